@@ -1,0 +1,1 @@
+"""Warp kernels and functions of warp_abtree, imported as ``warp_abtree.kernels``."""

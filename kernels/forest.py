@@ -1,0 +1,273 @@
+"""Vertex forest: corner rings of its nodes, and what `vertex_parent` alone says about every face.
+
+Ring of a node: a singly linked list of face corners, head[node] -> corner -> next[corner] -> ... -1.
+Corner 3 f + k is corner k of face f. A face is dead iff corner_node[3 f] < 0; dead corners stay in the rings of
+third vertices until these merge themselves, so every walk skips them.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Rings:
+    head: wp.array(dtype=int)  # [node_capacity], first corner or -1
+    degree: wp.array(dtype=int)  # [node_capacity], live faces
+    next: wp.array(dtype=int)  # [3 face_count]
+    corner_node: wp.array(dtype=int)  # [3 face_count], active node of each corner
+
+
+@wp.func
+def third_corner(f: int, a: int, b: int, corner_node: wp.array(dtype=int)):
+    """Return the corner of face f that is neither node a nor node b, where f has a or b; -1 unless it has both."""
+    x = corner_node[3 * f]
+    y = corner_node[3 * f + 1]
+    z = corner_node[3 * f + 2]
+    if (x == a and y == b) or (x == b and y == a):
+        return z
+    if (y == a and z == b) or (y == b and z == a):
+        return x
+    if (x == a and z == b) or (x == b and z == a):
+        return y
+    return int(-1)
+
+
+@wp.func
+def absorb_ring(rings: Rings, node: int, a: int, b: int, c: int, tail: int):
+    """Move the ring of `node` (a or b, merging into c) behind corner `tail` of c's ring; kill faces that have a and b.
+
+    Returns the new tail, -1 while c's ring is empty. Degrees of third vertices fall with every death; c's is counted.
+    """
+    k = rings.head[node]
+    while k >= 0:
+        following = rings.next[k]
+        f = k // 3
+        if rings.corner_node[3 * f] >= 0:
+            third = third_corner(f, a, b, rings.corner_node)
+            if third >= 0:
+                rings.degree[third] = rings.degree[third] - 1
+                rings.corner_node[3 * f] = -1
+            else:
+                rings.corner_node[k] = c
+                rings.degree[c] = rings.degree[c] + 1
+                if tail < 0:
+                    rings.head[c] = k
+                else:
+                    rings.next[tail] = k
+                tail = k
+        k = following
+    if tail >= 0:
+        rings.next[tail] = -1
+    return tail
+
+
+@wp.func
+def count_dying(rings: Rings, a: int, b: int):
+    """Count the live faces that have both a and b, on the shorter ring."""
+    node = wp.where(rings.degree[a] <= rings.degree[b], a, b)
+    count = int(0)
+    k = rings.head[node]
+    while k >= 0:
+        f = k // 3
+        if rings.corner_node[3 * f] >= 0:
+            if third_corner(f, a, b, rings.corner_node) >= 0:
+                count += 1
+        k = rings.next[k]
+    return count
+
+
+@wp.func
+def third_vertices_live(rings: Rings, a: int, b: int):
+    """Tell whether a third corner of a face dying with (a, b) has another live face."""
+    k = rings.head[a]
+    while k >= 0:
+        f = k // 3
+        if rings.corner_node[3 * f] >= 0:
+            third = third_corner(f, a, b, rings.corner_node)
+            if third >= 0:
+                other = rings.head[third]
+                while other >= 0:
+                    g = other // 3
+                    if rings.corner_node[3 * g] >= 0:
+                        if third_corner(g, a, b, rings.corner_node) < 0:
+                            return True
+                    other = rings.next[other]
+        k = rings.next[k]
+    return False
+
+
+@wp.func
+def has_face(rings: Rings, node: int, i: int, j: int):
+    """Tell whether a live face joins node, i and j."""
+    k = rings.head[node]
+    while k >= 0:
+        f = k // 3
+        if rings.corner_node[3 * f] >= 0:
+            if third_corner(f, i, j, rings.corner_node) == node:
+                return True
+        k = rings.next[k]
+    return False
+
+
+@wp.func
+def joins(rings: Rings, a: int, b: int):
+    """Tell whether a live face has a and b."""
+    k = rings.head[a]
+    while k >= 0:
+        f = k // 3
+        if rings.corner_node[3 * f] >= 0:
+            if third_corner(f, a, b, rings.corner_node) >= 0:
+                return True
+        k = rings.next[k]
+    return False
+
+
+@wp.func
+def breaks_link(rings: Rings, a: int, b: int):
+    """Tell whether merging a and b violates the link condition: link(a) and link(b) share more than link(ab).
+
+    Opposite edges are compared as faces, (a, i, j) against (b, i, j); that i and j are neighbours proves nothing.
+    """
+    k = rings.head[a]
+    while k >= 0:
+        f = k // 3
+        if rings.corner_node[3 * f] >= 0:
+            i = rings.corner_node[3 * f + (k + 1) % 3]
+            j = rings.corner_node[3 * f + (k + 2) % 3]
+            if i != b and j != b:
+                if has_face(rings, b, i, j):
+                    return True
+                if joins(rings, b, i) and not has_face(rings, a, b, i):
+                    return True
+                if joins(rings, b, j) and not has_face(rings, a, b, j):
+                    return True
+        k = rings.next[k]
+    return False
+
+
+
+@wp.kernel
+def link_rings_kernel(
+    face_count: int,
+    face_vertex: wp.array2d(dtype=int),
+    # In and out:
+    rings_inout: Rings,
+):
+    """Link the corners of every face with three distinct corners; mark the others dead (serial, dim=1).
+
+    Args:
+        rings_inout: `head` must hold -1 and `degree` 0. Rings come out in ascending order of corners.
+    """
+    f = face_count - 1
+    while f >= 0:
+        x = face_vertex[f, 0]
+        y = face_vertex[f, 1]
+        z = face_vertex[f, 2]
+        if x == y or y == z or z == x:
+            rings_inout.corner_node[3 * f] = -1
+        else:
+            for k in range(3):
+                v = face_vertex[f, k]
+                rings_inout.corner_node[3 * f + k] = v
+                rings_inout.next[3 * f + k] = rings_inout.head[v]
+                rings_inout.head[v] = 3 * f + k
+                rings_inout.degree[v] = rings_inout.degree[v] + 1
+        f -= 1
+
+
+@wp.func
+def next_merge(node: int, node_count: int, vertex_parent: wp.array(dtype=int)):
+    """Return the parent of a node, or node_count at a root, so that roots come last."""
+    p = vertex_parent[node]
+    if p < 0:
+        p = node_count
+    return p
+
+
+@wp.kernel
+def count_events_kernel(
+    vertex_count: int,
+    node_count: int,
+    face_vertex: wp.array2d(dtype=int),
+    vertex_parent: wp.array(dtype=int),
+    # In and out:
+    split_size_inout: wp.array(dtype=wp.int64),
+    # Out:
+    face_split_out: wp.array(dtype=int),
+):
+    """Find the merge at which each face dies, and count the faces that every split touches (serial, dim=1).
+
+    The three corners climb in the order of the merges, so the first merge that two of them share is the lowest
+    common ancestor at which the face dies; every merge passed on the way deforms the face.
+    """
+    merge_count = node_count - vertex_count
+    for f in range(face_vertex.shape[0]):
+        x = face_vertex[f, 0]
+        y = face_vertex[f, 1]
+        z = face_vertex[f, 2]
+        split = int(0)
+        alive = int(1)
+        if x == y or y == z or z == x:
+            split = merge_count + 1
+            alive = int(0)
+        while alive == 1:
+            px = next_merge(x, node_count, vertex_parent)
+            py = next_merge(y, node_count, vertex_parent)
+            pz = next_merge(z, node_count, vertex_parent)
+            p = wp.min(px, wp.min(py, pz))
+            if p == node_count:
+                alive = int(0)
+            else:
+                j = p - vertex_count
+                i = merge_count - 1 - j
+                split_size_inout[i] = split_size_inout[i] + wp.int64(1)
+                if int(px == p) + int(py == p) + int(pz == p) > 1:
+                    split = merge_count - j
+                    alive = int(0)
+                x = wp.where(px == p, p, x)
+                y = wp.where(py == p, p, y)
+                z = wp.where(pz == p, p, z)
+        face_split_out[f] = split
+
+
+@wp.kernel
+def fill_events_kernel(
+    vertex_count: int,
+    node_count: int,
+    face_vertex: wp.array2d(dtype=int),
+    vertex_parent: wp.array(dtype=int),
+    # In and out:
+    split_cursor_inout: wp.array(dtype=wp.int64),
+    # Out:
+    split_face_out: wp.array(dtype=int),
+):
+    """Write every face to the slices of the splits that touch it (serial, dim=1: each slice comes out ascending).
+
+    Args:
+        split_cursor_inout: Start of every slice, shape [m]; ends as the end of every slice.
+    """
+    merge_count = node_count - vertex_count
+    for f in range(face_vertex.shape[0]):
+        x = face_vertex[f, 0]
+        y = face_vertex[f, 1]
+        z = face_vertex[f, 2]
+        alive = int(1)
+        if x == y or y == z or z == x:
+            alive = int(0)
+        while alive == 1:
+            px = next_merge(x, node_count, vertex_parent)
+            py = next_merge(y, node_count, vertex_parent)
+            pz = next_merge(z, node_count, vertex_parent)
+            p = wp.min(px, wp.min(py, pz))
+            if p == node_count:
+                alive = int(0)
+            else:
+                i = merge_count - 1 - (p - vertex_count)
+                split_face_out[split_cursor_inout[i]] = f
+                split_cursor_inout[i] = split_cursor_inout[i] + wp.int64(1)
+                if int(px == p) + int(py == p) + int(pz == p) > 1:
+                    alive = int(0)
+                x = wp.where(px == p, p, x)
+                y = wp.where(py == p, p, y)
+                z = wp.where(pz == p, p, z)

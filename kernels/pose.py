@@ -1,0 +1,164 @@
+"""Poses of objects, and the pose of one object in the frame of another."""
+
+import warp as wp
+
+from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+# Products of three coordinates stay normal above this.
+COORDINATE_MIN = wp.constant(wp.float64(2.0**-290))
+ROUNDING_32 = wp.constant(wp.float64(2.0**-18))
+ROUNDING_64 = wp.constant(wp.float64(2.0**-49))
+
+
+@wp.struct
+class PairPose:
+    """The pose of B in A's frame, A the object with the smaller index.
+
+    rotation, translation map B's model frame to A's in float64. rotation32, translation32, margin serve boxes about the
+    models' centres.
+    """
+
+    rotation: wp.mat33d
+    translation: wp.vec3d
+    rotation32: wp.mat33
+    translation32: wp.vec3
+    margin: wp.float32
+
+
+@wp.func
+def sum_products(p0: wp.float64, q0: wp.float64, p1: wp.float64, q1: wp.float64, p2: wp.float64, q2: wp.float64):
+    return (p0 * q0 + p1 * q1) + p2 * q2
+
+
+@wp.func
+def pose_point(rotation: wp.mat33d, translation: wp.vec3d, p: wp.vec3d):
+    """Return x' of DESIGN section 6: left to right, without fused multiply-add, tiny coordinates as 0."""
+    x = wp.vec3d()
+    for i in range(3):
+        y = sum_products(rotation[i, 0], p[0], rotation[i, 1], p[1], rotation[i, 2], p[2]) + translation[i]
+        x[i] = wp.where(wp.abs(y) < COORDINATE_MIN, wp.float64(0.0), y)
+    return x
+
+
+@wp.func
+def relate_objects(objects: ObjectPool, a: wp.int32, b: wp.int32):
+    """Return R = Ra^T Rb and t = Ra^T (tb - ta), each entry the sum of its three products from left to right."""
+    ra = objects.rotation[a]
+    rb = objects.rotation[b]
+    shift = objects.position[b] - objects.position[a]
+    r = wp.mat33d()
+    t = wp.vec3d()
+    for i in range(3):
+        t[i] = sum_products(ra[0, i], shift[0], ra[1, i], shift[1], ra[2, i], shift[2])
+        for j in range(3):
+            r[i, j] = sum_products(ra[0, i], rb[0, j], ra[1, i], rb[1, j], ra[2, i], rb[2, j])
+    return r, t
+
+
+@wp.func
+def reach_box(lower: wp.vec3, upper: wp.vec3):
+    """Return the largest coordinate of a box, in magnitude."""
+    m = wp.max(wp.max(wp.abs(lower[0]), wp.abs(upper[0])), wp.max(wp.abs(lower[1]), wp.abs(upper[1])))
+    return wp.float64(wp.max(m, wp.max(wp.abs(lower[2]), wp.abs(upper[2]))))
+
+
+@wp.func
+def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32):
+    """Return the `PairPose` of B in A's frame.
+
+    The margin covers, with a factor of two to spare, every rounding between the exact x' of B's vertices and the float32 box
+    test. With u = 2^-24, r_a and r_b the reach of the root boxes and s the largest component of the translation between the
+    centres, centre and half width of B's posed box err by at most 11 sqrt(3) u r_b + 4 u s, those of A's by 2 u r_a, and the
+    comparison adds u (3 sqrt(3) r_b + s + 3 r_a): less than 32 u (r_a + r_b + s) in all, twice that on B's axes. The float64 part
+    covers x' itself and the shift between centres, and `skewed` a rotation that is not orthonormal to the last bit, on
+    whose columns B's axes are taken.
+    """
+    r, t = relate_objects(objects, a, b)
+    state_a = objects.state[a]
+    state_b = objects.state[b]
+    centre_a = models.centre[states.model[state_a]]
+    centre_b = models.centre[states.model[state_b]]
+    root_a = states.node_start[state_a] + 1
+    root_b = states.node_start[state_b] + 1
+    reach_a = reach_box(states.node_lower[root_a], states.node_upper[root_a])
+    reach_b = reach_box(states.node_lower[root_b], states.node_upper[root_b])
+    shift = wp.vec3d()
+    size = wp.float64(0.0)
+    far = wp.float64(0.0)
+    skewed = wp.float64(0.0)
+    for i in range(3):
+        shift[i] = (
+            sum_products(r[i, 0], centre_b[0], r[i, 1], centre_b[1], r[i, 2], centre_b[2]) + t[i]
+        ) - centre_a[i]
+        far = wp.max(far, wp.abs(shift[i]))
+        size = wp.max(size, wp.abs(t[i]) + wp.abs(centre_a[i]))
+        for j in range(3):
+            gram = sum_products(r[0, i], r[0, j], r[1, i], r[1, j], r[2, i], r[2, j])
+            skewed = wp.max(skewed, wp.abs(gram - wp.where(i == j, wp.float64(1.0), wp.float64(0.0))))
+    reach_c = wp.max(wp.max(wp.abs(centre_b[0]), wp.abs(centre_b[1])), wp.abs(centre_b[2]))
+    margin64 = ROUNDING_64 * (size + wp.float64(2.0) * (reach_c + reach_b) + reach_a)
+    margin64 = margin64 + wp.float64(4.0) * skewed * (reach_b + far)
+    margin32 = ROUNDING_32 * (reach_a + reach_b + far)
+
+    pose = PairPose()
+    pose.rotation = r
+    pose.translation = t
+    pose.rotation32 = wp.mat33(r)
+    if far > wp.float64(2.0) * (reach_a + wp.float64(2.0) * reach_b) + margin64:
+        # Far apart for certain, perhaps beyond float32: a margin that no box passes.
+        pose.margin = -wp.inf
+    else:
+        pose.translation32 = wp.vec3(shift)
+        pose.margin = wp.float32(margin64 + margin32)
+    return pose
+
+
+@wp.kernel
+def relate_pair_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_pose_out: wp.array(dtype=PairPose),
+):
+    """Compute the pose of B in A's frame once a pair, A the smaller index."""
+    p = wp.tid()
+    if p >= wp.min(pair_count[0], pairs.shape[0]):
+        return
+    a = wp.min(pairs[p][0], pairs[p][1])
+    b = wp.max(pairs[p][0], pairs[p][1])
+    pair_pose_out[p] = pair_pose(models, states, objects, a, b)
+
+
+@wp.func
+def rotate_quaternion(q: wp.vec4d):
+    """Return the rotation matrix of a quaternion x y z w after normalising it."""
+    two = wp.float64(2.0)
+    one = wp.float64(1.0)
+    norm = wp.sqrt(((q[0] * q[0] + q[1] * q[1]) + q[2] * q[2]) + q[3] * q[3])
+    x = q[0] / norm
+    y = q[1] / norm
+    z = q[2] / norm
+    w = q[3] / norm
+    return wp.mat33d(
+        one - two * (y * y + z * z),
+        two * (x * y - z * w),
+        two * (x * z + y * w),
+        two * (x * y + z * w),
+        one - two * (x * x + z * z),
+        two * (y * z - x * w),
+        two * (x * z - y * w),
+        two * (y * z + x * w),
+        one - two * (x * x + y * y),
+    )
+
+
+@wp.kernel
+def set_pose_kernel(poses: wp.array2d(dtype=wp.float64), objects_inout: ObjectPool):
+    """Set rotation and position from x y z qx qy qz qw [world units, unit quaternion], one row an object."""
+    i = wp.tid()
+    objects_inout.position[i] = wp.vec3d(poses[i, 0], poses[i, 1], poses[i, 2])
+    objects_inout.rotation[i] = rotate_quaternion(wp.vec4d(poses[i, 3], poses[i, 4], poses[i, 5], poses[i, 6]))

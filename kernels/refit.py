@@ -1,0 +1,145 @@
+"""ACTIVE-WALK and ACTIVE-REFIT, level by level: boxes, status and skip links of marked nodes."""
+
+import warp as wp
+
+from warp_abtree.kernels.boxes import round_down_vec, round_up_vec
+from warp_abtree.kernels.pools import ACTIVE, INACTIVE, ModelPool, StatePool
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.func
+def refit_leaf(models: ModelPool, states: StatePool, state: wp.int32, node: wp.int32, face: wp.int32):
+    """Box one face about the model's centre, or empty the leaf of an inactive face."""
+    at = states.node_start[state] + node
+    corner = states.face_corner[states.face_start[state] + face]
+    if corner[0] < 0:
+        states.node_status[at] = INACTIVE
+        states.node_lower[at] = wp.vec3(wp.inf, wp.inf, wp.inf)
+        states.node_upper[at] = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+        states.node_skip[at] = -1
+        return
+    centre = models.centre[states.model[state]]
+    a = models.vertex_pos[corner[0]] - centre
+    b = models.vertex_pos[corner[1]] - centre
+    c = models.vertex_pos[corner[2]] - centre
+    states.node_status[at] = ACTIVE
+    states.node_lower[at] = round_down_vec(wp.min(a, wp.min(b, c)))
+    states.node_upper[at] = round_up_vec(wp.max(a, wp.max(b, c)))
+    states.node_skip[at] = node
+
+
+@wp.func
+def refit_inner(states: StatePool, state: wp.int32, node: wp.int32):
+    """Unite the children of a node; both are final."""
+    at = states.node_start[state] + node
+    left = states.node_start[state] + 2 * node
+    skip_left = states.node_skip[left]
+    skip_right = states.node_skip[left + 1]
+    # An empty box is (+inf, -inf), so the union needs no case for an inactive child.
+    states.node_lower[at] = wp.min(states.node_lower[left], states.node_lower[left + 1])
+    states.node_upper[at] = wp.max(states.node_upper[left], states.node_upper[left + 1])
+    skip = node
+    if skip_left < 0:
+        skip = skip_right
+    elif skip_right < 0:
+        skip = skip_left
+    states.node_skip[at] = skip
+    states.node_status[at] = wp.where(skip < 0, INACTIVE, ACTIVE)
+
+
+@wp.func
+def refit_node(models: ModelPool, states: StatePool, state: wp.int32, node: wp.int32):
+    face = models.node_face[models.node_start[states.model[state]] + node]
+    if face >= 0:
+        refit_leaf(models, states, state, node, face)
+    else:
+        refit_inner(states, state, node)
+
+
+@wp.kernel
+def refit_level_kernel(
+    level: wp.int32,
+    models: ModelPool,
+    level_start: wp.array(dtype=wp.int32),
+    level_count: wp.array(dtype=wp.int32),
+    level_node: wp.array(dtype=wp.vec2i),
+    states_inout: StatePool,
+):
+    """Refit every marked node of one level.
+
+    Invariant: children of this level are final, since levels go deepest first.
+    Source: Liu et al. 2006, section 3.2.2, ACTIVE-REFIT; Algorithm 3.
+    """
+    tid = wp.tid()
+    if tid >= level_count[level]:
+        return
+    item = level_node[level_start[level] + tid]
+    refit_node(models, states_inout, item[0], item[1])
+
+
+@wp.kernel
+def refit_whole_level_kernel(
+    level: wp.int32,
+    models: ModelPool,
+    update_state: wp.array(dtype=wp.int32),
+    states_inout: StatePool,
+):
+    """Refit every node of one level in the states under full update, one thread a node.
+
+    Invariant: children of this level are final.
+    """
+    tid = wp.tid()
+    state = update_state[tid >> level]
+    node = (1 << level) + (tid & ((1 << level) - 1))
+    # A heap index without a node lies under a leaf of the level above.
+    if level > 0 and models.node_face[models.node_start[states_inout.model[state]] + (node >> 1)] >= 0:
+        return
+    refit_node(models, states_inout, state, node)
+
+
+@wp.kernel
+def copy_node_kernel(
+    node_end: wp.array(dtype=wp.int32),
+    source_state: wp.array(dtype=wp.int32),
+    target_state: wp.array(dtype=wp.int32),
+    states_inout: StatePool,
+):
+    """Copy the nodes of whole states.
+
+    Args:
+        node_end: Running total of node counts, shape [copy_count].
+    """
+    tid = wp.tid()
+    u = wp.lower_bound(node_end, tid + 1)
+    begin = wp.int32(0)
+    if u > 0:
+        begin = node_end[u - 1]
+    source = states_inout.node_start[source_state[u]] + tid - begin
+    target = states_inout.node_start[target_state[u]] + tid - begin
+    states_inout.node_status[target] = states_inout.node_status[source]
+    states_inout.node_lower[target] = states_inout.node_lower[source]
+    states_inout.node_upper[target] = states_inout.node_upper[source]
+    states_inout.node_skip[target] = states_inout.node_skip[source]
+
+
+@wp.kernel
+def copy_face_kernel(
+    face_end: wp.array(dtype=wp.int32),
+    source_state: wp.array(dtype=wp.int32),
+    target_state: wp.array(dtype=wp.int32),
+    states_inout: StatePool,
+):
+    """Copy the face corners of whole states.
+
+    Args:
+        face_end: Running total of face counts, shape [copy_count].
+    """
+    tid = wp.tid()
+    u = wp.lower_bound(face_end, tid + 1)
+    begin = wp.int32(0)
+    if u > 0:
+        begin = face_end[u - 1]
+    source = states_inout.face_start[source_state[u]] + tid - begin
+    target = states_inout.face_start[target_state[u]] + tid - begin
+    states_inout.face_corner[target] = states_inout.face_corner[source]

@@ -1,0 +1,264 @@
+"""ACTIVE-INTERSECT: dual-tree traversal of many object pairs, every intersecting face pair reported.
+
+Two regimes, one answer: a thread a pair, depth first (CPU), and a block a pair around a shared stack (CUDA).
+Both visit the same pairs of nodes and differ in their order only.
+Source: Liu et al. 2006, section 3.2.2, ACTIVE-INTERSECT.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.boxes import boxes_overlap
+from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.pose import PairPose, pose_point
+from warp_abtree.kernels.triangle import intersect_triangles
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+OUTPUT_ANY = wp.constant(0)
+OUTPUT_COUNT = wp.constant(1)
+OUTPUT_FACES = wp.constant(2)
+
+# A visit replaces one entry by two a level deeper, so depth first holds at most one entry a level of either tree, plus one.
+STACK_LENGTH = wp.constant(64)
+stack_type = wp.types.vector(length=128, dtype=wp.int32)
+
+SHARED_LENGTH = wp.constant(1024)
+
+
+@wp.struct
+class PairTrees:
+    """Where the two trees of a pair lie in the pools."""
+
+    node_a: wp.int32
+    node_b: wp.int32
+    face_node_a: wp.int32
+    face_node_b: wp.int32
+    corner_a: wp.int32
+    corner_b: wp.int32
+
+
+@wp.struct
+class Hits:
+    """Results of a batch of pairs.
+
+    any_hit, count: shape [pair]. face: (pair, face a, face b), a of the pair's first object, shape [capacity]; total keeps counting
+    past the capacity. node_tests, triangle_tests: work done, shape [pair].
+    """
+
+    any_hit: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)
+    face: wp.array(dtype=wp.vec3i)
+    total: wp.array(dtype=wp.int32)
+    node_tests: wp.array(dtype=wp.int32)
+    triangle_tests: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def locate_trees(models: ModelPool, states: StatePool, state_a: wp.int32, state_b: wp.int32):
+    trees = PairTrees()
+    trees.node_a = states.node_start[state_a]
+    trees.node_b = states.node_start[state_b]
+    trees.face_node_a = models.node_start[states.model[state_a]]
+    trees.face_node_b = models.node_start[states.model[state_b]]
+    trees.corner_a = states.face_start[state_a]
+    trees.corner_b = states.face_start[state_b]
+    return trees
+
+
+@wp.func
+def test_faces(
+    models: ModelPool, states: StatePool, trees: PairTrees, pose: PairPose, face_a: wp.int32, face_b: wp.int32
+):
+    """Test one active face of A against one of B, in A's frame."""
+    a = states.face_corner[trees.corner_a + face_a]
+    b = states.face_corner[trees.corner_b + face_b]
+    return intersect_triangles(
+        models.vertex_pos[a[0]],
+        models.vertex_pos[a[1]],
+        models.vertex_pos[a[2]],
+        pose_point(pose.rotation, pose.translation, models.vertex_pos[b[0]]),
+        pose_point(pose.rotation, pose.translation, models.vertex_pos[b[1]]),
+        pose_point(pose.rotation, pose.translation, models.vertex_pos[b[2]]),
+    )
+
+
+@wp.func
+def report_hit(output: wp.int32, pair: wp.int32, swapped: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+    hits.any_hit[pair] = 1
+    if output == OUTPUT_FACES:
+        slot = wp.atomic_add(hits.total, 0, 1)
+        if slot < hits.face.shape[0]:
+            if swapped != 0:
+                hits.face[slot] = wp.vec3i(pair, face_b, face_a)
+            else:
+                hits.face[slot] = wp.vec3i(pair, face_a, face_b)
+
+
+@wp.func
+def visit_nodes(
+    models: ModelPool, states: StatePool, trees: PairTrees, pose: PairPose, node_a: wp.int32, node_b: wp.int32
+):
+    """Test one pair of nodes and say what follows.
+
+    Returns (kind, x, y): kind 0 nothing, 1 the leaves' faces x and y are candidates, 2 descend A into x and y, 3 descend B.
+    x and y are skip nodes: a leaf or two active children each, so a coarse tree costs no more than one built for its LOD.
+    """
+    lower_a = states.node_lower[trees.node_a + node_a]
+    upper_a = states.node_upper[trees.node_a + node_a]
+    lower_b = states.node_lower[trees.node_b + node_b]
+    upper_b = states.node_upper[trees.node_b + node_b]
+    if not boxes_overlap(lower_a, upper_a, lower_b, upper_b, pose.rotation32, pose.translation32, pose.margin):
+        return 0, 0, 0
+    face_a = models.node_face[trees.face_node_a + node_a]
+    face_b = models.node_face[trees.face_node_b + node_b]
+    if face_a >= 0 and face_b >= 0:
+        return 1, face_a, face_b
+    size_a = upper_a - lower_a
+    size_b = upper_b - lower_b
+    larger_a = size_a[0] + size_a[1] + size_a[2] >= size_b[0] + size_b[1] + size_b[2]
+    if face_b >= 0 or (face_a < 0 and larger_a):
+        at = trees.node_a + 2 * node_a
+        return 2, states.node_skip[at], states.node_skip[at + 1]
+    at = trees.node_b + 2 * node_b
+    return 3, states.node_skip[at], states.node_skip[at + 1]
+
+
+@wp.func
+def traverse_depth_first(
+    output: wp.int32,
+    pair: wp.int32,
+    swapped: wp.int32,
+    start_a: wp.int32,
+    start_b: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    trees: PairTrees,
+    pose: PairPose,
+    hits: Hits,
+):
+    """Traverse from one pair of nodes in this thread; return (hits, node tests, triangle tests)."""
+    stack = stack_type()
+    stack[0] = start_a
+    stack[1] = start_b
+    top = wp.int32(1)
+    hit_count = wp.int32(0)
+    node_tests = wp.int32(0)
+    triangle_tests = wp.int32(0)
+    while top > 0:
+        top -= 1
+        node_a = stack[2 * top]
+        node_b = stack[2 * top + 1]
+        kind, x, y = visit_nodes(models, states, trees, pose, node_a, node_b)
+        node_tests += 1
+        if kind == 1:
+            triangle_tests += 1
+            if test_faces(models, states, trees, pose, x, y):
+                hit_count += 1
+                report_hit(output, pair, swapped, x, y, hits)
+                if output == OUTPUT_ANY:
+                    top = 0
+        elif kind == 2:
+            stack[2 * top] = x
+            stack[2 * top + 1] = node_b
+            stack[2 * top + 2] = y
+            stack[2 * top + 3] = node_b
+            top += 2
+        elif kind == 3:
+            stack[2 * top] = node_a
+            stack[2 * top + 1] = x
+            stack[2 * top + 2] = node_a
+            stack[2 * top + 3] = y
+            top += 2
+    return hit_count, node_tests, triangle_tests
+
+
+@wp.kernel
+def traverse_thread_kernel(
+    output: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    hits_out: Hits,
+):
+    """Traverse one object pair a thread, depth first."""
+    p = wp.tid()
+    if p >= wp.min(pair_count[0], pairs.shape[0]):
+        return
+    swapped = wp.where(pairs[p][0] > pairs[p][1], 1, 0)
+    state_a = objects.state[wp.min(pairs[p][0], pairs[p][1])]
+    state_b = objects.state[wp.max(pairs[p][0], pairs[p][1])]
+    trees = locate_trees(models, states, state_a, state_b)
+    skip_a = states.node_skip[trees.node_a + 1]
+    skip_b = states.node_skip[trees.node_b + 1]
+    hit_count, node_tests, triangle_tests = traverse_depth_first(
+        output, p, swapped, skip_a, skip_b, models, states, trees, pair_poses[p], hits_out
+    )
+    hits_out.count[p] = hit_count
+    hits_out.node_tests[p] = node_tests
+    hits_out.triangle_tests[p] = triangle_tests
+
+
+@wp.kernel
+def traverse_block_kernel(
+    output: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    hits_out: Hits,
+):
+    """Traverse one object pair a block: its threads pop node pairs from a shared stack and push what overlaps.
+
+    What the full stack refuses, its thread finishes depth first: nothing is lost, whatever the stack's length.
+    """
+    p, lane = wp.tid()
+    if p >= wp.min(pair_count[0], pairs.shape[0]):
+        return
+    swapped = wp.where(pairs[p][0] > pairs[p][1], 1, 0)
+    state_a = objects.state[wp.min(pairs[p][0], pairs[p][1])]
+    state_b = objects.state[wp.max(pairs[p][0], pairs[p][1])]
+    trees = locate_trees(models, states, state_a, state_b)
+    pose = pair_poses[p]
+    hit_count = wp.int32(0)
+    node_tests = wp.int32(0)
+    triangle_tests = wp.int32(0)
+
+    stack = wp.tile_stack(capacity=SHARED_LENGTH, dtype=wp.vec2i)
+    start = wp.vec2i(states.node_skip[trees.node_a + 1], states.node_skip[trees.node_b + 1])
+    wp.tile_stack_push(stack, start, lane == 0)
+    while wp.tile_stack_count(stack) > 0:
+        item, slot = wp.tile_stack_pop(stack)
+        kind = wp.int32(0)
+        x = wp.int32(0)
+        y = wp.int32(0)
+        # For `any` a hit empties the stack: items are popped and dropped, so that every thread leaves the loop together.
+        if slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
+            kind, x, y = visit_nodes(models, states, trees, pose, item[0], item[1])
+            node_tests += 1
+        if kind == 1:
+            triangle_tests += 1
+            if test_faces(models, states, trees, pose, x, y):
+                hit_count += 1
+                report_hit(output, p, swapped, x, y, hits_out)
+        first = wp.where(kind == 2, wp.vec2i(x, item[1]), wp.vec2i(item[0], x))
+        second = wp.where(kind == 2, wp.vec2i(y, item[1]), wp.vec2i(item[0], y))
+        kept_first = wp.tile_stack_push(stack, first, kind >= 2)
+        kept_second = wp.tile_stack_push(stack, second, kind >= 2)
+        for child in range(2):
+            refused = kind >= 2 and wp.where(child == 0, kept_first, kept_second) < 0
+            if refused:
+                node = wp.where(child == 0, first, second)
+                more, more_nodes, more_triangles = traverse_depth_first(
+                    output, p, swapped, node[0], node[1], models, states, trees, pose, hits_out
+                )
+                hit_count += more
+                node_tests += more_nodes
+                triangle_tests += more_triangles
+    wp.atomic_add(hits_out.count, p, hit_count)
+    wp.atomic_add(hits_out.node_tests, p, node_tests)
+    wp.atomic_add(hits_out.triangle_tests, p, triangle_tests)

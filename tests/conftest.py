@@ -1,0 +1,36 @@
+"""What the tests share: the devices present, and where real meshes may lie."""
+
+import os
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+wp.config.quiet = True
+wp.init()
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(params=[str(device) for device in wp.get_devices()])
+def device(request):
+    """Name of a Warp device; the test runs once on each one present."""
+    return request.param
+
+
+def real_mesh_path(name):
+    """Return the path of NAME.obj.gz, or skip the test.
+
+    The folder is the environment variable ABTREE_MESHES, else ../shared/meshes beside the checkout.
+    """
+    folder = Path(os.environ.get("ABTREE_MESHES", ROOT.parent / "shared" / "meshes"))
+    path = folder / f"{name}.obj.gz"
+    if not path.is_file():
+        pytest.skip(f"{name}.obj.gz is not at hand; ABTREE_MESHES names the folder of real meshes")
+    return path
+
+
+@pytest.fixture(name="real_mesh_path")
+def real_mesh_path_fixture():
+    """Give `real_mesh_path` to a test that does not import it."""
+    return real_mesh_path

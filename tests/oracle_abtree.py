@@ -1,0 +1,378 @@
+"""A serial AB-Tree in plain Python, after Algorithms 1 to 3 of Liu, Georganas and Roth 2006, section 3.2.
+
+This is the oracle for the library's parallel tree: the operations keep the paper's names and structure (linked nodes,
+recursion, one primitive at a time), and share no code with the library. What both sides must agree on to the bit is
+stated where it is computed: the median split, the heap numbering, and the rounding of leaf boxes.
+
+Erratum (a) of the paper is explained at `active_mark`.
+"""
+
+import math
+import random
+from dataclasses import dataclass, field
+
+import numpy as np
+
+INACTIVE, ACTIVE, DEFORMED = 0, 1, 2
+NONE = -1
+EMPTY = ((math.inf,) * 3, (-math.inf,) * 3)
+
+
+# --- the progressive mesh --------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Progressive:
+    """A progressive mesh as plain lists; n_v original vertices, n_f faces, m merges.
+
+    Merge j makes vertex node n_v + j. `lod` counts vertex splits from the base mesh, so m is the original, and
+    merge j is the one that takes lod m - j to m - j - 1.
+
+    Fields:
+        vertex_parent: Parent of each vertex node, -1 at a root, length n_v + m.
+        vertex_pos: Position of each vertex node [model units], length n_v + m.
+        face_vertex: Original corners of each face, length n_f.
+        face_split: Face f is active iff lod >= face_split[f], length n_f; m + 1 for a face that is never active.
+        split_start: Slice i of split_face is split_start[i] .. split_start[i+1], length m + 1.
+        split_face: Faces that the split from lod i to i + 1 inserts or deforms.
+    """
+
+    vertex_parent: list
+    vertex_pos: list
+    face_vertex: list
+    face_split: list
+    split_start: list
+    split_face: list
+
+    @classmethod
+    def of(cls, source):
+        """Copy the six arrays of any object that has them as attributes into plain lists."""
+        return cls(*(np.asarray(getattr(source, name)).tolist() for name in cls.__dataclass_fields__))
+
+    @property
+    def lod_max(self):
+        return len(self.split_start) - 1
+
+    @property
+    def vertex_count(self):
+        return len(self.vertex_parent) - self.lod_max
+
+    def ancestor(self, vertex, lod):
+        """Highest ancestor of an original vertex that exists at this lod."""
+        limit = self.vertex_count + self.lod_max - lod
+        while NONE < self.vertex_parent[vertex] < limit:
+            vertex = self.vertex_parent[vertex]
+        return vertex
+
+    def corners(self, face, lod):
+        """The three active vertex nodes of a face."""
+        return [self.ancestor(v, lod) for v in self.face_vertex[face]]
+
+    def is_active(self, face, lod):
+        return lod >= self.face_split[face]
+
+    def sets_between(self, lod_from, lod_to):
+        """The paper's sets I, R and D (inserted, removed, deformed) for a change of lod in either direction.
+
+        The faces touched by splits a .. b-1 are one contiguous slice, whichever way it is crossed.
+        """
+        low, high = min(lod_from, lod_to), max(lod_from, lod_to)
+        inserted, removed, deformed = [], [], []
+        for face in sorted(set(self.split_face[self.split_start[low] : self.split_start[high]])):
+            before, after = self.is_active(face, lod_from), self.is_active(face, lod_to)
+            if before and after:
+                deformed.append(face)
+            elif after:
+                inserted.append(face)
+            elif before:
+                removed.append(face)
+        return inserted, removed, deformed
+
+    def centre(self):
+        """Centre of the box of the original vertices; 0.5 * lower + 0.5 * upper cannot overflow."""
+        points = self.vertex_pos[: self.vertex_count]
+        return [0.5 * min(p[k] for p in points) + 0.5 * max(p[k] for p in points) for k in range(3)]
+
+
+def random_progressive(vertices, faces, seed=0, base_faces=4, jitter=0.05):
+    """Collapse random edges of a small mesh, nonmanifold or not, and write down what happened.
+
+    Everything is found by replaying the collapses on explicit corner lists, so face_split and the slices are facts
+    of the replay and not derived from the vertex forest.
+    """
+    rng = random.Random(seed)
+    position = [list(map(float, v)) for v in vertices]
+    face_vertex = [list(map(int, f)) for f in faces]
+    parent = [NONE] * len(position)
+    corner = {f: list(c) for f, c in enumerate(face_vertex) if len(set(c)) == 3}
+    death = {}  # face -> merge that removed it
+    touched = []  # per merge, the faces that it removed or deformed
+    while len(corner) > base_faces:
+        a, b = rng.sample(corner[rng.choice(list(corner))], 2)
+        new, merge = len(position), len(touched)
+        position.append([(position[a][k] + position[b][k]) / 2 + rng.uniform(-jitter, jitter) for k in range(3)])
+        parent.append(NONE)
+        parent[a] = parent[b] = new
+        touched.append([f for f, c in corner.items() if a in c or b in c])
+        for f in touched[-1]:
+            corner[f] = [new if v in (a, b) else v for v in corner[f]]
+            if len(set(corner[f])) < 3:
+                del corner[f]
+                death[f] = merge
+    m = len(touched)
+    split = [m - death[f] if f in death else (0 if f in corner else m + 1) for f in range(len(face_vertex))]
+    start, flat = [0], []
+    for slice_faces in reversed(touched):
+        flat += slice_faces
+        start.append(len(flat))
+    return Progressive(parent, position, face_vertex, split, start, flat)
+
+
+# --- the tree --------------------------------------------------------------------------------------------------------
+
+
+class Node:
+    """A tree node with the fields of the paper, and two of ours.
+
+    range is (lower, upper); index is the primitive of a leaf and None inside; number is the heap index (root 1,
+    children 2x and 2x+1); skip is the highest descendant-or-self that a traversal need visit.
+    """
+
+    __slots__ = ("index", "left", "number", "parent", "range", "right", "skip", "status")
+
+    def __init__(self, number, parent):
+        self.number, self.parent = number, parent
+        self.left = self.right = self.index = self.skip = None
+        self.range, self.status = EMPTY, INACTIVE
+
+    @property
+    def is_leaf(self):
+        return self.index is not None
+
+    def deactivate(self):
+        self.status, self.range, self.skip = INACTIVE, EMPTY, None
+
+
+@dataclass
+class ABTree:
+    """An AB-Tree: linked nodes, the indexed list `leaf` (face -> leaf node), and the lod that the mesh stands at."""
+
+    mesh: Progressive
+    lod: int
+    root: Node = None
+    leaf: list = field(default_factory=list)
+    centre: list = field(default_factory=list)
+
+    def nodes(self):
+        """All nodes, children after parents."""
+        stack = [self.root]
+        while stack:
+            node = stack.pop()
+            yield node
+            if not node.is_leaf:
+                stack += [node.right, node.left]
+
+    def flat(self):
+        """Heap-indexed copy of the state, for comparison with flat arrays.
+
+        Returns:
+            Dict of NumPy arrays: status int8 [size], lower and upper float32 [size, 3], skip int32 [size] (-1: none),
+            face_node int32 [n_f]. size is 2^(depth+1); a number without a node reads as inactive.
+        """
+        numbered = {node.number: node for node in self.nodes()}
+        size = 2 << (max(numbered).bit_length() - 1)
+        state = {
+            "status": np.zeros(size, np.int8),
+            "lower": np.full((size, 3), np.inf, np.float32),
+            "upper": np.full((size, 3), -np.inf, np.float32),
+            "skip": np.full(size, NONE, np.int32),
+            "face_node": np.array([leaf.number for leaf in self.leaf], np.int32),
+        }
+        for number, node in numbered.items():
+            state["status"][number] = node.status
+            state["lower"][number], state["upper"][number] = node.range
+            if node.skip is not None:
+                state["skip"][number] = node.skip.number
+        return state
+
+
+@dataclass
+class Update:
+    """What one ACTIVE-UPDATE cost: k distinct faces, and the number of nodes marked (equation 1 bounds it)."""
+
+    k: int
+    nodes_refitted: int
+
+
+def refit_bound(n, k):
+    """Equation (1): at most k (log2 n - log2 k + 2) - 1 nodes are marked, n rounded up to a power of two."""
+    return k * ((n - 1).bit_length() - math.log2(k) + 2) - 1 if k else 0
+
+
+def round_down(value):
+    """Largest float32 strictly below a float64, as the boxes want it: outwards even where the value is exact."""
+    f = np.float32(value)
+    return float(np.nextafter(f, np.float32(-np.inf)) if float(f) >= value else f)
+
+
+def round_up(value):
+    """Smallest float32 strictly above a float64."""
+    f = np.float32(value)
+    return float(np.nextafter(f, np.float32(np.inf)) if float(f) <= value else f)
+
+
+def active_build(mesh, lod=None):
+    """ACTIVE-BUILD(P): split the set of all primitives top-down, then take the state of one lod (default: finest).
+
+    Halves are equal to within one: node i of depth d covers the leaf positions (i n) >> d .. ((i+1) n) >> d. The axis
+    is the longest of the box of the segment's faces at the finest lod (ties: lowest axis), the order is by
+    lower + upper of each face's own box (ties: lowest face). Faces that are never active have leaves too.
+    """
+    n = len(mesh.face_vertex)
+    points = [[mesh.vertex_pos[v] for v in face] for face in mesh.face_vertex]
+    lower = [[min(p[k] for p in face) for k in range(3)] for face in points]
+    upper = [[max(p[k] for p in face) for k in range(3)] for face in points]
+    tree = ABTree(mesh, mesh.lod_max, leaf=[None] * n, centre=mesh.centre())
+
+    def subdivide(faces, number, parent):
+        node = Node(number, parent)
+        if len(faces) == 1:
+            node.index = faces[0]
+            tree.leaf[node.index] = node
+            return node
+        extent = [max(upper[f][k] for f in faces) - min(lower[f][k] for f in faces) for k in range(3)]
+        axis = extent.index(max(extent))
+        ordered = sorted(faces, key=lambda f: (lower[f][axis] + upper[f][axis], f))
+        depth = number.bit_length() - 1
+        i = number - (1 << depth)
+        half = ((2 * i + 1) * n >> depth + 1) - (i * n >> depth)
+        node.left = subdivide(ordered[:half], 2 * number, node)
+        node.right = subdivide(ordered[half:], 2 * number + 1, node)
+        return node
+
+    tree.root = subdivide(list(range(n)), 1, None)
+    rebuild(tree, mesh.lod_max if lod is None else lod)
+    return tree
+
+
+def rebuild(tree, lod):
+    """Set every node for a lod from nothing: the state that any ACTIVE-UPDATE must arrive at, bit for bit."""
+    tree.lod = lod
+
+    def visit(node):
+        if not node.is_leaf:
+            visit(node.left)
+            visit(node.right)
+            alive = node.left.status == ACTIVE or node.right.status == ACTIVE
+        else:
+            alive = tree.mesh.is_active(node.index, lod)
+        if alive:
+            active_refit(tree, node)
+        else:
+            node.deactivate()
+
+    visit(tree.root)
+
+
+def active_mark(inserted, removed, deformed, tree):
+    """ACTIVE-MARK(I, R, D, T): mark bottom-up what a refinement touches; returns the subtree Ts as a set of nodes.
+
+    Erratum (a). Algorithm 2 as printed climbs from a removed leaf x only while the sibling is active, and writes
+    nothing on the way: a leaf with an active sibling keeps its status and box, and so do its ancestors. At the first
+    inactive sibling it sets x, but not its parent, to inactive and returns from the whole operation (lines 6 and 10),
+    so that the rest of R and all of D and I are never marked. The text says what is meant: a node is inactive iff no
+    active primitive lies under it, and every box is the smallest. So a removed leaf becomes inactive, and with it each
+    ancestor whose other child is inactive too; from the first ancestor that keeps an active child upwards, boxes may
+    shrink, and the nodes are deformed. R goes before D and I, which revive what R had emptied.
+    """
+    marked = set()
+    for face in removed:
+        x = tree.leaf[face]
+        x.deactivate()
+        marked.add(x)
+        while x.parent is not None:
+            x = x.parent
+            if x.left.status == INACTIVE and x.right.status == INACTIVE:
+                x.deactivate()
+            else:
+                x.status = DEFORMED
+            marked.add(x)
+    for face in deformed + inserted:
+        x = tree.leaf[face]
+        while x is not None:
+            x.status = DEFORMED
+            marked.add(x)
+            x = x.parent
+    return marked
+
+
+def active_refit(tree, node):
+    """ACTIVE-REFIT(x): the smallest box, status active, and the skip link.
+
+    A leaf's float32 box is about the model's centre and strictly encloses the float64 differences. Inside, minima and
+    maxima are exact, so the box does not depend on the order of the updates.
+    """
+    if node.is_leaf:
+        corners = [tree.mesh.vertex_pos[v] for v in tree.mesh.corners(node.index, tree.lod)]
+        moved = [[p[k] - tree.centre[k] for k in range(3)] for p in corners]
+        lower = tuple(round_down(min(p[k] for p in moved)) for k in range(3))
+        upper = tuple(round_up(max(p[k] for p in moved)) for k in range(3))
+        node.range, node.skip = (lower, upper), node
+    else:
+        children = [c for c in (node.left, node.right) if c.status == ACTIVE]
+        lower = tuple(min(c.range[0][k] for c in children) for k in range(3))
+        upper = tuple(max(c.range[1][k] for c in children) for k in range(3))
+        node.range = (lower, upper)
+        node.skip = node if len(children) == 2 else children[0].skip
+    node.status = ACTIVE
+
+
+def active_walk(tree, node):
+    """ACTIVE-WALK(x): refit the deformed nodes in post-order, so that children are final before their parent."""
+    if node is not None and node.status == DEFORMED:
+        active_walk(tree, node.left)
+        active_walk(tree, node.right)
+        active_refit(tree, node)
+
+
+def active_update(inserted, removed, deformed, tree):
+    """ACTIVE-UPDATE(I, R, D, T): mark, then walk from the root. The mesh already stands at its new lod (tree.lod)."""
+    marked = active_mark(inserted, removed, deformed, tree)
+    active_walk(tree, tree.root)
+    return Update(len(inserted) + len(removed) + len(deformed), len(marked))
+
+
+def set_lod(tree, lod):
+    """Refine or coarsen the mesh under a tree, and update the tree."""
+    sets = tree.mesh.sets_between(tree.lod, lod)
+    tree.lod = lod
+    return active_update(*sets, tree)
+
+
+def active_intersect(tree_a, tree_b, overlap, primitive_test):
+    """ACTIVE-INTERSECT(T, T'): all intersecting pairs of active primitives.
+
+    The paper leaves open which node of a pair to open: here the one nearer to its root.
+
+    Args:
+        overlap: overlap(range_a, range_b) -> bool, ranges as (lower, upper) about the respective model's centre; it
+            places the boxes, and may only answer False where they are apart.
+        primitive_test: primitive_test(face_a, face_b) -> bool.
+    """
+    hits = []
+
+    def visit(x, y):
+        if x.status != ACTIVE or y.status != ACTIVE or not overlap(x.range, y.range):
+            return
+        if x.is_leaf and y.is_leaf:
+            if primitive_test(x.index, y.index):
+                hits.append((x.index, y.index))
+        elif y.is_leaf or (not x.is_leaf and x.number <= y.number):
+            visit(x.left, y)
+            visit(x.right, y)
+        else:
+            visit(x, y.left)
+            visit(x, y.right)
+
+    visit(tree_a.root, tree_b.root)
+    return sorted(hits)

@@ -1,0 +1,22 @@
+"""Batched mesh-mesh interference queries at any level of detail, on NVIDIA Warp."""
+
+from warp_abtree.intersect import CapacityError, Query, Result, sweep
+from warp_abtree.mesh import MeshError
+from warp_abtree.model import Model, ModelError
+from warp_abtree.refine import UpdateStats
+from warp_abtree.scene import Scene, TreeState
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "MeshError",
+    "Model",
+    "ModelError",
+    "CapacityError",
+    "Query",
+    "Result",
+    "Scene",
+    "TreeState",
+    "UpdateStats",
+    "sweep",
+]

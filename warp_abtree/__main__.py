@@ -1,0 +1,8 @@
+"""Run the command line: ``python -m warp_abtree``."""
+
+import sys
+
+from warp_abtree.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

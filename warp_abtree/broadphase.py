@@ -1,0 +1,87 @@
+"""Candidate object pairs from posed root boxes; worlds never mix, static objects never pair with static ones."""
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels import broadphase
+from warp_abtree.state import ModelArrays, ObjectArrays, StateArrays
+
+EVERY_WORLD = -1
+
+
+class BroadPhase:
+    """Broad phase of a fixed set of objects: allocates once, launches many times.
+
+    Attributes:
+        pairs: (i, j), i < j, in no order, device vec2i (capacity,).
+        pair_count: Pairs found, device int32 (1,); keeps counting past the capacity.
+    """
+
+    def __init__(self, models: ModelArrays, states: StateArrays, objects: ObjectArrays, excluded, capacity=None):
+        self.models = models
+        self.states = states
+        self.objects = objects
+        self.device = device = states.device
+        count = objects.pool.state.shape[0]
+        worlds = objects.pool.world.numpy()
+        names, group = np.unique(worlds, return_inverse=True)
+        everywhere = np.flatnonzero(names == EVERY_WORLD)
+        self.shared_group = int(everywhere[0]) if len(everywhere) else -1
+        self.lower = wp.zeros(count, dtype=wp.vec3, device=device)
+        self.upper = wp.zeros(count, dtype=wp.vec3, device=device)
+        self.group = wp.array(group.astype(np.int32), dtype=wp.int32, device=device)
+        self.excluded = wp.array(excluded, dtype=wp.int64, device=device)
+        self.pair_count = wp.zeros(1, dtype=wp.int32, device=device)
+        self.bvh = None
+        self.resize(capacity or max(64, 4 * count))
+
+    def resize(self, capacity: int):
+        """Make room for a number of pairs."""
+        self.pairs = wp.empty(capacity, dtype=wp.vec2i, device=self.device)
+
+    def launch(self):
+        """Box, build and query; launches only (on CUDA the second time on, so that a graph can capture it)."""
+        wp.launch(
+            broadphase.pose_box_kernel,
+            dim=len(self.lower),
+            inputs=[self.models.pool, self.states.pool, self.objects.pool, self.lower, self.upper],
+            device=self.device,
+        )
+        if self.bvh is None:
+            self.bvh = wp.Bvh(self.lower, self.upper, groups=self.group)
+        else:
+            self.bvh.rebuild()
+        self.pair_count.zero_()
+        wp.launch(
+            broadphase.find_pair_kernel,
+            dim=len(self.lower),
+            inputs=[
+                self.shared_group,
+                self.bvh.id,
+                self.lower,
+                self.upper,
+                self.group,
+                self.excluded,
+                self.objects.pool,
+                self.pair_count,
+                self.pairs,
+            ],
+            device=self.device,
+        )
+
+    def find(self) -> np.ndarray:
+        """Return all pairs, int32 (p, 2), sorted, i < j. Waits for the device; buffers grow as needed."""
+        self.launch()
+        found = int(self.pair_count.numpy()[0])
+        if found > len(self.pairs):
+            self.resize(found)
+            self.launch()
+            found = int(self.pair_count.numpy()[0])
+        pairs = self.pairs.numpy()[:found].reshape(-1, 2)
+        return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+
+
+def exclusion_keys(pairs: np.ndarray) -> np.ndarray:
+    """Return sorted unique keys i * 2^32 + j, i < j, of pairs (p, 2) in either order, int64."""
+    pairs = np.sort(np.asarray(pairs, np.int64).reshape(-1, 2), axis=1)
+    return np.unique((pairs[:, 0] << 32) + pairs[:, 1])

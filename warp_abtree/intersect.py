@@ -1,0 +1,189 @@
+"""ACTIVE-INTERSECT for a batch: `Query`, its results, and `sweep`."""
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.broadphase import BroadPhase
+from warp_abtree.kernels import pose, traverse
+
+OUTPUTS = {"any": traverse.OUTPUT_ANY, "count": traverse.OUTPUT_COUNT, "faces": traverse.OUTPUT_FACES}
+PRECISIONS = ("exact", "float64", "float32")
+BLOCK_DIM = 128
+
+
+class CapacityError(RuntimeError):
+    """A buffer was too small and work was lost; the message names the demand."""
+
+
+def check_request(output: str, precision: str, within=None):
+    """Check what is asked of a query.
+
+    Raises:
+        ValueError: An unknown output or precision.
+        NotImplementedError: One that has a name but no code yet.
+    """
+    if output not in (*OUTPUTS, "contacts"):
+        raise ValueError(f"output {output!r} is none of 'any', 'count', 'faces', 'contacts'")
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision {precision!r} is none of 'exact', 'float64', 'float32'")
+    if output == "contacts":
+        raise NotImplementedError("output='contacts' is not built yet; ask for 'faces'")
+    if precision != "float64":
+        raise NotImplementedError(f"precision={precision!r} is not built yet; 'float64' is what runs today")
+    if within is not None:
+        raise NotImplementedError("within= is not built yet; queries answer intersection only")
+
+
+class Result:
+    """What a query found, on the host.
+
+    Attributes:
+        pairs: Object pairs asked, int32 (p, 2).
+        any: Whether each pair intersects, bool (p,).
+        count: Intersecting face pairs of each, int32 (p,); None for output "any".
+        faces: (pair, face of the pair's first object, face of its second), int32 (k, 3), sorted; None unless output is "faces".
+        node_tests, triangle_tests: Work done for each pair, int32 (p,).
+    """
+
+    def __init__(self, pairs, output, pair_demand, pair_room, hit_demand, hit_room, hits):
+        self.pairs = pairs
+        self._pair_demand, self._pair_room = pair_demand, pair_room
+        self._hit_demand, self._hit_room = hit_demand, hit_room
+        p = len(pairs)
+        self.any = hits.any_hit.numpy()[:p] != 0
+        self.node_tests = hits.node_tests.numpy()[:p]
+        self.triangle_tests = hits.triangle_tests.numpy()[:p]
+        self.count = hits.count.numpy()[:p] if output != "any" else None
+        self.faces = None
+        if output == "faces":
+            faces = hits.face.numpy()[: min(hit_demand, hit_room)].reshape(-1, 3)
+            self.faces = faces[np.lexsort((faces[:, 2], faces[:, 1], faces[:, 0]))]
+
+    def check(self):
+        """Raise where anything was lost.
+
+        Raises:
+            CapacityError: A buffer overflowed; the message names the demand.
+        """
+        if self._pair_demand > self._pair_room:
+            raise CapacityError(
+                f"the broad phase found {self._pair_demand} pairs, the query has room for {self._pair_room}"
+            )
+        if self._hit_demand > self._hit_room:
+            raise CapacityError(
+                f"{self._hit_demand} face pairs intersect, the query has room for {self._hit_room}: capacity={self._hit_demand}"
+            )
+
+
+class Query:
+    """Intersection of many object pairs as an operator: allocates once, launches many times.
+
+    `launch()` only launches, so a CUDA graph can capture it (after one launch outside the capture, which builds the broad
+    phase's tree). A change of the scene's objects, or a change of LODs that grows its pool of states, asks for a new query.
+
+    Args:
+        scene: `Scene` whose poses and LODs hold at the time of each launch.
+        output: "any", "count" or "faces".
+        pairs: Object pairs to ask, (p, 2); None runs the broad phase in every launch.
+        capacity: Face pairs that `faces` has room for.
+        pair_capacity: Pairs that the broad phase has room for.
+        precision: Arithmetic of the triangle test.
+
+    Attributes:
+        hits: Device arrays of the last launch (`kernels.traverse.Hits`), faces in no order.
+        pairs, pair_count: The pairs asked, device vec2i and int32 (1,).
+    """
+
+    def __init__(
+        self, scene, output="faces", pairs=None, capacity=None, pair_capacity=None, precision="float64", within=None
+    ):
+        check_request(output, precision, within)
+        for name, value in (("capacity", capacity), ("pair_capacity", pair_capacity)):
+            if value is not None and not 0 < int(value) < 2**31:
+                raise ValueError(f"{name} is {value}, not within 1 .. 2^31 - 1")
+        self.scene = scene
+        self.output = output
+        self.arrays = scene.arrays()
+        self.device = scene.device
+        self.broad_phase = None
+        if pairs is None:
+            self.broad_phase = BroadPhase(*self.arrays, scene.excluded_keys(), pair_capacity)
+            self.pairs, self.pair_count = self.broad_phase.pairs, self.broad_phase.pair_count
+        else:
+            pairs = scene.check_pairs(pairs)
+            self.pairs = wp.array(pairs, dtype=wp.vec2i, device=self.device)
+            self.pair_count = wp.array([len(pairs)], dtype=wp.int32, device=self.device)
+        room = len(self.pairs)
+        self.pair_poses = wp.empty(room, dtype=pose.PairPose, device=self.device)
+        self.hits = traverse.Hits()
+        for name in ("any_hit", "count", "node_tests", "triangle_tests"):
+            setattr(self.hits, name, wp.zeros(room, dtype=wp.int32, device=self.device))
+        self.hits.total = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self.resize((capacity or max(1024, 16 * room)) if output == "faces" else 0)
+
+    def resize(self, capacity: int):
+        """Make room for a number of intersecting face pairs."""
+        self.hits.face = wp.empty(capacity, dtype=wp.vec3i, device=self.device)
+
+    def launch(self):
+        """Run broad phase (unless pairs were given) and narrow phase. Launches only.
+
+        Raises:
+            RuntimeError: The scene's objects changed since the query was made.
+        """
+        if self.arrays != self.scene.arrays():
+            raise RuntimeError("objects were added to the scene since this query was made; make a new one")
+        if self.broad_phase is not None:
+            self.broad_phase.launch()
+        self.traverse()
+
+    def traverse(self):
+        """Run the narrow phase over the pairs in place. Launches only."""
+        models, states, objects = (arrays.pool for arrays in self.arrays)
+        room = len(self.pairs)
+        if room == 0:
+            return
+        for array in (self.hits.any_hit, self.hits.count, self.hits.total, self.hits.node_tests, self.hits.triangle_tests):
+            array.zero_()
+        wp.launch(
+            pose.relate_pair_kernel,
+            dim=room,
+            inputs=[models, states, objects, self.pair_count, self.pairs, self.pair_poses],
+            device=self.device,
+        )
+        output = int(OUTPUTS[self.output])
+        inputs = [output, models, states, objects, self.pair_count, self.pairs, self.pair_poses, self.hits]
+        if self.device.is_cuda:
+            wp.launch_tiled(
+                traverse.traverse_block_kernel, dim=[room], inputs=inputs, block_dim=BLOCK_DIM, device=self.device
+            )
+        else:
+            wp.launch(traverse.traverse_thread_kernel, dim=room, inputs=inputs, device=self.device)
+
+    def result(self) -> Result:
+        """Return the results of the last launch on the host, sorted. Waits for the device."""
+        found = int(self.pair_count.numpy()[0])
+        pairs = self.pairs.numpy()[: min(found, len(self.pairs))].reshape(-1, 2)
+        total = int(self.hits.total.numpy()[0])
+        return Result(pairs, self.output, found, len(self.pairs), total, len(self.hits.face), self.hits)
+
+    def run(self) -> Result:
+        """Launch, grow the buffer of face pairs if it was too small, and return the whole result. Waits for the device."""
+        self.launch()
+        total = int(self.hits.total.numpy()[0])
+        if self.output == "faces" and total > len(self.hits.face):
+            self.resize(total)
+            self.traverse()
+        result = self.result()
+        result.check()
+        return result
+
+
+def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precision="float64", device=None):
+    """Test one pair of models at many poses of B in A's frame, no objects made.
+
+    Raises:
+        NotImplementedError: Always, until the throughput work; `Scene.intersect` answers the same question.
+    """
+    check_request(output, precision)
+    raise NotImplementedError("sweep is not built yet; add one object a pose to a Scene and call intersect")

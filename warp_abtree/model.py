@@ -1,0 +1,215 @@
+"""Model: a mesh with its progressive mesh and its AB-Tree, saved and opened as .npz."""
+
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from warp_abtree.mesh import Mesh, load_mesh, mesh_from_arrays
+from warp_abtree.progressive import ProgressiveMesh, build_progressive
+from warp_abtree.tree import Tree, active_build
+
+FORMAT_NAME = "warp_abtree model"
+FORMAT_VERSION = 1
+
+_ARRAYS = {
+    "vertex_parent": (np.int32, 1),
+    "vertex_pos": (np.float64, 2),
+    "face_vertex": (np.int32, 2),
+    "face_split": (np.int32, 1),
+    "split_start": (None, 1),
+    "split_face": (np.int32, 1),
+    "lod_error": (np.float64, 1),
+}
+
+
+class ModelError(ValueError):
+    """A model file that is not one, or not whole."""
+
+
+class Model:
+    """A mesh at every level of detail, and the tree over it.
+
+    LOD counts vertex splits from the base mesh: 0 is the base, `lod_max` the original. Face ids are the face's index in the
+    file at every LOD.
+
+    Attributes:
+        name: Where the mesh came from.
+        progressive: `ProgressiveMesh`.
+        tree: `Tree`.
+        dropped_faces: Faces that welding left without three distinct corners, int32; never active.
+        centre: Middle of the box of the original vertices [model units], float64 (3,); boxes are kept about it.
+    """
+
+    def __init__(self, progressive: ProgressiveMesh, tree: Tree, name: str):
+        self.progressive = progressive
+        self.tree = tree
+        self.name = name
+        self.dropped_faces = np.flatnonzero(progressive.face_split > progressive.lod_max).astype(np.int32)
+        original = progressive.vertex_pos[: progressive.vertex_count]
+        self.centre = 0.5 * original.min(0) + 0.5 * original.max(0)
+
+    @classmethod
+    def load(cls, source, base_faces: int = 10, progress=None) -> "Model":
+        """Load a mesh and build its progressive mesh and AB-Tree.
+
+        Args:
+            source: Path of anything trimesh reads (also gzipped), trimesh.Trimesh or Scene, "warp:bunny", "warp:bear",
+                "warp:rocks", or a `Mesh`.
+            base_faces: Faces at which the collapse sequence stops.
+            progress: Called as progress(stage, done, total) during long builds.
+
+        Raises:
+            MeshError: The mesh is missing, unreadable, empty or invalid.
+            ValueError: base_faces is below 1.
+        """
+        mesh = source if isinstance(source, Mesh) else load_mesh(source)
+        progressive = build_progressive(mesh, base_faces=base_faces, progress=progress)
+        return cls(progressive, active_build(mesh.vertices, mesh.faces), mesh.name)
+
+    @classmethod
+    def from_arrays(cls, vertices, faces, base_faces: int = 10, progress=None, name: str = "arrays") -> "Model":
+        """Build a model from vertices (v, 3) and faces (n, 3); see `load`."""
+        return cls.load(mesh_from_arrays(vertices, faces, name=name), base_faces, progress)
+
+    @property
+    def face_count(self) -> int:
+        """Faces of the original mesh, dropped ones included."""
+        return self.progressive.face_count
+
+    @property
+    def vertex_count(self) -> int:
+        """Vertices of the original mesh after welding."""
+        return self.progressive.vertex_count
+
+    @property
+    def lod_max(self) -> int:
+        """The finest LOD, the original mesh."""
+        return self.progressive.lod_max
+
+    def check_lod(self, lod) -> int:
+        """Return a LOD as int.
+
+        Raises:
+            ValueError: It is no whole number from 0 to lod_max.
+        """
+        if isinstance(lod, (bool, np.bool_)) or not isinstance(lod, (int, np.integer)):
+            if not (isinstance(lod, (float, np.floating)) and float(lod).is_integer()):
+                raise ValueError(f"model {self.name!r}: LOD {lod!r} is not a whole number")
+        if not 0 <= lod <= self.lod_max:
+            raise ValueError(f"model {self.name!r}: LOD {lod} is outside 0 .. {self.lod_max}")
+        return int(lod)
+
+    def mesh_at(self, lod):
+        """Return the mesh at a LOD: vertices float64 (v, 3), faces int32 (f, 3), face_ids int32 (f,)."""
+        return self.progressive.mesh_at(self.check_lod(lod))
+
+    def error_at(self, lod) -> float:
+        """Return a certified bound [model units] on the distance of any original surface point to the surface at a LOD."""
+        return float(self.progressive.lod_error[self.check_lod(lod)])
+
+    def lod_for(self, fraction: float | None = None, tolerance: float | None = None) -> int:
+        """Return the LOD nearest to a share of the faces, or the coarsest whose certified error is within a tolerance.
+
+        Args:
+            fraction: Share of face_count, in (0, 1].
+            tolerance: Largest error [model units], at least 0.
+
+        Raises:
+            ValueError: Not exactly one of the two is given, or it is out of range.
+        """
+        return self.progressive.lod_for(fraction=fraction, tolerance=tolerance)
+
+    def save(self, path):
+        """Write the model to an .npz file; the file appears whole or not at all."""
+        path = Path(path)
+        partial = path.with_name(path.name + ".partial")
+        arrays = {name: getattr(self.progressive, name) for name in _ARRAYS}
+        try:
+            with open(partial, "wb") as file:
+                np.savez_compressed(
+                    file,
+                    format=np.array(FORMAT_NAME),
+                    version=np.array(FORMAT_VERSION),
+                    name=np.array(self.name),
+                    leaf_node=self.tree.leaf_node,
+                    **arrays,
+                )
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+    @classmethod
+    def open(cls, path) -> "Model":
+        """Read a model that `save` wrote, and check it whole.
+
+        Raises:
+            ModelError: The file is missing, no such file, truncated, altered in a way that breaks it, or of another version.
+        """
+        path = Path(path)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                if not hasattr(file, "files") or "format" not in file.files:
+                    raise ModelError(f"{path}: not a warp_abtree model file")
+                if str(file["format"]) != FORMAT_NAME:
+                    raise ModelError(f"{path}: not a warp_abtree model file")
+                if file["version"].shape != () or int(file["version"]) != FORMAT_VERSION:
+                    raise ModelError(
+                        f"{path}: format version {file['version']}, this library reads {FORMAT_VERSION}; build it again"
+                    )
+                missing = [name for name in (*_ARRAYS, "leaf_node", "name") if name not in file.files]
+                if missing:
+                    raise ModelError(f"{path}: lacks the array {missing[0]!r}")
+                arrays = {name: file[name] for name in _ARRAYS}
+                leaf_node, name = file["leaf_node"], str(file["name"])
+        except ModelError:
+            raise
+        except FileNotFoundError:
+            raise ModelError(f"{path}: no such file") from None
+        except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+            raise ModelError(f"{path}: cannot be read as a model file ({error})") from None
+        except Exception as error:  # zlib.error and struct.error of a damaged archive
+            raise ModelError(f"{path}: damaged ({type(error).__name__}: {error})") from None
+        return _assemble(path, arrays, leaf_node, name)
+
+
+def _assemble(path, arrays, leaf_node, name) -> Model:
+    """Check every array of a model file against the others and build the model."""
+
+    def require(truth, what):
+        if not truth:
+            raise ModelError(f"{path}: {what}")
+
+    for key, (dtype, ndim) in _ARRAYS.items():
+        value = arrays[key]
+        integral = value.dtype.kind == "i" if dtype is None else value.dtype == dtype
+        require(integral and value.ndim == ndim, f"array {key!r} has type {value.dtype} and shape {value.shape}")
+    parent, pos = arrays["vertex_parent"], arrays["vertex_pos"]
+    faces, split = arrays["face_vertex"], arrays["face_split"]
+    start, error = arrays["split_start"], arrays["lod_error"]
+    m = len(error) - 1
+    n_v = len(parent) - m
+    n_f = len(faces)
+    require(m >= 0 and n_v > 0 and n_f > 0, "empty arrays")
+    require(pos.shape == (n_v + m, 3) and np.isfinite(pos).all(), "'vertex_pos' has the wrong length or is not finite")
+    require(faces.shape == (n_f, 3) and faces.min() >= 0 and faces.max() < n_v, "'face_vertex' is out of range")
+    nodes = np.arange(n_v + m)
+    above = (parent > nodes) & (parent >= n_v) & (parent < n_v + m)
+    require(((parent == -1) | above).all(), "'vertex_parent' is no forest")
+    require(split.shape == (n_f,) and split.min() >= 0 and split.max() <= m + 1, "'face_split' is out of range")
+    slices = arrays["split_face"]
+    require(
+        len(start) == m + 1 and start[0] == 0 and (np.diff(start) >= 0).all() and start[-1] == len(slices),
+        "'split_start' does not fit 'split_face'",
+    )
+    require(len(slices) == 0 or (slices.min() >= 0 and slices.max() < n_f), "'split_face' is out of range")
+    require(
+        np.isfinite(error).all() and error[-1] == 0 and (np.diff(error) <= 0).all(),
+        "'lod_error' is not finite, falling and 0 at the end",
+    )
+    progressive = ProgressiveMesh(**arrays)
+    tree = active_build(pos[:n_v], faces)
+    require(np.array_equal(tree.leaf_node, leaf_node), "'leaf_node' is not the tree of these faces")
+    require((split <= m).any(), "no face is ever active")
+    return Model(progressive, tree, name)

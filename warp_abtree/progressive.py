@@ -1,0 +1,280 @@
+"""The progressive mesh: a collapse sequence, the vertex forest it makes, and a certified error for every LOD."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels import collapse, deviation, forest
+
+MERGES_PER_LAUNCH = 25_000
+REPLAYS_PER_LAUNCH = 5_000
+NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
+
+
+@dataclass(frozen=True)
+class ProgressiveMesh:
+    """A mesh at every level of detail; `lod` counts vertex splits, 0 at the base and m at the original.
+
+    Nodes 0..n_v-1 of the forest are the original vertices, node n_v+j is made by merge j; at `lod` the merges
+    0..m-lod-1 are applied, and split i undoes merge m-1-i.
+
+    Attributes:
+        vertex_parent: Node that each node merges into, -1 at a root, shape [n_v+m].
+        vertex_pos: Positions [model units], shape [n_v+m, 3]; the first n_v are the original's, to the bit.
+        face_vertex: Original faces, shape [n_f, 3].
+        face_split: Face f is active iff lod >= face_split[f]; m+1 for faces without three distinct corners; shape [n_f].
+        split_start: Where each split's slice of `split_face` begins, shape [m+1].
+        split_face: Slice i lists, ascending, every face that split i inserts or deforms.
+        lod_error: Certified bound [model units] on the distance of any point of the original surface from the
+            surface at each LOD, shape [m+1]; falls with lod, 0 at m.
+    """
+
+    vertex_parent: np.ndarray
+    vertex_pos: np.ndarray
+    face_vertex: np.ndarray
+    face_split: np.ndarray
+    split_start: np.ndarray
+    split_face: np.ndarray
+    lod_error: np.ndarray
+
+    @property
+    def lod_max(self):
+        """Return m, the LOD of the original mesh."""
+        return len(self.split_start) - 1
+
+    @property
+    def vertex_count(self):
+        """Return n_v, the number of original vertices."""
+        return len(self.vertex_parent) - self.lod_max
+
+    @property
+    def face_count(self):
+        """Return n_f, the number of original faces, dropped ones included."""
+        return len(self.face_vertex)
+
+    @cached_property
+    def _active_counts(self):
+        return np.cumsum(np.bincount(self.face_split, minlength=self.lod_max + 2)[: self.lod_max + 1])
+
+    def active_count(self, lod):
+        """Count the active faces at a LOD, or at each of an array of LODs; raise ValueError outside 0..m."""
+        lods = np.asarray(lod)
+        if not np.issubdtype(lods.dtype, np.integer):
+            raise ValueError(f"lod must be an integer, got {lod!r}")
+        if np.any(lods < 0) or np.any(lods > self.lod_max):
+            raise ValueError(f"lod must lie in 0..{self.lod_max}, got {lod}")
+        counts = self._active_counts[lods]
+        return int(counts) if lods.ndim == 0 else counts
+
+    def active_vertices(self, lod):
+        """Return the active ancestor of every original vertex at a LOD, int32 [n_v]; raise ValueError outside 0..m."""
+        self.active_count(lod)
+        limit = self.vertex_count + self.lod_max - int(lod)
+        node = np.arange(limit, dtype=np.int32)
+        parent = self.vertex_parent[:limit]
+        inner = (parent >= 0) & (parent < limit)
+        node[inner] = parent[inner]
+        # pointer doubling: the forest's depth in its logarithm of rounds
+        while True:
+            above = node[node]
+            if np.array_equal(above, node):
+                return node[: self.vertex_count].copy()
+            node = above
+
+    def mesh_at(self, lod):
+        """Return the surface at a LOD: vertices float64 [v, 3] (used ones only), faces int32 [f, 3], face ids int32 [f].
+
+        Faces are in the order of the original file, their ids are indices of original faces; at m the vertices are the
+        original ones in their order. Raises ValueError outside 0..m.
+        """
+        active = self.active_vertices(lod)
+        face_ids = np.flatnonzero(self.face_split <= lod).astype(np.int32)
+        corners = active[self.face_vertex[face_ids]]
+        if lod == self.lod_max:
+            return self.vertex_pos[: self.vertex_count].copy(), corners, face_ids
+        used, faces = np.unique(corners, return_inverse=True)
+        return self.vertex_pos[used], faces.reshape(-1, 3).astype(np.int32), face_ids
+
+    def lod_for(self, fraction=None, tolerance=None):
+        """Return the LOD for exactly one of two wishes.
+
+        Args:
+            fraction: Part of `face_count` in (0, 1]; the LOD whose active count is nearest, the finer of equals.
+            tolerance: Largest error [model units], >= 0; the coarsest LOD whose `lod_error` is within it.
+        Raises ValueError for any other value, or unless one wish is given.
+        """
+        if (fraction is None) == (tolerance is None):
+            raise ValueError("lod_for takes exactly one of fraction= and tolerance=")
+        if tolerance is not None:
+            if not tolerance >= 0:
+                raise ValueError(f"tolerance must be >= 0, got {tolerance}")
+            return int(np.argmax(self.lod_error <= tolerance))
+        if not 0 < fraction <= 1:
+            raise ValueError(f"fraction must lie in (0, 1], got {fraction}")
+        miss = np.abs(self._active_counts - fraction * self.face_count)
+        return int(self.lod_max - np.argmin(miss[::-1]))
+
+
+def build_progressive(mesh, base_faces=10, link_condition=False, progress=None):
+    """Collapse a mesh to a base of about `base_faces` faces and certify the error of every LOD on the way.
+
+    The sequence for a larger base is a prefix of that for a smaller one, and does not depend on the mesh's scale by
+    powers of two. It stops early only where every further merge would kill the last face.
+
+    Args:
+        mesh: Anything with `vertices` float64 [v, 3], `faces` int32 [n_f, 3].
+        base_faces: Stop when no more faces than this are left, >= 1.
+        link_condition: Put merges that break the link condition after all others.
+        progress: Called as progress(stage, done, total) between launches; stages "collapse" and "error".
+    Raises ValueError for empty, non-finite or oversized meshes, bad indices, base_faces < 1, or if no face has three
+    distinct corners.
+    Source: Garland and Heckbert 1997 (collapse); DESIGN.md section 4 (error).
+    """
+    vertices, faces = _checked(mesh, base_faces)
+    report = progress if progress is not None else lambda stage, done, total: None
+    centre, scale = _frame(vertices)
+    parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), bool(link_condition), report)
+    vertex_pos = np.concatenate([vertices, centre + scale * pos[len(vertices) :]])
+    face_split, split_start, split_face = _splits(parent, faces, len(vertices))
+    replay = deviation_of(vertex_pos, parent, faces, face_split, split_start, split_face, report)
+    return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, replay)
+
+
+def _checked(mesh, base_faces):
+    if int(base_faces) != base_faces or base_faces < 1:
+        raise ValueError(f"base_faces must be an integer >= 1, got {base_faces}")
+    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise ValueError(f"vertices and faces must be [n, 3], got {vertices.shape} and {faces.shape}")
+    if len(faces) == 0 or len(vertices) == 0:
+        raise ValueError("the mesh is empty")
+    if 2 * len(vertices) >= NODE_LIMIT or 3 * len(faces) >= 2**31:
+        raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
+    if not np.isfinite(vertices).all():
+        raise ValueError("a vertex is not finite")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"faces index vertices {faces.min()}..{faces.max()} of {len(vertices)}")
+    if not _distinct(faces).any():
+        raise ValueError("no face has three distinct corners")
+    return vertices, faces
+
+
+def _distinct(faces):
+    return (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+
+
+def _frame(vertices):
+    """Return the centre and a power of two that bounds the extent, so that scaling back and forth rounds nothing."""
+    lower, upper = vertices.min(axis=0), vertices.max(axis=0)
+    extent = float(np.max(upper / 2 - lower / 2))
+    exponent = np.frexp(extent)[1] + 1 if extent > 0 else 0
+    return lower / 2 + upper / 2, float(np.ldexp(1.0, int(np.clip(exponent, -1000, 1000))))
+
+
+def _edges(faces):
+    """Return the packed edges of the faces with three corners, ascending, and which corners start a boundary edge."""
+    valid = _distinct(faces)
+    start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
+    pair = (np.minimum(start, end) << 32) | (np.maximum(start, end) << 2)
+    slot = np.flatnonzero(np.repeat(valid, 3))
+    pair = pair.reshape(-1)[slot]
+    order = np.argsort(pair)
+    pair = pair[order]
+    first = np.flatnonzero(np.concatenate([[True], pair[1:] != pair[:-1]]))
+    single = np.diff(np.append(first, len(pair))) == 1
+    boundary = np.zeros(faces.size, dtype=np.int8)
+    boundary[slot[order[first[single]]]] = 1
+    return pair[first], boundary.reshape(faces.shape)
+
+
+def _cpu(values, dtype):
+    return wp.array(values, dtype=dtype, device="cpu")
+
+
+def _filled(count, value, dtype=int):
+    return wp.full(count, value, dtype=dtype, device="cpu")
+
+
+def linked_rings(faces, face_array, node_capacity):
+    """Return `forest.Rings` of the original mesh with room for `node_capacity` nodes."""
+    rings = forest.Rings()
+    rings.head = _filled(node_capacity, -1)
+    rings.degree = _filled(node_capacity, 0)
+    rings.next = _filled(3 * len(faces), -1)
+    rings.corner_node = _filled(3 * len(faces), -1)
+    wp.launch(forest.link_rings_kernel, dim=1, inputs=[len(faces), face_array, rings], device="cpu")
+    return rings
+
+
+def _collapse(pos, faces, base_faces, link_condition, report):
+    """Run the collapse; return vertex_parent int32 [n_v+m] and all normalised positions float64 [n_v+m, 3]."""
+    vertex_count, capacity = len(pos), 2 * len(pos)
+    edges, boundary = _edges(faces)
+    face_array = _cpu(faces, int)
+    surface = collapse.Surface()
+    surface.pos = _cpu(np.concatenate([pos, np.zeros_like(pos)]), wp.vec3d)
+    surface.quadric = wp.zeros(capacity, dtype=collapse.Quadric, device="cpu")
+    surface.parent = _filled(capacity, -1)
+    surface.stamp = _filled(capacity, -1)
+    rings = linked_rings(faces, face_array, capacity)
+    wp.launch(
+        collapse.weigh_faces_kernel, dim=1, inputs=[len(faces), face_array, _cpu(boundary, wp.int8), surface], device="cpu"
+    )
+    heap = collapse.Heap()
+    size = len(edges)
+    heap.pair = _cpu(np.resize(edges, 2 * size + 256), wp.int64)
+    heap.key = wp.zeros(2 * size + 256, dtype=wp.float64, device="cpu")
+    wp.launch(collapse.price_edges_kernel, dim=1, inputs=[size, heap.pair, surface, heap.key], device="cpu")
+    start_live = int(_distinct(faces).sum())
+    counter = _cpu(np.array([size, 0, start_live, collapse.HEAP_FULL], dtype=np.int32), int)
+    state = counter.numpy()  # shares the memory
+    goal = max(start_live - base_faces, 1)
+    while state[3] != int(collapse.FINISHED):
+        if state[3] == int(collapse.HEAP_FULL):
+            heap = _roomier_heap(surface, heap, counter)
+        sizes = [vertex_count, base_faces, MERGES_PER_LAUNCH, len(heap.key), int(link_condition)]
+        wp.launch(
+            collapse.collapse_edges_kernel, dim=1, inputs=[*sizes, surface, rings, heap, counter], device="cpu"
+        )
+        report("collapse", min(start_live - int(state[2]), goal), goal)
+    nodes = vertex_count + int(state[1])
+    return surface.parent.numpy()[:nodes].copy(), surface.pos.numpy()[:nodes]
+
+
+def _roomier_heap(surface, heap, counter):
+    """Drop stale entries; where that leaves the heap more than half full, or a hub's edges want more, double it."""
+    before = int(counter.numpy()[0])
+    wp.launch(collapse.compact_heap_kernel, dim=1, inputs=[surface, heap, counter], device="cpu")
+    size, capacity = int(counter.numpy()[0]), len(heap.key)
+    if 2 * size <= capacity and 2 * before > capacity:
+        return heap
+    larger = collapse.Heap()
+    larger.key = wp.zeros(2 * capacity, dtype=wp.float64, device="cpu")
+    larger.pair = wp.zeros(2 * capacity, dtype=wp.int64, device="cpu")
+    wp.copy(larger.key, heap.key, count=size)
+    wp.copy(larger.pair, heap.pair, count=size)
+    return larger
+
+
+def _splits(parent, faces, vertex_count):
+    """Return face_split int32 [n_f], split_start int64 [m+1] and split_face int32 of a forest."""
+    node_count = len(parent)
+    merge_count = node_count - vertex_count
+    face_array, parent_array = _cpu(faces, int), _cpu(parent, int)
+    size = wp.zeros(merge_count + 1, dtype=wp.int64, device="cpu")
+    face_split = wp.zeros(len(faces), dtype=int, device="cpu")
+    inputs = [vertex_count, node_count, face_array, parent_array]
+    wp.launch(forest.count_events_kernel, dim=1, inputs=[*inputs, size, face_split], device="cpu")
+    split_start = np.concatenate([[0], np.cumsum(size.numpy()[:merge_count])]).astype(np.int64)
+    split_face = wp.zeros(int(split_start[-1]), dtype=int, device="cpu")
+    cursor = _cpu(split_start.copy(), wp.int64)
+    wp.launch(forest.fill_events_kernel, dim=1, inputs=[*inputs, cursor, split_face], device="cpu")
+    return face_split.numpy(), split_start, split_face.numpy()
+
+
+def deviation_of(vertex_pos, parent, faces, face_split, split_start, split_face, report):
+    m = len(split_start) - 1
+    return np.where(np.arange(m + 1) < m, np.inf, 0.0)

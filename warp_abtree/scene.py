@@ -1,0 +1,325 @@
+"""Scene: posed objects at levels of detail, and every question that one can ask of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.broadphase import EVERY_WORLD, BroadPhase, exclusion_keys
+from warp_abtree.intersect import Query, Result, check_request
+from warp_abtree.kernels import pose as pose_kernels
+from warp_abtree.model import Model
+from warp_abtree.refine import UpdateStats, set_object_lods
+from warp_abtree.state import ModelArrays, ObjectArrays, StateArrays
+
+QUATERNION_TOLERANCE = 1e-3
+RIGID_TOLERANCE = 1e-6
+
+
+def to_numpy(values) -> np.ndarray:
+    """Return an array of any of the frameworks, or a sequence, as NumPy."""
+    if hasattr(values, "numpy") and not isinstance(values, np.ndarray):
+        values = values.numpy()
+    return np.asarray(values)
+
+
+def check_poses(poses, what="poses") -> np.ndarray:
+    """Return poses as float64, (n, 7) or (n, 4, 4).
+
+    Raises:
+        ValueError: Another shape, a number that is not finite, a quaternion whose norm is off by more than 1e-3, a matrix that is
+            not rigid within 1e-6.
+    """
+    poses = to_numpy(poses)
+    if poses.dtype.kind not in "fiu":
+        raise ValueError(f"{what}: type {poses.dtype} holds no numbers")
+    if not (poses.ndim == 2 and poses.shape[1] == 7) and not (poses.ndim == 3 and poses.shape[1:] == (4, 4)):
+        raise ValueError(f"{what}: shape {poses.shape} is neither (n, 7) nor (n, 4, 4)")
+    poses = poses.astype(np.float64)
+    bad = ~np.isfinite(poses.reshape(len(poses), -1)).all(1)
+    if bad.any():
+        raise ValueError(f"{what}: pose {np.flatnonzero(bad)[0]} is not finite")
+    if poses.ndim == 2:
+        norm = np.sqrt((poses[:, 3:] ** 2).sum(1))
+        bad = ~(np.abs(norm - 1) <= QUATERNION_TOLERANCE)
+        if bad.any():
+            i = int(np.flatnonzero(bad)[0])
+            raise ValueError(f"{what}: pose {i} has a quaternion of norm {norm[i]:.6g}, off 1 by more than 1e-3")
+        return poses
+    rotation = poses[:, :3, :3]
+    gram = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max((1, 2))
+    bad = ~(gram <= RIGID_TOLERANCE) | ~(np.linalg.det(rotation) > 0)
+    bad |= np.abs(poses[:, 3] - [0, 0, 0, 1]).max(1) > 0
+    if bad.any():
+        raise ValueError(f"{what}: matrix {np.flatnonzero(bad)[0]} is not rigid within 1e-6")
+    return poses
+
+
+@dataclass(frozen=True)
+class TreeState:
+    """The AB-Tree of one object at its LOD, on the host.
+
+    Attributes:
+        lod: Where it stands.
+        status: 0 inactive, 1 active, per heap node (the root is 1), int32.
+        lower, upper: Boxes [model units], model frame, float64 (nodes, 3), rounded outwards; (+inf, -inf) where inactive.
+        skip: The node that a traversal visits in place of each, -1 where inactive, int32.
+        face_node: Leaf of each face, int32 (n_f,).
+    """
+
+    lod: int
+    status: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    skip: np.ndarray
+    face_node: np.ndarray
+
+
+class Scene:
+    """Many objects, many worlds, one device.
+
+    Args:
+        device: Warp device, such as "cpu" or "cuda:0"; None for Warp's default.
+
+    Raises:
+        ValueError: No such device on this machine.
+    """
+
+    def __init__(self, device=None):
+        try:
+            self.device = wp.get_device(device)
+        except Exception as error:
+            present = ", ".join(d.alias for d in wp.get_devices())
+            raise ValueError(f"no device {device!r} on this machine; there is {present} ({error})") from None
+        self.models: list[Model] = []
+        self.object_model: list[int] = []
+        self.object_importance: list[int] = []
+        self._world: list[int] = []
+        self._static: list[bool] = []
+        self._added_pose: list[np.ndarray] = []
+        self._lod: list[int] = []
+        self._excluded = np.empty(0, np.int64)
+        self._arrays = None
+
+    @property
+    def object_count(self) -> int:
+        """Objects added so far."""
+        return len(self.object_model)
+
+    @property
+    def lods(self) -> np.ndarray:
+        """LOD of each object, int32 (n,)."""
+        return np.array(self._lod, np.int32)
+
+    def add(self, model, pose=(0, 0, 0, 0, 0, 0, 1), world=0, lod=None, importance=1, static=False) -> int:
+        """Add an object and return its index.
+
+        Args:
+            model: `Model`.
+            pose: x y z qx qy qz qw [world units, unit quaternion], or a rigid (4, 4) matrix.
+            world: Objects of different worlds never meet; -1 is in every world.
+            lod: LOD to stand at; None is the finest.
+            importance: Application context beta of the LOD selection, 1, 2 or 3 (paper, section 4.2).
+            static: Whether it never pairs with another static object.
+
+        Raises:
+            TypeError: model is no Model.
+            ValueError: Anything else is out of range; nothing is added.
+        """
+        if not isinstance(model, Model):
+            raise TypeError(f"model is a {type(model).__name__}, not a Model")
+        pose = to_numpy(pose)
+        checked = check_poses(pose[None], "pose")[0]
+        if int(world) != world or not EVERY_WORLD <= world < 2**31:
+            raise ValueError(f"world {world!r} is no whole number from -1")
+        if importance not in (1, 2, 3):
+            raise ValueError(f"importance {importance!r} is none of 1, 2, 3")
+        lod = model.lod_max if lod is None else model.check_lod(lod)
+        known = next((i for i, other in enumerate(self.models) if other is model), None)
+        self._settle()
+        if known is None:
+            known = len(self.models)
+            self.models.append(model)
+        self.object_model.append(known)
+        self.object_importance.append(int(importance))
+        self._world.append(int(world))
+        self._static.append(bool(static))
+        self._added_pose.append(checked)
+        self._lod.append(lod)
+        return self.object_count - 1
+
+    def _settle(self):
+        """Take the device's poses back before the arrays are made anew. Waits for the device."""
+        if self._arrays is None:
+            return
+        objects = self._arrays[2]
+        matrices = np.tile(np.eye(4), (len(objects.state), 1, 1))
+        matrices[:, :3, :3] = objects.pool.rotation.numpy()
+        matrices[:, :3, 3] = objects.pool.position.numpy()
+        self._added_pose = list(matrices)
+        self._arrays = None
+
+    def arrays(self):
+        """Return (`ModelArrays`, `StateArrays`, `ObjectArrays`), made at the first use after an `add`."""
+        if self._arrays is None:
+            if not self.object_model:
+                raise ValueError("the scene has no object")
+            models = ModelArrays(self.models, self.device)
+            states = StateArrays(models, self.device)
+            objects = ObjectArrays(self._world, self._static, self.device)
+            set_object_lods(models, states, objects, np.array(self.object_model), np.array(self._lod))
+            self._arrays = (models, states, objects)
+            self._place(self._added_pose)
+        return self._arrays
+
+    def _place(self, poses):
+        """Set poses of mixed kinds: quaternions are turned into matrices on the device, matrices are taken as they are."""
+        objects = self._arrays[2]
+        rows = np.zeros((len(poses), 7))
+        rows[:, 6] = 1.0
+        matrix = np.array([p.ndim == 2 for p in poses])
+        for i, p in enumerate(poses):
+            if not matrix[i]:
+                rows[i] = p
+        self._place_quaternions(rows)
+        if matrix.any():
+            rotation = objects.pool.rotation.numpy()
+            position = objects.pool.position.numpy()
+            stacked = np.array([poses[i] for i in np.flatnonzero(matrix)])
+            rotation[matrix] = stacked[:, :3, :3]
+            position[matrix] = stacked[:, :3, 3]
+            objects.pool.rotation.assign(rotation)
+            objects.pool.position.assign(position)
+
+    def _place_quaternions(self, rows):
+        device_rows = wp.array(rows, dtype=wp.float64, device=self.device)
+        wp.launch(
+            pose_kernels.set_pose_kernel, dim=len(rows), inputs=[device_rows, self._arrays[2].pool], device=self.device
+        )
+
+    def set_poses(self, poses):
+        """Set the pose of every object.
+
+        Args:
+            poses: (n, 7) x y z qx qy qz qw, quaternions normalised in float64, or (n, 4, 4) rigid matrices taken as they are;
+                float32 or float64 [world units].
+
+        Raises:
+            ValueError: Wrong shape or count, a number that is not finite, a quaternion or matrix that is no rotation; nothing is
+                changed.
+        """
+        poses = check_poses(poses)
+        if len(poses) != self.object_count:
+            raise ValueError(f"poses: {len(poses)} given for {self.object_count} objects")
+        self.arrays()
+        if poses.ndim == 2:
+            self._place_quaternions(poses)
+        else:
+            objects = self._arrays[2].pool
+            objects.rotation.assign(np.ascontiguousarray(poses[:, :3, :3]))
+            objects.position.assign(np.ascontiguousarray(poses[:, :3, 3]))
+
+    def set_lods(self, lods) -> UpdateStats:
+        """Bring every object to a LOD: meshes are refined and trees updated in one batch, states are shared.
+
+        Args:
+            lods: (n,) whole numbers, each from 0 to its model's lod_max.
+
+        Raises:
+            ValueError: Wrong shape or a LOD out of range; nothing is changed.
+        """
+        lods = to_numpy(lods)
+        if lods.shape != (self.object_count,):
+            raise ValueError(f"lods: shape {lods.shape} given for {self.object_count} objects")
+        if lods.dtype.kind not in "iu" and not (lods.dtype.kind == "f" and (lods == np.floor(lods)).all()):
+            raise ValueError(f"lods: type {lods.dtype} holds no whole numbers")
+        top = np.array([model.lod_max for model in self.models])[self.object_model]
+        bad = np.flatnonzero((lods < 0) | (lods > top))
+        if len(bad):
+            i = int(bad[0])
+            raise ValueError(f"lods: object {i} asks for LOD {lods[i]}, outside 0 .. {top[i]}")
+        models, states, objects = self.arrays()
+        stats = set_object_lods(models, states, objects, np.array(self.object_model), lods.astype(np.int64))
+        self._lod = [int(lod) for lod in lods]
+        return stats
+
+    def check_pairs(self, pairs) -> np.ndarray:
+        """Return object pairs as int32 (p, 2).
+
+        Raises:
+            ValueError: Wrong shape, an index that is no object, an object paired with itself.
+        """
+        pairs = to_numpy(pairs)
+        if pairs.size == 0:
+            return np.empty((0, 2), np.int32)
+        if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind not in "iu":
+            raise ValueError(f"pairs: shape {pairs.shape} and type {pairs.dtype}, not whole numbers of shape (p, 2)")
+        bad = np.flatnonzero(((pairs < 0) | (pairs >= self.object_count)).any(1))
+        if len(bad):
+            raise ValueError(f"pairs: pair {bad[0]} is {tuple(pairs[bad[0]].tolist())}, the scene has {self.object_count} objects")
+        bad = np.flatnonzero(pairs[:, 0] == pairs[:, 1])
+        if len(bad):
+            raise ValueError(f"pairs: pair {bad[0]} pairs object {pairs[bad[0], 0]} with itself")
+        return pairs.astype(np.int32)
+
+    def filter(self, pairs):
+        """Exclude object pairs from every later broad phase.
+
+        Raises:
+            ValueError: As `check_pairs`.
+        """
+        self._excluded = np.union1d(self._excluded, exclusion_keys(self.check_pairs(pairs)))
+
+    def excluded_keys(self) -> np.ndarray:
+        """Return the excluded pairs as sorted keys i * 2^32 + j, i < j, int64."""
+        return self._excluded
+
+    def broad_phase(self) -> np.ndarray:
+        """Return the object pairs whose posed root boxes overlap, int32 (p, 2), sorted, i < j. Waits for the device.
+
+        Worlds never mix (-1 is in every one), two static objects never pair, filtered pairs stay out.
+        """
+        if self.object_count < 2:
+            return np.empty((0, 2), np.int32)
+        return BroadPhase(*self.arrays(), self._excluded).find()
+
+    def intersect(self, pairs=None, output="any", precision="float64", within=None) -> Result:
+        """Test object pairs for intersection, exactly as posed and at their LODs. Waits for the device.
+
+        Touching counts. Columns of the result follow the order in which a pair names its objects.
+
+        Args:
+            pairs: (p, 2) object indices; None asks the broad phase.
+            output: "any", "count" or "faces".
+            precision: "float64" today: signs of float64 determinants, wrong only within their rounding.
+
+        Raises:
+            ValueError: Bad pairs or an unknown option.
+            NotImplementedError: "contacts", other precisions and within=, which are not built yet.
+        """
+        check_request(output, precision, within)
+        pairs = self.broad_phase() if pairs is None else self.check_pairs(pairs)
+        return Query(self, output, pairs=pairs, precision=precision).run()
+
+    def tree_state(self, i) -> TreeState:
+        """Return the AB-Tree of an object at its LOD. Waits for the device.
+
+        Raises:
+            ValueError: No such object.
+        """
+        if not 0 <= int(i) < self.object_count:
+            raise ValueError(f"object {i!r} is outside 0 .. {self.object_count - 1}")
+        models, states, objects = self.arrays()
+        slot = states.slots[objects.state[int(i)]]
+        model = self.models[slot.model]
+        nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
+        lower = states.pool.node_lower[nodes].numpy() + model.centre
+        upper = states.pool.node_upper[nodes].numpy() + model.centre
+        return TreeState(
+            slot.lod,
+            states.pool.node_status[nodes].numpy(),
+            np.where(np.isinf(lower), lower, np.nextafter(lower, -np.inf)),
+            np.where(np.isinf(upper), upper, np.nextafter(upper, np.inf)),
+            states.pool.node_skip[nodes].numpy(),
+            model.tree.leaf_node,
+        )

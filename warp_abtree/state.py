@@ -1,0 +1,188 @@
+"""Models, tree states and objects as flat device arrays."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
+
+
+def _upload(values, dtype, device):
+    return wp.array(values, dtype=dtype, device=device)
+
+
+class ModelArrays:
+    """Static arrays of several models, concatenated on one device.
+
+    Attributes:
+        pool: `ModelPool` for kernels.
+        vertex_start, face_start, split_start, node_count, face_count, depth: NumPy, one entry a model.
+        split_bounds: split_start of each model, offset into the pool's split_face.
+    """
+
+    def __init__(self, models, device):
+        def starts(lengths):
+            return np.concatenate([[0], np.cumsum(lengths)])
+
+        forests = [model.progressive for model in models]
+        self.vertex_start = starts([len(f.vertex_parent) for f in forests])
+        self.face_start = starts([f.face_count for f in forests])
+        self.split_start = starts([len(f.split_face) for f in forests])
+        self.node_start = starts([model.tree.node_count for model in models])
+        for what, total in (("vertices", self.vertex_start[-1]), ("face slices", self.split_start[-1])):
+            if total >= 2**31:
+                raise ValueError(f"the models of one scene hold {total} {what}, more than 2^31")
+        self.face_count = np.array([f.face_count for f in forests], np.int64)
+        self.node_count = np.array([model.tree.node_count for model in models], np.int64)
+        self.depth = np.array([model.tree.depth for model in models], np.int64)
+        self.lod_max = np.array([f.lod_max for f in forests], np.int64)
+        self.split_bounds = [
+            f.split_start.astype(np.int64) + s for f, s in zip(forests, self.split_start[:-1], strict=True)
+        ]
+
+        def joined(parts, dtype):
+            return _upload(np.ascontiguousarray(np.concatenate(parts)), dtype, device)
+
+        parents = [
+            np.where(f.vertex_parent < 0, -1, f.vertex_parent + s).astype(np.int32)
+            for f, s in zip(forests, self.vertex_start[:-1], strict=True)
+        ]
+        corners = [
+            (f.face_vertex + s).astype(np.int32) for f, s in zip(forests, self.vertex_start[:-1], strict=True)
+        ]
+        pool = ModelPool()
+        pool.vertex_parent = joined(parents, wp.int32)
+        pool.vertex_pos = joined([f.vertex_pos for f in forests], wp.vec3d)
+        pool.face_vertex = joined(corners, wp.vec3i)
+        pool.face_split = joined([f.face_split for f in forests], wp.int32)
+        pool.split_face = joined([f.split_face for f in forests], wp.int32)
+        pool.leaf_node = joined([model.tree.leaf_node for model in models], wp.int32)
+        pool.node_face = joined([model.tree.node_face for model in models], wp.int32)
+        pool.face_start = _upload(self.face_start[:-1].astype(np.int32), wp.int32, device)
+        pool.face_count = _upload(self.face_count.astype(np.int32), wp.int32, device)
+        pool.node_start = _upload(self.node_start[:-1].astype(np.int32), wp.int32, device)
+        finest = [s + f.vertex_count for f, s in zip(forests, self.vertex_start[:-1], strict=True)]
+        pool.finest_limit = _upload(np.array(finest, np.int32), wp.int32, device)
+        pool.lod_max = _upload(self.lod_max.astype(np.int32), wp.int32, device)
+        pool.centre = _upload(np.array([model.centre for model in models]), wp.vec3d, device)
+        self.pool = pool
+
+
+@dataclass
+class Slot:
+    """One tree state: where it lies, and what stands there."""
+
+    model: int
+    lod: int
+    node_start: int
+    face_start: int
+
+
+class StateArrays:
+    """A pool of tree states that grows; a freed state is taken again by the same model.
+
+    Attributes:
+        pool: `StatePool` for kernels. Growing replaces its arrays, so a captured graph needs a pool that does not grow.
+        slots: Host side of each state.
+        free: Ids of states that no object uses, by model.
+    """
+
+    def __init__(self, models: ModelArrays, device):
+        self.models = models
+        self.device = device
+        self.slots: list[Slot] = []
+        self.free: dict[int, list[int]] = {}
+        self.node_total = 0
+        self.face_total = 0
+        self.pool = StatePool()
+        self._allocate_nodes(0)
+        self._allocate_faces(0)
+
+    def _allocate_nodes(self, count):
+        old, kept = self.pool, self.node_total
+        new = {
+            "node_status": wp.zeros(count, dtype=wp.int32, device=self.device),
+            "node_lower": wp.full(count, wp.vec3(wp.inf, wp.inf, wp.inf), dtype=wp.vec3, device=self.device),
+            "node_upper": wp.full(count, wp.vec3(-wp.inf, -wp.inf, -wp.inf), dtype=wp.vec3, device=self.device),
+            "node_skip": wp.full(count, -1, dtype=wp.int32, device=self.device),
+        }
+        for name, array in new.items():
+            if kept:
+                wp.copy(array, getattr(old, name), count=kept)
+            setattr(self.pool, name, array)
+        self.node_room = count
+
+    def _allocate_faces(self, count):
+        old, kept = self.pool, self.face_total
+        array = wp.full(count, wp.vec3i(-1, -1, -1), dtype=wp.vec3i, device=self.device)
+        if kept:
+            wp.copy(array, old.face_corner, count=kept)
+        self.pool.face_corner = array
+        self.face_room = count
+
+    def reserve(self, wanted_models):
+        """Take one state for each entry of a list of models and return their ids; contents are whatever stood there.
+
+        Raises:
+            ValueError: The pool would pass 2^31 nodes.
+        """
+        fresh = []
+        ids = []
+        spare = {model: list(ids) for model, ids in self.free.items()}
+        for model in wanted_models:
+            if spare.get(model):
+                ids.append(spare[model].pop())
+            else:
+                ids.append(len(self.slots) + len(fresh))
+                fresh.append(model)
+        nodes = self.node_total + sum(int(self.models.node_count[m]) for m in fresh)
+        faces = self.face_total + sum(int(self.models.face_count[m]) for m in fresh)
+        if nodes >= 2**31:
+            raise ValueError(f"the tree states of the scene would hold {nodes} nodes, more than 2^31; use fewer LODs")
+        if nodes > self.node_room:
+            self._allocate_nodes(max(nodes, min(2 * self.node_room, 2**31 - 1)))
+        if faces > self.face_room:
+            self._allocate_faces(max(faces, min(2 * self.face_room, 2**31 - 1)))
+        self.free = spare
+        for model in fresh:
+            self.slots.append(Slot(model, -1, self.node_total, self.face_total))
+            self.node_total += int(self.models.node_count[model])
+            self.face_total += int(self.models.face_count[model])
+        return ids
+
+    def upload_slots(self):
+        """Bring model, LOD and starts of all states to the device."""
+
+        def column(name):
+            return _upload(np.array([getattr(s, name) for s in self.slots], np.int32), wp.int32, self.device)
+
+        self.pool.model = column("model")
+        self.pool.lod = column("lod")
+        self.pool.node_start = column("node_start")
+        self.pool.face_start = column("face_start")
+
+
+class ObjectArrays:
+    """Posed objects of a scene on one device.
+
+    Attributes:
+        pool: `ObjectPool` for kernels.
+        state: State of each object, NumPy int32 (n,), the host's copy of pool.state.
+    """
+
+    def __init__(self, worlds, statics, device):
+        count = len(worlds)
+        self.device = device
+        self.state = np.full(count, -1, np.int32)
+        self.pool = ObjectPool()
+        self.pool.state = wp.full(count, -1, dtype=wp.int32, device=device)
+        self.pool.world = _upload(np.asarray(worlds, np.int32), wp.int32, device)
+        self.pool.is_static = _upload(np.asarray(statics, np.int32), wp.int32, device)
+        self.pool.rotation = wp.zeros(count, dtype=wp.mat33d, device=device)
+        self.pool.position = wp.zeros(count, dtype=wp.vec3d, device=device)
+
+    def set_states(self, state):
+        """Point every object at a state, int32 (n,)."""
+        self.state = np.asarray(state, np.int32)
+        self.pool.state.assign(self.state)

@@ -1,0 +1,225 @@
+"""The AB-Tree: its static topology, and the update that an LOD change asks for.
+
+Source: Liu, Georganas and Roth 2006, section 3.2.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels import mark, refit
+from warp_abtree.kernels.pools import LEVEL_MAX
+
+FACE_COUNT_MAX = 2**30
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Static topology of an AB-Tree over n faces.
+
+    Attributes:
+        leaf_node: Heap index of each face's leaf, the paper's indexed list, int32 (n,).
+        node_face: Face of each leaf node, -1 elsewhere, int32 (2^(depth+1),); the root is 1.
+        depth: ceil(log2 n).
+    """
+
+    leaf_node: np.ndarray
+    node_face: np.ndarray
+    depth: int
+
+    @property
+    def node_count(self) -> int:
+        """Length of the node arrays: heap indices 0 .. 2^(depth+1)-1, 2n-1 of them in use."""
+        return len(self.node_face)
+
+
+def _partition(order, left, begin, middle):
+    """Move the marked entries of every segment before the others, keeping the order of each kind.
+
+    Args:
+        order: Face ids, segment after segment.
+        left: Whether each face goes left, per face id.
+        begin, middle: Where the segment of each position begins, and where its right half will.
+    """
+    goes_left = left[order]
+    rank = np.cumsum(goes_left) - goes_left
+    rank -= rank[begin]
+    position = np.arange(len(order))
+    out = np.empty_like(order)
+    out[np.where(goes_left, begin + rank, middle + (position - begin) - rank)] = order
+    return out
+
+
+def _sort_leaves(lower, upper, depth):
+    """Return the face at each leaf position: median splits, one level at a time, over three presorted orders."""
+    n = len(lower)
+    key = lower + upper
+    orders = [np.argsort(key[:, axis], kind="stable") for axis in range(3)]
+    left = np.zeros(n, bool)
+    for d in range(depth):
+        bounds = (np.arange((1 << d) + 1) * n) >> d
+        middles = ((2 * np.arange(1 << d) + 1) * n) >> (d + 1)
+        lengths = np.diff(bounds)
+        extent = np.maximum.reduceat(upper[orders[0]], bounds[:-1]) - np.minimum.reduceat(lower[orders[0]], bounds[:-1])
+        axis = np.repeat(np.argmax(extent, 1), lengths)
+        begin = np.repeat(bounds[:-1], lengths)
+        middle = np.repeat(middles, lengths)
+        in_left = np.arange(n) < middle
+        for k in range(3):
+            here = axis == k
+            left[orders[k][here]] = in_left[here]
+        orders = [_partition(order, left, begin, middle) for order in orders]
+    return orders[0]
+
+
+def active_build(vertex_pos: np.ndarray, face_vertex: np.ndarray) -> Tree:
+    """Build the balanced tree over all faces top-down (ACTIVE-BUILD).
+
+    Each segment splits at its median along the longest axis of its box, in the order of the faces' box centres, ties by face
+    index; halves are equal to within one. The node at depth d and index i holds leaf positions (i n) >> d .. ((i+1) n) >> d.
+
+    Args:
+        vertex_pos: Original vertices [model units], float64 (v, 3).
+        face_vertex: Original faces, int32 (n, 3).
+
+    Raises:
+        ValueError: No face, or more than 2^30.
+
+    Source: Liu et al. 2006, section 3.2.2, ACTIVE-BUILD.
+    """
+    n = len(face_vertex)
+    if not 0 < n <= FACE_COUNT_MAX:
+        raise ValueError(f"an AB-Tree needs 1 to 2^30 faces, not {n}")
+    corners = vertex_pos[face_vertex]
+    depth = (n - 1).bit_length()
+    leaf_face = _sort_leaves(corners.min(1), corners.max(1), depth)
+    # Halves equal to within one put every leaf on one of the two deepest levels.
+    node_face = np.full(2 << depth, -1, np.int32)
+    bounds = (np.arange((1 << depth) + 1) * n) >> depth
+    deep = np.flatnonzero(np.diff(bounds))
+    node = (1 << depth) + deep
+    if depth > 0:
+        above = (np.arange((1 << (depth - 1)) + 1) * n) >> (depth - 1)
+        single = np.diff(above)[deep >> 1] == 1
+        node = np.where(single, node >> 1, node)
+    node_face[node] = leaf_face[bounds[deep]]
+    leaf_node = np.empty(n, np.int32)
+    leaf_node[leaf_face] = node
+    return Tree(leaf_node, node_face, depth)
+
+
+@dataclass
+class UpdateBatch:
+    """Tree states under update, and the slices of faces that change.
+
+    Partial updates come first, then full ones; the counters have one entry an update, in this order.
+
+    Attributes:
+        state, lod: State and target LOD of each update, int32 (u,).
+        full: Whether the whole tree is refitted, bool (u,).
+        slice_start, slice_length: Slice of each update in split_face; length 0 where it is full, int64 (u,).
+        depth, face_count: Tree depth and faces of each update's model, int64 (u,).
+        changed_count, marked_count: Faces that change and nodes refitted, device int32 (u,), written by the update.
+    """
+
+    state: np.ndarray
+    lod: np.ndarray
+    full: np.ndarray
+    slice_start: np.ndarray
+    slice_length: np.ndarray
+    depth: np.ndarray
+    face_count: np.ndarray
+    device: wp.Device
+
+    def __post_init__(self):
+        def upload(values):
+            return wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=self.device)
+
+        count = len(self.state)
+        ids = np.arange(count)
+        partial = ~self.full
+        end = np.cumsum(self.slice_length[partial])
+        self.entry_count = int(end[-1]) if len(end) else 0
+        self.entry_end = upload(end)
+        self.partial_state = upload(self.state[partial])
+        self.partial_slice = upload(self.slice_start[partial])
+        self.partial_id = upload(ids[partial])
+        # Deepest first, so that the states that have a level are the first of the list.
+        order = ids[self.full][np.argsort(-self.depth[self.full], kind="stable")]
+        self.full_depth = self.depth[order]
+        self.full_state = upload(self.state[order])
+        self.full_id = upload(order)
+        self.full_face_end = upload(np.cumsum(self.face_count[order]))
+        self.full_face_count = int(self.face_count[order].sum())
+        self.changed_count = wp.zeros(max(count, 1), dtype=wp.int32, device=self.device)
+        self.marked_count = wp.zeros(max(count, 1), dtype=wp.int32, device=self.device)
+        if self.entry_count:
+            level_room = [
+                min(self.entry_count, int(np.sum(self.depth[partial] >= d)) << d) for d in range(int(LEVEL_MAX))
+            ]
+            self.level_room = level_room
+            self.level_start = upload(np.concatenate([[0], np.cumsum(level_room)[:-1]]))
+            self.level_count = wp.zeros(int(LEVEL_MAX), dtype=wp.int32, device=self.device)
+            self.level_node = wp.empty(sum(level_room), dtype=wp.vec2i, device=self.device)
+
+
+def active_mark(models, states, batch: UpdateBatch):
+    """Mark the leaves of every affected face and their ancestors deformed, each node once (ACTIVE-MARK)."""
+    if batch.entry_count == 0:
+        return
+    wp.launch(
+        mark.mark_path_kernel,
+        dim=batch.entry_count,
+        inputs=[
+            batch.entry_count,
+            models,
+            batch.entry_end,
+            batch.partial_state,
+            batch.partial_slice,
+            batch.partial_id,
+            batch.level_start,
+            states,
+            batch.level_count,
+            batch.level_node,
+            batch.changed_count,
+            batch.marked_count,
+        ],
+        device=batch.device,
+    )
+
+
+def active_walk(models, states, batch: UpdateBatch):
+    """Refit what is marked, and every node of states under full update, deepest level first (ACTIVE-WALK)."""
+    deepest = int(batch.depth.max()) if len(batch.depth) else -1
+    for level in range(deepest, -1, -1):
+        if batch.entry_count:
+            wp.launch(
+                refit.refit_level_kernel,
+                dim=batch.level_room[level],
+                inputs=[level, models, batch.level_start, batch.level_count, batch.level_node, states],
+                device=batch.device,
+            )
+        whole = int(np.sum(batch.full_depth >= level))
+        if whole:
+            wp.launch(
+                refit.refit_whole_level_kernel,
+                dim=whole << level,
+                inputs=[level, models, batch.full_state, states],
+                device=batch.device,
+            )
+
+
+def active_update(models, states, batch: UpdateBatch):
+    """Bring boxes, status and skip links to the corners that refinement has set (ACTIVE-UPDATE).
+
+    Leaves the very same bits as a rebuild of all boxes at that LOD. Launches only; no host synchronisation.
+
+    Args:
+        models, states: `ModelPool` and `StatePool` of one device.
+        batch: What to update; its counters are written.
+
+    Source: Liu et al. 2006, section 3.2.2, ACTIVE-UPDATE; Algorithm 1.
+    """
+    active_mark(models, states, batch)
+    active_walk(models, states, batch)
