@@ -53,8 +53,8 @@ def boxes_overlap(
 ):
     """Return False only where box A and the posed box B are apart, on the three axes of each.
 
-    rotation, translation: B's frame in A's, both about their models' centres. margin: `pair_margin`, which covers the rounding of
-    everything here, so that no pair of points that meet is ever pruned.
+    rotation, translation: B's frame in A's, both about their models' centres. margin: `pair_margin`, which covers the
+    rounding of everything here, so that no pair of points that meet is ever pruned.
     """
     half_a = (upper_a - lower_a) * 0.5
     half_b = (upper_b - lower_b) * 0.5

@@ -52,7 +52,7 @@ def append_pair(
     pair_count: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
 ):
-    """Append the pair (min, max) unless both are static or the user excluded it; the count goes on past the capacity."""
+    """Append (min, max) unless both are static or the user excluded it; the count goes on past the capacity."""
     if objects.is_static[i] != 0 and objects.is_static[j] != 0:
         return
     low = wp.min(i, j)

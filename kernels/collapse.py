@@ -479,9 +479,7 @@ def collapse_edges_kernel(
                     q = edge_quadric(surface_inout, a, b)
                     place = place_edge(surface_inout, a, b, q)
                     old = pair_stage(pair)
-                    stage = postponed_stage(
-                        surface_inout, rings_inout, link_condition, a, b, old, dying, place.pos
-                    )
+                    stage = postponed_stage(surface_inout, rings_inout, link_condition, a, b, old, dying, place.pos)
                     if stage != old:
                         key = postponed_key(surface_inout, rings_inout, a, b, stage, q, place.cost)
                         size = heap_push(heap_inout, size, key, pack_pair(a, b, stage))

@@ -21,13 +21,12 @@ def separates_line(a: wp.vec2d, b: wp.vec2d, inner: wp.vec2d, p: wp.vec2d, q: wp
 
 
 @wp.func
-def overlap_flat(
-    a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d, q: wp.vec2d, r: wp.vec2d
-):
+def overlap_flat(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d, q: wp.vec2d, r: wp.vec2d):
     """Return whether no edge line separates two closed plane triangles.
 
-    Complete for two triangles, and for a triangle and a segment or a point: every edge of their Minkowski difference is then
-    parallel to an edge of one of them. (A segment as p, q, r has side 0 on its own line, so both sides are asked.)
+    Complete for two triangles, and for a triangle and a segment or a point: every edge of their Minkowski difference
+    is then parallel to an edge of one of them. (A segment as p, q, r has side 0 on its own line, so both sides are
+    asked.)
     """
     if separates_line(a, b, c, p, q, r) or separates_line(b, c, a, p, q, r) or separates_line(c, a, b, p, q, r):
         return False
@@ -50,9 +49,7 @@ def widest_axis(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 
 @wp.func
-def intersect_coplanar(
-    axis: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d
-):
+def intersect_coplanar(axis: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d):
     return overlap_flat(
         drop_axis(a, axis),
         drop_axis(b, axis),

@@ -146,7 +146,6 @@ def breaks_link(rings: Rings, a: int, b: int):
     return False
 
 
-
 @wp.kernel
 def link_rings_kernel(
     face_count: int,

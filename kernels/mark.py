@@ -35,16 +35,17 @@ def mark_path_kernel(
 ):
     """Walk from the leaf of each affected face to the root and mark what no earlier walk has marked.
 
-    Whoever marks a node first appends (state, node) to the worklist of its level, so a batch costs O(k (log n - log k + 2)).
+    Whoever marks a node first appends (state, node) to the worklist of its level, so a batch costs O(k (log n - log k
+    + 2)).
 
     Args:
         entry_end, update_state, update_slice: Slices of the updates, as in `refine_slice_kernel`.
         update_id: Where each update counts, shape [update_count].
         level_start: Where the worklist of each level begins, shape [LEVEL_MAX].
-    Source: Liu et al. 2006, section 3.2.2 and Algorithm 2. As printed it returns from the whole operation at the first removed
-        leaf with an inactive sibling and leaves one with an active sibling untouched; its text says what is meant: a node is
-        inactive iff no active primitive lies under it, and boxes are smallest. So removed, deformed and inserted leaves are all
-        marked here, and ACTIVE-WALK decides the status.
+    Source: Liu et al. 2006, section 3.2.2 and Algorithm 2. As printed it returns from the whole operation at the
+        first removed leaf with an inactive sibling and leaves one with an active sibling untouched; its text says
+        what is meant: a node is inactive iff no active primitive lies under it, and boxes are smallest. So removed,
+        deformed and inserted leaves are all marked here, and ACTIVE-WALK decides the status.
     """
     tid = wp.tid()
     if tid >= entry_count:

@@ -1,7 +1,8 @@
 """Flat device arrays of all models, tree states and objects, as the structs that kernels receive.
 
-Ids that cross structs are global: a vertex id indexes `vertex_pos`, a state id `StatePool`, an object id `ObjectPool`. Node ids
-are heap indices inside one tree (the root is 1), face ids are the face's index in its own model.
+Ids that cross structs are global: a vertex id indexes `vertex_pos`, a state id `StatePool`, an object id
+`ObjectPool`. Node ids are heap indices inside one tree (the root is 1), face ids are the face's index in its own
+model.
 """
 
 import warp as wp
@@ -43,8 +44,8 @@ class ModelPool:
 class StatePool:
     """Everything that a level of detail decides: one entry a model at a LOD.
 
-    Per node: node_status, node_lower, node_upper [model units, about the model's centre], node_skip. Per face: face_corner, the
-    active ancestors (global vertex ids) of the three corners, -1 where the face is inactive.
+    Per node: node_status, node_lower, node_upper [model units, about the model's centre], node_skip. Per face:
+    face_corner, the active ancestors (global vertex ids) of the three corners, -1 where the face is inactive.
     """
 
     model: wp.array(dtype=wp.int32)

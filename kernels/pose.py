@@ -68,12 +68,12 @@ def reach_box(lower: wp.vec3, upper: wp.vec3):
 def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32):
     """Return the `PairPose` of B in A's frame.
 
-    The margin covers, with a factor of two to spare, every rounding between the exact x' of B's vertices and the float32 box
-    test. With u = 2^-24, r_a and r_b the reach of the root boxes and s the largest component of the translation between the
-    centres, centre and half width of B's posed box err by at most 11 sqrt(3) u r_b + 4 u s, those of A's by 2 u r_a, and the
-    comparison adds u (3 sqrt(3) r_b + s + 3 r_a): less than 32 u (r_a + r_b + s) in all, twice that on B's axes. The float64 part
-    covers x' itself and the shift between centres, and `skewed` a rotation that is not orthonormal to the last bit, on
-    whose columns B's axes are taken.
+    The margin covers, with a factor of two to spare, every rounding between the exact x' of B's vertices and the
+    float32 box test. With u = 2^-24, r_a and r_b the reach of the root boxes and s the largest component of the
+    translation between the centres, centre and half width of B's posed box err by at most 11 sqrt(3) u r_b + 4 u s,
+    those of A's by 2 u r_a, and the comparison adds u (3 sqrt(3) r_b + s + 3 r_a): less than 32 u (r_a + r_b + s) in
+    all, twice that on B's axes. The float64 part covers x' itself and the shift between centres, and `skewed` a
+    rotation that is not orthonormal to the last bit, on whose columns B's axes are taken.
     """
     r, t = relate_objects(objects, a, b)
     state_a = objects.state[a]
@@ -89,9 +89,7 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     far = wp.float64(0.0)
     skewed = wp.float64(0.0)
     for i in range(3):
-        shift[i] = (
-            sum_products(r[i, 0], centre_b[0], r[i, 1], centre_b[1], r[i, 2], centre_b[2]) + t[i]
-        ) - centre_a[i]
+        shift[i] = (sum_products(r[i, 0], centre_b[0], r[i, 1], centre_b[1], r[i, 2], centre_b[2]) + t[i]) - centre_a[i]
         far = wp.max(far, wp.abs(shift[i]))
         size = wp.max(size, wp.abs(t[i]) + wp.abs(centre_a[i]))
         for j in range(3):

@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.func
 def find_ancestor(vertex_parent: wp.array(dtype=wp.int32), vertex: wp.int32, limit: wp.int32):
-    """Return the highest ancestor of a vertex below the id limit (DESIGN: node n_v + j exists once merge j is applied)."""
+    """Return the highest ancestor of a vertex below an id: node n_v + j stands once merge j is applied."""
     x = vertex
     y = vertex_parent[x]
     while y >= 0 and y < limit:

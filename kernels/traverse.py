@@ -18,11 +18,13 @@ OUTPUT_ANY = wp.constant(0)
 OUTPUT_COUNT = wp.constant(1)
 OUTPUT_FACES = wp.constant(2)
 
-# A visit replaces one entry by two a level deeper, so depth first holds at most one entry a level of either tree, plus one.
+# A visit replaces one entry by two a level deeper, so depth first holds at most one entry a level of either tree,
+# plus one.
 STACK_LENGTH = wp.constant(64)
 stack_type = wp.types.vector(length=128, dtype=wp.int32)
 
 SHARED_LENGTH = wp.constant(1024)
+CANDIDATE_LENGTH = wp.constant(512)
 
 
 @wp.struct
@@ -41,8 +43,8 @@ class PairTrees:
 class Hits:
     """Results of a batch of pairs.
 
-    any_hit, count: shape [pair]. face: (pair, face a, face b), a of the pair's first object, shape [capacity]; total keeps counting
-    past the capacity. node_tests, triangle_tests: work done, shape [pair].
+    any_hit, count: shape [pair]. face: (pair, face a, face b), a of the pair's first object, shape [capacity]; total
+    keeps counting past the capacity. node_tests, triangle_tests: work done, shape [pair].
     """
 
     any_hit: wp.array(dtype=wp.int32)
@@ -100,8 +102,9 @@ def visit_nodes(
 ):
     """Test one pair of nodes and say what follows.
 
-    Returns (kind, x, y): kind 0 nothing, 1 the leaves' faces x and y are candidates, 2 descend A into x and y, 3 descend B.
-    x and y are skip nodes: a leaf or two active children each, so a coarse tree costs no more than one built for its LOD.
+    Returns (kind, x, y): kind 0 nothing, 1 the leaves' faces x and y are candidates, 2 descend A into x and y,
+    3 descend B. x and y are skip nodes, a leaf or two active children each, so that a coarse LOD costs no more node
+    tests than a tree built for it.
     """
     lower_a = states.node_lower[trees.node_a + node_a]
     upper_a = states.node_upper[trees.node_a + node_a]
@@ -201,6 +204,25 @@ def traverse_thread_kernel(
     hits_out.triangle_tests[p] = triangle_tests
 
 
+@wp.func
+def finish_refused(
+    output: wp.int32,
+    pair: wp.int32,
+    swapped: wp.int32,
+    refused: bool,
+    node: wp.vec2i,
+    models: ModelPool,
+    states: StatePool,
+    trees: PairTrees,
+    pose: PairPose,
+    hits: Hits,
+):
+    """Traverse depth first from a pair of nodes that the shared stack had no room for; return the three counts."""
+    if refused:
+        return traverse_depth_first(output, pair, swapped, node[0], node[1], models, states, trees, pose, hits)
+    return 0, 0, 0
+
+
 @wp.kernel
 def traverse_block_kernel(
     output: wp.int32,
@@ -214,51 +236,48 @@ def traverse_block_kernel(
 ):
     """Traverse one object pair a block: its threads pop node pairs from a shared stack and push what overlaps.
 
-    What the full stack refuses, its thread finishes depth first: nothing is lost, whatever the stack's length.
+    Candidate faces wait on a second stack until every thread has one to test. What the full stack refuses, its thread
+    finishes depth first: nothing is lost, whatever the stack's length.
     """
     p, lane = wp.tid()
     if p >= wp.min(pair_count[0], pairs.shape[0]):
         return
     swapped = wp.where(pairs[p][0] > pairs[p][1], 1, 0)
-    state_a = objects.state[wp.min(pairs[p][0], pairs[p][1])]
-    state_b = objects.state[wp.max(pairs[p][0], pairs[p][1])]
-    trees = locate_trees(models, states, state_a, state_b)
+    low = objects.state[wp.min(pairs[p][0], pairs[p][1])]
+    trees = locate_trees(models, states, low, objects.state[wp.max(pairs[p][0], pairs[p][1])])
     pose = pair_poses[p]
-    hit_count = wp.int32(0)
-    node_tests = wp.int32(0)
-    triangle_tests = wp.int32(0)
-
+    counts = wp.vec3i(0, 0, 0)
     stack = wp.tile_stack(capacity=SHARED_LENGTH, dtype=wp.vec2i)
+    # Visits stop at block_dim candidates and add at most as many, so this stack never fills.
+    candidates = wp.tile_stack(capacity=CANDIDATE_LENGTH, dtype=wp.vec2i)
     start = wp.vec2i(states.node_skip[trees.node_a + 1], states.node_skip[trees.node_b + 1])
     wp.tile_stack_push(stack, start, lane == 0)
-    while wp.tile_stack_count(stack) > 0:
-        item, slot = wp.tile_stack_pop(stack)
-        kind = wp.int32(0)
-        x = wp.int32(0)
-        y = wp.int32(0)
-        # For `any` a hit empties the stack: items are popped and dropped, so that every thread leaves the loop together.
-        if slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
-            kind, x, y = visit_nodes(models, states, trees, pose, item[0], item[1])
-            node_tests += 1
-        if kind == 1:
-            triangle_tests += 1
-            if test_faces(models, states, trees, pose, x, y):
-                hit_count += 1
-                report_hit(output, p, swapped, x, y, hits_out)
-        first = wp.where(kind == 2, wp.vec2i(x, item[1]), wp.vec2i(item[0], x))
-        second = wp.where(kind == 2, wp.vec2i(y, item[1]), wp.vec2i(item[0], y))
-        kept_first = wp.tile_stack_push(stack, first, kind >= 2)
-        kept_second = wp.tile_stack_push(stack, second, kind >= 2)
-        for child in range(2):
-            refused = kind >= 2 and wp.where(child == 0, kept_first, kept_second) < 0
-            if refused:
-                node = wp.where(child == 0, first, second)
-                more, more_nodes, more_triangles = traverse_depth_first(
-                    output, p, swapped, node[0], node[1], models, states, trees, pose, hits_out
+    ready = wp.where(output == OUTPUT_ANY, 1, wp.block_dim())
+    while wp.tile_stack_count(stack) + wp.tile_stack_count(candidates) > 0:
+        # For `any` a hit empties the stacks: items are popped and dropped, so every thread leaves the loop together.
+        if wp.tile_stack_count(candidates) >= ready or wp.tile_stack_count(stack) == 0:
+            faces, face_slot = wp.tile_stack_pop(candidates)
+            if face_slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
+                counts += wp.vec3i(0, 0, 1)
+                if test_faces(models, states, trees, pose, faces[0], faces[1]):
+                    counts += wp.vec3i(1, 0, 0)
+                    report_hit(output, p, swapped, faces[0], faces[1], hits_out)
+        else:
+            item, slot = wp.tile_stack_pop(stack)
+            kind, x, y = wp.int32(0), wp.int32(0), wp.int32(0)
+            if slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
+                kind, x, y = visit_nodes(models, states, trees, pose, item[0], item[1])
+                counts += wp.vec3i(0, 1, 0)
+            wp.tile_stack_push(candidates, wp.vec2i(x, y), kind == 1)
+            for child in range(2):
+                z = wp.where(child == 0, x, y)
+                node = wp.where(kind == 2, wp.vec2i(z, item[1]), wp.vec2i(item[0], z))
+                kept = wp.tile_stack_push(stack, node, kind >= 2)
+                refused = kind >= 2 and kept < 0
+                hit, nodes, faces_tested = finish_refused(
+                    output, p, swapped, refused, node, models, states, trees, pose, hits_out
                 )
-                hit_count += more
-                node_tests += more_nodes
-                triangle_tests += more_triangles
-    wp.atomic_add(hits_out.count, p, hit_count)
-    wp.atomic_add(hits_out.node_tests, p, node_tests)
-    wp.atomic_add(hits_out.triangle_tests, p, triangle_tests)
+                counts += wp.vec3i(hit, nodes, faces_tested)
+    wp.atomic_add(hits_out.count, p, counts[0])
+    wp.atomic_add(hits_out.node_tests, p, counts[1])
+    wp.atomic_add(hits_out.triangle_tests, p, counts[2])

@@ -1,4 +1,4 @@
-"""Triangle against triangle, closed sets: touching counts, coplanar overlap counts, zero-area faces are segments or points."""
+"""Triangle against triangle as closed sets: touching and coplanar overlap count, zero-area faces are segments."""
 
 import warp as wp
 
@@ -75,8 +75,8 @@ def intersect_triangles(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, 
     alone_b, side_b = find_alone(sb0, sb1, sb2)
     p1, q1, r1 = rotate_first(alone_a, a0, a1, a2)
     p2, q2, r2 = rotate_first(alone_b, b0, b1, b2)
-    # Turn each triangle so that the other's lone corner lies above its plane. The planes meet in a line; on it the triangles
-    # are the intervals between edges p q and p r, and two more signs order the ends.
+    # Turn each triangle so that the other's lone corner lies above its plane. The planes meet in a line; on it the
+    # triangles are the intervals between edges p q and p r, and two more signs order the ends.
     if side_a < 0:
         t = q2
         q2 = r2

@@ -119,14 +119,13 @@ def test_trimesh_and_scene():
 
     scene = trimesh.Scene()
     scene.add_geometry(shape, node_name="here")
-    mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
-    mirror[0, 3] = 4.0
+    mirror = np.array([[0, -1, 0, 4], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], float)
     scene.add_geometry(shape, node_name="there", transform=mirror)
     scene.add_geometry(trimesh.PointCloud([[9.0, 9.0, 9.0]]))
     joined = load_mesh(scene)
     count = len(shape.faces)
     np.testing.assert_array_equal(joined.vertices[joined.faces[:count]], shape.vertices[shape.faces])
-    mirrored = shape.vertices[shape.faces][:, ::-1] * [-1, 1, 1] + [4, 0, 0]
+    mirrored = shape.vertices[shape.faces][:, ::-1][..., [1, 2, 0]] * [-1, 1, 1] + [4, 0, 0]
     np.testing.assert_array_equal(joined.vertices[joined.faces[count:]], mirrored)
     assert describe_mesh(joined)["components"] == 2
 
@@ -185,7 +184,7 @@ def test_clean_mesh_is_kept_bit_for_bit():
 
 
 def test_weld_counts_and_order():
-    vertices = [[9, 9, 9], [1, 0, 0], [0, 0, 0], [-0.0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, np.nextafter(0, 1)]]
+    vertices = [[9, 9, 9], [1, 0, 0], [-0.0, 0, 0], [0, -0.0, 0], [0, 1, 0], [1, 0, 0], [0, 0, np.nextafter(0, 1)]]
     faces = [[2, 1, 4], [3, 5, 4], [2, 3, 4], [6, 1, 4]]
     mesh = mesh_from_arrays(vertices, faces)
     np.testing.assert_array_equal(mesh.vertices, [[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, np.nextafter(0, 1)]])
@@ -220,6 +219,7 @@ def test_random_soups(soup):
     mesh = mesh_from_arrays(vertices, faces)
     np.testing.assert_array_equal(mesh.vertices[mesh.faces], vertices[faces])
     np.testing.assert_array_equal(mesh.dropped_faces, dropped)
+    assert not np.signbit(mesh.vertices[mesh.vertices == 0.0]).any()
     assert len({tuple(x) for x in mesh.vertices}) == len(mesh.vertices)
     assert set(mesh.faces.ravel().tolist()) == set(range(len(mesh.vertices)))
     assert mesh.file_vertex_count == mesh.unreferenced_count + mesh.welded_count + len(mesh.vertices)
@@ -282,6 +282,14 @@ def test_describe_two_components_duplicates_and_zero_area():
     assert describe(tiny, faces)["zero_area_faces"] == describe(huge, faces)["zero_area_faces"] == 1
 
 
+def test_zero_area_allows_for_rounding():
+    line = [[0.6, 0.3, 0.0], [0.6, 0.54, 0.27], [0.6, 0.86, 0.63]]
+    line[2][1] = np.nextafter(0.86, 0)
+    cross = np.cross(np.subtract(line[1], line[0]), np.subtract(line[2], line[0]))
+    assert 0 < np.linalg.norm(cross) < 1e-16
+    assert describe(line, [[0, 1, 2]])["zero_area_faces"] == 1
+
+
 def test_components_of_a_shuffled_strip():
     count = 20000
     order = np.random.default_rng(3).permutation(count + 2)
@@ -291,9 +299,20 @@ def test_components_of_a_shuffled_strip():
     assert describe(vertices, order[strip])["components"] == 3
 
 
+@pytest.mark.parametrize("chains, length", [(300, 30), (2000, 8)])
+def test_components_of_shuffled_chains(chains, length):
+    # Faces of a chain share one vertex with the next; labels travel along it in a random order.
+    size = 2 * length + 1
+    faces = size * np.arange(chains)[:, None, None] + 2 * np.arange(length)[:, None] + np.arange(3)
+    order = np.random.default_rng(5).permutation(chains * size)
+    vertices = np.random.default_rng(6).random((chains * size, 3))
+    assert describe(vertices, order[faces.reshape(-1, 3)])["components"] == chains
+
+
 # Errors.
 
 V, F = TRIANGLE
+STL = b"solid\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
 BIG = np.broadcast_to(np.array([0, 1, 2], dtype=np.int32), (2**30 + 1, 3))
 
 
@@ -360,7 +379,7 @@ def test_limits_are_included_and_integral_floats_pass():
         ("a.obj.gz", b"not gzip at all", "cannot be read"),
         ("a.obj.gz", gzip.compress(OBJ.encode())[:-20], "cannot be read"),
         ("a.stl", b"solid x\nfacet\nendsolid", "no faces"),
-        ("a.stl", b"solid\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 x\n\nendsolid", "cannot be read as stl"),
+        ("a.stl", STL + b"vertex x 0 0\nvertex 1 0 0\nvertex 0 1 0\n\nendsolid", "cannot be read as stl"),
         ("a.stl", b"", "no faces"),
         ("a.ply", b"not a ply", "cannot be read as ply"),
         ("a.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n", "cannot be read as off"),

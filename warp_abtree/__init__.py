@@ -9,10 +9,10 @@ from warp_abtree.scene import Scene, TreeState
 __version__ = "0.1.0"
 
 __all__ = [
+    "CapacityError",
     "MeshError",
     "Model",
     "ModelError",
-    "CapacityError",
     "Query",
     "Result",
     "Scene",

@@ -41,7 +41,8 @@ class Result:
         pairs: Object pairs asked, int32 (p, 2).
         any: Whether each pair intersects, bool (p,).
         count: Intersecting face pairs of each, int32 (p,); None for output "any".
-        faces: (pair, face of the pair's first object, face of its second), int32 (k, 3), sorted; None unless output is "faces".
+        faces: (pair, face of the pair's first object, face of its second), int32 (k, 3), sorted; None unless output
+            is "faces".
         node_tests, triangle_tests: Work done for each pair, int32 (p,).
     """
 
@@ -71,15 +72,17 @@ class Result:
             )
         if self._hit_demand > self._hit_room:
             raise CapacityError(
-                f"{self._hit_demand} face pairs intersect, the query has room for {self._hit_room}: capacity={self._hit_demand}"
+                f"{self._hit_demand} face pairs intersect, the query has room for {self._hit_room}: "
+                f"make it with capacity={self._hit_demand}"
             )
 
 
 class Query:
     """Intersection of many object pairs as an operator: allocates once, launches many times.
 
-    `launch()` only launches, so a CUDA graph can capture it (after one launch outside the capture, which builds the broad
-    phase's tree). A change of the scene's objects, or a change of LODs that grows its pool of states, asks for a new query.
+    `launch()` only launches, so a CUDA graph can capture it (after one launch outside the capture, which builds the
+    broad phase's tree). A change of the scene's objects, or a change of LODs that grows its pool of states, asks for
+    a new query.
 
     Args:
         scene: `Scene` whose poses and LODs hold at the time of each launch.
@@ -143,7 +146,13 @@ class Query:
         room = len(self.pairs)
         if room == 0:
             return
-        for array in (self.hits.any_hit, self.hits.count, self.hits.total, self.hits.node_tests, self.hits.triangle_tests):
+        for array in (
+            self.hits.any_hit,
+            self.hits.count,
+            self.hits.total,
+            self.hits.node_tests,
+            self.hits.triangle_tests,
+        ):
             array.zero_()
         wp.launch(
             pose.relate_pair_kernel,
@@ -168,7 +177,7 @@ class Query:
         return Result(pairs, self.output, found, len(self.pairs), total, len(self.hits.face), self.hits)
 
     def run(self) -> Result:
-        """Launch, grow the buffer of face pairs if it was too small, and return the whole result. Waits for the device."""
+        """Launch, grow the buffer of face pairs if it was too small, return the whole result. Waits for the device."""
         self.launch()
         total = int(self.hits.total.numpy()[0])
         if self.output == "faces" and total > len(self.hits.face):

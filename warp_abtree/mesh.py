@@ -232,11 +232,9 @@ def _weld(positions):
 
 
 def _zero_area(vertices, faces):
-    # An exact power of two brings the extent near 1, so that products neither overflow nor underflow.
-    scale = 2.0 ** -np.floor(np.log2(np.ptp(vertices, axis=0).max()))
     corner = vertices[faces[:, 0]]
-    x1, y1, z1 = ((vertices[faces[:, 1]] - corner) * scale).T
-    x2, y2, z2 = ((vertices[faces[:, 2]] - corner) * scale).T
+    x1, y1, z1 = (vertices[faces[:, 1]] - corner).T
+    x2, y2, z2 = (vertices[faces[:, 2]] - corner).T
     zero = np.ones(len(faces), dtype=bool)
     for p, q in ((y1 * z2, z1 * y2), (z1 * x2, x1 * z2), (x1 * y2, y1 * x2)):
         zero &= np.abs(p - q) <= 2.0**-50 * (np.abs(p) + np.abs(q))
@@ -296,7 +294,7 @@ def _load_file(path, name):
         raise MeshError(f"{path}: unknown extension '{kind}'; known here: {' '.join(sorted(known))}")
     try:
         with warnings.catch_warnings():
-            # NumPy only warns where a number in a text file cannot be read, and cuts the file short there.
+            # Older NumPy only warns where a number in a text file cannot be read, and cuts the file short there.
             warnings.filterwarnings("error", message="string or file could not be read")
             resolver = trimesh.resolvers.FilePathResolver(str(path))
             scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)

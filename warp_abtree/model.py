@@ -31,8 +31,8 @@ class ModelError(ValueError):
 class Model:
     """A mesh at every level of detail, and the tree over it.
 
-    LOD counts vertex splits from the base mesh: 0 is the base, `lod_max` the original. Face ids are the face's index in the
-    file at every LOD.
+    LOD counts vertex splits from the base mesh: 0 is the base, `lod_max` the original. Face ids are the face's index
+    in the file at every LOD.
 
     Attributes:
         name: Where the mesh came from.
@@ -106,7 +106,7 @@ class Model:
         return self.progressive.mesh_at(self.check_lod(lod))
 
     def error_at(self, lod) -> float:
-        """Return a certified bound [model units] on the distance of any original surface point to the surface at a LOD."""
+        """Return a certified bound [model units] on how far a point of the original surface lies from that at a LOD."""
         return float(self.progressive.lod_error[self.check_lod(lod)])
 
     def lod_for(self, fraction: float | None = None, tolerance: float | None = None) -> int:
@@ -145,7 +145,8 @@ class Model:
         """Read a model that `save` wrote, and check it whole.
 
         Raises:
-            ModelError: The file is missing, no such file, truncated, altered in a way that breaks it, or of another version.
+            ModelError: The file is missing, no such file, truncated, altered in a way that breaks it, or of another
+                version.
         """
         path = Path(path)
         try:

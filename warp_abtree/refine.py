@@ -1,4 +1,5 @@
-"""LOD change: which state serves which target, the faces I, R and D that change, and the update of every tree at once."""
+"""LOD change: which state serves which target, the faces I, R and D that change, and the update of every tree at
+once."""
 
 from dataclasses import dataclass
 
@@ -54,8 +55,8 @@ class Plan:
 def _plan(states: StateArrays, wanted: set, used: set) -> tuple[Plan, dict]:
     """Choose a state for every wanted (model, lod).
 
-    States that stand at a target stay; every other target takes the nearest state that no target keeps, in place, else a new
-    state that starts as a copy of the nearest. Nearest is by the length of the slice between them.
+    States that stand at a target stay; every other target takes the nearest state that no target keeps, in place,
+    else a new state that starts as a copy of the nearest. Nearest is by the length of the slice between them.
 
     Returns the plan, and the state of every wanted (model, lod).
     """
@@ -84,7 +85,9 @@ def _plan(states: StateArrays, wanted: set, used: set) -> tuple[Plan, dict]:
             plan.source.append(state)
         else:
             copies.append(key)
-    sources = [min(by_model.get(key[0], [-1]), key=lambda s, key=key: distance(s, key) if s >= 0 else 0) for key in copies]
+    sources = [
+        min(by_model.get(key[0], [-1]), key=lambda s, key=key: distance(s, key) if s >= 0 else 0) for key in copies
+    ]
     for state, key, source in zip(states.reserve([key[0] for key in copies]), copies, sources, strict=True):
         chosen[key] = state
         plan.state.append(state)
@@ -120,7 +123,7 @@ def _make_batch(models: ModelArrays, states: StateArrays, plan: Plan) -> UpdateB
 
 
 def _copy_states(models: ModelArrays, states: StateArrays, plan: Plan, batch: UpdateBatch):
-    """Copy the source of every state that starts from another one, before anything moves; clear the corners of a first one."""
+    """Copy the source of every state that starts from another, before anything moves; clear a first one's corners."""
     pairs = []
     for state, source, full in zip(plan.state, plan.source, batch.full, strict=True):
         if source < 0:

@@ -27,8 +27,8 @@ def check_poses(poses, what="poses") -> np.ndarray:
     """Return poses as float64, (n, 7) or (n, 4, 4).
 
     Raises:
-        ValueError: Another shape, a number that is not finite, a quaternion whose norm is off by more than 1e-3, a matrix that is
-            not rigid within 1e-6.
+        ValueError: Another shape, a number that is not finite, a quaternion whose norm is off by more than 1e-3, a
+            matrix that is not rigid within 1e-6.
     """
     poses = to_numpy(poses)
     if poses.dtype.kind not in "fiu":
@@ -62,7 +62,8 @@ class TreeState:
     Attributes:
         lod: Where it stands.
         status: 0 inactive, 1 active, per heap node (the root is 1), int32.
-        lower, upper: Boxes [model units], model frame, float64 (nodes, 3), rounded outwards; (+inf, -inf) where inactive.
+        lower, upper: Boxes [model units], model frame, float64 (nodes, 3), rounded outwards; (+inf, -inf) where
+            inactive.
         skip: The node that a traversal visits in place of each, -1 where inactive, int32.
         face_node: Leaf of each face, int32 (n_f,).
     """
@@ -173,7 +174,7 @@ class Scene:
         return self._arrays
 
     def _place(self, poses):
-        """Set poses of mixed kinds: quaternions are turned into matrices on the device, matrices are taken as they are."""
+        """Set poses of mixed kinds: the device turns quaternions into matrices, matrices are taken as they are."""
         objects = self._arrays[2]
         rows = np.zeros((len(poses), 7))
         rows[:, 6] = 1.0
@@ -201,12 +202,12 @@ class Scene:
         """Set the pose of every object.
 
         Args:
-            poses: (n, 7) x y z qx qy qz qw, quaternions normalised in float64, or (n, 4, 4) rigid matrices taken as they are;
-                float32 or float64 [world units].
+            poses: (n, 7) x y z qx qy qz qw, quaternions normalised in float64, or (n, 4, 4) rigid matrices taken as
+                they are; float32 or float64 [world units].
 
         Raises:
-            ValueError: Wrong shape or count, a number that is not finite, a quaternion or matrix that is no rotation; nothing is
-                changed.
+            ValueError: Wrong shape or count, a number that is not finite, a quaternion or matrix that is no rotation;
+                nothing is changed.
         """
         poses = check_poses(poses)
         if len(poses) != self.object_count:
@@ -256,7 +257,9 @@ class Scene:
             raise ValueError(f"pairs: shape {pairs.shape} and type {pairs.dtype}, not whole numbers of shape (p, 2)")
         bad = np.flatnonzero(((pairs < 0) | (pairs >= self.object_count)).any(1))
         if len(bad):
-            raise ValueError(f"pairs: pair {bad[0]} is {tuple(pairs[bad[0]].tolist())}, the scene has {self.object_count} objects")
+            raise ValueError(
+                f"pairs: pair {bad[0]} is {tuple(pairs[bad[0]].tolist())}, the scene has {self.object_count} objects"
+            )
         bad = np.flatnonzero(pairs[:, 0] == pairs[:, 1])
         if len(bad):
             raise ValueError(f"pairs: pair {bad[0]} pairs object {pairs[bad[0], 0]} with itself")
@@ -309,7 +312,7 @@ class Scene:
         """
         if not 0 <= int(i) < self.object_count:
             raise ValueError(f"object {i!r} is outside 0 .. {self.object_count - 1}")
-        models, states, objects = self.arrays()
+        _, states, objects = self.arrays()
         slot = states.slots[objects.state[int(i)]]
         model = self.models[slot.model]
         nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)

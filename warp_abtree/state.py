@@ -48,9 +48,7 @@ class ModelArrays:
             np.where(f.vertex_parent < 0, -1, f.vertex_parent + s).astype(np.int32)
             for f, s in zip(forests, self.vertex_start[:-1], strict=True)
         ]
-        corners = [
-            (f.face_vertex + s).astype(np.int32) for f, s in zip(forests, self.vertex_start[:-1], strict=True)
-        ]
+        corners = [(f.face_vertex + s).astype(np.int32) for f, s in zip(forests, self.vertex_start[:-1], strict=True)]
         pool = ModelPool()
         pool.vertex_parent = joined(parents, wp.int32)
         pool.vertex_pos = joined([f.vertex_pos for f in forests], wp.vec3d)

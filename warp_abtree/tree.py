@@ -76,8 +76,9 @@ def _sort_leaves(lower, upper, depth):
 def active_build(vertex_pos: np.ndarray, face_vertex: np.ndarray) -> Tree:
     """Build the balanced tree over all faces top-down (ACTIVE-BUILD).
 
-    Each segment splits at its median along the longest axis of its box, in the order of the faces' box centres, ties by face
-    index; halves are equal to within one. The node at depth d and index i holds leaf positions (i n) >> d .. ((i+1) n) >> d.
+    Each segment splits at its median along the longest axis of its box, in the order of the faces' box centres, ties
+    by face index; halves are equal to within one. The node at depth d and index i holds leaf positions (i n) >> d ..
+    ((i+1) n) >> d.
 
     Args:
         vertex_pos: Original vertices [model units], float64 (v, 3).

@@ -1,0 +1,32 @@
+"""python -m bench query|update [--device D] [--json FILE]"""
+
+import argparse
+import json
+import sys
+
+import warp as wp
+
+from . import query, update
+
+CASES = {"query": query.run, "update": update.run}
+
+
+def main(argv=None):
+    parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
+    parser.add_argument("name", choices=sorted(CASES))
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--json", metavar="FILE", help="write the rows to a file as well")
+    options = parser.parse_args(argv)
+    wp.config.quiet = True
+    rows = []
+    for row in CASES[options.name](options.device):
+        rows.append(row)
+        print("  ".join(f"{key}={value}" for key, value in row.items()), flush=True)
+    if options.json:
+        with open(options.json, "w") as file:
+            json.dump({"warp": wp.config.version, "rows": rows}, file, indent=1)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
