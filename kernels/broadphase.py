@@ -63,7 +63,7 @@ def append_pair(
         if at < excluded.shape[0] and excluded[at] == key:
             return
     slot = wp.atomic_add(pair_count, 0, 1)
-    if slot < pairs.shape[0]:
+    if slot >= 0 and slot < pairs.shape[0]:
         pairs[slot] = wp.vec2i(low, high)
 
 

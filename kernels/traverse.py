@@ -44,15 +44,15 @@ class Hits:
     """Results of a batch of pairs.
 
     any_hit, count: shape [pair]. face: (pair, face a, face b), a of the pair's first object, shape [capacity]; total
-    keeps counting past the capacity. node_tests, triangle_tests: work done, shape [pair].
+    numbers them and may wrap, the demand is the sum of count. node_tests, triangle_tests: work done, shape [pair].
     """
 
     any_hit: wp.array(dtype=wp.int32)
-    count: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int64)
     face: wp.array(dtype=wp.vec3i)
     total: wp.array(dtype=wp.int32)
-    node_tests: wp.array(dtype=wp.int32)
-    triangle_tests: wp.array(dtype=wp.int32)
+    node_tests: wp.array(dtype=wp.int64)
+    triangle_tests: wp.array(dtype=wp.int64)
 
 
 @wp.func
@@ -89,7 +89,7 @@ def report_hit(output: wp.int32, pair: wp.int32, swapped: wp.int32, face_a: wp.i
     hits.any_hit[pair] = 1
     if output == OUTPUT_FACES:
         slot = wp.atomic_add(hits.total, 0, 1)
-        if slot < hits.face.shape[0]:
+        if slot >= 0 and slot < hits.face.shape[0]:
             if swapped != 0:
                 hits.face[slot] = wp.vec3i(pair, face_b, face_a)
             else:
@@ -139,24 +139,25 @@ def traverse_depth_first(
     pose: PairPose,
     hits: Hits,
 ):
-    """Traverse from one pair of nodes in this thread; return (hits, node tests, triangle tests)."""
+    """Traverse from one pair of nodes in this thread; return hits, node tests and triangle tests."""
     stack = stack_type()
     stack[0] = start_a
     stack[1] = start_b
     top = wp.int32(1)
-    hit_count = wp.int32(0)
-    node_tests = wp.int32(0)
-    triangle_tests = wp.int32(0)
+    hit_count = wp.int64(0)
+    node_tests = wp.int64(0)
+    triangle_tests = wp.int64(0)
+    one = wp.int64(1)
     while top > 0:
         top -= 1
         node_a = stack[2 * top]
         node_b = stack[2 * top + 1]
         kind, x, y = visit_nodes(models, states, trees, pose, node_a, node_b)
-        node_tests += 1
+        node_tests += one
         if kind == 1:
-            triangle_tests += 1
+            triangle_tests += one
             if test_faces(models, states, trees, pose, x, y):
-                hit_count += 1
+                hit_count += one
                 report_hit(output, pair, swapped, x, y, hits)
                 if output == OUTPUT_ANY:
                     top = 0
@@ -172,7 +173,7 @@ def traverse_depth_first(
             stack[2 * top + 2] = node_a
             stack[2 * top + 3] = y
             top += 2
-    return hit_count, node_tests, triangle_tests
+    return wp.vec3l(hit_count, node_tests, triangle_tests)
 
 
 @wp.kernel
@@ -196,12 +197,10 @@ def traverse_thread_kernel(
     trees = locate_trees(models, states, state_a, state_b)
     skip_a = states.node_skip[trees.node_a + 1]
     skip_b = states.node_skip[trees.node_b + 1]
-    hit_count, node_tests, triangle_tests = traverse_depth_first(
-        output, p, swapped, skip_a, skip_b, models, states, trees, pair_poses[p], hits_out
-    )
-    hits_out.count[p] = hit_count
-    hits_out.node_tests[p] = node_tests
-    hits_out.triangle_tests[p] = triangle_tests
+    counts = traverse_depth_first(output, p, swapped, skip_a, skip_b, models, states, trees, pair_poses[p], hits_out)
+    hits_out.count[p] = counts[0]
+    hits_out.node_tests[p] = counts[1]
+    hits_out.triangle_tests[p] = counts[2]
 
 
 @wp.func
@@ -217,10 +216,10 @@ def finish_refused(
     pose: PairPose,
     hits: Hits,
 ):
-    """Traverse depth first from a pair of nodes that the shared stack had no room for; return the three counts."""
+    """Traverse depth first from a pair of nodes that the shared stack had no room for; return the counts."""
     if refused:
         return traverse_depth_first(output, pair, swapped, node[0], node[1], models, states, trees, pose, hits)
-    return 0, 0, 0
+    return wp.vec3l()
 
 
 @wp.kernel
@@ -246,7 +245,8 @@ def traverse_block_kernel(
     low = objects.state[wp.min(pairs[p][0], pairs[p][1])]
     trees = locate_trees(models, states, low, objects.state[wp.max(pairs[p][0], pairs[p][1])])
     pose = pair_poses[p]
-    counts = wp.vec3i(0, 0, 0)
+    counts = wp.vec3l()
+    zero, one = wp.int64(0), wp.int64(1)
     stack = wp.tile_stack(capacity=SHARED_LENGTH, dtype=wp.vec2i)
     # Visits stop at block_dim candidates and add at most as many, so this stack never fills.
     candidates = wp.tile_stack(capacity=CANDIDATE_LENGTH, dtype=wp.vec2i)
@@ -258,26 +258,23 @@ def traverse_block_kernel(
         if wp.tile_stack_count(candidates) >= ready or wp.tile_stack_count(stack) == 0:
             faces, face_slot = wp.tile_stack_pop(candidates)
             if face_slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
-                counts += wp.vec3i(0, 0, 1)
+                counts += wp.vec3l(zero, zero, one)
                 if test_faces(models, states, trees, pose, faces[0], faces[1]):
-                    counts += wp.vec3i(1, 0, 0)
+                    counts += wp.vec3l(one, zero, zero)
                     report_hit(output, p, swapped, faces[0], faces[1], hits_out)
         else:
             item, slot = wp.tile_stack_pop(stack)
             kind, x, y = wp.int32(0), wp.int32(0), wp.int32(0)
             if slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
                 kind, x, y = visit_nodes(models, states, trees, pose, item[0], item[1])
-                counts += wp.vec3i(0, 1, 0)
+                counts += wp.vec3l(zero, one, zero)
             wp.tile_stack_push(candidates, wp.vec2i(x, y), kind == 1)
             for child in range(2):
                 z = wp.where(child == 0, x, y)
                 node = wp.where(kind == 2, wp.vec2i(z, item[1]), wp.vec2i(item[0], z))
                 kept = wp.tile_stack_push(stack, node, kind >= 2)
                 refused = kind >= 2 and kept < 0
-                hit, nodes, faces_tested = finish_refused(
-                    output, p, swapped, refused, node, models, states, trees, pose, hits_out
-                )
-                counts += wp.vec3i(hit, nodes, faces_tested)
+                counts += finish_refused(output, p, swapped, refused, node, models, states, trees, pose, hits_out)
     wp.atomic_add(hits_out.count, p, counts[0])
     wp.atomic_add(hits_out.node_tests, p, counts[1])
     wp.atomic_add(hits_out.triangle_tests, p, counts[2])

@@ -9,6 +9,10 @@ from warp_abtree.state import ModelArrays, ObjectArrays, StateArrays
 EVERY_WORLD = -1
 
 
+class CapacityError(RuntimeError):
+    """A buffer was too small and work was lost; the message names the demand."""
+
+
 class BroadPhase:
     """Broad phase of a fixed set of objects: allocates once, launches many times.
 
@@ -69,14 +73,24 @@ class BroadPhase:
             device=self.device,
         )
 
+    def count_found(self) -> int:
+        """Return how many pairs the last launch found. Waits for the device.
+
+        Raises:
+            CapacityError: 2^31 pairs or more.
+        """
+        found = int(self.pair_count.numpy()[0])
+        if found < 0:
+            raise CapacityError("the broad phase found 2^31 object pairs or more; use more worlds or fewer objects")
+        return found
+
     def find(self) -> np.ndarray:
         """Return all pairs, int32 (p, 2), sorted, i < j. Waits for the device; buffers grow as needed."""
         self.launch()
-        found = int(self.pair_count.numpy()[0])
+        found = self.count_found()
         if found > len(self.pairs):
             self.resize(found)
             self.launch()
-            found = int(self.pair_count.numpy()[0])
         pairs = self.pairs.numpy()[:found].reshape(-1, 2)
         return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 

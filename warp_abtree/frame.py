@@ -109,10 +109,13 @@ class Frame:
         self.clock = clock
         self.history: list[FrameRow] = []
         self._poses = np.empty((scene.object_count, 7))
-        self._lods = np.array(scene.lods)
         self._model = np.array(scene.object_model)
-        self._measure_lods()
         scene.arrays()
+        self._measure_lods()
+
+    def warm_up(self):
+        """Run broad and narrow phase once and keep no row, so that no row times the loading of kernels."""
+        self.scene.intersect(self.scene.broad_phase(), output=self.output)
 
     def poses_at(self, time: float) -> np.ndarray:
         """Return the poses of a time [s], (n, 7), in a buffer that the next call overwrites.
@@ -129,7 +132,7 @@ class Frame:
         number = len(self.history)
         time = number * self.time_step
         marks = [self._mark()]
-        nodes_refitted = self._set_lods(time)
+        stats = self._set_lods(time)
         marks.append(self._mark())
         if self.motion is not None:
             self.scene.set_poses(self.poses_at(time))
@@ -139,6 +142,8 @@ class Frame:
         result = self.scene.intersect(pairs, output=self.output)
         marks.append(self._mark())
         stage_ms = {stage: 1e3 * (end - begin) for stage, begin, end in zip(STAGES, marks, marks[1:])}
+        if stats is not None:
+            self._measure_lods()
         self.history.append(
             FrameRow(
                 frame=number,
@@ -151,7 +156,7 @@ class Frame:
                 lod_min=int(self._lods.min()),
                 lod_max=int(self._lods.max()),
                 faces=self._faces,
-                nodes_refitted=nodes_refitted,
+                nodes_refitted=0 if stats is None else int(np.sum(stats.nodes_refitted, dtype=np.int64)),
                 **stage_ms,
             )
         )
@@ -170,18 +175,14 @@ class Frame:
         wp.synchronize_device(self.scene.device)
         return self.clock()
 
-    def _set_lods(self, time) -> int:
-        if self.lods is None:
-            return 0
-        wanted = np.asarray(self.lods(time))
-        if np.array_equal(wanted, self._lods):
-            return 0
-        stats = self.scene.set_lods(wanted)
-        self._lods = wanted.astype(np.int64)
-        self._measure_lods()
-        return int(np.sum(stats.nodes_refitted, dtype=np.int64))
+    def _set_lods(self, time):
+        wanted = None if self.lods is None else np.asarray(self.lods(time))
+        if wanted is None or np.array_equal(wanted, self.scene.lods):
+            return None
+        return self.scene.set_lods(wanted)
 
     def _measure_lods(self):
+        self._lods = self.scene.lods.astype(np.int64)
         keys, repeats = np.unique(np.stack([self._model, self._lods], axis=1), axis=0, return_counts=True)
         models = self.scene.models
         self._states = len(keys)

@@ -3,16 +3,12 @@
 import numpy as np
 import warp as wp
 
-from warp_abtree.broadphase import BroadPhase
+from warp_abtree.broadphase import BroadPhase, CapacityError
 from warp_abtree.kernels import pose, traverse
 
 OUTPUTS = {"any": traverse.OUTPUT_ANY, "count": traverse.OUTPUT_COUNT, "faces": traverse.OUTPUT_FACES}
 PRECISIONS = ("exact", "float64", "float32")
 BLOCK_DIM = 128
-
-
-class CapacityError(RuntimeError):
-    """A buffer was too small and work was lost; the message names the demand."""
 
 
 def check_request(output: str, precision: str, within=None):
@@ -40,16 +36,16 @@ class Result:
     Attributes:
         pairs: Object pairs asked, int32 (p, 2).
         any: Whether each pair intersects, bool (p,).
-        count: Intersecting face pairs of each, int32 (p,); None for output "any".
+        count: Intersecting face pairs of each, int64 (p,); None for output "any".
         faces: (pair, face of the pair's first object, face of its second), int32 (k, 3), sorted; None unless output
             is "faces".
-        node_tests, triangle_tests: Work done for each pair, int32 (p,).
+        node_tests, triangle_tests: Work done for each pair, int64 (p,).
     """
 
-    def __init__(self, pairs, output, pair_demand, pair_room, hit_demand, hit_room, hits):
+    def __init__(self, pairs, output, pair_demand, pair_room, hits):
         self.pairs = pairs
         self._pair_demand, self._pair_room = pair_demand, pair_room
-        self._hit_demand, self._hit_room = hit_demand, hit_room
+        self._hit_demand, self._hit_room = 0, len(hits.face)
         p = len(pairs)
         self.any = hits.any_hit.numpy()[:p] != 0
         self.node_tests = hits.node_tests.numpy()[:p]
@@ -57,7 +53,8 @@ class Result:
         self.count = hits.count.numpy()[:p] if output != "any" else None
         self.faces = None
         if output == "faces":
-            faces = hits.face.numpy()[: min(hit_demand, hit_room)].reshape(-1, 3)
+            self._hit_demand = int(self.count.sum())
+            faces = hits.face.numpy()[: min(self._hit_demand, self._hit_room)].reshape(-1, 3)
             self.faces = faces[np.lexsort((faces[:, 2], faces[:, 1], faces[:, 0]))]
 
     def check(self):
@@ -116,13 +113,18 @@ class Query:
             pairs = scene.check_pairs(pairs)
             self.pairs = wp.array(pairs, dtype=wp.vec2i, device=self.device)
             self.pair_count = wp.array([len(pairs)], dtype=wp.int32, device=self.device)
+        self.hits = traverse.Hits()
+        self.hits.total = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self._allocate_pairs()
+        self.resize((capacity or max(1024, 16 * len(self.pairs))) if output == "faces" else 0)
+
+    def _allocate_pairs(self):
+        """Make room for whatever belongs to a pair."""
         room = len(self.pairs)
         self.pair_poses = wp.empty(room, dtype=pose.PairPose, device=self.device)
-        self.hits = traverse.Hits()
-        for name in ("any_hit", "count", "node_tests", "triangle_tests"):
-            setattr(self.hits, name, wp.zeros(room, dtype=wp.int32, device=self.device))
-        self.hits.total = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self.resize((capacity or max(1024, 16 * room)) if output == "faces" else 0)
+        self.hits.any_hit = wp.zeros(room, dtype=wp.int32, device=self.device)
+        for name in ("count", "node_tests", "triangle_tests"):
+            setattr(self.hits, name, wp.zeros(room, dtype=wp.int64, device=self.device))
 
     def resize(self, capacity: int):
         """Make room for a number of intersecting face pairs."""
@@ -171,21 +173,27 @@ class Query:
 
     def result(self) -> Result:
         """Return the results of the last launch on the host, sorted. Waits for the device."""
-        found = int(self.pair_count.numpy()[0])
+        found = self.broad_phase.count_found() if self.broad_phase is not None else len(self.pairs)
         pairs = self.pairs.numpy()[: min(found, len(self.pairs))].reshape(-1, 2)
-        total = int(self.hits.total.numpy()[0])
-        return Result(pairs, self.output, found, len(self.pairs), total, len(self.hits.face), self.hits)
+        return Result(pairs, self.output, found, len(self.pairs), self.hits)
 
     def run(self) -> Result:
-        """Launch, grow the buffer of face pairs if it was too small, return the whole result. Waits for the device."""
+        """Launch, grow buffers that were too small, and return the whole result. Waits for the device."""
         self.launch()
-        total = int(self.hits.total.numpy()[0])
-        if self.output == "faces" and total > len(self.hits.face):
-            self.resize(total)
+        if self.broad_phase is not None and self.broad_phase.count_found() > len(self.pairs):
+            self.broad_phase.resize(self.broad_phase.count_found())
+            self.pairs = self.broad_phase.pairs
+            self._allocate_pairs()
+            self.launch()
+        if self.output == "faces" and self._hit_demand() > len(self.hits.face):
+            self.resize(self._hit_demand())
             self.traverse()
         result = self.result()
         result.check()
         return result
+
+    def _hit_demand(self) -> int:
+        return int(self.hits.count.numpy().sum())
 
 
 def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precision="float64", device=None):

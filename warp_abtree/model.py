@@ -209,8 +209,10 @@ def _assemble(path, arrays, leaf_node, name) -> Model:
         np.isfinite(error).all() and error[-1] == 0 and (np.diff(error) <= 0).all(),
         "'lod_error' is not finite, falling and 0 at the end",
     )
-    progressive = ProgressiveMesh(**arrays)
-    tree = active_build(pos[:n_v], faces)
-    require(np.array_equal(tree.leaf_node, leaf_node), "'leaf_node' is not the tree of these faces")
     require((split <= m).any(), "no face is ever active")
-    return Model(progressive, tree, name)
+    require(leaf_node.dtype == np.int32 and leaf_node.shape == (n_f,), "'leaf_node' has the wrong type or length")
+    try:
+        tree = Tree.from_leaves(leaf_node)
+    except ValueError as mistake:
+        raise ModelError(f"{path}: {mistake}") from None
+    return Model(ProgressiveMesh(**arrays), tree, name)

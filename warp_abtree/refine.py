@@ -193,11 +193,10 @@ def set_object_lods(
     plan, chosen = _plan(states, set(wanted), used)
     batch = _make_batch(models, states, plan)
     if plan.state:
-        states.upload_slots()
-        _copy_states(models, states, plan, batch)
         for state, lod in zip(plan.state, plan.lod, strict=True):
             states.slots[state].lod = lod
         states.upload_slots()
+        _copy_states(models, states, plan, batch)
         refine_meshes(models, states, batch)
         active_update(models.pool, states.pool, batch)
     serving = np.array([chosen[key] for key in wanted], np.int32)[inverse.reshape(-1)]

@@ -28,10 +28,42 @@ class Tree:
     node_face: np.ndarray
     depth: int
 
+    @classmethod
+    def from_leaves(cls, leaf_node: np.ndarray) -> "Tree":
+        """Make the tree that an indexed list describes.
+
+        Raises:
+            ValueError: The list does not give every face a leaf of its own.
+        """
+        n = len(leaf_node)
+        node_face = np.full(2 << find_depth(n), -1, np.int32)
+        if not np.array_equal(np.sort(leaf_node), np.sort(leaf_nodes(n))):
+            raise ValueError(f"the indexed list is not one leaf for each of {n} faces")
+        node_face[leaf_node] = np.arange(n, dtype=np.int32)
+        return cls(leaf_node, node_face, find_depth(n))
+
     @property
     def node_count(self) -> int:
         """Length of the node arrays: heap indices 0 .. 2^(depth+1)-1, 2n-1 of them in use."""
         return len(self.node_face)
+
+
+def find_depth(n: int) -> int:
+    """Return the depth of a tree of n leaves, ceil(log2 n)."""
+    return (n - 1).bit_length()
+
+
+def leaf_nodes(n: int) -> np.ndarray:
+    """Return the heap index of each leaf position of a tree of n leaves, int32 (n,)."""
+    depth = find_depth(n)
+    bounds = (np.arange((1 << depth) + 1) * n) >> depth
+    index = np.flatnonzero(np.diff(bounds))
+    node = (1 << depth) + index
+    if depth > 0:
+        # Halves equal to within one put every leaf on one of the two deepest levels.
+        above = (np.arange((1 << (depth - 1)) + 1) * n) >> (depth - 1)
+        node = np.where(np.diff(above)[index >> 1] == 1, node >> 1, node)
+    return node.astype(np.int32)
 
 
 def _partition(order, left, begin, middle):
@@ -93,21 +125,10 @@ def active_build(vertex_pos: np.ndarray, face_vertex: np.ndarray) -> Tree:
     if not 0 < n <= FACE_COUNT_MAX:
         raise ValueError(f"an AB-Tree needs 1 to 2^30 faces, not {n}")
     corners = vertex_pos[face_vertex]
-    depth = (n - 1).bit_length()
-    leaf_face = _sort_leaves(corners.min(1), corners.max(1), depth)
-    # Halves equal to within one put every leaf on one of the two deepest levels.
-    node_face = np.full(2 << depth, -1, np.int32)
-    bounds = (np.arange((1 << depth) + 1) * n) >> depth
-    deep = np.flatnonzero(np.diff(bounds))
-    node = (1 << depth) + deep
-    if depth > 0:
-        above = (np.arange((1 << (depth - 1)) + 1) * n) >> (depth - 1)
-        single = np.diff(above)[deep >> 1] == 1
-        node = np.where(single, node >> 1, node)
-    node_face[node] = leaf_face[bounds[deep]]
+    leaf_face = _sort_leaves(corners.min(1), corners.max(1), find_depth(n))
     leaf_node = np.empty(n, np.int32)
-    leaf_node[leaf_face] = node
-    return Tree(leaf_node, node_face, depth)
+    leaf_node[leaf_face] = leaf_nodes(n)
+    return Tree.from_leaves(leaf_node)
 
 
 @dataclass
