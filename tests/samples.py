@@ -1,6 +1,6 @@
 """Meshes, models and poses that several tests use."""
 
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ from oracle_abtree import Progressive
 from oracle_triangle import brute_force_faces, quaternion_matrix
 
 import warp_abtree as ab
+from warp_abtree.mesh import load_mesh
 
 REAL_MESHES = ("cow", "fandisk", "fcl-env", "fcl-rob", "homer", "rocker-arm", "stanford-bunny", "woody")
 WARP_MESHES = ("warp:bunny", "warp:bear", "warp:rocks")
@@ -17,7 +18,7 @@ STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def soup(faces, seed, lattice=0):
-    """Random corners: nonmanifold, with faces that repeat a corner; on a small lattice also with ties and duplicates."""
+    """Random corners: nonmanifold, with faces that repeat a corner; on a small lattice with ties and duplicates too."""
     rng = np.random.default_rng(seed)
     count = faces // 2 + 3
     vertices = rng.integers(0, lattice, (count, 3)).astype(float) if lattice else rng.normal(size=(count, 3))
@@ -78,18 +79,24 @@ SHAPES = {
 }
 
 
-@lru_cache(maxsize=None)
+@cache
 def sample(name, base_faces=4):
-    """Return the model of a shape, of a mesh inside Warp, or of a real mesh; skip the test where that is not at hand."""
+    """Return the model of a shape, of a mesh inside Warp, or of a real mesh; skip the test where that is not at hand.
+
+    Loaded meshes are brought to extents of 1 to 2 by a power of two, so that any two of them can meet.
+    """
     if name in SHAPES:
         return ab.Model.from_arrays(*SHAPES[name](), base_faces=base_faces, name=name)
     if name in WARP_MESHES:
         pytest.importorskip("pxr")
-        return ab.Model.load(name, base_faces=base_faces)
-    return ab.Model.load(real_mesh_path(name), base_faces=base_faces)
+        mesh = load_mesh(name)
+    else:
+        mesh = load_mesh(real_mesh_path(name))
+    exponent = np.frexp(np.ptp(mesh.vertices, axis=0).max())[1] - 1
+    return ab.Model.from_arrays(np.ldexp(mesh.vertices, -exponent), mesh.faces, base_faces=base_faces, name=name)
 
 
-@lru_cache(maxsize=None)
+@cache
 def plain(model):
     """Return a model's progressive mesh as the lists that the oracle reads."""
     return Progressive.of(model.progressive)

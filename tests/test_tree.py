@@ -47,7 +47,9 @@ def without_merges(vertices, faces):
 
 
 @settings(deadline=None, max_examples=60)
-@given(st.integers(1, 70), st.integers(0, 2**31), st.sampled_from([0, 2, 3, 9]), st.sampled_from([1.0, 2.0**90, 2.0**-90]))
+@given(
+    st.integers(1, 70), st.integers(0, 2**31), st.sampled_from([0, 2, 3, 9]), st.sampled_from([1.0, 2.0**90, 2.0**-90])
+)
 def test_build_of_soups_equals_the_oracle(count, seed, lattice, scale):
     vertices, faces = soup(count, seed, lattice)
     vertices = vertices * scale

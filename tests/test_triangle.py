@@ -18,9 +18,7 @@ ORDERS = [(p, q) for p in permutations(range(3)) for q in permutations(range(3))
 def intersect_pair_kernel(corners: wp.array2d(dtype=wp.vec3d), meet_out: wp.array(dtype=wp.int32)):
     """Test triangles corners[i, :3] and corners[i, 3:]."""
     i = wp.tid()
-    if intersect_triangles(
-        corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
-    ):
+    if intersect_triangles(corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]):
         meet_out[i] = 1
 
 

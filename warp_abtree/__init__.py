@@ -2,7 +2,7 @@
 
 from warp_abtree.broadphase import CapacityError
 from warp_abtree.dynamics import Kinematic
-from warp_abtree.frame import Frame, FrameRow
+from warp_abtree.frame import Frame, FrameRow, LodSweep, resolve_lod
 from warp_abtree.intersect import Query, Result, sweep
 from warp_abtree.mesh import MeshError, describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model import Model, ModelError
@@ -17,6 +17,7 @@ __all__ = [
     "Frame",
     "FrameRow",
     "Kinematic",
+    "LodSweep",
     "MeshError",
     "Model",
     "ModelError",
@@ -30,5 +31,6 @@ __all__ = [
     "load_mesh",
     "load_scene",
     "mesh_from_arrays",
+    "resolve_lod",
     "sweep",
 ]

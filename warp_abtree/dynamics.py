@@ -52,9 +52,9 @@ def _rows(values, count, width, what):
 class Kinematic:
     """Prescribed motion of n objects.
 
-    At time t an object stands at position + velocity t + wave(t / period + phase) shuttle, where the wave runs from 0 to 1 and
-    back in straight lines, and is turned by rate t about its axis through its own origin, after its start rotation. A single
-    row, or number, serves all objects.
+    At time t an object stands at position + velocity t + wave(t / period + phase) shuttle, where the wave runs from 0
+    to 1 and back in straight lines, and is turned by rate t about its axis through its own origin, after its start
+    rotation. A single row, or number, serves all objects.
 
     Attributes:
         position: Start [units], float64 (n, 3).
@@ -67,8 +67,8 @@ class Kinematic:
         phase: Part of a period by which the shuttle is ahead, (n,).
 
     Raises:
-        ValueError: Shapes that do not fit, numbers that are not finite, a quaternion whose norm is off 1 by more than 1e-3, an
-            axis of no length that turns, a period not above 0.
+        ValueError: Shapes that do not fit, numbers that are not finite, a quaternion whose norm is off 1 by more than
+            1e-3, an axis of no length that turns, a period not above 0.
     """
 
     position: np.ndarray

@@ -1,23 +1,78 @@
 """One frame after another: set LODs, move, find candidate pairs, intersect them; each stage timed on its own.
 
-LODs come from a function of time; their selection under a time budget (section 4.2 of the paper) comes later, and so does
-the movement that answers contacts.
+LODs come from a function of time; their selection under a time budget (section 4.2 of the paper) comes later, and so
+does the movement that answers contacts.
 
 Source: Liu et al. 2006, Algorithm 4.
 """
 
+import csv
+import json
+import math
+import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 import warp as wp
 
-from warp_abtree.dynamics import Kinematic
+from warp_abtree.dynamics import Kinematic, triangle_wave
 from warp_abtree.intersect import Result
+from warp_abtree.model import Model
 from warp_abtree.scene import Scene
 
 STAGES = ("refine_ms", "move_ms", "broad_ms", "query_ms")
+
+
+def resolve_lod(model: Model, wish) -> int:
+    """Return the LOD that a wish means for a model.
+
+    Args:
+        wish: A float is a part of the faces in (0, 1], an int a LOD; "finest", "coarsest", or "tol:X", the coarsest
+            LOD whose certified error is within X [model units]. A number as text with a dot is a float.
+
+    Raises:
+        ValueError: None of these, or out of range.
+    """
+    if wish in ("finest", "coarsest"):
+        return model.lod_max if wish == "finest" else 0
+    if isinstance(wish, str):
+        number, kinds = wish.removeprefix("tol:"), (float,) if wish.startswith("tol:") else (int, float)
+        for kind in kinds:
+            try:
+                value = kind(number)
+            except ValueError:
+                continue
+            return model.lod_for(tolerance=value) if number != wish else resolve_lod(model, value)
+        raise ValueError(f"LOD {wish!r} is none of a part of the faces, a whole number, finest, coarsest, tol:X")
+    return model.lod_for(fraction=wish) if isinstance(wish, float) else model.check_lod(wish)
+
+
+@dataclass(frozen=True)
+class LodSweep:
+    """LODs of some objects that go from one part of the faces to another and back, in equal ratios.
+
+    Attributes:
+        objects: Object indices by model, a list of (`Model`, int array).
+        start, turn: Parts of the faces at the start, and half a period later.
+        period: Time there and back [s].
+    """
+
+    objects: list
+    start: float
+    turn: float
+    period: float
+
+    def fraction(self, time: float) -> float:
+        """Return the part of the faces at a time [s]."""
+        return self.start * (self.turn / self.start) ** float(triangle_wave(time / self.period))
+
+    def apply(self, fraction: float, lods: np.ndarray):
+        """Write the LODs of a part of the faces into the LODs of all objects, int (n,)."""
+        for model, indices in self.objects:
+            lods[indices] = model.lod_for(fraction=fraction)
 
 
 @dataclass(frozen=True)
@@ -169,6 +224,41 @@ class Frame:
             if progress is not None:
                 progress(done, frames)
         return self.history
+
+    def summary(self) -> dict:
+        """Return mean, min and max of the counts, the range of LODs, and mean, p95 and total of stages [ms]."""
+        columns = {name: [row.as_dict()[name] for row in self.history] for name in FrameRow.names()}
+        found = {"frames": len(self.history), "objects": self.scene.object_count}
+        for name in ("states", "pairs", "touching", "hits", "faces", "nodes_refitted"):
+            values = np.array([math.nan if value is None else value for value in columns[name]], np.float64)
+            found[name] = {"mean": float(values.mean()), "min": float(values.min()), "max": float(values.max())}
+        found["lod_min"], found["lod_max"] = min(columns["lod_min"]), max(columns["lod_max"])
+        found["stages"] = {}
+        for name in (*STAGES, "total_ms"):
+            values = np.array(columns[name])
+            found["stages"][name] = {
+                "mean": float(values.mean()),
+                "p95": float(np.percentile(values, 95)),
+                "total": float(values.sum()),
+            }
+        return found
+
+    def record(self, path):
+        """Write the history to a .json file, or as CSV to any other; the file appears whole or not at all."""
+        path = Path(path)
+        partial = path.with_name(path.name + ".partial")
+        rows = [row.as_dict() for row in self.history]
+        try:
+            with open(partial, "w", newline="", encoding="utf-8") as file:
+                if path.suffix.lower() == ".json":
+                    json.dump(rows, file, indent=1)
+                else:
+                    writer = csv.DictWriter(file, FrameRow.names())
+                    writer.writeheader()
+                    writer.writerows(rows)
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)
 
     def _mark(self) -> float:
         """Read the clock when the device has finished. (synchronization point)"""

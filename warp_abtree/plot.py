@@ -3,7 +3,9 @@
 Objects interpenetrate here, where sorting faces by depth fails, so visibility is decided pixel by pixel.
 """
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -11,17 +13,17 @@ from warp_abtree import Scene
 
 # Plain and intersecting faces, by model in the order of the scene.
 COLOURS = (
-    ((0.70, 0.66, 0.62), (0.05, 0.68, 0.22), "green"),
-    ((0.27, 0.45, 0.70), (1.00, 0.84, 0.10), "yellow"),
-    ((0.78, 0.45, 0.33), (0.95, 0.20, 0.55), "pink"),
-    ((0.50, 0.42, 0.66), (0.20, 0.85, 0.90), "cyan"),
+    ((0.80, 0.76, 0.71), (0.06, 0.74, 0.25)),
+    ((0.30, 0.50, 0.78), (1.00, 0.87, 0.12)),
+    ((0.84, 0.50, 0.37), (0.97, 0.22, 0.60)),
+    ((0.56, 0.48, 0.74), (0.20, 0.88, 0.94)),
 )
 BACKGROUND = (1.0, 1.0, 1.0)
 SAMPLES = 3  # along each side of a pixel
 CHUNK = 2_000_000  # candidate pixels at once
 # Directions to the lights in the eye's frame (right, up, towards the eye), and their strengths.
-AMBIENT = 0.34
-LIGHTS = (((-0.45, 0.75, 0.60), 0.62), ((0.80, 0.05, 0.45), 0.20))
+AMBIENT = 0.42
+LIGHTS = (((-0.45, 0.75, 0.60), 0.58), ((0.80, 0.05, 0.45), 0.18))
 
 
 @dataclass
@@ -75,7 +77,7 @@ def make_panel(scene: Scene, poses, objects, subject=None) -> Panel:
         for side in (0, 1):
             mine = pairs[result.faces[:, 0], side] == i if len(pairs) else np.zeros(0, bool)
             hit[result.faces[mine, 1 + side]] = True
-        plain, struck, _ = COLOURS[owner[i] % len(COLOURS)]
+        plain, struck = COLOURS[owner[i] % len(COLOURS)]
         triangles.append(place(poses[i], vertices)[faces])
         colours.append(np.where(hit[face_ids][:, None], struck, plain))
         shown[owner[i]] = shown.get(owner[i], 0) + len(face_ids)
@@ -86,7 +88,9 @@ def make_panel(scene: Scene, poses, objects, subject=None) -> Panel:
     else:
         lods = np.unique(scene.lods[objects[owner[objects] == subject]])
         span = f"{lods[0]:,}" if len(lods) == 1 else f"{lods[0]:,} to {lods[-1]:,}"
-        first = f"{scene.models[subject].name} at LOD {span} of {scene.models[subject].lod_max:,}: {shown[subject]:,} faces"
+        first = (
+            f"{scene.models[subject].name} at LOD {span} of {scene.models[subject].lod_max:,}: {shown[subject]:,} faces"
+        )
     second = f"{count:,} intersecting face pairs"
     if subject in hit_faces:
         second += f", {hit_faces[subject]:,} faces of the {scene.models[subject].name}"
@@ -158,7 +162,7 @@ def _weights(corner, x, y):
 
 
 def rasterise(corner, inverse, width, height):
-    """Return the foremost triangle of every pixel and its inverse depth, (height, width) each; -1 and 0 where there is none.
+    """Return the foremost triangle of every pixel and its inverse depth, (height, width); -1 and 0 where there is none.
 
     Args:
         corner: Pixel coordinates, y down, (t, 3, 2).
@@ -217,7 +221,7 @@ def _edges(corner, x, y):
     double = np.abs((bx - ax) * (cy - ay) - (by - ay) * (cx - ax))
     height = double[:, None] / np.maximum(side, 1e-12)
     distance = (_weights(corner, x, y) * height).min(axis=1) / SAMPLES
-    strength = np.clip(0.04 * np.sqrt(double) / SAMPLES, 0.10, 0.45)
+    strength = np.clip(0.03 * np.sqrt(double) / SAMPLES, 0.10, 0.40)
     return 1.0 - strength * np.clip(1.0 - (distance - 0.35) / 0.4, 0.0, 1.0)
 
 
@@ -244,8 +248,10 @@ def draw(panels: list[Panel], path, title: str, legend, eye, up, size: int = 620
     height = head + panel_head + rows + foot
     dpi = 100
     figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor=BACKGROUND)
-    FigureCanvasAgg(figure)
-    figure.text(0.5, 1 - 0.5 * head / height, title, ha="center", va="center", fontsize=15, fontweight="bold", color="0.15")
+    canvas = FigureCanvasAgg(figure)
+    figure.text(
+        0.5, 1 - 0.5 * head / height, title, ha="center", va="center", fontsize=15, fontweight="bold", color="0.15"
+    )
     for i, (panel, image) in enumerate(zip(panels, images)):
         left = gap + i * (columns + gap)
         axes = figure.add_axes((left / width, foot / height, columns / width, rows / height))
@@ -254,8 +260,26 @@ def draw(panels: list[Panel], path, title: str, legend, eye, up, size: int = 620
         where = (left + 0.5 * columns) / width, 1 - (head + 0.5 * panel_head) / height
         figure.text(*where, panel.title, ha="center", va="center", fontsize=10.5, color="0.25", linespacing=1.35)
     handles = [matplotlib.patches.Patch(facecolor=colour, edgecolor="0.4", label=label) for colour, label in legend]
-    figure.legend(handles=handles, loc="lower center", ncols=len(handles), frameon=False, fontsize=10.5, borderaxespad=0.6)
-    figure.savefig(path, format="png", dpi=dpi, facecolor=BACKGROUND, pil_kwargs={"optimize": True})
+    figure.legend(
+        handles=handles, loc="lower center", ncols=len(handles), frameon=False, fontsize=10.5, borderaxespad=0.6
+    )
+    _write_png(canvas, path)
+
+
+def _write_png(canvas, path):
+    """Write a canvas as a PNG of 256 colours, a third of the size; the file appears whole or not at all."""
+    import PIL.Image
+
+    canvas.draw()
+    image = PIL.Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
+    partial = Path(f"{path}.partial")
+    try:
+        image.quantize(256, PIL.Image.Quantize.MAXCOVERAGE, dither=PIL.Image.Dither.NONE).save(
+            partial, format="PNG", optimize=True
+        )
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _crop(images):
@@ -266,6 +290,16 @@ def _crop(images):
     rows, columns = np.flatnonzero(drawn.any(axis=1)), np.flatnonzero(drawn.any(axis=0))
     y, x = max(rows[0] - 8, 0), max(columns[0] - 8, 0)
     return [image[y : rows[-1] + 9, x : columns[-1] + 9] for image in images]
+
+
+def panel_lods(loaded) -> list[np.ndarray]:
+    """Return the LODs of all objects in each panel: both ends of the sweeps, or what the file's [picture] asks for."""
+    fractions = [loaded.picture.lods or [sweep.start, sweep.turn] for sweep in loaded.sweeps]
+    chosen = [loaded.base_lods.copy() for _ in range(len(fractions[0]) if fractions else 1)]
+    for sweep, parts in zip(loaded.sweeps, fractions):
+        for lods, part in zip(chosen, parts):
+            sweep.apply(part, lods)
+    return chosen
 
 
 def draw_scene(loaded, path, time: float):
@@ -291,14 +325,14 @@ def draw_scene(loaded, path, time: float):
     subject = next((i for i, model in enumerate(scene.models) if swept and model is swept[0]), None)
     before, panels = scene.lods, []
     try:
-        for lods in loaded.panel_lods():
+        for lods in panel_lods(loaded):
             scene.set_lods(lods)
             panels.append(make_panel(scene, loaded.motion.poses(time), objects, subject))
     finally:
         scene.set_lods(before)
     legend = []
     for i in dict.fromkeys(owner[objects].tolist()):
-        plain, struck, colour = COLOURS[i % len(COLOURS)]
+        plain, struck = COLOURS[i % len(COLOURS)]
         name = scene.models[i].name
         legend += [(plain, name), (struck, f"{name}, intersecting")]
     draw(panels, path, loaded.title, legend, picture.eye, picture.up)

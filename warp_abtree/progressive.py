@@ -9,8 +9,13 @@ import warp as wp
 from warp_abtree.kernels import collapse, deviation, forest
 
 MERGES_PER_LAUNCH = 25_000
-REPLAYS_PER_LAUNCH = 5_000
+COVERS_PER_LAUNCH = 200_000
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
+
+# What rounding can hide from a bound, in units of the extent's power of two (coordinates within 1/2, so 2^-54 each):
+# reading the vertices of both surfaces, a closest point of some ten operations, and the points of at most 24 cuts by
+# three planes each, every one of which lies within 2^-52 of the segment that it cuts: 2^-45 in all.
+ROUNDING = 2.0**-44
 
 
 @dataclass(frozen=True)
@@ -138,8 +143,8 @@ def build_progressive(mesh, base_faces=10, link_condition=False, progress=None):
     parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), bool(link_condition), report)
     vertex_pos = np.concatenate([vertices, centre + scale * pos[len(vertices) :]])
     face_split, split_start, split_face = _splits(parent, faces, len(vertices))
-    replay = deviation_of(vertex_pos, parent, faces, face_split, split_start, split_face, report)
-    return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, replay)
+    lod_error = _deviation(vertex_pos, parent, faces, report)
+    return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, lod_error)
 
 
 def _checked(mesh, base_faces):
@@ -198,7 +203,7 @@ def _filled(count, value, dtype=int):
     return wp.full(count, value, dtype=dtype, device="cpu")
 
 
-def linked_rings(faces, face_array, node_capacity):
+def _linked_rings(faces, face_array, node_capacity):
     """Return `forest.Rings` of the original mesh with room for `node_capacity` nodes."""
     rings = forest.Rings()
     rings.head = _filled(node_capacity, -1)
@@ -219,7 +224,7 @@ def _collapse(pos, faces, base_faces, link_condition, report):
     surface.quadric = wp.zeros(capacity, dtype=collapse.Quadric, device="cpu")
     surface.parent = _filled(capacity, -1)
     surface.stamp = _filled(capacity, -1)
-    rings = linked_rings(faces, face_array, capacity)
+    rings = _linked_rings(faces, face_array, capacity)
     wp.launch(
         collapse.weigh_faces_kernel, dim=1, inputs=[len(faces), face_array, _cpu(boundary, wp.int8), surface], device="cpu"
     )
@@ -275,6 +280,50 @@ def _splits(parent, faces, vertex_count):
     return face_split.numpy(), split_start, split_face.numpy()
 
 
-def deviation_of(vertex_pos, parent, faces, face_split, split_start, split_face, report):
-    m = len(split_start) - 1
-    return np.where(np.arange(m + 1) < m, np.inf, 0.0)
+def _deviation(vertex_pos, parent, faces, report):
+    """Return lod_error float64 [m+1]."""
+    centre, scale = _frame(vertex_pos[np.unique(faces)])
+    merge_count, face_count = _merge_count(parent), len(faces)
+    vertex_count = len(parent) - merge_count
+    if merge_count == 0:
+        return np.zeros(1)
+    child = np.flatnonzero(parent >= 0)
+    pair = child[np.argsort(parent[child], kind="stable")].reshape(-1, 2)
+    rings = _linked_rings(faces, _cpu(faces, int), len(parent))
+    replay = _replay((vertex_pos - centre) / scale, face_count)
+    scratch = deviation.Scratch()
+    scratch.near = _filled(face_count + deviation.SLOTS, 0)
+    scratch.used = _filled(deviation.SLOTS, 0)
+    scratch.waiting = wp.zeros((deviation.STACK, deviation.CORNERS), dtype=wp.vec3d, device="cpu")
+    scratch.waiting_count = _filled(deviation.STACK, 0)
+    scratch.piece = wp.zeros(deviation.CORNERS, dtype=wp.vec3d, device="cpu")
+    scratch.inner = wp.zeros(deviation.CORNERS, dtype=wp.vec3d, device="cpu")
+    counter = _filled(3, 0)
+    inputs = [face_count, _cpu(faces, int), rings.corner_node, replay, counter]
+    wp.launch(deviation.start_replay_kernel, dim=1, inputs=inputs, device="cpu")
+    bound_sq = wp.zeros(merge_count, dtype=wp.float64, device="cpu")
+    inputs = [vertex_count, merge_count, COVERS_PER_LAUNCH, _cpu(pair, int), replay, scratch, rings, counter, bound_sq]
+    state = counter.numpy()  # shares the memory
+    while state[0] < merge_count:
+        wp.launch(deviation.replay_merges_kernel, dim=1, inputs=inputs, device="cpu")
+        report("error", int(state[0]), merge_count)
+    error = scale * (np.sqrt(bound_sq.numpy()) + ROUNDING)
+    return np.append(error[::-1], 0.0)
+
+
+def _merge_count(parent):
+    # every merge has exactly two children
+    return int(np.count_nonzero(parent >= 0)) // 2
+
+
+def _replay(pos, face_count):
+    replay = deviation.Replay()
+    replay.pos = _cpu(pos, wp.vec3d)
+    for name in ("triangle_pos", "face_pos"):
+        setattr(replay, name, wp.zeros((face_count, 3), dtype=wp.vec3d, device="cpu"))
+    replay.face_ball = wp.zeros(face_count, dtype=wp.vec4d, device="cpu")
+    for name in ("live_face", "live_place", "face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face", "slot_count"):
+        setattr(replay, name, _filled(face_count, -1))
+    for name in ("slot_face", "slot_next", "slot_last"):
+        setattr(replay, name, _filled(deviation.SLOTS * face_count, -1))
+    return replay

@@ -8,8 +8,8 @@
 
     [models.NAME]                    # one of mesh and shape
     mesh = "cow.obj"                 # path from the scene file's folder, or "warp:bunny", "warp:bear", "warp:rocks"
-    shape = "torus"                  # or box, icosphere, uv_sphere, cylinder, cone, capsule, annulus, with the parameters
-    major_radius = 1.0               # that trimesh.creation has under these names
+    shape = "torus"                  # or box, icosphere, uv_sphere, cylinder, cone, capsule, annulus,
+    major_radius = 1.0               # with the parameters that trimesh.creation has under these names
     size = 1.0                       # scales the longest extent to this length [units], or
     scale = 2.0                      # scales all coordinates
     centre = true                    # moves the middle of the box to the model's origin (default false)
@@ -23,15 +23,15 @@
     world = 0                        # objects of different worlds never meet; -1 is in every world
     static = false                   # static objects never meet each other
     importance = 1                   # 1, 2 or 3, for the selection of LODs
-    lod = 0.25                       # part of the faces; or a whole number, "finest", "coarsest", "tol:0.01" [units], or a
-                                     # list, taken in turn
+    lod = 0.25                       # part of the faces; or a whole number, "finest", "coarsest", "tol:0.01" [units],
+                                     # or a list, taken in turn
     velocity = [0, 0, 0]             # [units/s]
     turn = { axis = [0, 1, 0], degrees = 45 }        # each second, about the object's origin
     shuttle = { by = [0, 0, 1], period = 4, phase = 0 }  # there and back in a period [s]
     count = 8                        # copies in the same world
     grid = { size = [4, 4, 2], spacing = [1, 1, 1] } # or copies on a grid around the position
     worlds = 16                      # and all of them once in each of so many worlds
-    random = { position = [1, 1, 1], rotation = true, velocity = 0.5, turn = 90, phase = true }  # up to so much, each way
+    random = { position = [1, 1, 1], rotation = true, velocity = 0.5, turn = 90, phase = true }  # up to so much
 
     [[lod_sweep]]                    # fine to coarse and back, in equal ratios
     model = "NAME"                   # or objects = ["left"]
@@ -49,19 +49,20 @@
 A key that is not listed here is refused.
 """
 
+import importlib
 import math
 import os
-import re
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import trimesh
 
-from warp_abtree import Frame, Kinematic, Model, Scene, load_mesh, mesh_from_arrays
+from warp_abtree import Frame, Kinematic, LodSweep, Model, Scene, load_mesh, mesh_from_arrays, resolve_lod
 
-OBJECT_LIMIT = 1_000_000
+OBJECT_LIMIT = 1_000_000  # of one entry
 _MISSING = object()
 
 
@@ -77,8 +78,7 @@ def _number(low=-math.inf, high=math.inf, open_low=False):
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise ValueError("not a finite number")
         if not low <= value <= high or (open_low and value == low):
-            raise ValueError(f"{value} is not {'above' if open_low else 'at least'} {low:g}" if high == math.inf else
-                             f"{value} is outside {low:g} .. {high:g}")
+            raise ValueError(f"{value} is not {'above' if open_low else 'from'} {low:g} to {high:g}")
         return float(value)
 
     return check
@@ -108,8 +108,9 @@ def _vector(length, check=None):
 
 def _direction(value):
     value = np.array(_vector(3)(value))
-    if not np.linalg.norm(value) > 0:
+    if not value.any():
         raise ValueError("a direction of no length")
+    value /= np.abs(value).max()  # no square over- or underflows
     return value / np.linalg.norm(value)
 
 
@@ -127,18 +128,21 @@ _text, _truth, _table = _kind(str, "a text"), _kind(bool, "true or false"), _kin
 
 def _one_or_list(check):
     def check_list(value):
-        entries = value if isinstance(value, list) else [value]
-        if not entries:
+        if value == []:
             raise ValueError("an empty list")
-        return [check(entry) for entry in entries]
+        return [check(entry) for entry in (value if isinstance(value, list) else [value])]
 
     return check_list
 
 
 def _lod(value):
     if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise ValueError("not a LOD: a part of the faces such as 0.25, a whole number, \"finest\" or \"coarsest\"")
+        raise ValueError('not a LOD: a part of the faces such as 0.25, a whole number, "finest" or "coarsest"')
     return value
+
+
+_LENGTH, _PART, _SECTIONS = _number(0.0, open_low=True), _number(0.0, 1.0, open_low=True), _whole(3, 10_000)
+_ORIGIN = [0.0, 0.0, 0.0]
 
 
 class _Keys:
@@ -151,19 +155,20 @@ class _Keys:
         self.values = dict(values)
 
     def at(self, key):
-        return f"{self.where}.{key}" if self.where else key
+        return ".".join(part for part in (self.where, key) if part) or "the file"
 
     def fail(self, key, message):
+        """Raise SceneError about a key, or about the table itself where key is None."""
         raise SceneError(f"{self.path}: {self.at(key)}: {message}") from None
 
     def take(self, key, check, default=_MISSING):
         if key not in self.values:
             if default is _MISSING:
-                raise SceneError(f"{self.path}: {self.where or 'the file'}: the key {key!r} is missing")
+                self.fail(None, f"the key {key!r} is missing")
             return default
         try:
             return check(self.values.pop(key))
-        except ValueError as error:
+        except (ValueError, OverflowError) as error:
             self.fail(key, error)
 
     def table(self, key):
@@ -178,12 +183,11 @@ class _Keys:
 
     def end(self):
         if self.values:
-            raise SceneError(f"{self.path}: {self.at(sorted(self.values)[0])}: unknown key")
+            self.fail(sorted(self.values)[0], "unknown key")
 
 
 # Models.
 
-_LENGTH, _SECTIONS = _number(0.0, open_low=True), _whole(3, 10_000)
 SHAPES = {
     "box": {"extents": _vector(3, _LENGTH)},
     "icosphere": {"subdivisions": _whole(0, 8), "radius": _LENGTH},
@@ -192,100 +196,50 @@ SHAPES = {
     "cone": {"radius": _LENGTH, "height": _LENGTH, "sections": _SECTIONS},
     "capsule": {"radius": _LENGTH, "height": _LENGTH, "count": _vector(2, _SECTIONS)},
     "annulus": {"r_min": _LENGTH, "r_max": _LENGTH, "height": _LENGTH, "sections": _SECTIONS},
-    "torus": {
-        "major_radius": _LENGTH,
-        "minor_radius": _LENGTH,
-        "major_sections": _SECTIONS,
-        "minor_sections": _SECTIONS,
-    },
+    "torus": dict.fromkeys(("major_radius", "minor_radius"), _LENGTH)
+    | dict.fromkeys(("major_sections", "minor_sections"), _SECTIONS),
 }
 
 
-@dataclass
-class _ModelRow:
-    keys: _Keys
-    name: str
-    mesh: str | None
-    shape: str | None
-    parameters: dict
-    size: float | None
-    scale: float | None
-    centre: bool
-    base_faces: int
-
-
-def _read_model(keys: _Keys, name) -> _ModelRow:
-    mesh, shape = keys.take("mesh", _text, None), keys.take("shape", _text, None)
-    if (mesh is None) == (shape is None):
-        raise SceneError(f"{keys.path}: {keys.where}: give one of mesh and shape")
-    parameters = {}
-    if shape is not None:
-        if shape not in SHAPES:
-            keys.fail("shape", f"{shape!r} is none of {', '.join(sorted(SHAPES))}")
-        parameters = {key: keys.take(key, check) for key, check in SHAPES[shape].items() if key in keys.values}
+def _read_model(keys: _Keys, name, folder: Path):
+    """Check [models.NAME] and return a function that builds the model."""
+    mesh_name, shape = keys.take("mesh", _text, None), keys.take("shape", _text, None)
+    if (mesh_name is None) == (shape is None):
+        keys.fail(None, "give one of mesh and shape")
+    if shape is not None and shape not in SHAPES:
+        keys.fail("shape", f"{shape!r} is none of {', '.join(sorted(SHAPES))}")
+    parameters = {key: keys.take(key, check) for key, check in SHAPES.get(shape, {}).items() if key in keys.values}
     size, scale = keys.take("size", _LENGTH, None), keys.take("scale", _LENGTH, None)
     if size is not None and scale is not None:
-        raise SceneError(f"{keys.path}: {keys.where}: give size or scale, not both")
-    row = _ModelRow(
-        keys,
-        name,
-        mesh,
-        shape,
-        parameters,
-        size,
-        scale,
-        keys.take("centre", _truth, False),
-        keys.take("base_faces", _whole(1), 10),
-    )
+        keys.fail(None, "give size or scale, not both")
+    centre, base_faces = keys.take("centre", _truth, False), keys.take("base_faces", _whole(1), 10)
     keys.end()
-    return row
 
+    def source():
+        if shape is not None:
+            return getattr(trimesh.creation, shape)(**parameters)
+        return mesh_name if mesh_name.startswith("warp:") else folder / mesh_name
 
-def _load_model(row: _ModelRow, folder: Path, progress) -> Model:
-    keys = row.keys
-    try:
-        if row.shape is not None:
-            mesh = load_mesh(getattr(trimesh.creation, row.shape)(**row.parameters), name=row.name)
-        elif row.mesh.startswith("warp:"):
-            mesh = load_mesh(row.mesh)
-        else:
-            mesh = load_mesh(folder / row.mesh)
-    except (ValueError, TypeError) as error:
-        keys.fail("mesh" if row.mesh else "shape", error)
-    try:
-        vertices = mesh.vertices
-        lower, upper = vertices.min(axis=0), vertices.max(axis=0)
-        if row.centre:
-            vertices = vertices - (lower / 2 + upper / 2)
-        factor = row.scale or 1.0
-        if row.size is not None:
-            factor = row.size / float((upper - lower).max())
-        if row.centre or factor != 1.0:
-            mesh = mesh_from_arrays(vertices * factor, mesh.faces, name=mesh.name)
-        return Model.load(mesh, base_faces=row.base_faces, progress=progress)
-    except ValueError as error:
-        raise SceneError(f"{keys.path}: {keys.where}: {error}") from None
+    def build(progress) -> Model:
+        try:
+            mesh = load_mesh(source(), name=name if shape is not None else None)
+        except (ValueError, TypeError) as error:
+            keys.fail("mesh" if shape is None else "shape", error)
+        try:
+            lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+            vertices = mesh.vertices - (lower / 2 + upper / 2) if centre else mesh.vertices
+            factor = (scale or 1.0) if size is None else size / float((upper - lower).max())
+            if centre or factor != 1.0:
+                with np.errstate(over="ignore"):
+                    mesh = mesh_from_arrays(vertices * factor, mesh.faces, name=mesh.name)
+            return Model.load(mesh, base_faces=base_faces, progress=progress)
+        except ValueError as error:
+            keys.fail(None, error)
+
+    return build
 
 
 # Objects.
-
-
-@dataclass
-class _ObjectRow:
-    """One entry of [[objects]] after its copies are laid out; arrays have one row a copy."""
-
-    keys: _Keys
-    name: str | None
-    model: list[str]
-    lod: list
-    world: np.ndarray
-    static: bool
-    importance: int
-    motion: dict = field(default_factory=dict)
-
-    @property
-    def count(self):
-        return len(self.world)
 
 
 def _rotation(keys: _Keys | None):
@@ -308,7 +262,7 @@ def _offsets(keys: _Keys) -> np.ndarray:
     if grid is None:
         return np.zeros((count or 1, 3))
     if count is not None:
-        raise SceneError(f"{keys.path}: {keys.where}: give count or grid, not both")
+        keys.fail(None, "give count or grid, not both")
     size = np.array(grid.take("size", _vector(3, _whole(1, OBJECT_LIMIT))))
     spacing = np.array(grid.take("spacing", _vector(3)))
     grid.end()
@@ -318,57 +272,49 @@ def _offsets(keys: _Keys) -> np.ndarray:
     return (cells - (size - 1) / 2) * spacing
 
 
-def _unit_vectors(rng, count, width):
-    vectors = rng.normal(size=(count, width))
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
 def _scatter(keys: _Keys, motion, rng):
     """Add what the table `random` asks for; always draws the same numbers, so that one key does not change another."""
-    random = keys.table("random")
-    if random is None:
-        return
+    random = keys.table("random") or _Keys(keys.path, keys.at("random"), {})
     count = len(motion["position"])
-    box, way = rng.uniform(-1, 1, (count, 3)), _unit_vectors(rng, count, 3)
-    rotation, axis = _unit_vectors(rng, count, 4), _unit_vectors(rng, count, 3)
+    box = rng.uniform(-1, 1, (count, 3))
+    way, axis, rotation = (
+        vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        for vectors in (rng.normal(size=(count, width)) for width in (3, 3, 4))
+    )
     speed, rate, phase = rng.uniform(0, 1, (3, count))
-    motion["position"] += box * random.take("position", _vector(3, _number(0.0)), [0.0, 0.0, 0.0])
+    motion["position"] += box * random.take("position", _vector(3, _number(0.0)), _ORIGIN)
     motion["velocity"] += way * (speed * random.take("velocity", _number(0.0), 0.0))[:, None]
     if random.take("rotation", _truth, False):
         motion["rotation"][:] = rotation
-    turn = random.take("turn", _number(0.0), None)
-    if turn is not None:
-        motion["axis"][:] = axis
-        motion["rate"][:] = rate * math.radians(turn)
+    if "turn" in random.values:
+        motion["axis"][:], motion["rate"][:] = axis, rate * math.radians(random.take("turn", _number(0.0)))
     if random.take("phase", _truth, False):
         motion["phase"][:] = phase
     random.end()
 
 
-def _read_object(keys: _Keys, models, rng) -> _ObjectRow:
+def _read_object(keys: _Keys, models, rng) -> SimpleNamespace:
+    """Check one entry of [[objects]] and lay out its copies; arrays have one row a copy."""
     name = keys.take("name", _text, None)
     model = keys.take("model", _one_or_list(_text))
     for entry in model:
         if entry not in models:
             keys.fail("model", f"there is no [models.{entry}]")
     offsets = _offsets(keys)
-    copies = len(offsets)
-    first, worlds = keys.take("world", _whole(-1), 0), keys.take("worlds", _whole(1, OBJECT_LIMIT), 1)
+    first, worlds = keys.take("world", _whole(-1, 2**30), 0), keys.take("worlds", _whole(1, OBJECT_LIMIT), 1)
     if first < 0 and worlds > 1:
         keys.fail("worlds", "the world -1 is every world already")
-    count = copies * worlds
+    count = len(offsets) * worlds
     if count > OBJECT_LIMIT:
         keys.fail("worlds", f"more than {OBJECT_LIMIT} objects")
-    position = np.tile(offsets + keys.take("position", _vector(3), [0.0, 0.0, 0.0]), (worlds, 1))
     motion = {
-        "position": position,
+        "position": np.tile(offsets + keys.take("position", _vector(3), _ORIGIN), (worlds, 1)),
         "rotation": np.tile(_rotation(keys.table("rotation")), (count, 1)),
-        "velocity": np.tile(keys.take("velocity", _vector(3), [0.0, 0.0, 0.0]), (count, 1)),
+        "velocity": np.tile(keys.take("velocity", _vector(3), _ORIGIN), (count, 1)),
         "axis": np.tile([0.0, 0.0, 1.0], (count, 1)),
-        "rate": np.zeros(count),
         "shuttle": np.zeros((count, 3)),
         "period": np.full(count, np.inf),
-        "phase": np.zeros(count),
+        **{key: np.zeros(count) for key in ("rate", "phase")},
     }
     turn, shuttle = keys.table("turn"), keys.table("shuttle")
     if turn is not None:
@@ -381,104 +327,35 @@ def _read_object(keys: _Keys, models, rng) -> _ObjectRow:
         motion["phase"][:] = shuttle.take("phase", _number(), 0.0)
         shuttle.end()
     _scatter(keys, motion, rng)
-    row = _ObjectRow(
-        keys,
-        name,
-        model,
-        keys.take("lod", _one_or_list(_lod), ["finest"]),
-        np.repeat(np.arange(first, first + worlds), copies),
-        keys.take("static", _truth, False),
-        keys.take("importance", _whole(1, 3), 1),
-        motion,
+    row = SimpleNamespace(
+        **{"keys": keys, "name": name, "model": model, "motion": motion},
+        lod=keys.take("lod", _one_or_list(_lod), ["finest"]),
+        world=np.repeat(np.arange(first, first + worlds), len(offsets)),
+        static=keys.take("static", _truth, False),
+        importance=keys.take("importance", _whole(1, 3), 1),
     )
     keys.end()
     return row
 
 
-# LODs.
-
-
-def resolve_lod(model: Model, wish) -> int:
-    """Return the LOD that a wish means for a model.
-
-    Args:
-        wish: A float is a part of the faces in (0, 1], an int a LOD; "finest", "coarsest", or "tol:X", the coarsest LOD whose
-            certified error is within X [model units].
-
-    Raises:
-        ValueError: None of these, or out of range.
-    """
-    if isinstance(wish, str):
-        if wish == "finest":
-            return model.lod_max
-        if wish == "coarsest":
-            return 0
-        if wish.startswith("tol:"):
-            try:
-                tolerance = float(wish[4:])
-            except ValueError:
-                raise ValueError(f"LOD {wish!r}: {wish[4:]!r} is not a number") from None
-            return model.lod_for(tolerance=tolerance)
-        raise ValueError(f"LOD {wish!r} is none of a part of the faces, a whole number, finest, coarsest, tol:X")
-    if isinstance(wish, float):
-        return model.lod_for(fraction=wish)
-    return model.check_lod(wish)
-
-
-@dataclass(frozen=True)
-class LodSweep:
-    """LODs of some objects that go from one part of the faces to another and back, in equal ratios.
-
-    Attributes:
-        objects: Indices by model, a list of (`Model`, int array).
-        fine, coarse: Parts of the faces at the start and half a period later.
-        period: Time there and back [s].
-    """
-
-    objects: list
-    fine: float
-    coarse: float
-    period: float
-
-    def fraction(self, time: float) -> float:
-        """Return the part of the faces at a time [s]."""
-        phase = time / self.period
-        wave = 1.0 - abs(2.0 * (phase - math.floor(phase)) - 1.0)
-        return self.fine * (self.coarse / self.fine) ** wave
-
-    def apply(self, fraction: float, lods: np.ndarray):
-        """Write the LODs of a part of the faces into lods, (n,)."""
-        for model, indices in self.objects:
-            lods[indices] = model.lod_for(fraction=fraction)
+# LODs over time.
 
 
 def _read_sweep(keys: _Keys, models, rows):
-    part = _number(0.0, 1.0, open_low=True)
     model, names = keys.take("model", _text, None), keys.take("objects", _one_or_list(_text), None)
     if (model is None) == (names is None):
-        raise SceneError(f"{keys.path}: {keys.where}: give one of model and objects")
+        keys.fail(None, "give one of model and objects")
     if model is not None and model not in models:
         keys.fail("model", f"there is no [models.{model}]")
     for name in names or []:
         if name not in {row.name for row in rows}:
             keys.fail("objects", f"no object is named {name!r}")
-    ends = keys.take("from", part), keys.take("to", part), keys.take("period", _LENGTH)
+    ends = keys.take("from", _PART), keys.take("to", _PART), keys.take("period", _LENGTH)
     keys.end()
     return model, names, ends
 
 
 # The whole file.
-
-
-@dataclass(frozen=True)
-class Picture:
-    """What `[picture]` asks for; time and lods may be None."""
-
-    eye: list
-    up: list
-    world: int
-    time: float | None
-    lods: list | None
 
 
 @dataclass(eq=False)
@@ -494,7 +371,7 @@ class SceneFile:
         worlds: World of each object, int (n,).
         base_lods: LOD of each object before sweeps, int64 (n,).
         sweeps: `LodSweep`s.
-        picture: `Picture`.
+        picture: What [picture] asks for: eye, up, world, time or None, lods or None.
     """
 
     path: Path
@@ -507,7 +384,7 @@ class SceneFile:
     worlds: np.ndarray
     base_lods: np.ndarray
     sweeps: list
-    picture: Picture
+    picture: SimpleNamespace
 
     def lods_at(self, time: float) -> np.ndarray:
         """Return the LOD of every object at a time [s], int64 (n,)."""
@@ -515,18 +392,6 @@ class SceneFile:
         for sweep in self.sweeps:
             sweep.apply(sweep.fraction(time), lods)
         return lods
-
-    def panel_lods(self) -> list[np.ndarray]:
-        """Return the LODs of every panel of the picture: both ends of the sweeps, or what the file asks for."""
-        panels = [[sweep.fine, sweep.coarse] for sweep in self.sweeps]
-        if self.picture.lods is not None:
-            panels = [self.picture.lods for _ in self.sweeps]
-        count = len(panels[0]) if panels else 1
-        chosen = [self.base_lods.copy() for _ in range(count)]
-        for sweep, fractions in zip(self.sweeps, panels):
-            for lods, fraction in zip(chosen, fractions):
-                sweep.apply(fraction, lods)
-        return chosen
 
     def frame(self, output: str = "count", **options) -> Frame:
         """Return a `Frame` that runs this scene; options are those of `Frame`."""
@@ -536,19 +401,14 @@ class SceneFile:
 
 def _read_toml(path: Path) -> dict:
     try:
-        import tomllib
+        tomllib = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     except ImportError:
-        try:
-            import tomli as tomllib
-        except ImportError:
-            raise SceneError(f"{path}: scene files need the package tomli on Python 3.10: pip install tomli") from None
+        raise SceneError(f"{path}: scene files need the package tomli on Python 3.10: pip install tomli") from None
     try:
         return tomllib.loads(path.read_bytes().decode())
     except OSError as error:
         raise SceneError(f"{path}: {error.strerror or error}") from None
-    except UnicodeDecodeError as error:
-        raise SceneError(f"{path}: not a text file ({error})") from None
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # bytes that are no UTF-8 among them
         raise SceneError(f"{path}: not valid TOML: {error}") from None
 
 
@@ -573,37 +433,38 @@ def load_scene(path: str | os.PathLike, device=None, progress=None) -> SceneFile
     time_step = head.take("time_step", _LENGTH, 1 / 60)
     head.end()
     tables = top.take("models", _table)
-    model_rows = {name: _read_model(_Keys(path, f"models.{name}", table), name) for name, table in tables.items()}
+    keys = {name: _Keys(path, f"models.{name}", table) for name, table in tables.items()}
+    builders = {name: _read_model(keys[name], name, path.parent) for name in tables}
     objects = top.tables("objects")
     if not objects:
-        raise SceneError(f"{path}: the file: no [[objects]]")
-    rows = [_read_object(keys, model_rows, np.random.default_rng([seed, i])) for i, keys in enumerate(objects)]
-    total = sum(row.count for row in rows)
-    if total > OBJECT_LIMIT:
-        raise SceneError(f"{path}: objects: {total} objects, more than {OBJECT_LIMIT}")
-    wishes = [_read_sweep(keys, model_rows, rows) for keys in top.tables("lod_sweep")]
+        top.fail(None, "no [[objects]]")
+    rows = [_read_object(keys, builders, np.random.default_rng([seed, i])) for i, keys in enumerate(objects)]
+    wishes = [_read_sweep(keys, builders, rows) for keys in top.tables("lod_sweep")]
     picture = _read_picture(top.table("picture") or _Keys(path, "picture", {}))
     top.end()
 
-    models = {name: _load_model(row, path.parent, progress) for name, row in model_rows.items()}
+    try:
+        motion = Kinematic(**{key: np.concatenate([row.motion[key] for row in rows]) for key in rows[0].motion})
+    except ValueError as error:  # a sum of finite numbers that is not
+        top.fail("objects", error)
+    models = {name: build(progress) for name, build in builders.items()}
     owners = _add_objects(scene, rows, models)
-    motion = Kinematic(**{key: np.concatenate([row.motion[key] for row in rows]) for key in rows[0].motion})
     worlds = np.concatenate([row.world for row in rows])
     sweeps = [_make_sweep(wish, models, owners) for wish in wishes]
-    base = scene.lods.astype(np.int64)
-    loaded = SceneFile(path, title, frames, time_step, models, scene, motion, worlds, base, sweeps, picture)
+    head = path, title, frames, time_step
+    loaded = SceneFile(*head, models, scene, motion, worlds, scene.lods.astype(np.int64), sweeps, picture)
     scene.set_lods(loaded.lods_at(0.0))
     scene.set_poses(motion.poses(0.0))
     return loaded
 
 
-def _read_picture(keys: _Keys) -> Picture:
-    picture = Picture(
-        keys.take("eye", _direction, [0.4, 0.35, 1.0]),
-        keys.take("up", _direction, [0.0, 1.0, 0.0]),
-        keys.take("world", _whole(0), 0),
-        keys.take("time", _number(), None),
-        keys.take("lods", _one_or_list(_number(0.0, 1.0, open_low=True)), None),
+def _read_picture(keys: _Keys) -> SimpleNamespace:
+    picture = SimpleNamespace(
+        eye=keys.take("eye", _direction, [0.4, 0.35, 1.0]),
+        up=keys.take("up", _direction, [0.0, 1.0, 0.0]),
+        world=keys.take("world", _whole(0), 0),
+        time=keys.take("time", _number(), None),
+        lods=keys.take("lods", _one_or_list(_PART), None),
     )
     if not np.linalg.norm(np.cross(picture.eye, picture.up)) > 1e-6:
         keys.fail("up", "points along eye")
@@ -616,25 +477,21 @@ def _add_objects(scene, rows, models):
     owners = []
     for row in rows:
         poses = np.concatenate([row.motion["position"], row.motion["rotation"]], axis=1)
-        for i in range(row.count):
+        for i in range(len(row.world)):
             name = row.model[i % len(row.model)]
-            wish = row.lod[i % len(row.lod)]
             try:
-                lod = resolve_lod(models[name], wish)
+                lod = resolve_lod(models[name], row.lod[i % len(row.lod)])
             except ValueError as error:
                 row.keys.fail("lod", error)
-            try:
-                scene.add(models[name], poses[i], int(row.world[i]), lod, row.importance, row.static)
-            except ValueError as error:
-                raise SceneError(f"{row.keys.path}: {row.keys.where}: {error}") from None
+            scene.add(models[name], poses[i], int(row.world[i]), lod, row.importance, row.static)
             owners.append((row.name, name))
     return owners
 
 
 def _make_sweep(wish, models, owners) -> LodSweep:
-    model, names, (fine, coarse, period) = wish
-    chosen = [i for i, (name, of) in enumerate(owners) if of == model or (names is not None and name in names)]
-    by_model = {}
-    for i in chosen:
-        by_model.setdefault(owners[i][1], []).append(i)
-    return LodSweep([(models[of], np.array(indices)) for of, indices in by_model.items()], fine, coarse, period)
+    model, names, ends = wish
+    chosen = {
+        of: [i for i, (name, its) in enumerate(owners) if its == of and (of == model or name in (names or ()))]
+        for of in models
+    }
+    return LodSweep([(models[of], np.array(indices)) for of, indices in chosen.items() if indices], *ends)
