@@ -104,10 +104,12 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     pose.rotation = r
     pose.translation = t
     pose.rotation32 = wp.mat33(r)
-    if far > wp.float64(2.0) * (reach_a + wp.float64(2.0) * reach_b) + margin64:
-        # Far apart for certain, perhaps beyond float32: a margin that no box passes.
-        pose.margin = -wp.inf
-    else:
+    # A margin that no box passes, for pairs that are apart for certain and perhaps beyond float32, or even float64: a
+    # distance that overflowed gives infinity or NaN.
+    pose.margin = -wp.inf
+    limit = wp.float64(2.0) * (reach_a + wp.float64(2.0) * reach_b) + margin64
+    near = wp.abs(shift[0]) <= limit and wp.abs(shift[1]) <= limit and wp.abs(shift[2]) <= limit
+    if near and limit < wp.float64(wp.inf):
         pose.translation32 = wp.vec3(shift)
         pose.margin = wp.float32(margin64 + margin32)
     return pose

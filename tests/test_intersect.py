@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 import warp as wp
 from oracle_peers import fcl_faces, judge
+from oracle_triangle import into_frame_of_a
 from samples import REAL_MESHES, SHAPES, STILL, WARP_MESHES, contact_poses, random_poses, sample, true_faces
 
 import warp_abtree as ab
 from warp_abtree import intersect
 from warp_abtree.kernels import traverse
+from warp_abtree.kernels.pose import PairPose, pose_point
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 SHAPE_PAIRS = [
     ("ball", "torus"),
@@ -124,6 +128,37 @@ def test_agrees_with_fcl(device, names):
         wrong += len(verdict.peer_wrong)
     assert wrong <= 0.02 * len(result.faces) + 2
     assert len(result.faces) > 0
+
+
+# Where B's vertices lie in A's frame: to the bit, since every answer is defined on these coordinates.
+
+
+@wp.kernel
+def pose_point_kernel(
+    pair_poses: wp.array(dtype=PairPose), points: wp.array(dtype=wp.vec3d), moved_out: wp.array2d(dtype=wp.vec3d)
+):
+    p, i = wp.tid()
+    moved_out[p, i] = pose_point(pair_poses[p].rotation, pair_poses[p].translation, points[i])
+
+
+def test_relative_poses_equal_the_definition(device):
+    rng = np.random.default_rng(10)
+    poses = np.concatenate([random_poses(rng, 20, 3.0), random_poses(rng, 20, 1e-3), random_poses(rng, 20, 1e7)])
+    points = rng.normal(size=(50, 3)) * 2.0 ** rng.integers(-30, 5, (50, 3))
+    points[0] = 0
+    points[1] = 2.0**-291, -(2.0**-300), 2.0**-290
+    poses[:2] = STILL
+    scene = ab.Scene(device)
+    for pose in poses:
+        scene.add(sample("box"), pose)
+    pairs = np.concatenate([np.arange(60).reshape(-1, 2), rng.permutation(60).reshape(-1, 2)])
+    query = ab.Query(scene, "any", pairs=pairs, precision="float64")
+    query.launch()
+    moved = wp.zeros((60, 50), dtype=wp.vec3d, device=device)
+    inputs = [query.pair_poses, wp.array(points, dtype=wp.vec3d, device=device)]
+    wp.launch(pose_point_kernel, dim=(60, 50), inputs=inputs, outputs=[moved], device=device)
+    for (i, j), got in zip(pairs, moved.numpy(), strict=True):
+        np.testing.assert_array_equal(got, into_frame_of_a(points, poses[min(i, j)], poses[max(i, j)]))
 
 
 # Degenerate contact. Coordinates are small multiples of a power of two, so that float64 decides exactly.

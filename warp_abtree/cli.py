@@ -1,6 +1,6 @@
 """The command line: ``warp-abtree info|build|query|run|bench|view``.
 
-Exit status 0 when done, 2 with one line on stderr for bad input, 1 with one line where work was lost or a device failed.
+Exit status 0 when done, 2 with one line on stderr for bad input, 1 where work was lost or a device failed.
 """
 
 import argparse
@@ -112,7 +112,7 @@ def start_warp():
 
 
 @contextlib.contextmanager
-def compile_notice(stream=None):
+def compile_notice(stream=None, delay=NOTICE_DELAY):
     """Say once on stderr that kernels are being compiled, if that takes longer than a moment."""
     finished = threading.Event()
 
@@ -127,7 +127,7 @@ def compile_notice(stream=None):
         busy = 0.0
         while not finished.wait(0.25):
             busy += 0.25 * compiling()
-            if busy >= NOTICE_DELAY:
+            if busy > delay:
                 print("compiling kernels for this machine; later runs find them in a cache", file=stream or sys.stderr)
                 return
 

@@ -169,7 +169,11 @@ class Frame:
         self._measure_lods()
 
     def warm_up(self):
-        """Run broad and narrow phase once and keep no row, so that no row times the loading of kernels."""
+        """Run every stage once and keep no row, so that no row times the loading of kernels; LODs stay as they are."""
+        if self.lods is not None:
+            before = self.scene.lods
+            self.scene.set_lods(np.asarray(self.lods(self.time_step)))
+            self.scene.set_lods(before)
         self.scene.intersect(self.scene.broad_phase(), output=self.output)
 
     def poses_at(self, time: float) -> np.ndarray:

@@ -6,10 +6,11 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels import collapse, deviation, forest
+from warp_abtree.kernels import collapse, deviation, forest, piece
 
 MERGES_PER_LAUNCH = 25_000
 COVERS_PER_LAUNCH = 200_000
+HEAP_ROOM = (2, 256)  # entries to begin with: so many an edge, and so many more
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
 
 # What rounding can hide from a bound, in units of the extent's power of two (coordinates within 1/2, so 2^-54 each):
@@ -29,7 +30,7 @@ class ProgressiveMesh:
         vertex_parent: Node that each node merges into, -1 at a root, shape [n_v+m].
         vertex_pos: Positions [model units], shape [n_v+m, 3]; the first n_v are the original's, to the bit.
         face_vertex: Original faces, shape [n_f, 3].
-        face_split: Face f is active iff lod >= face_split[f]; m+1 for faces without three distinct corners; shape [n_f].
+        face_split: Face f is active iff lod >= face_split[f], m+1 for dropped faces; shape [n_f].
         split_start: Where each split's slice of `split_face` begins, shape [m+1].
         split_face: Slice i lists, ascending, every face that split i inserts or deforms.
         lod_error: Certified bound [model units] on the distance of any point of the original surface from the
@@ -89,7 +90,7 @@ class ProgressiveMesh:
             node = above
 
     def mesh_at(self, lod):
-        """Return the surface at a LOD: vertices float64 [v, 3] (used ones only), faces int32 [f, 3], face ids int32 [f].
+        """Return the surface at a LOD: used vertices float64 [v, 3], faces int32 [f, 3], face ids int32 [f].
 
         Faces are in the order of the original file, their ids are indices of original faces; at m the vertices are the
         original ones in their order. Raises ValueError outside 0..m.
@@ -226,12 +227,16 @@ def _collapse(pos, faces, base_faces, link_condition, report):
     surface.stamp = _filled(capacity, -1)
     rings = _linked_rings(faces, face_array, capacity)
     wp.launch(
-        collapse.weigh_faces_kernel, dim=1, inputs=[len(faces), face_array, _cpu(boundary, wp.int8), surface], device="cpu"
+        collapse.weigh_faces_kernel,
+        dim=1,
+        inputs=[len(faces), face_array, _cpu(boundary, wp.int8), surface],
+        device="cpu",
     )
     heap = collapse.Heap()
     size = len(edges)
-    heap.pair = _cpu(np.resize(edges, 2 * size + 256), wp.int64)
-    heap.key = wp.zeros(2 * size + 256, dtype=wp.float64, device="cpu")
+    room = HEAP_ROOM[0] * size + HEAP_ROOM[1]
+    heap.pair = _cpu(np.resize(edges, room), wp.int64)
+    heap.key = wp.zeros(room, dtype=wp.float64, device="cpu")
     wp.launch(collapse.price_edges_kernel, dim=1, inputs=[size, heap.pair, surface, heap.key], device="cpu")
     start_live = int(_distinct(faces).sum())
     counter = _cpu(np.array([size, 0, start_live, collapse.HEAP_FULL], dtype=np.int32), int)
@@ -241,9 +246,7 @@ def _collapse(pos, faces, base_faces, link_condition, report):
         if state[3] == int(collapse.HEAP_FULL):
             heap = _roomier_heap(surface, heap, counter)
         sizes = [vertex_count, base_faces, MERGES_PER_LAUNCH, len(heap.key), int(link_condition)]
-        wp.launch(
-            collapse.collapse_edges_kernel, dim=1, inputs=[*sizes, surface, rings, heap, counter], device="cpu"
-        )
+        wp.launch(collapse.collapse_edges_kernel, dim=1, inputs=[*sizes, surface, rings, heap, counter], device="cpu")
         report("collapse", min(start_live - int(state[2]), goal), goal)
     nodes = vertex_count + int(state[1])
     return surface.parent.numpy()[:nodes].copy(), surface.pos.numpy()[:nodes]
@@ -291,14 +294,14 @@ def _deviation(vertex_pos, parent, faces, report):
     pair = child[np.argsort(parent[child], kind="stable")].reshape(-1, 2)
     rings = _linked_rings(faces, _cpu(faces, int), len(parent))
     replay = _replay((vertex_pos - centre) / scale, face_count)
-    scratch = deviation.Scratch()
-    scratch.near = _filled(face_count + deviation.SLOTS, 0)
+    scratch = piece.Scratch()
+    scratch.near = _filled(face_count, 0)
     scratch.used = _filled(deviation.SLOTS, 0)
-    scratch.waiting = wp.zeros((deviation.STACK, deviation.CORNERS), dtype=wp.vec3d, device="cpu")
-    scratch.waiting_count = _filled(deviation.STACK, 0)
-    scratch.piece = wp.zeros(deviation.CORNERS, dtype=wp.vec3d, device="cpu")
-    scratch.inner = wp.zeros(deviation.CORNERS, dtype=wp.vec3d, device="cpu")
-    counter = _filled(3, 0)
+    scratch.waiting = wp.zeros((piece.STACK, piece.CORNERS), dtype=wp.vec3d, device="cpu")
+    scratch.waiting_count = _filled(piece.STACK, 0)
+    scratch.piece = wp.zeros(piece.CORNERS, dtype=wp.vec3d, device="cpu")
+    scratch.inner = wp.zeros(piece.CORNERS, dtype=wp.vec3d, device="cpu")
+    counter = _filled(5, 0)
     inputs = [face_count, _cpu(faces, int), rings.corner_node, replay, counter]
     wp.launch(deviation.start_replay_kernel, dim=1, inputs=inputs, device="cpu")
     bound_sq = wp.zeros(merge_count, dtype=wp.float64, device="cpu")
@@ -322,8 +325,10 @@ def _replay(pos, face_count):
     for name in ("triangle_pos", "face_pos"):
         setattr(replay, name, wp.zeros((face_count, 3), dtype=wp.vec3d, device="cpu"))
     replay.face_ball = wp.zeros(face_count, dtype=wp.vec4d, device="cpu")
-    for name in ("live_face", "live_place", "face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face", "slot_count"):
+    for name in ("live_face", "live_place", "face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face"):
         setattr(replay, name, _filled(face_count, -1))
-    for name in ("slot_face", "slot_next", "slot_last"):
-        setattr(replay, name, _filled(deviation.SLOTS * face_count, -1))
+    pooled = 3 * face_count + 4096  # a pool that runs dry loosens bounds, no more
+    for name in ("slot_face", "slot_triangle", "slot_sibling", "slot_next", "slot_last"):
+        setattr(replay, name, _filled(face_count + pooled, -1))
+    replay.free_slot = _filled(pooled, 0)
     return replay

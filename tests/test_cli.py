@@ -1,0 +1,394 @@
+"""The command line: what it prints, what it writes, its pictures, and one line with status 2 for anything bad."""
+
+import csv
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+import trimesh
+
+import warp_abtree as ab
+from warp_abtree import cli, plot
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENE = """
+[scene]
+frames = 4
+time_step = 0.25
+[models.ball]
+shape = "icosphere"
+subdivisions = 2
+[models.ring]
+shape = "torus"
+major_radius = 1.0
+minor_radius = 0.3
+[[objects]]
+model = "ball"
+name = "ball"
+[[objects]]
+model = "ring"
+position = [0.6, 0, 0]
+shuttle = { by = [0.4, 0, 0], period = 2 }
+[[lod_sweep]]
+objects = ["ball"]
+from = 1.0
+to = 0.1
+period = 2
+"""
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """Work in a folder with two meshes, a scene and files that are none of these."""
+    monkeypatch.chdir(tmp_path)
+    trimesh.creation.icosphere(subdivisions=2).export("ball.obj")
+    trimesh.creation.torus(major_radius=1.0, minor_radius=0.3).export("ring.ply")
+    Path("scene.toml").write_text(SCENE)
+    Path("bad.toml").write_text("[scene]\nspeed = 3\n")
+    Path("broken.toml").write_text("[scene\n")
+    Path("junk.obj").write_text("hello\n")
+    Path("nan.obj").write_text("v 0 0 0\nv 1 nan 0\nv 0 1 0\nf 1 2 3\n")
+    Path("junk.npz").write_bytes(b"junk")
+    Path("text.mesh").write_text("hello\n")
+    return tmp_path
+
+
+def run(capsys, *arguments, status=0):
+    """Run the command line; return its stdout, and stderr's lines."""
+    assert cli.main([str(argument) for argument in arguments]) == status
+    captured = capsys.readouterr()
+    return captured.out, captured.err.splitlines()
+
+
+def run_process(*arguments, cwd, **environment):
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    return subprocess.run(
+        [sys.executable, "-m", "warp_abtree", *map(str, arguments)],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": path, **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+# info and build.
+
+
+def test_info(files, capsys):
+    shown, errors = run(capsys, "info", "ball.obj")
+    assert re.search(r"^faces +320$", shown, re.M) and re.search(r"^open edges +0$", shown, re.M) and not errors
+    found = json.loads(run(capsys, "info", "ball.obj", "--json", "--device", "cpu")[0])
+    assert found["faces"] == 320 and found["components"] == 1 and found["closed"] is True
+    assert found == ab.describe_mesh(ab.load_mesh("ball.obj"))
+
+
+def test_build(files, capsys):
+    shown, _ = run(capsys, "build", "ball.obj", "ball.npz", "--base-faces", 40)
+    assert "320 faces" in shown and "162 vertices" in shown
+    model = ab.Model.open("ball.npz")
+    assert len(model.mesh_at(0)[1]) <= 40
+    rows = [line.split() for line in shown.splitlines() if " %" in line and line[0].isdigit()]
+    assert [row[0] for row in rows] == ["50", "20", "10", "5", "1"]
+    assert [int(row[3]) for row in rows] == [model.lod_for(fraction=x) for x in (0.5, 0.2, 0.1, 0.05, 0.01)]
+    found = json.loads(run(capsys, "build", "ball.obj", "ball.npz", "--json")[0])
+    assert found["faces"] == 320 and found["base_faces"] <= 10 and len(found["errors"]) == 5
+    assert found["diagonal"] == pytest.approx(2 * 3**0.5, rel=0.02)
+    assert sorted(path.name for path in files.glob("ball*")) == ["ball.npz", "ball.obj"]
+
+
+# query.
+
+
+def answer(capsys, *arguments):
+    return json.loads(run(capsys, "query", *arguments, "--device", "cpu", "--json")[0])
+
+
+def test_query_against_the_library(files, capsys):
+    pose = (0.8, 0.1, -1e-3, 0.0, 0.6, 0.0, 0.8)
+    found = answer(
+        capsys, "ball.obj", "ring.ply", "--pose", *pose, "--lod-a", 0.25, "--lod-b", "900", "--output", "faces"
+    )
+    ball, ring = ab.Model.load("ball.obj"), ab.Model.load("ring.ply")
+    scene = ab.Scene(device="cpu")
+    scene.add(ball, lod=ball.lod_for(fraction=0.25))
+    scene.add(ring, pose=pose, lod=900)
+    expected = scene.intersect(np.array([[0, 1]]), output="faces")
+    assert found["faces"] == expected.faces[:, 1:].tolist() and len(found["faces"]) > cli.LISTED_FACES
+    assert found["count"] == expected.count[0] and found["intersects"] is True
+    assert found["lods"] == scene.lods.tolist()
+    bound = ball.error_at(found["lods"][0]) + ring.error_at(900)
+    assert found["bound"] == (pytest.approx(bound) if np.isfinite(bound) else None)
+
+    assert answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1)["count"] == 0
+    swapped = answer(capsys, "ring.ply", "ball.obj", "--output", "any")
+    assert swapped["intersects"] is True and swapped["count"] is None and "faces" not in swapped
+
+
+def test_query_for_people(files, capsys):
+    shown, errors = run(
+        capsys, "query", "ball.obj", "ring.ply", "--pose", *"0.8 -1e-3 0 0 0 0 1".split(), "--output", "faces"
+    )
+    count = int(re.search(r"intersecting face pairs: ([\d,]+)", shown)[1].replace(",", ""))
+    listed = [line for line in shown.splitlines() if re.fullmatch(r" +\d+ +\d+", line)]
+    assert len(listed) == cli.LISTED_FACES and f"and {count - cli.LISTED_FACES:,} more" in shown
+    assert "error(A) + error(B): 0\n" in shown and "they intersect" in shown and not errors
+    assert "do not intersect" in run(capsys, "query", "ball.obj", "ball.obj", "--pose", 3, 0, 0, 0, 0, 0, 1)[0]
+
+
+def test_query_of_built_models(files, capsys):
+    run(capsys, "build", "ring.ply", "ring.npz")
+    built = answer(capsys, "ring.npz", "ring.npz", "--lod-a", "coarsest", "--lod-b", "tol:0")
+    direct = answer(capsys, "ring.ply", "ring.ply", "--lod-a", "0", "--lod-b", "finest")
+    assert built["count"] == direct["count"] > 0 and built["lods"] == direct["lods"]
+
+
+# run.
+
+
+def test_run_for_people(files, capsys):
+    shown, errors = run(capsys, "run", "scene.toml", "--device", "cpu")
+    for text in ("4 frames on cpu", "2 objects of 2 models in 1 world,", "refine and refit", "broad phase", "p95"):
+        assert text in shown
+    assert not errors
+
+
+def test_run_for_programs(files, capsys):
+    found = json.loads(run(capsys, "run", "scene.toml", "--frames", 3, "--record", "rows.json", "--json")[0])
+    rows = json.loads(Path("rows.json").read_text())
+    run(capsys, "run", "scene.toml", "--frames", 3, "--record", "rows.csv")
+    table = list(csv.DictReader(io.StringIO(Path("rows.csv").read_text())))
+    assert [row["hits"] for row in rows] == [int(row["hits"]) for row in table] and len(rows) == 3
+    assert found["frames"] == 3 and found["objects"] == 2 and found["models"] == 2 and found["worlds"] == 1
+    assert found["hits"]["max"] == max(row["hits"] for row in rows) > 0
+    assert found["stages"]["total_ms"]["total"] == pytest.approx(sum(row["total_ms"] for row in rows))
+    assert found["lod_min"] == min(row["lod_min"] for row in rows)
+
+
+def test_picture(files, capsys):
+    shown, _ = run(capsys, "run", "scene.toml", "--frames", 2, "--picture", "out.png")
+    assert "wrote out.png" in shown
+    image = matplotlib.image.imread("out.png")[:, :, :3]
+    assert image.shape[1] > 600
+    # Both panels show plain and intersecting faces of both models.
+    for half in np.array_split(image[100:-50], 2, axis=1):
+        red, green, blue = half.reshape(-1, 3).T
+        assert np.mean((red > 0.98) & (green > 0.98) & (blue > 0.98)) > 0.1, "background"
+        assert np.mean((blue > 1.4 * red) & (blue > 1.2 * green)) > 0.02, "ring"
+        assert np.mean((red > green) & (green > blue) & (red < 1.4 * blue) & (red < 0.95)) > 0.02, "ball"
+        assert np.mean((green > 1.8 * red) & (green > 1.8 * blue)) > 0.002, "intersecting faces of the ball"
+        assert np.mean((red > 2 * blue) & (green > 2 * blue)) > 0.002, "intersecting faces of the ring"
+    assert sorted(path.name for path in files.glob("out*")) == ["out.png"]
+
+
+def test_struck_faces_are_coloured(files):
+    loaded = ab.load_scene("scene.toml", device="cpu")
+    scene, poses = loaded.scene, loaded.motion.poses(0.3)
+    scene.set_lods(loaded.lods_at(0.7))
+    panel = plot.make_panel(scene, poses, [0, 1], subject=0)
+    hits = scene.intersect(np.array([[0, 1]]), output="faces").faces
+    begin = 0
+    for side, pose in enumerate(poses):
+        vertices, faces, ids = scene.models[side].mesh_at(int(scene.lods[side]))
+        here = slice(begin, begin + len(ids))
+        begin = here.stop
+        struck = (panel.colours[here] == plot.COLOURS[side][1]).all(axis=1)
+        assert set(ids[struck].tolist()) == set(hits[:, 1 + side].tolist()) and 0 < struck.sum() < len(ids)
+        assert np.allclose(panel.triangles[here], vertices[faces] + pose[:3])
+    assert begin == len(panel.triangles) and f"{len(hits):,} intersecting face pairs" in panel.title
+
+
+def test_pixels_show_the_nearest_triangle():
+    rng = np.random.default_rng(5)
+    corner, inverse = rng.uniform(-6, 30, (40, 3, 2)), rng.uniform(0.5, 2.0, (40, 3))
+    corner[3], corner[4] = corner[3, 0], np.linspace(corner[4, 0], corner[4, 1], 3)  # no area
+    front, depth = plot.rasterise(corner, inverse, 24, 20)
+    for y in range(20):
+        for x in range(24):
+            best, nearest = -1, 0.0
+            for t in set(range(40)) - {3, 4}:
+                a, b, c = corner[t]
+                try:
+                    u, v = np.linalg.solve(np.stack([b - a, c - a], axis=1), np.array([x + 0.5, y + 0.5]) - a)
+                except np.linalg.LinAlgError:
+                    continue
+                value = inverse[t] @ [1 - u - v, u, v]
+                if min(u, v, 1 - u - v) >= 0 and value > nearest:
+                    best, nearest = t, value
+            assert front[y, x] == best and depth[y, x] == pytest.approx(nearest)
+
+
+def test_placing_points():
+    half = 0.5**0.5
+    assert np.allclose(
+        plot.place([1, 2, 3, 0, 0, half, half], np.array([[1.0, 0, 0], [0, 1, 5]])), [[1, 3, 3], [0, 2, 8]]
+    )
+
+
+# Bad input.
+
+BAD = [
+    ((), "COMMAND"),
+    (("fly",), "fly"),
+    (("info",), "MESH"),
+    (("info", "gone.obj"), "gone.obj: no such file"),
+    (("info", "."), "folder"),
+    (("info", "nan.obj"), "not finite"),
+    (("info", "junk.obj"), "junk.obj"),
+    (("info", "text.mesh"), "unknown extension"),
+    (("info", "warp:cat"), "warp:cat"),
+    (("info", "ball.obj", "--speed"), "--speed"),
+    (("info", "ball.obj", "--device", "cuda:99"), "no device 'cuda:99'"),
+    (("build", "ball.obj", "gone/ball.npz"), "no folder gone"),
+    (("build", "ball.obj", "ball.txt"), "must end in .npz"),
+    (("build", "ball.obj", "ball.npz", "--base-faces", "0"), "--base-faces"),
+    (("build", "nan.obj", "ball.npz"), "not finite"),
+    (("query", "ball.obj"), "B"),
+    (("query", "ball.obj", "gone.npz"), "gone.npz: no such file"),
+    (("query", "ball.obj", "junk.npz"), "junk.npz"),
+    (("query", "ball.obj", "ball.obj", "--pose", "1", "2"), "--pose"),
+    (("query", "ball.obj", "ball.obj", "--pose", *"0 0 0 0 0 0 x".split()), "--pose"),
+    (("query", "ball.obj", "ball.obj", "--pose", *"0 0 0 0 0 0 2".split()), "norm 2"),
+    (("query", "ball.obj", "ball.obj", "--pose", *"-inf 0 0 0 0 0 1".split()), "not finite"),
+    (("query", "ball.obj", "ball.obj", "--lod-a", "1.5"), "--lod-a"),
+    (("query", "ball.obj", "ball.obj", "--lod-b", "-3"), "--lod-b"),
+    (("query", "ball.obj", "ball.obj", "--lod-b", "99999"), "--lod-b"),
+    (("query", "ball.obj", "ball.obj", "--lod-b", "tol:-1"), "--lod-b"),
+    (("query", "ball.obj", "ball.obj", "--lod-b", "fine"), "--lod-b"),
+    (("query", "ball.obj", "ball.obj", "--output", "contacts"), "--output"),
+    (("query", "ball.obj", "ball.obj", "--device", "tpu"), "no device 'tpu'"),
+    (("run", "gone.toml"), "gone.toml"),
+    (("run", "bad.toml"), "bad.toml: scene.speed: unknown key"),
+    (("run", "broken.toml"), "line 1"),
+    (("run", "scene.toml", "--frames", "0"), "--frames"),
+    (("run", "scene.toml", "--picture", "out.jpg"), "must end in .png"),
+    (("run", "scene.toml", "--picture", "gone/out.png"), "no folder gone"),
+    (("run", "scene.toml", "--record", "rows.xls"), ".csv or .json"),
+    (("bench",), "not built yet"),
+    (("view", "--fast"), "not built yet"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) or "nothing" for arguments, _ in BAD])
+def test_bad_input_gives_one_line(files, capsys, arguments, message):
+    before = sorted(files.iterdir())
+    shown, errors = run(capsys, *arguments, status=2)
+    assert len(errors) == 1 and message in errors[0] and errors[0].startswith("warp-abtree: ")
+    assert not shown and sorted(files.iterdir()) == before
+
+
+def test_lost_work_is_status_1(files, capsys, monkeypatch):
+    def lose(*_):
+        raise ab.CapacityError("7 pairs were lost")
+
+    monkeypatch.setattr(cli, "describe_mesh", lose)
+    assert run(capsys, "info", "ball.obj", status=1)[1] == ["warp-abtree: 7 pairs were lost"]
+
+
+def test_help_has_examples(capsys):
+    for command in ("info", "build", "query", "run"):
+        with pytest.raises(SystemExit) as caught:
+            cli.main([command, "--help"])
+        assert caught.value.code == 0
+        shown = capsys.readouterr().out
+        assert f"examples:\n  warp-abtree {command} " in shown and "--device" in shown
+    with pytest.raises(SystemExit):
+        cli.main(["--version"])
+    assert capsys.readouterr().out == f"warp-abtree {ab.__version__}\n"
+
+
+# Progress.
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_bar_on_a_terminal():
+    stream, clock = Terminal(), iter([0.0, 0.1, 1.0, 2.0])
+    progress = cli.Progress(stream, clock=lambda: next(clock))
+    for done in (0, 1, 5, 10):
+        progress("error", done, 10)
+    progress.close()
+    assert stream.getvalue().split("\r")[1:3] == [
+        f"error      [{'#' * 15:<30}]  50 %",
+        f"error      [{'#' * 30}] 100 %",
+    ]
+    assert stream.getvalue().endswith("\r\x1b[K")
+
+
+def test_progress_off_a_terminal_is_a_line_a_stage():
+    stream, clock = io.StringIO(), iter(range(100))
+    progress = cli.Progress(stream, clock=lambda: next(clock))
+    for stage in ("collapse", "error"):
+        for done in range(5):
+            progress(stage, done, 4)
+    progress.close()
+    assert stream.getvalue() == "collapse ...\nerror ...\n"
+
+
+# As people start it.
+
+
+def test_process_is_quiet(files):
+    done = run_process("query", "ball.obj", "ring.ply", "--json", "--device", "cpu", cwd=files)
+    assert done.returncode == 0 and json.loads(done.stdout)["intersects"] is True
+    assert done.stderr == ""
+
+
+def test_process_fails_in_one_line(files):
+    done = run_process("query", "ball.obj", "nan.obj", cwd=files)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert len(done.stderr.splitlines()) == 1 and "not finite" in done.stderr
+
+
+def test_compiling_is_announced(files):
+    stream = io.StringIO()
+    cache = files / "cache"
+    (cache / f"wp_module_p{os.getpid()}_t1").mkdir(parents=True)
+    before, cli.wp.config.kernel_cache_dir = cli.wp.config.kernel_cache_dir, str(cache)
+    try:
+        with cli.compile_notice(stream, delay=0.0):
+            for _ in range(100):
+                if stream.getvalue():
+                    break
+                cli.time.sleep(0.05)
+    finally:
+        cli.wp.config.kernel_cache_dir = before
+    assert stream.getvalue().count("\n") == 1 and "compiling" in stream.getvalue()
+
+
+# README.
+
+
+def readme_blocks(after):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    return re.findall(r"```\w+\n(.*?)```", text[text.index(after) :], re.S)
+
+
+def test_readme_python_runs(capsys, monkeypatch):
+    pytest.importorskip("pxr")
+    monkeypatch.chdir(ROOT)
+    blocks = [block for block in readme_blocks("## Python") if block.startswith("import")]
+    assert len(blocks) == 2
+    for block in blocks:
+        exec(compile(block, "README.md", "exec"), {})
+        assert capsys.readouterr().out
+
+
+def test_readme_commands_exist():
+    lines = [*readme_blocks("<!-- main-command -->")[0].splitlines(), *readme_blocks("## Command line")[0].splitlines()]
+    for line in lines:
+        command = line.split("warp-abtree", 1)[1].split("#")[0].split()
+        assert cli.make_parser().parse_args(command).command == command[0]
+        for word in command:
+            assert not word.startswith("scenes/") or (ROOT / word).is_file()
+    assert len(lines) == 5
