@@ -153,7 +153,7 @@ def test_lod_wishes(models):
 
 def test_rows_are_what_a_fresh_scene_finds(models, device):
     def lods_at(time):
-        return np.array([models[0].lod_max if time < 0.25 else 40, 60, 40])
+        return np.array([models[0].lod_max, 60, 40] if time < 0.25 else [50, 60, 50])
 
     motion = make_motion()
     frame = ab.Frame(make_scene(models, device), motion, lods_at, output="faces", time_step=0.1)
@@ -172,7 +172,7 @@ def test_rows_are_what_a_fresh_scene_finds(models, device):
         model_of = (models[0], models[1], models[0])
         assert row.faces == sum(len(m.mesh_at(lod)[2]) for m, lod in zip(model_of, lods_at(time)))
         assert row.states == (3 if number < 3 else 2)
-        # Trees are refitted in the first frame and where the LOD of the first object changes, and at no other time.
+        # Trees are refitted in the first frame and where LODs change, and at no other time.
         assert (row.nodes_refitted > 0) == (number in (0, 3)), row
     assert max(row.hits for row in frame.history) > 0
 

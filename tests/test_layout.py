@@ -8,7 +8,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PIPELINE = (
-    "mesh progressive tree model state refine lod broadphase intersect contact scene dynamics frame scene_file plot cli"
+    "checks mesh progressive tree model state refine lod broadphase intersect contact scene dynamics frame "
+    "scene_file plot cli"
 ).split()
 OUTSIDE = PIPELINE[PIPELINE.index("scene_file") :]  # these use the public API alone
 CORE_DEPENDENCIES = {"warp", "numpy", "trimesh", "warp_abtree"}

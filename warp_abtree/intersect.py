@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.broadphase import BroadPhase, CapacityError
+from warp_abtree.checks import whole_number
 from warp_abtree.kernels import pose, traverse
 
 OUTPUTS = {"any": traverse.OUTPUT_ANY, "count": traverse.OUTPUT_COUNT, "faces": traverse.OUTPUT_FACES}
@@ -98,9 +99,10 @@ class Query:
         self, scene, output="faces", pairs=None, capacity=None, pair_capacity=None, precision="float64", within=None
     ):
         check_request(output, precision, within)
-        for name, value in (("capacity", capacity), ("pair_capacity", pair_capacity)):
-            if value is not None and not 0 < int(value) < 2**31:
-                raise ValueError(f"{name} is {value}, not within 1 .. 2^31 - 1")
+        if capacity is not None:
+            capacity = whole_number(capacity, "capacity", 1, 2**31 - 1)
+        if pair_capacity is not None:
+            pair_capacity = whole_number(pair_capacity, "pair_capacity", 1, 2**31 - 1)
         self.scene = scene
         self.output = output
         self.arrays = scene.arrays()

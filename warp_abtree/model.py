@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_abtree.checks import whole_number
 from warp_abtree.mesh import Mesh, load_mesh, mesh_from_arrays
 from warp_abtree.progressive import ProgressiveMesh, build_progressive
 from warp_abtree.tree import Tree, active_build
@@ -94,12 +95,7 @@ class Model:
         Raises:
             ValueError: It is no whole number from 0 to lod_max.
         """
-        if isinstance(lod, (bool, np.bool_)) or not isinstance(lod, (int, np.integer)):
-            if not (isinstance(lod, (float, np.floating)) and float(lod).is_integer()):
-                raise ValueError(f"model {self.name!r}: LOD {lod!r} is not a whole number")
-        if not 0 <= lod <= self.lod_max:
-            raise ValueError(f"model {self.name!r}: LOD {lod} is outside 0 .. {self.lod_max}")
-        return int(lod)
+        return whole_number(lod, f"model {self.name!r}: LOD", 0, self.lod_max)
 
     def mesh_at(self, lod):
         """Return the mesh at a LOD: vertices float64 (v, 3), faces int32 (f, 3), face_ids int32 (f,)."""
@@ -151,19 +147,8 @@ class Model:
         path = Path(path)
         try:
             with np.load(path, allow_pickle=False) as file:
-                if not hasattr(file, "files") or "format" not in file.files:
-                    raise ModelError(f"{path}: not a warp_abtree model file")
-                if str(file["format"]) != FORMAT_NAME:
-                    raise ModelError(f"{path}: not a warp_abtree model file")
-                if file["version"].shape != () or int(file["version"]) != FORMAT_VERSION:
-                    raise ModelError(
-                        f"{path}: format version {file['version']}, this library reads {FORMAT_VERSION}; build it again"
-                    )
-                missing = [name for name in (*_ARRAYS, "leaf_node", "name") if name not in file.files]
-                if missing:
-                    raise ModelError(f"{path}: lacks the array {missing[0]!r}")
-                arrays = {name: file[name] for name in _ARRAYS}
-                leaf_node, name = file["leaf_node"], str(file["name"])
+                _check_format(path, file)
+                arrays = {name: file[name] for name in (*_ARRAYS, "leaf_node", "name")}
         except ModelError:
             raise
         except FileNotFoundError:
@@ -172,16 +157,32 @@ class Model:
             raise ModelError(f"{path}: cannot be read as a model file ({error})") from None
         except Exception as error:  # zlib.error and struct.error of a damaged archive
             raise ModelError(f"{path}: damaged ({type(error).__name__}: {error})") from None
-        return _assemble(path, arrays, leaf_node, name)
+        return _assemble(path, arrays)
 
 
-def _assemble(path, arrays, leaf_node, name) -> Model:
+def _check_format(path, file):
+    """Check that an opened file calls itself a model of the version that this library reads."""
+    if not isinstance(file, np.lib.npyio.NpzFile) or not {"format", "version"} <= set(file.files):
+        raise ModelError(f"{path}: not a warp_abtree model file")
+    form, version = file["format"], file["version"]
+    if not isinstance(form, np.ndarray) or form.shape != () or str(form) != FORMAT_NAME:
+        raise ModelError(f"{path}: not a warp_abtree model file")
+    if not isinstance(version, np.ndarray) or version.shape != () or version.tolist() != FORMAT_VERSION:
+        raise ModelError(f"{path}: format version {version}, this library reads {FORMAT_VERSION}; build it again")
+    missing = [name for name in (*_ARRAYS, "leaf_node", "name") if name not in file.files]
+    if missing:
+        raise ModelError(f"{path}: lacks the array {missing[0]!r}")
+
+
+def _assemble(path, arrays) -> Model:
     """Check every array of a model file against the others and build the model."""
 
     def require(truth, what):
         if not truth:
             raise ModelError(f"{path}: {what}")
 
+    require(all(isinstance(value, np.ndarray) for value in arrays.values()), "a member is no array")
+    leaf_node, name = arrays.pop("leaf_node"), str(arrays.pop("name"))
     for key, (dtype, ndim) in _ARRAYS.items():
         value = arrays[key]
         integral = value.dtype.kind == "i" if dtype is None else value.dtype == dtype

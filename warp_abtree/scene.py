@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.broadphase import EVERY_WORLD, BroadPhase, exclusion_keys
+from warp_abtree.checks import to_numpy, whole_number
 from warp_abtree.intersect import Query, Result, check_request
 from warp_abtree.kernels import pose as pose_kernels
 from warp_abtree.model import Model
@@ -16,13 +17,6 @@ QUATERNION_TOLERANCE = 1e-3
 RIGID_TOLERANCE = 1e-6
 
 
-def to_numpy(values) -> np.ndarray:
-    """Return an array of any of the frameworks, or a sequence, as NumPy."""
-    if hasattr(values, "numpy") and not isinstance(values, np.ndarray):
-        values = values.numpy()
-    return np.asarray(values)
-
-
 def check_poses(poses, what="poses") -> np.ndarray:
     """Return poses as float64, (n, 7) or (n, 4, 4).
 
@@ -30,13 +24,11 @@ def check_poses(poses, what="poses") -> np.ndarray:
         ValueError: Another shape, a number that is not finite, a quaternion whose norm is off by more than 1e-3, a
             matrix that is not rigid within 1e-6.
     """
-    poses = to_numpy(poses)
-    if poses.dtype.kind not in "fiu":
-        raise ValueError(f"{what}: type {poses.dtype} holds no numbers")
+    poses = to_numpy(poses, what)
     if not (poses.ndim == 2 and poses.shape[1] == 7) and not (poses.ndim == 3 and poses.shape[1:] == (4, 4)):
         raise ValueError(f"{what}: shape {poses.shape} is neither (n, 7) nor (n, 4, 4)")
     poses = poses.astype(np.float64)
-    bad = ~np.isfinite(poses.reshape(len(poses), -1)).all(1)
+    bad = ~np.isfinite(poses).all(tuple(range(1, poses.ndim)))
     if bad.any():
         raise ValueError(f"{what}: pose {np.flatnonzero(bad)[0]} is not finite")
     if poses.ndim == 2:
@@ -129,12 +121,9 @@ class Scene:
         """
         if not isinstance(model, Model):
             raise TypeError(f"model is a {type(model).__name__}, not a Model")
-        pose = to_numpy(pose)
-        checked = check_poses(pose[None], "pose")[0]
-        if int(world) != world or not EVERY_WORLD <= world < 2**31:
-            raise ValueError(f"world {world!r} is no whole number from -1")
-        if importance not in (1, 2, 3):
-            raise ValueError(f"importance {importance!r} is none of 1, 2, 3")
+        checked = check_poses(to_numpy(pose, "pose")[None], "pose")[0]
+        world = whole_number(world, "world", EVERY_WORLD, 2**31 - 1)
+        importance = whole_number(importance, "importance", 1, 3)
         lod = model.lod_max if lod is None else model.check_lod(lod)
         known = next((i for i, other in enumerate(self.models) if other is model), None)
         self._settle()
@@ -142,8 +131,8 @@ class Scene:
             known = len(self.models)
             self.models.append(model)
         self.object_model.append(known)
-        self.object_importance.append(int(importance))
-        self._world.append(int(world))
+        self.object_importance.append(importance)
+        self._world.append(world)
         self._static.append(bool(static))
         self._added_pose.append(checked)
         self._lod.append(lod)
@@ -229,7 +218,7 @@ class Scene:
         Raises:
             ValueError: Wrong shape or a LOD out of range; nothing is changed.
         """
-        lods = to_numpy(lods)
+        lods = to_numpy(lods, "lods")
         if lods.shape != (self.object_count,):
             raise ValueError(f"lods: shape {lods.shape} given for {self.object_count} objects")
         if lods.dtype.kind not in "iu" and not (lods.dtype.kind == "f" and (lods == np.floor(lods)).all()):
@@ -250,8 +239,8 @@ class Scene:
         Raises:
             ValueError: Wrong shape, an index that is no object, an object paired with itself.
         """
-        pairs = to_numpy(pairs)
-        if pairs.size == 0:
+        pairs = to_numpy(pairs, "pairs")
+        if pairs.shape in ((0,), (0, 2)):
             return np.empty((0, 2), np.int32)
         if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind not in "iu":
             raise ValueError(f"pairs: shape {pairs.shape} and type {pairs.dtype}, not whole numbers of shape (p, 2)")
@@ -310,10 +299,9 @@ class Scene:
         Raises:
             ValueError: No such object.
         """
-        if not 0 <= int(i) < self.object_count:
-            raise ValueError(f"object {i!r} is outside 0 .. {self.object_count - 1}")
+        i = whole_number(i, "object", 0, self.object_count - 1)
         _, states, objects = self.arrays()
-        slot = states.slots[objects.state[int(i)]]
+        slot = states.slots[objects.state[i]]
         model = self.models[slot.model]
         nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
         lower = states.pool.node_lower[nodes].numpy() + model.centre
