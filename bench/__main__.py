@@ -17,7 +17,7 @@ def main(argv=None):
     parser.add_argument("--device", default=None)
     parser.add_argument("--json", metavar="FILE", help="write the rows to a file as well")
     options = parser.parse_args(argv)
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     rows = []
     for row in CASES[options.name](options.device):
         rows.append(row)

@@ -16,7 +16,7 @@ from warp_abtree.kernels.cover import (
     cover_triangle,
     piece_distance_sq,
 )
-from warp_abtree.kernels.forest import Rings, absorb_ring, third_corner
+from warp_abtree.kernels.forest import Rings, absorb_ring, count_dying, third_corner
 from warp_abtree.kernels.piece import Scratch
 
 wp.set_module_options({"enable_backward": False})
@@ -131,6 +131,7 @@ def retire_faces(replay: Replay, scratch: Scratch, rings: Rings, live: int, a: i
     Returns the live faces and the candidates.
     """
     near_count = int(0)
+    alone = rings.degree[a] + rings.degree[b] == 2 * count_dying(rings, a, b)
     k = rings.head[a]
     while k >= 0:
         f = k // 3
@@ -143,7 +144,7 @@ def retire_faces(replay: Replay, scratch: Scratch, rings: Rings, live: int, a: i
                 replay.live_face[place] = moved
                 replay.live_place[moved] = place
                 other = rings.head[third]
-                while other >= 0:
+                while alone and other >= 0:
                     g = other // 3
                     if rings.corner_node[3 * g] >= 0:
                         if third_corner(g, a, b, rings.corner_node) < 0:

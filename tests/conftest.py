@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_WARNING
 wp.init()
 
 ROOT = Path(__file__).resolve().parents[1]

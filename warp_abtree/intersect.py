@@ -49,9 +49,10 @@ class Result:
         self._hit_demand, self._hit_room = 0, len(hits.face)
         p = len(pairs)
         self.any = hits.any_hit.numpy()[:p] != 0
-        self.node_tests = hits.node_tests.numpy()[:p]
-        self.triangle_tests = hits.triangle_tests.numpy()[:p]
-        self.count = hits.count.numpy()[:p] if output != "any" else None
+        # On the CPU numpy() shares the memory that the next launch writes.
+        self.node_tests = hits.node_tests.numpy()[:p].copy()
+        self.triangle_tests = hits.triangle_tests.numpy()[:p].copy()
+        self.count = hits.count.numpy()[:p].copy() if output != "any" else None
         self.faces = None
         if output == "faces":
             self._hit_demand = int(self.count.sum())
@@ -87,7 +88,7 @@ class Query:
         output: "any", "count" or "faces".
         pairs: Object pairs to ask, (p, 2); None runs the broad phase in every launch.
         capacity: Face pairs that `faces` has room for.
-        pair_capacity: Pairs that the broad phase has room for.
+        pair_capacity: Pairs that there is room for; by default those given, or a guess for the broad phase.
         precision: Arithmetic of the triangle test.
 
     Attributes:
@@ -112,13 +113,31 @@ class Query:
             self.broad_phase = BroadPhase(*self.arrays, scene.excluded_keys(), pair_capacity)
             self.pairs, self.pair_count = self.broad_phase.pairs, self.broad_phase.pair_count
         else:
-            pairs = scene.check_pairs(pairs)
-            self.pairs = wp.array(pairs, dtype=wp.vec2i, device=self.device)
-            self.pair_count = wp.array([len(pairs)], dtype=wp.int32, device=self.device)
+            self.pair_count = wp.zeros(1, dtype=wp.int32, device=self.device)
+            self.pairs = wp.empty(pair_capacity or 0, dtype=wp.vec2i, device=self.device)
         self.hits = traverse.Hits()
         self.hits.total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._allocate_pairs()
+        if pairs is not None:
+            self.set_pairs(pairs)
         self.resize((capacity or max(1024, 16 * len(self.pairs))) if output == "faces" else 0)
+
+    def set_pairs(self, pairs):
+        """Ask other pairs from now on, in the room there is if they fit.
+
+        Raises:
+            ValueError: Bad pairs, or a query that runs the broad phase.
+        """
+        if self.broad_phase is not None:
+            raise ValueError("this query takes its pairs from the broad phase")
+        pairs = self.scene.check_pairs(pairs)
+        if len(pairs) > len(self.pairs):
+            self.pairs = wp.empty(len(pairs), dtype=wp.vec2i, device=self.device)
+            self._allocate_pairs()
+        if len(pairs):
+            wp.copy(self.pairs, wp.array(pairs, dtype=wp.vec2i, device=self.device), count=len(pairs))
+        self.pair_count.fill_(len(pairs))
+        self._given = pairs
 
     def _allocate_pairs(self):
         """Make room for whatever belongs to a pair."""
@@ -175,8 +194,10 @@ class Query:
 
     def result(self) -> Result:
         """Return the results of the last launch on the host, sorted. Waits for the device."""
-        found = self.broad_phase.count_found() if self.broad_phase is not None else len(self.pairs)
-        pairs = self.pairs.numpy()[: min(found, len(self.pairs))].reshape(-1, 2)
+        if self.broad_phase is None:
+            return Result(self._given, self.output, len(self._given), len(self.pairs), self.hits)
+        found = self.broad_phase.count_found()
+        pairs = self.pairs.numpy()[: min(found, len(self.pairs))].reshape(-1, 2).copy()
         return Result(pairs, self.output, found, len(self.pairs), self.hits)
 
     def run(self) -> Result:

@@ -239,7 +239,8 @@ def _collapse(pos, faces, base_faces, link_condition, report):
     heap.key = wp.zeros(room, dtype=wp.float64, device="cpu")
     wp.launch(collapse.price_edges_kernel, dim=1, inputs=[size, heap.pair, surface, heap.key], device="cpu")
     start_live = int(_distinct(faces).sum())
-    counter = _cpu(np.array([size, 0, start_live, collapse.HEAP_FULL], dtype=np.int32), int)
+    counter = _cpu(np.array([size, 0, start_live, collapse.RUNNING], dtype=np.int32), int)
+    wp.launch(collapse.compact_heap_kernel, dim=1, inputs=[surface, heap, counter], device="cpu")
     state = counter.numpy()  # shares the memory
     goal = max(start_live - base_faces, 1)
     while state[3] != int(collapse.FINISHED):
@@ -253,15 +254,15 @@ def _collapse(pos, faces, base_faces, link_condition, report):
 
 
 def _roomier_heap(surface, heap, counter):
-    """Drop stale entries; where that leaves the heap more than half full, or a hub's edges want more, double it."""
+    """Drop stale entries; where that leaves the heap fairly full, or a hub's edges want more, return a larger one."""
     before = int(counter.numpy()[0])
     wp.launch(collapse.compact_heap_kernel, dim=1, inputs=[surface, heap, counter], device="cpu")
     size, capacity = int(counter.numpy()[0]), len(heap.key)
-    if 2 * size <= capacity and 2 * before > capacity:
+    if 4 * size <= 3 * capacity < 4 * before:
         return heap
     larger = collapse.Heap()
-    larger.key = wp.zeros(2 * capacity, dtype=wp.float64, device="cpu")
-    larger.pair = wp.zeros(2 * capacity, dtype=wp.int64, device="cpu")
+    larger.key = wp.zeros(capacity + capacity // 2 + 64, dtype=wp.float64, device="cpu")
+    larger.pair = wp.zeros(capacity + capacity // 2 + 64, dtype=wp.int64, device="cpu")
     wp.copy(larger.key, heap.key, count=size)
     wp.copy(larger.pair, heap.pair, count=size)
     return larger

@@ -93,6 +93,8 @@ class Scene:
         self._lod: list[int] = []
         self._excluded = np.empty(0, np.int64)
         self._arrays = None
+        self._broad_phase = None
+        self._queries: dict[str, Query] = {}
 
     @property
     def object_count(self) -> int:
@@ -148,6 +150,8 @@ class Scene:
         matrices[:, :3, 3] = objects.pool.position.numpy()
         self._added_pose = list(matrices)
         self._arrays = None
+        self._broad_phase = None
+        self._queries.clear()
 
     def arrays(self):
         """Return (`ModelArrays`, `StateArrays`, `ObjectArrays`), made at the first use after an `add`."""
@@ -261,6 +265,7 @@ class Scene:
             ValueError: As `check_pairs`.
         """
         self._excluded = np.union1d(self._excluded, exclusion_keys(self.check_pairs(pairs)))
+        self._broad_phase = None
 
     def excluded_keys(self) -> np.ndarray:
         """Return the excluded pairs as sorted keys i * 2^32 + j, i < j, int64."""
@@ -273,7 +278,9 @@ class Scene:
         """
         if self.object_count < 2:
             return np.empty((0, 2), np.int32)
-        return BroadPhase(*self.arrays(), self._excluded).find()
+        if self._broad_phase is None:
+            self._broad_phase = BroadPhase(*self.arrays(), self._excluded)
+        return self._broad_phase.find()
 
     def intersect(self, pairs=None, output="any", precision="float64", within=None) -> Result:
         """Test object pairs for intersection, exactly as posed and at their LODs. Waits for the device.
@@ -291,7 +298,11 @@ class Scene:
         """
         check_request(output, precision, within)
         pairs = self.broad_phase() if pairs is None else self.check_pairs(pairs)
-        return Query(self, output, pairs=pairs, precision=precision).run()
+        if output in self._queries:
+            self._queries[output].set_pairs(pairs)
+        else:
+            self._queries[output] = Query(self, output, pairs=pairs, precision=precision)
+        return self._queries[output].run()
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.
@@ -308,9 +319,9 @@ class Scene:
         upper = states.pool.node_upper[nodes].numpy() + model.centre
         return TreeState(
             slot.lod,
-            states.pool.node_status[nodes].numpy(),
+            states.pool.node_status[nodes].numpy().copy(),
             np.where(np.isinf(lower), lower, np.nextafter(lower, -np.inf)),
             np.where(np.isinf(upper), upper, np.nextafter(upper, np.inf)),
-            states.pool.node_skip[nodes].numpy(),
+            states.pool.node_skip[nodes].numpy().copy(),
             model.tree.leaf_node,
         )
