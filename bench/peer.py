@@ -1,6 +1,6 @@
 """What a Warp user writes today: one thread a face of A, a wp.Bvh over the faces of B, wp.intersect_tri_tri.
 
-A baseline for time only: its triangle test has an absolute epsilon and reports about twice the true pairs on fine meshes.
+A baseline for time only: its triangle test has an absolute epsilon and invents pairs on fine meshes.
 """
 
 import numpy as np
