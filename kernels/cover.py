@@ -37,8 +37,8 @@ class Replay:
     triangle_pos: wp.array2d(dtype=wp.vec3d)  # [face_count, 3], original triangles
     face_pos: wp.array2d(dtype=wp.vec3d)  # [face_count, 3], active faces where they are now
     face_ball: wp.array(dtype=wp.vec4d)  # [face_count], centre and radius of a ball about each
-    live_face: wp.array(dtype=int)  # [face_count], active faces in any order
-    live_place: wp.array(dtype=int)  # [face_count], where each stands there
+    bvh: wp.uint64  # wp.Bvh over the boxes of the faces in bvh_face; 0 until a piece vanishes
+    bvh_face: wp.array(dtype=int)  # [any]
     slot_face: wp.array(dtype=int)  # [slot_count], face that the slot's triangle is registered with
     slot_triangle: wp.array(dtype=int)  # [slot_count]; slot t is triangle t's own, those after face_count are pooled
     slot_sibling: wp.array(dtype=int)  # [slot_count], next slot of the same triangle, or -1

@@ -16,7 +16,7 @@ from warp_abtree.kernels.cover import (
     cover_triangle,
     piece_distance_sq,
 )
-from warp_abtree.kernels.forest import Rings, absorb_ring, count_dying, third_corner
+from warp_abtree.kernels.forest import Rings, absorb_ring, count_dying, third_corner, third_vertices_live
 from warp_abtree.kernels.piece import Scratch
 
 wp.set_module_options({"enable_backward": False})
@@ -28,6 +28,9 @@ LIVE_FACES = wp.constant(1)
 STAMP = wp.constant(2)
 FREE_SLOTS = wp.constant(3)
 QUEUED = wp.constant(4)  # triangles that the last merge covered anew
+INDEXED = wp.constant(5)  # active faces when the tree was built; 0: never; -1: a piece vanishes and it must be built
+
+SEARCH_REACH = wp.constant(wp.float64(2.0**-10))
 
 
 @wp.func
@@ -91,17 +94,40 @@ def register_triangle(replay: Replay, scratch: Scratch, t: int, used: int, free:
 
 
 @wp.func
-def search_all(replay: Replay, scratch: Scratch, live: int, first: int):
-    """Return the active face that bounds the triangle in hand best; `first` is tried first."""
-    best = first
-    bound = piece_distance_sq(replay, scratch, 3, best, wp.float64(wp.inf))
-    for i in range(live):
-        f = replay.live_face[i]
-        distance = piece_distance_sq(replay, scratch, 3, f, bound)
-        if distance < bound:
-            best = f
-            bound = distance
+def search_all(replay: Replay, scratch: Scratch, rings: Rings, limit: wp.float64):
+    """Return the active face that bounds the triangle in hand best, or any that does within `limit`.
+
+    The tree only proposes faces, some of them dead by now; what they bound is measured.
+    """
+    lower = wp.min(scratch.piece[0], wp.min(scratch.piece[1], scratch.piece[2]))
+    upper = wp.max(scratch.piece[0], wp.max(scratch.piece[1], scratch.piece[2]))
+    best = int(-1)
+    bound = wp.float64(wp.inf)
+    reach = wp.max(wp.sqrt(limit), SEARCH_REACH)
+    searching = bool(True)
+    while searching:
+        r = wp.vec3d(reach, reach, reach)
+        query = wp.bvh_query_aabb(replay.bvh, wp.vec3(lower - r), wp.vec3(upper + r))
+        i = int(0)
+        while bound > limit and wp.bvh_query_next(query, i):
+            f = replay.bvh_face[i]
+            if rings.corner_node[3 * f] >= 0:
+                distance = piece_distance_sq(replay, scratch, 3, f, bound)
+                if distance < bound:
+                    best = f
+                    bound = distance
+        # a face that bounds within the reach meets the box searched, so none was missed
+        searching = bound > limit and bound > reach * reach
+        reach = wp.where(best < 0, reach * wp.float64(2.0), wp.sqrt(bound) * wp.float64(1.001))
     return best
+
+
+@wp.func
+def piece_vanishes(rings: Rings, a: int, b: int):
+    """Tell whether merging a and b leaves their piece without a face."""
+    if rings.degree[a] + rings.degree[b] > 2 * count_dying(rings, a, b):
+        return False
+    return not third_vertices_live(rings, a, b)
 
 
 @wp.func
@@ -125,33 +151,24 @@ def queue_ring(replay: Replay, rings: Rings, queued: int, node: int, stamp: int)
 
 
 @wp.func
-def retire_faces(replay: Replay, scratch: Scratch, rings: Rings, live: int, a: int, b: int, stamp: int):
-    """Take the faces that have a and b off the live list; make those at their third corners candidates.
-
-    Returns the live faces and the candidates.
-    """
+def third_rings(replay: Replay, scratch: Scratch, rings: Rings, a: int, b: int, stamp: int):
+    """Make the faces at the third corners of those that die with (a, b) candidates; return how many these are."""
     near_count = int(0)
-    alone = rings.degree[a] + rings.degree[b] == 2 * count_dying(rings, a, b)
     k = rings.head[a]
     while k >= 0:
         f = k // 3
         if rings.corner_node[3 * f] >= 0:
             third = third_corner(f, a, b, rings.corner_node)
             if third >= 0:
-                live -= 1
-                place = replay.live_place[f]
-                moved = replay.live_face[live]
-                replay.live_face[place] = moved
-                replay.live_place[moved] = place
                 other = rings.head[third]
-                while alone and other >= 0:
+                while other >= 0:
                     g = other // 3
                     if rings.corner_node[3 * g] >= 0:
                         if third_corner(g, a, b, rings.corner_node) < 0:
                             near_count = add_near(replay, scratch, near_count, stamp, stamp, g)
                     other = rings.next[other]
         k = rings.next[k]
-    return live, near_count
+    return near_count
 
 
 @wp.kernel
@@ -176,8 +193,6 @@ def start_replay_kernel(
             set_face(replay_inout, corner_node, f)
             replay_inout.slot_triangle[f] = f
             register_slot(replay_inout, f, f)
-            replay_inout.live_face[live] = f
-            replay_inout.live_place[f] = live
             live += 1
     counter_inout[LIVE_FACES] = live
     pooled = replay_inout.free_slot.shape[0]
@@ -195,7 +210,6 @@ def cover_queued(
     t: int,
     first: int,
     near_count: int,
-    live: int,
     shared: int,
     limit: wp.float64,
 ):
@@ -219,7 +233,7 @@ def cover_queued(
                 near_count = add_near(replay, scratch, near_count, shared, own, f)
             slot = replay.slot_sibling[slot]
         if near_count == 0:
-            f = search_all(replay, scratch, live, replay.live_face[0])
+            f = search_all(replay, scratch, rings, limit)
             for k in range(3):
                 near_count = add_ring(replay, scratch, rings, near_count, shared, own, rings.corner_node[3 * f + k])
         free = release_triangle(replay, t, face_count, free)
@@ -247,7 +261,10 @@ def replay_merge(
     counter[STAMP] = stamp
     queued = queue_ring(replay, rings, 0, a, stamp)
     queued = queue_ring(replay, rings, queued, b, stamp)
-    live, near_count = retire_faces(replay, scratch, rings, counter[LIVE_FACES], a, b, stamp)
+    dying = count_dying(rings, a, b)
+    near_count = int(0)
+    if rings.degree[a] + rings.degree[b] == 2 * dying:
+        near_count = third_rings(replay, scratch, rings, a, b, stamp)
     tail = absorb_ring(rings, a, a, b, c, -1)
     tail = absorb_ring(rings, b, a, b, c, tail)
     near_count = add_ring(replay, scratch, rings, near_count, stamp, stamp, c)
@@ -257,9 +274,9 @@ def replay_merge(
         k = rings.next[k]
     for i in range(queued):
         limit = cover_queued(
-            replay, scratch, rings, counter, replay.queue[i], replay.queue_face[i], near_count, live, stamp, limit
+            replay, scratch, rings, counter, replay.queue[i], replay.queue_face[i], near_count, stamp, limit
         )
-    counter[LIVE_FACES] = live
+    counter[LIVE_FACES] = counter[LIVE_FACES] - dying
     counter[QUEUED] = queued
     return limit
 
@@ -290,14 +307,22 @@ def replay_merges_kernel(
     if j > 0:
         limit = bound_sq_out[j - 1]
     covers = int(0)
-    while j < merge_count and covers < cover_budget:
+    searchable = bool(True)
+    while searchable and j < merge_count and covers < cover_budget:
+        a = merge_pair[j, 0]
+        b = merge_pair[j, 1]
+        if 2 * counter_inout[LIVE_FACES] < counter_inout[INDEXED] or counter_inout[INDEXED] == 0:
+            searchable = not piece_vanishes(rings_inout, a, b)
+        if not searchable:
+            counter_inout[INDEXED] = -1
+            break
         limit = replay_merge(
             replay_inout,
             scratch_inout,
             rings_inout,
             counter_inout,
-            merge_pair[j, 0],
-            merge_pair[j, 1],
+            a,
+            b,
             vertex_count + j,
             limit,
         )

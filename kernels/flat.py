@@ -8,49 +8,62 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def separates_line(a: wp.vec2d, b: wp.vec2d, inner: wp.vec2d, p: wp.vec2d, q: wp.vec2d, r: wp.vec2d):
+def separates_line(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, inner: wp.vec2d, p: wp.vec2d, q: wp.vec2d, r: wp.vec2d):
     """Return whether p, q and r all lie strictly on the side of line ab that `inner` is not on."""
-    zero = wp.float64(0.0)
-    side = orient2d(a, b, inner)
-    sp = orient2d(a, b, p)
-    sq = orient2d(a, b, q)
-    sr = orient2d(a, b, r)
-    if side >= zero and sp < zero and sq < zero and sr < zero:
-        return True
-    return side <= zero and sp > zero and sq > zero and sr > zero
+    side = orient2d(mode, a, b, inner)
+    sp = orient2d(mode, a, b, p)
+    if sp == 0 or sp == side:
+        return False
+    return orient2d(mode, a, b, q) == sp and orient2d(mode, a, b, r) == sp
 
 
 @wp.func
-def overlap_flat(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d, q: wp.vec2d, r: wp.vec2d):
+def overlap_flat(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d, q: wp.vec2d, r: wp.vec2d):
     """Return whether no edge line separates two closed plane triangles.
 
     Complete for two triangles, and for a triangle and a segment or a point: every edge of their Minkowski difference
     is then parallel to an edge of one of them. (A segment as p, q, r has side 0 on its own line, so both sides are
     asked.)
     """
-    if separates_line(a, b, c, p, q, r) or separates_line(b, c, a, p, q, r) or separates_line(c, a, b, p, q, r):
+    if (
+        separates_line(mode, a, b, c, p, q, r)
+        or separates_line(mode, b, c, a, p, q, r)
+        or separates_line(mode, c, a, b, p, q, r)
+    ):
         return False
-    if separates_line(p, q, r, a, b, c) or separates_line(q, r, p, a, b, c) or separates_line(r, p, q, a, b, c):
+    if (
+        separates_line(mode, p, q, r, a, b, c)
+        or separates_line(mode, q, r, p, a, b, c)
+        or separates_line(mode, r, p, q, a, b, c)
+    ):
         return False
     return True
 
 
 @wp.func
-def widest_axis(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Return the axis along which a triangle projects to the largest area, -1 where every projection is collinear."""
+def widest_axis(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """Return the axis along which a triangle projects to about the largest area, -1 where all three are collinear."""
     axis = wp.int32(-1)
-    most = wp.float64(0.0)
+    most = wp.float64(-1.0)
+    u = b - a
+    v = c - a
     for i in range(3):
-        area = wp.abs(orient2d(drop_axis(a, i), drop_axis(b, i), drop_axis(c, i)))
-        if area > most:
-            axis = i
-            most = area
+        if orient2d(mode, drop_axis(a, i), drop_axis(b, i), drop_axis(c, i)) != 0:
+            j = (i + 1) % 3
+            k = (i + 2) % 3
+            area = wp.abs(u[j] * v[k] - u[k] * v[j])
+            if area > most:
+                axis = i
+                most = area
     return axis
 
 
 @wp.func
-def intersect_coplanar(axis: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d):
+def intersect_coplanar(
+    mode: wp.int32, axis: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d
+):
     return overlap_flat(
+        mode,
         drop_axis(a, axis),
         drop_axis(b, axis),
         drop_axis(c, axis),
@@ -87,28 +100,29 @@ def find_ends(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 
 @wp.func
-def intersect_segment_triangle(axis: wp.int32, p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+def intersect_segment_triangle(
+    mode: wp.int32, axis: wp.int32, p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d
+):
     """Return whether a closed segment (or point) meets a triangle of positive area, `axis` its `widest_axis`."""
-    zero = wp.float64(0.0)
-    sp = orient3d(a, b, c, p)
-    sq = orient3d(a, b, c, q)
-    if (sp > zero and sq > zero) or (sp < zero and sq < zero):
+    sp = orient3d(mode, a, b, c, p)
+    sq = orient3d(mode, a, b, c, q)
+    if sp == 0 and sq == 0:
+        return intersect_coplanar(mode, axis, a, b, c, p, q, q)
+    if sp == sq:
         return False
-    if sp == zero and sq == zero:
-        return intersect_coplanar(axis, a, b, c, p, q, q)
-    ab = orient3d(p, q, a, b)
-    bc = orient3d(p, q, b, c)
-    ca = orient3d(p, q, c, a)
-    return (ab >= zero and bc >= zero and ca >= zero) or (ab <= zero and bc <= zero and ca <= zero)
+    ab = orient3d(mode, p, q, a, b)
+    bc = orient3d(mode, p, q, b, c)
+    ca = orient3d(mode, p, q, c, a)
+    return (ab >= 0 and bc >= 0 and ca >= 0) or (ab <= 0 and bc <= 0 and ca <= 0)
 
 
 @wp.func
-def intersect_segments(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
+def intersect_segments(mode: wp.int32, p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
     """Return whether two closed segments (or points) meet.
 
     Coplanar ones meet iff their boxes and all three projections do: one projection keeps the plane, or the line, apart.
     """
-    if orient3d(p, q, a, b) != wp.float64(0.0):
+    if orient3d(mode, p, q, a, b) != 0:
         return False
     meet = bool(True)
     for i in range(3):
@@ -118,13 +132,14 @@ def intersect_segments(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
         q2 = drop_axis(q, i)
         a2 = drop_axis(a, i)
         b2 = drop_axis(b, i)
-        if separates_line(p2, q2, q2, a2, b2, b2) or separates_line(a2, b2, b2, p2, q2, q2):
+        if separates_line(mode, p2, q2, q2, a2, b2, b2) or separates_line(mode, a2, b2, b2, p2, q2, q2):
             meet = False
     return meet
 
 
 @wp.func
 def intersect_degenerate(
+    mode: wp.int32,
     axis_a: wp.int32,
     axis_b: wp.int32,
     a: wp.vec3d,
@@ -138,9 +153,9 @@ def intersect_degenerate(
     if axis_a < 0 and axis_b < 0:
         a_low, a_high = find_ends(a, b, c)
         b_low, b_high = find_ends(p, q, r)
-        return intersect_segments(a_low, a_high, b_low, b_high)
+        return intersect_segments(mode, a_low, a_high, b_low, b_high)
     if axis_a < 0:
         a_low, a_high = find_ends(a, b, c)
-        return intersect_segment_triangle(axis_b, a_low, a_high, p, q, r)
+        return intersect_segment_triangle(mode, axis_b, a_low, a_high, p, q, r)
     b_low, b_high = find_ends(p, q, r)
-    return intersect_segment_triangle(axis_a, b_low, b_high, a, b, c)
+    return intersect_segment_triangle(mode, axis_a, b_low, b_high, a, b, c)

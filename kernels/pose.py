@@ -17,7 +17,7 @@ class PairPose:
     """The pose of B in A's frame, A the object with the smaller index.
 
     rotation, translation map B's model frame to A's in float64. rotation32, translation32, margin serve boxes about the
-    models' centres.
+    models' centres. scale is a power of two that brings the larger model to about unit size.
     """
 
     rotation: wp.mat33d
@@ -25,6 +25,7 @@ class PairPose:
     rotation32: wp.mat33
     translation32: wp.vec3
     margin: wp.float32
+    scale: wp.float64
 
 
 @wp.func
@@ -104,6 +105,9 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     pose.rotation = r
     pose.translation = t
     pose.rotation32 = wp.mat33(r)
+    # The exponent of a float32 without its digits is a power of two.
+    exponent = wp.cast(wp.float32(wp.max(reach_a, reach_b)), wp.int32) & 0x7F800000
+    pose.scale = wp.float64(1.0) / wp.float64(wp.cast(exponent, wp.float32))
     # A margin that no box passes, for pairs that are apart for certain and perhaps beyond float32, or even float64: a
     # distance that overflowed gives infinity or NaN.
     pose.margin = -wp.inf

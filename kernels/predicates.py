@@ -1,29 +1,91 @@
-"""Orientation signs in float64. The float32 filter and the expansions of the exact predicates take their place here."""
+"""Orientation signs: a float64 determinant with a proven error bound, and expansions where it leaves the sign open.
+
+Bounds. With e = 2^-53 and no overflow, the determinants below err by at most (7 + 56 e) e P in 3D and (3 + 16 e) e P in
+2D, P the same sum with every product and difference of products replaced by the sum of magnitudes, computed in the same
+arithmetic (Shewchuk 1997, sections 4.3 and 4.4, bounds A). Underflow: coordinates are 0 or at least 2^-290, hence
+differences are multiples of 2^-342 and products of three of 2^-1026: what falls below float64's normal range lies on
+its grid of 2^-1074 and is not rounded at all. So P is 0 only where every product has a factor 0, and the sign is 0.
+"""
 
 import warp as wp
 
+from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d
+
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
+# How signs are made. FILTER answers UNSURE where the bound leaves the sign open; EXACT goes on to expansions.
+FILTER = wp.constant(0)
+FLOAT64 = wp.constant(1)
+FLOAT32 = wp.constant(2)
+EXACT = wp.constant(3)
+
+UNSURE = wp.constant(2)
+
+BOUND_3D = wp.constant(wp.float64((7.0 + 56.0 * 2.0**-53) * 2.0**-53))
+BOUND_2D = wp.constant(wp.float64((3.0 + 16.0 * 2.0**-53) * 2.0**-53))
+
 
 @wp.func
-def orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return a value whose sign says on which side of plane (a, b, c) point d lies.
+def plain_sign(x: wp.float64):
+    zero = wp.float64(0.0)
+    return wp.where(x > zero, 1, wp.where(x < zero, -1, 0))
 
-    Positive where (b - a) x (c - a) points away from d. Source: Shewchuk 1997, section 4, without the adaptive stages.
+
+@wp.func
+def filtered_sign(x: wp.float64, bound: wp.float64):
+    """Return the sign of a value that errs by at most a bound, or UNSURE; a bound of 0 makes 0 a sure sign."""
+    if x > bound:
+        return 1
+    if x < -bound:
+        return -1
+    return wp.where(bound == wp.float64(0.0), 0, UNSURE)
+
+
+@wp.func
+def orient3d_float32(a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Return the sign of a float32 determinant, unguarded."""
+    return plain_sign(wp.float64(wp.dot(a, wp.cross(b, c))))
+
+
+@wp.func
+def orient3d(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Return on which side of plane (a, b, c) point d lies: 1 below, -1 above, 0 on it, or UNSURE.
+
+    Seen from above, a, b and c turn counterclockwise.
     """
-    ad = a - d
-    bd = b - d
-    cd = c - d
-    x = ad[0] * (bd[1] * cd[2] - bd[2] * cd[1])
-    y = bd[0] * (cd[1] * ad[2] - cd[2] * ad[1])
-    z = cd[0] * (ad[1] * bd[2] - ad[2] * bd[1])
-    return (x + y) + z
+    u = a - d
+    v = b - d
+    w = c - d
+    if mode == FLOAT32:
+        return orient3d_float32(wp.vec3(u), wp.vec3(v), wp.vec3(w))
+    v1w2 = v[1] * w[2]
+    v2w1 = v[2] * w[1]
+    w1u2 = w[1] * u[2]
+    w2u1 = w[2] * u[1]
+    u1v2 = u[1] * v[2]
+    u2v1 = u[2] * v[1]
+    value = (u[0] * (v1w2 - v2w1) + v[0] * (w1u2 - w2u1)) + w[0] * (u1v2 - u2v1)
+    if mode == FLOAT64:
+        return plain_sign(value)
+    size = wp.abs(u[0]) * (wp.abs(v1w2) + wp.abs(v2w1)) + wp.abs(v[0]) * (wp.abs(w1u2) + wp.abs(w2u1))
+    size = size + wp.abs(w[0]) * (wp.abs(u1v2) + wp.abs(u2v1))
+    sign = filtered_sign(value, BOUND_3D * size)
+    if mode == EXACT and sign == UNSURE:
+        sign = exact_orient3d(a, b, c, d)
+    return sign
 
 
 @wp.func
-def orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
-    """Return a value that is positive where a, b, c turn counterclockwise, zero where they are collinear."""
-    return (a[0] - c[0]) * (b[1] - c[1]) - (a[1] - c[1]) * (b[0] - c[0])
+def orient2d(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
+    """Return 1 where a, b, c turn counterclockwise, -1 clockwise, 0 where they are collinear, or UNSURE."""
+    left = (a[0] - c[0]) * (b[1] - c[1])
+    right = (a[1] - c[1]) * (b[0] - c[0])
+    if mode == FLOAT64 or mode == FLOAT32:
+        return plain_sign(left - right)
+    sign = filtered_sign(left - right, BOUND_2D * (wp.abs(left) + wp.abs(right)))
+    if mode == EXACT and sign == UNSURE:
+        sign = exact_orient2d(a, b, c)
+    return sign
 
 
 @wp.func

@@ -10,6 +10,7 @@ import warp as wp
 from warp_abtree.kernels.boxes import boxes_overlap
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
+from warp_abtree.kernels.predicates import EXACT, FLOAT32, UNSURE
 from warp_abtree.kernels.triangle import intersect_triangles
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -44,7 +45,9 @@ class Hits:
     """Results of a batch of pairs.
 
     any_hit, count: shape [pair]. face: (pair, face a, face b), a of the pair's first object, shape [capacity]; total
-    numbers them and may wrap, the demand is the sum of count. node_tests, triangle_tests: work done, shape [pair].
+    numbers them and may wrap, the demand is the sum of count. node_tests, triangle_tests, exact_tests: work done,
+    shape [pair].
+    unsure: (pair, face of the lower object, face of the higher) that wait for exact signs, shape [capacity].
     """
 
     any_hit: wp.array(dtype=wp.int32)
@@ -53,10 +56,16 @@ class Hits:
     total: wp.array(dtype=wp.int32)
     node_tests: wp.array(dtype=wp.int64)
     triangle_tests: wp.array(dtype=wp.int64)
+    exact_tests: wp.array(dtype=wp.int64)
+    unsure: wp.array(dtype=wp.vec3i)
+    unsure_total: wp.array(dtype=wp.int32)
 
 
 @wp.func
-def locate_trees(models: ModelPool, states: StatePool, state_a: wp.int32, state_b: wp.int32):
+def locate_pair(models: ModelPool, states: StatePool, objects: ObjectPool, pair: wp.vec2i):
+    """Return whether a pair names its higher object first, and its trees, the lower object's as A."""
+    state_a = objects.state[wp.min(pair[0], pair[1])]
+    state_b = objects.state[wp.max(pair[0], pair[1])]
     trees = PairTrees()
     trees.node_a = states.node_start[state_a]
     trees.node_b = states.node_start[state_b]
@@ -64,24 +73,41 @@ def locate_trees(models: ModelPool, states: StatePool, state_a: wp.int32, state_
     trees.face_node_b = models.node_start[states.model[state_b]]
     trees.corner_a = states.face_start[state_a]
     trees.corner_b = states.face_start[state_b]
-    return trees
+    return wp.where(pair[0] > pair[1], 1, 0), trees
 
 
 @wp.func
 def test_faces(
-    models: ModelPool, states: StatePool, trees: PairTrees, pose: PairPose, face_a: wp.int32, face_b: wp.int32
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    trees: PairTrees,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
 ):
-    """Test one active face of A against one of B, in A's frame."""
+    """Test one active face of A against one of B, in A's frame; return 1, 0 or UNSURE."""
     a = states.face_corner[trees.corner_a + face_a]
     b = states.face_corner[trees.corner_b + face_b]
-    return intersect_triangles(
-        models.vertex_pos[a[0]],
-        models.vertex_pos[a[1]],
-        models.vertex_pos[a[2]],
-        pose_point(pose.rotation, pose.translation, models.vertex_pos[b[0]]),
-        pose_point(pose.rotation, pose.translation, models.vertex_pos[b[1]]),
-        pose_point(pose.rotation, pose.translation, models.vertex_pos[b[2]]),
-    )
+    a0 = models.vertex_pos[a[0]]
+    a1 = models.vertex_pos[a[1]]
+    a2 = models.vertex_pos[a[2]]
+    b0 = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[0]])
+    b1 = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[1]])
+    b2 = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[2]])
+    if mode == FLOAT32:
+        # A power of two brings the model to unit size, so that no product leaves float32's range.
+        s = pose.scale
+        return intersect_triangles(mode, a0 * s, a1 * s, a2 * s, b0 * s, b1 * s, b2 * s)
+    return intersect_triangles(mode, a0, a1, a2, b0, b1, b2)
+
+
+@wp.func
+def defer_faces(pair: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+    """Put a pair of faces on the list that `settle_unsure_kernel` works off; its count goes on past the capacity."""
+    slot = wp.atomic_add(hits.unsure_total, 0, 1)
+    if slot >= 0 and slot < hits.unsure.shape[0]:
+        hits.unsure[slot] = wp.vec3i(pair, face_a, face_b)
 
 
 @wp.func
@@ -128,7 +154,9 @@ def visit_nodes(
 
 @wp.func
 def traverse_depth_first(
+    defers: wp.int32,
     output: wp.int32,
+    mode: wp.int32,
     pair: wp.int32,
     swapped: wp.int32,
     start_a: wp.int32,
@@ -139,7 +167,10 @@ def traverse_depth_first(
     pose: PairPose,
     hits: Hits,
 ):
-    """Traverse from one pair of nodes in this thread; return hits, node tests and triangle tests."""
+    """Traverse from one pair of nodes in this thread; return hits, node tests, triangle tests and exact tests.
+
+    Faces that the filter leaves open are deferred, or settled in place.
+    """
     stack = stack_type()
     stack[0] = start_a
     stack[1] = start_b
@@ -147,6 +178,7 @@ def traverse_depth_first(
     hit_count = wp.int64(0)
     node_tests = wp.int64(0)
     triangle_tests = wp.int64(0)
+    exact_tests = wp.int64(0)
     one = wp.int64(1)
     while top > 0:
         top -= 1
@@ -156,7 +188,14 @@ def traverse_depth_first(
         node_tests += one
         if kind == 1:
             triangle_tests += one
-            if test_faces(models, states, trees, pose, x, y):
+            meet = test_faces(mode, models, states, trees, pose, x, y)
+            if meet == UNSURE:
+                exact_tests += one
+                if defers != 0:
+                    defer_faces(pair, x, y, hits)
+                else:
+                    meet = test_faces(EXACT, models, states, trees, pose, x, y)
+            if meet == 1:
                 hit_count += one
                 report_hit(output, pair, swapped, x, y, hits)
                 if output == OUTPUT_ANY:
@@ -173,12 +212,13 @@ def traverse_depth_first(
             stack[2 * top + 2] = node_a
             stack[2 * top + 3] = y
             top += 2
-    return wp.vec3l(hit_count, node_tests, triangle_tests)
+    return wp.vec4l(hit_count, node_tests, triangle_tests, exact_tests)
 
 
 @wp.kernel
 def traverse_thread_kernel(
     output: wp.int32,
+    mode: wp.int32,
     models: ModelPool,
     states: StatePool,
     objects: ObjectPool,
@@ -191,21 +231,22 @@ def traverse_thread_kernel(
     p = wp.tid()
     if p >= wp.min(pair_count[0], pairs.shape[0]):
         return
-    swapped = wp.where(pairs[p][0] > pairs[p][1], 1, 0)
-    state_a = objects.state[wp.min(pairs[p][0], pairs[p][1])]
-    state_b = objects.state[wp.max(pairs[p][0], pairs[p][1])]
-    trees = locate_trees(models, states, state_a, state_b)
+    swapped, trees = locate_pair(models, states, objects, pairs[p])
     skip_a = states.node_skip[trees.node_a + 1]
     skip_b = states.node_skip[trees.node_b + 1]
-    counts = traverse_depth_first(output, p, swapped, skip_a, skip_b, models, states, trees, pair_poses[p], hits_out)
+    counts = traverse_depth_first(
+        0, output, mode, p, swapped, skip_a, skip_b, models, states, trees, pair_poses[p], hits_out
+    )
     hits_out.count[p] = counts[0]
     hits_out.node_tests[p] = counts[1]
     hits_out.triangle_tests[p] = counts[2]
+    hits_out.exact_tests[p] = counts[3]
 
 
 @wp.func
 def finish_refused(
     output: wp.int32,
+    mode: wp.int32,
     pair: wp.int32,
     swapped: wp.int32,
     refused: bool,
@@ -218,13 +259,14 @@ def finish_refused(
 ):
     """Traverse depth first from a pair of nodes that the shared stack had no room for; return the counts."""
     if refused:
-        return traverse_depth_first(output, pair, swapped, node[0], node[1], models, states, trees, pose, hits)
-    return wp.vec3l()
+        return traverse_depth_first(1, output, mode, pair, swapped, node[0], node[1], models, states, trees, pose, hits)
+    return wp.vec4l()
 
 
 @wp.kernel
 def traverse_block_kernel(
     output: wp.int32,
+    mode: wp.int32,
     models: ModelPool,
     states: StatePool,
     objects: ObjectPool,
@@ -235,18 +277,15 @@ def traverse_block_kernel(
 ):
     """Traverse one object pair a block: its threads pop node pairs from a shared stack and push what overlaps.
 
-    Candidate faces wait on a second stack until every thread has one to test. What the full stack refuses, its thread
-    finishes depth first: nothing is lost, whatever the stack's length.
+    Candidate faces wait on a second stack until every thread has one. What the full stack refuses, its thread finishes.
     """
     p, lane = wp.tid()
     if p >= wp.min(pair_count[0], pairs.shape[0]):
         return
-    swapped = wp.where(pairs[p][0] > pairs[p][1], 1, 0)
-    low = objects.state[wp.min(pairs[p][0], pairs[p][1])]
-    trees = locate_trees(models, states, low, objects.state[wp.max(pairs[p][0], pairs[p][1])])
+    swapped, trees = locate_pair(models, states, objects, pairs[p])
     pose = pair_poses[p]
-    counts = wp.vec3l()
-    zero, one = wp.int64(0), wp.int64(1)
+    counts = wp.vec4l()
+    one = wp.int64(1)
     stack = wp.tile_stack(capacity=SHARED_LENGTH, dtype=wp.vec2i)
     # Visits stop at block_dim candidates and add at most as many, so this stack never fills.
     candidates = wp.tile_stack(capacity=CANDIDATE_LENGTH, dtype=wp.vec2i)
@@ -258,23 +297,52 @@ def traverse_block_kernel(
         if wp.tile_stack_count(candidates) >= ready or wp.tile_stack_count(stack) == 0:
             faces, face_slot = wp.tile_stack_pop(candidates)
             if face_slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
-                counts += wp.vec3l(zero, zero, one)
-                if test_faces(models, states, trees, pose, faces[0], faces[1]):
-                    counts += wp.vec3l(one, zero, zero)
+                counts[2] += one
+                meet = test_faces(mode, models, states, trees, pose, faces[0], faces[1])
+                if meet == UNSURE:
+                    counts[3] += one
+                    defer_faces(p, faces[0], faces[1], hits_out)
+                elif meet == 1:
+                    counts[0] += one
                     report_hit(output, p, swapped, faces[0], faces[1], hits_out)
         else:
             item, slot = wp.tile_stack_pop(stack)
             kind, x, y = wp.int32(0), wp.int32(0), wp.int32(0)
             if slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
                 kind, x, y = visit_nodes(models, states, trees, pose, item[0], item[1])
-                counts += wp.vec3l(zero, one, zero)
+                counts[1] += one
             wp.tile_stack_push(candidates, wp.vec2i(x, y), kind == 1)
             for child in range(2):
                 z = wp.where(child == 0, x, y)
                 node = wp.where(kind == 2, wp.vec2i(z, item[1]), wp.vec2i(item[0], z))
                 kept = wp.tile_stack_push(stack, node, kind >= 2)
                 refused = kind >= 2 and kept < 0
-                counts += finish_refused(output, p, swapped, refused, node, models, states, trees, pose, hits_out)
+                counts += finish_refused(output, mode, p, swapped, refused, node, models, states, trees, pose, hits_out)
     wp.atomic_add(hits_out.count, p, counts[0])
     wp.atomic_add(hits_out.node_tests, p, counts[1])
     wp.atomic_add(hits_out.triangle_tests, p, counts[2])
+    wp.atomic_add(hits_out.exact_tests, p, counts[3])
+
+
+@wp.kernel
+def settle_unsure_kernel(
+    output: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    hits_inout: Hits,
+):
+    """Decide the face pairs that the filter left open, one a thread, with exact signs."""
+    tid = wp.tid()
+    if tid >= wp.min(hits_inout.unsure_total[0], hits_inout.unsure.shape[0]):
+        return
+    item = hits_inout.unsure[tid]
+    p = item[0]
+    if output == OUTPUT_ANY and hits_inout.any_hit[p] != 0:
+        return
+    swapped, trees = locate_pair(models, states, objects, pairs[p])
+    if test_faces(EXACT, models, states, trees, pair_poses[p], item[1], item[2]) == 1:
+        wp.atomic_add(hits_inout.count, p, wp.int64(1))
+        report_hit(output, p, swapped, item[1], item[2], hits_inout)

@@ -3,26 +3,25 @@
 import warp as wp
 
 from warp_abtree.kernels.flat import intersect_coplanar, intersect_degenerate, widest_axis
-from warp_abtree.kernels.predicates import orient3d
+from warp_abtree.kernels.predicates import FILTER, UNSURE, orient3d
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def find_alone(s0: wp.float64, s1: wp.float64, s2: wp.float64):
+def find_alone(s0: wp.int32, s1: wp.int32, s2: wp.int32):
     """Return which corner of a triangle that crosses or touches a plane is alone on its closed side, and that side.
 
-    The others lie on the other closed side. Where one corner touches and two lie above, it is alone below.
+    The others lie on the other closed side. Where one corner touches and two lie on one side, it is alone on the other.
     """
-    zero = wp.float64(0.0)
-    above = wp.where(s0 > zero, 1, 0) + wp.where(s1 > zero, 1, 0) + wp.where(s2 > zero, 1, 0)
-    below = wp.where(s0 < zero, 1, 0) + wp.where(s1 < zero, 1, 0) + wp.where(s2 < zero, 1, 0)
-    if above == 1:
-        return wp.where(s0 > zero, 0, wp.where(s1 > zero, 1, 2)), 1
-    if below == 1:
-        return wp.where(s0 < zero, 0, wp.where(s1 < zero, 1, 2)), -1
-    alone = wp.where(s0 == zero, 0, wp.where(s1 == zero, 1, 2))
-    return alone, wp.where(above == 2, -1, 1)
+    positive = wp.where(s0 > 0, 1, 0) + wp.where(s1 > 0, 1, 0) + wp.where(s2 > 0, 1, 0)
+    negative = wp.where(s0 < 0, 1, 0) + wp.where(s1 < 0, 1, 0) + wp.where(s2 < 0, 1, 0)
+    if positive == 1:
+        return wp.where(s0 > 0, 0, wp.where(s1 > 0, 1, 2)), 1
+    if negative == 1:
+        return wp.where(s0 < 0, 0, wp.where(s1 < 0, 1, 2)), -1
+    alone = wp.where(s0 == 0, 0, wp.where(s1 == 0, 1, 2))
+    return alone, wp.where(positive == 2, -1, 1)
 
 
 @wp.func
@@ -36,47 +35,54 @@ def rotate_first(i: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 
 @wp.func
-def is_one_sided(s0: wp.float64, s1: wp.float64, s2: wp.float64):
-    zero = wp.float64(0.0)
-    return (s0 > zero and s1 > zero and s2 > zero) or (s0 < zero and s1 < zero and s2 < zero)
+def is_one_sided(s0: wp.int32, s1: wp.int32, s2: wp.int32):
+    return s0 != 0 and s0 != UNSURE and s0 == s1 and s1 == s2
 
 
 @wp.func
-def intersect_special(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
+def intersect_special(
+    mode: wp.int32, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d
+):
     """Decide faces whose plane is shared, or not defined."""
-    axis_a = widest_axis(a0, a1, a2)
-    axis_b = widest_axis(b0, b1, b2)
+    axis_a = widest_axis(mode, a0, a1, a2)
+    axis_b = widest_axis(mode, b0, b1, b2)
     if axis_a < 0 or axis_b < 0:
-        return intersect_degenerate(axis_a, axis_b, a0, a1, a2, b0, b1, b2)
-    return intersect_coplanar(axis_a, a0, a1, a2, b0, b1, b2)
+        return intersect_degenerate(mode, axis_a, axis_b, a0, a1, a2, b0, b1, b2)
+    return intersect_coplanar(mode, axis_a, a0, a1, a2, b0, b1, b2)
 
 
 @wp.func
-def intersect_triangles(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
-    """Return whether two closed triangles meet.
+def intersect_triangles(
+    mode: wp.int32, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d
+):
+    """Return whether two closed triangles meet, 1 or 0; UNSURE where a FILTER leaves a sign that counts open.
 
     Source: Guigue and Devillers 2003, Fast and robust triangle-triangle overlap test using orientation predicates.
     """
-    zero = wp.float64(0.0)
-    sa0 = orient3d(b0, b1, b2, a0)
-    sa1 = orient3d(b0, b1, b2, a1)
-    sa2 = orient3d(b0, b1, b2, a2)
+    sa0 = orient3d(mode, b0, b1, b2, a0)
+    sa1 = orient3d(mode, b0, b1, b2, a1)
+    sa2 = orient3d(mode, b0, b1, b2, a2)
     if is_one_sided(sa0, sa1, sa2):
-        return False
-    sb0 = orient3d(a0, a1, a2, b0)
-    sb1 = orient3d(a0, a1, a2, b1)
-    sb2 = orient3d(a0, a1, a2, b2)
+        return 0
+    sb0 = orient3d(mode, a0, a1, a2, b0)
+    sb1 = orient3d(mode, a0, a1, a2, b1)
+    sb2 = orient3d(mode, a0, a1, a2, b2)
     if is_one_sided(sb0, sb1, sb2):
-        return False
+        return 0
     # A zero-area face sees every corner of the other on its "plane".
-    if (sa0 == zero and sa1 == zero and sa2 == zero) or (sb0 == zero and sb1 == zero and sb2 == zero):
-        return intersect_special(a0, a1, a2, b0, b1, b2)
+    special = (sa0 == 0 and sa1 == 0 and sa2 == 0) or (sb0 == 0 and sb1 == 0 and sb2 == 0)
+    if mode == FILTER:
+        # Signs are -1, 0 or 1: the largest is UNSURE iff any is.
+        if special or wp.max(wp.max(sa0, wp.max(sa1, sa2)), wp.max(sb0, wp.max(sb1, sb2))) == UNSURE:
+            return UNSURE
+    elif special:
+        return wp.where(intersect_special(mode, a0, a1, a2, b0, b1, b2), 1, 0)
     alone_a, side_a = find_alone(sa0, sa1, sa2)
     alone_b, side_b = find_alone(sb0, sb1, sb2)
     p1, q1, r1 = rotate_first(alone_a, a0, a1, a2)
     p2, q2, r2 = rotate_first(alone_b, b0, b1, b2)
-    # Turn each triangle so that the other's lone corner lies above its plane. The planes meet in a line; on it the
-    # triangles are the intervals between edges p q and p r, and two more signs order the ends.
+    # Turn each triangle so that the other's lone corner lies on the positive side of its plane. The planes meet in a
+    # line; on it the triangles are the intervals between edges p q and p r, and two more signs order the ends.
     if side_a < 0:
         t = q2
         q2 = r2
@@ -85,4 +91,8 @@ def intersect_triangles(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, 
         t = q1
         q1 = r1
         r1 = t
-    return orient3d(p1, q1, p2, q2) <= zero and orient3d(p1, r1, r2, p2) <= zero
+    first = orient3d(mode, p1, q1, p2, q2)
+    second = orient3d(mode, p1, r1, r2, p2)
+    if first == 1 or second == 1:
+        return 0
+    return wp.where(first == UNSURE or second == UNSURE, UNSURE, 1)

@@ -12,7 +12,6 @@ from oracle_triangle import into_frame_of_a
 from samples import REAL_MESHES, SHAPES, STILL, WARP_MESHES, contact_poses, random_poses, sample, true_faces
 
 import warp_abtree as ab
-from warp_abtree import intersect
 from warp_abtree.kernels import traverse
 from warp_abtree.kernels.pose import PairPose, pose_point
 
@@ -34,7 +33,7 @@ BRUTE_FACES = 2500
 
 
 def ask(scene, pairs, output="faces"):
-    return scene.intersect(pairs, output=output, precision="float64")
+    return scene.intersect(pairs, output=output, precision="exact")
 
 
 def random_lod(rng, model, most_faces):
@@ -152,7 +151,7 @@ def test_relative_poses_equal_the_definition(device):
     for pose in poses:
         scene.add(sample("box"), pose)
     pairs = np.concatenate([np.arange(60).reshape(-1, 2), rng.permutation(60).reshape(-1, 2)])
-    query = ab.Query(scene, "any", pairs=pairs, precision="float64")
+    query = ab.Query(scene, "any", pairs=pairs, precision="exact")
     query.launch()
     moved = wp.zeros((60, 50), dtype=wp.vec3d, device=device)
     inputs = [query.pair_poses, wp.array(points, dtype=wp.vec3d, device=device)]
@@ -300,7 +299,7 @@ def test_overflow_is_told(device):
     pairs = np.arange(12).reshape(-1, 2)
     whole = ask(scene, pairs)
     demand = len(whole.faces)
-    query = ab.Query(scene, "faces", pairs=pairs, capacity=3, precision="float64")
+    query = ab.Query(scene, "faces", pairs=pairs, capacity=3, precision="exact")
     query.launch()
     result = query.result()
     assert len(result.faces) == 3
@@ -309,7 +308,7 @@ def test_overflow_is_told(device):
         result.check()
     grown = query.run()
     np.testing.assert_array_equal(grown.faces, whole.faces)
-    query = ab.Query(scene, "faces", pairs=pairs, capacity=demand, precision="float64")
+    query = ab.Query(scene, "faces", pairs=pairs, capacity=demand, precision="exact")
     query.launch()
     query.result().check()
 
@@ -328,11 +327,11 @@ def test_broad_phase_overflow_is_told(device):
     scene = ab.Scene(device)
     for _ in range(5):
         scene.add(sample("box"))
-    query = ab.Query(scene, "any", pair_capacity=4, precision="float64")
+    query = ab.Query(scene, "any", pair_capacity=4, precision="exact")
     query.launch()
     with pytest.raises(ab.CapacityError, match="10 pairs"):
         query.result().check()
-    assert len(scene.broad_phase()) == len(scene.intersect(precision="float64").pairs) == 10
+    assert len(scene.broad_phase()) == len(scene.intersect(precision="exact").pairs) == 10
 
 
 def test_nothing_asked(device):
@@ -345,27 +344,10 @@ def test_nothing_asked(device):
 
 
 class BlockQuery(ab.Query):
-    """A query in the regime of blocks around a shared stack, on any device."""
+    """A query that takes the CUDA regime on every device."""
 
-    block_dim = 1
-    kernels = traverse
-
-    def traverse(self):
-        super().traverse()  # relative poses, and answers to be overwritten
-        for name in ("any_hit", "count", "total", "node_tests", "triangle_tests"):
-            getattr(self.hits, name).zero_()
-        hits = self.kernels.Hits()
-        for name in ("any_hit", "count", "face", "total", "node_tests", "triangle_tests"):
-            setattr(hits, name, getattr(self.hits, name))
-        models, states, objects = (arrays.pool for arrays in self.arrays)
-        output = int(intersect.OUTPUTS[self.output])
-        wp.launch_tiled(
-            self.kernels.traverse_block_kernel,
-            dim=[len(self.pairs)],
-            inputs=[output, models, states, objects, self.pair_count, self.pairs, self.pair_poses, hits],
-            block_dim=self.block_dim,
-            device=self.device,
-        )
+    def uses_blocks(self):
+        return True
 
 
 @pytest.fixture(scope="module")
@@ -389,22 +371,42 @@ def tight_kernels(tmp_path_factory):
 @pytest.mark.parametrize("stack", ["whole", "tight"])
 def test_blocks_give_the_same_answers(device, stack, tight_kernels):
     scene, _ = posed_cases(np.random.default_rng(8), ("torus", "soup"), 12, BRUTE_FACES, device)
+    poses = random_poses(np.random.default_rng(8), 1, 1.0)
+    for _ in range(2):  # the same mesh twice in one place: many faces wait for exact signs
+        scene.add(sample("torus"), poses[0], lod=sample("torus").lod_for(fraction=0.2))
     pairs = np.arange(24).reshape(-1, 2)
-    pairs = np.concatenate([pairs, pairs[::-1, ::-1], [(0, 3), (2, 9)]])
+    pairs = np.concatenate([pairs, pairs[::-1, ::-1], [(0, 3), (2, 9), (24, 25), (25, 24)]])
     for output in ("faces", "count", "any"):
         plain = ask(scene, pairs, output)
-        query = BlockQuery(scene, output, pairs=pairs, precision="float64")
+        query = BlockQuery(scene, output, pairs=pairs, unsure_capacity=2)
         query.kernels = traverse if stack == "whole" else tight_kernels
         query.block_dim = 64 if query.device.is_cuda else 1
         result = query.run()
         np.testing.assert_array_equal(result.any, plain.any)
         if output != "any":
-            np.testing.assert_array_equal(result.count, plain.count)
-            np.testing.assert_array_equal(result.node_tests, plain.node_tests)
-            np.testing.assert_array_equal(result.triangle_tests, plain.triangle_tests)
+            for name in ("count", "node_tests", "triangle_tests", "exact_tests"):
+                np.testing.assert_array_equal(getattr(result, name), getattr(plain, name))
         if output == "faces":
             np.testing.assert_array_equal(result.faces, plain.faces)
             assert len(result.faces) > 100
+            assert result.exact_tests[-1] > 2, "the list of unsure faces has grown"
+
+
+@pytest.mark.parametrize("name", ["cow", "fandisk", "fcl-env", "woody", "torus", "soup"])
+@pytest.mark.parametrize("turned", [False, True])
+def test_exact_where_every_face_meets_its_twin(device, name, turned):
+    """One mesh twice in one place: coplanar twins at the identity, twins a rounding apart at any other pose."""
+    model = sample(name)
+    lod = model.lod_for(fraction=min(1.0, 1500 / model.face_count))
+    pose = random_poses(np.random.default_rng(10), 1, 1.0)[0] if turned else STILL
+    scene = ab.Scene(device)
+    for _ in range(2):
+        scene.add(model, pose, lod=lod)
+    result = ask(scene, [(0, 1)])
+    np.testing.assert_array_equal(result.faces[:, 1:], true_faces(model, lod, pose, model, lod, pose))
+    if turned and name not in ("soup", "woody"):  # few pairs, and perhaps none
+        rounded = scene.intersect([(0, 1)], "faces", precision="float32")
+        assert not np.array_equal(rounded.faces, result.faces), "the case is too easy to tell exact signs from others"
 
 
 @pytest.mark.parametrize("name", ["cow", "rocker-arm", "stanford-bunny", "torus"])
@@ -435,10 +437,8 @@ def test_what_is_not_built_says_so(device):
     scene.add(box)
     scene.add(box)
     for options in (
-        {"output": "contacts", "precision": "float64"},
-        {"precision": "exact"},
-        {"precision": "float32"},
-        {"precision": "float64", "within": 0.1},
+        {"output": "contacts"},
+        {"within": 0.1},
     ):
         with pytest.raises(NotImplementedError):
             scene.intersect([(0, 1)], **options)

@@ -183,11 +183,19 @@ def test_clean_mesh_is_kept_bit_for_bit():
     np.testing.assert_array_equal(mesh.faces, faces)
 
 
+def test_tiny_coordinates_become_zero():
+    below = np.nextafter(2.0**-290, 0)
+    mesh = mesh_from_arrays([[0, below, -5e-324], [1, 0, 0], [0, 1, -(2.0**-290)], [0, 0, 0]], [[0, 1, 2], [0, 3, 1]])
+    np.testing.assert_array_equal(mesh.vertices, [[0, 0, 0], [1, 0, 0], [0, 1, -(2.0**-290)]])
+    np.testing.assert_array_equal(mesh.dropped_faces, [1])
+    assert not np.signbit(mesh.vertices[0]).any()
+
+
 def test_weld_counts_and_order():
-    vertices = [[9, 9, 9], [1, 0, 0], [-0.0, 0, 0], [0, -0.0, 0], [0, 1, 0], [1, 0, 0], [0, 0, np.nextafter(0, 1)]]
+    vertices = [[9, 9, 9], [1, 0, 0], [-0.0, 0, 0], [0, -0.0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 2.0**-290]]
     faces = [[2, 1, 4], [3, 5, 4], [2, 3, 4], [6, 1, 4]]
     mesh = mesh_from_arrays(vertices, faces)
-    np.testing.assert_array_equal(mesh.vertices, [[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, np.nextafter(0, 1)]])
+    np.testing.assert_array_equal(mesh.vertices, [[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, 2.0**-290]])
     np.testing.assert_array_equal(mesh.faces, [[1, 0, 2], [1, 0, 2], [1, 1, 2], [3, 0, 2]])
     np.testing.assert_array_equal(mesh.dropped_faces, [2])
     assert not np.signbit(mesh.vertices).any()
@@ -205,7 +213,7 @@ def soups():
 @given(soups())
 @example((np.zeros((3, 3)), np.array([[0, 1, 2]])))
 def test_random_soups(soup):
-    vertices, faces = soup[0], soup[1] % len(soup[0])
+    vertices, faces = np.where(np.abs(soup[0]) < 2.0**-290, 0.0, soup[0]), soup[1] % len(soup[0])
     corners = [{tuple(x + 0.0) for x in vertices[face]} for face in faces]
     dropped = [f for f, corner in enumerate(corners) if len(corner) < 3]
     if len(dropped) == len(faces):

@@ -405,10 +405,15 @@ def test_bad_input_is_refused():
 
 
 def test_link_condition_leaves_no_coincident_faces():
-    progressive = build_progressive(torus(), base_faces=16, link_condition=True)
-    for lod in range(progressive.lod_max + 1):
-        faces = np.sort(progressive.mesh_at(lod)[1], axis=1)
-        assert len(np.unique(faces, axis=0)) == len(faces)
+    shape = {"major_radius": 1.0, "minor_radius": 0.02, "major_sections": 60, "minor_sections": 4}
+    mesh = of_shape(trimesh.creation.torus(**shape))
+    for link_condition in (False, True):
+        progressive = build_progressive(mesh, base_faces=20, link_condition=link_condition)
+        repeats = 0
+        for lod in range(progressive.lod_max + 1):
+            faces = np.sort(progressive.mesh_at(lod)[1], axis=1)
+            repeats += len(faces) - len(np.unique(faces, axis=0))
+        assert (repeats == 0) == link_condition
 
 
 @pytest.mark.parametrize("name", REAL_MESHES)
@@ -419,3 +424,12 @@ def test_real_meshes(name, real_mesh_path):
     if len(mesh.faces) < 30_000:
         replay(mesh, progressive)
     check_error(mesh, progressive, steps=4, count=2000)
+
+
+@pytest.mark.parametrize("name", ["cow", "fandisk"])
+def test_error_is_tight_on_real_meshes(name, real_mesh_path):
+    mesh = load_mesh(real_mesh_path(name))
+    progressive = build_progressive(mesh)
+    for fraction in (0.1, 0.01):
+        lod = progressive.lod_for(fraction=fraction)
+        assert progressive.lod_error[lod] <= 1.2 * measured_error(mesh, progressive, lod)

@@ -175,9 +175,9 @@ BAD_PAIRS = {
 @pytest.mark.parametrize("method", ["intersect", "filter", "query"])
 def test_pairs_are_refused(device, method, case):
     calls = {
-        "intersect": lambda scene: scene.intersect(pairs, precision="float64"),
+        "intersect": lambda scene: scene.intersect(pairs, precision="exact"),
         "filter": lambda scene: scene.filter(pairs),
-        "query": lambda scene: ab.Query(scene, pairs=pairs, precision="float64"),
+        "query": lambda scene: ab.Query(scene, pairs=pairs, precision="exact"),
     }
     pairs, words = BAD_PAIRS[case]
     check_refusal(pair_scene(device), calls[method], WRONG, *words)
@@ -222,14 +222,14 @@ def test_an_empty_scene(device):
     for call in (
         lambda: scene.set_poses(np.empty((0, 7))),
         lambda: scene.set_lods([]),
-        lambda: scene.intersect([(0, 1)], precision="float64"),
+        lambda: scene.intersect([(0, 1)], precision="exact"),
         lambda: scene.tree_state(0),
-        lambda: ab.Query(scene, precision="float64"),
+        lambda: ab.Query(scene, precision="exact"),
     ):
         with pytest.raises(ValueError, match=r"no object|0 objects|outside"):
             call()
     scene.add(sample("box"))
-    assert scene.intersect(precision="float64").pairs.shape == (0, 2)
+    assert scene.intersect(precision="exact").pairs.shape == (0, 2)
 
 
 # What is taken.
@@ -292,7 +292,7 @@ def test_arrays_of_every_kind_are_taken(device):
         assert scene.lods.tolist() == [3, 2, 1]
     pairs = [(0, 1), (2, 0)]
     for given in (pairs, np.array(pairs, np.uint16), wp.array(pairs, dtype=wp.vec2i, device=device)):
-        assert scene.intersect(given, precision="float64").pairs.tolist() == [[0, 1], [2, 0]]
+        assert scene.intersect(given, precision="exact").pairs.tolist() == [[0, 1], [2, 0]]
 
 
 # What holds across changes.
@@ -303,7 +303,7 @@ def test_add_keeps_poses_and_lods(device):
     rng = np.random.default_rng(3)
     scene.set_poses(random_poses(rng, 3, 5.0))
     scene.set_lods([7, 3, 20])
-    scene.intersect(precision="float64")
+    scene.intersect(precision="exact")
     before = placed(scene)
     states = [raw_state(scene, i) for i in range(3)]
     scene.add(sample("torus"), TURN, lod=5)
@@ -319,7 +319,7 @@ def test_add_keeps_poses_and_lods(device):
 
 def test_a_refused_object_spoils_no_query(device):
     scene = pair_scene(device)
-    query = ab.Query(scene, precision="float64")
+    query = ab.Query(scene, precision="exact")
     query.launch()
     with pytest.raises(ValueError):
         scene.add(sample("box"), lod=-1)
@@ -337,8 +337,8 @@ def test_a_query_follows_poses_and_lods(device):
     for model in models:
         scene.add(model)
     pairs = [(0, 1), (2, 0), (3, 1), (2, 3)]
-    asked = ab.Query(scene, "faces", pairs=pairs, precision="float64")
-    found = ab.Query(scene, "faces", precision="float64", capacity=20_000)
+    asked = ab.Query(scene, "faces", pairs=pairs, precision="exact")
+    found = ab.Query(scene, "faces", precision="exact", capacity=20_000)
     hits = 0
     for _ in range(6):
         poses = random_poses(rng, 4, 0.6)
@@ -371,11 +371,11 @@ def test_scenes_do_not_mix(device):
     first.add(torus, pose_b)
     second.add(torus, lod=4)
     second.add(ball, pose_b, lod=9)
-    before = first.intersect([(0, 1)], output="faces", precision="float64").faces
+    before = first.intersect([(0, 1)], output="faces", precision="exact").faces
     second.set_lods([9, 60])
     second.set_poses([TURN, np.eye(4)])
-    second.intersect([(0, 1)], precision="float64")
-    np.testing.assert_array_equal(first.intersect([(0, 1)], output="faces", precision="float64").faces, before)
+    second.intersect([(0, 1)], precision="exact")
+    np.testing.assert_array_equal(first.intersect([(0, 1)], output="faces", precision="exact").faces, before)
     np.testing.assert_array_equal(before[:, 1:], true_faces(ball, ball.lod_max, pose_a, torus, torus.lod_max, pose_b))
 
 

@@ -5,11 +5,12 @@ import warp as wp
 
 from warp_abtree.broadphase import BroadPhase, CapacityError
 from warp_abtree.checks import whole_number
-from warp_abtree.kernels import pose, traverse
+from warp_abtree.kernels import pose, predicates, traverse
 
 OUTPUTS = {"any": traverse.OUTPUT_ANY, "count": traverse.OUTPUT_COUNT, "faces": traverse.OUTPUT_FACES}
-PRECISIONS = ("exact", "float64", "float32")
-BLOCK_DIM = 128
+PRECISIONS = {"exact": predicates.FILTER, "float64": predicates.FLOAT64, "float32": predicates.FLOAT32}
+# Face pairs that the float64 filter leaves open, about 1 in 10^5 unless faces are coplanar; the list grows as needed.
+UNSURE_CAPACITY = 65536
 
 
 def check_request(output: str, precision: str, within=None):
@@ -25,8 +26,6 @@ def check_request(output: str, precision: str, within=None):
         raise ValueError(f"precision {precision!r} is none of 'exact', 'float64', 'float32'")
     if output == "contacts":
         raise NotImplementedError("output='contacts' is not built yet; ask for 'faces'")
-    if precision != "float64":
-        raise NotImplementedError(f"precision={precision!r} is not built yet; 'float64' is what runs today")
     if within is not None:
         raise NotImplementedError("within= is not built yet; queries answer intersection only")
 
@@ -40,18 +39,21 @@ class Result:
         count: Intersecting face pairs of each, int64 (p,); None for output "any".
         faces: (pair, face of the pair's first object, face of its second), int32 (k, 3), sorted; None unless output
             is "faces".
-        node_tests, triangle_tests: Work done for each pair, int64 (p,).
+        node_tests, triangle_tests, exact_tests: Work done for each pair, int64 (p,); exact tests are the triangle tests
+            that the float64 filter left open.
     """
 
     def __init__(self, pairs, output, pair_demand, pair_room, hits):
         self.pairs = pairs
         self._pair_demand, self._pair_room = pair_demand, pair_room
         self._hit_demand, self._hit_room = 0, len(hits.face)
+        self._unsure_room = len(hits.unsure)
         p = len(pairs)
         self.any = hits.any_hit.numpy()[:p] != 0
         # On the CPU numpy() shares the memory that the next launch writes.
         self.node_tests = hits.node_tests.numpy()[:p].copy()
         self.triangle_tests = hits.triangle_tests.numpy()[:p].copy()
+        self.exact_tests = hits.exact_tests.numpy()[:p].copy()
         self.count = hits.count.numpy()[:p].copy() if output != "any" else None
         self.faces = None
         if output == "faces":
@@ -68,6 +70,12 @@ class Result:
         if self._pair_demand > self._pair_room:
             raise CapacityError(
                 f"the broad phase found {self._pair_demand} pairs, the query has room for {self._pair_room}"
+            )
+        unsure = int(self.exact_tests.sum())
+        if self._unsure_room and unsure > self._unsure_room:
+            raise CapacityError(
+                f"{unsure} face pairs need exact signs, the query has room for {self._unsure_room}: "
+                f"make it with unsure_capacity={unsure}"
             )
         if self._hit_demand > self._hit_room:
             raise CapacityError(
@@ -89,23 +97,38 @@ class Query:
         pairs: Object pairs to ask, (p, 2); None runs the broad phase in every launch.
         capacity: Face pairs that `faces` has room for.
         pair_capacity: Pairs that there is room for; by default those given, or a guess for the broad phase.
-        precision: Arithmetic of the triangle test.
+        precision: "exact": the sign of every determinant is right. "float64", "float32": the sign of the rounded one.
+        unsure_capacity: Face pairs that there is room for between the filter and the exact signs, on CUDA.
 
     Attributes:
         hits: Device arrays of the last launch (`kernels.traverse.Hits`), faces in no order.
         pairs, pair_count: The pairs asked, device vec2i and int32 (1,).
     """
 
+    kernels = traverse
+    block_dim = 128
+
     def __init__(
-        self, scene, output="faces", pairs=None, capacity=None, pair_capacity=None, precision="float64", within=None
+        self,
+        scene,
+        output="faces",
+        pairs=None,
+        capacity=None,
+        pair_capacity=None,
+        precision="exact",
+        within=None,
+        unsure_capacity=None,
     ):
         check_request(output, precision, within)
         if capacity is not None:
             capacity = whole_number(capacity, "capacity", 1, 2**31 - 1)
         if pair_capacity is not None:
             pair_capacity = whole_number(pair_capacity, "pair_capacity", 1, 2**31 - 1)
+        if unsure_capacity is not None:
+            unsure_capacity = whole_number(unsure_capacity, "unsure_capacity", 1, 2**31 - 1)
         self.scene = scene
         self.output = output
+        self.precision = precision
         self.arrays = scene.arrays()
         self.device = scene.device
         self.broad_phase = None
@@ -117,6 +140,10 @@ class Query:
             self.pairs = wp.empty(pair_capacity or 0, dtype=wp.vec2i, device=self.device)
         self.hits = traverse.Hits()
         self.hits.total = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self.hits.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
+        # One thread a pair settles in place; blocks leave it to a second pass.
+        deferring = self.uses_blocks() and precision == "exact"
+        self._resize_unsure((unsure_capacity or UNSURE_CAPACITY) if deferring else 0)
         self._allocate_pairs()
         if pairs is not None:
             self.set_pairs(pairs)
@@ -144,8 +171,15 @@ class Query:
         room = len(self.pairs)
         self.pair_poses = wp.empty(room, dtype=pose.PairPose, device=self.device)
         self.hits.any_hit = wp.zeros(room, dtype=wp.int32, device=self.device)
-        for name in ("count", "node_tests", "triangle_tests"):
+        for name in ("count", "node_tests", "triangle_tests", "exact_tests"):
             setattr(self.hits, name, wp.zeros(room, dtype=wp.int64, device=self.device))
+
+    def _resize_unsure(self, capacity: int):
+        self.hits.unsure = wp.empty(capacity, dtype=wp.vec3i, device=self.device)
+
+    def uses_blocks(self) -> bool:
+        """Return whether a block of threads shares each pair; on the CPU one thread has a pair to itself."""
+        return self.device.is_cuda
 
     def resize(self, capacity: int):
         """Make room for a number of intersecting face pairs."""
@@ -175,6 +209,8 @@ class Query:
             self.hits.total,
             self.hits.node_tests,
             self.hits.triangle_tests,
+            self.hits.exact_tests,
+            self.hits.unsure_total,
         ):
             array.zero_()
         wp.launch(
@@ -183,14 +219,21 @@ class Query:
             inputs=[models, states, objects, self.pair_count, self.pairs, self.pair_poses],
             device=self.device,
         )
-        output = int(OUTPUTS[self.output])
-        inputs = [output, models, states, objects, self.pair_count, self.pairs, self.pair_poses, self.hits]
-        if self.device.is_cuda:
-            wp.launch_tiled(
-                traverse.traverse_block_kernel, dim=[room], inputs=inputs, block_dim=BLOCK_DIM, device=self.device
-            )
-        else:
+        output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
+        posed = [self.pairs, self.pair_poses, self.hits]
+        inputs = [output, mode, models, states, objects, self.pair_count, *posed]
+        if not self.uses_blocks():
             wp.launch(traverse.traverse_thread_kernel, dim=room, inputs=inputs, device=self.device)
+            return
+        kernel = self.kernels.traverse_block_kernel
+        wp.launch_tiled(kernel, dim=[room], inputs=inputs, block_dim=self.block_dim, device=self.device)
+        if len(self.hits.unsure):
+            wp.launch(
+                self.kernels.settle_unsure_kernel,
+                dim=len(self.hits.unsure),
+                inputs=[output, models, states, objects, *posed],
+                device=self.device,
+            )
 
     def result(self) -> Result:
         """Return the results of the last launch on the host, sorted. Waits for the device."""
@@ -208,18 +251,22 @@ class Query:
             self.pairs = self.broad_phase.pairs
             self._allocate_pairs()
             self.launch()
-        if self.output == "faces" and self._hit_demand() > len(self.hits.face):
-            self.resize(self._hit_demand())
+        if len(self.hits.unsure) and self._sum(self.hits.exact_tests) > len(self.hits.unsure):
+            self._resize_unsure(self._sum(self.hits.exact_tests))
+            self.traverse()
+        if self.output == "faces" and self._sum(self.hits.count) > len(self.hits.face):
+            self.resize(self._sum(self.hits.count))
             self.traverse()
         result = self.result()
         result.check()
         return result
 
-    def _hit_demand(self) -> int:
-        return int(self.hits.count.numpy().sum())
+    @staticmethod
+    def _sum(counts) -> int:
+        return int(counts.numpy().sum())
 
 
-def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precision="float64", device=None):
+def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precision="exact", device=None):
     """Test one pair of models at many poses of B in A's frame, no objects made.
 
     Raises:

@@ -19,6 +19,7 @@ import warp as wp
 
 FACE_LIMIT = 2**30  # int32 forest ids count up to two nodes a vertex, and heap indices up to two a face
 EXTENT_LIMITS = (2.0**-100, 2.0**100)  # boxes are float32
+COORDINATE_MIN = 2.0**-290  # smaller ones are 0
 WARP_ASSETS = ("bunny", "bear", "rocks")
 
 
@@ -84,7 +85,7 @@ def mesh_from_arrays(vertices, faces, name="arrays"):
         name: Name for people.
 
     Returns:
-        A Mesh.
+        A Mesh; coordinates under 2^-290 are 0.
 
     Raises:
         MeshError: Wrong shape or type, no faces, coordinates not finite, an index out of range, or an extent outside
@@ -145,7 +146,8 @@ def _build(vertices, faces, name, where):
     referenced = np.zeros(file_vertex_count, dtype=bool)
     referenced[faces] = True
     used = np.flatnonzero(referenced)
-    positions = vertices[used] + 0.0  # makes -0.0 the same as 0.0
+    # Makes -0.0 the same as 0.0, and products of three coordinates free of underflow, so that exact signs are exact.
+    positions = np.where(np.abs(vertices[used]) < COORDINATE_MIN, 0.0, vertices[used])
     first, distinct = _weld(positions)
     new_index = np.full(file_vertex_count, -1, dtype=np.int32)
     new_index[used] = distinct

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 
 import numpy as np
 import warp as wp
@@ -13,10 +14,10 @@ COVERS_PER_LAUNCH = 200_000
 HEAP_ROOM = (2, 256)  # entries to begin with: so many an edge, and so many more
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
 
-# What rounding can hide from a bound, in units of the extent's power of two (coordinates within 1/2, so 2^-54 each):
-# reading the vertices of both surfaces, a closest point of some ten operations, and the points of at most 24 cuts by
-# three planes each, every one of which lies within 2^-52 of the segment that it cuts: 2^-45 in all.
-ROUNDING = 2.0**-44
+# What rounding can hide from a bound, in units of the frame (coordinates about 1/2, so 2^-54 each): reading the
+# vertices of both surfaces, a closest point of some ten operations, and the points of at most 64 cuts by three planes
+# each, every one within 2^-52 a coordinate of the segment that it cuts: 192 sqrt(3) 2^-52 and a little, under 2^-43.
+ROUNDING = 2.0**-43
 
 
 @dataclass(frozen=True)
@@ -114,11 +115,11 @@ class ProgressiveMesh:
         if (fraction is None) == (tolerance is None):
             raise ValueError("lod_for takes exactly one of fraction= and tolerance=")
         if tolerance is not None:
-            if not tolerance >= 0:
-                raise ValueError(f"tolerance must be >= 0, got {tolerance}")
+            if not (isinstance(tolerance, Real) and tolerance >= 0):
+                raise ValueError(f"tolerance must be >= 0, got {tolerance!r}")
             return int(np.argmax(self.lod_error <= tolerance))
-        if not 0 < fraction <= 1:
-            raise ValueError(f"fraction must lie in (0, 1], got {fraction}")
+        if not (isinstance(fraction, Real) and 0 < fraction <= 1):
+            raise ValueError(f"fraction must lie in (0, 1], got {fraction!r}")
         miss = np.abs(self._active_counts - fraction * self.face_count)
         return int(self.lod_max - np.argmin(miss[::-1]))
 
@@ -302,7 +303,7 @@ def _deviation(vertex_pos, parent, faces, report):
     scratch.waiting_count = _filled(piece.STACK, 0)
     scratch.piece = wp.zeros(piece.CORNERS, dtype=wp.vec3d, device="cpu")
     scratch.inner = wp.zeros(piece.CORNERS, dtype=wp.vec3d, device="cpu")
-    counter = _filled(5, 0)
+    counter = _filled(6, 0)
     inputs = [face_count, _cpu(faces, int), rings.corner_node, replay, counter]
     wp.launch(deviation.start_replay_kernel, dim=1, inputs=inputs, device="cpu")
     bound_sq = wp.zeros(merge_count, dtype=wp.float64, device="cpu")
@@ -310,6 +311,9 @@ def _deviation(vertex_pos, parent, faces, report):
     state = counter.numpy()  # shares the memory
     while state[0] < merge_count:
         wp.launch(deviation.replay_merges_kernel, dim=1, inputs=inputs, device="cpu")
+        if state[5] < 0:
+            bvh = _index(replay, rings)
+            replay.bvh, state[5] = bvh.id, state[1]
         report("error", int(state[0]), merge_count)
     error = scale * (np.sqrt(bound_sq.numpy()) + ROUNDING)
     return np.append(error[::-1], 0.0)
@@ -326,10 +330,20 @@ def _replay(pos, face_count):
     for name in ("triangle_pos", "face_pos"):
         setattr(replay, name, wp.zeros((face_count, 3), dtype=wp.vec3d, device="cpu"))
     replay.face_ball = wp.zeros(face_count, dtype=wp.vec4d, device="cpu")
-    for name in ("live_face", "live_place", "face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face"):
+    for name in ("face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face"):
         setattr(replay, name, _filled(face_count, -1))
     pooled = 3 * face_count + 4096  # a pool that runs dry loosens bounds, no more
     for name in ("slot_face", "slot_triangle", "slot_sibling", "slot_next", "slot_last"):
         setattr(replay, name, _filled(face_count + pooled, -1))
     replay.free_slot = _filled(pooled, 0)
+    replay.bvh_face = _filled(1, 0)
     return replay
+
+
+def _index(replay, rings):
+    """Return a wp.Bvh over the active faces, for triangles whose piece vanishes."""
+    active = np.flatnonzero(rings.corner_node.numpy()[::3] >= 0).astype(np.int32)
+    corners = replay.face_pos.numpy()[active]
+    lower, upper = corners.min(axis=1).astype(np.float32), corners.max(axis=1).astype(np.float32)
+    replay.bvh_face = _cpu(active, int)
+    return wp.Bvh(_cpu(lower, wp.vec3), _cpu(upper, wp.vec3))

@@ -94,7 +94,7 @@ class Scene:
         self._excluded = np.empty(0, np.int64)
         self._arrays = None
         self._broad_phase = None
-        self._queries: dict[str, Query] = {}
+        self._queries: dict[tuple, Query] = {}
 
     @property
     def object_count(self) -> int:
@@ -282,7 +282,7 @@ class Scene:
             self._broad_phase = BroadPhase(*self.arrays(), self._excluded)
         return self._broad_phase.find()
 
-    def intersect(self, pairs=None, output="any", precision="float64", within=None) -> Result:
+    def intersect(self, pairs=None, output="any", precision="exact", within=None) -> Result:
         """Test object pairs for intersection, exactly as posed and at their LODs. Waits for the device.
 
         Touching counts. Columns of the result follow the order in which a pair names its objects.
@@ -290,19 +290,21 @@ class Scene:
         Args:
             pairs: (p, 2) object indices; None asks the broad phase.
             output: "any", "count" or "faces".
-            precision: "float64" today: signs of float64 determinants, wrong only within their rounding.
+            precision: "exact": the answer is exact for A's vertices and the posed ones of B, A the object with the
+                smaller index. "float64" and "float32" take the signs of rounded determinants.
 
         Raises:
             ValueError: Bad pairs or an unknown option.
-            NotImplementedError: "contacts", other precisions and within=, which are not built yet.
+            NotImplementedError: "contacts" and within=, which are not built yet.
         """
         check_request(output, precision, within)
         pairs = self.broad_phase() if pairs is None else self.check_pairs(pairs)
-        if output in self._queries:
-            self._queries[output].set_pairs(pairs)
+        asked = (output, precision)
+        if asked in self._queries:
+            self._queries[asked].set_pairs(pairs)
         else:
-            self._queries[output] = Query(self, output, pairs=pairs, precision=precision)
-        return self._queries[output].run()
+            self._queries[asked] = Query(self, output, pairs=pairs, precision=precision)
+        return self._queries[asked].run()
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.
