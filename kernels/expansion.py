@@ -1,6 +1,7 @@
 """Exact signs by floating-point expansions: sums of float64 components that do not overlap, smallest first.
 
 Source: Shewchuk 1997, Adaptive precision floating-point arithmetic and fast robust geometric predicates.
+Loops count by hand, since Warp unrolls those over a constant range, and this code is inlined at every sign.
 Every product below is either exact by `fuse_multiply` or written with a separate sum, and modules that use it compile
 without contraction (`fuse_fp` off on CUDA; Warp's CPU backend does not contract), so no compiler changes a rounding.
 """
@@ -57,10 +58,13 @@ def add_product(sum: wp.array(dtype=wp.float64), length: wp.int32, a: wp.float64
     if a == wp.float64(0.0) or b == wp.float64(0.0) or c == wp.float64(0.0):
         return length
     high, low = two_product(a, b)
-    for i in range(2):
-        x, y = two_product(wp.where(i == 0, low, high), c)
-        length = grow_expansion(sum, length, y)
+    low_high, low_low = two_product(low, c)
+    high_high, high_low = two_product(high, c)
+    part = wp.int32(0)
+    while part < 4:
+        x = wp.where(part < 2, wp.where(part == 0, low_low, low_high), wp.where(part == 2, high_low, high_high))
         length = grow_expansion(sum, length, x)
+        part += 1
     return length
 
 
@@ -80,15 +84,18 @@ def exact_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     w, w_low = two_sum(c, -d)
     sum = wp.zeros(shape=(EXPANSION_LENGTH,), dtype=wp.float64)
     length = wp.int32(0)
-    for i in range(3):
-        j = (i + 1) % 3
-        k = (i + 2) % 3
-        for part in range(8):
-            x = wp.where((part & 1) != 0, u_low, u)
-            y = wp.where((part & 2) != 0, v_low, v)
-            z = wp.where((part & 4) != 0, w_low, w)
-            length = add_product(sum, length, x[i], y[j], z[k])
-            length = add_product(sum, length, -x[i], y[k], z[j])
+    term = wp.int32(0)
+    # Bits of a term: the components, then whether the permutation is odd, then the axis of u.
+    while term < 48:
+        i = term >> 4
+        odd = (term >> 3) & 1
+        j = (i + 1 + odd) % 3
+        k = (i + 2 - odd) % 3
+        x = wp.where((term & 1) != 0, u_low[i], u[i])
+        y = wp.where((term & 2) != 0, v_low[j], v[j])
+        z = wp.where((term & 4) != 0, w_low[k], w[k])
+        length = add_product(sum, length, wp.where(odd != 0, -x, x), y, z)
+        term += 1
     return leading_sign(sum, length)
 
 
@@ -100,9 +107,11 @@ def exact_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
     v, v_low = two_sum(b, -c)
     sum = wp.zeros(shape=(EXPANSION_LENGTH,), dtype=wp.float64)
     length = wp.int32(0)
-    for part in range(4):
-        x = wp.where((part & 1) != 0, u_low, u)
-        y = wp.where((part & 2) != 0, v_low, v)
-        length = add_product(sum, length, x[0], y[1], one)
-        length = add_product(sum, length, -x[1], y[0], one)
+    term = wp.int32(0)
+    while term < 8:
+        i = term >> 2
+        x = wp.where((term & 1) != 0, u_low[i], u[i])
+        y = wp.where((term & 2) != 0, v_low[1 - i], v[1 - i])
+        length = add_product(sum, length, wp.where(i != 0, -x, x), y, one)
+        term += 1
     return leading_sign(sum, length)

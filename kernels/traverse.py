@@ -5,15 +5,18 @@ Both visit the same pairs of nodes and differ in their order only.
 Source: Liu et al. 2006, section 3.2.2, ACTIVE-INTERSECT.
 """
 
+import functools
+
 import warp as wp
 
 from warp_abtree.kernels.boxes import boxes_overlap
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
-from warp_abtree.kernels.predicates import EXACT, FLOAT32, UNSURE
+from warp_abtree.kernels.predicates import FLOAT32, UNSURE
 from warp_abtree.kernels.triangle import intersect_triangles
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
 
 OUTPUT_ANY = wp.constant(0)
 OUTPUT_COUNT = wp.constant(1)
@@ -154,7 +157,6 @@ def visit_nodes(
 
 @wp.func
 def traverse_depth_first(
-    defers: wp.int32,
     output: wp.int32,
     mode: wp.int32,
     pair: wp.int32,
@@ -167,10 +169,7 @@ def traverse_depth_first(
     pose: PairPose,
     hits: Hits,
 ):
-    """Traverse from one pair of nodes in this thread; return hits, node tests, triangle tests and exact tests.
-
-    Faces that the filter leaves open are deferred, or settled in place.
-    """
+    """Traverse from one pair of nodes in this thread; return hits, node tests, triangle tests and exact tests."""
     stack = stack_type()
     stack[0] = start_a
     stack[1] = start_b
@@ -191,11 +190,8 @@ def traverse_depth_first(
             meet = test_faces(mode, models, states, trees, pose, x, y)
             if meet == UNSURE:
                 exact_tests += one
-                if defers != 0:
-                    defer_faces(pair, x, y, hits)
-                else:
-                    meet = test_faces(EXACT, models, states, trees, pose, x, y)
-            if meet == 1:
+                defer_faces(pair, x, y, hits)
+            elif meet == 1:
                 hit_count += one
                 report_hit(output, pair, swapped, x, y, hits)
                 if output == OUTPUT_ANY:
@@ -215,32 +211,37 @@ def traverse_depth_first(
     return wp.vec4l(hit_count, node_tests, triangle_tests, exact_tests)
 
 
-@wp.kernel
-def traverse_thread_kernel(
-    output: wp.int32,
-    mode: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    hits_out: Hits,
-):
-    """Traverse one object pair a thread, depth first."""
-    p = wp.tid()
-    if p >= wp.min(pair_count[0], pairs.shape[0]):
-        return
-    swapped, trees = locate_pair(models, states, objects, pairs[p])
-    skip_a = states.node_skip[trees.node_a + 1]
-    skip_b = states.node_skip[trees.node_b + 1]
-    counts = traverse_depth_first(
-        0, output, mode, p, swapped, skip_a, skip_b, models, states, trees, pair_poses[p], hits_out
-    )
-    hits_out.count[p] = counts[0]
-    hits_out.node_tests[p] = counts[1]
-    hits_out.triangle_tests[p] = counts[2]
-    hits_out.exact_tests[p] = counts[3]
+@functools.cache
+def thread_traversal(mode: int):
+    """Return the kernel that gives a thread each object pair, its signs made in a mode of `predicates`."""
+
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    def traverse_thread_kernel(
+        output: wp.int32,
+        models: ModelPool,
+        states: StatePool,
+        objects: ObjectPool,
+        pair_count: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        pair_poses: wp.array(dtype=PairPose),
+        hits_out: Hits,
+    ):
+        """Traverse one object pair a thread, depth first."""
+        p = wp.tid()
+        if p >= wp.min(pair_count[0], pairs.shape[0]):
+            return
+        swapped, trees = locate_pair(models, states, objects, pairs[p])
+        skip_a = states.node_skip[trees.node_a + 1]
+        skip_b = states.node_skip[trees.node_b + 1]
+        counts = traverse_depth_first(
+            output, wp.static(mode), p, swapped, skip_a, skip_b, models, states, trees, pair_poses[p], hits_out
+        )
+        hits_out.count[p] = counts[0]
+        hits_out.node_tests[p] = counts[1]
+        hits_out.triangle_tests[p] = counts[2]
+        hits_out.exact_tests[p] = counts[3]
+
+    return traverse_thread_kernel
 
 
 @wp.func
@@ -259,90 +260,74 @@ def finish_refused(
 ):
     """Traverse depth first from a pair of nodes that the shared stack had no room for; return the counts."""
     if refused:
-        return traverse_depth_first(1, output, mode, pair, swapped, node[0], node[1], models, states, trees, pose, hits)
+        return traverse_depth_first(output, mode, pair, swapped, node[0], node[1], models, states, trees, pose, hits)
     return wp.vec4l()
 
 
-@wp.kernel
-def traverse_block_kernel(
-    output: wp.int32,
-    mode: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    hits_out: Hits,
-):
-    """Traverse one object pair a block: its threads pop node pairs from a shared stack and push what overlaps.
+@functools.cache
+def block_traversal(mode: int):
+    """Return the kernel that gives a block of threads each object pair, its signs made in a mode of `predicates`."""
 
-    Candidate faces wait on a second stack until every thread has one. What the full stack refuses, its thread finishes.
-    """
-    p, lane = wp.tid()
-    if p >= wp.min(pair_count[0], pairs.shape[0]):
-        return
-    swapped, trees = locate_pair(models, states, objects, pairs[p])
-    pose = pair_poses[p]
-    counts = wp.vec4l()
-    one = wp.int64(1)
-    stack = wp.tile_stack(capacity=SHARED_LENGTH, dtype=wp.vec2i)
-    # Visits stop at block_dim candidates and add at most as many, so this stack never fills.
-    candidates = wp.tile_stack(capacity=CANDIDATE_LENGTH, dtype=wp.vec2i)
-    start = wp.vec2i(states.node_skip[trees.node_a + 1], states.node_skip[trees.node_b + 1])
-    wp.tile_stack_push(stack, start, lane == 0)
-    ready = wp.where(output == OUTPUT_ANY, 1, wp.block_dim())
-    while wp.tile_stack_count(stack) + wp.tile_stack_count(candidates) > 0:
-        # For `any` a hit empties the stacks: items are popped and dropped, so every thread leaves the loop together.
-        if wp.tile_stack_count(candidates) >= ready or wp.tile_stack_count(stack) == 0:
-            faces, face_slot = wp.tile_stack_pop(candidates)
-            if face_slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
-                counts[2] += one
-                meet = test_faces(mode, models, states, trees, pose, faces[0], faces[1])
-                if meet == UNSURE:
-                    counts[3] += one
-                    defer_faces(p, faces[0], faces[1], hits_out)
-                elif meet == 1:
-                    counts[0] += one
-                    report_hit(output, p, swapped, faces[0], faces[1], hits_out)
-        else:
-            item, slot = wp.tile_stack_pop(stack)
-            kind, x, y = wp.int32(0), wp.int32(0), wp.int32(0)
-            if slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
-                kind, x, y = visit_nodes(models, states, trees, pose, item[0], item[1])
-                counts[1] += one
-            wp.tile_stack_push(candidates, wp.vec2i(x, y), kind == 1)
-            for child in range(2):
-                z = wp.where(child == 0, x, y)
-                node = wp.where(kind == 2, wp.vec2i(z, item[1]), wp.vec2i(item[0], z))
-                kept = wp.tile_stack_push(stack, node, kind >= 2)
-                refused = kind >= 2 and kept < 0
-                counts += finish_refused(output, mode, p, swapped, refused, node, models, states, trees, pose, hits_out)
-    wp.atomic_add(hits_out.count, p, counts[0])
-    wp.atomic_add(hits_out.node_tests, p, counts[1])
-    wp.atomic_add(hits_out.triangle_tests, p, counts[2])
-    wp.atomic_add(hits_out.exact_tests, p, counts[3])
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    def traverse_block_kernel(
+        output: wp.int32,
+        models: ModelPool,
+        states: StatePool,
+        objects: ObjectPool,
+        pair_count: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        pair_poses: wp.array(dtype=PairPose),
+        hits_out: Hits,
+    ):
+        """Traverse one object pair a block: its threads pop node pairs from a shared stack and push what overlaps.
 
+        Candidate faces wait on a second stack until every thread has one. What the full stack refuses, its thread
+        finishes alone.
+        """
+        p, lane = wp.tid()
+        if p >= wp.min(pair_count[0], pairs.shape[0]):
+            return
+        swapped, trees = locate_pair(models, states, objects, pairs[p])
+        pose = pair_poses[p]
+        counts = wp.vec4l()
+        one = wp.int64(1)
+        stack = wp.tile_stack(capacity=SHARED_LENGTH, dtype=wp.vec2i)
+        # Visits stop at block_dim candidates and add at most as many, so this stack never fills.
+        candidates = wp.tile_stack(capacity=CANDIDATE_LENGTH, dtype=wp.vec2i)
+        start = wp.vec2i(states.node_skip[trees.node_a + 1], states.node_skip[trees.node_b + 1])
+        wp.tile_stack_push(stack, start, lane == 0)
+        ready = wp.where(output == OUTPUT_ANY, 1, wp.block_dim())
+        while wp.tile_stack_count(stack) + wp.tile_stack_count(candidates) > 0:
+            # For `any` a hit empties the stacks: items are popped and dropped, so all threads leave the loop together.
+            if wp.tile_stack_count(candidates) >= ready or wp.tile_stack_count(stack) == 0:
+                faces, face_slot = wp.tile_stack_pop(candidates)
+                if face_slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
+                    counts[2] += one
+                    meet = test_faces(wp.static(mode), models, states, trees, pose, faces[0], faces[1])
+                    if meet == UNSURE:
+                        counts[3] += one
+                        defer_faces(p, faces[0], faces[1], hits_out)
+                    elif meet == 1:
+                        counts[0] += one
+                        report_hit(output, p, swapped, faces[0], faces[1], hits_out)
+            else:
+                item, slot = wp.tile_stack_pop(stack)
+                kind, x, y = wp.int32(0), wp.int32(0), wp.int32(0)
+                if slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
+                    kind, x, y = visit_nodes(models, states, trees, pose, item[0], item[1])
+                    counts[1] += one
+                wp.tile_stack_push(candidates, wp.vec2i(x, y), kind == 1)
+                for child in range(2):
+                    z = wp.where(child == 0, x, y)
+                    node = wp.where(kind == 2, wp.vec2i(z, item[1]), wp.vec2i(item[0], z))
+                    kept = wp.tile_stack_push(stack, node, kind >= 2)
+                    refused = kind >= 2 and kept < 0
+                    counts += finish_refused(
+                        output, wp.static(mode), p, swapped, refused, node, models, states, trees, pose, hits_out
+                    )
+        wp.atomic_add(hits_out.count, p, counts[0])
+        wp.atomic_add(hits_out.node_tests, p, counts[1])
+        wp.atomic_add(hits_out.triangle_tests, p, counts[2])
+        wp.atomic_add(hits_out.exact_tests, p, counts[3])
 
-@wp.kernel
-def settle_unsure_kernel(
-    output: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    hits_inout: Hits,
-):
-    """Decide the face pairs that the filter left open, one a thread, with exact signs."""
-    tid = wp.tid()
-    if tid >= wp.min(hits_inout.unsure_total[0], hits_inout.unsure.shape[0]):
-        return
-    item = hits_inout.unsure[tid]
-    p = item[0]
-    if output == OUTPUT_ANY and hits_inout.any_hit[p] != 0:
-        return
-    swapped, trees = locate_pair(models, states, objects, pairs[p])
-    if test_faces(EXACT, models, states, trees, pair_poses[p], item[1], item[2]) == 1:
-        wp.atomic_add(hits_inout.count, p, wp.int64(1))
-        report_hit(output, p, swapped, item[1], item[2], hits_inout)
+    return traverse_block_kernel

@@ -5,7 +5,7 @@ import warp as wp
 
 from warp_abtree.broadphase import BroadPhase, CapacityError
 from warp_abtree.checks import whole_number
-from warp_abtree.kernels import pose, predicates, traverse
+from warp_abtree.kernels import pose, predicates, settle, traverse
 
 OUTPUTS = {"any": traverse.OUTPUT_ANY, "count": traverse.OUTPUT_COUNT, "faces": traverse.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.FILTER, "float64": predicates.FLOAT64, "float32": predicates.FLOAT32}
@@ -98,7 +98,7 @@ class Query:
         capacity: Face pairs that `faces` has room for.
         pair_capacity: Pairs that there is room for; by default those given, or a guess for the broad phase.
         precision: "exact": the sign of every determinant is right. "float64", "float32": the sign of the rounded one.
-        unsure_capacity: Face pairs that there is room for between the filter and the exact signs, on CUDA.
+        unsure_capacity: Face pairs that there is room for between the filter and the exact signs.
 
     Attributes:
         hits: Device arrays of the last launch (`kernels.traverse.Hits`), faces in no order.
@@ -141,9 +141,7 @@ class Query:
         self.hits = traverse.Hits()
         self.hits.total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.hits.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
-        # One thread a pair settles in place; blocks leave it to a second pass.
-        deferring = self.uses_blocks() and precision == "exact"
-        self._resize_unsure((unsure_capacity or UNSURE_CAPACITY) if deferring else 0)
+        self._resize_unsure((unsure_capacity or UNSURE_CAPACITY) if precision == "exact" else 0)
         self._allocate_pairs()
         if pairs is not None:
             self.set_pairs(pairs)
@@ -221,15 +219,15 @@ class Query:
         )
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
         posed = [self.pairs, self.pair_poses, self.hits]
-        inputs = [output, mode, models, states, objects, self.pair_count, *posed]
-        if not self.uses_blocks():
-            wp.launch(traverse.traverse_thread_kernel, dim=room, inputs=inputs, device=self.device)
-            return
-        kernel = self.kernels.traverse_block_kernel
-        wp.launch_tiled(kernel, dim=[room], inputs=inputs, block_dim=self.block_dim, device=self.device)
+        inputs = [output, models, states, objects, self.pair_count, *posed]
+        if self.uses_blocks():
+            kernel = self.kernels.block_traversal(mode)
+            wp.launch_tiled(kernel, dim=[room], inputs=inputs, block_dim=self.block_dim, device=self.device)
+        else:
+            wp.launch(self.kernels.thread_traversal(mode), dim=room, inputs=inputs, device=self.device)
         if len(self.hits.unsure):
             wp.launch(
-                self.kernels.settle_unsure_kernel,
+                settle.settle_unsure_kernel,
                 dim=len(self.hits.unsure),
                 inputs=[output, models, states, objects, *posed],
                 device=self.device,
