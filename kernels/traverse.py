@@ -281,8 +281,7 @@ def block_traversal(mode: int):
     ):
         """Traverse one object pair a block: its threads pop node pairs from a shared stack and push what overlaps.
 
-        Candidate faces wait on a second stack until every thread has one. What the full stack refuses, its thread
-        finishes alone.
+        Candidate faces wait on a second stack until every thread has one. Threads finish what the full stack refuses.
         """
         p, lane = wp.tid()
         if p >= wp.min(pair_count[0], pairs.shape[0]):
