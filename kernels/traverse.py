@@ -268,7 +268,7 @@ def finish_refused(
 def block_traversal(mode: int):
     """Return the kernel that gives a block of threads each object pair, its signs made in a mode of `predicates`."""
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=168)
     def traverse_block_kernel(
         output: wp.int32,
         models: ModelPool,
