@@ -27,8 +27,8 @@ OUTPUT_FACES = wp.constant(2)
 STACK_LENGTH = wp.constant(64)
 stack_type = wp.types.vector(length=128, dtype=wp.int32)
 
-SHARED_LENGTH = wp.constant(1024)
-CANDIDATE_LENGTH = wp.constant(512)
+SHARED_LENGTH = wp.constant(2048)
+CANDIDATE_LENGTH = wp.constant(512)  # two blocks of the largest size
 
 
 @wp.struct
