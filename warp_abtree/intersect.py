@@ -12,7 +12,7 @@ PRECISIONS = {"exact": predicates.FILTER, "float64": predicates.FLOAT64, "float3
 # So many pairs leave most of a GPU idle at 128 threads each; 256 were 1.6 times faster, and slower from 1,024 pairs on.
 FEW_PAIRS = 512
 
-# Face pairs that the float64 filter leaves open, none in 27 million of two random knots, most where faces are coplanar; the list grows as needed.
+# Face pairs that the float64 filter leaves open: few unless faces are coplanar. The list grows as needed.
 UNSURE_CAPACITY = 65536
 
 
@@ -25,10 +25,10 @@ def check_request(output: str, precision: str, within=None):
     """
     if output not in (*OUTPUTS, "contacts"):
         raise ValueError(f"output {output!r} is none of 'any', 'count', 'faces', 'contacts'")
-    if precision not in PRECISIONS:
+    if precision not in tuple(PRECISIONS):
         raise ValueError(f"precision {precision!r} is none of 'exact', 'float64', 'float32'")
     if output == "contacts":
-        raise NotImplementedError("output='contacts' is not built yet; ask for 'faces'")
+        raise NotImplementedError("contacts are made by Scene.intersect, from a query of output 'faces'")
     if within is not None:
         raise NotImplementedError("within= is not built yet; queries answer intersection only")
 
@@ -41,7 +41,9 @@ class Result:
         any: Whether each pair intersects, bool (p,).
         count: Intersecting face pairs of each, int64 (p,); None for output "any".
         faces: (pair, face of the pair's first object, face of its second), int32 (k, 3), sorted; None unless output
-            is "faces".
+            is "faces" or "contacts".
+        contacts, pair_contacts: Structured arrays (k,) and (p,), see `warp_abtree.contact`; None unless output is
+            "contacts".
         node_tests, triangle_tests, exact_tests: Work done for each pair, int64 (p,); exact tests are the triangle tests
             that the float64 filter left open.
     """
@@ -58,7 +60,7 @@ class Result:
         self.triangle_tests = hits.triangle_tests.numpy()[:p].copy()
         self.exact_tests = hits.exact_tests.numpy()[:p].copy()
         self.count = hits.count.numpy()[:p].copy() if output != "any" else None
-        self.faces = None
+        self.faces = self.contacts = self.pair_contacts = None
         if output == "faces":
             self._hit_demand = int(self.count.sum())
             faces = hits.face.numpy()[: min(self._hit_demand, self._hit_room)].reshape(-1, 3)
