@@ -17,7 +17,8 @@ class PairPose:
     """The pose of B in A's frame, A the object with the smaller index.
 
     rotation, translation map B's model frame to A's in float64. rotation32, translation32, margin serve boxes about the
-    models' centres. scale is a power of two that brings the larger model to about unit size.
+    models' centres. scale is a power of two that brings the larger model to about unit size. within is a distance that
+    margin covers too, 0 for intersection.
     """
 
     rotation: wp.mat33d
@@ -26,6 +27,7 @@ class PairPose:
     translation32: wp.vec3
     margin: wp.float32
     scale: wp.float64
+    within: wp.float64
 
 
 @wp.func
@@ -66,15 +68,16 @@ def reach_box(lower: wp.vec3, upper: wp.vec3):
 
 
 @wp.func
-def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32):
-    """Return the `PairPose` of B in A's frame.
+def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32, within: wp.float64):
+    """Return the `PairPose` of B in A's frame, for points that meet or lie within a distance in A's frame.
 
     The margin covers, with a factor of two to spare, every rounding between the exact x' of B's vertices and the
     float32 box test. With u = 2^-24, r_a and r_b the reach of the root boxes and s the largest component of the
     translation between the centres, centre and half width of B's posed box err by at most 11 sqrt(3) u r_b + 4 u s,
     those of A's by 2 u r_a, and the comparison adds u (3 sqrt(3) r_b + s + 3 r_a): less than 32 u (r_a + r_b + s) in
     all, twice that on B's axes. The float64 part covers x' itself and the shift between centres, and `skewed` a
-    rotation that is not orthonormal to the last bit, on whose columns B's axes are taken.
+    rotation that is not orthonormal to the last bit, on whose columns B's axes are taken. A gap along a unit axis is a
+    distance, so `within` adds to the margin; a column is longer than 1 by at most `skewed`.
     """
     r, t = relate_objects(objects, a, b)
     state_a = objects.state[a]
@@ -104,6 +107,7 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     pose = PairPose()
     pose.rotation = r
     pose.translation = t
+    pose.within = within
     pose.rotation32 = wp.mat33(r)
     # The exponent of a float32 without its digits is a power of two.
     exponent = wp.cast(wp.float32(wp.max(reach_a, reach_b)), wp.int32) & 0x7F800000
@@ -112,10 +116,11 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     # distance that overflowed gives infinity or NaN.
     pose.margin = -wp.inf
     limit = wp.float64(2.0) * (reach_a + wp.float64(2.0) * reach_b) + margin64
-    near = wp.abs(shift[0]) <= limit and wp.abs(shift[1]) <= limit and wp.abs(shift[2]) <= limit
+    wide = limit + within
+    near = wp.abs(shift[0]) <= wide and wp.abs(shift[1]) <= wide and wp.abs(shift[2]) <= wide
     if near and limit < wp.float64(wp.inf):
         pose.translation32 = wp.vec3(shift)
-        pose.margin = wp.float32(margin64 + margin32)
+        pose.margin = wp.float32(margin64 + margin32 + within * (wp.float64(1.0) + skewed + ROUNDING_32))
     return pose
 
 
@@ -134,7 +139,7 @@ def relate_pair_kernel(
         return
     a = wp.min(pairs[p][0], pairs[p][1])
     b = wp.max(pairs[p][0], pairs[p][1])
-    pair_pose_out[p] = pair_pose(models, states, objects, a, b)
+    pair_pose_out[p] = pair_pose(models, states, objects, a, b, wp.float64(0.0))
 
 
 @wp.func

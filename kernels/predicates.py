@@ -18,6 +18,8 @@ FILTER = wp.constant(0)
 FLOAT64 = wp.constant(1)
 FLOAT32 = wp.constant(2)
 EXACT = wp.constant(3)
+# No signs: faces count as met unless proved farther apart than a distance.
+WITHIN = wp.constant(4)
 
 UNSURE = wp.constant(2)
 

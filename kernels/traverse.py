@@ -10,9 +10,10 @@ import functools
 import warp as wp
 
 from warp_abtree.kernels.boxes import boxes_overlap
+from warp_abtree.kernels.distance import triangles_near
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
-from warp_abtree.kernels.predicates import FLOAT32, UNSURE
+from warp_abtree.kernels.predicates import FLOAT32, UNSURE, WITHIN
 from warp_abtree.kernels.triangle import intersect_triangles
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
@@ -98,6 +99,8 @@ def test_faces(
     b0 = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[0]])
     b1 = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[1]])
     b2 = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[2]])
+    if mode == WITHIN:
+        return triangles_near(pose.within, a0, a1, a2, b0, b1, b2)
     if mode == FLOAT32:
         # A power of two brings the model to unit size, so that no product leaves float32's range.
         s = pose.scale

@@ -436,13 +436,7 @@ def test_what_is_not_built_says_so(device):
     box = sample("box")
     scene.add(box)
     scene.add(box)
-    for options in (
-        {"output": "contacts"},
-        {"within": 0.1},
-    ):
-        with pytest.raises(NotImplementedError):
-            scene.intersect([(0, 1)], **options)
-        with pytest.raises(NotImplementedError):
-            ab.Query(scene, pairs=[(0, 1)], **options)
+    with pytest.raises(NotImplementedError):
+        ab.Query(scene, "contacts", pairs=[(0, 1)])
     with pytest.raises(NotImplementedError):
         ab.sweep(box, box, random_poses(np.random.default_rng(0), 3, 1.0))

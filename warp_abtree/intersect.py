@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.broadphase import BroadPhase, CapacityError
-from warp_abtree.checks import whole_number
-from warp_abtree.kernels import pose, predicates, settle, traverse
+from warp_abtree.checks import to_numpy, whole_number
+from warp_abtree.kernels import distance, pose, predicates, settle, traverse
 
 OUTPUTS = {"any": traverse.OUTPUT_ANY, "count": traverse.OUTPUT_COUNT, "faces": traverse.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.FILTER, "float64": predicates.FLOAT64, "float32": predicates.FLOAT32}
@@ -16,7 +16,7 @@ FEW_PAIRS = 512
 UNSURE_CAPACITY = 65536
 
 
-def check_request(output: str, precision: str, within=None):
+def check_request(output: str, precision: str):
     """Check what is asked of a query.
 
     Raises:
@@ -29,8 +29,23 @@ def check_request(output: str, precision: str, within=None):
         raise ValueError(f"precision {precision!r} is none of 'exact', 'float64', 'float32'")
     if output == "contacts":
         raise NotImplementedError("contacts are made by Scene.intersect, from a query of output 'faces'")
-    if within is not None:
-        raise NotImplementedError("within= is not built yet; queries answer intersection only")
+
+
+def check_within(within, pair_count=None) -> np.ndarray:
+    """Return distances [world units] as float64, () or (p,).
+
+    Raises:
+        ValueError: Another shape (for pairs of the broad phase any but a scalar), a distance that is negative, infinite
+            or no number.
+    """
+    within = to_numpy(within, "within").astype(np.float64)
+    if within.shape != () and within.shape != (pair_count,):
+        known = "pairs of the broad phase: one distance for all" if pair_count is None else f"{pair_count} pairs"
+        raise ValueError(f"within: shape {within.shape} given for {known}")
+    bad = np.flatnonzero(~(np.isfinite(within) & (within >= 0)))
+    if len(bad):
+        raise ValueError(f"within: {within.flat[bad[0]]} of pair {bad[0]} is no finite distance of 0 or more")
+    return within
 
 
 class Result:
@@ -44,17 +59,19 @@ class Result:
             is "faces" or "contacts".
         contacts, pair_contacts: Structured arrays (k,) and (p,), see `warp_abtree.contact`; None unless output is
             "contacts".
+        apart: Whether each pair is proved farther apart than `within`, bool (p,); None without within.
         node_tests, triangle_tests, exact_tests: Work done for each pair, int64 (p,); exact tests are the triangle tests
             that the float64 filter left open.
     """
 
-    def __init__(self, pairs, output, pair_demand, pair_room, hits):
+    def __init__(self, pairs, output, pair_demand, pair_room, hits, near=None):
         self.pairs = pairs
         self._pair_demand, self._pair_room = pair_demand, pair_room
         self._hit_demand, self._hit_room = 0, len(hits.face)
         self._unsure_room = len(hits.unsure)
         p = len(pairs)
         self.any = hits.any_hit.numpy()[:p] != 0
+        self.apart = None if near is None else near.any_hit.numpy()[:p] == 0
         # On the CPU numpy() shares the memory that the next launch writes.
         self.node_tests = hits.node_tests.numpy()[:p].copy()
         self.triangle_tests = hits.triangle_tests.numpy()[:p].copy()
@@ -103,11 +120,15 @@ class Query:
         capacity: Face pairs that `faces` has room for.
         pair_capacity: Pairs that there is room for; by default those given, or a guess for the broad phase.
         precision: "exact": the sign of every determinant is right. "float64", "float32": the sign of the rounded one.
+        within: Distances [world units], one for all pairs or (p,) beside given pairs: ask also which pairs are farther
+            apart. The proof covers all rounding: pairs beyond by less than about 1e-13 of their size stay unproved, by
+            less than 6 s where a rotation is off orthonormal by s, and all for distances from 2^1000 on.
         unsure_capacity: Face pairs that there is room for between the filter and the exact signs.
 
     Attributes:
         hits: Device arrays of the last launch (`kernels.traverse.Hits`), faces in no order.
         pairs, pair_count: The pairs asked, device vec2i and int32 (1,).
+        near: As `hits` for `within`: any_hit is 0 where a pair is proved apart; None without within.
     """
 
     kernels = traverse
@@ -124,7 +145,9 @@ class Query:
         within=None,
         unsure_capacity=None,
     ):
-        check_request(output, precision, within)
+        check_request(output, precision)
+        if within is not None:
+            within = check_within(within, None if pairs is None else len(scene.check_pairs(pairs)))
         if capacity is not None:
             capacity = whole_number(capacity, "capacity", 1, 2**31 - 1)
         if pair_capacity is not None:
@@ -146,21 +169,27 @@ class Query:
         self.hits = traverse.Hits()
         self.hits.total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.hits.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self.near = None if within is None else self._make_near()
+        self._within = within
         self._resize_unsure((unsure_capacity or UNSURE_CAPACITY) if precision == "exact" else 0)
         self._allocate_pairs()
         if pairs is not None:
             self.set_pairs(pairs)
         self.resize((capacity or max(1024, 16 * len(self.pairs))) if output == "faces" else 0)
 
-    def set_pairs(self, pairs):
-        """Ask other pairs from now on, in the room there is if they fit.
+    def set_pairs(self, pairs, within=None):
+        """Ask other pairs from now on, in the room there is if they fit; within None keeps the distances.
 
         Raises:
-            ValueError: Bad pairs, or a query that runs the broad phase.
+            ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
         """
         if self.broad_phase is not None:
             raise ValueError("this query takes its pairs from the broad phase")
         pairs = self.scene.check_pairs(pairs)
+        if within is not None and self.near is None:
+            raise ValueError("this query was made without within")
+        if self.near is not None:
+            self._within = check_within(self._within if within is None else within, len(pairs))
         if len(pairs) > len(self.pairs):
             self.pairs = wp.empty(len(pairs), dtype=wp.vec2i, device=self.device)
             self._allocate_pairs()
@@ -168,6 +197,7 @@ class Query:
             wp.copy(self.pairs, wp.array(pairs, dtype=wp.vec2i, device=self.device), count=len(pairs))
         self.pair_count.fill_(len(pairs))
         self._given = pairs
+        self._fill_within()
 
     def _allocate_pairs(self):
         """Make room for whatever belongs to a pair."""
@@ -176,6 +206,27 @@ class Query:
         self.hits.any_hit = wp.zeros(room, dtype=wp.int32, device=self.device)
         for name in ("count", "node_tests", "triangle_tests", "exact_tests"):
             setattr(self.hits, name, wp.zeros(room, dtype=wp.int64, device=self.device))
+        if self.near is not None:
+            self.within = wp.empty(room, dtype=wp.float64, device=self.device)
+            self.near.any_hit = wp.zeros(room, dtype=wp.int32, device=self.device)
+            for name in ("count", "node_tests", "triangle_tests", "exact_tests"):
+                setattr(self.near, name, wp.zeros(room, dtype=wp.int64, device=self.device))
+            if self.broad_phase is not None:
+                self._fill_within()
+
+    def _make_near(self):
+        near = traverse.Hits()
+        near.total = near.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
+        return near
+
+    def _fill_within(self):
+        if self.near is None:
+            return
+        if self._within.ndim == 0:
+            self.within.fill_(float(self._within))
+        elif len(self._within):
+            values = wp.array(self._within, dtype=wp.float64, device=self.device)
+            wp.copy(self.within, values, count=len(self._within))
 
     def _resize_unsure(self, capacity: int):
         self.hits.unsure = wp.empty(capacity, dtype=wp.vec3i, device=self.device)
@@ -198,7 +249,34 @@ class Query:
             raise RuntimeError("objects were added to the scene since this query was made; make a new one")
         if self.broad_phase is not None:
             self.broad_phase.launch()
+        self.prove_apart()
         self.traverse()
+
+    def prove_apart(self):
+        """Find the pairs that are not proved farther apart than `within`, if that is asked. Launches only."""
+        room = len(self.pairs)
+        if self.near is None or room == 0:
+            return
+        for array in (self.near.any_hit, self.near.count, self.near.node_tests, self.near.triangle_tests):
+            array.zero_()
+        pools = [arrays.pool for arrays in self.arrays]
+        wp.launch(
+            distance.relate_within_kernel,
+            dim=room,
+            inputs=[*pools, self.pair_count, self.pairs, self.within, self.pair_poses],
+            device=self.device,
+        )
+        posed = [self.pair_count, self.pairs, self.pair_poses, self.near]
+        self._launch_traversal(int(predicates.WITHIN), [int(traverse.OUTPUT_ANY), *pools, *posed])
+
+    def _launch_traversal(self, mode, inputs):
+        room = len(self.pairs)
+        if self.uses_blocks():
+            kernel = self.kernels.block_traversal(mode)
+            block_dim = self.block_dim or (256 if room <= FEW_PAIRS else 128)
+            wp.launch_tiled(kernel, dim=[room], inputs=inputs, block_dim=block_dim, device=self.device)
+        else:
+            wp.launch(self.kernels.thread_traversal(mode), dim=room, inputs=inputs, device=self.device)
 
     def traverse(self):
         """Run the narrow phase over the pairs in place. Launches only."""
@@ -224,13 +302,7 @@ class Query:
         )
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
         posed = [self.pairs, self.pair_poses, self.hits]
-        inputs = [output, models, states, objects, self.pair_count, *posed]
-        if self.uses_blocks():
-            kernel = self.kernels.block_traversal(mode)
-            block_dim = self.block_dim or (256 if room <= FEW_PAIRS else 128)
-            wp.launch_tiled(kernel, dim=[room], inputs=inputs, block_dim=block_dim, device=self.device)
-        else:
-            wp.launch(self.kernels.thread_traversal(mode), dim=room, inputs=inputs, device=self.device)
+        self._launch_traversal(mode, [output, models, states, objects, self.pair_count, *posed])
         if len(self.hits.unsure):
             wp.launch(
                 settle.settle_unsure_kernel,
@@ -242,10 +314,10 @@ class Query:
     def result(self) -> Result:
         """Return the results of the last launch on the host, sorted. Waits for the device."""
         if self.broad_phase is None:
-            return Result(self._given, self.output, len(self._given), len(self.pairs), self.hits)
+            return Result(self._given, self.output, len(self._given), len(self.pairs), self.hits, self.near)
         found = self.broad_phase.count_found()
         pairs = self.pairs.numpy()[: min(found, len(self.pairs))].reshape(-1, 2).copy()
-        return Result(pairs, self.output, found, len(self.pairs), self.hits)
+        return Result(pairs, self.output, found, len(self.pairs), self.hits, self.near)
 
     def run(self) -> Result:
         """Launch, grow buffers that were too small, and return the whole result. Waits for the device."""

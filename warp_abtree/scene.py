@@ -7,7 +7,8 @@ import warp as wp
 
 from warp_abtree.broadphase import EVERY_WORLD, BroadPhase, exclusion_keys
 from warp_abtree.checks import to_numpy, whole_number
-from warp_abtree.intersect import Query, Result, check_request
+from warp_abtree.contact import contact_dtypes, find_contacts
+from warp_abtree.intersect import Query, Result, check_request, check_within
 from warp_abtree.kernels import pose as pose_kernels
 from warp_abtree.model import Model
 from warp_abtree.refine import UpdateStats, set_object_lods
@@ -282,29 +283,42 @@ class Scene:
             self._broad_phase = BroadPhase(*self.arrays(), self._excluded)
         return self._broad_phase.find()
 
-    def intersect(self, pairs=None, output="any", precision="exact", within=None) -> Result:
+    def intersect(self, pairs=None, output="any", precision="exact", within=None, contact_dtype=np.float64) -> Result:
         """Test object pairs for intersection, exactly as posed and at their LODs. Waits for the device.
 
         Touching counts. Columns of the result follow the order in which a pair names its objects.
 
         Args:
             pairs: (p, 2) object indices; None asks the broad phase.
-            output: "any", "count" or "faces".
+            output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
+                an object pair's summary of them, stands in `warp_abtree.contact`.
             precision: "exact": the answer is exact for A's vertices and the posed ones of B, A the object with the
                 smaller index. "float64" and "float32" take the signs of rounded determinants.
+            within: Distance d >= 0 [world units], or (p,) of them: `result.apart` tells the pairs whose posed surfaces,
+                at their LODs, are proved farther apart than d; never true where they are not, whatever the rounding.
+                With d = error_at(A) + error_at(B) it proves that the original meshes do not intersect. The broad phase
+                finds overlapping boxes only, whatever d is.
+            contact_dtype: Type of the real numbers in contacts, float64 or float32.
 
         Raises:
-            ValueError: Bad pairs or an unknown option.
-            NotImplementedError: "contacts" and within=, which are not built yet.
+            ValueError: Bad pairs, a bad distance or an unknown option.
         """
-        check_request(output, precision, within)
+        contact_dtypes(contact_dtype)
+        with_contacts = output == "contacts"
+        output = "faces" if with_contacts else output
+        check_request(output, precision)
         pairs = self.broad_phase() if pairs is None else self.check_pairs(pairs)
-        asked = (output, precision)
+        if within is not None:
+            within = check_within(within, len(pairs))
+        asked = (output, precision, within is not None)
         if asked in self._queries:
-            self._queries[asked].set_pairs(pairs)
+            self._queries[asked].set_pairs(pairs, within)
         else:
-            self._queries[asked] = Query(self, output, pairs=pairs, precision=precision)
-        return self._queries[asked].run()
+            self._queries[asked] = Query(self, output, pairs=pairs, precision=precision, within=within)
+        result = self._queries[asked].run()
+        if with_contacts:
+            result.contacts, result.pair_contacts = find_contacts(self._queries[asked], result, contact_dtype)
+        return result
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.

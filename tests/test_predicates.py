@@ -1,0 +1,275 @@
+"""Expansions and orientation signs against fractions, and that no compiler contracts them."""
+
+import importlib
+import re
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warp_abtree.kernels import traverse
+from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d, two_product, two_sum
+from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE, orient2d, orient3d
+
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
+COUNT = 400
+TINY = 2.0**-290
+
+
+@wp.kernel
+def two_sum_kernel(a: wp.array(dtype=wp.float64), b: wp.array(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)):
+    i = wp.tid()
+    high, low = two_sum(a[i], b[i])
+    out[0, i] = high
+    out[1, i] = low
+
+
+@wp.kernel
+def two_product_kernel(a: wp.array(dtype=wp.float64), b: wp.array(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)):
+    i = wp.tid()
+    high, low = two_product(a[i], b[i])
+    out[0, i] = high
+    out[1, i] = low
+
+
+@wp.kernel
+def sum_of_product_kernel(
+    a: wp.array(dtype=wp.float64), b: wp.array(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)
+):
+    """The product invites contraction: fused into the sum, it is not the rounded one."""
+    i = wp.tid()
+    high, low = two_sum(a[i] * b[i], a[i])
+    out[0, i] = high
+    out[1, i] = low
+
+
+@wp.kernel
+def orient3d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=wp.int32)):
+    i = wp.tid()
+    out[i] = orient3d(mode, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
+
+
+@wp.kernel
+def orient2d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.int32)):
+    i = wp.tid()
+    out[i] = orient2d(mode, points[i, 0], points[i, 1], points[i, 2])
+
+
+@wp.kernel
+def expansion3d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=wp.int32)):
+    i = wp.tid()
+    out[i] = exact_orient3d(points[i, 0], points[i, 1], points[i, 2], points[i, 3])
+
+
+@wp.kernel
+def expansion2d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.int32)):
+    i = wp.tid()
+    out[i] = exact_orient2d(points[i, 0], points[i, 1], points[i, 2])
+
+
+def apply(kernel, a, b, device):
+    arrays = [wp.array(x, dtype=wp.float64, device=device) for x in (a, b)]
+    out = wp.zeros((2, len(a)), dtype=wp.float64, device=device)
+    wp.launch(kernel, dim=len(a), inputs=arrays, outputs=[out], device=device)
+    return out.numpy()
+
+
+def random_floats(rng, count, low, high):
+    return np.ldexp(rng.uniform(1, 2, count) * rng.choice([-1.0, 1.0], count), rng.integers(low, high, count))
+
+
+def check_exact(got, expected, rounded):
+    high, low = got
+    np.testing.assert_array_equal(high, rounded)
+    for h, t, x in zip(high.tolist(), low.tolist(), expected):
+        assert Fraction(h) + Fraction(t) == x
+
+
+@pytest.mark.parametrize("kernel", [two_sum_kernel, sum_of_product_kernel], ids=lambda k: k.key)
+def test_two_sum_loses_nothing(device, kernel):
+    rng = np.random.default_rng(1)
+    a = random_floats(rng, 3000, -500, 450)
+    b = np.concatenate([np.ldexp(a[:2000], rng.integers(-110, 50, 2000)), random_floats(rng, 1000, -500, 450)])
+    b[:1000] *= -rng.uniform(1, 2, 1000)
+    if kernel is two_sum_kernel:
+        extreme = [0.0, -0.0, 5e-324, -5e-324, 2.0**-1022, 1.0, -1.0, np.nextafter(1, 2), 2.0**1022, -(2.0**1022)]
+        x, y = np.meshgrid(extreme, extreme)
+        a, b = np.concatenate([a, x.ravel()]), np.concatenate([b, y.ravel()])
+        first, second = a, b
+    else:
+        first, second = a * b, a
+    expected = [Fraction(x) + Fraction(y) for x, y in zip(first.tolist(), second.tolist())]
+    check_exact(apply(kernel, a, b, device), expected, first + second)
+
+
+def test_two_product_loses_nothing(device):
+    """Wherever the error is no smaller than float64's grid; whole multiples of 2^-342 are among that."""
+    rng = np.random.default_rng(2)
+    a, b = random_floats(rng, 3000, -430, 500), random_floats(rng, 3000, -430, 500)
+    a[:500] = rng.integers(-(2**53), 2**53, 500) * 2.0**-342
+    b[:500] = rng.integers(-(2**53), 2**53, 500) * 2.0**-684
+    a[500:510], b[505:515] = 0.0, 0.0
+    expected = [Fraction(x) * Fraction(y) for x, y in zip(a.tolist(), b.tolist())]
+    check_exact(apply(two_product_kernel, a, b, device), expected, a * b)
+
+
+# --- signs. Points are (count, dim + 1, dim), for 3 and for 2 dimensions ---------------------------------------------
+
+
+def lattice_points(rng, dim):
+    return rng.integers(-3, 4, (COUNT, dim + 1, dim)).astype(float)
+
+
+def random_points(rng, dim):
+    return rng.normal(size=(COUNT, dim + 1, dim))
+
+
+def flat_points(rng, dim):
+    """The last point on the plane or line of the others, up to rounding and two units in the last place."""
+    points = random_points(rng, dim) + 2.0 ** rng.integers(-3, 20, (COUNT, 1, 1)) * rng.normal(size=(COUNT, 1, dim))
+    weight = rng.choice([0.0, 0.25, 0.5, 1.0, -1.0, 0.3], (COUNT, dim - 1, 1))
+    points[:, dim] = points[:, 0] + (weight * (points[:, 1:dim] - points[:, :1])).sum(1)
+    return points + rng.integers(-2, 3, points.shape) * np.spacing(np.abs(points))
+
+
+def grid_points(rng, dim):
+    """Coordinates of about 2^-290, a few multiples of 2^-342 apart: the products of three lie on the last bits."""
+    return TINY * (1 + lattice_points(rng, dim) * 2.0**-52 + 4 * 2.0**-52)
+
+
+def mixed_points(rng, dim):
+    """Coordinates of every magnitude from 2^-290 to 1, repeated so that much cancels."""
+    values = np.concatenate([random_floats(rng, 6, -290, 0), [0.0, TINY, 1.0]])
+    return rng.choice(values, (COUNT, dim + 1, dim))
+
+
+def tiny_flat_points(rng, dim):
+    points = flat_points(rng, dim) * 2.0**-285
+    return np.where(np.abs(points) < TINY, 0.0, points)
+
+
+KINDS = {
+    "random": random_points,
+    "lattice": lattice_points,
+    "flat": flat_points,
+    "tiny lattice": lambda rng, dim: lattice_points(rng, dim) * TINY,
+    "tiny grid": grid_points,
+    "tiny flat": tiny_flat_points,
+    "mixed": mixed_points,
+    "large flat": lambda rng, dim: flat_points(rng, dim) * 2.0**150,
+    "large lattice": lambda rng, dim: lattice_points(rng, dim) * 2.0**150,
+}
+
+
+def true_signs(points):
+    signs = []
+    for rows in points.tolist():
+        *rows, last = [[Fraction(x) for x in row] for row in rows]
+        u = [[x - y for x, y in zip(row, last)] for row in rows]
+        if len(u) == 2:
+            det = u[0][0] * u[1][1] - u[0][1] * u[1][0]
+        else:
+            det = sum(
+                u[0][i] * (u[1][(i + 1) % 3] * u[2][(i + 2) % 3] - u[1][(i + 2) % 3] * u[2][(i + 1) % 3])
+                for i in range(3)
+            )
+        signs.append((det > 0) - (det < 0))
+    return np.array(signs)
+
+
+def find_signs(kernel, mode, points, device):
+    dtype = wp.vec3d if points.shape[2] == 3 else wp.vec2d
+    out = wp.zeros(len(points), dtype=wp.int32, device=device)
+    wp.launch(
+        kernel, dim=len(points), inputs=[int(mode), wp.array(points, dtype=dtype, device=device), out], device=device
+    )
+    return out.numpy()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_signs(device, dim, kind):
+    """EXACT and the expansions alone are always right, FILTER wherever it is sure, and 0 is as good as any sign."""
+    points = KINDS[kind](np.random.default_rng([3, dim]), dim)
+    truth = true_signs(points)
+    assert len(np.unique(truth)) >= 2
+    kernel, expansion = (orient2d_kernel, expansion2d_kernel) if dim == 2 else (orient3d_kernel, expansion3d_kernel)
+    np.testing.assert_array_equal(find_signs(kernel, EXACT, points, device), truth)
+    np.testing.assert_array_equal(find_signs(expansion, 0, points, device), truth)
+    filtered = find_signs(kernel, FILTER, points, device)
+    sure = filtered != int(UNSURE)
+    np.testing.assert_array_equal(filtered[sure], truth[sure])
+    plain = find_signs(kernel, FLOAT64, points, device)
+    assert set(np.unique(plain)) <= {-1, 0, 1}
+    np.testing.assert_array_equal(plain[sure], truth[sure])
+    if kind == "random":
+        assert sure.all()
+        assert (find_signs(kernel, FLOAT32, points, device) == truth).mean() > 0.99
+    elif kind in ("flat", "large flat"):
+        assert (plain != truth).any() and not sure[plain != truth].any(), "float64 alone is not good enough here"
+    elif kind.endswith("lattice"):
+        np.testing.assert_array_equal(plain, truth)  # these determinants are small integers
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_signs_change_with_the_order(device, dim):
+    """Two points exchanged change every exact sign, to the bit."""
+    points = np.concatenate([make(np.random.default_rng([4, dim]), dim) for make in KINDS.values()])
+    kernel = orient2d_kernel if dim == 2 else orient3d_kernel
+    signs = find_signs(kernel, EXACT, points, device)
+    for i in range(dim):
+        order = np.arange(dim + 1)
+        order[[i, i + 1]] = i + 1, i
+        np.testing.assert_array_equal(find_signs(kernel, EXACT, points[:, order], device), -signs)
+
+
+def test_the_filter_is_tight(device):
+    """The bound leaves open what it must and no more than some units in the last place around."""
+    rng = np.random.default_rng(5)
+    points = rng.normal(size=(2000, 4, 3))
+    points[:, 3] = points[:, :3].mean(1) + 1e-12 * rng.normal(size=(2000, 3))
+    assert (find_signs(orient3d_kernel, FILTER, points, device) != int(UNSURE)).mean() > 0.95
+
+
+# --- no contraction --------------------------------------------------------------------------------------------------
+
+
+def test_modules_with_signs_do_not_contract():
+    names = ("predicates", "expansion", "triangle", "flat", "boxes", "pose", "traverse", "settle", "refit")
+    modules = [wp.get_module(importlib.import_module(f"warp_abtree.kernels.{name}").__name__) for name in names]
+    for mode in (FILTER, FLOAT64, FLOAT32):
+        modules += [make(int(mode)).module for make in (traverse.thread_traversal, traverse.block_traversal)]
+    assert [m.name for m in modules if m.options["fuse_fp"] or m.options["fast_math"]] == []
+
+
+def ptx_of(module, folder):
+    """Return the PTX of a module, which needs no GPU, or skip."""
+    try:
+        wp.compile_aot_module(module, arch=80, module_dir=folder, use_ptx=True)
+    except Exception as error:
+        pytest.skip(f"no PTX without a GPU here: {error}")
+    (path,) = folder.glob("*.ptx")
+    return path.read_text()
+
+
+def find_contraction(text):
+    """Return the instructions that are fused, and those that ptxas may fuse since they name no rounding."""
+    fused = re.findall(r"\bfma\.\S*f(?:32|64)", text)
+    return fused + re.findall(r"\b(?:add|sub|mul)\.(?!rn\b)\S*f(?:32|64)", text)
+
+
+@pytest.mark.parametrize("fuse_fp", [False, True])
+def test_ptx_is_not_contracted(tmp_path, fuse_fp):
+    """Every product and sum is rounded by itself; without the option, it would not be."""
+    kernel = wp.Kernel(sum_of_product_kernel.func, module=wp.Module(f"ptx_{fuse_fp}", None))
+    kernel.module.options.update(enable_backward=False, fuse_fp=fuse_fp)
+    assert bool(find_contraction(ptx_of(kernel.module, tmp_path))) == fuse_fp
+
+
+def test_ptx_of_the_traversal_is_not_contracted(tmp_path):
+    """The kernel that poses vertices, filters signs and tests boxes; it has no expansions, hence no fma at all."""
+    text = ptx_of(traverse.thread_traversal(int(FILTER)).module, tmp_path)
+    assert len(re.findall(r"\bmul\.rn\.f64", text)) > 50
+    assert find_contraction(text) == []
