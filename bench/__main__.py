@@ -1,4 +1,4 @@
-"""python -m bench query|update [--device D] [--json FILE]"""
+"""python -m bench exact|query|update [--device D] [--json FILE]"""
 
 import argparse
 import json
@@ -6,9 +6,9 @@ import sys
 
 import warp as wp
 
-from . import query, update
+from . import exact, query, update
 
-CASES = {"query": query.run, "update": update.run}
+CASES = {"exact": exact.run, "query": query.run, "update": update.run}
 
 
 def main(argv=None):
@@ -16,10 +16,15 @@ def main(argv=None):
     parser.add_argument("name", choices=sorted(CASES))
     parser.add_argument("--device", default=None)
     parser.add_argument("--json", metavar="FILE", help="write the rows to a file as well")
+    parser.add_argument("--count", type=int, help="exact: random pairs; a tenth as many adversarial ones")
+    parser.add_argument("--processes", type=int, help="exact: processes that run the oracle")
     options = parser.parse_args(argv)
+    sizes = {name: getattr(options, name) for name in ("count", "processes") if getattr(options, name) is not None}
+    if sizes and options.name != "exact":
+        parser.error("--count and --processes belong to exact")
     wp.config.log_level = wp.LOG_WARNING
     rows = []
-    for row in CASES[options.name](options.device):
+    for row in CASES[options.name](options.device, **sizes):
         rows.append(row)
         print("  ".join(f"{key}={value}" for key, value in row.items()), flush=True)
     if options.json:

@@ -71,13 +71,13 @@ def reach_box(lower: wp.vec3, upper: wp.vec3):
 def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32, within: wp.float64):
     """Return the `PairPose` of B in A's frame, for points that meet or lie within a distance in A's frame.
 
-    The margin covers, with a factor of two to spare, every rounding between the exact x' of B's vertices and the
-    float32 box test. With u = 2^-24, r_a and r_b the reach of the root boxes and s the largest component of the
-    translation between the centres, centre and half width of B's posed box err by at most 11 sqrt(3) u r_b + 4 u s,
-    those of A's by 2 u r_a, and the comparison adds u (3 sqrt(3) r_b + s + 3 r_a): less than 32 u (r_a + r_b + s) in
-    all, twice that on B's axes. The float64 part covers x' itself and the shift between centres, and `skewed` a
-    rotation that is not orthonormal to the last bit, on whose columns B's axes are taken. A gap along a unit axis is a
-    distance, so `within` adds to the margin; a column is longer than 1 by at most `skewed`.
+    The margin covers every rounding between the exact x' of B's vertices and the float32 box test. With u = 2^-24,
+    r_a and r_b the reach of the root boxes and s the largest component of the translation between the centres,
+    these sum to less than 25 u r_b + 4 u s + 5 u r_a on A's axes and 37 u r_b + 11 u s + 20 u r_a on B's, against
+    64 u of each here (docs/exactness.md has the terms). The float64 part covers x' itself and the shift between
+    centres, and `skewed` a rotation that is not orthonormal to the last bit, on whose columns B's axes are taken. A
+    gap along a unit axis is a distance, so `within` adds to the margin; a column is longer than 1 by at most
+    `skewed`.
     """
     r, t = relate_objects(objects, a, b)
     state_a = objects.state[a]

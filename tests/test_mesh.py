@@ -191,6 +191,15 @@ def test_tiny_coordinates_become_zero():
     assert not np.signbit(mesh.vertices[0]).any()
 
 
+def test_coordinates_too_far_out_are_refused():
+    far = np.nextafter(2.0**300, np.inf)
+    with pytest.raises(MeshError, match=r"vertex 1 .* 2\^300"):
+        mesh_from_arrays([[far, 9, 9], [far, 0, 0], [far, 1, 0], [far, 0, 1]], [[2, 1, 3]])
+    assert (
+        len(mesh_from_arrays([[-(2.0**300), 0, 0], [-(2.0**300), 1, 0], [-(2.0**300), 0, 1]], [[0, 1, 2]]).faces) == 1
+    )
+
+
 def test_weld_counts_and_order():
     vertices = [[9, 9, 9], [1, 0, 0], [-0.0, 0, 0], [0, -0.0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 2.0**-290]]
     faces = [[2, 1, 4], [3, 5, 4], [2, 3, 4], [6, 1, 4]]

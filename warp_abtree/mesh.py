@@ -20,6 +20,7 @@ import warp as wp
 FACE_LIMIT = 2**30  # int32 forest ids count up to two nodes a vertex, and heap indices up to two a face
 EXTENT_LIMITS = (2.0**-100, 2.0**100)  # boxes are float32
 COORDINATE_MIN = 2.0**-290  # smaller ones are 0
+COORDINATE_MAX = 2.0**300  # products of three stay finite
 WARP_ASSETS = ("bunny", "bear", "rocks")
 
 
@@ -88,8 +89,8 @@ def mesh_from_arrays(vertices, faces, name="arrays"):
         A Mesh; coordinates under 2^-290 are 0.
 
     Raises:
-        MeshError: Wrong shape or type, no faces, coordinates not finite, an index out of range, or an extent outside
-            2^-100 .. 2^100.
+        MeshError: Wrong shape or type, no faces, coordinates not finite or beyond 2^300, an index out of range, or an
+            extent outside 2^-100 .. 2^100.
     """
     return _build(vertices, faces, name, where=name)
 
@@ -163,6 +164,9 @@ def _build(vertices, faces, name, where):
         extent = float((positions.max(axis=0) - positions.min(axis=0)).max())
     if not EXTENT_LIMITS[0] <= extent <= EXTENT_LIMITS[1]:
         raise MeshError(f"{where}: extent {extent:g} lies outside 2^-100 .. 2^100; scale the mesh")
+    if np.abs(positions).max() > COORDINATE_MAX:
+        index = int(used[first[np.argmax(np.abs(positions).max(axis=1))]])
+        raise MeshError(f"{where}: vertex {index} has a coordinate beyond 2^300; move the mesh towards the origin")
     return Mesh(
         vertices=positions,
         faces=faces,

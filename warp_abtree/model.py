@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.checks import whole_number
-from warp_abtree.mesh import COORDINATE_MIN, Mesh, load_mesh, mesh_from_arrays
+from warp_abtree.mesh import COORDINATE_MAX, COORDINATE_MIN, Mesh, load_mesh, mesh_from_arrays
 from warp_abtree.progressive import ProgressiveMesh, build_progressive
 from warp_abtree.tree import Tree, active_build
 
@@ -195,7 +195,9 @@ def _assemble(path, arrays) -> Model:
     n_f = len(faces)
     require(m >= 0 and n_v > 0 and n_f > 0, "empty arrays")
     require(pos.shape == (n_v + m, 3) and np.isfinite(pos).all(), "'vertex_pos' has the wrong length or is not finite")
-    require(not ((np.abs(pos) < COORDINATE_MIN) & (pos != 0)).any(), "'vertex_pos' has coordinates under 2^-290")
+    size = np.abs(pos)
+    fits = ((size >= COORDINATE_MIN) | (size == 0)) & (size <= COORDINATE_MAX)
+    require(fits.all(), "'vertex_pos' has coordinates outside 2^-290 .. 2^300")
     require(faces.shape == (n_f, 3) and faces.min() >= 0 and faces.max() < n_v, "'face_vertex' is out of range")
     nodes = np.arange(n_v + m)
     above = (parent > nodes) & (parent >= n_v) & (parent < n_v + m)
