@@ -339,5 +339,5 @@ class Scene:
             np.where(np.isinf(lower), lower, np.nextafter(lower, -np.inf)),
             np.where(np.isinf(upper), upper, np.nextafter(upper, np.inf)),
             states.pool.node_skip[nodes].numpy().copy(),
-            model.tree.leaf_node,
+            model.tree.leaf_node.copy(),
         )
