@@ -77,12 +77,20 @@ def leading_sign(sum: wp.array(dtype=wp.float64), length: wp.int32):
 
 
 @wp.func
-def exact_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return the sign of det(a - d, b - d, c - d), exactly."""
+def sum_expansion(sum: wp.array(dtype=wp.float64), length: wp.int32):
+    """Return the value of an expansion, smallest components first: a few roundings of relative size 2^-53."""
+    value = wp.float64(0.0)
+    for i in range(length):
+        value += sum[i]
+    return value
+
+
+@wp.func
+def expand_orient3d(sum: wp.array(dtype=wp.float64), a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Fill an expansion with det(a - d, b - d, c - d), exactly; return its length."""
     u, u_low = two_sum(a, -d)
     v, v_low = two_sum(b, -d)
     w, w_low = two_sum(c, -d)
-    sum = wp.zeros(shape=(EXPANSION_LENGTH,), dtype=wp.float64)
     length = wp.int32(0)
     term = wp.int32(0)
     # Bits of a term: the components, then whether the permutation is odd, then the axis of u.
@@ -96,16 +104,15 @@ def exact_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
         z = wp.where((term & 4) != 0, w_low[k], w[k])
         length = add_product(sum, length, wp.where(odd != 0, -x, x), y, z)
         term += 1
-    return leading_sign(sum, length)
+    return length
 
 
 @wp.func
-def exact_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
-    """Return the sign of det(a - c, b - c), exactly."""
+def expand_orient2d(sum: wp.array(dtype=wp.float64), a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
+    """Fill an expansion with det(a - c, b - c), exactly; return its length."""
     one = wp.float64(1.0)
     u, u_low = two_sum(a, -c)
     v, v_low = two_sum(b, -c)
-    sum = wp.zeros(shape=(EXPANSION_LENGTH,), dtype=wp.float64)
     length = wp.int32(0)
     term = wp.int32(0)
     while term < 8:
@@ -114,4 +121,20 @@ def exact_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
         y = wp.where((term & 2) != 0, v_low[1 - i], v[1 - i])
         length = add_product(sum, length, wp.where(i != 0, -x, x), y, one)
         term += 1
+    return length
+
+
+@wp.func
+def exact_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Return the sign of det(a - d, b - d, c - d), exactly."""
+    sum = wp.zeros(shape=(EXPANSION_LENGTH,), dtype=wp.float64)
+    length = expand_orient3d(sum, a, b, c, d)
+    return leading_sign(sum, length)
+
+
+@wp.func
+def exact_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
+    """Return the sign of det(a - c, b - c), exactly."""
+    sum = wp.zeros(shape=(EXPANSION_LENGTH,), dtype=wp.float64)
+    length = expand_orient2d(sum, a, b, c)
     return leading_sign(sum, length)

@@ -7,7 +7,7 @@ on, and the rounding of its coordinates. Nothing here depends on the order in wh
 
 import warp as wp
 
-from warp_abtree.kernels.expansion import EXPANSION_LENGTH, add_product, two_sum
+from warp_abtree.kernels.expansion import EXPANSION_LENGTH, expand_orient2d, expand_orient3d, sum_expansion
 from warp_abtree.kernels.flat import find_ends, widest_axis
 from warp_abtree.kernels.predicates import BOUND_2D, BOUND_3D, EXACT, drop_axis, orient2d, orient3d, plain_sign
 from warp_abtree.kernels.triangle import find_alone, is_one_sided
@@ -22,50 +22,18 @@ NEAREST_STEPS = wp.constant(32)
 
 
 @wp.func
-def sum_expansion(sum: wp.array(dtype=wp.float64), length: wp.int32):
-    """Return the value of an expansion, smallest components first: a few roundings of relative size 2^-53."""
-    value = wp.float64(0.0)
-    for i in range(length):
-        value += sum[i]
-    return value
-
-
-@wp.func
 def expand_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return det(a - d, b - d, c - d) by expansions; terms as in `exact_orient3d`."""
-    u, u_low = two_sum(a, -d)
-    v, v_low = two_sum(b, -d)
-    w, w_low = two_sum(c, -d)
+    """Return det(a - d, b - d, c - d) by expansions."""
     sum = wp.zeros(shape=(EXPANSION_LENGTH,), dtype=wp.float64)
-    length = wp.int32(0)
-    term = wp.int32(0)
-    while term < 48:
-        i = term >> 4
-        odd = (term >> 3) & 1
-        j = (i + 1 + odd) % 3
-        k = (i + 2 - odd) % 3
-        x = wp.where((term & 1) != 0, u_low[i], u[i])
-        y = wp.where((term & 2) != 0, v_low[j], v[j])
-        z = wp.where((term & 4) != 0, w_low[k], w[k])
-        length = add_product(sum, length, wp.where(odd != 0, -x, x), y, z)
-        term += 1
+    length = expand_orient3d(sum, a, b, c, d)
     return sum_expansion(sum, length)
 
 
 @wp.func
 def expand_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
-    """Return det(a - c, b - c) by expansions; terms as in `exact_orient2d`."""
-    u, u_low = two_sum(a, -c)
-    v, v_low = two_sum(b, -c)
+    """Return det(a - c, b - c) by expansions."""
     sum = wp.zeros(shape=(EXPANSION_LENGTH,), dtype=wp.float64)
-    length = wp.int32(0)
-    term = wp.int32(0)
-    while term < 8:
-        i = term >> 2
-        x = wp.where((term & 1) != 0, u_low[i], u[i])
-        y = wp.where((term & 2) != 0, v_low[1 - i], v[1 - i])
-        length = add_product(sum, length, wp.where(i != 0, -x, x), y, wp.float64(1.0))
-        term += 1
+    length = expand_orient2d(sum, a, b, c)
     return sum_expansion(sum, length)
 
 
