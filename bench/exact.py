@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE
+from warp_abtree.kernels.screen import SCREEN_UNIT, screen_triangles
 from warp_abtree.kernels.triangle import intersect_triangles
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
@@ -222,18 +223,44 @@ def pair_test(mode):
     return test_pair_kernel
 
 
-def ask(mode, pairs, device):
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+def screen_pair_kernel(
+    error: wp.float32,
+    unit: wp.float32,
+    corners: wp.array2d(dtype=wp.vec3),
+    meet_out: wp.array(dtype=wp.int32),
+):
+    i = wp.tid()
+    meet_out[i] = screen_triangles(
+        error, unit, corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
+    )
+
+
+def time_launch(kernel, inputs, count, device):
     """Return a kernel's answers, int32 (count,), and the time of its launch [s]."""
-    corners = wp.array(np.ascontiguousarray(pairs).reshape(-1, 6, 3), dtype=wp.vec3d, device=device)
-    answers = wp.zeros(len(pairs), dtype=wp.int32, device=device)
-    kernel = pair_test(int(mode))
-    if len(pairs) == 0:
+    answers = wp.zeros(count, dtype=wp.int32, device=device)
+    if count == 0:
         return answers.numpy(), 0.0
     wp.synchronize_device(device)
     begin = time.perf_counter()
-    wp.launch(kernel, dim=len(pairs), inputs=[corners, answers], device=device)
+    wp.launch(kernel, dim=count, inputs=[*inputs, answers], device=device)
     wp.synchronize_device(device)
     return answers.numpy(), time.perf_counter() - begin
+
+
+def ask(mode, pairs, device):
+    """Return the answers of float64 or exact signs, int32 (count,), and the time [s]."""
+    corners = wp.array(np.ascontiguousarray(pairs).reshape(-1, 6, 3), dtype=wp.vec3d, device=device)
+    return time_launch(pair_test(int(mode)), [corners], len(pairs), device)
+
+
+def ask_float32(pairs, device, proven=True):
+    """Return the answers of the float32 stage, with its bound or without, and the time [s]."""
+    near = unit_size(pairs).astype(np.float32)
+    # Coordinates of at most 1 are off by at most 2^-25, differences by twice as much.
+    error, unit = (1.02 * 2.0**-24, float(SCREEN_UNIT)) if proven else (0.0, 0.0)
+    corners = wp.array(near.reshape(-1, 6, 3), dtype=wp.vec3, device=device)
+    return time_launch(screen_pair_kernel, [error, unit, corners], len(pairs), device)
 
 
 def unit_size(pairs):
@@ -248,18 +275,28 @@ def check_chunk(job, truth, device, tally):
     if job[0] != "random":
         pairs, rows = turn_pairs(pairs)
     truth = truth[rows]
-    first, filter_time = ask(FILTER, pairs, device)
-    unsure = np.flatnonzero(first == int(UNSURE))
-    answers = first.copy()
-    answers[unsure], exact_time = ask(EXACT, pairs[unsure], device)
-    plain, plain_time = ask(FLOAT64, pairs, device)
-    single, single_time = ask(FLOAT32, unit_size(pairs), device)
-    wrong = np.flatnonzero(answers != truth)
+    # Every stage is asked about every pair, so that each is held to the truth wherever it is sure.
+    screened, screen_time = ask_float32(pairs, device)
+    filtered, _ = ask(FILTER, pairs, device)
+    exact, _ = ask(EXACT, pairs, device)
+    wrong = np.flatnonzero(
+        ((screened != truth) & (screened != UNSURE)) | ((filtered != truth) & (filtered != UNSURE)) | (exact != truth)
+    )
     for i in wrong[:3]:
-        print(f"{job[0]}: {pairs[i].tolist()}: exact {truth[i]}, got {answers[i]}", file=sys.stderr, flush=True)
+        answers = f"stages {screened[i]}, {filtered[i]}, {exact[i]}"
+        print(f"{job[0]}: {pairs[i].tolist()}: exact {truth[i]}, {answers}", file=sys.stderr, flush=True)
+    # As a query does: the next stage for what the one before left open.
+    left = np.flatnonzero(screened == UNSURE)
+    again, filter_time = ask(FILTER, pairs[left], device)
+    hard = left[again == UNSURE]
+    _, exact_time = ask(EXACT, pairs[hard], device)
+    plain, plain_time = ask(FLOAT64, pairs, device)
+    single, single_time = ask_float32(pairs, device, proven=False)
+    rest = np.flatnonzero(single == UNSURE)
+    single[rest], rest_time = ask(FLOAT32, unit_size(pairs[rest]), device)
     tally += [
-        len(truth), truth.sum(), len(wrong), len(unsure), (plain != truth).sum(), (single != truth).sum(),
-        filter_time, exact_time, plain_time, single_time,
+        len(truth), truth.sum(), len(wrong), len(left), len(hard), (plain != truth).sum(), (single != truth).sum(),
+        screen_time, filter_time, exact_time, plain_time, single_time + rest_time,
     ]  # fmt: skip
 
 
@@ -275,8 +312,8 @@ def plan(count):
 
 
 def run(device, count=100_000, processes=2):
-    """Yield one row a kind of pair: pairs asked, share that meet, disagreements of exact signs with the truth, share
-    left to the second pass, error rates of float64 and float32, time a pair of each [ns].
+    """Yield one row a kind of pair: pairs asked, share that meet, disagreements of any stage with the truth, shares
+    left to float64 and to expansions, error rates of float64 and float32 alone, time of each a pair asked [ns].
 
     Raises:
         RuntimeError: An answer was wrong, or the tests' oracle is not at hand.
@@ -287,13 +324,14 @@ def run(device, count=100_000, processes=2):
     tallies = {}
     for mode in (FILTER, EXACT, FLOAT64, FLOAT32):
         ask(mode, make_chunk(("random", 0, 1)), device)  # compile before anything is timed
+    ask_float32(make_chunk(("random", 0, 1)), device)
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
         begin = time.perf_counter()
         # Kinds end in the order of the jobs, so a kind's row is whole when the next one starts.
         for at, (job, truth) in enumerate(zip(jobs, pool.imap(find_truth, jobs))):
             if job[0] not in tallies and tallies:
                 yield summarise(device, *list(tallies.items())[-1])
-            check_chunk(job, truth, device, tallies.setdefault(job[0], np.zeros(10)))
+            check_chunk(job, truth, device, tallies.setdefault(job[0], np.zeros(12)))
             done, wrong = (int(sum(tally[k] for tally in tallies.values())) for k in (0, 2))
             line = f"{at + 1}/{len(jobs)} chunks, {done} pairs, {wrong} wrong, {time.perf_counter() - begin:.0f} s"
             print(f"{job[0]}: {line}", file=sys.stderr, flush=True)
@@ -304,19 +342,17 @@ def run(device, count=100_000, processes=2):
 
 def summarise(device, kind, tally):
     """Turn a tally into a row."""
-    pairs, meet, wrong, unsure, plain, single, *times = tally.tolist()
-    filter_ns, exact_ns, plain_ns, single_ns = (round(1e9 * t / pairs, 1) for t in times)
+    pairs, meet, wrong, left, hard, plain, single, *times = tally.tolist()
+    stages = ("float32_stage_ns", "float64_stage_ns", "exact_stage_ns", "float64_ns", "float32_ns")
     return {
         "device": device.name,
         "kind": kind,
         "pairs": int(pairs),
         "meet": round(meet / pairs, 4),
         "disagreements": int(wrong),
-        "second_pass": float(f"{unsure / pairs:.3g}"),
+        "to_float64": float(f"{left / pairs:.3g}"),
+        "to_exact": float(f"{hard / pairs:.3g}"),
         "float64_errors": float(f"{plain / pairs:.3g}"),
         "float32_errors": float(f"{single / pairs:.3g}"),
-        "filter_ns": filter_ns,
-        "second_pass_ns": exact_ns,
-        "float64_ns": plain_ns,
-        "float32_ns": single_ns,
+        **{name: round(1e9 * t / pairs, 1) for name, t in zip(stages, times, strict=True)},
     }

@@ -9,6 +9,10 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 # Products of three coordinates stay normal above this.
 COORDINATE_MIN = wp.constant(wp.float64(2.0**-290))
 ROUNDING_32 = wp.constant(wp.float64(2.0**-18))
+UNIT_32 = wp.constant(wp.float64(2.0**-24))
+# Between these sizes of models float32 neither overflows nor loses digits to underflow.
+REACH_MIN = wp.constant(wp.float64(2.0**-100))
+REACH_MAX = wp.constant(wp.float64(2.0**100))
 ROUNDING_64 = wp.constant(wp.float64(2.0**-49))
 
 
@@ -16,9 +20,9 @@ ROUNDING_64 = wp.constant(wp.float64(2.0**-49))
 class PairPose:
     """The pose of B in A's frame, A the object with the smaller index.
 
-    rotation, translation map B's model frame to A's in float64. rotation32, translation32, margin serve boxes about the
-    models' centres. scale is a power of two that brings the larger model to about unit size. within is a distance that
-    margin covers too, 0 for intersection.
+    rotation, translation map B's model frame to A's in float64. rotation32, translation32 map coordinates about the
+    models' centres in float32; margin serves boxes, and scale, a power of two that brings the larger model to about
+    unit size, and error serve `screen_triangles`. within is a distance that margin covers too, 0 for intersection.
     """
 
     rotation: wp.mat33d
@@ -26,6 +30,7 @@ class PairPose:
     rotation32: wp.mat33
     translation32: wp.vec3
     margin: wp.float32
+    error: wp.float32
     scale: wp.float64
     within: wp.float64
 
@@ -103,6 +108,8 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     margin64 = ROUNDING_64 * (size + wp.float64(2.0) * (reach_c + reach_b) + reach_a)
     margin64 = margin64 + wp.float64(4.0) * skewed * (reach_b + far)
     margin32 = ROUNDING_32 * (reach_a + reach_b + far)
+    # Of one coordinate in `screen_triangles`: the first axis of the boxes' margin without box A.
+    off32 = UNIT_32 * (wp.float64(2.0) * reach_a + wp.float64(13.0) * reach_b + wp.float64(3.0) * far)
 
     pose = PairPose()
     pose.rotation = r
@@ -112,6 +119,9 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     # The exponent of a float32 without its digits is a power of two.
     exponent = wp.cast(wp.float32(wp.max(reach_a, reach_b)), wp.int32) & 0x7F800000
     pose.scale = wp.float64(1.0) / wp.float64(wp.cast(exponent, wp.float32))
+    pose.error = wp.float32(pose.scale * wp.float64(2.02) * (off32 + margin64))
+    if wp.max(reach_a, reach_b) < REACH_MIN or wp.max(reach_a, reach_b) > REACH_MAX:
+        pose.error = wp.inf
     # A margin that no box passes, for pairs that are apart for certain and perhaps beyond float32, or even float64: a
     # distance that overflowed gives infinity or NaN.
     pose.margin = -wp.inf

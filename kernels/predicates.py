@@ -7,6 +7,8 @@ differences are multiples of 2^-342 and products of three of 2^-1026: what falls
 its grid of 2^-1074 and is not rounded at all. So P is 0 only where every product has a factor 0, and the sign is 0.
 """
 
+from typing import Any
+
 import warp as wp
 
 from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d
@@ -18,9 +20,6 @@ FILTER = wp.constant(0)
 FLOAT64 = wp.constant(1)
 FLOAT32 = wp.constant(2)
 EXACT = wp.constant(3)
-# No signs: faces count as met unless proved farther apart than a distance.
-WITHIN = wp.constant(4)
-
 UNSURE = wp.constant(2)
 
 BOUND_3D = wp.constant(wp.float64((7.0 + 56.0 * 2.0**-53) * 2.0**-53))
@@ -34,13 +33,11 @@ def plain_sign(x: wp.float64):
 
 
 @wp.func
-def filtered_sign(x: wp.float64, bound: wp.float64):
+def filtered_sign(x: Any, bound: Any):
     """Return the sign of a value that errs by at most a bound, or UNSURE; a bound of 0 makes 0 a sure sign."""
-    if x > bound:
-        return 1
-    if x < -bound:
-        return -1
-    return wp.where(bound == wp.float64(0.0), 0, UNSURE)
+    # Without branches: which sign it is cannot be predicted.
+    open = wp.where(bound == type(bound)(0.0), 0, UNSURE)
+    return wp.where(x > bound, 1, wp.where(x < -bound, -1, open))
 
 
 @wp.func

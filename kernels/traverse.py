@@ -13,7 +13,8 @@ from warp_abtree.kernels.boxes import boxes_overlap
 from warp_abtree.kernels.distance import triangles_near
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
-from warp_abtree.kernels.predicates import FLOAT32, UNSURE, WITHIN
+from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, UNSURE
+from warp_abtree.kernels.screen import SCREEN_UNIT, screen_triangles
 from warp_abtree.kernels.triangle import intersect_triangles
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
@@ -23,10 +24,16 @@ OUTPUT_ANY = wp.constant(0)
 OUTPUT_COUNT = wp.constant(1)
 OUTPUT_FACES = wp.constant(2)
 
+# In place of a precision: faces count as met unless proved farther apart than a distance.
+WITHIN = wp.constant(-1)
+
 # A visit replaces one entry by two a level deeper, so depth first holds at most one entry a level of either tree,
 # plus one.
 STACK_LENGTH = wp.constant(64)
 stack_type = wp.types.vector(length=128, dtype=wp.int32)
+
+# Hits, then the work done: node, triangle, float64 and exact tests.
+counts_type = wp.types.vector(length=5, dtype=wp.int64)
 
 SHARED_LENGTH = wp.constant(2048)
 CANDIDATE_LENGTH = wp.constant(512)  # two blocks of the largest size
@@ -49,9 +56,9 @@ class Hits:
     """Results of a batch of pairs.
 
     any_hit, count: shape [pair]. face: (pair, face a, face b), a of the pair's first object, shape [capacity]; total
-    numbers them and may wrap, the demand is the sum of count. node_tests, triangle_tests, exact_tests: work done,
-    shape [pair].
-    unsure: (pair, face of the lower object, face of the higher) that wait for exact signs, shape [capacity].
+    numbers them and may wrap, the demand is the sum of count. node_tests to exact_tests: work done,
+    shape [pair]; float64_tests are the triangle tests that float32 left open, exact_tests those that took expansions.
+    unsure: (pair, face of the lower object, face of the higher) that wait for the next stage, shape [capacity].
     """
 
     any_hit: wp.array(dtype=wp.int32)
@@ -60,6 +67,7 @@ class Hits:
     total: wp.array(dtype=wp.int32)
     node_tests: wp.array(dtype=wp.int64)
     triangle_tests: wp.array(dtype=wp.int64)
+    float64_tests: wp.array(dtype=wp.int64)
     exact_tests: wp.array(dtype=wp.int64)
     unsure: wp.array(dtype=wp.vec3i)
     unsure_total: wp.array(dtype=wp.int32)
@@ -81,6 +89,37 @@ def locate_pair(models: ModelPool, states: StatePool, objects: ObjectPool, pair:
 
 
 @wp.func
+def screen_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    trees: PairTrees,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+):
+    """Test one active face of A against one of B in float32; return 1, 0 or UNSURE."""
+    a = states.face_corner[trees.corner_a + face_a]
+    b = states.face_corner[trees.corner_b + face_b]
+    error = pose.error
+    unit = SCREEN_UNIT
+    if mode == FLOAT32:
+        error = 0.0
+        unit = 0.0
+    s = wp.float32(pose.scale)
+    return screen_triangles(
+        error,
+        unit,
+        models.vertex_near[a[0]] * s,
+        models.vertex_near[a[1]] * s,
+        models.vertex_near[a[2]] * s,
+        (pose.rotation32 * models.vertex_near[b[0]] + pose.translation32) * s,
+        (pose.rotation32 * models.vertex_near[b[1]] + pose.translation32) * s,
+        (pose.rotation32 * models.vertex_near[b[2]] + pose.translation32) * s,
+    )
+
+
+@wp.func
 def test_faces(
     mode: wp.int32,
     models: ModelPool,
@@ -90,7 +129,7 @@ def test_faces(
     face_a: wp.int32,
     face_b: wp.int32,
 ):
-    """Test one active face of A against one of B, in A's frame; return 1, 0 or UNSURE."""
+    """Test one active face of A against one of B in float64, in A's frame; return 1, 0 or UNSURE."""
     a = states.face_corner[trees.corner_a + face_a]
     b = states.face_corner[trees.corner_b + face_b]
     a0 = models.vertex_pos[a[0]]
@@ -109,11 +148,66 @@ def test_faces(
 
 
 @wp.func
+def settle_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    trees: PairTrees,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+):
+    """Decide a pair of faces that float32 left open; return whether they meet, and whether it took expansions."""
+    if mode != EXACT:
+        return test_faces(mode, models, states, trees, pose, face_a, face_b), 0
+    meet = test_faces(FILTER, models, states, trees, pose, face_a, face_b)
+    if meet != UNSURE:
+        return meet, 0
+    return test_faces(mode, models, states, trees, pose, face_a, face_b), 1
+
+
+@wp.func
+def decide_faces(
+    mode: wp.int32,
+    deferring: bool,
+    models: ModelPool,
+    states: StatePool,
+    trees: PairTrees,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+):
+    """Return whether a pair of faces meets, and the stage that said so: 0 float32, 1 float64, 2 expansions.
+
+    Where the later stages are left to another kernel, pairs that need them are UNSURE at stage 1.
+    """
+    if mode == WITHIN:
+        return test_faces(mode, models, states, trees, pose, face_a, face_b), 0
+    meet = screen_faces(mode, models, states, trees, pose, face_a, face_b)
+    if meet != UNSURE:
+        return meet, 0
+    if deferring:
+        return meet, 1
+    meet, hard = settle_faces(mode, models, states, trees, pose, face_a, face_b)
+    return meet, 1 + hard
+
+
+@wp.func
 def defer_faces(pair: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
-    """Put a pair of faces on the list that `settle_unsure_kernel` works off; its count goes on past the capacity."""
+    """Put a pair of faces on the list that `settle_faces_kernel` works off; its count goes on past the capacity."""
     slot = wp.atomic_add(hits.unsure_total, 0, 1)
     if slot >= 0 and slot < hits.unsure.shape[0]:
         hits.unsure[slot] = wp.vec3i(pair, face_a, face_b)
+
+
+@wp.func
+def count_test(stage: wp.int32):
+    """Return what one triangle test decided at a stage adds to the counts."""
+    counts = counts_type()
+    counts[2] = wp.int64(1)
+    counts[3] = wp.int64(wp.min(stage, 1))
+    counts[4] = wp.int64(wp.max(stage - 1, 0))
+    return counts
 
 
 @wp.func
@@ -162,6 +256,7 @@ def visit_nodes(
 def traverse_depth_first(
     output: wp.int32,
     mode: wp.int32,
+    deferring: bool,
     pair: wp.int32,
     swapped: wp.int32,
     start_a: wp.int32,
@@ -172,30 +267,26 @@ def traverse_depth_first(
     pose: PairPose,
     hits: Hits,
 ):
-    """Traverse from one pair of nodes in this thread; return hits, node tests, triangle tests and exact tests."""
+    """Traverse from one pair of nodes in this thread; return the counts."""
     stack = stack_type()
     stack[0] = start_a
     stack[1] = start_b
     top = wp.int32(1)
-    hit_count = wp.int64(0)
-    node_tests = wp.int64(0)
-    triangle_tests = wp.int64(0)
-    exact_tests = wp.int64(0)
+    counts = counts_type()
     one = wp.int64(1)
     while top > 0:
         top -= 1
         node_a = stack[2 * top]
         node_b = stack[2 * top + 1]
         kind, x, y = visit_nodes(models, states, trees, pose, node_a, node_b)
-        node_tests += one
+        counts[1] += one
         if kind == 1:
-            triangle_tests += one
-            meet = test_faces(mode, models, states, trees, pose, x, y)
+            meet, stage = decide_faces(mode, deferring, models, states, trees, pose, x, y)
+            counts += count_test(stage)
             if meet == UNSURE:
-                exact_tests += one
                 defer_faces(pair, x, y, hits)
             elif meet == 1:
-                hit_count += one
+                counts[0] += one
                 report_hit(output, pair, swapped, x, y, hits)
                 if output == OUTPUT_ANY:
                     top = 0
@@ -211,12 +302,12 @@ def traverse_depth_first(
             stack[2 * top + 2] = node_a
             stack[2 * top + 3] = y
             top += 2
-    return wp.vec4l(hit_count, node_tests, triangle_tests, exact_tests)
+    return counts
 
 
 @functools.cache
 def thread_traversal(mode: int):
-    """Return the kernel that gives a thread each object pair, its signs made in a mode of `predicates`."""
+    """Return the kernel that gives a thread each object pair, at a precision or WITHIN."""
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def traverse_thread_kernel(
@@ -237,12 +328,13 @@ def thread_traversal(mode: int):
         skip_a = states.node_skip[trees.node_a + 1]
         skip_b = states.node_skip[trees.node_b + 1]
         counts = traverse_depth_first(
-            output, wp.static(mode), p, swapped, skip_a, skip_b, models, states, trees, pair_poses[p], hits_out
+            output, wp.static(mode), False, p, swapped, skip_a, skip_b, models, states, trees, pair_poses[p], hits_out
         )
         hits_out.count[p] = counts[0]
         hits_out.node_tests[p] = counts[1]
         hits_out.triangle_tests[p] = counts[2]
-        hits_out.exact_tests[p] = counts[3]
+        hits_out.float64_tests[p] = counts[3]
+        hits_out.exact_tests[p] = counts[4]
 
     return traverse_thread_kernel
 
@@ -263,13 +355,18 @@ def finish_refused(
 ):
     """Traverse depth first from a pair of nodes that the shared stack had no room for; return the counts."""
     if refused:
-        return traverse_depth_first(output, mode, pair, swapped, node[0], node[1], models, states, trees, pose, hits)
-    return wp.vec4l()
+        return traverse_depth_first(
+            output, mode, True, pair, swapped, node[0], node[1], models, states, trees, pose, hits
+        )
+    return counts_type()
 
 
 @functools.cache
 def block_traversal(mode: int):
-    """Return the kernel that gives a block of threads each object pair, its signs made in a mode of `predicates`."""
+    """Return the kernel that gives a block of threads each object pair, FLOAT32, WITHIN, or for both other precisions.
+
+    What float32 leaves open waits for `settle_traversal`.
+    """
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=168)
     def traverse_block_kernel(
@@ -291,7 +388,7 @@ def block_traversal(mode: int):
             return
         swapped, trees = locate_pair(models, states, objects, pairs[p])
         pose = pair_poses[p]
-        counts = wp.vec4l()
+        counts = counts_type()
         one = wp.int64(1)
         stack = wp.tile_stack(capacity=SHARED_LENGTH, dtype=wp.vec2i)
         # Visits stop at block_dim candidates and add at most as many, so this stack never fills.
@@ -304,10 +401,9 @@ def block_traversal(mode: int):
             if wp.tile_stack_count(candidates) >= ready or wp.tile_stack_count(stack) == 0:
                 faces, face_slot = wp.tile_stack_pop(candidates)
                 if face_slot >= 0 and (output != OUTPUT_ANY or hits_out.any_hit[p] == 0):
-                    counts[2] += one
-                    meet = test_faces(wp.static(mode), models, states, trees, pose, faces[0], faces[1])
+                    meet, stage = decide_faces(wp.static(mode), True, models, states, trees, pose, faces[0], faces[1])
+                    counts += count_test(stage)
                     if meet == UNSURE:
-                        counts[3] += one
                         defer_faces(p, faces[0], faces[1], hits_out)
                     elif meet == 1:
                         counts[0] += one
@@ -330,6 +426,7 @@ def block_traversal(mode: int):
         wp.atomic_add(hits_out.count, p, counts[0])
         wp.atomic_add(hits_out.node_tests, p, counts[1])
         wp.atomic_add(hits_out.triangle_tests, p, counts[2])
-        wp.atomic_add(hits_out.exact_tests, p, counts[3])
+        wp.atomic_add(hits_out.float64_tests, p, counts[3])
+        wp.atomic_add(hits_out.exact_tests, p, counts[4])
 
     return traverse_block_kernel

@@ -1,5 +1,7 @@
 """Triangle against triangle as closed sets: touching and coplanar overlap count, zero-area faces are segments."""
 
+from typing import Any
+
 import warp as wp
 
 from warp_abtree.kernels.flat import intersect_coplanar, intersect_degenerate, widest_axis
@@ -25,13 +27,49 @@ def find_alone(s0: wp.int32, s1: wp.int32, s2: wp.int32):
 
 
 @wp.func
-def rotate_first(i: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+def rotate_first(i: wp.int32, a: Any, b: Any, c: Any):
     """Return the corners turned so that corner i comes first."""
     if i == 1:
         return b, c, a
     if i == 2:
         return c, a, b
     return a, b, c
+
+
+@wp.func
+def turn_triangles(
+    sa0: wp.int32,
+    sa1: wp.int32,
+    sa2: wp.int32,
+    sb0: wp.int32,
+    sb1: wp.int32,
+    sb2: wp.int32,
+    a0: Any,
+    a1: Any,
+    a2: Any,
+    b0: Any,
+    b1: Any,
+    b2: Any,
+):
+    """Return both triangles, each with the corner first that is alone on its side of the other's plane.
+
+    Each is turned so that the other's lone corner lies on the positive side of its plane. The planes meet in a line; on
+    it the triangles are the intervals between edges p q and p r, and two more signs order the ends: they meet unless
+    orient3d(p1, q1, p2, q2) or orient3d(p1, r1, r2, p2) is 1.
+    """
+    alone_a, side_a = find_alone(sa0, sa1, sa2)
+    alone_b, side_b = find_alone(sb0, sb1, sb2)
+    p1, q1, r1 = rotate_first(alone_a, a0, a1, a2)
+    p2, q2, r2 = rotate_first(alone_b, b0, b1, b2)
+    if side_a < 0:
+        t = q2
+        q2 = r2
+        r2 = t
+    if side_b < 0:
+        t = q1
+        q1 = r1
+        r1 = t
+    return p1, q1, r1, p2, q2, r2
 
 
 @wp.func
@@ -77,20 +115,7 @@ def intersect_triangles(
             return UNSURE
     elif special:
         return wp.where(intersect_special(mode, a0, a1, a2, b0, b1, b2), 1, 0)
-    alone_a, side_a = find_alone(sa0, sa1, sa2)
-    alone_b, side_b = find_alone(sb0, sb1, sb2)
-    p1, q1, r1 = rotate_first(alone_a, a0, a1, a2)
-    p2, q2, r2 = rotate_first(alone_b, b0, b1, b2)
-    # Turn each triangle so that the other's lone corner lies on the positive side of its plane. The planes meet in a
-    # line; on it the triangles are the intervals between edges p q and p r, and two more signs order the ends.
-    if side_a < 0:
-        t = q2
-        q2 = r2
-        r2 = t
-    if side_b < 0:
-        t = q1
-        q1 = r1
-        r1 = t
+    p1, q1, r1, p2, q2, r2 = turn_triangles(sa0, sa1, sa2, sb0, sb1, sb2, a0, a1, a2, b0, b1, b2)
     first = orient3d(mode, p1, q1, p2, q2)
     second = orient3d(mode, p1, r1, r2, p2)
     if first == 1 or second == 1:

@@ -15,7 +15,7 @@ import pytest
 import trimesh
 
 import warp_abtree as ab
-from warp_abtree import cli, plot
+from warp_abtree import cli, plot, report
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = """
@@ -50,6 +50,8 @@ def files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     trimesh.creation.icosphere(subdivisions=2).export("ball.obj")
     trimesh.creation.torus(major_radius=1.0, minor_radius=0.3).export("ring.ply")
+    trimesh.creation.box().export("box.obj")
+    ab.Model.from_arrays(np.eye(3), [[0, 1, 2]]).save("face.npz")
     Path("scene.toml").write_text(SCENE)
     Path("bad.toml").write_text("[scene]\nspeed = 3\n")
     Path("broken.toml").write_text("[scene\n")
@@ -57,6 +59,7 @@ def files(tmp_path, monkeypatch):
     Path("nan.obj").write_text("v 0 0 0\nv 1 nan 0\nv 0 1 0\nf 1 2 3\n")
     Path("junk.npz").write_bytes(b"junk")
     Path("text.mesh").write_text("hello\n")
+    Path("folder.npz").mkdir()
     return tmp_path
 
 
@@ -107,8 +110,8 @@ def test_build(files, capsys):
 # query.
 
 
-def answer(capsys, *arguments):
-    return json.loads(run(capsys, "query", *arguments, "--device", "cpu", "--json")[0])
+def answer(capsys, *arguments, device="cpu"):
+    return json.loads(run(capsys, "query", *arguments, "--device", device, "--json")[0])
 
 
 def test_query_against_the_library(files, capsys):
@@ -121,7 +124,7 @@ def test_query_against_the_library(files, capsys):
     scene.add(ball, lod=ball.lod_for(fraction=0.25))
     scene.add(ring, pose=pose, lod=900)
     expected = scene.intersect(np.array([[0, 1]]), output="faces")
-    assert found["faces"] == expected.faces[:, 1:].tolist() and len(found["faces"]) > cli.LISTED_FACES
+    assert found["faces"] == expected.faces[:, 1:].tolist() and len(found["faces"]) > report.LISTED_FACES
     assert found["count"] == expected.count[0] and found["intersects"] is True
     assert found["lods"] == scene.lods.tolist()
     bound = ball.error_at(found["lods"][0]) + ring.error_at(900)
@@ -138,7 +141,7 @@ def test_query_for_people(files, capsys):
     )
     count = int(re.search(r"intersecting face pairs: ([\d,]+)", shown)[1].replace(",", ""))
     listed = [line for line in shown.splitlines() if re.fullmatch(r" +\d+ +\d+", line)]
-    assert len(listed) == cli.LISTED_FACES and f"and {count - cli.LISTED_FACES:,} more" in shown
+    assert len(listed) == report.LISTED_FACES and f"and {count - report.LISTED_FACES:,} more" in shown
     assert "error(A) + error(B): 0\n" in shown and "they intersect" in shown and not errors
     assert "do not intersect" in run(capsys, "query", "ball.obj", "ball.obj", "--pose", 3, 0, 0, 0, 0, 0, 1)[0]
 
@@ -148,6 +151,125 @@ def test_query_of_built_models(files, capsys):
     built = answer(capsys, "ring.npz", "ring.npz", "--lod-a", "coarsest", "--lod-b", "tol:0")
     direct = answer(capsys, "ring.ply", "ring.ply", "--lod-a", "0", "--lod-b", "finest")
     assert built["count"] == direct["count"] > 0 and built["lods"] == direct["lods"]
+
+
+VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
+ASIDE = (0.8, 0.1, -1e-3, 0.0, 0.6, 0.0, 0.8)
+
+
+def contacts_of(device, a, b, pose, precision="exact"):
+    """Ask the library what `query A B --output contacts` asks."""
+    scene = ab.Scene(device)
+    scene.add(ab.Model.load(a))
+    scene.add(ab.Model.load(b), pose=pose)
+    return scene.intersect(np.array([[0, 1]]), output="contacts", precision=precision)
+
+
+@pytest.mark.parametrize("precision", ["exact", "float64", "float32"])
+def test_contacts_against_the_library(files, capsys, device, precision):
+    # The shifted twin has coplanar faces beside it; their rounded signs differ from the exact ones.
+    for a, b, pose in (("ball.obj", "ring.ply", ASIDE), ("box.obj", "box.obj", (0.3, 0.1, 0, 0, 0, 0, 1))):
+        expected = contacts_of(device, a, b, pose, precision)
+        words = (a, b, "--pose", *pose, "--output", "contacts", "--precision", precision)
+        found = answer(capsys, *words, "--record", "rows.csv", device=device)
+        assert found["count"] == expected.count[0] > 0 and found["precision"] == precision
+        assert (
+            found["faces"] == expected.faces[:, 1:].tolist() == [[x["face_a"], x["face_b"]] for x in found["contacts"]]
+        )
+        rows = list(csv.DictReader(io.StringIO(Path("rows.csv").read_text())))
+        assert len(rows) == len(found["contacts"]) == len(expected.contacts)
+        for row, entry, contact in zip(rows, found["contacts"], expected.contacts):
+            assert [int(row["face_a"]), int(row["face_b"])] == [contact["face_a"], contact["face_b"]]
+            for name in VECTORS:
+                assert entry[name] == [float(row[f"{name}_{axis}"]) for axis in "xyz"] == contact[name].tolist()
+            assert entry["coplanar"] is bool(int(row["coplanar"])) is bool(contact["coplanar"])
+            assert len(row) == 2 + 3 * len(VECTORS) + 1 and set(entry) == {"face_a", "face_b", *VECTORS, "coplanar"}
+        summed = expected.pair_contacts[0]
+        assert found["pair_contacts"] == {name: summed[name].tolist() for name in summed.dtype.names}
+
+        run(capsys, "query", *words, "--device", device, "--record", "arrays.npz")
+        with np.load("arrays.npz") as arrays:
+            assert set(arrays) == {"any", "count", "faces", "contacts", "pair_contacts"}
+            for name in arrays:
+                assert arrays[name].dtype == getattr(expected, name).dtype
+                assert arrays[name].tobytes() == getattr(expected, name).tobytes()
+    assert expected.contacts["coplanar"].any()
+    assert not list(files.glob("*.partial"))
+
+
+def test_precision_reaches_the_query(files, capsys, device):
+    """Nearly coincident balls, whose answers differ from precision to precision."""
+    pose = (1e-7, 0, 0, 0, 0, 0, 1)
+    counts = {}
+    for precision in ("exact", "float64", "float32"):
+        found = answer(capsys, "ball.obj", "ball.obj", "--pose", *pose, "--precision", precision, device=device)
+        counts[precision] = found["count"]
+        assert found["count"] == contacts_of(device, "ball.obj", "ball.obj", pose, precision).count[0]
+    assert counts["float32"] != counts["exact"]
+    assert answer(capsys, "ball.obj", "ball.obj", "--pose", *pose, device=device)["count"] == counts["exact"]
+
+
+def test_contacts_for_people(files, capsys, device):
+    shown, errors = run(
+        capsys, *f"query ball.obj ring.ply --device {device} --pose".split(), *ASIDE, "--output", "contacts"
+    )
+    expected = contacts_of(device, "ball.obj", "ring.ply", ASIDE)
+    for text, name in (("point of the contacts", "point"), ("from A to B", "normal"), ("an estimate", "depth")):
+        line = re.search(rf"{text}: (.*)", shown)[1]
+        assert np.allclose([float(x) for x in line.split()], expected.pair_contacts[name][0], rtol=1e-5)
+    listed = [line.split() for line in shown.splitlines() if re.fullmatch(r" +\d+ +\d+( +[-.\de]+){9}", line)]
+    assert len(listed) == report.LISTED_FACES and f"and {len(expected.faces) - len(listed):,} more" in shown
+    for words, contact in zip(listed, expected.contacts):
+        assert [int(x) for x in words[:2]] == [contact["face_a"], contact["face_b"]]
+        numbers = np.concatenate([contact[name] for name in ("p0", "p1", "normal")])
+        assert np.allclose([float(x) for x in words[2:]], numbers, rtol=1e-3)
+    assert "precision exact" in shown and not errors
+    box = run(capsys, *"query box.obj box.obj --output contacts --precision float32".split(), "--device", device)[0]
+    assert "precision float32" in box and re.search(r"^ .* coplanar$", box, re.M)
+
+
+def test_contacts_of_what_is_apart(files, capsys, device):
+    words = "query ball.obj ring.ply --pose 9 0 0 0 0 0 1 --output contacts --record".split()
+    shown, _ = run(capsys, *words, "rows.csv", "--device", device)
+    assert "do not intersect" in shown and "depth" not in shown and shown.endswith("wrote rows.csv\n")
+    lines = Path("rows.csv").read_text().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("face_a,face_b,p0_x,")
+    found = json.loads(run(capsys, *words, "arrays.npz", "--json", "--device", device)[0])
+    nowhere = [None, None, None]
+    assert found["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere, "depth": 0}
+    assert found["faces"] == found["contacts"] == []
+    with np.load("arrays.npz") as arrays:
+        assert len(arrays["contacts"]) == 0 and np.isnan(arrays["pair_contacts"]["point"]).all()
+
+
+def test_record_of_each_output(files, capsys):
+    words = "query ball.obj ring.ply --device cpu --record"
+    for output, names in (("any", {"any"}), ("count", {"any", "count"}), ("faces", {"any", "count", "faces"})):
+        found = answer(capsys, "ball.obj", "ring.ply", "--output", output)
+        assert "contacts" not in found and "pair_contacts" not in found
+        shown, _ = run(capsys, *words.split(), "out.npz", "--output", output)
+        assert shown.endswith("wrote out.npz\n")
+        with np.load("out.npz") as arrays:
+            assert set(arrays) == names and arrays["any"][0]
+    run(capsys, *words.split(), "out.csv", "--output", "faces")
+    rows = list(csv.reader(io.StringIO(Path("out.csv").read_text())))
+    assert rows[0] == ["face_a", "face_b"] and [[int(x) for x in row] for row in rows[1:]] == found["faces"]
+
+
+@pytest.mark.parametrize(("name", "writer"), [("out.csv", "csv.writer"), ("out.npz", "np.savez")])
+def test_a_record_that_fails_leaves_the_old_one(files, capsys, monkeypatch, name, writer):
+    def full(file, *_, **__):
+        file.write("part" if name == "out.csv" else b"part")
+        file.flush()
+        raise OSError(28, "No space left on device")
+
+    Path(name).write_text("old")
+    module, function = writer.split(".")
+    monkeypatch.setattr(getattr(report, module), function, full)
+    words = "query ball.obj ring.ply --device cpu --output contacts --record"
+    shown, errors = run(capsys, *words.split(), name, status=2)
+    assert not shown and len(errors) == 1 and "No space left" in errors[0]
+    assert Path(name).read_text() == "old" and not list(files.glob("*.partial"))
 
 
 # run.
@@ -262,7 +384,19 @@ BAD = [
     (("query", "ball.obj", "ball.obj", "--lod-b", "99999"), "--lod-b"),
     (("query", "ball.obj", "ball.obj", "--lod-b", "tol:-1"), "--lod-b"),
     (("query", "ball.obj", "ball.obj", "--lod-b", "fine"), "--lod-b"),
-    (("query", "ball.obj", "ball.obj", "--output", "contacts"), "--output"),
+    (("query", "ball.obj", "ball.obj", "--output", "depth"), "--output"),
+    (("query", "ball.obj", "ball.obj", "--precision", "half"), "--precision"),
+    (("query", "ball.obj", "ball.obj", "--precision"), "--precision"),
+    (("query", "ball.obj", "ball.obj", *"--output contacts --record out.json".split()), "must end in .csv or .npz"),
+    (("query", "ball.obj", "ball.obj", *"--output contacts --record out".split()), "must end in .csv or .npz"),
+    (("query", "ball.obj", "ball.obj", *"--output contacts --record gone/out.csv".split()), "no folder gone"),
+    (("query", "ball.obj", "ball.obj", *"--output contacts --record ball.obj/out.csv".split()), "no folder ball.obj"),
+    (("query", "ball.obj", "ball.obj", *"--output contacts --record folder.npz".split()), "is a folder"),
+    (("query", "ball.obj", "ball.obj", "--record", "out.csv"), "ask --output faces or contacts"),
+    (("query", "ball.obj", "ball.obj", "--output", "any", "--record", "out.csv"), "ask --output faces or contacts"),
+    (("query", "ball.obj", "face.npz", "--record", "face.npz"), "face.npz: is read"),
+    (("query", "./face.npz", "ball.obj", "--record", "face.npz"), "face.npz: is read"),
+    (("query", "ball.obj", "nan.obj", "--output", "contacts", "--record", "out.npz"), "not finite"),
     (("query", "ball.obj", "ball.obj", "--device", "tpu"), "no device 'tpu'"),
     (("run", "gone.toml"), "gone.toml"),
     (("run", "bad.toml"), "bad.toml: scene.speed: unknown key"),
@@ -304,37 +438,6 @@ def test_help_has_examples(capsys):
     assert capsys.readouterr().out == f"warp-abtree {ab.__version__}\n"
 
 
-# Progress.
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def test_progress_bar_on_a_terminal():
-    stream, clock = Terminal(), iter([0.0, 0.1, 1.0, 2.0])
-    progress = cli.Progress(stream, clock=lambda: next(clock))
-    for done in (0, 1, 5, 10):
-        progress("error", done, 10)
-    progress.close()
-    assert stream.getvalue().split("\r")[1:3] == [
-        f"error      [{'#' * 15:<30}]  50 %",
-        f"error      [{'#' * 30}] 100 %",
-    ]
-    assert stream.getvalue().endswith("\r\x1b[K")
-
-
-def test_progress_off_a_terminal_is_a_line_a_stage():
-    stream, clock = io.StringIO(), iter(range(100))
-    progress = cli.Progress(stream, clock=lambda: next(clock))
-    for stage in ("collapse", "error"):
-        for done in range(5):
-            progress(stage, done, 4)
-    progress.close()
-    assert stream.getvalue() == "collapse ...\nerror ...\n"
-
-
 # As people start it.
 
 
@@ -348,22 +451,6 @@ def test_process_fails_in_one_line(files):
     done = run_process("query", "ball.obj", "nan.obj", cwd=files)
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1 and "not finite" in done.stderr
-
-
-def test_compiling_is_announced(files):
-    stream = io.StringIO()
-    cache = files / "cache"
-    (cache / f"wp_module_p{os.getpid()}_t1").mkdir(parents=True)
-    before, cli.wp.config.kernel_cache_dir = cli.wp.config.kernel_cache_dir, str(cache)
-    try:
-        with cli.compile_notice(stream, delay=0.0):
-            for _ in range(100):
-                if stream.getvalue():
-                    break
-                cli.time.sleep(0.05)
-    finally:
-        cli.wp.config.kernel_cache_dir = before
-    assert stream.getvalue().count("\n") == 1 and "compiling" in stream.getvalue()
 
 
 # README.
@@ -391,4 +478,4 @@ def test_readme_commands_exist():
         assert cli.make_parser().parse_args(command).command == command[0]
         for word in command:
             assert not word.startswith("scenes/") or (ROOT / word).is_file()
-    assert len(lines) == 5
+    assert len(lines) == 6

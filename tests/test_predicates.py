@@ -1,4 +1,4 @@
-"""Expansions and orientation signs against fractions, and that no compiler contracts them."""
+"""Expansions and signs of all three stages against fractions, and that no compiler contracts them."""
 
 import importlib
 import re
@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_abtree.kernels import traverse
+from warp_abtree.kernels import settle, traverse
 from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d, two_product, two_sum
 from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE, orient2d, orient3d
+from warp_abtree.kernels.screen import SCREEN_UNIT, side_of_plane, sides_of_plane
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
@@ -67,6 +68,24 @@ def expansion3d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec3d), out: 
 def expansion2d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.int32)):
     i = wp.tid()
     out[i] = exact_orient2d(points[i, 0], points[i, 1], points[i, 2])
+
+
+@wp.kernel
+def screen_kernel(
+    error: wp.array(dtype=wp.float32),
+    unit: wp.float32,
+    points: wp.array2d(dtype=wp.vec3),
+    out: wp.array2d(dtype=wp.int32),
+):
+    i = wp.tid()
+    a, b, c, d, e, f = points[i, 0], points[i, 1], points[i, 2], points[i, 3], points[i, 4], points[i, 5]
+    s0, s1, s2 = sides_of_plane(error[i], unit, a, b, c, d, e, f)
+    out[i, 0] = s0
+    out[i, 1] = s1
+    out[i, 2] = s2
+    out[i, 3] = side_of_plane(error[i], unit, a, b, c, d)
+    out[i, 4] = side_of_plane(error[i], unit, a, b, c, e)
+    out[i, 5] = side_of_plane(error[i], unit, a, b, c, f)
 
 
 def apply(kernel, a, b, device):
@@ -233,14 +252,77 @@ def test_the_filter_is_tight(device):
     assert (find_signs(orient3d_kernel, FILTER, points, device) != int(UNSURE)).mean() > 0.95
 
 
+# --- float32, the first stage ----------------------------------------------------------------------------------------
+
+
+def screen_signs(error, unit, points, device):
+    """Return signs (count, 6) of three points against a plane, all at once and one by one; points [count, 6, 3]."""
+    out = wp.zeros((len(points), 6), dtype=wp.int32, device=device)
+    error = wp.array(error, dtype=wp.float32, device=device)
+    points = wp.array(points.astype(np.float32), dtype=wp.vec3, device=device)
+    wp.launch(screen_kernel, len(points), [error, float(unit), points, out], device=device)
+    return out.numpy()
+
+
+def screen_points(rng, kind):
+    """Six points about the origin of at most unit size: the fourth is that of a kind, two more lie nearby."""
+    points = KINDS[kind](rng, 3)
+    points = np.concatenate([points, points[:, 3:] + 1e-3 * rng.normal(size=points[:, 3:].shape), points[:, :1]], 1)
+    points -= points[:, :1] + 1e-2 * rng.normal(size=(COUNT, 1, 3))
+    return points / np.maximum(1e-200, np.abs(points).max((1, 2), keepdims=True))
+
+
+def true_sides(points):
+    return np.stack([true_signs(points[:, [0, 1, 2, k]]) for k in (3, 4, 5)] * 2, 1)
+
+
+@pytest.mark.parametrize("off", [2.0**-26, 2.0**-20, 2.0**-10])
+@pytest.mark.parametrize("kind", ["random", "lattice", "flat", "large flat"])
+def test_screen_is_right_where_it_is_sure(device, kind, off):
+    """Coordinates moved by up to `off`, in a random or in the worst direction, and rounded to float32."""
+    rng = np.random.default_rng(7)
+    points = screen_points(rng, kind)
+    normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])[:, None]
+    height = rng.choice([0.0, 0.5, 1.0, 2.0, 4.0], (COUNT, 1, 1)) * off * np.sign(normal)
+    points[:, 3:] += height
+    truth = true_sides(points)
+    worst = np.concatenate([np.sign(normal) * np.ones((1, 3, 1)), -np.sign(normal) * np.ones((1, 3, 1))], 1)
+    shift = np.where(rng.random((COUNT, 1, 1)) < 0.5, worst, rng.uniform(-1, 1, points.shape)) * off
+    moved = (points + shift).astype(np.float32)
+    error = 2.02 * np.abs(moved - points).max((1, 2))
+    signs = screen_signs(error, SCREEN_UNIT, moved, device)
+    sure = signs != int(UNSURE)
+    np.testing.assert_array_equal(signs[sure], truth[sure])
+    plain = screen_signs(0 * error, SCREEN_UNIT, moved, device)
+    if kind != "random":
+        assert (plain != truth)[plain != int(UNSURE)].any(), "coordinates that are off must be reckoned with here"
+    elif off < 1e-6:
+        assert sure[:, [0, 1, 3, 4]].mean() > 0.98, "the sixth point lies in the plane but for the shift"
+    far = screen_signs(np.full(COUNT, np.inf), SCREEN_UNIT, moved, device)
+    assert (far == int(UNSURE)).all()
+
+
+@pytest.mark.parametrize("kind", ["random", "flat", "large flat"])
+def test_screen_covers_its_own_rounding(device, kind):
+    """Coordinates that float32 holds exactly: only the arithmetic rounds."""
+    points = screen_points(np.random.default_rng(8), kind).astype(np.float32).astype(float)
+    truth = true_sides(points)
+    signs = screen_signs(np.zeros(COUNT), SCREEN_UNIT, points, device)
+    sure = signs != int(UNSURE)
+    np.testing.assert_array_equal(signs[sure], truth[sure])
+    plain = screen_signs(np.zeros(COUNT), 0.0, points, device)
+    assert (plain != int(UNSURE)).all()
+    assert (plain != truth).any() == (kind != "random"), "float32 alone is good enough for points at random only"
+
+
 # --- no contraction --------------------------------------------------------------------------------------------------
 
 
 def test_modules_with_signs_do_not_contract():
-    names = ("predicates", "expansion", "triangle", "flat", "boxes", "pose", "traverse", "settle", "refit")
+    names = ("predicates", "expansion", "triangle", "flat", "boxes", "pose", "traverse", "settle", "refit", "screen")
     modules = [wp.get_module(importlib.import_module(f"warp_abtree.kernels.{name}").__name__) for name in names]
-    for mode in (FILTER, FLOAT64, FLOAT32):
-        modules += [make(int(mode)).module for make in (traverse.thread_traversal, traverse.block_traversal)]
+    makers = (traverse.thread_traversal, traverse.block_traversal, settle.settle_traversal)
+    modules += [make(int(mode)).module for mode in (EXACT, FLOAT64, FLOAT32, traverse.WITHIN) for make in makers]
     assert [m.name for m in modules if m.options["fuse_fp"] or m.options["fast_math"]] == []
 
 
@@ -269,7 +351,12 @@ def test_ptx_is_not_contracted(tmp_path, fuse_fp):
 
 
 def test_ptx_of_the_traversal_is_not_contracted(tmp_path):
-    """The kernel that poses vertices, filters signs and tests boxes; it has no expansions, hence no fma at all."""
-    text = ptx_of(traverse.thread_traversal(int(FILTER)).module, tmp_path)
+    """The kernels that pose vertices, bound signs and test boxes; without expansions they have no fma at all."""
+    (tmp_path / "screen").mkdir()
+    (tmp_path / "settle").mkdir()
+    text = ptx_of(traverse.block_traversal(int(EXACT)).module, tmp_path / "screen")
+    assert len(re.findall(r"\bmul\.rn\.f32", text)) > 100
+    assert find_contraction(text) == []
+    text = ptx_of(settle.settle_traversal(int(FLOAT64)).module, tmp_path / "settle")
     assert len(re.findall(r"\bmul\.rn\.f64", text)) > 50
     assert find_contraction(text) == []

@@ -8,12 +8,16 @@ from warp_abtree.checks import to_numpy, whole_number
 from warp_abtree.kernels import distance, pose, predicates, settle, traverse
 
 OUTPUTS = {"any": traverse.OUTPUT_ANY, "count": traverse.OUTPUT_COUNT, "faces": traverse.OUTPUT_FACES}
-PRECISIONS = {"exact": predicates.FILTER, "float64": predicates.FLOAT64, "float32": predicates.FLOAT32}
+PRECISIONS = {"exact": predicates.EXACT, "float64": predicates.FLOAT64, "float32": predicates.FLOAT32}
 # So many pairs leave most of a GPU idle at 128 threads each; 256 were 1.6 times faster, and slower from 1,024 pairs on.
 FEW_PAIRS = 512
 
-# Face pairs that the float64 filter leaves open: few unless faces are coplanar. The list grows as needed.
+COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
+
+# Face pairs that the float32 stage leaves open: about one in a hundred. The list grows as needed.
 UNSURE_CAPACITY = 65536
+
+EXACT, FLOAT64 = int(predicates.EXACT), int(predicates.FLOAT64)
 
 
 def check_request(output: str, precision: str):
@@ -60,8 +64,8 @@ class Result:
         contacts, pair_contacts: Structured arrays (k,) and (p,), see `warp_abtree.contact`; None unless output is
             "contacts".
         apart: Whether each pair is proved farther apart than `within`, bool (p,); None without within.
-        node_tests, triangle_tests, exact_tests: Work done for each pair, int64 (p,); exact tests are the triangle tests
-            that the float64 filter left open.
+        node_tests, triangle_tests, float64_tests, exact_tests: Work done for each pair, int64 (p,): pairs of boxes,
+            pairs of faces, those of them that float32 left open, and of these those that took exact arithmetic.
     """
 
     def __init__(self, pairs, output, pair_demand, pair_room, hits, near=None):
@@ -73,9 +77,8 @@ class Result:
         self.any = hits.any_hit.numpy()[:p] != 0
         self.apart = None if near is None else near.any_hit.numpy()[:p] == 0
         # On the CPU numpy() shares the memory that the next launch writes.
-        self.node_tests = hits.node_tests.numpy()[:p].copy()
-        self.triangle_tests = hits.triangle_tests.numpy()[:p].copy()
-        self.exact_tests = hits.exact_tests.numpy()[:p].copy()
+        for name in COUNTERS:
+            setattr(self, name, getattr(hits, name).numpy()[:p].copy())
         self.count = hits.count.numpy()[:p].copy() if output != "any" else None
         self.faces = self.contacts = self.pair_contacts = None
         if output == "faces":
@@ -93,10 +96,10 @@ class Result:
             raise CapacityError(
                 f"the broad phase found {self._pair_demand} pairs, the query has room for {self._pair_room}"
             )
-        unsure = int(self.exact_tests.sum())
+        unsure = int(self.float64_tests.sum())
         if self._unsure_room and unsure > self._unsure_room:
             raise CapacityError(
-                f"{unsure} face pairs need exact signs, the query has room for {self._unsure_room}: "
+                f"{unsure} face pairs need more than float32, the query has room for {self._unsure_room}: "
                 f"make it with unsure_capacity={unsure}"
             )
         if self._hit_demand > self._hit_room:
@@ -123,7 +126,7 @@ class Query:
         within: Distances [world units], one for all pairs or (p,) beside given pairs: ask also which pairs are farther
             apart. The proof covers all rounding: pairs beyond by less than about 1e-13 of their size stay unproved, by
             less than 6 s where a rotation is off orthonormal by s, and all for distances from 2^1000 on.
-        unsure_capacity: Face pairs that there is room for between the filter and the exact signs.
+        unsure_capacity: Face pairs that there is room for between float32 and the later stages; not needed on the CPU.
 
     Attributes:
         hits: Device arrays of the last launch (`kernels.traverse.Hits`), faces in no order.
@@ -171,7 +174,7 @@ class Query:
         self.hits.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.near = None if within is None else self._make_near()
         self._within = within
-        self._resize_unsure((unsure_capacity or UNSURE_CAPACITY) if precision == "exact" else 0)
+        self._resize_unsure((unsure_capacity or UNSURE_CAPACITY) if self.uses_blocks() else 0)
         self._allocate_pairs()
         if pairs is not None:
             self.set_pairs(pairs)
@@ -204,12 +207,12 @@ class Query:
         room = len(self.pairs)
         self.pair_poses = wp.empty(room, dtype=pose.PairPose, device=self.device)
         self.hits.any_hit = wp.zeros(room, dtype=wp.int32, device=self.device)
-        for name in ("count", "node_tests", "triangle_tests", "exact_tests"):
+        for name in ("count", *COUNTERS):
             setattr(self.hits, name, wp.zeros(room, dtype=wp.int64, device=self.device))
         if self.near is not None:
             self.within = wp.empty(room, dtype=wp.float64, device=self.device)
             self.near.any_hit = wp.zeros(room, dtype=wp.int32, device=self.device)
-            for name in ("count", "node_tests", "triangle_tests", "exact_tests"):
+            for name in ("count", *COUNTERS):
                 setattr(self.near, name, wp.zeros(room, dtype=wp.int64, device=self.device))
             if self.broad_phase is not None:
                 self._fill_within()
@@ -267,12 +270,12 @@ class Query:
             device=self.device,
         )
         posed = [self.pair_count, self.pairs, self.pair_poses, self.near]
-        self._launch_traversal(int(predicates.WITHIN), [int(traverse.OUTPUT_ANY), *pools, *posed])
+        self._launch_traversal(int(traverse.WITHIN), [int(traverse.OUTPUT_ANY), *pools, *posed])
 
     def _launch_traversal(self, mode, inputs):
         room = len(self.pairs)
         if self.uses_blocks():
-            kernel = self.kernels.block_traversal(mode)
+            kernel = self.kernels.block_traversal(EXACT if mode == FLOAT64 else mode)
             block_dim = self.block_dim or (256 if room <= FEW_PAIRS else 128)
             wp.launch_tiled(kernel, dim=[room], inputs=inputs, block_dim=block_dim, device=self.device)
         else:
@@ -290,6 +293,7 @@ class Query:
             self.hits.total,
             self.hits.node_tests,
             self.hits.triangle_tests,
+            self.hits.float64_tests,
             self.hits.exact_tests,
             self.hits.unsure_total,
         ):
@@ -305,7 +309,7 @@ class Query:
         self._launch_traversal(mode, [output, models, states, objects, self.pair_count, *posed])
         if len(self.hits.unsure):
             wp.launch(
-                settle.settle_unsure_kernel,
+                settle.settle_traversal(mode),
                 dim=len(self.hits.unsure),
                 inputs=[output, models, states, objects, *posed],
                 device=self.device,
@@ -327,8 +331,8 @@ class Query:
             self.pairs = self.broad_phase.pairs
             self._allocate_pairs()
             self.launch()
-        if len(self.hits.unsure) and self._sum(self.hits.exact_tests) > len(self.hits.unsure):
-            self._resize_unsure(self._sum(self.hits.exact_tests))
+        if len(self.hits.unsure) and self._sum(self.hits.float64_tests) > len(self.hits.unsure):
+            self._resize_unsure(self._sum(self.hits.float64_tests))
             self.traverse()
         if self.output == "faces" and self._sum(self.hits.count) > len(self.hits.face):
             self.resize(self._sum(self.hits.count))

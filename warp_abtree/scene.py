@@ -163,20 +163,19 @@ class Scene:
             states = StateArrays(models, self.device)
             objects = ObjectArrays(self._world, self._static, self.device)
             set_object_lods(models, states, objects, np.array(self.object_model), np.array(self._lod))
+            self._place(objects, self._added_pose)
             self._arrays = (models, states, objects)
-            self._place(self._added_pose)
         return self._arrays
 
-    def _place(self, poses):
+    def _place(self, objects, poses):
         """Set poses of mixed kinds: the device turns quaternions into matrices, matrices are taken as they are."""
-        objects = self._arrays[2]
         rows = np.zeros((len(poses), 7))
         rows[:, 6] = 1.0
         matrix = np.array([p.ndim == 2 for p in poses])
         for i, p in enumerate(poses):
             if not matrix[i]:
                 rows[i] = p
-        self._place_quaternions(rows)
+        self._place_quaternions(objects, rows)
         if matrix.any():
             rotation = objects.pool.rotation.numpy()
             position = objects.pool.position.numpy()
@@ -186,11 +185,9 @@ class Scene:
             objects.pool.rotation.assign(rotation)
             objects.pool.position.assign(position)
 
-    def _place_quaternions(self, rows):
+    def _place_quaternions(self, objects, rows):
         device_rows = wp.array(rows, dtype=wp.float64, device=self.device)
-        wp.launch(
-            pose_kernels.set_pose_kernel, dim=len(rows), inputs=[device_rows, self._arrays[2].pool], device=self.device
-        )
+        wp.launch(pose_kernels.set_pose_kernel, dim=len(rows), inputs=[device_rows, objects.pool], device=self.device)
 
     def set_poses(self, poses):
         """Set the pose of every object.
@@ -206,13 +203,12 @@ class Scene:
         poses = check_poses(poses)
         if len(poses) != self.object_count:
             raise ValueError(f"poses: {len(poses)} given for {self.object_count} objects")
-        self.arrays()
+        objects = self.arrays()[2]
         if poses.ndim == 2:
-            self._place_quaternions(poses)
+            self._place_quaternions(objects, poses)
         else:
-            objects = self._arrays[2].pool
-            objects.rotation.assign(np.ascontiguousarray(poses[:, :3, :3]))
-            objects.position.assign(np.ascontiguousarray(poses[:, :3, 3]))
+            objects.pool.rotation.assign(np.ascontiguousarray(poses[:, :3, :3]))
+            objects.pool.position.assign(np.ascontiguousarray(poses[:, :3, 3]))
 
     def set_lods(self, lods) -> UpdateStats:
         """Bring every object to a LOD: meshes are refined and trees updated in one batch, states are shared.
@@ -222,6 +218,7 @@ class Scene:
 
         Raises:
             ValueError: Wrong shape or a LOD out of range; nothing is changed.
+            RuntimeError: The device is out of memory; LODs and states are as before.
         """
         lods = to_numpy(lods, "lods")
         if lods.shape != (self.object_count,):
@@ -234,7 +231,8 @@ class Scene:
             i = int(bad[0])
             raise ValueError(f"lods: object {i} asks for LOD {lods[i]}, outside 0 .. {top[i]}")
         models, states, objects = self.arrays()
-        stats = set_object_lods(models, states, objects, np.array(self.object_model), lods.astype(np.int64))
+        with states.restored_on_error():
+            stats = set_object_lods(models, states, objects, np.array(self.object_model), lods.astype(np.int64))
         self._lod = [int(lod) for lod in lods]
         return stats
 
@@ -311,13 +309,16 @@ class Scene:
         if within is not None:
             within = check_within(within, len(pairs))
         asked = (output, precision, within is not None)
-        if asked in self._queries:
-            self._queries[asked].set_pairs(pairs, within)
+        # A query that fails, for lack of memory, is not kept: it gives its own back.
+        query = self._queries.pop(asked, None)
+        if query is None:
+            query = Query(self, output, pairs=pairs, precision=precision, within=within)
         else:
-            self._queries[asked] = Query(self, output, pairs=pairs, precision=precision, within=within)
-        result = self._queries[asked].run()
+            query.set_pairs(pairs, within)
+        result = query.run()
+        self._queries[asked] = query
         if with_contacts:
-            result.contacts, result.pair_contacts = find_contacts(self._queries[asked], result, contact_dtype)
+            result.contacts, result.pair_contacts = find_contacts(query, result, contact_dtype)
         return result
 
     def tree_state(self, i) -> TreeState:

@@ -1,11 +1,15 @@
 """Models, tree states and objects as flat device arrays."""
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
+
+# Columns of `StatePool` that mirror the host's slots.
+SLOT_COLUMNS = ("model", "lod", "node_start", "face_start")
 
 
 def _upload(values, dtype, device):
@@ -52,6 +56,8 @@ class ModelArrays:
         pool = ModelPool()
         pool.vertex_parent = joined(parents, wp.int32)
         pool.vertex_pos = joined([f.vertex_pos for f in forests], wp.vec3d)
+        near = [model.progressive.vertex_pos - model.centre for model in models]
+        pool.vertex_near = joined([x.astype(np.float32) for x in near], wp.vec3)
         pool.face_vertex = joined(corners, wp.vec3i)
         pool.face_split = joined([f.face_split for f in forests], wp.int32)
         pool.split_face = joined([f.split_face for f in forests], wp.int32)
@@ -151,14 +157,33 @@ class StateArrays:
 
     def upload_slots(self):
         """Bring model, LOD and starts of all states to the device."""
+        columns = [np.array([getattr(s, name) for s in self.slots], np.int32) for name in SLOT_COLUMNS]
+        for name, array in zip(SLOT_COLUMNS, [_upload(values, wp.int32, self.device) for values in columns]):
+            setattr(self.pool, name, array)
 
-        def column(name):
-            return _upload(np.array([getattr(s, name) for s in self.slots], np.int32), wp.int32, self.device)
+    @contextmanager
+    def restored_on_error(self):
+        """Put every state back where a change of LODs fails before its first launch, as for lack of memory.
 
-        self.pool.model = column("model")
-        self.pool.lod = column("lod")
-        self.pool.node_start = column("node_start")
-        self.pool.face_start = column("face_start")
+        An update allocates all that it needs before it moves a state that is in use, so what stands on the device
+        still fits. Room that the pool has gained stays.
+        """
+        lods = [slot.lod for slot in self.slots]
+        held = {name: getattr(self, name) for name in ("node_total", "face_total")}
+        free = {model: list(ids) for model, ids in self.free.items()}
+        columns = {name: getattr(self.pool, name) for name in SLOT_COLUMNS}
+        try:
+            yield
+        except BaseException:
+            del self.slots[len(lods) :]
+            for slot, lod in zip(self.slots, lods, strict=True):
+                slot.lod = lod
+            for name, value in held.items():
+                setattr(self, name, value)
+            self.free = free
+            for name, array in columns.items():
+                setattr(self.pool, name, array)
+            raise
 
 
 class ObjectArrays:
