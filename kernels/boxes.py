@@ -1,4 +1,4 @@
-"""Conservative float32 boxes of float64 points, and their overlap under a rigid transform."""
+"""Conservative float32 boxes of float64 points, and whether two of them overlap under a rigid transform."""
 
 import warp as wp
 
@@ -41,34 +41,44 @@ def round_up_vec(x: wp.vec3d):
     return wp.vec3(round_up(x[0]), round_up(x[1]), round_up(x[2]))
 
 
-@wp.func
-def boxes_overlap(
-    lower_a: wp.vec3,
-    upper_a: wp.vec3,
-    lower_b: wp.vec3,
-    upper_b: wp.vec3,
-    rotation: wp.mat33,
-    translation: wp.vec3,
-    margin: float,
-):
-    """Return False only where box A and the posed box B are apart, on the three axes of each.
+@wp.struct
+class PosedBox:
+    """Twice the centre and the whole width of a box along the axes of its own frame, and along those of the other."""
 
-    rotation, translation: B's frame in A's, both about their models' centres. margin: `pair_margin`, which covers the
-    rounding of everything here, so that no pair of points that meet is ever pruned.
-    """
-    half_a = (upper_a - lower_a) * 0.5
-    half_b = (upper_b - lower_b) * 0.5
-    centre_b = (upper_b + lower_b) * 0.5
-    apart = rotation * centre_b + translation - (upper_a + lower_a) * 0.5
+    sum: wp.vec3
+    size: wp.vec3
+    turned_sum: wp.vec3
+    turned_size: wp.vec3
+
+
+@wp.func
+def pose_box(lower: wp.vec3, upper: wp.vec3, rotation: wp.mat33, translation: wp.vec3):
+    """Return a box with its image in another frame: x -> rotation x + translation, both about the models' centres."""
+    box = PosedBox()
+    box.sum = upper + lower
+    box.size = upper - lower
+    box.turned_sum = rotation * box.sum + (translation + translation)
     for i in range(3):
-        reach = wp.abs(rotation[i, 0]) * half_b[0] + wp.abs(rotation[i, 1]) * half_b[1]
-        reach = reach + wp.abs(rotation[i, 2]) * half_b[2] + half_a[i] + margin
-        if wp.abs(apart[i]) > reach:
-            return False
-    for j in range(3):
-        reach = wp.abs(rotation[0, j]) * half_a[0] + wp.abs(rotation[1, j]) * half_a[1]
-        reach = reach + wp.abs(rotation[2, j]) * half_a[2] + half_b[j] + margin
-        along = apart[0] * rotation[0, j] + apart[1] * rotation[1, j] + apart[2] * rotation[2, j]
-        if wp.abs(along) > reach:
-            return False
-    return True
+        reach = wp.abs(rotation[i, 0]) * box.size[0] + wp.abs(rotation[i, 1]) * box.size[1]
+        box.turned_size[i] = reach + wp.abs(rotation[i, 2]) * box.size[2]
+    return box
+
+
+@wp.func
+def boxes_overlap(a: PosedBox, b: PosedBox, margin: float):
+    """Return False only where two boxes are apart along one of the three axes of each.
+
+    margin: of `PairPose`; it covers the rounding of everything here and of the poses, so that no pair of points that
+    meet is ever pruned. Each axis has a box in the frame of which it is an axis, and the other's image there.
+    """
+    reach = margin + margin
+    p = a.sum - b.turned_sum
+    q = a.turned_sum - b.sum
+    return (
+        wp.abs(p[0]) <= a.size[0] + b.turned_size[0] + reach
+        and wp.abs(p[1]) <= a.size[1] + b.turned_size[1] + reach
+        and wp.abs(p[2]) <= a.size[2] + b.turned_size[2] + reach
+        and wp.abs(q[0]) <= a.turned_size[0] + b.size[0] + reach
+        and wp.abs(q[1]) <= a.turned_size[1] + b.size[1] + reach
+        and wp.abs(q[2]) <= a.turned_size[2] + b.size[2] + reach
+    )

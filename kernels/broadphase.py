@@ -3,6 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.boxes import round_down, round_up
+from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -22,9 +23,9 @@ def pose_box_kernel(
     """Box the posed root box of each object in the world, rounded outwards."""
     i = wp.tid()
     state = objects.state[i]
-    root = states.node_start[state] + 1
-    lower = wp.vec3d(states.node_lower[root])
-    upper = wp.vec3d(states.node_upper[root])
+    root = load_node(states, states.node_start[state] + 1)
+    lower = wp.vec3d(root.lower)
+    upper = wp.vec3d(root.upper)
     rotation = objects.rotation[i]
     position = objects.position[i]
     middle = models.centre[states.model[state]] + wp.float64(0.5) * (lower + upper)

@@ -13,6 +13,7 @@ itself, d |n| by 2 u more. `GAP_ROUNDING` is 128 u. What underflows is under 2^-
 
 import warp as wp
 
+from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pair_pose, reach_box, sum_products
 
@@ -161,10 +162,10 @@ def pad_distance(models: ModelPool, states: StatePool, objects: ObjectPool, a: w
     """
     state_a = objects.state[a]
     state_b = objects.state[b]
-    root_a = states.node_start[state_a] + 1
-    root_b = states.node_start[state_b] + 1
-    reach_a = reach_box(states.node_lower[root_a], states.node_upper[root_a])
-    reach_b = reach_box(states.node_lower[root_b], states.node_upper[root_b])
+    root_a = load_node(states, states.node_start[state_a] + 1)
+    root_b = load_node(states, states.node_start[state_b] + 1)
+    reach_a = reach_box(root_a.lower, root_a.upper)
+    reach_b = reach_box(root_b.lower, root_b.upper)
     reach_a = reach_a + largest(models.centre[states.model[state_a]])
     reach_b = reach_b + largest(models.centre[states.model[state_b]])
     shift = largest(objects.position[b] - objects.position[a])

@@ -46,7 +46,7 @@ class ModelPool:
 class StatePool:
     """Everything that a level of detail decides: one entry a model at a LOD.
 
-    Per node: node_status, node_lower, node_upper [model units, about the model's centre], node_skip. Per face:
+    Per node: node_status, and node_box, two entries of 16 bytes for a record (`nodes.Node`). Per face:
     face_corner, the active ancestors (global vertex ids) of the three corners, -1 where the face is inactive.
     """
 
@@ -55,9 +55,7 @@ class StatePool:
     node_start: wp.array(dtype=wp.int32)
     face_start: wp.array(dtype=wp.int32)
     node_status: wp.array(dtype=wp.int32)
-    node_lower: wp.array(dtype=wp.vec3)
-    node_upper: wp.array(dtype=wp.vec3)
-    node_skip: wp.array(dtype=wp.int32)
+    node_box: wp.array(dtype=wp.vec4)
     face_corner: wp.array(dtype=wp.vec3i)
 
 

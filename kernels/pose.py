@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -13,7 +14,7 @@ UNIT_32 = wp.constant(wp.float64(2.0**-24))
 # Between these sizes of models float32 neither overflows nor loses digits to underflow.
 REACH_MIN = wp.constant(wp.float64(2.0**-100))
 REACH_MAX = wp.constant(wp.float64(2.0**100))
-ROUNDING_64 = wp.constant(wp.float64(2.0**-49))
+ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
 
 
 @wp.struct
@@ -21,14 +22,16 @@ class PairPose:
     """The pose of B in A's frame, A the object with the smaller index.
 
     rotation, translation map B's model frame to A's in float64. rotation32, translation32 map coordinates about the
-    models' centres in float32; margin serves boxes, and scale, a power of two that brings the larger model to about
-    unit size, and error serve `screen_triangles`. within is a distance that margin covers too, 0 for intersection.
+    models' centres in float32, the transpose and back32 the other way. margin serves boxes; scale, a power of two that
+    brings the larger model to about unit size, and error serve `screen_triangles`. within is a distance that margin
+    covers too, 0 for intersection.
     """
 
     rotation: wp.mat33d
     translation: wp.vec3d
     rotation32: wp.mat33
     translation32: wp.vec3
+    back32: wp.vec3
     margin: wp.float32
     error: wp.float32
     scale: wp.float64
@@ -78,8 +81,8 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
 
     The margin covers every rounding between the exact x' of B's vertices and the float32 box test. With u = 2^-24,
     r_a and r_b the reach of the root boxes and s the largest component of the translation between the centres,
-    these sum to less than 25 u r_b + 4 u s + 5 u r_a on A's axes and 37 u r_b + 11 u s + 20 u r_a on B's, against
-    64 u of each here (docs/exactness.md has the terms). The float64 part covers x' itself and the shift between
+    these sum to less than 25 u r_b + 4 u s + 5 u r_a on A's axes and 25 u r_a + 6 u s + 5 u r_b on B's, against 64 u
+    of each here (docs/exactness.md has the terms). The float64 part covers x' itself and the shift between
     centres, and `skewed` a rotation that is not orthonormal to the last bit, on whose columns B's axes are taken. A
     gap along a unit axis is a distance, so `within` adds to the margin; a column is longer than 1 by at most
     `skewed`.
@@ -89,10 +92,10 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     state_b = objects.state[b]
     centre_a = models.centre[states.model[state_a]]
     centre_b = models.centre[states.model[state_b]]
-    root_a = states.node_start[state_a] + 1
-    root_b = states.node_start[state_b] + 1
-    reach_a = reach_box(states.node_lower[root_a], states.node_upper[root_a])
-    reach_b = reach_box(states.node_lower[root_b], states.node_upper[root_b])
+    root_a = load_node(states, states.node_start[state_a] + 1)
+    root_b = load_node(states, states.node_start[state_b] + 1)
+    reach_a = reach_box(root_a.lower, root_a.upper)
+    reach_b = reach_box(root_b.lower, root_b.upper)
     shift = wp.vec3d()
     size = wp.float64(0.0)
     far = wp.float64(0.0)
@@ -130,6 +133,8 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     near = wp.abs(shift[0]) <= wide and wp.abs(shift[1]) <= wide and wp.abs(shift[2]) <= wide
     if near and limit < wp.float64(wp.inf):
         pose.translation32 = wp.vec3(shift)
+        for i in range(3):
+            pose.back32[i] = -wp.float32(sum_products(r[0, i], shift[0], r[1, i], shift[1], r[2, i], shift[2]))
         pose.margin = wp.float32(margin64 + margin32 + within * (wp.float64(1.0) + skewed + ROUNDING_32))
     return pose
 

@@ -3,6 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.boxes import round_down_vec, round_up_vec
+from warp_abtree.kernels.nodes import Node, empty_node, load_node, store_node
 from warp_abtree.kernels.pools import ACTIVE, INACTIVE, ModelPool, StatePool
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -15,37 +16,41 @@ def refit_leaf(models: ModelPool, states: StatePool, state: wp.int32, node: wp.i
     corner = states.face_corner[states.face_start[state] + face]
     if corner[0] < 0:
         states.node_status[at] = INACTIVE
-        states.node_lower[at] = wp.vec3(wp.inf, wp.inf, wp.inf)
-        states.node_upper[at] = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
-        states.node_skip[at] = -1
+        store_node(states, at, empty_node())
         return
     centre = models.centre[states.model[state]]
     a = models.vertex_pos[corner[0]] - centre
     b = models.vertex_pos[corner[1]] - centre
     c = models.vertex_pos[corner[2]] - centre
     states.node_status[at] = ACTIVE
-    states.node_lower[at] = round_down_vec(wp.min(a, wp.min(b, c)))
-    states.node_upper[at] = round_up_vec(wp.max(a, wp.max(b, c)))
-    states.node_skip[at] = node
+    leaf = Node()
+    leaf.lower = round_down_vec(wp.min(a, wp.min(b, c)))
+    leaf.upper = round_up_vec(wp.max(a, wp.max(b, c)))
+    leaf.skip = node
+    leaf.face = face
+    store_node(states, at, leaf)
 
 
 @wp.func
 def refit_inner(states: StatePool, state: wp.int32, node: wp.int32):
     """Unite the children of a node; both are final."""
-    at = states.node_start[state] + node
-    left = states.node_start[state] + 2 * node
-    skip_left = states.node_skip[left]
-    skip_right = states.node_skip[left + 1]
+    first = states.node_start[state] + 2 * node
+    left = load_node(states, first)
+    right = load_node(states, first + 1)
     # An empty box is (+inf, -inf), so the union needs no case for an inactive child.
-    states.node_lower[at] = wp.min(states.node_lower[left], states.node_lower[left + 1])
-    states.node_upper[at] = wp.max(states.node_upper[left], states.node_upper[left + 1])
-    skip = node
-    if skip_left < 0:
-        skip = skip_right
-    elif skip_right < 0:
-        skip = skip_left
-    states.node_skip[at] = skip
-    states.node_status[at] = wp.where(skip < 0, INACTIVE, ACTIVE)
+    whole = Node()
+    whole.lower = wp.min(left.lower, right.lower)
+    whole.upper = wp.max(left.upper, right.upper)
+    whole.skip = node
+    whole.face = -1
+    if left.skip < 0:
+        whole.skip = right.skip
+        whole.face = right.face
+    elif right.skip < 0:
+        whole.skip = left.skip
+        whole.face = left.face
+    store_node(states, states.node_start[state] + node, whole)
+    states.node_status[states.node_start[state] + node] = wp.where(whole.skip < 0, INACTIVE, ACTIVE)
 
 
 @wp.func
@@ -118,9 +123,7 @@ def copy_node_kernel(
     source = states_inout.node_start[source_state[u]] + tid - begin
     target = states_inout.node_start[target_state[u]] + tid - begin
     states_inout.node_status[target] = states_inout.node_status[source]
-    states_inout.node_lower[target] = states_inout.node_lower[source]
-    states_inout.node_upper[target] = states_inout.node_upper[source]
-    states_inout.node_skip[target] = states_inout.node_skip[source]
+    store_node(states_inout, target, load_node(states_inout, source))
 
 
 @wp.kernel

@@ -4,16 +4,17 @@ import functools
 
 import warp as wp
 
+from warp_abtree.kernels.faces import OUTPUT_ANY, OUTPUT_FACES, Hits, locate_pair, report_hit, settle_faces
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose
-from warp_abtree.kernels.traverse import MODULE_OPTIONS, OUTPUT_ANY, Hits, locate_pair, report_hit, settle_faces
 
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
 
 @functools.cache
 def settle_traversal(mode: int):
-    """Return the kernel that decides what `block_traversal` left open, at a precision."""
+    """Return the kernel that decides what `warp_traversal` left open, at a precision."""
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def settle_faces_kernel(
@@ -39,6 +40,9 @@ def settle_traversal(mode: int):
             wp.atomic_add(hits_inout.exact_tests, p, wp.int64(1))
         if meet == 1:
             wp.atomic_add(hits_inout.count, p, wp.int64(1))
-            report_hit(output, p, swapped, item[1], item[2], hits_inout)
+            hits_inout.any_hit[p] = 1
+            if output == OUTPUT_FACES:
+                slot = wp.atomic_add(hits_inout.total, 0, 1)
+                report_hit(slot, p, swapped, item[1], item[2], hits_inout)
 
     return settle_faces_kernel

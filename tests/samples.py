@@ -139,8 +139,6 @@ def raw_state(scene, i):
     return {
         "lod": slot.lod,
         "status": states.pool.node_status.numpy()[nodes],
-        "lower": states.pool.node_lower.numpy()[nodes],
-        "upper": states.pool.node_upper.numpy()[nodes],
-        "skip": states.pool.node_skip.numpy()[nodes],
+        **dict(zip(("lower", "upper", "skip"), states.read_nodes(slot, model.tree.node_count))),
         "corner": np.where(corners < 0, -1, corners - models.vertex_start[slot.model]),
     }

@@ -1,9 +1,5 @@
 """Batched traversal: every intersecting face pair, against exact brute force and an independent library."""
 
-import importlib.util
-import re
-import sys
-
 import numpy as np
 import pytest
 import warp as wp
@@ -12,8 +8,8 @@ from oracle_triangle import into_frame_of_a
 from samples import REAL_MESHES, SHAPES, STILL, WARP_MESHES, contact_poses, random_poses, sample, true_faces
 
 import warp_abtree as ab
-from warp_abtree.kernels import traverse
 from warp_abtree.kernels.pose import PairPose, pose_point
+from warp_abtree.kernels.warps import STACK_LENGTH
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -343,33 +339,17 @@ def test_nothing_asked(device):
         assert result.faces.shape == (0, 3) and result.pairs.shape == (0, 2)
 
 
-class BlockQuery(ab.Query):
+class WarpQuery(ab.Query):
     """A query that takes the CUDA regime on every device."""
 
-    def uses_blocks(self):
+    def uses_warps(self):
         return True
 
 
-@pytest.fixture(scope="module")
-def tight_kernels(tmp_path_factory):
-    """The traversal kernels with a shared stack of three entries, so that most work spills."""
-    source = importlib.util.find_spec("warp_abtree.kernels.traverse").origin
-    with open(source, encoding="utf-8") as file:
-        text = file.read()
-    text, found = re.subn(r"SHARED_LENGTH = wp.constant\(\d+\)", "SHARED_LENGTH = wp.constant(3)", text)
-    assert found == 1
-    path = tmp_path_factory.mktemp("kernels") / "tight_traverse.py"
-    path.write_text(text)
-    spec = importlib.util.spec_from_file_location("tight_traverse", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
-
-
-@pytest.mark.parametrize("stack", ["whole", "tight"])
-def test_blocks_give_the_same_answers(device, stack, tight_kernels):
+@pytest.mark.parametrize("room", [STACK_LENGTH, 0])
+@pytest.mark.parametrize("parts", [1, 5, 300])
+def test_warps_give_the_same_answers(device, room, parts):
+    """One warp a pair and several, with room on the stack or none, so that they go one item at a time."""
     scene, _ = posed_cases(np.random.default_rng(8), ("torus", "soup"), 12, BRUTE_FACES, device)
     poses = random_poses(np.random.default_rng(8), 1, 1.0)
     for _ in range(2):  # the same mesh twice in one place: many faces wait for exact signs
@@ -378,13 +358,12 @@ def test_blocks_give_the_same_answers(device, stack, tight_kernels):
     pairs = np.concatenate([pairs, pairs[::-1, ::-1], [(0, 3), (2, 9), (24, 25), (25, 24)]])
     for output in ("faces", "count", "any"):
         plain = ask(scene, pairs, output)
-        query = BlockQuery(scene, output, pairs=pairs, unsure_capacity=2)
-        query.kernels = traverse if stack == "whole" else tight_kernels
-        query.block_dim = 64 if query.device.is_cuda else 1
+        query = WarpQuery(scene, output, pairs=pairs, unsure_capacity=2)
+        query.warp_count, query.stack_room = parts * len(pairs), room
         result = query.run()
         np.testing.assert_array_equal(result.any, plain.any)
         if output != "any":
-            for name in ("count", "node_tests", "triangle_tests", "exact_tests"):
+            for name in ("count", "node_tests", "triangle_tests", "float64_tests", "exact_tests"):
                 np.testing.assert_array_equal(getattr(result, name), getattr(plain, name))
         if output == "faces":
             np.testing.assert_array_equal(result.faces, plain.faces)
@@ -436,7 +415,5 @@ def test_what_is_not_built_says_so(device):
     box = sample("box")
     scene.add(box)
     scene.add(box)
-    with pytest.raises(NotImplementedError):
-        ab.Query(scene, "contacts", pairs=[(0, 1)])
     with pytest.raises(NotImplementedError):
         ab.sweep(box, box, random_poses(np.random.default_rng(0), 3, 1.0))

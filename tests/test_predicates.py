@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_abtree.kernels import settle, traverse
+from warp_abtree.kernels import faces, settle, traverse
 from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d, two_product, two_sum
 from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE, orient2d, orient3d
 from warp_abtree.kernels.screen import SCREEN_UNIT, side_of_plane, sides_of_plane
@@ -319,10 +319,25 @@ def test_screen_covers_its_own_rounding(device, kind):
 
 
 def test_modules_with_signs_do_not_contract():
-    names = ("predicates", "expansion", "triangle", "flat", "boxes", "pose", "traverse", "settle", "refit", "screen")
+    names = (
+        "predicates",
+        "expansion",
+        "triangle",
+        "flat",
+        "boxes",
+        "pose",
+        "traverse",
+        "settle",
+        "refit",
+        "screen",
+        "faces",
+        "visit",
+        "nodes",
+    )
+    names += ("screen", "faces", "visit", "nodes")
     modules = [wp.get_module(importlib.import_module(f"warp_abtree.kernels.{name}").__name__) for name in names]
-    makers = (traverse.thread_traversal, traverse.block_traversal, settle.settle_traversal)
-    modules += [make(int(mode)).module for mode in (EXACT, FLOAT64, FLOAT32, traverse.WITHIN) for make in makers]
+    makers = (traverse.thread_traversal, traverse.warp_traversal, settle.settle_traversal)
+    modules += [make(int(mode)).module for mode in (EXACT, FLOAT64, FLOAT32, faces.WITHIN) for make in makers]
     assert [m.name for m in modules if m.options["fuse_fp"] or m.options["fast_math"]] == []
 
 
@@ -354,7 +369,7 @@ def test_ptx_of_the_traversal_is_not_contracted(tmp_path):
     """The kernels that pose vertices, bound signs and test boxes; without expansions they have no fma at all."""
     (tmp_path / "screen").mkdir()
     (tmp_path / "settle").mkdir()
-    text = ptx_of(traverse.block_traversal(int(EXACT)).module, tmp_path / "screen")
+    text = ptx_of(traverse.warp_traversal(int(EXACT)).module, tmp_path / "screen")
     assert len(re.findall(r"\bmul\.rn\.f32", text)) > 100
     assert find_contraction(text) == []
     text = ptx_of(settle.settle_traversal(int(FLOAT64)).module, tmp_path / "settle")

@@ -301,15 +301,15 @@ def test_matrices_off_orthonormal(device):
 # Operators, regimes, input.
 
 
-class BlockQuery(ab.Query):
+class WarpQuery(ab.Query):
     """A query that takes the CUDA regime on every device."""
 
-    def uses_blocks(self):
+    def uses_warps(self):
         return True
 
 
 class ThreadQuery(ab.Query):
-    def uses_blocks(self):
+    def uses_warps(self):
         return False
 
 
@@ -320,9 +320,9 @@ def test_regimes_and_outputs_agree(device):
     within = rng.choice([0, 0.1, 0.5, 1.0], len(pairs))
     expected = scene.intersect(pairs, within=within)
     assert 3 < expected.apart.sum() < 27
-    for kind, output in itertools.product((ThreadQuery, BlockQuery), ("any", "faces")):
+    for kind, output in itertools.product((ThreadQuery, WarpQuery), ("any", "faces")):
         query = kind(scene, output, pairs=pairs, within=within)
-        query.block_dim = 64 if query.device.is_cuda else 1
+        query.warp_count = 3 * len(pairs)
         result, plain = query.run(), scene.intersect(pairs, output)
         np.testing.assert_array_equal(result.apart, expected.apart)
         assert plain.apart is None

@@ -1,6 +1,7 @@
 """Batched mesh-mesh interference queries at any level of detail, on NVIDIA Warp."""
 
 from warp_abtree.broadphase import CapacityError
+from warp_abtree.contact import ContactQuery
 from warp_abtree.dynamics import Kinematic
 from warp_abtree.frame import Frame, FrameRow, LodSweep, resolve_lod
 from warp_abtree.intersect import Query, Result, sweep
@@ -14,6 +15,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "CapacityError",
+    "ContactQuery",
     "Frame",
     "FrameRow",
     "Kinematic",

@@ -1,4 +1,4 @@
-"""Contacts: where intersecting faces meet, with which normals, and one summary an object pair.
+"""Contacts: where intersecting faces meet, with which normals, and one summary an object pair; `ContactQuery`.
 
 Everything is computed from the inputs of the exact test, in the frame of the object with the lower index, and then
 posed to the world by that object's pose. A face pair's contact, in the order in which the pair names its objects:
@@ -12,9 +12,12 @@ posed to the world by that object's pose. A face pair's contact, in the order in
 * coplanar: whether the faces have area and lie in one plane, exactly.
 
 An end is a corner, or lies on an edge, off its exact place by at most 2^-40 of the edge's length and the rounding of
-coordinates in both frames. Pairs that a coarser precision reports although they are apart get a point between them.
+coordinates in both frames. Where the lower object's rotation is a matrix R that is off orthonormal by s, the largest
+entry of |R^T R - I|, ends lie on the higher object's posed mesh only to within 3 s of their distance from the lower
+object's position. Pairs that a coarser precision reports although they are apart get a point between them.
 
-An object pair's summary is a sum over its contacts in the order of `Result.faces`, in float64:
+An object pair's summary is made of sums over its contacts in the order of `Result.faces`, in float64. Each sum adds the
+contacts of each chunk of 32, the last chunk perhaps shorter, from left to right, then the chunks from left to right:
 
 * count: contacts, as `Result.count`.
 * point: mean of the segments' midpoints, weighted by length; unweighted where all lengths vanish. It need not lie on
@@ -37,8 +40,9 @@ CUDA, and for a pair named the other way the contacts differ in nothing but orde
 import numpy as np
 import warp as wp
 
+from warp_abtree.broadphase import CapacityError
 from warp_abtree.intersect import Query, Result
-from warp_abtree.kernels import contact
+from warp_abtree.kernels import contact, order, reduce
 
 VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
 
@@ -61,44 +65,168 @@ def contact_dtypes(dtype=np.float64):
     return np.dtype([*indices, *vectors, ("coplanar", bool)]), np.dtype([("count", np.int64), *means])
 
 
-def find_contacts(query: Query, result: Result, dtype=np.float64):
-    """Return contacts and summaries of a whole result that a query's last launch gave. Waits for the device.
+class ContactResult(Result):
+    """What a `ContactQuery` found, on the host: faces, contacts and their summaries as `Result` describes them."""
+
+    def __init__(self, query, pairs, pair_demand):
+        super().__init__(pairs, "contacts", pair_demand, len(query.pairs), query.hits, query.near)
+        self._hit_demand = int(self.count.sum())
+        rows = min(self._hit_demand, self._hit_room)
+        face_type, pair_type = contact_dtypes(query.contact_dtype)
+        self.contacts, self.pair_contacts = np.zeros(rows, face_type), np.zeros(len(pairs), pair_type)
+        self.faces = np.empty((0, 3), np.int32)
+        self.pair_contacts["count"] = self.count
+        with np.errstate(over="ignore"):
+            if len(pairs):
+                for name in ("point", "normal", "depth"):
+                    self.pair_contacts[name] = getattr(query.pair_contacts, name)[: len(pairs)].numpy()
+            if rows:
+                # On the CPU numpy() shares the memory that the next launch writes.
+                self.faces = query.faces[:rows].numpy().copy()
+                for name in (*VECTORS, "coplanar"):
+                    self.contacts[name] = getattr(query.contacts, name)[:rows].numpy()
+        for column, name in enumerate(("pair", "face_a", "face_b")):
+            self.contacts[name] = self.faces[:, column]
+
+
+class ContactQuery(Query):
+    """Contacts of many object pairs as an operator: `Query` of output "faces", and what this module's docstring says.
+
+    `launch()` only launches, sorting included, so that a CUDA graph can take poses to contacts without the host.
 
     Args:
-        query: Query of output "faces" whose scene has not changed since.
-        dtype: Type of real numbers returned; they are computed in float64, and those beyond float32 become infinite.
+        scene, pairs, pair_capacity, precision, within, unsure_capacity: As for `Query`.
+        capacity: Contacts that there is room for, below 2^30. Room that stays empty takes 180 bytes a contact and time
+            to sort all the same.
+        contact_dtype: Type of the real numbers in `result()`, float64 or float32; those beyond float32 become infinite.
 
-    Returns:
-        Structured arrays (k,) and (p,), world frame and world units, as the module's docstring defines them.
-
-    Raises:
-        ValueError: The type is neither float32 nor float64.
+    Attributes:
+        faces: The last launch's `Result.faces`, device vec3i (capacity,), sorted.
+        contacts: Their contacts, device arrays (capacity,) of `kernels.contact.Contacts`, float64.
+        pair_contacts: Their summaries, device arrays (pair capacity,) of `kernels.reduce.PairContacts`, float64.
+        start: Where the rows of pair p start in faces and contacts, device int32 (pair capacity + 1,): they end at
+            start[p + 1], and all of them at the last entry. Places behind that hold nothing.
+        hits, pairs, pair_count, near: As for `Query`. Where hits.count sums to more than the capacity, contacts are
+            missing in all of the above, on a GPU not the same in each launch.
     """
-    face_type, pair_type = contact_dtypes(dtype)
-    contacts, means = np.zeros(len(result.faces), face_type), np.zeros(len(result.pairs), pair_type)
-    for column, name in enumerate(("pair", "face_a", "face_b")):
-        contacts[name] = result.faces[:, column]
-    means["count"] = result.count
-    means["point"] = means["normal"] = np.nan
-    if not len(contacts):
-        return contacts, means
-    device = query.device
-    found, summed = contact.Contacts(), contact.PairContacts()
-    for name in VECTORS:
-        setattr(found, name, wp.empty(len(contacts), dtype=wp.vec3d, device=device))
-    found.coplanar = wp.empty(len(contacts), dtype=wp.int32, device=device)
-    summed.point = wp.full(len(means), wp.vec3d(np.nan, np.nan, np.nan), dtype=wp.vec3d, device=device)
-    summed.normal = wp.clone(summed.point)
-    summed.depth = wp.zeros(len(means), dtype=wp.float64, device=device)
-    start = np.concatenate([[0], np.cumsum(result.count)]).astype(np.int32)
-    faces = wp.array(result.faces, dtype=wp.vec3i, device=device)
-    inputs = [*(arrays.pool for arrays in query.arrays), query.pairs, query.pair_poses, faces]
-    wp.launch(contact.find_contact_kernel, dim=len(contacts), inputs=[*inputs, found], device=device)
-    start = wp.array(start, dtype=wp.int32, device=device)
-    wp.launch(contact.reduce_contact_kernel, dim=len(means), inputs=[*inputs, start, found, summed], device=device)
-    with np.errstate(over="ignore"):
-        for name in (*VECTORS, "coplanar"):
-            contacts[name] = getattr(found, name).numpy()
-        for name in ("point", "normal", "depth"):
-            means[name] = getattr(summed, name).numpy()
-    return contacts, means
+
+    key_bits = 63  # of a sort key; an object pair and two faces that take more are sorted in two passes
+    _places = 0
+
+    def __init__(
+        self,
+        scene,
+        pairs=None,
+        capacity=None,
+        pair_capacity=None,
+        precision="exact",
+        within=None,
+        unsure_capacity=None,
+        contact_dtype=np.float64,
+    ):
+        contact_dtypes(contact_dtype)
+        self.contact_dtype = contact_dtype
+        self.contacts, self.pair_contacts = contact.Contacts(), reduce.PairContacts()
+        self._sums = reduce.ChunkSums()
+        super().__init__(scene, "faces", pairs, capacity, pair_capacity, precision, within, unsure_capacity)
+
+    def resize(self, capacity: int):
+        """Make room for a number of contacts.
+
+        Raises:
+            CapacityError: 2^30 contacts or more.
+        """
+        if capacity >= 2**30:
+            raise CapacityError(f"{capacity} face pairs asked, a contact query has room for fewer than 2^30")
+        super().resize(capacity)
+        self._places = capacity
+        self.faces = self._empty(capacity, wp.vec3i)
+        for name in VECTORS:
+            setattr(self.contacts, name, self._empty(capacity, wp.vec3d))
+        self.contacts.coplanar = self._empty(capacity, wp.int32)
+        # The sort takes as much again as scratch.
+        self._key, self._order = self._empty(2 * capacity, wp.int64), self._empty(2 * capacity, wp.int32)
+        self._allocate_chunks()
+
+    def _allocate_pairs(self):
+        super()._allocate_pairs()
+        room = len(self.pairs)
+        self.start = wp.zeros(room + 1, dtype=wp.int32, device=self.device)
+        for array in ("point", "normal"):
+            setattr(self.pair_contacts, array, self._empty(room, wp.vec3d))
+        self.pair_contacts.depth = self._empty(room, wp.float64)
+        self._sums.total, self._sums.middle = self._empty(room, wp.float64), self._empty(room, wp.vec3d)
+        self._allocate_chunks()
+
+    def _allocate_chunks(self):
+        count = self._chunk_count()
+        self._sums.span = self._empty(count, wp.vec3i)
+        for name in ("point", "normal"):
+            setattr(self._sums, name, self._empty(count, wp.vec3d))
+        for name in ("length", "area", "change", "front", "back"):
+            setattr(self._sums, name, self._empty(count, wp.float64))
+
+    def _empty(self, count, dtype):
+        return wp.empty(count, dtype=dtype, device=self.device)
+
+    def _chunk_count(self) -> int:
+        """Return how many chunks there may be: `first_chunk` of the pair after the last, if all places are taken."""
+        return self._places // int(reduce.CHUNK) + len(self.pairs)
+
+    def traverse(self):
+        """Run the narrow phase over the pairs in place and make the contacts. Launches only."""
+        super().traverse()
+        if len(self.pairs):
+            self.find_contacts()
+
+    def find_contacts(self):
+        """Sort the hits in place, whatever their order, make their contacts and sum them. Launches only."""
+        self._sort()
+        self._find()
+        self._reduce()
+
+    def _launch(self, kernel, dim, inputs):
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+
+    def _passes(self):
+        """Return the bits of (pair, face a, face b) that each pass of the sort looks at."""
+        pair = len(self.pairs).bit_length()
+        face = (max(model.face_count for model in self.scene.models) - 1).bit_length()
+        if pair + 2 * face <= self.key_bits:
+            return [(pair, face, face)]
+        return [(0, 0, face), (pair, face, 0)]
+
+    def _sort(self):
+        capacity, room = self._places, len(self.pairs)
+        total, face = self.hits.total, self.hits.face
+        for number, widths in enumerate(self._passes()):
+            inputs = [room, wp.vec3i(*widths), number == 0, total, face, self._order, self._key]
+            self._launch(order.make_key_kernel, capacity, inputs)
+            with wp.ScopedDevice(self.device):
+                wp.utils.radix_sort_pairs(self._key, self._order, capacity, end_bit=sum(widths))
+        self._launch(order.place_row_kernel, capacity, [total, face, self._order, self.faces])
+        self._launch(order.start_pair_kernel, room + 1, [capacity, sum(widths[1:]), self._key, self.start])
+
+    def _find(self):
+        posed = [*(arrays.pool for arrays in self.arrays), self.pairs, self.pair_poses]
+        self._launch(contact.find_contact_kernel, self._places, [*posed, self.start, self.faces, self.contacts])
+
+    def _reduce(self):
+        room, chunks = len(self.pairs), self._chunk_count()
+        pools = [arrays.pool for arrays in self.arrays]
+        start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
+        self._launch(reduce.sum_length_kernel, chunks, [start, contacts, sums])
+        self._launch(reduce.total_length_kernel, room, [start, sums])
+        self._launch(reduce.sum_mean_kernel, chunks, [start, contacts, sums])
+        self._launch(reduce.average_contact_kernel, room, [*pools, self.pairs, start, sums, means])
+        posed = [*pools, self.pairs, self.pair_poses]
+        self._launch(reduce.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
+        self._launch(reduce.measure_depth_kernel, room, [*pools, self.pairs, start, contacts, sums, means])
+
+    def result(self) -> ContactResult:
+        """Return faces, contacts and summaries of the last launch on the host. Waits for the device."""
+        if self.broad_phase is None:
+            return ContactResult(self, self._given, len(self._given))
+        found = self.broad_phase.count_found()
+        pairs = self.pairs.numpy()[: min(found, len(self.pairs))].reshape(-1, 2).copy()
+        return ContactResult(self, pairs, found)

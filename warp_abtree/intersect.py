@@ -5,12 +5,13 @@ import warp as wp
 
 from warp_abtree.broadphase import BroadPhase, CapacityError
 from warp_abtree.checks import to_numpy, whole_number
-from warp_abtree.kernels import distance, pose, predicates, settle, traverse
+from warp_abtree.kernels import distance, faces, pose, predicates, settle, traverse
+from warp_abtree.kernels.warps import STACK_LENGTH, WARP_SIZE, WARPS_PER_BLOCK
 
-OUTPUTS = {"any": traverse.OUTPUT_ANY, "count": traverse.OUTPUT_COUNT, "faces": traverse.OUTPUT_FACES}
+OUTPUTS = {"any": faces.OUTPUT_ANY, "count": faces.OUTPUT_COUNT, "faces": faces.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float64": predicates.FLOAT64, "float32": predicates.FLOAT32}
-# So many pairs leave most of a GPU idle at 128 threads each; 256 were 1.6 times faster, and slower from 1,024 pairs on.
-FEW_PAIRS = 512
+# Few pairs are shared by so many warps in all, about four times what an H200 runs at a time.
+WARP_COUNT = 16384
 
 COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 
@@ -24,15 +25,14 @@ def check_request(output: str, precision: str):
     """Check what is asked of a query.
 
     Raises:
-        ValueError: An unknown output or precision.
-        NotImplementedError: One that has a name but no code yet.
+        ValueError: An unknown output or precision, or contacts, which another operator finds.
     """
     if output not in (*OUTPUTS, "contacts"):
         raise ValueError(f"output {output!r} is none of 'any', 'count', 'faces', 'contacts'")
     if precision not in tuple(PRECISIONS):
         raise ValueError(f"precision {precision!r} is none of 'exact', 'float64', 'float32'")
     if output == "contacts":
-        raise NotImplementedError("contacts are made by Scene.intersect, from a query of output 'faces'")
+        raise ValueError("output 'contacts' is found by ab.ContactQuery, or Scene.intersect")
 
 
 def check_within(within, pair_count=None) -> np.ndarray:
@@ -129,13 +129,13 @@ class Query:
         unsure_capacity: Face pairs that there is room for between float32 and the later stages; not needed on the CPU.
 
     Attributes:
-        hits: Device arrays of the last launch (`kernels.traverse.Hits`), faces in no order.
+        hits: Device arrays of the last launch (`kernels.faces.Hits`), faces in no order.
         pairs, pair_count: The pairs asked, device vec2i and int32 (1,).
         near: As `hits` for `within`: any_hit is 0 where a pair is proved apart; None without within.
     """
 
-    kernels = traverse
-    block_dim = None  # chosen by the number of pairs
+    warp_count = WARP_COUNT
+    stack_room = STACK_LENGTH
 
     def __init__(
         self,
@@ -169,12 +169,12 @@ class Query:
         else:
             self.pair_count = wp.zeros(1, dtype=wp.int32, device=self.device)
             self.pairs = wp.empty(pair_capacity or 0, dtype=wp.vec2i, device=self.device)
-        self.hits = traverse.Hits()
+        self.hits = faces.Hits()
         self.hits.total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.hits.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.near = None if within is None else self._make_near()
         self._within = within
-        self._resize_unsure((unsure_capacity or UNSURE_CAPACITY) if self.uses_blocks() else 0)
+        self._resize_unsure((unsure_capacity or UNSURE_CAPACITY) if self.uses_warps() else 0)
         self._allocate_pairs()
         if pairs is not None:
             self.set_pairs(pairs)
@@ -218,7 +218,7 @@ class Query:
                 self._fill_within()
 
     def _make_near(self):
-        near = traverse.Hits()
+        near = faces.Hits()
         near.total = near.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
         return near
 
@@ -234,8 +234,8 @@ class Query:
     def _resize_unsure(self, capacity: int):
         self.hits.unsure = wp.empty(capacity, dtype=wp.vec3i, device=self.device)
 
-    def uses_blocks(self) -> bool:
-        """Return whether a block of threads shares each pair; on the CPU one thread has a pair to itself."""
+    def uses_warps(self) -> bool:
+        """Return whether warps work on the pairs; on the CPU one thread has a pair to itself."""
         return self.device.is_cuda
 
     def resize(self, capacity: int):
@@ -270,16 +270,20 @@ class Query:
             device=self.device,
         )
         posed = [self.pair_count, self.pairs, self.pair_poses, self.near]
-        self._launch_traversal(int(traverse.WITHIN), [int(traverse.OUTPUT_ANY), *pools, *posed])
+        self._launch_traversal(int(faces.WITHIN), [int(faces.OUTPUT_ANY), *pools, *posed])
 
     def _launch_traversal(self, mode, inputs):
         room = len(self.pairs)
-        if self.uses_blocks():
-            kernel = self.kernels.block_traversal(EXACT if mode == FLOAT64 else mode)
-            block_dim = self.block_dim or (256 if room <= FEW_PAIRS else 128)
-            wp.launch_tiled(kernel, dim=[room], inputs=inputs, block_dim=block_dim, device=self.device)
-        else:
-            wp.launch(self.kernels.thread_traversal(mode), dim=room, inputs=inputs, device=self.device)
+        if not self.uses_warps():
+            wp.launch(traverse.thread_traversal(mode), dim=room, inputs=inputs, device=self.device)
+            return
+        kernel = traverse.warp_traversal(EXACT if mode == FLOAT64 else mode)
+        warps = max(room, self.warp_count)
+        size = WARP_SIZE if self.device.is_cuda else 1
+        block_dim = WARP_SIZE * WARPS_PER_BLOCK
+        wp.launch(
+            kernel, dim=warps * size, inputs=[warps, self.stack_room, *inputs], block_dim=block_dim, device=self.device
+        )
 
     def traverse(self):
         """Run the narrow phase over the pairs in place. Launches only."""

@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_abtree.broadphase import EVERY_WORLD, BroadPhase, exclusion_keys
 from warp_abtree.checks import to_numpy, whole_number
-from warp_abtree.contact import contact_dtypes, find_contacts
+from warp_abtree.contact import ContactQuery, contact_dtypes
 from warp_abtree.intersect import Query, Result, check_request, check_within
 from warp_abtree.kernels import pose as pose_kernels
 from warp_abtree.model import Model
@@ -303,22 +303,23 @@ class Scene:
         """
         contact_dtypes(contact_dtype)
         with_contacts = output == "contacts"
-        output = "faces" if with_contacts else output
-        check_request(output, precision)
+        check_request("faces" if with_contacts else output, precision)
         pairs = self.broad_phase() if pairs is None else self.check_pairs(pairs)
         if within is not None:
             within = check_within(within, len(pairs))
         asked = (output, precision, within is not None)
         # A query that fails, for lack of memory, is not kept: it gives its own back.
         query = self._queries.pop(asked, None)
-        if query is None:
-            query = Query(self, output, pairs=pairs, precision=precision, within=within)
-        else:
+        if query is not None:
             query.set_pairs(pairs, within)
+        elif with_contacts:
+            query = ContactQuery(self, pairs=pairs, precision=precision, within=within)
+        else:
+            query = Query(self, output, pairs=pairs, precision=precision, within=within)
+        if with_contacts:
+            query.contact_dtype = contact_dtype
         result = query.run()
         self._queries[asked] = query
-        if with_contacts:
-            result.contacts, result.pair_contacts = find_contacts(query, result, contact_dtype)
         return result
 
     def tree_state(self, i) -> TreeState:
@@ -332,13 +333,13 @@ class Scene:
         slot = states.slots[objects.state[i]]
         model = self.models[slot.model]
         nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
-        lower = states.pool.node_lower[nodes].numpy() + model.centre
-        upper = states.pool.node_upper[nodes].numpy() + model.centre
+        lower, upper, skip = states.read_nodes(slot, model.tree.node_count)
+        lower, upper = lower + model.centre, upper + model.centre
         return TreeState(
             slot.lod,
             states.pool.node_status[nodes].numpy().copy(),
             np.where(np.isinf(lower), lower, np.nextafter(lower, -np.inf)),
             np.where(np.isinf(upper), upper, np.nextafter(upper, np.inf)),
-            states.pool.node_skip[nodes].numpy().copy(),
+            skip,
             model.tree.leaf_node.copy(),
         )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_abtree.kernels.nodes import clear_node_kernel
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 
 # Columns of `StatePool` that mirror the host's slots.
@@ -105,16 +106,13 @@ class StateArrays:
 
     def _allocate_nodes(self, count):
         old, kept = self.pool, self.node_total
-        new = {
-            "node_status": wp.zeros(count, dtype=wp.int32, device=self.device),
-            "node_lower": wp.full(count, wp.vec3(wp.inf, wp.inf, wp.inf), dtype=wp.vec3, device=self.device),
-            "node_upper": wp.full(count, wp.vec3(-wp.inf, -wp.inf, -wp.inf), dtype=wp.vec3, device=self.device),
-            "node_skip": wp.full(count, -1, dtype=wp.int32, device=self.device),
-        }
-        for name, array in new.items():
-            if kept:
-                wp.copy(array, getattr(old, name), count=kept)
-            setattr(self.pool, name, array)
+        status = wp.zeros(count, dtype=wp.int32, device=self.device)
+        box = wp.empty(2 * count, dtype=wp.vec4, device=self.device)
+        if kept:
+            wp.copy(status, old.node_status, count=kept)
+            wp.copy(box, old.node_box, count=2 * kept)
+        self.pool.node_status, self.pool.node_box = status, box
+        wp.launch(clear_node_kernel, count - kept, [kept, self.pool], device=self.device)
         self.node_room = count
 
     def _allocate_faces(self, count):
@@ -129,7 +127,7 @@ class StateArrays:
         """Take one state for each entry of a list of models and return their ids; contents are whatever stood there.
 
         Raises:
-            ValueError: The pool would pass 2^31 nodes.
+            ValueError: The pool would pass 2^30 nodes.
         """
         fresh = []
         ids = []
@@ -142,10 +140,10 @@ class StateArrays:
                 fresh.append(model)
         nodes = self.node_total + sum(int(self.models.node_count[m]) for m in fresh)
         faces = self.face_total + sum(int(self.models.face_count[m]) for m in fresh)
-        if nodes >= 2**31:
-            raise ValueError(f"the tree states of the scene would hold {nodes} nodes, more than 2^31; use fewer LODs")
+        if nodes >= 2**30:
+            raise ValueError(f"the tree states of the scene would hold {nodes} nodes, more than 2^30; use fewer LODs")
         if nodes > self.node_room:
-            self._allocate_nodes(max(nodes, min(2 * self.node_room, 2**31 - 1)))
+            self._allocate_nodes(max(nodes, min(2 * self.node_room, 2**30 - 1)))
         if faces > self.face_room:
             self._allocate_faces(max(faces, min(2 * self.face_room, 2**31 - 1)))
         self.free = spare
@@ -154,6 +152,11 @@ class StateArrays:
             self.node_total += int(self.models.node_count[model])
             self.face_total += int(self.models.face_count[model])
         return ids
+
+    def read_nodes(self, slot, count):
+        """Return lower and upper bounds, float32 (count, 3), and skip ids of a slot's nodes. Waits for the device."""
+        box = self.pool.node_box[2 * slot.node_start : 2 * (slot.node_start + count)].numpy().reshape(count, 2, 4)
+        return box[:, 0, :3], box[:, 1, :3], np.ascontiguousarray(box[:, 0, 3]).view(np.int32)
 
     def upload_slots(self):
         """Bring model, LOD and starts of all states to the device."""

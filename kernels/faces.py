@@ -1,0 +1,189 @@
+"""Pairs of faces of an object pair: the stages that decide them, and the report of those that meet."""
+
+import warp as wp
+
+from warp_abtree.kernels.distance import triangles_near
+from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.pose import PairPose, pose_point
+from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, UNSURE
+from warp_abtree.kernels.screen import SCREEN_UNIT, screen_triangles
+from warp_abtree.kernels.triangle import intersect_triangles
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+OUTPUT_ANY = wp.constant(0)
+OUTPUT_COUNT = wp.constant(1)
+OUTPUT_FACES = wp.constant(2)
+
+# In place of a precision: faces count as met unless proved farther apart than a distance.
+WITHIN = wp.constant(-1)
+
+
+@wp.struct
+class PairTrees:
+    """Where the two trees of a pair lie in the pools."""
+
+    node_a: wp.int32
+    node_b: wp.int32
+    face_node_a: wp.int32
+    face_node_b: wp.int32
+    corner_a: wp.int32
+    corner_b: wp.int32
+
+
+@wp.struct
+class Hits:
+    """Results of a batch of pairs.
+
+    any_hit, count: shape [pair]. face: (pair, face a, face b), a of the pair's first object, shape [capacity]; total
+    numbers them and may wrap, the demand is the sum of count. node_tests to exact_tests: work done,
+    shape [pair]; float64_tests are the triangle tests that float32 left open, exact_tests those that took expansions.
+    unsure: (pair, face of the lower object, face of the higher) that wait for the next stage, shape [capacity].
+    """
+
+    any_hit: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int64)
+    face: wp.array(dtype=wp.vec3i)
+    total: wp.array(dtype=wp.int32)
+    node_tests: wp.array(dtype=wp.int64)
+    triangle_tests: wp.array(dtype=wp.int64)
+    float64_tests: wp.array(dtype=wp.int64)
+    exact_tests: wp.array(dtype=wp.int64)
+    unsure: wp.array(dtype=wp.vec3i)
+    unsure_total: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def locate_pair(models: ModelPool, states: StatePool, objects: ObjectPool, pair: wp.vec2i):
+    """Return whether a pair names its higher object first, and its trees, the lower object's as A."""
+    state_a = objects.state[wp.min(pair[0], pair[1])]
+    state_b = objects.state[wp.max(pair[0], pair[1])]
+    trees = PairTrees()
+    trees.node_a = states.node_start[state_a]
+    trees.node_b = states.node_start[state_b]
+    trees.face_node_a = models.node_start[states.model[state_a]]
+    trees.face_node_b = models.node_start[states.model[state_b]]
+    trees.corner_a = states.face_start[state_a]
+    trees.corner_b = states.face_start[state_b]
+    return wp.where(pair[0] > pair[1], 1, 0), trees
+
+
+@wp.func
+def screen_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    trees: PairTrees,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+):
+    """Test one active face of A against one of B in float32; return 1, 0 or UNSURE."""
+    a = states.face_corner[trees.corner_a + face_a]
+    b = states.face_corner[trees.corner_b + face_b]
+    error = pose.error
+    unit = SCREEN_UNIT
+    if mode == FLOAT32:
+        error = 0.0
+        unit = 0.0
+    s = wp.float32(pose.scale)
+    return screen_triangles(
+        error,
+        unit,
+        models.vertex_near[a[0]] * s,
+        models.vertex_near[a[1]] * s,
+        models.vertex_near[a[2]] * s,
+        (pose.rotation32 * models.vertex_near[b[0]] + pose.translation32) * s,
+        (pose.rotation32 * models.vertex_near[b[1]] + pose.translation32) * s,
+        (pose.rotation32 * models.vertex_near[b[2]] + pose.translation32) * s,
+    )
+
+
+@wp.func
+def test_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    trees: PairTrees,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+):
+    """Test one active face of A against one of B in float64, in A's frame; return 1, 0 or UNSURE."""
+    a = states.face_corner[trees.corner_a + face_a]
+    b = states.face_corner[trees.corner_b + face_b]
+    a0 = models.vertex_pos[a[0]]
+    a1 = models.vertex_pos[a[1]]
+    a2 = models.vertex_pos[a[2]]
+    b0 = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[0]])
+    b1 = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[1]])
+    b2 = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[2]])
+    if mode == WITHIN:
+        return triangles_near(pose.within, a0, a1, a2, b0, b1, b2)
+    if mode == FLOAT32:
+        # A power of two brings the model to unit size, so that no product leaves float32's range.
+        s = pose.scale
+        return intersect_triangles(mode, a0 * s, a1 * s, a2 * s, b0 * s, b1 * s, b2 * s)
+    return intersect_triangles(mode, a0, a1, a2, b0, b1, b2)
+
+
+@wp.func
+def settle_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    trees: PairTrees,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+):
+    """Decide a pair of faces that float32 left open; return whether they meet, and whether it took expansions."""
+    if mode != EXACT:
+        return test_faces(mode, models, states, trees, pose, face_a, face_b), 0
+    meet = test_faces(FILTER, models, states, trees, pose, face_a, face_b)
+    if meet != UNSURE:
+        return meet, 0
+    return test_faces(mode, models, states, trees, pose, face_a, face_b), 1
+
+
+@wp.func
+def decide_faces(
+    mode: wp.int32,
+    deferring: bool,
+    models: ModelPool,
+    states: StatePool,
+    trees: PairTrees,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+):
+    """Return whether a pair of faces meets, and the stage that said so: 0 float32, 1 float64, 2 expansions.
+
+    Where the later stages are left to another kernel, pairs that need them are UNSURE at stage 1.
+    """
+    if mode == WITHIN:
+        return test_faces(mode, models, states, trees, pose, face_a, face_b), 0
+    meet = screen_faces(mode, models, states, trees, pose, face_a, face_b)
+    if meet != UNSURE:
+        return meet, 0
+    if deferring:
+        return meet, 1
+    meet, hard = settle_faces(mode, models, states, trees, pose, face_a, face_b)
+    return meet, 1 + hard
+
+
+@wp.func
+def defer_faces(slot: wp.int32, pair: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+    """Put a pair of faces on the list that `settle_faces_kernel` works off, if there is room."""
+    if slot >= 0 and slot < hits.unsure.shape[0]:
+        hits.unsure[slot] = wp.vec3i(pair, face_a, face_b)
+
+
+@wp.func
+def report_hit(slot: wp.int32, pair: wp.int32, swapped: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+    """Write a hit in the order in which the pair names its objects, if there is room."""
+    if slot >= 0 and slot < hits.face.shape[0]:
+        if swapped != 0:
+            hits.face[slot] = wp.vec3i(pair, face_b, face_a)
+        else:
+            hits.face[slot] = wp.vec3i(pair, face_a, face_b)

@@ -1,0 +1,73 @@
+"""Hits in the order of `Result.faces`, (pair, face a, face b), on the device: what goes before and after a radix sort.
+
+All of it has the size of the buffer of hits, so that a CUDA graph can hold it; places without a hit sort behind them.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.func
+def count_rows(total: wp.int32, capacity: wp.int32):
+    """Return how many hits are in the buffer; a total that wrapped below 0 means more than it holds."""
+    return wp.where(total < 0, capacity, wp.min(total, capacity))
+
+
+@wp.kernel
+def make_key_kernel(
+    room: wp.int32,
+    widths: wp.vec3i,
+    fresh: wp.bool,
+    total: wp.array(dtype=wp.int32),
+    face: wp.array(dtype=wp.vec3i),
+    order_inout: wp.array(dtype=wp.int32),
+    key_out: wp.array(dtype=wp.int64),
+):
+    """Make the key of one place a thread, from the fields that a pass of the sort looks at, the last one lowest.
+
+    Args:
+        room: Object pairs that there is room for; in place of the pair, it marks places without a hit.
+        widths: Bits of each field, at most 63 in all; 0 leaves it out.
+        fresh: Whether this is the first pass, which takes the hits as they lie.
+    """
+    i = wp.tid()
+    at = order_inout[i]
+    if fresh:
+        at = i
+        order_inout[i] = i
+    row = wp.vec3i(room, 0, 0)
+    if at < count_rows(total[0], face.shape[0]):
+        row = face[at]
+    key = wp.int64(0)
+    for k in range(3):
+        if widths[k] > 0:
+            key = (key << wp.int64(widths[k])) | wp.int64(row[k])
+    key_out[i] = key
+
+
+@wp.kernel
+def place_row_kernel(
+    total: wp.array(dtype=wp.int32),
+    face: wp.array(dtype=wp.vec3i),
+    order: wp.array(dtype=wp.int32),
+    sorted_out: wp.array(dtype=wp.vec3i),
+):
+    """Put one hit a thread in its place."""
+    i = wp.tid()
+    if i < count_rows(total[0], face.shape[0]):
+        sorted_out[i] = face[order[i]]
+
+
+@wp.kernel
+def start_pair_kernel(
+    capacity: wp.int32, shift: wp.int32, key: wp.array(dtype=wp.int64), start_out: wp.array(dtype=wp.int32)
+):
+    """Find where the hits of one object pair a thread start, and after the last pair where they end.
+
+    Args:
+        key: Sorted keys of the last pass, with the pair above `shift` bits, then scratch, shape [2 capacity].
+    """
+    p = wp.tid()
+    # One more than there are keys: the search never looks at its end, and returns the place before it if all are less.
+    start_out[p] = wp.lower_bound(key, 0, capacity + 1, wp.int64(p) << wp.int64(shift))

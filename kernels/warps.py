@@ -1,0 +1,153 @@
+"""The threads of a warp at work on one stack in shared memory. On the CPU a thread is a warp of its own.
+
+Every function but the stack's address and its reads must be reached by all threads of the warp together.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+WARP_SIZE = 32
+WARPS_PER_BLOCK = 4
+STACK_LENGTH = 1024  # node pairs, a power of two
+# Fewer face pairs than there are threads wait while a visit adds four a thread at most.
+CANDIDATE_LENGTH = 160
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return 32;
+#else
+    return 1;
+#endif
+""")
+def warp_size() -> wp.int32: ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return threadIdx.x & 31;
+#else
+    return 0;
+#endif
+""")
+def warp_lane() -> wp.int32: ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ long long items[{WARPS_PER_BLOCK} * ({STACK_LENGTH} + {CANDIDATE_LENGTH})];
+    return (wp::uint64)(items + (threadIdx.x >> 5) * ({STACK_LENGTH} + {CANDIDATE_LENGTH}));
+#else
+    static long long items[{STACK_LENGTH} + {CANDIDATE_LENGTH}];
+    return (wp::uint64)items;
+#endif
+""")
+def warp_stack() -> wp.uint64:
+    """Return the address of this warp's items: its stack, then its candidates."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+""")
+def warp_sync(): ...
+
+
+@wp.func_native("""
+    return ((const long long*)items)[i];
+""")
+def read_item(items: wp.uint64, i: wp.int32) -> wp.int64: ...
+
+
+@wp.func_native("""
+    ((long long*)items)[i] = item;
+""")
+def write_item(items: wp.uint64, i: wp.int32, item: wp.int64): ...
+
+
+@wp.func_native("""
+    return ((long long)x << 32) | (unsigned int)y;
+""")
+def pack_item(x: wp.int32, y: wp.int32) -> wp.int64: ...
+
+
+@wp.func_native("""
+    return (int)(item >> 32);
+""")
+def item_first(item: wp.int64) -> wp.int32: ...
+
+
+@wp.func_native("""
+    return (int)item;
+""")
+def item_second(item: wp.int64) -> wp.int32: ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    if (flag)
+        ((long long*)items)[(end + __popc(votes & ((1u << (threadIdx.x & 31)) - 1u))) & mask] = item;
+    return end + __popc(votes);
+#else
+    if (flag)
+        ((long long*)items)[end & mask] = item;
+    return end + (flag ? 1 : 0);
+#endif
+""")
+def push_item(items: wp.uint64, mask: wp.int32, end: wp.int32, flag: bool, item: wp.int64) -> wp.int32:
+    """Append the items of the threads whose flag is set, in order of threads; return the new end."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __any_sync(0xffffffffu, flag);
+#else
+    return flag;
+#endif
+""")
+def warp_any(flag: bool) -> bool: ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    if (votes == 0)
+        return 0;
+    int lane = threadIdx.x & 31;
+    int leader = __ffs(votes) - 1;
+    int start = 0;
+    if (lane == leader)
+        start = atomicAdd(total.data, __popc(votes));
+    start = __shfl_sync(0xffffffffu, start, leader);
+    return start + __popc(votes & ((1u << lane) - 1u));
+#else
+    int start = total.data[0];
+    if (flag)
+        total.data[0] = start + 1;
+    return start;
+#endif
+""")
+def reserve_slot(total: wp.array(dtype=wp.int32), flag: bool) -> wp.int32:
+    """Count the set flags into total[0] with one atomic a warp; return the slot of each thread whose flag is set."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    long long sum = x;
+    for (int step = 16; step > 0; step >>= 1)
+        sum += __shfl_down_sync(0xffffffffu, sum, step);
+    if ((threadIdx.x & 31) == 0 && sum != 0)
+        atomicAdd((unsigned long long*)totals.data + i, (unsigned long long)sum);
+#else
+    totals.data[i] += x;
+#endif
+""")
+def add_warp_sum(totals: wp.array(dtype=wp.int64), i: wp.int32, x: wp.int32):
+    """Add a value of every thread to totals[i] with one atomic a warp."""
+    ...
