@@ -335,8 +335,9 @@ class Query:
             self.pairs = self.broad_phase.pairs
             self._allocate_pairs()
             self.launch()
-        if len(self.hits.unsure) and self._sum(self.hits.float64_tests) > len(self.hits.unsure):
-            self._resize_unsure(self._sum(self.hits.float64_tests))
+        while len(self.hits.unsure) and self._sum(self.hits.float64_tests) > len(self.hits.unsure):
+            # How many wait varies for `any`, where the first hit of a pair ends its traversal.
+            self._resize_unsure(2 * self._sum(self.hits.float64_tests))
             self.traverse()
         if self.output == "faces" and self._sum(self.hits.count) > len(self.hits.face):
             self.resize(self._sum(self.hits.count))
