@@ -15,7 +15,7 @@ import warp as wp
 
 from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.pose import PairPose, pair_pose, reach_box, sum_products
+from warp_abtree.kernels.pose import reach_box, sum_products
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -174,28 +174,3 @@ def pad_distance(models: ModelPool, states: StatePool, objects: ObjectPool, a: w
     two = wp.float64(2.0)
     padded = d * (wp.float64(1.0) + two * (skew_a + skew_b) + POSE_ROUNDING)
     return padded + wp.float64(6.0) * skew_a * reach_a + POSE_ROUNDING * (reach_a + reach_b + shift)
-
-
-@wp.kernel
-def relate_within_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    within: wp.array(dtype=wp.float64),
-    pair_pose_out: wp.array(dtype=PairPose),
-):
-    """Compute the pose of B in A's frame once a pair, its boxes wide enough for a distance [world units] each."""
-    p = wp.tid()
-    if p >= wp.min(pair_count[0], pairs.shape[0]):
-        return
-    a = wp.min(pairs[p][0], pairs[p][1])
-    b = wp.max(pairs[p][0], pairs[p][1])
-    padded = pad_distance(models, states, objects, a, b, within[p])
-    pose = pair_pose(models, states, objects, a, b, padded)
-    if within[p] >= DISTANCE_MAX:
-        # Nothing is proved where distances may overflow: every box passes, and the first faces count as near.
-        pose.within = wp.float64(wp.inf)
-        pose.margin = wp.inf
-    pair_pose_out[p] = pose

@@ -2,7 +2,9 @@
 
 import warp as wp
 
+from warp_abtree.kernels.boxes import map_point
 from warp_abtree.kernels.distance import triangles_near
+from warp_abtree.kernels.nodes import load_constant
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
 from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, UNSURE
@@ -69,6 +71,12 @@ def locate_pair(models: ModelPool, states: StatePool, objects: ObjectPool, pair:
 
 
 @wp.func
+def load_near(models: ModelPool, vertex: wp.int32):
+    x = load_constant(models.vertex_near, wp.int64(vertex))
+    return wp.vec3(x[0], x[1], x[2])
+
+
+@wp.func
 def screen_faces(
     mode: wp.int32,
     models: ModelPool,
@@ -90,12 +98,12 @@ def screen_faces(
     return screen_triangles(
         error,
         unit,
-        models.vertex_near[a[0]] * s,
-        models.vertex_near[a[1]] * s,
-        models.vertex_near[a[2]] * s,
-        (pose.rotation32 * models.vertex_near[b[0]] + pose.translation32) * s,
-        (pose.rotation32 * models.vertex_near[b[1]] + pose.translation32) * s,
-        (pose.rotation32 * models.vertex_near[b[2]] + pose.translation32) * s,
+        load_near(models, a[0]) * s,
+        load_near(models, a[1]) * s,
+        load_near(models, a[2]) * s,
+        map_point(pose.rotation32, pose.translation32, load_near(models, b[0])) * s,
+        map_point(pose.rotation32, pose.translation32, load_near(models, b[1])) * s,
+        map_point(pose.rotation32, pose.translation32, load_near(models, b[2])) * s,
     )
 
 

@@ -21,14 +21,14 @@ class ModelPool:
     """Static data of every model, concatenated.
 
     Per vertex of the forest: vertex_parent (global id, -1 at a root), vertex_pos [model units],
-    vertex_near, the same about the model's centre in float32.
+    vertex_near, the same about the model's centre in float32 (x, y, z, 0).
     Per face: face_vertex (global ids), face_split, leaf_node (the indexed list). Per node: node_face (-1 inside).
     Per model: starts into these, counts, centre [model units].
     """
 
     vertex_parent: wp.array(dtype=wp.int32)
     vertex_pos: wp.array(dtype=wp.vec3d)
-    vertex_near: wp.array(dtype=wp.vec3)
+    vertex_near: wp.array(dtype=wp.vec4)
     face_vertex: wp.array(dtype=wp.vec3i)
     face_split: wp.array(dtype=wp.int32)
     split_face: wp.array(dtype=wp.int32)

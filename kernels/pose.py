@@ -139,24 +139,6 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     return pose
 
 
-@wp.kernel
-def relate_pair_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_pose_out: wp.array(dtype=PairPose),
-):
-    """Compute the pose of B in A's frame once a pair, A the smaller index."""
-    p = wp.tid()
-    if p >= wp.min(pair_count[0], pairs.shape[0]):
-        return
-    a = wp.min(pairs[p][0], pairs[p][1])
-    b = wp.max(pairs[p][0], pairs[p][1])
-    pair_pose_out[p] = pair_pose(models, states, objects, a, b, wp.float64(0.0))
-
-
 @wp.func
 def rotate_quaternion(q: wp.vec4d):
     """Return the rotation matrix of a quaternion x y z w after normalising it."""

@@ -20,7 +20,8 @@ FILTER = wp.constant(0)
 FLOAT64 = wp.constant(1)
 FLOAT32 = wp.constant(2)
 EXACT = wp.constant(3)
-UNSURE = wp.constant(2)
+# So large that no sum of three signs with one of these among them is 3 or -3.
+UNSURE = wp.constant(8)
 
 BOUND_3D = wp.constant(wp.float64((7.0 + 56.0 * 2.0**-53) * 2.0**-53))
 BOUND_2D = wp.constant(wp.float64((3.0 + 16.0 * 2.0**-53) * 2.0**-53))

@@ -9,12 +9,25 @@ which `unit` is 9 2^-24. docs/exactness.md has the terms. With error and unit 0 
 
 import warp as wp
 
+from warp_abtree.kernels.boxes import fuse32
 from warp_abtree.kernels.predicates import UNSURE, filtered_sign
 from warp_abtree.kernels.triangle import is_one_sided, turn_triangles
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 SCREEN_UNIT = wp.constant(9.0 * 2.0**-24)
+
+
+@wp.func
+def dot32(u: wp.vec3, v: wp.vec3):
+    return fuse32(u[0], v[0], fuse32(u[1], v[1], u[2] * v[2]))
+
+
+@wp.func
+def cross32(u: wp.vec3, v: wp.vec3):
+    return wp.vec3(
+        fuse32(u[1], v[2], -(u[2] * v[1])), fuse32(u[2], v[0], -(u[0] * v[2])), fuse32(u[0], v[1], -(u[1] * v[0]))
+    )
 
 
 @wp.func
@@ -48,12 +61,12 @@ def sides_of_plane(
     w0 = a - d0
     w1 = a - d1
     w2 = a - d2
-    normal = wp.cross(u, v)
+    normal = cross32(u, v)
     far = wp.max(sum_sizes(w0), wp.max(sum_sizes(w1), sum_sizes(w2)))
     bound = bound_error(error, unit, sum_sizes(u), sum_sizes(v), far)
-    s0 = filtered_sign(wp.dot(w0, normal), bound)
-    s1 = filtered_sign(wp.dot(w1, normal), bound)
-    s2 = filtered_sign(wp.dot(w2, normal), bound)
+    s0 = filtered_sign(dot32(w0, normal), bound)
+    s1 = filtered_sign(dot32(w1, normal), bound)
+    s2 = filtered_sign(dot32(w2, normal), bound)
     return s0, s1, s2
 
 
@@ -62,7 +75,7 @@ def side_of_plane(error: wp.float32, unit: wp.float32, a: wp.vec3, b: wp.vec3, c
     u = a - d
     v = b - d
     w = c - d
-    return filtered_sign(wp.dot(u, wp.cross(v, w)), bound_error(error, unit, sum_sizes(u), sum_sizes(v), sum_sizes(w)))
+    return filtered_sign(dot32(u, cross32(v, w)), bound_error(error, unit, sum_sizes(u), sum_sizes(v), sum_sizes(w)))
 
 
 @wp.func

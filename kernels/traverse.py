@@ -23,14 +23,15 @@ from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose
 from warp_abtree.kernels.predicates import UNSURE
-from warp_abtree.kernels.visit import four_items, visit_item
+from warp_abtree.kernels.visit import visit_item
 from warp_abtree.kernels.warps import (
     STACK_LENGTH,
     add_warp_sum,
+    four_items,
     item_first,
     item_second,
     pack_item,
-    push_item,
+    push_items,
     read_item,
     reserve_slot,
     warp_any,
@@ -57,7 +58,6 @@ ITEMS_TO_PART = wp.constant(STACK_LENGTH // 2)
 PARTS_MAX = wp.constant(256)
 # An early hit ends a pair for `any`, so few face pairs wait.
 FEW_CANDIDATES = wp.constant(8)
-NO_MASK = wp.constant(2**31 - 1)
 
 
 @wp.func
@@ -158,12 +158,9 @@ def expand_items(
     children = four_items()
     if lane < popped:
         children, mask, tests = visit_item(states, trees, pose, item)
-    candidates = items + wp.uint64(8 * STACK_LENGTH)
-    for k in range(4):
-        end = push_item(items, STACK_MASK, end, (mask & (1 << k)) != 0, children[k])
-        waiting = push_item(candidates, NO_MASK, waiting, (mask & (16 << k)) != 0, children[k])
+    ends = push_items(items, end, waiting, mask, children)
     warp_sync()
-    return end, waiting, tests
+    return item_second(ends), item_first(ends), tests
 
 
 @wp.func
@@ -186,7 +183,7 @@ def test_candidates(
     meet = wp.int32(0)
     item = wp.int64(0)
     if lane < popped:
-        item = read_item(items + wp.uint64(8 * STACK_LENGTH), first + lane)
+        item = read_item(items, STACK_LENGTH + first + lane)
         meet, _stage = decide_faces(mode, True, models, states, trees, pose, item_first(item), item_second(item))
     warp_sync()
     found = meet == 1
@@ -255,7 +252,7 @@ def warp_traversal(mode: int):
     What float32 leaves open waits for `settle_traversal`.
     """
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=128)
     def traverse_warp_kernel(
         warp_count: wp.int32,
         stack_room: wp.int32,
@@ -297,9 +294,10 @@ def warp_traversal(mode: int):
                 end -= popped
                 end, waiting, compared = expand_items(items, end, popped, end, waiting, states, trees, pose)
                 node_tests += compared
-            if output == OUTPUT_ANY and warp_any(found or hits_inout.any_hit[p] != 0):
-                end = head
-                waiting = 0
+            if output == OUTPUT_ANY:
+                if warp_any(found or hits_inout.any_hit[p] != 0):
+                    end = head
+                    waiting = 0
         add_warp_sum(hits_inout.node_tests, p, node_tests)
         add_warp_sum(hits_inout.count, p, tests[0])
         add_warp_sum(hits_inout.triangle_tests, p, tests[1])

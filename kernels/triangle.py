@@ -18,22 +18,19 @@ def find_alone(s0: wp.int32, s1: wp.int32, s2: wp.int32):
     """
     positive = wp.where(s0 > 0, 1, 0) + wp.where(s1 > 0, 1, 0) + wp.where(s2 > 0, 1, 0)
     negative = wp.where(s0 < 0, 1, 0) + wp.where(s1 < 0, 1, 0) + wp.where(s2 < 0, 1, 0)
-    if positive == 1:
-        return wp.where(s0 > 0, 0, wp.where(s1 > 0, 1, 2)), 1
-    if negative == 1:
-        return wp.where(s0 < 0, 0, wp.where(s1 < 0, 1, 2)), -1
-    alone = wp.where(s0 == 0, 0, wp.where(s1 == 0, 1, 2))
-    return alone, wp.where(positive == 2, -1, 1)
+    # 1, -1 or 0: the sign of which there is one, or none of which is alone but that of a corner that touches.
+    kind = wp.where(positive == 1, 1, wp.where(negative == 1, -1, 0))
+    alone = wp.where(s0 == kind, 0, wp.where(s1 == kind, 1, 2))
+    return alone, wp.where(kind != 0, kind, wp.where(positive == 2, -1, 1))
 
 
 @wp.func
 def rotate_first(i: wp.int32, a: Any, b: Any, c: Any):
     """Return the corners turned so that corner i comes first."""
-    if i == 1:
-        return b, c, a
-    if i == 2:
-        return c, a, b
-    return a, b, c
+    first = wp.where(i == 0, a, wp.where(i == 1, b, c))
+    second = wp.where(i == 0, b, wp.where(i == 1, c, a))
+    third = wp.where(i == 0, c, wp.where(i == 1, a, b))
+    return first, second, third
 
 
 @wp.func
@@ -61,20 +58,21 @@ def turn_triangles(
     alone_b, side_b = find_alone(sb0, sb1, sb2)
     p1, q1, r1 = rotate_first(alone_a, a0, a1, a2)
     p2, q2, r2 = rotate_first(alone_b, b0, b1, b2)
-    if side_a < 0:
-        t = q2
-        q2 = r2
-        r2 = t
-    if side_b < 0:
-        t = q1
-        q1 = r1
-        r1 = t
-    return p1, q1, r1, p2, q2, r2
+    back_a = side_a < 0
+    back_b = side_b < 0
+    return (
+        p1,
+        wp.where(back_b, r1, q1),
+        wp.where(back_b, q1, r1),
+        p2,
+        wp.where(back_a, r2, q2),
+        wp.where(back_a, q2, r2),
+    )
 
 
 @wp.func
 def is_one_sided(s0: wp.int32, s1: wp.int32, s2: wp.int32):
-    return s0 != 0 and s0 != UNSURE and s0 == s1 and s1 == s2
+    return wp.abs(s0 + s1 + s2) == 3
 
 
 @wp.func

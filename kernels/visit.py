@@ -8,114 +8,100 @@ Source: Liu et al. 2006, section 3.2.2, ACTIVE-INTERSECT.
 
 import warp as wp
 
-from warp_abtree.kernels.boxes import PosedBox, boxes_overlap, pose_box
+from warp_abtree.kernels.boxes import PosedBox, boxes_overlap, pose_box, widen_box
 from warp_abtree.kernels.faces import PairTrees
-from warp_abtree.kernels.nodes import load_constant_node
+from warp_abtree.kernels.nodes import Node, load_constant_node
 from warp_abtree.kernels.pools import StatePool
 from warp_abtree.kernels.pose import PairPose
-from warp_abtree.kernels.warps import item_first, item_second, pack_item
+from warp_abtree.kernels.warps import four_items, item_first, item_second, pack_item
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.struct
 class Branch:
-    """A child in a visit: its box in both frames, and what it stands for."""
+    """A child in a visit: its box in both frames, and what it stands for.
+
+    down: what an item holds that goes on with its children, if it has any. reach: twice the sum of the box's extents,
+    goes down unless it is less than the other's need, which is that sum, 0 at a leaf.
+    """
 
     box: PosedBox
+    reach: wp.float32
+    need: wp.float32
     skip: wp.int32
+    down: wp.int32
     face: wp.int32
 
 
-four_items = wp.types.vector(length=4, dtype=wp.int64)
-
-
 @wp.func
-def load_branch_a(states: StatePool, pose: PairPose, at: wp.int32):
-    node = load_constant_node(states, at)
+def make_branch(box: PosedBox, node: Node):
     branch = Branch()
-    branch.box = pose_box(node.lower, node.upper, wp.transpose(pose.rotation32), pose.back32)
+    branch.box = box
+    branch.reach = box.size[0] + box.size[1] + box.size[2]
+    branch.need = wp.where(node.face >= 0, 0.0, branch.reach)
+    branch.reach += branch.reach
     branch.skip = node.skip
+    branch.down = wp.where(node.face >= 0, node.skip, -node.skip)
     branch.face = node.face
     return branch
 
 
 @wp.func
-def load_branch_b(states: StatePool, pose: PairPose, at: wp.int32):
-    node = load_constant_node(states, at)
-    branch = Branch()
-    branch.box = pose_box(node.lower, node.upper, pose.rotation32, pose.translation32)
-    branch.skip = node.skip
-    branch.face = node.face
+def branch_of_a(pose: PairPose, node: Node):
+    branch = make_branch(pose_box(node.lower, node.upper, wp.transpose(pose.rotation32), pose.back32), node)
+    branch.box = widen_box(branch.box, pose.margin)
     return branch
+
+
+@wp.func
+def branch_of_b(pose: PairPose, node: Node):
+    return make_branch(pose_box(node.lower, node.upper, pose.rotation32, pose.translation32), node)
 
 
 @wp.func
 def next_item(a: Branch, b: Branch):
     """Return the item that two overlapping branches leave: their faces, where both are leaves.
 
-    Else the visit goes down both, or only the one that is twice as large as the other, or no leaf.
+    Else the visit goes down both, or only the one that is more than twice as large as the other, or no leaf.
     """
-    if a.face >= 0 and b.face >= 0:
-        return pack_item(a.face, b.face)
-    size_a = a.box.size[0] + a.box.size[1] + a.box.size[2]
-    size_b = b.box.size[0] + b.box.size[1] + b.box.size[2]
-    x = a.skip
-    y = b.skip
-    if a.face < 0 and (b.face >= 0 or size_a + size_a >= size_b):
-        x = -x
-    if b.face < 0 and (a.face >= 0 or size_b + size_b >= size_a):
-        y = -y
+    # The sign of a union of bits: both are leaves unless one has none.
+    leaves = (a.face | b.face) >= 0
+    x = wp.where(leaves, a.face, wp.where(a.reach >= b.need, a.down, a.skip))
+    y = wp.where(leaves, b.face, wp.where(b.reach >= a.need, b.down, b.skip))
     return pack_item(x, y)
 
 
 @wp.func
-def compare_branches(pose: PairPose, a: Branch, b: Branch, k: wp.int32):
-    """Return what follows of two branches: an item, and bit k of a mask if they overlap, bit k + 4 if as two leaves."""
-    item = wp.int64(0)
-    mask = wp.int32(0)
-    if boxes_overlap(a.box, b.box, pose.margin):
-        item = next_item(a, b)
-        mask = wp.where(a.face >= 0 and b.face >= 0, 16 << k, 1 << k)
-    return item, mask
+def overlap_bit(a: Branch, b: Branch, k: wp.int32):
+    """Return bit k of a mask if two branches overlap, bit k + 4 if they do as two leaves."""
+    bit = wp.where((a.face | b.face) >= 0, 16 << k, 1 << k)
+    return wp.where(boxes_overlap(a.box, b.box), bit, 0)
 
 
 @wp.func
 def visit_item(states: StatePool, trees: PairTrees, pose: PairPose, item: wp.int64):
     """Compare what an item names; return the items that follow, a mask of those in use, and the pairs compared.
 
-    Bits 0 to 3 of the mask stand for items to visit, bits 4 to 7 for pairs of faces to test.
+    Bits 0 to 3 of the mask stand for items to visit, bits 4 to 7 for pairs of faces to test. No branches: the threads
+    of a warp stay together, and all loads are under way at once. A node without a second child is its own.
     """
     x = item_first(item)
     y = item_second(item)
+    two_a = wp.where(x < 0, 1, 0)
+    two_b = wp.where(y < 0, 1, 0)
     at_a = trees.node_a + wp.where(x < 0, -2 * x, x)
     at_b = trees.node_b + wp.where(y < 0, -2 * y, y)
-    items = four_items()
-    a = load_branch_a(states, pose, at_a)
-    b = load_branch_b(states, pose, at_b)
-    first, mask = compare_branches(pose, a, b, 0)
-    items[0] = first
-    tests = wp.int32(1)
-    second = wp.int32(0)
-    if y < 0:
-        c = load_branch_b(states, pose, at_b + 1)
-        next, second = compare_branches(pose, a, c, 1)
-        items[1] = next
-        mask += second
-        tests += 1
-        if x < 0:
-            a = load_branch_a(states, pose, at_a + 1)
-            next, second = compare_branches(pose, a, c, 2)
-            items[2] = next
-            mask += second
-            next, second = compare_branches(pose, a, b, 3)
-            items[3] = next
-            mask += second
-            tests += 2
-    elif x < 0:
-        a = load_branch_a(states, pose, at_a + 1)
-        next, second = compare_branches(pose, a, b, 3)
-        items[3] = next
-        mask += second
-        tests += 1
-    return items, mask, tests
+    node_a0 = load_constant_node(states, at_a)
+    node_a1 = load_constant_node(states, at_a + two_a)
+    node_b0 = load_constant_node(states, at_b)
+    node_b1 = load_constant_node(states, at_b + two_b)
+    a0 = branch_of_a(pose, node_a0)
+    a1 = branch_of_a(pose, node_a1)
+    b0 = branch_of_b(pose, node_b0)
+    b1 = branch_of_b(pose, node_b1)
+    used = 17 * (1 + 2 * two_b + 4 * two_a + 8 * two_a * two_b)
+    mask = overlap_bit(a0, b0, 0) | overlap_bit(a0, b1, 1)
+    mask = mask | overlap_bit(a1, b0, 2) | overlap_bit(a1, b1, 3)
+    items = four_items(next_item(a0, b0), next_item(a0, b1), next_item(a1, b0), next_item(a1, b1))
+    return items, mask & used, (1 + two_a) * (1 + two_b)

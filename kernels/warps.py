@@ -7,6 +7,8 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
+four_items = wp.types.vector(length=4, dtype=wp.int64)
+
 WARP_SIZE = 32
 WARPS_PER_BLOCK = 4
 STACK_LENGTH = 1024  # node pairs, a power of two
@@ -86,20 +88,40 @@ def item_first(item: wp.int64) -> wp.int32: ...
 def item_second(item: wp.int64) -> wp.int32: ...
 
 
-@wp.func_native("""
+@wp.func_native(f"""
+    long long* stack = (long long*)items;
+    int stacked = end, waiting = end_waiting, all = mask;
 #if defined(__CUDA_ARCH__)
-    unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    if (flag)
-        ((long long*)items)[(end + __popc(votes & ((1u << (threadIdx.x & 31)) - 1u))) & mask] = item;
-    return end + __popc(votes);
+    // Bits 0 to 3 count in the low half, bits 4 to 7 in the high half.
+    unsigned int mine = __popc(mask & 15) | (__popc(mask & 240) << 16), sum = mine;
+    for (int step = 1; step < 32; step <<= 1) {{
+        unsigned int other = __shfl_up_sync(0xffffffffu, sum, step);
+        if ((threadIdx.x & 31) >= step)
+            sum += other;
+    }}
+    unsigned int total = __shfl_sync(0xffffffffu, sum, 31);
+    stacked += (sum - mine) & 0xffff;
+    waiting += (sum - mine) >> 16;
 #else
-    if (flag)
-        ((long long*)items)[end & mask] = item;
-    return end + (flag ? 1 : 0);
+    unsigned int total = __builtin_popcount(mask & 15) | (__builtin_popcount(mask & 240) << 16);
 #endif
+    #pragma unroll
+    for (int k = 0; k < 4; ++k) {{
+        int at = (all & (1 << k)) ? (stacked++ & {STACK_LENGTH - 1}) : {STACK_LENGTH} + waiting;
+        if (all & (16 << k))
+            ++waiting;
+        if (all & (17 << k))
+            stack[at] = children[k];
+    }}
+    return ((long long)(end_waiting + (total >> 16)) << 32) | (unsigned int)(end + (total & 0xffff));
 """)
-def push_item(items: wp.uint64, mask: wp.int32, end: wp.int32, flag: bool, item: wp.int64) -> wp.int32:
-    """Append the items of the threads whose flag is set, in order of threads; return the new end."""
+def push_items(
+    items: wp.uint64, end: wp.int32, end_waiting: wp.int32, mask: wp.int32, children: four_items
+) -> wp.int64:
+    """Append the children of bits 0 to 3 to the stack, those of bits 4 to 7 to the face pairs; return both new ends.
+
+    The ends come packed, that of the face pairs first.
+    """
     ...
 
 

@@ -298,7 +298,8 @@ def test_a_graph_takes_poses_to_contacts(device, given):
     scene, pairs = touching(device)
     if not given and not scene.device.is_cuda:
         pytest.skip("a tree of boxes is built anew in CUDA graphs only")
-    query = ab.ContactQuery(scene, pairs if given else None, capacity=60000, pair_capacity=400)
+    capacity = 60000 if given else 500000
+    query = ab.ContactQuery(scene, pairs if given else None, capacity=capacity, pair_capacity=400)
     query.launch()
     rng = np.random.default_rng(3)
     for recapture in range(2):
@@ -317,7 +318,7 @@ def test_a_graph_takes_poses_to_contacts(device, given):
         if given and not recapture:
             pairs = np.concatenate([pairs, pairs[::-1, ::-1]])
             query.set_pairs(pairs)
-        query.resize(70000)
+        query.resize(capacity + 10000)
         query.launch()
 
 

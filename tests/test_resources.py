@@ -15,6 +15,8 @@ from test_margins import GpuQuery
 from test_scene import everything
 
 import warp_abtree as ab
+from warp_abtree.contact import VECTORS
+from warp_abtree.kernels.reduce import CHUNK
 from warp_abtree.state import SLOT_COLUMNS
 
 PAIRS = np.array([(0, 1), (1, 2), (3, 1)])
@@ -219,7 +221,7 @@ def test_questions(device, memory, question, pairs):
 
 
 def rooms_agree(queries):
-    """Check that all arrays that have an entry a pair are of one length, or kernels write past an end."""
+    """Check that all arrays that have an entry a pair or a contact are of one length, or kernels write past an end."""
     for query in queries:
         rooms = [query.pair_poses]
         for hits in (query.hits, query.near):
@@ -229,22 +231,28 @@ def rooms_agree(queries):
             rooms.append(query.within)
         if query.broad_phase is not None:
             rooms.append(query.broad_phase.pairs)
+        if isinstance(query, ab.ContactQuery):
+            means, sums, contacts = query.pair_contacts, query._sums, query.contacts
+            rooms += [means.point, means.normal, means.depth, sums.total, sums.middle, query.start[1:]]
+            places = [query.faces, *(getattr(contacts, name) for name in (*VECTORS, "coplanar"))]
+            places += [query._key[::2], query._order[::2]]
+            assert {len(array) for array in places} == {len(query.hits.face)}
+            chunks = [sums.point, sums.normal, sums.length, sums.area, sums.change, sums.front, sums.back, sums.span]
+            assert {len(array) for array in chunks} == {len(query.hits.face) // int(CHUNK) + len(query.pairs)}
         assert {len(room) for room in rooms} == {len(query.pairs)}
 
 
 # --- queries that are kept -------------------------------------------------------------------------------------------
 
 
-UNEVEN = pytest.mark.xfail(reason="Query makes its buffers of pairs longer one by one", strict=True)
-
 QUERIES = {
     "faces": (ab.Query, dict(output="faces", pairs=PAIRS[:1])),
     "within": (ab.Query, dict(output="count", pairs=PAIRS[:1], within=0.01)),
     "as on CUDA": (GpuQuery, dict(output="faces", pairs=PAIRS[:1])),
+    "contacts": (ab.ContactQuery, dict(pairs=PAIRS[:1])),
 }
 
 
-@UNEVEN
 @pytest.mark.parametrize("kind", QUERIES)
 def test_a_query_is_given_more_pairs(device, memory, kind):
     """It goes on with the pairs that it had, and later takes the others."""
@@ -270,11 +278,13 @@ GROWING = {
     "hits": (ab.Query, dict(output="faces", pairs=MORE_PAIRS, capacity=1)),
     "found pairs": (ab.Query, dict(output="faces", pair_capacity=1, capacity=1)),
     "found pairs within": (ab.Query, dict(output="count", pair_capacity=1, within=0.01)),
+    "contacts": (ab.ContactQuery, dict(pairs=MORE_PAIRS, capacity=1)),
+    "found contacts": (ab.ContactQuery, dict(pair_capacity=1, capacity=1)),
     "unsure faces": (GpuQuery, dict(output="faces", pairs=[(0, 4), *PAIRS], unsure_capacity=1, capacity=1)),
 }
 
 
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=UNEVEN if "found" in k else ()) for k in GROWING])
+@pytest.mark.parametrize("kind", GROWING)
 def test_a_query_grows(device, memory, kind):
     """Buffers that turn out too small, none of which may be left behind by the others."""
     make_query, options = GROWING[kind]

@@ -138,40 +138,45 @@ class ContactQuery(Query):
         """
         if capacity >= 2**30:
             raise CapacityError(f"{capacity} face pairs asked, a contact query has room for fewer than 2^30")
+        made = [(self, "faces", self._empty(capacity, wp.vec3i))]
+        made += [(self.contacts, name, self._empty(capacity, wp.vec3d)) for name in VECTORS]
+        made.append((self.contacts, "coplanar", self._empty(capacity, wp.int32)))
+        # The sort takes as much again as scratch.
+        made.append((self, "_key", self._empty(2 * capacity, wp.int64)))
+        made.append((self, "_order", self._empty(2 * capacity, wp.int32)))
+        made += self._chunk_arrays(self._chunk_count(capacity, len(self.pairs)))
         super().resize(capacity)
         self._places = capacity
-        self.faces = self._empty(capacity, wp.vec3i)
-        for name in VECTORS:
-            setattr(self.contacts, name, self._empty(capacity, wp.vec3d))
-        self.contacts.coplanar = self._empty(capacity, wp.int32)
-        # The sort takes as much again as scratch.
-        self._key, self._order = self._empty(2 * capacity, wp.int64), self._empty(2 * capacity, wp.int32)
-        self._allocate_chunks()
+        for owner, name, array in made:
+            setattr(owner, name, array)
 
-    def _allocate_pairs(self):
-        super()._allocate_pairs()
-        room = len(self.pairs)
-        self.start = wp.zeros(room + 1, dtype=wp.int32, device=self.device)
-        for array in ("point", "normal"):
-            setattr(self.pair_contacts, array, self._empty(room, wp.vec3d))
-        self.pair_contacts.depth = self._empty(room, wp.float64)
-        self._sums.total, self._sums.middle = self._empty(room, wp.float64), self._empty(room, wp.vec3d)
-        self._allocate_chunks()
+    def _pair_arrays(self, room: int) -> list:
+        made = super()._pair_arrays(room)
+        made.append((self, "start", wp.zeros(room + 1, dtype=wp.int32, device=self.device)))
+        for owner, name, dtype in (
+            (self.pair_contacts, "point", wp.vec3d),
+            (self.pair_contacts, "normal", wp.vec3d),
+            (self.pair_contacts, "depth", wp.float64),
+            (self._sums, "total", wp.float64),
+            (self._sums, "middle", wp.vec3d),
+        ):
+            made.append((owner, name, self._empty(room, dtype)))
+        return made + self._chunk_arrays(self._chunk_count(self._places, room))
 
-    def _allocate_chunks(self):
-        count = self._chunk_count()
-        self._sums.span = self._empty(count, wp.vec3i)
-        for name in ("point", "normal"):
-            setattr(self._sums, name, self._empty(count, wp.vec3d))
-        for name in ("length", "area", "change", "front", "back"):
-            setattr(self._sums, name, self._empty(count, wp.float64))
+    def _chunk_arrays(self, count: int) -> list:
+        """Return (owner, attribute, new array) of whatever has an entry a chunk."""
+        made = [(self._sums, "span", self._empty(count, wp.vec3i))]
+        made += [(self._sums, name, self._empty(count, wp.vec3d)) for name in ("point", "normal")]
+        names = ("length", "area", "change", "front", "back")
+        return made + [(self._sums, name, self._empty(count, wp.float64)) for name in names]
 
     def _empty(self, count, dtype):
         return wp.empty(count, dtype=dtype, device=self.device)
 
-    def _chunk_count(self) -> int:
+    @staticmethod
+    def _chunk_count(places: int, pairs: int) -> int:
         """Return how many chunks there may be: `first_chunk` of the pair after the last, if all places are taken."""
-        return self._places // int(reduce.CHUNK) + len(self.pairs)
+        return places // int(reduce.CHUNK) + pairs
 
     def traverse(self):
         """Run the narrow phase over the pairs in place and make the contacts. Launches only."""
@@ -212,7 +217,7 @@ class ContactQuery(Query):
         self._launch(contact.find_contact_kernel, self._places, [*posed, self.start, self.faces, self.contacts])
 
     def _reduce(self):
-        room, chunks = len(self.pairs), self._chunk_count()
+        room, chunks = len(self.pairs), len(self._sums.span)
         pools = [arrays.pool for arrays in self.arrays]
         start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
         self._launch(reduce.sum_length_kernel, chunks, [start, contacts, sums])
@@ -225,8 +230,4 @@ class ContactQuery(Query):
 
     def result(self) -> ContactResult:
         """Return faces, contacts and summaries of the last launch on the host. Waits for the device."""
-        if self.broad_phase is None:
-            return ContactResult(self, self._given, len(self._given))
-        found = self.broad_phase.count_found()
-        pairs = self.pairs.numpy()[: min(found, len(self.pairs))].reshape(-1, 2).copy()
-        return ContactResult(self, pairs, found)
+        return ContactResult(self, *self._asked())

@@ -5,13 +5,13 @@ import warp as wp
 
 from warp_abtree.broadphase import BroadPhase, CapacityError
 from warp_abtree.checks import to_numpy, whole_number
-from warp_abtree.kernels import distance, faces, pose, predicates, settle, traverse
+from warp_abtree.kernels import faces, pose, predicates, relate, settle, traverse
 from warp_abtree.kernels.warps import STACK_LENGTH, WARP_SIZE, WARPS_PER_BLOCK
 
 OUTPUTS = {"any": faces.OUTPUT_ANY, "count": faces.OUTPUT_COUNT, "faces": faces.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float64": predicates.FLOAT64, "float32": predicates.FLOAT32}
-# Few pairs are shared by so many warps in all, about four times what an H200 runs at a time.
-WARP_COUNT = 16384
+# Few pairs are shared by so many warps in all, about twice what an H200 runs at a time.
+WARP_COUNT = 4096
 
 COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 
@@ -173,9 +173,10 @@ class Query:
         self.hits.total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.hits.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.near = None if within is None else self._make_near()
+        self._no_distance = wp.empty(0, dtype=wp.float64, device=self.device)
         self._within = within
         self._resize_unsure((unsure_capacity or UNSURE_CAPACITY) if self.uses_warps() else 0)
-        self._allocate_pairs()
+        self._take_pairs(self.pairs)
         if pairs is not None:
             self.set_pairs(pairs)
         self.resize((capacity or max(1024, 16 * len(self.pairs))) if output == "faces" else 0)
@@ -192,44 +193,55 @@ class Query:
         if within is not None and self.near is None:
             raise ValueError("this query was made without within")
         if self.near is not None:
-            self._within = check_within(self._within if within is None else within, len(pairs))
+            within = check_within(self._within if within is None else within, len(pairs))
+        # What may fail for lack of memory comes before anything that changes the query.
+        rows = wp.array(pairs, dtype=wp.vec2i, device=self.device)
+        distances = self._upload_within(within)
         if len(pairs) > len(self.pairs):
-            self.pairs = wp.empty(len(pairs), dtype=wp.vec2i, device=self.device)
-            self._allocate_pairs()
+            self._take_pairs(wp.empty(len(pairs), dtype=wp.vec2i, device=self.device))
         if len(pairs):
-            wp.copy(self.pairs, wp.array(pairs, dtype=wp.vec2i, device=self.device), count=len(pairs))
+            wp.copy(self.pairs, rows, count=len(pairs))
         self.pair_count.fill_(len(pairs))
         self._given = pairs
-        self._fill_within()
+        self._within = within
+        self._fill_within(distances)
 
-    def _allocate_pairs(self):
-        """Make room for whatever belongs to a pair."""
-        room = len(self.pairs)
-        self.pair_poses = wp.empty(room, dtype=pose.PairPose, device=self.device)
-        self.hits.any_hit = wp.zeros(room, dtype=wp.int32, device=self.device)
-        for name in ("count", *COUNTERS):
-            setattr(self.hits, name, wp.zeros(room, dtype=wp.int64, device=self.device))
+    def _pair_arrays(self, room: int) -> list:
+        """Return (owner, attribute, new array) of whatever has an entry a pair."""
+        made = [(self, "pair_poses", wp.empty(room, dtype=pose.PairPose, device=self.device))]
+        for hits in (self.hits, self.near):
+            if hits is not None:
+                made.append((hits, "any_hit", wp.zeros(room, dtype=wp.int32, device=self.device)))
+                for name in ("count", *COUNTERS):
+                    made.append((hits, name, wp.zeros(room, dtype=wp.int64, device=self.device)))
         if self.near is not None:
-            self.within = wp.empty(room, dtype=wp.float64, device=self.device)
-            self.near.any_hit = wp.zeros(room, dtype=wp.int32, device=self.device)
-            for name in ("count", *COUNTERS):
-                setattr(self.near, name, wp.zeros(room, dtype=wp.int64, device=self.device))
-            if self.broad_phase is not None:
-                self._fill_within()
+            made.append((self, "within", wp.empty(room, dtype=wp.float64, device=self.device)))
+        return made
+
+    def _take_pairs(self, pairs):
+        """Take a device list of pairs and make room for whatever belongs to a pair: all of it, or nothing changes."""
+        for owner, name, array in [*self._pair_arrays(len(pairs)), (self, "pairs", pairs)]:
+            setattr(owner, name, array)
+        if self.broad_phase is not None:
+            self.broad_phase.pairs = pairs
+            self._fill_within(None)
 
     def _make_near(self):
         near = faces.Hits()
         near.total = near.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
         return near
 
-    def _fill_within(self):
-        if self.near is None:
-            return
-        if self._within.ndim == 0:
+    def _upload_within(self, within):
+        """Return distances of pairs on the device, None where there are none or one for all."""
+        if self.near is None or within.ndim == 0 or not len(within):
+            return None
+        return wp.array(within, dtype=wp.float64, device=self.device)
+
+    def _fill_within(self, distances):
+        if distances is not None:
+            wp.copy(self.within, distances, count=len(distances))
+        elif self.near is not None and self._within.ndim == 0:
             self.within.fill_(float(self._within))
-        elif len(self._within):
-            values = wp.array(self._within, dtype=wp.float64, device=self.device)
-            wp.copy(self.within, values, count=len(self._within))
 
     def _resize_unsure(self, capacity: int):
         self.hits.unsure = wp.empty(capacity, dtype=wp.vec3i, device=self.device)
@@ -260,80 +272,58 @@ class Query:
         room = len(self.pairs)
         if self.near is None or room == 0:
             return
-        for array in (self.near.any_hit, self.near.count, self.near.node_tests, self.near.triangle_tests):
-            array.zero_()
-        pools = [arrays.pool for arrays in self.arrays]
-        wp.launch(
-            distance.relate_within_kernel,
-            dim=room,
-            inputs=[*pools, self.pair_count, self.pairs, self.within, self.pair_poses],
-            device=self.device,
-        )
-        posed = [self.pair_count, self.pairs, self.pair_poses, self.near]
-        self._launch_traversal(int(faces.WITHIN), [int(faces.OUTPUT_ANY), *pools, *posed])
+        self._launch_traversal(self.within, self.near, int(faces.WITHIN), int(faces.OUTPUT_ANY))
 
-    def _launch_traversal(self, mode, inputs):
+    def _launch_traversal(self, within, hits, mode, output):
+        pools = [arrays.pool for arrays in self.arrays]
         room = len(self.pairs)
+        inputs = [*pools, self.pair_count, self.pairs, within, self.pair_poses, hits]
+        wp.launch(relate.relate_pair_kernel, dim=room, inputs=inputs, device=self.device)
+        inputs = [output, *pools, self.pair_count, self.pairs, self.pair_poses, hits]
         if not self.uses_warps():
             wp.launch(traverse.thread_traversal(mode), dim=room, inputs=inputs, device=self.device)
             return
-        kernel = traverse.warp_traversal(EXACT if mode == FLOAT64 else mode)
         warps = max(room, self.warp_count)
-        size = WARP_SIZE if self.device.is_cuda else 1
-        block_dim = WARP_SIZE * WARPS_PER_BLOCK
         wp.launch(
-            kernel, dim=warps * size, inputs=[warps, self.stack_room, *inputs], block_dim=block_dim, device=self.device
+            traverse.warp_traversal(EXACT if mode == FLOAT64 else mode),
+            dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
+            inputs=[warps, self.stack_room, *inputs],
+            block_dim=WARP_SIZE * WARPS_PER_BLOCK,
+            device=self.device,
         )
 
     def traverse(self):
         """Run the narrow phase over the pairs in place. Launches only."""
-        models, states, objects = (arrays.pool for arrays in self.arrays)
-        room = len(self.pairs)
-        if room == 0:
+        if not len(self.pairs):
             return
-        for array in (
-            self.hits.any_hit,
-            self.hits.count,
-            self.hits.total,
-            self.hits.node_tests,
-            self.hits.triangle_tests,
-            self.hits.float64_tests,
-            self.hits.exact_tests,
-            self.hits.unsure_total,
-        ):
-            array.zero_()
-        wp.launch(
-            pose.relate_pair_kernel,
-            dim=room,
-            inputs=[models, states, objects, self.pair_count, self.pairs, self.pair_poses],
-            device=self.device,
-        )
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
-        posed = [self.pairs, self.pair_poses, self.hits]
-        self._launch_traversal(mode, [output, models, states, objects, self.pair_count, *posed])
+        self._launch_traversal(self._no_distance, self.hits, mode, output)
         if len(self.hits.unsure):
+            pools = [arrays.pool for arrays in self.arrays]
             wp.launch(
                 settle.settle_traversal(mode),
                 dim=len(self.hits.unsure),
-                inputs=[output, models, states, objects, *posed],
+                inputs=[output, *pools, self.pairs, self.pair_poses, self.hits],
                 device=self.device,
             )
 
     def result(self) -> Result:
         """Return the results of the last launch on the host, sorted. Waits for the device."""
+        pairs, demand = self._asked()
+        return Result(pairs, self.output, demand, len(self.pairs), self.hits, self.near)
+
+    def _asked(self):
+        """Return the pairs of the last launch on the host, those there was room for, and how many there were."""
         if self.broad_phase is None:
-            return Result(self._given, self.output, len(self._given), len(self.pairs), self.hits, self.near)
+            return self._given, len(self._given)
         found = self.broad_phase.count_found()
-        pairs = self.pairs.numpy()[: min(found, len(self.pairs))].reshape(-1, 2).copy()
-        return Result(pairs, self.output, found, len(self.pairs), self.hits, self.near)
+        return self.pairs.numpy()[: min(found, len(self.pairs))].reshape(-1, 2).copy(), found
 
     def run(self) -> Result:
         """Launch, grow buffers that were too small, and return the whole result. Waits for the device."""
         self.launch()
         if self.broad_phase is not None and self.broad_phase.count_found() > len(self.pairs):
-            self.broad_phase.resize(self.broad_phase.count_found())
-            self.pairs = self.broad_phase.pairs
-            self._allocate_pairs()
+            self._take_pairs(wp.empty(self.broad_phase.count_found(), dtype=wp.vec2i, device=self.device))
             self.launch()
         while len(self.hits.unsure) and self._sum(self.hits.float64_tests) > len(self.hits.unsure):
             # How many wait varies for `any`, where the first hit of a pair ends its traversal.

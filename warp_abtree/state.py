@@ -57,8 +57,8 @@ class ModelArrays:
         pool = ModelPool()
         pool.vertex_parent = joined(parents, wp.int32)
         pool.vertex_pos = joined([f.vertex_pos for f in forests], wp.vec3d)
-        near = [model.progressive.vertex_pos - model.centre for model in models]
-        pool.vertex_near = joined([x.astype(np.float32) for x in near], wp.vec3)
+        near = [np.pad(model.progressive.vertex_pos - model.centre, ((0, 0), (0, 1))) for model in models]
+        pool.vertex_near = joined([x.astype(np.float32) for x in near], wp.vec4)
         pool.face_vertex = joined(corners, wp.vec3i)
         pool.face_split = joined([f.face_split for f in forests], wp.int32)
         pool.split_face = joined([f.split_face for f in forests], wp.int32)

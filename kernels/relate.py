@@ -1,0 +1,51 @@
+"""The start of a traversal: the relative pose of each object pair, and its counters at 0."""
+
+import warp as wp
+
+from warp_abtree.kernels.distance import DISTANCE_MAX, pad_distance
+from warp_abtree.kernels.faces import Hits
+from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.pose import PairPose, pair_pose
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.kernel
+def relate_pair_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    within: wp.array(dtype=wp.float64),
+    pair_pose_out: wp.array(dtype=PairPose),
+    hits_out: Hits,
+):
+    """Compute the pose of B in A's frame once a pair, A the smaller index, and clear what the traversal counts.
+
+    Args:
+        within: Distances [world units] that boxes are to be widened by, shape [pair]; [0] for intersection.
+    """
+    p = wp.tid()
+    if p == 0:
+        hits_out.total[0] = 0
+        hits_out.unsure_total[0] = 0
+    hits_out.any_hit[p] = 0
+    hits_out.count[p] = wp.int64(0)
+    hits_out.node_tests[p] = wp.int64(0)
+    hits_out.triangle_tests[p] = wp.int64(0)
+    hits_out.float64_tests[p] = wp.int64(0)
+    hits_out.exact_tests[p] = wp.int64(0)
+    if p >= wp.min(pair_count[0], pairs.shape[0]):
+        return
+    a = wp.min(pairs[p][0], pairs[p][1])
+    b = wp.max(pairs[p][0], pairs[p][1])
+    if within.shape[0] == 0:
+        pair_pose_out[p] = pair_pose(models, states, objects, a, b, wp.float64(0.0))
+        return
+    pose = pair_pose(models, states, objects, a, b, pad_distance(models, states, objects, a, b, within[p]))
+    if within[p] >= DISTANCE_MAX:
+        # Nothing is proved where distances may overflow: every box passes, and the first faces count as near.
+        pose.within = wp.float64(wp.inf)
+        pose.margin = wp.inf
+    pair_pose_out[p] = pose
