@@ -1,4 +1,5 @@
-"""Orientation signs: a float64 determinant with a proven error bound, and expansions where it leaves the sign open.
+"""Orientation signs: a float64 determinant with a proven error bound; where it leaves the sign open, the same in double
+words, and at last expansions.
 
 Bounds. With e = 2^-53 and no overflow, the determinants below err by at most (7 + 56 e) e P in 3D and (3 + 16 e) e P in
 2D, P the same sum with every product and difference of products replaced by the sum of magnitudes, computed in the same
@@ -11,11 +12,12 @@ from typing import Any
 
 import warp as wp
 
+from warp_abtree.kernels.double_word import BOUND_DOUBLE, double_orient2d, double_orient3d
 from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-# How signs are made. FILTER answers UNSURE where the bound leaves the sign open; EXACT goes on to expansions.
+# How signs are made. FILTER answers UNSURE where the bound leaves the sign open; EXACT goes on.
 FILTER = wp.constant(0)
 FLOAT64 = wp.constant(1)
 FLOAT32 = wp.constant(2)
@@ -71,7 +73,9 @@ def orient3d(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
     size = size + wp.abs(w[0]) * (wp.abs(u1v2) + wp.abs(u2v1))
     sign = filtered_sign(value, BOUND_3D * size)
     if mode == EXACT and sign == UNSURE:
-        sign = exact_orient3d(a, b, c, d)
+        sign = filtered_sign(double_orient3d(a, b, c, d), BOUND_DOUBLE * size)
+        if sign == UNSURE:
+            sign = exact_orient3d(a, b, c, d)
     return sign
 
 
@@ -82,9 +86,12 @@ def orient2d(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
     right = (a[1] - c[1]) * (b[0] - c[0])
     if mode == FLOAT64 or mode == FLOAT32:
         return plain_sign(left - right)
-    sign = filtered_sign(left - right, BOUND_2D * (wp.abs(left) + wp.abs(right)))
+    size = wp.abs(left) + wp.abs(right)
+    sign = filtered_sign(left - right, BOUND_2D * size)
     if mode == EXACT and sign == UNSURE:
-        sign = exact_orient2d(a, b, c)
+        sign = filtered_sign(double_orient2d(a, b, c), BOUND_DOUBLE * size)
+        if sign == UNSURE:
+            sign = exact_orient2d(a, b, c)
     return sign
 
 

@@ -55,7 +55,6 @@ STACK_MASK = wp.constant(STACK_LENGTH - 1)
 # Warps on one pair part its work when there are about so many items for each, or as many as the stack takes then.
 ITEMS_PER_WARP = wp.constant(8)
 ITEMS_TO_PART = wp.constant(STACK_LENGTH // 2)
-PARTS_MAX = wp.constant(256)
 # An early hit ends a pair for `any`, so few face pairs wait.
 FEW_CANDIDATES = wp.constant(8)
 
@@ -254,7 +253,7 @@ def warp_traversal(mode: int):
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=128)
     def traverse_warp_kernel(
-        warp_count: wp.int32,
+        parts_max: wp.int32,
         stack_room: wp.int32,
         output: wp.int32,
         models: ModelPool,
@@ -267,7 +266,8 @@ def warp_traversal(mode: int):
     ):
         """Traverse a share of one object pair a warp."""
         count = wp.min(pair_count[0], pairs.shape[0])
-        parts = wp.clamp(warp_count / wp.max(count, 1), 1, PARTS_MAX)
+        # Measured best for 1 to 8,192 pairs: the more parts, the more is done in each of them.
+        parts = wp.max(1, wp.int32(wp.float32(parts_max) / wp.sqrt(wp.float32(wp.max(count, 1)))))
         p = (wp.tid() / warp_size()) / parts
         if p >= count:
             return

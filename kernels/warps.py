@@ -1,4 +1,4 @@
-"""The threads of a warp at work on one stack in shared memory. On the CPU a thread is a warp of its own.
+"""The threads of a warp at work on one stack in shared memory: a block is a warp, on the CPU one thread.
 
 Every function but the stack's address and its reads must be reached by all threads of the warp together.
 """
@@ -10,7 +10,6 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 four_items = wp.types.vector(length=4, dtype=wp.int64)
 
 WARP_SIZE = 32
-WARPS_PER_BLOCK = 4
 STACK_LENGTH = 1024  # node pairs, a power of two
 # Fewer face pairs than there are threads wait while a visit adds four a thread at most.
 CANDIDATE_LENGTH = 160
@@ -28,7 +27,7 @@ def warp_size() -> wp.int32: ...
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    return threadIdx.x & 31;
+    return threadIdx.x;
 #else
     return 0;
 #endif
@@ -38,8 +37,8 @@ def warp_lane() -> wp.int32: ...
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ long long items[{WARPS_PER_BLOCK} * ({STACK_LENGTH} + {CANDIDATE_LENGTH})];
-    return (wp::uint64)(items + (threadIdx.x >> 5) * ({STACK_LENGTH} + {CANDIDATE_LENGTH}));
+    __shared__ long long items[{STACK_LENGTH} + {CANDIDATE_LENGTH}];
+    return (wp::uint64)items;
 #else
     static long long items[{STACK_LENGTH} + {CANDIDATE_LENGTH}];
     return (wp::uint64)items;
@@ -96,7 +95,7 @@ def item_second(item: wp.int64) -> wp.int32: ...
     unsigned int mine = __popc(mask & 15) | (__popc(mask & 240) << 16), sum = mine;
     for (int step = 1; step < 32; step <<= 1) {{
         unsigned int other = __shfl_up_sync(0xffffffffu, sum, step);
-        if ((threadIdx.x & 31) >= step)
+        if (threadIdx.x >= step)
             sum += other;
     }}
     unsigned int total = __shfl_sync(0xffffffffu, sum, 31);
@@ -140,7 +139,7 @@ def warp_any(flag: bool) -> bool: ...
     unsigned int votes = __ballot_sync(0xffffffffu, flag);
     if (votes == 0)
         return 0;
-    int lane = threadIdx.x & 31;
+    int lane = threadIdx.x;
     int leader = __ffs(votes) - 1;
     int start = 0;
     if (lane == leader)
@@ -164,7 +163,7 @@ def reserve_slot(total: wp.array(dtype=wp.int32), flag: bool) -> wp.int32:
     long long sum = x;
     for (int step = 16; step > 0; step >>= 1)
         sum += __shfl_down_sync(0xffffffffu, sum, step);
-    if ((threadIdx.x & 31) == 0 && sum != 0)
+    if (threadIdx.x == 0 && sum != 0)
         atomicAdd((unsigned long long*)totals.data + i, (unsigned long long)sum);
 #else
     totals.data[i] += x;

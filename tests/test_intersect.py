@@ -359,7 +359,7 @@ def test_warps_give_the_same_answers(device, room, parts):
     for output in ("faces", "count", "any"):
         plain = ask(scene, pairs, output)
         query = WarpQuery(scene, output, pairs=pairs, unsure_capacity=2)
-        query.warp_count, query.stack_room = parts * len(pairs), room
+        query.parts_max, query.stack_room = parts, room
         result = query.run()
         np.testing.assert_array_equal(result.any, plain.any)
         if output != "any":

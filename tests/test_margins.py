@@ -26,8 +26,6 @@ class GpuQuery(ab.Query):
     def uses_warps(self):
         return True
 
-    uses_blocks = uses_warps
-
 
 def random_turn(rng):
     return quaternion_matrix(random_quaternions(rng, 1)[0])

@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 
 from warp_abtree.kernels import faces, settle, traverse
+from warp_abtree.kernels.double_word import double_orient2d, double_orient3d
 from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d, two_product, two_sum
 from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE, orient2d, orient3d
 from warp_abtree.kernels.screen import SCREEN_UNIT, side_of_plane, sides_of_plane
@@ -68,6 +69,18 @@ def expansion3d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec3d), out: 
 def expansion2d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.int32)):
     i = wp.tid()
     out[i] = exact_orient2d(points[i, 0], points[i, 1], points[i, 2])
+
+
+@wp.kernel
+def double3d_kernel(points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=wp.float64)):
+    i = wp.tid()
+    out[i] = double_orient3d(points[i, 0], points[i, 1], points[i, 2], points[i, 3])
+
+
+@wp.kernel
+def double2d_kernel(points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.float64)):
+    i = wp.tid()
+    out[i] = double_orient2d(points[i, 0], points[i, 1], points[i, 2])
 
 
 @wp.kernel
@@ -182,20 +195,22 @@ KINDS = {
 }
 
 
+def true_terms(rows):
+    """Return the products of a determinant as fractions, for points given as lists."""
+    *rows, last = [[Fraction(x) for x in row] for row in rows]
+    u = [[x - y for x, y in zip(row, last)] for row in rows]
+    if len(u) == 2:
+        return [u[0][0] * u[1][1], -u[0][1] * u[1][0]]
+    terms = []
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        terms += [u[0][i] * u[1][j] * u[2][k], -u[0][i] * u[1][k] * u[2][j]]
+    return terms
+
+
 def true_signs(points):
-    signs = []
-    for rows in points.tolist():
-        *rows, last = [[Fraction(x) for x in row] for row in rows]
-        u = [[x - y for x, y in zip(row, last)] for row in rows]
-        if len(u) == 2:
-            det = u[0][0] * u[1][1] - u[0][1] * u[1][0]
-        else:
-            det = sum(
-                u[0][i] * (u[1][(i + 1) % 3] * u[2][(i + 2) % 3] - u[1][(i + 2) % 3] * u[2][(i + 1) % 3])
-                for i in range(3)
-            )
-        signs.append((det > 0) - (det < 0))
-    return np.array(signs)
+    values = [sum(true_terms(rows)) for rows in points.tolist()]
+    return np.array([(x > 0) - (x < 0) for x in values])
 
 
 def find_signs(kernel, mode, points, device):
@@ -230,6 +245,20 @@ def test_signs(device, dim, kind):
         assert (plain != truth).any() and not sure[plain != truth].any(), "float64 alone is not good enough here"
     elif kind.endswith("lattice"):
         np.testing.assert_array_equal(plain, truth)  # these determinants are small integers
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_double_words_keep_their_bound(device, kind, dim):
+    points = KINDS[kind](np.random.default_rng([6, dim]), dim)
+    out = wp.zeros(len(points), dtype=wp.float64, device=device)
+    kernel, dtype = (double3d_kernel, wp.vec3d) if dim == 3 else (double2d_kernel, wp.vec2d)
+    wp.launch(kernel, len(points), [wp.array(points, dtype=dtype, device=device), out], device=device)
+    for value, rows in zip(out.numpy().tolist(), points.tolist()):
+        terms = true_terms(rows)
+        off = abs(Fraction(value) - sum(terms))
+        # The high word alone is returned.
+        assert off <= Fraction(2) ** -53 * abs(Fraction(value)) + 20 * Fraction(2) ** -106 * sum(map(abs, terms))
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -334,7 +363,7 @@ def test_modules_with_signs_do_not_contract():
         "visit",
         "nodes",
     )
-    names += ("screen", "faces", "visit", "nodes")
+    names += ("screen", "faces", "visit", "nodes", "double_word")
     modules = [wp.get_module(importlib.import_module(f"warp_abtree.kernels.{name}").__name__) for name in names]
     makers = (traverse.thread_traversal, traverse.warp_traversal, settle.settle_traversal)
     modules += [make(int(mode)).module for mode in (EXACT, FLOAT64, FLOAT32, faces.WITHIN) for make in makers]
@@ -366,7 +395,7 @@ def test_ptx_is_not_contracted(tmp_path, fuse_fp):
 
 
 def test_ptx_of_the_traversal_is_not_contracted(tmp_path):
-    """The kernels that pose vertices, bound signs and test boxes; without expansions they have no float64 fma at all."""
+    """The kernels that pose vertices, bound signs and test boxes; without exact signs they have no float64 fma."""
     (tmp_path / "screen").mkdir()
     (tmp_path / "settle").mkdir()
     text = ptx_of(traverse.warp_traversal(int(EXACT)).module, tmp_path / "screen")

@@ -322,7 +322,7 @@ def test_regimes_and_outputs_agree(device):
     assert 3 < expected.apart.sum() < 27
     for kind, output in itertools.product((ThreadQuery, WarpQuery), ("any", "faces")):
         query = kind(scene, output, pairs=pairs, within=within)
-        query.warp_count = 3 * len(pairs)
+        query.parts_max = 20
         result, plain = query.run(), scene.intersect(pairs, output)
         np.testing.assert_array_equal(result.apart, expected.apart)
         assert plain.apart is None

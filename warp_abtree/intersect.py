@@ -1,17 +1,19 @@
 """ACTIVE-INTERSECT for a batch: `Query`, its results, and `sweep`."""
 
+import math
+
 import numpy as np
 import warp as wp
 
 from warp_abtree.broadphase import BroadPhase, CapacityError
 from warp_abtree.checks import to_numpy, whole_number
 from warp_abtree.kernels import faces, pose, predicates, relate, settle, traverse
-from warp_abtree.kernels.warps import STACK_LENGTH, WARP_SIZE, WARPS_PER_BLOCK
+from warp_abtree.kernels.warps import STACK_LENGTH, WARP_SIZE
 
 OUTPUTS = {"any": faces.OUTPUT_ANY, "count": faces.OUTPUT_COUNT, "faces": faces.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float64": predicates.FLOAT64, "float32": predicates.FLOAT32}
-# Few pairs are shared by so many warps in all, about twice what an H200 runs at a time.
-WARP_COUNT = 4096
+# Warps that share a single pair; c pairs have 1 / sqrt(c) of that each.
+PARTS_MAX = 256
 
 COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 
@@ -134,7 +136,7 @@ class Query:
         near: As `hits` for `within`: any_hit is 0 where a pair is proved apart; None without within.
     """
 
-    warp_count = WARP_COUNT
+    parts_max = PARTS_MAX
     stack_room = STACK_LENGTH
 
     def __init__(
@@ -283,12 +285,12 @@ class Query:
         if not self.uses_warps():
             wp.launch(traverse.thread_traversal(mode), dim=room, inputs=inputs, device=self.device)
             return
-        warps = max(room, self.warp_count)
+        warps = max(room, int(self.parts_max * math.sqrt(room)) + 1)
         wp.launch(
             traverse.warp_traversal(EXACT if mode == FLOAT64 else mode),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
-            inputs=[warps, self.stack_room, *inputs],
-            block_dim=WARP_SIZE * WARPS_PER_BLOCK,
+            inputs=[self.parts_max, self.stack_room, *inputs],
+            block_dim=WARP_SIZE,
             device=self.device,
         )
 
