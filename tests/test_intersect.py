@@ -405,15 +405,3 @@ def test_a_coarse_tree_costs_no_more_than_one_built_for_its_lod(device, name, fr
     ours, theirs = ask(active, pairs, "count"), ask(built, pairs, "count")
     np.testing.assert_array_equal(ours.count, theirs.count)
     assert ours.node_tests.sum() <= 1.1 * theirs.node_tests.sum()
-
-
-# What has a name but no code yet.
-
-
-def test_what_is_not_built_says_so(device):
-    scene = ab.Scene(device)
-    box = sample("box")
-    scene.add(box)
-    scene.add(box)
-    with pytest.raises(NotImplementedError):
-        ab.sweep(box, box, random_poses(np.random.default_rng(0), 3, 1.0))

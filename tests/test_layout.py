@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PIPELINE = (
-    "checks mesh progressive tree model state refine lod broadphase intersect contact scene dynamics frame "
+    "checks mesh progressive tree model state refine lod broadphase intersect contact scene pose_sweep dynamics frame "
     "scene_file plot waiting report cli"
 ).split()
 OUTSIDE = PIPELINE[PIPELINE.index("scene_file") :]  # these use the public API alone

@@ -1,4 +1,4 @@
-"""ACTIVE-INTERSECT for a batch: `Query`, its results, and `sweep`."""
+"""ACTIVE-INTERSECT for a batch: `Query` and its results."""
 
 import math
 
@@ -341,13 +341,3 @@ class Query:
     @staticmethod
     def _sum(counts) -> int:
         return int(counts.numpy().sum())
-
-
-def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precision="exact", device=None):
-    """Test one pair of models at many poses of B in A's frame, no objects made.
-
-    Raises:
-        NotImplementedError: Always, until the throughput work; `Scene.intersect` answers the same question.
-    """
-    check_request(output, precision)
-    raise NotImplementedError("sweep is not built yet; add one object a pose to a Scene and call intersect")
