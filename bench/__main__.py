@@ -1,4 +1,4 @@
-"""python -m bench exact|precision|query|sweep|update [--device D] [--json FILE]"""
+"""python -m bench exact|peers|precision|query|sweep|update [--device D] [--json FILE]"""
 
 import argparse
 import json
@@ -6,9 +6,16 @@ import sys
 
 import warp as wp
 
-from . import exact, precision, query, sweep, update
+from . import exact, peers, precision, query, sweep, update
 
-CASES = {"exact": exact.run, "precision": precision.run, "query": query.run, "sweep": sweep.run, "update": update.run}
+CASES = {
+    "exact": exact.run,
+    "peers": peers.run,
+    "precision": precision.run,
+    "query": query.run,
+    "sweep": sweep.run,
+    "update": update.run,
+}
 
 
 def main(argv=None):

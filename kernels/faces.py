@@ -39,7 +39,7 @@ class Hits:
 
     any_hit, count: shape [pair]. face: (pair, face a, face b), a of the pair's first object, shape [capacity]; total
     numbers them and may wrap, the demand is the sum of count. node_tests to exact_tests: work done,
-    shape [pair]; float64_tests are the triangle tests that float32 left open, exact_tests those that took expansions.
+    shape [pair]; float64_tests are the triangle tests that float32 left open, exact_tests those that took exact signs.
     unsure: (pair, face of the lower object, face of the higher) that wait for the next stage, shape [capacity].
     """
 
@@ -145,7 +145,7 @@ def settle_faces(
     face_a: wp.int32,
     face_b: wp.int32,
 ):
-    """Decide a pair of faces that float32 left open; return whether they meet, and whether it took expansions."""
+    """Decide a pair of faces that float32 left open; return whether they meet, and whether it took exact signs."""
     if mode != EXACT:
         return test_faces(mode, models, states, trees, pose, face_a, face_b), 0
     meet = test_faces(FILTER, models, states, trees, pose, face_a, face_b)
@@ -155,9 +155,8 @@ def settle_faces(
 
 
 @wp.func
-def decide_faces(
+def try_faces(
     mode: wp.int32,
-    deferring: bool,
     models: ModelPool,
     states: StatePool,
     trees: PairTrees,
@@ -165,19 +164,10 @@ def decide_faces(
     face_a: wp.int32,
     face_b: wp.int32,
 ):
-    """Return whether a pair of faces meets, and the stage that said so: 0 float32, 1 float64, 2 expansions.
-
-    Where the later stages are left to another kernel, pairs that need them are UNSURE at stage 1.
-    """
+    """Return whether a pair of faces meets as the first stage sees it: 1, 0 or UNSURE; all of it for WITHIN."""
     if mode == WITHIN:
-        return test_faces(mode, models, states, trees, pose, face_a, face_b), 0
-    meet = screen_faces(mode, models, states, trees, pose, face_a, face_b)
-    if meet != UNSURE:
-        return meet, 0
-    if deferring:
-        return meet, 1
-    meet, hard = settle_faces(mode, models, states, trees, pose, face_a, face_b)
-    return meet, 1 + hard
+        return test_faces(mode, models, states, trees, pose, face_a, face_b)
+    return screen_faces(mode, models, states, trees, pose, face_a, face_b)
 
 
 @wp.func

@@ -45,7 +45,7 @@ def sum_products(p0: wp.float64, q0: wp.float64, p1: wp.float64, q1: wp.float64,
 
 @wp.func
 def pose_point(rotation: wp.mat33d, translation: wp.vec3d, p: wp.vec3d):
-    """Return x' of DESIGN section 6: left to right, without fused multiply-add, tiny coordinates as 0."""
+    """Return x' of docs/exactness.md: left to right, without fused multiply-add, tiny coordinates as 0."""
     x = wp.vec3d()
     for i in range(3):
         y = sum_products(rotation[i, 0], p[0], rotation[i, 1], p[1], rotation[i, 2], p[2]) + translation[i]
@@ -81,7 +81,7 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
 
     The margin covers every rounding between the exact x' of B's vertices and the float32 box test. With u = 2^-24,
     r_a and r_b the reach of the root boxes and s the largest component of the translation between the centres,
-    these sum to less than 25 u r_b + 4 u s + 5 u r_a on A's axes and 25 u r_a + 6 u s + 5 u r_b on B's, against 64 u
+    these sum to less than 18 u r_b + 5 u s + 5 u r_a on A's axes and 18 u r_a + 9 u s + 5 u r_b on B's, against 64 u
     of each here (docs/exactness.md has the terms). The float64 part covers x' itself and the shift between
     centres, and `skewed` a rotation that is not orthonormal to the last bit, on whose columns B's axes are taken. A
     gap along a unit axis is a distance, so `within` adds to the margin; a column is longer than 1 by at most
@@ -111,7 +111,7 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     margin64 = ROUNDING_64 * (size + wp.float64(2.0) * (reach_c + reach_b) + reach_a)
     margin64 = margin64 + wp.float64(4.0) * skewed * (reach_b + far)
     margin32 = ROUNDING_32 * (reach_a + reach_b + far)
-    # Of one coordinate in `screen_triangles`: the first axis of the boxes' margin without box A.
+    # Of a coordinate in `screen_triangles`; docs/exactness.md has the terms, which need `near` below.
     off32 = UNIT_32 * (wp.float64(2.0) * reach_a + wp.float64(13.0) * reach_b + wp.float64(3.0) * far)
 
     pose = PairPose()

@@ -14,15 +14,17 @@ from warp_abtree.kernels.faces import (
     OUTPUT_FACES,
     Hits,
     PairTrees,
-    decide_faces,
     defer_faces,
     locate_pair,
     report_hit,
+    settle_faces,
+    try_faces,
 )
 from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose
 from warp_abtree.kernels.predicates import UNSURE
+from warp_abtree.kernels.vector import visit_items
 from warp_abtree.kernels.visit import visit_item
 from warp_abtree.kernels.warps import (
     STACK_LENGTH,
@@ -47,9 +49,13 @@ wp.set_module_options(MODULE_OPTIONS)
 
 # A visit replaces an item by four at most, each a level deeper in one tree or in both: depth first, three more a level
 # at most of the shallower tree, and one more a level of the other.
-DEPTH_FIRST_LENGTH = 128
-DEPTH_FIRST_ROOM = wp.constant(DEPTH_FIRST_LENGTH)
+DEPTH_FIRST_LENGTH = 256
+DEPTH_FIRST_ROOM = wp.constant(128)
 depth_first_stack = wp.types.vector(length=DEPTH_FIRST_LENGTH, dtype=wp.int64)
+
+# One thread tests so many face pairs at a time, so that its processor finds its way through either loop.
+FACES_READY = wp.constant(16)
+waiting_list = wp.types.vector(length=24, dtype=wp.int64)
 
 STACK_MASK = wp.constant(STACK_LENGTH - 1)
 # Warps on one pair part its work when there are about so many items for each, or as many as the stack takes then.
@@ -66,11 +72,10 @@ def first_item(states: StatePool, trees: PairTrees):
 
 
 @wp.func
-def lowest_item(items: four_items, mask: wp.int32):
-    """Return the item of the lowest bit set."""
-    if (mask & 3) != 0:
-        return wp.where((mask & 1) != 0, items[0], items[1])
-    return wp.where((mask & 4) != 0, items[2], items[3])
+def keep_hit(output: wp.int32, pair: wp.int32, swapped: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+    hits.any_hit[pair] = 1
+    if output == OUTPUT_FACES:
+        report_hit(wp.atomic_add(hits.total, 0, 1), pair, swapped, face_a, face_b, hits)
 
 
 @functools.cache
@@ -88,7 +93,7 @@ def thread_traversal(mode: int):
         pair_poses: wp.array(dtype=PairPose),
         hits_inout: Hits,
     ):
-        """Traverse one object pair a thread, depth first."""
+        """Traverse one object pair a thread, depth first; CPU only."""
         p = wp.tid()
         if p >= wp.min(pair_count[0], pairs.shape[0]):
             return
@@ -96,36 +101,42 @@ def thread_traversal(mode: int):
         pose = pair_poses[p]
         stack = depth_first_stack()
         stack[0] = first_item(states, trees)
-        top = wp.int32(1)
+        stack[1] = stack[0]
+        waiting_faces = waiting_list()
+        top, waiting = wp.int32(1), wp.int32(0)
+        ready = wp.where(output == OUTPUT_ANY, 1, FACES_READY)
         node_tests, triangle_tests = wp.int64(0), wp.int64(0)
         float64_tests, exact_tests, hit_count = wp.int64(0), wp.int64(0), wp.int64(0)
         while top > 0:
-            top -= 1
-            items, mask, compared = visit_item(states, trees, pose, stack[top])
-            node_tests += wp.int64(compared)
-            for k in range(4):
-                if (mask & (1 << k)) != 0:
-                    stack[top] = items[k]
-                    top += 1
-            mask = mask >> 4
-            while mask != 0:
-                item = lowest_item(items, mask)
-                mask = mask & (mask - 1)
-                face_a = item_first(item)
-                face_b = item_second(item)
-                meet, stage = decide_faces(wp.static(mode), False, models, states, trees, pose, face_a, face_b)
+            taken = wp.min(top, 2)
+            top -= taken
+            items = visit_items(states, trees, pose, stack[top], stack[top + 1], taken)
+            mask = wp.int32(items[8])
+            node_tests += items[9]
+            # Written without branches, which could not be predicted; what is not in use is written over.
+            for k in range(8):
+                stack[top] = items[k]
+                top += (mask >> k) & 1
+                waiting_faces[waiting] = items[k]
+                waiting += (mask >> (k + 8)) & 1
+            if top > 0 and waiting < ready:
+                continue
+            while waiting > 0:
+                waiting -= 1
+                face_a = item_first(waiting_faces[waiting])
+                face_b = item_second(waiting_faces[waiting])
+                meet = try_faces(wp.static(mode), models, states, trees, pose, face_a, face_b)
                 triangle_tests += wp.int64(1)
-                float64_tests += wp.int64(wp.min(stage, 1))
-                exact_tests += wp.int64(stage >> 1)
+                if meet == UNSURE:
+                    meet, hard = settle_faces(wp.static(mode), models, states, trees, pose, face_a, face_b)
+                    float64_tests += wp.int64(1)
+                    exact_tests += wp.int64(hard)
                 if meet == 1:
                     hit_count += wp.int64(1)
-                    hits_inout.any_hit[p] = 1
-                    if output == OUTPUT_FACES:
-                        slot = wp.atomic_add(hits_inout.total, 0, 1)
-                        report_hit(slot, p, swapped, face_a, face_b, hits_inout)
-                    elif output == OUTPUT_ANY:
+                    keep_hit(output, p, swapped, face_a, face_b, hits_inout)
+                    if output == OUTPUT_ANY:
                         top = 0
-                        mask = 0
+                        waiting = 0
         hits_inout.count[p] = hit_count
         hits_inout.node_tests[p] = node_tests
         hits_inout.triangle_tests[p] = triangle_tests
@@ -183,7 +194,7 @@ def test_candidates(
     item = wp.int64(0)
     if lane < popped:
         item = read_item(items, STACK_LENGTH + first + lane)
-        meet, _stage = decide_faces(mode, True, models, states, trees, pose, item_first(item), item_second(item))
+        meet = try_faces(mode, models, states, trees, pose, item_first(item), item_second(item))
     warp_sync()
     found = meet == 1
     if output == OUTPUT_FACES:

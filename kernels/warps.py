@@ -1,6 +1,6 @@
 """The threads of a warp at work on one stack in shared memory: a block is a warp, on the CPU one thread.
 
-Every function but the stack's address and its reads must be reached by all threads of the warp together.
+`warp_sync`, `push_items`, `warp_any`, `reserve_slot` and `add_warp_sum` must be reached by all its threads together.
 """
 
 import warp as wp

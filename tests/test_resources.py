@@ -15,6 +15,7 @@ from test_margins import GpuQuery
 from test_scene import everything
 
 import warp_abtree as ab
+from warp_abtree import intersect
 from warp_abtree.contact import VECTORS
 from warp_abtree.kernels.reduce import CHUNK
 from warp_abtree.state import SLOT_COLUMNS
@@ -376,13 +377,28 @@ def test_the_error_names_the_demand(device):
         for size, call in (
             (12 * LARGEST, lambda: ab.Query(scene, "faces", pairs=PAIRS, capacity=LARGEST)),
             (12 * LARGEST, lambda: GpuQuery(scene, "faces", pairs=PAIRS, unsure_capacity=LARGEST)),
-            (8 * LARGEST, lambda: ab.Query(scene, "any", pair_capacity=LARGEST)),
             (12 * LARGEST, lambda: query.resize(LARGEST)),
         ):
             with pytest.raises(RuntimeError, match=f"{size} bytes on device '{device}'"):
                 call()
             check_scene(before, scene)
             assert describe(query.run()) == answers
+
+
+def test_more_pairs_than_a_launch_holds(device, monkeypatch):
+    monkeypatch.setattr(intersect, "PAIRS_MAX", len(MORE_PAIRS))
+    scene = make_scene(device)
+    before = check_scene(None, scene)
+    query = ab.Query(scene, "faces", pairs=PAIRS)
+    answers = describe(query.run())
+    with pytest.raises(ValueError, match="pair_capacity 13 is outside"):
+        ab.Query(scene, "any", pair_capacity=13)
+    many = np.concatenate([MORE_PAIRS, PAIRS])
+    for call in (lambda: query.set_pairs(many), lambda: scene.intersect(many), lambda: ab.Query(scene, pairs=many)):
+        with pytest.raises(ab.CapacityError, match="15 object pairs at a time"):
+            call()
+        check_scene(before, scene)
+        assert describe(query.run()) == answers
 
 
 def named_demand(query, name):

@@ -15,6 +15,9 @@ PRECISIONS = {"exact": predicates.EXACT, "float64": predicates.FLOAT64, "float32
 # Warps that share a single pair; c pairs have 1 / sqrt(c) of that each.
 PARTS_MAX = 256
 
+# A launch of 32 threads a pair stays within 2^31.
+PAIRS_MAX = 2**26
+
 COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 
 # Face pairs that the float32 stage leaves open: about one in a hundred. The list grows as needed.
@@ -156,7 +159,7 @@ class Query:
         if capacity is not None:
             capacity = whole_number(capacity, "capacity", 1, 2**31 - 1)
         if pair_capacity is not None:
-            pair_capacity = whole_number(pair_capacity, "pair_capacity", 1, 2**31 - 1)
+            pair_capacity = whole_number(pair_capacity, "pair_capacity", 1, PAIRS_MAX)
         if unsure_capacity is not None:
             unsure_capacity = whole_number(unsure_capacity, "unsure_capacity", 1, 2**31 - 1)
         self.scene = scene
@@ -222,6 +225,8 @@ class Query:
 
     def _take_pairs(self, pairs):
         """Take a device list of pairs and make room for whatever belongs to a pair: all of it, or nothing changes."""
+        if len(pairs) > PAIRS_MAX:
+            raise CapacityError(f"{len(pairs)} object pairs at a time, more than 2^26; ask them in parts")
         for owner, name, array in [*self._pair_arrays(len(pairs)), (self, "pairs", pairs)]:
             setattr(owner, name, array)
         if self.broad_phase is not None:
@@ -329,7 +334,7 @@ class Query:
             self.launch()
         while len(self.hits.unsure) and self._sum(self.hits.float64_tests) > len(self.hits.unsure):
             # How many wait varies for `any`, where the first hit of a pair ends its traversal.
-            self._resize_unsure(2 * self._sum(self.hits.float64_tests))
+            self._resize_unsure(min(2 * self._sum(self.hits.float64_tests), 2**31 - 1))
             self.traverse()
         if self.output == "faces" and self._sum(self.hits.count) > len(self.hits.face):
             self.resize(self._sum(self.hits.count))

@@ -137,7 +137,7 @@ def build_progressive(mesh, base_faces=10, link_condition=False, progress=None):
         progress: Called as progress(stage, done, total) between launches; stages "collapse" and "error".
     Raises ValueError for empty, non-finite or oversized meshes, bad indices, base_faces < 1, or if no face has three
     distinct corners.
-    Source: Garland and Heckbert 1997 (collapse); DESIGN.md section 4 (error).
+    Source: Garland and Heckbert 1997 (collapse).
     """
     vertices, faces = _checked(mesh, base_faces)
     report = progress if progress is not None else lambda stage, done, total: None
