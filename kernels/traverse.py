@@ -24,7 +24,7 @@ from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose
 from warp_abtree.kernels.predicates import UNSURE
-from warp_abtree.kernels.vector import visit_items
+from warp_abtree.kernels.vector import take_slot, visit_items
 from warp_abtree.kernels.visit import visit_item
 from warp_abtree.kernels.warps import (
     STACK_LENGTH,
@@ -75,7 +75,7 @@ def first_item(states: StatePool, trees: PairTrees):
 def keep_hit(output: wp.int32, pair: wp.int32, swapped: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
     hits.any_hit[pair] = 1
     if output == OUTPUT_FACES:
-        report_hit(wp.atomic_add(hits.total, 0, 1), pair, swapped, face_a, face_b, hits)
+        report_hit(take_slot(hits.total), pair, swapped, face_a, face_b, hits)
 
 
 @functools.cache
@@ -84,6 +84,8 @@ def thread_traversal(mode: int):
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def traverse_thread_kernel(
+        first: wp.int32,
+        step: wp.int32,
         output: wp.int32,
         models: ModelPool,
         states: StatePool,
@@ -93,18 +95,15 @@ def thread_traversal(mode: int):
         pair_poses: wp.array(dtype=PairPose),
         hits_inout: Hits,
     ):
-        """Traverse one object pair a thread, depth first; CPU only."""
-        p = wp.tid()
+        """Traverse every step-th object pair from the first on, depth first; CPU only, on several cores at once."""
+        p = first + step * wp.tid()
         if p >= wp.min(pair_count[0], pairs.shape[0]):
             return
         swapped, trees = locate_pair(models, states, objects, pairs[p])
         pose = pair_poses[p]
-        stack = depth_first_stack()
-        stack[0] = first_item(states, trees)
-        stack[1] = stack[0]
+        stack = depth_first_stack(first_item(states, trees))
         waiting_faces = waiting_list()
         top, waiting = wp.int32(1), wp.int32(0)
-        ready = wp.where(output == OUTPUT_ANY, 1, FACES_READY)
         node_tests, triangle_tests = wp.int64(0), wp.int64(0)
         float64_tests, exact_tests, hit_count = wp.int64(0), wp.int64(0), wp.int64(0)
         while top > 0:
@@ -119,12 +118,12 @@ def thread_traversal(mode: int):
                 top += (mask >> k) & 1
                 waiting_faces[waiting] = items[k]
                 waiting += (mask >> (k + 8)) & 1
-            if top > 0 and waiting < ready:
+            if top > 0 and waiting < FACES_READY and output != OUTPUT_ANY:
                 continue
             while waiting > 0:
                 waiting -= 1
-                face_a = item_first(waiting_faces[waiting])
-                face_b = item_second(waiting_faces[waiting])
+                item = waiting_faces[waiting]
+                face_a, face_b = item_first(item), item_second(item)
                 meet = try_faces(wp.static(mode), models, states, trees, pose, face_a, face_b)
                 triangle_tests += wp.int64(1)
                 if meet == UNSURE:

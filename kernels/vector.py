@@ -1,6 +1,7 @@
-"""`visit_item` in vector instructions, for the CPU: the same numbers in the same order, three axes at a time.
+"""What the CPU does in its own way: `visit_item` in vector instructions, and atomics that are.
 
-Two items at a time: neither waits for the other, so the processor works on both.
+A visit computes the same numbers in the same order, three axes at a time. Two items at a time: neither waits for the
+other, so the processor works on both.
 """
 
 import warp as wp
@@ -108,6 +109,18 @@ def visit_two(
 
     Bits 0 to 7 of the mask stand for items to visit, bits 8 to 15 for pairs of faces to test.
     """
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return atomicAdd(total.data, 1);
+#else
+    return __atomic_fetch_add(total.data, 1, __ATOMIC_RELAXED);
+#endif
+""")
+def take_slot(total: wp.array(dtype=wp.int32)) -> wp.int32:
+    """Count one more into total[0] and return what it was; on the CPU, Warp's own atomics race with other threads."""
     ...
 
 

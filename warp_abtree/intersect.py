@@ -7,6 +7,7 @@ import warp as wp
 
 from warp_abtree.broadphase import BroadPhase, CapacityError
 from warp_abtree.checks import to_numpy, whole_number
+from warp_abtree.cores import core_count, launch_on_cores
 from warp_abtree.kernels import faces, pose, predicates, relate, settle, traverse
 from warp_abtree.kernels.warps import STACK_LENGTH, WARP_SIZE
 
@@ -139,6 +140,7 @@ class Query:
         near: As `hits` for `within`: any_hit is 0 where a pair is proved apart; None without within.
     """
 
+    cores = None  # CPU threads; None is all that the process may use
     parts_max = PARTS_MAX
     stack_room = STACK_LENGTH
 
@@ -288,7 +290,10 @@ class Query:
         wp.launch(relate.relate_pair_kernel, dim=room, inputs=inputs, device=self.device)
         inputs = [output, *pools, self.pair_count, self.pairs, self.pair_poses, hits]
         if not self.uses_warps():
-            wp.launch(traverse.thread_traversal(mode), dim=room, inputs=inputs, device=self.device)
+            cores = core_count() if self.cores is None else self.cores
+            # A launch on a further core costs some 50 us: the work of many pairs apart, of less than one in contact.
+            least = 32 if output == int(faces.OUTPUT_ANY) else 1
+            launch_on_cores(traverse.thread_traversal(mode), room, inputs, self.device, cores, least)
             return
         warps = max(room, int(self.parts_max * math.sqrt(room)) + 1)
         wp.launch(

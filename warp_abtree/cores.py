@@ -1,0 +1,47 @@
+"""Launches on several cores of the CPU: Warp runs one on one thread, so a launch is dealt out to several."""
+
+import functools
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import warp as wp
+
+
+def core_count() -> int:
+    """Return the cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on every system
+        return os.cpu_count() or 1
+
+
+@functools.cache
+def _workers(count: int):
+    return ThreadPoolExecutor(count, thread_name_prefix="warp_abtree")
+
+
+def launch_on_cores(kernel, count, inputs, device, cores, least=1):
+    """Launch a kernel over items 0 to count - 1 on several threads of the CPU; waits for them.
+
+    The kernel takes (first, step) before its inputs: thread `tid` works on item first + step tid. It writes what
+    belongs to its item alone, or with true atomics: Warp's own are none on the CPU. While a graph is captured, one
+    thread launches, since only its launches would be recorded.
+
+    Args:
+        least: Items that make a further core worth its while.
+    """
+    cores = max(1, min(cores, count // least))
+    if cores == 1 or device.is_capturing:
+        wp.launch(kernel, dim=count, inputs=[0, 1, *inputs], device=device)
+        return
+    wp.load_module(kernel.module, device)  # modules load on one thread
+    dims = [(count - first + cores - 1) // cores for first in range(cores)]
+    deal = [
+        _workers(cores - 1).submit(wp.launch, kernel, dim=dims[first], inputs=[first, cores, *inputs], device=device)
+        for first in range(1, cores)
+    ]
+    try:
+        wp.launch(kernel, dim=dims[0], inputs=[0, cores, *inputs], device=device)
+    finally:
+        for job in deal:
+            job.result()
