@@ -1,4 +1,4 @@
-"""python -m bench exact|peers|precision|query|sweep|update [--device D] [--json FILE]"""
+"""python -m bench exact|memory|peers|precision|query|sweep|update [--device D] [--json FILE]"""
 
 import argparse
 import json
@@ -6,10 +6,11 @@ import sys
 
 import warp as wp
 
-from . import exact, peers, precision, query, sweep, update
+from . import exact, memory, peers, precision, query, sweep, update
 
 CASES = {
     "exact": exact.run,
+    "memory": memory.run,
     "peers": peers.run,
     "precision": precision.run,
     "query": query.run,

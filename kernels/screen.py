@@ -35,6 +35,19 @@ def sum_sizes(v: wp.vec3):
     return (wp.abs(v[0]) + wp.abs(v[1])) + wp.abs(v[2])
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return wp::max(x, wp::max(y, z));
+#else
+    const wp::float32 m = y > z ? y : z;
+    return x > m ? x : m;
+#endif
+""")
+def largest(x: wp.float32, y: wp.float32, z: wp.float32) -> wp.float32:
+    """Return the largest of three; on the CPU without the branches that `wp.max` has for NaN, which may pass by."""
+    ...
+
+
 @wp.func
 def bound_error(error: wp.float32, unit: wp.float32, u: wp.float32, v: wp.float32, w: wp.float32):
     """Return how far a determinant can err whose rows have these sums of magnitudes."""
@@ -62,7 +75,7 @@ def sides_of_plane(
     w1 = a - d1
     w2 = a - d2
     normal = cross32(u, v)
-    far = wp.max(sum_sizes(w0), wp.max(sum_sizes(w1), sum_sizes(w2)))
+    far = largest(sum_sizes(w0), sum_sizes(w1), sum_sizes(w2))
     bound = bound_error(error, unit, sum_sizes(u), sum_sizes(v), far)
     s0 = filtered_sign(dot32(w0, normal), bound)
     s1 = filtered_sign(dot32(w1, normal), bound)

@@ -1,0 +1,58 @@
+"""Bytes that a scene's arrays hold: a face of a model, a face of a tree state, an object, a pair; states shared."""
+
+import numpy as np
+import trimesh
+import warp as wp
+
+import warp_abtree as ab
+
+from .shapes import knot, pair_poses
+
+
+def count_bytes(holder):
+    """Return the bytes of all arrays among an object's attributes."""
+    return sum(value.capacity for value in vars(holder).values() if isinstance(value, wp.array))
+
+
+def scenes(device):
+    """Yield (name, scene, faces of all models)."""
+    for size in (200, 5000, 60000, 1_000_000):
+        model = ab.Model.from_arrays(*knot(size))
+        scene = ab.Scene(device)
+        scene.add(model)
+        scene.add(model, (0.5, 0, 0, 0, 0, 0, 1))
+        yield f"a knot of {model.face_count:,} faces, twice", scene, model.face_count
+    models = [ab.Model.from_arrays(*knot(size)) for size in (1000, 2000, 4000)]
+    for subdivisions in (3, 4):
+        ball = trimesh.creation.icosphere(subdivisions)
+        models.append(ab.Model.from_arrays(ball.vertices, ball.faces))
+    scene = ab.Scene(device)
+    poses = pair_poses(5000, 3.0)
+    for i in range(10000):
+        model = models[i % 5]
+        scene.add(model, poses[i], lod=model.lod_max * (i // 5 % 8 + 1) // 8)
+    yield "10,000 objects of 5 models at 8 LODs", scene, sum(model.face_count for model in models)
+
+
+def run(device):
+    """Yield one row a scene: objects, states, and bytes: of the models and the states a face, an object, a pair."""
+    device = wp.get_device(device)
+    for name, scene, faces in scenes(device):
+        models, states, objects = scene.arrays()
+        pairs = np.stack([np.arange(scene.object_count - 1), np.arange(1, scene.object_count)], 1)
+        query = ab.Query(scene, "any", pairs=pairs)
+        a_pair = (query.pairs.capacity + query.pair_poses.capacity + count_bytes(query.hits)) / len(pairs)
+        state_faces = sum(scene.models[slot.model].face_count for slot in states.slots)
+        yield {
+            "device": device.name,
+            "scene": name,
+            "objects": scene.object_count,
+            "states": len(states.slots),
+            "model_bytes_a_face": round(count_bytes(models.pool) / faces, 1),
+            "state_bytes_a_face": round(count_bytes(states.pool) / state_faces, 1),
+            "object_bytes": round(count_bytes(objects.pool) / scene.object_count, 1),
+            "pair_bytes": round(a_pair, 1),
+            "all_mib": round(
+                (count_bytes(models.pool) + count_bytes(states.pool) + count_bytes(objects.pool)) / 2**20, 2
+            ),
+        }
