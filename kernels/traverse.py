@@ -47,10 +47,10 @@ from warp_abtree.kernels.warps import (
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
-# A visit replaces an item by four at most, each a level deeper in one tree or in both: depth first, three more a level
-# at most of the shallower tree, and one more a level of the other.
-DEPTH_FIRST_LENGTH = 256
+# A visit replaces an item by four at most, each a level deeper in both trees, or by two, a level deeper in one. So depth
+# first leaves three items a level at most, 31 levels deep, and two items at a time six.
 DEPTH_FIRST_ROOM = wp.constant(128)
+DEPTH_FIRST_LENGTH = 256
 depth_first_stack = wp.types.vector(length=DEPTH_FIRST_LENGTH, dtype=wp.int64)
 
 # One thread tests so many face pairs at a time, so that its processor finds its way through either loop.
@@ -276,7 +276,7 @@ def warp_traversal(mode: int):
     ):
         """Traverse a share of one object pair a warp."""
         count = wp.min(pair_count[0], pairs.shape[0])
-        # Measured best for 1 to 8,192 pairs: the more parts, the more is done in each of them.
+        # Measured best for 1 to 8,192 pairs: with more parts, more of the start is done again in each of them.
         parts = wp.max(1, wp.int32(wp.float32(parts_max) / wp.sqrt(wp.float32(wp.max(count, 1)))))
         p = (wp.tid() / warp_size()) / parts
         if p >= count:
