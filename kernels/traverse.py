@@ -47,8 +47,8 @@ from warp_abtree.kernels.warps import (
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
-# A visit replaces an item by four at most, each a level deeper in both trees, or by two, a level deeper in one. So depth
-# first leaves three items a level at most, 31 levels deep, and two items at a time six.
+# A visit replaces an item by four at most, each a level deeper in both trees, or by two, a level deeper in one. So
+# depth first leaves three items a level at most, 31 levels deep, and two items at a time six.
 DEPTH_FIRST_ROOM = wp.constant(128)
 DEPTH_FIRST_LENGTH = 256
 depth_first_stack = wp.types.vector(length=DEPTH_FIRST_LENGTH, dtype=wp.int64)
