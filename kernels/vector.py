@@ -64,7 +64,8 @@ ten_numbers = wp.types.vector(length=10, dtype=wp.int64)
         return b;
     };
     wp::int64 mask = 0, compared = 0;
-    const wp::int64 taken[2] = {first, second};
+    // What stands above the top of a stack may be no item.
+    const wp::int64 taken[2] = {first, count > 1 ? second : first};
     #pragma clang loop unroll(full)
     for (int i = 0; i < 2; ++i) {
         const int x = (int)(taken[i] >> 32), y = (int)taken[i], two_a = x < 0, two_b = y < 0;
