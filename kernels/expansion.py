@@ -1,7 +1,7 @@
 """Exact signs by floating-point expansions: sums of float64 components that do not overlap, smallest first.
 
 Source: Shewchuk 1997, Adaptive precision floating-point arithmetic and fast robust geometric predicates.
-Loops count by hand, since Warp unrolls those over a constant range, and this code is inlined at every sign.
+Loops count by hand, since Warp unrolls those over a constant range. Signs are not inlined: one array serves them all.
 Every product below is either exact by `fuse_multiply` or written with a separate sum, and modules that use it compile
 without contraction (`fuse_fp` off on CUDA; Warp's CPU backend does not contract), so no compiler changes a rounding.
 """
@@ -12,8 +12,10 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-# 6 products of three differences, each difference two components, each product of three components four.
-EXPANSION_LENGTH = 192
+# In 3D 6 products of three differences, each difference two components, each product of three components four; in 2D
+# 2 products of two differences, each product of two components two.
+LENGTH_3D = 192
+LENGTH_2D = 16
 
 
 @wp.func_native("""return fma(a, b, c);""")
@@ -124,17 +126,17 @@ def expand_orient2d(sum: wp.array(dtype=wp.float64), a: wp.vec2d, b: wp.vec2d, c
     return length
 
 
-@wp.func
+@wp.func(inline=False)
 def exact_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """Return the sign of det(a - d, b - d, c - d), exactly."""
-    sum = wp.zeros(shape=(EXPANSION_LENGTH,), dtype=wp.float64)
+    sum = wp.zeros(shape=(LENGTH_3D,), dtype=wp.float64)
     length = expand_orient3d(sum, a, b, c, d)
     return leading_sign(sum, length)
 
 
-@wp.func
+@wp.func(inline=False)
 def exact_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
     """Return the sign of det(a - c, b - c), exactly."""
-    sum = wp.zeros(shape=(EXPANSION_LENGTH,), dtype=wp.float64)
+    sum = wp.zeros(shape=(LENGTH_2D,), dtype=wp.float64)
     length = expand_orient2d(sum, a, b, c)
     return leading_sign(sum, length)

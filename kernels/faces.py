@@ -40,7 +40,8 @@ class Hits:
     any_hit, count: shape [pair]. face: (pair, face a, face b), a of the pair's first object, shape [capacity]; total
     numbers them and may wrap, the demand is the sum of count. node_tests to exact_tests: work done,
     shape [pair]; float64_tests are the triangle tests that float32 left open, exact_tests those that took exact signs.
-    unsure: (pair, face of the lower object, face of the higher) that wait for the next stage, shape [capacity].
+    unsure: (pair, face of the lower object, face of the higher) that float32 left open, shape [capacity]; hard: those
+    that float64 left open too, of the same shape where there is such a stage.
     """
 
     any_hit: wp.array(dtype=wp.int32)
@@ -53,6 +54,8 @@ class Hits:
     exact_tests: wp.array(dtype=wp.int64)
     unsure: wp.array(dtype=wp.vec3i)
     unsure_total: wp.array(dtype=wp.int32)
+    hard: wp.array(dtype=wp.vec3i)
+    hard_total: wp.array(dtype=wp.int32)
 
 
 @wp.func

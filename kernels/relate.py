@@ -30,6 +30,7 @@ def relate_pair_kernel(
     if p == 0:
         hits_out.total[0] = 0
         hits_out.unsure_total[0] = 0
+        hits_out.hard_total[0] = 0
     hits_out.any_hit[p] = 0
     hits_out.count[p] = wp.int64(0)
     hits_out.node_tests[p] = wp.int64(0)

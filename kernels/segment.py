@@ -7,7 +7,7 @@ on, and the rounding of its coordinates. Nothing here depends on the order in wh
 
 import warp as wp
 
-from warp_abtree.kernels.expansion import EXPANSION_LENGTH, expand_orient2d, expand_orient3d, sum_expansion
+from warp_abtree.kernels.expansion import LENGTH_2D, LENGTH_3D, expand_orient2d, expand_orient3d, sum_expansion
 from warp_abtree.kernels.flat import find_ends, widest_axis
 from warp_abtree.kernels.predicates import BOUND_2D, BOUND_3D, EXACT, drop_axis, orient2d, orient3d, plain_sign
 from warp_abtree.kernels.triangle import find_alone, is_one_sided
@@ -21,18 +21,18 @@ POINT_ROOM = wp.constant(15)
 NEAREST_STEPS = wp.constant(32)
 
 
-@wp.func
+@wp.func(inline=False)
 def expand_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """Return det(a - d, b - d, c - d) by expansions."""
-    sum = wp.zeros(shape=(EXPANSION_LENGTH,), dtype=wp.float64)
+    sum = wp.zeros(shape=(LENGTH_3D,), dtype=wp.float64)
     length = expand_orient3d(sum, a, b, c, d)
     return sum_expansion(sum, length)
 
 
-@wp.func
+@wp.func(inline=False)
 def expand_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
     """Return det(a - c, b - c) by expansions."""
-    sum = wp.zeros(shape=(EXPANSION_LENGTH,), dtype=wp.float64)
+    sum = wp.zeros(shape=(LENGTH_2D,), dtype=wp.float64)
     length = expand_orient2d(sum, a, b, c)
     return sum_expansion(sum, length)
 

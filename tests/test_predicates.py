@@ -362,8 +362,8 @@ def test_modules_with_signs_do_not_contract():
         "faces",
         "visit",
         "nodes",
+        "double_word",
     )
-    names += ("screen", "faces", "visit", "nodes", "double_word")
     modules = [wp.get_module(importlib.import_module(f"warp_abtree.kernels.{name}").__name__) for name in names]
     makers = (traverse.thread_traversal, traverse.warp_traversal, settle.settle_traversal)
     modules += [make(int(mode)).module for mode in (EXACT, FLOAT64, FLOAT32, faces.WITHIN) for make in makers]

@@ -24,7 +24,7 @@ COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 # Face pairs that the float32 stage leaves open: about one in a hundred. The list grows as needed.
 UNSURE_CAPACITY = 65536
 
-EXACT, FLOAT64 = int(predicates.EXACT), int(predicates.FLOAT64)
+EXACT, FILTER, FLOAT64 = int(predicates.EXACT), int(predicates.FILTER), int(predicates.FLOAT64)
 
 
 def check_request(output: str, precision: str):
@@ -179,6 +179,7 @@ class Query:
         self.hits = faces.Hits()
         self.hits.total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.hits.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self.hits.hard_total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.near = None if within is None else self._make_near()
         self._no_distance = wp.empty(0, dtype=wp.float64, device=self.device)
         self._within = within
@@ -237,7 +238,7 @@ class Query:
 
     def _make_near(self):
         near = faces.Hits()
-        near.total = near.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
+        near.total = near.unsure_total = near.hard_total = wp.zeros(1, dtype=wp.int32, device=self.device)
         return near
 
     def _upload_within(self, within):
@@ -253,7 +254,9 @@ class Query:
             self.within.fill_(float(self._within))
 
     def _resize_unsure(self, capacity: int):
-        self.hits.unsure = wp.empty(capacity, dtype=wp.vec3i, device=self.device)
+        unsure = wp.empty(capacity, dtype=wp.vec3i, device=self.device)
+        self.hits.hard = wp.empty(capacity if self.precision == "exact" else 0, dtype=wp.vec3i, device=self.device)
+        self.hits.unsure = unsure
 
     def uses_warps(self) -> bool:
         """Return whether warps work on the pairs; on the CPU one thread has a pair to itself."""
@@ -312,12 +315,12 @@ class Query:
         self._launch_traversal(self._no_distance, self.hits, mode, output)
         if len(self.hits.unsure):
             pools = [arrays.pool for arrays in self.arrays]
-            wp.launch(
-                settle.settle_traversal(mode),
-                dim=len(self.hits.unsure),
-                inputs=[output, *pools, self.pairs, self.pair_poses, self.hits],
-                device=self.device,
-            )
+            kernels = [settle.settle_traversal(FILTER if mode == EXACT else mode)]
+            if mode == EXACT:
+                kernels.append(settle.settle_hard_kernel)
+            inputs = [output, *pools, self.pairs, self.pair_poses, self.hits]
+            for kernel in kernels:
+                wp.launch(kernel, dim=len(self.hits.unsure), inputs=inputs, device=self.device)
 
     def result(self) -> Result:
         """Return the results of the last launch on the host, sorted. Waits for the device."""
