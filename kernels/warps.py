@@ -1,6 +1,7 @@
 """The threads of a warp at work on one stack in shared memory: a block is a warp, on the CPU one thread.
 
-`warp_sync`, `push_items`, `warp_any`, `reserve_slot` and `add_warp_sum` must be reached by all its threads together.
+All its threads must reach `warp_sync`, `push_items`, `warp_any`, `reserve_slot`, `count_flags` and `add_warp_sum`
+together.
 """
 
 import warp as wp
@@ -171,4 +172,21 @@ def reserve_slot(total: wp.array(dtype=wp.int32), flag: bool) -> wp.int32:
 """)
 def add_warp_sum(totals: wp.array(dtype=wp.int64), i: wp.int32, x: wp.int32):
     """Add a value of every thread to totals[i] with one atomic a warp."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    if (!__any_sync(0xffffffffu, flag))
+        return;
+    unsigned int same = __match_any_sync(0xffffffffu, flag ? i : -1);
+    if (flag && threadIdx.x + 1 == __ffs(same))
+        atomicAdd((unsigned long long*)totals.data + i, (unsigned long long)__popc(same));
+#else
+    if (flag)
+        totals.data[i] += 1;
+#endif
+""")
+def count_flags(totals: wp.array(dtype=wp.int64), i: wp.int32, flag: bool):
+    """Count the set flags into totals[i], i >= 0 of each thread, with one atomic for those that share it."""
     ...

@@ -23,6 +23,8 @@ COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 
 # Face pairs that the float32 stage leaves open: about one in a hundred. The list grows as needed.
 UNSURE_CAPACITY = 65536
+# Warps that work off the lists of face pairs left open: about as many as one device runs at a time.
+SETTLE_WARPS = 2048
 
 EXACT, FILTER, FLOAT64 = int(predicates.EXACT), int(predicates.FILTER), int(predicates.FLOAT64)
 
@@ -318,9 +320,10 @@ class Query:
             kernels = [settle.settle_traversal(FILTER if mode == EXACT else mode)]
             if mode == EXACT:
                 kernels.append(settle.settle_hard_kernel)
-            inputs = [output, *pools, self.pairs, self.pair_poses, self.hits]
+            threads = SETTLE_WARPS * WARP_SIZE if self.device.is_cuda else 1
+            inputs = [threads, output, *pools, self.pairs, self.pair_poses, self.hits]
             for kernel in kernels:
-                wp.launch(kernel, dim=len(self.hits.unsure), inputs=inputs, device=self.device)
+                wp.launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
 
     def result(self) -> Result:
         """Return the results of the last launch on the host, sorted. Waits for the device."""
