@@ -1,12 +1,18 @@
-"""python -m bench exact|memory|peers|precision|query|sweep|update [--device D] [--json FILE]"""
+"""python -m bench exact|memory|peers|precision|query|scale|sweep|update [--device D] [--json FILE] [...]"""
 
 import argparse
+import datetime
+import inspect
 import json
+import platform
 import sys
 
+import numpy as np
 import warp as wp
 
-from . import exact, memory, peers, precision, query, sweep, update
+import warp_abtree as ab
+
+from . import exact, memory, peers, plots, precision, query, scale, sweep, update
 
 CASES = {
     "exact": exact.run,
@@ -14,9 +20,13 @@ CASES = {
     "peers": peers.run,
     "precision": precision.run,
     "query": query.run,
+    "scale": scale.run,
     "sweep": sweep.run,
     "update": update.run,
 }
+FIGURES = {"scale": scale.FIGURES, "update": update.FIGURES}
+# What only some cases take, by the name of their argument.
+OPTIONS = ("count", "processes", "quick", "largest", "models")
 
 
 def main(argv=None):
@@ -24,21 +34,50 @@ def main(argv=None):
     parser.add_argument("name", choices=sorted(CASES))
     parser.add_argument("--device", default=None)
     parser.add_argument("--json", metavar="FILE", help="write the rows to a file as well")
+    parser.add_argument("--quick", action="store_true", default=None, help="the smallest sizes, to try a case out")
+    parser.add_argument("--largest", type=int, metavar="FACES", help="scale, update: leave larger meshes out")
+    parser.add_argument("--models", metavar="DIR", help="scale, update: keep the models there for the next run")
+    parser.add_argument("--plots", metavar="DIR", help="scale, update: draw SVG figures there (needs matplotlib)")
+    parser.add_argument("--rows", metavar="FILE", help="with --plots: draw what --json wrote, in place of a run")
     parser.add_argument("--count", type=int, help="exact: random pairs; a tenth as many adversarial ones")
     parser.add_argument("--processes", type=int, help="exact: processes that run the oracle")
     options = parser.parse_args(argv)
-    sizes = {name: getattr(options, name) for name in ("count", "processes") if getattr(options, name) is not None}
-    if sizes and options.name != "exact":
-        parser.error("--count and --processes belong to exact")
-    wp.config.log_level = wp.LOG_WARNING
-    rows = []
-    for row in CASES[options.name](options.device, **sizes):
-        rows.append(row)
-        print("  ".join(f"{key}={value}" for key, value in row.items()), flush=True)
+    run = CASES[options.name]
+    asked = {name: getattr(options, name) for name in OPTIONS if getattr(options, name) is not None}
+    for name in asked:
+        if name not in inspect.signature(run).parameters:
+            parser.error(f"{options.name} takes no --{name}")
+    if options.plots and options.name not in FIGURES:
+        parser.error(f"{options.name} takes no --plots")
+    if options.rows and (not options.plots or options.json):
+        parser.error("--rows goes with --plots, without --json")
+    if options.rows:
+        with open(options.rows) as file:
+            rows = json.load(file)["rows"]
+    else:
+        rows = print_rows(run(options.device, **asked))
     if options.json:
         with open(options.json, "w") as file:
-            json.dump({"warp": wp.config.version, "rows": rows}, file, indent=1)
+            json.dump({**describe_run(), "rows": rows}, file, indent=1)
+    if options.plots:
+        print(plots.draw(rows, FIGURES[options.name], options.plots), flush=True)
     return 0
+
+
+def print_rows(found):
+    """Print rows as they come and return them."""
+    wp.config.log_level = wp.LOG_WARNING
+    rows = []
+    for row in found:
+        rows.append(row)
+        print("  ".join(f"{key}={value}" for key, value in row.items()), flush=True)
+    return rows
+
+
+def describe_run():
+    """Return versions and date."""
+    versions = {"warp": wp.config.version, "warp_abtree": ab.__version__, "numpy": np.__version__}
+    return versions | {"python": platform.python_version(), "date": datetime.date.today().isoformat()}
 
 
 if __name__ == "__main__":

@@ -8,36 +8,53 @@ import warp_abtree as ab
 
 from .shapes import knot, pair_poses
 
+FULL = {"faces": (200, 5000, 60000, 1_000_000), "knots": (1000, 2000, 4000), "balls": (3, 4), "objects": 10000}
+QUICK = {"faces": (200,), "knots": (200,), "balls": (1,), "objects": 32}
+
 
 def count_bytes(holder):
     """Return the bytes of all arrays among an object's attributes."""
     return sum(value.capacity for value in vars(holder).values() if isinstance(value, wp.array))
 
 
-def scenes(device):
+def held_mib(scene, query=None) -> float:
+    """Return what the arrays of a scene, and of a query over it, hold [MiB]; the tree of the broad phase left out."""
+    total = sum(count_bytes(arrays.pool) for arrays in scene.arrays())
+    if query is not None:
+        total += count_bytes(query) + count_bytes(query.hits)
+        if query.broad_phase is not None:
+            # Its pairs are the query's.
+            total += count_bytes(query.broad_phase) - query.pairs.capacity - query.pair_count.capacity
+    return round(total / 2**20, 3)
+
+
+def scenes(device, sizes):
     """Yield (name, scene, faces of all models)."""
-    for size in (200, 5000, 60000, 1_000_000):
+    for size in sizes["faces"]:
         model = ab.Model.from_arrays(*knot(size))
         scene = ab.Scene(device)
         scene.add(model)
         scene.add(model, (0.5, 0, 0, 0, 0, 0, 1))
         yield f"a knot of {model.face_count:,} faces, twice", scene, model.face_count
-    models = [ab.Model.from_arrays(*knot(size)) for size in (1000, 2000, 4000)]
-    for subdivisions in (3, 4):
+    models = [ab.Model.from_arrays(*knot(size)) for size in sizes["knots"]]
+    for subdivisions in sizes["balls"]:
         ball = trimesh.creation.icosphere(subdivisions)
         models.append(ab.Model.from_arrays(ball.vertices, ball.faces))
     scene = ab.Scene(device)
-    poses = pair_poses(5000, 3.0)
-    for i in range(10000):
-        model = models[i % 5]
-        scene.add(model, poses[i], lod=model.lod_max * (i // 5 % 8 + 1) // 8)
-    yield "10,000 objects of 5 models at 8 LODs", scene, sum(model.face_count for model in models)
+    for i, pose in enumerate(pair_poses(sizes["objects"] // 2, 3.0)):
+        model = models[i % len(models)]
+        scene.add(model, pose, lod=model.lod_max * (i // len(models) % 8 + 1) // 8)
+    yield (
+        f"{scene.object_count:,} objects of {len(models)} models at 8 LODs",
+        scene,
+        sum(model.face_count for model in models),
+    )
 
 
-def run(device):
+def run(device, quick=False):
     """Yield one row a scene: objects, states, and bytes: of the models and the states a face, an object, a pair."""
     device = wp.get_device(device)
-    for name, scene, faces in scenes(device):
+    for name, scene, faces in scenes(device, QUICK if quick else FULL):
         models, states, objects = scene.arrays()
         pairs = np.stack([np.arange(scene.object_count - 1), np.arange(1, scene.object_count)], 1)
         query = ab.Query(scene, "any", pairs=pairs)

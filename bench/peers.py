@@ -25,6 +25,8 @@ REAL = {
     "bunny-bunny": ("stanford-bunny", "stanford-bunny"),
     "env-rob": ("fcl-env", "fcl-rob"),
 }
+FULL = {"faces": 5000, "poses": 200, "repeats": 5}
+QUICK = {"faces": 300, "poses": 6, "repeats": 1}
 ALL_CONTACTS = 2**31 - 1
 JUDGED_MAX = 20_000
 
@@ -160,9 +162,9 @@ PEERS = (FclPeer, TrimeshPeer, CoalPeer)
 # --- workloads -------------------------------------------------------------------------------------------------------
 
 
-def workloads():
+def workloads(face_target):
     """Yield (name, model of A, model of B): the knot, and what the folder in ABTREE_MESHES has of the real ones."""
-    model = ab.Model.from_arrays(*knot(5000), name="knot")
+    model = ab.Model.from_arrays(*knot(face_target), name="knot")
     yield "knot-knot", model, model
     folder = Path(os.environ.get("ABTREE_MESHES", ""))
     for name, stems in REAL.items():
@@ -295,12 +297,13 @@ def run_to_host(query):
     return run
 
 
-def run(device, pose_count=200, repeats=5):
+def run(device, quick=False):
     """Yield one row a workload and peer: differences, queries a second of both and ratios (ours over the peer)."""
     device = wp.get_device(device)
+    sizes = QUICK if quick else FULL
     with one_core() as core:
-        for name, model_a, model_b in workloads():
-            yield from run_workload(name, model_a, model_b, device, core, pose_count, repeats)
+        for name, model_a, model_b in workloads(sizes["faces"]):
+            yield from run_workload(name, model_a, model_b, device, core, sizes["poses"], sizes["repeats"])
 
 
 def run_workload(name, model_a, model_b, device, core, pose_count, repeats):

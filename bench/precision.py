@@ -12,23 +12,24 @@ from .shapes import knot, pair_poses
 from .timing import time_in_turn
 
 PRECISIONS = ("exact", "float64", "float32")
+FULL = {"faces": 5000, "subdivisions": 4, "pairs": 256, "laid": 16, "repeats": 11}
+QUICK = {"faces": 300, "subdivisions": 1, "pairs": 3, "laid": 1, "repeats": 1}
 
 
-def scenes():
+def scenes(sizes):
     """Yield (name, model, poses of objects 2p and 2p + 1)."""
-    model = ab.Model.from_arrays(*knot(5000), name="knot 4,794")
+    tangle = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
     for distance in (0.9, 0.2):
-        yield f"knots, centres {distance} apart", model, pair_poses(256, distance)
-    ball = trimesh.creation.icosphere(4)
-    model = ab.Model.from_arrays(0.5 * ball.vertices, ball.faces, name="ball 5,120")
-    yield "balls, centres 0.7 apart", model, pair_poses(256, 0.7)
-    model = ab.Model.from_arrays(*knot(5000), name="knot 4,794")
-    poses = pair_poses(16, 0.9)
+        yield f"knots, centres {distance} apart", tangle, pair_poses(sizes["pairs"], distance)
+    ball = trimesh.creation.icosphere(sizes["subdivisions"])
+    model = ab.Model.from_arrays(0.5 * ball.vertices, ball.faces, name="ball")
+    yield "balls, centres 0.7 apart", model, pair_poses(sizes["pairs"], 0.7)
+    poses = pair_poses(sizes["laid"], 0.9)
     poses[1::2] = poses[::2]
-    yield "a knot laid on itself, turned", model, poses
+    yield "a knot laid on itself, turned", tangle, poses
     poses = poses.copy()
     poses[:] = [0, 0, 0, 0, 0, math.sqrt(0.5), math.sqrt(0.5)]
-    yield "a knot laid on itself, a quarter turn", model, poses
+    yield "a knot laid on itself, a quarter turn", tangle, poses
 
 
 def count_differences(faces, truth):
@@ -37,11 +38,12 @@ def count_differences(faces, truth):
     return len(rows - kept), len(kept - rows)
 
 
-def run(device, repeats=11):
+def run(device, quick=False):
     """Yield one row a scene: hits, share of face pairs that reach float64 and expansions, and for each precision pairs
     missed, pairs invented and the median time of a launch [ms], and what exact costs beside float32."""
     device = wp.get_device(device)
-    for name, model, poses in scenes():
+    sizes = QUICK if quick else FULL
+    for name, model, poses in scenes(sizes):
         scene = ab.Scene(device=device)
         for pose in poses:
             scene.add(model, pose=pose)
@@ -51,7 +53,7 @@ def run(device, repeats=11):
             query = ab.Query(scene, output="faces", pairs=pairs, precision=precision)
             found[precision] = query.run()
             queries[precision] = query
-        times = time_in_turn({p: query.launch for p, query in queries.items()}, device, repeats)
+        times = time_in_turn({p: query.launch for p, query in queries.items()}, device, sizes["repeats"])
         exact = found["exact"]
         asked = exact.triangle_tests.sum()
         row = {"device": device.name, "scene": name, "hits": len(exact.faces), "triangle_tests": int(asked)}

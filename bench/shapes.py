@@ -1,6 +1,10 @@
-"""Meshes and poses of the benchmarks, made the same to the bit everywhere."""
+"""Meshes, models and poses of the benchmarks, made the same to the bit everywhere."""
+
+from pathlib import Path
 
 import numpy as np
+
+import warp_abtree as ab
 
 
 def knot(face_target):
@@ -40,3 +44,14 @@ def pair_poses(pair_count, distance, seed=0):
     x[:, 3:] = q
     x[1::2, :3] = d * distance
     return x
+
+
+def knot_model(face_target, folder=None):
+    """Return the model of `knot`, which takes minutes for a million faces; a folder keeps it between runs."""
+    if folder is None:
+        return ab.Model.from_arrays(*knot(face_target), name=f"knot {face_target}")
+    path = Path(folder) / f"knot-{face_target}.npz"
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        ab.Model.from_arrays(*knot(face_target), name=f"knot {face_target}").save(path)
+    return ab.Model.open(path)

@@ -12,10 +12,14 @@ import warp_abtree as ab
 from .shapes import knot
 from .timing import time_in_turn
 
+FULL = {"faces": 5000, "counts": (1024, 65536), "repeats": 11}
+QUICK = {"faces": 300, "counts": (16,), "repeats": 1}
 
-def models():
+
+def models(sizes):
     """Yield the knot, and the cow if the folder in ABTREE_MESHES has it."""
-    yield "knot 4,794", ab.Model.from_arrays(*knot(5000))
+    model = ab.Model.from_arrays(*knot(sizes["faces"]))
+    yield f"knot {model.face_count:,}", model
     cow = Path(os.environ.get("ABTREE_MESHES", "")) / "cow.obj.gz"
     if cow.is_file():
         yield "cow 5,804", ab.Model.load(cow)
@@ -28,11 +32,12 @@ def random_poses(count, size, seed=0):
     return np.concatenate([size * rng.uniform(-1, 1, (count, 3)), q / np.linalg.norm(q, axis=1, keepdims=True)], 1)
 
 
-def run(device, counts=(1024, 65536), repeats=11):
+def run(device, quick=False):
     """Yield one row a model and number of poses: share that meets, million poses a second, launch alone and `sweep`."""
     device = wp.get_device(device)
-    for name, model in models():
-        for count in counts:
+    sizes = QUICK if quick else FULL
+    for name, model in models(sizes):
+        for count in sizes["counts"]:
             poses = random_poses(count, np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())
             scene = ab.Scene(device)
             scene.add(model)
@@ -40,7 +45,7 @@ def run(device, counts=(1024, 65536), repeats=11):
                 scene.add(model, pose)
             query = ab.Query(scene, "any", pairs=[(0, i + 1) for i in range(count)])
             result = query.run()
-            (times,) = time_in_turn({"any": query.launch}, device, repeats).values()
+            (times,) = time_in_turn({"any": query.launch}, device, sizes["repeats"]).values()
             ab.sweep(model, model, poses, device=device)
             begin = time.perf_counter()
             found = ab.sweep(model, model, poses, device=device)

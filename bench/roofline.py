@@ -1,0 +1,116 @@
+"""Bytes and operations of a query, counted from its result's counters, beside what the device can do.
+
+Counted is what the algorithm cannot do without, so every share below is a lower bound of the true one: an operation is
+an addition, subtraction, multiplication or comparison of real numbers, a fused multiply-add is two; absolute values,
+choices and integers cost nothing, and nothing is loaded twice within one test. Bytes are those asked of memory,
+whether a cache has them or not; stacks in shared memory or registers are left out.
+
+* node test (kernels/visit.py, boxes.py): a visit of four comparisons loads four records of 32 bytes. It poses four
+  boxes: 6 operations for sum and size, 18 for the image of the sum, 15 for that of the size, 3 for reach; 6 more widen
+  each of A's two. A comparison is 6 subtractions, 6 additions, 6 comparisons, and 2 to choose what follows. In all
+  2 (48 + 42) + 4 * 20 = 260, so 65 operations and 32 bytes a test. (A visit of two comparisons does the same work for
+  half as many tests.)
+* triangle test (kernels/faces.py, screen.py): 2 corner triples of 12 bytes and 6 vertices of 16; 18 operations to scale
+  six corners and 54 to pose three. A plane and three signs: 15 for differences, 9 for the normal, 10 for sizes of
+  vectors and 2 for the largest, 11 for the bound, 15 for dot products, 6 for signs, 68 in all. Most pairs end there.
+  A pair that meets goes through a second plane and two more signs of 42 each: 152 more.
+* float64 test (kernels/faces.py, predicates.py): 2 corner triples and 6 vertices of 24 bytes; 63 operations to pose
+  three, and at least three signs of 34 each, in float64.
+* exact test: the same again, and at least one sign in double words (kernels/double_word.py): 54 for differences, 120
+  for minors, 30 and 40 for the rest.
+* an object pair: a relative pose of 180 bytes, written and read; a hit: 12 bytes.
+"""
+
+import time
+
+import numpy as np
+import warp as wp
+
+NODE_BYTES, NODE_FLOPS = 32, 65
+TRIANGLE_BYTES, TRIANGLE_FLOPS, HIT_FLOPS = 2 * 12 + 6 * 16, 18 + 54 + 68, 68 + 2 * 42
+FLOAT64_BYTES, FLOAT64_FLOPS = 2 * 12 + 6 * 24, 63 + 3 * 34
+EXACT_BYTES, EXACT_FLOPS = FLOAT64_BYTES, FLOAT64_FLOPS + 54 + 120 + 30 + 40
+PAIR_BYTES, HIT_BYTES = 2 * 180, 12
+
+# Published peaks: memory [bytes/s], float32 and float64 without tensor cores [operations/s], by a part of the name.
+PEAKS = {
+    "H200": (4.8e12, 66.9e12, 33.5e12),
+    "H100 PCIe": (2.0e12, 51.2e12, 25.6e12),
+    "H100": (3.35e12, 66.9e12, 33.5e12),
+    "A100": (1.555e12, 19.5e12, 9.7e12),
+}
+
+
+def measure_peaks(side=1024, words=2**25):
+    """Return what the processor reaches, all its cores: memory by a copy, operations by a product of matrices."""
+
+    def least(run):
+        times = []
+        for _ in range(5):
+            begin = time.perf_counter()
+            run()
+            times.append(time.perf_counter() - begin)
+        return min(times)
+
+    a, b = np.ones(words, np.float32), np.zeros(words, np.float32)
+    peaks = [2 * a.nbytes / least(lambda: np.copyto(b, a))]
+    for dtype in (np.float32, np.float64):
+        m = np.ones((side, side), dtype)
+        out = np.empty_like(m)
+        peaks.append(2 * side**3 / least(lambda m=m, out=out: np.matmul(m, m, out=out)))
+    return tuple(peaks)
+
+
+def find_peaks(device):
+    """Return a device's peaks as in `PEAKS`: measured on the CPU, published on CUDA; None for a name not listed."""
+    if device.is_cpu:
+        return measure_peaks()
+    return next((peaks for name, peaks in PEAKS.items() if name in device.name), None)
+
+
+def count_work(result):
+    """Return bytes, float32 and float64 operations that a result's counters stand for."""
+    nodes, triangles, doubles, exact = (
+        int(getattr(result, name).sum(dtype=np.int64))
+        for name in ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
+    )
+    hits = int(result.any.sum() if result.count is None else result.count.sum(dtype=np.int64))
+    written = hits if result.faces is not None else 0
+    size = NODE_BYTES * nodes + TRIANGLE_BYTES * triangles + FLOAT64_BYTES * doubles + EXACT_BYTES * exact
+    size += PAIR_BYTES * len(result.pairs) + HIT_BYTES * written
+    single = NODE_FLOPS * nodes + TRIANGLE_FLOPS * triangles + HIT_FLOPS * max(hits - doubles, 0)
+    return size, single, FLOAT64_FLOPS * doubles + EXACT_FLOPS * exact
+
+
+def roofline(result, milliseconds, peaks) -> dict:
+    """Return columns: node tests a second, work, rates, and what shares of the peaks they are.
+
+    floor_ms is the time that the scarcest of the three would take if it alone were at its peak all the time.
+    """
+    seconds = 1e-3 * milliseconds
+    size, single, double = count_work(result)
+    row = {
+        "node_tests_per_s": float(f"{result.node_tests.sum(dtype=np.int64) / seconds:.4g}"),
+        "bytes": size,
+        "float32_ops": single,
+        "float64_ops": double,
+        "ops_per_byte": round((single + double) / size, 2),
+        "gb_per_s": float(f"{1e-9 * size / seconds:.4g}"),
+        "gflop_per_s": float(f"{1e-9 * (single + double) / seconds:.4g}"),
+    }
+    if peaks is not None:
+        floors = [work / peak for work, peak in zip((size, single, double), peaks, strict=True)]
+        for name, floor in zip(("memory", "float32", "float64"), floors, strict=True):
+            row[f"{name}_share"] = float(f"{floor / seconds:.3g}")
+        row["floor_ms"] = float(f"{1e3 * max(floors):.4g}")
+    return row
+
+
+def used_memory(device) -> dict:
+    """Return columns of memory [MiB] in use on a CUDA device: Warp's pool, and all that is taken; none on the CPU."""
+    if device.is_cpu:
+        return {}
+    wp.synchronize_device(device)
+    taken = device.total_memory - device.free_memory
+    pool = wp.get_mempool_used_mem_current(device) if wp.is_mempool_enabled(device) else None
+    return {"pool_mib": None if pool is None else round(pool / 2**20, 1), "taken_mib": round(taken / 2**20, 1)}
