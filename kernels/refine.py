@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_abtree.kernels.plan import UpdatePlan, find_update, item_count, list_length
 from warp_abtree.kernels.pools import ModelPool, StatePool
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -39,61 +40,43 @@ def refine_face(models: ModelPool, states: StatePool, state: wp.int32, face: wp.
 
 
 @wp.kernel
-def refine_slice_kernel(
-    entry_count: wp.int32,
-    models: ModelPool,
-    entry_end: wp.array(dtype=wp.int32),
-    update_state: wp.array(dtype=wp.int32),
-    update_slice: wp.array(dtype=wp.int32),
-    states_inout: StatePool,
-):
+def refine_slice_kernel(step: wp.int32, models: ModelPool, plan: UpdatePlan, states_inout: StatePool):
     """Refine every face that the slices of partial updates list.
 
     A slice may list a face twice; both threads write the same corners, whichever old ones they read.
 
     Args:
-        entry_end: Running total of slice lengths, shape [update_count].
-        update_state: State of each update, shape [update_count].
-        update_slice: Where its slice begins in split_face, shape [update_count].
+        step: Threads of this launch.
     """
-    tid = wp.tid()
-    if tid >= entry_count:
-        return
-    u = wp.lower_bound(entry_end, tid + 1)
-    begin = wp.int32(0)
-    if u > 0:
-        begin = entry_end[u - 1]
-    state = update_state[u]
-    face = models.split_face[update_slice[u] + tid - begin]
-    states_inout.face_corner[states_inout.face_start[state] + face] = refine_face(models, states_inout, state, face)
+    updates = list_length(plan.partial_total)
+    entries = item_count(plan.partial_total)
+    entry = wp.tid()
+    while entry < entries:
+        u, i = find_update(plan.entry_end, updates, entry)
+        state = plan.partial_state[u]
+        face = models.split_face[plan.slice_start[u] + i]
+        at = states_inout.face_start[state] + face
+        states_inout.face_corner[at] = refine_face(models, states_inout, state, face)
+        entry += step
 
 
 @wp.kernel
-def refine_all_kernel(
-    models: ModelPool,
-    face_end: wp.array(dtype=wp.int32),
-    update_state: wp.array(dtype=wp.int32),
-    update_id: wp.array(dtype=wp.int32),
-    states_inout: StatePool,
-    changed_count_out: wp.array(dtype=wp.int32),
-):
+def refine_all_kernel(step: wp.int32, models: ModelPool, states_inout: StatePool, plan_inout: UpdatePlan):
     """Refine every face of the states under full update and count those that change.
 
     Args:
-        face_end: Running total of face counts, shape [update_count].
-        update_state: State of each update, shape [update_count].
-        update_id: Where each update counts, shape [update_count].
+        step: Threads of this launch.
     """
-    tid = wp.tid()
-    u = wp.lower_bound(face_end, tid + 1)
-    begin = wp.int32(0)
-    if u > 0:
-        begin = face_end[u - 1]
-    state = update_state[u]
-    face = tid - begin
-    at = states_inout.face_start[state] + face
-    old = states_inout.face_corner[at]
-    new = refine_face(models, states_inout, state, face)
-    if new[0] != old[0] or new[1] != old[1] or new[2] != old[2]:
-        states_inout.face_corner[at] = new
-        wp.atomic_add(changed_count_out, update_id[u], 1)
+    updates = list_length(plan_inout.full_total)
+    faces = item_count(plan_inout.full_total)
+    item = wp.tid()
+    while item < faces:
+        u, face = find_update(plan_inout.face_end, updates, item)
+        state = plan_inout.full_state[u]
+        at = states_inout.face_start[state] + face
+        old = states_inout.face_corner[at]
+        new = refine_face(models, states_inout, state, face)
+        if new[0] != old[0] or new[1] != old[1] or new[2] != old[2]:
+            states_inout.face_corner[at] = new
+            wp.atomic_add(plan_inout.changed_count, state, 1)
+        item += step

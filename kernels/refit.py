@@ -4,6 +4,7 @@ import warp as wp
 
 from warp_abtree.kernels.boxes import round_down_vec, round_up_vec
 from warp_abtree.kernels.nodes import Node, empty_node, load_node, store_node
+from warp_abtree.kernels.plan import UpdatePlan
 from warp_abtree.kernels.pools import ACTIVE, INACTIVE, ModelPool, StatePool
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -63,44 +64,30 @@ def refit_node(models: ModelPool, states: StatePool, state: wp.int32, node: wp.i
 
 
 @wp.kernel
-def refit_level_kernel(
-    level: wp.int32,
-    models: ModelPool,
-    level_start: wp.array(dtype=wp.int32),
-    level_count: wp.array(dtype=wp.int32),
-    level_node: wp.array(dtype=wp.vec2i),
-    states_inout: StatePool,
-):
-    """Refit every marked node of one level.
+def refit_level_kernel(step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdatePlan, states_inout: StatePool):
+    """Refit every marked node of one level, and every node of this level in the states under full update.
 
+    Args:
+        step: Threads of this launch.
     Invariant: children of this level are final, since levels go deepest first.
     Source: Liu et al. 2006, section 3.2.2, ACTIVE-REFIT; Algorithm 3.
     """
-    tid = wp.tid()
-    if tid >= level_count[level]:
-        return
-    item = level_node[level_start[level] + tid]
-    refit_node(models, states_inout, item[0], item[1])
-
-
-@wp.kernel
-def refit_whole_level_kernel(
-    level: wp.int32,
-    models: ModelPool,
-    update_state: wp.array(dtype=wp.int32),
-    states_inout: StatePool,
-):
-    """Refit every node of one level in the states under full update, one thread a node.
-
-    Invariant: children of this level are final.
-    """
-    tid = wp.tid()
-    state = update_state[tid >> level]
-    node = (1 << level) + (tid & ((1 << level) - 1))
-    # A heap index without a node lies under a leaf of the level above.
-    if level > 0 and models.node_face[models.node_start[states_inout.model[state]] + (node >> 1)] >= 0:
-        return
-    refit_node(models, states_inout, state, node)
+    marked = plan.level_count[level]
+    items = marked + (plan.whole_count[level] << level)
+    item = wp.tid()
+    while item < items:
+        if item < marked:
+            listed = plan.level_node[plan.level_start[level] + item]
+            refit_node(models, states_inout, listed[0], listed[1])
+        else:
+            whole = item - marked
+            state = plan.whole_state[plan.whole_start[level] + (whole >> level)]
+            node = (1 << level) + (whole & ((1 << level) - 1))
+            # A heap index without a node lies under a leaf of the level above.
+            up = models.node_start[states_inout.model[state]] + (node >> 1)
+            if level == 0 or models.node_face[up] < 0:
+                refit_node(models, states_inout, state, node)
+        item += step
 
 
 @wp.kernel

@@ -6,12 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_abtree.kernels import plan as plan_kernels
 from warp_abtree.kernels import refine, refit
+from warp_abtree.kernels.pools import LEVEL_MAX
 from warp_abtree.state import ModelArrays, ObjectArrays, StateArrays
-from warp_abtree.tree import UpdateBatch, active_update
+from warp_abtree.tree import UpdateBatch, UpdateWork, active_update, launch_items, make_level_lists
 
 # Past this share of the faces in its slice, a state is refitted whole. A slice repeats faces, so k is smaller still.
 FULL_SHARE = 0.5
+
+# Wishes on the device that could not be met, and the lowest index that had one.
+NO_FAULTS = (0, 2**31 - 1)
 
 
 class UpdateStats:
@@ -31,7 +36,7 @@ class UpdateStats:
     @property
     def k(self) -> np.ndarray:
         """Distinct faces inserted, removed or deformed, int32 (u,). Waits for the device."""
-        return self._batch.changed_count.numpy()[: len(self.state)]
+        return self._batch.plan.changed_count.numpy()[self.state]
 
     @property
     def nodes_refitted(self) -> np.ndarray:
@@ -39,7 +44,7 @@ class UpdateStats:
 
         At most k (log2 n - log2 k + 2) - 1 where the update is partial (equation 1, n rounded up to a power of two).
         """
-        marked = self._batch.marked_count.numpy()[: len(self.state)]
+        marked = self._batch.plan.marked_count.numpy()[self.state]
         return np.where(self.full, 2 * self._batch.face_count - 1, marked).astype(np.int32)
 
 
@@ -118,6 +123,7 @@ def _make_batch(models: ModelArrays, states: StateArrays, plan: Plan) -> UpdateB
         np.array(length, np.int64),
         models.depth[owner],
         models.face_count[owner],
+        len(states.slots),
         states.device,
     )
 
@@ -146,36 +152,130 @@ def _copy_states(models: ModelArrays, states: StateArrays, plan: Plan, batch: Up
     launch(refit.copy_node_kernel, partial, [models.node_count[r[2]] for r in partial])
 
 
-def refine_meshes(models: ModelArrays, states: StateArrays, batch: UpdateBatch):
+def refine_meshes(models: ModelArrays, states: StateArrays, work: UpdateWork):
     """Set the active ancestors of every face corner that changes. Launches only."""
-    if batch.entry_count:
-        wp.launch(
-            refine.refine_slice_kernel,
-            dim=batch.entry_count,
-            inputs=[
-                batch.entry_count,
-                models.pool,
-                batch.entry_end,
-                batch.partial_state,
-                batch.partial_slice,
-                states.pool,
-            ],
-            device=states.device,
-        )
-    if batch.full_face_count:
-        wp.launch(
-            refine.refine_all_kernel,
-            dim=batch.full_face_count,
-            inputs=[
-                models.pool,
-                batch.full_face_end,
-                batch.full_state,
-                batch.full_id,
-                states.pool,
-                batch.changed_count,
-            ],
-            device=states.device,
-        )
+    inputs = [models.pool, work.plan, states.pool]
+    launch_items(refine.refine_slice_kernel, work.entry_room, inputs, states.device)
+    inputs = [models.pool, states.pool, work.plan]
+    launch_items(refine.refine_all_kernel, work.face_room, inputs, states.device)
+
+
+def _carry_out(models: ModelArrays, states: StateArrays, plan: Plan) -> UpdateBatch:
+    """Bring states to their LODs, copies before anything moves."""
+    batch = _make_batch(models, states, plan)
+    if plan.state:
+        for state, lod in zip(plan.state, plan.lod, strict=True):
+            states.slots[state].lod = lod
+        states.upload_slots()
+        _copy_states(models, states, plan, batch)
+        refine_meshes(models, states, batch)
+        active_update(models.pool, states.pool, batch)
+    return batch
+
+
+def build_states(models: ModelArrays, states: StateArrays, state_model, lods) -> list:
+    """Make a state for each model and LOD of two lists, of its own each, and return their ids.
+
+    Raises:
+        ValueError: The pool would pass 2^30 nodes.
+    """
+    ids = states.reserve(state_model)
+    _carry_out(models, states, Plan(ids, [int(lod) for lod in lods], [-1] * len(ids)))
+    return ids
+
+
+class LodUpdate(UpdateWork):
+    """Bring every state of a pool to LODs that stand on the device, planned there: allocates once, launches many.
+
+    The worklists have room for the worst case: every state moves, by the longest slice that is not refitted whole.
+    From the first launch on, LODs of states are known on the device only (`StatePool.lod`).
+
+    Args:
+        models, states: A pool that grows no more.
+
+    Attributes:
+        wanted: LOD of each state, device int32 (s,), to be written before a launch.
+        faults: LODs wanted out of range (the nearer end is taken) and the lowest state that had one, device int32 (2,).
+    """
+
+    def __init__(self, models: ModelArrays, states: StateArrays):
+        self.models, self.states = models, states
+        device = states.device
+        owner = np.array([slot.model for slot in states.slots])
+        bounds = [len(bound) for bound in models.split_bounds]
+        longest = np.array([bound[-1] - bound[0] for bound in models.split_bounds])
+        partial_max = np.minimum(longest, np.floor(FULL_SHARE * models.face_count).astype(np.int64))
+        entries, depth = partial_max[owner], models.depth[owner]
+        levels = range(int(depth.max()) + 1)
+        level_room = [int(np.sum(depth >= level)) << level for level in levels]
+        marked_room = [int(np.minimum(entries, 1 << level)[depth >= level].sum()) for level in levels]
+        whole_room = np.array([np.sum(depth >= level) for level in range(int(LEVEL_MAX))])
+        count = len(owner)
+
+        def upload(values):
+            return wp.array(np.asarray(values, np.int64), dtype=wp.int32, device=device)
+
+        def room(length, dtype=wp.int32):
+            return wp.zeros(length, dtype=dtype, device=device)
+
+        self.splits = plan_kernels.SplitTable()
+        self.splits.bound = upload(np.concatenate(models.split_bounds))
+        self.splits.bound_start = upload(np.cumsum(bounds) - bounds)
+        self.splits.partial_max = upload(partial_max)
+        self.splits.depth = upload(models.depth)
+        plan = plan_kernels.UpdatePlan()
+        plan.partial_total, plan.full_total = room(1, wp.int64), room(1, wp.int64)
+        for name in ("partial_state", "slice_start", "entry_end", "full_state", "face_end"):
+            setattr(plan, name, room(count))
+        plan.changed_count, plan.marked_count = room(count), room(count)
+        plan.whole_count = room(int(LEVEL_MAX))
+        plan.whole_start = upload(np.cumsum(whole_room) - whole_room)
+        plan.whole_state = room(int(whole_room.sum()))
+        make_level_lists(plan, marked_room, device)
+        self.wanted = upload([slot.lod for slot in states.slots])
+        self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=device)
+        super().__init__(plan, int(entries.sum()), int(models.face_count[owner].sum()), level_room, device)
+
+    def launch(self):
+        """Refine meshes and update trees. Launches only: five, and one a level of the deepest tree."""
+        count = len(self.wanted)
+        wp.launch(plan_kernels.clear_plan_kernel, max(count, int(LEVEL_MAX)), [self.plan], device=self.device)
+        inputs = [self.models.pool, self.splits, self.wanted, self.states.pool, self.plan, self.faults]
+        wp.launch(plan_kernels.plan_update_kernel, count, inputs, device=self.device)
+        refine_meshes(self.models, self.states, self)
+        active_update(self.models.pool, self.states.pool, self)
+
+
+class LodLadder:
+    """Serve LODs that stand on the device from states made beforehand: no tree is ever updated.
+
+    Args:
+        rungs: LODs of each model that states are made for, rising.
+        lods: LOD that each object starts at, int (n,).
+
+    Attributes:
+        wanted: LOD of each object, device int32 (n,), to be written before a launch; the coarsest rung that is not
+            coarser serves it.
+        faults: LODs wanted below 0 or beyond the last rung (the nearer end is taken) and the lowest object that had
+            one, device int32 (2,).
+
+    Raises:
+        ValueError: The pool would pass 2^30 nodes.
+    """
+
+    def __init__(self, models: ModelArrays, states: StateArrays, objects: ObjectArrays, object_model, rungs, lods):
+        self.states, self.objects, self.device = states, objects, states.device
+        starts = np.concatenate([[0], np.cumsum([len(part) for part in rungs])])
+        build_states(models, states, np.repeat(np.arange(len(rungs)), np.diff(starts)), np.concatenate(rungs))
+        objects.set_states(starts[object_model])
+        self.rung_start = wp.array(starts, dtype=wp.int32, device=self.device)
+        self.wanted = wp.array(np.asarray(lods), dtype=wp.int32, device=self.device)
+        self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=self.device)
+
+    def launch(self):
+        """Point objects at other states. One launch."""
+        inputs = [self.states.pool, self.rung_start, self.wanted, self.objects.pool, self.faults]
+        wp.launch(plan_kernels.pick_state_kernel, len(self.wanted), inputs, device=self.device)
 
 
 def set_object_lods(
@@ -191,14 +291,7 @@ def set_object_lods(
     wanted = [(int(m), int(lod)) for m, lod in keys]
     used = {int(s) for s in objects.state if s >= 0}
     plan, chosen = _plan(states, set(wanted), used)
-    batch = _make_batch(models, states, plan)
-    if plan.state:
-        for state, lod in zip(plan.state, plan.lod, strict=True):
-            states.slots[state].lod = lod
-        states.upload_slots()
-        _copy_states(models, states, plan, batch)
-        refine_meshes(models, states, batch)
-        active_update(models.pool, states.pool, batch)
+    batch = _carry_out(models, states, plan)
     serving = np.array([chosen[key] for key in wanted], np.int32)[inverse.reshape(-1)]
     if not np.array_equal(serving, objects.state):
         for state in used - set(chosen.values()):

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels import mark, refit
+from warp_abtree.kernels.plan import UpdatePlan
 from warp_abtree.kernels.pools import LEVEL_MAX
 
 FACE_COUNT_MAX = 2**30
@@ -131,117 +132,115 @@ def active_build(vertex_pos: np.ndarray, face_vertex: np.ndarray) -> Tree:
     return Tree.from_leaves(leaf_node)
 
 
-@dataclass
-class UpdateBatch:
-    """Tree states under update, and the slices of faces that change.
+# Threads that a GPU runs at a time, of each multiprocessor: more take turns over what they work off.
+THREADS_AT_ONCE = 2048
 
-    Partial updates come first, then full ones; the counters have one entry an update, in this order.
+
+def launch_items(kernel, items: int, inputs: list, device):
+    """Launch a kernel over at most so many items; how many there are, it reads on the device.
+
+    The kernel takes (step) before its inputs: thread `tid` works on the items tid, tid + step, and so on.
+    """
+    if items:
+        step = min(items, THREADS_AT_ONCE * device.sm_count) if device.is_cuda else 1
+        wp.launch(kernel, dim=step, inputs=[step, *inputs], device=device)
+
+
+@dataclass
+class UpdateWork:
+    """An update of many tree states: what kernels work off, and the most that there can be of it.
 
     Attributes:
+        plan: `UpdatePlan` for kernels.
+        entry_room, face_room: Faces in the slices of partial updates, and of states under full update, at most.
+        level_room: Nodes to refit on each level, the root's first, at most; as many entries as there are levels.
+    """
+
+    plan: UpdatePlan
+    entry_room: int
+    face_room: int
+    level_room: list
+    device: wp.Device
+
+
+def make_level_lists(plan: UpdatePlan, marked_room: list, device):
+    """Make the worklists of an update, each of its own length."""
+    room = np.zeros(int(LEVEL_MAX), np.int64)
+    room[: len(marked_room)] = marked_room
+    starts = np.cumsum(room) - room
+    plan.level_start = wp.array(starts.astype(np.int32), dtype=wp.int32, device=device)
+    plan.level_count = wp.zeros(int(LEVEL_MAX), dtype=wp.int32, device=device)
+    plan.level_node = wp.empty(int(room.sum()), dtype=wp.vec2i, device=device)
+
+
+class UpdateBatch(UpdateWork):
+    """An update that the host plans.
+
+    Args:
         state, lod: State and target LOD of each update, int32 (u,).
         full: Whether the whole tree is refitted, bool (u,).
         slice_start, slice_length: Slice of each update in split_face; length 0 where it is full, int64 (u,).
         depth, face_count: Tree depth and faces of each update's model, int64 (u,).
-        changed_count, marked_count: Faces that change and nodes refitted, device int32 (u,), written by the update.
+        state_count: States of the pool; `plan.changed_count` and `plan.marked_count` have an entry for each.
     """
 
-    state: np.ndarray
-    lod: np.ndarray
-    full: np.ndarray
-    slice_start: np.ndarray
-    slice_length: np.ndarray
-    depth: np.ndarray
-    face_count: np.ndarray
-    device: wp.Device
-
-    def __post_init__(self):
-        def upload(values):
-            return wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=self.device)
-
-        count = len(self.state)
-        ids = np.arange(count)
-        partial = ~self.full
-        end = np.cumsum(self.slice_length[partial])
-        self.entry_count = int(end[-1]) if len(end) else 0
-        self.entry_end = upload(end)
-        self.partial_state = upload(self.state[partial])
-        self.partial_slice = upload(self.slice_start[partial])
-        self.partial_id = upload(ids[partial])
+    def __init__(self, state, lod, full, slice_start, slice_length, depth, face_count, state_count, device):
+        self.state, self.lod, self.full = state, lod, full
+        self.slice_start, self.slice_length = slice_start, slice_length
+        self.depth, self.face_count = depth, face_count
+        partial = np.flatnonzero(~full)
         # Deepest first, so that the states that have a level are the first of the list.
-        order = ids[self.full][np.argsort(-self.depth[self.full], kind="stable")]
-        self.full_depth = self.depth[order]
-        self.full_state = upload(self.state[order])
-        self.full_id = upload(order)
-        self.full_face_end = upload(np.cumsum(self.face_count[order]))
-        self.full_face_count = int(self.face_count[order].sum())
-        self.changed_count = wp.zeros(max(count, 1), dtype=wp.int32, device=self.device)
-        self.marked_count = wp.zeros(max(count, 1), dtype=wp.int32, device=self.device)
-        if self.entry_count:
-            level_room = [
-                min(self.entry_count, int(np.sum(self.depth[partial] >= d)) << d) for d in range(int(LEVEL_MAX))
-            ]
-            self.level_room = level_room
-            self.level_start = upload(np.concatenate([[0], np.cumsum(level_room)[:-1]]))
-            self.level_count = wp.zeros(int(LEVEL_MAX), dtype=wp.int32, device=self.device)
-            self.level_node = wp.empty(sum(level_room), dtype=wp.vec2i, device=self.device)
+        whole = np.flatnonzero(full)
+        whole = whole[np.argsort(-depth[whole], kind="stable")]
+        entry_end, face_end = np.cumsum(slice_length[partial]), np.cumsum(face_count[whole])
+        entries = int(entry_end[-1]) if len(partial) else 0
+        faces = int(face_end[-1]) if len(whole) else 0
+        levels = range(int(depth.max()) + 1 if len(depth) else 0)
+        whole_count = np.array([np.sum(depth[whole] >= level) for level in range(int(LEVEL_MAX))], np.int64)
+        marked_room = [min(entries, int(np.sum(depth[partial] >= level)) << level) for level in levels]
+        level_room = [room + (int(whole_count[level]) << level) for level, room in enumerate(marked_room)]
+        plan = UpdatePlan()
+
+        def upload(values, dtype=wp.int32):
+            return wp.array(np.asarray(values, np.int64), dtype=dtype, device=device)
+
+        plan.partial_total = upload([(len(partial) << 32) + entries], wp.int64)
+        plan.partial_state = upload(state[partial])
+        plan.slice_start = upload(slice_start[partial])
+        plan.entry_end = upload(entry_end)
+        plan.full_total = upload([(len(whole) << 32) + faces], wp.int64)
+        plan.full_state = plan.whole_state = upload(state[whole])
+        plan.face_end = upload(face_end)
+        plan.whole_count = upload(whole_count)
+        plan.whole_start = wp.zeros(int(LEVEL_MAX), dtype=wp.int32, device=device)
+        plan.changed_count = wp.zeros(state_count, dtype=wp.int32, device=device)
+        plan.marked_count = wp.zeros(state_count, dtype=wp.int32, device=device)
+        make_level_lists(plan, marked_room, device)
+        super().__init__(plan, entries, faces, level_room, device)
 
 
-def active_mark(models, states, batch: UpdateBatch):
+def active_mark(models, states, work: UpdateWork):
     """Mark the leaves of every affected face and their ancestors deformed, each node once (ACTIVE-MARK)."""
-    if batch.entry_count == 0:
-        return
-    wp.launch(
-        mark.mark_path_kernel,
-        dim=batch.entry_count,
-        inputs=[
-            batch.entry_count,
-            models,
-            batch.entry_end,
-            batch.partial_state,
-            batch.partial_slice,
-            batch.partial_id,
-            batch.level_start,
-            states,
-            batch.level_count,
-            batch.level_node,
-            batch.changed_count,
-            batch.marked_count,
-        ],
-        device=batch.device,
-    )
+    launch_items(mark.mark_path_kernel, work.entry_room, [models, states, work.plan], work.device)
 
 
-def active_walk(models, states, batch: UpdateBatch):
+def active_walk(models, states, work: UpdateWork):
     """Refit what is marked, and every node of states under full update, deepest level first (ACTIVE-WALK)."""
-    deepest = int(batch.depth.max()) if len(batch.depth) else -1
-    for level in range(deepest, -1, -1):
-        if batch.entry_count:
-            wp.launch(
-                refit.refit_level_kernel,
-                dim=batch.level_room[level],
-                inputs=[level, models, batch.level_start, batch.level_count, batch.level_node, states],
-                device=batch.device,
-            )
-        whole = int(np.sum(batch.full_depth >= level))
-        if whole:
-            wp.launch(
-                refit.refit_whole_level_kernel,
-                dim=whole << level,
-                inputs=[level, models, batch.full_state, states],
-                device=batch.device,
-            )
+    for level, room in reversed(list(enumerate(work.level_room))):
+        launch_items(refit.refit_level_kernel, room, [level, models, work.plan, states], work.device)
 
 
-def active_update(models, states, batch: UpdateBatch):
+def active_update(models, states, work: UpdateWork):
     """Bring boxes, status and skip links to the corners that refinement has set (ACTIVE-UPDATE).
 
-    Leaves the very same bits as a rebuild of all boxes at that LOD. Launches only; no host synchronisation.
+    Leaves the very same bits as a rebuild of all boxes at that LOD. Launches only, one and one a level of the deepest
+    tree; no host synchronisation.
 
     Args:
         models, states: `ModelPool` and `StatePool` of one device.
-        batch: What to update; its counters are written.
+        work: What to update; its worklists and counters are written.
 
     Source: Liu et al. 2006, section 3.2.2, ACTIVE-UPDATE; Algorithm 1.
     """
-    active_mark(models, states, batch)
-    active_walk(models, states, batch)
+    active_mark(models, states, work)
+    active_walk(models, states, work)
