@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from warp_abtree.kernels.faces import PairTrees, locate_pair
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
 from warp_abtree.kernels.segment import face_normal, intersect_faces, unit_vector
@@ -42,15 +41,14 @@ def pair_direction(models: ModelPool, states: StatePool, objects: ObjectPool, a:
 def load_corners(
     models: ModelPool,
     states: StatePool,
-    trees: PairTrees,
     pose: PairPose,
     face_a: wp.int32,
     face_b: wp.int32,
     corner: wp.array(dtype=wp.vec3d),
 ):
     """Put the corners of a face of A and of one of B, both in A's frame, into places 0..2 and 3..5."""
-    a = states.face_corner[trees.corner_a + face_a]
-    b = states.face_corner[trees.corner_b + face_b]
+    a = states.face_corner[pose.trees.corner_a + face_a]
+    b = states.face_corner[pose.trees.corner_b + face_b]
     for k in range(3):
         corner[k] = models.vertex_pos[a[k]]
         corner[3 + k] = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[k]])
@@ -76,10 +74,10 @@ def find_contact_kernel(
     if i >= start[start.shape[0] - 1]:
         return
     p = faces[i][0]
-    swapped, trees = locate_pair(models, states, objects, pairs[p])
+    swapped = pair_poses[p].swapped
     a = wp.min(pairs[p][0], pairs[p][1])
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(models, states, trees, pair_poses[p], faces[i][1 + swapped], faces[i][2 - swapped], corner)
+    load_corners(models, states, pair_poses[p], faces[i][1 + swapped], faces[i][2 - swapped], corner)
     p0, p1, coplanar = intersect_faces(pair_poses[p].scale, corner)
     rotation = objects.rotation[a]
     p0 = pose_point(rotation, objects.position[a], p0)

@@ -5,7 +5,7 @@ import warp as wp
 from warp_abtree.kernels.boxes import map_point
 from warp_abtree.kernels.distance import triangles_near
 from warp_abtree.kernels.nodes import load_constant
-from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
 from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, UNSURE
 from warp_abtree.kernels.screen import SCREEN_UNIT, screen_triangles
@@ -19,18 +19,6 @@ OUTPUT_FACES = wp.constant(2)
 
 # In place of a precision: faces count as met unless proved farther apart than a distance.
 WITHIN = wp.constant(-1)
-
-
-@wp.struct
-class PairTrees:
-    """Where the two trees of a pair lie in the pools."""
-
-    node_a: wp.int32
-    node_b: wp.int32
-    face_node_a: wp.int32
-    face_node_b: wp.int32
-    corner_a: wp.int32
-    corner_b: wp.int32
 
 
 @wp.struct
@@ -58,19 +46,20 @@ class Hits:
     hard_total: wp.array(dtype=wp.int32)
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    int4 x = __ldg((const int4*)corners.data + i);
+    return wp::vec_t<4, wp::int32>(x.x, x.y, x.z, x.w);
+#else
+    return corners.data[i];
+#endif
+""")
+def load_corner(corners: wp.array(dtype=wp.vec4i), i: wp.int32) -> wp.vec4i: ...
+
+
 @wp.func
-def locate_pair(models: ModelPool, states: StatePool, objects: ObjectPool, pair: wp.vec2i):
-    """Return whether a pair names its higher object first, and its trees, the lower object's as A."""
-    state_a = objects.state[wp.min(pair[0], pair[1])]
-    state_b = objects.state[wp.max(pair[0], pair[1])]
-    trees = PairTrees()
-    trees.node_a = states.node_start[state_a]
-    trees.node_b = states.node_start[state_b]
-    trees.face_node_a = models.node_start[states.model[state_a]]
-    trees.face_node_b = models.node_start[states.model[state_b]]
-    trees.corner_a = states.face_start[state_a]
-    trees.corner_b = states.face_start[state_b]
-    return wp.where(pair[0] > pair[1], 1, 0), trees
+def load_corner_ids(states: StatePool, i: wp.int32):
+    return load_corner(states.face_corner, i)
 
 
 @wp.func
@@ -84,14 +73,13 @@ def screen_faces(
     mode: wp.int32,
     models: ModelPool,
     states: StatePool,
-    trees: PairTrees,
     pose: PairPose,
     face_a: wp.int32,
     face_b: wp.int32,
 ):
     """Test one active face of A against one of B in float32; return 1, 0 or UNSURE."""
-    a = states.face_corner[trees.corner_a + face_a]
-    b = states.face_corner[trees.corner_b + face_b]
+    a = load_corner_ids(states, pose.trees.corner_a + face_a)
+    b = load_corner_ids(states, pose.trees.corner_b + face_b)
     error = pose.error
     unit = SCREEN_UNIT
     if mode == FLOAT32:
@@ -115,14 +103,13 @@ def test_faces(
     mode: wp.int32,
     models: ModelPool,
     states: StatePool,
-    trees: PairTrees,
     pose: PairPose,
     face_a: wp.int32,
     face_b: wp.int32,
 ):
     """Test one active face of A against one of B in float64, in A's frame; return 1, 0 or UNSURE."""
-    a = states.face_corner[trees.corner_a + face_a]
-    b = states.face_corner[trees.corner_b + face_b]
+    a = states.face_corner[pose.trees.corner_a + face_a]
+    b = states.face_corner[pose.trees.corner_b + face_b]
     a0 = models.vertex_pos[a[0]]
     a1 = models.vertex_pos[a[1]]
     a2 = models.vertex_pos[a[2]]
@@ -143,18 +130,17 @@ def settle_faces(
     mode: wp.int32,
     models: ModelPool,
     states: StatePool,
-    trees: PairTrees,
     pose: PairPose,
     face_a: wp.int32,
     face_b: wp.int32,
 ):
     """Decide a pair of faces that float32 left open; return whether they meet, and whether it took exact signs."""
     if mode != EXACT:
-        return test_faces(mode, models, states, trees, pose, face_a, face_b), 0
-    meet = test_faces(FILTER, models, states, trees, pose, face_a, face_b)
+        return test_faces(mode, models, states, pose, face_a, face_b), 0
+    meet = test_faces(FILTER, models, states, pose, face_a, face_b)
     if meet != UNSURE:
         return meet, 0
-    return test_faces(mode, models, states, trees, pose, face_a, face_b), 1
+    return test_faces(mode, models, states, pose, face_a, face_b), 1
 
 
 @wp.func
@@ -162,15 +148,14 @@ def try_faces(
     mode: wp.int32,
     models: ModelPool,
     states: StatePool,
-    trees: PairTrees,
     pose: PairPose,
     face_a: wp.int32,
     face_b: wp.int32,
 ):
     """Return whether a pair of faces meets as the first stage sees it: 1, 0 or UNSURE; all of it for WITHIN."""
     if mode == WITHIN:
-        return test_faces(mode, models, states, trees, pose, face_a, face_b)
-    return screen_faces(mode, models, states, trees, pose, face_a, face_b)
+        return test_faces(mode, models, states, pose, face_a, face_b)
+    return screen_faces(mode, models, states, pose, face_a, face_b)
 
 
 @wp.func

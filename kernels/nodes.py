@@ -12,7 +12,8 @@ class Node:
     """A box [model units, about the model's centre] and what the node stands for.
 
     skip: the node itself if it has two active children or is a leaf, else what its one active child stands for; -1
-    where nothing below is active. face: of a skip node that is a leaf, else -1.
+    where nothing below is active. face: of a skip node that is a leaf, else negative: as float32 bits, minus the sum of
+    the box's extents, which `store_node` sees to.
     """
 
     lower: wp.vec3
@@ -61,8 +62,12 @@ def store_node(states: StatePool, at: wp.int32, node: Node):
     i = wp.int64(2) * wp.int64(at)
     lower = node.lower
     upper = node.upper
+    face = node.face
+    if face < 0:
+        extent = ((upper[0] - lower[0]) + (upper[1] - lower[1])) + (upper[2] - lower[2])
+        face = wp.cast(-wp.max(extent, 0.0), wp.int32)
     states.node_box[i] = wp.vec4(lower[0], lower[1], lower[2], wp.cast(node.skip, wp.float32))
-    states.node_box[i + wp.int64(1)] = wp.vec4(upper[0], upper[1], upper[2], wp.cast(node.face, wp.float32))
+    states.node_box[i + wp.int64(1)] = wp.vec4(upper[0], upper[1], upper[2], wp.cast(face, wp.float32))
 
 
 @wp.func

@@ -56,7 +56,7 @@ class StatePool:
     face_start: wp.array(dtype=wp.int32)
     node_status: wp.array(dtype=wp.int32)
     node_box: wp.array(dtype=wp.vec4)
-    face_corner: wp.array(dtype=wp.vec3i)
+    face_corner: wp.array(dtype=wp.vec4i)
 
 
 @wp.struct

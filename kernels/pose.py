@@ -18,8 +18,18 @@ ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
 
 
 @wp.struct
+class PairTrees:
+    """Where the two trees of a pair lie in the pools."""
+
+    node_a: wp.int32
+    node_b: wp.int32
+    corner_a: wp.int32
+    corner_b: wp.int32
+
+
+@wp.struct
 class PairPose:
-    """The pose of B in A's frame, A the object with the smaller index.
+    """The pose of B in A's frame, A the object with the smaller index, and where the trees of both lie.
 
     rotation, translation map B's model frame to A's in float64. rotation32, translation32 map coordinates about the
     models' centres in float32, the transpose and back32 the other way. margin serves boxes; scale, a power of two that
@@ -36,6 +46,9 @@ class PairPose:
     error: wp.float32
     scale: wp.float64
     within: wp.float64
+    trees: PairTrees
+    # Whether the pair names B first.
+    swapped: wp.int32
 
 
 @wp.func
@@ -137,6 +150,19 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
             pose.back32[i] = -wp.float32(sum_products(r[0, i], shift[0], r[1, i], shift[1], r[2, i], shift[2]))
         pose.margin = wp.float32(margin64 + margin32 + within * (wp.float64(1.0) + skewed + ROUNDING_32))
     return pose
+
+
+@wp.func
+def locate_trees(states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32):
+    """Return where the trees of two objects lie."""
+    state_a = objects.state[a]
+    state_b = objects.state[b]
+    trees = PairTrees()
+    trees.node_a = states.node_start[state_a]
+    trees.node_b = states.node_start[state_b]
+    trees.corner_a = states.face_start[state_a]
+    trees.corner_b = states.face_start[state_b]
+    return trees
 
 
 @wp.func

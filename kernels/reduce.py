@@ -7,7 +7,6 @@ then one thread a pair its chunks in theirs, so that no bit depends on the devic
 import warp as wp
 
 from warp_abtree.kernels.contact import SHORTEST_NORMAL, Contacts, load_corners, pair_direction
-from warp_abtree.kernels.faces import locate_pair
 from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
@@ -212,7 +211,7 @@ def sum_loop_kernel(
     p = span[0]
     n = pair_contacts.normal[p]
     origin = contacts.p0[start[p]]
-    swapped, trees = locate_pair(models, states, objects, pairs[p])
+    swapped = pair_poses[p].swapped
     a = wp.min(pairs[p][0], pairs[p][1])
     front = -wp.float64(wp.inf)
     back = wp.float64(wp.inf)
@@ -221,7 +220,7 @@ def sum_loop_kernel(
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
     k = span[1]
     while k < span[2]:
-        load_corners(models, states, trees, pair_poses[p], faces[k][1 + swapped], faces[k][2 - swapped], corner)
+        load_corners(models, states, pair_poses[p], faces[k][1 + swapped], faces[k][2 - swapped], corner)
         i = wp.int32(0)
         while i < 6:
             at = wp.dot(n, pose_point(objects.rotation[a], objects.position[a], corner[i]) - origin)

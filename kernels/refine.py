@@ -24,7 +24,7 @@ def refine_face(models: ModelPool, states: StatePool, state: wp.int32, face: wp.
     """Return the corners of a face at the LOD of its state; (-1, -1, -1) where it is inactive."""
     model = states.model[state]
     at = models.face_start[model] + face
-    corner = wp.vec3i(-1, -1, -1)
+    corner = wp.vec4i(-1, -1, -1, -1)
     lod = states.lod[state]
     if lod >= models.face_split[at]:
         limit = models.finest_limit[model] + models.lod_max[model] - lod

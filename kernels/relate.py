@@ -5,13 +5,15 @@ import warp as wp
 from warp_abtree.kernels.distance import DISTANCE_MAX, pad_distance
 from warp_abtree.kernels.faces import Hits
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.pose import PairPose, pair_pose
+from warp_abtree.kernels.pose import PairPose, locate_trees, pair_pose
+from warp_abtree.kernels.share import Work, part_count
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.kernel
 def relate_pair_kernel(
+    parts_max: wp.int32,
     models: ModelPool,
     states: StatePool,
     objects: ObjectPool,
@@ -20,6 +22,7 @@ def relate_pair_kernel(
     within: wp.array(dtype=wp.float64),
     pair_pose_out: wp.array(dtype=PairPose),
     hits_out: Hits,
+    work_out: Work,
 ):
     """Compute the pose of B in A's frame once a pair, A the smaller index, and clear what the traversal counts.
 
@@ -27,6 +30,16 @@ def relate_pair_kernel(
         within: Distances [world units] that boxes are to be widened by, shape [pair]; [0] for intersection.
     """
     p = wp.tid()
+    count = wp.min(pair_count[0], pairs.shape[0])
+    if p < work_out.flag.shape[0]:
+        work_out.flag[p] = 0
+    if p == 0 and work_out.counter.shape[0] > 0:
+        work_out.counter[0] = 0
+        work_out.counter[1] = count * part_count(parts_max, count)
+        work_out.counter[2] = 0
+        work_out.counter[3] = 0
+    if p >= pairs.shape[0]:
+        return
     if p == 0:
         hits_out.total[0] = 0
         hits_out.unsure_total[0] = 0
@@ -37,16 +50,18 @@ def relate_pair_kernel(
     hits_out.triangle_tests[p] = wp.int64(0)
     hits_out.float64_tests[p] = wp.int64(0)
     hits_out.exact_tests[p] = wp.int64(0)
-    if p >= wp.min(pair_count[0], pairs.shape[0]):
+    if p >= count:
         return
     a = wp.min(pairs[p][0], pairs[p][1])
     b = wp.max(pairs[p][0], pairs[p][1])
-    if within.shape[0] == 0:
-        pair_pose_out[p] = pair_pose(models, states, objects, a, b, wp.float64(0.0))
-        return
-    pose = pair_pose(models, states, objects, a, b, pad_distance(models, states, objects, a, b, within[p]))
-    if within[p] >= DISTANCE_MAX:
+    distance = wp.float64(0.0)
+    if within.shape[0] > 0:
+        distance = pad_distance(models, states, objects, a, b, within[p])
+    pose = pair_pose(models, states, objects, a, b, distance)
+    if within.shape[0] > 0 and within[p] >= DISTANCE_MAX:
         # Nothing is proved where distances may overflow: every box passes, and the first faces count as near.
         pose.within = wp.float64(wp.inf)
         pose.margin = wp.inf
+    pose.trees = locate_trees(states, objects, a, b)
+    pose.swapped = wp.where(pairs[p][0] > pairs[p][1], 1, 0)
     pair_pose_out[p] = pose

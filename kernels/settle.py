@@ -8,8 +8,8 @@ import functools
 
 import warp as wp
 
-from warp_abtree.kernels.faces import OUTPUT_ANY, OUTPUT_FACES, Hits, locate_pair, report_hit, test_faces
-from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.faces import OUTPUT_ANY, OUTPUT_FACES, Hits, report_hit, test_faces
+from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose
 from warp_abtree.kernels.predicates import EXACT, FILTER, UNSURE
 from warp_abtree.kernels.warps import count_flags, reserve_slot, warp_lane
@@ -24,8 +24,6 @@ def settle_item(
     output: wp.int32,
     models: ModelPool,
     states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
     waits: bool,
     item: wp.vec3i,
@@ -34,17 +32,15 @@ def settle_item(
     """Decide a face pair if it waits, count and report a hit; return 1, 0 or UNSURE. For all threads of a warp."""
     p = item[0]
     meet = wp.int32(0)
-    swapped = wp.int32(0)
     if waits and not (output == OUTPUT_ANY and hits.any_hit[p] != 0):
-        swapped, trees = locate_pair(models, states, objects, pairs[p])
-        meet = test_faces(mode, models, states, trees, pair_poses[p], item[1], item[2])
+        meet = test_faces(mode, models, states, pair_poses[p], item[1], item[2])
     count_flags(hits.count, p, meet == 1)
     if meet == 1:
         hits.any_hit[p] = 1
     if output == OUTPUT_FACES:
         slot = reserve_slot(hits.total, meet == 1)
         if meet == 1:
-            report_hit(slot, p, swapped, item[1], item[2], hits)
+            report_hit(slot, p, pair_poses[p].swapped, item[1], item[2], hits)
     return meet
 
 
@@ -58,8 +54,6 @@ def settle_traversal(mode: int):
         output: wp.int32,
         models: ModelPool,
         states: StatePool,
-        objects: ObjectPool,
-        pairs: wp.array(dtype=wp.vec2i),
         pair_poses: wp.array(dtype=PairPose),
         hits_inout: Hits,
     ):
@@ -71,9 +65,7 @@ def settle_traversal(mode: int):
             item = wp.vec3i()
             if waits:
                 item = hits_inout.unsure[first + warp_lane()]
-            meet = settle_item(
-                wp.static(mode), output, models, states, objects, pairs, pair_poses, waits, item, hits_inout
-            )
+            meet = settle_item(wp.static(mode), output, models, states, pair_poses, waits, item, hits_inout)
             if wp.static(mode == int(FILTER)):
                 hard = meet == UNSURE
                 count_flags(hits_inout.exact_tests, item[0], hard)
@@ -91,8 +83,6 @@ def settle_hard_kernel(
     output: wp.int32,
     models: ModelPool,
     states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
@@ -103,5 +93,5 @@ def settle_hard_kernel(
         item = wp.vec3i()
         if waits:
             item = hits_inout.hard[first + warp_lane()]
-        settle_item(EXACT, output, models, states, objects, pairs, pair_poses, waits, item, hits_inout)
+        settle_item(EXACT, output, models, states, pair_poses, waits, item, hits_inout)
         first += threads

@@ -13,17 +13,29 @@ from warp_abtree.kernels.faces import (
     OUTPUT_ANY,
     OUTPUT_FACES,
     Hits,
-    PairTrees,
     defer_faces,
-    locate_pair,
     report_hit,
     settle_faces,
     try_faces,
 )
 from warp_abtree.kernels.nodes import load_node
-from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose
 from warp_abtree.kernels.predicates import UNSURE
+from warp_abtree.kernels.share import (
+    MAILBOX_COUNT,
+    MAILBOX_ITEMS,
+    SHARES_AT_ONCE,
+    Work,
+    await_share,
+    close_mailbox,
+    count_hungry,
+    empty_mailbox,
+    end_unit,
+    open_mailbox,
+    part_count,
+    take_unit,
+)
 from warp_abtree.kernels.vector import take_slot, visit_items
 from warp_abtree.kernels.visit import visit_item
 from warp_abtree.kernels.warps import (
@@ -63,12 +75,15 @@ ITEMS_PER_WARP = wp.constant(8)
 ITEMS_TO_PART = wp.constant(STACK_LENGTH // 2)
 # An early hit ends a pair for `any`, so few face pairs wait.
 FEW_CANDIDATES = wp.constant(8)
+# Measured: a warp with work for two looks every eighth visit whether others wait, every fourth where pairs are few.
+SHARE_LEAST = wp.constant(16)
+MANY_PARTS = wp.constant(8)
 
 
 @wp.func
-def first_item(states: StatePool, trees: PairTrees):
+def first_item(states: StatePool, pose: PairPose):
     """Return the item that compares the roots."""
-    return pack_item(load_node(states, trees.node_a + 1).skip, load_node(states, trees.node_b + 1).skip)
+    return pack_item(load_node(states, pose.trees.node_a + 1).skip, load_node(states, pose.trees.node_b + 1).skip)
 
 
 @wp.func
@@ -89,19 +104,16 @@ def thread_traversal(mode: int):
         output: wp.int32,
         models: ModelPool,
         states: StatePool,
-        objects: ObjectPool,
         pair_count: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
         pair_poses: wp.array(dtype=PairPose),
         hits_inout: Hits,
     ):
         """Traverse every step-th object pair from the first on, depth first; CPU only, on several cores at once."""
         p = first + step * wp.tid()
-        if p >= wp.min(pair_count[0], pairs.shape[0]):
+        if p >= wp.min(pair_count[0], pair_poses.shape[0]):
             return
-        swapped, trees = locate_pair(models, states, objects, pairs[p])
         pose = pair_poses[p]
-        stack = depth_first_stack(first_item(states, trees))
+        stack = depth_first_stack(first_item(states, pose))
         waiting_faces = waiting_list()
         top, waiting = wp.int32(1), wp.int32(0)
         node_tests, triangle_tests = wp.int64(0), wp.int64(0)
@@ -109,7 +121,7 @@ def thread_traversal(mode: int):
         while top > 0:
             taken = wp.min(top, 2)
             top -= taken
-            items = visit_items(states, trees, pose, stack[top], stack[top + 1], taken)
+            items = visit_items(states, pose, stack[top], stack[top + 1], taken)
             mask = wp.int32(items[8])
             node_tests += items[9]
             # Written without branches, which could not be predicted; what is not in use is written over.
@@ -124,15 +136,15 @@ def thread_traversal(mode: int):
                 waiting -= 1
                 item = waiting_faces[waiting]
                 face_a, face_b = item_first(item), item_second(item)
-                meet = try_faces(wp.static(mode), models, states, trees, pose, face_a, face_b)
+                meet = try_faces(wp.static(mode), models, states, pose, face_a, face_b)
                 triangle_tests += wp.int64(1)
                 if meet == UNSURE:
-                    meet, hard = settle_faces(wp.static(mode), models, states, trees, pose, face_a, face_b)
+                    meet, hard = settle_faces(wp.static(mode), models, states, pose, face_a, face_b)
                     float64_tests += wp.int64(1)
                     exact_tests += wp.int64(hard)
                 if meet == 1:
                     hit_count += wp.int64(1)
-                    keep_hit(output, p, swapped, face_a, face_b, hits_inout)
+                    keep_hit(output, p, pose.swapped, face_a, face_b, hits_inout)
                     if output == OUTPUT_ANY:
                         top = 0
                         waiting = 0
@@ -153,7 +165,6 @@ def expand_items(
     end: wp.int32,
     waiting: wp.int32,
     states: StatePool,
-    trees: PairTrees,
     pose: PairPose,
 ):
     """Visit items first to first + popped, one a thread, append what follows; return ends and pairs compared."""
@@ -166,7 +177,7 @@ def expand_items(
     tests = wp.int32(0)
     children = four_items()
     if lane < popped:
-        children, mask, tests = visit_item(states, trees, pose, item)
+        children, mask, tests = visit_item(states, pose, item)
     ends = push_items(items, end, waiting, mask, children)
     warp_sync()
     return item_second(ends), item_first(ends), tests
@@ -180,10 +191,8 @@ def test_candidates(
     first: wp.int32,
     popped: wp.int32,
     pair: wp.int32,
-    swapped: wp.int32,
     models: ModelPool,
     states: StatePool,
-    trees: PairTrees,
     pose: PairPose,
     hits: Hits,
 ):
@@ -193,13 +202,13 @@ def test_candidates(
     item = wp.int64(0)
     if lane < popped:
         item = read_item(items, STACK_LENGTH + first + lane)
-        meet = try_faces(mode, models, states, trees, pose, item_first(item), item_second(item))
+        meet = try_faces(mode, models, states, pose, item_first(item), item_second(item))
     warp_sync()
     found = meet == 1
     if output == OUTPUT_FACES:
         slot = reserve_slot(hits.total, found)
         if found:
-            report_hit(slot, pair, swapped, item_first(item), item_second(item), hits)
+            report_hit(slot, pair, pose.swapped, item_first(item), item_second(item), hits)
     if found:
         hits.any_hit[pair] = 1
     slot = reserve_slot(hits.unsure_total, meet == UNSURE)
@@ -228,16 +237,14 @@ def part_items(items: wp.uint64, head: wp.int32, end: wp.int32, part: wp.int32, 
 
 
 @wp.func
-def spread_items(
-    items: wp.uint64, part: wp.int32, parts: wp.int32, states: StatePool, trees: PairTrees, pose: PairPose
-):
+def spread_items(items: wp.uint64, part: wp.int32, parts: wp.int32, states: StatePool, pose: PairPose):
     """Start a pair: expand the roots breadth first, the same in every warp at work on it, and keep a share.
 
     Returns where the share starts and ends, the face pairs that wait, and the pairs of boxes compared: these two are
     the first warp's.
     """
     if warp_lane() == 0:
-        write_item(items, 0, first_item(states, trees))
+        write_item(items, 0, first_item(states, pose))
     warp_sync()
     head, end = wp.int32(0), wp.int32(1)
     waiting, compared = wp.int32(0), wp.int32(0)
@@ -245,7 +252,7 @@ def spread_items(
     while parts > 1 and end > head and end - head < wanted and waiting < warp_size():
         first = head
         head += wp.min(warp_size(), end - head)
-        end, waiting, more = expand_items(items, first, head - first, end, waiting, states, trees, pose)
+        end, waiting, more = expand_items(items, first, head - first, end, waiting, states, pose)
         compared += more
     if part > 0:
         waiting = 0
@@ -254,9 +261,87 @@ def spread_items(
     return head, end, waiting, compared
 
 
+@wp.func
+def take_share(items: wp.uint64, box: wp.int32, work: Work):
+    """Put what lies in a mailbox on the empty stack; return the stack's end."""
+    size = work.owner[box][1]
+    lane = warp_lane()
+    if lane < size:
+        write_item(items, lane, work.item[box * MAILBOX_ITEMS + lane])
+    empty_mailbox(work.flag, box)
+    return size
+
+
+@wp.func
+def give_shares(items: wp.uint64, pair: wp.int32, head: wp.int32, end: wp.int32, hungry: wp.int32, work: Work):
+    """Serve waiting warps with the oldest items, which have most below them; return the new head."""
+    wanted = wp.min(hungry, SHARES_AT_ONCE)
+    size = wp.min(wp.max((end - head) / (wanted + 1), SHARE_LEAST), MAILBOX_ITEMS)
+    lane = warp_lane()
+    while wanted > 0 and end - head >= 2 * size:
+        ticket = open_mailbox(work.counter, work.flag)
+        box = ticket & (MAILBOX_COUNT - 1)
+        if lane < size:
+            work.item[box * MAILBOX_ITEMS + lane] = read_item(items, (head + lane) & STACK_MASK)
+        if lane == 0:
+            work.owner[box] = wp.vec2i(pair, size)
+        close_mailbox(work.flag, ticket)
+        head += size
+        wanted -= 1
+    return head
+
+
+@wp.func
+def traverse_items(
+    output: wp.int32,
+    mode: wp.int32,
+    stack_room: wp.int32,
+    share_mask: wp.int32,
+    items: wp.uint64,
+    head: wp.int32,
+    end: wp.int32,
+    waiting: wp.int32,
+    p: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    hits: Hits,
+    work: Work,
+):
+    """Traverse what is on the stack and is not given away; return pairs of boxes compared, and face pair tests."""
+    node_tests, turn = wp.int32(0), wp.int32(0)
+    tests = wp.vec4i()
+    ready = wp.where(output == OUTPUT_ANY, wp.min(FEW_CANDIDATES, warp_size()), warp_size())
+    while end > head or waiting > 0:
+        found = False
+        hungry = wp.int32(0)
+        turn += 1
+        if (turn & share_mask) == 0:
+            hungry = count_hungry(work.counter)
+        if waiting >= ready or end == head:
+            popped = wp.min(waiting, warp_size())
+            waiting -= popped
+            more, found = test_candidates(output, mode, items, waiting, popped, p, models, states, pose, hits)
+            tests += more
+        else:
+            # One at a time, depth first, needs little room; more where there is.
+            popped = wp.max(1, (stack_room - DEPTH_FIRST_ROOM - (end - head)) / 3)
+            popped = wp.min(popped, wp.min(warp_size(), end - head))
+            end -= popped
+            end, waiting, compared = expand_items(items, end, popped, end, waiting, states, pose)
+            node_tests += compared
+        if hungry > 0 and end - head >= 2 * SHARE_LEAST:
+            head = give_shares(items, p, head, end, hungry, work)
+        if output == OUTPUT_ANY:
+            if warp_any(found or hits.any_hit[p] != 0):
+                end = head
+                waiting = 0
+    return node_tests, tests
+
+
 @functools.cache
 def warp_traversal(mode: int):
-    """Return the kernel that gives each object pair one or more warps: FLOAT32, WITHIN, or for both other precisions.
+    """Return the kernel that has warps share the object pairs: FLOAT32, WITHIN, or for both other precisions.
 
     What float32 leaves open waits for `settle_traversal`.
     """
@@ -268,49 +353,39 @@ def warp_traversal(mode: int):
         output: wp.int32,
         models: ModelPool,
         states: StatePool,
-        objects: ObjectPool,
         pair_count: wp.array(dtype=wp.int32),
-        pairs: wp.array(dtype=wp.vec2i),
         pair_poses: wp.array(dtype=PairPose),
         hits_inout: Hits,
+        work_inout: Work,
     ):
-        """Traverse a share of one object pair a warp."""
-        count = wp.min(pair_count[0], pairs.shape[0])
-        # Measured best for 1 to 8,192 pairs: with more parts, more of the start is done again in each of them.
-        parts = wp.max(1, wp.int32(wp.float32(parts_max) / wp.sqrt(wp.float32(wp.max(count, 1)))))
-        p = (wp.tid() / warp_size()) / parts
-        if p >= count:
-            return
-        part = (wp.tid() / warp_size()) % parts
-        swapped, trees = locate_pair(models, states, objects, pairs[p])
-        pose = pair_poses[p]
+        """Traverse units of work, each a part of one object pair, and shares of them, until there are none."""
+        count = wp.min(pair_count[0], pair_poses.shape[0])
+        parts = part_count(parts_max, count)
+        share_mask = wp.where(parts >= MANY_PARTS, 3, 7)
         items = warp_stack()
-        head, end, waiting, node_tests = spread_items(items, part, parts, states, trees, pose)
-        tests = wp.vec4i()
-        ready = wp.where(output == OUTPUT_ANY, wp.min(FEW_CANDIDATES, warp_size()), warp_size())
-        while end > head or waiting > 0:
-            found = False
-            if waiting >= ready or end == head:
-                popped = wp.min(waiting, warp_size())
-                waiting -= popped
-                more, found = test_candidates(
-                    output, wp.static(mode), items, waiting, popped, p, swapped, models, states, trees, pose, hits_inout
-                )
-                tests += more
+        while True:
+            unit = take_unit(work_inout.counter)
+            p = unit / parts
+            box = wp.int32(-1)
+            if unit >= count * parts:
+                box = await_share(work_inout.counter, work_inout.flag)
+                if box < 0:
+                    return
+                p = work_inout.owner[box][0]
+            pose = pair_poses[p]
+            head, waiting, spread = wp.int32(0), wp.int32(0), wp.int32(0)
+            if box >= 0:
+                end = take_share(items, box, work_inout)
             else:
-                # One at a time, depth first, needs little room; more where there is.
-                popped = wp.max(1, (stack_room - DEPTH_FIRST_ROOM - (end - head)) / 3)
-                popped = wp.min(popped, wp.min(warp_size(), end - head))
-                end -= popped
-                end, waiting, compared = expand_items(items, end, popped, end, waiting, states, trees, pose)
-                node_tests += compared
-            if output == OUTPUT_ANY:
-                if warp_any(found or hits_inout.any_hit[p] != 0):
-                    end = head
-                    waiting = 0
-        add_warp_sum(hits_inout.node_tests, p, node_tests)
-        add_warp_sum(hits_inout.count, p, tests[0])
-        add_warp_sum(hits_inout.triangle_tests, p, tests[1])
-        add_warp_sum(hits_inout.float64_tests, p, tests[2])
+                head, end, waiting, spread = spread_items(items, unit % parts, parts, states, pose)
+            node_tests, tests = traverse_items(
+                output, wp.static(mode), stack_room, share_mask, items, head, end, waiting, p,
+                models, states, pose, hits_inout, work_inout,
+            )  # fmt: skip
+            add_warp_sum(hits_inout.node_tests, p, node_tests + spread)
+            add_warp_sum(hits_inout.count, p, tests[0])
+            add_warp_sum(hits_inout.triangle_tests, p, tests[1])
+            add_warp_sum(hits_inout.float64_tests, p, tests[2])
+            end_unit(work_inout.counter, work_inout.flag)
 
     return traverse_warp_kernel

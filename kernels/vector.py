@@ -6,7 +6,6 @@ other, so the processor works on both.
 
 import warp as wp
 
-from warp_abtree.kernels.faces import PairTrees
 from warp_abtree.kernels.pools import StatePool
 from warp_abtree.kernels.pose import PairPose
 
@@ -23,7 +22,7 @@ ten_numbers = wp.types.vector(length=10, dtype=wp.int64)
 #else
     typedef float lanes __attribute__((vector_size(16)));
     typedef int bits __attribute__((vector_size(16)));
-    struct Branch { lanes sum, size, turned_sum, turned_size; float reach, need; int skip, down, face; };
+    struct Branch { lanes sum, size, turned_sum, turned_size; float span; int skip, down, face; };
     const lanes zero = {0.0f, 0.0f, 0.0f, 0.0f};
     const auto& r = rotation.data;
     const lanes rows[3] = {{r[0][0], r[0][1], r[0][2], 0.0f}, {r[1][0], r[1][1], r[1][2], 0.0f},
@@ -55,11 +54,9 @@ ten_numbers = wp.types.vector(length=10, dtype=wp.int64)
         b.turned_size = __builtin_elementwise_abs(axes[2]) * w;
         b.turned_size = __builtin_elementwise_fma(__builtin_elementwise_abs(axes[1]), v, b.turned_size);
         b.turned_size = __builtin_elementwise_fma(__builtin_elementwise_abs(axes[0]), u, b.turned_size);
-        const float extent = b.size[0] + b.size[1] + b.size[2];
+        b.span = high[3];
         b.skip = ((bits)low)[3];
         b.face = ((bits)high)[3];
-        b.need = b.face >= 0 ? 0.0f : extent;
-        b.reach = extent + extent;
         b.down = b.face >= 0 ? b.skip : -b.skip;
         return b;
     };
@@ -81,8 +78,8 @@ ten_numbers = wp.types.vector(length=10, dtype=wp.int64)
             const bits hit = (__builtin_elementwise_abs(p.sum - q.turned_sum) <= p.size + wide + q.turned_size)
                            & (__builtin_elementwise_abs(p.turned_sum - q.sum) <= p.turned_size + wide + q.size);
             const bool leaves = (p.face | q.face) >= 0;
-            const int u = leaves ? p.face : p.reach >= q.need ? p.down : p.skip;
-            const int v = leaves ? q.face : q.reach >= p.need ? q.down : q.skip;
+            const int u = leaves ? p.face : p.span + p.span <= q.span ? p.down : p.skip;
+            const int v = leaves ? q.face : q.span + q.span <= p.span ? q.down : q.skip;
             found |= (hit[0] & hit[1] & hit[2]) & (leaves ? 256 << k : 1 << k);
             result[4 * i + k] = ((wp::int64)u << 32) | (unsigned int)v;
         }
@@ -126,14 +123,12 @@ def take_slot(total: wp.array(dtype=wp.int32)) -> wp.int32:
 
 
 @wp.func
-def visit_items(
-    states: StatePool, trees: PairTrees, pose: PairPose, first: wp.int64, second: wp.int64, count: wp.int32
-):
+def visit_items(states: StatePool, pose: PairPose, first: wp.int64, second: wp.int64, count: wp.int32):
     """Compare what one or two items name, as `visit_two` returns it."""
     return visit_two(
         states.node_box,
-        trees.node_a,
-        trees.node_b,
+        pose.trees.node_a,
+        pose.trees.node_b,
         pose.rotation32,
         pose.translation32,
         pose.back32,

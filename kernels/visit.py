@@ -9,7 +9,6 @@ Source: Liu et al. 2006, section 3.2.2, ACTIVE-INTERSECT.
 import warp as wp
 
 from warp_abtree.kernels.boxes import PosedBox, boxes_overlap, pose_box, widen_box
-from warp_abtree.kernels.faces import PairTrees
 from warp_abtree.kernels.nodes import Node, load_constant_node
 from warp_abtree.kernels.pools import StatePool
 from warp_abtree.kernels.pose import PairPose
@@ -22,13 +21,12 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 class Branch:
     """A child in a visit: its box in both frames, and what it stands for.
 
-    down: what an item holds that goes on with its children, if it has any. reach: twice the sum of the box's extents,
-    goes down unless it is less than the other's need, which is that sum, 0 at a leaf.
+    down: what an item holds that goes on with its children, if it has any. span: minus the sum of the box's extents;
+    not negative at a leaf, whose face number its bits are.
     """
 
     box: PosedBox
-    reach: wp.float32
-    need: wp.float32
+    span: wp.float32
     skip: wp.int32
     down: wp.int32
     face: wp.int32
@@ -38,9 +36,7 @@ class Branch:
 def make_branch(box: PosedBox, node: Node):
     branch = Branch()
     branch.box = box
-    branch.reach = box.size[0] + box.size[1] + box.size[2]
-    branch.need = wp.where(node.face >= 0, 0.0, branch.reach)
-    branch.reach += branch.reach
+    branch.span = wp.cast(node.face, wp.float32)
     branch.skip = node.skip
     branch.down = wp.where(node.face >= 0, node.skip, -node.skip)
     branch.face = node.face
@@ -67,20 +63,20 @@ def next_item(a: Branch, b: Branch):
     """
     # The sign of a union of bits: both are leaves unless one has none.
     leaves = (a.face | b.face) >= 0
-    x = wp.where(leaves, a.face, wp.where(a.reach >= b.need, a.down, a.skip))
-    y = wp.where(leaves, b.face, wp.where(b.reach >= a.need, b.down, b.skip))
+    x = wp.where(leaves, a.face, wp.where(a.span + a.span <= b.span, a.down, a.skip))
+    y = wp.where(leaves, b.face, wp.where(b.span + b.span <= a.span, b.down, b.skip))
     return pack_item(x, y)
 
 
 @wp.func
-def overlap_bit(a: Branch, b: Branch, k: wp.int32):
-    """Return bit k of a mask if two branches overlap, bit k + 4 if they do as two leaves."""
+def overlap_bit(used: bool, a: Branch, b: Branch, k: wp.int32):
+    """Return bit k of a mask if two branches in use overlap, bit k + 4 if they do as two leaves."""
     bit = wp.where((a.face | b.face) >= 0, 16 << k, 1 << k)
-    return wp.where(boxes_overlap(a.box, b.box), bit, 0)
+    return wp.where(boxes_overlap(a.box, b.box), wp.where(used, bit, 0), 0)
 
 
 @wp.func
-def visit_item(states: StatePool, trees: PairTrees, pose: PairPose, item: wp.int64):
+def visit_item(states: StatePool, pose: PairPose, item: wp.int64):
     """Compare what an item names; return the items that follow, a mask of those in use, and the pairs compared.
 
     Bits 0 to 3 of the mask stand for items to visit, bits 4 to 7 for pairs of faces to test. No branches: the threads
@@ -90,8 +86,8 @@ def visit_item(states: StatePool, trees: PairTrees, pose: PairPose, item: wp.int
     y = item_second(item)
     two_a = wp.where(x < 0, 1, 0)
     two_b = wp.where(y < 0, 1, 0)
-    at_a = trees.node_a + wp.where(x < 0, -2 * x, x)
-    at_b = trees.node_b + wp.where(y < 0, -2 * y, y)
+    at_a = pose.trees.node_a + wp.where(x < 0, -2 * x, x)
+    at_b = pose.trees.node_b + wp.where(y < 0, -2 * y, y)
     node_a0 = load_constant_node(states, at_a)
     node_a1 = load_constant_node(states, at_a + two_a)
     node_b0 = load_constant_node(states, at_b)
@@ -100,8 +96,7 @@ def visit_item(states: StatePool, trees: PairTrees, pose: PairPose, item: wp.int
     a1 = branch_of_a(pose, node_a1)
     b0 = branch_of_b(pose, node_b0)
     b1 = branch_of_b(pose, node_b1)
-    used = 17 * (1 + 2 * two_b + 4 * two_a + 8 * two_a * two_b)
-    mask = overlap_bit(a0, b0, 0) | overlap_bit(a0, b1, 1)
-    mask = mask | overlap_bit(a1, b0, 2) | overlap_bit(a1, b1, 3)
+    mask = overlap_bit(True, a0, b0, 0) | overlap_bit(y < 0, a0, b1, 1)
+    mask = mask | overlap_bit(x < 0, a1, b0, 2) | overlap_bit((x & y) < 0, a1, b1, 3)
     items = four_items(next_item(a0, b0), next_item(a0, b1), next_item(a1, b0), next_item(a1, b1))
-    return items, mask & used, (1 + two_a) * (1 + two_b)
+    return items, mask, (1 + two_a) * (1 + two_b)

@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 four_items = wp.types.vector(length=4, dtype=wp.int64)
 
 WARP_SIZE = 32
-STACK_LENGTH = 1024  # node pairs, a power of two
+STACK_LENGTH = 512  # node pairs, a power of two
 # Fewer face pairs than there are threads wait while a visit adds four a thread at most.
 CANDIDATE_LENGTH = 160
 
@@ -38,10 +38,10 @@ def warp_lane() -> wp.int32: ...
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ long long items[{STACK_LENGTH} + {CANDIDATE_LENGTH}];
+    __shared__ long long items[{STACK_LENGTH} + {CANDIDATE_LENGTH} + 1];
     return (wp::uint64)items;
 #else
-    static long long items[{STACK_LENGTH} + {CANDIDATE_LENGTH}];
+    static long long items[{STACK_LENGTH} + {CANDIDATE_LENGTH} + 1];
     return (wp::uint64)items;
 #endif
 """)
@@ -107,11 +107,13 @@ def item_second(item: wp.int64) -> wp.int32: ...
 #endif
     #pragma unroll
     for (int k = 0; k < 4; ++k) {{
-        int at = (all & (1 << k)) ? (stacked++ & {STACK_LENGTH - 1}) : {STACK_LENGTH} + waiting;
-        if (all & (16 << k))
-            ++waiting;
-        if (all & (17 << k))
-            stack[at] = children[k];
+        const bool down = all & (1 << k), face = all & (16 << k);
+        // What is not in use goes where nobody reads: a store without a branch.
+        int at = face ? {STACK_LENGTH} + waiting : {STACK_LENGTH + CANDIDATE_LENGTH};
+        at = down ? stacked & {STACK_LENGTH - 1} : at;
+        stacked += down;
+        waiting += face;
+        stack[at] = children[k];
     }}
     return ((long long)(end_waiting + (total >> 16)) << 32) | (unsigned int)(end + (total & 0xffff));
 """)

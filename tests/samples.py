@@ -135,7 +135,7 @@ def raw_state(scene, i):
     slot = states.slots[objects.state[i]]
     model = scene.models[slot.model]
     nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
-    corners = states.pool.face_corner.numpy()[slot.face_start : slot.face_start + model.face_count]
+    corners = states.pool.face_corner.numpy()[slot.face_start : slot.face_start + model.face_count, :3]
     return {
         "lod": slot.lod,
         "status": states.pool.node_status.numpy()[nodes],

@@ -8,13 +8,13 @@ import warp as wp
 from warp_abtree.broadphase import BroadPhase, CapacityError
 from warp_abtree.checks import to_numpy, whole_number
 from warp_abtree.cores import core_count, launch_on_cores
-from warp_abtree.kernels import faces, pose, predicates, relate, settle, traverse
+from warp_abtree.kernels import faces, pose, predicates, relate, settle, share, traverse
 from warp_abtree.kernels.warps import STACK_LENGTH, WARP_SIZE
 
 OUTPUTS = {"any": faces.OUTPUT_ANY, "count": faces.OUTPUT_COUNT, "faces": faces.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float64": predicates.FLOAT64, "float32": predicates.FLOAT32}
 # Warps that share a single pair; c pairs have 1 / sqrt(c) of that each.
-PARTS_MAX = 256
+PARTS_MAX = 128
 
 # A launch of 32 threads a pair stays within 2^31.
 PAIRS_MAX = 2**26
@@ -25,6 +25,8 @@ COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 UNSURE_CAPACITY = 65536
 # Warps that work off the lists of face pairs left open: about as many as one device runs at a time.
 SETTLE_WARPS = 2048
+# Warps of the traversal that one multiprocessor runs at a time, by its registers.
+WARPS_A_PROCESSOR = 16
 
 EXACT, FILTER, FLOAT64 = int(predicates.EXACT), int(predicates.FILTER), int(predicates.FLOAT64)
 
@@ -183,6 +185,12 @@ class Query:
         self.hits.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.hits.hard_total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.near = None if within is None else self._make_near()
+        self.work = share.Work()
+        boxes = share.MAILBOX_COUNT if self.uses_warps() else 0
+        self.work.counter = wp.zeros(share.COUNTER_COUNT if boxes else 0, dtype=wp.int32, device=self.device)
+        self.work.flag = wp.zeros(boxes, dtype=wp.int32, device=self.device)
+        self.work.owner = wp.empty(boxes, dtype=wp.vec2i, device=self.device)
+        self.work.item = wp.empty(boxes * share.MAILBOX_ITEMS, dtype=wp.int64, device=self.device)
         self._no_distance = wp.empty(0, dtype=wp.float64, device=self.device)
         self._within = within
         self._resize_unsure((unsure_capacity or UNSURE_CAPACITY) if self.uses_warps() else 0)
@@ -291,9 +299,10 @@ class Query:
     def _launch_traversal(self, within, hits, mode, output):
         pools = [arrays.pool for arrays in self.arrays]
         room = len(self.pairs)
-        inputs = [*pools, self.pair_count, self.pairs, within, self.pair_poses, hits]
-        wp.launch(relate.relate_pair_kernel, dim=room, inputs=inputs, device=self.device)
-        inputs = [output, *pools, self.pair_count, self.pairs, self.pair_poses, hits]
+        inputs = [self.parts_max, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
+        dim = max(room, len(self.work.flag))
+        wp.launch(relate.relate_pair_kernel, dim=dim, inputs=inputs, device=self.device)
+        inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits]
         if not self.uses_warps():
             cores = core_count() if self.cores is None else self.cores
             # A launch on a further core costs some 50 us: the work of many pairs apart, of less than one in contact.
@@ -301,10 +310,11 @@ class Query:
             launch_on_cores(traverse.thread_traversal(mode), room, inputs, self.device, cores, least)
             return
         warps = max(room, int(self.parts_max * math.sqrt(room)) + 1)
+        warps = min(warps, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         wp.launch(
             traverse.warp_traversal(EXACT if mode == FLOAT64 else mode),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
-            inputs=[self.parts_max, self.stack_room, *inputs],
+            inputs=[self.parts_max, self.stack_room, *inputs, self.work],
             block_dim=WARP_SIZE,
             device=self.device,
         )
@@ -316,12 +326,12 @@ class Query:
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
         self._launch_traversal(self._no_distance, self.hits, mode, output)
         if len(self.hits.unsure):
-            pools = [arrays.pool for arrays in self.arrays]
             kernels = [settle.settle_traversal(FILTER if mode == EXACT else mode)]
             if mode == EXACT:
                 kernels.append(settle.settle_hard_kernel)
             threads = SETTLE_WARPS * WARP_SIZE if self.device.is_cuda else 1
-            inputs = [threads, output, *pools, self.pairs, self.pair_poses, self.hits]
+            models, states = (arrays.pool for arrays in self.arrays[:2])
+            inputs = [threads, output, models, states, self.pair_poses, self.hits]
             for kernel in kernels:
                 wp.launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
 

@@ -135,7 +135,7 @@ def _copy_states(models: ModelArrays, states: StateArrays, plan: Plan, batch: Up
         if source < 0:
             slot = states.slots[state]
             view = states.pool.face_corner[slot.face_start : slot.face_start + int(models.face_count[slot.model])]
-            view.fill_(wp.vec3i(-1, -1, -1))
+            view.fill_(wp.vec4i(-1, -1, -1, -1))
         elif source != state:
             pairs.append((source, state, states.slots[state].model, full))
 

@@ -117,7 +117,7 @@ class StateArrays:
 
     def _allocate_faces(self, count):
         old, kept = self.pool, self.face_total
-        array = wp.full(count, wp.vec3i(-1, -1, -1), dtype=wp.vec3i, device=self.device)
+        array = wp.full(count, wp.vec4i(-1, -1, -1, -1), dtype=wp.vec4i, device=self.device)
         if kept:
             wp.copy(array, old.face_corner, count=kept)
         self.pool.face_corner = array
