@@ -1,4 +1,4 @@
-"""python -m bench exact|memory|peers|precision|query|scale|sweep|update [--device D] [--json FILE] [...]"""
+"""python -m bench NAME [--device D] [--json FILE] [...]: one of the cases below, its rows printed as they come."""
 
 import argparse
 import datetime
@@ -12,10 +12,12 @@ import warp as wp
 
 import warp_abtree as ab
 
-from . import exact, memory, peers, plots, precision, query, scale, sweep, update
+from . import cascade, exact, frame, memory, peers, plots, precision, query, scale, sweep, update
 
 CASES = {
+    "cascade": cascade.run,
     "exact": exact.run,
+    "frame": frame.run,
     "memory": memory.run,
     "peers": peers.run,
     "precision": precision.run,

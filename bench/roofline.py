@@ -6,19 +6,19 @@ choices and integers cost nothing, and nothing is loaded twice within one test. 
 whether a cache has them or not; stacks in shared memory or registers are left out.
 
 * node test (kernels/visit.py, boxes.py): a visit of four comparisons loads four records of 32 bytes. It poses four
-  boxes: 6 operations for sum and size, 18 for the image of the sum, 15 for that of the size, 3 for reach; 6 more widen
-  each of A's two. A comparison is 6 subtractions, 6 additions, 6 comparisons, and 2 to choose what follows. In all
-  2 (48 + 42) + 4 * 20 = 260, so 65 operations and 32 bytes a test. (A visit of two comparisons does the same work for
+  boxes: 6 operations for sum and size, 18 for the image of the sum, 15 for that of the size; 6 more widen each of A's
+  two. A comparison is 6 subtractions, 6 additions, 6 comparisons, and 4 to choose what follows. In all
+  2 (45 + 39) + 4 * 22 = 256, so 64 operations and 32 bytes a test. (A visit of two comparisons does the same work for
   half as many tests.)
-* triangle test (kernels/faces.py, screen.py): 2 corner triples of 12 bytes and 6 vertices of 16; 18 operations to scale
+* triangle test (kernels/faces.py, screen.py): 2 corner triples in 16 bytes and 6 vertices of 16; 18 operations to scale
   six corners and 54 to pose three. A plane and three signs: 15 for differences, 9 for the normal, 10 for sizes of
   vectors and 2 for the largest, 11 for the bound, 15 for dot products, 6 for signs, 68 in all. Most pairs end there.
   A pair that meets goes through a second plane and two more signs of 42 each: 152 more.
 * float64 test (kernels/faces.py, predicates.py): 2 corner triples and 6 vertices of 24 bytes; 63 operations to pose
-  three, and at least three signs of 34 each, in float64.
+  three, and at least one plane, 18, and three signs of 16 each, in float64.
 * exact test: the same again, and at least one sign in double words (kernels/double_word.py): 54 for differences, 120
   for minors, 30 and 40 for the rest.
-* an object pair: a relative pose of 180 bytes, written and read; a hit: 12 bytes.
+* an object pair: a relative pose of 208 bytes, written and read; a hit: 12 bytes.
 """
 
 import time
@@ -26,11 +26,11 @@ import time
 import numpy as np
 import warp as wp
 
-NODE_BYTES, NODE_FLOPS = 32, 65
-TRIANGLE_BYTES, TRIANGLE_FLOPS, HIT_FLOPS = 2 * 12 + 6 * 16, 18 + 54 + 68, 68 + 2 * 42
-FLOAT64_BYTES, FLOAT64_FLOPS = 2 * 12 + 6 * 24, 63 + 3 * 34
+NODE_BYTES, NODE_FLOPS = 32, 64
+TRIANGLE_BYTES, TRIANGLE_FLOPS, HIT_FLOPS = 2 * 16 + 6 * 16, 18 + 54 + 68, 68 + 2 * 42
+FLOAT64_BYTES, FLOAT64_FLOPS = 2 * 16 + 6 * 24, 63 + 18 + 3 * 16
 EXACT_BYTES, EXACT_FLOPS = FLOAT64_BYTES, FLOAT64_FLOPS + 54 + 120 + 30 + 40
-PAIR_BYTES, HIT_BYTES = 2 * 180, 12
+PAIR_BYTES, HIT_BYTES = 2 * 208, 12
 
 # Published peaks: memory [bytes/s], float32 and float64 without tensor cores [operations/s], by a part of the name.
 PEAKS = {

@@ -40,7 +40,7 @@ def frame_state(frame, scene, i):
     slot = frame._states.slots[state]
     model = scene.models[slot.model]
     nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
-    corners = pool.face_corner.numpy()[slot.face_start : slot.face_start + model.face_count]
+    corners = pool.face_corner.numpy()[slot.face_start : slot.face_start + model.face_count, :3]
     return {
         "lod": int(pool.lod.numpy()[state]),
         "status": pool.node_status.numpy()[nodes],

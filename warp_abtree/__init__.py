@@ -1,12 +1,19 @@
 """Batched mesh-mesh interference queries at any level of detail, on NVIDIA Warp."""
 
 from warp_abtree.broadphase import CapacityError
+from warp_abtree.cascade import Cascade, CascadeResult, intersect_originals
+from warp_abtree.clock import ReplayClock, WorkClock
 from warp_abtree.contact import ContactQuery
-from warp_abtree.dynamics import Kinematic
-from warp_abtree.frame import Frame, FrameRow, LodSweep, resolve_lod
+from warp_abtree.control import Feedback, PaperController, PredictiveController, ToleranceController
+from warp_abtree.dynamics import Dynamics, Kinematic
+from warp_abtree.frame import Frame, FrameRow, LodSweep, judge_budget, judge_step, resolve_lod
+from warp_abtree.frame_graph import FrameGraph
 from warp_abtree.intersect import Query, Result
+from warp_abtree.lod import Camera, Ladder
+from warp_abtree.manifold import ManifoldQuery
 from warp_abtree.mesh import MeshError, describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model import Model, ModelError
+from warp_abtree.newton import NewtonContacts
 from warp_abtree.pose_sweep import sweep
 from warp_abtree.refine import UpdateStats
 from warp_abtree.scene import Scene, TreeState
@@ -15,22 +22,39 @@ from warp_abtree.scene_file import SceneError, load_scene
 __version__ = "0.1.0"
 
 __all__ = [
+    "Camera",
     "CapacityError",
+    "Cascade",
+    "CascadeResult",
     "ContactQuery",
+    "Dynamics",
+    "Feedback",
     "Frame",
+    "FrameGraph",
     "FrameRow",
     "Kinematic",
+    "Ladder",
     "LodSweep",
+    "ManifoldQuery",
     "MeshError",
     "Model",
     "ModelError",
+    "NewtonContacts",
+    "PaperController",
+    "PredictiveController",
     "Query",
+    "ReplayClock",
     "Result",
     "Scene",
     "SceneError",
+    "ToleranceController",
     "TreeState",
     "UpdateStats",
+    "WorkClock",
     "describe_mesh",
+    "intersect_originals",
+    "judge_budget",
+    "judge_step",
     "load_mesh",
     "load_scene",
     "mesh_from_arrays",
