@@ -18,7 +18,7 @@ whether a cache has them or not; stacks in shared memory or registers are left o
   three, and at least one plane, 18, and three signs of 16 each, in float64.
 * exact test: the same again, and at least one sign in double words (kernels/double_word.py): 54 for differences, 120
   for minors, 30 and 40 for the rest.
-* an object pair: a relative pose of 208 bytes, written and read; a hit: 12 bytes.
+* an object pair: a relative pose of 200 bytes, written and read; a hit: 12 bytes.
 """
 
 import time
@@ -30,7 +30,7 @@ NODE_BYTES, NODE_FLOPS = 32, 64
 TRIANGLE_BYTES, TRIANGLE_FLOPS, HIT_FLOPS = 2 * 16 + 6 * 16, 18 + 54 + 68, 68 + 2 * 42
 FLOAT64_BYTES, FLOAT64_FLOPS = 2 * 16 + 6 * 24, 63 + 18 + 3 * 16
 EXACT_BYTES, EXACT_FLOPS = FLOAT64_BYTES, FLOAT64_FLOPS + 54 + 120 + 30 + 40
-PAIR_BYTES, HIT_BYTES = 2 * 208, 12
+PAIR_BYTES, HIT_BYTES = 2 * 200, 12
 
 # Published peaks: memory [bytes/s], float32 and float64 without tensor cores [operations/s], by a part of the name.
 PEAKS = {

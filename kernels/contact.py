@@ -47,8 +47,8 @@ def load_corners(
     corner: wp.array(dtype=wp.vec3d),
 ):
     """Put the corners of a face of A and of one of B, both in A's frame, into places 0..2 and 3..5."""
-    a = states.face_corner[pose.trees.corner_a + face_a]
-    b = states.face_corner[pose.trees.corner_b + face_b]
+    a = states.face_corner[pose.corner_a + face_a]
+    b = states.face_corner[pose.corner_b + face_b]
     for k in range(3):
         corner[k] = models.vertex_pos[a[k]]
         corner[3 + k] = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[k]])

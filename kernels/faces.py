@@ -78,8 +78,8 @@ def screen_faces(
     face_b: wp.int32,
 ):
     """Test one active face of A against one of B in float32; return 1, 0 or UNSURE."""
-    a = load_corner_ids(states, pose.trees.corner_a + face_a)
-    b = load_corner_ids(states, pose.trees.corner_b + face_b)
+    a = load_corner_ids(states, pose.corner_a + face_a)
+    b = load_corner_ids(states, pose.corner_b + face_b)
     error = pose.error
     unit = SCREEN_UNIT
     if mode == FLOAT32:
@@ -108,8 +108,8 @@ def test_faces(
     face_b: wp.int32,
 ):
     """Test one active face of A against one of B in float64, in A's frame; return 1, 0 or UNSURE."""
-    a = states.face_corner[pose.trees.corner_a + face_a]
-    b = states.face_corner[pose.trees.corner_b + face_b]
+    a = states.face_corner[pose.corner_a + face_a]
+    b = states.face_corner[pose.corner_b + face_b]
     a0 = models.vertex_pos[a[0]]
     a1 = models.vertex_pos[a[1]]
     a2 = models.vertex_pos[a[2]]

@@ -18,23 +18,14 @@ ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
 
 
 @wp.struct
-class PairTrees:
-    """Where the two trees of a pair lie in the pools."""
-
-    node_a: wp.int32
-    node_b: wp.int32
-    corner_a: wp.int32
-    corner_b: wp.int32
-
-
-@wp.struct
 class PairPose:
-    """The pose of B in A's frame, A the object with the smaller index, and where the trees of both lie.
+    """The pose of B in A's frame, A the object with the smaller index.
 
     rotation, translation map B's model frame to A's in float64. rotation32, translation32 map coordinates about the
     models' centres in float32, the transpose and back32 the other way. margin serves boxes; scale, a power of two that
     brings the larger model to about unit size, and error serve `screen_triangles`. within is a distance that margin
-    covers too, 0 for intersection.
+    covers too, 0 for intersection. node_* and corner_* say where the trees and face corners of both lie in the pools,
+    swapped whether the pair names B first. In this order nothing is padded, which would be stored byte by byte.
     """
 
     rotation: wp.mat33d
@@ -44,11 +35,13 @@ class PairPose:
     back32: wp.vec3
     margin: wp.float32
     error: wp.float32
+    swapped: wp.int32
     scale: wp.float64
     within: wp.float64
-    trees: PairTrees
-    # Whether the pair names B first.
-    swapped: wp.int32
+    node_a: wp.int32
+    node_b: wp.int32
+    corner_a: wp.int32
+    corner_b: wp.int32
 
 
 @wp.func
@@ -131,6 +124,10 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     pose.rotation = r
     pose.translation = t
     pose.within = within
+    pose.node_a = states.node_start[state_a]
+    pose.node_b = states.node_start[state_b]
+    pose.corner_a = states.face_start[state_a]
+    pose.corner_b = states.face_start[state_b]
     pose.rotation32 = wp.mat33(r)
     # The exponent of a float32 without its digits is a power of two.
     exponent = wp.cast(wp.float32(wp.max(reach_a, reach_b)), wp.int32) & 0x7F800000
@@ -150,19 +147,6 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
             pose.back32[i] = -wp.float32(sum_products(r[0, i], shift[0], r[1, i], shift[1], r[2, i], shift[2]))
         pose.margin = wp.float32(margin64 + margin32 + within * (wp.float64(1.0) + skewed + ROUNDING_32))
     return pose
-
-
-@wp.func
-def locate_trees(states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32):
-    """Return where the trees of two objects lie."""
-    state_a = objects.state[a]
-    state_b = objects.state[b]
-    trees = PairTrees()
-    trees.node_a = states.node_start[state_a]
-    trees.node_b = states.node_start[state_b]
-    trees.corner_a = states.face_start[state_a]
-    trees.corner_b = states.face_start[state_b]
-    return trees
 
 
 @wp.func

@@ -68,21 +68,6 @@ def resolve_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, size: wp.float64):
 
 
 @wp.func
-def filter_orient3d(
-    mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, value: wp.float64, size: wp.float64
-):
-    """Return the sign of a rounded determinant of four points where its bound tells it, else as the mode asks."""
-    sign = filtered_sign(value, BOUND_3D * size)
-    if sign == UNSURE:
-        # Meshes laid on one another share points: a determinant of 0, which no bound above 0 tells.
-        if a == b or a == c or a == d or b == c or b == d or c == d:
-            sign = 0
-        elif mode == EXACT:
-            sign = resolve_orient3d(a, b, c, d, size)
-    return sign
-
-
-@wp.func
 def orient3d(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """Return on which side of plane (a, b, c) point d lies: 1 below, -1 above, 0 on it, or UNSURE.
 
@@ -104,39 +89,14 @@ def orient3d(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
         return plain_sign(value)
     size = wp.abs(u[0]) * (wp.abs(v1w2) + wp.abs(v2w1)) + wp.abs(v[0]) * (wp.abs(w1u2) + wp.abs(w2u1))
     size = size + wp.abs(w[0]) * (wp.abs(u1v2) + wp.abs(u2v1))
-    return filter_orient3d(mode, a, b, c, d, value, size)
-
-
-@wp.func
-def filter_corner(
-    mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, normal: wp.vec3d, reach: wp.vec3d
-):
-    """Return `orient3d` of a point by a plane through a; the determinant along another row, of the same bound."""
-    w = a - d
-    value = (w[0] * normal[0] + w[1] * normal[1]) + w[2] * normal[2]
-    size = (wp.abs(w[0]) * reach[0] + wp.abs(w[1]) * reach[1]) + wp.abs(w[2]) * reach[2]
-    return filter_orient3d(mode, a, b, c, d, value, size)
-
-
-@wp.func
-def orient_corners(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d0: wp.vec3d, d1: wp.vec3d, d2: wp.vec3d):
-    """Return `orient3d` of three points by one plane, whose normal is computed once where a bound guards the signs."""
-    if mode == FLOAT32 or mode == FLOAT64:
-        return orient3d(mode, a, b, c, d0), orient3d(mode, a, b, c, d1), orient3d(mode, a, b, c, d2)
-    u = b - a
-    v = c - a
-    normal = wp.vec3d()
-    reach = wp.vec3d()
-    for i in range(3):
-        left = u[(i + 1) % 3] * v[(i + 2) % 3]
-        right = u[(i + 2) % 3] * v[(i + 1) % 3]
-        normal[i] = left - right
-        reach[i] = wp.abs(left) + wp.abs(right)
-    return (
-        filter_corner(mode, a, b, c, d0, normal, reach),
-        filter_corner(mode, a, b, c, d1, normal, reach),
-        filter_corner(mode, a, b, c, d2, normal, reach),
-    )
+    sign = filtered_sign(value, BOUND_3D * size)
+    if sign == UNSURE:
+        # Meshes laid on one another share points: a determinant of 0, which no bound above 0 tells.
+        if a == b or a == c or a == d or b == c or b == d or c == d:
+            sign = 0
+        elif mode == EXACT:
+            sign = resolve_orient3d(a, b, c, d, size)
+    return sign
 
 
 @wp.func

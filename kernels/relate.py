@@ -5,7 +5,7 @@ import warp as wp
 from warp_abtree.kernels.distance import DISTANCE_MAX, pad_distance
 from warp_abtree.kernels.faces import Hits
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.pose import PairPose, locate_trees, pair_pose
+from warp_abtree.kernels.pose import PairPose, pair_pose
 from warp_abtree.kernels.share import Work, part_count
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -62,6 +62,5 @@ def relate_pair_kernel(
         # Nothing is proved where distances may overflow: every box passes, and the first faces count as near.
         pose.within = wp.float64(wp.inf)
         pose.margin = wp.inf
-    pose.trees = locate_trees(states, objects, a, b)
     pose.swapped = wp.where(pairs[p][0] > pairs[p][1], 1, 0)
     pair_pose_out[p] = pose

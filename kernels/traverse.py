@@ -83,7 +83,7 @@ MANY_PARTS = wp.constant(8)
 @wp.func
 def first_item(states: StatePool, pose: PairPose):
     """Return the item that compares the roots."""
-    return pack_item(load_node(states, pose.trees.node_a + 1).skip, load_node(states, pose.trees.node_b + 1).skip)
+    return pack_item(load_node(states, pose.node_a + 1).skip, load_node(states, pose.node_b + 1).skip)
 
 
 @wp.func

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from warp_abtree.kernels.flat import intersect_coplanar, intersect_degenerate, widest_axis
-from warp_abtree.kernels.predicates import FILTER, UNSURE, orient3d, orient_corners
+from warp_abtree.kernels.predicates import FILTER, UNSURE, orient3d
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -95,10 +95,14 @@ def intersect_triangles(
 
     Source: Guigue and Devillers 2003, Fast and robust triangle-triangle overlap test using orientation predicates.
     """
-    sa0, sa1, sa2 = orient_corners(mode, b0, b1, b2, a0, a1, a2)
+    sa0 = orient3d(mode, b0, b1, b2, a0)
+    sa1 = orient3d(mode, b0, b1, b2, a1)
+    sa2 = orient3d(mode, b0, b1, b2, a2)
     if is_one_sided(sa0, sa1, sa2):
         return 0
-    sb0, sb1, sb2 = orient_corners(mode, a0, a1, a2, b0, b1, b2)
+    sb0 = orient3d(mode, a0, a1, a2, b0)
+    sb1 = orient3d(mode, a0, a1, a2, b1)
+    sb2 = orient3d(mode, a0, a1, a2, b2)
     if is_one_sided(sb0, sb1, sb2):
         return 0
     # A zero-area face sees every corner of the other on its "plane".

@@ -127,8 +127,8 @@ def visit_items(states: StatePool, pose: PairPose, first: wp.int64, second: wp.i
     """Compare what one or two items name, as `visit_two` returns it."""
     return visit_two(
         states.node_box,
-        pose.trees.node_a,
-        pose.trees.node_b,
+        pose.node_a,
+        pose.node_b,
         pose.rotation32,
         pose.translation32,
         pose.back32,
