@@ -9,9 +9,10 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PIPELINE = (
     "checks mesh progressive tree model state refine lod broadphase cores intersect contact scene cascade "
-    "frame_graph pose_sweep manifold bodies dynamics newton clock control frame scene_file plot waiting report cli"
+    "frame_graph pose_sweep manifold bodies dynamics newton clock control frame "
+    "scene_keys scene_models scene_control scene_file recording plot waiting report cli"
 ).split()
-OUTSIDE = PIPELINE[PIPELINE.index("scene_file") :]  # these use the public API alone
+OUTSIDE = PIPELINE[PIPELINE.index("scene_keys") :]  # these use the public API alone
 CORE_DEPENDENCIES = {"warp", "numpy", "trimesh", "warp_abtree"}
 FILE_LINES, KERNEL_LINES = 500, 60
 

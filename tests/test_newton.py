@@ -1,0 +1,129 @@
+"""Contacts for Newton, where it is installed: geometry against closed forms, and bodies that its solver holds up."""
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+import warp_abtree as ab
+
+newton = pytest.importorskip("newton")
+# Newton's first steps compile its own kernels, which takes most of the time of this file.
+
+
+def mesh_of(shape):
+    return newton.Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces).ravel())
+
+
+def placed(position, axis=(0, 0, 1), angle=0.0):
+    axis = np.asarray(axis, float) / np.linalg.norm(axis)
+    return wp.transform(wp.vec3(*position), wp.quat(*(np.sin(angle / 2) * axis), float(np.cos(angle / 2))))
+
+
+CUBE = trimesh.creation.box((1, 1, 1))
+FLOOR = trimesh.creation.box((8, 8, 1))
+
+
+def matrix(pose):
+    """4x4 matrix of x y z qx qy qz qw."""
+    found = trimesh.transformations.quaternion_matrix([pose[6], *pose[3:6]])
+    found[:3, 3] = pose[:3]
+    return found
+
+
+def world_points(model, state, contacts):
+    """Surface points of both shapes in the world, by Newton's convention for points and offsets of bodies."""
+    count = int(contacts.rigid_contact_count.numpy()[0])
+    body, body_q = model.shape_body.numpy(), state.body_q.numpy()
+    points = []
+    for side in (0, 1):
+        shapes = getattr(contacts, f"rigid_contact_shape{side}").numpy()[:count]
+        local = getattr(contacts, f"rigid_contact_point{side}").numpy()[:count]
+        local = local + getattr(contacts, f"rigid_contact_offset{side}").numpy()[:count]
+        poses = [np.eye(4) if body[s] < 0 else matrix(body_q[body[s]]) for s in shapes]
+        points.append(np.array([(m @ [*x, 1])[:3] for m, x in zip(poses, local)]).reshape(-1, 3))
+    return points, contacts.rigid_contact_normal.numpy()[:count]
+
+
+def test_a_cube_on_a_floor_has_its_corners(device):
+    builder = newton.ModelBuilder()
+    turn = (0, 0, 1), 0.5
+    config = newton.ModelBuilder.ShapeConfig(margin=0.02)
+    builder.add_shape_mesh(-1, xform=placed((0, 0, -0.5)), mesh=mesh_of(FLOOR), cfg=config)
+    body = builder.add_body(xform=placed((0.3, 0.2, 0.0), *turn))
+    # The shape stands off its body, and its mesh is scaled.
+    builder.add_shape_mesh(body, xform=placed((0, 0, 0.49)), mesh=mesh_of(CUBE), scale=wp.vec3(1.0, 0.8, 1.0))
+    model = builder.finalize(device=device)
+    state, found = model.state(), ab.NewtonContacts(model)
+    contacts = found.contacts()
+    for _ in range(2):
+        found.collide(state, contacts)
+    (first, second), normals = world_points(model, state, contacts)
+    assert len(normals) == 4
+    np.testing.assert_allclose(normals, np.tile([0, 0, 1], (4, 1)), atol=1e-6)
+    assert set(contacts.rigid_contact_shape0.numpy()[:4]) == {0} and set(contacts.rigid_contact_shape1.numpy()[:4]) == {
+        1
+    }
+    np.testing.assert_allclose((second - first) @ [0, 0, 1], -0.01, atol=1e-6)
+    r = matrix([0, 0, 0, *placed((0, 0, 0), *turn)[3:]])[:3, :3]
+    corners = np.array([r @ [x, y, 0] + [0.3, 0.2, 0] for x in (-0.5, 0.5) for y in (-0.4, 0.4)])
+    for corner in corners:
+        assert np.abs(0.5 * (first + second) - corner)[:, :2].max(1).min() < 1e-6
+    assert np.unique(contacts.rigid_contact_margin0.numpy()[:4]) == pytest.approx(0.02)
+
+
+def test_filters_groups_and_worlds(device):
+    def add(builder, **config):
+        body = builder.add_body(xform=placed((0, 0, 0)))
+        return builder.add_shape_mesh(body, mesh=mesh_of(CUBE), cfg=newton.ModelBuilder.ShapeConfig(**config))
+
+    part = newton.ModelBuilder()
+    add(part)
+    part.add_shape_mesh(0, xform=placed((0.5, 0, 0)), mesh=mesh_of(CUBE))  # of the same body
+    builder = newton.ModelBuilder()
+    for _ in range(2):
+        builder.add_world(part)
+    add(builder, collision_group=-1)  # in every world
+    model = builder.finalize(device=device)
+    assert model.shape_world.numpy().tolist() == [0, 0, 1, 1, -1]
+    found = ab.NewtonContacts(model)
+    assert found.scene.broad_phase().tolist() == [[0, 4], [1, 4], [2, 4], [3, 4]]
+    builder = newton.ModelBuilder()
+    shapes = [add(builder, collision_group=g) for g in (1, 1, 2, -1, -1, -2, 0)]
+    builder.add_shape_collision_filter_pair(shapes[0], shapes[1])
+    found = ab.NewtonContacts(builder.finalize(device=device))
+    expected = [(0, 3), (0, 4), (0, 5), (1, 3), (1, 4), (1, 5), (2, 3), (2, 4), (2, 5), (3, 5), (4, 5)]
+    assert [tuple(pair) for pair in found.scene.broad_phase().tolist()] == expected
+
+
+def test_room_and_wrong_models(device):
+    builder = newton.ModelBuilder()
+    builder.add_shape_mesh(-1, xform=placed((0, 0, -0.5)), mesh=mesh_of(FLOOR))
+    builder.add_shape_sphere(builder.add_body())
+    with pytest.raises(ValueError, match="1 shapes that are meshes"):
+        ab.NewtonContacts(builder.finalize(device=device))
+    builder.add_shape_mesh(builder.add_body(xform=placed((0, 0, 0.49))), mesh=mesh_of(CUBE))
+    model = builder.finalize(device=device)
+    found = ab.NewtonContacts(model)
+    with pytest.raises(ab.CapacityError, match="4 rigid contacts"):
+        found.collide(model.state(), found.contacts(2))
+
+
+def test_a_ring_falls_over_a_peg_in_newton(device):
+    builder = newton.ModelBuilder()
+    builder.add_shape_mesh(-1, xform=placed((0, 0, -0.5)), mesh=mesh_of(FLOOR))
+    peg = trimesh.creation.cylinder(0.3, 1.2, sections=8)
+    builder.add_shape_mesh(-1, xform=placed((0, 0, 0.55)), mesh=mesh_of(peg))
+    ring = builder.add_body(xform=placed((0.1, 0, 1.0), (2, 1, 0), 0.15))
+    builder.add_shape_mesh(ring, mesh=mesh_of(trimesh.creation.torus(0.8, 0.25, 16, 8)))
+    model = builder.finalize(device=device)
+    found = ab.NewtonContacts(model)
+    solver, contacts, control = newton.solvers.SolverXPBD(model), found.contacts(), model.control()
+    state, after = model.state(), model.state()
+    for _ in range(400):
+        state.clear_forces()
+        found.collide(state, contacts)
+        solver.step(state, after, control, contacts, 1 / 240)
+        state, after = after, state
+    x, y, z = state.body_q.numpy()[0, :3]
+    assert np.hypot(x, y) < 0.3 and z == pytest.approx(0.25, abs=0.02)
