@@ -67,7 +67,7 @@ FIGURES = (
 def forced(share):
     """Let states be refitted whole past another share of their faces; None changes nothing."""
     kept = refine.FULL_SHARE
-    refine.FULL_SHARE = kept if share is None else share
+    refine.FULL_SHARE = kept if share is None else dict.fromkeys(kept, share)
     try:
         yield
     finally:
@@ -236,7 +236,7 @@ def run_mesh(device, model, sizes):
         row = {"device": device.name, "case": "one state", "faces": model.face_count, "splits": step}
         row |= {"k": int(k[0]), "share": float(f"{k[0] / model.face_count:.4g}"), "entries": entries}
         row |= {"nodes_refitted": int(nodes[0]), "bound": int(bound_nodes(int(k[0]), model.face_count))}
-        row["full"] = entries > refine.FULL_SHARE * model.face_count  # what the library chooses
+        row["full"] = entries > refine.full_share(device) * model.face_count  # what the library chooses
         row |= time_update(scene, [finest - step], [finest], launches, device, sizes["repeats"])
         # Not in turn with the others, whose tree it would drive out of the caches.
         row |= summarise("bvh_build", time_in_turn({"build": peer.rebuild}, device, sizes["repeats"])["build"])
@@ -249,7 +249,7 @@ def run_mesh(device, model, sizes):
         "crossover_k": (crossover := find_crossover(rows, "k")),
         "crossover_share": crossover and round(crossover / model.face_count, 4),
         "crossover_entries": find_crossover(rows, "entries"),
-        "full_share": refine.FULL_SHARE,
+        "full_share": refine.full_share(device),
         "slope": fit_slope([row["k"] for row in rows], [row["update_ms"] for row in rows]),
         "host_build_ms": time_host_build(model),
     }

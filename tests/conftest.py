@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 import warp as wp
 
+from warp_abtree import refine
+
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 
@@ -34,3 +36,9 @@ def real_mesh_path(name):
 def real_mesh_path_fixture():
     """Give `real_mesh_path` to a test that does not import it."""
     return real_mesh_path
+
+
+@pytest.fixture
+def half_refitted_in_part(monkeypatch):
+    """Refit states in part up to half of their faces on every device, also where the whole costs less."""
+    monkeypatch.setattr(refine, "FULL_SHARE", dict.fromkeys(refine.FULL_SHARE, 0.5))

@@ -11,6 +11,8 @@ from samples import random_poses, raw_state, sample
 import warp_abtree as ab
 from warp_abtree import tree
 
+pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
+
 NAMES = ("one", "two", "small ball", "crumbs", "grid", "soup", "lattice soup", "twins")
 
 

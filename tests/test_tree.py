@@ -10,6 +10,8 @@ from samples import SHAPES, crumbs, plain, raw_state, repeated, sample, soup
 import warp_abtree as ab
 from warp_abtree.tree import active_build
 
+pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
+
 WALKED = ("one", "two", "three", "five", "small ball", "crumbs", "grid", "soup", "lattice soup", "twins")
 
 

@@ -17,7 +17,7 @@ import warp as wp
 
 from warp_abtree.checks import whole_number
 from warp_abtree.kernels import lod as kernels
-from warp_abtree.refine import FULL_SHARE
+from warp_abtree.refine import full_share
 
 SPACINGS = ("operations", "ratio")
 LEVELS_PER_OCTAVE = int(kernels.STEPS_PER_OCTAVE) // int(kernels.DITHER)
@@ -381,7 +381,8 @@ class PredictedSelection:
         launch(kernels.raise_faces_kernel, len(prediction.power_up), pool, prediction)
         inputs = models, pool, self.dial, self._offset, self.rung, self.work, prediction
         launch(kernels.predict_work_kernel, (candidates, int(kernels.CHUNKS)), *inputs)
-        launch(kernels.predict_refit_kernel, (candidates, models), models, FULL_SHARE, pool, prediction)
+        share = full_share(self.view.device)
+        launch(kernels.predict_refit_kernel, (candidates, models), models, share, pool, prediction)
         launch(kernels.sum_chunk_kernel, candidates, prediction)
         limits = self.budget, self.aim, self.low, self.patience, self.dial_max, self.stay
         launch(kernels.choose_dial_kernel, 1, *limits, prediction, self.dial, self.choice)

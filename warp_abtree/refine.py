@@ -12,8 +12,15 @@ from warp_abtree.kernels.pools import LEVEL_MAX
 from warp_abtree.state import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.tree import UpdateBatch, UpdateWork, active_update, launch_items, make_level_lists
 
-# Past this share of the faces in its slice, a state is refitted whole. A slice repeats faces, so k is smaller still.
-FULL_SHARE = 0.5
+# Past this share of the faces in its slice, a state is refitted whole: what was measured to cost less. A slice repeats
+# faces, so k is smaller still.
+FULL_SHARE = {"cpu": 0.5, "cuda": 0.01}
+
+
+def full_share(device) -> float:
+    """Return the share of its faces past which a state is refitted whole: on a GPU few nodes take as long as many."""
+    return FULL_SHARE["cuda" if device.is_cuda else "cpu"]
+
 
 # Wishes on the device that could not be met, and the lowest index that had one.
 NO_FAULTS = (0, 2**31 - 1)
@@ -110,7 +117,7 @@ def _make_batch(models: ModelArrays, states: StateArrays, plan: Plan) -> UpdateB
         from_lod = states.slots[source].lod if source >= 0 else -1
         low, high = (min(lod, from_lod), max(lod, from_lod)) if source >= 0 else (0, 0)
         touched = int(bounds[high] - bounds[low])
-        whole = source < 0 or touched > FULL_SHARE * models.face_count[model]
+        whole = source < 0 or touched > full_share(states.device) * models.face_count[model]
         full.append(whole)
         start.append(0 if whole else int(bounds[low]))
         length.append(0 if whole else touched)
@@ -204,7 +211,7 @@ class LodUpdate(UpdateWork):
         owner = np.array([slot.model for slot in states.slots])
         bounds = [len(bound) for bound in models.split_bounds]
         longest = np.array([bound[-1] - bound[0] for bound in models.split_bounds])
-        partial_max = np.minimum(longest, np.floor(FULL_SHARE * models.face_count).astype(np.int64))
+        partial_max = np.minimum(longest, np.floor(full_share(device) * models.face_count).astype(np.int64))
         entries, depth = partial_max[owner], models.depth[owner]
         levels = range(int(depth.max()) + 1)
         level_room = [int(np.sum(depth >= level)) << level for level in levels]
