@@ -353,6 +353,7 @@ def plain_nodes(model, ladder, k, held, wanted):
     return math.floor(total)
 
 
+@pytest.mark.usefixtures("half_refitted_in_part")
 def test_prediction_is_that_of_plain_python(models, device):
     rng = np.random.default_rng(4)
     scene = make_scene(models, 50, device)
