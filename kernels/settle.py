@@ -48,7 +48,7 @@ def settle_item(
 def settle_traversal(mode: int):
     """Return the kernel that decides what `warp_traversal` left open in float64; FILTER lists what that leaves."""
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=80)
     def settle_faces_kernel(
         threads: wp.int32,
         output: wp.int32,

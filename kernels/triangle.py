@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from warp_abtree.kernels.flat import intersect_coplanar, intersect_degenerate, widest_axis
-from warp_abtree.kernels.predicates import FILTER, UNSURE, orient3d
+from warp_abtree.kernels.predicates import EXACT, FILTER, UNSURE, orient3d
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -100,6 +100,9 @@ def intersect_triangles(
     sa2 = orient3d(mode, b0, b1, b2, a2)
     if is_one_sided(sa0, sa1, sa2):
         return 0
+    if mode == EXACT and sa0 == 0 and sa1 == 0 and sa2 == 0:
+        # Exact zeros take longest: not three more of them.
+        return wp.where(intersect_special(mode, a0, a1, a2, b0, b1, b2), 1, 0)
     sb0 = orient3d(mode, a0, a1, a2, b0)
     sb1 = orient3d(mode, a0, a1, a2, b1)
     sb2 = orient3d(mode, a0, a1, a2, b2)

@@ -23,8 +23,8 @@ COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 
 # Face pairs that the float32 stage leaves open: about one in a hundred. The list grows as needed.
 UNSURE_CAPACITY = 65536
-# Warps that work off the lists of face pairs left open: about as many as one device runs at a time.
-SETTLE_WARPS = 2048
+# Warps that work off the lists of face pairs left open: more than one device runs at a time.
+SETTLE_WARPS = 4096
 # Warps of the traversal that one multiprocessor runs at a time, by its registers.
 WARPS_A_PROCESSOR = 16
 
