@@ -174,7 +174,7 @@ def test_sweep_of_a_named_object(tmp_path):
         ("[scene]\ntime_step = -1\n" + ONE, "scene.time_step"),
         ("[scene]\nspeed = 1\n" + ONE, "scene.speed: unknown key"),
         ("scene = 3\n" + ONE, "scene: not a table"),
-        ('[models.m]\n[[objects]]\nmodel = "m"\n', "models.m: give one of mesh and shape"),
+        ('[models.m]\n[[objects]]\nmodel = "m"\n', "models.m: give mesh or shape"),
         ('[models.m]\nshape = "cube"\n[[objects]]\nmodel = "m"\n', "models.m.shape: 'cube' is none of"),
         ('[models.m]\nshape = "torus"\n[[objects]]\nmodel = "m"\n', "models.m.shape"),
         ('[models.m]\nshape = "box"\nradius = 1\n[[objects]]\nmodel = "m"\n', "models.m.radius: unknown key"),
@@ -221,6 +221,53 @@ def test_sweep_of_a_named_object(tmp_path):
         (ONE + '[[lod_sweep]]\nmodel = "ball"\nfrom = 1\nto = 0\nperiod = 1\n', "lod_sweep[0].to"),
         (ONE + "[picture]\neye = [0, 2, 0]\n", "picture.up: points along eye"),
         (ONE + "[picture]\nzoom = 2\n", "picture.zoom: unknown key"),
+        (ONE.replace("[[", "faces = 0\n[["), "models.ball.faces: 0 is outside"),
+        (ONE.replace("[[", "mesh = []\n[["), "models.ball.mesh: an empty list"),
+        (ONE.replace("[[", "mesh = [3]\n[["), "models.ball.mesh: not a text"),
+        ('[models.m]\nmesh = ["a.obj", "b.obj"]\n[[objects]]\nmodel = "m"\n', "b.obj: no such file"),
+        ('[models.m]\nshape = "knot"\nradius = 1\n[[objects]]\nmodel = "m"\n', "models.m.shape: knot() missing"),
+        ('[models.m]\nshape = "revolve"\nprofile = [[1, 0], [1, 0]]\nsections = 9\n', "models.m.profile: a radius"),
+        ('[models.m]\nshape = "revolve"\nprofile = [[0, 0], [1, 1]]\nsections = 9\n', "models.m.profile: a radius"),
+        ('[models.m]\nshape = "revolve"\nprofile = 3\nsections = 9\n', "models.m.profile: not a list of points"),
+        (ONE + "count = 2\ngrid = { size = [0, 0, 1], spacing = [1, 1, 1] }\n", "give count or grid"),
+        (ONE + "grid = { size = [0, 1, 1], spacing = [1, 1, 1] }\n", "give count or grid"),
+        (ONE + "kinematic = true\n", "objects[0].kinematic: the scene has no [dynamics]"),
+        (ONE + "density = 2\n", "objects[0].density: the scene has no [dynamics]"),
+        (ONE + "density = 0\n[dynamics]\n", "objects[0].density: 0 is not above"),
+        (ONE + "restitution = 2\n[dynamics]\n", "objects[0].restitution: 2 is not from 0 to 1"),
+        (ONE + "static = true\nkinematic = true\n[dynamics]\n", "objects[0].kinematic: a static object"),
+        (ONE + "shuttle = { by = [1, 0, 0], period = 1 }\n[dynamics]\n", "objects[0].shuttle: a rigid body"),
+        (ONE + "[dynamics]\ngravity = 9.81\n", "dynamics.gravity: not a list of 3"),
+        (ONE + "[dynamics]\nfriction = -1\n", "dynamics.friction: -1 is not from 0"),
+        (ONE + "[dynamics]\nwind = 1\n", "dynamics.wind: unknown key"),
+        (ONE + "[dynamics]\n[picture]\ntime = 1\n", "picture.time: rigid bodies"),
+        (ONE + "[lod]\n", "lod: give budget_ms or tolerance"),
+        (ONE + "[lod]\nbudget_ms = 0\n", "lod.budget_ms: 0 is not above 0"),
+        (ONE + '[lod]\nbudget_ms = "8ms"\n', "lod.budget_ms: not a finite number"),
+        (ONE + "[lod]\ntolerance = -1\n", "lod.tolerance: -1 is not from 0"),
+        (ONE + '[lod]\ncontroller = "magic"\n', "lod.controller: 'magic' is none of predictive, paper, tolerance"),
+        (ONE + '[lod]\ncontroller = "paper"\n', "lod: controller 'paper' needs a budget"),
+        (ONE + "[lod]\nbudget_ms = 1\nsteps = 0\n", "lod.steps: 0 is outside"),
+        (ONE + "[lod]\nbudget_ms = 1\nlow = 0.9\naim = 0.5\n", "lod.low: is above aim"),
+        (ONE + "[lod]\nbudget_ms = 1\nspeed = 3\n", "lod.speed: unknown key"),
+        (
+            ONE + '[lod]\nbudget_ms = 1\n[[lod_sweep]]\nmodel = "ball"\nfrom = 1\nto = 0.5\nperiod = 1\n',
+            "lod: LODs are swept, or chosen by a controller",
+        ),
+        (ONE + "[camera]\neye = [0, 0, 1]\n", "camera: the key 'target' is missing"),
+        (ONE + "[camera]\neye = [0, 0, 1]\ntarget = [0, 0, 1]\n", "camera: the camera looks at its own eye"),
+        (
+            ONE + "[camera]\neye = [0, 1, 0]\ntarget = [0, 0, 0]\n",
+            "camera: the camera looks at its own eye, or along up",
+        ),
+        (ONE + "[camera]\neye = [0, 0, 1]\ntarget = [0, 0, 0]\nfar = 0\n", "camera.far: 0 is not above 0"),
+        (ONE + "[camera]\neye = [0, 0, 1]\n[[camera.keys]]\ntime = 0\n", "camera: give eye and target, or"),
+        (ONE + "[camera]\nkeys = [3]\n", "camera.keys[0]: not a table"),
+        (ONE + "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\n", "camera.keys[0]: the key 'target' is missing"),
+        (
+            ONE + 2 * "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\ntarget = [0, 0, 0]\n",
+            "camera.keys[1].time: 0.0 is not after",
+        ),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path, text, message):
@@ -229,6 +276,13 @@ def test_what_is_wrong_is_said(tmp_path, text, message):
     assert message in str(caught.value)
     assert str(caught.value).startswith(str(tmp_path / "scene.toml"))
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_bodies_without_a_mass_are_named(tmp_path):
+    sheet = '[models.sheet]\nshape = "terrain"\nextents = [1, 1]\ncells = [2, 2]\nbumps = 0\nwaves = 1\nrim = 0\n'
+    loaded = load(tmp_path, sheet + '[[objects]]\nmodel = "sheet"\n[dynamics]\n')
+    with pytest.raises(ab.SceneError, match=r"scene.toml: objects: model 'sheet' is flat"):
+        loaded.frame()
 
 
 def test_file_that_is_none(tmp_path):

@@ -14,9 +14,12 @@ import numpy as np
 
 import warp_abtree as ab
 from warp_abtree import Model, Scene, describe_mesh, load_mesh, load_scene, report, resolve_lod
+from warp_abtree.recording import Recording, record_run
+from warp_abtree.scene_control import CONTROLLERS
 from warp_abtree.waiting import Progress, compile_notice, start_warp
 
 PROGRAM = "warp-abtree"
+PLOT_NAME = "frames.png"
 NOT_BUILT = {
     "bench": "bench is not built yet; `python -m bench` in a checkout has what there is",
     "view": "view is not built yet; `run SCENE --picture PNG` draws a scene",
@@ -132,41 +135,97 @@ def query(options, progress):
 
 
 def run(options, progress):
-    """Run a scene file."""
-    if options.record:
-        report.check_output(options.record, [".csv", ".json"])
-    if options.picture:
-        report.check_output(options.picture, [".png"])
-        try:
-            import matplotlib  # noqa: F401
-        except ImportError:
-            raise ValueError("--picture needs Matplotlib: pip install matplotlib") from None
-    loaded = load_scene(options.scene, device=options.device, progress=progress)
-    frames = loaded.frames if options.frames is None else options.frames
-    frame = loaded.frame()
-    frame.warm_up()
-    frame.run(frames, progress=lambda done, total: progress("frames", done, total))
+    """Run a scene file, or a recording again."""
+    again = str(options.scene).lower().endswith(".npz")
+    _check_run(options, again)
+    replay = Recording.open(options.scene) if again else None
+    if again:
+        device = options.device or replay.settings["device"]
+        loaded = replay.load_scene(options.scene, device=device, progress=progress)
+        frames = len(replay.rows) if options.frames is None else options.frames
+        if frames > len(replay.rows):
+            raise ValueError(f"--frames: {options.scene} has {len(replay.rows)} frames")
+        asked = {name: replay.settings[name] for name in ("controller", "budget_ms")}
+    else:
+        loaded = load_scene(options.scene, device=options.device, progress=progress, objects=options.objects)
+        frames = loaded.frames if options.frames is None else options.frames
+        asked = {"controller": options.controller, "budget_ms": options.budget}
+    frame, recording = record_run(
+        loaded,
+        frames,
+        replay,
+        keep=again or bool(options.record and options.record.suffix.lower() == ".npz"),
+        progress=lambda done, total: progress("frames", done, total),
+        **asked,
+    )
     progress.close()
-    if options.record:
-        frame.record(options.record)
-    if options.picture:
-        from warp_abtree.plot import draw_scene
-
-        draw_scene(loaded, options.picture, frame.history[-1].time)
+    different = replay.difference(recording) if again else None
+    if different:
+        raise RuntimeError(f"{options.scene}: {different}")
+    written = _write_run(options, loaded, frame, recording)
     summary = {
         "title": loaded.title,
         "device": str(loaded.scene.device),
         "time_step": loaded.time_step,
         "models": len(loaded.scene.models),
+        "meshes": {
+            name: {"mesh": model.name, "faces": model.face_count, "base_faces": _active(model, 0)}
+            for name, model in loaded.models.items()
+        },
         "worlds": len(np.unique(loaded.worlds[loaded.worlds >= 0])),
+        "controller": recording.settings["controller"],
+        "replay": str(options.scene) if again else None,
         **frame.summary(),
     }
     if options.json:
         report.print_json(summary)
     else:
         report.print_summary(summary)
-        for path in filter(None, (options.record, options.picture)):
+        for path in written:
             print(f"wrote {path}")
+
+
+def _check_run(options, again):
+    """Refuse options that cannot be met, before any work."""
+    if again:
+        for name in ("budget", "controller", "objects"):
+            if getattr(options, name) is not None:
+                raise ValueError(f"--{name}: a recording runs again as it was")
+    if options.record:
+        report.check_output(options.record, [".csv", ".json", ".npz"], inputs=[options.scene])
+    if options.picture:
+        report.check_output(options.picture, [".png"])
+    if options.plot:
+        report.check_output(options.plot / PLOT_NAME, [".png"], make=True)
+    for name in ("picture", "plot"):
+        if getattr(options, name):
+            try:
+                import matplotlib  # noqa: F401
+            except ImportError:
+                raise ValueError(f"--{name} needs Matplotlib: pip install matplotlib") from None
+
+
+def _write_run(options, loaded, frame, recording):
+    """Write what a run was asked to; return the files."""
+    if options.record:
+        if options.record.suffix.lower() == ".npz":
+            recording.save(options.record)
+        else:
+            frame.record(options.record)
+    if options.picture:
+        from warp_abtree.plot import draw_scene
+
+        poses = None if loaded.dynamics is None else frame.motion.dynamics.poses()
+        chosen = None if recording.settings["controller"] == "none" else loaded.scene.lods
+        draw_scene(loaded, options.picture, frame.history[-1].time, poses, chosen)
+    if options.plot:
+        from warp_abtree.plot import draw_run
+
+        options.plot.mkdir(exist_ok=True)
+        top = np.array([model.lod_max for model in loaded.scene.models])[loaded.scene.object_model]
+        title = f"{loaded.title}: {recording.settings['controller']} on {loaded.scene.device}"
+        draw_run(frame.history, recording.lods / np.maximum(top, 1), options.plot / PLOT_NAME, title)
+    return list(filter(None, (options.record, options.picture, options.plot and options.plot / PLOT_NAME)))
 
 
 # Arguments.
@@ -179,6 +238,17 @@ def _positive(text):
         value = 0
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 1")
+    return value
+
+
+def _milliseconds(text):
+    match = re.fullmatch(r"\s*([\d.eE+-]+)\s*(ms|s)?\s*", text)
+    try:
+        value = float(match[1]) * (1e3 if match[2] == "s" else 1.0)
+    except (TypeError, ValueError):
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is no time above 0, as 8ms or 0.008s")
     return value
 
 
@@ -258,11 +328,19 @@ def make_parser() -> argparse.ArgumentParser:
         "run a scene file frame by frame and time its stages",
         "scenes/bunny_tori.toml --picture bunny_tori.png",
         "scenes/herd.toml --frames 10 --device cpu --record herd.csv",
+        "scenes/rain.toml --budget 8ms --controller paper --plot plots --record rain.npz",
+        "rain.npz",
     )
-    sub.add_argument("scene", metavar="SCENE.toml", help="scene file; README.md names its keys")
+    sub.add_argument("scene", metavar="SCENE", help="scene file (.toml), or a recorded run (.npz), which runs again")
     sub.add_argument("--frames", type=_positive, metavar="N", help="frames to run (the scene's own number)")
     sub.add_argument("--picture", type=Path, metavar="PNG", help="draw the scene, intersecting faces coloured")
-    sub.add_argument("--record", type=Path, metavar="FILE", help="write a row a frame, .csv or .json")
+    sub.add_argument("--objects", type=_positive, metavar="N", help="about so many objects, by other counts or worlds")
+    sub.add_argument("--budget", type=_milliseconds, metavar="TIME", help="time of a frame to hold, as 8ms or 0.008s")
+    sub.add_argument("--controller", choices=CONTROLLERS, help="what chooses LODs (the scene's own, or predictive)")
+    sub.add_argument(
+        "--record", type=Path, metavar="FILE", help="write a row a frame, .csv or .json; .npz holds all and runs again"
+    )
+    sub.add_argument("--plot", type=Path, metavar="DIR", help="draw LODs, times and error over the frames there")
 
     command("bench", None, "benchmarks (not built yet)")
     command("view", None, "look at a scene (not built yet)")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_abtree import Scene
+from warp_abtree import FrameRow, Scene
 
 # Plain and intersecting faces, by model in the order of the scene.
 COLOURS = (
@@ -20,6 +20,7 @@ COLOURS = (
 )
 BACKGROUND = (1.0, 1.0, 1.0)
 SAMPLES = 2  # along each side of a pixel
+LEGEND_WIDTH = 190  # pixels of an entry
 CHUNK = 200_000  # candidate pixels at once
 # Directions to the lights in the eye's frame (right, up, towards the eye), and their strengths.
 AMBIENT = 0.42
@@ -243,8 +244,11 @@ def draw(panels: list[Panel], path, title: str, legend, eye, up, size: int = 620
     camera = Camera.around(np.concatenate([panel.triangles.reshape(-1, 3) for panel in panels]), eye, up)
     images = _crop([render(panel, camera, size) for panel in panels])
     rows, columns = images[0].shape[:2]
-    gap, head, panel_head, foot = 16, 44, 50, 40
+    gap, head, panel_head = 16, 44, 50
     width = len(panels) * columns + (len(panels) + 1) * gap
+    # Pairs of entries, plain and intersecting, stay side by side.
+    across = max(1, min(len(legend) // 2, width // (2 * LEGEND_WIDTH)))
+    foot = 40 + 20 * (-(-len(legend) // (2 * across)) - 1)
     height = head + panel_head + rows + foot
     dpi = 100
     figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor=BACKGROUND)
@@ -259,9 +263,12 @@ def draw(panels: list[Panel], path, title: str, legend, eye, up, size: int = 620
         axes.set_axis_off()
         where = (left + 0.5 * columns) / width, 1 - (head + 0.5 * panel_head) / height
         figure.text(*where, panel.title, ha="center", va="center", fontsize=10.5, color="0.25", linespacing=1.35)
-    handles = [matplotlib.patches.Patch(facecolor=colour, edgecolor="0.4", label=label) for colour, label in legend]
+    # The legend fills columns first.
+    lines = [legend[i : i + 2 * across] for i in range(0, len(legend), 2 * across)]
+    entries = [line[i] for i in range(2 * across) for line in lines if i < len(line)]
+    handles = [matplotlib.patches.Patch(facecolor=colour, edgecolor="0.4", label=label) for colour, label in entries]
     figure.legend(
-        handles=handles, loc="lower center", ncols=len(handles), frameon=False, fontsize=10.5, borderaxespad=0.6
+        handles=handles, loc="lower center", ncols=2 * across, frameon=False, fontsize=10.5, borderaxespad=0.6
     )
     _write_png(canvas, path)
 
@@ -302,7 +309,7 @@ def panel_lods(loaded) -> list[np.ndarray]:
     return chosen
 
 
-def draw_scene(loaded, path, time: float):
+def draw_scene(loaded, path, time: float, poses=None, lods=None):
     """Draw a scene file's picture at one time and several LODs: both sides of an LOD switch, the same poses.
 
     The scene's LODs are what they were afterwards, its poses those of the picture.
@@ -311,12 +318,15 @@ def draw_scene(loaded, path, time: float):
         loaded: What `load_scene` returned.
         path: PNG file to write.
         time: Time of the poses [s], unless the file's `[picture]` has one.
+        poses: Pose of every object, (n, 7), in the place of those of the time.
+        lods: LOD of every object, (n,), for one panel in the place of the file's.
 
     Raises:
         ValueError: The world to draw has no object.
     """
     scene, picture = loaded.scene, loaded.picture
     time = time if picture.time is None else picture.time
+    poses = loaded.motion.poses(time) if poses is None else poses
     objects = np.flatnonzero((loaded.worlds == picture.world) | (loaded.worlds == -1))
     if len(objects) == 0:
         raise ValueError(f"{loaded.path}: picture.world: no object is in world {picture.world}")
@@ -325,9 +335,9 @@ def draw_scene(loaded, path, time: float):
     subject = next((i for i, model in enumerate(scene.models) if swept and model is swept[0]), None)
     before, panels = scene.lods, []
     try:
-        for lods in panel_lods(loaded):
-            scene.set_lods(lods)
-            panels.append(make_panel(scene, loaded.motion.poses(time), objects, subject))
+        for shown in panel_lods(loaded) if lods is None else [lods]:
+            scene.set_lods(shown)
+            panels.append(make_panel(scene, poses, objects, subject))
     finally:
         scene.set_lods(before)
     legend = []
@@ -336,3 +346,61 @@ def draw_scene(loaded, path, time: float):
         name = scene.models[i].name
         legend += [(plain, name), (struck, f"{name}, intersecting")]
     draw(panels, path, loaded.title, legend, picture.eye, picture.up)
+
+
+# Runs.
+
+STAGE_LABELS = {
+    "select_ms": "select",
+    "refine_ms": "refine",
+    "broad_ms": "broad phase",
+    "query_ms": "query",
+    "move_ms": "move",
+    "answer_ms": "answer",
+}
+
+
+def draw_run(rows: list[FrameRow], parts, path, title: str):
+    """Draw LODs, times by stage and certified error of a run over its frames, to a PNG file.
+
+    Args:
+        rows: One a frame.
+        parts: LOD of every object over its finest, (frames, n).
+        path: File to write.
+        title: Above.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 10), dpi=100, facecolor=BACKGROUND, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    lods, times, errors = figure.subplots(3, 1, sharex=True)
+    figure.suptitle(title, fontsize=14, fontweight="bold", color="0.15")
+    frames = np.array([row.frame for row in rows])
+
+    low, tenth, middle, ninth, high = np.percentile(parts, (0, 10, 50, 90, 100), axis=1)
+    lods.fill_between(frames, low, high, color="C0", alpha=0.15, linewidth=0, label="all objects")
+    lods.fill_between(frames, tenth, ninth, color="C0", alpha=0.35, linewidth=0, label="10 to 90 % of them")
+    lods.plot(frames, middle, color="C0", label="median")
+    lods.set(ylabel="LOD, part of the finest", ylim=(-0.03 * high.max() - 1e-6, 1.05 * high.max() + 1e-6))
+
+    stages = [[getattr(row, name) for row in rows] for name in STAGE_LABELS]
+    cost = np.sum(stages[:4], axis=0)
+    times.stackplot(frames, *stages, labels=STAGE_LABELS.values(), alpha=0.8, linewidth=0, step="mid")
+    times.step(frames, cost, where="mid", color="black", linewidth=0.8, label="T': select to query")
+    budgets = [row.budget_ms for row in rows if row.budget_ms is not None]
+    if budgets:
+        times.axhline(budgets[-1], color="red", linewidth=1, label=f"T = {budgets[-1]:g} ms")
+        times.axhline(1.1 * budgets[-1], color="red", linewidth=1, linestyle=":", label="T + 10 %")
+    # One hitch must not flatten the rest.
+    top = np.percentile(np.sum(stages, axis=0), 99)
+    times.set(ylabel="time [ms]", ylim=(0, 1.25 * max(top, *budgets, 1e-6)))
+
+    errors.plot(frames, [row.error_mean for row in rows], color="C3", label="mean of the objects")
+    errors.plot(frames, [row.error_max for row in rows], color="C3", linestyle=":", label="greatest")
+    errors.set(ylabel="certified error [world units]", xlabel="frame", xlim=(frames[0], max(frames[-1], 1)))
+    errors.set_ylim(bottom=0)
+    for axes in (lods, times, errors):
+        axes.grid(True, alpha=0.3)
+        axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    _write_png(canvas, path)

@@ -10,10 +10,13 @@ import numpy as np
 
 LISTED_FACES = 20  # face pairs or contacts that `query` prints
 STAGES = {
+    "select_ms": "select LODs",
     "refine_ms": "refine and refit",
     "move_ms": "move",
     "broad_ms": "broad phase",
     "query_ms": "query",
+    "answer_ms": "answer",
+    "cost_ms": "select to query, without move",
     "total_ms": "frame",
 }
 
@@ -138,6 +141,11 @@ def print_summary(summary):
     worlds = f"{summary['worlds']} world{'' if summary['worlds'] == 1 else 's'}"
     span = f"LODs {summary['lod_min']:,} to {summary['lod_max']:,}"
     print(f"{summary['objects']:,} objects of {summary['models']} models in {worlds}, {span}\n")
+    table = [["model", "faces", "of the base", "mesh"]]
+    for name, mesh in summary["meshes"].items():
+        table.append([name, f"{mesh['faces']:,}", f"{mesh['base_faces']:,}", mesh["mesh"]])
+    print_table(table)
+    print()
     table = [["a frame", "mean", "min", "max"]]
     for name, label in (
         ("pairs", "candidate pairs"),
@@ -156,24 +164,53 @@ def print_summary(summary):
         stage = summary["stages"][name]
         table.append([label, f"{stage['mean']:.3f}", f"{stage['p95']:.3f}", f"{stage['total']:.1f}"])
     print_table(table)
+    print()
+    _print_budget(summary)
+    if summary.get("replay"):
+        print(f"as recorded in {summary['replay']}: every row, LOD and pose, bit for bit")
+
+
+def _print_budget(summary):
+    """Print how a budget was held, and what it cost in accuracy."""
+    mean, greatest = summary["error_mean"]["mean"], summary["error_max"]["max"]
+    print(f"certified error of the objects: {mean:.3g} on average, at most {greatest:.3g}")
+    if summary["budget_ms"] is None:
+        return
+    print(f"budget: {summary['budget_ms']:g} ms, {summary['controller']} controller")
+    budget = summary["budget"]
+    if budget is None:
+        print("no frame after the first second, so the budget is not judged")
+        return
+    print(
+        f"after the first second: {100 * budget['within']:.1f} % of {budget['frames']} frames within it, "
+        f"{100 * budget['within_tenth']:.1f} % within 10 % more; the worst took {budget['worst']:.2f} of it, "
+        f"{budget['longest_over']} in a row were over; LODs turned back {budget['turns']:.2f} times a second and object"
+    )
 
 
 # Files.
 
 
-def check_output(path, suffixes, inputs=()):
+def check_output(path, suffixes, inputs=(), make=False):
     """Refuse a file that could not be written, or that is one of the inputs, before any work.
+
+    Args:
+        path: File.
+        suffixes: That its name may have.
+        inputs: Files that are read.
+        make: Whether its folder will be made in the one above.
 
     Raises:
         ValueError: With what is wrong.
     """
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: the name must end in {' or '.join(suffixes)}")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: there is no folder {path.parent}")
+    folder = path.parent.parent if make and not path.parent.exists() else path.parent
+    if not folder.is_dir():
+        raise ValueError(f"{path}: there is no folder {folder}")
     if path.is_dir():
         raise ValueError(f"{path}: is a folder")
-    if not all(os.access(place, os.W_OK) for place in (path.parent, path) if place.exists()):
+    if not all(os.access(place, os.W_OK) for place in (folder, path) if place.exists()):
         raise ValueError(f"{path}: cannot be written")
     if path.exists() and any(Path(name).exists() and path.samefile(name) for name in inputs):
         raise ValueError(f"{path}: is read, so it is not overwritten")
