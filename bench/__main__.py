@@ -12,9 +12,10 @@ import warp as wp
 
 import warp_abtree as ab
 
-from . import cascade, exact, frame, memory, peers, plots, precision, query, scale, sweep, update
+from . import budget, cascade, exact, frame, memory, peers, plots, precision, query, scale, sweep, update
 
 CASES = {
+    "budget": budget.run,
     "cascade": cascade.run,
     "exact": exact.run,
     "frame": frame.run,
