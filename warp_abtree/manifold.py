@@ -14,8 +14,9 @@ Meshes meet in curves, and a curve alone has no depth. Here is what is made of i
 
 Normals come from the winding of the faces, outwards. Only surfaces that cross have contacts: an object that lies whole
 inside another has none. Depth is exact while every vertex inside has a face that crosses; once a whole ring of faces
-is inside it is that ring's, too little: a ball of 82,000 faces comes to rest 1.8 times as deep as it is told to. Of
-two thin things that are through each other the way out is as likely forwards as back.
+is inside it is that ring's, too little, and rings that go under in one step are forgotten: fine meshes come to rest
+several times as deep as they are told to (docs/dynamics.md has figures). Of two thin things that are through each other
+the way out is as likely forwards as back.
 
 Source of the area vector as a gradient: Allard et al. 2010, Volume Contact Constraints at Arbitrary Resolution,
 section 3; that the boundary curve gives it is Stokes' theorem.
