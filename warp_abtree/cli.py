@@ -4,6 +4,7 @@ Exit status 0 when done, 2 with one line on stderr for bad input, 1 where work w
 """
 
 import argparse
+import gc
 import os
 import re
 import sys
@@ -150,6 +151,9 @@ def run(options, progress):
         loaded = load_scene(options.scene, device=options.device, progress=progress, objects=options.objects)
         frames = loaded.frames if options.frames is None else options.frames
         asked = {"controller": options.controller, "budget_ms": options.budget}
+    # A full collection of what was loaded takes longer than the budget of a frame.
+    gc.collect()
+    gc.freeze()
     frame, recording = record_run(
         loaded,
         frames,
