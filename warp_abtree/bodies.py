@@ -122,7 +122,7 @@ def mass_properties(model: Model) -> MassProperties:
     volume worth the name, as of a flat sheet, has none.
 
     Raises:
-        ValueError: The convex hull has no volume.
+        ValueError: The convex hull has no volume, or is needed where scipy is not installed.
     """
     vertices, faces, _ = model.mesh_at(model.lod_max)
     middle = 0.5 * (vertices.min(0) + vertices.max(0))
@@ -133,6 +133,9 @@ def mass_properties(model: Model) -> MassProperties:
         if convex_hull:
             try:
                 mesh = mesh.convex_hull
+            except ImportError as error:
+                what = f"model {model.name!r} is not closed, and its convex hull needs scipy, extra `dynamics`"
+                raise ValueError(f"{what} ({error})") from None
             except Exception as error:  # Qhull's own, for points in a plane
                 what = f"model {model.name!r} is flat: it has no mass, so it must be static"
                 raise ValueError(f"{what} ({error})") from None
