@@ -122,7 +122,7 @@ def mass_properties(model: Model) -> MassProperties:
     volume worth the name, as of a flat sheet, has none.
 
     Raises:
-        ValueError: The convex hull has no volume, or is needed where scipy is not installed.
+        ValueError: The convex hull has no volume, or is needed where scipy or networkx is missing.
     """
     vertices, faces, _ = model.mesh_at(model.lod_max)
     middle = 0.5 * (vertices.min(0) + vertices.max(0))
@@ -134,7 +134,7 @@ def mass_properties(model: Model) -> MassProperties:
             try:
                 mesh = mesh.convex_hull
             except ImportError as error:
-                what = f"model {model.name!r} is not closed, and its convex hull needs scipy, extra `dynamics`"
+                what = f"model {model.name!r} is not closed, and its convex hull needs scipy and networkx, extra `dynamics`"
                 raise ValueError(f"{what} ({error})") from None
             except Exception as error:  # Qhull's own, for points in a plane
                 what = f"model {model.name!r} is flat: it has no mass, so it must be static"
