@@ -96,7 +96,7 @@ def test_an_open_mesh_without_scipy(monkeypatch):
     missing = trimesh.exceptions.ExceptionWrapper(ModuleNotFoundError("No module named 'scipy'"))
     monkeypatch.setattr(trimesh.convex, "ConvexHull", missing)
     mesh = trimesh.creation.box((1, 2, 3))
-    with pytest.raises(ValueError, match="'open' is not closed, and its convex hull needs scipy"):
+    with pytest.raises(ValueError, match="'open' is not closed: its convex hull needs scipy"):
         mass_properties(ab.Model.from_arrays(mesh.vertices, mesh.faces[1:], name="open"))
 
 

@@ -134,7 +134,7 @@ def mass_properties(model: Model) -> MassProperties:
             try:
                 mesh = mesh.convex_hull
             except ImportError as error:
-                what = f"model {model.name!r} is not closed, and its convex hull needs scipy and networkx, extra `dynamics`"
+                what = f"model {model.name!r} is not closed: its convex hull needs scipy and networkx, extra `dynamics`"
                 raise ValueError(f"{what} ({error})") from None
             except Exception as error:  # Qhull's own, for points in a plane
                 what = f"model {model.name!r} is flat: it has no mass, so it must be static"
