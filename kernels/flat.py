@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.predicates import drop_axis, orient2d, orient3d
+from warp_abtree.kernels.predicates import drop_axis, orient2d, orient3d, orient_edges
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -110,9 +110,9 @@ def intersect_segment_triangle(
         return intersect_coplanar(mode, axis, a, b, c, p, q, q)
     if sp == sq:
         return False
-    ab = orient3d(mode, p, q, a, b)
-    bc = orient3d(mode, p, q, b, c)
-    ca = orient3d(mode, p, q, c, a)
+    ab = orient_edges(mode, p, q, a, b)
+    bc = orient_edges(mode, p, q, b, c)
+    ca = orient_edges(mode, p, q, c, a)
     return (ab >= 0 and bc >= 0 and ca >= 0) or (ab <= 0 and bc <= 0 and ca <= 0)
 
 
@@ -122,7 +122,7 @@ def intersect_segments(mode: wp.int32, p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b:
 
     Coplanar ones meet iff their boxes and all three projections do: one projection keeps the plane, or the line, apart.
     """
-    if orient3d(mode, p, q, a, b) != 0:
+    if orient_edges(mode, p, q, a, b) != 0:
         return False
     meet = bool(True)
     for i in range(3):

@@ -1,9 +1,10 @@
 """Orientation signs: a float64 determinant with a proven error bound; where it leaves the sign open, the same in double
 words, and at last expansions.
 
-Bounds. With e = 2^-53 and no overflow, the determinants below err by at most (7 + 56 e) e P in 3D and (3 + 16 e) e P in
-2D, P the same sum with every product and difference of products replaced by the sum of magnitudes, computed in the same
-arithmetic (Shewchuk 1997, sections 4.3 and 4.4, bounds A). Underflow: coordinates are 0 or at least 2^-290, hence
+Bounds. With e = 2^-53 and no overflow, the determinants below err by at most (8 + 128 e) e P in 3D, with fused
+multiply-add by name, and (3 + 16 e) e P in 2D, P the same sum with every product and difference of products replaced by
+the sum of magnitudes, computed in the same arithmetic (docs/exactness.md, after Shewchuk 1997, sections 4.3 and 4.4).
+Underflow: coordinates are 0 or at least 2^-290, hence
 differences are multiples of 2^-342 and products of three of 2^-1026: what falls below float64's normal range lies on
 its grid of 2^-1074 and is not rounded at all. So P is 0 only where every product has a factor 0, and the sign is 0.
 """
@@ -13,7 +14,7 @@ from typing import Any
 import warp as wp
 
 from warp_abtree.kernels.double_word import BOUND_DOUBLE, double_orient2d, double_orient3d
-from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d
+from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d, fuse_multiply
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -25,7 +26,7 @@ EXACT = wp.constant(3)
 # So large that no sum of three signs with one of these among them is 3 or -3.
 UNSURE = wp.constant(8)
 
-BOUND_3D = wp.constant(wp.float64((7.0 + 56.0 * 2.0**-53) * 2.0**-53))
+BOUND_3D = wp.constant(wp.float64((8.0 + 128.0 * 2.0**-53) * 2.0**-53))
 BOUND_2D = wp.constant(wp.float64((3.0 + 16.0 * 2.0**-53) * 2.0**-53))
 
 
@@ -41,12 +42,6 @@ def filtered_sign(x: Any, bound: Any):
     # Without branches: which sign it is cannot be predicted.
     open = wp.where(bound == type(bound)(0.0), 0, UNSURE)
     return wp.where(x > bound, 1, wp.where(x < -bound, -1, open))
-
-
-@wp.func
-def orient3d_float32(a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Return the sign of a float32 determinant, unguarded."""
-    return plain_sign(wp.float64(wp.dot(a, wp.cross(b, c))))
 
 
 @wp.func(inline=False)
@@ -68,31 +63,68 @@ def resolve_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, size: wp.float64):
 
 
 @wp.func
+def fused_minor(a: wp.float64, b: wp.float64, c: wp.float64, d: wp.float64):
+    """Return a b - c d and |a b| + |c d|."""
+    p = c * d
+    return fuse_multiply(a, b, -p), fuse_multiply(wp.abs(a), wp.abs(b), wp.abs(p))
+
+
+@wp.func
+def fused_sum(u: wp.vec3d, x: wp.float64, y: wp.float64, z: wp.float64):
+    return fuse_multiply(u[2], z, fuse_multiply(u[1], y, u[0] * x))
+
+
+@wp.func
+def filter_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Return the sign of `orient3d` or UNSURE, and the sum of magnitudes."""
+    u = a - d
+    v = b - d
+    w = c - d
+    x, x_size = fused_minor(v[1], w[2], v[2], w[1])
+    y, y_size = fused_minor(w[1], u[2], w[2], u[1])
+    z, z_size = fused_minor(u[1], v[2], u[2], v[1])
+    heads = wp.vec3d(u[0], v[0], w[0])
+    size = fused_sum(wp.abs(heads), x_size, y_size, z_size)
+    return filtered_sign(fused_sum(heads, x, y, z), BOUND_3D * size), size
+
+
+@wp.func
+def plain_orient3d(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Return the sign of `orient3d` of rounded determinants, unguarded."""
+    u = a - d
+    v = b - d
+    w = c - d
+    if mode == FLOAT32:
+        return plain_sign(wp.float64(wp.dot(wp.vec3(u), wp.cross(wp.vec3(v), wp.vec3(w)))))
+    x = v[1] * w[2] - v[2] * w[1]
+    y = w[1] * u[2] - w[2] * u[1]
+    z = u[1] * v[2] - u[2] * v[1]
+    return plain_sign((u[0] * x + v[0] * y) + w[0] * z)
+
+
+@wp.func
 def orient3d(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """Return on which side of plane (a, b, c) point d lies: 1 below, -1 above, 0 on it, or UNSURE.
 
     Seen from above, a, b and c turn counterclockwise.
     """
-    u = a - d
-    v = b - d
-    w = c - d
-    if mode == FLOAT32:
-        return orient3d_float32(wp.vec3(u), wp.vec3(v), wp.vec3(w))
-    v1w2 = v[1] * w[2]
-    v2w1 = v[2] * w[1]
-    w1u2 = w[1] * u[2]
-    w2u1 = w[2] * u[1]
-    u1v2 = u[1] * v[2]
-    u2v1 = u[2] * v[1]
-    value = (u[0] * (v1w2 - v2w1) + v[0] * (w1u2 - w2u1)) + w[0] * (u1v2 - u2v1)
-    if mode == FLOAT64:
-        return plain_sign(value)
-    size = wp.abs(u[0]) * (wp.abs(v1w2) + wp.abs(v2w1)) + wp.abs(v[0]) * (wp.abs(w1u2) + wp.abs(w2u1))
-    size = size + wp.abs(w[0]) * (wp.abs(u1v2) + wp.abs(u2v1))
-    sign = filtered_sign(value, BOUND_3D * size)
+    if mode == FLOAT32 or mode == FLOAT64:
+        return plain_orient3d(mode, a, b, c, d)
+    sign, size = filter_orient3d(a, b, c, d)
+    if mode == EXACT and sign == UNSURE:
+        sign = resolve_orient3d(a, b, c, d, size)
+    return sign
+
+
+@wp.func
+def orient_edges(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Return `orient3d` of the ends of two edges, a b and c d."""
+    if mode == FLOAT32 or mode == FLOAT64:
+        return plain_orient3d(mode, a, b, c, d)
+    sign, size = filter_orient3d(a, b, c, d)
     if sign == UNSURE:
-        # Meshes laid on one another share points: a determinant of 0, which no bound above 0 tells.
-        if a == b or a == c or a == d or b == c or b == d or c == d:
+        # Meshes laid on one another share points. Where d is shared, the size is 0 and so is the sign.
+        if a == c or b == c:
             sign = 0
         elif mode == EXACT:
             sign = resolve_orient3d(a, b, c, d, size)

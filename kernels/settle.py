@@ -77,7 +77,7 @@ def settle_traversal(mode: int):
     return settle_faces_kernel
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=168)
 def settle_hard_kernel(
     threads: wp.int32,
     output: wp.int32,

@@ -5,7 +5,8 @@ from typing import Any
 import warp as wp
 
 from warp_abtree.kernels.flat import intersect_coplanar, intersect_degenerate, widest_axis
-from warp_abtree.kernels.predicates import EXACT, FILTER, UNSURE, orient3d
+from warp_abtree.kernels.predicates import EXACT, FILTER, UNSURE, orient3d, orient_edges
+from warp_abtree.kernels.warps import lowest_bit
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -52,7 +53,7 @@ def turn_triangles(
 
     Each is turned so that the other's lone corner lies on the positive side of its plane. The planes meet in a line; on
     it the triangles are the intervals between edges p q and p r, and two more signs order the ends: they meet unless
-    orient3d(p1, q1, p2, q2) or orient3d(p1, r1, r2, p2) is 1.
+    orient_edges(p1, q1, p2, q2) or orient_edges(p1, r1, r2, p2) is 1.
     """
     alone_a, side_a = find_alone(sa0, sa1, sa2)
     alone_b, side_b = find_alone(sb0, sb1, sb2)
@@ -88,6 +89,70 @@ def intersect_special(
 
 
 @wp.func
+def pick_corners(k: wp.int32, a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b2: Any):
+    """Return the corners whose sign is the k-th of `intersect_triangles`: a face and a corner of the other."""
+    of_a = k < 3
+    d = wp.where(of_a, a0, b0)
+    if k % 3 == 1:
+        d = wp.where(of_a, a1, b1)
+    if k % 3 == 2:
+        d = wp.where(of_a, a2, b2)
+    return wp.where(of_a, b0, a0), wp.where(of_a, b1, a1), wp.where(of_a, b2, a2), d
+
+
+@wp.func
+def unpack_sign(signs: wp.int32, k: wp.int32):
+    return ((signs >> (2 * k)) & 3) - 1
+
+
+@wp.func
+def find_signs(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
+    """Return the six exact signs of `intersect_triangles`, 1 added, two bits each; for a flat A not all of B's.
+
+    Threads of a warp have different signs open: each takes its own next, so that they need not wait for one another.
+    """
+    signs = wp.int32(0)
+    pending = wp.int32(0)
+    for k in range(6):
+        a, b, c, d = pick_corners(k, a0, a1, a2, b0, b1, b2)
+        sign = orient3d(FILTER, a, b, c, d)
+        if sign == UNSURE:
+            pending |= 1 << k
+        else:
+            signs |= (sign + 1) << (2 * k)
+    while pending != 0:
+        k = lowest_bit(pending)
+        pending &= pending - 1
+        a, b, c, d = pick_corners(k, a0, a1, a2, b0, b1, b2)
+        signs |= (orient3d(EXACT, a, b, c, d) + 1) << (2 * k)
+        if (pending & 7) == 0 and (signs & 63) == 21:
+            pending = 0  # zeros take longest: not three more of them
+    return signs
+
+
+@wp.func
+def intersect_exactly(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
+    """Return what `intersect_triangles` does by exact signs, the same for neighbouring threads at the same time."""
+    signs = find_signs(a0, a1, a2, b0, b1, b2)
+    sa0, sa1, sa2 = unpack_sign(signs, 0), unpack_sign(signs, 1), unpack_sign(signs, 2)
+    sb0, sb1, sb2 = unpack_sign(signs, 3), unpack_sign(signs, 4), unpack_sign(signs, 5)
+    flat_a = sa0 == 0 and sa1 == 0 and sa2 == 0
+    if is_one_sided(sa0, sa1, sa2) or (not flat_a and is_one_sided(sb0, sb1, sb2)):
+        return 0
+    if flat_a or (sb0 == 0 and sb1 == 0 and sb2 == 0):
+        return wp.where(intersect_special(EXACT, a0, a1, a2, b0, b1, b2), 1, 0)
+    p1, q1, r1, p2, q2, r2 = turn_triangles(sa0, sa1, sa2, sb0, sb1, sb2, a0, a1, a2, b0, b1, b2)
+    first = orient_edges(FILTER, p1, q1, p2, q2)
+    second = orient_edges(FILTER, p1, r1, r2, p2)
+    while first != 1 and second != 1 and wp.max(first, second) == UNSURE:
+        one = first == UNSURE
+        sign = orient3d(EXACT, p1, wp.where(one, q1, r1), wp.where(one, p2, r2), wp.where(one, q2, p2))
+        first = wp.where(one, sign, first)
+        second = wp.where(one, second, sign)
+    return wp.where(first == 1 or second == 1, 0, 1)
+
+
+@wp.func
 def intersect_triangles(
     mode: wp.int32, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d
 ):
@@ -95,14 +160,13 @@ def intersect_triangles(
 
     Source: Guigue and Devillers 2003, Fast and robust triangle-triangle overlap test using orientation predicates.
     """
+    if mode == EXACT:
+        return intersect_exactly(a0, a1, a2, b0, b1, b2)
     sa0 = orient3d(mode, b0, b1, b2, a0)
     sa1 = orient3d(mode, b0, b1, b2, a1)
     sa2 = orient3d(mode, b0, b1, b2, a2)
     if is_one_sided(sa0, sa1, sa2):
         return 0
-    if mode == EXACT and sa0 == 0 and sa1 == 0 and sa2 == 0:
-        # Exact zeros take longest: not three more of them.
-        return wp.where(intersect_special(mode, a0, a1, a2, b0, b1, b2), 1, 0)
     sb0 = orient3d(mode, a0, a1, a2, b0)
     sb1 = orient3d(mode, a0, a1, a2, b1)
     sb2 = orient3d(mode, a0, a1, a2, b2)
@@ -117,8 +181,8 @@ def intersect_triangles(
     elif special:
         return wp.where(intersect_special(mode, a0, a1, a2, b0, b1, b2), 1, 0)
     p1, q1, r1, p2, q2, r2 = turn_triangles(sa0, sa1, sa2, sb0, sb1, sb2, a0, a1, a2, b0, b1, b2)
-    first = orient3d(mode, p1, q1, p2, q2)
-    second = orient3d(mode, p1, r1, r2, p2)
+    first = orient_edges(mode, p1, q1, p2, q2)
+    second = orient_edges(mode, p1, r1, r2, p2)
     if first == 1 or second == 1:
         return 0
     return wp.where(first == UNSURE or second == UNSURE, UNSURE, 1)

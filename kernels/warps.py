@@ -38,10 +38,10 @@ def warp_lane() -> wp.int32: ...
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ long long items[{STACK_LENGTH} + {CANDIDATE_LENGTH} + 1];
+    __shared__ long long items[{STACK_LENGTH + CANDIDATE_LENGTH + WARP_SIZE}];
     return (wp::uint64)items;
 #else
-    static long long items[{STACK_LENGTH} + {CANDIDATE_LENGTH} + 1];
+    static long long items[{STACK_LENGTH + CANDIDATE_LENGTH + 1}];
     return (wp::uint64)items;
 #endif
 """)
@@ -90,8 +90,9 @@ def item_second(item: wp.int64) -> wp.int32: ...
 
 @wp.func_native(f"""
     long long* stack = (long long*)items;
-    int stacked = end, waiting = end_waiting, all = mask;
+    int stacked = end, waiting = end_waiting, all = mask, unused = {STACK_LENGTH + CANDIDATE_LENGTH};
 #if defined(__CUDA_ARCH__)
+    unused += threadIdx.x;
     // Bits 0 to 3 count in the low half, bits 4 to 7 in the high half.
     unsigned int mine = __popc(mask & 15) | (__popc(mask & 240) << 16), sum = mine;
     for (int step = 1; step < 32; step <<= 1) {{
@@ -109,7 +110,7 @@ def item_second(item: wp.int64) -> wp.int32: ...
     for (int k = 0; k < 4; ++k) {{
         const bool down = all & (1 << k), face = all & (16 << k);
         // What is not in use goes where nobody reads: a store without a branch.
-        int at = face ? {STACK_LENGTH} + waiting : {STACK_LENGTH + CANDIDATE_LENGTH};
+        int at = face ? {STACK_LENGTH} + waiting : unused;
         at = down ? stacked & {STACK_LENGTH - 1} : at;
         stacked += down;
         waiting += face;
@@ -135,6 +136,16 @@ def push_items(
 #endif
 """)
 def warp_any(flag: bool) -> bool: ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ffs(bits) - 1;
+#else
+    return __builtin_ctz(bits);
+#endif
+""")
+def lowest_bit(bits: wp.int32) -> wp.int32: ...
 
 
 @wp.func_native("""

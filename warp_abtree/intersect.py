@@ -309,7 +309,8 @@ class Query:
             least = 32 if output == int(faces.OUTPUT_ANY) else 1
             launch_on_cores(traverse.thread_traversal(mode), room, inputs, self.device, cores, least)
             return
-        warps = max(room, int(self.parts_max * math.sqrt(room)) + 1)
+        # More than there are parts: those that find none wait for shares.
+        warps = max(room, int(4 * self.parts_max * math.sqrt(room)) + 1)
         warps = min(warps, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         wp.launch(
             traverse.warp_traversal(EXACT if mode == FLOAT64 else mode),
