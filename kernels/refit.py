@@ -63,31 +63,63 @@ def refit_node(models: ModelPool, states: StatePool, state: wp.int32, node: wp.i
         refit_inner(states, state, node)
 
 
-@wp.kernel
-def refit_level_kernel(step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdatePlan, states_inout: StatePool):
-    """Refit every marked node of one level, and every node of this level in the states under full update.
+@wp.func
+def refit_level(
+    first: wp.int32, step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdatePlan, states: StatePool
+):
+    """Refit every so many-th of a level's nodes: those marked, and all of the states under full update.
 
-    Args:
-        step: Threads of this launch.
     Invariant: children of this level are final, since levels go deepest first.
     Source: Liu et al. 2006, section 3.2.2, ACTIVE-REFIT; Algorithm 3.
     """
     marked = plan.level_count[level]
     items = marked + (plan.whole_count[level] << level)
-    item = wp.tid()
+    item = wp.int32(first)
     while item < items:
         if item < marked:
             listed = plan.level_node[plan.level_start[level] + item]
-            refit_node(models, states_inout, listed[0], listed[1])
+            refit_node(models, states, listed[0], listed[1])
         else:
             whole = item - marked
             state = plan.whole_state[plan.whole_start[level] + (whole >> level)]
             node = (1 << level) + (whole & ((1 << level) - 1))
             # A heap index without a node lies under a leaf of the level above.
-            up = models.node_start[states_inout.model[state]] + (node >> 1)
+            up = models.node_start[states.model[state]] + (node >> 1)
             if level == 0 or models.node_face[up] < 0:
-                refit_node(models, states_inout, state, node)
+                refit_node(models, states, state, node)
         item += step
+
+
+@wp.kernel
+def refit_level_kernel(step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdatePlan, states_inout: StatePool):
+    """Refit what an update asks for on one level.
+
+    Args:
+        step: Threads of this launch.
+    """
+    refit_level(wp.tid(), step, level, models, plan, states_inout)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+""")
+def block_sync(): ...
+
+
+@wp.kernel
+def refit_top_kernel(step: wp.int32, levels: wp.int32, models: ModelPool, plan: UpdatePlan, states_inout: StatePool):
+    """Refit what an update asks for on so many levels from the root on, deepest first: one block for all of them.
+
+    Args:
+        step: Threads of this launch, which are one block.
+    """
+    level = levels - 1
+    while level >= 0:
+        refit_level(wp.tid(), step, level, models, plan, states_inout)
+        block_sync()
+        level -= 1
 
 
 @wp.kernel

@@ -353,7 +353,8 @@ def test_launches_of_a_frame(device, monkeypatch, name, levels):
     narrow = 4 if wp.get_device(device).is_cuda else 2
     for count in (2, 40):
         scene = add_objects(device, [name] * count)
-        for options, own in (({}, 5 + levels), ({"ladder": [[0, 1]]}, 1)):
+        large = sum(count << level > 1024 for level in range(levels))  # nodes of all states on a level
+        for options, own in (({}, 6 + large), ({"ladder": [[0, 1]]}, 1)):
             frame = ab.FrameGraph(scene, "count", **options)
             launched = count_launches(monkeypatch, frame.capture)
             assert len(launched) == 1 + own + 2 + narrow + 1

@@ -77,10 +77,10 @@ class FrameGraph:
     `launch()` only launches, on arrays that are allocated once, so that a graph can capture it, on CUDA and the CPU,
     together with the kernels of a simulator or an LOD controller that write `poses` and `lods`. The answers are those
     of `set_poses`, `set_lods` and `intersect` of the scene, bit for bit. No launch waits for the host, and their number
-    depends on nothing but the number L of levels of the deepest tree (at most 31):
+    depends on nothing but how many states there are and how deep their trees (at most 31 levels):
 
     * 1 for poses;
-    * 5 + L for LODs, 1 with a ladder;
+    * 6 for LODs, and 1 for each level on which all states together have more than 1,024 nodes; 1 with a ladder;
     * 2 for the broad phase, with a clearing and a rebuild of `wp.Bvh` between them; none for given pairs;
     * 2 for the narrow phase on the CPU (outside a graph one of them once a core), 4 on CUDA (3 without exact signs), 2
       more with `within`; for contacts those of `ContactQuery`;

@@ -244,7 +244,7 @@ class LodUpdate(UpdateWork):
         super().__init__(plan, int(entries.sum()), int(models.face_count[owner].sum()), level_room, device)
 
     def launch(self):
-        """Refine meshes and update trees. Launches only: five, and one a level of the deepest tree."""
+        """Refine meshes and update trees. Launches only: six, and one for each level that has much to refit."""
         count = len(self.wanted)
         wp.launch(plan_kernels.clear_plan_kernel, max(count, int(LEVEL_MAX)), [self.plan], device=self.device)
         inputs = [self.models.pool, self.splits, self.wanted, self.states.pool, self.plan, self.faults]

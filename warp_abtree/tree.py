@@ -13,6 +13,9 @@ from warp_abtree.kernels.plan import UpdatePlan
 from warp_abtree.kernels.pools import LEVEL_MAX
 
 FACE_COUNT_MAX = 2**30
+# Nodes of a level that one block refits, at most: a launch costs about as much. And the threads of that block.
+TOP_ROOM = 1024
+TOP_THREADS = 512
 
 
 @dataclass(frozen=True)
@@ -225,16 +228,24 @@ def active_mark(models, states, work: UpdateWork):
 
 
 def active_walk(models, states, work: UpdateWork):
-    """Refit what is marked, and every node of states under full update, deepest level first (ACTIVE-WALK)."""
-    for level, room in reversed(list(enumerate(work.level_room))):
-        launch_items(refit.refit_level_kernel, room, [level, models, work.plan, states], work.device)
+    """Refit what is marked, and every node of states under full update, deepest level first (ACTIVE-WALK).
+
+    One launch a level, and one for all those from the root on that have little to refit.
+    """
+    top = next((level for level, room in enumerate(work.level_room) if room > TOP_ROOM), len(work.level_room))
+    for level in reversed(range(top, len(work.level_room))):
+        launch_items(refit.refit_level_kernel, work.level_room[level], [level, models, work.plan, states], work.device)
+    if top:
+        threads = TOP_THREADS if work.device.is_cuda else 1
+        inputs = [threads, top, models, work.plan, states]
+        wp.launch(refit.refit_top_kernel, threads, inputs, block_dim=threads, device=work.device)
 
 
 def active_update(models, states, work: UpdateWork):
     """Bring boxes, status and skip links to the corners that refinement has set (ACTIVE-UPDATE).
 
-    Leaves the very same bits as a rebuild of all boxes at that LOD. Launches only, one and one a level of the deepest
-    tree; no host synchronisation.
+    Leaves the very same bits as a rebuild of all boxes at that LOD. Launches only, two and one for each level that has
+    much to refit; no host synchronisation.
 
     Args:
         models, states: `ModelPool` and `StatePool` of one device.
