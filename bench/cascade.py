@@ -14,6 +14,7 @@ import warp as wp
 import warp_abtree as ab
 
 from .peers import one_core
+from .roofline import used_memory
 from .shapes import knot
 from .timing import time_in_turn
 
@@ -95,7 +96,7 @@ class Approach:
 
 
 def run(device, quick=False):
-    """Yield one row a workload and gap: shares settled, box pairs compared, median times a pair [us] and ratios."""
+    """Yield one row a workload and gap: shares settled, box pairs compared, times a pair [us], ratios and memory."""
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
     with one_core() as core:
@@ -135,11 +136,13 @@ def run_workload(about, model_a, model_b, device, sizes):
             )
         for who, values in times.items():
             row[f"{who}_us"] = round(1e3 * float(np.median(values)) / count, 3)
+            row[f"{who}_p95_us"] = round(1e3 * float(np.percentile(values, 95)) / count, 3)
         for who in queries:
             base = "faces_originals" if who.startswith("faces") else "originals"
             if who != base:
                 row[f"{who}_speed"] = round(row[f"{base}_us"] / row[f"{who}_us"], 2)
-        yield row
+        row["node_tests_per_s"] = float(f"{1e6 * row['node_tests'] / row['originals_us']:.4g}")
+        yield row | used_memory(device)
 
 
 def check_answers(found):

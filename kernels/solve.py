@@ -356,6 +356,7 @@ def relax_place(rows: Rows, bodies: Bodies, n: wp.vec3d, p: wp.int32, k: wp.int3
 @wp.func
 def relax_pair(
     stage: wp.int32,
+    backward: wp.int32,
     pairs: wp.array(dtype=wp.vec2i),
     manifolds: Manifolds,
     memory: Memory,
@@ -363,14 +364,15 @@ def relax_pair(
     bodies: Bodies,
     p: wp.int32,
 ):
-    """Relax the points of a pair one after another."""
+    """Relax the points of a pair one after another, the last one first if `backward`."""
     a = pairs[p][0]
     b = pairs[p][1]
     if stage == BOUNCE:
         bounce_pair(manifolds, rows, bodies, p, a, b)
         return
-    k = wp.int32(0)
-    while k < manifolds.count[p]:
+    turn = wp.int32(0)
+    while turn < manifolds.count[p]:
+        k = wp.where(backward != 0, manifolds.count[p] - 1 - turn, turn)
         n = manifolds.normal[p, k]
         if stage == START:
             start_point(memory, rows, bodies, n, p, k, a, b)
@@ -378,12 +380,13 @@ def relax_pair(
             relax_velocity(rows, bodies, n, p, k, a, b)
         else:
             relax_place(rows, bodies, n, p, k, a, b)
-        k += 1
+        turn += 1
 
 
 @wp.kernel
 def relax_colour_kernel(
     stage: wp.int32,
+    backward: wp.int32,
     colour: wp.int32,
     order: wp.array(dtype=wp.int32),
     key: wp.array(dtype=wp.int32),
@@ -400,12 +403,13 @@ def relax_colour_kernel(
     """
     k = wp.lower_bound(key, 0, order.shape[0] // 2, colour) + wp.tid()
     if k < order.shape[0] // 2 and key[k] == colour:
-        relax_pair(stage, pairs, manifolds, memory, rows_inout, bodies_inout, order[k])
+        relax_pair(stage, backward, pairs, manifolds, memory, rows_inout, bodies_inout, order[k])
 
 
 @wp.kernel
 def relax_in_turn_kernel(
     stage: wp.int32,
+    backward: wp.int32,
     first: wp.int32,
     rounds: wp.int32,
     order: wp.array(dtype=wp.int32),
@@ -416,16 +420,23 @@ def relax_in_turn_kernel(
     rows_inout: Rows,
     bodies_inout: Bodies,
 ):
-    """Relax the pairs of all colours from the first one on, colour by colour, by one thread, a number of times."""
+    """Relax the pairs of all colours from the first one on, colour by colour, by one thread, a number of times.
+
+    Args:
+        backward: Whether the first round goes from the last colour to the first. Velocities go to and fro, so that no
+            end of a stack is always the last to hear of the other; all else goes forward.
+    """
     room = order.shape[0] // 2
     start = wp.lower_bound(key, 0, room, first)
     end = wp.lower_bound(key, 0, room, NO_COLOUR)
     round = wp.int32(0)
     while round < rounds:
-        k = start
-        while k < end:
-            relax_pair(stage, pairs, manifolds, memory, rows_inout, bodies_inout, order[k])
-            k += 1
+        reverse = wp.where(stage == VELOCITY, (backward + round) % 2, 0)
+        turn = wp.int32(0)
+        while turn < end - start:
+            k = wp.where(reverse != 0, end - 1 - turn, start + turn)
+            relax_pair(stage, reverse, pairs, manifolds, memory, rows_inout, bodies_inout, order[k])
+            turn += 1
         round += 1
 
 

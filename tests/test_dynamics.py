@@ -352,7 +352,7 @@ def test_a_stack_of_five_stands_for_ten_seconds(device, splits):
         dynamics.step(1 / 60)
     moved = dynamics.poses()[1:] - start
     slop = dynamics.properties[1].reach / 512
-    assert np.abs(moved[:, :2]).max() < 0.01 and np.abs(moved[:, 3:6]).max() < 0.01
+    assert np.abs(moved[:, :2]).max() < 0.006 and np.abs(moved[:, 3:6]).max() < 0.01
     np.testing.assert_allclose(moved[:, 2], -slop * np.arange(1, 6), atol=2 * slop)
     assert not dynamics.asleep.any() and np.abs(dynamics.velocities()[0]).max() < 1e-3
 
@@ -385,7 +385,8 @@ def test_bodies_meet_as_they_are_at_their_lods(device):
     for lod in (ball.lod_for(fraction=0.1), ball.lod_max, ball.lod_for(fraction=0.3)):
         scene.set_lods([GROUND.lod_max, lod])
         dynamics.wake()
-        for _ in range(400):
+        # A ball of few faces rocks from one to the next.
+        for _ in range(600):
             dynamics.step(1 / 120)
         assert dynamics.asleep[1]
         pose = dynamics.poses()[1]

@@ -349,7 +349,8 @@ def test_table1_stands_at_the_face_counts_of_the_paper(device):
 
 @pytest.mark.parametrize("text", [RINGS, BODIES], ids=["prescribed", "bodies"])
 def test_a_recorded_run_runs_again(tmp_path, device, text):
-    frame, first = record_run(load(tmp_path, text, device=device, objects=12), 8)
+    # A budget that every machine keeps, so that LODs climb.
+    frame, first = record_run(load(tmp_path, text, device=device, objects=12), 8, budget_ms=1e4)
     assert len({row.cost_ms for row in first.rows}) == 8, "real times"
     path = tmp_path / "run.npz"
     first.save(path)
@@ -359,7 +360,7 @@ def test_a_recorded_run_runs_again(tmp_path, device, text):
     (tmp_path / "scene.toml").unlink()
     loaded = opened.load_scene(path, device)
     assert loaded.scene.object_count == first.lods.shape[1] < 15
-    again, second = record_run(loaded, 8, opened)
+    again, second = record_run(loaded, 8, opened, budget_ms=1e4)
     assert again.history == frame.history and opened.difference(second) is None
     assert second.lods.tobytes() == first.lods.tobytes() and second.poses.tobytes() == first.poses.tobytes()
     assert len(np.unique(first.lods)) > 1 and not np.array_equal(first.poses[0], first.poses[-1])
@@ -424,24 +425,3 @@ def test_another_mesh_is_noticed(tmp_path):
     (tmp_path / "m.obj").unlink()
     with pytest.raises(ab.SceneError, match=r"m.obj: no such file"):
         recording.load_scene("run.npz")
-
-
-# The benchmark.
-
-
-def test_budget_bench(device, monkeypatch):
-    from bench import budget
-
-    monkeypatch.setattr(budget, "QUICK", {"frames": 63, "floor_frames": 62})
-    monkeypatch.setattr(budget, "QUICK_OBJECTS", 12)
-    rows = list(budget.run(device, quick=True))
-    assert [(row["scene"], row["controller"]) for row in rows] == [
-        (scene, controller) for scene in ("rain", "focus") for controller in ("none", "predictive", "paper")
-    ]
-    for row in rows:
-        assert row["judged"] == 3 and 0 <= row["within"] <= row["within_tenth"] <= 1 and row["budget_ms"] > 0
-        assert (row["error_max"] == 0) == (row["controller"] == "none") and row["cost_ms"] <= row["cost_p95_ms"]
-        if row["controller"] == "none":
-            assert row["within_tenth"] == 0 and row["worst"] >= 3
-        else:
-            assert row["faces"] < rows[0]["faces"]

@@ -195,7 +195,7 @@ class RigidBodies:
         self.mass, self._moments = np.full(n, np.inf), np.full((n, 3), np.inf)
         centre, axes, reach = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)), np.full(n, np.inf)
         for i in np.flatnonzero(rigid):
-            own = self.properties[i]
+            own = found[scene.object_model[i]]
             self.mass[i], self._moments[i] = density[i] * own.volume, density[i] * own.moments
             centre[i], axes[i], reach[i] = own.centre, own.axes, own.reach
         self._centre, self._axes = centre, axes

@@ -13,6 +13,7 @@ and then measures distances of faces, which cost more than tests for contact.
 """
 
 from numbers import Real
+from typing import cast
 
 import numpy as np
 import warp as wp
@@ -39,7 +40,7 @@ def check_rungs(rungs) -> tuple:
     except TypeError:
         raise ValueError(f"rungs: {rungs!r} is no sequence of shares of the faces") from None
     for k, share in enumerate(rungs):
-        if isinstance(share, bool) or not isinstance(share, Real) or not 0 < share < 1:
+        if isinstance(share, bool) or not isinstance(share, Real) or not 0 < float(share) < 1:
             raise ValueError(f"rungs: {share!r} at {k} is no share of the faces between 0 and 1")
         if k and not share > rungs[k - 1]:
             raise ValueError(f"rungs: {share!r} at {k} does not exceed {rungs[k - 1]!r} before it")
@@ -88,9 +89,9 @@ def _stand(scene: Scene, lods) -> list:
 class _Stage(Query):
     """A query about the objects at one rung, whose pairs and results lie in arrays of the cascade."""
 
-    def __init__(self, cascade, standing, *arguments, **options):
+    def __init__(self, cascade, standing, output="faces", **options):
         self.cascade = cascade
-        super().__init__(standing, *arguments, pairs=np.empty((0, 2), np.int32), unsure_capacity=1, **options)
+        super().__init__(standing, output, pairs=np.empty((0, 2), np.int32), unsure_capacity=1, **options)
 
     def uses_warps(self):
         return self.cascade.uses_warps()
@@ -269,4 +270,4 @@ def intersect_originals(scene, pairs=None, output="any", precision="exact", rung
     query = Cascade(scene, output, np.empty((0, 2), np.int32) if pairs is None else pairs, rungs, precision=precision)
     if pairs is None and scene.object_count > 1:
         query.set_pairs(BroadPhase(*query.arrays, scene.excluded_keys()).find())
-    return query.run()
+    return cast(CascadeResult, query.run())

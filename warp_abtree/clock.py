@@ -5,6 +5,7 @@ import json
 import os
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -116,7 +117,7 @@ class Timer:
     def __init__(self, device, clock):
         self.device = device
         self.counts_work = hasattr(clock, "charge")
-        self.clock = perf_counter if clock is None else clock
+        self.clock: Any = perf_counter if clock is None else clock
         self._events = None
         if clock is None and device.is_cuda:
             self._events = [wp.Event(device, enable_timing=True) for _ in range(len(STAGES) + 1)]

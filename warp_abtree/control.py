@@ -7,6 +7,7 @@ read a clock: time reaches them in the feedback, so they repeat themselves on co
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -58,6 +59,7 @@ class Controller:
     """
 
     budget_ms: float | None = None
+    _selection: Any  # of warp_abtree.lod
 
     def __init__(self, scene, camera: Camera | Callable[[float], Camera] | None = None, window: int = 10):
         if not (camera is None or isinstance(camera, Camera) or callable(camera)):
@@ -144,7 +146,7 @@ class CostFit:
 
     def line(self) -> tuple[float, float]:
         """Return slope and intercept, NaN before the first observation."""
-        weight, x, y, xx, xy = self.sums
+        weight, x, y, xx, xy = self.sums.tolist()
         if weight == 0:
             return math.nan, math.nan
         x, y, xx, xy = x / weight, y / weight, xx / weight, xy / weight
@@ -192,7 +194,8 @@ class PredictiveController(Controller):
         tests = result.node_tests + TRIANGLE_WORK * result.triangle_tests
         work = np.zeros(count)
         if len(result.pairs):
-            work = 0.5 * sum(np.bincount(result.pairs[:, side], tests, count) for side in (0, 1))
+            first, second = (np.bincount(result.pairs[:, side], tests, count) for side in (0, 1))
+            work = 0.5 * (first + second)
         total = float(tests.sum())
         self._learn_growth(total)
         self._query.add(total, stages["query_ms"])

@@ -5,9 +5,9 @@
 1. Contacts where the bodies stand, each touching pair reduced to at most 8 points (`warp_abtree.manifold`).
 2. Bounces: pairs with a point that comes in faster than 2 |gravity| dt are reflected, `restitution` times as fast,
    pair after pair, as often as `iterations` allows; friction acts against what slides.
-3. Gravity; then impulses at all points by relaxation, one point after another (projected Gauss-Seidel, the sequential
-   impulses of games), until nothing sinks, started from those of the step before where points rest. Friction is
-   Coulomb's, in a disc.
+3. Gravity; then impulses at all points by relaxation, one point after another, to and fro (projected Gauss-Seidel, the
+   sequential impulses of games), until nothing sinks, started from those of the step before where points rest. Friction
+   is Coulomb's, in a disc.
 4. Corrections of place, one fifth of the way to a depth of `slop` a step, that leave no velocity behind (split
    impulses). A resting contact keeps that depth, or it would be none.
 5. Semi-implicit Euler: places move with the new velocities. Rotations keep the angular momentum, not the spin, by a
@@ -32,6 +32,7 @@ first order.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -43,6 +44,8 @@ from warp_abtree.kernels import bodies as body_kernels
 from warp_abtree.kernels import colour as colouring
 from warp_abtree.kernels import solve
 from warp_abtree.manifold import POINTS_MAX, ManifoldQuery
+from warp_abtree.mesh import mesh_from_arrays
+from warp_abtree.model import Model
 from warp_abtree.scene import Scene, check_poses
 
 AXIS_TOLERANCE = 1e-3
@@ -77,6 +80,14 @@ def quaternions_about(axis, angle) -> np.ndarray:
     return np.concatenate([np.asarray(axis, np.float64) * np.sin(half), np.cos(half)], axis=-1)
 
 
+# Defaults of `Kinematic`, a row or a number for all objects; it makes arrays of them.
+_NO_TURN: Any = (0.0, 0.0, 0.0, 1.0)
+_NO_WAY: Any = (0.0, 0.0, 0.0)
+_UPWARDS: Any = (0.0, 0.0, 1.0)
+_ZERO: Any = 0.0
+_FOR_EVER: Any = np.inf
+
+
 @dataclass(eq=False)
 class Kinematic:
     """Prescribed motion of n objects.
@@ -101,13 +112,13 @@ class Kinematic:
     """
 
     position: np.ndarray
-    rotation: np.ndarray = (0.0, 0.0, 0.0, 1.0)
-    velocity: np.ndarray = (0.0, 0.0, 0.0)
-    axis: np.ndarray = (0.0, 0.0, 1.0)
-    rate: np.ndarray = 0.0
-    shuttle: np.ndarray = (0.0, 0.0, 0.0)
-    period: np.ndarray = np.inf
-    phase: np.ndarray = 0.0
+    rotation: np.ndarray = _NO_TURN
+    velocity: np.ndarray = _NO_WAY
+    axis: np.ndarray = _UPWARDS
+    rate: np.ndarray = _ZERO
+    shuttle: np.ndarray = _NO_WAY
+    period: np.ndarray = _FOR_EVER
+    phase: np.ndarray = _ZERO
 
     def __post_init__(self):
         self.position = np.array(self.position, np.float64)
@@ -283,7 +294,8 @@ class Dynamics(RigidBodies):
         else:
             rotation, position = targets[:, :3, :3], targets[:, :3, 3]
         if not len(self._targets[0]):
-            self._targets = tuple(wp.zeros(len(targets), dtype=t, device=self.device) for t in (wp.mat33d, wp.vec3d))
+            n, device = len(targets), self.device
+            self._targets = wp.zeros(n, dtype=wp.mat33d, device=device), wp.zeros(n, dtype=wp.vec3d, device=device)
         self._targets[0].assign(np.ascontiguousarray(rotation))
         self._targets[1].assign(np.ascontiguousarray(position))
 
@@ -307,6 +319,7 @@ class Dynamics(RigidBodies):
         Raises:
             CapacityError: Names the demand.
         """
+        assert self.query.broad_phase is not None  # the query was made without pairs
         pairs = self.query.broad_phase.count_found()
         if pairs > self._room:
             raise CapacityError(
@@ -373,14 +386,26 @@ class Dynamics(RigidBodies):
         touching = [self.query.pairs, self.query.manifolds]
         inputs = [self._colour_order, self._colour_key, *touching, self._memory, self._rows, self.bodies]
         if self.in_turn:
-            self._launch(solve.relax_in_turn_kernel, 1, [stage, 0, rounds, *inputs])
+            self._launch(solve.relax_in_turn_kernel, 1, [stage, 0, 0, rounds, *inputs])
             return
-        for _ in range(rounds):
-            for colour in colours:
+        for turn in range(rounds):
+            backward = turn % 2 if stage == int(solve.VELOCITY) else 0
+            for colour in reversed(colours) if backward else colours:
                 if colour < COLOURS:
-                    self._launch(solve.relax_colour_kernel, self._room, [stage, colour, *inputs])
+                    self._launch(solve.relax_colour_kernel, self._room, [stage, backward, colour, *inputs])
                 else:
-                    self._launch(solve.relax_in_turn_kernel, 1, [stage, COLOURS, 1, *inputs])
+                    self._launch(solve.relax_in_turn_kernel, 1, [stage, backward, COLOURS, 1, *inputs])
+
+
+def load_kernels(device):
+    """Let two tetrahedra collide, in all the ways in which steps launch."""
+    corners, faces = np.concatenate([np.zeros((1, 3)), np.eye(3)]), [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
+    model, scene = Model.load(mesh_from_arrays(corners, faces)), Scene(device=device)
+    scene.add(model)
+    scene.add(model, pose=(0.1, 0.1, 0.1, 0, 0, 0, 1))
+    bodies = Dynamics(scene)
+    bodies.step(1e-3)
+    bodies.launch(1e-3)
 
 
 class SteppedMotion:
@@ -403,11 +428,16 @@ class SteppedMotion:
         """Take the time [s]; the poses are in the scene already."""
         self._time = time
 
+    def warm_up(self, time_step: float):
+        """Load all kernels of a step, and make the room that contacts take where the bodies stand; nothing moves."""
+        load_kernels(self.dynamics.device)
+        self.find(time_step)
+
     def find(self, time_step: float):
-        """Find the contacts of the step from here, and return them as a `ManifoldResult`. Waits for the device."""
+        """Find the contacts of the step from here; return a `ManifoldResult` without points. Waits for the device."""
         targets = None if self.prescribed is None else self.prescribed.poses(self._time + time_step)
         self.dynamics.find(time_step, targets)
-        return self.dynamics.query.result()
+        return self.dynamics.query.result(with_points=False)
 
     def answer(self, result, time_step: float):
         """Move on by a step."""

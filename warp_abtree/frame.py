@@ -12,14 +12,17 @@ import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import warp as wp
 
 from warp_abtree.clock import COST_STAGES, STAGES, Timer
-from warp_abtree.control import Controller, Feedback
-from warp_abtree.dynamics import Kinematic, triangle_wave
+from warp_abtree.control import Feedback
+from warp_abtree.dynamics import triangle_wave
 from warp_abtree.intersect import Result
 from warp_abtree.model import Model
+from warp_abtree.refine import full_share
 from warp_abtree.scene import Scene
 
 
@@ -193,6 +196,32 @@ def judge_step(rows, frame: int, budget_ms: float | None = None) -> dict:
     return {"peak": float(ratio.max()), "frames": int(back[0]) if len(back) else None}
 
 
+def rehearse_updates(scene: Scene):
+    """Launch whatever a change of LODs may launch, on a copy of the smallest model that has it all.
+
+    In part, from a copied state; from another, in place; and whole. Models so small that they are always refitted
+    whole never are in part.
+    """
+    share = full_share(scene.device)
+    chosen, step = None, 0
+    for model in sorted(scene.models, key=lambda model: model.face_count):
+        if not model.lod_max:
+            continue
+        spans = np.diff(model.progressive.split_start)
+        if chosen is None:
+            chosen = model
+        if spans.min() <= share * model.face_count:
+            chosen, step = model, int(spans.argmin())
+            break
+    if chosen is None:
+        return
+    copy = Scene(device=scene.device)
+    for _ in range(2):
+        copy.add(chosen, lod=step)
+    for lods in ((step, step + 1), (step + 1, step), (0, chosen.lod_max), (chosen.lod_max, chosen.lod_max)):
+        copy.set_lods(lods)
+
+
 class Frame:
     """Runs a scene frame by frame and keeps a row on each.
 
@@ -205,6 +234,7 @@ class Frame:
             or None where it has set those of the scene itself;
             `find(time_step)`, optional: returns a `Result` in the place of the frame's own broad phase and query, for
             what finds its contacts itself;
+            `warm_up(time_step)`, optional: loads what these launch, and moves nothing (asked by `Frame.warm_up`);
             `answer(result, time_step)`, optional: hears what was found, and moves on by the time to the next frame [s].
         lods: A controller of `warp_abtree.control`, or anything with its `next_lods` and `budget_ms`; or called with
             the time [s], returns the LOD of every object, int (n,); None leaves them.
@@ -223,8 +253,8 @@ class Frame:
     def __init__(
         self,
         scene: Scene,
-        motion: Kinematic | None = None,
-        lods: Controller | Callable[[float], np.ndarray] | None = None,
+        motion: Any = None,
+        lods: Any = None,
         output: str = "count",
         time_step: float = 1 / 60,
         clock: Callable[[], float] | None = None,
@@ -248,13 +278,20 @@ class Frame:
         self._measure_lods()
 
     def warm_up(self):
-        """Run every stage once and keep no row, so that no row times the loading of kernels; LODs stay as they are."""
+        """Run every stage once and keep no row, so that no row times the loading of kernels.
+
+        Nothing moves, and LODs stay as they are: changes of them are rehearsed on copies. A motion that finds contacts
+        itself is asked to load its own, where it has `warm_up(time_step)`. Waits for the device.
+        """
         if self.lods is not None:
-            before = self.scene.lods
-            # A controller hears of no frame yet: it looks at the scene as it stands and moves nothing.
-            self.scene.set_lods(self._select(0.0 if hasattr(self.lods, "next_lods") else self.time_step))
-            self.scene.set_lods(before)
-        self.scene.intersect(self.scene.broad_phase(), output=self.output)
+            # A controller hears of no frame yet: it looks at the scene as it stands.
+            self._select(0.0)
+            rehearse_updates(self.scene)
+        if hasattr(self.motion, "warm_up"):
+            self.motion.warm_up(self.time_step)
+        if not hasattr(self.motion, "find"):
+            self.scene.intersect(self.scene.broad_phase(), output=self.output)
+        wp.synchronize_device(self.scene.device)
 
     def poses_at(self, time: float) -> np.ndarray:
         """Return the poses of a time [s], (n, 7), in a buffer that the next call overwrites.
@@ -283,7 +320,7 @@ class Frame:
         timer.mark(posed=0 if self.motion is None else scene.object_count)
         finds = hasattr(self.motion, "find")
         pairs = None if finds else scene.broad_phase()
-        timer.mark(candidate=0 if finds else len(pairs))
+        timer.mark(candidate=0 if pairs is None else len(pairs))
         result = self.motion.find(self.time_step) if finds else scene.intersect(pairs, output=self.output)
         node_tests, triangle_tests = _sum(result.node_tests), _sum(result.triangle_tests)
         timer.mark(query=1, node_test=node_tests, triangle_test=triangle_tests)
@@ -339,7 +376,7 @@ class Frame:
             after: `budget`, the verdict of `judge_budget`, leaves out frames before this time [s].
         """
         columns = {name: [row.as_dict()[name] for row in self.history] for name in FrameRow.names()}
-        found = {"frames": len(self.history), "objects": self.scene.object_count}
+        found: dict[str, Any] = {"frames": len(self.history), "objects": self.scene.object_count}
         counts = "states", "pairs", "touching", "hits", "faces", "nodes_refitted", "node_tests", "triangle_tests"
         for name in (*counts, "error_mean", "error_max"):
             values = np.array([math.nan if value is None else value for value in columns[name]], np.float64)

@@ -38,12 +38,15 @@ class ManifoldResult(Result):
 
     Attributes:
         points: Contact points in the order of pairs: a dictionary of pair, place in `pairs`, int (k,); point, normal,
-            float64 (k, 3), and depth, (k,), as `ManifoldQuery.manifolds`.
+            float64 (k, 3), and depth, (k,), as `ManifoldQuery.manifolds`; None where they were left on the device.
     """
 
-    def __init__(self, query, pairs, pair_demand):
+    def __init__(self, query, pairs, pair_demand, with_points=True):
         super().__init__(pairs, "count", pair_demand, len(query.pairs), query.hits)
         self._hit_demand, self._hit_room = int(self.count.sum()), len(query.hits.face)
+        self.points = None
+        if not with_points:
+            return
         count = query.manifolds.count.numpy()[: len(pairs)]
         used = np.arange(POINTS_MAX) < count[:, None]
         self.points = {"pair": np.repeat(np.arange(len(pairs)), count)}
@@ -66,6 +69,9 @@ class ManifoldQuery(ContactQuery):
         pair_key: first object * 2^32 + second object of each pair of the broad phase, device int64 (2 pair capacity,);
             the greatest int64 behind the last pair.
     """
+
+    pair_key: wp.array
+    _pair_order: wp.array
 
     def __init__(self, scene, pairs=None, capacity=None, pair_capacity=None, precision="exact", roles=None):
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
@@ -156,9 +162,10 @@ class ManifoldQuery(ContactQuery):
             self.resize(2 * self._sum(self.hits.count))
             self.traverse()
 
-    def result(self) -> ManifoldResult:
-        """Return the counts and contact points of the last launch on the host. Waits for the device."""
-        return ManifoldResult(self, *self._asked())
+    def result(self, with_points: bool = True) -> ManifoldResult:  # type: ignore[override]  # points, not contacts
+        """Return the counts and, unless told otherwise, the contact points of the last launch on the host. Waits."""
+        pairs, demand = self._asked()
+        return ManifoldResult(self, pairs, demand, with_points)
 
     def run(self) -> ManifoldResult:
         """Launch, grow buffers that were too small, and return the whole result. Waits for the device."""

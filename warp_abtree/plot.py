@@ -3,13 +3,15 @@
 Objects interpenetrate here, where sorting faces by depth fails, so visibility is decided pixel by pixel.
 """
 
+from __future__ import annotations
+
 import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from warp_abtree import FrameRow, Scene
+import warp_abtree as ab
 
 # Plain and intersecting faces, by model in the order of the scene.
 COLOURS = (
@@ -55,7 +57,7 @@ def place(pose, points) -> np.ndarray:
     return points @ rotation.T + pose[:3]
 
 
-def make_panel(scene: Scene, poses, objects, subject=None) -> Panel:
+def make_panel(scene: ab.Scene, poses, objects, subject=None) -> Panel:
     """Pose a scene, find the intersecting faces of some of its objects, and colour them.
 
     Args:
@@ -70,7 +72,9 @@ def make_panel(scene: Scene, poses, objects, subject=None) -> Panel:
     pairs = pairs[np.isin(pairs, objects).all(axis=1)]
     result = scene.intersect(pairs, output="faces")
     owner = np.array(scene.object_model)
-    triangles, colours, shown, hit_faces = [], [], {}, {}
+    triangles, colours = [], []
+    shown: dict[int, int] = {}
+    hit_faces: dict[int, int] = {}
     for i in objects:
         model = scene.models[owner[i]]
         vertices, faces, face_ids = model.mesh_at(int(scene.lods[i]))
@@ -117,7 +121,7 @@ class Camera:
     distance: float
 
     @classmethod
-    def around(cls, points, eye, up) -> "Camera":
+    def around(cls, points, eye, up) -> Camera:
         """Return a camera that looks from a direction and sees all points (n, 3)."""
         back = np.asarray(eye, np.float64) / np.linalg.norm(eye)
         right = np.cross(up, back)
@@ -360,7 +364,7 @@ STAGE_LABELS = {
 }
 
 
-def draw_run(rows: list[FrameRow], parts, path, title: str):
+def draw_run(rows: list[ab.FrameRow], parts, path, title: str):
     """Draw LODs, times by stage and certified error of a run over its frames, to a PNG file.
 
     Args:
@@ -403,4 +407,72 @@ def draw_run(rows: list[FrameRow], parts, path, title: str):
     for axes in (lods, times, errors):
         axes.grid(True, alpha=0.3)
         axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    _write_png(canvas, path)
+
+
+# Colours that are told apart with any colour vision (Okabe and Ito 2008), dashes, and widths, by controller.
+CONTROLLER_STYLES = {
+    "none": ("finest LODs", "0.45", "-", 0.9),
+    "coarsest": ("coarsest LODs", "0.45", ":", 1.2),
+    "tolerance": ("tolerance", "#009E73", "-", 1.0),
+    "paper": ("paper's controller", "#D55E00", "-", 1.0),
+    "predictive": ("predictive controller", "#0072B2", "-", 1.4),
+}
+
+
+def draw_controllers(runs: dict[str, list[ab.FrameRow]], budget_ms: float, path, title: str):
+    """Draw what several controllers made of one scene, to a PNG file: frame times about T, faces, certified error.
+
+    Args:
+        runs: Rows of a run by controller: "predictive", "paper", "tolerance", "none" (finest LODs), "coarsest".
+        budget_ms: T [ms].
+        path: File to write.
+        title: Above.
+
+    Raises:
+        ValueError: No run, or one of an unknown controller.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    unknown = set(runs) - set(CONTROLLER_STYLES)
+    if unknown or not runs:
+        raise ValueError(f"runs: {sorted(unknown)} are none of {', '.join(CONTROLLER_STYLES)}, or there are none")
+    figure = Figure(figsize=(9, 8.4), dpi=100, facecolor=BACKGROUND, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    times, faces, errors = figure.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.0, 1.0))
+    figure.suptitle(title, fontsize=13, fontweight="bold", color="0.15")
+    most = max(row.faces for rows in runs.values() for row in rows)
+    for name, (label, colour, dash, width) in CONTROLLER_STYLES.items():
+        rows = runs.get(name)
+        if rows is None:
+            continue
+        style = {"color": colour, "linestyle": dash, "linewidth": width, "label": label}
+        frames = [row.frame for row in rows]
+        times.plot(frames, [row.cost_ms for row in rows], **style)
+        faces.plot(frames, [100 * row.faces / most for row in rows], **style)
+        errors.plot(frames, [row.error_mean for row in rows], **style)
+    times.axhspan(budget_ms, 1.1 * budget_ms, color="#F0E442", alpha=0.7, linewidth=0, label="T to T + 10 %")
+    times.axhline(budget_ms, color="black", linewidth=0.9, label=f"T = {budget_ms:.3g} ms")
+    costs = np.array([row.cost_ms for rows in runs.values() for row in rows])
+    # A hitch, and frames before anything has come together, must not flatten the rest.
+    times.set(
+        yscale="log", ylim=(max(costs.min(), budget_ms / 10) / 1.15, 1.3 * max(np.percentile(costs, 99.5), budget_ms))
+    )
+    times.set_ylabel("frame time T' [ms]")
+    faces.set(yscale="log", ylabel="faces of all objects\n[% of the finest]")
+    errors.set(ylabel="certified error, mean\nof the objects [world units]")
+    errors.set_xlabel("frame")
+    errors.set_ylim(bottom=0)
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    for axes, steps in ((times, (1, 2, 5)), (faces, (1, 3))):
+        axes.yaxis.set_major_locator(LogLocator(subs=steps))
+        axes.yaxis.set_major_formatter(plain)
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    for axes in (times, faces, errors):
+        axes.set_xlim(0, max(max(row.frame for row in rows) for rows in runs.values()) or 1)
+        axes.grid(True, alpha=0.3)
+    handles, labels = times.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize="small")
     _write_png(canvas, path)

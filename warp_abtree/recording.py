@@ -10,6 +10,7 @@ import os
 import zipfile
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,7 +48,7 @@ class Recording:
         path = Path(path)
         partial = path.with_name(path.name + ".partial")
         table = [asdict(row) for row in self.rows]
-        columns = {}
+        columns: dict[str, Any] = {}
         for name in COLUMNS:
             values = [row[name] for row in table]
             if name in _OPTIONAL:

@@ -2,6 +2,7 @@
 once."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -80,7 +81,9 @@ def _plan(states: StateArrays, wanted: set, used: set) -> tuple[Plan, dict]:
         by_model.setdefault(states.slots[s].model, []).append(s)
     movable = {model: [s for s in ids if s not in kept] for model, ids in by_model.items()}
 
-    def distance(state, key):
+    def distance(key, state):
+        if state < 0:  # there is no state of this model yet
+            return 0
         bounds = states.models.split_bounds[key[0]]
         return abs(int(bounds[states.slots[state].lod]) - int(bounds[key[1]]))
 
@@ -89,7 +92,7 @@ def _plan(states: StateArrays, wanted: set, used: set) -> tuple[Plan, dict]:
     for key in sorted(wanted - chosen.keys()):
         spare = movable.get(key[0], [])
         if spare:
-            state = min(spare, key=lambda s, key=key: distance(s, key))
+            state = min(spare, key=partial(distance, key))
             spare.remove(state)
             chosen[key] = state
             plan.state.append(state)
@@ -97,9 +100,7 @@ def _plan(states: StateArrays, wanted: set, used: set) -> tuple[Plan, dict]:
             plan.source.append(state)
         else:
             copies.append(key)
-    sources = [
-        min(by_model.get(key[0], [-1]), key=lambda s, key=key: distance(s, key) if s >= 0 else 0) for key in copies
-    ]
+    sources = [min(by_model.get(key[0], [-1]), key=partial(distance, key)) for key in copies]
     for state, key, source in zip(states.reserve([key[0] for key in copies]), copies, sources, strict=True):
         chosen[key] = state
         plan.state.append(state)
@@ -294,9 +295,9 @@ def set_object_lods(
         object_model: Model of each object, int (n,).
         lods: Target LOD of each object, int (n,), within its model's range.
     """
-    keys, inverse = np.unique(np.stack([object_model, lods], 1), axis=0, return_inverse=True)
-    wanted = [(int(m), int(lod)) for m, lod in keys]
-    used = {int(s) for s in objects.state if s >= 0}
+    keys, inverse = np.unique((object_model.astype(np.int64) << 32) + lods, return_inverse=True)
+    wanted = [(key >> 32, key & (2**32 - 1)) for key in keys.tolist()]
+    used = set(np.unique(objects.state[objects.state >= 0]).tolist())
     plan, chosen = _plan(states, set(wanted), used)
     batch = _carry_out(models, states, plan)
     serving = np.array([chosen[key] for key in wanted], np.int32)[inverse.reshape(-1)]

@@ -93,8 +93,8 @@ class Scene:
         self._added_pose: list[np.ndarray] = []
         self._lod: list[int] = []
         self._excluded = np.empty(0, np.int64)
-        self._arrays = None
-        self._broad_phase = None
+        self._arrays: tuple[ModelArrays, StateArrays, ObjectArrays] | None = None
+        self._broad_phase: BroadPhase | None = None
         self._queries: dict[tuple, Query] = {}
 
     @property
@@ -154,7 +154,7 @@ class Scene:
         self._broad_phase = None
         self._queries.clear()
 
-    def arrays(self):
+    def arrays(self) -> tuple[ModelArrays, StateArrays, ObjectArrays]:
         """Return (`ModelArrays`, `StateArrays`, `ObjectArrays`), made at the first use after an `add`."""
         if self._arrays is None:
             if not self.object_model:
@@ -233,7 +233,7 @@ class Scene:
         models, states, objects = self.arrays()
         with states.restored_on_error():
             stats = set_object_lods(models, states, objects, np.array(self.object_model), lods.astype(np.int64))
-        self._lod = [int(lod) for lod in lods]
+        self._lod = lods.astype(np.int64).tolist()
         return stats
 
     def check_pairs(self, pairs) -> np.ndarray:
@@ -316,7 +316,7 @@ class Scene:
             query = ContactQuery(self, pairs=pairs, precision=precision, within=within)
         else:
             query = Query(self, output, pairs=pairs, precision=precision, within=within)
-        if with_contacts:
+        if isinstance(query, ContactQuery):
             query.contact_dtype = contact_dtype
         result = query.run()
         self._queries[asked] = query

@@ -9,12 +9,10 @@ from warp_abtree import (
     Camera,
     Dynamics,
     Kinematic,
-    Model,
     PaperController,
     PredictiveController,
     Scene,
     ToleranceController,
-    mesh_from_arrays,
 )
 from warp_abtree import scene_keys as keys_of
 
@@ -79,7 +77,7 @@ def read_camera(keys) -> CameraPath | None:
         if i and not times[i] > times[i - 1]:
             point.fail("time", f"{times[i]} is not after the one before, {times[i - 1]}")
     keys.end()
-    path = CameraPath(np.array(times), *(np.array(end) for end in ends), loop, options)
+    path = CameraPath(np.array(times), np.array(ends[0]), np.array(ends[1]), loop, options)
     for row, time in zip(rows, times):
         try:
             path(time)
@@ -136,7 +134,7 @@ class LodControl:
         return kind(scene, self.budget_ms, camera, **options)
 
 
-def read_lod(keys) -> LodControl:
+def read_lod(keys: keys_of.Keys | None) -> LodControl:
     """Check [lod]."""
     if keys is None:
         return LodControl()
@@ -162,7 +160,7 @@ def read_lod(keys) -> LodControl:
             keys.fail(None, "give budget_ms or tolerance")
         controller = "tolerance" if budget is None else "predictive"
     try:
-        return LodControl(None, budget, tolerance, options).asked(controller)
+        return LodControl("none", budget, tolerance, options).asked(controller)
     except ValueError as error:
         keys.fail(None, error)
 
@@ -214,12 +212,3 @@ def read_dynamics(keys) -> DynamicsSettings | None:
     body = {name: keys.take(name, check, default) for name, (check, default) in BODY.items()}
     keys.end()
     return DynamicsSettings(options, body)
-
-
-def load_kernels(device):
-    """Let two tetrahedra collide, so that no frame times the loading of the kernels of rigid bodies."""
-    corners, faces = np.concatenate([np.zeros((1, 3)), np.eye(3)]), [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]
-    model, scene = Model.load(mesh_from_arrays(corners, faces)), Scene(device=device)
-    scene.add(model)
-    scene.add(model, pose=(0.1, 0.1, 0.1, 0, 0, 0, 1))
-    Dynamics(scene).step(1e-3)
