@@ -128,7 +128,7 @@ def describe_mesh(mesh):
         "duplicate_faces": len(corners) - _distinct_rows(corners),
         "open_edges": open_edges,
         "nonmanifold_edges": int(np.count_nonzero(edge_faces > 2)),
-        "components": _component_count(faces, vertex_count),
+        "components": len(np.unique(component_labels(faces, vertex_count)[np.unique(faces)])),
         "closed": open_edges == 0,
         "extents": (upper - lower).tolist(),
         "bounds": [lower.tolist(), upper.tolist()],
@@ -252,9 +252,9 @@ def _distinct_rows(rows):
     return 1 + int(np.count_nonzero((ordered[1:] != ordered[:-1]).any(axis=1)))
 
 
-def _component_count(faces, vertex_count):
+def component_labels(faces, vertex_count):
+    """Return the lowest vertex that each vertex is joined to through faces, int (v,)."""
     label = np.arange(vertex_count)
-    used = np.unique(faces)
     pending = faces
     while len(pending):
         corner_label = label[pending]
@@ -269,7 +269,7 @@ def _component_count(faces, vertex_count):
             label = jumped
         corner_label = label[pending]
         pending = pending[(corner_label != corner_label[:, :1]).any(axis=1)]
-    return len(np.unique(label[used]))
+    return label
 
 
 # Reading.
@@ -344,7 +344,7 @@ def _from_geometry(geometry, name, where=None):
     return _build(np.concatenate(vertices), np.concatenate(faces), name, where)
 
 
-def _parse_obj(data, where):
+def _parse_obj(data, where) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and triangles of an OBJ file; only `v` and `f` lines matter here."""
     vertices, corners, counts = [], [], []
     for number, line in enumerate(data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines(), start=1):
@@ -376,11 +376,11 @@ def _parse_obj(data, where):
         counts.append(len(polygon))
     if not counts:
         raise MeshError(f"{where}: no faces")
-    vertices = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-    return vertices, _triangulate(vertices, np.array(counts), np.array(corners) - 1, where)
+    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+    return points, triangulate(points, np.array(counts), np.array(corners) - 1, where)
 
 
-def _read_warp_asset(source, asset):
+def _read_warp_asset(source, asset) -> tuple[np.ndarray, np.ndarray]:
     if asset not in WARP_ASSETS:
         raise MeshError(f"{source}: unknown; Warp's meshes are {', '.join('warp:' + each for each in WARP_ASSETS)}")
     try:
@@ -394,13 +394,13 @@ def _read_warp_asset(source, asset):
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/root/{asset}"))  # its transform is the identity in all three files
     vertices = np.array(mesh.GetPointsAttr().Get(), dtype=np.float64)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get())
-    return vertices, _triangulate(vertices, counts, np.array(mesh.GetFaceVertexIndicesAttr().Get()), source)
+    return vertices, triangulate(vertices, counts, np.array(mesh.GetFaceVertexIndicesAttr().Get()), source)
 
 
 # Polygons.
 
 
-def _triangulate(vertices, counts, corners, where):
+def triangulate(vertices, counts, corners, where):
     """Cut polygons into triangles, in place: polygon p gives counts[p] - 2 of them."""
     if (counts == 3).all():
         return corners.reshape(-1, 3)

@@ -1,0 +1,182 @@
+"""Every Python block of README.md and docs/ runs, every scene in them loads, links lead somewhere; examples run."""
+
+import contextlib
+import importlib.util
+import io
+import re
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_abtree as ab
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"(?:<!-- needs: ([\w, ]+) -->\n)?^```(\w+)\n(.*?)^```", re.S | re.M)
+# What a page does at full size, at one that tests can bear.
+SMALLER = {
+    "docs/lod.md": (
+        ('("rain", "focus")', '("focus",)'),
+        ("(3, 4)", "(3,)"),
+        ("objects=150", "objects=4"),
+        (".run(240)", ".run(62)"),
+        ("objects=60", "objects=4"),
+        (".run(120)", ".run(3)"),
+    ),
+    "docs/howto_budget.md": (
+        ("objects=60", "objects=12"),
+        ("frame.run(120)", "frame.run(66)"),
+        ("range(30)", "range(3)"),
+    ),
+    "docs/howto_planning.md": (("100_000", "3_000"), ("[:2000]", "[:300]")),
+    "README.md": (("frame.run(150)", "frame.run(62)"), ("range(480)", "range(20)")),
+}
+
+
+def name_of(page):
+    return page.relative_to(ROOT).as_posix()
+
+
+def blocks_of(page, language):
+    """Return (what a block needs, its text) of every block of a language, smaller where `SMALLER` says so."""
+    text = page.read_text(encoding="utf-8")
+    found = [
+        (needs.split(", ") if needs else [], block) for needs, kind, block in BLOCK.findall(text) if kind == language
+    ]
+    if language == "python":
+        for old, new in SMALLER.get(name_of(page), ()):
+            assert any(old in block for _, block in found), f"{name_of(page)} no longer holds {old!r}"
+            found = [(needs, block.replace(old, new)) for needs, block in found]
+    return found
+
+
+def missing(needs):
+    """Return what of a block's needs is not here: modules, or "cuda"."""
+    here = {"cuda": wp.is_cuda_available()}
+    return [need for need in needs if not here.get(need, need != "cuda" and importlib.util.find_spec(need) is not None)]
+
+
+PYTHON = [(page, i) for page in PAGES for i in range(len(blocks_of(page, "python")))]
+
+
+@pytest.fixture(scope="module")
+def run_block(tmp_path_factory):
+    """Return a function that runs a block after those before it on its page, all in one namespace."""
+    spaces, done = {}, {}
+
+    def run(page, index):
+        space = spaces.setdefault(page, {})
+        for i, (needs, block) in enumerate(blocks_of(page, "python")[: index + 1]):
+            if i < done.get(page, 0):
+                continue
+            done[page] = i + 1
+            if not missing(needs):
+                # Line numbers of the page, for a traceback that can be read.
+                start = page.read_text(encoding="utf-8").split("```python\n")[: i + 1]
+                lines = sum(part.count("\n") + 1 for part in start) - 1
+                exec(compile("\n" * lines + block, name_of(page), "exec"), space)
+
+    folder = tmp_path_factory.mktemp("docs")
+    (folder / "scenes").symlink_to(ROOT / "scenes")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        yield run
+
+
+@pytest.mark.parametrize(("page", "index"), PYTHON, ids=[f"{name_of(page)}-{i + 1}" for page, i in PYTHON])
+def test_python_blocks_run(run_block, page, index):
+    needs, block = blocks_of(page, "python")[index]
+    absent = missing([*needs, *(["pxr"] if "warp:" in block else [])])
+    if absent:
+        pytest.skip(f"needs {', '.join(absent)}")
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown):
+        run_block(page, index)
+    assert bool(shown.getvalue()) >= ("print(" in block)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks_of(page, "toml")], ids=name_of)
+def test_scenes_in_pages_load(page):
+    for _, text in blocks_of(page, "toml"):
+        loaded = ab.load_scene(page, device="cpu", text=text)
+        rows = loaded.frame(output="count").run(2)
+        assert rows[-1].objects == loaded.scene.object_count > 1
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_somewhere(page):
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if not target.startswith(("http", "#")):
+            assert (page.parent / target.split("#")[0]).exists(), target
+
+
+def test_blocks_are_found_and_told_apart():
+    found = BLOCK.findall("x\n<!-- needs: torch, cuda -->\n```python\na\n```\n\n```sh\nb\n```\n```python\nc\n```\n")
+    assert found == [("torch, cuda", "python", "a\n"), ("", "sh", "b\n"), ("", "python", "c\n")]
+    assert missing(["no_such_module", "numpy"]) == ["no_such_module"]
+    pages = [name_of(page) for page, _ in PYTHON]
+    assert len(PYTHON) > 15 and pages.count("README.md") >= 5
+
+
+# Examples.
+
+
+def run_example(name, *words):
+    """Run an example's main with words of a command line; return what it returns, and what it printed."""
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown):
+        found = runpy.run_path(str(ROOT / "scenes" / f"{name}.py"))["main"]([str(word) for word in words])
+    return found, shown.getvalue()
+
+
+def test_planning_example(device, tmp_path):
+    import trimesh
+
+    hit, shown = run_example("planning", "--device", device, "--poses", 400, "--parts", 6, "--glb", tmp_path / "g.glb")
+    assert len(hit) == 400 and 0 < hit.sum() < 400 and "a second" in shown
+    written = trimesh.load_scene(tmp_path / "g.glb")
+    assert sorted(written.graph.nodes_geometry) == ["bin", "gripper"]
+    fcl = pytest.importorskip("trimesh.collision").CollisionManager
+    pytest.importorskip("fcl")
+    parts = runpy.run_path(str(ROOT / "scenes" / "planning.py"))
+    peer = fcl()
+    peer.add_object("bin", parts["make_bin"](6))
+    gripper = parts["make_gripper"]()
+    peer.add_object("gripper", gripper)
+    for pose, expected in zip(parts["sample_grasps"](400)[:60], hit):
+        matrix = trimesh.transformations.quaternion_matrix(np.roll(pose[3:], 1))
+        matrix[:3, 3] = pose[:3]
+        peer.set_transform("gripper", matrix)
+        assert peer.in_collision_internal() == expected
+
+
+def test_worlds_example(device):
+    torch = pytest.importorskip("torch")
+    found, shown = run_example("worlds_torch", "--device", device, "--worlds", 3, "--samples", 24, "--rounds", 6)
+    assert "of 3 rings on their pegs" in shown
+    poses, hit = found
+    assert poses.shape == (3 + 3 * 24, 7) and hit.dtype == torch.bool
+    scene, pairs = runpy.run_path(str(ROOT / "scenes" / "worlds_torch.py"))["make_scene"](3, 24, device)
+    scene.set_poses(poses.cpu().numpy())
+    expected = scene.intersect(pairs).any
+    assert np.array_equal(hit.cpu().numpy(), expected) and 0 < expected.sum() < len(pairs)
+
+
+def test_worlds_example_without_torch(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(SystemExit, match="skipped: this example needs PyTorch"):
+        run_example("worlds_torch", "--device", "cpu")
+
+
+def test_budget_example(device):
+    words = "--objects 12 --frames 70 --part 2 --count-work --device"
+    found, shown = run_example("hold_budget", *words.split(), device)
+    assert set(found) == {"paper", "predictive"} and "mean error" in shown
+    for verdict in found.values():
+        assert verdict["frames"] == 10 and verdict["error_mean"] > 0
+    assert found["predictive"]["within"] > found["paper"]["within"]
