@@ -1,0 +1,108 @@
+"""What the experiments of the paper share: its three models, pairs of objects in contact, launches of one refit."""
+
+import copy
+import importlib
+
+import numpy as np
+
+import warp_abtree as ab
+
+from .cascade import Approach
+from .update import forced
+
+# Nothing public hands out the batch of an update.
+refine = importlib.import_module("warp_abtree.refine")
+
+# Of table 1: the paper's name, its faces and vertices of M^n and M^0; then ours, the best at hand first.
+PAPER_MODELS = (
+    ("bones", (4204, 2154), (10, 39), ("fandisk 4204", "warp:bear"), 10),
+    ("cow", (5804, 2904), (10, 8), ("cow", "warp:rocks"), 10),
+    ("bunny", (57563, 25000), (500, 1406), ("bunny 57564", "warp:bunny"), 500),
+)
+
+
+def paper_models(context, largest=True) -> list:
+    """Return the models in place of bones, cow and bunny; without the bunny where a quick run leaves it out."""
+    rows = PAPER_MODELS if largest or not context.quick else PAPER_MODELS[:2]
+    return [context.model(*names, base_faces=base_faces) for _, _, _, names, base_faces in rows]
+
+
+def longest_side(model) -> float:
+    """Return the longest side of a model's box [model units]."""
+    return float(np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())
+
+
+class PosedPairs:
+    """Pairs of objects of one model in random rotations: A at the origin, B so far pushed into it along a way out.
+
+    Args:
+        lods: LODs of A and of B.
+        firsts: Objects A, one for all pairs or one for each; every one has a tree state of its own.
+        share: Whether the one A is of B's model, so that they share a state where they stand at one LOD.
+
+    Attributes:
+        scene: `Scene`; objects 0 to firsts-1 are A.
+        pairs: Object pairs, int (count, 2).
+        matrices: Poses of all objects since the last push, (objects, 4, 4).
+    """
+
+    def __init__(self, model, count, device, lods=None, firsts=1, share=False, steps=32):
+        lods = (model.lod_max, model.lod_max) if lods is None else lods
+        finder = ab.Scene(device)
+        finder.add(model)
+        for _ in range(count):
+            finder.add(model)
+        self._approach = Approach(finder, model, model, count, steps)
+        self._size = longest_side(model)
+        self._firsts = firsts
+        self.scene = ab.Scene(device)
+        for _ in range(self._firsts):
+            self.scene.add(model if share else copy.copy(model), lod=lods[0])
+        for _ in range(count):
+            self.scene.add(model, lod=lods[1])
+        first = np.arange(count) % firsts
+        self.pairs = np.stack([first, self._firsts + np.arange(count)], 1)
+
+    def push(self, depth):
+        """Pose every B so far inside from where it last touches A on its way out, as a part of A's longest side."""
+        approach = self._approach
+        approach.place(approach.free - depth * self._size)
+        still = np.tile(np.eye(4), (self._firsts, 1, 1))
+        self.matrices = np.concatenate([still, approach.matrices[1:]])
+        self.scene.set_poses(self.matrices)
+
+    def like(self, model, device):
+        """Return a scene of another model, the same objects at the same poses."""
+        scene = ab.Scene(device)
+        for matrix in self.matrices:
+            scene.add(model, matrix)
+        return scene
+
+
+def hear_batch(scene, lods, share):
+    """Set LODs by one kind of refit (`update.REGIMES`) and return the batch of that update."""
+    batches, original = [], refine.active_update
+
+    def overhear(models, states, batch):
+        batches.append(batch)
+        original(models, states, batch)
+
+    refine.active_update = overhear
+    try:
+        with forced(share):
+            scene.set_lods(lods)
+    finally:
+        refine.active_update = original
+    return batches[0]
+
+
+def refit_launch(scene, batch):
+    """Return a launch of marking and refit alone, the LODs being those that the batch leads to; it may be repeated."""
+    models, states, _ = scene.arrays()
+
+    def launch():
+        for name in ("changed_count", "marked_count", "level_count"):
+            getattr(batch.plan, name).zero_()
+        refine.active_update(models.pool, states.pool, batch)
+
+    return launch
