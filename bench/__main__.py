@@ -1,4 +1,7 @@
-"""python -m bench NAME [--device D] [--json FILE] [...]: one of the cases below, its rows printed as they come."""
+"""python -m bench NAME [--device D] [--json FILE] [...]: one of the cases below, its rows printed as they come.
+
+python -m bench paper|tradeoff|all --out DIR [...]: a study, see `bench/study.py`.
+"""
 
 import argparse
 import datetime
@@ -12,10 +15,11 @@ import warp as wp
 
 import warp_abtree as ab
 
-from . import budget, cascade, exact, frame, memory, peers, plots, precision, query, scale, sweep, update
+from . import budget, build, cascade, exact, frame, memory, peers, plots, precision, query, scale, study, sweep, update
 
 CASES = {
     "budget": budget.run,
+    "build": build.run,
     "cascade": cascade.run,
     "exact": exact.run,
     "frame": frame.run,
@@ -27,20 +31,25 @@ CASES = {
     "sweep": sweep.run,
     "update": update.run,
 }
-FIGURES = {"scale": scale.FIGURES, "update": update.FIGURES}
+FIGURES = {"build": build.FIGURES, "scale": scale.FIGURES, "update": update.FIGURES}
+# Cases that take the folder of their figures themselves, and how each draws what it kept there.
+DRAWN = {"budget": budget.draw_saved}
 # What only some cases take, by the name of their argument.
 OPTIONS = ("count", "processes", "quick", "largest", "models")
 
 
 def main(argv=None):
+    argv = list(sys.argv[1:] if argv is None else argv)
+    if argv and argv[0] in (*study.STUDIES, "all"):
+        return study.main(argv)
     parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
     parser.add_argument("name", choices=sorted(CASES))
     parser.add_argument("--device", default=None)
     parser.add_argument("--json", metavar="FILE", help="write the rows to a file as well")
     parser.add_argument("--quick", action="store_true", default=None, help="the smallest sizes, to try a case out")
-    parser.add_argument("--largest", type=int, metavar="FACES", help="scale, update: leave larger meshes out")
-    parser.add_argument("--models", metavar="DIR", help="scale, update: keep the models there for the next run")
-    parser.add_argument("--plots", metavar="DIR", help="scale, update: draw SVG figures there (needs matplotlib)")
+    parser.add_argument("--largest", type=int, metavar="FACES", help="build, scale, update: leave larger meshes out")
+    parser.add_argument("--models", metavar="DIR", help="build, memory, scale, update: keep the models there")
+    parser.add_argument("--plots", metavar="DIR", help="budget, build, scale, update: draw figures there")
     parser.add_argument("--rows", metavar="FILE", help="with --plots: draw what --json wrote, in place of a run")
     parser.add_argument("--count", type=int, help="exact: random pairs; a tenth as many adversarial ones")
     parser.add_argument("--processes", type=int, help="exact: processes that run the oracle")
@@ -50,10 +59,15 @@ def main(argv=None):
     for name in asked:
         if name not in inspect.signature(run).parameters:
             parser.error(f"{options.name} takes no --{name}")
-    if options.plots and options.name not in FIGURES:
+    if options.plots and options.name not in (*FIGURES, *DRAWN):
         parser.error(f"{options.name} takes no --plots")
     if options.rows and (not options.plots or options.json):
         parser.error("--rows goes with --plots, without --json")
+    if options.name in DRAWN and options.rows:
+        print(DRAWN[options.name](options.rows))
+        return 0
+    if options.name in DRAWN and options.plots:
+        asked["plots"] = options.plots
     if options.rows:
         with open(options.rows) as file:
             rows = json.load(file)["rows"]
@@ -62,7 +76,7 @@ def main(argv=None):
     if options.json:
         with open(options.json, "w") as file:
             json.dump({**describe_run(), "rows": rows}, file, indent=1)
-    if options.plots:
+    if options.plots and options.name in FIGURES:
         print(plots.draw(rows, FIGURES[options.name], options.plots), flush=True)
     return 0
 

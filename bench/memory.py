@@ -6,7 +6,7 @@ import warp as wp
 
 import warp_abtree as ab
 
-from .shapes import knot, pair_poses
+from .shapes import knot_model, pair_poses
 
 FULL = {"faces": (200, 5000, 60000, 1_000_000), "knots": (1000, 2000, 4000), "balls": (3, 4), "objects": 10000}
 QUICK = {"faces": (200,), "knots": (200,), "balls": (1,), "objects": 32}
@@ -28,15 +28,15 @@ def held_mib(scene, query=None) -> float:
     return round(total / 2**20, 3)
 
 
-def scenes(device, sizes):
+def scenes(device, sizes, folder):
     """Yield (name, scene, faces of all models)."""
     for size in sizes["faces"]:
-        model = ab.Model.from_arrays(*knot(size))
+        model = knot_model(size, folder)
         scene = ab.Scene(device)
         scene.add(model)
         scene.add(model, (0.5, 0, 0, 0, 0, 0, 1))
         yield f"a knot of {model.face_count:,} faces, twice", scene, model.face_count
-    models = [ab.Model.from_arrays(*knot(size)) for size in sizes["knots"]]
+    models = [knot_model(size, folder) for size in sizes["knots"]]
     for subdivisions in sizes["balls"]:
         ball = trimesh.creation.icosphere(subdivisions)
         models.append(ab.Model.from_arrays(ball.vertices, ball.faces))
@@ -51,11 +51,11 @@ def scenes(device, sizes):
     )
 
 
-def run(device, quick=False):
+def run(device, quick=False, models=None):
     """Yield one row a scene: objects, states, and bytes: of the models and the states a face, an object, a pair."""
     device = wp.get_device(device)
-    for name, scene, faces in scenes(device, QUICK if quick else FULL):
-        models, states, objects = scene.arrays()
+    for name, scene, faces in scenes(device, QUICK if quick else FULL, models):
+        pools, states, objects = scene.arrays()
         pairs = np.stack([np.arange(scene.object_count - 1), np.arange(1, scene.object_count)], 1)
         query = ab.Query(scene, "any", pairs=pairs)
         a_pair = (query.pairs.capacity + query.pair_poses.capacity + count_bytes(query.hits)) / len(pairs)
@@ -65,11 +65,11 @@ def run(device, quick=False):
             "scene": name,
             "objects": scene.object_count,
             "states": len(states.slots),
-            "model_bytes_a_face": round(count_bytes(models.pool) / faces, 1),
+            "model_bytes_a_face": round(count_bytes(pools.pool) / faces, 1),
             "state_bytes_a_face": round(count_bytes(states.pool) / state_faces, 1),
             "object_bytes": round(count_bytes(objects.pool) / scene.object_count, 1),
             "pair_bytes": round(a_pair, 1),
             "all_mib": round(
-                (count_bytes(models.pool) + count_bytes(states.pool) + count_bytes(objects.pool)) / 2**20, 2
+                (count_bytes(pools.pool) + count_bytes(states.pool) + count_bytes(objects.pool)) / 2**20, 2
             ),
         }

@@ -43,6 +43,33 @@ def count_hits_kernel(
 
 
 @wp.kernel
+def find_any_kernel(
+    face_count: wp.int32,
+    bvh: wp.uint64,
+    vertices: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    poses: wp.array(dtype=wp.transform),
+    any_inout: wp.array(dtype=wp.int32),
+):
+    """As `count_hits_kernel`, but a pair that is known to meet is left alone."""
+    tid = wp.tid()
+    pair = tid // face_count
+    a = tid % face_count
+    if any_inout[pair] != 0:
+        return
+    relative = wp.transform_multiply(wp.transform_inverse(poses[2 * pair + 1]), poses[2 * pair])
+    p = wp.transform_point(relative, vertices[faces[a][0]])
+    q = wp.transform_point(relative, vertices[faces[a][1]])
+    r = wp.transform_point(relative, vertices[faces[a][2]])
+    query = wp.bvh_query_aabb(bvh, wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r)))
+    b = wp.int32(0)
+    while wp.bvh_query_next(query, b):
+        if wp.intersect_tri_tri(p, q, r, vertices[faces[b][0]], vertices[faces[b][1]], vertices[faces[b][2]]) != 0:
+            any_inout[pair] = 1
+            return
+
+
+@wp.kernel
 def box_face_kernel(
     vertices: wp.array(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
@@ -110,6 +137,27 @@ class BvhPeer:
             raise RuntimeError(f"the peer found {total} face pairs, with room for {len(self.hits)}")
         rows = self.hits.numpy()[:total].reshape(-1, 3)
         return rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))]
+
+
+class AnyPeer(BvhPeer):
+    """The same for yes or no."""
+
+    def __init__(self, vertices, faces, poses, device, constructor="sah"):
+        super().__init__(vertices, faces, poses, 0, device, constructor)
+        self.any = wp.zeros(self.pair_count, dtype=wp.int32, device=device)
+
+    def launch(self):
+        self.any.zero_()
+        wp.launch(
+            find_any_kernel,
+            dim=self.pair_count * self.face_count,
+            inputs=[self.face_count, self.bvh.id, self.vertices, self.faces, self.poses, self.any],
+            device=self.device,
+        )
+
+    def result(self) -> np.ndarray:
+        """Return whether each pair meets, bool (p,). Waits for the device."""
+        return self.any.numpy() != 0
 
 
 def find_constructor(vertices, faces, poses, device, repeats=5) -> str:

@@ -1,14 +1,16 @@
-"""One core against one core: ours beside python-fcl, trimesh and Coal, where installed, on batches of posed pairs.
+"""One core against one core: ours beside FCL in C++, python-fcl, trimesh and Coal, where installed, on posed pairs.
 
 A workload is one model against another at 200 poses, half of them in contact. Answers are compared before anything is
-timed. Ours is timed from the launch to the sorted result on the host. A peer is timed over a loop of its own calls,
-objects made before, until the library has its contacts; no face numbers are read from them.
+timed. Times are those that the thread ran. Ours is timed from the launch to the sorted result on the host. A peer is
+timed over a loop of its own calls, objects made before, until the library has its contacts; no face numbers are read
+from them. Then ours on all cores is timed in turn with ours on one, by the wall clock.
 """
 
 import contextlib
 import gc
 import importlib.util
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +18,9 @@ import warp as wp
 
 import warp_abtree as ab
 
+from .fcl_peer import FclCppPeer
 from .shapes import knot
-from .timing import time_in_turn
+from .timing import summarise, time_in_turn
 
 ORACLE = Path(__file__).resolve().parents[1] / "tests" / "oracle_triangle.py"
 REAL = {
@@ -156,7 +159,7 @@ class CoalPeer:
         return [(contact.b1, contact.b2) for contact in answer.getContacts()]
 
 
-PEERS = (FclPeer, TrimeshPeer, CoalPeer)
+PEERS = (FclCppPeer, FclPeer, TrimeshPeer, CoalPeer)
 
 
 # --- workloads -------------------------------------------------------------------------------------------------------
@@ -298,15 +301,20 @@ def run_to_host(query):
 
 
 def run(device, quick=False):
-    """Yield one row a workload and peer: differences, queries a second of both and ratios (ours over the peer)."""
+    """Yield one row a workload and peer, differences, queries a second of both and ratios (ours over the peer), and one
+    a workload of ours on one core and on all.
+    """
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
-    with one_core() as core:
-        for name, model_a, model_b in workloads(sizes["faces"]):
-            yield from run_workload(name, model_a, model_b, device, core, sizes["poses"], sizes["repeats"])
+    for name, model_a, model_b in workloads(sizes["faces"]):
+        with one_core() as core:
+            about, queries, matrices, meshes = make_workload(name, model_a, model_b, device, sizes["poses"])
+            yield from run_workload(about | {"core": core}, queries, matrices, meshes, sizes["repeats"])
+        yield about | time_cores(queries, sizes["repeats"])
 
 
-def run_workload(name, model_a, model_b, device, core, pose_count, repeats):
+def make_workload(name, model_a, model_b, device, pose_count):
+    """Return the columns that name a workload, its queries by output, matrices of B and both meshes."""
     a = model_a.mesh_at(model_a.lod_max)[:2]
     b = a if model_b is model_a else model_b.mesh_at(model_b.lod_max)[:2]
     scene = ab.Scene(device)
@@ -317,27 +325,32 @@ def run_workload(name, model_a, model_b, device, core, pose_count, repeats):
     matrices = half_in_contact(scene, pairs, a[0], b[0])
     scene.set_poses(np.concatenate([np.eye(4)[None], matrices]))
     queries = {output: ab.Query(scene, output, pairs=pairs) for output in ("any", "faces")}
+    about = {"device": device.name, "workload": name, "faces": f"{len(a[1])} x {len(b[1])}", "poses": pose_count}
+    return about, queries, matrices, (a, b)
+
+
+def run_workload(about, queries, matrices, meshes, repeats):
+    """Yield one row a peer."""
     found = {output: query.run() for output, query in queries.items()}
     if not np.array_equal(found["any"].any, found["faces"].count > 0):
         raise RuntimeError("outputs 'any' and 'faces' of ours differ")
-
-    about = {"device": device.name, "core": core, "workload": name, "faces": f"{len(a[1])} x {len(b[1])}"}
-    about |= {"poses": pose_count, "meet": int(found["any"].any.sum()), "hits": len(found["faces"].faces)}
+    about = about | {"meet": int(found["any"].any.sum()), "hits": len(found["faces"].faces)}
     peers, missing, differences = [], {}, {}
     for kind in PEERS:
         try:
-            peers.append(kind(a, b, matrices))
+            peers.append(kind(*meshes, matrices))
         except ImportError as error:
             missing[kind.name] = str(error)
     for peer in peers:
-        differences[peer.name] = compare(peer, found["any"].any, found["faces"].faces, a, b, matrices)
-    rates = {}
+        differences[peer.name] = compare(peer, found["any"].any, found["faces"].faces, *meshes, matrices)
+    times = {}
+    # Of one thread the time that it ran, whatever else the machine does; a GPU works while the thread waits.
+    clock = time.thread_time if queries["any"].device.is_cpu else time.perf_counter
     for output, query in queries.items():
         launches = {"ours": run_to_host(query)} | {peer.name: getattr(peer, output) for peer in peers}
-        with no_garbage_collection():  # the clock of the CPU on every device: results are read back
-            measured = time_in_turn(launches, wp.get_device("cpu"), repeats)
-        for who, times in measured.items():
-            rates[who, output] = 1e3 * pose_count / float(np.median(times))
+        with no_garbage_collection():  # on every device as on the CPU: results are read back
+            measured = time_in_turn(launches, wp.get_device("cpu"), repeats, clock)
+        times |= {(who, output): values for who, values in measured.items()}
         if not np.array_equal(query.result().any, found["any"].any):
             raise RuntimeError(f"the timed answer of {output!r} differs from the checked one")
     for kind in PEERS:
@@ -347,8 +360,37 @@ def run_workload(name, model_a, model_b, device, core, pose_count, repeats):
         else:
             row |= differences[kind.name]
         for output in queries:
-            row[f"ours_{output}_per_s"] = round(rates["ours", output])
+            ours = times["ours", output]
+            row |= {f"ours_{output}_per_s": rate(ours, len(matrices))} | summarise(f"ours_{output}", ours)
             if kind.name not in missing:
-                row[f"peer_{output}_per_s"] = round(rates[kind.name, output])
-                row[f"{output}_ratio"] = round(rates["ours", output] / rates[kind.name, output], 2)
+                theirs = times[kind.name, output]
+                row |= {f"peer_{output}_per_s": rate(theirs, len(matrices))} | summarise(f"peer_{output}", theirs)
+                row[f"{output}_ratio"] = round(float(np.median(theirs) / np.median(ours)), 2)
         yield row
+
+
+def rate(times, count):
+    """Return queries a second of a batch whose times [ms] are given."""
+    return round(1e3 * count / float(np.median(times)))
+
+
+def time_cores(queries, repeats):
+    """Return columns of ours on all cores of this process and how many times faster than on one that is."""
+    row = {"cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()}
+    for output, query in queries.items():
+
+        def run_on(cores, query=query):
+            def run():
+                query.cores = cores
+                query.launch()
+                return query.result()
+
+            return run
+
+        launches = {"all": run_on(None), "one": run_on(1)}
+        with no_garbage_collection():
+            times = time_in_turn(launches, wp.get_device("cpu"), repeats)
+        query.cores = None
+        row |= summarise(f"all_{output}", times["all"]) | summarise(f"one_{output}", times["one"])
+        row[f"{output}_ratio"] = round(float(np.median(times["one"]) / np.median(times["all"])), 2)
+    return row

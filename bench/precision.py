@@ -9,7 +9,7 @@ import warp as wp
 import warp_abtree as ab
 
 from .shapes import knot, pair_poses
-from .timing import time_in_turn
+from .timing import summarise, time_in_turn
 
 PRECISIONS = ("exact", "float64", "float32")
 FULL = {"faces": 5000, "subdivisions": 4, "pairs": 256, "laid": 16, "repeats": 11}
@@ -40,7 +40,7 @@ def count_differences(faces, truth):
 
 def run(device, quick=False):
     """Yield one row a scene: hits, share of face pairs that reach float64 and expansions, and for each precision pairs
-    missed, pairs invented and the median time of a launch [ms], and what exact costs beside float32."""
+    missed, pairs invented and the time of a launch [ms], and what exact costs beside float32."""
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
     for name, model, poses in scenes(sizes):
@@ -63,6 +63,6 @@ def run(device, quick=False):
             missed, invented = count_differences(found[precision].faces, exact.faces)
             if precision != "exact":
                 row[f"{precision}_missed"], row[f"{precision}_invented"] = missed, invented
-            row[f"{precision}_ms"] = round(float(np.median(times[precision])), 4)
+            row |= summarise(precision, times[precision])
         row["exact_to_float32"] = round(float(np.median(times["exact"]) / np.median(times["float32"])), 2)
         yield row

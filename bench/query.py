@@ -11,6 +11,7 @@ import warp_abtree as ab
 from . import newton_peer
 from .memory import held_mib
 from .peer import BvhPeer, count_differences, find_constructor
+from .peers import load_oracle
 from .roofline import find_peaks, roofline, used_memory
 from .shapes import knot, pair_poses
 from .timing import summarise, time_in_turn, time_rounds, time_wall
@@ -21,6 +22,7 @@ QUICK = {"faces": 300, "pairs": (1, 4), "distances": (0.2,), "repeats": 3}
 PAIRS_MAX_CLOSE = 1024
 FAR = 0.9
 NEWTON_PAIRS_MAX = {"cuda": 1024, "cpu": 64}
+JUDGED = 300  # face pairs that the oracle is asked about
 
 
 def run(device, quick=False):
@@ -28,8 +30,10 @@ def run(device, quick=False):
 
     first_s is the first run: it compiles or loads kernels and grows buffers. ours and peer are launches, whose face
     pairs lie on the device in no order; result and peer_result what it takes to bring them to the host and sort them
-    there; sorted and peer_sorted both together. ratio is the peer's launch over ours. Errors are counted against the
-    exact answer. Memory is that of scene and query, before there are peers.
+    there; sorted and peer_sorted both together. ratio is the peer's launch over ours; on the CPU ours has
+    all cores, and one_core and one_core_ratio are of both on one. Errors are counted against the exact answer; judged
+    says of how many face pairs on which the peer differs the exact oracle of the tests was asked, ours_wrong in how
+    many it sides with the peer. Memory is that of scene and query, before there are peers.
     """
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
@@ -77,6 +81,7 @@ def run_case(device, model, vertices, faces, poses, distance, constructor, peaks
     found = peer.result()
     row["peer_hits"] = len(found)
     row["peer_missed"], row["peer_invented"] = count_differences(found, whole.faces)
+    row |= judge(found, whole.faces, model, poses)
     for name, other in newton.items():
         row |= {f"{name}_{key}": value for key, value in other.compare(whole.any).items()}
     for name, values in times.items():
@@ -84,12 +89,47 @@ def run_case(device, model, vertices, faces, poses, distance, constructor, peaks
         if name != "ours":
             ratio = "ratio" if name == "peer" else f"{name}_ratio"
             row[ratio] = round(float(np.median(values) / np.median(times["ours"])), 2)
+    if device.is_cpu:
+        row |= time_one_core(query, peer, device, repeats)
     row |= {f"{name}_skipped": why for name, why in skipped.items()}
     row |= time_results(query, peer, device, min(repeats, 3))
     row["sorted_ms"] = round(row["ours_ms"] + row["result_ms"], 4)
     row["peer_sorted_ms"] = round(row["peer_ms"] + row["peer_result_ms"], 4)
     row["sorted_ratio"] = round(row["peer_sorted_ms"] / row["sorted_ms"], 2)
     return row | memory | roofline(again, row["ours_ms"], peaks)
+
+
+def time_one_core(query, peer, device, repeats):
+    """Return columns of launches of both on one core: the time [ms] that the thread ran, and the peer's over ours."""
+    query.cores = 1
+    launches = {"one_core": query.launch, "peer_one_core": peer.launch}
+    times = time_in_turn(launches, device, repeats, time.thread_time)
+    query.cores = None
+    ratio = round(float(np.median(times["peer_one_core"]) / np.median(times["one_core"])), 2)
+    return summarise("one_core", times["one_core"]) | {"one_core_ratio": ratio}
+
+
+def judge(found, ours, model, poses):
+    """Return columns: how many face pairs on which the peer differs the exact oracle judged, in how many ours is wrong.
+
+    Raises:
+        RuntimeError: One is.
+    """
+    oracle = load_oracle()
+    if oracle is None:
+        return {"judged": 0, "ours_wrong": None}
+    theirs, mine = (set(map(tuple, rows.tolist())) for rows in (found, ours))
+    disputed = sorted(mine ^ theirs)
+    disputed = disputed[:: max(1, len(disputed) // JUDGED)]
+    vertices, faces, _ = model.mesh_at(model.lod_max)
+    wrong = 0
+    for pair, a, b in disputed:
+        points = oracle.into_frame_of_a(vertices[faces[b]], poses[2 * pair], poses[2 * pair + 1])
+        meets = oracle.triangles_intersect(vertices[faces[a]], points)
+        wrong += bool(meets) != ((pair, a, b) in mine)
+    if wrong:
+        raise RuntimeError(f"{wrong} of {len(disputed)} face pairs on which the peer differs are errors of ours")
+    return {"judged": len(disputed), "ours_wrong": wrong}
 
 
 def refuse_newton(device, pair_count) -> str | None:

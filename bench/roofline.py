@@ -19,6 +19,10 @@ whether a cache has them or not; stacks in shared memory or registers are left o
 * exact test: the same again, and at least one sign in double words (kernels/double_word.py): 54 for differences, 120
   for minors, 30 and 40 for the rest.
 * an object pair: a relative pose of 200 bytes, written and read; a hit: 12 bytes.
+* update (kernels/refine.py, mark.py, refit.py): an entry of a slice reads its face and that face's leaf, 8 bytes, and
+  writes the face's corners, 16. A node is appended to a worklist and read from there, 16 bytes, its face number is read
+  and its status written, 8, and its record written, 32. A leaf reads its corners and three vertices of 24 bytes, 88, an
+  inner node the records of its children, 64. Walks up the forest and atomics are left out.
 """
 
 import time
@@ -31,6 +35,7 @@ TRIANGLE_BYTES, TRIANGLE_FLOPS, HIT_FLOPS = 2 * 16 + 6 * 16, 18 + 54 + 68, 68 + 
 FLOAT64_BYTES, FLOAT64_FLOPS = 2 * 16 + 6 * 24, 63 + 18 + 3 * 16
 EXACT_BYTES, EXACT_FLOPS = FLOAT64_BYTES, FLOAT64_FLOPS + 54 + 120 + 30 + 40
 PAIR_BYTES, HIT_BYTES = 2 * 200, 12
+ENTRY_BYTES, REFIT_BYTES, LEAF_BYTES, INNER_BYTES = 8 + 16, 16 + 8 + 32, 16 + 3 * 24, 2 * 32
 
 # Published peaks: memory [bytes/s], float32 and float64 without tensor cores [operations/s], by a part of the name.
 PEAKS = {
@@ -103,6 +108,23 @@ def roofline(result, milliseconds, peaks) -> dict:
         for name, floor in zip(("memory", "float32", "float64"), floors, strict=True):
             row[f"{name}_share"] = float(f"{floor / seconds:.3g}")
         row["floor_ms"] = float(f"{1e3 * max(floors):.4g}")
+    return row
+
+
+def update_roofline(changed, refitted, entries, milliseconds, peaks) -> dict:
+    """Return columns of an update: nodes refitted a second, bytes, their rate and their share of the peak.
+
+    Args:
+        changed: k, the leaves among the nodes refitted.
+        entries: Faces in the slices between the LODs, repeats included.
+    """
+    seconds = 1e-3 * milliseconds
+    size = ENTRY_BYTES * entries + REFIT_BYTES * refitted + LEAF_BYTES * changed + INNER_BYTES * (refitted - changed)
+    row = {"nodes_per_s": float(f"{refitted / seconds:.4g}"), "bytes": size}
+    row["gb_per_s"] = float(f"{1e-9 * size / seconds:.4g}")
+    if peaks is not None:
+        row["memory_share"] = float(f"{size / peaks[0] / seconds:.3g}")
+        row["floor_ms"] = float(f"{1e3 * size / peaks[0]:.4g}")
     return row
 
 

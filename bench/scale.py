@@ -10,7 +10,8 @@ import warp_abtree as ab
 
 from .memory import held_mib
 from .peer import BvhPeer
-from .roofline import used_memory
+from .plots import upper_half
+from .roofline import find_peaks, roofline, used_memory
 from .shapes import knot, knot_model, pair_poses
 from .timing import fit_slope, summarise, time_in_turn
 
@@ -23,7 +24,7 @@ SIZES = {
     },
     "cpu": {
         "pairs": {"faces": 500, "counts": (1, 10, 100, 1000, 10_000)},
-        "faces": {"sizes": (200, 1000, 5000, 20_000, 60_000), "pairs": (1, 64)},
+        "faces": {"sizes": (200, 1000, 5000, 20_000, 60_000, 250_000, 1_000_000), "pairs": (1, 64)},
         "worlds": {"faces": 500, "objects": 4, "counts": (1, 4, 16, 64, 256, 1024)},
         "repeats": 5,
     },
@@ -34,29 +35,37 @@ QUICK = {
     "worlds": {"faces": 200, "objects": 4, "counts": (1, 8)},
     "repeats": 2,
 }
+LARGEST_CPU = 60_000  # unless more is asked for
 DISTANCE = 0.9
 # Pairs and worlds asked again by themselves, where other numbers of warps work on each.
 CHECKED = 3
 
-FIGURES = tuple(
+PANELS = (
+    {"where": {"sweep": "pairs"}, "x": "pairs", "xlabel": "object pairs", "by": None},
+    {"where": {"sweep": "faces"}, "x": "faces", "xlabel": "faces a mesh", "by": ("pairs", "pairs")},
+    {"where": {"sweep": "worlds"}, "x": "worlds", "xlabel": "worlds of four objects", "by": None},
+)
+TIMES = (
+    {"ours_ms": "ours", "peer_ms": "wp.Bvh peer"},
+    {"ours_ms": "ours", "peer_ms": "wp.Bvh peer"},
+    {"ours_ms": "broad and narrow phase", "broad_ms": "broad phase alone"},
+)
+MEMORY = {"arrays_mib": "arrays"}
+FIGURES = (
     {
-        "file": f"scale_{sweep}_{what}.svg",
-        "title": f"{what} by {label}",
-        "where": {"sweep": sweep},
-        "x": x,
-        "y": y,
-        "ylabel": unit,
-        "by": "pairs" if sweep == "faces" else None,
-    }
-    for sweep, x, label in (
-        ("pairs", "pairs", "object pairs"),
-        ("faces", "faces", "faces"),
-        ("worlds", "worlds", "worlds"),
-    )
-    for what, y, unit in (
-        ("time", ("ours_ms", "broad_ms") if sweep == "worlds" else ("ours_ms", "peer_ms"), "ms"),
-        ("memory", ("arrays_mib", "taken_mib"), "MiB"),
-    )
+        "file": "scale_time.svg",
+        "panels": tuple(
+            panel | {"title": f"time, by {panel['x']}", "y": y, "ylabel": "time of a launch [ms]"}
+            for panel, y in zip(PANELS, TIMES, strict=True)
+        ),
+    },
+    {
+        "file": "scale_memory.svg",
+        "panels": tuple(
+            panel | {"title": f"memory, by {panel['x']}", "y": MEMORY, "ylabel": "memory of all arrays [MiB]"}
+            for panel in PANELS
+        ),
+    },
 )
 
 
@@ -65,31 +74,32 @@ def run(device, quick=False, largest=None, models=None):
 
     Each launch lists all face pairs; build_s is the time to make scene and query, first_s that of the first run, which
     compiles and grows buffers. Memory is that of scene and query, before there is a peer. broad is the broad phase of
-    worlds alone.
+    worlds alone; its work is not counted in the roofline, its time is.
     """
     device = wp.get_device(device)
+    peaks = find_peaks(device)
     sizes = QUICK if quick else SIZES["cuda" if device.is_cuda else "cpu"]
     repeats = sizes["repeats"]
     rows = []
     model = knot_model(sizes["pairs"]["faces"], models)
     for count in sizes["pairs"]["counts"]:
-        rows.append(run_pairs("pairs", device, model, sizes["pairs"]["faces"], count, repeats))
+        rows.append(run_pairs("pairs", device, model, sizes["pairs"]["faces"], count, repeats, peaks))
         yield rows[-1]
     yield describe_slope("pairs", "pairs", rows)
     rows = []
     for face_target in sizes["faces"]["sizes"]:
-        if face_target > (largest or face_target):
+        if face_target > (largest or (LARGEST_CPU if device.is_cpu else face_target)):
             continue
         model = knot_model(face_target, models)
         for count in sizes["faces"]["pairs"]:
-            rows.append(run_pairs("faces", device, model, face_target, count, repeats))
+            rows.append(run_pairs("faces", device, model, face_target, count, repeats, peaks))
             yield rows[-1]
     for count in sizes["faces"]["pairs"]:
         yield describe_slope("faces", "faces", [row for row in rows if row["pairs"] == count]) | {"pairs": count}
     rows = []
     model = knot_model(sizes["worlds"]["faces"], models)
     for count in sizes["worlds"]["counts"]:
-        rows.append(run_worlds(device, model, count, sizes["worlds"]["objects"], repeats))
+        rows.append(run_worlds(device, model, count, sizes["worlds"]["objects"], repeats, peaks))
         yield rows[-1]
     yield describe_slope("worlds", "worlds", rows)
 
@@ -97,15 +107,15 @@ def run(device, quick=False, largest=None, models=None):
 def describe_slope(sweep, x, rows) -> dict:
     """Return the row of a sweep's slopes."""
     row = {"sweep": f"{sweep}: slope", "sizes": len(rows)}
-    half = rows[len(rows) // 2 - 1 :] if len(rows) > 2 else rows
-    for name in ("ours_ms", "peer_ms", "broad_ms", "arrays_mib", "taken_mib"):
+    half = upper_half(rows)
+    for name in ("ours_ms", "peer_ms", "broad_ms", "arrays_mib", "pool_mib"):
         if rows and name in rows[0]:
             for label, some in ((f"{name}_slope", rows), (f"{name}_slope_upper", half)):
                 row[label] = fit_slope([r[x] for r in some], [r[name] for r in some])
     return row
 
 
-def run_pairs(sweep, device, model, face_target, pair_count, repeats):
+def run_pairs(sweep, device, model, face_target, pair_count, repeats, peaks):
     """Return the row of one batch of pairs of a model, beside the wp.Bvh peer."""
     gc.collect()  # scenes and their queries hold each other
     poses = pair_poses(pair_count, DISTANCE)
@@ -129,7 +139,7 @@ def run_pairs(sweep, device, model, face_target, pair_count, repeats):
     row |= time_query(query, {"peer": peer.launch}, result, device, repeats)
     row["us_a_pair"] = round(1e3 * row["ours_ms"] / pair_count, 3)
     row["ratio"] = round(row["peer_ms"] / row["ours_ms"], 2)
-    return row | memory
+    return row | memory | roofline(result, row["ours_ms"], peaks)
 
 
 def time_query(query, others, result, device, repeats):
@@ -167,7 +177,7 @@ def world_poses(world_count, object_count, size, seed=0):
     return np.concatenate([x, q / np.linalg.norm(q, axis=-1, keepdims=True)], -1)
 
 
-def run_worlds(device, model, world_count, object_count, repeats):
+def run_worlds(device, model, world_count, object_count, repeats, peaks):
     """Return the row of many worlds of a few objects each: broad phase and narrow phase in one launch."""
     gc.collect()
     poses = world_poses(world_count, object_count, np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())
@@ -187,7 +197,7 @@ def run_worlds(device, model, world_count, object_count, repeats):
     row |= {"build_s": round(built - begin, 3), "first_s": round(first, 3)}
     row |= time_query(query, {"broad": query.broad_phase.launch}, result, device, repeats)
     row["us_a_world"] = round(1e3 * row["ours_ms"] / world_count, 3)
-    return row | memory
+    return row | memory | roofline(result, row["ours_ms"], peaks)
 
 
 def check_worlds(scene, model, poses, result):

@@ -15,7 +15,9 @@ import warp as wp
 
 import warp_abtree as ab
 
+from .memory import held_mib
 from .peer import BvhPeer
+from .roofline import find_peaks, update_roofline, used_memory
 from .shapes import knot_model
 from .timing import WARM_UP, fit_slope, make_runs, summarise, time_both, time_in_turn
 
@@ -41,21 +43,26 @@ REGIMES = {"update": math.inf, "full": -1.0}  # values of FULL_SHARE
 FIGURES = (
     {
         "file": "update_time.svg",
-        "title": "ACTIVE-UPDATE",
-        "where": {"case": "one state"},
-        "x": "k",
-        "y": ("update_ms", "full_ms"),
-        "ylabel": "ms",
-        "by": "faces",
-    },
-    {
-        "file": "update_states.svg",
-        "title": "many states in one update",
-        "where": {"case": "many states"},
-        "x": "states",
-        "y": ("update_ms", "full_ms", "wall_ms"),
-        "ylabel": "ms",
-        "by": None,
+        "panels": (
+            {
+                "title": "ACTIVE-UPDATE of one state",
+                "where": {"case": "one state"},
+                "x": "k",
+                "xlabel": "k, faces that change",
+                "y": {"update_ms": "update", "full_ms": "full refit"},
+                "ylabel": "time of an update [ms]",
+                "by": ("faces", "faces"),
+            },
+            {
+                "title": "many states of a small mesh",
+                "where": {"case": "many states"},
+                "x": "states",
+                "xlabel": "states in one update",
+                "y": {"update_ms": "update", "full_ms": "full refit", "wall_ms": "set_lods, as called"},
+                "ylabel": "time of an update [ms]",
+                "by": None,
+            },
+        ),
     },
 )
 
@@ -208,6 +215,8 @@ def find_crossover(rows, column):
 def run(device, quick=False, largest=None, models=None):
     """Yield one row a share of a mesh, one a mesh with its crossover, and one a number of states moved at once.
 
+    Nodes and bytes are those of the partial update, counted; memory is that of the scene, before there is a peer.
+
     entries are the faces of the slice between the LODs, repeats included, which is what `FULL_SHARE` is compared with;
     full tells whether the library would refit the whole tree. bvh_build boxes the faces at the LOD and builds a wp.Bvh
     over them; host_build is ACTIVE-BUILD over the finest mesh. crossover_* are where the update costs as much as a full
@@ -215,19 +224,22 @@ def run(device, quick=False, largest=None, models=None):
     """
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
+    peaks = find_peaks(device)
     limit = largest or (LARGEST_CPU if device.is_cpu else max(sizes["faces"]))
     for face_target in sizes["faces"]:
         if face_target <= limit:
-            yield from run_mesh(device, knot_model(face_target, models), sizes)
+            yield from run_mesh(device, knot_model(face_target, models), sizes, peaks)
     for count in sizes["states"]:
-        yield run_states(device, knot_model(sizes["state_faces"], models), count, sizes["repeats"])
+        yield run_states(device, knot_model(sizes["state_faces"], models), count, sizes["repeats"], peaks)
 
 
-def run_mesh(device, model, sizes):
+def run_mesh(device, model, sizes, peaks):
     """Yield the rows of one mesh."""
     scene = ab.Scene(device=device)
     scene.add(model)
     finest, rows = model.lod_max, []
+    scene.arrays()
+    memory = {"arrays_mib": held_mib(scene)} | used_memory(device)
     steps = sorted({max(1, round(share * model.lod_max)) for share in sizes["shares"]})
     for step in steps:
         k, nodes, entries, launches = check_update(scene, [finest - step], [finest], model.face_count)
@@ -240,6 +252,7 @@ def run_mesh(device, model, sizes):
         row |= time_update(scene, [finest - step], [finest], launches, device, sizes["repeats"])
         # Not in turn with the others, whose tree it would drive out of the caches.
         row |= summarise("bvh_build", time_in_turn({"build": peer.rebuild}, device, sizes["repeats"])["build"])
+        row |= memory | update_roofline(row["k"], row["nodes_refitted"], entries, row["update_ms"], peaks)
         rows.append(row)
         yield row
     yield {
@@ -266,7 +279,7 @@ def time_host_build(model, repeats=3):
     return round(float(np.median(times)), 2)
 
 
-def run_states(device, model, count, repeats):
+def run_states(device, model, count, repeats, peaks):
     """Return the row of many states of a model, each at a LOD of its own, moved by a few splits in one call."""
     step = model.lod_max // STATES_PER_MODEL
     scene = ab.Scene(device=device)
@@ -285,4 +298,5 @@ def run_states(device, model, count, repeats):
     row["bound"] = int(sum(bound_nodes(int(x), model.face_count) for x in k))
     row |= time_update(scene, there, back, launches, device, repeats)
     row["us_a_state"] = round(1e3 * row["update_ms"] / count, 3)
-    return row
+    row |= {"arrays_mib": held_mib(scene)} | used_memory(device)
+    return row | update_roofline(row["k"], row["nodes_refitted"], entries, row["update_ms"], peaks)

@@ -26,6 +26,9 @@ SLOTS = wp.constant(32)  # faces that a triangle is registered with at most
 # Coordinates are within 1/2 and rounded at 2^-53: without this floor flat regions would be cut for nothing.
 FLOOR = wp.constant(wp.float64(2.0**-46))
 MARGIN = wp.constant(wp.float64(0.05))  # of the bound: how far a piece may reach over the edge of a prism
+# A box farther away than another face, by more than rounding can hide, spares the distance to the face in it.
+BOX_SLACK = wp.constant(wp.float64(1.001))
+BOX_MIN = wp.constant(wp.float64(2.0**-70))
 SLACK_SQ = wp.constant(wp.float64(1.1))  # a piece so near to the best that any candidates can do is not cut further
 
 
@@ -36,7 +39,7 @@ class Replay:
     pos: wp.array(dtype=wp.vec3d)  # [node_count], normalised
     triangle_pos: wp.array2d(dtype=wp.vec3d)  # [face_count, 3], original triangles
     face_pos: wp.array2d(dtype=wp.vec3d)  # [face_count, 3], active faces where they are now
-    face_ball: wp.array(dtype=wp.vec4d)  # [face_count], centre and radius of a ball about each
+    face_box: wp.array2d(dtype=wp.vec3d)  # [face_count, 2], lower and upper corner of the box of each
     bvh: wp.uint64  # wp.Bvh over the boxes of the faces in bvh_face; 0 until a piece vanishes
     bvh_face: wp.array(dtype=int)  # [any]
     slot_face: wp.array(dtype=int)  # [slot_count], face that the slot's triangle is registered with
@@ -58,13 +61,36 @@ def active_distance_sq(replay: Replay, f: int, p: wp.vec3d):
 
 
 @wp.func
+def outside(p: wp.float64, lower: wp.float64, upper: wp.float64):
+    """Return how far a coordinate lies outside an interval."""
+    below = lower - p
+    above = p - upper
+    most = wp.where(below > above, below, above)
+    return wp.where(most > wp.float64(0.0), most, wp.float64(0.0))
+
+
+@wp.func
+def box_distance_sq(replay: Replay, f: int, p: wp.vec3d):
+    """Return the squared distance to the box of face f."""
+    lower = replay.face_box[f, 0]
+    upper = replay.face_box[f, 1]
+    x = outside(p[0], lower[0], upper[0])
+    y = outside(p[1], lower[1], upper[1])
+    z = outside(p[2], lower[2], upper[2])
+    return x * x + y * y + z * z
+
+
+@wp.func
 def piece_distance_sq(replay: Replay, scratch: Scratch, count: int, f: int, enough: wp.float64):
     """Return the largest corner distance of the piece in hand to face f, or anything above `enough` once it is."""
-    ball = replay.face_ball[f]
-    reach = wp.length(scratch.piece[0] - wp.vec3d(ball[0], ball[1], ball[2])) - ball[3]
     worst = wp.float64(0.0)
-    if reach > wp.float64(0.0) and reach * reach > wp.float64(1.001) * enough:
-        return reach * reach
+    i = int(0)
+    beyond = wp.max(BOX_SLACK * enough, BOX_MIN)
+    while i < count:
+        least = box_distance_sq(replay, f, scratch.piece[i])
+        if least > beyond:
+            return least
+        i += 1
     i = int(0)
     while i < count and worst <= enough:
         worst = wp.max(worst, active_distance_sq(replay, f, scratch.piece[i]))
@@ -74,7 +100,10 @@ def piece_distance_sq(replay: Replay, scratch: Scratch, count: int, f: int, enou
 
 @wp.func
 def nearest_face(replay: Replay, scratch: Scratch, count: int, near_count: int, limit: wp.float64):
-    """Return the candidate that bounds the piece in hand best, or the first that does within `limit`; -1 if none."""
+    """Return the candidate that bounds the piece in hand best, or the first that does within `limit`, and its bound.
+
+    -1 and infinity if there is none.
+    """
     best = int(-1)
     best_bound = wp.float64(wp.inf)
     i = int(0)
@@ -84,7 +113,7 @@ def nearest_face(replay: Replay, scratch: Scratch, count: int, near_count: int, 
             best = scratch.near[i]
             best_bound = bound
         i += 1
-    return best
+    return best, best_bound
 
 
 @wp.func
@@ -92,10 +121,11 @@ def point_nearest_face(replay: Replay, scratch: Scratch, near_count: int, p: wp.
     best = int(-1)
     best_distance = wp.float64(wp.inf)
     for i in range(near_count):
-        distance = active_distance_sq(replay, scratch.near[i], p)
-        if distance < best_distance:
-            best = scratch.near[i]
-            best_distance = distance
+        if box_distance_sq(replay, scratch.near[i], p) <= wp.max(BOX_SLACK * best_distance, BOX_MIN):
+            distance = active_distance_sq(replay, scratch.near[i], p)
+            if distance < best_distance:
+                best = scratch.near[i]
+                best_distance = distance
     return best
 
 
@@ -242,18 +272,20 @@ def cover_triangle(
     while top > 0:
         top -= 1
         count = load_piece(scratch, top)
-        best = nearest_face(replay, scratch, count, near_count, limit)
-        bound = piece_distance_sq(replay, scratch, count, best, wp.float64(wp.inf))
+        best, bound = nearest_face(replay, scratch, count, near_count, limit)
         final = bound <= limit
         if not final:
+            before = near_count
             least, near_count = approach_piece(replay, scratch, rings, count, near_count, shared, own, limit)
-            best = nearest_face(replay, scratch, count, near_count, limit)
-            bound = piece_distance_sq(replay, scratch, count, best, wp.float64(wp.inf))
+            if near_count > before:
+                best, bound = nearest_face(replay, scratch, count, near_count, limit)
             final = bound <= wp.max(SLACK_SQ * least, limit) or cuts >= CUTS
             final = final or top + 4 >= STACK or count + 4 > CORNERS
         if final:
             used = use_face(replay, scratch, count, used, room, best)
-            limit = wp.max(limit, piece_distance_sq(replay, scratch, count, scratch.used[used - 1], wp.float64(wp.inf)))
+            if scratch.used[used - 1] != best:
+                bound = piece_distance_sq(replay, scratch, count, scratch.used[used - 1], wp.float64(wp.inf))
+            limit = wp.max(limit, bound)
         else:
             cuts += 1
             middle = wp.vec3d()

@@ -42,9 +42,8 @@ def set_face(replay: Replay, corner_node: wp.array(dtype=int), f: int):
     replay.face_pos[f, 0] = a
     replay.face_pos[f, 1] = b
     replay.face_pos[f, 2] = c
-    centre = (a + b + c) / wp.float64(3.0)
-    radius = wp.sqrt(wp.max(wp.length_sq(a - centre), wp.max(wp.length_sq(b - centre), wp.length_sq(c - centre))))
-    replay.face_ball[f] = wp.vec4d(centre[0], centre[1], centre[2], radius)
+    replay.face_box[f, 0] = wp.min(a, wp.min(b, c))
+    replay.face_box[f, 1] = wp.max(a, wp.max(b, c))
 
 
 @wp.func

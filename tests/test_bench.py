@@ -11,7 +11,7 @@ import warp as wp
 
 import warp_abtree as ab
 from bench import __main__ as main
-from bench import newton_peer, peer, plots, roofline, scale, timing, update
+from bench import build, fcl_peer, newton_peer, peer, peers, plots, query, roofline, scale, sweep, timing, update
 from bench.shapes import knot, knot_model, pair_poses
 
 
@@ -47,7 +47,7 @@ def test_query(device):
     assert [row["pairs"] for row in rows] == [1, 4]
     for row in rows:
         assert row["triangle_tests"] >= row["hits"] > 0 and row["node_tests"] > row["triangle_tests"]
-        assert row["peer_hits"] - row["peer_invented"] + row["peer_missed"] == row["hits"]
+        assert row["peer_hits"] - row["peer_invented"] + row["peer_missed"] == row["hits"] and row["ours_wrong"] == 0
         assert row["ratio"] == pytest.approx(row["peer_ms"] / row["ours_ms"], rel=0.2, abs=0.02)
         assert row["bytes"] >= 32 * row["node_tests"] + 120 * row["triangle_tests"] + 12 * row["hits"]
         assert row["node_tests_per_s"] == pytest.approx(1e3 * row["node_tests"] / row["ours_ms"], rel=0.01)
@@ -69,7 +69,8 @@ def test_update(device):
     for row in shares:
         assert row["k"] <= row["nodes_refitted"] <= row["bound"] and row["entries"] >= row["k"]
         assert row["full"] == (row["entries"] > update.refine.full_share(wp.get_device(device)) * row["faces"])
-        assert row["bvh_build_ms"] > 0 and row["wall_ms"] > 0
+        assert row["bvh_build_ms"] > 0 and row["wall_ms"] > 0 and row["arrays_mib"] > 0
+        assert row["nodes_per_s"] == pytest.approx(1e3 * row["nodes_refitted"] / row["update_ms"], rel=0.01)
     many = cases_of(rows, "case", "many states")
     assert [row["states"] for row in many] == [1, 12]
     assert many[1]["k"] > many[0]["k"] and many[1]["nodes_refitted"] > 10 * many[0]["nodes_refitted"]
@@ -94,6 +95,8 @@ def test_scale(device, tmp_path):
     worlds = cases_of(rows, "sweep", "worlds")
     assert [(row["worlds"], row["objects"]) for row in worlds] == [(1, 4), (8, 32)]
     assert all(row["pairs"] <= 6 * row["worlds"] for row in worlds) and worlds[1]["hits"] > worlds[0]["hits"]
+    for row in [*pairs, *meshes, *worlds]:
+        assert row["bytes"] >= 32 * row["node_tests_per_s"] * 1e-3 * row["ours_ms"] * 0.99 > 0
     slopes = [row for row in rows if row["sweep"].endswith("slope")]
     assert len(slopes) == 4 and all(row["ours_ms_slope"] is not None for row in slopes)
     assert all(0 < row["arrays_mib_slope"] <= 1.05 for row in slopes), "memory grows, and no faster than what is asked"
@@ -107,16 +110,32 @@ def test_other_cases(device, name, no_real_meshes):
     if name == "precision":
         assert all(row["hits"] > 0 for row in rows[-2:])
     if name == "sweep":
-        assert 0 < rows[0]["meet"] < 1
+        assert [(row["case"], row["poses"]) for row in rows] == [("launch", 16), ("sweep", 16), ("sweep", 40)]
+        assert all(0 < row["meet"] < 1 for row in rows)
+        assert rows[0]["peer_missed"] == rows[0]["peer_invented"] == 0 and rows[0]["node_tests_per_s"] > 0
 
 
 def test_peers(device, no_real_meshes):
     pytest.importorskip("fcl")
-    rows = run_case("peers", device, quick=True)
+    *rows, cores = run_case("peers", device, quick=True)
     ran = [row for row in rows if "skipped" not in row]
-    assert {row["peer"] for row in rows} == {"python-fcl", "trimesh", "coal"} and ran
+    assert {row["peer"] for row in rows} == {"fcl-c++", "python-fcl", "trimesh", "coal"} and ran
+    assert cores["cores"] >= 1 and cores["faces_ratio"] > 0
     for row in ran:
         assert row["meet"] == 3 and row["faces_missed"] == row["faces_invented"] == row["ours_wrong"] == 0
+
+
+def test_build(device, tmp_path):
+    *rows, slopes = run_case("build", device, quick=True, models=tmp_path)
+    assert [row["faces"] for row in rows] == [168, 576]
+    for row in rows:
+        assert row["tightness"] >= 1 and row["lod_max"] > row["faces"] / 3
+        stages = sum(row[f"{name}_ms"] for name in ("collapse", "error", "tree"))
+        assert stages == pytest.approx(row["build_ms"], rel=0.5)
+        assert (build.PEER + "_ms" in row) != (build.PEER + "_skipped" in row), "the peer runs or is named as skipped"
+        assert ab.Model.open(tmp_path / f"knot-{200 if row['faces'] == 168 else 600}.npz").face_count == row["faces"]
+        assert 60 < row["model_bytes_a_face"] < 150 and row["file_mib"] > 0 and row["peak_mib"] is None
+    assert slopes["build_ms_slope"] is not None
 
 
 def test_exact(device):
@@ -203,13 +222,48 @@ def test_an_update_that_forgets_nodes_is_noticed(device, monkeypatch):
     whole = update.refine.active_update
 
     def forget(models, states, work):
-        if not work.full.all():  # a partial update refits but its leaves
-            work.level_room = [0] * (len(work.level_room) - 2) + work.level_room[-2:]
-        whole(models, states, work)
+        if work.full.all():
+            return whole(models, states, work)
+        update.tree.active_mark(models, states, work)
+        counts = work.plan.level_count.numpy().copy()
+        counts[: len(work.level_room) - 2] = 0  # a partial update refits but its leaves
+        work.plan.level_count.assign(counts)
+        update.tree.active_walk(models, states, work)
 
     monkeypatch.setattr(update.refine, "active_update", forget)
     with pytest.raises(RuntimeError, match="bits"):
         update.check_update(scene, there, back, model.face_count)
+
+
+def test_a_query_that_is_wrong_is_noticed(posed):
+    """A face pair too few, and one too many, beside a peer that has them right."""
+    scene, result = posed
+    model, poses, truth = scene.models[0], pair_poses(3, 0.2), result.faces
+    assert query.judge(truth, truth, model, poses) == {"judged": 0, "ours_wrong": 0}
+    assert query.judge(truth[1:], truth, model, poses) == {"judged": 1, "ours_wrong": 0}
+    apart = np.array([[0, 0, 0]]) if (0, 0, 0) not in set(map(tuple, truth.tolist())) else np.array([[0, 0, 1]])
+    for ours in (truth[1:], np.concatenate([truth, apart])):
+        with pytest.raises(RuntimeError, match="1 of 1 face pairs"):
+            query.judge(truth, ours, model, poses)
+
+
+def test_a_sweep_that_answers_otherwise_is_noticed(device):
+    model = knot_model(200)
+    poses = sweep.random_poses(20, 2.0).astype(np.float32)
+    found = ab.sweep(model, model, poses, device=device)
+    sweep.check_sweep(wp.get_device(device), model, poses, found)
+    with pytest.raises(RuntimeError, match="differ"):
+        sweep.check_sweep(wp.get_device(device), model, poses, ~found)
+
+
+def test_a_model_whose_error_is_too_small_is_noticed(monkeypatch):
+    model = knot_model(600)
+    assert build.check_model(model, 100) >= 1
+    monkeypatch.setattr(ab.Model, "error_at", lambda self, lod, kept=ab.Model.error_at: 0.5 * kept(self, lod))
+    with pytest.raises(RuntimeError, match="beyond its error"):
+        build.check_model(model, 1000)
+    with pytest.raises(RuntimeError, match="opened model differs"):
+        build.check_same(model, knot_model(500))
 
 
 def test_replayed_updates_leave_the_bits_of_set_lods(device):
@@ -260,6 +314,51 @@ def test_peer_finds_what_brute_force_finds(device):
         small.result()
 
 
+def test_peer_of_yes_or_no_finds_what_that_of_pairs_finds(device):
+    poses = pair_poses(4, 0.2)
+    poses[5, :3] += 7
+    asked = [*knot(300), poses]
+    yes_no = peer.AnyPeer(*asked, wp.get_device(device))
+    every = peer.BvhPeer(*asked, 5000, wp.get_device(device))
+    for other in (yes_no, yes_no, every):
+        other.launch()
+    found = np.isin(np.arange(4), every.result()[:, 0])
+    assert np.array_equal(yes_no.result(), found) and found.tolist() == [True, True, False, True]
+
+
+def cube(size=1.0):
+    corners = size * np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
+    return corners, np.array([*faces, [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]], np.int32)
+
+
+def test_fcl_in_cpp_finds_what_brute_force_finds():
+    """Two meshes that differ, and one with itself; B is placed by its matrix."""
+    try:
+        fcl_peer.load_library()
+    except ImportError as error:
+        pytest.skip(str(error))
+    matrices = np.tile(np.eye(4), (3, 1, 1))
+    matrices[:, :3, 3] = [[0.41, 0.27, 0.33], [5, 0, 0], [-0.4, -0.3, 0.2]]
+    for a, b in ((cube(), cube(0.7)), (cube(),) * 2):
+        found = fcl_peer.FclCppPeer(a, b, matrices)
+        assert found.any().tolist() == [True, False, True]
+        answers = found.faces()
+        for answer, matrix in zip(answers, matrices, strict=True):
+            truth = peers.load_oracle().brute_force_faces(*a, *b, np.eye(4), matrix)
+            assert sorted(map(tuple, found.face_pairs(answer))) == sorted(map(tuple, truth.tolist()))
+
+
+def test_fcl_in_cpp_is_named_where_it_cannot_be_compiled(monkeypatch):
+    for name, value in (("PATH", "/nowhere"), ("CXX", "no-such-compiler")):
+        fcl_peer.load_library.cache_clear()
+        with monkeypatch.context() as patch:
+            patch.setenv(name, value)
+            with pytest.raises(ImportError, match="no "):
+                fcl_peer.FclCppPeer(cube(), cube(), np.eye(4)[None])
+    fcl_peer.load_library.cache_clear()
+
+
 def test_best_constructor_is_one_of_them(device):
     name = peer.find_constructor(*knot(200), pair_poses(2, 0.5), wp.get_device(device), repeats=1)
     assert name in peer.CONSTRUCTORS
@@ -298,6 +397,14 @@ def test_work_of_a_result():
     assert row["node_tests_per_s"] == 1e6 and "floor_ms" not in roofline.roofline(result, 1.0, None)
 
 
+def test_work_of_an_update():
+    """3 leaves and 5 inner nodes from a slice of 4 entries, in a millisecond at a peak of 1 GB/s."""
+    row = roofline.update_roofline(3, 8, 4, 1.0, (1e9, 1e9, 1e9))
+    assert row["bytes"] == 24 * 4 + 56 * 8 + 88 * 3 + 64 * 5 and row["nodes_per_s"] == 8000
+    assert row["memory_share"] == pytest.approx(row["bytes"] / 1e6, rel=0.01)
+    assert "floor_ms" not in roofline.update_roofline(3, 8, 4, 1.0, None)
+
+
 def test_peaks_by_name():
     find = lambda name: roofline.find_peaks(SimpleNamespace(is_cpu=False, name=name))  # noqa: E731
     assert find("NVIDIA H200")[0] > find("NVIDIA H100 80GB HBM3")[0] > find("NVIDIA H100 PCIe")[0]
@@ -307,15 +414,19 @@ def test_peaks_by_name():
 
 def test_plots(tmp_path, monkeypatch):
     rows = [{"sweep": "pairs", "pairs": n, "ours_ms": 2.0 * n, "peer_ms": 3.0 * n, "arrays_mib": 1.0} for n in (1, 10)]
-    lines = plots.find_lines(rows, scale.FIGURES[0])
+    lines = plots.find_lines(rows, scale.FIGURES[0]["panels"][0])
     assert lines == {("ours_ms", None): [(1, 2.0), (10, 20.0)], ("peer_ms", None): [(1, 3.0), (10, 30.0)]}
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "matplotlib", None)
         assert plots.draw(rows, scale.FIGURES, tmp_path).startswith("plots skipped: ")
     assert not list(tmp_path.iterdir())
     pytest.importorskip("matplotlib")
-    assert "scale_pairs_time.svg, scale_pairs_memory.svg" in plots.draw(rows, scale.FIGURES, tmp_path / "new")
-    assert "ours: slope 1.00" in (tmp_path / "new" / "scale_pairs_time.svg").read_text()
+    assert "scale_time.svg, scale_memory.svg" in plots.draw(rows, scale.FIGURES, tmp_path / "new")
+    drawn = (tmp_path / "new" / "scale_time.svg").read_text()
+    assert "ours: slope 1.00" in drawn and "time of a launch [ms]" in drawn and "object pairs" in drawn
+    assert "faces a mesh" not in drawn, "no panel without rows"
+    plots.draw(rows, scale.FIGURES, tmp_path / "new")
+    assert (tmp_path / "new" / "scale_time.svg").read_text() == drawn, "the same rows, the same file"
 
 
 def test_command_draws_earlier_rows(tmp_path, capsys):
@@ -325,7 +436,7 @@ def test_command_draws_earlier_rows(tmp_path, capsys):
     file.write_text(json.dumps({"rows": [row | {"k": k, "update_ms": 0.1 * k} for k in (1, 10)]}))
     assert main.main(["update", "--rows", str(file), "--plots", str(tmp_path)]) == 0
     assert "update_time.svg" in capsys.readouterr().out
-    assert "update, faces 100: slope 1.00" in (tmp_path / "update_time.svg").read_text()
+    assert "update, 100 faces: slope 1.00" in (tmp_path / "update_time.svg").read_text()
     with pytest.raises(SystemExit):
         main.main(["update", "--rows", str(file)])
 

@@ -115,10 +115,10 @@ class ProgressiveMesh:
         if (fraction is None) == (tolerance is None):
             raise ValueError("lod_for takes exactly one of fraction= and tolerance=")
         if tolerance is not None:
-            if not (isinstance(tolerance, Real) and tolerance >= 0):
+            if not (isinstance(tolerance, Real) and float(tolerance) >= 0):
                 raise ValueError(f"tolerance must be >= 0, got {tolerance!r}")
             return int(np.argmax(self.lod_error <= tolerance))
-        if not (isinstance(fraction, Real) and 0 < fraction <= 1):
+        if not (isinstance(fraction, Real) and 0 < float(fraction) <= 1):
             raise ValueError(f"fraction must lie in (0, 1], got {fraction!r}")
         miss = np.abs(self._active_counts - fraction * self.face_count)
         return int(self.lod_max - np.argmin(miss[::-1]))
@@ -329,7 +329,7 @@ def _replay(pos, face_count):
     replay.pos = _cpu(pos, wp.vec3d)
     for name in ("triangle_pos", "face_pos"):
         setattr(replay, name, wp.zeros((face_count, 3), dtype=wp.vec3d, device="cpu"))
-    replay.face_ball = wp.zeros(face_count, dtype=wp.vec4d, device="cpu")
+    replay.face_box = wp.zeros((face_count, 2), dtype=wp.vec3d, device="cpu")
     for name in ("face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face"):
         setattr(replay, name, _filled(face_count, -1))
     pooled = 3 * face_count + 4096  # a pool that runs dry loosens bounds, no more
