@@ -247,14 +247,15 @@ class Scene:
             return np.empty((0, 2), np.int32)
         if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind not in "iu":
             raise ValueError(f"pairs: shape {pairs.shape} and type {pairs.dtype}, not whole numbers of shape (p, 2)")
-        bad = np.flatnonzero(((pairs < 0) | (pairs >= self.object_count)).any(1))
-        if len(bad):
+        if pairs.min() < 0 or pairs.max() >= self.object_count:
+            bad = np.flatnonzero(((pairs < 0) | (pairs >= self.object_count)).any(1))
             raise ValueError(
                 f"pairs: pair {bad[0]} is {tuple(pairs[bad[0]].tolist())}, the scene has {self.object_count} objects"
             )
-        bad = np.flatnonzero(pairs[:, 0] == pairs[:, 1])
-        if len(bad):
-            raise ValueError(f"pairs: pair {bad[0]} pairs object {pairs[bad[0], 0]} with itself")
+        same = pairs[:, 0] == pairs[:, 1]
+        if same.any():
+            bad = int(same.argmax())
+            raise ValueError(f"pairs: pair {bad} pairs object {pairs[bad, 0]} with itself")
         return pairs.astype(np.int32)
 
     def filter(self, pairs):
