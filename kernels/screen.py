@@ -5,6 +5,8 @@ that differences of corners are off by less than `error`. With |x| the sum of a 
 determinant of rows u, v, w by at most error (|u||v| + |v||w| + |w||u|), where rows are taken 2 error longer for the
 terms of higher order. Its own arithmetic, u . (v x w), adds eight roundings: 8 2^-24 |u||v||w| to first order, for
 which `unit` is 9 2^-24. docs/exactness.md has the terms. With error and unit 0 every sign is the computed one.
+
+`vector.screen_waiting` is the same for 16 pairs at a time: what changes here changes there, and tests compare them.
 """
 
 import warp as wp

@@ -12,6 +12,7 @@ import warp as wp
 from warp_abtree.kernels.faces import (
     OUTPUT_ANY,
     OUTPUT_FACES,
+    WITHIN,
     Hits,
     defer_faces,
     report_hit,
@@ -21,7 +22,8 @@ from warp_abtree.kernels.faces import (
 from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose
-from warp_abtree.kernels.predicates import UNSURE
+from warp_abtree.kernels.predicates import FLOAT32, UNSURE
+from warp_abtree.kernels.screen import SCREEN_UNIT
 from warp_abtree.kernels.share import (
     MAILBOX_COUNT,
     MAILBOX_ITEMS,
@@ -36,7 +38,7 @@ from warp_abtree.kernels.share import (
     part_count,
     take_unit,
 )
-from warp_abtree.kernels.vector import take_slot, visit_items
+from warp_abtree.kernels.vector import ITEMS_AT_ONCE, STACK_ROOM, descend, screen_waiting, single_node, take_slots
 from warp_abtree.kernels.visit import visit_item
 from warp_abtree.kernels.warps import (
     STACK_LENGTH,
@@ -60,14 +62,14 @@ MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
 # A visit replaces an item by four at most, each a level deeper in both trees, or by two, a level deeper in one. So
-# depth first leaves three items a level at most, 31 levels deep, and two items at a time six.
+# depth first leaves three items a level at most, 31 levels deep.
 DEPTH_FIRST_ROOM = wp.constant(128)
-DEPTH_FIRST_LENGTH = 256
-depth_first_stack = wp.types.vector(length=DEPTH_FIRST_LENGTH, dtype=wp.int64)
 
-# One thread tests so many face pairs at a time, so that its processor finds its way through either loop.
-FACES_READY = wp.constant(16)
-waiting_list = wp.types.vector(length=24, dtype=wp.int64)
+# A thread tests so many face pairs at a time, so that its processor finds its way through either loop; an early hit
+# ends a pair for `any`.
+FACES_READY, FACES_FOR_ANY = wp.constant(128), wp.constant(1)
+ITEMS_FOR_ANY = wp.constant(8)
+WAITING_ROOM = int(FACES_READY) + 4 * ITEMS_AT_ONCE + 4
 
 STACK_MASK = wp.constant(STACK_LENGTH - 1)
 # Warps on one pair part its work when there are about so many items for each, or as many as the stack takes then.
@@ -87,10 +89,45 @@ def first_item(states: StatePool, pose: PairPose):
 
 
 @wp.func
-def keep_hit(output: wp.int32, pair: wp.int32, swapped: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+def keep_hits(
+    output: wp.int32, pair: wp.int32, swapped: wp.int32, count: wp.int32, faces: wp.array(dtype=wp.int64), hits: Hits
+):
+    """Note that an object pair meets, and report the pairs of faces on a list, if that is asked."""
     hits.any_hit[pair] = 1
     if output == OUTPUT_FACES:
-        report_hit(take_slot(hits.total), pair, swapped, face_a, face_b, hits)
+        slot = take_slots(hits.total, count)
+        for i in range(count):
+            report_hit(slot + i, pair, swapped, item_first(faces[i]), item_second(faces[i]), hits)
+
+
+@wp.func
+def settle_waiting(
+    mode: wp.int32,
+    output: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    met: wp.int32,
+    waiting: wp.int32,
+    faces: wp.array(dtype=wp.int64),
+    met_inout: wp.array(dtype=wp.int64),
+):
+    """Decide pairs of faces that wait, perhaps until the first hit, and add hits to those on a list that have met.
+
+    Returns how many have met then, how many were decided, and how many of these took exact signs. Both lists may be
+    one: what is added stands before what is looked at.
+    """
+    tested, exact = wp.int32(0), wp.int32(0)
+    for i in range(waiting):
+        if output != OUTPUT_ANY or met == 0:
+            item = faces[i]
+            meet, hard = settle_faces(mode, models, states, pose, item_first(item), item_second(item))
+            tested += 1
+            exact += hard
+            if meet == 1:
+                met_inout[met] = item
+                met += 1
+    return met, tested, exact
 
 
 @functools.cache
@@ -113,41 +150,45 @@ def thread_traversal(mode: int):
         if p >= wp.min(pair_count[0], pair_poses.shape[0]):
             return
         pose = pair_poses[p]
-        stack = depth_first_stack(first_item(states, pose))
-        waiting_faces = waiting_list()
-        top, waiting = wp.int32(1), wp.int32(0)
+        stack = wp.zeros(shape=STACK_ROOM, dtype=wp.int64)
+        root = first_item(states, pose)
+        stack[0] = pack_item(single_node(item_first(root)), single_node(item_second(root)))
+        waiting_faces = wp.zeros(shape=WAITING_ROOM, dtype=wp.int64)
+        left_open = wp.zeros(shape=WAITING_ROOM, dtype=wp.int64)
+        error, unit = wp.float32(pose.error), wp.float32(SCREEN_UNIT)
+        if wp.static(mode == int(FLOAT32)):
+            error, unit = wp.float32(0.0), wp.float32(0.0)
+        top = wp.int32(1)
         node_tests, triangle_tests = wp.int64(0), wp.int64(0)
         float64_tests, exact_tests, hit_count = wp.int64(0), wp.int64(0), wp.int64(0)
+        at_once, ready = ITEMS_AT_ONCE, FACES_READY
+        if output == OUTPUT_ANY:
+            at_once, ready = ITEMS_FOR_ANY, FACES_FOR_ANY
         while top > 0:
-            taken = wp.min(top, 2)
-            top -= taken
-            items = visit_items(states, pose, stack[top], stack[top + 1], taken)
-            mask = wp.int32(items[8])
-            node_tests += items[9]
-            # Written without branches, which could not be predicted; what is not in use is written over.
-            for k in range(8):
-                stack[top] = items[k]
-                top += (mask >> k) & 1
-                waiting_faces[waiting] = items[k]
-                waiting += (mask >> (k + 8)) & 1
-            if top > 0 and waiting < FACES_READY and output != OUTPUT_ANY:
-                continue
-            while waiting > 0:
-                waiting -= 1
-                item = waiting_faces[waiting]
-                face_a, face_b = item_first(item), item_second(item)
-                meet = try_faces(wp.static(mode), models, states, pose, face_a, face_b)
-                triangle_tests += wp.int64(1)
-                if meet == UNSURE:
-                    meet, hard = settle_faces(wp.static(mode), models, states, pose, face_a, face_b)
-                    float64_tests += wp.int64(1)
-                    exact_tests += wp.int64(hard)
-                if meet == 1:
-                    hit_count += wp.int64(1)
-                    keep_hit(output, p, pose.swapped, face_a, face_b, hits_inout)
-                    if output == OUTPUT_ANY:
-                        top = 0
-                        waiting = 0
+            progress = descend(states, pose, at_once, ready, top, stack, waiting_faces)
+            top, waiting = wp.int32(progress[0]), wp.int32(progress[1])
+            node_tests += progress[2]
+            if wp.static(mode == int(WITHIN)):
+                met, tested, hard = settle_waiting(
+                    wp.static(mode), output, models, states, pose, 0, waiting, waiting_faces, waiting_faces
+                )
+                triangle_tests += wp.int64(tested)
+            else:
+                screened = screen_waiting(
+                    models, states, pose, error, unit, output == OUTPUT_ANY, waiting, waiting_faces, left_open
+                )
+                met, left = wp.int32(screened[0]), wp.int32(screened[1])
+                met, tested, hard = settle_waiting(
+                    wp.static(mode), output, models, states, pose, met, left, left_open, waiting_faces
+                )
+                triangle_tests += screened[2]
+                float64_tests += wp.int64(tested)
+                exact_tests += wp.int64(hard)
+            if met > 0:
+                hit_count += wp.int64(met)
+                keep_hits(output, p, pose.swapped, met, waiting_faces, hits_inout)
+                if output == OUTPUT_ANY:
+                    top = 0
         hits_inout.count[p] = hit_count
         hits_inout.node_tests[p] = node_tests
         hits_inout.triangle_tests[p] = triangle_tests

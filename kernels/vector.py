@@ -1,139 +1,363 @@
-"""What the CPU does in its own way: `visit_item` in vector instructions, and atomics that are.
+"""The traversal on the CPU in vector instructions, and atomics that are.
 
-A visit computes the same numbers in the same order, three axes at a time. Two items at a time: neither waits for the
-other, so the processor works on both.
+`descend` compares four pairs of boxes at a time, as `visit_item` does one by one, and `screen_waiting` 16 pairs of
+faces, as `screen_triangles` does one: the same numbers in the same order, so that every device finds and counts the
+same. Items wait for one another in no way, so the processor works on several at once.
 """
 
 import warp as wp
 
-from warp_abtree.kernels.pools import StatePool
+from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose
+from warp_abtree.kernels.predicates import UNSURE
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-# Eight items, the mask of those in use, and the pairs compared.
-ten_numbers = wp.types.vector(length=10, dtype=wp.int64)
+# Items that are taken at once, and brought into the cache together: as many as find room.
+ITEMS_AT_ONCE = 64
+STACK_ROOM = 1024
+# One at a time, depth first, leaves three items a level, 31 levels deep; a visit writes over four more, and divisions
+# round.
+ROOM_FOR_ONE = 3 * 31 + 8
+
+three_numbers = wp.types.vector(length=3, dtype=wp.int64)
+
+# Which of the four pairs of boxes are in use, four bits for each choice: of two siblings the first (1), the second (2)
+# or both (3), in A and in B.
+ROWS, COLUMNS = (0, 3, 12, 15), (0, 5, 10, 15)
+PAIRS_USED = sum((ROWS[a] & COLUMNS[b]) << 4 * (4 * a + b) for a in range(4) for b in range(4))
 
 
-@wp.func_native("""
-    wp::vec_t<10, wp::int64> result;
+def in_groups(*first):
+    """Return the indices of a shuffle of two times 16 numbers that does the same in each group of four."""
+    return ", ".join(str(i + 4 * group) for group in range(4) for i in first)
+
+
+@wp.func_native(f"""
+    wp::vec_t<3, wp::int64> result;
 #if defined(__CUDA_ARCH__)
     __trap();  // warps have a visit of their own
 #else
-    typedef float lanes __attribute__((vector_size(16)));
-    typedef int bits __attribute__((vector_size(16)));
-    struct Branch { lanes sum, size, turned_sum, turned_size; float span; int skip, down, face; };
-    const lanes zero = {0.0f, 0.0f, 0.0f, 0.0f};
-    const auto& r = rotation.data;
-    const lanes rows[3] = {{r[0][0], r[0][1], r[0][2], 0.0f}, {r[1][0], r[1][1], r[1][2], 0.0f},
-                           {r[2][0], r[2][1], r[2][2], 0.0f}};
-    const lanes columns[3] = {{r[0][0], r[1][0], r[2][0], 0.0f}, {r[0][1], r[1][1], r[2][1], 0.0f},
-                              {r[0][2], r[1][2], r[2][2], 0.0f}};
-    const lanes forth = {translation[0] + translation[0], translation[1] + translation[1],
-                         translation[2] + translation[2], 0.0f};
-    const lanes home = {back[0] + back[0], back[1] + back[1], back[2] + back[2], 0.0f};
-    const float widening = margin + margin;
-    const lanes wide = {widening, widening, widening, widening};
-    auto load = [&](wp::int64 at, const lanes (&axes)[3], const lanes& shift) {
-        const lanes* record = (const lanes*)((const float*)boxes.data + 8 * at);
-        const lanes low = record[0], high = record[1];
-        const lanes lower = __builtin_shufflevector(low, zero, 0, 1, 2, 4);
-        const lanes upper = __builtin_shufflevector(high, zero, 0, 1, 2, 4);
-        Branch b;
-        b.sum = upper + lower;
-        b.size = upper - lower;
-        const lanes x = __builtin_shufflevector(b.sum, b.sum, 0, 0, 0, 0);
-        const lanes y = __builtin_shufflevector(b.sum, b.sum, 1, 1, 1, 1);
-        const lanes z = __builtin_shufflevector(b.sum, b.sum, 2, 2, 2, 2);
-        const lanes u = __builtin_shufflevector(b.size, b.size, 0, 0, 0, 0);
-        const lanes v = __builtin_shufflevector(b.size, b.size, 1, 1, 1, 1);
-        const lanes w = __builtin_shufflevector(b.size, b.size, 2, 2, 2, 2);
-        b.turned_sum = __builtin_elementwise_fma(axes[2], z, shift);
-        b.turned_sum = __builtin_elementwise_fma(axes[1], y, b.turned_sum);
-        b.turned_sum = __builtin_elementwise_fma(axes[0], x, b.turned_sum);
-        b.turned_size = __builtin_elementwise_abs(axes[2]) * w;
-        b.turned_size = __builtin_elementwise_fma(__builtin_elementwise_abs(axes[1]), v, b.turned_size);
-        b.turned_size = __builtin_elementwise_fma(__builtin_elementwise_abs(axes[0]), u, b.turned_size);
-        b.span = high[3];
-        b.skip = ((bits)low)[3];
-        b.face = ((bits)high)[3];
-        b.down = b.face >= 0 ? b.skip : -b.skip;
-        return b;
-    };
-    wp::int64 mask = 0, compared = 0;
-    // What stands above the top of a stack may be no item.
-    const wp::int64 taken[2] = {first, count > 1 ? second : first};
-    #pragma clang loop unroll(full)
-    for (int i = 0; i < 2; ++i) {
-        const int x = (int)(taken[i] >> 32), y = (int)taken[i], two_a = x < 0, two_b = y < 0;
-        const wp::int64 at_a = (wp::int64)node_a + (x < 0 ? -2 * x : x);
-        const wp::int64 at_b = (wp::int64)node_b + (y < 0 ? -2 * y : y);
-        const Branch a[2] = {load(at_a, rows, home), load(at_a + two_a, rows, home)};
-        const Branch b[2] = {load(at_b, columns, forth), load(at_b + two_b, columns, forth)};
-        const int used = i < count ? 257 * (1 + 2 * two_b + 4 * two_a + 8 * two_a * two_b) : 0;
-        int found = 0;
+    // Groups of four numbers: x, y, z and one that is not in use.
+    typedef float groups __attribute__((vector_size(64)));
+    typedef float loose __attribute__((vector_size(64), aligned(16)));
+    typedef int bits __attribute__((vector_size(64)));
+    typedef float eight __attribute__((vector_size(32)));
+    typedef int ints __attribute__((vector_size(32)));
+    typedef wp::int64 longs __attribute__((vector_size(32)));
+    typedef wp::int64 loose_longs __attribute__((vector_size(32), aligned(8)));
+    typedef bool flags __attribute__((ext_vector_type(16)));
+    typedef bool eight_flags __attribute__((ext_vector_type(8)));
+    const groups none = {{}};
+    const auto& r = pose.rotation32.data;
+    const auto& there = pose.translation32;
+    const auto& back = pose.back32;
+    // For both children of A, then for both children of B.
+    groups axes[3];
+    for (int k = 0; k < 3; ++k)
+        axes[k] = groups{{r[k][0], r[k][1], r[k][2], 0.0f, r[k][0], r[k][1], r[k][2], 0.0f,
+                          r[0][k], r[1][k], r[2][k], 0.0f, r[0][k], r[1][k], r[2][k], 0.0f}};
+    const groups turned[3] = {{__builtin_elementwise_abs(axes[0]), __builtin_elementwise_abs(axes[1]),
+                               __builtin_elementwise_abs(axes[2])}};
+    const float home[3] = {{back[0] + back[0], back[1] + back[1], back[2] + back[2]}};
+    const float forth[3] = {{there[0] + there[0], there[1] + there[1], there[2] + there[2]}};
+    const groups shift = {{home[0], home[1], home[2], 0.0f, home[0], home[1], home[2], 0.0f,
+                           forth[0], forth[1], forth[2], 0.0f, forth[0], forth[1], forth[2], 0.0f}};
+    const float w = pose.margin + pose.margin;
+    const groups wide = {{w, w, w, w, w, w, w, w, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f}};
+    // The boxes of A twice each, those of B in turn: four pairs.
+    auto of_a = [](const groups& v) {{
+        return __builtin_shufflevector(v, v, 0, 1, 2, 3, 0, 1, 2, 3, 4, 5, 6, 7, 4, 5, 6, 7);
+    }};
+    auto of_b = [](const groups& v) {{
+        return __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15, 8, 9, 10, 11, 12, 13, 14, 15);
+    }};
+    struct Taken {{ const char *a, *b; unsigned int used; }};
+    const char* tree_a = (const char*)states.node_box.data + 32 * (wp::int64)pose.node_a;
+    const char* tree_b = (const char*)states.node_box.data + 32 * (wp::int64)pose.node_b;
+    wp::int64* items = stack.data;
+    wp::int64* found = faces.data;
+    wp::int64 compared = 0;
+    int end = top, waiting = 0;
+    // Siblings lie side by side, so an item says which two, by half the first one's index times 4, and which of them.
+    auto take = [&](wp::int64 item) {{
+        const unsigned int x = (unsigned int)(item >> 32), y = (unsigned int)item;
+        const Taken taken = {{tree_a + 16 * (wp::int64)(x & -4), tree_b + 16 * (wp::int64)(y & -4),
+                              (unsigned int)({PAIRS_USED}ull >> (((x & 3) << 4) | ((y & 3) << 2))) & 15}};
+        __builtin_prefetch(taken.a);
+        __builtin_prefetch(taken.b);
+        return taken;
+    }};
+    auto visit = [&](const Taken& taken) {{
+        const groups a = *(const loose*)taken.a, b = *(const loose*)taken.b;
+        groups low = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27);
+        groups high = __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
+        low = __builtin_shufflevector(low, none, 0, 1, 2, 16, 4, 5, 6, 16, 8, 9, 10, 16, 12, 13, 14, 16);
+        high = __builtin_shufflevector(high, none, 0, 1, 2, 16, 4, 5, 6, 16, 8, 9, 10, 16, 12, 13, 14, 16);
+        const groups sum = high + low, size = high - low;
+        const groups x = __builtin_shufflevector(sum, sum, {in_groups(0, 0, 0, 0)});
+        const groups y = __builtin_shufflevector(sum, sum, {in_groups(1, 1, 1, 1)});
+        const groups z = __builtin_shufflevector(sum, sum, {in_groups(2, 2, 2, 2)});
+        const groups p = __builtin_shufflevector(size, size, {in_groups(0, 0, 0, 0)});
+        const groups q = __builtin_shufflevector(size, size, {in_groups(1, 1, 1, 1)});
+        const groups s = __builtin_shufflevector(size, size, {in_groups(2, 2, 2, 2)});
+        groups sum_there = __builtin_elementwise_fma(axes[2], z, shift);
+        sum_there = __builtin_elementwise_fma(axes[1], y, sum_there);
+        sum_there = __builtin_elementwise_fma(axes[0], x, sum_there);
+        groups size_there = turned[2] * s;
+        size_there = __builtin_elementwise_fma(turned[1], q, size_there);
+        size_there = __builtin_elementwise_fma(turned[0], p, size_there);
+        const groups size_wide = size + wide, there_wide = size_there + wide;
+        const bits hit =
+            (__builtin_elementwise_abs(of_a(sum) - of_b(sum_there)) <= of_a(size_wide) + of_b(size_there)) &
+            (__builtin_elementwise_abs(of_a(sum_there) - of_b(sum)) <= of_a(there_wide) + of_b(size));
+        unsigned int m = __builtin_bit_cast(unsigned short, __builtin_convertvector(hit, flags)) | 0x8888;
+        m &= m >> 1;
+        m &= m >> 2;
+        // Bits 0, 4, 8 and 12 side by side.
+        const unsigned int mask = ((m & 0x1111) * 0x1248 >> 12) & taken.used;
+        // What follows, as in `next_item`: of A for the four pairs, then of B.
+        const bits whole_a = (bits)a, whole_b = (bits)b;
+        const ints skip = __builtin_shufflevector(whole_a, whole_b, 3, 3, 11, 11, 19, 27, 19, 27);
+        const ints face = __builtin_shufflevector(whole_a, whole_b, 7, 7, 15, 15, 23, 31, 23, 31);
+        const ints other = __builtin_shufflevector(face, face, 4, 5, 6, 7, 0, 1, 2, 3);
+        const eight span = (eight)face, other_span = (eight)other;
+        const ints inner = (face | other) < 0, down = (face < 0) & (span + span <= other_span);
+        const ints stay = ((skip + skip) & -4) + (skip & 1) + 1;
+        const ints next = inner ? (down ? 4 * skip + 3 : stay) : face;
+        const longs pairs = (longs)__builtin_shufflevector(next, next, 4, 0, 5, 1, 6, 2, 7, 3);
+        const unsigned int go =
+            mask & __builtin_bit_cast(unsigned char, __builtin_convertvector(inner, eight_flags));
+        const unsigned int test = mask & ~go;
+        compared += __builtin_popcount(taken.used);
+#if defined(__AVX512VL__)
+        *(loose_longs*)(items + end) = __builtin_ia32_compressdi256_mask(pairs, longs{{}}, go);
+        *(loose_longs*)(found + waiting) = __builtin_ia32_compressdi256_mask(pairs, longs{{}}, test);
+        end += __builtin_popcount(go);
+        waiting += __builtin_popcount(test);
+#else
+        // Without branches, which could not be predicted; what is not in use is written over.
         #pragma clang loop unroll(full)
-        for (int k = 0; k < 4; ++k) {
-            const Branch &p = a[k >> 1], &q = b[k & 1];
-            const bits hit = (__builtin_elementwise_abs(p.sum - q.turned_sum) <= p.size + wide + q.turned_size)
-                           & (__builtin_elementwise_abs(p.turned_sum - q.sum) <= p.turned_size + wide + q.size);
-            const bool leaves = (p.face | q.face) >= 0;
-            const int u = leaves ? p.face : p.span + p.span <= q.span ? p.down : p.skip;
-            const int v = leaves ? q.face : q.span + q.span <= p.span ? q.down : q.skip;
-            found |= (hit[0] & hit[1] & hit[2]) & (leaves ? 256 << k : 1 << k);
-            result[4 * i + k] = ((wp::int64)u << 32) | (unsigned int)v;
-        }
-        mask |= (wp::int64)(found & used) << (4 * i);
-        compared += i < count ? (1 + two_a) * (1 + two_b) : 0;
-    }
-    result[8] = mask;
-    result[9] = compared;
+        for (int k = 0; k < 4; ++k) {{
+            items[end] = found[waiting] = pairs[k];
+            end += (go >> k) & 1;
+            waiting += (test >> k) & 1;
+        }}
+#endif
+    }};
+    while (end > 0 && waiting < ready) {{
+        const int room = ({STACK_ROOM - ROOM_FOR_ONE} - end) / 3, fits = room > 1 ? room : 1;
+        const int wanted = at_once < fits ? at_once : fits, count = wanted < end ? wanted : end;
+        end -= count;
+        Taken taken[{ITEMS_AT_ONCE}];
+        for (int i = 0; i < count; ++i)
+            taken[i] = take(items[end + i]);
+        for (int i = 0; i < count; ++i)
+            visit(taken[i]);
+    }}
+    result[0] = end;
+    result[1] = waiting;
+    result[2] = compared;
 #endif
     return result;
 """)
-def visit_two(
-    boxes: wp.array(dtype=wp.vec4),
-    node_a: wp.int32,
-    node_b: wp.int32,
-    rotation: wp.mat33,
-    translation: wp.vec3,
-    back: wp.vec3,
-    margin: wp.float32,
-    first: wp.int64,
-    second: wp.int64,
-    count: wp.int32,
-) -> ten_numbers:
-    """Compare what one or two items name; return what follows of both, a mask, and the pairs compared.
+def descend(
+    states: StatePool,
+    pose: PairPose,
+    at_once: wp.int32,
+    ready: wp.int32,
+    top: wp.int32,
+    stack: wp.array(dtype=wp.int64),
+    faces: wp.array(dtype=wp.int64),
+) -> three_numbers:
+    """Visit items from the top of a stack until there are none, or so many pairs of faces wait as are asked for.
 
-    Bits 0 to 7 of the mask stand for items to visit, bits 8 to 15 for pairs of faces to test.
+    Returns the items left on the stack, the pairs of faces that wait, and the pairs of boxes compared.
+    """
+    ...
+
+
+@wp.func
+def single_node(node: wp.int32):
+    """Return what an item of `descend` says of one node."""
+    return 4 * (node >> 1) + (node & 1) + 1
+
+
+@wp.func_native(f"""
+    wp::vec_t<3, wp::int64> result;
+#if defined(__CUDA_ARCH__)
+    __trap();  // a thread tests a pair
+#else
+    {{
+    #pragma clang fp contract(off)
+    // A number of each of 16 pairs of faces.
+    typedef float lanes __attribute__((vector_size(64)));
+    typedef int bits __attribute__((vector_size(64)));
+    typedef bool flags __attribute__((ext_vector_type(16)));
+    typedef float four __attribute__((vector_size(16)));
+    typedef float eight __attribute__((vector_size(32)));
+    typedef wp::int32 sixteen[16];
+    struct Point {{ lanes x, y, z; }};
+    const auto& r = pose.rotation32.data;
+    const auto& t = pose.translation32;
+    const float scale = (float)pose.scale;
+    const four* near = (const four*)models.vertex_near.data;
+    const wp::vec_t<4, wp::int32>* corners = states.face_corner.data;
+    wp::int64* list = faces.data;
+    wp::int64* rest = left_open.data;
+    auto every = [](float v) {{ return lanes{{v, v, v, v, v, v, v, v, v, v, v, v, v, v, v, v}}; }};
+    auto absolute = [](const lanes& v) {{ return __builtin_elementwise_abs(v); }};
+    auto fuse = [](const lanes& a, const lanes& b, const lanes& c) {{ return __builtin_elementwise_fma(a, b, c); }};
+    auto sum_sizes = [&](const Point& v) {{ return (absolute(v.x) + absolute(v.y)) + absolute(v.z); }};
+    auto minus = [](const Point& a, const Point& b) {{ return Point{{a.x - b.x, a.y - b.y, a.z - b.z}}; }};
+    auto cross = [&](const Point& u, const Point& v) {{
+        return Point{{fuse(u.y, v.z, -(u.z * v.y)), fuse(u.z, v.x, -(u.x * v.z)), fuse(u.x, v.y, -(u.y * v.x))}};
+    }};
+    auto dot = [&](const Point& u, const Point& v) {{ return fuse(u.x, v.x, fuse(u.y, v.y, u.z * v.z)); }};
+    auto bound_error = [&](const lanes& u, const lanes& v, const lanes& w) {{
+        const lanes p = u + 2.0f * error, q = v + 2.0f * error, s = w + 2.0f * error;
+        return error * (p * q + s * (p + q)) + unit * (p * q * s);
+    }};
+    auto filtered_sign = [](const lanes& x, const lanes& bound) {{
+        const bits open = bound == 0.0f ? bits{{}} : bits{{}} + {int(UNSURE)};
+        return x > bound ? bits{{}} + 1 : x < -bound ? bits{{}} - 1 : open;
+    }};
+    auto choose = [](const bits& which, const Point& a, const Point& b) {{
+        return Point{{which ? a.x : b.x, which ? a.y : b.y, which ? a.z : b.z}};
+    }};
+    auto to_mask = [](const bits& which) {{
+        return (unsigned int)__builtin_bit_cast(unsigned short, __builtin_convertvector(which, flags));
+    }};
+    auto gather = [&](const sixteen& corner) {{
+        lanes row[4];
+        for (int k = 0; k < 4; ++k) {{
+            const eight p = __builtin_shufflevector(near[corner[k]], near[corner[k + 4]], 0, 1, 2, 3, 4, 5, 6, 7);
+            const eight q = __builtin_shufflevector(near[corner[k + 8]], near[corner[k + 12]], 0, 1, 2, 3, 4, 5, 6, 7);
+            row[k] = __builtin_shufflevector(p, q, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+        }}
+        const lanes low_01 = __builtin_shufflevector(row[0], row[1], {in_groups(0, 16, 1, 17)});
+        const lanes low_23 = __builtin_shufflevector(row[2], row[3], {in_groups(0, 16, 1, 17)});
+        const lanes high_01 = __builtin_shufflevector(row[0], row[1], {in_groups(2, 18, 3, 19)});
+        const lanes high_23 = __builtin_shufflevector(row[2], row[3], {in_groups(2, 18, 3, 19)});
+        return Point{{__builtin_shufflevector(low_01, low_23, {in_groups(0, 1, 16, 17)}),
+                      __builtin_shufflevector(low_01, low_23, {in_groups(2, 3, 18, 19)}),
+                      __builtin_shufflevector(high_01, high_23, {in_groups(0, 1, 16, 17)})}};
+    }};
+    auto near_a = [&](const sixteen& corner) {{
+        const Point p = gather(corner);
+        return Point{{p.x * scale, p.y * scale, p.z * scale}};
+    }};
+    auto near_b = [&](const sixteen& corner) {{
+        const Point p = gather(corner);
+        lanes x[3];
+        for (int i = 0; i < 3; ++i) {{
+            x[i] = fuse(every(r[i][2]), p.z, every(t[i]));
+            x[i] = fuse(every(r[i][0]), p.x, fuse(every(r[i][1]), p.y, x[i]));
+        }}
+        return Point{{x[0] * scale, x[1] * scale, x[2] * scale}};
+    }};
+    auto sides_of_plane = [&](const Point& a, const Point& b, const Point& c, const Point (&d)[3], bits (&side)[3]) {{
+        const Point u = minus(b, a), v = minus(c, a);
+        const Point w[3] = {{minus(a, d[0]), minus(a, d[1]), minus(a, d[2])}};
+        const Point normal = cross(u, v);
+        const lanes size[3] = {{sum_sizes(w[0]), sum_sizes(w[1]), sum_sizes(w[2])}};
+        const lanes more = size[1] > size[2] ? size[1] : size[2];
+        const lanes bound = bound_error(sum_sizes(u), sum_sizes(v), size[0] > more ? size[0] : more);
+        for (int i = 0; i < 3; ++i)
+            side[i] = filtered_sign(dot(w[i], normal), bound);
+    }};
+    auto one_sided = [](const bits (&s)[3]) {{
+        const bits sum = s[0] + s[1] + s[2];
+        return (sum == 3) | (sum == -3);
+    }};
+    // As `find_alone`, and the corners turned so that this one comes first.
+    auto turn = [&](const bits (&s)[3], const Point (&c)[3], bits& back, Point& p, Point& q, Point& last) {{
+        const bits positive = -((s[0] > 0) + (s[1] > 0) + (s[2] > 0));
+        const bits negative = -((s[0] < 0) + (s[1] < 0) + (s[2] < 0));
+        const bits kind = positive == 1 ? bits{{}} + 1 : negative == 1 ? bits{{}} - 1 : bits{{}};
+        const bits first = s[0] == kind, second = s[1] == kind;
+        back = (kind < 0) | ((kind == 0) & (positive == 2));
+        p = choose(first, c[0], choose(second, c[1], c[2]));
+        q = choose(first, c[1], choose(second, c[2], c[0]));
+        last = choose(first, c[2], choose(second, c[0], c[1]));
+    }};
+    auto side_of_plane = [&](const Point& a, const Point& b, const Point& c, const Point& d) {{
+        const Point u = minus(a, d), v = minus(b, d), w = minus(c, d);
+        return filtered_sign(dot(u, cross(v, w)), bound_error(sum_sizes(u), sum_sizes(v), sum_sizes(w)));
+    }};
+    int met = 0, open = 0, done = 0;
+    while (done < waiting && (done == 0 || met == 0 || !first_ends)) {{
+        const int count = waiting - done < 16 ? waiting - done : 16;
+        sixteen corner_a[3], corner_b[3];
+        wp::int64 item[16];
+        for (int k = 0; k < 16; ++k) {{
+            item[k] = list[done + (k < count ? k : 0)];
+            const auto& a = corners[pose.corner_a + (int)(item[k] >> 32)];
+            const auto& b = corners[pose.corner_b + (int)item[k]];
+            for (int i = 0; i < 3; ++i) {{
+                corner_a[i][k] = a[i];
+                corner_b[i][k] = b[i];
+            }}
+        }}
+        done += count;
+        const Point a[3] = {{near_a(corner_a[0]), near_a(corner_a[1]), near_a(corner_a[2])}};
+        const Point b[3] = {{near_b(corner_b[0]), near_b(corner_b[1]), near_b(corner_b[2])}};
+        bits sides_a[3], sides_b[3];
+        sides_of_plane(b[0], b[1], b[2], a, sides_a);
+        sides_of_plane(a[0], a[1], a[2], b, sides_b);
+        const bits crossing = ~(one_sided(sides_a) | one_sided(sides_b));
+        unsigned int left = to_mask(crossing) & ((1u << count) - 1);
+        if (left == 0)
+            continue;
+        bits unsure = ((sides_a[0] | sides_a[1] | sides_a[2]) == 0) | ((sides_b[0] | sides_b[1] | sides_b[2]) == 0);
+        for (int i = 0; i < 3; ++i)
+            unsure |= (sides_a[i] == {int(UNSURE)}) | (sides_b[i] == {int(UNSURE)});
+        bits back_a, back_b;
+        Point p1, q1, r1, p2, q2, r2;
+        turn(sides_a, a, back_a, p1, q1, r1);
+        turn(sides_b, b, back_b, p2, q2, r2);
+        const bits s = side_of_plane(p1, choose(back_b, r1, q1), p2, choose(back_a, r2, q2));
+        const bits e = side_of_plane(p1, choose(back_b, q1, r1), choose(back_a, q2, r2), p2);
+        const bits apart = (s == 1) | (e == 1);
+        const bits unknown = unsure | (~apart & ((s == {int(UNSURE)}) | (e == {int(UNSURE)})));
+        unsigned int opens = left & to_mask(unknown);
+        for (left &= ~opens & ~to_mask(apart); left != 0; left &= left - 1)
+            list[met++] = item[__builtin_ctz(left)];
+        for (; opens != 0; opens &= opens - 1)
+            rest[open++] = item[__builtin_ctz(opens)];
+    }}
+    result[0] = met;
+    result[1] = open;
+    result[2] = done;
+    }}
+#endif
+    return result;
+""")
+def screen_waiting(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    error: wp.float32,
+    unit: wp.float32,
+    first_ends: bool,
+    waiting: wp.int32,
+    faces: wp.array(dtype=wp.int64),
+    left_open: wp.array(dtype=wp.int64),
+) -> three_numbers:
+    """Test pairs of faces as `screen_faces`, 16 at a time, perhaps until the first that meet.
+
+    Returns how many met, which stand in front of the list then, how many are left open, and how many were tested.
     """
     ...
 
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    return atomicAdd(total.data, 1);
+    return atomicAdd(total.data, count);
 #else
-    return __atomic_fetch_add(total.data, 1, __ATOMIC_RELAXED);
+    return __atomic_fetch_add(total.data, count, __ATOMIC_RELAXED);
 #endif
 """)
-def take_slot(total: wp.array(dtype=wp.int32)) -> wp.int32:
-    """Count one more into total[0] and return what it was; on the CPU, Warp's own atomics race with other threads."""
+def take_slots(total: wp.array(dtype=wp.int32), count: wp.int32) -> wp.int32:
+    """Count more into total[0] and return what it was; on the CPU, Warp's own atomics race with other threads."""
     ...
-
-
-@wp.func
-def visit_items(states: StatePool, pose: PairPose, first: wp.int64, second: wp.int64, count: wp.int32):
-    """Compare what one or two items name, as `visit_two` returns it."""
-    return visit_two(
-        states.node_box,
-        pose.node_a,
-        pose.node_b,
-        pose.rotation32,
-        pose.translation32,
-        pose.back32,
-        pose.margin,
-        first,
-        second,
-        count,
-    )

@@ -1,6 +1,7 @@
 """ACTIVE-INTERSECT for a batch: `Query` and its results."""
 
 import math
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -10,6 +11,7 @@ from warp_abtree.checks import to_numpy, whole_number
 from warp_abtree.cores import core_count, launch_on_cores
 from warp_abtree.kernels import faces, pose, predicates, relate, settle, share, traverse
 from warp_abtree.kernels.warps import STACK_LENGTH, WARP_SIZE
+from warp_abtree.state import ModelArrays, ObjectArrays, StateArrays
 
 OUTPUTS = {"any": faces.OUTPUT_ANY, "count": faces.OUTPUT_COUNT, "faces": faces.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float64": predicates.FLOAT64, "float32": predicates.FLOAT32}
@@ -25,6 +27,8 @@ COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 UNSURE_CAPACITY = 65536
 # Warps that work off the lists of face pairs left open: more than one device runs at a time.
 SETTLE_WARPS = 4096
+# Rows whose sorting takes longer than packing each into one number, which sorts 20 times as fast.
+ROWS_TO_PACK = 1000
 # Warps of the traversal that one multiprocessor runs at a time, by its registers.
 WARPS_A_PROCESSOR = 16
 
@@ -62,6 +66,25 @@ def check_within(within, pair_count=None) -> np.ndarray:
     return within
 
 
+def sort_rows(rows: np.ndarray) -> np.ndarray:
+    """Return rows of three int32 that are not negative, (k, 3), sorted by the first, the second and the third."""
+    packs = len(rows) >= ROWS_TO_PACK
+    widths = [int(column.max()).bit_length() for column in rows.T] if packs else []
+    if not packs or sum(widths) > 63:
+        return rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))]
+    key = rows[:, 0].astype(np.int64)
+    for column in (1, 2):
+        key <<= widths[column]
+        key |= rows[:, column]
+    key.sort()
+    found = np.empty_like(rows)
+    for column in (2, 1):
+        np.bitwise_and(key, (1 << widths[column]) - 1, out=found[:, column], casting="unsafe")
+        key >>= widths[column]
+    found[:, 0] = key
+    return found
+
+
 class Result:
     """What a query found, on the host.
 
@@ -78,6 +101,11 @@ class Result:
             pairs of faces, those of them that float32 left open, and of these those that took exact arithmetic.
     """
 
+    node_tests: np.ndarray
+    triangle_tests: np.ndarray
+    float64_tests: np.ndarray
+    exact_tests: np.ndarray
+
     def __init__(self, pairs, output, pair_demand, pair_room, hits, near=None):
         self.pairs = pairs
         self._pair_demand, self._pair_room = pair_demand, pair_room
@@ -85,16 +113,19 @@ class Result:
         self._unsure_room = len(hits.unsure)
         p = len(pairs)
         self.any = hits.any_hit.numpy()[:p] != 0
-        self.apart = None if near is None else near.any_hit.numpy()[:p] == 0
+        # Any: who asked for them knows that they are not None.
+        self.apart: Any = None if near is None else near.any_hit.numpy()[:p] == 0
         # On the CPU numpy() shares the memory that the next launch writes.
         for name in COUNTERS:
             setattr(self, name, getattr(hits, name).numpy()[:p].copy())
-        self.count = hits.count.numpy()[:p].copy() if output != "any" else None
-        self.faces = self.contacts = self.pair_contacts = None
-        if output == "faces":
+        self.count: Any = hits.count.numpy()[:p].copy() if output != "any" else None
+        self.faces: Any = None
+        self.contacts: Any = None
+        self.pair_contacts: Any = None
+        if output == "faces" and self.count is not None:
             self._hit_demand = int(self.count.sum())
             faces = hits.face.numpy()[: min(self._hit_demand, self._hit_room)].reshape(-1, 3)
-            self.faces = faces[np.lexsort((faces[:, 2], faces[:, 1], faces[:, 0]))]
+            self.faces = sort_rows(faces)
 
     def check(self):
         """Raise where anything was lost.
@@ -147,6 +178,10 @@ class Query:
     cores = None  # CPU threads; None is all that the process may use
     parts_max = PARTS_MAX
     stack_room = STACK_LENGTH
+    pairs: wp.array
+    pair_poses: wp.array
+    within: wp.array  # where asked
+    broad_phase: BroadPhase | None
 
     def __init__(
         self,
@@ -171,11 +206,12 @@ class Query:
         self.scene = scene
         self.output = output
         self.precision = precision
-        self.arrays = scene.arrays()
+        self.arrays: tuple[ModelArrays, StateArrays, ObjectArrays] = scene.arrays()
         self.device = scene.device
         self.broad_phase = None
         if pairs is None:
-            self.broad_phase = BroadPhase(*self.arrays, scene.excluded_keys(), pair_capacity)
+            models, states, objects = self.arrays
+            self.broad_phase = BroadPhase(models, states, objects, scene.excluded_keys(), pair_capacity)
             self.pairs, self.pair_count = self.broad_phase.pairs, self.broad_phase.pair_count
         else:
             self.pair_count = wp.zeros(1, dtype=wp.int32, device=self.device)
