@@ -15,7 +15,23 @@ import warp as wp
 
 import warp_abtree as ab
 
-from . import budget, build, cascade, exact, frame, memory, peers, plots, precision, query, scale, study, sweep, update
+from . import (
+    budget,
+    build,
+    cascade,
+    exact,
+    frame,
+    memory,
+    peers,
+    plots,
+    precision,
+    query,
+    scale,
+    scaling,
+    study,
+    sweep,
+    update,
+)
 
 CASES = {
     "budget": budget.run,
@@ -28,6 +44,7 @@ CASES = {
     "precision": precision.run,
     "query": query.run,
     "scale": scale.run,
+    "scaling": scaling.run,
     "sweep": sweep.run,
     "update": update.run,
 }
@@ -35,7 +52,7 @@ FIGURES = {"build": build.FIGURES, "scale": scale.FIGURES, "update": update.FIGU
 # Cases that take the folder of their figures themselves, and how each draws what it kept there.
 DRAWN = {"budget": budget.draw_saved}
 # What only some cases take, by the name of their argument.
-OPTIONS = ("count", "processes", "quick", "largest", "models")
+OPTIONS = ("count", "devices", "predict", "processes", "quick", "largest", "models")
 
 
 def main(argv=None):
@@ -52,6 +69,8 @@ def main(argv=None):
     parser.add_argument("--plots", metavar="DIR", help="budget, build, scale, update: draw figures there")
     parser.add_argument("--rows", metavar="FILE", help="with --plots: draw what --json wrote, in place of a run")
     parser.add_argument("--count", type=int, help="exact: random pairs; a tenth as many adversarial ones")
+    parser.add_argument("--devices", help="scaling: Warp devices with commas between (cpu,cpu)")
+    parser.add_argument("--predict", metavar="FILE", help="scaling: read what --json wrote, and predict from it")
     parser.add_argument("--processes", type=int, help="exact: processes that run the oracle")
     options = parser.parse_args(argv)
     run = CASES[options.name]

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 
 import warp_abtree as ab
-from warp_abtree import cli, report
+from warp_abtree import cli, doctor, report
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -288,8 +289,8 @@ BAD = [
     (("query", "./face.npz", "ball.obj", "--record", "face.npz"), "face.npz: is read"),
     (("query", "ball.obj", "nan.obj", "--output", "contacts", "--record", "out.npz"), "not finite"),
     (("query", "ball.obj", "ball.obj", "--device", "tpu"), "no device 'tpu'"),
-    (("bench",), "not built yet"),
-    (("view", "--fast"), "not built yet"),
+    (("bench",), "name a benchmark"),
+    (("view", "--fast"), "SCENE_OR_MESHES"),
 ]
 
 
@@ -310,15 +311,88 @@ def test_lost_work_is_status_1(files, capsys, monkeypatch):
 
 
 def test_help_has_examples(capsys):
-    for command in ("info", "build", "query", "run"):
+    for command in ("info", "build", "query", "run", "view", "picture", "bench", "doctor"):
         with pytest.raises(SystemExit) as caught:
             cli.main([command, "--help"])
         assert caught.value.code == 0
         shown = capsys.readouterr().out
-        assert f"examples:\n  warp-abtree {command} " in shown and "--device" in shown
+        assert f"examples:\n  warp-abtree {command}" in shown and "--device" in shown
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    shown = capsys.readouterr().out
+    assert "exit status:\n  0 " in shown and "examples:" in shown
     with pytest.raises(SystemExit):
         cli.main(["--version"])
     assert capsys.readouterr().out == f"warp-abtree {ab.__version__}\n"
+
+
+# doctor, tables and completion.
+
+
+def test_doctor(capsys):
+    found = json.loads(run(capsys, "doctor", "--json")[0])
+    assert [each["device"] for each in found["devices"]] == [device.alias for device in wp.get_devices()]
+    assert found["usable"] is True and all(each["ok"] for each in found["devices"])
+    assert found["warp_abtree"] == ab.__version__ and found["packages"]["numpy"]["version"] == np.__version__
+    assert found["kernel_cache"]["modules"] > 0 and "bunny_tori" in found["scenes"]["names"]
+    shown, errors = run(capsys, "doctor", "--device", "cpu")
+    assert re.search(r"^cpu .*right", shown, re.M) and shown.endswith("usable\n") and not errors
+    assert ("pip install" in shown) == bool(found["install"])
+
+
+def test_doctor_finds_what_is_wrong(capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "_CROSSING", (doctor._CROSSING[0], doctor._CROSSING[0]))
+    shown, _ = run(capsys, "doctor", "--device", "cpu", status=0)  # they touch: still the right counts
+    monkeypatch.setattr(doctor, "_AWAY", (0, 0, 0, 0, 0, 0, 1))
+    shown, _ = run(capsys, "doctor", "--device", "cpu", status=1)
+    assert "a wrong answer: [1, 1, 1]" in shown and shown.endswith("not usable as it is\n")
+    monkeypatch.setattr(doctor, "CORE", {"warp-lang": "999"})
+    monkeypatch.setattr(doctor, "EXTRAS", {"view": ("to see", {"numpy": "", "no-such-thing": "2.1", "trimesh": "999"})})
+    found = json.loads(run(capsys, "doctor", "--json", "--device", "cpu", status=1)[0])
+    assert found["install"] == ["no-such-thing>=2.1", "trimesh>=999"] and found["packages"]["warp-lang"]["ok"] is False
+    assert found["extras"]["view"]["ok"] is False and found["extras"]["view"]["packages"]["numpy"]["ok"] is True
+
+
+def test_doctor_knows_the_extras():
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    extras = set(re.findall(r"^(\w+) = \[", text.split("optional-dependencies]")[1].split("\n[")[0], re.M))
+    assert set(doctor.EXTRAS) == extras - {"bench", "docs", "test", "dev"}
+    for extra, (_, packages) in doctor.EXTRAS.items():
+        line = re.search(rf"^{extra} = \[(.*)\]$", text, re.M)[1]
+        wanted = [item.split(";")[0].strip() for item in re.findall(r'"([^"]*)"', line)]
+        assert wanted == [f"{name}>={least}" if least else name for name, least in packages.items()]
+    wanted = re.search(r"^dependencies = \[(.*)\]$", text, re.M)[1]
+    assert [f"{name}>={least}" if least else name for name, least in doctor.CORE.items()] == re.findall(
+        '"(.*?)"', wanted
+    )
+
+
+def test_tables_on_a_terminal(monkeypatch):
+    pytest.importorskip("rich")
+
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    rows = [["stage [ms]", "mean"], ["a [b]", "1.0"], ["c", "20.0"]]
+    monkeypatch.setenv("TERM", "xterm")
+    for columns, headed in (("80", True), ("12", False)):
+        monkeypatch.setenv("COLUMNS", columns)
+        monkeypatch.setattr(sys, "stdout", Terminal())
+        report.print_table(rows)
+        shown = re.sub(r"\x1b\[[\d;]*m", "", sys.stdout.getvalue())
+        assert "stage [ms]" in shown and "a [b]" in shown and ("─" in shown) is headed
+
+
+def test_completion(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert "pip install shtab" in run(capsys, "--print-completion", "bash", status=2)[1][0]
+    monkeypatch.undo()
+    pytest.importorskip("shtab")
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["--print-completion", "bash"])
+    shown = capsys.readouterr().out
+    assert not caught.value.code and "--lod-a" in shown and "doctor" in shown and "compgen" in shown
 
 
 # As people start it.
@@ -361,4 +435,4 @@ def test_readme_commands_exist():
         assert cli.make_parser().parse_args(command).command == command[0]
         for word in command:
             assert not word.startswith("scenes/") or (ROOT / word).is_file()
-    assert len(lines) == 6
+    assert len(lines) >= 6

@@ -106,7 +106,6 @@ def test_a_recorded_run_runs_again(files, capsys, device):
     first = json.loads(run(capsys, "run", "run.npz", "--json", "--record", "rows.json")[0])
     again = json.loads(run(capsys, "run", "run.npz", "--json", "--record", "rows.csv")[0])
     assert (first.pop("written"), again.pop("written")) == (["rows.json"], ["rows.csv"])
-    assert (first.pop("written"), again.pop("written")) == (["rows.json"], ["rows.csv"])
     assert first == again and first["replay"] == "run.npz" and first["budget_ms"] == 2
     rows = json.loads(Path("rows.json").read_text())
     with np.load("run.npz") as file:

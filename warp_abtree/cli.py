@@ -1,4 +1,4 @@
-"""The command line: ``warp-abtree info|build|query|run|bench|view``.
+"""The command line: ``warp-abtree info|build|query|run|view|picture|bench|doctor``.
 
 Exit status 0 when done, 2 with one line on stderr for bad input, 1 where work was lost or a device failed.
 """
@@ -6,7 +6,6 @@ Exit status 0 when done, 2 with one line on stderr for bad input, 1 where work w
 import argparse
 import gc
 import os
-import re
 import sys
 import time
 from pathlib import Path
@@ -14,23 +13,37 @@ from pathlib import Path
 import numpy as np
 
 import warp_abtree as ab
-from warp_abtree import Model, Scene, describe_mesh, load_mesh, load_scene, report, resolve_lod
+from warp_abtree import (
+    Model,
+    Scene,
+    bench_command,
+    describe_mesh,
+    doctor,
+    load_mesh,
+    load_scene,
+    picture,
+    report,
+    resolve_lod,
+    sweep_command,
+    view,
+)
+from warp_abtree.cli_arguments import (
+    MESHES,
+    PROGRAM,
+    STATUS,
+    Parser,
+    PrintCompletion,
+    add_query_arguments,
+    add_run_arguments,
+    examples_of,
+    milliseconds,
+    positive,
+    shield_numbers,
+)
 from warp_abtree.recording import Recording, record_run
-from warp_abtree.scene_control import CONTROLLERS
 from warp_abtree.waiting import Progress, compile_notice, start_warp
 
-PROGRAM = "warp-abtree"
 PLOT_NAME = "frames.png"
-NOT_BUILT = {
-    "bench": "bench is not built yet; `python -m bench` in a checkout has what there is",
-    "view": "view is not built yet; `run SCENE --picture PNG` draws a scene",
-}
-_NEGATIVE = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|^-(inf|nan)$")
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message):
-        raise ValueError(f"{message} (see {self.prog} --help)")
 
 
 # Commands.
@@ -106,7 +119,7 @@ def query(options, progress):
     scene.intersect(pair, **asked)  # loads the kernels, so that the time below is the query's
     begin = time.perf_counter()
     found = scene.intersect(pair, **asked)
-    milliseconds = 1e3 * (time.perf_counter() - begin)
+    spent = 1e3 * (time.perf_counter() - begin)
     bound = sum(model.error_at(lod) for model, lod in zip(models, lods))
     result = {
         "intersects": bool(found.any[0]),
@@ -116,7 +129,7 @@ def query(options, progress):
         "active_faces": [_active(model, lod) for model, lod in zip(models, lods)],
         "node_tests": int(found.node_tests[0]),
         "triangle_tests": int(found.triangle_tests[0]),
-        "milliseconds": milliseconds,
+        "milliseconds": spent,
         "device": str(scene.device),
         "precision": options.precision,
     }
@@ -127,6 +140,7 @@ def query(options, progress):
         result["pair_contacts"] = found.pair_contacts[0]
     if options.record:
         report.record_found(found, options.record)
+        result["written"] = [str(options.record)]
     if options.json:
         report.print_json(result)
         return
@@ -140,7 +154,7 @@ def run(options, progress):
     again = str(options.scene).lower().endswith(".npz")
     _check_run(options, again)
     replay = Recording.open(options.scene) if again else None
-    if again:
+    if replay is not None:
         device = options.device or replay.settings["device"]
         loaded = replay.load_scene(options.scene, device=device, progress=progress)
         frames = len(replay.rows) if options.frames is None else options.frames
@@ -163,7 +177,7 @@ def run(options, progress):
         **asked,
     )
     progress.close()
-    different = replay.difference(recording) if again else None
+    different = None if replay is None else replay.difference(recording)
     if different:
         raise RuntimeError(f"{options.scene}: {different}")
     written = _write_run(options, loaded, frame, recording)
@@ -179,6 +193,7 @@ def run(options, progress):
         "worlds": len(np.unique(loaded.worlds[loaded.worlds >= 0])),
         "controller": recording.settings["controller"],
         "replay": str(options.scene) if again else None,
+        "written": [str(path) for path in written],
         **frame.summary(),
     }
     if options.json:
@@ -232,50 +247,31 @@ def _write_run(options, loaded, frame, recording):
     return list(filter(None, (options.record, options.picture, options.plot and options.plot / PLOT_NAME)))
 
 
-# Arguments.
-
-
-def _positive(text):
-    try:
-        value = int(text)
-    except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 1")
-    return value
-
-
-def _milliseconds(text):
-    match = re.fullmatch(r"\s*([\d.eE+-]+)\s*(ms|s)?\s*", text)
-    try:
-        value = float(match[1]) * (1e3 if match[2] == "s" else 1.0)
-    except (TypeError, ValueError):
-        value = 0.0
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is no time above 0, as 8ms or 0.008s")
-    return value
+# The parser.
 
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
-    parser = _Parser(
+    parser = Parser(
         prog=PROGRAM,
         description="Mesh-mesh interference queries at any level of detail (LOD), in batches, on CUDA or the CPU.",
-        epilog=f"examples:\n  {PROGRAM} info cow.obj\n  {PROGRAM} run scenes/bunny_tori.toml --picture bunny_tori.png",
+        epilog=f"examples:\n  {PROGRAM} doctor\n  {PROGRAM} info cow.obj\n"
+        f"  {PROGRAM} run bunny_tori --picture bunny_tori.png\n\n{STATUS}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {ab.__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
+    shells = ("bash", "zsh", "tcsh", "fish")
+    parser.add_argument(
+        "--print-completion", action=PrintCompletion, choices=shells, help="print the completion script of a shell"
+    )
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
 
     def command(name, function, summary, *examples):
-        epilog = (
-            "examples:\n" + "\n".join(f"  {PROGRAM} {name} {example}" for example in examples) if examples else None
-        )
         sub = commands.add_parser(
             name,
             help=summary,
             description=summary[0].upper() + summary[1:] + ".",
-            epilog=epilog,
+            epilog=examples_of(name, examples),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         sub.set_defaults(function=function)
@@ -283,14 +279,13 @@ def make_parser() -> argparse.ArgumentParser:
         sub.add_argument("--json", action="store_true", help="print JSON")
         return sub
 
-    meshes = 'a mesh file, gzipped or not, or "warp:bunny", "warp:bear", "warp:rocks"'
     sub = command("info", info, "say what a mesh holds and what is odd about it", "cow.obj", "warp:bunny --json")
-    sub.add_argument("mesh", metavar="MESH", help=meshes)
+    sub.add_argument("mesh", metavar="MESH", help=MESHES)
 
     sub = command("build", build, "build a model from a mesh and save it", "cow.obj cow.npz --base-faces 100")
-    sub.add_argument("mesh", metavar="MESH", help=meshes)
+    sub.add_argument("mesh", metavar="MESH", help=MESHES)
     sub.add_argument("out", metavar="OUT.npz", type=Path, help="file to write")
-    sub.add_argument("--base-faces", type=_positive, default=10, metavar="N", help="faces of the coarsest LOD (10)")
+    sub.add_argument("--base-faces", type=positive, default=10, metavar="N", help="faces of the coarsest LOD (10)")
 
     sub = command(
         "query",
@@ -300,54 +295,23 @@ def make_parser() -> argparse.ArgumentParser:
         "cow.npz cow.npz --pose -0.5 0 0 0 0 0 1 --lod-a 0.25 --lod-b tol:0.01 --output faces --json",
         "cow.npz cow.npz --pose 0.2 0 0 0 0 0 1 --output contacts --record contacts.csv",
     )
-    wish = "LOD: a number with a dot is a part of the faces in (0, 1], a whole number a LOD, or tol:X, finest, coarsest"
-    sub.add_argument("a", metavar="A", help=f"{meshes}, or a model that build wrote (.npz)")
-    sub.add_argument("b", metavar="B", help="the same")
-    sub.add_argument(
-        "--pose",
-        nargs=7,
-        type=float,
-        default=[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
-        metavar=("X", "Y", "Z", "QX", "QY", "QZ", "QW"),
-        help="pose of B in the frame of A: position and unit quaternion (0 0 0 0 0 0 1)",
-    )
-    sub.add_argument("--lod-a", default="finest", metavar="LOD", help=f"{wish} (finest)")
-    sub.add_argument("--lod-b", default="finest", metavar="LOD", help="the same for B (finest)")
-    sub.add_argument(
-        "--output", choices=("any", "count", "faces", "contacts"), default="count", help="what to ask (count)"
-    )
-    sub.add_argument(
-        "--precision",
-        choices=("exact", "float64", "float32"),
-        default="exact",
-        help="signs of determinants: exact, or of the rounded ones (exact)",
-    )
-    sub.add_argument(
-        "--record", type=Path, metavar="FILE", help="write face pairs and contacts as .csv, all that is asked as .npz"
-    )
-
+    add_query_arguments(sub)
     sub = command(
         "run",
         run,
-        "run a scene file frame by frame and time its stages",
-        "scenes/bunny_tori.toml --picture bunny_tori.png",
+        "run a scene frame by frame and time its stages",
+        "bunny_tori --picture bunny_tori.png",
         "scenes/herd.toml --frames 10 --device cpu --record herd.csv",
-        "scenes/rain.toml --budget 8ms --controller paper --plot plots --record rain.npz",
+        "rain --budget 8ms --controller paper --plot plots --record rain.npz",
         "rain.npz",
     )
-    sub.add_argument("scene", metavar="SCENE", help="scene file (.toml), or a recorded run (.npz), which runs again")
-    sub.add_argument("--frames", type=_positive, metavar="N", help="frames to run (the scene's own number)")
-    sub.add_argument("--picture", type=Path, metavar="PNG", help="draw the scene, intersecting faces coloured")
-    sub.add_argument("--objects", type=_positive, metavar="N", help="about so many objects, by other counts or worlds")
-    sub.add_argument("--budget", type=_milliseconds, metavar="TIME", help="time of a frame to hold, as 8ms or 0.008s")
-    sub.add_argument("--controller", choices=CONTROLLERS, help="what chooses LODs (the scene's own, or predictive)")
-    sub.add_argument(
-        "--record", type=Path, metavar="FILE", help="write a row a frame, .csv or .json; .npz holds all and runs again"
-    )
-    sub.add_argument("--plot", type=Path, metavar="DIR", help="draw LODs, times and error over the frames there")
-
-    command("bench", None, "benchmarks (not built yet)")
-    command("view", None, "look at a scene (not built yet)")
+    add_run_arguments(sub)
+    command("bench", None, bench_command.SUMMARY, *bench_command.EXAMPLES)
+    view.add_arguments(command("view", view.view, view.SUMMARY, *view.EXAMPLES), positive, milliseconds)
+    picture.add_arguments(command("picture", picture.picture, picture.SUMMARY, *picture.EXAMPLES), positive)
+    about = sweep_command.SUMMARY, *sweep_command.EXAMPLES
+    sweep_command.add_arguments(command("sweep", sweep_command.sweep, *about), positive)
+    command("doctor", doctor.doctor, doctor.SUMMARY, *doctor.EXAMPLES)
     return parser
 
 
@@ -360,27 +324,27 @@ def main(argv=None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     progress = Progress()
     try:
-        # argparse takes -1e-3 for an option; with a blank before it, it is a number.
-        options, rest = make_parser().parse_known_args([f" {text}" if _NEGATIVE.match(text) else text for text in argv])
-        if options.command in NOT_BUILT:
-            raise ValueError(NOT_BUILT[options.command])
+        if argv[:1] == ["bench"] and argv[1:] not in (["-h"], ["--help"]):
+            start_warp()
+            return bench_command.bench(argv[1:])
+        options, rest = make_parser().parse_known_args(shield_numbers(argv))
         if rest:
             raise ValueError(f"unrecognized arguments: {' '.join(rest)} (see {PROGRAM} {options.command} --help)")
         start_warp()
         with compile_notice():
-            options.function(options, progress)
+            status = options.function(options, progress) or 0
         sys.stdout.flush()
     except BrokenPipeError:
         # The reader went away; Python must not complain once more when it closes stdout.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (ValueError, OSError, NotImplementedError, MemoryError) as error:
+    except (ValueError, OSError, MemoryError) as error:
         return _fail(progress, error, 2)
     except RuntimeError as error:  # work was lost, or the device failed
         return _fail(progress, error, 1)
     except KeyboardInterrupt:
         return _fail(progress, "interrupted", 130)
-    return 0
+    return status
 
 
 def _fail(progress, error, status):

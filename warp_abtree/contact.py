@@ -111,6 +111,10 @@ class ContactQuery(Query):
     """
 
     key_bits = 63  # of a sort key; an object pair and two faces that take more are sorted in two passes
+    faces: wp.array
+    start: wp.array
+    _key: wp.array
+    _order: wp.array
     _places = 0
 
     def __init__(

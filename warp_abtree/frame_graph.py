@@ -1,5 +1,7 @@
 """One frame without the host: poses and LODs in, results out, all on the device, as one graph to capture."""
 
+from functools import partial
+
 import numpy as np
 import warp as wp
 
@@ -150,10 +152,8 @@ class FrameGraph:
         self._demand = wp.empty(3, dtype=wp.int64, device=self.device)
         options = {"pairs": pairs, "capacity": capacity, "pair_capacity": pair_capacity, "precision": precision}
         options |= {"within": within, "unsure_capacity": unsure_capacity}
-        if output == "contacts":
-            self.query = ContactQuery(posed, **options)
-        else:
-            self.query = Query(posed, output, **options)
+        asked: type[Query] | partial = ContactQuery if output == "contacts" else partial(Query, output=output)
+        self.query: Query = asked(posed, **options)
         # Loads the kernels and builds the broad phase's tree, which a capture cannot.
         self.launch()
         self.clear_faults()

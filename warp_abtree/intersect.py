@@ -175,7 +175,7 @@ class Query:
         near: As `hits` for `within`: any_hit is 0 where a pair is proved apart; None without within.
     """
 
-    cores = None  # CPU threads; None is all that the process may use
+    cores: int | None = None  # CPU threads; None is all that the process may use
     parts_max = PARTS_MAX
     stack_room = STACK_LENGTH
     pairs: wp.array

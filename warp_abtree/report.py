@@ -4,6 +4,7 @@ import csv
 import json
 import math
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ def plain(value):
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
     if isinstance(value, np.void):
-        return {name: plain(value[name]) for name in value.dtype.names}
+        return {name: plain(value[name]) for name in value.dtype.names or ()}
     if isinstance(value, np.ndarray):
         return [plain(entry) for entry in value]
     if isinstance(value, np.generic):
@@ -47,12 +48,41 @@ def print_json(value):
 # Text.
 
 
-def print_table(rows):
-    """Print rows of texts: the first column to the left, the others to the right."""
+def print_table(rows, left=1):
+    """Print rows of texts, the first of them headings; on a terminal by rich, where it is installed.
+
+    Args:
+        left: How many columns stand to the left; the others stand to the right.
+    """
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    if sys.stdout.isatty() and _print_rich_table(rows, left, sum(widths) + 3 * len(widths)):
+        return
     for row in rows:
-        cells = [cell.ljust(width) if i == 0 else cell.rjust(width) for i, (cell, width) in enumerate(zip(row, widths))]
+        cells = [
+            cell.ljust(width) if i < left else cell.rjust(width) for i, (cell, width) in enumerate(zip(row, widths))
+        ]
         print("  ".join(cells).rstrip())
+
+
+def _print_rich_table(rows, left, width) -> bool:
+    """Print a table by rich; return whether that was done: a table wider than the terminal would lose its ends."""
+    try:
+        from rich import box
+        from rich.console import Console
+        from rich.table import Table
+        from rich.text import Text
+    except ImportError:
+        return False
+    console = Console()
+    if width > console.width:
+        return False
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for i, heading in enumerate(rows[0]):
+        table.add_column(Text(heading), justify="left" if i < left else "right", no_wrap=True)
+    for row in rows[1:]:
+        table.add_row(*(Text(cell) for cell in row))
+    console.print(table)
+    return True
 
 
 def print_info(found):

@@ -254,8 +254,8 @@ class Scene:
             )
         same = pairs[:, 0] == pairs[:, 1]
         if same.any():
-            bad = int(same.argmax())
-            raise ValueError(f"pairs: pair {bad} pairs object {pairs[bad, 0]} with itself")
+            first = int(same.argmax())
+            raise ValueError(f"pairs: pair {first} pairs object {pairs[first, 0]} with itself")
         return pairs.astype(np.int32)
 
     def filter(self, pairs):

@@ -98,6 +98,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -108,11 +109,11 @@ from warp_abtree.scene_control import (
     CameraPath,
     DynamicsSettings,
     LodControl,
-    load_kernels,
     read_camera,
     read_dynamics,
     read_lod,
 )
+from warp_abtree.scene_folder import find_scene, scene_names
 from warp_abtree.scene_keys import Keys, SceneError
 from warp_abtree.scene_models import read_model
 
@@ -365,7 +366,6 @@ class SceneFile:
             lods = self.lods_at
         motion = self.motion
         if self.dynamics is not None:
-            load_kernels(self.scene.device)
             bodies = self.make_bodies() if bodies is None else bodies
             motion = bodies.motion(self.motion)
         frame = Frame(self.scene, motion, lods, output=output, time_step=self.time_step, **options)
@@ -381,6 +381,9 @@ def _read_toml(path: Path, text):
     try:
         text = path.read_bytes().decode() if text is None else text
         return text, tomllib.loads(text)
+    except FileNotFoundError as error:
+        known = ", ".join(scene_names())
+        raise SceneError(f"{path}: {error.strerror}; scenes that come with the package: {known}") from None
     except OSError as error:
         raise SceneError(f"{path}: {error.strerror or error}") from None
     except ValueError as error:  # bytes that are no UTF-8 among them
@@ -391,7 +394,8 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
     """Read a scene file, build its models and place its objects.
 
     Args:
-        path: TOML file; the module docstring of `warp_abtree.scene_file` lists its keys.
+        path: TOML file; the module docstring of `warp_abtree.scene_file` lists its keys. Or the name of a scene that
+            comes with the package, such as "bunny_tori".
         device: Warp device; None for Warp's default.
         progress: Called as progress(stage, done, total) during long builds.
         objects: About so many objects in all: every `worlds`, or else `count`, of the file is multiplied by the same
@@ -402,7 +406,7 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
         SceneError: The file is missing or wrong; nothing is left half done.
         ValueError: No such device on this machine.
     """
-    path = Path(path)
+    path = find_scene(path)
     scene = Scene(device=device)
     text, tree = _read_toml(path, text)
     top = Keys(path, "", tree)
@@ -435,10 +439,12 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
     owners = _add_objects(scene, rows, models)
     worlds = np.concatenate([row.world for row in rows])
     sweeps = [_make_sweep(wish, models, owners) for wish in wishes]
+    given: dict[str, Any] = {"path": path, "title": title, "text": text, "objects": objects, "frames": frames}
+    given |= {"time_step": time_step, "camera": camera, "control": control, "dynamics": dynamics}
+    given |= {"models": models, "scene": scene, "motion": motion, "worlds": worlds, "sweeps": sweeps}
     loaded = SceneFile(
-        **{"path": path, "title": title, "text": text, "objects": objects, "frames": frames, "time_step": time_step},
-        **{"models": models, "scene": scene, "motion": motion, "worlds": worlds, "sweeps": sweeps, "picture": picture},
-        **{"camera": camera, "control": control, "dynamics": dynamics},
+        **given,
+        picture=picture,
         base_lods=scene.lods.astype(np.int64),
         kinematic=np.concatenate([row.kinematic for row in rows]),
         body={name: np.concatenate([row.body[name] for row in rows]) for name in BODY},

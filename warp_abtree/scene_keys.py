@@ -1,6 +1,7 @@
 """Keys of scene files: what a value may be, and tables that name the file and the key where something is wrong."""
 
 import math
+from typing import NoReturn
 
 import numpy as np
 
@@ -107,7 +108,7 @@ class Keys:
     def at(self, key):
         return ".".join(part for part in (self.where, key) if part) or "the file"
 
-    def fail(self, key, message):
+    def fail(self, key, message) -> NoReturn:
         """Raise SceneError about a key, or about the table itself where key is None."""
         raise SceneError(f"{self.path}: {self.at(key)}: {message}") from None
 

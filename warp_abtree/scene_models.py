@@ -3,6 +3,7 @@
 import importlib.util
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -152,7 +153,7 @@ def _find_source(names, folder, has_shape):
     return names[-1] if names[-1].startswith("warp:") else folder / names[-1]
 
 
-def read_model(keys, name, folder: Path):
+def read_model(keys: keys_of.Keys, name, folder: Path):
     """Check [models.NAME] and return a function of progress that builds the `Model`."""
     mesh_names, shape = keys.take("mesh", keys_of.one_or_list(keys_of.text), []), keys.take("shape", keys_of.text, None)
     if not mesh_names and shape is None:
@@ -172,7 +173,7 @@ def read_model(keys, name, folder: Path):
         source = _find_source(mesh_names, folder, shape is not None)
         try:
             if source is None:
-                made = OWN.get(shape) or getattr(trimesh.creation, shape)
+                made: Any = OWN.get(shape) or getattr(trimesh.creation, shape)
                 article = "an" if shape[0] in "aeiou" else "a"
                 title = f"{name} ({article} {shape})" if mesh_names else name
                 return load_mesh(made(**parameters), name=title)
@@ -207,4 +208,5 @@ def _bring_to(mesh, faces, progress):
     if rounds:
         vertices, corners = trimesh.remesh.subdivide_loop(vertices, corners, iterations=rounds)
     model = Model.load(mesh_from_arrays(vertices, corners, name=mesh.name), base_faces=faces, progress=progress)
-    return mesh_from_arrays(*model.mesh_at(0)[:2], name=mesh.name)
+    vertices, corners, _ = model.mesh_at(0)
+    return mesh_from_arrays(vertices, corners, name=mesh.name)

@@ -12,8 +12,27 @@ import warp as wp
 NOTICE_DELAY = 1.5  # seconds of compiling before a word about it
 
 
+def _start_bar(stage):
+    """Return a bar of rich on stderr that runs, and its task; None where rich is not installed."""
+    try:
+        from rich import progress
+        from rich.console import Console
+    except ImportError:
+        return None
+    columns = progress.TextColumn("{task.description}"), progress.BarColumn(), progress.TaskProgressColumn()
+    # No thread of its own redraws it: that would take time from frames that are being timed.
+    console = Console(stderr=True)
+    bar = progress.Progress(
+        *columns, progress.TimeRemainingColumn(), console=console, transient=True, auto_refresh=False
+    )
+    bar.start()
+    return bar, bar.add_task(stage)
+
+
 class Progress:
     """A bar on stderr: redrawn in place on a terminal, a line a stage otherwise; drawn only once a stage takes long.
+
+    On the terminal of the process rich draws it, where that is installed.
 
     Args:
         stream: Where to write; None for sys.stderr.
@@ -27,6 +46,7 @@ class Progress:
         self.live = self.stream.isatty()
         self.delay, self.clock = delay, clock
         self.stage, self.began, self.shown = None, 0.0, None
+        self._bar = None
 
     def __call__(self, stage, done, total):
         """Show how much of a stage is done."""
@@ -37,10 +57,17 @@ class Progress:
         if now - self.began < self.delay:
             return
         part = min(done / total, 1.0) if total else 1.0
-        if self.live and (self.shown is None or now - self.shown > 0.05 or part == 1.0):
-            bar = "#" * round(self.WIDTH * part)
-            self.stream.write(f"\r{stage:<10} [{bar:<{self.WIDTH}}] {100 * part:3.0f} %")
-        elif not self.live and self.shown is None:
+        if self.live and self.stream is sys.stderr and self.shown is None:
+            self._bar = _start_bar(stage)
+        if self.live and self.shown is not None and now - self.shown <= 0.05 and part < 1.0:
+            return
+        if self._bar is not None:
+            bar, task = self._bar
+            bar.update(task, completed=part, total=1.0, refresh=True)
+        elif self.live:
+            drawn = "#" * round(self.WIDTH * part)
+            self.stream.write(f"\r{stage:<10} [{drawn:<{self.WIDTH}}] {100 * part:3.0f} %")
+        elif self.shown is None:
             self.stream.write(f"{stage} ...\n")
         else:
             return
@@ -49,7 +76,10 @@ class Progress:
 
     def close(self):
         """End the line of the last stage."""
-        if self.live and self.shown is not None:
+        if self._bar is not None:
+            self._bar[0].stop()
+            self._bar = None
+        elif self.live and self.shown is not None:
             self.stream.write("\r\x1b[K")
             self.stream.flush()
         self.stage = self.shown = None

@@ -1,0 +1,241 @@
+"""Scaling over devices through `MultiScene`, the cost model from counters, and what follows for more devices.
+
+Two workloads, both with new poses at every question, sent from the host: a sweep (one object in every world, one more
+in each world, pairs given, yes or no) and worlds (four objects each, broad phase, face pairs counted). Strong: as many
+worlds whatever the number of devices; weak: as many on each device. Times are by the wall clock, all numbers of devices
+in turn, poses in and merged results out; busy is the time of the slowest device by itself. A CPU worker has one core.
+"""
+
+import contextlib
+import json
+import math
+import os
+import tempfile
+import time
+
+import numpy as np
+import warp as wp
+
+import warp_abtree as ab
+
+from .roofline import NODE_BYTES, PAIR_BYTES, TRIANGLE_BYTES
+from .scale import world_poses
+from .shapes import knot, pair_poses
+from .sweep import random_poses
+from .timing import make_runs, summarise, time_rounds, time_wall
+
+SIZES = {
+    "cuda": {"faces": 5000, "sweep": 65536, "worlds": 8192, "repeats": 9, "counts": (256, 1024, 4096), "driver": 2**21},
+    "cpu": {"faces": 2000, "sweep": 8192, "worlds": 512, "repeats": 7, "counts": (64, 256, 512), "driver": 2**20},
+}
+QUICK = {"faces": 300, "sweep": 32, "worlds": 8, "repeats": 1, "counts": (4, 16), "driver": 4096}
+OBJECTS = 4  # a world
+DISTANCES = (0.2, 0.9, 1.6)
+TERMS = ("launch", "pair", "node")
+# Instructions of a face test over those of a box test (docs/performance.md): the two rise together, so that a fit
+# cannot tell them apart.
+TRIANGLE_NODES = 5
+PREDICTED, PREDICTED_POSES = (1, 2, 8, 64, 1000), (10**9, 10**12)
+START_S = 10.0  # of Ray and its workers: assumed, kernels in their cache
+SHARD = 65536
+
+
+def run(device, devices=None, quick=False, predict=None):
+    """Yield the cost model, the rates of a worker and a driver of shards, then a row a workload, way and device count.
+
+    Args:
+        devices: Names with commas between; None is twice the CPU, or `device` alone.
+        predict: File that `--json` wrote: its rows are read, and what they predict is yielded in the place of a run.
+    """
+    if predict is not None:
+        with open(predict) as file:
+            yield from predict_rows(json.load(file)["rows"])
+        return
+    devices = devices.split(",") if devices else [device] if device else ["cpu", "cpu"]
+    first = wp.get_device(devices[0])
+    sizes = QUICK if quick else SIZES["cuda" if first.is_cuda else "cpu"]
+    model = ab.Model.from_arrays(*knot(sizes["faces"]))
+    yield run_cost(first, sizes)
+    yield run_worker(first, model, min(SHARD, sizes["driver"]), sizes["repeats"])
+    yield run_driver(model, sizes["driver"])
+    for processes in (None, True) if first.is_cuda else (None,):
+        for case in ("sweep", "worlds"):
+            for way in ("strong", "weak"):
+                yield from run_scaling(devices, model, case, way, sizes, processes)
+
+
+# The cost model.
+
+
+def run_cost(device, sizes):
+    """Return the row of a fit: time = launch + pairs * pair + (node tests + 5 triangle tests) * node.
+
+    Least squares of relative errors, none of the three below 0, over face counts, distances and numbers of pairs.
+    """
+    counted, times = [], []
+    for faces in (max(100, sizes["faces"] // 8), sizes["faces"]):
+        model = ab.Model.from_arrays(*knot(faces))
+        for distance in DISTANCES:
+            for count in sizes["counts"]:
+                scene = ab.Scene(device)
+                for pose in pair_poses(count, distance):
+                    scene.add(model, pose)
+                query = ab.Query(scene, "count", pairs=np.arange(2 * count).reshape(-1, 2))
+                result = query.run()
+                found = time_rounds(make_runs({"query": query.launch}, device), sizes["repeats"])["query"]
+                counted.append([1.0, count, (result.node_tests + TRIANGLE_NODES * result.triangle_tests).sum()])
+                times.append(np.median(found))
+    counted, times = np.array(counted, np.float64), np.array(times)
+    cost = fit_cost(counted / times[:, None], np.ones(len(times)))
+    off = np.abs(counted @ cost / times - 1)
+    row = {"case": "cost", "device": device.name, "samples": len(times)}
+    row |= {f"{term}_us": float(f"{1e3 * value:.4g}") for term, value in zip(TERMS, cost)}
+    row |= {"pair_in_nodes": round(float(cost[1] / cost[2]), 2) if cost[2] > 0 else None}
+    row |= {"off_mean": round(float(off.mean()), 3), "off_worst": round(float(off.max()), 3)}
+    return row | {"pair_bytes": PAIR_BYTES, "node_bytes": NODE_BYTES, "triangle_bytes": TRIANGLE_BYTES}
+
+
+def fit_cost(rows, values):
+    """Return the coefficients, none below 0, that fit best in least squares; terms that would be are left out."""
+    kept = list(range(rows.shape[1]))
+    while True:
+        found = np.linalg.lstsq(rows[:, kept], values, rcond=None)[0]
+        if (found >= 0).all():
+            cost = np.zeros(rows.shape[1])
+            cost[kept] = found
+            return cost
+        del kept[int(found.argmin())]
+
+
+# Shards: a worker, and the driver.
+
+
+def run_worker(device, model, count, repeats):
+    """Return the row of a shard asked on one device, on the CPU by one core: poses on the host, answers there."""
+    job = ab.SweepJob(model, model, random_poses(count, float(np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())))
+    asker, item = job.asker(), job.item(0, count)
+    kept, ab.Query.cores = ab.Query.cores, 1
+    try:
+        times = time_rounds({"shard": time_wall(lambda: asker.ask(item, device), device)}, repeats)["shard"]
+    finally:
+        ab.Query.cores = kept
+    row = {"case": "worker", "device": device.name, "faces": model.face_count, "poses": count}
+    return row | summarise("shard", times) | {"worker_mposes_s": float(f"{count / np.median(times) / 1e3:.4g}")}
+
+
+class Silent:
+    """A pool that answers at once: what is left is what the driver does, reading poses and writing shards."""
+
+    workers, lost = 1, 0
+
+    def ask(self, job, ranges):
+        for start, stop in ranges:
+            yield start, stop, {"any": np.zeros(len(job.item(start, stop)[1]), bool)}
+
+
+def run_driver(model, count):
+    """Return how many poses a second a driver checks, and reads and writes, with workers that take no time."""
+    with tempfile.TemporaryDirectory() as folder:
+        np.save(f"{folder}/poses.npy", random_poses(count, 1.0))
+        begin = time.perf_counter()
+        job = ab.SweepJob(model, model, f"{folder}/poses.npy", shard=min(SHARD, count))
+        made = time.perf_counter()
+        ab.run_shards(job, f"{folder}/out", pool=Silent())
+        done = time.perf_counter()
+    rates = {"check_mposes_s": count / (made - begin) / 1e6, "driver_mposes_s": count / (done - made) / 1e6}
+    return {"case": "driver", "poses": count} | {name: float(f"{rate:.4g}") for name, rate in rates.items()}
+
+
+# Devices.
+
+
+def fill(scene, model, case, count):
+    """Add the objects of so many worlds; return their poses, a second set of them, and the pairs asked."""
+    size = float(np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())
+    still = np.array([[0.0, 0, 0, 0, 0, 0, 1]])
+    if case == "sweep":
+        poses = [np.concatenate([still, random_poses(count, size, seed)]) for seed in (0, 1)]
+        worlds = np.arange(-1, count)
+        pairs = np.stack([np.zeros(count, int), np.arange(1, count + 1)], 1)
+    else:
+        poses = [world_poses(count, OBJECTS, size, seed).reshape(-1, 7) for seed in (0, 1)]
+        worlds, pairs = np.repeat(np.arange(count), OBJECTS), None
+    for pose, world in zip(poses[0], worlds.tolist()):
+        scene.add(model, pose, world=world)
+    return poses, pairs
+
+
+def run_scaling(devices, model, case, way, sizes, processes):
+    """Yield a row for each number of devices."""
+    output = "any" if case == "sweep" else "count"
+    with contextlib.ExitStack() as stack:
+        runs, scenes, seen = {}, {}, {}
+        for parts in range(1, len(devices) + 1):
+            scene = stack.enter_context(ab.MultiScene(devices[:parts], processes, cores=1))
+            count = sizes[case] * (parts if way == "weak" else 1)
+            poses, pairs = fill(scene, model, case, count)
+            scene.intersect(pairs, output=output)
+            if case == "worlds":
+                scene.balance()
+                scene.intersect(pairs, output=output)
+            runs[parts] = time_question(scene, poses, pairs, output)
+            scenes[parts] = scene
+            scene.set_poses(poses[0])
+            found = scene.intersect(pairs, output=output)
+            seen[parts] = (found.pairs.tobytes(), getattr(found, output).tobytes())
+            if way == "strong" and seen[parts] != seen[1]:
+                raise RuntimeError(f"{case}: {parts} devices answer otherwise than one")
+        times = time_rounds(runs, sizes["repeats"])
+        busy = {parts: max(scene.seconds) for parts, scene in scenes.items()}
+    base = float(np.median(times[1]))
+    for parts, values in times.items():
+        median = float(np.median(values))
+        row = {"case": case, "way": way, "device": wp.get_device(devices[0]).name, "devices": parts}
+        row |= {"asked_by": "processes" if processes or devices[0] == "cpu" else "threads"}
+        row |= {"worlds": sizes[case] * (parts if way == "weak" else 1), "question_ms": round(median, 3)}
+        row |= {"question_p95_ms": round(float(np.percentile(values, 95)), 3), "busy_ms": round(1e3 * busy[parts], 3)}
+        ideal = base / parts if way == "strong" else base
+        yield row | {"efficiency": round(ideal / median, 3), "cores_here": os.cpu_count()}
+
+
+def time_question(scene, poses, pairs, output):
+    """Return a callable that sets other poses, asks, and returns the time [ms]."""
+    turn = [0]
+
+    def question():
+        turn[0] ^= 1
+        begin = time.perf_counter()
+        scene.set_poses(poses[turn[0]])
+        scene.intersect(pairs, output=output)
+        return 1e3 * (time.perf_counter() - begin)
+
+    return question
+
+
+# What follows.
+
+
+def predict_rows(rows):
+    """Yield what measured rows predict for a sweep through shards on more devices, nothing else measured.
+
+    n workers, each with the measured rate r, that share nothing: the time is START_S, poses / (n r), and a last shard
+    for which the others wait. Efficiency is poses / (n r) over that. A driver feeds as many workers as its rate is
+    times r; with more, each driver has a file of poses of its own, and their folders together are the answer.
+    """
+    worker = next(row for row in rows if row["case"] == "worker")
+    driver = next(row for row in rows if row["case"] == "driver")
+    rate, limit = 1e6 * worker["worker_mposes_s"], 1e6 * driver["driver_mposes_s"]
+    for poses in PREDICTED_POSES:
+        for count in PREDICTED:
+            working = poses / (count * rate)
+            total = START_S + working + SHARD / rate
+            yield {
+                "case": "predicted",
+                "device": worker["device"],
+                "poses": poses,
+                "devices": count,
+                "seconds": float(f"{total:.4g}"),
+                "efficiency": round(working / total, 3),
+                "drivers": math.ceil(count * rate / limit),
+                "one_driver_seconds": float(f"{max(total, START_S + poses / limit):.4g}"),
+            }

@@ -1,0 +1,241 @@
+"""python docs/figures.py: draw the pictures of concepts.md anew, from the library itself."""
+
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import trimesh
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+import warp_abtree as ab
+from warp_abtree import picture, plot
+from warp_abtree import view_parts as parts
+
+FOLDER = Path(__file__).parent
+INK, PALE, BLUE, RED, GREEN = "#33373d", "#d5d8dc", "#3b76c4", "#d4472f", "#2f9e58"
+
+# The same file each time it is drawn.
+matplotlib.rcParams.update({"svg.hashsalt": "warp_abtree", "font.size": 9, "svg.fonttype": "none"})
+
+
+def save(figure, name):
+    figure.savefig(FOLDER / name, metadata={"Date": None}, bbox_inches="tight", pad_inches=0.05)
+
+
+def draw_lods():
+    """A bunny at four LODs, with what is certified of each."""
+    model = ab.Model.load("warp:bunny")
+    panels = []
+    for share in (1.0, 0.2, 0.05, 0.01):
+        lod = model.lod_for(fraction=share)
+        vertices, faces, _ = model.mesh_at(lod)
+        error = "the original" if lod == model.lod_max else f"error at most {model.error_at(lod):.2g}"
+        title = f"LOD {lod:,} of {model.lod_max:,}\n{len(faces):,} faces, {error}"
+        panels.append(plot.Panel(title, vertices[faces], np.tile(plot.COLOURS[0][0], (len(faces), 1))))
+    legend = [
+        (
+            plot.COLOURS[0][0],
+            f"bunny; its box has a diagonal of {np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0)):.2g}",
+        )
+    ]
+    plot.draw(
+        panels, FOLDER / "concept_lods.png", "One model, every level of detail", legend, (0.15, 0.3, 1), (0, 1, 0), 300
+    )
+
+
+# The tree.
+
+
+def place_of(node):
+    """Return where a heap node is drawn: its place in its level, and its level."""
+    level = node.bit_length() - 1
+    return (node - (1 << level) + 0.5) / (1 << level), -level
+
+
+def draw_tree(axes, tree, title, marked=()):
+    nodes = [node for node in range(1, len(tree.node_face)) if tree.used[node]]
+    for colour, width, chosen in ((PALE, 0.8, False), (RED, 1.4, True)):
+        ways = [
+            (place_of(node), place_of(node // 2), (np.nan, np.nan))
+            for node in nodes
+            if (node in marked) is chosen and node > 1
+        ]
+        axes.plot(*np.array([point for way in ways for point in way] or [(np.nan, np.nan)]).T, color=colour, lw=width)
+    kinds: dict[tuple, list] = {}
+    for node in nodes:
+        leaf, active = tree.node_face[node] >= 0, tree.status[node] != 0
+        passed = active and not leaf and tree.skip[node] != node
+        colour = RED if node in marked else BLUE if active else PALE
+        kind = ("s" if leaf else "o", colour, "white" if passed or not active else colour)
+        kinds.setdefault(kind, []).append(place_of(node))
+    for (marker, colour, inside), places in kinds.items():
+        axes.plot(*np.array(places).T, marker, ms=4.5 if marker == "s" else 5.5, mec=colour, mfc=inside)
+    axes.set_title(title, loc="left", color=INK)
+    axes.set_axis_off()
+
+
+class TreeAt:
+    """The tree of a model at a LOD, as the device has it."""
+
+    def __init__(self, model, lod):
+        scene = ab.Scene("cpu")
+        scene.add(model, lod=lod)
+        state = scene.tree_state(0)
+        self.status, self.skip, self.node_face = state.status, state.skip, model.tree.node_face
+        self.used = np.zeros(len(self.node_face), bool)
+        for node in state.face_node:
+            while node:
+                self.used[node] = True
+                node //= 2
+
+
+def draw_trees():
+    """An AB-Tree at the original, at a coarser LOD, and what an update between two LODs visits."""
+    model = ab.Model.load(trimesh.creation.torus(1.0, 0.4, 6, 4), base_faces=8)
+    progressive, top = model.progressive, model.lod_max
+    low, high = top // 2 - 1, top // 2
+    changed = progressive.split_face[progressive.split_start[low] : progressive.split_start[high]]
+    marked = set()
+    for node in model.tree.leaf_node[changed].tolist():
+        while node:
+            marked.add(node)
+            node //= 2
+    figure = Figure(figsize=(7.4, 5.6))
+    rows = figure.subplots(3, 1)
+    draw_tree(rows[0], TreeAt(model, top), f"LOD {top}, the original: all {model.face_count} leaves are active")
+    count = len(model.mesh_at(low)[1])
+    draw_tree(rows[1], TreeAt(model, low), f"LOD {low}: {count} active leaves; hollow circles are passed by")
+    title = f"LOD {low} to {high}: {len(set(changed.tolist()))} faces change, {len(marked)} nodes are refitted"
+    draw_tree(rows[2], TreeAt(model, high), title, marked)
+    dot = {"marker": "o", "ls": ""}
+    figure.legend(
+        handles=[
+            Line2D([], [], color=BLUE, marker="s", ls="", label="active leaf, one face"),
+            Line2D([], [], color=BLUE, **dot, label="active"),
+            Line2D([], [], mec=BLUE, mfc="white", **dot, label="active, one active child"),
+            Line2D([], [], mec=PALE, mfc="white", **dot, label="inactive"),
+            Line2D([], [], color=RED, **dot, label="marked and refitted"),
+        ],
+        loc="lower center", ncols=5, frameon=False, handletextpad=0.2, columnspacing=1.2, fontsize=8,
+    )  # fmt: skip
+    save(figure, "concept_tree.svg")
+
+
+# Traversal.
+
+
+def meeting_nodes(states, poses, levels):
+    """Return for each level the pairs of active nodes whose boxes overlap, of those whose parents' do."""
+    turn = [trimesh.transformations.quaternion_matrix(np.roll(pose[3:], 1))[:3, :3] for pose in poses]
+
+    def box(side, node):
+        """Box in the world around a posed node."""
+        lower, upper = states[side].lower[node], states[side].upper[node]
+        middle = turn[side] @ (0.5 * (lower + upper)) + np.asarray(poses[side][:3])
+        half = np.abs(turn[side]) @ (0.5 * (upper - lower))
+        return middle - half, middle + half
+
+    pairs, found = [(1, 1)], []
+    for _ in range(levels):
+        kept = []
+        for a, b in pairs:
+            (low_a, high_a), (low_b, high_b) = box(0, a), box(1, b)
+            if (low_a <= high_b).all() and (low_b <= high_a).all():
+                kept.append((a, b))
+        found.append(kept)
+        children = [
+            [(x, y) for x in (2 * a, 2 * a + 1) for y in (2 * b, 2 * b + 1)]
+            for a, b in kept
+            if 2 * a + 1 < len(states[0].status) and 2 * b + 1 < len(states[1].status)
+        ]
+        pairs = [(a, b) for each in children for a, b in each if states[0].status[a] and states[1].status[b]]
+    return found
+
+
+def draw_traversal():
+    """Two rings, and the nodes that a traversal still holds at some levels."""
+    model = ab.Model.load(trimesh.creation.torus(1.0, 0.3, 48, 24))
+    half = 0.5**0.5
+    poses = [(0, 0, 0, 0, 0, 0, 1), (0.55, 0.1, 0, half, 0, 0, half)]
+    scene = ab.Scene("cpu")
+    for pose in poses:
+        scene.add(model, pose)
+    states = [scene.tree_state(i) for i in (0, 1)]
+    found = meeting_nodes(states, poses, model.tree.depth + 1)
+    count = int(scene.intersect([[0, 1]], output="count").count[0])
+    eye, up = (0.3, 0.5, 1.0), (0, 1, 0)
+    vertices, faces, _ = model.mesh_at(model.lod_max)
+    panels = []
+    corners = [plot.place(pose, vertices)[faces] for pose in poses]
+    camera = plot.Camera.around(np.concatenate(corners).reshape(-1, 3), eye, up)
+    for level in (2, 5, 8):
+        triangles, colours = list(corners), [np.tile(plot.COLOURS[k][0], (len(faces), 1)) for k in (0, 1)]
+        for side in (0, 1):
+            nodes = sorted({pair[side] for pair in found[level]})
+            lines = parts.box_lines(np.stack([states[side].lower[nodes], states[side].upper[nodes]], axis=1))
+            lines = plot.place(poses[side], lines.reshape(-1, 3)).reshape(-1, 2, 3)
+            strips = picture.ribbons(lines, camera, 0.006 * camera.radius)
+            triangles.append(strips)
+            colours.append(np.tile(((0.75, 0.15, 0.1), (0.1, 0.25, 0.7))[side], (len(strips), 1)))
+        title = f"level {level}: {len(found[level]):,} of {4**level:,} pairs of nodes overlap"
+        panels.append(plot.Panel(f"{title}\n", np.concatenate(triangles), np.concatenate(colours)))
+    legend = [((0.75, 0.15, 0.1), "nodes of the first"), ((0.1, 0.25, 0.7), "nodes of the second")]
+    title = f"From two roots to {count:,} intersecting pairs of {len(faces):,} by {len(faces):,} faces"
+    plot.draw(panels, FOLDER / "concept_traversal.png", title, legend, eye, up, 380)
+
+
+# The dials.
+
+
+def draw_dials():
+    """What a coarser LOD saves and costs: tests counted, answers compared, no times."""
+    model = ab.Model.load("warp:bunny")
+    rng = np.random.default_rng(0)
+    poses = np.zeros((400, 7))
+    poses[:, :3] = rng.normal(size=(400, 3))
+    poses[:, :3] *= rng.uniform(0.6, 1.6, (400, 1)) / np.linalg.norm(poses[:, :3], axis=1, keepdims=True)
+    poses[:, 3:] = rng.normal(size=(400, 4))
+    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+    diagonal = np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0))
+    shares = np.array([1, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01, 0.005])
+    rows = []
+    for share in shares:
+        lod = model.lod_for(fraction=share)
+        scene = ab.Scene("cpu")
+        scene.add(model, lod=lod)
+        for pose in poses:
+            scene.add(model, pose, lod=lod)
+        pairs = np.stack([np.zeros(400, int), np.arange(1, 401)], 1)
+        found = scene.intersect(pairs, output="count")
+        tests = int(found.node_tests.sum() + found.triangle_tests.sum())
+        rows.append((model.error_at(lod) / diagonal, tests, found.any))
+    error = 100 * np.array([row[0] for row in rows])
+    tests = 100 * np.array([row[1] for row in rows]) / rows[0][1]
+    wrong = 100 * np.array([np.mean(row[2] != rows[0][2]) for row in rows])
+    figure = Figure(figsize=(7.4, 2.6))
+    left, right = figure.subplots(1, 2)
+    left.plot(100 * shares, tests, "o-", color=BLUE)
+    left.set(ylabel="tests of boxes and faces [%]", ylim=(0, 105))
+    right.plot(100 * shares, error, "o-", color=RED, label="certified error [% of the diagonal]")
+    right.plot(100 * shares, wrong, "s--", color=GREEN, label="answers yes or no that differ [%]")
+    right.set_ylim(bottom=0)
+    right.legend(frameon=False, fontsize=8)
+    for axes in (left, right):
+        axes.set(xscale="log", xlabel="faces [%]", xticks=[100, 10, 1], xticklabels=["100", "10", "1"])
+        axes.invert_xaxis()
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.3)
+    figure.tight_layout(w_pad=3)
+    save(figure, "concept_dials.svg")
+
+
+def main():
+    draw_lods()
+    draw_trees()
+    draw_traversal()
+    draw_dials()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,47 @@
+"""What turns pages that read well in a repository into a site: files and folders that they link to become pages."""
+
+import re
+from pathlib import Path
+
+from mkdocs.structure.files import File, InclusionLevel
+
+ROOT = Path(__file__).resolve().parents[1]
+# [text](../scenes/planning.py), with or without a part of the page.
+LINK = re.compile(r"\]\(\.\./([\w./-]+)(#[\w-]+)?\)")
+LANGUAGES = {".py": "python", ".toml": "toml"}
+
+
+def page_of(path) -> str:
+    """Return the page that shows a file of the repository."""
+    return f"source/{path}.md"
+
+
+def on_files(files, config):
+    """Add a page for each file that the pages link to."""
+    linked = {
+        match[1]
+        for page in files.documentation_pages()
+        for match in LINK.finditer(Path(page.abs_src_path).read_text(encoding="utf-8"))
+    }
+    for path in sorted(linked):
+        text = (ROOT / path).read_text(encoding="utf-8")
+        if not path.endswith(".md"):
+            title = path.rsplit("/", 1)[-1]
+            text = f"# {title}\n\n`{path}`\n\n````{LANGUAGES[Path(path).suffix]}\n{text}````\n"
+        files.append(_generated(config, page_of(path), text))
+    names = sorted(path.name for path in (ROOT / "docs" / "data").glob("*.json"))
+    rows = "\n".join(f"- [{name}]({name})" for name in names)
+    files.append(_generated(config, "data/index.md", f"# Data\n\nThe runs behind the tables:\n\n{rows}\n"))
+    return files
+
+
+def _generated(config, name, content):
+    return File.generated(config, name, content=content, inclusion=InclusionLevel.NOT_IN_NAV)
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Point links to such files, and to the folder of data, at their pages."""
+    if page.file.generated_by:
+        return markdown
+    markdown = markdown.replace("](data)", "](data/index.md)")
+    return LINK.sub(lambda match: f"]({page_of(match[1])}{match[2] or ''})", markdown)

@@ -1,0 +1,52 @@
+"""The pictures of docs/concepts.md: the script draws them, and the numbers in those of the repository still hold."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """Give a folder with all pictures, and the titles of those that are no text."""
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("pxr")
+    spec = importlib.util.spec_from_file_location("figures", DOCS / "figures.py")
+    figures = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(figures)
+    figures.FOLDER = tmp_path_factory.mktemp("figures")
+    titles = {}
+    with pytest.MonkeyPatch.context() as patch:
+
+        def draw(panels, path, title, *_):
+            titles[path.name] = [title, *(panel.title for panel in panels)]
+            path.touch()
+
+        patch.setattr(figures.plot, "draw", draw)  # which tests/test_cli_run.py holds; here what it is given
+        figures.main()
+    return figures.FOLDER, titles
+
+
+def test_all_pictures_of_the_page_are_drawn(drawn):
+    named = re.findall(r"\((concept_[\w.]+)\)", (DOCS / "concepts.md").read_text(encoding="utf-8"))
+    assert sorted(named) == sorted(path.name for path in drawn[0].iterdir()) and len(named) == 4
+    assert sorted(named) == sorted(path.name for path in DOCS.glob("concept_*") if path.suffix in (".png", ".svg"))
+
+
+@pytest.mark.parametrize("name", ["concept_tree.svg", "concept_dials.svg"])
+def test_vector_pictures_say_what_the_library_finds(drawn, name):
+    def words(folder):
+        return re.findall(r"<text[^>]*>([^<]*)</text>", (folder / name).read_text(encoding="utf-8"))
+
+    assert words(drawn[0]) == words(DOCS) and len(words(DOCS)) > 5
+
+
+def test_what_pictures_show(drawn):
+    title, *levels = drawn[1]["concept_traversal.png"]
+    pairs = [int(re.search(r": ([\d,]+) of", level)[1].replace(",", "")) for level in levels]
+    assert int(re.search(r"to (\d+) intersecting", title)[1]) > 50 and pairs == sorted(pairs)
+    _, *lods = drawn[1]["concept_lods.png"]
+    assert "the original" in lods[0] and [("error at most" in lod) for lod in lods] == [False, True, True, True]

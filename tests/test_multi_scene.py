@@ -1,0 +1,219 @@
+"""`MultiScene` against one scene: the same bits however worlds are dealt, and nothing half done where a part fails."""
+
+import itertools
+import os
+import signal
+
+import numpy as np
+import pytest
+from samples import STILL, random_poses, sample
+
+import warp_abtree as ab
+from warp_abtree import multi_scene
+from warp_abtree.intersect import COUNTERS
+
+OUTPUTS = ("any", "count", "faces", "contacts")
+FIELDS = ("pairs", "any", "count", "faces", "contacts", "pair_contacts", "apart")
+
+
+def fill(scene, worlds=7, seed=0):
+    """Add objects of worlds in no order, of two models, and some that are in every world."""
+    rng = np.random.default_rng(seed)
+    models = sample("torus"), sample("small ball")
+    scene.add(models[1], world=-1, static=True)
+    for turn, world in enumerate(rng.permutation(np.repeat(np.arange(worlds), 1 + np.arange(worlds) % 3)).tolist()):
+        model = models[turn % 2]
+        scene.add(model, random_poses(rng, 1, 1.7)[0], 3 * world, [None, 20][turn % 2], static=turn % 4 == 0)
+    matrix = np.eye(4)
+    matrix[:3, 3] = 0.6, 0.1, 0
+    scene.add(models[0], matrix, world=-1)
+    scene.filter([[0, 3]])
+    return scene
+
+
+def counted(device):
+    """Return what repeats from launch to launch: on a GPU the work done for a pair does not."""
+    return (*FIELDS, *COUNTERS) if device == "cpu" else FIELDS
+
+
+def assert_same(found, expected, device):
+    for name in counted(device):
+        ours, theirs = getattr(found, name), getattr(expected, name)
+        assert (ours is None) == (theirs is None), name
+        if theirs is not None:
+            assert ours.dtype == theirs.dtype and ours.shape == theirs.shape, name
+            assert ours.tobytes() == theirs.tobytes(), name
+
+
+def assert_same_answers(many, one, device, outputs=OUTPUTS):
+    for output in outputs:
+        assert_same(many.intersect(output=output), one.intersect(output=output), device)
+
+
+@pytest.mark.parametrize("processes", [True, False])
+def test_same_bits_as_one_scene(device, processes):
+    one = fill(ab.Scene(device))
+    rng = np.random.default_rng(3)
+    with fill(ab.MultiScene([device, device], processes)) as many:
+        np.testing.assert_array_equal(many.broad_phase(), one.broad_phase())
+        expected = one.intersect(output="count")
+        assert 10 < len(expected.pairs) and 5 < expected.any.sum() < len(expected.pairs)
+        assert_same_answers(many, one, device)
+        order = rng.permutation(len(expected.pairs))
+        asked = expected.pairs[order][:, ::-1].copy()  # in another order, named the other way
+        near = rng.uniform(0, 0.5, len(asked))
+        for output in OUTPUTS:
+            asking = {"output": output, "within": near, "contact_dtype": np.float32}
+            assert_same(many.intersect(asked, **asking), one.intersect(asked, **asking), device)
+        assert_same(many.intersect(within=0.3), one.intersect(within=0.3), device)
+        assert_same(many.intersect([], "faces"), one.intersect([], "faces"), device)
+        many.balance()
+        for scene in (many, one):
+            scene.set_poses(random_poses(np.random.default_rng(4), scene.object_count, 0.8))
+            scene.set_lods(scene.lods // 2)
+        assert_same_answers(many, one, device, ["contacts"])
+        for scene in (many, one):
+            scene.add(sample("box"), STILL, world=6)
+            scene.filter([[1, 2], [0, 5]])
+        assert_same_answers(many, one, device, ["faces"])
+        state, other = many.tree_state(5), one.tree_state(5)
+        assert state.lod == other.lod and np.array_equal(state.lower, other.lower)
+
+
+def test_worlds_are_all_dealt_and_every_part_has_some(device):
+    with fill(ab.MultiScene([device] * 3, processes=False)) as many:
+        many.intersect()
+        world = np.array(many._ledger._world)
+        own = [set(world[rows][world[rows] >= 0].tolist()) for rows in many._members]
+        assert all(own) and sorted(itertools.chain(*own)) == sorted(set(world[world >= 0].tolist()))
+        for rows in many._members:
+            assert {0, many.object_count - 1} <= set(rows.tolist())  # of world -1
+
+
+@pytest.mark.parametrize("speeds", [(1.0, 1.0), (1.0, 2.5)])
+def test_worlds_are_dealt_evenly_by_measured_work(speeds):
+    """Against the best of all deals: longest first is never worse by more than a third on equal devices."""
+    rng = np.random.default_rng(1)
+    many = ab.MultiScene(["cpu", "cpu"], processes=False)
+    for world in range(9):
+        many.add(sample("box"), world=world)
+    many._cost = dict(enumerate(rng.uniform(1, 20, 9).tolist()))
+    many._speed = np.array(speeds)
+    times = many._deal()
+    cost, total = np.array(list(many._cost.values())), np.zeros(2)
+    for world, part in many._part_of.items():
+        total[part] += cost[world] / speeds[part]
+    np.testing.assert_allclose(times, total)
+    deals = (np.array(deal) for deal in itertools.product((0, 1), repeat=9))
+    best = min(max(cost[deal == 0].sum() / speeds[0], cost[deal == 1].sum() / speeds[1]) for deal in deals)
+    assert best <= times.max() <= 7 / 6 * best
+
+
+def test_balance_takes_the_counters(device):
+    """Worlds in contact cost more than worlds apart, however many faces they have."""
+    with ab.MultiScene([device, device], processes=False) as many:
+        with pytest.raises(ValueError, match="nothing is measured yet"):
+            many.balance()
+        for world in range(6):
+            for x in (0.0, 0.3 if world in (0, 2) else 50.0):
+                many.add(sample("torus"), (x, 0, 0, 0, 0, 0, 1), world=world)
+        pairs = np.arange(12).reshape(6, 2)
+        result = many.intersect(pairs, output="count")
+        assert set(np.flatnonzero(result.any)) == {0, 2}
+        assert many._part_of[0] == many._part_of[2]  # of equal size: dealt in turn
+        many.balance()
+        assert many._part_of[0] != many._part_of[2]
+        expected = result.count
+        np.testing.assert_array_equal(many.intersect(pairs, output="count").count, expected)
+
+
+def test_a_worker_that_ends_changes_nothing():
+    one = fill(ab.Scene("cpu"))
+    with fill(ab.MultiScene(["cpu", "cpu"])) as many:
+        assert_same_answers(many, one, "cpu", ["faces"])
+        os.kill(many._carriers[1].process.pid, signal.SIGKILL)
+        with pytest.raises(RuntimeError, match="worker 1 on cpu ended with exit code -9; nothing was changed"):
+            many.set_poses(random_poses(np.random.default_rng(9), many.object_count, 0.3))
+        assert_same_answers(many, one, "cpu", ["faces"])
+        workers = [carrier.process for carrier in many._carriers]
+    assert all(not worker.is_alive() for worker in workers)
+    with pytest.raises(RuntimeError, match="closed"):
+        many.intersect()
+
+
+@pytest.mark.parametrize("error", [MemoryError("no room"), KeyboardInterrupt()])
+def test_a_part_that_fails_changes_nothing(device, monkeypatch, error):
+    one = fill(ab.Scene(device))
+    with fill(ab.MultiScene([device, device], processes=False)) as many:
+        assert_same_answers(many, one, device, ["faces"])
+        broken, before = many._carriers[1], many.lods
+        if isinstance(error, Exception):
+            monkeypatch.setattr(broken.part, "set_lods", lambda lods: (_ for _ in ()).throw(error))
+        else:
+            monkeypatch.setattr(broken, "finish", lambda: (_ for _ in ()).throw(error))
+        with pytest.raises(type(error)):
+            many.set_lods(many.lods // 3)
+        np.testing.assert_array_equal(many.lods, before)
+        monkeypatch.undo()
+        assert_same_answers(many, one, device, ["faces"])
+
+
+def test_bad_input_is_refused_before_anything_is_sent(device, monkeypatch):
+    with fill(ab.MultiScene([device, device], processes=False)) as many:
+        many.intersect()
+        monkeypatch.setattr(many, "_ask", lambda *_: pytest.fail("was sent"))
+        n = many.object_count
+        poses = np.tile(np.array(STILL), (n, 1))
+        bad = poses.copy()
+        bad[4, 2] = np.nan
+        world = np.array(many._ledger._world)
+        mixed = [[int(np.flatnonzero(world == 0)[0]), int(np.flatnonzero(world == 3)[0])]]
+        for call, what in (
+            (lambda: many.set_poses(poses[1:]), f"{n - 1} given for {n} objects"),
+            (lambda: many.set_poses(bad), "pose 4 is not finite"),
+            (lambda: many.set_lods(np.full(n, 10**6)), "object 0 asks for LOD 1000000, outside"),
+            (lambda: many.set_lods(np.full(n, 0.5)), "no whole numbers"),
+            (lambda: many.intersect(mixed), "pair 0 is of the worlds 0 and 3"),
+            (lambda: many.intersect([[0, n]]), f"the scene has {n} objects"),
+            (lambda: many.intersect(output="some"), "output 'some'"),
+            (lambda: many.intersect(within=-1.0), "within"),
+            (lambda: many.tree_state(n), f"object {n} is outside"),
+            (lambda: many.add(sample("box"), world=-2), "world -2 is outside"),
+        ):
+            with pytest.raises(ValueError, match=what):
+                call()
+        with pytest.raises(TypeError, match="not a Model"):
+            many.add("box")
+        assert many.object_count == n
+
+
+def test_devices():
+    with pytest.raises(ValueError, match="devices: none given"):
+        ab.MultiScene([])
+    with pytest.raises(ValueError, match="no device 'cuda:77'"):
+        ab.MultiScene(["cpu", "cuda:77"])
+    with pytest.raises(ValueError, match="the scene has no object"):
+        ab.MultiScene(["cpu"], processes=False).intersect()
+    assert ab.MultiScene().devices
+
+
+def test_objects_in_every_world_alone(device):
+    """Two objects of world -1 meet once, whatever the number of parts."""
+    with ab.MultiScene([device, device], processes=False) as many:
+        for x in (0.0, 0.5):
+            many.add(sample("torus"), (x, 0, 0, 0, 0, 0, 1), world=-1)
+        assert many.intersect().pairs.tolist() == [[0, 1]]
+        for world in (4, 5):
+            many.add(sample("box"), (9, 9, 9, 0, 0, 0, 1), world=world)
+        result = many.intersect(output="faces")
+        assert result.pairs.tolist() == [[0, 1]] and len(result.faces) == result.count[0] > 0
+
+
+def test_merged_results_say_what_is_lost():
+    with fill(ab.MultiScene(["cpu"], processes=False)) as many:
+        result = many.intersect(output="faces")
+        result.check()
+        answer = {name: getattr(result, name) for name in multi_scene.FIELDS}
+        answer["faces"] = answer["faces"][:-1]
+        with pytest.raises(ab.CapacityError, match="face pairs intersect"):
+            multi_scene.MultiResult(result.pairs, [np.arange(len(result.pairs))], [answer]).check()

@@ -1,0 +1,138 @@
+"""What is shipped: wheel and source distribution hold the package, its kernels and scenes, and a wheel runs alone."""
+
+import email
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import warp_abtree as ab
+from warp_abtree.scene_folder import find_scene, scene_folder, scene_names
+
+ROOT = Path(__file__).resolve().parents[1]
+LEAST_SETUPTOOLS = 77  # for the licence as pyproject.toml writes it
+
+
+def modern_setuptools() -> bool:
+    try:
+        return int(importlib.import_module("setuptools").__version__.split(".")[0]) >= LEAST_SETUPTOOLS
+    except ImportError:
+        return False
+
+
+@pytest.fixture(scope="session")
+def dist(tmp_path_factory):
+    """Give the folder of a built wheel and source distribution: of ABTREE_DIST, or built here."""
+    if "ABTREE_DIST" in os.environ:
+        return Path(os.environ["ABTREE_DIST"])
+    if importlib.util.find_spec("build") is None or not modern_setuptools():
+        pytest.skip(f"needs build and setuptools {LEAST_SETUPTOOLS}, or ABTREE_DIST; .ci/run gives that")
+    folder = tmp_path_factory.mktemp("packaging")
+    left_out = shutil.ignore_patterns(".git", ".venv", "build", "dist", "*.egg-info", "__pycache__", ".*_cache")
+    shutil.copytree(ROOT, folder / "source", ignore=left_out)
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", folder / "dist", folder / "source"]
+    subprocess.run(command, check=True, capture_output=True)
+    return folder / "dist"
+
+
+@pytest.fixture(scope="session")
+def wheel(dist):
+    (path,) = dist.glob("*.whl")
+    with zipfile.ZipFile(path) as file:
+        yield path, file
+
+
+def sources(folder, suffixes=(".py",)):
+    return {path.name for path in (ROOT / folder).iterdir() if path.suffix in suffixes}
+
+
+def test_wheel_holds_the_package(wheel):
+    _, file = wheel
+    held = {name for name in file.namelist() if ".dist-info/" not in name}
+    assert {name.split("/")[0] for name in held} == {"warp_abtree"}
+    expected = {f"warp_abtree/{name}" for name in sources("warp_abtree")} | {"warp_abtree/py.typed"}
+    expected |= {f"warp_abtree/kernels/{name}" for name in sources("kernels")}
+    expected |= {f"warp_abtree/scenes/{name}" for name in sources("scenes", (".py", ".toml"))}
+    assert held == expected
+    # An installed package has the kernels themselves, not the bridge to a checkout.
+    assert file.read("warp_abtree/kernels/__init__.py") == (ROOT / "kernels" / "__init__.py").read_bytes()
+
+
+def test_versions_agree(wheel):
+    path, file = wheel
+    (name,) = (name for name in file.namelist() if name.endswith(".dist-info/METADATA"))
+    metadata = email.message_from_bytes(file.read(name))
+    assert metadata["Version"] == ab.__version__ == path.name.split("-")[1]
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert ab.__version__ not in text and not re.search(r"^version = \"", text, re.M)
+    assert set(metadata.get_all("Provides-Extra")) == set(re.findall(r"^(\w+) = \[", extras_of(text), re.M))
+
+
+def extras_of(text):
+    return text.split("[project.optional-dependencies]")[1].split("\n[")[0]
+
+
+def test_source_distribution_holds_what_a_wheel_needs(dist):
+    (path,) = dist.glob("*.tar.gz")
+    with tarfile.open(path) as file:
+        held = {name.split("/", 1)[1] for name in file.getnames() if "/" in name}
+    for folder in ("warp_abtree", "kernels", "scenes", "tests", "bench", "docs"):
+        expected = {f"{folder}/{name}" for name in sources(folder, (".py", ".toml", ".md", ".png", ".svg"))}
+        assert expected <= held, expected - held
+    assert {"pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md", "warp_abtree/py.typed"} <= held
+    assert not [name for name in held if "__pycache__" in name or name.startswith((".git", "build/", "dist/"))]
+
+
+def test_wheel_runs_without_the_checkout(wheel, tmp_path):
+    _, file = wheel
+    file.extractall(tmp_path / "installed")
+    (tmp_path / "elsewhere").mkdir()
+
+    def command(*words):
+        return subprocess.run(
+            [sys.executable, "-m", "warp_abtree", *words],
+            cwd=tmp_path / "elsewhere",
+            env={**os.environ, "PYTHONPATH": str(tmp_path / "installed")},
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+
+    found = json.loads(command("doctor", "--json", "--device", "cpu").stdout)
+    assert found["usable"] and Path(found["folder"]) == tmp_path / "installed" / "warp_abtree"
+    assert Path(found["scenes"]["folder"]) == tmp_path / "installed" / "warp_abtree" / "scenes"
+    assert found["scenes"]["names"] == scene_names()
+    done = command("run", "needle", "--frames", "1", "--device", "cpu", "--json")
+    assert done.returncode == 0 and json.loads(done.stdout)["frames"] == 1, done.stderr
+
+
+def test_scenes_are_found_by_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert scene_folder() == ROOT / "scenes" and "bunny_tori" in scene_names()
+    for name in ("bunny_tori", "bunny_tori.toml", Path("bunny_tori")):
+        assert find_scene(name) == ROOT / "scenes" / "bunny_tori.toml"
+    for name in ("cow", "bunny_tori.npz", "gone/bunny_tori.toml", "warp:bunny", str(tmp_path / "bunny_tori.toml")):
+        assert find_scene(name) == Path(name)
+    Path("bunny_tori").mkdir()
+    assert find_scene("bunny_tori") == ROOT / "scenes" / "bunny_tori.toml"
+    Path("bunny_tori.toml").write_text("")
+    assert find_scene("bunny_tori.toml") == Path("bunny_tori.toml")
+    with pytest.raises(ab.SceneError, match=r"gone\.toml: No such file.*scenes that come.*bunny_tori, "):
+        ab.load_scene("gone.toml", device="cpu")
+    assert ab.load_scene("needle", device="cpu").path == ROOT / "scenes" / "needle.toml"
+
+
+def test_api_pages_have_every_public_name():
+    pages = "".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").glob("api_*.md")))
+    shown = re.findall(r"^::: warp_abtree\.(\w+)$", pages, re.M)
+    assert sorted(name for name in shown if name in ab.__all__) == sorted(ab.__all__)
+    listed = re.findall(r"`(\w+)`", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"))
+    assert set(ab.__all__) <= set(listed)
