@@ -65,7 +65,8 @@ def test_run_for_people(files, capsys):
     shown, errors = run(capsys, "run", "scene.toml", "--device", "cpu")
     for text in ("4 frames on cpu", "2 objects of 2 models in 1 world,", "refine and refit", "broad phase", "p95"):
         assert text in shown
-    assert not errors
+    # A machine that has not run these before says that it compiles kernels.
+    assert not [line for line in errors if "compiling kernels" not in line]
 
 
 def test_run_for_programs(files, capsys):
