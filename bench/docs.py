@@ -11,7 +11,7 @@ from pathlib import Path
 
 from .html import SHOWN_RUN, VERDICT, common_run, judge
 from .parts import Finished, cells
-from .study import find_parts
+from .study import STUDIES, find_parts
 
 DATA = Path(__file__).resolve().parents[1] / "docs" / "data"
 BLOCK = re.compile(r"<!-- (table|claims|run): (\S+) -->\n.*?<!-- /\1 -->", re.DOTALL)
@@ -20,7 +20,7 @@ BLOCK = re.compile(r"<!-- (table|claims|run): (\S+) -->\n.*?<!-- /\1 -->", re.DO
 def read_run(path) -> list:
     """Return the finished parts of a study's JSON; parts that the study no longer has are left out."""
     found = json.loads(Path(path).read_text(encoding="utf-8"))
-    names = ("paper", "tradeoff") if found["study"] == "all" else (found["study"],)
+    names = STUDIES if found["study"] == "all" else (found["study"],)
     parts = [part for name in names for part in find_parts(name)]
     return [
         Finished(part, kept["rows"], kept["run"], kept["notes"])
@@ -68,6 +68,8 @@ def markdown_table(finished, name) -> str:
                 rows = table.rows(done.rows)
                 left = [any(isinstance(row.get(column.name), str) for row in rows) for column in table.columns]
                 return _grid([column.heading for column in table.columns], cells(table, done.rows), left)
+    if name in {table.name for study in STUDIES for part in find_parts(study) for table in part.tables}:
+        return "Not measured in this run."
     raise ValueError(f"no part has a table {name!r}")
 
 
