@@ -1,9 +1,10 @@
-"""Scaling over devices through `MultiScene`, the cost model from counters, and what follows for more devices.
+"""Scaling over devices, the cost model from counters, and what follows for more devices.
 
-Two workloads, both with new poses at every question, sent from the host: a sweep (one object in every world, one more
-in each world, pairs given, yes or no) and worlds (four objects each, broad phase, face pairs counted). Strong: as many
-worlds whatever the number of devices; weak: as many on each device. Times are by the wall clock, all numbers of devices
-in turn, poses in and merged results out; busy is the time of the slowest device by itself. A CPU worker has one core.
+Through `MultiScene`, with new poses from the host at every question: a sweep (one object in every world, one more in
+each world, pairs given, yes or no) and worlds (four objects each, broad phase, face pairs counted). Through
+`ThisProcess`: shards, those of a `SweepJob`, as `warp-abtree sweep` does them but for the disk. Strong: as much work
+whatever the number of devices; weak: as much on each device. Times are by the wall clock, all numbers of devices in
+turn, poses in and merged results out; busy is the time of the slowest device by itself. A CPU worker has one core.
 """
 
 import contextlib
@@ -12,6 +13,7 @@ import math
 import os
 import tempfile
 import time
+from collections import deque
 
 import numpy as np
 import warp as wp
@@ -25,10 +27,26 @@ from .sweep import random_poses
 from .timing import make_runs, summarise, time_rounds, time_wall
 
 SIZES = {
-    "cuda": {"faces": 5000, "sweep": 65536, "worlds": 8192, "repeats": 9, "counts": (256, 1024, 4096), "driver": 2**21},
-    "cpu": {"faces": 2000, "sweep": 8192, "worlds": 512, "repeats": 7, "counts": (64, 256, 512), "driver": 2**20},
+    "cuda": {
+        "faces": 5000,
+        "sweep": 65536,
+        "worlds": 8192,
+        "repeats": 9,
+        "counts": (256, 1024, 4096),
+        "driver": 2**21,
+        "shards": 2**23,
+    },
+    "cpu": {
+        "faces": 2000,
+        "sweep": 8192,
+        "worlds": 512,
+        "repeats": 7,
+        "counts": (64, 256, 512),
+        "driver": 2**20,
+        "shards": 2**18,
+    },
 }
-QUICK = {"faces": 300, "sweep": 32, "worlds": 8, "repeats": 1, "counts": (4, 16), "driver": 4096}
+QUICK = {"faces": 300, "sweep": 32, "worlds": 8, "repeats": 1, "counts": (4, 16), "driver": 4096, "shards": 64}
 OBJECTS = 4  # a world
 DISTANCES = (0.2, 0.9, 1.6)
 TERMS = ("launch", "pair", "node")
@@ -62,6 +80,8 @@ def run(device, devices=None, quick=False, predict=None):
         for case in ("sweep", "worlds"):
             for way in ("strong", "weak"):
                 yield from run_scaling(devices, model, case, way, sizes, processes)
+    for way in ("strong", "weak"):
+        yield from run_shards(devices, model, way, sizes)
 
 
 # The cost model.
@@ -147,6 +167,43 @@ def run_driver(model, count):
 
 
 # Devices.
+
+
+def run_shards(devices, model, way, sizes):
+    """Yield a row for each number of devices that do the shards of a sweep, each from a thread; nothing is written.
+
+    Raises:
+        RuntimeError: Answers are not those of one device.
+    """
+    size = float(np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())
+    shard, repeats = min(SHARD, sizes["shards"] // 32), min(5, sizes["repeats"])
+    poses = random_poses(sizes["shards"] * len(devices), size)
+    kept, ab.Query.cores = ab.Query.cores, 1
+    try:
+        runs, counts = {}, {}
+        for parts in range(1, len(devices) + 1):
+            counts[parts] = sizes["shards"] * (parts if way == "weak" else 1)
+            job = ab.SweepJob(model, model, poses[: counts[parts]], shard=shard)
+            ranges = [(start, start + shard) for start in range(0, counts[parts], shard)]
+            pool = ab.ThisProcess(devices[:parts])
+            answers = {start: columns["any"] for start, _, columns in pool.ask(job, ranges)}
+            found = np.concatenate([answers[start] for start, _ in ranges])
+            if not np.array_equal(found, ab.sweep(model, model, poses[: len(found)], device=devices[0])):
+                raise RuntimeError(f"shards: {parts} devices answer otherwise than one")
+            runs[parts] = time_wall(
+                lambda pool=pool, job=job, ranges=ranges: deque(pool.ask(job, ranges), 0), wp.get_device(devices[0])
+            )
+        times = time_rounds(runs, repeats)
+    finally:
+        ab.Query.cores = kept
+    base = float(np.median(times[1]))
+    for parts, values in times.items():
+        median = float(np.median(values))
+        row = {"case": "shards", "way": way, "device": wp.get_device(devices[0]).name, "devices": parts}
+        row |= {"asked_by": "threads", "poses": counts[parts]} | summarise("shards", values)
+        row |= {"mposes_s": float(f"{counts[parts] / median / 1e3:.4g}")}
+        ideal = base / parts if way == "strong" else base
+        yield row | {"efficiency": round(ideal / median, 3), "cores_here": os.cpu_count()}
 
 
 def fill(scene, model, case, count):

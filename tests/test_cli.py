@@ -311,7 +311,7 @@ def test_lost_work_is_status_1(files, capsys, monkeypatch):
 
 
 def test_help_has_examples(capsys):
-    for command in ("info", "build", "query", "run", "view", "picture", "bench", "doctor"):
+    for command in ("info", "build", "query", "run", "sweep", "view", "picture", "bench", "doctor"):
         with pytest.raises(SystemExit) as caught:
             cli.main([command, "--help"])
         assert caught.value.code == 0

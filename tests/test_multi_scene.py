@@ -9,7 +9,8 @@ import pytest
 from samples import STILL, random_poses, sample
 
 import warp_abtree as ab
-from warp_abtree import multi_scene
+from bench import scaling
+from warp_abtree import multi_scene, scene_part
 from warp_abtree.intersect import COUNTERS
 
 OUTPUTS = ("any", "count", "faces", "contacts")
@@ -68,10 +69,16 @@ def test_same_bits_as_one_scene(device, processes):
         assert_same(many.intersect(within=0.3), one.intersect(within=0.3), device)
         assert_same(many.intersect([], "faces"), one.intersect([], "faces"), device)
         many.balance()
+        for seed in (4, 5):  # worlds are dealt anew at the first use, then they are where they are
+            for scene in (many, one):
+                scene.set_poses(random_poses(np.random.default_rng(seed), scene.object_count, 0.8))
+                scene.set_lods(scene.lods // 2)
+            assert_same_answers(many, one, device, ["contacts"])
+        matrices = np.tile(np.eye(4), (one.object_count, 1, 1))
+        matrices[:, :3, 3] = rng.uniform(-0.7, 0.7, (one.object_count, 3))
         for scene in (many, one):
-            scene.set_poses(random_poses(np.random.default_rng(4), scene.object_count, 0.8))
-            scene.set_lods(scene.lods // 2)
-        assert_same_answers(many, one, device, ["contacts"])
+            scene.set_poses(matrices)
+        assert_same_answers(many, one, device, ["faces"])
         for scene in (many, one):
             scene.add(sample("box"), STILL, world=6)
             scene.filter([[1, 2], [0, 5]])
@@ -101,7 +108,7 @@ def test_worlds_are_dealt_evenly_by_measured_work(speeds):
     many._speed = np.array(speeds)
     times = many._deal()
     cost, total = np.array(list(many._cost.values())), np.zeros(2)
-    for world, part in many._part_of.items():
+    for world, part in enumerate(many._owner):
         total[part] += cost[world] / speeds[part]
     np.testing.assert_allclose(times, total)
     deals = (np.array(deal) for deal in itertools.product((0, 1), repeat=9))
@@ -120,9 +127,9 @@ def test_balance_takes_the_counters(device):
         pairs = np.arange(12).reshape(6, 2)
         result = many.intersect(pairs, output="count")
         assert set(np.flatnonzero(result.any)) == {0, 2}
-        assert many._part_of[0] == many._part_of[2]  # of equal size: dealt in turn
+        assert many._owner[0] == many._owner[4]  # of equal size: dealt in turn
         many.balance()
-        assert many._part_of[0] != many._part_of[2]
+        assert many._owner[0] != many._owner[4]
         expected = result.count
         np.testing.assert_array_equal(many.intersect(pairs, output="count").count, expected)
 
@@ -213,7 +220,44 @@ def test_merged_results_say_what_is_lost():
     with fill(ab.MultiScene(["cpu"], processes=False)) as many:
         result = many.intersect(output="faces")
         result.check()
-        answer = {name: getattr(result, name) for name in multi_scene.FIELDS}
+        answer = {name: getattr(result, name) for name in scene_part.FIELDS}
         answer["faces"] = answer["faces"][:-1]
         with pytest.raises(ab.CapacityError, match="face pairs intersect"):
             multi_scene.MultiResult(result.pairs, [np.arange(len(result.pairs))], [answer]).check()
+
+
+# The bench of it.
+
+
+def test_cost_is_fitted(device):
+    rng = np.random.default_rng(2)
+    rows = rng.uniform(1, 100, (20, 3))
+    np.testing.assert_allclose(scaling.fit_cost(rows, rows @ [3.0, 0.5, 0.25]), [3.0, 0.5, 0.25])
+    cost = scaling.fit_cost(rows, rows @ [3.0, -0.01, 0.25])
+    assert cost[1] == 0 and cost[0] > 0 and cost[2] > 0
+    sizes = scaling.QUICK
+    row = scaling.run_cost(scaling.wp.get_device(device), sizes)
+    assert row["samples"] == 12 and row["node_us"] >= 0 and row["off_mean"] <= row["off_worst"]
+
+
+def test_shards_on_devices_are_timed(device):
+    model = sample("small ball")
+    rows = list(scaling.run_shards([device, device], model, "weak", scaling.QUICK))
+    assert [(row["devices"], row["poses"]) for row in rows] == [(1, 64), (2, 128)]
+    assert rows[0]["efficiency"] == 1 and rows[1]["mposes_s"] > 0
+    assert scaling.ab.Query.cores is None
+    driver = scaling.run_driver(model, 4096)
+    assert driver["driver_mposes_s"] > 0 and driver["check_mposes_s"] > 0
+
+
+def test_prediction():
+    rows = [
+        {"case": "worker", "device": "it", "worker_mposes_s": 2.0},
+        {"case": "driver", "driver_mposes_s": 100.0},
+    ]
+    found = {(row["poses"], row["devices"]): row for row in scaling.predict_rows(rows)}
+    many = found[10**12, 1000]
+    assert many["seconds"] == pytest.approx(10 + 500 + 65536 / 2e6, rel=1e-3)
+    assert many["drivers"] == 20 and many["one_driver_seconds"] == pytest.approx(10010, rel=1e-3)
+    assert many["efficiency"] == pytest.approx(500 / many["seconds"], abs=1e-3)
+    assert found[10**9, 1000]["efficiency"] < 0.05 < 0.97 < found[10**9, 1]["efficiency"]

@@ -4,10 +4,7 @@ import contextlib
 import dataclasses
 import io
 import json
-import os
 import pickle
-import signal
-import sys
 
 import numpy as np
 import pytest
@@ -100,6 +97,20 @@ def test_float32_poses_count_as_what_they_are(tmp_path):
     poses = poses_of().astype(np.float32)
     ab.run_shards(ab.SweepJob(*pair(), poses, output="count", shard=64), tmp_path / "out")
     np.testing.assert_array_equal(read(tmp_path / "out")["count"], ab.sweep(*pair(), poses, output="count"))
+
+
+@pytest.mark.parametrize("output", ["count", "contacts"])
+def test_several_devices_of_one_process_write_the_same(device, tmp_path, output):
+    job = ab.SweepJob(*pair(), poses_of(), lods_of(100), output=output, shard=7)
+    ab.run_shards(job, tmp_path / "one", pool=ab.ThisProcess(device))
+    done = ab.run_shards(job, tmp_path / "three", pool=ab.ThisProcess([device] * 3))
+    assert done["workers"] == 3 and contents(tmp_path / "three") == contents(tmp_path / "one")
+    with pytest.raises(KeyboardInterrupt):
+        ab.run_shards(job, tmp_path / "four", pool=ab.ThisProcess([device] * 4), progress=stop_after(6))
+    assert ab.run_shards(job, tmp_path / "four", pool=ab.ThisProcess([device] * 2))["found"] == 6
+    assert contents(tmp_path / "four") == contents(tmp_path / "one")
+    with pytest.raises(ValueError, match="an empty list"):
+        ab.ThisProcess([])
 
 
 def test_no_poses(tmp_path):
@@ -376,6 +387,7 @@ def test_command(tmp_path):
     assert status == 0 and "5 worlds in 3 shards" in text
     for words, what in (
         ([a, b, "--out", tmp_path / "x"], "POSES.npy is missing"),
+        ([a, poses, "--out", tmp_path / "x"], "is no scene; a sweep takes two models, or one twice"),
         ([a, b, a, poses, "--out", tmp_path / "x"], "two models and POSES.npy"),
         ([scene, poses, "--out", tmp_path / "x"], "takes a scene of two"),
         ([a, b, poses, "--frames", 3, "--out", tmp_path / "x"], "--frames: goes with a scene"),
@@ -400,95 +412,3 @@ def test_without_ray_one_line_says_so(tmp_path, monkeypatch):
     assert len(read(tmp_path / "out")["any"]) == 100
     status, _, err = command(*asked, "--workers", "2")
     assert status == 2 and "need Ray" in err
-
-
-# Ray.
-
-
-@pytest.fixture(scope="module")
-def pool():
-    pytest.importorskip("ray")
-    with ab.RayPool(workers=2) as made:
-        yield made
-
-
-@pytest.mark.parametrize("output", ["count", "contacts"])
-def test_ray_writes_the_same_bytes(tmp_path, pool, output):
-    job = ab.SweepJob(*pair(), poses_of(400), output=output, shard=25)
-    ab.run_shards(job, tmp_path / "plain", pool=ab.ThisProcess("cuda:0" if pool.on_gpus else "cpu"))
-    done = ab.run_shards(job, tmp_path / "ray", pool=pool)
-    assert (done["shards"], done["workers"], done["lost"]) == (16, 2, 0)
-    assert contents(tmp_path / "ray") == contents(tmp_path / "plain")
-
-
-def test_ray_goes_on_without_a_worker_that_is_killed(tmp_path, pool):
-    job = ab.SweepJob(*pair(), poses_of(400), output="faces", shard=10)
-    ab.run_shards(job, tmp_path / "plain", pool=ab.ThisProcess("cuda:0" if pool.on_gpus else "cpu"))
-    killed = []
-
-    def kill(_, done, total):
-        if done >= 5 and not killed and pool.pids:
-            killed.append(next(iter(pool.pids.values())))
-            os.kill(killed[0], signal.SIGKILL)
-
-    done = ab.run_shards(job, tmp_path / "ray", pool=pool, progress=kill)
-    assert killed and done["lost"] == 1
-    assert contents(tmp_path / "ray") == contents(tmp_path / "plain")
-
-
-def test_ray_goes_on_after_an_interrupt(tmp_path, pool):
-    job = ab.SweepJob(*pair(), poses_of(400), output="count", shard=10)
-    ab.run_shards(job, tmp_path / "plain", pool=ab.ThisProcess("cuda:0" if pool.on_gpus else "cpu"))
-    with pytest.raises(KeyboardInterrupt):
-        ab.run_shards(job, tmp_path / "ray", pool=pool, progress=stop_after(7))
-    assert ab.run_shards(job, tmp_path / "ray", pool=pool)["found"] == 7
-    assert contents(tmp_path / "ray") == contents(tmp_path / "plain")
-
-
-def test_ray_runs_worlds(tmp_path, pool):
-    job = ab.WorldsJob(load_worlds(tmp_path, "[dynamics]"), 4, "poses", 2)
-    ab.run_shards(job, tmp_path / "plain", pool=ab.ThisProcess("cuda:0" if pool.on_gpus else "cpu"))
-    ab.run_shards(job, tmp_path / "ray", pool=pool)
-    assert contents(tmp_path / "ray") == contents(tmp_path / "plain")
-
-
-class Asker:
-    """Fails, or ends its worker, at one item."""
-
-    def __init__(self, how):
-        self.how = how
-
-    def ask(self, item, device=None):
-        if item == 20 and self.how == "end":
-            os._exit(1)
-        if item == 20:
-            raise ValueError("no such item: 20")
-        return {"any": np.zeros(10, bool)}
-
-
-class Job:
-    unit, count, shard = "pose", 40, 10
-
-    def __init__(self, how):
-        self.how = how
-
-    def describe(self):
-        return {"count": self.count, "shard": self.shard}
-
-    def item(self, start, stop):
-        return start
-
-    def asker(self):
-        return Asker(self.how)
-
-
-@pytest.mark.parametrize("how", ["end", "fail"])
-def test_ray_gives_up_on_a_shard_that_cannot_be_done(tmp_path, pool, how):
-    pool.ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import the tests
-    error, what = RuntimeError, r"shard \(20, 30\) ended its worker, 3 times"
-    if how == "fail":
-        error, what = ValueError, "^no such item: 20$"
-    with pytest.raises(error, match=what):
-        ab.run_shards(Job(how), tmp_path / "out", pool=pool)
-    held = sorted(path.name for path in (tmp_path / "out").glob("shard-*"))
-    assert "shard-000000000020-000000000030.npz" not in held

@@ -1,4 +1,4 @@
-"""The command line: ``warp-abtree info|build|query|run|view|picture|bench|doctor``.
+"""The command line: ``warp-abtree info|build|query|run|sweep|view|picture|bench|doctor``.
 
 Exit status 0 when done, 2 with one line on stderr for bad input, 1 where work was lost or a device failed.
 """

@@ -22,6 +22,7 @@ EXTRAS = {
     "view": ("viewer and pictures", {"matplotlib": "", "viser": "1.1", "tomli": ""}),
     "dynamics": ("bodies whose meshes are open", {"scipy": "", "networkx": ""}),
     "newton": ("contacts for Newton's solvers", {"newton": "1.8"}),
+    "cluster": ("sweeps on Ray, Parquet files", {"ray": "", "pyarrow": ""}),
     "cli": ("tables and bars, completion in shells", {"rich": "", "shtab": ""}),
 }
 OLD_PYTHON_ONLY = ("tomli",)  # Python 3.11 has tomllib

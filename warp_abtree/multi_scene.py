@@ -5,12 +5,7 @@ which LODs is kept here, so that a worker that ends costs nothing but its start.
 """
 
 import contextlib
-import multiprocessing
 import pickle
-import signal
-import time
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -18,124 +13,17 @@ import warp as wp
 from warp_abtree.checks import to_numpy, whole_number
 from warp_abtree.contact import contact_dtypes
 from warp_abtree.cores import core_count
-from warp_abtree.intersect import COUNTERS, Query, Result, check_request, check_within
+from warp_abtree.intersect import COUNTERS, Result, check_request, check_within
 from warp_abtree.scene import Scene, TreeState, check_poses
+from warp_abtree.scene_part import ProcessPart, ThreadPart
 
 # Cost of a candidate pair and of a triangle test in node tests (docs/scaling.md).
-PAIR_COST, TRIANGLE_COST = 100.0, 5.0
-
-FIELDS = ("pairs", "any", "count", "faces", "contacts", "pair_contacts", "apart", *COUNTERS)
+PAIR_COST, TRIANGLE_COST = 200.0, 5.0
 
 
 def work_of(result) -> np.ndarray:
     """Return the cost of each pair of a result in node tests, float64 (p,)."""
     return PAIR_COST + result.node_tests + TRIANGLE_COST * result.triangle_tests
-
-
-class _Part:
-    """The objects of one device: what a process or a thread is asked."""
-
-    def __init__(self, device):
-        self.device = device
-        self.models: dict = {}
-        self.scene: Any = None  # a Scene once it is built
-
-    def build(self, models, objects, excluded):
-        for key, model in models.items():
-            self.models[key] = pickle.loads(model) if isinstance(model, bytes) else model
-        self.scene = None  # its memory first
-        scene = Scene(self.device)
-        for model, *rest in objects:
-            scene.add(self.models[model], *rest)
-        if len(excluded):
-            scene.filter(excluded)
-        scene.arrays()
-        self.scene = scene
-
-    def set_poses(self, poses):
-        self.scene.set_poses(poses)
-
-    def set_lods(self, lods):
-        self.scene.set_lods(lods)
-
-    def broad_phase(self):
-        return self.scene.broad_phase()
-
-    def tree_state(self, i):
-        return self.scene.tree_state(i)
-
-    def intersect(self, *asked):
-        result = self.scene.intersect(*asked)
-        return {name: getattr(result, name) for name in FIELDS}
-
-
-def _answer(part, name, arguments):
-    """Return (answer, error, seconds) of a call."""
-    begin = time.perf_counter()
-    try:
-        return getattr(part, name)(*arguments), None, time.perf_counter() - begin
-    except Exception as error:
-        return None, error, time.perf_counter() - begin
-
-
-def _serve(connection, device, cores):
-    """Answer calls until the other end goes away."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is for the parent, which stops its workers
-    wp.config.log_level = wp.LOG_WARNING
-    Query.cores = cores
-    part = _Part(device)
-    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        while True:
-            answer, error, seconds = _answer(part, *connection.recv())
-            if error is not None:
-                try:
-                    pickle.loads(pickle.dumps(error))
-                except Exception:  # of a library, with arguments of its own
-                    error = RuntimeError(f"{type(error).__name__}: {error}")
-            connection.send((answer, error, seconds))
-
-
-class _Process:
-    """A part in a process of its own."""
-
-    def __init__(self, device, cores):
-        context = multiprocessing.get_context("spawn")  # neither Warp nor CUDA survives a fork
-        self.connection, far = context.Pipe()
-        self.process = context.Process(target=_serve, args=(far, device, cores), daemon=True)
-        self.process.start()
-        far.close()
-
-    def begin(self, name, arguments):
-        self.connection.send((name, arguments))
-
-    def finish(self):
-        return self.connection.recv()
-
-    def exit_code(self):
-        self.process.join(1.0)
-        return self.process.exitcode
-
-    def stop(self):
-        self.connection.close()  # which ends it, unless it is at work
-        self.process.terminate()
-        self.process.join()
-
-
-class _Thread:
-    """A part in a thread of this process."""
-
-    def __init__(self, device):
-        self.part = _Part(device)
-        self.pool = ThreadPoolExecutor(1, thread_name_prefix="warp_abtree part")
-
-    def begin(self, name, arguments):
-        self.job = self.pool.submit(_answer, self.part, name, arguments)
-
-    def finish(self):
-        return self.job.result()
-
-    def stop(self):
-        self.pool.shutdown()
 
 
 class MultiResult(Result):
@@ -214,9 +102,12 @@ class MultiScene:
         self._ledger = Scene("cpu")  # checks and keeps what is added; never asked
         self._carriers: list = []
         self._known: list[set] = []
+        self._poses: np.ndarray | None = None  # of the last `set_poses`, not yet in the ledger
+        self._last: tuple | None = None  # the pairs of the last question, and the cost of each
         self._cost: dict[int, float] | None = None
         self._speed = np.ones(len(self.devices))
         self._loaded: set = set()
+        self._dealt = 0
         self._built = self._closed = False
 
     def __enter__(self):
@@ -258,6 +149,7 @@ class MultiScene:
 
     def add(self, model, pose=(0, 0, 0, 0, 0, 0, 1), world=0, lod=None, importance=1, static=False) -> int:
         """Add an object and return its index; arguments and errors as `Scene.add`. Worlds are dealt at the next use."""
+        self._keep_poses()
         index = self._ledger.add(model, pose, world, lod, importance, static)
         self._built = False
         return index
@@ -274,7 +166,11 @@ class MultiScene:
             raise ValueError(f"poses: {len(poses)} given for {self.object_count} objects")
         if self._built:
             self._ask("set_poses", {k: (poses[rows],) for k, rows in enumerate(self._members) if len(rows)})
-        self._ledger._added_pose = list(poses)
+        self._poses = poses
+
+    def _keep_poses(self):
+        if self._poses is not None:
+            self._ledger._added_pose, self._poses = list(self._poses), None
 
     def set_lods(self, lods):
         """Bring every object to a LOD; arguments and errors as `Scene.set_lods`."""
@@ -306,8 +202,11 @@ class MultiScene:
         Raises:
             ValueError: Nothing was measured yet, or objects were added since.
         """
-        if self._cost is None:
+        if self._last is None or self._dealt != self.object_count:
             raise ValueError("nothing is measured yet; call intersect first")
+        pairs, work = self._last
+        worlds, inverse = np.unique(self._world[pairs].reshape(-1, 2).max(1, initial=-1), return_inverse=True)
+        self._cost = dict(zip(worlds.tolist(), np.bincount(inverse, work, len(worlds)).tolist()))
         self._built = False
         times = self._deal()
         return float(times.max() / times.mean()) if times.any() else 1.0
@@ -315,7 +214,7 @@ class MultiScene:
     def _deal(self) -> np.ndarray:
         """Give each world to the device that would be done with it first, costly ones first; return expected times."""
         ledger = self._ledger
-        world = np.array(ledger._world)
+        world = self._world = np.array(ledger._world)
         worlds, inverse = np.unique(world[world >= 0], return_inverse=True)
         if self._cost is None:
             active = [
@@ -328,9 +227,8 @@ class MultiScene:
         for w in np.argsort(-cost, kind="stable"):
             part[w] = (times + cost[w] / self._speed).argmin()
             times[part[w]] += cost[w] / self._speed[part[w]]
-        self._part_of = dict(zip(worlds.tolist(), part.tolist()))
         every = np.flatnonzero(world < 0)
-        owner = np.full(len(world), -1)
+        self._owner = owner = np.full(len(world), -1)  # -1 is everywhere
         owner[world >= 0] = part[inverse]
         self._members = []
         for k in range(len(self.devices)):
@@ -350,9 +248,9 @@ class MultiScene:
         for device in self.devices:
             if self._processes or (self._processes is None and device == "cpu"):
                 share = max(1, core_count() // (cpus if device == "cpu" else len(self.devices)))
-                self._carriers.append(_Process(device, self._cores or share))
+                self._carriers.append(ProcessPart(device, self._cores or share))
             else:
-                self._carriers.append(_Thread(device))
+                self._carriers.append(ThreadPart(device))
         self._known = [set() for _ in self.devices]
 
     def _build(self):
@@ -360,10 +258,11 @@ class MultiScene:
         self._start()
         if self._built:
             return
-        if len(self._ledger._world) != getattr(self, "_dealt", 0):
+        if self.object_count != self._dealt:
             self._cost = None
-        self._dealt = len(self._ledger._world)
+        self._dealt = self.object_count
         self._deal()
+        self._keep_poses()
         ledger, packed, asked = self._ledger, {}, {}
         keys = ledger.excluded_keys()
         excluded = np.stack([keys >> 32, keys & (2**32 - 1)], 1)
@@ -373,7 +272,7 @@ class MultiScene:
             models = {}
             for m in sorted({ledger.object_model[i] for i in rows} - self._known[k]):
                 models[m] = ledger.models[m]
-                if isinstance(self._carriers[k], _Process):
+                if isinstance(self._carriers[k], ProcessPart):
                     packed.setdefault(m, pickle.dumps(ledger.models[m], protocol=5))
                     models[m] = packed[m]
             columns = (ledger.object_model, ledger._added_pose, ledger._world, ledger._lod)
@@ -447,7 +346,7 @@ class MultiScene:
 
     def _merge_pairs(self, found):
         """Return all pairs, sorted, and for each part the places of its own, -1 where the first answers."""
-        everywhere = np.array(self._ledger._world) < 0
+        everywhere = self._world < 0
         named, kept = [], []
         for k, pairs in found.items():
             named.append(self._members[k][pairs].reshape(-1, 2))
@@ -491,8 +390,7 @@ class MultiScene:
                 if len(rows):
                     asked[k] = (None, *options, within, contact_dtype)
         else:
-            world = np.array(self._ledger._world)[pairs].reshape(-1, 2).max(1, initial=-1)
-            part = np.array([self._part_of.get(w, 0) for w in world.tolist()], int)
+            part = np.maximum(self._owner[pairs].reshape(-1, 2).max(1, initial=-1), 0)
             for k, rows in enumerate(self._members):
                 place = np.flatnonzero(part == k)
                 if len(place) or k == 0:  # one answers for none, too
@@ -509,9 +407,7 @@ class MultiScene:
 
     def _measure(self, result, parts, places):
         work = work_of(result)
-        world = np.array(self._ledger._world)[result.pairs].reshape(-1, 2).max(1, initial=-1)
-        worlds, inverse = np.unique(world, return_inverse=True)
-        self._cost = dict(zip(worlds.tolist(), np.bincount(inverse, work, len(worlds)).tolist()))
+        self._last = result.pairs, work
         # Devices of one kind are as fast as each other: a rate of a few worlds is mostly that of a launch.
         kinds = [wp.get_device(device).name for device in self.devices]
         spent, done = dict.fromkeys(kinds, 0.0), dict.fromkeys(kinds, 0.0)

@@ -9,11 +9,14 @@ import hashlib
 import json
 import os
 import re
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from warp_abtree.checks import to_numpy, whole_number
 from warp_abtree.intersect import check_request
@@ -359,21 +362,57 @@ def _read_manifest(path) -> dict:
 
 
 class ThisProcess:
-    """Does the shards of a job one after another, here.
+    """Does the shards of a job here, on one device or several, a thread for each of these.
 
     Args:
-        device: Warp device; None for Warp's default.
+        device: Warp device, or a list of them; None for Warp's default.
     """
 
+    lost = 0
+
     def __init__(self, device=None):
-        self.device = Scene(device).device
-        self.lost, self.workers = 0, 1
+        names = list(device) if isinstance(device, list | tuple) else [device]
+        if not names:
+            raise ValueError("device: an empty list")
+        self.devices = [Scene(name).device for name in names]
+        self.workers = len(self.devices)
 
     def ask(self, job, ranges):
         """Yield (start, stop, columns) of each range, once, in any order."""
-        asker = job.asker()
-        for start, stop in ranges:
-            yield start, stop, asker.ask(job.item(start, stop), self.device)
+        askers = [job.asker() for _ in self.devices]
+        waiting = deque(ranges)
+        # Kernels load on one thread at a time.
+        for asker, device in zip(askers, self.devices):
+            if waiting:
+                part = waiting.popleft()
+                yield *part, asker.ask(job.item(*part), device)
+        if self.workers == 1:
+            while waiting:
+                part = waiting.popleft()
+                yield *part, askers[0].ask(job.item(*part), self.devices[0])
+            return
+        threads = [ThreadPoolExecutor(1, thread_name_prefix="warp_abtree shard") for _ in askers]
+        under_way: dict = {}
+        before = wp.get_device()
+
+        def feed(k):
+            if waiting:
+                part = waiting.popleft()
+                under_way[threads[k].submit(askers[k].ask, job.item(*part), self.devices[k])] = k, part
+
+        try:
+            for k in [*range(self.workers)] * 2:  # one at work, one ahead
+                feed(k)
+            while under_way:
+                for answered in wait(under_way, return_when=FIRST_COMPLETED).done:
+                    k, part = under_way.pop(answered)
+                    feed(k)
+                    yield *part, answered.result()
+        finally:
+            for thread in threads:
+                thread.shutdown(cancel_futures=True)
+            if wp.get_device() != before:  # threads share Warp's default
+                wp.set_device(before)
 
 
 def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:

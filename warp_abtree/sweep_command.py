@@ -39,7 +39,9 @@ def add_arguments(sub, positive):
     sub.add_argument("--shard", type=positive, metavar="N", help="poses (65536) or worlds (64) a file")
     sub.add_argument("--file", choices=("npz", "parquet"), default="npz", help="kind of the files (npz)")
     sub.add_argument(
-        "--ray", metavar="ADDRESS", help='of a Ray cluster, or "none" for one process; by default Ray is started here'
+        "--ray",
+        metavar="ADDRESS",
+        help='of a Ray cluster (Ray is started here). "none": this process, with --device cuda:0,cuda:1 on two',
     )
     sub.add_argument("--workers", type=positive, metavar="N", help="Ray workers (as many as GPUs, or else CPU cores)")
 
@@ -64,7 +66,7 @@ def sweep(options, progress):
         with contextlib.redirect_stdout(sys.stderr), RayPool(options.ray, options.workers) as pool:
             done = run_shards(job, options.out, pool=pool, **named)
     else:
-        done = run_shards(job, options.out, pool=ThisProcess(options.device), **named)
+        done = run_shards(job, options.out, pool=ThisProcess(options.device and options.device.split(",")), **named)
     progress.close()
     result = {"out": str(options.out), "unit": job.unit, **done, "seconds": time.perf_counter() - begin}
     if options.json:
@@ -80,6 +82,8 @@ def sweep(options, progress):
 def _make_job(options, progress):
     source = list(options.source)
     poses = source.pop() if source[-1].lower().endswith(".npy") else None
+    if len(source) == 1 and Path(source[0]).suffix.lower() not in ("", ".toml"):
+        raise ValueError(f"{source[0]}: is no scene; a sweep takes two models, or one twice, and POSES.npy")
     if poses is None:
         return _make_worlds(options, source, progress)
     for name in ("frames", "objects"):
