@@ -7,7 +7,7 @@ from warp_abtree.kernels.distance import triangles_near
 from warp_abtree.kernels.nodes import load_constant
 from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
-from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, UNSURE
+from warp_abtree.kernels.predicates import FLOAT32
 from warp_abtree.kernels.screen import SCREEN_UNIT, screen_triangles
 from warp_abtree.kernels.triangle import intersect_triangles
 
@@ -123,24 +123,6 @@ def test_faces(
         s = pose.scale
         return intersect_triangles(mode, a0 * s, a1 * s, a2 * s, b0 * s, b1 * s, b2 * s)
     return intersect_triangles(mode, a0, a1, a2, b0, b1, b2)
-
-
-@wp.func
-def settle_faces(
-    mode: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    face_a: wp.int32,
-    face_b: wp.int32,
-):
-    """Decide a pair of faces that float32 left open; return whether they meet, and whether it took exact signs."""
-    if mode != EXACT:
-        return test_faces(mode, models, states, pose, face_a, face_b), 0
-    meet = test_faces(FILTER, models, states, pose, face_a, face_b)
-    if meet != UNSURE:
-        return meet, 0
-    return test_faces(mode, models, states, pose, face_a, face_b), 1
 
 
 @wp.func

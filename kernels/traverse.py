@@ -16,13 +16,13 @@ from warp_abtree.kernels.faces import (
     Hits,
     defer_faces,
     report_hit,
-    settle_faces,
+    test_faces,
     try_faces,
 )
 from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose
-from warp_abtree.kernels.predicates import FLOAT32, UNSURE
+from warp_abtree.kernels.predicates import EXACT, FLOAT32, UNSURE
 from warp_abtree.kernels.screen import SCREEN_UNIT
 from warp_abtree.kernels.share import (
     MAILBOX_COUNT,
@@ -39,6 +39,7 @@ from warp_abtree.kernels.share import (
     take_unit,
 )
 from warp_abtree.kernels.vector import ITEMS_AT_ONCE, STACK_ROOM, descend, screen_waiting, single_node, take_slots
+from warp_abtree.kernels.vector64 import filter_waiting
 from warp_abtree.kernels.visit import visit_item
 from warp_abtree.kernels.warps import (
     STACK_LENGTH,
@@ -114,20 +115,46 @@ def settle_waiting(
 ):
     """Decide pairs of faces that wait, perhaps until the first hit, and add hits to those on a list that have met.
 
-    Returns how many have met then, how many were decided, and how many of these took exact signs. Both lists may be
-    one: what is added stands before what is looked at.
+    Returns how many have met then, and how many were decided. Both lists may be one: what is added stands before what
+    is looked at.
     """
-    tested, exact = wp.int32(0), wp.int32(0)
+    tested = wp.int32(0)
     for i in range(waiting):
         if output != OUTPUT_ANY or met == 0:
             item = faces[i]
-            meet, hard = settle_faces(mode, models, states, pose, item_first(item), item_second(item))
             tested += 1
-            exact += hard
-            if meet == 1:
+            if test_faces(mode, models, states, pose, item_first(item), item_second(item)) == 1:
                 met_inout[met] = item
                 met += 1
-    return met, tested, exact
+    return met, tested
+
+
+@wp.func
+def settle_open(
+    mode: wp.int32,
+    output: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    met: wp.int32,
+    left: wp.int32,
+    left_open: wp.array(dtype=wp.int64),
+    met_inout: wp.array(dtype=wp.int64),
+):
+    """Decide pairs of faces that float32 left open, as `settle_waiting`: for EXACT in float64, then what that leaves.
+
+    Returns how many have met then, how many were decided, and how many of these took exact signs.
+    """
+    if mode != EXACT:
+        met, tested = settle_waiting(mode, output, models, states, pose, met, left, left_open, met_inout)
+        return met, tested, 0
+    if left == 0 or (output == OUTPUT_ANY and met > 0):
+        return met, 0, 0
+    counts = filter_waiting(models, states, pose, output == OUTPUT_ANY, met, left, left_open, met_inout)
+    met, hard = settle_waiting(
+        mode, output, models, states, pose, wp.int32(counts[0]), wp.int32(counts[1]), left_open, met_inout
+    )
+    return met, wp.int32(counts[2]), wp.int32(counts[3]) + hard
 
 
 @functools.cache
@@ -169,7 +196,7 @@ def thread_traversal(mode: int):
             top, waiting = wp.int32(progress[0]), wp.int32(progress[1])
             node_tests += progress[2]
             if wp.static(mode == int(WITHIN)):
-                met, tested, hard = settle_waiting(
+                met, tested = settle_waiting(
                     wp.static(mode), output, models, states, pose, 0, waiting, waiting_faces, waiting_faces
                 )
                 triangle_tests += wp.int64(tested)
@@ -178,11 +205,11 @@ def thread_traversal(mode: int):
                     models, states, pose, error, unit, output == OUTPUT_ANY, waiting, waiting_faces, left_open
                 )
                 met, left = wp.int32(screened[0]), wp.int32(screened[1])
-                met, tested, hard = settle_waiting(
+                met, filtered, hard = settle_open(
                     wp.static(mode), output, models, states, pose, met, left, left_open, waiting_faces
                 )
                 triangle_tests += screened[2]
-                float64_tests += wp.int64(tested)
+                float64_tests += wp.int64(filtered)
                 exact_tests += wp.int64(hard)
             if met > 0:
                 hit_count += wp.int64(met)

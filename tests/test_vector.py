@@ -6,12 +6,24 @@ import warp as wp
 from samples import contact_poses, sample
 
 import warp_abtree as ab
+from warp_abtree.kernels.double_word import BOUND_DOUBLE, double_orient3d
 from warp_abtree.kernels.faces import screen_faces
+from warp_abtree.kernels.faces import test_faces as decide_faces
 from warp_abtree.kernels.pools import ModelPool, StatePool
-from warp_abtree.kernels.pose import PairPose
-from warp_abtree.kernels.predicates import EXACT, FLOAT32, UNSURE
+from warp_abtree.kernels.pose import PairPose, pose_point
+from warp_abtree.kernels.predicates import (
+    EXACT,
+    FILTER,
+    FLOAT32,
+    UNSURE,
+    filter_orient3d,
+    filtered_sign,
+    orient3d,
+    orient_edges,
+)
 from warp_abtree.kernels.screen import SCREEN_UNIT
 from warp_abtree.kernels.traverse import WAITING_ROOM, first_item
+from warp_abtree.kernels.triangle import turn_triangles
 from warp_abtree.kernels.vector import (
     ITEMS_AT_ONCE,
     ROOM_FOR_ONE,
@@ -21,6 +33,7 @@ from warp_abtree.kernels.vector import (
     single_node,
     take_slots,
 )
+from warp_abtree.kernels.vector64 import filter_waiting
 from warp_abtree.kernels.visit import visit_item
 from warp_abtree.kernels.warps import item_first, item_second, pack_item
 
@@ -137,6 +150,186 @@ def test_screens_the_same_as_one_by_one(kind, turned):
         seen.append(np.bincount(meet, minlength=int(UNSURE) + 1) > 0)
     assert seen[1][[0, 1, int(UNSURE)]].all() or kind in ("flat", "wild")
     assert np.isin(meet, [0, int(UNSURE)]).all(), "no sign is sure where the bound is no number"
+
+
+# --- the float64 stage -----------------------------------------------------------------------------------------------
+
+
+@wp.func
+def pose64(rotation: wp.mat33d, translation: wp.vec3d, corner_b: wp.int32):
+    pose = PairPose()
+    pose.rotation = rotation
+    pose.translation = translation
+    pose.corner_b = corner_b
+    return pose
+
+
+@wp.func
+def double_decides(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
+    """Return whether one sign of two edges in double words decides what a FILTER leaves open."""
+    sa0, sa1, sa2 = orient3d(FILTER, b0, b1, b2, a0), orient3d(FILTER, b0, b1, b2, a1), orient3d(FILTER, b0, b1, b2, a2)
+    sb0, sb1, sb2 = orient3d(FILTER, a0, a1, a2, b0), orient3d(FILTER, a0, a1, a2, b1), orient3d(FILTER, a0, a1, a2, b2)
+    if wp.max(wp.max(sa0, wp.max(sa1, sa2)), wp.max(sb0, wp.max(sb1, sb2))) == UNSURE:
+        return 0
+    if (sa0 == 0 and sa1 == 0 and sa2 == 0) or (sb0 == 0 and sb1 == 0 and sb2 == 0):
+        return 0
+    p1, q1, r1, p2, q2, r2 = turn_triangles(sa0, sa1, sa2, sb0, sb1, sb2, a0, a1, a2, b0, b1, b2)
+    first = orient_edges(FILTER, p1, q1, p2, q2)
+    second = orient_edges(FILTER, p1, r1, r2, p2)
+    if first == UNSURE:
+        _, size = filter_orient3d(p1, q1, p2, q2)
+        first = filtered_sign(double_orient3d(p1, q1, p2, q2), BOUND_DOUBLE * size)
+    else:
+        _, size = filter_orient3d(p1, r1, r2, p2)
+        second = filtered_sign(double_orient3d(p1, r1, r2, p2), BOUND_DOUBLE * size)
+    return wp.where(first == 1 or second == 1 or (first != UNSURE and second != UNSURE), 1, 0)
+
+
+@wp.kernel
+def filter_one_kernel(
+    models: ModelPool,
+    states: StatePool,
+    rotation: wp.mat33d,
+    translation: wp.vec3d,
+    corner_b: wp.int32,
+    faces: wp.array(dtype=wp.int64),
+    filter_out: wp.array(dtype=wp.int32),
+    exact_out: wp.array(dtype=wp.int32),
+    decided_out: wp.array(dtype=wp.int32),
+):
+    i = wp.tid()
+    pose = pose64(rotation, translation, corner_b)
+    face_a, face_b = item_first(faces[i]), item_second(faces[i])
+    filter_out[i] = decide_faces(FILTER, models, states, pose, face_a, face_b)
+    exact_out[i] = decide_faces(EXACT, models, states, pose, face_a, face_b)
+    a, b = states.face_corner[face_a], states.face_corner[corner_b + face_b]
+    decided_out[i] = double_decides(
+        models.vertex_pos[a[0]],
+        models.vertex_pos[a[1]],
+        models.vertex_pos[a[2]],
+        pose_point(rotation, translation, models.vertex_pos[b[0]]),
+        pose_point(rotation, translation, models.vertex_pos[b[1]]),
+        pose_point(rotation, translation, models.vertex_pos[b[2]]),
+    )
+
+
+@wp.kernel
+def filter_all_kernel(
+    first_ends: wp.bool,
+    met: wp.int32,
+    waiting: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    rotation: wp.mat33d,
+    translation: wp.vec3d,
+    corner_b: wp.int32,
+    open_inout: wp.array(dtype=wp.int64),
+    faces_inout: wp.array(dtype=wp.int64),
+    count_out: wp.array(dtype=wp.int64),
+):
+    pose = pose64(rotation, translation, corner_b)
+    counts = filter_waiting(models, states, pose, first_ends, met, waiting, open_inout, faces_inout)
+    for i in range(4):
+        count_out[i] = counts[i]
+
+
+def exact_points(kind, rng, count):
+    """Return float64 (2 count, 3), of A and of B, and a pose: signs are sure, zero, lost in rounding, or no numbers."""
+    a, b = rng.uniform(-1, 1, (2, count, 3))
+    rotation, shift = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=3) / 9
+    if kind in ("lattice", "coplanar"):
+        a, b = rng.integers(-1, 2, (2, count, 3)).astype(float)
+        rotation, shift = np.eye(3)[[1, 2, 0]], np.array([1.0, 0, 0])
+    if kind == "coplanar":
+        a, b = a @ np.diag([1, 1, 0]), 3 * b @ np.diag([1, 0, 1])
+        rotation, shift = np.eye(3)[[0, 2, 1]], np.zeros(3)
+    elif kind in ("coincident", "nearly coincident"):
+        b, rotation, shift = a.copy(), np.eye(3), np.zeros(3)
+        if kind == "nearly coincident":
+            b += rng.integers(-2, 3, b.shape) * np.spacing(b)
+    elif kind == "coincident, turned":
+        b = (a - shift) @ rotation
+    elif kind == "nearly coplanar":
+        for x in (a, b):
+            x[:, 2] = 0.1 * x[:, 0] + 0.3 * x[:, 1] + 1e-15 * rng.normal(size=count)
+        rotation, shift = np.eye(3), np.zeros(3)
+    elif kind == "tiny":  # about 2^-290, below which a posed coordinate is 0
+        size = 2.0 ** rng.integers(-292, -287, (2, count, 1))
+        a, b = rng.integers(-3, 4, (2, count, 3)) * size
+        a[np.abs(a) < 2.0**-290] = 0.0
+        rotation, shift = np.eye(3), np.zeros(3)
+    elif kind == "huge":
+        a, b, shift = 2.0**330 * a, 2.0**330 * b, 2.0**327 * shift
+    elif kind == "wild":
+        a, b = (x * 10.0 ** rng.integers(-300, 300, (count, 1)) for x in (a, b))
+        a[rng.random(count) < 0.02], b[rng.random(count) < 0.02] = np.inf, np.nan
+    return np.concatenate([a, b]), rotation, shift
+
+
+# What must turn up: pairs that meet, that are apart, that double words decide, and that are left open.
+CASES = {
+    "random": "met apart",
+    "lattice": "met apart left",
+    "coplanar": "left",
+    "coincident": "met apart left",
+    "nearly coincident": "met apart decided",
+    "coincident, turned": "met apart decided",
+    "nearly coplanar": "apart left",
+    "tiny": "met apart left",
+    "huge": "met apart",
+    "wild": "apart left",
+    "degenerate": "met apart left",
+}
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_filters_the_same_as_one_by_one(kind):
+    rng = np.random.default_rng(11)
+    count, face_count, ask_count, before = 40, 150, 2053, 3  # no multiple of 8
+    points, rotation, shift = exact_points(kind, rng, count)
+    models, states = ModelPool(), StatePool()
+    models.vertex_pos = wp.array(points, dtype=wp.vec3d, device=CPU)
+    corners = np.array([rng.choice(count, 3, replace=kind == "degenerate") for _ in range(2 * face_count)])
+    if "coincident" in kind:
+        corners[face_count:] = corners[:face_count]
+    corners[face_count:] += count
+    corners = np.pad(corners, ((0, 0), (0, 1))).astype(np.int32)
+    states.face_corner = wp.array(corners, dtype=wp.vec4i, device=CPU)
+    placed = [models, states, wp.mat33d(rotation), wp.vec3d(*shift), face_count]
+    asked = rng.integers(0, face_count, (ask_count, 2))
+    if "coincident" in kind:
+        # Half of them neighbours.
+        shares = (corners[:, None, :3, None] + count == corners[face_count:, None, :3].reshape(1, -1, 1, 3)).any((2, 3))
+        one, other = np.nonzero(shares[:face_count])
+        chosen = rng.integers(0, len(one), ask_count // 2)
+        asked[: ask_count // 2] = np.stack([one[chosen], other[chosen]], 1)
+    asked = (asked[:, 0] << 32) | asked[:, 1]
+    plain, exact, decided = (wp.empty(ask_count, dtype=wp.int32, device=CPU) for _ in range(3))
+    items = wp.array(asked, dtype=wp.int64, device=CPU)
+    wp.launch(filter_one_kernel, dim=ask_count, inputs=[*placed, items, plain, exact, decided], device=CPU)
+    unsure, exact = plain.numpy() == int(UNSURE), exact.numpy()
+    decided = unsure & (decided.numpy() == 1)
+    met = np.where(decided, exact, plain.numpy()) == 1
+    assert (plain.numpy()[~unsure] == exact[~unsure]).all() or kind == "wild"
+    for first_ends in (False, True):
+        left = wp.array(np.append(asked, UNTOUCHED), dtype=wp.int64, device=CPU)
+        faces, counts = filled(before + ask_count + 1), wp.zeros(4, dtype=wp.int64, device=CPU)
+        inputs = [first_ends, before, ask_count, *placed, left, faces, counts]
+        wp.launch(filter_all_kernel, dim=1, inputs=inputs, device=CPU)
+        end, still_open, tested, resolved = counts.numpy()
+        ends = first_ends and met.any()
+        assert tested == (min(ask_count, 8 * (np.flatnonzero(met)[0] // 8 + 1)) if ends else ask_count)
+        first = np.arange(ask_count) < tested
+        np.testing.assert_array_equal(np.sort(faces.numpy()[before:end]), np.sort(asked[first & met]))
+        np.testing.assert_array_equal(
+            np.sort(left.numpy()[:still_open]), np.sort(asked[first & unsure & ~decided]), err_msg="left open"
+        )
+        assert resolved == (first & decided).sum()
+        assert (faces.numpy()[:before] == UNTOUCHED).all() and (faces.numpy()[end:] == UNTOUCHED).all()
+        assert left.numpy()[-1] == UNTOUCHED
+    seen = {"met": met & ~decided, "apart": ~met & ~unsure, "decided": decided, "left": unsure & ~decided}
+    assert all(seen[name].sum() > 30 for name in CASES[kind].split())
+    assert (met & decided).any() or "decided" not in CASES[kind]
 
 
 # --- the traversal ---------------------------------------------------------------------------------------------------
