@@ -1,4 +1,7 @@
-"""Triangle against triangle as closed sets: touching and coplanar overlap count, zero-area faces are segments."""
+"""Triangle against triangle as closed sets: touching and coplanar overlap count, zero-area faces are segments.
+
+`vector64.filter_waiting` does as `intersect_triangles` does for FILTER, 8 pairs at a time; tests compare them.
+"""
 
 from typing import Any
 
