@@ -94,8 +94,8 @@ class FrameGraph:
     Tree states, and so memory, come in one of two ways:
 
     * One an object, or one a group of objects, updated in place by the AB-Tree's own update, a full refit where more
-      than half of the faces may change: any LOD, some 90 to 140 bytes a face and state, a tenth of that for worklists.
-      They have room for all states to change at once.
+      than half of the faces may change, on CUDA a hundredth: any LOD, some 90 to 140 bytes a face and state, a tenth of
+      that for worklists. They have room for all states to change at once.
     * With a ladder, one a model and rung, made beforehand: an LOD change costs an index. The less memory where a model
       has more objects than rungs.
 
