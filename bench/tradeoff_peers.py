@@ -24,6 +24,7 @@ COACD_THRESHOLDS = (0.2, 0.1)
 DECOMPOSED_FACES = 10_000  # larger meshes are brought to so many faces first, by our LODs: many minutes otherwise
 VHACD_HULLS = (8, 64)
 SDF_RESOLUTIONS = (32, 64, 128)
+NEWTON_POSES = 1024  # at a time: its time a pose hardly falls beyond, and a body is to be set up for each
 BASE_FACES = 10
 OURS, OURS_WITHIN, OURS_FCL = "our LODs", "our LODs, within both errors", "our LODs, python-fcl"
 SIMPLIFIED, HULL, COACD, VHACD = "fast-simplification, python-fcl", "convex hull, python-fcl", "CoACD", "V-HACD"
@@ -254,7 +255,7 @@ def newton_points(context, subject):
         return
     if context.peer("newton") is None:
         return
-    poses = subject.tiled()
+    poses = subject.tiled(NEWTON_POSES)
     vertices, faces, _ = subject.a.mesh_at(subject.a.lod_max)
     hits = int(subject.stage.ask(subject.poses, "count").count.sum()) * (len(poses) // len(subject.poses))
     for sdf in (0, *SDF_RESOLUTIONS):
@@ -268,7 +269,7 @@ def newton_points(context, subject):
             seconds = time.perf_counter() - begin
             row = judge(subject, method, setting, query.meets, share=1.0, build_s=seconds)
             query.place(poses)
-            row["us"] = 1e3 * time_launches(context, {"run": query.peer.launch})["run"] / len(poses)
+            row["us"] = 1e3 * time_launches(context, {"run": query.peer.launch}, 5)["run"] / len(poses)
             query.peer.check()
             yield row | {"where": "GPU"}, None
         except Exception as error:  # another package's failure must not cost the rest of a run

@@ -252,9 +252,9 @@ class Subject:
         low, _ = find_first_contact(meets, self.motions, self.steps)
         return (low - self.low) / self.size
 
-    def tiled(self):
-        """Return poses to time: all of them, on CUDA several times over so that there is work for the device."""
-        times = -(-POSES_AT_A_TIME // len(self.poses)) if self.device.is_cuda else 1
+    def tiled(self, least=POSES_AT_A_TIME):
+        """Return poses to time: all of them, on CUDA several times over, at least so many: work for the device."""
+        times = -(-least // len(self.poses)) if self.device.is_cuda else 1
         return np.tile(self.poses, (times, 1))
 
 

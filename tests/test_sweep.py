@@ -2,6 +2,7 @@
 
 import gc
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from test_margins import GpuQuery
 
 import warp_abtree as ab
 from warp_abtree import pose_sweep
+from warp_abtree.turns import device_turn
 
 
 @pytest.fixture(autouse=True)
@@ -218,7 +220,8 @@ def test_long_lists_are_not_kept(device, monkeypatch):
 
 
 def test_two_threads(device):
-    """Each has its own buffers while both ask about the same models."""
+    """Each has its own buffers while both ask about the same models; on a GPU they take turns."""
+    stream = wp.get_stream(device) if wp.get_device(device).is_cuda else None
     models, poses = [sample("torus"), sample("soup")], [mixed_poses(seed) for seed in (1, 2)]
     expected = [ab.sweep(*models, rows, output="count", device=device) for rows in poses]
     found = [[], []]
@@ -234,3 +237,30 @@ def test_two_threads(device):
         thread.join()
     for i in range(2):
         assert len(found[i]) == 10 and all(np.array_equal(x, expected[i]) for x in found[i])
+    if stream is not None:  # where they do not, Warp may be left on the null stream, which cannot be captured
+        assert wp.get_stream(device) is stream
+        with wp.ScopedCapture(device):
+            wp.zeros(3, device=device).fill_(1.0)
+
+
+def test_threads_take_turns_on_a_gpu_alone():
+    gpus = [SimpleNamespace(is_cuda=True, alias=f"cuda:{i}") for i in (98, 98, 99)]
+    cpu = SimpleNamespace(is_cuda=False, alias="cpu")
+
+    def enters(device):
+        """Whether another thread has a turn at once while this one has one on the first GPU."""
+        entered = threading.Event()
+
+        def work():
+            with device_turn(device):
+                entered.set()
+
+        with device_turn(gpus[0]), device_turn(gpus[0]):  # within its own turn a thread may ask again
+            thread = threading.Thread(target=work)
+            thread.start()
+            at_once = entered.wait(0.2)
+        thread.join()
+        assert entered.is_set()
+        return at_once
+
+    assert not enters(gpus[1]) and enters(gpus[2]) and enters(cpu)

@@ -4,6 +4,7 @@ What a pair of models needs on a device is kept for the next call. Poses pass th
 works on a chunk, the one before is read and the next one brought there.
 """
 
+import functools
 import weakref
 from collections import deque
 
@@ -15,6 +16,7 @@ from warp_abtree.intersect import Query, check_request
 from warp_abtree.kernels.sweep import NONE_REFUSED, place_poses_kernel, report_chunk_kernel
 from warp_abtree.scene import QUATERNION_TOLERANCE, Scene
 from warp_abtree.state import ObjectArrays
+from warp_abtree.turns import device_turn
 
 # Poses asked at a time: enough to fill a GPU, few enough that millions need no more memory; fewer where few are asked.
 CHUNKS = (1024, 8192, 65536)
@@ -135,6 +137,12 @@ class _Chunk:
             self.question = None
 
 
+@functools.cache
+def _find_copy_stream(alias):
+    """Return a device's stream for transfers, one for all: Warp makes and ends streams on one thread at a time."""
+    return wp.Stream(alias)
+
+
 class _Lane:
     """Buffers through which a chunk passes: poses in, answers out. On the CPU host and device share them."""
 
@@ -166,7 +174,7 @@ class _Question:
         self.query = Query(chunk, self.output, pairs=self.pairs, precision=precision)
         self.count = self.room
         self.lanes: dict = {}
-        self.copies = wp.Stream(self.device) if self.device.is_cuda else None
+        self.copies = _find_copy_stream(self.device.alias) if self.device.is_cuda else None
 
     def _find_lanes(self, poses):
         """Return the lanes of poses of one type, made at the first use."""
@@ -288,7 +296,7 @@ def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precisi
     Poses are checked on the device; on CUDA transfers overlap with launches, except for "faces". The arrays of the last
     four pairs of models, LODs and devices stay on the device for the next call as long as both models live: models and
     tree states, some 190 bytes a face, and 0.5 KB for each of at most 74,752 poses in chunks of three sizes. Whatever
-    the number of poses, a call needs no more memory besides its answer.
+    the number of poses, a call needs no more memory besides its answer. Calls of several threads take turns on a GPU.
 
     Args:
         model_a, model_b: `Model`; may be the same.
@@ -309,16 +317,21 @@ def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precisi
     """
     check_request(output, precision)
     pair = Scene(device)
+    with device_turn(pair.device):
+        return _sweep(pair, (model_a, model_b), poses, (lod_a, lod_b), output, precision)
+
+
+def _sweep(pair, models, poses, lods, output, precision):
     poses = _take_poses(poses, pair.device)
-    pair.add(model_a, lod=lod_a)
-    pair.add(model_b, lod=lod_b)
+    for model, lod in zip(models, lods):
+        pair.add(model, lod=lod)
     if len(poses) == 0:
         return np.empty((0, 3), np.int32) if output == "faces" else np.empty(0, ANSWERS[output])
-    key = (id(model_a), id(model_b), *pair.lods.tolist(), pair.device.alias)
+    key = (*map(id, models), *pair.lods.tolist(), pair.device.alias)
     # Taken out while in use: a call from another thread has its own, and one that fails leaves nothing behind.
     posed = _kept.pop(key, None)
     if posed is None:
-        owners = [weakref.ref(model, lambda _: _kept.pop(key, None)) for model in (model_a, model_b)]
+        owners = [weakref.ref(model, lambda _: _kept.pop(key, None)) for model in models]
         posed = _PosedModels(pair, owners)
     chunk = posed.find_chunk(len(poses))
     question = chunk.ask(output, precision)
