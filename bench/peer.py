@@ -13,6 +13,23 @@ wp.set_module_options({"enable_backward": False})
 CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")
 
 
+@wp.func
+def place_face(
+    pair: wp.int32,
+    a: wp.int32,
+    vertices: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    poses: wp.array(dtype=wp.transform),
+):
+    """Return the corners of a face of object 2 `pair` in the frame of object 2 `pair` + 1."""
+    relative = wp.transform_multiply(wp.transform_inverse(poses[2 * pair + 1]), poses[2 * pair])
+    face = faces[a]
+    p = wp.transform_point(relative, vertices[face[0]])
+    q = wp.transform_point(relative, vertices[face[1]])
+    r = wp.transform_point(relative, vertices[face[2]])
+    return p, q, r
+
+
 @wp.kernel
 def count_hits_kernel(
     face_count: wp.int32,
@@ -26,10 +43,7 @@ def count_hits_kernel(
     tid = wp.tid()
     pair = tid // face_count
     a = tid % face_count
-    relative = wp.transform_multiply(wp.transform_inverse(poses[2 * pair + 1]), poses[2 * pair])
-    p = wp.transform_point(relative, vertices[faces[a][0]])
-    q = wp.transform_point(relative, vertices[faces[a][1]])
-    r = wp.transform_point(relative, vertices[faces[a][2]])
+    p, q, r = place_face(pair, a, vertices, faces, poses)
     query = wp.bvh_query_aabb(bvh, wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r)))
     b = wp.int32(0)
     while wp.bvh_query_next(query, b):
@@ -57,10 +71,7 @@ def find_any_kernel(
     a = tid % face_count
     if any_inout[pair] != 0:
         return
-    relative = wp.transform_multiply(wp.transform_inverse(poses[2 * pair + 1]), poses[2 * pair])
-    p = wp.transform_point(relative, vertices[faces[a][0]])
-    q = wp.transform_point(relative, vertices[faces[a][1]])
-    r = wp.transform_point(relative, vertices[faces[a][2]])
+    p, q, r = place_face(pair, a, vertices, faces, poses)
     query = wp.bvh_query_aabb(bvh, wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r)))
     b = wp.int32(0)
     while wp.bvh_query_next(query, b):
