@@ -42,12 +42,12 @@ def vector(values, what):
 def column(values, count, what, low, high=np.inf, open_below=False):
     """Return (count,) numbers between two, the lower one excluded if it is open."""
     values = stretch(to_numpy(values, what), count, None, what)
-    fits = (values > low if open_below else values >= low) & (values <= high)
+    fits = np.isfinite(values) & (values > low if open_below else values >= low) & (values <= high)
     if not fits.all():
         i = int(np.argmin(fits))
         raise ValueError(
             f"{what}: {values[i]} of object {i} is not {'above' if open_below else 'at least'} {low}"
-            + (f" and at most {high}" if high < np.inf else "")
+            + (f" and at most {high}" if high < np.inf else " and finite")
         )
     return values
 

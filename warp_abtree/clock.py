@@ -67,7 +67,10 @@ def _read_rows(path):
             rows = json.load(file) if path.suffix.lower() == ".json" else list(csv.DictReader(file))
         if not rows:
             raise ValueError("no frames")
-        return [{stage: float(row[stage]) for stage in STAGES} for row in rows]
+        rows = [{stage: float(row[stage]) for stage in STAGES} for row in rows]
+        if not np.isfinite([list(row.values()) for row in rows]).all():
+            raise ValueError("a stage is not finite")
+        return rows
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror or error}") from None
     except (ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:

@@ -224,18 +224,20 @@ class FrameGraph:
         Raises:
             ValueError: A pose was not finite or a quaternion off unit length by more than 1e-3 (its object kept the
                 pose before); a LOD was out of range (the nearer end was taken).
-            CapacityError: Pairs, hits or face pairs that float32 leaves open outran their buffers; names the demand.
+            CapacityError: Pairs, hits or face pairs that float32 leaves open outran their buffers; names the demand,
+                and whatever else was wrong.
         """
         poses, lods, demand = self._bad_poses.numpy().copy(), self._update.faults.numpy().copy(), self._demand.numpy()
         found, hits, unsure = (int(value) for value in demand)
         self.clear_faults()
+        wrong, lost = [], []
         if poses[0]:
-            raise ValueError(
+            wrong.append(
                 f"poses: {poses[0]} rows since the last check were not finite or not of unit quaternions; the first "
                 f"object that had one is {poses[1]}, and kept its pose"
             )
         if lods[0]:
-            raise ValueError(
+            wrong.append(
                 f"lods: {lods[0]} entries since the last check were out of range; the first one that had one is "
                 f"{lods[1]}, and took the nearer end"
             )
@@ -247,6 +249,10 @@ class FrameGraph:
             room["unsure_capacity"] = len(self.query.hits.unsure)
         for name, places in room.items():
             if demands[name] > places:
-                raise CapacityError(
+                lost.append(
                     f"a frame since the last check needed {name}={demands[name]}, the frame graph has room for {places}"
                 )
+        if lost:
+            raise CapacityError("; ".join([*lost, *wrong]))
+        if wrong:
+            raise ValueError("; ".join(wrong))

@@ -211,7 +211,8 @@ class Query:
         self.broad_phase = None
         if pairs is None:
             models, states, objects = self.arrays
-            self.broad_phase = BroadPhase(models, states, objects, scene.excluded_keys(), pair_capacity)
+            self._excluded = scene.excluded_keys()
+            self.broad_phase = BroadPhase(models, states, objects, self._excluded, pair_capacity)
             self.pairs, self.pair_count = self.broad_phase.pairs, self.broad_phase.pair_count
         else:
             self.pair_count = wp.zeros(1, dtype=wp.int32, device=self.device)
@@ -316,14 +317,20 @@ class Query:
         """Run broad phase (unless pairs were given) and narrow phase. Launches only.
 
         Raises:
-            RuntimeError: The scene's objects changed since the query was made.
+            RuntimeError: The scene's objects changed since the query was made, or its filter where the broad phase
+                runs.
         """
-        if self.arrays != self.scene.arrays():
-            raise RuntimeError("objects were added to the scene since this query was made; make a new one")
+        self._check_scene()
         if self.broad_phase is not None:
             self.broad_phase.launch()
         self.prove_apart()
         self.traverse()
+
+    def _check_scene(self):
+        if self.arrays != self.scene.arrays():
+            raise RuntimeError("objects were added to the scene since this query was made; make a new one")
+        if self.broad_phase is not None and len(self.scene.excluded_keys()) > len(self._excluded):
+            raise RuntimeError("pairs were filtered out of the scene since this query was made; make a new one")
 
     def prove_apart(self):
         """Find the pairs that are not proved farther apart than `within`, if that is asked. Launches only."""

@@ -106,10 +106,9 @@ class ManifoldQuery(ContactQuery):
         """Run broad phase (unless pairs were given), narrow phase and reduction. Launches only.
 
         Raises:
-            RuntimeError: The scene's objects changed since the query was made.
+            RuntimeError: As `Query.launch`.
         """
-        if self.arrays != self.scene.arrays():
-            raise RuntimeError("objects were added to the scene since this query was made; make a new one")
+        self._check_scene()
         if self.broad_phase is not None:
             self.broad_phase.launch()
             self._sort_pairs()

@@ -7,6 +7,7 @@ from numbers import Real
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks import whole_number
 from warp_abtree.kernels import collapse, deviation, forest, piece
 
 MERGES_PER_LAUNCH = 25_000
@@ -144,14 +145,13 @@ def build_progressive(mesh, base_faces=10, link_condition=False, progress=None):
     centre, scale = _frame(vertices)
     parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), bool(link_condition), report)
     vertex_pos = np.concatenate([vertices, centre + scale * pos[len(vertices) :]])
-    face_split, split_start, split_face = _splits(parent, faces, len(vertices))
+    face_split, split_start, split_face = find_splits(parent, faces, len(vertices))
     lod_error = _deviation(vertex_pos, parent, faces, report)
     return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, lod_error)
 
 
 def _checked(mesh, base_faces):
-    if int(base_faces) != base_faces or base_faces < 1:
-        raise ValueError(f"base_faces must be an integer >= 1, got {base_faces}")
+    whole_number(base_faces, "base_faces", 1, 2**62)
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
     faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
@@ -269,7 +269,7 @@ def _roomier_heap(surface, heap, counter):
     return larger
 
 
-def _splits(parent, faces, vertex_count):
+def find_splits(parent, faces, vertex_count):
     """Return face_split int32 [n_f], split_start int64 [m+1] and split_face int32 of a forest."""
     node_count = len(parent)
     merge_count = node_count - vertex_count

@@ -94,7 +94,7 @@ class Recording:
             raise ValueError(f"{path}: a recording of version {version}, not {FORMAT_VERSION}")
         try:
             return cls._from_arrays(arrays)
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             what = f"{error} is missing" if isinstance(error, KeyError) else error
             raise ValueError(f"{path}: a damaged recording ({what})") from None
 
@@ -116,6 +116,8 @@ class Recording:
             real = _is_real(name) or name in _OPTIONAL
             if column.shape != (frames,) or column.dtype != (np.float64 if real else np.int64):
                 raise ValueError(f"row_{name}: shape {column.shape} and type {column.dtype} of {frames} frames")
+            if name not in _OPTIONAL and not np.isfinite(column).all():
+                raise ValueError(f"row_{name}: a number is not finite")
             columns[name] = column.tolist()
             if name in _OPTIONAL:
                 whole = int if name == "hits" else float
