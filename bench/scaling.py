@@ -2,9 +2,11 @@
 
 Through `MultiScene`, with new poses from the host at every question: a sweep (one object in every world, one more in
 each world, pairs given, yes or no) and worlds (four objects each, broad phase, face pairs counted). Through
-`ThisProcess`: shards, those of a `SweepJob`, as `warp-abtree sweep` does them but for the disk. Strong: as much work
-whatever the number of devices; weak: as much on each device. Times are by the wall clock, all numbers of devices in
-turn, poses in and merged results out; busy is the time of the slowest device by itself. A CPU worker has one core.
+`FrameGraph`, one a device: frames, the same worlds, whose poses change and whose answers stay on the devices, so that
+the host brings nothing. Through `ThisProcess`: shards, those of a `SweepJob`, as `warp-abtree sweep` does them but for
+the disk. Strong: as much work whatever the number of devices; weak: as much on each device. Devices are 1, 2, 4 and so
+on, and all. Times are by the wall clock, all numbers of devices in turn, poses in and merged results out; busy is what
+the slowest device with its thread or process took of it. A CPU worker has one core.
 """
 
 import contextlib
@@ -14,6 +16,8 @@ import os
 import tempfile
 import time
 from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
@@ -24,13 +28,14 @@ from .roofline import NODE_BYTES, PAIR_BYTES, TRIANGLE_BYTES
 from .scale import world_poses
 from .shapes import knot, pair_poses
 from .sweep import random_poses
-from .timing import make_runs, summarise, time_rounds, time_wall
+from .timing import capture, make_runs, summarise, time_rounds, time_wall
 
 SIZES = {
     "cuda": {
         "faces": 5000,
         "sweep": 65536,
         "worlds": 8192,
+        "frames": 8,
         "repeats": 9,
         "counts": (256, 1024, 4096),
         "driver": 2**21,
@@ -40,13 +45,23 @@ SIZES = {
         "faces": 2000,
         "sweep": 8192,
         "worlds": 512,
+        "frames": 2,
         "repeats": 7,
         "counts": (64, 256, 512),
         "driver": 2**20,
         "shards": 2**18,
     },
 }
-QUICK = {"faces": 300, "sweep": 32, "worlds": 8, "repeats": 1, "counts": (4, 16), "driver": 4096, "shards": 64}
+QUICK = {
+    "faces": 300,
+    "sweep": 32,
+    "worlds": 8,
+    "frames": 2,
+    "repeats": 1,
+    "counts": (4, 16),
+    "driver": 4096,
+    "shards": 64,
+}
 OBJECTS = 4  # a world
 DISTANCES = (0.2, 0.9, 1.6)
 TERMS = ("launch", "pair", "node")
@@ -76,12 +91,10 @@ def run(device, devices=None, quick=False, predict=None):
     yield run_cost(first, sizes)
     yield run_worker(first, model, min(SHARD, sizes["driver"]), sizes["repeats"])
     yield run_driver(model, sizes["driver"])
-    for processes in (None, True) if first.is_cuda else (None,):
-        for case in ("sweep", "worlds"):
-            for way in ("strong", "weak"):
-                yield from run_scaling(devices, model, case, way, sizes, processes)
-    for way in ("strong", "weak"):
-        yield from run_shards(devices, model, way, sizes)
+    for case in ("sweep", "worlds"):
+        yield from run_scaling(devices, model, case, sizes)
+    yield from run_frames(devices, model, sizes)
+    yield from run_shards(devices, model, sizes)
 
 
 # The cost model.
@@ -169,8 +182,44 @@ def run_driver(model, count):
 # Devices.
 
 
-def run_shards(devices, model, way, sizes):
-    """Yield a row for each number of devices that do the shards of a sweep, each from a thread; nothing is written.
+def list_sizes(devices) -> list:
+    """Return what is asked, (devices, times the work of one): each number of devices once with one, once with its own.
+
+    Numbers are the powers of two, and all.
+    """
+    numbers = [1 << i for i in range(len(devices).bit_length()) if 1 << i < len(devices)] + [len(devices)]
+    return sorted({(parts, times) for parts in numbers for times in (1, parts)})
+
+
+def list_rows(case, devices, found, describe):
+    """Yield a row a way and number of devices.
+
+    Args:
+        found: Times [ms] by (devices, times the work of one).
+        describe: Returns the columns of a case: of such a key, and of the times that were found.
+    """
+    base = float(np.median(found[1, 1]))
+    for way in ("strong", "weak"):
+        for parts in sorted({parts for parts, _ in found}):
+            key = parts, parts if way == "weak" else 1
+            row = {"case": case, "way": way, "device": wp.get_device(devices[0]).name, "devices": parts}
+            ideal = base * key[1] / parts
+            row |= describe(key, found[key])
+            yield row | {"efficiency": round(ideal / float(np.median(found[key])), 3), "cores_here": os.cpu_count()}
+
+
+@contextlib.contextmanager
+def one_core():
+    """Give each launch on the CPU one core."""
+    kept, ab.Query.cores = ab.Query.cores, 1
+    try:
+        yield
+    finally:
+        ab.Query.cores = kept
+
+
+def run_shards(devices, model, sizes):
+    """Yield rows of devices that do the shards of a sweep, each from a thread; nothing is written.
 
     Raises:
         RuntimeError: Answers are not those of one device.
@@ -178,32 +227,28 @@ def run_shards(devices, model, way, sizes):
     size = float(np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())
     shard, repeats = min(SHARD, sizes["shards"] // 32), min(5, sizes["repeats"])
     poses = random_poses(sizes["shards"] * len(devices), size)
-    kept, ab.Query.cores = ab.Query.cores, 1
-    try:
-        runs, counts = {}, {}
-        for parts in range(1, len(devices) + 1):
-            counts[parts] = sizes["shards"] * (parts if way == "weak" else 1)
-            job = ab.SweepJob(model, model, poses[: counts[parts]], shard=shard)
-            ranges = [(start, start + shard) for start in range(0, counts[parts], shard)]
+    expected = ab.sweep(model, model, poses, device=devices[0])
+    with one_core():
+        runs = {}
+        for parts, times in list_sizes(devices):
+            count = sizes["shards"] * times
+            job = ab.SweepJob(model, model, poses[:count], shard=shard)
+            ranges = [(start, start + shard) for start in range(0, count, shard)]
             pool = ab.ThisProcess(devices[:parts])
             answers = {start: columns["any"] for start, _, columns in pool.ask(job, ranges)}
-            found = np.concatenate([answers[start] for start, _ in ranges])
-            if not np.array_equal(found, ab.sweep(model, model, poses[: len(found)], device=devices[0])):
+            if not np.array_equal(np.concatenate([answers[start] for start, _ in ranges]), expected[:count]):
                 raise RuntimeError(f"shards: {parts} devices answer otherwise than one")
-            runs[parts] = time_wall(
+            runs[parts, times] = time_wall(
                 lambda pool=pool, job=job, ranges=ranges: deque(pool.ask(job, ranges), 0), wp.get_device(devices[0])
             )
-        times = time_rounds(runs, repeats)
-    finally:
-        ab.Query.cores = kept
-    base = float(np.median(times[1]))
-    for parts, values in times.items():
-        median = float(np.median(values))
-        row = {"case": "shards", "way": way, "device": wp.get_device(devices[0]).name, "devices": parts}
-        row |= {"asked_by": "threads", "poses": counts[parts]} | summarise("shards", values)
-        row |= {"mposes_s": float(f"{counts[parts] / median / 1e3:.4g}")}
-        ideal = base / parts if way == "strong" else base
-        yield row | {"efficiency": round(ideal / median, 3), "cores_here": os.cpu_count()}
+        found = time_rounds(runs, repeats)
+
+    def describe(key, values):
+        count = sizes["shards"] * key[1]
+        row = {"asked_by": "threads", "poses": count} | summarise("shards", values)
+        return row | {"mposes_s": float(f"{count / np.median(values) / 1e3:.4g}")}
+
+    yield from list_rows("shards", devices, found, describe)
 
 
 def fill(scene, model, case, count):
@@ -222,51 +267,136 @@ def fill(scene, model, case, count):
     return poses, pairs
 
 
-def run_scaling(devices, model, case, way, sizes, processes):
-    """Yield a row for each number of devices."""
+def run_scaling(devices, model, case, sizes):
+    """Yield rows of a `MultiScene` that is asked with new poses.
+
+    Raises:
+        RuntimeError: Answers are not those of one device.
+    """
     output = "any" if case == "sweep" else "count"
     with contextlib.ExitStack() as stack:
-        runs, scenes, seen = {}, {}, {}
-        for parts in range(1, len(devices) + 1):
-            scene = stack.enter_context(ab.MultiScene(devices[:parts], processes, cores=1))
-            count = sizes[case] * (parts if way == "weak" else 1)
-            poses, pairs = fill(scene, model, case, count)
+        runs, expected = {}, None
+        for parts, times in list_sizes(devices):
+            scene = stack.enter_context(ab.MultiScene(devices[:parts], cores=1))
+            poses, pairs = fill(scene, model, case, sizes[case] * times)
             scene.intersect(pairs, output=output)
             if case == "worlds":
                 scene.balance()
                 scene.intersect(pairs, output=output)
-            runs[parts] = time_question(scene, poses, pairs, output)
-            scenes[parts] = scene
+            runs[parts, times] = Question(scene, poses, pairs, output)
             scene.set_poses(poses[0])
             found = scene.intersect(pairs, output=output)
-            seen[parts] = (found.pairs.tobytes(), getattr(found, output).tobytes())
-            if way == "strong" and seen[parts] != seen[1]:
-                raise RuntimeError(f"{case}: {parts} devices answer otherwise than one")
-        times = time_rounds(runs, sizes["repeats"])
-        busy = {parts: max(scene.seconds) for parts, scene in scenes.items()}
-    base = float(np.median(times[1]))
-    for parts, values in times.items():
-        median = float(np.median(values))
-        row = {"case": case, "way": way, "device": wp.get_device(devices[0]).name, "devices": parts}
-        row |= {"asked_by": "processes" if processes or devices[0] == "cpu" else "threads"}
-        row |= {"worlds": sizes[case] * (parts if way == "weak" else 1), "question_ms": round(median, 3)}
-        row |= {"question_p95_ms": round(float(np.percentile(values, 95)), 3), "busy_ms": round(1e3 * busy[parts], 3)}
-        ideal = base / parts if way == "strong" else base
-        yield row | {"efficiency": round(ideal / median, 3), "cores_here": os.cpu_count()}
+            if times == 1:
+                seen = found.pairs.tobytes(), getattr(found, output).tobytes()
+                expected = expected or seen
+                if seen != expected:
+                    raise RuntimeError(f"{case}: {parts} devices answer otherwise than one")
+        found = time_rounds(runs, sizes["repeats"])
+
+    def describe(key, values):
+        row = {"asked_by": "processes" if devices[0] == "cpu" else "threads", "worlds": sizes[case] * key[1]}
+        return row | summarise("question", values) | {"busy_ms": round(float(np.median(runs[key].busy)), 3)}
+
+    yield from list_rows(case, devices, found, describe)
 
 
-def time_question(scene, poses, pairs, output):
-    """Return a callable that sets other poses, asks, and returns the time [ms]."""
-    turn = [0]
+class Question:
+    """Sets other poses than before and asks; returns the time [ms], and keeps the parts' of it in `busy`."""
 
-    def question():
-        turn[0] ^= 1
+    def __init__(self, scene, poses, pairs, output):
+        self.scene, self.poses, self.pairs, self.output = scene, poses, pairs, output
+        self.turn, self.busy = 0, []
+
+    def __call__(self):
+        self.turn ^= 1
         begin = time.perf_counter()
-        scene.set_poses(poses[turn[0]])
-        scene.intersect(pairs, output=output)
-        return 1e3 * (time.perf_counter() - begin)
+        self.scene.set_poses(self.poses[self.turn])
+        busy = max(self.scene.seconds)
+        self.scene.intersect(self.pairs, output=self.output)
+        spent = time.perf_counter() - begin
+        self.busy.append(1e3 * (busy + max(self.scene.seconds)))
+        return 1e3 * spent
 
-    return question
+
+class Frames:
+    """A `FrameGraph` of worlds whose poses are on its device, in two sets that take turns."""
+
+    def __init__(self, device, model, poses):
+        self.device = wp.get_device(device)
+        scene = ab.Scene(device)
+        for row, pose in enumerate(poses[0]):
+            scene.add(model, pose, world=row // OBJECTS)
+        self.frame = ab.FrameGraph(scene, "count", ladder=[[model.lod_max]])
+        self.poses = [wp.array(rows, dtype=wp.float64, device=self.device) for rows in poses]
+        self.answers = [self.answer(rows) for rows in self.poses]
+        self.graph = capture(self.launch, self.device) if self.device.is_cuda else None
+
+    def answer(self, rows):
+        """Return the pairs of a set of poses with their counts, int64 (p, 3), sorted; buffers grow as needed."""
+        wp.copy(self.frame.poses, rows)
+        result = self.frame.run()
+        found = np.column_stack([result.pairs, result.count])
+        return found[np.lexsort((found[:, 1], found[:, 0]))]
+
+    def launch(self):
+        for rows in self.poses:
+            wp.copy(self.frame.poses, rows)
+            self.frame.launch()
+
+    def run(self, count):
+        """Run an even number of frames and wait for them."""
+        for _ in range(count // 2):
+            if self.graph is None:
+                self.launch()
+            else:
+                wp.capture_launch(self.graph)
+        wp.synchronize_device(self.device)
+
+
+def run_frames(devices, model, sizes):
+    """Yield rows of a `FrameGraph` a device, each launched from a thread of its own; nothing passes the host.
+
+    Raises:
+        RuntimeError: Answers are not those of one device.
+    """
+    size, count = float(np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max()), sizes["worlds"]
+    poses = [world_poses(count * len(devices), OBJECTS, size, seed).reshape(-1, 7) for seed in (0, 1)]
+    with one_core(), ThreadPoolExecutor(len(devices)) as threads:
+        runs = {}
+        for parts, times in list_sizes(devices):
+            bounds = [OBJECTS * (count * times * k // parts) for k in range(parts + 1)]
+            spans = [slice(start, stop) for start, stop in pairwise(bounds)]
+            made = [Frames(device, model, [rows[span] for rows in poses]) for device, span in zip(devices, spans)]
+            runs[parts, times] = made
+            check_frames(runs[1, 1][0], made, bounds)
+        rounds = {
+            key: lambda made=made: deque(threads.map(Frames.run, made, [sizes["frames"]] * len(made)), 0)
+            for key, made in runs.items()
+        }
+        calls = {key: time_wall(launch, devices[0]) for key, launch in rounds.items()}
+        found = time_rounds(calls, sizes["repeats"])
+        for frames in (frames for made in runs.values() for frames in made):
+            frames.frame.check()
+
+    def describe(key, values):
+        return {"asked_by": "threads", "worlds": count * key[1]} | summarise(
+            "frame", np.array(values) / sizes["frames"]
+        )
+
+    yield from list_rows("frames", devices, found, describe)
+
+
+def check_frames(one, made, bounds):
+    """Check that frames on several devices find what those on one find in its worlds.
+
+    Raises:
+        RuntimeError: They do not.
+    """
+    last = len(one.poses[0])
+    for turn, expected in enumerate(one.answers):
+        found = np.concatenate([frames.answers[turn] + [start, start, 0] for frames, start in zip(made, bounds)])
+        if not np.array_equal(found[found[:, 0] < last], expected):
+            raise RuntimeError(f"frames: {len(made)} devices answer otherwise than one")
 
 
 # What follows.

@@ -171,13 +171,13 @@ def test_bad_input_is_refused_before_anything_is_sent(device, monkeypatch):
         monkeypatch.setattr(many, "_ask", lambda *_: pytest.fail("was sent"))
         n = many.object_count
         poses = np.tile(np.array(STILL), (n, 1))
-        bad = poses.copy()
-        bad[4, 2] = np.nan
         world = np.array(many._ledger._world)
         mixed = [[int(np.flatnonzero(world == 0)[0]), int(np.flatnonzero(world == 3)[0])]]
         for call, what in (
             (lambda: many.set_poses(poses[1:]), f"{n - 1} given for {n} objects"),
-            (lambda: many.set_poses(bad), "pose 4 is not finite"),
+            (lambda: many.set_poses(poses[:, :6]), "is neither"),
+            (lambda: many.intersect(5), "not whole numbers of shape"),
+            (lambda: many.intersect([[0, 1]], within=[0.1, 0.2]), "given for 1 pairs"),
             (lambda: many.set_lods(np.full(n, 10**6)), "object 0 asks for LOD 1000000, outside"),
             (lambda: many.set_lods(np.full(n, 0.5)), "no whole numbers"),
             (lambda: many.intersect(mixed), "pair 0 is of the worlds 0 and 3"),
@@ -192,6 +192,130 @@ def test_bad_input_is_refused_before_anything_is_sent(device, monkeypatch):
         with pytest.raises(TypeError, match="not a Model"):
             many.add("box")
         assert many.object_count == n
+
+
+@pytest.mark.parametrize("processes", [True, False])
+def test_bad_poses_move_no_object(device, processes):
+    """Wherever the bad one stands, the error is that of one scene, and poses are those of the last good call."""
+    one = fill(ab.Scene(device))
+    rng = np.random.default_rng(6)
+    with fill(ab.MultiScene([device] * 2, processes)) as many:
+        for turn, i in enumerate((0, 4, 9)):
+            good = random_poses(rng, one.object_count, 0.8)
+            matrices = np.tile(np.eye(4), (len(good), 1, 1))
+            matrices[:, :3, 3] = good[:, :3]
+            bad = random_poses(rng, one.object_count, 0.8)
+            bad_matrices = matrices.copy()
+            bad_matrices[:, :3, 3] = bad[:, :3]
+            bad_matrices[i, 0, 0] = -1
+            bad[[i, -2], 2 + turn] = [np.nan, 40.0, np.inf][turn]  # the first of several is named
+            for scene in (one, many):
+                scene.set_poses([good, matrices][turn % 2])
+            for refused in (bad, bad_matrices, bad.astype(np.float32)):
+                messages = []
+                for scene in (one, many):
+                    with pytest.raises(ValueError, match="poses: ") as found:
+                        scene.set_poses(refused)
+                    messages.append(str(found.value))
+                assert messages[0] == messages[1] and f" {i} " in messages[0]
+            assert_same_answers(many, one, device, ["count"])
+
+
+def test_sound_poses_are_those_that_pass_the_check():
+    rng = np.random.default_rng(7)
+    poses = random_poses(rng, 300, 1.0)
+    for size in (1 - 1.0001e-3, 1 - 0.9999e-3, 1 - 0.9e-3, 1.0, 1 + 0.9e-3, 1 + 0.9999e-3, 1 + 1.0001e-3, 1e100, 0.0):
+        row = poses[:1].copy()
+        row[0, 3:] *= size
+        assert scene_part.are_sound(np.concatenate([poses, row])) == (abs(size - 1) < 1e-3)
+    for column in range(7):
+        for value in (np.nan, np.inf, -np.inf):
+            bad = poses.copy()
+            bad[rng.integers(len(bad)), column] = value
+            assert not scene_part.are_sound(bad)
+    matrices = np.tile(np.eye(4), (3, 1, 1))
+    assert scene_part.are_sound(matrices) and not scene_part.are_sound(2 * matrices)
+    assert scene_part.are_sound(poses[:0])
+
+
+def test_runs_of_indices():
+    assert scene_part.find_runs(np.array([], int)) == [slice(0, 0)]
+    assert scene_part.find_runs(np.array([3, 4, 5])) == [slice(3, 6)]
+    assert scene_part.as_slice(np.array([7])) == slice(7, 8)
+    assert scene_part.find_runs(np.array([0, 2, 3, 9])) == [slice(0, 1), slice(2, 4), slice(9, 10)]
+    for count in (scene_part.RUNS_MAX, scene_part.RUNS_MAX + 1):
+        runs = scene_part.find_runs(2 * np.arange(count))
+        assert (runs is None) == (count > scene_part.RUNS_MAX)
+
+
+@pytest.mark.parametrize("order, processes", [("by world", False), ("mixed", False), ("mixed", True)])
+def test_pairs_asked_again_and_others(device, order, processes):
+    """The same pairs, the same array with other pairs in it, fewer of them, and poses in between, in any order."""
+    rng = np.random.default_rng(8)
+    worlds = np.repeat(np.arange(40), 2)
+    if order == "mixed":
+        worlds = rng.permutation(worlds)
+    scenes = ab.Scene(device), ab.MultiScene([device] * 2, processes)
+    for world in worlds.tolist():
+        pose = random_poses(rng, 1, 0.6)[0]
+        for scene in scenes:
+            scene.add(sample("small ball"), pose, world=world)
+    one, many = scenes
+    members = np.argsort(worlds, kind="stable").reshape(-1, 2)
+    with many:
+        pairs = members.copy()
+        for turn in range(12):
+            if turn in (4, 5, 9):
+                pairs[:] = members[rng.permutation(40)][:, :: 1 - 2 * (turn % 2)]
+            asked = pairs[: 17 if turn == 7 else 40]
+            if turn % 3:
+                poses = random_poses(rng, len(worlds), 0.6).astype([np.float64, np.float32][turn % 2])
+                for scene in scenes:
+                    scene.set_poses(poses)
+            if turn == 6 and not processes:
+                many._drop()  # parts are built anew from what is kept here
+            output = OUTPUTS[turn % 4]
+            found = many.intersect(asked, output, within=0.1 if turn % 2 else None)
+            assert_same(found, one.intersect(asked, output, within=0.1 if turn % 2 else None), device)
+            found.pairs[:] = 0  # which is nobody else's
+            if turn == 6:
+                with pytest.raises(ValueError, match="no finite distance"):
+                    many.intersect(asked[:5], within=-1.0)
+            if turn == 10:
+                for scene in scenes:
+                    scene.add(sample("small ball"), STILL, world=int(worlds[0]))
+                worlds = np.append(worlds, worlds[0])
+        assert_same_answers(many, one, device, ["faces"])
+        bad = pairs.copy()
+        bad[3] = 0, len(worlds)
+        with pytest.raises(ValueError, match=f"the scene has {len(worlds)} objects"):
+            many.intersect(bad)
+        assert_same(many.intersect(pairs), one.intersect(pairs), device)
+
+
+def test_poses_handed_in_may_change_afterwards(device):
+    one = fill(ab.Scene(device))
+    with fill(ab.MultiScene([device] * 2, processes=False)) as many:
+        for turn in range(3):
+            poses = random_poses(np.random.default_rng(turn), one.object_count, 0.8)
+            one.set_poses(poses)
+            many.set_poses(poses)
+            poses[:] = np.nan
+            assert_same_answers(many, one, device, ["count"])
+        many._drop()  # parts are built anew from what is kept here
+        assert_same_answers(many, one, device, ["count"])
+
+
+def test_worlds_that_follow_each_other_stay_together():
+    """Where that is even: then objects and pairs of a device are a slice of all."""
+    with ab.MultiScene(["cpu"] * 3, processes=False) as many:
+        for row in range(60):
+            many.add(sample("box"), (0.1 * row, 0, 0, 0, 0, 0, 1), world=59 - row // 2)
+        many._deal()
+        assert (np.diff(many._owner) >= 0).all() and np.bincount(many._owner).tolist() == [20, 20, 20]
+        many._cost = dict.fromkeys(range(60), 1.0) | {30: 40.0, 31: 40.0, 32: 40.0}
+        times = many._deal()
+        assert times.max() <= 50 and len(set(many._owner[2 * (59 - np.array([30, 31, 32]))].tolist())) == 3
 
 
 def test_devices():
@@ -240,12 +364,36 @@ def test_cost_is_fitted(device):
     assert row["samples"] == 12 and row["node_us"] >= 0 and row["off_mean"] <= row["off_worst"]
 
 
+@pytest.mark.parametrize("count", [1, 2, 4, 5])
+def test_numbers_of_devices(count):
+    numbers = {1: [1], 2: [1, 2], 4: [1, 2, 4], 5: [1, 2, 4, 5]}[count]
+    assert scaling.list_sizes(["cpu"] * count) == sorted({(n, times) for n in numbers for times in (1, n)})
+
+
+def check_rows(rows, name):
+    assert [(row["way"], row["devices"]) for row in rows] == [("strong", 1), ("strong", 2), ("weak", 1), ("weak", 2)]
+    sizes = [row[name] for row in rows]
+    assert sizes[:3] == sizes[:1] * 3 and sizes[3] == 2 * sizes[0]
+    assert rows[0]["efficiency"] == rows[2]["efficiency"] == 1
+    assert scaling.ab.Query.cores is None
+
+
+def test_frames_on_devices_are_timed(device, monkeypatch):
+    model = sample("small ball")
+    rows = list(scaling.run_frames([device, device], model, scaling.QUICK))
+    check_rows(rows, "worlds")
+    assert all(row["frame_ms"] > 0 for row in rows)
+    whole = scaling.Frames.answer
+    monkeypatch.setattr(scaling.Frames, "answer", lambda self, rows: whole(self, rows)[:-1])
+    with pytest.raises(RuntimeError, match="frames: 2 devices answer otherwise than one"):
+        list(scaling.run_frames([device, device], model, scaling.QUICK))
+
+
 def test_shards_on_devices_are_timed(device):
     model = sample("small ball")
-    rows = list(scaling.run_shards([device, device], model, "weak", scaling.QUICK))
-    assert [(row["devices"], row["poses"]) for row in rows] == [(1, 64), (2, 128)]
-    assert rows[0]["efficiency"] == 1 and rows[1]["mposes_s"] > 0
-    assert scaling.ab.Query.cores is None
+    rows = list(scaling.run_shards([device, device], model, scaling.QUICK))
+    check_rows(rows, "poses")
+    assert rows[3]["mposes_s"] > 0
     driver = scaling.run_driver(model, 4096)
     assert driver["driver_mposes_s"] > 0 and driver["check_mposes_s"] > 0
 

@@ -23,6 +23,7 @@ from warp_abtree.intersect import check_request
 from warp_abtree.model import Model
 from warp_abtree.pose_sweep import sweep
 from warp_abtree.scene import QUATERNION_TOLERANCE, Scene
+from warp_abtree.turns import device_turn
 
 FORMAT_NAME, FORMAT_VERSION = "warp_abtree shards", 1
 MANIFEST = "job.json"
@@ -62,9 +63,9 @@ class _Rows:
         self.count, self.width = shape
 
     def read(self, start, stop) -> np.ndarray:
-        """Return rows as an array of their own."""
+        """Return rows, of an array in memory without a copy."""
         if self.array is not None:
-            return np.array(self.array[start:stop])
+            return self.array[start:stop]
         row = self.width * self.dtype.itemsize
         with open(self.path, "rb") as file:
             file.seek(self.offset + start * row)
@@ -395,10 +396,15 @@ class ThisProcess:
         under_way: dict = {}
         before = wp.get_device()
 
+        def ask(k, part):
+            item = job.item(*part)  # each thread reads what it asks
+            with device_turn(self.devices[k]):
+                return askers[k].ask(item, self.devices[k])
+
         def feed(k):
             if waiting:
                 part = waiting.popleft()
-                under_way[threads[k].submit(askers[k].ask, job.item(*part), self.devices[k])] = k, part
+                under_way[threads[k].submit(ask, k, part)] = k, part
 
         try:
             for k in [*range(self.workers)] * 2:  # one at work, one ahead
