@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from samples import sample
+from samples import SHAPES, sample
 
 import warp_abtree as ab
 
@@ -59,6 +59,29 @@ def test_arrays_of_different_meshes_are_refused(tmp_path, case):
     rewrite(path, *ALTERED[case])
     with pytest.raises(ab.ModelError, match=r"m\.npz: "):
         ab.Model.open(path)
+
+
+@pytest.mark.parametrize("name", ["vertex_pos", "lod_error", "leaf_node", "name"])
+def test_what_fits_together_is_refused_where_it_was_altered(tmp_path, name):
+    path = tmp_path / "m.npz"
+    model = ab.Model.from_arrays(*SHAPES["small ball"](), name="ball")
+    model.save(path)
+
+    def change(value, _):
+        if name == "leaf_node":
+            value = value.copy()
+            value[:2] = value[1::-1]
+            return value
+        return np.array("boll") if name == "name" else value * 0.5
+
+    rewrite(path, name, change)
+    with pytest.raises(ab.ModelError, match=r"m\.npz: altered since it was saved"):
+        ab.Model.open(path)
+
+
+def test_a_model_that_cannot_be_written_names_the_file_asked_for(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none.m\.npz'$"):
+        sample("small ball").save(tmp_path / "none" / "m.npz")
 
 
 @pytest.mark.parametrize("operator", [ab.Query, ab.ContactQuery, ab.ManifoldQuery])

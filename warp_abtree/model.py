@@ -1,5 +1,6 @@
 """Model: a mesh with its progressive mesh and its AB-Tree, saved and opened as .npz."""
 
+import hashlib
 import os
 import zipfile
 from pathlib import Path
@@ -12,7 +13,7 @@ from warp_abtree.progressive import ProgressiveMesh, build_progressive, find_spl
 from warp_abtree.tree import Tree, active_build
 
 FORMAT_NAME = "warp_abtree model"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 _ARRAYS = {
     "vertex_parent": (np.int32, 1),
@@ -23,6 +24,7 @@ _ARRAYS = {
     "split_face": (np.int32, 1),
     "lod_error": (np.float64, 1),
 }
+_MEMBERS = (*_ARRAYS, "leaf_node", "name")
 
 
 class ModelError(ValueError):
@@ -118,21 +120,24 @@ class Model:
         return self.progressive.lod_for(fraction=fraction, tolerance=tolerance)
 
     def save(self, path):
-        """Write the model to an .npz file; the file appears whole or not at all."""
+        """Write the model to an .npz file; the file appears whole or not at all.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
         path = Path(path)
         partial = path.with_name(path.name + ".partial")
         arrays = {name: getattr(self.progressive, name) for name in _ARRAYS}
+        arrays |= {"leaf_node": self.tree.leaf_node, "name": np.array(self.name)}
+        about = {"format": np.array(FORMAT_NAME), "version": np.array(FORMAT_VERSION), "digest": _digest(arrays)}
         try:
             with open(partial, "wb") as file:
-                np.savez_compressed(
-                    file,
-                    format=np.array(FORMAT_NAME),
-                    version=np.array(FORMAT_VERSION),
-                    name=np.array(self.name),
-                    leaf_node=self.tree.leaf_node,
-                    **arrays,
-                )
+                np.savez_compressed(file, **about, **arrays)
             os.replace(partial, path)
+        except OSError as error:
+            if error.errno is None:
+                raise
+            raise OSError(error.errno, error.strerror, str(path)) from None
         finally:
             partial.unlink(missing_ok=True)
 
@@ -141,14 +146,14 @@ class Model:
         """Read a model that `save` wrote, and check it whole.
 
         Raises:
-            ModelError: The file is missing, no such file, truncated, altered in a way that breaks it, or of another
-                version.
+            ModelError: The file is missing, no such file, truncated, altered, or of another version.
         """
         path = Path(path)
         try:
             with np.load(path, allow_pickle=False) as file:
                 _check_format(path, file)
-                arrays = {name: file[name] for name in (*_ARRAYS, "leaf_node", "name")}
+                digest = file["digest"]
+                arrays = {name: file[name] for name in _MEMBERS}
         except ModelError:
             raise
         except FileNotFoundError:
@@ -157,7 +162,21 @@ class Model:
             raise ModelError(f"{path}: cannot be read as a model file ({error})") from None
         except Exception as error:  # zlib.error and struct.error of a damaged archive
             raise ModelError(f"{path}: damaged ({type(error).__name__}: {error})") from None
-        return _assemble(path, arrays)
+        model = _assemble(path, dict(arrays))
+        # What fits together may still be wrong: a bound, a position.
+        if not isinstance(digest, np.ndarray) or not np.array_equal(digest, _digest(arrays)):
+            raise ModelError(f"{path}: altered since it was saved")
+        return model
+
+
+def _digest(arrays):
+    """Return a hash of all members, uint8 (32,)."""
+    found = hashlib.blake2b(digest_size=32)
+    for name in _MEMBERS:
+        value = np.ascontiguousarray(arrays[name])
+        found.update(f"{name} {value.dtype.str} {value.shape}".encode())
+        found.update(value.view(np.uint8) if value.size else b"")
+    return np.frombuffer(found.digest(), np.uint8)
 
 
 def _check_format(path, file):
@@ -169,7 +188,7 @@ def _check_format(path, file):
         raise ModelError(f"{path}: not a warp_abtree model file")
     if not isinstance(version, np.ndarray) or version.shape != () or version.tolist() != FORMAT_VERSION:
         raise ModelError(f"{path}: format version {version}, this library reads {FORMAT_VERSION}; build it again")
-    missing = [name for name in (*_ARRAYS, "leaf_node", "name") if name not in file.files]
+    missing = [name for name in (*_MEMBERS, "digest") if name not in file.files]
     if missing:
         raise ModelError(f"{path}: lacks the array {missing[0]!r}")
 
