@@ -9,7 +9,7 @@ import numpy as np
 
 from warp_abtree.checks import whole_number
 from warp_abtree.mesh import COORDINATE_MAX, COORDINATE_MIN, EXTENT_LIMITS, Mesh, load_mesh, mesh_from_arrays
-from warp_abtree.progressive import ProgressiveMesh, build_progressive, find_splits
+from warp_abtree.progressive import ProgressiveMesh, build_progressive
 from warp_abtree.tree import Tree, active_build
 
 FORMAT_NAME = "warp_abtree model"
@@ -232,7 +232,6 @@ def _assemble(path, arrays) -> Model:
     require(EXTENT_LIMITS[0] <= extent <= EXTENT_LIMITS[1], f"extent {extent:g} lies outside 2^-100 .. 2^100")
     require(np.ptp(pos, axis=0).max() <= 2.0**120, "'vertex_pos' has merged vertices beyond float32")
     require((np.bincount(parent[parent >= 0] - n_v, minlength=m) == 2).all(), "'vertex_parent' has a merge not of two")
-    _require_splits(require, arrays, n_v)
     require(
         np.isfinite(error).all() and error[-1] == 0 and (np.diff(error) <= 0).all(),
         "'lod_error' is not finite, falling and 0 at the end",
@@ -244,13 +243,3 @@ def _assemble(path, arrays) -> Model:
     except ValueError as mistake:
         raise ModelError(f"{path}: {mistake}") from None
     return Model(ProgressiveMesh(**arrays), tree, name)
-
-
-def _require_splits(require, arrays, n_v):
-    """Check that faces come, go and change where the forest says: all of it follows from `vertex_parent`."""
-    split, start, slices = find_splits(arrays["vertex_parent"], arrays["face_vertex"], n_v)
-    require(np.array_equal(arrays["face_split"], split), "'face_split' does not follow from 'vertex_parent'")
-    require(np.array_equal(arrays["split_start"], start), "'split_start' does not follow from 'vertex_parent'")
-    of = np.repeat(np.arange(len(start) - 1), np.diff(start))
-    found, wanted = (np.sort((of << 32) + faces) for faces in (arrays["split_face"], slices))
-    require(np.array_equal(found, wanted), "'split_face' does not follow from 'vertex_parent'")

@@ -145,7 +145,7 @@ def build_progressive(mesh, base_faces=10, link_condition=False, progress=None):
     centre, scale = _frame(vertices)
     parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), bool(link_condition), report)
     vertex_pos = np.concatenate([vertices, centre + scale * pos[len(vertices) :]])
-    face_split, split_start, split_face = find_splits(parent, faces, len(vertices))
+    face_split, split_start, split_face = _splits(parent, faces, len(vertices))
     lod_error = _deviation(vertex_pos, parent, faces, report)
     return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, lod_error)
 
@@ -269,7 +269,7 @@ def _roomier_heap(surface, heap, counter):
     return larger
 
 
-def find_splits(parent, faces, vertex_count):
+def _splits(parent, faces, vertex_count):
     """Return face_split int32 [n_f], split_start int64 [m+1] and split_face int32 of a forest."""
     node_count = len(parent)
     merge_count = node_count - vertex_count
