@@ -3,7 +3,6 @@
 python -m bench paper|tradeoff|all --out DIR [...]: a study, see `bench/study.py`.
 """
 
-import argparse
 import datetime
 import inspect
 import json
@@ -57,10 +56,10 @@ OPTIONS = ("count", "devices", "predict", "processes", "quick", "largest", "mode
 
 def main(argv=None):
     argv = list(sys.argv[1:] if argv is None else argv)
-    if argv and argv[0] in (*study.STUDIES, "all"):
+    if argv and argv[0] in study.STUDY_NAMES:
         return study.main(argv)
-    parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
-    parser.add_argument("name", choices=sorted(CASES))
+    parser = study.Parser(prog="python -m bench", description=__doc__)
+    parser.add_argument("name", choices=[*study.STUDY_NAMES, *sorted(CASES)])
     parser.add_argument("--device", default=None)
     parser.add_argument("--json", metavar="FILE", help="write the rows to a file as well")
     parser.add_argument("--quick", action="store_true", default=None, help="the smallest sizes, to try a case out")
@@ -73,6 +72,8 @@ def main(argv=None):
     parser.add_argument("--predict", metavar="FILE", help="scaling: read what --json wrote, and predict from it")
     parser.add_argument("--processes", type=int, help="exact: processes that run the oracle")
     options = parser.parse_args(argv)
+    if options.name in study.STUDY_NAMES:
+        parser.error(f"a study is named before its options: {options.name} ...")
     run = CASES[options.name]
     asked = {name: getattr(options, name) for name in OPTIONS if getattr(options, name) is not None}
     for name in asked:

@@ -27,6 +27,14 @@ from . import html, meshes, timing
 from .parts import Finished, Part, plain
 
 STUDIES = ("paper", "tradeoff")
+STUDY_NAMES = (*STUDIES, "all")
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that says what is wrong in one line."""
+
+    def error(self, message):
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
 class Context:
@@ -297,8 +305,8 @@ def find_parts(name) -> tuple:
 
 def main(argv) -> int:
     """Run `python -m bench paper|tradeoff|all`."""
-    parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__.splitlines()[0])
-    parser.add_argument("name", choices=(*STUDIES, "all"))
+    parser = Parser(prog="python -m bench", description=__doc__.splitlines()[0])
+    parser.add_argument("name", choices=STUDY_NAMES)
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="where to write, and what to resume")
     parser.add_argument("--device", default=None, help='Warp device; by default the first GPU, else "cpu"')
     parser.add_argument("--quick", action="store_true", help="the smallest sizes: under two minutes on two cores")

@@ -149,10 +149,11 @@ def test_contacts_against_the_library(files, capsys, device, precision):
         assert (
             found["faces"] == expected.faces[:, 1:].tolist() == [[x["face_a"], x["face_b"]] for x in found["contacts"]]
         )
+        assert found["faces"] == expected.contacts["faces"].tolist()
         rows = list(csv.DictReader(io.StringIO(Path("rows.csv").read_text())))
         assert len(rows) == len(found["contacts"]) == len(expected.contacts)
         for row, entry, contact in zip(rows, found["contacts"], expected.contacts):
-            assert [int(row["face_a"]), int(row["face_b"])] == [contact["face_a"], contact["face_b"]]
+            assert [int(row["face_a"]), int(row["face_b"])] == contact["faces"].tolist()
             for name in VECTORS:
                 assert entry[name] == [float(row[f"{name}_{axis}"]) for axis in "xyz"] == contact[name].tolist()
             assert entry["coplanar"] is bool(int(row["coplanar"])) is bool(contact["coplanar"])
@@ -193,7 +194,7 @@ def test_contacts_for_people(files, capsys, device):
     listed = [line.split() for line in shown.splitlines() if re.fullmatch(r" +\d+ +\d+( +[-.\de]+){9}", line)]
     assert len(listed) == report.LISTED_FACES and f"and {len(expected.faces) - len(listed):,} more" in shown
     for words, contact in zip(listed, expected.contacts):
-        assert [int(x) for x in words[:2]] == [contact["face_a"], contact["face_b"]]
+        assert [int(x) for x in words[:2]] == contact["faces"].tolist()
         numbers = np.concatenate([contact[name] for name in ("p0", "p1", "normal")])
         assert np.allclose([float(x) for x in words[2:]], numbers, rtol=1e-3)
     assert "precision exact" in shown and not errors

@@ -117,8 +117,8 @@ def test_ends_and_normals_equal_exact_clipping(device, case):
     assert len(rows) > 10
     check_fields(result)
     for row in rows[np.random.default_rng(0).permutation(len(rows))[:120]]:
-        a = triangles(models[0], row["face_a"])
-        b = into_frame_of_a(triangles(models[1], row["face_b"]), STILL, pose)
+        a = triangles(models[0], row["faces"][0])
+        b = into_frame_of_a(triangles(models[1], row["faces"][1]), STILL, pose)
         polygon = shared_polygon(a, b)
         room = 4e-12 * max(np.ptp(a, axis=0).max(), np.ptp(b, axis=0).max()) + 1e-15 * np.abs([a, b]).max()
         for end in (row["p0"], row["p1"]):
@@ -137,7 +137,7 @@ def test_ends_and_normals_equal_exact_clipping(device, case):
 def check_fields(result):
     """Every hit once and in order, no NaN, unit normals as defined, the sum over each pair as defined."""
     rows = result.contacts
-    np.testing.assert_array_equal(np.stack([rows["pair"], rows["face_a"], rows["face_b"]], 1), result.faces)
+    np.testing.assert_array_equal(np.column_stack([rows["pair"], rows["faces"]]), result.faces)
     assert rows["pair"].dtype == np.int32 and rows["coplanar"].dtype == bool
     for name in VECTORS:
         assert rows[name].shape == (len(rows), 3) and rows[name].dtype == np.float64 and np.isfinite(rows[name]).all()
@@ -178,10 +178,11 @@ def check_sums(result):
 def mirror(contacts):
     """Contacts as of the pairs named the other way."""
     turned = contacts.copy()
-    for x, y in (("face_a", "face_b"), ("p0", "p1"), ("normal_a", "normal_b")):
+    for x, y in (("p0", "p1"), ("normal_a", "normal_b")):
         turned[x], turned[y] = contacts[y], contacts[x]
+    turned["faces"] = contacts["faces"][:, ::-1]
     turned["normal"] = -contacts["normal"]
-    return turned[np.lexsort((turned["face_b"], turned["face_a"], turned["pair"]))]
+    return turned[np.lexsort((*turned["faces"].T[::-1], turned["pair"]))]
 
 
 @pytest.mark.parametrize(
@@ -207,7 +208,7 @@ def test_batches_in_the_world(device, names):
     for row in result.contacts[rng.permutation(len(result.contacts))[:60]]:
         for side in range(2):
             pose = poses[2 * row["pair"] + side]
-            corners = triangles(models[side], row["face_b" if side else "face_a"])
+            corners = triangles(models[side], row["faces"][side])
             corners = corners @ quaternion_matrix(pose[3:]).T + pose[:3]
             for end in (row["p0"], row["p1"]):
                 assert distance(corners, end) < 4e-12
@@ -221,6 +222,23 @@ def test_batches_in_the_world(device, names):
     for name, sign in (("point", 1), ("normal", -1), ("depth", 1)):
         before = result.pair_contacts[name][some]
         np.testing.assert_allclose(swapped.pair_contacts[name][some], sign * before, rtol=1e-6, atol=1e-9)
+
+
+def test_contacts_name_their_faces_and_need_no_pickle(device, tmp_path):
+    """DESIGN: structured, `pair, faces, p0, p1, ...`; what is kept on disk comes back to the bit."""
+    scene, _ = two(device, "ball", "torus", pose_b=CASES["flat"][2])
+    result = contacts_of(scene, [(1, 0)])
+    assert len(result.contacts) > 10
+    assert result.contacts.dtype.names == ("pair", "faces", *VECTORS, "coplanar")
+    assert result.contacts.dtype["faces"] == np.dtype((np.int32, (2,)))
+    np.testing.assert_array_equal(result.contacts["faces"], result.faces[:, 1:])
+    np.save(tmp_path / "one.npy", result.contacts, allow_pickle=False)
+    np.savez(tmp_path / "some.npz", contacts=result.contacts, pair_contacts=result.pair_contacts)
+    read = np.load(tmp_path / "one.npy", allow_pickle=False)
+    with np.load(tmp_path / "some.npz", allow_pickle=False) as file:
+        for back in (read, file["contacts"]):
+            assert back.dtype == result.contacts.dtype and back.tobytes() == result.contacts.tobytes()
+        assert file["pair_contacts"].tobytes() == result.pair_contacts.tobytes()
 
 
 def distance(corners, p):
@@ -368,8 +386,8 @@ def test_depth_without_an_area(device):
     rows = result.contacts[result.contacts["pair"] == 0]
     normal = result.pair_contacts["normal"][0]
     assert len(rows) > 2 and (rows["p0"] == tip[0]).all() and (rows["p1"] == tip[0]).all()
-    faces = (triangles(models[0], rows["face_a"]) @ normal).max() - (
-        triangles(models[1], rows["face_b"]) @ normal
+    faces = (triangles(models[0], rows["faces"][:, 0]) @ normal).max() - (
+        triangles(models[1], rows["faces"][:, 1]) @ normal
     ).min()
     boxes = [np.array(np.meshgrid(*mesh.bounds.T)).reshape(3, -1).T @ normal for mesh in (wide, tetrahedron)]
     wanted = min(faces, boxes[0].max() - boxes[1].min())

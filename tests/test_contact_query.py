@@ -144,7 +144,7 @@ def test_shapes_in_contact(device):
     plain = scene.intersect(pairs, output="faces")
     np.testing.assert_array_equal(result.faces, plain.faces)
     rows = result.contacts
-    np.testing.assert_array_equal(np.stack([rows["pair"], rows["face_a"], rows["face_b"]], 1), plain.faces)
+    np.testing.assert_array_equal(np.column_stack([rows["pair"], rows["faces"]]), plain.faces)
     assert (result.count > 2 * CHUNK).sum() > 3
     assert check_summaries(result) > 5
     same(scene.intersect(pairs, output="contacts"), result)

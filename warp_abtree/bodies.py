@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from warp_abtree.checks import to_numpy
+from warp_abtree.checks import first_line, to_numpy
 from warp_abtree.kernels import bodies as kernels
 from warp_abtree.model import Model
 from warp_abtree.scene import Scene
@@ -138,7 +138,7 @@ def mass_properties(model: Model) -> MassProperties:
                 raise ValueError(f"{what} ({error})") from None
             except Exception as error:  # Qhull's own, for points in a plane
                 what = f"model {model.name!r} is flat: it has no mass, so it must be static"
-                raise ValueError(f"{what} ({error})") from None
+                raise ValueError(f"{what} ({first_line(error)})") from None
         found = mesh.mass_properties
     inertia = np.asarray(found.inertia, np.float64)
     if not (found.mass > 1e-12 and np.isfinite(inertia).all()):

@@ -20,6 +20,11 @@ def to_numpy(values, what: str) -> np.ndarray:
     return array
 
 
+def first_line(error) -> str:
+    """Return the first line of an error's text, or its type where it has none."""
+    return next(iter(str(error).splitlines()), "") or type(error).__name__
+
+
 def whole_number(value, what: str, low: int, high: int) -> int:
     """Return a whole number from low to high as int.
 

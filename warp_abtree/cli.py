@@ -21,6 +21,7 @@ from warp_abtree import (
     doctor,
     load_mesh,
     load_scene,
+    mesh_from_arrays,
     picture,
     report,
     resolve_lod,
@@ -49,15 +50,28 @@ PLOT_NAME = "frames.png"
 # Commands.
 
 
+def _is_model(source) -> bool:
+    return source.lower().endswith(".npz")
+
+
 def _load_model(source, progress) -> Model:
-    return Model.open(source) if source.lower().endswith(".npz") else Model.load(source, progress=progress)
+    return Model.open(source) if _is_model(source) else Model.load(source, progress=progress)
 
 
 def info(options, progress):
-    """Say what a mesh file holds."""
+    """Say what a mesh file or a built model holds."""
     Scene(device=options.device)
-    found = describe_mesh(load_mesh(options.mesh))
+    found = _describe_model(options.mesh) if _is_model(options.mesh) else describe_mesh(load_mesh(options.mesh))
     (report.print_json if options.json else report.print_info)(found)
+
+
+def _describe_model(path) -> dict:
+    model = Model.open(path)
+    forest = model.progressive
+    found = describe_mesh(mesh_from_arrays(forest.vertex_pos[: model.vertex_count], forest.face_vertex, model.name))
+    for key in ("file_vertices", "unreferenced_vertices", "welded_vertices"):
+        del found[key]  # a model does not keep them
+    return found | {"lods": model.lod_max + 1, "base_faces": _active(model, 0)}
 
 
 def build(options, progress):
@@ -136,7 +150,7 @@ def query(options, progress):
     if found.faces is not None:
         result["faces"] = found.faces[:, 1:]
     if found.contacts is not None:
-        result["contacts"] = found.contacts[[name for name in found.contacts.dtype.names if name != "pair"]]
+        result["contacts"] = report.flat_contacts(found.contacts)
         result["pair_contacts"] = found.pair_contacts[0]
     if options.record:
         report.record_found(found, options.record)
@@ -279,8 +293,9 @@ def make_parser() -> argparse.ArgumentParser:
         sub.add_argument("--json", action="store_true", help="print JSON")
         return sub
 
-    sub = command("info", info, "say what a mesh holds and what is odd about it", "cow.obj", "warp:bunny --json")
-    sub.add_argument("mesh", metavar="MESH", help=MESHES)
+    about = "say what a mesh or a built model holds and what is odd about it"
+    sub = command("info", info, about, "cow.obj", "cow.npz", "warp:bunny --json")
+    sub.add_argument("mesh", metavar="MESH", help=f"{MESHES}, or a model that build wrote (.npz)")
 
     sub = command("build", build, "build a model from a mesh and save it", "cow.obj cow.npz --base-faces 100")
     sub.add_argument("mesh", metavar="MESH", help=MESHES)
@@ -351,3 +366,7 @@ def _fail(progress, error, status):
     progress.close()
     print(f"{PROGRAM}: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
     return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())

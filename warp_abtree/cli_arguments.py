@@ -41,7 +41,7 @@ def positive(text) -> int:
     except ValueError:
         value = 0
     if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 1")
+        raise argparse.ArgumentTypeError(f"{text.strip()!r} is no whole number from 1")
     return value
 
 
@@ -53,7 +53,7 @@ def milliseconds(text) -> float:
     except ValueError:
         value = 0.0
     if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is no time above 0, as 8ms or 0.008s")
+        raise argparse.ArgumentTypeError(f"{text.strip()!r} is no time above 0, as 8ms or 0.008s")
     return value
 
 

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks import to_numpy
+
 STAGES = ("select_ms", "refine_ms", "move_ms", "broad_ms", "query_ms", "answer_ms")
 COST_STAGES = ("select_ms", "refine_ms", "broad_ms", "query_ms")
 """Stages of T = TR + TB + TQ + TLOD (paper, section 4.2): selection, refinement with refitting, queries with their
@@ -87,7 +89,7 @@ class WorkClock:
         seconds: What it reads.
 
     Raises:
-        ValueError: An unknown name.
+        ValueError: An unknown name, or a rate that is negative or not finite.
     """
 
     def __init__(self, rates: dict | None = None):
@@ -95,6 +97,10 @@ class WorkClock:
         if unknown:
             raise ValueError(f"rates: {sorted(unknown)[0]!r} is none of {', '.join(RATES)}")
         self.rates = {**RATES, **(rates or {})}
+        for name, rate in self.rates.items():
+            value = to_numpy(rate, f"rates: {name!r}")
+            if value.shape != () or not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"rates: {name!r} is {rate!r}, not a finite number of seconds from 0")
         self.seconds = 0.0
 
     def __call__(self) -> float:

@@ -393,8 +393,7 @@ class CollisionManager:
             rows = result.contacts
             segments = np.stack([rows["p0"], rows["p1"]], 1)
             depths = result.pair_contacts["depth"][rows["pair"]].tolist()
-            faces = np.stack([rows["face_a"], rows["face_b"]], 1).tolist()
-            for k, *of in zip(rows["pair"].tolist(), faces, segments, rows["normal"], depths):
+            for k, *of in zip(rows["pair"].tolist(), rows["faces"].tolist(), segments, rows["normal"], depths):
                 contacts.append(ContactData(names[k], *of))
             contacts += [inside[k] for k in hit if not result.any[k]]
         return bool(hit), [names[k] for k in hit], contacts

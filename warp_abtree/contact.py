@@ -3,6 +3,8 @@
 Everything is computed from the inputs of the exact test, in the frame of the object with the lower index, and then
 posed to the world by that object's pose. A face pair's contact, in the order in which the pair names its objects:
 
+* pair, faces: place of the object pair in `Result.pairs`, and the face of its first and of its second object, (2,):
+  the columns of `Result.faces`.
 * p0, p1: the ends of the segment that the two faces share, along normal_a x normal_b; where the faces are coplanar, the
   two points of the polygon that they share that are farthest apart; where they touch in a point, that point twice.
 * normal_a, normal_b: unit normals of the faces by their winding, zero for faces of no area.
@@ -27,14 +29,17 @@ contacts of each chunk of 32, the last chunk perhaps shorter, from left to right
 * depth: an estimate of how far the second object would have to move along the normal to come free. The contact curve
   encloses an area, seen along the normal; its faces say how fast that area shrinks with such a motion; depth is their
   quotient, at most the overlap of the two root boxes along the normal, which it is too where the area does not shrink.
-  Without an area (points, shared planes) it is the overlap along the normal of the faces that touch. Exact for a box
-  pressed straight into a larger one; (2 r + d) / 2 d times the truth for balls of radius r at distance d; half of it
-  for the tip of a cone. It is not the penetration depth (the smallest motion in any direction), and no bound on it:
-  where a curve runs over the edge of an object the mean normal leans over, and depth can be several times too large;
-  for separate regions of contact and for open surfaces it is merely a length.
+  Without an area (points, shared planes) it is the overlap along the normal of the faces that touch. For a box pressed
+  straight into a larger one it is exact up to the rounding of the root boxes, float32 and outwards: 3e-7 for boxes of 4
+  units, so that boxes that only touch have that depth. At most (2 r + d) / 2 d times the truth for balls of radius r at
+  distance d, less where the root boxes cap it; half of it for the tip of a cone. It is not the penetration depth (the
+  smallest motion in any direction), and no bound on it: where a curve runs over the edge of an object the mean normal
+  leans over, and depth can be several times too large; for separate regions of contact and for open surfaces it is
+  merely a length.
 
 A pair without contacts has depth 0 and NaN as point and normal. The results are the same, bit for bit, on CPU and
-CUDA, and for a pair named the other way the contacts differ in nothing but order, exchanged ends and signs.
+CUDA. For a pair named the other way the contacts differ in nothing but order, exchanged ends and signs; sums follow the
+order of the faces as named, so that its summary may differ in the last bits too.
 """
 
 import numpy as np
@@ -59,7 +64,7 @@ def contact_dtypes(dtype=np.float64):
         real = None
     if real not in (np.float32, np.float64):
         raise ValueError(f"contact_dtype {dtype!r} is neither float32 nor float64")
-    indices = [(name, np.int32) for name in ("pair", "face_a", "face_b")]
+    indices = [("pair", np.int32), ("faces", np.int32, (2,))]
     vectors = [(name, real, (3,)) for name in VECTORS]
     means = [("point", real, (3,)), ("normal", real, (3,)), ("depth", real)]
     return np.dtype([*indices, *vectors, ("coplanar", bool)]), np.dtype([("count", np.int64), *means])
@@ -85,8 +90,7 @@ class ContactResult(Result):
                 self.faces = query.faces[:rows].numpy().copy()
                 for name in (*VECTORS, "coplanar"):
                     self.contacts[name] = getattr(query.contacts, name)[:rows].numpy()
-        for column, name in enumerate(("pair", "face_a", "face_b")):
-            self.contacts[name] = self.faces[:, column]
+        self.contacts["pair"], self.contacts["faces"] = self.faces[:, 0], self.faces[:, 1:]
 
 
 class ContactQuery(Query):

@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_abtree.clock import COST_STAGES
 from warp_abtree.intersect import Result
-from warp_abtree.lod import Camera, Ladder, PaperSelection, PredictedSelection, ToleranceSelection, View
+from warp_abtree.lod import Camera, Ladder, PaperSelection, PredictedSelection, ToleranceSelection, View, positive
 
 # A test of two triangles costs about as much as so many tests of two boxes.
 TRIANGLE_WORK = 4.0
@@ -96,12 +96,19 @@ class PaperController(Controller):
         budget_ms: T [ms].
         threshold_ms: t [ms]; None is 10 % of T.
         steps: Delta LOD is the operations of a model divided by this.
+
+    Raises:
+        TypeError: camera is neither a `Camera` nor a function.
+        ValueError: Anything else is out of range.
     """
 
     def __init__(self, scene, budget_ms, camera=None, threshold_ms=None, steps: int = 50, window: int = 10):
+        budget_ms = positive(budget_ms, "budget_ms")
+        if threshold_ms is not None:
+            threshold_ms = positive(threshold_ms, "threshold_ms")
         super().__init__(scene, camera, window)
         self._selection = PaperSelection(self.view, budget_ms, threshold_ms, Ladder(scene.models, steps))
-        self.budget_ms = self._selection.budget
+        self.budget_ms = budget_ms
 
     def _hear(self, feedback):
         self._selection.cost.fill_(feedback.cost_ms)
@@ -115,6 +122,9 @@ class ToleranceController(Controller):
         tolerance: Error of an important, still object at the eye [world units], at least 0.
         loosest: Most that a tolerance is loosened.
         steps, spacing: As in `Ladder`.
+
+    Raises:
+        TypeError, ValueError: As `PaperController`.
     """
 
     def __init__(self, scene, tolerance, camera=None, loosest=64.0, steps=50, spacing="ratio", window=10):
@@ -172,13 +182,16 @@ class PredictiveController(Controller):
 
     Attributes:
         predicted_ms: What the frame to come is predicted to cost [ms]; NaN before the second. Waits for the device.
+
+    Raises:
+        TypeError, ValueError: As `PaperController`.
     """
 
     def __init__(self, scene, budget_ms, camera=None, steps=50, spacing="ratio", window=10, **options):
+        self.budget_ms = positive(budget_ms, "budget_ms")
         super().__init__(scene, camera, window)
         ladder = Ladder(scene.models, steps, spacing)
-        self._selection = PredictedSelection(self.view, budget_ms, ladder=ladder, **options)
-        self.budget_ms = self._selection.budget
+        self._selection = PredictedSelection(self.view, self.budget_ms, ladder=ladder, **options)
         self._query, self._refine, self._rest = CostFit(), CostFit(), CostFit()
         self._exponent, self._drift = 1.0, 0.0
 

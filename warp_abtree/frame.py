@@ -20,7 +20,8 @@ import warp as wp
 from warp_abtree.clock import COST_STAGES, STAGES, Timer
 from warp_abtree.control import Feedback
 from warp_abtree.dynamics import triangle_wave
-from warp_abtree.intersect import Result
+from warp_abtree.intersect import Result, check_request
+from warp_abtree.lod import positive
 from warp_abtree.model import Model
 from warp_abtree.refine import full_share
 from warp_abtree.scene import Scene
@@ -239,7 +240,7 @@ class Frame:
         lods: A controller of `warp_abtree.control`, or anything with its `next_lods` and `budget_ms`; or called with
             the time [s], returns the LOD of every object, int (n,); None leaves them.
         output: What is asked of each candidate pair: "any", "count", "faces" or "contacts".
-        time_step: Time between frames [s].
+        time_step: Time between frames [s], above 0.
         clock: Seconds, read around stages when the device has finished. A clock with a method `charge` is told the
             counted work of a stage first (`WorkClock`). None is the host's clock, on CUDA events.
 
@@ -247,7 +248,8 @@ class Frame:
         history: One `FrameRow` a frame run.
 
     Raises:
-        ValueError: A motion of another number of objects, or a time step that is not finite.
+        ValueError: A motion of another number of objects, a time step that is not above 0 and finite, an unknown
+            output, LODs that are neither a controller nor a function, or a clock that cannot be called.
     """
 
     def __init__(
@@ -261,13 +263,16 @@ class Frame:
     ):
         if motion is not None and len(motion) != scene.object_count:
             raise ValueError(f"the motion is of {len(motion)} objects, the scene has {scene.object_count}")
-        if not np.isfinite(time_step):
-            raise ValueError(f"time_step {time_step!r} is not finite")
+        if not (lods is None or callable(lods) or hasattr(lods, "next_lods")):
+            raise ValueError(f"lods: a {type(lods).__name__} is neither a controller nor a function of time")
+        if not (clock is None or callable(clock)):
+            raise ValueError(f"clock: a {type(clock).__name__} cannot be called")
+        check_request("faces" if output == "contacts" else output, "exact")
         self.scene = scene
         self.motion = motion
         self.lods = lods
         self.output = output
-        self.time_step = float(time_step)
+        self.time_step = positive(time_step, "time_step")
         self.history: list[FrameRow] = []
         self._timer = Timer(scene.device, clock)
         self._heard: dict = {}
@@ -374,7 +379,12 @@ class Frame:
 
         Args:
             after: `budget`, the verdict of `judge_budget`, leaves out frames before this time [s].
+
+        Raises:
+            ValueError: No frame has run.
         """
+        if not self.history:
+            raise ValueError("a summary is of frames, and none has run")
         columns = {name: [row.as_dict()[name] for row in self.history] for name in FrameRow.names()}
         found: dict[str, Any] = {"frames": len(self.history), "objects": self.scene.object_count}
         counts = "states", "pairs", "touching", "hits", "faces", "nodes_refitted", "node_tests", "triangle_tests"
@@ -395,7 +405,11 @@ class Frame:
         return found
 
     def record(self, path):
-        """Write the history to a .json file, or as CSV to any other; the file appears whole or not at all."""
+        """Write the history to a .json file, or as CSV to any other; the file appears whole or not at all.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
         path = Path(path)
         partial = path.with_name(path.name + ".partial")
         rows = [row.as_dict() for row in self.history]
@@ -408,6 +422,10 @@ class Frame:
                     writer.writeheader()
                     writer.writerows(rows)
             os.replace(partial, path)
+        except OSError as error:
+            if error.errno is None:
+                raise
+            raise OSError(error.errno, error.strerror, str(path)) from None
         finally:
             partial.unlink(missing_ok=True)
 

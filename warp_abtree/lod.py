@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks import whole_number
+from warp_abtree.checks import to_numpy, whole_number
 from warp_abtree.kernels import lod as kernels
 from warp_abtree.refine import full_share
 
@@ -28,9 +28,9 @@ FALLS = tuple(-round(2.0 ** (i / 2)) for i in range(21) if i not in (1, 3))
 
 
 def _finite(values, what, shape) -> np.ndarray:
-    array = np.asarray(values, np.float64)
+    array = to_numpy(values, what).astype(np.float64)
     if array.shape != shape or not np.isfinite(array).all():
-        wanted = "a finite number" if shape == () else f"{shape[0]} finite numbers"
+        wanted = "a finite number" if shape == () else f"{' by '.join(map(str, shape))} finite numbers"
         raise ValueError(f"{what}: {values!r} is not {wanted}")
     return array
 
@@ -71,8 +71,8 @@ class Camera:
 
     def __post_init__(self):
         object.__setattr__(self, "eye", _finite(self.eye, "eye", (3,)))
-        view = np.asarray(self.view, np.float64)
-        if view.shape != (3, 3) or not np.abs(view @ view.T - np.eye(3)).max() <= 1e-6 or not np.linalg.det(view) > 0:
+        view = _finite(self.view, "view", (3, 3))
+        if not np.abs(view @ view.T - np.eye(3)).max() <= 1e-6 or not np.linalg.det(view) > 0:
             raise ValueError("view: the rows are no rotation")
         object.__setattr__(self, "view", view)
         if not positive(self.field_of_view, "field_of_view") < math.pi:

@@ -17,6 +17,8 @@ import numpy as np
 import trimesh
 import warp as wp
 
+from warp_abtree.checks import first_line
+
 FACE_LIMIT = 2**30  # int32 forest ids count up to two nodes a vertex, and heap indices up to two a face
 EXTENT_LIMITS = (2.0**-100, 2.0**100)  # boxes are float32
 COORDINATE_MIN = 2.0**-290  # smaller ones are 0
@@ -182,7 +184,7 @@ def _as_array(values, what, kinds, where):
     try:
         array = np.asarray(values)
     except (ValueError, TypeError) as error:
-        raise MeshError(f"{where}: {what} do not form an array: {_first_line(error)}") from None
+        raise MeshError(f"{where}: {what} do not form an array: {first_line(error)}") from None
     if array.size == 0:
         raise MeshError(f"{where}: no {what}")
     if array.dtype.kind not in kinds:
@@ -292,7 +294,9 @@ def _load_file(path, name):
         if zipped:
             data = gzip.decompress(data)
     except (OSError, EOFError, zlib.error) as error:
-        raise MeshError(f"{path}: cannot be read: {_first_line(error)}") from None
+        raise MeshError(f"{path}: cannot be read: {first_line(error)}") from None
+    if kind == "npz":
+        raise MeshError(f"{path}: not a mesh file; a built model is read by Model.open")
     if kind == "obj":
         return _build(*_parse_obj(data, str(path)), name, where=str(path))
     known = trimesh.available_formats()
@@ -305,7 +309,7 @@ def _load_file(path, name):
             resolver = trimesh.resolvers.FilePathResolver(str(path))
             scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
     except Exception as error:  # trimesh's readers raise whatever goes wrong inside them
-        raise MeshError(f"{path}: cannot be read as {kind}: {_first_line(error)}") from None
+        raise MeshError(f"{path}: cannot be read as {kind}: {first_line(error)}") from None
     return _from_geometry(scene, name, where=str(path))
 
 
@@ -377,7 +381,11 @@ def _parse_obj(data, where) -> tuple[np.ndarray, np.ndarray]:
     if not counts:
         raise MeshError(f"{where}: no faces")
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-    return points, triangulate(points, np.array(counts), np.array(corners) - 1, where)
+    try:
+        indices = np.array(corners, dtype=np.int64) - 1
+    except OverflowError:
+        raise MeshError(f"{where}: a face refers to vertex {max(corners)}, but there are {len(points)}") from None
+    return points, triangulate(points, np.array(counts), indices, where)
 
 
 def _read_warp_asset(source, asset) -> tuple[np.ndarray, np.ndarray]:
@@ -450,8 +458,3 @@ def _clip_ears(points):
         triangles.append((i, j, k))
         ring.remove(j)
     return [*triangles, tuple(ring)]
-
-
-def _first_line(error):
-    lines = str(error).splitlines()
-    return lines[0] if lines and lines[0] else type(error).__name__

@@ -53,13 +53,16 @@ class Model:
         original = progressive.vertex_pos[: progressive.vertex_count]
         self.centre = 0.5 * original.min(0) + 0.5 * original.max(0)
 
+    def __repr__(self):
+        return f"Model({self.name!r}, {self.face_count:,} faces, LODs 0 .. {self.lod_max:,})"
+
     @classmethod
     def load(cls, source, base_faces: int = 10, progress=None) -> "Model":
         """Load a mesh and build its progressive mesh and AB-Tree.
 
         Args:
             source: Path of anything trimesh reads (also gzipped), trimesh.Trimesh or Scene, "warp:bunny", "warp:bear",
-                "warp:rocks", or a `Mesh`.
+                "warp:rocks", or a `Mesh`. What `save` wrote is read by `open`.
             base_faces: Faces at which the collapse sequence stops.
             progress: Called as progress(stage, done, total) during long builds.
 

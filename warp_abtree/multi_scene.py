@@ -63,8 +63,9 @@ class MultiScene:
     """A `Scene` over several devices: each has some of the worlds, and the objects of world -1.
 
     Answers are those of one scene, bit for bit, whatever the devices and however worlds are dealt. Every call waits for
-    all devices. Bad input is refused before anything is changed. Where a worker ends or a device fails, that is raised
-    once; poses and LODs are as before the call, and the next one starts afresh.
+    all devices. Pairs of two worlds, which a `Scene` answers where they are named, are refused here. Bad input is
+    refused before anything is changed. Where a worker ends or a device fails, that is raised once; poses and LODs are
+    as before the call, and the next one starts afresh.
 
     Args:
         devices: Warp devices, such as ["cuda:0", "cuda:1"] or ["cpu", "cpu"]; None is every GPU, or a CPU process for

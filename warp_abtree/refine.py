@@ -41,6 +41,9 @@ class UpdateStats:
         self.lod = batch.lod
         self.full = batch.full
 
+    def __repr__(self):
+        return f"UpdateStats({len(self.state)} states updated, {int(np.sum(self.full))} of them whole)"
+
     @property
     def k(self) -> np.ndarray:
         """Distinct faces inserted, removed or deformed, int32 (u,). Waits for the device."""

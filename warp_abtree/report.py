@@ -40,6 +40,15 @@ def plain(value):
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def flat_contacts(contacts) -> list[dict]:
+    """Return the contacts of one object pair as a dictionary each, their faces under `face_a` and `face_b`."""
+    names = contacts.dtype.names[2:]
+    return [
+        {"face_a": a, "face_b": b, **{name: row[name] for name in names}}
+        for row, (a, b) in zip(contacts, contacts["faces"].tolist())
+    ]
+
+
 def print_json(value):
     """Print a value as JSON."""
     print(json.dumps(plain(value), indent=1, allow_nan=False))

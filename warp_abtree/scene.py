@@ -72,6 +72,8 @@ class TreeState:
 class Scene:
     """Many objects, many worlds, one device.
 
+    Without objects `broad_phase` finds no pairs; `set_poses`, `set_lods` and `intersect` raise ValueError.
+
     Args:
         device: Warp device, such as "cpu" or "cuda:0"; None for Warp's default.
 
@@ -113,10 +115,10 @@ class Scene:
         Args:
             model: `Model`.
             pose: x y z qx qy qz qw [world units, unit quaternion], or a rigid (4, 4) matrix.
-            world: Objects of different worlds never meet; -1 is in every world.
+            world: The broad phase never pairs objects of different worlds; -1 is in every world.
             lod: LOD to stand at; None is the finest.
             importance: Application context beta of the LOD selection, 1, 2 or 3 (paper, section 4.2).
-            static: Whether it never pairs with another static object.
+            static: Whether the broad phase never pairs it with another static object, a bool.
 
         Raises:
             TypeError: model is no Model.
@@ -127,6 +129,8 @@ class Scene:
         checked = check_poses(to_numpy(pose, "pose")[None], "pose")[0]
         world = whole_number(world, "world", EVERY_WORLD, 2**31 - 1)
         importance = whole_number(importance, "importance", 1, 3)
+        if not isinstance(static, bool | np.bool_):
+            raise ValueError(f"static {static!r} is neither True nor False")
         lod = model.lod_max if lod is None else model.check_lod(lod)
         known = next((i for i, other in enumerate(self.models) if other is model), None)
         self._settle()
@@ -288,7 +292,8 @@ class Scene:
         Touching counts. Columns of the result follow the order in which a pair names its objects.
 
         Args:
-            pairs: (p, 2) object indices; None asks the broad phase.
+            pairs: (p, 2) object indices, asked whatever their worlds, also where both are static or filtered out of the
+                broad phase (a `MultiScene` refuses pairs of two worlds); None asks the broad phase.
             output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
                 an object pair's summary of them, stands in `warp_abtree.contact`.
             precision: "exact": the answer is exact for A's vertices and the posed ones of B, A the object with the
@@ -300,7 +305,7 @@ class Scene:
             contact_dtype: Type of the real numbers in contacts, float64 or float32.
 
         Raises:
-            ValueError: Bad pairs, a bad distance or an unknown option.
+            ValueError: Bad pairs, a bad distance, an unknown option, or a scene without objects.
         """
         contact_dtypes(contact_dtype)
         with_contacts = output == "contacts"

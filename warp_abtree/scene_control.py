@@ -153,6 +153,8 @@ def read_lod(keys: keys_of.Keys | None) -> LodControl:
     }
     options = {name: keys.take(name, check) for name, check in checks.items() if name in keys.values}
     keys.end()
+    if controller == "paper" and "spacing" in options:
+        keys.fail("spacing", "the LODs of the paper's controller are equal numbers of operations apart")
     if not options.get("low", 0.0) <= options.get("aim", 1.0):
         keys.fail("low", "is above aim")
     if controller is None:

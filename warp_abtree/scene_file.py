@@ -404,9 +404,9 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
 
     Raises:
         SceneError: The file is missing or wrong; nothing is left half done.
-        ValueError: No such device on this machine.
+        ValueError: No such device on this machine, or objects is no whole number from 1.
     """
-    path = find_scene(path)
+    objects, path = keys_of.object_count(objects), find_scene(path)
     scene = Scene(device=device)
     text, tree = _read_toml(path, text)
     top = Keys(path, "", tree)

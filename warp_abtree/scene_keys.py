@@ -37,6 +37,19 @@ def whole(low, high=2**31 - 1):
     return check
 
 
+def object_count(value):
+    """Return a number of objects that was asked for beside the file, or None.
+
+    Raises:
+        ValueError: It is no whole number from 1.
+    """
+    value = int(value) if isinstance(value, np.integer) else value
+    try:
+        return None if value is None else whole(1)(value)
+    except ValueError as error:
+        raise ValueError(f"objects {value!r}: {error}") from None
+
+
 def vector(length, check=None):
     check = check or number()
 

@@ -213,7 +213,7 @@ class SweepAsker:
                 continue
             columns = _name_faces(result.faces, start + first)
             if self.output == "contacts":
-                names = result.contacts.dtype.names[3:]
+                names = result.contacts.dtype.names[2:]
                 columns |= {name: np.ascontiguousarray(result.contacts[name]) for name in names}
             parts.append(columns)
         return {name: np.concatenate([columns[name] for columns in parts]) for name in parts[0]}
