@@ -74,24 +74,19 @@ class PosedBox:
 
 
 @wp.func
-def pose_box(lower: wp.vec3, upper: wp.vec3, rotation: wp.mat33, translation: wp.vec3):
-    """Return a box with its image in another frame: x -> rotation x + translation, both about the models' centres."""
+def pose_box(lower: wp.vec3, upper: wp.vec3, rotation: wp.mat33, translation: wp.vec3, margin: wp.float32):
+    """Return a box with its image in another frame: x -> rotation x + translation, both about the models' centres.
+
+    The image is wider by a margin on either side, along all axes.
+    """
     box = PosedBox()
     box.sum = upper + lower
     box.size = upper - lower
     box.turned_sum = map_point(rotation, translation + translation, box.sum)
     for i in range(3):
-        reach = fuse32(wp.abs(rotation[i, 1]), box.size[1], wp.abs(rotation[i, 2]) * box.size[2])
+        reach = fuse32(wp.abs(rotation[i, 2]), box.size[2], margin + margin)
+        reach = fuse32(wp.abs(rotation[i, 1]), box.size[1], reach)
         box.turned_size[i] = fuse32(wp.abs(rotation[i, 0]), box.size[0], reach)
-    return box
-
-
-@wp.func
-def widen_box(box: PosedBox, margin: float):
-    """Return a box wider by a margin on either side, along all axes."""
-    wide = wp.vec3(margin + margin, margin + margin, margin + margin)
-    box.size += wide
-    box.turned_size += wide
     return box
 
 
@@ -108,8 +103,7 @@ def all_within(p: wp.vec3, u: wp.vec3, q: wp.vec3, v: wp.vec3) -> bool:
 def boxes_overlap(a: PosedBox, b: PosedBox):
     """Return False only where two boxes are apart along one of the three axes of each.
 
-    One of them is widened by the margin of `PairPose`, which covers the rounding of everything here and of the poses,
-    so that no pair of points that meet is ever pruned. Each axis has a box in whose frame it is an axis, and the
-    other's image there.
+    Each axis has a box in whose frame it is an axis, and the other's image there, wider by the margin of `PairPose`,
+    which covers the rounding of everything here and of the poses, so that no pair of points that meet is ever pruned.
     """
     return all_within(a.sum - b.turned_sum, a.size + b.turned_size, a.turned_sum - b.sum, a.turned_size + b.size)

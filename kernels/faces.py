@@ -8,7 +8,7 @@ from warp_abtree.kernels.nodes import load_constant
 from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
 from warp_abtree.kernels.predicates import FLOAT32
-from warp_abtree.kernels.screen import SCREEN_UNIT, screen_triangles
+from warp_abtree.kernels.screen import SCREEN_UNIT, cross_triangles, part_triangles, turn_corners
 from warp_abtree.kernels.triangle import intersect_triangles
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -69,7 +69,23 @@ def load_near(models: ModelPool, vertex: wp.int32):
 
 
 @wp.func
-def screen_faces(
+def near_of_a(models: ModelPool, pose: PairPose, vertex: wp.int32):
+    return load_near(models, vertex) * wp.float32(pose.scale)
+
+
+@wp.func
+def near_of_b(models: ModelPool, pose: PairPose, vertex: wp.int32):
+    return map_point(pose.rotation32, pose.translation32, load_near(models, vertex)) * wp.float32(pose.scale)
+
+
+@wp.func
+def screen_bounds(mode: wp.int32, pose: PairPose):
+    """Return the error of coordinates and of arithmetic that signs allow for; none for FLOAT32."""
+    return wp.where(mode == FLOAT32, 0.0, pose.error), wp.where(mode == FLOAT32, 0.0, SCREEN_UNIT)
+
+
+@wp.func
+def part_faces(
     mode: wp.int32,
     models: ModelPool,
     states: StatePool,
@@ -77,24 +93,49 @@ def screen_faces(
     face_a: wp.int32,
     face_b: wp.int32,
 ):
-    """Test one active face of A against one of B in float32; return 1, 0 or UNSURE."""
+    """Return PARTED where float32 says that the plane of one of two active faces parts them, else what it says."""
+    if mode == WITHIN:
+        return 0
     a = load_corner_ids(states, pose.corner_a + face_a)
     b = load_corner_ids(states, pose.corner_b + face_b)
-    error = pose.error
-    unit = SCREEN_UNIT
-    if mode == FLOAT32:
-        error = 0.0
-        unit = 0.0
-    s = wp.float32(pose.scale)
-    return screen_triangles(
+    error, unit = screen_bounds(mode, pose)
+    return part_triangles(
         error,
         unit,
-        load_near(models, a[0]) * s,
-        load_near(models, a[1]) * s,
-        load_near(models, a[2]) * s,
-        map_point(pose.rotation32, pose.translation32, load_near(models, b[0])) * s,
-        map_point(pose.rotation32, pose.translation32, load_near(models, b[1])) * s,
-        map_point(pose.rotation32, pose.translation32, load_near(models, b[2])) * s,
+        near_of_a(models, pose, a[0]),
+        near_of_a(models, pose, a[1]),
+        near_of_a(models, pose, a[2]),
+        near_of_b(models, pose, b[0]),
+        near_of_b(models, pose, b[1]),
+        near_of_b(models, pose, b[2]),
+    )
+
+
+@wp.func
+def cross_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+    signs: wp.int32,
+):
+    """Test active faces that no plane parts, with the signs of `part_faces`, in float32; return 1, 0 or UNSURE."""
+    a = load_corner_ids(states, pose.corner_a + face_a)
+    b = load_corner_ids(states, pose.corner_b + face_b)
+    p1, q1, r1, p2, q2, r2 = turn_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
+    error, unit = screen_bounds(mode, pose)
+    return cross_triangles(
+        error,
+        unit,
+        signs,
+        near_of_a(models, pose, p1),
+        near_of_a(models, pose, q1),
+        near_of_a(models, pose, r1),
+        near_of_b(models, pose, p2),
+        near_of_b(models, pose, q2),
+        near_of_b(models, pose, r2),
     )
 
 
@@ -133,11 +174,12 @@ def try_faces(
     pose: PairPose,
     face_a: wp.int32,
     face_b: wp.int32,
+    signs: wp.int32,
 ):
-    """Return whether a pair of faces meets as the first stage sees it: 1, 0 or UNSURE; all of it for WITHIN."""
+    """Return whether faces that no plane parts meet as the first stage sees it: 1, 0 or UNSURE; or WITHIN, whole."""
     if mode == WITHIN:
         return test_faces(mode, models, states, pose, face_a, face_b)
-    return screen_faces(mode, models, states, pose, face_a, face_b)
+    return cross_faces(mode, models, states, pose, face_a, face_b, signs)
 
 
 @wp.func

@@ -6,6 +6,8 @@ from warp_abtree.kernels.pools import StatePool
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
+SPAN_MIN = wp.constant(wp.float32(2.0**-126))
+
 
 @wp.struct
 class Node:
@@ -13,7 +15,7 @@ class Node:
 
     skip: the node itself if it has two active children or is a leaf, else what its one active child stands for; -1
     where nothing below is active. face: of a skip node that is a leaf, else negative: as float32 bits, minus the sum of
-    the box's extents, which `store_node` sees to.
+    the box's extents, but never 0, which `store_node` sees to.
     """
 
     lower: wp.vec3
@@ -65,7 +67,7 @@ def store_node(states: StatePool, at: wp.int32, node: Node):
     face = node.face
     if face < 0:
         extent = ((upper[0] - lower[0]) + (upper[1] - lower[1])) + (upper[2] - lower[2])
-        face = wp.cast(-wp.max(extent, 0.0), wp.int32)
+        face = wp.cast(-wp.max(extent, SPAN_MIN), wp.int32)
     states.node_box[i] = wp.vec4(lower[0], lower[1], lower[2], wp.cast(node.skip, wp.float32))
     states.node_box[i + wp.int64(1)] = wp.vec4(upper[0], upper[1], upper[2], wp.cast(face, wp.float32))
 

@@ -35,8 +35,8 @@ def relate_pair_kernel(
         work_out.flag[p] = 0
     if p == 0 and work_out.counter.shape[0] > 0:
         work_out.counter[0] = 0
-        work_out.counter[1] = count * part_count(parts_max, count)
-        work_out.counter[2] = 0
+        work_out.counter[1] = 0
+        work_out.counter[2] = count * part_count(parts_max, count)
         work_out.counter[3] = 0
     if p >= pairs.shape[0]:
         return

@@ -27,7 +27,7 @@ COUNTER_COUNT = 4
 class Work:
     """Counters and mailboxes of one launch.
 
-    counter: units taken, units and shares not ended, tickets taken, tickets served. flag: 0 empty, the ticket + 1
+    counter: tickets served, tickets taken, units and shares not ended, units taken. flag: 0 empty, the ticket + 1
     that it is full for, or -1 when all is done, shape [mailbox]. owner: (object pair, number of items), shape
     [mailbox]. item: shape [mailbox * 32].
     """
@@ -42,10 +42,10 @@ class Work:
 #if defined(__CUDA_ARCH__)
     int unit = 0;
     if (threadIdx.x == 0)
-        unit = atomicAdd(counter.data, 1);
+        unit = atomicAdd(counter.data + 3, 1);
     return __shfl_sync(0xffffffffu, unit, 0);
 #else
-    return counter.data[0]++;
+    return counter.data[3]++;
 #endif
 """)
 def take_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
@@ -56,14 +56,20 @@ def take_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     // One load of both, past the first-level cache.
-    const volatile int2* both = (const volatile int2*)(counter.data + 2);
-    int taken = both->x, served = both->y;
-    return taken - served;
+    return *(const volatile long long*)counter.data;
 #else
     return 0;
 #endif
 """)
-def count_hungry(counter: wp.array(dtype=wp.int32)) -> wp.int32:
+def load_tickets(counter: wp.array(dtype=wp.int32)) -> wp.int64:
+    """Return the tickets taken and, in the low half, those served, to be subtracted when they have arrived."""
+    ...
+
+
+@wp.func_native("""
+    return (int)(tickets >> 32) - (int)tickets;
+""")
+def count_hungry(tickets: wp.int64) -> wp.int32:
     """Return about how many warps wait for a share."""
     ...
 
@@ -72,11 +78,11 @@ def count_hungry(counter: wp.array(dtype=wp.int32)) -> wp.int32:
 #if defined(__CUDA_ARCH__)
     int box = -1;
     if (threadIdx.x == 0) {{
-        int ticket = atomicAdd(counter.data + 2, 1);
+        int ticket = atomicAdd(counter.data + 1, 1);
         const volatile int* mine = (const volatile int*)(flag.data + (ticket & {MAILBOX_COUNT - 1}));
         __threadfence();
         // Whoever ends the last unit sends home those who have tickets by then.
-        if (*(const volatile int*)(counter.data + 1) != 0) {{
+        if (*(const volatile int*)(counter.data + 2) != 0) {{
             int got = *mine;
             while (got != ticket + 1 && got != -1) {{
                 __nanosleep(100);
@@ -114,8 +120,8 @@ def empty_mailbox(flag: wp.array(dtype=wp.int32), box: wp.int32): ...
 #if defined(__CUDA_ARCH__)
     int ticket = 0;
     if (threadIdx.x == 0) {{
-        atomicAdd(counter.data + 1, 1);
-        ticket = atomicAdd(counter.data + 3, 1);
+        atomicAdd(counter.data + 2, 1);
+        ticket = atomicAdd(counter.data, 1);
         while (*(const volatile int*)(flag.data + (ticket & {MAILBOX_COUNT - 1})) != 0)
             __nanosleep(100);
         __threadfence();
@@ -148,13 +154,13 @@ def close_mailbox(flag: wp.array(dtype=wp.int32), ticket: wp.int32):
 #if defined(__CUDA_ARCH__)
     int left = 1;
     if (threadIdx.x == 0)
-        left = atomicSub(counter.data + 1, 1) - 1;
+        left = atomicSub(counter.data + 2, 1) - 1;
     if (__shfl_sync(0xffffffffu, left, 0) != 0)
         return;
     for (int i = threadIdx.x; i < {MAILBOX_COUNT // 4}; i += 32)
         ((int4*)flag.data)[i] = make_int4(-1, -1, -1, -1);
 #else
-    counter.data[1] -= 1;
+    counter.data[2] -= 1;
 #endif
 """)
 def end_unit(counter: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32)):

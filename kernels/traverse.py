@@ -15,6 +15,7 @@ from warp_abtree.kernels.faces import (
     WITHIN,
     Hits,
     defer_faces,
+    part_faces,
     report_hit,
     test_faces,
     try_faces,
@@ -23,7 +24,7 @@ from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose
 from warp_abtree.kernels.predicates import EXACT, FLOAT32, UNSURE
-from warp_abtree.kernels.screen import SCREEN_UNIT
+from warp_abtree.kernels.screen import PARTED, SCREEN_UNIT
 from warp_abtree.kernels.share import (
     MAILBOX_COUNT,
     MAILBOX_ITEMS,
@@ -34,6 +35,7 @@ from warp_abtree.kernels.share import (
     count_hungry,
     empty_mailbox,
     end_unit,
+    load_tickets,
     open_mailbox,
     part_count,
     take_unit,
@@ -42,14 +44,17 @@ from warp_abtree.kernels.vector import ITEMS_AT_ONCE, STACK_ROOM, descend, scree
 from warp_abtree.kernels.vector64 import filter_waiting
 from warp_abtree.kernels.visit import visit_item
 from warp_abtree.kernels.warps import (
+    CROSSING_START,
     STACK_LENGTH,
     add_warp_sum,
-    four_items,
     item_first,
     item_second,
+    keep_value,
     pack_item,
+    push_crossing,
     push_items,
     read_item,
+    read_signs,
     reserve_slot,
     warp_any,
     warp_lane,
@@ -78,9 +83,11 @@ ITEMS_PER_WARP = wp.constant(8)
 ITEMS_TO_PART = wp.constant(STACK_LENGTH // 2)
 # An early hit ends a pair for `any`, so few face pairs wait.
 FEW_CANDIDATES = wp.constant(8)
-# Measured: a warp with work for two looks every eighth visit whether others wait, every fourth where pairs are few.
+# A warp with work for two looks at every second turn whether others wait, at every one where pairs are few: a turn is
+# so many visits, or fewer until a warp of face pairs waits, and their tests.
 SHARE_LEAST = wp.constant(16)
 MANY_PARTS = wp.constant(8)
+VISITS_A_TURN = wp.constant(4)
 
 
 @wp.func
@@ -235,24 +242,42 @@ def expand_items(
     states: StatePool,
     pose: PairPose,
 ):
-    """Visit items first to first + popped, one a thread, append what follows; return ends and pairs compared."""
+    """Visit items first to first + popped, one a thread, append what follows; return ends and pairs compared.
+
+    Threads without an item look at another's, so that none branches. What each appends depends on what all have read,
+    so nothing is written over before it is read.
+    """
     lane = warp_lane()
-    item = wp.int64(0)
-    if lane < popped:
-        item = read_item(items, (first + lane) & STACK_MASK)
-    warp_sync()
-    mask = wp.int32(0)
-    tests = wp.int32(0)
-    children = four_items()
-    if lane < popped:
-        children, mask, tests = visit_item(states, pose, item)
-    ends = push_items(items, end, waiting, mask, children)
+    item = read_item(items, (first + wp.min(lane, popped - 1)) & STACK_MASK)
+    children, steps, tests = visit_item(states, pose, item, wp.where(lane < popped, -1, 0))
+    ends = push_items(items, end, waiting, steps, children)
     warp_sync()
     return item_second(ends), item_first(ends), tests
 
 
 @wp.func
-def test_candidates(
+def part_candidates(
+    mode: wp.int32,
+    items: wp.uint64,
+    first: wp.int32,
+    popped: wp.int32,
+    crossing: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+):
+    """Look which of the face pairs that waited a plane parts, one a thread; return how many wait that none does."""
+    lane = warp_lane()
+    item = read_item(items, STACK_LENGTH + first + wp.min(lane, popped - 1))
+    signs = part_faces(mode, models, states, pose, item_first(item), item_second(item))
+    signs = wp.where(lane < popped, signs, PARTED)
+    crossing = push_crossing(items, crossing, signs != PARTED, item, signs)
+    warp_sync()
+    return crossing
+
+
+@wp.func
+def test_crossing(
     output: wp.int32,
     mode: wp.int32,
     items: wp.uint64,
@@ -264,13 +289,12 @@ def test_candidates(
     pose: PairPose,
     hits: Hits,
 ):
-    """Test face pairs that waited, one a thread; return (hits, tests, tests left open, 0) and whether this one met."""
+    """Test face pairs that no plane parts, one a thread; return whether this one met, and whether that is open."""
     lane = warp_lane()
-    meet = wp.int32(0)
-    item = wp.int64(0)
-    if lane < popped:
-        item = read_item(items, STACK_LENGTH + first + lane)
-        meet = try_faces(mode, models, states, pose, item_first(item), item_second(item))
+    at = first + wp.min(lane, popped - 1)
+    item = read_item(items, CROSSING_START + at)
+    meet = try_faces(mode, models, states, pose, item_first(item), item_second(item), read_signs(items, at))
+    meet = wp.where(lane < popped, meet, 0)
     warp_sync()
     found = meet == 1
     if output == OUTPUT_FACES:
@@ -282,8 +306,7 @@ def test_candidates(
     slot = reserve_slot(hits.unsure_total, meet == UNSURE)
     if meet == UNSURE:
         defer_faces(slot, pair, item_first(item), item_second(item), hits)
-    tested = wp.where(lane < popped, 1, 0)
-    return wp.vec4i(wp.where(found, 1, 0), tested, wp.where(meet == UNSURE, 1, 0), 0), found
+    return found, meet == UNSURE
 
 
 @wp.func
@@ -378,33 +401,44 @@ def traverse_items(
 ):
     """Traverse what is on the stack and is not given away; return pairs of boxes compared, and face pair tests."""
     node_tests, turn = wp.int32(0), wp.int32(0)
-    tests = wp.vec4i()
-    ready = wp.where(output == OUTPUT_ANY, wp.min(FEW_CANDIDATES, warp_size()), warp_size())
-    while end > head or waiting > 0:
+    tested, hit_count, left_open = wp.int32(0), wp.int32(0), wp.int32(0)
+    crossing = wp.int32(0)
+    ready = keep_value(wp.where(output == OUTPUT_ANY, wp.min(FEW_CANDIDATES, warp_size()), warp_size()))
+    ready_crossing = wp.where(output == OUTPUT_ANY, 1, warp_size())
+    while end > head or waiting > 0 or crossing > 0:
         found = False
-        hungry = wp.int32(0)
+        tickets, visits = wp.int64(0), wp.int32(0)
         turn += 1
         if (turn & share_mask) == 0:
-            hungry = count_hungry(work.counter)
-        if waiting >= ready or end == head:
-            popped = wp.min(waiting, warp_size())
-            waiting -= popped
-            more, found = test_candidates(output, mode, items, waiting, popped, p, models, states, pose, hits)
-            tests += more
-        else:
+            tickets = load_tickets(work.counter)
+        while visits < VISITS_A_TURN and end > head and waiting < ready:
             # One at a time, depth first, needs little room; more where there is.
-            popped = wp.max(1, (stack_room - DEPTH_FIRST_ROOM - (end - head)) / 3)
+            popped = wp.max(1, (stack_room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
             popped = wp.min(popped, wp.min(warp_size(), end - head))
             end -= popped
             end, waiting, compared = expand_items(items, end, popped, end, waiting, states, pose)
             node_tests += compared
+            visits += 1
+        if waiting >= ready or (end == head and waiting > 0):
+            popped = wp.min(waiting, warp_size())
+            waiting -= popped
+            crossing = part_candidates(mode, items, waiting, popped, crossing, models, states, pose)
+            tested += popped
+        if crossing >= ready_crossing or (end == head and waiting == 0 and crossing > 0):
+            popped = wp.min(crossing, warp_size())
+            crossing -= popped
+            found, left = test_crossing(output, mode, items, crossing, popped, p, models, states, pose, hits)
+            hit_count += wp.where(found, 1, 0)
+            left_open += wp.where(left, 1, 0)
+        hungry = count_hungry(tickets)
         if hungry > 0 and end - head >= 2 * SHARE_LEAST:
             head = give_shares(items, p, head, end, hungry, work)
         if output == OUTPUT_ANY:
             if warp_any(found or hits.any_hit[p] != 0):
                 end = head
                 waiting = 0
-    return node_tests, tests
+                crossing = 0
+    return node_tests, wp.vec3i(hit_count, wp.where(warp_lane() == 0, tested, 0), left_open)
 
 
 @functools.cache
@@ -429,7 +463,7 @@ def warp_traversal(mode: int):
         """Traverse units of work, each a part of one object pair, and shares of them, until there are none."""
         count = wp.min(pair_count[0], pair_poses.shape[0])
         parts = part_count(parts_max, count)
-        share_mask = wp.where(parts >= MANY_PARTS, 3, 7)
+        share_mask = keep_value(wp.where(parts >= MANY_PARTS, 0, 1))
         items = warp_stack()
         while True:
             unit = take_unit(work_inout.counter)

@@ -64,7 +64,7 @@ def in_groups(*first):
     const groups shift = {{home[0], home[1], home[2], 0.0f, home[0], home[1], home[2], 0.0f,
                            forth[0], forth[1], forth[2], 0.0f, forth[0], forth[1], forth[2], 0.0f}};
     const float w = pose.margin + pose.margin;
-    const groups wide = {{w, w, w, w, w, w, w, w, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f}};
+    const groups wide = {{w, w, w, w, w, w, w, w, w, w, w, w, w, w, w, w}};
     // The boxes of A twice each, those of B in turn: four pairs.
     auto of_a = [](const groups& v) {{
         return __builtin_shufflevector(v, v, 0, 1, 2, 3, 0, 1, 2, 3, 4, 5, 6, 7, 4, 5, 6, 7);
@@ -104,13 +104,12 @@ def in_groups(*first):
         groups sum_there = __builtin_elementwise_fma(axes[2], z, shift);
         sum_there = __builtin_elementwise_fma(axes[1], y, sum_there);
         sum_there = __builtin_elementwise_fma(axes[0], x, sum_there);
-        groups size_there = turned[2] * s;
+        groups size_there = __builtin_elementwise_fma(turned[2], s, wide);
         size_there = __builtin_elementwise_fma(turned[1], q, size_there);
         size_there = __builtin_elementwise_fma(turned[0], p, size_there);
-        const groups size_wide = size + wide, there_wide = size_there + wide;
         const bits hit =
-            (__builtin_elementwise_abs(of_a(sum) - of_b(sum_there)) <= of_a(size_wide) + of_b(size_there)) &
-            (__builtin_elementwise_abs(of_a(sum_there) - of_b(sum)) <= of_a(there_wide) + of_b(size));
+            (__builtin_elementwise_abs(of_a(sum) - of_b(sum_there)) <= of_a(size) + of_b(size_there)) &
+            (__builtin_elementwise_abs(of_a(sum_there) - of_b(sum)) <= of_a(size_there) + of_b(size));
         unsigned int m = __builtin_bit_cast(unsigned short, __builtin_convertvector(hit, flags)) | 0x8888;
         m &= m >> 1;
         m &= m >> 2;

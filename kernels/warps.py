@@ -1,7 +1,7 @@
 """The threads of a warp at work on one stack in shared memory: a block is a warp, on the CPU one thread.
 
-All its threads must reach `warp_sync`, `push_items`, `warp_any`, `reserve_slot`, `count_flags` and `add_warp_sum`
-together.
+All its threads must reach `warp_stack`, `warp_sync`, `push_items`, `keep_value`, `push_crossing`, `warp_any`,
+`reserve_slot`, `count_flags` and `add_warp_sum` together.
 """
 
 import warp as wp
@@ -14,6 +14,9 @@ WARP_SIZE = 32
 STACK_LENGTH = 512  # node pairs, a power of two
 # Fewer face pairs than there are threads wait while a visit adds four a thread at most.
 CANDIDATE_LENGTH = 160
+# Fewer than there are threads wait while each adds one at most.
+CROSSING_LENGTH = 64
+CROSSING_START = STACK_LENGTH + CANDIDATE_LENGTH
 
 
 @wp.func_native("""
@@ -38,15 +41,19 @@ def warp_lane() -> wp.int32: ...
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    __shared__ long long items[{STACK_LENGTH + CANDIDATE_LENGTH + WARP_SIZE}];
-    return (wp::uint64)items;
+    __shared__ long long items[{CROSSING_START} + {CROSSING_LENGTH} * 3 / 2];
+    // Through another thread, so that the address is held and not computed again at every use.
+    return __shfl_sync(0xffffffffu, (unsigned int)__cvta_generic_to_shared(items), 0);
 #else
-    static long long items[{STACK_LENGTH + CANDIDATE_LENGTH + 1}];
+    static long long items[{CROSSING_START} + {CROSSING_LENGTH} * 3 / 2];
     return (wp::uint64)items;
 #endif
 """)
 def warp_stack() -> wp.uint64:
-    """Return the address of this warp's items: its stack, then its candidates."""
+    """Return where this warp's items lie, an address in shared memory on CUDA.
+
+    Its stack, its candidates, those that no plane parts, and the signs of these, half an item each.
+    """
     ...
 
 
@@ -59,13 +66,23 @@ def warp_sync(): ...
 
 
 @wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    long long item;
+    asm volatile("ld.shared.b64 %0, [%1];" : "=l"(item) : "r"((unsigned int)items + 8 * i) : "memory");
+    return item;
+#else
     return ((const long long*)items)[i];
+#endif
 """)
 def read_item(items: wp.uint64, i: wp.int32) -> wp.int64: ...
 
 
 @wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("st.shared.b64 [%0], %1;" :: "r"((unsigned int)items + 8 * i), "l"(item) : "memory");
+#else
     ((long long*)items)[i] = item;
+#endif
 """)
 def write_item(items: wp.uint64, i: wp.int32, item: wp.int64): ...
 
@@ -89,42 +106,96 @@ def item_second(item: wp.int64) -> wp.int32: ...
 
 
 @wp.func_native(f"""
-    long long* stack = (long long*)items;
-    int stacked = end, waiting = end_waiting, all = mask, unused = {STACK_LENGTH + CANDIDATE_LENGTH};
 #if defined(__CUDA_ARCH__)
-    unused += threadIdx.x;
-    // Bits 0 to 3 count in the low half, bits 4 to 7 in the high half.
-    unsigned int mine = __popc(mask & 15) | (__popc(mask & 240) << 16), sum = mine;
-    for (int step = 1; step < 32; step <<= 1) {{
-        unsigned int other = __shfl_up_sync(0xffffffffu, sum, step);
-        if (threadIdx.x >= step)
-            sum += other;
-    }}
-    unsigned int total = __shfl_sync(0xffffffffu, sum, 31);
-    stacked += (sum - mine) & 0xffff;
-    waiting += (sum - mine) >> 16;
-#else
-    unsigned int total = __builtin_popcount(mask & 15) | (__builtin_popcount(mask & 240) << 16);
-#endif
+    const unsigned int mine = (steps[0] + steps[1]) + (steps[2] + steps[3]);
+    unsigned int sum = mine;
+    // What came from a thread is added, nothing where there is none.
+    #pragma unroll
+    for (int step = 1; step < 32; step <<= 1)
+        asm volatile("{{ .reg .pred from; .reg .b32 other;"
+                     " shfl.sync.up.b32 other|from, %0, %1, 0, 0xffffffff; @from add.u32 %0, %0, other; }}"
+                     : "+r"(sum) : "r"(step));
+    const unsigned int total = __shfl_sync(0xffffffffu, sum, 31);
+    // Bytes from the start: on the stack in the low half, among the face pairs in the high half.
+    unsigned int place = ((end & {STACK_LENGTH - 1}) | ({STACK_LENGTH} + end_waiting) << 16) * 8 + (sum - mine) * 8;
     #pragma unroll
     for (int k = 0; k < 4; ++k) {{
-        const bool down = all & (1 << k), face = all & (16 << k);
-        // What is not in use goes where nobody reads: a store without a branch.
-        int at = face ? {STACK_LENGTH} + waiting : unused;
-        at = down ? stacked & {STACK_LENGTH - 1} : at;
-        stacked += down;
-        waiting += face;
-        stack[at] = children[k];
+        const unsigned int at = steps[k] > 1 ? place >> 16 : place & {8 * STACK_LENGTH - 1};
+        asm volatile("{{ .reg .pred used; setp.ne.u32 used, %0, 0; @used st.shared.v2.b32 [%1], {{%2, %3}}; }}"
+                     :: "r"(steps[k]), "r"((unsigned int)items + at), "r"((int)children[k]),
+                        "r"((int)(children[k] >> 32)) : "memory");
+        place += 8 * steps[k];
     }}
+#else
+    long long* stack = (long long*)items;
+    int total = 0;
+    for (int k = 0; k < 4; ++k) {{
+        if (steps[k] > 1)
+            stack[{STACK_LENGTH} + end_waiting + (total >> 16)] = children[k];
+        else if (steps[k] == 1)
+            stack[(end + total) & {STACK_LENGTH - 1}] = children[k];
+        total += steps[k];
+    }}
+#endif
     return ((long long)(end_waiting + (total >> 16)) << 32) | (unsigned int)(end + (total & 0xffff));
 """)
 def push_items(
-    items: wp.uint64, end: wp.int32, end_waiting: wp.int32, mask: wp.int32, children: four_items
+    items: wp.uint64, end: wp.int32, end_waiting: wp.int32, steps: wp.vec4i, children: four_items
 ) -> wp.int64:
-    """Append the children of bits 0 to 3 to the stack, those of bits 4 to 7 to the face pairs; return both new ends.
+    """Append the children with an ITEM_STEP to the stack, those with a FACE_STEP to the face pairs; return both ends.
 
     The ends come packed, that of the face pairs first.
     """
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(0xffffffffu, x, 0);
+#else
+    return x;
+#endif
+""")
+def keep_value(x: wp.int32) -> wp.int32:
+    """Return a number that is the same in all threads, so that it is held and not computed again where it is used."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    const unsigned int at = end + __popc(votes & ((1u << threadIdx.x) - 1u)), start = items;
+    asm volatile("{{ .reg .pred used; setp.ne.s32 used, %0, 0;"
+                 " @used st.shared.b64 [%1], %2; @used st.shared.b32 [%3], %4; }}"
+                 :: "r"((int)flag), "r"(start + 8 * ({CROSSING_START} + at)), "l"(item),
+                    "r"(start + 8 * {CROSSING_START + CROSSING_LENGTH} + 4 * at), "r"(signs) : "memory");
+    return end + __popc(votes);
+#else
+    if (flag) {{
+        ((long long*)items)[{CROSSING_START} + end] = item;
+        ((int*)items)[2 * {CROSSING_START + CROSSING_LENGTH} + end] = signs;
+    }}
+    return end + flag;
+#endif
+""")
+def push_crossing(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, signs: wp.int32) -> wp.int32:
+    """Append the face pairs whose flag is set, with their signs, to those that no plane parts; return the new end."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    int signs;
+    asm volatile("ld.shared.b32 %0, [%1];"
+                 : "=r"(signs)
+                 : "r"((unsigned int)items + 8 * {CROSSING_START + CROSSING_LENGTH} + 4 * i) : "memory");
+    return signs;
+#else
+    return ((const int*)items)[2 * {CROSSING_START + CROSSING_LENGTH} + i];
+#endif
+""")
+def read_signs(items: wp.uint64, i: wp.int32) -> wp.int32:
+    """Return the signs of the i-th face pair that no plane parts."""
     ...
 
 

@@ -12,7 +12,7 @@ from warp_abtree.kernels import faces, settle, traverse
 from warp_abtree.kernels.double_word import double_orient2d, double_orient3d
 from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d, two_product, two_sum
 from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE, orient2d, orient3d
-from warp_abtree.kernels.screen import SCREEN_UNIT, side_of_plane, sides_of_plane
+from warp_abtree.kernels.screen import SCREEN_UNIT, add_signs, heights_over_plane, one_sided, side_of_plane
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
@@ -92,10 +92,12 @@ def screen_kernel(
 ):
     i = wp.tid()
     a, b, c, d, e, f = points[i, 0], points[i, 1], points[i, 2], points[i, 3], points[i, 4], points[i, 5]
-    s0, s1, s2 = sides_of_plane(error[i], unit, a, b, c, d, e, f)
-    out[i, 0] = s0
-    out[i, 1] = s1
-    out[i, 2] = s2
+    heights, bound = heights_over_plane(error[i], unit, b - a, c - a, a - d, a - e, a - f)
+    signs = add_signs(0, heights, bound)
+    for k in range(3):
+        pair = (signs >> (4 - 2 * k)) & 3
+        out[i, k] = wp.where(pair == 2, 1, wp.where(pair == 1, -1, wp.where(bound == 0.0, 0, UNSURE)))
+    out[i, 6] = one_sided(heights, bound)
     out[i, 3] = side_of_plane(error[i], unit, a, b, c, d)
     out[i, 4] = side_of_plane(error[i], unit, a, b, c, e)
     out[i, 5] = side_of_plane(error[i], unit, a, b, c, f)
@@ -286,11 +288,13 @@ def test_the_filter_is_tight(device):
 
 def screen_signs(error, unit, points, device):
     """Return signs (count, 6) of three points against a plane, all at once and one by one; points [count, 6, 3]."""
-    out = wp.zeros((len(points), 6), dtype=wp.int32, device=device)
+    out = wp.zeros((len(points), 7), dtype=wp.int32, device=device)
     error = wp.array(error, dtype=wp.float32, device=device)
     points = wp.array(points.astype(np.float32), dtype=wp.vec3, device=device)
     wp.launch(screen_kernel, len(points), [error, float(unit), points, out], device=device)
-    return out.numpy()
+    signs = out.numpy()
+    np.testing.assert_array_equal(signs[:, 6] < 0, np.abs(signs[:, :3].sum(1)) == 3)
+    return signs[:, :6]
 
 
 def screen_points(rng, kind):

@@ -7,7 +7,7 @@ from samples import contact_poses, sample
 
 import warp_abtree as ab
 from warp_abtree.kernels.double_word import BOUND_DOUBLE, double_orient3d
-from warp_abtree.kernels.faces import screen_faces
+from warp_abtree.kernels.faces import cross_faces, part_faces
 from warp_abtree.kernels.faces import test_faces as decide_faces
 from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
@@ -21,7 +21,7 @@ from warp_abtree.kernels.predicates import (
     orient3d,
     orient_edges,
 )
-from warp_abtree.kernels.screen import SCREEN_UNIT
+from warp_abtree.kernels.screen import PARTED, SCREEN_UNIT
 from warp_abtree.kernels.traverse import WAITING_ROOM, first_item
 from warp_abtree.kernels.triangle import turn_triangles
 from warp_abtree.kernels.vector import (
@@ -34,7 +34,7 @@ from warp_abtree.kernels.vector import (
     take_slots,
 )
 from warp_abtree.kernels.vector64 import filter_waiting
-from warp_abtree.kernels.visit import visit_item
+from warp_abtree.kernels.visit import FACE_STEP, ITEM_STEP, visit_item
 from warp_abtree.kernels.warps import item_first, item_second, pack_item
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -72,7 +72,9 @@ def screen_one_kernel(
 ):
     i = wp.tid()
     pose = made_pose(rotation, translation, scale, error, corner_b)
-    meet_out[i] = screen_faces(mode, models, states, pose, item_first(faces[i]), item_second(faces[i]))
+    a, b = item_first(faces[i]), item_second(faces[i])
+    signs = part_faces(mode, models, states, pose, a, b)
+    meet_out[i] = wp.where(signs == PARTED, 0, cross_faces(mode, models, states, pose, a, b, signs))
 
 
 @wp.kernel
@@ -349,13 +351,13 @@ def visit_all_kernel(
     top, found, compared = wp.int32(1), wp.int32(0), wp.int32(0)
     while top > 0:
         top -= 1
-        items, mask, tests = visit_item(states, pose, stack_inout[top])
+        items, steps, tests = visit_item(states, pose, stack_inout[top], -1)
         compared += tests
         for k in range(4):
-            if (mask >> k) & 1 != 0:
+            if steps[k] == ITEM_STEP:
                 stack_inout[top] = items[k]
                 top += 1
-            if (mask >> (k + 4)) & 1 != 0:
+            if steps[k] == FACE_STEP:
                 found_out[found] = items[k]
                 found += 1
     count_out[0] = wp.int64(found)
