@@ -119,12 +119,6 @@ class Context:
         times = timing.time_rounds({name: time_thread(x) for name, x in launches.items()}, repeats or self.size(21, 5))
         return {name: float(np.median(values)) for name, values in times.items()}
 
-    def time_calls(self, calls: dict, repeats=None) -> dict:
-        """Return the median time [ms] by the wall clock of calls that wait for the host, by name, in turn."""
-        repeats = repeats or self.size(15, 3)
-        runs = {name: timing.time_wall(call, self.device) for name, call in calls.items()}
-        return {name: float(np.median(values)) for name, values in timing.time_rounds(runs, repeats).items()}
-
 
 def time_thread(call):
     """Return a callable that calls something and returns the CPU time that this thread took [ms]."""

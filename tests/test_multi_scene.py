@@ -185,6 +185,7 @@ def test_bad_input_is_refused_before_anything_is_sent(device, monkeypatch):
             (lambda: many.intersect(output="some"), "output 'some'"),
             (lambda: many.intersect(within=-1.0), "within"),
             (lambda: many.tree_state(n), f"object {n} is outside"),
+            (lambda: many.tree_state(0.5), "object 0.5 is not a whole number"),
             (lambda: many.add(sample("box"), world=-2), "world -2 is outside"),
         ):
             with pytest.raises(ValueError, match=what):
@@ -338,6 +339,18 @@ def test_objects_in_every_world_alone(device):
             many.add(sample("box"), (9, 9, 9, 0, 0, 0, 1), world=world)
         result = many.intersect(output="faces")
         assert result.pairs.tolist() == [[0, 1]] and len(result.faces) == result.count[0] > 0
+
+
+def test_a_device_without_a_world_is_not_asked(device):
+    """The slower of two devices gets none of one world, also where it comes first."""
+    with ab.MultiScene([device, device], processes=False) as many:
+        for x in (0.0, 0.5, 9.0):
+            many.add(sample("torus"), (x, 0, 0, 0, 0, 0, 1))
+        many._speed = np.array([1.0, 4.0])
+        assert many.intersect([[0, 1], [0, 2]]).any.tolist() == [True, False]
+        assert [len(rows) for rows in many._members] == [0, 3]
+        assert many.intersect().pairs.tolist() == [[0, 1]]
+        assert len(many.intersect(np.empty((0, 2), int)).any) == 0
 
 
 def test_merged_results_say_what_is_lost():

@@ -160,6 +160,21 @@ def test_a_write_that_fails_leaves_no_file(tmp_path, monkeypatch):
     assert ab.run_shards(job, tmp_path / "out")["found"] == 0
 
 
+def test_names_of_shards_beyond_twelve_digits_are_found(tmp_path):
+    ranges = [(10**12 - 5, 10**12), (10**12, 10**12 + 5)]
+    for part in ranges:
+        (tmp_path / shards._shard_name(*part, "npz")).touch()
+    assert sorted(shards._find_shards(tmp_path)) == ranges
+
+
+def test_a_run_that_ended_while_it_wrote_its_first_file_is_gone_on_with(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / f"{MANIFEST}.1.partial").write_text("{")
+    assert ab.run_shards(ab.SweepJob(*pair(), poses_of(), shard=50), out)["shards"] == 2
+    assert not list(out.glob("*.partial"))
+
+
 def test_a_folder_is_of_one_job(tmp_path):
     options = {"output": "any", "shard": 50}
     ab.run_shards(ab.SweepJob(*pair(), poses_of(), **options), tmp_path / "out")
@@ -347,6 +362,15 @@ def test_worlds_that_cannot_be_dealt(tmp_path):
         ab.WorldsJob(scene)
     with pytest.raises(ValueError, match="output 'any' of worlds"):
         ab.WorldsJob(load_worlds(tmp_path), output="any")
+    for name, value in (("frames", 0), ("frames", 2.5), ("shard", 0), ("shard", -1)):
+        with pytest.raises(ValueError, match=f"^{name} {value} is "):
+            ab.WorldsJob(load_worlds(tmp_path), **{name: value})
+
+
+@pytest.mark.parametrize("workers", [0, -1, 1.5])
+def test_workers_of_ray_are_counted_from_one(workers):
+    with pytest.raises(ValueError, match=f"^workers {workers} is "):
+        ab.RayPool(workers=workers)
 
 
 # The command.

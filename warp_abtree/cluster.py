@@ -12,6 +12,7 @@ from collections import deque
 
 import numpy as np
 
+from warp_abtree.checks import whole_number
 from warp_abtree.intersect import Query
 from warp_abtree.scene import Scene
 from warp_abtree.shards import hash_model
@@ -60,10 +61,11 @@ class RayPool:
         lost: Workers that ended before their work, in the last job.
 
     Raises:
-        ValueError: Ray is not installed, or does not start or answer.
+        ValueError: Ray is not installed, or does not start or answer; workers is no whole number from 1.
     """
 
     def __init__(self, address=None, workers=None):
+        workers = None if workers is None else whole_number(workers, "workers", 1, 2**16)
         self.ray = _import_ray()
         self.pids: dict = {}
         self.lost = 0
@@ -192,7 +194,8 @@ class WorldsJob:
         shard: Worlds a shard.
 
     Raises:
-        ValueError: A scene without worlds, or whose LODs a controller chooses by the clock; a rigid body in world -1.
+        ValueError: A scene without worlds, or whose LODs a controller chooses by the clock; a rigid body in world -1;
+            an unknown output, or frames or worlds a shard that are no whole number from 1.
     """
 
     unit = "world"
@@ -202,8 +205,8 @@ class WorldsJob:
             raise ValueError(f"output {output!r} of worlds is none of 'count', 'poses'")
         if scene.control.controller != "none":
             raise ValueError(f"{scene.path}: [lod] goes by the clock of one device; worlds in shards need fixed LODs")
-        self.frames = scene.frames if frames is None else frames
-        self.output, self.shard = output, shard
+        self.frames = whole_number(scene.frames if frames is None else frames, "frames", 1, 2**31 - 1)
+        self.output, self.shard = output, whole_number(shard, "shard", 1, 2**31 - 1)
         self.worlds = np.unique(scene.worlds[scene.worlds >= 0])
         self.count = len(self.worlds)
         if not self.count:

@@ -410,7 +410,7 @@ class MultiScene:
         number = np.empty(self.object_count, np.int32)
         for k, rows in enumerate(self._members):
             place = np.flatnonzero(part == k)
-            if len(place) or k == 0:  # one answers for none, too
+            if len(place) or (len(rows) and not places):  # one that has objects answers for none, too
                 places[k] = as_slice(place)
                 number[rows] = np.arange(len(rows))
                 sent[k] = number[pairs[places[k]]]
@@ -479,8 +479,7 @@ class MultiScene:
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD; errors as `Scene.tree_state`."""
-        if not 0 <= i < self.object_count:
-            raise ValueError(f"object {i} is outside 0 .. {self.object_count - 1}")
+        i = whole_number(i, "object", 0, self.object_count - 1)
         self._build()
         k = next(k for k, rows in enumerate(self._members) if i in rows)
         return self._ask("tree_state", {k: (int(np.searchsorted(self._members[k], i)),)})[k]

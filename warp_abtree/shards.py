@@ -28,7 +28,7 @@ from warp_abtree.turns import device_turn
 FORMAT_NAME, FORMAT_VERSION = "warp_abtree shards", 1
 MANIFEST = "job.json"
 FILES = ("npz", "parquet")
-SHARD_NAME = re.compile(r"^shard-(\d{12})-(\d{12})\.(npz|parquet)$")
+SHARD_NAME = re.compile(r"^shard-(\d{12,})-(\d{12,})\.(npz|parquet)$")
 # Poses of a shard, and rows looked at in one piece while a job is checked.
 READ_ROWS = SHARD = 65536
 # Objects and bytes of tree states of a scene that asks contacts, or LODs that change from pose to pose.
@@ -280,7 +280,7 @@ class _Folder:
             if held["hash"] != self.manifest["hash"]:
                 other = [key for key, value in self.manifest["job"].items() if held["job"].get(key) != value]
                 raise ValueError(f"{self.path}: holds another job; not the same: {', '.join(other)}")
-        elif any(self.path.iterdir()):
+        elif any(entry.suffix != ".partial" for entry in self.path.iterdir()):  # half a manifest is none
             raise ValueError(f"{self.path}: is not empty and holds no {MANIFEST}")
         else:
             text = json.dumps(self.manifest, indent=1)
