@@ -146,6 +146,17 @@ def part_triangles(
 
 
 @wp.func
+def are_open(unit: wp.float32, signs: wp.int32):
+    """Return whether signs of planes that part nothing leave it to the next stage: a shared plane, or one unknown.
+
+    A sign that is neither positive nor negative is unknown, or 0 where there are no errors.
+    """
+    known = ((signs >> 1) | signs) & (POSITIVE >> 1)
+    flat = (known & SIGNS_OF_A) == 0 or (known & SIGNS_OF_B) == 0
+    return flat or (known != (POSITIVE >> 1) and unit != 0.0)
+
+
+@wp.func
 def find_alone_in(signs: wp.int32):
     """Return which corner is alone on its side, as `find_alone` of three signs, and whether it is the negative one."""
     over = signs & 42
@@ -178,7 +189,6 @@ def turn_corners(signs: wp.int32, a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b
 def cross_triangles(
     error: wp.float32,
     unit: wp.float32,
-    signs: wp.int32,
     p1: wp.vec3,
     q1: wp.vec3,
     r1: wp.vec3,
@@ -186,19 +196,14 @@ def cross_triangles(
     q2: wp.vec3,
     r2: wp.vec3,
 ):
-    """Return 1 where two closed triangles that no plane parts meet, 0 where not, UNSURE where float32 cannot tell.
+    """Return 1 where two closed triangles meet whose planes tell all signs, 0 where not, UNSURE where it is open.
 
-    The corners come turned. A shared plane and faces without one are left to the next stage.
+    The corners come turned.
     """
     first = side_of_plane(error, unit, p1, q1, p2, q2)
     second = side_of_plane(error, unit, p1, r1, r2, p2)
     meet = wp.where(first == UNSURE or second == UNSURE, UNSURE, 1)
-    meet = wp.where(first == 1 or second == 1, 0, meet)
-    # A sign that is neither positive nor negative is open, or 0 where there are no errors.
-    known = ((signs >> 1) | signs) & (POSITIVE >> 1)
-    flat = (known & SIGNS_OF_A) == 0 or (known & SIGNS_OF_B) == 0
-    is_open = known != (POSITIVE >> 1) and unit != 0.0
-    return wp.where(flat or is_open, UNSURE, meet)
+    return wp.where(first == 1 or second == 1, 0, meet)
 
 
 @wp.func
@@ -215,4 +220,5 @@ def screen_triangles(
     """Return 1 where two closed triangles meet, 0 where they do not, UNSURE where float32 cannot tell: both parts."""
     signs = part_triangles(error, unit, a0, a1, a2, b0, b1, b2)
     p1, q1, r1, p2, q2, r2 = turn_corners(signs, a0, a1, a2, b0, b1, b2)
-    return wp.where(signs == PARTED, 0, cross_triangles(error, unit, signs, p1, q1, r1, p2, q2, r2))
+    meet = wp.where(are_open(unit, signs), UNSURE, cross_triangles(error, unit, p1, q1, r1, p2, q2, r2))
+    return wp.where(signs == PARTED, 0, meet)

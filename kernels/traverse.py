@@ -9,22 +9,20 @@ import functools
 
 import warp as wp
 
+from warp_abtree.kernels.candidates import part_candidates, test_crossing
 from warp_abtree.kernels.faces import (
     OUTPUT_ANY,
     OUTPUT_FACES,
     WITHIN,
     Hits,
-    defer_faces,
-    part_faces,
     report_hit,
     test_faces,
-    try_faces,
 )
 from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose
-from warp_abtree.kernels.predicates import EXACT, FLOAT32, UNSURE
-from warp_abtree.kernels.screen import PARTED, SCREEN_UNIT
+from warp_abtree.kernels.predicates import EXACT, FLOAT32
+from warp_abtree.kernels.screen import SCREEN_UNIT
 from warp_abtree.kernels.share import (
     MAILBOX_COUNT,
     MAILBOX_ITEMS,
@@ -44,18 +42,14 @@ from warp_abtree.kernels.vector import ITEMS_AT_ONCE, STACK_ROOM, descend, scree
 from warp_abtree.kernels.vector64 import filter_waiting
 from warp_abtree.kernels.visit import visit_item
 from warp_abtree.kernels.warps import (
-    CROSSING_START,
     STACK_LENGTH,
     add_warp_sum,
     item_first,
     item_second,
     keep_value,
     pack_item,
-    push_crossing,
     push_items,
     read_item,
-    read_signs,
-    reserve_slot,
     warp_any,
     warp_lane,
     warp_size,
@@ -75,7 +69,7 @@ DEPTH_FIRST_ROOM = wp.constant(128)
 # ends a pair for `any`.
 FACES_READY, FACES_FOR_ANY = wp.constant(128), wp.constant(1)
 ITEMS_FOR_ANY = wp.constant(8)
-WAITING_ROOM = int(FACES_READY) + 4 * ITEMS_AT_ONCE + 4
+WAITING_ROOM = int(FACES_READY) + 4 * ITEMS_AT_ONCE + 16  # 16 are written at a time
 
 STACK_MASK = wp.constant(STACK_LENGTH - 1)
 # Warps on one pair part its work when there are about so many items for each, or as many as the stack takes then.
@@ -256,60 +250,6 @@ def expand_items(
 
 
 @wp.func
-def part_candidates(
-    mode: wp.int32,
-    items: wp.uint64,
-    first: wp.int32,
-    popped: wp.int32,
-    crossing: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-):
-    """Look which of the face pairs that waited a plane parts, one a thread; return how many wait that none does."""
-    lane = warp_lane()
-    item = read_item(items, STACK_LENGTH + first + wp.min(lane, popped - 1))
-    signs = part_faces(mode, models, states, pose, item_first(item), item_second(item))
-    signs = wp.where(lane < popped, signs, PARTED)
-    crossing = push_crossing(items, crossing, signs != PARTED, item, signs)
-    warp_sync()
-    return crossing
-
-
-@wp.func
-def test_crossing(
-    output: wp.int32,
-    mode: wp.int32,
-    items: wp.uint64,
-    first: wp.int32,
-    popped: wp.int32,
-    pair: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    hits: Hits,
-):
-    """Test face pairs that no plane parts, one a thread; return whether this one met, and whether that is open."""
-    lane = warp_lane()
-    at = first + wp.min(lane, popped - 1)
-    item = read_item(items, CROSSING_START + at)
-    meet = try_faces(mode, models, states, pose, item_first(item), item_second(item), read_signs(items, at))
-    meet = wp.where(lane < popped, meet, 0)
-    warp_sync()
-    found = meet == 1
-    if output == OUTPUT_FACES:
-        slot = reserve_slot(hits.total, found)
-        if found:
-            report_hit(slot, pair, pose.swapped, item_first(item), item_second(item), hits)
-    if found:
-        hits.any_hit[pair] = 1
-    slot = reserve_slot(hits.unsure_total, meet == UNSURE)
-    if meet == UNSURE:
-        defer_faces(slot, pair, item_first(item), item_second(item), hits)
-    return found, meet == UNSURE
-
-
-@wp.func
 def part_items(items: wp.uint64, head: wp.int32, end: wp.int32, part: wp.int32, parts: wp.int32):
     """Keep every so many-th item from head on, for one of several warps that hold the same; return the new end."""
     kept = (end - head - part + parts - 1) / parts
@@ -387,7 +327,7 @@ def traverse_items(
     output: wp.int32,
     mode: wp.int32,
     stack_room: wp.int32,
-    share_mask: wp.int32,
+    parts: wp.int32,
     items: wp.uint64,
     head: wp.int32,
     end: wp.int32,
@@ -405,13 +345,17 @@ def traverse_items(
     crossing = wp.int32(0)
     ready = keep_value(wp.where(output == OUTPUT_ANY, wp.min(FEW_CANDIDATES, warp_size()), warp_size()))
     ready_crossing = wp.where(output == OUTPUT_ANY, 1, warp_size())
+    # Where many warps look for one hit of a pair, each asks at every visit whether there is one.
+    alert = output == OUTPUT_ANY and parts > MANY_PARTS
+    visits_max = keep_value(wp.where(alert, 1, VISITS_A_TURN))
+    share_mask = keep_value(wp.where(alert, 3, wp.where(parts >= MANY_PARTS, 0, 1)))
     while end > head or waiting > 0 or crossing > 0:
         found = False
         tickets, visits = wp.int64(0), wp.int32(0)
         turn += 1
         if (turn & share_mask) == 0:
             tickets = load_tickets(work.counter)
-        while visits < VISITS_A_TURN and end > head and waiting < ready:
+        while visits < visits_max and end > head and waiting < ready:
             # One at a time, depth first, needs little room; more where there is.
             popped = wp.max(1, (stack_room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
             popped = wp.min(popped, wp.min(warp_size(), end - head))
@@ -422,7 +366,8 @@ def traverse_items(
         if waiting >= ready or (end == head and waiting > 0):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
-            crossing = part_candidates(mode, items, waiting, popped, crossing, models, states, pose)
+            crossing, left = part_candidates(mode, items, waiting, popped, crossing, p, models, states, pose, hits)
+            left_open += wp.where(left, 1, 0)
             tested += popped
         if crossing >= ready_crossing or (end == head and waiting == 0 and crossing > 0):
             popped = wp.min(crossing, warp_size())
@@ -463,7 +408,6 @@ def warp_traversal(mode: int):
         """Traverse units of work, each a part of one object pair, and shares of them, until there are none."""
         count = wp.min(pair_count[0], pair_poses.shape[0])
         parts = part_count(parts_max, count)
-        share_mask = keep_value(wp.where(parts >= MANY_PARTS, 0, 1))
         items = warp_stack()
         while True:
             unit = take_unit(work_inout.counter)
@@ -481,7 +425,7 @@ def warp_traversal(mode: int):
             else:
                 head, end, waiting, spread = spread_items(items, unit % parts, parts, states, pose)
             node_tests, tests = traverse_items(
-                output, wp.static(mode), stack_room, share_mask, items, head, end, waiting, p,
+                output, wp.static(mode), stack_room, parts, items, head, end, waiting, p,
                 models, states, pose, hits_inout, work_inout,
             )  # fmt: skip
             add_warp_sum(hits_inout.node_tests, p, node_tests + spread)

@@ -9,7 +9,6 @@ import warp as wp
 
 from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose
-from warp_abtree.kernels.predicates import UNSURE
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -26,6 +25,11 @@ three_numbers = wp.types.vector(length=3, dtype=wp.int64)
 # or both (3), in A and in B.
 ROWS, COLUMNS = (0, 3, 12, 15), (0, 5, 10, 15)
 PAIRS_USED = sum((ROWS[a] & COLUMNS[b]) << 4 * (4 * a + b) for a in range(4) for b in range(4))
+
+
+def every_other(first):
+    """Return the indices of a shuffle of two times 16 numbers that takes each second one."""
+    return ", ".join(str(first + 2 * i) for i in range(16))
 
 
 def in_groups(*first):
@@ -195,13 +199,16 @@ def single_node(node: wp.int32):
     typedef bool flags __attribute__((ext_vector_type(16)));
     typedef float four __attribute__((vector_size(16)));
     typedef float eight __attribute__((vector_size(32)));
-    typedef wp::int32 sixteen[16];
+    typedef int loose __attribute__((vector_size(64), aligned(4)));
+    typedef unsigned int counts __attribute__((vector_size(64)));
+    typedef wp::int64 longs __attribute__((vector_size(64)));
+    typedef unsigned int sixteen[16];
     struct Point {{ lanes x, y, z; }};
     const auto& r = pose.rotation32.data;
     const auto& t = pose.translation32;
     const float scale = (float)pose.scale;
-    const four* near = (const four*)models.vertex_near.data;
-    const wp::vec_t<4, wp::int32>* corners = states.face_corner.data;
+    const void* near = models.vertex_near.data;
+    const void* corners = states.face_corner.data;
     wp::int64* list = faces.data;
     wp::int64* rest = left_open.data;
     auto every = [](float v) {{ return lanes{{v, v, v, v, v, v, v, v, v, v, v, v, v, v, v, v}}; }};
@@ -217,21 +224,22 @@ def single_node(node: wp.int32):
         const lanes p = u + 2.0f * error, q = v + 2.0f * error, s = w + 2.0f * error;
         return error * (p * q + s * (p + q)) + unit * (p * q * s);
     }};
-    auto filtered_sign = [](const lanes& x, const lanes& bound) {{
-        const bits open = bound == 0.0f ? bits{{}} : bits{{}} + {int(UNSURE)};
-        return x > bound ? bits{{}} + 1 : x < -bound ? bits{{}} - 1 : open;
-    }};
     auto choose = [](const bits& which, const Point& a, const Point& b) {{
         return Point{{which ? a.x : b.x, which ? a.y : b.y, which ? a.z : b.z}};
     }};
     auto to_mask = [](const bits& which) {{
         return (unsigned int)__builtin_bit_cast(unsigned short, __builtin_convertvector(which, flags));
     }};
-    auto gather = [&](const sixteen& corner) {{
+    auto widen = [](unsigned int mask) {{
+        return -__builtin_convertvector(__builtin_bit_cast(flags, (unsigned short)mask), bits);
+    }};
+    // Rows of four numbers, each where so many pairs of numbers end.
+    auto gather = [](const void* table, const sixteen& start) {{
+        auto at = [&](int k) {{ return *(const four*)((const double*)table + start[k]); }};
         lanes row[4];
         for (int k = 0; k < 4; ++k) {{
-            const eight p = __builtin_shufflevector(near[corner[k]], near[corner[k + 4]], 0, 1, 2, 3, 4, 5, 6, 7);
-            const eight q = __builtin_shufflevector(near[corner[k + 8]], near[corner[k + 12]], 0, 1, 2, 3, 4, 5, 6, 7);
+            const eight p = __builtin_shufflevector(at(k), at(k + 4), 0, 1, 2, 3, 4, 5, 6, 7);
+            const eight q = __builtin_shufflevector(at(k + 8), at(k + 12), 0, 1, 2, 3, 4, 5, 6, 7);
             row[k] = __builtin_shufflevector(p, q, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
         }}
         const lanes low_01 = __builtin_shufflevector(row[0], row[1], {in_groups(0, 16, 1, 17)});
@@ -243,11 +251,11 @@ def single_node(node: wp.int32):
                       __builtin_shufflevector(high_01, high_23, {in_groups(0, 1, 16, 17)})}};
     }};
     auto near_a = [&](const sixteen& corner) {{
-        const Point p = gather(corner);
+        const Point p = gather(near, corner);
         return Point{{p.x * scale, p.y * scale, p.z * scale}};
     }};
     auto near_b = [&](const sixteen& corner) {{
-        const Point p = gather(corner);
+        const Point p = gather(near, corner);
         lanes x[3];
         for (int i = 0; i < 3; ++i) {{
             x[i] = fuse(every(r[i][2]), p.z, every(t[i]));
@@ -255,75 +263,106 @@ def single_node(node: wp.int32):
         }}
         return Point{{x[0] * scale, x[1] * scale, x[2] * scale}};
     }};
-    auto sides_of_plane = [&](const Point& a, const Point& b, const Point& c, const Point (&d)[3], bits (&side)[3]) {{
+    // Of 16 times three signs those that are 1 and those that are -1, a bit each; where they lie on one side, and where
+    // one is UNSURE or all are 0.
+    struct Sides {{ unsigned int above[3], below[3], one_sided, unsure; }};
+    auto sides_of_plane = [&](const Point& a, const Point& b, const Point& c, const Point (&d)[3]) {{
         const Point u = minus(b, a), v = minus(c, a);
         const Point w[3] = {{minus(a, d[0]), minus(a, d[1]), minus(a, d[2])}};
         const Point normal = cross(u, v);
         const lanes size[3] = {{sum_sizes(w[0]), sum_sizes(w[1]), sum_sizes(w[2])}};
         const lanes more = size[1] > size[2] ? size[1] : size[2];
         const lanes bound = bound_error(sum_sizes(u), sum_sizes(v), size[0] > more ? size[0] : more);
-        for (int i = 0; i < 3; ++i)
-            side[i] = filtered_sign(dot(w[i], normal), bound);
-    }};
-    auto one_sided = [](const bits (&s)[3]) {{
-        const bits sum = s[0] + s[1] + s[2];
-        return (sum == 3) | (sum == -3);
+        Sides s;
+        unsigned int none[3];
+        for (int i = 0; i < 3; ++i) {{
+            const lanes value = dot(w[i], normal);
+            s.above[i] = to_mask(value > bound);
+            s.below[i] = to_mask(value < -bound);
+            none[i] = ~(s.above[i] | s.below[i]);
+        }}
+        s.one_sided = (s.above[0] & s.above[1] & s.above[2]) | (s.below[0] & s.below[1] & s.below[2]);
+        s.unsure = (none[0] | none[1] | none[2]) & (~to_mask(bound == 0.0f) | (none[0] & none[1] & none[2]));
+        return s;
     }};
     // As `find_alone`, and the corners turned so that this one comes first.
-    auto turn = [&](const bits (&s)[3], const Point (&c)[3], bits& back, Point& p, Point& q, Point& last) {{
-        const bits positive = -((s[0] > 0) + (s[1] > 0) + (s[2] > 0));
-        const bits negative = -((s[0] < 0) + (s[1] < 0) + (s[2] < 0));
-        const bits kind = positive == 1 ? bits{{}} + 1 : negative == 1 ? bits{{}} - 1 : bits{{}};
-        const bits first = s[0] == kind, second = s[1] == kind;
-        back = (kind < 0) | ((kind == 0) & (positive == 2));
+    auto turn = [&](const Sides& s, const Point (&c)[3], bits& back, Point& p, Point& q, Point& last) {{
+        const unsigned int pair_above = s.above[0] & s.above[1], odd_above = s.above[0] ^ s.above[1];
+        const unsigned int pair_below = s.below[0] & s.below[1], odd_below = s.below[0] ^ s.below[1];
+        const unsigned int positive = (odd_above ^ s.above[2]) & ~(pair_above & s.above[2]);
+        const unsigned int negative = (odd_below ^ s.below[2]) & ~(pair_below & s.below[2]) & ~positive;
+        const unsigned int zero = ~(positive | negative);
+        auto is_kind = [&](int i) {{
+            return widen((positive & s.above[i]) | (negative & s.below[i]) | (zero & ~(s.above[i] | s.below[i])));
+        }};
+        const bits first = is_kind(0), second = is_kind(1);
+        back = widen(negative | (zero & (pair_above | (odd_above & s.above[2]))));
         p = choose(first, c[0], choose(second, c[1], c[2]));
         q = choose(first, c[1], choose(second, c[2], c[0]));
         last = choose(first, c[2], choose(second, c[0], c[1]));
     }};
+    struct Side {{ unsigned int above, unsure; }};
     auto side_of_plane = [&](const Point& a, const Point& b, const Point& c, const Point& d) {{
         const Point u = minus(a, d), v = minus(b, d), w = minus(c, d);
-        return filtered_sign(dot(u, cross(v, w)), bound_error(sum_sizes(u), sum_sizes(v), sum_sizes(w)));
+        const lanes value = dot(u, cross(v, w)), bound = bound_error(sum_sizes(u), sum_sizes(v), sum_sizes(w));
+        const unsigned int above = to_mask(value > bound);
+        return Side{{above, ~(above | to_mask(value < -bound) | to_mask(bound == 0.0f))}};
     }};
     int met = 0, open = 0, done = 0;
     while (done < waiting && (done == 0 || met == 0 || !first_ends)) {{
         const int count = waiting - done < 16 ? waiting - done : 16;
-        sixteen corner_a[3], corner_b[3];
-        wp::int64 item[16];
-        for (int k = 0; k < 16; ++k) {{
-            item[k] = list[done + (k < count ? k : 0)];
-            const auto& a = corners[pose.corner_a + (int)(item[k] >> 32)];
-            const auto& b = corners[pose.corner_b + (int)item[k]];
-            for (int i = 0; i < 3; ++i) {{
-                corner_a[i][k] = a[i];
-                corner_b[i][k] = b[i];
-            }}
+        const wp::int64* items = list + done;
+        const longs lane = {{0, 1, 2, 3, 4, 5, 6, 7}}, some = longs{{}} + items[0];
+        const bits low = (bits)(lane < count ? (longs)*(const loose*)items : some);
+        const bits high = (bits)(lane + 8 < count ? (longs)*(const loose*)(items + 8) : some);
+        // Rows of two faces, then of six corners.
+        alignas(64) sixteen face[2], corner[6];
+        *(counts*)face[0] = 2 * (counts)(pose.corner_a + __builtin_shufflevector(low, high, {every_other(1)}));
+        *(counts*)face[1] = 2 * (counts)(pose.corner_b + __builtin_shufflevector(low, high, {every_other(0)}));
+        for (int i = 0; i < 2; ++i) {{
+            const Point c = gather(corners, face[i]);
+            *(counts*)corner[3 * i] = 2 * (counts)c.x;
+            *(counts*)corner[3 * i + 1] = 2 * (counts)c.y;
+            *(counts*)corner[3 * i + 2] = 2 * (counts)c.z;
         }}
+        auto append = [&](wp::int64* to, unsigned int which) {{
+#if defined(__AVX512VL__)
+            const longs first = __builtin_ia32_compressdi512_mask((longs)low, longs{{}}, which);
+            const longs second = __builtin_ia32_compressdi512_mask((longs)high, longs{{}}, which >> 8);
+            *(loose*)to = (loose)first;
+            *(loose*)(to + __builtin_popcount(which & 255)) = (loose)second;
+#else
+            for (int n = 0; which != 0; which &= which - 1)
+                to[n++] = items[__builtin_ctz(which)];
+#endif
+        }};
         done += count;
-        const Point a[3] = {{near_a(corner_a[0]), near_a(corner_a[1]), near_a(corner_a[2])}};
-        const Point b[3] = {{near_b(corner_b[0]), near_b(corner_b[1]), near_b(corner_b[2])}};
-        bits sides_a[3], sides_b[3];
-        sides_of_plane(b[0], b[1], b[2], a, sides_a);
-        sides_of_plane(a[0], a[1], a[2], b, sides_b);
-        const bits crossing = ~(one_sided(sides_a) | one_sided(sides_b));
-        unsigned int left = to_mask(crossing) & ((1u << count) - 1);
-        if (left == 0)
+        const Point a[3] = {{near_a(corner[0]), near_a(corner[1]), near_a(corner[2])}};
+        const Point b[3] = {{near_b(corner[3]), near_b(corner[4]), near_b(corner[5])}};
+        const Sides sides_a = sides_of_plane(b[0], b[1], b[2], a), sides_b = sides_of_plane(a[0], a[1], a[2], b);
+        const unsigned int left = ~(sides_a.one_sided | sides_b.one_sided) & ((1u << count) - 1);
+        const unsigned int unsure = sides_a.unsure | sides_b.unsure;
+        // Of a mesh laid on itself, or nearly so, as a rule all.
+        if ((left & ~unsure) == 0) {{
+            append(rest + open, left);
+            open += __builtin_popcount(left);
             continue;
-        bits unsure = ((sides_a[0] | sides_a[1] | sides_a[2]) == 0) | ((sides_b[0] | sides_b[1] | sides_b[2]) == 0);
-        for (int i = 0; i < 3; ++i)
-            unsure |= (sides_a[i] == {int(UNSURE)}) | (sides_b[i] == {int(UNSURE)});
+        }}
         bits back_a, back_b;
         Point p1, q1, r1, p2, q2, r2;
         turn(sides_a, a, back_a, p1, q1, r1);
         turn(sides_b, b, back_b, p2, q2, r2);
-        const bits s = side_of_plane(p1, choose(back_b, r1, q1), p2, choose(back_a, r2, q2));
-        const bits e = side_of_plane(p1, choose(back_b, q1, r1), choose(back_a, q2, r2), p2);
-        const bits apart = (s == 1) | (e == 1);
-        const bits unknown = unsure | (~apart & ((s == {int(UNSURE)}) | (e == {int(UNSURE)})));
-        unsigned int opens = left & to_mask(unknown);
-        for (left &= ~opens & ~to_mask(apart); left != 0; left &= left - 1)
-            list[met++] = item[__builtin_ctz(left)];
-        for (; opens != 0; opens &= opens - 1)
-            rest[open++] = item[__builtin_ctz(opens)];
+        const Side s = side_of_plane(p1, choose(back_b, r1, q1), p2, choose(back_a, r2, q2));
+        const Side e = side_of_plane(p1, choose(back_b, q1, r1), choose(back_a, q2, r2), p2);
+        const unsigned int apart = s.above | e.above, opens = left & (unsure | (~apart & (s.unsure | e.unsure)));
+        const unsigned int meet = left & ~opens & ~apart;
+        if (opens != 0) {{
+            append(rest + open, opens);
+            open += __builtin_popcount(opens);
+        }}
+        // Last: those that meet take the place of pairs that were looked at, perhaps of these.
+        append(list + met, meet);
+        met += __builtin_popcount(meet);
     }}
     result[0] = met;
     result[1] = open;
@@ -344,6 +383,8 @@ def screen_waiting(
     left_open: wp.array(dtype=wp.int64),
 ) -> three_numbers:
     """Test pairs of faces as `screen_faces`, 16 at a time, perhaps until the first that meet.
+
+    Lists have room for 16 more.
 
     Returns how many met, which stand in front of the list then, how many are left open, and how many were tested.
     """

@@ -31,12 +31,12 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
     typedef double lanes __attribute__((vector_size(64)));
     typedef wp::int64 bits __attribute__((vector_size(64)));
     typedef wp::int64 loose_longs __attribute__((vector_size(64), aligned(8)));
-    typedef int row_of_four __attribute__((vector_size(16)));
     typedef int ints __attribute__((vector_size(32)));
     typedef int loose_ints __attribute__((vector_size(32), aligned(4)));
     typedef bool flags __attribute__((ext_vector_type(8)));
-    typedef double two __attribute__((vector_size(16), aligned(8)));
     typedef double four __attribute__((vector_size(32)));
+    typedef int four_ints __attribute__((vector_size(16)));
+    typedef unsigned int counts __attribute__((vector_size(32)));
     struct Point {{ lanes x, y, z; }};
     struct Double {{ lanes high, low; }};
     struct Sign {{ lanes value, size; }};
@@ -45,8 +45,8 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
     const auto& r = pose.rotation.data;
     const auto& t = pose.translation;
     const double* position = (const double*)models.vertex_pos.data;
-    const row_of_four* corners = (const row_of_four*)states.face_corner.data;
     wp::int64* rest = left_open.data;
+    const double* corners = (const double*)states.face_corner.data;
     wp::int64* hits = faces.data;
     auto absolute = [](const lanes& v) {{ return __builtin_elementwise_abs(v); }};
     auto fuse = [](const lanes& a, const lanes& b, const lanes& c) {{ return __builtin_elementwise_fma(a, b, c); }};
@@ -62,26 +62,32 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
     auto widen = [](unsigned int mask) {{
         return -__builtin_convertvector(__builtin_bit_cast(flags, (unsigned char)mask), ints);
     }};
-    auto gather = [&](const int* vertex) {{
-        const double* p[8];
-        two xy[8];
-        for (int k = 0; k < 8; ++k) {{
-            p[k] = position + 3 * (wp::int64)vertex[k];
-            xy[k] = *(const two*)p[k];
+    // Points, each where so many numbers end.
+    auto gather = [&](const int* start) {{
+        auto at = [&](int k) {{
+            const double* p = position + (unsigned int)start[k];
+#if defined(__AVX512VL__)
+            return (four)__builtin_ia32_loadupd256_mask((const four*)p, four{{}}, 7);
+#else
+            return four{{p[0], p[1], p[2], 0.0}};
+#endif
+        }};
+        lanes row[4];
+        for (int k = 0; k < 4; ++k) {{
+            const int i = k < 2 ? k : k + 2;
+            row[k] = __builtin_shufflevector(at(i), at(i + 2), 0, 1, 2, 3, 4, 5, 6, 7);
         }}
-        lanes row[2];
-        for (int k = 0; k < 2; ++k) {{
-            const four low = __builtin_shufflevector(xy[k], xy[k + 2], 0, 1, 2, 3);
-            const four high = __builtin_shufflevector(xy[k + 4], xy[k + 6], 0, 1, 2, 3);
-            row[k] = __builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7);
-        }}
-        return Point{{__builtin_shufflevector(row[0], row[1], 0, 8, 2, 10, 4, 12, 6, 14),
-                      __builtin_shufflevector(row[0], row[1], 1, 9, 3, 11, 5, 13, 7, 15),
-                      lanes{{p[0][2], p[1][2], p[2][2], p[3][2], p[4][2], p[5][2], p[6][2], p[7][2]}}}};
+        const lanes low_01 = __builtin_shufflevector(row[0], row[1], 0, 8, 2, 10, 4, 12, 6, 14);
+        const lanes low_23 = __builtin_shufflevector(row[2], row[3], 0, 8, 2, 10, 4, 12, 6, 14);
+        const lanes high_01 = __builtin_shufflevector(row[0], row[1], 1, 9, 3, 11, 5, 13, 7, 15);
+        const lanes high_23 = __builtin_shufflevector(row[2], row[3], 1, 9, 3, 11, 5, 13, 7, 15);
+        return Point{{__builtin_shufflevector(low_01, low_23, 0, 1, 4, 5, 8, 9, 12, 13),
+                      __builtin_shufflevector(high_01, high_23, 0, 1, 4, 5, 8, 9, 12, 13),
+                      __builtin_shufflevector(low_01, low_23, 2, 3, 6, 7, 10, 11, 14, 15)}};
     }};
     // As `pose_point`.
-    auto gather_posed = [&](const int* vertex) {{
-        const Point p = gather(vertex);
+    auto gather_posed = [&](const int* start) {{
+        const Point p = gather(start);
         lanes x[3];
         for (int i = 0; i < 3; ++i) {{
             const lanes y = ((r[i][0] * p.x + r[i][1] * p.y) + r[i][2] * p.z) + t[i];
@@ -106,7 +112,7 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
     auto filtered = [&](const lanes& value, const lanes& bound) {{
         const unsigned int above = to_mask(value > bound), below = to_mask(value < -bound);
         const unsigned int open = 255 & ~(above | below);
-        return Sides{{above, below, open == 0 ? 0 : open & ~to_mask(bound == 0.0)}};
+        return Sides{{above, below, open & ~to_mask(bound == 0.0)}};
     }};
     // Double words, as in their module.
     auto add_fast = [](const lanes& a, const lanes& b) {{
@@ -136,45 +142,82 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
         const Double x = multiply(u0, minor(v1, w2, v2, w1)), y = multiply(v0, minor(w1, u2, w2, u1));
         return add(add(x, y), multiply(w0, minor(u1, v2, u2, v1))).high;
     }};
-    int open = 0;
+    typedef int ids[{KEPT_ROOM}];
+    int open = 0, kept = 0, hard_count = 0;
     wp::int64 resolved = 0;
+    // Put what a mask names on a list, of which eight places are written over. No branch depends on a single pair of
+    // faces: it could not be predicted, and what follows it would wait for the longest chain of operations.
+    auto append = [](wp::int64* list, const bits& item, unsigned int which) {{
+#if defined(__AVX512VL__)
+        *(loose_longs*)list = __builtin_ia32_compressdi512_mask(item, bits{{}}, which);
+#else
+        for (int n = 0; which != 0; which &= which - 1)
+            list[n++] = item[__builtin_ctz(which)];
+#endif
+    }};
+    auto append_ints = [](int* list, const ints& item, unsigned int which) {{
+#if defined(__AVX512VL__)
+        *(loose_ints*)list = __builtin_ia32_compresssi256_mask(item, ints{{}}, which);
+#else
+        for (int n = 0; which != 0; which &= which - 1)
+            list[n++] = item[__builtin_ctz(which)];
+#endif
+    }};
+    auto look_up = [](const int* list) {{ return (ints)*(const loose_ints*)list; }};
     // Pairs of which each lies on both sides of the other, their corners in the order of `turn_triangles`: those that
     // two more signs decide.
-    int turned[6][{KEPT_ROOM}];
+    ids turned[6];
     wp::int64 crossing[{KEPT_ROOM}];
+    // Of these, those with a sign open, one of both and as a rule the only one: its four corners and its sum of
+    // magnitudes, whose sign bit is set where the other is open too.
+    ids hard_corner[4];
+    wp::int64 hard_item[{KEPT_ROOM}], hard_size[{KEPT_ROOM}];
     auto order_ends = [&](int first, int count) {{
         const Point p1 = gather(turned[0] + first), q1 = gather(turned[1] + first), r1 = gather(turned[2] + first);
         const Point p2 = gather_posed(turned[3] + first);
         const Point q2 = gather_posed(turned[4] + first), r2 = gather_posed(turned[5] + first);
+        const bits item = *(const loose_longs*)(crossing + first);
         const Sign start = orient(p1, q1, p2, q2), end = orient(p1, r1, r2, p2);
         Sides s = filtered(start.value, {BOUND_3D.value.hex()} * start.size);
         Sides e = filtered(end.value, {BOUND_3D.value.hex()} * end.size);
-        if (s.open | e.open) {{
-            // As `orient_edges`.
-            s.open &= ~to_mask(same(p1, p2) | same(q1, p2));
-            e.open &= ~to_mask(same(p1, r2) | same(r1, r2));
-        }}
-        const unsigned int all = (1u << count) - 1;
-        const unsigned int hard = all & ~(s.above | e.above) & (s.open | e.open);
-        if (hard) {{
-            // One of both, as a rule the only one.
-            const bits one = __builtin_convertvector(widen(s.open), bits);
-            const lanes value = double_orient(p1, choose(one, q1, r1), choose(one, p2, r2), choose(one, q2, p2));
-            const Sides sure = filtered(value, {BOUND_DOUBLE.value.hex()} * (one ? start.size : end.size));
-            const unsigned int of_end = ~s.open;
-            e.above |= hard & of_end & sure.above;
-            e.open &= ~(hard & of_end & ~sure.open);
-            s.above |= hard & ~of_end & sure.above;
-            s.open &= of_end | ~hard | sure.open;
-        }}
-        const unsigned int apart = s.above | e.above;
-        unsigned int left = all & ~apart & (s.open | e.open);
-        unsigned int found = all & ~apart & ~left;
-        resolved += __builtin_popcount(hard & ~left);
-        for (; found != 0; found &= found - 1)
-            hits[met++] = crossing[first + __builtin_ctz(found)];
-        for (; left != 0; left &= left - 1)
-            rest[open++] = crossing[first + __builtin_ctz(left)];
+        // As `orient_edges`.
+        s.open &= ~to_mask(same(p1, p2) | same(q1, p2));
+        e.open &= ~to_mask(same(p1, r2) | same(r1, r2));
+        const unsigned int left = ((1u << count) - 1) & ~(s.above | e.above), hard = left & (s.open | e.open);
+        append(hits + met, item, left & ~hard);
+        met += __builtin_popcount(left & ~hard);
+        const ints one = widen(s.open);
+        append_ints(hard_corner[0] + hard_count, look_up(turned[0] + first), hard);
+        append_ints(hard_corner[1] + hard_count, one ? look_up(turned[1] + first) : look_up(turned[2] + first), hard);
+        append_ints(hard_corner[2] + hard_count, one ? look_up(turned[3] + first) : look_up(turned[5] + first), hard);
+        append_ints(hard_corner[3] + hard_count, one ? look_up(turned[4] + first) : look_up(turned[3] + first), hard);
+        const bits wide = __builtin_convertvector(one, bits);
+        const lanes size = wide ? start.size : end.size;
+        const bits both = __builtin_convertvector(widen(s.open & e.open), bits);
+        append(hard_size + hard_count, (bits)(both ? -size : size), hard);
+        append(hard_item + hard_count, item, hard);
+        hard_count += __builtin_popcount(hard);
+    }};
+    auto resolve = [&](int first, int count) {{
+        const bits item = *(const loose_longs*)(hard_item + first), kind = *(const loose_longs*)(hard_size + first);
+        const lanes value = double_orient(gather(hard_corner[0] + first), gather(hard_corner[1] + first),
+                                          gather_posed(hard_corner[2] + first), gather_posed(hard_corner[3] + first));
+        const Sides sure = filtered(value, {BOUND_DOUBLE.value.hex()} * absolute((lanes)kind));
+        const unsigned int all = (1u << count) - 1, below = all & ~sure.above;
+        unsigned int left = below & (sure.open | to_mask(kind < 0));
+        resolved += count - __builtin_popcount(left);
+        append(hits + met, item, below & ~left);
+        met += __builtin_popcount(below & ~left);
+        for (; __builtin_expect(left != 0, 0); left &= left - 1)
+            rest[open++] = hard_item[first + __builtin_ctz(left)];
+    }};
+    // Do something with pairs that are kept, 8 at a time; behind the end stand corners that there are.
+    auto work_off = [&](ids* list, int rows, int& count, auto& work) {{
+        for (int i = 0; i < rows; ++i)
+            *(loose_ints*)(list[i] + count) = ints{{}};
+        for (int i = 0; i < count; i += 8)
+            work(i, count - i < 8 ? count - i : 8);
+        count = 0;
     }};
     // As `find_alone`, of 8 triangles: those whose first corner is alone, whose second is, and whose lone corner lies
     // on the negative side.
@@ -191,7 +234,16 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
         const unsigned int two_above = pair_above | (odd_above & s[2].above);
         return Alone{{is_kind(s[0]), is_kind(s[1]), negative | (zero & two_above)}};
     }};
-    auto turn = [&](const Alone& alone, unsigned int back, const ints* c, ints* turned_c) {{
+    // The same where none of the corners touches.
+    auto find_lone = [](const Sides (&s)[3]) {{
+        const unsigned int odd = s[0].above ^ s[1].above, other = s[1].above ^ s[2].above;
+        return Alone{{odd & ~other, odd & other, (s[0].above & s[1].above) | (odd & s[2].above)}};
+    }};
+    auto has_sides = [](const Sides (&s)[3]) {{
+        return (s[0].above | s[0].below) & (s[1].above | s[1].below) & (s[2].above | s[2].below);
+    }};
+    auto turn = [&](const Alone& alone, unsigned int back, const ids* start, int at, ints* turned_c) {{
+        const ints c[3] = {{look_up(start[0] + at), look_up(start[1] + at), look_up(start[2] + at)}};
         const ints first = widen(alone.first), second = widen(alone.second), turns_back = widen(back);
         turned_c[0] = first ? c[0] : second ? c[1] : c[2];
         const ints q = first ? c[1] : second ? c[2] : c[0], r = first ? c[2] : second ? c[0] : c[1];
@@ -207,56 +259,48 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
             any |= s[i].above | s[i].below | s[i].open;
         return ~any;
     }};
-    // The next group is looked up while one is worked on.
-    struct Group {{ bits item; ints corner[6]; }};
-    Group groups[2];
-    auto transpose = [](const row_of_four (&c)[8], ints* corner) {{
-        ints row[4];
-        for (int k = 0; k < 4; ++k)
-            row[k] = __builtin_shufflevector(c[k], c[k + 4], 0, 1, 2, 3, 4, 5, 6, 7);
-        const ints low_01 = __builtin_shufflevector(row[0], row[1], 0, 8, 1, 9, 4, 12, 5, 13);
-        const ints low_23 = __builtin_shufflevector(row[2], row[3], 0, 8, 1, 9, 4, 12, 5, 13);
-        const ints high_01 = __builtin_shufflevector(row[0], row[1], 2, 10, 3, 11, 6, 14, 7, 15);
-        const ints high_23 = __builtin_shufflevector(row[2], row[3], 2, 10, 3, 11, 6, 14, 7, 15);
-        corner[0] = __builtin_shufflevector(low_01, low_23, 0, 1, 8, 9, 4, 5, 12, 13);
-        corner[1] = __builtin_shufflevector(low_01, low_23, 2, 3, 10, 11, 6, 7, 14, 15);
-        corner[2] = __builtin_shufflevector(high_01, high_23, 0, 1, 8, 9, 4, 5, 12, 13);
-    }};
-    auto load = [&](Group& group, int first) {{
-        const wp::int64* items = rest + first;
-        wp::int64 last[8];
-        if (first + 8 > waiting) {{
-            for (int k = 0; k < 8; ++k)
-                last[k] = items[first + k < waiting ? k : 0];
-            items = last;
+    // Where the corners' numbers start, of A and of B, of the pairs of faces from one on.
+    ids start[6];
+    auto find_corners = [&](int first, int count) {{
+        const bits some = bits{{}} + rest[first];
+        for (int i = 0; i < count; i += 8) {{
+            const bits lane = {{0, 1, 2, 3, 4, 5, 6, 7}};
+            const bits item = lane < count - i ? (bits)*(const loose_longs*)(rest + first + i) : some;
+            const counts face[2] = {{2 * (counts)(pose.corner_a + __builtin_convertvector(item >> 32, ints)),
+                                     2 * (counts)(pose.corner_b + __builtin_convertvector(item, ints))}};
+            for (int k = 0; k < 2; ++k) {{
+                auto at = [&](int j) {{ return *(const four_ints*)(corners + face[k][j]); }};
+                ints row[4];
+                for (int j = 0; j < 4; ++j)
+                    row[j] = __builtin_shufflevector(at(j), at(j + 4), 0, 1, 2, 3, 4, 5, 6, 7);
+                const ints low_01 = __builtin_shufflevector(row[0], row[1], 0, 8, 1, 9, 4, 12, 5, 13);
+                const ints low_23 = __builtin_shufflevector(row[2], row[3], 0, 8, 1, 9, 4, 12, 5, 13);
+                const ints high_01 = __builtin_shufflevector(row[0], row[1], 2, 10, 3, 11, 6, 14, 7, 15);
+                const ints high_23 = __builtin_shufflevector(row[2], row[3], 2, 10, 3, 11, 6, 14, 7, 15);
+                const ints x = __builtin_shufflevector(low_01, low_23, 0, 1, 8, 9, 4, 5, 12, 13);
+                const ints y = __builtin_shufflevector(low_01, low_23, 2, 3, 10, 11, 6, 7, 14, 15);
+                const ints z = __builtin_shufflevector(high_01, high_23, 0, 1, 8, 9, 4, 5, 12, 13);
+                *(loose_ints*)(start[3 * k] + i) = x + x + x;
+                *(loose_ints*)(start[3 * k + 1] + i) = y + y + y;
+                *(loose_ints*)(start[3 * k + 2] + i) = z + z + z;
+            }}
         }}
-        group.item = *(const loose_longs*)items;
-        row_of_four a[8], b[8];
-        for (int k = 0; k < 8; ++k) {{
-            const wp::int64 item = items[k];
-            a[k] = corners[pose.corner_a + (int)(item >> 32)];
-            b[k] = corners[pose.corner_b + (int)item];
-        }}
-        transpose(a, group.corner);
-        transpose(b, group.corner + 3);
     }};
-    const int before = met;
-    int done = 0, kept = 0, which = 0;
-    if (waiting > 0)
-        load(groups[0], 0);
+    const int before = met, at_once = first_ends ? 8 : {KEPT_ROOM};
+    int done = 0;
     while (done < waiting && (met == before || !first_ends)) {{
         const int count = waiting - done < 8 ? waiting - done : 8;
-        const Group& group = groups[which];
+        const int at = done % at_once;
+        if (at == 0)
+            find_corners(done, waiting - done < at_once ? waiting - done : at_once);
+        const bits item = *(const loose_longs*)(rest + done);
         done += count;
-        which ^= 1;
-        if (done < waiting)
-            load(groups[which], done);
         // From each corner of A to each of B: the other way round, every rounding is the same.
         Point d[3][3], d_size[3][3];
         {{
-            const int* corner = (const int*)group.corner;
-            const Point a[3] = {{gather(corner), gather(corner + 8), gather(corner + 16)}};
-            const Point b[3] = {{gather_posed(corner + 24), gather_posed(corner + 32), gather_posed(corner + 40)}};
+            const Point a[3] = {{gather(start[0] + at), gather(start[1] + at), gather(start[2] + at)}};
+            const Point b[3] = {{gather_posed(start[3] + at), gather_posed(start[4] + at),
+                                 gather_posed(start[5] + at)}};
             for (int i = 0; i < 3; ++i)
                 for (int j = 0; j < 3; ++j) {{
                     d[i][j] = minus(b[j], a[i]);
@@ -264,44 +308,46 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
                 }}
         }}
         Sides side_a[3], side_b[3];
+        lanes bound[6];
         #pragma clang loop unroll(full)
         for (int i = 0; i < 3; ++i) {{
             const Sign of_a = determinant(d[i][0], d[i][1], d[i][2], d_size[i][0], d_size[i][1], d_size[i][2]);
             const Sign of_b = determinant(d[0][i], d[1][i], d[2][i], d_size[0][i], d_size[1][i], d_size[2][i]);
-            side_a[i] = filtered(of_a.value, {BOUND_3D.value.hex()} * of_a.size);
-            side_b[i] = filtered(-of_b.value, {BOUND_3D.value.hex()} * of_b.size);
+            bound[i] = {BOUND_3D.value.hex()} * of_a.size;
+            bound[i + 3] = {BOUND_3D.value.hex()} * of_b.size;
+            side_a[i] = Sides{{to_mask(of_a.value > bound[i]), to_mask(of_a.value < -bound[i]), 0}};
+            side_b[i] = Sides{{to_mask(of_b.value < -bound[i + 3]), to_mask(of_b.value > bound[i + 3]), 0}};
         }}
         unsigned int left = ((1u << count) - 1) & ~(one_sided(side_a) | one_sided(side_b));
-        unsigned int unsure = has_all_zero(side_a) | has_all_zero(side_b);
-        for (int i = 0; i < 3; ++i)
-            unsure |= side_a[i].open | side_b[i].open;
-        for (unsigned int m = left & unsure; m != 0; m &= m - 1)
-            rest[open++] = group.item[__builtin_ctz(m)];
-        left &= ~unsure;
-        const Alone alone_a = find_alone(side_a), alone_b = find_alone(side_b);
+        Alone alone_a = find_lone(side_a), alone_b = find_lone(side_b);
+        // Else no sign that counts is open or 0.
+        if (__builtin_expect((left & ~(has_sides(side_a) & has_sides(side_b))) != 0, 0)) {{
+            for (int i = 0; i < 3; ++i) {{
+                side_a[i].open = ~(side_a[i].above | side_a[i].below | to_mask(bound[i] == 0.0));
+                side_b[i].open = ~(side_b[i].above | side_b[i].below | to_mask(bound[i + 3] == 0.0));
+            }}
+            unsigned int unsure = has_all_zero(side_a) | has_all_zero(side_b);
+            for (int i = 0; i < 3; ++i)
+                unsure |= side_a[i].open | side_b[i].open;
+            unsure &= left;
+            append(rest + open, item, unsure);
+            open += __builtin_popcount(unsure);
+            left &= ~unsure;
+            alone_a = find_alone(side_a);
+            alone_b = find_alone(side_b);
+        }}
         ints order[6];
-        turn(alone_a, alone_b.back, group.corner, order);
-        turn(alone_b, alone_a.back, group.corner + 3, order + 3);
-#if defined(__AVX512VL__)
+        turn(alone_a, alone_b.back, start, at, order);
+        turn(alone_b, alone_a.back, start + 3, at, order + 3);
         for (int i = 0; i < 6; ++i)
-            *(loose_ints*)(turned[i] + kept) = __builtin_ia32_compresssi256_mask(order[i], ints{{}}, left);
-        *(loose_longs*)(crossing + kept) = __builtin_ia32_compressdi512_mask(group.item, bits{{}}, left);
+            append_ints(turned[i] + kept, order[i], left);
+        append(crossing + kept, item, left);
         kept += __builtin_popcount(left);
-#else
-        for (; left != 0; left &= left - 1) {{
-            const int k = __builtin_ctz(left);
-            for (int i = 0; i < 6; ++i)
-                turned[i][kept] = order[i][k];
-            crossing[kept++] = group.item[k];
-        }}
-#endif
-        if (first_ends || done == waiting || kept > {KEPT_ROOM - 16}) {{
-            for (int i = 0; i < 6; ++i)
-                *(loose_ints*)(turned[i] + kept) = ints{{}};
-            for (int i = 0; i < kept; i += 8)
-                order_ends(i, kept - i < 8 ? kept - i : 8);
-            kept = 0;
-        }}
+        const bool last = first_ends || done == waiting;
+        if (last || kept > {KEPT_ROOM - 16})
+            work_off(turned, 6, kept, order_ends);
+        if (hard_count > 0)
+            work_off(hard_corner, 4, hard_count, resolve);
     }}
     result[0] = met;
     result[1] = open;
@@ -322,6 +368,8 @@ def filter_waiting(
     faces: wp.array(dtype=wp.int64),
 ) -> four_numbers:
     """Test pairs of faces in float64, 8 at a time, perhaps until the first that meet, and add those to a list.
+
+    Lists have room for 8 more.
 
     Returns how many have met then, how many are left open, which stand in front of their list then, how many were
     tested, and how many of these float64 left open and double words decided.

@@ -1,5 +1,7 @@
 """The vector instructions of the CPU beside the plain functions that every device runs, number by number."""
 
+import math
+
 import numpy as np
 import pytest
 import warp as wp
@@ -7,7 +9,7 @@ from samples import contact_poses, sample
 
 import warp_abtree as ab
 from warp_abtree.kernels.double_word import BOUND_DOUBLE, double_orient3d
-from warp_abtree.kernels.faces import cross_faces, part_faces
+from warp_abtree.kernels.faces import are_faces_open, cross_faces, part_faces
 from warp_abtree.kernels.faces import test_faces as decide_faces
 from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
@@ -41,6 +43,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 CPU = "cpu"
 UNTOUCHED = -77
+OVER = 16  # what vector instructions may write behind a list
 
 
 # --- the float32 stage -----------------------------------------------------------------------------------------------
@@ -74,7 +77,10 @@ def screen_one_kernel(
     pose = made_pose(rotation, translation, scale, error, corner_b)
     a, b = item_first(faces[i]), item_second(faces[i])
     signs = part_faces(mode, models, states, pose, a, b)
-    meet_out[i] = wp.where(signs == PARTED, 0, cross_faces(mode, models, states, pose, a, b, signs))
+    meet = cross_faces(mode, models, states, pose, a, b, signs)
+    if are_faces_open(mode, signs):
+        meet = wp.static(int(UNSURE))
+    meet_out[i] = wp.where(signs == PARTED, 0, meet)
 
 
 @wp.kernel
@@ -93,7 +99,8 @@ def screen_all_kernel(
     count_out: wp.array(dtype=wp.int64),
 ):
     pose = made_pose(rotation, translation, scale, error, corner_b)
-    counts = screen_waiting(models, states, pose, error, unit, first_ends, faces_inout.shape[0], faces_inout, open_out)
+    waiting = faces_inout.shape[0] - OVER
+    counts = screen_waiting(models, states, pose, error, unit, first_ends, waiting, faces_inout, open_out)
     for i in range(3):
         count_out[i] = counts[i]
 
@@ -136,8 +143,8 @@ def test_screens_the_same_as_one_by_one(kind, turned):
         wp.launch(screen_one_kernel, dim=ask_count, inputs=inputs, device=CPU)
         meet = meet.numpy()
         for first_ends in (False, True):
-            faces = wp.array(asked, dtype=wp.int64, device=CPU)
-            left = wp.full(ask_count, UNTOUCHED, dtype=wp.int64, device=CPU)
+            faces = wp.array(np.append(asked, [UNTOUCHED] * OVER), dtype=wp.int64, device=CPU)
+            left = filled(ask_count + OVER)
             counts = wp.zeros(3, dtype=wp.int64, device=CPU)
             unit = 0.0 if error == 0.0 else float(SCREEN_UNIT)
             inputs = [first_ends, error, unit, models, states, *placed, face_count, faces, left, counts]
@@ -148,7 +155,8 @@ def test_screens_the_same_as_one_by_one(kind, turned):
             assert tested == (min(ask_count, 16 * (hit[0] // 16 + 1)) if ends else ask_count)
             np.testing.assert_array_equal(faces.numpy()[:met], asked[:tested][meet[:tested] == 1])
             np.testing.assert_array_equal(left.numpy()[:unsure], asked[:tested][meet[:tested] == int(UNSURE)])
-            assert (left.numpy()[unsure:] == UNTOUCHED).all()
+            assert (left.numpy()[unsure + OVER :] == UNTOUCHED).all()
+            assert (faces.numpy()[16 * math.ceil(ask_count / 16) :] == UNTOUCHED).all()
         seen.append(np.bincount(meet, minlength=int(UNSURE) + 1) > 0)
     assert seen[1][[0, 1, int(UNSURE)]].all() or kind in ("flat", "wild")
     assert np.isin(meet, [0, int(UNSURE)]).all(), "no sign is sure where the bound is no number"
@@ -313,22 +321,25 @@ def test_filters_the_same_as_one_by_one(kind):
     decided = unsure & (decided.numpy() == 1)
     met = np.where(decided, exact, plain.numpy()) == 1
     assert (plain.numpy()[~unsure] == exact[~unsure]).all() or kind == "wild"
-    for first_ends in (False, True):
-        left = wp.array(np.append(asked, UNTOUCHED), dtype=wp.int64, device=CPU)
-        faces, counts = filled(before + ask_count + 1), wp.zeros(4, dtype=wp.int64, device=CPU)
+    # As they come, and those first that are left open, so that a search for a first hit gets that far.
+    came = np.arange(ask_count)
+    for first_ends, order in ((False, came), (True, came), (True, np.argsort(~(unsure & ~decided), kind="stable"))):
+        items, hit, hard, closed = asked[order], met[order], unsure[order], decided[order]
+        left = wp.array(np.append(items, [UNTOUCHED] * OVER), dtype=wp.int64, device=CPU)
+        faces, counts = filled(before + ask_count + OVER), wp.zeros(4, dtype=wp.int64, device=CPU)
         inputs = [first_ends, before, ask_count, *placed, left, faces, counts]
         wp.launch(filter_all_kernel, dim=1, inputs=inputs, device=CPU)
         end, still_open, tested, resolved = counts.numpy()
-        ends = first_ends and met.any()
-        assert tested == (min(ask_count, 8 * (np.flatnonzero(met)[0] // 8 + 1)) if ends else ask_count)
+        ends = first_ends and hit.any()
+        assert tested == (min(ask_count, 8 * (np.flatnonzero(hit)[0] // 8 + 1)) if ends else ask_count)
         first = np.arange(ask_count) < tested
-        np.testing.assert_array_equal(np.sort(faces.numpy()[before:end]), np.sort(asked[first & met]))
+        np.testing.assert_array_equal(np.sort(faces.numpy()[before:end]), np.sort(items[first & hit]))
         np.testing.assert_array_equal(
-            np.sort(left.numpy()[:still_open]), np.sort(asked[first & unsure & ~decided]), err_msg="left open"
+            np.sort(left.numpy()[:still_open]), np.sort(items[first & hard & ~closed]), err_msg="left open"
         )
-        assert resolved == (first & decided).sum()
-        assert (faces.numpy()[:before] == UNTOUCHED).all() and (faces.numpy()[end:] == UNTOUCHED).all()
-        assert left.numpy()[-1] == UNTOUCHED
+        assert resolved == (first & closed).sum()
+        assert (faces.numpy()[:before] == UNTOUCHED).all() and (faces.numpy()[end + 8 :] == UNTOUCHED).all()
+        assert (left.numpy()[ask_count + 8 :] == UNTOUCHED).all()
     seen = {"met": met & ~decided, "apart": ~met & ~unsure, "decided": decided, "left": unsure & ~decided}
     assert all(seen[name].sum() > 30 for name in CASES[kind].split())
     assert (met & decided).any() or "decided" not in CASES[kind]

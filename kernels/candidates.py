@@ -1,0 +1,102 @@
+"""Face pairs that wait on a warp's stack, in two parts: planes first, and only of those that are left the edges.
+
+All threads of a warp come here together.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.faces import (
+    OUTPUT_FACES,
+    Hits,
+    are_faces_open,
+    defer_faces,
+    part_faces,
+    report_hit,
+    try_faces,
+)
+from warp_abtree.kernels.pools import ModelPool, StatePool
+from warp_abtree.kernels.pose import PairPose
+from warp_abtree.kernels.predicates import UNSURE
+from warp_abtree.kernels.screen import PARTED
+from warp_abtree.kernels.warps import (
+    CROSSING_START,
+    STACK_LENGTH,
+    item_first,
+    item_second,
+    push_crossing,
+    read_item,
+    read_signs,
+    reserve_slot,
+    warp_lane,
+    warp_sync,
+)
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.func
+def leave_open(pair: wp.int32, left: bool, item: wp.int64, hits: Hits):
+    """Leave face pairs to the next stage, those of the threads that say so."""
+    slot = reserve_slot(hits.unsure_total, left)
+    if left:
+        defer_faces(slot, pair, item_first(item), item_second(item), hits)
+
+
+@wp.func
+def part_candidates(
+    mode: wp.int32,
+    items: wp.uint64,
+    first: wp.int32,
+    popped: wp.int32,
+    crossing: wp.int32,
+    pair: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    hits: Hits,
+):
+    """Look which of the face pairs that waited a plane parts, one a thread.
+
+    Those whose planes leave it open wait for the next stage. Return how many wait that go on here, and whether this
+    one is left open.
+    """
+    lane = warp_lane()
+    item = read_item(items, STACK_LENGTH + first + wp.min(lane, popped - 1))
+    signs = part_faces(mode, models, states, pose, item_first(item), item_second(item))
+    signs = wp.where(lane < popped, signs, PARTED)
+    left = signs != PARTED and are_faces_open(mode, signs)
+    crossing = push_crossing(items, crossing, signs != PARTED and not left, item, signs)
+    leave_open(pair, left, item, hits)
+    warp_sync()
+    return crossing, left
+
+
+@wp.func
+def test_crossing(
+    output: wp.int32,
+    mode: wp.int32,
+    items: wp.uint64,
+    first: wp.int32,
+    popped: wp.int32,
+    pair: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    hits: Hits,
+):
+    """Test face pairs that no plane parts, one a thread; return whether this one met, and whether that is open."""
+    lane = warp_lane()
+    at = first + wp.min(lane, popped - 1)
+    item = read_item(items, CROSSING_START + at)
+    meet = try_faces(mode, models, states, pose, item_first(item), item_second(item), read_signs(items, at))
+    meet = wp.where(lane < popped, meet, 0)
+    warp_sync()
+    found = meet == 1
+    if output == OUTPUT_FACES:
+        slot = reserve_slot(hits.total, found)
+        if found:
+            report_hit(slot, pair, pose.swapped, item_first(item), item_second(item), hits)
+    if found:
+        hits.any_hit[pair] = 1
+    leave_open(pair, meet == UNSURE, item, hits)
+    return found, meet == UNSURE
