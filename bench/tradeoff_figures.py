@@ -4,7 +4,7 @@ import numpy as np
 
 from .html import COLOURS, MARKERS, STYLES
 from .parts import pick
-from .tradeoff_peers import COACD, HULL, NEWTON_BVH, NEWTON_SDF, OURS, OURS_WITHIN, SIMPLIFIED, VHACD
+from .tradeoff_peers import COACD, HULL, NEWTON_SDF, OURS, OURS_WITHIN, SIMPLIFIED, VHACD
 from .tradeoff_tables import group, over_meshes
 
 LOWEST = 1e-3  # per cent: below it axes are linear, so that 0, the exact answer, is in the picture
@@ -16,7 +16,6 @@ METHODS = {  # colour and marker
     COACD: (2, "D"),
     VHACD: (3, "v"),
     NEWTON_SDF: (4, "P"),
-    NEWTON_BVH: (4, "*"),
 }
 
 

@@ -28,7 +28,7 @@ NEWTON_POSES = 1024  # at a time: its time a pose hardly falls beyond, and a bod
 BASE_FACES = 10
 OURS, OURS_WITHIN, OURS_FCL = "our LODs", "our LODs, within both errors", "our LODs, python-fcl"
 SIMPLIFIED, HULL, COACD, VHACD = "fast-simplification, python-fcl", "convex hull, python-fcl", "CoACD", "V-HACD"
-NEWTON_BVH, NEWTON_SDF = "Newton, BVH", "Newton, SDF"
+NEWTON_SDF = "Newton, SDF"
 
 
 class FclMeets:
@@ -246,7 +246,7 @@ def fcl_points(context, subject, fcl):
 
 
 def newton_points(context, subject):
-    """Yield the points of Newton's BVH and of its signed distance fields at three resolutions."""
+    """Yield the points of Newton's signed distance fields at three resolutions."""
     if not context.device.is_cuda:
         context.note("Newton is skipped: its signed distance fields need CUDA.")
         return
@@ -258,8 +258,8 @@ def newton_points(context, subject):
     poses = subject.tiled(NEWTON_POSES)
     vertices, faces, _ = subject.a.mesh_at(subject.a.lod_max)
     hits = int(subject.stage.ask(subject.poses, "count").count.sum()) * (len(poses) // len(subject.poses))
-    for sdf in (0, *SDF_RESOLUTIONS):
-        method, setting = (NEWTON_SDF, f"{sdf} voxels") if sdf else (NEWTON_BVH, "")
+    for sdf in SDF_RESOLUTIONS:
+        setting = f"{sdf} voxels"
         try:
             begin = time.perf_counter()
             query = NewtonMeets(
@@ -267,13 +267,13 @@ def newton_points(context, subject):
             )
             wp.synchronize_device(context.device)
             seconds = time.perf_counter() - begin
-            row = judge(subject, method, setting, query.meets, share=1.0, build_s=seconds)
+            row = judge(subject, NEWTON_SDF, setting, query.meets, share=1.0, build_s=seconds)
             query.place(poses)
             row["us"] = 1e3 * time_launches(context, {"run": query.peer.launch}, 5)["run"] / len(poses)
             query.peer.check()
             yield row | {"where": "GPU"}, None
         except Exception as error:  # another package's failure must not cost the rest of a run
-            context.note(f"{method} {setting} is skipped for {subject.name}: {type(error).__name__}: {error}")
+            context.note(f"{NEWTON_SDF} {setting} is skipped for {subject.name}: {type(error).__name__}: {error}")
 
 
 def find_version(package):

@@ -8,7 +8,6 @@ import warp as wp
 from warp_abtree.kernels.faces import (
     OUTPUT_FACES,
     Hits,
-    are_faces_open,
     defer_faces,
     part_faces,
     report_hit,
@@ -35,40 +34,24 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def leave_open(pair: wp.int32, left: bool, item: wp.int64, hits: Hits):
-    """Leave face pairs to the next stage, those of the threads that say so."""
-    slot = reserve_slot(hits.unsure_total, left)
-    if left:
-        defer_faces(slot, pair, item_first(item), item_second(item), hits)
-
-
-@wp.func
 def part_candidates(
     mode: wp.int32,
     items: wp.uint64,
     first: wp.int32,
     popped: wp.int32,
     crossing: wp.int32,
-    pair: wp.int32,
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    hits: Hits,
 ):
-    """Look which of the face pairs that waited a plane parts, one a thread.
-
-    Those whose planes leave it open wait for the next stage. Return how many wait that go on here, and whether this
-    one is left open.
-    """
+    """Look which of the face pairs that waited a plane parts, one a thread; return how many wait that none does."""
     lane = warp_lane()
     item = read_item(items, STACK_LENGTH + first + wp.min(lane, popped - 1))
     signs = part_faces(mode, models, states, pose, item_first(item), item_second(item))
     signs = wp.where(lane < popped, signs, PARTED)
-    left = signs != PARTED and are_faces_open(mode, signs)
-    crossing = push_crossing(items, crossing, signs != PARTED and not left, item, signs)
-    leave_open(pair, left, item, hits)
+    crossing = push_crossing(items, crossing, signs != PARTED, item, signs)
     warp_sync()
-    return crossing, left
+    return crossing
 
 
 @wp.func
@@ -98,5 +81,7 @@ def test_crossing(
             report_hit(slot, pair, pose.swapped, item_first(item), item_second(item), hits)
     if found:
         hits.any_hit[pair] = 1
-    leave_open(pair, meet == UNSURE, item, hits)
+    slot = reserve_slot(hits.unsure_total, meet == UNSURE)
+    if meet == UNSURE:
+        defer_faces(slot, pair, item_first(item), item_second(item), hits)
     return found, meet == UNSURE

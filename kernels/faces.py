@@ -7,7 +7,7 @@ from warp_abtree.kernels.distance import triangles_near
 from warp_abtree.kernels.nodes import load_constant
 from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
-from warp_abtree.kernels.predicates import FLOAT32
+from warp_abtree.kernels.predicates import FLOAT32, UNSURE
 from warp_abtree.kernels.screen import SCREEN_UNIT, are_open, cross_triangles, part_triangles, turn_corners
 from warp_abtree.kernels.triangle import intersect_triangles
 
@@ -112,12 +112,6 @@ def part_faces(
 
 
 @wp.func
-def are_faces_open(mode: wp.int32, signs: wp.int32):
-    """Return whether the signs of `part_faces` leave a pair of faces to the next stage."""
-    return mode != WITHIN and are_open(wp.where(mode == FLOAT32, 0.0, SCREEN_UNIT), signs)
-
-
-@wp.func
 def cross_faces(
     mode: wp.int32,
     models: ModelPool,
@@ -127,11 +121,13 @@ def cross_faces(
     face_b: wp.int32,
     signs: wp.int32,
 ):
-    """Test active faces whose planes tell all, with the signs of `part_faces`, in float32; return 1, 0 or UNSURE."""
+    """Test active faces that no plane parts, with the signs of `part_faces`, in float32; return 1, 0 or UNSURE."""
+    error, unit = screen_bounds(mode, pose)
+    if are_open(unit, signs):
+        return UNSURE
     a = load_corner_ids(states, pose.corner_a + face_a)
     b = load_corner_ids(states, pose.corner_b + face_b)
     p1, q1, r1, p2, q2, r2 = turn_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
-    error, unit = screen_bounds(mode, pose)
     return cross_triangles(
         error,
         unit,
@@ -181,7 +177,7 @@ def try_faces(
     face_b: wp.int32,
     signs: wp.int32,
 ):
-    """Return whether faces whose planes tell all meet as the first stage sees it: 1, 0 or UNSURE; or WITHIN, whole."""
+    """Return whether faces that no plane parts meet as the first stage sees it: 1, 0 or UNSURE; or WITHIN, whole."""
     if mode == WITHIN:
         return test_faces(mode, models, states, pose, face_a, face_b)
     return cross_faces(mode, models, states, pose, face_a, face_b, signs)

@@ -238,11 +238,11 @@ def expand_items(
 ):
     """Visit items first to first + popped, one a thread, append what follows; return ends and pairs compared.
 
-    Threads without an item look at another's, so that none branches. What each appends depends on what all have read,
-    so nothing is written over before it is read.
+    Threads without an item look at another's, so that none branches.
     """
     lane = warp_lane()
     item = read_item(items, (first + wp.min(lane, popped - 1)) & STACK_MASK)
+    warp_sync()
     children, steps, tests = visit_item(states, pose, item, wp.where(lane < popped, -1, 0))
     ends = push_items(items, end, waiting, steps, children)
     warp_sync()
@@ -346,7 +346,7 @@ def traverse_items(
     ready = keep_value(wp.where(output == OUTPUT_ANY, wp.min(FEW_CANDIDATES, warp_size()), warp_size()))
     ready_crossing = wp.where(output == OUTPUT_ANY, 1, warp_size())
     # Where many warps look for one hit of a pair, each asks at every visit whether there is one.
-    alert = output == OUTPUT_ANY and parts > MANY_PARTS
+    alert = output == OUTPUT_ANY and parts >= MANY_PARTS
     visits_max = keep_value(wp.where(alert, 1, VISITS_A_TURN))
     share_mask = keep_value(wp.where(alert, 3, wp.where(parts >= MANY_PARTS, 0, 1)))
     while end > head or waiting > 0 or crossing > 0:
@@ -366,8 +366,7 @@ def traverse_items(
         if waiting >= ready or (end == head and waiting > 0):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
-            crossing, left = part_candidates(mode, items, waiting, popped, crossing, p, models, states, pose, hits)
-            left_open += wp.where(left, 1, 0)
+            crossing = part_candidates(mode, items, waiting, popped, crossing, models, states, pose)
             tested += popped
         if crossing >= ready_crossing or (end == head and waiting == 0 and crossing > 0):
             popped = wp.min(crossing, warp_size())

@@ -9,7 +9,7 @@ from samples import contact_poses, sample
 
 import warp_abtree as ab
 from warp_abtree.kernels.double_word import BOUND_DOUBLE, double_orient3d
-from warp_abtree.kernels.faces import are_faces_open, cross_faces, part_faces
+from warp_abtree.kernels.faces import cross_faces, part_faces
 from warp_abtree.kernels.faces import test_faces as decide_faces
 from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pose_point
@@ -77,10 +77,7 @@ def screen_one_kernel(
     pose = made_pose(rotation, translation, scale, error, corner_b)
     a, b = item_first(faces[i]), item_second(faces[i])
     signs = part_faces(mode, models, states, pose, a, b)
-    meet = cross_faces(mode, models, states, pose, a, b, signs)
-    if are_faces_open(mode, signs):
-        meet = wp.static(int(UNSURE))
-    meet_out[i] = wp.where(signs == PARTED, 0, meet)
+    meet_out[i] = wp.where(signs == PARTED, 0, cross_faces(mode, models, states, pose, a, b, signs))
 
 
 @wp.kernel
