@@ -33,7 +33,7 @@ def relate_pair_kernel(
     count = wp.min(pair_count[0], pairs.shape[0])
     if p < work_out.flag.shape[0]:
         work_out.flag[p] = 0
-    if p == 0 and work_out.counter.shape[0] > 0:
+    if p == 0:
         work_out.counter[0] = 0
         work_out.counter[1] = 0
         work_out.counter[2] = count * part_count(parts_max, count)

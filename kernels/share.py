@@ -45,7 +45,7 @@ class Work:
         unit = atomicAdd(counter.data + 3, 1);
     return __shfl_sync(0xffffffffu, unit, 0);
 #else
-    return counter.data[3]++;
+    return __atomic_fetch_add(counter.data + 3, 1, __ATOMIC_RELAXED);
 #endif
 """)
 def take_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:

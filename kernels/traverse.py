@@ -83,6 +83,8 @@ SHARE_LEAST = wp.constant(16)
 MANY_PARTS = wp.constant(8)
 VISITS_A_TURN = wp.constant(4)
 
+long_counts = wp.types.vector(length=4, dtype=wp.int64)
+
 
 @wp.func
 def first_item(states: StatePool, pose: PairPose):
@@ -158,70 +160,72 @@ def settle_open(
     return met, wp.int32(counts[2]), wp.int32(counts[3]) + hard
 
 
+@wp.func
+def write_counts(p: wp.int32, hit_count: wp.int64, tests: long_counts, hits: Hits):
+    """Write what an object pair took: boxes, faces, those in float64 and those with exact signs."""
+    hits.count[p] = hit_count
+    hits.node_tests[p] = tests[0]
+    hits.triangle_tests[p] = tests[1]
+    hits.float64_tests[p] = tests[2]
+    hits.exact_tests[p] = tests[3]
+
+
 @functools.cache
 def thread_traversal(mode: int):
-    """Return the kernel that gives a thread each object pair, at a precision or WITHIN."""
+    """Return the kernel whose threads share the object pairs, at a precision or WITHIN."""
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def traverse_thread_kernel(
-        first: wp.int32,
-        step: wp.int32,
         output: wp.int32,
         models: ModelPool,
         states: StatePool,
         pair_count: wp.array(dtype=wp.int32),
         pair_poses: wp.array(dtype=PairPose),
         hits_inout: Hits,
+        work_inout: Work,
     ):
-        """Traverse every step-th object pair from the first on, depth first; CPU only, on several cores at once."""
-        p = first + step * wp.tid()
-        if p >= wp.min(pair_count[0], pair_poses.shape[0]):
-            return
-        pose = pair_poses[p]
+        """Take one object pair after the other and traverse it depth first; CPU only, a thread a core."""
+        count = wp.min(pair_count[0], pair_poses.shape[0])
         stack = wp.zeros(shape=STACK_ROOM, dtype=wp.int64)
-        root = first_item(states, pose)
-        stack[0] = pack_item(single_node(item_first(root)), single_node(item_second(root)))
         waiting_faces = wp.zeros(shape=WAITING_ROOM, dtype=wp.int64)
         left_open = wp.zeros(shape=WAITING_ROOM, dtype=wp.int64)
-        error, unit = wp.float32(pose.error), wp.float32(SCREEN_UNIT)
-        if wp.static(mode == int(FLOAT32)):
-            error, unit = wp.float32(0.0), wp.float32(0.0)
-        top = wp.int32(1)
-        node_tests, triangle_tests = wp.int64(0), wp.int64(0)
-        float64_tests, exact_tests, hit_count = wp.int64(0), wp.int64(0), wp.int64(0)
         at_once, ready = ITEMS_AT_ONCE, FACES_READY
         if output == OUTPUT_ANY:
             at_once, ready = ITEMS_FOR_ANY, FACES_FOR_ANY
-        while top > 0:
-            progress = descend(states, pose, at_once, ready, top, stack, waiting_faces)
-            top, waiting = wp.int32(progress[0]), wp.int32(progress[1])
-            node_tests += progress[2]
-            if wp.static(mode == int(WITHIN)):
-                met, tested = settle_waiting(
-                    wp.static(mode), output, models, states, pose, 0, waiting, waiting_faces, waiting_faces
-                )
-                triangle_tests += wp.int64(tested)
-            else:
-                screened = screen_waiting(
-                    models, states, pose, error, unit, output == OUTPUT_ANY, waiting, waiting_faces, left_open
-                )
-                met, left = wp.int32(screened[0]), wp.int32(screened[1])
-                met, filtered, hard = settle_open(
-                    wp.static(mode), output, models, states, pose, met, left, left_open, waiting_faces
-                )
-                triangle_tests += screened[2]
-                float64_tests += wp.int64(filtered)
-                exact_tests += wp.int64(hard)
-            if met > 0:
-                hit_count += wp.int64(met)
-                keep_hits(output, p, pose.swapped, met, waiting_faces, hits_inout)
-                if output == OUTPUT_ANY:
-                    top = 0
-        hits_inout.count[p] = hit_count
-        hits_inout.node_tests[p] = node_tests
-        hits_inout.triangle_tests[p] = triangle_tests
-        hits_inout.float64_tests[p] = float64_tests
-        hits_inout.exact_tests[p] = exact_tests
+        p = take_unit(work_inout.counter)
+        while p < count:
+            pose = pair_poses[p]
+            root = first_item(states, pose)
+            stack[0] = pack_item(single_node(item_first(root)), single_node(item_second(root)))
+            error, unit = wp.float32(pose.error), wp.float32(SCREEN_UNIT)
+            if wp.static(mode == int(FLOAT32)):
+                error, unit = wp.float32(0.0), wp.float32(0.0)
+            top, hit_count = wp.int32(1), wp.int64(0)
+            tests = long_counts()
+            while top > 0:
+                progress = descend(states, pose, at_once, ready, top, stack, waiting_faces)
+                top, waiting = wp.int32(progress[0]), wp.int32(progress[1])
+                if wp.static(mode == int(WITHIN)):
+                    met, tested = settle_waiting(
+                        wp.static(mode), output, models, states, pose, 0, waiting, waiting_faces, waiting_faces
+                    )
+                    tests += long_counts(progress[2], wp.int64(tested), wp.int64(0), wp.int64(0))
+                else:
+                    screened = screen_waiting(
+                        models, states, pose, error, unit, output == OUTPUT_ANY, waiting, waiting_faces, left_open
+                    )
+                    met, left = wp.int32(screened[0]), wp.int32(screened[1])
+                    met, filtered, hard = settle_open(
+                        wp.static(mode), output, models, states, pose, met, left, left_open, waiting_faces
+                    )
+                    tests += long_counts(progress[2], screened[2], wp.int64(filtered), wp.int64(hard))
+                if met > 0:
+                    hit_count += wp.int64(met)
+                    keep_hits(output, p, pose.swapped, met, waiting_faces, hits_inout)
+                    if output == OUTPUT_ANY:
+                        top = 0
+            write_counts(p, hit_count, tests, hits_inout)
+            p = take_unit(work_inout.counter)
 
     return traverse_thread_kernel
 

@@ -7,14 +7,17 @@ from samples import random_poses, sample
 
 import warp_abtree as ab
 from warp_abtree.cores import core_count, launch_on_cores
+from warp_abtree.kernels.vector import take_slots
 
 PAIRS = np.array([(i, j) for i in range(12) for j in range(12) if i != j])
 
 
 @wp.kernel
-def count_item_kernel(first: wp.int32, step: wp.int32, seen_inout: wp.array(dtype=wp.int32)):
-    i = first + step * wp.tid()
-    seen_inout[i] = seen_inout[i] + 1
+def count_item_kernel(count: wp.int32, taken_inout: wp.array(dtype=wp.int32), seen_inout: wp.array(dtype=wp.int32)):
+    i = take_slots(taken_inout, 1)
+    while i < count:
+        seen_inout[i] = seen_inout[i] + 1
+        i = take_slots(taken_inout, 1)
 
 
 @pytest.fixture(scope="module")
@@ -29,9 +32,9 @@ def scene():
 @pytest.mark.parametrize("cores", [1, 2, 3, 7])
 def test_every_item_once(cores):
     for count in (1, 15, 16, 17, 1000):
-        seen = wp.zeros(count, dtype=wp.int32, device="cpu")
-        launch_on_cores(count_item_kernel, count, [seen], wp.get_device("cpu"), cores)
-        assert (seen.numpy() == 1).all()
+        seen, taken = (wp.zeros(length, dtype=wp.int32, device="cpu") for length in (count, 1))
+        launch_on_cores(count_item_kernel, count, [count, taken, seen], wp.get_device("cpu"), cores)
+        assert (seen.numpy() == 1).all() and taken.numpy()[0] == count + min(cores, count)
 
 
 @pytest.mark.parametrize("output", ["any", "count", "faces"])
@@ -66,9 +69,9 @@ def test_a_capture_records_all(scene):
 
 
 def test_a_failure_is_raised():
-    seen = wp.zeros(100, dtype=wp.int32, device="cpu")
+    seen, taken = (wp.zeros(length, dtype=wp.int32, device="cpu") for length in (100, 1))
     with pytest.raises(Exception, match="seen_inout"):
-        launch_on_cores(count_item_kernel, 100, [3.5], wp.get_device("cpu"), 2)
+        launch_on_cores(count_item_kernel, 100, [100, taken, 3.5], wp.get_device("cpu"), 2)
     assert not seen.numpy().any()
 
 

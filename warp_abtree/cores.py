@@ -21,27 +21,22 @@ def _workers(count: int):
 
 
 def launch_on_cores(kernel, count, inputs, device, cores, least=1):
-    """Launch a kernel over items 0 to count - 1 on several threads of the CPU; waits for them.
+    """Launch a kernel on several threads of the CPU, which share a number of items; waits for them.
 
-    The kernel takes (first, step) before its inputs: thread `tid` works on item first + step tid. It writes what
-    belongs to its item alone, or with true atomics: Warp's own are none on the CPU. While a graph is captured, one
-    thread launches, since only its launches would be recorded.
+    Each thread of the kernel takes one item after the other until there are none. It writes what belongs to its item
+    alone, or with true atomics: Warp's own are none on the CPU. While a graph is captured, one thread launches, since
+    only its launches would be recorded.
 
     Args:
         least: Items that make a further core worth its while.
     """
     cores = max(1, min(cores, count // least))
-    if cores == 1 or device.is_capturing:
-        wp.launch(kernel, dim=count, inputs=[0, 1, *inputs], device=device)
-        return
+    if cores > 1 and device.is_capturing:
+        cores = 1
     wp.load_module(kernel.module, device)  # modules load on one thread
-    dims = [(count - first + cores - 1) // cores for first in range(cores)]
-    deal = [
-        _workers(cores - 1).submit(wp.launch, kernel, dim=dims[first], inputs=[first, cores, *inputs], device=device)
-        for first in range(1, cores)
-    ]
+    deal = [_workers(cores - 1).submit(wp.launch, kernel, dim=1, inputs=inputs, device=device) for _ in range(1, cores)]
     try:
-        wp.launch(kernel, dim=dims[0], inputs=[0, cores, *inputs], device=device)
+        wp.launch(kernel, dim=1, inputs=inputs, device=device)
     finally:
         for job in deal:
             job.result()

@@ -224,7 +224,7 @@ class Query:
         self.near = None if within is None else self._make_near()
         self.work = share.Work()
         boxes = share.MAILBOX_COUNT if self.uses_warps() else 0
-        self.work.counter = wp.zeros(share.COUNTER_COUNT if boxes else 0, dtype=wp.int32, device=self.device)
+        self.work.counter = wp.zeros(share.COUNTER_COUNT, dtype=wp.int32, device=self.device)
         self.work.flag = wp.zeros(boxes, dtype=wp.int32, device=self.device)
         self.work.owner = wp.empty(boxes, dtype=wp.vec2i, device=self.device)
         self.work.item = wp.empty(boxes * share.MAILBOX_ITEMS, dtype=wp.int64, device=self.device)
@@ -350,7 +350,7 @@ class Query:
             cores = core_count() if self.cores is None else self.cores
             # A launch on a further core costs some 50 us: the work of many pairs apart, of less than one in contact.
             least = 32 if output == int(faces.OUTPUT_ANY) else 1
-            launch_on_cores(traverse.thread_traversal(mode), room, inputs, self.device, cores, least)
+            launch_on_cores(traverse.thread_traversal(mode), room, [*inputs, self.work], self.device, cores, least)
             return
         # More than there are parts: those that find none wait for shares.
         warps = max(room, int(4 * self.parts_max * math.sqrt(room)) + 1)
