@@ -324,8 +324,8 @@ def make_parser() -> argparse.ArgumentParser:
     command("bench", None, bench_command.SUMMARY, *bench_command.EXAMPLES)
     view.add_arguments(command("view", view.view, view.SUMMARY, *view.EXAMPLES), positive, milliseconds)
     picture.add_arguments(command("picture", picture.picture, picture.SUMMARY, *picture.EXAMPLES), positive)
-    about = sweep_command.SUMMARY, *sweep_command.EXAMPLES
-    sweep_command.add_arguments(command("sweep", sweep_command.sweep, *about), positive)
+    words = sweep_command.SUMMARY, *sweep_command.EXAMPLES
+    sweep_command.add_arguments(command("sweep", sweep_command.sweep, *words), positive)
     command("doctor", doctor.doctor, doctor.SUMMARY, *doctor.EXAMPLES)
     return parser
 

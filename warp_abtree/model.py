@@ -178,7 +178,7 @@ def _digest(arrays):
     for name in _MEMBERS:
         value = np.ascontiguousarray(arrays[name])
         found.update(f"{name} {value.dtype.str} {value.shape}".encode())
-        found.update(value.view(np.uint8) if value.size else b"")
+        found.update(value.tobytes())
     return np.frombuffer(found.digest(), np.uint8)
 
 
