@@ -338,14 +338,6 @@ def find_candidate_kernel(
 
 
 @wp.func
-def candidate_distance(curves: Curves, i: wp.int32, k: wp.int32, size: wp.float64, point: wp.vec3d, normal: wp.vec3d):
-    """Return the squared distance of a candidate from a point, differences of normals counted in sizes."""
-    r = curves.point[i, k] - point
-    m = size * (curves.normal[i] - normal)
-    return wp.dot(r, r) + wp.dot(m, m)
-
-
-@wp.func
 def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
     """Return the deepest candidate of a pair, contact and number, and its depth, -1 where there is none."""
     deepest = wp.float64(-1.0)

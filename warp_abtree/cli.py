@@ -50,18 +50,11 @@ PLOT_NAME = "frames.png"
 # Commands.
 
 
-def _is_model(source) -> bool:
-    return source.lower().endswith(".npz")
-
-
-def _load_model(source, progress) -> Model:
-    return Model.open(source) if _is_model(source) else Model.load(source, progress=progress)
-
-
 def info(options, progress):
     """Say what a mesh file or a built model holds."""
     Scene(device=options.device)
-    found = _describe_model(options.mesh) if _is_model(options.mesh) else describe_mesh(load_mesh(options.mesh))
+    built = sweep_command.is_model(options.mesh)
+    found = _describe_model(options.mesh) if built else describe_mesh(load_mesh(options.mesh))
     (report.print_json if options.json else report.print_info)(found)
 
 
@@ -114,8 +107,8 @@ def query(options, progress):
         if options.record.suffix.lower() == ".csv" and options.output in ("any", "count"):
             raise ValueError(f"{options.record}: a row is a face pair; ask --output faces or contacts, or write .npz")
     scene = Scene(device=options.device)
-    models = [_load_model(options.a, progress)]
-    models.append(models[0] if options.b == options.a else _load_model(options.b, progress))
+    models = [sweep_command.load_model(options.a, progress)]
+    models.append(models[0] if options.b == options.a else sweep_command.load_model(options.b, progress))
     progress.close()
     lods = []
     for option, model, wish in (("--lod-a", models[0], options.lod_a), ("--lod-b", models[1], options.lod_b)):

@@ -197,6 +197,7 @@ class PredictiveController(Controller):
 
     @property
     def predicted_ms(self) -> float:
+        """Return what the frame to come is predicted to cost [ms], NaN before the second. Waits for the device."""
         choice = self._selection.choice.numpy()
         return float(choice[1] + choice[2])
 

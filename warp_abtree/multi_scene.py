@@ -156,6 +156,8 @@ class MultiScene:
 
     def set_poses(self, poses):
         """Set the pose of every object; arguments and errors as `Scene.set_poses`."""
+        if not self.object_count:
+            raise ValueError("the scene has no object")
         poses = to_numpy(poses, "poses")
         if poses.shape not in ((self.object_count, 7), (self.object_count, 4, 4)):
             raise ValueError(f"poses: {len(check_poses(poses))} given for {self.object_count} objects")
@@ -272,12 +274,19 @@ class MultiScene:
         if self._carriers:
             return
         cpus = self.devices.count("cpu")
-        for device in self.devices:
-            if self._processes or (self._processes is None and device == "cpu"):
-                share = max(1, core_count() // (cpus if device == "cpu" else len(self.devices)))
-                self._carriers.append(ProcessPart(device, self._cores or share))
-            else:
-                self._carriers.append(ThreadPart(device))
+        carriers: list = []
+        try:
+            for device in self.devices:
+                if self._processes or (self._processes is None and device == "cpu"):
+                    share = max(1, core_count() // (cpus if device == "cpu" else len(self.devices)))
+                    carriers.append(ProcessPart(device, self._cores or share))
+                else:
+                    carriers.append(ThreadPart(device))
+        except BaseException:  # an interrupt
+            for carrier in carriers:
+                carrier.stop()
+            raise
+        self._carriers = carriers
         self._known = [set() for _ in self.devices]
 
     def _build(self):

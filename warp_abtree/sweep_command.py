@@ -90,8 +90,8 @@ def _make_job(options, progress):
         if getattr(options, name) is not None:
             raise ValueError(f"--{name}: goes with a scene whose worlds are run")
     if len(source) == 2:
-        models = [_load_model(source[0], progress)]
-        models.append(models[0] if source[1] == source[0] else _load_model(source[1], progress))
+        models = [load_model(source[0], progress)]
+        models.append(models[0] if source[1] == source[0] else load_model(source[1], progress))
         lods = [model.lod_max for model in models]
     elif len(source) == 1:
         scene = load_scene(source[0], device="cpu", progress=progress).scene
@@ -128,5 +128,11 @@ def _make_worlds(options, source, progress):
     return WorldsJob(scene, options.frames, options.output or "count", options.shard or SHARDS["worlds"])
 
 
-def _load_model(source, progress) -> Model:
-    return Model.open(source) if source.lower().endswith(".npz") else Model.load(source, progress=progress)
+def is_model(source) -> bool:
+    """Return whether a path is one of a built model."""
+    return source.lower().endswith(".npz")
+
+
+def load_model(source, progress) -> Model:
+    """Open a built model, or build one of a mesh."""
+    return Model.open(source) if is_model(source) else Model.load(source, progress=progress)
