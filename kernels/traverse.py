@@ -1,7 +1,8 @@
 """ACTIVE-INTERSECT: dual-tree traversal of many object pairs, every intersecting face pair reported.
 
-Two regimes, one answer: a thread a pair, depth first (CPU), and warps that share the pairs among them, each with a
-stack of its own in shared memory (CUDA). Both visit the same pairs of nodes and differ in their order only.
+Two regimes, one answer: threads that take one pair after the other, depth first (CPU), and warps that share the pairs
+among them, each with a stack of its own in shared memory (CUDA). Both visit the same pairs of nodes and differ in their
+order only.
 Source: Liu et al. 2006, section 3.2.2, ACTIVE-INTERSECT.
 """
 

@@ -382,7 +382,7 @@ def screen_waiting(
     faces: wp.array(dtype=wp.int64),
     left_open: wp.array(dtype=wp.int64),
 ) -> three_numbers:
-    """Test pairs of faces as `screen_faces`, 16 at a time, perhaps until the first that meet.
+    """Test pairs of faces as `screen_triangles`, 16 at a time, perhaps until the first that meet.
 
     Lists have room for 16 more.
 

@@ -364,6 +364,7 @@ def test_modules_with_signs_do_not_contract():
         "refit",
         "screen",
         "faces",
+        "candidates",
         "visit",
         "nodes",
         "double_word",

@@ -5,6 +5,7 @@ import dataclasses
 import io
 import json
 import pickle
+import threading
 
 import numpy as np
 import pytest
@@ -110,6 +111,28 @@ def test_several_devices_of_one_process_write_the_same(device, tmp_path, output)
     assert contents(tmp_path / "four") == contents(tmp_path / "one")
     with pytest.raises(ValueError, match="an empty list"):
         ab.ThisProcess([])
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_every_shard_is_asked_in_a_turn(tmp_path, monkeypatch, count):
+    """Where one device alone is asked, too: another thread may use the same GPU."""
+    entered, asked = threading.local(), []
+
+    @contextlib.contextmanager
+    def turn(device):
+        entered.device = device
+        yield
+        entered.device = None
+
+    def ask(asker, item, device=None, plain=shards.SweepAsker.ask):
+        asked.append(device is not None and getattr(entered, "device", None) == device)
+        return plain(asker, item, device)
+
+    monkeypatch.setattr(shards, "device_turn", turn)
+    monkeypatch.setattr(shards.SweepAsker, "ask", ask)
+    job = ab.SweepJob(*pair(), poses_of(), lods_of(100), output="count", shard=20)
+    ab.run_shards(job, tmp_path / "out", pool=ab.ThisProcess(["cpu"] * count))
+    assert asked == [True] * 5
 
 
 def test_no_poses(tmp_path):

@@ -31,6 +31,8 @@ SETTLE_WARPS = 4096
 ROWS_TO_PACK = 1000
 # Warps of the traversal that one multiprocessor runs at a time, by its registers.
 WARPS_A_PROCESSOR = 16
+# So that each finds a mailbox for all that it gives away at once.
+WARPS_MAX = share.MAILBOX_COUNT // int(share.SHARES_AT_ONCE)
 
 EXACT, FILTER, FLOAT64 = int(predicates.EXACT), int(predicates.FILTER), int(predicates.FLOAT64)
 
@@ -306,7 +308,7 @@ class Query:
         self.hits.unsure = unsure
 
     def uses_warps(self) -> bool:
-        """Return whether warps work on the pairs; on the CPU one thread has a pair to itself."""
+        """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
         return self.device.is_cuda
 
     def resize(self, capacity: int):
@@ -354,11 +356,11 @@ class Query:
             return
         # More than there are parts: those that find none wait for shares.
         warps = max(room, int(4 * self.parts_max * math.sqrt(room)) + 1)
-        warps = min(warps, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
+        warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         wp.launch(
             traverse.warp_traversal(EXACT if mode == FLOAT64 else mode),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
-            inputs=[self.parts_max, self.stack_room, *inputs, self.work],
+            inputs=[self.parts_max, min(self.stack_room, STACK_LENGTH), *inputs, self.work],
             block_dim=WARP_SIZE,
             device=self.device,
         )

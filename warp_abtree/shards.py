@@ -382,24 +382,25 @@ class ThisProcess:
         """Yield (start, stop, columns) of each range, once, in any order."""
         askers = [job.asker() for _ in self.devices]
         waiting = deque(ranges)
-        # Kernels load on one thread at a time.
-        for asker, device in zip(askers, self.devices):
-            if waiting:
-                part = waiting.popleft()
-                yield *part, asker.ask(job.item(*part), device)
-        if self.workers == 1:
-            while waiting:
-                part = waiting.popleft()
-                yield *part, askers[0].ask(job.item(*part), self.devices[0])
-            return
-        threads = [ThreadPoolExecutor(1, thread_name_prefix="warp_abtree shard") for _ in askers]
-        under_way: dict = {}
-        before = wp.get_device()
 
         def ask(k, part):
             item = job.item(*part)  # each thread reads what it asks
             with device_turn(self.devices[k]):
                 return askers[k].ask(item, self.devices[k])
+
+        # Kernels load on one thread at a time.
+        for k in range(self.workers):
+            if waiting:
+                part = waiting.popleft()
+                yield *part, ask(k, part)
+        if self.workers == 1:
+            while waiting:
+                part = waiting.popleft()
+                yield *part, ask(0, part)
+            return
+        threads = [ThreadPoolExecutor(1, thread_name_prefix="warp_abtree shard") for _ in askers]
+        under_way: dict = {}
+        before = wp.get_device()
 
         def feed(k):
             if waiting:
