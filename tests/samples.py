@@ -142,3 +142,25 @@ def raw_state(scene, i):
         **dict(zip(("lower", "upper", "skip"), states.read_nodes(slot, model.tree.node_count))),
         "corner": np.where(corners < 0, -1, corners - models.vertex_start[slot.model]),
     }
+
+
+# A ball, and a ring that moves through it to and fro; tests add what they ask about.
+SHUTTLE_SCENE = """
+[scene]
+frames = 4
+time_step = 0.25
+[models.ball]
+shape = "icosphere"
+subdivisions = 2
+[models.ring]
+shape = "torus"
+major_radius = 1.0
+minor_radius = 0.3
+[[objects]]
+model = "ball"
+name = "ball"
+[[objects]]
+model = "ring"
+position = [0.6, 0, 0]
+shuttle = { by = [0.4, 0, 0], period = 2 }
+"""

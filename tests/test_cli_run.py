@@ -10,34 +10,21 @@ import matplotlib.image
 import numpy as np
 import pytest
 import trimesh
+from samples import SHUTTLE_SCENE
 
 import warp_abtree as ab
 from warp_abtree import cli, plot, report
 
-SCENE = """
-[scene]
-frames = 4
-time_step = 0.25
-[models.ball]
-shape = "icosphere"
-subdivisions = 2
-[models.ring]
-shape = "torus"
-major_radius = 1.0
-minor_radius = 0.3
-[[objects]]
-model = "ball"
-name = "ball"
-[[objects]]
-model = "ring"
-position = [0.6, 0, 0]
-shuttle = { by = [0.4, 0, 0], period = 2 }
+SCENE = (
+    SHUTTLE_SCENE
+    + """
 [[lod_sweep]]
 objects = ["ball"]
 from = 1.0
 to = 0.1
 period = 2
 """
+)
 
 
 @pytest.fixture

@@ -33,7 +33,8 @@ def launch_on_cores(kernel, count, inputs, device, cores, least=1):
     cores = max(1, min(cores, count // least))
     if cores > 1 and device.is_capturing:
         cores = 1
-    wp.load_module(kernel.module, device)  # modules load on one thread
+    if cores > 1:
+        wp.load_module(kernel.module, device)  # modules load on one thread
     deal = [_workers(cores - 1).submit(wp.launch, kernel, dim=1, inputs=inputs, device=device) for _ in range(1, cores)]
     try:
         wp.launch(kernel, dim=1, inputs=inputs, device=device)

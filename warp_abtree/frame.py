@@ -8,7 +8,6 @@ Source: Liu et al. 2006, Algorithm 4.
 import csv
 import json
 import math
-import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -20,6 +19,7 @@ import warp as wp
 from warp_abtree.clock import COST_STAGES, STAGES, Timer
 from warp_abtree.control import Feedback
 from warp_abtree.dynamics import triangle_wave
+from warp_abtree.files import whole_file
 from warp_abtree.intersect import Result, check_request
 from warp_abtree.lod import positive
 from warp_abtree.model import Model
@@ -410,24 +410,14 @@ class Frame:
         Raises:
             OSError: The file cannot be written.
         """
-        path = Path(path)
-        partial = path.with_name(path.name + ".partial")
         rows = [row.as_dict() for row in self.history]
-        try:
-            with open(partial, "w", newline="", encoding="utf-8") as file:
-                if path.suffix.lower() == ".json":
-                    json.dump(rows, file, indent=1)
-                else:
-                    writer = csv.DictWriter(file, FrameRow.names())
-                    writer.writeheader()
-                    writer.writerows(rows)
-            os.replace(partial, path)
-        except OSError as error:
-            if error.errno is None:
-                raise
-            raise OSError(error.errno, error.strerror, str(path)) from None
-        finally:
-            partial.unlink(missing_ok=True)
+        with whole_file(path, "w", newline="", encoding="utf-8") as file:
+            if Path(path).suffix.lower() == ".json":
+                json.dump(rows, file, indent=1)
+            else:
+                writer = csv.DictWriter(file, FrameRow.names())
+                writer.writeheader()
+                writer.writerows(rows)
 
     def _select(self, time):
         """Return the LODs that are wanted at a time, on the host. (synchronization point)"""

@@ -1,13 +1,13 @@
 """Model: a mesh with its progressive mesh and its AB-Tree, saved and opened as .npz."""
 
 import hashlib
-import os
 import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from warp_abtree.checks import whole_number
+from warp_abtree.files import whole_file
 from warp_abtree.mesh import COORDINATE_MAX, COORDINATE_MIN, EXTENT_LIMITS, Mesh, load_mesh, mesh_from_arrays
 from warp_abtree.progressive import ProgressiveMesh, build_progressive
 from warp_abtree.tree import Tree, active_build
@@ -128,21 +128,11 @@ class Model:
         Raises:
             OSError: The file cannot be written.
         """
-        path = Path(path)
-        partial = path.with_name(path.name + ".partial")
         arrays = {name: getattr(self.progressive, name) for name in _ARRAYS}
         arrays |= {"leaf_node": self.tree.leaf_node, "name": np.array(self.name)}
         about = {"format": np.array(FORMAT_NAME), "version": np.array(FORMAT_VERSION), "digest": _digest(arrays)}
-        try:
-            with open(partial, "wb") as file:
-                np.savez_compressed(file, **about, **arrays)
-            os.replace(partial, path)
-        except OSError as error:
-            if error.errno is None:
-                raise
-            raise OSError(error.errno, error.strerror, str(path)) from None
-        finally:
-            partial.unlink(missing_ok=True)
+        with whole_file(path) as file:
+            np.savez_compressed(file, **about, **arrays)
 
     @classmethod
     def open(cls, path) -> "Model":
