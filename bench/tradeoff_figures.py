@@ -194,6 +194,7 @@ def draw_rivals(rows, figure):
     found = group(pick(rows, case="point"), "subject")
     if not found:
         return False
+    mixed = len(group(pick(rows, case="point"), "where")) > 1  # a GPU and a core in one picture: the legend says which
     columns = min(3, len(found))
     axes = figure.subplots(-(-len(found) // columns), columns, sharey=True, squeeze=False)
     handles = {}
@@ -204,7 +205,8 @@ def draw_rivals(rows, figure):
                 line = "-" if method in (OURS, OURS_WITHIN, SIMPLIFIED) else ":"
                 x = [row["us"] for row in points]
                 style = {"color": COLOURS[colour], "marker": marker, "linestyle": line, "linewidth": 1, "markersize": 5}
-                (handles[method],) = axis.plot(x, per_cent(points, "contact_mean"), **style)
+                label = f"{method} ({points[0]['where']})" if mixed else method
+                (handles[label],) = axis.plot(x, per_cent(points, "contact_mean"), **style)
         cost_axis(axis, "time of a query [µs]")
         axis.set_title(subject, fontsize=10)
         what = "first contact off, mean [% of the size]"

@@ -447,7 +447,7 @@ RIVAL_TABLES = (
             *ANSWERS,
             *CONTACT,
             Column("us", "time of a query [us]", ".3g"),
-            Column("cost", "of our finest's", ".2f"),
+            Column("cost", "of our finest's", ",.2f"),
             Column("build_s", "made in [s]", ".2g"),
             Column("fronts", "fronts it is on", "d"),
         ),
