@@ -158,7 +158,7 @@ def settle_open(
     met, hard = settle_waiting(
         mode, output, models, states, pose, wp.int32(counts[0]), wp.int32(counts[1]), left_open, met_inout
     )
-    return met, wp.int32(counts[2]), wp.int32(counts[3]) + hard
+    return met, wp.int32(counts[2]), hard
 
 
 @wp.func
