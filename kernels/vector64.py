@@ -62,12 +62,7 @@ three_numbers = wp.types.vector(length=3, dtype=wp.int64)
     // Points, each where so many numbers end.
     auto gather = [&](const int* start) {{
         auto at = [&](int k) {{
-            const double* p = position + (unsigned int)start[k];
-#if defined(__AVX512VL__)
-            return (four)__builtin_ia32_loadupd256_mask((const four*)p, four{{}}, 7);
-#else
-            return four{{p[0], p[1], p[2], 0.0}};
-#endif
+            return *(const four*)(position + (unsigned int)start[k]);
         }};
         lanes row[4];
         for (int k = 0; k < 4; ++k) {{
@@ -227,9 +222,9 @@ three_numbers = wp.types.vector(length=3, dtype=wp.int64)
                 const ints x = __builtin_shufflevector(low_01, low_23, 0, 1, 8, 9, 4, 5, 12, 13);
                 const ints y = __builtin_shufflevector(low_01, low_23, 2, 3, 10, 11, 6, 7, 14, 15);
                 const ints z = __builtin_shufflevector(high_01, high_23, 0, 1, 8, 9, 4, 5, 12, 13);
-                *(loose_ints*)(start[3 * k] + i) = x + x + x;
-                *(loose_ints*)(start[3 * k + 1] + i) = y + y + y;
-                *(loose_ints*)(start[3 * k + 2] + i) = z + z + z;
+                *(loose_ints*)(start[3 * k] + i) = 4 * x;
+                *(loose_ints*)(start[3 * k + 1] + i) = 4 * y;
+                *(loose_ints*)(start[3 * k + 2] + i) = 4 * z;
             }}
         }}
     }};

@@ -253,7 +253,7 @@ def test_filters_the_same_as_one_by_one(kind):
     count, face_count, ask_count, before = 40, 150, 2053, 3  # no multiple of 8
     points, rotation, shift = exact_points(kind, rng, count)
     models, states = ModelPool(), StatePool()
-    models.vertex_pos = wp.array(points, dtype=wp.vec3d, device=CPU)
+    models.vertex_pos = wp.array(np.pad(points, ((0, 0), (0, 1))), dtype=wp.vec4d, device=CPU)
     corners = np.array([rng.choice(count, 3, replace=kind == "degenerate") for _ in range(2 * face_count)])
     if "coincident" in kind:
         corners[face_count:] = corners[:face_count]
