@@ -351,9 +351,8 @@ class WarpQuery(ab.Query):
 def test_warps_give_the_same_answers(device, room, parts):
     """One warp a pair and several, with room on the stack or none, so that they go one item at a time."""
     scene, _ = posed_cases(np.random.default_rng(8), ("torus", "soup"), 12, BRUTE_FACES, device)
-    poses = random_poses(np.random.default_rng(8), 1, 1.0)
-    for _ in range(2):  # the same mesh twice in one place: many faces wait for exact signs
-        scene.add(sample("torus"), poses[0], lod=sample("torus").lod_for(fraction=0.2))
+    for _ in range(2):  # the same mesh twice in one place: coplanar twins wait for exact signs
+        scene.add(sample("torus"), STILL, lod=sample("torus").lod_for(fraction=0.2))
     pairs = np.arange(24).reshape(-1, 2)
     pairs = np.concatenate([pairs, pairs[::-1, ::-1], [(0, 3), (2, 9), (24, 25), (25, 24)]])
     for output in ("faces", "count", "any"):
@@ -368,7 +367,7 @@ def test_warps_give_the_same_answers(device, room, parts):
         if output == "faces":
             np.testing.assert_array_equal(result.faces, plain.faces)
             assert len(result.faces) > 100
-            assert result.exact_tests[-1] > 2, "the list of unsure faces has grown"
+            assert result.float64_tests[-1] > result.exact_tests[-1] > 2, "the list of unsure faces has grown"
 
 
 @pytest.mark.parametrize("name", ["cow", "fandisk", "fcl-env", "woody", "torus", "soup"])

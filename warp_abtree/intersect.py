@@ -372,9 +372,8 @@ class Query:
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
         self._launch_traversal(self._no_distance, self.hits, mode, output)
         if len(self.hits.unsure):
-            kernels = [settle.settle_traversal(FILTER if mode == EXACT else mode)]
-            if mode == EXACT:
-                kernels.append(settle.settle_hard_kernel)
+            exact = [settle.filter_faces_kernel, settle.settle_hard_kernel]
+            kernels = exact if mode == EXACT else [settle.settle_traversal(mode)]
             threads = SETTLE_WARPS * WARP_SIZE if self.device.is_cuda else 1
             models, states = (arrays.pool for arrays in self.arrays[:2])
             inputs = [threads, output, models, states, self.pair_poses, self.hits]
