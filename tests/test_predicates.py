@@ -1,5 +1,6 @@
 """Expansions and signs of all three stages against fractions, and that no compiler contracts them."""
 
+import functools
 import importlib
 import re
 from fractions import Fraction
@@ -370,7 +371,8 @@ def test_modules_with_signs_do_not_contract():
         "double_word",
     )
     modules = [wp.get_module(importlib.import_module(f"warp_abtree.kernels.{name}").__name__) for name in names]
-    makers = (traverse.thread_traversal, traverse.warp_traversal, settle.settle_traversal)
+    makers = [traverse.thread_traversal, settle.settle_traversal]
+    makers += [functools.partial(traverse.warp_traversal, for_any=for_any) for for_any in (False, True)]
     modules += [make(int(mode)).module for mode in (EXACT, FLOAT64, FLOAT32, faces.WITHIN) for make in makers]
     assert [m.name for m in modules if m.options["fuse_fp"] or m.options["fast_math"]] == []
 
@@ -401,12 +403,11 @@ def test_ptx_is_not_contracted(tmp_path, fuse_fp):
 
 def test_ptx_of_the_traversal_is_not_contracted(tmp_path):
     """The kernels that pose vertices, bound signs and test boxes; without exact signs they have no float64 fma."""
-    (tmp_path / "screen").mkdir()
-    (tmp_path / "settle").mkdir()
-    text = ptx_of(traverse.warp_traversal(int(EXACT)).module, tmp_path / "screen")
-    assert len(re.findall(r"\bmul\.rn\.f32", text)) > 50
-    # In float32 the kernel itself asks for fused operations, the same on every device.
-    assert {x for x in find_contraction(text) if x != "fma.rn.f32"} == set()
+    for for_any in (False, True):
+        text = ptx_of(traverse.warp_traversal(int(EXACT), for_any).module, tmp_path / f"screen_{for_any}")
+        assert len(re.findall(r"\bmul\.rn\.f32", text)) > 50
+        # In float32 the kernel itself asks for fused operations, the same on every device.
+        assert {x for x in find_contraction(text) if x != "fma.rn.f32"} == set()
     text = ptx_of(settle.settle_traversal(int(FLOAT64)).module, tmp_path / "settle")
     assert len(re.findall(r"\bmul\.rn\.f64", text)) > 50
     assert find_contraction(text) == []

@@ -358,7 +358,7 @@ class Query:
         warps = max(room, int(4 * self.parts_max * math.sqrt(room)) + 1)
         warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         wp.launch(
-            traverse.warp_traversal(EXACT if mode == FLOAT64 else mode),
+            traverse.warp_traversal(EXACT if mode == FLOAT64 else mode, output == int(faces.OUTPUT_ANY)),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
             inputs=[self.parts_max, min(self.stack_room, STACK_LENGTH), *inputs, self.work],
             block_dim=WARP_SIZE,
