@@ -94,7 +94,7 @@ def part_faces(
     face_b: wp.int32,
 ):
     """Return PARTED where float32 says that the plane of one of two active faces parts them, else what it says."""
-    if mode == WITHIN:
+    if mode == WITHIN or (mode != FLOAT32 and pose.error == wp.inf):
         return 0
     a = load_corner_ids(states, pose.corner_a + face_a)
     b = load_corner_ids(states, pose.corner_b + face_b)
