@@ -62,6 +62,16 @@ def settle_item(
 
 
 @wp.func
+def items_at_once(count: wp.int32, threads: wp.int32):
+    """Return how many face pairs of a list a warp takes at a time: as many as it has threads, or fewer of a short list.
+
+    Threads that go different ways wait for one another, those of different warps do not.
+    """
+    warps = threads / warp_size()
+    return wp.clamp((count + warps - 1) / warps, 1, warp_size())
+
+
+@wp.func
 def defer_hard(hits: Hits, hard: bool, item: wp.vec3i):
     """Put a face pair on the list that `settle_hard_kernel` works off. For all threads of a warp."""
     count_flags(hits.exact_tests, item[0], hard)
@@ -84,15 +94,17 @@ def settle_traversal(mode: int):
         hits_inout: Hits,
     ):
         """Decide the face pairs on the list of those left open: every so many-th a thread."""
+        lane = warp_lane()
         end = wp.min(hits_inout.unsure_total[0], hits_inout.unsure.shape[0])
-        first = wp.tid() - warp_lane()
+        at_once = items_at_once(end, threads)
+        first = at_once * (wp.tid() / warp_size())
         while first < end:
-            waits = first + warp_lane() < end
+            waits = lane < wp.min(at_once, end - first)
             item = wp.vec3i()
             if waits:
-                item = hits_inout.unsure[first + warp_lane()]
+                item = hits_inout.unsure[first + lane]
             settle_item(wp.static(mode), output, models, states, pair_poses, waits, item, hits_inout)
-            first += threads
+            first += at_once * (threads / warp_size())
 
     return settle_faces_kernel
 
@@ -151,7 +163,7 @@ def settle_crossing(
     defer_hard(hits, meet == UNSURE, item)
 
 
-@wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=96)
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=128)
 def filter_faces_kernel(
     threads: wp.int32,
     output: wp.int32,
@@ -167,18 +179,20 @@ def filter_faces_kernel(
     lane = warp_lane()
     kept = warp_kept()
     end = wp.min(hits_inout.unsure_total[0], hits_inout.unsure.shape[0])
-    first = wp.tid() - lane
+    at_once = items_at_once(end, threads)
+    first = at_once * (wp.tid() / warp_size())
     crossing = wp.int32(0)
     while first < end or crossing > 0:
         if first < end:
-            item = hits_inout.unsure[wp.min(first + lane, end - 1)]
+            item = hits_inout.unsure[first + wp.min(lane, end - 1 - first)]
             signs = wp.int32(PARTED)
-            if first + lane < end and not (output == OUTPUT_ANY and hits_inout.any_hit[item[0]] != 0):
+            waits = lane < wp.min(at_once, end - first)
+            if waits and not (output == OUTPUT_ANY and hits_inout.any_hit[item[0]] != 0):
                 signs = part_item(models, states, pair_poses[item[0]], item)
             crossing = keep_item(kept, crossing, signs >= 0, item, signs)
             defer_hard(hits_inout, signs == UNDECIDED, item)
             warp_sync()
-            first += threads
+            first += at_once * (threads / warp_size())
         if crossing >= warp_size() or (first >= end and crossing > 0):
             popped = wp.min(crossing, warp_size())
             crossing -= popped
@@ -195,11 +209,14 @@ def settle_hard_kernel(
     hits_inout: Hits,
 ):
     """Decide the face pairs that float64 left open by exact signs: every so many-th a thread."""
-    first = wp.tid() - warp_lane()
-    while first < hits_inout.hard_total[0]:
-        waits = first + warp_lane() < hits_inout.hard_total[0]
+    lane = warp_lane()
+    end = hits_inout.hard_total[0]
+    at_once = items_at_once(end, threads)
+    first = at_once * (wp.tid() / warp_size())
+    while first < end:
+        waits = lane < wp.min(at_once, end - first)
         item = wp.vec3i()
         if waits:
-            item = hits_inout.hard[first + warp_lane()]
+            item = hits_inout.hard[first + lane]
         settle_item(EXACT, output, models, states, pair_poses, waits, item, hits_inout)
-        first += threads
+        first += at_once * (threads / warp_size())
