@@ -4,12 +4,12 @@ import warp as wp
 
 from warp_abtree.kernels.boxes import map_point
 from warp_abtree.kernels.distance import triangles_near
+from warp_abtree.kernels.filter import decide_triangles
 from warp_abtree.kernels.nodes import load_constant
 from warp_abtree.kernels.pools import ModelPool, StatePool, load_vertex
 from warp_abtree.kernels.pose import PairPose, pose_point
 from warp_abtree.kernels.predicates import FLOAT32, UNSURE
 from warp_abtree.kernels.screen import SCREEN_UNIT, are_open, cross_triangles, part_triangles, turn_corners
-from warp_abtree.kernels.triangle import intersect_triangles
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -163,8 +163,8 @@ def test_faces(
     if mode == FLOAT32:
         # A power of two brings the model to unit size, so that no product leaves float32's range.
         s = pose.scale
-        return intersect_triangles(mode, a0 * s, a1 * s, a2 * s, b0 * s, b1 * s, b2 * s)
-    return intersect_triangles(mode, a0, a1, a2, b0, b1, b2)
+        return decide_triangles(mode, a0 * s, a1 * s, a2 * s, b0 * s, b1 * s, b2 * s)
+    return decide_triangles(mode, a0, a1, a2, b0, b1, b2)
 
 
 @wp.func

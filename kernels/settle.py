@@ -9,7 +9,7 @@ import functools
 import warp as wp
 
 from warp_abtree.kernels.faces import OUTPUT_ANY, OUTPUT_FACES, Hits, load_corner_ids, report_hit, test_faces
-from warp_abtree.kernels.filter import UNDECIDED, filter_crossing, filter_planes
+from warp_abtree.kernels.filter import JOINED, UNDECIDED, filter_crossing, filter_planes
 from warp_abtree.kernels.pools import ModelPool, StatePool, load_vertex
 from warp_abtree.kernels.pose import PairPose, pose_point
 from warp_abtree.kernels.predicates import EXACT, UNSURE
@@ -156,7 +156,9 @@ def settle_crossing(
     waiting = read_kept(kept, first + wp.min(lane, popped - 1))
     item = wp.vec3i(waiting[0], waiting[1], waiting[2])
     p = item[0]
-    meet = cross_item(models, states, pair_poses[p], item, waiting[3])
+    meet = wp.int32(1)
+    if waiting[3] != JOINED:
+        meet = cross_item(models, states, pair_poses[p], item, waiting[3])
     meet = wp.where(lane < popped, meet, 0)
     warp_sync()
     report_item(output, pair_poses, item, meet == 1, hits)

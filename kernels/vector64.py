@@ -1,6 +1,6 @@
 """The float64 stage on the CPU in vector instructions: what float32 leaves open, 8 pairs of faces at a time.
 
-`filter_waiting` finds the signs of `intersect_triangles` for FILTER by the same operations in the same order, so that
+`filter_waiting` finds the signs of `filter_triangles` by the same operations in the same order, so that
 every device counts the same.
 """
 
@@ -272,9 +272,17 @@ three_numbers = wp.types.vector(length=3, dtype=wp.int64)
             for (int i = 0; i < 3; ++i)
                 unsure |= side_a[i].open | side_b[i].open;
             unsure &= left;
+            left &= ~unsure;
+            unsigned int joined = 0;
+            for (int i = 0; i < 3; ++i)
+                for (int j = 0; j < 3; ++j)
+                    joined |= to_mask((d_size[i][j].x + d_size[i][j].y) + d_size[i][j].z == 0.0);
+            joined &= unsure;
+            unsure &= ~joined;
+            append(hits + met, item, joined);
+            met += __builtin_popcount(joined);
             append(rest + open, item, unsure);
             open += __builtin_popcount(unsure);
-            left &= ~unsure;
             alone_a = find_alone(side_a);
             alone_b = find_alone(side_b);
         }}

@@ -236,7 +236,7 @@ CASES = {
     "random": "met apart",
     "lattice": "met apart left",
     "coplanar": "left",
-    "coincident": "met apart left",
+    "coincident": "met apart",
     "nearly coincident": "met apart",
     "coincident, turned": "met apart",
     "nearly coplanar": "apart left",
