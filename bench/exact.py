@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
+from warp_abtree.kernels.filter import decide_triangles
 from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE
 from warp_abtree.kernels.screen import SCREEN_UNIT, screen_triangles
-from warp_abtree.kernels.triangle import intersect_triangles
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 ORACLE = Path(__file__).resolve().parents[1] / "tests" / "oracle_triangle.py"
@@ -216,7 +216,7 @@ def pair_test(mode):
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def test_pair_kernel(corners: wp.array2d(dtype=wp.vec3d), meet_out: wp.array(dtype=wp.int32)):
         i = wp.tid()
-        meet_out[i] = intersect_triangles(
+        meet_out[i] = decide_triangles(
             wp.static(mode), corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
         )
 

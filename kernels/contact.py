@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool, load_vertex
 from warp_abtree.kernels.pose import PairPose, pose_point
 from warp_abtree.kernels.segment import face_normal, intersect_faces, unit_vector
 
@@ -50,8 +50,8 @@ def load_corners(
     a = states.face_corner[pose.corner_a + face_a]
     b = states.face_corner[pose.corner_b + face_b]
     for k in range(3):
-        corner[k] = models.vertex_pos[a[k]]
-        corner[3 + k] = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[k]])
+        corner[k] = load_vertex(models.vertex_pos, a[k])
+        corner[3 + k] = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[k]))
 
 
 @wp.kernel

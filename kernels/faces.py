@@ -4,12 +4,12 @@ import warp as wp
 
 from warp_abtree.kernels.boxes import map_point
 from warp_abtree.kernels.distance import triangles_near
+from warp_abtree.kernels.filter import decide_triangles
 from warp_abtree.kernels.nodes import load_constant
-from warp_abtree.kernels.pools import ModelPool, StatePool
+from warp_abtree.kernels.pools import ModelPool, StatePool, load_vertex
 from warp_abtree.kernels.pose import PairPose, pose_point
 from warp_abtree.kernels.predicates import FLOAT32, UNSURE
 from warp_abtree.kernels.screen import SCREEN_UNIT, are_open, cross_triangles, part_triangles, turn_corners
-from warp_abtree.kernels.triangle import intersect_triangles
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -94,7 +94,7 @@ def part_faces(
     face_b: wp.int32,
 ):
     """Return PARTED where float32 says that the plane of one of two active faces parts them, else what it says."""
-    if mode == WITHIN:
+    if mode == WITHIN or (mode != FLOAT32 and pose.error == wp.inf):
         return 0
     a = load_corner_ids(states, pose.corner_a + face_a)
     b = load_corner_ids(states, pose.corner_b + face_b)
@@ -152,19 +152,19 @@ def test_faces(
     """Test one active face of A against one of B in float64, in A's frame; return 1, 0 or UNSURE."""
     a = states.face_corner[pose.corner_a + face_a]
     b = states.face_corner[pose.corner_b + face_b]
-    a0 = models.vertex_pos[a[0]]
-    a1 = models.vertex_pos[a[1]]
-    a2 = models.vertex_pos[a[2]]
-    b0 = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[0]])
-    b1 = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[1]])
-    b2 = pose_point(pose.rotation, pose.translation, models.vertex_pos[b[2]])
+    a0 = load_vertex(models.vertex_pos, a[0])
+    a1 = load_vertex(models.vertex_pos, a[1])
+    a2 = load_vertex(models.vertex_pos, a[2])
+    b0 = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[0]))
+    b1 = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[1]))
+    b2 = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[2]))
     if mode == WITHIN:
         return triangles_near(pose.within, a0, a1, a2, b0, b1, b2)
     if mode == FLOAT32:
         # A power of two brings the model to unit size, so that no product leaves float32's range.
         s = pose.scale
-        return intersect_triangles(mode, a0 * s, a1 * s, a2 * s, b0 * s, b1 * s, b2 * s)
-    return intersect_triangles(mode, a0, a1, a2, b0, b1, b2)
+        return decide_triangles(mode, a0 * s, a1 * s, a2 * s, b0 * s, b1 * s, b2 * s)
+    return decide_triangles(mode, a0, a1, a2, b0, b1, b2)
 
 
 @wp.func

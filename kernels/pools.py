@@ -20,14 +20,14 @@ LEVEL_MAX = wp.constant(31)
 class ModelPool:
     """Static data of every model, concatenated.
 
-    Per vertex of the forest: vertex_parent (global id, -1 at a root), vertex_pos [model units],
-    vertex_near, the same about the model's centre in float32 (x, y, z, 0).
+    Per vertex of the forest: vertex_parent (global id, -1 at a root), vertex_pos [model units] (x, y, z, 0),
+    vertex_near, the same about the model's centre in float32.
     Per face: face_vertex (global ids), face_split, leaf_node (the indexed list). Per node: node_face (-1 inside).
     Per model: starts into these, counts, centre [model units].
     """
 
     vertex_parent: wp.array(dtype=wp.int32)
-    vertex_pos: wp.array(dtype=wp.vec3d)
+    vertex_pos: wp.array(dtype=wp.vec4d)
     vertex_near: wp.array(dtype=wp.vec4)
     face_vertex: wp.array(dtype=wp.vec3i)
     face_split: wp.array(dtype=wp.int32)
@@ -40,6 +40,22 @@ class ModelPool:
     finest_limit: wp.array(dtype=wp.int32)
     lod_max: wp.array(dtype=wp.int32)
     centre: wp.array(dtype=wp.vec3d)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    // 32 bytes lie in one sector: two loads, where three numbers of 24 bytes would take three.
+    const double2* p = (const double2*)vertices.data + 2 * (long long)i;
+    const double2 xy = __ldg(p);
+    return wp::vec_t<3, wp::float64>(xy.x, xy.y, __ldg(&p[1].x));
+#else
+    const wp::vec_t<4, wp::float64>& p = vertices.data[i];
+    return wp::vec_t<3, wp::float64>(p[0], p[1], p[2]);
+#endif
+""")
+def load_vertex(vertices: wp.array(dtype=wp.vec4d), i: wp.int32) -> wp.vec3d:
+    """Return a position of `ModelPool.vertex_pos`, which nothing writes during a kernel."""
+    ...
 
 
 @wp.struct

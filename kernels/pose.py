@@ -106,13 +106,16 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     size = wp.float64(0.0)
     far = wp.float64(0.0)
     skewed = wp.float64(0.0)
+    turned = wp.float64(0.0)
     for i in range(3):
         shift[i] = (sum_products(r[i, 0], centre_b[0], r[i, 1], centre_b[1], r[i, 2], centre_b[2]) + t[i]) - centre_a[i]
         far = wp.max(far, wp.abs(shift[i]))
         size = wp.max(size, wp.abs(t[i]) + wp.abs(centre_a[i]))
         for j in range(3):
+            one = wp.where(i == j, wp.float64(1.0), wp.float64(0.0))
             gram = sum_products(r[0, i], r[0, j], r[1, i], r[1, j], r[2, i], r[2, j])
-            skewed = wp.max(skewed, wp.abs(gram - wp.where(i == j, wp.float64(1.0), wp.float64(0.0))))
+            skewed = wp.max(skewed, wp.abs(gram - one))
+            turned = wp.max(turned, wp.abs(r[i, j] - one))
     reach_c = wp.max(wp.max(wp.abs(centre_b[0]), wp.abs(centre_b[1])), wp.abs(centre_b[2]))
     margin64 = ROUNDING_64 * (size + wp.float64(2.0) * (reach_c + reach_b) + reach_a)
     margin64 = margin64 + wp.float64(4.0) * skewed * (reach_b + far)
@@ -134,6 +137,9 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     pose.scale = wp.float64(1.0) / wp.float64(wp.cast(exponent, wp.float32))
     pose.error = wp.float32(pose.scale * wp.float64(2.02) * (off32 + margin64))
     if wp.max(reach_a, reach_b) < REACH_MIN or wp.max(reach_a, reach_b) > REACH_MAX:
+        pose.error = wp.inf
+    if states.model[state_a] == states.model[state_b] and far + wp.float64(3.0) * turned * reach_b <= off32:
+        # A mesh laid on itself: no vertex is farther from its twin than float32 can tell.
         pose.error = wp.inf
     # A margin that no box passes, for pairs that are apart for certain and perhaps beyond float32, or even float64: a
     # distance that overflowed gives infinity or NaN.

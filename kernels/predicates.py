@@ -75,17 +75,39 @@ def fused_sum(u: wp.vec3d, x: wp.float64, y: wp.float64, z: wp.float64):
 
 
 @wp.func
-def filter_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return the sign of `orient3d` or UNSURE, and the sum of magnitudes."""
-    u = a - d
-    v = b - d
-    w = c - d
+def filter_rows(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
+    """Return the sign of det(u, v, w) of three differences or UNSURE, and the sum of magnitudes."""
     x, x_size = fused_minor(v[1], w[2], v[2], w[1])
     y, y_size = fused_minor(w[1], u[2], w[2], u[1])
     z, z_size = fused_minor(u[1], v[2], u[2], v[1])
     heads = wp.vec3d(u[0], v[0], w[0])
     size = fused_sum(wp.abs(heads), x_size, y_size, z_size)
     return filtered_sign(fused_sum(heads, x, y, z), BOUND_3D * size), size
+
+
+@wp.func
+def filter_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Return the sign of `orient3d` or UNSURE, and the sum of magnitudes."""
+    return filter_rows(a - d, b - d, c - d)
+
+
+@wp.func
+def sum_sizes64(v: wp.vec3d):
+    return (wp.abs(v[0]) + wp.abs(v[1])) + wp.abs(v[2])
+
+
+@wp.func
+def filter_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Return the sign of `orient_edges` or UNSURE.
+
+    Rows may be taken from one another: det(a - d, b - c, c - d) and det(a - c, b - d, c - d) are the same number. Ends
+    of edges that are laid on one another nearly coincide, so one of the two has rows that are nearly nothing, and an
+    error as small.
+    """
+    ac, ad, bc, bd = a - c, a - d, b - c, b - d
+    across = sum_sizes64(ad) * sum_sizes64(bc) < sum_sizes64(ac) * sum_sizes64(bd)
+    sign, _ = filter_rows(wp.where(across, ad, ac), wp.where(across, bc, bd), c - d)
+    return sign
 
 
 @wp.func
@@ -121,13 +143,9 @@ def orient_edges(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.ve
     """Return `orient3d` of the ends of two edges, a b and c d."""
     if mode == FLOAT32 or mode == FLOAT64:
         return plain_orient3d(mode, a, b, c, d)
-    sign, size = filter_orient3d(a, b, c, d)
-    if sign == UNSURE:
-        # Meshes laid on one another share points. Where d is shared, the size is 0 and so is the sign.
-        if a == c or b == c:
-            sign = 0
-        elif mode == EXACT:
-            sign = resolve_orient3d(a, b, c, d, size)
+    sign = filter_edges(a, b, c, d)
+    if mode == EXACT and sign == UNSURE:
+        sign = orient3d(EXACT, a, b, c, d)
     return sign
 
 

@@ -5,7 +5,7 @@ import warp as wp
 from warp_abtree.kernels.boxes import round_down_vec, round_up_vec
 from warp_abtree.kernels.nodes import Node, empty_node, load_node, store_node
 from warp_abtree.kernels.plan import UpdatePlan
-from warp_abtree.kernels.pools import ACTIVE, INACTIVE, ModelPool, StatePool
+from warp_abtree.kernels.pools import ACTIVE, INACTIVE, ModelPool, StatePool, load_vertex
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -20,9 +20,9 @@ def refit_leaf(models: ModelPool, states: StatePool, state: wp.int32, node: wp.i
         store_node(states, at, empty_node())
         return
     centre = models.centre[states.model[state]]
-    a = models.vertex_pos[corner[0]] - centre
-    b = models.vertex_pos[corner[1]] - centre
-    c = models.vertex_pos[corner[2]] - centre
+    a = load_vertex(models.vertex_pos, corner[0]) - centre
+    b = load_vertex(models.vertex_pos, corner[1]) - centre
+    c = load_vertex(models.vertex_pos, corner[2]) - centre
     states.node_status[at] = ACTIVE
     leaf = Node()
     leaf.lower = round_down_vec(wp.min(a, wp.min(b, c)))

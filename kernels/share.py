@@ -67,7 +67,13 @@ def load_tickets(counter: wp.array(dtype=wp.int32)) -> wp.int64:
 
 
 @wp.func_native("""
-    return (int)(tickets >> 32) - (int)tickets;
+    const int hungry = (int)(tickets >> 32) - (int)tickets;
+#if defined(__CUDA_ARCH__)
+    // Threads that were not together read at different times; what follows needs the same number in all.
+    return __shfl_sync(0xffffffffu, hungry, 0);
+#else
+    return hungry;
+#endif
 """)
 def count_hungry(tickets: wp.int64) -> wp.int32:
     """Return about how many warps wait for a share."""
@@ -153,8 +159,11 @@ def close_mailbox(flag: wp.array(dtype=wp.int32), ticket: wp.int32):
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
     int left = 1;
-    if (threadIdx.x == 0)
+    if (threadIdx.x == 0) {{
+        __threadfence();  // a mailbox that this warp has emptied, before the last one fills it with -1
         left = atomicSub(counter.data + 2, 1) - 1;
+        __threadfence();
+    }}
     if (__shfl_sync(0xffffffffu, left, 0) != 0)
         return;
     for (int i = threadIdx.x; i < {MAILBOX_COUNT // 4}; i += 32)

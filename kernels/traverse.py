@@ -158,7 +158,7 @@ def settle_open(
     met, hard = settle_waiting(
         mode, output, models, states, pose, wp.int32(counts[0]), wp.int32(counts[1]), left_open, met_inout
     )
-    return met, wp.int32(counts[2]), wp.int32(counts[3]) + hard
+    return met, wp.int32(counts[2]), hard
 
 
 @wp.func
@@ -331,8 +331,10 @@ def give_shares(items: wp.uint64, pair: wp.int32, head: wp.int32, end: wp.int32,
 def traverse_items(
     output: wp.int32,
     mode: wp.int32,
+    for_any: bool,
+    visits_max: wp.int32,
+    share_mask: wp.int32,
     stack_room: wp.int32,
-    parts: wp.int32,
     items: wp.uint64,
     head: wp.int32,
     end: wp.int32,
@@ -348,12 +350,8 @@ def traverse_items(
     node_tests, turn = wp.int32(0), wp.int32(0)
     tested, hit_count, left_open = wp.int32(0), wp.int32(0), wp.int32(0)
     crossing = wp.int32(0)
-    ready = keep_value(wp.where(output == OUTPUT_ANY, wp.min(FEW_CANDIDATES, warp_size()), warp_size()))
-    ready_crossing = wp.where(output == OUTPUT_ANY, 1, warp_size())
-    # Where many warps look for one hit of a pair, each asks at every visit whether there is one.
-    alert = output == OUTPUT_ANY and parts >= MANY_PARTS
-    visits_max = keep_value(wp.where(alert, 1, VISITS_A_TURN))
-    share_mask = keep_value(wp.where(alert, 3, wp.where(parts >= MANY_PARTS, 0, 1)))
+    ready = wp.where(for_any, wp.min(FEW_CANDIDATES, warp_size()), warp_size())
+    ready_crossing = wp.where(for_any, 1, warp_size())
     while end > head or waiting > 0 or crossing > 0:
         found = False
         tickets, visits = wp.int64(0), wp.int32(0)
@@ -382,7 +380,7 @@ def traverse_items(
         hungry = count_hungry(tickets)
         if hungry > 0 and end - head >= 2 * SHARE_LEAST:
             head = give_shares(items, p, head, end, hungry, work)
-        if output == OUTPUT_ANY:
+        if for_any:
             if warp_any(found or hits.any_hit[p] != 0):
                 end = head
                 waiting = 0
@@ -391,10 +389,11 @@ def traverse_items(
 
 
 @functools.cache
-def warp_traversal(mode: int):
+def warp_traversal(mode: int, for_any: bool):
     """Return the kernel that has warps share the object pairs: FLOAT32, WITHIN, or for both other precisions.
 
-    What float32 leaves open waits for `settle_traversal`.
+    One for OUTPUT_ANY and one for the other outputs, each with what it takes as constants. What float32 leaves open
+    waits for `settle_traversal`.
     """
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=128)
@@ -412,6 +411,11 @@ def warp_traversal(mode: int):
         """Traverse units of work, each a part of one object pair, and shares of them, until there are none."""
         count = wp.min(pair_count[0], pair_poses.shape[0])
         parts = part_count(parts_max, count)
+        visits_max = VISITS_A_TURN
+        share_mask = keep_value(wp.where(parts >= MANY_PARTS, wp.static(3 if for_any else 0), 1))
+        if wp.static(for_any):
+            # Where many warps look for one hit of a pair, each asks at every visit whether there is one.
+            visits_max = keep_value(wp.where(parts >= MANY_PARTS, 1, VISITS_A_TURN))
         items = warp_stack()
         while True:
             unit = take_unit(work_inout.counter)
@@ -429,7 +433,8 @@ def warp_traversal(mode: int):
             else:
                 head, end, waiting, spread = spread_items(items, unit % parts, parts, states, pose)
             node_tests, tests = traverse_items(
-                output, wp.static(mode), stack_room, parts, items, head, end, waiting, p,
+                wp.where(wp.static(for_any), OUTPUT_ANY, output), wp.static(mode), wp.static(for_any),
+                visits_max, share_mask, stack_room, items, head, end, waiting, p,
                 models, states, pose, hits_inout, work_inout,
             )  # fmt: skip
             add_warp_sum(hits_inout.node_tests, p, node_tests + spread)

@@ -1,7 +1,4 @@
-"""Triangle against triangle as closed sets: touching and coplanar overlap count, zero-area faces are segments.
-
-`vector64.filter_waiting` does as `intersect_triangles` does for FILTER, 8 pairs at a time; tests compare them.
-"""
+"""Triangle against triangle as closed sets: touching and coplanar overlap count, zero-area faces are segments."""
 
 from typing import Any
 
@@ -159,7 +156,7 @@ def intersect_exactly(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1
 def intersect_triangles(
     mode: wp.int32, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d
 ):
-    """Return whether two closed triangles meet, 1 or 0; UNSURE where a FILTER leaves a sign that counts open.
+    """Return whether two closed triangles meet, 1 or 0, by exact signs or rounded ones.
 
     Source: Guigue and Devillers 2003, Fast and robust triangle-triangle overlap test using orientation predicates.
     """
@@ -177,15 +174,9 @@ def intersect_triangles(
         return 0
     # A zero-area face sees every corner of the other on its "plane".
     special = (sa0 == 0 and sa1 == 0 and sa2 == 0) or (sb0 == 0 and sb1 == 0 and sb2 == 0)
-    if mode == FILTER:
-        # Signs are -1, 0 or 1: the largest is UNSURE iff any is.
-        if special or wp.max(wp.max(sa0, wp.max(sa1, sa2)), wp.max(sb0, wp.max(sb1, sb2))) == UNSURE:
-            return UNSURE
-    elif special:
+    if special:
         return wp.where(intersect_special(mode, a0, a1, a2, b0, b1, b2), 1, 0)
     p1, q1, r1, p2, q2, r2 = turn_triangles(sa0, sa1, sa2, sb0, sb1, sb2, a0, a1, a2, b0, b1, b2)
     first = orient_edges(mode, p1, q1, p2, q2)
     second = orient_edges(mode, p1, r1, r2, p2)
-    if first == 1 or second == 1:
-        return 0
-    return wp.where(first == UNSURE or second == UNSURE, UNSURE, 1)
+    return wp.where(first == 1 or second == 1, 0, 1)

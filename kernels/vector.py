@@ -309,6 +309,11 @@ def single_node(node: wp.int32):
         return Side{{above, ~(above | to_mask(value < -bound) | to_mask(bound == 0.0f))}};
     }};
     int met = 0, open = 0, done = 0;
+    if (error == __builtin_inff()) {{
+        for (; open < waiting; ++open)
+            rest[open] = list[open];
+        done = waiting;
+    }}
     while (done < waiting && (done == 0 || met == 0 || !first_ends)) {{
         const int count = waiting - done < 16 ? waiting - done : 16;
         const wp::int64* items = list + done;

@@ -1,13 +1,11 @@
 """The float64 stage on the CPU in vector instructions: what float32 leaves open, 8 pairs of faces at a time.
 
-`filter_waiting` finds the signs of `intersect_triangles` for FILTER by the same operations in the same order, so that
-every device counts the same. Where nothing but the order of two edges is open, which is nearly always so on meshes
-laid on one another, it goes on to double words, as `resolve_orient3d` does.
+`filter_waiting` finds the signs of `filter_triangles` by the same operations in the same order, so that
+every device counts the same.
 """
 
 import warp as wp
 
-from warp_abtree.kernels.double_word import BOUND_DOUBLE
 from warp_abtree.kernels.pools import ModelPool, StatePool
 from warp_abtree.kernels.pose import COORDINATE_MIN, PairPose
 from warp_abtree.kernels.predicates import BOUND_3D
@@ -17,11 +15,11 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 # Of pairs that the first six signs leave, so many wait for two more, among them room for 16 that are not in use.
 KEPT_ROOM = 256
 
-four_numbers = wp.types.vector(length=4, dtype=wp.int64)
+three_numbers = wp.types.vector(length=3, dtype=wp.int64)
 
 
 @wp.func_native(f"""
-    wp::vec_t<4, wp::int64> result;
+    wp::vec_t<3, wp::int64> result;
 #if defined(__CUDA_ARCH__)
     __trap();  // a thread tests a pair
 #else
@@ -52,7 +50,6 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
     auto fuse = [](const lanes& a, const lanes& b, const lanes& c) {{ return __builtin_elementwise_fma(a, b, c); }};
     auto minus = [](const Point& a, const Point& b) {{ return Point{{a.x - b.x, a.y - b.y, a.z - b.z}}; }};
     auto sizes = [&](const Point& a) {{ return Point{{absolute(a.x), absolute(a.y), absolute(a.z)}}; }};
-    auto same = [](const Point& a, const Point& b) {{ return (a.x == b.x) & (a.y == b.y) & (a.z == b.z); }};
     auto choose = [](const bits& which, const Point& a, const Point& b) {{
         return Point{{which ? a.x : b.x, which ? a.y : b.y, which ? a.z : b.z}};
     }};
@@ -65,12 +62,7 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
     // Points, each where so many numbers end.
     auto gather = [&](const int* start) {{
         auto at = [&](int k) {{
-            const double* p = position + (unsigned int)start[k];
-#if defined(__AVX512VL__)
-            return (four)__builtin_ia32_loadupd256_mask((const four*)p, four{{}}, 7);
-#else
-            return four{{p[0], p[1], p[2], 0.0}};
-#endif
+            return *(const four*)(position + (unsigned int)start[k]);
         }};
         lanes row[4];
         for (int k = 0; k < 4; ++k) {{
@@ -105,46 +97,22 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
         return Sign{{fuse(w.x, z, fuse(v.x, y, u.x * x)),
                      fuse(w_size.x, z_size, fuse(v_size.x, y_size, u_size.x * x_size))}};
     }};
-    auto orient = [&](const Point& a, const Point& b, const Point& c, const Point& d) {{
-        const Point u = minus(a, d), v = minus(b, d), w = minus(c, d);
+    auto sized_determinant = [&](const Point& u, const Point& v, const Point& w) {{
         return determinant(u, v, w, sizes(u), sizes(v), sizes(w));
+    }};
+    auto sum_sizes = [&](const Point& v) {{ return (absolute(v.x) + absolute(v.y)) + absolute(v.z); }};
+    // As `filter_edges`, of the differences of ends.
+    auto orient_edges = [&](const Point& ac, const Point& ad, const Point& bc, const Point& bd, const Point& cd) {{
+        const bits across = sum_sizes(ad) * sum_sizes(bc) < sum_sizes(ac) * sum_sizes(bd);
+        return sized_determinant(choose(across, ad, ac), choose(across, bc, bd), cd);
     }};
     auto filtered = [&](const lanes& value, const lanes& bound) {{
         const unsigned int above = to_mask(value > bound), below = to_mask(value < -bound);
         const unsigned int open = 255 & ~(above | below);
         return Sides{{above, below, open & ~to_mask(bound == 0.0)}};
     }};
-    // Double words, as in their module.
-    auto add_fast = [](const lanes& a, const lanes& b) {{
-        const lanes x = a + b;
-        return Double{{x, b - (x - a)}};
-    }};
-    auto two_sum = [](const lanes& a, const lanes& b) {{
-        const lanes x = a + b, part = x - a;
-        return Double{{x, (a - (x - part)) + (b - part)}};
-    }};
-    auto multiply = [&](const Double& a, const Double& b) {{
-        const lanes high = a.high * b.high, low = fuse(a.high, b.high, -high);
-        return add_fast(high, low + fuse(a.low, b.high, a.high * b.low));
-    }};
-    auto add = [&](const Double& a, const Double& b) {{
-        const Double high = two_sum(a.high, b.high), low = two_sum(a.low, b.low);
-        const Double part = add_fast(high.high, high.low + low.high);
-        return add_fast(part.high, low.low + part.low);
-    }};
-    auto minor = [&](const Double& a, const Double& b, const Double& c, const Double& d) {{
-        return add(multiply(a, b), multiply(Double{{-c.high, -c.low}}, d));
-    }};
-    auto double_orient = [&](const Point& a, const Point& b, const Point& c, const Point& d) {{
-        const Double u0 = two_sum(a.x, -d.x), u1 = two_sum(a.y, -d.y), u2 = two_sum(a.z, -d.z);
-        const Double v0 = two_sum(b.x, -d.x), v1 = two_sum(b.y, -d.y), v2 = two_sum(b.z, -d.z);
-        const Double w0 = two_sum(c.x, -d.x), w1 = two_sum(c.y, -d.y), w2 = two_sum(c.z, -d.z);
-        const Double x = multiply(u0, minor(v1, w2, v2, w1)), y = multiply(v0, minor(w1, u2, w2, u1));
-        return add(add(x, y), multiply(w0, minor(u1, v2, u2, v1))).high;
-    }};
     typedef int ids[{KEPT_ROOM}];
-    int open = 0, kept = 0, hard_count = 0;
-    wp::int64 resolved = 0;
+    int open = 0, kept = 0;
     // Put what a mask names on a list, of which eight places are written over. No branch depends on a single pair of
     // faces: it could not be predicted, and what follows it would wait for the longest chain of operations.
     auto append = [](wp::int64* list, const bits& item, unsigned int which) {{
@@ -168,56 +136,30 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
     // two more signs decide.
     ids turned[6];
     wp::int64 crossing[{KEPT_ROOM}];
-    // Of these, those with a sign open, one of both and as a rule the only one: its four corners and its sum of
-    // magnitudes, whose sign bit is set where the other is open too.
-    ids hard_corner[4];
-    wp::int64 hard_item[{KEPT_ROOM}], hard_size[{KEPT_ROOM}];
     auto order_ends = [&](int first, int count) {{
         const Point p1 = gather(turned[0] + first), q1 = gather(turned[1] + first), r1 = gather(turned[2] + first);
         const Point p2 = gather_posed(turned[3] + first);
         const Point q2 = gather_posed(turned[4] + first), r2 = gather_posed(turned[5] + first);
         const bits item = *(const loose_longs*)(crossing + first);
-        const Sign start = orient(p1, q1, p2, q2), end = orient(p1, r1, r2, p2);
-        Sides s = filtered(start.value, {BOUND_3D.value.hex()} * start.size);
-        Sides e = filtered(end.value, {BOUND_3D.value.hex()} * end.size);
-        // As `orient_edges`.
-        s.open &= ~to_mask(same(p1, p2) | same(q1, p2));
-        e.open &= ~to_mask(same(p1, r2) | same(r1, r2));
-        const unsigned int left = ((1u << count) - 1) & ~(s.above | e.above), hard = left & (s.open | e.open);
+        const Point p1p2 = minus(p1, p2);
+        const Sign start = orient_edges(p1p2, minus(p1, q2), minus(q1, p2), minus(q1, q2), minus(p2, q2));
+        const Sign end = orient_edges(minus(p1, r2), p1p2, minus(r1, r2), minus(r1, p2), minus(r2, p2));
+        const Sides s = filtered(start.value, {BOUND_3D.value.hex()} * start.size);
+        const Sides e = filtered(end.value, {BOUND_3D.value.hex()} * end.size);
+        const unsigned int left = ((1u << count) - 1) & ~(s.above | e.above);
+        unsigned int hard = left & (s.open | e.open);
         append(hits + met, item, left & ~hard);
         met += __builtin_popcount(left & ~hard);
-        const ints one = widen(s.open);
-        append_ints(hard_corner[0] + hard_count, look_up(turned[0] + first), hard);
-        append_ints(hard_corner[1] + hard_count, one ? look_up(turned[1] + first) : look_up(turned[2] + first), hard);
-        append_ints(hard_corner[2] + hard_count, one ? look_up(turned[3] + first) : look_up(turned[5] + first), hard);
-        append_ints(hard_corner[3] + hard_count, one ? look_up(turned[4] + first) : look_up(turned[3] + first), hard);
-        const bits wide = __builtin_convertvector(one, bits);
-        const lanes size = wide ? start.size : end.size;
-        const bits both = __builtin_convertvector(widen(s.open & e.open), bits);
-        append(hard_size + hard_count, (bits)(both ? -size : size), hard);
-        append(hard_item + hard_count, item, hard);
-        hard_count += __builtin_popcount(hard);
+        for (; __builtin_expect(hard != 0, 0); hard &= hard - 1)
+            rest[open++] = crossing[first + __builtin_ctz(hard)];  // `append` could write over what is not read yet
     }};
-    auto resolve = [&](int first, int count) {{
-        const bits item = *(const loose_longs*)(hard_item + first), kind = *(const loose_longs*)(hard_size + first);
-        const lanes value = double_orient(gather(hard_corner[0] + first), gather(hard_corner[1] + first),
-                                          gather_posed(hard_corner[2] + first), gather_posed(hard_corner[3] + first));
-        const Sides sure = filtered(value, {BOUND_DOUBLE.value.hex()} * absolute((lanes)kind));
-        const unsigned int all = (1u << count) - 1, below = all & ~sure.above;
-        unsigned int left = below & (sure.open | to_mask(kind < 0));
-        resolved += count - __builtin_popcount(left);
-        append(hits + met, item, below & ~left);
-        met += __builtin_popcount(below & ~left);
-        for (; __builtin_expect(left != 0, 0); left &= left - 1)
-            rest[open++] = hard_item[first + __builtin_ctz(left)];
-    }};
-    // Do something with pairs that are kept, 8 at a time; behind the end stand corners that there are.
-    auto work_off = [&](ids* list, int rows, int& count, auto& work) {{
-        for (int i = 0; i < rows; ++i)
-            *(loose_ints*)(list[i] + count) = ints{{}};
-        for (int i = 0; i < count; i += 8)
-            work(i, count - i < 8 ? count - i : 8);
-        count = 0;
+    // Behind the end of the list stand corners that there are.
+    auto order_kept = [&]() {{
+        for (int i = 0; i < 6; ++i)
+            *(loose_ints*)(turned[i] + kept) = ints{{}};
+        for (int i = 0; i < kept; i += 8)
+            order_ends(i, kept - i < 8 ? kept - i : 8);
+        kept = 0;
     }};
     // As `find_alone`, of 8 triangles: those whose first corner is alone, whose second is, and whose lone corner lies
     // on the negative side.
@@ -280,9 +222,9 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
                 const ints x = __builtin_shufflevector(low_01, low_23, 0, 1, 8, 9, 4, 5, 12, 13);
                 const ints y = __builtin_shufflevector(low_01, low_23, 2, 3, 10, 11, 6, 7, 14, 15);
                 const ints z = __builtin_shufflevector(high_01, high_23, 0, 1, 8, 9, 4, 5, 12, 13);
-                *(loose_ints*)(start[3 * k] + i) = x + x + x;
-                *(loose_ints*)(start[3 * k + 1] + i) = y + y + y;
-                *(loose_ints*)(start[3 * k + 2] + i) = z + z + z;
+                *(loose_ints*)(start[3 * k] + i) = 4 * x;
+                *(loose_ints*)(start[3 * k + 1] + i) = 4 * y;
+                *(loose_ints*)(start[3 * k + 2] + i) = 4 * z;
             }}
         }}
     }};
@@ -330,9 +272,17 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
             for (int i = 0; i < 3; ++i)
                 unsure |= side_a[i].open | side_b[i].open;
             unsure &= left;
+            left &= ~unsure;
+            unsigned int joined = 0;
+            for (int i = 0; i < 3; ++i)
+                for (int j = 0; j < 3; ++j)
+                    joined |= to_mask((d_size[i][j].x + d_size[i][j].y) + d_size[i][j].z == 0.0);
+            joined &= unsure;
+            unsure &= ~joined;
+            append(hits + met, item, joined);
+            met += __builtin_popcount(joined);
             append(rest + open, item, unsure);
             open += __builtin_popcount(unsure);
-            left &= ~unsure;
             alone_a = find_alone(side_a);
             alone_b = find_alone(side_b);
         }}
@@ -345,14 +295,11 @@ four_numbers = wp.types.vector(length=4, dtype=wp.int64)
         kept += __builtin_popcount(left);
         const bool last = first_ends || done == waiting;
         if (last || kept > {KEPT_ROOM - 16})
-            work_off(turned, 6, kept, order_ends);
-        if (hard_count > 0)
-            work_off(hard_corner, 4, hard_count, resolve);
+            order_kept();
     }}
     result[0] = met;
     result[1] = open;
     result[2] = done;
-    result[3] = resolved;
     }}
 #endif
     return result;
@@ -366,12 +313,12 @@ def filter_waiting(
     waiting: wp.int32,
     left_open: wp.array(dtype=wp.int64),
     faces: wp.array(dtype=wp.int64),
-) -> four_numbers:
+) -> three_numbers:
     """Test pairs of faces in float64, 8 at a time, perhaps until the first that meet, and add those to a list.
 
     Lists have room for 8 more.
 
-    Returns how many have met then, how many are left open, which stand in front of their list then, how many were
-    tested, and how many of these float64 left open and double words decided.
+    Returns how many have met then, how many are left open, which stand in front of their list then, and how many were
+    tested.
     """
     ...

@@ -199,6 +199,56 @@ def read_signs(items: wp.uint64, i: wp.int32) -> wp.int32:
     ...
 
 
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    __shared__ int4 items[{CROSSING_LENGTH}];
+    return __cvta_generic_to_shared(items);
+#else
+    static int items[{CROSSING_LENGTH} * 4];
+    return (wp::uint64)items;
+#endif
+""")
+def warp_kept() -> wp.uint64:
+    """Return where this warp keeps face pairs with their signs, an address in shared memory on CUDA."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    const unsigned int at = (unsigned int)kept + 16 * (end + __popc(votes & ((1u << threadIdx.x) - 1u)));
+    if (flag)
+        asm volatile("st.shared.v4.b32 [%0], {%1, %2, %3, %4};"
+                     :: "r"(at), "r"(item[0]), "r"(item[1]), "r"(item[2]), "r"(signs) : "memory");
+    return end + __popc(votes);
+#else
+    int* to = (int*)kept + 4 * end;
+    for (int k = 0; flag && k < 4; ++k)
+        to[k] = k < 3 ? item[k] : signs;
+    return end + flag;
+#endif
+""")
+def keep_item(kept: wp.uint64, end: wp.int32, flag: bool, item: wp.vec3i, signs: wp.int32) -> wp.int32:
+    """Append the face pairs whose flag is set, with their signs, to those that are kept; return the new end."""
+    ...
+
+
+@wp.func_native("""
+    wp::vec_t<4, wp::int32> x;
+#if defined(__CUDA_ARCH__)
+    asm volatile("ld.shared.v4.b32 {%0, %1, %2, %3}, [%4];"
+                 : "=r"(x[0]), "=r"(x[1]), "=r"(x[2]), "=r"(x[3]) : "r"((unsigned int)kept + 16 * i) : "memory");
+#else
+    for (int k = 0; k < 4; ++k)
+        x[k] = ((const int*)kept)[4 * i + k];
+#endif
+    return x;
+""")
+def read_kept(kept: wp.uint64, i: wp.int32) -> wp.vec4i:
+    """Return the i-th face pair that is kept, and its signs."""
+    ...
+
+
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     return __any_sync(0xffffffffu, flag);

@@ -1,5 +1,7 @@
 """Batched traversal: every intersecting face pair, against exact brute force and an independent library."""
 
+import copy
+
 import numpy as np
 import pytest
 import warp as wp
@@ -351,16 +353,17 @@ class WarpQuery(ab.Query):
 def test_warps_give_the_same_answers(device, room, parts):
     """One warp a pair and several, with room on the stack or none, so that they go one item at a time."""
     scene, _ = posed_cases(np.random.default_rng(8), ("torus", "soup"), 12, BRUTE_FACES, device)
-    poses = random_poses(np.random.default_rng(8), 1, 1.0)
-    for _ in range(2):  # the same mesh twice in one place: many faces wait for exact signs
-        scene.add(sample("torus"), poses[0], lod=sample("torus").lod_for(fraction=0.2))
+    for x in (0.0, 0.03125):  # faces in one plane wait for exact signs
+        scene.add(sample("grid"), (x, x / 2, 0, 0, 0, 0, 1), lod=sample("grid").lod_for(fraction=0.2))
     pairs = np.arange(24).reshape(-1, 2)
     pairs = np.concatenate([pairs, pairs[::-1, ::-1], [(0, 3), (2, 9), (24, 25), (25, 24)]])
+    visits = {}
     for output in ("faces", "count", "any"):
         plain = ask(scene, pairs, output)
         query = WarpQuery(scene, output, pairs=pairs, unsure_capacity=2)
         query.parts_max, query.stack_room = parts, room
         result = query.run()
+        visits[output] = result.node_tests.sum()
         np.testing.assert_array_equal(result.any, plain.any)
         if output != "any":
             for name in ("count", "node_tests", "triangle_tests", "float64_tests", "exact_tests"):
@@ -369,6 +372,8 @@ def test_warps_give_the_same_answers(device, room, parts):
             np.testing.assert_array_equal(result.faces, plain.faces)
             assert len(result.faces) > 100
             assert result.exact_tests[-1] > 2, "the list of unsure faces has grown"
+    if parts == 1:
+        assert visits["any"] < visits["count"], "a pair ends at its first hit"
 
 
 @pytest.mark.parametrize("name", ["cow", "fandisk", "fcl-env", "woody", "torus", "soup"])
@@ -386,6 +391,23 @@ def test_exact_where_every_face_meets_its_twin(device, name, turned):
     if turned and name not in ("soup", "woody"):  # few pairs, and perhaps none
         rounded = scene.intersect([(0, 1)], "faces", precision="float32")
         assert not np.array_equal(rounded.faces, result.faces), "the case is too easy to tell exact signs from others"
+
+
+@pytest.mark.parametrize("name", ["torus", "soup", "ball"])
+def test_a_mesh_laid_on_itself_goes_to_float64_at_once(device, name):
+    """Of twins in one place all faces, of a copy's those that float32 leaves open: the answers are the same."""
+    model = sample(name)
+    for pose in (STILL, random_poses(np.random.default_rng(12), 1, 1.0)[0]):
+        scene = ab.Scene(device)
+        beside = (*np.asarray(pose[:3]) + 1e-4, *pose[3:])
+        for placed, at in ((model, pose), (model, pose), (copy.copy(model), pose), (model, beside)):
+            scene.add(placed, at)
+        result = ask(scene, [(0, 1), (0, 2), (0, 3)])
+        first, second, _ = (result.faces[result.faces[:, 0] == p, 1:] for p in range(3))
+        np.testing.assert_array_equal(first, second)
+        tested, left = result.triangle_tests, result.float64_tests
+        assert left[0] == tested[0] == tested[1] > left[1]
+        assert left[2] < tested[2]
 
 
 @pytest.mark.parametrize("name", ["cow", "rocker-arm", "stanford-bunny", "torus"])

@@ -1,5 +1,6 @@
 """Expansions and signs of all three stages against fractions, and that no compiler contracts them."""
 
+import functools
 import importlib
 import re
 from fractions import Fraction
@@ -11,7 +12,7 @@ import warp as wp
 from warp_abtree.kernels import faces, settle, traverse
 from warp_abtree.kernels.double_word import double_orient2d, double_orient3d
 from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d, two_product, two_sum
-from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE, orient2d, orient3d
+from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE, orient2d, orient3d, orient_edges
 from warp_abtree.kernels.screen import SCREEN_UNIT, add_signs, heights_over_plane, one_sided, side_of_plane
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
@@ -51,6 +52,12 @@ def sum_of_product_kernel(
 def orient3d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=wp.int32)):
     i = wp.tid()
     out[i] = orient3d(mode, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
+
+
+@wp.kernel
+def orient_edges_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=wp.int32)):
+    i = wp.tid()
+    out[i] = orient_edges(mode, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
 
 
 @wp.kernel
@@ -249,6 +256,38 @@ def test_signs(device, dim, kind):
         np.testing.assert_array_equal(plain, truth)  # these determinants are small integers
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_signs_of_edges(device, kind):
+    """The same determinant from other rows."""
+    points = KINDS[kind](np.random.default_rng(8), 3)
+    truth = true_signs(points)
+    np.testing.assert_array_equal(find_signs(orient_edges_kernel, EXACT, points, device), truth)
+    filtered = find_signs(orient_edges_kernel, FILTER, points, device)
+    sure = filtered != int(UNSURE)
+    np.testing.assert_array_equal(filtered[sure], truth[sure])
+    if kind == "random":
+        assert sure.all()
+
+
+@pytest.mark.parametrize("across", [False, True])
+@pytest.mark.parametrize("shared", [False, True])
+def test_edges_laid_on_one_another_need_no_more_than_float64(device, across, shared):
+    """Ends some units in the last place apart, in either order, and ends that coincide."""
+    rng = np.random.default_rng(9)
+    first = rng.normal(size=(COUNT, 2, 3))
+    second = first + rng.integers(-3, 4, first.shape) * np.spacing(first)
+    if shared:
+        second[:, 0] = first[:, 0]
+    points = np.concatenate([first, second[:, ::-1] if across else second], 1)
+    truth = true_signs(points)
+    filtered = find_signs(orient_edges_kernel, FILTER, points, device)
+    sure = filtered != int(UNSURE)
+    np.testing.assert_array_equal(filtered[sure], truth[sure])
+    np.testing.assert_array_equal(find_signs(orient_edges_kernel, EXACT, points, device), truth)
+    assert (truth == 0).all() == shared and sure.mean() > 0.97
+    assert shared or (find_signs(orient3d_kernel, FILTER, points, device) != int(UNSURE)).mean() < 0.3
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("kind", KINDS)
 def test_double_words_keep_their_bound(device, kind, dim):
@@ -368,10 +407,14 @@ def test_modules_with_signs_do_not_contract():
         "visit",
         "nodes",
         "double_word",
+        "filter",
+        "settle",
     )
     modules = [wp.get_module(importlib.import_module(f"warp_abtree.kernels.{name}").__name__) for name in names]
-    makers = (traverse.thread_traversal, traverse.warp_traversal, settle.settle_traversal)
+    makers = [traverse.thread_traversal, settle.settle_traversal]
+    makers += [functools.partial(traverse.warp_traversal, for_any=for_any) for for_any in (False, True)]
     modules += [make(int(mode)).module for mode in (EXACT, FLOAT64, FLOAT32, faces.WITHIN) for make in makers]
+    modules += [settle.filter_faces_kernel.module, settle.settle_hard_kernel.module]
     assert [m.name for m in modules if m.options["fuse_fp"] or m.options["fast_math"]] == []
 
 
@@ -401,12 +444,11 @@ def test_ptx_is_not_contracted(tmp_path, fuse_fp):
 
 def test_ptx_of_the_traversal_is_not_contracted(tmp_path):
     """The kernels that pose vertices, bound signs and test boxes; without exact signs they have no float64 fma."""
-    (tmp_path / "screen").mkdir()
-    (tmp_path / "settle").mkdir()
-    text = ptx_of(traverse.warp_traversal(int(EXACT)).module, tmp_path / "screen")
-    assert len(re.findall(r"\bmul\.rn\.f32", text)) > 50
-    # In float32 the kernel itself asks for fused operations, the same on every device.
-    assert {x for x in find_contraction(text) if x != "fma.rn.f32"} == set()
+    for for_any in (False, True):
+        text = ptx_of(traverse.warp_traversal(int(EXACT), for_any).module, tmp_path / f"screen_{for_any}")
+        assert len(re.findall(r"\bmul\.rn\.f32", text)) > 50
+        # In float32 the kernel itself asks for fused operations, the same on every device.
+        assert {x for x in find_contraction(text) if x != "fma.rn.f32"} == set()
     text = ptx_of(settle.settle_traversal(int(FLOAT64)).module, tmp_path / "settle")
     assert len(re.findall(r"\bmul\.rn\.f64", text)) > 50
     assert find_contraction(text) == []

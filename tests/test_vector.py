@@ -8,24 +8,13 @@ import warp as wp
 from samples import contact_poses, sample
 
 import warp_abtree as ab
-from warp_abtree.kernels.double_word import BOUND_DOUBLE, double_orient3d
 from warp_abtree.kernels.faces import cross_faces, part_faces
 from warp_abtree.kernels.faces import test_faces as decide_faces
 from warp_abtree.kernels.pools import ModelPool, StatePool
-from warp_abtree.kernels.pose import PairPose, pose_point
-from warp_abtree.kernels.predicates import (
-    EXACT,
-    FILTER,
-    FLOAT32,
-    UNSURE,
-    filter_orient3d,
-    filtered_sign,
-    orient3d,
-    orient_edges,
-)
+from warp_abtree.kernels.pose import PairPose
+from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, UNSURE
 from warp_abtree.kernels.screen import PARTED, SCREEN_UNIT
 from warp_abtree.kernels.traverse import WAITING_ROOM, first_item
-from warp_abtree.kernels.triangle import turn_triangles
 from warp_abtree.kernels.vector import (
     ITEMS_AT_ONCE,
     ROOM_FOR_ONE,
@@ -171,27 +160,6 @@ def pose64(rotation: wp.mat33d, translation: wp.vec3d, corner_b: wp.int32):
     return pose
 
 
-@wp.func
-def double_decides(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
-    """Return whether one sign of two edges in double words decides what a FILTER leaves open."""
-    sa0, sa1, sa2 = orient3d(FILTER, b0, b1, b2, a0), orient3d(FILTER, b0, b1, b2, a1), orient3d(FILTER, b0, b1, b2, a2)
-    sb0, sb1, sb2 = orient3d(FILTER, a0, a1, a2, b0), orient3d(FILTER, a0, a1, a2, b1), orient3d(FILTER, a0, a1, a2, b2)
-    if wp.max(wp.max(sa0, wp.max(sa1, sa2)), wp.max(sb0, wp.max(sb1, sb2))) == UNSURE:
-        return 0
-    if (sa0 == 0 and sa1 == 0 and sa2 == 0) or (sb0 == 0 and sb1 == 0 and sb2 == 0):
-        return 0
-    p1, q1, r1, p2, q2, r2 = turn_triangles(sa0, sa1, sa2, sb0, sb1, sb2, a0, a1, a2, b0, b1, b2)
-    first = orient_edges(FILTER, p1, q1, p2, q2)
-    second = orient_edges(FILTER, p1, r1, r2, p2)
-    if first == UNSURE:
-        _, size = filter_orient3d(p1, q1, p2, q2)
-        first = filtered_sign(double_orient3d(p1, q1, p2, q2), BOUND_DOUBLE * size)
-    else:
-        _, size = filter_orient3d(p1, r1, r2, p2)
-        second = filtered_sign(double_orient3d(p1, r1, r2, p2), BOUND_DOUBLE * size)
-    return wp.where(first == 1 or second == 1 or (first != UNSURE and second != UNSURE), 1, 0)
-
-
 @wp.kernel
 def filter_one_kernel(
     models: ModelPool,
@@ -202,22 +170,12 @@ def filter_one_kernel(
     faces: wp.array(dtype=wp.int64),
     filter_out: wp.array(dtype=wp.int32),
     exact_out: wp.array(dtype=wp.int32),
-    decided_out: wp.array(dtype=wp.int32),
 ):
     i = wp.tid()
     pose = pose64(rotation, translation, corner_b)
     face_a, face_b = item_first(faces[i]), item_second(faces[i])
     filter_out[i] = decide_faces(FILTER, models, states, pose, face_a, face_b)
     exact_out[i] = decide_faces(EXACT, models, states, pose, face_a, face_b)
-    a, b = states.face_corner[face_a], states.face_corner[corner_b + face_b]
-    decided_out[i] = double_decides(
-        models.vertex_pos[a[0]],
-        models.vertex_pos[a[1]],
-        models.vertex_pos[a[2]],
-        pose_point(rotation, translation, models.vertex_pos[b[0]]),
-        pose_point(rotation, translation, models.vertex_pos[b[1]]),
-        pose_point(rotation, translation, models.vertex_pos[b[2]]),
-    )
 
 
 @wp.kernel
@@ -236,7 +194,7 @@ def filter_all_kernel(
 ):
     pose = pose64(rotation, translation, corner_b)
     counts = filter_waiting(models, states, pose, first_ends, met, waiting, open_inout, faces_inout)
-    for i in range(4):
+    for i in range(3):
         count_out[i] = counts[i]
 
 
@@ -273,14 +231,14 @@ def exact_points(kind, rng, count):
     return np.concatenate([a, b]), rotation, shift
 
 
-# What must turn up: pairs that meet, that are apart, that double words decide, and that are left open.
+# What must turn up: pairs that meet, that are apart, and that are left open.
 CASES = {
     "random": "met apart",
     "lattice": "met apart left",
     "coplanar": "left",
-    "coincident": "met apart left",
-    "nearly coincident": "met apart decided",
-    "coincident, turned": "met apart decided",
+    "coincident": "met apart",
+    "nearly coincident": "met apart",
+    "coincident, turned": "met apart",
     "nearly coplanar": "apart left",
     "tiny": "met apart left",
     "huge": "met apart",
@@ -295,7 +253,7 @@ def test_filters_the_same_as_one_by_one(kind):
     count, face_count, ask_count, before = 40, 150, 2053, 3  # no multiple of 8
     points, rotation, shift = exact_points(kind, rng, count)
     models, states = ModelPool(), StatePool()
-    models.vertex_pos = wp.array(points, dtype=wp.vec3d, device=CPU)
+    models.vertex_pos = wp.array(np.pad(points, ((0, 0), (0, 1))), dtype=wp.vec4d, device=CPU)
     corners = np.array([rng.choice(count, 3, replace=kind == "degenerate") for _ in range(2 * face_count)])
     if "coincident" in kind:
         corners[face_count:] = corners[:face_count]
@@ -311,35 +269,30 @@ def test_filters_the_same_as_one_by_one(kind):
         chosen = rng.integers(0, len(one), ask_count // 2)
         asked[: ask_count // 2] = np.stack([one[chosen], other[chosen]], 1)
     asked = (asked[:, 0] << 32) | asked[:, 1]
-    plain, exact, decided = (wp.empty(ask_count, dtype=wp.int32, device=CPU) for _ in range(3))
+    plain, exact = (wp.empty(ask_count, dtype=wp.int32, device=CPU) for _ in range(2))
     items = wp.array(asked, dtype=wp.int64, device=CPU)
-    wp.launch(filter_one_kernel, dim=ask_count, inputs=[*placed, items, plain, exact, decided], device=CPU)
-    unsure, exact = plain.numpy() == int(UNSURE), exact.numpy()
-    decided = unsure & (decided.numpy() == 1)
-    met = np.where(decided, exact, plain.numpy()) == 1
-    assert (plain.numpy()[~unsure] == exact[~unsure]).all() or kind == "wild"
+    wp.launch(filter_one_kernel, dim=ask_count, inputs=[*placed, items, plain, exact], device=CPU)
+    plain, exact = plain.numpy(), exact.numpy()
+    met, unsure = plain == 1, plain == int(UNSURE)
+    assert (plain[~unsure] == exact[~unsure]).all() or kind == "wild"
     # As they come, and those first that are left open, so that a search for a first hit gets that far.
     came = np.arange(ask_count)
-    for first_ends, order in ((False, came), (True, came), (True, np.argsort(~(unsure & ~decided), kind="stable"))):
-        items, hit, hard, closed = asked[order], met[order], unsure[order], decided[order]
+    for first_ends, order in ((False, came), (True, came), (True, np.argsort(~unsure, kind="stable"))):
+        items, hit, hard = asked[order], met[order], unsure[order]
         left = wp.array(np.append(items, [UNTOUCHED] * OVER), dtype=wp.int64, device=CPU)
-        faces, counts = filled(before + ask_count + OVER), wp.zeros(4, dtype=wp.int64, device=CPU)
+        faces, counts = filled(before + ask_count + OVER), wp.zeros(3, dtype=wp.int64, device=CPU)
         inputs = [first_ends, before, ask_count, *placed, left, faces, counts]
         wp.launch(filter_all_kernel, dim=1, inputs=inputs, device=CPU)
-        end, still_open, tested, resolved = counts.numpy()
+        end, still_open, tested = counts.numpy()
         ends = first_ends and hit.any()
         assert tested == (min(ask_count, 8 * (np.flatnonzero(hit)[0] // 8 + 1)) if ends else ask_count)
         first = np.arange(ask_count) < tested
         np.testing.assert_array_equal(np.sort(faces.numpy()[before:end]), np.sort(items[first & hit]))
-        np.testing.assert_array_equal(
-            np.sort(left.numpy()[:still_open]), np.sort(items[first & hard & ~closed]), err_msg="left open"
-        )
-        assert resolved == (first & closed).sum()
+        np.testing.assert_array_equal(np.sort(left.numpy()[:still_open]), np.sort(items[first & hard]))
         assert (faces.numpy()[:before] == UNTOUCHED).all() and (faces.numpy()[end + 8 :] == UNTOUCHED).all()
         assert (left.numpy()[ask_count + 8 :] == UNTOUCHED).all()
-    seen = {"met": met & ~decided, "apart": ~met & ~unsure, "decided": decided, "left": unsure & ~decided}
+    seen = {"met": met, "apart": plain == 0, "left": unsure}
     assert all(seen[name].sum() > 30 for name in CASES[kind].split())
-    assert (met & decided).any() or "decided" not in CASES[kind]
 
 
 # --- the traversal ---------------------------------------------------------------------------------------------------

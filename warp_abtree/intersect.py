@@ -25,11 +25,9 @@ COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 
 # Face pairs that the float32 stage leaves open: about one in a hundred. The list grows as needed.
 UNSURE_CAPACITY = 65536
-# Warps that work off the lists of face pairs left open: more than one device runs at a time.
-SETTLE_WARPS = 4096
 # Rows whose sorting takes longer than packing each into one number, which sorts 20 times as fast.
 ROWS_TO_PACK = 1000
-# Warps of the traversal that one multiprocessor runs at a time, by its registers.
+# Warps that one multiprocessor runs at a time, of the traversal and of the passes after it, by their registers.
 WARPS_A_PROCESSOR = 16
 # So that each finds a mailbox for all that it gives away at once.
 WARPS_MAX = share.MAILBOX_COUNT // int(share.SHARES_AT_ONCE)
@@ -358,7 +356,7 @@ class Query:
         warps = max(room, int(4 * self.parts_max * math.sqrt(room)) + 1)
         warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         wp.launch(
-            traverse.warp_traversal(EXACT if mode == FLOAT64 else mode),
+            traverse.warp_traversal(EXACT if mode == FLOAT64 else mode, output == int(faces.OUTPUT_ANY)),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
             inputs=[self.parts_max, min(self.stack_room, STACK_LENGTH), *inputs, self.work],
             block_dim=WARP_SIZE,
@@ -372,10 +370,9 @@ class Query:
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
         self._launch_traversal(self._no_distance, self.hits, mode, output)
         if len(self.hits.unsure):
-            kernels = [settle.settle_traversal(FILTER if mode == EXACT else mode)]
-            if mode == EXACT:
-                kernels.append(settle.settle_hard_kernel)
-            threads = SETTLE_WARPS * WARP_SIZE if self.device.is_cuda else 1
+            exact = [settle.filter_faces_kernel, settle.settle_hard_kernel]
+            kernels = exact if mode == EXACT else [settle.settle_traversal(mode)]
+            threads = WARPS_A_PROCESSOR * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
             models, states = (arrays.pool for arrays in self.arrays[:2])
             inputs = [threads, output, models, states, self.pair_poses, self.hits]
             for kernel in kernels:

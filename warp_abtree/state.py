@@ -56,7 +56,7 @@ class ModelArrays:
         corners = [(f.face_vertex + s).astype(np.int32) for f, s in zip(forests, self.vertex_start[:-1], strict=True)]
         pool = ModelPool()
         pool.vertex_parent = joined(parents, wp.int32)
-        pool.vertex_pos = joined([f.vertex_pos for f in forests], wp.vec3d)
+        pool.vertex_pos = joined([np.pad(f.vertex_pos, ((0, 0), (0, 1))) for f in forests], wp.vec4d)
         near = [np.pad(model.progressive.vertex_pos - model.centre, ((0, 0), (0, 1))) for model in models]
         pool.vertex_near = joined([x.astype(np.float32) for x in near], wp.vec4)
         pool.face_vertex = joined(corners, wp.vec3i)
