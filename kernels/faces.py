@@ -185,7 +185,7 @@ def try_faces(
 
 @wp.func
 def defer_faces(slot: wp.int32, pair: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
-    """Put a pair of faces on the list that `settle_faces_kernel` works off, if there is room."""
+    """Put a pair of faces on the list that the settling passes work off, if there is room."""
     if slot >= 0 and slot < hits.unsure.shape[0]:
         hits.unsure[slot] = wp.vec3i(pair, face_a, face_b)
 

@@ -82,7 +82,15 @@ def reach_box(lower: wp.vec3, upper: wp.vec3):
 
 
 @wp.func
-def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32, within: wp.float64):
+def pair_pose(
+    whole: bool,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    a: wp.int32,
+    b: wp.int32,
+    within: wp.float64,
+):
     """Return the `PairPose` of B in A's frame, for points that meet or lie within a distance in A's frame.
 
     The margin covers every rounding between the exact x' of B's vertices and the float32 box test. With u = 2^-24,
@@ -91,7 +99,7 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     of each here (docs/exactness.md has the terms). The float64 part covers x' itself and the shift between
     centres, and `skewed` a rotation that is not orthonormal to the last bit, on whose columns B's axes are taken. A
     gap along a unit axis is a distance, so `within` adds to the margin; a column is longer than 1 by at most
-    `skewed`.
+    `skewed`. `whole` says that all faces are asked for, not one hit, which float32 may find first.
     """
     r, t = relate_objects(objects, a, b)
     state_a = objects.state[a]
@@ -138,7 +146,8 @@ def pair_pose(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.i
     pose.error = wp.float32(pose.scale * wp.float64(2.02) * (off32 + margin64))
     if wp.max(reach_a, reach_b) < REACH_MIN or wp.max(reach_a, reach_b) > REACH_MAX:
         pose.error = wp.inf
-    if states.model[state_a] == states.model[state_b] and far + wp.float64(3.0) * turned * reach_b <= off32:
+    same = states.model[state_a] == states.model[state_b] and states.lod[state_a] == states.lod[state_b]
+    if whole and same and far + wp.float64(3.0) * turned * reach_b <= off32:
         # A mesh laid on itself: no vertex is farther from its twin than float32 can tell.
         pose.error = wp.inf
     # A margin that no box passes, for pairs that are apart for certain and perhaps beyond float32, or even float64: a

@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.distance import DISTANCE_MAX, pad_distance
-from warp_abtree.kernels.faces import Hits
+from warp_abtree.kernels.faces import OUTPUT_ANY, Hits
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pair_pose
 from warp_abtree.kernels.share import Work, part_count
@@ -14,6 +14,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 @wp.kernel
 def relate_pair_kernel(
     parts_max: wp.int32,
+    output: wp.int32,
     models: ModelPool,
     states: StatePool,
     objects: ObjectPool,
@@ -57,7 +58,7 @@ def relate_pair_kernel(
     distance = wp.float64(0.0)
     if within.shape[0] > 0:
         distance = pad_distance(models, states, objects, a, b, within[p])
-    pose = pair_pose(models, states, objects, a, b, distance)
+    pose = pair_pose(output != OUTPUT_ANY, models, states, objects, a, b, distance)
     if within.shape[0] > 0 and within[p] >= DISTANCE_MAX:
         # Nothing is proved where distances may overflow: every box passes, and the first faces count as near.
         pose.within = wp.float64(wp.inf)

@@ -104,7 +104,7 @@ def settle_traversal(mode: int):
             if waits:
                 item = hits_inout.unsure[first + lane]
             settle_item(wp.static(mode), output, models, states, pair_poses, waits, item, hits_inout)
-            first += at_once * (threads / warp_size())
+            first += wp.min(at_once * (threads / warp_size()), end - first)
 
     return settle_faces_kernel
 
@@ -194,7 +194,7 @@ def filter_faces_kernel(
             crossing = keep_item(kept, crossing, signs >= 0, item, signs)
             defer_hard(hits_inout, signs == UNDECIDED, item)
             warp_sync()
-            first += at_once * (threads / warp_size())
+            first += wp.min(at_once * (threads / warp_size()), end - first)
         if crossing >= warp_size() or (first >= end and crossing > 0):
             popped = wp.min(crossing, warp_size())
             crossing -= popped
@@ -221,4 +221,4 @@ def settle_hard_kernel(
         if waits:
             item = hits_inout.hard[first + lane]
         settle_item(EXACT, output, models, states, pair_poses, waits, item, hits_inout)
-        first += at_once * (threads / warp_size())
+        first += wp.min(at_once * (threads / warp_size()), end - first)

@@ -164,6 +164,7 @@ def close_mailbox(flag: wp.array(dtype=wp.int32), ticket: wp.int32):
         left = atomicSub(counter.data + 2, 1) - 1;
         __threadfence();
     }}
+    __syncwarp();
     if (__shfl_sync(0xffffffffu, left, 0) != 0)
         return;
     for (int i = threadIdx.x; i < {MAILBOX_COUNT // 4}; i += 32)

@@ -393,7 +393,7 @@ def warp_traversal(mode: int, for_any: bool):
     """Return the kernel that has warps share the object pairs: FLOAT32, WITHIN, or for both other precisions.
 
     One for OUTPUT_ANY and one for the other outputs, each with what it takes as constants. What float32 leaves open
-    waits for `settle_traversal`.
+    waits for the settling passes.
     """
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=128)

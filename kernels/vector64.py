@@ -32,11 +32,10 @@ three_numbers = wp.types.vector(length=3, dtype=wp.int64)
     typedef int ints __attribute__((vector_size(32)));
     typedef int loose_ints __attribute__((vector_size(32), aligned(4)));
     typedef bool flags __attribute__((ext_vector_type(8)));
-    typedef double four __attribute__((vector_size(32)));
+    typedef double four __attribute__((vector_size(32), aligned(8)));
     typedef int four_ints __attribute__((vector_size(16)));
     typedef unsigned int counts __attribute__((vector_size(32)));
     struct Point {{ lanes x, y, z; }};
-    struct Double {{ lanes high, low; }};
     struct Sign {{ lanes value, size; }};
     // Of 8 signs those that are 1, -1 and UNSURE, a bit each.
     struct Sides {{ unsigned int above, below, open; }};
@@ -61,9 +60,7 @@ three_numbers = wp.types.vector(length=3, dtype=wp.int64)
     }};
     // Points, each where so many numbers end.
     auto gather = [&](const int* start) {{
-        auto at = [&](int k) {{
-            return *(const four*)(position + (unsigned int)start[k]);
-        }};
+        auto at = [&](int k) {{ return *(const four*)(position + (unsigned int)start[k]); }};
         lanes row[4];
         for (int k = 0; k < 4; ++k) {{
             const int i = k < 2 ? k : k + 2;
@@ -87,7 +84,7 @@ three_numbers = wp.types.vector(length=3, dtype=wp.int64)
         }}
         return Point{{x[0], x[1], x[2]}};
     }};
-    // As `filter_orient3d`, of differences and their magnitudes.
+    // As `filter_rows`, of differences and their magnitudes.
     auto determinant = [&](const Point& u, const Point& v, const Point& w,
                            const Point& u_size, const Point& v_size, const Point& w_size) {{
         const lanes p = v.z * w.y, q = w.z * u.y, s = u.z * v.y;
@@ -316,7 +313,7 @@ def filter_waiting(
 ) -> three_numbers:
     """Test pairs of faces in float64, 8 at a time, perhaps until the first that meet, and add those to a list.
 
-    Lists have room for 8 more.
+    Lists are not the same one, and have room for 8 more.
 
     Returns how many have met then, how many are left open, which stand in front of their list then, and how many were
     tested.

@@ -1,7 +1,7 @@
 """The threads of a warp at work on one stack in shared memory: a block is a warp, on the CPU one thread.
 
-All its threads must reach `warp_stack`, `warp_sync`, `push_items`, `keep_value`, `push_crossing`, `warp_any`,
-`reserve_slot`, `count_flags` and `add_warp_sum` together.
+All its threads must reach `warp_stack`, `warp_sync`, `push_items`, `keep_value`, `push_crossing`, `keep_item`,
+`warp_any`, `reserve_slot`, `count_flags` and `add_warp_sum` together.
 """
 
 import warp as wp

@@ -133,11 +133,13 @@ def test_the_order_of_faces_and_corners_changes_nothing(device, posed, plain):
 
 
 def work_of(result):
-    return np.stack([result.count, result.node_tests, result.triangle_tests, result.exact_tests], 1)
+    return np.stack(
+        [result.count, result.node_tests, result.triangle_tests, result.float64_tests, result.exact_tests], 1
+    )
 
 
 def test_scaling_by_powers_of_two_changes_no_bit(device):
-    """Every power from 2^-60 to 2^60, in one batch: the same faces after the same node, triangle and exact tests."""
+    """Every power from 2^-60 to 2^60, in one batch: the same faces after the same tests of each kind."""
     rng = np.random.default_rng(4)
     meshes = [SHAPES[name]() for name in ("crumbs", "small ball")]
     models = [ab.Model.from_arrays(*mesh, base_faces=10**6) for mesh in meshes]
@@ -152,7 +154,7 @@ def test_scaling_by_powers_of_two_changes_no_bit(device):
     for first in (0, 1):
         work = work_of(result)[first::2]
         np.testing.assert_array_equal(work, np.broadcast_to(work[0], work.shape))
-        assert (work[0] > (20, 20, 20, 0 if first else -1)).all()
+        assert (work[0] > (20, 20, 20, 0 if first else -1, -1)).all()
         faces = [result.faces[result.faces[:, 0] == p][:, 1:] for p in range(first, len(cases), 2)]
         for other in faces:
             np.testing.assert_array_equal(other, faces[0])
@@ -246,10 +248,10 @@ def test_batches_buffers_and_precisions_do_not_matter(device):
     scene.add(sample("twins"), STILL)
     pairs = np.array([(i, j) for i in range(8) for j in range(8) if i != j])
     whole = scene.intersect(pairs, output="faces")
-    assert whole.exact_tests.sum() > 100
+    assert whole.float64_tests.sum() > 100
     for trial in range(6):
         order = rng.permutation(len(pairs))
-        capacities = rng.integers(1, 2 * whole.exact_tests.sum(), 2)
+        capacities = rng.integers(1, 2 * whole.float64_tests.sum(), 2)
         for precision in ("float32", "float64"):
             scene.intersect(pairs[order], output="faces", precision=precision)
         query = ab.Query(scene, pairs=pairs[order], capacity=capacities[0], unsure_capacity=capacities[1])

@@ -353,10 +353,12 @@ class WarpQuery(ab.Query):
 def test_warps_give_the_same_answers(device, room, parts):
     """One warp a pair and several, with room on the stack or none, so that they go one item at a time."""
     scene, _ = posed_cases(np.random.default_rng(8), ("torus", "soup"), 12, BRUTE_FACES, device)
+    for _ in range(2):  # a mesh laid on itself
+        scene.add(sample("torus"), STILL, lod=sample("torus").lod_for(fraction=0.2))
     for x in (0.0, 0.03125):  # faces in one plane wait for exact signs
         scene.add(sample("grid"), (x, x / 2, 0, 0, 0, 0, 1), lod=sample("grid").lod_for(fraction=0.2))
     pairs = np.arange(24).reshape(-1, 2)
-    pairs = np.concatenate([pairs, pairs[::-1, ::-1], [(0, 3), (2, 9), (24, 25), (25, 24)]])
+    pairs = np.concatenate([pairs, pairs[::-1, ::-1], [(0, 3), (2, 9), (24, 25), (26, 27), (27, 26)]])
     visits = {}
     for output in ("faces", "count", "any"):
         plain = ask(scene, pairs, output)
@@ -408,6 +410,10 @@ def test_a_mesh_laid_on_itself_goes_to_float64_at_once(device, name):
         tested, left = result.triangle_tests, result.float64_tests
         assert left[0] == tested[0] == tested[1] > left[1]
         assert left[2] < tested[2]
+        coarse = model.lod_for(fraction=0.3)
+        scene.set_lods([model.lod_max, coarse, coarse, coarse])
+        apart = ask(scene, [(0, 1), (0, 2)])  # no twins
+        assert (apart.float64_tests < apart.triangle_tests).all() and np.ptp(apart.float64_tests) == 0
 
 
 @pytest.mark.parametrize("name", ["cow", "rocker-arm", "stanford-bunny", "torus"])

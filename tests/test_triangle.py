@@ -7,8 +7,8 @@ import oracle_triangle as oracle
 import pytest
 import warp as wp
 
-from warp_abtree.kernels.predicates import EXACT
-from warp_abtree.kernels.triangle import intersect_triangles
+from warp_abtree.kernels.filter import decide_triangles
+from warp_abtree.kernels.predicates import EXACT, FILTER, UNSURE
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -19,17 +19,22 @@ ORDERS = [(p, q) for p in permutations(range(3)) for q in permutations(range(3))
 def intersect_pair_kernel(mode: wp.int32, corners: wp.array2d(dtype=wp.vec3d), meet_out: wp.array(dtype=wp.int32)):
     """Test triangles corners[i, :3] and corners[i, 3:]."""
     i = wp.tid()
-    meet_out[i] = intersect_triangles(
+    meet_out[i] = decide_triangles(
         mode, corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
     )
 
 
 def meet(pairs, device):
-    """Return the kernel's answers for triangle pairs (k, 2, 3, 3)."""
+    """Return the kernel's answers for triangle pairs (k, 2, 3, 3), with which the filter agrees where it is sure."""
     corners = wp.array(np.ascontiguousarray(pairs).reshape(-1, 6, 3), dtype=wp.vec3d, device=device)
-    answers = wp.zeros(len(pairs), dtype=wp.int32, device=device)
-    wp.launch(intersect_pair_kernel, dim=len(pairs), inputs=[int(EXACT), corners, answers], device=device)
-    return answers.numpy() != 0
+    found = {}
+    for mode in (EXACT, FILTER):
+        answers = wp.zeros(len(pairs), dtype=wp.int32, device=device)
+        wp.launch(intersect_pair_kernel, dim=len(pairs), inputs=[int(mode), corners, answers], device=device)
+        found[mode] = answers.numpy()
+    sure = found[FILTER] != int(UNSURE)
+    np.testing.assert_array_equal(found[FILTER][sure], found[EXACT][sure])
+    return found[EXACT] != 0
 
 
 def truth(pairs):

@@ -25,6 +25,8 @@ COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 
 # Face pairs that the float32 stage leaves open: about one in a hundred. The list grows as needed.
 UNSURE_CAPACITY = 65536
+# Entries that an int32 numbers.
+LIST_MAX = 2**31 - 1
 # Rows whose sorting takes longer than packing each into one number, which sorts 20 times as fast.
 ROWS_TO_PACK = 1000
 # Warps that one multiprocessor runs at a time, of the traversal and of the passes after it, by their registers.
@@ -198,11 +200,11 @@ class Query:
         if within is not None:
             within = check_within(within, None if pairs is None else len(scene.check_pairs(pairs)))
         if capacity is not None:
-            capacity = whole_number(capacity, "capacity", 1, 2**31 - 1)
+            capacity = whole_number(capacity, "capacity", 1, LIST_MAX)
         if pair_capacity is not None:
             pair_capacity = whole_number(pair_capacity, "pair_capacity", 1, PAIRS_MAX)
         if unsure_capacity is not None:
-            unsure_capacity = whole_number(unsure_capacity, "unsure_capacity", 1, 2**31 - 1)
+            unsure_capacity = whole_number(unsure_capacity, "unsure_capacity", 1, LIST_MAX)
         self.scene = scene
         self.output = output
         self.precision = precision
@@ -342,7 +344,7 @@ class Query:
     def _launch_traversal(self, within, hits, mode, output):
         pools = [arrays.pool for arrays in self.arrays]
         room = len(self.pairs)
-        inputs = [self.parts_max, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
+        inputs = [self.parts_max, output, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
         wp.launch(relate.relate_pair_kernel, dim=dim, inputs=inputs, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits]
@@ -396,16 +398,20 @@ class Query:
         if self.broad_phase is not None and self.broad_phase.count_found() > len(self.pairs):
             self._take_pairs(wp.empty(self.broad_phase.count_found(), dtype=wp.vec2i, device=self.device))
             self.launch()
-        while len(self.hits.unsure) and self._sum(self.hits.float64_tests) > len(self.hits.unsure):
-            # How many wait varies for `any`, where the first hit of a pair ends its traversal.
-            self._resize_unsure(min(2 * self._sum(self.hits.float64_tests), 2**31 - 1))
-            self.traverse()
+        self._grow_unsure()
         if self.output == "faces" and self._sum(self.hits.count) > len(self.hits.face):
             self.resize(self._sum(self.hits.count))
             self.traverse()
         result = self.result()
         result.check()
         return result
+
+    def _grow_unsure(self):
+        """Make room for the face pairs that wait, as far as there can be, and traverse again until all find it."""
+        # How many wait varies for `any`, where the first hit of a pair ends its traversal.
+        while 0 < len(self.hits.unsure) < min(LIST_MAX, demand := self._sum(self.hits.float64_tests)):
+            self._resize_unsure(min(2 * demand, LIST_MAX))
+            self.traverse()
 
     @staticmethod
     def _sum(counts) -> int:

@@ -154,9 +154,7 @@ class ManifoldQuery(ContactQuery):
         if self.broad_phase is not None and self.broad_phase.count_found() > len(self.pairs):
             self._take_pairs(wp.empty(2 * self.broad_phase.count_found(), dtype=wp.vec2i, device=self.device))
             self.launch()
-        while len(self.hits.unsure) and self._sum(self.hits.float64_tests) > len(self.hits.unsure):
-            self._resize_unsure(min(2 * self._sum(self.hits.float64_tests), 2**31 - 1))
-            self.traverse()
+        self._grow_unsure()
         if self._sum(self.hits.count) > self._places:
             self.resize(2 * self._sum(self.hits.count))
             self.traverse()

@@ -35,9 +35,10 @@ class ModelArrays:
         self.face_start = starts([f.face_count for f in forests])
         self.split_start = starts([len(f.split_face) for f in forests])
         self.node_start = starts([model.tree.node_count for model in models])
-        for what, total in (("vertices", self.vertex_start[-1]), ("face slices", self.split_start[-1])):
-            if total >= 2**31:
-                raise ValueError(f"the models of one scene hold {total} {what}, more than 2^31")
+        # Vertices are looked up by four times their index in 32 bits.
+        for what, total, power in (("vertices", self.vertex_start[-1], 30), ("face slices", self.split_start[-1], 31)):
+            if total >= 2**power:
+                raise ValueError(f"the models of one scene hold {total} {what}, more than 2^{power}")
         self.face_count = np.array([f.face_count for f in forests], np.int64)
         self.node_count = np.array([model.tree.node_count for model in models], np.int64)
         self.depth = np.array([model.tree.depth for model in models], np.int64)
