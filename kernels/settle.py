@@ -165,7 +165,7 @@ def settle_crossing(
     defer_hard(hits, meet == UNSURE, item)
 
 
-@wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=128)
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=96)
 def filter_faces_kernel(
     threads: wp.int32,
     output: wp.int32,

@@ -29,12 +29,13 @@ UNSURE_CAPACITY = 65536
 LIST_MAX = 2**31 - 1
 # Rows whose sorting takes longer than packing each into one number, which sorts 20 times as fast.
 ROWS_TO_PACK = 1000
-# Warps that one multiprocessor runs at a time, of the traversal and of the passes after it, by their registers.
+# Warps that one multiprocessor runs at a time by their registers: of the traversal, of the float64 pass, of exact signs.
 WARPS_A_PROCESSOR = 16
+FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
 # So that each finds a mailbox for all that it gives away at once.
 WARPS_MAX = share.MAILBOX_COUNT // int(share.SHARES_AT_ONCE)
 
-EXACT, FILTER, FLOAT64 = int(predicates.EXACT), int(predicates.FILTER), int(predicates.FLOAT64)
+EXACT, FLOAT64 = int(predicates.EXACT), int(predicates.FLOAT64)
 
 
 def check_request(output: str, precision: str):
@@ -372,12 +373,14 @@ class Query:
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
         self._launch_traversal(self._no_distance, self.hits, mode, output)
         if len(self.hits.unsure):
-            exact = [settle.filter_faces_kernel, settle.settle_hard_kernel]
-            kernels = exact if mode == EXACT else [settle.settle_traversal(mode)]
-            threads = WARPS_A_PROCESSOR * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
+            first = settle.filter_faces_kernel if mode == EXACT else settle.settle_traversal(mode)
+            passes = [(first, FILTER_WARPS_A_PROCESSOR)]
+            if mode == EXACT:
+                passes.append((settle.settle_hard_kernel, EXACT_WARPS_A_PROCESSOR))
             models, states = (arrays.pool for arrays in self.arrays[:2])
-            inputs = [threads, output, models, states, self.pair_poses, self.hits]
-            for kernel in kernels:
+            for kernel, warps in passes:
+                threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
+                inputs = [threads, output, models, states, self.pair_poses, self.hits]
                 wp.launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
 
     def result(self) -> Result:
