@@ -29,7 +29,7 @@ UNSURE_CAPACITY = 65536
 LIST_MAX = 2**31 - 1
 # Rows whose sorting takes longer than packing each into one number, which sorts 20 times as fast.
 ROWS_TO_PACK = 1000
-# Warps that one multiprocessor runs at a time by their registers: of the traversal, of the float64 pass, of exact signs.
+# Warps that one multiprocessor runs at a time by their registers: of the traversal, of float64, of exact signs.
 WARPS_A_PROCESSOR = 16
 FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
 # So that each finds a mailbox for all that it gives away at once.
