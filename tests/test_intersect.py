@@ -355,10 +355,10 @@ def test_warps_give_the_same_answers(device, room, parts):
     scene, _ = posed_cases(np.random.default_rng(8), ("torus", "soup"), 12, BRUTE_FACES, device)
     for _ in range(2):  # a mesh laid on itself
         scene.add(sample("torus"), STILL, lod=sample("torus").lod_for(fraction=0.2))
-    for x in (0.0, 0.03125):  # faces in one plane wait for exact signs
+    for x in (0.0, 0.0, 0.03125):  # corners in common, faces in one plane wait for exact signs
         scene.add(sample("grid"), (x, x / 2, 0, 0, 0, 0, 1), lod=sample("grid").lod_for(fraction=0.2))
     pairs = np.arange(24).reshape(-1, 2)
-    pairs = np.concatenate([pairs, pairs[::-1, ::-1], [(0, 3), (2, 9), (24, 25), (26, 27), (27, 26)]])
+    pairs = np.concatenate([pairs, pairs[::-1, ::-1], [(0, 3), (2, 9), (24, 25), (26, 27), (26, 28), (28, 26)]])
     visits = {}
     for output in ("faces", "count", "any"):
         plain = ask(scene, pairs, output)
