@@ -1,5 +1,5 @@
 """Orientation signs: a float64 determinant with a proven error bound; where it leaves the sign open, the same in double
-words, and at last expansions.
+words, then in wrapping integers, and at last expansions.
 
 Bounds. With e = 2^-53 and no overflow, the determinants below err by at most (8 + 128 e) e P in 3D, with fused
 multiply-add by name, and (3 + 16 e) e P in 2D, P the same sum with every product and difference of products replaced by
@@ -15,6 +15,7 @@ import warp as wp
 
 from warp_abtree.kernels.double_word import BOUND_DOUBLE, double_orient2d, double_orient3d
 from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d, fuse_multiply
+from warp_abtree.kernels.integer import integer_orient2d, integer_orient3d
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -47,7 +48,10 @@ def filtered_sign(x: Any, bound: Any):
 @wp.func(inline=False)
 def resolve_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, size: wp.float64):
     """Return a sign that float64 leaves open, `size` the sum of magnitudes. Not inlined: long, and rarely called."""
-    sign = filtered_sign(double_orient3d(a, b, c, d), BOUND_DOUBLE * size)
+    bound = BOUND_DOUBLE * size
+    sign = filtered_sign(double_orient3d(a, b, c, d), bound)
+    if sign == UNSURE:
+        sign = integer_orient3d(a, b, c, d, bound)
     if sign == UNSURE:
         sign = exact_orient3d(a, b, c, d)
     return sign
@@ -56,7 +60,10 @@ def resolve_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, size: w
 @wp.func(inline=False)
 def resolve_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, size: wp.float64):
     """Return a sign that float64 leaves open, as `resolve_orient3d`."""
-    sign = filtered_sign(double_orient2d(a, b, c), BOUND_DOUBLE * size)
+    bound = BOUND_DOUBLE * size
+    sign = filtered_sign(double_orient2d(a, b, c), bound)
+    if sign == UNSURE:
+        sign = integer_orient2d(a, b, c, bound)
     if sign == UNSURE:
         sign = exact_orient2d(a, b, c)
     return sign

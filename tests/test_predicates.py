@@ -12,6 +12,7 @@ import warp as wp
 from warp_abtree.kernels import faces, settle, traverse
 from warp_abtree.kernels.double_word import double_orient2d, double_orient3d
 from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d, two_product, two_sum
+from warp_abtree.kernels.integer import integer_orient2d, integer_orient3d
 from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE, orient2d, orient3d, orient_edges
 from warp_abtree.kernels.screen import SCREEN_UNIT, add_signs, heights_over_plane, one_sided, side_of_plane
 
@@ -64,6 +65,18 @@ def orient_edges_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec3d), out:
 def orient2d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.int32)):
     i = wp.tid()
     out[i] = orient2d(mode, points[i, 0], points[i, 1], points[i, 2])
+
+
+@wp.kernel
+def integer3d_kernel(bound: wp.array(dtype=wp.float64), points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=int)):
+    i = wp.tid()
+    out[i] = integer_orient3d(points[i, 0], points[i, 1], points[i, 2], points[i, 3], bound[i])
+
+
+@wp.kernel
+def integer2d_kernel(bound: wp.array(dtype=wp.float64), points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=int)):
+    i = wp.tid()
+    out[i] = integer_orient2d(points[i, 0], points[i, 1], points[i, 2], bound[i])
 
 
 @wp.kernel
@@ -302,6 +315,54 @@ def test_double_words_keep_their_bound(device, kind, dim):
         assert off <= Fraction(2) ** -53 * abs(Fraction(value)) + 20 * Fraction(2) ** -106 * sum(map(abs, terms))
 
 
+def lowest_power(x):
+    """Return the power of two of the lowest bit of a number that is not 0."""
+    x = Fraction(x)
+    return (x.numerator & -x.numerator).bit_length() - x.denominator.bit_length()
+
+
+def unit_of(rows):
+    """Return the power of two that a determinant is a whole multiple of, None where a row is 0."""
+    *rows, last = rows
+    powers = [[lowest_power(x) for x in [*row, *last] if x != 0] for row in rows]
+    return sum(map(min, powers)) if all(powers) else None
+
+
+@pytest.mark.parametrize("share", [1, 4])
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_integers_tell_small_determinants(device, kind, dim, share):
+    """Right wherever they tell a sign of one within four times a bound, which they do within 2^122 units."""
+    points = KINDS[kind](np.random.default_rng([7, dim]), dim)
+    values = [sum(true_terms(rows)) for rows in points.tolist()]
+    # No larger than the bound, or than 4 times the bound.
+    bound = [float(abs(x)) / share for x in values]
+    bound = [np.nextafter(b, np.inf) if 4 * Fraction(b) < abs(x) or b == 0 else b for x, b in zip(values, bound)]
+    out = wp.zeros(len(points), dtype=int, device=device)
+    kernel, dtype = (integer3d_kernel, wp.vec3d) if dim == 3 else (integer2d_kernel, wp.vec2d)
+    arrays = [wp.array(bound, dtype=wp.float64, device=device), wp.array(points, dtype=dtype, device=device)]
+    wp.launch(kernel, len(points), [*arrays, out], device=device)
+    told = 0
+    for rows, value, b, sign in zip(points.tolist(), values, bound, out.numpy().tolist(), strict=True):
+        assert sign in ((value > 0) - (value < 0), int(UNSURE))
+        unit = unit_of(rows)
+        small = unit is None or Fraction(b) < Fraction(2) ** (unit + 122)
+        assert sign != int(UNSURE) or not small
+        told += small
+    assert told > 3 or kind == "random"
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_integers_leave_what_is_no_number(device, dim):
+    points = np.tile(np.eye(dim + 1, dim), (4, 1, 1))
+    points[1, 0, 0], points[2, dim, 1] = np.nan, np.inf
+    out = wp.zeros(4, dtype=int, device=device)
+    kernel, dtype = (integer3d_kernel, wp.vec3d) if dim == 3 else (integer2d_kernel, wp.vec2d)
+    bounds = wp.array([1.0, 1.0, 1.0, np.inf], dtype=wp.float64, device=device)
+    wp.launch(kernel, 4, [bounds, wp.array(points, dtype=dtype, device=device), out], device=device)
+    assert out.numpy().tolist() == [1, int(UNSURE), int(UNSURE), int(UNSURE)]
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_signs_change_with_the_order(device, dim):
     """Two points exchanged change every exact sign, to the bit."""
@@ -408,6 +469,7 @@ def test_modules_with_signs_do_not_contract():
         "nodes",
         "double_word",
         "filter",
+        "integer",
     )
     modules = [wp.get_module(importlib.import_module(f"warp_abtree.kernels.{name}").__name__) for name in names]
     makers = [traverse.thread_traversal, settle.settle_traversal]
