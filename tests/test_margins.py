@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from oracle_triangle import into_frame_of_a, quaternion_matrix, triangles_intersect
 from samples import random_quaternions
-from test_predicates import find_signs, orient2d_kernel, true_signs
+from signs import find_signs, true_signs
+from test_predicates import orient2d_kernel
 
 import warp_abtree as ab
 from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT64, UNSURE

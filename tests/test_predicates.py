@@ -8,18 +8,23 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import warp as wp
+from signs import (
+    COUNT,
+    KINDS,
+    find_signs,
+    random_floats,
+    true_signs,
+    true_terms,
+)
 
 from warp_abtree.kernels import faces, settle, traverse
 from warp_abtree.kernels.double_word import double_orient2d, double_orient3d
 from warp_abtree.kernels.expansion import exact_orient2d, exact_orient3d, two_product, two_sum
-from warp_abtree.kernels.integer import integer_orient2d, integer_orient3d
 from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE, orient2d, orient3d, orient_edges
 from warp_abtree.kernels.screen import SCREEN_UNIT, add_signs, heights_over_plane, one_sided, side_of_plane
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
-COUNT = 400
-TINY = 2.0**-290
 
 
 @wp.kernel
@@ -65,18 +70,6 @@ def orient_edges_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec3d), out:
 def orient2d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.int32)):
     i = wp.tid()
     out[i] = orient2d(mode, points[i, 0], points[i, 1], points[i, 2])
-
-
-@wp.kernel
-def integer3d_kernel(bound: wp.array(dtype=wp.float64), points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=int)):
-    i = wp.tid()
-    out[i] = integer_orient3d(points[i, 0], points[i, 1], points[i, 2], points[i, 3], bound[i])
-
-
-@wp.kernel
-def integer2d_kernel(bound: wp.array(dtype=wp.float64), points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=int)):
-    i = wp.tid()
-    out[i] = integer_orient2d(points[i, 0], points[i, 1], points[i, 2], bound[i])
 
 
 @wp.kernel
@@ -130,10 +123,6 @@ def apply(kernel, a, b, device):
     return out.numpy()
 
 
-def random_floats(rng, count, low, high):
-    return np.ldexp(rng.uniform(1, 2, count) * rng.choice([-1.0, 1.0], count), rng.integers(low, high, count))
-
-
 def check_exact(got, expected, rounded):
     high, low = got
     np.testing.assert_array_equal(high, rounded)
@@ -169,79 +158,7 @@ def test_two_product_loses_nothing(device):
     check_exact(apply(two_product_kernel, a, b, device), expected, a * b)
 
 
-# --- signs. Points are (count, dim + 1, dim), for 3 and for 2 dimensions ---------------------------------------------
-
-
-def lattice_points(rng, dim):
-    return rng.integers(-3, 4, (COUNT, dim + 1, dim)).astype(float)
-
-
-def random_points(rng, dim):
-    return rng.normal(size=(COUNT, dim + 1, dim))
-
-
-def flat_points(rng, dim):
-    """The last point on the plane or line of the others, up to rounding and two units in the last place."""
-    points = random_points(rng, dim) + 2.0 ** rng.integers(-3, 20, (COUNT, 1, 1)) * rng.normal(size=(COUNT, 1, dim))
-    weight = rng.choice([0.0, 0.25, 0.5, 1.0, -1.0, 0.3], (COUNT, dim - 1, 1))
-    points[:, dim] = points[:, 0] + (weight * (points[:, 1:dim] - points[:, :1])).sum(1)
-    return points + rng.integers(-2, 3, points.shape) * np.spacing(np.abs(points))
-
-
-def grid_points(rng, dim):
-    """Coordinates of about 2^-290, a few multiples of 2^-342 apart: the products of three lie on the last bits."""
-    return TINY * (1 + lattice_points(rng, dim) * 2.0**-52 + 4 * 2.0**-52)
-
-
-def mixed_points(rng, dim):
-    """Coordinates of every magnitude from 2^-290 to 1, repeated so that much cancels."""
-    values = np.concatenate([random_floats(rng, 6, -290, 0), [0.0, TINY, 1.0]])
-    return rng.choice(values, (COUNT, dim + 1, dim))
-
-
-def tiny_flat_points(rng, dim):
-    points = flat_points(rng, dim) * 2.0**-285
-    return np.where(np.abs(points) < TINY, 0.0, points)
-
-
-KINDS = {
-    "random": random_points,
-    "lattice": lattice_points,
-    "flat": flat_points,
-    "tiny lattice": lambda rng, dim: lattice_points(rng, dim) * TINY,
-    "tiny grid": grid_points,
-    "tiny flat": tiny_flat_points,
-    "mixed": mixed_points,
-    "large flat": lambda rng, dim: flat_points(rng, dim) * 2.0**150,
-    "large lattice": lambda rng, dim: lattice_points(rng, dim) * 2.0**150,
-}
-
-
-def true_terms(rows):
-    """Return the products of a determinant as fractions, for points given as lists."""
-    *rows, last = [[Fraction(x) for x in row] for row in rows]
-    u = [[x - y for x, y in zip(row, last)] for row in rows]
-    if len(u) == 2:
-        return [u[0][0] * u[1][1], -u[0][1] * u[1][0]]
-    terms = []
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        terms += [u[0][i] * u[1][j] * u[2][k], -u[0][i] * u[1][k] * u[2][j]]
-    return terms
-
-
-def true_signs(points):
-    values = [sum(true_terms(rows)) for rows in points.tolist()]
-    return np.array([(x > 0) - (x < 0) for x in values])
-
-
-def find_signs(kernel, mode, points, device):
-    dtype = wp.vec3d if points.shape[2] == 3 else wp.vec2d
-    out = wp.zeros(len(points), dtype=wp.int32, device=device)
-    wp.launch(
-        kernel, dim=len(points), inputs=[int(mode), wp.array(points, dtype=dtype, device=device), out], device=device
-    )
-    return out.numpy()
+# --- signs ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -313,54 +230,6 @@ def test_double_words_keep_their_bound(device, kind, dim):
         off = abs(Fraction(value) - sum(terms))
         # The high word alone is returned.
         assert off <= Fraction(2) ** -53 * abs(Fraction(value)) + 20 * Fraction(2) ** -106 * sum(map(abs, terms))
-
-
-def lowest_power(x):
-    """Return the power of two of the lowest bit of a number that is not 0."""
-    x = Fraction(x)
-    return (x.numerator & -x.numerator).bit_length() - x.denominator.bit_length()
-
-
-def unit_of(rows):
-    """Return the power of two that a determinant is a whole multiple of, None where a row is 0."""
-    *rows, last = rows
-    powers = [[lowest_power(x) for x in [*row, *last] if x != 0] for row in rows]
-    return sum(map(min, powers)) if all(powers) else None
-
-
-@pytest.mark.parametrize("share", [1, 4])
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("kind", KINDS)
-def test_integers_tell_small_determinants(device, kind, dim, share):
-    """Right wherever they tell a sign of one within four times a bound, which they do within 2^122 units."""
-    points = KINDS[kind](np.random.default_rng([7, dim]), dim)
-    values = [sum(true_terms(rows)) for rows in points.tolist()]
-    # No larger than the bound, or than 4 times the bound.
-    bound = [float(abs(x)) / share for x in values]
-    bound = [np.nextafter(b, np.inf) if 4 * Fraction(b) < abs(x) or b == 0 else b for x, b in zip(values, bound)]
-    out = wp.zeros(len(points), dtype=int, device=device)
-    kernel, dtype = (integer3d_kernel, wp.vec3d) if dim == 3 else (integer2d_kernel, wp.vec2d)
-    arrays = [wp.array(bound, dtype=wp.float64, device=device), wp.array(points, dtype=dtype, device=device)]
-    wp.launch(kernel, len(points), [*arrays, out], device=device)
-    told = 0
-    for rows, value, b, sign in zip(points.tolist(), values, bound, out.numpy().tolist(), strict=True):
-        assert sign in ((value > 0) - (value < 0), int(UNSURE))
-        unit = unit_of(rows)
-        small = unit is None or Fraction(b) < Fraction(2) ** (unit + 122)
-        assert sign != int(UNSURE) or not small
-        told += small
-    assert told > 3 or kind == "random"
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_integers_leave_what_is_no_number(device, dim):
-    points = np.tile(np.eye(dim + 1, dim), (4, 1, 1))
-    points[1, 0, 0], points[2, dim, 1] = np.nan, np.inf
-    out = wp.zeros(4, dtype=int, device=device)
-    kernel, dtype = (integer3d_kernel, wp.vec3d) if dim == 3 else (integer2d_kernel, wp.vec2d)
-    bounds = wp.array([1.0, 1.0, 1.0, np.inf], dtype=wp.float64, device=device)
-    wp.launch(kernel, 4, [bounds, wp.array(points, dtype=dtype, device=device), out], device=device)
-    assert out.numpy().tolist() == [1, int(UNSURE), int(UNSURE), int(UNSURE)]
 
 
 @pytest.mark.parametrize("dim", [2, 3])
