@@ -3,7 +3,7 @@
 A row of differences is whole multiples of a power of two, the lowest bit set in any number of it, so the determinant is
 a whole multiple of the product G of its rows' powers. Computed modulo 2^128 it is right to the bit once it is known to
 lie within 2^126 G. Double words leave a sign open only where it lies within 2^-98 P, P its sum of magnitudes, so that
-is so wherever P < 2^224 G: unless coordinates of a row differ in magnitude by some 2^20.
+is so wherever P < 2^223 G: unless coordinates of a row differ in magnitude by some 2^19.
 """
 
 import warp as wp
