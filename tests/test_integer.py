@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import warp as wp
-from signs import KINDS, true_terms
+from signs import COUNT, KINDS, true_terms
 
 from warp_abtree.kernels.integer import integer_orient2d, integer_orient3d
 from warp_abtree.kernels.predicates import UNSURE
@@ -34,6 +34,17 @@ def unit_of(rows):
     *rows, last = rows
     powers = [[lowest_power(x) for x in [*row, *last] if x != 0] for row in rows]
     return sum(map(min, powers)) if all(powers) else None
+
+
+def spread_points(rng, dim):
+    """The first row is some 2^70 times a sum of the others, and a small rest: the last point's, which rounds nothing."""
+    last = rng.integers(-9, 10, (COUNT, 1, dim)).astype(float)
+    rows = rng.integers(-9, 10, (COUNT, dim - 1, dim)).astype(float)
+    first = (rng.integers(-9, 10, (COUNT, dim - 1, 1)) * rows).sum(1, keepdims=True)
+    return np.concatenate([first * 2.0 ** rng.integers(60, 100, (COUNT, 1, 1)), rows + last, last], 1)
+
+
+KINDS = KINDS | {"spread": spread_points}
 
 
 @pytest.mark.parametrize("share", [1, 4])
