@@ -37,11 +37,11 @@ def unit_of(rows):
 
 
 def spread_points(rng, dim):
-    """The first row is some 2^70 times a sum of the others, and a small rest: the last point's, which rounds nothing."""
+    """The first row is a large power of two times a sum of the others, less the last point, which rounds nothing."""
     last = rng.integers(-9, 10, (COUNT, 1, dim)).astype(float)
     rows = rng.integers(-9, 10, (COUNT, dim - 1, dim)).astype(float)
     first = (rng.integers(-9, 10, (COUNT, dim - 1, 1)) * rows).sum(1, keepdims=True)
-    return np.concatenate([first * 2.0 ** rng.integers(60, 100, (COUNT, 1, 1)), rows + last, last], 1)
+    return np.concatenate([first * 2.0 ** rng.integers(60, 200, (COUNT, 1, 1)), rows + last, last], 1)
 
 
 KINDS = KINDS | {"spread": spread_points}
