@@ -36,17 +36,20 @@ def error_axis(axis, what):
     axis.set_ylabel(what)
 
 
-def cost_axis(axis, label):
-    """Let an axis of times or counts be logarithmic, its ticks plain numbers."""
+def plain_ticks(axis, low, high):
+    """Let a logarithmic axis between two numbers have plain numbers as ticks, two at least and no more than fit."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+    steps = {6: (1, 1.5, 2, 3, 4, 5, 7), 30: (1, 2, 5), 300: (1, 3), np.inf: (1,)}
+    axis.set_major_locator(LogLocator(subs=next(subs for span, subs in steps.items() if high < span * low)))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def cost_axis(axis, label):
+    """Let an axis of times or counts be logarithmic, its ticks plain numbers."""
     axis.set_xscale("log")
-    low, high = axis.get_xlim()
-    axis.xaxis.set_major_locator(
-        LogLocator(subs=(1, 2, 5) if high < 15 * low else (1, 3) if high < 300 * low else (1,))
-    )
-    axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,g}"))
-    axis.xaxis.set_minor_formatter(NullFormatter())
+    plain_ticks(axis.xaxis, *axis.get_xlim())
     axis.set_xlabel(label)
 
 
@@ -172,6 +175,7 @@ def draw_dials(rows, figure):
         left.bar(place, y, width, color=COLOURS[k], hatch=hatch, edgecolor="white", label=f"{value:.0%} of the faces")
     left.set_xticks(range(len(names)), names)
     left.set_yscale("log")
+    plain_ticks(left.yaxis, *left.get_ylim())
     left.set_ylabel("time of a pose [µs], geometric mean")
     left.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     left.grid(False, axis="x")

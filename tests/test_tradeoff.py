@@ -1,6 +1,7 @@
 """The study of speed against accuracy: its measures on cases known by hand, and its parts at small sizes. No time is
 judged."""
 
+import itertools
 import math
 from types import SimpleNamespace
 
@@ -9,7 +10,15 @@ import pytest
 import trimesh
 
 import warp_abtree as ab
-from bench import tradeoff, tradeoff_dials, tradeoff_lods, tradeoff_peers, tradeoff_promise, tradeoff_tables
+from bench import (
+    tradeoff,
+    tradeoff_dials,
+    tradeoff_figures,
+    tradeoff_lods,
+    tradeoff_peers,
+    tradeoff_promise,
+    tradeoff_tables,
+)
 from bench.shapes import knot
 from bench.study import Context
 from bench.tradeoff_regions import (
@@ -227,6 +236,25 @@ def test_levels_of_detail(context):
     assert sum(row["missed"] for row in at) == coarse["missed"] and len(at) == 10
     (part,) = (part for part in tradeoff.PARTS if part.name == "lods")
     check_report(part, rows)
+
+
+@pytest.mark.parametrize("low, high", [(0.013, 0.0435), (0.05, 0.6), (1.1, 2.3), (0.4, 8.0), (20, 7000)])
+def test_ticks_of_costs_are_plain_numbers_that_do_not_overlap(low, high):
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("Agg")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 7.5), layout="constrained")
+    axis = figure.subplots(2, 2)[0, 0]
+    axis.plot([low, high], [1, 2])
+    tradeoff_figures.cost_axis(axis, "time")
+    figure.draw_without_rendering()
+    left, right = axis.get_xlim()
+    shown = [label for label in axis.get_xticklabels() if left <= label.get_position()[0] <= right]
+    assert 2 <= len(shown) <= 7
+    assert all(float(label.get_text().replace(",", "")) for label in shown)
+    boxes = sorted((label.get_window_extent() for label in shown), key=lambda box: box.x0)
+    assert all(one.x1 + 0.5 * one.height < other.x0 for one, other in itertools.pairwise(boxes))
 
 
 def check_report(part, rows):
