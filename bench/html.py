@@ -3,6 +3,7 @@
 import base64
 import csv
 import html as text
+import math
 import sys
 from pathlib import Path
 
@@ -47,6 +48,16 @@ def write_tables(finished, folder: Path):
                 writer = csv.writer(file)
                 writer.writerow([column.heading for column in table.columns])
                 writer.writerows([[row.get(column.name) for column in table.columns] for row in rows])
+
+
+def plain_ticks(axis, low, high):
+    """Let a logarithmic axis between two numbers have plain numbers as ticks, two at least and no more than fit."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    steps = {6: (1, 1.5, 2, 3, 4, 5, 7), 30: (1, 2, 5), 300: (1, 3), math.inf: (1,)}
+    axis.set_major_locator(LogLocator(subs=next(subs for span, subs in steps.items() if high < span * low)))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def draw_figures(finished, folder: Path) -> dict:

@@ -8,7 +8,7 @@ import numpy as np
 import warp_abtree as ab
 
 from . import update
-from .html import COLOURS, MARKERS, STYLES
+from .html import COLOURS, MARKERS, STYLES, plain_ticks
 from .memory import count_bytes
 from .paper_setup import paper_models
 from .parts import Claim, Column, Figure, Part, Table, pick
@@ -271,8 +271,8 @@ def draw_cache(rows, figure):
         axes.set(xlabel="levels of detail", ylabel=unit)
         axes.set_xticks(COUNTS, [str(count) for count in COUNTS])
         axes.minorticks_off()
-        axes.legend(fontsize=7)
-        axes.margins(y=0.25)
+        plain_ticks(axes.yaxis, *axes.get_ylim())
+        axes.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
 
 
 CACHE = Part(

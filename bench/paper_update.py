@@ -162,6 +162,7 @@ def draw_figure_6(rows, figure):
             [row["k"] for row in whole], [row["full_ms"] for row in whole], "--", color=COLOURS[6], label="full refit"
         )
         top.set(title=f"{name}: r = {fits[name]['correlation']:.3f}", xlabel="k [faces]", ylim=(0, None))
+        top.locator_params(axis="x", nbins=4)
         low = axes[1][column]
         low.loglog(k, [row["nodes"] for row in moves], MARKERS[0], color=COLOURS[0], label="counted, LOD change")
         low.loglog(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .html import COLOURS, MARKERS, STYLES
+from .html import COLOURS, MARKERS, STYLES, plain_ticks
 from .parts import pick
 from .tradeoff_peers import COACD, HULL, NEWTON_SDF, OURS, OURS_WITHIN, SIMPLIFIED, VHACD
 from .tradeoff_tables import group, over_meshes
@@ -34,16 +34,6 @@ def error_axis(axis, what):
     axis.yaxis.set_minor_locator(NullLocator())
     axis.set_ylim(-0.3 * LOWEST, 150)
     axis.set_ylabel(what)
-
-
-def plain_ticks(axis, low, high):
-    """Let a logarithmic axis between two numbers have plain numbers as ticks, two at least and no more than fit."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    steps = {6: (1, 1.5, 2, 3, 4, 5, 7), 30: (1, 2, 5), 300: (1, 3), np.inf: (1,)}
-    axis.set_major_locator(LogLocator(subs=next(subs for span, subs in steps.items() if high < span * low)))
-    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,g}"))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def cost_axis(axis, label):
