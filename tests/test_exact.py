@@ -141,21 +141,24 @@ def work_of(result):
 def test_scaling_by_powers_of_two_changes_no_bit(device):
     """Every power from 2^-60 to 2^60, in one batch: the same faces after the same tests of each kind."""
     rng = np.random.default_rng(4)
-    meshes = [SHAPES[name]() for name in ("crumbs", "small ball")]
+    meshes = [SHAPES[name]() for name in ("crumbs", "small ball", "grid")]
     models = [ab.Model.from_arrays(*mesh, base_faces=10**6) for mesh in meshes]
     poses = contact_poses(rng, models[0], models[0].lod_max, models[1], models[1].lod_max, spread=5.0)
     twin = poses[0]
+    beside = np.array(STILL) + (0.3, 0.1, 0, 0, 0, 0, 0)  # in the same plane, no corner in common
     cases = []
     for k in range(-60, 61):
         by = np.array([2.0**k] * 3 + [1.0] * 4)
-        a, b = (ab.Model.from_arrays(np.ldexp(v, k), f, base_faces=10**6) for v, f in meshes)
+        a, b, sheet = (ab.Model.from_arrays(np.ldexp(v, k), f, base_faces=10**6) for v, f in meshes)
         cases += [(a, None, poses[0] * by, b, None, poses[1] * by), (a, None, twin * by, a, None, twin * by)]
+        cases.append((sheet, None, STILL, sheet, None, beside * by))
     result = ask(device, cases)
-    for first in (0, 1):
-        work = work_of(result)[first::2]
+    # Faces that meet, and tests of boxes, faces, in float64 and by exact signs: so many at least.
+    for first, least in enumerate([(20, 20, 20, 0, 0), (20, 20, 20, 1, 0), (20, 20, 20, 20, 20)]):
+        work = work_of(result)[first::3]
         np.testing.assert_array_equal(work, np.broadcast_to(work[0], work.shape))
-        assert (work[0] > (20, 20, 20, 0 if first else -1, -1)).all()
-        faces = [result.faces[result.faces[:, 0] == p][:, 1:] for p in range(first, len(cases), 2)]
+        assert (work[0] >= least).all()
+        faces = [result.faces[result.faces[:, 0] == p][:, 1:] for p in range(first, len(cases), 3)]
         for other in faces:
             np.testing.assert_array_equal(other, faces[0])
 
@@ -246,9 +249,11 @@ def test_batches_buffers_and_precisions_do_not_matter(device):
         scene.add(sample(name), random_poses(rng, 1, 0.5)[0])
     scene.add(sample("twins"), STILL)
     scene.add(sample("twins"), STILL)
-    pairs = np.array([(i, j) for i in range(8) for j in range(8) if i != j])
+    scene.add(sample("grid"), STILL)
+    scene.add(sample("grid"), np.array(STILL) + (0.3, 0.1, 0, 0, 0, 0, 0))  # in one plane
+    pairs = np.array([(i, j) for i in range(10) for j in range(10) if i != j])
     whole = scene.intersect(pairs, output="faces")
-    assert whole.float64_tests.sum() > 100
+    assert whole.float64_tests.sum() > whole.exact_tests.sum() > 100
     for trial in range(6):
         order = rng.permutation(len(pairs))
         capacities = rng.integers(1, 2 * whole.float64_tests.sum(), 2)
