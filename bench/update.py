@@ -101,7 +101,7 @@ def set_lods(scene, lods, share):
         refine.active_update = original
     (batch,) = batches
     models, states, _ = scene.arrays()
-    targets = states.pool.lod
+    targets = wp.clone(states.pool.lod)  # the next update writes in place
 
     def launch():
         for name in ("changed_count", "marked_count", "level_count"):

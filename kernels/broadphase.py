@@ -3,6 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.boxes import round_down, round_up
+from warp_abtree.kernels.generation import LaunchRecord, is_stale
 from warp_abtree.kernels.nodes import load_node
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 
@@ -17,11 +18,16 @@ def pose_box_kernel(
     models: ModelPool,
     states: StatePool,
     objects: ObjectPool,
+    record: LaunchRecord,
     lower_out: wp.array(dtype=wp.vec3),
     upper_out: wp.array(dtype=wp.vec3),
 ):
-    """Box the posed root box of each object in the world, rounded outwards."""
+    """Box the posed root box of each object in the world, rounded outwards; a stale launch boxes points apart."""
     i = wp.tid()
+    if is_stale(record):
+        lower_out[i] = wp.vec3(wp.float32(i), 0.0, 0.0)
+        upper_out[i] = lower_out[i]
+        return
     state = objects.state[i]
     root = load_node(states, states.node_start[state] + 1)
     lower = wp.vec3d(root.lower)

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from warp_abtree.kernels.generation import LaunchRecord, record_launch
+from warp_abtree.kernels.place import is_quaternion_pose, read_position, read_quaternion
 from warp_abtree.kernels.plan import note_fault
 from warp_abtree.kernels.pools import ObjectPool
 from warp_abtree.kernels.pose import rotate_quaternion
@@ -26,6 +28,7 @@ def place_object_kernel(
     poses: wp.array2d(dtype=wp.float64),
     objects_inout: ObjectPool,
     faults_inout: wp.array(dtype=wp.int32),
+    record_inout: LaunchRecord,
 ):
     """Set rotation and position from x y z qx qy qz qw, one row an object; a bad row moves nothing and is a fault.
 
@@ -34,13 +37,11 @@ def place_object_kernel(
         faults_inout: As `note_fault`, by object.
     """
     i = wp.tid()
-    position = wp.vec3d(poses[i, 0], poses[i, 1], poses[i, 2])
-    q = wp.vec4d(poses[i, 3], poses[i, 4], poses[i, 5], poses[i, 6])
-    finite = wp.isfinite(position[0]) and wp.isfinite(position[1]) and wp.isfinite(position[2])
-    # Written so that NaN is refused too.
-    if finite and wp.abs(wp.length(q) - wp.float64(1.0)) <= tolerance:
-        objects_inout.position[i] = position
-        objects_inout.rotation[i] = rotate_quaternion(q)
+    if i == 0:
+        record_launch(record_inout)
+    if is_quaternion_pose(tolerance, poses, i):
+        objects_inout.position[i] = read_position(poses, i)
+        objects_inout.rotation[i] = rotate_quaternion(read_quaternion(poses, i))
     else:
         note_fault(faults_inout, i)
 
@@ -50,12 +51,15 @@ def tally_demand_kernel(
     pair_count: wp.array(dtype=wp.int32),
     hit_total: wp.array(dtype=wp.int32),
     unsure_total: wp.array(dtype=wp.int32),
+    launched: wp.array(dtype=wp.int32),
     demand_inout: wp.array(dtype=wp.int64),
 ):
     """Keep the greatest demand of any frame: object pairs, face pairs that meet, face pairs that float32 leaves open.
 
+    The last entry becomes 1 once a frame was stale (`LaunchRecord.launched`).
     Counts past 2^31 are kept, since one thread a pair or hit takes an int32 past its sign bit, not around.
     """
     demand_inout[0] = wp.max(demand_inout[0], wp.int64(wp.uint32(pair_count[0])))
     demand_inout[1] = wp.max(demand_inout[1], wp.int64(wp.uint32(hit_total[0])))
     demand_inout[2] = wp.max(demand_inout[2], wp.int64(wp.uint32(unsure_total[0])))
+    demand_inout[3] = wp.max(demand_inout[3], wp.int64(launched[1]))

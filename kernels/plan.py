@@ -14,6 +14,9 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 LIST_SHIFT = wp.constant(wp.int64(32))
 ITEM_MASK = wp.constant(wp.int64(2**32 - 1))
 
+# LOD of a state whose last update was interrupted.
+UNKNOWN = wp.constant(-1)
+
 
 @wp.struct
 class UpdatePlan:
@@ -145,6 +148,9 @@ def plan_update_kernel(
     if lod == old:
         return
     states_inout.lod[s] = lod
+    if old == UNKNOWN:
+        list_full(plan_inout, s, models.face_count[model], splits.depth[model])
+        return
     at = splits.bound_start[model]
     begin = splits.bound[at + wp.min(lod, old)]
     length = splits.bound[at + wp.max(lod, old)] - begin

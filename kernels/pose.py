@@ -185,11 +185,3 @@ def rotate_quaternion(q: wp.vec4d):
         two * (y * z + x * w),
         one - two * (x * x + y * y),
     )
-
-
-@wp.kernel
-def set_pose_kernel(poses: wp.array2d(dtype=wp.float64), objects_inout: ObjectPool):
-    """Set rotation and position from x y z qx qy qz qw [world units, unit quaternion], one row an object."""
-    i = wp.tid()
-    objects_inout.position[i] = wp.vec3d(poses[i, 0], poses[i, 1], poses[i, 2])
-    objects_inout.rotation[i] = rotate_quaternion(wp.vec4d(poses[i, 3], poses[i, 4], poses[i, 5], poses[i, 6]))

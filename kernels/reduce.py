@@ -131,6 +131,19 @@ def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_in
     sums_inout.normal[c] = normal
 
 
+@wp.func_native("""
+    // NumPy's NaN: devices differ in the sign and payload of the NaN that they make.
+    union {
+        long long bits;
+        wp::float64 x;
+    } nan = {0x7ff8000000000000ll};
+    return wp::vec_t<3, wp::float64>(nan.x, nan.x, nan.x);
+""")
+def no_vector() -> wp.vec3d:
+    """Return three NaNs of the bits 0x7ff8000000000000 on every device."""
+    ...
+
+
 @wp.kernel
 def average_contact_kernel(
     models: ModelPool,
@@ -143,9 +156,8 @@ def average_contact_kernel(
 ):
     """Sum one object pair's chunks a thread to its mean point and normal; NaN for a pair without contacts."""
     p = wp.tid()
-    nan = wp.float64(wp.nan)
     point = wp.vec3d()
-    n = wp.vec3d(nan, nan, nan)
+    n = no_vector()
     c = first_chunk(p, start)
     end = end_chunk(p, start)
     if c < end:
@@ -276,8 +288,7 @@ def measure_depth_kernel(
     p = wp.tid()
     first = start[p]
     if first == start[p + 1]:
-        nan = wp.float64(wp.nan)
-        pair_contacts_inout.point[p] = wp.vec3d(nan, nan, nan)
+        pair_contacts_inout.point[p] = no_vector()
         pair_contacts_inout.depth[p] = wp.float64(0.0)
         return
     origin = contacts.p0[first]

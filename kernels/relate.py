@@ -4,9 +4,10 @@ import warp as wp
 
 from warp_abtree.kernels.distance import DISTANCE_MAX, pad_distance
 from warp_abtree.kernels.faces import OUTPUT_ANY, Hits
+from warp_abtree.kernels.generation import LaunchRecord, is_stale, record_launch
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pair_pose
-from warp_abtree.kernels.share import Work, part_count
+from warp_abtree.kernels.share import NO_UNIT, Work, part_count
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -21,27 +22,32 @@ def relate_pair_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
     within: wp.array(dtype=wp.float64),
+    record_inout: LaunchRecord,
     pair_pose_out: wp.array(dtype=PairPose),
     hits_out: Hits,
     work_out: Work,
 ):
     """Compute the pose of B in A's frame once a pair, A the smaller index, and clear what the traversal counts.
 
+    A stale launch finds nothing, and reads no tree: its states may be half changed.
+
     Args:
         within: Distances [world units] that boxes are to be widened by, shape [pair]; [0] for intersection.
     """
     p = wp.tid()
     count = wp.min(pair_count[0], pairs.shape[0])
+    stale = is_stale(record_inout)
     if p < work_out.flag.shape[0]:
         work_out.flag[p] = 0
     if p == 0:
         work_out.counter[0] = 0
         work_out.counter[1] = 0
-        work_out.counter[2] = count * part_count(parts_max, count)
-        work_out.counter[3] = 0
+        work_out.counter[2] = wp.where(stale, 0, count * part_count(parts_max, count))
+        work_out.counter[3] = wp.where(stale, NO_UNIT, 0)
     if p >= pairs.shape[0]:
         return
     if p == 0:
+        record_launch(record_inout)
         hits_out.total[0] = 0
         hits_out.unsure_total[0] = 0
         hits_out.hard_total[0] = 0
@@ -51,7 +57,7 @@ def relate_pair_kernel(
     hits_out.triangle_tests[p] = wp.int64(0)
     hits_out.float64_tests[p] = wp.int64(0)
     hits_out.exact_tests[p] = wp.int64(0)
-    if p >= count:
+    if p >= count or stale:
         return
     a = wp.min(pairs[p][0], pairs[p][1])
     b = wp.max(pairs[p][0], pairs[p][1])

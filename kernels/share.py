@@ -22,6 +22,9 @@ SHARES_AT_ONCE = wp.constant(3)
 MAILBOX_ITEMS = 32
 COUNTER_COUNT = 4
 
+# More than there are units of any launch: as the number of units taken, it leaves none.
+NO_UNIT = wp.constant(2**30)
+
 
 @wp.struct
 class Work:

@@ -5,6 +5,14 @@ from typing import Any
 import warp as wp
 
 from warp_abtree.kernels.faces import Hits
+from warp_abtree.kernels.place import (
+    is_matrix_pose,
+    is_quaternion_pose,
+    read_column,
+    read_position,
+    read_quaternion,
+    read_rotation,
+)
 from warp_abtree.kernels.pools import ObjectPool
 from warp_abtree.kernels.pose import rotate_quaternion
 
@@ -17,8 +25,17 @@ REFUSED = wp.constant(0)  # first pose that is none, NONE_REFUSED if all are
 UNSURE = wp.constant(1)  # face pairs that float32 left open
 
 
+@wp.func
+def refuse_pose(objects: ObjectPool, report: wp.array(dtype=wp.int32), i: wp.int32):
+    """Note that row i is no pose, and place its object where it meets nothing."""
+    far = wp.float64(wp.nan)
+    objects.position[i + 1] = wp.vec3d(far, far, far)
+    objects.rotation[i + 1] = wp.identity(n=3, dtype=wp.float64)
+    wp.atomic_min(report, REFUSED, i)
+
+
 @wp.kernel
-def place_poses_kernel(
+def place_quaternion_kernel(
     tolerance: wp.float64,
     poses: wp.array2d(dtype=Any),
     objects_inout: ObjectPool,
@@ -26,29 +43,42 @@ def place_poses_kernel(
 ):
     """Set objects 1, 2, ... from x y z qx qy qz qw, and note the first row that is no pose.
 
-    Such a row is placed where it meets nothing.
-
     Args:
         tolerance: How far the norm of a quaternion may be off 1.
         poses: float32 or float64, shape [capacity, 7].
     """
     i = wp.tid()
-    x = wp.vec3d(wp.float64(poses[i, 0]), wp.float64(poses[i, 1]), wp.float64(poses[i, 2]))
-    q = wp.vec4d(wp.float64(poses[i, 3]), wp.float64(poses[i, 4]), wp.float64(poses[i, 5]), wp.float64(poses[i, 6]))
-    norm = wp.sqrt(((q[0] * q[0] + q[1] * q[1]) + q[2] * q[2]) + q[3] * q[3])
-    finite = wp.isfinite(x[0]) and wp.isfinite(x[1]) and wp.isfinite(x[2])
-    if finite and wp.abs(norm - wp.float64(1.0)) <= tolerance:
-        objects_inout.position[i + 1] = x
-        objects_inout.rotation[i + 1] = rotate_quaternion(q)
+    if is_quaternion_pose(tolerance, poses, i):
+        objects_inout.position[i + 1] = read_position(poses, i)
+        objects_inout.rotation[i + 1] = rotate_quaternion(read_quaternion(poses, i))
     else:
-        far = wp.float64(wp.nan)
-        objects_inout.position[i + 1] = wp.vec3d(far, far, far)
-        objects_inout.rotation[i + 1] = wp.identity(n=3, dtype=wp.float64)
-        wp.atomic_min(report_inout, REFUSED, i)
+        refuse_pose(objects_inout, report_inout, i)
 
 
-for _real in (wp.float32, wp.float64):
-    wp.overload(place_poses_kernel, {"poses": wp.array2d(dtype=_real)})
+@wp.kernel
+def place_matrix_kernel(
+    tolerance: wp.float64,
+    poses: wp.array2d(dtype=Any),
+    objects_inout: ObjectPool,
+    report_inout: wp.array(dtype=wp.int32),
+):
+    """Set objects 1, 2, ... from rigid 4x4 matrices, taken as they are, and note the first row that is none.
+
+    Args:
+        tolerance: How far R^T R may be off the identity.
+        poses: float32 or float64, shape [capacity, 16].
+    """
+    i = wp.tid()
+    if is_matrix_pose(tolerance, poses, i):
+        objects_inout.position[i + 1] = read_column(poses, i)
+        objects_inout.rotation[i + 1] = read_rotation(poses, i)
+    else:
+        refuse_pose(objects_inout, report_inout, i)
+
+
+for _kernel in (place_quaternion_kernel, place_matrix_kernel):
+    for _real in (wp.float32, wp.float64):
+        wp.overload(_kernel, {"poses": wp.array2d(dtype=_real)})
 
 
 @wp.kernel

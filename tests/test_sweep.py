@@ -149,7 +149,8 @@ def test_refused(device):
     torus, poses = sample("torus"), np.array([STILL, STILL], float)
     for what, error, options in (
         ("shape", ValueError, {"poses": poses[:, :6]}),
-        ("shape", ValueError, {"poses": np.tile(np.eye(4), (3, 1, 1))}),
+        ("shape", ValueError, {"poses": np.tile(np.eye(4), (3, 1, 1))[:, :3]}),
+        ("matrix 2 is not rigid", ValueError, {"poses": np.eye(4) * [[[1.0]], [[1.0]], [[2.0]]]}),
         ("no real numbers", ValueError, {"poses": poses.astype(complex)}),
         ("LOD", ValueError, {"lod_b": torus.lod_max + 1}),
         ("output 'all'", ValueError, {"output": "all"}),

@@ -2,6 +2,7 @@
 
 from warp_abtree.broadphase import CapacityError
 from warp_abtree.cascade import Cascade, CascadeResult, intersect_originals
+from warp_abtree.checks import wrap_array
 from warp_abtree.clock import ReplayClock, WorkClock
 from warp_abtree.cluster import RayPool, WorldsJob
 from warp_abtree.collision_manager import CollisionManager
@@ -10,7 +11,7 @@ from warp_abtree.control import Feedback, PaperController, PredictiveController,
 from warp_abtree.dynamics import Dynamics, Kinematic
 from warp_abtree.frame import Frame, FrameRow, LodSweep, judge_budget, judge_step, resolve_lod
 from warp_abtree.frame_graph import FrameGraph
-from warp_abtree.interop import PoseInput, scene_from_file, scene_from_trimesh, to_trimesh, wrap_array
+from warp_abtree.interop import PoseInput, scene_from_file, scene_from_trimesh, to_trimesh
 from warp_abtree.intersect import Query, Result
 from warp_abtree.lod import Camera, Ladder
 from warp_abtree.manifold import ManifoldQuery

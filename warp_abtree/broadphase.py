@@ -3,6 +3,8 @@
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks import check_device
+from warp_abtree.generation import LaunchGuard
 from warp_abtree.kernels import broadphase
 from warp_abtree.state import ModelArrays, ObjectArrays, StateArrays
 
@@ -19,6 +21,7 @@ class BroadPhase:
     Attributes:
         pairs: (i, j), i < j, in no order, device vec2i (capacity,).
         pair_count: Pairs found, device int32 (1,); keeps counting past the capacity.
+        guard: `LaunchGuard` of what launches it; a query takes its own.
     """
 
     def __init__(self, models: ModelArrays, states: StateArrays, objects: ObjectArrays, excluded, capacity=None):
@@ -26,6 +29,7 @@ class BroadPhase:
         self.states = states
         self.objects = objects
         self.device = device = states.device
+        check_device(device, "making a broad phase")
         count = objects.pool.state.shape[0]
         worlds = objects.pool.world.numpy()
         names, group = np.unique(worlds, return_inverse=True)
@@ -36,25 +40,20 @@ class BroadPhase:
         self.group = wp.array(group.astype(np.int32), dtype=wp.int32, device=device)
         self.excluded = wp.array(excluded, dtype=wp.int64, device=device)
         self.pair_count = wp.zeros(1, dtype=wp.int32, device=device)
-        self.bvh: wp.Bvh | None = None
+        self.guard = LaunchGuard(device, states.generation, objects.filter_generation)
         self.resize(capacity or max(64, 4 * count))
+        self._launch_boxes()
+        # Made here, since no graph can capture it.
+        self.bvh = wp.Bvh(self.lower, self.upper, groups=self.group)
 
     def resize(self, capacity: int):
         """Make room for a number of pairs."""
         self.pairs = wp.empty(capacity, dtype=wp.vec2i, device=self.device)
 
     def launch(self):
-        """Box, build and query; launches only (on CUDA the second time on, so that a graph can capture it)."""
-        wp.launch(
-            broadphase.pose_box_kernel,
-            dim=len(self.lower),
-            inputs=[self.models.pool, self.states.pool, self.objects.pool, self.lower, self.upper],
-            device=self.device,
-        )
-        if self.bvh is None:
-            self.bvh = wp.Bvh(self.lower, self.upper, groups=self.group)
-        else:
-            self.bvh.rebuild()
+        """Box, rebuild and query. Launches only, so that a graph can capture it."""
+        self._launch_boxes()
+        self.bvh.rebuild()
         self.pair_count.zero_()
         wp.launch(
             broadphase.find_pair_kernel,
@@ -72,6 +71,11 @@ class BroadPhase:
             ],
             device=self.device,
         )
+
+    def _launch_boxes(self):
+        pools = [self.models.pool, self.states.pool, self.objects.pool]
+        inputs = [*pools, self.guard.record(), self.lower, self.upper]
+        wp.launch(broadphase.pose_box_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
 
     def count_found(self) -> int:
         """Return how many pairs the last launch found. Waits for the device.

@@ -1,16 +1,94 @@
 """Checks of what a caller hands in: one clear error that names what and where, before anything is changed."""
 
+import os
+
 import numpy as np
+import warp as wp
+
+# Process in which the library first looked for a device, and so started Warp.
+_started_in: int | None = None
+
+
+def check_device(device, what: str | None = None):
+    """Refuse a device that cannot be used in this process, or where a graph is being captured.
+
+    Args:
+        what: A call that waits for the device or allocates, which no graph can capture; None for a launch.
+
+    Raises:
+        RuntimeError: The device is a GPU and the process was forked from one that had started Warp; or a graph is
+            being captured.
+    """
+    global _started_in
+    _started_in = _started_in or os.getpid()
+    if device.is_cuda and os.getpid() != _started_in:
+        raise RuntimeError(
+            f"{device} cannot be used in a process forked after Warp started: CUDA does not survive a fork; "
+            "start workers by spawn, as multiprocessing.get_context('spawn') does"
+        )
+    if what is not None and device.is_capturing:
+        raise RuntimeError(f"{what} cannot be captured in a graph; call it before the capture begins")
+
+
+def wrap_array(values, what="array"):
+    """Return an array of any framework as a Warp array on the same memory.
+
+    Args:
+        values: Warp, PyTorch, JAX, CuPy or NumPy array, or anything else that speaks DLPack or has
+            `__cuda_array_interface__`. A tensor that requires gradients is taken without them.
+
+    Raises:
+        ValueError: It is none, or its memory cannot be shared.
+    """
+    if isinstance(values, wp.array):
+        return values
+    try:
+        if isinstance(values, np.ndarray):
+            # In place of DLPack, which NumPy refuses for arrays that are read-only.
+            return wp.array(values, dtype=wp.dtype_from_numpy(values.dtype), device="cpu", copy=False)
+        if getattr(values, "requires_grad", False):
+            values = values.detach()
+        if hasattr(values, "__dlpack__"):
+            return wp.from_dlpack(values)
+        if hasattr(values, "__cuda_array_interface__"):
+            return _wrap_cuda_array(values)
+    except (RuntimeError, TypeError, BufferError, ValueError, KeyError) as error:
+        raise ValueError(f"{what}: its memory cannot be shared ({first_line(error)})") from None
+    raise ValueError(f"{what}: a {type(values).__name__} is no array that can share its memory")
+
+
+def _wrap_cuda_array(values):
+    """Wrap what has `__cuda_array_interface__` but no DLPack, such as an array of Numba, on the current GPU."""
+    described, device = values.__cuda_array_interface__, wp.get_cuda_device()
+    if described.get("stream") is not None:
+        wp.synchronize_device(device)
+    dtype, shape = wp.dtype_from_numpy(np.dtype(described["typestr"])), described["shape"]
+    strides, address = described.get("strides"), described["data"][0]
+    # Warp calls the deleter when the last view goes: till then it holds the owner of the memory.
+    return wp.array(
+        ptr=address, dtype=dtype, shape=shape, strides=strides, device=device, deleter=lambda *_, owner=values: None
+    )
+
+
+def is_device_array(values) -> bool:
+    """Return whether an array of some framework lies on a GPU, or is Warp's."""
+    if isinstance(values, np.ndarray):
+        return False
+    if isinstance(values, wp.array) or hasattr(values, "__cuda_array_interface__"):
+        return True
+    return hasattr(values, "__dlpack_device__") and int(values.__dlpack_device__()[0]) != 1  # kDLCPU
 
 
 def to_numpy(values, what: str) -> np.ndarray:
     """Return an array of any framework, or a sequence, as a NumPy array of real numbers.
 
+    What lies on a GPU is copied. (synchronization point)
+
     Raises:
         ValueError: It is no array of numbers.
     """
-    if hasattr(values, "numpy") and not isinstance(values, np.ndarray):
-        values = values.numpy()
+    if not isinstance(values, np.ndarray) and (is_device_array(values) or hasattr(values, "__dlpack__")):
+        values = wrap_array(values, what).numpy()
     try:
         array = np.asarray(values)
     except (ValueError, TypeError) as error:

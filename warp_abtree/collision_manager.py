@@ -7,7 +7,8 @@ import numpy as np
 
 from warp_abtree.convex import Shape, shape_of
 from warp_abtree.nearest import find_nearest
-from warp_abtree.scene import Scene, check_poses
+from warp_abtree.poses import check_poses
+from warp_abtree.scene import Scene
 
 EXTERNAL = "__external"  # the name that trimesh gives to what is not in the manager
 # Places of objects that went are kept for others of the same mesh, so many or as many as there are objects.
@@ -106,7 +107,7 @@ class CollisionManager:
         self._scene = scene
         self._shapes: list[Shape] = []
         self._spare: dict[Shape, list[int]] = {}
-        self._poses = np.empty((8, 4, 4))
+        self._poses = np.tile(np.eye(4), (8, 1, 1))
         self._moved = False
 
     @property
@@ -121,10 +122,12 @@ class CollisionManager:
         if spare:
             slot = spare.pop()
         else:
-            slot = self._scene.add(shape.model, matrix)
-            self._shapes.append(shape)
+            slot = self._scene.object_count
             if slot == len(self._poses):
-                self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
+                self._poses = np.concatenate([self._poses, np.tile(np.eye(4), (slot, 1, 1))])
+            # First, so that an interruption leaves no object without a shape.
+            self._shapes[slot:] = [shape]
+            self._scene.add(shape.model, matrix)
         self._poses[slot] = matrix
         self._moved = True
         return slot

@@ -37,7 +37,7 @@ contacts of each chunk of 32, the last chunk perhaps shorter, from left to right
   leans over, and depth can be several times too large; for separate regions of contact and for open surfaces it is
   merely a length.
 
-A pair without contacts has depth 0 and NaN as point and normal. The results are the same, bit for bit, on CPU and
+A pair without contacts has depth 0 and NaN as point and normal, of the bits 0x7ff8000000000000. The results are the same, bit for bit, on CPU and
 CUDA. For a pair named the other way the contacts differ in nothing but order, exchanged ends and signs; sums follow the
 order of the faces as named, so that its summary may differ in the last bits too.
 """
@@ -146,17 +146,17 @@ class ContactQuery(Query):
         """
         if capacity >= 2**30:
             raise CapacityError(f"{capacity} face pairs asked, a contact query has room for fewer than 2^30")
-        made = [(self, "faces", self._empty(capacity, wp.vec3i))]
+        self._replace([*self._place_arrays(capacity), (self, "_places", capacity)])
+
+    def _place_arrays(self, capacity: int) -> list:
+        """Return (owner, attribute, new array) of whatever has an entry a contact."""
+        made = [(self.hits, "face", self._empty(capacity, wp.vec3i)), (self, "faces", self._empty(capacity, wp.vec3i))]
         made += [(self.contacts, name, self._empty(capacity, wp.vec3d)) for name in VECTORS]
         made.append((self.contacts, "coplanar", self._empty(capacity, wp.int32)))
         # The sort takes as much again as scratch.
         made.append((self, "_key", self._empty(2 * capacity, wp.int64)))
         made.append((self, "_order", self._empty(2 * capacity, wp.int32)))
-        made += self._chunk_arrays(self._chunk_count(capacity, len(self.pairs)))
-        super().resize(capacity)
-        self._places = capacity
-        for owner, name, array in made:
-            setattr(owner, name, array)
+        return made + self._chunk_arrays(self._chunk_count(capacity, len(self.pairs)))
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
@@ -198,7 +198,7 @@ class ContactQuery(Query):
         self._find()
         self._reduce()
 
-    def _launch(self, kernel, dim, inputs):
+    def _launch_kernel(self, kernel, dim, inputs):
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
 
     def _passes(self):
@@ -214,27 +214,27 @@ class ContactQuery(Query):
         total, face = self.hits.total, self.hits.face
         for number, widths in enumerate(self._passes()):
             inputs = [room, wp.vec3i(*widths), number == 0, total, face, self._order, self._key]
-            self._launch(order.make_key_kernel, capacity, inputs)
+            self._launch_kernel(order.make_key_kernel, capacity, inputs)
             with wp.ScopedDevice(self.device):
                 wp.utils.radix_sort_pairs(self._key, self._order, capacity, end_bit=sum(widths))
-        self._launch(order.place_row_kernel, capacity, [total, face, self._order, self.faces])
-        self._launch(order.start_pair_kernel, room + 1, [capacity, sum(widths[1:]), self._key, self.start])
+        self._launch_kernel(order.place_row_kernel, capacity, [total, face, self._order, self.faces])
+        self._launch_kernel(order.start_pair_kernel, room + 1, [capacity, sum(widths[1:]), self._key, self.start])
 
     def _find(self):
         posed = [*(arrays.pool for arrays in self.arrays), self.pairs, self.pair_poses]
-        self._launch(contact.find_contact_kernel, self._places, [*posed, self.start, self.faces, self.contacts])
+        self._launch_kernel(contact.find_contact_kernel, self._places, [*posed, self.start, self.faces, self.contacts])
 
     def _reduce(self):
         room, chunks = len(self.pairs), len(self._sums.span)
         pools = [arrays.pool for arrays in self.arrays]
         start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
-        self._launch(reduce.sum_length_kernel, chunks, [start, contacts, sums])
-        self._launch(reduce.total_length_kernel, room, [start, sums])
-        self._launch(reduce.sum_mean_kernel, chunks, [start, contacts, sums])
-        self._launch(reduce.average_contact_kernel, room, [*pools, self.pairs, start, sums, means])
+        self._launch_kernel(reduce.sum_length_kernel, chunks, [start, contacts, sums])
+        self._launch_kernel(reduce.total_length_kernel, room, [start, sums])
+        self._launch_kernel(reduce.sum_mean_kernel, chunks, [start, contacts, sums])
+        self._launch_kernel(reduce.average_contact_kernel, room, [*pools, self.pairs, start, sums, means])
         posed = [*pools, self.pairs, self.pair_poses]
-        self._launch(reduce.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
-        self._launch(reduce.measure_depth_kernel, room, [*pools, self.pairs, start, contacts, sums, means])
+        self._launch_kernel(reduce.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
+        self._launch_kernel(reduce.measure_depth_kernel, room, [*pools, self.pairs, start, contacts, sums, means])
 
     def result(self) -> ContactResult:
         """Return faces, contacts and summaries of the last launch on the host. Waits for the device."""

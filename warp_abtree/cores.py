@@ -2,7 +2,7 @@
 
 import functools
 import os
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import warp as wp
 
@@ -20,6 +20,11 @@ def _workers(count: int):
     return ThreadPoolExecutor(count, thread_name_prefix="warp_abtree")
 
 
+if hasattr(os, "register_at_fork"):
+    # Threads do not come along into a forked child: it would wait for ever for those of its parent.
+    os.register_at_fork(after_in_child=_workers.cache_clear)
+
+
 def launch_on_cores(kernel, count, inputs, device, cores, least=1):
     """Launch a kernel on several threads of the CPU, which share a number of items; waits for them.
 
@@ -35,9 +40,24 @@ def launch_on_cores(kernel, count, inputs, device, cores, least=1):
         cores = 1
     if cores > 1:
         wp.load_module(kernel.module, device)  # modules load on one thread
-    deal = [_workers(cores - 1).submit(wp.launch, kernel, dim=1, inputs=inputs, device=device) for _ in range(1, cores)]
+    deal = []
     try:
+        for _ in range(1, cores):
+            deal.append(_workers(cores - 1).submit(wp.launch, kernel, dim=1, inputs=inputs, device=device))
         wp.launch(kernel, dim=1, inputs=inputs, device=device)
     finally:
-        for job in deal:
-            job.result()
+        _wait_for(deal)
+    for job in deal:
+        job.result()
+
+
+def _wait_for(jobs):
+    """Wait until no thread touches the arrays of a launch any more, whatever interrupts that; raise it then."""
+    interruption = None
+    while not all(job.done() for job in jobs):
+        try:
+            wait(jobs)
+        except BaseException as error:
+            interruption = error
+    if interruption is not None:
+        raise interruption

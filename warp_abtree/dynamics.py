@@ -31,6 +31,7 @@ is taken away under a sleeping body does not wake it, nor does a change of LODs:
 first order.
 """
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,7 +47,8 @@ from warp_abtree.kernels import solve
 from warp_abtree.manifold import POINTS_MAX, ManifoldQuery
 from warp_abtree.mesh import mesh_from_arrays
 from warp_abtree.model import Model
-from warp_abtree.scene import Scene, check_poses
+from warp_abtree.poses import check_poses
+from warp_abtree.scene import Scene
 
 AXIS_TOLERANCE = 1e-3
 COLOURS, NO_COLOUR = int(colouring.COLOURS), int(colouring.NO_COLOUR)
@@ -222,7 +224,7 @@ class Dynamics(RigidBodies):
         )
         self.query = ManifoldQuery(scene, None, capacity, pair_capacity, roles=self.bodies.role)
         self._rows, self._memory = solve.Rows(), solve.Memory()
-        self._room = -1
+        self._room, self._torn = -1, False
         self._grow()
 
     def _grow(self):
@@ -236,6 +238,7 @@ class Dynamics(RigidBodies):
         def empty(shape, dtype):
             return wp.zeros(shape, dtype=dtype, device=self.device)
 
+        made: list = []
         for kind, struct, single in (
             (solve.Rows, self._rows, ("restitution", "friction", "threshold", "free")),
             (solve.Memory, self._memory, ("key", "count")),
@@ -248,10 +251,24 @@ class Dynamics(RigidBodies):
                     if kept:
                         old = getattr(struct, name)
                         wp.copy(array.flatten(), old.flatten(), count=old.size)
-                setattr(struct, name, array)
-        self._colour_key, self._colour_order = empty(2 * room, wp.int32), empty(2 * room, wp.int32)
-        self._colour = empty(room, wp.int32)
-        self._room = room
+                made.append((struct, name, array))
+        made += [(self, name, empty(2 * room, wp.int32)) for name in ("_colour_key", "_colour_order")]
+        made.append((self, "_colour", empty(room, wp.int32)))
+        with self._between():
+            for owner, name, array in made:
+                setattr(owner, name, array)
+            self._room = room
+
+    @contextmanager
+    def _between(self):
+        """Refuse the bodies for good where what changes them is interrupted; a capture changes nothing."""
+        self._torn = self._torn or not self.device.is_capturing
+        yield
+        self._torn = False
+
+    def _check_whole(self):
+        if self._torn:
+            raise RuntimeError("a step of the bodies was interrupted; make a new Dynamics of the scene")
 
     def step(self, dt: float, targets=None):
         """Move all bodies by one step. Waits for the device, to grow what is too small.
@@ -263,7 +280,7 @@ class Dynamics(RigidBodies):
 
         Raises:
             ValueError: A step that is not above 0, or bad poses; nothing is changed.
-            RuntimeError: Objects were added to the scene.
+            RuntimeError: Objects were added to the scene, or a step was interrupted.
             CapacityError: More contacts than can be numbered.
         """
         self.find(dt, targets)
@@ -272,6 +289,7 @@ class Dynamics(RigidBodies):
     def find(self, dt: float, targets=None):
         """Do the first half of `step`: find the contacts where the bodies stand, without moving them."""
         dt = positive(dt, "dt")
+        self._check_whole()
         if targets is not None:
             self.set_targets(targets)
         elif len(self._targets[0]):
@@ -282,6 +300,7 @@ class Dynamics(RigidBodies):
 
     def answer(self, dt: float):
         """Do the second half of `step`, with the same dt: impulses, and motion."""
+        self._check_whole()
         self._settle(dt, whole=False)
 
     def set_targets(self, targets):
@@ -309,9 +328,11 @@ class Dynamics(RigidBodies):
 
         Bodies are lost to each other where contacts or pairs do not fit; `check` tells.
         """
-        self._begin(dt)
-        self.query.launch()
-        self._settle(dt, whole=True)
+        self._check_whole()
+        with self.query.guard.launching(self):
+            self._begin(dt)
+            self.query.launch()
+            self._settle(dt, whole=True)
 
     def check(self):
         """Raise where the last step had no room for its contacts. Waits for the device.
@@ -340,6 +361,10 @@ class Dynamics(RigidBodies):
 
     def _settle(self, dt, whole):
         """Take contacts to the poses at the end of the step; unless whole, launch no more colours than there are."""
+        with self._between():
+            self._answer_contacts(dt, whole)
+
+    def _answer_contacts(self, dt, whole):
         n, room, query, bodies = len(self.mass), self._room, self.query, self.bodies
         pairs = query.pairs
         touching = [query.pair_count, pairs, query.manifolds]

@@ -1,17 +1,20 @@
 """One frame without the host: poses and LODs in, results out, all on the device, as one graph to capture."""
 
+import warnings
 from functools import partial
 
 import numpy as np
 import warp as wp
 
 from warp_abtree.broadphase import CapacityError
-from warp_abtree.checks import to_numpy
+from warp_abtree.checks import check_device, to_numpy
 from warp_abtree.contact import ContactQuery
+from warp_abtree.generation import STALE_GRAPH
 from warp_abtree.intersect import Query, Result
 from warp_abtree.kernels import frame_graph as kernels
 from warp_abtree.refine import NO_FAULTS, LodLadder, LodUpdate, build_states
-from warp_abtree.scene import QUATERNION_TOLERANCE, Scene
+from warp_abtree.poses import QUATERNION_TOLERANCE
+from warp_abtree.scene import Scene
 from warp_abtree.state import ObjectArrays, StateArrays
 
 
@@ -133,6 +136,7 @@ class FrameGraph:
         groups=None,
         ladder=None,
     ):
+        check_device(scene.device, "making a FrameGraph")
         posed = _Posed(scene)
         self.device = scene.device
         self._models, self._states, self._objects = posed.arrays()
@@ -149,13 +153,14 @@ class FrameGraph:
         self.poses = wp.empty((len(posed.object_model), 7), dtype=wp.float64, device=self.device)
         wp.launch(kernels.read_pose_kernel, len(self.poses), [self._objects.pool, self.poses], device=self.device)
         self._bad_poses = wp.empty(2, dtype=wp.int32, device=self.device)
-        self._demand = wp.empty(3, dtype=wp.int64, device=self.device)
+        self._demand = wp.zeros(4, dtype=wp.int64, device=self.device)
         options = {"pairs": pairs, "capacity": capacity, "pair_capacity": pair_capacity, "precision": precision}
         options |= {"within": within, "unsure_capacity": unsure_capacity}
         asked: type[Query] | partial = ContactQuery if output == "contacts" else partial(Query, output=output)
         self.query: Query = asked(posed, **options)
-        # Loads the kernels and builds the broad phase's tree, which a capture cannot.
+        # Loads the kernels, and tells what the poses as they stand take.
         self.launch()
+        self._fit_unsure(unsure_capacity)
         self.clear_faults()
 
     def _own_states(self, lods, groups, object_model):
@@ -173,16 +178,36 @@ class FrameGraph:
         wanted = np.minimum(lods, last)
         return LodLadder(self._models, self._states, self._objects, posed.object_model, rungs, wanted)
 
+    def _fit_unsure(self, given):
+        """Make room for the face pairs that float32 leaves open, unless that room was given; then say what it lacks."""
+        needed, room = int(self._demand.numpy()[2]), len(self.query.hits.unsure)
+        if not 0 < room < needed:
+            return
+        if given is None:
+            self.query.grow_unsure()
+            return
+        warnings.warn(
+            f"unsure_capacity={given}: the poses as they stand leave {needed} face pairs open after float32; "
+            f"make it with unsure_capacity={needed}, or without",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+
     def launch(self):
-        """Run one frame on what stands in `poses` and `lods`. Launches only, see above how many."""
-        self._set_objects()
-        self.query.launch()
-        hits = self.query.hits
-        inputs = [self.query.pair_count, hits.total, hits.unsure_total, self._demand]
-        wp.launch(kernels.tally_demand_kernel, 1, inputs, device=self.device)
+        """Run one frame on what stands in `poses` and `lods`. Launches only, see above how many.
+
+        Where it is interrupted, the next launch refits all tree states.
+        """
+        with self.query.guard.launching(self):
+            self._set_objects()
+            self.query.launch()
+            hits, launched = self.query.hits, self.query.guard.launched
+            inputs = [self.query.pair_count, hits.total, hits.unsure_total, launched, self._demand]
+            wp.launch(kernels.tally_demand_kernel, 1, inputs, device=self.device)
 
     def _set_objects(self):
-        inputs = [QUATERNION_TOLERANCE, self.poses, self._objects.pool, self._bad_poses]
+        record = self.query.guard.record()
+        inputs = [QUATERNION_TOLERANCE, self.poses, self._objects.pool, self._bad_poses, record]
         wp.launch(kernels.place_object_kernel, len(self.poses), inputs, device=self.device)
         self._update.launch()
 
@@ -207,29 +232,37 @@ class FrameGraph:
         Raises:
             ValueError: As `check`.
         """
-        self._set_objects()
-        result = self.query.run()
+        check_device(self.device, "FrameGraph.run (launch can)")
+        with self.query.guard.launching(self):
+            self._set_objects()
+            result = self.query.run()
         self.check()
         return result
 
     def clear_faults(self):
         """Forget what `check` would raise."""
+        check_device(self.device, "FrameGraph.clear_faults")
         self._bad_poses.assign(np.array(NO_FAULTS, np.int32))
         self._update.faults.assign(np.array(NO_FAULTS, np.int32))
         self._demand.zero_()
+        self.query.guard.clear_stale()
 
     def check(self):
         """Raise what went wrong in any frame since the last call. Waits for the device.
 
         Raises:
+            RuntimeError: A frame was the replay of a graph captured before a buffer grew; it found nothing.
             ValueError: A pose was not finite or a quaternion off unit length by more than 1e-3 (its object kept the
                 pose before); a LOD was out of range (the nearer end was taken).
             CapacityError: Pairs, hits or face pairs that float32 leaves open outran their buffers; names the demand,
                 and whatever else was wrong.
         """
+        check_device(self.device, "FrameGraph.check")
         poses, lods, demand = self._bad_poses.numpy().copy(), self._update.faults.numpy().copy(), self._demand.numpy()
-        found, hits, unsure = (int(value) for value in demand)
+        found, hits, unsure, stale = (int(value) for value in demand)
         self.clear_faults()
+        if stale:
+            raise RuntimeError(f"a frame since the last check is lost: its graph {STALE_GRAPH}")
         wrong, lost = [], []
         if poses[0]:
             wrong.append(

@@ -6,42 +6,20 @@ import numpy as np
 import trimesh
 import warp as wp
 
+from warp_abtree.checks import check_device, wrap_array
+from warp_abtree.generation import STALE_GRAPH, LaunchGuard
 from warp_abtree.kernels import frame_graph as kernels
 from warp_abtree.mesh import MeshError, load_mesh, triangulate
 from warp_abtree.model import Model
+from warp_abtree.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
 from warp_abtree.refine import NO_FAULTS
-from warp_abtree.scene import QUATERNION_TOLERANCE, RIGID_TOLERANCE, Scene
+from warp_abtree.scene import Scene
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 # Two stretches that differ by this part are one.
 STRETCH_TOLERANCE = 1e-9
 
 # Poses.
-
-
-def wrap_array(values, what="array"):
-    """Return an array of any framework as a Warp array on the same memory.
-
-    Args:
-        values: Warp, PyTorch, JAX, CuPy or NumPy array, or anything else that speaks DLPack. A tensor that requires
-            gradients is taken without them.
-
-    Raises:
-        ValueError: It is none, or its memory cannot be shared.
-    """
-    if isinstance(values, wp.array):
-        return values
-    try:
-        if isinstance(values, np.ndarray):
-            # In place of DLPack, which NumPy refuses for arrays that are read-only.
-            return wp.array(values, dtype=wp.dtype_from_numpy(values.dtype), device="cpu", copy=False)
-        if getattr(values, "requires_grad", False):
-            values = values.detach()
-        if hasattr(values, "__dlpack__"):
-            return wp.from_dlpack(values)
-    except (RuntimeError, TypeError, BufferError, ValueError) as error:
-        raise ValueError(f"{what}: its memory cannot be shared ({error})") from None
-    raise ValueError(f"{what}: a {type(values).__name__} is no array that can share its memory")
 
 
 class PoseInput:
@@ -59,9 +37,11 @@ class PoseInput:
     """
 
     def __init__(self, scene):
+        check_device(scene.device, "making a PoseInput")
         self.scene = scene
         self.device = scene.device
         self._arrays = scene.arrays()
+        self._guard = LaunchGuard(self.device, self._arrays[2].generation)
         count = scene.object_count
         self.poses = wp.empty((count, 7), dtype=wp.float64, device=self.device)
         self._faults = wp.array(NO_FAULTS, dtype=wp.int32, device=self.device)
@@ -81,11 +61,16 @@ class PoseInput:
         """
         if self._arrays != self.scene.arrays():
             raise RuntimeError("objects were added to the scene since this pose input was made; make a new one")
+        check_device(self.device)
+        with self._guard.launching(self):
+            self._launch(poses)
+
+    def _launch(self, poses):
         rows = self.poses if poses is None else self._check(wrap_array(poses, "poses"))
         if rows.dtype == wp.float32:
             wp.utils.array_cast(rows, self.poses)
             rows = self.poses
-        inputs = [QUATERNION_TOLERANCE, rows, self._arrays[2].pool, self._faults]
+        inputs = [QUATERNION_TOLERANCE, rows, self._arrays[2].pool, self._faults, self._guard.record()]
         wp.launch(kernels.place_object_kernel, len(self.poses), inputs, device=self.device)
 
     def _check(self, rows):
@@ -104,7 +89,13 @@ class PoseInput:
         Raises:
             ValueError: A pose was not finite, or a quaternion off unit length by more than 1e-3; its object kept the
                 pose before.
+            RuntimeError: Poses were set by a graph captured before objects were added to the scene; they are lost.
         """
+        check_device(self.device, "PoseInput.check")
+        stale = self._guard.launched.numpy()[1]
+        if stale:
+            self._guard.clear_stale()
+            raise RuntimeError(f"poses since the last check are lost: the graph {STALE_GRAPH}")
         count, first = self._faults.numpy().tolist()
         self._faults.assign(np.array(NO_FAULTS, np.int32))
         if count:

@@ -1,14 +1,16 @@
 """ACTIVE-INTERSECT for a batch: `Query` and its results."""
 
 import math
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_abtree.broadphase import BroadPhase, CapacityError
-from warp_abtree.checks import to_numpy, whole_number
+from warp_abtree.checks import check_device, to_numpy, whole_number
 from warp_abtree.cores import core_count, launch_on_cores
+from warp_abtree.generation import LaunchGuard
 from warp_abtree.kernels import faces, pose, predicates, relate, settle, share, traverse
 from warp_abtree.kernels.warps import STACK_LENGTH, WARP_SIZE
 from warp_abtree.state import ModelArrays, ObjectArrays, StateArrays
@@ -156,9 +158,11 @@ class Result:
 class Query:
     """Intersection of many object pairs as an operator: allocates once, launches many times.
 
-    `launch()` only launches, so a CUDA graph can capture it (after one launch outside the capture, which builds the
-    broad phase's tree). A change of the scene's objects, or a change of LODs that grows its pool of states, asks for
-    a new query.
+    `launch()` only launches, so that a CUDA graph can capture it, the first launch too. Objects added to the scene ask
+    for a new query; so do pairs filtered out of it, where the query runs the broad phase. A captured graph holds until
+    arrays that it uses are replaced: by these, by a change of LODs that takes more tree states than the scene had room
+    for, and by a buffer that grows. `result()` refuses what a stale graph has left. Keep the query as long as its
+    graphs.
 
     Args:
         scene: `Scene` whose poses and LODs hold at the time of each launch.
@@ -198,6 +202,7 @@ class Query:
         unsure_capacity=None,
     ):
         check_request(output, precision)
+        check_device(scene.device, f"making a {type(self).__name__}")
         if within is not None:
             within = check_within(within, None if pairs is None else len(scene.check_pairs(pairs)))
         if capacity is not None:
@@ -211,11 +216,16 @@ class Query:
         self.precision = precision
         self.arrays: tuple[ModelArrays, StateArrays, ObjectArrays] = scene.arrays()
         self.device = scene.device
+        self._torn = False
+        self.guard = LaunchGuard(
+            self.device, self.arrays[1].generation, self.arrays[2].filter_generation if pairs is None else None
+        )
         self.broad_phase = None
         if pairs is None:
             models, states, objects = self.arrays
             self._excluded = scene.excluded_keys()
             self.broad_phase = BroadPhase(models, states, objects, self._excluded, pair_capacity)
+            self.broad_phase.guard = self.guard
             self.pairs, self.pair_count = self.broad_phase.pairs, self.broad_phase.pair_count
         else:
             self.pair_count = wp.zeros(1, dtype=wp.int32, device=self.device)
@@ -247,6 +257,8 @@ class Query:
         """
         if self.broad_phase is not None:
             raise ValueError("this query takes its pairs from the broad phase")
+        check_device(self.device, "giving a query other pairs")
+        self._check_whole()
         pairs = self.scene.check_pairs(pairs)
         if within is not None and self.near is None:
             raise ValueError("this query was made without within")
@@ -255,14 +267,37 @@ class Query:
         # What may fail for lack of memory comes before anything that changes the query.
         rows = wp.array(pairs, dtype=wp.vec2i, device=self.device)
         distances = self._upload_within(within)
+        made = []
         if len(pairs) > len(self.pairs):
-            self._take_pairs(wp.empty(len(pairs), dtype=wp.vec2i, device=self.device))
-        if len(pairs):
-            wp.copy(self.pairs, rows, count=len(pairs))
-        self.pair_count.fill_(len(pairs))
-        self._given = pairs
-        self._within = within
-        self._fill_within(distances)
+            made = self._make_room(wp.empty(len(pairs), dtype=wp.vec2i, device=self.device))
+        with self._changing():
+            if made:
+                self._replace(made)
+            self.guard.forget()
+            if len(pairs):
+                wp.copy(self.pairs, rows, count=len(pairs))
+            self.pair_count.fill_(len(pairs))
+            self._given = pairs
+            self._within = within
+            self._fill_within(distances)
+
+    @contextmanager
+    def _changing(self):
+        """Refuse the query for good where a change of what belongs together is interrupted."""
+        before, self._torn = self._torn, True
+        yield
+        self._torn = before
+
+    def _check_whole(self):
+        if self._torn:
+            raise RuntimeError("this query was interrupted while its buffers changed; make a new one")
+
+    def _replace(self, made):
+        """Put new arrays, (owner, attribute, array), in the place of old ones."""
+        self.guard.buffers.advance()
+        with self._changing():
+            for owner, name, array in made:
+                setattr(owner, name, array)
 
     def _pair_arrays(self, room: int) -> list:
         """Return (owner, attribute, new array) of whatever has an entry a pair."""
@@ -276,15 +311,22 @@ class Query:
             made.append((self, "within", wp.empty(room, dtype=wp.float64, device=self.device)))
         return made
 
-    def _take_pairs(self, pairs):
-        """Take a device list of pairs and make room for whatever belongs to a pair: all of it, or nothing changes."""
+    def _make_room(self, pairs) -> list:
+        """Return (owner, attribute, new array) of a device list of pairs, and of whatever belongs to a pair."""
         if len(pairs) > PAIRS_MAX:
             raise CapacityError(f"{len(pairs)} object pairs at a time, more than 2^26; ask them in parts")
-        for owner, name, array in [*self._pair_arrays(len(pairs)), (self, "pairs", pairs)]:
-            setattr(owner, name, array)
+        made = [*self._pair_arrays(len(pairs)), (self, "pairs", pairs)]
         if self.broad_phase is not None:
-            self.broad_phase.pairs = pairs
-            self._fill_within(None)
+            made.append((self.broad_phase, "pairs", pairs))
+        return made
+
+    def _take_pairs(self, pairs):
+        """Take a device list of pairs and make room for whatever belongs to a pair: all of it, or nothing changes."""
+        made = self._make_room(pairs)
+        with self._changing():
+            self._replace(made)
+            if self.broad_phase is not None:
+                self._fill_within(None)
 
     def _make_near(self):
         near = faces.Hits()
@@ -304,9 +346,9 @@ class Query:
             self.within.fill_(float(self._within))
 
     def _resize_unsure(self, capacity: int):
-        unsure = wp.empty(capacity, dtype=wp.vec3i, device=self.device)
-        self.hits.hard = wp.empty(capacity if self.precision == "exact" else 0, dtype=wp.vec3i, device=self.device)
-        self.hits.unsure = unsure
+        hard = capacity if self.precision == "exact" else 0
+        made = [("unsure", capacity), ("hard", hard)]
+        self._replace([(self.hits, name, wp.empty(room, dtype=wp.vec3i, device=self.device)) for name, room in made])
 
     def uses_warps(self) -> bool:
         """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
@@ -314,22 +356,28 @@ class Query:
 
     def resize(self, capacity: int):
         """Make room for a number of intersecting face pairs."""
-        self.hits.face = wp.empty(capacity, dtype=wp.vec3i, device=self.device)
+        self._replace([(self.hits, "face", wp.empty(capacity, dtype=wp.vec3i, device=self.device))])
 
     def launch(self):
         """Run broad phase (unless pairs were given) and narrow phase. Launches only.
 
         Raises:
             RuntimeError: The scene's objects changed since the query was made, or its filter where the broad phase
-                runs.
+                runs; or a change of the query's buffers was interrupted.
         """
         self._check_scene()
+        with self.guard.launching(self):
+            self._launch()
+
+    def _launch(self):
         if self.broad_phase is not None:
             self.broad_phase.launch()
         self.prove_apart()
         self.traverse()
 
     def _check_scene(self):
+        check_device(self.device)
+        self._check_whole()
         if self.arrays != self.scene.arrays():
             raise RuntimeError("objects were added to the scene since this query was made; make a new one")
         if self.broad_phase is not None and len(self.scene.excluded_keys()) > len(self._excluded):
@@ -345,7 +393,8 @@ class Query:
     def _launch_traversal(self, within, hits, mode, output):
         pools = [arrays.pool for arrays in self.arrays]
         room = len(self.pairs)
-        inputs = [self.parts_max, output, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
+        inputs = [self.parts_max, output, *pools, self.pair_count, self.pairs, within]
+        inputs += [self.guard.record(), self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
         wp.launch(relate.relate_pair_kernel, dim=dim, inputs=inputs, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits]
@@ -384,12 +433,25 @@ class Query:
                 wp.launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
 
     def result(self) -> Result:
-        """Return the results of the last launch on the host, sorted. Waits for the device."""
+        """Return the results of the last launch on the host, sorted. Waits for the device.
+
+        Raises:
+            RuntimeError: There are none: nothing was launched, a launch was interrupted, or it was the replay of a
+                graph whose arrays were replaced.
+        """
         pairs, demand = self._asked()
         return Result(pairs, self.output, demand, len(self.pairs), self.hits, self.near)
 
     def _asked(self):
-        """Return the pairs of the last launch on the host, those there was room for, and how many there were."""
+        """Return the pairs of the last launch on the host, those there was room for, and how many there were.
+
+        Raises:
+            RuntimeError: As `result`.
+        """
+        check_device(self.device, "reading results")
+        self._check_whole()
+        if len(self.pairs):  # without room for pairs there are no launches
+            self.guard.check()
         if self.broad_phase is None:
             return self._given, len(self._given)
         found = self.broad_phase.count_found()
@@ -397,19 +459,22 @@ class Query:
 
     def run(self) -> Result:
         """Launch, grow buffers that were too small, and return the whole result. Waits for the device."""
-        self.launch()
-        if self.broad_phase is not None and self.broad_phase.count_found() > len(self.pairs):
-            self._take_pairs(wp.empty(self.broad_phase.count_found(), dtype=wp.vec2i, device=self.device))
-            self.launch()
-        self._grow_unsure()
-        if self.output == "faces" and self._sum(self.hits.count) > len(self.hits.face):
-            self.resize(self._sum(self.hits.count))
-            self.traverse()
+        check_device(self.device, "Query.run (launch can)")
+        self._check_scene()
+        with self.guard.launching(self):
+            self._launch()
+            if self.broad_phase is not None and self.broad_phase.count_found() > len(self.pairs):
+                self._take_pairs(wp.empty(self.broad_phase.count_found(), dtype=wp.vec2i, device=self.device))
+                self._launch()
+            self.grow_unsure()
+            if self.output == "faces" and self._sum(self.hits.count) > len(self.hits.face):
+                self.resize(self._sum(self.hits.count))
+                self.traverse()
         result = self.result()
         result.check()
         return result
 
-    def _grow_unsure(self):
+    def grow_unsure(self):
         """Make room for the face pairs that wait, as far as there can be, and traverse again until all find it."""
         # How many wait varies for `any`, where the first hit of a pair ends its traversal.
         while 0 < len(self.hits.unsure) < min(LIST_MAX, demand := self._sum(self.hits.float64_tests)):

@@ -25,6 +25,7 @@ section 3; that the boundary curve gives it is Stokes' theorem.
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks import check_device
 from warp_abtree.contact import ContactQuery
 from warp_abtree.intersect import Result
 from warp_abtree.kernels import bodies, manifold
@@ -78,18 +79,13 @@ class ManifoldQuery(ContactQuery):
         self.roles = wp.empty(0, dtype=wp.int32, device=scene.device) if roles is None else roles
         super().__init__(scene, pairs, capacity, pair_capacity, precision)
 
-    def resize(self, capacity: int):
-        """Make room for a number of contacts.
-
-        Raises:
-            CapacityError: 2^30 contacts or more.
-        """
-        super().resize(capacity)
-        curves = self.curves
-        curves.parent, curves.loop = self._empty(capacity, wp.int32), self._empty(capacity, wp.int32)
-        curves.loop_normal, curves.normal = self._empty(capacity, wp.vec3d), self._empty(capacity, wp.vec3d)
-        curves.point = self._empty((capacity, 2), wp.vec3d)
-        curves.depth = self._empty((capacity, 2), wp.float64)
+    def _place_arrays(self, capacity: int) -> list:
+        made = super()._place_arrays(capacity)
+        for name, dtype in (("parent", wp.int32), ("loop", wp.int32), ("loop_normal", wp.vec3d), ("normal", wp.vec3d)):
+            made.append((self.curves, name, self._empty(capacity, dtype)))
+        for name, dtype in (("point", wp.vec3d), ("depth", wp.float64)):
+            made.append((self.curves, name, self._empty((capacity, 2), dtype)))
+        return made
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
@@ -102,13 +98,7 @@ class ManifoldQuery(ContactQuery):
         made.append((self, "_pair_order", self._empty(2 * room, wp.int32)))
         return made
 
-    def launch(self):
-        """Run broad phase (unless pairs were given), narrow phase and reduction. Launches only.
-
-        Raises:
-            RuntimeError: As `Query.launch`.
-        """
-        self._check_scene()
+    def _launch(self):
         if self.broad_phase is not None:
             self.broad_phase.launch()
             self._sort_pairs()
@@ -117,10 +107,10 @@ class ManifoldQuery(ContactQuery):
     def _sort_pairs(self):
         room = len(self.pairs)
         inputs = [self.pair_count, self.pairs, self.roles, self._pair_order, self.pair_key]
-        self._launch(bodies.make_pair_key_kernel, room, inputs)
+        self._launch_kernel(bodies.make_pair_key_kernel, room, inputs)
         with wp.ScopedDevice(self.device):
             wp.utils.radix_sort_pairs(self.pair_key, self._pair_order, room)
-        self._launch(bodies.place_pair_kernel, room + 1, [self.pair_key, self.pair_count, self.pairs])
+        self._launch_kernel(bodies.place_pair_kernel, room + 1, [self.pair_key, self.pair_count, self.pairs])
 
     def find_contacts(self):
         """Sort the hits in place, make their contacts, and reduce them to points. Launches only."""
@@ -129,16 +119,16 @@ class ManifoldQuery(ContactQuery):
         capacity, room = self._places, len(self.pairs)
         pools = [arrays.pool for arrays in self.arrays]
         start, rows, curves = self.start, self.faces, self.curves
-        self._launch(manifold.begin_loop_kernel, capacity, [start, rows, curves, self._order, self._key])
+        self._launch_kernel(manifold.begin_loop_kernel, capacity, [start, rows, curves, self._order, self._key])
         self._sort_keys(capacity, 31 + room.bit_length())
-        self._launch(manifold.link_loop_kernel, capacity, [start, rows, self._order, self._key, curves])
-        self._launch(manifold.name_loop_kernel, capacity, [start, curves, self._order, self._key])
+        self._launch_kernel(manifold.link_loop_kernel, capacity, [start, rows, self._order, self._key, curves])
+        self._launch_kernel(manifold.name_loop_kernel, capacity, [start, curves, self._order, self._key])
         self._sort_keys(capacity, 31)
         inputs = [*pools, self.pairs, start, rows, self.contacts, self._order, curves]
-        self._launch(manifold.average_loop_kernel, capacity, inputs)
+        self._launch_kernel(manifold.average_loop_kernel, capacity, inputs)
         inputs = [*pools, self.pairs, self.pair_poses, start, rows, self.contacts, curves]
-        self._launch(manifold.find_candidate_kernel, capacity, inputs)
-        self._launch(manifold.spread_point_kernel, room, [pools[2], self.pairs, start, curves, self.manifolds])
+        self._launch_kernel(manifold.find_candidate_kernel, capacity, inputs)
+        self._launch_kernel(manifold.spread_point_kernel, room, [pools[2], self.pairs, start, curves, self.manifolds])
 
     def _sort_keys(self, count, bits):
         with wp.ScopedDevice(self.device):
@@ -150,14 +140,17 @@ class ManifoldQuery(ContactQuery):
         Raises:
             CapacityError: 2^26 pairs, or 2^30 contacts, or more.
         """
-        self.launch()
-        if self.broad_phase is not None and self.broad_phase.count_found() > len(self.pairs):
-            self._take_pairs(wp.empty(2 * self.broad_phase.count_found(), dtype=wp.vec2i, device=self.device))
-            self.launch()
-        self._grow_unsure()
-        if self._sum(self.hits.count) > self._places:
-            self.resize(2 * self._sum(self.hits.count))
-            self.traverse()
+        check_device(self.device, "ManifoldQuery.run (launch can)")
+        self._check_scene()
+        with self.guard.launching(self):
+            self._launch()
+            if self.broad_phase is not None and self.broad_phase.count_found() > len(self.pairs):
+                self._take_pairs(wp.empty(2 * self.broad_phase.count_found(), dtype=wp.vec2i, device=self.device))
+                self._launch()
+            self.grow_unsure()
+            if self._sum(self.hits.count) > self._places:
+                self.resize(2 * self._sum(self.hits.count))
+                self.traverse()
 
     def result(self, with_points: bool = True) -> ManifoldResult:  # type: ignore[override]  # points, not contacts
         """Return the counts and, unless told otherwise, the contact points of the last launch on the host. Waits."""

@@ -113,9 +113,10 @@ class NewtonContacts:
 
     def launch(self, state, contacts):
         """Do as `collide` does in the room there is. Launches only, so that a CUDA graph can capture it."""
-        self._place(state.body_q)
-        self.query.launch()
-        self._write(state.body_q, contacts)
+        with self.query.guard.launching(self):
+            self._place(state.body_q)
+            self.query.launch()
+            self._write(state.body_q, contacts)
 
     def check(self, contacts):
         """Raise where the last contacts did not fit. Waits for the device.

@@ -11,10 +11,11 @@ from collections import deque
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks import to_numpy
+from warp_abtree.checks import check_device, to_numpy
 from warp_abtree.intersect import Query, check_request
-from warp_abtree.kernels.sweep import NONE_REFUSED, place_poses_kernel, report_chunk_kernel
-from warp_abtree.scene import QUATERNION_TOLERANCE, Scene
+from warp_abtree.kernels.sweep import NONE_REFUSED, place_matrix_kernel, place_quaternion_kernel, report_chunk_kernel
+from warp_abtree.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE, check_poses, device_rows
+from warp_abtree.scene import Scene
 from warp_abtree.state import ObjectArrays
 from warp_abtree.turns import device_turn
 
@@ -25,18 +26,19 @@ KEPT_PAIRS = 4
 KEPT_ROWS = 2**20
 
 SCALARS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
-TRANSFORMS = {wp.transformf: wp.float32, wp.transformd: wp.float64}
+# Numbers of a row, and what sets objects from rows: quaternions, and matrices.
+PLACING = {7: (place_quaternion_kernel, QUATERNION_TOLERANCE), 16: (place_matrix_kernel, RIGID_TOLERANCE)}
 ANSWERS = {"any": np.dtype(bool), "count": np.dtype(np.int64)}
 
 _kept: dict[tuple, "_PosedModels"] = {}
 
 
 class _HostPoses:
-    """Poses (p, 7) in the memory of the host."""
+    """Poses in the memory of the host, rows of 7 or 16 numbers."""
 
     def __init__(self, rows):
         self.rows = rows
-        self.scalar = SCALARS[rows.dtype]
+        self.scalar, self.width = SCALARS[rows.dtype], rows.shape[1]
 
     def __len__(self):
         return len(self.rows)
@@ -46,45 +48,41 @@ class _HostPoses:
 
 
 class _DevicePoses:
-    """Poses in the memory of the device that asks: rows of 7 numbers, or transforms."""
+    """Poses in the memory of the device that asks, rows of 7 or 16 numbers."""
 
-    def __init__(self, array):
-        self.scalar = TRANSFORMS.get(array.dtype, array.dtype)
-        self.count = array.shape[0]
-        self.kept = array if array.is_contiguous else array.contiguous()
-        self.flat = wp.array(ptr=self.kept.ptr, dtype=self.scalar, shape=7 * self.count, device=array.device)
+    def __init__(self, rows):
+        self.scalar, (self.count, self.width) = rows.dtype, rows.shape
+        self.flat = rows.flatten()
 
     def __len__(self):
         return self.count
 
     def row(self, i):
-        return self.flat[7 * i : 7 * i + 7].numpy()
+        return self.flat[self.width * i : self.width * (i + 1)].numpy()
 
 
 def _take_poses(poses, device):
     """Return poses where they are, or on the host.
 
     Raises:
-        ValueError: No numbers, or another shape than (p, 7).
+        ValueError: No numbers, or another shape than (p, 7) and (p, 4, 4).
     """
-    if isinstance(poses, wp.array) and poses.device == device and device.is_cuda:
-        rows = poses.ndim == 2 and poses.shape[1] == 7 and poses.dtype in SCALARS.values()
-        if rows or (poses.ndim == 1 and poses.dtype in TRANSFORMS):
-            return _DevicePoses(poses)
+    rows = device_rows(poses, device)
+    if rows is not None:
+        return _DevicePoses(rows)
     rows = to_numpy(poses, "poses")
-    if rows.shape in ((0,), (0, 7)):
+    if rows.shape == (0,):
         rows = np.empty((0, 7))
-    if rows.ndim != 2 or rows.shape[1] != 7:
-        raise ValueError(f"poses: shape {rows.shape}, not (p, 7)")
+    if not (rows.ndim == 2 and rows.shape[1] == 7) and not (rows.ndim == 3 and rows.shape[1:] == (4, 4)):
+        raise ValueError(f"poses: shape {rows.shape} is neither (p, 7) nor (p, 4, 4)")
+    rows = rows.reshape(len(rows), 7 if rows.ndim == 2 else 16)
     return _HostPoses(rows if rows.dtype in SCALARS else rows.astype(np.float64))
 
 
 def _refuse(poses, i):
     row = np.asarray(poses.row(i), np.float64)
-    if not np.isfinite(row).all():
-        raise ValueError(f"poses: pose {i} is not finite")
-    norm = np.sqrt((row[3:] ** 2).sum())
-    raise ValueError(f"poses: pose {i} has a quaternion of norm {norm:.6g}, off 1 by more than {QUATERNION_TOLERANCE}")
+    check_poses(row[None] if poses.width == 7 else row.reshape(1, 4, 4), first=i)
+    raise ValueError(f"poses: pose {i} is no pose")  # by rounding, where the host finds it just within
 
 
 class _PosedModels:
@@ -146,11 +144,12 @@ def _find_copy_stream(alias):
 class _Lane:
     """Buffers through which a chunk passes: poses in, answers out. On the CPU host and device share them."""
 
-    def __init__(self, device, room, output, scalar):
+    def __init__(self, device, room, output, scalar, width):
         def mirror(array):
             return array if device.is_cpu else wp.empty(len(array), dtype=array.dtype, device="cpu", pinned=True)
 
-        self.poses = wp.empty((room, 7), dtype=scalar, device=device)
+        self.width = width
+        self.poses = wp.empty((room, width), dtype=scalar, device=device)
         self.answer = wp.empty(room if output == "any" else 0, dtype=wp.uint8, device=device)
         self.report = wp.empty(2, dtype=wp.int32, device=device)
         self.poses_flat = self.poses.flatten()
@@ -178,30 +177,33 @@ class _Question:
 
     def _find_lanes(self, poses):
         """Return the lanes of poses of one type, made at the first use."""
-        if poses.scalar not in self.lanes:
+        kind = poses.scalar, poses.width
+        if kind not in self.lanes:
             count = 1 if self.output == "faces" else 2
-            made = [_Lane(self.device, self.room, self.output, poses.scalar) for _ in range(count)]
+            made = [_Lane(self.device, self.room, self.output, *kind) for _ in range(count)]
             if self.device.is_cuda:
                 # Another stream may touch what was allocated on this one only once it is there.
                 wp.synchronize_device(self.device)
-            self.lanes[poses.scalar] = made
-        return self.lanes[poses.scalar]
+            self.lanes[kind] = made
+        return self.lanes[kind]
 
     def _load(self, lane, poses, start, count):
         """Bring poses into a lane whose last chunk is over."""
+        width = lane.width
         if isinstance(poses, _DevicePoses):
-            wp.copy(lane.poses_flat, poses.flat, src_offset=7 * start, count=7 * count)
+            wp.copy(lane.poses_flat, poses.flat, src_offset=width * start, count=width * count)
             return
-        np.copyto(lane.poses_host.numpy().reshape(-1, 7)[:count], poses.rows[start : start + count])
+        np.copyto(lane.poses_host.numpy().reshape(-1, width)[:count], poses.rows[start : start + count])
         if self.copies is not None:
-            wp.copy(lane.poses_flat, lane.poses_host, count=7 * count, stream=self.copies)
+            wp.copy(lane.poses_flat, lane.poses_host, count=width * count, stream=self.copies)
             self.copies.record_event(lane.loaded)
             wp.get_stream(self.device).wait_event(lane.loaded)
 
     def _place(self, lane):
         lane.report.fill_(NONE_REFUSED)
-        inputs = [wp.float64(QUATERNION_TOLERANCE), lane.poses, self.objects.pool, lane.report]
-        wp.launch(place_poses_kernel, self.count, inputs, device=self.device)
+        kernel, tolerance = PLACING[lane.width]
+        inputs = [wp.float64(tolerance), lane.poses, self.objects.pool, lane.report]
+        wp.launch(kernel, self.count, inputs, device=self.device)
 
     def _launch(self, lane):
         self._place(lane)
@@ -260,9 +262,10 @@ class _Question:
                 waiting.append((lane, start, count))
             while waiting:
                 finish()
-        finally:
-            if waiting:  # where a pose is refused, the other lane's buffers are in use
-                wp.synchronize_device(self.device)
+        except BaseException:
+            # A pose was refused, or an interruption came: lanes whose transfers are under way must not go yet.
+            wp.synchronize_device(self.device)
+            raise
         return answers
 
     def list_faces(self, poses):
@@ -300,8 +303,9 @@ def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precisi
 
     Args:
         model_a, model_b: `Model`; may be the same.
-        poses: (p, 7) x y z qx qy qz qw [model units of A, unit quaternions, normalised in float64], float32 or float64.
-            A Warp array of the device that asks, (p, 7) or transforms (p,), is read where it is.
+        poses: (p, 7) x y z qx qy qz qw [model units of A, unit quaternions, normalised in float64], or rigid (p, 4, 4)
+            matrices, taken as they are; float32 or float64, of any framework. What lies on the GPU that asks is read
+            where it is, Warp's transforms and matrices (p,) too.
         lod_a, lod_b: LODs; None is the finest.
         output: "any", "count" or "faces".
         precision: As `Scene.intersect`, exact for A's vertices and the posed ones of B.
@@ -314,9 +318,11 @@ def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precisi
     Raises:
         TypeError: model_a or model_b is no Model.
         ValueError: Bad poses, the first of which is named, a LOD out of range, an unknown option or device.
+        RuntimeError: A graph is being captured.
     """
     check_request(output, precision)
     pair = Scene(device)
+    check_device(pair.device, "ab.sweep")
     with device_turn(pair.device):
         return _sweep(pair, (model_a, model_b), poses, (lod_a, lod_b), output, precision)
 

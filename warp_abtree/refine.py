@@ -139,28 +139,26 @@ def _make_batch(models: ModelArrays, states: StateArrays, plan: Plan) -> UpdateB
     )
 
 
-def _copy_states(models: ModelArrays, states: StateArrays, plan: Plan, batch: UpdateBatch):
-    """Copy the source of every state that starts from another, before anything moves; clear a first one's corners."""
-    pairs = []
+def _plan_copies(models: ModelArrays, states: StateArrays, plan: Plan, batch: UpdateBatch) -> list:
+    """Return the launches that copy the source of every state that starts from another: kernel, threads and inputs."""
+    copies = []
     for state, source, full in zip(plan.state, plan.source, batch.full, strict=True):
-        if source < 0:
-            slot = states.slots[state]
-            view = states.pool.face_corner[slot.face_start : slot.face_start + int(models.face_count[slot.model])]
-            view.fill_(wp.vec4i(-1, -1, -1, -1))
-        elif source != state:
-            pairs.append((source, state, states.slots[state].model, full))
+        if source >= 0 and source != state:
+            copies.append((source, state, states.slots[state].model, full))
 
-    def launch(kernel, rows, lengths):
+    def launches(kernel, rows, lengths):
         if not rows:
-            return
+            return []
         end = np.cumsum(lengths)
         ends = [np.asarray(values, np.int32) for values in (end, [r[0] for r in rows], [r[1] for r in rows])]
         arrays = [wp.array(values, dtype=wp.int32, device=states.device) for values in ends]
-        wp.launch(kernel, dim=int(end[-1]), inputs=[*arrays, states.pool], device=states.device)
+        return [(kernel, int(end[-1]), [*arrays, states.pool])]
 
-    launch(refit.copy_face_kernel, pairs, [models.face_count[r[2]] for r in pairs])
-    partial = [r for r in pairs if not r[3]]
-    launch(refit.copy_node_kernel, partial, [models.node_count[r[2]] for r in partial])
+    partial = [r for r in copies if not r[3]]
+    return [
+        *launches(refit.copy_face_kernel, copies, [models.face_count[r[2]] for r in copies]),
+        *launches(refit.copy_node_kernel, partial, [models.node_count[r[2]] for r in partial]),
+    ]
 
 
 def refine_meshes(models: ModelArrays, states: StateArrays, work: UpdateWork):
@@ -171,17 +169,32 @@ def refine_meshes(models: ModelArrays, states: StateArrays, work: UpdateWork):
     launch_items(refine.refine_all_kernel, work.face_room, inputs, states.device)
 
 
-def _carry_out(models: ModelArrays, states: StateArrays, plan: Plan) -> UpdateBatch:
-    """Bring states to their LODs, copies before anything moves."""
-    batch = _make_batch(models, states, plan)
-    if plan.state:
+class _StateMove:
+    """Brings states to their LODs, copies before anything moves: allocates first, then launches."""
+
+    def __init__(self, models: ModelArrays, states: StateArrays, plan: Plan):
+        self.models, self.states, self.plan = models, states, plan
+        self.batch = _make_batch(models, states, plan)
+        self._copies = _plan_copies(models, states, plan, self.batch)
+
+    def launch(self):
+        """Move the states; only launches and small transfers."""
+        models, states, plan = self.models, self.states, self.plan
+        states.touch()
+        if not plan.state:
+            return
         for state, lod in zip(plan.state, plan.lod, strict=True):
             states.slots[state].lod = lod
         states.upload_slots()
-        _copy_states(models, states, plan, batch)
-        refine_meshes(models, states, batch)
-        active_update(models.pool, states.pool, batch)
-    return batch
+        for state, source in zip(plan.state, plan.source, strict=True):
+            if source < 0:
+                slot = states.slots[state]
+                end = slot.face_start + int(models.face_count[slot.model])
+                states.pool.face_corner[slot.face_start : end].fill_(wp.vec4i(-1, -1, -1, -1))
+        for kernel, threads, inputs in self._copies:
+            wp.launch(kernel, dim=threads, inputs=inputs, device=states.device)
+        refine_meshes(models, states, self.batch)
+        active_update(models.pool, states.pool, self.batch)
 
 
 def build_states(models: ModelArrays, states: StateArrays, state_model, lods) -> list:
@@ -191,7 +204,7 @@ def build_states(models: ModelArrays, states: StateArrays, state_model, lods) ->
         ValueError: The pool would pass 2^30 nodes.
     """
     ids = states.reserve(state_model)
-    _carry_out(models, states, Plan(ids, [int(lod) for lod in lods], [-1] * len(ids)))
+    _StateMove(models, states, Plan(ids, [int(lod) for lod in lods], [-1] * len(ids))).launch()
     return ids
 
 
@@ -248,7 +261,17 @@ class LodUpdate(UpdateWork):
         super().__init__(plan, int(entries.sum()), int(models.face_count[owner].sum()), level_room, device)
 
     def launch(self):
-        """Refine meshes and update trees. Launches only: six, and one for each level that has much to refit."""
+        """Refine meshes and update trees. Launches only: six, and one for each level that has much to refit.
+
+        Where it is interrupted, the next launch refits every state whole.
+        """
+        try:
+            self._launch()
+        except BaseException:
+            self.states.pool.lod.fill_(int(plan_kernels.UNKNOWN))
+            raise
+
+    def _launch(self):
         count = len(self.wanted)
         wp.launch(plan_kernels.clear_plan_kernel, max(count, int(LEVEL_MAX)), [self.plan], device=self.device)
         inputs = [self.models.pool, self.splits, self.wanted, self.states.pool, self.plan, self.faults]
@@ -294,6 +317,8 @@ def set_object_lods(
 ) -> UpdateStats:
     """Bring every object to a LOD: refine meshes, update trees, share states; states that no object uses are freed.
 
+    All that it needs is allocated before the first state in use changes (`StateArrays.change`).
+
     Args:
         object_model: Model of each object, int (n,).
         lods: Target LOD of each object, int (n,), within its model's range.
@@ -302,10 +327,13 @@ def set_object_lods(
     wanted = [(key >> 32, key & (2**32 - 1)) for key in keys.tolist()]
     used = set(np.unique(objects.state[objects.state >= 0]).tolist())
     plan, chosen = _plan(states, set(wanted), used)
-    batch = _carry_out(models, states, plan)
+    move = _StateMove(models, states, plan)
     serving = np.array([chosen[key] for key in wanted], np.int32)[inverse.reshape(-1)]
-    if not np.array_equal(serving, objects.state):
+    moved = not np.array_equal(serving, objects.state)
+    staged = objects.stage_states(serving, states.generation) if moved else None
+    move.launch()
+    if moved:
         for state in used - set(chosen.values()):
             states.free.setdefault(states.slots[state].model, []).append(state)
-        objects.set_states(serving)
-    return UpdateStats(batch)
+        objects.set_states(serving, staged)
+    return UpdateStats(move.batch)

@@ -6,46 +6,13 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.broadphase import EVERY_WORLD, BroadPhase, exclusion_keys
-from warp_abtree.checks import to_numpy, whole_number
+from warp_abtree.checks import check_device, to_numpy, whole_number
 from warp_abtree.contact import ContactQuery, contact_dtypes
 from warp_abtree.intersect import Query, Result, check_request, check_within
-from warp_abtree.kernels import pose as pose_kernels
 from warp_abtree.model import Model
+from warp_abtree.poses import check_poses, device_rows, launch_place, place_rows
 from warp_abtree.refine import UpdateStats, set_object_lods
 from warp_abtree.state import ModelArrays, ObjectArrays, StateArrays
-
-QUATERNION_TOLERANCE = 1e-3
-RIGID_TOLERANCE = 1e-6
-
-
-def check_poses(poses, what="poses") -> np.ndarray:
-    """Return poses as float64, (n, 7) or (n, 4, 4).
-
-    Raises:
-        ValueError: Another shape, a number that is not finite, a quaternion whose norm is off by more than 1e-3, a
-            matrix that is not rigid within 1e-6.
-    """
-    poses = to_numpy(poses, what)
-    if not (poses.ndim == 2 and poses.shape[1] == 7) and not (poses.ndim == 3 and poses.shape[1:] == (4, 4)):
-        raise ValueError(f"{what}: shape {poses.shape} is neither (n, 7) nor (n, 4, 4)")
-    poses = poses.astype(np.float64)
-    bad = ~np.isfinite(poses).all(tuple(range(1, poses.ndim)))
-    if bad.any():
-        raise ValueError(f"{what}: pose {np.flatnonzero(bad)[0]} is not finite")
-    if poses.ndim == 2:
-        norm = np.sqrt((poses[:, 3:] ** 2).sum(1))
-        bad = ~(np.abs(norm - 1) <= QUATERNION_TOLERANCE)
-        if bad.any():
-            i = int(np.flatnonzero(bad)[0])
-            raise ValueError(f"{what}: pose {i} has a quaternion of norm {norm[i]:.6g}, off 1 by more than 1e-3")
-        return poses
-    rotation = poses[:, :3, :3]
-    gram = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max((1, 2))
-    bad = ~(gram <= RIGID_TOLERANCE) | ~(np.linalg.det(rotation) > 0)
-    bad |= np.abs(poses[:, 3] - [0, 0, 0, 1]).max(1) > 0
-    if bad.any():
-        raise ValueError(f"{what}: matrix {np.flatnonzero(bad)[0]} is not rigid within 1e-6")
-    return poses
 
 
 @dataclass(frozen=True)
@@ -87,6 +54,7 @@ class Scene:
         except Exception as error:
             present = ", ".join(d.alias for d in wp.get_devices())
             raise ValueError(f"no device {device!r} on this machine; there is {present} ({error})") from None
+        check_device(self.device)
         self.models: list[Model] = []
         self.object_model: list[int] = []
         self.object_importance: list[int] = []
@@ -123,6 +91,7 @@ class Scene:
         Raises:
             TypeError: model is no Model.
             ValueError: Anything else is out of range; nothing is added.
+            RuntimeError: A graph is being captured.
         """
         if not isinstance(model, Model):
             raise TypeError(f"model is a {type(model).__name__}, not a Model")
@@ -132,98 +101,117 @@ class Scene:
         if not isinstance(static, bool | np.bool_):
             raise ValueError(f"static {static!r} is neither True nor False")
         lod = model.lod_max if lod is None else model.check_lod(lod)
-        known = next((i for i, other in enumerate(self.models) if other is model), None)
-        self._settle()
-        if known is None:
-            known = len(self.models)
-            self.models.append(model)
-        self.object_model.append(known)
-        self.object_importance.append(importance)
-        self._world.append(world)
-        self._static.append(bool(static))
-        self._added_pose.append(checked)
-        self._lod.append(lod)
-        return self.object_count - 1
+        known = next((i for i, other in enumerate(self.models) if other is model), len(self.models))
+        self._retire()
+        count = self.object_count
+        columns = self._world, self._static, self._added_pose, self._lod, self.object_importance, self.object_model
+        try:
+            if known == len(self.models):
+                self.models.append(model)
+            for column, value in zip(columns, (world, bool(static), checked, lod, importance, known)):
+                column.append(value)
+        except BaseException:
+            for column in columns:
+                del column[count:]
+            raise
+        return count
 
-    def _settle(self):
+    def _retire(self):
         """Take the device's poses back before the arrays are made anew. Waits for the device."""
         if self._arrays is None:
             return
-        objects = self._arrays[2]
+        check_device(self.device, "adding an object")
+        _, states, objects = self._arrays
         matrices = np.tile(np.eye(4), (len(objects.state), 1, 1))
         matrices[:, :3, :3] = objects.pool.rotation.numpy()
         matrices[:, :3, 3] = objects.pool.position.numpy()
+        states.generation.advance()
+        objects.generation.advance()
         self._added_pose = list(matrices)
-        self._arrays = None
-        self._broad_phase = None
         self._queries.clear()
+        self._broad_phase = None
+        self._arrays = None
 
     def arrays(self) -> tuple[ModelArrays, StateArrays, ObjectArrays]:
-        """Return (`ModelArrays`, `StateArrays`, `ObjectArrays`), made at the first use after an `add`."""
+        """Return (`ModelArrays`, `StateArrays`, `ObjectArrays`), made at the first use after an `add`.
+
+        Tree states that an interrupted change of LODs has left torn are made anew.
+        """
         if self._arrays is None:
             if not self.object_model:
                 raise ValueError("the scene has no object")
+            check_device(self.device, "making a scene's arrays")
             models = ModelArrays(self.models, self.device)
             states = StateArrays(models, self.device)
             objects = ObjectArrays(self._world, self._static, self.device)
-            set_object_lods(models, states, objects, np.array(self.object_model), np.array(self._lod))
-            self._place(objects, self._added_pose)
+            self._bring_lods(models, states, objects)
+            self._place_added(objects.pool)
             self._arrays = (models, states, objects)
+        elif self._arrays[1].torn:
+            check_device(self.device, "making tree states anew")
+            models, states, objects = self._arrays
+            states.reset()
+            objects.state = np.full(self.object_count, -1, np.int32)
+            self._bring_lods(models, states, objects)
+            states.generation.resume()
+            states.torn = False
         return self._arrays
 
-    def _place(self, objects, poses):
-        """Set poses of mixed kinds: the device turns quaternions into matrices, matrices are taken as they are."""
+    def _bring_lods(self, models, states, objects):
+        set_object_lods(models, states, objects, np.array(self.object_model), np.array(self._lod))
+
+    def _place_added(self, pool):
+        """Set poses of both kinds: the device turns quaternions into matrices, matrices are taken as they are."""
+        poses = self._added_pose
+        matrix = np.array([pose.ndim == 2 for pose in poses])
         rows = np.zeros((len(poses), 7))
         rows[:, 6] = 1.0
-        matrix = np.array([p.ndim == 2 for p in poses])
-        for i, p in enumerate(poses):
-            if not matrix[i]:
-                rows[i] = p
-        self._place_quaternions(objects, rows)
+        for i in np.flatnonzero(~matrix):
+            rows[i] = poses[i]
+        launch_place(wp.array(rows, dtype=wp.float64, device=self.device), pool)
         if matrix.any():
-            rotation = objects.pool.rotation.numpy()
-            position = objects.pool.position.numpy()
+            rotation, position = pool.rotation.numpy(), pool.position.numpy()
             stacked = np.array([poses[i] for i in np.flatnonzero(matrix)])
-            rotation[matrix] = stacked[:, :3, :3]
-            position[matrix] = stacked[:, :3, 3]
-            objects.pool.rotation.assign(rotation)
-            objects.pool.position.assign(position)
-
-    def _place_quaternions(self, objects, rows):
-        device_rows = wp.array(rows, dtype=wp.float64, device=self.device)
-        wp.launch(pose_kernels.set_pose_kernel, dim=len(rows), inputs=[device_rows, objects.pool], device=self.device)
+            rotation[matrix], position[matrix] = stacked[:, :3, :3], stacked[:, :3, 3]
+            pool.rotation.assign(rotation)
+            pool.position.assign(position)
 
     def set_poses(self, poses):
         """Set the pose of every object.
 
         Args:
             poses: (n, 7) x y z qx qy qz qw, quaternions normalised in float64, or (n, 4, 4) rigid matrices taken as
-                they are; float32 or float64 [world units].
+                they are; float32 or float64 [world units]. An array of any framework; one on the scene's GPU is checked
+                and read there. (synchronization point)
 
         Raises:
             ValueError: Wrong shape or count, a number that is not finite, a quaternion or matrix that is no rotation;
                 nothing is changed.
         """
-        poses = check_poses(poses)
-        if len(poses) != self.object_count:
-            raise ValueError(f"poses: {len(poses)} given for {self.object_count} objects")
-        objects = self.arrays()[2]
-        if poses.ndim == 2:
-            self._place_quaternions(objects, poses)
+        check_device(self.device, "Scene.set_poses (PoseInput can)")
+        rows = device_rows(poses, self.device)
+        if rows is None:
+            poses = check_poses(poses)
+        given = len(poses) if rows is None else len(rows)
+        if given != self.object_count:
+            raise ValueError(f"poses: {given} given for {self.object_count} objects")
+        pool = self.arrays()[2].pool
+        if rows is not None:
+            place_rows(rows, pool)
         else:
-            objects.pool.rotation.assign(np.ascontiguousarray(poses[:, :3, :3]))
-            objects.pool.position.assign(np.ascontiguousarray(poses[:, :3, 3]))
+            launch_place(wp.array(poses.reshape(given, -1), dtype=wp.float64, device=self.device), pool)
 
     def set_lods(self, lods) -> UpdateStats:
         """Bring every object to a LOD: meshes are refined and trees updated in one batch, states are shared.
 
         Args:
-            lods: (n,) whole numbers, each from 0 to its model's lod_max.
+            lods: (n,) whole numbers, each from 0 to its model's lod_max; of any framework, copied from a GPU.
 
         Raises:
             ValueError: Wrong shape or a LOD out of range; nothing is changed.
-            RuntimeError: The device is out of memory; LODs and states are as before.
+            RuntimeError: The device is out of memory, or a launch fails; LODs and answers are as before.
         """
+        check_device(self.device, "Scene.set_lods (FrameGraph.lods can)")
         lods = to_numpy(lods, "lods")
         if lods.shape != (self.object_count,):
             raise ValueError(f"lods: shape {lods.shape} given for {self.object_count} objects")
@@ -235,9 +223,10 @@ class Scene:
             i = int(bad[0])
             raise ValueError(f"lods: object {i} asks for LOD {lods[i]}, outside 0 .. {top[i]}")
         models, states, objects = self.arrays()
-        with states.restored_on_error():
-            stats = set_object_lods(models, states, objects, np.array(self.object_model), lods.astype(np.int64))
-        self._lod = lods.astype(np.int64).tolist()
+        targets = lods.astype(np.int64)
+        with states.change():
+            stats = set_object_lods(models, states, objects, np.array(self.object_model), targets)
+            self._lod = targets.tolist()
         return stats
 
     def check_pairs(self, pairs) -> np.ndarray:
@@ -268,8 +257,11 @@ class Scene:
         Raises:
             ValueError: As `check_pairs`.
         """
-        self._excluded = np.union1d(self._excluded, exclusion_keys(self.check_pairs(pairs)))
+        excluded = np.union1d(self._excluded, exclusion_keys(self.check_pairs(pairs)))
+        if self._arrays is not None:
+            self._arrays[2].filter_generation.advance()
         self._broad_phase = None
+        self._excluded = excluded
 
     def excluded_keys(self) -> np.ndarray:
         """Return the excluded pairs as sorted keys i * 2^32 + j, i < j, int64."""
@@ -280,10 +272,12 @@ class Scene:
 
         Worlds never mix (-1 is in every one), two static objects never pair, filtered pairs stay out.
         """
+        check_device(self.device, "Scene.broad_phase")
         if self.object_count < 2:
             return np.empty((0, 2), np.int32)
+        arrays = self.arrays()
         if self._broad_phase is None:
-            self._broad_phase = BroadPhase(*self.arrays(), self._excluded)
+            self._broad_phase = BroadPhase(*arrays, self._excluded)
         return self._broad_phase.find()
 
     def intersect(self, pairs=None, output="any", precision="exact", within=None, contact_dtype=np.float64) -> Result:
@@ -307,6 +301,7 @@ class Scene:
         Raises:
             ValueError: Bad pairs, a bad distance, an unknown option, or a scene without objects.
         """
+        check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)
         with_contacts = output == "contacts"
         check_request("faces" if with_contacts else output, precision)
@@ -334,6 +329,7 @@ class Scene:
         Raises:
             ValueError: No such object.
         """
+        check_device(self.device, "Scene.tree_state")
         i = whole_number(i, "object", 0, self.object_count - 1)
         _, states, objects = self.arrays()
         slot = states.slots[objects.state[i]]

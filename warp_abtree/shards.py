@@ -22,7 +22,8 @@ from warp_abtree.checks import to_numpy, whole_number
 from warp_abtree.intersect import check_request
 from warp_abtree.model import Model
 from warp_abtree.pose_sweep import sweep
-from warp_abtree.scene import QUATERNION_TOLERANCE, Scene
+from warp_abtree.poses import QUATERNION_TOLERANCE
+from warp_abtree.scene import Scene
 from warp_abtree.turns import device_turn
 
 FORMAT_NAME, FORMAT_VERSION = "warp_abtree shards", 1

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_abtree.generation import Generation
 from warp_abtree.kernels.nodes import clear_node_kernel
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 
 # Columns of `StatePool` that mirror the host's slots.
 SLOT_COLUMNS = ("model", "lod", "node_start", "face_start")
+SLOTS_LEAST = 16  # states that the pool has room for at first
 
 
 def _upload(values, dtype, device):
@@ -89,21 +91,27 @@ class StateArrays:
     """A pool of tree states that grows; a freed state is taken again by the same model.
 
     Attributes:
-        pool: `StatePool` for kernels. Growing replaces its arrays, so a captured graph needs a pool that does not grow.
+        pool: `StatePool` for kernels, longer than what is in use. Growing replaces its arrays, which captured graphs
+            cannot follow.
+        generation: Of the arrays of the pool; retired where the scene makes others.
         slots: Host side of each state.
         free: Ids of states that no object uses, by model.
+        torn: Whether a change of LODs was interrupted: states hold what no LOD explains until `reset`.
     """
 
     def __init__(self, models: ModelArrays, device):
         self.models = models
         self.device = device
+        self.generation = Generation(device)
         self.slots: list[Slot] = []
         self.free: dict[int, list[int]] = {}
+        self.torn = self._touched = False
         self.node_total = 0
         self.face_total = 0
         self.pool = StatePool()
         self._allocate_nodes(0)
         self._allocate_faces(0)
+        self._allocate_slots(SLOTS_LEAST)
 
     def _allocate_nodes(self, count):
         old, kept = self.pool, self.node_total
@@ -112,6 +120,7 @@ class StateArrays:
         if kept:
             wp.copy(status, old.node_status, count=kept)
             wp.copy(box, old.node_box, count=2 * kept)
+        self.generation.advance()
         self.pool.node_status, self.pool.node_box = status, box
         wp.launch(clear_node_kernel, count - kept, [kept, self.pool], device=self.device)
         self.node_room = count
@@ -121,8 +130,20 @@ class StateArrays:
         array = wp.full(count, wp.vec4i(-1, -1, -1, -1), dtype=wp.vec4i, device=self.device)
         if kept:
             wp.copy(array, old.face_corner, count=kept)
+        self.generation.advance()
         self.pool.face_corner = array
         self.face_room = count
+
+    def _allocate_slots(self, count):
+        made = {name: wp.zeros(count, dtype=wp.int32, device=self.device) for name in SLOT_COLUMNS}
+        kept = len(self.slots)
+        for name, array in made.items():
+            if kept:
+                wp.copy(array, getattr(self.pool, name), count=kept)
+        self.generation.advance()
+        for name, array in made.items():
+            setattr(self.pool, name, array)
+        self.slot_room = count
 
     def reserve(self, wanted_models):
         """Take one state for each entry of a list of models and return their ids; contents are whatever stood there.
@@ -147,6 +168,8 @@ class StateArrays:
             self._allocate_nodes(max(nodes, min(2 * self.node_room, 2**30 - 1)))
         if faces > self.face_room:
             self._allocate_faces(max(faces, min(2 * self.face_room, 2**31 - 1)))
+        if len(self.slots) + len(fresh) > self.slot_room:
+            self._allocate_slots(max(len(self.slots) + len(fresh), 2 * self.slot_room))
         self.free = spare
         for model in fresh:
             self.slots.append(Slot(model, -1, self.node_total, self.face_total))
@@ -160,34 +183,48 @@ class StateArrays:
         return box[:, 0, :3], box[:, 1, :3], np.ascontiguousarray(box[:, 0, 3]).view(np.int32)
 
     def upload_slots(self):
-        """Bring model, LOD and starts of all states to the device."""
-        columns = [np.array([getattr(s, name) for s in self.slots], np.int32) for name in SLOT_COLUMNS]
-        for name, array in zip(SLOT_COLUMNS, [_upload(values, wp.int32, self.device) for values in columns]):
-            setattr(self.pool, name, array)
+        """Bring model, LOD and starts of all states to the device, in place."""
+        for name in SLOT_COLUMNS:
+            values = np.array([getattr(slot, name) for slot in self.slots], np.int32)
+            source = wp.array(values, dtype=wp.int32, device="cpu", copy=False)
+            wp.copy(getattr(self.pool, name), source, count=len(values))
+
+    def touch(self):
+        """Say that from here on states in use change: what fails now leaves them torn."""
+        self._touched = True
 
     @contextmanager
-    def restored_on_error(self):
-        """Put every state back where a change of LODs fails before its first launch, as for lack of memory.
+    def change(self):
+        """Change LODs wholly or not at all.
 
-        An update allocates all that it needs before it moves a state that is in use, so what stands on the device
-        still fits. Room that the pool has gained stays.
+        What fails before `touch`, as for lack of memory, leaves every state as it was; room that the pool has gained
+        stays. What fails after it, an interruption among them, leaves the states torn, for `reset`.
         """
         lods = [slot.lod for slot in self.slots]
         held = {name: getattr(self, name) for name in ("node_total", "face_total")}
-        free = {model: list(ids) for model, ids in self.free.items()}
-        columns = {name: getattr(self.pool, name) for name in SLOT_COLUMNS}
+        held["free"] = {model: list(ids) for model, ids in self.free.items()}
+        self.torn, self._touched = True, False
         try:
             yield
         except BaseException:
-            del self.slots[len(lods) :]
-            for slot, lod in zip(self.slots, lods, strict=True):
-                slot.lod = lod
-            for name, value in held.items():
-                setattr(self, name, value)
-            self.free = free
-            for name, array in columns.items():
-                setattr(self.pool, name, array)
+            self.generation.suspend()
+            if not self._touched:
+                del self.slots[len(lods) :]
+                for slot, lod in zip(self.slots, lods, strict=True):
+                    slot.lod = lod
+                for name, value in held.items():
+                    setattr(self, name, value)
+                self.generation.resume()
+                self.torn = False
             raise
+        self.torn = False
+
+    def reset(self):
+        """Forget all states; the pool keeps its room."""
+        self.slots, self.free = [], {}
+        self.node_total = self.face_total = 0
+        self.pool.node_status.zero_()
+        wp.launch(clear_node_kernel, self.node_room, [0, self.pool], device=self.device)
 
 
 class ObjectArrays:
@@ -196,6 +233,8 @@ class ObjectArrays:
     Attributes:
         pool: `ObjectPool` for kernels.
         state: State of each object, NumPy int32 (n,), the host's copy of pool.state.
+        generation: Of the arrays; retired where the scene makes others.
+        filter_generation: Of the pairs filtered out of the broad phase of these objects.
     """
 
     def __init__(self, worlds, statics, device):
@@ -208,8 +247,22 @@ class ObjectArrays:
         self.pool.is_static = _upload(np.asarray(statics, np.int32), wp.int32, device)
         self.pool.rotation = wp.zeros(count, dtype=wp.mat33d, device=device)
         self.pool.position = wp.zeros(count, dtype=wp.vec3d, device=device)
+        self.generation, self.filter_generation = Generation(device), Generation(device)
+        self._pointed = 0
 
-    def set_states(self, state):
+    def stage_states(self, state, generation: Generation):
+        """Return what `set_states` needs to point objects at states of a pool that has grown; None where it has not.
+
+        A graph that was captured before reads the array that it knows: its tree states are none of the new ones.
+        """
+        if generation.number == self._pointed:
+            return None
+        return wp.array(state, dtype=wp.int32, device=self.device), generation.number
+
+    def set_states(self, state, staged=None):
         """Point every object at a state, int32 (n,)."""
+        if staged is None:
+            self.pool.state.assign(np.asarray(state, np.int32))
+        else:
+            self.pool.state, self._pointed = staged
         self.state = np.asarray(state, np.int32)
-        self.pool.state.assign(self.state)

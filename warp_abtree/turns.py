@@ -1,9 +1,14 @@
 """Threads that use one GPU take turns: Warp keeps one current stream a device, whatever the thread."""
 
 import contextlib
+import os
 import threading
 
 _locks: dict = {}
+
+if hasattr(os, "register_at_fork"):
+    # A lock that another thread held stays locked in a forked child.
+    os.register_at_fork(after_in_child=_locks.clear)
 
 
 def device_turn(device):

@@ -1,0 +1,43 @@
+"""Generations of device arrays: a graph that replays on arrays that were replaced since its capture is found out."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+STALE = wp.constant(-2)
+
+
+@wp.struct
+class LaunchRecord:
+    """The generations of arrays that a launch was given, those in force when it runs, and what became of it.
+
+    states, filter, buffers: given; a captured graph keeps those of its capture.
+    states_now, filter_now, buffers_now: in force, shape [1].
+    launched: generation of the buffers that the last launch used, or STALE; and 1 if any launch was stale since this
+    was cleared, shape [2].
+    """
+
+    states: wp.int32
+    filter: wp.int32
+    buffers: wp.int32
+    states_now: wp.array(dtype=wp.int32)
+    filter_now: wp.array(dtype=wp.int32)
+    buffers_now: wp.array(dtype=wp.int32)
+    launched: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def is_stale(record: LaunchRecord):
+    """Return whether anything that a launch was given has been replaced, or is in doubt."""
+    current = record.states == record.states_now[0] and record.filter == record.filter_now[0]
+    return not (current and record.buffers == record.buffers_now[0])
+
+
+@wp.func
+def record_launch(record: LaunchRecord):
+    """Note which buffers a launch uses, or that it is stale; for one thread."""
+    if is_stale(record):
+        record.launched[0] = STALE
+        record.launched[1] = 1
+    else:
+        record.launched[0] = record.buffers
