@@ -1,7 +1,6 @@
 """Batched mesh-mesh interference queries at any level of detail, on NVIDIA Warp."""
 
 from warp_abtree.broadphase import CapacityError
-from warp_abtree.cascade import Cascade, CascadeResult, intersect_originals
 from warp_abtree.clock import ReplayClock, WorkClock
 from warp_abtree.cluster import RayPool, WorldsJob
 from warp_abtree.collision_manager import CollisionManager
@@ -30,8 +29,6 @@ __version__ = "0.1.0"
 __all__ = [
     "Camera",
     "CapacityError",
-    "Cascade",
-    "CascadeResult",
     "CollisionManager",
     "ContactQuery",
     "Dynamics",
@@ -66,7 +63,6 @@ __all__ = [
     "WorldsJob",
     "describe_mesh",
     "draw_controllers",
-    "intersect_originals",
     "judge_budget",
     "judge_step",
     "load_mesh",
