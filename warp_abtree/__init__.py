@@ -15,7 +15,6 @@ from warp_abtree.lod import Camera, Ladder
 from warp_abtree.manifold import ManifoldQuery
 from warp_abtree.mesh import MeshError, describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model import Model, ModelError
-from warp_abtree.multi_scene import MultiScene
 from warp_abtree.newton import NewtonContacts
 from warp_abtree.plot import draw_controllers
 from warp_abtree.pose_sweep import sweep
@@ -43,7 +42,6 @@ __all__ = [
     "MeshError",
     "Model",
     "ModelError",
-    "MultiScene",
     "NewtonContacts",
     "PaperController",
     "PoseInput",
