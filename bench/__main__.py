@@ -17,7 +17,6 @@ import warp_abtree as ab
 from . import (
     budget,
     build,
-    cascade,
     exact,
     frame,
     memory,
@@ -35,7 +34,6 @@ from . import (
 CASES = {
     "budget": budget.run,
     "build": build.run,
-    "cascade": cascade.run,
     "exact": exact.run,
     "frame": frame.run,
     "memory": memory.run,

@@ -7,7 +7,7 @@ import numpy as np
 
 import warp_abtree as ab
 
-from .cascade import Approach
+from .shapes import centre_and_radius
 from .update import forced
 
 # Nothing public hands out the batch of an update.
@@ -32,6 +32,51 @@ def longest_side(model) -> float:
     return float(np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())
 
 
+class Approach:
+    """Poses of copies of a model, B, around another one, A, object 0 of a scene, each along a direction of its own.
+
+    Attributes:
+        free: Distance of the centres just beyond the last contact of each B on its way out [model units], (count,).
+    """
+
+    def __init__(self, scene, model, count, steps, seed=0):
+        rng = np.random.default_rng(seed)
+        self.centre, radius = centre_and_radius(model)
+        away = rng.normal(size=(count, 3))
+        self.away = away / np.linalg.norm(away, axis=1, keepdims=True)
+        x, y, z, w = (lambda q: q / np.linalg.norm(q, axis=0))(rng.normal(size=(4, count)))
+        self.matrices = np.tile(np.eye(4), (count + 1, 1, 1))
+        self.matrices[1:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], 1)
+        self.matrices[1:, 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], 1)
+        self.matrices[1:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], 1)
+        self.scene = scene
+        self.pairs = np.stack([np.zeros(count, np.int32), np.arange(1, count + 1, dtype=np.int32)], 1)
+        self._find_contact(2 * radius, steps)
+
+    def _find_contact(self, reach, steps):
+        """Find where B is last in contact on its way out, by steps and then by bisection, and first is not."""
+        query = ab.Query(self.scene, "any", pairs=self.pairs)
+
+        def meets(along):
+            self.place(along)
+            return query.run().any
+
+        low = np.zeros(len(self.pairs))
+        for along in np.linspace(0, reach, steps):
+            low = np.where(meets(np.full(len(low), along)), along, low)
+        high = low + reach / (steps - 1)
+        for _ in range(50):
+            middle = (low + high) / 2
+            met = meets(middle)
+            low, high = np.where(met, middle, low), np.where(met, high, middle)
+        self.free = high
+
+    def place(self, along):
+        """Pose every B with its centre a distance [model units] from A's."""
+        self.matrices[1:, :3, 3] = self.centre + along[:, None] * self.away - self.matrices[1:, :3, :3] @ self.centre
+        self.scene.set_poses(self.matrices)
+
+
 class PosedPairs:
     """Pairs of objects of one model in random rotations: A at the origin, B so far pushed into it along a way out.
 
@@ -52,7 +97,7 @@ class PosedPairs:
         finder.add(model)
         for _ in range(count):
             finder.add(model)
-        self._approach = Approach(finder, model, model, count, steps)
+        self._approach = Approach(finder, model, count, steps)
         self._size = longest_side(model)
         self._firsts = firsts
         self.scene = ab.Scene(device)

@@ -1,12 +1,10 @@
 """Scaling over devices, the cost model from counters, and what follows for more devices.
 
-Through `MultiScene`, with new poses from the host at every question: a sweep (one object in every world, one more in
-each world, pairs given, yes or no) and worlds (four objects each, broad phase, face pairs counted). Through
-`FrameGraph`, one a device: frames, the same worlds, whose poses change and whose answers stay on the devices, so that
-the host brings nothing. Through `ThisProcess`: shards, those of a `SweepJob`, as `warp-abtree sweep` does them but for
-the disk. Strong: as much work whatever the number of devices; weak: as much on each device. Devices are 1, 2, 4 and so
-on, and all. Times are by the wall clock, all numbers of devices in turn, poses in and merged results out; busy is what
-the slowest device with its thread or process took of it. A CPU worker has one core.
+Frames: worlds of four objects, broad phase, face pairs counted, a `FrameGraph` a device that a thread of its own
+launches; poses change and answers stay on the devices, so that the host brings nothing. Shards: those of a `SweepJob`
+through `ThisProcess`, as `warp-abtree sweep` does them but for the disk. Strong: as much work whatever the number of
+devices; weak: as much on each device. Devices are 1, 2, 4 and so on, and all. Times are by the wall clock, all numbers
+of devices in turn. A CPU has one core.
 """
 
 import contextlib
@@ -33,7 +31,6 @@ from .timing import capture, make_runs, summarise, time_rounds, time_wall
 SIZES = {
     "cuda": {
         "faces": 5000,
-        "sweep": 65536,
         "worlds": 8192,
         "frames": 8,
         "repeats": 9,
@@ -43,7 +40,6 @@ SIZES = {
     },
     "cpu": {
         "faces": 2000,
-        "sweep": 8192,
         "worlds": 512,
         "frames": 2,
         "repeats": 7,
@@ -54,7 +50,6 @@ SIZES = {
 }
 QUICK = {
     "faces": 300,
-    "sweep": 32,
     "worlds": 8,
     "frames": 2,
     "repeats": 1,
@@ -91,8 +86,6 @@ def run(device, devices=None, quick=False, predict=None):
     yield run_cost(first, sizes)
     yield run_worker(first, model, min(SHARD, sizes["driver"]), sizes["repeats"])
     yield run_driver(model, sizes["driver"])
-    for case in ("sweep", "worlds"):
-        yield from run_scaling(devices, model, case, sizes)
     yield from run_frames(devices, model, sizes)
     yield from run_shards(devices, model, sizes)
 
@@ -249,73 +242,6 @@ def run_shards(devices, model, sizes):
         return row | {"mposes_s": float(f"{count / np.median(values) / 1e3:.4g}")}
 
     yield from list_rows("shards", devices, found, describe)
-
-
-def fill(scene, model, case, count):
-    """Add the objects of so many worlds; return their poses, a second set of them, and the pairs asked."""
-    size = float(np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())
-    still = np.array([[0.0, 0, 0, 0, 0, 0, 1]])
-    if case == "sweep":
-        poses = [np.concatenate([still, random_poses(count, size, seed)]) for seed in (0, 1)]
-        worlds = np.arange(-1, count)
-        pairs = np.stack([np.zeros(count, int), np.arange(1, count + 1)], 1)
-    else:
-        poses = [world_poses(count, OBJECTS, size, seed).reshape(-1, 7) for seed in (0, 1)]
-        worlds, pairs = np.repeat(np.arange(count), OBJECTS), None
-    for pose, world in zip(poses[0], worlds.tolist()):
-        scene.add(model, pose, world=world)
-    return poses, pairs
-
-
-def run_scaling(devices, model, case, sizes):
-    """Yield rows of a `MultiScene` that is asked with new poses.
-
-    Raises:
-        RuntimeError: Answers are not those of one device.
-    """
-    output = "any" if case == "sweep" else "count"
-    with contextlib.ExitStack() as stack:
-        runs, expected = {}, None
-        for parts, times in list_sizes(devices):
-            scene = stack.enter_context(ab.MultiScene(devices[:parts], cores=1))
-            poses, pairs = fill(scene, model, case, sizes[case] * times)
-            scene.intersect(pairs, output=output)
-            if case == "worlds":
-                scene.balance()
-                scene.intersect(pairs, output=output)
-            runs[parts, times] = Question(scene, poses, pairs, output)
-            scene.set_poses(poses[0])
-            found = scene.intersect(pairs, output=output)
-            if times == 1:
-                seen = found.pairs.tobytes(), getattr(found, output).tobytes()
-                expected = expected or seen
-                if seen != expected:
-                    raise RuntimeError(f"{case}: {parts} devices answer otherwise than one")
-        found = time_rounds(runs, sizes["repeats"])
-
-    def describe(key, values):
-        row = {"asked_by": "processes" if devices[0] == "cpu" else "threads", "worlds": sizes[case] * key[1]}
-        return row | summarise("question", values) | {"busy_ms": round(float(np.median(runs[key].busy)), 3)}
-
-    yield from list_rows(case, devices, found, describe)
-
-
-class Question:
-    """Sets other poses than before and asks; returns the time [ms], and keeps the parts' of it in `busy`."""
-
-    def __init__(self, scene, poses, pairs, output):
-        self.scene, self.poses, self.pairs, self.output = scene, poses, pairs, output
-        self.turn, self.busy = 0, []
-
-    def __call__(self):
-        self.turn ^= 1
-        begin = time.perf_counter()
-        self.scene.set_poses(self.poses[self.turn])
-        busy = max(self.scene.seconds)
-        self.scene.intersect(self.pairs, output=self.output)
-        spent = time.perf_counter() - begin
-        self.busy.append(1e3 * (busy + max(self.scene.seconds)))
-        return 1e3 * spent
 
 
 class Frames:

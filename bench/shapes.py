@@ -46,6 +46,13 @@ def pair_poses(pair_count, distance, seed=0):
     return x
 
 
+def centre_and_radius(model):
+    """Return the middle of a model's box and the radius of the ball about it that holds the model."""
+    points = model.mesh_at(model.lod_max)[0]
+    centre = (points.min(0) + points.max(0)) / 2
+    return centre, np.linalg.norm(points - centre, axis=1).max()
+
+
 def knot_model(face_target, folder=None):
     """Return the model of `knot`, which takes minutes for a million faces; a folder keeps it between runs."""
     if folder is None:

@@ -13,6 +13,7 @@ import numpy as np
 import warp_abtree as ab
 
 from .peers import no_garbage_collection, one_core
+from .shapes import centre_and_radius
 from .timing import time_rounds
 
 REAL = {
@@ -47,13 +48,6 @@ def subjects(context):
         a, b = found[name]
         model_a = context.model(a)
         yield Subject(context, name, model_a, model_a if a == b else context.model(b))
-
-
-def centre_and_radius(model):
-    """Return the middle of a model's box and the radius of the ball about it that holds the model."""
-    points = model.mesh_at(model.lod_max)[0]
-    centre = (points.min(0) + points.max(0)) / 2
-    return centre, np.linalg.norm(points - centre, axis=1).max()
 
 
 def rotate(quaternions, point):

@@ -180,3 +180,18 @@ def test_budget_example(device):
     for verdict in found.values():
         assert verdict["frames"] == 10 and verdict["error_mean"] > 0
     assert found["predictive"]["within"] > found["paper"]["within"]
+
+
+def test_several_gpus_example(device):
+    words = "--worlds 5 --frames 40 --devices".split()
+    counts, shown = run_example("several_gpus", *words, f"{device},{device}")
+    assert f"one scene on {device} counts the same" in shown
+    assert counts.shape == (5,) and counts.all() and len(set(counts)) > 1
+    for devices in (device, ",".join([device] * 7), "cpu"):
+        assert np.array_equal(run_example("several_gpus", *words, devices)[0], counts)
+
+
+def test_several_gpus_example_tells_a_wrong_count(device, monkeypatch):
+    monkeypatch.setattr(wp, "capture_launch", lambda graph: None)
+    with pytest.raises(SystemExit, match=f"one scene on {device} counts otherwise"):
+        run_example("several_gpus", "--devices", device, "--worlds", 3)

@@ -1,7 +1,6 @@
 """Batched mesh-mesh interference queries at any level of detail, on NVIDIA Warp."""
 
 from warp_abtree.broadphase import CapacityError
-from warp_abtree.cascade import Cascade, CascadeResult, intersect_originals
 from warp_abtree.checks import wrap_array
 from warp_abtree.clock import ReplayClock, WorkClock
 from warp_abtree.cluster import RayPool, WorldsJob
@@ -17,7 +16,6 @@ from warp_abtree.lod import Camera, Ladder
 from warp_abtree.manifold import ManifoldQuery
 from warp_abtree.mesh import MeshError, describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model import Model, ModelError
-from warp_abtree.multi_scene import MultiScene
 from warp_abtree.newton import NewtonContacts
 from warp_abtree.plot import draw_controllers
 from warp_abtree.pose_sweep import sweep
@@ -31,8 +29,6 @@ __version__ = "0.1.0"
 __all__ = [
     "Camera",
     "CapacityError",
-    "Cascade",
-    "CascadeResult",
     "CollisionManager",
     "ContactQuery",
     "Dynamics",
@@ -47,7 +43,6 @@ __all__ = [
     "MeshError",
     "Model",
     "ModelError",
-    "MultiScene",
     "NewtonContacts",
     "PaperController",
     "PoseInput",
@@ -67,7 +62,6 @@ __all__ = [
     "WorldsJob",
     "describe_mesh",
     "draw_controllers",
-    "intersect_originals",
     "judge_budget",
     "judge_step",
     "load_mesh",

@@ -287,7 +287,7 @@ class Scene:
 
         Args:
             pairs: (p, 2) object indices, asked whatever their worlds, also where both are static or filtered out of the
-                broad phase (a `MultiScene` refuses pairs of two worlds); None asks the broad phase.
+                broad phase; None asks the broad phase.
             output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
                 an object pair's summary of them, stands in `warp_abtree.contact`.
             precision: "exact": the answer is exact for A's vertices and the posed ones of B, A the object with the
