@@ -71,10 +71,12 @@ def _wrap_cuda_array(values):
 
 
 def is_device_array(values) -> bool:
-    """Return whether an array of some framework lies on a GPU, or is Warp's."""
+    """Return whether an array of some framework lies on a GPU."""
+    if isinstance(values, wp.array):
+        return values.device.is_cuda
     if isinstance(values, np.ndarray):
         return False
-    if isinstance(values, wp.array) or hasattr(values, "__cuda_array_interface__"):
+    if hasattr(values, "__cuda_array_interface__"):  # of a tensor on the CPU that raises AttributeError
         return True
     return hasattr(values, "__dlpack_device__") and int(values.__dlpack_device__()[0]) != 1  # kDLCPU
 
@@ -87,12 +89,18 @@ def to_numpy(values, what: str) -> np.ndarray:
     Raises:
         ValueError: It is no array of numbers.
     """
-    if not isinstance(values, np.ndarray) and (is_device_array(values) or hasattr(values, "__dlpack__")):
-        values = wrap_array(values, what).numpy()
     try:
+        if isinstance(values, wp.array):
+            values = values.numpy()
+        elif is_device_array(values):
+            values = wrap_array(values, what).numpy()
+        elif hasattr(values, "numpy"):
+            values = (values.detach() if getattr(values, "requires_grad", False) else values).numpy()
+        elif hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray):
+            values = np.from_dlpack(values)
         array = np.asarray(values)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{what}: no array of numbers ({error})") from None
+    except (ValueError, TypeError, BufferError, RuntimeError) as error:
+        raise ValueError(f"{what}: no array of numbers ({first_line(error)})") from None
     if array.dtype.kind not in "iuf":
         raise ValueError(f"{what}: type {array.dtype} holds no real numbers")
     return array

@@ -5,6 +5,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from warp_abtree.checks import to_numpy
 from warp_abtree.convex import Shape, shape_of
 from warp_abtree.nearest import find_nearest
 from warp_abtree.poses import check_poses
@@ -164,7 +165,7 @@ class CollisionManager:
 
     @staticmethod
     def _matrix(transform, name):
-        matrix = np.eye(4) if transform is None else np.asarray(transform)
+        matrix = np.eye(4) if transform is None else to_numpy(transform, f"transform of {name!r}")
         if matrix.shape != (4, 4):
             raise ValueError(f"transform of {name!r}: shape {matrix.shape}, not (4, 4)")
         return check_poses(matrix[None], f"transform of {name!r}")[0]

@@ -37,9 +37,9 @@ contacts of each chunk of 32, the last chunk perhaps shorter, from left to right
   leans over, and depth can be several times too large; for separate regions of contact and for open surfaces it is
   merely a length.
 
-A pair without contacts has depth 0 and NaN as point and normal, of the bits 0x7ff8000000000000. The results are the same, bit for bit, on CPU and
-CUDA. For a pair named the other way the contacts differ in nothing but order, exchanged ends and signs; sums follow the
-order of the faces as named, so that its summary may differ in the last bits too.
+A pair without contacts has depth 0 and NaN as point and normal, of the bits 0x7ff8000000000000. The results are the
+same, bit for bit, on CPU and CUDA. For a pair named the other way the contacts differ in nothing but order, exchanged
+ends and signs; sums follow the order of the faces as named, so that its summary may differ in the last bits too.
 """
 
 import numpy as np

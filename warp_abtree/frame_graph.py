@@ -12,8 +12,8 @@ from warp_abtree.contact import ContactQuery
 from warp_abtree.generation import STALE_GRAPH
 from warp_abtree.intersect import Query, Result
 from warp_abtree.kernels import frame_graph as kernels
-from warp_abtree.refine import NO_FAULTS, LodLadder, LodUpdate, build_states
 from warp_abtree.poses import QUATERNION_TOLERANCE
+from warp_abtree.refine import NO_FAULTS, LodLadder, LodUpdate, build_states
 from warp_abtree.scene import Scene
 from warp_abtree.state import ObjectArrays, StateArrays
 

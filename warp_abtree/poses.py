@@ -60,7 +60,7 @@ def device_rows(poses, device, what="poses"):
     """Return poses that lie on a GPU as rows of 7 or 16 numbers of it, without a copy where they are contiguous.
 
     Args:
-        poses: (n, 7) or (n, 4, 4), float32 or float64, of any framework; or a Warp array (n,) of transforms or matrices.
+        poses: (n, 7) or (n, 4, 4), float32 or float64, of any framework; or Warp's transforms or matrices, (n,).
 
     Returns:
         Warp array (n, 7) or (n, 16); None where the poses do not lie on this device, or are of another kind.
@@ -76,7 +76,8 @@ def device_rows(poses, device, what="poses"):
         rows = wp.array(ptr=array.ptr, dtype=scalar, shape=(len(array), width), device=device)
         rows._owner = array
         return rows
-    if array.dtype not in REALS or not (array.ndim == 2 and array.shape[1] == 7) != (array.shape[1:] == (4, 4)):
+    quaternions = array.ndim == 2 and array.shape[1] == 7
+    if array.dtype not in REALS or not (quaternions or array.shape[1:] == (4, 4)):
         return None
     array = array if array.is_contiguous else array.contiguous()
     return array if array.ndim == 2 else array.reshape((array.shape[0], 16))
