@@ -8,6 +8,8 @@ import warp as wp
 
 from warp_abtree import refine
 
+# JAX would take three quarters of a GPU's memory for itself.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 
