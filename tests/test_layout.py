@@ -8,9 +8,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PIPELINE = (
-    "checks files mesh progressive tree model state refine lod broadphase cores intersect contact scene cascade "
-    "frame_graph turns pose_sweep scene_part multi_scene shards nearest convex collision_manager interop manifold "
-    "bodies dynamics newton clock control frame cluster "
+    "checks files mesh progressive tree outward model state refine lod broadphase cores intersect contact scene "
+    "cascade frame_graph turns pose_sweep scene_part multi_scene shards nearest convex collision_manager interop "
+    "manifold bodies dynamics newton clock control frame cluster "
     "scene_keys scene_folder scene_models scene_control scene_file recording plot waiting report "
     "view_source view_parts picture view_text view_stage view_page view_record view bench_command sweep_command doctor "
     "cli_arguments cli"
