@@ -41,6 +41,11 @@ def turned(vertices, faces, seed=0):
     return vertices @ turn.T, faces
 
 
+def far_grid(seed):
+    vertices, faces = turned(*grid(2), seed)
+    return vertices + 1e6 * np.random.default_rng(seed).normal(size=3), faces
+
+
 def corners_at(model, lod):
     vertices, faces, _ = model.mesh_at(lod)
     return vertices[faces]
@@ -135,13 +140,13 @@ def test_no_point_is_farther(model, share):
 
 EXACT = {
     "flat grid": lambda: turned(*grid(2), seed=1),
-    "line": lambda: line((1.0, 0.7, -0.3), 9),
-    "line, flat": lambda: line((1.0, 2.0, -1.0), 9),
+    "line": lambda: line((1.0, 2.0, -1.0), 9),
+    **{f"line, seed {seed}": lambda seed=seed: line(np.random.default_rng(seed).normal(size=3), 6) for seed in (1, 9)},
     "box": lambda: turned(*of_trimesh(trimesh.creation.box())),
     "comb": lambda: turned(*square_comb(2)),
     "soup": lambda: soup(12, 5),
     "lattice soup": lambda: soup(20, 6, lattice=3),
-    "far away": lambda: (turned(*square_comb(2))[0] + 1e6, square_comb(2)[1]),
+    **{f"far away, seed {seed}": lambda seed=seed: far_grid(seed) for seed in (0, 2, 4)},
 }
 
 
