@@ -117,9 +117,9 @@ class Model:
         Args:
             side: "inward": how far a point of the original surface can lie from the surface at the LOD. Found when the
                 model is built; falls with the LOD. "outward": how far a point of the surface at the LOD can lie from
-                the original surface. Found when asked for, on one core of the CPU, then kept: about 2 us for each face
-                of the original and the first time another 1 us, more for soups of long faces. Within 1 % of the
-                largest distance as a rule. Need not fall with the LOD.
+                the original surface; as a rule within 1 % of the largest distance. Found when asked for, on one core of
+                the CPU, and kept: 2 to 4 us for each face of the original, more for soups of long faces. Need not fall
+                with the LOD.
 
         Raises:
             ValueError: lod is no whole number from 0 to lod_max, or side is another word.
@@ -132,11 +132,11 @@ class Model:
         raise ValueError(f"model {self.name!r}: side {side!r} is neither 'inward' nor 'outward'")
 
     def lod_for(self, fraction: float | None = None, tolerance: float | None = None) -> int:
-        """Return the LOD nearest to a share of the faces, or the coarsest whose certified error is within a tolerance.
+        """Return the LOD nearest to a share of the faces, or the coarsest whose inward error is within a tolerance.
 
         Args:
             fraction: Share of face_count, in (0, 1].
-            tolerance: Largest error [model units], at least 0.
+            tolerance: Largest `error_at(lod)` [model units], at least 0: of the original from the LOD, not outward.
 
         Raises:
             ValueError: Not exactly one of the two is given, or it is out of range.

@@ -1,4 +1,9 @@
-"""The other side of a LOD's error: a certified bound on how far its surface lies from the original, LOD by LOD."""
+"""The other side of a LOD's error: a certified bound on how far its surface lies from the original, when asked for.
+
+Rounding. A cut moves a corner of a piece by at most sqrt(3) 2^-52 in a frame where coordinates are within 1/2; then the
+parts cover the piece but for that, so after 192 cuts in one another the pieces cover the face but for 192 times that.
+Distances of corners are measured to points of original faces, both rounded. `progressive.ROUNDING` covers all of it.
+"""
 
 from functools import cached_property
 

@@ -210,7 +210,7 @@ def print_summary(summary):
 def _print_budget(summary):
     """Print how a budget was held, and what it cost in accuracy."""
     mean, greatest = summary["error_mean"]["mean"], summary["error_max"]["max"]
-    print(f"certified error of the objects: {mean:.3g} on average, at most {greatest:.3g}")
+    print(f"certified error of the objects, original to LOD: {mean:.3g} on average, at most {greatest:.3g}")
     if summary["budget_ms"] is None:
         return
     print(f"budget: {summary['budget_ms']:g} ms, {summary['controller']} controller")
