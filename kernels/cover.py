@@ -11,10 +11,9 @@ from warp_abtree.kernels.piece import (
     CORNERS,
     STACK,
     Scratch,
-    cut_piece,
     face_distance_sq,
-    halve_piece,
     load_piece,
+    split_piece,
     store_piece,
 )
 
@@ -208,30 +207,6 @@ def approach_piece(
 
 
 @wp.func
-def split_piece(replay: Replay, scratch: Scratch, count: int, top: int, f: int, margin: wp.float64):
-    """Cut the piece in hand by the prism over face f, or across if that leaves it whole; return the new top."""
-    a = replay.face_pos[f, 0]
-    normal = wp.cross(replay.face_pos[f, 1] - a, replay.face_pos[f, 2] - a)
-    bottom = top
-    kept = count
-    if wp.length_sq(normal) > wp.float64(0.0):
-        normal = wp.normalize(normal)
-        for k in range(3):
-            if kept > 0:
-                p = replay.face_pos[f, k]
-                side = wp.normalize(wp.cross(normal, replay.face_pos[f, (k + 1) % 3] - p))
-                kept = cut_piece(scratch, kept, top, side, p, margin)
-                if scratch.waiting_count[top] > 0:
-                    top += 1
-    if kept > 0:
-        store_piece(scratch, top, kept)
-        top += 1
-    if top - bottom == 1:
-        top = halve_piece(scratch, load_piece(scratch, bottom), bottom)
-    return top
-
-
-@wp.func
 def use_face(replay: Replay, scratch: Scratch, count: int, used: int, room: int, f: int):
     """Note that the piece in hand stands on face f, or on a face already used where there is no room for f.
 
@@ -293,5 +268,5 @@ def cover_triangle(
                 middle = middle + scratch.piece[i]
             middle = middle / wp.float64(count)
             over = point_nearest_face(replay, scratch, near_count, middle)
-            top = split_piece(replay, scratch, count, top, over, FLOOR + MARGIN * wp.sqrt(limit))
+            top = split_piece(replay.face_pos, scratch, count, top, over, FLOOR + MARGIN * wp.sqrt(limit))
     return limit, used

@@ -146,3 +146,29 @@ def halve_piece(scratch: Scratch, count: int, top: int):
         store_piece(scratch, top, kept)
         top += 1
     return top
+
+
+@wp.func
+def split_piece(
+    face_pos: wp.array2d(dtype=wp.vec3d), scratch: Scratch, count: int, top: int, f: int, margin: wp.float64
+):
+    """Cut the piece in hand by the prism over face f, or across if that leaves it whole; return the new top."""
+    a = face_pos[f, 0]
+    normal = wp.cross(face_pos[f, 1] - a, face_pos[f, 2] - a)
+    bottom = top
+    kept = count
+    if wp.length_sq(normal) > wp.float64(0.0):
+        normal = wp.normalize(normal)
+        for k in range(3):
+            if kept > 0:
+                p = face_pos[f, k]
+                side = wp.normalize(wp.cross(normal, face_pos[f, (k + 1) % 3] - p))
+                kept = cut_piece(scratch, kept, top, side, p, margin)
+                if scratch.waiting_count[top] > 0:
+                    top += 1
+    if kept > 0:
+        store_piece(scratch, top, kept)
+        top += 1
+    if top - bottom == 1:
+        top = halve_piece(scratch, load_piece(scratch, bottom), bottom)
+    return top

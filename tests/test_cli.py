@@ -73,9 +73,17 @@ def test_build(files, capsys):
     assert len(model.mesh_at(0)[1]) <= 40
     rows = [line.split() for line in shown.splitlines() if " %" in line and line[0].isdigit()]
     assert [row[0] for row in rows] == ["50", "20", "10", "5", "1"]
-    assert [int(row[3]) for row in rows] == [model.lod_for(fraction=x) for x in (0.5, 0.2, 0.1, 0.05, 0.01)]
+    lods = [model.lod_for(fraction=x) for x in (0.5, 0.2, 0.1, 0.05, 0.01)]
+    assert [int(row[3]) for row in rows] == lods
+    assert [row[4] for row in rows] == [f"{model.error_at(lod):.3g}" for lod in lods]
+    assert [row[7] for row in rows] == [f"{model.error_at(lod, side='outward'):.3g}" for lod in lods]
+    assert "original to LOD" in shown and "LOD to original" in shown
     found = json.loads(run(capsys, "build", "ball.obj", "ball.npz", "--json")[0])
     assert found["faces"] == 320 and found["base_faces"] <= 10 and len(found["errors"]) == 5
+    model = ab.Model.open("ball.npz")
+    lods = [model.lod_for(fraction=x) for x in (0.5, 0.2, 0.1, 0.05, 0.01)]
+    for side in ("inward", "outward"):
+        assert [row[f"error_{side}"] for row in found["errors"]] == [model.error_at(lod, side=side) for lod in lods]
     assert found["diagonal"] == pytest.approx(2 * 3**0.5, rel=0.02)
     assert sorted(path.name for path in files.glob("ball*")) == ["ball.npz", "ball.obj"]
 

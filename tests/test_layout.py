@@ -8,8 +8,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PIPELINE = (
-    "checks files mesh progressive tree model generation state refine lod broadphase cores poses intersect contact "
-    "scene frame_graph turns pose_sweep shards nearest convex collision_manager interop manifold "
+    "checks files mesh progressive tree outward model generation state refine lod broadphase cores poses intersect "
+    "contact scene frame_graph turns pose_sweep shards nearest convex collision_manager interop manifold "
     "bodies dynamics newton clock control frame cluster "
     "scene_keys scene_folder scene_models scene_control scene_file recording plot waiting report "
     "view_source view_parts picture view_text view_stage view_page view_record view bench_command sweep_command doctor "

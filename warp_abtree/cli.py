@@ -45,6 +45,7 @@ from warp_abtree.recording import Recording, record_run
 from warp_abtree.waiting import Progress, compile_notice, start_warp
 
 PLOT_NAME = "frames.png"
+LISTED_SHARES = (0.5, 0.2, 0.1, 0.05, 0.01)  # of the faces, at which `build` says the errors
 
 
 # Commands.
@@ -77,9 +78,12 @@ def build(options, progress):
     progress.close()
     model.save(options.out)
     rows = []
-    for share in (0.5, 0.2, 0.1, 0.05, 0.01):
+    for share in LISTED_SHARES:
+        progress("outward error", len(rows), len(LISTED_SHARES))
         lod = model.lod_for(fraction=share)
-        rows.append({"share": share, "lod": lod, "faces": _active(model, lod), "error": model.error_at(lod)})
+        errors = {f"error_{side}": model.error_at(lod, side=side) for side in ("inward", "outward")}
+        rows.append({"share": share, "lod": lod, "faces": _active(model, lod), **errors})
+    progress.close()
     diagonal = float(np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0)))
     result = {
         "file": str(options.out),

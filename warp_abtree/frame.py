@@ -88,7 +88,7 @@ class FrameRow:
         hits: Intersecting face pairs; None where only "any" was asked.
         lod_min, lod_max: Least and greatest LOD of any object.
         faces: Active faces of all objects together.
-        error_mean, error_max: Mean and greatest certified error of the objects at their LODs [world units].
+        error_mean, error_max: Mean and greatest `Model.error_at` of the objects at their LODs, one-sided [world units].
         lods_changed: Objects whose LOD this frame changed.
         lods_turned: Those of them whose change before it went the other way: oscillation.
         nodes_refitted: Nodes of all updated trees.
@@ -158,7 +158,7 @@ def judge_budget(rows, budget_ms: float | None = None, after: float = 1.0) -> di
     Returns:
         None where no row is left, else a dict: frames; within and within_tenth, shares of them within T and T + 10 %;
         worst, the greatest cost over T; longest_over, most frames in a row over T + 10 %; turns, how often the LOD of
-        an object turned back, a second; error_mean, the mean certified error [world units].
+        an object turned back, a second; error_mean, the mean `Model.error_at` [world units].
     """
     rows = [row for row in rows if row.time >= after and (budget_ms or row.budget_ms) is not None]
     if not rows:

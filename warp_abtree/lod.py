@@ -115,7 +115,7 @@ class Ladder:
 
     Attributes:
         lod: LOD of each rung, int32 (models, steps + 1).
-        error: Certified error of each [model units], falling to 0, float64 (models, steps + 1).
+        error: `Model.error_at` of each [model units], falling to 0, float64 (models, steps + 1).
         faces: Active faces of each, int32 (models, steps + 1).
 
     Raises:

@@ -142,7 +142,7 @@ def build_progressive(mesh, base_faces=10, link_condition=False, progress=None):
     """
     vertices, faces = _checked(mesh, base_faces)
     report = progress if progress is not None else lambda stage, done, total: None
-    centre, scale = _frame(vertices)
+    centre, scale = find_frame(vertices)
     parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), bool(link_condition), report)
     vertex_pos = np.concatenate([vertices, centre + scale * pos[len(vertices) :]])
     face_split, split_start, split_face = _splits(parent, faces, len(vertices))
@@ -173,7 +173,7 @@ def _distinct(faces):
     return (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
 
 
-def _frame(vertices):
+def find_frame(vertices):
     """Return the centre and a power of two that bounds the extent, so that scaling back and forth rounds nothing."""
     lower, upper = vertices.min(axis=0), vertices.max(axis=0)
     extent = float(np.max(upper / 2 - lower / 2))
@@ -287,7 +287,7 @@ def _splits(parent, faces, vertex_count):
 
 def _deviation(vertex_pos, parent, faces, report):
     """Return lod_error float64 [m+1]."""
-    centre, scale = _frame(vertex_pos[np.unique(faces)])
+    centre, scale = find_frame(vertex_pos[np.unique(faces)])
     merge_count, face_count = _merge_count(parent), len(faces)
     vertex_count = len(parent) - merge_count
     if merge_count == 0:

@@ -109,20 +109,18 @@ def _shown(value) -> str:
 
 
 def print_build(result):
-    """Print how large a model became, and its error at some parts of the faces."""
+    """Print how large a model became, and both sides of its error at some parts of the faces."""
     print(
         f"{result['file']}: {result['faces']:,} faces, {result['vertices']:,} vertices, {result['lods']:,} LODs, "
         f"base of {result['base_faces']:,} faces, built in {result['seconds']:.2f} s, {result['bytes'] / 1e6:.1f} MB"
     )
-    table = [["faces", "", "LOD", "error", "of the diagonal"]]
+    print("certified errors: no point of the one surface lies farther than this from the other")
+    table = [["faces", "", "LOD", "original to LOD", "of the diagonal", "LOD to original", "of the diagonal"]]
     for row in result["errors"]:
-        numbers = (
-            f"{row['faces']:,}",
-            f"{row['lod']:,}",
-            f"{row['error']:.3g}",
-            f"{100 * row['error'] / result['diagonal']:.3g} %",
-        )
-        table.append([f"{100 * row['share']:g} %", *numbers])
+        table.append([f"{100 * row['share']:g} %", f"{row['faces']:,}", f"{row['lod']:,}"])
+        for side in ("inward", "outward"):
+            error = row[f"error_{side}"]
+            table[-1] += [f"{error:.3g}", f"{100 * error / result['diagonal']:.3g} %"]
     print_table(table)
 
 
@@ -144,7 +142,7 @@ def print_query(result, models, found):
         print(f"mean point of the contacts: {_vector(pair['point'])}")
         print(f"mean normal, from A to B: {_vector(pair['normal'])}")
         print(f"depth along it, an estimate: {pair['depth']:.6g}")
-    print(f"bound on the distance to the original surfaces, error(A) + error(B): {result['bound']:.6g}")
+    print(f"originals lie within this of the surfaces asked, error(A) + error(B): {result['bound']:.6g}")
     print(
         f"{result['milliseconds']:.3g} ms on {result['device']}, precision {result['precision']}: "
         f"{result['node_tests']:,} node tests, {result['triangle_tests']:,} triangle tests"
@@ -212,7 +210,7 @@ def print_summary(summary):
 def _print_budget(summary):
     """Print how a budget was held, and what it cost in accuracy."""
     mean, greatest = summary["error_mean"]["mean"], summary["error_max"]["max"]
-    print(f"certified error of the objects: {mean:.3g} on average, at most {greatest:.3g}")
+    print(f"certified error of the objects, original to LOD: {mean:.3g} on average, at most {greatest:.3g}")
     if summary["budget_ms"] is None:
         return
     print(f"budget: {summary['budget_ms']:g} ms, {summary['controller']} controller")

@@ -1,0 +1,98 @@
+"""Distances of points to a surface, apart from the kernels: by brute force in float64, and in fractions."""
+
+from fractions import Fraction
+
+import numpy as np
+import warp as wp
+
+
+def lattice_points(corners, count):
+    """Return a lattice of points of each triangle, `count` to an edge, corners included, float64 (k, 3)."""
+    i, j = np.array([(i, j) for i in range(count + 1) for j in range(count + 1 - i)]).T
+    weights = np.stack([i, j, count - i - j], 1) / count
+    return np.einsum("sk,fkx->fsx", weights, corners).reshape(-1, 3)
+
+
+def brute_distances(points, corners):
+    """Return the distance of every point to the nearest triangle, of its edges and its plane where the foot is inside.
+
+    Args:
+        points: Shape (p, 3).
+        corners: Shape (f, 3, 3).
+    """
+    least = np.full(len(points), np.inf)
+    step = max(1, 500_000 // len(points))
+    for start in range(0, len(corners), step):
+        a, b, c = np.moveaxis(corners[start : start + step], 1, 0)
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal, axis=1)
+        inside = np.broadcast_to(length > 0, (len(points), len(a)))
+        best = np.full(inside.shape, np.inf)
+        for p, q in ((a, b), (b, c), (c, a)):
+            edge, to = q - p, points[:, None] - p
+            size = np.einsum("fx,fx->f", edge, edge)
+            along = np.clip(np.einsum("pfx,fx->pf", to, edge) / np.where(size > 0, size, 1), 0, 1)
+            best = np.minimum(best, np.linalg.norm(to - along[..., None] * edge, axis=2))
+            inside = inside & (np.einsum("pfx,fx->pf", np.cross(edge, to), normal) >= 0)
+        height = np.abs(np.einsum("pfx,fx->pf", points[:, None] - a, normal)) / np.where(length > 0, length, 1)
+        least = np.minimum(least, np.where(inside, np.minimum(best, height), best).min(1))
+    return least
+
+
+@wp.kernel(module="unique")
+def measure_distance_kernel(mesh: wp.uint64, points: wp.array[wp.vec3], distance_out: wp.array[float]):
+    i = wp.tid()
+    found = wp.mesh_query_point_no_sign(mesh, points[i], 1.0e6)
+    foot = wp.mesh_eval_position(mesh, found.face, found.u, found.v)
+    distance_out[i] = wp.length(points[i] - foot)
+
+
+def farthest_distance(triangles, corners):
+    """Return the greatest distance of some triangles from others that a search by points finds.
+
+    Warp's own query in float32 says which triangles have the farthest points, and which points of theirs; what it
+    misjudges makes the answer less, never more.
+    """
+    low, size = corners.min((0, 1)), np.ptp(corners, axis=(0, 1)).max()
+    soup = wp.array(((corners - low) / size).reshape(-1, 3), dtype=wp.vec3, device="cpu")
+    surface = wp.Mesh(soup, wp.array(np.arange(3 * len(corners)), dtype=int, device="cpu"))
+
+    def measure(points):
+        place = wp.array((points - low) / size, dtype=wp.vec3, device="cpu")
+        distance = wp.empty(len(points), dtype=float, device="cpu")
+        wp.launch(measure_distance_kernel, len(points), [surface.id, place], [distance], device="cpu")
+        return distance.numpy()
+
+    coarse = measure(lattice_points(triangles, 6)).reshape(len(triangles), -1).max(1)
+    points = lattice_points(triangles[np.argsort(coarse)[-40:]], 100)
+    return brute_distances(points[np.argsort(measure(points))[-20:]], corners).max()
+
+
+def exact_distance_sq(point, corners):
+    """Return the squared distance of a point of fractions to the nearest triangle, a Fraction."""
+
+    def dot(p, q):
+        return sum(x * y for x, y in zip(p, q))
+
+    def less(p, q):
+        return [x - y for x, y in zip(p, q)]
+
+    def cross(p, q):
+        return [p[(k + 1) % 3] * q[(k + 2) % 3] - p[(k + 2) % 3] * q[(k + 1) % 3] for k in range(3)]
+
+    least = None
+    for triangle in corners:
+        a, b, c = [[Fraction(x) for x in corner] for corner in triangle.tolist()]
+        found = []
+        for p, q in ((a, b), (b, c), (c, a)):
+            edge, to = less(q, p), less(point, p)
+            along = min(max(dot(to, edge) / (dot(edge, edge) or 1), 0), 1)
+            away = [x - along * y for x, y in zip(to, edge)]
+            found.append(dot(away, away))
+        normal = cross(less(b, a), less(c, a))
+        if any(normal) and all(
+            dot(cross(less(q, p), less(point, p)), normal) >= 0 for p, q in ((a, b), (b, c), (c, a))
+        ):
+            found.append(dot(less(point, a), normal) ** 2 / dot(normal, normal))
+        least = min(found) if least is None else min(least, *found)
+    return least
