@@ -265,6 +265,18 @@ def test_growth_is_forgotten_where_nothing_is_tested(models):
     assert ratio[29] == pytest.approx(1.0, abs=1e-3) and ratio[51:] == pytest.approx(1.0, abs=2e-3)
 
 
+def test_a_climb_is_not_taken_for_growth(models):
+    """Tests become more with the LODs, under the same load: as soon as no LOD moves, no growth is predicted."""
+    plant, scene = make_plant(models)
+    controller = PredictiveController(scene, 50.0)
+    load = 1e4 * 5.0 / finest_tests(plant)
+    while not plant.rows or plant.rows[-1].error_mean > 0:
+        plant.step(controller, load)
+        assert len(plant.rows) < 60
+    plant.step(controller, load)
+    assert len(plant.rows) > 10 and controller.predicted_ms == pytest.approx(plant.rows[-1].cost_ms, rel=5e-3)
+
+
 def test_a_leap_of_the_load_is_not_taken_for_growth(models):
     """Tests triple at once: the frame after is predicted a few percent dearer, not twice as dear."""
     ratio = predict_frames(models, [0.0, 1.1, 1.1])
