@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Products of three coordinates stay normal above this.
 COORDINATE_MIN = wp.constant(wp.float64(2.0**-290))
-ROUNDING_32 = wp.constant(wp.float64(2.0**-18))
+ROUNDING_32 = wp.constant(wp.float64(9.0 * 2.0**-24))
 UNIT_32 = wp.constant(wp.float64(2.0**-24))
 # Between these sizes of models float32 neither overflows nor loses digits to underflow.
 REACH_MIN = wp.constant(wp.float64(2.0**-100))
@@ -95,8 +95,8 @@ def pair_pose(
 
     The margin covers every rounding between the exact x' of B's vertices and the float32 box test. With u = 2^-24,
     r_a and r_b the reach of the root boxes and s the largest component of the translation between the centres,
-    these sum to less than 18 u r_b + 5 u s + 5 u r_a on A's axes and 18 u r_a + 9 u s + 5 u r_b on B's, against 64 u
-    of each here (docs/exactness.md has the terms). The float64 part covers x' itself and the shift between
+    these sum to less than 9 u r_b + 5 u s + 2 u r_a on A's axes and 9 u r_a + 8.7 u s + 2 u r_b on B's, so 9 u of each
+    are taken (docs/exactness.md has the terms). The float64 part covers x' itself and the shift between
     centres, and `skewed` a rotation that is not orthonormal to the last bit, on whose columns B's axes are taken. A
     gap along a unit axis is a distance, so `within` adds to the margin; a column is longer than 1 by at most
     `skewed`. `whole` says that all faces are asked for, not one hit, which float32 may find first.

@@ -1,10 +1,12 @@
 """Candidate pairs against brute force over posed root boxes; worlds, static objects, filters."""
 
+from fractions import Fraction
+
 import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
-from oracle_triangle import pose_matrix
+from oracle_triangle import into_frame_of_a, pose_matrix, triangles_intersect
 from samples import STILL, random_poses, raw_state, sample
 
 import warp_abtree as ab
@@ -113,6 +115,61 @@ def test_far_from_the_origin_nothing_is_missed(device, offset):
     poses[:, :3] += [offset, 0, -offset]
     scene = make_scene(device, [sample("crumbs")] * 120, poses, [0] * 120, [False] * 120)
     assert len(check_pairs(scene, poses, [0] * 120, [False] * 120)) > 100
+
+
+def exact_box(scene, i, pose):
+    """Return lower and upper end of an object's posed root box, three fractions each, for a pose taken as a matrix."""
+    state = raw_state(scene, i)
+    ends = [[Fraction(float(x)) for x in state[name][1]] for name in ("lower", "upper")]
+    centre = [Fraction(x) for x in scene.models[scene.object_model[i]].centre.tolist()]
+    lower, upper = [], []
+    for row, position in zip(pose[:3, :3].tolist(), pose[:3, 3].tolist(), strict=True):
+        parts = [(Fraction(r) * (c + p), Fraction(r) * (c + q)) for r, c, p, q in zip(row, centre, *ends, strict=True)]
+        lower.append(Fraction(position) + sum(map(min, parts)))
+        upper.append(Fraction(position) + sum(map(max, parts)))
+    return lower, upper
+
+
+@pytest.mark.parametrize("far", [0.0, 2.0**36])
+def test_boxes_in_the_world_contain_what_they_box(device, far):
+    """In fractions, models as far from their own origin as poses bring them back; and boxes are not much too large."""
+    rng = np.random.default_rng(4)
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    scene = ab.Scene(device)
+    for pose in poses:
+        place = far * rng.normal(size=3)
+        pose[:3, :3] = pose_matrix(random_poses(rng, 1, 1.0)[0])[0]
+        pose[:3, 3] = rng.normal(size=3) - pose[:3, :3] @ place
+        scene.add(ab.Model.from_arrays(place + rng.normal(size=(3, 3)), [[0, 1, 2]]), pose)
+    query = ab.Query(scene, "any")
+    query.run()
+    boxes = [corner.numpy().tolist() for corner in (query.broad_phase.lower, query.broad_phase.upper)]
+    room = Fraction(4e-7) + Fraction(40 * 2.0**-48 * far)
+    for i, pose in enumerate(poses):
+        for lower, upper, least, most in zip(boxes[0][i], boxes[1][i], *exact_box(scene, i, pose), strict=True):
+            assert least - 4 * room < Fraction(lower) < least
+            assert most < Fraction(upper) < most + 4 * room
+
+
+def test_faces_that_touch_far_from_their_origins_are_candidates(device):
+    """Corners of root boxes that meet in one point, where float64 rounds the boxes apart."""
+    rng = np.random.default_rng(5)
+    scene = ab.Scene(device)
+    for world in range(30):
+        poses, faces = np.tile(np.eye(4), (2, 1, 1)), []
+        for pose, side in zip(poses, (1, -1), strict=True):
+            pose[:3, :3] = pose_matrix(random_poses(rng, 1, 1.0)[0])[0]
+            # The first corner is that end of its box which goes farthest along the world's first axis.
+            inward = -side * np.sign(pose[0, :3]) * rng.uniform(0.2, 1.0, (2, 3))
+            faces.append(2.0**36 * rng.normal(size=3) + np.concatenate([np.zeros((1, 3)), inward]))
+            pose[:3, 3] = -pose[:3, :3] @ faces[-1][0]
+        first = into_frame_of_a(faces[1][:1], *poses)
+        faces[0] += first - faces[0][:1]
+        faces[0][0] = first
+        assert triangles_intersect(faces[0], into_frame_of_a(faces[1], *poses))
+        for face, pose in zip(faces, poses, strict=True):
+            scene.add(ab.Model.from_arrays(face, [[0, 1, 2]]), pose, world=world)
+    np.testing.assert_array_equal(scene.broad_phase(), np.arange(60).reshape(-1, 2))
 
 
 def test_thousand_worlds(device):

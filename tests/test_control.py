@@ -234,6 +234,55 @@ def test_predictions_come_true_where_nothing_moves(models):
     assert controller.predicted_ms == pytest.approx(plant.rows[-1].cost_ms, rel=0.01)
 
 
+def predict_frames(models, growth):
+    """Return what was predicted over what came true, for loads e^growth times a base, LODs at the finest all along."""
+    plant, scene = make_plant(models)
+    controller = PredictiveController(scene, 50.0)
+    load = 1e4 * 5.0 / finest_tests(plant)
+    for _ in range(60):
+        plant.step(controller, load)
+    ratios = []
+    for g in growth:
+        plant.step(controller, load * math.exp(g))
+        assert plant.rows[-1].error_mean == 0
+        ratios.append(controller.predicted_ms / plant.rows[-1].cost_ms)
+    return np.array(ratios)
+
+
+def test_growth_that_lasts_is_predicted(models):
+    """Tests that grow by 3 % a frame while no LOD moves, stand, and fall: what falls is not counted on."""
+    up, level = np.arange(1, 31) * 0.03, np.full(30, 0.9)
+    ratio = predict_frames(models, [*up, *level, *up[::-1]])
+    assert ratio[0] == pytest.approx(1 / 1.03, abs=2e-3), "nobody can know"
+    assert (np.diff(ratio[:30]) > 0).all() and ratio[29] == pytest.approx(1.0, abs=1e-3)
+    assert ratio[30] == pytest.approx(1.03, abs=2e-3) and ratio[59] == pytest.approx(1.0, abs=1e-3)
+    assert (ratio[62:90] > 1.02).all(), "each frame is predicted to cost what the one before it did"
+
+
+def test_growth_is_forgotten_where_nothing_is_tested(models):
+    up = np.arange(1, 31) * 0.03
+    ratio = predict_frames(models, [*up, *[-math.inf] * 20, *[0.0] * 3])
+    assert ratio[29] == pytest.approx(1.0, abs=1e-3) and ratio[51:] == pytest.approx(1.0, abs=2e-3)
+
+
+def test_a_climb_is_not_taken_for_growth(models):
+    """Tests become more with the LODs, under the same load: as soon as no LOD moves, no growth is predicted."""
+    plant, scene = make_plant(models)
+    controller = PredictiveController(scene, 50.0)
+    load = 1e4 * 5.0 / finest_tests(plant)
+    while not plant.rows or plant.rows[-1].error_mean > 0:
+        plant.step(controller, load)
+        assert len(plant.rows) < 60
+    plant.step(controller, load)
+    assert len(plant.rows) > 10 and controller.predicted_ms == pytest.approx(plant.rows[-1].cost_ms, rel=5e-3)
+
+
+def test_a_leap_of_the_load_is_not_taken_for_growth(models):
+    """Tests triple at once: the frame after is predicted a few percent dearer, not twice as dear."""
+    ratio = predict_frames(models, [0.0, 1.1, 1.1])
+    assert ratio[0] == pytest.approx(1.0, abs=1e-3) and 1.0 < ratio[2] < 1.05
+
+
 def test_the_tests_of_a_pair_are_shared_by_its_objects(models):
     _, scene = make_plant(models, 4)
     controller = PredictiveController(scene, 5.0)

@@ -61,7 +61,10 @@ class _Search:
         skew = [np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max((1, 2)) for r in (a[:, :3, :3], b[:, :3, :3])]
         self.stretch = 1 + 4 * (skew[0] + skew[1]) + ROUNDING
         reach = max(float(np.abs(part.middle[1]).max() + part.radius[1]) for part in boxes)
-        self.slack = (reach + np.linalg.norm(self.shift, axis=1)) * (4 * (skew[0] + skew[1]) + ROUNDING)
+        size = reach + np.linalg.norm(self.shift, axis=1)
+        # Faces are measured in the world, where coordinates round as far as objects lie from its origin.
+        world = np.linalg.norm(a[:, :3, 3], axis=1) + np.linalg.norm(b[:, :3, 3], axis=1)
+        self.slack = size * (4 * (skew[0] + skew[1]) + ROUNDING) + world * ROUNDING
         self.bound = upper
         self.found = None
 
