@@ -13,6 +13,17 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
 
 
+@wp.func
+def measure_skew(r: wp.mat33d):
+    """Return how far R R^T is off the identity, the largest entry; a matrix is off by 3 times that at most."""
+    gram = r * wp.transpose(r)
+    skew = wp.float64(0.0)
+    for i in range(3):
+        for j in range(3):
+            skew = wp.max(skew, wp.abs(gram[i, j] - wp.where(i == j, wp.float64(1.0), wp.float64(0.0))))
+    return skew
+
+
 @wp.kernel
 def pose_box_kernel(
     models: ModelPool,
@@ -38,12 +49,14 @@ def pose_box_kernel(
     half = wp.float64(0.5) * (upper - lower)
     box_lower = wp.vec3()
     box_upper = wp.vec3()
+    # B is taken to A's frame by the transpose: where that is no inverse, A stands off by (R R^T - I) of its points.
+    skew = wp.float64(3.0) * measure_skew(rotation) * (wp.length(middle) + wp.length(half))
     for k in range(3):
         terms = wp.vec3d(rotation[k, 0] * middle[0], rotation[k, 1] * middle[1], rotation[k, 2] * middle[2])
         centre = terms[0] + terms[1] + terms[2] + position[k]
         reach = wp.abs(rotation[k, 0]) * half[0] + wp.abs(rotation[k, 1]) * half[1] + wp.abs(rotation[k, 2]) * half[2]
         size = wp.abs(terms[0]) + wp.abs(terms[1]) + wp.abs(terms[2]) + wp.abs(position[k]) + reach
-        reach = reach + ROUNDING_64 * size
+        reach = reach + ROUNDING_64 * size + skew
         box_lower[k] = round_down(centre - reach)
         box_upper[k] = round_up(centre + reach)
     lower_out[i] = box_lower

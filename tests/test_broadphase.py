@@ -231,3 +231,24 @@ def test_distances_beyond_float32(device):
     assert needed <= found
     meets = scene.intersect(precision="exact")
     assert {tuple(pair) for pair, hit in zip(meets.pairs.tolist(), meets.any, strict=True) if hit} == needed
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_frames_off_orthonormal_hide_no_pair(device, order):
+    """Matrices rigid within 1e-6 are taken as they are: faces that meet by the exact test are candidates."""
+    model = sample("box")
+    shrunk = np.diag([1 - 4.9e-7] * 3 + [1.0])
+    found = []
+    for gap in (-9.5e-7, 0.0, 4.0e-7, 4.9e-7, 9e-7):
+        scene = ab.Scene(device)
+        # The boxes' faces lie half a unit from their middles; only the first frame is off.
+        other = np.eye(4)
+        other[0, 3] = order * (1 + gap / 2)
+        scene.add(model, shrunk)
+        scene.add(model, other)
+        pairs = scene.broad_phase().tolist()
+        met = scene.intersect([(0, 1)]).any[0]
+        assert pairs or not met
+        np.testing.assert_array_equal(scene.intersect().any, [met] if pairs else [])
+        found.append((met, len(pairs)))
+    assert found[0][0] and found[2][0] and not found[-1][0], found

@@ -359,9 +359,14 @@ class CollisionManager:
         poses = self._poses[: len(self._shapes)]
         middle = np.array([shape.middle for shape in self._shapes]).reshape(-1, 3)
         half = np.array([shape.half for shape in self._shapes]).reshape(-1, 3)
-        middle = np.einsum("nij,nj->ni", poses[:, :3, :3], middle) + poses[:, :3, 3]
-        half = np.einsum("nij,nj->ni", np.abs(poses[:, :3, :3]), half)
-        return middle, half * (1 + 1e-9) + 1e-12 * np.abs(middle)
+        rotation, position = poses[:, :3, :3], poses[:, :3, 3]
+        size = np.linalg.norm(middle, axis=1) + np.linalg.norm(half, axis=1)
+        skew = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0)
+        # Rounding of terms that may cancel, and of a frame that is off orthonormal, as in the broad phase.
+        pad = 3 * skew * size + 1e-12 * (size + np.abs(position).max(1, initial=0))
+        middle = np.einsum("nij,nj->ni", rotation, middle) + position
+        half = np.einsum("nij,nj->ni", np.abs(rotation), half)
+        return middle, half * (1 + 1e-9) + pad[:, None]
 
     def _gaps(self, pairs):
         """Return a distance that the boxes of each pair keep, (p,)."""
