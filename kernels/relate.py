@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_abtree.kernels.distance import DISTANCE_MAX, pad_distance
 from warp_abtree.kernels.faces import OUTPUT_ANY, Hits
-from warp_abtree.kernels.generation import LaunchRecord, is_stale, record_launch
+from warp_abtree.kernels.generation import is_stale, record_launch
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pair_pose
 from warp_abtree.kernels.share import NO_UNIT, Work, part_count
@@ -22,7 +22,6 @@ def relate_pair_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
     within: wp.array(dtype=wp.float64),
-    record_inout: LaunchRecord,
     pair_pose_out: wp.array(dtype=PairPose),
     hits_out: Hits,
     work_out: Work,
@@ -36,7 +35,7 @@ def relate_pair_kernel(
     """
     p = wp.tid()
     count = wp.min(pair_count[0], pairs.shape[0])
-    stale = is_stale(record_inout)
+    stale = is_stale(work_out.record)
     if p < work_out.flag.shape[0]:
         work_out.flag[p] = 0
     if p == 0:
@@ -47,7 +46,7 @@ def relate_pair_kernel(
     if p >= pairs.shape[0]:
         return
     if p == 0:
-        record_launch(record_inout)
+        record_launch(work_out.record)
         hits_out.total[0] = 0
         hits_out.unsure_total[0] = 0
         hits_out.hard_total[0] = 0

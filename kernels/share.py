@@ -14,6 +14,8 @@ number of warps.
 
 import warp as wp
 
+from warp_abtree.kernels.generation import LaunchRecord
+
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # A power of two, more than SHARES_AT_ONCE for each warp that a device runs at a time.
@@ -32,13 +34,15 @@ class Work:
 
     counter: tickets served, tickets taken, units and shares not ended, units taken. flag: 0 empty, the ticket + 1
     that it is full for, or -1 when all is done, shape [mailbox]. owner: (object pair, number of items), shape
-    [mailbox]. item: shape [mailbox * 32].
+    [mailbox]. item: shape [mailbox * 32]. record: what the launch was given; not an argument of its own, which would
+    take time in every launch.
     """
 
     counter: wp.array(dtype=wp.int32)
     flag: wp.array(dtype=wp.int32)
     owner: wp.array(dtype=wp.vec2i)
     item: wp.array(dtype=wp.int64)
+    record: LaunchRecord
 
 
 @wp.func_native("""

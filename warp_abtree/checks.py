@@ -20,7 +20,8 @@ def check_device(device, what: str | None = None):
             being captured.
     """
     global _started_in
-    _started_in = _started_in or os.getpid()
+    if _started_in is None:
+        _started_in = os.getpid()
     if device.is_cuda and os.getpid() != _started_in:
         raise RuntimeError(
             f"{device} cannot be used in a process forked after Warp started: CUDA does not survive a fork; "

@@ -4,8 +4,6 @@ A CUDA graph keeps the addresses that it was captured with. Whoever replaces arr
 launch writes on the device which generation it was given, and `LaunchGuard.check` compares.
 """
 
-from contextlib import contextmanager
-
 import warp as wp
 
 from warp_abtree.kernels.generation import STALE, LaunchRecord
@@ -99,6 +97,7 @@ class LaunchGuard:
         self._record.buffers_now = self.buffers.now
         self._record.launched = wp.array([NOT_LAUNCHED, 0], dtype=wp.int32, device=device)
         self._captured: dict = {}
+        self._given: tuple = ()
 
     @property
     def launched(self) -> wp.array:
@@ -107,25 +106,31 @@ class LaunchGuard:
 
     def record(self) -> LaunchRecord:
         """Return the record for a kernel about to be launched, with the generations as they are."""
-        record = self._record
-        record.states, record.filter = self._states.given(), self._filter.given()
-        record.buffers = self.buffers.given()
-        return record
+        given = self._states.given(), self._filter.given(), self.buffers.given()
+        if given != self._given:
+            self._record.states, self._record.filter, self._record.buffers = self._given = given
+        return self._record
 
-    @contextmanager
+    def write_to(self, record: LaunchRecord):
+        """Keep a record up to date that is part of another struct, in the place of the guard's own."""
+        self._record, self._given = record, ()
+
     def launching(self, owner):
-        """Mark results as those of no launch where the launches of an operator do not all happen.
+        """Return a context that marks results as those of no launch where the launches in it do not all happen.
 
         While a graph is captured, the arrays that `owner` uses are kept from then on, as long as it lives: a graph
         that replays after they were replaced reads and writes memory that is still its own.
         """
         if self.device.is_capturing:
             self._captured |= find_arrays(owner)
-        try:
-            yield
-        except BaseException:
+        return self
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, error, *_):
+        if error is not None:
             self.launched[:1].fill_(INTERRUPTED)
-            raise
 
     def forget(self):
         """Let results count as none until the next launch."""

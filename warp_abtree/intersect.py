@@ -241,6 +241,8 @@ class Query:
         self.work.flag = wp.zeros(boxes, dtype=wp.int32, device=self.device)
         self.work.owner = wp.empty(boxes, dtype=wp.vec2i, device=self.device)
         self.work.item = wp.empty(boxes * share.MAILBOX_ITEMS, dtype=wp.int64, device=self.device)
+        self.work.record = self.guard.record()
+        self.guard.write_to(self.work.record)
         self._no_distance = wp.empty(0, dtype=wp.float64, device=self.device)
         self._within = within
         self._resize_unsure((unsure_capacity or UNSURE_CAPACITY) if self.uses_warps() else 0)
@@ -394,7 +396,8 @@ class Query:
         pools = [arrays.pool for arrays in self.arrays]
         room = len(self.pairs)
         inputs = [self.parts_max, output, *pools, self.pair_count, self.pairs, within]
-        inputs += [self.guard.record(), self.pair_poses, hits, self.work]
+        self.guard.record()
+        inputs += [self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
         wp.launch(relate.relate_pair_kernel, dim=dim, inputs=inputs, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits]
