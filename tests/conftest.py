@@ -16,6 +16,11 @@ wp.init()
 ROOT = Path(__file__).resolve().parents[1]
 
 
+def slow(*values):
+    """Return cases of a parameter that are marked slow."""
+    return [pytest.param(value, marks=pytest.mark.slow) for value in values]
+
+
 @pytest.fixture(params=[str(device) for device in wp.get_devices()])
 def device(request):
     """Name of a Warp device; the test runs once on each one present."""

@@ -82,6 +82,7 @@ def test_update_leaves_large_meshes_out(device):
     assert {row["faces"] for row in cases_of(rows, "case", "one state")} == {168}
 
 
+@pytest.mark.slow
 def test_scale(device, tmp_path):
     rows = run_case("scale", device, quick=True, models=tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["knot-200.npz", "knot-600.npz"]
@@ -138,6 +139,7 @@ def test_build(device, tmp_path):
     assert slopes["build_ms_slope"] is not None
 
 
+@pytest.mark.slow
 def test_exact(device):
     rows = run_case("exact", device, count=110, processes=1)
     assert all(row["disagreements"] == 0 for row in rows)

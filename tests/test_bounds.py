@@ -5,8 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 CODE = """
 import numpy as np
+import pytest
 import trimesh
 import warp as wp
 
@@ -29,6 +32,7 @@ for z in np.linspace(-0.9, 0.9, 40):
 """
 
 
+@pytest.mark.slow
 def test_nothing_beyond_the_nodes_is_read():
     """In a process of its own: reading there ends it."""
     root = Path(__file__).resolve().parents[1]

@@ -427,6 +427,7 @@ def readme_blocks(after):
     return re.findall(r"```\w+\n(.*?)```", text[text.index(after) :], re.S)
 
 
+@pytest.mark.slow
 def test_readme_python_runs(capsys, monkeypatch):
     pytest.importorskip("pxr")
     monkeypatch.chdir(ROOT)

@@ -110,6 +110,7 @@ def test_a_recorded_run_runs_again(files, capsys, device):
     assert not shown and len(errors) == 1 and "run.npz: frame 3: hits is " in errors[0]
 
 
+@pytest.mark.slow
 def test_plot(files, capsys):
     shown, _ = run(capsys, "run", "scene.toml", "--frames", 6, "--budget", "20ms", "--plot", "plots", "--device", "cpu")
     assert shown.endswith(f"wrote {Path('plots', 'frames.png')}\n")
@@ -141,6 +142,7 @@ def test_picture_of_a_controlled_run_shows_its_lods(files, capsys, monkeypatch):
     assert len(shown[0]) == 1 and len(shown[1]) == 2 and shown[0][0] <= 20 < shown[1][1]
 
 
+@pytest.mark.slow
 def test_picture_of_rigid_bodies(files, capsys):
     text = SCENE.split("[[lod_sweep]]")[0].replace("shuttle = { by = [0.4, 0, 0], period = 2 }", "velocity = [9, 0, 0]")
     Path("bodies.toml").write_text(text + "[dynamics]\ngravity = [0, 0, 0]\n")
@@ -150,6 +152,7 @@ def test_picture_of_rigid_bodies(files, capsys):
     assert first.shape != last.shape or not np.array_equal(first, last)
 
 
+@pytest.mark.slow
 def test_picture(files, capsys):
     shown, _ = run(capsys, "run", "scene.toml", "--frames", 2, "--picture", "out.png")
     assert "wrote out.png" in shown

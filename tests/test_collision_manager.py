@@ -67,6 +67,7 @@ def bare(answer):
 # The same answers.
 
 
+@pytest.mark.slow
 def test_names_on_random_scenes(device, monkeypatch):
     monkeypatch.setattr(collision_manager, "FIRST_PAIRS", 2)
     rng = np.random.default_rng(1)
@@ -200,6 +201,7 @@ def test_a_part_inside_a_solid(device):
 
 
 @pytest.mark.parametrize("chunk", [128, nearest.CHUNK])
+@pytest.mark.slow
 def test_distances_on_random_scenes(device, monkeypatch, chunk):
     monkeypatch.setattr(nearest, "CHUNK", chunk)
     rng = np.random.default_rng(4)

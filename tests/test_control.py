@@ -92,6 +92,7 @@ def run(load, lods=None, frames=150, rates=RATES):
 
 
 @pytest.mark.parametrize("kind", ["rain", "focus"])
+@pytest.mark.slow
 def test_the_predictive_controller_holds_a_budget(models, device, kind):
     """In a budget that the finest LOD breaks by 4 times in the middle frame; the paper's controller beside it."""
     off = run(make_load(kind, models, device))

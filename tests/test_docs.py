@@ -88,6 +88,7 @@ def run_block(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("page", "index"), PYTHON, ids=[f"{name_of(page)}-{i + 1}" for page, i in PYTHON])
+@pytest.mark.slow
 def test_python_blocks_run(run_block, page, index):
     needs, block = blocks_of(page, "python")[index]
     absent = missing([*needs, *(["pxr"] if "warp:" in block else [])])
@@ -173,6 +174,7 @@ def test_worlds_example_without_torch(monkeypatch):
         run_example("worlds_torch", "--device", "cpu")
 
 
+@pytest.mark.slow
 def test_budget_example(device):
     words = "--objects 12 --frames 70 --part 2 --count-work --device"
     found, shown = run_example("hold_budget", *words.split(), device)
@@ -182,6 +184,7 @@ def test_budget_example(device):
     assert found["predictive"]["within"] > found["paper"]["within"]
 
 
+@pytest.mark.slow
 def test_several_gpus_example(device):
     words = "--worlds 5 --frames 40 --devices".split()
     counts, shown = run_example("several_gpus", *words, f"{device},{device}")

@@ -214,6 +214,7 @@ def test_cubes_face_to_face(device, restitution):
     assert np.abs(velocity[:, 1:]).max() < 0.02 and np.abs(spin).max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_closed_elastic_scene_gains_no_energy(device):
     """Bound: 1e-4 of the energy over 10,000 steps. The tumbling of bodies swings it; no bounce adds to it."""
     wall, half = box(5, 5, 1), np.sqrt(0.5)
@@ -374,6 +375,7 @@ def test_a_torus_falls_over_a_peg_and_stays(device):
     assert abs(matrices_of(dynamics.poses()[2:, 3:])[0, 2, 2]) > 0.999
 
 
+@pytest.mark.slow
 def test_bodies_meet_as_they_are_at_their_lods(device):
     """A ball rests on the mesh that its LOD has, with the mass of the original."""
     ball = model_of(trimesh.creation.icosphere(2, 0.5))

@@ -1,6 +1,7 @@
 """Certified errors against original meshes that just touch: never proved apart, and some are by a smaller bound."""
 
 import numpy as np
+import pytest
 from oracle_triangle import pose_matrix
 from samples import random_quaternions, sample
 
@@ -59,6 +60,7 @@ def touching_poses(rng, scene, names, count):
     return at(low), chosen
 
 
+@pytest.mark.slow
 def test_poses_that_touch_tell_a_wrong_bound(device):
     rng = np.random.default_rng(9)
     count, wrong = 300, {0.5: 0, 0.8: 0}

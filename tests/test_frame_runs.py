@@ -48,6 +48,7 @@ print(sum(row.lods_changed for row in frame.history), frame.history[-1].hits)
 
 
 @pytest.mark.parametrize("kind", ["bodies", "budget", "lods"])
+@pytest.mark.slow
 def test_nothing_is_loaded_after_the_warm_up(device, kind):
     """In a process of its own, where nothing is loaded yet; Warp says what it loads."""
     words = [sys.executable, "-c", WARMED_UP, device, kind]

@@ -49,6 +49,7 @@ def build(soup):
 
 @relaxed
 @given(soups(), soups(), st.tuples(position, position, position), turn, st.data())
+@pytest.mark.slow
 def test_meshes_and_poses(device, soup_a, soup_b, place, turned, data):
     a, b = build(soup_a), build(soup_b)
     if a is None or b is None:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from conftest import slow
 from samples import random_poses, sample
 from test_resources import add_objects, check_scene, describe, make_scene
 from test_scene import everything
@@ -117,7 +118,7 @@ def move_lods(scene, move):
     return np.zeros(4, int) if move == "coarsest" else scene.lods - MOVES[move]
 
 
-@pytest.mark.parametrize("move", MOVES)
+@pytest.mark.parametrize("move", ["one apart", *slow("in place", "all apart", "coarsest")])
 def test_lods(device, interrupter, move):
     """Also the change after it gives what it gives on a scene that nothing has happened to."""
 
@@ -135,7 +136,7 @@ def test_lods(device, interrupter, move):
     ) > (8)
 
 
-@pytest.mark.parametrize("move", MOVES)
+@pytest.mark.parametrize("move", ["one apart", *slow("in place", "all apart", "coarsest")])
 def test_graphs_and_queries_beside_lods(device, interrupter, move):
     """A query that was made before, and its graph, answer as before or refuse, while the scene is torn and after."""
 
@@ -187,6 +188,7 @@ def test_first_use(device, interrupter):
     assert interrupter.everywhere(lambda: add_objects(device), lambda s: s.intersect(PAIRS, output="faces"), check) > 30
 
 
+@pytest.mark.slow
 def test_a_new_object(device, interrupter):
     """It is there, or not; the others answer as before."""
 
@@ -231,10 +233,11 @@ QUESTIONS = {
 }
 
 
-@pytest.mark.parametrize("pairs", [MORE_PAIRS, None], ids=["given", "found"])
+@pytest.mark.parametrize("pairs", ["given", *slow("found")])
 @pytest.mark.parametrize("question", QUESTIONS)
 def test_questions(device, interrupter, question, pairs):
     options = QUESTIONS[question]
+    pairs = MORE_PAIRS if pairs == "given" else None
 
     def make():
         scene = make_scene(device)
@@ -393,6 +396,7 @@ def test_bodies(device, interrupter):
     assert interrupter.everywhere(make, lambda bodies: bodies.step(1e-3), check) > 10
 
 
+@pytest.mark.slow
 def test_collision_managers(device, interrupter):
     ball, ring = trimesh.creation.icosphere(subdivisions=2), trimesh.creation.torus(1.0, 0.3)
 
@@ -465,6 +469,7 @@ print(lods == [model.lod_max] * 3 and np.array_equal(faces, make().intersect(out
 """
 
 
+@pytest.mark.slow
 def test_a_kernel_cache_that_cannot_be_written(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("in the place of the cache")

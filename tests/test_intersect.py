@@ -5,6 +5,7 @@ import copy
 import numpy as np
 import pytest
 import warp as wp
+from conftest import slow
 from oracle_peers import fcl_faces, judge
 from oracle_triangle import into_frame_of_a
 from samples import REAL_MESHES, SHAPES, STILL, WARP_MESHES, contact_poses, random_poses, sample, true_faces
@@ -102,6 +103,7 @@ def test_shapes_equal_brute_force(device, names):
 
 
 @pytest.mark.parametrize("names", [*REAL_PAIRS, ("warp:bunny", "warp:bear"), ("warp:rocks", "fcl-env")], ids="-".join)
+@pytest.mark.slow
 def test_real_meshes_equal_brute_force(device, names):
     scene, cases = posed_cases(np.random.default_rng(2), names, 4, BRUTE_FACES, device)
     expected = check_cases(scene, cases)
@@ -180,7 +182,10 @@ def check_pair(device, model_a, pose_a, model_b, pose_b, lods=(None, None)):
     return faces
 
 
-@pytest.mark.parametrize("name", ["torus", "grid", "crumbs", "fcl-rob", "woody", "fandisk"])
+LAID_ON_THEMSELVES = ["torus", "grid", "crumbs", *slow("fcl-rob", "woody", "fandisk")]
+
+
+@pytest.mark.parametrize("name", LAID_ON_THEMSELVES)
 def test_a_mesh_on_top_of_itself(device, name):
     """Every face is coplanar with its twin, and touches all its neighbours."""
     model = rounded(name)

@@ -54,6 +54,7 @@ def sources(folder, suffixes=(".py",)):
     return {path.name for path in (ROOT / folder).iterdir() if path.suffix in suffixes}
 
 
+@pytest.mark.slow
 def test_wheel_holds_the_package(wheel):
     _, file = wheel
     held = {name for name in file.namelist() if ".dist-info/" not in name}
@@ -66,6 +67,7 @@ def test_wheel_holds_the_package(wheel):
     assert file.read("warp_abtree/kernels/__init__.py") == (ROOT / "kernels" / "__init__.py").read_bytes()
 
 
+@pytest.mark.slow
 def test_versions_agree(wheel):
     path, file = wheel
     (name,) = (name for name in file.namelist() if name.endswith(".dist-info/METADATA"))
@@ -80,6 +82,7 @@ def extras_of(text):
     return text.split("[project.optional-dependencies]")[1].split("\n[")[0]
 
 
+@pytest.mark.slow
 def test_source_distribution_holds_what_a_wheel_needs(dist):
     (path,) = dist.glob("*.tar.gz")
     with tarfile.open(path) as file:
@@ -91,6 +94,7 @@ def test_source_distribution_holds_what_a_wheel_needs(dist):
     assert not [name for name in held if "__pycache__" in name or name.startswith((".git", "build/", "dist/"))]
 
 
+@pytest.mark.slow
 def test_wheel_runs_without_the_checkout(wheel, tmp_path):
     _, file = wheel
     file.extractall(tmp_path / "installed")
@@ -114,6 +118,7 @@ def test_wheel_runs_without_the_checkout(wheel, tmp_path):
     assert done.returncode == 0 and json.loads(done.stdout)["frames"] == 1, done.stderr
 
 
+@pytest.mark.slow
 def test_scenes_are_found_by_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert scene_folder() == ROOT / "scenes" and "bunny_tori" in scene_names()
@@ -130,6 +135,7 @@ def test_scenes_are_found_by_name(tmp_path, monkeypatch):
     assert ab.load_scene("needle", device="cpu").path == ROOT / "scenes" / "needle.toml"
 
 
+@pytest.mark.slow
 def test_api_pages_have_every_public_name():
     pages = "".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").glob("api_*.md")))
     shown = re.findall(r"^::: warp_abtree\.(\w+)$", pages, re.M)

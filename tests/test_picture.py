@@ -115,6 +115,7 @@ def test_picture_of_meshes(files, capsys):
     assert count("apart.png", picture.BOX_COLOUR) > count("balls.png", picture.BOX_COLOUR)
 
 
+@pytest.mark.slow
 def test_picture_of_a_frame(files, capsys):
     for frame in (0, 3):
         run(capsys, "scene.toml", "--frame", frame, "--out", f"{frame}.png", "--size", 200, "--device", "cpu")

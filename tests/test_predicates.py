@@ -372,6 +372,7 @@ def test_ptx_is_not_contracted(tmp_path, fuse_fp):
     assert bool(find_contraction(ptx_of(kernel.module, tmp_path))) == fuse_fp
 
 
+@pytest.mark.slow
 def test_ptx_of_the_traversal_is_not_contracted(tmp_path):
     """The kernels that pose vertices, bound signs and test boxes; without exact signs they have no float64 fma."""
     for for_any in (False, True):

@@ -338,6 +338,7 @@ def test_scale_changes_nothing(mesh, power):
 
 
 @pytest.mark.parametrize("offset", [1e3, 1e9])
+@pytest.mark.slow
 def test_far_from_the_origin(offset):
     mesh = grid(12, 0.7)
     far = welded(mesh.vertices + [offset, -offset, 0.3 * offset], mesh.faces)
@@ -362,6 +363,7 @@ def test_error_bounds_what_is_measured(mesh):
     check_error(mesh, build_progressive(mesh, base_faces=1))
 
 
+@pytest.mark.slow
 def test_error_is_tight():
     for name, limit in (("torus", 1.3), ("sphere", 1.3), ("bumpy grid", 1.5)):
         mesh = MESHES[name]()
@@ -433,6 +435,7 @@ def test_link_condition_leaves_no_coincident_faces():
 
 
 @pytest.mark.parametrize("name", REAL_MESHES)
+@pytest.mark.slow
 def test_real_meshes(name, real_mesh_path):
     mesh = load_mesh(real_mesh_path(name))
     progressive = build_progressive(mesh)

@@ -121,6 +121,7 @@ def test_generated_solids(tmp_path, text, faces, volume):
     assert mesh.volume == pytest.approx(volume, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_nut_runs_on_its_bolt(device):
     from warp_abtree import scene_models
 
@@ -239,6 +240,7 @@ def test_controllers_of_a_file(tmp_path):
     assert isinstance(plain.frame(budget_ms=3).lods, ab.PredictiveController)
 
 
+@pytest.mark.slow
 def test_near_objects_refine(tmp_path, device):
     """With counted work in the place of time: at one budget, errors rise with the distance from the camera."""
     loaded = load_ours("focus", device, [("size = [10, 5, 0]", "size = [2, 2, 0]")], objects=80)
@@ -284,6 +286,7 @@ def test_rigid_bodies_of_a_file(tmp_path, device):
 # The scenes.
 
 
+@pytest.mark.slow
 def test_rain(device):
     loaded = load_ours("rain", device, [("cells = [128, 128]", "cells = [16, 16]")], objects=30)
     assert 29 <= loaded.scene.object_count <= 31 and loaded.frames >= 300

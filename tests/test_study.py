@@ -54,6 +54,7 @@ def thin(rows):
     return rows[1:]
 
 
+@pytest.mark.slow
 def test_run_is_written_and_resumed(tmp_path, capsys):
     runs = []
     parts = [make_part(runs), make_part(runs, "second")]
