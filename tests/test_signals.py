@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ import trimesh
 from samples import SHUTTLE_SCENE
 
 import warp_abtree as ab
-from warp_abtree import cli
+from warp_abtree import cli, cluster
 
 ROOT = Path(__file__).resolve().parents[1]
 STATUS = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}
@@ -130,17 +131,32 @@ def test_a_signal_stops_the_page(files, number, before):
     assert (process.returncode, errors) == expected
 
 
-def test_a_caller_keeps_its_signals(capsys, monkeypatch):
+def test_a_caller_keeps_its_signals(files, capsys, monkeypatch):
     """Of a command that is called, and of a program's that runs in another thread than the main one."""
     before = [signal.getsignal(number) for number in BOTH]
-    assert cli.main(["info", "warp:cat"]) == 2
-    monkeypatch.setattr(sys, "argv", ["warp-abtree", "info", "warp:cat"])
+    words = ["info", "ball.obj", "--device", "cpu"]
+    assert cli.main(words) == 0
+    monkeypatch.setattr(sys, "argv", ["warp-abtree", *words])
     status = []
     thread = threading.Thread(target=lambda: status.append(cli.main()))
     thread.start()
     thread.join()
-    assert status == [2] and capsys.readouterr().err.count("\n") == 2
+    assert status == [0] and not capsys.readouterr().err
     assert [signal.getsignal(number) for number in BOTH] == before
+
+
+def test_ray_leaves_a_program_its_handler(monkeypatch):
+    before, theirs = signal.getsignal(signal.SIGTERM), lambda number, frame: None
+    ray = SimpleNamespace(is_initialized=lambda: False, cluster_resources=lambda: {"CPU": 1}, shutdown=lambda: None)
+    ray.init = lambda **_: signal.signal(signal.SIGTERM, theirs)
+    monkeypatch.setattr(cluster, "_import_ray", lambda: ray)
+    try:
+        for ours, kept in ((cli._terminate, cli._terminate), (signal.SIG_DFL, theirs)):
+            signal.signal(signal.SIGTERM, ours)
+            ab.RayPool(workers=1).close()
+            assert signal.getsignal(signal.SIGTERM) is kept
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_a_program_handles_signals(monkeypatch, capsys):
