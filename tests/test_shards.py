@@ -12,7 +12,7 @@ import pytest
 from samples import SHAPES, STILL, random_poses, sample
 
 import warp_abtree as ab
-from warp_abtree import shards, sweep_command
+from warp_abtree import shard_folder, shards, sweep_command
 from warp_abtree.cli import main
 from warp_abtree.shard_folder import MANIFEST
 
@@ -181,6 +181,13 @@ def test_a_write_that_fails_leaves_no_file(tmp_path, monkeypatch):
         ab.run_shards(job, tmp_path / "out")
     assert list(contents(tmp_path / "out")) == [MANIFEST]
     assert ab.run_shards(job, tmp_path / "out")["found"] == 0
+
+
+def test_names_have_room_for_more_than_twelve_digits(tmp_path):
+    job = {"count": 2 * 10**12, "shard": 10**12, "file": "npz"}
+    for part in shard_folder._ranges(job):
+        (tmp_path / shard_folder._shard_name(*part, "npz")).touch()
+    assert list(shard_folder._find_shards(tmp_path, job)) == [(0, 10**12), (10**12, 2 * 10**12)]
 
 
 def test_a_run_that_ended_while_it_wrote_its_first_file_is_gone_on_with(tmp_path):
