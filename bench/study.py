@@ -22,6 +22,7 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree.files import atomic_write
 
 from . import html, meshes, timing
 from .parts import Finished, Part, plain
@@ -226,7 +227,7 @@ def run_part(part: Part, context: Context, folder: Path, conditions: dict, comma
     run["seconds"] = plain(time.perf_counter() - begin)
     file = folder / "parts" / f"{part.name}.json"
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(file, write_json({"run": run, "notes": context.notes, "rows": rows}, 2))
+    write_text(file, write_json({"run": run, "notes": context.notes, "rows": rows}, 2))
     return Finished(part, rows, run, list(context.notes))
 
 
@@ -241,11 +242,10 @@ def write_json(data, depth=4) -> str:
     return "{\n" + ",\n".join(lines) + "\n}"
 
 
-def write_whole(path: Path, text: str):
+def write_text(path: Path, text: str):
     """Write a file that appears whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    with atomic_write(path, "w", encoding="utf-8") as file:
+        file.write(text)
 
 
 def run_study(name, parts, folder, device=None, quick=False, models=None, command="", again=False, only=None) -> list:
@@ -286,10 +286,10 @@ def run_study(name, parts, folder, device=None, quick=False, models=None, comman
 def write_study(name, finished, folder: Path):
     """Write JSON, CSV, figures and the HTML page of parts that were run."""
     data = {done.part.name: {"run": done.about_run, "notes": done.notes, "rows": done.rows} for done in finished}
-    write_whole(folder / f"{name}.json", write_json({"study": name, "parts": data}))
+    write_text(folder / f"{name}.json", write_json({"study": name, "parts": data}))
     html.write_tables(finished, folder / "tables")
     drawn = html.draw_figures(finished, folder / "figures")
-    write_whole(folder / f"{name}.html", html.page(name, finished, drawn))
+    write_text(folder / f"{name}.html", html.page(name, finished, drawn))
 
 
 def find_parts(name) -> tuple:

@@ -9,7 +9,6 @@ import pytest
 
 CODE = """
 import numpy as np
-import pytest
 import trimesh
 import warp as wp
 

@@ -12,9 +12,9 @@ import pytest
 from samples import SHAPES, STILL, random_poses, sample
 
 import warp_abtree as ab
-from warp_abtree import shards, sweep_command
+from warp_abtree import shard_folder, shards, sweep_command
 from warp_abtree.cli import main
-from warp_abtree.shards import MANIFEST
+from warp_abtree.shard_folder import MANIFEST
 
 MODELS = ("torus", "small ball")
 
@@ -70,7 +70,7 @@ def test_answers_are_those_of_a_scene(device, tmp_path, monkeypatch, output, kin
     np.save(tmp_path / "poses.npy", poses)
     job = ab.SweepJob(*pair(), tmp_path / "poses.npy", given, output=output, shard=27)
     done = ab.run_shards(job, tmp_path / "out", pool=ab.ThisProcess(device))
-    assert done == {"shards": 4, "found": 0, "count": 100, "workers": 1, "lost": 0}
+    assert done == {"shards": 4, "found": 0, "damaged": 0, "count": 100, "workers": 1, "lost": 0}
     found, expected = read(tmp_path / "out"), ask_scene(device, poses, lods, output)
     assert 10 < expected.any.sum() < 90
     if output in ("any", "count"):
@@ -183,11 +183,11 @@ def test_a_write_that_fails_leaves_no_file(tmp_path, monkeypatch):
     assert ab.run_shards(job, tmp_path / "out")["found"] == 0
 
 
-def test_names_of_shards_beyond_twelve_digits_are_found(tmp_path):
-    ranges = [(10**12 - 5, 10**12), (10**12, 10**12 + 5)]
-    for part in ranges:
-        (tmp_path / shards._shard_name(*part, "npz")).touch()
-    assert sorted(shards._find_shards(tmp_path)) == ranges
+def test_names_have_room_for_more_than_twelve_digits(tmp_path):
+    job = {"count": 2 * 10**12, "shard": 10**12, "file": "npz"}
+    for part in shard_folder._ranges(job):
+        (tmp_path / shard_folder._shard_name(*part, "npz")).touch()
+    assert list(shard_folder._find_shards(tmp_path, job)) == [(0, 10**12), (10**12, 2 * 10**12)]
 
 
 def test_a_run_that_ended_while_it_wrote_its_first_file_is_gone_on_with(tmp_path):

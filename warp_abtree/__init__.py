@@ -22,7 +22,8 @@ from warp_abtree.pose_sweep import sweep
 from warp_abtree.refine import UpdateStats
 from warp_abtree.scene import Scene, TreeState
 from warp_abtree.scene_file import SceneError, load_scene
-from warp_abtree.shards import SweepJob, ThisProcess, read_shards, run_shards
+from warp_abtree.shard_folder import read_shards
+from warp_abtree.shards import SweepJob, ThisProcess, run_shards
 
 __version__ = "0.1.0"
 

@@ -1,12 +1,15 @@
 """The command line: ``warp-abtree info|build|query|run|sweep|view|picture|bench|doctor``.
 
-Exit status 0 when done, 2 with one line on stderr for bad input, 1 where work was lost or a device failed.
+Exit status 0 when done, 2 with one line on stderr for bad input, 1 where work was lost or a device failed, 130 and 143
+when stopped by SIGINT and SIGTERM.
 """
 
 import argparse
 import gc
 import os
+import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -327,15 +330,38 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
+class Terminated(SystemExit):
+    """SIGTERM came: a command ends as after an interrupt, and removes what it has half written."""
+
+
+def _terminate(number, frame):
+    raise Terminated(128 + number)
+
+
+def _handle_signals():
+    """Let SIGINT and SIGTERM stop the command, although the process may have inherited that they are ignored.
+
+    Shells start background jobs with SIGINT ignored.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return  # only the main thread may, and signals come there
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, _terminate)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
+
+
 def main(argv=None) -> int:
     """Run the command line and return its exit status.
 
     Args:
-        argv: Arguments without the program's name; None for those of the process.
+        argv: Arguments without the program's name; None for those of the process, which then handles signals, too.
     """
-    argv = list(sys.argv[1:] if argv is None else argv)
     progress = Progress()
     try:
+        if argv is None:
+            _handle_signals()
+        argv = list(sys.argv[1:] if argv is None else argv)
         if argv[:1] == ["bench"] and argv[1:] not in (["-h"], ["--help"]):
             start_warp()
             return bench_command.bench(argv[1:])
@@ -356,6 +382,8 @@ def main(argv=None) -> int:
         return _fail(progress, error, 1)
     except KeyboardInterrupt:
         return _fail(progress, "interrupted", 130)
+    except Terminated as error:
+        return _fail(progress, "terminated", error.code)
     return status
 
 

@@ -13,7 +13,8 @@ exit status:
   0    done
   1    work was lost, a device failed, or whoever reads the output went away
   2    bad input; one line on stderr says what and where
-  130  interrupted
+  130  interrupted (SIGINT)
+  143  terminated (SIGTERM)
 """
 MESHES = 'a mesh file, gzipped or not, or "warp:bunny", "warp:bear", "warp:rocks"'
 _NEGATIVE = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|^-(inf|nan)$")

@@ -8,6 +8,8 @@ import copy
 import dataclasses
 import hashlib
 import os
+import signal
+import threading
 from collections import deque
 
 import numpy as np
@@ -29,6 +31,17 @@ def _import_ray():
     except ImportError:
         raise ValueError("Ray is not installed: pip install ray") from None
     return ray
+
+
+@contextlib.contextmanager
+def _sigterm_kept():
+    """Give a program that handles SIGTERM its handler back; Ray puts another in its place."""
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        if callable(before) and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)
 
 
 class _Worker:
@@ -75,12 +88,13 @@ class RayPool:
         if self._own:
             options = {"include_dashboard": False, "num_cpus": workers} if address is None else {}
             try:
-                self.ray.init(
-                    address="local" if address is None else address,
-                    log_to_driver=False,
-                    logging_level="ERROR",
-                    **options,
-                )
+                with _sigterm_kept():
+                    self.ray.init(
+                        address="local" if address is None else address,
+                        log_to_driver=False,
+                        logging_level="ERROR",
+                        **options,
+                    )
             except Exception as error:
                 raise ValueError(f"Ray at {address or 'this machine'}: {error}") from None
         found = self.ray.cluster_resources()

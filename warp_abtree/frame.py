@@ -19,7 +19,7 @@ import warp as wp
 from warp_abtree.clock import COST_STAGES, STAGES, Timer
 from warp_abtree.control import Feedback
 from warp_abtree.dynamics import triangle_wave
-from warp_abtree.files import whole_file
+from warp_abtree.files import atomic_write
 from warp_abtree.intersect import Result, check_request
 from warp_abtree.lod import positive
 from warp_abtree.model import Model
@@ -411,7 +411,7 @@ class Frame:
             OSError: The file cannot be written.
         """
         rows = [row.as_dict() for row in self.history]
-        with whole_file(path, "w", newline="", encoding="utf-8") as file:
+        with atomic_write(path, "w", newline="", encoding="utf-8") as file:
             if Path(path).suffix.lower() == ".json":
                 json.dump(rows, file, indent=1)
             else:

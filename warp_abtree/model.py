@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.checks import whole_number
-from warp_abtree.files import whole_file
+from warp_abtree.files import atomic_write
 from warp_abtree.mesh import COORDINATE_MAX, COORDINATE_MIN, EXTENT_LIMITS, Mesh, load_mesh, mesh_from_arrays
 from warp_abtree.outward import OutwardError
 from warp_abtree.progressive import ProgressiveMesh, build_progressive
@@ -152,7 +152,7 @@ class Model:
         arrays = {name: getattr(self.progressive, name) for name in _ARRAYS}
         arrays |= {"leaf_node": self.tree.leaf_node, "name": np.array(self.name)}
         about = {"format": np.array(FORMAT_NAME), "version": np.array(FORMAT_VERSION), "digest": _digest(arrays)}
-        with whole_file(path) as file:
+        with atomic_write(path) as file:
             np.savez_compressed(file, **about, **arrays)
 
     @classmethod

@@ -5,13 +5,12 @@ Objects interpenetrate here, where sorting faces by depth fails, so visibility i
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 import warp_abtree as ab
+from warp_abtree.files import atomic_write
 
 # Plain and intersecting faces, by model in the order of the scene.
 COLOURS = (
@@ -283,14 +282,9 @@ def _write_png(canvas, path):
 
     canvas.draw()
     image = PIL.Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
-    partial = Path(f"{path}.partial")
-    try:
-        image.quantize(256, PIL.Image.Quantize.MEDIANCUT, kmeans=1, dither=PIL.Image.Dither.NONE).save(
-            partial, format="PNG", optimize=True
-        )
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    image = image.quantize(256, PIL.Image.Quantize.MEDIANCUT, kmeans=1, dither=PIL.Image.Dither.NONE)
+    with atomic_write(path) as file:
+        image.save(file, format="PNG", optimize=True)
 
 
 def _crop(images):

@@ -6,7 +6,6 @@ and be the same. Run again, a controller hears the times of the recording, and e
 
 import hashlib
 import json
-import os
 import zipfile
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from warp_abtree import FrameRow, ReplayClock, load_scene
+from warp_abtree.files import atomic_write
 from warp_abtree.scene_file import SceneFile
 
 FORMAT_NAME, FORMAT_VERSION = "warp_abtree recording", 1
@@ -45,8 +45,6 @@ class Recording:
 
     def save(self, path):
         """Write to an .npz file; it appears whole or not at all."""
-        path = Path(path)
-        partial = path.with_name(path.name + ".partial")
         table = [asdict(row) for row in self.rows]
         columns: dict[str, Any] = {}
         for name in COLUMNS:
@@ -55,22 +53,18 @@ class Recording:
                 columns[f"row_{name}"] = np.array([np.nan if value is None else value for value in values], np.float64)
             else:
                 columns[f"row_{name}"] = np.array(values, np.float64 if _is_real(name) else np.int64)
-        try:
-            with open(partial, "wb") as file:
-                np.savez_compressed(
-                    file,
-                    format=np.array(FORMAT_NAME),
-                    version=np.array(FORMAT_VERSION),
-                    text=np.array(self.text),
-                    settings=np.array(json.dumps(self.settings)),
-                    models=np.array(self.models),
-                    lods=self.lods,
-                    poses=self.poses,
-                    **columns,
-                )
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+        with atomic_write(path) as file:
+            np.savez_compressed(
+                file,
+                format=np.array(FORMAT_NAME),
+                version=np.array(FORMAT_VERSION),
+                text=np.array(self.text),
+                settings=np.array(json.dumps(self.settings)),
+                models=np.array(self.models),
+                lods=self.lods,
+                poses=self.poses,
+                **columns,
+            )
 
     @classmethod
     def open(cls, path) -> "Recording":

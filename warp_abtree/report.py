@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_abtree.files import atomic_write
+
 LISTED_FACES = 20  # face pairs or contacts that `query` prints
 STAGES = {
     "select_ms": "select LODs",
@@ -259,19 +261,14 @@ def record_found(found, path: Path):
     A .npz file holds the arrays of `Result` by their names, those that were asked. A .csv file has a row for each face
     pair, with its contact if that was asked; the summary over an object pair has no place there.
     """
-    partial = path.with_name(path.name + ".partial")
-    try:
-        if path.suffix.lower() == ".npz":
-            names = ("any", "count", "faces", "contacts", "pair_contacts")
-            arrays = {name: getattr(found, name) for name in names if getattr(found, name) is not None}
-            with open(partial, "wb") as file:
-                np.savez(file, **arrays)
-        else:
-            with open(partial, "w", newline="", encoding="utf-8") as file:
-                _write_rows(csv.writer(file), found)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    if path.suffix.lower() == ".npz":
+        names = ("any", "count", "faces", "contacts", "pair_contacts")
+        arrays = {name: getattr(found, name) for name in names if getattr(found, name) is not None}
+        with atomic_write(path) as file:
+            np.savez(file, **arrays)
+    else:
+        with atomic_write(path, "w", newline="", encoding="utf-8") as file:
+            _write_rows(csv.writer(file), found)
 
 
 def _write_rows(writer, found):

@@ -1,16 +1,12 @@
 """Jobs that take long, in shards: each a file that appears whole or not at all, so that a job can be gone on with.
 
-A folder holds `job.json`, which names the job by a hash, and a file for each range of poses (or worlds),
-`shard-000000065536-000000131072.npz` or `.parquet`. The same job writes the same bytes, whoever does it.
+The same job writes the same bytes, whoever does it; `shard_folder` says what is written and how it is checked.
 """
 
 import dataclasses
 import hashlib
-import json
 import os
-import re
 from collections import deque
-from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
@@ -19,17 +15,15 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks import to_numpy, whole_number
+from warp_abtree.files import sweep_up
 from warp_abtree.intersect import check_request
 from warp_abtree.model import Model
 from warp_abtree.pose_sweep import sweep
 from warp_abtree.poses import QUATERNION_TOLERANCE
 from warp_abtree.scene import Scene
+from warp_abtree.shard_folder import ShardFolder
 from warp_abtree.turns import device_turn
 
-FORMAT_NAME, FORMAT_VERSION = "warp_abtree shards", 1
-MANIFEST = "job.json"
-FILES = ("npz", "parquet")
-SHARD_NAME = re.compile(r"^shard-(\d{12,})-(\d{12,})\.(npz|parquet)$")
 # Poses of a shard, and rows looked at in one piece while a job is checked.
 READ_ROWS = SHARD = 65536
 # Objects and bytes of tree states of a scene that asks contacts, or LODs that change from pose to pose.
@@ -250,116 +244,6 @@ def _name_faces(faces, start) -> dict:
     return {"pose": faces[:, 0].astype(np.int64) + start, "face_a": faces[:, 1], "face_b": faces[:, 2]}
 
 
-# The folder.
-
-
-class _Folder:
-    def __init__(self, out, job, file):
-        if file not in FILES:
-            raise ValueError(f"file {file!r} is none of 'npz', 'parquet'")
-        if file == "parquet":
-            _import_parquet()
-        self.path, self.job, self.file = Path(out), job, file
-        known = json.loads(json.dumps({**job.describe(), "file": file}))
-        digest = hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
-        self.manifest = {"format": FORMAT_NAME, "version": FORMAT_VERSION, "hash": digest, "job": known}
-        self.left = dict.fromkeys(_ranges(job.count, job.shard))
-
-    def open(self):
-        """Make the folder, or find that it holds this job; `left` are the ranges without a file.
-
-        Raises:
-            ValueError: It holds another job, or something else.
-        """
-        if self.path.exists() and not self.path.is_dir():
-            raise ValueError(f"{self.path}: is a file")
-        if not self.path.parent.is_dir():
-            raise ValueError(f"{self.path}: there is no folder {self.path.parent}")
-        self.path.mkdir(exist_ok=True)
-        if (self.path / MANIFEST).exists():
-            held = _read_manifest(self.path)
-            if held["hash"] != self.manifest["hash"]:
-                other = [key for key, value in self.manifest["job"].items() if held["job"].get(key) != value]
-                raise ValueError(f"{self.path}: holds another job; not the same: {', '.join(other)}")
-        elif any(entry.suffix != ".partial" for entry in self.path.iterdir()):  # half a manifest is none
-            raise ValueError(f"{self.path}: is not empty and holds no {MANIFEST}")
-        else:
-            text = json.dumps(self.manifest, indent=1)
-            self._appear(MANIFEST, lambda file: file.write(text.encode()))
-        for found in _find_shards(self.path):
-            self.left.pop(found, None)
-
-    def write(self, start, stop, columns):
-        if self.file == "npz":
-            self._appear(_shard_name(start, stop, "npz"), lambda file: np.savez(file, **columns))
-            return
-        pyarrow, parquet = _import_parquet()
-        if self.job.unit not in columns:
-            columns = {self.job.unit: np.arange(start, stop), **columns}
-        table = pyarrow.table({name: pyarrow.array(values) for name, values in _flat(columns)})
-        self._appear(_shard_name(start, stop, "parquet"), lambda file: parquet.write_table(table, file))
-
-    def _appear(self, name, write):
-        """Write a file under a name of its own, and rename it once it is whole and on the disk."""
-        partial = self.path / f"{name}.{os.getpid()}.partial"
-        try:
-            with open(partial, "wb") as file:
-                write(file)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(partial, self.path / name)
-        finally:
-            partial.unlink(missing_ok=True)
-
-    def sweep_up(self):
-        """Remove what runs that were killed left half written."""
-        for path in self.path.glob("*.partial"):
-            path.unlink(missing_ok=True)
-
-
-def _import_parquet():
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError:
-        raise ValueError("Parquet needs PyArrow: pip install pyarrow") from None
-    return pyarrow, pyarrow.parquet
-
-
-def _flat(columns):
-    """Yield names and columns, those of vectors by axis: a table has no wider ones."""
-    for name, values in columns.items():
-        if values.ndim == 1:
-            yield name, values
-        else:
-            yield from ((f"{name}_{axis}", np.ascontiguousarray(part)) for axis, part in zip("xyz", values.T))
-
-
-def _ranges(count, shard):
-    return [(start, min(start + shard, count)) for start in range(0, count, shard)]
-
-
-def _shard_name(start, stop, file) -> str:
-    return f"shard-{start:012d}-{stop:012d}.{file}"
-
-
-def _find_shards(path) -> dict:
-    found = filter(None, (SHARD_NAME.match(entry.name) for entry in path.iterdir()))
-    return {(int(match[1]), int(match[2])): path / match[0] for match in found}
-
-
-def _read_manifest(path) -> dict:
-    try:
-        held = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ValueError(f"{path}: holds no {MANIFEST}") from None
-    except ValueError as error:
-        raise ValueError(f"{path / MANIFEST}: damaged ({error})") from None
-    if not isinstance(held, dict) or (held.get("format"), held.get("version")) != (FORMAT_NAME, FORMAT_VERSION):
-        raise ValueError(f"{path / MANIFEST}: not of {FORMAT_NAME}, version {FORMAT_VERSION}")
-    return held
-
-
 # Doing a job.
 
 
@@ -424,30 +308,33 @@ class ThisProcess:
 
 
 def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:
-    """Do a job and write each shard as it comes; shards that are there already are not done again.
+    """Do a job and write each shard as it comes; shards that are there already are checked and not done again.
 
-    Memory is that of a few shards, whatever the size of the job. One run at a time writes to a folder.
+    A shard that is damaged, cut short or altered is done again. Memory is that of a few shards, whatever the size of
+    the job. One run at a time writes to a folder.
 
     Args:
         job: `SweepJob`, or `WorldsJob`.
         out: Folder to make, or to go on in.
         file: "npz", or "parquet", which needs pyarrow.
         pool: What does the shards: `RayPool`, or `ThisProcess` by default.
-        progress: Called as progress("shards", done, total) after each, those found among them.
+        progress: Called as progress("shards", done, total) after each, those found among them; before that as
+            progress("check", done, total) after each that is found and read.
 
     Returns:
-        A dict: shards, found (those that were there), count, workers, and lost, workers that ended before their work.
+        A dict: shards, found (those that were there and whole), damaged (those that were there and done again), count,
+        workers, and lost, workers that ended before their work.
 
     Raises:
-        ValueError: The folder holds another job or something else; bad options. Nothing is written.
+        ValueError: The folder holds another job, a shard of another or something else; bad options. Nothing is written.
+        OSError: A file cannot be read or written.
         RuntimeError: Work was lost again and again.
     """
-    folder = _Folder(out, job, file)
+    folder = ShardFolder(out, job, file)
     pool = ThisProcess() if pool is None else pool
-    folder.open()
-    total = len(_ranges(job.count, job.shard))
-    found = done = total - len(folder.left)
-    left = folder.left
+    total, left = len(folder.left), folder.left
+    folder.open(progress)
+    found = done = total - len(left)
     if progress is not None:
         progress("shards", done, total)
     for start, stop, columns in pool.ask(job, list(left)) if left else ():
@@ -460,29 +347,6 @@ def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:
             progress("shards", done, total)
     if left:
         raise RuntimeError(f"{len(left)} of {total} shards were not answered")
-    folder.sweep_up()
-    return {"shards": total, "found": found, "count": job.count, "workers": pool.workers, "lost": pool.lost}
-
-
-def read_shards(out) -> Iterator[tuple[int, int, dict]]:
-    """Yield (start, stop, columns) of each shard of a finished job, in order; columns are arrays by name.
-
-    For "any" and "count" a row is a pose from `start`; for "faces" and "contacts" a face pair, its pose in the column
-    `pose`. Parquet has the column `pose` always, and vectors as three columns.
-
-    Raises:
-        ValueError: No such folder, or shards are missing.
-    """
-    path = Path(out)
-    job = _read_manifest(path)["job"]
-    shards, ranges = _find_shards(path), _ranges(job["count"], job["shard"])
-    missing = [part for part in ranges if part not in shards]
-    if missing:
-        raise ValueError(f"{path}: {len(missing)} of {len(ranges)} shards are missing; run the job again to finish it")
-    for start, stop in ranges:
-        if job["file"] == "npz":
-            with np.load(shards[start, stop], allow_pickle=False) as held:
-                yield start, stop, dict(held)
-        else:
-            table = _import_parquet()[1].read_table(shards[start, stop])
-            yield start, stop, {name: table[name].to_numpy() for name in table.column_names}
+    sweep_up(folder.path)
+    about = {"shards": total, "found": found, "damaged": len(folder.damaged), "count": job.count}
+    return {**about, "workers": pool.workers, "lost": pool.lost}

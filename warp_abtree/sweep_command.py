@@ -73,8 +73,9 @@ def sweep(options, progress):
         print_json(result)
         return
     by = f"{done['workers']} Ray workers, {done['lost']} of them lost" if with_ray else "one process"
+    damaged = f", {done['damaged']} damaged and done again" if done["damaged"] else ""
     print(
-        f"{done['count']:,} {job.unit}s in {done['shards']} shards, {done['found']} found there, by {by}, "
+        f"{done['count']:,} {job.unit}s in {done['shards']} shards, {done['found']} found there{damaged}, by {by}, "
         f"in {result['seconds']:.1f} s: {options.out}"
     )
 

@@ -116,6 +116,6 @@ def view(options, progress):
         shown = "localhost" if options.host in ("127.0.0.1", "0.0.0.0") else options.host
         address = f"http://{shown}:{server.get_port()}"
         found = {"address": address, "title": source.title, "objects": source.scene.object_count}
-        print(json.dumps(found) if options.json else f"{source.title}: {address} (Ctrl-C ends)", flush=True)
-        with contextlib.suppress(KeyboardInterrupt):
+        with contextlib.suppress(KeyboardInterrupt):  # from when the address is told
+            print(json.dumps(found) if options.json else f"{source.title}: {address} (Ctrl-C ends)", flush=True)
             page.run()

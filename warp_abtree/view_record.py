@@ -1,11 +1,11 @@
 """A standalone page of a run: viser's own client with the recorded scene inside, and times in a corner."""
 
 import html
-import os
 from pathlib import Path
 from typing import Any
 
 from warp_abtree import view_text
+from warp_abtree.files import atomic_write
 from warp_abtree.view_page import Page
 
 # The canvas would fade in whenever the run begins again.
@@ -57,9 +57,5 @@ def record_page(server, source, path: Path, frames: int, settings=None, progress
     about = PANEL.format(title=html.escape(source.title), text=text, plot=view_text.time_picture(rows))
     written = recorder.as_html()
     end = written.rindex("</body>")
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_text(written[:end] + about + written[end:], encoding="utf-8")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    with atomic_write(path, "w", encoding="utf-8") as file:
+        file.write(written[:end] + about + written[end:])

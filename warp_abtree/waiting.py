@@ -66,7 +66,7 @@ class Progress:
             bar.update(task, completed=part, total=1.0, refresh=True)
         elif self.live:
             drawn = "#" * round(self.WIDTH * part)
-            self.stream.write(f"\r{stage:<10} [{drawn:<{self.WIDTH}}] {100 * part:3.0f} %")
+            self.stream.write(f"\r{stage:<12} [{drawn:<{self.WIDTH}}] {100 * part:3.0f} %")
         elif self.shown is None:
             self.stream.write(f"{stage} ...\n")
         else:
