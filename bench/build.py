@@ -132,7 +132,7 @@ class Stages:
 
     def finish(self):
         stop, collapse = time.thread_time(), self.end.get("collapse", self.begin)
-        error = self.end.get("error bounds", collapse)
+        error = self.end.get("LOD bounds", collapse)
         parts = {"collapse": collapse - self.begin, "error": error - collapse, "tree": stop - error}
         return {name: 1e3 * seconds for name, seconds in {**parts, "build": stop - self.begin}.items()}
 

@@ -313,8 +313,8 @@ def test_it_is_deterministic_and_resumes(mesh, monkeypatch):
     calls = []
     second = build_progressive(mesh, base_faces=1, progress=lambda *call: calls.append(call))
     assert_same(first, second)
-    assert {stage for stage, _, _ in calls} <= {"collapse", "error bounds"}
-    for stage in ("collapse", "error bounds"):
+    assert {stage for stage, _, _ in calls} <= {"collapse", "LOD bounds"}
+    for stage in ("collapse", "LOD bounds"):
         done = [call[1] for call in calls if call[0] == stage]
         assert done == sorted(done)
         assert first.lod_max == 0 or len(done) >= first.lod_max // 3

@@ -82,7 +82,7 @@ def build(options, progress):
     model.save(options.out)
     rows = []
     for share in LISTED_SHARES:
-        progress("outward error", len(rows), len(LISTED_SHARES))
+        progress("outward bounds", len(rows), len(LISTED_SHARES))
         lod = model.lod_for(fraction=share)
         errors = {f"error_{side}": model.error_at(lod, side=side) for side in ("inward", "outward")}
         rows.append({"share": share, "lod": lod, "faces": _active(model, lod), **errors})

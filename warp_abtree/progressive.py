@@ -135,7 +135,7 @@ def build_progressive(mesh, base_faces=10, link_condition=False, progress=None):
         mesh: Anything with `vertices` float64 [v, 3], `faces` int32 [n_f, 3].
         base_faces: Stop when no more faces than this are left, >= 1.
         link_condition: Put merges that break the link condition after all others.
-        progress: Called as progress(stage, done, total) between launches; stages "collapse" and "error bounds".
+        progress: Called as progress(stage, done, total) between launches; stages "collapse" and "LOD bounds".
     Raises ValueError for empty, non-finite or oversized meshes, bad indices, base_faces < 1, or if no face has three
     distinct corners.
     Source: Garland and Heckbert 1997 (collapse).
@@ -314,7 +314,7 @@ def _deviation(vertex_pos, parent, faces, report):
         if state[5] < 0:
             bvh = _index(replay, rings)
             replay.bvh, state[5] = bvh.id, state[1]
-        report("error bounds", int(state[0]), merge_count)
+        report("LOD bounds", int(state[0]), merge_count)
     error = scale * (np.sqrt(bound_sq.numpy()) + ROUNDING)
     return np.append(error[::-1], 0.0)
 
