@@ -272,6 +272,7 @@ def test_a_study_behind_its_options(capsys):
     assert status == 2 and len(lines) == 1 and "before its options" in lines[0]
 
 
+@pytest.mark.slow
 def test_the_module_of_the_command_line_runs():
     done = subprocess.run([sys.executable, "-m", "warp_abtree.cli", "info"], capture_output=True, text=True)
     assert done.returncode == 2 and "the following arguments are required: MESH" in done.stderr

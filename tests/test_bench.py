@@ -42,6 +42,7 @@ def no_real_meshes(monkeypatch):
 # --- cases -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_query(device):
     rows = run_case("query", device, quick=True)
     assert [row["pairs"] for row in rows] == [1, 4]
@@ -58,6 +59,7 @@ def test_query(device):
             assert (f"{name}_ms" in row) != (f"{name}_skipped" in row), "a peer runs or is named as skipped"
 
 
+@pytest.mark.slow
 def test_update(device):
     rows = run_case("update", device, quick=True)
     shares = cases_of(rows, "case", "one state")
@@ -104,6 +106,7 @@ def test_scale(device, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["memory", "precision", "sweep"])
+@pytest.mark.slow
 def test_other_cases(device, name, no_real_meshes):
     rows = run_case(name, device, quick=True)
     if name == "memory":
@@ -126,6 +129,7 @@ def test_peers(device, no_real_meshes):
         assert row["meet"] == 3 and row["faces_missed"] == row["faces_invented"] == row["ours_wrong"] == 0
 
 
+@pytest.mark.slow
 def test_build(device, tmp_path):
     *rows, slopes = run_case("build", device, quick=True, models=tmp_path)
     assert [row["faces"] for row in rows] == [168, 576]
@@ -149,6 +153,7 @@ def test_exact(device):
 # --- the command -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_command_writes_rows(tmp_path, capsys):
     file = tmp_path / "rows.json"
     assert main.main(["query", "--device", "cpu", "--quick", "--json", str(file)]) == 0
@@ -414,6 +419,7 @@ def test_peaks_by_name():
     assert all(peak > 1e6 for peak in roofline.measure_peaks(side=64, words=2**12))
 
 
+@pytest.mark.slow
 def test_plots(tmp_path, monkeypatch):
     rows = [{"sweep": "pairs", "pairs": n, "ours_ms": 2.0 * n, "peer_ms": 3.0 * n, "arrays_mib": 1.0} for n in (1, 10)]
     lines = plots.find_lines(rows, scale.FIGURES[0]["panels"][0])

@@ -407,6 +407,7 @@ def test_completion(capsys, monkeypatch):
 # As people start it.
 
 
+@pytest.mark.slow
 def test_process_is_quiet(files):
     done = run_process("query", "ball.obj", "ring.ply", "--json", "--device", "cpu", cwd=files)
     assert done.returncode == 0 and json.loads(done.stdout)["intersects"] is True

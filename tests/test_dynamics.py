@@ -247,6 +247,7 @@ def test_a_closed_elastic_scene_gains_no_energy(device):
     assert np.abs(dynamics.poses()[6:, :3]).max() < 1.5, "nothing has left"
 
 
+@pytest.mark.slow
 def test_bounces_under_gravity_gain_no_energy(device):
     """A cube that lands on its face, and a ball. A step of Euler swings their energy by m g v dt / 2."""
     dynamics = on_ground(device, (CUBE, (-1, 0, 1.4, 0, 0, 0, 1)), (BALL, (1, 0, 1.4, 0, 0, 0, 1)), restitution=1)
@@ -344,6 +345,7 @@ def test_what_sleeps_wakes_when_hit(device):
 
 
 @pytest.mark.parametrize("splits", [0, 2])
+@pytest.mark.slow
 def test_a_stack_of_five_stands_for_ten_seconds(device, splits):
     cube = box(1, 1, 1, splits=splits)
     placed = [(cube, (0.02 * (k % 2), 0.01 * k, 0.5 + k, 0, 0, 0, 1)) for k in range(5)]

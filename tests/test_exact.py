@@ -189,6 +189,7 @@ def contact(rng, names):
 
 
 @pytest.mark.parametrize("names", PAIRS, ids="-".join)
+@pytest.mark.slow
 def test_every_scale_is_exact(device, names):
     """1e-6 to 1e6 by powers of ten; that scaling rounds, so each size is a case of its own."""
     _, poses = contact(np.random.default_rng(5), names)

@@ -94,6 +94,7 @@ period = 1
 
 @relaxed
 @given(st.data())
+@pytest.mark.slow
 def test_scene_files(tmp_path, data):
     """Damage a scene file by lines and characters: it loads, or one SceneError names the file."""
     text = list(SCENE)

@@ -110,7 +110,7 @@ def test_real_meshes_equal_brute_force(device, names):
     assert sum(map(len, expected)) > 0
 
 
-@pytest.mark.parametrize("names", [*SHAPE_PAIRS[:4], *REAL_PAIRS, WARP_MESHES[:2]], ids="-".join)
+@pytest.mark.parametrize("names", [*SHAPE_PAIRS[:4], *slow(*REAL_PAIRS, WARP_MESHES[:2])], ids="-".join)
 def test_agrees_with_fcl(device, names):
     """Any LOD up to the original; FCL's own mistakes are told apart by the exact test."""
     pytest.importorskip("fcl")
@@ -385,6 +385,7 @@ def test_warps_give_the_same_answers(device, room, parts):
 
 @pytest.mark.parametrize("name", ["cow", "fandisk", "fcl-env", "woody", "torus", "soup"])
 @pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.slow
 def test_exact_where_every_face_meets_its_twin(device, name, turned):
     """One mesh twice in one place: coplanar twins at the identity, twins a rounding apart at any other pose."""
     model = sample(name)

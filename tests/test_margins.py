@@ -110,6 +110,7 @@ REGIMES = {
 @pytest.mark.parametrize("make_query", [ab.Query, GpuQuery], ids=["threads", "as on CUDA"])
 @pytest.mark.parametrize("speck_first", [True, False], ids=["speck first", "speck second"])
 @pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.slow
 def test_faces_that_touch_are_never_missed(device, regime, speck_first, make_query):
     rng = np.random.default_rng([11, list(REGIMES).index(regime)])
     cases = [touching_pair(rng, *REGIMES[regime], speck_first) for _ in range(COUNT)]

@@ -114,6 +114,7 @@ def test_known_answers_between_segments_and_points(a, b, meets):
         assert triangle.triangles_intersect_fractions(p, q) is meets
 
 
+@pytest.mark.slow
 def test_integers_agree_with_fractions():
     pairs = adversarial_pairs()
     answers = [triangle.triangles_intersect(a, b) for a, b in pairs]

@@ -65,6 +65,7 @@ def some_lods(model, count=6):
 
 
 @pytest.mark.parametrize("teeth", [2, 3, 4])
+@pytest.mark.slow
 def test_a_comb_whose_gaps_are_closed(teeth):
     """Every point of the original lies in the surface at a LOD, which fills gaps and so lies far from the original."""
     model = ab.Model.from_arrays(*square_comb(teeth), base_faces=2)
@@ -189,6 +190,7 @@ def test_it_is_tight(name):
 
 
 @pytest.mark.parametrize("name", ["cow", "fandisk", "rocker-arm", "stanford-bunny"])
+@pytest.mark.slow
 def test_it_is_tight_on_real_meshes(name):
     model = ab.Model.load(real_mesh_path(name))
     for fraction in (0.1, 0.01):

@@ -359,6 +359,7 @@ def test_far_from_the_origin(offset):
     check_error(here, moved)
 
 
+@pytest.mark.slow
 def test_error_bounds_what_is_measured(mesh):
     check_error(mesh, build_progressive(mesh, base_faces=1))
 

@@ -172,6 +172,7 @@ def test_a_damaged_shard_is_found_out_and_done_again(tmp_path, monkeypatch, file
 
 
 @pytest.mark.parametrize("output", ["count", "contacts"])
+@pytest.mark.slow
 def test_no_flipped_bit_changes_what_is_read(tmp_path, file, output):
     """Flip a bit of every byte, or of some: it is found out, or it is in a byte that does not matter."""
     out = tmp_path / "out"

@@ -94,11 +94,16 @@ def stop(process, number):
     ("words", "where", "before", "old"),
     [
         ("build ball.obj new.npz", "np.savez_compressed", ignore, None),
-        ("build ball.obj new.npz", "np.savez_compressed", block, "new.npz"),
-        ("run scene.toml --record new.csv", "csv", handle_plainly, "new.csv"),
-        ("run scene.toml --record new.npz", "frames", ignore, None),
-        ("query ball.obj ball.obj --output faces --record new.npz", "np.savez", ignore, "new.npz"),
-        ("sweep ball.npz ball.npz poses.npy --out answers --ray none", "np.savez", ignore, None),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                ("build ball.obj new.npz", "np.savez_compressed", block, "new.npz"),
+                ("run scene.toml --record new.csv", "csv", handle_plainly, "new.csv"),
+                ("run scene.toml --record new.npz", "frames", ignore, None),
+                ("query ball.obj ball.obj --output faces --record new.npz", "np.savez", ignore, "new.npz"),
+                ("sweep ball.npz ball.npz poses.npy --out answers --ray none", "np.savez", ignore, None),
+            )
+        ),
     ],
 )
 def test_a_signal_stops_a_command(files, words, where, before, old, number):
@@ -120,6 +125,7 @@ def test_a_signal_stops_a_command(files, words, where, before, old, number):
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize("number", BOTH, ids=lambda number: number.name)
 @pytest.mark.parametrize("before", [ignore, block, handle_plainly], ids=lambda before: before.__name__)
+@pytest.mark.slow
 def test_a_signal_stops_the_page(files, number, before):
     pytest.importorskip("viser")
     words = "view ball.obj ball.obj --port 0 --json --device cpu".split()

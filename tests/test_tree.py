@@ -169,6 +169,7 @@ def random_lods(rng, lods, tops):
     return np.where(jump > 0.96, rng.choice([0, 1]) * tops, lods)
 
 
+@pytest.mark.slow
 def test_random_walk_of_many_objects(device):
     rng = np.random.default_rng(3)
     models = [sample(name) for name in WALKED]
@@ -181,6 +182,7 @@ def test_random_walk_of_many_objects(device):
 
 
 @pytest.mark.parametrize("name", ["cow", "fcl-env", "woody"])
+@pytest.mark.slow
 def test_random_walk_of_real_meshes(device, name):
     rng = np.random.default_rng(4)
     walker = Walker([sample(name)], [0, 0, 0], device)
@@ -190,6 +192,7 @@ def test_random_walk_of_real_meshes(device, name):
         walker.step(lods, with_oracle=t % 12 == 11)
 
 
+@pytest.mark.slow
 def test_random_walk_of_a_large_mesh(device):
     walker = Walker([sample("stanford-bunny")], [0, 0], device)
     top = int(walker.tops()[0])
@@ -318,6 +321,7 @@ def test_pool_keeps_to_what_is_needed(device):
     assert (states.node_room, states.face_room) == room
 
 
+@pytest.mark.slow
 def test_thousands_of_objects_in_one_batch(device):
     rng = np.random.default_rng(7)
     models = [sample(name) for name in ("small ball", "crumbs", "twins", "one")]

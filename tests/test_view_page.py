@@ -63,6 +63,7 @@ def page(server, device):
     return page
 
 
+@pytest.mark.slow
 def test_a_page_stands_until_it_is_told_to_play(page):
     assert page.moments == 1 and page.moment.number == 0 and "| state | paused |" in page._state.content
     page._note(page._run_button, "step")
@@ -81,6 +82,7 @@ def test_a_page_stands_until_it_is_told_to_play(page):
     assert page.moment.number == 0 and not page._rows
 
 
+@pytest.mark.slow
 def test_what_people_do_reaches_the_scene(page):
     top = page.source.scene.models[0].lod_max
     page._note(page._hold_all, 50.0)
@@ -132,6 +134,7 @@ def test_a_standalone_page_holds_all_that_it_shows(files, capsys):
     assert sorted(path.name for path in files.glob("page*")) == ["page.html"]
 
 
+@pytest.mark.slow
 def test_view_serves_until_it_is_interrupted(files):
     pytest.importorskip("viser")
     command = [sys.executable, "-m", "warp_abtree", "view", "box.obj", "box.obj", "--port", "0", "--device", "cpu"]

@@ -6,6 +6,7 @@ import os
 import re
 
 import numpy as np
+import pytest
 import trimesh
 from samples import SHUTTLE_SCENE
 
@@ -40,6 +41,7 @@ def test_progress_off_a_terminal_is_a_line_a_stage():
     assert stream.getvalue() == "collapse ...\nLOD bounds ...\n"
 
 
+@pytest.mark.slow
 def test_no_label_can_be_taken_for_an_error(tmp_path, monkeypatch, capsys):
     """Of any command, were every stage to take long."""
     monkeypatch.chdir(tmp_path)
