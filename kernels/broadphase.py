@@ -35,10 +35,6 @@ def pose_box_kernel(
 ):
     """Box the posed root box of each object in the world, rounded outwards; a stale launch boxes points apart."""
     i = wp.tid()
-    if is_stale(record):
-        lower_out[i] = wp.vec3(wp.float32(i), 0.0, 0.0)
-        upper_out[i] = lower_out[i]
-        return
     state = objects.state[i]
     root = load_node(states, states.node_start[state] + 1)
     lower = wp.vec3d(root.lower)
@@ -59,6 +55,10 @@ def pose_box_kernel(
         reach = reach + ROUNDING_64 * size + skew
         box_lower[k] = round_down(centre - reach)
         box_upper[k] = round_up(centre + reach)
+    # At last, so that no load waits for it.
+    if is_stale(record):
+        box_lower = wp.vec3(wp.float32(i), 0.0, 0.0)
+        box_upper = box_lower
     lower_out[i] = box_lower
     upper_out[i] = box_upper
 

@@ -35,9 +35,11 @@ def is_stale(record: LaunchRecord):
 
 @wp.func
 def record_launch(record: LaunchRecord):
-    """Note which buffers a launch uses, or that it is stale; for one thread."""
-    if is_stale(record):
+    """Note which buffers a launch uses, or that it is stale; for one thread. Return whether it is stale."""
+    stale = is_stale(record)
+    if stale:
         record.launched[0] = STALE
         record.launched[1] = 1
     else:
         record.launched[0] = record.buffers
+    return stale

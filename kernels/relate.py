@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_abtree.kernels.distance import DISTANCE_MAX, pad_distance
 from warp_abtree.kernels.faces import OUTPUT_ANY, Hits
-from warp_abtree.kernels.generation import is_stale, record_launch
+from warp_abtree.kernels.generation import record_launch
 from warp_abtree.kernels.pools import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.pose import PairPose, pair_pose
 from warp_abtree.kernels.share import NO_UNIT, Work, part_count
@@ -28,17 +28,18 @@ def relate_pair_kernel(
 ):
     """Compute the pose of B in A's frame once a pair, A the smaller index, and clear what the traversal counts.
 
-    A stale launch finds nothing, and reads no tree: its states may be half changed.
+    A stale launch is left no work: tree states may be half changed, though in bounds.
 
     Args:
         within: Distances [world units] that boxes are to be widened by, shape [pair]; [0] for intersection.
     """
     p = wp.tid()
     count = wp.min(pair_count[0], pairs.shape[0])
-    stale = is_stale(work_out.record)
     if p < work_out.flag.shape[0]:
         work_out.flag[p] = 0
-    if p == 0:
+    # By a warp that has no pose to wait for, where there are several.
+    if p == wp.min(32, wp.max(pairs.shape[0], work_out.flag.shape[0]) - 1):
+        stale = record_launch(work_out.record)
         work_out.counter[0] = 0
         work_out.counter[1] = 0
         work_out.counter[2] = wp.where(stale, 0, count * part_count(parts_max, count))
@@ -46,7 +47,6 @@ def relate_pair_kernel(
     if p >= pairs.shape[0]:
         return
     if p == 0:
-        record_launch(work_out.record)
         hits_out.total[0] = 0
         hits_out.unsure_total[0] = 0
         hits_out.hard_total[0] = 0
@@ -56,7 +56,7 @@ def relate_pair_kernel(
     hits_out.triangle_tests[p] = wp.int64(0)
     hits_out.float64_tests[p] = wp.int64(0)
     hits_out.exact_tests[p] = wp.int64(0)
-    if p >= count or stale:
+    if p >= count:
         return
     a = wp.min(pairs[p][0], pairs[p][1])
     b = wp.max(pairs[p][0], pairs[p][1])
