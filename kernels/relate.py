@@ -37,8 +37,8 @@ def relate_pair_kernel(
     count = wp.min(pair_count[0], pairs.shape[0])
     if p < work_out.flag.shape[0]:
         work_out.flag[p] = 0
-    # By a warp that has no pose to wait for, where there are several.
-    if p == wp.min(32, wp.max(pairs.shape[0], work_out.flag.shape[0]) - 1):
+    # By the last thread, which has no pose to wait for unless there are very many.
+    if p == wp.max(pairs.shape[0], work_out.flag.shape[0]) - 1:
         stale = record_launch(work_out.record)
         work_out.counter[0] = 0
         work_out.counter[1] = 0
