@@ -1,5 +1,8 @@
 """Captured graphs whose arrays were replaced, and captures of what was never launched: one error, never an answer."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 import warp as wp
@@ -154,6 +157,34 @@ def test_buffers_that_grow(device, operator):
         query.result()
     query.launch()
     np.testing.assert_array_equal(query.result().count, expected)
+
+
+class OwnQuery(ab.Query):
+    """A query of a user's own class."""
+
+
+@pytest.mark.parametrize("kind", [ab.Query, OwnQuery])
+def test_a_graph_keeps_its_arrays(device, kind):
+    """Those of the query, of the scene and of the broad phase, until the query goes."""
+    scene = make_scene(device)
+    query = kind(scene, "faces", capacity=8)
+    captured, states, objects = capture(device, query), query.arrays[1].pool, query.arrays[2].pool
+    kept = [query.hits.face, query.hits.any_hit, query.pair_poses, query.pairs, query.work.counter]
+    kept += [states.node_box, states.face_corner, states.lod, objects.state, objects.rotation]
+    kept += [query.broad_phase.lower, query.broad_phase.excluded, query.broad_phase.bvh, query.guard.launched]
+    alive = [weakref.ref(array) for array in kept]
+    query.run()
+    scene.set_lods(rungs(4))
+    scene.add(sample("box"))
+    del kept, states, objects
+    gc.collect()
+    assert all(reference() is not None for reference in alive)
+    wp.capture_launch(captured)
+    with pytest.raises(RuntimeError, match=STALE):
+        query.result()
+    del query, captured
+    gc.collect()
+    assert not any(reference() is not None for reference in alive[:5])
 
 
 def test_results_without_a_launch(device, operator):

@@ -71,9 +71,16 @@ def find_arrays(value) -> dict:
             open_values += value
         elif hasattr(value, "_cls") and hasattr(value._cls, "vars"):  # an instance of a Warp struct
             open_values += [getattr(value, name) for name in value._cls.vars]
-        elif type(value).__module__.startswith("warp_abtree.") and type(value).__name__ not in ("Scene", "Model"):
+        elif hasattr(value, "__dict__") and _holds_arrays(type(value)):
             open_values += vars(value).values()
     return found
+
+
+def _holds_arrays(kind) -> bool:
+    """Return whether a class is the library's, or made from one, but for what outlives its operators."""
+    names = [f"{base.__module__}.{base.__name__}" for base in kind.__mro__]
+    own = any(name.startswith("warp_abtree.") for name in names)
+    return own and not {"warp_abtree.scene.Scene", "warp_abtree.model.Model"} & set(names)
 
 
 class LaunchGuard:

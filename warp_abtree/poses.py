@@ -99,6 +99,8 @@ def place_rows(rows, pool):
         check_poses(row.reshape(1, 4, 4) if matrices else row, first=bad)
         raise ValueError(f"poses: pose {bad} is no pose")  # by rounding, where the host finds it just within
     launch_place(rows, pool)
+    # Whose memory it is may free or change it as soon as this returns, on another stream.
+    wp.synchronize_stream(wp.get_stream(rows.device))
 
 
 def launch_place(rows, pool):
