@@ -174,7 +174,10 @@ def test_a_graph_keeps_its_arrays(device, kind):
     kept += [query.broad_phase.lower, query.broad_phase.excluded, query.broad_phase.bvh, query.guard.launched]
     alive = [weakref.ref(array) for array in kept]
     query.run()
+    known, ids = objects.state, objects.state.numpy().tolist()
     scene.set_lods(rungs(4))
+    assert known.numpy().tolist() == ids, "the states of the pool that the graph knows, and no others"
+    del known
     scene.add(sample("box"))
     del kept, states, objects
     gc.collect()
