@@ -74,7 +74,7 @@ def _wrap_cuda_array(values):
 def is_device_array(values) -> bool:
     """Return whether an array of some framework lies on a GPU."""
     if isinstance(values, wp.array):
-        return values.device.is_cuda
+        return values.device is not None and values.device.is_cuda
     if isinstance(values, np.ndarray):
         return False
     if hasattr(values, "__cuda_array_interface__"):  # of a tensor on the CPU that raises AttributeError

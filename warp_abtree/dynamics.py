@@ -196,6 +196,10 @@ class Dynamics(RigidBodies):
         ValueError: A number out of range or of the wrong shape, or a body without a volume.
     """
 
+    _colour: wp.array
+    _colour_key: wp.array
+    _colour_order: wp.array
+
     def __init__(
         self,
         scene: Scene,

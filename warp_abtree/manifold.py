@@ -81,10 +81,10 @@ class ManifoldQuery(ContactQuery):
 
     def _place_arrays(self, capacity: int) -> list:
         made = super()._place_arrays(capacity)
-        for name, dtype in (("parent", wp.int32), ("loop", wp.int32), ("loop_normal", wp.vec3d), ("normal", wp.vec3d)):
-            made.append((self.curves, name, self._empty(capacity, dtype)))
-        for name, dtype in (("point", wp.vec3d), ("depth", wp.float64)):
-            made.append((self.curves, name, self._empty((capacity, 2), dtype)))
+        made += [(self.curves, name, self._empty(capacity, wp.int32)) for name in ("parent", "loop")]
+        made += [(self.curves, name, self._empty(capacity, wp.vec3d)) for name in ("loop_normal", "normal")]
+        made.append((self.curves, "point", self._empty((capacity, 2), wp.vec3d)))
+        made.append((self.curves, "depth", self._empty((capacity, 2), wp.float64)))
         return made
 
     def _pair_arrays(self, room: int) -> list:

@@ -73,9 +73,9 @@ def device_rows(poses, device, what="poses"):
     if array.ndim == 1 and array.dtype in POSE_TYPES:
         scalar, width = POSE_TYPES[array.dtype]
         array = array if array.is_contiguous else array.contiguous()
-        rows = wp.array(ptr=array.ptr, dtype=scalar, shape=(len(array), width), device=device)
-        rows._owner = array
-        return rows
+        shape = (len(array), width)
+        # The deleter holds the owner of the memory until the rows go.
+        return wp.array(ptr=array.ptr, dtype=scalar, shape=shape, device=device, deleter=lambda *_, owner=array: None)
     quaternions = array.ndim == 2 and array.shape[1] == 7
     if array.dtype not in REALS or not (quaternions or array.shape[1:] == (4, 4)):
         return None

@@ -104,7 +104,8 @@ class Scene:
         known = next((i for i, other in enumerate(self.models) if other is model), len(self.models))
         self._retire()
         count = self.object_count
-        columns = self._world, self._static, self._added_pose, self._lod, self.object_importance, self.object_model
+        columns: list[list] = [self._world, self._static, self._added_pose, self._lod]
+        columns += [self.object_importance, self.object_model]
         try:
             if known == len(self.models):
                 self.models.append(model)
