@@ -14,6 +14,8 @@ from bench import __main__ as main
 from bench import build, fcl_peer, newton_peer, peer, peers, plots, query, roofline, scale, sweep, timing, update
 from bench.shapes import knot, knot_model, pair_poses
 
+pytestmark = pytest.mark.slow
+
 
 def run_case(name, device, **options):
     """Return the rows of a case, every number in them finite and no time or size negative."""
@@ -42,7 +44,6 @@ def no_real_meshes(monkeypatch):
 # --- cases -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_query(device):
     rows = run_case("query", device, quick=True)
     assert [row["pairs"] for row in rows] == [1, 4]
@@ -59,7 +60,6 @@ def test_query(device):
             assert (f"{name}_ms" in row) != (f"{name}_skipped" in row), "a peer runs or is named as skipped"
 
 
-@pytest.mark.slow
 def test_update(device):
     rows = run_case("update", device, quick=True)
     shares = cases_of(rows, "case", "one state")
@@ -84,7 +84,6 @@ def test_update_leaves_large_meshes_out(device):
     assert {row["faces"] for row in cases_of(rows, "case", "one state")} == {168}
 
 
-@pytest.mark.slow
 def test_scale(device, tmp_path):
     rows = run_case("scale", device, quick=True, models=tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["knot-200.npz", "knot-600.npz"]
@@ -106,7 +105,6 @@ def test_scale(device, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["memory", "precision", "sweep"])
-@pytest.mark.slow
 def test_other_cases(device, name, no_real_meshes):
     rows = run_case(name, device, quick=True)
     if name == "memory":
@@ -129,7 +127,6 @@ def test_peers(device, no_real_meshes):
         assert row["meet"] == 3 and row["faces_missed"] == row["faces_invented"] == row["ours_wrong"] == 0
 
 
-@pytest.mark.slow
 def test_build(device, tmp_path):
     *rows, slopes = run_case("build", device, quick=True, models=tmp_path)
     assert [row["faces"] for row in rows] == [168, 576]
@@ -143,7 +140,6 @@ def test_build(device, tmp_path):
     assert slopes["build_ms_slope"] is not None
 
 
-@pytest.mark.slow
 def test_exact(device):
     rows = run_case("exact", device, count=110, processes=1)
     assert all(row["disagreements"] == 0 for row in rows)
@@ -153,7 +149,6 @@ def test_exact(device):
 # --- the command -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_command_writes_rows(tmp_path, capsys):
     file = tmp_path / "rows.json"
     assert main.main(["query", "--device", "cpu", "--quick", "--json", str(file)]) == 0
@@ -419,7 +414,6 @@ def test_peaks_by_name():
     assert all(peak > 1e6 for peak in roofline.measure_peaks(side=64, words=2**12))
 
 
-@pytest.mark.slow
 def test_plots(tmp_path, monkeypatch):
     rows = [{"sweep": "pairs", "pairs": n, "ours_ms": 2.0 * n, "peer_ms": 3.0 * n, "arrays_mib": 1.0} for n in (1, 10)]
     lines = plots.find_lines(rows, scale.FIGURES[0]["panels"][0])

@@ -11,10 +11,11 @@ import pytest
 import warp_abtree as ab
 from bench import budget
 
+pytestmark = pytest.mark.slow
+
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 
 
-@pytest.mark.slow
 def test_budget_bench(device, monkeypatch, tmp_path):
     monkeypatch.setattr(budget, "QUICK", {"frames": 63, "step": 6, "probe": 12, "selected": 200})
     monkeypatch.setattr(budget, "QUICK_OBJECTS", 12)

@@ -147,6 +147,7 @@ def contacts_of(device, a, b, pose, precision="exact"):
 
 
 @pytest.mark.parametrize("precision", ["exact", "float64", "float32"])
+@pytest.mark.slow
 def test_contacts_against_the_library(files, capsys, device, precision):
     # The shifted twin has coplanar faces beside it; their rounded signs differ from the exact ones.
     for a, b, pose in (("ball.obj", "ring.ply", ASIDE), ("box.obj", "box.obj", (0.3, 0.1, 0, 0, 0, 0, 1))):

@@ -489,6 +489,7 @@ def test_faces_that_do_not_meet_get_a_point_between(device):
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.slow
 def test_coarser_precision(device, precision):
     scene, _ = two(device, "small ball", "small ball", pose_b=(1e-7, 0, 0, 0, 0, 0, 1))
     check_fields(contacts_of(scene, precision=precision))

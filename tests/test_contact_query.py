@@ -138,6 +138,7 @@ def same(result, other):
         assert getattr(result, name).tobytes() == getattr(other, name).tobytes(), name
 
 
+@pytest.mark.slow
 def test_shapes_in_contact(device):
     scene, pairs = touching(device)
     result = ab.ContactQuery(scene, pairs).run()

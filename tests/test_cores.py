@@ -38,6 +38,7 @@ def test_every_item_once(cores):
 
 
 @pytest.mark.parametrize("output", ["any", "count", "faces"])
+@pytest.mark.slow
 def test_same_answers(scene, output):
     def ask(cores, within=None):
         query = ab.Query(scene, output, pairs=PAIRS, within=within)

@@ -101,6 +101,7 @@ def test_python_blocks_run(run_block, page, index):
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks_of(page, "toml")], ids=name_of)
+@pytest.mark.slow
 def test_scenes_in_pages_load(page):
     for _, text in blocks_of(page, "toml"):
         loaded = ab.load_scene(page, device="cpu", text=text)

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
@@ -30,7 +32,6 @@ def drawn(tmp_path_factory):
     return figures.FOLDER, titles
 
 
-@pytest.mark.slow
 def test_all_pictures_of_the_page_are_drawn(drawn):
     named = re.findall(r"\((concept_[\w.]+)\)", (DOCS / "concepts.md").read_text(encoding="utf-8"))
     assert sorted(named) == sorted(path.name for path in drawn[0].iterdir()) and len(named) == 4
@@ -38,7 +39,6 @@ def test_all_pictures_of_the_page_are_drawn(drawn):
 
 
 @pytest.mark.parametrize("name", ["concept_tree.svg", "concept_dials.svg"])
-@pytest.mark.slow
 def test_vector_pictures_say_what_the_library_finds(drawn, name):
     def words(folder):
         return re.findall(r"<text[^>]*>([^<]*)</text>", (folder / name).read_text(encoding="utf-8"))
@@ -46,7 +46,6 @@ def test_vector_pictures_say_what_the_library_finds(drawn, name):
     assert words(drawn[0]) == words(DOCS) and len(words(DOCS)) > 5
 
 
-@pytest.mark.slow
 def test_what_pictures_show(drawn):
     title, *levels = drawn[1]["concept_traversal.png"]
     pairs = [int(re.search(r": ([\d,]+) of", level)[1].replace(",", "")) for level in levels]

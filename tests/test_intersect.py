@@ -422,7 +422,7 @@ def test_a_mesh_laid_on_itself_goes_to_float64_at_once(device, name):
         assert (apart.float64_tests < apart.triangle_tests).all() and np.ptp(apart.float64_tests) == 0
 
 
-@pytest.mark.parametrize("name", ["cow", "rocker-arm", "stanford-bunny", "torus"])
+@pytest.mark.parametrize("name", [*slow("cow", "rocker-arm", "stanford-bunny"), "torus"])
 @pytest.mark.parametrize("fraction", [0.1, 0.03, 0.01])
 def test_a_coarse_tree_costs_no_more_than_one_built_for_its_lod(device, name, fraction):
     """Skip links keep "no loss" true: node tests within 1.1 times those of a static tree, over 20 poses in contact."""

@@ -89,6 +89,7 @@ def plain(device, names, models):
     return faces
 
 
+@pytest.mark.slow
 def test_swapped_objects(device, names, models, plain):
     """As A and B, and as first and second of a pair: four ways to ask one question."""
     swapped = ask_models(device, *models[::-1], [pair[::-1] for pair in grid_poses(names)])
@@ -175,6 +176,7 @@ def test_order_of_faces_and_corners(device, names, plain):
 
 
 @pytest.mark.parametrize("make_query", [ab.Query, GpuQuery], ids=["threads", "as on CUDA"])
+@pytest.mark.slow
 def test_scale(device, names, make_query):
     """2^-60 to 2^60: the same faces from the same work, also where coordinates and poses round."""
     rng = np.random.default_rng(26)

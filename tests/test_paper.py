@@ -10,6 +10,8 @@ from bench import paper_lods, paper_meshes, paper_query, paper_setup, paper_tree
 from bench.shapes import knot
 from bench.study import Context
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def model():

@@ -447,6 +447,7 @@ def test_real_meshes(name, real_mesh_path):
 
 
 @pytest.mark.parametrize("name", ["cow", "fandisk"])
+@pytest.mark.slow
 def test_error_is_tight_on_real_meshes(name, real_mesh_path):
     mesh = load_mesh(real_mesh_path(name))
     progressive = build_progressive(mesh)

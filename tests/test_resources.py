@@ -134,6 +134,7 @@ def test_first_use(device, memory):
     assert count > 30
 
 
+@pytest.mark.slow
 def test_a_new_object(device, memory):
     """Poses and LODs of the others stay where they were set, not where they were added."""
 
@@ -164,6 +165,7 @@ MOVES = {
 
 
 @pytest.mark.parametrize("move", MOVES)
+@pytest.mark.slow
 def test_lods(device, memory, move):
     """States that move, that are copied, taken again and new, and a pool that grows."""
 
@@ -204,6 +206,7 @@ QUESTIONS = {
 
 @pytest.mark.parametrize("pairs", [MORE_PAIRS, None], ids=["given", "found"])
 @pytest.mark.parametrize("question", QUESTIONS)
+@pytest.mark.slow
 def test_questions(device, memory, question, pairs):
     """More pairs than the scene was asked before, with what belongs to each, and more hits than it had room for."""
     options = QUESTIONS[question]
@@ -286,6 +289,7 @@ GROWING = {
 
 
 @pytest.mark.parametrize("kind", GROWING)
+@pytest.mark.slow
 def test_a_query_grows(device, memory, kind):
     """Buffers that turn out too small, none of which may be left behind by the others."""
     make_query, options = GROWING[kind]

@@ -163,6 +163,7 @@ def test_given_pairs_need_no_broad_phase(device, ledger):
     assert fresh._broad_phase is None
 
 
+@pytest.mark.slow
 def test_contacts_cost_only_those_who_ask(device, ledger):
     scene = make_scene(device, 60)
     scene.arrays()

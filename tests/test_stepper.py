@@ -9,6 +9,8 @@ import warp_abtree as ab
 from warp_abtree.bodies import quaternions_of
 from warp_abtree.kernels import colour
 
+pytestmark = pytest.mark.slow
+
 SHAPES = (BRICK, TORUS, BALL)
 
 

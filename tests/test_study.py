@@ -12,6 +12,8 @@ from bench import docs, html, meshes, study
 from bench.parts import Claim, Column, Figure, Finished, Part, Table, cells, pick, plain, shown
 from warp_abtree import bench_command, cli
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -54,7 +56,6 @@ def thin(rows):
     return rows[1:]
 
 
-@pytest.mark.slow
 def test_run_is_written_and_resumed(tmp_path, capsys):
     runs = []
     parts = [make_part(runs), make_part(runs, "second")]

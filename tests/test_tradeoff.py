@@ -40,6 +40,8 @@ from bench.tradeoff_subject import (
     rotate,
 )
 
+pytestmark = pytest.mark.slow
+
 
 class SmallModels:
     """One knot for every mesh, in a folder that has none of the others."""

@@ -147,6 +147,7 @@ def test_single_faces_equal_brute_force(device, kind):
 
 
 @pytest.mark.parametrize("names", [("torus", "soup"), ("ball", "cow"), ("cow", "fandisk")], ids="-".join)
+@pytest.mark.slow
 def test_equals_fcl(device, names):
     """Whole meshes, at up to 5,000 faces."""
     fcl = pytest.importorskip("fcl")
