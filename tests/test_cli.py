@@ -180,6 +180,7 @@ def test_contacts_against_the_library(files, capsys, device, precision):
     assert not list(files.glob("*.partial"))
 
 
+@pytest.mark.slow
 def test_precision_reaches_the_query(files, capsys, device):
     """Nearly coincident balls, whose answers differ from precision to precision."""
     pose = (1e-7, 0, 0, 0, 0, 0, 1)

@@ -23,6 +23,7 @@ def coincident(device, monkeypatch):
     return scene
 
 
+@pytest.mark.slow
 def test_the_room_of_the_first_frame_is_made(coincident):
     frame = ab.FrameGraph(coincident, output="count")
     needed = int(frame.run().float64_tests.sum())
@@ -33,6 +34,7 @@ def test_the_room_of_the_first_frame_is_made(coincident):
     np.testing.assert_array_equal(frame.result().count, coincident.intersect(output="count").count)
 
 
+@pytest.mark.slow
 def test_a_room_that_is_too_small_is_told_at_construction(coincident):
     needed = int(ab.FrameGraph(coincident, output="count").run().float64_tests.sum())
     with pytest.warns(RuntimeWarning, match=f"=8: .* leave {needed} .*unsure_capacity={needed}"):

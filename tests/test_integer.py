@@ -10,6 +10,8 @@ from signs import COUNT, KINDS, true_terms
 from warp_abtree.kernels.integer import integer_orient2d, integer_orient3d
 from warp_abtree.kernels.predicates import UNSURE
 
+pytestmark = pytest.mark.slow
+
 
 @wp.kernel
 def integer3d_kernel(bound: wp.array(dtype=wp.float64), points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=int)):

@@ -355,6 +355,7 @@ class WarpQuery(ab.Query):
 
 @pytest.mark.parametrize("room", [STACK_LENGTH, 0])
 @pytest.mark.parametrize("parts", [1, 5, 300])
+@pytest.mark.slow
 def test_warps_give_the_same_answers(device, room, parts):
     """One warp a pair and several, with room on the stack or none, so that they go one item at a time."""
     scene, _ = posed_cases(np.random.default_rng(8), ("torus", "soup"), 12, BRUTE_FACES, device)

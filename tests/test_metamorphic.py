@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from conftest import slow
 from oracle_triangle import pose_matrix, relative_pose
 from samples import contact_poses, random_poses, sample, true_faces
 from test_exact import QUARTERS, ask, coarse, sort_rows, to_matrix
@@ -175,7 +176,7 @@ def test_order_of_faces_and_corners(device, names, plain):
     check_equal([sort_rows(np.stack([order_a[r[:, 0]], order_b[r[:, 1]]], 1)) for r in found], plain)
 
 
-@pytest.mark.parametrize("make_query", [ab.Query, GpuQuery], ids=["threads", "as on CUDA"])
+@pytest.mark.parametrize("make_query", [ab.Query, *slow(GpuQuery)], ids=["threads", "as on CUDA"])
 @pytest.mark.slow
 def test_scale(device, names, make_query):
     """2^-60 to 2^60: the same faces from the same work, also where coordinates and poses round."""
@@ -196,7 +197,7 @@ def test_scale(device, names, make_query):
     assert (rows == rows[0]).all()
 
 
-@pytest.mark.parametrize("make_query", [ab.Query, GpuQuery], ids=["threads", "as on CUDA"])
+@pytest.mark.parametrize("make_query", [ab.Query, *slow(GpuQuery)], ids=["threads", "as on CUDA"])
 @pytest.mark.parametrize("names", [("cow", "fandisk"), ("fcl-rob", "woody"), ("torus", "ball")], ids="-".join)
 def test_distance_from_the_origin(device, names, make_query):
     """Up to 1e7 sizes, of poses and of the meshes' own coordinates, against brute force in integers."""

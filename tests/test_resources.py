@@ -258,6 +258,7 @@ QUERIES = {
 
 
 @pytest.mark.parametrize("kind", QUERIES)
+@pytest.mark.slow
 def test_a_query_is_given_more_pairs(device, memory, kind):
     """It goes on with the pairs that it had, and later takes the others."""
     make_query, options = QUERIES[kind]
@@ -370,6 +371,7 @@ def little_memory(device):
 LARGEST = 2**31 - 1
 
 
+@pytest.mark.slow
 def test_the_error_names_the_demand(device):
     """The largest buffers that may be asked for, for real: so many entries of three or two integers."""
     scene = make_scene(device)
@@ -414,6 +416,7 @@ def named_demand(query, name):
 
 
 @pytest.mark.parametrize("kind", ["unsure", "pairs"])
+@pytest.mark.slow
 def test_room_for_the_demand_is_enough(device, kind):
     """As the error of a query that lost work names it; hits are in test_intersect."""
     scene = make_scene(device)

@@ -127,6 +127,7 @@ def query_bytes(ledger, kind, scene, pairs, output, **options):
 
 
 @pytest.mark.parametrize("kind", [ab.Query, GpuQuery])
+@pytest.mark.slow
 def test_a_query_has_room_for_its_output_alone(device, ledger, kind):
     scene = make_scene(device, 400)
     pairs = np.arange(400).reshape(-1, 2)

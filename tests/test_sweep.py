@@ -95,6 +95,7 @@ def test_more_poses_than_before_and_fewer(device, monkeypatch):
 
 
 @pytest.mark.parametrize("output", ["any", "count", "faces"])
+@pytest.mark.slow
 def test_lists_that_overflow_lose_nothing(device, output, monkeypatch, small_chunks):
     """The CUDA regime, with room for one face pair of those that float32 leaves open; boxes lie flush."""
 

@@ -10,6 +10,8 @@ import warp as wp
 from warp_abtree.kernels.filter import decide_triangles
 from warp_abtree.kernels.predicates import EXACT, FILTER, UNSURE
 
+pytestmark = pytest.mark.slow
+
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 ORDERS = [(p, q) for p in permutations(range(3)) for q in permutations(range(3))]

@@ -28,6 +28,8 @@ from warp_abtree.kernels.vector64 import filter_waiting
 from warp_abtree.kernels.visit import FACE_STEP, ITEM_STEP, visit_item
 from warp_abtree.kernels.warps import item_first, item_second, pack_item
 
+pytestmark = pytest.mark.slow
+
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 CPU = "cpu"

@@ -314,6 +314,7 @@ class ThreadQuery(ab.Query):
         return False
 
 
+@pytest.mark.slow
 def test_regimes_and_outputs_agree(device):
     rng = np.random.default_rng(8)
     scene, cases = posed_pairs(rng, device, [("torus", "soup")] * 30, faces=400)

@@ -6,6 +6,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from conftest import slow
 from oracle_triangle import into_frame_of_a, quaternion_matrix
 from samples import true_faces
 from signs import true_signs
@@ -27,7 +28,7 @@ class GpuQuery(ab.Query):
         return True
 
 
-QUERIES = pytest.mark.parametrize("make_query", [ab.Query, GpuQuery], ids=["threads", "as on CUDA"])
+QUERIES = pytest.mark.parametrize("make_query", [ab.Query, *slow(GpuQuery)], ids=["threads", "as on CUDA"])
 
 
 def mirrored(corners):
