@@ -261,8 +261,6 @@ class FrameGraph:
         poses, lods, demand = self._bad_poses.numpy().copy(), self._update.faults.numpy().copy(), self._demand.numpy()
         found, hits, unsure, stale = (int(value) for value in demand)
         self.clear_faults()
-        if stale:
-            raise RuntimeError(f"a frame since the last check is lost: its graph {STALE_GRAPH}")
         wrong, lost = [], []
         if poses[0]:
             wrong.append(
@@ -285,6 +283,9 @@ class FrameGraph:
                 lost.append(
                     f"a frame since the last check needed {name}={demands[name]}, the frame graph has room for {places}"
                 )
+        if stale:
+            stale_frame = f"a frame since the last check is lost: its graph {STALE_GRAPH}"
+            raise RuntimeError("; ".join([stale_frame, *lost, *wrong]))
         if lost:
             raise CapacityError("; ".join([*lost, *wrong]))
         if wrong:
