@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.filter import decide_triangles
-from warp_abtree.kernels.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE
-from warp_abtree.kernels.screen import SCREEN_UNIT, screen_triangles
+from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, FLOAT64, UNSURE
+from warp_abtree.kernels.triangle.float32_filter import SCREEN_UNIT, screen_triangles
+from warp_abtree.kernels.triangle.float64_filter import decide_triangles
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
-ORACLE = Path(__file__).resolve().parents[1] / "tests" / "oracle_triangle.py"
+ORACLE = Path(__file__).resolve().parents[1] / "tests" / "oracles" / "triangle.py"
 CHUNK = 20_000
 # Every so many adversarial pairs, one is asked in all orders; the others in one order each, in turn.
 WHOLE_EVERY = 64

@@ -1,17 +1,16 @@
 """What the experiments of the paper share: its three models, pairs of objects in contact, launches of one refit."""
 
 import copy
-import importlib
 
 import numpy as np
 
 import warp_abtree as ab
+from warp_abtree.state import update as refine
 
 from .shapes import centre_and_radius
 from .update import forced
 
 # Nothing public hands out the batch of an update.
-refine = importlib.import_module("warp_abtree.refine")
 
 # Of table 1: the paper's name, its faces and vertices of M^n and M^0; then ours, the best at hand first.
 PAPER_MODELS = (

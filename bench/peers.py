@@ -22,7 +22,7 @@ from .fcl_peer import FclCppPeer
 from .shapes import knot
 from .timing import summarise, time_in_turn
 
-ORACLE = Path(__file__).resolve().parents[1] / "tests" / "oracle_triangle.py"
+ORACLE = Path(__file__).resolve().parents[1] / "tests" / "oracles" / "triangle.py"
 REAL = {
     "cow-cow": ("cow", "cow"),
     "bunny-bunny": ("stanford-bunny", "stanford-bunny"),

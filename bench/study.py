@@ -22,7 +22,7 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
-from warp_abtree.files import atomic_write
+from warp_abtree.checks.atomic_write import atomic_write
 
 from . import html, meshes, timing
 from .parts import Finished, Part, plain

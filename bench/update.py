@@ -6,7 +6,6 @@ on the same states, in turn. Their bits are compared before anything is timed.
 
 import contextlib
 import copy
-import importlib
 import math
 import time
 
@@ -14,6 +13,8 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree.model import tree
+from warp_abtree.state import update as refine
 
 from .memory import held_mib
 from .peer import BvhPeer
@@ -22,8 +23,6 @@ from .shapes import knot_model
 from .timing import WARM_UP, fit_slope, make_runs, summarise, time_both, time_in_turn
 
 # Nothing public forces a kind of refit, hands out the batch of an update, or builds a tree alone.
-refine = importlib.import_module("warp_abtree.refine")
-tree = importlib.import_module("warp_abtree.tree")
 
 # Shares of the splits between the finest LOD and the other.
 SHARES = (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.5, 0.9)

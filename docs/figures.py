@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 import warp_abtree as ab
-from warp_abtree import picture, plot
-from warp_abtree import view_parts as parts
+from warp_abtree.app.pictures import picture, plot
+from warp_abtree.app.viewer import render_data as parts
 
 FOLDER = Path(__file__).parent
 INK, PALE, BLUE, RED, GREEN = "#33373d", "#d5d8dc", "#3b76c4", "#d4472f", "#2f9e58"

@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from warp_abtree.kernels.manifold import Manifolds
-from warp_abtree.kernels.pools import ObjectPool
-from warp_abtree.kernels.pose import rotate_quaternion
+from warp_abtree.kernels.arrays import ObjectPool
+from warp_abtree.kernels.contact.manifold import Manifolds
+from warp_abtree.kernels.poses import rotate_quaternion
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

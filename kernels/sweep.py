@@ -4,8 +4,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_abtree.kernels.faces import Hits
-from warp_abtree.kernels.place import (
+from warp_abtree.kernels.arrays import ObjectPool
+from warp_abtree.kernels.place_poses import (
     is_matrix_pose,
     is_quaternion_pose,
     read_column,
@@ -13,8 +13,8 @@ from warp_abtree.kernels.place import (
     read_quaternion,
     read_rotation,
 )
-from warp_abtree.kernels.pools import ObjectPool
-from warp_abtree.kernels.pose import rotate_quaternion
+from warp_abtree.kernels.poses import rotate_quaternion
+from warp_abtree.kernels.traversal.face_pairs import Hits
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from warp_abtree import refine
+from warp_abtree.state import update as refine
 
 # JAX would take three quarters of a GPU's memory for itself.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")

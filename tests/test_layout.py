@@ -1,4 +1,4 @@
-"""The floor plan: which module may import which, and how kernels are laid out. Sources are read, not run."""
+"""The floor plan: which package may import which, and how files are laid out. Sources are read, not run."""
 
 import ast
 import sys
@@ -7,20 +7,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PIPELINE = (
-    "checks files mesh progressive tree outward model generation state refine lod broadphase cores poses intersect "
-    "contact scene frame_graph turns pose_sweep shard_folder shards nearest convex collision_manager interop manifold "
-    "bodies dynamics newton clock control frame cluster "
-    "scene_keys scene_folder scene_models scene_control scene_file recording plot waiting report "
-    "view_source view_parts picture view_text view_stage view_page view_record view bench_command sweep_command doctor "
-    "cli_arguments cli"
-).split()
-OUTSIDE = PIPELINE[PIPELINE.index("scene_keys") :]  # these use the public API alone, and what is shared
-SHARED = {"files"}  # helpers of the library and of its users
+# Each package may import itself, `checks`, kernels, and what stands in its row.
+CORE = ["checks", "model", "state", "query", "scene", "lod", "simulate"]
+MAY_IMPORT = {name: set(CORE[:place]) for place, name in enumerate(CORE)}
+MAY_IMPORT |= {"interop": set(CORE), "jobs": set(CORE), "app": {*CORE, "interop", "jobs"}}
 CORE_DEPENDENCIES = {"warp", "numpy", "trimesh", "warp_abtree"}
-FILE_LINES, KERNEL_LINES = 500, 60
+FILE_LINES, FOLDER_FILES, FUNCTION_LINES = 500, 12, 60
 
-PACKAGE = sorted((ROOT / "warp_abtree").glob("*.py"))
+PACKAGE = sorted(path for name in MAY_IMPORT for path in (ROOT / "warp_abtree" / name).rglob("*.py"))
 KERNELS = sorted((ROOT / "kernels").rglob("*.py"))
 USERS = sorted(path for folder in ("bench", "scenes") for path in (ROOT / folder).rglob("*.py"))
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
@@ -43,45 +37,81 @@ def imports(tree, package):
                 yield module, alias.name, node.lineno
 
 
-def inner_imports(tree, package, names):
-    """Yield (part of the package, line): of `import warp_abtree.x` and `from warp_abtree import x`, the part x."""
+def package_of(path):
+    """Return the dotted package of a module of warp_abtree."""
+    return ".".join(path.relative_to(ROOT).parent.parts)
+
+
+def direction_faults(tree, package):
+    """List what a module imports of warp_abtree against the direction of the packages."""
+    faults = []
+    own = package.split(".")[1]
     for module, name, line in imports(tree, package):
         parts = module.split(".")
         if parts[0] != "warp_abtree":
             continue
-        if len(parts) > 1:
-            yield parts[1], line
-        elif name is None:
-            yield "", line
-        elif name in names:
-            yield name, line
-        else:
-            yield f".{name}", line  # a name of warp_abtree/__init__.py
-
-
-def host_faults(name, tree):
-    """List what a module of the pipeline imports against its direction."""
-    faults = []
-    allowed = {"kernels", *PIPELINE[: PIPELINE.index(name)]}
-    for part, line in inner_imports(tree, "warp_abtree", {"kernels", *PIPELINE}):
-        if part not in allowed:
-            faults.append(f"line {line}: {name} imports {part or 'warp_abtree'}, which does not stand above it")
+        if len(parts) == 1:
+            faults.append(f"line {line}: imports {name or module} of the package's root")
+        elif parts[1] not in {own, "kernels", *MAY_IMPORT[own]}:
+            faults.append(f"line {line}: {own} imports {parts[1]}")
     return faults
 
 
-def outside_faults(name, tree, public, package="warp_abtree"):
-    """List what a user of the package takes from it beyond its public names."""
+def dynamic_import_faults(tree):
+    """List imports by a string of what is the project's own."""
+    faults = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("import_module", "__import__"):
+            if node.args and "warp_abtree" in ast.unparse(node.args[0]):
+                faults.append(f"line {node.lineno}: {ast.unparse(node)}")
+    return faults
+
+
+def import_edges(path):
+    """Return the modules of warp_abtree that a module imports when it is itself imported."""
+    top = ast.Module([node for node in parse(path).body if isinstance(node, ast.Import | ast.ImportFrom)], [])
+    return {
+        found
+        for module, name, _ in imports(top, package_of(path))
+        if module.split(".")[0] == "warp_abtree"
+        for found in [f"{module}.{name}", module]
+    }
+
+
+def find_cycle(edges):
+    """Return modules that import one another in a circle, [] where there is none."""
+    done, trail = set(), []
+
+    def walk(module):
+        if module in trail:
+            return trail[trail.index(module) :]
+        if module in done or module not in edges:
+            return []
+        trail.append(module)
+        for other in sorted(edges[module] & edges.keys()):
+            if other != module and (found := walk(other)):
+                return found
+        done.add(trail.pop())
+        return []
+
+    return next((found for module in sorted(edges) if (found := walk(module))), [])
+
+
+def outside_faults(tree, public, package):
+    """List what a user of the library takes from it beyond its public names."""
     faults, aliases = [], set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             aliases |= {alias.asname or "warp_abtree" for alias in node.names if alias.name == "warp_abtree"}
-    neighbours = SHARED | (set(OUTSIDE[: OUTSIDE.index(name)]) if name in OUTSIDE else set())
-    for part, line in inner_imports(tree, package, {"kernels", *PIPELINE}):
-        if part and part not in neighbours and part.removeprefix(".") not in public:
-            faults.append(f"line {line}: {part} is not public")
+    for module, name, line in imports(tree, package):
+        parts = module.split(".")
+        if parts[0] != "warp_abtree" or parts[1:2] in (["app"], ["checks"]):
+            continue
+        if len(parts) > 1 or (name is not None and name not in public):
+            faults.append(f"line {line}: {module}{'.' + name if name else ''} is not public")
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in aliases:
-            if node.attr not in public and node.attr not in neighbours:
+            if node.attr not in public:
                 faults.append(f"line {node.lineno}: warp_abtree.{node.attr} is not public")
     return faults
 
@@ -115,7 +145,7 @@ def kernel_faults(tree):
             faults.append(f"{node.name}: kernels, and only kernels, are named *_kernel")
         if not is_kernel(node):
             continue
-        if node.end_lineno - node.lineno + 1 >= KERNEL_LINES:
+        if node.end_lineno - node.lineno + 1 >= FUNCTION_LINES:
             faults.append(f"{node.name}: {node.end_lineno - node.lineno + 1} lines")
         names = [argument.arg for argument in node.args.args]
         group = [2 if name.endswith("_out") else 1 if name.endswith("_inout") else 0 for name in names]
@@ -135,24 +165,34 @@ def shown(path):
     return str(path.relative_to(ROOT))
 
 
-@pytest.mark.parametrize("path", [path for path in PACKAGE if not path.stem.startswith("__")], ids=shown)
-def test_host_modules_import_upwards(path):
-    assert path.stem in PIPELINE, "a module needs its place in the pipeline"
+def test_every_module_stands_in_a_package():
+    at_root = {path.name for path in (ROOT / "warp_abtree").glob("*.py")}
+    assert at_root == {"__init__.py", "__main__.py"}
+    folders = {path.name for path in (ROOT / "warp_abtree").iterdir() if path.is_dir() and path.name != "__pycache__"}
+    assert folders == {*MAY_IMPORT, "kernels"}
+
+
+@pytest.mark.parametrize("path", PACKAGE, ids=shown)
+def test_packages_import_those_below(path):
     tree = parse(path)
-    if path.stem in OUTSIDE:
-        assert not outside_faults(path.stem, tree, public_names())
+    assert not direction_faults(tree, package_of(path))
+    if package_of(path).split(".")[1] == "app":
         return
-    assert not host_faults(path.stem, tree)
     at_import = ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], [])
-    roots = {module.split(".")[0] for module, _, _ in imports(at_import, "warp_abtree")}
+    roots = {module.split(".")[0] for module, _, _ in imports(at_import, package_of(path))}
     assert roots <= CORE_DEPENDENCIES | sys.stdlib_module_names, "extras are imported where they are used"
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    edges = {package_of(path) + "." + path.stem: import_edges(path) for path in PACKAGE}
+    assert find_cycle(edges) == []
 
 
 @pytest.mark.parametrize("path", USERS, ids=shown)
 def test_users_use_the_public_api(path):
-    if path.stem == "exact":  # times and judges the kernels themselves, stage by stage
+    if path.stem in ("exact", "update", "paper_setup"):  # they time and judge the insides, stage by stage
         return
-    assert not outside_faults(path.stem, parse(path), public_names(), package="bench")
+    assert not outside_faults(parse(path), public_names(), package="bench")
 
 
 @pytest.mark.parametrize("path", KERNELS, ids=shown)
@@ -168,12 +208,14 @@ def test_files(path):
     assert not [line for module, _, line in imports(tree, "x") if module.split(".")[0] == "kernels"], (
         "import warp_abtree.kernels, or every kernel exists twice"
     )
+    assert not [line for module, _, line in imports(tree, "x") if module.split(".")[-1].startswith("test_")]
+    assert path.name == "test_predicates.py" or not dynamic_import_faults(tree)
     assert len(path.read_text(encoding="utf-8").splitlines()) <= FILE_LINES
 
 
 def test_kernel_folders_hold_no_code_in_init():
-    body = parse(ROOT / "kernels" / "__init__.py").body
-    assert [type(node) for node in body] == [ast.Expr]
+    for path in (ROOT / "kernels").rglob("__init__.py"):
+        assert [type(node) for node in parse(path).body] == [ast.Expr]
     bridge = parse(ROOT / "warp_abtree" / "kernels" / "__init__.py").body
     assert [type(node) for node in bridge] == [ast.Expr, ast.ImportFrom, ast.Assign, ast.If]
     assert sorted(path.name for path in (ROOT / "warp_abtree" / "kernels").glob("*.py")) == ["__init__.py"]
@@ -185,39 +227,49 @@ def test_kernel_folders_hold_no_code_in_init():
 @pytest.mark.parametrize(
     "source",
     [
-        "from warp_abtree.scene import Scene",
-        "import warp_abtree.scene as s",
-        "def f():\n    from warp_abtree import scene",
-        "from .tree import x",
-        "from . import intersect",
+        "from warp_abtree.scene.scene import Scene",
+        "import warp_abtree.scene.scene as s",
+        "def f():\n    from warp_abtree.app import cli",
+        "from ..query import x",
+        "from .. import query",
         "import warp_abtree as ab",
         "from warp_abtree import Model",
     ],
 )
 def test_rule_of_direction_catches(source):
-    assert host_faults("tree", parse(source))
-    assert not host_faults("tree", parse("from warp_abtree.mesh import Mesh\nfrom .kernels import mark\nimport numpy"))
+    assert direction_faults(parse(source), "warp_abtree.state")
+    fine = "from warp_abtree.model.mesh import Mesh\nfrom .arrays import x\nfrom warp_abtree.kernels import y"
+    assert not direction_faults(parse(fine), "warp_abtree.state")
+
+
+def test_rule_of_cycles_catches():
+    assert find_cycle({"a": {"b"}, "b": {"c"}, "c": {"a"}}) == ["a", "b", "c"]
+    assert not find_cycle({"a": {"b", "c"}, "b": {"c"}, "c": {"numpy"}})
+
+
+def test_rule_of_dynamic_imports_catches():
+    assert dynamic_import_faults(parse('importlib.import_module("warp_abtree.mesh")'))
+    assert dynamic_import_faults(parse('__import__(f"warp_abtree.{name}")'))
+    assert not dynamic_import_faults(parse('importlib.import_module("tomllib")'))
 
 
 @pytest.mark.parametrize(
     "source",
     [
-        "from warp_abtree.model import Model",
+        "from warp_abtree.model.model import Model",
         "from warp_abtree import Secret",
         "import warp_abtree as ab\nab.state.StatePool",
         "import warp_abtree\nwarp_abtree.Secret",
         "from warp_abtree.kernels import mark",
-        "import warp_abtree.mesh",
+        "import warp_abtree.model.mesh",
     ],
 )
 def test_rule_of_the_public_api_catches(source):
-    assert outside_faults("bench", parse(source), {"Model"})
-    assert outside_faults("plot", parse(source), {"Model"})
-    assert not outside_faults("bench", parse("from warp_abtree.files import atomic_write"), set())
-    fine = "import warp_abtree as ab\nfrom warp_abtree import Model\nab.Model.load"
-    assert not outside_faults("bench", parse(fine), {"Model"})
-    assert not outside_faults("cli", parse("from warp_abtree import plot\nfrom warp_abtree.scene_file import x"), set())
-    assert outside_faults("plot", parse("from warp_abtree import cli"), set())
+    assert outside_faults(parse(source), {"Model"}, "bench")
+    fine = (
+        "import warp_abtree as ab\nfrom warp_abtree import Model\nab.Model.load\nfrom warp_abtree.app import pictures"
+    )
+    assert not outside_faults(parse(fine), {"Model"}, "bench")
 
 
 @pytest.mark.parametrize(
@@ -236,7 +288,7 @@ def test_rule_of_kernels_catches(source):
     assert not kernel_faults(parse("@wp.kernel\ndef f_kernel(a: int, b_inout: int, c_out: int):\n    pass"))
 
 
-@pytest.mark.parametrize("source", ["from .pose import x", "from warp_abtree.mesh import x", "import trimesh"])
+@pytest.mark.parametrize("source", ["from .pose import x", "from warp_abtree.model.mesh import x", "import trimesh"])
 def test_rule_of_kernel_imports_catches(source):
     assert kernel_import_faults(parse(source))
-    assert not kernel_import_faults(parse("import warp as wp\nfrom warp_abtree.kernels.pose import x\nimport math"))
+    assert not kernel_import_faults(parse("import warp as wp\nfrom warp_abtree.kernels.poses import x\nimport math"))

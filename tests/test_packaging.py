@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import warp_abtree as ab
-from warp_abtree.scene_folder import find_scene, scene_folder, scene_names
+from warp_abtree.app.toml.folder import find_scene, scene_folder, scene_names
 
 ROOT = Path(__file__).resolve().parents[1]
 LEAST_SETUPTOOLS = 77  # for the licence as pyproject.toml writes it
@@ -51,7 +51,7 @@ def wheel(dist):
 
 
 def sources(folder, suffixes=(".py",)):
-    return {path.name for path in (ROOT / folder).iterdir() if path.suffix in suffixes}
+    return {str(path.relative_to(ROOT / folder)) for path in (ROOT / folder).rglob("*") if path.suffix in suffixes}
 
 
 @pytest.mark.slow
@@ -59,7 +59,7 @@ def test_wheel_holds_the_package(wheel):
     _, file = wheel
     held = {name for name in file.namelist() if ".dist-info/" not in name}
     assert {name.split("/")[0] for name in held} == {"warp_abtree"}
-    expected = {f"warp_abtree/{name}" for name in sources("warp_abtree")} | {"warp_abtree/py.typed"}
+    expected = {f"warp_abtree/{name}" for name in sources("warp_abtree", (".py", ".typed"))}
     expected |= {f"warp_abtree/kernels/{name}" for name in sources("kernels")}
     expected |= {f"warp_abtree/scenes/{name}" for name in sources("scenes", (".py", ".toml"))}
     assert held == expected

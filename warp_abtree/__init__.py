@@ -1,31 +1,30 @@
 """Batched mesh-mesh interference queries at any level of detail, on NVIDIA Warp."""
 
-from warp_abtree.broadphase import CapacityError
-from warp_abtree.checks import wrap_array
-from warp_abtree.clock import ReplayClock, WorkClock
-from warp_abtree.cluster import RayPool, WorldsJob
-from warp_abtree.collision_manager import CollisionManager
-from warp_abtree.contact import ContactQuery
-from warp_abtree.control import Feedback, PaperController, PredictiveController, ToleranceController
-from warp_abtree.dynamics import Dynamics, Kinematic
-from warp_abtree.frame import Frame, FrameRow, LodSweep, judge_budget, judge_step, resolve_lod
-from warp_abtree.frame_graph import FrameGraph
-from warp_abtree.interop import PoseInput, scene_from_file, scene_from_trimesh, to_trimesh
-from warp_abtree.intersect import Query, Result
-from warp_abtree.lod import Camera, Ladder
-from warp_abtree.manifold import ManifoldQuery
-from warp_abtree.mesh import MeshError, describe_mesh, load_mesh, mesh_from_arrays
-from warp_abtree.model import Model, ModelError
-from warp_abtree.newton import NewtonContacts
-from warp_abtree.plot import draw_controllers
-from warp_abtree.pose_sweep import sweep
-from warp_abtree.refine import UpdateStats
-from warp_abtree.scene import Scene, TreeState
-from warp_abtree.scene_file import SceneError, load_scene
-from warp_abtree.shard_folder import read_shards
-from warp_abtree.shards import SweepJob, ThisProcess, run_shards
-
-__version__ = "0.1.0"
+from warp_abtree.app.pictures.plot import draw_controllers
+from warp_abtree.app.toml.scene_file import SceneError, load_scene
+from warp_abtree.checks.arguments import wrap_array
+from warp_abtree.checks.version import __version__ as __version__
+from warp_abtree.interop.collision_manager import CollisionManager
+from warp_abtree.interop.newton import NewtonContacts
+from warp_abtree.interop.scenes import PoseInput, scene_from_file, scene_from_trimesh, to_trimesh
+from warp_abtree.jobs.ray_pool import RayPool, WorldsJob
+from warp_abtree.jobs.shard_folder import read_shards
+from warp_abtree.jobs.shards import SweepJob, ThisProcess, run_shards
+from warp_abtree.lod.controllers import Feedback, PaperController, PredictiveController, ToleranceController
+from warp_abtree.lod.selection import Camera, Ladder
+from warp_abtree.lod.timing import ReplayClock, WorkClock
+from warp_abtree.model.mesh import MeshError, describe_mesh, load_mesh, mesh_from_arrays
+from warp_abtree.model.model import Model, ModelError
+from warp_abtree.query.broad_phase import CapacityError
+from warp_abtree.query.contacts import ContactQuery
+from warp_abtree.query.manifold import ManifoldQuery
+from warp_abtree.query.narrow_phase import Query, Result
+from warp_abtree.scene.pipeline import FrameGraph
+from warp_abtree.scene.scene import Scene, TreeState
+from warp_abtree.scene.sweep import sweep
+from warp_abtree.simulate.frame import Frame, FrameRow, LodSweep, judge_budget, judge_step, resolve_lod
+from warp_abtree.simulate.rigid_bodies import Dynamics, Kinematic
+from warp_abtree.state.update import UpdateStats
 
 __all__ = [
     "Camera",

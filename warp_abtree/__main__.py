@@ -2,7 +2,7 @@
 
 import sys
 
-from warp_abtree.cli import main
+from warp_abtree.app.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

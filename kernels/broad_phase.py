@@ -1,0 +1,121 @@
+"""Candidate object pairs: posed root boxes in a wp.Bvh grouped by world."""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.generation import LaunchRecord, is_stale
+from warp_abtree.kernels.traversal.boxes import round_down, round_up
+from warp_abtree.kernels.traversal.nodes import load_node
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+# Some ten float64 roundings; this is 32 of them.
+ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
+
+
+@wp.func
+def measure_skew(r: wp.mat33d):
+    """Return how far R R^T is off the identity, the largest entry; a matrix is off by 3 times that at most."""
+    gram = r * wp.transpose(r)
+    skew = wp.float64(0.0)
+    for i in range(3):
+        for j in range(3):
+            skew = wp.max(skew, wp.abs(gram[i, j] - wp.where(i == j, wp.float64(1.0), wp.float64(0.0))))
+    return skew
+
+
+@wp.kernel
+def pose_box_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    record: LaunchRecord,
+    lower_out: wp.array(dtype=wp.vec3),
+    upper_out: wp.array(dtype=wp.vec3),
+):
+    """Box the posed root box of each object in the world, rounded outwards; a stale launch boxes points apart."""
+    i = wp.tid()
+    state = objects.state[i]
+    root = load_node(states, states.node_start[state] + 1)
+    lower = wp.vec3d(root.lower)
+    upper = wp.vec3d(root.upper)
+    rotation = objects.rotation[i]
+    position = objects.position[i]
+    middle = models.centre[states.model[state]] + wp.float64(0.5) * (lower + upper)
+    half = wp.float64(0.5) * (upper - lower)
+    box_lower = wp.vec3()
+    box_upper = wp.vec3()
+    # B is taken to A's frame by the transpose: where that is no inverse, A stands off by (R R^T - I) of its points.
+    skew = wp.float64(3.0) * measure_skew(rotation) * (wp.length(middle) + wp.length(half))
+    for k in range(3):
+        terms = wp.vec3d(rotation[k, 0] * middle[0], rotation[k, 1] * middle[1], rotation[k, 2] * middle[2])
+        centre = terms[0] + terms[1] + terms[2] + position[k]
+        reach = wp.abs(rotation[k, 0]) * half[0] + wp.abs(rotation[k, 1]) * half[1] + wp.abs(rotation[k, 2]) * half[2]
+        size = wp.abs(terms[0]) + wp.abs(terms[1]) + wp.abs(terms[2]) + wp.abs(position[k]) + reach
+        reach = reach + ROUNDING_64 * size + skew
+        box_lower[k] = round_down(centre - reach)
+        box_upper[k] = round_up(centre + reach)
+    # At last, so that no load waits for it.
+    if is_stale(record):
+        box_lower = wp.vec3(wp.float32(i), 0.0, 0.0)
+        box_upper = box_lower
+    lower_out[i] = box_lower
+    upper_out[i] = box_upper
+
+
+@wp.func
+def append_pair(
+    i: wp.int32,
+    j: wp.int32,
+    objects: ObjectPool,
+    excluded: wp.array(dtype=wp.int64),
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+):
+    """Append (min, max) unless both are static or the user excluded it; the count goes on past the capacity."""
+    if objects.is_static[i] != 0 and objects.is_static[j] != 0:
+        return
+    low = wp.min(i, j)
+    high = wp.max(i, j)
+    if excluded.shape[0] > 0:
+        key = (wp.int64(low) << wp.int64(32)) + wp.int64(high)
+        at = wp.lower_bound(excluded, key)
+        if at < excluded.shape[0] and excluded[at] == key:
+            return
+    slot = wp.atomic_add(pair_count, 0, 1)
+    if slot >= 0 and slot < pairs.shape[0]:
+        pairs[slot] = wp.vec2i(low, high)
+
+
+@wp.kernel
+def find_pair_kernel(
+    shared_group: wp.int32,
+    bvh: wp.uint64,
+    lower: wp.array(dtype=wp.vec3),
+    upper: wp.array(dtype=wp.vec3),
+    group: wp.array(dtype=wp.int32),
+    excluded: wp.array(dtype=wp.int64),
+    objects: ObjectPool,
+    pair_count_inout: wp.array(dtype=wp.int32),
+    pairs_out: wp.array(dtype=wp.vec2i),
+):
+    """Find the partners of each object: larger indices in its own world, and everything that is in every world.
+
+    Args:
+        shared_group: Group of the objects that are in every world, -1 if there is none.
+        group: Group of each object; worlds are renumbered from 0.
+        excluded: Sorted keys i * 2^32 + j, i < j.
+    """
+    i = wp.tid()
+    # The root of a missing group would be -1, which means the whole tree; an object's own group always exists.
+    root = wp.bvh_get_group_root(bvh, group[i])
+    query = wp.bvh_query_aabb(bvh, lower[i], upper[i], root)
+    j = wp.int32(0)
+    while wp.bvh_query_next(query, j):
+        if j > i:
+            append_pair(i, j, objects, excluded, pair_count_inout, pairs_out)
+    if shared_group >= 0 and group[i] != shared_group:
+        root = wp.bvh_get_group_root(bvh, shared_group)
+        query = wp.bvh_query_aabb(bvh, lower[i], upper[i], root)
+        while wp.bvh_query_next(query, j):
+            append_pair(i, j, objects, excluded, pair_count_inout, pairs_out)

@@ -1,0 +1,479 @@
+"""Contact points of an object pair: normals of its contact curves, depths behind faces, a few points to stand for all.
+
+A loop is a set of contacts that faces link: two contacts of a pair that share a face of either object are of one loop.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.contact.contact import Contacts, load_corners, pair_direction
+from warp_abtree.kernels.poses import PairPose, pose_point
+from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+POINTS = wp.constant(8)
+"""Points that stand for a pair."""
+
+# A face seen at a smaller cosine along a direction says nothing about depth in that direction.
+FACING = wp.constant(wp.float64(0.1))
+# A face's own normal serves in place of the loop's within 60 degrees of it.
+LIKENESS = wp.constant(wp.float64(0.5))
+# Areas of a loop, relative to its length squared, that have no direction worth the name.
+FLATTEST_LOOP = wp.constant(wp.float64(2.0**-20))
+# By which part of a face's size its column is wider, so that walls that stand on its rim are inside.
+COLUMN_SLACK = wp.constant(wp.float64(2.0**-36))
+# Squared part of the spread within which a point adds nothing to others.
+NEAREST_POINT = wp.constant(wp.float64(2.0**-9))
+# By which part of its distance a point is favoured at the far end of the spread.
+FAVOUR = wp.constant(wp.float64(2.0**-5))
+# The deepest point is among those chosen if this part of its depth is more than theirs.
+DEEPER = wp.constant(wp.float64(0.9))
+CORNERS = wp.constant(8)
+LAST_KEY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
+
+
+@wp.struct
+class Curves:
+    """Per contact: loop is the first contact of its loop; point, two candidates, the deepest and one far from it
+    [world units, world frame], with depth [world units], -1 where there is none, and the normal of both. Per loop, at
+    its first contact: loop_normal. Unit normals, from the pair's first object to its second."""
+
+    parent: wp.array(dtype=wp.int32)
+    loop: wp.array(dtype=wp.int32)
+    loop_normal: wp.array(dtype=wp.vec3d)
+    point: wp.array2d(dtype=wp.vec3d)
+    depth: wp.array2d(dtype=wp.float64)
+    normal: wp.array(dtype=wp.vec3d)
+
+
+@wp.struct
+class Manifolds:
+    """Points of each pair, row p of shape [pair, POINTS]: count of them, shape [pair], point [world units], unit
+    normal from the pair's first object to its second, both world frame, depth [world units] along it."""
+
+    count: wp.array(dtype=wp.int32)
+    point: wp.array2d(dtype=wp.vec3d)
+    normal: wp.array2d(dtype=wp.vec3d)
+    depth: wp.array2d(dtype=wp.float64)
+
+
+@wp.func
+def find_root(parent: wp.array(dtype=wp.int32), i: wp.int32):
+    root = i
+    while parent[root] != root:
+        root = parent[root]
+    return root
+
+
+@wp.func
+def unite_roots(parent: wp.array(dtype=wp.int32), i: wp.int32, j: wp.int32):
+    """Unite two sets; the root of a set is its least member, whatever the order of unions."""
+    a = find_root(parent, i)
+    b = find_root(parent, j)
+    while a != b:
+        high = wp.max(a, b)
+        low = wp.min(a, b)
+        old = wp.atomic_cas(parent, high, high, low)
+        if old == high:
+            a = low
+            b = low
+        else:
+            # Another thread was first; what it wrote is less than high, so that this ends.
+            a = find_root(parent, old)
+            b = find_root(parent, low)
+
+
+@wp.kernel
+def begin_loop_kernel(
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    curves_out: Curves,
+    order_out: wp.array(dtype=wp.int32),
+    key_out: wp.array(dtype=wp.int64),
+):
+    """Make each contact a loop of its own, with a key that brings contacts of one face of B together."""
+    i = wp.tid()
+    order_out[i] = i
+    key_out[i] = LAST_KEY
+    if i < start[start.shape[0] - 1]:
+        key_out[i] = (wp.int64(faces[i][0]) << wp.int64(31)) | wp.int64(faces[i][2])
+        curves_out.parent[i] = i
+
+
+@wp.kernel
+def link_loop_kernel(
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    order: wp.array(dtype=wp.int32),
+    key: wp.array(dtype=wp.int64),
+    curves_inout: Curves,
+):
+    """Unite neighbours that share a face, in the order of the first object's faces and in that of the second's."""
+    i = wp.tid()
+    if i + 1 >= start[start.shape[0] - 1]:
+        return
+    if faces[i][0] == faces[i + 1][0] and faces[i][1] == faces[i + 1][1]:
+        unite_roots(curves_inout.parent, i, i + 1)
+    if key[i] == key[i + 1]:
+        unite_roots(curves_inout.parent, order[i], order[i + 1])
+
+
+@wp.kernel
+def name_loop_kernel(
+    start: wp.array(dtype=wp.int32),
+    curves_inout: Curves,
+    order_out: wp.array(dtype=wp.int32),
+    key_out: wp.array(dtype=wp.int64),
+):
+    """Name the loop of each contact by its first, as the key that brings loops together."""
+    i = wp.tid()
+    order_out[i] = i
+    key_out[i] = LAST_KEY
+    if i < start[start.shape[0] - 1]:
+        root = find_root(curves_inout.parent, i)
+        curves_inout.loop[i] = root
+        key_out[i] = wp.int64(root)
+
+
+@wp.kernel
+def average_loop_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
+    order: wp.array(dtype=wp.int32),
+    curves_inout: Curves,
+):
+    """Find the normal of one loop, by the thread of its first contact: the direction of the area within the curve.
+
+    Moving an object by dx changes the volume that closed surfaces share by the vector area of the curve times dx, so
+    this is the direction that frees them soonest. An open or empty curve takes the mean of its contacts' normals.
+    """
+    k = wp.tid()
+    last = start[start.shape[0] - 1]
+    if k >= last or curves_inout.loop[order[k]] != order[k]:
+        return
+    root = order[k]
+    origin = contacts.p0[root]
+    total = wp.float64(0.0)
+    half = wp.float64(0.5)
+    middle = wp.vec3d()
+    gap = wp.vec3d()
+    mean = wp.vec3d()
+    plain = wp.vec3d()
+    area = wp.vec3d()
+    i = root
+    while i >= 0:
+        along = contacts.p1[i] - contacts.p0[i]
+        length = measure_length(along)
+        mean += length * contacts.normal[i]
+        plain += contacts.normal[i]
+        if contacts.coplanar[i] == 0:
+            total += length
+            gap += along
+            middle += (length * half) * ((contacts.p0[i] - origin) + (contacts.p1[i] - origin))
+            area += half * wp.cross(contacts.p0[i] - origin, along)
+        k += 1
+        i = wp.int32(-1)
+        if k < last and curves_inout.loop[order[k]] == root:
+            i = order[k]
+    n = area
+    if total > wp.float64(0.0):
+        # About the mean point, since for an open curve the area depends on where it is measured from.
+        n = (area - half * wp.cross(middle / total, gap)) / (total * total)
+    if measure_length(n) <= FLATTEST_LOOP:
+        n = mean
+        if measure_length(mean) <= FLATTEST_LOOP * total:
+            n = plain
+        if measure_length(plain) <= FLATTEST_LOOP:
+            p = faces[root][0]
+            n = pair_direction(models, states, objects, pairs[p][0], pairs[p][1])
+    curves_inout.loop_normal[root] = unit_vector(n)
+
+
+@wp.func
+def clip_column(
+    corner: wp.array(dtype=wp.vec3d), face: wp.int32, cut: wp.int32, n: wp.vec3d, polygon: wp.array(dtype=wp.vec3d)
+):
+    """Clip the triangle at cut to the column of the triangle at face along n; return the number of polygon corners."""
+    zero = wp.float64(0.0)
+    clipped = wp.zeros(shape=(CORNERS,), dtype=wp.vec3d)
+    count = wp.int32(3)
+    for k in range(3):
+        polygon[k] = corner[cut + k]
+    for k in range(3):
+        u = corner[face + k]
+        edge = corner[face + (k + 1) % 3] - u
+        across = corner[face + (k + 2) % 3] - u
+        inward = unit_vector(wp.cross(edge, n))
+        if wp.dot(inward, across) < zero:
+            inward = -inward
+        slack = COLUMN_SLACK * (measure_length(edge) + measure_length(across))
+        kept = wp.int32(0)
+        i = wp.int32(0)
+        while i < count:
+            p = polygon[i]
+            q = polygon[(i + 1) % count]
+            at_p = wp.dot(inward, p - u) + slack
+            at_q = wp.dot(inward, q - u) + slack
+            if at_p >= zero:
+                clipped[kept] = p
+                kept += 1
+            if (at_p < zero) != (at_q < zero):
+                clipped[kept] = p + (q - p) * (at_p / (at_p - at_q))
+                kept += 1
+            i += 1
+        count = kept
+        i = wp.int32(0)
+        while i < count:
+            polygon[i] = clipped[i]
+            i += 1
+    return count
+
+
+@wp.func
+def measure_column(
+    corner: wp.array(dtype=wp.vec3d), n: wp.vec3d, normal_a: wp.vec3d, normal_b: wp.vec3d, first: wp.int32
+):
+    """Return how deep one face lies behind the other along n, where, and a second such point far from it; -1 for none.
+
+    Args:
+        corner: Corners of the pair's first object at places first .. first + 2, of its second at the others.
+    """
+    none = wp.float64(-1.0)
+    facing_a = wp.dot(n, normal_a)
+    facing_b = -wp.dot(n, normal_b)
+    face = first
+    cut = 3 - first
+    plane = normal_a
+    facing = facing_a
+    if facing_b > facing_a:
+        face = 3 - first
+        cut = first
+        plane = normal_b
+        facing = facing_b
+    origin = wp.vec3d()
+    if facing < FACING:
+        return none, origin, none, origin
+    polygon = wp.zeros(shape=(CORNERS,), dtype=wp.vec3d)
+    count = clip_column(corner, face, cut, n, polygon)
+    deepest = none
+    point = origin
+    i = wp.int32(0)
+    while i < count:
+        depth = wp.dot(corner[face] - polygon[i], plane) / facing
+        if depth > deepest and depth >= wp.float64(0.0):
+            deepest = depth
+            point = polygon[i]
+        i += 1
+    other = none
+    second = point
+    most = wp.float64(0.0)
+    i = wp.int32(0)
+    while i < count:
+        depth = wp.dot(corner[face] - polygon[i], plane) / facing
+        away = wp.dot(polygon[i] - point, polygon[i] - point)
+        if away > most and depth >= wp.float64(0.5) * deepest:
+            most = away
+            other = depth
+            second = polygon[i]
+        i += 1
+    return deepest, point, other, second
+
+
+@wp.kernel
+def find_candidate_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
+    curves_inout: Curves,
+):
+    """Find the normal and two candidate points of one contact a thread.
+
+    Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least.
+    """
+    i = wp.tid()
+    if i >= start[start.shape[0] - 1]:
+        return
+    p = faces[i][0]
+    swapped = pair_poses[p].swapped
+    a = wp.min(pairs[p][0], pairs[p][1])
+    corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
+    load_corners(models, states, pair_poses[p], faces[i][1 + swapped], faces[i][2 - swapped], corner)
+    back = wp.transpose(objects.rotation[a])
+    normal_a = back * contacts.normal_a[i]
+    normal_b = back * contacts.normal_b[i]
+    loop = back * curves_inout.loop_normal[curves_inout.loop[i]]
+    first = 3 * swapped
+    n = loop
+    depth, point, other, second = measure_column(corner, n, normal_a, normal_b, first)
+    for k in range(2):
+        m = wp.where(k == 0, normal_a, -normal_b)
+        if wp.dot(m, loop) > LIKENESS:
+            d, x, e, y = measure_column(corner, m, normal_a, normal_b, first)
+            if d >= wp.float64(0.0) and (depth < wp.float64(0.0) or d <= depth):
+                n = m
+                depth = d
+                point = x
+                other = e
+                second = y
+    curves_inout.depth[i, 0] = depth
+    curves_inout.depth[i, 1] = other
+    rotation = objects.rotation[a]
+    curves_inout.normal[i] = rotation * n
+    curves_inout.point[i, 0] = pose_point(rotation, objects.position[a], point)
+    curves_inout.point[i, 1] = pose_point(rotation, objects.position[a], second)
+    if depth < wp.float64(0.0):
+        curves_inout.point[i, 1] = contacts.p1[i]
+        curves_inout.point[i, 0] = wp.float64(0.5) * (contacts.p0[i] + contacts.p1[i])
+
+
+@wp.func
+def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
+    """Return the deepest candidate of a pair, contact and number, and its depth, -1 where there is none."""
+    deepest = wp.float64(-1.0)
+    best = wp.vec2i(first, 0)
+    i = first
+    while i < end:
+        for k in range(2):
+            if curves.depth[i, k] > deepest:
+                deepest = curves.depth[i, k]
+                best = wp.vec2i(i, k)
+        i += 1
+    return best, deepest
+
+
+@wp.func
+def find_outermost(first: wp.int32, end: wp.int32, least: wp.float64, along: wp.vec3d, curves: Curves):
+    """Return the candidate that reaches farthest along a direction, of those of a least depth."""
+    origin = curves.point[first, 0]
+    farthest = -wp.float64(wp.inf)
+    best = wp.vec2i(first, 0)
+    i = first
+    while i < end:
+        for k in range(2):
+            reach = wp.dot(along, curves.point[i, k] - origin)
+            if curves.depth[i, k] >= least and reach > farthest:
+                farthest = reach
+                best = wp.vec2i(i, k)
+        i += 1
+    return best
+
+
+@wp.func
+def distance_squared(
+    point: wp.vec3d, normal: wp.vec3d, size: wp.float64, p: wp.int32, count: wp.int32, manifolds: Manifolds
+):
+    """Return how far a candidate lies from the nearest segment between points chosen, normals counted in sizes."""
+    nearest = wp.float64(wp.inf)
+    j = wp.int32(0)
+    while j < count:
+        x = manifolds.point[p, j]
+        m = manifolds.normal[p, j]
+        r = point - x
+        u = size * (normal - m)
+        other = j
+        while other < count:
+            s = manifolds.point[p, other] - x
+            v = size * (manifolds.normal[p, other] - m)
+            along = wp.dot(r, s) + wp.dot(u, v)
+            length = wp.dot(s, s) + wp.dot(v, v)
+            t = wp.float64(0.0)
+            if length > wp.float64(0.0):
+                t = wp.clamp(along / length, wp.float64(0.0), wp.float64(1.0))
+            d = r - t * s
+            e = u - t * v
+            nearest = wp.min(nearest, wp.dot(d, d) + wp.dot(e, e))
+            other += 1
+        j += 1
+    return nearest
+
+
+@wp.func
+def find_farthest(
+    first: wp.int32,
+    end: wp.int32,
+    least: wp.float64,
+    size: wp.float64,
+    along: wp.vec3d,
+    p: wp.int32,
+    count: wp.int32,
+    curves: Curves,
+    manifolds: Manifolds,
+):
+    """Return the candidate of a least depth that is farthest from the points chosen, and how far, squared.
+
+    Those on one side are favoured a little, so that noise does not choose between two that are as far.
+    """
+    farthest = wp.float64(-1.0)
+    best = wp.vec2i(first, 0)
+    i = first
+    while i < end:
+        for k in range(2):
+            if curves.depth[i, k] >= least:
+                x = curves.point[i, k]
+                d = distance_squared(x, curves.normal[i], size, p, count, manifolds)
+                if size > wp.float64(0.0):
+                    d = d * (wp.float64(1.0) + FAVOUR * wp.dot(along, x - manifolds.point[p, 0]) / size)
+                if d > farthest:
+                    farthest = d
+                    best = wp.vec2i(i, k)
+        i += 1
+    return best, farthest
+
+
+@wp.kernel
+def spread_point_kernel(
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    start: wp.array(dtype=wp.int32),
+    curves: Curves,
+    manifolds_out: Manifolds,
+):
+    """Choose the points of one pair a thread: an outermost one, those farthest from those before, the deepest.
+
+    Distance counts places, and normals in sizes of the pair's contact. Where no face of the pair looks along its
+    contact's normal, the middles of the contacts serve, with depth 0.
+    """
+    p = wp.tid()
+    first = start[p]
+    end = start[p + 1]
+    manifolds_out.count[p] = 0
+    if first >= end:
+        return
+    zero = wp.float64(0.0)
+    along = objects.rotation[wp.min(pairs[p][0], pairs[p][1])] * wp.vec3d(
+        wp.float64(0.6134), wp.float64(0.5327), wp.float64(0.5831)
+    )
+    deepest_at, deepest = find_deepest(first, end, curves)
+    best = find_outermost(first, end, wp.float64(0.5) * deepest, along, curves)
+    count = wp.int32(0)
+    size = zero
+    least = zero
+    deep = zero
+    searching = bool(True)
+    while searching:
+        depth = wp.max(curves.depth[best[0], best[1]], zero)
+        manifolds_out.point[p, count] = curves.point[best[0], best[1]]
+        manifolds_out.normal[p, count] = curves.normal[best[0]]
+        manifolds_out.depth[p, count] = depth
+        deep = wp.max(deep, depth)
+        count += 1
+        best, farthest = find_farthest(first, end, wp.min(deepest, zero), size, along, p, count, curves, manifolds_out)
+        if count == 1:
+            size = wp.sqrt(wp.max(farthest, zero))
+            least = NEAREST_POINT * farthest
+        if farthest <= least or count == POINTS - 1:
+            best = deepest_at
+            searching = DEEPER * deepest > deep
+        searching = searching and count < POINTS
+    manifolds_out.count[p] = count

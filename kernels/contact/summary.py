@@ -1,0 +1,304 @@
+"""One summary an object pair of its sorted contacts, in sums of a fixed shape.
+
+A chunk is CHUNK contacts of one pair, the pair's last one shorter. One thread a chunk sums its contacts in their order,
+then one thread a pair its chunks in theirs, so that no bit depends on the device or on the order in which threads run.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.contact.contact import SHORTEST_NORMAL, Contacts, load_corners, pair_direction
+from warp_abtree.kernels.poses import PairPose, pose_point
+from warp_abtree.kernels.traversal.nodes import load_node
+from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+CHUNK = wp.constant(32)
+# Squared sine of the angle between two planes, under which their line runs away too fast to tell how fast.
+FLATTEST = wp.constant(wp.float64(2.0**-40))
+
+
+@wp.struct
+class PairContacts:
+    """One entry an object pair: mean point [world units, world frame], unit mean normal, depth [world units]."""
+
+    point: wp.array(dtype=wp.vec3d)
+    normal: wp.array(dtype=wp.vec3d)
+    depth: wp.array(dtype=wp.float64)
+
+
+@wp.struct
+class ChunkSums:
+    """Sums over each chunk, and what a pair's chunks need of each other.
+
+    span: (pair, first contact, end); length; point from the pair's first end, and normal, both weighted; area that the
+    contact curve encloses, and how fast it changes; front, back: extent of the faces along the normal. Shape [chunk].
+    total: length of all contacts, or 0; middle: mean point from the first end. Shape [pair].
+    """
+
+    span: wp.array(dtype=wp.vec3i)
+    length: wp.array(dtype=wp.float64)
+    point: wp.array(dtype=wp.vec3d)
+    normal: wp.array(dtype=wp.vec3d)
+    area: wp.array(dtype=wp.float64)
+    change: wp.array(dtype=wp.float64)
+    front: wp.array(dtype=wp.float64)
+    back: wp.array(dtype=wp.float64)
+    total: wp.array(dtype=wp.float64)
+    middle: wp.array(dtype=wp.vec3d)
+
+
+@wp.func
+def first_chunk(p: wp.int32, start: wp.array(dtype=wp.int32)):
+    """Return the place of a pair's first chunk: each pair before has at most one chunk more than whole ones fit."""
+    return start[p] // CHUNK + p
+
+
+@wp.func
+def end_chunk(p: wp.int32, start: wp.array(dtype=wp.int32)):
+    """Return the place after a pair's last chunk."""
+    return first_chunk(p, start) + (start[p + 1] - start[p] + CHUNK - 1) // CHUNK
+
+
+@wp.func
+def locate_chunk(c: wp.int32, start: wp.array(dtype=wp.int32)):
+    """Return (pair, first contact, end) of a chunk; a place without one has its end at or before the first."""
+    low = wp.int32(0)
+    high = start.shape[0] - 1
+    while high - low > 1:  # the pair is one of low .. high - 1
+        middle = (low + high) // 2
+        if first_chunk(middle, start) <= c:
+            low = middle
+        else:
+            high = middle
+    first = start[low] + (c - first_chunk(low, start)) * CHUNK
+    return wp.vec3i(low, first, wp.min(first + CHUNK, start[low + 1]))
+
+
+@wp.kernel
+def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_out: ChunkSums):
+    """Locate one chunk a thread and sum the lengths of its contacts."""
+    c = wp.tid()
+    span = locate_chunk(c, start)
+    sums_out.span[c] = span
+    length = wp.float64(0.0)
+    k = span[1]
+    while k < span[2]:
+        length += measure_length(contacts.p1[k] - contacts.p0[k])
+        k += 1
+    sums_out.length[c] = length
+
+
+@wp.kernel
+def total_length_kernel(start: wp.array(dtype=wp.int32), sums_inout: ChunkSums):
+    """Sum the lengths of one object pair's chunks a thread."""
+    p = wp.tid()
+    total = wp.float64(0.0)
+    c = first_chunk(p, start)
+    end = end_chunk(p, start)
+    while c < end:
+        total += sums_inout.length[c]
+        c += 1
+    sums_inout.total[p] = total
+
+
+@wp.kernel
+def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_inout: ChunkSums):
+    """Sum one chunk's points, from the first end of its pair, and normals, weighted by their part of the pair's length.
+
+    Where all lengths vanish all weights are the same.
+    """
+    c = wp.tid()
+    span = sums_inout.span[c]
+    if span[1] >= span[2]:
+        return
+    p = span[0]
+    origin = contacts.p0[start[p]]
+    half = wp.float64(0.5)
+    total = sums_inout.total[p]
+    point = wp.vec3d()
+    normal = wp.vec3d()
+    k = span[1]
+    while k < span[2]:
+        weight = wp.float64(1.0) / wp.float64(start[p + 1] - start[p])
+        if total != wp.float64(0.0):
+            weight = measure_length(contacts.p1[k] - contacts.p0[k]) / total
+        point += weight * (half * (contacts.p0[k] - origin) + half * (contacts.p1[k] - origin))
+        normal += weight * contacts.normal[k]
+        k += 1
+    sums_inout.point[c] = point
+    sums_inout.normal[c] = normal
+
+
+@wp.func_native("""
+    // NumPy's NaN: devices differ in the sign and payload of the NaN that they make.
+    union {
+        long long bits;
+        wp::float64 x;
+    } nan = {0x7ff8000000000000ll};
+    return wp::vec_t<3, wp::float64>(nan.x, nan.x, nan.x);
+""")
+def no_vector() -> wp.vec3d:
+    """Return three NaNs of the bits 0x7ff8000000000000 on every device."""
+    ...
+
+
+@wp.kernel
+def average_contact_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    start: wp.array(dtype=wp.int32),
+    sums_inout: ChunkSums,
+    pair_contacts_out: PairContacts,
+):
+    """Sum one object pair's chunks a thread to its mean point and normal; NaN for a pair without contacts."""
+    p = wp.tid()
+    point = wp.vec3d()
+    n = no_vector()
+    c = first_chunk(p, start)
+    end = end_chunk(p, start)
+    if c < end:
+        n = wp.vec3d()
+        while c < end:
+            point += sums_inout.point[c]
+            n += sums_inout.normal[c]
+            c += 1
+        if measure_length(n) <= SHORTEST_NORMAL:
+            n = pair_direction(models, states, objects, pairs[p][0], pairs[p][1])
+        n = unit_vector(n)
+    sums_inout.middle[p] = point
+    pair_contacts_out.normal[p] = n
+
+
+@wp.func
+def box_support(models: ModelPool, states: StatePool, objects: ObjectPool, i: wp.int32, n: wp.vec3d, origin: wp.vec3d):
+    """Return how far the root box of a posed object reaches along n from a point, world frame."""
+    state = objects.state[i]
+    root = load_node(states, states.node_start[state] + 1)
+    lower = wp.vec3d(root.lower)
+    upper = wp.vec3d(root.upper)
+    centre = pose_point(objects.rotation[i], objects.position[i], models.centre[states.model[state]])
+    m = wp.transpose(objects.rotation[i]) * n
+    reach = wp.dot(n, centre - origin)
+    for k in range(3):
+        reach += wp.max(m[k] * lower[k], m[k] * upper[k])
+    return reach
+
+
+@wp.func
+def loop_change(segment: wp.vec3d, normal_a: wp.vec3d, normal_b: wp.vec3d, n: wp.vec3d):
+    """Return how fast the area within a contact curve changes, a segment's part, as B moves along n at unit speed.
+
+    The line of the two planes moves at v = x normal_a + y normal_b with v . normal_a = 0, v . normal_b = n . normal_b.
+    """
+    cosine = wp.dot(normal_a, normal_b)
+    square = wp.float64(1.0) - cosine * cosine
+    if square < FLATTEST:
+        return wp.float64(0.0)
+    y = wp.dot(n, normal_b) / square
+    return y * wp.dot(normal_b - normal_a * cosine, wp.cross(segment, n))
+
+
+@wp.kernel
+def sum_loop_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
+    pair_contacts: PairContacts,
+    sums_inout: ChunkSums,
+):
+    """Sum what the depth needs of one chunk a thread: area within the contact curve, its change, extents of faces."""
+    c = wp.tid()
+    span = sums_inout.span[c]
+    if span[1] >= span[2]:
+        return
+    p = span[0]
+    n = pair_contacts.normal[p]
+    origin = contacts.p0[start[p]]
+    swapped = pair_poses[p].swapped
+    a = wp.min(pairs[p][0], pairs[p][1])
+    front = -wp.float64(wp.inf)
+    back = wp.float64(wp.inf)
+    area = wp.float64(0.0)
+    change = wp.float64(0.0)
+    corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
+    k = span[1]
+    while k < span[2]:
+        load_corners(models, states, pair_poses[p], faces[k][1 + swapped], faces[k][2 - swapped], corner)
+        i = wp.int32(0)
+        while i < 6:
+            at = wp.dot(n, pose_point(objects.rotation[a], objects.position[a], corner[i]) - origin)
+            # Places 0..2 are the lower object's, which a swapped pair names second.
+            if (i < 3) == (swapped == 0):
+                front = wp.max(front, at)
+            else:
+                back = wp.min(back, at)
+            i += 1
+        # About the mean point, since for an open curve the area depends on where it is measured from.
+        r = contacts.p0[k] - origin - sums_inout.middle[p]
+        s = contacts.p1[k] - contacts.p0[k]
+        if contacts.coplanar[k] == 0:
+            area += wp.float64(0.5) * wp.dot(n, wp.cross(r, s))
+            change += loop_change(s, contacts.normal_a[k], contacts.normal_b[k], n)
+        k += 1
+    sums_inout.area[c] = area
+    sums_inout.change[c] = change
+    sums_inout.front[c] = front
+    sums_inout.back[c] = back
+
+
+@wp.func
+def sum_loop(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
+    """Return area, change, and the overlap of the faces along the normal, of all chunks of a pair."""
+    front = -wp.float64(wp.inf)
+    back = wp.float64(wp.inf)
+    area = wp.float64(0.0)
+    change = wp.float64(0.0)
+    c = first_chunk(p, start)
+    end = end_chunk(p, start)
+    while c < end:
+        front = wp.max(front, sums.front[c])
+        back = wp.min(back, sums.back[c])
+        area += sums.area[c]
+        change += sums.change[c]
+        c += 1
+    return area, change, front - back
+
+
+@wp.kernel
+def measure_depth_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    start: wp.array(dtype=wp.int32),
+    contacts: Contacts,
+    sums: ChunkSums,
+    pair_contacts_inout: PairContacts,
+):
+    """Estimate the depth of one object pair a thread, and pose its mean point; docstring of warp_abtree/contact.py."""
+    p = wp.tid()
+    first = start[p]
+    if first == start[p + 1]:
+        pair_contacts_inout.point[p] = no_vector()
+        pair_contacts_inout.depth[p] = wp.float64(0.0)
+        return
+    origin = contacts.p0[first]
+    n = pair_contacts_inout.normal[p]
+    area, change, overlap = sum_loop(p, start, sums)
+    depth = box_support(models, states, objects, pairs[p][0], n, origin)
+    depth += box_support(models, states, objects, pairs[p][1], -n, origin)
+    if area == wp.float64(0.0):
+        depth = wp.min(depth, overlap)
+    elif area * change < wp.float64(0.0):
+        depth = wp.min(depth, -area / change)
+    pair_contacts_inout.point[p] = origin + sums.middle[p]
+    pair_contacts_inout.depth[p] = wp.max(depth, wp.float64(0.0))

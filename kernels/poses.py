@@ -1,0 +1,187 @@
+"""Poses of objects, and the pose of one object in the frame of another."""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.traversal.nodes import load_node
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+# Products of three coordinates stay normal above this.
+COORDINATE_MIN = wp.constant(wp.float64(2.0**-290))
+ROUNDING_32 = wp.constant(wp.float64(9.0 * 2.0**-24))
+UNIT_32 = wp.constant(wp.float64(2.0**-24))
+# Between these sizes of models float32 neither overflows nor loses digits to underflow.
+REACH_MIN = wp.constant(wp.float64(2.0**-100))
+REACH_MAX = wp.constant(wp.float64(2.0**100))
+ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
+
+
+@wp.struct
+class PairPose:
+    """The pose of B in A's frame, A the object with the smaller index.
+
+    rotation, translation map B's model frame to A's in float64. rotation32, translation32 map coordinates about the
+    models' centres in float32, the transpose and back32 the other way. margin serves boxes; scale, a power of two that
+    brings the larger model to about unit size, and error serve `screen_triangles`. within is a distance that margin
+    covers too, 0 for intersection. node_* and corner_* say where the trees and face corners of both lie in the pools,
+    swapped whether the pair names B first. In this order nothing is padded, which would be stored byte by byte.
+    """
+
+    rotation: wp.mat33d
+    translation: wp.vec3d
+    rotation32: wp.mat33
+    translation32: wp.vec3
+    back32: wp.vec3
+    margin: wp.float32
+    error: wp.float32
+    swapped: wp.int32
+    scale: wp.float64
+    within: wp.float64
+    node_a: wp.int32
+    node_b: wp.int32
+    corner_a: wp.int32
+    corner_b: wp.int32
+
+
+@wp.func
+def sum_products(p0: wp.float64, q0: wp.float64, p1: wp.float64, q1: wp.float64, p2: wp.float64, q2: wp.float64):
+    return (p0 * q0 + p1 * q1) + p2 * q2
+
+
+@wp.func
+def pose_point(rotation: wp.mat33d, translation: wp.vec3d, p: wp.vec3d):
+    """Return x' of docs/exactness.md: left to right, without fused multiply-add, tiny coordinates as 0."""
+    x = wp.vec3d()
+    for i in range(3):
+        y = sum_products(rotation[i, 0], p[0], rotation[i, 1], p[1], rotation[i, 2], p[2]) + translation[i]
+        x[i] = wp.where(wp.abs(y) < COORDINATE_MIN, wp.float64(0.0), y)
+    return x
+
+
+@wp.func
+def relate_objects(objects: ObjectPool, a: wp.int32, b: wp.int32):
+    """Return R = Ra^T Rb and t = Ra^T (tb - ta), each entry the sum of its three products from left to right."""
+    ra = objects.rotation[a]
+    rb = objects.rotation[b]
+    shift = objects.position[b] - objects.position[a]
+    r = wp.mat33d()
+    t = wp.vec3d()
+    for i in range(3):
+        t[i] = sum_products(ra[0, i], shift[0], ra[1, i], shift[1], ra[2, i], shift[2])
+        for j in range(3):
+            r[i, j] = sum_products(ra[0, i], rb[0, j], ra[1, i], rb[1, j], ra[2, i], rb[2, j])
+    return r, t
+
+
+@wp.func
+def reach_box(lower: wp.vec3, upper: wp.vec3):
+    """Return the largest coordinate of a box, in magnitude."""
+    m = wp.max(wp.max(wp.abs(lower[0]), wp.abs(upper[0])), wp.max(wp.abs(lower[1]), wp.abs(upper[1])))
+    return wp.float64(wp.max(m, wp.max(wp.abs(lower[2]), wp.abs(upper[2]))))
+
+
+@wp.func
+def pair_pose(
+    whole: bool,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    a: wp.int32,
+    b: wp.int32,
+    within: wp.float64,
+):
+    """Return the `PairPose` of B in A's frame, for points that meet or lie within a distance in A's frame.
+
+    The margin covers every rounding between the exact x' of B's vertices and the float32 box test. With u = 2^-24,
+    r_a and r_b the reach of the root boxes and s the largest component of the translation between the centres,
+    these sum to less than 9 u r_b + 5 u s + 2 u r_a on A's axes and 9 u r_a + 8.7 u s + 2 u r_b on B's, so 9 u of each
+    are taken (docs/exactness.md has the terms). The float64 part covers x' itself and the shift between
+    centres, and `skewed` a rotation that is not orthonormal to the last bit, on whose columns B's axes are taken. A
+    gap along a unit axis is a distance, so `within` adds to the margin; a column is longer than 1 by at most
+    `skewed`. `whole` says that all faces are asked for, not one hit, which float32 may find first.
+    """
+    r, t = relate_objects(objects, a, b)
+    state_a = objects.state[a]
+    state_b = objects.state[b]
+    centre_a = models.centre[states.model[state_a]]
+    centre_b = models.centre[states.model[state_b]]
+    root_a = load_node(states, states.node_start[state_a] + 1)
+    root_b = load_node(states, states.node_start[state_b] + 1)
+    reach_a = reach_box(root_a.lower, root_a.upper)
+    reach_b = reach_box(root_b.lower, root_b.upper)
+    shift = wp.vec3d()
+    size = wp.float64(0.0)
+    far = wp.float64(0.0)
+    skewed = wp.float64(0.0)
+    turned = wp.float64(0.0)
+    for i in range(3):
+        shift[i] = (sum_products(r[i, 0], centre_b[0], r[i, 1], centre_b[1], r[i, 2], centre_b[2]) + t[i]) - centre_a[i]
+        far = wp.max(far, wp.abs(shift[i]))
+        size = wp.max(size, wp.abs(t[i]) + wp.abs(centre_a[i]))
+        for j in range(3):
+            one = wp.where(i == j, wp.float64(1.0), wp.float64(0.0))
+            gram = sum_products(r[0, i], r[0, j], r[1, i], r[1, j], r[2, i], r[2, j])
+            skewed = wp.max(skewed, wp.abs(gram - one))
+            turned = wp.max(turned, wp.abs(r[i, j] - one))
+    reach_c = wp.max(wp.max(wp.abs(centre_b[0]), wp.abs(centre_b[1])), wp.abs(centre_b[2]))
+    margin64 = ROUNDING_64 * (size + wp.float64(2.0) * (reach_c + reach_b) + reach_a)
+    margin64 = margin64 + wp.float64(4.0) * skewed * (reach_b + far)
+    margin32 = ROUNDING_32 * (reach_a + reach_b + far)
+    # Of a coordinate in `screen_triangles`; docs/exactness.md has the terms, which need `near` below.
+    off32 = UNIT_32 * (wp.float64(2.0) * reach_a + wp.float64(13.0) * reach_b + wp.float64(3.0) * far)
+
+    pose = PairPose()
+    pose.rotation = r
+    pose.translation = t
+    pose.within = within
+    pose.node_a = states.node_start[state_a]
+    pose.node_b = states.node_start[state_b]
+    pose.corner_a = states.face_start[state_a]
+    pose.corner_b = states.face_start[state_b]
+    pose.rotation32 = wp.mat33(r)
+    # The exponent of a float32 without its digits is a power of two.
+    exponent = wp.cast(wp.float32(wp.max(reach_a, reach_b)), wp.int32) & 0x7F800000
+    pose.scale = wp.float64(1.0) / wp.float64(wp.cast(exponent, wp.float32))
+    pose.error = wp.float32(pose.scale * wp.float64(2.02) * (off32 + margin64))
+    if wp.max(reach_a, reach_b) < REACH_MIN or wp.max(reach_a, reach_b) > REACH_MAX:
+        pose.error = wp.inf
+    same = states.model[state_a] == states.model[state_b] and states.lod[state_a] == states.lod[state_b]
+    if whole and same and far + wp.float64(3.0) * turned * reach_b <= off32:
+        # A mesh laid on itself: no vertex is farther from its twin than float32 can tell.
+        pose.error = wp.inf
+    # A margin that no box passes, for pairs that are apart for certain and perhaps beyond float32, or even float64: a
+    # distance that overflowed gives infinity or NaN.
+    pose.margin = -wp.inf
+    limit = wp.float64(2.0) * (reach_a + wp.float64(2.0) * reach_b) + margin64
+    wide = limit + within
+    near = wp.abs(shift[0]) <= wide and wp.abs(shift[1]) <= wide and wp.abs(shift[2]) <= wide
+    if near and limit < wp.float64(wp.inf):
+        pose.translation32 = wp.vec3(shift)
+        for i in range(3):
+            pose.back32[i] = -wp.float32(sum_products(r[0, i], shift[0], r[1, i], shift[1], r[2, i], shift[2]))
+        pose.margin = wp.float32(margin64 + margin32 + within * (wp.float64(1.0) + skewed + ROUNDING_32))
+    return pose
+
+
+@wp.func
+def rotate_quaternion(q: wp.vec4d):
+    """Return the rotation matrix of a quaternion x y z w after normalising it."""
+    two = wp.float64(2.0)
+    one = wp.float64(1.0)
+    norm = wp.sqrt(((q[0] * q[0] + q[1] * q[1]) + q[2] * q[2]) + q[3] * q[3])
+    x = q[0] / norm
+    y = q[1] / norm
+    z = q[2] / norm
+    w = q[3] / norm
+    return wp.mat33d(
+        one - two * (y * y + z * z),
+        two * (x * y - z * w),
+        two * (x * z + y * w),
+        two * (x * y + z * w),
+        one - two * (x * x + z * z),
+        two * (y * z - x * w),
+        two * (x * z - y * w),
+        two * (y * z + x * w),
+        one - two * (x * x + y * y),
+    )

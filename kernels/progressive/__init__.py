@@ -1,0 +1,1 @@
+"""The progressive mesh and its certified errors."""

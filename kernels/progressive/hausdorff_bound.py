@@ -1,0 +1,337 @@
+"""Certified deviation: how far the original surface lies from the surface after every merge; one serial replay.
+
+Every original triangle is registered with up to SLOTS active faces that cover it within the running maximum (see
+kernels/cover.py). A registration stays true until its face moves or dies; then the triangle is covered anew by its
+other faces and by those about the merge.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.progressive.polygon import Scratch
+from warp_abtree.kernels.progressive.triangle_cover import (
+    FLOOR,
+    SLOTS,
+    Replay,
+    add_near,
+    add_ring,
+    cover_triangle,
+    piece_distance_sq,
+)
+from warp_abtree.kernels.progressive.vertex_forest import (
+    Rings,
+    absorb_ring,
+    count_dying,
+    third_corner,
+    third_vertices_live,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+# counter: what the kernel carries from launch to launch
+NEXT_MERGE = wp.constant(0)
+LIVE_FACES = wp.constant(1)
+STAMP = wp.constant(2)
+FREE_SLOTS = wp.constant(3)
+QUEUED = wp.constant(4)  # triangles that the last merge covered anew
+INDEXED = wp.constant(5)  # active faces when the tree was built; 0: never; -1: a piece vanishes and it must be built
+
+SEARCH_REACH = wp.constant(wp.float64(2.0**-10))
+
+
+@wp.func
+def set_face(replay: Replay, corner_node: wp.array(dtype=int), f: int):
+    """Take an active face's corners from the forest."""
+    a = replay.pos[corner_node[3 * f]]
+    b = replay.pos[corner_node[3 * f + 1]]
+    c = replay.pos[corner_node[3 * f + 2]]
+    replay.face_pos[f, 0] = a
+    replay.face_pos[f, 1] = b
+    replay.face_pos[f, 2] = c
+    replay.face_box[f, 0] = wp.min(a, wp.min(b, c))
+    replay.face_box[f, 1] = wp.max(a, wp.max(b, c))
+
+
+@wp.func
+def register_slot(replay: Replay, slot: int, f: int):
+    first = replay.face_slot[f]
+    replay.slot_face[slot] = f
+    replay.slot_next[slot] = first
+    replay.slot_last[slot] = -1
+    if first >= 0:
+        replay.slot_last[first] = slot
+    replay.face_slot[f] = slot
+
+
+@wp.func
+def release_triangle(replay: Replay, t: int, face_count: int, free: int):
+    """End every registration of triangle t; return how many pooled slots are free."""
+    slot = t
+    while slot >= 0:
+        before = replay.slot_last[slot]
+        after = replay.slot_next[slot]
+        if before >= 0:
+            replay.slot_next[before] = after
+        else:
+            replay.face_slot[replay.slot_face[slot]] = after
+        if after >= 0:
+            replay.slot_last[after] = before
+        if slot >= face_count:
+            replay.free_slot[free] = slot
+            free += 1
+        slot = replay.slot_sibling[slot]
+    replay.slot_sibling[t] = -1
+    return free
+
+
+@wp.func
+def register_triangle(replay: Replay, scratch: Scratch, t: int, used: int, free: int):
+    """Register triangle t with the faces in scratch.used; return how many pooled slots are left."""
+    register_slot(replay, t, scratch.used[0])
+    for k in range(1, used):
+        free -= 1
+        slot = replay.free_slot[free]
+        replay.slot_triangle[slot] = t
+        replay.slot_sibling[slot] = replay.slot_sibling[t]
+        replay.slot_sibling[t] = slot
+        register_slot(replay, slot, scratch.used[k])
+    return free
+
+
+@wp.func
+def search_all(replay: Replay, scratch: Scratch, rings: Rings, limit: wp.float64):
+    """Return the active face that bounds the triangle in hand best, or any that does within `limit`.
+
+    The tree only proposes faces, some of them dead by now; what they bound is measured.
+    """
+    lower = wp.min(scratch.piece[0], wp.min(scratch.piece[1], scratch.piece[2]))
+    upper = wp.max(scratch.piece[0], wp.max(scratch.piece[1], scratch.piece[2]))
+    best = int(-1)
+    bound = wp.float64(wp.inf)
+    reach = wp.max(wp.sqrt(limit), SEARCH_REACH)
+    searching = bool(True)
+    while searching:
+        r = wp.vec3d(reach, reach, reach)
+        query = wp.bvh_query_aabb(replay.bvh, wp.vec3(lower - r), wp.vec3(upper + r))
+        i = int(0)
+        while bound > limit and wp.bvh_query_next(query, i):
+            f = replay.bvh_face[i]
+            if rings.corner_node[3 * f] >= 0:
+                distance = piece_distance_sq(replay, scratch, 3, f, bound)
+                if distance < bound:
+                    best = f
+                    bound = distance
+        # a face that bounds within the reach meets the box searched, so none was missed
+        searching = bound > limit and bound > reach * reach
+        reach = wp.where(best < 0, reach * wp.float64(2.0), wp.sqrt(bound) * wp.float64(1.001))
+    return best
+
+
+@wp.func
+def piece_vanishes(rings: Rings, a: int, b: int):
+    """Tell whether merging a and b leaves their piece without a face."""
+    if rings.degree[a] + rings.degree[b] > 2 * count_dying(rings, a, b):
+        return False
+    return not third_vertices_live(rings, a, b)
+
+
+@wp.func
+def queue_ring(replay: Replay, rings: Rings, queued: int, node: int, stamp: int):
+    """Queue every triangle registered with a live face at a node; return the new count."""
+    k = rings.head[node]
+    while k >= 0:
+        f = k // 3
+        if rings.corner_node[3 * f] >= 0:
+            slot = replay.face_slot[f]
+            while slot >= 0:
+                t = replay.slot_triangle[slot]
+                if replay.triangle_stamp[t] != stamp:
+                    replay.triangle_stamp[t] = stamp
+                    replay.queue[queued] = t
+                    replay.queue_face[queued] = f
+                    queued += 1
+                slot = replay.slot_next[slot]
+        k = rings.next[k]
+    return queued
+
+
+@wp.func
+def third_rings(replay: Replay, scratch: Scratch, rings: Rings, a: int, b: int, stamp: int):
+    """Make the faces at the third corners of those that die with (a, b) candidates; return how many these are."""
+    near_count = int(0)
+    k = rings.head[a]
+    while k >= 0:
+        f = k // 3
+        if rings.corner_node[3 * f] >= 0:
+            third = third_corner(f, a, b, rings.corner_node)
+            if third >= 0:
+                other = rings.head[third]
+                while other >= 0:
+                    g = other // 3
+                    if rings.corner_node[3 * g] >= 0:
+                        if third_corner(g, a, b, rings.corner_node) < 0:
+                            near_count = add_near(replay, scratch, near_count, stamp, stamp, g)
+                    other = rings.next[other]
+        k = rings.next[k]
+    return near_count
+
+
+@wp.kernel
+def start_replay_kernel(
+    face_count: int,
+    face_vertex: wp.array2d(dtype=int),
+    corner_node: wp.array(dtype=int),
+    # In and out:
+    replay_inout: Replay,
+    counter_inout: wp.array(dtype=int),
+):
+    """Register every original triangle with itself (serial, dim=1).
+
+    Args:
+        replay_inout: `face_slot`, `slot_sibling` and the stamps must hold -1.
+    """
+    live = int(0)
+    for f in range(face_count):
+        for k in range(3):
+            replay_inout.triangle_pos[f, k] = replay_inout.pos[face_vertex[f, k]]
+        if corner_node[3 * f] >= 0:
+            set_face(replay_inout, corner_node, f)
+            replay_inout.slot_triangle[f] = f
+            register_slot(replay_inout, f, f)
+            live += 1
+    counter_inout[LIVE_FACES] = live
+    pooled = replay_inout.free_slot.shape[0]
+    for k in range(pooled):
+        replay_inout.free_slot[k] = face_count + pooled - 1 - k
+    counter_inout[FREE_SLOTS] = pooled
+
+
+@wp.func
+def cover_queued(
+    replay: Replay,
+    scratch: Scratch,
+    rings: Rings,
+    counter: wp.array(dtype=int),
+    t: int,
+    first: int,
+    near_count: int,
+    shared: int,
+    limit: wp.float64,
+):
+    """Register triangle t anew, about the merge or wherever its other faces are; return the square of its bound."""
+    for k in range(3):
+        scratch.piece[k] = replay.triangle_pos[t, k]
+    face_count = replay.face_slot.shape[0]
+    free = counter[FREE_SLOTS]
+    scratch.used[0] = first
+    used = int(0)
+    if rings.corner_node[3 * first] >= 0:
+        if piece_distance_sq(replay, scratch, 3, first, limit) <= limit:
+            used = int(1)
+    if used == 0:
+        own = counter[STAMP] + 1
+        counter[STAMP] = own
+        slot = t
+        while slot >= 0:
+            f = replay.slot_face[slot]
+            if rings.corner_node[3 * f] >= 0:
+                near_count = add_near(replay, scratch, near_count, shared, own, f)
+            slot = replay.slot_sibling[slot]
+        if near_count == 0:
+            f = search_all(replay, scratch, rings, limit)
+            for k in range(3):
+                near_count = add_ring(replay, scratch, rings, near_count, shared, own, rings.corner_node[3 * f + k])
+        free = release_triangle(replay, t, face_count, free)
+        room = wp.min(SLOTS, 1 + free)
+        limit, used = cover_triangle(replay, scratch, rings, near_count, shared, own, room, limit)
+    else:
+        free = release_triangle(replay, t, face_count, free)
+    counter[FREE_SLOTS] = register_triangle(replay, scratch, t, used, free)
+    return limit
+
+
+@wp.func
+def replay_merge(
+    replay: Replay,
+    scratch: Scratch,
+    rings: Rings,
+    counter: wp.array(dtype=int),
+    a: int,
+    b: int,
+    c: int,
+    limit: wp.float64,
+):
+    """Merge nodes a and b into c, cover anew what stood on their faces; return the square of the bound."""
+    stamp = counter[STAMP] + 1
+    counter[STAMP] = stamp
+    queued = queue_ring(replay, rings, 0, a, stamp)
+    queued = queue_ring(replay, rings, queued, b, stamp)
+    dying = count_dying(rings, a, b)
+    near_count = int(0)
+    if rings.degree[a] + rings.degree[b] == 2 * dying:
+        near_count = third_rings(replay, scratch, rings, a, b, stamp)
+    tail = absorb_ring(rings, a, a, b, c, -1)
+    tail = absorb_ring(rings, b, a, b, c, tail)
+    near_count = add_ring(replay, scratch, rings, near_count, stamp, stamp, c)
+    k = rings.head[c]
+    while k >= 0:
+        set_face(replay, rings.corner_node, k // 3)
+        k = rings.next[k]
+    for i in range(queued):
+        limit = cover_queued(
+            replay, scratch, rings, counter, replay.queue[i], replay.queue_face[i], near_count, stamp, limit
+        )
+    counter[LIVE_FACES] = counter[LIVE_FACES] - dying
+    counter[QUEUED] = queued
+    return limit
+
+
+@wp.kernel
+def replay_merges_kernel(
+    vertex_count: int,
+    merge_count: int,
+    cover_budget: int,
+    merge_pair: wp.array2d(dtype=int),
+    # In and out:
+    replay_inout: Replay,
+    scratch_inout: Scratch,
+    rings_inout: Rings,
+    counter_inout: wp.array(dtype=int),
+    # Out:
+    bound_sq_out: wp.array(dtype=wp.float64),
+):
+    """Apply merges until `cover_budget` triangles have been covered anew (serial, dim=1).
+
+    Args:
+        merge_pair: The two nodes of each merge, shape [m, 2].
+        bound_sq_out: Square of the running maximum after each merge, normalised, shape [m].
+    Invariant: every registered triangle lies within the running maximum of the faces that it is registered with.
+    """
+    j = counter_inout[NEXT_MERGE]
+    limit = FLOOR * FLOOR
+    if j > 0:
+        limit = bound_sq_out[j - 1]
+    covers = int(0)
+    searchable = bool(True)
+    while searchable and j < merge_count and covers < cover_budget:
+        a = merge_pair[j, 0]
+        b = merge_pair[j, 1]
+        if 2 * counter_inout[LIVE_FACES] < counter_inout[INDEXED] or counter_inout[INDEXED] == 0:
+            searchable = not piece_vanishes(rings_inout, a, b)
+        if not searchable:
+            counter_inout[INDEXED] = -1
+            break
+        limit = replay_merge(
+            replay_inout,
+            scratch_inout,
+            rings_inout,
+            counter_inout,
+            a,
+            b,
+            vertex_count + j,
+            limit,
+        )
+        covers += counter_inout[QUEUED] + 1
+        bound_sq_out[j] = limit
+        j += 1
+    counter_inout[NEXT_MERGE] = j

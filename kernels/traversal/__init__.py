@@ -1,0 +1,1 @@
+"""Dual-tree traversal of object pairs."""

@@ -1,0 +1,206 @@
+"""Pairs of faces of an object pair: the stages that decide them, and the report of those that meet."""
+
+import warp as wp
+
+from warp_abtree.kernels.arithmetic.predicates import FLOAT32, UNSURE
+from warp_abtree.kernels.arrays import ModelPool, StatePool, load_vertex
+from warp_abtree.kernels.poses import PairPose, pose_point
+from warp_abtree.kernels.traversal.boxes import map_point
+from warp_abtree.kernels.traversal.nodes import load_constant
+from warp_abtree.kernels.triangle.distance import triangles_near
+from warp_abtree.kernels.triangle.float32_filter import (
+    SCREEN_UNIT,
+    are_open,
+    cross_triangles,
+    part_triangles,
+    turn_corners,
+)
+from warp_abtree.kernels.triangle.float64_filter import decide_triangles
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+OUTPUT_ANY = wp.constant(0)
+OUTPUT_COUNT = wp.constant(1)
+OUTPUT_FACES = wp.constant(2)
+
+# In place of a precision: faces count as met unless proved farther apart than a distance.
+WITHIN = wp.constant(-1)
+
+
+@wp.struct
+class Hits:
+    """Results of a batch of pairs.
+
+    any_hit, count: shape [pair]. face: (pair, face a, face b), a of the pair's first object, shape [capacity]; total
+    numbers them and may wrap, the demand is the sum of count. node_tests to exact_tests: work done,
+    shape [pair]; float64_tests are the triangle tests that float32 left open, exact_tests those that took exact signs.
+    unsure: (pair, face of the lower object, face of the higher) that float32 left open, shape [capacity]; hard: those
+    that float64 left open too, of the same shape where there is such a stage.
+    """
+
+    any_hit: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int64)
+    face: wp.array(dtype=wp.vec3i)
+    total: wp.array(dtype=wp.int32)
+    node_tests: wp.array(dtype=wp.int64)
+    triangle_tests: wp.array(dtype=wp.int64)
+    float64_tests: wp.array(dtype=wp.int64)
+    exact_tests: wp.array(dtype=wp.int64)
+    unsure: wp.array(dtype=wp.vec3i)
+    unsure_total: wp.array(dtype=wp.int32)
+    hard: wp.array(dtype=wp.vec3i)
+    hard_total: wp.array(dtype=wp.int32)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    int4 x = __ldg((const int4*)corners.data + i);
+    return wp::vec_t<4, wp::int32>(x.x, x.y, x.z, x.w);
+#else
+    return corners.data[i];
+#endif
+""")
+def load_corner(corners: wp.array(dtype=wp.vec4i), i: wp.int32) -> wp.vec4i: ...
+
+
+@wp.func
+def load_corner_ids(states: StatePool, i: wp.int32):
+    return load_corner(states.face_corner, i)
+
+
+@wp.func
+def load_near(models: ModelPool, vertex: wp.int32):
+    x = load_constant(models.vertex_near, wp.int64(vertex))
+    return wp.vec3(x[0], x[1], x[2])
+
+
+@wp.func
+def near_of_a(models: ModelPool, pose: PairPose, vertex: wp.int32):
+    return load_near(models, vertex) * wp.float32(pose.scale)
+
+
+@wp.func
+def near_of_b(models: ModelPool, pose: PairPose, vertex: wp.int32):
+    return map_point(pose.rotation32, pose.translation32, load_near(models, vertex)) * wp.float32(pose.scale)
+
+
+@wp.func
+def screen_bounds(mode: wp.int32, pose: PairPose):
+    """Return the error of coordinates and of arithmetic that signs allow for; none for FLOAT32."""
+    return wp.where(mode == FLOAT32, 0.0, pose.error), wp.where(mode == FLOAT32, 0.0, SCREEN_UNIT)
+
+
+@wp.func
+def part_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+):
+    """Return PARTED where float32 says that the plane of one of two active faces parts them, else what it says."""
+    if mode == WITHIN or (mode != FLOAT32 and pose.error == wp.inf):
+        return 0
+    a = load_corner_ids(states, pose.corner_a + face_a)
+    b = load_corner_ids(states, pose.corner_b + face_b)
+    error, unit = screen_bounds(mode, pose)
+    return part_triangles(
+        error,
+        unit,
+        near_of_a(models, pose, a[0]),
+        near_of_a(models, pose, a[1]),
+        near_of_a(models, pose, a[2]),
+        near_of_b(models, pose, b[0]),
+        near_of_b(models, pose, b[1]),
+        near_of_b(models, pose, b[2]),
+    )
+
+
+@wp.func
+def cross_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+    signs: wp.int32,
+):
+    """Test active faces that no plane parts, with the signs of `part_faces`, in float32; return 1, 0 or UNSURE."""
+    error, unit = screen_bounds(mode, pose)
+    if are_open(unit, signs):
+        return UNSURE
+    a = load_corner_ids(states, pose.corner_a + face_a)
+    b = load_corner_ids(states, pose.corner_b + face_b)
+    p1, q1, r1, p2, q2, r2 = turn_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
+    return cross_triangles(
+        error,
+        unit,
+        near_of_a(models, pose, p1),
+        near_of_a(models, pose, q1),
+        near_of_a(models, pose, r1),
+        near_of_b(models, pose, p2),
+        near_of_b(models, pose, q2),
+        near_of_b(models, pose, r2),
+    )
+
+
+@wp.func
+def test_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+):
+    """Test one active face of A against one of B in float64, in A's frame; return 1, 0 or UNSURE."""
+    a = states.face_corner[pose.corner_a + face_a]
+    b = states.face_corner[pose.corner_b + face_b]
+    a0 = load_vertex(models.vertex_pos, a[0])
+    a1 = load_vertex(models.vertex_pos, a[1])
+    a2 = load_vertex(models.vertex_pos, a[2])
+    b0 = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[0]))
+    b1 = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[1]))
+    b2 = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[2]))
+    if mode == WITHIN:
+        return triangles_near(pose.within, a0, a1, a2, b0, b1, b2)
+    if mode == FLOAT32:
+        # A power of two brings the model to unit size, so that no product leaves float32's range.
+        s = pose.scale
+        return decide_triangles(mode, a0 * s, a1 * s, a2 * s, b0 * s, b1 * s, b2 * s)
+    return decide_triangles(mode, a0, a1, a2, b0, b1, b2)
+
+
+@wp.func
+def try_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+    signs: wp.int32,
+):
+    """Return whether faces that no plane parts meet as the first stage sees it: 1, 0 or UNSURE; or WITHIN, whole."""
+    if mode == WITHIN:
+        return test_faces(mode, models, states, pose, face_a, face_b)
+    return cross_faces(mode, models, states, pose, face_a, face_b, signs)
+
+
+@wp.func
+def defer_faces(slot: wp.int32, pair: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+    """Put a pair of faces on the list that the settling passes work off, if there is room."""
+    if slot >= 0 and slot < hits.unsure.shape[0]:
+        hits.unsure[slot] = wp.vec3i(pair, face_a, face_b)
+
+
+@wp.func
+def report_hit(slot: wp.int32, pair: wp.int32, swapped: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+    """Write a hit in the order in which the pair names its objects, if there is room."""
+    if slot >= 0 and slot < hits.face.shape[0]:
+        if swapped != 0:
+            hits.face[slot] = wp.vec3i(pair, face_b, face_a)
+        else:
+            hits.face[slot] = wp.vec3i(pair, face_a, face_b)

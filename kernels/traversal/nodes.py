@@ -1,0 +1,88 @@
+"""Node records: a box and where its subtree goes on, in 32 bytes that a thread loads at once."""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import StatePool
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+SPAN_MIN = wp.constant(wp.float32(2.0**-126))
+
+
+@wp.struct
+class Node:
+    """A box [model units, about the model's centre] and what the node stands for.
+
+    skip: the node itself if it has two active children or is a leaf, else what its one active child stands for; -1
+    where nothing below is active. face: of a skip node that is a leaf, else negative: as float32 bits, minus the sum of
+    the box's extents, but never 0, which `store_node` sees to.
+    """
+
+    lower: wp.vec3
+    upper: wp.vec3
+    skip: wp.int32
+    face: wp.int32
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float4 x = __ldg((const float4*)values.data + i);
+    return wp::vec_t<4, wp::float32>(x.x, x.y, x.z, x.w);
+#else
+    return values.data[i];
+#endif
+""")
+def load_constant(values: wp.array(dtype=wp.vec4), i: wp.int64) -> wp.vec4: ...
+
+
+@wp.func
+def unpack_node(low: wp.vec4, high: wp.vec4):
+    node = Node()
+    node.lower = wp.vec3(low[0], low[1], low[2])
+    node.upper = wp.vec3(high[0], high[1], high[2])
+    node.skip = wp.cast(low[3], wp.int32)
+    node.face = wp.cast(high[3], wp.int32)
+    return node
+
+
+@wp.func
+def load_node(states: StatePool, at: wp.int32):
+    """Return the record of a node in the pool."""
+    i = wp.int64(2) * wp.int64(at)
+    return unpack_node(states.node_box[i], states.node_box[i + wp.int64(1)])
+
+
+@wp.func
+def load_constant_node(states: StatePool, at: wp.int32):
+    """Return the record of a node that nothing writes during this kernel: two loads of 16 bytes."""
+    i = wp.int64(2) * wp.int64(at)
+    return unpack_node(load_constant(states.node_box, i), load_constant(states.node_box, i + wp.int64(1)))
+
+
+@wp.func
+def store_node(states: StatePool, at: wp.int32, node: Node):
+    i = wp.int64(2) * wp.int64(at)
+    lower = node.lower
+    upper = node.upper
+    face = node.face
+    if face < 0:
+        extent = ((upper[0] - lower[0]) + (upper[1] - lower[1])) + (upper[2] - lower[2])
+        face = wp.cast(-wp.max(extent, SPAN_MIN), wp.int32)
+    states.node_box[i] = wp.vec4(lower[0], lower[1], lower[2], wp.cast(node.skip, wp.float32))
+    states.node_box[i + wp.int64(1)] = wp.vec4(upper[0], upper[1], upper[2], wp.cast(face, wp.float32))
+
+
+@wp.func
+def empty_node():
+    """Return a box that changes no union, over nothing active."""
+    node = Node()
+    node.lower = wp.vec3(wp.inf, wp.inf, wp.inf)
+    node.upper = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+    node.skip = -1
+    node.face = -1
+    return node
+
+
+@wp.kernel
+def clear_node_kernel(start: wp.int32, states_inout: StatePool):
+    store_node(states_inout, start + wp.tid(), empty_node())

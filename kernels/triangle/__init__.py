@@ -1,0 +1,1 @@
+"""Triangle against triangle."""

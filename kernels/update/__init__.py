@@ -1,0 +1,1 @@
+"""LOD updates of tree states."""

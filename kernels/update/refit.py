@@ -1,0 +1,167 @@
+"""ACTIVE-WALK and ACTIVE-REFIT, level by level: boxes, status and skip links of marked nodes."""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import ACTIVE, INACTIVE, ModelPool, StatePool, load_vertex
+from warp_abtree.kernels.traversal.boxes import round_down_vec, round_up_vec
+from warp_abtree.kernels.traversal.nodes import Node, empty_node, load_node, store_node
+from warp_abtree.kernels.update.work_lists import UpdatePlan
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.func
+def refit_leaf(models: ModelPool, states: StatePool, state: wp.int32, node: wp.int32, face: wp.int32):
+    """Box one face about the model's centre, or empty the leaf of an inactive face."""
+    at = states.node_start[state] + node
+    corner = states.face_corner[states.face_start[state] + face]
+    if corner[0] < 0:
+        states.node_status[at] = INACTIVE
+        store_node(states, at, empty_node())
+        return
+    centre = models.centre[states.model[state]]
+    a = load_vertex(models.vertex_pos, corner[0]) - centre
+    b = load_vertex(models.vertex_pos, corner[1]) - centre
+    c = load_vertex(models.vertex_pos, corner[2]) - centre
+    states.node_status[at] = ACTIVE
+    leaf = Node()
+    leaf.lower = round_down_vec(wp.min(a, wp.min(b, c)))
+    leaf.upper = round_up_vec(wp.max(a, wp.max(b, c)))
+    leaf.skip = node
+    leaf.face = face
+    store_node(states, at, leaf)
+
+
+@wp.func
+def refit_inner(states: StatePool, state: wp.int32, node: wp.int32):
+    """Unite the children of a node; both are final."""
+    first = states.node_start[state] + 2 * node
+    left = load_node(states, first)
+    right = load_node(states, first + 1)
+    # An empty box is (+inf, -inf), so the union needs no case for an inactive child.
+    whole = Node()
+    whole.lower = wp.min(left.lower, right.lower)
+    whole.upper = wp.max(left.upper, right.upper)
+    whole.skip = node
+    whole.face = -1
+    if left.skip < 0:
+        whole.skip = right.skip
+        whole.face = right.face
+    elif right.skip < 0:
+        whole.skip = left.skip
+        whole.face = left.face
+    store_node(states, states.node_start[state] + node, whole)
+    states.node_status[states.node_start[state] + node] = wp.where(whole.skip < 0, INACTIVE, ACTIVE)
+
+
+@wp.func
+def refit_node(models: ModelPool, states: StatePool, state: wp.int32, node: wp.int32):
+    face = models.node_face[models.node_start[states.model[state]] + node]
+    if face >= 0:
+        refit_leaf(models, states, state, node, face)
+    else:
+        refit_inner(states, state, node)
+
+
+@wp.func
+def refit_level(
+    first: wp.int32, step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdatePlan, states: StatePool
+):
+    """Refit every so many-th of a level's nodes: those marked, and all of the states under full update.
+
+    Invariant: children of this level are final, since levels go deepest first.
+    Source: Liu et al. 2006, section 3.2.2, ACTIVE-REFIT; Algorithm 3.
+    """
+    marked = plan.level_count[level]
+    items = marked + (plan.whole_count[level] << level)
+    item = wp.int32(first)
+    while item < items:
+        if item < marked:
+            listed = plan.level_node[plan.level_start[level] + item]
+            refit_node(models, states, listed[0], listed[1])
+        else:
+            whole = item - marked
+            state = plan.whole_state[plan.whole_start[level] + (whole >> level)]
+            node = (1 << level) + (whole & ((1 << level) - 1))
+            # A heap index without a node lies under a leaf of the level above.
+            up = models.node_start[states.model[state]] + (node >> 1)
+            if level == 0 or models.node_face[up] < 0:
+                refit_node(models, states, state, node)
+        item += step
+
+
+@wp.kernel
+def refit_level_kernel(step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdatePlan, states_inout: StatePool):
+    """Refit what an update asks for on one level.
+
+    Args:
+        step: Threads of this launch.
+    """
+    refit_level(wp.tid(), step, level, models, plan, states_inout)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+""")
+def block_sync(): ...
+
+
+@wp.kernel
+def refit_top_kernel(step: wp.int32, levels: wp.int32, models: ModelPool, plan: UpdatePlan, states_inout: StatePool):
+    """Refit what an update asks for on so many levels from the root on, deepest first: one block for all of them.
+
+    Args:
+        step: Threads of this launch, which are one block.
+    """
+    level = levels - 1
+    while level >= 0:
+        refit_level(wp.tid(), step, level, models, plan, states_inout)
+        block_sync()
+        level -= 1
+
+
+@wp.kernel
+def copy_node_kernel(
+    node_end: wp.array(dtype=wp.int32),
+    source_state: wp.array(dtype=wp.int32),
+    target_state: wp.array(dtype=wp.int32),
+    states_inout: StatePool,
+):
+    """Copy the nodes of whole states.
+
+    Args:
+        node_end: Running total of node counts, shape [copy_count].
+    """
+    tid = wp.tid()
+    u = wp.lower_bound(node_end, tid + 1)
+    begin = wp.int32(0)
+    if u > 0:
+        begin = node_end[u - 1]
+    source = states_inout.node_start[source_state[u]] + tid - begin
+    target = states_inout.node_start[target_state[u]] + tid - begin
+    states_inout.node_status[target] = states_inout.node_status[source]
+    store_node(states_inout, target, load_node(states_inout, source))
+
+
+@wp.kernel
+def copy_face_kernel(
+    face_end: wp.array(dtype=wp.int32),
+    source_state: wp.array(dtype=wp.int32),
+    target_state: wp.array(dtype=wp.int32),
+    states_inout: StatePool,
+):
+    """Copy the face corners of whole states.
+
+    Args:
+        face_end: Running total of face counts, shape [copy_count].
+    """
+    tid = wp.tid()
+    u = wp.lower_bound(face_end, tid + 1)
+    begin = wp.int32(0)
+    if u > 0:
+        begin = face_end[u - 1]
+    source = states_inout.face_start[source_state[u]] + tid - begin
+    target = states_inout.face_start[target_state[u]] + tid - begin
+    states_inout.face_corner[target] = states_inout.face_corner[source]

@@ -1,0 +1,184 @@
+"""What an update of many tree states works through: made by the host, or by a kernel inside a captured graph.
+
+Every count stands in device memory, so that a launch need not know it: threads take items first + step tid until there
+are none left.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import LEVEL_MAX, ModelPool, ObjectPool, StatePool
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+# One atomic takes an update's place in a list and its items' places after those of the updates before it.
+LIST_SHIFT = wp.constant(wp.int64(32))
+ITEM_MASK = wp.constant(wp.int64(2**32 - 1))
+
+# LOD of a state whose last update was interrupted.
+UNKNOWN = wp.constant(-1)
+
+
+@wp.struct
+class UpdatePlan:
+    """States under update: those that refit what a slice of faces touches, and those that are refitted whole.
+
+    Partial updates: partial_total (1,) holds updates * 2^32 + entries of all slices; partial_state, slice_start (into
+    split_face) and entry_end (running total of slice lengths) have one entry an update.
+    Full updates: full_total (1,) holds updates * 2^32 + faces; full_state and face_end (running total) have one entry
+    an update. whole_state lists, from whole_start[level] on, the whole_count[level] of them whose trees have a level.
+    Worklists: level_node lists, from level_start[level] on, the level_count[level] marked nodes as (state, node).
+    Counters: changed_count and marked_count, faces that change and nodes refitted, shape [state].
+    """
+
+    partial_total: wp.array(dtype=wp.int64)
+    partial_state: wp.array(dtype=wp.int32)
+    slice_start: wp.array(dtype=wp.int32)
+    entry_end: wp.array(dtype=wp.int32)
+    full_total: wp.array(dtype=wp.int64)
+    full_state: wp.array(dtype=wp.int32)
+    face_end: wp.array(dtype=wp.int32)
+    whole_count: wp.array(dtype=wp.int32)
+    whole_start: wp.array(dtype=wp.int32)
+    whole_state: wp.array(dtype=wp.int32)
+    level_count: wp.array(dtype=wp.int32)
+    level_start: wp.array(dtype=wp.int32)
+    level_node: wp.array(dtype=wp.vec2i)
+    changed_count: wp.array(dtype=wp.int32)
+    marked_count: wp.array(dtype=wp.int32)
+
+
+@wp.struct
+class SplitTable:
+    """Where the slices of each model lie, one entry a model.
+
+    bound: split_start of every model, as places in the pool's split_face; bound_start: where a model's begin in it.
+    partial_max: the longest slice that a partial update takes. depth: of the tree.
+    """
+
+    bound: wp.array(dtype=wp.int32)
+    bound_start: wp.array(dtype=wp.int32)
+    partial_max: wp.array(dtype=wp.int32)
+    depth: wp.array(dtype=wp.int32)
+
+
+@wp.func
+def list_length(total: wp.array(dtype=wp.int64)):
+    return wp.int32(total[0] >> LIST_SHIFT)
+
+
+@wp.func
+def item_count(total: wp.array(dtype=wp.int64)):
+    return wp.int32(total[0] & ITEM_MASK)
+
+
+@wp.func
+def find_update(item_end: wp.array(dtype=wp.int32), update_count: wp.int32, item: wp.int32):
+    """Return the update that an item belongs to, and which of its items it is."""
+    u = wp.lower_bound(item_end, 0, update_count, item + 1)
+    begin = wp.int32(0)
+    if u > 0:
+        begin = item_end[u - 1]
+    return u, item - begin
+
+
+@wp.kernel
+def clear_plan_kernel(plan_out: UpdatePlan):
+    """Empty every list and counter, a thread a state, and LEVEL_MAX threads at least."""
+    i = wp.tid()
+    if i == 0:
+        plan_out.partial_total[0] = wp.int64(0)
+        plan_out.full_total[0] = wp.int64(0)
+    if i < LEVEL_MAX:
+        plan_out.whole_count[i] = 0
+        plan_out.level_count[i] = 0
+    if i < plan_out.changed_count.shape[0]:
+        plan_out.changed_count[i] = 0
+        plan_out.marked_count[i] = 0
+
+
+@wp.func
+def list_partial(plan: UpdatePlan, state: wp.int32, begin: wp.int32, length: wp.int32):
+    before = wp.atomic_add(plan.partial_total, 0, (wp.int64(1) << LIST_SHIFT) + wp.int64(length))
+    u = wp.int32(before >> LIST_SHIFT)
+    plan.partial_state[u] = state
+    plan.slice_start[u] = begin
+    plan.entry_end[u] = wp.int32(before & ITEM_MASK) + length
+
+
+@wp.func
+def list_full(plan: UpdatePlan, state: wp.int32, face_count: wp.int32, depth: wp.int32):
+    before = wp.atomic_add(plan.full_total, 0, (wp.int64(1) << LIST_SHIFT) + wp.int64(face_count))
+    u = wp.int32(before >> LIST_SHIFT)
+    plan.full_state[u] = state
+    plan.face_end[u] = wp.int32(before & ITEM_MASK) + face_count
+    for level in range(depth + 1):
+        slot = wp.atomic_add(plan.whole_count, level, 1)
+        plan.whole_state[plan.whole_start[level] + slot] = state
+    plan.marked_count[state] = 2 * face_count - 1
+
+
+@wp.func
+def note_fault(faults: wp.array(dtype=wp.int32), i: wp.int32):
+    """Count a wish that cannot be met, and keep the lowest index that had one."""
+    wp.atomic_add(faults, 0, 1)
+    wp.atomic_min(faults, 1, i)
+
+
+@wp.kernel
+def plan_update_kernel(
+    models: ModelPool,
+    splits: SplitTable,
+    wanted: wp.array(dtype=wp.int32),
+    states_inout: StatePool,
+    plan_inout: UpdatePlan,
+    faults_inout: wp.array(dtype=wp.int32),
+):
+    """Compare each state's LOD with the wanted one and list the states that move; the faces between are one slice.
+
+    Args:
+        wanted: LOD of each state; one out of range is a fault and brought to the nearer end.
+        faults_inout: As `note_fault`, by state.
+    """
+    s = wp.tid()
+    model = states_inout.model[s]
+    lod = wp.clamp(wanted[s], 0, models.lod_max[model])
+    if lod != wanted[s]:
+        note_fault(faults_inout, s)
+    old = states_inout.lod[s]
+    if lod == old:
+        return
+    states_inout.lod[s] = lod
+    if old == UNKNOWN:
+        list_full(plan_inout, s, models.face_count[model], splits.depth[model])
+        return
+    at = splits.bound_start[model]
+    begin = splits.bound[at + wp.min(lod, old)]
+    length = splits.bound[at + wp.max(lod, old)] - begin
+    if length > splits.partial_max[model]:
+        list_full(plan_inout, s, models.face_count[model], splits.depth[model])
+    else:
+        list_partial(plan_inout, s, begin, length)
+
+
+@wp.kernel
+def pick_state_kernel(
+    states: StatePool,
+    rung_start: wp.array(dtype=wp.int32),
+    wanted: wp.array(dtype=wp.int32),
+    objects_inout: ObjectPool,
+    faults_inout: wp.array(dtype=wp.int32),
+):
+    """Point each object at the coarsest state of its model that is not coarser than the wanted LOD.
+
+    Args:
+        rung_start: Where the states of each model begin, by rising LOD, shape [model + 1].
+        wanted: LOD of each object; one out of range is a fault and served by the nearer end.
+        faults_inout: As `note_fault`, by object.
+    """
+    i = wp.tid()
+    model = states.model[objects_inout.state[i]]
+    # The last one where all are coarser.
+    rung = wp.lower_bound(states.lod, rung_start[model], rung_start[model + 1], wanted[i])
+    if wanted[i] < 0 or wanted[i] > states.lod[rung]:
+        note_fault(faults_inout, i)
+    objects_inout.state[i] = rung

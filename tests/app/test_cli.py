@@ -1,0 +1,452 @@
+"""The command line: what it prints, what it writes, and one line with status 2 for anything bad; `run` apart."""
+
+import csv
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+import warp_abtree as ab
+from warp_abtree.app.cli import doctor, report
+from warp_abtree.app.cli import main as cli
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """Work in a folder with meshes, and files that are none."""
+    monkeypatch.chdir(tmp_path)
+    trimesh.creation.icosphere(subdivisions=2).export("ball.obj")
+    trimesh.creation.torus(major_radius=1.0, minor_radius=0.3).export("ring.ply")
+    trimesh.creation.box().export("box.obj")
+    ab.Model.from_arrays(np.eye(3), [[0, 1, 2]]).save("face.npz")
+    Path("junk.obj").write_text("hello\n")
+    Path("nan.obj").write_text("v 0 0 0\nv 1 nan 0\nv 0 1 0\nf 1 2 3\n")
+    Path("junk.npz").write_bytes(b"junk")
+    Path("text.mesh").write_text("hello\n")
+    Path("folder.npz").mkdir()
+    return tmp_path
+
+
+def run(capsys, *arguments, status=0):
+    """Run the command line; return its stdout, and stderr's lines."""
+    assert cli.main([str(argument) for argument in arguments]) == status
+    captured = capsys.readouterr()
+    return captured.out, captured.err.splitlines()
+
+
+def run_process(*arguments, cwd, **environment):
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    return subprocess.run(
+        [sys.executable, "-m", "warp_abtree", *map(str, arguments)],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": path, **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+# info and build.
+
+
+def test_info(files, capsys):
+    shown, errors = run(capsys, "info", "ball.obj")
+    assert re.search(r"^faces +320$", shown, re.M) and re.search(r"^open edges +0$", shown, re.M) and not errors
+    found = json.loads(run(capsys, "info", "ball.obj", "--json", "--device", "cpu")[0])
+    assert found["faces"] == 320 and found["components"] == 1 and found["closed"] is True
+    assert found == ab.describe_mesh(ab.load_mesh("ball.obj"))
+
+
+def test_build(files, capsys):
+    shown, _ = run(capsys, "build", "ball.obj", "ball.npz", "--base-faces", 40)
+    assert "320 faces" in shown and "162 vertices" in shown
+    model = ab.Model.open("ball.npz")
+    assert len(model.mesh_at(0)[1]) <= 40
+    rows = [line.split() for line in shown.splitlines() if " %" in line and line[0].isdigit()]
+    assert [row[0] for row in rows] == ["50", "20", "10", "5", "1"]
+    lods = [model.lod_for(fraction=x) for x in (0.5, 0.2, 0.1, 0.05, 0.01)]
+    assert [int(row[3]) for row in rows] == lods
+    assert [row[4] for row in rows] == [f"{model.error_at(lod):.3g}" for lod in lods]
+    assert [row[7] for row in rows] == [f"{model.error_at(lod, side='outward'):.3g}" for lod in lods]
+    assert "original to LOD" in shown and "LOD to original" in shown
+    found = json.loads(run(capsys, "build", "ball.obj", "ball.npz", "--json")[0])
+    assert found["faces"] == 320 and found["base_faces"] <= 10 and len(found["errors"]) == 5
+    model = ab.Model.open("ball.npz")
+    lods = [model.lod_for(fraction=x) for x in (0.5, 0.2, 0.1, 0.05, 0.01)]
+    for side in ("inward", "outward"):
+        assert [row[f"error_{side}"] for row in found["errors"]] == [model.error_at(lod, side=side) for lod in lods]
+    assert found["diagonal"] == pytest.approx(2 * 3**0.5, rel=0.02)
+    assert sorted(path.name for path in files.glob("ball*")) == ["ball.npz", "ball.obj"]
+
+
+# query.
+
+
+def answer(capsys, *arguments, device="cpu"):
+    return json.loads(run(capsys, "query", *arguments, "--device", device, "--json")[0])
+
+
+def test_query_against_the_library(files, capsys):
+    pose = (0.8, 0.1, -1e-3, 0.0, 0.6, 0.0, 0.8)
+    found = answer(
+        capsys, "ball.obj", "ring.ply", "--pose", *pose, "--lod-a", 0.25, "--lod-b", "900", "--output", "faces"
+    )
+    ball, ring = ab.Model.load("ball.obj"), ab.Model.load("ring.ply")
+    scene = ab.Scene(device="cpu")
+    scene.add(ball, lod=ball.lod_for(fraction=0.25))
+    scene.add(ring, pose=pose, lod=900)
+    expected = scene.intersect(np.array([[0, 1]]), output="faces")
+    assert found["faces"] == expected.faces[:, 1:].tolist() and len(found["faces"]) > report.LISTED_FACES
+    assert found["count"] == expected.count[0] and found["intersects"] is True
+    assert found["lods"] == scene.lods.tolist()
+    bound = ball.error_at(found["lods"][0]) + ring.error_at(900)
+    assert found["bound"] == (pytest.approx(bound) if np.isfinite(bound) else None)
+
+    assert answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1)["count"] == 0
+    swapped = answer(capsys, "ring.ply", "ball.obj", "--output", "any")
+    assert swapped["intersects"] is True and swapped["count"] is None and "faces" not in swapped
+
+
+def test_query_for_people(files, capsys):
+    shown, errors = run(
+        capsys, "query", "ball.obj", "ring.ply", "--pose", *"0.8 -1e-3 0 0 0 0 1".split(), "--output", "faces"
+    )
+    count = int(re.search(r"intersecting face pairs: ([\d,]+)", shown)[1].replace(",", ""))
+    listed = [line for line in shown.splitlines() if re.fullmatch(r" +\d+ +\d+", line)]
+    assert len(listed) == report.LISTED_FACES and f"and {count - report.LISTED_FACES:,} more" in shown
+    assert "error(A) + error(B): 0\n" in shown and "they intersect" in shown and not errors
+    assert "do not intersect" in run(capsys, "query", "ball.obj", "ball.obj", "--pose", 3, 0, 0, 0, 0, 0, 1)[0]
+
+
+def test_query_of_built_models(files, capsys):
+    run(capsys, "build", "ring.ply", "ring.npz")
+    built = answer(capsys, "ring.npz", "ring.npz", "--lod-a", "coarsest", "--lod-b", "tol:0")
+    direct = answer(capsys, "ring.ply", "ring.ply", "--lod-a", "0", "--lod-b", "finest")
+    assert built["count"] == direct["count"] > 0 and built["lods"] == direct["lods"]
+
+
+VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
+ASIDE = (0.8, 0.1, -1e-3, 0.0, 0.6, 0.0, 0.8)
+
+
+def contacts_of(device, a, b, pose, precision="exact"):
+    """Ask the library what `query A B --output contacts` asks."""
+    scene = ab.Scene(device)
+    scene.add(ab.Model.load(a))
+    scene.add(ab.Model.load(b), pose=pose)
+    return scene.intersect(np.array([[0, 1]]), output="contacts", precision=precision)
+
+
+@pytest.mark.parametrize("precision", ["exact", "float64", "float32"])
+@pytest.mark.slow
+def test_contacts_against_the_library(files, capsys, device, precision):
+    # The shifted twin has coplanar faces beside it; their rounded signs differ from the exact ones.
+    for a, b, pose in (("ball.obj", "ring.ply", ASIDE), ("box.obj", "box.obj", (0.3, 0.1, 0, 0, 0, 0, 1))):
+        expected = contacts_of(device, a, b, pose, precision)
+        words = (a, b, "--pose", *pose, "--output", "contacts", "--precision", precision)
+        found = answer(capsys, *words, "--record", "rows.csv", device=device)
+        assert found["count"] == expected.count[0] > 0 and found["precision"] == precision
+        assert (
+            found["faces"] == expected.faces[:, 1:].tolist() == [[x["face_a"], x["face_b"]] for x in found["contacts"]]
+        )
+        assert found["faces"] == expected.contacts["faces"].tolist()
+        rows = list(csv.DictReader(io.StringIO(Path("rows.csv").read_text())))
+        assert len(rows) == len(found["contacts"]) == len(expected.contacts)
+        for row, entry, contact in zip(rows, found["contacts"], expected.contacts):
+            assert [int(row["face_a"]), int(row["face_b"])] == contact["faces"].tolist()
+            for name in VECTORS:
+                assert entry[name] == [float(row[f"{name}_{axis}"]) for axis in "xyz"] == contact[name].tolist()
+            assert entry["coplanar"] is bool(int(row["coplanar"])) is bool(contact["coplanar"])
+            assert len(row) == 2 + 3 * len(VECTORS) + 1 and set(entry) == {"face_a", "face_b", *VECTORS, "coplanar"}
+        summed = expected.pair_contacts[0]
+        assert found["pair_contacts"] == {name: summed[name].tolist() for name in summed.dtype.names}
+
+        run(capsys, "query", *words, "--device", device, "--record", "arrays.npz")
+        with np.load("arrays.npz") as arrays:
+            assert set(arrays) == {"any", "count", "faces", "contacts", "pair_contacts"}
+            for name in arrays:
+                assert arrays[name].dtype == getattr(expected, name).dtype
+                assert arrays[name].tobytes() == getattr(expected, name).tobytes()
+    assert expected.contacts["coplanar"].any()
+    assert not list(files.glob("*.partial"))
+
+
+@pytest.mark.slow
+def test_precision_reaches_the_query(files, capsys, device):
+    """Nearly coincident balls, whose answers differ from precision to precision."""
+    pose = (1e-7, 0, 0, 0, 0, 0, 1)
+    counts = {}
+    for precision in ("exact", "float64", "float32"):
+        found = answer(capsys, "ball.obj", "ball.obj", "--pose", *pose, "--precision", precision, device=device)
+        counts[precision] = found["count"]
+        assert found["count"] == contacts_of(device, "ball.obj", "ball.obj", pose, precision).count[0]
+    assert counts["float32"] != counts["exact"]
+    assert answer(capsys, "ball.obj", "ball.obj", "--pose", *pose, device=device)["count"] == counts["exact"]
+
+
+def test_contacts_for_people(files, capsys, device):
+    shown, errors = run(
+        capsys, *f"query ball.obj ring.ply --device {device} --pose".split(), *ASIDE, "--output", "contacts"
+    )
+    expected = contacts_of(device, "ball.obj", "ring.ply", ASIDE)
+    for text, name in (("point of the contacts", "point"), ("from A to B", "normal"), ("an estimate", "depth")):
+        line = re.search(rf"{text}: (.*)", shown)[1]
+        assert np.allclose([float(x) for x in line.split()], expected.pair_contacts[name][0], rtol=1e-5)
+    listed = [line.split() for line in shown.splitlines() if re.fullmatch(r" +\d+ +\d+( +[-.\de]+){9}", line)]
+    assert len(listed) == report.LISTED_FACES and f"and {len(expected.faces) - len(listed):,} more" in shown
+    for words, contact in zip(listed, expected.contacts):
+        assert [int(x) for x in words[:2]] == contact["faces"].tolist()
+        numbers = np.concatenate([contact[name] for name in ("p0", "p1", "normal")])
+        assert np.allclose([float(x) for x in words[2:]], numbers, rtol=1e-3)
+    assert "precision exact" in shown and not errors
+    box = run(capsys, *"query box.obj box.obj --output contacts --precision float32".split(), "--device", device)[0]
+    assert "precision float32" in box and re.search(r"^ .* coplanar$", box, re.M)
+
+
+def test_contacts_of_what_is_apart(files, capsys, device):
+    words = "query ball.obj ring.ply --pose 9 0 0 0 0 0 1 --output contacts --record".split()
+    shown, _ = run(capsys, *words, "rows.csv", "--device", device)
+    assert "do not intersect" in shown and "depth" not in shown and shown.endswith("wrote rows.csv\n")
+    lines = Path("rows.csv").read_text().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("face_a,face_b,p0_x,")
+    found = json.loads(run(capsys, *words, "arrays.npz", "--json", "--device", device)[0])
+    nowhere = [None, None, None]
+    assert found["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere, "depth": 0}
+    assert found["faces"] == found["contacts"] == []
+    with np.load("arrays.npz") as arrays:
+        assert len(arrays["contacts"]) == 0 and np.isnan(arrays["pair_contacts"]["point"]).all()
+
+
+def test_record_of_each_output(files, capsys):
+    words = "query ball.obj ring.ply --device cpu --record"
+    for output, names in (("any", {"any"}), ("count", {"any", "count"}), ("faces", {"any", "count", "faces"})):
+        found = answer(capsys, "ball.obj", "ring.ply", "--output", output)
+        assert "contacts" not in found and "pair_contacts" not in found
+        shown, _ = run(capsys, *words.split(), "out.npz", "--output", output)
+        assert shown.endswith("wrote out.npz\n")
+        with np.load("out.npz") as arrays:
+            assert set(arrays) == names and arrays["any"][0]
+    run(capsys, *words.split(), "out.csv", "--output", "faces")
+    rows = list(csv.reader(io.StringIO(Path("out.csv").read_text())))
+    assert rows[0] == ["face_a", "face_b"] and [[int(x) for x in row] for row in rows[1:]] == found["faces"]
+
+
+@pytest.mark.parametrize(("name", "writer"), [("out.csv", "csv.writer"), ("out.npz", "np.savez")])
+def test_a_record_that_fails_leaves_the_old_one(files, capsys, monkeypatch, name, writer):
+    def full(file, *_, **__):
+        file.write("part" if name == "out.csv" else b"part")
+        file.flush()
+        raise OSError(28, "No space left on device")
+
+    Path(name).write_text("old")
+    module, function = writer.split(".")
+    monkeypatch.setattr(getattr(report, module), function, full)
+    words = "query ball.obj ring.ply --device cpu --output contacts --record"
+    shown, errors = run(capsys, *words.split(), name, status=2)
+    assert not shown and len(errors) == 1 and "No space left" in errors[0]
+    assert Path(name).read_text() == "old" and not list(files.glob("*.partial"))
+
+
+# Bad input.
+
+BAD = [
+    ((), "COMMAND"),
+    (("fly",), "fly"),
+    (("info",), "MESH"),
+    (("info", "gone.obj"), "gone.obj: no such file"),
+    (("info", "."), "folder"),
+    (("info", "nan.obj"), "not finite"),
+    (("info", "junk.obj"), "junk.obj"),
+    (("info", "text.mesh"), "unknown extension"),
+    (("info", "warp:cat"), "warp:cat"),
+    (("info", "ball.obj", "--speed"), "--speed"),
+    (("info", "ball.obj", "--device", "cuda:99"), "no device 'cuda:99'"),
+    (("build", "ball.obj", "gone/ball.npz"), "no folder gone"),
+    (("build", "ball.obj", "ball.txt"), "must end in .npz"),
+    (("build", "ball.obj", "ball.npz", "--base-faces", "0"), "--base-faces"),
+    (("build", "nan.obj", "ball.npz"), "not finite"),
+    (("query", "ball.obj"), "B"),
+    (("query", "ball.obj", "gone.npz"), "gone.npz: no such file"),
+    (("query", "ball.obj", "junk.npz"), "junk.npz"),
+    (("query", "ball.obj", "ball.obj", "--pose", "1", "2"), "--pose"),
+    (("query", "ball.obj", "ball.obj", "--pose", *"0 0 0 0 0 0 x".split()), "--pose"),
+    (("query", "ball.obj", "ball.obj", "--pose", *"0 0 0 0 0 0 2".split()), "norm 2"),
+    (("query", "ball.obj", "ball.obj", "--pose", *"-inf 0 0 0 0 0 1".split()), "not finite"),
+    (("query", "ball.obj", "ball.obj", "--lod-a", "1.5"), "--lod-a"),
+    (("query", "ball.obj", "ball.obj", "--lod-b", "-3"), "--lod-b"),
+    (("query", "ball.obj", "ball.obj", "--lod-b", "99999"), "--lod-b"),
+    (("query", "ball.obj", "ball.obj", "--lod-b", "tol:-1"), "--lod-b"),
+    (("query", "ball.obj", "ball.obj", "--lod-b", "fine"), "--lod-b"),
+    (("query", "ball.obj", "ball.obj", "--output", "depth"), "--output"),
+    (("query", "ball.obj", "ball.obj", "--precision", "half"), "--precision"),
+    (("query", "ball.obj", "ball.obj", "--precision"), "--precision"),
+    (("query", "ball.obj", "ball.obj", *"--output contacts --record out.json".split()), "must end in .csv or .npz"),
+    (("query", "ball.obj", "ball.obj", *"--output contacts --record out".split()), "must end in .csv or .npz"),
+    (("query", "ball.obj", "ball.obj", *"--output contacts --record gone/out.csv".split()), "no folder gone"),
+    (("query", "ball.obj", "ball.obj", *"--output contacts --record ball.obj/out.csv".split()), "no folder ball.obj"),
+    (("query", "ball.obj", "ball.obj", *"--output contacts --record folder.npz".split()), "is a folder"),
+    (("query", "ball.obj", "ball.obj", "--record", "out.csv"), "ask --output faces or contacts"),
+    (("query", "ball.obj", "ball.obj", "--output", "any", "--record", "out.csv"), "ask --output faces or contacts"),
+    (("query", "ball.obj", "face.npz", "--record", "face.npz"), "face.npz: is read"),
+    (("query", "./face.npz", "ball.obj", "--record", "face.npz"), "face.npz: is read"),
+    (("query", "ball.obj", "nan.obj", "--output", "contacts", "--record", "out.npz"), "not finite"),
+    (("query", "ball.obj", "ball.obj", "--device", "tpu"), "no device 'tpu'"),
+    (("bench",), "name a benchmark"),
+    (("view", "--fast"), "SCENE_OR_MESHES"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) or "nothing" for arguments, _ in BAD])
+def test_bad_input_gives_one_line(files, capsys, arguments, message):
+    before = sorted(files.iterdir())
+    shown, errors = run(capsys, *arguments, status=2)
+    assert len(errors) == 1 and message in errors[0] and errors[0].startswith("warp-abtree: ")
+    assert not shown and sorted(files.iterdir()) == before
+
+
+def test_lost_work_is_status_1(files, capsys, monkeypatch):
+    def lose(*_):
+        raise ab.CapacityError("7 pairs were lost")
+
+    monkeypatch.setattr(cli, "describe_mesh", lose)
+    assert run(capsys, "info", "ball.obj", status=1)[1] == ["warp-abtree: 7 pairs were lost"]
+
+
+def test_help_has_examples(capsys):
+    for command in ("info", "build", "query", "run", "sweep", "view", "picture", "bench", "doctor"):
+        with pytest.raises(SystemExit) as caught:
+            cli.main([command, "--help"])
+        assert caught.value.code == 0
+        shown = capsys.readouterr().out
+        assert f"examples:\n  warp-abtree {command}" in shown and "--device" in shown
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    shown = capsys.readouterr().out
+    assert "exit status:\n  0 " in shown and "examples:" in shown
+    with pytest.raises(SystemExit):
+        cli.main(["--version"])
+    assert capsys.readouterr().out == f"warp-abtree {ab.__version__}\n"
+
+
+# doctor, tables and completion.
+
+
+def test_doctor(capsys):
+    found = json.loads(run(capsys, "doctor", "--json")[0])
+    assert [each["device"] for each in found["devices"]] == [device.alias for device in wp.get_devices()]
+    assert found["usable"] is True and all(each["ok"] for each in found["devices"])
+    assert found["warp_abtree"] == ab.__version__ and found["packages"]["numpy"]["version"] == np.__version__
+    assert found["kernel_cache"]["modules"] > 0 and "bunny_tori" in found["scenes"]["names"]
+    shown, errors = run(capsys, "doctor", "--device", "cpu")
+    assert re.search(r"^cpu .*right", shown, re.M) and shown.endswith("usable\n") and not errors
+    assert ("pip install" in shown) == bool(found["install"])
+
+
+def test_doctor_finds_what_is_wrong(capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "_CROSSING", (doctor._CROSSING[0], doctor._CROSSING[0]))
+    shown, _ = run(capsys, "doctor", "--device", "cpu", status=0)  # they touch: still the right counts
+    monkeypatch.setattr(doctor, "_AWAY", (0, 0, 0, 0, 0, 0, 1))
+    shown, _ = run(capsys, "doctor", "--device", "cpu", status=1)
+    assert "a wrong answer: [1, 1, 1]" in shown and shown.endswith("not usable as it is\n")
+    monkeypatch.setattr(doctor, "CORE", {"warp-lang": "999"})
+    monkeypatch.setattr(doctor, "EXTRAS", {"view": ("to see", {"numpy": "", "no-such-thing": "2.1", "trimesh": "999"})})
+    found = json.loads(run(capsys, "doctor", "--json", "--device", "cpu", status=1)[0])
+    assert found["install"] == ["no-such-thing>=2.1", "trimesh>=999"] and found["packages"]["warp-lang"]["ok"] is False
+    assert found["extras"]["view"]["ok"] is False and found["extras"]["view"]["packages"]["numpy"]["ok"] is True
+
+
+def test_doctor_knows_the_extras():
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    extras = set(re.findall(r"^(\w+) = \[", text.split("optional-dependencies]")[1].split("\n[")[0], re.M))
+    assert set(doctor.EXTRAS) == extras - {"bench", "docs", "test", "dev"}
+    for extra, (_, packages) in doctor.EXTRAS.items():
+        line = re.search(rf"^{extra} = \[(.*)\]$", text, re.M)[1]
+        wanted = [item.split(";")[0].strip() for item in re.findall(r'"([^"]*)"', line)]
+        assert wanted == [f"{name}>={least}" if least else name for name, least in packages.items()]
+    wanted = re.search(r"^dependencies = \[(.*)\]$", text, re.M)[1]
+    assert [f"{name}>={least}" if least else name for name, least in doctor.CORE.items()] == re.findall(
+        '"(.*?)"', wanted
+    )
+
+
+def test_tables_on_a_terminal(monkeypatch):
+    pytest.importorskip("rich")
+
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    rows = [["stage [ms]", "mean"], ["a [b]", "1.0"], ["c", "20.0"]]
+    monkeypatch.setenv("TERM", "xterm")
+    for columns, headed in (("80", True), ("12", False)):
+        monkeypatch.setenv("COLUMNS", columns)
+        monkeypatch.setattr(sys, "stdout", Terminal())
+        report.print_table(rows)
+        shown = re.sub(r"\x1b\[[\d;]*m", "", sys.stdout.getvalue())
+        assert "stage [ms]" in shown and "a [b]" in shown and ("─" in shown) is headed
+
+
+def test_completion(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert "pip install shtab" in run(capsys, "--print-completion", "bash", status=2)[1][0]
+    monkeypatch.undo()
+    pytest.importorskip("shtab")
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["--print-completion", "bash"])
+    shown = capsys.readouterr().out
+    assert not caught.value.code and "--lod-a" in shown and "doctor" in shown and "compgen" in shown
+
+
+# As people start it.
+
+
+@pytest.mark.slow
+def test_process_is_quiet(files):
+    done = run_process("query", "ball.obj", "ring.ply", "--json", "--device", "cpu", cwd=files)
+    assert done.returncode == 0 and json.loads(done.stdout)["intersects"] is True
+    assert done.stderr == ""
+
+
+def test_process_fails_in_one_line(files):
+    done = run_process("query", "ball.obj", "nan.obj", cwd=files)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert len(done.stderr.splitlines()) == 1 and "not finite" in done.stderr
+
+
+# README.
+
+
+def readme_blocks(after):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    return re.findall(r"```\w+\n(.*?)```", text[text.index(after) :], re.S)
+
+
+@pytest.mark.slow
+def test_readme_python_runs(capsys, monkeypatch):
+    pytest.importorskip("pxr")
+    monkeypatch.chdir(ROOT)
+    blocks = [block for block in readme_blocks("## Python") if block.startswith("import")]
+    assert len(blocks) >= 2
+    for block in blocks:
+        exec(compile(block, "README.md", "exec"), {})
+        assert capsys.readouterr().out
+
+
+def test_readme_commands_exist():
+    lines = [*readme_blocks("<!-- main-command -->")[0].splitlines(), *readme_blocks("## Command line")[0].splitlines()]
+    for line in lines:
+        command = line.split("warp-abtree", 1)[1].split("#")[0].split()
+        assert cli.make_parser().parse_args(command).command == command[0]
+        for word in command:
+            assert not word.startswith("scenes/") or (ROOT / word).is_file()
+    assert len(lines) >= 6

@@ -1,0 +1,342 @@
+"""Atomic writes: whole files on the disk, from several processes at once, and nothing left of those that fail."""
+
+import io
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.study import write_text
+from warp_abtree.checks import atomic_write as files
+from warp_abtree.checks.atomic_write import SUFFIX, atomic_write, sweep_up
+
+SIZE = 200_000
+
+
+# Without the package, which takes long to import.
+IMPORT = f"""
+import sys
+sys.path.insert(0, {str(Path(files.__file__).parent)!r})
+from atomic_write import atomic_write
+"""
+
+
+def start(script, *arguments):
+    """Start a process that runs a script, with pipes."""
+    command = [sys.executable, "-c", IMPORT + script, *map(str, arguments)]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+
+WRITER = f"""
+path, letter = sys.argv[1], sys.argv[2].encode()
+print("ready", flush=True)
+sys.stdin.readline()
+for _ in range(50):
+    with atomic_write(path) as file:
+        for _ in range(4):
+            file.write(letter * {SIZE // 4})
+            file.flush()
+"""
+
+
+def test_processes_that_write_one_path_never_tear_it(tmp_path):
+    path = tmp_path / "model.npz"
+    path.write_bytes(b"0" * SIZE)
+    writers = [start(WRITER, path, letter) for letter in "abcd"]
+    try:
+        for writer in writers:
+            assert writer.stdout.readline() == "ready\n"
+        for writer in writers:
+            writer.stdin.write("\n")
+            writer.stdin.flush()
+        seen = set()
+        while any(writer.poll() is None for writer in writers):
+            found = path.read_bytes()
+            assert len(found) == SIZE and len(set(found)) == 1, "a torn file"
+            seen.add(found[:1])
+        assert [writer.wait() for writer in writers] == [0] * 4
+    finally:
+        for writer in writers:
+            writer.kill()
+            writer.communicate()
+    assert len(seen) > 1 and [entry.name for entry in tmp_path.iterdir()] == ["model.npz"]
+
+
+def record(monkeypatch):
+    """Return the list into which calls of os.fsync and os.replace go: what is synced, and its size then."""
+    calls = []
+
+    def fsync(opened, plain=os.fsync):
+        found = os.fstat(opened)
+        calls.append(("folder", found.st_ino) if stat.S_ISDIR(found.st_mode) else ("file", found.st_ino, found.st_size))
+        plain(opened)
+
+    def replace(source, target, plain=os.replace):
+        calls.append(("replace", os.stat(source).st_ino, Path(target).name))
+        plain(source, target)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", replace)
+    return calls
+
+
+def check_calls(calls, path):
+    """Check that a file was brought to the disk whole before it took its name, and its folder after."""
+    found = path.stat()
+    at = [call[2:] for call in calls].index((path.name,))
+    assert calls[at - 1 : at + 2] == [
+        ("file", found.st_ino, found.st_size),
+        ("replace", found.st_ino, path.name),
+        ("folder", path.parent.stat().st_ino),
+    ]
+
+
+def write_bytes(path):
+    with atomic_write(path) as file:
+        file.write(b"x" * 100)
+
+
+def save_model(path):
+    import warp_abtree as ab
+
+    ab.Model.from_arrays(np.eye(3), [[0, 1, 2]]).save(path)
+
+
+def run_frame():
+    import warp_abtree as ab
+
+    model = ab.Model.from_arrays(np.eye(3), [[0, 1, 2]])
+    scene = ab.Scene("cpu")
+    for _ in range(2):
+        scene.add(model)
+    frame = ab.Frame(scene, output="contacts")
+    return frame, frame.step()
+
+
+def record_frames(path):
+    run_frame()[0].record(path)
+
+
+def record_query(path):
+    from warp_abtree.app.cli.report import record_found
+
+    record_found(run_frame()[1], path)
+
+
+def save_recording(path):
+    from warp_abtree.app.recording import Recording
+
+    Recording("", {}, [], run_frame()[0].history, np.zeros((1, 2), np.int32), np.zeros((1, 2, 7))).save(path)
+
+
+def draw_picture(path):
+    pytest.importorskip("matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from warp_abtree.app.pictures import plot
+
+    plot._write_png(FigureCanvasAgg(Figure((1, 1))), path)
+
+
+def record_page(path):
+    """Write a page of a source with one frame, whose drawing is left out."""
+    from types import SimpleNamespace
+
+    from warp_abtree.app.viewer import text as view_text
+    from warp_abtree.app.viewer import web_record as view_record
+
+    recorder = SimpleNamespace(insert_sleep=lambda _: None, as_html=lambda: "<body></body>")
+    server = SimpleNamespace(get_scene_serializer=lambda: recorder)
+    moment = SimpleNamespace(row=None, number=0)
+    drawing = SimpleNamespace(contact_count=0)
+    page = SimpleNamespace(settings=None, playing=True, advance=lambda: drawing, moment=moment)
+    source = SimpleNamespace(time_step=0.1, title="", scene=SimpleNamespace(object_count=0, device="cpu"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(view_record, "Page", lambda *_, **__: page)
+        patch.setattr(view_text, "time_picture", lambda _: "")
+        view_record.record_page(server, source, path, 1)
+
+
+def make_shards(path):
+    import warp_abtree as ab
+
+    model = ab.Model.from_arrays(np.eye(3), [[0, 1, 2]])
+    file = path.suffix[1:] if path.suffix != ".json" else "npz"
+    ab.run_shards(ab.SweepJob(model, model, np.eye(7)[6:]), path.parent, file=file, pool=ab.ThisProcess("cpu"))
+
+
+SHARD = "shard-000000000000-000000000001"
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [
+        (write_bytes, "bytes"),
+        (lambda path: write_text(path, "text"), "study.json"),
+        (save_model, "model.npz"),
+        (record_frames, "rows.csv"),
+        (record_frames, "rows.json"),
+        (record_query, "found.csv"),
+        (record_query, "found.npz"),
+        (save_recording, "run.npz"),
+        (draw_picture, "picture.png"),
+        (record_page, "page.html"),
+        (make_shards, "job.json"),
+        (make_shards, f"{SHARD}.npz"),
+        (make_shards, f"{SHARD}.parquet"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_every_writer_syncs_its_file_then_replaces_then_syncs_the_folder(tmp_path, monkeypatch, write, name):
+    if name.endswith("parquet"):
+        pytest.importorskip("pyarrow")
+    calls = record(monkeypatch)
+    write(tmp_path / name)
+    check_calls(calls, tmp_path / name)
+    assert not list(tmp_path.glob(f"*{SUFFIX}"))
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077, 0o000])
+def test_permissions_are_those_of_any_new_file(tmp_path, mask):
+    before = os.umask(mask)
+    try:
+        write_bytes(tmp_path / "written")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "written").stat().st_mode) == 0o666 & ~mask
+
+
+def test_text_is_written_as_asked(tmp_path):
+    with atomic_write(tmp_path / "rows.csv", "w", newline="", encoding="utf-16") as file:
+        file.write("ä\n")
+    assert (tmp_path / "rows.csv").read_bytes() == "ä\n".encode("utf-16")
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(28, "No space left"), ValueError("bad"), KeyboardInterrupt(), SystemExit(143)]
+)
+@pytest.mark.parametrize("where", ["body", "fsync", "replace"])
+def test_what_stood_there_stays_if_a_write_fails(tmp_path, monkeypatch, error, where):
+    path = tmp_path / "written"
+    path.write_text("old")
+
+    def fail(*_):
+        raise error
+
+    if where != "body":
+        monkeypatch.setattr(os, where, fail)
+    with pytest.raises(type(error)) as caught, atomic_write(path) as file:
+        file.write(b"new")
+        if where == "body":
+            fail()
+    assert path.read_text() == "old" and [entry.name for entry in tmp_path.iterdir()] == ["written"]
+    if isinstance(error, OSError):
+        assert caught.value.errno == 28 and caught.value.filename == str(path)
+
+
+def test_errors_name_the_path_that_was_asked_for(tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    for path, kind in (
+        (tmp_path / "missing" / "x.npz", FileNotFoundError),
+        (tmp_path / "file" / "x.npz", NotADirectoryError),
+        (tmp_path / "folder", IsADirectoryError),
+        (tmp_path / ("x" * 300), OSError),
+    ):
+        with pytest.raises(kind) as caught, atomic_write(path):
+            pass
+        assert caught.value.filename == str(path) and SUFFIX not in str(caught.value)
+    with pytest.raises(FileNotFoundError) as caught, atomic_write(tmp_path / "copy"):
+        open(tmp_path / "source")
+    assert caught.value.filename == str(tmp_path / "source"), "the error is not about the copy"
+    with pytest.raises(OSError, match=r"^no errno$"), atomic_write(tmp_path / "copy"):
+        raise OSError("no errno")
+    with pytest.raises(io.UnsupportedOperation), atomic_write(tmp_path / "copy") as file:
+        file.read()
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "folder"]
+
+
+def test_the_longest_name_can_be_written(tmp_path):
+    path = tmp_path / ("ä" * 100 + "x" * 55)
+    write_bytes(path)
+    assert path.stat().st_size == 100
+
+
+HALF = """
+with atomic_write(sys.argv[1]) as file:
+    file.write(b"half")
+    file.flush()
+    print("half", flush=True)
+    sys.stdin.readline()
+    file.write(b" and half")
+"""
+
+
+def test_sweeping_up_leaves_what_another_process_is_writing(tmp_path):
+    live, dead = (start(HALF, tmp_path / name) for name in ("live", "dead"))
+    try:
+        assert live.stdout.readline() == dead.stdout.readline() == "half\n"
+        (tmp_path / f"shard.npz.{live.pid}{SUFFIX}").touch()  # of a writer that had the same id once
+        (tmp_path / "other").touch()
+        dead.send_signal(signal.SIGKILL)
+        dead.wait()
+        assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 3
+        sweep_up(tmp_path)
+        assert [path.name[:5] for path in tmp_path.glob(f"*{SUFFIX}")] == ["live."]
+        live.communicate("\n")
+        assert live.returncode == 0
+    finally:
+        for process in (live, dead):
+            process.kill()
+            process.communicate()
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"live": "half and half", "other": ""}
+
+
+def test_a_file_that_is_swept_up_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
+    made = []
+
+    def lock(file, wait=False, plain=files._lock):
+        made.append(file.name)
+        if len(made) == 1:
+            os.unlink(file.name)
+        return plain(file, wait)
+
+    monkeypatch.setattr(files, "_lock", lock)
+    write_bytes(tmp_path / "written")
+    assert len(set(made)) == 2 and (tmp_path / "written").stat().st_size == 100
+
+
+def test_writers_and_sweeping_up_at_once(tmp_path):
+    """What is swept up while files come is none of theirs."""
+    writer = start(WRITER, tmp_path / "written", "a")
+    try:
+        writer.stdout.readline()
+        writer.stdin.write("\n")
+        writer.stdin.flush()
+        end = time.monotonic() + 60
+        while writer.poll() is None and time.monotonic() < end:
+            sweep_up(tmp_path)
+        assert writer.wait() == 0
+    finally:
+        writer.kill()
+        writer.communicate()
+    assert (tmp_path / "written").stat().st_size == SIZE
+
+
+def test_a_name_that_another_writer_has_is_not_taken(tmp_path, monkeypatch):
+    names = iter(["same", "same", "other"])
+    monkeypatch.setattr(files.secrets, "token_hex", lambda _: next(names))
+    with atomic_write(tmp_path / "written") as first:
+        first.write(b"first")
+        first.flush()
+        with atomic_write(tmp_path / "written") as second:
+            second.write(b"second")
+        assert (tmp_path / "written").read_bytes() == b"second"
+    assert (tmp_path / "written").read_bytes() == b"first"

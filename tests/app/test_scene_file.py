@@ -1,0 +1,322 @@
+"""Scene files: what a good one makes, and the one line that a bad one gives."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import warp_abtree as ab
+from warp_abtree.app.pictures import plot
+
+SCENES = Path(__file__).resolve().parents[2] / "scenes"
+BALL = '[models.ball]\nshape = "icosphere"\nsubdivisions = 1\n'
+ONE = BALL + '[[objects]]\nmodel = "ball"\n'
+
+
+def load(tmp_path, text):
+    path = tmp_path / "scene.toml"
+    path.write_text(text, encoding="utf-8")
+    return ab.load_scene(path, device="cpu")
+
+
+# Good ones.
+
+
+def test_smallest_scene(tmp_path):
+    loaded = load(tmp_path, ONE)
+    assert (loaded.title, loaded.frames, loaded.scene.object_count) == ("scene", 60, 1)
+    assert loaded.scene.lods.tolist() == [loaded.models["ball"].lod_max]
+    assert np.array_equal(loaded.motion.poses(3.0), [[0, 0, 0, 0, 0, 0, 1]])
+    assert loaded.frame().step().any.tolist() == []
+
+
+def test_every_key_of_an_object(tmp_path):
+    loaded = load(
+        tmp_path,
+        BALL
+        + """
+        [scene]
+        title = "keys"
+        frames = 7
+        time_step = 0.5
+        seed = 3
+        [[objects]]
+        model = "ball"
+        name = "first"
+        position = [1, 2, 3]
+        rotation = { axis = [0, 0, 2], degrees = 90 }
+        world = 4
+        static = true
+        importance = 3
+        lod = 9
+        velocity = [0, 1, 0]
+        turn = { axis = [0, 0, 1], degrees = 180 }
+        shuttle = { by = [2, 0, 0], period = 4, phase = 0.25 }
+        [[objects]]
+        model = "ball"
+        rotation = { quaternion = [1, 0, 0, 0] }
+        lod = "coarsest"
+        """,
+    )
+    assert (loaded.title, loaded.frames, loaded.time_step) == ("keys", 7, 0.5)
+    assert loaded.worlds.tolist() == [4, 0]
+    assert loaded.scene.lods.tolist() == [9, 0]
+    assert loaded.scene.object_importance == [3, 1]
+    half = math.sqrt(0.5)
+    # After 1 s: one up, half of the shuttle's way and half as much again; a quarter turn and a half turn.
+    assert np.allclose(loaded.motion.poses(1.0), [[3, 3, 3, 0, 0, half, -half], [0, 0, 0, 1, 0, 0, 0]])
+
+
+def test_copies(tmp_path):
+    loaded = load(
+        tmp_path,
+        BALL
+        + """
+        [models.box]
+        shape = "box"
+        extents = [1, 2, 4]
+        [[objects]]
+        model = ["ball", "box"]
+        grid = { size = [3, 1, 2], spacing = [2, 0, 1] }
+        position = [10, 0, 0]
+        lod = [0.5, "finest", 1]
+        world = 5
+        worlds = 2
+        """,
+    )
+    assert loaded.scene.object_count == 12
+    assert loaded.worlds.tolist() == [5] * 6 + [6] * 6
+    assert loaded.scene.object_model == [0, 1] * 6
+    expected = [[10 + x, 0, z] for x in (-2, 0, 2) for z in (-0.5, 0.5)] * 2
+    assert np.allclose(loaded.motion.position, expected)
+    ball, box = loaded.models["ball"], loaded.models["box"]
+    lods = [ball.lod_for(fraction=0.5), box.lod_max, 1, box.lod_for(fraction=0.5), ball.lod_max, 1]
+    assert loaded.scene.lods.tolist() == lods * 2
+
+
+def test_random_is_seeded_and_bounded(tmp_path):
+    text = ONE + (
+        "count = 50\nshuttle = { by = [1, 0, 0], period = 2 }\n"
+        "random = { position = [1, 0.5, 0], rotation = true, velocity = 2, turn = 90, phase = true }\n"
+    )
+    first, again = load(tmp_path, "[scene]\nseed = 1\n" + text), load(tmp_path, "[scene]\nseed = 1\n" + text)
+    other = load(tmp_path, "[scene]\nseed = 2\n" + text)
+    assert np.array_equal(first.motion.poses(1.0), again.motion.poses(1.0))
+    assert not np.allclose(first.motion.poses(1.0), other.motion.poses(1.0))
+    motion = first.motion
+    assert (np.abs(motion.position) <= [1, 0.5, 0]).all() and np.ptp(motion.position[:, 0]) > 1
+    speed = np.linalg.norm(motion.velocity, axis=1)
+    assert speed.max() <= 2 and speed.max() > 1
+    assert motion.rate.min() >= 0 and math.radians(45) < motion.rate.max() <= math.radians(90)
+    assert len(np.unique(motion.phase)) == 50 and len(np.unique(motion.rotation, axis=0)) == 50
+
+
+def test_sizes(tmp_path):
+    trimesh.creation.box(extents=[1, 2, 4]).apply_translation([5, 0, 0]).export(tmp_path / "brick.ply")
+    row = '[models.{}]\nmesh = "brick.ply"\n{}\n'
+    text = row.format("plain", "") + row.format("sized", "size = 1\ncentre = true") + row.format("scaled", "scale = 3")
+    loaded = load(tmp_path, text + '[[objects]]\nmodel = "plain"\n')
+    boxes = {name: model.mesh_at(model.lod_max)[0] for name, model in loaded.models.items()}
+    assert np.allclose([boxes["plain"].min(0), boxes["plain"].max(0)], [[4.5, -1, -2], [5.5, 1, 2]])
+    assert np.allclose([boxes["sized"].min(0), boxes["sized"].max(0)], [[-0.125, -0.25, -0.5], [0.125, 0.25, 0.5]])
+    assert np.allclose([boxes["scaled"].min(0), boxes["scaled"].max(0)], [[13.5, -3, -6], [16.5, 3, 6]])
+
+
+@pytest.mark.parametrize(
+    ("shape", "parameters", "extents"),
+    [
+        ("box", "extents = [1, 2, 3]", (1, 2, 3)),
+        ("uv_sphere", "radius = 2\ncount = [16, 16]", (4, 4, 4)),
+        ("cylinder", "radius = 1\nheight = 3\nsections = 64", (2, 2, 3)),
+        ("cone", "radius = 1\nheight = 3\nsections = 64", (2, 2, 3)),
+        ("capsule", "radius = 1\nheight = 3\ncount = [16, 16]", (2, 2, 5)),
+        ("annulus", "r_min = 0.5\nr_max = 1\nheight = 3\nsections = 64", (2, 2, 3)),
+        ("torus", "major_radius = 2\nminor_radius = 1", (6, 6, 2)),
+    ],
+)
+def test_shapes(tmp_path, shape, parameters, extents):
+    text = f'[models.m]\nshape = "{shape}"\n{parameters}\n[[objects]]\nmodel = "m"\n'
+    model = load(tmp_path, text).models["m"]
+    vertices, _, _ = model.mesh_at(model.lod_max)
+    assert np.allclose(np.ptp(vertices, axis=0), extents, rtol=0.05)
+
+
+def test_sweep_of_a_named_object(tmp_path):
+    text = (
+        ONE
+        + 'name = "a"\n[[objects]]\nmodel = "ball"\n[[lod_sweep]]\nobjects = ["a"]\nfrom = 1\nto = 0.25\nperiod = 2\n'
+    )
+    loaded = load(tmp_path, text)
+    ball = loaded.models["ball"]
+    assert loaded.lods_at(0.0).tolist() == [ball.lod_max] * 2
+    assert loaded.lods_at(1.0).tolist() == [ball.lod_for(fraction=0.25), ball.lod_max]
+    assert [lods[0] for lods in plot.panel_lods(loaded)] == [ball.lod_max, ball.lod_for(fraction=0.25)]
+    frame = loaded.frame()
+    frame.run(60)
+    assert len({row.lod_min for row in frame.history}) > 10
+
+
+# Bad ones.
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "models"),
+        (BALL, "no [[objects]]"),
+        ("[scene\n", "line 1"),
+        (ONE + "colour = 3\n", "objects[0].colour: unknown key"),
+        (ONE + "[extra]\na = 1\n", "extra: unknown key"),
+        ("[scene]\nframes = 0\n" + ONE, "scene.frames: 0 is outside"),
+        ("[scene]\nframes = 1.5\n" + ONE, "scene.frames: not a whole number"),
+        ("[scene]\ntime_step = -1\n" + ONE, "scene.time_step"),
+        ("[scene]\nspeed = 1\n" + ONE, "scene.speed: unknown key"),
+        ("scene = 3\n" + ONE, "scene: not a table"),
+        ('[models.m]\n[[objects]]\nmodel = "m"\n', "models.m: give mesh or shape"),
+        ('[models.m]\nshape = "cube"\n[[objects]]\nmodel = "m"\n', "models.m.shape: 'cube' is none of"),
+        ('[models.m]\nshape = "torus"\n[[objects]]\nmodel = "m"\n', "models.m.shape"),
+        ('[models.m]\nshape = "box"\nradius = 1\n[[objects]]\nmodel = "m"\n', "models.m.radius: unknown key"),
+        (
+            '[models.m]\nshape = "box"\nextents = [1, 2]\n[[objects]]\nmodel = "m"\n',
+            "models.m.extents: not a list of 3",
+        ),
+        ('[models.m]\nmesh = "gone.obj"\n[[objects]]\nmodel = "m"\n', "gone.obj: no such file"),
+        ('[models.m]\nmesh = "warp:cat"\n[[objects]]\nmodel = "m"\n', "models.m.mesh: warp:cat: unknown"),
+        (ONE.replace("[[", "size = 1\nscale = 2\n[["), "give size or scale"),
+        (ONE.replace("[[", "base_faces = 0\n[["), "models.ball.base_faces"),
+        (ONE.replace("[[", "scale = 1e300\n[["), "models.ball: "),
+        (ONE.replace('"ball"', '"bull"'), "objects[0].model: there is no [models.bull]"),
+        (BALL + "[[objects]]\n", "objects[0]: the key 'model' is missing"),
+        (BALL + "objects = 3\n", "models.ball.objects: unknown key"),
+        ("objects = 3\n" + BALL, "objects: not a list of tables"),
+        (ONE + "position = [0, 0]\n", "objects[0].position: not a list of 3"),
+        (ONE + "position = [0, 0, nan]\n", "objects[0].position: not a finite number"),
+        (ONE + 'position = [0, 0, "x"]\n', "objects[0].position: not a finite number"),
+        (ONE + "position = [0, 0, 1" + "0" * 400 + "]\n", "objects[0].position: "),
+        (ONE + "rotation = { quaternion = [0, 0, 0, 2] }\n", "objects[0].rotation.quaternion: its norm is 2"),
+        (ONE + "rotation = { axis = [0, 0, 0], degrees = 3 }\n", "objects[0].rotation.axis: a direction of no length"),
+        (ONE + "rotation = { axis = [0, 0, 1] }\n", "objects[0].rotation: the key 'degrees' is missing"),
+        (ONE + "rotation = [0, 0, 1]\n", "objects[0].rotation: not a table"),
+        (ONE + "lod = 1.5\n", "objects[0].lod: fraction"),
+        (ONE + "lod = 99999\n", "objects[0].lod: "),
+        (ONE + 'lod = "fine"\n', "objects[0].lod: LOD 'fine'"),
+        (ONE + "lod = []\n", "objects[0].lod: an empty list"),
+        (ONE + "lod = true\n", "objects[0].lod: not a LOD"),
+        (ONE + "world = -2\n", "objects[0].world"),
+        (ONE + "world = -1\nworlds = 2\n", "objects[0].worlds"),
+        (ONE + "worlds = 0\n", "objects[0].worlds"),
+        (ONE + "count = 1000\nworlds = 100000\n", "objects[0].worlds: more than"),
+        (ONE + "count = 2\ngrid = { size = [1, 1, 1], spacing = [1, 1, 1] }\n", "give count or grid"),
+        (ONE + "grid = { size = [1000, 1000, 1000], spacing = [1, 1, 1] }\n", "objects[0].grid.size: more than"),
+        (ONE + 'static = "yes"\n', "objects[0].static: not true or false"),
+        (ONE + "importance = 4\n", "objects[0].importance"),
+        (ONE + "shuttle = { by = [1, 0, 0] }\n", "objects[0].shuttle: the key 'period' is missing"),
+        (ONE + "shuttle = { by = [1, 0, 0], period = 0 }\n", "objects[0].shuttle.period"),
+        (ONE + "random = { wobble = 1 }\n", "objects[0].random.wobble: unknown key"),
+        (ONE + "[[lod_sweep]]\nfrom = 1\nto = 0.1\nperiod = 1\n", "lod_sweep[0]: give one of model and objects"),
+        (ONE + '[[lod_sweep]]\nmodel = "x"\nfrom = 1\nto = 0.1\nperiod = 1\n', "lod_sweep[0].model"),
+        (ONE + '[[lod_sweep]]\nobjects = ["x"]\nfrom = 1\nto = 0.1\nperiod = 1\n', "no object is named 'x'"),
+        (ONE + '[[lod_sweep]]\nmodel = "ball"\nfrom = 1\nto = 0\nperiod = 1\n', "lod_sweep[0].to"),
+        (ONE + "[picture]\neye = [0, 2, 0]\n", "picture.up: points along eye"),
+        (ONE + "[picture]\nzoom = 2\n", "picture.zoom: unknown key"),
+        (ONE.replace("[[", "faces = 0\n[["), "models.ball.faces: 0 is outside"),
+        (ONE.replace("[[", "mesh = []\n[["), "models.ball.mesh: an empty list"),
+        (ONE.replace("[[", "mesh = [3]\n[["), "models.ball.mesh: not a text"),
+        ('[models.m]\nmesh = ["a.obj", "b.obj"]\n[[objects]]\nmodel = "m"\n', "b.obj: no such file"),
+        ('[models.m]\nshape = "knot"\nradius = 1\n[[objects]]\nmodel = "m"\n', "models.m.shape: knot() missing"),
+        ('[models.m]\nshape = "revolve"\nprofile = [[1, 0], [1, 0]]\nsections = 9\n', "models.m.profile: a radius"),
+        ('[models.m]\nshape = "revolve"\nprofile = [[0, 0], [1, 1]]\nsections = 9\n', "models.m.profile: a radius"),
+        ('[models.m]\nshape = "revolve"\nprofile = 3\nsections = 9\n', "models.m.profile: not a list of points"),
+        (ONE + "count = 2\ngrid = { size = [0, 0, 1], spacing = [1, 1, 1] }\n", "give count or grid"),
+        (ONE + "grid = { size = [0, 1, 1], spacing = [1, 1, 1] }\n", "give count or grid"),
+        (ONE + "kinematic = true\n", "objects[0].kinematic: the scene has no [dynamics]"),
+        (ONE + "density = 2\n", "objects[0].density: the scene has no [dynamics]"),
+        (ONE + "density = 0\n[dynamics]\n", "objects[0].density: 0 is not above"),
+        (ONE + "restitution = 2\n[dynamics]\n", "objects[0].restitution: 2 is not from 0 to 1"),
+        (ONE + "static = true\nkinematic = true\n[dynamics]\n", "objects[0].kinematic: a static object"),
+        (ONE + "shuttle = { by = [1, 0, 0], period = 1 }\n[dynamics]\n", "objects[0].shuttle: a rigid body"),
+        (ONE + "[dynamics]\ngravity = 9.81\n", "dynamics.gravity: not a list of 3"),
+        (ONE + "[dynamics]\nfriction = -1\n", "dynamics.friction: -1 is not from 0"),
+        (ONE + "[dynamics]\nwind = 1\n", "dynamics.wind: unknown key"),
+        (ONE + "[dynamics]\n[picture]\ntime = 1\n", "picture.time: rigid bodies"),
+        (ONE + "[lod]\n", "lod: give budget_ms or tolerance"),
+        (ONE + "[lod]\nbudget_ms = 0\n", "lod.budget_ms: 0 is not above 0"),
+        (ONE + '[lod]\nbudget_ms = "8ms"\n', "lod.budget_ms: not a finite number"),
+        (ONE + "[lod]\ntolerance = -1\n", "lod.tolerance: -1 is not from 0"),
+        (ONE + '[lod]\ncontroller = "magic"\n', "lod.controller: 'magic' is none of predictive, paper, tolerance"),
+        (ONE + '[lod]\ncontroller = "paper"\n', "lod: controller 'paper' needs a budget"),
+        (ONE + "[lod]\nbudget_ms = 1\nsteps = 0\n", "lod.steps: 0 is outside"),
+        (ONE + "[lod]\nbudget_ms = 1\nlow = 0.9\naim = 0.5\n", "lod.low: is above aim"),
+        (ONE + "[lod]\nbudget_ms = 1\nspeed = 3\n", "lod.speed: unknown key"),
+        (
+            ONE + '[lod]\nbudget_ms = 1\n[[lod_sweep]]\nmodel = "ball"\nfrom = 1\nto = 0.5\nperiod = 1\n',
+            "lod: LODs are swept, or chosen by a controller",
+        ),
+        (ONE + "[camera]\neye = [0, 0, 1]\n", "camera: the key 'target' is missing"),
+        (ONE + "[camera]\neye = [0, 0, 1]\ntarget = [0, 0, 1]\n", "camera: the camera looks at its own eye"),
+        (
+            ONE + "[camera]\neye = [0, 1, 0]\ntarget = [0, 0, 0]\n",
+            "camera: the camera looks at its own eye, or along up",
+        ),
+        (ONE + "[camera]\neye = [0, 0, 1]\ntarget = [0, 0, 0]\nfar = 0\n", "camera.far: 0 is not above 0"),
+        (ONE + "[camera]\neye = [0, 0, 1]\n[[camera.keys]]\ntime = 0\n", "camera: give eye and target, or"),
+        (ONE + "[camera]\nkeys = [3]\n", "camera.keys[0]: not a table"),
+        (ONE + "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\n", "camera.keys[0]: the key 'target' is missing"),
+        (
+            ONE + 2 * "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\ntarget = [0, 0, 0]\n",
+            "camera.keys[1].time: 0.0 is not after",
+        ),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path, text, message):
+    with pytest.raises(ab.SceneError) as caught:
+        load(tmp_path, text)
+    assert message in str(caught.value)
+    assert str(caught.value).startswith(str(tmp_path / "scene.toml"))
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_bodies_without_a_mass_are_named(tmp_path):
+    sheet = '[models.sheet]\nshape = "terrain"\nextents = [1, 1]\ncells = [2, 2]\nbumps = 0\nwaves = 1\nrim = 0\n'
+    loaded = load(tmp_path, sheet + '[[objects]]\nmodel = "sheet"\n[dynamics]\n')
+    with pytest.raises(ab.SceneError, match=r"scene.toml: objects: model 'sheet' is flat"):
+        loaded.frame()
+
+
+def test_file_that_is_none(tmp_path):
+    for path in (tmp_path / "gone.toml", tmp_path):
+        with pytest.raises(ab.SceneError, match=str(path)):
+            ab.load_scene(path, device="cpu")
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ab.SceneError, match="not valid TOML"):
+        ab.load_scene(tmp_path / "bytes.toml", device="cpu")
+
+
+def test_device_that_is_none():
+    with pytest.raises(ValueError, match="no device"):
+        ab.load_scene(SCENES / "herd.toml", device="cuda:99")
+
+
+# The scenes of the project.
+
+
+def test_bunny_tori(device):
+    pytest.importorskip("pxr")
+    loaded = ab.load_scene(SCENES / "bunny_tori.toml", device=device)
+    frame = loaded.frame(output="faces")
+    rows = frame.run(3)
+    assert all(row.objects == 6 and row.hits > 0 for row in rows)
+    assert rows[2].nodes_refitted > 0 and rows[2].faces < rows[0].faces
+
+
+def test_herd(device):
+    pytest.importorskip("pxr")
+    loaded = ab.load_scene(SCENES / "herd.toml", device=device)
+    frame = loaded.frame(output="any")
+    result = frame.step()
+    row = frame.history[0]
+    assert row.objects >= 200 and len(loaded.models) == 3 and row.states > 5
+    assert len(np.unique(loaded.worlds)) >= 16 and 0 < row.touching < row.pairs
+    assert np.array_equal(loaded.worlds[result.pairs[:, 0]], loaded.worlds[result.pairs[:, 1]])

@@ -1,0 +1,431 @@
+"""The scenes of the project at small sizes, generated shapes, controllers from files, and recorded runs."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from oracles.triangle import brute_force_faces
+
+import warp_abtree as ab
+from warp_abtree.app.recording import FORMAT_VERSION, Recording, record_run
+
+SCENES = Path(__file__).resolve().parents[2] / "scenes"
+# A machine so slow that few objects are a load.
+RATES = {"node_test": 1e-7, "triangle_test": 2e-7}
+RINGS = """
+[scene]
+frames = 8
+time_step = 0.1
+[camera]
+far = 20
+[[camera.keys]]
+time = 0.0
+eye = [0, 0, 9]
+target = [0, 0, 0]
+[[camera.keys]]
+time = 0.5
+eye = [2, 0, 0]
+target = [0, 0, -9]
+[lod]
+controller = "predictive"
+budget_ms = 4
+tolerance = 0.02
+[models.ring]
+shape = "torus"
+major_radius = 0.6
+minor_radius = 0.2
+base_faces = 40
+[[objects]]
+model = "ring"
+count = 24
+grid = { size = [2, 3, 0], spacing = [0.9, 0.9, -0.9] }
+shuttle = { by = [0.5, 0.1, 0.2], period = 1 }
+random = { rotation = true, turn = 200, phase = true }
+"""
+BODIES = (
+    RINGS.replace("shuttle = { by = [0.5, 0.1, 0.2], period = 1 }", "velocity = [0, 0, 1]").replace(
+        ", phase = true", ""
+    )
+    + """
+density = 2.0
+[dynamics]
+gravity = [0, -1, 0]
+friction = 0.25
+[[objects]]
+model = "ring"
+kinematic = true
+position = [0, 0, 4]
+shuttle = { by = [0, 0, -4], period = 1 }
+[[objects]]
+model = "ring"
+static = true
+position = [0, -3, 0]
+"""
+)
+
+
+def load(tmp_path, text, **options):
+    path = tmp_path / "scene.toml"
+    path.write_text(text, encoding="utf-8")
+    return ab.load_scene(path, **{"device": "cpu", **options})
+
+
+def load_ours(name, device, changes=(), **options):
+    """Load a scene of the project with parts of its text exchanged."""
+    text = (SCENES / f"{name}.toml").read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return ab.load_scene(SCENES / f"{name}.toml", device=device, text=text, **options)
+
+
+# Shapes.
+
+
+@pytest.mark.parametrize(
+    ("text", "faces", "volume"),
+    [
+        # Pappus: a tube's volume is that of its section times the way of its middle, here a trefoil's.
+        ('shape = "knot"\nradius = 3\ntube_radius = 0.1\nsections = [600, 60]', 72_000, None),
+        ('shape = "revolve"\nprofile = [[1, 0], [1, 2]]\nsections = 500', 2000, 2 * math.pi),
+        ('shape = "revolve"\nprofile = [[1, 0], [2, 3]]\nsections = 500', 2000, 7 * math.pi),
+        # Half of a thread's depth is cut away on average: the square of the radius averages r^2 - r d + d^2 / 3.
+        (
+            'shape = "bolt"\nradius = 1\nlength = 4\npitch = 0.4\nhead = 3\nsections = [240, 400]',
+            192_960,
+            math.pi * 4 * (1 - 0.2 + 0.04 / 3) + 0.6 * 9 * math.sqrt(3) / 2,
+        ),
+        (
+            'shape = "nut"\nradius = 1\nheight = 2\npitch = 0.4\nwidth = 3\nsections = [240, 200]',
+            96_960,
+            2 * 9 * math.sqrt(3) / 2 - 2 * math.pi * (1.04**2 - 1.04 * 0.2 + 0.04 / 3),
+        ),
+    ],
+)
+def test_generated_solids(tmp_path, text, faces, volume):
+    from warp_abtree.app.toml import keys as scene_keys
+    from warp_abtree.app.toml import models as scene_models
+
+    parameters = {}
+    exec(text, {}, parameters)
+    name = parameters.pop("shape")
+    checked = {key: check(parameters[key]) for key, check in scene_models.SHAPES[name].items()}
+    mesh = scene_models.OWN[name](**checked)
+    assert len(mesh.faces) == faces and mesh.is_volume and scene_keys is not None
+    if volume is None:
+        u = np.linspace(0, 2 * np.pi, 100_001)
+        r = np.cos(3 * u) + 2
+        way = np.stack([r * np.cos(2 * u), r * np.sin(2 * u), -np.sin(3 * u)], 1)
+        volume = math.pi * 0.1**2 * np.linalg.norm(np.diff(way, axis=0), axis=1).sum()
+    assert mesh.volume == pytest.approx(volume, rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_nut_runs_on_its_bolt(device):
+    from warp_abtree.app.toml import models as scene_models
+
+    bolt = ab.Model.load(scene_models.bolt(1.0, 3.0, 0.5, 3.0, (48, 181)))
+    nut = ab.Model.load(scene_models.nut(1.0, 0.5, 0.5, 3.0, (48, 31)))
+    turns = np.array([0.0, 1 / 3, 0.75, 1.0, 1.5])
+
+    def count(rise, turns):
+        half = math.pi * turns
+        poses = np.zeros((len(turns), 7))
+        poses[:, 2], poses[:, 5], poses[:, 6] = 1 + rise * 0.5 * turns, np.sin(half), np.cos(half)
+        return ab.sweep(bolt, nut, poses, output="count", device=device)
+
+    assert (count(1, turns) == 0).all(), "along the thread it is free"
+    assert (count(-1, turns[1:3]) > 0).all() and (count(2, turns[1:3]) > 0).all(), "otherwise it is not"
+
+
+def test_terrain_is_an_open_sheet_that_faces_up(tmp_path):
+    text = '[models.t]\nshape = "terrain"\nextents = [8, 4]\ncells = [10, 6]\nbumps = 0.1\nwaves = 2\nrim = 1\n'
+    model = load(tmp_path, text + '[[objects]]\nmodel = "t"\n').models["t"]
+    vertices, faces, _ = model.mesh_at(model.lod_max)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    assert (np.cross(b - a, c - a)[:, 1] > 0).all() and len(faces) == 120
+    assert np.allclose(np.ptp(vertices, axis=0)[[0, 2]], [8, 4])
+    corner = np.abs(vertices[:, [0, 2]]).sum(axis=1).argmax()
+    assert vertices[corner, 1] == pytest.approx(2.0, abs=0.11) == vertices[:, 1].max()
+
+
+def test_faces_are_brought_to_a_number(tmp_path):
+    sizes = {"fewer": 200, "more": 1500, "odd": 201}
+    text = "".join(f'[models.{n}]\nshape = "icosphere"\nsubdivisions = 2\nfaces = {f}\n' for n, f in sizes.items())
+    models = load(tmp_path, text + '[[objects]]\nmodel = "odd"\n').models
+    assert [model.face_count for model in models.values()] == [200, 1500, 200]
+    for model in models.values():
+        vertices, _, _ = model.mesh_at(model.lod_max)
+        assert 0.9 < np.linalg.norm(vertices, axis=1).mean() < 1.01
+
+
+def test_a_shape_stands_in_for_meshes_that_are_not_there(tmp_path):
+    text = '[models.m]\nmesh = ["gone.obj", "box.obj"]\nshape = "icosphere"\n[[objects]]\nmodel = "m"\n'
+    model = load(tmp_path, text).models["m"]
+    assert (model.name, model.face_count) == ("m (an icosphere)", 1280)
+    import trimesh
+
+    trimesh.creation.box().export(tmp_path / "box.obj")
+    model = load(tmp_path, text).models["m"]
+    assert (model.name, model.face_count) == ("m (box.obj)", 12)
+    with pytest.raises(ab.SceneError, match=r"gone.obj: no such file"):
+        load(tmp_path, text.replace('"box.obj"', '"gone.obj"').replace('shape = "icosphere"\n', ""))
+
+
+# Copies.
+
+
+def test_a_grid_grows_with_count(tmp_path):
+    ball = '[models.ball]\nshape = "icosphere"\nsubdivisions = 0\n[[objects]]\nmodel = "ball"\n'
+    text = ball + "count = 7\nposition = [0, 10, 0]\ngrid = { size = [2, 0, 1], spacing = [1, 3, 1] }\n"
+    expected = [[x, 10 + y, 0] for y in (0, 3, 6, 9) for x in (-0.5, 0.5)][:7]
+    assert np.allclose(load(tmp_path, text).motion.position, expected)
+    assert load(tmp_path, text, objects=3).motion.position.tolist() == expected[:3]
+
+
+def test_another_number_of_objects(tmp_path):
+    ball = '[models.ball]\nshape = "icosphere"\nsubdivisions = 0\n'
+    row = '[[objects]]\nmodel = "ball"\n'
+    text = ball + row + "count = 2\nworlds = 30\n" + row + "worlds = 30\n" + row + "count = 10\n" + row
+    for asked, worlds, count in ((None, 30, 10), (51, 15, 5), (201, 60, 20), (1, 1, 1)):
+        loaded = load(tmp_path, text, objects=asked)
+        assert loaded.scene.object_count == 3 * worlds + count + 1
+        assert loaded.worlds.max() == worlds - 1
+    with pytest.raises(ab.SceneError, match="count or worlds"):
+        load(tmp_path, ball + row + "grid = { size = [2, 2, 2], spacing = [1, 1, 1] }\n", objects=3)
+
+
+# What steers a run.
+
+
+def test_camera_goes_along_its_key_points(tmp_path):
+    camera = load(tmp_path, RINGS).camera
+    for time, eye, target in (
+        (-1, [0, 0, 9], [0, 0, 0]),
+        (0.25, [1, 0, 4.5], [0, 0, -4.5]),
+        (9, [2, 0, 0], [0, 0, -9]),
+    ):
+        found = camera(time)
+        back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
+        assert np.allclose(found.eye, eye) and np.allclose(found.view[2], back) and found.far == 20
+    looped = load(tmp_path, RINGS.replace("far = 20", "far = 20\nloop = true")).camera
+    assert np.allclose(looped(1.75).eye, [1, 0, 4.5])
+    still = load(tmp_path, RINGS.split("[camera]")[0] + "[models" + RINGS.split("[models", 1)[1]).camera
+    assert still is None
+
+
+def test_controllers_of_a_file(tmp_path):
+    loaded = load(tmp_path, RINGS.replace("tolerance = 0.02", "tolerance = 0.02\nsteps = 1\naim = 0.8\nlow = 0.5"))
+    frame = loaded.frame()
+    assert isinstance(frame.lods, ab.PredictiveController) and frame.lods.budget_ms == 4
+    assert isinstance(loaded.frame(controller="paper", budget_ms=9).lods, ab.PaperController)
+    assert loaded.frame(budget_ms=9).lods.budget_ms == 9
+    tolerant = loaded.frame(controller="tolerance")
+    assert isinstance(tolerant.lods, ab.ToleranceController)
+    assert tolerant.run(3)[-1].budget_ms is None
+    top = loaded.models["ring"].lod_max
+    assert np.unique(loaded.scene.lods).tolist() == [top], "a ladder of one step"
+    fine = load(tmp_path, RINGS).frame(controller="tolerance")
+    assert fine.run(3)[-1].error_max > 0 and fine.scene.lods.max() < top
+    off = loaded.frame(controller="none")
+    assert off.lods is None and off.run(1)[0].error_max == 0
+    for asked in ({"controller": "tolerance", "budget_ms": 3}, {"controller": "none", "budget_ms": 3}):
+        with pytest.raises(ValueError, match="holds no budget"):
+            loaded.frame(**asked)
+    plain = load(tmp_path, RINGS.split("[camera]")[0] + "[models" + RINGS.split("[models", 1)[1])
+    for controller, message in (("paper", "needs a budget"), ("tolerance", "needs lod.tolerance"), ("x", "none of")):
+        with pytest.raises(ValueError, match=message):
+            plain.frame(controller=controller)
+    assert isinstance(plain.frame(budget_ms=3).lods, ab.PredictiveController)
+
+
+@pytest.mark.slow
+def test_near_objects_refine(tmp_path, device):
+    """With counted work in the place of time: at one budget, errors rise with the distance from the camera."""
+    loaded = load_ours("focus", device, [("size = [10, 5, 0]", "size = [2, 2, 0]")], objects=80)
+    finest = loaded.frame(controller="none", clock=ab.WorkClock(RATES)).run(1)[0].cost_ms
+    frame = loaded.frame(budget_ms=finest / 3, clock=ab.WorkClock(RATES))
+    frame.run(90)
+    time = frame.history[-1].time
+    away = np.linalg.norm(loaded.motion.poses(time)[:, :3] - loaded.camera(time).eye, axis=1)
+    models = np.take(np.array(loaded.scene.models, object), loaded.scene.object_model)
+    error = np.array([model.error_at(int(lod)) for model, lod in zip(models, loaded.scene.lods)])
+    near = away < np.median(away)
+    assert 0 < error[near].mean() < 0.9 * error[~near].mean()
+    assert frame.summary()["budget"]["within_tenth"] >= 0.95
+    assert loaded.camera(8.0).eye[2] < loaded.motion.position[:, 2].min(), "the camera comes out behind the field"
+    again = loaded.frame(budget_ms=finest / 3, clock=ab.WorkClock(RATES))
+    assert np.array_equal(loaded.scene.arrays()[2].pool.position.numpy(), loaded.motion.poses(0.0)[:, :3])
+    assert [row.error_mean for row in again.run(12)] == [row.error_mean for row in frame.history[:12]]
+
+
+def test_rigid_bodies_of_a_file(tmp_path, device):
+    loaded = load(tmp_path, BODIES, device=device)
+    bodies = loaded.make_bodies()
+    model = loaded.models["ring"]
+    volume = bodies.mass[0] / 2
+    assert volume == pytest.approx(2 * math.pi**2 * 0.6 * 0.2**2, rel=0.05) and model.face_count == 2048
+    assert np.flatnonzero(~bodies.rigid).tolist() == [24, 25] and bodies.driven.tolist() == [False] * 24 + [True, False]
+    assert bodies.gravity.tolist() == [0, -1, 0]
+    velocity, spin = bodies.velocities()
+    assert np.allclose(velocity[:24], [0, 0, 1]) and np.allclose(velocity[24:], 0)
+    assert 1 < np.linalg.norm(spin[:24], axis=1).max() <= math.radians(200)
+    frame = loaded.frame(controller="none", bodies=bodies)
+    start = bodies.poses()
+    frame.run(4)
+    poses = bodies.poses()
+    # Three tenths of a second and one more: the driven one follows the shuttle, the static one stays, others fall.
+    assert np.allclose(poses[24, :3], loaded.motion.poses(0.4)[24, :3]) and np.array_equal(poses[25], start[25])
+    assert poses[:24, 1].mean() < start[:24, 1].mean()
+    assert np.array_equal(loaded.make_bodies().poses(), start)
+    again = loaded.frame(controller="none").run(4)
+    assert [row.hits for row in again] == [row.hits for row in frame.history], "a run begins at the start"
+
+
+# The scenes.
+
+
+@pytest.mark.slow
+def test_rain(device):
+    loaded = load_ours("rain", device, [("cells = [128, 128]", "cells = [16, 16]")], objects=30)
+    assert 29 <= loaded.scene.object_count <= 31 and loaded.frames >= 300
+    frame = loaded.frame(budget_ms=12, clock=ab.WorkClock(RATES))
+    frame.run(90)
+    late = frame.history[60:]
+    assert min(row.touching for row in late) > 5 and frame.history[0].touching < 5
+    assert frame.summary()["budget"]["within_tenth"] >= 0.95
+    assert all(row.answer_ms >= 0 and row.error_mean > 0 for row in late)
+    height = frame.motion.dynamics.poses()[1:, 1]
+    assert height.min() > -0.6 and np.median(height) < 2.5
+
+
+def test_worlds(device):
+    assert "worlds = 4096" in (SCENES / "worlds.toml").read_text()
+    loaded = load_ours("worlds", device, objects=16)
+    assert np.bincount(loaded.worlds).tolist() == [2] * 8
+    result = loaded.frame().step()
+    assert (np.diff(result.pairs, axis=1) == 8).all() and result.any.any()
+
+
+def test_needle(device):
+    loaded = load_ours("needle", device)
+    rows = loaded.frame().run(3)
+    assert all(row.hits > 0 for row in rows)
+    scene = loaded.scene
+    result = scene.intersect(output="faces")
+    meets = dict(zip(map(tuple, result.pairs.tolist()), result.any.tolist()))
+    boxes = np.flatnonzero(loaded.worlds == 4)
+    middle = boxes[0]
+    assert [meets.get((middle, other), False) for other in boxes[1:]] == [True, True, True, False]
+    # Exact brute force on the slivers, the far ones and the tiny ones of this frame.
+    poses = loaded.motion.poses(2 * loaded.time_step)
+    checked = 0
+    for p, (i, j) in enumerate(result.pairs.tolist()):
+        a, b = (scene.models[scene.object_model[k]] for k in (i, j))
+        if a.face_count * b.face_count > 110_000:
+            continue
+        mesh_a, mesh_b = a.mesh_at(a.lod_max), b.mesh_at(b.lod_max)
+        hits = brute_force_faces(*mesh_a[:2], *mesh_b[:2], poses[i], poses[j])
+        true = {(int(mesh_a[2][x]), int(mesh_b[2][y])) for x, y in hits}
+        assert {(x, y) for q, x, y in result.faces.tolist() if q == p} == true
+        checked += 1
+    assert checked >= 12
+
+
+def test_table1_stands_at_the_face_counts_of_the_paper(device):
+    text = (SCENES / "table1.toml").read_text()
+    for line in ("faces = 4204", "faces = 5804", "faces = 57563", "base_faces = 500"):
+        assert f"\n{line}\n" in text
+    small = [("warp:", "none/"), ("faces = 57563", "faces = 1001"), ("sections = [600, 60]", "sections = [80, 10]")]
+    loaded = load_ours("table1", device, small)
+    models = loaded.models
+    assert [models[name].face_count for name in ("bones", "cow", "bunny")] == [4204, 5804, 1000]
+    assert [len(models[name].mesh_at(0)[1]) for name in ("bones", "cow", "bunny")] == [10, 10, 500]
+    assert models["cow"].name == "cow (a knot)"
+    rows = loaded.frame().run(8)
+    assert rows[0].faces == 4204 + 5804 + 1000 and rows[7].faces < rows[0].faces and rows[0].hits > 0
+
+
+# Recordings.
+
+
+@pytest.mark.parametrize("text", [RINGS, BODIES], ids=["prescribed", "bodies"])
+def test_a_recorded_run_runs_again(tmp_path, device, text):
+    # A budget that every machine keeps, so that LODs climb.
+    frame, first = record_run(load(tmp_path, text, device=device, objects=12), 8, budget_ms=1e4)
+    assert len({row.cost_ms for row in first.rows}) == 8, "real times"
+    path = tmp_path / "run.npz"
+    first.save(path)
+    assert [entry.name for entry in tmp_path.iterdir() if "partial" in entry.name] == []
+    opened = Recording.open(path)
+    assert opened.rows == frame.history and opened.settings == first.settings
+    (tmp_path / "scene.toml").unlink()
+    loaded = opened.load_scene(path, device)
+    assert loaded.scene.object_count == first.lods.shape[1] < 15
+    again, second = record_run(loaded, 8, opened, budget_ms=1e4)
+    assert again.history == frame.history and opened.difference(second) is None
+    assert second.lods.tobytes() == first.lods.tobytes() and second.poses.tobytes() == first.poses.tobytes()
+    assert len(np.unique(first.lods)) > 1 and not np.array_equal(first.poses[0], first.poses[-1])
+    if text is RINGS:
+        assert np.array_equal(first.poses[3], loaded.motion.poses(3 * 0.1))
+
+
+def test_a_difference_is_named(tmp_path):
+    _, first = record_run(load(tmp_path, RINGS, objects=12), 4)
+    _, second = record_run(load(tmp_path, RINGS, objects=12), 4, first)
+    assert first.difference(second) is None
+    second.lods[2, 5] += 1
+    assert first.difference(second) == "frame 2: lods are not those recorded"
+    _, other = record_run(load(tmp_path, RINGS.replace("degrees", "degrees"), objects=12), 4, first, controller="none")
+    assert "frame 0: " in first.difference(other)
+
+
+def test_damaged_recordings_are_refused(tmp_path):
+    _, recording = record_run(load(tmp_path, RINGS, objects=8), 2)
+    path = tmp_path / "run.npz"
+    recording.save(path)
+    with np.load(path) as file:
+        good = {name: file[name] for name in file.files}
+    settings = json.loads(str(good["settings"]))
+    bad = [
+        ({"format": np.array("x")}, "not a recording of a run"),
+        ({"version": np.array(FORMAT_VERSION + 1)}, f"version {FORMAT_VERSION + 1}"),
+        ({"lods": good["lods"][:1]}, "lods: shape"),
+        ({"lods": good["lods"].astype(np.int64)}, "int64"),
+        ({"poses": good["poses"][:, :, :6]}, "poses: shape"),
+        ({"row_hits": good["row_hits"][:1]}, "row_hits"),
+        ({"settings": np.array("{}")}, "is missing"),
+        ({"settings": np.array("{")}, "damaged"),
+        ({"settings": np.array(json.dumps({**settings, "objects": "many"}))}, "objects is 'many'"),
+        ({"poses": np.array([{}], dtype=object)}, "not a recording"),
+    ]
+    for changes, message in bad:
+        np.savez(path, **{**good, **changes})
+        with pytest.raises(ValueError, match=message) as caught:
+            Recording.open(path)
+        assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
+    np.savez(path, **{name: value for name, value in good.items() if name != "row_hits"})
+    with pytest.raises(ValueError, match="row_hits' is missing"):
+        Recording.open(path)
+    for content in (b"", b"junk", b"PK\x03\x04junk"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="not a recording"):
+            Recording.open(path)
+    with pytest.raises(ValueError, match="No such file"):
+        Recording.open(tmp_path / "gone.npz")
+
+
+def test_another_mesh_is_noticed(tmp_path):
+    import trimesh
+
+    trimesh.creation.box().export(tmp_path / "m.obj")
+    loaded = load(tmp_path, '[models.m]\nmesh = "m.obj"\n[[objects]]\nmodel = "m"\n')
+    _, recording = record_run(loaded, 1)
+    trimesh.creation.box([1, 1, 2]).export(tmp_path / "m.obj")
+    with pytest.raises(ValueError, match=r"run.npz: the mesh of models.m is not"):
+        recording.load_scene("run.npz")
+    (tmp_path / "m.obj").unlink()
+    with pytest.raises(ab.SceneError, match=r"m.obj: no such file"):
+        recording.load_scene("run.npz")

@@ -1,0 +1,213 @@
+"""The page on its server, without a browser; the standalone page; the command, and one line for anything bad."""
+
+import base64
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+import trimesh
+from helpers.viewer import make_models, make_source, write_scene
+
+import warp_abtree as ab
+from warp_abtree.app.cli import main as cli
+from warp_abtree.app.viewer.playback import open_source
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_scene(tmp_path)
+    trimesh.creation.box().export("box.obj")
+    Path("bad.toml").write_text("[scene]\nspeed = 3\n")
+    return tmp_path
+
+
+@pytest.fixture
+def server():
+    pytest.importorskip("viser")
+    from warp_abtree.app.viewer.command import serve
+
+    before = set(threading.enumerate())
+    with serve() as server:
+        yield server
+        assert len(left_over(before)) > 0
+    end = time.monotonic() + 10
+    while left_over(before) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not left_over(before), "threads end with the server"
+
+
+def left_over(before):
+    """Return threads that came since, without those that the library keeps for its launches."""
+    since = set(threading.enumerate()) - before
+    return [thread.name for thread in since if not thread.name.startswith("warp_abtree")]
+
+
+@pytest.fixture
+def page(server, device):
+    from warp_abtree.app.viewer.page import Page
+
+    page = Page(server, make_source(make_models(), device))
+    page.run(seconds=0.3)
+    return page
+
+
+@pytest.mark.slow
+def test_a_page_stands_until_it_is_told_to_play(page):
+    assert page.moments == 1 and page.moment.number == 0 and "| state | paused |" in page._state.content
+    page._note(page._run_button, "step")
+    page.run(seconds=0.3)
+    assert page.moments == 2 and page.moment.row.frame == 0 and not page.playing
+    page._note(page._run_button, "play")
+    page.run(seconds=0.5)
+    assert page.playing and page.moment.number > 2 and page.rate > 0 and len(page._rows) == page.moment.number + 1
+    page._note(page._run_button, "play")
+    page.run(seconds=0.2)
+    number = page.moment.number
+    page.run(seconds=0.2)
+    assert page.moment.number == number
+    page._note(page._run_button, "restart")
+    page.run(seconds=0.2)
+    assert page.moment.number == 0 and not page._rows
+
+
+@pytest.mark.slow
+def test_what_people_do_reaches_the_scene(page):
+    top = page.source.scene.models[0].lod_max
+    page._note(page._hold_all, 50.0)
+    page.run(seconds=0.2)
+    assert page.moment.lods.tolist() == [round(0.5 * top), 141, round(0.5 * top)]
+    page._note(page._pick, 1)
+    page._note(page._hold_picked, 10.0)
+    page.run(seconds=0.2)
+    assert page.moment.lods[1] == 28 and page._picked.value == 1 and not page._own.disabled
+    assert "28 of 282, held" in page._numbers.content and page._gizmo is not None
+    page._note(page._release, 1)
+    page.run(seconds=0.2)
+    assert page.moment.lods[1] == 282 and page.moment.lods[0] == round(0.5 * top) and page._own.disabled
+    page._note(page._set_budget, 7.0)
+    page.run(seconds=0.2)
+    assert page.source.budget_ms == 7.0 and page._way.value == "budget, predicted"
+    page._note(page._run_button, "step")
+    page.run(seconds=0.3)
+    assert page.moment.row.budget_ms == 7.0
+    page._note(page._pick, -1)
+    page.run(seconds=0.2)
+    assert page.settings.picked is None and page._gizmo is None and page._lod.disabled
+
+
+def test_a_page_closes_from_another_thread(page):
+    thread = threading.Thread(target=page.run)
+    thread.start()
+    page.close()
+    thread.join(timeout=10)
+    assert not thread.is_alive()
+
+
+def test_a_standalone_page_holds_all_that_it_shows(files, capsys):
+    msgspec, zstandard = pytest.importorskip("msgspec"), pytest.importorskip("zstandard")
+    pytest.importorskip("viser")
+    assert cli.main(["view", "scene.toml", "--record", "page.html", "--frames", "3", "--device", "cpu"]) == 0
+    assert capsys.readouterr().out == "wrote page.html\n"
+    page = Path("page.html").read_text(encoding="utf-8")
+    assert not re.findall(r"""(?:src|href)=["'](?:https?:|/)""", page), "nothing is fetched"
+    assert '<details id="about"' in page and "2 objects" not in page and "4 objects, 3 frames on cpu" in page
+    packed = base64.b64decode(re.search(r'__VISER_EMBED_DATA__="([^"]*)"', page)[1])
+    inner = zstandard.ZstdDecompressor().decompressobj().decompress(packed[8:])
+    found = msgspec.msgpack.decode(inner[8 : 8 + int.from_bytes(inner[:8], "little")], strict=False)
+    assert found["durationSeconds"] == pytest.approx(3 * 0.25)
+    names = [message.get("name") for _, message in found["messages"]]
+    assert {"/objects/0", "/objects/1", "/struck/0", "/struck/1", "/contacts"} <= set(names)
+    later = [message["name"] for time, message in found["messages"] if time > 0 and "name" in message]
+    assert "/objects/1" in later and "/contacts" in later
+    assert sorted(path.name for path in files.glob("page*")) == ["page.html"]
+
+
+@pytest.mark.slow
+def test_view_serves_until_it_is_interrupted(files):
+    pytest.importorskip("viser")
+    command = [sys.executable, "-m", "warp_abtree", "view", "box.obj", "box.obj", "--port", "0", "--device", "cpu"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        [*command, "--json"], env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        try:
+            found = json.loads(process.stdout.readline())
+            with urllib.request.urlopen(found["address"], timeout=20) as answer:
+                assert answer.status == 200 and b"<html" in answer.read(2000)
+            process.send_signal(signal.SIGINT)
+            shown, errors = process.communicate(timeout=20)
+        finally:
+            process.kill()
+    assert found["objects"] == 2 and found["title"] == "box"
+    assert process.returncode == 0 and not shown
+    assert not [line for line in errors.splitlines() if "compiling kernels" not in line]
+
+
+BAD = [
+    (("view",), "SCENE_OR_MESHES"),
+    (("view", "gone.toml"), "gone.toml"),
+    (("view", "bad.toml"), "bad.toml: scene.speed: unknown key"),
+    (("view", "gone.obj"), "gone.obj"),
+    (("view", "box.obj", "scene.toml"), "a scene file is looked at alone"),
+    (("view", "box.obj", "--port", "70000"), "--port: 70000 is outside"),
+    (("view", "box.obj", "--host", "no.such.host.invalid"), "no.such.host.invalid:0: cannot be served at"),
+    (("view", "box.obj", "--frames", "3"), "--frames: of --record"),
+    (("view", "box.obj", "--record", "page.txt"), "must end in .html"),
+    (("view", "box.obj", "--record", "gone/page.html"), "no folder gone"),
+    (("view", "box.obj", "--device", "cuda:77"), "cuda:77"),
+    (("view", "box.obj", "--budget", "soon"), "no time above 0"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+def test_bad_input_gives_one_line(files, capsys, arguments, message):
+    pytest.importorskip("viser")
+    before = sorted(files.iterdir())
+    assert cli.main(list(arguments)) == 2
+    captured = capsys.readouterr()
+    errors = captured.err.splitlines()
+    assert len(errors) == 1 and message in errors[0] and errors[0].startswith("warp-abtree: ")
+    assert not captured.out and sorted(files.iterdir()) == before
+
+
+def test_a_port_that_is_taken(files, capsys):
+    pytest.importorskip("viser")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        assert cli.main(["view", "box.obj", "--port", str(port)]) == 2
+    assert f"127.0.0.1:{port}: cannot be served at (Address already in use)" in capsys.readouterr().err
+
+
+def test_without_viser(files, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert cli.main(["view", "box.obj"]) == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 1 and "view needs viser: pip install warp-abtree[view]" in errors[0]
+
+
+def test_a_recording_has_a_slider_of_frames(files, server):
+    from warp_abtree.app.recording import record_run
+    from warp_abtree.app.viewer.page import Page
+
+    record_run(ab.load_scene("scene.toml", device="cpu"), 4)[1].save("run.npz")
+    page = Page(server, open_source(["run.npz"], "cpu"))
+    page._note(page._seek, 2)
+    page.run(seconds=0.3)
+    assert page.moment.number == 2 and page._frame_slider.value == 2 and page._budget is None
+    page._note(page._run_button, "step")
+    page.run(seconds=0.3)
+    assert page.moment.number == 3 and page.moment.row.frame == 3

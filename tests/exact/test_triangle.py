@@ -1,0 +1,155 @@
+"""The triangle test against exact arithmetic, degenerate cases above all."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+import warp as wp
+from oracles import triangle as oracle
+
+from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, UNSURE
+from warp_abtree.kernels.triangle.float64_filter import decide_triangles
+
+pytestmark = pytest.mark.slow
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+ORDERS = [(p, q) for p in permutations(range(3)) for q in permutations(range(3))]
+
+
+@wp.kernel
+def intersect_pair_kernel(mode: wp.int32, corners: wp.array2d(dtype=wp.vec3d), meet_out: wp.array(dtype=wp.int32)):
+    """Test triangles corners[i, :3] and corners[i, 3:]."""
+    i = wp.tid()
+    meet_out[i] = decide_triangles(
+        mode, corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
+    )
+
+
+def meet(pairs, device):
+    """Return the kernel's answers for triangle pairs (k, 2, 3, 3), with which the filter agrees where it is sure."""
+    corners = wp.array(np.ascontiguousarray(pairs).reshape(-1, 6, 3), dtype=wp.vec3d, device=device)
+    found = {}
+    for mode in (EXACT, FILTER):
+        answers = wp.zeros(len(pairs), dtype=wp.int32, device=device)
+        wp.launch(intersect_pair_kernel, dim=len(pairs), inputs=[int(mode), corners, answers], device=device)
+        found[mode] = answers.numpy()
+    sure = found[FILTER] != int(UNSURE)
+    np.testing.assert_array_equal(found[FILTER][sure], found[EXACT][sure])
+    return found[EXACT] != 0
+
+
+def truth(pairs):
+    """Return the exact answers for triangle pairs of one magnitude."""
+    points = pairs.reshape(-1, 3)
+    index = np.arange(len(points)).reshape(-1, 2, 3)
+    rows = np.arange(len(pairs))
+    return oracle.pairs_intersect(points, index[:, 0], points, index[:, 1], np.stack([rows, rows], 1))
+
+
+def generic(rng, count):
+    """Triangles of all sizes near each other."""
+    size = 2.0 ** rng.uniform(-3, 1, (count, 2, 1, 1))
+    return rng.normal(size=(count, 2, 3, 3)) * size + 0.5 * rng.normal(size=(count, 2, 1, 3))
+
+
+def lattice(size):
+    """Corners on a small lattice: most pairs touch, are coplanar or have zero area."""
+    return lambda rng, count: rng.integers(0, size, (count, 2, 3, 3)).astype(float)
+
+
+def in_plane(rng, count):
+    """Both triangles in one oblique plane, some of them segments and points."""
+    u, v, origin = (rng.integers(-(2**9), 2**9, (count, 1, 1, 3)).astype(float) for _ in range(3))
+    s, t = (rng.integers(-2, 3, (count, 2, 3, 1)).astype(float) for _ in range(2))
+    return u * s + v * t + origin
+
+
+def touching(rng, count):
+    """The second triangle starts on a corner, an edge or the inside of the first, and some of it lies in its plane."""
+    a = 4.0 * rng.integers(-(2**8), 2**8, (count, 3, 3))
+    weight = rng.choice([0.0, 0.25, 0.5, 1.0, -0.5], (count, 3, 3))
+    weight[:, :, 2] = 1 - weight[:, :, 0] - weight[:, :, 1]
+    b = (weight[:, :, :, None] * a[:, None]).sum(2)
+    off = rng.integers(0, 2, (count, 3, 1)) * rng.integers(-64, 65, (count, 3, 3))
+    off[:, 0] = 0
+    return np.stack([a, b + off], 1)
+
+
+def collinear(rng, count):
+    """Segments and points along few lines, against each other and against triangles."""
+    origin, way = rng.integers(-4, 5, (2, count, 2, 1, 3)).astype(float)
+    segment = origin + way * rng.integers(-3, 4, (count, 2, 3, 1))
+    whole = rng.random((count, 2, 1, 1)) < 0.3
+    return np.where(whole, rng.integers(-4, 5, (count, 2, 3, 3)), segment).astype(float)
+
+
+def same_line(rng, count):
+    """Segments and points of one line."""
+    origin, way = rng.integers(-4, 5, (2, count, 1, 1, 3)).astype(float)
+    return origin + way * rng.integers(-4, 5, (count, 2, 3, 1))
+
+
+# Determinants of these small integers are exact in float64, so no answer may differ; generic ones are never so near.
+KINDS = {
+    "generic": (generic, 40_000),
+    "lattice of 2": (lattice(2), 20_000),
+    "lattice of 3": (lattice(3), 40_000),
+    "lattice of 6": (lattice(6), 30_000),
+    "in one plane": (in_plane, 30_000),
+    "touching": (touching, 30_000),
+    "collinear": (collinear, 30_000),
+    "on one line": (same_line, 10_000),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_answers_are_exact(device, kind):
+    make, count = KINDS[kind]
+    pairs = make(np.random.default_rng(1), count)
+    expected = truth(pairs)
+    assert 0.02 < expected.mean() < 0.99, "both answers need to occur"
+    wrong = np.flatnonzero(meet(pairs, device) != expected)
+    assert len(wrong) == 0, f"{len(wrong)} wrong, first: {pairs[wrong[0]].tolist()}, exact {expected[wrong[0]]}"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_answers_do_not_depend_on_order(device, kind):
+    pairs = KINDS[kind][0](np.random.default_rng(2), 1200)
+    expected = truth(pairs)
+    for p, q in ORDERS:
+        turned = np.stack([pairs[:, 0][:, p], pairs[:, 1][:, q]], 1)
+        np.testing.assert_array_equal(meet(turned, device), expected)
+        np.testing.assert_array_equal(meet(turned[:, ::-1], device), expected)
+
+
+@pytest.mark.parametrize("exponent", [-280, -100, -30, 30, 100, 280])
+def test_answers_do_not_depend_on_scale(device, exponent):
+    rng = np.random.default_rng(3)
+    pairs = np.concatenate([make(rng, 500) for make, _ in KINDS.values()])
+    np.testing.assert_array_equal(meet(np.ldexp(pairs, exponent), device), truth(pairs))
+
+
+def test_certain_answers_survive_rounding(device):
+    """A float64 determinant may lie about triangles that almost touch, but not about those it can prove apart."""
+    rng = np.random.default_rng(4)
+    pairs = touching(rng, 30_000) / 7.0 + rng.normal(size=(30_000, 1, 1, 3))
+    pairs[:, 1] += rng.choice([0.0, 1e-15, 1e-12, 1e-6], (30_000, 1, 1)) * rng.normal(size=(30_000, 1, 3))
+    apart = oracle.provably_apart(pairs[:, 0], pairs[:, 1])
+    answers = meet(pairs, device)
+    assert 1000 < apart.sum() < 29_000
+    assert not answers[apart].any()
+    assert (answers == truth(pairs)).mean() > 0.8
+
+
+def test_a_triangle_meets_itself_and_its_neighbours(device):
+    """Shared corners cancel exactly, so faces of one mesh that share a vertex always meet, whatever the coordinates."""
+    rng = np.random.default_rng(5)
+    pairs = rng.normal(size=(20_000, 2, 3, 3)) * 2.0 ** rng.integers(-20, 20, (20_000, 1, 1, 1))
+    shared = rng.integers(1, 4, 20_000)
+    for corner in range(3):
+        rows = shared > corner
+        pairs[rows, 1, corner] = pairs[rows, 0, corner]
+    order = rng.permuted(np.tile(np.arange(3), (20_000, 1)), axis=1)
+    pairs[:, 1] = np.take_along_axis(pairs[:, 1], order[:, :, None], 1)
+    assert meet(pairs, device).all()

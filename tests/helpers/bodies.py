@@ -1,0 +1,51 @@
+"""Bodies and scenes that rigid-body tests start from."""
+
+import numpy as np
+import trimesh
+
+import warp_abtree as ab
+
+FLOOR = (0, 0, -0.5, 0, 0, 0, 1)
+
+
+NO_GRAVITY = {"gravity": (0, 0, 0)}
+
+
+def model_of(mesh):
+    return ab.Model.from_arrays(np.asarray(mesh.vertices), np.asarray(mesh.faces), base_faces=4)
+
+
+def box(*extents, splits=0):
+    mesh = trimesh.creation.box(extents)
+    for _ in range(splits):
+        mesh = mesh.subdivide()
+    return model_of(mesh)
+
+
+CUBE, BRICK = box(1, 1, 1), box(1, 0.7, 0.5)
+
+
+GROUND = box(8, 8, 1)
+
+
+BALL = model_of(trimesh.creation.icosphere(1, 0.5))
+
+
+TORUS = model_of(trimesh.creation.torus(0.5, 0.2, 8, 6))
+
+
+def about(axis, angle):
+    axis = np.asarray(axis, float) / np.linalg.norm(axis)
+    return (*(np.sin(angle / 2) * axis), np.cos(angle / 2))
+
+
+def make(device, *placed, world=0, **options):
+    """Return the dynamics of (model, pose) or (model, pose, static)."""
+    scene = ab.Scene(device)
+    for model, pose, *static in placed:
+        scene.add(model, pose=pose, static=bool(static and static[0]), world=world)
+    return ab.Dynamics(scene, **options)
+
+
+def on_ground(device, *placed, **options):
+    return make(device, (GROUND, FLOOR, True), *placed, **options)

@@ -1,0 +1,13 @@
+"""Kernels that ask for single signs."""
+
+import warp as wp
+
+from warp_abtree.kernels.arithmetic.predicates import (
+    orient2d,
+)
+
+
+@wp.kernel
+def orient2d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.int32)):
+    i = wp.tid()
+    out[i] = orient2d(mode, points[i, 0], points[i, 1], points[i, 2])

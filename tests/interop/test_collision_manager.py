@@ -1,0 +1,405 @@
+"""CollisionManager: the same calls on trimesh's, with FCL behind it; contacts on both surfaces; places given back."""
+
+import gc
+import itertools
+import math
+import weakref
+
+import numpy as np
+import pytest
+import trimesh
+from oracles.triangle import brute_force_faces
+
+import warp_abtree as ab
+from warp_abtree.interop import collision_manager, nearest
+from warp_abtree.interop import convex_solid as convex
+
+pytest.importorskip("fcl")
+from trimesh.collision import CollisionManager as TrimeshManager
+
+
+def shapes():
+    """Convex solids, surfaces with holes, an open sheet, and one of several parts."""
+    rng = np.random.default_rng(0)
+    ball, box = trimesh.creation.icosphere(subdivisions=1, radius=0.5), trimesh.creation.box((0.7, 0.9, 0.5))
+    parts = [trimesh.creation.icosphere(subdivisions=0, radius=0.1) for _ in range(5)]
+    for part in parts:
+        part.apply_translation(rng.uniform(-0.5, 0.5, 3))
+    sheet = trimesh.creation.icosphere(subdivisions=2, radius=0.8)
+    sheet = trimesh.Trimesh(sheet.vertices, sheet.faces[:60], process=False)
+    return {
+        "ball": ball,
+        "box": box,
+        "large box": trimesh.creation.box((2, 2, 2)),
+        "cylinder": trimesh.creation.cylinder(0.3, 1.2, sections=12),
+        "torus": trimesh.creation.torus(0.6, 0.2, 16, 8),
+        "annulus": trimesh.creation.annulus(0.3, 0.5, 0.6, sections=12),
+        "crumbs": trimesh.util.concatenate(parts),
+        "sheet": sheet,
+    }
+
+
+SHAPES = shapes()
+
+
+def random_transform(rng, spread, real=np.float32):
+    """A rigid matrix, by default of float32 numbers, which trimesh makes of those of add_object."""
+    matrix = trimesh.transformations.random_rotation_matrix(rng.random(3))
+    matrix[:3, 3] = rng.uniform(-spread, spread, 3)
+    return matrix.astype(real).astype(np.float64)
+
+
+def both(device):
+    return TrimeshManager(), ab.CollisionManager(device)
+
+
+def fill(managers, rng, count, spread, prefix=""):
+    for k in range(count):
+        mesh, transform = SHAPES[rng.choice(list(SHAPES))], random_transform(rng, spread)
+        for manager in managers:
+            manager.add_object(f"{prefix}{k}", mesh, transform)
+
+
+def bare(answer):
+    """Leave the contacts out of an answer."""
+    return answer[:2] if isinstance(answer, tuple) else answer
+
+
+# The same answers.
+
+
+@pytest.mark.slow
+def test_names_on_random_scenes(device, monkeypatch):
+    monkeypatch.setattr(collision_manager, "FIRST_PAIRS", 2)
+    rng = np.random.default_rng(1)
+    hits = misses = 0
+    for spread in (0.8, 1.5, 2.5, 4.0) * 3:
+        theirs, ours = both(device)
+        fill((theirs, ours), rng, 9, spread)
+        expected = theirs.in_collision_internal(return_names=True)
+        assert ours.in_collision_internal(return_names=True) == expected
+        assert ours.in_collision_internal() == theirs.in_collision_internal() == expected[0]
+        hits, misses = hits + len(expected[1]), misses + 36 - len(expected[1])
+        for mesh in SHAPES.values():
+            transform = random_transform(rng, spread)
+            asked = mesh, transform
+            expected = theirs.in_collision_single(*asked, return_names=True)
+            assert ours.in_collision_single(*asked, return_names=True) == expected
+            assert ours.in_collision_single(*asked) == theirs.in_collision_single(*asked) == expected[0]
+        others = both(device)
+        fill(others, rng, 6, spread, "other ")
+        expected = theirs.in_collision_other(others[0], return_names=True)
+        assert ours.in_collision_other(others[1], return_names=True) == expected
+        assert others[1].in_collision_internal(True) == others[0].in_collision_internal(True)
+    assert hits > 50 and misses > 50
+
+
+def test_a_scene_that_changes(device):
+    rng = np.random.default_rng(2)
+    managers = theirs, ours = both(device)
+    fill(managers, rng, 8, 1.2)
+    names = [str(k) for k in range(8)]
+    for step in range(40):
+        name = rng.choice(names)
+        if step % 3 == 0:
+            for manager in managers:
+                manager.remove_object(name)
+            names.remove(name)
+        elif step % 3 == 1:
+            name, mesh, transform = f"new {step}", SHAPES[rng.choice(list(SHAPES))], random_transform(rng, 1.2)
+            for manager in managers:
+                manager.add_object(name, mesh, transform)
+            names.append(name)
+        transform = random_transform(rng, 1.2)
+        for manager in managers:
+            manager.set_transform(names[step % len(names)], transform)
+        assert ours.in_collision_internal(True) == theirs.in_collision_internal(True)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_solids_as_trimesh_takes_them(device, name):
+    mesh = SHAPES[name]
+    assert convex.is_convex(mesh) == mesh.is_convex
+    crumb = trimesh.creation.icosphere(subdivisions=0, radius=0.01)
+    theirs, ours = both(device)
+    for manager in (theirs, ours):
+        manager.add_object(name, mesh)
+    for at in itertools.product((-0.4, 0.0, 0.4), repeat=3):
+        transform = trimesh.transformations.translation_matrix(at)
+        assert ours.in_collision_single(crumb, transform) == theirs.in_collision_single(crumb, transform)
+    surfaces = ab.CollisionManager(device, convex_solids=False)
+    surfaces.add_object(name, mesh)
+    assert not surfaces.in_collision_single(crumb)
+
+
+# Contacts.
+
+
+def distance_to_face(mesh, transform, face, point):
+    corners = trimesh.transform_points(mesh.triangles[face], transform)[None]
+    return np.linalg.norm(trimesh.triangles.closest_point(corners, point[None])[0] - point)
+
+
+def test_contacts_lie_on_both_faces(device):
+    rng = np.random.default_rng(3)
+    ours = ab.CollisionManager(device)
+    placed = {name: random_transform(rng, 0.5, np.float64) for name in SHAPES}
+    for name, transform in placed.items():
+        ours.add_object(name, SHAPES[name], transform)
+    found, pairs, contacts = ours.in_collision_internal(return_names=True, return_data=True)
+    assert found and {tuple(sorted(contact.names)) for contact in contacts} == pairs
+    for contact in contacts[:: max(1, len(contacts) // 200)]:
+        a, b = sorted(contact.names)
+        for name in (a, b):
+            gap = distance_to_face(SHAPES[name], placed[name], contact.index(name), contact.point)
+            if gap > 1e-12:  # of a part inside a solid
+                assert SHAPES[name].is_convex and (contact.segment[0] == contact.segment[1]).all()
+                corner = trimesh.transform_points(SHAPES[name].triangles[contact.index(name)][:1], placed[name])[0]
+                assert abs((contact.point - corner) @ contact.normal) == pytest.approx(contact.depth)
+        assert np.linalg.norm(contact.normal) == pytest.approx(1) and contact.depth >= 0
+
+
+def test_face_pairs_against_brute_force(device):
+    """The pair of a contact is a pair of faces that meet, and none is missed; indices are the meshes' own."""
+    a, b = SHAPES["torus"], SHAPES["cylinder"]
+    transform = trimesh.transformations.translation_matrix((0.5, 0.1, 0.02))
+    ours = ab.CollisionManager(device)
+    ours.add_object("a", a)
+    found, names, contacts = ours.in_collision_single(b, transform, return_names=True, return_data=True)
+    still, moved = [0, 0, 0, 0, 0, 0, 1], [0.5, 0.1, 0.02, 0, 0, 0, 1]
+    expected = brute_force_faces(a.vertices, a.faces, b.vertices, b.faces, still, moved)
+    assert found and names == {"a"} and len(expected) > 20
+    assert [[x.index("a"), x.index("__external")] for x in contacts] == expected.tolist()
+    other = ab.CollisionManager(device)
+    other.add_object("b", b, transform)
+    _, names, contacts = ours.in_collision_other(other, True, True)
+    assert names == {("a", "b")} and [[x.index("a"), x.index("b")] for x in contacts] == expected.tolist()
+
+
+def test_a_part_inside_a_solid(device):
+    ours = ab.CollisionManager(device)
+    ours.add_object("box", SHAPES["large box"], trimesh.transformations.translation_matrix((5, 0, 0)))
+    crumb, at = trimesh.creation.box((0.2, 0.2, 0.2)), trimesh.transformations.translation_matrix((5.5, 0, 0))
+    inner = ab.CollisionManager(device)
+    inner.add_object("crumb", crumb, at)
+    for answer in (ours.in_collision_single(crumb, at, True, True), ours.in_collision_other(inner, True, True)):
+        found, names, (contact,) = answer
+        assert found and len(names) == 1
+        # Corners at 5.4 are deepest, 0.6 under the plane x = 6.
+        assert contact.depth == pytest.approx(0.6) and contact.point[0] == pytest.approx(5.4)
+        assert np.allclose(contact.normal, [1, 0, 0])
+        assert (SHAPES["large box"].triangles[contact.index("box")][:, 0] == 1).all()
+    # One part out of several is enough, and the name of the solid may come second.
+    parts = trimesh.util.concatenate([crumb, crumb.copy().apply_translation((50, 0, 0))])
+    assert ours.in_collision_single(parts, trimesh.transformations.translation_matrix((-45, 0, 0)))
+    assert not ours.in_collision_single(parts, trimesh.transformations.translation_matrix((-40, 0, 0)))
+    hollow = ab.CollisionManager(device)
+    hollow.add_object("crumb", crumb)
+    assert hollow.in_collision_single(SHAPES["large box"]) and not hollow.in_collision_single(SHAPES["torus"])
+
+
+# Distances.
+
+
+@pytest.mark.parametrize("chunk", [128, nearest.CHUNK])
+@pytest.mark.slow
+def test_distances_on_random_scenes(device, monkeypatch, chunk):
+    monkeypatch.setattr(nearest, "CHUNK", chunk)
+    rng = np.random.default_rng(4)
+    apart = 0
+    for spread in (2.5, 4.0, 8.0):
+        theirs, ours = both(device)
+        fill((theirs, ours), rng, 5, spread)
+        others = both(device)
+        fill(others, rng, 4, spread, "other ")
+        asked = [("internal", (None,)), *(("internal", (f"{k}",)) for k in range(5)), ("other", ())]
+        asked += [("single", (mesh, random_transform(rng, spread))) for mesh in SHAPES.values()]
+        for kind, arguments in asked:
+            named = {"return_name" if kind == "single" else "return_names": True}
+            expected, found = (
+                getattr(manager, f"min_distance_{kind}")(*(arguments if kind != "other" else (other,)), **named)
+                for manager, other in zip((theirs, ours), others)
+            )
+            assert found[0] == pytest.approx(max(expected[0], 0), abs=1e-5), (kind, arguments)
+            if expected[0] > 1e-5:
+                apart += 1
+                assert found[1] == expected[1]
+            else:
+                assert found[0] == 0
+    assert apart > 15
+
+
+def test_nearest_points(device):
+    rng = np.random.default_rng(5)
+    ours, placed = ab.CollisionManager(device), {}
+    for k, (name, mesh) in enumerate(SHAPES.items()):
+        placed[name] = random_transform(rng, 0, np.float64)
+        placed[name][:3, 3] += 2.5 * np.array([k % 2, k // 2 % 2, k // 4])
+        ours.add_object(name, mesh, placed[name])
+    distance, names, data = ours.min_distance_internal(return_names=True, return_data=True)
+    assert data.names == set(names) and data.distance == distance > 0
+    points = [data.point(name) for name in names]
+    assert np.linalg.norm(points[0] - points[1]) == pytest.approx(distance, rel=1e-12)
+    for name, point in zip(names, points):
+        assert distance_to_face(SHAPES[name], placed[name], data.index(name), point) < 1e-12
+    # All pairs of faces: none is nearer.
+    posed = {}
+    for name, mesh in SHAPES.items():
+        posed[name] = trimesh.transform_points(mesh.vertices, placed[name])[mesh.faces]
+    least = math.inf
+    for a, b in itertools.combinations(posed.values(), 2):
+        i, j = (part.ravel() for part in np.indices((len(a), len(b))))
+        least = min(least, nearest.triangle_distances(a[i], b[j])[0].min())
+    assert distance == pytest.approx(least, rel=1e-12)
+
+
+def test_triangle_distances_against_a_search():
+    """Nearest points by alternate projection in the plane of barycentric coordinates, from many starts."""
+    rng = np.random.default_rng(6)
+    a, b = rng.uniform(-1, 1, size=(2, 200, 3, 3))
+    b[:, :, 0] += 2.1
+    a[0, 2], b[1] = a[0, 1], b[1, 0]  # a segment, a point
+    found, p, q = nearest.triangle_distances(a, b)
+    assert np.allclose(np.linalg.norm(p - q, axis=1), found)
+    x, y = a.mean(1), b.mean(1)
+    for _ in range(3000):
+        x = trimesh.triangles.closest_point(a, y)
+        y = trimesh.triangles.closest_point(b, x)
+    searched = np.linalg.norm(x - y, axis=1)
+    proper = np.arange(200) > 1
+    assert (found[proper] <= searched[proper] + 1e-12).all()
+    assert np.allclose(found[proper], searched[proper], atol=1e-3)
+    for points, of in ((p, a), (q, b)):
+        on = trimesh.triangles.closest_point(of[proper], points[proper])
+        assert np.abs(on - points[proper]).max() < 1e-12
+
+
+@pytest.mark.parametrize("gap", [3.0, 1e-3, 1e-9, 2.0**-40])
+def test_known_distances(device, gap):
+    """Boxes face to face, with hundreds of pairs of faces at the same distance."""
+    fine = trimesh.creation.box((1, 1, 1)).subdivide().subdivide().subdivide()
+    ours = ab.CollisionManager(device)
+    ours.add_object("a", fine)
+    distance, data = ours.min_distance_single(
+        fine, trimesh.transformations.translation_matrix((1 + gap, 0, 0)), return_data=True
+    )
+    assert distance == pytest.approx((1 + gap) - 1, rel=1e-12)
+    assert data.point("a")[0] == 0.5 and data.point("__external")[0] == pytest.approx(0.5 + gap, rel=1e-15)
+    assert ours.min_distance_single(fine, np.eye(4)) == 0
+
+
+def test_nothing_to_ask(device):
+    theirs, ours = both(device)
+    ball = SHAPES["ball"]
+    assert ours.in_collision_internal(True, True) == theirs.in_collision_internal(True, True) == (False, set(), [])
+    assert ours.in_collision_single(ball, None, True, True) == (False, set(), [])
+    assert ours.in_collision_other(ours) is False
+    assert ours.min_distance_internal(return_names=True) == (math.inf, None)
+    assert ours.min_distance_single(ball, return_name=True, return_data=True) == (math.inf, None, None)
+    assert ours.min_distance_other(ours) == math.inf
+    ours.add_object("one", ball)
+    assert ours.in_collision_internal(True) == (False, set()) and ours.min_distance_internal() == math.inf
+
+
+# Objects that come and go.
+
+
+def test_replaced_and_changed_meshes(device):
+    ours = ab.CollisionManager(device)
+    mesh = trimesh.creation.box((1, 1, 1))
+    ours.add_object("a", mesh)
+    ball = SHAPES["ball"]
+    at = trimesh.transformations.translation_matrix((1.2, 0, 0))
+    assert not ours.in_collision_single(ball, at)
+    mesh.apply_scale(2)
+    assert not ours.in_collision_single(ball, at), "what was added stays as it was"
+    ours.add_object("a", mesh)
+    assert ours.in_collision_single(ball, at)
+    with pytest.raises(ValueError, match="a not in collision manager"):
+        ours.remove_object("a") or ours.remove_object("a")
+    assert not ours.in_collision_single(ball, at)
+
+
+def test_places_are_used_again_and_given_up(device):
+    ours = ab.CollisionManager(device)
+    for k in range(4):
+        ours.add_object(k, SHAPES["ball"], trimesh.transformations.translation_matrix((0.7 * k, 0, 0)))
+    expected = {(0, 1), (1, 2), (2, 3)}
+    assert ours.in_collision_internal(True) == (True, expected)
+    other = ab.CollisionManager(device)
+    for k in range(30):
+        other.add_object(k, SHAPES["torus"], trimesh.transformations.translation_matrix((0, 0, 0.4 * k)))
+    before = ours._scene
+    for _ in range(3):
+        ours.in_collision_single(SHAPES["box"])
+        ours.add_object("x", SHAPES["box"])
+        ours.remove_object("x")
+    assert ours._scene is before and ours._scene.object_count == 5
+    answers = [ours.in_collision_other(other, True) for _ in range(3)]
+    assert answers[0] == answers[1] == answers[2] and len(answers[0][1]) > 2
+    assert ours._scene.object_count == 4, "more places left than taken, and than 16"
+    assert ours.in_collision_internal(True) == (True, expected)
+    assert other.in_collision_internal(True)[0] and other._scene.object_count == 30
+    arrays = ours._scene.arrays()
+    for _ in range(3):
+        ours.in_collision_single(SHAPES["ball"], random_transform(np.random.default_rng(0), 1))
+        ours.set_transform(0, np.eye(4))
+    assert ours._scene.object_count == 5 and ours._scene.arrays() is not arrays
+    arrays = ours._scene.arrays()
+    ours.in_collision_single(SHAPES["ball"])
+    assert ours._scene.arrays() is arrays, "the second time nothing is made anew"
+
+
+def test_equal_meshes_share_a_model_that_goes_with_them(device):
+    managers = [ab.CollisionManager(device) for _ in range(2)]
+    mesh = trimesh.creation.box((1, 2, 3.25))
+    for k, manager in enumerate(managers):
+        manager.add_object(k, mesh.copy())
+    model = managers[0]._scene.models[0]
+    assert managers[1]._scene.models == [model]
+    gone, known = weakref.ref(model), len(convex._SHAPES)
+    del managers, manager, model
+    gc.collect()
+    assert gone() is None and len(convex._SHAPES) < known
+
+
+def test_models_as_meshes(device):
+    model = ab.Model.load(SHAPES["torus"])
+    ours = ab.CollisionManager(device)
+    ours.add_object("a", model)
+    ours.add_object("b", model, trimesh.transformations.translation_matrix((0.5, 0, 0)))
+    assert ours.in_collision_internal() and ours._scene.models == [model]
+
+
+# What is refused, before anything changes.
+
+
+def test_bad_input(device):
+    ours = ab.CollisionManager(device)
+    ball = SHAPES["ball"]
+    ours.add_object("a", ball)
+    stretched = np.diag([1, 1, 2.0, 1])
+    for transform, message in (
+        (stretched, "transform of 'a'.*not rigid"),
+        (np.full((4, 4), np.nan), "not finite"),
+        (np.eye(3), r"shape \(3, 3\), not \(4, 4\)"),
+    ):
+        for call in (lambda t: ours.add_object("a", SHAPES["box"], t), lambda t: ours.set_transform("a", t)):
+            with pytest.raises(ValueError, match=message):
+                call(transform)
+        with pytest.raises(ValueError, match=message.replace("'a'", "'__external'")):
+            ours.in_collision_single(ball, transform)
+    with pytest.raises(ab.MeshError, match="cannot load a mesh from int"):
+        ours.add_object("a", 3)
+    with pytest.raises(ab.MeshError, match="no faces"):
+        ours.in_collision_single(trimesh.Trimesh())
+    for call in (lambda: ours.set_transform("b", np.eye(4)), lambda: ours.min_distance_internal("b")):
+        with pytest.raises(ValueError, match="b not in collision manager"):
+            call()
+    for call in (ours.in_collision_other, ours.min_distance_other):
+        with pytest.raises(TypeError, match=r"not a warp_abtree\.CollisionManager"):
+            call(TrimeshManager())
+    with pytest.raises(ValueError, match="no device"):
+        ab.CollisionManager("nothing:7")
+    assert ours.in_collision_single(ball, return_names=True) == (True, {"a"})
+    assert ours._scene.object_count == 2 and collision_manager.EXTERNAL == "__external"

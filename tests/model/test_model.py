@@ -1,0 +1,362 @@
+"""Model files: saved and opened to the bit, and refused with one clear error when anything is wrong with them."""
+
+import dataclasses
+import io
+import pickle
+import zipfile
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from helpers.samples import SHAPES, crumbs, plain, sample, soup
+from hypothesis import HealthCheck, given, settings
+
+import warp_abtree as ab
+from warp_abtree.model.model import FORMAT_VERSION, Model
+
+ARRAYS = ("vertex_parent", "vertex_pos", "face_vertex", "face_split", "split_start", "split_face", "lod_error")
+
+
+def with_errors(model):
+    """Return the model with made-up errors: how they are certified is another test's business."""
+    m = model.lod_max
+    errors = np.linspace(1.0, 0.0, m + 1) ** 3 if m else np.zeros(1)
+    progressive = dataclasses.replace(model.progressive, lod_error=errors)
+    return Model(progressive, model.tree, model.name)
+
+
+def assert_same(model, other):
+    for name in ARRAYS:
+        mine, theirs = getattr(model.progressive, name), getattr(other.progressive, name)
+        assert (mine.dtype, mine.shape) == (theirs.dtype, theirs.shape), name
+        assert mine.tobytes() == theirs.tobytes(), name
+    np.testing.assert_array_equal(model.tree.leaf_node, other.tree.leaf_node)
+    np.testing.assert_array_equal(model.tree.node_face, other.tree.node_face)
+    np.testing.assert_array_equal(model.dropped_faces, other.dropped_faces)
+    np.testing.assert_array_equal(model.centre, other.centre)
+    assert (model.name, model.tree.depth) == (other.name, other.tree.depth)
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory):
+    """The bytes of a small model file."""
+    path = tmp_path_factory.mktemp("content") / "model.npz"
+    with_errors(sample("twins")).save(path)
+    return path.read_bytes()
+
+
+@pytest.fixture
+def parts(content):
+    """The arrays of a model file, to be changed and written by `write`."""
+    with np.load(io.BytesIO(content)) as file:
+        return {name: file[name] for name in file.files}
+
+
+def write(path, parts):
+    with open(path, "wb") as file:
+        np.savez(file, **parts)
+    return path
+
+
+def refuse(path, *words):
+    with pytest.raises(ab.ModelError) as caught:
+        Model.open(path)
+    message = str(caught.value)
+    assert str(path) in message and "\n" not in message
+    for word in words:
+        assert word in message
+
+
+# Round trips.
+
+
+@pytest.mark.parametrize("name", [*SHAPES, "cow", "fcl-env"])
+def test_round_trip_is_exact(tmp_path, name):
+    model = with_errors(sample(name))
+    path = tmp_path / "a model.npz"
+    model.save(path)
+    opened = Model.open(str(path))
+    assert_same(model, opened)
+    for lod in {0, model.lod_max // 2, model.lod_max}:
+        for mine, theirs in zip(model.mesh_at(lod), opened.mesh_at(lod), strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+    assert [p.name for p in tmp_path.iterdir()] == ["a model.npz"]
+
+
+def test_dropped_faces_survive(tmp_path):
+    vertices, faces = crumbs(3)
+    model = with_errors(ab.Model.from_arrays(vertices, np.concatenate([[[1, 1, 2]], faces]), base_faces=1))
+    model.save(tmp_path / "m.npz")
+    opened = Model.open(tmp_path / "m.npz")
+    assert opened.dropped_faces.tolist() == [0]
+    assert_same(model, opened)
+
+
+@settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(1, 30), st.integers(0, 2**31), st.sampled_from([1.0, 2.0**90, 2.0**-90]))
+def test_round_trip_of_soups(tmp_path, count, seed, scale):
+    vertices, faces = soup(count, seed)
+    model = with_errors(ab.Model.from_arrays(vertices * scale, faces, base_faces=1))
+    model.save(tmp_path / "soup.npz")
+    assert_same(model, Model.open(tmp_path / "soup.npz"))
+
+
+# Damage.
+
+
+def test_truncated_files_are_refused(tmp_path, content):
+    path = tmp_path / "cut.npz"
+    lengths = np.unique(np.concatenate([np.arange(0, 64), np.linspace(0, len(content) - 1, 150).astype(int)]))
+    for length in lengths:
+        path.write_bytes(content[:length])
+        refuse(path)
+
+
+def test_flipped_bytes_are_noticed(tmp_path, content):
+    """A file either opens as it was saved, where a byte matters to nobody, or is refused."""
+    rng = np.random.default_rng(1)
+    path, model = tmp_path / "flipped.npz", with_errors(sample("twins"))
+    opened = 0
+    for _ in range(400):
+        data = bytearray(content)
+        for at in rng.integers(0, len(data), rng.integers(1, 4)):
+            data[at] ^= 1 << rng.integers(8)
+        path.write_bytes(data)
+        try:
+            assert_same(model, Model.open(path))
+            opened += 1
+        except ab.ModelError as error:
+            assert str(path) in str(error)
+    assert opened < 200
+
+
+@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.binary(max_size=200))
+def test_any_bytes_are_refused(tmp_path, data):
+    (tmp_path / "any.npz").write_bytes(data)
+    refuse(tmp_path / "any.npz")
+
+
+# Another kind of file, another version, another content.
+
+
+def test_files_that_are_no_models_are_refused(tmp_path, content):
+    refuse(tmp_path / "absent.npz", "no such file")
+    refuse(tmp_path)
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    refuse(tmp_path / "array.npy")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    refuse(tmp_path / "other.npz", "not a warp_abtree model")
+    (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    refuse(tmp_path / "mesh.obj")
+    (tmp_path / "empty.npz").write_bytes(b"")
+    refuse(tmp_path / "empty.npz")
+    with zipfile.ZipFile(tmp_path / "zip.npz", "w") as archive:
+        archive.writestr("format.npy", b"text")
+    refuse(tmp_path / "zip.npz")
+
+
+class Bomb:
+    """Unpickling this leaves a file behind."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+def test_pickles_are_never_run(tmp_path, parts):
+    trace = tmp_path / "trace"
+    (tmp_path / "pickle.npz").write_bytes(pickle.dumps(Bomb(trace)))
+    refuse(tmp_path / "pickle.npz")
+    array = np.empty((), object)
+    array[()] = Bomb(trace)
+    np.save(tmp_path / "object.npy", array, allow_pickle=True)
+    refuse(tmp_path / "object.npy")
+    for name in (*ARRAYS, "leaf_node", "format", "version", "name"):
+        with open(tmp_path / "model.npz", "wb") as file:
+            np.savez(file, allow_pickle=True, **{**parts, name: array})
+        refuse(tmp_path / "model.npz")
+    assert not trace.exists()
+    np.load(tmp_path / "object.npy", allow_pickle=True)
+    assert trace.exists(), "the bomb would have worked"
+
+
+def test_members_that_are_no_arrays_are_refused(tmp_path, parts):
+    """np.load hands out members without the ending .npy raw, pickles too: bytes, not arrays."""
+    trace = tmp_path / "trace"
+    for name in (*ARRAYS, "leaf_node", "format", "version", "name"):
+        path = write(tmp_path / "model.npz", {key: value for key, value in parts.items() if key != name})
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr(name, pickle.dumps(Bomb(trace)))
+        refuse(path)
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize("version", [0, FORMAT_VERSION + 1, -1, FORMAT_VERSION + 0.5, float("nan"), "new", [1, 1]])
+def test_other_versions_are_refused(tmp_path, parts, version):
+    refuse(write(tmp_path / "m.npz", {**parts, "version": np.array(version)}))
+
+
+def test_the_version_is_named(tmp_path, parts):
+    path = write(tmp_path / "m.npz", {**parts, "version": np.array(7)})
+    refuse(path, "version 7", str(FORMAT_VERSION))
+    refuse(write(tmp_path / "f.npz", {**parts, "format": np.array("soup")}), "not a warp_abtree model")
+
+
+@pytest.mark.parametrize("name", [*ARRAYS, "leaf_node", "name", "version", "format"])
+def test_missing_arrays_are_named(tmp_path, parts, name):
+    del parts[name]
+    refuse(write(tmp_path / "m.npz", parts), *([repr(name)] if name not in ("version", "format") else []))
+
+
+@pytest.mark.parametrize("name", [*ARRAYS, "leaf_node"])
+def test_types_and_shapes_are_checked(tmp_path, parts, name):
+    good = parts[name]
+    for bad in (
+        good.astype(np.complex128),
+        good.astype(str),
+        good.astype(np.float32),
+        good.astype(bool),
+        good.reshape(-1) if good.ndim == 2 else good[:, None],
+        good[:0],
+        good[None],
+        good[:-1],
+        np.concatenate([good, good[-1:]]),
+        good[0],
+    ):
+        refuse(write(tmp_path / "m.npz", {**parts, name: bad}))
+
+
+# What each array must not hold: (array, index, value).
+BAD_VALUES = {
+    "position not finite": ("vertex_pos", (3, 1), np.nan),
+    "position infinite": ("vertex_pos", (-1, 0), np.inf),
+    "corner below": ("face_vertex", (4, 0), -1),
+    "corner above": ("face_vertex", (4, 0), 42),
+    "parent is its own child": ("vertex_parent", 5, 5),
+    "parent among the originals": ("vertex_parent", 5, 6),
+    "parent out of range": ("vertex_parent", 5, 10**6),
+    "parent below its child": ("vertex_parent", -1, 42),
+    "no parent has -2": ("vertex_parent", 5, -2),
+    "split below": ("face_split", 2, -1),
+    "split above": ("face_split", 2, 10**6),
+    "start not 0": ("split_start", 0, 1),
+    "start falls": ("split_start", 3, 10**6),
+    "slices end elsewhere": ("split_start", -1, 3),
+    "no such face": ("split_face", 0, 160),
+    "negative face": ("split_face", 0, -1),
+    "error not finite": ("lod_error", 0, np.inf),
+    "error unknown": ("lod_error", 4, np.nan),
+    "error rises": ("lod_error", 4, 9.0),
+    "error at the end": ("lod_error", -1, 0.001),
+    "error below 0": ("lod_error", -1, -1.0),
+    "leaf inside the tree": ("leaf_node", 0, 5),
+    "leaf out of range": ("leaf_node", 0, 512),
+    "no leaf": ("leaf_node", 3, -1),
+    "two faces in one leaf": ("leaf_node", slice(2, 4), 190),
+}
+
+
+@pytest.mark.parametrize("case", BAD_VALUES)
+def test_values_are_checked(tmp_path, parts, case):
+    name, index, value = BAD_VALUES[case]
+    parts[name] = parts[name].copy()
+    parts[name][index] = value
+    refuse(write(tmp_path / "m.npz", parts))
+
+
+# Saving.
+
+
+def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "m.npz"
+    model = with_errors(sample("three"))
+    model.save(path)
+    before = path.read_bytes()
+
+    def fail(file, **arrays):
+        file.write(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    for target in (path, tmp_path / "new.npz"):
+        with pytest.raises(OSError, match="disk full"):
+            with_errors(sample("twins")).save(target)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["m.npz"]
+    assert_same(model, Model.open(path))
+
+
+def test_saving_replaces(tmp_path):
+    path = tmp_path / "m.npz"
+    for name in ("twins", "three"):
+        with_errors(sample(name)).save(path)
+        assert_same(with_errors(sample(name)), Model.open(path))
+    with pytest.raises(OSError):
+        with_errors(sample("three")).save(tmp_path / "absent" / "m.npz")
+
+
+# Arguments.
+
+
+@pytest.mark.parametrize("lod", [-1, 10**6, 0.5, float("nan"), float("inf"), True, "1", None])
+def test_lods_are_checked(lod):
+    model = sample("twins")
+    for call in (model.mesh_at, model.error_at):
+        with pytest.raises(ValueError, match="LOD") as caught:
+            call(lod)
+        assert str(lod) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        dict(fraction=0.1, tolerance=0.1),
+        dict(fraction=0.0),
+        dict(fraction=-0.1),
+        dict(fraction=1.001),
+        dict(fraction=float("nan")),
+        dict(fraction="half"),
+        dict(tolerance=-1e-9),
+        dict(tolerance=float("nan")),
+        dict(tolerance="fine"),
+    ],
+)
+def test_wishes_are_checked(options):
+    with pytest.raises((ValueError, TypeError), match=r"fraction|tolerance"):
+        sample("twins").lod_for(**options)
+
+
+def test_wishes_are_met():
+    model = with_errors(sample("ball"))
+    counts = [len(model.mesh_at(lod)[1]) for lod in range(model.lod_max + 1)]
+    for fraction in (1.0, 0.5, 0.1, 0.01, 1e-9):
+        miss = np.abs(np.array(counts) - fraction * model.face_count)
+        lod = model.lod_for(fraction=fraction)
+        assert miss[lod] == miss.min() and (miss[lod + 1 :] > miss[lod]).all()
+    errors = [model.error_at(lod) for lod in range(model.lod_max + 1)]
+    for tolerance in (0.0, 1e-3, errors[7], 0.5, 1.0, float("inf")):
+        lod = model.lod_for(tolerance=tolerance)
+        assert errors[lod] <= tolerance and (lod == 0 or errors[lod - 1] > tolerance)
+
+
+@pytest.mark.parametrize("name", ["soup", "crumbs", "lattice soup"])
+def test_mesh_at_is_what_the_forest_says(name):
+    model, mesh = sample(name), plain(sample(name))
+    for lod in range(0, model.lod_max + 1, 7):
+        vertices, faces, ids = model.mesh_at(lod)
+        assert (vertices.dtype, faces.dtype, ids.dtype) == (np.float64, np.int32, np.int32)
+        assert ids.tolist() == [f for f in range(model.face_count) if mesh.is_active(f, lod)]
+        expected = [[mesh.vertex_pos[v] for v in mesh.corners(f, lod)] for f in ids]
+        np.testing.assert_array_equal(vertices[faces], expected)
+
+
+def test_bad_sources_are_refused():
+    for source in (None, 3, "no/such/file.obj"):
+        with pytest.raises(ab.MeshError):
+            Model.load(source)
+    with pytest.raises(ValueError, match="base_faces"):
+        Model.from_arrays(*SHAPES["box"](), base_faces=0)

@@ -1,0 +1,240 @@
+"""The error of a LOD on its other side: how far its surface lies from the original, against points of that surface."""
+
+import pickle
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import trimesh
+from conftest import real_mesh_path
+from helpers.samples import crumbs, grid, of_trimesh, sample, soup
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from oracles.distance import brute_distances, exact_distance_sq, farthest_distance, lattice_points
+
+import warp_abtree as ab
+from warp_abtree.model.outward_error import OutwardError
+
+FUZZ = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+
+
+def square_comb(teeth):
+    """A flat comb: a strip 0.25 high, and on it teeth 0.75 high and 1 wide with gaps 0.5 wide."""
+    place, faces = {}, []
+    x = np.cumsum([0] + [1.0, 0.5] * teeth)
+    for k in range(2 * teeth - 1):
+        for low, high in ((0, 0.25), (0.25, 1))[: 2 - k % 2]:
+            corner = [(x[k], low, 0.0), (x[k + 1], low, 0.0), (x[k + 1], high, 0.0), (x[k], high, 0.0)]
+            a, b, c, d = (place.setdefault(p, len(place)) for p in corner)
+            faces += [[a, b, c], [a, c, d]]
+    return np.array(list(place)), np.array(faces)
+
+
+def line(direction, count=20):
+    """Faces without area: every corner on one line, but for rounding."""
+    i = np.arange(count - 2)
+    return np.arange(count)[:, None] ** 1.5 * np.array(direction), np.stack([i, i + 1, i + 2], 1)
+
+
+def turned(vertices, faces, seed=0):
+    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    return vertices @ turn.T, faces
+
+
+def far_grid(seed):
+    vertices, faces = turned(*grid(2), seed)
+    return vertices + 1e6 * np.random.default_rng(seed).normal(size=3), faces
+
+
+def corners_at(model, lod):
+    vertices, faces, _ = model.mesh_at(lod)
+    return vertices[faces]
+
+
+def original(model):
+    """Corners of the faces of the original, those of zero area too."""
+    return corners_at(model, model.lod_max)
+
+
+def some_lods(model, count=6):
+    m = model.lod_max
+    return sorted({*np.geomspace(1, m + 1, count).astype(int) - 1, *np.linspace(0, m, count).astype(int)})
+
+
+# What the bound is.
+
+
+@pytest.mark.parametrize("teeth", [2, 3, 4])
+@pytest.mark.slow
+def test_a_comb_whose_gaps_are_closed(teeth):
+    """Every point of the original lies in the surface at a LOD, which fills gaps and so lies far from the original."""
+    model = ab.Model.from_arrays(*square_comb(teeth), base_faces=2)
+    closed = [lod for lod in range(model.lod_max) if model.error_at(lod) < 1e-8]
+    far = 0.0
+    for lod in closed:
+        measured = brute_distances(lattice_points(corners_at(model, lod), 64), original(model)).max()
+        bound = model.error_at(lod, side="outward")
+        assert measured - 1e-15 <= bound <= 1.02 * measured + 1e-9
+        far = max(far, measured)
+    assert 0.15 < far < 0.25
+
+
+def test_the_original_is_0_away():
+    for name in ("one", "ball", "soup", "lattice soup", "twins"):
+        model = sample(name)
+        assert model.error_at(model.lod_max, side="outward") == 0.0
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        lambda: grid(12),
+        lambda: turned(*grid(12)),
+        lambda: of_trimesh(trimesh.creation.box().subdivide().subdivide().subdivide()),
+        lambda: turned(*of_trimesh(trimesh.creation.box().subdivide().subdivide().subdivide())),
+    ],
+)
+def test_flat_regions_cost_nothing(shape):
+    """A LOD within the original surface, or within rounding of it, has a bound of that size; edges do not spoil it."""
+    model = ab.Model.from_arrays(*shape())
+    size = np.ptp(original(model), axis=(0, 1)).max()
+    assert model.error_at(model.lod_for(fraction=0.1), side="outward") < 1e-8 * size
+
+
+@st.composite
+def models(draw):
+    """Soups with repeated and degenerate faces, crumbs, flat grids and balls, out of shape and far from the origin."""
+    seed = draw(st.integers(0, 2**32 - 1))
+    rng = np.random.default_rng(seed)
+    kind = draw(st.sampled_from(["soup", "lattice", "crumbs", "grid", "ball", "comb"]))
+    if kind in ("soup", "lattice"):
+        vertices, faces = soup(draw(st.integers(1, 60)), seed, lattice=draw(st.integers(2, 4)) * (kind == "lattice"))
+    elif kind == "crumbs":
+        vertices, faces = crumbs(draw(st.integers(1, 15)), seed)
+    elif kind == "grid":
+        vertices, faces = grid(draw(st.integers(1, 6)))
+    elif kind == "comb":
+        vertices, faces = square_comb(draw(st.integers(1, 5)))
+    else:
+        vertices, faces = of_trimesh(trimesh.creation.icosphere(1))
+    if draw(st.booleans()):
+        vertices = vertices + draw(st.sampled_from([1e-12, 1e-3, 0.3])) * rng.normal(size=vertices.shape)
+    if draw(st.booleans()):
+        vertices = turned(vertices * [1, 1, draw(st.sampled_from([1e-6, 0.1, 30.0]))], faces, seed)[0]
+    vertices = vertices + draw(st.sampled_from([0.0, 0.0, 1e3, 1e9]))
+    return ab.Model.from_arrays(vertices, faces, base_faces=draw(st.integers(1, 10)))
+
+
+@FUZZ
+@given(models(), st.floats(0, 1))
+def test_no_point_is_farther(model, share):
+    lod = int(share * model.lod_max)
+    centre = original(model)[0, 0]  # differences from it are exact or nearly so
+    corners, points = original(model) - centre, lattice_points(corners_at(model, lod) - centre, 9)
+    bound = model.error_at(lod, side="outward") + 1e-15 * np.abs(points).max()  # points are rounded
+    distance = brute_distances(points, corners)
+    # Float64 cannot tell whether a point lies in a sliver; fractions can.
+    for k in np.argsort(distance)[-3:]:
+        if distance[k] > bound:
+            assert exact_distance_sq([Fraction(x) for x in points[k].tolist()], corners) <= Fraction(bound) ** 2
+
+
+EXACT = {
+    "flat grid": lambda: turned(*grid(2), seed=1),
+    "line": lambda: line((1.0, 2.0, -1.0), 9),
+    **{f"line, seed {seed}": lambda seed=seed: line(np.random.default_rng(seed).normal(size=3), 6) for seed in (1, 9)},
+    "box": lambda: turned(*of_trimesh(trimesh.creation.box())),
+    "comb": lambda: turned(*square_comb(2)),
+    "soup": lambda: soup(12, 5),
+    "lattice soup": lambda: soup(20, 6, lattice=3),
+    **{f"far away, seed {seed}": lambda seed=seed: far_grid(seed) for seed in (0, 2, 4)},
+}
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_rounding_is_covered(name):
+    """Distances in fractions of points that are themselves fractions: the bound holds without any allowance."""
+    model = ab.Model.from_arrays(*EXACT[name](), base_faces=1)
+    weights = [(4, 0, 0), (0, 4, 0), (0, 0, 4), (2, 1, 1), (2, 2, 0), (0, 1, 3)]
+    corners = original(model)
+    for lod in some_lods(model, 3):
+        bound_sq = Fraction(model.error_at(lod, side="outward")) ** 2
+        for triangle in corners_at(model, lod).tolist():
+            for weight in weights:
+                point = [sum(Fraction(w, 4) * Fraction(x) for w, x in zip(weight, axis)) for axis in zip(*triangle)]
+                assert exact_distance_sq(point, corners) <= bound_sq
+
+
+# How good it is.
+
+SHAPES = {
+    "torus": lambda: of_trimesh(trimesh.creation.torus(1.0, 0.4, 24, 12)),
+    "capsule": lambda: of_trimesh(trimesh.creation.capsule(1.0, 0.4, count=(16, 16))),
+    "comb": lambda: turned(*square_comb(6)),
+    "soup": lambda: soup(40, 7),
+    "crumbs": lambda: crumbs(20),
+}
+
+
+def check_tight(model, lod):
+    measured = farthest_distance(corners_at(model, lod), original(model))
+    bound, size = model.error_at(lod, side="outward"), np.ptp(original(model), axis=(0, 1)).max()
+    assert measured - 1e-15 * size <= bound <= 1.03 * measured + 1e-12 * size
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_it_is_tight(name):
+    model = ab.Model.from_arrays(*SHAPES[name](), base_faces=4)
+    for fraction in (0.5, 0.2, 0.05):
+        check_tight(model, model.lod_for(fraction=fraction))
+
+
+@pytest.mark.parametrize("name", ["cow", "fandisk", "rocker-arm", "stanford-bunny"])
+@pytest.mark.slow
+def test_it_is_tight_on_real_meshes(name):
+    model = ab.Model.load(real_mesh_path(name))
+    for fraction in (0.1, 0.01):
+        check_tight(model, model.lod_for(fraction=fraction))
+
+
+@pytest.mark.parametrize("power", [-90, -3, 1, 60])
+@pytest.mark.parametrize("shape", ["torus", "comb", "soup"])
+def test_scale_changes_nothing(shape, power):
+    vertices, faces = SHAPES[shape]()
+    one = ab.Model.from_arrays(vertices, faces, base_faces=4)
+    other = ab.Model.from_arrays(np.ldexp(vertices, power), faces, base_faces=4)
+    for lod in some_lods(one):
+        assert np.ldexp(one.error_at(lod, side="outward"), power) == other.error_at(lod, side="outward")
+
+
+# How it is asked.
+
+
+@pytest.mark.parametrize("side", ["out", "Outward", "", None, 1, ["outward"]])
+def test_other_sides_are_refused(side):
+    with pytest.raises(ValueError, match="'inward' nor 'outward'") as caught:
+        sample("ball").error_at(3, side=side)
+    assert repr(side) in str(caught.value)
+
+
+def test_inward_is_the_default():
+    model = sample("ball")
+    for lod in some_lods(model):
+        assert model.error_at(lod) == model.error_at(lod, side="inward") == model.progressive.lod_error[lod]
+
+
+@pytest.mark.parametrize("lod", [-1, 10**6, 0.5, None])
+def test_lods_are_checked(lod):
+    with pytest.raises(ValueError, match="LOD"):
+        sample("ball").error_at(lod, side="outward")
+
+
+def test_it_is_found_once_and_not_pickled(monkeypatch):
+    asked = []
+    find = OutwardError._bound
+    monkeypatch.setattr(OutwardError, "_bound", lambda self, lod: asked.append(lod) or find(self, lod))
+    model = ab.Model.from_arrays(*SHAPES["torus"]())
+    first = [model.error_at(lod, side="outward") for lod in (5, 9, 5, np.int64(9))]
+    assert asked == [5, 9] and first[:2] == first[2:]
+    again = pickle.loads(pickle.dumps(model))
+    assert again.error_at(5, side="outward") == first[0] and asked == [5, 9, 5]

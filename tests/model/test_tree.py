@@ -1,0 +1,351 @@
+"""The AB-Tree: its build, and that every walk of LODs ends at the very bits of a rebuild and of the plain oracle."""
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from helpers.samples import SHAPES, crumbs, plain, raw_state, repeated, sample, soup
+from hypothesis import HealthCheck, given, settings
+from oracles import abtree as oracle
+
+import warp_abtree as ab
+from warp_abtree.model.tree import active_build
+
+pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
+
+WALKED = ("one", "two", "three", "five", "small ball", "crumbs", "grid", "soup", "lattice soup", "twins")
+
+
+# Build.
+
+
+def check_build(vertices, faces, expected):
+    tree = active_build(vertices, faces)
+    numbers = [leaf.number for leaf in expected.leaf]
+    assert tree.leaf_node.tolist() == numbers
+    assert tree.depth == (len(faces) - 1).bit_length()
+    assert tree.node_count == 2 << tree.depth
+    inverse = np.full(tree.node_count, -1)
+    inverse[numbers] = np.arange(len(faces))
+    assert tree.node_face.tolist() == inverse.tolist()
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_build_equals_the_oracle(name):
+    model = sample(name)
+    mesh = model.progressive
+    check_build(mesh.vertex_pos[: mesh.vertex_count], mesh.face_vertex, oracle.active_build(plain(model)))
+    np.testing.assert_array_equal(model.tree.leaf_node, active_build(mesh.vertex_pos, mesh.face_vertex).leaf_node)
+
+
+@pytest.mark.parametrize("name", ["cow", "fcl-env", "woody"])
+def test_build_of_real_meshes_equals_the_oracle(name):
+    model = sample(name)
+    leaves = oracle.active_build(plain(model)).leaf
+    assert model.tree.leaf_node.tolist() == [leaf.number for leaf in leaves]
+
+
+def without_merges(vertices, faces):
+    return oracle.Progressive([-1] * len(vertices), vertices.tolist(), faces.tolist(), [0] * len(faces), [0], [])
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.integers(1, 70), st.integers(0, 2**31), st.sampled_from([0, 2, 3, 9]), st.sampled_from([1.0, 2.0**90, 2.0**-90])
+)
+def test_build_of_soups_equals_the_oracle(count, seed, lattice, scale):
+    vertices, faces = soup(count, seed, lattice)
+    vertices = vertices * scale
+    check_build(vertices, faces, oracle.active_build(without_merges(vertices, faces)))
+
+
+def test_build_refuses_no_face():
+    with pytest.raises(ValueError, match="1 to 2"):
+        active_build(np.zeros((3, 3)), np.zeros((0, 3), np.int32))
+
+
+# Update.
+
+
+def assert_same_bits(state, other):
+    for name, value in state.items():
+        assert np.asarray(value).tobytes() == np.asarray(other[name]).tobytes(), name
+
+
+class Walker:
+    """Scenes to compare: one walks, one is made anew at the same LODs; and the oracle's rebuilds, remembered."""
+
+    def __init__(self, models, objects, device):
+        self.models, self.device = models, device
+        self.objects = objects
+        self.scene = ab.Scene(device)
+        for m in objects:
+            self.scene.add(models[m])
+        self.truth = {}
+
+    def tops(self):
+        return np.array([self.models[m].lod_max for m in self.objects])
+
+    def oracle_state(self, m, lod):
+        """Return the raw state that the oracle's rebuild has at a LOD."""
+        if (m, lod) not in self.truth:
+            mesh = plain(self.models[m])
+            tree = oracle.active_build(mesh, lod)
+            flat = tree.flat()
+            corner = [
+                mesh.corners(f, lod) if mesh.is_active(f, lod) else [-1] * 3 for f in range(len(mesh.face_vertex))
+            ]
+            self.truth[m, lod] = {
+                "lod": lod,
+                "status": flat["status"].astype(np.int32),
+                "lower": flat["lower"],
+                "upper": flat["upper"],
+                "skip": flat["skip"],
+                "corner": np.array(corner, self.corner_type),
+            }
+        return self.truth[m, lod]
+
+    def check_states(self, lods, with_oracle=True):
+        fresh = ab.Scene(self.device)
+        for m, lod in zip(self.objects, lods, strict=True):
+            fresh.add(self.models[m], lod=int(lod))
+        seen = set()
+        for i, (m, lod) in enumerate(zip(self.objects, lods, strict=True)):
+            if (m, lod) in seen:
+                continue
+            seen.add((m, lod))
+            state = raw_state(self.scene, i)
+            assert state["lod"] == lod
+            assert state["status"].max() <= oracle.ACTIVE, "a node was left deformed"
+            assert_same_bits(state, raw_state(fresh, i))
+            if with_oracle:
+                self.corner_type = state["corner"].dtype
+                assert_same_bits(state, self.oracle_state(m, int(lod)))
+        return seen
+
+    def step(self, lods, with_oracle=True):
+        """Set LODs; check states, sharing, counters and equation 1. Returns the number of partial updates."""
+        models, states, objects = self.scene.arrays()
+        before = {int(s): (states.slots[s].model, states.slots[s].lod) for s in objects.state}
+        stats = self.scene.set_lods(lods)
+        seen = self.check_states(lods, with_oracle)
+        assert len(set(objects.state.tolist())) == len(seen), "objects that share model and LOD share a state"
+        assert len(set(stats.state.tolist())) == len(stats.state)
+        assert {(self.scene.models.index(self.models[m]), int(lod)) for m, lod in seen} == {
+            (states.slots[s].model, states.slots[s].lod) for s in objects.state
+        }
+        for row, (state, lod) in enumerate(zip(stats.state, stats.lod, strict=True)):
+            self.check_counters(stats, row, before, state, int(lod), states, models, with_oracle)
+        return int((~stats.full).sum())
+
+    def check_counters(self, stats, row, before, state, lod, states, models, with_oracle):
+        owner = states.slots[state].model
+        mesh = self.scene.models[owner].progressive
+        n = mesh.face_count
+        starts = [before[state]] if state in before else [b for b in before.values() if b[0] == owner]
+        # A copy starts from the nearest state of its model; which one of two equally near is nobody's business.
+        span = [abs(int(mesh.split_start[lod]) - int(mesh.split_start[b[1]])) for b in starts]
+        sources = [b[1] for b, s in zip(starts, span, strict=True) if s == min(span)]
+        slices = [mesh.split_face[slice(*sorted((mesh.split_start[a], mesh.split_start[lod])))] for a in sources]
+        k, nodes = int(stats.k[row]), int(stats.nodes_refitted[row])
+        assert k in [len(np.unique(part)) for part in slices]
+        if stats.full[row]:
+            assert nodes == 2 * n - 1
+            return
+        assert nodes <= oracle.refit_bound(n, k) if k else nodes == 0
+        if with_oracle:
+            counted = []
+            for source in sources:
+                tree = oracle.active_build(plain(self.scene.models[owner]), source)
+                counted.append(oracle.set_lod(tree, lod))
+            assert (k, nodes) in [(update.k, update.nodes_refitted) for update in counted]
+
+
+def random_lods(rng, lods, tops):
+    """One LOD an object: small steps, jumps to the ends and anywhere, and objects that stay."""
+    step = rng.integers(-8, 9, len(tops)) * rng.choice([0, 1, 1, 4], len(tops))
+    lods = np.clip(lods + step, 0, tops)
+    jump = rng.random(len(tops))
+    lods = np.where(jump < 0.08, rng.integers(0, tops + 1), lods)
+    return np.where(jump > 0.96, rng.choice([0, 1]) * tops, lods)
+
+
+@pytest.mark.slow
+def test_random_walk_of_many_objects(device):
+    rng = np.random.default_rng(3)
+    models = [sample(name) for name in WALKED]
+    walker = Walker(models, rng.permutation(np.repeat(np.arange(len(models)), 3)).tolist(), device)
+    lods, partial = walker.tops(), 0
+    for _ in range(25):
+        lods = random_lods(rng, lods, walker.tops())
+        partial += walker.step(lods)
+    assert partial > 150
+
+
+@pytest.mark.parametrize("name", ["cow", "fcl-env", "woody"])
+@pytest.mark.slow
+def test_random_walk_of_real_meshes(device, name):
+    rng = np.random.default_rng(4)
+    walker = Walker([sample(name)], [0, 0, 0], device)
+    top = walker.tops()
+    for t in range(25):
+        lods = np.clip((top * rng.choice([0.0, 0.1, 0.5, 0.9, 1.0], 3)).astype(int) + rng.integers(-30, 31, 3), 0, top)
+        walker.step(lods, with_oracle=t % 12 == 11)
+
+
+@pytest.mark.slow
+def test_random_walk_of_a_large_mesh(device):
+    walker = Walker([sample("stanford-bunny")], [0, 0], device)
+    top = int(walker.tops()[0])
+    for lods in ([top, top - 1], [top - 900, top - 3], [top // 2, 200], [top // 2 + 400, 0], [top, 5], [3, 3]):
+        walker.step(np.array(lods), with_oracle=False)
+
+
+def test_there_and_back(device):
+    """A climb that undoes a descent split by split ends where it began."""
+    model = sample("crumbs")
+    walker = Walker([model], [0], device)
+    start = raw_state(walker.scene, 0)
+    for lod in [*range(model.lod_max - 1, -1, -1), *range(1, model.lod_max + 1)]:
+        stats = walker.scene.set_lods([lod])
+        n, k = model.face_count, int(stats.k[0])
+        assert stats.full[0] or stats.nodes_refitted[0] <= oracle.refit_bound(n, k)
+    assert_same_bits(raw_state(walker.scene, 0), start)
+
+
+def test_every_change_between_two_lods(device):
+    model = sample("lattice soup")
+    walker = Walker([model], [0], device)
+    rng = np.random.default_rng(8)
+    pairs = [(a, b) for a in range(model.lod_max + 1) for b in range(model.lod_max + 1) if a != b]
+    for a, b in rng.permutation(pairs)[:60]:
+        walker.scene.set_lods([a])
+        walker.step(np.array([b]))
+
+
+soups = st.builds(
+    lambda count, seed, lattice, twice: (repeated if twice else lambda *mesh: mesh)(*soup(count, seed, lattice)),
+    st.integers(1, 40),
+    st.integers(0, 2**31),
+    st.sampled_from([0, 3, 6]),
+    st.booleans(),
+)
+shares = st.lists(st.tuples(*[st.floats(0, 1)] * 3), min_size=1, max_size=6)
+
+
+@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(soups, soups, shares)
+def test_walks_over_soups(device, first, second, walk):
+    models = [ab.Model.from_arrays(*mesh, base_faces=1) for mesh in (first, second)]
+    walker = Walker(models, [0, 1, 0], device)
+    for step in walk:
+        walker.step(np.round(np.array(step) * walker.tops()).astype(int))
+
+
+# What `tree_state` shows.
+
+
+@pytest.mark.parametrize("name", ["one", "crumbs", "soup", "lattice soup"])
+def test_tree_state_shows_the_state(device, name):
+    model = sample(name)
+    scene = ab.Scene(device)
+    scene.add(model, lod=0)
+    for lod in (0, model.lod_max // 2, model.lod_max):
+        scene.set_lods([lod])
+        raw, shown = raw_state(scene, 0), scene.tree_state(0)
+        assert shown.lod == lod
+        np.testing.assert_array_equal(shown.status, raw["status"])
+        np.testing.assert_array_equal(shown.skip, raw["skip"])
+        np.testing.assert_array_equal(shown.face_node, model.tree.leaf_node)
+        assert shown.lower.dtype == shown.upper.dtype == np.float64
+        empty = shown.status == 0
+        assert (shown.lower[empty] == np.inf).all() and (shown.upper[empty] == -np.inf).all()
+        vertices, faces, ids = model.mesh_at(lod)
+        assert set(np.flatnonzero(shown.status[model.tree.leaf_node])) == set(ids)
+        for face, f in zip(faces, ids, strict=True):
+            node = shown.face_node[f]
+            while node:
+                assert (shown.lower[node] <= vertices[face].min(0)).all()
+                assert (shown.upper[node] >= vertices[face].max(0)).all()
+                node >>= 1
+        slack = 1e-5 * np.abs(vertices).max()
+        used = vertices[np.unique(faces)]
+        assert (shown.lower[1] > used.min(0) - slack).all() and (shown.upper[1] < used.max(0) + slack).all()
+
+
+# Sharing of states.
+
+
+def test_objects_share_states(device):
+    model, other = sample("small ball"), sample("crumbs")
+    scene = ab.Scene(device)
+    for m in (model, other, model, model):
+        scene.add(m)
+    _, states, objects = scene.arrays()
+    assert objects.state[0] == objects.state[2] == objects.state[3] != objects.state[1]
+    assert len(states.slots) == 2
+
+    scene.set_lods([10, 5, 20, 30])  # more targets than states: copies
+    assert len(set(objects.state)) == 4 and len(states.slots) == 4
+    room = states.node_room, states.face_room
+    stay = dict(enumerate(objects.state.tolist()))
+
+    stats = scene.set_lods([10, 5, 20, 30])
+    assert len(stats.state) == len(stats.k) == len(stats.nodes_refitted) == 0
+
+    stats = scene.set_lods([20, 5, 30, 11])  # only one target is new, and 10 is the state that nobody keeps
+    assert stats.state.tolist() == [stay[0]] and stats.lod.tolist() == [11]
+    assert objects.state.tolist() == [stay[2], stay[1], stay[3], stay[0]]
+
+    scene.set_lods([7, 5, 7, 7])
+    assert len(set(objects.state)) == 2
+    assert sum(map(len, states.free.values())) == 2
+    scene.set_lods([1, 2, 3, 4])  # freed states are taken again
+    assert len(states.slots) == 4 and not any(states.free.values())
+    assert (states.node_room, states.face_room) == room
+    np.testing.assert_array_equal(objects.pool.state.numpy(), objects.state)
+    np.testing.assert_array_equal(scene.lods, [1, 2, 3, 4])
+
+
+def test_pool_keeps_to_what_is_needed(device):
+    rng = np.random.default_rng(6)
+    model = sample("small ball")
+    scene = ab.Scene(device)
+    for _ in range(40):
+        scene.add(model)
+    scene.set_lods(rng.choice(model.lod_max, 40, replace=False))
+    _, states, _ = scene.arrays()
+    room = states.node_room, states.face_room
+    for _ in range(10):
+        scene.set_lods(rng.integers(0, model.lod_max + 1, 40))
+    assert len(states.slots) == 40
+    assert (states.node_room, states.face_room) == room
+
+
+@pytest.mark.slow
+def test_thousands_of_objects_in_one_batch(device):
+    rng = np.random.default_rng(7)
+    models = [sample(name) for name in ("small ball", "crumbs", "twins", "one")]
+    walker = Walker(models, rng.integers(0, 4, 5000).tolist(), device)
+    ladders = [np.unique(np.linspace(0, model.lod_max, 50).astype(int)) for model in models]
+    for _ in range(3):
+        lods = np.array([rng.choice(ladders[m]) for m in walker.objects])
+        stats = walker.scene.set_lods(lods)
+        assert (stats.nodes_refitted > 0).all()
+        walker.check_states(lods)
+    assert len(walker.scene.arrays()[1].slots) <= sum(map(len, ladders))
+
+
+def test_dropped_faces_are_never_active(device):
+    vertices, faces = crumbs(4)
+    vertices = np.concatenate([vertices, vertices[faces[0]]])  # the file's vertices, not welded
+    thin = np.array([[0, 0, 1], [16, 0, 2], [3, 3, 3]])
+    model = ab.Model.from_arrays(vertices, np.concatenate([thin, faces]), base_faces=1)
+    assert model.dropped_faces.tolist() == [0, 1, 2]
+    scene = ab.Scene(device)
+    scene.add(model)
+    for lod in range(model.lod_max, -1, -1):
+        scene.set_lods([lod])
+        state = raw_state(scene, 0)
+        assert (state["corner"][:3] == -1).all()
+        assert (state["status"][model.tree.leaf_node[:3]] == oracle.INACTIVE).all()
+        assert not np.isin(model.mesh_at(lod)[2], [0, 1, 2]).any()

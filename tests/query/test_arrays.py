@@ -1,0 +1,220 @@
+"""Arrays of other frameworks wherever poses, LODs and pairs go in; what lies on a GPU is read without its framework."""
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.resources import describe
+from helpers.samples import random_poses, sample
+
+import warp_abtree as ab
+from warp_abtree.scene.poses import check_poses, device_rows
+
+
+class DlpackArray:
+    """An array that speaks DLPack and nothing else."""
+
+    def __init__(self, array):
+        self.array = array
+
+    def __dlpack__(self, **options):
+        return self.array.__dlpack__(**options)
+
+    def __dlpack_device__(self):
+        return self.array.__dlpack_device__()
+
+
+class InterfaceArray:
+    """An array on a GPU that has `__cuda_array_interface__` and nothing else."""
+
+    def __init__(self, array):
+        self.array = array
+
+    @property
+    def __cuda_array_interface__(self):
+        return self.array.__cuda_array_interface__
+
+
+def to_torch(values, device):
+    torch = pytest.importorskip("torch")
+    return torch.asarray(values, device="cuda" if device.is_cuda else "cpu")
+
+
+def to_cupy(values, device):
+    if not device.is_cuda:
+        pytest.skip("CuPy is for GPUs")
+    return pytest.importorskip("cupy").asarray(values)
+
+
+def to_numba(values, device):
+    if not device.is_cuda:
+        pytest.skip("arrays of Numba on a GPU")
+    return pytest.importorskip("numba.cuda").to_device(values)
+
+
+def to_jax(values, device):
+    jax = pytest.importorskip("jax")
+    jax.config.update("jax_enable_x64", True)
+    return jax.device_put(values, jax.devices("cuda" if device.is_cuda else "cpu")[0])
+
+
+def to_interface(values, device):
+    if not device.is_cuda:
+        pytest.skip("the interface is one of GPUs")
+    return InterfaceArray(wp.array(values, device=device))
+
+
+FRAMEWORKS = {
+    "warp": lambda values, device: wp.array(values, device=device),
+    "dlpack": lambda values, device: DlpackArray(wp.array(values, device=device)),
+    "interface": to_interface,
+    "torch": to_torch,
+    "cupy": to_cupy,
+    "numba": to_numba,
+    "jax": to_jax,
+}
+
+
+@pytest.fixture(params=FRAMEWORKS)
+def framework(request, device):
+    make = FRAMEWORKS[request.param]
+    return lambda values: make(np.ascontiguousarray(values), wp.get_device(device))
+
+
+PAIRS = np.array([(0, 1), (1, 2), (3, 1), (2, 0)])
+
+
+def make_scene(device):
+    scene = ab.Scene(device)
+    for pose in random_poses(np.random.default_rng(1), 4, 0.4):
+        scene.add(sample("torus"), pose)
+    return scene
+
+
+def poses_of(shape, real, count=4):
+    poses = random_poses(np.random.default_rng(2), count, 0.4).astype(real)
+    if shape == "matrices":
+        matrices = np.tile(np.eye(4), (count, 1, 1))
+        x, y, z, w = poses[:, 3:].astype(np.float64).T
+        # A turn about z alone is rigid to the last bit but one, in either precision.
+        angle = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        matrices[:, 0, 0] = matrices[:, 1, 1] = np.cos(angle)
+        matrices[:, 1, 0], matrices[:, 0, 1] = np.sin(angle), -np.sin(angle)
+        matrices[:, :3, 3] = poses[:, :3]
+        return matrices.astype(real)
+    return poses
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+@pytest.mark.parametrize("shape", ["quaternions", "matrices"])
+def test_poses(device, framework, shape, real):
+    """The same bits as from NumPy, for a scene and a sweep."""
+    poses = poses_of(shape, real)
+    first, second = make_scene(device), make_scene(device)
+    first.set_poses(poses)
+    second.set_poses(framework(poses))
+    for name in ("rotation", "position"):
+        expected = getattr(first.arrays()[2].pool, name).numpy()
+        assert getattr(second.arrays()[2].pool, name).numpy().tobytes() == expected.tobytes()
+    model, many = sample("torus"), poses_of(shape, real, 500)
+    for output in ("count", "faces"):
+        expected = ab.sweep(model, model, many, output=output, device=device)
+        np.testing.assert_array_equal(ab.sweep(model, model, framework(many), output=output, device=device), expected)
+        assert len(expected) >= 500 and expected.any()
+
+
+def test_poses_of_both_kinds_agree(device):
+    """A sweep over matrices answers what one over their quaternions answers, and a scene at each of them."""
+    model = sample("torus")
+    matrices = poses_of("matrices", np.float64, 50)
+    quaternions = np.zeros((50, 7))
+    quaternions[:, :3] = matrices[:, :3, 3]
+    half = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0]) / 2
+    quaternions[:, 5], quaternions[:, 6] = np.sin(half), np.cos(half)
+    found = ab.sweep(model, model, matrices, output="count", device=device)
+    np.testing.assert_array_equal(found, ab.sweep(model, model, quaternions, output="count", device=device))
+    scene = ab.Scene(device)
+    scene.add(model)
+    for matrix in matrices:
+        scene.add(model, matrix)
+    pairs = np.stack([np.zeros(50, int), np.arange(1, 51)], 1)
+    np.testing.assert_array_equal(found, scene.intersect(pairs, output="count").count)
+
+
+def test_lods_pairs_and_distances(device, framework):
+    first, second = make_scene(device), make_scene(device)
+    lods = first.lods - [0, 30, 60, 90]
+    first.set_lods(lods)
+    second.set_lods(framework(lods))
+    np.testing.assert_array_equal(second.lods, lods)
+    within = np.array([0.01, 0.02, 0.03, 0.04])
+    expected = describe(first.intersect(PAIRS, output="faces", within=within))
+    assert describe(second.intersect(framework(PAIRS), output="faces", within=framework(within))) == expected
+    query = ab.Query(second, "faces", pairs=framework(PAIRS), within=framework(within))
+    assert describe(query.run()) == expected
+    query.set_pairs(framework(PAIRS[:2]), framework(within[:2]))
+    assert describe(query.run()) == describe(first.intersect(PAIRS[:2], output="faces", within=within[:2]))
+    assert describe(ab.ContactQuery(second, framework(PAIRS)).run()) == describe(first.intersect(PAIRS, "contacts"))
+    frame = ab.FrameGraph(second, output="count", pairs=framework(PAIRS), groups=framework(np.arange(4)))
+    np.testing.assert_array_equal(frame.run().count, first.intersect(PAIRS, output="count").count)
+    second.filter(framework(PAIRS[:2]))
+    np.testing.assert_array_equal(second.broad_phase(), [(0, 2), (0, 3), (1, 3), (2, 3)])
+
+
+def test_transforms_of_managers(device, framework):
+    manager = ab.CollisionManager(device)
+    manager.add_object("a", sample("torus"), framework(poses_of("matrices", np.float64)[0]))
+    manager.add_object("b", sample("torus"))
+    manager.set_transform("b", framework(poses_of("matrices", np.float64)[1]))
+    assert manager.in_collision_internal()
+
+
+def test_what_lies_elsewhere_is_refused_or_copied(device, framework):
+    scene = make_scene(device)
+    poses = poses_of("quaternions", np.float64)
+    before = scene.arrays()[2].pool.position.numpy().copy()
+    bad = poses.copy()
+    bad[2, 3:] *= 1.5
+    for values, what in (
+        (bad, "pose 2 has a quaternion of norm 1.5"),
+        (np.where(np.arange(7) == 1, np.nan, poses), "pose 0 is not finite"),
+        (poses[:3], "3 given for 4 objects"),
+        (poses[:, :6], "neither"),
+        (np.diag([1, 1, 1, 2.0]) * np.ones((4, 1, 1)), "matrix 0 is not rigid"),
+        (np.diag([1, 1, -1, 1.0]) * np.ones((4, 1, 1)), "matrix 0 is not rigid"),
+        (np.eye(4) * np.array([1, 1, 1 + 1e-5])[[0, 1, 2, 0]][:, None, None], "matrix 2 is not rigid"),
+    ):
+        with pytest.raises(ValueError, match=what):
+            scene.set_poses(framework(values))
+        np.testing.assert_array_equal(scene.arrays()[2].pool.position.numpy(), before)
+    for call in (
+        lambda: scene.set_lods(framework(np.array([0, 1, 2, 10**6]))),
+        lambda: scene.intersect(framework(np.array([(0, 7)]))),
+        lambda: ab.sweep(sample("torus"), sample("torus"), framework(bad), device=device),
+    ):
+        with pytest.raises(ValueError, match=r"object 3 asks|has 4 objects|pose 2 has a quaternion of norm 1\.5"):
+            call()
+
+
+def test_what_is_on_the_gpu_is_read_there(device):
+    """Contiguous rows without a copy, Warp's transforms and matrices too; other types and devices are brought over."""
+    target = wp.get_device(device)
+    rows = wp.array(poses_of("quaternions", np.float64), device=device)
+    if not target.is_cuda:
+        assert device_rows(rows, target) is None
+        return
+    assert device_rows(rows, target).ptr == rows.ptr
+    matrices = wp.array(poses_of("matrices", np.float32), device=device)
+    assert device_rows(matrices, target).ptr == matrices.ptr and device_rows(matrices, target).shape == (4, 16)
+    transforms = wp.array(rows.numpy(), dtype=wp.transformd, device=device)
+    assert device_rows(transforms, target).ptr == transforms.ptr and device_rows(transforms, target).shape == (4, 7)
+    across = wp.array(np.ascontiguousarray(rows.numpy().T), device=device).transpose()
+    np.testing.assert_array_equal(device_rows(across, target).numpy(), rows.numpy())
+    assert device_rows(wp.array(rows.numpy(), device="cpu"), target) is None
+
+
+def test_no_numbers(device):
+    scene = make_scene(device)
+    for values in (wp.array(np.ones((4, 7), bool), device=device), "poses", [[1], [1, 2]], object()):
+        with pytest.raises(ValueError, match="poses: "):
+            scene.set_poses(values)
+    assert check_poses([(0, 0, 0, 0, 0, 0, 1)]).shape == (1, 7)

@@ -1,0 +1,254 @@
+"""Candidate pairs against brute force over posed root boxes; worlds, static objects, filters."""
+
+from fractions import Fraction
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from helpers.samples import STILL, random_poses, raw_state, sample
+from hypothesis import HealthCheck, given, settings
+from oracles.triangle import into_frame_of_a, pose_matrix, triangles_intersect
+
+import warp_abtree as ab
+
+NAMES = ("box", "crumbs", "grid", "three")
+CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(-1, 3)
+
+
+def posed_boxes(scene, poses):
+    """Return lower and upper (n, 3) of the posed root boxes in float64."""
+    lower, upper = [], []
+    for i, pose in enumerate(poses):
+        state = raw_state(scene, i)
+        centre = scene.models[scene.object_model[i]].centre
+        ends = np.stack([state["lower"][1], state["upper"][1]]).astype(np.float64) + centre
+        rotation, position = pose_matrix(pose)
+        points = np.take_along_axis(ends, CORNERS, 0) @ rotation.T + position
+        lower.append(points.min(0))
+        upper.append(points.max(0))
+    return np.array(lower), np.array(upper)
+
+
+def overlaps(lower, upper, slack):
+    """Return which boxes overlap when each is widened by slack times its largest coordinate, bool (n, n)."""
+    room = slack * np.maximum(np.abs(lower), np.abs(upper)).max(1)[:, None]
+    lower, upper = lower - room, upper + room
+    return ((lower[:, None] <= upper) & (upper[:, None] >= lower)).all(2)
+
+
+def check_pairs(scene, poses, worlds, statics, excluded=()):
+    """Compare with brute force: all pairs that overlap, and none that float32 can tell apart. Returns the pairs."""
+    pairs = scene.broad_phase()
+    assert pairs.dtype == np.int32 and pairs.ndim == 2 and pairs.shape[1] == 2
+    assert (pairs[:, 0] < pairs[:, 1]).all()
+    found = list(map(tuple, pairs.tolist()))
+    assert found == sorted(set(found)), "sorted, each once"
+    worlds, statics = np.array(worlds), np.array(statics)
+    may = (worlds[:, None] == worlds) | (worlds[:, None] == -1) | (worlds == -1)
+    may &= ~(statics[:, None] & statics)
+    for i, j in excluded:
+        may[i, j] = may[j, i] = False
+    may = np.triu(may, 1)
+    lower, upper = posed_boxes(scene, poses)
+    needed = np.argwhere(may & overlaps(lower, upper, -1e-13))
+    allowed = np.argwhere(may & overlaps(lower, upper, 3e-7))
+    assert set(map(tuple, needed.tolist())) <= set(found)
+    assert set(found) <= set(map(tuple, allowed.tolist()))
+    return pairs
+
+
+def make_scene(device, models, poses, worlds, statics, lods=None):
+    scene = ab.Scene(device)
+    for i, model in enumerate(models):
+        lod = None if lods is None else round(lods[i] * model.lod_max)
+        scene.add(model, poses[i], world=worlds[i], static=statics[i], lod=lod)
+    return scene
+
+
+objects = st.lists(
+    st.tuples(
+        st.sampled_from(NAMES),
+        st.tuples(*[st.integers(-6, 6)] * 3),
+        st.sampled_from([(0, 0, 0, 1), (0, 0, 1, 0), (0.5, 0.5, 0.5, 0.5), (0.6, 0, 0.8, 0), (0.1, 0.7, -0.7, 0.1)]),
+        st.sampled_from([-1, 0, 0, 0, 1, 7, 2**31 - 1]),
+        st.booleans(),
+        st.sampled_from([0.0, 0.3, 1.0]),
+    ),
+    min_size=2,
+    max_size=25,
+)
+
+
+@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(objects, st.lists(st.tuples(st.integers(0, 24), st.integers(0, 24)), max_size=8))
+def test_random_scenes_equal_brute_force(device, things, excluded):
+    """Positions on a lattice, so that boxes often touch."""
+    names, positions, turns, worlds, statics, lods = zip(*things, strict=True)
+    turns = np.array(turns) / np.linalg.norm(turns, axis=1, keepdims=True)
+    poses = np.concatenate([0.5 * np.array(positions), turns], 1)
+    scene = make_scene(device, [sample(name) for name in names], poses, worlds, statics, lods)
+    check_pairs(scene, poses, worlds, statics)
+    excluded = [(i, j) for i, j in excluded if i != j and max(i, j) < len(things)]
+    for i, j in excluded:
+        scene.filter([(i, j)])
+    check_pairs(scene, poses, worlds, statics, excluded)
+
+
+def test_many_objects_after_moves_and_lods(device):
+    rng = np.random.default_rng(1)
+    models = [sample(name) for name in rng.choice(NAMES, 600)]
+    worlds, statics = rng.integers(-1, 3, 600), rng.random(600) < 0.3
+    poses = random_poses(rng, 600, 6.0)
+    scene = make_scene(device, models, poses, worlds.tolist(), statics.tolist())
+    assert len(check_pairs(scene, poses, worlds, statics)) > 300
+    poses = random_poses(rng, 600, 4.0)
+    scene.set_poses(poses)
+    scene.set_lods([rng.integers(0, model.lod_max + 1) for model in models])
+    assert len(check_pairs(scene, poses, worlds, statics)) > 600
+
+
+@pytest.mark.parametrize("offset", [1e4, 1e6, -3e7])
+def test_far_from_the_origin_nothing_is_missed(device, offset):
+    """Boxes in the world are float32: far away they are coarser, never too small."""
+    rng = np.random.default_rng(2)
+    poses = random_poses(rng, 120, 4.0)
+    poses[:, :3] += [offset, 0, -offset]
+    scene = make_scene(device, [sample("crumbs")] * 120, poses, [0] * 120, [False] * 120)
+    assert len(check_pairs(scene, poses, [0] * 120, [False] * 120)) > 100
+
+
+def exact_box(scene, i, pose):
+    """Return lower and upper end of an object's posed root box, three fractions each, for a pose taken as a matrix."""
+    state = raw_state(scene, i)
+    ends = [[Fraction(float(x)) for x in state[name][1]] for name in ("lower", "upper")]
+    centre = [Fraction(x) for x in scene.models[scene.object_model[i]].centre.tolist()]
+    lower, upper = [], []
+    for row, position in zip(pose[:3, :3].tolist(), pose[:3, 3].tolist(), strict=True):
+        parts = [(Fraction(r) * (c + p), Fraction(r) * (c + q)) for r, c, p, q in zip(row, centre, *ends, strict=True)]
+        lower.append(Fraction(position) + sum(map(min, parts)))
+        upper.append(Fraction(position) + sum(map(max, parts)))
+    return lower, upper
+
+
+@pytest.mark.parametrize("far", [0.0, 2.0**36])
+def test_boxes_in_the_world_contain_what_they_box(device, far):
+    """In fractions, models as far from their own origin as poses bring them back; and boxes are not much too large."""
+    rng = np.random.default_rng(4)
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    scene = ab.Scene(device)
+    for pose in poses:
+        place = far * rng.normal(size=3)
+        pose[:3, :3] = pose_matrix(random_poses(rng, 1, 1.0)[0])[0]
+        pose[:3, 3] = rng.normal(size=3) - pose[:3, :3] @ place
+        scene.add(ab.Model.from_arrays(place + rng.normal(size=(3, 3)), [[0, 1, 2]]), pose)
+    query = ab.Query(scene, "any")
+    query.run()
+    boxes = [corner.numpy().tolist() for corner in (query.broad_phase.lower, query.broad_phase.upper)]
+    room = Fraction(4e-7) + Fraction(40 * 2.0**-48 * far)
+    for i, pose in enumerate(poses):
+        for lower, upper, least, most in zip(boxes[0][i], boxes[1][i], *exact_box(scene, i, pose), strict=True):
+            assert least - 4 * room < Fraction(lower) < least
+            assert most < Fraction(upper) < most + 4 * room
+
+
+def test_faces_that_touch_far_from_their_origins_are_candidates(device):
+    """Corners of root boxes that meet in one point, where float64 rounds the boxes apart."""
+    rng = np.random.default_rng(5)
+    scene = ab.Scene(device)
+    for world in range(30):
+        poses, faces = np.tile(np.eye(4), (2, 1, 1)), []
+        for pose, side in zip(poses, (1, -1), strict=True):
+            pose[:3, :3] = pose_matrix(random_poses(rng, 1, 1.0)[0])[0]
+            # The first corner is that end of its box which goes farthest along the world's first axis.
+            inward = -side * np.sign(pose[0, :3]) * rng.uniform(0.2, 1.0, (2, 3))
+            faces.append(2.0**36 * rng.normal(size=3) + np.concatenate([np.zeros((1, 3)), inward]))
+            pose[:3, 3] = -pose[:3, :3] @ faces[-1][0]
+        first = into_frame_of_a(faces[1][:1], *poses)
+        faces[0] += first - faces[0][:1]
+        faces[0][0] = first
+        assert triangles_intersect(faces[0], into_frame_of_a(faces[1], *poses))
+        for face, pose in zip(faces, poses, strict=True):
+            scene.add(ab.Model.from_arrays(face, [[0, 1, 2]]), pose, world=world)
+    np.testing.assert_array_equal(scene.broad_phase(), np.arange(60).reshape(-1, 2))
+
+
+def test_thousand_worlds(device):
+    """Everything overlaps everything, and only worlds keep it apart."""
+    box = sample("box")
+    scene = ab.Scene(device)
+    worlds = np.concatenate([np.repeat(np.arange(1000), 3), [-1, -1]])
+    worlds = np.random.default_rng(3).permutation(np.where(worlds < 0, -1, 1001 * worlds))
+    for world in worlds:
+        scene.add(box, world=int(world))
+    pairs = scene.broad_phase()
+    shared = (worlds[:, None] == -1) | (worlds == -1)
+    expected = np.argwhere(np.triu((worlds[:, None] == worlds) | shared, 1))
+    np.testing.assert_array_equal(pairs, expected)
+    assert len(pairs) == 3 * 1000 + 2 * 3000 + 1
+    result = scene.intersect(precision="exact")
+    np.testing.assert_array_equal(result.pairs[np.lexsort(result.pairs.T[::-1])], expected)
+
+
+def test_every_world_only(device):
+    """Objects that are in every world meet each other even where there is no other world."""
+    box = sample("box")
+    scene = make_scene(device, [box] * 4, [STILL] * 4, [-1] * 4, [False, False, True, True])
+    np.testing.assert_array_equal(scene.broad_phase(), [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3)])
+
+
+def test_touching_and_apart(device):
+    box = sample("box")
+    poses = np.array([STILL, (1, 0, 0, 0, 0, 0, 1), (2.001, 0, 0, 0, 0, 0, 1), (1, 1, 1, 0, 0, 0, 1)])
+    scene = make_scene(device, [box] * 4, poses, [0] * 4, [False] * 4)
+    np.testing.assert_array_equal(scene.broad_phase(), [(0, 1), (0, 3), (1, 3)])
+
+
+def test_filter_adds_up_and_outlives_changes(device):
+    box = sample("box")
+    scene = make_scene(device, [box] * 4, [STILL] * 4, [0] * 4, [False] * 4)
+    scene.filter([(0, 1), (3, 2)])
+    scene.filter(np.array([[1, 0], [0, 3]]))
+    scene.filter([])
+    np.testing.assert_array_equal(scene.broad_phase(), [(0, 2), (1, 2), (1, 3)])
+    scene.add(box)
+    scene.set_lods([0] * 5)
+    np.testing.assert_array_equal(scene.broad_phase(), [(0, 2), (0, 4), (1, 2), (1, 3), (1, 4), (2, 4), (3, 4)])
+    assert scene.intersect([(0, 1)], precision="exact").any.all(), "a pair that is asked for is tested all the same"
+    assert len(scene.intersect(precision="exact").pairs) == 7
+
+
+def test_distances_beyond_float32(device):
+    """Objects out of float32's reach neither vanish nor hide the others."""
+    box = sample("box")
+    poses = np.tile(STILL, (40, 1))
+    poses[:, 0] = 0.75 * np.arange(40)
+    poses[::4, 0] = 1e300
+    poses[1::8, 1] = -1e200
+    scene = make_scene(device, [box] * 40, poses, [0] * 40, [False] * 40)
+    found = set(map(tuple, scene.broad_phase().tolist()))
+    lower, upper = posed_boxes(scene, poses)
+    needed = set(map(tuple, np.argwhere(np.triu(overlaps(lower, upper, 0.0), 1)).tolist()))
+    assert needed <= found
+    meets = scene.intersect(precision="exact")
+    assert {tuple(pair) for pair, hit in zip(meets.pairs.tolist(), meets.any, strict=True) if hit} == needed
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_frames_off_orthonormal_hide_no_pair(device, order):
+    """Matrices rigid within 1e-6 are taken as they are: faces that meet by the exact test are candidates."""
+    model = sample("box")
+    shrunk = np.diag([1 - 4.9e-7] * 3 + [1.0])
+    found = []
+    for gap in (-9.5e-7, 0.0, 4.0e-7, 4.9e-7, 9e-7):
+        scene = ab.Scene(device)
+        # The boxes' faces lie half a unit from their middles; only the first frame is off.
+        other = np.eye(4)
+        other[0, 3] = order * (1 + gap / 2)
+        scene.add(model, shrunk)
+        scene.add(model, other)
+        pairs = scene.broad_phase().tolist()
+        met = scene.intersect([(0, 1)]).any[0]
+        assert pairs or not met
+        np.testing.assert_array_equal(scene.intersect().any, [met] if pairs else [])
+        found.append((met, len(pairs)))
+    assert found[0][0] and found[2][0] and not found[-1][0], found

@@ -1,0 +1,377 @@
+"""Contacts as an operator: the order of rows, the shape of sums to the bit, capacities, and capture."""
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.samples import STILL, contact_poses, random_poses, sample
+
+import warp_abtree as ab
+
+CHUNK = 32  # contacts that are summed from left to right before sums are; part of the definition
+FAR = (9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+# Sums in their stated order, in plain Python.
+
+
+def dot(u, v):
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+def cross(u, v):
+    return np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+
+
+def scaled(v):
+    """Return the largest component's magnitude, and the vector divided by it."""
+    largest = np.abs(v).max()
+    return largest, v / largest if largest else v
+
+
+def length(v):
+    largest, u = scaled(v)
+    return largest * np.sqrt(dot(u, u))
+
+
+def summed(terms):
+    """Sum chunks of terms from left to right, then their sums."""
+    sums = []
+    for k in range(0, len(terms), CHUNK):
+        total = terms[0] * 0.0
+        for term in terms[k : k + CHUNK]:
+            total = total + term
+        sums.append(total)
+    total = terms[0] * 0.0
+    for part in sums:
+        total = total + part
+    return total
+
+
+def summary(rows):
+    """Return (point, normal, depth) of a pair's contacts; None as depth where there is no curve to tell it."""
+    origin, count = rows["p0"][0], len(rows)
+    lengths = [length(q - p) for p, q in zip(rows["p0"], rows["p1"])]
+    total = summed(lengths)
+    weights = [x / total for x in lengths] if total else [1.0 / count] * count
+    ends = list(zip(weights, rows["p0"], rows["p1"]))
+    middle = summed([w * (0.5 * (p - origin) + 0.5 * (q - origin)) for w, p, q in ends])
+    mean = summed([w * n for w, n in zip(weights, rows["normal"])])
+    assert length(mean) > 2.0**-20
+    _, n = scaled(mean)
+    n = n / np.sqrt(dot(n, n))
+    areas, changes = [np.float64(0)], [np.float64(0)]
+    for row in rows:
+        r, s = row["p0"] - origin - middle, row["p1"] - row["p0"]
+        cosine = dot(row["normal_a"], row["normal_b"])
+        square = 1.0 - cosine * cosine
+        away = row["normal_b"] - row["normal_a"] * cosine
+        flat = square < 2.0**-40
+        areas.append(0.0 if row["coplanar"] else 0.5 * dot(n, cross(r, s)))
+        changes.append(0.0 if row["coplanar"] or flat else dot(n, row["normal_b"]) / square * dot(away, cross(s, n)))
+    area, change = summed(areas[1:]), summed(changes[1:])
+    return origin + middle, n, -area / change if area * change < 0 else None
+
+
+def check_summaries(result):
+    """Compare every pair's summary to the bit; return how often the contact curve told the depth."""
+    curves = 0
+    assert len(result.pair_contacts) == len(result.pairs)
+    np.testing.assert_array_equal(result.pair_contacts["count"], result.count)
+    for p, got in enumerate(result.pair_contacts):
+        rows = result.contacts[result.contacts["pair"] == p]
+        assert len(rows) == result.count[p]
+        if not len(rows):
+            assert np.isnan(got["point"]).all() and np.isnan(got["normal"]).all() and got["depth"] == 0
+            continue
+        point, normal, depth = summary(rows)
+        assert got["point"].tobytes() == point.tobytes()
+        assert got["normal"].tobytes() == normal.tobytes()
+        assert depth is None or got["depth"] <= depth
+        curves += got["depth"] == depth
+    return curves
+
+
+def teeth(count, seed, points=False):
+    """So many triangles that cross the plane z = 0, or touch it with a corner, each alone."""
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(-0.1, 0.1, (count, 3, 3))
+    corners += np.append(rng.uniform(0, 1, (count, 2)), np.zeros((count, 1)), 1)[:, None]
+    corners[:, 0, 2] = 0 if points else rng.uniform(-1.5, -0.5, count)
+    corners[:, 1:, 2] = rng.uniform(0.5, 1.5, (count, 2))
+    return ab.Model.from_arrays(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
+
+
+@pytest.mark.parametrize("points", [False, True])
+def test_sums_of_every_length(device, points):
+    """Counts around whole chunks, weighted by length or all alike."""
+    counts = (1, 2, 31, 32, 33, 63, 64, 65, 96, 97, 300)
+    scene = ab.Scene(device)
+    floor = ab.Model.from_arrays(np.array([[-9.0, -9, 0], [30, -9, 0], [-9, 30, 0]]), [[0, 1, 2]])
+    scene.add(floor)
+    for count in counts:
+        scene.add(teeth(count, count, points))
+    pairs = np.array([(0, i + 1) if i % 2 else (i + 1, 0) for i in range(len(counts))])
+    result = ab.ContactQuery(scene, pairs).run()
+    np.testing.assert_array_equal(result.count, counts)
+    check_summaries(result)
+
+
+def touching(device, names=("ball", "torus", "soup", "lattice soup"), pairs=12, seed=0):
+    """A scene of pairs of objects (2 p, 2 p + 1) in contact, and one object far away."""
+    rng = np.random.default_rng(seed)
+    scene = ab.Scene(device)
+    for p in range(pairs):
+        models = [sample(names[p % len(names)]), sample(names[(p // 2 + 1) % len(names)])]
+        poses = contact_poses(rng, models[0], models[0].lod_max, models[1], models[1].lod_max)
+        for model, pose in zip(models, poses):
+            scene.add(model, pose)
+    scene.add(models[0], (50.0, 0, 0, 0, 0, 0, 1))
+    pairs = np.arange(2 * pairs).reshape(-1, 2)
+    pairs[1::2] = pairs[1::2, ::-1]
+    return scene, np.concatenate([pairs, [(0, len(pairs) * 2)], pairs[:3]])
+
+
+def same(result, other):
+    """Whether two results agree in every bit of faces, contacts and summaries."""
+    np.testing.assert_array_equal(result.count, other.count)
+    for name in ("faces", "contacts", "pair_contacts"):
+        assert getattr(result, name).tobytes() == getattr(other, name).tobytes(), name
+
+
+@pytest.mark.slow
+def test_shapes_in_contact(device):
+    scene, pairs = touching(device)
+    result = ab.ContactQuery(scene, pairs).run()
+    plain = scene.intersect(pairs, output="faces")
+    np.testing.assert_array_equal(result.faces, plain.faces)
+    rows = result.contacts
+    np.testing.assert_array_equal(np.column_stack([rows["pair"], rows["faces"]]), plain.faces)
+    assert (result.count > 2 * CHUNK).sum() > 3
+    assert check_summaries(result) > 5
+    same(scene.intersect(pairs, output="contacts"), result)
+
+
+# Order and room change nothing.
+
+
+class TwoPassQuery(ab.ContactQuery):
+    """Has room for too few bits in a key, and sorts twice."""
+
+    key_bits = 20
+
+
+def test_any_order_of_hits(device):
+    scene, pairs = touching(device)
+    expected = ab.ContactQuery(scene, pairs).run()
+    rng = np.random.default_rng(1)
+    for kind in (ab.ContactQuery, TwoPassQuery):
+        query = kind(scene, pairs)
+        same(query.run(), expected)
+        k = len(expected.faces)
+        for _ in range(2):
+            hits = query.hits.face.numpy().copy()
+            hits[:k] = rng.permutation(hits[:k])
+            hits[k:] = -1
+            query.hits.face.assign(hits)
+            query.find_contacts()
+            same(query.result(), expected)
+
+
+def test_any_capacity(device):
+    scene, pairs = touching(device, pairs=4)
+    expected = scene.intersect(pairs, output="contacts")
+    demand = len(expected.contacts)
+    for capacity in (demand, demand + 1, 3 * demand + 7, 1):
+        query = ab.ContactQuery(scene, pairs, capacity=capacity, pair_capacity=len(pairs) + capacity % 7)
+        same(query.run(), expected)
+        same(query.result(), expected)
+        assert len(query.faces) == (capacity if capacity > 1 else demand)
+
+
+def test_any_batch(device):
+    """A pair's contacts and their sum are the same alone, repeated and in any place."""
+    scene, pairs = touching(device)
+    whole = ab.ContactQuery(scene, pairs).run()
+    batch = np.append(np.random.default_rng(2).integers(0, len(pairs), 30), [12, 12, 0])
+    query = ab.ContactQuery(scene, pairs[:1])
+    query.set_pairs(pairs[batch])
+    mixed = query.run()
+    assert (mixed.count == 0).any()
+    for row, p in enumerate(batch):
+        mine, theirs = mixed.contacts[mixed.contacts["pair"] == row], whole.contacts[whole.contacts["pair"] == p]
+        for name in mine.dtype.names[1:]:
+            assert mine[name].tobytes() == theirs[name].tobytes()
+        assert mixed.pair_contacts[row].tobytes() == whole.pair_contacts[p].tobytes()
+
+
+def check_device_arrays(query, result):
+    """What lies on the device is what the host was given; starts cover the rows of each pair."""
+    start, k = query.start.numpy(), len(result.faces)
+    assert len(start) == len(query.pairs) + 1 == len(query.pair_contacts.depth) + 1
+    rows = result.faces[:, 0]
+    np.testing.assert_array_equal(start, np.searchsorted(rows, np.arange(len(start))))
+    np.testing.assert_array_equal(query.faces.numpy()[:k], result.faces)
+    for name in ("p0", "p1", "normal_a", "normal_b", "normal", "coplanar"):
+        np.testing.assert_array_equal(getattr(query.contacts, name).numpy()[:k], result.contacts[name])
+    for name in ("point", "normal", "depth"):
+        found = getattr(query.pair_contacts, name).numpy()
+        np.testing.assert_array_equal(found[: len(result.pairs)], result.pair_contacts[name])
+        beyond = found[len(result.pairs) :]
+        assert (beyond == 0).all() if name == "depth" else np.isnan(beyond).all()
+
+
+@pytest.mark.parametrize("room", [None, 7, 500])
+def test_pairs_of_the_broad_phase(device, room):
+    scene, _ = touching(device, pairs=8)
+    query = ab.ContactQuery(scene, pair_capacity=room)
+    result = query.run()
+    assert len(result.pairs) == len(scene.broad_phase()) > 8
+    check_device_arrays(query, result)
+    plain = scene.intersect(result.pairs, output="contacts")
+    same(result, plain)
+    query = ab.ContactQuery(scene, pair_capacity=5)
+    query.launch()
+    with pytest.raises(ab.CapacityError, match=f"found {len(result.pairs)} pairs, .* room for 5"):
+        query.result().check()
+
+
+def test_overflow_names_the_demand(device):
+    scene, pairs = touching(device)
+    whole = scene.intersect(pairs, output="contacts")
+    demand = len(whole.contacts)
+    known = {row.tobytes() for row in whole.contacts}
+    for capacity in (1, 31, demand // 2, demand - 1):
+        query = ab.ContactQuery(scene, pairs, capacity=capacity)
+        query.launch()
+        part = query.result()
+        with pytest.raises(ab.CapacityError, match=f"^{demand} face pairs .* room for {capacity}: .*capacity={demand}"):
+            part.check()
+        np.testing.assert_array_equal(part.count, whole.count)
+        assert len(part.contacts) == len(part.faces) == capacity
+        assert (np.lexsort(part.faces.T[::-1]) == np.arange(capacity)).all()
+        assert {row.tobytes() for row in part.contacts} <= known
+        np.testing.assert_array_equal(query.start.numpy(), np.searchsorted(part.faces[:, 0], np.arange(len(pairs) + 1)))
+        same(query.run(), whole)
+    ab.ContactQuery(scene, pairs, capacity=demand).run()
+
+
+def test_nothing_to_find(device):
+    scene, pairs = touching(device, pairs=2)
+    query = ab.ContactQuery(scene, pairs)
+    assert len(query.run().contacts) > 0
+    apart = np.array([(0, 4), (4, 1)])
+    query.set_pairs(apart)
+    result = query.run()
+    assert len(result.contacts) == 0 and result.faces.shape == (0, 3) and len(result.pair_contacts) == 2
+    check_summaries(result)
+    check_device_arrays(query, result)
+    query.set_pairs([])
+    for none in (query.run(), ab.ContactQuery(scene, []).run()):
+        assert none.contacts.shape == none.pair_contacts.shape == none.count.shape == (0,)
+        assert none.faces.shape == (0, 3) and none.faces.dtype == np.int32 and none.contacts["p0"].shape == (0, 3)
+    lone = ab.Scene(device)
+    lone.add(sample("box"))
+    assert len(ab.ContactQuery(lone).run().pair_contacts) == 0
+
+
+def test_other_poses_and_distances(device):
+    """A query goes on with the poses of each launch, and proves distances beside contacts."""
+    ball = sample("ball")
+    scene = ab.Scene(device)
+    for x in (0, 1.5, 4):
+        scene.add(ball, (x, 0, 0, 0, 0, 0, 1))
+    query = ab.ContactQuery(scene, [(0, 1), (1, 2), (0, 2)], within=1.0)
+    np.testing.assert_array_equal(query.run().apart, [False, False, True])
+    first = query.result()
+    scene.set_poses([FAR, STILL, (0.2, 1.5, 0, 0, 0, 0, 1)])
+    second = query.run()
+    np.testing.assert_array_equal(second.any, [False, True, False])
+    same(second, scene.intersect(second.pairs, output="contacts"))
+    assert len(first.contacts) == first.count[0] > 0, "results on the host stay as they were"
+    assert (first.contacts["pair"] == 0).all() and (first.faces[:, 0] == 0).all()
+
+
+# Capture.
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_a_graph_takes_poses_to_contacts(device, given):
+    scene, pairs = touching(device)
+    if not given and not scene.device.is_cuda:
+        pytest.skip("a tree of boxes is built anew in CUDA graphs only")
+    capacity = 60000 if given else 500000
+    query = ab.ContactQuery(scene, pairs if given else None, capacity=capacity, pair_capacity=400)
+    query.launch()
+    rng = np.random.default_rng(3)
+    for recapture in range(2):
+        with wp.ScopedCapture(query.device) as capture:
+            query.launch()
+        for _ in range(3):
+            scene.set_poses(random_poses(rng, scene.object_count, 1.5))
+            query.start.fill_(-1)
+            query.pair_contacts.depth.fill_(-1.0)
+            wp.capture_launch(capture.graph)
+            result = query.result()
+            result.check()
+            assert len(result.contacts) > 100
+            check_device_arrays(query, result)
+            same(result, scene.intersect(result.pairs, output="contacts"))
+        if given and not recapture:
+            pairs = np.concatenate([pairs, pairs[::-1, ::-1]])
+            query.set_pairs(pairs)
+        query.resize(capacity + 10000)
+        query.launch()
+
+
+# What is asked for, and what is refused.
+
+
+def test_float32(device):
+    scene, pairs = touching(device, pairs=3)
+    full, query = ab.ContactQuery(scene, pairs).run(), ab.ContactQuery(scene, pairs, contact_dtype=np.float32)
+    small = query.run()
+    for part in ("contacts", "pair_contacts"):
+        for name in getattr(full, part).dtype.names:
+            wanted = getattr(full, part)[name]
+            wanted = wanted.astype(np.float32) if wanted.dtype == np.float64 else wanted
+            assert getattr(small, part)[name].tobytes() == wanted.tobytes()
+    assert query.contacts.p0.dtype == wp.vec3d
+
+
+def test_refused(device):
+    scene, pairs = touching(device, pairs=1)
+    with pytest.raises(ValueError, match=r"ab\.ContactQuery"):
+        ab.Query(scene, "contacts", pairs=pairs)
+    with pytest.raises(ValueError, match="contact_dtype"):
+        ab.ContactQuery(scene, pairs, contact_dtype=np.int64)
+    with pytest.raises(ValueError, match="precision"):
+        ab.ContactQuery(scene, pairs, precision="best")
+    with pytest.raises(ValueError, match="capacity"):
+        ab.ContactQuery(scene, pairs, capacity=0)
+    with pytest.raises(ab.CapacityError, match="fewer than 2"):
+        ab.ContactQuery(scene, pairs, capacity=2**30)
+    query = ab.ContactQuery(scene, pairs)
+    scene.add(sample("box"))
+    with pytest.raises(RuntimeError, match="make a new one"):
+        query.launch()
+
+
+def test_skewed_matrices(device):
+    """A rotation that is off orthonormal by s carries ends off the posed mesh by at most 3 s of their distance."""
+    rng = np.random.default_rng(4)
+    scene, matrices = ab.Scene(device), np.tile(np.eye(4), (2, 1, 1))
+    wall = ab.Model.from_arrays(np.array([[-99.0, -99, 0], [99, -99, 0], [0, 99, 0]]), [[0, 1, 2]])
+    scene.add(sample("ball"))
+    scene.add(wall)
+    worst = 0.0
+    for _ in range(20):
+        skew = rng.uniform(-1, 1, (3, 3))
+        skew = np.eye(3) + (skew + skew.T) * 2e-7
+        s = np.abs(skew.T @ skew - np.eye(3)).max()
+        matrices[0, :3, :3], matrices[0, :3, 3] = skew, rng.uniform(-0.5, 0.5, 3)
+        scene.set_poses(matrices)
+        ends = scene.intersect([(0, 1)], output="contacts").contacts["p0"]
+        off = np.abs(ends[:, 2]) / (s * np.linalg.norm(ends - matrices[0, :3, 3], axis=1))
+        worst = max(worst, off.max())
+        assert s < 1e-6 and len(ends) > 10
+    assert 0.1 < worst <= 3.0

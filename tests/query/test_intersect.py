@@ -1,0 +1,442 @@
+"""Batched traversal: every intersecting face pair, against exact brute force and an independent library."""
+
+import copy
+
+import numpy as np
+import pytest
+import warp as wp
+from conftest import slow
+from helpers.samples import REAL_MESHES, SHAPES, STILL, WARP_MESHES, contact_poses, random_poses, sample, true_faces
+from oracles.peers import fcl_faces, judge
+from oracles.triangle import into_frame_of_a
+
+import warp_abtree as ab
+from warp_abtree.kernels.poses import PairPose, pose_point
+from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+SHAPE_PAIRS = [
+    ("ball", "torus"),
+    ("capsule", "box"),
+    ("crumbs", "crumbs"),
+    ("soup", "ball"),
+    ("soup", "lattice soup"),
+    ("grid", "torus"),
+    ("twins", "twins"),
+    ("one", "soup"),
+    ("two", "three"),
+]
+REAL_PAIRS = list(zip(REAL_MESHES, REAL_MESHES[1:] + REAL_MESHES[:1], strict=True))
+BRUTE_FACES = 2500
+
+
+def ask(scene, pairs, output="faces"):
+    return scene.intersect(pairs, output=output, precision="exact")
+
+
+def random_lod(rng, model, most_faces):
+    """Return a LOD of at most about so many faces, all sizes equally likely on a logarithmic scale."""
+    most = min(most_faces, model.face_count)
+    return model.lod_for(fraction=most ** rng.uniform(0.4, 1.0) / model.face_count)
+
+
+def posed_cases(rng, names, count, most_faces, device):
+    """Return a scene of `count` pairs of objects (2 p, 2 p + 1) in contact, and what each object is."""
+    scene, cases = ab.Scene(device), []
+    for _ in range(count):
+        pair = [sample(name) for name in names]
+        lods = [random_lod(rng, model, most_faces) for model in pair]
+        poses = contact_poses(rng, pair[0], lods[0], pair[1], lods[1])
+        for model, lod, pose in zip(pair, lods, poses, strict=True):
+            scene.add(model, pose, lod=lod)
+        cases.append((pair[0], lods[0], poses[0], pair[1], lods[1], poses[1]))
+    return scene, cases
+
+
+def check_cases(scene, cases):
+    """Compare faces with brute force; any and count with faces; swapped and shuffled batches with plain ones."""
+    expected = [true_faces(*case) for case in cases]
+    pairs = np.arange(2 * len(cases)).reshape(-1, 2)
+    result = ask(scene, pairs)
+    rows = np.concatenate([np.insert(faces, 0, p, 1) for p, faces in enumerate(expected)])
+    np.testing.assert_array_equal(result.faces, rows)
+    check_agreement(scene, pairs, result)
+
+    mirrored = ask(scene, pairs[:, ::-1])
+    swapped = rows[:, [0, 2, 1]]
+    np.testing.assert_array_equal(mirrored.faces, swapped[np.lexsort(swapped.T[::-1])])
+
+    rng = np.random.default_rng(0)
+    order = rng.integers(0, len(pairs), 3 * len(pairs))
+    turned = rng.random(len(order)) < 0.5
+    batch = np.where(turned[:, None], pairs[order][:, ::-1], pairs[order])
+    result = ask(scene, batch)
+    np.testing.assert_array_equal(result.count, [len(expected[p]) for p in order])
+    for row, (p, flip) in enumerate(zip(order, turned, strict=True)):
+        faces = expected[p][:, ::-1] if flip else expected[p]
+        got = result.faces[result.faces[:, 0] == row][:, 1:]
+        np.testing.assert_array_equal(got, faces[np.lexsort(faces.T[::-1])])
+    return expected
+
+
+def check_agreement(scene, pairs, result):
+    """The three outputs agree, and results are typed, shaped and sorted as promised."""
+    np.testing.assert_array_equal(result.pairs, pairs)
+    assert (result.any.dtype, result.count.dtype.kind, result.faces.dtype) == (bool, "i", np.int32)
+    np.testing.assert_array_equal(result.count, np.bincount(result.faces[:, 0], minlength=len(pairs)))
+    np.testing.assert_array_equal(result.any, result.count > 0)
+    assert (np.lexsort(result.faces.T[::-1]) == np.arange(len(result.faces))).all()
+    counts, alone = ask(scene, pairs, "count"), ask(scene, pairs, "any")
+    np.testing.assert_array_equal(counts.count, result.count)
+    np.testing.assert_array_equal(counts.any, result.any)
+    np.testing.assert_array_equal(alone.any, result.any)
+    assert counts.faces is None and alone.faces is None and alone.count is None
+    assert (alone.triangle_tests <= result.triangle_tests).all()
+
+
+@pytest.mark.parametrize("names", SHAPE_PAIRS, ids="-".join)
+def test_shapes_equal_brute_force(device, names):
+    scene, cases = posed_cases(np.random.default_rng(1), names, 10, BRUTE_FACES, device)
+    expected = check_cases(scene, cases)
+    assert sum(map(len, expected)) > 0
+
+
+@pytest.mark.parametrize("names", [*REAL_PAIRS, ("warp:bunny", "warp:bear"), ("warp:rocks", "fcl-env")], ids="-".join)
+@pytest.mark.slow
+def test_real_meshes_equal_brute_force(device, names):
+    scene, cases = posed_cases(np.random.default_rng(2), names, 4, BRUTE_FACES, device)
+    expected = check_cases(scene, cases)
+    assert sum(map(len, expected)) > 0
+
+
+@pytest.mark.parametrize("names", [*SHAPE_PAIRS[:4], *slow(*REAL_PAIRS, WARP_MESHES[:2])], ids="-".join)
+def test_agrees_with_fcl(device, names):
+    """Any LOD up to the original; FCL's own mistakes are told apart by the exact test."""
+    pytest.importorskip("fcl")
+    scene, cases = posed_cases(np.random.default_rng(3), names, 3, 10**6, device)
+    result = ask(scene, np.arange(6).reshape(-1, 2))
+    wrong = 0
+    for p, (model_a, lod_a, pose_a, model_b, lod_b, pose_b) in enumerate(cases):
+        (*mesh_a, ids_a), (*mesh_b, ids_b) = model_a.mesh_at(lod_a), model_b.mesh_at(lod_b)
+        ours = result.faces[result.faces[:, 0] == p][:, 1:]
+        rows = np.stack([np.searchsorted(ids_a, ours[:, 0]), np.searchsorted(ids_b, ours[:, 1])], 1)
+        pair = (*mesh_a, *mesh_b, pose_a, pose_b)
+        verdict = judge(rows, fcl_faces(*pair), *pair)
+        assert verdict.ours_wrong == []
+        wrong += len(verdict.peer_wrong)
+    assert wrong <= 0.02 * len(result.faces) + 2
+    assert len(result.faces) > 0
+
+
+# Where B's vertices lie in A's frame: to the bit, since every answer is defined on these coordinates.
+
+
+@wp.kernel
+def pose_point_kernel(
+    pair_poses: wp.array(dtype=PairPose), points: wp.array(dtype=wp.vec3d), moved_out: wp.array2d(dtype=wp.vec3d)
+):
+    p, i = wp.tid()
+    moved_out[p, i] = pose_point(pair_poses[p].rotation, pair_poses[p].translation, points[i])
+
+
+def test_relative_poses_equal_the_definition(device):
+    rng = np.random.default_rng(10)
+    poses = np.concatenate([random_poses(rng, 20, 3.0), random_poses(rng, 20, 1e-3), random_poses(rng, 20, 1e7)])
+    points = rng.normal(size=(50, 3)) * 2.0 ** rng.integers(-30, 5, (50, 3))
+    points[0] = 0
+    points[1] = 2.0**-291, -(2.0**-300), 2.0**-290
+    poses[:2] = STILL
+    scene = ab.Scene(device)
+    for pose in poses:
+        scene.add(sample("box"), pose)
+    pairs = np.concatenate([np.arange(60).reshape(-1, 2), rng.permutation(60).reshape(-1, 2)])
+    query = ab.Query(scene, "any", pairs=pairs, precision="exact")
+    query.launch()
+    moved = wp.zeros((60, 50), dtype=wp.vec3d, device=device)
+    inputs = [query.pair_poses, wp.array(points, dtype=wp.vec3d, device=device)]
+    wp.launch(pose_point_kernel, dim=(60, 50), inputs=inputs, outputs=[moved], device=device)
+    for (i, j), got in zip(pairs, moved.numpy(), strict=True):
+        np.testing.assert_array_equal(got, into_frame_of_a(points, poses[min(i, j)], poses[max(i, j)]))
+
+
+# Degenerate contact. Coordinates are small multiples of a power of two, so that float64 decides exactly.
+
+
+def rounded(name):
+    """Return a model whose coordinates are whole multiples of 2^-12 of its extent."""
+    model = sample(name)
+    vertices, faces, _ = model.mesh_at(model.lod_max)
+    unit = 2.0 ** np.ceil(np.log2(np.abs(vertices).max()))
+    return ab.Model.from_arrays(np.round(vertices / unit * 4096) / 4096, faces)
+
+
+def check_pair(device, model_a, pose_a, model_b, pose_b, lods=(None, None)):
+    """Compare one pair with brute force and return its faces."""
+    scene = ab.Scene(device)
+    scene.add(model_a, pose_a, lod=lods[0])
+    scene.add(model_b, pose_b, lod=lods[1])
+    faces = ask(scene, [(0, 1)]).faces[:, 1:]
+    lod_a, lod_b = scene.lods
+    np.testing.assert_array_equal(faces, true_faces(model_a, lod_a, pose_a, model_b, lod_b, pose_b))
+    return faces
+
+
+LAID_ON_THEMSELVES = ["torus", "grid", "crumbs", *slow("fcl-rob", "woody", "fandisk")]
+
+
+@pytest.mark.parametrize("name", LAID_ON_THEMSELVES)
+def test_a_mesh_on_top_of_itself(device, name):
+    """Every face is coplanar with its twin, and touches all its neighbours."""
+    model = rounded(name)
+    faces = check_pair(device, model, STILL, model, STILL)
+    alive = model.mesh_at(model.lod_max)[2]
+    assert {(f, f) for f in alive} <= set(map(tuple, faces.tolist()))
+    turned = np.array([[0, -1, 0, 0.5], [1, 0, 0, 0.25], [0, 0, 1, 3], [0, 0, 0, 1]])
+    np.testing.assert_array_equal(check_pair(device, model, turned, model, turned), faces)
+
+
+@pytest.mark.parametrize("name", ["fcl-env", "cow", "homer"])
+def test_neighbours_meet_at_any_lod(device, name):
+    """A mesh on itself with its own coordinates: faces that share a vertex are all found."""
+    model = sample(name)
+    scene = ab.Scene(device)
+    pose = np.eye(4)
+    for fraction in (0.05, 0.3):
+        lod = model.lod_for(fraction=fraction)
+        scene.add(model, pose, lod=lod)
+        scene.add(model, pose, lod=lod)
+        faces = ask(scene, [(scene.object_count - 2, scene.object_count - 1)]).faces[:, 1:]
+        found = set(map(tuple, faces.tolist()))
+        _, corners, ids = model.mesh_at(lod)
+        for vertex in np.unique(corners):
+            ring = ids[(corners == vertex).any(1)]
+            assert {(f, g) for f in ring for g in ring} <= found
+
+
+@pytest.mark.parametrize("shift, meets", [((1, 0, 0), 1), ((1, 1, 0), 1), ((1, 1, 1), 1), ((0.5, 0.25, 1), 1)])
+def test_touching_boxes(device, shift, meets):
+    """Faces, edges and corners that touch count; one unit in the last place farther, they do not."""
+    box = sample("box")
+    assert len(check_pair(device, box, STILL, box, (*shift, 0, 0, 0, 1))) > 0
+    beyond = [np.nextafter(x, 9) if x == 1 else x for x in shift]
+    assert len(check_pair(device, box, STILL, box, (*beyond, 0, 0, 0, 1))) == 0
+
+
+# Positions and scales.
+
+
+def moved(case, shift):
+    model_a, lod_a, pose_a, model_b, lod_b, pose_b = case
+    return model_a, lod_a, pose_a + shift, model_b, lod_b, pose_b + shift
+
+
+@pytest.mark.parametrize("far", [1e3, 1e6, 1e9])
+def test_far_from_the_origin(device, far):
+    """Both objects far away, and meshes whose own coordinates are far from their origin."""
+    rng = np.random.default_rng(5)
+    _, cases = posed_cases(rng, ("ball", "crumbs"), 6, BRUTE_FACES, device)
+    shift = np.array([far, -far, 0.3 * far, 0, 0, 0, 0])
+    cases = [moved(case, shift) for case in cases]
+    vertices, faces, _ = sample("torus").mesh_at(sample("torus").lod_max)
+    remote = ab.Model.from_arrays(vertices + [far, far, -far], faces, base_faces=4)
+    for _ in range(3):
+        lod = random_lod(rng, remote, BRUTE_FACES)
+        pose_a, pose_b = contact_poses(rng, remote, lod, sample("soup"), 50)
+        cases += [(remote, lod, pose_a, sample("soup"), 50, pose_b)]
+        cases += [(sample("soup"), 50, pose_b, remote, lod, pose_a)]
+    scene = ab.Scene(device)
+    for case in cases:
+        scene.add(case[0], case[2], lod=case[1])
+        scene.add(case[3], case[5], lod=case[4])
+    assert sum(map(len, check_cases(scene, cases))) > 100
+
+
+@pytest.mark.parametrize("exponent", [-60, -23, -1, 1, 31, 60])
+def test_scaling_by_a_power_of_two_changes_nothing(device, exponent):
+    rng = np.random.default_rng(6)
+    scale = 2.0**exponent
+    names = ("soup", "torus")
+    scaled = []
+    for name in names:
+        vertices, faces = SHAPES[name]()
+        scaled.append(ab.Model.from_arrays(vertices * scale, faces, base_faces=4))
+        assert scaled[-1].lod_max == sample(name).lod_max
+    plain, cases = posed_cases(rng, names, 8, BRUTE_FACES, device)
+    large = ab.Scene(device)
+    for _, lod_a, pose_a, _, lod_b, pose_b in cases:
+        by = np.array([scale] * 3 + [1.0] * 4)
+        large.add(scaled[0], pose_a * by, lod=lod_a)
+        large.add(scaled[1], pose_b * by, lod=lod_b)
+    pairs = np.arange(16).reshape(-1, 2)
+    result, other = ask(plain, pairs), ask(large, pairs)
+    np.testing.assert_array_equal(result.faces, other.faces)
+    assert len(result.faces) > 20
+
+
+@pytest.mark.parametrize("far", [1e6, 1e30, 1e39, 1e300, 1.7e308])
+def test_pairs_far_apart(device, far):
+    """Beyond float32, even where the distance overflows float64, the answer is no and costs nothing."""
+    scene = ab.Scene(device)
+    ball = sample("small ball")
+    scene.add(ball)
+    for x in (far, -far):
+        for axis in range(3):
+            scene.add(ball, np.concatenate([np.roll([x, 0, 0], axis), STILL[3:]]))
+    scene.add(ball, (far, 0, 0, 0, 0, 0, 1))
+    count = scene.object_count
+    pairs = [(i, j) for i in range(count) for j in range(count) if i != j]
+    result = ask(scene, pairs)
+    meets = {(1, count - 1), (count - 1, 1)}
+    assert {pair for pair, any_hit in zip(pairs, result.any, strict=True) if any_hit} == meets
+    apart = [pair not in meets for pair in pairs]
+    assert (result.node_tests[apart] <= 2).all() and (result.triangle_tests[apart] == 0).all()
+    assert (result.count[~np.array(apart)] >= ball.face_count).all()
+
+
+# Capacity, operators, regimes.
+
+
+def test_overflow_is_told(device):
+    scene, _ = posed_cases(np.random.default_rng(7), ("ball", "torus"), 6, BRUTE_FACES, device)
+    pairs = np.arange(12).reshape(-1, 2)
+    whole = ask(scene, pairs)
+    demand = len(whole.faces)
+    query = ab.Query(scene, "faces", pairs=pairs, capacity=3, precision="exact")
+    query.launch()
+    result = query.result()
+    assert len(result.faces) == 3
+    np.testing.assert_array_equal(result.count, whole.count)  # counts are whole all the same
+    with pytest.raises(ab.CapacityError, match=f"{demand} face pairs .* room for 3"):
+        result.check()
+    grown = query.run()
+    np.testing.assert_array_equal(grown.faces, whole.faces)
+    query = ab.Query(scene, "faces", pairs=pairs, capacity=demand, precision="exact")
+    query.launch()
+    query.result().check()
+
+
+def test_scene_grows_its_buffers(device):
+    """More hits than the room that a query of one pair starts with."""
+    model = rounded("torus")
+    scene = ab.Scene(device)
+    scene.add(model)
+    scene.add(model)
+    result = ask(scene, [(0, 1)])
+    assert len(result.faces) == result.count[0] > 1024
+
+
+def test_broad_phase_overflow_is_told(device):
+    scene = ab.Scene(device)
+    for _ in range(5):
+        scene.add(sample("box"))
+    query = ab.Query(scene, "any", pair_capacity=4, precision="exact")
+    query.launch()
+    with pytest.raises(ab.CapacityError, match="10 pairs"):
+        query.result().check()
+    assert len(scene.broad_phase()) == len(scene.intersect(precision="exact").pairs) == 10
+
+
+def test_nothing_asked(device):
+    scene = ab.Scene(device)
+    scene.add(sample("box"))
+    for pairs in ([], np.empty((0, 2), int), None):
+        result = ask(scene, pairs)
+        assert result.any.shape == result.count.shape == (0,)
+        assert result.faces.shape == (0, 3) and result.pairs.shape == (0, 2)
+
+
+class WarpQuery(ab.Query):
+    """A query that takes the CUDA regime on every device."""
+
+    def uses_warps(self):
+        return True
+
+
+@pytest.mark.parametrize("room", [STACK_LENGTH, 0])
+@pytest.mark.parametrize("parts", [1, 5, 300])
+@pytest.mark.slow
+def test_warps_give_the_same_answers(device, room, parts):
+    """One warp a pair and several, with room on the stack or none, so that they go one item at a time."""
+    scene, _ = posed_cases(np.random.default_rng(8), ("torus", "soup"), 12, BRUTE_FACES, device)
+    for _ in range(2):  # a mesh laid on itself
+        scene.add(sample("torus"), STILL, lod=sample("torus").lod_for(fraction=0.2))
+    for x in (0.0, 0.0, 0.03125):  # corners in common, faces in one plane wait for exact signs
+        scene.add(sample("grid"), (x, x / 2, 0, 0, 0, 0, 1), lod=sample("grid").lod_for(fraction=0.2))
+    pairs = np.arange(24).reshape(-1, 2)
+    pairs = np.concatenate([pairs, pairs[::-1, ::-1], [(0, 3), (2, 9), (24, 25), (26, 27), (26, 28), (28, 26)]])
+    visits = {}
+    for output in ("faces", "count", "any"):
+        plain = ask(scene, pairs, output)
+        query = WarpQuery(scene, output, pairs=pairs, unsure_capacity=2)
+        query.parts_max, query.stack_room = parts, room
+        result = query.run()
+        visits[output] = result.node_tests.sum()
+        np.testing.assert_array_equal(result.any, plain.any)
+        if output != "any":
+            for name in ("count", "node_tests", "triangle_tests", "float64_tests", "exact_tests"):
+                np.testing.assert_array_equal(getattr(result, name), getattr(plain, name))
+        if output == "faces":
+            np.testing.assert_array_equal(result.faces, plain.faces)
+            assert len(result.faces) > 100
+            assert result.exact_tests[-1] > 2, "the list of unsure faces has grown"
+    if parts == 1:
+        assert visits["any"] < visits["count"], "a pair ends at its first hit"
+
+
+@pytest.mark.parametrize("name", ["cow", "fandisk", "fcl-env", "woody", "torus", "soup"])
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.slow
+def test_exact_where_every_face_meets_its_twin(device, name, turned):
+    """One mesh twice in one place: coplanar twins at the identity, twins a rounding apart at any other pose."""
+    model = sample(name)
+    lod = model.lod_for(fraction=min(1.0, 1500 / model.face_count))
+    pose = random_poses(np.random.default_rng(10), 1, 1.0)[0] if turned else STILL
+    scene = ab.Scene(device)
+    for _ in range(2):
+        scene.add(model, pose, lod=lod)
+    result = ask(scene, [(0, 1)])
+    np.testing.assert_array_equal(result.faces[:, 1:], true_faces(model, lod, pose, model, lod, pose))
+    if turned and name not in ("soup", "woody"):  # few pairs, and perhaps none
+        rounded = scene.intersect([(0, 1)], "faces", precision="float32")
+        assert not np.array_equal(rounded.faces, result.faces), "the case is too easy to tell exact signs from others"
+
+
+@pytest.mark.parametrize("name", ["torus", "soup", "ball"])
+def test_a_mesh_laid_on_itself_goes_to_float64_at_once(device, name):
+    """Of twins in one place all faces, of a copy's those that float32 leaves open: the answers are the same."""
+    model = sample(name)
+    for pose in (STILL, random_poses(np.random.default_rng(12), 1, 1.0)[0]):
+        scene = ab.Scene(device)
+        beside = (*np.asarray(pose[:3]) + 1e-4, *pose[3:])
+        for placed, at in ((model, pose), (model, pose), (copy.copy(model), pose), (model, beside)):
+            scene.add(placed, at)
+        result = ask(scene, [(0, 1), (0, 2), (0, 3)])
+        first, second, _ = (result.faces[result.faces[:, 0] == p, 1:] for p in range(3))
+        np.testing.assert_array_equal(first, second)
+        tested, left = result.triangle_tests, result.float64_tests
+        assert left[0] == tested[0] == tested[1] > left[1]
+        assert left[2] < tested[2]
+        coarse = model.lod_for(fraction=0.3)
+        scene.set_lods([model.lod_max, coarse, coarse, coarse])
+        apart = ask(scene, [(0, 1), (0, 2)])  # no twins
+        assert (apart.float64_tests < apart.triangle_tests).all() and np.ptp(apart.float64_tests) == 0
+
+
+@pytest.mark.parametrize("name", [*slow("cow", "rocker-arm", "stanford-bunny"), "torus"])
+@pytest.mark.parametrize("fraction", [0.1, 0.03, 0.01])
+def test_a_coarse_tree_costs_no_more_than_one_built_for_its_lod(device, name, fraction):
+    """Skip links keep "no loss" true: node tests within 1.1 times those of a static tree, over 20 poses in contact."""
+    model = sample(name)
+    lod = model.lod_for(fraction=fraction)
+    static = ab.Model.from_arrays(*model.mesh_at(lod)[:2])
+    rng = np.random.default_rng(9)
+    active, built = ab.Scene(device), ab.Scene(device)
+    for _ in range(20):
+        for pose in contact_poses(rng, model, lod, model, lod):
+            active.add(model, pose, lod=lod)
+            built.add(static, pose)
+    pairs = np.arange(40).reshape(-1, 2)
+    ours, theirs = ask(active, pairs, "count"), ask(built, pairs, "count")
+    np.testing.assert_array_equal(ours.count, theirs.count)
+    assert ours.node_tests.sum() <= 1.1 * theirs.node_tests.sum()

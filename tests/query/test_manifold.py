@@ -1,0 +1,195 @@
+"""Contact points: depths and normals of boxes in closed form, area vectors against clipped faces, order and room."""
+
+import itertools
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.samples import random_poses
+
+import warp_abtree as ab
+from warp_abtree.simulate.body_state import matrices_of
+
+
+def model_of(mesh):
+    return ab.Model.from_arrays(np.asarray(mesh.vertices), np.asarray(mesh.faces), base_faces=4)
+
+
+def box(*extents, splits=0):
+    mesh = trimesh.creation.box(extents)
+    for _ in range(splits):
+        mesh = mesh.subdivide()
+    return model_of(mesh)
+
+
+def about(axis, angle):
+    axis = np.asarray(axis, float) / np.linalg.norm(axis)
+    return (*(np.sin(angle / 2) * axis), np.cos(angle / 2))
+
+
+def ask(device, *placed, **options):
+    """Return the query of (model, pose) in a scene, and what it finds."""
+    scene = ab.Scene(device)
+    for model, pose in placed:
+        scene.add(model, pose=pose)
+    query = ab.ManifoldQuery(scene, **options)
+    return query, query.run()
+
+
+def clip_area_vector(half, pose, other_half, other_pose):
+    """Area vector of that part of the faces of one box that lies within another, by clipping each face: an oracle."""
+    r, r2 = matrices_of([pose[3:], other_pose[3:]])
+    total = np.zeros(3)
+    for axis, sign in itertools.product(range(3), (-1, 1)):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        polygon = []
+        for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
+            corner = np.zeros(3)
+            corner[axis], corner[u], corner[v] = sign * half[axis], a * half[u], b * half[v]
+            polygon.append(r2.T @ (r @ corner + pose[:3] - other_pose[:3]))
+        for k, s in itertools.product(range(3), (-1, 1)):
+            kept = []
+            for p, q in zip(polygon, polygon[1:] + polygon[:1]):
+                at_p, at_q = other_half[k] - s * p[k], other_half[k] - s * q[k]
+                if at_p >= 0:
+                    kept.append(p)
+                if (at_p < 0) != (at_q < 0):
+                    kept.append(p + (q - p) * at_p / (at_p - at_q))
+            polygon = kept
+        for p, q in itertools.pairwise(polygon[1:]):
+            total += 0.5 * sign * abs(np.linalg.norm(np.cross(p - polygon[0], q - polygon[0]))) * r[:, axis]
+    return total
+
+
+@pytest.mark.parametrize("splits", [(0, 0), (2, 0), (0, 2), (2, 2)])
+def test_a_box_on_a_floor_has_its_four_corners(device, splits):
+    floor, cube = box(4, 4, 1, splits=splits[0]), box(1, 0.8, 0.6, splits=splits[1])
+    turned = about((0, 0, 1), 0.3)
+    _, result = ask(device, (floor, (0, 0, -0.5, 0, 0, 0, 1)), (cube, (0.1, 0.2, 0.29, *turned)))
+    points = result.points
+    np.testing.assert_allclose(points["normal"], np.tile([0, 0, 1.0], (len(points["pair"]), 1)), atol=1e-12)
+    np.testing.assert_allclose(points["depth"], 0.01, atol=1e-12)
+    r = matrices_of([turned])[0]
+    for x, y in itertools.product((-0.5, 0.5), (-0.4, 0.4)):
+        corner = r @ [x, y, -0.3] + [0.1, 0.2, 0.29]
+        away = np.linalg.norm(points["point"] - corner, axis=1)
+        # Where both are finely meshed the place of a point is that of a column, one of many.
+        assert away.min() < (1e-9 if splits == (0, 0) else 0.15)
+
+
+def test_equal_boxes_in_a_stack_push_upwards(device):
+    cube = box(1, 1, 1)
+    for shift in ((0, 0), (0.02, 0.01), (0.3, 0.0), (0.4, -0.4)):
+        _, result = ask(device, (cube, (0, 0, 0, 0, 0, 0, 1)), (cube, (*shift, 0.995, 0, 0, 0, 1)))
+        points = result.points
+        assert len(points["pair"]) >= 4
+        np.testing.assert_allclose(points["normal"], np.tile([0, 0, 1.0], (len(points["pair"]), 1)), atol=1e-9)
+        np.testing.assert_allclose(points["depth"], 0.005, atol=1e-9)
+        spread = np.ptp(points["point"][:, :2], axis=0)
+        np.testing.assert_allclose(spread, 1 - np.abs(shift), atol=1e-5)
+
+
+def test_edges_across_edges_push_along_their_cross_product(device):
+    bar = box(4, 0.5, 0.5)
+    first = (0, 0, 0, *about((1, 0, 0), np.pi / 4))
+    half = np.sqrt(0.125)
+    over = matrices_of([about((0, 0, 1), np.pi / 2)])[0] @ matrices_of([about((1, 0, 0), np.pi / 4)])[0]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = over, [0, 0, 2 * half - 0.02]
+    start = np.eye(4)
+    start[:3, :3] = matrices_of([first[3:]])[0]
+    _, result = ask(device, (bar, start), (bar, pose))
+    points = result.points
+    np.testing.assert_allclose(points["normal"], np.tile([0, 0, 1.0], (len(points["pair"]), 1)), atol=1e-9)
+    assert points["depth"].max() == pytest.approx(0.02, abs=1e-9)
+    assert np.abs(points["point"][:, :2]).max() < 0.05
+
+
+def test_a_corner_is_pushed_by_floor_and_walls_each_its_own_way(device):
+    corner = trimesh.util.concatenate(
+        [trimesh.creation.box((4, 4, 1)).apply_translation(t) for t in ((0, 0, -0.5),)]
+        + [trimesh.creation.box((1, 4, 4)).apply_translation((-2.5, 0, 2))]
+    )
+    _, result = ask(device, (model_of(corner), (0, 0, 0, 0, 0, 0, 1)), (box(1, 1, 1), (-1.51, 0.1, 0.495, 0, 0, 0, 1)))
+    normals = result.points["normal"]
+    up, aside = np.abs(normals - [0, 0, 1]).max(1) < 1e-9, np.abs(normals - [1, 0, 0]).max(1) < 1e-9
+    assert up.sum() >= 2 and aside.sum() >= 2
+    np.testing.assert_allclose(result.points["depth"][up], 0.005, atol=1e-9)
+    assert result.points["depth"][aside].max() == pytest.approx(0.01, abs=1e-9)
+
+
+@pytest.mark.parametrize("splits", [0, 2])
+def test_a_loop_points_along_the_area_vector(device, splits):
+    rng = np.random.default_rng(5)
+    halves = np.array([0.5, 0.4, 0.3]), np.array([0.45, 0.35, 0.5])
+    shapes = [box(*(2 * half), splits=splits) for half in halves]
+    judged = 0
+    for _ in range(25):
+        poses = random_poses(rng, 2, 0.4)
+        query, result = ask(device, *zip(shapes, poses))
+        if not result.any[0]:
+            continue
+        loops = query.curves.loop.numpy()[: result.count[0]]
+        area = clip_area_vector(halves[0], poses[0], halves[1], poses[1])
+        if len(set(loops.tolist())) > 1 or np.linalg.norm(area) < 1e-3:
+            continue
+        judged += 1
+        found = query.curves.loop_normal.numpy()[loops[0]]
+        np.testing.assert_allclose(found, area / np.linalg.norm(area), atol=1e-9)
+    assert judged >= 8
+
+
+def test_separate_contacts_are_separate_loops(device):
+    """A table whose four legs stand in a floor, each on faces of its own; its normals point up at every leg."""
+    legs = [(x, y) for x in (-1, 1) for y in (-1, 1)]
+    parts = [trimesh.creation.box((0.2, 0.2, 1)).apply_translation((x, y, 0.5)) for x, y in legs]
+    table = model_of(
+        trimesh.util.concatenate([*parts, trimesh.creation.box((3, 3, 0.2)).apply_translation((0, 0, 1.2))])
+    )
+    tile = trimesh.creation.box((1.5, 1.5, 0.5))
+    tiles = model_of(trimesh.util.concatenate([tile.copy().apply_translation((x, y, -0.25)) for x, y in legs]))
+    query, result = ask(device, (tiles, (0, 0, 0, 0, 0, 0, 1)), (table, (0, 0, -0.01, 0, 0, 0, 1)))
+    assert len(set(query.curves.loop.numpy()[: result.count[0]].tolist())) == 4
+    points = result.points
+    assert len(points["pair"]) == 4, "legs are boxes: what lies between their outermost corners adds nothing"
+    quadrants = {tuple(np.sign(p[:2]).astype(int)) for p in points["point"]}
+    assert len(quadrants) == 4, "the points are spread over all legs"
+    np.testing.assert_allclose(points["normal"][:, 2], 1, atol=1e-9)
+
+
+def test_apart_inside_and_touching(device):
+    cube, small, sheet = box(1, 1, 1), box(0.2, 0.2, 0.2), ([[-2, -2, 0], [2, -2, 0], [0, 3, 0.0]], [[0, 1, 2]])
+    still = (0, 0, 0, 0, 0, 0, 1)
+    _, inside = ask(device, (cube, still), (small, still), pairs=[(0, 1)])
+    assert not inside.any[0] and len(inside.points["pair"]) == 0
+    _, touching = ask(device, (cube, still), (cube, (0, 0, 1, 0, 0, 0, 1)))
+    assert touching.any[0] and np.all(touching.points["depth"] == 0)
+    np.testing.assert_allclose(touching.points["normal"][:, 2], 1, atol=1e-9)
+    _, flat = ask(device, (ab.Model.from_arrays(*sheet), still), (small, (0, 0, 0.09, 0, 0, 0, 1)))
+    np.testing.assert_allclose(flat.points["normal"][:, 2], 1, atol=1e-9)
+    np.testing.assert_allclose(flat.points["depth"], 0.01, atol=1e-9)
+
+
+def test_a_pair_named_the_other_way_turns_its_normals(device):
+    cube = box(1, 1, 1)
+    placed = (cube, (0, 0, 0, 0, 0, 0, 1)), (cube, (0.3, 0.2, 0.9, *about((1, 2, 3), 0.4)))
+    forth = ask(device, *placed, pairs=[(0, 1)])[1].points
+    back = ask(device, *placed, pairs=[(1, 0)])[1].points
+    order = lambda rows: rows[np.lexsort(np.round(rows, 9).T)]  # noqa: E731
+    assert len(forth["pair"]) == len(back["pair"])
+    np.testing.assert_allclose(np.sort(forth["depth"]), np.sort(back["depth"]), atol=1e-12)
+    np.testing.assert_allclose(order(forth["normal"]), order(-back["normal"]), atol=1e-9)
+
+
+def test_room_grows_and_changes_nothing(device):
+    rng = np.random.default_rng(1)
+    placed = [(box(1, 0.8, 0.6, splits=1), pose) for pose in random_poses(rng, 12, 1.2)]
+    _, ample = ask(device, *placed, capacity=10_000, pair_capacity=1000)
+    query, tight = ask(device, *placed, capacity=1, pair_capacity=1)
+    assert tight.pairs.tolist() == ample.pairs.tolist() == sorted(ample.pairs.tolist())
+    assert len(tight.points["pair"]) > 12
+    for name, values in ample.points.items():
+        assert np.array_equal(values, tight.points[name]), name
+    query.launch()
+    for name, values in query.result().points.items():
+        assert np.array_equal(values, ample.points[name]), name

@@ -1,0 +1,386 @@
+"""Pairs proved apart: against brute-force distances, FCL, and what the proof promises of the original meshes."""
+
+import itertools
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.samples import SHAPES, STILL, contact_poses, random_poses, sample
+from oracles.triangle import into_frame_of_a, pose_matrix
+
+import warp_abtree as ab
+
+NAMES = ("box", "small ball", "crumbs", "soup", "torus", "three", "capsule", "one")
+FACES = 60
+
+
+def dot(u, v):
+    return (u * v).sum(-1)
+
+
+def over(a, b):
+    """a / b, and 0 where b is 0."""
+    return np.divide(a, b, out=np.zeros(np.broadcast_shapes(np.shape(a), np.shape(b))), where=b > 0)
+
+
+def triangle_distances(a, b):
+    """Distances of triangles a and b, (k, 3, 3) each, that do not intersect.
+
+    The least over all pairs of features: corner and edge, the lines of two edges where they are closest inside both,
+    corner and plane above the inside of a face.
+    """
+    least = np.full(len(a), np.inf)
+    for x, y in ((a, b), (b, a)):
+        normal = np.cross(y[:, 1] - y[:, 0], y[:, 2] - y[:, 0])
+        area = dot(normal, normal)
+        for i in range(3):
+            inside = area > 0
+            for j in range(3):
+                p, q, corner = y[:, j], y[:, (j + 1) % 3], x[:, i]
+                along = np.clip(over(dot(corner - p, q - p), dot(q - p, q - p)), 0, 1)
+                least = np.minimum(least, np.linalg.norm(corner - p - along[:, None] * (q - p), axis=1))
+                inside &= dot(np.cross(q - p, corner - p), normal) >= 0
+            height = np.abs(over(dot(x[:, i] - y[:, 0], normal), np.sqrt(area)))
+            least = np.where(inside, np.minimum(least, height), least)
+    for i, j in itertools.product(range(3), repeat=2):
+        p, q = a[:, i], b[:, j]
+        e, f = a[:, (i + 1) % 3] - p, b[:, (j + 1) % 3] - q
+        cross = np.cross(e, f)
+        size = dot(cross, cross)
+        s, t = over(dot(np.cross(q - p, f), cross), size), over(dot(np.cross(q - p, e), cross), size)
+        inside = (size > 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+        gap = np.abs(over(dot(q - p, cross), np.sqrt(size)))
+        least = np.where(inside, np.minimum(least, gap), least)
+    return least
+
+
+def mesh_distance(model_a, lod_a, pose_a, model_b, lod_b, pose_b):
+    """Distance of two posed meshes that do not intersect, over all pairs of faces."""
+    vertices_a, faces_a, _ = model_a.mesh_at(lod_a)
+    vertices_b, faces_b, _ = model_b.mesh_at(lod_b)
+    a, b = vertices_a[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b]
+    i, j = (k.ravel() for k in np.meshgrid(np.arange(len(a)), np.arange(len(b))))
+    return triangle_distances(a[i], b[j]).min()
+
+
+def small_lod(rng, model, faces=FACES):
+    return model.lod_for(fraction=min(1.0, rng.uniform(0.1, 1) * faces / model.face_count))
+
+
+def posed_pairs(rng, device, pairs, faces=FACES, gap=2.0):
+    """Return a scene of objects (2 p, 2 p + 1), in contact or moved apart by up to a gap, and what each object is."""
+    scene, cases = ab.Scene(device), []
+    for names in pairs:
+        model_a, model_b = map(sample, names)
+        lods = [small_lod(rng, model, faces) for model in (model_a, model_b)]
+        pose_a, pose_b = contact_poses(rng, model_a, lods[0], model_b, lods[1])
+        away = rng.normal(size=3)
+        pose_b[:3] += (1 + gap * rng.random()) * away / np.linalg.norm(away) * (rng.random() < 0.7)
+        scene.add(model_a, pose_a, lod=lods[0])
+        scene.add(model_b, pose_b, lod=lods[1])
+        cases.append((model_a, lods[0], pose_a, model_b, lods[1], pose_b))
+    return scene, cases
+
+
+def pairs_of(cases):
+    return np.arange(2 * len(cases)).reshape(-1, 2)
+
+
+def check_distances(scene, pairs, distances, close=1e-9):
+    """Apart at a little less than the distance, not at it or beyond, and not where the pair intersects."""
+    distances = np.array(distances)
+    for factor in (0.0, 0.3, 0.9, 1 - close):
+        result = scene.intersect(pairs, within=factor * distances)
+        np.testing.assert_array_equal(result.apart, distances > 0)
+        assert not (result.apart & result.any).any()
+    for factor in (1 + close, 1.1, 3.0, 1e6):
+        assert not scene.intersect(pairs, within=factor * distances).apart.any()
+
+
+def distances_of(scene, cases):
+    """Distance of each pair, 0 where they intersect."""
+    met = scene.intersect(pairs_of(cases)).any
+    return np.array([0.0 if hit else mesh_distance(*case) for hit, case in zip(met, cases, strict=True)])
+
+
+def test_equals_brute_force(device):
+    rng = np.random.default_rng(1)
+    scene, cases = posed_pairs(rng, device, [tuple(rng.choice(NAMES, 2)) for _ in range(90)])
+    distances = distances_of(scene, cases)
+    assert 30 < (distances > 0).sum() < 85
+    check_distances(scene, pairs_of(cases), distances)
+    check_distances(scene, pairs_of(cases)[:, ::-1], distances)
+
+
+@pytest.mark.parametrize("kind", ["random", "flat", "parallel", "slivers", "segments and points", "lattice"])
+def test_single_faces_equal_brute_force(device, kind):
+    """All ways in which two triangles can be closest, parallel ones and faces without area too."""
+    rng = np.random.default_rng(2)
+    scene, cases = ab.Scene(device), []
+    for _ in range(200):
+        a, b = rng.normal(size=(2, 3, 3))
+        b += rng.normal(size=3) * 2
+        if kind == "flat":
+            a[:, 2], b[:, 2] = 0, rng.integers(0, 2)
+        elif kind == "parallel":
+            b = a * rng.uniform(0.5, 2) + rng.normal(size=3)
+        elif kind == "slivers":
+            a[2] = a[0] + rng.random() * (a[1] - a[0]) + 1e-6 * rng.normal(size=3)
+            b[2] = b[0] + rng.random() * (b[1] - b[0]) + 1e-6 * rng.normal(size=3)
+        elif kind == "segments and points":
+            # Sums of halves stay collinear. Three equal corners weld, so a point is a very short segment.
+            a, b = np.round(a * 64) / 64, np.round(b * 64) / 64
+            a[2] = (a[0] + a[1]) / 2
+            if rng.random() < 0.5:
+                b[1:] = b[0] + 2.0**-40 * np.eye(3)[:2]
+        elif kind == "lattice":
+            a, b = np.round(a), np.round(b)
+        if min(len(np.unique(a, axis=0)), len(np.unique(b, axis=0))) < 3:
+            continue
+        models = [ab.Model.from_arrays(corners, [(0, 1, 2)]) for corners in (a, b)]
+        for model in models:
+            scene.add(model)
+        cases.append((models[0], 0, STILL, models[1], 0, STILL))
+    distances = distances_of(scene, cases)
+    assert (distances > 0).sum() > 100
+    check_distances(scene, pairs_of(cases), distances)
+
+
+@pytest.mark.parametrize("names", [("torus", "soup"), ("ball", "cow"), ("cow", "fandisk")], ids="-".join)
+@pytest.mark.slow
+def test_equals_fcl(device, names):
+    """Whole meshes, at up to 5,000 faces."""
+    fcl = pytest.importorskip("fcl")
+    rng = np.random.default_rng(3)
+    scene, cases = posed_pairs(rng, device, [names] * 10, faces=5000, gap=6.0)
+    distances = []
+    for model_a, lod_a, pose_a, model_b, lod_b, pose_b in cases:
+        objects = []
+        for model, lod, pose in ((model_a, lod_a, pose_a), (model_b, lod_b, pose_b)):
+            vertices, faces, _ = model.mesh_at(lod)
+            mesh = fcl.BVHModel()
+            mesh.beginModel(len(vertices), len(faces))
+            mesh.addSubModel(vertices, faces)
+            mesh.endModel()
+            objects.append(fcl.CollisionObject(mesh, fcl.Transform(*pose_matrix(pose))))
+        distances.append(fcl.distance(*objects, fcl.DistanceRequest(), fcl.DistanceResult()))
+    met = scene.intersect(pairs_of(cases)).any
+    distances = np.where(met, 0.0, distances)
+    assert (distances > 0).sum() > 2
+    check_distances(scene, pairs_of(cases), distances)
+
+
+def test_coarse_proof_holds_for_the_original_meshes(device):
+    """Apart by more than both errors at any LODs: then the finest meshes do not intersect."""
+    rng = np.random.default_rng(4)
+    names = ("torus", "ball", "capsule", "soup")
+    coarse, fine, within = ab.Scene(device), ab.Scene(device), []
+    for _ in range(300):
+        pair = [sample(name) for name in rng.choice(names, 2)]
+        lods = [int(model.lod_max * rng.random() ** 0.3) for model in pair]
+        poses = contact_poses(rng, pair[0], lods[0], pair[1], lods[1])
+        poses[1][:3] += rng.normal(size=3) * rng.random()
+        for model, lod, pose in zip(pair, lods, poses, strict=True):
+            coarse.add(model, pose, lod=lod)
+            fine.add(model, pose)
+        within.append(sum(model.error_at(lod) for model, lod in zip(pair, lods, strict=True)))
+    pairs = np.arange(600).reshape(-1, 2)
+    result, truth = coarse.intersect(pairs, within=within), fine.intersect(pairs)
+    assert not (result.apart & truth.any).any()
+    assert result.apart.sum() > 30 and (~result.apart & ~truth.any).sum() > 5
+    assert (~coarse.intersect(pairs).any & truth.any).any(), "coarse meshes alone give wrong answers here"
+
+
+# Touching, scales, places, poses.
+
+
+@pytest.mark.parametrize("shift", [(1, 0, 0), (1, 1, 0), (1, 1, 1), (0.5, 0.25, 1), (0.25, 0, 0), (0, 0, 0)])
+def test_touching_is_never_apart(device, shift):
+    scene = ab.Scene(device)
+    scene.add(sample("box"))
+    scene.add(sample("box"), (*shift, 0, 0, 0, 1))
+    scene.add(sample("box"), (*(np.array(shift) * (1 + 1e-9)), 0, 0, 0, 1))
+    result = scene.intersect([(0, 1), (1, 0), (0, 2)], within=0.0)
+    np.testing.assert_array_equal(result.any, [True, True, max(shift) < 1])
+    np.testing.assert_array_equal(result.apart, ~result.any)
+
+
+@pytest.mark.parametrize("exponent", [-60, -7, 31, 60])
+def test_scaling_by_a_power_of_two_changes_nothing(device, exponent):
+    rng = np.random.default_rng(5)
+    plain, cases = posed_pairs(rng, device, [("soup", "small ball")] * 20)
+    models = {}
+    for name in ("soup", "small ball"):
+        vertices, faces = SHAPES[name]()
+        models[sample(name)] = ab.Model.from_arrays(np.ldexp(vertices, exponent), faces, base_faces=4)
+    scaled = ab.Scene(device)
+    for case in cases:
+        for model, lod, pose in (case[:3], case[3:]):
+            scaled.add(models[model], pose * ([2.0**exponent] * 3 + [1] * 4), lod=lod)
+    distances = distances_of(plain, cases)
+    for factor in (0, 1 - 1e-13, 1 - 1e-15, 1, 1 + 1e-15, 1 + 1e-13, 2):
+        one = plain.intersect(pairs_of(cases), within=factor * distances)
+        other = scaled.intersect(pairs_of(cases), within=factor * np.ldexp(distances, exponent))
+        np.testing.assert_array_equal(one.apart, other.apart)
+
+
+@pytest.mark.parametrize("far", [1e3, 1e6])
+def test_far_from_the_origin(device, far):
+    """Both objects far away; a mesh with coordinates far from its own origin. What is lost is in proportion."""
+    rng = np.random.default_rng(6)
+    shift = np.array([far, -far, 0.3 * far, 0, 0, 0, 0])
+    vertices, faces, _ = sample("small ball").mesh_at(sample("small ball").lod_max)
+    remote = ab.Model.from_arrays(vertices + shift[:3], faces, base_faces=4)
+    scene, cases = ab.Scene(device), []
+    for k in range(20):
+        model = remote if k % 2 else sample("torus")
+        lod, other = small_lod(rng, model), sample("soup")
+        pose_a, pose_b = contact_poses(rng, model, lod, other, 40)
+        pose_b[:3] += 3 * rng.normal(size=3)
+        case = (model, lod, pose_a + shift, other, 40, pose_b + shift)
+        cases.append((*case[3:], *case[:3]) if k % 4 < 2 else case)
+        for x in (cases[-1][:3], cases[-1][3:]):
+            scene.add(x[0], x[2], lod=x[1])
+    distances = distances_of(scene, cases)
+    assert (distances > 0.01).sum() > 5
+    distances[distances < 0.01] = 0
+    pairs = pairs_of(cases)[distances > 0]
+    check_distances(scene, pairs, distances[distances > 0], 1e-9 + 1e-11 * far)
+
+
+@pytest.mark.parametrize("far", [1e9, 1e30, 1e39, 1e299])
+def test_far_pairs_and_huge_distances(device, far):
+    scene = ab.Scene(device)
+    for x in (0, far, -far):
+        scene.add(sample("box"), (x, 0, 0, 0, 0, 0, 1))
+    pairs = [(0, 1), (1, 0), (1, 2)]
+    for within, apart in ((0, 1), (far / 2, 1), (0.99 * far, 1), (1.01 * far, 0), (2.1 * far, 0), (1.7e308, 0)):
+        result = scene.intersect(pairs, within=within)
+        np.testing.assert_array_equal(result.apart, [apart, apart, within < 2 * far])
+        assert not result.any.any()
+
+
+def test_distances_that_overflow(device):
+    scene = ab.Scene(device)
+    for x in (1.7e308, -1.7e308):
+        scene.add(sample("box"), (x, 0, 0, 0, 0, 0, 1))
+    assert scene.intersect([(0, 1)], within=1e300).apart[0]
+    assert not scene.intersect([(0, 1)], within=1.7e308).any[0]
+
+
+def test_matrices_off_orthonormal(device):
+    """Rotations rounded to float32 and stretched: never proved beyond the distance in the world.
+
+    The mesh lies far from its own origin, where a rotation that is off moves it most.
+    """
+    rng = np.random.default_rng(7)
+    vertices, faces = SHAPES["soup"]()
+    model = ab.Model.from_arrays(vertices + [50, -50, 50], faces, base_faces=4)
+    lod = model.lod_for(fraction=0.1)
+    vertices, faces, _ = model.mesh_at(lod)
+    scene, distances = ab.Scene(device), []
+    for _ in range(40):
+        pair = []
+        for shift in rng.normal(size=(2, 3)) * 3:
+            pose = np.eye(4)
+            stretch = 1 + rng.choice([-4e-7, 0, 4e-7])
+            pose[:3, :3] = pose_matrix(random_poses(rng, 1, 1)[0])[0].astype(np.float32) * stretch
+            shift = shift - pose[:3, :3] @ [50, -50, 50]
+            pose[:3, 3] = shift
+            scene.add(model, pose, lod=lod)
+            pair.append((vertices @ pose[:3, :3].T + shift)[faces])
+        i, j = (k.ravel() for k in np.meshgrid(np.arange(len(faces)), np.arange(len(faces))))
+        distances.append(triangle_distances(pair[0][i], pair[1][j]).min())
+    pairs = np.arange(80).reshape(-1, 2)
+    distances = np.where(scene.intersect(pairs).any, 0, distances)
+    assert (distances > 0).sum() > 10
+    assert not scene.intersect(pairs, within=distances * (1 + 1e-12)).apart.any()
+    clear = distances > 1e-2
+    assert scene.intersect(pairs, within=distances * (1 - 1e-2)).apart[clear].all()
+
+
+# Operators, regimes, input.
+
+
+class WarpQuery(ab.Query):
+    """A query that takes the CUDA regime on every device."""
+
+    def uses_warps(self):
+        return True
+
+
+class ThreadQuery(ab.Query):
+    def uses_warps(self):
+        return False
+
+
+@pytest.mark.slow
+def test_regimes_and_outputs_agree(device):
+    rng = np.random.default_rng(8)
+    scene, cases = posed_pairs(rng, device, [("torus", "soup")] * 30, faces=400)
+    pairs = pairs_of(cases)
+    within = rng.choice([0, 0.1, 0.5, 1.0], len(pairs))
+    expected = scene.intersect(pairs, within=within)
+    assert 3 < expected.apart.sum() < 27
+    # On CUDA only warps work on pairs: the thread's visit is in the CPU's vector instructions.
+    kinds = (WarpQuery,) if scene.device.is_cuda else (ThreadQuery, WarpQuery)
+    for kind, output in itertools.product(kinds, ("any", "faces")):
+        query = kind(scene, output, pairs=pairs, within=within)
+        query.parts_max = 20
+        result, plain = query.run(), scene.intersect(pairs, output)
+        np.testing.assert_array_equal(result.apart, expected.apart)
+        assert plain.apart is None
+        for name in ("any", "count", "faces"):
+            np.testing.assert_array_equal(getattr(result, name), getattr(plain, name))
+    if query.device.is_cuda:
+        query.near.any_hit.fill_(7)
+        with wp.ScopedCapture(query.device) as capture:
+            query.launch()
+        wp.capture_launch(capture.graph)
+        np.testing.assert_array_equal(query.result().apart, expected.apart)
+
+
+def test_query_takes_other_pairs_and_distances(device):
+    scene = ab.Scene(device)
+    for x in (0, 1.5, 4, 9):
+        scene.add(sample("box"), (x, 0, 0, 0, 0, 0, 1))
+    query = ab.Query(scene, "any", pairs=[(0, 1), (1, 2)], within=1.0)
+    np.testing.assert_array_equal(query.run().apart, [False, True])
+    query.set_pairs([(0, 1), (0, 2), (2, 3)])
+    np.testing.assert_array_equal(query.run().apart, [False, True, True])
+    query.set_pairs([(0, 1), (0, 2), (2, 3)], within=[0.25, 3.5, 3.5])
+    np.testing.assert_array_equal(query.run().apart, [True, False, True])
+    query.set_pairs([(2, 3), (0, 1), (0, 2)])
+    np.testing.assert_array_equal(query.run().apart, [True, False, False])
+    with pytest.raises(ValueError, match="2 pairs"):
+        query.set_pairs([(0, 1), (0, 2)])
+    np.testing.assert_array_equal(query.run().apart, [True, False, False])
+    with pytest.raises(ValueError, match="without within"):
+        ab.Query(scene, "any", pairs=[(0, 1)]).set_pairs([(0, 1)], within=1.0)
+    assert scene.intersect(np.empty((0, 2), int), within=1.0).apart.shape == (0,)
+
+
+def test_broad_phase_pairs(device):
+    scene = ab.Scene(device)
+    for angle in np.linspace(0, 3, 8):  # a torus and balls inside its box, some in its hole
+        scene.add(sample("torus"), (0, 0, 100 * angle, 0, 0, 0, 1))
+        scene.add(sample("box"), (0.4 * angle, 0, 100 * angle, 0, 0, 0, 1))
+    query = ab.Query(scene, "any", within=0.01, pair_capacity=2)
+    result = query.run()
+    order = np.lexsort(result.pairs.T[::-1])
+    expected = scene.intersect(result.pairs[order], within=0.01)
+    np.testing.assert_array_equal(result.apart[order], expected.apart)
+    assert scene.intersect(within=0.01).apart.shape == (len(order),)
+
+
+@pytest.mark.parametrize("within", [-1, -1e-300, np.nan, np.inf, [1, 2, 3], [[1]], [1, -1], [1, np.nan], "1", [], True])
+def test_bad_distances(device, within):
+    scene = ab.Scene(device)
+    scene.add(sample("box"))
+    scene.add(sample("box"))
+    for ask in (scene.intersect, lambda pairs, within: ab.Query(scene, pairs=pairs, within=within)):
+        with pytest.raises(ValueError, match="within"):
+            ask([(0, 1), (1, 0)], within=within)
+    with pytest.raises(ValueError, match="within"):
+        ab.Query(scene, within=[1, 2])
+    assert scene.intersect([(0, 1), (1, 0)], within=0).apart.shape == (2,)

@@ -1,0 +1,268 @@
+"""`sweep` against a scene with an object a pose; what it keeps between calls."""
+
+import gc
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.gpu_query import GpuQuery
+from helpers.samples import SHAPES, STILL, random_poses, sample
+
+import warp_abtree as ab
+from warp_abtree.checks.device_lock import device_turn
+from warp_abtree.scene import sweep as pose_sweep
+
+
+@pytest.fixture(autouse=True)
+def nothing_kept():
+    pose_sweep._kept.clear()
+    yield
+    pose_sweep._kept.clear()
+
+
+@pytest.fixture
+def small_chunks(monkeypatch):
+    monkeypatch.setattr(pose_sweep, "CHUNKS", (7,))
+
+
+def ask_scene(device, models, poses, lods, **options):
+    scene = ab.Scene(device)
+    scene.add(models[0], STILL, lod=lods[0])
+    for pose in poses:
+        scene.add(models[1], pose, lod=lods[1])
+    return scene.intersect([(0, i + 1) for i in range(len(poses))], **options)
+
+
+def mixed_poses(seed=1):
+    """Poses of which some meet and some do not, more than three chunks of 7."""
+    rng = np.random.default_rng(seed)
+    return np.concatenate([random_poses(rng, 13, 1.2), random_poses(rng, 13, 6.0)])
+
+
+@pytest.mark.parametrize("precision", ["exact", "float32"])
+@pytest.mark.parametrize("names", [("torus", "soup"), ("torus", "torus")])
+def test_same_as_a_scene(device, names, precision, small_chunks):
+    models, poses = [sample(name) for name in names], mixed_poses()
+    lods = [models[0].lod_for(fraction=0.3), None]
+    expected = ask_scene(device, models, poses, lods, output="faces", precision=precision)
+    assert 3 < expected.any.sum() < 26
+    options = {"lod_a": lods[0], "precision": precision, "device": device}
+    for _ in range(2):  # the second time from what is kept
+        for output in ("any", "count", "faces"):
+            found = ab.sweep(*models, poses, output=output, **options)
+            np.testing.assert_array_equal(found, getattr(expected, output))
+            assert found.dtype == getattr(expected, output).dtype
+    on_device = wp.array(poses, dtype=wp.float64, device=device)
+    np.testing.assert_array_equal(ab.sweep(*models, on_device, **options), expected.any)
+
+
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+def test_poses_of_every_kind(device, real, small_chunks):
+    """Rows and transforms, on the host and on the device, whole and in part; float32 counts as what it is."""
+    models, poses = [sample("torus"), sample("soup")], mixed_poses(2).astype(real)
+    expected = ask_scene(device, models, poses.astype(np.float64), [None, None], output="count")
+    assert 3 < expected.any.sum() < 26
+    scalar, transform = pose_sweep.SCALARS[poses.dtype], {4: wp.transformf, 8: wp.transformd}[poses.itemsize]
+    apart = np.zeros((2 * len(poses), 7), real)
+    apart[::2] = poses
+    for asked in (
+        poses,
+        poses.tolist(),
+        apart[::2],
+        wp.array(poses, dtype=scalar, device=device),
+        wp.array(apart, dtype=scalar, device=device)[::2],
+        wp.array(poses, dtype=transform, device=device),
+        wp.array(apart, dtype=transform, device=device)[::2],
+        wp.array(poses, dtype=transform, device="cpu"),
+    ):
+        for output in ("any", "count"):
+            found = ab.sweep(*models, asked, output=output, device=device)
+            np.testing.assert_array_equal(found, getattr(expected, output))
+
+
+def test_more_poses_than_before_and_fewer(device, monkeypatch):
+    monkeypatch.setattr(pose_sweep, "CHUNKS", (2, 5, 20))
+    models, poses = [sample("torus"), sample("soup")], mixed_poses()
+    expected = ask_scene(device, models, poses, [None, None], output="faces")
+    for count in (3, 26, 1, 17, 0, 26):
+        for output in ("any", "faces"):
+            found = ab.sweep(*models, poses[:count], output=output, device=device)
+            whole = expected.any[:count] if output == "any" else expected.faces[expected.faces[:, 0] < count]
+            np.testing.assert_array_equal(found, whole)
+    assert sorted(next(iter(pose_sweep._kept.values())).chunks) == [2, 5, 20]
+
+
+@pytest.mark.parametrize("output", ["any", "count", "faces"])
+@pytest.mark.slow
+def test_lists_that_overflow_lose_nothing(device, output, monkeypatch, small_chunks):
+    """The CUDA regime, with room for one face pair of those that float32 leaves open; boxes lie flush."""
+
+    class Narrow(GpuQuery):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options, unsure_capacity=1)
+
+    box = sample("box")
+    poses = np.tile(np.array(STILL), (20, 1))
+    poses[:, 0] = np.arange(20) / 10
+    expected = ask_scene(device, [box, box], poses, [None, None], output="faces")
+    assert expected.any[:11].all() and not expected.any[11:].any()
+    monkeypatch.setattr(pose_sweep, "Query", Narrow)
+    found = ab.sweep(box, box, poses, output=output, device=device)
+    np.testing.assert_array_equal(found, getattr(expected, output))
+    (posed,) = pose_sweep._kept.values()
+    assert len(posed.chunks[7].question.query.hits.unsure) > 1
+
+
+def test_no_poses(device):
+    torus = sample("torus")
+    for output, shape in (("any", (0,)), ("count", (0,)), ("faces", (0, 3))):
+        assert ab.sweep(torus, torus, np.empty((0, 7)), output=output, device=device).shape == shape
+
+
+@pytest.mark.parametrize("output", ["any", "faces"])
+@pytest.mark.parametrize("kind", ["host", "device"])
+def test_the_first_bad_pose_is_named(device, output, kind, small_chunks):
+    torus, poses = sample("torus"), mixed_poses()
+    expected = ab.sweep(torus, torus, poses, output=output, device=device)
+    for column, value, what in (
+        (2, np.nan, "pose 16 is not finite"),
+        (5, np.inf, "pose 16 is not finite"),
+        (6, 3.0, "pose 16 has a quaternion of norm 3"),
+    ):
+        bad = poses.copy()
+        bad[[16, 18, 25], column] = value
+        asked = wp.array(bad, dtype=wp.float64, device=device) if kind == "device" else bad
+        with pytest.raises(ValueError, match=what):
+            ab.sweep(torus, torus, asked, output=output, device=device)
+        found = ab.sweep(torus, torus, poses, output=output, device=device)
+        np.testing.assert_array_equal(found, expected)
+    just, beyond = poses.copy(), poses.copy()
+    just[:, 3:] *= 1.000999
+    beyond[21, 3:] *= 1.001001
+    assert len(ab.sweep(torus, torus, just, device=device)) == len(poses)
+    with pytest.raises(ValueError, match="pose 21 has a quaternion of norm 1"):
+        ab.sweep(torus, torus, beyond, device=device)
+
+
+def test_refused(device):
+    torus, poses = sample("torus"), np.array([STILL, STILL], float)
+    for what, error, options in (
+        ("shape", ValueError, {"poses": poses[:, :6]}),
+        ("shape", ValueError, {"poses": np.tile(np.eye(4), (3, 1, 1))[:, :3]}),
+        ("matrix 2 is not rigid", ValueError, {"poses": np.eye(4) * [[[1.0]], [[1.0]], [[2.0]]]}),
+        ("no real numbers", ValueError, {"poses": poses.astype(complex)}),
+        ("LOD", ValueError, {"lod_b": torus.lod_max + 1}),
+        ("output 'all'", ValueError, {"output": "all"}),
+        ("ContactQuery", ValueError, {"output": "contacts"}),
+        ("precision 'half'", ValueError, {"precision": "half"}),
+        ("no device", ValueError, {"device": "cuda:99"}),
+        ("not a Model", TypeError, {"model_b": "torus"}),
+    ):
+        asked = {"model_a": torus, "model_b": torus, "poses": poses, "device": device, **options}
+        with pytest.raises(error, match=what):
+            ab.sweep(**asked)
+    assert not pose_sweep._kept
+
+
+# --- what is kept ----------------------------------------------------------------------------------------------------
+
+
+def new_model(name="box"):
+    return ab.Model.from_arrays(*SHAPES[name](), base_faces=4)
+
+
+def test_a_pair_of_models_is_set_up_once(device, monkeypatch):
+    """Models, states and, for the same question, buffers."""
+    made = []
+    monkeypatch.setattr(pose_sweep, "_PosedModels", lambda *x, kind=pose_sweep._PosedModels: made.append(1) or kind(*x))
+    a, b, poses = new_model(), new_model("torus"), mixed_poses()
+    first = ab.sweep(a, b, poses, device=device)
+    (posed,) = pose_sweep._kept.values()
+    (chunk,) = posed.chunks.values()
+    question = chunk.question
+    assert np.array_equal(ab.sweep(a, b, poses, device=device), first)
+    assert chunk.question is question and made == [1]
+    ab.sweep(a, b, poses, output="count", device=device)
+    assert chunk.question is not question and made == [1], "of one question, so that memory stays bounded"
+    for options in ({"lod_a": 0}, {"lod_b": 3}):
+        ab.sweep(a, b, poses, device=device, **options)
+    ab.sweep(b, a, poses, device=device)
+    assert made == [1] * 4
+
+
+def test_what_is_kept_is_bounded_and_goes_with_its_models(device):
+    poses = mixed_poses()[:2]
+    models = [new_model() for _ in range(pose_sweep.KEPT_PAIRS + 2)]
+    other = new_model("torus")
+    for model in models:
+        ab.sweep(model, other, poses, device=device)
+    assert len(pose_sweep._kept) == pose_sweep.KEPT_PAIRS
+    assert [key[0] for key in pose_sweep._kept] == [id(model) for model in models[2:]]
+    ab.sweep(models[2], other, poses, device=device)
+    assert [key[0] for key in pose_sweep._kept][-1] == id(models[2]), "the oldest is that asked longest ago"
+    del models[-1], model
+    gc.collect()
+    assert len(pose_sweep._kept) == pose_sweep.KEPT_PAIRS - 1
+    del other
+    gc.collect()
+    assert not pose_sweep._kept
+
+
+def test_long_lists_are_not_kept(device, monkeypatch):
+    a, poses = sample("torus"), np.tile(np.array(STILL), (3, 1))
+    monkeypatch.setattr(pose_sweep, "KEPT_ROWS", 2**17)
+    ab.sweep(a, a, poses, device=device)
+    (posed,) = pose_sweep._kept.values()
+    assert posed.chunks[1024].question is not None
+    monkeypatch.setattr(pose_sweep, "KEPT_ROWS", 100)
+    ab.sweep(a, a, poses, output="faces", device=device)
+    assert posed.chunks[1024].question is None
+
+
+def test_two_threads(device):
+    """Each has its own buffers while both ask about the same models; on a GPU they take turns."""
+    stream = wp.get_stream(device) if wp.get_device(device).is_cuda else None
+    models, poses = [sample("torus"), sample("soup")], [mixed_poses(seed) for seed in (1, 2)]
+    expected = [ab.sweep(*models, rows, output="count", device=device) for rows in poses]
+    found = [[], []]
+
+    def ask(i):
+        for _ in range(10):
+            found[i].append(ab.sweep(*models, poses[i], output="count", device=device))
+
+    threads = [threading.Thread(target=ask, args=(i,)) for i in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for i in range(2):
+        assert len(found[i]) == 10 and all(np.array_equal(x, expected[i]) for x in found[i])
+    if stream is not None:  # where they do not, Warp may be left on the null stream, which cannot be captured
+        assert wp.get_stream(device) is stream
+        with wp.ScopedCapture(device):
+            wp.zeros(3, device=device).fill_(1.0)
+
+
+def test_threads_take_turns_on_a_gpu_alone():
+    gpus = [SimpleNamespace(is_cuda=True, alias=f"cuda:{i}") for i in (98, 98, 99)]
+    cpu = SimpleNamespace(is_cuda=False, alias="cpu")
+
+    def enters(device):
+        """Whether another thread has a turn at once while this one has one on the first GPU."""
+        entered = threading.Event()
+
+        def work():
+            with device_turn(device):
+                entered.set()
+
+        with device_turn(gpus[0]), device_turn(gpus[0]):  # within its own turn a thread may ask again
+            thread = threading.Thread(target=work)
+            thread.start()
+            at_once = entered.wait(0.2)
+        thread.join()
+        assert entered.is_set()
+        return at_once
+
+    assert not enters(gpus[1]) and enters(gpus[2]) and enters(cpu)

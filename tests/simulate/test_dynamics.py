@@ -1,0 +1,388 @@
+"""Rigid bodies: what is kept in collisions, what comes to rest and stays, against closed forms and plain Python."""
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, NO_GRAVITY, TORUS, about, box, make, model_of, on_ground
+
+import warp_abtree as ab
+from warp_abtree.simulate.body_state import mass_properties, matrices_of
+
+
+def totals(dynamics):
+    """Momentum, angular momentum and kinetic energy of all bodies, from masses, poses and velocities alone."""
+    velocity, spin = dynamics.velocities()
+    poses = dynamics.poses()
+    momentum, angular, energy = np.zeros(3), np.zeros(3), 0.0
+    for i in np.flatnonzero(np.isfinite(dynamics.mass)):
+        model = dynamics.scene.models[dynamics.scene.object_model[i]]
+        vertices, faces, _ = model.mesh_at(model.lod_max)
+        own = trimesh.Trimesh(vertices, faces, process=False)
+        own.density = dynamics.mass[i] / own.volume
+        r = matrices_of(poses[i : i + 1, 3:])[0]
+        inertia = r @ own.moment_inertia @ r.T
+        centre = r @ own.center_mass + poses[i, :3]
+        momentum += own.mass * velocity[i]
+        angular += np.cross(centre, own.mass * velocity[i]) + inertia @ spin[i]
+        energy += 0.5 * own.mass * velocity[i] @ velocity[i] + 0.5 * spin[i] @ inertia @ spin[i]
+    return momentum, angular, energy
+
+
+# Mass.
+
+
+def test_mass_properties_of_a_box_off_its_origin():
+    a, b, c = 2.0, 1.0, 0.5
+    mesh = trimesh.creation.box((a, b, c)).apply_translation((3, -2, 1))
+    found = mass_properties(model_of(mesh))
+    assert found.volume == pytest.approx(1.0) and not found.convex_hull
+    np.testing.assert_allclose(found.centre, [3, -2, 1], atol=1e-12)
+    expected = sorted([(b * b + c * c) / 12, (a * a + c * c) / 12, (a * a + b * b) / 12])
+    np.testing.assert_allclose(found.moments, expected, rtol=1e-12)
+    np.testing.assert_allclose(found.axes @ found.axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(found.axes) > 0
+    assert found.reach == pytest.approx(np.linalg.norm([a, b, c]) / 2)
+
+
+def test_an_open_mesh_has_the_mass_of_its_convex_hull():
+    mesh = trimesh.creation.box((1, 2, 3))
+    keep = np.ones(12, bool)
+    keep[[0, 5]] = False
+    found = mass_properties(ab.Model.from_arrays(mesh.vertices, mesh.faces[keep]))
+    assert found.convex_hull and found.volume == pytest.approx(6.0)
+    inside_out = mass_properties(ab.Model.from_arrays(mesh.vertices, mesh.faces[:, ::-1]))
+    assert inside_out.convex_hull and inside_out.volume == pytest.approx(6.0)
+    with pytest.raises(ValueError, match="flat"):
+        mass_properties(ab.Model.from_arrays([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]], [[0, 1, 2], [0, 2, 3]]))
+
+
+def test_an_open_mesh_without_scipy(monkeypatch):
+    missing = trimesh.exceptions.ExceptionWrapper(ModuleNotFoundError("No module named 'scipy'"))
+    monkeypatch.setattr(trimesh.convex, "ConvexHull", missing)
+    mesh = trimesh.creation.box((1, 2, 3))
+    with pytest.raises(ValueError, match="'open' is not closed: its convex hull needs scipy"):
+        mass_properties(ab.Model.from_arrays(mesh.vertices, mesh.faces[1:], name="open"))
+
+
+# Free motion.
+
+
+def tumble(moments, momentum, rotation, time, steps):
+    """Turn a free body by fine Runge-Kutta steps of its rotation matrix; plain NumPy."""
+    dt = time / steps
+
+    def rate(r):
+        spin = r @ ((r.T @ momentum) / moments)
+        return np.array([[0, -spin[2], spin[1]], [spin[2], 0, -spin[0]], [-spin[1], spin[0], 0]]) @ r
+
+    for _ in range(steps):
+        k1 = rate(rotation)
+        k2 = rate(rotation + 0.5 * dt * k1)
+        k3 = rate(rotation + 0.5 * dt * k2)
+        k4 = rate(rotation + dt * k3)
+        rotation = rotation + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return rotation
+
+
+def test_a_free_body_flies_and_tumbles(device):
+    """About the middle axis of inertia, where motion is unstable; the error falls with the square of the step."""
+    brick, pose = box(2, 1, 0.4), (0.3, 0.2, 0.1, *about((1, 2, 3), 0.7))
+    spin = np.array([0.3, 5.0, 0.2])
+    errors = []
+    for steps in (100, 200):
+        dynamics = make(device, (brick, pose), velocity=(1, 2, 3), spin=spin, **NO_GRAVITY)
+        start = totals(dynamics)
+        for _ in range(steps):
+            dynamics.step(1 / steps)
+        found = totals(dynamics)
+        np.testing.assert_allclose(found[0], start[0], rtol=1e-14)
+        np.testing.assert_allclose(found[1], start[1], rtol=1e-11)
+        assert found[2] == pytest.approx(start[2], rel=2e-3)
+        np.testing.assert_allclose(dynamics.poses()[0, :3], [1.3, 2.2, 3.1], atol=1e-12)
+        r = matrices_of([pose[3:]])[0]
+        moments = dynamics.mass[0] / 12 * np.array([1 + 0.16, 4 + 0.16, 4 + 1])
+        true = tumble(moments, r @ (moments * (r.T @ spin)), r, 1.0, 4000)
+        errors.append(np.abs(matrices_of(dynamics.poses()[:, 3:])[0] - true).max())
+    assert errors[0] < 0.02 and errors[1] < errors[0] / 3
+
+
+def test_gravity_is_semi_implicit_euler(device):
+    dynamics = make(device, (CUBE, (0, 0, 0, 0, 0, 0, 1)), gravity=(0, 0, -8), velocity=(0.5, 0, 1))
+    for _ in range(10):
+        dynamics.step(0.125)
+    falls = 1 - np.cumsum(np.full(10, 8 * 0.125))
+    np.testing.assert_allclose(dynamics.velocities()[0][0], [0.5, 0, 1 + 0 - 8 * 1.25], rtol=1e-15)
+    np.testing.assert_allclose(dynamics.poses()[0, :3], [0.625, 0, 0.125 * falls.sum()], rtol=1e-14)
+
+
+# What collisions keep.
+
+
+def swarm(device, seed, **options):
+    """Six bodies that fly at each other and do not overlap at first."""
+    rng = np.random.default_rng(seed)
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])[rng.permutation(8)[:6]]
+    turns = rng.normal(size=(6, 4))
+    placed = [
+        (model, (*(1.1 * p), *(q / np.linalg.norm(q)))) for model, p, q in zip((BRICK, BALL, TORUS) * 2, corners, turns)
+    ]
+    velocity = -corners * rng.uniform(0.7, 1.0, (6, 1)) + rng.normal(0, 0.1, (6, 3))
+    spin = rng.normal(size=(6, 3))
+    density = rng.uniform(0.5, 3, 6)
+    return make(device, *placed, density=density, velocity=velocity, spin=spin, **NO_GRAVITY, **options)
+
+
+@pytest.mark.parametrize("restitution, friction", [(1, 0), (1, 0.6), (0.5, 0.3), (0, 0.5)])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_free_collisions_keep_momentum_and_angular_momentum(device, seed, restitution, friction):
+    dynamics = swarm(device, seed, restitution=restitution, friction=friction)
+    start, touched, before = totals(dynamics), 0, dynamics.velocities()[0]
+    assert not dynamics.scene.intersect().any.any()
+    size = np.abs(dynamics.mass[:, None] * before).sum()
+    energies = [start[2]]
+    for _ in range(150):
+        dynamics.step(0.01)
+        touched += int(dynamics.query.manifolds.count.numpy().sum() > 0)
+        energies.append(dynamics.energy())
+    found = totals(dynamics)
+    assert touched >= 3 and np.abs(dynamics.velocities()[0] - before).max() > 0.5
+    assert np.abs(found[0] - start[0]).max() < 1e-13 * size
+    assert np.abs(found[1] - start[1]).max() < 1e-13 * size
+    # A free tumble swings the energy a little; impulses add none.
+    assert np.diff(energies).max() < 2e-5 * start[2]
+    assert found[2] == pytest.approx(energies[-1], rel=1e-9)
+    if restitution == 1 and friction == 0:
+        assert found[2] == pytest.approx(start[2], rel=1e-3)
+    else:
+        assert found[2] < 0.99 * start[2]
+
+
+@pytest.mark.parametrize("restitution", [1.0, 0.5, 0.0])
+def test_cubes_face_to_face(device, restitution):
+    dynamics = make(
+        device,
+        (CUBE, (-0.55, 0, 0, 0, 0, 0, 1)),
+        (CUBE, (0.55, 0.001, 0.002, 0, 0, 0, 1)),
+        velocity=[[1, 0, 0], [-1, 0, 0]],
+        density=[1, 3],
+        restitution=restitution,
+        friction=0,
+        **NO_GRAVITY,
+    )
+    for _ in range(20):
+        dynamics.step(0.01)
+    velocity, spin = dynamics.velocities()
+    # Along the line of centres: momentum 1 - 3, speed of separation the restitution times 2.
+    np.testing.assert_allclose(velocity[:, 0], [-0.5 - 1.5 * restitution, -0.5 + 0.5 * restitution], atol=0.02)
+    assert velocity[1, 0] - velocity[0, 0] == pytest.approx(2 * restitution, abs=0.02)
+    assert np.abs(velocity[:, 1:]).max() < 0.02 and np.abs(spin).max() < 0.05
+
+
+@pytest.mark.slow
+def test_a_closed_elastic_scene_gains_no_energy(device):
+    """Bound: 1e-4 of the energy over 10,000 steps. The tumbling of bodies swings it; no bounce adds to it."""
+    wall, half = box(5, 5, 1), np.sqrt(0.5)
+    turns = {0: (0, half, 0, half), 1: (half, 0, 0, half), 2: (0, 0, 0, 1)}
+    walls = []
+    for axis, turn in turns.items():
+        for side in (-1, 1):
+            place = np.zeros(3)
+            place[axis] = 2.0 * side
+            walls.append((wall, (*place, *turn), True))
+    bodies = [(BRICK, (-0.7, -0.7, 0, *about((1, 1, 0), 0.5))), (BALL, (0.7, -0.6, 0.3, 0, 0, 0, 1))]
+    bodies.append((TORUS, (0, 0.7, -0.2, *about((0, 1, 1), 0.8))))
+    velocity, spin = np.zeros((9, 3)), np.zeros((9, 3))
+    velocity[6:], spin[6:] = [[1, 0.5, 0.3], [-0.6, 0.8, 0.2], [0.2, -0.7, 0.9]], [[1, 0, 0.4], [0, 1, 0], [0.5, 0, 1]]
+    options = {"restitution": 1, "friction": 0, **NO_GRAVITY, "velocity": velocity, "spin": spin}
+    dynamics = make(device, *walls, *bodies, **options)
+    start, energies, bounces = dynamics.energy(), [], 0
+    steps = 10_000 if dynamics.device.is_cpu else 2_000
+    momentum = dynamics.momentum()[0]
+    for step in range(steps):
+        dynamics.step(0.01)
+        if step % 10 == 0:
+            energies.append(dynamics.energy())
+            bounces += np.abs(dynamics.momentum()[0] - momentum).max() > 1e-6
+            momentum = dynamics.momentum()[0]
+    energies = np.array(energies) / start - 1
+    assert bounces > steps / 100
+    assert energies.max() < 1e-4, energies.max()
+    assert energies.min() > -0.01, energies.min()
+    assert np.abs(dynamics.poses()[6:, :3]).max() < 1.5, "nothing has left"
+
+
+@pytest.mark.slow
+def test_bounces_under_gravity_gain_no_energy(device):
+    """A cube that lands on its face, and a ball. A step of Euler swings their energy by m g v dt / 2."""
+    dynamics = on_ground(device, (CUBE, (-1, 0, 1.4, 0, 0, 0, 1)), (BALL, (1, 0, 1.4, 0, 0, 0, 1)), restitution=1)
+    start, energies = dynamics.energy(), []
+    for _ in range(1500):
+        dynamics.step(1 / 240)
+        energies.append(dynamics.energy())
+    swing = 0.5 * dynamics.mass[1:].sum() * 9.81 * np.sqrt(2 * 9.81) / 240
+    assert max(energies) < start + swing
+    assert max(energies[-400:]) > 0.9 * start, "elastic bodies still bounce"
+
+
+def test_corrections_of_place_leave_velocity_and_energy(device):
+    """A brick deep in the floor that leaves it slowly: it is lifted and turned, but moves and spins on as before."""
+    pose = (0, 0, 0.4, *about((0.3, 1, 0), 0.5))
+    dynamics = on_ground(device, (box(1.2, 0.9, 0.5), pose), velocity=(0, 0, 0.3), spin=(0, 0, 2), **NO_GRAVITY)
+    start = totals(dynamics)
+    dynamics.step(0.01)
+    found = totals(dynamics)
+    lifted = dynamics.poses()[1, 2] - 0.4 - 0.01 * 0.3
+    assert lifted > 0.005
+    np.testing.assert_allclose(found[0], start[0], rtol=1e-12)
+    assert found[2] == pytest.approx(start[2], rel=1e-3)
+
+
+@pytest.mark.parametrize("restitution", [0.5, 0.8])
+def test_a_drop_rebounds_by_restitution(device, restitution):
+    dynamics = on_ground(device, (CUBE, (0, 0, 1.5, 0, 0, 0, 1)), restitution=restitution)
+    heights = []
+    for _ in range(400):
+        dynamics.step(1 / 480)
+        heights.append(dynamics.poses()[1, 2] - 0.5)
+    landed = int(np.argmin(heights[:230]))
+    assert max(heights[landed:]) == pytest.approx(restitution**2, abs=0.01)
+
+
+# Friction.
+
+
+@pytest.mark.parametrize("angle, friction", [(0.3, 0.4), (0.5, 0.2), (0.4, 0.0)])
+def test_a_box_on_a_slope_sticks_or_slides(device, angle, friction):
+    turn = about((0, 1, 0), angle)
+    r = matrices_of([turn])[0]
+    placed = (GROUND, (*(r @ [0, 0, -0.5]), *turn), True), (CUBE, (*(r @ [-2, 0, 0.4983]), *turn))
+    dynamics = make(device, *placed, friction=friction)
+    start = dynamics.poses()[1, :3]
+    for _ in range(120):
+        dynamics.step(1 / 120)
+    slid = r.T @ (dynamics.poses()[1, :3] - start)
+    pull = 9.81 * max(0.0, np.sin(angle) - friction * np.cos(angle))
+    assert slid[0] == pytest.approx(0.5 * pull, rel=0.06, abs=1e-3)
+    assert np.abs(slid[1:]).max() < 0.1 * abs(slid[0]) + 2e-3
+    assert dynamics.asleep[1] == (pull == 0)
+
+
+# Rest.
+
+
+def test_boxes_come_to_rest_on_a_plane_and_sleep(device):
+    rng = np.random.default_rng(4)
+    turns = [about(rng.normal(size=3), a) for a in rng.uniform(0, 1.5, 6)]
+    placed = [(BRICK, (2 * (i % 3) - 2, 2.4 * (i // 3) - 1.2, 1.2 + 0.1 * i, *turn)) for i, turn in enumerate(turns)]
+    dynamics = on_ground(device, *placed, restitution=0.3)
+    for _ in range(420):
+        dynamics.step(1 / 120)
+    assert dynamics.asleep.tolist() == [False, *[True] * 6]
+    assert np.all(dynamics.velocities()[0] == 0) and np.all(dynamics.velocities()[1] == 0)
+    poses = dynamics.poses()[1:]
+    slop = dynamics.properties[1].reach / 512
+    for pose in poses:
+        r = np.abs(matrices_of([pose[3:]])[0][2])
+        axis = int(np.argmax(r))
+        assert r[axis] > 1 - 1e-4, "flat on a face"
+        assert pose[2] == pytest.approx((0.5, 0.35, 0.25)[axis] - slop, abs=slop)
+    for _ in range(10):
+        dynamics.step(1 / 120)
+    assert np.array_equal(dynamics.poses()[1:], poses) and len(dynamics.query.result().pairs) == 0
+
+
+def test_what_sleeps_wakes_when_hit(device):
+    dynamics = on_ground(
+        device, (CUBE, (0, 0, 0.4985, 0, 0, 0, 1)), (CUBE, (0, 0, 6, 0, 0, 0, 1)), (CUBE, (3, 0, 0.4985, 0, 0, 0, 1))
+    )
+    for _ in range(90):
+        dynamics.step(1 / 120)
+    assert dynamics.asleep.tolist() == [False, True, False, True]
+    for _ in range(60):
+        dynamics.step(1 / 120)
+    assert dynamics.asleep.tolist() == [False, False, False, True]
+    for _ in range(180):
+        dynamics.step(1 / 120)
+    assert dynamics.asleep.tolist() == [False, True, True, True]
+    dynamics.wake()
+    assert not dynamics.asleep.any()
+
+
+@pytest.mark.parametrize("splits", [0, 2])
+@pytest.mark.slow
+def test_a_stack_of_five_stands_for_ten_seconds(device, splits):
+    cube = box(1, 1, 1, splits=splits)
+    placed = [(cube, (0.02 * (k % 2), 0.01 * k, 0.5 + k, 0, 0, 0, 1)) for k in range(5)]
+    dynamics = on_ground(device, *placed, sleep_speed=0)
+    start = dynamics.poses()[1:]
+    for _ in range(600):
+        dynamics.step(1 / 60)
+    moved = dynamics.poses()[1:] - start
+    slop = dynamics.properties[1].reach / 512
+    assert np.abs(moved[:, :2]).max() < 0.006 and np.abs(moved[:, 3:6]).max() < 0.01
+    np.testing.assert_allclose(moved[:, 2], -slop * np.arange(1, 6), atol=2 * slop)
+    assert not dynamics.asleep.any() and np.abs(dynamics.velocities()[0]).max() < 1e-3
+
+
+def test_a_torus_falls_over_a_peg_and_stays(device):
+    peg = model_of(trimesh.creation.cylinder(0.3, 1.2, sections=8))
+    ring = model_of(trimesh.creation.torus(0.8, 0.25, 16, 8))
+    pose = (0.35, 0.05, 1.7, *about((2, 1, 0), 0.25))
+    dynamics = on_ground(device, (peg, (0, 0, 0.55, 0, 0, 0, 1), True), (ring, pose), restitution=0.2)
+    pegged = []
+    for _ in range(240):
+        dynamics.step(1 / 60)
+        pegged.append(1 in np.unique(dynamics.query.result().pairs[dynamics.query.result().any]))
+    assert any(pegged), "it has met the peg"
+    assert dynamics.asleep[2]
+    x, y, z = dynamics.poses()[2, :3]
+    assert np.hypot(x, y) < 0.8 - 0.25 - 0.3 + 0.05, "the peg stands in the hole"
+    assert z == pytest.approx(0.25, abs=0.005)
+    assert abs(matrices_of(dynamics.poses()[2:, 3:])[0, 2, 2]) > 0.999
+
+
+@pytest.mark.slow
+def test_bodies_meet_as_they_are_at_their_lods(device):
+    """A ball rests on the mesh that its LOD has, with the mass of the original."""
+    ball = model_of(trimesh.creation.icosphere(2, 0.5))
+    scene = ab.Scene(device)
+    scene.add(GROUND, pose=FLOOR, static=True)
+    scene.add(ball, pose=(0, 0, 0.6, 0, 0, 0, 1))
+    dynamics = ab.Dynamics(scene)
+    slop = dynamics.properties[1].reach / 512
+    for lod in (ball.lod_for(fraction=0.1), ball.lod_max, ball.lod_for(fraction=0.3)):
+        scene.set_lods([GROUND.lod_max, lod])
+        dynamics.wake()
+        # A ball of few faces rocks from one to the next.
+        for _ in range(600):
+            dynamics.step(1 / 120)
+        assert dynamics.asleep[1]
+        pose = dynamics.poses()[1]
+        vertices = ball.mesh_at(lod)[0] @ matrices_of([pose[3:]])[0].T + pose[:3]
+        assert vertices[:, 2].min() == pytest.approx(-slop, abs=slop)
+    assert dynamics.mass[1] == pytest.approx(trimesh.creation.icosphere(2, 0.5).volume)
+
+
+# Kinematic objects.
+
+
+def test_a_kinematic_floor_carries_and_stops(device):
+    dynamics = make(device, (GROUND, FLOOR), (CUBE, (0, 0, 0.4985, 0, 0, 0, 1)), kinematic=[0])
+    assert np.isinf(dynamics.mass[0]) and dynamics.mass[1] == pytest.approx(1)
+    targets = dynamics.poses()
+    for step in range(120):
+        targets[0, 0] = 0.5 * (step + 1) / 120
+        targets[0, 3:] = about((0, 0, 1), 0.4 * (step + 1) / 120)
+        dynamics.step(1 / 120, targets)
+    np.testing.assert_allclose(dynamics.poses()[0], targets[0], atol=1e-15)
+    velocity, spin = dynamics.velocities()
+    np.testing.assert_allclose(velocity[0], [0.5, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(spin[0], [0, 0, 0.4], atol=1e-9)
+    assert spin[1, 2] == pytest.approx(0.4, abs=0.02), "friction turns the cube along"
+    for _ in range(120):
+        dynamics.step(1 / 120)
+    assert dynamics.asleep.tolist() == [False, True] and np.all(dynamics.velocities()[0] == 0)
+    targets[0, 2] += 0.05
+    dynamics.step(0.1, targets)
+    dynamics.step(0.1)
+    assert not dynamics.asleep[1], "a driven object wakes what it touches"

@@ -1,0 +1,421 @@
+"""Kinematic motion against closed forms and a bouncing point; frames against fresh scenes and an injected clock."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+import trimesh
+
+import warp_abtree as ab
+from warp_abtree.lod.controllers import PaperController, PredictiveController, ToleranceController
+from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.timing import STAGES, ReplayClock, WorkClock
+from warp_abtree.simulate.frame import judge_budget, judge_step
+from warp_abtree.simulate.rigid_bodies import multiply_quaternions, quaternions_about
+
+
+def rotate(quaternion, vector):
+    """Turn a vector by a quaternion x y z w as the product q v q*."""
+    x, y, z, w = quaternion
+    turned = multiply_quaternions(multiply_quaternions(quaternion, [*vector, 0.0]), [-x, -y, -z, w])
+    assert abs(turned[3]) < 1e-12
+    return turned[:3]
+
+
+def rodrigues(axis, angle, vector):
+    axis, vector = np.asarray(axis) / np.linalg.norm(axis), np.asarray(vector)
+    along = axis * (axis @ vector)
+    return along + (vector - along) * math.cos(angle) + np.cross(axis, vector) * math.sin(angle)
+
+
+def bounce(start, way, period, phase, time, steps=20_000):
+    """Walk from one end to the other and back in small steps, turning round at the ends."""
+    s, direction = 0.0, 1.0
+    for _ in range(round(steps * (time / period + phase))):
+        s += direction * 2.0 / steps
+        if s >= 1.0 - 1e-9 or s <= 1e-9:
+            direction = -direction
+    return np.asarray(start) + s * np.asarray(way)
+
+
+@pytest.fixture(scope="module")
+def models():
+    ring = trimesh.creation.torus(major_radius=0.5, minor_radius=0.15, major_sections=24, minor_sections=12)
+    return ab.Model.load(ring), ab.Model.load(trimesh.creation.icosphere(subdivisions=2, radius=0.4))
+
+
+def make_scene(models, device="cpu"):
+    scene = ab.Scene(device=device)
+    for model in (models[0], models[1], models[0]):
+        scene.add(model)
+    return scene
+
+
+def make_motion():
+    return ab.Kinematic(
+        position=[[0.0, 0.0, 0.0], [0.7, 0.0, 0.0], [0.0, 0.3, 0.0]],
+        velocity=[[0.0, 0.0, 0.0], [-0.5, 0.0, 0.0], [0.1, 0.0, 0.0]],
+        axis=[1.0, 2.0, -1.0],
+        rate=[0.0, 1.0, 2.5],
+    )
+
+
+# Motion.
+
+
+def test_motion_in_a_straight_line():
+    motion = ab.Kinematic(position=[[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]], velocity=[[1.0, 0.0, -2.0], [0.0, 0.5, 0.0]])
+    assert np.allclose(motion.poses(4.0), [[5, 2, -5, 0, 0, 0, 1], [0, 2, 0, 0, 0, 0, 1]])
+    assert np.allclose(motion.poses(-1.0)[:, :3], [[0, 2, 5], [0, -0.5, 0]])
+
+
+def test_turning_follows_rodrigues():
+    rng = np.random.default_rng(1)
+    axis, rate = rng.normal(size=(8, 3)), rng.uniform(-3, 3, 8)
+    start = rng.normal(size=(8, 4))
+    start /= np.linalg.norm(start, axis=1, keepdims=True)
+    motion = ab.Kinematic(position=np.zeros((8, 3)), rotation=start, axis=axis, rate=rate)
+    for time in (0.0, 0.3, 7.7, -2.0):
+        poses = motion.poses(time)
+        assert np.allclose(np.linalg.norm(poses[:, 3:], axis=1), 1.0, atol=1e-15)
+        for i in range(8):
+            vector = rng.normal(size=3)
+            expected = rodrigues(axis[i], rate[i] * time, rotate(start[i], vector))
+            assert np.allclose(rotate(poses[i, 3:], vector), expected, atol=1e-12)
+
+
+def test_quarter_turn_is_right_handed():
+    assert np.allclose(rotate(quaternions_about([0, 0, 1], np.pi / 2), [1, 0, 0]), [0, 1, 0])
+
+
+@pytest.mark.parametrize("time", [0.0, 0.4, 1.0, 1.3, 2.0, 5.9])
+def test_shuttle_reflects_at_its_ends(time):
+    start, way = [0.5, 0.0, 1.0], [1.0, -2.0, 0.5]
+    motion = ab.Kinematic(position=[start], shuttle=way, period=2.0, phase=0.25)
+    assert np.allclose(motion.poses(time)[0, :3], bounce(start, way, 2.0, 0.25, time), atol=1e-3)
+
+
+def test_poses_write_into_a_buffer():
+    motion = make_motion()
+    out = np.empty((3, 7))
+    assert motion.poses(0.7, out=out) is out
+    assert np.array_equal(out, motion.poses(0.7))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"position": [0.0, 0.0, 0.0]},
+        {"velocity": np.zeros((2, 3))},
+        {"velocity": [np.nan, 0, 0]},
+        {"rotation": [0.0, 0.0, 0.0, 2.0]},
+        {"axis": [0.0, 0.0, 0.0], "rate": 1.0},
+        {"period": 0.0},
+        {"period": np.nan},
+    ],
+)
+def test_motion_refuses(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        ab.Kinematic(**{"position": np.zeros((3, 3)), **wrong})
+
+
+# LODs.
+
+
+def test_sweep_goes_down_and_up_in_equal_ratios(models):
+    sweep = ab.LodSweep([(models[0], np.array([0, 2]))], 1.0, 0.04, 4.0)
+    assert [sweep.fraction(t) for t in (0, 1, 2, 3, 4)] == pytest.approx([1.0, 0.2, 0.04, 0.2, 1.0])
+    lods = np.array([7, 7, 7])
+    sweep.apply(0.5, lods)
+    assert lods.tolist() == [models[0].lod_for(fraction=0.5), 7, models[0].lod_for(fraction=0.5)]
+
+
+def test_lod_wishes(models):
+    model = models[0]
+    for wish, lod in (
+        ("finest", model.lod_max),
+        ("coarsest", 0),
+        (17, 17),
+        ("17", 17),
+        (0.25, model.lod_for(fraction=0.25)),
+        ("0.25", model.lod_for(fraction=0.25)),
+        (1.0, model.lod_max),
+        ("1", 1),
+        ("tol:1e30", model.lod_for(tolerance=1e30)),
+        ("tol:0", model.lod_for(tolerance=0)),
+    ):
+        assert ab.resolve_lod(model, wish) == lod, wish
+    for wish in ("", "fine", "tol:", "tol:x", "tol:-1", "tol:nan", "nan", 0.0, 1.5, -1, model.lod_max + 1, "2.0"):
+        with pytest.raises(ValueError):
+            ab.resolve_lod(model, wish)
+
+
+# Frames.
+
+
+def test_rows_are_what_a_fresh_scene_finds(models, device):
+    def lods_at(time):
+        return np.array([models[0].lod_max, 60, 40] if time < 0.25 else [50, 60, 50])
+
+    motion = make_motion()
+    frame = ab.Frame(make_scene(models, device), motion, lods_at, output="faces", time_step=0.1)
+    for number in range(5):
+        time = number * 0.1
+        result = frame.step()
+        fresh = make_scene(models, device)
+        fresh.set_lods(lods_at(time))
+        fresh.set_poses(motion.poses(time))
+        expected = fresh.intersect(output="faces")
+        assert np.array_equal(result.pairs, expected.pairs) and np.array_equal(result.faces, expected.faces)
+        row = frame.history[-1]
+        assert (row.frame, row.time, row.objects) == (number, pytest.approx(time), 3)
+        assert (row.pairs, row.touching, row.hits) == (len(expected.pairs), expected.any.sum(), len(expected.faces))
+        assert (row.lod_min, row.lod_max) == (lods_at(time).min(), lods_at(time).max())
+        model_of = (models[0], models[1], models[0])
+        assert row.faces == sum(len(m.mesh_at(lod)[2]) for m, lod in zip(model_of, lods_at(time)))
+        assert row.states == (3 if number < 3 else 2)
+        # Trees are refitted in the first frame and where LODs change, and at no other time.
+        assert (row.nodes_refitted > 0) == (number in (0, 3)), row
+    assert max(row.hits for row in frame.history) > 0
+
+
+def test_lods_are_set_only_where_they_change(models, monkeypatch):
+    scene, calls = make_scene(models), []
+    frame = ab.Frame(scene, lods=lambda time: np.array([scene.lods[0], 60, 40 if time < 0.45 else 50]), time_step=0.1)
+    set_lods = scene.set_lods
+    monkeypatch.setattr(scene, "set_lods", lambda lods: calls.append(len(frame.history)) or set_lods(lods))
+    frame.run(8)
+    assert calls == [0, 5]
+    lods = scene.lods
+    frame.warm_up()
+    assert np.array_equal(scene.lods, lods) and len(frame.history) == 8
+
+
+def test_stages_are_timed_apart(models):
+    steps = [100.0, 0.5, 0.001, 0.020, 0.300, 4.0, 60.0, 50.0, 0.6, 0.002, 0.030, 0.400, 5.0, 70.0]
+    ticks = iter(np.cumsum(steps))
+    frame = ab.Frame(make_scene(models), make_motion(), output="any", clock=lambda: next(ticks))
+    frame.warm_up()
+    rows = frame.run(2)
+    stages = [tuple(getattr(row, stage) for stage in STAGES) for row in rows]
+    assert stages == [(500, 1, 20, 300, 4000, 60000), (600, 2, 30, 400, 5000, 70000)]  # to the nanosecond
+    assert rows[1].total_ms == pytest.approx(76032)
+    assert rows[1].cost_ms == pytest.approx(6002)  # without movement and answer
+    assert rows[0].hits is None
+    summary = frame.summary()
+    assert summary["stages"]["query_ms"] == pytest.approx({"mean": 4500, "p95": 4950, "total": 9000})
+    assert summary["frames"] == 2 and summary["objects"] == 3
+
+
+def test_history_is_recorded(models, tmp_path):
+    frame = ab.Frame(make_scene(models), make_motion())
+    seen = []
+    frame.run(3, progress=lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    frame.record(tmp_path / "rows.json")
+    frame.record(tmp_path / "rows.csv")
+    expected = [row.as_dict() for row in frame.history]
+    assert json.loads((tmp_path / "rows.json").read_text()) == expected
+    with open(tmp_path / "rows.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ab.FrameRow.names()
+    assert [{key: float(value) if value else None for key, value in row.items()} for row in rows] == expected
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["rows.csv", "rows.json"]
+
+
+def test_frame_refuses(models):
+    with pytest.raises(ValueError, match="scene has 3"):
+        ab.Frame(make_scene(models), ab.Kinematic(position=[[0.0, 0.0, 0.0]]))
+    with pytest.raises(ValueError, match="time_step"):
+        ab.Frame(make_scene(models), time_step=np.nan)
+    with pytest.raises(ValueError, match="no motion"):
+        ab.Frame(make_scene(models)).poses_at(0.0)
+
+
+# Budgets.
+
+
+def make_controller(kind, scene):
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), far=10.0)
+    if kind == "tolerance":
+        return ToleranceController(scene, 0.01, camera)
+    return {"paper": PaperController, "predictive": PredictiveController}[kind](scene, 8.0, camera)
+
+
+@pytest.mark.parametrize("kind", ["paper", "tolerance", "predictive"])
+def test_a_run_repeats_itself_on_its_recorded_clock(models, device, kind, tmp_path):
+    """Whatever the machine did in the meantime: rows, LODs and hits are the same, from memory and from files."""
+
+    def run(clock):
+        scene = make_scene(models, device)
+        frame = ab.Frame(scene, make_motion(), make_controller(kind, scene), "faces", clock=clock)
+        return frame, [(frame.step().faces.tobytes(), scene.lods.tolist()) for _ in range(40)]
+
+    # A machine so uneven that controllers have much to do.
+    ticks = iter(np.cumsum(np.random.default_rng(1).uniform(0, 3e-3, 40 * (len(STAGES) + 1))))
+    first, found = run(lambda: float(next(ticks)))
+    if kind != "tolerance":
+        assert len({tuple(lods) for _, lods in found}) > 5
+    first.record(tmp_path / "rows.json")
+    first.record(tmp_path / "rows.csv")
+    assert first.history[0].budget_ms == (None if kind == "tolerance" else 8.0)
+    for rows in (first.history, tmp_path / "rows.json", str(tmp_path / "rows.csv")):
+        again, same = run(ReplayClock(rows))
+        assert again.history == first.history and same == found
+    with pytest.raises(RuntimeError, match="after 40 frames"):
+        again.step()
+
+
+@pytest.mark.parametrize("content", [None, "{", "[1]", "frame,time\n0,0\n", '[{"select_ms": "x"}]'])
+def test_replay_refuses(tmp_path, content):
+    for name in ("rows.json", "rows.csv"):
+        path = tmp_path / name
+        if content is not None:
+            path.write_text(content)
+        if (name, content) in (("rows.csv", "{"), ("rows.csv", "[1]")):
+            continue  # a table of no rows
+        with pytest.raises(ValueError, match=name):
+            ReplayClock(path)
+
+
+def test_controllers_move_lods_from_the_coarsest(models, device):
+    """A budget without bounds lets all of them climb to the finest."""
+    for kind in (PaperController, PredictiveController):
+        scene = make_scene(models, device)
+        frame = ab.Frame(scene, make_motion(), kind(scene, 1e6), clock=WorkClock())
+        frame.warm_up()
+        assert scene.lods.tolist() == [models[0].lod_max, models[1].lod_max, models[0].lod_max]
+        rows = frame.run(80)
+        assert rows[0].lod_max == 0 and rows[0].lods_changed == 3 and rows[0].lods_turned == 0
+        assert scene.lods.tolist() == [models[0].lod_max, models[1].lod_max, models[0].lod_max]
+        assert rows[-1].error_max == 0 < rows[0].error_mean <= rows[0].error_max
+
+
+def test_work_is_counted_not_timed(models, device):
+    rates = dict.fromkeys(WorkClock().rates, 0.0)
+    for name, stage, count in (
+        ("node_test", "query_ms", lambda row: row.node_tests),
+        ("triangle_test", "query_ms", lambda row: row.triangle_tests),
+        ("candidate", "broad_ms", lambda row: row.pairs),
+        ("posed", "move_ms", lambda row: 3),
+        ("node_refitted", "refine_ms", lambda row: row.nodes_refitted),
+        ("lod_change", "refine_ms", lambda row: int(row.lods_changed > 0)),
+        ("selected", "select_ms", lambda row: 3),
+    ):
+        lods = lambda time: np.array([40, 60, 40 + int(10 * time)])  # noqa: E731
+        clock = WorkClock({**rates, name: 1e-3})
+        rows = ab.Frame(make_scene(models, device), make_motion(), lods, time_step=0.1, clock=clock).run(4)
+        assert [getattr(row, stage) for row in rows] == [count(row) for row in rows], name
+        assert sum(count(row) for row in rows) > 0
+        assert all(row.total_ms == getattr(row, stage) for row in rows)
+    with pytest.raises(ValueError, match="'tests' is none of"):
+        WorkClock({"tests": 1.0})
+
+
+def test_rows_tell_errors_and_turns(models):
+    lods = np.array([[10, 20, 30], [20, 20, 30], [15, 25, 30], [15, 20, 31], [20, 20, 30], [20, 20, 30]])
+    frame = ab.Frame(make_scene(models), lods=lambda time: lods[round(time)], time_step=1.0)
+    rows = frame.run(6)
+    of = (models[0], models[1], models[0])
+    for row, stand in zip(rows, lods):
+        errors = [model.error_at(int(lod)) for model, lod in zip(of, stand)]
+        assert (row.error_mean, row.error_max) == (pytest.approx(np.mean(errors)), max(errors))
+    # Objects start at their finest, so that the first change is a fall for all.
+    assert [row.lods_changed for row in rows] == [3, 1, 2, 2, 2, 0]
+    assert [row.lods_turned for row in rows] == [0, 1, 2, 2, 2, 0]
+
+
+def make_rows(costs, budget=10.0, step=0.5):
+    rows = []
+    for i, cost in enumerate(costs):
+        values = dict.fromkeys(ab.FrameRow.names()[:-2], 0)
+        values |= {"frame": i, "time": i * step, "objects": 4, "lods_turned": i % 2, "error_mean": float(i)}
+        rows.append(ab.FrameRow(**{**values, "budget_ms": budget, "query_ms": cost, "move_ms": 99.0}))
+    return rows
+
+
+def test_budgets_are_judged():
+    rows = make_rows([50, 50, 10, 10.5, 11, 11.5, 12, 8, 40, 9])
+    verdict = judge_budget(rows)
+    assert verdict == {
+        "frames": 8,
+        "within": 3 / 8,
+        "within_tenth": 5 / 8,
+        "worst": 4.0,
+        "longest_over": 2,
+        "turns": pytest.approx(4 / 4 / 4.0),
+        "error_mean": 5.5,
+    }
+    assert judge_budget(rows, after=0.0)["within"] == 3 / 10
+    assert judge_budget(rows, budget_ms=20.0)["within"] == 7 / 8
+    assert judge_budget(rows, after=5.0) is None and judge_budget(make_rows([1.0] * 9, None)) is None
+    assert judge_step(rows, 0) == {"peak": 5.0, "frames": 2}
+    assert judge_step(rows, 5) == {"peak": 4.0, "frames": 2}
+    assert judge_step(rows, 8) == {"peak": 4.0, "frames": 1}
+    assert judge_step(make_rows([30, 40]), 1) == {"peak": 4.0, "frames": None}
+    with pytest.raises(ValueError, match="frame 10"):
+        judge_step(rows, 10)
+
+
+def test_summary_judges_the_budget(models):
+    scene = make_scene(models)
+    frame = ab.Frame(scene, make_motion(), PaperController(scene, 1e6), clock=WorkClock())
+    frame.run(70)
+    summary = frame.summary()
+    assert summary["budget_ms"] == 1e6 and summary["budget"] == judge_budget(frame.history)
+    assert summary["budget"]["frames"] == 10 and summary["budget"]["within"] == 1.0
+    assert frame.summary(after=0.0)["budget"]["frames"] == 70
+    assert ab.Frame(scene).run(1) and json.dumps(summary)
+    still = ab.Frame(make_scene(models))
+    still.run(2)
+    assert still.summary()["budget"] is None and still.summary()["budget_ms"] is None
+
+
+# What moves the objects.
+
+
+class Pusher:
+    """Moves the third object away whenever anything touches, and sets the scene's poses itself."""
+
+    def __init__(self, scene, log):
+        self.scene, self.log, self.x = scene, log, 0.0
+
+    def __len__(self):
+        return 3
+
+    def poses(self, time, out):
+        self.log.append(("poses", time))
+        out[:] = make_motion().poses(0.0)
+        out[2, 0] += self.x
+        self.scene.set_poses(out)
+
+    def answer(self, result, time_step):
+        self.log.append(("answer", int(result.any.sum())))
+        self.x += 10.0 * time_step * result.any.any()
+
+
+class Finder(Pusher):
+    def find(self, time_step):
+        self.log.append(("find", time_step))
+        return self.scene.intersect([[1, 2]], output="count")
+
+
+def test_motion_hears_what_was_found_and_moves_on(models, device):
+    log, scene = [], make_scene(models, device)
+    rows = ab.Frame(scene, Pusher(scene, log), time_step=0.25).run(3)
+    touching = [row.touching for row in rows]
+    assert touching[0] == 3 and touching[-1] == 1
+    expected = [(("poses", 0.25 * i), ("answer", touching[i])) for i in range(3)]
+    assert log == [entry for pair in expected for entry in pair]
+
+
+def test_motion_may_find_contacts_itself(models, monkeypatch):
+    log, scene = [], make_scene(models)
+    monkeypatch.setattr(scene, "broad_phase", None)
+    frame = ab.Frame(scene, Finder(scene, log), time_step=0.25, clock=WorkClock({"candidate": 1.0}))
+    result = frame.step()
+    assert [entry[0] for entry in log] == ["poses", "find", "answer"]
+    assert result.pairs.tolist() == [[1, 2]] and frame.history[0].pairs == 1
+    assert frame.history[0].hits == result.count.sum() > 0 and frame.history[0].broad_ms == 0

@@ -1,0 +1,118 @@
+"""Whole runs of frames: nothing is loaded in one, and worlds alone are what they are among others."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import warp_abtree as ab
+from warp_abtree.lod.controllers import PaperController, ToleranceController
+from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.timing import STAGES, ReplayClock
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def models():
+    ring = trimesh.creation.torus(major_radius=0.5, minor_radius=0.15, major_sections=24, minor_sections=12)
+    return ab.Model.load(ring), ab.Model.load(trimesh.creation.icosphere(subdivisions=2, radius=0.4))
+
+
+WARMED_UP = """
+import sys, numpy as np, trimesh, warp_abtree as ab
+device, kind = sys.argv[1:]
+ring = ab.Model.load(trimesh.creation.torus(0.5, 0.15, major_sections=64, minor_sections=24))
+scene = ab.Scene(device=device)
+for i in range(3):
+    scene.add(ring, (0.3 * i, 0, 0, 0, 0, 0, 1))
+top, motion = ring.lod_max, None
+if kind == "bodies":
+    motion = ab.Dynamics(scene).motion()
+if kind == "budget":
+    lods = ab.PredictiveController(scene, 1e6, ab.Camera.look_at((0, 0, 9), (0, 0, 0)))
+else:
+    steps = [(top, top - 1, 0), (top, top - 1, top - 1), (0, 1, 2), (top, top, top)]
+    lods = lambda time: np.array(steps[min(round(60 * time), 3)])
+frame = ab.Frame(scene, motion, lods)
+before = scene.lods.tolist(), scene.arrays()[2].pool.position.numpy().tobytes()
+frame.warm_up()
+assert before == (scene.lods.tolist(), scene.arrays()[2].pool.position.numpy().tobytes()) and not frame.history
+print("warm", flush=True)
+frame.run(8)
+print(sum(row.lods_changed for row in frame.history), frame.history[-1].hits)
+"""
+
+
+@pytest.mark.parametrize("kind", ["bodies", "budget", "lods"])
+@pytest.mark.slow
+def test_nothing_is_loaded_after_the_warm_up(device, kind):
+    """In a process of its own, where nothing is loaded yet; Warp says what it loads."""
+    words = [sys.executable, "-c", WARMED_UP, device, kind]
+    said = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    before, after = said.split("warm\n")
+    assert "load on device" in before and "load on device" not in after, after
+    changed, hits = map(int, after.split())
+    assert changed >= 3 and hits > 0
+
+
+class InWorlds(ab.Kinematic):
+    """Motion of the objects of worlds 0, 1, ... and of one, the last, that is in all of them."""
+
+    def __init__(self, worlds):
+        rng = np.random.default_rng(7)
+        rows = [(rng.uniform(-0.8, 0.8, (4, 3)), rng.uniform(-1, 1, (4, 3)), rng.uniform(1, 3, 4)) for _ in range(3)]
+        place, velocity, rate = (np.concatenate([rows[w][k] for w in worlds]) for k in range(3))
+        shared = np.zeros((1, 3))
+        super().__init__(
+            np.concatenate([place, shared]),
+            velocity=np.concatenate([velocity, shared]),
+            axis=(1, 2, 3),
+            rate=np.append(rate, 0.0),
+        )
+
+
+def run_worlds(models, device, worlds, kind, moved, clock=None):
+    """Run some of three worlds together; return frame, LODs and (objects, faces) of all hits by world and frame."""
+    scene, motion = ab.Scene(device=device), InWorlds(worlds)
+    for place, world in enumerate(worlds):
+        for i in range(4):
+            scene.add(models[i % 2], world=place, importance=1 + (world + i) % 3)
+    scene.add(models[0], world=-1, static=True)
+    scene.set_poses(motion.poses(0.0))
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), far=10.0)
+    lods = PaperController(scene, 8.0, camera) if kind == "paper" else ToleranceController(scene, 0.01, camera)
+    if moved == "bodies":
+        velocity = np.array(motion.velocity)
+        motion = ab.Dynamics(scene, restitution=0.4, gravity=(0, 0, -3), velocity=velocity).motion()
+    frame = ab.Frame(scene, motion, lods, clock=clock, output="faces")
+    found = {world: [] for world in worlds}
+    for _ in range(30):
+        result = frame.step()
+        for place, world in enumerate(worlds):
+            mine = np.append(np.arange(4 * place, 4 * place + 4), 4 * len(worlds))
+            kept = np.isin(result.pairs, mine).all(1)
+            pairs = np.searchsorted(mine, result.pairs[kept]).tolist()
+            seen = [scene.lods[mine].tolist(), pairs, result.count[kept].tolist()]
+            seen.append(result.node_tests[kept].tolist())
+            if result.faces is not None:
+                seen.append(result.faces[kept[result.faces[:, 0]], 1:].tolist())
+            found[world].append(seen)
+    return frame, found
+
+
+@pytest.mark.parametrize("moved", ["as told", "bodies"])
+@pytest.mark.parametrize("kind", ["paper", "tolerance"])
+def test_worlds_alone_and_together_are_the_same(models, device, kind, moved):
+    """On one recorded clock. (A predicted budget is shared by all that is in the scene, so it is another alone.)"""
+    ticks = np.cumsum(np.random.default_rng(3).uniform(0, 1.5e-3, 30 * (len(STAGES) + 1)))
+    together, found = run_worlds(models, device, (0, 1, 2), kind, moved, iter(ticks.tolist()).__next__)
+    assert len({str(seen[0]) for seen in found[1]}) > (1 if kind == "tolerance" else 3), "LODs change"
+    assert found[0] != found[1] and any(seen[2] for seen in found[2])
+    for world in range(3):
+        assert (
+            run_worlds(models, device, (world,), kind, moved, ReplayClock(together.history))[1][world] == found[world]
+        )

@@ -1,0 +1,302 @@
+"""Captured graphs whose arrays were replaced, and captures of what was never launched: one error, never an answer."""
+
+import gc
+import weakref
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.samples import random_poses, sample
+
+import warp_abtree as ab
+
+PAIRS = np.array([(0, 1), (1, 2), (0, 2), (2, 3), (3, 0)])
+OPERATORS = {
+    "count": lambda scene, **options: ab.Query(scene, "count", **options),
+    "faces": lambda scene, **options: ab.Query(scene, "faces", **options),
+    "within": lambda scene, **options: ab.Query(scene, "count", within=0.01, **options),
+    "contacts": lambda scene, **options: ab.ContactQuery(scene, **options),
+    "manifolds": lambda scene, **options: ab.ManifoldQuery(scene, **options),
+}
+STALE = "captured before arrays that it uses were replaced"
+
+
+@pytest.fixture(params=OPERATORS)
+def operator(request):
+    return OPERATORS[request.param]
+
+
+def make_scene(device, count=4):
+    scene = ab.Scene(device)
+    for pose in random_poses(np.random.default_rng(1), count, 0.3):
+        scene.add(sample("torus"), pose)
+    return scene
+
+
+def capture(device, operator):
+    with wp.ScopedCapture(device) as captured:
+        operator.launch()
+    return captured.graph
+
+
+def rungs(count):
+    """Return LODs that differ from one another."""
+    return sample("torus").lod_max - 7 * np.arange(count)
+
+
+@pytest.mark.parametrize("pairs", [PAIRS, None], ids=["given", "found"])
+def test_the_first_launch_is_captured(device, operator, pairs):
+    """Nothing has to be launched before, the broad phase's tree included."""
+    scene = make_scene(device)
+    query = operator(scene, pairs=pairs, capacity=20_000)
+    wp.capture_launch(capture(device, query))
+    result = query.result()
+    result.check()
+    expected = scene.intersect(pairs, output="count")
+    assert expected.count.sum() > 100
+    order = [result.pairs.tolist().index(pair) for pair in expected.pairs.tolist()]
+    np.testing.assert_array_equal(result.count[order], expected.count)
+
+
+@pytest.mark.parametrize("pairs", [PAIRS, None], ids=["given", "found"])
+def test_a_pool_that_grows(device, operator, pairs):
+    """More LODs than before take more tree states: a replay is refused, a launch and a new capture are not."""
+    scene = make_scene(device)
+    query = operator(scene, pairs=pairs, capacity=20_000)
+    graph = capture(device, query)
+    scene.set_lods(rungs(4))
+    wp.capture_launch(graph)
+    with pytest.raises(RuntimeError, match=STALE):
+        query.result()
+    expected = scene.intersect(pairs, output="count").count.sum()
+    query.launch()
+    assert query.result().count.sum() == expected > 100
+    wp.capture_launch(graph)
+    with pytest.raises(RuntimeError, match=STALE):
+        query.result()
+    wp.capture_launch(capture(device, query))
+    assert query.result().count.sum() == expected
+
+
+def test_lods_in_the_room_there_is(device, operator):
+    """A graph goes on through changes of LODs that take no more states than there were."""
+    scene = make_scene(device)
+    scene.set_lods(rungs(4))
+    query = operator(scene, pairs=PAIRS, capacity=20_000)
+    graph = capture(device, query)
+    for lods in (rungs(4) - 3, np.zeros(4, int), rungs(4)[::-1], np.full(4, 40), rungs(4) - 9):
+        scene.set_lods(lods)
+        wp.capture_launch(graph)
+        result = query.result()
+        result.check()
+        np.testing.assert_array_equal(result.count, make_and_ask(device, lods))
+
+
+def make_and_ask(device, lods):
+    fresh = make_scene(device)
+    fresh.set_lods(lods)
+    return fresh.intersect(PAIRS, output="count").count
+
+
+def test_many_changes_of_lods(device):
+    """Whatever the pool does, an answer is right or refused."""
+    rng, scene = np.random.default_rng(5), make_scene(device)
+    ladder = np.linspace(0, sample("torus").lod_max, 60).astype(int)
+    query = ab.Query(scene, "count", pairs=PAIRS)
+    graph, refused = capture(device, query), 0
+    for _ in range(12):
+        lods = rng.choice(ladder, 4)
+        scene.set_lods(lods)
+        wp.capture_launch(graph)
+        try:
+            found = query.result().count
+        except RuntimeError:
+            refused += 1
+            graph = capture(device, query)
+            wp.capture_launch(graph)
+            found = query.result().count
+        np.testing.assert_array_equal(found, make_and_ask(device, lods))
+    assert 1 <= refused <= 4
+
+
+@pytest.mark.parametrize("pairs", [PAIRS, None], ids=["given", "found"])
+def test_an_object_is_added(device, operator, pairs):
+    scene = make_scene(device)
+    query = operator(scene, pairs=pairs, capacity=20_000)
+    graph = capture(device, query)
+    scene.add(sample("torus"))
+    scene.intersect([(0, 4)])
+    wp.capture_launch(graph)
+    with pytest.raises(RuntimeError, match=STALE):
+        query.result()
+
+
+def test_pairs_are_filtered_out(device, operator):
+    """That concerns graphs that run the broad phase, and no others."""
+    scene = make_scene(device)
+    found, given = operator(scene, capacity=20_000), operator(scene, pairs=PAIRS, capacity=20_000)
+    graphs = [capture(device, query) for query in (found, given)]
+    scene.filter(PAIRS[:1])
+    for graph in graphs:
+        wp.capture_launch(graph)
+    with pytest.raises(RuntimeError, match=STALE):
+        found.result()
+    assert given.result().count[0] > 0
+
+
+def test_buffers_that_grow(device, operator):
+    """The replay writes into memory that is still the graph's own, and its results are refused."""
+    scene = make_scene(device)
+    query = operator(scene, pairs=PAIRS[:1], capacity=8)
+    graph = capture(device, query)
+    query.set_pairs(PAIRS)
+    expected = query.run().count
+    query.launch()
+    wp.capture_launch(graph)
+    with pytest.raises(RuntimeError, match=STALE):
+        query.result()
+    query.launch()
+    np.testing.assert_array_equal(query.result().count, expected)
+
+
+class OwnQuery(ab.Query):
+    """A query of a user's own class."""
+
+
+@pytest.mark.parametrize("kind", [ab.Query, OwnQuery])
+def test_a_graph_keeps_its_arrays(device, kind):
+    """Those of the query, of the scene and of the broad phase, until the query goes."""
+    scene = make_scene(device)
+    query = kind(scene, "faces", capacity=8)
+    captured, states, objects = capture(device, query), query.arrays[1].pool, query.arrays[2].pool
+    kept = [query.hits.face, query.hits.any_hit, query.pair_poses, query.pairs, query.work.counter]
+    kept += [states.node_box, states.face_corner, states.lod, objects.state, objects.rotation]
+    kept += [query.broad_phase.lower, query.broad_phase.excluded, query.broad_phase.bvh, query.guard.launched]
+    alive = [weakref.ref(array) for array in kept]
+    query.run()
+    known, ids = objects.state, objects.state.numpy().tolist()
+    scene.set_lods(rungs(4))
+    assert known.numpy().tolist() == ids, "the states of the pool that the graph knows, and no others"
+    del known
+    scene.add(sample("box"))
+    del kept, states, objects
+    gc.collect()
+    assert all(reference() is not None for reference in alive)
+    wp.capture_launch(captured)
+    with pytest.raises(RuntimeError, match=STALE):
+        query.result()
+    del query, captured
+    gc.collect()
+    assert not any(reference() is not None for reference in alive[:5])
+
+
+def test_results_without_a_launch(device, operator):
+    scene = make_scene(device)
+    query = operator(scene, pairs=PAIRS, capacity=20_000)
+    with pytest.raises(RuntimeError, match="nothing was launched"):
+        query.result()
+    query.launch()
+    query.result()
+    query.set_pairs(PAIRS[:2])
+    with pytest.raises(RuntimeError, match="nothing was launched"):
+        query.result()
+    query.launch()
+    query.resize(30_000)
+    with pytest.raises(RuntimeError, match="buffers were replaced"):
+        query.result()
+
+
+def test_a_frame_whose_buffers_grow(device):
+    """`run` outside a graph grows them; the graph of before says so, at the result and at the check."""
+    frame = ab.FrameGraph(make_scene(device), output="faces", pairs=PAIRS, capacity=8)
+    graph = frame.capture()
+    expected = frame.run().faces
+    wp.capture_launch(graph)
+    with pytest.raises(RuntimeError, match=STALE):
+        frame.result()
+    frame.launch()
+    np.testing.assert_array_equal(frame.result().faces, expected)
+    with pytest.raises(RuntimeError, match=f"a frame since the last check is lost.*{STALE}"):
+        frame.check()
+    frame.check()
+    wp.capture_launch(frame.capture())
+    np.testing.assert_array_equal(frame.result().faces, expected)
+    frame.check()
+
+
+def test_poses_of_a_graph(device):
+    scene = make_scene(device)
+    poses = ab.PoseInput(scene)
+    graph = capture(device, poses)
+    wp.capture_launch(graph)
+    poses.check()
+    scene.set_lods(rungs(4))  # which replaces nothing that poses lie in
+    wp.capture_launch(graph)
+    poses.check()
+    scene.add(sample("torus"))
+    wp.capture_launch(graph)
+    with pytest.raises(RuntimeError, match=f"poses since the last check are lost.*{STALE}"):
+        poses.check()
+
+
+def test_bodies_of_a_graph(device):
+    """Contacts that outgrow their buffers in `step` end the graphs of `launch`."""
+    scene = make_scene(device, 3)
+    scene.set_poses(np.array([(3.0 * k, 0, 0, 0, 0, 0, 1) for k in range(3)]))
+    bodies = ab.Dynamics(scene, gravity=(0, 0, 0), capacity=8, pair_capacity=1)
+    bodies.step(1e-4)
+    graph = capture_step(device, bodies)
+    wp.capture_launch(graph)
+    bodies.check()
+    scene.set_poses(np.array([(0.2 * k, 0, 0, 0, 0, 0, 1) for k in range(3)]))
+    bodies.step(1e-4)
+    wp.capture_launch(graph)
+    with pytest.raises(RuntimeError, match=STALE):
+        bodies.check()
+
+
+def capture_step(device, bodies):
+    with wp.ScopedCapture(device) as captured:
+        bodies.launch(1e-4)
+    return captured.graph
+
+
+CALLS = {
+    "set_poses": lambda scene, query, frame: scene.set_poses(np.tile([0, 0, 0, 0, 0, 0, 1.0], (4, 1))),
+    "set_lods": lambda scene, query, frame: scene.set_lods([3] * 4),
+    "add": lambda scene, query, frame: scene.add(sample("torus")),
+    "broad_phase": lambda scene, query, frame: scene.broad_phase(),
+    "intersect": lambda scene, query, frame: scene.intersect(PAIRS),
+    "tree_state": lambda scene, query, frame: scene.tree_state(0),
+    "Query": lambda scene, query, frame: ab.Query(scene, "count"),
+    "ContactQuery": lambda scene, query, frame: ab.ContactQuery(scene, capacity=1000),
+    "FrameGraph": lambda scene, query, frame: ab.FrameGraph(scene),
+    "PoseInput": lambda scene, query, frame: ab.PoseInput(scene),
+    "sweep": lambda scene, query, frame: ab.sweep(
+        sample("torus"), sample("torus"), [(0, 0, 0, 0, 0, 0, 1)], device=scene.device
+    ),
+    "run": lambda scene, query, frame: query.run(),
+    "result": lambda scene, query, frame: query.result(),
+    "set_pairs": lambda scene, query, frame: query.set_pairs(PAIRS[:1]),
+    "frame run": lambda scene, query, frame: frame.run(),
+    "frame result": lambda scene, query, frame: frame.result(),
+    "frame check": lambda scene, query, frame: frame.check(),
+}
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_what_waits_is_refused_in_a_capture(device, call):
+    """In one sentence, and nothing has changed: neither the scene nor the graph."""
+    scene = make_scene(device)
+    query, frame = ab.Query(scene, "count", pairs=PAIRS), ab.FrameGraph(scene, output="count", pairs=PAIRS)
+    expected = query.run().count
+    lods = scene.lods
+    with wp.ScopedCapture(device) as captured:
+        query.launch()
+        with pytest.raises(RuntimeError, match="cannot be captured in a graph; call it before the capture begins"):
+            CALLS[call](scene, query, frame)
+    wp.capture_launch(captured.graph)
+    np.testing.assert_array_equal(query.result().count, expected)
+    np.testing.assert_array_equal(scene.intersect(PAIRS, output="count").count, expected)
+    np.testing.assert_array_equal(scene.lods, lods)
+    assert scene.object_count == 4

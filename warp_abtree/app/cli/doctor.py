@@ -1,0 +1,207 @@
+"""`warp-abtree doctor`: what this machine has, what is missing, and whether its devices answer right."""
+
+import importlib.metadata
+import os
+import platform
+import sys
+import time
+from pathlib import Path
+
+import warp as wp
+
+from warp_abtree.app.cli import report
+from warp_abtree.app.toml.folder import scene_folder, scene_names
+from warp_abtree.checks.version import __version__
+from warp_abtree.model.model import Model
+from warp_abtree.scene.scene import Scene
+
+SUMMARY = "say what this machine has, what is missing, and whether its devices answer right"
+EXAMPLES = ("", "--json", "--device cpu")
+CORE = {"warp-lang": "1.19", "numpy": "", "trimesh": ""}
+# Of each extra: what it is for, and its packages with the least version; tests hold them against pyproject.toml.
+EXTRAS = {
+    "usd": ("meshes inside Warp, USD files", {"usd-core": "", "tomli": ""}),
+    "view": ("viewer and pictures", {"matplotlib": "", "viser": "1.1", "tomli": ""}),
+    "dynamics": ("bodies whose meshes are open", {"scipy": "", "networkx": ""}),
+    "newton": ("contacts for Newton's solvers", {"newton": "1.8"}),
+    "cluster": ("sweeps on Ray, Parquet files", {"ray": "", "pyarrow": ""}),
+    "cli": ("tables and bars, completion in shells", {"rich": "", "shtab": ""}),
+}
+OLD_PYTHON_ONLY = ("tomli",)  # Python 3.11 has tomllib
+
+# Two triangles that cross, and where the second one passes the first by.
+_CROSSING = ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0.25, 0.25, -1], [0.25, 0.25, 1], [2, 2, 0]])
+_AWAY = (0, 0, 3, 0, 0, 0, 1)
+
+
+def _numbers(version) -> tuple:
+    parts = []
+    for part in version.split("."):
+        digits = part[: len(part) - len(part.lstrip("0123456789"))]
+        if not digits:
+            break
+        parts.append(int(digits))
+    return tuple(parts)
+
+
+def check_package(name, least="") -> dict:
+    """Return a package's installed version, or None, and whether that is new enough."""
+    try:
+        version = importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return {"version": None, "ok": False, "needs": f"{name}>={least}" if least else name}
+    return {
+        "version": version,
+        "ok": _numbers(version) >= _numbers(least),
+        "needs": f"{name}>={least}" if least else name,
+    }
+
+
+def check_extras() -> dict:
+    """Return for each extra what it is for, its packages as `check_package`, and whether all are there."""
+    found = {}
+    for extra, (purpose, packages) in EXTRAS.items():
+        kept = {name: least for name, least in packages.items() if _is_needed(name)}
+        checked = {name: check_package(name, least) for name, least in kept.items()}
+        found[extra] = {"for": purpose, "packages": checked, "ok": all(each["ok"] for each in checked.values())}
+    return found
+
+
+def _is_needed(name) -> bool:
+    return name not in OLD_PYTHON_ONLY or sys.version_info < (3, 11)
+
+
+def check_device(device) -> dict:
+    """Ask a device a question whose answer is known.
+
+    Returns:
+        alias, name, architecture, memory [bytes, None for the CPU], ok, seconds that the answer took, with loading
+        and, the first time, compiling of kernels; error, what went wrong, or None.
+    """
+    gpu = device.is_cuda
+    found = {
+        "device": device.alias,
+        "name": device.name if gpu else platform.processor() or platform.machine(),
+        "architecture": f"sm_{device.arch}" if gpu else platform.machine(),
+        "memory_bytes": device.total_memory if gpu else None,
+        "free_bytes": device.free_memory if gpu else None,
+    }
+    begin = time.perf_counter()
+    try:
+        scene = Scene(device)
+        first, second = (Model.from_arrays(vertices, [[0, 1, 2]]) for vertices in _CROSSING)
+        scene.add(first)
+        scene.add(second)
+        scene.add(second, pose=_AWAY)
+        answer = scene.intersect([[0, 1], [0, 2], [1, 2]], output="count").count.tolist()
+        error = None if answer == [1, 0, 0] else f"a wrong answer: {answer}"
+    except Exception as problem:  # whatever it is, it is what the doctor is asked about
+        error = " ".join(str(problem).split()) or type(problem).__name__
+    return {**found, "ok": error is None, "seconds": time.perf_counter() - begin, "error": error}
+
+
+def check_cache() -> dict:
+    """Return where Warp keeps compiled kernels, how many modules and bytes stand there, and whether it can write."""
+    folder = Path(wp.config.kernel_cache_dir or "")  # set since Warp was started
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {
+        "folder": str(folder),
+        "modules": sum(1 for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else 0,
+        "bytes": sum(path.stat().st_size for path in files),
+        "writable": os.access(folder, os.W_OK),
+    }
+
+
+def examine(devices=None) -> dict:
+    """Return all that `warp-abtree doctor --json` prints.
+
+    Args:
+        devices: Warp devices to ask; None is all.
+    """
+    checked = [check_device(device) for device in (wp.get_devices() if devices is None else devices)]
+    core = {name: check_package(name, least) for name, least in CORE.items()}
+    found = {
+        "warp_abtree": __version__,
+        "folder": str(Path(__file__).parents[2]),
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cuda_driver": _cuda_driver(),
+        "devices": checked,
+        "packages": core,
+        "extras": check_extras(),
+        "kernel_cache": check_cache(),
+        "scenes": {"folder": str(scene_folder()), "names": scene_names()},
+    }
+    missing = [each["needs"] for extra in found["extras"].values() for each in extra["packages"].values()]
+    found["install"] = list(dict.fromkeys(needs for needs in missing if not _has(found, needs)))
+    found["usable"] = bool(checked) and all(each["ok"] for each in (*checked, *core.values()))
+    return found
+
+
+def _has(found, needs) -> bool:
+    return all(
+        each["ok"]
+        for extra in found["extras"].values()
+        for each in extra["packages"].values()
+        if each["needs"] == needs
+    )
+
+
+def _cuda_driver():
+    try:
+        version = wp.get_cuda_driver_version() if wp.is_cuda_available() else None
+    except RuntimeError:
+        return None
+    return ".".join(map(str, version)) if isinstance(version, tuple) else version
+
+
+def doctor(options, progress) -> int:
+    """Examine this machine; the exit status is 0 where it is usable, else 1."""
+    devices = None if options.device is None else [Scene(device=options.device).device]
+    found = examine(devices)
+    if options.json:
+        report.print_json(found)
+    else:
+        print_findings(found)
+    return 0 if found["usable"] else 1
+
+
+def print_findings(found):
+    """Print what `examine` found."""
+    versions = ", ".join(f"{name} {each['version'] or 'missing'}" for name, each in found["packages"].items())
+    print(f"warp_abtree {found['warp_abtree']} in {found['folder']}")
+    print(f"Python {found['python']} on {found['system']}, {found['cores']} cores; {versions}")
+    print(f"CUDA driver: {found['cuda_driver'] or 'none, so no GPU is used'}\n")
+    rows = [["device", "name", "memory", "two triangles"]]
+    for each in found["devices"]:
+        memory = "" if each["memory_bytes"] is None else f"{each['memory_bytes'] / 2**30:.0f} GiB"
+        name = each["name"] if each["memory_bytes"] is None else f"{each['name']} ({each['architecture']})"
+        rows.append([each["device"], name, memory, f"{'right' if each['ok'] else 'failed'}, {each['seconds']:.2f} s"])
+    report.print_table(rows, left=3)
+    for each in found["devices"]:
+        if each["error"]:
+            print(f"{each['device']}: {each['error']}")
+    print()
+    rows = [["extra", "for", "packages"]]
+    for name, extra in found["extras"].items():
+        packages = ", ".join(
+            f"{package} {'missing' if each['version'] is None else each['version'] + ('' if each['ok'] else ' (old)')}"
+            for package, each in extra["packages"].items()
+        )
+        rows.append([name, extra["for"], packages])
+    report.print_table(rows, left=3)
+    print()
+    cache = found["kernel_cache"]
+    print(
+        f"kernel cache: {cache['folder']}, {cache['modules']} modules, {cache['bytes'] / 1e6:.0f} MB"
+        f"{'' if cache['writable'] else ', not writable'} (WARP_CACHE_PATH moves it)"
+    )
+    print(f"scenes: {', '.join(found['scenes']['names'])} ({found['scenes']['folder']})")
+    if found["install"]:
+        print(f"what is missing: pip install {' '.join(_quoted(needs) for needs in found['install'])}")
+    print("usable" if found["usable"] else "not usable as it is")
+
+
+def _quoted(needs) -> str:
+    return f"'{needs}'" if ">" in needs else needs

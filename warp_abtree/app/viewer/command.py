@@ -1,0 +1,121 @@
+"""`warp-abtree view`: a page in the browser about a scene, a recorded run or meshes."""
+
+import contextlib
+import gc
+import io
+import json
+import logging
+import socket
+from pathlib import Path
+
+from warp_abtree.app.cli.report import check_output
+from warp_abtree.app.viewer.playback import add_source_arguments, open_source
+
+PORT = 8080
+SUMMARY = "look at a scene, a recorded run or meshes in the browser"
+EXAMPLES = (
+    "scenes/bunny_tori.toml",
+    "warp:bunny warp:bunny --pose 0.3 0 0 0 0 0 1",
+    "scenes/focus.toml --objects 500 --budget 20ms",
+    "rain.npz",
+    "scenes/bunny_tori.toml --record bunny_tori.html",
+)
+
+
+def add_arguments(sub, positive, milliseconds):
+    """Add the arguments of the command to its parser.
+
+    Args:
+        positive, milliseconds: Types of the command line's numbers.
+    """
+    add_source_arguments(sub, positive)
+    sub.add_argument("--budget", type=milliseconds, metavar="TIME", help="time of a frame to hold, as 8ms or 0.008s")
+    sub.add_argument("--host", default="127.0.0.1", help="address to serve at (127.0.0.1, this machine alone)")
+    sub.add_argument("--port", type=int, metavar="P", help=f"port to serve at ({PORT}, or the next one that is free)")
+    sub.add_argument("--record", type=Path, metavar="HTML", help="write a page that needs no server, and end")
+    sub.add_argument("--frames", type=positive, metavar="N", help="frames of --record (the scene's own number)")
+
+
+def import_viser():
+    """Return viser, silent.
+
+    Raises:
+        ValueError: It is not installed.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise ValueError(f"view needs viser: pip install warp-abtree[view] ({error})") from None
+    # A browser that goes away in the middle of a message is no news.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    return viser
+
+
+def check_port(host, port):
+    """Refuse an address that cannot be served at.
+
+    Raises:
+        ValueError: No such address, no such port, or another program has it.
+    """
+    if not 0 <= port <= 65535:
+        raise ValueError(f"--port: {port} is outside 0 .. 65535")
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        with socket.socket(found[0], found[1]) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(found[4])
+    except OSError as error:
+        raise ValueError(f"{host}:{port}: cannot be served at ({error.strerror or error})") from None
+
+
+@contextlib.contextmanager
+def serve(host="127.0.0.1", port=0):
+    """Give a viser server, stopped with its threads at the end."""
+    viser = import_viser()
+    # The server prints where it is and that it stops; the command says that itself.
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host=host, port=port, verbose=False)
+    try:
+        yield server
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+def view(options, progress):
+    """Serve a page until Ctrl-C, or write one."""
+    from warp_abtree.app.viewer.page import Page
+    from warp_abtree.app.viewer.web_record import record_page
+
+    import_viser()
+    if options.record:
+        check_output(options.record, [".html"], inputs=options.source)
+    elif options.frames:
+        raise ValueError("--frames: of --record; the page plays on")
+    if options.port is not None or options.host != "127.0.0.1":
+        check_port(options.host, 0 if options.port is None else options.port)
+    named = {"objects": options.objects, "poses": options.pose, "lod": options.lod}
+    source = open_source(options.source, options.device, progress, **named)
+    if options.budget is not None:
+        if source.length is not None:
+            raise ValueError("--budget: a recording holds its LODs")
+        source.choose("scene" if source.control.controller in ("predictive", "paper") else "predictive", options.budget)
+    progress.close()
+    gc.collect()
+    gc.freeze()
+    with serve(options.host, PORT if options.port is None else options.port) as server:
+        if options.record:
+            frames = source.frames if options.frames is None else options.frames
+            record_page(server, source, options.record, frames, progress=progress)
+            progress.close()
+            print(json.dumps({"page": str(options.record)}) if options.json else f"wrote {options.record}")
+            return
+        if options.port and server.get_port() != options.port:
+            raise ValueError(f"{options.host}:{options.port}: cannot be served at")
+        page = Page(server, source)
+        shown = "localhost" if options.host in ("127.0.0.1", "0.0.0.0") else options.host
+        address = f"http://{shown}:{server.get_port()}"
+        found = {"address": address, "title": source.title, "objects": source.scene.object_count}
+        with contextlib.suppress(KeyboardInterrupt):  # from when the address is told
+            print(json.dumps(found) if options.json else f"{source.title}: {address} (Ctrl-C ends)", flush=True)
+            page.run()

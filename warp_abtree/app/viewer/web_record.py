@@ -1,0 +1,61 @@
+"""A standalone page of a run: viser's own client with the recorded scene inside, and times in a corner."""
+
+import html
+from pathlib import Path
+from typing import Any
+
+from warp_abtree.app.viewer import text as view_text
+from warp_abtree.app.viewer.page import Page
+from warp_abtree.checks.atomic_write import atomic_write
+
+# The canvas would fade in whenever the run begins again.
+PANEL = """<style>
+canvas {{ opacity: 1 !important; }}
+#about {{ position: fixed; left: 12px; bottom: 52px; z-index: 10; max-width: 300px; padding: 8px 12px;
+  border-radius: 6px; box-shadow: 0 1px 4px #0004; background: rgba(255, 255, 255, 0.9); color: #222;
+  font: 13px/1.4 sans-serif; }}
+#about summary {{ font-weight: bold; cursor: pointer; }}
+#about svg {{ display: block; width: 100%; height: auto; margin-top: 6px; }}
+</style><details id="about" open><summary>{title}</summary>{text}{plot}</details>"""
+
+
+def record_page(server, source, path: Path, frames: int, settings=None, progress=None):
+    """Run a source for some frames and write a page that plays them and needs no server.
+
+    Args:
+        server: `viser.ViserServer` that nobody uses otherwise.
+        source: `Source` at its start.
+        path: File to write; it appears whole or not at all.
+        frames: How many.
+        settings: What to change of the page's `Settings` by name.
+        progress: Called as progress(stage, done, total).
+    """
+    played = 0.0
+    page = Page(server, source, clock=lambda: played)
+    for name, value in (settings or {}).items():
+        setattr(page.settings, name, value)
+    page.playing = True
+    rows, hits = [], []
+    recorder: Any = None  # of viser
+    for done in range(1, frames + 1):
+        drawing = page.advance()
+        if not page.playing:
+            raise RuntimeError(f"frame {page.moment.number} failed")
+        if recorder is None:
+            # From here on the recorder hears every change; what stands already it takes as the start.
+            recorder = server.get_scene_serializer()
+        recorder.insert_sleep(source.time_step)
+        played += source.time_step
+        rows.append(page.moment.row)
+        hits.append(drawing.contact_count)
+        if progress is not None:
+            progress("frames", done, frames)
+    text = (
+        f"<div>{source.scene.object_count:,} objects, {frames:,} frames on {source.scene.device}; "
+        f"{min(hits):,} to {max(hits):,} intersecting face pairs</div>"
+    )
+    about = PANEL.format(title=html.escape(source.title), text=text, plot=view_text.time_picture(rows))
+    written = recorder.as_html()
+    end = written.rindex("</body>")
+    with atomic_write(path, "w", encoding="utf-8") as file:
+        file.write(written[:end] + about + written[end:])

@@ -1,0 +1,1 @@
+"""Checks of arguments, atomic writes and locks: what every package may use."""

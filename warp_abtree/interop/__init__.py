@@ -1,0 +1,1 @@
+"""Other libraries: trimesh, Newton, glTF, USD, and arrays of other frameworks."""

@@ -1,0 +1,1 @@
+"""Resumable batch jobs in shards, in this process or on Ray."""

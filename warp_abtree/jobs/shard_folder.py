@@ -1,0 +1,283 @@
+"""The folder of a job: `job.json`, which names the job by a hash, and a file for each range of poses (or worlds).
+
+A shard holds, beside its columns, the hash of its job, its range, and a digest of all three, in arrays of the .npz file
+or in the metadata of the Parquet schema. All shards that are found are read and checked, one column at a time.
+"""
+
+import hashlib
+import json
+import re
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warp_abtree.checks.arguments import first_line
+from warp_abtree.checks.atomic_write import SUFFIX, atomic_write
+
+FORMAT_NAME, FORMAT_VERSION = "warp_abtree shards", 2
+MANIFEST = "job.json"
+FILES = ("npz", "parquet")
+SHARD_NAME = re.compile(r"^shard-\d{12,}-\d{12,}\.(npz|parquet)$")
+STAMP = ("job", "range", "digest")
+
+
+class DamagedShard(ValueError):
+    """A file is not what was written for its range of the job."""
+
+
+class ShardFolder:
+    """The folder of one job.
+
+    Attributes:
+        left: Ranges still to be done, in order, as keys.
+        damaged: Ranges whose file is there and damaged; they are left, too.
+    """
+
+    def __init__(self, out, job, file):
+        if file not in FILES:
+            raise ValueError(f"file {file!r} is none of 'npz', 'parquet'")
+        if file == "parquet":
+            _import_parquet()
+        self.path, self.unit = Path(out), job.unit
+        known = json.loads(json.dumps({**job.describe(), "file": file}))
+        self.manifest = {"format": FORMAT_NAME, "version": FORMAT_VERSION, "hash": _hash_job(known), "job": known}
+        self.left = dict.fromkeys(_ranges(known))
+        self.damaged: list = []
+
+    def open(self, progress=None):
+        """Make the folder, or check what it holds of this job.
+
+        Args:
+            progress: Called as progress("check", done, total) after each shard that is found.
+
+        Raises:
+            ValueError: It holds another job, or a shard of another, or something else. Nothing is changed.
+            OSError: A shard cannot be read.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise ValueError(f"{self.path}: is a file")
+        if not self.path.parent.is_dir():
+            raise ValueError(f"{self.path}: there is no folder {self.path.parent}")
+        self.path.mkdir(exist_ok=True)
+        if not (self.path / MANIFEST).exists():
+            if any(entry.suffix != SUFFIX for entry in self.path.iterdir()):  # half a manifest is none
+                raise ValueError(f"{self.path}: is not empty and holds no {MANIFEST}")
+            with atomic_write(self.path / MANIFEST, "w", encoding="utf-8") as file:
+                json.dump(self.manifest, file, indent=1)
+            return
+        held = _read_manifest(self.path)
+        if held["hash"] != self.manifest["hash"]:
+            other = [key for key, value in self.manifest["job"].items() if held["job"].get(key) != value]
+            raise ValueError(f"{self.path}: holds another job; not the same: {', '.join(other)}")
+        shards = _find_shards(self.path, held["job"])
+        for done, (part, path) in enumerate(shards.items(), start=1):
+            try:
+                _read_shard(path, held, *part, keep=False)
+                del self.left[part]
+            except DamagedShard:
+                self.damaged.append(part)
+            if progress is not None:
+                progress("check", done, len(shards))
+
+    def write(self, start, stop, columns):
+        """Write the shard of a range.
+
+        Raises:
+            RuntimeError: The columns are not those of the range.
+            OSError: The file cannot be written.
+        """
+        job = self.manifest["job"]
+        if job["file"] == "parquet":
+            columns = dict(_flat(columns if self.unit in columns else {self.unit: np.arange(start, stop), **columns}))
+        fault = _row_fault(job, {len(values) for values in columns.values()}, start, stop)
+        if fault:
+            raise RuntimeError(f"shard {start} to {stop} was answered with {fault}")
+        digest = hashlib.sha256()
+        for name, values in columns.items():
+            _add_column(digest, name, values)
+        stamp = {"job": self.manifest["hash"], "range": f"{start} {stop}"}
+        stamp["digest"] = _close_digest(digest, stamp["job"], stamp["range"])
+        with atomic_write(self.path / _shard_name(start, stop, job["file"])) as file:
+            if job["file"] == "npz":
+                arrays: dict[str, Any] = {name: np.array(text) for name, text in stamp.items()}
+                np.savez(file, **arrays, **columns)
+            else:
+                pyarrow, parquet = _import_parquet()
+                table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})
+                parquet.write_table(table.replace_schema_metadata(stamp), file)
+
+
+def read_shards(out) -> Iterator[tuple[int, int, dict]]:
+    """Yield (start, stop, columns) of each shard of a finished job, in order; columns are arrays by name.
+
+    For "any" and "count" a row is a pose from `start`; for "faces" and "contacts" a face pair, its pose in the column
+    `pose`. Parquet has the column `pose` always, and vectors as three columns. A shard is checked before it is given.
+
+    Raises:
+        ValueError: No such folder, shards are missing, or a shard is damaged, altered or of another job; it names the
+            file.
+        OSError: A shard cannot be read.
+    """
+    path = Path(out)
+    manifest = _read_manifest(path)
+    shards, ranges = _find_shards(path, manifest["job"]), _ranges(manifest["job"])
+    missing = len(ranges) - len(shards)
+    if missing:
+        raise ValueError(f"{path}: {missing} of {len(ranges)} shards are missing; run the job again to finish it")
+    for start, stop in ranges:
+        try:
+            columns = _read_shard(shards[start, stop], manifest, start, stop)
+        except DamagedShard as error:
+            raise ValueError(f"{error}; run the job again to do this shard anew") from None
+        yield start, stop, columns
+        del columns  # only one shard is held
+
+
+# Shards.
+
+
+def _read_shard(path, manifest, start, stop, keep=True) -> dict:
+    """Check a shard and return its columns, none unless they are kept.
+
+    Raises:
+        DamagedShard: It is not what was written for this range.
+        ValueError: It is of another job.
+        OSError: It cannot be opened.
+    """
+    read = _read_npz if manifest["job"]["file"] == "npz" else _read_parquet
+    if read is _read_parquet:
+        _import_parquet()
+    stamp, columns, rows, digest = {}, {}, set(), hashlib.sha256()
+    with open(path, "rb") as file:
+        try:
+            for name, values in read(file):
+                if name in STAMP:
+                    stamp[name] = str(values)
+                    continue
+                _add_column(digest, name, values)
+                rows.add(len(values))
+                if keep:
+                    columns[name] = values
+                del values  # before the next is read
+        except MemoryError:
+            raise
+        except Exception as error:  # what a reader makes of damage is of many types
+            raise DamagedShard(f"{path}: damaged ({first_line(error)})") from None
+    if set(stamp) != set(STAMP) or stamp["digest"] != _close_digest(digest, stamp["job"], stamp["range"]):
+        raise DamagedShard(f"{path}: damaged or altered")
+    if stamp["job"] != manifest["hash"]:
+        raise ValueError(f"{path}: a shard of another job")
+    if stamp["range"] != f"{start} {stop}":
+        raise DamagedShard(f"{path}: holds the range {stamp['range']}")
+    fault = _row_fault(manifest["job"], rows, start, stop)
+    if fault:
+        raise DamagedShard(f"{path}: holds {fault}")
+    return columns
+
+
+def _read_npz(file):
+    """Yield names and arrays."""
+    with zipfile.ZipFile(file) as archive:
+        # Headers are trusted only after this: a damaged one may ask for any amount of memory.
+        damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(f"checksum of {damaged}")
+        for name in archive.namelist():
+            with archive.open(name) as member:
+                yield name.removesuffix(".npy"), np.lib.format.read_array(member, allow_pickle=False)
+
+
+def _read_parquet(file):
+    """Yield names and arrays, the metadata first."""
+    with _import_parquet()[1].ParquetFile(file) as table:
+        schema = table.schema_arrow
+        for name, text in (schema.metadata or {}).items():
+            if name.decode() in STAMP:
+                yield name.decode(), text.decode()
+        for name in schema.names:
+            yield name, table.read(columns=[name]).column(0).to_numpy()
+
+
+def _import_parquet():
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise ValueError("Parquet needs PyArrow: pip install pyarrow") from None
+    return pyarrow, pyarrow.parquet
+
+
+def _add_column(digest, name, values):
+    digest.update(f"{name} {values.dtype.str} {values.shape}\n".encode())
+    digest.update(np.ascontiguousarray(values))
+
+
+def _close_digest(digest, job, part) -> str:
+    digest.update(f"{job} {part}".encode())
+    return digest.hexdigest()
+
+
+def _row_fault(job, lengths, start, stop) -> str | None:
+    """Say what is wrong with the lengths of a shard's columns; None if nothing is."""
+    if len(lengths) != 1:
+        return "columns of different lengths" if lengths else "no columns"
+    rows, expected = min(lengths), (stop - start) * job.get("frames", 1)
+    if job.get("output") in ("any", "count") and rows != expected:  # a row a pose, or a world and frame
+        return f"{rows} rows, not {expected}"
+    return None
+
+
+def _flat(columns):
+    """Yield names and columns, those of vectors by axis: a table has no wider ones."""
+    for name, values in columns.items():
+        if values.ndim == 1:
+            yield name, values
+        else:
+            yield from ((f"{name}_{axis}", np.ascontiguousarray(part)) for axis, part in zip("xyz", values.T))
+
+
+# Names and the manifest.
+
+
+def _ranges(job) -> list[tuple[int, int]]:
+    count, shard = job["count"], job["shard"]
+    return [(start, min(start + shard, count)) for start in range(0, count, shard)]
+
+
+def _shard_name(start, stop, file) -> str:
+    return f"shard-{start:012d}-{stop:012d}.{file}"
+
+
+def _find_shards(path, job) -> dict[tuple[int, int], Path]:
+    """Return the file of each range that has one, in order.
+
+    Raises:
+        ValueError: A shard's name is not one of the job.
+    """
+    held = {entry.name for entry in path.iterdir() if SHARD_NAME.match(entry.name)}
+    names = {part: _shard_name(*part, job["file"]) for part in _ranges(job)}
+    other = sorted(held.difference(names.values()))
+    if other:
+        raise ValueError(f"{path / other[0]}: a shard of another job")
+    return {part: path / name for part, name in names.items() if name in held}
+
+
+def _hash_job(job) -> str:
+    return hashlib.sha256(json.dumps(job, sort_keys=True).encode()).hexdigest()
+
+
+def _read_manifest(path) -> dict:
+    try:
+        held = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ValueError(f"{path}: holds no {MANIFEST}") from None
+    except ValueError as error:
+        raise ValueError(f"{path / MANIFEST}: damaged ({error})") from None
+    if not isinstance(held, dict) or (held.get("format"), held.get("version")) != (FORMAT_NAME, FORMAT_VERSION):
+        raise ValueError(f"{path / MANIFEST}: not of {FORMAT_NAME}, version {FORMAT_VERSION}")
+    if held.get("hash") != _hash_job(held.get("job")):
+        raise ValueError(f"{path / MANIFEST}: damaged (the hash is not that of the job)")
+    return held

@@ -1,0 +1,460 @@
+"""Meshes: load, validate, weld, and say what was found.
+
+A face keeps the index that it has in the source, at every later step. OBJ is read here, since trimesh groups its faces
+by material and takes quads out of line; every other format is read by trimesh, whose order is kept (for polygons in PLY
+and OFF: triangles first, then quads, then the rest).
+"""
+
+import gzip
+import io
+import os
+import warnings
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+import warp as wp
+
+from warp_abtree.checks.arguments import first_line
+
+FACE_LIMIT = 2**30  # int32 forest ids count up to two nodes a vertex, and heap indices up to two a face
+EXTENT_LIMITS = (2.0**-100, 2.0**100)  # boxes are float32
+COORDINATE_MIN = 2.0**-290  # smaller ones are 0
+COORDINATE_MAX = 2.0**300  # products of three stay finite
+WARP_ASSETS = ("bunny", "bear", "rocks")
+
+
+class MeshError(ValueError):
+    """Say in one line what is wrong with a mesh, and where."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Hold a welded triangle mesh.
+
+    Attributes:
+        vertices: Positions [model units], float64, shape [v, 3]; all distinct, all referenced, in the source's order.
+        faces: Corners, int32, shape [n_f, 3]; in the source's order.
+        dropped_faces: Faces that welding left without three distinct corners, int32, ascending; they keep their index.
+        name: Name for people.
+        file_vertex_count: Vertices in the source.
+        unreferenced_count: Vertices of the source that no face refers to.
+        welded_count: Vertices that coincide with an earlier one and were merged into it.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    dropped_faces: np.ndarray
+    name: str
+    file_vertex_count: int
+    unreferenced_count: int
+    welded_count: int
+
+
+def load_mesh(source, name=None):
+    """Load a triangle mesh.
+
+    Args:
+        source: One of: a path to anything that trimesh loads, gzipped (``.obj.gz``) or not; ``"warp:bunny"``,
+            ``"warp:bear"`` or ``"warp:rocks"``, meshes inside Warp (these need the extra ``usd``); a trimesh.Trimesh;
+            a trimesh.Scene, whose meshes are joined where its transforms put them.
+        name: Name for people; by default the file's, without its extensions.
+
+    Returns:
+        A Mesh. Polygons of OBJ and USD are cut into fans from their first corner, or by clipping ears where that fan
+        would fold over; either way polygon by polygon in the source's order.
+
+    Raises:
+        MeshError: The source cannot be read, or holds no mesh that can be used.
+    """
+    if isinstance(source, trimesh.parent.Geometry):
+        return _from_geometry(source, "trimesh" if name is None else name)
+    if not isinstance(source, str | os.PathLike):
+        raise MeshError(f"cannot load a mesh from {type(source).__name__}; give a path, a trimesh.Trimesh or arrays")
+    if isinstance(source, str) and source.startswith("warp:"):
+        asset = source[len("warp:") :]
+        return _build(*_read_warp_asset(source, asset), asset if name is None else name, where=source)
+    return _load_file(Path(source), name)
+
+
+def mesh_from_arrays(vertices, faces, name="arrays"):
+    """Make a mesh from arrays.
+
+    Args:
+        vertices: Positions [model units], real numbers, shape [v, 3].
+        faces: Corners, integers (or floats with integral values), shape [n_f, 3].
+        name: Name for people.
+
+    Returns:
+        A Mesh; coordinates under 2^-290 are 0.
+
+    Raises:
+        MeshError: Wrong shape or type, no faces, coordinates not finite or beyond 2^300, an index out of range, or an
+            extent outside 2^-100 .. 2^100.
+    """
+    return _build(vertices, faces, name, where=name)
+
+
+def describe_mesh(mesh):
+    """Say what a mesh is made of, as a dictionary that JSON can hold.
+
+    Edges, components, duplicates and zero areas are counted over the faces that were not dropped. An area is zero to
+    rounding: its float64 cross product lies within that product's own error bound. Two faces with the same three
+    corners in any order are duplicates; each one after the first counts. Faces that share a vertex are of one
+    component. A mesh is closed if no edge belongs to one face only.
+
+    Args:
+        mesh: A Mesh.
+
+    Returns:
+        The dictionary; lengths in model units.
+    """
+    faces = np.delete(mesh.faces, mesh.dropped_faces, axis=0).astype(np.int64)
+    vertex_count = len(mesh.vertices)
+    corners = np.sort(faces, axis=1)
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [0, 2]], corners[:, [1, 2]]])
+    _, edge_faces = np.unique(edges[:, 0] * vertex_count + edges[:, 1], return_counts=True)
+    lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    open_edges = int(np.count_nonzero(edge_faces == 1))
+    return {
+        "name": mesh.name,
+        "faces": len(mesh.faces),
+        "vertices": vertex_count,
+        "file_vertices": mesh.file_vertex_count,
+        "unreferenced_vertices": mesh.unreferenced_count,
+        "welded_vertices": mesh.welded_count,
+        "dropped_faces": len(mesh.dropped_faces),
+        "zero_area_faces": int(np.count_nonzero(_zero_area(mesh.vertices, faces))),
+        "duplicate_faces": len(corners) - _distinct_rows(corners),
+        "open_edges": open_edges,
+        "nonmanifold_edges": int(np.count_nonzero(edge_faces > 2)),
+        "components": len(np.unique(component_labels(faces, vertex_count)[np.unique(faces)])),
+        "closed": open_edges == 0,
+        "extents": (upper - lower).tolist(),
+        "bounds": [lower.tolist(), upper.tolist()],
+        "diagonal": float(np.linalg.norm(upper - lower)),
+    }
+
+
+# Validation and welding.
+
+
+def _build(vertices, faces, name, where):
+    vertices = _checked_vertices(vertices, where)
+    faces = _checked_faces(faces, len(vertices), where)
+    file_vertex_count = len(vertices)
+
+    referenced = np.zeros(file_vertex_count, dtype=bool)
+    referenced[faces] = True
+    used = np.flatnonzero(referenced)
+    # Makes -0.0 the same as 0.0, and products of three coordinates free of underflow, so that exact signs are exact.
+    positions = np.where(np.abs(vertices[used]) < COORDINATE_MIN, 0.0, vertices[used])
+    first, distinct = _weld(positions)
+    new_index = np.full(file_vertex_count, -1, dtype=np.int32)
+    new_index[used] = distinct
+    positions, faces = positions[first], new_index[faces]
+    if len(positions) > FACE_LIMIT:
+        raise MeshError(f"{where}: {len(positions)} vertices, but at most 2^30 are possible")
+
+    a, b, c = faces.T
+    dropped = np.flatnonzero((a == b) | (b == c) | (c == a)).astype(np.int32)
+    if len(dropped) == len(faces):
+        raise MeshError(f"{where}: no face has three distinct corners (coincident vertices are one)")
+    with np.errstate(over="ignore"):
+        extent = float((positions.max(axis=0) - positions.min(axis=0)).max())
+    if not EXTENT_LIMITS[0] <= extent <= EXTENT_LIMITS[1]:
+        raise MeshError(f"{where}: extent {extent:g} lies outside 2^-100 .. 2^100; scale the mesh")
+    if np.abs(positions).max() > COORDINATE_MAX:
+        index = int(used[first[np.argmax(np.abs(positions).max(axis=1))]])
+        raise MeshError(f"{where}: vertex {index} has a coordinate beyond 2^300; move the mesh towards the origin")
+    return Mesh(
+        vertices=positions,
+        faces=faces,
+        dropped_faces=dropped,
+        name=str(name),
+        file_vertex_count=file_vertex_count,
+        unreferenced_count=file_vertex_count - len(used),
+        welded_count=len(used) - len(positions),
+    )
+
+
+def _as_array(values, what, kinds, where):
+    try:
+        array = np.asarray(values)
+    except (ValueError, TypeError) as error:
+        raise MeshError(f"{where}: {what} do not form an array: {first_line(error)}") from None
+    if array.size == 0:
+        raise MeshError(f"{where}: no {what}")
+    if array.dtype.kind not in kinds:
+        raise MeshError(f"{where}: {what} have type {array.dtype}, not a number that can be used")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise MeshError(f"{where}: {what} have shape {array.shape}, not (n, 3)")
+    return array
+
+
+def _checked_vertices(vertices, where):
+    with np.errstate(over="ignore"):
+        vertices = _as_array(vertices, "vertices", "iuf", where).astype(np.float64)
+    finite = np.isfinite(vertices).all(axis=1)
+    if not finite.all():
+        index = int(np.argmin(finite))
+        raise MeshError(f"{where}: vertex {index} is not finite: {vertices[index].tolist()}")
+    return vertices
+
+
+def _checked_faces(faces, vertex_count, where):
+    faces = _as_array(faces, "faces", "iuf", where)
+    if len(faces) > FACE_LIMIT:
+        raise MeshError(f"{where}: {len(faces)} faces, but at most 2^30 are possible")
+    if faces.dtype.kind == "f":
+        with np.errstate(invalid="ignore"):
+            integral = (np.floor(faces) == faces).all(axis=1)
+        if not integral.all():
+            index = int(np.argmin(integral))
+            raise MeshError(f"{where}: face {index} has corners that are not integers: {faces[index].tolist()}")
+    inside = ((faces >= 0) & (faces < vertex_count)).all(axis=1)
+    if not inside.all():
+        index = int(np.argmin(inside))
+        raise MeshError(
+            f"{where}: face {index} has corners {[int(x) for x in faces[index] if np.isfinite(x)]}, "
+            f"but vertices run from 0 to {vertex_count - 1}"
+        )
+    return faces.astype(np.int64)
+
+
+def _weld(positions):
+    """Return the first vertex of each distinct position, ascending, and each vertex's index into that list."""
+    order = np.lexsort(positions.T)  # stable: coincident vertices stay in ascending order
+    ordered = positions[order]
+    starts = np.ones(len(order), dtype=bool)
+    starts[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    representative = np.empty(len(order), dtype=np.int64)
+    representative[order] = order[starts][np.cumsum(starts) - 1]
+    is_first = representative == np.arange(len(order))
+    return np.flatnonzero(is_first), (np.cumsum(is_first) - 1)[representative]
+
+
+# What describe_mesh counts.
+
+
+def _zero_area(vertices, faces):
+    corner = vertices[faces[:, 0]]
+    x1, y1, z1 = (vertices[faces[:, 1]] - corner).T
+    x2, y2, z2 = (vertices[faces[:, 2]] - corner).T
+    zero = np.ones(len(faces), dtype=bool)
+    for p, q in ((y1 * z2, z1 * y2), (z1 * x2, x1 * z2), (x1 * y2, y1 * x2)):
+        zero &= np.abs(p - q) <= 2.0**-50 * (np.abs(p) + np.abs(q))
+    return zero
+
+
+def _distinct_rows(rows):
+    ordered = rows[np.lexsort(rows.T)]
+    return 1 + int(np.count_nonzero((ordered[1:] != ordered[:-1]).any(axis=1)))
+
+
+def component_labels(faces, vertex_count):
+    """Return the lowest vertex that each vertex is joined to through faces, int (v,)."""
+    label = np.arange(vertex_count)
+    pending = faces
+    while len(pending):
+        corner_label = label[pending]
+        lowest = corner_label.min(axis=1)
+        for column in corner_label.T:
+            np.minimum.at(label, column, lowest)
+        # Invariant: label[v] <= v, so jumping ends, at roots.
+        while True:
+            jumped = label[label]
+            if np.array_equal(jumped, label):
+                break
+            label = jumped
+        corner_label = label[pending]
+        pending = pending[(corner_label != corner_label[:, :1]).any(axis=1)]
+    return label
+
+
+# Reading.
+
+
+def _load_file(path, name):
+    if path.is_dir():
+        raise MeshError(f"{path}: is a folder, not a mesh file")
+    if not path.is_file():
+        raise MeshError(f"{path}: no such file")
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    zipped = suffixes[-1:] == [".gz"] and suffixes[-2:] != [".tar", ".gz"]
+    kind = "".join(suffixes[-2:-1] if zipped else suffixes[-2:] if suffixes[-2:] == [".tar", ".gz"] else suffixes[-1:])
+    kind = kind.removeprefix(".")
+    if name is None:
+        stem = path.name.removesuffix(path.suffixes[-1]) if zipped else path.name
+        name = stem[: len(stem) - len(kind) - 1] if kind else stem
+    try:
+        data = path.read_bytes()
+        if zipped:
+            data = gzip.decompress(data)
+    except (OSError, EOFError, zlib.error) as error:
+        raise MeshError(f"{path}: cannot be read: {first_line(error)}") from None
+    if kind == "npz":
+        raise MeshError(f"{path}: not a mesh file; a built model is read by Model.open")
+    if kind == "obj":
+        return _build(*_parse_obj(data, str(path)), name, where=str(path))
+    known = trimesh.available_formats()
+    if kind not in known:
+        raise MeshError(f"{path}: unknown extension '{kind}'; known here: {' '.join(sorted(known))}")
+    try:
+        with warnings.catch_warnings():
+            # Older NumPy only warns where a number in a text file cannot be read, and cuts the file short there.
+            warnings.filterwarnings("error", message="string or file could not be read")
+            resolver = trimesh.resolvers.FilePathResolver(str(path))
+            scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
+    except Exception as error:  # trimesh's readers raise whatever goes wrong inside them
+        raise MeshError(f"{path}: cannot be read as {kind}: {first_line(error)}") from None
+    return _from_geometry(scene, name, where=str(path))
+
+
+def _from_geometry(geometry, name, where=None):
+    """Join the triangles of a trimesh object; points and paths beside them are left out."""
+    where = name if where is None else where
+    if isinstance(geometry, trimesh.Scene):
+        placed = [
+            (geometry.geometry[part], pose) for pose, part in map(geometry.graph.get, geometry.graph.nodes_geometry)
+        ]
+    else:
+        placed = [(geometry, np.eye(4))]
+    if not placed:
+        raise MeshError(f"{where}: no faces")
+    vertices, faces, vertex_count = [], [], 0
+    for mesh, pose in placed:
+        if not isinstance(mesh, trimesh.Trimesh):
+            continue
+        part_vertices, part_faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+        if part_faces.size == 0:
+            continue
+        # Before the parts are joined, when an index too large would point into the next one.
+        part_faces = _checked_faces(part_faces, len(part_vertices), where)
+        pose = np.asarray(pose, dtype=np.float64)
+        if not np.array_equal(pose, np.eye(4)):
+            with np.errstate(invalid="ignore", over="ignore"):
+                part_vertices = part_vertices @ pose[:3, :3].T + pose[:3, 3]
+            if np.linalg.det(pose[:3, :3]) < 0.0:
+                part_faces = part_faces[:, ::-1]  # a mirrored surface keeps its outside
+        vertices.append(part_vertices)
+        faces.append(part_faces + vertex_count)
+        vertex_count += len(part_vertices)
+    if not faces:
+        kinds = sorted({type(part).__name__ for part, _ in placed})
+        raise MeshError(f"{where}: no faces (it holds {', '.join(kinds)})")
+    return _build(np.concatenate(vertices), np.concatenate(faces), name, where)
+
+
+def _parse_obj(data, where) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and triangles of an OBJ file; only `v` and `f` lines matter here."""
+    vertices, corners, counts = [], [], []
+    for number, line in enumerate(data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines(), start=1):
+        fields = line.split()
+        kind = fields[0] if fields else b""
+        if kind != b"v" and kind != b"f":
+            continue
+        if b"#" in line:
+            fields = line.split(b"#", 1)[0].split()
+        try:
+            if kind == b"v":
+                x, y, z = fields[1:4]
+                vertices.append((float(x), float(y), float(z)))
+                continue
+            if b"/" in line:
+                fields = [field.split(b"/", 1)[0] for field in fields]
+            polygon = [int(field) for field in fields[1:]]
+            if len(polygon) < 3:
+                raise ValueError
+        except ValueError:
+            text = line.decode(errors="replace").strip()
+            raise MeshError(f"{where}: line {number} cannot be read: {text[:60]}") from None
+        if min(polygon) <= 0:
+            # A negative index counts back from the last vertex so far.
+            polygon = [index if index > 0 else len(vertices) + index + 1 if index else 0 for index in polygon]
+            if min(polygon) <= 0:
+                raise MeshError(f"{where}: line {number} refers to a vertex before the first")
+        corners.extend(polygon)
+        counts.append(len(polygon))
+    if not counts:
+        raise MeshError(f"{where}: no faces")
+    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+    try:
+        indices = np.array(corners, dtype=np.int64) - 1
+    except OverflowError:
+        raise MeshError(f"{where}: a face refers to vertex {max(corners)}, but there are {len(points)}") from None
+    return points, triangulate(points, np.array(counts), indices, where)
+
+
+def _read_warp_asset(source, asset) -> tuple[np.ndarray, np.ndarray]:
+    if asset not in WARP_ASSETS:
+        raise MeshError(f"{source}: unknown; Warp's meshes are {', '.join('warp:' + each for each in WARP_ASSETS)}")
+    try:
+        from pxr import Usd, UsdGeom
+    except ImportError:
+        raise MeshError(f"{source}: reading it needs usd-core: pip install warp-abtree[usd]") from None
+    path = Path(wp.__file__).parent / "examples" / "assets" / f"{asset}.usd"
+    if not path.is_file():
+        raise MeshError(f"{source}: {path} is missing from this installation of Warp")
+    stage = Usd.Stage.Open(str(path))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/root/{asset}"))  # its transform is the identity in all three files
+    vertices = np.array(mesh.GetPointsAttr().Get(), dtype=np.float64)
+    counts = np.array(mesh.GetFaceVertexCountsAttr().Get())
+    return vertices, triangulate(vertices, counts, np.array(mesh.GetFaceVertexIndicesAttr().Get()), source)
+
+
+# Polygons.
+
+
+def triangulate(vertices, counts, corners, where):
+    """Cut polygons into triangles, in place: polygon p gives counts[p] - 2 of them."""
+    if (counts == 3).all():
+        return corners.reshape(-1, 3)
+    if corners.min() < 0 or corners.max() >= len(vertices):
+        raise MeshError(f"{where}: a face refers to vertex {corners.max()}, but there are {len(vertices)}")
+    polygon_start = np.cumsum(counts) - counts
+    triangle_start = np.cumsum(counts - 2) - (counts - 2)
+    polygon = np.repeat(np.arange(len(counts)), counts - 2)
+    apex = polygon_start[polygon]
+    second = apex + 1 + np.arange(len(polygon)) - triangle_start[polygon]
+    triangles = np.stack([corners[apex], corners[second], corners[second + 1]], axis=1)
+
+    # Three in five polygons of warp:rocks are not convex. A fan's cross products sum to the polygon's area vector.
+    with np.errstate(invalid="ignore", over="ignore"):
+        a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
+        cross = np.cross(b - a, c - a)
+        area = np.add.reduceat(cross, triangle_start)
+        fold = np.einsum("ij,ij->i", cross, area[polygon]) < -1e-9 * np.einsum("ij,ij->i", area, area)[polygon]
+    for p in np.unique(polygon[fold]):
+        ring = corners[polygon_start[p] : polygon_start[p] + counts[p]]
+        drop = np.argmax(np.abs(area[p]))
+        flat = np.delete(vertices[ring], drop, axis=1) * (1.0, (1.0, -1.0, 1.0)[drop] * np.sign(area[p][drop]))
+        triangles[triangle_start[p] :][: counts[p] - 2] = ring[_clip_ears(flat)]
+    return triangles
+
+
+def _clip_ears(points):
+    """Cut a counterclockwise polygon of the plane into triangles that do not fold; return their corners."""
+
+    def turn(i, j, k):
+        (ax, ay), (bx, by), (cx, cy) = points[i], points[j], points[k]
+        return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+
+    points = [tuple(point) for point in points.tolist()]
+    ring, triangles = list(range(len(points))), []
+    while len(ring) > 3:
+        candidates = list(zip(ring[-1:] + ring[:-1], ring, ring[1:] + ring[:1]))
+        for i, j, k in candidates:
+            others = [x for x in ring if points[x] not in (points[i], points[j], points[k])]
+            if turn(i, j, k) > 0.0 and not any(
+                turn(i, j, x) >= 0.0 and turn(j, k, x) >= 0.0 and turn(k, i, x) >= 0.0 for x in others
+            ):
+                break
+        else:
+            # No ear: the polygon crosses itself, or is flat to rounding. Any cut will do.
+            i, j, k = max(candidates, key=lambda corner: turn(*corner))
+        triangles.append((i, j, k))
+        ring.remove(j)
+    return [*triangles, tuple(ring)]

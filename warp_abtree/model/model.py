@@ -1,0 +1,259 @@
+"""Model: a mesh with its progressive mesh and its AB-Tree, saved and opened as .npz."""
+
+import hashlib
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from warp_abtree.checks.arguments import whole_number
+from warp_abtree.checks.atomic_write import atomic_write
+from warp_abtree.model.mesh import COORDINATE_MAX, COORDINATE_MIN, EXTENT_LIMITS, Mesh, load_mesh, mesh_from_arrays
+from warp_abtree.model.outward_error import OutwardError
+from warp_abtree.model.progressive import ProgressiveMesh, build_progressive
+from warp_abtree.model.tree import Tree, active_build
+
+FORMAT_NAME = "warp_abtree model"
+FORMAT_VERSION = 2
+
+_ARRAYS = {
+    "vertex_parent": (np.int32, 1),
+    "vertex_pos": (np.float64, 2),
+    "face_vertex": (np.int32, 2),
+    "face_split": (np.int32, 1),
+    "split_start": (None, 1),
+    "split_face": (np.int32, 1),
+    "lod_error": (np.float64, 1),
+}
+_MEMBERS = (*_ARRAYS, "leaf_node", "name")
+
+
+class ModelError(ValueError):
+    """A model file that is not one, or not whole."""
+
+
+class Model:
+    """A mesh at every level of detail, and the tree over it.
+
+    LOD counts vertex splits from the base mesh: 0 is the base, `lod_max` the original. Face ids are the face's index
+    in the file at every LOD.
+
+    Attributes:
+        name: Where the mesh came from.
+        progressive: `ProgressiveMesh`.
+        tree: `Tree`.
+        dropped_faces: Faces that welding left without three distinct corners, int32; never active.
+        centre: Middle of the box of the original vertices [model units], float64 (3,); boxes are kept about it.
+    """
+
+    def __init__(self, progressive: ProgressiveMesh, tree: Tree, name: str):
+        self.progressive = progressive
+        self.tree = tree
+        self.name = name
+        self.dropped_faces = np.flatnonzero(progressive.face_split > progressive.lod_max).astype(np.int32)
+        original = progressive.vertex_pos[: progressive.vertex_count]
+        self.centre = 0.5 * original.min(0) + 0.5 * original.max(0)
+        self._outward = OutwardError(progressive, tree)
+
+    def __repr__(self):
+        return f"Model({self.name!r}, {self.face_count:,} faces, LODs 0 .. {self.lod_max:,})"
+
+    @classmethod
+    def load(cls, source, base_faces: int = 10, progress=None) -> "Model":
+        """Load a mesh and build its progressive mesh and AB-Tree.
+
+        Args:
+            source: Path of anything trimesh reads (also gzipped), trimesh.Trimesh or Scene, "warp:bunny", "warp:bear",
+                "warp:rocks", or a `Mesh`. What `save` wrote is read by `open`.
+            base_faces: Faces at which the collapse sequence stops.
+            progress: Called as progress(stage, done, total) during long builds.
+
+        Raises:
+            MeshError: The mesh is missing, unreadable, empty or invalid.
+            ValueError: base_faces is below 1.
+        """
+        mesh = source if isinstance(source, Mesh) else load_mesh(source)
+        progressive = build_progressive(mesh, base_faces=base_faces, progress=progress)
+        return cls(progressive, active_build(mesh.vertices, mesh.faces), mesh.name)
+
+    @classmethod
+    def from_arrays(cls, vertices, faces, base_faces: int = 10, progress=None, name: str = "arrays") -> "Model":
+        """Build a model from vertices (v, 3) and faces (n, 3); see `load`."""
+        return cls.load(mesh_from_arrays(vertices, faces, name=name), base_faces, progress)
+
+    @property
+    def face_count(self) -> int:
+        """Faces of the original mesh, dropped ones included."""
+        return self.progressive.face_count
+
+    @property
+    def vertex_count(self) -> int:
+        """Vertices of the original mesh after welding."""
+        return self.progressive.vertex_count
+
+    @property
+    def lod_max(self) -> int:
+        """The finest LOD, the original mesh."""
+        return self.progressive.lod_max
+
+    def check_lod(self, lod) -> int:
+        """Return a LOD as int.
+
+        Raises:
+            ValueError: It is no whole number from 0 to lod_max.
+        """
+        return whole_number(lod, f"model {self.name!r}: LOD", 0, self.lod_max)
+
+    def mesh_at(self, lod):
+        """Return the mesh at a LOD: vertices float64 (v, 3), faces int32 (f, 3), face_ids int32 (f,)."""
+        return self.progressive.mesh_at(self.check_lod(lod))
+
+    def error_at(self, lod, side: str = "inward") -> float:
+        """Return a certified one-sided bound [model units] on the distance between the original and a LOD.
+
+        Both are bounds on the largest distance and hold in spite of rounding; the greater of them bounds the Hausdorff
+        distance. Neither bounds the other: where a LOD closes a gap, "inward" may be 0 and "outward" large.
+
+        Args:
+            side: "inward": how far a point of the original surface can lie from the surface at the LOD. Found when the
+                model is built; falls with the LOD. "outward": how far a point of the surface at the LOD can lie from
+                the original surface; as a rule within 1 % of the largest distance. Found when asked for, on one core of
+                the CPU, and kept: 2 to 4 us for each face of the original, more for soups of long faces. Need not fall
+                with the LOD.
+
+        Raises:
+            ValueError: lod is no whole number from 0 to lod_max, or side is another word.
+        """
+        lod = self.check_lod(lod)
+        if side == "inward":
+            return float(self.progressive.lod_error[lod])
+        if side == "outward":
+            return self._outward.at(lod)
+        raise ValueError(f"model {self.name!r}: side {side!r} is neither 'inward' nor 'outward'")
+
+    def lod_for(self, fraction: float | None = None, tolerance: float | None = None) -> int:
+        """Return the LOD nearest to a share of the faces, or the coarsest whose inward error is within a tolerance.
+
+        Args:
+            fraction: Share of face_count, in (0, 1].
+            tolerance: Largest `error_at(lod)` [model units], at least 0: of the original from the LOD, not outward.
+
+        Raises:
+            ValueError: Not exactly one of the two is given, or it is out of range.
+        """
+        return self.progressive.lod_for(fraction=fraction, tolerance=tolerance)
+
+    def save(self, path):
+        """Write the model to an .npz file; the file appears whole or not at all.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        arrays = {name: getattr(self.progressive, name) for name in _ARRAYS}
+        arrays |= {"leaf_node": self.tree.leaf_node, "name": np.array(self.name)}
+        about = {"format": np.array(FORMAT_NAME), "version": np.array(FORMAT_VERSION), "digest": _digest(arrays)}
+        with atomic_write(path) as file:
+            np.savez_compressed(file, **about, **arrays)
+
+    @classmethod
+    def open(cls, path) -> "Model":
+        """Read a model that `save` wrote, and check it whole.
+
+        Raises:
+            ModelError: The file is missing, no such file, truncated, altered, or of another version.
+        """
+        path = Path(path)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                _check_format(path, file)
+                digest = file["digest"]
+                arrays = {name: file[name] for name in _MEMBERS}
+        except ModelError:
+            raise
+        except FileNotFoundError:
+            raise ModelError(f"{path}: no such file") from None
+        except (OSError, ValueError, EOFError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+            raise ModelError(f"{path}: cannot be read as a model file ({error})") from None
+        except Exception as error:  # zlib.error and struct.error of a damaged archive
+            raise ModelError(f"{path}: damaged ({type(error).__name__}: {error})") from None
+        model = _assemble(path, dict(arrays))
+        # What fits together may still be wrong: a bound, a position.
+        if not isinstance(digest, np.ndarray) or not np.array_equal(digest, _digest(arrays)):
+            raise ModelError(f"{path}: altered since it was saved")
+        return model
+
+
+def _digest(arrays):
+    """Return a hash of all members, uint8 (32,)."""
+    found = hashlib.blake2b(digest_size=32)
+    for name in _MEMBERS:
+        value = np.ascontiguousarray(arrays[name])
+        found.update(f"{name} {value.dtype.str} {value.shape}".encode())
+        found.update(value.tobytes())
+    return np.frombuffer(found.digest(), np.uint8)
+
+
+def _check_format(path, file):
+    """Check that an opened file calls itself a model of the version that this library reads."""
+    if not isinstance(file, np.lib.npyio.NpzFile) or not {"format", "version"} <= set(file.files):
+        raise ModelError(f"{path}: not a warp_abtree model file")
+    form, version = file["format"], file["version"]
+    if not isinstance(form, np.ndarray) or form.shape != () or str(form) != FORMAT_NAME:
+        raise ModelError(f"{path}: not a warp_abtree model file")
+    if not isinstance(version, np.ndarray) or version.shape != () or version.tolist() != FORMAT_VERSION:
+        raise ModelError(f"{path}: format version {version}, this library reads {FORMAT_VERSION}; build it again")
+    missing = [name for name in (*_MEMBERS, "digest") if name not in file.files]
+    if missing:
+        raise ModelError(f"{path}: lacks the array {missing[0]!r}")
+
+
+def _assemble(path, arrays) -> Model:
+    """Check every array of a model file against the others and build the model."""
+
+    def require(truth, what):
+        if not truth:
+            raise ModelError(f"{path}: {what}")
+
+    require(all(isinstance(value, np.ndarray) for value in arrays.values()), "a member is no array")
+    leaf_node, name = arrays.pop("leaf_node"), str(arrays.pop("name"))
+    for key, (dtype, ndim) in _ARRAYS.items():
+        value = arrays[key]
+        integral = value.dtype.kind == "i" if dtype is None else value.dtype == dtype
+        require(integral and value.ndim == ndim, f"array {key!r} has type {value.dtype} and shape {value.shape}")
+    parent, pos = arrays["vertex_parent"], arrays["vertex_pos"]
+    faces, split = arrays["face_vertex"], arrays["face_split"]
+    start, error = arrays["split_start"], arrays["lod_error"]
+    m = len(error) - 1
+    n_v = len(parent) - m
+    n_f = len(faces)
+    require(m >= 0 and n_v > 0 and n_f > 0, "empty arrays")
+    require(pos.shape == (n_v + m, 3) and np.isfinite(pos).all(), "'vertex_pos' has the wrong length or is not finite")
+    size = np.abs(pos)
+    fits = ((size >= COORDINATE_MIN) | (size == 0)) & (size <= COORDINATE_MAX)
+    require(fits.all(), "'vertex_pos' has coordinates outside 2^-290 .. 2^300")
+    require(faces.shape == (n_f, 3) and faces.min() >= 0 and faces.max() < n_v, "'face_vertex' is out of range")
+    nodes = np.arange(n_v + m)
+    above = (parent > nodes) & (parent >= n_v) & (parent < n_v + m)
+    require(((parent == -1) | above).all(), "'vertex_parent' is no forest")
+    require(split.shape == (n_f,) and split.min() >= 0 and split.max() <= m + 1, "'face_split' is out of range")
+    slices = arrays["split_face"]
+    require(
+        len(start) == m + 1 and start[0] == 0 and (np.diff(start) >= 0).all() and start[-1] == len(slices),
+        "'split_start' does not fit 'split_face'",
+    )
+    require(len(slices) == 0 or (slices.min() >= 0 and slices.max() < n_f), "'split_face' is out of range")
+    extent = np.ptp(pos[:n_v], axis=0).max()
+    require(EXTENT_LIMITS[0] <= extent <= EXTENT_LIMITS[1], f"extent {extent:g} lies outside 2^-100 .. 2^100")
+    require(np.ptp(pos, axis=0).max() <= 2.0**120, "'vertex_pos' has merged vertices beyond float32")
+    require((np.bincount(parent[parent >= 0] - n_v, minlength=m) == 2).all(), "'vertex_parent' has a merge not of two")
+    require(
+        np.isfinite(error).all() and error[-1] == 0 and (np.diff(error) <= 0).all(),
+        "'lod_error' is not finite, falling and 0 at the end",
+    )
+    require((split <= m).any(), "no face is ever active")
+    require(leaf_node.dtype == np.int32 and leaf_node.shape == (n_f,), "'leaf_node' has the wrong type or length")
+    try:
+        tree = Tree.from_leaves(leaf_node)
+    except ValueError as mistake:
+        raise ModelError(f"{path}: {mistake}") from None
+    return Model(ProgressiveMesh(**arrays), tree, name)

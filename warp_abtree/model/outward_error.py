@@ -1,0 +1,97 @@
+"""The other side of a LOD's error: a certified bound on how far its surface lies from the original, when asked for.
+
+Rounding. A cut moves a corner of a piece by at most sqrt(3) 2^-52 in a frame where coordinates are within 1/2; then the
+parts cover the piece but for that, so after 192 cuts in one another the pieces cover the face but for 192 times that.
+Distances of corners are measured to points of original faces, both rounded. `progressive.ROUNDING` covers all of it.
+"""
+
+from functools import cached_property
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels.progressive import outward_bound as outward
+from warp_abtree.kernels.progressive import polygon as piece
+from warp_abtree.model.progressive import ROUNDING, find_frame
+
+
+class OutwardError:
+    """Bounds on the distance of any point of the surface at a LOD from the original surface, found when asked for.
+
+    Keeps what it found and, since the first call, about 120 bytes for each face of the original. Neither is pickled.
+    """
+
+    def __init__(self, progressive, tree):
+        self.progressive, self.tree = progressive, tree
+        self._found: dict[int, float] = {}
+
+    def __getstate__(self):
+        return {"progressive": self.progressive, "tree": self.tree, "_found": {}}
+
+    def at(self, lod: int) -> float:
+        """Return the bound [model units] at a LOD; 0 where every active face lies where it does in the original."""
+        if lod not in self._found:
+            self._found[lod] = self._bound(lod)
+        return self._found[lod]
+
+    def _bound(self, lod):
+        progressive = self.progressive
+        vertices, faces, face_ids = progressive.mesh_at(lod)
+        moved = (vertices[faces] != progressive.vertex_pos[progressive.face_vertex[face_ids]]).any((1, 2))
+        if not moved.any():
+            return 0.0
+        faces, face_ids = faces[moved], face_ids[moved]
+        centre, scale, original = self._index
+        vertices = (vertices - centre) / scale
+        corner = vertices[faces]
+        # Corners and middles first: a face whose bound is below the greatest of their distances is not cut.
+        used, first = np.unique(faces, return_index=True)
+        point = np.concatenate([vertices[used], corner.mean(1)])
+        guess = np.concatenate([face_ids[first // 3], face_ids])
+        distance_sq = wp.zeros(len(point), dtype=wp.float64, device="cpu")
+        inputs = [_cpu(point, wp.vec3d), _cpu(guess, int), original, distance_sq]
+        wp.launch(outward.measure_points_kernel, dim=len(point), inputs=inputs, device="cpu")
+        bound_sq = wp.zeros(len(corner), dtype=wp.float64, device="cpu")
+        inputs = [float(distance_sq.numpy().max()), _cpu(corner, wp.vec3d), _cpu(face_ids, int), original]
+        wp.launch(outward.bound_faces_kernel, dim=1, inputs=[*inputs, *_scratch(), bound_sq], device="cpu")
+        # ROUNDING is of coordinates up to 1/2; merged vertices may lie outside the box of the original ones.
+        reach = max(1.0, 2 * float(np.abs(point).max()))
+        return float(scale * (np.sqrt(bound_sq.numpy().max()) + ROUNDING * reach))
+
+    @cached_property
+    def _index(self):
+        """Return the frame, and in it the original faces with boxes over the tree, from the leaves up."""
+        progressive, tree = self.progressive, self.tree
+        centre, scale = find_frame(progressive.vertex_pos[: progressive.vertex_count])
+        corner = (progressive.vertex_pos[progressive.face_vertex] - centre) / scale
+        lower = np.full((tree.node_count, 3), np.inf, np.float32)
+        upper = np.full((tree.node_count, 3), -np.inf, np.float32)
+        there = progressive.face_split <= progressive.lod_max
+        leaf = tree.leaf_node[there]
+        # the next float32, whichever way the conversion rounded
+        lower[leaf] = np.nextafter(corner[there].min(1).astype(np.float32), np.float32(-np.inf))
+        upper[leaf] = np.nextafter(corner[there].max(1).astype(np.float32), np.float32(np.inf))
+        for level in range(tree.depth - 1, -1, -1):
+            node = np.arange(1 << level, 2 << level)
+            node = node[tree.node_face[node] < 0]
+            lower[node] = np.minimum(lower[2 * node], lower[2 * node + 1])
+            upper[node] = np.maximum(upper[2 * node], upper[2 * node + 1])
+        original = outward.Original()
+        original.face_pos = _cpu(corner, wp.vec3d)
+        original.node_lower, original.node_upper = _cpu(lower, wp.vec3), _cpu(upper, wp.vec3)
+        original.node_face = _cpu(tree.node_face, int)
+        return centre, scale, original
+
+
+def _cpu(values, dtype):
+    return wp.array(values, dtype=dtype, device="cpu")
+
+
+def _scratch():
+    """Return room for the pieces of one face, and for their depths."""
+    scratch, corners = piece.Scratch(), int(piece.CORNERS)
+    scratch.near, scratch.used = (wp.zeros(1, dtype=int, device="cpu") for _ in range(2))
+    scratch.waiting = wp.zeros((outward.ROWS, corners), dtype=wp.vec3d, device="cpu")
+    scratch.waiting_count = wp.zeros(outward.ROWS, dtype=int, device="cpu")
+    scratch.piece, scratch.inner = (wp.zeros(corners, dtype=wp.vec3d, device="cpu") for _ in range(2))
+    return scratch, wp.zeros(outward.ROWS, dtype=int, device="cpu")

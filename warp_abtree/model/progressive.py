@@ -1,0 +1,352 @@
+"""The progressive mesh: a collapse sequence, the vertex forest it makes, and a certified error for every LOD."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from numbers import Real
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import whole_number
+from warp_abtree.kernels.progressive import collapse
+from warp_abtree.kernels.progressive import hausdorff_bound as deviation
+from warp_abtree.kernels.progressive import polygon as piece
+from warp_abtree.kernels.progressive import vertex_forest as forest
+
+MERGES_PER_LAUNCH = 25_000
+COVERS_PER_LAUNCH = 200_000
+HEAP_ROOM = (2, 256)  # entries to begin with: so many an edge, and so many more
+NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
+
+# What rounding can hide from a bound, in units of the frame (coordinates about 1/2, so 2^-54 each): reading the
+# vertices of both surfaces, a closest point of some ten operations, and the points of at most 64 cuts by three planes
+# each, every one within 2^-52 a coordinate of the segment that it cuts: 192 sqrt(3) 2^-52 and a little, under 2^-43.
+ROUNDING = 2.0**-43
+
+
+@dataclass(frozen=True)
+class ProgressiveMesh:
+    """A mesh at every level of detail; `lod` counts vertex splits, 0 at the base and m at the original.
+
+    Nodes 0..n_v-1 of the forest are the original vertices, node n_v+j is made by merge j; at `lod` the merges
+    0..m-lod-1 are applied, and split i undoes merge m-1-i.
+
+    Attributes:
+        vertex_parent: Node that each node merges into, -1 at a root, shape [n_v+m].
+        vertex_pos: Positions [model units], shape [n_v+m, 3]; the first n_v are the original's, to the bit.
+        face_vertex: Original faces, shape [n_f, 3].
+        face_split: Face f is active iff lod >= face_split[f], m+1 for dropped faces; shape [n_f].
+        split_start: Where each split's slice of `split_face` begins, shape [m+1].
+        split_face: Slice i lists, ascending, every face that split i inserts or deforms.
+        lod_error: Certified bound [model units] on the distance of any point of the original surface from the
+            surface at each LOD, shape [m+1]; falls with lod, 0 at m.
+    """
+
+    vertex_parent: np.ndarray
+    vertex_pos: np.ndarray
+    face_vertex: np.ndarray
+    face_split: np.ndarray
+    split_start: np.ndarray
+    split_face: np.ndarray
+    lod_error: np.ndarray
+
+    @property
+    def lod_max(self):
+        """Return m, the LOD of the original mesh."""
+        return len(self.split_start) - 1
+
+    @property
+    def vertex_count(self):
+        """Return n_v, the number of original vertices."""
+        return len(self.vertex_parent) - self.lod_max
+
+    @property
+    def face_count(self):
+        """Return n_f, the number of original faces, dropped ones included."""
+        return len(self.face_vertex)
+
+    @cached_property
+    def _active_counts(self):
+        return np.cumsum(np.bincount(self.face_split, minlength=self.lod_max + 2)[: self.lod_max + 1])
+
+    def active_count(self, lod):
+        """Count the active faces at a LOD, or at each of an array of LODs; raise ValueError outside 0..m."""
+        lods = np.asarray(lod)
+        if not np.issubdtype(lods.dtype, np.integer):
+            raise ValueError(f"lod must be an integer, got {lod!r}")
+        if np.any(lods < 0) or np.any(lods > self.lod_max):
+            raise ValueError(f"lod must lie in 0..{self.lod_max}, got {lod}")
+        counts = self._active_counts[lods]
+        return int(counts) if lods.ndim == 0 else counts
+
+    def active_vertices(self, lod):
+        """Return the active ancestor of every original vertex at a LOD, int32 [n_v]; raise ValueError outside 0..m."""
+        self.active_count(lod)
+        limit = self.vertex_count + self.lod_max - int(lod)
+        node = np.arange(limit, dtype=np.int32)
+        parent = self.vertex_parent[:limit]
+        inner = (parent >= 0) & (parent < limit)
+        node[inner] = parent[inner]
+        # pointer doubling: the forest's depth in its logarithm of rounds
+        while True:
+            above = node[node]
+            if np.array_equal(above, node):
+                return node[: self.vertex_count].copy()
+            node = above
+
+    def mesh_at(self, lod):
+        """Return the surface at a LOD: used vertices float64 [v, 3], faces int32 [f, 3], face ids int32 [f].
+
+        Faces are in the order of the original file, their ids are indices of original faces; at m the vertices are the
+        original ones in their order. Raises ValueError outside 0..m.
+        """
+        active = self.active_vertices(lod)
+        face_ids = np.flatnonzero(self.face_split <= lod).astype(np.int32)
+        corners = active[self.face_vertex[face_ids]]
+        if lod == self.lod_max:
+            return self.vertex_pos[: self.vertex_count].copy(), corners, face_ids
+        used, faces = np.unique(corners, return_inverse=True)
+        return self.vertex_pos[used], faces.reshape(-1, 3).astype(np.int32), face_ids
+
+    def lod_for(self, fraction=None, tolerance=None):
+        """Return the LOD for exactly one of two wishes.
+
+        Args:
+            fraction: Part of `face_count` in (0, 1]; the LOD whose active count is nearest, the finer of equals.
+            tolerance: Largest error [model units], >= 0; the coarsest LOD whose `lod_error` is within it.
+        Raises ValueError for any other value, or unless one wish is given.
+        """
+        if (fraction is None) == (tolerance is None):
+            raise ValueError("lod_for takes exactly one of fraction= and tolerance=")
+        if tolerance is not None:
+            if not (isinstance(tolerance, Real) and float(tolerance) >= 0):
+                raise ValueError(f"tolerance must be >= 0, got {tolerance!r}")
+            return int(np.argmax(self.lod_error <= tolerance))
+        if not (isinstance(fraction, Real) and 0 < float(fraction) <= 1):
+            raise ValueError(f"fraction must lie in (0, 1], got {fraction!r}")
+        miss = np.abs(self._active_counts - fraction * self.face_count)
+        return int(self.lod_max - np.argmin(miss[::-1]))
+
+
+def build_progressive(mesh, base_faces=10, link_condition=False, progress=None):
+    """Collapse a mesh to a base of about `base_faces` faces and certify the error of every LOD on the way.
+
+    The sequence for a larger base is a prefix of that for a smaller one, and does not depend on the mesh's scale by
+    powers of two. It stops early only where every further merge would kill the last face.
+
+    Args:
+        mesh: Anything with `vertices` float64 [v, 3], `faces` int32 [n_f, 3].
+        base_faces: Stop when no more faces than this are left, >= 1.
+        link_condition: Put merges that break the link condition after all others.
+        progress: Called as progress(stage, done, total) between launches; stages "collapse" and "LOD bounds".
+    Raises ValueError for empty, non-finite or oversized meshes, bad indices, base_faces < 1, or if no face has three
+    distinct corners.
+    Source: Garland and Heckbert 1997 (collapse).
+    """
+    vertices, faces = _checked(mesh, base_faces)
+    report = progress if progress is not None else lambda stage, done, total: None
+    centre, scale = find_frame(vertices)
+    parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), bool(link_condition), report)
+    vertex_pos = np.concatenate([vertices, centre + scale * pos[len(vertices) :]])
+    face_split, split_start, split_face = _splits(parent, faces, len(vertices))
+    lod_error = _deviation(vertex_pos, parent, faces, report)
+    return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, lod_error)
+
+
+def _checked(mesh, base_faces):
+    whole_number(base_faces, "base_faces", 1, 2**62)
+    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise ValueError(f"vertices and faces must be [n, 3], got {vertices.shape} and {faces.shape}")
+    if len(faces) == 0 or len(vertices) == 0:
+        raise ValueError("the mesh is empty")
+    if 2 * len(vertices) >= NODE_LIMIT or 3 * len(faces) >= 2**31:
+        raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
+    if not np.isfinite(vertices).all():
+        raise ValueError("a vertex is not finite")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"faces index vertices {faces.min()}..{faces.max()} of {len(vertices)}")
+    if not _distinct(faces).any():
+        raise ValueError("no face has three distinct corners")
+    return vertices, faces
+
+
+def _distinct(faces):
+    return (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+
+
+def find_frame(vertices):
+    """Return the centre and a power of two that bounds the extent, so that scaling back and forth rounds nothing."""
+    lower, upper = vertices.min(axis=0), vertices.max(axis=0)
+    extent = float(np.max(upper / 2 - lower / 2))
+    exponent = np.frexp(extent)[1] + 1 if extent > 0 else 0
+    return lower / 2 + upper / 2, float(np.ldexp(1.0, int(np.clip(exponent, -1000, 1000))))
+
+
+def _edges(faces):
+    """Return the packed edges of the faces with three corners, ascending, and which corners start a boundary edge."""
+    valid = _distinct(faces)
+    start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
+    pair = (np.minimum(start, end) << 32) | (np.maximum(start, end) << 2)
+    slot = np.flatnonzero(np.repeat(valid, 3))
+    pair = pair.reshape(-1)[slot]
+    order = np.argsort(pair)
+    pair = pair[order]
+    first = np.flatnonzero(np.concatenate([[True], pair[1:] != pair[:-1]]))
+    single = np.diff(np.append(first, len(pair))) == 1
+    boundary = np.zeros(faces.size, dtype=np.int8)
+    boundary[slot[order[first[single]]]] = 1
+    return pair[first], boundary.reshape(faces.shape)
+
+
+def _cpu(values, dtype):
+    return wp.array(values, dtype=dtype, device="cpu")
+
+
+def _filled(count, value, dtype=int):
+    return wp.full(count, value, dtype=dtype, device="cpu")
+
+
+def _linked_rings(faces, face_array, node_capacity):
+    """Return `forest.Rings` of the original mesh with room for `node_capacity` nodes."""
+    rings = forest.Rings()
+    rings.head = _filled(node_capacity, -1)
+    rings.degree = _filled(node_capacity, 0)
+    rings.next = _filled(3 * len(faces), -1)
+    rings.corner_node = _filled(3 * len(faces), -1)
+    wp.launch(forest.link_rings_kernel, dim=1, inputs=[len(faces), face_array, rings], device="cpu")
+    return rings
+
+
+def _collapse(pos, faces, base_faces, link_condition, report):
+    """Run the collapse; return vertex_parent int32 [n_v+m] and all normalised positions float64 [n_v+m, 3]."""
+    vertex_count, capacity = len(pos), 2 * len(pos)
+    edges, boundary = _edges(faces)
+    face_array = _cpu(faces, int)
+    surface = collapse.Surface()
+    surface.pos = _cpu(np.concatenate([pos, np.zeros_like(pos)]), wp.vec3d)
+    surface.quadric = wp.zeros(capacity, dtype=collapse.Quadric, device="cpu")
+    surface.parent = _filled(capacity, -1)
+    surface.stamp = _filled(capacity, -1)
+    rings = _linked_rings(faces, face_array, capacity)
+    wp.launch(
+        collapse.weigh_faces_kernel,
+        dim=1,
+        inputs=[len(faces), face_array, _cpu(boundary, wp.int8), surface],
+        device="cpu",
+    )
+    heap = collapse.Heap()
+    size = len(edges)
+    room = HEAP_ROOM[0] * size + HEAP_ROOM[1]
+    heap.pair = _cpu(np.resize(edges, room), wp.int64)
+    heap.key = wp.zeros(room, dtype=wp.float64, device="cpu")
+    wp.launch(collapse.price_edges_kernel, dim=1, inputs=[size, heap.pair, surface, heap.key], device="cpu")
+    start_live = int(_distinct(faces).sum())
+    counter = _cpu(np.array([size, 0, start_live, collapse.RUNNING], dtype=np.int32), int)
+    wp.launch(collapse.compact_heap_kernel, dim=1, inputs=[surface, heap, counter], device="cpu")
+    state = counter.numpy()  # shares the memory
+    goal = max(start_live - base_faces, 1)
+    while state[3] != int(collapse.FINISHED):
+        if state[3] == int(collapse.HEAP_FULL):
+            heap = _roomier_heap(surface, heap, counter)
+        sizes = [vertex_count, base_faces, MERGES_PER_LAUNCH, len(heap.key), int(link_condition)]
+        wp.launch(collapse.collapse_edges_kernel, dim=1, inputs=[*sizes, surface, rings, heap, counter], device="cpu")
+        report("collapse", min(start_live - int(state[2]), goal), goal)
+    nodes = vertex_count + int(state[1])
+    return surface.parent.numpy()[:nodes].copy(), surface.pos.numpy()[:nodes]
+
+
+def _roomier_heap(surface, heap, counter):
+    """Drop stale entries; where that leaves the heap fairly full, or a hub's edges want more, return a larger one."""
+    before = int(counter.numpy()[0])
+    wp.launch(collapse.compact_heap_kernel, dim=1, inputs=[surface, heap, counter], device="cpu")
+    size, capacity = int(counter.numpy()[0]), len(heap.key)
+    if 4 * size <= 3 * capacity < 4 * before:
+        return heap
+    larger = collapse.Heap()
+    larger.key = wp.zeros(capacity + capacity // 2 + 64, dtype=wp.float64, device="cpu")
+    larger.pair = wp.zeros(capacity + capacity // 2 + 64, dtype=wp.int64, device="cpu")
+    wp.copy(larger.key, heap.key, count=size)
+    wp.copy(larger.pair, heap.pair, count=size)
+    return larger
+
+
+def _splits(parent, faces, vertex_count):
+    """Return face_split int32 [n_f], split_start int64 [m+1] and split_face int32 of a forest."""
+    node_count = len(parent)
+    merge_count = node_count - vertex_count
+    face_array, parent_array = _cpu(faces, int), _cpu(parent, int)
+    size = wp.zeros(merge_count + 1, dtype=wp.int64, device="cpu")
+    face_split = wp.zeros(len(faces), dtype=int, device="cpu")
+    inputs = [vertex_count, node_count, face_array, parent_array]
+    wp.launch(forest.count_events_kernel, dim=1, inputs=[*inputs, size, face_split], device="cpu")
+    split_start = np.concatenate([[0], np.cumsum(size.numpy()[:merge_count])]).astype(np.int64)
+    split_face = wp.zeros(int(split_start[-1]), dtype=int, device="cpu")
+    cursor = _cpu(split_start.copy(), wp.int64)
+    wp.launch(forest.fill_events_kernel, dim=1, inputs=[*inputs, cursor, split_face], device="cpu")
+    return face_split.numpy(), split_start, split_face.numpy()
+
+
+def _deviation(vertex_pos, parent, faces, report):
+    """Return lod_error float64 [m+1]."""
+    centre, scale = find_frame(vertex_pos[np.unique(faces)])
+    merge_count, face_count = _merge_count(parent), len(faces)
+    vertex_count = len(parent) - merge_count
+    if merge_count == 0:
+        return np.zeros(1)
+    child = np.flatnonzero(parent >= 0)
+    pair = child[np.argsort(parent[child], kind="stable")].reshape(-1, 2)
+    rings = _linked_rings(faces, _cpu(faces, int), len(parent))
+    replay = _replay((vertex_pos - centre) / scale, face_count)
+    scratch = piece.Scratch()
+    scratch.near = _filled(face_count, 0)
+    scratch.used = _filled(deviation.SLOTS, 0)
+    scratch.waiting = wp.zeros((piece.STACK, piece.CORNERS), dtype=wp.vec3d, device="cpu")
+    scratch.waiting_count = _filled(piece.STACK, 0)
+    scratch.piece = wp.zeros(piece.CORNERS, dtype=wp.vec3d, device="cpu")
+    scratch.inner = wp.zeros(piece.CORNERS, dtype=wp.vec3d, device="cpu")
+    counter = _filled(6, 0)
+    inputs = [face_count, _cpu(faces, int), rings.corner_node, replay, counter]
+    wp.launch(deviation.start_replay_kernel, dim=1, inputs=inputs, device="cpu")
+    bound_sq = wp.zeros(merge_count, dtype=wp.float64, device="cpu")
+    inputs = [vertex_count, merge_count, COVERS_PER_LAUNCH, _cpu(pair, int), replay, scratch, rings, counter, bound_sq]
+    state = counter.numpy()  # shares the memory
+    while state[0] < merge_count:
+        wp.launch(deviation.replay_merges_kernel, dim=1, inputs=inputs, device="cpu")
+        if state[5] < 0:
+            bvh = _index(replay, rings)
+            replay.bvh, state[5] = bvh.id, state[1]
+        report("LOD bounds", int(state[0]), merge_count)
+    error = scale * (np.sqrt(bound_sq.numpy()) + ROUNDING)
+    return np.append(error[::-1], 0.0)
+
+
+def _merge_count(parent):
+    # every merge has exactly two children
+    return int(np.count_nonzero(parent >= 0)) // 2
+
+
+def _replay(pos, face_count):
+    replay = deviation.Replay()
+    replay.pos = _cpu(pos, wp.vec3d)
+    for name in ("triangle_pos", "face_pos"):
+        setattr(replay, name, wp.zeros((face_count, 3), dtype=wp.vec3d, device="cpu"))
+    replay.face_box = wp.zeros((face_count, 2), dtype=wp.vec3d, device="cpu")
+    for name in ("face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face"):
+        setattr(replay, name, _filled(face_count, -1))
+    pooled = 3 * face_count + 4096  # a pool that runs dry loosens bounds, no more
+    for name in ("slot_face", "slot_triangle", "slot_sibling", "slot_next", "slot_last"):
+        setattr(replay, name, _filled(face_count + pooled, -1))
+    replay.free_slot = _filled(pooled, 0)
+    replay.bvh_face = _filled(1, 0)
+    return replay
+
+
+def _index(replay, rings):
+    """Return a wp.Bvh over the active faces, for triangles whose piece vanishes."""
+    active = np.flatnonzero(rings.corner_node.numpy()[::3] >= 0).astype(np.int32)
+    corners = replay.face_pos.numpy()[active]
+    lower, upper = corners.min(axis=1).astype(np.float32), corners.max(axis=1).astype(np.float32)
+    replay.bvh_face = _cpu(active, int)
+    return wp.Bvh(_cpu(lower, wp.vec3), _cpu(upper, wp.vec3))

@@ -1,0 +1,243 @@
+"""Contacts: where intersecting faces meet, with which normals, and one summary an object pair; `ContactQuery`.
+
+Everything is computed from the inputs of the exact test, in the frame of the object with the lower index, and then
+posed to the world by that object's pose. A face pair's contact, in the order in which the pair names its objects:
+
+* pair, faces: place of the object pair in `Result.pairs`, and the face of its first and of its second object, (2,):
+  the columns of `Result.faces`.
+* p0, p1: the ends of the segment that the two faces share, along normal_a x normal_b; where the faces are coplanar, the
+  two points of the polygon that they share that are farthest apart; where they touch in a point, that point twice.
+* normal_a, normal_b: unit normals of the faces by their winding, zero for faces of no area.
+* normal: unit, from the first object to the second: the direction of normal_a - normal_b. Where that is shorter than
+  2^-20, the faces look the same way, and it is the normal of the lower object's face, turned towards the higher; where
+  neither face has an area, the direction from one model's centre to the other's, or the x axis.
+* coplanar: whether the faces have area and lie in one plane, exactly.
+
+An end is a corner, or lies on an edge, off its exact place by at most 2^-40 of the edge's length and the rounding of
+coordinates in both frames. Where the lower object's rotation is a matrix R that is off orthonormal by s, the largest
+entry of |R^T R - I|, ends lie on the higher object's posed mesh only to within 3 s of their distance from the lower
+object's position. Pairs that a coarser precision reports although they are apart get a point between them.
+
+An object pair's summary is made of sums over its contacts in the order of `Result.faces`, in float64. Each sum adds the
+contacts of each chunk of 32, the last chunk perhaps shorter, from left to right, then the chunks from left to right:
+
+* count: contacts, as `Result.count`.
+* point: mean of the segments' midpoints, weighted by length; unweighted where all lengths vanish. It need not lie on
+  either surface.
+* normal: mean of the normals, weighted as the points, at unit length. A mean shorter than 2^-20, as of curves that run
+  around an object, gives way to the direction between the models' centres.
+* depth: an estimate of how far the second object would have to move along the normal to come free. The contact curve
+  encloses an area, seen along the normal; its faces say how fast that area shrinks with such a motion; depth is their
+  quotient, at most the overlap of the two root boxes along the normal, which it is too where the area does not shrink.
+  Without an area (points, shared planes) it is the overlap along the normal of the faces that touch. For a box pressed
+  straight into a larger one it is exact up to the rounding of the root boxes, float32 and outwards: 3e-7 for boxes of 4
+  units, so that boxes that only touch have that depth. At most (2 r + d) / 2 d times the truth for balls of radius r at
+  distance d, less where the root boxes cap it; half of it for the tip of a cone. It is not the penetration depth (the
+  smallest motion in any direction), and no bound on it: where a curve runs over the edge of an object the mean normal
+  leans over, and depth can be several times too large; for separate regions of contact and for open surfaces it is
+  merely a length.
+
+A pair without contacts has depth 0 and NaN as point and normal, of the bits 0x7ff8000000000000. The results are the
+same, bit for bit, on CPU and CUDA. For a pair named the other way the contacts differ in nothing but order, exchanged
+ends and signs; sums follow the order of the faces as named, so that its summary may differ in the last bits too.
+"""
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels.contact import contact
+from warp_abtree.kernels.contact import sort_hits as order
+from warp_abtree.kernels.contact import summary as reduce
+from warp_abtree.query.broad_phase import CapacityError
+from warp_abtree.query.narrow_phase import Query, Result
+
+VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
+
+
+def contact_dtypes(dtype=np.float64):
+    """Return the types of `Result.contacts` and `Result.pair_contacts`, real numbers of a type inside.
+
+    Raises:
+        ValueError: The type is neither float32 nor float64.
+    """
+    try:
+        real = np.dtype(dtype)
+    except TypeError:
+        real = None
+    if real not in (np.float32, np.float64):
+        raise ValueError(f"contact_dtype {dtype!r} is neither float32 nor float64")
+    indices = [("pair", np.int32), ("faces", np.int32, (2,))]
+    vectors = [(name, real, (3,)) for name in VECTORS]
+    means = [("point", real, (3,)), ("normal", real, (3,)), ("depth", real)]
+    return np.dtype([*indices, *vectors, ("coplanar", bool)]), np.dtype([("count", np.int64), *means])
+
+
+class ContactResult(Result):
+    """What a `ContactQuery` found, on the host: faces, contacts and their summaries as `Result` describes them."""
+
+    def __init__(self, query, pairs, pair_demand):
+        super().__init__(pairs, "contacts", pair_demand, len(query.pairs), query.hits, query.near)
+        self._hit_demand = int(self.count.sum())
+        rows = min(self._hit_demand, self._hit_room)
+        face_type, pair_type = contact_dtypes(query.contact_dtype)
+        self.contacts, self.pair_contacts = np.zeros(rows, face_type), np.zeros(len(pairs), pair_type)
+        self.faces = np.empty((0, 3), np.int32)
+        self.pair_contacts["count"] = self.count
+        with np.errstate(over="ignore"):
+            if len(pairs):
+                for name in ("point", "normal", "depth"):
+                    self.pair_contacts[name] = getattr(query.pair_contacts, name)[: len(pairs)].numpy()
+            if rows:
+                # On the CPU numpy() shares the memory that the next launch writes.
+                self.faces = query.faces[:rows].numpy().copy()
+                for name in (*VECTORS, "coplanar"):
+                    self.contacts[name] = getattr(query.contacts, name)[:rows].numpy()
+        self.contacts["pair"], self.contacts["faces"] = self.faces[:, 0], self.faces[:, 1:]
+
+
+class ContactQuery(Query):
+    """Contacts of many object pairs as an operator: `Query` of output "faces", and what this module's docstring says.
+
+    `launch()` only launches, sorting included, so that a CUDA graph can take poses to contacts without the host.
+
+    Args:
+        scene, pairs, pair_capacity, precision, within, unsure_capacity: As for `Query`.
+        capacity: Contacts that there is room for, below 2^30. Room that stays empty takes 180 bytes a contact and time
+            to sort all the same.
+        contact_dtype: Type of the real numbers in `result()`, float64 or float32; those beyond float32 become infinite.
+
+    Attributes:
+        faces: The last launch's `Result.faces`, device vec3i (capacity,), sorted.
+        contacts: Their contacts, device arrays (capacity,) of `kernels.contact.Contacts`, float64.
+        pair_contacts: Their summaries, device arrays (pair capacity,) of `kernels.reduce.PairContacts`, float64.
+        start: Where the rows of pair p start in faces and contacts, device int32 (pair capacity + 1,): they end at
+            start[p + 1], and all of them at the last entry. Places behind that hold nothing.
+        hits, pairs, pair_count, near: As for `Query`. Where hits.count sums to more than the capacity, contacts are
+            missing in all of the above, on a GPU not the same in each launch.
+    """
+
+    key_bits = 63  # of a sort key; an object pair and two faces that take more are sorted in two passes
+    faces: wp.array
+    start: wp.array
+    _key: wp.array
+    _order: wp.array
+    _places = 0
+
+    def __init__(
+        self,
+        scene,
+        pairs=None,
+        capacity=None,
+        pair_capacity=None,
+        precision="exact",
+        within=None,
+        unsure_capacity=None,
+        contact_dtype=np.float64,
+    ):
+        contact_dtypes(contact_dtype)
+        self.contact_dtype = contact_dtype
+        self.contacts, self.pair_contacts = contact.Contacts(), reduce.PairContacts()
+        self._sums = reduce.ChunkSums()
+        super().__init__(scene, "faces", pairs, capacity, pair_capacity, precision, within, unsure_capacity)
+
+    def resize(self, capacity: int):
+        """Make room for a number of contacts.
+
+        Raises:
+            CapacityError: 2^30 contacts or more.
+        """
+        if capacity >= 2**30:
+            raise CapacityError(f"{capacity} face pairs asked, a contact query has room for fewer than 2^30")
+        self._replace([*self._place_arrays(capacity), (self, "_places", capacity)])
+
+    def _place_arrays(self, capacity: int) -> list:
+        """Return (owner, attribute, new array) of whatever has an entry a contact."""
+        made = [(self.hits, "face", self._empty(capacity, wp.vec3i)), (self, "faces", self._empty(capacity, wp.vec3i))]
+        made += [(self.contacts, name, self._empty(capacity, wp.vec3d)) for name in VECTORS]
+        made.append((self.contacts, "coplanar", self._empty(capacity, wp.int32)))
+        # The sort takes as much again as scratch.
+        made.append((self, "_key", self._empty(2 * capacity, wp.int64)))
+        made.append((self, "_order", self._empty(2 * capacity, wp.int32)))
+        return made + self._chunk_arrays(self._chunk_count(capacity, len(self.pairs)))
+
+    def _pair_arrays(self, room: int) -> list:
+        made = super()._pair_arrays(room)
+        made.append((self, "start", wp.zeros(room + 1, dtype=wp.int32, device=self.device)))
+        for owner, name, dtype in (
+            (self.pair_contacts, "point", wp.vec3d),
+            (self.pair_contacts, "normal", wp.vec3d),
+            (self.pair_contacts, "depth", wp.float64),
+            (self._sums, "total", wp.float64),
+            (self._sums, "middle", wp.vec3d),
+        ):
+            made.append((owner, name, self._empty(room, dtype)))
+        return made + self._chunk_arrays(self._chunk_count(self._places, room))
+
+    def _chunk_arrays(self, count: int) -> list:
+        """Return (owner, attribute, new array) of whatever has an entry a chunk."""
+        made = [(self._sums, "span", self._empty(count, wp.vec3i))]
+        made += [(self._sums, name, self._empty(count, wp.vec3d)) for name in ("point", "normal")]
+        names = ("length", "area", "change", "front", "back")
+        return made + [(self._sums, name, self._empty(count, wp.float64)) for name in names]
+
+    def _empty(self, count, dtype):
+        return wp.empty(count, dtype=dtype, device=self.device)
+
+    @staticmethod
+    def _chunk_count(places: int, pairs: int) -> int:
+        """Return how many chunks there may be: `first_chunk` of the pair after the last, if all places are taken."""
+        return places // int(reduce.CHUNK) + pairs
+
+    def traverse(self):
+        """Run the narrow phase over the pairs in place and make the contacts. Launches only."""
+        super().traverse()
+        if len(self.pairs):
+            self.find_contacts()
+
+    def find_contacts(self):
+        """Sort the hits in place, whatever their order, make their contacts and sum them. Launches only."""
+        self._sort()
+        self._find()
+        self._reduce()
+
+    def _launch_kernel(self, kernel, dim, inputs):
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+
+    def _passes(self):
+        """Return the bits of (pair, face a, face b) that each pass of the sort looks at."""
+        pair = len(self.pairs).bit_length()
+        face = (max(model.face_count for model in self.scene.models) - 1).bit_length()
+        if pair + 2 * face <= self.key_bits:
+            return [(pair, face, face)]
+        return [(0, 0, face), (pair, face, 0)]
+
+    def _sort(self):
+        capacity, room = self._places, len(self.pairs)
+        total, face = self.hits.total, self.hits.face
+        for number, widths in enumerate(self._passes()):
+            inputs = [room, wp.vec3i(*widths), number == 0, total, face, self._order, self._key]
+            self._launch_kernel(order.make_key_kernel, capacity, inputs)
+            with wp.ScopedDevice(self.device):
+                wp.utils.radix_sort_pairs(self._key, self._order, capacity, end_bit=sum(widths))
+        self._launch_kernel(order.place_row_kernel, capacity, [total, face, self._order, self.faces])
+        self._launch_kernel(order.start_pair_kernel, room + 1, [capacity, sum(widths[1:]), self._key, self.start])
+
+    def _find(self):
+        posed = [*(arrays.pool for arrays in self.arrays), self.pairs, self.pair_poses]
+        self._launch_kernel(contact.find_contact_kernel, self._places, [*posed, self.start, self.faces, self.contacts])
+
+    def _reduce(self):
+        room, chunks = len(self.pairs), len(self._sums.span)
+        pools = [arrays.pool for arrays in self.arrays]
+        start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
+        self._launch_kernel(reduce.sum_length_kernel, chunks, [start, contacts, sums])
+        self._launch_kernel(reduce.total_length_kernel, room, [start, sums])
+        self._launch_kernel(reduce.sum_mean_kernel, chunks, [start, contacts, sums])
+        self._launch_kernel(reduce.average_contact_kernel, room, [*pools, self.pairs, start, sums, means])
+        posed = [*pools, self.pairs, self.pair_poses]
+        self._launch_kernel(reduce.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
+        self._launch_kernel(reduce.measure_depth_kernel, room, [*pools, self.pairs, start, contacts, sums, means])
+
+    def result(self) -> ContactResult:
+        """Return faces, contacts and summaries of the last launch on the host. Waits for the device."""
+        return ContactResult(self, *self._asked())

@@ -1,0 +1,166 @@
+"""Contact points: the contacts of an object pair reduced to a few points that a solver can push on; `ManifoldQuery`.
+
+Meshes meet in curves, and a curve alone has no depth. Here is what is made of it, for each object pair:
+
+* Contacts that share a face of either object form a loop. The normal of a loop is the direction of the area vector of
+  its curve, 1/2 sum p x dp: the volume that two closed surfaces share shrinks by that vector times a motion, so it is
+  the way out, for edges against edges and for corners too, and it needs the curve alone. A curve without area gives way
+  to the mean of its contacts' normals.
+* A contact's depth is how far the one face lies behind the other's plane within the column of that face along the
+  normal, at the deepest place. Where the normal of either face is within 60 degrees of the loop's and makes that
+  depth no larger, it takes the place of the loop's: so a box in a corner is pushed by floor and wall, each its own way.
+* Of all candidates of the pair an outermost one is taken, then those farthest, in place and in normal, from the
+  segments between those before, and the deepest, up to `POINTS` of them.
+
+Normals come from the winding of the faces, outwards. Only surfaces that cross have contacts: an object that lies whole
+inside another has none. Depth is exact while every vertex inside has a face that crosses; once a whole ring of faces
+is inside it is that ring's, too little, and rings that go under in one step are forgotten: fine meshes come to rest
+several times as deep as they are told to (docs/dynamics.md has figures). Of two thin things that are through each other
+the way out is as likely forwards as back.
+
+Source of the area vector as a gradient: Allard et al. 2010, Volume Contact Constraints at Arbitrary Resolution,
+section 3; that the boundary curve gives it is Stokes' theorem.
+"""
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import check_device
+from warp_abtree.kernels.contact import manifold
+from warp_abtree.kernels.contact.manifold import POINTS
+from warp_abtree.kernels.dynamics import bodies
+from warp_abtree.query.contacts import ContactQuery
+from warp_abtree.query.narrow_phase import Result
+
+POINTS_MAX = int(POINTS)
+
+
+class ManifoldResult(Result):
+    """What a `ManifoldQuery` found, on the host: as `Result` of output "count", and the points.
+
+    Attributes:
+        points: Contact points in the order of pairs: a dictionary of pair, place in `pairs`, int (k,); point, normal,
+            float64 (k, 3), and depth, (k,), as `ManifoldQuery.manifolds`; None where they were left on the device.
+    """
+
+    def __init__(self, query, pairs, pair_demand, with_points=True):
+        super().__init__(pairs, "count", pair_demand, len(query.pairs), query.hits)
+        self._hit_demand, self._hit_room = int(self.count.sum()), len(query.hits.face)
+        self.points = None
+        if not with_points:
+            return
+        count = query.manifolds.count.numpy()[: len(pairs)]
+        used = np.arange(POINTS_MAX) < count[:, None]
+        self.points = {"pair": np.repeat(np.arange(len(pairs)), count)}
+        for name in ("point", "normal", "depth"):
+            self.points[name] = getattr(query.manifolds, name).numpy()[: len(pairs)][used]
+
+
+class ManifoldQuery(ContactQuery):
+    """Contact points of many object pairs as an operator: `ContactQuery`, then the points of each pair.
+
+    Pairs of the broad phase are sorted by their objects, so that nothing depends on the order in which it found them.
+
+    Args:
+        scene, pairs, capacity, pair_capacity, precision: As for `ContactQuery`.
+        roles: Device int32 (n,) of `kernels.bodies` roles: pairs of the broad phase in which nothing can move are left
+            out. None keeps all.
+
+    Attributes:
+        manifolds: Points of each pair, device arrays (pair capacity, POINTS) of `kernels.manifold.Manifolds`, float64.
+        pair_key: first object * 2^32 + second object of each pair of the broad phase, device int64 (2 pair capacity,);
+            the greatest int64 behind the last pair.
+    """
+
+    pair_key: wp.array
+    _pair_order: wp.array
+
+    def __init__(self, scene, pairs=None, capacity=None, pair_capacity=None, precision="exact", roles=None):
+        self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
+        self.roles = wp.empty(0, dtype=wp.int32, device=scene.device) if roles is None else roles
+        super().__init__(scene, pairs, capacity, pair_capacity, precision)
+
+    def _place_arrays(self, capacity: int) -> list:
+        made = super()._place_arrays(capacity)
+        made += [(self.curves, name, self._empty(capacity, wp.int32)) for name in ("parent", "loop")]
+        made += [(self.curves, name, self._empty(capacity, wp.vec3d)) for name in ("loop_normal", "normal")]
+        made.append((self.curves, "point", self._empty((capacity, 2), wp.vec3d)))
+        made.append((self.curves, "depth", self._empty((capacity, 2), wp.float64)))
+        return made
+
+    def _pair_arrays(self, room: int) -> list:
+        made = super()._pair_arrays(room)
+        points = (room, POINTS_MAX)
+        made.append((self.manifolds, "count", wp.zeros(room, dtype=wp.int32, device=self.device)))
+        for name, dtype in (("point", wp.vec3d), ("normal", wp.vec3d), ("depth", wp.float64)):
+            made.append((self.manifolds, name, self._empty(points, dtype)))
+        # The sort takes as much again as scratch.
+        made.append((self, "pair_key", self._empty(2 * room, wp.int64)))
+        made.append((self, "_pair_order", self._empty(2 * room, wp.int32)))
+        return made
+
+    def _launch(self):
+        if self.broad_phase is not None:
+            self.broad_phase.launch()
+            self._sort_pairs()
+        self.traverse()
+
+    def _sort_pairs(self):
+        room = len(self.pairs)
+        inputs = [self.pair_count, self.pairs, self.roles, self._pair_order, self.pair_key]
+        self._launch_kernel(bodies.make_pair_key_kernel, room, inputs)
+        with wp.ScopedDevice(self.device):
+            wp.utils.radix_sort_pairs(self.pair_key, self._pair_order, room)
+        self._launch_kernel(bodies.place_pair_kernel, room + 1, [self.pair_key, self.pair_count, self.pairs])
+
+    def find_contacts(self):
+        """Sort the hits in place, make their contacts, and reduce them to points. Launches only."""
+        self._sort()
+        self._find()
+        capacity, room = self._places, len(self.pairs)
+        pools = [arrays.pool for arrays in self.arrays]
+        start, rows, curves = self.start, self.faces, self.curves
+        self._launch_kernel(manifold.begin_loop_kernel, capacity, [start, rows, curves, self._order, self._key])
+        self._sort_keys(capacity, 31 + room.bit_length())
+        self._launch_kernel(manifold.link_loop_kernel, capacity, [start, rows, self._order, self._key, curves])
+        self._launch_kernel(manifold.name_loop_kernel, capacity, [start, curves, self._order, self._key])
+        self._sort_keys(capacity, 31)
+        inputs = [*pools, self.pairs, start, rows, self.contacts, self._order, curves]
+        self._launch_kernel(manifold.average_loop_kernel, capacity, inputs)
+        inputs = [*pools, self.pairs, self.pair_poses, start, rows, self.contacts, curves]
+        self._launch_kernel(manifold.find_candidate_kernel, capacity, inputs)
+        self._launch_kernel(manifold.spread_point_kernel, room, [pools[2], self.pairs, start, curves, self.manifolds])
+
+    def _sort_keys(self, count, bits):
+        with wp.ScopedDevice(self.device):
+            wp.utils.radix_sort_pairs(self._key, self._order, count, end_bit=bits)
+
+    def run_grown(self):
+        """Launch, and again with more room until nothing is lost. Waits for the device.
+
+        Raises:
+            CapacityError: 2^26 pairs, or 2^30 contacts, or more.
+        """
+        check_device(self.device, "ManifoldQuery.run (launch can)")
+        self._check_scene()
+        with self.guard.launching(self):
+            self._launch()
+            if self.broad_phase is not None and self.broad_phase.count_found() > len(self.pairs):
+                self._take_pairs(wp.empty(2 * self.broad_phase.count_found(), dtype=wp.vec2i, device=self.device))
+                self._launch()
+            self.grow_unsure()
+            if self._sum(self.hits.count) > self._places:
+                self.resize(2 * self._sum(self.hits.count))
+                self.traverse()
+
+    def result(self, with_points: bool = True) -> ManifoldResult:  # type: ignore[override]  # points, not contacts
+        """Return the counts and, unless told otherwise, the contact points of the last launch on the host. Waits."""
+        pairs, demand = self._asked()
+        return ManifoldResult(self, pairs, demand, with_points)
+
+    def run(self) -> ManifoldResult:
+        """Launch, grow buffers that were too small, and return the whole result. Waits for the device."""
+        self.run_grown()
+        result = self.result()
+        result.check()
+        return result

@@ -1,0 +1,1 @@
+"""Posed objects: the scene, its poses, the captured pipeline and sweeps of poses."""

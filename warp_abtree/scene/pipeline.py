@@ -1,0 +1,292 @@
+"""One frame without the host: poses and LODs in, results out, all on the device, as one graph to capture."""
+
+import warnings
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import check_device, to_numpy
+from warp_abtree.kernels import pipeline as kernels
+from warp_abtree.query.broad_phase import CapacityError
+from warp_abtree.query.contacts import ContactQuery
+from warp_abtree.query.narrow_phase import Query, Result
+from warp_abtree.scene.poses import QUATERNION_TOLERANCE
+from warp_abtree.scene.scene import Scene
+from warp_abtree.state.arrays import ObjectArrays, StateArrays
+from warp_abtree.state.generation import STALE_GRAPH
+from warp_abtree.state.update import NO_FAULTS, LodLadder, LodUpdate, build_states
+
+
+def check_groups(groups, object_model) -> np.ndarray:
+    """Return the group of each object, int (n,).
+
+    Raises:
+        ValueError: Wrong shape, a number from 0 on that no object has, or a group of several models.
+    """
+    groups = to_numpy(groups, "groups")
+    if groups.shape != object_model.shape or groups.dtype.kind not in "iu":
+        raise ValueError(f"groups: shape {groups.shape} and type {groups.dtype}, not {len(object_model)} whole numbers")
+    names, first, inverse = np.unique(groups, return_index=True, return_inverse=True)
+    if not np.array_equal(names, np.arange(len(names))):
+        raise ValueError(f"groups: numbered {names[0]} to {names[-1]} for {len(names)} groups, not from 0 without gaps")
+    other = np.flatnonzero(object_model != object_model[first][inverse])
+    if len(other):
+        raise ValueError(f"groups: group {groups[other[0]]} holds objects of several models")
+    return groups.astype(np.int64)
+
+
+def check_ladder(ladder, models) -> list:
+    """Return the rungs of each model, rising int arrays.
+
+    Raises:
+        ValueError: Not one list a model, an empty one, or a LOD out of range.
+    """
+    parts = [list(part) for part in ladder]
+    if len(parts) != len(models):
+        raise ValueError(f"ladder: {len(parts)} lists of LODs given for {len(models)} models")
+    rungs = [np.unique([model.check_lod(lod) for lod in part]).astype(np.int64) for part, model in zip(parts, models)]
+    empty = [i for i, part in enumerate(rungs) if not len(part)]
+    if empty:
+        raise ValueError(f"ladder: no LOD for model {empty[0]}")
+    return rungs
+
+
+class _Posed:
+    """What a `Query` asks of a scene: the scene's models, and states and objects of the frame's own."""
+
+    check_pairs = Scene.check_pairs
+
+    def __init__(self, scene: Scene):
+        models, _, placed = scene.arrays()
+        self.device = scene.device
+        self.models = list(scene.models)
+        self.object_model = np.array(scene.object_model)
+        self._excluded = scene.excluded_keys()
+        self.object_count = scene.object_count
+        objects = ObjectArrays(placed.pool.world.numpy(), placed.pool.is_static.numpy(), self.device)
+        wp.copy(objects.pool.rotation, placed.pool.rotation)
+        wp.copy(objects.pool.position, placed.pool.position)
+        self._arrays = (models, StateArrays(models, self.device), objects)
+
+    def arrays(self):
+        return self._arrays
+
+    def excluded_keys(self):
+        return self._excluded
+
+
+class FrameGraph:
+    """A frame as an operator: sets poses, brings trees to LODs, runs broad and narrow phase, all on the device.
+
+    `launch()` only launches, on arrays that are allocated once, so that a graph can capture it, on CUDA and the CPU,
+    together with the kernels of a simulator or an LOD controller that write `poses` and `lods`. The answers are those
+    of `set_poses`, `set_lods` and `intersect` of the scene, bit for bit. No launch waits for the host, and their number
+    depends on nothing but how many states there are and how deep their trees (at most 31 levels):
+
+    * 1 for poses;
+    * 6 for LODs, and 1 for each level on which all states together have more than 1,024 nodes; 1 with a ladder;
+    * 2 for the broad phase, with a clearing and a rebuild of `wp.Bvh` between them; none for given pairs;
+    * 2 for the narrow phase on the CPU (outside a graph one of them once a core), 4 on CUDA (3 without exact signs), 2
+      more with `within`; for contacts those of `ContactQuery`;
+    * 1 that keeps the greatest demand.
+
+    The frame takes the scene's models, objects, poses, LODs and filter as they are when it is made. States and objects
+    are its own: it leaves the scene as it is, and what happens to the scene later does not reach it.
+
+    Tree states, and so memory, come in one of two ways:
+
+    * One an object, or one a group of objects, updated in place by the AB-Tree's own update, a full refit where more
+      than half of the faces may change, on CUDA a hundredth: any LOD, some 90 to 140 bytes a face and state, a tenth of
+      that for worklists. They have room for all states to change at once.
+    * With a ladder, one a model and rung, made beforehand: an LOD change costs an index. The less memory where a model
+      has more objects than rungs.
+
+    Args:
+        scene: `Scene` with all its objects.
+        output: "any", "count", "faces" or "contacts".
+        pairs, capacity, pair_capacity, precision, within, unsure_capacity: As for `Query`; in a graph nothing grows.
+        groups: Group of each object, int (n,), from 0 without gaps; the objects of a group share model, LOD and state.
+            None gives each object a state of its own.
+        ladder: LODs that objects may stand at, one list for each of `scene.models`, in any order. The coarsest one that
+            is not coarser serves a wish.
+
+    Attributes:
+        poses: x y z qx qy qz qw [world units, unit quaternion], device float64 (n, 7); those of the scene at first.
+        lods: LOD of each object, with groups of each group, device int32; the scene's at first, of a group's first
+            object, as far as a ladder reaches.
+        query: The `Query` or `ContactQuery` that answers, with its results in device arrays.
+        changed_count, marked_count: Faces that changed and nodes refitted in the last launch, device int32, one entry
+            a state; None with a ladder.
+
+    Raises:
+        ValueError: Bad groups, a bad ladder or request, an empty scene, or states of 2^30 nodes and more.
+    """
+
+    def __init__(
+        self,
+        scene,
+        output="any",
+        pairs=None,
+        capacity=None,
+        pair_capacity=None,
+        precision="exact",
+        within=None,
+        unsure_capacity=None,
+        groups=None,
+        ladder=None,
+    ):
+        check_device(scene.device, "making a FrameGraph")
+        posed = _Posed(scene)
+        self.device = scene.device
+        self._models, self._states, self._objects = posed.arrays()
+        if groups is not None and ladder is not None:
+            raise ValueError("groups and ladder: give one of them; with a ladder objects share states anyway")
+        if ladder is None:
+            self._update = self._own_states(scene.lods, groups, posed.object_model)
+        else:
+            self._update = self._make_ladder(scene.lods, ladder, posed)
+        self.lods = self._update.wanted
+        plan = getattr(self._update, "plan", None)
+        self.changed_count = None if plan is None else plan.changed_count
+        self.marked_count = None if plan is None else plan.marked_count
+        self.poses = wp.empty((len(posed.object_model), 7), dtype=wp.float64, device=self.device)
+        wp.launch(kernels.read_pose_kernel, len(self.poses), [self._objects.pool, self.poses], device=self.device)
+        self._bad_poses = wp.empty(2, dtype=wp.int32, device=self.device)
+        self._demand = wp.zeros(4, dtype=wp.int64, device=self.device)
+        options = {"pairs": pairs, "capacity": capacity, "pair_capacity": pair_capacity, "precision": precision}
+        options |= {"within": within, "unsure_capacity": unsure_capacity}
+        asked: type[Query] | partial = ContactQuery if output == "contacts" else partial(Query, output=output)
+        self.query: Query = asked(posed, **options)
+        # Loads the kernels, and tells what the poses as they stand take.
+        self.launch()
+        self._fit_unsure(unsure_capacity)
+        self.clear_faults()
+
+    def _own_states(self, lods, groups, object_model):
+        """Make a state an object or group."""
+        group = np.arange(len(lods)) if groups is None else check_groups(groups, object_model)
+        first = np.unique(group, return_index=True)[1]
+        ids = build_states(self._models, self._states, object_model[first].tolist(), lods[first])
+        self._objects.set_states(np.array(ids)[group])
+        return LodUpdate(self._models, self._states)
+
+    def _make_ladder(self, lods, ladder, posed):
+        """Make a state a model and rung."""
+        rungs = check_ladder(ladder, posed.models)
+        last = np.array([part[-1] for part in rungs])[posed.object_model]
+        wanted = np.minimum(lods, last)
+        return LodLadder(self._models, self._states, self._objects, posed.object_model, rungs, wanted)
+
+    def _fit_unsure(self, given):
+        """Make room for the face pairs that float32 leaves open, unless that room was given; then say what it lacks."""
+        needed, room = int(self._demand.numpy()[2]), len(self.query.hits.unsure)
+        if not 0 < room < needed:
+            return
+        if given is None:
+            self.query.grow_unsure()
+            return
+        warnings.warn(
+            f"unsure_capacity={given}: the poses as they stand leave {needed} face pairs open after float32; "
+            f"make it with unsure_capacity={needed}, or without",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+
+    def launch(self):
+        """Run one frame on what stands in `poses` and `lods`. Launches only, see above how many.
+
+        Where it is interrupted, the next launch refits all tree states.
+        """
+        with self.query.guard.launching(self):
+            self._set_objects()
+            self.query.launch()
+            hits, launched = self.query.hits, self.query.guard.launched
+            inputs = [self.query.pair_count, hits.total, hits.unsure_total, launched, self._demand]
+            wp.launch(kernels.tally_demand_kernel, 1, inputs, device=self.device)
+
+    def _set_objects(self):
+        record = self.query.guard.record()
+        inputs = [QUATERNION_TOLERANCE, self.poses, self._objects.pool, self._bad_poses, record]
+        wp.launch(kernels.place_object_kernel, len(self.poses), inputs, device=self.device)
+        self._update.launch()
+
+    def capture(self) -> wp.Graph:
+        """Return `launch()` as a graph for `wp.capture_launch`; it holds as long as the frame does and no buffer grows.
+
+        To capture it with kernels of your own, call `launch()` inside a `wp.ScopedCapture`.
+        """
+        with wp.ScopedCapture(self.device) as capture:
+            self.launch()
+        return capture.graph
+
+    def result(self) -> Result:
+        """Return the results of the last launch on the host, as `Scene.intersect`. Waits for the device."""
+        return self.query.result()
+
+    def run(self) -> Result:
+        """Run one frame outside a graph, grow buffers that were too small, and return its result. Waits for the device.
+
+        Serves to size buffers on a hard frame. Graphs captured before a buffer grew must be captured anew.
+
+        Raises:
+            ValueError: As `check`.
+        """
+        check_device(self.device, "FrameGraph.run (launch can)")
+        with self.query.guard.launching(self):
+            self._set_objects()
+            result = self.query.run()
+        self.check()
+        return result
+
+    def clear_faults(self):
+        """Forget what `check` would raise."""
+        check_device(self.device, "FrameGraph.clear_faults")
+        self._bad_poses.assign(np.array(NO_FAULTS, np.int32))
+        self._update.faults.assign(np.array(NO_FAULTS, np.int32))
+        self._demand.zero_()
+        self.query.guard.clear_stale()
+
+    def check(self):
+        """Raise what went wrong in any frame since the last call. Waits for the device.
+
+        Raises:
+            RuntimeError: A frame was the replay of a graph captured before a buffer grew; it found nothing.
+            ValueError: A pose was not finite or a quaternion off unit length by more than 1e-3 (its object kept the
+                pose before); a LOD was out of range (the nearer end was taken).
+            CapacityError: Pairs, hits or face pairs that float32 leaves open outran their buffers; names the demand,
+                and whatever else was wrong.
+        """
+        check_device(self.device, "FrameGraph.check")
+        poses, lods, demand = self._bad_poses.numpy().copy(), self._update.faults.numpy().copy(), self._demand.numpy()
+        found, hits, unsure, stale = (int(value) for value in demand)
+        self.clear_faults()
+        wrong, lost = [], []
+        if poses[0]:
+            wrong.append(
+                f"poses: {poses[0]} rows since the last check were not finite or not of unit quaternions; the first "
+                f"object that had one is {poses[1]}, and kept its pose"
+            )
+        if lods[0]:
+            wrong.append(
+                f"lods: {lods[0]} entries since the last check were out of range; the first one that had one is "
+                f"{lods[1]}, and took the nearer end"
+            )
+        room = {"pair_capacity": len(self.query.pairs)}
+        demands = {"pair_capacity": found, "capacity": hits, "unsure_capacity": unsure}
+        if self.query.output == "faces":
+            room["capacity"] = len(self.query.hits.face)
+        if len(self.query.hits.unsure):
+            room["unsure_capacity"] = len(self.query.hits.unsure)
+        for name, places in room.items():
+            if demands[name] > places:
+                lost.append(
+                    f"a frame since the last check needed {name}={demands[name]}, the frame graph has room for {places}"
+                )
+        if stale:
+            stale_frame = f"a frame since the last check is lost: its graph {STALE_GRAPH}"
+            raise RuntimeError("; ".join([stale_frame, *lost, *wrong]))
+        if lost:
+            raise CapacityError("; ".join([*lost, *wrong]))
+        if wrong:
+            raise ValueError("; ".join(wrong))

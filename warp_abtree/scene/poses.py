@@ -1,0 +1,108 @@
+"""Poses that a caller hands in: checked before anything moves, and read where they lie on a GPU."""
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import is_device_array, to_numpy, wrap_array
+from warp_abtree.kernels import place_poses as place
+
+QUATERNION_TOLERANCE = 1e-3
+RIGID_TOLERANCE = 1e-6
+
+REALS = (wp.float32, wp.float64)
+# Warp's types of a pose, their numbers, and how many.
+POSE_TYPES = {
+    wp.transformf: (wp.float32, 7),
+    wp.transformd: (wp.float64, 7),
+    wp.mat44f: (wp.float32, 16),
+    wp.mat44d: (wp.float64, 16),
+}
+NONE_BAD = 2**31 - 1
+
+
+def check_poses(poses, what="poses", first=0) -> np.ndarray:
+    """Return poses as float64, (n, 7) or (n, 4, 4).
+
+    Args:
+        first: Number of the first pose, for messages.
+
+    Raises:
+        ValueError: Another shape, a number that is not finite, a quaternion whose norm is off by more than 1e-3, a
+            matrix that is not rigid within 1e-6.
+    """
+    poses = to_numpy(poses, what)
+    if not (poses.ndim == 2 and poses.shape[1] == 7) and not (poses.ndim == 3 and poses.shape[1:] == (4, 4)):
+        raise ValueError(f"{what}: shape {poses.shape} is neither (n, 7) nor (n, 4, 4)")
+    poses = poses.astype(np.float64)
+    bad = ~np.isfinite(poses).all(tuple(range(1, poses.ndim)))
+    if bad.any():
+        raise ValueError(f"{what}: pose {first + np.flatnonzero(bad)[0]} is not finite")
+    if poses.ndim == 2:
+        norm = np.sqrt((poses[:, 3:] ** 2).sum(1))
+        bad = ~(np.abs(norm - 1) <= QUATERNION_TOLERANCE)
+        if bad.any():
+            i = int(np.flatnonzero(bad)[0])
+            raise ValueError(
+                f"{what}: pose {first + i} has a quaternion of norm {norm[i]:.6g}, "
+                f"off 1 by more than {QUATERNION_TOLERANCE}"
+            )
+        return poses
+    rotation = poses[:, :3, :3]
+    gram = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max((1, 2))
+    bad = ~(gram <= RIGID_TOLERANCE) | ~(np.linalg.det(rotation) > 0)
+    bad |= np.abs(poses[:, 3] - [0, 0, 0, 1]).max(1) > 0
+    if bad.any():
+        raise ValueError(f"{what}: matrix {first + np.flatnonzero(bad)[0]} is not rigid within 1e-6")
+    return poses
+
+
+def device_rows(poses, device, what="poses"):
+    """Return poses that lie on a GPU as rows of 7 or 16 numbers of it, without a copy where they are contiguous.
+
+    Args:
+        poses: (n, 7) or (n, 4, 4), float32 or float64, of any framework; or Warp's transforms or matrices, (n,).
+
+    Returns:
+        Warp array (n, 7) or (n, 16); None where the poses do not lie on this device, or are of another kind.
+    """
+    if not device.is_cuda or not is_device_array(poses):
+        return None
+    array = wrap_array(poses, what)
+    if array.device != device:
+        return None
+    if array.ndim == 1 and array.dtype in POSE_TYPES:
+        scalar, width = POSE_TYPES[array.dtype]
+        array = array if array.is_contiguous else array.contiguous()
+        shape = (len(array), width)
+        # The deleter holds the owner of the memory until the rows go.
+        return wp.array(ptr=array.ptr, dtype=scalar, shape=shape, device=device, deleter=lambda *_, owner=array: None)
+    quaternions = array.ndim == 2 and array.shape[1] == 7
+    if array.dtype not in REALS or not (quaternions or array.shape[1:] == (4, 4)):
+        return None
+    array = array if array.is_contiguous else array.contiguous()
+    return array if array.ndim == 2 else array.reshape((array.shape[0], 16))
+
+
+def place_rows(rows, pool):
+    """Check rows of `device_rows` on the device and set the objects of a pool from them. (synchronization point)
+
+    Raises:
+        ValueError: As `check_poses`; nothing is changed.
+    """
+    matrices = rows.shape[1] == 16
+    first = wp.full(1, NONE_BAD, dtype=wp.int32, device=rows.device)
+    inputs = [wp.float64(RIGID_TOLERANCE if matrices else QUATERNION_TOLERANCE), rows, first]
+    wp.launch(place.pose_check(rows.dtype, rows.shape[1]), len(rows), inputs, device=rows.device)
+    bad = int(first.numpy()[0])
+    if bad != NONE_BAD:
+        row = rows[bad : bad + 1].numpy()
+        check_poses(row.reshape(1, 4, 4) if matrices else row, first=bad)
+        raise ValueError(f"poses: pose {bad} is no pose")  # by rounding, where the host finds it just within
+    launch_place(rows, pool)
+    # Whose memory it is may free or change it as soon as this returns, on another stream.
+    wp.synchronize_stream(wp.get_stream(rows.device))
+
+
+def launch_place(rows, pool):
+    """Set the objects of a pool from sound rows of 7 or 16 numbers. One launch: all objects move, or none."""
+    wp.launch(place.pose_setter(rows.dtype, rows.shape[1]), len(rows), [rows, pool], device=rows.device)

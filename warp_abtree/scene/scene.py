@@ -1,0 +1,348 @@
+"""Scene: posed objects at levels of detail, and every question that one can ask of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
+from warp_abtree.model.model import Model
+from warp_abtree.query.broad_phase import EVERY_WORLD, BroadPhase, exclusion_keys
+from warp_abtree.query.contacts import ContactQuery, contact_dtypes
+from warp_abtree.query.narrow_phase import Query, Result, check_request, check_within
+from warp_abtree.scene.poses import check_poses, device_rows, launch_place, place_rows
+from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
+from warp_abtree.state.update import UpdateStats, set_object_lods
+
+
+@dataclass(frozen=True)
+class TreeState:
+    """The AB-Tree of one object at its LOD, on the host.
+
+    Attributes:
+        lod: Where it stands.
+        status: 0 inactive, 1 active, per heap node (the root is 1), int32.
+        lower, upper: Boxes [model units], model frame, float64 (nodes, 3), rounded outwards; (+inf, -inf) where
+            inactive.
+        skip: The node that a traversal visits in place of each, -1 where inactive, int32.
+        face_node: Leaf of each face, int32 (n_f,).
+    """
+
+    lod: int
+    status: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    skip: np.ndarray
+    face_node: np.ndarray
+
+
+class Scene:
+    """Many objects, many worlds, one device.
+
+    Without objects `broad_phase` finds no pairs; `set_poses`, `set_lods` and `intersect` raise ValueError.
+
+    Args:
+        device: Warp device, such as "cpu" or "cuda:0"; None for Warp's default.
+
+    Raises:
+        ValueError: No such device on this machine.
+    """
+
+    def __init__(self, device=None):
+        try:
+            self.device = wp.get_device(device)
+        except Exception as error:
+            present = ", ".join(d.alias for d in wp.get_devices())
+            raise ValueError(f"no device {device!r} on this machine; there is {present} ({error})") from None
+        check_device(self.device)
+        self.models: list[Model] = []
+        self.object_model: list[int] = []
+        self.object_importance: list[int] = []
+        self._world: list[int] = []
+        self._static: list[bool] = []
+        self._added_pose: list[np.ndarray] = []
+        self._lod: list[int] = []
+        self._excluded = np.empty(0, np.int64)
+        self._arrays: tuple[ModelArrays, StateArrays, ObjectArrays] | None = None
+        self._broad_phase: BroadPhase | None = None
+        self._queries: dict[tuple, Query] = {}
+
+    @property
+    def object_count(self) -> int:
+        """Objects added so far."""
+        return len(self.object_model)
+
+    @property
+    def lods(self) -> np.ndarray:
+        """LOD of each object, int32 (n,)."""
+        return np.array(self._lod, np.int32)
+
+    def add(self, model, pose=(0, 0, 0, 0, 0, 0, 1), world=0, lod=None, importance=1, static=False) -> int:
+        """Add an object and return its index.
+
+        Args:
+            model: `Model`.
+            pose: x y z qx qy qz qw [world units, unit quaternion], or a rigid (4, 4) matrix.
+            world: The broad phase never pairs objects of different worlds; -1 is in every world.
+            lod: LOD to stand at; None is the finest.
+            importance: Application context beta of the LOD selection, 1, 2 or 3 (paper, section 4.2).
+            static: Whether the broad phase never pairs it with another static object, a bool.
+
+        Raises:
+            TypeError: model is no Model.
+            ValueError: Anything else is out of range; nothing is added.
+            RuntimeError: A graph is being captured.
+        """
+        if not isinstance(model, Model):
+            raise TypeError(f"model is a {type(model).__name__}, not a Model")
+        checked = check_poses(to_numpy(pose, "pose")[None], "pose")[0]
+        world = whole_number(world, "world", EVERY_WORLD, 2**31 - 1)
+        importance = whole_number(importance, "importance", 1, 3)
+        if not isinstance(static, bool | np.bool_):
+            raise ValueError(f"static {static!r} is neither True nor False")
+        lod = model.lod_max if lod is None else model.check_lod(lod)
+        known = next((i for i, other in enumerate(self.models) if other is model), len(self.models))
+        self._retire()
+        count = self.object_count
+        columns: list[list] = [self._world, self._static, self._added_pose, self._lod]
+        columns += [self.object_importance, self.object_model]
+        try:
+            if known == len(self.models):
+                self.models.append(model)
+            for column, value in zip(columns, (world, bool(static), checked, lod, importance, known)):
+                column.append(value)
+        except BaseException:
+            for column in columns:
+                del column[count:]
+            raise
+        return count
+
+    def _retire(self):
+        """Take the device's poses back before the arrays are made anew. Waits for the device."""
+        if self._arrays is None:
+            return
+        check_device(self.device, "adding an object")
+        _, states, objects = self._arrays
+        matrices = np.tile(np.eye(4), (len(objects.state), 1, 1))
+        matrices[:, :3, :3] = objects.pool.rotation.numpy()
+        matrices[:, :3, 3] = objects.pool.position.numpy()
+        states.generation.advance()
+        objects.generation.advance()
+        self._added_pose = list(matrices)
+        self._queries.clear()
+        self._broad_phase = None
+        self._arrays = None
+
+    def arrays(self) -> tuple[ModelArrays, StateArrays, ObjectArrays]:
+        """Return (`ModelArrays`, `StateArrays`, `ObjectArrays`), made at the first use after an `add`.
+
+        Tree states that an interrupted change of LODs has left torn are made anew.
+        """
+        if self._arrays is None:
+            if not self.object_model:
+                raise ValueError("the scene has no object")
+            check_device(self.device, "making a scene's arrays")
+            models = ModelArrays(self.models, self.device)
+            states = StateArrays(models, self.device)
+            objects = ObjectArrays(self._world, self._static, self.device)
+            self._bring_lods(models, states, objects)
+            self._place_added(objects.pool)
+            self._arrays = (models, states, objects)
+        elif self._arrays[1].torn:
+            check_device(self.device, "making tree states anew")
+            models, states, objects = self._arrays
+            states.reset()
+            objects.state = np.full(self.object_count, -1, np.int32)
+            self._bring_lods(models, states, objects)
+            states.generation.resume()
+            states.torn = False
+        return self._arrays
+
+    def _bring_lods(self, models, states, objects):
+        set_object_lods(models, states, objects, np.array(self.object_model), np.array(self._lod))
+
+    def _place_added(self, pool):
+        """Set poses of both kinds: the device turns quaternions into matrices, matrices are taken as they are."""
+        poses = self._added_pose
+        matrix = np.array([pose.ndim == 2 for pose in poses])
+        rows = np.zeros((len(poses), 7))
+        rows[:, 6] = 1.0
+        for i in np.flatnonzero(~matrix):
+            rows[i] = poses[i]
+        launch_place(wp.array(rows, dtype=wp.float64, device=self.device), pool)
+        if matrix.any():
+            rotation, position = pool.rotation.numpy(), pool.position.numpy()
+            stacked = np.array([poses[i] for i in np.flatnonzero(matrix)])
+            rotation[matrix], position[matrix] = stacked[:, :3, :3], stacked[:, :3, 3]
+            pool.rotation.assign(rotation)
+            pool.position.assign(position)
+
+    def set_poses(self, poses):
+        """Set the pose of every object.
+
+        Args:
+            poses: (n, 7) x y z qx qy qz qw, quaternions normalised in float64, or (n, 4, 4) rigid matrices taken as
+                they are; float32 or float64 [world units]. An array of any framework; one on the scene's GPU is checked
+                and read there. (synchronization point)
+
+        Raises:
+            ValueError: Wrong shape or count, a number that is not finite, a quaternion or matrix that is no rotation;
+                nothing is changed.
+        """
+        check_device(self.device, "Scene.set_poses (PoseInput can)")
+        rows = device_rows(poses, self.device)
+        if rows is None:
+            poses = check_poses(poses)
+        given = len(poses) if rows is None else len(rows)
+        if given != self.object_count:
+            raise ValueError(f"poses: {given} given for {self.object_count} objects")
+        pool = self.arrays()[2].pool
+        if rows is not None:
+            place_rows(rows, pool)
+        else:
+            launch_place(wp.array(poses.reshape(given, -1), dtype=wp.float64, device=self.device), pool)
+
+    def set_lods(self, lods) -> UpdateStats:
+        """Bring every object to a LOD: meshes are refined and trees updated in one batch, states are shared.
+
+        Args:
+            lods: (n,) whole numbers, each from 0 to its model's lod_max; of any framework, copied from a GPU.
+
+        Raises:
+            ValueError: Wrong shape or a LOD out of range; nothing is changed.
+            RuntimeError: The device is out of memory, or a launch fails; LODs and answers are as before.
+        """
+        check_device(self.device, "Scene.set_lods (FrameGraph.lods can)")
+        lods = to_numpy(lods, "lods")
+        if lods.shape != (self.object_count,):
+            raise ValueError(f"lods: shape {lods.shape} given for {self.object_count} objects")
+        if lods.dtype.kind not in "iu" and not (lods.dtype.kind == "f" and (lods == np.floor(lods)).all()):
+            raise ValueError(f"lods: type {lods.dtype} holds no whole numbers")
+        top = np.array([model.lod_max for model in self.models])[self.object_model]
+        bad = np.flatnonzero((lods < 0) | (lods > top))
+        if len(bad):
+            i = int(bad[0])
+            raise ValueError(f"lods: object {i} asks for LOD {lods[i]}, outside 0 .. {top[i]}")
+        models, states, objects = self.arrays()
+        targets = lods.astype(np.int64)
+        with states.change():
+            stats = set_object_lods(models, states, objects, np.array(self.object_model), targets)
+            self._lod = targets.tolist()
+        return stats
+
+    def check_pairs(self, pairs) -> np.ndarray:
+        """Return object pairs as int32 (p, 2).
+
+        Raises:
+            ValueError: Wrong shape, an index that is no object, an object paired with itself.
+        """
+        pairs = to_numpy(pairs, "pairs")
+        if pairs.shape in ((0,), (0, 2)):
+            return np.empty((0, 2), np.int32)
+        if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind not in "iu":
+            raise ValueError(f"pairs: shape {pairs.shape} and type {pairs.dtype}, not whole numbers of shape (p, 2)")
+        if pairs.min() < 0 or pairs.max() >= self.object_count:
+            bad = np.flatnonzero(((pairs < 0) | (pairs >= self.object_count)).any(1))
+            raise ValueError(
+                f"pairs: pair {bad[0]} is {tuple(pairs[bad[0]].tolist())}, the scene has {self.object_count} objects"
+            )
+        same = pairs[:, 0] == pairs[:, 1]
+        if same.any():
+            first = int(same.argmax())
+            raise ValueError(f"pairs: pair {first} pairs object {pairs[first, 0]} with itself")
+        return pairs.astype(np.int32)
+
+    def filter(self, pairs):
+        """Exclude object pairs from every later broad phase.
+
+        Raises:
+            ValueError: As `check_pairs`.
+        """
+        excluded = np.union1d(self._excluded, exclusion_keys(self.check_pairs(pairs)))
+        if self._arrays is not None:
+            self._arrays[2].filter_generation.advance()
+        self._broad_phase = None
+        self._excluded = excluded
+
+    def excluded_keys(self) -> np.ndarray:
+        """Return the excluded pairs as sorted keys i * 2^32 + j, i < j, int64."""
+        return self._excluded
+
+    def broad_phase(self) -> np.ndarray:
+        """Return the object pairs whose posed root boxes overlap, int32 (p, 2), sorted, i < j. Waits for the device.
+
+        Worlds never mix (-1 is in every one), two static objects never pair, filtered pairs stay out.
+        """
+        check_device(self.device, "Scene.broad_phase")
+        if self.object_count < 2:
+            return np.empty((0, 2), np.int32)
+        arrays = self.arrays()
+        if self._broad_phase is None:
+            self._broad_phase = BroadPhase(*arrays, self._excluded)
+        return self._broad_phase.find()
+
+    def intersect(self, pairs=None, output="any", precision="exact", within=None, contact_dtype=np.float64) -> Result:
+        """Test object pairs for intersection, exactly as posed and at their LODs. Waits for the device.
+
+        Touching counts. Columns of the result follow the order in which a pair names its objects.
+
+        Args:
+            pairs: (p, 2) object indices, asked whatever their worlds, also where both are static or filtered out of the
+                broad phase; None asks the broad phase.
+            output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
+                an object pair's summary of them, stands in `warp_abtree.query.contacts`.
+            precision: "exact": the answer is exact for A's vertices and the posed ones of B, A the object with the
+                smaller index. "float64" and "float32" take the signs of rounded determinants.
+            within: Distance d >= 0 [world units], or (p,) of them: `result.apart` tells the pairs whose posed surfaces,
+                at their LODs, are proved farther apart than d; never true where they are not, whatever the rounding.
+                With d = error_at(A) + error_at(B) it proves that the original meshes do not intersect. The broad phase
+                finds overlapping boxes only, whatever d is.
+            contact_dtype: Type of the real numbers in contacts, float64 or float32.
+
+        Raises:
+            ValueError: Bad pairs, a bad distance, an unknown option, or a scene without objects.
+        """
+        check_device(self.device, "Scene.intersect (Query.launch can)")
+        contact_dtypes(contact_dtype)
+        with_contacts = output == "contacts"
+        check_request("faces" if with_contacts else output, precision)
+        pairs = self.broad_phase() if pairs is None else self.check_pairs(pairs)
+        if within is not None:
+            within = check_within(within, len(pairs))
+        asked = (output, precision, within is not None)
+        # A query that fails, for lack of memory, is not kept: it gives its own back.
+        query = self._queries.pop(asked, None)
+        if query is not None:
+            query.set_pairs(pairs, within)
+        elif with_contacts:
+            query = ContactQuery(self, pairs=pairs, precision=precision, within=within)
+        else:
+            query = Query(self, output, pairs=pairs, precision=precision, within=within)
+        if isinstance(query, ContactQuery):
+            query.contact_dtype = contact_dtype
+        result = query.run()
+        self._queries[asked] = query
+        return result
+
+    def tree_state(self, i) -> TreeState:
+        """Return the AB-Tree of an object at its LOD. Waits for the device.
+
+        Raises:
+            ValueError: No such object.
+        """
+        check_device(self.device, "Scene.tree_state")
+        i = whole_number(i, "object", 0, self.object_count - 1)
+        _, states, objects = self.arrays()
+        slot = states.slots[objects.state[i]]
+        model = self.models[slot.model]
+        nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
+        lower, upper, skip = states.read_nodes(slot, model.tree.node_count)
+        lower, upper = lower + model.centre, upper + model.centre
+        return TreeState(
+            slot.lod,
+            states.pool.node_status[nodes].numpy().copy(),
+            np.where(np.isinf(lower), lower, np.nextafter(lower, -np.inf)),
+            np.where(np.isinf(upper), upper, np.nextafter(upper, np.inf)),
+            skip,
+            model.tree.leaf_node.copy(),
+        )

@@ -1,0 +1,347 @@
+"""`sweep`: one pair of models at very many relative poses, no objects made.
+
+What a pair of models needs on a device is kept for the next call. Poses pass through two lanes of buffers: while a GPU
+works on a chunk, the one before is read and the next one brought there.
+"""
+
+import functools
+import weakref
+from collections import deque
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import check_device, to_numpy
+from warp_abtree.checks.device_lock import device_turn
+from warp_abtree.kernels.sweep import NONE_REFUSED, place_matrix_kernel, place_quaternion_kernel, report_chunk_kernel
+from warp_abtree.query.narrow_phase import Query, check_request
+from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE, check_poses, device_rows
+from warp_abtree.scene.scene import Scene
+from warp_abtree.state.arrays import ObjectArrays
+
+# Poses asked at a time: enough to fill a GPU, few enough that millions need no more memory; fewer where few are asked.
+CHUNKS = (1024, 8192, 65536)
+# Pairs of models whose device arrays are kept, and rows of their lists that are.
+KEPT_PAIRS = 4
+KEPT_ROWS = 2**20
+
+SCALARS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
+# Numbers of a row, and what sets objects from rows: quaternions, and matrices.
+PLACING = {7: (place_quaternion_kernel, QUATERNION_TOLERANCE), 16: (place_matrix_kernel, RIGID_TOLERANCE)}
+ANSWERS = {"any": np.dtype(bool), "count": np.dtype(np.int64)}
+
+_kept: dict[tuple, "_PosedModels"] = {}
+
+
+class _HostPoses:
+    """Poses in the memory of the host, rows of 7 or 16 numbers."""
+
+    def __init__(self, rows):
+        self.rows = rows
+        self.scalar, self.width = SCALARS[rows.dtype], rows.shape[1]
+
+    def __len__(self):
+        return len(self.rows)
+
+    def row(self, i):
+        return self.rows[i]
+
+
+class _DevicePoses:
+    """Poses in the memory of the device that asks, rows of 7 or 16 numbers."""
+
+    def __init__(self, rows):
+        self.scalar, (self.count, self.width) = rows.dtype, rows.shape
+        self.flat = rows.flatten()
+
+    def __len__(self):
+        return self.count
+
+    def row(self, i):
+        return self.flat[self.width * i : self.width * (i + 1)].numpy()
+
+
+def _take_poses(poses, device):
+    """Return poses where they are, or on the host.
+
+    Raises:
+        ValueError: No numbers, or another shape than (p, 7) and (p, 4, 4).
+    """
+    rows = device_rows(poses, device)
+    if rows is not None:
+        return _DevicePoses(rows)
+    rows = to_numpy(poses, "poses")
+    if rows.shape == (0,):
+        rows = np.empty((0, 7))
+    if not (rows.ndim == 2 and rows.shape[1] == 7) and not (rows.ndim == 3 and rows.shape[1:] == (4, 4)):
+        raise ValueError(f"poses: shape {rows.shape} is neither (p, 7) nor (p, 4, 4)")
+    rows = rows.reshape(len(rows), 7 if rows.ndim == 2 else 16)
+    return _HostPoses(rows if rows.dtype in SCALARS else rows.astype(np.float64))
+
+
+def _refuse(poses, i):
+    row = np.asarray(poses.row(i), np.float64)
+    check_poses(row[None] if poses.width == 7 else row.reshape(1, 4, 4), first=i)
+    raise ValueError(f"poses: pose {i} is no pose")  # by rounding, where the host finds it just within
+
+
+class _PosedModels:
+    """A pair of models on a device, and chunks of several sizes, each made when first needed."""
+
+    def __init__(self, pair: Scene, owners):
+        self.device = pair.device
+        self.owners = owners  # weak, and taken out of what is kept when a model goes
+        self.models, self.states, objects = pair.arrays()
+        self.state = objects.state
+        self.chunks: dict[int, _Chunk] = {}
+
+    def find_chunk(self, count):
+        """Return the smallest chunk that holds a number of poses, or the largest there is."""
+        room = next((room for room in CHUNKS if room >= count), CHUNKS[-1])
+        if room not in self.chunks:
+            self.chunks[room] = _Chunk(self, room)
+        return self.chunks[room]
+
+
+class _Chunk:
+    """What a `Query` asks of a scene, for object 0, model A, and objects 1 to `room`, all of them model B."""
+
+    def __init__(self, posed: _PosedModels, room):
+        self.device = posed.device
+        self.room = room
+        self.objects = ObjectArrays(np.zeros(room + 1), np.zeros(room + 1), self.device)
+        self.objects.set_states(np.repeat(posed.state, [1, room]))
+        self.objects.pool.rotation[:1].assign(np.eye(3)[None])
+        self._arrays = (posed.models, posed.states, self.objects)
+        self.question: _Question | None = None
+
+    def arrays(self):
+        return self._arrays
+
+    def check_pairs(self, pairs):
+        return pairs
+
+    def ask(self, output, precision):
+        """Return the question that was asked last if it is the same, else another."""
+        key = (output, precision)
+        if self.question is None or self.question.key != key:
+            self.question = None  # its memory first
+            self.question = _Question(self, key)
+        return self.question
+
+    def trim(self):
+        """Give long lists back."""
+        if self.question is not None and not self.question.is_small():
+            self.question = None
+
+
+@functools.cache
+def _find_copy_stream(alias):
+    """Return a device's stream for transfers, one for all: Warp makes and ends streams on one thread at a time."""
+    return wp.Stream(alias)
+
+
+class _Lane:
+    """Buffers through which a chunk passes: poses in, answers out. On the CPU host and device share them."""
+
+    def __init__(self, device, room, output, scalar, width):
+        def mirror(array):
+            return array if device.is_cpu else wp.empty(len(array), dtype=array.dtype, device="cpu", pinned=True)
+
+        self.width = width
+        self.poses = wp.empty((room, width), dtype=scalar, device=device)
+        self.answer = wp.empty(room if output == "any" else 0, dtype=wp.uint8, device=device)
+        self.report = wp.empty(2, dtype=wp.int32, device=device)
+        self.poses_flat = self.poses.flatten()
+        self.poses_host, self.report_host = mirror(self.poses_flat), mirror(self.report)
+        answer = wp.empty(room, dtype=wp.int64, device=device) if output == "count" else self.answer
+        self.answer_host = mirror(answer)
+        self.unsure_room = 0
+        if device.is_cuda:
+            self.loaded, self.done = wp.Event(device), wp.Event(device)
+
+
+class _Question:
+    """One kind of question about a pair of models: its query and its lanes."""
+
+    def __init__(self, chunk: _Chunk, key):
+        self.key = key
+        self.output, precision = key
+        self.device, self.room, self.objects = chunk.device, chunk.room, chunk.objects
+        self.pairs = np.zeros((self.room, 2), np.int32)
+        self.pairs[:, 1] = np.arange(1, self.room + 1)
+        self.query = Query(chunk, self.output, pairs=self.pairs, precision=precision)
+        self.count = self.room
+        self.lanes: dict = {}
+        self.copies = _find_copy_stream(self.device.alias) if self.device.is_cuda else None
+
+    def _find_lanes(self, poses):
+        """Return the lanes of poses of one type, made at the first use."""
+        kind = poses.scalar, poses.width
+        if kind not in self.lanes:
+            count = 1 if self.output == "faces" else 2
+            made = [_Lane(self.device, self.room, self.output, *kind) for _ in range(count)]
+            if self.device.is_cuda:
+                # Another stream may touch what was allocated on this one only once it is there.
+                wp.synchronize_device(self.device)
+            self.lanes[kind] = made
+        return self.lanes[kind]
+
+    def _load(self, lane, poses, start, count):
+        """Bring poses into a lane whose last chunk is over."""
+        width = lane.width
+        if isinstance(poses, _DevicePoses):
+            wp.copy(lane.poses_flat, poses.flat, src_offset=width * start, count=width * count)
+            return
+        np.copyto(lane.poses_host.numpy().reshape(-1, width)[:count], poses.rows[start : start + count])
+        if self.copies is not None:
+            wp.copy(lane.poses_flat, lane.poses_host, count=width * count, stream=self.copies)
+            self.copies.record_event(lane.loaded)
+            wp.get_stream(self.device).wait_event(lane.loaded)
+
+    def _place(self, lane):
+        lane.report.fill_(NONE_REFUSED)
+        kernel, tolerance = PLACING[lane.width]
+        inputs = [wp.float64(tolerance), lane.poses, self.objects.pool, lane.report]
+        wp.launch(kernel, self.count, inputs, device=self.device)
+
+    def _launch(self, lane):
+        self._place(lane)
+        self.query.launch()
+        inputs = [self.query.hits, lane.report, lane.answer]
+        wp.launch(report_chunk_kernel, self.count, inputs, device=self.device)
+
+    def _begin(self, lane, poses, start, count):
+        self._load(lane, poses, start, count)
+        lane.unsure_room = len(self.query.hits.unsure)
+        if count != self.count:
+            self.query.pair_count.fill_(count)
+            self.count = count
+        self._launch(lane)
+        if self.output == "count":
+            wp.copy(lane.answer_host, self.query.hits.count, count=count)
+        if self.device.is_cuda:
+            if self.output == "any":
+                wp.copy(lane.answer_host, lane.answer, count=count)
+            wp.copy(lane.report_host, lane.report)
+            wp.get_stream(self.device).record_event(lane.done)
+
+    def _finish(self, lane, poses, start, count):
+        """Wait for a chunk and return its answers."""
+        if self.device.is_cuda:
+            wp.synchronize_event(lane.done)
+        refused, unsure = lane.report_host.numpy().tolist()
+        if refused != NONE_REFUSED:
+            _refuse(poses, start + refused)
+        if unsure % 2**32 > lane.unsure_room:  # which may have grown since
+            return getattr(self._ask_again(lane, count), self.output)
+        return lane.answer_host.numpy()[:count]
+
+    def _ask_again(self, lane, count):
+        """Ask the poses in a lane, with buffers that grow as needed. Waits for the device."""
+        self.query.set_pairs(self.pairs[:count])
+        self.count = count
+        self._place(lane)
+        return self.query.run()
+
+    def list_answers(self, poses):
+        """Return "any" or "count" of all poses."""
+        answers = np.empty(len(poses), ANSWERS[self.output])
+        lanes, waiting = self._find_lanes(poses), deque()
+
+        def finish():
+            lane, start, count = waiting.popleft()
+            answers[start : start + count] = self._finish(lane, poses, start, count)
+
+        try:
+            for turn, start in enumerate(range(0, len(poses), self.room)):
+                lane, count = lanes[turn % len(lanes)], min(self.room, len(poses) - start)
+                if len(waiting) == len(lanes):
+                    finish()
+                self._begin(lane, poses, start, count)
+                waiting.append((lane, start, count))
+            while waiting:
+                finish()
+        except BaseException:
+            # A pose was refused, or an interruption came: lanes whose transfers are under way must not go yet.
+            wp.synchronize_device(self.device)
+            raise
+        return answers
+
+    def list_faces(self, poses):
+        """Return the rows of "faces" of all poses."""
+        parts, lane = [], self._find_lanes(poses)[0]
+        for start in range(0, len(poses), self.room):
+            count = min(self.room, len(poses) - start)
+            self._load(lane, poses, start, count)
+            found = self._ask_again(lane, count).faces
+            refused = int(lane.report.numpy()[0])
+            if refused != NONE_REFUSED:
+                _refuse(poses, start + refused)
+            found[:, 0] += start
+            parts.append(found)
+        return np.concatenate(parts)
+
+    def is_small(self):
+        return len(self.query.hits.face) + len(self.query.hits.unsure) <= KEPT_ROWS
+
+
+def _keep(key, posed):
+    """Keep what a pair of models has on the device, in the place of what was asked longest ago."""
+    _kept[key] = posed
+    for old in list(_kept)[:-KEPT_PAIRS]:
+        _kept.pop(old, None)
+
+
+def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precision="exact", device=None):
+    """Test one pair of models at many poses of B in A's frame. Waits for the device, once a chunk of 65,536 poses.
+
+    Poses are checked on the device; on CUDA transfers overlap with launches, except for "faces". The arrays of the last
+    four pairs of models, LODs and devices stay on the device for the next call as long as both models live: models and
+    tree states, some 190 bytes a face, and 0.5 KB for each of at most 74,752 poses in chunks of three sizes. Whatever
+    the number of poses, a call needs no more memory besides its answer. Calls of several threads take turns on a GPU.
+
+    Args:
+        model_a, model_b: `Model`; may be the same.
+        poses: (p, 7) x y z qx qy qz qw [model units of A, unit quaternions, normalised in float64], or rigid (p, 4, 4)
+            matrices, taken as they are; float32 or float64, of any framework. What lies on the GPU that asks is read
+            where it is, Warp's transforms and matrices (p,) too.
+        lod_a, lod_b: LODs; None is the finest.
+        output: "any", "count" or "faces".
+        precision: As `Scene.intersect`, exact for A's vertices and the posed ones of B.
+        device: Warp device; None for Warp's default.
+
+    Returns:
+        For "any" bool (p,), for "count" the intersecting face pairs of each pose, int64 (p,), for "faces" rows (pose,
+        face of A, face of B), int32 (k, 3), sorted.
+
+    Raises:
+        TypeError: model_a or model_b is no Model.
+        ValueError: Bad poses, the first of which is named, a LOD out of range, an unknown option or device.
+        RuntimeError: A graph is being captured.
+    """
+    check_request(output, precision)
+    pair = Scene(device)
+    check_device(pair.device, "ab.sweep")
+    with device_turn(pair.device):
+        return _sweep(pair, (model_a, model_b), poses, (lod_a, lod_b), output, precision)
+
+
+def _sweep(pair, models, poses, lods, output, precision):
+    poses = _take_poses(poses, pair.device)
+    for model, lod in zip(models, lods):
+        pair.add(model, lod=lod)
+    if len(poses) == 0:
+        return np.empty((0, 3), np.int32) if output == "faces" else np.empty(0, ANSWERS[output])
+    key = (*map(id, models), *pair.lods.tolist(), pair.device.alias)
+    # Taken out while in use: a call from another thread has its own, and one that fails leaves nothing behind.
+    posed = _kept.pop(key, None)
+    if posed is None:
+        owners = [weakref.ref(model, lambda _: _kept.pop(key, None)) for model in models]
+        posed = _PosedModels(pair, owners)
+    chunk = posed.find_chunk(len(poses))
+    question = chunk.ask(output, precision)
+    answers = question.list_faces(poses) if output == "faces" else question.list_answers(poses)
+    chunk.trim()
+    _keep(key, posed)
+    return answers

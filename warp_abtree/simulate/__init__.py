@@ -1,0 +1,1 @@
+"""Algorithm 4 of the paper: frames, motion and rigid bodies."""

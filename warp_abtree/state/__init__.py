@@ -1,0 +1,1 @@
+"""What an LOD decides, on a device: tree states and their updates."""
