@@ -6,7 +6,7 @@ import warp as wp
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
-from warp_abtree.kernels.traversal.simd import take_slots
+from warp_abtree.kernels.traversal.warp_stack import take_slots
 from warp_abtree.query.cpu_threads import core_count, launch_on_cores
 
 PAIRS = np.array([(i, j) for i in range(12) for j in range(12) if i != j])

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_abtree.kernels.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import mark, refit
-from warp_abtree.kernels.update.work_lists import UpdatePlan
+from warp_abtree.kernels.update.work_lists import WorkLists
 
 FACE_COUNT_MAX = 2**30
 # Nodes of a level that one block refits, at most: a launch costs about as much. And the threads of that block.
@@ -154,19 +154,19 @@ class UpdateWork:
     """An update of many tree states: what kernels work off, and the most that there can be of it.
 
     Attributes:
-        plan: `UpdatePlan` for kernels.
+        plan: `WorkLists` for kernels.
         entry_room, face_room: Faces in the slices of partial updates, and of states under full update, at most.
         level_room: Nodes to refit on each level, the root's first, at most; as many entries as there are levels.
     """
 
-    plan: UpdatePlan
+    plan: WorkLists
     entry_room: int
     face_room: int
     level_room: list
     device: wp.Device
 
 
-def make_level_lists(plan: UpdatePlan, marked_room: list, device):
+def make_level_lists(plan: WorkLists, marked_room: list, device):
     """Make the worklists of an update, each of its own length."""
     room = np.zeros(int(LEVEL_MAX), np.int64)
     room[: len(marked_room)] = marked_room
@@ -202,7 +202,7 @@ class UpdateBatch(UpdateWork):
         whole_count = np.array([np.sum(depth[whole] >= level) for level in range(int(LEVEL_MAX))], np.int64)
         marked_room = [min(entries, int(np.sum(depth[partial] >= level)) << level) for level in levels]
         level_room = [room + (int(whole_count[level]) << level) for level, room in enumerate(marked_room)]
-        plan = UpdatePlan()
+        plan = WorkLists()
 
         def upload(values, dtype=wp.int32):
             return wp.array(np.asarray(values, np.int64), dtype=dtype, device=device)

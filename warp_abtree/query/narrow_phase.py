@@ -14,7 +14,7 @@ from warp_abtree.kernels.traversal import dual_tree as traverse
 from warp_abtree.kernels.traversal import face_pairs as faces
 from warp_abtree.kernels.traversal import load_balance as share
 from warp_abtree.kernels.traversal import relative_pose as relate
-from warp_abtree.kernels.traversal import uncertain_pairs as settle
+from warp_abtree.kernels.traversal import simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase, CapacityError
 from warp_abtree.query.cpu_threads import core_count, launch_on_cores
@@ -22,7 +22,7 @@ from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.generation import LaunchGuard
 
 OUTPUTS = {"any": faces.OUTPUT_ANY, "count": faces.OUTPUT_COUNT, "faces": faces.OUTPUT_FACES}
-PRECISIONS = {"exact": predicates.EXACT, "float64": predicates.FLOAT64, "float32": predicates.FLOAT32}
+PRECISIONS = {"exact": predicates.EXACT, "float32": predicates.FLOAT32}
 # Warps that share a single pair; c pairs have 1 / sqrt(c) of that each.
 PARTS_MAX = 128
 
@@ -41,9 +41,9 @@ ROWS_TO_PACK = 1000
 WARPS_A_PROCESSOR = 16
 FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
 # So that each finds a mailbox for all that it gives away at once.
-WARPS_MAX = share.MAILBOX_COUNT // int(share.SHARES_AT_ONCE)
+WARPS_MAX = share.SLOT_COUNT // int(share.DONATIONS_AT_ONCE)
 
-EXACT, FLOAT64 = int(predicates.EXACT), int(predicates.FLOAT64)
+EXACT = int(predicates.EXACT)
 
 
 def check_request(output: str, precision: str):
@@ -55,7 +55,7 @@ def check_request(output: str, precision: str):
     if output not in (*OUTPUTS, "contacts"):
         raise ValueError(f"output {output!r} is none of 'any', 'count', 'faces', 'contacts'")
     if precision not in tuple(PRECISIONS):
-        raise ValueError(f"precision {precision!r} is none of 'exact', 'float64', 'float32'")
+        raise ValueError(f"precision {precision!r} is none of 'exact', 'float32'")
     if output == "contacts":
         raise ValueError("output 'contacts' is found by ab.ContactQuery, or Scene.intersect")
 
@@ -121,7 +121,7 @@ class Result:
         self.pairs = pairs
         self._pair_demand, self._pair_room = pair_demand, pair_room
         self._hit_demand, self._hit_room = 0, len(hits.face)
-        self._unsure_room = len(hits.unsure)
+        self._unsure_room = len(hits.uncertain)
         p = len(pairs)
         self.any = hits.any_hit.numpy()[:p] != 0
         # Any: who asked for them knows that they are not None.
@@ -176,7 +176,7 @@ class Query:
         pairs: Object pairs to ask, (p, 2); None runs the broad phase in every launch.
         capacity: Face pairs that `faces` has room for.
         pair_capacity: Pairs that there is room for; by default those given, or a guess for the broad phase.
-        precision: "exact": the sign of every determinant is right. "float64", "float32": the sign of the rounded one.
+        precision: "exact": the sign of every determinant is right. "float32": the sign of the rounded one.
         within: Distances [world units], one for all pairs or (p,) beside given pairs: ask also which pairs are farther
             apart. The proof covers all rounding: pairs beyond by less than about 1e-13 of their size stay unproved, by
             less than 6 s where a rotation is off orthonormal by s, and all for distances from 2^1000 on.
@@ -238,15 +238,15 @@ class Query:
             self.pairs = wp.empty(pair_capacity or 0, dtype=wp.vec2i, device=self.device)
         self.hits = faces.Hits()
         self.hits.total = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self.hits.unsure_total = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self.hits.hard_total = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self.hits.uncertain_total = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self.hits.inexact_total = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.near = None if within is None else self._make_near()
         self.work = share.Work()
-        boxes = share.MAILBOX_COUNT if self.uses_warps() else 0
+        boxes = share.SLOT_COUNT if self.uses_warps() else 0
         self.work.counter = wp.zeros(share.COUNTER_COUNT, dtype=wp.int32, device=self.device)
         self.work.flag = wp.zeros(boxes, dtype=wp.int32, device=self.device)
         self.work.owner = wp.empty(boxes, dtype=wp.vec2i, device=self.device)
-        self.work.item = wp.empty(boxes * share.MAILBOX_ITEMS, dtype=wp.int64, device=self.device)
+        self.work.item = wp.empty(boxes * share.SLOT_ITEMS, dtype=wp.int64, device=self.device)
         self.work.record = self.guard.record()
         self.guard.write_to(self.work.record)
         self._no_distance = wp.empty(0, dtype=wp.float64, device=self.device)
@@ -338,7 +338,7 @@ class Query:
 
     def _make_near(self):
         near = faces.Hits()
-        near.total = near.unsure_total = near.hard_total = wp.zeros(1, dtype=wp.int32, device=self.device)
+        near.total = near.uncertain_total = near.inexact_total = wp.zeros(1, dtype=wp.int32, device=self.device)
         return near
 
     def _upload_within(self, within):
@@ -354,8 +354,8 @@ class Query:
             self.within.fill_(float(self._within))
 
     def _resize_unsure(self, capacity: int):
-        hard = capacity if self.precision == "exact" else 0
-        made = [("unsure", capacity), ("hard", hard)]
+        inexact = capacity if self.precision == "exact" else 0
+        made = [("uncertain", capacity), ("inexact", inexact)]
         self._replace([(self.hits, name, wp.empty(room, dtype=wp.vec3i, device=self.device)) for name, room in made])
 
     def uses_warps(self) -> bool:
@@ -401,25 +401,26 @@ class Query:
     def _launch_traversal(self, within, hits, mode, output):
         pools = [arrays.pool for arrays in self.arrays]
         room = len(self.pairs)
-        inputs = [self.parts_max, output, *pools, self.pair_count, self.pairs, within]
+        self.work.parts_max = self.parts_max
+        inputs = [output, *pools, self.pair_count, self.pairs, within]
         self.guard.record()
         inputs += [self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
-        wp.launch(relate.relate_pair_kernel, dim=dim, inputs=inputs, device=self.device)
+        wp.launch(relate.relative_pose_kernel, dim=dim, inputs=inputs, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits]
         if not self.uses_warps():
             cores = core_count() if self.cores is None else self.cores
             # A launch on a further core costs some 50 us: the work of many pairs apart, of less than one in contact.
             least = 32 if output == int(faces.OUTPUT_ANY) else 1
-            launch_on_cores(traverse.thread_traversal(mode), room, [*inputs, self.work], self.device, cores, least)
+            launch_on_cores(simd.thread_traversal(mode), room, [*inputs, self.work], self.device, cores, least)
             return
         # More than there are parts: those that find none wait for shares.
         warps = max(room, int(4 * self.parts_max * math.sqrt(room)) + 1)
         warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         wp.launch(
-            traverse.warp_traversal(EXACT if mode == FLOAT64 else mode, output == int(faces.OUTPUT_ANY)),
+            traverse.warp_traversal(mode, output == int(faces.OUTPUT_ANY)),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
-            inputs=[self.parts_max, min(self.stack_room, STACK_LENGTH), *inputs, self.work],
+            inputs=[min(self.stack_room, STACK_LENGTH), *inputs, self.work],
             block_dim=WARP_SIZE,
             device=self.device,
         )
@@ -430,11 +431,11 @@ class Query:
             return
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
         self._launch_traversal(self._no_distance, self.hits, mode, output)
-        if len(self.hits.unsure):
-            first = settle.filter_faces_kernel if mode == EXACT else settle.settle_traversal(mode)
+        if len(self.hits.uncertain):
+            first = uncertain_pairs.float64_filter_kernel if mode == EXACT else uncertain_pairs.resolve_rounded_kernel
             passes = [(first, FILTER_WARPS_A_PROCESSOR)]
             if mode == EXACT:
-                passes.append((settle.settle_hard_kernel, EXACT_WARPS_A_PROCESSOR))
+                passes.append((uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR))
             models, states = (arrays.pool for arrays in self.arrays[:2])
             for kernel, warps in passes:
                 threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
@@ -486,7 +487,7 @@ class Query:
     def grow_unsure(self):
         """Make room for the face pairs that wait, as far as there can be, and traverse again until all find it."""
         # How many wait varies for `any`, where the first hit of a pair ends its traversal.
-        while 0 < len(self.hits.unsure) < min(LIST_MAX, demand := self._sum(self.hits.float64_tests)):
+        while 0 < len(self.hits.uncertain) < min(LIST_MAX, demand := self._sum(self.hits.float64_tests)):
             self._resize_unsure(min(2 * demand, LIST_MAX))
             self.traverse()
 

@@ -180,7 +180,7 @@ class FrameGraph:
 
     def _fit_unsure(self, given):
         """Make room for the face pairs that float32 leaves open, unless that room was given; then say what it lacks."""
-        needed, room = int(self._demand.numpy()[2]), len(self.query.hits.unsure)
+        needed, room = int(self._demand.numpy()[2]), len(self.query.hits.uncertain)
         if not 0 < room < needed:
             return
         if given is None:
@@ -202,7 +202,7 @@ class FrameGraph:
             self._set_objects()
             self.query.launch()
             hits, launched = self.query.hits, self.query.guard.launched
-            inputs = [self.query.pair_count, hits.total, hits.unsure_total, launched, self._demand]
+            inputs = [self.query.pair_count, hits.total, hits.uncertain_total, launched, self._demand]
             wp.launch(kernels.tally_demand_kernel, 1, inputs, device=self.device)
 
     def _set_objects(self):
@@ -276,8 +276,8 @@ class FrameGraph:
         demands = {"pair_capacity": found, "capacity": hits, "unsure_capacity": unsure}
         if self.query.output == "faces":
             room["capacity"] = len(self.query.hits.face)
-        if len(self.query.hits.unsure):
-            room["unsure_capacity"] = len(self.query.hits.unsure)
+        if len(self.query.hits.uncertain):
+            room["unsure_capacity"] = len(self.query.hits.uncertain)
         for name, places in room.items():
             if demands[name] > places:
                 lost.append(

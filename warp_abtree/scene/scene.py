@@ -292,7 +292,7 @@ class Scene:
             output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
                 an object pair's summary of them, stands in `warp_abtree.query.contacts`.
             precision: "exact": the answer is exact for A's vertices and the posed ones of B, A the object with the
-                smaller index. "float64" and "float32" take the signs of rounded determinants.
+                smaller index. "float32" takes the signs of rounded determinants.
             within: Distance d >= 0 [world units], or (p,) of them: `result.apart` tells the pairs whose posed surfaces,
                 at their LODs, are proved farther apart than d; never true where they are not, whatever the rounding.
                 With d = error_at(A) + error_at(B) it proves that the original meshes do not intersect. The broad phase

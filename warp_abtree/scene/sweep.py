@@ -213,7 +213,7 @@ class _Question:
 
     def _begin(self, lane, poses, start, count):
         self._load(lane, poses, start, count)
-        lane.unsure_room = len(self.query.hits.unsure)
+        lane.unsure_room = len(self.query.hits.uncertain)
         if count != self.count:
             self.query.pair_count.fill_(count)
             self.count = count
@@ -283,7 +283,7 @@ class _Question:
         return np.concatenate(parts)
 
     def is_small(self):
-        return len(self.query.hits.face) + len(self.query.hits.unsure) <= KEPT_ROWS
+        return len(self.query.hits.face) + len(self.query.hits.uncertain) <= KEPT_ROWS
 
 
 def _keep(key, posed):

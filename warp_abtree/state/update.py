@@ -247,7 +247,7 @@ class LodUpdate(UpdateWork):
         self.splits.bound_start = upload(np.cumsum(bounds) - bounds)
         self.splits.partial_max = upload(partial_max)
         self.splits.depth = upload(models.depth)
-        plan = plan_kernels.UpdatePlan()
+        plan = plan_kernels.WorkLists()
         plan.partial_total, plan.full_total = room(1, wp.int64), room(1, wp.int64)
         for name in ("partial_state", "slice_start", "entry_end", "full_state", "face_end"):
             setattr(plan, name, room(count))
