@@ -20,7 +20,6 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 BLOCK = re.compile(r"(?:<!-- needs: ([\w, ]+) -->\n)?^```(\w+)\n(.*?)^```", re.S | re.M)
 # What a page does at full size, at one that tests can bear.
 SMALLER = {
-    "docs/lod.md": (("objects=60", "objects=4"), (".run(120)", ".run(3)")),
     "docs/howto_lod.md": (("objects=60", "objects=12"), ("range(120)", "range(66)")),
     "docs/howto_planning.md": (("100_000", "3_000"), ("[:2000]", "[:300]")),
 }
