@@ -261,7 +261,7 @@ def warp_traversal(mode: int, for_any: bool):
     ):
         """Traverse units of work, each a part of one object pair, and donated items, until there are none."""
         count = wp.min(pair_count[0], pair_poses.shape[0])
-        parts = units_per_pair(work_inout.parts_max, count)
+        parts = units_per_pair(work_inout.warps_per_pair, count)
         pace = Pace()
         pace.stack_room = stack_room
         pace.for_any = wp.static(for_any)

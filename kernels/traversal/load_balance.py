@@ -44,7 +44,7 @@ class Work:
     flag: wp.array(dtype=wp.int32)  # 0 free, the ticket + 1 that it is full for, -1 when all is done, shape [slot]
     owner: wp.array(dtype=wp.vec2i)  # (object pair, number of items), shape [slot]
     item: wp.array(dtype=wp.int64)  # node pairs (`node_pair`), shape [slot * SLOT_ITEMS]
-    parts_max: wp.int32  # units of a single pair; c pairs have 1 / sqrt(c) of that each
+    warps_per_pair: wp.int32  # units of a single pair; c pairs have 1 / sqrt(c) of that each
     record: LaunchRecord  # what the launch was given; here, since another argument takes time in every launch
 
 
@@ -98,6 +98,6 @@ def end_unit(counter: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32)):
 
 
 @wp.func
-def units_per_pair(parts_max: wp.int32, count: wp.int32):
+def units_per_pair(warps_per_pair: wp.int32, count: wp.int32):
     """Return how many units an object pair is at first; more of them cost more, since each starts at the roots."""
-    return wp.max(1, wp.int32(wp.float32(parts_max) / wp.sqrt(wp.float32(wp.max(count, 1)))))
+    return wp.max(1, wp.int32(wp.float32(warps_per_pair) / wp.sqrt(wp.float32(wp.max(count, 1)))))

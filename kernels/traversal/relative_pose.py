@@ -41,7 +41,7 @@ def relative_pose_kernel(
         stale = record_launch(work_out.record)
         work_out.counter[0] = 0
         work_out.counter[1] = 0
-        work_out.counter[2] = wp.where(stale, 0, count * units_per_pair(work_out.parts_max, count))
+        work_out.counter[2] = wp.where(stale, 0, count * units_per_pair(work_out.warps_per_pair, count))
         work_out.counter[3] = wp.where(stale, NO_UNIT, 0)
     if p >= pairs.shape[0]:
         return

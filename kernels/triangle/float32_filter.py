@@ -145,7 +145,7 @@ def find_alone_in(signs: wp.int32):
 
 @wp.func
 def rotate_corners(signs: wp.int32, a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b2: Any):
-    """Return both triangles' corners, or their ids, as `rotate_triangles`; in any order where triangles are coplanar."""
+    """Return both triangles' corners, or their ids, as `rotate_triangles`; in any order where these are coplanar."""
     alone_a, back_a = find_alone_in(signs >> 6)
     alone_b, back_b = find_alone_in(signs)
     p1, q1, r1 = rotate_first(alone_a, a0, a1, a2)

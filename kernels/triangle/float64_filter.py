@@ -77,7 +77,7 @@ def filter_straddling(p1: wp.vec3d, q1: wp.vec3d, r1: wp.vec3d, p2: wp.vec3d, q2
 
 @wp.func
 def float64_filter_triangles(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
-    """Return 1 where two closed triangles meet, 0 where not, UNCERTAIN where float64 leaves a sign uncertain: both parts."""
+    """Return 1 where two closed triangles meet, 0 where not, UNCERTAIN where float64 cannot tell: both parts."""
     signs = filter_planes(a0, a1, a2, b0, b1, b2)
     if signs == SEPARATED:
         return 0

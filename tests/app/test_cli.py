@@ -421,32 +421,3 @@ def test_process_fails_in_one_line(files):
     done = run_process("query", "ball.obj", "nan.obj", cwd=files)
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1 and "not finite" in done.stderr
-
-
-# README.
-
-
-def readme_blocks(after):
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    return re.findall(r"```\w+\n(.*?)```", text[text.index(after) :], re.S)
-
-
-@pytest.mark.slow
-def test_readme_python_runs(capsys, monkeypatch):
-    pytest.importorskip("pxr")
-    monkeypatch.chdir(ROOT)
-    blocks = [block for block in readme_blocks("## Python") if block.startswith("import")]
-    assert len(blocks) >= 2
-    for block in blocks:
-        exec(compile(block, "README.md", "exec"), {})
-        assert capsys.readouterr().out
-
-
-def test_readme_commands_exist():
-    lines = [*readme_blocks("<!-- main-command -->")[0].splitlines(), *readme_blocks("## Command line")[0].splitlines()]
-    for line in lines:
-        command = line.split("warp-abtree", 1)[1].split("#")[0].split()
-        assert cli.make_parser().parse_args(command).command == command[0]
-        for word in command:
-            assert not word.startswith("scenes/") or (ROOT / word).is_file()
-    assert len(lines) >= 6

@@ -226,7 +226,7 @@ def test_batches_buffers_and_precisions_do_not_matter(device):
         order = rng.permutation(len(pairs))
         capacities = rng.integers(1, 2 * whole.float64_tests.sum(), 2)
         scene.intersect(pairs[order], output="faces", precision="float32")
-        query = ab.Query(scene, pairs=pairs[order], capacity=capacities[0], unsure_capacity=capacities[1])
+        query = ab.Query(scene, pairs=pairs[order], capacity=ab.Buffers(capacities[0], uncertain=capacities[1]))
         if trial % 2:
             query.run()
         result = query.run()
