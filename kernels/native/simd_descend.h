@@ -1,4 +1,4 @@
-// The dual-tree traversal of the CPU: up to four pairs of boxes at a time, as `test_node_pair` one by one.
+// The dual-tree traversal of the CPU: up to four pairs of boxes at a time, as `compare_node_pair` one by one.
 #pragma once
 #include "builtin.h"
 #include "sizes.h"

@@ -27,7 +27,7 @@ from warp_abtree.kernels.traversal.load_balance import (
     take_unit,
     units_per_pair,
 )
-from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second, test_node_pair
+from warp_abtree.kernels.traversal.node_pair import compare_node_pair, first_item, item_first, item_second
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
     add_warp_sum,
@@ -99,7 +99,7 @@ def expand_items(
     lane = warp_lane()
     item = read_item(items, (first + wp.min(lane, popped - 1)) & STACK_MASK)
     warp_sync()
-    children, emitted, tests = test_node_pair(states, pose, item, wp.where(lane < popped, -1, 0))
+    children, emitted, tests = compare_node_pair(states, pose, item, wp.where(lane < popped, -1, 0))
     ends = push_children(items, end, waiting, emitted, children)
     warp_sync()
     return item_second(ends), item_first(ends), tests

@@ -115,7 +115,7 @@ def count_used(used: wp.vec4i):
 
 
 @wp.func
-def test_node_pair(states: StatePool, pose: PairPose, item: wp.int64, live: wp.int32):
+def compare_node_pair(states: StatePool, pose: PairPose, item: wp.int64, live: wp.int32):
     """Compare what an item names; return the items that follow, what each emits, and the pairs of boxes compared.
 
     live is -1, or 0 where nothing is asked of the item, which still names nodes. No branches: the lanes of a warp stay

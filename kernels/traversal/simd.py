@@ -47,7 +47,7 @@ def descend(
 ) -> three_numbers:
     """Test items from the top of a stack until there are none, or so many leaf pairs wait as are asked for.
 
-    The same as `test_node_pair`, four pairs of boxes at a time.
+    The same as `compare_node_pair`, four pairs of boxes at a time.
 
     Returns the items left on the stack, the leaf pairs that wait, and the pairs of boxes compared.
     """

@@ -16,10 +16,10 @@ from warp_abtree.kernels.traversal.face_pairs import face_plane_signs, intersect
 from warp_abtree.kernels.traversal.node_pair import (
     EMIT_ITEM,
     EMIT_LEAVES,
+    compare_node_pair,
     first_item,
     item_first,
     item_second,
-    test_node_pair,
 )
 from warp_abtree.kernels.traversal.simd import (
     CPU_STACK_LENGTH,
@@ -312,20 +312,20 @@ def test_filters_the_same_as_one_by_one(kind):
 
 
 @wp.kernel
-def visit_all_kernel(
+def compare_all_kernel(
     states: StatePool,
     pair_poses: wp.array(dtype=PairPose),
     stack_inout: wp.array(dtype=wp.int64),
     found_out: wp.array(dtype=wp.int64),
     count_out: wp.array(dtype=wp.int64),
 ):
-    """Traverse pair 0 by `test_node_pair`, one item at a time."""
+    """Traverse pair 0 by `compare_node_pair`, one item at a time."""
     pose = pair_poses[0]
     stack_inout[0] = first_item(states, pose)
     top, found, compared = wp.int32(1), wp.int32(0), wp.int32(0)
     while top > 0:
         top -= 1
-        items, steps, tests = test_node_pair(states, pose, stack_inout[top], -1)
+        items, steps, tests = compare_node_pair(states, pose, stack_inout[top], -1)
         compared += tests
         for k in range(4):
             if steps[k] == EMIT_ITEM:
@@ -380,7 +380,7 @@ def filled(count):
 
 
 @pytest.mark.parametrize("names", [("torus", "torus"), ("soup", "torus"), ("torus", "soup")], ids="-".join)
-def test_descends_as_visits_do(names):
+def test_descends_as_node_pair_tests_do(names):
     """The same pairs of boxes and faces, whatever is taken at once, in any order and at any level of detail."""
     a, b = (sample(name) for name in names)
     for lods in ((a.lod_max, b.lod_max), (a.lod_for(fraction=0.3), b.lod_for(fraction=0.1)), (0, b.lod_max)):
@@ -391,7 +391,7 @@ def test_descends_as_visits_do(names):
         query = ab.Query(scene, "faces", pairs=[(0, 1)])
         query.launch()
         states = query.arrays[1].pool
-        plain, compared = traverse(visit_all_kernel, [], states, query.pair_poses, [filled(4096)], 10**6)
+        plain, compared = traverse(compare_all_kernel, [], states, query.pair_poses, [filled(4096)], 10**6)
         assert compared == query.hits.node_tests.numpy()[0] and len(plain) == query.hits.triangle_tests.numpy()[0]
         assert len(plain) > 0
         for at_once in (1, 2, 7, ITEMS_AT_ONCE):
@@ -413,7 +413,7 @@ def test_descends_in_little_room():
     query = ab.Query(scene, "faces", pairs=[(0, 1)])
     query.launch()
     states = query.arrays[1].pool
-    plain, compared = traverse(visit_all_kernel, [], states, query.pair_poses, [filled(4096)], 10**6)
+    plain, compared = traverse(compare_all_kernel, [], states, query.pair_poses, [filled(4096)], 10**6)
     times = CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH
     stack, faces = filled(CPU_STACK_LENGTH + 64), filled(WAITING_LENGTH + 64)
     buffers, room = [stack, faces], times * len(plain)
