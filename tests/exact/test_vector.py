@@ -390,7 +390,7 @@ def test_descends_as_node_pair_tests_do(names):
         scene.add(b, pose_b, lod=lods[1])
         query = ab.Query(scene, "faces", pairs=[(0, 1)])
         query.launch()
-        states = query.arrays[1].pool
+        states = query.batch.pools[1]
         plain, compared = traverse(compare_all_kernel, [], states, query.pair_poses, [filled(4096)], 10**6)
         assert compared == query.hits.node_tests.numpy()[0] and len(plain) == query.hits.triangle_tests.numpy()[0]
         assert len(plain) > 0
@@ -412,7 +412,7 @@ def test_descends_in_little_room():
         scene.add(model, lod=model.lod_for(fraction=0.2))
     query = ab.Query(scene, "faces", pairs=[(0, 1)])
     query.launch()
-    states = query.arrays[1].pool
+    states = query.batch.pools[1]
     plain, compared = traverse(compare_all_kernel, [], states, query.pair_poses, [filled(4096)], 10**6)
     times = CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH
     stack, faces = filled(CPU_STACK_LENGTH + 64), filled(WAITING_LENGTH + 64)
