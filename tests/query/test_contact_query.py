@@ -231,26 +231,6 @@ def test_pairs_of_the_broad_phase(device, room):
         query.result().check()
 
 
-def test_overflow_names_the_demand(device):
-    scene, pairs = touching(device)
-    whole = scene.intersect(pairs, output="contacts")
-    demand = len(whole.contacts)
-    known = {row.tobytes() for row in whole.contacts}
-    for capacity in (1, 31, demand // 2, demand - 1):
-        query = ab.ContactQuery(scene, pairs, capacity=capacity)
-        query.launch()
-        part = query.result()
-        with pytest.raises(ab.CapacityError, match=f"^{demand} face pairs .* room for {capacity}: .*capacity={demand}"):
-            part.check()
-        np.testing.assert_array_equal(part.count, whole.count)
-        assert len(part.contacts) == len(part.faces) == capacity
-        assert (np.lexsort(part.faces.T[::-1]) == np.arange(capacity)).all()
-        assert {row.tobytes() for row in part.contacts} <= known
-        np.testing.assert_array_equal(query.start.numpy(), np.searchsorted(part.faces[:, 0], np.arange(len(pairs) + 1)))
-        same(query.run(), whole)
-    ab.ContactQuery(scene, pairs, capacity=demand).run()
-
-
 def test_nothing_to_find(device):
     scene, pairs = touching(device, pairs=2)
     query = ab.ContactQuery(scene, pairs)
@@ -332,24 +312,6 @@ def test_float32(device):
             wanted = wanted.astype(np.float32) if wanted.dtype == np.float64 else wanted
             assert getattr(small, part)[name].tobytes() == wanted.tobytes()
     assert query.contacts.p0.dtype == wp.vec3d
-
-
-def test_refused(device):
-    scene, pairs = touching(device, pairs=1)
-    with pytest.raises(ValueError, match=r"ab\.ContactQuery"):
-        ab.Query(scene, "contacts", pairs=pairs)
-    with pytest.raises(ValueError, match="contact_dtype"):
-        ab.ContactQuery(scene, pairs, contact_dtype=np.int64)
-    with pytest.raises(ValueError, match="precision"):
-        ab.ContactQuery(scene, pairs, precision="best")
-    with pytest.raises(ValueError, match="capacity"):
-        ab.ContactQuery(scene, pairs, capacity=0)
-    with pytest.raises(ab.CapacityError, match="fewer than 2"):
-        ab.ContactQuery(scene, pairs, capacity=2**30)
-    query = ab.ContactQuery(scene, pairs)
-    scene.add(sample("box"))
-    with pytest.raises(RuntimeError, match="make a new one"):
-        query.launch()
 
 
 def test_skewed_matrices(device):

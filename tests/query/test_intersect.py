@@ -298,46 +298,6 @@ def test_pairs_far_apart(device, far):
 # Capacity, operators, regimes.
 
 
-def test_overflow_is_told(device):
-    scene, _ = posed_cases(np.random.default_rng(7), ("ball", "torus"), 6, BRUTE_FACES, device)
-    pairs = np.arange(12).reshape(-1, 2)
-    whole = ask(scene, pairs)
-    demand = len(whole.faces)
-    query = ab.Query(scene, "faces", pairs=pairs, capacity=3, precision="exact")
-    query.launch()
-    result = query.result()
-    assert len(result.faces) == 3
-    np.testing.assert_array_equal(result.count, whole.count)  # counts are whole all the same
-    with pytest.raises(ab.CapacityError, match=f"{demand} face pairs .* room for 3"):
-        result.check()
-    grown = query.run()
-    np.testing.assert_array_equal(grown.faces, whole.faces)
-    query = ab.Query(scene, "faces", pairs=pairs, capacity=demand, precision="exact")
-    query.launch()
-    query.result().check()
-
-
-def test_scene_grows_its_buffers(device):
-    """More hits than the room that a query of one pair starts with."""
-    model = rounded("torus")
-    scene = ab.Scene(device)
-    scene.add(model)
-    scene.add(model)
-    result = ask(scene, [(0, 1)])
-    assert len(result.faces) == result.count[0] > 1024
-
-
-def test_broad_phase_overflow_is_told(device):
-    scene = ab.Scene(device)
-    for _ in range(5):
-        scene.add(sample("box"))
-    query = ab.Query(scene, "any", pair_capacity=4, precision="exact")
-    query.launch()
-    with pytest.raises(ab.CapacityError, match="10 pairs"):
-        query.result().check()
-    assert len(scene.broad_phase()) == len(scene.intersect(precision="exact").pairs) == 10
-
-
 def test_nothing_asked(device):
     scene = ab.Scene(device)
     scene.add(sample("box"))
