@@ -360,5 +360,3 @@ def test_broad_phase_pairs(device):
     expected = scene.intersect(result.pairs[order], within=0.01)
     np.testing.assert_array_equal(result.apart[order], expected.apart)
     assert scene.intersect(within=0.01).apart.shape == (len(order),)
-
-
