@@ -140,7 +140,7 @@ def test_a_query_has_room_for_its_output_alone(device, ledger, kind):
     assert held["any"] == held["count"] and held["faces"] == held["any"] + 12 * 50_000
     near = query_bytes(ledger, kind, scene, pairs, "any", within=1.0)
     assert near > held["any"] and near - held["any"] < 100 * len(pairs) + SLACK, "a second answer, asked for"
-    rounded = query_bytes(ledger, kind, scene, pairs, "any", precision="float64")
+    rounded = query_bytes(ledger, kind, scene, pairs, "any", precision="float32")
     if kind(scene, "any", pairs=pairs).uses_warps():
         unsure = 100_000
         wide = query_bytes(ledger, kind, scene, pairs, "any", unsure_capacity=unsure)
