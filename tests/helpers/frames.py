@@ -38,11 +38,6 @@ def set_lods(frame, lods):
     frame.lods.assign(np.asarray(lods).astype(np.int32))
 
 
-def state_slots(frame):
-    """Return the slots of tree states that a frame holds."""
-    return frame._states.slots
-
-
 def check_states(frame, scene):
     """Check that every object's state in a frame holds the bits of a state built at the scene's LODs."""
     fresh = ab.Scene(scene.device)
@@ -50,7 +45,7 @@ def check_states(frame, scene):
         fresh.add(scene.models[m], lod=int(lod))
     for i in range(scene.object_count):
         truth = raw_state(fresh, i)
-        state = stored_state(scene.models, frame._models, frame._states, frame._objects.pool.state.numpy()[i])
+        state = stored_state(scene.models, frame.batch, frame.batch.objects.pool.state.numpy()[i])
         for name, value in truth.items():
             assert np.asarray(value).tobytes() == np.asarray(state[name]).tobytes(), (i, name)
 

@@ -46,7 +46,7 @@ def make_scene(device):
 
 def check_scene(before, scene):
     """Return all that a scene holds and answers, or check that it still does."""
-    states = scene.arrays()[1].pool
+    states = scene.batch().states.pool
     now = [getattr(states, name).numpy().tobytes() for name in SLOT_COLUMNS]
     now += [*everything(scene), *describe(scene.intersect(PAIRS, output="faces"))]
     now += describe(scene.intersect(MORE_PAIRS, output="count"))
@@ -62,7 +62,7 @@ def check_answers(before, scene):
     for i in range(scene.object_count):
         state = scene.tree_state(i)
         now += [state.lod, *(getattr(state, name).tobytes() for name in ("status", "lower", "upper", "skip"))]
-    objects = scene.arrays()[2].pool
+    objects = scene.batch().objects.pool
     now += [objects.rotation.numpy().tobytes(), objects.position.numpy().tobytes()]
     assert before is None or now == before
     return now

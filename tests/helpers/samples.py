@@ -129,8 +129,9 @@ def true_faces(model_a, lod_a, pose_a, model_b, lod_b, pose_b):
     return np.stack([ids_a[hits[:, 0]], ids_b[hits[:, 1]]], 1)
 
 
-def stored_state(scene_models, models, states, state):
+def stored_state(scene_models, batch, state):
     """Return the bytes of a tree state: float32 boxes as stored, not as `tree_state` widens them."""
+    states = batch.states
     slot = states.slots[state]
     model = scene_models[slot.model]
     nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
@@ -139,14 +140,14 @@ def stored_state(scene_models, models, states, state):
         "lod": int(states.pool.lod.numpy()[state]),
         "status": states.pool.node_status.numpy()[nodes],
         **dict(zip(("lower", "upper", "skip"), states.read_nodes(slot, model.tree.node_count))),
-        "corner": np.where(corners < 0, -1, corners - models.vertex_start[slot.model]),
+        "corner": np.where(corners < 0, -1, corners - batch.models.vertex_start[slot.model]),
     }
 
 
 def raw_state(scene, i):
     """Return the bytes of an object's tree state."""
-    models, states, objects = scene.arrays()
-    return stored_state(scene.models, models, states, objects.state[i])
+    batch = scene.batch()
+    return stored_state(scene.models, batch, batch.objects.state[i])
 
 
 # A ball, and a ring that moves through it to and fro; tests add what they ask about.

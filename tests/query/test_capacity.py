@@ -12,25 +12,15 @@ from helpers.resources import MORE_PAIRS, PAIRS, check_scene, describe, make_sce
 from helpers.samples import sample
 
 import warp_abtree as ab
-from warp_abtree.query import narrow_phase
+from warp_abtree.query import request
 
-# Operator, options (pairs are found by the broad phase unless given), what is too small, how the error tells it.
+# Operator, options (pairs are found by the broad phase unless given), and the buffer that is too small.
 KINDS = {
-    "hits": (
-        ab.Query,
-        dict(output="faces", pairs=...),
-        "capacity",
-        r"^(\d+) face pairs .* room for {}: .*capacity=\1$",
-    ),
-    "contacts": (ab.ContactQuery, dict(pairs=...), "capacity", r"^(\d+) face pairs .* room for {}: .*capacity=\1$"),
-    "found pairs": (ab.Query, dict(output="faces"), "pair_capacity", r"found (\d+) pairs, .* room for {}$"),
-    "pairs of contacts": (ab.ContactQuery, {}, "pair_capacity", r"found (\d+) pairs, .* room for {}$"),
-    "uncertain pairs": (
-        GpuQuery,
-        dict(output="faces", pairs=...),
-        "unsure_capacity",
-        r"room for {}: .*unsure_capacity=(\d+)$",
-    ),
+    "hits": (ab.Query, dict(output="faces", pairs=...), "hits"),
+    "contacts": (ab.ContactQuery, dict(pairs=...), "hits"),
+    "found pairs": (ab.Query, dict(output="faces"), "pairs"),
+    "pairs of contacts": (ab.ContactQuery, {}, "pairs"),
+    "uncertain pairs": (GpuQuery, dict(output="faces", pairs=...), "uncertain"),
 }
 
 
@@ -45,20 +35,21 @@ def crowd(device):
 @pytest.mark.parametrize("kind", [*list(KINDS)[:-1], *slow("uncertain pairs")])
 def test_overflow_names_the_demand(crowd, kind):
     """Counts are whole all the same, and what there was room for are rows of the whole answer, in order."""
-    operator, options, name, message = KINDS[kind]
+    operator, options, name = KINDS[kind]
     whole = crowd.intersect(output="contacts")
     options = {**options, **({"pairs": whole.pairs} if "pairs" in options else {})}
-    options |= {"capacity": len(whole.faces)} if name != "capacity" else {}
+    ample = {} if name == "hits" else {"hits": len(whole.faces)}
 
     def named_demand(room):
-        query = operator(crowd, **options, **{name: room})
+        query = operator(crowd, **options, capacity=ab.Buffers(**{**ample, name: room}))
         query.launch()
         result = query.result()
         with pytest.raises(ab.CapacityError) as caught:
             result.check()
-        found = re.search(message.format(room), str(caught.value))
-        assert found and "\n" not in str(caught.value), caught.value
-        if name == "capacity":
+        pattern = rf"(\d+) [\w\s]*, the query has room for {room}: [^\n]*Buffers\({name}=\1\)"
+        found = re.fullmatch(pattern, str(caught.value))
+        assert found, caught.value
+        if name == "hits":
             np.testing.assert_array_equal(result.count, whole.count)
             assert len(result.faces) == room and (np.lexsort(result.faces.T[::-1]) == np.arange(room)).all()
             assert {row.tobytes() for row in result.faces} <= {row.tobytes() for row in whole.faces}
@@ -73,11 +64,10 @@ def test_overflow_names_the_demand(crowd, kind):
         return int(found.group(1))
 
     demand = named_demand(1)
-    known = {"capacity": len(whole.faces), "pair_capacity": len(whole.pairs), "unsure_capacity": demand}
-    assert demand == known[name] > 8
+    assert demand == {"hits": len(whole.faces), "pairs": len(whole.pairs), "uncertain": demand}[name] > 8
     for room in (demand // 2, demand - 1):
         assert named_demand(room) == demand
-    query = operator(crowd, **options, **{name: demand})
+    query = operator(crowd, **options, capacity=ab.Buffers(**{**ample, name: demand}))
     query.launch()
     result = query.result()
     result.check()
@@ -129,7 +119,7 @@ def test_the_error_names_the_bytes(device):
     with little_memory(device):
         for call in (
             lambda: ab.Query(scene, "faces", pairs=PAIRS, capacity=LARGEST),
-            lambda: GpuQuery(scene, "faces", pairs=PAIRS, unsure_capacity=LARGEST),
+            lambda: GpuQuery(scene, "faces", pairs=PAIRS, capacity=ab.Buffers(uncertain=LARGEST)),
             lambda: query.resize(LARGEST),
         ):
             with pytest.raises(RuntimeError, match=f"{12 * LARGEST} bytes on device '{device}'"):
@@ -139,13 +129,13 @@ def test_the_error_names_the_bytes(device):
 
 
 def test_more_pairs_than_a_launch_holds(device, monkeypatch):
-    monkeypatch.setattr(narrow_phase, "PAIRS_MAX", len(MORE_PAIRS))
+    monkeypatch.setattr(request, "PAIRS_MAX", len(MORE_PAIRS))
     scene = make_scene(device)
     before = check_scene(None, scene)
     query = ab.Query(scene, "faces", pairs=PAIRS)
     answers = describe(query.run())
-    with pytest.raises(ValueError, match="pair_capacity 13 is outside"):
-        ab.Query(scene, "any", pair_capacity=13)
+    with pytest.raises(ValueError, match="buffers: pairs 13 is outside"):
+        ab.Query(scene, "any", capacity=ab.Buffers(pairs=13))
     many = np.concatenate([MORE_PAIRS, PAIRS])
     for call in (lambda: query.set_pairs(many), lambda: scene.intersect(many), lambda: ab.Query(scene, pairs=many)):
         with pytest.raises(ab.CapacityError, match="15 object pairs at a time"):

@@ -98,7 +98,7 @@ def test_any_capacity(device):
     expected = scene.intersect(pairs, output="contacts")
     demand = len(expected.contacts)
     for capacity in (demand, demand + 1, 3 * demand + 7, 1):
-        query = ab.ContactQuery(scene, pairs, capacity=capacity, pair_capacity=len(pairs) + capacity % 7)
+        query = ab.ContactQuery(scene, pairs, capacity=ab.Buffers(capacity, pairs=len(pairs) + capacity % 7))
         same(query.run(), expected)
         same(query.result(), expected)
         assert len(query.faces) == (capacity if capacity > 1 else demand)
@@ -139,7 +139,7 @@ def check_device_arrays(query, result):
 @pytest.mark.parametrize("room", [None, 7, 500])
 def test_pairs_of_the_broad_phase(device, room):
     scene, _ = touching(device, pairs=8)
-    query = ab.ContactQuery(scene, pair_capacity=room)
+    query = ab.ContactQuery(scene, capacity=ab.Buffers(pairs=room))
     result = query.run()
     assert len(result.pairs) == len(scene.broad_phase()) > 8
     check_device_arrays(query, result)
@@ -195,7 +195,7 @@ def test_a_graph_takes_poses_to_contacts(device, given):
     if not given and not scene.device.is_cuda:
         pytest.skip("a tree of boxes is built anew in CUDA graphs only")
     capacity = 60000 if given else 500000
-    query = ab.ContactQuery(scene, pairs if given else None, capacity=capacity, pair_capacity=400)
+    query = ab.ContactQuery(scene, pairs if given else None, capacity=ab.Buffers(capacity, pairs=400))
     query.launch()
     rng = np.random.default_rng(3)
     for recapture in range(2):

@@ -71,11 +71,14 @@ def test_a_query_is_given_more_pairs(device, memory, kind):
 
 GROWING = {
     "hits": (ab.Query, dict(output="faces", pairs=MORE_PAIRS, capacity=1)),
-    "found pairs": (ab.Query, dict(output="faces", pair_capacity=1, capacity=1)),
-    "found pairs within": (ab.Query, dict(output="count", pair_capacity=1, within=0.01)),
+    "found pairs": (ab.Query, dict(output="faces", capacity=ab.Buffers(pairs=1, hits=1))),
+    "found pairs within": (ab.Query, dict(output="count", capacity=ab.Buffers(pairs=1), within=0.01)),
     "contacts": (ab.ContactQuery, dict(pairs=MORE_PAIRS, capacity=1)),
-    "found contacts": (ab.ContactQuery, dict(pair_capacity=1, capacity=1)),
-    "uncertain pairs": (GpuQuery, dict(output="faces", pairs=[(0, 4), *PAIRS], unsure_capacity=1, capacity=1)),
+    "found contacts": (ab.ContactQuery, dict(capacity=ab.Buffers(pairs=1, hits=1))),
+    "uncertain pairs": (
+        GpuQuery,
+        dict(output="faces", pairs=[(0, 4), *PAIRS], capacity=ab.Buffers(uncertain=1, hits=1)),
+    ),
 }
 
 
@@ -105,7 +108,7 @@ def test_the_broad_phase_grows(device, memory):
         scene = ab.Scene(device)
         for _ in range(20):
             scene.add(sample("box"))
-        scene.arrays()
+        scene.batch()
         return scene
 
     def check(before, scene):
@@ -137,10 +140,10 @@ def test_the_tree_of_the_broad_phase(device, monkeypatch):
 
 OPERATORS = {
     "faces": lambda scene: ab.Query(scene, "faces", pairs=MORE_PAIRS),
-    "found": lambda scene: ab.Query(scene, "count", pair_capacity=2),
+    "found": lambda scene: ab.Query(scene, "count", capacity=ab.Buffers(pairs=2)),
     "within": lambda scene: ab.Query(scene, "count", pairs=MORE_PAIRS, within=0.01),
     "contacts": lambda scene: ab.ContactQuery(scene, pairs=MORE_PAIRS, capacity=8),
-    "manifolds": lambda scene: ab.ManifoldQuery(scene, pair_capacity=2, capacity=8),
+    "manifolds": lambda scene: ab.ManifoldQuery(scene, capacity=ab.Buffers(pairs=2, hits=8)),
 }
 CALLS = {
     "launch": lambda query: query.launch(),

@@ -282,7 +282,7 @@ def test_warps_give_the_same_answers(device, room, parts):
     for output in ("faces", "count", "any"):
         plain = ask(scene, pairs, output)
         with testing.regime(warps=True, warps_per_pair=parts, stack_length=room):
-            query = ab.Query(scene, output, pairs=pairs, unsure_capacity=2)
+            query = ab.Query(scene, output, pairs=pairs, capacity=ab.Buffers(uncertain=2))
         result = query.run()
         visits[output] = result.node_tests.sum()
         np.testing.assert_array_equal(result.any, plain.any)

@@ -13,14 +13,13 @@ from helpers.frames import (
     random_lods,
     replay,
     set_lods,
-    state_slots,
     tops,
 )
 from helpers.samples import random_poses, raw_state, sample
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
-from warp_abtree.model import tree
+from warp_abtree.state import work_lists
 
 pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
 
@@ -35,7 +34,7 @@ def test_random_walk_in_a_graph(device):
     rng = np.random.default_rng(1)
     names = rng.permutation(np.repeat(NAMES, 3))
     scene = add_objects(device, names)
-    frame = ab.FrameGraph(scene, pair_capacity=1000)
+    frame = ab.FrameGraph(scene, capacity=ab.Buffers(pairs=1000))
     launch = replay(frame)
     singles = [add_objects(device, [name]) for name in names]
     lods, top, kinds = scene.lods, tops(scene), []
@@ -73,7 +72,7 @@ def test_random_walk_of_real_meshes(device, name):
 
 def test_all_states_at_the_crossover(device, monkeypatch):
     """Worklists hold the longest slices that are not refitted whole, of all states at once; few threads take turns."""
-    monkeypatch.setattr(tree, "THREADS_AT_ONCE", 1)
+    monkeypatch.setattr(work_lists, "THREADS_AT_ONCE", 1)
     names = ["small ball", "crumbs", "torus", "soup", "twins"] * 3
     scene = add_objects(device, names, spread=9.0)
     moves = []
@@ -151,12 +150,12 @@ def test_answers_are_those_of_the_scene(device, case, captured):
             parts = [levels[m] for m in scene.object_model]
             return np.array([min(level for level in part if level >= lod) for part, lod in zip(parts, lods)])
 
-    rows = {"capacity": 60000} if options["output"] in ("faces", "contacts") else {}
-    frame = ab.FrameGraph(scene, **options, **rows, pair_capacity=36)
+    hits = 60000 if options["output"] in ("faces", "contacts") else None
+    frame = ab.FrameGraph(scene, **options, capacity=ab.Buffers(hits, pairs=36))
     if group is not None:
-        assert len(frame.lods) == len(state_slots(frame)) == len(frame.changed_count) == 7
+        assert len(frame.lods) == len(frame.batch.states.slots) == len(frame.changed_count) == 7
     if snap is not None:
-        assert len(state_slots(frame)) == sum(len(np.unique(part)) for part in levels)
+        assert len(frame.batch.states.slots) == sum(len(np.unique(part)) for part in levels)
         assert frame.changed_count is None and frame.marked_count is None
     launch = replay(frame) if captured else frame.launch
     assert ask_both(scene, frame, launch, np.random.default_rng(3), 6, group=group, snap=snap, **request) > 50

@@ -91,11 +91,11 @@ def test_lost_work_is_told(device):
     hits = len(expected.faces)
     scene.set_poses(far)
     for options, message in (
-        ({"pair_capacity": 14, "capacity": 2 * hits}, "pair_capacity=15, .* for 14"),
-        ({"pair_capacity": 15, "capacity": hits - 1}, f" capacity={hits}, .* for {hits - 1}"),
-        ({"pair_capacity": 15, "capacity": hits}, None),
+        ({"hits": 2 * hits, "pairs": 14}, "pairs=15.*for 14"),
+        ({"hits": hits - 1, "pairs": 15}, f"hits={hits}.* for {hits - 1}"),
+        ({"hits": hits, "pairs": 15}, None),
     ):
-        frame = ab.FrameGraph(scene, "faces", **options)
+        frame = ab.FrameGraph(scene, "faces", capacity=ab.Buffers(**options))
         launch = replay(frame)
         for poses in (far, near, far):
             frame.poses.assign(poses)
@@ -121,7 +121,7 @@ def test_one_check_tells_all_that_was_wrong(device):
     frame.lods.fill_(10**6)
     frame.launch()
     frame.poses.assign(poses)
-    with pytest.raises(ab.CapacityError, match=r"capacity=.*poses: 2 rows.*lods: 2 entries"):
+    with pytest.raises(ab.CapacityError, match=r"hits=.*poses: 2 rows.*lods: 2 entries"):
         frame.check()
 
 
@@ -149,7 +149,7 @@ def test_refused(options, message):
 def coincident(device, monkeypatch):
     """A scene of coincident objects, asked as on CUDA: float32 leaves many pairs of faces open."""
     monkeypatch.setattr(pipeline, "Query", GpuQuery)
-    monkeypatch.setattr(narrow_phase, "UNSURE_CAPACITY", 16)
+    monkeypatch.setattr(narrow_phase, "UNCERTAIN_ROOM", 16)
     scene = ab.Scene(device)
     for _ in range(3):
         scene.add(sample("twins"))
@@ -170,13 +170,13 @@ def test_the_room_of_the_first_frame_is_made(coincident):
 @pytest.mark.slow
 def test_a_room_that_is_too_small_is_told_at_construction(coincident):
     needed = int(ab.FrameGraph(coincident, output="count").run().float64_tests.sum())
-    with pytest.warns(RuntimeWarning, match=f"=8: .* leave {needed} .*unsure_capacity={needed}"):
-        frame = ab.FrameGraph(coincident, output="count", unsure_capacity=8)
+    with pytest.warns(RuntimeWarning, match=f"=8: .* leave {needed} .*uncertain={needed}"):
+        frame = ab.FrameGraph(coincident, output="count", capacity=ab.Buffers(uncertain=8))
     wp.capture_launch(frame.capture())
-    with pytest.raises(ab.CapacityError, match=f"needed unsure_capacity={needed}, the frame graph has room for 8"):
+    with pytest.raises(ab.CapacityError, match=f"needed .*uncertain={needed}.*room for 8"):
         frame.check()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        frame = ab.FrameGraph(coincident, output="count", unsure_capacity=needed)
+        frame = ab.FrameGraph(coincident, output="count", capacity=ab.Buffers(uncertain=needed))
     wp.capture_launch(frame.capture())
     frame.check()

@@ -11,7 +11,7 @@ import warp_abtree as ab
 
 
 def placed(scene):
-    pool = scene.arrays()[2].pool
+    pool = scene.batch().objects.pool
     return pool.rotation.numpy(), pool.position.numpy()
 
 
@@ -157,6 +157,6 @@ def test_names_of_a_model_may_repeat(device):
 def test_statistics_of_an_update_can_be_read(device):
     scene = pair_scene(device)
     stats = scene.set_lods([0, 3, 5])
-    assert repr(stats) == f"UpdateStats({len(stats.state)} states updated, {stats.full.sum()} of them whole)"
+    assert repr(stats) == f"LodUpdate({len(stats.state)} states updated, {stats.full.sum()} of them whole)"
     assert len(stats.state) == 3
-    assert "UpdateStats(0 states" in repr(scene.set_lods([0, 3, 5]))
+    assert "LodUpdate(0 states" in repr(scene.set_lods([0, 3, 5]))

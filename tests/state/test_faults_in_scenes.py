@@ -50,7 +50,7 @@ def test_lods(device, fault, move):
     def make():
         scene = make_scene(device)
         if move == "pool grows":
-            scene.arrays()[1].free.clear()  # no state to take again
+            scene.batch().states.free.clear()  # no state to take again
         return scene
 
     def check(before, scene):
@@ -108,7 +108,7 @@ def test_poses(device, fault, matrices):
 
     def move(scene):
         scene.set_poses(poses)
-        return scene.arrays()[2].pool.position.numpy()
+        return scene.batch().objects.pool.position.numpy()
 
     count, _ = fault.everywhere(lambda: make_scene(device), move, check_scene)
     assert count >= 1 or isinstance(fault, MemoryShortage)

@@ -51,7 +51,7 @@ def make():
         scene.add(model, pose=(0.3 * k, 0.1, 0, 0, 0, 0, 1))
     return scene
 scene = make()
-scene.arrays()
+scene.batch()
 kept, wp.config.kernel_cache_dir = wp.config.kernel_cache_dir, sys.argv[1]
 for call in (lambda: scene.set_lods([model.lod_max - 1] * 3), lambda: scene.intersect(output="faces")):
     try:
