@@ -105,7 +105,7 @@ def test_lists_that_overflow_lose_nothing(device, output, monkeypatch, small_chu
     poses[:, 0] = np.arange(20) / 10
     expected = ask_scene(device, [box, box], poses, [None, None], output="faces")
     assert expected.any[:11].all() and not expected.any[11:].any()
-    monkeypatch.setattr(pose_sweep, "Query", partial(GpuQuery, unsure_capacity=1))
+    monkeypatch.setattr(pose_sweep, "Query", partial(GpuQuery, capacity=ab.Buffers(uncertain=1)))
     found = ab.sweep(box, box, poses, output=output, device=device)
     np.testing.assert_array_equal(found, getattr(expected, output))
     (posed,) = pose_sweep._kept.values()

@@ -14,10 +14,12 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.device_lock import device_turn
 from warp_abtree.kernels.sweep import NONE_REFUSED, place_matrix_kernel, place_quaternion_kernel, report_chunk_kernel
-from warp_abtree.query.narrow_phase import Query, check_request
+from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.request import check_request
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE, check_poses, device_rows
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.arrays import ObjectArrays
+from warp_abtree.state.batch import Batch
 
 # Poses asked at a time: enough to fill a GPU, few enough that millions need no more memory; fewer where few are asked.
 CHUNKS = (1024, 8192, 65536)
@@ -91,8 +93,7 @@ class _PosedModels:
     def __init__(self, pair: Scene, owners):
         self.device = pair.device
         self.owners = owners  # weak, and taken out of what is kept when a model goes
-        self.models, self.states, objects = pair.arrays()
-        self.state = objects.state
+        self.batch = pair.batch()
         self.chunks: dict[int, _Chunk] = {}
 
     def find_chunk(self, count):
@@ -104,22 +105,15 @@ class _PosedModels:
 
 
 class _Chunk:
-    """What a `Query` asks of a scene, for object 0, model A, and objects 1 to `room`, all of them model B."""
+    """A batch of object 0, model A, and objects 1 to `room`, all of them model B."""
 
     def __init__(self, posed: _PosedModels, room):
-        self.device = posed.device
-        self.room = room
-        self.objects = ObjectArrays(np.zeros(room + 1), np.zeros(room + 1), self.device)
-        self.objects.set_states(np.repeat(posed.state, [1, room]))
-        self.objects.pool.rotation[:1].assign(np.eye(3)[None])
-        self._arrays = (posed.models, posed.states, self.objects)
+        pair, self.room = posed.batch, room
+        objects = ObjectArrays(np.zeros(room + 1), np.zeros(room + 1), posed.device)
+        objects.set_states(np.repeat(pair.objects.state, [1, room]))
+        objects.pool.rotation[:1].assign(np.eye(3)[None])
+        self.batch = Batch(pair.models, pair.states, objects, np.repeat(pair.object_model, [1, room]))
         self.question: _Question | None = None
-
-    def arrays(self):
-        return self._arrays
-
-    def check_pairs(self, pairs):
-        return pairs
 
     def ask(self, output, precision):
         """Return the question that was asked last if it is the same, else another."""
@@ -156,7 +150,7 @@ class _Lane:
         self.poses_host, self.report_host = mirror(self.poses_flat), mirror(self.report)
         answer = wp.empty(room, dtype=wp.int64, device=device) if output == "count" else self.answer
         self.answer_host = mirror(answer)
-        self.unsure_room = 0
+        self.uncertain_room = 0
         if device.is_cuda:
             self.loaded, self.done = wp.Event(device), wp.Event(device)
 
@@ -167,10 +161,10 @@ class _Question:
     def __init__(self, chunk: _Chunk, key):
         self.key = key
         self.output, precision = key
-        self.device, self.room, self.objects = chunk.device, chunk.room, chunk.objects
+        self.device, self.room, self.objects = chunk.batch.device, chunk.room, chunk.batch.objects
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
-        self.query = Query(chunk, self.output, pairs=self.pairs, precision=precision)
+        self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision)
         self.count = self.room
         self.lanes: dict = {}
         self.copies = _find_copy_stream(self.device.alias) if self.device.is_cuda else None
@@ -213,7 +207,7 @@ class _Question:
 
     def _begin(self, lane, poses, start, count):
         self._load(lane, poses, start, count)
-        lane.unsure_room = len(self.query.hits.unsure)
+        lane.uncertain_room = len(self.query.hits.unsure)
         if count != self.count:
             self.query.pair_count.fill_(count)
             self.count = count
@@ -230,10 +224,10 @@ class _Question:
         """Wait for a chunk and return its answers."""
         if self.device.is_cuda:
             wp.synchronize_event(lane.done)
-        refused, unsure = lane.report_host.numpy().tolist()
+        refused, uncertain = lane.report_host.numpy().tolist()
         if refused != NONE_REFUSED:
             _refuse(poses, start + refused)
-        if unsure % 2**32 > lane.unsure_room:  # which may have grown since
+        if uncertain % 2**32 > lane.uncertain_room:  # which may have grown since
             return getattr(self._ask_again(lane, count), self.output)
         return lane.answer_host.numpy()[:count]
 
