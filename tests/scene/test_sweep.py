@@ -109,7 +109,7 @@ def test_lists_that_overflow_lose_nothing(device, output, monkeypatch, small_chu
     found = ab.sweep(box, box, poses, output=output, device=device)
     np.testing.assert_array_equal(found, getattr(expected, output))
     (posed,) = pose_sweep._kept.values()
-    assert len(posed.chunks[7].chunk_query.query.hits.unsure) > 1
+    assert len(posed.chunks[7].chunk_query.query.hits.uncertain) > 1
 
 
 def test_no_poses(device):

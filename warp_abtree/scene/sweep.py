@@ -207,7 +207,7 @@ class _ChunkQuery:
 
     def _begin(self, slot, poses, start, count):
         self._load(slot, poses, start, count)
-        slot.uncertain_room = len(self.query.hits.unsure)
+        slot.uncertain_room = len(self.query.hits.uncertain)
         if count != self.count:
             self.query.pair_count.fill_(count)
             self.count = count
@@ -277,7 +277,7 @@ class _ChunkQuery:
         return np.concatenate(parts)
 
     def is_small(self):
-        return len(self.query.hits.face) + len(self.query.hits.unsure) <= KEPT_ROWS
+        return len(self.query.hits.face) + len(self.query.hits.uncertain) <= KEPT_ROWS
 
 
 def _keep(key, posed):
