@@ -8,8 +8,9 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, wrap_array
 from warp_abtree.kernels import pipeline as kernels
-from warp_abtree.model.mesh import MeshError, load_mesh, triangulate
+from warp_abtree.model.mesh import MeshError, load_mesh
 from warp_abtree.model.model import Model
+from warp_abtree.model.obj import triangulate
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.generation import STALE_GRAPH, LaunchGuard
