@@ -7,7 +7,7 @@ import threading
 from collections import deque
 
 from warp_abtree.checks.arguments import whole_number
-from warp_abtree.query.narrow_phase import Query
+from warp_abtree.checks.regime import change_regime
 
 # Shards sent to a worker at a time: one running, one queued.
 AHEAD = 2
@@ -38,7 +38,7 @@ class _Actor:
     """Ray actor: holds the task runner of a job, which came once, through the object store."""
 
     def __init__(self, runner, device):
-        Query.cores = 1 if device == "cpu" else None  # one actor per core
+        change_regime(cpu_threads=1 if device == "cpu" else None)  # one actor per core
         self.runner, self.device = runner, device
 
     def ready(self):

@@ -17,7 +17,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import to_numpy, whole_number
 from warp_abtree.kernels.lod import selection as kernels
-from warp_abtree.state.update import full_share
+from warp_abtree.state.update import full_refit_fraction
 
 SPACINGS = ("operations", "ratio")
 LEVELS_PER_OCTAVE = int(kernels.STEPS_PER_OCTAVE) // int(kernels.DITHER)
@@ -381,7 +381,7 @@ class PredictedSelection:
         launch(kernels.raise_faces_kernel, len(prediction.power_up), pool, prediction)
         inputs = models, pool, self.dial, self._offset, self.rung, self.work, prediction
         launch(kernels.predict_work_kernel, (candidates, int(kernels.CHUNKS)), *inputs)
-        share = full_share(self.view.device)
+        share = full_refit_fraction(self.view.device)
         launch(kernels.predict_refit_kernel, (candidates, models), models, share, pool, prediction)
         launch(kernels.sum_chunk_kernel, candidates, prediction)
         limits = self.budget, self.aim, self.low, self.patience, self.dial_max, self.stay
