@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from helpers.samples import random_poses, sample
+import warp_abtree as ab
+from helpers.samples import STILL, random_poses, sample
 from warp_abtree.app.toml.scene_file import load_scene
 from warp_abtree.jobs import SweepJob, ThisProcess, read_shards, run_shards
 
@@ -43,6 +44,15 @@ def contents(out):
 
 def shard_at(out, k):
     return sorted(out.glob("shard-*"))[k]
+
+
+def intersect(device, poses, lods, output):
+    """Return the result of a scene with two objects per pose, whose index is the pair's."""
+    scene = ab.Scene(device)
+    for k, model in enumerate(pair()):
+        for i in range(len(poses)):
+            scene.add(model, poses[i] if k else STILL, lod=int(lods[i, k]))
+    return scene.intersect(np.arange(len(poses))[:, None] + [0, len(poses)], output=output)
 
 
 def stop_after(count):
