@@ -299,7 +299,7 @@ class CollisionManager:
         if self._convex_solids:
             apart = np.flatnonzero(~result.any)
             nested = apart[self._placed.may_contain(pairs[apart])].tolist()
-            inside = {k: self._placed.find_contained(*pairs[k], names[k]) for k in nested}
+            inside = {k: self._placed.find_contained(pairs[k], names[k]) for k in nested}
         hit = [k for k in range(len(pairs)) if result.any[k] or inside.get(k) is not None]
         contacts = []
         if return_data:

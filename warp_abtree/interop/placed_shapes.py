@@ -115,14 +115,15 @@ class PlacedShapes:
             nested |= solid[outer] & (held | several[inner])
         return nested
 
-    def find_contained(self, i, j, names):
+    def find_contained(self, pair, names):
         """Return a `ContactData` if a component of one object is inside the other; surfaces must not intersect."""
-        for outer, inner in ((i, j), (j, i)):
+        for outer, inner in (pair, pair[::-1]):
             shape, other = self.shapes[outer], self.shapes[inner]
             found = shape.find_inside(self.poses[outer], other, self.poses[inner])
             if found is not None:
                 point, normal, depth, face_outer, face_inner = found
-                faces = (face_outer, face_inner) if outer == i else (face_inner, face_outer)
-                normal = normal if outer == i else -normal
+                first = outer == pair[0]
+                faces = (face_outer, face_inner) if first else (face_inner, face_outer)
+                normal = normal if first else -normal
                 return ContactData(names, faces, np.stack([point, point]), normal, depth)
         return None

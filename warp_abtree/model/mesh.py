@@ -70,7 +70,8 @@ def load_mesh(source, name=None):
     name = split_file_name(path)[0] if name is None else name
     if isinstance(found, trimesh.Scene):
         return _join_geometry(found, name, where=str(path))
-    return _weld_mesh(*found, name, where=str(path))
+    vertices, faces = found
+    return _weld_mesh(vertices, faces, name, where=str(path))
 
 
 def mesh_from_arrays(vertices, faces, name="arrays"):

@@ -4,6 +4,7 @@ import hashlib
 import zipfile
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -87,7 +88,7 @@ class Model:
         """Hash of mesh, collapses and tree, hexadecimal; equal for equal models whatever their names."""
         return _hash_arrays({name: value for name, value in self._arrays().items() if name != "name"}).hex()
 
-    def _arrays(self) -> dict:
+    def _arrays(self) -> dict[str, Any]:
         arrays = {name: getattr(self.progressive, name) for name in _ARRAYS}
         return arrays | {"leaf_node": self.tree.leaf_node, "name": np.array(self.name)}
 
@@ -161,9 +162,9 @@ class Model:
         """
         arrays = self._arrays()
         digest = np.frombuffer(_hash_arrays(arrays), np.uint8)
-        about = {"format": np.array(FORMAT_NAME), "version": np.array(FORMAT_VERSION), "digest": digest}
+        about: dict[str, Any] = {"format": np.array(FORMAT_NAME), "version": np.array(FORMAT_VERSION), "digest": digest}
         with atomic_write(path) as file:
-            np.savez_compressed(file, **about, **arrays)
+            np.savez_compressed(file, **about | arrays)
 
     @classmethod
     def open(cls, path) -> "Model":
