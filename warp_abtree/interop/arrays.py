@@ -6,8 +6,8 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, wrap_array
 from warp_abtree.kernels import pipeline as kernels
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE
+from warp_abtree.state.device_update import NO_FAULTS
 from warp_abtree.state.generation import STALE_GRAPH, LaunchGuard
-from warp_abtree.state.update import NO_FAULTS
 
 
 class PoseInput:
@@ -28,12 +28,12 @@ class PoseInput:
         check_device(scene.device, "making a PoseInput")
         self.scene = scene
         self.device = scene.device
-        self._arrays = scene.arrays()
-        self._guard = LaunchGuard(self.device, self._arrays[2].generation)
+        self._batch = scene.batch()
+        self._guard = LaunchGuard(self.device, self._batch.objects.generation)
         count = scene.object_count
         self.poses = wp.empty((count, 7), dtype=wp.float64, device=self.device)
         self._faults = wp.array(NO_FAULTS, dtype=wp.int32, device=self.device)
-        wp.launch(kernels.read_pose_kernel, count, [self._arrays[2].pool, self.poses], device=self.device)
+        wp.launch(kernels.read_pose_kernel, count, [self._batch.objects.pool, self.poses], device=self.device)
 
     def launch(self, poses=None):
         """Place every object. Launches only.
@@ -47,8 +47,7 @@ class PoseInput:
             ValueError: Another shape, type or device; nothing is changed.
             RuntimeError: Objects were added to the scene since this was made.
         """
-        if self._arrays != self.scene.arrays():
-            raise RuntimeError("objects were added to the scene since this pose input was made; make a new one")
+        self._batch.check("pose input")
         check_device(self.device)
         with self._guard.launching(self):
             self._launch(poses)
@@ -58,7 +57,7 @@ class PoseInput:
         if rows.dtype == wp.float32:
             wp.utils.array_cast(rows, self.poses)
             rows = self.poses
-        inputs = [QUATERNION_TOLERANCE, rows, self._arrays[2].pool, self._faults, self._guard.record()]
+        inputs = [QUATERNION_TOLERANCE, rows, self._batch.objects.pool, self._faults, self._guard.record()]
         wp.launch(kernels.place_object_kernel, len(self.poses), inputs, device=self.device)
 
     def _check(self, rows):

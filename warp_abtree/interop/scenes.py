@@ -204,7 +204,7 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
     if result is not None and len(result.pairs) and int(result.pairs.max()) >= count:
         raise ValueError(f"result: asks object {int(result.pairs.max())}, the scene has {count}")
     hit = _intersecting_faces(scene, result)
-    objects = scene.arrays()[2].pool
+    objects = scene.batch().objects.pool
     worlds = objects.world.numpy()
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = objects.rotation.numpy(), objects.position.numpy()

@@ -9,7 +9,7 @@ import numpy as np
 
 from warp_abtree.checks.arguments import to_numpy, whole_number
 from warp_abtree.model.model import Model
-from warp_abtree.query.narrow_phase import check_request
+from warp_abtree.query.request import check_request
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep import sweep
