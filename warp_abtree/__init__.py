@@ -4,12 +4,11 @@ from warp_abtree.app.pictures.plot import draw_controllers
 from warp_abtree.app.toml.scene_file import SceneError, load_scene
 from warp_abtree.checks.arguments import wrap_array
 from warp_abtree.checks.version import __version__ as __version__
+from warp_abtree.interop.arrays import PoseInput
 from warp_abtree.interop.collision_manager import CollisionManager
 from warp_abtree.interop.newton import NewtonContacts
-from warp_abtree.interop.scenes import PoseInput, scene_from_file, scene_from_trimesh, to_trimesh
-from warp_abtree.jobs.ray_pool import RayPool, WorldsJob
-from warp_abtree.jobs.shard_folder import read_shards
-from warp_abtree.jobs.shards import SweepJob, ThisProcess, run_shards
+from warp_abtree.interop.scenes import scene_from_file, scene_from_trimesh, to_trimesh
+from warp_abtree.jobs import RayPool, SweepJob, ThisProcess, WorldsJob, read_shards, run_shards
 from warp_abtree.lod.controllers import Feedback, PaperController, PredictiveController, ToleranceController
 from warp_abtree.lod.selection import Camera, Ladder
 from warp_abtree.lod.timing import ReplayClock, WorkClock

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy
-from warp_abtree.checks.device_lock import device_turn
+from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.sweep import NONE_REFUSED, place_matrix_kernel, place_quaternion_kernel, report_chunk_kernel
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request
@@ -317,7 +317,7 @@ def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precisi
     check_request(output, precision)
     pair = Scene(device)
     check_device(pair.device, "ab.sweep")
-    with device_turn(pair.device):
+    with device_lock(pair.device):
         return _sweep(pair, (model_a, model_b), poses, (lod_a, lod_b), output, precision)
 
 
