@@ -22,8 +22,10 @@ from warp_abtree.query.narrow_phase import Query, Result
 from warp_abtree.scene.pipeline import FrameGraph
 from warp_abtree.scene.scene import Scene, TreeState
 from warp_abtree.scene.sweep import sweep
-from warp_abtree.simulate.frame import Frame, FrameRow, LodSweep, judge_budget, judge_step, resolve_lod
-from warp_abtree.simulate.rigid_bodies import Dynamics, Kinematic
+from warp_abtree.simulate.budget_report import budget_report, step_response
+from warp_abtree.simulate.frame import Frame, FrameRow, LodSweep, resolve_lod
+from warp_abtree.simulate.motion import Kinematic
+from warp_abtree.simulate.rigid_bodies import Dynamics
 from warp_abtree.state.update import UpdateStats
 
 __all__ = [
@@ -60,10 +62,9 @@ __all__ = [
     "UpdateStats",
     "WorkClock",
     "WorldsJob",
+    "budget_report",
     "describe_mesh",
     "draw_controllers",
-    "judge_budget",
-    "judge_step",
     "load_mesh",
     "load_scene",
     "mesh_from_arrays",
@@ -72,6 +73,7 @@ __all__ = [
     "run_shards",
     "scene_from_file",
     "scene_from_trimesh",
+    "step_response",
     "sweep",
     "to_trimesh",
     "wrap_array",
