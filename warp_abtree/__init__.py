@@ -11,8 +11,8 @@ from warp_abtree.jobs.ray_pool import RayPool, WorldsJob
 from warp_abtree.jobs.shard_folder import read_shards
 from warp_abtree.jobs.shards import SweepJob, ThisProcess, run_shards
 from warp_abtree.lod.controllers import Feedback, PaperController, PredictiveController, ToleranceController
-from warp_abtree.lod.selection import Camera, Ladder
 from warp_abtree.lod.timing import ReplayClock, WorkClock
+from warp_abtree.lod.view import Camera
 from warp_abtree.model.mesh import MeshError, describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model, ModelError
 from warp_abtree.query.broad_phase import CapacityError
@@ -26,6 +26,7 @@ from warp_abtree.simulate.budget_report import budget_report, step_response
 from warp_abtree.simulate.frame import Frame, FrameRow, LodSweep, resolve_lod
 from warp_abtree.simulate.motion import Kinematic
 from warp_abtree.simulate.rigid_bodies import Dynamics
+from warp_abtree.state.ladder import Ladder
 from warp_abtree.state.update import UpdateStats
 
 __all__ = [

@@ -9,7 +9,7 @@ import trimesh
 
 import warp_abtree as ab
 from warp_abtree.lod.controllers import CostFit, Feedback, PaperController, PredictiveController, ToleranceController
-from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.view import Camera
 from warp_abtree.lod.timing import WorkClock
 from warp_abtree.simulate.frame import judge_budget, judge_step
 

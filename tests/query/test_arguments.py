@@ -11,7 +11,7 @@ from helpers.samples import sample
 
 import warp_abtree as ab
 from warp_abtree.app.cli.main import main
-from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.view import Camera
 
 SCENE = """
 [models.ball]

@@ -10,7 +10,7 @@ import trimesh
 
 import warp_abtree as ab
 from warp_abtree.lod.controllers import PaperController, PredictiveController, ToleranceController
-from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.view import Camera
 from warp_abtree.lod.timing import STAGES, ReplayClock, WorkClock
 from warp_abtree.simulate.frame import judge_budget, judge_step
 from warp_abtree.simulate.rigid_bodies import multiply_quaternions, quaternions_about

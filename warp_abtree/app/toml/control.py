@@ -7,7 +7,7 @@ import numpy as np
 
 from warp_abtree.app.toml import keys as keys_of
 from warp_abtree.lod.controllers import PaperController, PredictiveController, ToleranceController
-from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.view import Camera
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.motion import Kinematic
 from warp_abtree.simulate.rigid_bodies import Dynamics
