@@ -8,7 +8,7 @@ import trimesh
 from helpers.samples import random_poses
 
 import warp_abtree as ab
-from warp_abtree.simulate.body_state import matrices_of
+from warp_abtree.checks.quaternions import matrices_of
 
 
 def model_of(mesh):

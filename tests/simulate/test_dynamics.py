@@ -6,7 +6,8 @@ import trimesh
 from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, NO_GRAVITY, TORUS, about, box, make, model_of, on_ground
 
 import warp_abtree as ab
-from warp_abtree.simulate.body_state import mass_properties, matrices_of
+from warp_abtree.checks.quaternions import matrices_of
+from warp_abtree.simulate.body_state import mass_properties
 
 
 def totals(dynamics):
@@ -41,7 +42,7 @@ def test_mass_properties_of_a_box_off_its_origin():
     np.testing.assert_allclose(found.moments, expected, rtol=1e-12)
     np.testing.assert_allclose(found.axes @ found.axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(found.axes) > 0
-    assert found.reach == pytest.approx(np.linalg.norm([a, b, c]) / 2)
+    assert found.bounding_radius == pytest.approx(np.linalg.norm([a, b, c]) / 2)
 
 
 def test_an_open_mesh_has_the_mass_of_its_convex_hull():
@@ -90,7 +91,7 @@ def test_a_free_body_flies_and_tumbles(device):
     spin = np.array([0.3, 5.0, 0.2])
     errors = []
     for steps in (100, 200):
-        dynamics = make(device, (brick, pose), velocity=(1, 2, 3), spin=spin, **NO_GRAVITY)
+        dynamics = make(device, (brick, pose), velocity=(1, 2, 3), angular_velocity=spin, **NO_GRAVITY)
         start = totals(dynamics)
         for _ in range(steps):
             dynamics.step(1 / steps)
@@ -129,7 +130,7 @@ def swarm(device, seed, **options):
     velocity = -corners * rng.uniform(0.7, 1.0, (6, 1)) + rng.normal(0, 0.1, (6, 3))
     spin = rng.normal(size=(6, 3))
     density = rng.uniform(0.5, 3, 6)
-    return make(device, *placed, density=density, velocity=velocity, spin=spin, **NO_GRAVITY, **options)
+    return make(device, *placed, density=density, velocity=velocity, angular_velocity=spin, **NO_GRAVITY, **options)
 
 
 @pytest.mark.parametrize("restitution, friction", [(1, 0), (1, 0.6), (0.5, 0.3), (0, 0.5)])
@@ -227,7 +228,9 @@ def test_bounces_under_gravity_gain_no_energy(device):
 def test_corrections_of_place_leave_velocity_and_energy(device):
     """A brick deep in the floor that leaves it slowly: it is lifted and turned, but moves and spins on as before."""
     pose = (0, 0, 0.4, *about((0.3, 1, 0), 0.5))
-    dynamics = on_ground(device, (box(1.2, 0.9, 0.5), pose), velocity=(0, 0, 0.3), spin=(0, 0, 2), **NO_GRAVITY)
+    dynamics = on_ground(
+        device, (box(1.2, 0.9, 0.5), pose), velocity=(0, 0, 0.3), angular_velocity=(0, 0, 2), **NO_GRAVITY
+    )
     start = totals(dynamics)
     dynamics.step(0.01)
     found = totals(dynamics)
@@ -280,7 +283,7 @@ def test_boxes_come_to_rest_on_a_plane_and_sleep(device):
     assert dynamics.asleep.tolist() == [False, *[True] * 6]
     assert np.all(dynamics.velocities()[0] == 0) and np.all(dynamics.velocities()[1] == 0)
     poses = dynamics.poses()[1:]
-    slop = dynamics.properties[1].reach / 512
+    slop = dynamics.properties[1].bounding_radius / 512
     for pose in poses:
         r = np.abs(matrices_of([pose[3:]])[0][2])
         axis = int(np.argmax(r))
@@ -318,7 +321,7 @@ def test_a_stack_of_five_stands_for_ten_seconds(device, splits):
     for _ in range(600):
         dynamics.step(1 / 60)
     moved = dynamics.poses()[1:] - start
-    slop = dynamics.properties[1].reach / 512
+    slop = dynamics.properties[1].bounding_radius / 512
     assert np.abs(moved[:, :2]).max() < 0.006 and np.abs(moved[:, 3:6]).max() < 0.01
     np.testing.assert_allclose(moved[:, 2], -slop * np.arange(1, 6), atol=2 * slop)
     assert not dynamics.asleep.any() and np.abs(dynamics.velocities()[0]).max() < 1e-3
@@ -349,7 +352,7 @@ def test_bodies_meet_as_they_are_at_their_lods(device):
     scene.add(GROUND, pose=FLOOR, static=True)
     scene.add(ball, pose=(0, 0, 0.6, 0, 0, 0, 1))
     dynamics = ab.Dynamics(scene)
-    slop = dynamics.properties[1].reach / 512
+    slop = dynamics.properties[1].bounding_radius / 512
     for lod in (ball.lod_for(fraction=0.1), ball.lod_max, ball.lod_for(fraction=0.3)):
         scene.set_lods([GROUND.lod_max, lod])
         dynamics.wake()

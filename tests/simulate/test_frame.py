@@ -9,11 +9,11 @@ import pytest
 import trimesh
 
 import warp_abtree as ab
+from warp_abtree.checks.quaternions import multiply_quaternions, quaternions_about
 from warp_abtree.lod.controllers import PaperController, PredictiveController, ToleranceController
-from warp_abtree.lod.view import Camera
 from warp_abtree.lod.timing import STAGES, ReplayClock, WorkClock
-from warp_abtree.simulate.frame import judge_budget, judge_step
-from warp_abtree.simulate.rigid_bodies import multiply_quaternions, quaternions_about
+from warp_abtree.lod.view import Camera
+from warp_abtree.simulate.budget_report import budget_report, step_response
 
 
 def rotate(quaternion, vector):
@@ -171,7 +171,7 @@ def test_rows_are_what_a_fresh_scene_finds(models, device):
         assert np.array_equal(result.pairs, expected.pairs) and np.array_equal(result.faces, expected.faces)
         row = frame.history[-1]
         assert (row.frame, row.time, row.objects) == (number, pytest.approx(time), 3)
-        assert (row.pairs, row.touching, row.hits) == (len(expected.pairs), expected.any.sum(), len(expected.faces))
+        assert (row.pairs, row.intersecting, row.hits) == (len(expected.pairs), expected.any.sum(), len(expected.faces))
         assert (row.lod_min, row.lod_max) == (lods_at(time).min(), lods_at(time).max())
         model_of = (models[0], models[1], models[0])
         assert row.faces == sum(len(m.mesh_at(lod)[2]) for m, lod in zip(model_of, lods_at(time)))
@@ -288,7 +288,7 @@ def test_controllers_move_lods_from_the_coarsest(models, device):
         frame.warm_up()
         assert scene.lods.tolist() == [models[0].lod_max, models[1].lod_max, models[0].lod_max]
         rows = frame.run(80)
-        assert rows[0].lod_max == 0 and rows[0].lods_changed == 3 and rows[0].lods_turned == 0
+        assert rows[0].lod_max == 0 and rows[0].lods_changed == 3 and rows[0].oscillations == 0
         assert scene.lods.tolist() == [models[0].lod_max, models[1].lod_max, models[0].lod_max]
         assert rows[-1].error_max == 0 < rows[0].error_mean <= rows[0].error_max
 
@@ -324,39 +324,39 @@ def test_rows_tell_errors_and_turns(models):
         assert (row.error_mean, row.error_max) == (pytest.approx(np.mean(errors)), max(errors))
     # Objects start at their finest, so that the first change is a fall for all.
     assert [row.lods_changed for row in rows] == [3, 1, 2, 2, 2, 0]
-    assert [row.lods_turned for row in rows] == [0, 1, 2, 2, 2, 0]
+    assert [row.oscillations for row in rows] == [0, 1, 2, 2, 2, 0]
 
 
 def make_rows(costs, budget=10.0, step=0.5):
     rows = []
     for i, cost in enumerate(costs):
         values = dict.fromkeys(ab.FrameRow.names()[:-2], 0)
-        values |= {"frame": i, "time": i * step, "objects": 4, "lods_turned": i % 2, "error_mean": float(i)}
+        values |= {"frame": i, "time": i * step, "objects": 4, "oscillations": i % 2, "error_mean": float(i)}
         rows.append(ab.FrameRow(**{**values, "budget_ms": budget, "query_ms": cost, "move_ms": 99.0}))
     return rows
 
 
 def test_budgets_are_judged():
     rows = make_rows([50, 50, 10, 10.5, 11, 11.5, 12, 8, 40, 9])
-    verdict = judge_budget(rows)
+    verdict = budget_report(rows)
     assert verdict == {
         "frames": 8,
         "within": 3 / 8,
-        "within_tenth": 5 / 8,
+        "within_110_percent": 5 / 8,
         "worst": 4.0,
         "longest_over": 2,
-        "turns": pytest.approx(4 / 4 / 4.0),
+        "oscillations": pytest.approx(4 / 4 / 4.0),
         "error_mean": 5.5,
     }
-    assert judge_budget(rows, after=0.0)["within"] == 3 / 10
-    assert judge_budget(rows, budget_ms=20.0)["within"] == 7 / 8
-    assert judge_budget(rows, after=5.0) is None and judge_budget(make_rows([1.0] * 9, None)) is None
-    assert judge_step(rows, 0) == {"peak": 5.0, "frames": 2}
-    assert judge_step(rows, 5) == {"peak": 4.0, "frames": 2}
-    assert judge_step(rows, 8) == {"peak": 4.0, "frames": 1}
-    assert judge_step(make_rows([30, 40]), 1) == {"peak": 4.0, "frames": None}
+    assert budget_report(rows, after=0.0)["within"] == 3 / 10
+    assert budget_report(rows, budget_ms=20.0)["within"] == 7 / 8
+    assert budget_report(rows, after=5.0) is None and budget_report(make_rows([1.0] * 9, None)) is None
+    assert step_response(rows, 0) == {"peak": 5.0, "frames": 2}
+    assert step_response(rows, 5) == {"peak": 4.0, "frames": 2}
+    assert step_response(rows, 8) == {"peak": 4.0, "frames": 1}
+    assert step_response(make_rows([30, 40]), 1) == {"peak": 4.0, "frames": None}
     with pytest.raises(ValueError, match="frame 10"):
-        judge_step(rows, 10)
+        step_response(rows, 10)
 
 
 def test_summary_judges_the_budget(models):
@@ -364,7 +364,7 @@ def test_summary_judges_the_budget(models):
     frame = ab.Frame(scene, make_motion(), PaperController(scene, 1e6), clock=WorkClock())
     frame.run(70)
     summary = frame.summary()
-    assert summary["budget_ms"] == 1e6 and summary["budget"] == judge_budget(frame.history)
+    assert summary["budget_ms"] == 1e6 and summary["budget"] == budget_report(frame.history)
     assert summary["budget"]["frames"] == 10 and summary["budget"]["within"] == 1.0
     assert frame.summary(after=0.0)["budget"]["frames"] == 70
     assert ab.Frame(scene).run(1) and json.dumps(summary)
@@ -405,7 +405,7 @@ class Finder(Pusher):
 def test_motion_hears_what_was_found_and_moves_on(models, device):
     log, scene = [], make_scene(models, device)
     rows = ab.Frame(scene, Pusher(scene, log), time_step=0.25).run(3)
-    touching = [row.touching for row in rows]
+    touching = [row.intersecting for row in rows]
     assert touching[0] == 3 and touching[-1] == 1
     expected = [(("poses", 0.25 * i), ("answer", touching[i])) for i in range(3)]
     assert log == [entry for pair in expected for entry in pair]

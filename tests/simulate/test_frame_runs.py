@@ -10,8 +10,8 @@ import trimesh
 
 import warp_abtree as ab
 from warp_abtree.lod.controllers import PaperController, ToleranceController
-from warp_abtree.lod.view import Camera
 from warp_abtree.lod.timing import STAGES, ReplayClock
+from warp_abtree.lod.view import Camera
 
 ROOT = Path(__file__).resolve().parents[2]
 

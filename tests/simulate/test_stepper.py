@@ -6,8 +6,8 @@ import trimesh
 from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, NO_GRAVITY, TORUS, about, box, make, on_ground
 
 import warp_abtree as ab
-from warp_abtree.kernels.dynamics import graph_coloring as colour
-from warp_abtree.simulate.body_state import quaternions_of
+from warp_abtree.checks.quaternions import quaternions_of
+from warp_abtree.kernels.dynamics import graph_coloring
 
 pytestmark = pytest.mark.slow
 
@@ -28,7 +28,7 @@ def heap(count=9, seed=0):
 class Coloured(ab.Dynamics):
     """Relaxes colour by colour, as on a GPU, on any device."""
 
-    in_turn = False
+    sequential = False
 
 
 def bits(dynamics):
@@ -72,10 +72,10 @@ def test_more_touching_bodies_than_colours(device):
             scene.add(model, pose=pose)
         dynamics = kind(scene, sleep_speed=0)
         run(dynamics, 10)
-        used = dynamics._colour.numpy()
-        assert (used == int(colour.COLOURS)).sum() == 36 + 1 - int(colour.COLOURS)
+        used = dynamics._pair_color.numpy()
+        assert (used == int(graph_coloring.COLOR_COUNT)).sum() == 36 + 1 - int(graph_coloring.COLOR_COUNT)
         pairs = dynamics.query.pairs.numpy()
-        for c in range(int(colour.COLOURS)):
+        for c in range(int(graph_coloring.COLOR_COUNT)):
             movers = pairs[used == c].ravel()
             movers = movers[movers > 0]
             assert len(set(movers.tolist())) == len(movers)
@@ -143,7 +143,7 @@ def test_a_frame_steps_and_reports(device):
         assert result.pairs.tolist() == stepped.query.result().pairs.tolist()
         assert frame.history[-1].hits == result.count.sum()
     assert np.array_equal(bits(stepped), bits(framed))
-    assert max(row.touching for row in frame.history) > 4
+    assert max(row.intersecting for row in frame.history) > 4
 
 
 def test_a_frame_drives_kinematic_objects(device):
@@ -176,7 +176,7 @@ def test_quaternions_of_all_rotations():
     q = rng.normal(size=(200, 4))
     q = np.concatenate([q, np.eye(4), [[1, 1, 0, 0], [0, 1, 1, 1e-12], [1e-9, 1, 0, 1]]])
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    from warp_abtree.simulate.body_state import matrices_of
+    from warp_abtree.checks.quaternions import matrices_of
 
     np.testing.assert_allclose(matrices_of(quaternions_of(matrices_of(q))), matrices_of(q), atol=1e-14)
 
@@ -194,7 +194,7 @@ def test_quaternions_of_all_rotations():
         ({"kinematic": [5]}, "kinematic"),
         ({"kinematic": [True]}, "kinematic"),
         ({"velocity": (np.nan, 0, 0)}, "velocity: a number is not finite"),
-        ({"spin": (1, 2)}, "spin: shape"),
+        ({"angular_velocity": (1, 2)}, "angular_velocity: shape"),
         ({"iterations": 0}, "iterations"),
         ({"slop": -1}, "slop"),
         ({"sleep_time": 0}, "sleep_time"),
@@ -237,7 +237,7 @@ def test_one_body_alone_and_none_at_all(device):
 def test_an_off_centre_mesh_turns_about_its_centre_of_mass(device):
     mesh = trimesh.creation.box((1, 0.5, 0.2)).apply_translation((5, 1, -2))
     model = ab.Model.from_arrays(mesh.vertices, mesh.faces, base_faces=4)
-    dynamics = make(device, (model, (-5, -1, 2, 0, 0, 0, 1)), spin=(0, 0, np.pi), **NO_GRAVITY)
+    dynamics = make(device, (model, (-5, -1, 2, 0, 0, 0, 1)), angular_velocity=(0, 0, np.pi), **NO_GRAVITY)
     run(dynamics, 50, 0.01)
     r = about((0, 0, 1), np.pi / 2)
     pose = dynamics.poses()[0]

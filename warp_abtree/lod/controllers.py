@@ -7,12 +7,13 @@ clock: times are part of the feedback, so that runs repeat on counted work or re
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import positive
-from warp_abtree.lod.selection import PaperSelection, PredictedSelection, Selection, ToleranceSelection
+from warp_abtree.lod.selection import PaperSelection, PredictedSelection, ToleranceSelection
 from warp_abtree.lod.timing import COST_STAGES
 from warp_abtree.lod.view import Camera, View
 from warp_abtree.query.narrow_phase import Result
@@ -61,7 +62,7 @@ class Controller:
     """
 
     budget_ms: float | None = None
-    _selection: Selection
+    selection: Any  # its operator, of `warp_abtree.lod.selection`
 
     def __init__(self, scene, camera: Camera | Callable[[float], Camera] | None = None, window: int = 10):
         if not (camera is None or isinstance(camera, Camera) or callable(camera)):
@@ -83,8 +84,8 @@ class Controller:
             self.view.look(self.camera if isinstance(self.camera, Camera) else self.camera(feedback.time))
             self.view.launch()
         self._update(feedback)
-        self._selection.launch()
-        return self._selection.lods
+        self.selection.launch()
+        return self.selection.lods
 
     def _update(self, feedback):
         """Upload what the selection needs of the feedback."""
@@ -109,11 +110,11 @@ class PaperController(Controller):
         if threshold_ms is not None:
             threshold_ms = positive(threshold_ms, "threshold_ms")
         super().__init__(scene, camera, window)
-        self._selection = PaperSelection(self.view, budget_ms, threshold_ms, Ladder(scene.models, steps))
+        self.selection = PaperSelection(self.view, budget_ms, threshold_ms, Ladder(scene.models, steps))
         self.budget_ms = budget_ms
 
     def _update(self, feedback):
-        self._selection.cost.fill_(feedback.cost_ms)
+        self.selection.cost.fill_(feedback.cost_ms)
 
 
 class ToleranceController(Controller):
@@ -131,7 +132,7 @@ class ToleranceController(Controller):
 
     def __init__(self, scene, tolerance, camera=None, loosest=64.0, steps=50, spacing="ratio", window=10):
         super().__init__(scene, camera, window)
-        self._selection = ToleranceSelection(self.view, tolerance, loosest, Ladder(scene.models, steps, spacing))
+        self.selection = ToleranceSelection(self.view, tolerance, loosest, Ladder(scene.models, steps, spacing))
 
 
 class CostFit:
@@ -190,7 +191,7 @@ class PredictiveController(Controller):
         self.budget_ms = positive(budget_ms, "budget_ms")
         super().__init__(scene, camera, window)
         ladder = Ladder(scene.models, steps, spacing)
-        self._selection = self.selection = PredictedSelection(self.view, self.budget_ms, ladder=ladder, **options)
+        self.selection = PredictedSelection(self.view, self.budget_ms, ladder=ladder, **options)
         self._query, self._refine, self._rest = CostFit(), CostFit(), CostFit()
         self._exponent, self._drift = 1.0, 0.0
 

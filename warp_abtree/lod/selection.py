@@ -224,10 +224,10 @@ class PredictedSelection(Selection):
         self._launch(prediction.raise_faces_kernel, len(predicted.power_up), pool, predicted)
         inputs = models, pool, self.scale, self.offset, self.level, self.work, predicted
         self._launch(prediction.predict_work_kernel, (candidates, int(prediction.CHUNKS)), *inputs)
-        inputs = models, full_share(self.device), pool, predicted
-        self._launch(prediction.predict_refit_kernel, (candidates, models), *inputs)
+        share = full_share(self.device)
+        self._launch(prediction.predict_refit_kernel, (candidates, models), models, share, pool, predicted)
         self._launch(prediction.sum_chunk_kernel, candidates, predicted)
         limits = self.budget, self.aim, self.low, self.hold_frames, self.position_max, self.stay
         self._launch(prediction.choose_position_kernel, 1, *limits, predicted, self.scale, self.choice)
-        inputs = candidates - 1, pool, self.scale, self.offset, self.choice, self.level, self.lods
-        self._launch(prediction.set_level_kernel, count, *inputs)
+        place = self.scale, self.offset, self.choice, self.level, self.lods
+        self._launch(prediction.set_level_kernel, count, candidates - 1, pool, *place)

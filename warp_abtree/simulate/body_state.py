@@ -149,7 +149,7 @@ class RigidBodies:
         self._centre, self._axes = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
         radius, rank = np.full(n, np.inf), np.zeros(n, np.int64)
         for i in np.flatnonzero(rigid):
-            own = self.properties[i]
+            own = found[scene.object_model[i]]
             self.mass[i], self._moments[i] = density[i] * own.volume, density[i] * own.moments
             self._centre[i], self._axes[i], radius[i] = own.centre, own.axes, own.bounding_radius
         rank[rigid] = _ranks(self._objects.pool.world.numpy()[rigid])
