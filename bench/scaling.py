@@ -7,7 +7,6 @@ devices; weak: as much on each device. Devices are 1, 2, 4 and so on, and all. T
 of devices in turn. A CPU has one core.
 """
 
-import contextlib
 import json
 import math
 import os
@@ -21,6 +20,7 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 from .roofline import NODE_BYTES, PAIR_BYTES, TRIANGLE_BYTES
 from .scale import world_poses
@@ -140,11 +140,8 @@ def run_worker(device, model, count, repeats):
     """Return the row of a shard asked on one device, on the CPU by one core: poses on the host, answers there."""
     job = ab.SweepJob(model, model, random_poses(count, float(np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())))
     asker, item = job.asker(), job.item(0, count)
-    kept, ab.Query.cores = ab.Query.cores, 1
-    try:
+    with testing.regime(cpu_threads=1):
         times = time_rounds({"shard": time_wall(lambda: asker.ask(item, device), device)}, repeats)["shard"]
-    finally:
-        ab.Query.cores = kept
     row = {"case": "worker", "device": device.name, "faces": model.face_count, "poses": count}
     return row | summarise("shard", times) | {"worker_mposes_s": float(f"{count / np.median(times) / 1e3:.4g}")}
 
@@ -201,14 +198,9 @@ def list_rows(case, devices, found, describe):
             yield row | {"efficiency": round(ideal / float(np.median(found[key])), 3), "cores_here": os.cpu_count()}
 
 
-@contextlib.contextmanager
 def one_core():
-    """Give each launch on the CPU one core."""
-    kept, ab.Query.cores = ab.Query.cores, 1
-    try:
-        yield
-    finally:
-        ab.Query.cores = kept
+    """Return a context that gives each launch on the CPU one core."""
+    return testing.regime(cpu_threads=1)
 
 
 def run_shards(devices, model, sizes):

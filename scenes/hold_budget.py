@@ -44,7 +44,8 @@ def main(words=None):
             raise SystemExit("the first second is not judged: give more frames")
         print(
             f"{controller:>10}: {verdict['within']:.0%} of frames within it, "
-            f"{verdict['within_110_percent']:.0%} within 10 % more, worst {verdict['worst']:.2f} times it, mean error {verdict['error_mean']:.3g}"
+            f"{verdict['within_110_percent']:.0%} within 10 % more, worst {verdict['worst']:.2f} times it, "
+            f"mean error {verdict['error_mean']:.3g}"
         )
     return found
 

@@ -76,7 +76,7 @@ def test_update(device):
     many = cases_of(rows, "case", "many states")
     assert [row["states"] for row in many] == [1, 12]
     assert many[1]["k"] > many[0]["k"] and many[1]["nodes_refitted"] > 10 * many[0]["nodes_refitted"]
-    assert update.refine.FULL_SHARE == {"cpu": 0.5, "cuda": 0.01}, "what was forced is put back"
+    assert update.testing.current_regime().full_refit == {"cpu": 0.5, "cuda": 0.01}, "what was forced is put back"
 
 
 def test_update_leaves_large_meshes_out(device):

@@ -11,6 +11,7 @@ from oracles.peers import fcl_faces, judge
 from oracles.triangle import into_frame_of_a
 
 import warp_abtree as ab
+from warp_abtree import testing
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH
 
@@ -346,13 +347,6 @@ def test_nothing_asked(device):
         assert result.faces.shape == (0, 3) and result.pairs.shape == (0, 2)
 
 
-class WarpQuery(ab.Query):
-    """A query that takes the CUDA regime on every device."""
-
-    def uses_warps(self):
-        return True
-
-
 @pytest.mark.parametrize("room", [STACK_LENGTH, 0])
 @pytest.mark.parametrize("parts", [1, 5, 300])
 @pytest.mark.slow
@@ -368,8 +362,8 @@ def test_warps_give_the_same_answers(device, room, parts):
     visits = {}
     for output in ("faces", "count", "any"):
         plain = ask(scene, pairs, output)
-        query = WarpQuery(scene, output, pairs=pairs, unsure_capacity=2)
-        query.parts_max, query.stack_room = parts, room
+        with testing.regime(warps=True, warps_per_pair=parts, stack_length=room):
+            query = ab.Query(scene, output, pairs=pairs, unsure_capacity=2)
         result = query.run()
         visits[output] = result.node_tests.sum()
         np.testing.assert_array_equal(result.any, plain.any)

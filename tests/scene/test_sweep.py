@@ -2,6 +2,7 @@
 
 import gc
 import threading
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -99,16 +100,12 @@ def test_more_poses_than_before_and_fewer(device, monkeypatch):
 def test_lists_that_overflow_lose_nothing(device, output, monkeypatch, small_chunks):
     """The CUDA regime, with room for one face pair of those that float32 leaves open; boxes lie flush."""
 
-    class Narrow(GpuQuery):
-        def __init__(self, *arguments, **options):
-            super().__init__(*arguments, **options, unsure_capacity=1)
-
     box = sample("box")
     poses = np.tile(np.array(STILL), (20, 1))
     poses[:, 0] = np.arange(20) / 10
     expected = ask_scene(device, [box, box], poses, [None, None], output="faces")
     assert expected.any[:11].all() and not expected.any[11:].any()
-    monkeypatch.setattr(pose_sweep, "Query", Narrow)
+    monkeypatch.setattr(pose_sweep, "Query", partial(GpuQuery, unsure_capacity=1))
     found = ab.sweep(box, box, poses, output=output, device=device)
     np.testing.assert_array_equal(found, getattr(expected, output))
     (posed,) = pose_sweep._kept.values()

@@ -19,7 +19,7 @@ from warp_abtree.kernels.lod import paper, prediction, tolerance
 from warp_abtree.kernels.lod.ladder import LodPool
 from warp_abtree.lod.view import View
 from warp_abtree.state.ladder import Ladder
-from warp_abtree.state.update import full_share
+from warp_abtree.state.update import full_refit_fraction
 
 TOLERANCES_PER_OCTAVE = int(prediction.POSITIONS_PER_OCTAVE) // int(prediction.DITHER)
 
@@ -224,7 +224,7 @@ class PredictedSelection(Selection):
         self._launch(prediction.raise_faces_kernel, len(predicted.power_up), pool, predicted)
         inputs = models, pool, self.scale, self.offset, self.level, self.work, predicted
         self._launch(prediction.predict_work_kernel, (candidates, int(prediction.CHUNKS)), *inputs)
-        share = full_share(self.device)
+        share = full_refit_fraction(self.device)
         self._launch(prediction.predict_refit_kernel, (candidates, models), models, share, pool, predicted)
         self._launch(prediction.sum_chunk_kernel, candidates, predicted)
         limits = self.budget, self.aim, self.low, self.hold_frames, self.position_max, self.stay

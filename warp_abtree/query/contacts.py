@@ -116,7 +116,6 @@ class ContactQuery(Query):
             missing in all of the above, on a GPU not the same in each launch.
     """
 
-    key_bits = 63  # of a sort key; an object pair and two faces that take more are sorted in two passes
     faces: wp.array
     start: wp.array
     _key: wp.array
@@ -207,7 +206,7 @@ class ContactQuery(Query):
         """Return the bits of (pair, face a, face b) that each pass of the sort looks at."""
         pair = len(self.pairs).bit_length()
         face = (max(model.face_count for model in self.scene.models) - 1).bit_length()
-        if pair + 2 * face <= self.key_bits:
+        if pair + 2 * face <= self._regime.key_bits:
             return [(pair, face, face)]
         return [(0, 0, face), (pair, face, 0)]
 

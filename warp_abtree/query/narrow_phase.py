@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
+from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels import poses as pose
 from warp_abtree.kernels.arithmetic import predicates
 from warp_abtree.kernels.traversal import dual_tree as traverse
@@ -23,9 +24,6 @@ from warp_abtree.state.generation import LaunchGuard
 
 OUTPUTS = {"any": faces.OUTPUT_ANY, "count": faces.OUTPUT_COUNT, "faces": faces.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float64": predicates.FLOAT64, "float32": predicates.FLOAT32}
-# Warps that share a single pair; c pairs have 1 / sqrt(c) of that each.
-PARTS_MAX = 128
-
 # A launch of 32 threads a pair stays within 2^31.
 PAIRS_MAX = 2**26
 
@@ -188,9 +186,6 @@ class Query:
         near: As `hits` for `within`: any_hit is 0 where a pair is proved apart; None without within.
     """
 
-    cores: int | None = None  # CPU threads; None is all that the process may use
-    parts_max = PARTS_MAX
-    stack_room = STACK_LENGTH
     pairs: wp.array
     pair_poses: wp.array
     within: wp.array  # where asked
@@ -217,6 +212,7 @@ class Query:
             pair_capacity = whole_number(pair_capacity, "pair_capacity", 1, PAIRS_MAX)
         if unsure_capacity is not None:
             unsure_capacity = whole_number(unsure_capacity, "unsure_capacity", 1, LIST_MAX)
+        self._regime = current_regime()
         self.scene = scene
         self.output = output
         self.precision = precision
@@ -360,7 +356,8 @@ class Query:
 
     def uses_warps(self) -> bool:
         """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
-        return self.device.is_cuda
+        warps = self._regime.warps
+        return self.device.is_cuda if warps is None else warps
 
     def resize(self, capacity: int):
         """Make room for a number of intersecting face pairs."""
@@ -401,28 +398,33 @@ class Query:
     def _launch_traversal(self, within, hits, mode, output):
         pools = [arrays.pool for arrays in self.arrays]
         room = len(self.pairs)
-        inputs = [self.parts_max, output, *pools, self.pair_count, self.pairs, within]
+        parts_max = self._regime.warps_per_pair
+        inputs = [parts_max, output, *pools, self.pair_count, self.pairs, within]
         self.guard.record()
         inputs += [self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
         wp.launch(relate.relate_pair_kernel, dim=dim, inputs=inputs, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits]
         if not self.uses_warps():
-            cores = core_count() if self.cores is None else self.cores
+            cores = current_regime().cpu_threads or core_count()
             # A launch on a further core costs some 50 us: the work of many pairs apart, of less than one in contact.
             least = 32 if output == int(faces.OUTPUT_ANY) else 1
             launch_on_cores(traverse.thread_traversal(mode), room, [*inputs, self.work], self.device, cores, least)
             return
         # More than there are parts: those that find none wait for shares.
-        warps = max(room, int(4 * self.parts_max * math.sqrt(room)) + 1)
+        warps = max(room, int(4 * parts_max * math.sqrt(room)) + 1)
         warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         wp.launch(
             traverse.warp_traversal(EXACT if mode == FLOAT64 else mode, output == int(faces.OUTPUT_ANY)),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
-            inputs=[self.parts_max, min(self.stack_room, STACK_LENGTH), *inputs, self.work],
+            inputs=[parts_max, self._stack_length(), *inputs, self.work],
             block_dim=WARP_SIZE,
             device=self.device,
         )
+
+    def _stack_length(self) -> int:
+        length = self._regime.stack_length
+        return STACK_LENGTH if length is None else min(length, STACK_LENGTH)
 
     def traverse(self):
         """Run the narrow phase over the pairs in place. Launches only."""

@@ -25,7 +25,7 @@ from warp_abtree.query.narrow_phase import Result, check_request
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.budget_report import budget_report
 from warp_abtree.simulate.motion import triangle_wave
-from warp_abtree.state.update import full_share
+from warp_abtree.state.update import full_refit_fraction
 
 
 def resolve_lod(model: Model, request) -> int:
@@ -154,7 +154,7 @@ def load_update_kernels(scene: Scene):
     These are a partial refit from a copied state, one in place, and a full refit. Very small models always have full
     refits.
     """
-    share = full_share(scene.device)
+    share = full_refit_fraction(scene.device)
     chosen, step = None, 0
     for model in sorted(scene.models, key=lambda model: model.face_count):
         if not model.lod_max:

@@ -7,20 +7,17 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import refine, refit
 from warp_abtree.kernels.update import work_lists as plan_kernels
 from warp_abtree.model.tree import UpdateBatch, UpdateWork, active_update, launch_items, make_level_lists
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 
-# Past this share of the faces in its slice, a state is refitted whole: what was measured to cost less. A slice repeats
-# faces, so k is smaller still.
-FULL_SHARE = {"cpu": 0.5, "cuda": 0.01}
 
-
-def full_share(device) -> float:
-    """Return the share of its faces past which a state is refitted whole: on a GPU few nodes take as long as many."""
-    return FULL_SHARE["cuda" if device.is_cuda else "cpu"]
+def full_refit_fraction(device) -> float:
+    """Return the fraction of its faces past which a state is refitted whole."""
+    return current_regime().full_refit["cuda" if device.is_cuda else "cpu"]
 
 
 # Wishes on the device that could not be met, and the lowest index that had one.
@@ -121,7 +118,7 @@ def _make_batch(models: ModelArrays, states: StateArrays, plan: Plan) -> UpdateB
         from_lod = states.slots[source].lod if source >= 0 else -1
         low, high = (min(lod, from_lod), max(lod, from_lod)) if source >= 0 else (0, 0)
         touched = int(bounds[high] - bounds[low])
-        whole = source < 0 or touched > full_share(states.device) * models.face_count[model]
+        whole = source < 0 or touched > full_refit_fraction(states.device) * models.face_count[model]
         full.append(whole)
         start.append(0 if whole else int(bounds[low]))
         length.append(0 if whole else touched)
@@ -228,7 +225,7 @@ class LodUpdate(UpdateWork):
         owner = np.array([slot.model for slot in states.slots])
         bounds = [len(bound) for bound in models.split_bounds]
         longest = np.array([bound[-1] - bound[0] for bound in models.split_bounds])
-        partial_max = np.minimum(longest, np.floor(full_share(device) * models.face_count).astype(np.int64))
+        partial_max = np.minimum(longest, np.floor(full_refit_fraction(device) * models.face_count).astype(np.int64))
         entries, depth = partial_max[owner], models.depth[owner]
         levels = range(int(depth.max()) + 1)
         level_room = [int(np.sum(depth >= level)) << level for level in levels]
