@@ -53,7 +53,7 @@ def step_response(rows, frame: int, budget_ms: float | None = None) -> dict:
     """
     rows = [row for row in rows if row.frame >= frame]
     if not rows or (budget_ms or rows[0].budget_ms) is None:
-        raise ValueError(f"there is no frame {frame}, or no budget to judge it by")
+        raise ValueError(f"there is no frame {frame}, or no budget to compare with")
     ratio = np.array([row.cost_ms for row in rows]) / (budget_ms or rows[0].budget_ms)
     back = np.flatnonzero(ratio <= 1.1)
     return {"peak": float(ratio.max()), "frames": int(back[0]) if len(back) else None}

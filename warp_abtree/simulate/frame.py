@@ -9,7 +9,7 @@ import csv
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -227,7 +227,7 @@ class Frame:
         self.time_step = positive(time_step, "time_step")
         self.history: list[FrameRow] = []
         self._timer = Timer(scene.device, clock)
-        self._feedback: dict = {}
+        self._feedback = Feedback(0.0)
         self._poses = np.empty((scene.object_count, 7))
         self._model = np.array(scene.object_model)
         self._direction = np.zeros(scene.object_count, np.int8)
@@ -285,12 +285,7 @@ class Frame:
         stage_ms = timer.stage_ms()
         refitted = 0 if stats is None else _sum(stats.nodes_refitted)
         changed, oscillations = (0, 0) if stats is None else self._measure_lods()
-        self._feedback = {
-            "stage_ms": stage_ms,
-            "nodes_refitted": refitted,
-            "lods_changed": stats is not None,
-            "result": result,
-        }
+        self._feedback = Feedback(time, stage_ms, refitted, stats is not None, result)
         self.history.append(
             FrameRow(
                 frame=number,
@@ -367,7 +362,7 @@ class Frame:
     def _select(self, time):
         """Return the LODs that are wanted at a time, on the host. (synchronization point)"""
         if hasattr(self.lods, "next_lods"):
-            return self.lods.next_lods(Feedback(time, **self._feedback)).numpy()
+            return self.lods.next_lods(replace(self._feedback, time=time)).numpy()
         return np.asarray(self.lods(time))
 
     def _measure_lods(self):
@@ -379,17 +374,16 @@ class Frame:
         self._direction = np.where(direction == 0, self._direction, direction)
         self._lods = lods
         keys, repeats = np.unique((self._model.astype(np.int64) << 32) + lods, return_counts=True)
-        states = [
-            (scene.models[key >> 32], key & (2**32 - 1), times) for key, times in zip(keys.tolist(), repeats.tolist())
-        ]
-        errors = [model.error_at(lod) for model, lod, _ in states]
+        states = [(scene.models[key >> 32], key & (2**32 - 1)) for key in keys.tolist()]
+        errors = np.array([model.error_at(lod) for model, lod in states])
+        faces = np.array([model.progressive.active_count(lod) for model, lod in states])
         self._lod_columns = {
             "states": len(keys),
             "lod_min": int(lods.min()),
             "lod_max": int(lods.max()),
-            "faces": sum(model.progressive.active_count(lod) * times for model, lod, times in states),
-            "error_mean": sum(error * times for error, (_, _, times) in zip(errors, states)) / len(lods),
-            "error_max": max(errors),
+            "faces": int(faces @ repeats),
+            "error_mean": float(sum((errors * repeats).tolist()) / len(lods)),
+            "error_max": float(errors.max()),
         }
         return changed, oscillations
 
