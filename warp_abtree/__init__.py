@@ -15,10 +15,11 @@ from warp_abtree.lod.timing import ReplayClock, WorkClock
 from warp_abtree.lod.view import Camera
 from warp_abtree.model.mesh import MeshError, describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model, ModelError
-from warp_abtree.query.broad_phase import CapacityError
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.manifold import ManifoldQuery
-from warp_abtree.query.narrow_phase import Query, Result
+from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.request import Buffers, CapacityError
+from warp_abtree.query.result import Result
 from warp_abtree.scene.pipeline import FrameGraph
 from warp_abtree.scene.scene import Scene, TreeState
 from warp_abtree.scene.sweep import sweep
@@ -26,10 +27,12 @@ from warp_abtree.simulate.budget_report import budget_report, step_response
 from warp_abtree.simulate.frame import Frame, FrameRow, LodSweep, resolve_lod
 from warp_abtree.simulate.motion import Kinematic
 from warp_abtree.simulate.rigid_bodies import Dynamics
+from warp_abtree.state.batch import Batch
 from warp_abtree.state.ladder import Ladder
-from warp_abtree.state.update import UpdateStats
 
 __all__ = [
+    "Batch",
+    "Buffers",
     "Camera",
     "CapacityError",
     "CollisionManager",
@@ -60,7 +63,6 @@ __all__ = [
     "ThisProcess",
     "ToleranceController",
     "TreeState",
-    "UpdateStats",
     "WorkClock",
     "WorldsJob",
     "budget_report",

@@ -178,7 +178,7 @@ def test_any_capacity(device):
     expected = scene.intersect(pairs, output="contacts")
     demand = len(expected.contacts)
     for capacity in (demand, demand + 1, 3 * demand + 7, 1):
-        query = ab.ContactQuery(scene, pairs, capacity=capacity, pair_capacity=len(pairs) + capacity % 7)
+        query = ab.ContactQuery(scene, pairs, capacity=ab.Buffers(capacity, pairs=len(pairs) + capacity % 7))
         same(query.run(), expected)
         same(query.result(), expected)
         assert len(query.faces) == (capacity if capacity > 1 else demand)
@@ -219,15 +219,15 @@ def check_device_arrays(query, result):
 @pytest.mark.parametrize("room", [None, 7, 500])
 def test_pairs_of_the_broad_phase(device, room):
     scene, _ = touching(device, pairs=8)
-    query = ab.ContactQuery(scene, pair_capacity=room)
+    query = ab.ContactQuery(scene, capacity=ab.Buffers(pairs=room))
     result = query.run()
     assert len(result.pairs) == len(scene.broad_phase()) > 8
     check_device_arrays(query, result)
     plain = scene.intersect(result.pairs, output="contacts")
     same(result, plain)
-    query = ab.ContactQuery(scene, pair_capacity=5)
+    query = ab.ContactQuery(scene, capacity=ab.Buffers(pairs=5))
     query.launch()
-    with pytest.raises(ab.CapacityError, match=f"found {len(result.pairs)} pairs, .* room for 5"):
+    with pytest.raises(ab.CapacityError, match=f"{len(result.pairs)} object pairs .* room for 5"):
         query.result().check()
 
 
@@ -240,7 +240,7 @@ def test_overflow_names_the_demand(device):
         query = ab.ContactQuery(scene, pairs, capacity=capacity)
         query.launch()
         part = query.result()
-        with pytest.raises(ab.CapacityError, match=f"^{demand} face pairs .* room for {capacity}: .*capacity={demand}"):
+        with pytest.raises(ab.CapacityError, match=f"^{demand} intersecting .* room for {capacity}: .*hits={demand}"):
             part.check()
         np.testing.assert_array_equal(part.count, whole.count)
         assert len(part.contacts) == len(part.faces) == capacity
@@ -296,7 +296,7 @@ def test_a_graph_takes_poses_to_contacts(device, given):
     if not given and not scene.device.is_cuda:
         pytest.skip("a tree of boxes is built anew in CUDA graphs only")
     capacity = 60000 if given else 500000
-    query = ab.ContactQuery(scene, pairs if given else None, capacity=capacity, pair_capacity=400)
+    query = ab.ContactQuery(scene, pairs if given else None, capacity=ab.Buffers(capacity, pairs=400))
     query.launch()
     rng = np.random.default_rng(3)
     for recapture in range(2):

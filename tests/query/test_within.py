@@ -354,7 +354,7 @@ def test_broad_phase_pairs(device):
     for angle in np.linspace(0, 3, 8):  # a torus and balls inside its box, some in its hole
         scene.add(sample("torus"), (0, 0, 100 * angle, 0, 0, 0, 1))
         scene.add(sample("box"), (0.4 * angle, 0, 100 * angle, 0, 0, 0, 1))
-    query = ab.Query(scene, "any", within=0.01, pair_capacity=2)
+    query = ab.Query(scene, "any", within=0.01, capacity=ab.Buffers(pairs=2))
     result = query.run()
     order = np.lexsort(result.pairs.T[::-1])
     expected = scene.intersect(result.pairs[order], within=0.01)

@@ -16,7 +16,7 @@ from warp_abtree.checks.arguments import positive
 from warp_abtree.lod.selection import PaperSelection, PredictedSelection, ToleranceSelection
 from warp_abtree.lod.timing import COST_STAGES
 from warp_abtree.lod.view import Camera, View
-from warp_abtree.query.narrow_phase import Result
+from warp_abtree.query.result import Result
 from warp_abtree.state.ladder import Ladder
 
 TRIANGLE_WORK = 4.0

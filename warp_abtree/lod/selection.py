@@ -19,7 +19,7 @@ from warp_abtree.kernels.lod import paper, prediction, tolerance
 from warp_abtree.kernels.lod.ladder import LodPool
 from warp_abtree.lod.view import View
 from warp_abtree.state.ladder import Ladder
-from warp_abtree.state.update import full_refit_fraction
+from warp_abtree.state.lod_update import full_refit_fraction
 
 TOLERANCES_PER_OCTAVE = int(prediction.POSITIONS_PER_OCTAVE) // int(prediction.DITHER)
 

@@ -83,7 +83,7 @@ class View:
     def __init__(self, scene, window: int = 10):
         self.scene = scene
         self.window = whole_number(window, "window", 1, 1000)
-        self.arrays = scene.arrays()
+        self.batch = scene.batch()
         self.device, count = scene.device, scene.object_count
 
         def zeros(length, dtype=wp.float64):
@@ -94,7 +94,7 @@ class View:
         self._arrays = kernels.ViewArrays()
         self._arrays.window = self.window
         self._arrays.object_model = wp.array(np.array(scene.object_model, np.int32), dtype=wp.int32, device=self.device)
-        self._arrays.centre = self.arrays[0].pool.centre
+        self._arrays.centre = self.batch.models.pool.centre
         self._arrays.camera, self._arrays.frame = zeros(15), zeros(1, wp.int32)
         self._arrays.screen, self._arrays.path = zeros(count, wp.vec3d), zeros(self.window * count)
         self._arrays.distance, self._arrays.motion, self._arrays.focus = self.distance, self.motion, self.focus
@@ -105,8 +105,7 @@ class View:
 
     def check(self):
         """Raise RuntimeError if the scene's objects changed since the operator was made."""
-        if self.arrays != self.scene.arrays():
-            raise RuntimeError("objects were added to the scene since this selection was made; make a new one")
+        self.batch.check("selection")
 
     def launch(self):
         """Measure. Launches only.
@@ -115,7 +114,7 @@ class View:
             RuntimeError: The scene's objects changed.
         """
         self.check()
-        pool = self.arrays[2].pool
+        pool = self.batch.objects.pool
         inputs = [pool.rotation, pool.position, self._arrays]
         wp.launch(kernels.measure_view_kernel, dim=len(self.focus), inputs=inputs, device=self.device)
         wp.launch(kernels.advance_frame_kernel, dim=1, inputs=[self._arrays.frame], device=self.device)

@@ -21,11 +21,12 @@ from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.lod.controllers import Feedback
 from warp_abtree.lod.timing import COST_STAGES, STAGES, Timer
 from warp_abtree.model.model import Model
-from warp_abtree.query.narrow_phase import Result, check_request
+from warp_abtree.query.request import check_request
+from warp_abtree.query.result import Result
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.budget_report import budget_report
 from warp_abtree.simulate.motion import triangle_wave
-from warp_abtree.state.update import full_refit_fraction
+from warp_abtree.state.lod_update import full_refit_fraction
 
 
 def resolve_lod(model: Model, request) -> int:
@@ -231,7 +232,7 @@ class Frame:
         self._poses = np.empty((scene.object_count, 7))
         self._model = np.array(scene.object_model)
         self._direction = np.zeros(scene.object_count, np.int8)
-        scene.arrays()
+        scene.batch()
         self._measure_lods()
 
     def warm_up(self):
@@ -377,7 +378,7 @@ class Frame:
         states = [(scene.models[key >> 32], key & (2**32 - 1)) for key in keys.tolist()]
         errors = np.array([model.error_at(lod) for model, lod in states])
         faces = np.array([model.progressive.active_count(lod) for model, lod in states])
-        self._lod_columns = {
+        self._lod_columns: dict[str, Any] = {
             "states": len(keys),
             "lod_min": int(lods.min()),
             "lod_max": int(lods.max()),

@@ -20,8 +20,8 @@ from warp_abtree.kernels.dynamics import constraints as constraint_kernels
 from warp_abtree.kernels.dynamics import graph_coloring, solve
 from warp_abtree.model.mesh import mesh_from_arrays
 from warp_abtree.model.model import Model
-from warp_abtree.query.broad_phase import CapacityError
 from warp_abtree.query.manifold import POINTS_MAX, ManifoldQuery
+from warp_abtree.query.request import Buffers, CapacityError
 from warp_abtree.scene.poses import check_poses
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.body_state import RigidBodies
@@ -40,15 +40,14 @@ class SolverOptions:
         sleep_speed: Speed below which a body counts as at rest [world units/s], one for all or (n,); None is
             0.01 sqrt(gravity * bounding radius), which is 0 without gravity: nothing sleeps.
         sleep_time: How long all bodies of an island must be at rest before they sleep [s].
-        capacity, pair_capacity: Initial capacity for contacts and pairs; `step` grows it, `launch` does not.
+        capacity: `Buffers`, or the initial capacity for contacts; `step` grows it, `launch` does not.
     """
 
     iterations: int = 16
     slop: Any = None
     sleep_speed: Any = None
     sleep_time: float = 0.5
-    capacity: int | None = None
-    pair_capacity: int | None = None
+    capacity: Buffers | int | None = None
 
 
 class Dynamics(RigidBodies):
@@ -103,7 +102,7 @@ class Dynamics(RigidBodies):
             wp.empty(0, dtype=wp.mat33d, device=self.device),
             wp.empty(0, dtype=wp.vec3d, device=self.device),
         )
-        self.query = ManifoldQuery(scene, None, solver.capacity, solver.pair_capacity, roles=self.bodies.motion_type)
+        self.query = ManifoldQuery(scene, None, solver.capacity, roles=self.bodies.motion_type)
         self._constraints, self._warm_start = constraint_kernels.Constraints(), constraint_kernels.WarmStart()
         self._room, self._interrupted = 0, False
         self._grow()
@@ -174,7 +173,7 @@ class Dynamics(RigidBodies):
         elif len(self._targets[0]):
             self.clear_targets()
         self._begin(dt)
-        self.query.run_grown()
+        self.query.grow()
         self._grow()
 
     def answer(self, dt: float):
@@ -223,7 +222,7 @@ class Dynamics(RigidBodies):
         pairs = self.query.broad_phase.count_found()
         if pairs > self._room:
             raise CapacityError(
-                f"{pairs} object pairs, there is room for {self._room}: make it with pair_capacity={pairs}"
+                f"{pairs} object pairs, there is room for {self._room}: make it with capacity=Buffers(pairs={pairs})"
             )
         self.query.result().check()
 
