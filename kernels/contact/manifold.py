@@ -5,7 +5,7 @@ A loop is a set of contacts that faces link: two contacts of a pair that share a
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.arrays import LAST_KEY, ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.contact.contact import Contacts, load_corners, pair_direction
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
@@ -24,7 +24,6 @@ LEAST_LOOP_AREA = wp.constant(wp.float64(2.0**-20))
 # By which part of a face's size its column is wider, so that walls that stand on its rim are inside.
 COLUMN_SLACK = wp.constant(wp.float64(2.0**-36))
 CORNERS = wp.constant(8)
-LAST_KEY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
 
 
 @wp.struct

@@ -37,8 +37,7 @@ pytestmark = pytest.mark.slow
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 CPU = "cpu"
-UNTOUCHED = -77
-OVER = 16  # what vector instructions may write behind a list
+UNTOUCHED, OVER = -77, 16  # OVER: what vector instructions may write behind a list
 
 
 # --- the float32 filter ----------------------------------------------------------------------------------------------
@@ -219,7 +218,7 @@ def exact_points(kind, rng, count):
     return np.concatenate([a, b]), rotation, shift
 
 
-# What must turn up: pairs that meet, that are apart, and that are uncertain.
+# What must turn up.
 CASES = {
     "random": "met apart",
     "lattice": "met apart left",
@@ -273,8 +272,7 @@ def test_float64_filter_is_the_same_as_one_by_one(kind):
     assert not uncertain[shared].any(), "corners in common decide what the signs do not"
     assert (plain[~uncertain] == exact[~uncertain]).all() or kind == "wild"
     # As they come, and the uncertain ones first, so that a search for a first hit gets that far.
-    came = np.arange(ask_count)
-    for first_ends, order in ((False, came), (True, came), (True, np.argsort(~uncertain, kind="stable"))):
+    for first_ends, order in ((False, np.s_[:]), (True, np.s_[:]), (True, np.argsort(~uncertain, kind="stable"))):
         items, hit, inexact = asked[order], met[order], uncertain[order]
         left = wp.array(np.append(items, [UNTOUCHED] * OVER), dtype=wp.int64, device=CPU)
         faces, counts = filled(before + ask_count + OVER), wp.zeros(3, dtype=wp.int64, device=CPU)
