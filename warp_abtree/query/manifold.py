@@ -37,8 +37,8 @@ class ManifoldQuery(ContactQuery):
 
     Args:
         scene, pairs, capacity, precision: As for `ContactQuery`.
-        roles: Device int32 (n,) of `kernels.bodies` roles: pairs of the broad phase in which nothing can move are left
-            out. None keeps all.
+        motion_type: Motion types of `kernels.dynamics.bodies`, device int32 (n,): pairs of the broad phase in which
+            nothing can move are left out. None keeps all.
 
     Attributes:
         manifolds: Points of each pair, device arrays (pair capacity, POINTS) of `kernels.manifold.Manifolds`, float64.
@@ -51,9 +51,9 @@ class ManifoldQuery(ContactQuery):
     pair_key: wp.array
     _pair_order: wp.array
 
-    def __init__(self, scene, pairs=None, capacity=None, precision="exact", roles=None):
+    def __init__(self, scene, pairs=None, capacity=None, precision="exact", motion_type=None):
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
-        self.roles = wp.empty(0, dtype=wp.int32, device=scene.device) if roles is None else roles
+        self.motion_type = wp.empty(0, dtype=wp.int32, device=scene.device) if motion_type is None else motion_type
         super().__init__(scene, pairs, capacity, precision)
 
     def _place_arrays(self, capacity: int) -> list:
@@ -83,7 +83,7 @@ class ManifoldQuery(ContactQuery):
 
     def _sort_pairs(self):
         room = len(self.pairs)
-        inputs = [self.pair_count, self.pairs, self.roles, self._pair_order, self.pair_key]
+        inputs = [self.pair_count, self.pairs, self.motion_type, self._pair_order, self.pair_key]
         self._launch_kernel(bodies.make_pair_key_kernel, room, inputs)
         with wp.ScopedDevice(self.device):
             wp.utils.radix_sort_pairs(self.pair_key, self._pair_order, room)

@@ -102,7 +102,7 @@ class Dynamics(RigidBodies):
             wp.empty(0, dtype=wp.mat33d, device=self.device),
             wp.empty(0, dtype=wp.vec3d, device=self.device),
         )
-        self.query = ManifoldQuery(scene, None, solver.capacity, roles=self.bodies.motion_type)
+        self.query = ManifoldQuery(scene, None, solver.capacity, motion_type=self.bodies.motion_type)
         self._constraints, self._warm_start = constraint_kernels.Constraints(), constraint_kernels.WarmStart()
         self._room, self._interrupted = 0, False
         self._grow()
