@@ -54,13 +54,22 @@ class Rain:
         return out
 
 
-def make_field(count, seed=3):
-    """Return the motion of rings that go to and fro about their places."""
-    rng = np.random.default_rng(seed)
-    place, turn = rng.uniform(-1, 1, (count, 3)) * [5, 5, 15], rng.normal(size=(count, 4))
-    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
-    way, phase = rng.uniform(-1, 1, (count, 3)), rng.uniform(0, 1, count)
-    return ab.Kinematic(place - 0.5 * way, rotation=turn, shuttle=way, period=math.pi, phase=phase)
+class Field:
+    """Rings that swing about their places."""
+
+    def __init__(self, count, seed=3):
+        rng = np.random.default_rng(seed)
+        self.place, turn = rng.uniform(-1, 1, (count, 3)) * [5, 5, 15], rng.normal(size=(count, 4))
+        self.turn = turn / np.linalg.norm(turn, axis=1, keepdims=True)
+        self.swing, self.phase = rng.uniform(-0.5, 0.5, (count, 3)), rng.uniform(0, 2 * math.pi, (count, 1))
+
+    def __len__(self):
+        return len(self.place)
+
+    def poses(self, time, out):
+        out[:, :3] = self.place + self.swing * np.sin(2 * time + self.phase)
+        out[:, 3:] = self.turn
+        return out
 
 
 def make_load(kind, models, device, count=80):
@@ -73,7 +82,7 @@ def make_load(kind, models, device, count=80):
         scene.add(rings[i % 2], importance=1 + i % 3)
     if kind == "rain":
         return scene, Rain(count), Camera.look_at((0, 6, 14), (0, 1, 0), far=60.0)
-    return scene, make_field(count), lambda time: Camera.look_at((0, 0, 18 - 6 * time), (0, 0, -100), far=50.0)
+    return scene, Field(count), lambda time: Camera.look_at((0, 0, 18 - 6 * time), (0, 0, -100), far=50.0)
 
 
 def run(load, lods=None, frames=150, rates=RATES):
