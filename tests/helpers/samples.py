@@ -46,6 +46,12 @@ def grid(size):
     return vertices, np.concatenate([near, far])
 
 
+def line(direction, count=20):
+    """Faces without area: every corner on one line, but for rounding."""
+    i = np.arange(count - 2)
+    return np.arange(count)[:, None] ** 1.5 * np.array(direction), np.stack([i, i + 1, i + 2], 1)
+
+
 def repeated(vertices, faces):
     """Every face twice, the second time turned."""
     return vertices, np.concatenate([faces, np.asarray(faces)[:, [1, 2, 0]]])
