@@ -257,7 +257,7 @@ def test_warps_give_the_same_answers(device, room, parts):
         if output == "faces":
             np.testing.assert_array_equal(result.faces, plain.faces)
             assert len(result.faces) > 100
-            assert result.exact_tests[-1] > 2, "the list of unsure faces has grown"
+            assert result.exact_tests[-1] > 2, "the list of uncertain pairs has grown"
     if parts == 1:
         assert visits["any"] < visits["count"], "a pair ends at its first hit"
 

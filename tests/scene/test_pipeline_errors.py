@@ -160,7 +160,7 @@ def coincident(device, monkeypatch):
 def test_the_room_of_the_first_frame_is_made(coincident):
     frame = ab.FrameGraph(coincident, output="count")
     needed = int(frame.run().float64_tests.sum())
-    assert len(frame.query.hits.unsure) >= needed > 16
+    assert len(frame.query.hits.uncertain) >= needed > 16
     frame = ab.FrameGraph(coincident, output="count")
     wp.capture_launch(frame.capture())
     frame.check()

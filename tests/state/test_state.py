@@ -142,10 +142,10 @@ def test_a_query_has_room_for_its_output_alone(device, ledger, kind):
     assert near > held["any"] and near - held["any"] < 100 * len(pairs) + SLACK, "a second answer, asked for"
     rounded = query_bytes(ledger, kind, scene, pairs, "any", precision="float32")
     if kind(scene, "any", pairs=pairs).uses_warps():
-        unsure = 100_000
-        wide = query_bytes(ledger, kind, scene, pairs, "any", capacity=ab.Buffers(uncertain=unsure))
+        room = 100_000
+        wide = query_bytes(ledger, kind, scene, pairs, "any", capacity=ab.Buffers(uncertain=room))
         narrow = query_bytes(ledger, kind, scene, pairs, "any", capacity=ab.Buffers(uncertain=1))
-        assert wide - narrow == 24 * (unsure - 1) and rounded < held["any"], "the exact stage has a list of its own"
+        assert wide - narrow == 24 * (room - 1) and rounded < held["any"], "the exact stage has a list of its own"
     else:
         assert rounded == held["any"] < 300 * len(pairs) + SLACK, "one thread a pair: no lists between stages"
 
