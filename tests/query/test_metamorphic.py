@@ -42,11 +42,11 @@ def grid_poses(names, count=3):
     poses = []
     for _ in range(count):
         (a, *_), (b, *_) = map(grid_mesh, names)
-        turns = [QUARTERS[k] for k in rng.integers(0, len(QUARTERS), 2)]
+        rotations = [QUARTERS[k] for k in rng.integers(0, len(QUARTERS), 2)]
         place = rng.integers(-1000, 1000, 3) / GRID
         p, q = 0.875 * a[rng.integers(len(a))], 0.875 * b[rng.integers(len(b))]
-        goal = turns[0] @ p + place - turns[1] @ q
-        poses.append((to_matrix(turns[0], place), to_matrix(turns[1], np.round(goal * GRID) / GRID)))
+        goal = rotations[0] @ p + place - rotations[1] @ q
+        poses.append((to_matrix(rotations[0], place), to_matrix(rotations[1], np.round(goal * GRID) / GRID)))
     if names[0] == names[1]:
         poses[-1] = poses[-1][:1] * 2
     return poses

@@ -170,7 +170,7 @@ def new_model(name="box"):
 
 
 def test_a_pair_of_models_is_set_up_once(device, monkeypatch):
-    """Models, states and, for the same question, buffers."""
+    """Models, states and, for the same output, buffers."""
     made = []
     monkeypatch.setattr(pose_sweep, "_PosedModels", lambda *x, kind=pose_sweep._PosedModels: made.append(1) or kind(*x))
     a, b, poses = new_model(), new_model("torus"), mixed_poses()
@@ -181,7 +181,7 @@ def test_a_pair_of_models_is_set_up_once(device, monkeypatch):
     assert np.array_equal(ab.sweep(a, b, poses, device=device), first)
     assert chunk.chunk_query is kept and made == [1]
     ab.sweep(a, b, poses, output="count", device=device)
-    assert chunk.chunk_query is not kept and made == [1], "of one question, so that memory stays bounded"
+    assert chunk.chunk_query is not kept and made == [1], "of one output, so that memory stays bounded"
     for options in ({"lod_a": 0}, {"lod_b": 3}):
         ab.sweep(a, b, poses, device=device, **options)
     ab.sweep(b, a, poses, device=device)
