@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from helpers.resources import describe
+from helpers.faults import describe
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab

@@ -5,9 +5,9 @@ import warnings
 import numpy as np
 import pytest
 import warp as wp
-from helpers.frames import add_objects, check_same, check_states, replay, set_lods, tops
 from helpers.gpu_query import GpuQuery
 from helpers.samples import random_poses, sample
+from helpers.scenes import add_objects, check_same, check_states, replay, set_lods, tops
 
 import warp_abtree as ab
 from warp_abtree.query import narrow_phase

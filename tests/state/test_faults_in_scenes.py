@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import warp as wp
 from conftest import slow
-from helpers.faults import FAULTS, Interruption, MemoryShortage
-from helpers.resources import (
+from helpers.faults import (
+    FAULTS,
     MORE_PAIRS,
     PAIRS,
+    Interruption,
+    MemoryShortage,
     add_objects,
     check_answers,
     check_buffer_lengths,
