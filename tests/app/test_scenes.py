@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import convert, toml
 from oracles.triangle import brute_force_faces
 
 import warp_abtree as ab
 from warp_abtree.app.recording import FORMAT_VERSION, Recording, record_run
+from warp_abtree.app.toml.model_tables import AnyShape
+from warp_abtree.app.toml.shapes import GENERATED
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 # A machine so slow that few objects are a load.
@@ -105,15 +108,9 @@ def load_ours(name, device, changes=(), **options):
     ],
 )
 def test_generated_solids(tmp_path, text, faces, volume):
-    from warp_abtree.app.toml import keys as scene_keys
-    from warp_abtree.app.toml import models as scene_models
-
-    parameters = {}
-    exec(text, {}, parameters)
-    name = parameters.pop("shape")
-    checked = {key: check(parameters[key]) for key, check in scene_models.SHAPES[name].items()}
-    mesh = scene_models.OWN[name](**checked)
-    assert len(mesh.faces) == faces and mesh.is_volume and scene_keys is not None
+    table = convert(toml.decode(text), AnyShape)
+    mesh = GENERATED[table.__struct_config__.tag](**table.parameters())
+    assert len(mesh.faces) == faces and mesh.is_volume
     if volume is None:
         u = np.linspace(0, 2 * np.pi, 100_001)
         r = np.cos(3 * u) + 2
@@ -124,10 +121,8 @@ def test_generated_solids(tmp_path, text, faces, volume):
 
 @pytest.mark.slow
 def test_a_nut_runs_on_its_bolt(device):
-    from warp_abtree.app.toml import models as scene_models
-
-    bolt = ab.Model.load(scene_models.bolt(1.0, 3.0, 0.5, 3.0, (48, 181)))
-    nut = ab.Model.load(scene_models.nut(1.0, 0.5, 0.5, 3.0, (48, 31)))
+    bolt = ab.Model.load(GENERATED["bolt"](1.0, 3.0, 0.5, 3.0, (48, 181)))
+    nut = ab.Model.load(GENERATED["nut"](1.0, 0.5, 0.5, 3.0, (48, 31)))
     turns = np.array([0.0, 1 / 3, 0.75, 1.0, 1.5])
 
     def count(rise, turns):

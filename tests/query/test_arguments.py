@@ -113,7 +113,7 @@ def test_a_number_of_objects_on_the_command_line(capsys, command, count):
 @pytest.mark.parametrize(
     ("text", "key"),
     [
-        (SCENE + 'static = "no"\n', r"objects\[0\].static: not true or false"),
+        (SCENE + 'static = "no"\n', r"objects\[0\].static: expected true or false"),
         (SCENE + '[lod]\ncontroller = "paper"\nbudget_ms = 8\nspacing = "ratio"\n', "lod.spacing: "),
     ],
 )
