@@ -1,15 +1,19 @@
 """Poses of recorded runs: those that were really used, to the bit, in memory, in the file and in the comparison."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from helpers.samples import SHUTTLE_SCENE
 
-import warp_abtree as ab
+from warp_abtree.app import SceneError, load_scene
 from warp_abtree.app.cli import main as cli
-from warp_abtree.app.recording import Recording, record_run
+from warp_abtree.app.cli.run_command import first_difference
+from warp_abtree.app.recording import FORMAT_VERSION, Recording, record_run
+from warp_abtree.lod.timing import ReplayClock
 
 FRAMES = 4
 TURNING = SHUTTLE_SCENE + "random = { rotation = true, turn = 90 }\n"
@@ -21,7 +25,7 @@ BODIES = (
 
 def load(tmp_path, text):
     (tmp_path / "scene.toml").write_text(text)
-    return ab.load_scene(tmp_path / "scene.toml", device="cpu")
+    return load_scene(tmp_path / "scene.toml", device="cpu")
 
 
 def watch(loaded) -> list:
@@ -76,15 +80,35 @@ def test_poses_are_those_that_were_asked_at(tmp_path, text):
 @pytest.mark.parametrize("text", [TURNING, BODIES], ids=["prescribed", "bodies"])
 def test_one_bit_of_one_pose_is_a_difference(tmp_path, text):
     _, first = record_run(load(tmp_path, text), FRAMES)
-    _, second = record_run(load(tmp_path, text), FRAMES, first)
-    assert first.difference(second) is None
+    _, second = record_run(load(tmp_path, text), FRAMES, clock=ReplayClock(first.rows))
+    assert first_difference(first, second) is None
     for place in np.ndindex(first.poses.shape):
         for bit in (0, 30, 63):  # the last also tells the zeros apart
             poses = first.poses.copy()
             poses.view(np.uint64)[place] ^= np.uint64(1) << np.uint64(bit)
             told = f"frame {place[0]}: poses are not those recorded"
-            assert first.difference(replace(second, poses=poses)) == told
-            assert replace(second, poses=poses).difference(first) == told
+            assert first_difference(first, replace(second, poses=poses)) == told
+    second.lods[2, 1] += 1
+    assert first_difference(first, second) == "frame 2: lods are not those recorded"
+    _, other = record_run(load(tmp_path, text), FRAMES, clock=ReplayClock(first.rows), budget_ms=1e4)
+    assert "frame 0: " in first_difference(first, other)
+
+
+@pytest.mark.parametrize("text", [TURNING, BODIES], ids=["prescribed", "bodies"])
+def test_a_recorded_run_runs_again_without_its_scene_file(tmp_path, device, text):
+    """Under a budget that every machine keeps, so that LODs climb."""
+    frame, first = record_run(load(tmp_path, text), 8, budget_ms=1e4)
+    assert len({row.cost_ms for row in first.rows}) == 8, "real times"
+    path = tmp_path / "run.npz"
+    first.save(path)
+    assert [entry.name for entry in tmp_path.iterdir() if "partial" in entry.name] == []
+    opened = Recording.open(path)
+    assert opened.rows == frame.history and opened.settings == first.settings
+    (tmp_path / "scene.toml").unlink()
+    loaded = opened.load_scene(path, device)
+    again, second = record_run(loaded, 8, budget_ms=1e4, clock=ReplayClock(opened.rows))
+    assert again.history == frame.history and first_difference(opened, second) is None
+    assert len(np.unique(first.lods)) > 1 and not np.array_equal(first.poses[0], first.poses[-1])
 
 
 def test_a_run_from_a_recording_with_another_pose_fails(tmp_path, capsys, monkeypatch):
@@ -99,3 +123,50 @@ def test_a_run_from_a_recording_with_another_pose_fails(tmp_path, capsys, monkey
     capsys.readouterr()
     assert cli.main(["run", "run.npz"]) == 1
     assert capsys.readouterr().err == "warp-abtree: run.npz: frame 2: poses are not those recorded\n"
+
+
+def test_damaged_recordings_are_refused(tmp_path):
+    _, recording = record_run(load(tmp_path, TURNING), 2)
+    path = tmp_path / "run.npz"
+    recording.save(path)
+    with np.load(path) as file:
+        good = {name: file[name] for name in file.files}
+    settings = json.loads(str(good["settings"]))
+    bad = [
+        ({"format": np.array("x")}, "not a recording of a run"),
+        ({"version": np.array(FORMAT_VERSION + 1)}, f"version {FORMAT_VERSION + 1}"),
+        ({"lods": good["lods"][:1]}, "lods: shape"),
+        ({"lods": good["lods"].astype(np.int64)}, "int64"),
+        ({"poses": good["poses"][:, :, :6]}, "poses: shape"),
+        ({"row_hits": good["row_hits"][:1]}, "row_hits"),
+        ({"settings": np.array("{}")}, "is missing"),
+        ({"settings": np.array("{")}, "damaged"),
+        ({"settings": np.array(json.dumps({**settings, "objects": "many"}))}, "objects is 'many'"),
+        ({"poses": np.array([{}], dtype=object)}, "not a recording"),
+    ]
+    for changes, message in bad:
+        np.savez(path, **{**good, **changes})
+        with pytest.raises(ValueError, match=message) as caught:
+            Recording.open(path)
+        assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
+    np.savez(path, **{name: value for name, value in good.items() if name != "row_hits"})
+    with pytest.raises(ValueError, match="row_hits' is missing"):
+        Recording.open(path)
+    for content in (b"", b"junk", b"PK\x03\x04junk"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="not a recording"):
+            Recording.open(path)
+    with pytest.raises(ValueError, match="No such file"):
+        Recording.open(tmp_path / "gone.npz")
+
+
+def test_another_mesh_is_noticed(tmp_path):
+    trimesh.creation.box().export(tmp_path / "m.obj")
+    loaded = load(tmp_path, '[models.m]\nmesh = "m.obj"\n[[objects]]\nmodel = "m"\n')
+    _, recording = record_run(loaded, 1)
+    trimesh.creation.box([1, 1, 2]).export(tmp_path / "m.obj")
+    with pytest.raises(ValueError, match=r"run.npz: the mesh of models.m is not"):
+        recording.load_scene("run.npz")
+    (tmp_path / "m.obj").unlink()
+    with pytest.raises(SceneError, match=r"m.obj: no such file"):
+        recording.load_scene("run.npz")

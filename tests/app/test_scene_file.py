@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 import warp_abtree as ab
-from warp_abtree.app.pictures import plot
+from warp_abtree.app.pictures.scenes import panel_lods
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 BALL = '[models.ball]\nshape = "icosphere"\nsubdivisions = 1\n'
@@ -152,7 +152,7 @@ def test_sweep_of_a_named_object(tmp_path):
     ball = loaded.models["ball"]
     assert loaded.lods_at(0.0).tolist() == [ball.lod_max] * 2
     assert loaded.lods_at(1.0).tolist() == [ball.lod_for(fraction=0.25), ball.lod_max]
-    assert [lods[0] for lods in plot.panel_lods(loaded)] == [ball.lod_max, ball.lod_for(fraction=0.25)]
+    assert [lods[0] for lods in panel_lods(loaded)] == [ball.lod_max, ball.lod_for(fraction=0.25)]
     frame = loaded.frame()
     frame.run(60)
     assert len({row.lod_min for row in frame.history}) > 10
@@ -176,7 +176,7 @@ def test_sweep_of_a_named_object(tmp_path):
         ("scene = 3\n" + ONE, "scene: expected a table, got a whole number"),
         ('[models.m]\n[[objects]]\nmodel = "m"\n', "models.m: give mesh or shape"),
         ('[models.m]\nshape = "cube"\n[[objects]]\nmodel = "m"\n', "models.m.shape: 'cube' is none of"),
-        ('[models.m]\nshape = "torus"\n[[objects]]\nmodel = "m"\n', "models.m: the key 'major_radius' is missing"),
+        ('[models.m]\nshape = "torus"\n[[objects]]\nmodel = "m"\n', "models.m.shape: torus() missing"),
         ('[models.m]\nshape = "box"\nradius = 1\n[[objects]]\nmodel = "m"\n', "models.m.radius: unknown key"),
         (
             '[models.m]\nshape = "box"\nextents = [1, 2]\n[[objects]]\nmodel = "m"\n',
@@ -203,7 +203,10 @@ def test_sweep_of_a_named_object(tmp_path):
         (ONE + "lod = 99999\n", "objects[0].lod: "),
         (ONE + 'lod = "fine"\n', "objects[0].lod: LOD 'fine'"),
         (ONE + "lod = []\n", "objects[0].lod: expected a list of length >= 1"),
-        (ONE + "lod = true\n", "objects[0].lod: expected a whole number or a number or a string or a list, got true or false"),
+        (
+            ONE + "lod = true\n",
+            "objects[0].lod: expected a whole number or a number or a string or a list, got true or false",
+        ),
         (ONE + "world = -2\n", "objects[0].world"),
         (ONE + "world = -1\nworlds = 2\n", "objects[0].worlds"),
         (ONE + "worlds = 0\n", "objects[0].worlds"),
@@ -225,9 +228,15 @@ def test_sweep_of_a_named_object(tmp_path):
         (ONE.replace("[[", "mesh = []\n[["), "models.ball.mesh: expected a list of length >= 1"),
         (ONE.replace("[[", "mesh = [3]\n[["), "models.ball.mesh[0]: expected a string, got a whole number"),
         ('[models.m]\nmesh = ["a.obj", "b.obj"]\n[[objects]]\nmodel = "m"\n', "b.obj: no such file"),
-        ('[models.m]\nshape = "knot"\nradius = 1\n[[objects]]\nmodel = "m"\n', "models.m: the key 'tube_radius' is missing"),
-        ('[models.m]\nshape = "revolve"\nprofile = [[1, 0], [1, 0]]\nsections = 9\n', "models.m.profile: z does not rise"),
-        ('[models.m]\nshape = "revolve"\nprofile = [[0, 0], [1, 1]]\nsections = 9\n', "models.m.profile[0][0]: expected a number > 0"),
+        ('[models.m]\nshape = "knot"\nradius = 1\n[[objects]]\nmodel = "m"\n', "models.m.shape: knot() missing"),
+        (
+            '[models.m]\nshape = "revolve"\nprofile = [[1, 0], [1, 0]]\nsections = 9\n[[objects]]\nmodel = "m"\n',
+            "models.m.shape: profile: z does not rise",
+        ),
+        (
+            '[models.m]\nshape = "revolve"\nprofile = [[0, 0], [1, 1]]\nsections = 9\n',
+            "models.m.profile[0][0]: expected a number > 0",
+        ),
         ('[models.m]\nshape = "revolve"\nprofile = 3\nsections = 9\n', "models.m.profile: expected a list"),
         (ONE + "count = 2\ngrid = { size = [0, 0, 1], spacing = [1, 1, 1] }\n", "give count or grid"),
         (ONE + "grid = { size = [0, 1, 1], spacing = [1, 1, 1] }\n", "give count or grid"),
@@ -261,7 +270,10 @@ def test_sweep_of_a_named_object(tmp_path):
             "camera: the camera looks at its own eye, or along up",
         ),
         (ONE + "[camera]\neye = [0, 0, 1]\ntarget = [0, 0, 0]\nfar = 0\n", "camera.far: expected a number > 0"),
-        (ONE + "[camera]\neye = [0, 0, 1]\n[[camera.keys]]\neye = [0, 0, 1]\ntarget = [0, 0, 0]\n", "camera: give eye and target, or"),
+        (
+            ONE + "[camera]\neye = [0, 0, 1]\n[[camera.keys]]\neye = [0, 0, 1]\ntarget = [0, 0, 0]\n",
+            "camera: give eye and target, or",
+        ),
         (ONE + "[camera]\nkeys = [3]\n", "camera.keys[0]: expected a table"),
         (ONE + "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\n", "camera.keys[0]: the key 'target' is missing"),
         (

@@ -20,12 +20,16 @@ EXAMPLES = ("", "--json", "--device cpu")
 CORE = {"warp-lang": "1.19", "numpy": "", "trimesh": ""}
 # Of each extra: what it is for, and its packages with the least version; tests hold them against pyproject.toml.
 EXTRAS = {
-    "usd": ("meshes inside Warp, USD files", {"usd-core": "", "tomli": ""}),
-    "view": ("viewer and pictures", {"matplotlib": "", "viser": "1.1", "tomli": ""}),
+    "app": (
+        "scene files, tables and bars, completion in shells",
+        {"msgspec": "", "rich": "", "shtab": "", "tomli": ""},
+    ),
+    "view": ("viewer", {"viser": "1.1"}),
+    "pictures": ("pictures and plots", {"pyvista": "", "matplotlib": ""}),
+    "usd": ("meshes inside Warp, USD files", {"usd-core": ""}),
     "dynamics": ("bodies whose meshes are open", {"scipy": "", "networkx": ""}),
     "newton": ("contacts for Newton's solvers", {"newton": "1.8"}),
     "cluster": ("sweeps on Ray, Parquet files", {"ray": "", "pyarrow": ""}),
-    "cli": ("tables and bars, completion in shells", {"rich": "", "shtab": ""}),
 }
 OLD_PYTHON_ONLY = ("tomli",)  # Python 3.11 has tomllib
 

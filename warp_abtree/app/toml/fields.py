@@ -17,7 +17,7 @@ Vector = tuple[float, float, float]
 ORIGIN = (0.0, 0.0, 0.0)
 
 
-class Table(Struct, frozen=True, forbid_unknown_fields=True):
+class Table(Struct, forbid_unknown_fields=True):
     """What all tables share."""
 
 

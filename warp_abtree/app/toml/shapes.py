@@ -90,6 +90,8 @@ def nut(radius, height, pitch, width, sections):
 def revolve(profile, sections):
     """Return a profile of points [radius, z], z rising, turned about z and closed by two poles."""
     radius, height = np.array(profile).T
+    if not (np.diff(height) > 0).all():
+        raise ValueError("profile: z does not rise")
     turn = np.linspace(0, 2 * np.pi, sections, endpoint=False)[None]
     return _wrap(_around(np.repeat(radius[:, None], sections, 1), height[:, None], turn), closed=False)
 

@@ -30,7 +30,7 @@ from warp_abtree.app.toml.fields import (
     Vector,
     check_direction,
 )
-from warp_abtree.app.toml.model_tables import AnyShape
+from warp_abtree.app.toml.model_tables import SHAPES
 
 
 class HeadTable(Table):
@@ -132,7 +132,7 @@ class ObjectTable(MaterialTable, kw_only=True):
     count: Copies | None = None  # copies in the same world
     grid: GridTable | None = None
     worlds: Copies = 1  # and all of them once in each of so many worlds
-    random: RandomTable = RandomTable()
+    random: RandomTable = field(default_factory=RandomTable)
 
     def __post_init__(self):
         if self.static and self.kinematic:
@@ -246,14 +246,14 @@ class PictureTable(Table):
 class SceneTable(Table, kw_only=True):
     """The whole file."""
 
-    scene: HeadTable = HeadTable()
+    scene: HeadTable = field(default_factory=HeadTable)
     models: dict[str, dict]  # each is a `ModelTable` or a `Shape`
     objects: list[ObjectTable] = field(default_factory=list)
     lod_sweep: list[SweepTable] = field(default_factory=list)
     lod: LodTable | None = None
     camera: CameraTable | None = None
     dynamics: DynamicsTable | None = None
-    picture: PictureTable = PictureTable()
+    picture: PictureTable = field(default_factory=PictureTable)
 
     def __post_init__(self):
         if self.dynamics is not None and self.picture.time is not None:
@@ -264,5 +264,5 @@ class SceneTable(Table, kw_only=True):
 CHOICES = {
     "controller": get_args(Controller),
     "spacing": get_args(Spacing),
-    "shape": tuple(kind.__struct_config__.tag for kind in get_args(AnyShape)),
+    "shape": tuple(SHAPES),
 }
