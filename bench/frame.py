@@ -58,7 +58,9 @@ class Driven:
     def __init__(self, scene, rungs, ladder):
         count = scene.object_count
         device = self.device = scene.device
-        self.frame = ab.FrameGraph(scene, "count", pair_capacity=16 * count, ladder=[rungs] if ladder else None)
+        self.frame = ab.FrameGraph(
+            scene, "count", capacity=ab.Buffers(pairs=16 * count), ladder=[rungs] if ladder else None
+        )
         self.time = wp.zeros(1, dtype=wp.int32, device=device)
         self.inputs = [
             wp.array(rungs, dtype=wp.int32, device=device),

@@ -73,12 +73,12 @@ def trace_budget(context):
             if row.frame % 2 == 0:
                 cost = {"cost": row.cost_ms / budget, "faces": row.faces}
                 yield {"case": "trace", "controller": controller, "time": row.time} | cost
-        judged = ab.judge_budget(frame.history, budget, after=SETTLED)
+        judged = ab.budget_report(frame.history, budget, after=SETTLED)
         about = {"case": "budget", "controller": controller, "objects": loaded.scene.object_count}
         yield (
             about
-            | {name: judged[name] for name in ("frames", "within", "within_tenth", "worst", "turns")}
-            | {"error_mean": judged["error_mean"]}
+            | {name: judged[name] for name in ("frames", "within", "worst", "error_mean")}
+            | {"within_tenth": judged["within_110_percent"], "turns": judged["oscillations"]}
         )
 
 
@@ -196,7 +196,7 @@ def measure_bytes(model, device):
     """Return the bytes of a model's arrays and of one tree state."""
     scene = ab.Scene(device)
     scene.add(model)
-    models, states, _ = scene.arrays()
+    models, states = scene.batch().models, scene.batch().states
     return count_bytes(models.pool), count_bytes(states.pool)
 
 
@@ -223,7 +223,7 @@ def time_changes(context, model, lods):
         for way, lod in (("there", low), ("back", high)):
             stats, _, ways[way] = update.set_lods(scene, [lod], None)  # by the kind of refit that the library takes
         times = context.time_graphs(ways)
-        scene.arrays()[1].upload_slots()
+        scene.batch().states.upload_slots()
         vertices, faces, _ = model.mesh_at(low)
         peer = BvhPeer(vertices, faces, np.zeros((0, 7)), 0, context.device, None)
         rebuilt = context.time_alone({"bvh": peer.rebuild})["bvh"]

@@ -5,7 +5,7 @@ import copy
 import numpy as np
 
 import warp_abtree as ab
-from warp_abtree.state import update as refine
+from warp_abtree import testing
 
 from .shapes import centre_and_radius
 from .update import forced
@@ -125,28 +125,10 @@ class PosedPairs:
 
 def hear_batch(scene, lods, share):
     """Set LODs by one kind of refit (`update.REGIMES`) and return the batch of that update."""
-    batches, original = [], refine.active_update
-
-    def overhear(models, states, batch):
-        batches.append(batch)
-        original(models, states, batch)
-
-    refine.active_update = overhear
-    try:
-        with forced(share):
-            scene.set_lods(lods)
-    finally:
-        refine.active_update = original
-    return batches[0]
+    with forced(share):
+        return scene.set_lods(lods)
 
 
 def refit_launch(scene, batch):
     """Return a launch of marking and refit alone, the LODs being those that the batch leads to; it may be repeated."""
-    models, states, _ = scene.arrays()
-
-    def launch():
-        for name in ("changed_count", "marked_count", "level_count"):
-            getattr(batch.plan, name).zero_()
-        refine.active_update(models.pool, states.pool, batch)
-
-    return launch
+    return testing.repeat_update(batch, refine=False)

@@ -62,7 +62,7 @@ def time_move(context, scene, model, home, there):
     scene.set_lods([home])
     there_launch, back_launch = launches["update"]
     moved = context.time_graphs({"there": there_launch, "between": whole, "back": back_launch, "after": whole})
-    scene.arrays()[1].upload_slots()
+    scene.batch().states.upload_slots()
     return {
         "case": "move",
         "from_finest": home == model.lod_max,
@@ -285,7 +285,7 @@ def time_shares(context, model, lod, count, states):
     if not (k < TENTH * model.face_count).all():
         raise RuntimeError(f"k is {k.max()} of {model.face_count}")
     moved = context.time_graphs(dict(zip(("there", "back"), launches["update"], strict=True)))
-    scene.arrays()[1].upload_slots()
+    scene.batch().states.upload_slots()
     scene.set_lods(there)
     update = (moved["there"] + moved["back"]) / 2
     for name, depth in CONFIGURATIONS:

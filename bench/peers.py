@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 from .fcl_peer import FclCppPeer
 from .shapes import knot
@@ -381,16 +382,15 @@ def time_cores(queries, repeats):
 
         def run_on(cores, query=query):
             def run():
-                query.cores = cores
-                query.launch()
-                return query.result()
+                with testing.regime(cpu_threads=cores):
+                    query.launch()
+                    return query.result()
 
             return run
 
         launches = {"all": run_on(None), "one": run_on(1)}
         with no_garbage_collection():
             times = time_in_turn(launches, wp.get_device("cpu"), repeats)
-        query.cores = None
         row |= summarise(f"all_{output}", times["all"]) | summarise(f"one_{output}", times["one"])
         row[f"{output}_ratio"] = round(float(np.median(times["one"]) / np.median(times["all"])), 2)
     return row

@@ -11,7 +11,7 @@ import warp_abtree as ab
 from .shapes import knot, pair_poses
 from .timing import summarise, time_in_turn
 
-PRECISIONS = ("exact", "float64", "float32")
+PRECISIONS = ("exact", "float32")
 FULL = {"faces": 5000, "subdivisions": 4, "pairs": 256, "laid": 16, "repeats": 11}
 QUICK = {"faces": 300, "subdivisions": 1, "pairs": 3, "laid": 1, "repeats": 1}
 

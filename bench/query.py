@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 from . import newton_peer
 from .memory import held_mib
@@ -101,10 +102,9 @@ def run_case(device, model, vertices, faces, poses, distance, constructor, peaks
 
 def time_one_core(query, peer, device, repeats):
     """Return columns of launches of both on one core: the time [ms] that the thread ran, and the peer's over ours."""
-    query.cores = 1
     launches = {"one_core": query.launch, "peer_one_core": peer.launch}
-    times = time_in_turn(launches, device, repeats, time.thread_time)
-    query.cores = None
+    with testing.regime(cpu_threads=1):
+        times = time_in_turn(launches, device, repeats, time.thread_time)
     ratio = round(float(np.median(times["peer_one_core"]) / np.median(times["one_core"])), 2)
     return summarise("one_core", times["one_core"]) | {"one_core_ratio": ratio}
 

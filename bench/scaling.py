@@ -7,7 +7,6 @@ devices; weak: as much on each device. Devices are 1, 2, 4 and so on, and all. T
 of devices in turn. A CPU has one core.
 """
 
-import contextlib
 import json
 import math
 import os
@@ -21,6 +20,7 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 from .roofline import NODE_BYTES, PAIR_BYTES, TRIANGLE_BYTES
 from .scale import world_poses
@@ -139,12 +139,9 @@ def fit_cost(rows, values):
 def run_worker(device, model, count, repeats):
     """Return the row of a shard asked on one device, on the CPU by one core: poses on the host, answers there."""
     job = ab.SweepJob(model, model, random_poses(count, float(np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())))
-    asker, item = job.asker(), job.item(0, count)
-    kept, ab.Query.cores = ab.Query.cores, 1
-    try:
-        times = time_rounds({"shard": time_wall(lambda: asker.ask(item, device), device)}, repeats)["shard"]
-    finally:
-        ab.Query.cores = kept
+    runner, task = job.runner(), job.task(0, count)
+    with testing.regime(cpu_threads=1):
+        times = time_rounds({"shard": time_wall(lambda: runner.run(task, device), device)}, repeats)["shard"]
     row = {"case": "worker", "device": device.name, "faces": model.face_count, "poses": count}
     return row | summarise("shard", times) | {"worker_mposes_s": float(f"{count / np.median(times) / 1e3:.4g}")}
 
@@ -154,9 +151,9 @@ class Silent:
 
     workers, lost = 1, 0
 
-    def ask(self, job, ranges):
+    def run(self, job, ranges):
         for start, stop in ranges:
-            yield start, stop, {"any": np.zeros(len(job.item(start, stop)[1]), bool)}
+            yield start, stop, {"any": np.zeros(len(job.task(start, stop)[1]), bool)}
 
 
 def run_driver(model, count):
@@ -201,14 +198,9 @@ def list_rows(case, devices, found, describe):
             yield row | {"efficiency": round(ideal / float(np.median(found[key])), 3), "cores_here": os.cpu_count()}
 
 
-@contextlib.contextmanager
 def one_core():
-    """Give each launch on the CPU one core."""
-    kept, ab.Query.cores = ab.Query.cores, 1
-    try:
-        yield
-    finally:
-        ab.Query.cores = kept
+    """Return a context that gives each launch on the CPU one core."""
+    return testing.regime(cpu_threads=1)
 
 
 def run_shards(devices, model, sizes):
@@ -228,11 +220,11 @@ def run_shards(devices, model, sizes):
             job = ab.SweepJob(model, model, poses[:count], shard=shard)
             ranges = [(start, start + shard) for start in range(0, count, shard)]
             pool = ab.ThisProcess(devices[:parts])
-            answers = {start: columns["any"] for start, _, columns in pool.ask(job, ranges)}
+            answers = {start: columns["any"] for start, _, columns in pool.run(job, ranges)}
             if not np.array_equal(np.concatenate([answers[start] for start, _ in ranges]), expected[:count]):
                 raise RuntimeError(f"shards: {parts} devices answer otherwise than one")
             runs[parts, times] = time_wall(
-                lambda pool=pool, job=job, ranges=ranges: deque(pool.ask(job, ranges), 0), wp.get_device(devices[0])
+                lambda pool=pool, job=job, ranges=ranges: deque(pool.run(job, ranges), 0), wp.get_device(devices[0])
             )
         found = time_rounds(runs, repeats)
 

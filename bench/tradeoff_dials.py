@@ -12,7 +12,7 @@ import warp_abtree as ab
 from .peer import count_differences
 from .tradeoff_subject import Stage, judge_answers, judge_contact, subjects, time_launches
 
-PRECISIONS = ("exact", "float64", "float32")
+PRECISIONS = ("exact", "float32")
 OUTPUTS = ("any", "count", "faces", "contacts")
 FRACTIONS = (0.01, 0.05, 0.2, 1)
 PRECISION_FRACTIONS = (0.1, 1)

@@ -1,10 +1,9 @@
 """Time of ACTIVE-UPDATE against k, beside a full refit of the same state and a tree built from scratch; many states.
 
-The library chooses between both kinds of refit by `FULL_SHARE`; here it is set from outside, so that each is measured
+The library chooses between both kinds of refit by `Regime.full_refit`; here it is set from outside: each is measured
 on the same states, in turn. Their bits are compared before anything is timed.
 """
 
-import contextlib
 import copy
 import math
 import time
@@ -13,8 +12,9 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree import testing
 from warp_abtree.model import tree
-from warp_abtree.state import update as refine
+from warp_abtree.state.lod_update import full_refit_fraction
 
 from .memory import held_mib
 from .peer import BvhPeer
@@ -37,7 +37,7 @@ QUICK = {"faces": (200, 600), "shares": (0.01, 0.1, 0.9), "states": (1, 12), "st
 LARGEST_CPU = 64000
 STATES_PER_MODEL = 8
 SETTLE = 2  # times there and back, the last of which counts
-REGIMES = {"update": math.inf, "full": -1.0}  # values of FULL_SHARE
+REGIMES = {"update": False, "full": True}
 
 FIGURES = (
     {
@@ -69,15 +69,9 @@ FIGURES = (
 # --- what the library does, forced and overheard ---------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def forced(share):
-    """Let states be refitted whole past another share of their faces; None changes nothing."""
-    kept = refine.FULL_SHARE
-    refine.FULL_SHARE = kept if share is None else dict.fromkeys(kept, share)
-    try:
-        yield
-    finally:
-        refine.FULL_SHARE = kept
+def forced(full):
+    """Return a context in which states are refitted whole (True), in part (False), or as the library chooses (None)."""
+    return testing.force_refits(full)
 
 
 def set_lods(scene, lods, share):
@@ -86,35 +80,14 @@ def set_lods(scene, lods, share):
     Returns:
         Stats, the faces in the slices between the LODs, and a launch of the same update, to be run from the same LODs.
     """
-    batches, original = [], refine.active_update
-
-    def overhear(models, states, batch):
-        batches.append(batch)
-        original(models, states, batch)
-
-    refine.active_update = overhear
-    try:
-        with forced(share):
-            stats = scene.set_lods(lods)
-    finally:
-        refine.active_update = original
-    (batch,) = batches
-    models, states, _ = scene.arrays()
-    targets = wp.clone(states.pool.lod)  # the next update writes in place
-
-    def launch():
-        for name in ("changed_count", "marked_count", "level_count"):
-            getattr(batch.plan, name).zero_()
-        states.pool.lod = targets
-        refine.refine_meshes(models, states, batch)
-        refine.active_update(models.pool, states.pool, batch)
-
-    return stats, int(batch.slice_length.sum()), launch
+    with forced(share):
+        stats = scene.set_lods(lods)
+    return stats, int(stats.slice_length.sum()), testing.repeat_update(stats)
 
 
 def read_bits(scene):
     """Return all boxes, links, statuses and corners, one row a state, in the order of model and LOD. Waits."""
-    _, states, _ = scene.arrays()
+    states = scene.batch().states
     order = np.lexsort(([slot.lod for slot in states.slots], [slot.model for slot in states.slots]))
     pool, count = states.pool, len(states.slots)
     node_end, face_end = states.node_total, states.face_total
@@ -137,7 +110,7 @@ def check_update(scene, there, back, faces):
     Raises:
         RuntimeError: Bits or k differ, the bound of equation (1) is passed, or states have changed places.
     """
-    _, states, _ = scene.arrays()
+    states = scene.batch().states
     begin = [slot.lod for slot in states.slots]
     start = read_bits(scene)
     launches, found = {}, {}
@@ -186,7 +159,7 @@ def time_update(scene, there, back, launches, device, repeats):
         for name in REGIMES:
             taken = [[runs[name, way]() for way in (0, 1)] for _ in range(SETTLE)]
             times[name] += taken[-1] if turn >= WARM_UP else []
-    scene.arrays()[1].upload_slots()
+    scene.batch().states.upload_slots()
     for turn in range(WARM_UP + repeats):
         for call, share in calls.items():
             taken = [time_set_lods(scene, lods, share, device) for _ in range(SETTLE) for lods in (there, back)]
@@ -216,7 +189,7 @@ def run(device, quick=False, largest=None, models=None):
 
     Nodes and bytes are those of the partial update, counted; memory is that of the scene, before there is a peer.
 
-    entries are the faces of the slice between the LODs, repeats included, which is what `FULL_SHARE` is compared with;
+    entries are the faces of the slice between the LODs, repeats included, compared with `Regime.full_refit`;
     full tells whether the library would refit the whole tree. bvh_build boxes the faces at the LOD and builds a wp.Bvh
     over them; host_build is ACTIVE-BUILD over the finest mesh. crossover_* are where the update costs as much as a full
     refit: the least measured if it always does, None if it never does.
@@ -237,7 +210,7 @@ def run_mesh(device, model, sizes, peaks):
     scene = ab.Scene(device=device)
     scene.add(model)
     finest, rows = model.lod_max, []
-    scene.arrays()
+    scene.batch()
     memory = {"arrays_mib": held_mib(scene)} | used_memory(device)
     steps = sorted({max(1, round(share * model.lod_max)) for share in sizes["shares"]})
     for step in steps:
@@ -247,7 +220,7 @@ def run_mesh(device, model, sizes, peaks):
         row = {"device": device.name, "case": "one state", "faces": model.face_count, "splits": step}
         row |= {"k": int(k[0]), "share": float(f"{k[0] / model.face_count:.4g}"), "entries": entries}
         row |= {"nodes_refitted": int(nodes[0]), "bound": int(bound_nodes(int(k[0]), model.face_count))}
-        row["full"] = entries > refine.full_share(device) * model.face_count  # what the library chooses
+        row["full"] = entries > full_refit_fraction(device) * model.face_count  # what the library chooses
         row |= time_update(scene, [finest - step], [finest], launches, device, sizes["repeats"])
         # Not in turn with the others, whose tree it would drive out of the caches.
         row |= summarise("bvh_build", time_in_turn({"build": peer.rebuild}, device, sizes["repeats"])["build"])
@@ -261,7 +234,7 @@ def run_mesh(device, model, sizes, peaks):
         "crossover_k": (crossover := find_crossover(rows, "k")),
         "crossover_share": crossover and round(crossover / model.face_count, 4),
         "crossover_entries": find_crossover(rows, "entries"),
-        "full_share": refine.full_share(device),
+        "full_share": full_refit_fraction(device),
         "slope": fit_slope([row["k"] for row in rows], [row["update_ms"] for row in rows]),
         "host_build_ms": time_host_build(model),
     }

@@ -6,20 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
+from helpers.bodies import ring_and_ball
 
 import warp_abtree as ab
 from warp_abtree.lod.controllers import PaperController, ToleranceController
-from warp_abtree.lod.selection import Camera
 from warp_abtree.lod.timing import STAGES, ReplayClock
+from warp_abtree.lod.view import Camera
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
 def models():
-    ring = trimesh.creation.torus(major_radius=0.5, minor_radius=0.15, major_sections=24, minor_sections=12)
-    return ab.Model.load(ring), ab.Model.load(trimesh.creation.icosphere(subdivisions=2, radius=0.4))
+    return ring_and_ball()
 
 
 WARMED_UP = """
@@ -38,9 +37,9 @@ else:
     steps = [(top, top - 1, 0), (top, top - 1, top - 1), (0, 1, 2), (top, top, top)]
     lods = lambda time: np.array(steps[min(round(60 * time), 3)])
 frame = ab.Frame(scene, motion, lods)
-before = scene.lods.tolist(), scene.arrays()[2].pool.position.numpy().tobytes()
+before = scene.lods.tolist(), scene.batch().objects.pool.position.numpy().tobytes()
 frame.warm_up()
-assert before == (scene.lods.tolist(), scene.arrays()[2].pool.position.numpy().tobytes()) and not frame.history
+assert before == (scene.lods.tolist(), scene.batch().objects.pool.position.numpy().tobytes()) and not frame.history
 print("warm", flush=True)
 frame.run(8)
 print(sum(row.lods_changed for row in frame.history), frame.history[-1].hits)

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_abtree.app.render_data import Snapshot
 from warp_abtree.app.toml.control import CONTROLLERS, LodControl, PictureView
-from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.view import Camera
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame, LodSweep
 

@@ -14,7 +14,6 @@ import numpy as np
 
 from warp_abtree.app.toml.scene_file import SceneFile, load_scene
 from warp_abtree.checks.atomic_write import atomic_write
-from warp_abtree.jobs.shards import hash_model
 from warp_abtree.simulate.frame import FrameRow
 
 FORMAT_NAME, FORMAT_VERSION = "warp_abtree recording", 2
@@ -30,7 +29,7 @@ class Recording:
     Attributes:
         text: The scene file.
         settings: path of the scene file, objects asked for or None, controller, budget_ms or None, and device.
-        models: `hash_model` of each model.
+        models: `Model.digest` of each model.
         rows: One `FrameRow` a frame.
         lods: LOD of every object in each frame, int32 (frames, n).
         poses: Pose of every object in each frame, x y z qx qy qz qw, float64 (frames, n, 7).
@@ -127,7 +126,7 @@ class Recording:
         objects = self.settings["objects"]
         loaded = load_scene(self.settings["path"], device, progress, objects, self.text)
         for (name, model), known in zip(loaded.models.items(), self.models):
-            if hash_model(model) != known:
+            if model.digest != known:
                 raise ValueError(f"{path}: the mesh of models.{name} is not the one of the recording")
         if (len(loaded.models), loaded.scene.object_count) != (len(self.models), self.lods.shape[1]):
             raise ValueError(f"{path}: a damaged recording (the scene has other objects)")
@@ -172,5 +171,5 @@ def record_run(loaded: SceneFile, frames: int, keep=True, progress=None, **optio
         "budget_ms": None if control.controller in ("none", "tolerance") else control.budget_ms,
         "device": str(scene.device),
     }
-    models = [hash_model(model) for model in loaded.models.values()] if keep else []
+    models = [model.digest for model in loaded.models.values()] if keep else []
     return frame, Recording(loaded.text, settings, models, list(frame.history), lods, poses)

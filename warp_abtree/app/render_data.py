@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
-from warp_abtree.query.narrow_phase import Result
+from warp_abtree.query.result import Result
 from warp_abtree.simulate.frame import FrameRow
 
 NO_LINES = np.empty((0, 2, 3), np.float32)

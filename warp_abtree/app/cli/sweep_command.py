@@ -10,8 +10,7 @@ from warp_abtree.app.cli.arguments import PRECISIONS, Parser, positive
 from warp_abtree.app.cli.model_commands import load_model
 from warp_abtree.app.cli.report import print_json
 from warp_abtree.app.toml.scene_file import load_scene
-from warp_abtree.jobs.ray_pool import RayPool, WorldsJob
-from warp_abtree.jobs.shards import SweepJob, ThisProcess, run_shards
+from warp_abtree.jobs import RayPool, SweepJob, ThisProcess, WorldsJob, run_shards
 from warp_abtree.simulate.frame import resolve_lod
 
 SUMMARY = "ask a pair of models at millions of poses, or run the worlds of a scene, into shards"

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from warp_abtree.checks.atomic_write import atomic_write
-from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.view import Camera
 
 BACKGROUND = (1.0, 1.0, 1.0)
 VIEW_ANGLE = 25.0  # degrees

@@ -7,14 +7,15 @@ import numpy as np
 
 from warp_abtree.app.toml.decode import fail
 from warp_abtree.lod.controllers import PaperController, PredictiveController, ToleranceController
-from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.view import Camera
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.rigid_bodies import Dynamics, Kinematic
+from warp_abtree.simulate.motion import Kinematic
+from warp_abtree.simulate.rigid_bodies import Dynamics
 
 CONTROLLERS = ("predictive", "paper", "tolerance", "none")
 # The options of [lod] that each controller takes.
 _OPTIONS = {
-    "predictive": ("steps", "spacing", "window", "aim", "low", "patience", "loosest"),
+    "predictive": ("steps", "spacing", "window", "aim", "low", "hold_frames", "loosest"),
     "paper": ("steps", "window", "threshold_ms"),
     "tolerance": ("steps", "spacing", "window", "loosest"),
 }
@@ -199,8 +200,8 @@ class DynamicsSettings:
             kinematic: Which objects follow the motion, bool (n,).
             material: density, restitution and friction of each object, (n,).
         """
-        spin = motion.axis * motion.rate[:, None]
-        moving = {"velocity": motion.velocity, "spin": spin, "kinematic": kinematic}
+        angular_velocity = motion.axis * motion.rate[:, None]
+        moving = {"velocity": motion.velocity, "angular_velocity": angular_velocity, "kinematic": kinematic}
         return Dynamics(scene, **self.options, **material, **moving)
 
 

@@ -27,7 +27,8 @@ from warp_abtree.app.toml.objects import make_groups
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame, LodSweep, resolve_lod
-from warp_abtree.simulate.rigid_bodies import Dynamics, Kinematic
+from warp_abtree.simulate.motion import Kinematic
+from warp_abtree.simulate.rigid_bodies import Dynamics
 
 
 @dataclass(eq=False)

@@ -180,7 +180,7 @@ class LodTable(Table):
     threshold_ms: Positive | None = None  # paper: t; a tenth of the budget by default
     aim: Fraction | None = None  # predictive: fraction of the budget to aim at,
     low: Fraction | None = None  # below which LODs rise,
-    patience: Annotated[int, Meta(ge=0, le=2**30)] | None = None  # after so many frames
+    hold_frames: Annotated[int, Meta(ge=0, le=2**30)] | None = None  # after so many frames
     loosest: Annotated[float, Meta(ge=1)] | None = None  # predictive, tolerance: most that a tolerance is loosened
 
     def __post_init__(self):

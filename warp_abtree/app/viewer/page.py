@@ -15,7 +15,7 @@ from warp_abtree.app.playback import HOLD, OWN
 from warp_abtree.app.render_data import Settings, compose, objects_of_world
 from warp_abtree.app.viewer import text as view_text
 from warp_abtree.app.viewer.viewer_scene import ViewerScene
-from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.view import Camera
 
 FRAME_SECONDS = 1 / 30  # between snapshots that are sent, at least
 TEXT_SECONDS = 0.2  # between changes of numbers and plots while it plays

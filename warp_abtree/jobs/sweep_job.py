@@ -1,0 +1,224 @@
+"""One pair of models at many poses, as a job."""
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warp_abtree.checks.arguments import to_numpy, whole_number
+from warp_abtree.model.model import Model
+from warp_abtree.query.request import check_request
+from warp_abtree.scene.poses import QUATERNION_TOLERANCE
+from warp_abtree.scene.scene import Scene
+from warp_abtree.scene.sweep import sweep
+
+# Poses of a shard, and rows read at a time while a job is checked.
+READ_ROWS = SHARD = 65536
+# Limits of the scene that finds contacts, or LODs that differ between poses: poses at a time, bytes of tree states.
+SCENE_POSES, STATE_BYTES, BYTES_A_FACE = 4096, 2**28, 190
+
+
+class _Rows:
+    """Rows of numbers in memory, or in an .npy file that is read in parts."""
+
+    path: Any  # of the file; None in memory
+
+    def __init__(self, source, what, width):
+        self.what, self.path, self.array = what, None, None
+        if isinstance(source, str | os.PathLike):
+            self.path = Path(source)
+            try:
+                mapped = np.load(self.path, mmap_mode="r", allow_pickle=False)
+            except FileNotFoundError:
+                raise ValueError(f"{what}: {source}: no such file") from None
+            except (OSError, ValueError, EOFError) as error:
+                raise ValueError(f"{what}: {source} cannot be read as .npy ({error})") from None
+            if not isinstance(mapped, np.memmap) or not mapped.flags.c_contiguous:
+                raise ValueError(f"{what}: {source} is not an .npy file of one array in C order")
+            self.dtype, shape, self.offset = mapped.dtype, mapped.shape, mapped.offset
+        else:
+            self.array = to_numpy(source, what)
+            self.dtype, shape = self.array.dtype, self.array.shape
+        if self.dtype.kind not in "iuf":
+            raise ValueError(f"{what}: type {self.dtype} holds no real numbers")
+        if len(shape) != 2 or shape[1] != width:
+            raise ValueError(f"{what}: shape {shape}, not (p, {width})")
+        self.count, self.width = shape
+
+    def read(self, start, stop) -> np.ndarray:
+        """Return a range of rows, without a copy if they are in memory."""
+        if self.array is not None:
+            return self.array[start:stop]
+        row = self.width * self.dtype.itemsize
+        with open(self.path, "rb") as file:
+            file.seek(self.offset + start * row)
+            rows = np.fromfile(file, self.dtype, (stop - start) * self.width)
+        if len(rows) != (stop - start) * self.width:
+            raise ValueError(f"{self.what}: {self.path} ends before row {stop}")
+        return rows.reshape(-1, self.width)
+
+    def hash_checked(self, check) -> str:
+        """Return a hash of all rows; check(index of the first, rows) is called on each part and raises on bad rows."""
+        found = hashlib.sha256(f"{self.dtype.str} {self.count}".encode())
+        for start in range(0, self.count, READ_ROWS):
+            rows = self.read(start, min(start + READ_ROWS, self.count))
+            check(start, rows)
+            found.update(rows.tobytes())
+        return found.hexdigest()
+
+
+def _check_poses(start, rows):
+    rows = rows.astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        norm = np.sqrt((rows[:, 3:] ** 2).sum(1))
+    bad = np.flatnonzero(~np.isfinite(rows).all(1))
+    if len(bad):
+        raise ValueError(f"poses: pose {start + bad[0]} is not finite")
+    bad = np.flatnonzero(~(np.abs(norm - 1) <= QUATERNION_TOLERANCE))
+    if len(bad):
+        raise ValueError(
+            f"poses: pose {start + bad[0]} has a quaternion of norm {norm[bad[0]]:.6g}, "
+            f"off 1 by more than {QUATERNION_TOLERANCE}"
+        )
+
+
+class SweepJob:
+    """One pair of models at many poses, or LODs, as a job for `run_shards`.
+
+    The constructor checks all poses and LODs, part by part.
+
+    Args:
+        model_a, model_b: `Model`; may be the same.
+        poses: (p, 7) as for `sweep`, an array or the path of an .npy file.
+        lods: LODs of A and B: (2,) for all poses, or (p, 2), an array or the path of an .npy file; None is the finest.
+            Poses with the LODs of nearby poses are faster.
+        output: "any", "count", "faces" or "contacts".
+        precision: As for `sweep`.
+        shard: Poses per shard.
+
+    Attributes:
+        count: Poses.
+
+    Raises:
+        TypeError: model_a or model_b is no Model.
+        ValueError: Bad poses or LODs (the message names the first), or an unknown option.
+    """
+
+    unit = "pose"
+
+    def __init__(self, model_a, model_b, poses, lods=None, output="any", precision="exact", shard=SHARD):
+        for model in (model_a, model_b):
+            if not isinstance(model, Model):
+                raise TypeError(f"model is a {type(model).__name__}, not a Model")
+        check_request("faces" if output == "contacts" else output, precision)
+        self.models = (model_a, model_b)
+        self.output, self.precision = output, precision
+        self.shard = whole_number(shard, "shard", 1, 2**31 - 1)
+        self.fixed, self.lods = (model_a.lod_max, model_b.lod_max), None
+        if lods is not None and not isinstance(lods, str | os.PathLike) and np.shape(lods) == (2,):
+            self.fixed = tuple(model.check_lod(lod) for model, lod in zip(self.models, np.asarray(lods).tolist()))
+        elif lods is not None:
+            self.lods = _Rows(lods, "lods", 2)
+        self.poses = _Rows(poses, "poses", 7)
+        self.count = self.poses.count
+        if self.lods is not None and self.lods.count != self.count:
+            raise ValueError(f"lods: {self.lods.count} given for {self.count} poses")
+        known_lods = self.fixed if self.lods is None else self.lods.hash_checked(self._check_lods)
+        self._known = {
+            "kind": "sweep",
+            "count": self.count,
+            "shard": self.shard,
+            "models": [model.digest for model in self.models],
+            "poses": self.poses.hash_checked(_check_poses),
+            "lods": known_lods,
+            "output": output,
+            "precision": precision,
+        }
+
+    def _check_lods(self, start, rows):
+        top = np.array([model.lod_max for model in self.models])
+        bad = np.flatnonzero(~((rows >= 0) & (rows <= top) & (rows == np.floor(rows))).all(1))
+        if len(bad):
+            raise ValueError(
+                f"lods: those of pose {start + bad[0]} are {rows[bad[0]].tolist()}, "
+                f"not whole numbers from 0 to {top.tolist()}"
+            )
+
+    def describe(self) -> dict:
+        """Return everything that determines the results, for JSON."""
+        return self._known
+
+    def task(self, start, stop):
+        """Return the input of one shard, sent to a worker."""
+        lods = None if self.lods is None else self.lods.read(start, stop).astype(np.int64)
+        return start, self.poses.read(start, stop), lods
+
+    def runner(self) -> "SweepRunner":
+        """Return the task runner, sent to each worker once."""
+        return SweepRunner(self.models, self.fixed, self.output, self.precision)
+
+
+class SweepRunner:
+    """Task runner of a `SweepJob` on one device; pickled without its scene."""
+
+    def __init__(self, models, fixed, output, precision):
+        self.models, self.fixed, self.output, self.precision = models, fixed, output, precision
+        self._scene: Any = None  # made at the first use
+
+    def __getstate__(self):
+        return {**vars(self), "_scene": None}
+
+    def run(self, task, device=None) -> dict:
+        """Return the columns of a shard, arrays of one length."""
+        start, poses, lods = task
+        if lods is None and self.output != "contacts":
+            options = {"output": self.output, "precision": self.precision, "device": device}
+            (model_a, model_b), (lod_a, lod_b) = self.models, self.fixed
+            found = sweep(model_a, model_b, poses, lod_a, lod_b, **options)
+            return {self.output: found} if self.output != "faces" else _name_faces(found, start)
+        parts = []
+        room = self._make_scene(len(poses), device)
+        for first in range(0, len(poses), room):
+            part = slice(first, first + room)
+            result = self._intersect(poses[part], None if lods is None else lods[part], room)
+            if self.output in ("any", "count"):
+                parts.append({self.output: getattr(result, self.output)})
+                continue
+            columns = _name_faces(result.faces, start + first)
+            if self.output == "contacts":
+                names = result.contacts.dtype.names[2:]
+                columns |= {name: np.ascontiguousarray(result.contacts[name]) for name in names}
+            parts.append(columns)
+        return {name: np.concatenate([columns[name] for columns in parts]) for name in parts[0]}
+
+    def _make_scene(self, count, device) -> int:
+        """Make the scene, with an A and a B for each pose, at the first call; return how many poses it holds."""
+        if self._scene is None:
+            faces = sum(model.face_count for model in self.models)
+            room = min(SCENE_POSES, count, max(1, STATE_BYTES // (BYTES_A_FACE * faces)))
+            scene = Scene(device)
+            for model, lod in zip(self.models, self.fixed):
+                for _ in range(room):
+                    scene.add(model, lod=lod)
+            self._scene = scene
+        return self._scene.object_count // 2
+
+    def _intersect(self, poses, lods, room):
+        """Intersect A and B at up to `room` poses; the other objects stay at the origin."""
+        count = len(poses)
+        placed = np.zeros((2 * room, 7))
+        placed[:, 6] = 1.0
+        placed[room : room + count] = poses
+        self._scene.set_poses(placed)
+        if lods is not None:
+            levels = np.tile(lods[-1:], (room, 1))
+            levels[:count] = lods
+            self._scene.set_lods(levels.T.reshape(-1))
+        pairs = np.arange(count)[:, None] + [0, room]
+        return self._scene.intersect(pairs, output=self.output, precision=self.precision)
+
+
+def _name_faces(faces, start) -> dict:
+    return {"pose": faces[:, 0].astype(np.int64) + start, "face_a": faces[:, 1], "face_b": faces[:, 2]}
