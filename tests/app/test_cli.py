@@ -353,13 +353,13 @@ def test_doctor(capsys):
 
 
 def test_doctor_finds_what_is_wrong(capsys, monkeypatch):
-    monkeypatch.setattr(doctor, "_CROSSING", (doctor._CROSSING[0], doctor._CROSSING[0]))
+    monkeypatch.setattr(doctor, "CROSSING", (doctor.CROSSING[0], doctor.CROSSING[0]))
     shown, _ = run(capsys, "doctor", "--device", "cpu", status=0)  # they touch: still the right counts
-    monkeypatch.setattr(doctor, "_AWAY", (0, 0, 0, 0, 0, 0, 1))
+    monkeypatch.setattr(doctor, "AWAY", (0, 0, 0, 0, 0, 0, 1))
     shown, _ = run(capsys, "doctor", "--device", "cpu", status=1)
     assert "a wrong answer: [1, 1, 1]" in shown and shown.endswith("not usable as it is\n")
-    monkeypatch.setattr(doctor, "CORE", {"warp-lang": "999"})
-    monkeypatch.setattr(doctor, "EXTRAS", {"view": ("to see", {"numpy": "", "no-such-thing": "2.1", "trimesh": "999"})})
+    monkeypatch.setattr(doctor, "CORE", ["warp-lang>=999"])
+    monkeypatch.setattr(doctor, "EXTRAS", {"view": ("to see", ["numpy", "no-such-thing>=2.1", "trimesh>=999"])})
     found = json.loads(run(capsys, "doctor", "--json", "--device", "cpu", status=1)[0])
     assert found["install"] == ["no-such-thing>=2.1", "trimesh>=999"] and found["packages"]["warp-lang"]["ok"] is False
     assert found["extras"]["view"]["ok"] is False and found["extras"]["view"]["packages"]["numpy"]["ok"] is True
@@ -369,14 +369,10 @@ def test_doctor_knows_the_extras():
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     extras = set(re.findall(r"^(\w+) = \[", text.split("optional-dependencies]")[1].split("\n[")[0], re.M))
     assert set(doctor.EXTRAS) == extras - {"bench", "docs", "test", "dev"}
-    for extra, (_, packages) in doctor.EXTRAS.items():
+    for extra, (_, needs) in doctor.EXTRAS.items():
         line = re.search(rf"^{extra} = \[(.*)\]$", text, re.M)[1]
-        wanted = [item.split(";")[0].strip() for item in re.findall(r'"([^"]*)"', line)]
-        assert wanted == [f"{name}>={least}" if least else name for name, least in packages.items()]
-    wanted = re.search(r"^dependencies = \[(.*)\]$", text, re.M)[1]
-    assert [f"{name}>={least}" if least else name for name, least in doctor.CORE.items()] == re.findall(
-        '"(.*?)"', wanted
-    )
+        assert [item.split(";")[0].strip() for item in re.findall(r'"([^"]*)"', line)] == list(needs)
+    assert re.findall('"(.*?)"', re.search(r"^dependencies = \[(.*)\]$", text, re.M)[1]) == list(doctor.CORE)
 
 
 def test_tables_on_a_terminal(monkeypatch):

@@ -132,7 +132,7 @@ def record_query(path):
 def save_recording(path):
     from warp_abtree.app.recording import Recording
 
-    Recording("", {}, [], run_frame()[0].history, np.zeros((1, 2), np.int32), np.zeros((1, 2, 7))).save(path)
+    Recording("", None, [], run_frame()[0].history, np.zeros((1, 2), np.int32), np.zeros((1, 2, 7))).save(path)
 
 
 def draw_picture(path):

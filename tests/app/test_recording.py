@@ -131,17 +131,21 @@ def test_damaged_recordings_are_refused(tmp_path):
     recording.save(path)
     with np.load(path) as file:
         good = {name: file[name] for name in file.files}
-    settings = json.loads(str(good["settings"]))
+    settings, rows = (json.loads(str(good[name])) for name in ("settings", "rows"))
+    row = rows[0]
     bad = [
         ({"format": np.array("x")}, "not a recording of a run"),
         ({"version": np.array(FORMAT_VERSION + 1)}, f"version {FORMAT_VERSION + 1}"),
         ({"lods": good["lods"][:1]}, "lods: shape"),
         ({"lods": good["lods"].astype(np.int64)}, "int64"),
+        ({"lods": good["lods"].ravel()}, "lods: shape"),
         ({"poses": good["poses"][:, :, :6]}, "poses: shape"),
-        ({"row_hits": good["row_hits"][:1]}, "row_hits"),
-        ({"settings": np.array("{}")}, "is missing"),
+        ({"rows": np.array(json.dumps(rows[:1]))}, "lods: shape"),
+        ({"rows": np.array(json.dumps([{**row, "hits": 0.5}, row]))}, "damaged .*int.* got .*float.*hits"),
+        ({"rows": np.array(json.dumps([{**row, "query_ms": None}, row]))}, "damaged .*query_ms"),
+        ({"settings": np.array("{}")}, "missing required field"),
         ({"settings": np.array("{")}, "damaged"),
-        ({"settings": np.array(json.dumps({**settings, "objects": "many"}))}, "objects is 'many'"),
+        ({"settings": np.array(json.dumps({**settings, "objects": "many"}))}, "damaged .*objects"),
         ({"poses": np.array([{}], dtype=object)}, "not a recording"),
     ]
     for changes, message in bad:
@@ -149,8 +153,8 @@ def test_damaged_recordings_are_refused(tmp_path):
         with pytest.raises(ValueError, match=message) as caught:
             Recording.open(path)
         assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
-    np.savez(path, **{name: value for name, value in good.items() if name != "row_hits"})
-    with pytest.raises(ValueError, match="row_hits' is missing"):
+    np.savez(path, **{name: value for name, value in good.items() if name != "rows"})
+    with pytest.raises(ValueError, match="rows' is missing"):
         Recording.open(path)
     for content in (b"", b"junk", b"PK\x03\x04junk"):
         path.write_bytes(content)

@@ -4,22 +4,36 @@ A recording holds the text of the scene file, so that it needs no other file but
 must be the same.
 """
 
-import json
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from warp_abtree.app.toml.decode import import_msgspec
 from warp_abtree.app.toml.scene_file import SceneFile, load_scene
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.simulate.frame import FrameRow
 
 FORMAT_NAME, FORMAT_VERSION = "warp_abtree recording", 2
-COLUMNS = tuple(field.name for field in fields(FrameRow))
-_OPTIONAL = ("hits", "budget_ms")  # NaN in the file where they are None
-_SETTINGS = {"path": str, "objects": int, "controller": str, "budget_ms": float, "device": str}
+
+
+@dataclass
+class RunSettings:
+    """What a run was asked for.
+
+    Attributes:
+        path: Of the scene file.
+        objects: Number of objects, None for the file's own.
+        controller, budget_ms: As for `SceneFile.frame`.
+        device: Warp device.
+    """
+
+    path: str
+    objects: int | None
+    controller: str
+    budget_ms: float | None
+    device: str
 
 
 @dataclass(eq=False)
@@ -28,7 +42,7 @@ class Recording:
 
     Attributes:
         text: The scene file.
-        settings: path of the scene file, objects asked for or None, controller, budget_ms or None, and device.
+        settings: What was asked for.
         models: `Model.digest` of each model.
         rows: One `FrameRow` a frame.
         lods: LOD of every object in each frame, int32 (frames, n).
@@ -36,7 +50,7 @@ class Recording:
     """
 
     text: str
-    settings: dict
+    settings: RunSettings
     models: list
     rows: list
     lods: np.ndarray
@@ -44,21 +58,18 @@ class Recording:
 
     def save(self, path):
         """Write to an .npz file; it appears whole or not at all."""
-        columns: dict[str, Any] = {}
-        for name in COLUMNS:
-            values = [getattr(row, name) for row in self.rows]
-            columns[f"row_{name}"] = np.array([np.nan if value is None else value for value in values], _type_of(name))
+        encode = import_msgspec(path).json.encode
         with atomic_write(path) as file:
             np.savez_compressed(
                 file,
                 format=np.array(FORMAT_NAME),
                 version=np.array(FORMAT_VERSION),
                 text=np.array(self.text),
-                settings=np.array(json.dumps(self.settings)),
+                settings=np.array(encode(self.settings).decode()),
+                rows=np.array(encode(self.rows).decode()),
                 models=np.array(self.models),
                 lods=self.lods,
                 poses=self.poses,
-                **columns,
             )
 
     @classmethod
@@ -81,36 +92,19 @@ class Recording:
         version = str(arrays.get("version"))
         if version != str(FORMAT_VERSION):
             raise ValueError(f"{path}: a recording of version {version}, not {FORMAT_VERSION}")
+        decode = import_msgspec(path).json.decode
         try:
-            return cls._from_arrays(arrays)
-        except (ValueError, KeyError, TypeError, OverflowError) as error:
+            settings = decode(str(arrays["settings"]), type=RunSettings)
+            rows = decode(str(arrays["rows"]), type=list[FrameRow])
+            lods, poses = arrays["lods"], arrays["poses"]
+            shapes = (len(rows), *lods.shape[1:2]), (*lods.shape[:2], 7)
+            for name, array, shape, kind in zip(("lods", "poses"), (lods, poses), shapes, ("int32", "float64")):
+                if array.shape != shape or array.dtype != kind or array.ndim < 2 or not array.size:
+                    raise ValueError(f"{name}: shape {array.shape} and type {array.dtype} of {len(rows)} frames")
+            return cls(str(arrays["text"]), settings, arrays["models"].tolist(), rows, lods, poses)
+        except (ValueError, KeyError) as error:
             what = f"{error} is missing" if isinstance(error, KeyError) else error
             raise ValueError(f"{path}: a damaged recording ({what})") from None
-
-    @classmethod
-    def _from_arrays(cls, arrays):
-        settings = json.loads(str(arrays["settings"]))
-        for name, kind in _SETTINGS.items():
-            if not isinstance(settings[name], kind) and (settings[name] is not None or name in ("path", "controller")):
-                raise ValueError(f"settings: {name} is {settings[name]!r}")
-        lods, poses = arrays["lods"], arrays["poses"]
-        frames = len(arrays["row_frame"])
-        count = lods.shape[1] if lods.ndim == 2 else 0
-        wanted = {"lods": ((frames, count), np.int32), "poses": ((frames, count, 7), np.float64)}
-        wanted |= {f"row_{name}": ((frames,), _type_of(name)) for name in COLUMNS}
-        for name, (shape, kind) in wanted.items():
-            array = arrays[name]
-            if array.shape != shape or array.dtype != kind or not array.size:
-                raise ValueError(f"{name}: shape {array.shape} and type {array.dtype} of {frames} frames")
-        columns = []
-        for name in COLUMNS:
-            column = arrays[f"row_{name}"]
-            if name not in _OPTIONAL and not np.isfinite(column).all():
-                raise ValueError(f"row_{name}: a number is not finite")
-            values = [None if np.isnan(value) else value for value in column.tolist()]
-            columns.append([value and int(value) for value in values] if name == "hits" else values)
-        rows = [FrameRow(*values) for values in zip(*columns)]
-        return cls(str(arrays["text"]), settings, arrays["models"].tolist(), rows, lods, poses)
 
     def load_scene(self, path, device=None, progress=None) -> SceneFile:
         """Return the scene of the recording.
@@ -123,19 +117,13 @@ class Recording:
             SceneError: A mesh is missing.
             ValueError: A mesh is another.
         """
-        objects = self.settings["objects"]
-        loaded = load_scene(self.settings["path"], device, progress, objects, self.text)
+        loaded = load_scene(self.settings.path, device, progress, self.settings.objects, self.text)
         for (name, model), known in zip(loaded.models.items(), self.models):
             if model.digest != known:
                 raise ValueError(f"{path}: the mesh of models.{name} is not the one of the recording")
         if (len(loaded.models), loaded.scene.object_count) != (len(self.models), self.lods.shape[1]):
             raise ValueError(f"{path}: a damaged recording (the scene has other objects)")
         return loaded
-
-
-def _type_of(name):
-    real = name == "time" or name.endswith("_ms") or name.startswith("error_") or name in _OPTIONAL
-    return np.float64 if real else np.int64
 
 
 def record_run(loaded: SceneFile, frames: int, keep=True, progress=None, **options):
@@ -164,12 +152,12 @@ def record_run(loaded: SceneFile, frames: int, keep=True, progress=None, **optio
         if progress is not None:
             progress(i + 1, frames)
     control = loaded.control.asked(options.get("controller"), options.get("budget_ms"))
-    settings = {
-        "path": str(Path(loaded.path).absolute()),
-        "objects": loaded.objects,
-        "controller": control.controller,
-        "budget_ms": None if control.controller in ("none", "tolerance") else control.budget_ms,
-        "device": str(scene.device),
-    }
+    settings = RunSettings(
+        path=str(Path(loaded.path).absolute()),
+        objects=loaded.objects,
+        controller=control.controller,
+        budget_ms=None if control.controller in ("none", "tolerance") else control.budget_ms,
+        device=str(scene.device),
+    )
     models = [model.digest for model in loaded.models.values()] if keep else []
     return frame, Recording(loaded.text, settings, models, list(frame.history), lods, poses)

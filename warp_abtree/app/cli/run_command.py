@@ -58,12 +58,12 @@ def run(options, progress):
     _check(options, again)
     replay = Recording.open(options.scene) if again else None
     if replay is not None:
-        loaded = replay.load_scene(options.scene, options.device or replay.settings["device"], progress)
+        loaded = replay.load_scene(options.scene, options.device or replay.settings.device, progress)
         recorded = len(replay.rows)
         frames = recorded if options.frames is None else options.frames
         if frames > recorded:
             raise ValueError(f"--frames: {options.scene} has {recorded} frames")
-        asked = {name: replay.settings[name] for name in ("controller", "budget_ms")}
+        asked: dict = {"controller": replay.settings.controller, "budget_ms": replay.settings.budget_ms}
         asked["clock"] = ReplayClock(replay.rows)
     else:
         loaded = load_scene(options.scene, device=options.device, progress=progress, objects=options.objects)
@@ -89,7 +89,7 @@ def run(options, progress):
             for name, model in loaded.models.items()
         },
         "worlds": len(np.unique(loaded.worlds[loaded.worlds >= 0])),
-        "controller": recording.settings["controller"],
+        "controller": recording.settings.controller,
         "replay": str(options.scene) if again else None,
         "written": written,
         **frame.summary(),
@@ -140,7 +140,7 @@ def _write(options, loaded, frame, recording) -> list[Path]:
             frame.record(options.record)
     if options.picture:
         poses = None if loaded.dynamics is None else frame.motion.dynamics.poses()
-        chosen = None if recording.settings["controller"] == "none" else loaded.scene.lods
+        chosen = None if recording.settings.controller == "none" else loaded.scene.lods
         draw_scene(loaded, options.picture, frame.history[-1].time, poses, chosen)
     if options.plot:
         options.plot.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""What controls a run: the camera, the controller of LODs, and rigid bodies, from [camera], [lod] and [dynamics]."""
+"""What controls a run, from [camera], [lod] and [picture]: the camera, the controller of LODs, and the view."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -9,8 +9,6 @@ from warp_abtree.app.toml.decode import fail
 from warp_abtree.lod.controllers import PaperController, PredictiveController, ToleranceController
 from warp_abtree.lod.view import Camera
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.motion import Kinematic
-from warp_abtree.simulate.rigid_bodies import Dynamics
 
 CONTROLLERS = ("predictive", "paper", "tolerance", "none")
 # The options of [lod] that each controller takes.
@@ -174,44 +172,3 @@ def make_control(path, table) -> LodControl:
         return LodControl("none", table.budget_ms, table.tolerance, options).asked(controller)
     except ValueError as error:
         fail(path, "lod", error)
-
-
-# Rigid bodies.
-
-MATERIAL = {"density": 1.0, "restitution": 0.0, "friction": 0.5}  # of objects where the file does not say
-
-
-@dataclass(frozen=True)
-class DynamicsSettings:
-    """What [dynamics] gives.
-
-    Attributes:
-        options: gravity, iterations, sleep_time of `Dynamics`.
-        material: density, restitution and friction of objects that give none.
-    """
-
-    options: dict
-    material: dict
-
-    def make(self, scene: Scene, motion: Kinematic, kinematic, material: dict) -> Dynamics:
-        """Return rigid bodies that start as the motion does at its time 0.
-
-        Args:
-            kinematic: Which objects follow the motion, bool (n,).
-            material: density, restitution and friction of each object, (n,).
-        """
-        angular_velocity = motion.axis * motion.rate[:, None]
-        moving = {"velocity": motion.velocity, "angular_velocity": angular_velocity, "kinematic": kinematic}
-        return Dynamics(scene, **self.options, **material, **moving)
-
-
-def make_dynamics(table) -> DynamicsSettings | None:
-    """Return what [dynamics] describes; None where the file has none."""
-    if table is None:
-        return None
-    options = {"gravity": list(table.gravity)}
-    for name in ("iterations", "sleep_time"):
-        if getattr(table, name) is not None:
-            options[name] = getattr(table, name)
-    given = {name: getattr(table, name) for name in MATERIAL}
-    return DynamicsSettings(options, {name: MATERIAL[name] if x is None else x for name, x in given.items()})

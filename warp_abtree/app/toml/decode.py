@@ -26,6 +26,19 @@ def fail(path, key: str, message) -> NoReturn:
     raise SceneError(" ".join(f"{path}: {key}: {message}".split())) from None
 
 
+def import_msgspec(path):
+    """Return msgspec, which reads a file.
+
+    Raises:
+        SceneError: It is not installed.
+    """
+    try:
+        import msgspec
+    except ImportError:
+        raise SceneError(f"{path}: scene files need msgspec: pip install warp-abtree[app]") from None
+    return msgspec
+
+
 def read_tables(path: Path, text: str | None = None):
     """Return the text of a scene file and its `SceneTable`, whose models are `ModelTable`s.
 
@@ -36,12 +49,9 @@ def read_tables(path: Path, text: str | None = None):
     Raises:
         SceneError: The file is missing or wrong, or msgspec is not installed.
     """
-    try:
-        import msgspec
+    msgspec = import_msgspec(path)
+    from warp_abtree.app.toml import model_tables, tables
 
-        from warp_abtree.app.toml import model_tables, tables
-    except ImportError:
-        raise SceneError(f"{path}: scene files need msgspec: pip install warp-abtree[app]") from None
     try:
         text = path.read_bytes().decode() if text is None else text
         tree = msgspec.toml.decode(text)

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from warp_abtree.app.toml.control import MATERIAL, DynamicsSettings, unit
+from warp_abtree.app.toml.control import unit
 from warp_abtree.app.toml.decode import SceneError, fail
 
-OBJECT_LIMIT = 1_000_000  # of one entry
+OBJECT_LIMIT = 1_000_000  # of one entry of [[objects]]
+MATERIAL = ("density", "restitution", "friction")
 
 
 @dataclass(eq=False)
@@ -33,14 +34,14 @@ class ObjectGroup:
     material: dict
 
 
-def make_group(path, key: str, table, dynamics: DynamicsSettings | None, rng) -> ObjectGroup:
+def make_group(path, key: str, table, dynamics, rng) -> ObjectGroup:
     """Lay out the copies of an entry.
 
     Args:
         path: The scene file.
         key: Of the entry.
         table: `ObjectTable`.
-        dynamics: None without [dynamics].
+        dynamics: `DynamicsTable`, or None.
         rng: NumPy generator of what is random.
 
     Raises:
@@ -72,7 +73,7 @@ def make_group(path, key: str, table, dynamics: DynamicsSettings | None, rng) ->
     material = {}
     for name in MATERIAL:
         own = getattr(table, name)
-        value = np.nan if dynamics is None else dynamics.material[name] if own is None else own
+        value = np.nan if dynamics is None else getattr(dynamics, name) if own is None else own
         material[name] = np.full(count, value)
     world = np.repeat(np.arange(table.world, table.world + table.worlds), len(offsets))
     return ObjectGroup(key, table, world, motion, np.full(count, table.kinematic), material)
@@ -141,7 +142,7 @@ def make_groups(path, tables, dynamics, seed: int, objects: int | None = None) -
     Args:
         path: The scene file.
         tables: `ObjectTable`s.
-        dynamics: `DynamicsSettings` or None.
+        dynamics: `DynamicsTable` or None.
         seed: Of what is random.
         objects: About so many objects in all: every `worlds`, or else `count`, is multiplied by the same number; None
             keeps them.

@@ -6,24 +6,22 @@ The keys of a file are the fields of the structs in `warp_abtree.app.toml.tables
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from warp_abtree.app.toml.control import (
-    MATERIAL,
     CameraPath,
-    DynamicsSettings,
     LodControl,
     PictureView,
     make_camera,
     make_control,
-    make_dynamics,
     make_view,
 )
 from warp_abtree.app.toml.decode import SceneError, fail, read_tables
 from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.models import build_model
-from warp_abtree.app.toml.objects import make_groups
+from warp_abtree.app.toml.objects import MATERIAL, make_groups
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame, LodSweep, resolve_lod
@@ -49,7 +47,7 @@ class SceneFile:
         picture: `PictureView`.
         camera: Called with a time [s] returns a `Camera`; None without [camera].
         control: `LodControl` of [lod].
-        dynamics: `DynamicsSettings`, None without [dynamics].
+        dynamics: `DynamicsTable`, None without [dynamics].
         kinematic: Whether each object moves as told among rigid bodies, bool (n,).
         body: density, restitution and friction of each object, (n,).
     """
@@ -69,7 +67,7 @@ class SceneFile:
     picture: PictureView
     camera: CameraPath | None
     control: LodControl
-    dynamics: DynamicsSettings | None
+    dynamics: Any
     kinematic: np.ndarray
     body: dict
 
@@ -90,7 +88,9 @@ class SceneFile:
             return None
         self.scene.set_poses(self.motion.poses(0.0))
         try:
-            return self.dynamics.make(self.scene, self.motion, self.kinematic, self.body)
+            angular_velocity = self.motion.axis * self.motion.rate[:, None]
+            moving = {"velocity": self.motion.velocity, "angular_velocity": angular_velocity}
+            return Dynamics(self.scene, kinematic=self.kinematic, **moving, **self.dynamics.options(), **self.body)
         except ValueError as error:
             raise SceneError(f"{self.path}: objects: {error}") from None
 
@@ -145,9 +145,9 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
     text, tables = read_tables(path, text)
     if not tables.objects:
         fail(path, "the file", "no [[objects]]")
-    dynamics, camera = make_dynamics(tables.dynamics), make_camera(path, tables.camera)
-    control, picture = make_control(path, tables.lod), make_view(path, tables.picture)
-    groups = make_groups(path, tables.objects, dynamics, tables.scene.seed, objects)
+    camera, control = make_camera(path, tables.camera), make_control(path, tables.lod)
+    picture = make_view(path, tables.picture)
+    groups = make_groups(path, tables.objects, tables.dynamics, tables.scene.seed, objects)
     _check_names(path, tables)
     try:
         motion = Kinematic(**{key: np.concatenate([group.motion[key] for group in groups]) for key in groups[0].motion})
@@ -171,7 +171,7 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
         picture=picture,
         camera=camera,
         control=control,
-        dynamics=dynamics,
+        dynamics=tables.dynamics,
         kinematic=np.concatenate([group.kinematic for group in groups]),
         body={name: np.concatenate([group.material[name] for group in groups]) for name in MATERIAL},
     )

@@ -18,7 +18,6 @@ from msgspec import Meta, field
 from msgspec.structs import replace
 
 from warp_abtree.app.toml.fields import (
-    OBJECT_LIMIT,
     ORIGIN,
     Copies,
     Count,
@@ -26,11 +25,13 @@ from warp_abtree.app.toml.fields import (
     NonEmpty,
     NotNegative,
     Positive,
+    Restitution,
     Table,
     Vector,
     check_direction,
 )
 from warp_abtree.app.toml.model_tables import SHAPES
+from warp_abtree.app.toml.objects import OBJECT_LIMIT
 
 
 class HeadTable(Table):
@@ -104,15 +105,7 @@ class RandomTable(Table):
     phase: bool = False  # of the shuttle
 
 
-class MaterialTable(Table):
-    """What [dynamics] gives to all bodies, and an object to itself."""
-
-    density: Positive | None = None  # 1
-    restitution: Annotated[float, Meta(ge=0, le=1)] | None = None  # 0
-    friction: NotNegative | None = None  # 0.5
-
-
-class ObjectTable(MaterialTable, kw_only=True):
+class ObjectTable(Table, kw_only=True):
     """[[objects]]: one object, or many."""
 
     model: str | NonEmpty[str]  # of a list each in turn
@@ -122,6 +115,9 @@ class ObjectTable(MaterialTable, kw_only=True):
     world: Annotated[int, Meta(ge=-1, le=2**30)] = 0  # objects of different worlds never meet; -1 is in every world
     static: bool = False  # static objects never meet each other
     kinematic: bool = False  # with [dynamics]: moves as told, and pushes
+    density: Positive | None = None  # with [dynamics]; these three are those of [dynamics] by default
+    restitution: Restitution | None = None
+    friction: NotNegative | None = None
     importance: Annotated[int, Meta(ge=1, le=3)] = 1  # 1 (most), 2 or 3, for the selection of LODs
     # A number with a decimal point is a fraction of the faces; a whole number, "finest", "coarsest" or "tol:0.01"; of a
     # list each in turn.
@@ -221,12 +217,20 @@ class CameraTable(Table):
                 raise ValueError(f"the key {name!r} is missing")
 
 
-class DynamicsTable(MaterialTable, kw_only=True):
+class DynamicsTable(Table):
     """[dynamics]: objects that are neither static nor kinematic are rigid bodies; velocity and turn start them."""
 
+    density: Positive = 1.0
+    restitution: Restitution = 0.0
+    friction: NotNegative = 0.5
     gravity: Vector = (0.0, -9.81, 0.0)
     iterations: Annotated[int, Meta(ge=1, le=10_000)] | None = None  # of the contact solver in a step
     sleep_time: Positive | None = None  # at rest before bodies sleep
+
+    def options(self) -> dict:
+        """Return the arguments of `Dynamics` that the file gives."""
+        given = {name: getattr(self, name) for name in ("gravity", "iterations", "sleep_time")}
+        return {name: value for name, value in given.items() if value is not None}
 
 
 class PictureTable(Table):

@@ -19,7 +19,7 @@ canvas {{ opacity: 1 !important; }}
 </style><details id="about" open><summary>{title}</summary>{text}{plot}</details>"""
 
 
-def record_page(server, playback, path: Path, frames: int, settings=None, progress=None):
+def record_page(server, playback, path: Path, frames: int, progress=None):
     """Run a playback for some frames and write a page that plays them and needs no server.
 
     Args:
@@ -27,13 +27,10 @@ def record_page(server, playback, path: Path, frames: int, settings=None, progre
         playback: `Playback` at its start.
         path: File to write; it appears whole or not at all.
         frames: How many.
-        settings: What to change of the page's `Settings` by name.
         progress: Called as progress(stage, done, total).
     """
     played = 0.0
     page = Page(server, playback, clock=lambda: played)
-    for name, value in (settings or {}).items():
-        setattr(page.settings, name, value)
     page.playing = True
     rows, hits = [], []
     recorder: Any = None  # of viser
