@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from helpers.viewer import run_command as run
 
 import warp_abtree as ab
 from warp_abtree.app.cli import doctor, model_commands, query_command, report
@@ -35,13 +36,6 @@ def files(tmp_path, monkeypatch):
     Path("text.mesh").write_text("hello\n")
     Path("folder.npz").mkdir()
     return tmp_path
-
-
-def run(capsys, *arguments, status=0):
-    """Run the command line; return its stdout, and stderr's lines."""
-    assert cli.main([str(argument) for argument in arguments]) == status
-    captured = capsys.readouterr()
-    return captured.out, captured.err.splitlines()
 
 
 def run_process(*arguments, cwd, **environment):
@@ -255,63 +249,6 @@ def test_a_record_that_fails_leaves_the_old_one(files, capsys, monkeypatch, name
     shown, errors = run(capsys, *words.split(), name, status=2)
     assert not shown and len(errors) == 1 and "No space left" in errors[0]
     assert Path(name).read_text() == "old" and not list(files.glob("*.partial"))
-
-
-# Bad input.
-
-BAD = [
-    ((), "COMMAND"),
-    (("fly",), "fly"),
-    (("info",), "MESH"),
-    (("info", "gone.obj"), "gone.obj: no such file"),
-    (("info", "."), "folder"),
-    (("info", "nan.obj"), "not finite"),
-    (("info", "junk.obj"), "junk.obj"),
-    (("info", "text.mesh"), "unknown extension"),
-    (("info", "warp:cat"), "warp:cat"),
-    (("info", "ball.obj", "--speed"), "--speed"),
-    (("info", "ball.obj", "--device", "cuda:99"), "no device 'cuda:99'"),
-    (("build", "ball.obj", "gone/ball.npz"), "no folder gone"),
-    (("build", "ball.obj", "ball.txt"), "must end in .npz"),
-    (("build", "ball.obj", "ball.npz", "--base-faces", "0"), "--base-faces"),
-    (("build", "nan.obj", "ball.npz"), "not finite"),
-    (("query", "ball.obj"), "B"),
-    (("query", "ball.obj", "gone.npz"), "gone.npz: no such file"),
-    (("query", "ball.obj", "junk.npz"), "junk.npz"),
-    (("query", "ball.obj", "ball.obj", "--pose", "1", "2"), "--pose"),
-    (("query", "ball.obj", "ball.obj", "--pose", *"0 0 0 0 0 0 x".split()), "--pose"),
-    (("query", "ball.obj", "ball.obj", "--pose", *"0 0 0 0 0 0 2".split()), "norm 2"),
-    (("query", "ball.obj", "ball.obj", "--pose", *"-inf 0 0 0 0 0 1".split()), "not finite"),
-    (("query", "ball.obj", "ball.obj", "--lod-a", "1.5"), "--lod-a"),
-    (("query", "ball.obj", "ball.obj", "--lod-b", "-3"), "--lod-b"),
-    (("query", "ball.obj", "ball.obj", "--lod-b", "99999"), "--lod-b"),
-    (("query", "ball.obj", "ball.obj", "--lod-b", "tol:-1"), "--lod-b"),
-    (("query", "ball.obj", "ball.obj", "--lod-b", "fine"), "--lod-b"),
-    (("query", "ball.obj", "ball.obj", "--output", "depth"), "--output"),
-    (("query", "ball.obj", "ball.obj", "--precision", "half"), "--precision"),
-    (("query", "ball.obj", "ball.obj", "--precision"), "--precision"),
-    (("query", "ball.obj", "ball.obj", *"--output contacts --record out.json".split()), "must end in .csv or .npz"),
-    (("query", "ball.obj", "ball.obj", *"--output contacts --record out".split()), "must end in .csv or .npz"),
-    (("query", "ball.obj", "ball.obj", *"--output contacts --record gone/out.csv".split()), "no folder gone"),
-    (("query", "ball.obj", "ball.obj", *"--output contacts --record ball.obj/out.csv".split()), "no folder ball.obj"),
-    (("query", "ball.obj", "ball.obj", *"--output contacts --record folder.npz".split()), "is a folder"),
-    (("query", "ball.obj", "ball.obj", "--record", "out.csv"), "ask --output faces or contacts"),
-    (("query", "ball.obj", "ball.obj", "--output", "any", "--record", "out.csv"), "ask --output faces or contacts"),
-    (("query", "ball.obj", "face.npz", "--record", "face.npz"), "face.npz: is read"),
-    (("query", "./face.npz", "ball.obj", "--record", "face.npz"), "face.npz: is read"),
-    (("query", "ball.obj", "nan.obj", "--output", "contacts", "--record", "out.npz"), "not finite"),
-    (("query", "ball.obj", "ball.obj", "--device", "tpu"), "no device 'tpu'"),
-    (("bench",), "name a benchmark"),
-    (("view", "--fast"), "SCENE_OR_MESHES"),
-]
-
-
-@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) or "nothing" for arguments, _ in BAD])
-def test_bad_input_gives_one_line(files, capsys, arguments, message):
-    before = sorted(files.iterdir())
-    shown, errors = run(capsys, *arguments, status=2)
-    assert len(errors) == 1 and message in errors[0] and errors[0].startswith("warp-abtree: ")
-    assert not shown and sorted(files.iterdir()) == before
 
 
 def test_lost_work_is_status_1(files, capsys, monkeypatch):

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.samples import SHUTTLE_SCENE
+from helpers.viewer import run_command as run
 
 import warp_abtree as ab
-from warp_abtree.app.cli import main as cli
 from warp_abtree.app.cli import run_command
 from warp_abtree.app.pictures import scenes
 from warp_abtree.app.styles import STAGE_LABELS
@@ -43,13 +43,6 @@ def files(tmp_path, monkeypatch):
     Path("junk.npz").write_bytes(b"junk")
     Path("folder.npz").mkdir()
     return tmp_path
-
-
-def run(capsys, *arguments, status=0):
-    """Run the command line; return its stdout, and stderr's lines."""
-    assert cli.main([str(argument) for argument in arguments]) == status
-    captured = capsys.readouterr()
-    return captured.out, captured.err.splitlines()
 
 
 def test_run_for_people(files, capsys):
@@ -179,45 +172,3 @@ def test_picture(files, capsys):
         assert np.mean((green > 1.8 * red) & (green > 1.8 * blue)) > 0.002, "intersecting faces of the ball"
         assert np.mean((red > 2 * blue) & (green > 2 * blue)) > 0.002, "intersecting faces of the ring"
     assert sorted(path.name for path in files.glob("out*")) == ["out.png"]
-
-
-# Bad input.
-
-BAD = [
-    (("run", "gone.toml"), "gone.toml"),
-    (("run", "bad.toml"), "bad.toml: scene.speed: unknown key"),
-    (("run", "broken.toml"), "line 1"),
-    (("run", "scene.toml", "--frames", "0"), "--frames"),
-    (("run", "scene.toml", "--picture", "out.jpg"), "must end in .png"),
-    (("run", "scene.toml", "--picture", "gone/out.png"), "no folder gone"),
-    (("run", "scene.toml", "--record", "rows.xls"), ".csv or .json or .npz"),
-    (("run", "scene.toml", "--record", "gone/run.npz"), "no folder gone"),
-    (("run", "scene.toml", "--plot", "gone/plots"), "no folder gone"),
-    (("run", "scene.toml", "--plot", "ball.obj"), "ball.obj"),
-    (("run", "scene.toml", "--objects", "0"), "--objects"),
-    (("run", "scene.toml", "--objects", "5"), "count or worlds"),
-    (("run", "scene.toml", "--budget", "soon"), "'soon' is no time above 0"),
-    (("run", "scene.toml", "--budget", "0ms"), "no time above 0"),
-    (("run", "scene.toml", "--budget", "-3ms"), "--budget"),
-    (("run", "scene.toml", "--budget", "infs"), "no time above 0"),
-    (("run", "scene.toml", "--controller", "magic"), "--controller"),
-    (("run", "scene.toml", "--controller", "paper"), "needs a budget"),
-    (("run", "scene.toml", "--controller", "tolerance"), "needs lod.tolerance"),
-    (("run", "scene.toml", "--controller", "none", "--budget", "3"), "holds no budget"),
-    (("run", "gone.npz"), "gone.npz: No such file"),
-    (("run", "junk.npz"), "junk.npz: not a recording"),
-    (("run", "face.npz"), "face.npz: not a recording of a run"),
-    (("run", "folder.npz"), "folder.npz"),
-    (("run", "junk.npz", "--record", "junk.npz"), "junk.npz: is read"),
-    (("run", "junk.npz", "--budget", "3"), "--budget: a recording runs again as it was"),
-    (("run", "junk.npz", "--controller", "paper"), "--controller: a recording"),
-    (("run", "junk.npz", "--objects", "3"), "--objects: a recording"),
-]
-
-
-@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
-def test_bad_input_gives_one_line(files, capsys, arguments, message):
-    before = sorted(files.iterdir())
-    shown, errors = run(capsys, *arguments, status=2)
-    assert len(errors) == 1 and message in errors[0] and errors[0].startswith("warp-abtree: ")
-    assert not shown and sorted(files.iterdir()) == before

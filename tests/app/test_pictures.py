@@ -146,34 +146,6 @@ def test_frames_go_as_far_as_they_are_asked(tmp_path, device):
     assert np.array_equal(snapshot.poses, expected.poses) and snapshot.poses[1, 1] < 0.5
 
 
-BAD = [
-    (("gone.toml",), "gone.toml"),
-    (("bad.toml",), "bad.toml: scene.speed: unknown key"),
-    (("ball.obj", "scene.toml"), "a scene file is looked at alone"),
-    (("ball.obj", "--out", "x.jpg"), "must end in .png"),
-    (("ball.obj", "--frame", "-1"), "--frame: -1 is below 0"),
-    (("ball.obj", "--tree", "-1"), "--tree: -1 is below 0"),
-    (("ball.obj", "--tree", "40"), "--tree: the deepest tree ends at level 9"),
-    (("ball.obj", "--size", "9"), "--size: 9 is outside 50 .. 8000"),
-    (("ball.obj", "--eye", "0", "1", "0"), "--eye: eye and up"),
-    (("ball.obj", "--eye", "nan", "1", "0"), "--eye: eye and up"),
-    (("ball.obj", "--world", "3"), "--world: no object is in world 3"),
-    (("run.npz", "--frame", "2"), "--frame: the recording has 2 frames"),
-]
-
-
-@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
-def test_bad_input_gives_one_line(files, capsys, arguments, message):
-    pytest.importorskip("pyvista")
-    if arguments[0] == "run.npz":
-        record_run(load_scene("scene.toml", device="cpu"), 2)[1].save("run.npz")
-    before = sorted(files.iterdir())
-    out = () if "--out" in arguments else ("--out", "out.png")
-    shown, errors = run(capsys, *arguments, *out, status=2)
-    assert len(errors) == 1 and message in errors[0] and errors[0].startswith("warp-abtree: ")
-    assert not shown and sorted(files.iterdir()) == before
-
-
 @pytest.mark.parametrize("name", ["pyvista", "matplotlib"])
 def test_without_pictures(files, capsys, monkeypatch, name):
     monkeypatch.setitem(sys.modules, name, None)

@@ -155,33 +155,6 @@ def test_view_serves_until_it_is_interrupted(files):
     assert not [line for line in errors.splitlines() if "compiling kernels" not in line]
 
 
-BAD = [
-    (("view",), "SCENE_OR_MESHES"),
-    (("view", "gone.toml"), "gone.toml"),
-    (("view", "bad.toml"), "bad.toml: scene.speed: unknown key"),
-    (("view", "gone.obj"), "gone.obj"),
-    (("view", "box.obj", "scene.toml"), "a scene file is looked at alone"),
-    (("view", "box.obj", "--port", "70000"), "--port: 70000 is outside"),
-    (("view", "box.obj", "--host", "no.such.host.invalid"), "no.such.host.invalid:0: cannot be served at"),
-    (("view", "box.obj", "--frames", "3"), "--frames: of --record"),
-    (("view", "box.obj", "--record", "page.txt"), "must end in .html"),
-    (("view", "box.obj", "--record", "gone/page.html"), "no folder gone"),
-    (("view", "box.obj", "--device", "cuda:77"), "cuda:77"),
-    (("view", "box.obj", "--budget", "soon"), "no time above 0"),
-]
-
-
-@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
-def test_bad_input_gives_one_line(files, capsys, arguments, message):
-    pytest.importorskip("viser")
-    before = sorted(files.iterdir())
-    assert cli.main(list(arguments)) == 2
-    captured = capsys.readouterr()
-    errors = captured.err.splitlines()
-    assert len(errors) == 1 and message in errors[0] and errors[0].startswith("warp-abtree: ")
-    assert not captured.out and sorted(files.iterdir()) == before
-
-
 def test_a_port_that_is_taken(files, capsys):
     pytest.importorskip("viser")
     with socket.socket() as other:

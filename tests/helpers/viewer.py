@@ -1,4 +1,4 @@
-"""Models, scene files and playbacks that tests of the viewer show."""
+"""Models, scene files and playbacks that tests of applications use, and a runner of commands."""
 
 from pathlib import Path
 
@@ -8,6 +8,7 @@ from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
 from helpers.samples import SHUTTLE_SCENE
+from warp_abtree.app.cli.main import main
 from warp_abtree.app.playback import MeshPlayback
 
 SCENE = (
@@ -66,3 +67,10 @@ def make_playback(models, device):
     poses = [(0, 0, 0, 0, 0, 0, 1), (0.6, 0.1, 0, half, 0, 0, half), (2.1, 0.2, 0.1, 0, 0, 0, 1)]
     chosen = [models[0], models[1], models[0]]
     return MeshPlayback(chosen, poses, [model.lod_max for model in chosen], device)
+
+
+def run_command(capsys, *arguments, status=0):
+    """Run the command line; return its stdout, and stderr's lines."""
+    assert main([str(argument) for argument in arguments]) == status
+    captured = capsys.readouterr()
+    return captured.out, captured.err.splitlines()
