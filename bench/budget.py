@@ -232,17 +232,17 @@ def settled_costs(frame):
 
 def judge(frame, budget):
     """Return the columns of one run."""
-    found, costs = ab.judge_budget(frame.history, budget), settled_costs(frame)
+    found, costs = ab.budget_report(frame.history, budget), settled_costs(frame)
     rows = [row for row in frame.history if row.time >= 1.0]
     return {
         "judged": found["frames"],
         "within": round(found["within"], 4),
-        "within_tenth": round(found["within_tenth"], 4),
+        "within_tenth": round(found["within_110_percent"], 4),
         "worst": round(found["worst"], 2),
         "longest_over": found["longest_over"],
         "cost_ms": round(float(np.median(costs)), 3),
         "cost_p95_ms": round(float(np.percentile(costs, 95)), 3),
-        "turns": round(found["turns"], 3),
+        "turns": round(found["oscillations"], 3),
         "error_mean": round(found["error_mean"], 5),
         "error_max": round(max(row.error_max for row in rows), 5),
         "faces": round(float(np.mean([row.faces for row in rows]))),
@@ -276,7 +276,7 @@ class Joined:
 
 def judge_step(frame, step, budget):
     """Return the columns of one load step."""
-    found, costs = ab.judge_step(frame.history, step, budget), np.array([row.cost_ms for row in frame.history])
+    found, costs = ab.step_response(frame.history, step, budget), np.array([row.cost_ms for row in frame.history])
     return {
         "before": round(float(np.median(costs[step // 2 : step])) / budget, 2),
         "peak": round(found["peak"], 2),

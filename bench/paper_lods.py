@@ -73,12 +73,12 @@ def trace_budget(context):
             if row.frame % 2 == 0:
                 cost = {"cost": row.cost_ms / budget, "faces": row.faces}
                 yield {"case": "trace", "controller": controller, "time": row.time} | cost
-        judged = ab.judge_budget(frame.history, budget, after=SETTLED)
+        judged = ab.budget_report(frame.history, budget, after=SETTLED)
         about = {"case": "budget", "controller": controller, "objects": loaded.scene.object_count}
         yield (
             about
-            | {name: judged[name] for name in ("frames", "within", "within_tenth", "worst", "turns")}
-            | {"error_mean": judged["error_mean"]}
+            | {name: judged[name] for name in ("frames", "within", "worst", "error_mean")}
+            | {"within_tenth": judged["within_110_percent"], "turns": judged["oscillations"]}
         )
 
 

@@ -9,8 +9,8 @@ from helpers.samples import SHAPES, sample
 
 import warp_abtree as ab
 from warp_abtree.app.cli.main import main
-from warp_abtree.lod.selection import Camera
 from warp_abtree.lod.timing import ReplayClock, WorkClock
+from warp_abtree.lod.view import Camera
 from warp_abtree.model.mesh import load_mesh
 
 SCENE = """

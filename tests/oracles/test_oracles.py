@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.samples import STILL, random_poses
+
 from oracles import abtree, triangle
 from oracles.peers import fcl_faces, judge
 
