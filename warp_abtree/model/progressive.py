@@ -320,18 +320,16 @@ def _bound_errors(vertex_pos, parent, faces, report, covers):
         return np.zeros(1)
     pair = child[np.argsort(parent[child], kind="stable")].reshape(-1, 2)
     face_array = _cpu(faces, int)
-    rings = _linked_rings(faces, face_array, len(parent))
     replay = _replay((vertex_pos - centre) / scale, face_count)
-    scratch = make_scratch(face_count, triangle_cover.SLOTS, polygon.STACK)
-    counter = _filled(6, 0)
-    _launch(hausdorff_bound.start_replay_kernel, face_count, face_array, rings.corner_node, replay, counter)
+    replay.rings = _linked_rings(faces, face_array, len(parent))
+    _launch(hausdorff_bound.start_replay_kernel, face_count, face_array, replay)
     bound_sq = wp.zeros(merge_count, dtype=wp.float64, device="cpu")
     inputs = [len(parent) - merge_count, merge_count, covers, _cpu(pair, int)]
-    state = counter.numpy()  # shares the memory
+    state = replay.counter.numpy()  # shares the memory
     while state[0] < merge_count:
-        _launch(hausdorff_bound.replay_merges_kernel, *inputs, replay, scratch, rings, counter, bound_sq)
+        _launch(hausdorff_bound.replay_merges_kernel, *inputs, replay, bound_sq)
         if state[5] < 0:
-            bvh = _index(replay, rings)
+            bvh = _index(replay)
             replay.bvh, state[5] = bvh.id, state[1]
         report("LOD bounds", int(state[0]), merge_count)
     error = scale * (np.sqrt(bound_sq.numpy()) + ROUNDING)
@@ -340,6 +338,8 @@ def _bound_errors(vertex_pos, parent, faces, report, covers):
 
 def _replay(pos, face_count):
     replay = triangle_cover.Replay()
+    replay.counter = _filled(6, 0)
+    replay.scratch = make_scratch(face_count, triangle_cover.SLOTS, polygon.STACK)
     replay.pos = _cpu(pos, wp.vec3d)
     replay.triangle_pos, replay.face_pos = _points(face_count, 3), _points(face_count, 3)
     replay.face_box = _points(face_count, 2)
@@ -353,9 +353,9 @@ def _replay(pos, face_count):
     return replay
 
 
-def _index(replay, rings):
+def _index(replay):
     """Return a wp.Bvh over the active faces, for triangles whose connected component vanishes."""
-    active = np.flatnonzero(rings.corner_node.numpy()[::3] >= 0).astype(np.int32)
+    active = np.flatnonzero(replay.rings.corner_node.numpy()[::3] >= 0).astype(np.int32)
     corners = replay.face_pos.numpy()[active]
     lower, upper = corners.min(axis=1).astype(np.float32), corners.max(axis=1).astype(np.float32)
     replay.bvh_face = _cpu(active, int)
