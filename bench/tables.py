@@ -157,10 +157,10 @@ def draw(figures, rows, folder) -> str:
             columns = min(3, len(panels))
             lines = -(-len(panels) // columns)
             canvas = Figure(figsize=(PANEL[0] * columns, PANEL[1] * lines), layout="constrained")
-            axes = canvas.subplots(lines, columns, squeeze=False).flat
+            axes = list(canvas.subplots(lines, columns, squeeze=False).flat)
             for place, (panel, points) in zip(axes, panels):
                 draw_panel(place, panel, points)
-            for place in list(axes)[len(panels) :]:
+            for place in axes[len(panels) :]:
                 place.remove()
             canvas.savefig(Path(folder) / figure["file"], metadata={"Date": None})
             drawn.append(figure["file"])
@@ -172,8 +172,12 @@ def split_panel(panel, rows):
     rows = pick(rows, **panel.get("where", {}))
     if "split" not in panel:
         return [(panel, rows)]
-    values = dict.fromkeys(row[panel["split"]] for row in rows)
-    return [(panel | {"title": str(value)}, pick(rows, **{panel["split"]: value})) for value in values]
+    values = list(dict.fromkeys(row[panel["split"]] for row in rows))
+    shared = {"order": list(dict.fromkeys(row.get(panel.get("by")) for row in rows))}
+    return [
+        (panel | shared | {"title": str(value), "legend": i == 0}, pick(rows, **{panel["split"]: value}))
+        for i, value in enumerate(values)
+    ]
 
 
 def find_lines(rows, panel) -> dict:
@@ -189,7 +193,10 @@ def find_lines(rows, panel) -> dict:
 
 
 def draw_panel(axes, panel, lines):
-    columns, parts = list(panel["y"]), list(dict.fromkeys(part for _, part in lines))
+    columns, parts = list(panel["y"]), panel.get("order") or list(dict.fromkeys(part for _, part in lines))
+    for set_scale, name in ((axes.set_xscale, "xscale"), (axes.set_yscale, "yscale")):
+        scale = panel.get(name, "log")
+        set_scale(scale, **({"linthresh": panel["least"], "linscale": 0.4} if scale == "symlog" else {}))
     for (column, part), points in lines.items():
         x, y = zip(*points, strict=True) if panel.get("unsorted") else zip(*sorted(points), strict=True)
         label = panel["y"][column]
@@ -205,11 +212,11 @@ def draw_panel(axes, panel, lines):
         style["marker"] = MARKERS[max(turn, colour) % len(MARKERS)] if panel.get("markers", True) else ""
         axes.plot(x, y, label=label, **style)
     axes.set(title=panel.get("title", ""), xlabel=panel["xlabel"], ylabel=panel["ylabel"])
-    for set_scale, name in ((axes.set_xscale, "xscale"), (axes.set_yscale, "yscale")):
-        scale = panel.get(name, "log")
-        set_scale(scale, **({"linthresh": panel["least"], "linscale": 0.4} if scale == "symlog" else {}))
+    if "least" in panel:  # no error is negative
+        axes.set_ylim(bottom=-0.3 * panel["least"])
     axes.grid(True, alpha=0.3)
-    axes.legend(fontsize=8, framealpha=0.9)
+    if panel.get("legend", True):
+        axes.legend(fontsize=8, framealpha=0.9)
 
 
 def main(files) -> int:

@@ -1,17 +1,24 @@
-"""What turns pages that read well in a repository into a site: files and folders that they link to become pages."""
+"""What turns pages that read well in a repository into a site: files that they link to outside docs/ become pages."""
 
+import posixpath
 import re
 from pathlib import Path
 
 from mkdocs.structure.files import File, InclusionLevel
 
 ROOT = Path(__file__).resolve().parents[1]
-# [text](../scenes/planning.py), with or without a part of the page.
-LINK = re.compile(r"\]\(\.\./([\w./-]+)(#[\w-]+)?\)")
+# [text](../scenes/planning.py), with or without a section of the page.
+LINK = re.compile(r"\]\((\.\./[\w./-]+)(#[\w-]+)?\)")
 LANGUAGES = {".py": "python", ".toml": "toml"}
 
 
-def page_of(path) -> str:
+def target_of(page: str, link: str) -> str | None:
+    """Return the path, from the repository's root, that a page of docs/ links to; None if that lies in docs/."""
+    path = posixpath.normpath(posixpath.join("docs", posixpath.dirname(page), link))
+    return None if path.startswith("docs/") else path
+
+
+def page_of(path: str) -> str:
     """Return the page that shows a file of the repository."""
     return f"source/{path}.md"
 
@@ -19,11 +26,11 @@ def page_of(path) -> str:
 def on_files(files, config):
     """Add a page for each file that the pages link to."""
     linked = {
-        match[1]
+        target_of(page.src_uri, match[1])
         for page in files.documentation_pages()
         for match in LINK.finditer(Path(page.abs_src_path).read_text(encoding="utf-8"))
     }
-    for path in sorted(linked):
+    for path in sorted(linked - {None}):
         text = (ROOT / path).read_text(encoding="utf-8")
         if not path.endswith(".md"):
             title = path.rsplit("/", 1)[-1]
@@ -44,4 +51,12 @@ def on_page_markdown(markdown, page, config, files):
     if page.file.generated_by:
         return markdown
     markdown = markdown.replace("](data)", "](data/index.md)")
-    return LINK.sub(lambda match: f"]({page_of(match[1])}{match[2] or ''})", markdown)
+
+    def to_page(match):
+        path = target_of(page.file.src_uri, match[1])
+        if path is None:
+            return match[0]
+        link = posixpath.relpath(page_of(path), posixpath.dirname(page.file.src_uri) or ".")
+        return f"]({link}{match[2] or ''})"
+
+    return LINK.sub(to_page, markdown)

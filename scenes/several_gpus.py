@@ -70,7 +70,10 @@ def main(words=None):
     dealt = np.array_split(poses, len(devices))  # worlds that follow each other
     options = {"output": "count", "ladder": [[model.lod_max]]}  # objects share one tree
     made = zip(devices, dealt)
-    frames = [ab.FrameGraph(make_scene(model, part, d), pair_capacity=PAIRS * len(part), **options) for d, part in made]
+    frames = [
+        ab.FrameGraph(make_scene(model, part, d), capacity=ab.Buffers(pairs=PAIRS * len(part)), **options)
+        for d, part in made
+    ]
     graphs = [capture(frame) for frame in frames]  # kernels load here, on one thread
     with ThreadPoolExecutor(len(devices)) as threads:
         list(threads.map(run, graphs, devices, [arguments.frames] * len(devices)))

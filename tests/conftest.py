@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from warp_abtree.state import update as refine
+from warp_abtree import testing
 
 # JAX would take three quarters of a GPU's memory for itself.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -46,6 +46,7 @@ def real_mesh_path_fixture():
 
 
 @pytest.fixture
-def half_refitted_in_part(monkeypatch):
+def half_refitted_in_part():
     """Refit states in part up to half of their faces on every device, also where the whole costs less."""
-    monkeypatch.setattr(refine, "FULL_SHARE", dict.fromkeys(refine.FULL_SHARE, 0.5))
+    with testing.regime(full_refit={"cpu": 0.5, "cuda": 0.5}):
+        yield

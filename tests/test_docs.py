@@ -1,4 +1,4 @@
-"""Every Python block of README.md and docs/ runs, every scene in them loads, links lead somewhere; examples run."""
+"""README.md and docs/: Python blocks run, scenes load, commands parse and links resolve. Examples run."""
 
 import contextlib
 import importlib.util
@@ -12,28 +12,16 @@ import numpy as np
 import pytest
 import warp as wp
 
-import warp_abtree as ab
+from warp_abtree.app import load_scene
+from warp_abtree.app.cli import main as cli
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"(?:<!-- needs: ([\w, ]+) -->\n)?^```(\w+)\n(.*?)^```", re.S | re.M)
 # What a page does at full size, at one that tests can bear.
 SMALLER = {
-    "docs/lod.md": (
-        ('("rain", "focus")', '("focus",)'),
-        ("(3, 4)", "(3,)"),
-        ("objects=150", "objects=4"),
-        (".run(240)", ".run(62)"),
-        ("objects=60", "objects=4"),
-        (".run(120)", ".run(3)"),
-    ),
-    "docs/howto_budget.md": (
-        ("objects=60", "objects=12"),
-        ("frame.run(120)", "frame.run(66)"),
-        ("range(30)", "range(3)"),
-    ),
+    "docs/howto_lod.md": (("objects=60", "objects=12"), ("range(120)", "range(66)")),
     "docs/howto_planning.md": (("100_000", "3_000"), ("[:2000]", "[:300]")),
-    "README.md": (("frame.run(150)", "frame.run(62)"), ("range(480)", "range(20)")),
 }
 
 
@@ -104,7 +92,7 @@ def test_python_blocks_run(run_block, page, index):
 @pytest.mark.slow
 def test_scenes_in_pages_load(page):
     for _, text in blocks_of(page, "toml"):
-        loaded = ab.load_scene(page, device="cpu", text=text)
+        loaded = load_scene(page, device="cpu", text=text)
         rows = loaded.frame(output="count").run(2)
         assert rows[-1].objects == loaded.scene.object_count > 1
 
@@ -122,7 +110,33 @@ def test_blocks_are_found_and_told_apart():
     assert found == [("torch, cuda", "python", "a\n"), ("", "sh", "b\n"), ("", "python", "c\n")]
     assert missing(["no_such_module", "numpy"]) == ["no_such_module"]
     pages = [name_of(page) for page, _ in PYTHON]
-    assert len(PYTHON) > 15 and pages.count("README.md") >= 5
+    assert len(PYTHON) > 15 and pages.count("README.md") == 1
+
+
+# Commands.
+
+
+def commands_of(page):
+    """Yield the words of every `warp-abtree` command in the shell blocks of a page, without its name."""
+    for _, text in blocks_of(page, "sh"):
+        for line in text.splitlines():
+            if "warp-abtree " in line and "--print-completion" not in line:
+                yield line.split("warp-abtree ", 1)[1].split("#")[0].split()
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if any(commands_of(page))], ids=name_of)
+def test_commands_parse(page):
+    for words in commands_of(page):
+        assert cli.make_parser().parse_args(words).command == words[0]
+        for word in words:
+            assert not word.startswith("scenes/") or (ROOT / word).is_file()
+
+
+def test_readme_has_one_line_for_the_run_and_one_for_the_tests():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    for marker, end in (("main-command", "--picture bunny_tori.png"), ("test-command", '-m "not slow"')):
+        (block,) = re.findall(rf"<!-- {marker} -->\n```sh\n(.*)\n```", text)
+        assert block.startswith("python3 -m venv .venv && .venv/bin/pip install -q -e ") and block.endswith(end)
 
 
 # Examples.

@@ -15,18 +15,21 @@ from warp_abtree.lod.selection import Camera, Ladder
 from warp_abtree.lod.timing import ReplayClock, WorkClock
 from warp_abtree.model.mesh import MeshError, describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model, ModelError
-from warp_abtree.query.broad_phase import CapacityError
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.manifold import ManifoldQuery
-from warp_abtree.query.narrow_phase import Query, Result
+from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.request import Buffers, CapacityError
+from warp_abtree.query.result import Result
 from warp_abtree.scene.pipeline import FrameGraph
 from warp_abtree.scene.scene import Scene, TreeState
 from warp_abtree.scene.sweep import sweep
 from warp_abtree.simulate.frame import Frame, FrameRow, LodSweep, judge_budget, judge_step, resolve_lod
 from warp_abtree.simulate.rigid_bodies import Dynamics, Kinematic
-from warp_abtree.state.update import UpdateStats
+from warp_abtree.state.batch import Batch
 
 __all__ = [
+    "Batch",
+    "Buffers",
     "Camera",
     "CapacityError",
     "CollisionManager",
@@ -57,7 +60,6 @@ __all__ = [
     "ThisProcess",
     "ToleranceController",
     "TreeState",
-    "UpdateStats",
     "WorkClock",
     "WorldsJob",
     "describe_mesh",

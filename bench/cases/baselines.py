@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 from ..baselines.coal import Coal
 from ..baselines.fcl import Fcl
@@ -76,9 +77,9 @@ def run_to_host(query, cores=None):
     """Return a callable that launches a query on some cores and returns its result."""
 
     def run():
-        query.cores = cores
-        query.launch()
-        return query.result()
+        with testing.regime(cpu_threads=cores):
+            query.launch()
+            return query.result()
 
     return run
 
@@ -167,7 +168,6 @@ class Workload:
             launches = {"all": run_to_host(query), "one": run_to_host(query, 1)}
             with no_garbage_collection():
                 times = time_in_turn(launches, wp.get_device("cpu"), self.repeats)
-            query.cores = None
             row |= summarise(f"all_{output}", times["all"]) | summarise(f"one_{output}", times["one"])
             row[f"{output}_ratio"] = ratio_of(times["one"], times["all"])
         return row

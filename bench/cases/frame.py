@@ -56,7 +56,9 @@ class DeviceFrames:
     def __init__(self, scene, levels, ladder):
         count = scene.object_count
         device = self.device = scene.device
-        self.frame = ab.FrameGraph(scene, "count", pair_capacity=16 * count, ladder=[levels] if ladder else None)
+        self.frame = ab.FrameGraph(
+            scene, "count", capacity=ab.Buffers(pairs=16 * count), ladder=[levels] if ladder else None
+        )
         self.time = wp.zeros(1, dtype=wp.int32, device=device)
         self.inputs = [
             wp.array(levels, dtype=wp.int32, device=device),
@@ -146,7 +148,7 @@ def run_objects(device, model, levels, count, ladder, repeats):
     frames.time.zero_()
     times = time_rounds(runs, repeats)
     frames.frame.check()
-    states = frames.frame.query.arrays[1]
+    states = frames.frame.query.batch.states
     row = {"device": device.name, "faces": model.face_count, "objects": count, "ladder": ladder} | host.found
     row |= {"states": len(states.slots), "state_mib": round(count_bytes(states.pool) / 2**20, 1)}
     row |= summarise_all(times)

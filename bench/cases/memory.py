@@ -19,7 +19,7 @@ def count_bytes(holder):
 
 def held_mib(scene, query=None) -> float:
     """Return what the arrays of a scene, and of a query over it, hold [MiB]; the tree of the broad phase left out."""
-    total = sum(count_bytes(arrays.pool) for arrays in scene.arrays())
+    total = sum(map(count_bytes, scene.batch().pools))
     if query is not None:
         total += count_bytes(query) + count_bytes(query.hits)
         if query.broad_phase is not None:
@@ -67,12 +67,12 @@ def run(device, quick=False, models=None):
     """Yield one row a scene: objects, states, and bytes: of the models and the states a face, an object, a pair."""
     device = wp.get_device(device)
     for name, scene, faces in scenes(device, QUICK if quick else FULL, models):
-        pools, states, objects = scene.arrays()
+        states = scene.batch().states
         pairs = np.stack([np.arange(scene.object_count - 1), np.arange(1, scene.object_count)], 1)
         query = ab.Query(scene, "any", pairs=pairs)
         pair_bytes = (query.pairs.capacity + query.pair_poses.capacity + count_bytes(query.hits)) / len(pairs)
         state_faces = sum(scene.models[slot.model].face_count for slot in states.slots)
-        sizes = [count_bytes(arrays.pool) for arrays in (pools, states, objects)]
+        sizes = [count_bytes(pool) for pool in scene.batch().pools]
         yield {
             "device": device.name,
             "scene": name,

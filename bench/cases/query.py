@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 from ..baselines.newton import make_newton
 from ..baselines.wp_bvh import BvhFaces, find_constructor
@@ -105,10 +106,9 @@ def check_peer(found, ours, model, poses):
 
 def time_one_core(query, peer, device, repeats):
     """Return columns of launches of both on one core: the time [ms] that the thread ran, and the peer's over ours."""
-    query.cores = 1
     launches = {"one_core": query.launch, "peer_one_core": peer.launch}
-    times = time_in_turn(launches, device, repeats, time.thread_time)
-    query.cores = None
+    with testing.regime(cpu_threads=1):
+        times = time_in_turn(launches, device, repeats, time.thread_time)
     ratio = ratio_of(times["peer_one_core"], times["one_core"])
     return summarise("one_core", times["one_core"]) | {"one_core_ratio": ratio}
 

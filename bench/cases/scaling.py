@@ -7,7 +7,6 @@ number of devices; weak: as much on each device. Devices are 1, 2, 4 and so on, 
 all numbers of devices in turn. A CPU has one core.
 """
 
-import contextlib
 import os
 import tempfile
 import time
@@ -19,6 +18,7 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 from ..inside import SweepJob, ThisProcess, run_shards
 from ..shapes import knot, longest_side, random_poses, world_poses
@@ -63,21 +63,11 @@ def run(device, devices=None, quick=False):
     yield from scale_shards(devices, model, sizes)
 
 
-@contextlib.contextmanager
-def one_core_a_launch():
-    """Give each launch on the CPU one core."""
-    kept, ab.Query.cores = ab.Query.cores, 1
-    try:
-        yield
-    finally:
-        ab.Query.cores = kept
-
-
 def time_worker(device, model, count, repeats):
     """Return the row of a shard asked on one device, on the CPU by one core: poses on the host, answers there."""
     job = SweepJob(model, model, random_poses(count, longest_side(model)))
     asker, item = job.asker(), job.item(0, count)
-    with one_core_a_launch():
+    with testing.regime(cpu_threads=1):
         times = time_rounds({"shard": time_call(lambda: asker.ask(item, device), device)}, repeats)["shard"]
     row = {"case": "worker", "device": device.name, "faces": model.face_count, "poses": count}
     return row | summarise("shard", times) | {"worker_mposes_s": float(f"{count / np.median(times) / 1e3:.4g}")}
@@ -141,7 +131,7 @@ def scale_shards(devices, model, sizes):
     shard, repeats = min(SHARD, sizes["shards"] // 32), min(5, sizes["repeats"])
     poses = random_poses(sizes["shards"] * len(devices), longest_side(model))
     expected = ab.sweep(model, model, poses, device=devices[0])
-    with one_core_a_launch():
+    with testing.regime(cpu_threads=1):
         runs = {}
         for parts, times in list_sizes(devices):
             count = sizes["shards"] * times
@@ -208,7 +198,7 @@ def scale_frames(devices, model, sizes):
     count = sizes["worlds"]
     shape = count * len(devices), OBJECTS, longest_side(model)
     poses = [world_poses(*shape, seed).reshape(-1, 7) for seed in (0, 1)]
-    with one_core_a_launch(), ThreadPoolExecutor(len(devices)) as threads:
+    with testing.regime(cpu_threads=1), ThreadPoolExecutor(len(devices)) as threads:
         made = {}
         for parts, times in list_sizes(devices):
             bounds = [OBJECTS * (count * times * k // parts) for k in range(parts + 1)]

@@ -11,18 +11,10 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 from ..baselines.wp_bvh import FaceBvh
-from ..inside import (
-    REFITS,
-    RecordedUpdate,
-    active_build,
-    forced_refit,
-    full_fraction,
-    read_bits,
-    state_lods,
-    upload_lods,
-)
+from ..inside import active_build, full_refit_fraction, read_bits, state_lods, upload_lods
 from ..roofline import find_peaks, update_roofline
 from ..shapes import knot_model
 from ..timing import WARM_UP, fit_slope, make_runs, medians, summarise, time_both, time_call, time_in_turn, time_rounds
@@ -40,6 +32,7 @@ FULL = {
 QUICK = {"faces": (200, 600), "fractions": (0.01, 0.1, 0.9), "states": (1, 12), "state_faces": 200, "repeats": 2}
 LARGEST_CPU = 64000
 STATES_PER_MODEL = 8
+REFITS = {"update": False, "full": True}  # whether states are refitted whole
 SETTLE = 2  # times there and back, the last of which counts
 
 
@@ -76,34 +69,38 @@ def check_update(scene, there, back, faces):
     """Move to other LODs and back by both kinds of refit and compare all bits.
 
     Returns:
-        k and nodes refitted of each state by the partial update, faces in its slices, and by kind of refit the
-        `RecordedUpdate`s there and back.
+        k and nodes refitted of each state by the partial update, faces in its slices, and by kind of refit the launches
+        that repeat the updates there and back.
 
     Raises:
         RuntimeError: Bits or k differ, the bound of equation (1) is passed, or states have changed places.
     """
     begin, start = state_lods(scene), read_bits(scene)
-    moves, bits, counts = {}, {}, {}
+    launches, bits, counts = {}, {}, {}
     for kind in REFITS:
-        forth = RecordedUpdate(scene, there, kind)
-        bits[kind] = read_bits(scene)
-        home = RecordedUpdate(scene, back, kind)
+        with testing.force_refits(REFITS[kind]):
+            forth = scene.set_lods(there)
+            counts[kind] = forth.k[np.argsort(forth.state)]
+            if not REFITS[kind]:
+                k, nodes, entries = forth.k.copy(), forth.nodes_refitted.copy(), int(forth.slice_length.sum())
+            forth = testing.repeat_update(forth)
+            bits[kind] = read_bits(scene)
+            home = testing.repeat_update(scene.set_lods(back))
         if state_lods(scene) != begin:
             raise RuntimeError("states do not return to where they were")
         if not same_bits(start, read_bits(scene)):
             raise RuntimeError(f"{kind}: the way back leaves other bits than were there before")
-        moves[kind], counts[kind] = (forth, home), forth.stats.k[np.argsort(forth.stats.state)]
-    k, nodes = moves["update"][0].stats.k.copy(), moves["update"][0].stats.nodes_refitted.copy()
+        launches[kind] = forth, home
     if not np.array_equal(counts["update"], counts["full"]):
         raise RuntimeError(f"a partial update changes {k.sum()} faces, a full refit {counts['full'].sum()}")
     if not same_bits(bits["update"], bits["full"]):
         raise RuntimeError("a partial update and a full refit leave different bits")
     if any(nodes[i] > bound_nodes(int(k[i]), faces) for i in range(len(k))):
         raise RuntimeError("more nodes refitted than equation (1) allows")
-    return k, nodes, moves["update"][0].entries, moves
+    return k, nodes, entries, launches
 
 
-def time_update(scene, there, back, moves, repeats):
+def time_update(scene, there, back, launches, repeats):
     """Return columns of times [ms].
 
     update, full: device time of refinement, marking and refit, there and back: graph replays on CUDA. wall: whole calls
@@ -112,8 +109,8 @@ def time_update(scene, there, back, moves, repeats):
     counts: what one kind of refit leaves in the caches is of no use to the other.
     """
     device = scene.device
-    launches = {(kind, way): move.launch for kind, ways in moves.items() for way, move in enumerate(ways)}
-    runs = make_runs(launches, device)
+    ways = {(kind, way): launch for kind, both in launches.items() for way, launch in enumerate(both)}
+    runs = make_runs(ways, device)
     calls = {"": None, "update_": "update", "full_": "full"}
     times = {name: [] for name in [*REFITS, *(call + clock for call in calls for clock in ("wall", "stream"))]}
     for turn in range(WARM_UP + repeats):
@@ -123,7 +120,7 @@ def time_update(scene, there, back, moves, repeats):
     upload_lods(scene)
     for turn in range(WARM_UP + repeats):
         for call, kind in calls.items():
-            with forced_refit(kind):
+            with testing.force_refits(None if kind is None else REFITS[kind]):
                 taken = [
                     time_both(lambda lods=lods: scene.set_lods(lods), device)
                     for _ in range(SETTLE)
@@ -157,14 +154,14 @@ def run_mesh(device, model, sizes, peaks):
     finest, repeats, rows = model.lod_max, sizes["repeats"], []
     memory = memory_columns(scene)
     for step in sorted({max(1, round(fraction * finest)) for fraction in sizes["fractions"]}):
-        k, nodes, entries, moves = check_update(scene, [finest - step], [finest], model.face_count)
+        k, nodes, entries, launches = check_update(scene, [finest - step], [finest], model.face_count)
         vertices, faces, _ = model.mesh_at(finest - step)
         baseline = FaceBvh(vertices, faces, device)
         row = {"device": device.name, "case": "one state", "faces": model.face_count, "splits": step}
         row |= {"k": int(k[0]), "share": float(f"{k[0] / model.face_count:.4g}"), "entries": entries}
         row |= {"nodes_refitted": int(nodes[0]), "bound": int(bound_nodes(int(k[0]), model.face_count))}
-        row["full"] = entries > full_fraction(device) * model.face_count  # what the library chooses
-        row |= time_update(scene, [finest - step], [finest], moves, repeats)
+        row["full"] = entries > full_refit_fraction(device) * model.face_count  # what the library chooses
+        row |= time_update(scene, [finest - step], [finest], launches, repeats)
         # Not in turn with the others, whose tree it would drive out of the caches.
         row |= summarise("bvh_build", time_in_turn({"build": baseline.rebuild}, device, repeats)["build"])
         row |= memory | update_roofline(row["k"], row["nodes_refitted"], entries, row["update_ms"], peaks)
@@ -180,7 +177,7 @@ def run_mesh(device, model, sizes, peaks):
         "crossover_k": crossover,
         "crossover_share": crossover and round(crossover / model.face_count, 4),
         "crossover_entries": find_crossover(rows, "entries"),
-        "full_share": full_fraction(device),
+        "full_share": full_refit_fraction(device),
         "slope": fit_slope([row["k"] for row in rows], [row["update_ms"] for row in rows]),
         "host_build_ms": round(medians(host)["build"], 2),
     }
@@ -197,13 +194,13 @@ def run_states(device, model, count, repeats, peaks):
         back.append(model.lod_max - step * (i % STATES_PER_MODEL))
         scene.add(clone, lod=back[-1])
     there = [lod - max(1, step // 4) for lod in back]
-    k, nodes, entries, moves = check_update(scene, there, back, model.face_count)
+    k, nodes, entries, launches = check_update(scene, there, back, model.face_count)
     if len(k) != count:
         raise RuntimeError(f"{len(k)} states moved in place of {count}")
     row = {"device": device.name, "case": "many states", "faces": model.face_count, "states": count}
     row |= {"k": int(k.sum()), "entries": entries, "nodes_refitted": int(nodes.sum())}
     row["bound"] = int(sum(bound_nodes(int(x), model.face_count) for x in k))
-    row |= time_update(scene, there, back, moves, repeats)
+    row |= time_update(scene, there, back, launches, repeats)
     row["us_a_state"] = round(1e3 * row["update_ms"] / count, 3)
     row |= memory_columns(scene)
     return row | update_roofline(row["k"], row["nodes_refitted"], entries, row["update_ms"], peaks)

@@ -34,7 +34,7 @@ def watch(loaded) -> list:
         ask = getattr(place, name)
 
         def ask_watched(*arguments, **named):
-            pool = loaded.scene.arrays()[2].pool
+            pool = loaded.scene.batch().objects.pool
             used.append((pool.position.numpy().copy(), pool.rotation.numpy().copy()))
             return ask(*arguments, **named)
 

@@ -257,7 +257,7 @@ def test_near_objects_refine(tmp_path, device):
     assert frame.summary()["budget"]["within_tenth"] >= 0.95
     assert loaded.camera(8.0).eye[2] < loaded.motion.position[:, 2].min(), "the camera comes out behind the field"
     again = loaded.frame(budget_ms=finest / 3, clock=ab.WorkClock(RATES))
-    assert np.array_equal(loaded.scene.arrays()[2].pool.position.numpy(), loaded.motion.poses(0.0)[:, :3])
+    assert np.array_equal(loaded.scene.batch().objects.pool.position.numpy(), loaded.motion.poses(0.0)[:, :3])
     assert [row.error_mean for row in again.run(12)] == [row.error_mean for row in frame.history[:12]]
 
 

@@ -13,6 +13,7 @@ import warp_abtree as ab
 from bench import __main__ as main
 from bench import build, fcl_peer, newton_peer, peer, peers, plots, query, roofline, scale, sweep, timing, update
 from bench.shapes import knot, knot_model, pair_poses
+from warp_abtree.state import lod_update, work_lists
 
 pytestmark = pytest.mark.slow
 
@@ -76,7 +77,7 @@ def test_update(device):
     many = cases_of(rows, "case", "many states")
     assert [row["states"] for row in many] == [1, 12]
     assert many[1]["k"] > many[0]["k"] and many[1]["nodes_refitted"] > 10 * many[0]["nodes_refitted"]
-    assert update.refine.FULL_SHARE == {"cpu": 0.5, "cuda": 0.01}, "what was forced is put back"
+    assert update.testing.current_regime().full_refit == {"cpu": 0.5, "cuda": 0.01}, "what was forced is put back"
 
 
 def test_update_leaves_large_meshes_out(device):
@@ -221,18 +222,18 @@ def test_an_update_that_forgets_nodes_is_noticed(device, monkeypatch):
     there, back = [model.lod_max - 5], [model.lod_max]
     k, *_, launches = update.check_update(scene, there, back, model.face_count)
     assert k[0] > 0 and set(launches) == {"update", "full"}
-    whole = update.refine.active_update
+    whole = lod_update.active_update
 
     def forget(models, states, work):
         if work.full.all():
             return whole(models, states, work)
-        update.tree.active_mark(models, states, work)
+        work_lists.active_mark(models, states, work)
         counts = work.plan.level_count.numpy().copy()
         counts[: len(work.level_room) - 2] = 0  # a partial update refits but its leaves
         work.plan.level_count.assign(counts)
-        update.tree.active_walk(models, states, work)
+        work_lists.active_walk(models, states, work)
 
-    monkeypatch.setattr(update.refine, "active_update", forget)
+    monkeypatch.setattr(lod_update, "active_update", forget)
     with pytest.raises(RuntimeError, match="bits"):
         update.check_update(scene, there, back, model.face_count)
 

@@ -29,7 +29,7 @@ def check_rows(rows, name):
     sizes = [row[name] for row in rows]
     assert sizes[:3] == sizes[:1] * 3 and sizes[3] == 2 * sizes[0]
     assert rows[0]["efficiency"] == rows[2]["efficiency"] == 1
-    assert scaling.ab.Query.cores is None
+    assert scaling.testing.current_regime().cpu_threads is None
 
 
 def test_frames_on_devices_are_timed(device, monkeypatch):

@@ -225,9 +225,8 @@ def test_batches_buffers_and_precisions_do_not_matter(device):
     for trial in range(6):
         order = rng.permutation(len(pairs))
         capacities = rng.integers(1, 2 * whole.float64_tests.sum(), 2)
-        for precision in ("float32", "float64"):
-            scene.intersect(pairs[order], output="faces", precision=precision)
-        query = ab.Query(scene, pairs=pairs[order], capacity=capacities[0], unsure_capacity=capacities[1])
+        scene.intersect(pairs[order], output="faces", precision="float32")
+        query = ab.Query(scene, pairs=pairs[order], capacity=ab.Buffers(capacities[0], uncertain=capacities[1]))
         if trial % 2:
             query.run()
         result = query.run()

@@ -82,7 +82,7 @@ def ask_touching(device, cases, make_query):
         scene.add(ab.Model.from_arrays(a, FACE))
         scene.add(ab.Model.from_arrays(b, FACE))
     poses = np.array([pose for case in cases for pose in (case[1], case[3])])
-    objects = scene.arrays()[2].pool
+    objects = scene.batch().objects.pool
     objects.rotation.assign(np.ascontiguousarray(poses[:, :3, :3]))
     objects.position.assign(np.ascontiguousarray(poses[:, :3, 3]))
     return make_query(scene, "any", pairs=np.arange(2 * len(cases)).reshape(-1, 2)).run().any

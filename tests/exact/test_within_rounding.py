@@ -181,7 +181,9 @@ def test_widened_boxes_allow_for_frames_off_orthonormal(device):
     scene = ab.Scene(device)
     scene.add(ab.Model.from_arrays(np.concatenate([1 - spread, spread - 1]), [[0, 1, 2], [3, 4, 5]]))
     scene.add(ab.Model.from_arrays(spread - 2.0**-21, FACE))
-    models, states, objects = (part.pool for part in scene.arrays())
+    models, states, objects = (
+        part.pool for part in (scene.batch().models, scene.batch().states, scene.batch().objects)
+    )
     third, across = np.ones(3) / np.sqrt(3.0), np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0)
     turn = np.stack([third, across, np.cross(third, across)], 1) * (1 + 2.0**-12)
     objects.rotation.assign(np.stack([np.eye(3), turn]))

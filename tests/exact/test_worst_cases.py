@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 from conftest import slow
+from helpers.gpu_query import GpuQuery
 from helpers.samples import true_faces
 from oracles.signs import true_signs
 from oracles.triangle import into_frame_of_a, quaternion_matrix
@@ -19,13 +20,6 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 U = 2.0**-24
 STILL = np.eye(4)
-
-
-class GpuQuery(ab.Query):
-    """A query that takes the CUDA regime on every device."""
-
-    def uses_warps(self):
-        return True
 
 
 QUERIES = pytest.mark.parametrize("make_query", [ab.Query, *slow(GpuQuery)], ids=["threads", "as on CUDA"])

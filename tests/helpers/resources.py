@@ -46,7 +46,7 @@ def make_scene(device):
 
 def check_scene(before, scene):
     """Return all that a scene holds and answers, or check that it still does."""
-    states = scene.arrays()[1].pool
+    states = scene.batch().states.pool
     now = [getattr(states, name).numpy().tobytes() for name in SLOT_COLUMNS]
     now += [*everything(scene), *describe(scene.intersect(PAIRS, output="faces"))]
     now += describe(scene.intersect(MORE_PAIRS, output="count"))

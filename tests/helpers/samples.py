@@ -131,7 +131,7 @@ def true_faces(model_a, lod_a, pose_a, model_b, lod_b, pose_b):
 
 def raw_state(scene, i):
     """Return the bytes behind an object's tree state: float32 boxes as stored, not as `tree_state` widens them."""
-    models, states, objects = scene.arrays()
+    models, states, objects = scene.batch().models, scene.batch().states, scene.batch().objects
     slot = states.slots[objects.state[i]]
     model = scene.models[slot.model]
     nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)

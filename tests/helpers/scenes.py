@@ -7,8 +7,8 @@ from helpers.samples import raw_state
 
 def everything(scene):
     """Return all that a scene holds, as bytes."""
-    _, states, objects = scene.arrays()
-    held = [scene.object_count, scene.lods, objects.state, scene.excluded_keys(), len(states.slots)]
+    states, objects = scene.batch().states, scene.batch().objects
+    held = [scene.object_count, scene.lods, objects.state, scene.batch().excluded, len(states.slots)]
     pool = objects.pool
     held += [array.numpy() for array in (pool.rotation, pool.position, pool.world, pool.is_static, pool.state)]
     held += [value for i in range(scene.object_count) for value in raw_state(scene, i).values()]

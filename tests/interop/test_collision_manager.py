@@ -340,14 +340,14 @@ def test_places_are_used_again_and_given_up(device):
     assert ours._scene.object_count == 4, "more places left than taken, and than 16"
     assert ours.in_collision_internal(True) == (True, expected)
     assert other.in_collision_internal(True)[0] and other._scene.object_count == 30
-    arrays = ours._scene.arrays()
+    arrays = ours._scene.batch()
     for _ in range(3):
         ours.in_collision_single(SHAPES["ball"], random_transform(np.random.default_rng(0), 1))
         ours.set_transform(0, np.eye(4))
-    assert ours._scene.object_count == 5 and ours._scene.arrays() is not arrays
-    arrays = ours._scene.arrays()
+    assert ours._scene.object_count == 5 and ours._scene.batch() is not arrays
+    arrays = ours._scene.batch()
     ours.in_collision_single(SHAPES["ball"])
-    assert ours._scene.arrays() is arrays, "the second time nothing is made anew"
+    assert ours._scene.batch() is arrays, "the second time nothing is made anew"
 
 
 def test_equal_meshes_share_a_model_that_goes_with_them(device):

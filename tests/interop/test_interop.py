@@ -199,7 +199,7 @@ def test_cupy(device):
 
 def posed_triangles(scene, i):
     """Corners of an object's original faces in the world."""
-    model, objects = scene.models[scene.object_model[i]], scene.arrays()[2].pool
+    model, objects = scene.models[scene.object_model[i]], scene.batch().objects.pool
     vertices, faces, _ = model.mesh_at(model.lod_max)
     return (vertices @ objects.rotation.numpy()[i].T + objects.position.numpy()[i])[faces]
 

@@ -18,7 +18,7 @@ ball = trimesh.creation.icosphere(2)
 scene = ab.Scene("cpu")
 scene.add(ab.Model.from_arrays(ball.vertices, ball.faces))
 scene.add(ab.Model.from_arrays(np.array([[-99.0, -99, 0], [99, -99, 0], [0, 99, 0]]), [[0, 1, 2]]))
-states = scene.arrays()[1].pool
+states = scene.batch().states.pool
 nodes = states.node_box.numpy()
 poison = np.full((4096, 4), 2**29 + 12345, np.int32).view(np.float32)
 states.node_box = wp.array(np.concatenate([nodes, poison]), dtype=wp.vec4, device="cpu")

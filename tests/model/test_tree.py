@@ -124,7 +124,7 @@ class Walker:
 
     def step(self, lods, with_oracle=True):
         """Set LODs; check states, sharing, counters and equation 1. Returns the number of partial updates."""
-        models, states, objects = self.scene.arrays()
+        models, states, objects = self.scene.batch().models, self.scene.batch().states, self.scene.batch().objects
         before = {int(s): (states.slots[s].model, states.slots[s].lod) for s in objects.state}
         stats = self.scene.set_lods(lods)
         seen = self.check_states(lods, with_oracle)
@@ -280,7 +280,7 @@ def test_objects_share_states(device):
     scene = ab.Scene(device)
     for m in (model, other, model, model):
         scene.add(m)
-    _, states, objects = scene.arrays()
+    states, objects = scene.batch().states, scene.batch().objects
     assert objects.state[0] == objects.state[2] == objects.state[3] != objects.state[1]
     assert len(states.slots) == 2
 
@@ -313,7 +313,7 @@ def test_pool_keeps_to_what_is_needed(device):
     for _ in range(40):
         scene.add(model)
     scene.set_lods(rng.choice(model.lod_max, 40, replace=False))
-    _, states, _ = scene.arrays()
+    states = scene.batch().states
     room = states.node_room, states.face_room
     for _ in range(10):
         scene.set_lods(rng.integers(0, model.lod_max + 1, 40))
@@ -332,7 +332,7 @@ def test_thousands_of_objects_in_one_batch(device):
         stats = walker.scene.set_lods(lods)
         assert (stats.nodes_refitted > 0).all()
         walker.check_states(lods)
-    assert len(walker.scene.arrays()[1].slots) <= sum(map(len, ladders))
+    assert len(walker.scene.batch().states.slots) <= sum(map(len, ladders))
 
 
 def test_dropped_faces_are_never_active(device):

@@ -78,9 +78,9 @@ def test_static_is_a_truth(static):
 def test_statistics_of_an_update_can_be_read(device):
     scene = balls(device, 2)
     stats = scene.set_lods([0, 3])
-    assert repr(stats) == f"UpdateStats({len(stats.state)} states updated, {stats.full.sum()} of them whole)"
+    assert repr(stats) == f"LodUpdate({len(stats.state)} states updated, {stats.full.sum()} of them whole)"
     assert len(stats.state) == 2
-    assert "UpdateStats(0 states" in repr(scene.set_lods([0, 3]))
+    assert "LodUpdate(0 states" in repr(scene.set_lods([0, 3]))
 
 
 # Scene files.

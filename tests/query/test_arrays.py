@@ -113,8 +113,8 @@ def test_poses(device, framework, shape, real):
     first.set_poses(poses)
     second.set_poses(framework(poses))
     for name in ("rotation", "position"):
-        expected = getattr(first.arrays()[2].pool, name).numpy()
-        assert getattr(second.arrays()[2].pool, name).numpy().tobytes() == expected.tobytes()
+        expected = getattr(first.batch().objects.pool, name).numpy()
+        assert getattr(second.batch().objects.pool, name).numpy().tobytes() == expected.tobytes()
     model, many = sample("torus"), poses_of(shape, real, 500)
     for output in ("count", "faces"):
         expected = ab.sweep(model, model, many, output=output, device=device)
@@ -171,7 +171,7 @@ def test_transforms_of_managers(device, framework):
 def test_what_lies_elsewhere_is_refused_or_copied(device, framework):
     scene = make_scene(device)
     poses = poses_of("quaternions", np.float64)
-    before = scene.arrays()[2].pool.position.numpy().copy()
+    before = scene.batch().objects.pool.position.numpy().copy()
     bad = poses.copy()
     bad[2, 3:] *= 1.5
     for values, what in (
@@ -185,7 +185,7 @@ def test_what_lies_elsewhere_is_refused_or_copied(device, framework):
     ):
         with pytest.raises(ValueError, match=what):
             scene.set_poses(framework(values))
-        np.testing.assert_array_equal(scene.arrays()[2].pool.position.numpy(), before)
+        np.testing.assert_array_equal(scene.batch().objects.pool.position.numpy(), before)
     for call in (
         lambda: scene.set_lods(framework(np.array([0, 1, 2, 10**6]))),
         lambda: scene.intersect(framework(np.array([(0, 7)]))),

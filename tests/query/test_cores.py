@@ -6,6 +6,7 @@ import warp as wp
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
+from warp_abtree import testing
 from warp_abtree.kernels.traversal.simd import take_slots
 from warp_abtree.query.cpu_threads import core_count, launch_on_cores
 
@@ -42,8 +43,8 @@ def test_every_item_once(cores):
 def test_same_answers(scene, output):
     def ask(cores, within=None):
         query = ab.Query(scene, output, pairs=PAIRS, within=within)
-        query.cores = cores
-        return query, query.run()
+        with testing.regime(cpu_threads=cores):
+            return query, query.run()
 
     expected = ask(1, within=0.5)[1]
     assert 10 < expected.any.sum()
@@ -59,10 +60,10 @@ def test_same_answers(scene, output):
 
 def test_a_capture_records_all(scene):
     query = ab.Query(scene, "faces", pairs=PAIRS)
-    query.cores = 4
-    expected = query.run().faces
-    with wp.ScopedCapture("cpu") as capture:
-        query.launch()
+    with testing.regime(cpu_threads=4):
+        expected = query.run().faces
+        with wp.ScopedCapture("cpu") as capture:
+            query.launch()
     query.hits.total.fill_(-1)
     query.hits.face.fill_(0)
     wp.capture_launch(capture.graph)

@@ -11,6 +11,7 @@ from oracles.peers import fcl_faces, judge
 from oracles.triangle import into_frame_of_a
 
 import warp_abtree as ab
+from warp_abtree import testing
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH
 
@@ -307,7 +308,7 @@ def test_overflow_is_told(device):
     result = query.result()
     assert len(result.faces) == 3
     np.testing.assert_array_equal(result.count, whole.count)  # counts are whole all the same
-    with pytest.raises(ab.CapacityError, match=f"{demand} face pairs .* room for 3"):
+    with pytest.raises(ab.CapacityError, match=f"{demand} intersecting .* room for 3"):
         result.check()
     grown = query.run()
     np.testing.assert_array_equal(grown.faces, whole.faces)
@@ -330,9 +331,9 @@ def test_broad_phase_overflow_is_told(device):
     scene = ab.Scene(device)
     for _ in range(5):
         scene.add(sample("box"))
-    query = ab.Query(scene, "any", pair_capacity=4, precision="exact")
+    query = ab.Query(scene, "any", capacity=ab.Buffers(pairs=4), precision="exact")
     query.launch()
-    with pytest.raises(ab.CapacityError, match="10 pairs"):
+    with pytest.raises(ab.CapacityError, match="10 object pairs"):
         query.result().check()
     assert len(scene.broad_phase()) == len(scene.intersect(precision="exact").pairs) == 10
 
@@ -344,13 +345,6 @@ def test_nothing_asked(device):
         result = ask(scene, pairs)
         assert result.any.shape == result.count.shape == (0,)
         assert result.faces.shape == (0, 3) and result.pairs.shape == (0, 2)
-
-
-class WarpQuery(ab.Query):
-    """A query that takes the CUDA regime on every device."""
-
-    def uses_warps(self):
-        return True
 
 
 @pytest.mark.parametrize("room", [STACK_LENGTH, 0])
@@ -368,8 +362,8 @@ def test_warps_give_the_same_answers(device, room, parts):
     visits = {}
     for output in ("faces", "count", "any"):
         plain = ask(scene, pairs, output)
-        query = WarpQuery(scene, output, pairs=pairs, unsure_capacity=2)
-        query.parts_max, query.stack_room = parts, room
+        with testing.regime(warps=True, warps_per_pair=parts, stack_length=room):
+            query = ab.Query(scene, output, pairs=pairs, capacity=ab.Buffers(uncertain=2))
         result = query.run()
         visits[output] = result.node_tests.sum()
         np.testing.assert_array_equal(result.any, plain.any)

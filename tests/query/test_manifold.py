@@ -184,8 +184,8 @@ def test_a_pair_named_the_other_way_turns_its_normals(device):
 def test_room_grows_and_changes_nothing(device):
     rng = np.random.default_rng(1)
     placed = [(box(1, 0.8, 0.6, splits=1), pose) for pose in random_poses(rng, 12, 1.2)]
-    _, ample = ask(device, *placed, capacity=10_000, pair_capacity=1000)
-    query, tight = ask(device, *placed, capacity=1, pair_capacity=1)
+    _, ample = ask(device, *placed, capacity=ab.Buffers(10_000, pairs=1000))
+    query, tight = ask(device, *placed, capacity=ab.Buffers(1, pairs=1))
     assert tight.pairs.tolist() == ample.pairs.tolist() == sorted(ample.pairs.tolist())
     assert len(tight.points["pair"]) > 12
     for name, values in ample.points.items():

@@ -111,7 +111,7 @@ def test_a_bad_pose_hides_no_lost_work(device):
     frame.lods.fill_(10**6)
     frame.launch()
     frame.poses.assign(poses)
-    with pytest.raises(ab.CapacityError, match=r"capacity=.*poses: 2 rows.*lods: 2 entries"):
+    with pytest.raises(ab.CapacityError, match=r"hits=.*poses: 2 rows.*lods: 2 entries"):
         frame.check()
 
 

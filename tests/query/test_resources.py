@@ -16,7 +16,7 @@ from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
 from warp_abtree.kernels.contact.summary import CHUNK
-from warp_abtree.query import narrow_phase as intersect
+from warp_abtree.query import request
 from warp_abtree.query.contacts import VECTORS
 
 SHORTAGE = r"Failed to allocate \d+ bytes on device '{}'"
@@ -131,7 +131,7 @@ def test_lods(device, memory, move):
     def make():
         scene = make_scene(device)
         if move == "one apart":
-            scene.arrays()[1].free.clear()  # no state to take again: the pool grows
+            scene.batch().states.free.clear()  # no state to take again: the pool grows
         return scene
 
     count, _ = memory.exhaust(make, set_lods, check_scene)
@@ -146,7 +146,7 @@ def test_poses(device, memory, matrices):
 
     def move(scene):
         scene.set_poses(poses)
-        return scene.arrays()[2].pool.position.numpy()
+        return scene.batch().objects.pool.position.numpy()
 
     memory.exhaust(lambda: make_scene(device), move, check_scene)
 
@@ -237,11 +237,11 @@ def test_a_query_is_given_more_pairs(device, memory, kind):
 
 GROWING = {
     "hits": (ab.Query, dict(output="faces", pairs=MORE_PAIRS, capacity=1)),
-    "found pairs": (ab.Query, dict(output="faces", pair_capacity=1, capacity=1)),
-    "found pairs within": (ab.Query, dict(output="count", pair_capacity=1, within=0.01)),
+    "found pairs": (ab.Query, dict(output="faces", capacity=ab.Buffers(pairs=1, hits=1))),
+    "found pairs within": (ab.Query, dict(output="count", capacity=ab.Buffers(pairs=1), within=0.01)),
     "contacts": (ab.ContactQuery, dict(pairs=MORE_PAIRS, capacity=1)),
-    "found contacts": (ab.ContactQuery, dict(pair_capacity=1, capacity=1)),
-    "unsure faces": (GpuQuery, dict(output="faces", pairs=[(0, 4), *PAIRS], unsure_capacity=1, capacity=1)),
+    "found contacts": (ab.ContactQuery, dict(capacity=ab.Buffers(pairs=1, hits=1))),
+    "unsure faces": (GpuQuery, dict(output="faces", pairs=[(0, 4), *PAIRS], capacity=ab.Buffers(uncertain=1, hits=1))),
 }
 
 
@@ -271,7 +271,7 @@ def test_the_broad_phase_grows(device, memory):
         scene = ab.Scene(device)
         for _ in range(20):
             scene.add(sample("box"))
-        scene.arrays()
+        scene.batch()
         return scene
 
     def check(before, scene):
@@ -337,7 +337,7 @@ def test_the_error_names_the_demand(device):
     with little_memory(device):
         for size, call in (
             (12 * LARGEST, lambda: ab.Query(scene, "faces", pairs=PAIRS, capacity=LARGEST)),
-            (12 * LARGEST, lambda: GpuQuery(scene, "faces", pairs=PAIRS, unsure_capacity=LARGEST)),
+            (12 * LARGEST, lambda: GpuQuery(scene, "faces", pairs=PAIRS, capacity=ab.Buffers(uncertain=LARGEST))),
             (12 * LARGEST, lambda: query.resize(LARGEST)),
         ):
             with pytest.raises(RuntimeError, match=f"{size} bytes on device '{device}'"):
@@ -347,13 +347,13 @@ def test_the_error_names_the_demand(device):
 
 
 def test_more_pairs_than_a_launch_holds(device, monkeypatch):
-    monkeypatch.setattr(intersect, "PAIRS_MAX", len(MORE_PAIRS))
+    monkeypatch.setattr(request, "PAIRS_MAX", len(MORE_PAIRS))
     scene = make_scene(device)
     before = check_scene(None, scene)
     query = ab.Query(scene, "faces", pairs=PAIRS)
     answers = describe(query.run())
-    with pytest.raises(ValueError, match="pair_capacity 13 is outside"):
-        ab.Query(scene, "any", pair_capacity=13)
+    with pytest.raises(ValueError, match="buffers: pairs 13 is outside"):
+        ab.Query(scene, "any", capacity=ab.Buffers(pairs=13))
     many = np.concatenate([MORE_PAIRS, PAIRS])
     for call in (lambda: query.set_pairs(many), lambda: scene.intersect(many), lambda: ab.Query(scene, pairs=many)):
         with pytest.raises(ab.CapacityError, match="15 object pairs at a time"):
@@ -381,12 +381,12 @@ def test_room_for_the_demand_is_enough(device, kind):
     whole = scene.intersect(output="faces")
     if kind == "unsure":
         options = dict(output="faces", pairs=whole.pairs, capacity=len(whole.faces))
-        demand = named_demand(GpuQuery(scene, **options, unsure_capacity=1), r"unsure_capacity=(\d+)")
-        query = GpuQuery(scene, **options, unsure_capacity=demand)
+        demand = named_demand(GpuQuery(scene, **options, capacity=ab.Buffers(uncertain=1)), r"uncertain=(\d+)")
+        query = GpuQuery(scene, **options, capacity=ab.Buffers(uncertain=demand))
     else:
-        demand = named_demand(ab.Query(scene, "faces", pair_capacity=1), r"found (\d+) pairs")
+        demand = named_demand(ab.Query(scene, "faces", capacity=ab.Buffers(pairs=1)), r"pairs=(\d+)")
         assert demand == len(whole.pairs)
-        query = ab.Query(scene, "faces", pair_capacity=demand, capacity=len(whole.faces))
+        query = ab.Query(scene, "faces", capacity=ab.Buffers(pairs=demand, hits=len(whole.faces)))
     query.launch()
     result = query.result()
     result.check()

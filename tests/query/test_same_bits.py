@@ -5,6 +5,7 @@ import pytest
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 MODELS = ("torus", "small ball", "box", "crumbs", "soup", "twins")
 NAN_BITS = 0x7FF8000000000000
@@ -38,10 +39,10 @@ def test_results(device, output, real):
     one_core = ab.ContactQuery if output == "contacts" else ab.Query
     scene = make_scene("cpu")
     query = one_core(scene, pairs=pairs(), within=0.05, **({} if output == "contacts" else {"output": output}))
-    query.cores = 1
     if output == "contacts":
         query.contact_dtype = real
-    expected = query.run()
+    with testing.regime(cpu_threads=1):
+        expected = query.run()
     found = make_scene(device).intersect(pairs(), **options)
     assert fields(found) == fields(expected)
     assert expected.any.any() and not expected.any.all()

@@ -9,6 +9,7 @@ from helpers.samples import SHAPES, STILL, contact_poses, random_poses, sample
 from oracles.triangle import into_frame_of_a, pose_matrix
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 NAMES = ("box", "small ball", "crumbs", "soup", "torus", "three", "capsule", "one")
 FACES = 60
@@ -302,18 +303,6 @@ def test_matrices_off_orthonormal(device):
 # Operators, regimes, input.
 
 
-class WarpQuery(ab.Query):
-    """A query that takes the CUDA regime on every device."""
-
-    def uses_warps(self):
-        return True
-
-
-class ThreadQuery(ab.Query):
-    def uses_warps(self):
-        return False
-
-
 @pytest.mark.slow
 def test_regimes_and_outputs_agree(device):
     rng = np.random.default_rng(8)
@@ -323,10 +312,10 @@ def test_regimes_and_outputs_agree(device):
     expected = scene.intersect(pairs, within=within)
     assert 3 < expected.apart.sum() < 27
     # On CUDA only warps work on pairs: the thread's visit is in the CPU's vector instructions.
-    kinds = (WarpQuery,) if scene.device.is_cuda else (ThreadQuery, WarpQuery)
-    for kind, output in itertools.product(kinds, ("any", "faces")):
-        query = kind(scene, output, pairs=pairs, within=within)
-        query.parts_max = 20
+    kinds = (True,) if scene.device.is_cuda else (False, True)
+    for warps, output in itertools.product(kinds, ("any", "faces")):
+        with testing.regime(warps=warps, warps_per_pair=20):
+            query = ab.Query(scene, output, pairs=pairs, within=within)
         result, plain = query.run(), scene.intersect(pairs, output)
         np.testing.assert_array_equal(result.apart, expected.apart)
         assert plain.apart is None
@@ -365,7 +354,7 @@ def test_broad_phase_pairs(device):
     for angle in np.linspace(0, 3, 8):  # a torus and balls inside its box, some in its hole
         scene.add(sample("torus"), (0, 0, 100 * angle, 0, 0, 0, 1))
         scene.add(sample("box"), (0.4 * angle, 0, 100 * angle, 0, 0, 0, 1))
-    query = ab.Query(scene, "any", within=0.01, pair_capacity=2)
+    query = ab.Query(scene, "any", within=0.01, capacity=ab.Buffers(pairs=2))
     result = query.run()
     order = np.lexsort(result.pairs.T[::-1])
     expected = scene.intersect(result.pairs[order], within=0.01)

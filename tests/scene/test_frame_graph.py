@@ -9,7 +9,7 @@ from helpers.samples import random_poses, raw_state, sample
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
-from warp_abtree.model import tree
+from warp_abtree.state import work_lists
 
 pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
 
@@ -37,17 +37,17 @@ def random_lods(rng, lods, top):
 
 def frame_state(frame, scene, i):
     """Return what `raw_state` returns, of the state that serves an object in a frame."""
-    pool = frame._states.pool
-    state = frame._objects.pool.state.numpy()[i]
-    slot = frame._states.slots[state]
+    pool = frame.batch.states.pool
+    state = frame.batch.objects.pool.state.numpy()[i]
+    slot = frame.batch.states.slots[state]
     model = scene.models[slot.model]
     nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
     corners = pool.face_corner.numpy()[slot.face_start : slot.face_start + model.face_count, :3]
     return {
         "lod": int(pool.lod.numpy()[state]),
         "status": pool.node_status.numpy()[nodes],
-        **dict(zip(("lower", "upper", "skip"), frame._states.read_nodes(slot, model.tree.node_count))),
-        "corner": np.where(corners < 0, -1, corners - frame._models.vertex_start[slot.model]),
+        **dict(zip(("lower", "upper", "skip"), frame.batch.states.read_nodes(slot, model.tree.node_count))),
+        "corner": np.where(corners < 0, -1, corners - frame.batch.models.vertex_start[slot.model]),
     }
 
 
@@ -102,7 +102,7 @@ def test_random_walk_in_a_graph(device):
     rng = np.random.default_rng(1)
     names = rng.permutation(np.repeat(NAMES, 3))
     scene = add_objects(device, names)
-    frame = ab.FrameGraph(scene, pair_capacity=1000)
+    frame = ab.FrameGraph(scene, capacity=ab.Buffers(pairs=1000))
     launch = replay(frame)
     singles = [add_objects(device, [name]) for name in names]
     lods, top, kinds = scene.lods, tops(scene), []
@@ -140,7 +140,7 @@ def test_random_walk_of_real_meshes(device, name):
 
 def test_all_states_at_the_crossover(device, monkeypatch):
     """Worklists hold the longest slices that are not refitted whole, of all states at once; few threads take turns."""
-    monkeypatch.setattr(tree, "THREADS_AT_ONCE", 1)
+    monkeypatch.setattr(work_lists, "THREADS_AT_ONCE", 1)
     names = ["small ball", "crumbs", "torus", "soup", "twins"] * 3
     scene = add_objects(device, names, spread=9.0)
     moves = []
@@ -197,7 +197,9 @@ CROWD = ("small ball", "torus", "soup", "lattice soup", "twins", "crumbs", "one"
 @pytest.mark.parametrize("output", ["any", "count", "faces", "contacts"])
 def test_answers_of_the_scene(device, output, captured):
     scene = add_objects(device, CROWD)
-    frame = ab.FrameGraph(scene, output, capacity=60000 if output in ("faces", "contacts") else None, pair_capacity=36)
+    frame = ab.FrameGraph(
+        scene, output, capacity=ab.Buffers(60000 if output in ("faces", "contacts") else None, pairs=36)
+    )
     launch = replay(frame) if captured else frame.launch
     assert ask_both(scene, frame, launch, np.random.default_rng(3), 5, output=output) > 50
 
@@ -206,7 +208,7 @@ def test_groups_share_states(device):
     scene = add_objects(device, CROWD)
     group = np.array([2, 1, 3, 4, 0, 5, 6, 2, 1])
     frame = ab.FrameGraph(scene, "count", groups=group)
-    assert len(frame.lods) == len(frame._states.slots) == len(frame.changed_count) == 7
+    assert len(frame.lods) == len(frame.batch.states.slots) == len(frame.changed_count) == 7
     assert ask_both(scene, frame, replay(frame), np.random.default_rng(4), 6, group=group, output="count") > 50
     assert_states(frame, scene)
 
@@ -216,7 +218,7 @@ def test_ladder(device, shares):
     scene = add_objects(device, CROWD)
     rungs = [[int(share * model.lod_max) for share in shares] for model in scene.models]
     frame = ab.FrameGraph(scene, "count", ladder=rungs)
-    assert len(frame._states.slots) == sum(len(np.unique(part)) for part in rungs)
+    assert len(frame.batch.states.slots) == sum(len(np.unique(part)) for part in rungs)
     assert frame.changed_count is None and frame.marked_count is None
 
     def snap(lods):
@@ -451,11 +453,11 @@ def test_lost_work_is_told(device):
     hits = len(expected.faces)
     scene.set_poses(far)
     for options, message in (
-        ({"pair_capacity": 14, "capacity": 2 * hits}, "pair_capacity=15, .* for 14"),
-        ({"pair_capacity": 15, "capacity": hits - 1}, f" capacity={hits}, .* for {hits - 1}"),
-        ({"pair_capacity": 15, "capacity": hits}, None),
+        ({"hits": 2 * hits, "pairs": 14}, "pairs=15.*for 14"),
+        ({"hits": hits - 1, "pairs": 15}, f"hits={hits}.* for {hits - 1}"),
+        ({"hits": hits, "pairs": 15}, None),
     ):
-        frame = ab.FrameGraph(scene, "faces", **options)
+        frame = ab.FrameGraph(scene, "faces", capacity=ab.Buffers(**options))
         launch = replay(frame)
         for poses in (far, near, far):
             frame.poses.assign(poses)

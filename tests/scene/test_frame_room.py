@@ -17,7 +17,7 @@ from warp_abtree.scene import pipeline as frame_graph
 def coincident(device, monkeypatch):
     """A scene of objects laid on one another, asked as on CUDA: float32 leaves many pairs of faces open."""
     monkeypatch.setattr(frame_graph, "Query", GpuQuery)
-    monkeypatch.setattr(intersect, "UNSURE_CAPACITY", 16)
+    monkeypatch.setattr(intersect, "UNCERTAIN_ROOM", 16)
     scene = ab.Scene(device)
     for _ in range(3):
         scene.add(sample("twins"))
@@ -38,13 +38,13 @@ def test_the_room_of_the_first_frame_is_made(coincident):
 @pytest.mark.slow
 def test_a_room_that_is_too_small_is_told_at_construction(coincident):
     needed = int(ab.FrameGraph(coincident, output="count").run().float64_tests.sum())
-    with pytest.warns(RuntimeWarning, match=f"=8: .* leave {needed} .*unsure_capacity={needed}"):
-        frame = ab.FrameGraph(coincident, output="count", unsure_capacity=8)
+    with pytest.warns(RuntimeWarning, match=f"=8: .* leave {needed} .*uncertain={needed}"):
+        frame = ab.FrameGraph(coincident, output="count", capacity=ab.Buffers(uncertain=8))
     wp.capture_launch(frame.capture())
-    with pytest.raises(ab.CapacityError, match=f"needed unsure_capacity={needed}, the frame graph has room for 8"):
+    with pytest.raises(ab.CapacityError, match=f"needed .*uncertain={needed}.*room for 8"):
         frame.check()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        frame = ab.FrameGraph(coincident, output="count", unsure_capacity=needed)
+        frame = ab.FrameGraph(coincident, output="count", capacity=ab.Buffers(uncertain=needed))
     wp.capture_launch(frame.capture())
     frame.check()

@@ -31,7 +31,7 @@ def pair_scene(device):
 
 def check_refusal(scene, call, error, *words):
     """The call raises one clear error that names what is wrong, and leaves no trace."""
-    before, arrays = everything(scene), scene.arrays()
+    before, arrays = everything(scene), scene.batch()
     with pytest.raises(error) as caught:
         call(scene)
     assert type(caught.value) in (ValueError, TypeError)
@@ -39,7 +39,7 @@ def check_refusal(scene, call, error, *words):
     assert "\n" not in message
     for word in words:
         assert word in message
-    assert scene.arrays() is arrays or scene.arrays() == arrays, "a refused call makes nothing anew"
+    assert scene.batch() is arrays, "a refused call makes nothing anew"
     assert everything(scene) == before
 
 
@@ -183,16 +183,17 @@ def test_pairs_are_refused(device, method, case):
     ],
 )
 def test_options_are_refused(device, options, words):
-    options = {"precision": "float64", **options}
+    options = {"precision": "float32", **options}
     check_refusal(pair_scene(device), lambda scene: scene.intersect([(0, 1)], **options), ValueError, *words)
     check_refusal(pair_scene(device), lambda scene: ab.Query(scene, **options), ValueError, *words)
 
 
 @pytest.mark.parametrize("value", [0, -1, 2**31, NAN, INF, "many"])
-@pytest.mark.parametrize("name", ["capacity", "pair_capacity"])
-def test_query_refuses_capacity(device, name, value):
-    options = {name: value, "precision": "float64"}
-    check_refusal(pair_scene(device), lambda scene: ab.Query(scene, **options), WRONG, name, str(value))
+def test_query_refuses_capacity(device, value):
+    check_refusal(pair_scene(device), lambda scene: ab.Query(scene, capacity=value), WRONG, "capacity", str(value))
+    for name in ("hits", "pairs", "uncertain"):
+        with pytest.raises(ValueError, match=f"buffers: {name} "):
+            ab.Buffers(**{name: value})
 
 
 @pytest.mark.parametrize("i", [-1, 3, 2**40, 0.5, NAN, INF, "first", None])
@@ -227,7 +228,7 @@ def test_an_empty_scene(device):
 
 
 def placed(scene):
-    pool = scene.arrays()[2].pool
+    pool = scene.batch().objects.pool
     return pool.rotation.numpy(), pool.position.numpy()
 
 

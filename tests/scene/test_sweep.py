@@ -2,6 +2,7 @@
 
 import gc
 import threading
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -99,20 +100,16 @@ def test_more_poses_than_before_and_fewer(device, monkeypatch):
 def test_lists_that_overflow_lose_nothing(device, output, monkeypatch, small_chunks):
     """The CUDA regime, with room for one face pair of those that float32 leaves open; boxes lie flush."""
 
-    class Narrow(GpuQuery):
-        def __init__(self, *arguments, **options):
-            super().__init__(*arguments, **options, unsure_capacity=1)
-
     box = sample("box")
     poses = np.tile(np.array(STILL), (20, 1))
     poses[:, 0] = np.arange(20) / 10
     expected = ask_scene(device, [box, box], poses, [None, None], output="faces")
     assert expected.any[:11].all() and not expected.any[11:].any()
-    monkeypatch.setattr(pose_sweep, "Query", Narrow)
+    monkeypatch.setattr(pose_sweep, "Query", partial(GpuQuery, capacity=ab.Buffers(uncertain=1)))
     found = ab.sweep(box, box, poses, output=output, device=device)
     np.testing.assert_array_equal(found, getattr(expected, output))
     (posed,) = pose_sweep._kept.values()
-    assert len(posed.chunks[7].question.query.hits.unsure) > 1
+    assert len(posed.chunks[7].chunk_query.query.hits.unsure) > 1
 
 
 def test_no_poses(device):
@@ -181,11 +178,11 @@ def test_a_pair_of_models_is_set_up_once(device, monkeypatch):
     first = ab.sweep(a, b, poses, device=device)
     (posed,) = pose_sweep._kept.values()
     (chunk,) = posed.chunks.values()
-    question = chunk.question
+    question = chunk.chunk_query
     assert np.array_equal(ab.sweep(a, b, poses, device=device), first)
-    assert chunk.question is question and made == [1]
+    assert chunk.chunk_query is question and made == [1]
     ab.sweep(a, b, poses, output="count", device=device)
-    assert chunk.question is not question and made == [1], "of one question, so that memory stays bounded"
+    assert chunk.chunk_query is not question and made == [1], "of one question, so that memory stays bounded"
     for options in ({"lod_a": 0}, {"lod_b": 3}):
         ab.sweep(a, b, poses, device=device, **options)
     ab.sweep(b, a, poses, device=device)
@@ -215,10 +212,10 @@ def test_long_lists_are_not_kept(device, monkeypatch):
     monkeypatch.setattr(pose_sweep, "KEPT_ROWS", 2**17)
     ab.sweep(a, a, poses, device=device)
     (posed,) = pose_sweep._kept.values()
-    assert posed.chunks[1024].question is not None
+    assert posed.chunks[1024].chunk_query is not None
     monkeypatch.setattr(pose_sweep, "KEPT_ROWS", 100)
     ab.sweep(a, a, poses, output="faces", device=device)
-    assert posed.chunks[1024].question is None
+    assert posed.chunks[1024].chunk_query is None
 
 
 def test_two_threads(device):

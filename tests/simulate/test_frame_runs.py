@@ -38,9 +38,9 @@ else:
     steps = [(top, top - 1, 0), (top, top - 1, top - 1), (0, 1, 2), (top, top, top)]
     lods = lambda time: np.array(steps[min(round(60 * time), 3)])
 frame = ab.Frame(scene, motion, lods)
-before = scene.lods.tolist(), scene.arrays()[2].pool.position.numpy().tobytes()
+before = scene.lods.tolist(), scene.batch().objects.pool.position.numpy().tobytes()
 frame.warm_up()
-assert before == (scene.lods.tolist(), scene.arrays()[2].pool.position.numpy().tobytes()) and not frame.history
+assert before == (scene.lods.tolist(), scene.batch().objects.pool.position.numpy().tobytes()) and not frame.history
 print("warm", flush=True)
 frame.run(8)
 print(sum(row.lods_changed for row in frame.history), frame.history[-1].hits)

@@ -99,7 +99,7 @@ def test_worlds_alone_and_together_are_the_same(device):
 
 def test_launches_do_what_steps_do(device):
     stepped = on_ground(device, *heap(), **OPTIONS)
-    launched = on_ground(device, *heap(), **OPTIONS, capacity=4096, pair_capacity=256)
+    launched = on_ground(device, *heap(), **OPTIONS, capacity=ab.Buffers(4096, pairs=256))
     for _ in range(60):
         stepped.step(1 / 120)
         launched.launch(1 / 120)
@@ -112,7 +112,7 @@ def test_a_graph_does_what_launches_do():
         pytest.skip("needs CUDA")
     import warp as wp
 
-    plain, captured = (on_ground(None, *heap(), **OPTIONS, capacity=4096, pair_capacity=256) for _ in range(2))
+    plain, captured = (on_ground(None, *heap(), **OPTIONS, capacity=ab.Buffers(4096, pairs=256)) for _ in range(2))
     run(plain, 1), run(captured, 1)
     with wp.ScopedCapture(captured.device) as capture:
         captured.launch(1 / 120)
@@ -123,11 +123,11 @@ def test_a_graph_does_what_launches_do():
 
 
 def test_room_grows_and_its_lack_is_told(device):
-    tight = on_ground(device, *heap(), **OPTIONS, capacity=1, pair_capacity=1)
-    ample = on_ground(device, *heap(), **OPTIONS, capacity=4096, pair_capacity=256)
+    tight = on_ground(device, *heap(), **OPTIONS, capacity=ab.Buffers(1, pairs=1))
+    ample = on_ground(device, *heap(), **OPTIONS, capacity=ab.Buffers(4096, pairs=256))
     assert np.array_equal(run(tight, 80), run(ample, 80))
-    short = on_ground(device, *heap(), **OPTIONS, capacity=4096, pair_capacity=1)
-    with pytest.raises(ab.CapacityError, match="pair_capacity="):
+    short = on_ground(device, *heap(), **OPTIONS, capacity=ab.Buffers(4096, pairs=1))
+    with pytest.raises(ab.CapacityError, match="pairs="):
         for _ in range(80):
             short.launch(1 / 120)
             short.check()

@@ -100,7 +100,7 @@ def check_answers(before, scene):
     for i in range(scene.object_count):
         state = scene.tree_state(i)
         now += [state.lod, *(getattr(state, name).tobytes() for name in ("status", "lower", "upper", "skip"))]
-    objects = scene.arrays()[2].pool
+    objects = scene.batch().objects.pool
     now += [objects.rotation.numpy().tobytes(), objects.position.numpy().tobytes()]
     assert before is None or now == before
     return now
@@ -255,10 +255,10 @@ def test_questions(device, interrupter, question, pairs):
 
 OPERATORS = {
     "faces": lambda scene: ab.Query(scene, "faces", pairs=MORE_PAIRS),
-    "found": lambda scene: ab.Query(scene, "count", pair_capacity=2),
+    "found": lambda scene: ab.Query(scene, "count", capacity=ab.Buffers(pairs=2)),
     "within": lambda scene: ab.Query(scene, "count", pairs=MORE_PAIRS, within=0.01),
     "contacts": lambda scene: ab.ContactQuery(scene, pairs=MORE_PAIRS, capacity=8),
-    "manifolds": lambda scene: ab.ManifoldQuery(scene, pair_capacity=2, capacity=8),
+    "manifolds": lambda scene: ab.ManifoldQuery(scene, capacity=ab.Buffers(pairs=2, hits=8)),
 }
 CALLS = {
     "launch": lambda query: query.launch(),
@@ -455,7 +455,7 @@ def make():
         scene.add(model, pose=(0.3 * k, 0.1, 0, 0, 0, 0, 1))
     return scene
 scene = make()
-scene.arrays()
+scene.batch()
 kept, wp.config.kernel_cache_dir = wp.config.kernel_cache_dir, sys.argv[1]
 for call in (lambda: scene.set_lods([model.lod_max - 1] * 3), lambda: scene.intersect(output="faces")):
     try:

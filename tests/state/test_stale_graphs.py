@@ -168,7 +168,7 @@ def test_a_graph_keeps_its_arrays(device, kind):
     """Those of the query, of the scene and of the broad phase, until the query goes."""
     scene = make_scene(device)
     query = kind(scene, "faces", capacity=8)
-    captured, states, objects = capture(device, query), query.arrays[1].pool, query.arrays[2].pool
+    captured, states, objects = capture(device, query), query.batch.states.pool, query.batch.objects.pool
     kept = [query.hits.face, query.hits.any_hit, query.pair_poses, query.pairs, query.work.counter]
     kept += [states.node_box, states.face_corner, states.lod, objects.state, objects.rotation]
     kept += [query.broad_phase.lower, query.broad_phase.excluded, query.broad_phase.bvh, query.guard.launched]
@@ -243,7 +243,7 @@ def test_bodies_of_a_graph(device):
     """Contacts that outgrow their buffers in `step` end the graphs of `launch`."""
     scene = make_scene(device, 3)
     scene.set_poses(np.array([(3.0 * k, 0, 0, 0, 0, 0, 1) for k in range(3)]))
-    bodies = ab.Dynamics(scene, gravity=(0, 0, 0), capacity=8, pair_capacity=1)
+    bodies = ab.Dynamics(scene, gravity=(0, 0, 0), capacity=ab.Buffers(8, pairs=1))
     bodies.step(1e-4)
     graph = capture_step(device, bodies)
     wp.capture_launch(graph)

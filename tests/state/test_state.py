@@ -88,11 +88,11 @@ def test_states_are_those_in_use(device, ledger, lods):
     """One state a model and LOD that stands, whatever the number of objects; a coarse one needs no finer one."""
     whole = make_scene(device, 1)
     with ledger.gained() as one:
-        whole.arrays()
+        whole.batch()
     for models in (("ball",), ("ball", "torus")):
         scene = make_scene(device, 80, lods, models)
-        scene.arrays()
-        _, states, objects = scene.arrays()
+        scene.batch()
+        states, objects = scene.batch().states, scene.batch().objects
         used = sorted({(scene.object_model[i], lod) for i, lod in enumerate(scene.lods.tolist())})
         assert sorted((slot.model, slot.lod) for slot in states.slots) == used
         assert states.node_room == sum(sample(models[m]).tree.node_count for m, _ in used)
@@ -101,21 +101,21 @@ def test_states_are_those_in_use(device, ledger, lods):
         assert set(objects.state) == set(range(len(used)))
     with ledger.gained() as more:
         many = make_scene(device, 1000)
-        many.arrays()
+        many.batch()
     assert more[0] < one[0] + 1000 * 120 + SLACK, "objects that share a state cost no more than a pose and a number"
 
 
 def test_an_lod_that_was_left_is_used_again(device, ledger):
     """LODs that wander for long hold one state, and what was allocated stays where it is."""
     scene = make_scene(device, 3)
-    scene.arrays()
+    scene.batch()
     lods = [scene.lods // 2, scene.lods // 3, scene.lods]
     for target in lods:
         scene.set_lods(target)
     with ledger.gained() as gained:
         for target in lods * 3:
             scene.set_lods(target)
-    assert len(scene.arrays()[1].slots) == 1 and abs(gained[0]) <= SLACK
+    assert len(scene.batch().states.slots) == 1 and abs(gained[0]) <= SLACK
 
 
 def query_bytes(ledger, kind, scene, pairs, output, **options):
@@ -131,7 +131,7 @@ def query_bytes(ledger, kind, scene, pairs, output, **options):
 def test_a_query_has_room_for_its_output_alone(device, ledger, kind):
     scene = make_scene(device, 400)
     pairs = np.arange(400).reshape(-1, 2)
-    scene.arrays()
+    scene.batch()
     query_bytes(ledger, kind, scene, pairs, "faces", within=1.0)  # what compiling and first launches hold
     held = {
         output: query_bytes(ledger, kind, scene, pairs, output, **options)
@@ -140,11 +140,11 @@ def test_a_query_has_room_for_its_output_alone(device, ledger, kind):
     assert held["any"] == held["count"] and held["faces"] == held["any"] + 12 * 50_000
     near = query_bytes(ledger, kind, scene, pairs, "any", within=1.0)
     assert near > held["any"] and near - held["any"] < 100 * len(pairs) + SLACK, "a second answer, asked for"
-    rounded = query_bytes(ledger, kind, scene, pairs, "any", precision="float64")
+    rounded = query_bytes(ledger, kind, scene, pairs, "any", precision="float32")
     if kind(scene, "any", pairs=pairs).uses_warps():
         unsure = 100_000
-        wide = query_bytes(ledger, kind, scene, pairs, "any", unsure_capacity=unsure)
-        narrow = query_bytes(ledger, kind, scene, pairs, "any", unsure_capacity=1)
+        wide = query_bytes(ledger, kind, scene, pairs, "any", capacity=ab.Buffers(uncertain=unsure))
+        narrow = query_bytes(ledger, kind, scene, pairs, "any", capacity=ab.Buffers(uncertain=1))
         assert wide - narrow == 24 * (unsure - 1) and rounded < held["any"], "the exact stage has a list of its own"
     else:
         assert rounded == held["any"] < 300 * len(pairs) + SLACK, "one thread a pair: no lists between stages"
@@ -152,11 +152,11 @@ def test_a_query_has_room_for_its_output_alone(device, ledger, kind):
 
 def test_given_pairs_need_no_broad_phase(device, ledger):
     scene = make_scene(device, 400)
-    scene.arrays()
+    scene.batch()
     pairs = np.arange(400).reshape(-1, 2)
     scene.broad_phase()
     given = query_bytes(ledger, ab.Query, scene, pairs, "any")
-    found = query_bytes(ledger, ab.Query, scene, None, "any", pair_capacity=len(pairs))
+    found = query_bytes(ledger, ab.Query, scene, None, "any", capacity=ab.Buffers(pairs=len(pairs)))
     assert found > given + 400 * 24, "boxes of all objects"
     assert ab.Query(scene, "any", pairs=pairs).broad_phase is None
     fresh = make_scene(device, 400)
@@ -167,7 +167,7 @@ def test_given_pairs_need_no_broad_phase(device, ledger):
 @pytest.mark.slow
 def test_contacts_cost_only_those_who_ask(device, ledger):
     scene = make_scene(device, 60)
-    scene.arrays()
+    scene.batch()
     pairs = np.arange(60).reshape(-1, 2)
     for output in ("any", "faces", "contacts"):
         make_scene(device, 60).intersect(pairs, output=output)
@@ -188,7 +188,7 @@ def test_a_sweep_needs_no_more_for_more_poses(device, ledger):
     ball, poses = sample("ball"), random_poses(np.random.default_rng(2), 20 * CHUNK, 3.0)
     pair = make_scene(device, 1)
     with ledger.gained() as whole:
-        pair.arrays()
+        pair.batch()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pose_sweep, "CHUNKS", (CHUNK,))
         with ledger.gained() as one:

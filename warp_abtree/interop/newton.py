@@ -15,8 +15,8 @@ import warp as wp
 
 from warp_abtree.kernels import newton as kernels
 from warp_abtree.model.model import Model
-from warp_abtree.query.broad_phase import CapacityError
 from warp_abtree.query.manifold import POINTS_MAX, ManifoldQuery
+from warp_abtree.query.request import CapacityError
 from warp_abtree.scene.scene import Scene
 
 FIELDS = ("shape0", "shape1", "point0", "point1", "offset0", "offset1", "normal", "margin0", "margin1")
@@ -44,7 +44,7 @@ class NewtonContacts:
         model: `newton.Model`. Its shapes that are meshes, on one device; all others are left out, their contacts too.
         models: `Model` of each shape by its index, where it should be another than the shape's mesh, as one built
             before; in the shape's frame, scaled. Shapes of one mesh and scale share a model.
-        capacity, pair_capacity: As for `ManifoldQuery`; `collide` makes more room, `launch` does not.
+        capacity: As for `ManifoldQuery`; `collide` makes more room, `launch` does not.
 
     Attributes:
         scene: The `Scene` of the shapes, all at their finest LOD; `scene.set_lods` changes that.
@@ -56,7 +56,7 @@ class NewtonContacts:
         ValueError: Fewer than two mesh shapes.
     """
 
-    def __init__(self, model, models=None, capacity=None, pair_capacity=None):
+    def __init__(self, model, models=None, capacity=None):
         import newton
 
         self.newton = newton
@@ -85,7 +85,7 @@ class NewtonContacts:
         self._ids = wp.array(self.shapes, dtype=wp.int32, device=self.device)
         self._no_body = wp.empty(0, dtype=wp.transform, device=self.device)
         self._place(model.body_q)
-        self.query = ManifoldQuery(self.scene, None, capacity, pair_capacity)
+        self.query = ManifoldQuery(self.scene, None, capacity)
         self._grow()
 
     def _grow(self):
@@ -105,7 +105,7 @@ class NewtonContacts:
             CapacityError: `contacts` has too little room; the message names the demand.
         """
         self._place(state.body_q)
-        self.query.run_grown()
+        self.query.grow()
         if len(self._count) != len(self.query.pairs):
             self._grow()
         self._write(state.body_q, contacts)
@@ -135,7 +135,7 @@ class NewtonContacts:
 
     def _place(self, body_q):
         body_q = self._no_body if body_q is None else body_q
-        inputs = [self._ids, body_q, self.model.shape_body, self.model.shape_transform, self.scene.arrays()[2].pool]
+        inputs = [self._ids, body_q, self.model.shape_body, self.model.shape_transform, self.scene.batch().objects.pool]
         self._launch(kernels.pose_object_kernel, len(self.shapes), inputs)
 
     def _write(self, body_q, contacts):

@@ -12,8 +12,8 @@ from warp_abtree.model.mesh import MeshError, load_mesh, triangulate
 from warp_abtree.model.model import Model
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
+from warp_abtree.state.device_update import NO_FAULTS
 from warp_abtree.state.generation import STALE_GRAPH, LaunchGuard
-from warp_abtree.state.update import NO_FAULTS
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 # Two stretches that differ by this part are one.
@@ -40,12 +40,12 @@ class PoseInput:
         check_device(scene.device, "making a PoseInput")
         self.scene = scene
         self.device = scene.device
-        self._arrays = scene.arrays()
-        self._guard = LaunchGuard(self.device, self._arrays[2].generation)
+        self._batch = scene.batch()
+        self._guard = LaunchGuard(self.device, self._batch.objects.generation)
         count = scene.object_count
         self.poses = wp.empty((count, 7), dtype=wp.float64, device=self.device)
         self._faults = wp.array(NO_FAULTS, dtype=wp.int32, device=self.device)
-        wp.launch(kernels.read_pose_kernel, count, [self._arrays[2].pool, self.poses], device=self.device)
+        wp.launch(kernels.read_pose_kernel, count, [self._batch.objects.pool, self.poses], device=self.device)
 
     def launch(self, poses=None):
         """Place every object. Launches only.
@@ -59,8 +59,7 @@ class PoseInput:
             ValueError: Another shape, type or device; nothing is changed.
             RuntimeError: Objects were added to the scene since this was made.
         """
-        if self._arrays != self.scene.arrays():
-            raise RuntimeError("objects were added to the scene since this pose input was made; make a new one")
+        self._batch.check("pose input")
         check_device(self.device)
         with self._guard.launching(self):
             self._launch(poses)
@@ -70,7 +69,7 @@ class PoseInput:
         if rows.dtype == wp.float32:
             wp.utils.array_cast(rows, self.poses)
             rows = self.poses
-        inputs = [QUATERNION_TOLERANCE, rows, self._arrays[2].pool, self._faults, self._guard.record()]
+        inputs = [QUATERNION_TOLERANCE, rows, self._batch.objects.pool, self._faults, self._guard.record()]
         wp.launch(kernels.place_object_kernel, len(self.poses), inputs, device=self.device)
 
     def _check(self, rows):
@@ -299,7 +298,7 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
     if result is not None and len(result.pairs) and int(result.pairs.max()) >= count:
         raise ValueError(f"result: asks object {int(result.pairs.max())}, the scene has {count}")
     hit = _faces_hit(scene, result)
-    objects = scene.arrays()[2].pool
+    objects = scene.batch().objects.pool
     worlds = objects.world.numpy()
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = objects.rotation.numpy(), objects.position.numpy()

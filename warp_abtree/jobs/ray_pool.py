@@ -15,8 +15,8 @@ from collections import deque
 import numpy as np
 
 from warp_abtree.checks.arguments import whole_number
+from warp_abtree.checks.regime import change_regime
 from warp_abtree.jobs.shards import hash_model
-from warp_abtree.query.narrow_phase import Query
 from warp_abtree.scene.scene import Scene
 
 # Shards that a worker has at a time, so that it never waits for the next.
@@ -48,7 +48,7 @@ class _Worker:
     """What an actor holds: the asker of a job, which came once, through the object store."""
 
     def __init__(self, asker, device):
-        Query.cores = 1 if device == "cpu" else None  # an actor a core
+        change_regime(cpu_threads=1 if device == "cpu" else None)  # an actor a core
         self.asker, self.device = asker, device
 
     def ready(self):

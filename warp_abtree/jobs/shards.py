@@ -19,7 +19,7 @@ from warp_abtree.checks.atomic_write import sweep_up
 from warp_abtree.checks.device_lock import device_turn
 from warp_abtree.jobs.shard_folder import ShardFolder
 from warp_abtree.model.model import Model
-from warp_abtree.query.narrow_phase import check_request
+from warp_abtree.query.request import check_request
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep import sweep

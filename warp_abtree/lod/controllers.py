@@ -22,7 +22,7 @@ from warp_abtree.lod.selection import (
     positive,
 )
 from warp_abtree.lod.timing import COST_STAGES
-from warp_abtree.query.narrow_phase import Result
+from warp_abtree.query.result import Result
 
 # A test of two triangles costs about as much as so many tests of two boxes.
 TRIANGLE_WORK = 4.0

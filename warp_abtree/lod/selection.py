@@ -17,7 +17,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import to_numpy, whole_number
 from warp_abtree.kernels.lod import selection as kernels
-from warp_abtree.state.update import full_share
+from warp_abtree.state.lod_update import full_refit_fraction
 
 SPACINGS = ("operations", "ratio")
 LEVELS_PER_OCTAVE = int(kernels.STEPS_PER_OCTAVE) // int(kernels.DITHER)
@@ -188,7 +188,7 @@ class View:
     def __init__(self, scene, window: int = 10):
         self.scene = scene
         self.window = whole_number(window, "window", 1, 1000)
-        self.arrays = scene.arrays()
+        self._batch = scene.batch()
         self.device, count = scene.device, scene.object_count
         self._object_model = wp.array(np.array(scene.object_model, np.int32), dtype=wp.int32, device=self.device)
         self.distance, self.motion = (wp.zeros(count, dtype=wp.float64, device=self.device) for _ in range(2))
@@ -204,8 +204,7 @@ class View:
 
     def check(self):
         """Raise RuntimeError where the scene's objects changed since the operator was made."""
-        if self.arrays != self.scene.arrays():
-            raise RuntimeError("objects were added to the scene since this selection was made; make a new one")
+        self._batch.check("selection")
 
     def launch(self):
         """Measure. Launches only.
@@ -214,7 +213,7 @@ class View:
             RuntimeError: The scene's objects changed.
         """
         self.check()
-        models, _, objects = self.arrays
+        models, objects = self._batch.models, self._batch.objects
         inputs = [self.window, models.pool.centre, self._object_model, self._view]
         inputs += [objects.pool.rotation, objects.pool.position, self._frame]
         inputs += [self._screen, self._path, self.distance, self.motion, self.focus]
@@ -381,7 +380,7 @@ class PredictedSelection:
         launch(kernels.raise_faces_kernel, len(prediction.power_up), pool, prediction)
         inputs = models, pool, self.dial, self._offset, self.rung, self.work, prediction
         launch(kernels.predict_work_kernel, (candidates, int(kernels.CHUNKS)), *inputs)
-        share = full_share(self.view.device)
+        share = full_refit_fraction(self.view.device)
         launch(kernels.predict_refit_kernel, (candidates, models), models, share, pool, prediction)
         launch(kernels.sum_chunk_kernel, candidates, prediction)
         limits = self.budget, self.aim, self.low, self.patience, self.dial_max, self.stay

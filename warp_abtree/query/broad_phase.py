@@ -4,19 +4,19 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device
-from warp_abtree.kernels import broad_phase as broadphase
-from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
+from warp_abtree.kernels.broad_phase import find_pair_kernel, pose_box_kernel
+from warp_abtree.query.request import CapacityError
+from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
 
 EVERY_WORLD = -1
 
 
-class CapacityError(RuntimeError):
-    """A buffer was too small and work was lost; the message names the demand."""
-
-
 class BroadPhase:
-    """Broad phase of a fixed set of objects: allocates once, launches many times.
+    """Broad phase of a batch: allocates once, launches many times.
+
+    Args:
+        capacity: Pairs that there is room for at first.
 
     Attributes:
         pairs: (i, j), i < j, in no order, device vec2i (capacity,).
@@ -24,23 +24,21 @@ class BroadPhase:
         guard: `LaunchGuard` of what launches it; a query takes its own.
     """
 
-    def __init__(self, models: ModelArrays, states: StateArrays, objects: ObjectArrays, excluded, capacity=None):
-        self.models = models
-        self.states = states
-        self.objects = objects
-        self.device = device = states.device
+    def __init__(self, batch: Batch, capacity=None):
+        self.batch = batch
+        self.device = device = batch.device
         check_device(device, "making a broad phase")
-        count = objects.pool.state.shape[0]
-        worlds = objects.pool.world.numpy()
+        count = batch.object_count
+        worlds = batch.objects.pool.world.numpy()
         names, group = np.unique(worlds, return_inverse=True)
         everywhere = np.flatnonzero(names == EVERY_WORLD)
         self.shared_group = int(everywhere[0]) if len(everywhere) else -1
         self.lower = wp.zeros(count, dtype=wp.vec3, device=device)
         self.upper = wp.zeros(count, dtype=wp.vec3, device=device)
         self.group = wp.array(group.astype(np.int32), dtype=wp.int32, device=device)
-        self.excluded = wp.array(excluded, dtype=wp.int64, device=device)
+        self.excluded = wp.array(batch.excluded, dtype=wp.int64, device=device)
         self.pair_count = wp.zeros(1, dtype=wp.int32, device=device)
-        self.guard = LaunchGuard(device, states.generation, objects.filter_generation)
+        self.guard = LaunchGuard(device, batch.states.generation, batch.filter_generation)
         self.resize(capacity or max(64, 4 * count))
         self._launch_boxes()
         # Made here, since no graph can capture it.
@@ -56,26 +54,18 @@ class BroadPhase:
         self.bvh.rebuild()
         self.pair_count.zero_()
         wp.launch(
-            broadphase.find_pair_kernel,
+            find_pair_kernel,
             dim=len(self.lower),
             inputs=[
-                self.shared_group,
-                self.bvh.id,
-                self.lower,
-                self.upper,
-                self.group,
-                self.excluded,
-                self.objects.pool,
-                self.pair_count,
-                self.pairs,
+                *(self.shared_group, self.bvh.id, self.lower, self.upper, self.group, self.excluded),
+                *(self.batch.objects.pool, self.pair_count, self.pairs),
             ],
             device=self.device,
         )
 
     def _launch_boxes(self):
-        pools = [self.models.pool, self.states.pool, self.objects.pool]
-        inputs = [*pools, self.guard.record(), self.lower, self.upper]
-        wp.launch(broadphase.pose_box_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
+        inputs = [*self.batch.pools, self.guard.record(), self.lower, self.upper]
+        wp.launch(pose_box_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
 
     def count_found(self) -> int:
         """Return how many pairs the last launch found. Waits for the device.
@@ -99,9 +89,3 @@ class BroadPhase:
         first, second = self.pairs.numpy()[:found].reshape(-1, 2).astype(np.int64).T
         keys = np.sort((first << 32) + second)
         return np.stack([keys >> 32, keys & (2**32 - 1)], 1).astype(np.int32)
-
-
-def exclusion_keys(pairs: np.ndarray) -> np.ndarray:
-    """Return sorted unique keys i * 2^32 + j, i < j, of pairs (p, 2) in either order, int64."""
-    pairs = np.sort(np.asarray(pairs, np.int64).reshape(-1, 2), axis=1)
-    return np.unique((pairs[:, 0] << 32) + pairs[:, 1])

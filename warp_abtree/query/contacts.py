@@ -48,51 +48,9 @@ import warp as wp
 from warp_abtree.kernels.contact import contact
 from warp_abtree.kernels.contact import sort_hits as order
 from warp_abtree.kernels.contact import summary as reduce
-from warp_abtree.query.broad_phase import CapacityError
-from warp_abtree.query.narrow_phase import Query, Result
-
-VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
-
-
-def contact_dtypes(dtype=np.float64):
-    """Return the types of `Result.contacts` and `Result.pair_contacts`, real numbers of a type inside.
-
-    Raises:
-        ValueError: The type is neither float32 nor float64.
-    """
-    try:
-        real = np.dtype(dtype)
-    except TypeError:
-        real = None
-    if real not in (np.float32, np.float64):
-        raise ValueError(f"contact_dtype {dtype!r} is neither float32 nor float64")
-    indices = [("pair", np.int32), ("faces", np.int32, (2,))]
-    vectors = [(name, real, (3,)) for name in VECTORS]
-    means = [("point", real, (3,)), ("normal", real, (3,)), ("depth", real)]
-    return np.dtype([*indices, *vectors, ("coplanar", bool)]), np.dtype([("count", np.int64), *means])
-
-
-class ContactResult(Result):
-    """What a `ContactQuery` found, on the host: faces, contacts and their summaries as `Result` describes them."""
-
-    def __init__(self, query, pairs, pair_demand):
-        super().__init__(pairs, "contacts", pair_demand, len(query.pairs), query.hits, query.near)
-        self._hit_demand = int(self.count.sum())
-        rows = min(self._hit_demand, self._hit_room)
-        face_type, pair_type = contact_dtypes(query.contact_dtype)
-        self.contacts, self.pair_contacts = np.zeros(rows, face_type), np.zeros(len(pairs), pair_type)
-        self.faces = np.empty((0, 3), np.int32)
-        self.pair_contacts["count"] = self.count
-        with np.errstate(over="ignore"):
-            if len(pairs):
-                for name in ("point", "normal", "depth"):
-                    self.pair_contacts[name] = getattr(query.pair_contacts, name)[: len(pairs)].numpy()
-            if rows:
-                # On the CPU numpy() shares the memory that the next launch writes.
-                self.faces = query.faces[:rows].numpy().copy()
-                for name in (*VECTORS, "coplanar"):
-                    self.contacts[name] = getattr(query.contacts, name)[:rows].numpy()
-        self.contacts["pair"], self.contacts["faces"] = self.faces[:, 0], self.faces[:, 1:]
+from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.request import CapacityError
+from warp_abtree.query.result import VECTORS, ContactResult, Result, contact_dtypes
 
 
 class ContactQuery(Query):
@@ -101,9 +59,9 @@ class ContactQuery(Query):
     `launch()` only launches, sorting included, so that a CUDA graph can take poses to contacts without the host.
 
     Args:
-        scene, pairs, pair_capacity, precision, within, unsure_capacity: As for `Query`.
-        capacity: Contacts that there is room for, below 2^30. Room that stays empty takes 180 bytes a contact and time
-            to sort all the same.
+        scene, pairs, precision, within: As for `Query`.
+        capacity: `Buffers`, or the contacts that there is room for, below 2^30. Room that stays empty takes 180 bytes a
+            contact and time to sort all the same.
         contact_dtype: Type of the real numbers in `result()`, float64 or float32; those beyond float32 become infinite.
 
     Attributes:
@@ -116,29 +74,19 @@ class ContactQuery(Query):
             missing in all of the above, on a GPU not the same in each launch.
     """
 
-    key_bits = 63  # of a sort key; an object pair and two faces that take more are sorted in two passes
+    result_type: type[Result] = ContactResult
     faces: wp.array
     start: wp.array
     _key: wp.array
     _order: wp.array
     _places = 0
 
-    def __init__(
-        self,
-        scene,
-        pairs=None,
-        capacity=None,
-        pair_capacity=None,
-        precision="exact",
-        within=None,
-        unsure_capacity=None,
-        contact_dtype=np.float64,
-    ):
+    def __init__(self, scene, pairs=None, capacity=None, precision="exact", within=None, contact_dtype=np.float64):
         contact_dtypes(contact_dtype)
         self.contact_dtype = contact_dtype
         self.contacts, self.pair_contacts = contact.Contacts(), reduce.PairContacts()
         self._sums = reduce.ChunkSums()
-        super().__init__(scene, "faces", pairs, capacity, pair_capacity, precision, within, unsure_capacity)
+        super().__init__(scene, "faces", pairs, capacity, precision, within)
 
     def resize(self, capacity: int):
         """Make room for a number of contacts.
@@ -206,8 +154,8 @@ class ContactQuery(Query):
     def _passes(self):
         """Return the bits of (pair, face a, face b) that each pass of the sort looks at."""
         pair = len(self.pairs).bit_length()
-        face = (max(model.face_count for model in self.scene.models) - 1).bit_length()
-        if pair + 2 * face <= self.key_bits:
+        face = (int(self.batch.models.face_count.max()) - 1).bit_length()
+        if pair + 2 * face <= self._regime.key_bits:
             return [(pair, face, face)]
         return [(0, 0, face), (pair, face, 0)]
 
@@ -223,12 +171,12 @@ class ContactQuery(Query):
         self._launch_kernel(order.start_pair_kernel, room + 1, [capacity, sum(widths[1:]), self._key, self.start])
 
     def _find(self):
-        posed = [*(arrays.pool for arrays in self.arrays), self.pairs, self.pair_poses]
+        posed = [*self.batch.pools, self.pairs, self.pair_poses]
         self._launch_kernel(contact.find_contact_kernel, self._places, [*posed, self.start, self.faces, self.contacts])
 
     def _reduce(self):
         room, chunks = len(self.pairs), len(self._sums.span)
-        pools = [arrays.pool for arrays in self.arrays]
+        pools = self.batch.pools
         start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
         self._launch_kernel(reduce.sum_length_kernel, chunks, [start, contacts, sums])
         self._launch_kernel(reduce.total_length_kernel, room, [start, sums])
@@ -237,7 +185,3 @@ class ContactQuery(Query):
         posed = [*pools, self.pairs, self.pair_poses]
         self._launch_kernel(reduce.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
         self._launch_kernel(reduce.measure_depth_kernel, room, [*pools, self.pairs, start, contacts, sums, means])
-
-    def result(self) -> ContactResult:
-        """Return faces, contacts and summaries of the last launch on the host. Waits for the device."""
-        return ContactResult(self, *self._asked())

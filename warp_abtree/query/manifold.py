@@ -22,38 +22,12 @@ Source of the area vector as a gradient: Allard et al. 2010, Volume Contact Cons
 section 3; that the boundary curve gives it is Stokes' theorem.
 """
 
-import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device
 from warp_abtree.kernels.contact import manifold
-from warp_abtree.kernels.contact.manifold import POINTS
 from warp_abtree.kernels.dynamics import bodies
 from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.narrow_phase import Result
-
-POINTS_MAX = int(POINTS)
-
-
-class ManifoldResult(Result):
-    """What a `ManifoldQuery` found, on the host: as `Result` of output "count", and the points.
-
-    Attributes:
-        points: Contact points in the order of pairs: a dictionary of pair, place in `pairs`, int (k,); point, normal,
-            float64 (k, 3), and depth, (k,), as `ManifoldQuery.manifolds`; None where they were left on the device.
-    """
-
-    def __init__(self, query, pairs, pair_demand, with_points=True):
-        super().__init__(pairs, "count", pair_demand, len(query.pairs), query.hits)
-        self._hit_demand, self._hit_room = int(self.count.sum()), len(query.hits.face)
-        self.points = None
-        if not with_points:
-            return
-        count = query.manifolds.count.numpy()[: len(pairs)]
-        used = np.arange(POINTS_MAX) < count[:, None]
-        self.points = {"pair": np.repeat(np.arange(len(pairs)), count)}
-        for name in ("point", "normal", "depth"):
-            self.points[name] = getattr(query.manifolds, name).numpy()[: len(pairs)][used]
+from warp_abtree.query.result import POINTS_MAX, ManifoldResult, Result
 
 
 class ManifoldQuery(ContactQuery):
@@ -62,7 +36,7 @@ class ManifoldQuery(ContactQuery):
     Pairs of the broad phase are sorted by their objects, so that nothing depends on the order in which it found them.
 
     Args:
-        scene, pairs, capacity, pair_capacity, precision: As for `ContactQuery`.
+        scene, pairs, capacity, precision: As for `ContactQuery`.
         roles: Device int32 (n,) of `kernels.bodies` roles: pairs of the broad phase in which nothing can move are left
             out. None keeps all.
 
@@ -72,13 +46,15 @@ class ManifoldQuery(ContactQuery):
             the greatest int64 behind the last pair.
     """
 
+    result_type: type[Result] = ManifoldResult
+    growth = 2
     pair_key: wp.array
     _pair_order: wp.array
 
-    def __init__(self, scene, pairs=None, capacity=None, pair_capacity=None, precision="exact", roles=None):
+    def __init__(self, scene, pairs=None, capacity=None, precision="exact", roles=None):
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
         self.roles = wp.empty(0, dtype=wp.int32, device=scene.device) if roles is None else roles
-        super().__init__(scene, pairs, capacity, pair_capacity, precision)
+        super().__init__(scene, pairs, capacity, precision)
 
     def _place_arrays(self, capacity: int) -> list:
         made = super()._place_arrays(capacity)
@@ -118,7 +94,7 @@ class ManifoldQuery(ContactQuery):
         self._sort()
         self._find()
         capacity, room = self._places, len(self.pairs)
-        pools = [arrays.pool for arrays in self.arrays]
+        pools = self.batch.pools
         start, rows, curves = self.start, self.faces, self.curves
         self._launch_kernel(manifold.begin_loop_kernel, capacity, [start, rows, curves, self._order, self._key])
         self._sort_keys(capacity, 31 + room.bit_length())
@@ -135,32 +111,7 @@ class ManifoldQuery(ContactQuery):
         with wp.ScopedDevice(self.device):
             wp.utils.radix_sort_pairs(self._key, self._order, count, end_bit=bits)
 
-    def run_grown(self):
-        """Launch, and again with more room until nothing is lost. Waits for the device.
-
-        Raises:
-            CapacityError: 2^26 pairs, or 2^30 contacts, or more.
-        """
-        check_device(self.device, "ManifoldQuery.run (launch can)")
-        self._check_scene()
-        with self.guard.launching(self):
-            self._launch()
-            if self.broad_phase is not None and self.broad_phase.count_found() > len(self.pairs):
-                self._take_pairs(wp.empty(2 * self.broad_phase.count_found(), dtype=wp.vec2i, device=self.device))
-                self._launch()
-            self.grow_unsure()
-            if self._sum(self.hits.count) > self._places:
-                self.resize(2 * self._sum(self.hits.count))
-                self.traverse()
-
-    def result(self, with_points: bool = True) -> ManifoldResult:  # type: ignore[override]  # points, not contacts
+    def result(self, with_points: bool = True) -> ManifoldResult:
         """Return the counts and, unless told otherwise, the contact points of the last launch on the host. Waits."""
-        pairs, demand = self._asked()
+        pairs, demand = self._queried()
         return ManifoldResult(self, pairs, demand, with_points)
-
-    def run(self) -> ManifoldResult:
-        """Launch, grow buffers that were too small, and return the whole result. Waits for the device."""
-        self.run_grown()
-        result = self.result()
-        result.check()
-        return result

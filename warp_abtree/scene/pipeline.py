@@ -8,14 +8,14 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.kernels import pipeline as kernels
-from warp_abtree.query.broad_phase import CapacityError
 from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.narrow_phase import Query, Result
+from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.request import CapacityError, check_capacity
+from warp_abtree.query.result import Result
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE
-from warp_abtree.scene.scene import Scene
-from warp_abtree.state.arrays import ObjectArrays, StateArrays
+from warp_abtree.state.device_update import NO_FAULTS, DeviceLodUpdate, LevelStates
 from warp_abtree.state.generation import STALE_GRAPH
-from warp_abtree.state.update import NO_FAULTS, LodLadder, LodUpdate, build_states
+from warp_abtree.state.lod_update import build_states
 
 
 def check_groups(groups, object_model) -> np.ndarray:
@@ -37,7 +37,7 @@ def check_groups(groups, object_model) -> np.ndarray:
 
 
 def check_ladder(ladder, models) -> list:
-    """Return the rungs of each model, rising int arrays.
+    """Return the levels of each model, rising int arrays.
 
     Raises:
         ValueError: Not one list a model, an empty one, or a LOD out of range.
@@ -45,35 +45,11 @@ def check_ladder(ladder, models) -> list:
     parts = [list(part) for part in ladder]
     if len(parts) != len(models):
         raise ValueError(f"ladder: {len(parts)} lists of LODs given for {len(models)} models")
-    rungs = [np.unique([model.check_lod(lod) for lod in part]).astype(np.int64) for part, model in zip(parts, models)]
-    empty = [i for i, part in enumerate(rungs) if not len(part)]
+    levels = [np.unique([model.check_lod(lod) for lod in part]).astype(np.int64) for part, model in zip(parts, models)]
+    empty = [i for i, part in enumerate(levels) if not len(part)]
     if empty:
         raise ValueError(f"ladder: no LOD for model {empty[0]}")
-    return rungs
-
-
-class _Posed:
-    """What a `Query` asks of a scene: the scene's models, and states and objects of the frame's own."""
-
-    check_pairs = Scene.check_pairs
-
-    def __init__(self, scene: Scene):
-        models, _, placed = scene.arrays()
-        self.device = scene.device
-        self.models = list(scene.models)
-        self.object_model = np.array(scene.object_model)
-        self._excluded = scene.excluded_keys()
-        self.object_count = scene.object_count
-        objects = ObjectArrays(placed.pool.world.numpy(), placed.pool.is_static.numpy(), self.device)
-        wp.copy(objects.pool.rotation, placed.pool.rotation)
-        wp.copy(objects.pool.position, placed.pool.position)
-        self._arrays = (models, StateArrays(models, self.device), objects)
-
-    def arrays(self):
-        return self._arrays
-
-    def excluded_keys(self):
-        return self._excluded
+    return levels
 
 
 class FrameGraph:
@@ -99,17 +75,17 @@ class FrameGraph:
     * One an object, or one a group of objects, updated in place by the AB-Tree's own update, a full refit where more
       than half of the faces may change, on CUDA a hundredth: any LOD, some 90 to 140 bytes a face and state, a tenth of
       that for worklists. They have room for all states to change at once.
-    * With a ladder, one a model and rung, made beforehand: an LOD change costs an index. The less memory where a model
-      has more objects than rungs.
+    * With a ladder, one a model and level, made beforehand: an LOD change costs an index. The less memory where a model
+      has more objects than levels.
 
     Args:
         scene: `Scene` with all its objects.
         output: "any", "count", "faces" or "contacts".
-        pairs, capacity, pair_capacity, precision, within, unsure_capacity: As for `Query`; in a graph nothing grows.
         groups: Group of each object, int (n,), from 0 without gaps; the objects of a group share model, LOD and state.
             None gives each object a state of its own.
         ladder: LODs that objects may stand at, one list for each of `scene.models`, in any order. The coarsest one that
-            is not coarser serves a wish.
+            is not coarser serves a request.
+        request: pairs, capacity, precision and within, as for `Query`; in a graph nothing grows.
 
     Attributes:
         poses: x y z qx qy qz qw [world units, unit quaternion], device float64 (n, 7); those of the scene at first.
@@ -123,72 +99,58 @@ class FrameGraph:
         ValueError: Bad groups, a bad ladder or request, an empty scene, or states of 2^30 nodes and more.
     """
 
-    def __init__(
-        self,
-        scene,
-        output="any",
-        pairs=None,
-        capacity=None,
-        pair_capacity=None,
-        precision="exact",
-        within=None,
-        unsure_capacity=None,
-        groups=None,
-        ladder=None,
-    ):
+    def __init__(self, scene, output="any", groups=None, ladder=None, **request):
         check_device(scene.device, "making a FrameGraph")
-        posed = _Posed(scene)
-        self.device = scene.device
-        self._models, self._states, self._objects = posed.arrays()
+        self.batch = batch = scene.batch().with_own_states()
+        self.device = batch.device
         if groups is not None and ladder is not None:
             raise ValueError("groups and ladder: give one of them; with a ladder objects share states anyway")
         if ladder is None:
-            self._update = self._own_states(scene.lods, groups, posed.object_model)
+            self._update = self._own_states(scene.lods, groups)
         else:
-            self._update = self._make_ladder(scene.lods, ladder, posed)
+            self._update = self._make_ladder(scene.lods, ladder, scene.models)
         self.lods = self._update.wanted
         plan = getattr(self._update, "plan", None)
         self.changed_count = None if plan is None else plan.changed_count
         self.marked_count = None if plan is None else plan.marked_count
-        self.poses = wp.empty((len(posed.object_model), 7), dtype=wp.float64, device=self.device)
-        wp.launch(kernels.read_pose_kernel, len(self.poses), [self._objects.pool, self.poses], device=self.device)
+        self.poses = wp.empty((batch.object_count, 7), dtype=wp.float64, device=self.device)
+        wp.launch(kernels.read_pose_kernel, len(self.poses), [batch.objects.pool, self.poses], device=self.device)
         self._bad_poses = wp.empty(2, dtype=wp.int32, device=self.device)
         self._demand = wp.zeros(4, dtype=wp.int64, device=self.device)
-        options = {"pairs": pairs, "capacity": capacity, "pair_capacity": pair_capacity, "precision": precision}
-        options |= {"within": within, "unsure_capacity": unsure_capacity}
-        asked: type[Query] | partial = ContactQuery if output == "contacts" else partial(Query, output=output)
-        self.query: Query = asked(posed, **options)
+        make = ContactQuery if output == "contacts" else partial(Query, output=output)
+        self.query: Query = make(batch, **request)
         # Loads the kernels, and tells what the poses as they stand take.
         self.launch()
-        self._fit_unsure(unsure_capacity)
+        self._fit_uncertain(request.get("capacity"))
         self.clear_faults()
 
-    def _own_states(self, lods, groups, object_model):
+    def _own_states(self, lods, groups):
         """Make a state an object or group."""
+        batch, object_model = self.batch, self.batch.object_model
         group = np.arange(len(lods)) if groups is None else check_groups(groups, object_model)
         first = np.unique(group, return_index=True)[1]
-        ids = build_states(self._models, self._states, object_model[first].tolist(), lods[first])
-        self._objects.set_states(np.array(ids)[group])
-        return LodUpdate(self._models, self._states)
+        ids = build_states(batch.models, batch.states, object_model[first].tolist(), lods[first])
+        batch.objects.set_states(np.array(ids)[group])
+        return DeviceLodUpdate(batch.models, batch.states)
 
-    def _make_ladder(self, lods, ladder, posed):
-        """Make a state a model and rung."""
-        rungs = check_ladder(ladder, posed.models)
-        last = np.array([part[-1] for part in rungs])[posed.object_model]
-        wanted = np.minimum(lods, last)
-        return LodLadder(self._models, self._states, self._objects, posed.object_model, rungs, wanted)
+    def _make_ladder(self, lods, ladder, models):
+        """Make a state a model and level."""
+        levels = check_ladder(ladder, models)
+        last = np.array([part[-1] for part in levels])[self.batch.object_model]
+        return LevelStates(self.batch, levels, np.minimum(lods, last))
 
-    def _fit_unsure(self, given):
-        """Make room for the face pairs that float32 leaves open, unless that room was given; then say what it lacks."""
+    def _fit_uncertain(self, capacity):
+        """Make room for the uncertain face pairs, unless that room was given; then say what it lacks."""
+        given = check_capacity(capacity).uncertain
         needed, room = int(self._demand.numpy()[2]), len(self.query.hits.unsure)
         if not 0 < room < needed:
             return
         if given is None:
-            self.query.grow_unsure()
+            self.query.grow_uncertain()
             return
         warnings.warn(
-            f"unsure_capacity={given}: the poses as they stand leave {needed} face pairs open after float32; "
-            f"make it with unsure_capacity={needed}, or without",
+            f"Buffers(uncertain={given}): the poses as they stand leave {needed} face pairs uncertain after float32; "
+            f"make it with uncertain={needed}, or without",
             RuntimeWarning,
             stacklevel=3,
         )
@@ -207,7 +169,7 @@ class FrameGraph:
 
     def _set_objects(self):
         record = self.query.guard.record()
-        inputs = [QUATERNION_TOLERANCE, self.poses, self._objects.pool, self._bad_poses, record]
+        inputs = [QUATERNION_TOLERANCE, self.poses, self.batch.objects.pool, self._bad_poses, record]
         wp.launch(kernels.place_object_kernel, len(self.poses), inputs, device=self.device)
         self._update.launch()
 
@@ -272,17 +234,15 @@ class FrameGraph:
                 f"lods: {lods[0]} entries since the last check were out of range; the first one that had one is "
                 f"{lods[1]}, and took the nearer end"
             )
-        room = {"pair_capacity": len(self.query.pairs)}
-        demands = {"pair_capacity": found, "capacity": hits, "unsure_capacity": unsure}
+        room = {"pairs": (found, len(self.query.pairs))}
         if self.query.output == "faces":
-            room["capacity"] = len(self.query.hits.face)
+            room["hits"] = hits, len(self.query.hits.face)
         if len(self.query.hits.unsure):
-            room["unsure_capacity"] = len(self.query.hits.unsure)
-        for name, places in room.items():
-            if demands[name] > places:
-                lost.append(
-                    f"a frame since the last check needed {name}={demands[name]}, the frame graph has room for {places}"
-                )
+            room["uncertain"] = unsure, len(self.query.hits.unsure)
+        for name, (demand, places) in room.items():
+            if demand > places:
+                needed = f"Buffers({name}={demand})"
+                lost.append(f"a frame since the last check needed {needed}, the frame graph has room for {places}")
         if stale:
             stale_frame = f"a frame since the last check is lost: its graph {STALE_GRAPH}"
             raise RuntimeError("; ".join([stale_frame, *lost, *wrong]))

@@ -7,12 +7,15 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
 from warp_abtree.model.model import Model
-from warp_abtree.query.broad_phase import EVERY_WORLD, BroadPhase, exclusion_keys
-from warp_abtree.query.contacts import ContactQuery, contact_dtypes
-from warp_abtree.query.narrow_phase import Query, Result, check_request, check_within
+from warp_abtree.query.broad_phase import EVERY_WORLD, BroadPhase
+from warp_abtree.query.contacts import ContactQuery
+from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.request import check_request, check_within
+from warp_abtree.query.result import Result, contact_dtypes
 from warp_abtree.scene.poses import check_poses, device_rows, launch_place, place_rows
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
-from warp_abtree.state.update import UpdateStats, set_object_lods
+from warp_abtree.state.batch import Batch, check_pairs, exclusion_keys
+from warp_abtree.state.lod_update import LodUpdate
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class Scene:
         self._added_pose: list[np.ndarray] = []
         self._lod: list[int] = []
         self._excluded = np.empty(0, np.int64)
-        self._arrays: tuple[ModelArrays, StateArrays, ObjectArrays] | None = None
+        self._batch: Batch | None = None
         self._broad_phase: BroadPhase | None = None
         self._queries: dict[tuple, Query] = {}
 
@@ -75,7 +78,7 @@ class Scene:
     @property
     def lods(self) -> np.ndarray:
         """LOD of each object, int32 (n,)."""
-        return np.array(self._lod, np.int32)
+        return np.array(self._lod if self._batch is None else self._batch.lods, np.int32)
 
     def add(self, model, pose=(0, 0, 0, 0, 0, 0, 1), world=0, lod=None, importance=1, static=False) -> int:
         """Add an object and return its index.
@@ -119,47 +122,37 @@ class Scene:
 
     def _retire(self):
         """Take the device's poses back before the arrays are made anew. Waits for the device."""
-        if self._arrays is None:
+        if self._batch is None:
             return
         check_device(self.device, "adding an object")
-        _, states, objects = self._arrays
+        objects = self._batch.objects
         matrices = np.tile(np.eye(4), (len(objects.state), 1, 1))
         matrices[:, :3, :3] = objects.pool.rotation.numpy()
         matrices[:, :3, 3] = objects.pool.position.numpy()
-        states.generation.advance()
-        objects.generation.advance()
-        self._added_pose = list(matrices)
+        self._batch.retire()
+        self._added_pose, self._lod = list(matrices), self._batch.lods.tolist()
         self._queries.clear()
         self._broad_phase = None
-        self._arrays = None
+        self._batch = None
 
-    def arrays(self) -> tuple[ModelArrays, StateArrays, ObjectArrays]:
-        """Return (`ModelArrays`, `StateArrays`, `ObjectArrays`), made at the first use after an `add`.
+    def batch(self) -> Batch:
+        """Return the scene's `Batch`, made at the first use after an `add`.
 
         Tree states that an interrupted change of LODs has left torn are made anew.
         """
-        if self._arrays is None:
+        if self._batch is None:
             if not self.object_model:
                 raise ValueError("the scene has no object")
             check_device(self.device, "making a scene's arrays")
             models = ModelArrays(self.models, self.device)
             states = StateArrays(models, self.device)
             objects = ObjectArrays(self._world, self._static, self.device)
-            self._bring_lods(models, states, objects)
+            batch = Batch(models, states, objects, self.object_model, self._excluded)
+            batch.set_lods(np.array(self._lod))
             self._place_added(objects.pool)
-            self._arrays = (models, states, objects)
-        elif self._arrays[1].torn:
-            check_device(self.device, "making tree states anew")
-            models, states, objects = self._arrays
-            states.reset()
-            objects.state = np.full(self.object_count, -1, np.int32)
-            self._bring_lods(models, states, objects)
-            states.generation.resume()
-            states.torn = False
-        return self._arrays
-
-    def _bring_lods(self, models, states, objects):
-        set_object_lods(models, states, objects, np.array(self.object_model), np.array(self._lod))
+            self._batch = batch
+        self._batch.mend()
+        return self._batch
 
     def _place_added(self, pool):
         """Set poses of both kinds: the device turns quaternions into matrices, matrices are taken as they are."""
@@ -196,13 +189,13 @@ class Scene:
         given = len(poses) if rows is None else len(rows)
         if given != self.object_count:
             raise ValueError(f"poses: {given} given for {self.object_count} objects")
-        pool = self.arrays()[2].pool
+        pool = self.batch().objects.pool
         if rows is not None:
             place_rows(rows, pool)
         else:
             launch_place(wp.array(poses.reshape(given, -1), dtype=wp.float64, device=self.device), pool)
 
-    def set_lods(self, lods) -> UpdateStats:
+    def set_lods(self, lods) -> LodUpdate:
         """Bring every object to a LOD: meshes are refined and trees updated in one batch, states are shared.
 
         Args:
@@ -223,50 +216,19 @@ class Scene:
         if len(bad):
             i = int(bad[0])
             raise ValueError(f"lods: object {i} asks for LOD {lods[i]}, outside 0 .. {top[i]}")
-        models, states, objects = self.arrays()
-        targets = lods.astype(np.int64)
-        with states.change():
-            stats = set_object_lods(models, states, objects, np.array(self.object_model), targets)
-            self._lod = targets.tolist()
-        return stats
-
-    def check_pairs(self, pairs) -> np.ndarray:
-        """Return object pairs as int32 (p, 2).
-
-        Raises:
-            ValueError: Wrong shape, an index that is no object, an object paired with itself.
-        """
-        pairs = to_numpy(pairs, "pairs")
-        if pairs.shape in ((0,), (0, 2)):
-            return np.empty((0, 2), np.int32)
-        if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind not in "iu":
-            raise ValueError(f"pairs: shape {pairs.shape} and type {pairs.dtype}, not whole numbers of shape (p, 2)")
-        if pairs.min() < 0 or pairs.max() >= self.object_count:
-            bad = np.flatnonzero(((pairs < 0) | (pairs >= self.object_count)).any(1))
-            raise ValueError(
-                f"pairs: pair {bad[0]} is {tuple(pairs[bad[0]].tolist())}, the scene has {self.object_count} objects"
-            )
-        same = pairs[:, 0] == pairs[:, 1]
-        if same.any():
-            first = int(same.argmax())
-            raise ValueError(f"pairs: pair {first} pairs object {pairs[first, 0]} with itself")
-        return pairs.astype(np.int32)
+        return self.batch().set_lods(lods.astype(np.int64))
 
     def filter(self, pairs):
         """Exclude object pairs from every later broad phase.
 
         Raises:
-            ValueError: As `check_pairs`.
+            ValueError: Wrong shape, an index that is no object, an object paired with itself.
         """
-        excluded = np.union1d(self._excluded, exclusion_keys(self.check_pairs(pairs)))
-        if self._arrays is not None:
-            self._arrays[2].filter_generation.advance()
+        excluded = np.union1d(self._excluded, exclusion_keys(check_pairs(pairs, self.object_count)))
+        if self._batch is not None:
+            self._batch.exclude(excluded)
         self._broad_phase = None
         self._excluded = excluded
-
-    def excluded_keys(self) -> np.ndarray:
-        """Return the excluded pairs as sorted keys i * 2^32 + j, i < j, int64."""
-        return self._excluded
 
     def broad_phase(self) -> np.ndarray:
         """Return the object pairs whose posed root boxes overlap, int32 (p, 2), sorted, i < j. Waits for the device.
@@ -276,9 +238,9 @@ class Scene:
         check_device(self.device, "Scene.broad_phase")
         if self.object_count < 2:
             return np.empty((0, 2), np.int32)
-        arrays = self.arrays()
+        batch = self.batch()
         if self._broad_phase is None:
-            self._broad_phase = BroadPhase(*arrays, self._excluded)
+            self._broad_phase = BroadPhase(batch)
         return self._broad_phase.find()
 
     def intersect(self, pairs=None, output="any", precision="exact", within=None, contact_dtype=np.float64) -> Result:
@@ -292,7 +254,7 @@ class Scene:
             output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
                 an object pair's summary of them, stands in `warp_abtree.query.contacts`.
             precision: "exact": the answer is exact for A's vertices and the posed ones of B, A the object with the
-                smaller index. "float64" and "float32" take the signs of rounded determinants.
+                smaller index. "float32" takes the signs of rounded determinants.
             within: Distance d >= 0 [world units], or (p,) of them: `result.apart` tells the pairs whose posed surfaces,
                 at their LODs, are proved farther apart than d; never true where they are not, whatever the rounding.
                 With d = error_at(A) + error_at(B) it proves that the original meshes do not intersect. The broad phase
@@ -306,7 +268,7 @@ class Scene:
         contact_dtypes(contact_dtype)
         with_contacts = output == "contacts"
         check_request("faces" if with_contacts else output, precision)
-        pairs = self.broad_phase() if pairs is None else self.check_pairs(pairs)
+        pairs = self.broad_phase() if pairs is None else check_pairs(pairs, self.object_count)
         if within is not None:
             within = check_within(within, len(pairs))
         asked = (output, precision, within is not None)
@@ -332,8 +294,8 @@ class Scene:
         """
         check_device(self.device, "Scene.tree_state")
         i = whole_number(i, "object", 0, self.object_count - 1)
-        _, states, objects = self.arrays()
-        slot = states.slots[objects.state[i]]
+        batch = self.batch()
+        states, slot = batch.states, batch.states.slots[batch.objects.state[i]]
         model = self.models[slot.model]
         nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
         lower, upper, skip = states.read_nodes(slot, model.tree.node_count)

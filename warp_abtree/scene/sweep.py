@@ -1,7 +1,7 @@
-"""`sweep`: one pair of models at very many relative poses, no objects made.
+"""`sweep`: one pair of models at very many relative poses, without objects.
 
-What a pair of models needs on a device is kept for the next call. Poses pass through two lanes of buffers: while a GPU
-works on a chunk, the one before is read and the next one brought there.
+What a pair of models needs on a device is kept for the next call. Poses pass through two
+buffer slots: while a GPU works on a chunk, the previous one is read and the next one uploaded.
 """
 
 import functools
@@ -14,12 +14,14 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.device_lock import device_turn
 from warp_abtree.kernels.sweep import NONE_REFUSED, place_matrix_kernel, place_quaternion_kernel, report_chunk_kernel
-from warp_abtree.query.narrow_phase import Query, check_request
+from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.request import check_request
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE, check_poses, device_rows
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.arrays import ObjectArrays
+from warp_abtree.state.batch import Batch
 
-# Poses asked at a time: enough to fill a GPU, few enough that millions need no more memory; fewer where few are asked.
+# Poses of a launch: enough to fill a GPU, few enough that millions need no more memory; fewer where few are given.
 CHUNKS = (1024, 8192, 65536)
 # Pairs of models whose device arrays are kept, and rows of their lists that are.
 KEPT_PAIRS = 4
@@ -91,8 +93,7 @@ class _PosedModels:
     def __init__(self, pair: Scene, owners):
         self.device = pair.device
         self.owners = owners  # weak, and taken out of what is kept when a model goes
-        self.models, self.states, objects = pair.arrays()
-        self.state = objects.state
+        self.batch = pair.batch()
         self.chunks: dict[int, _Chunk] = {}
 
     def find_chunk(self, count):
@@ -104,35 +105,28 @@ class _PosedModels:
 
 
 class _Chunk:
-    """What a `Query` asks of a scene, for object 0, model A, and objects 1 to `room`, all of them model B."""
+    """A batch of object 0, model A, and objects 1 to `room`, all of them model B."""
 
     def __init__(self, posed: _PosedModels, room):
-        self.device = posed.device
-        self.room = room
-        self.objects = ObjectArrays(np.zeros(room + 1), np.zeros(room + 1), self.device)
-        self.objects.set_states(np.repeat(posed.state, [1, room]))
-        self.objects.pool.rotation[:1].assign(np.eye(3)[None])
-        self._arrays = (posed.models, posed.states, self.objects)
-        self.question: _Question | None = None
+        pair, self.room = posed.batch, room
+        objects = ObjectArrays(np.zeros(room + 1), np.zeros(room + 1), posed.device)
+        objects.set_states(np.repeat(pair.objects.state, [1, room]))
+        objects.pool.rotation[:1].assign(np.eye(3)[None])
+        self.batch = Batch(pair.models, pair.states, objects, np.repeat(pair.object_model, [1, room]))
+        self.chunk_query: _ChunkQuery | None = None
 
-    def arrays(self):
-        return self._arrays
-
-    def check_pairs(self, pairs):
-        return pairs
-
-    def ask(self, output, precision):
-        """Return the question that was asked last if it is the same, else another."""
+    def find_query(self, output, precision):
+        """Return the chunk's query if it is of this output and precision, else another."""
         key = (output, precision)
-        if self.question is None or self.question.key != key:
-            self.question = None  # its memory first
-            self.question = _Question(self, key)
-        return self.question
+        if self.chunk_query is None or self.chunk_query.key != key:
+            self.chunk_query = None  # its memory first
+            self.chunk_query = _ChunkQuery(self, key)
+        return self.chunk_query
 
     def trim(self):
         """Give long lists back."""
-        if self.question is not None and not self.question.is_small():
-            self.question = None
+        if self.chunk_query is not None and not self.chunk_query.is_small():
+            self.chunk_query = None
 
 
 @functools.cache
@@ -141,7 +135,7 @@ def _find_copy_stream(alias):
     return wp.Stream(alias)
 
 
-class _Lane:
+class _Slot:
     """Buffers through which a chunk passes: poses in, answers out. On the CPU host and device share them."""
 
     def __init__(self, device, room, output, scalar, width):
@@ -156,126 +150,126 @@ class _Lane:
         self.poses_host, self.report_host = mirror(self.poses_flat), mirror(self.report)
         answer = wp.empty(room, dtype=wp.int64, device=device) if output == "count" else self.answer
         self.answer_host = mirror(answer)
-        self.unsure_room = 0
+        self.uncertain_room = 0
         if device.is_cuda:
             self.loaded, self.done = wp.Event(device), wp.Event(device)
 
 
-class _Question:
-    """One kind of question about a pair of models: its query and its lanes."""
+class _ChunkQuery:
+    """One kind of query about a pair of models, and its buffer slots."""
 
     def __init__(self, chunk: _Chunk, key):
         self.key = key
         self.output, precision = key
-        self.device, self.room, self.objects = chunk.device, chunk.room, chunk.objects
+        self.device, self.room, self.objects = chunk.batch.device, chunk.room, chunk.batch.objects
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
-        self.query = Query(chunk, self.output, pairs=self.pairs, precision=precision)
+        self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision)
         self.count = self.room
-        self.lanes: dict = {}
+        self._slots: dict = {}
         self.copies = _find_copy_stream(self.device.alias) if self.device.is_cuda else None
 
-    def _find_lanes(self, poses):
-        """Return the lanes of poses of one type, made at the first use."""
+    def _find_slots(self, poses):
+        """Return the slots of poses of one type, made at the first use."""
         kind = poses.scalar, poses.width
-        if kind not in self.lanes:
+        if kind not in self._slots:
             count = 1 if self.output == "faces" else 2
-            made = [_Lane(self.device, self.room, self.output, *kind) for _ in range(count)]
+            made = [_Slot(self.device, self.room, self.output, *kind) for _ in range(count)]
             if self.device.is_cuda:
                 # Another stream may touch what was allocated on this one only once it is there.
                 wp.synchronize_device(self.device)
-            self.lanes[kind] = made
-        return self.lanes[kind]
+            self._slots[kind] = made
+        return self._slots[kind]
 
-    def _load(self, lane, poses, start, count):
-        """Bring poses into a lane whose last chunk is over."""
-        width = lane.width
+    def _load(self, slot, poses, start, count):
+        """Bring poses into a slot whose last chunk is over."""
+        width = slot.width
         if isinstance(poses, _DevicePoses):
-            wp.copy(lane.poses_flat, poses.flat, src_offset=width * start, count=width * count)
+            wp.copy(slot.poses_flat, poses.flat, src_offset=width * start, count=width * count)
             return
-        np.copyto(lane.poses_host.numpy().reshape(-1, width)[:count], poses.rows[start : start + count])
+        np.copyto(slot.poses_host.numpy().reshape(-1, width)[:count], poses.rows[start : start + count])
         if self.copies is not None:
-            wp.copy(lane.poses_flat, lane.poses_host, count=width * count, stream=self.copies)
-            self.copies.record_event(lane.loaded)
-            wp.get_stream(self.device).wait_event(lane.loaded)
+            wp.copy(slot.poses_flat, slot.poses_host, count=width * count, stream=self.copies)
+            self.copies.record_event(slot.loaded)
+            wp.get_stream(self.device).wait_event(slot.loaded)
 
-    def _place(self, lane):
-        lane.report.fill_(NONE_REFUSED)
-        kernel, tolerance = PLACING[lane.width]
-        inputs = [wp.float64(tolerance), lane.poses, self.objects.pool, lane.report]
+    def _place(self, slot):
+        slot.report.fill_(NONE_REFUSED)
+        kernel, tolerance = PLACING[slot.width]
+        inputs = [wp.float64(tolerance), slot.poses, self.objects.pool, slot.report]
         wp.launch(kernel, self.count, inputs, device=self.device)
 
-    def _launch(self, lane):
-        self._place(lane)
+    def _launch(self, slot):
+        self._place(slot)
         self.query.launch()
-        inputs = [self.query.hits, lane.report, lane.answer]
+        inputs = [self.query.hits, slot.report, slot.answer]
         wp.launch(report_chunk_kernel, self.count, inputs, device=self.device)
 
-    def _begin(self, lane, poses, start, count):
-        self._load(lane, poses, start, count)
-        lane.unsure_room = len(self.query.hits.unsure)
+    def _begin(self, slot, poses, start, count):
+        self._load(slot, poses, start, count)
+        slot.uncertain_room = len(self.query.hits.unsure)
         if count != self.count:
             self.query.pair_count.fill_(count)
             self.count = count
-        self._launch(lane)
+        self._launch(slot)
         if self.output == "count":
-            wp.copy(lane.answer_host, self.query.hits.count, count=count)
+            wp.copy(slot.answer_host, self.query.hits.count, count=count)
         if self.device.is_cuda:
             if self.output == "any":
-                wp.copy(lane.answer_host, lane.answer, count=count)
-            wp.copy(lane.report_host, lane.report)
-            wp.get_stream(self.device).record_event(lane.done)
+                wp.copy(slot.answer_host, slot.answer, count=count)
+            wp.copy(slot.report_host, slot.report)
+            wp.get_stream(self.device).record_event(slot.done)
 
-    def _finish(self, lane, poses, start, count):
+    def _finish(self, slot, poses, start, count):
         """Wait for a chunk and return its answers."""
         if self.device.is_cuda:
-            wp.synchronize_event(lane.done)
-        refused, unsure = lane.report_host.numpy().tolist()
+            wp.synchronize_event(slot.done)
+        refused, uncertain = slot.report_host.numpy().tolist()
         if refused != NONE_REFUSED:
             _refuse(poses, start + refused)
-        if unsure % 2**32 > lane.unsure_room:  # which may have grown since
-            return getattr(self._ask_again(lane, count), self.output)
-        return lane.answer_host.numpy()[:count]
+        if uncertain % 2**32 > slot.uncertain_room:  # which may have grown since
+            return getattr(self._run_grown(slot, count), self.output)
+        return slot.answer_host.numpy()[:count]
 
-    def _ask_again(self, lane, count):
-        """Ask the poses in a lane, with buffers that grow as needed. Waits for the device."""
+    def _run_grown(self, slot, count):
+        """Query the poses in a slot, with buffers that grow as needed. Waits for the device."""
         self.query.set_pairs(self.pairs[:count])
         self.count = count
-        self._place(lane)
+        self._place(slot)
         return self.query.run()
 
-    def list_answers(self, poses):
+    def find_answers(self, poses):
         """Return "any" or "count" of all poses."""
         answers = np.empty(len(poses), ANSWERS[self.output])
-        lanes, waiting = self._find_lanes(poses), deque()
+        slots, waiting = self._find_slots(poses), deque()
 
         def finish():
-            lane, start, count = waiting.popleft()
-            answers[start : start + count] = self._finish(lane, poses, start, count)
+            slot, start, count = waiting.popleft()
+            answers[start : start + count] = self._finish(slot, poses, start, count)
 
         try:
             for turn, start in enumerate(range(0, len(poses), self.room)):
-                lane, count = lanes[turn % len(lanes)], min(self.room, len(poses) - start)
-                if len(waiting) == len(lanes):
+                slot, count = slots[turn % len(slots)], min(self.room, len(poses) - start)
+                if len(waiting) == len(slots):
                     finish()
-                self._begin(lane, poses, start, count)
-                waiting.append((lane, start, count))
+                self._begin(slot, poses, start, count)
+                waiting.append((slot, start, count))
             while waiting:
                 finish()
         except BaseException:
-            # A pose was refused, or an interruption came: lanes whose transfers are under way must not go yet.
+            # A pose was refused, or an interruption came: slots whose transfers are under way must not go yet.
             wp.synchronize_device(self.device)
             raise
         return answers
 
-    def list_faces(self, poses):
+    def find_faces(self, poses):
         """Return the rows of "faces" of all poses."""
-        parts, lane = [], self._find_lanes(poses)[0]
+        parts, slot = [], self._find_slots(poses)[0]
         for start in range(0, len(poses), self.room):
             count = min(self.room, len(poses) - start)
-            self._load(lane, poses, start, count)
-            found = self._ask_again(lane, count).faces
-            refused = int(lane.report.numpy()[0])
+            self._load(slot, poses, start, count)
+            found = self._run_grown(slot, count).faces
+            refused = int(slot.report.numpy()[0])
             if refused != NONE_REFUSED:
                 _refuse(poses, start + refused)
             found[:, 0] += start
@@ -287,7 +281,7 @@ class _Question:
 
 
 def _keep(key, posed):
-    """Keep what a pair of models has on the device, in the place of what was asked longest ago."""
+    """Keep what a pair of models has on the device, in place of the pair used longest ago."""
     _kept[key] = posed
     for old in list(_kept)[:-KEPT_PAIRS]:
         _kept.pop(old, None)
@@ -340,8 +334,8 @@ def _sweep(pair, models, poses, lods, output, precision):
         owners = [weakref.ref(model, lambda _: _kept.pop(key, None)) for model in models]
         posed = _PosedModels(pair, owners)
     chunk = posed.find_chunk(len(poses))
-    question = chunk.ask(output, precision)
-    answers = question.list_faces(poses) if output == "faces" else question.list_answers(poses)
+    query = chunk.find_query(output, precision)
+    answers = query.find_faces(poses) if output == "faces" else query.find_answers(poses)
     chunk.trim()
     _keep(key, posed)
     return answers

@@ -171,7 +171,7 @@ class RigidBodies:
     def __init__(self, scene: Scene, density, restitution, friction, gravity, kinematic, slop, sleep_speed):
         self.scene, self.device = scene, scene.device
         n = scene.object_count
-        self._objects = scene.arrays()[2]
+        self._objects = scene.batch().objects
         self.gravity = vector(gravity, "gravity")
         self.driven = mask_of(kinematic, n)
         self.rigid = ~self.driven & (self._objects.pool.is_static.numpy() == 0)

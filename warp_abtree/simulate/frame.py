@@ -21,10 +21,11 @@ from warp_abtree.lod.controllers import Feedback
 from warp_abtree.lod.selection import positive
 from warp_abtree.lod.timing import COST_STAGES, STAGES, Timer
 from warp_abtree.model.model import Model
-from warp_abtree.query.narrow_phase import Result, check_request
+from warp_abtree.query.request import check_request
+from warp_abtree.query.result import Result
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.rigid_bodies import triangle_wave
-from warp_abtree.state.update import full_share
+from warp_abtree.state.lod_update import full_refit_fraction
 
 
 def resolve_lod(model: Model, wish) -> int:
@@ -203,7 +204,7 @@ def rehearse_updates(scene: Scene):
     In part, from a copied state; from another, in place; and whole. Models so small that they are always refitted
     whole never are in part.
     """
-    share = full_share(scene.device)
+    share = full_refit_fraction(scene.device)
     chosen, step = None, 0
     for model in sorted(scene.models, key=lambda model: model.face_count):
         if not model.lod_max:
@@ -279,7 +280,7 @@ class Frame:
         self._poses = np.empty((scene.object_count, 7))
         self._model = np.array(scene.object_model)
         self._way = np.zeros(scene.object_count, np.int8)
-        scene.arrays()
+        scene.batch()
         self._measure_lods()
 
     def warm_up(self):

@@ -44,8 +44,8 @@ from warp_abtree.kernels.dynamics import graph_coloring as colouring
 from warp_abtree.kernels.dynamics import solve
 from warp_abtree.model.mesh import mesh_from_arrays
 from warp_abtree.model.model import Model
-from warp_abtree.query.broad_phase import CapacityError
 from warp_abtree.query.manifold import POINTS_MAX, ManifoldQuery
+from warp_abtree.query.request import CapacityError
 from warp_abtree.scene.poses import check_poses
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.body_state import RigidBodies, matrices_of, positive, stretch
@@ -185,7 +185,7 @@ class Dynamics(RigidBodies):
         sleep_speed: Speed below which a body counts as at rest [world units/s], one for all or (n,); None is
             0.01 sqrt(gravity reach), 0 without gravity, so that nothing sleeps.
         sleep_time: How long all bodies that touch each other must be at rest before they sleep [s].
-        capacity, pair_capacity: Contacts and pairs that there is room for; `step` makes more, `launch` does not.
+        capacity: `Buffers`, or the contacts that there is room for; `step` makes more, `launch` does not.
 
     Attributes:
         bodies, properties, mass, rigid, driven: As `RigidBodies`.
@@ -215,7 +215,6 @@ class Dynamics(RigidBodies):
         sleep_speed=None,
         sleep_time: float = 0.5,
         capacity=None,
-        pair_capacity=None,
     ):
         super().__init__(scene, density, restitution, friction, gravity, kinematic, slop, sleep_speed)
         self.iterations = whole_number(iterations, "iterations", 1, 10_000)
@@ -226,7 +225,7 @@ class Dynamics(RigidBodies):
             wp.empty(0, dtype=wp.mat33d, device=self.device),
             wp.empty(0, dtype=wp.vec3d, device=self.device),
         )
-        self.query = ManifoldQuery(scene, None, capacity, pair_capacity, roles=self.bodies.role)
+        self.query = ManifoldQuery(scene, None, capacity, roles=self.bodies.role)
         self._rows, self._memory = solve.Rows(), solve.Memory()
         self._room, self._torn = -1, False
         self._grow()
@@ -299,7 +298,7 @@ class Dynamics(RigidBodies):
         elif len(self._targets[0]):
             self.clear_targets()
         self._begin(dt)
-        self.query.run_grown()
+        self.query.grow()
         self._grow()
 
     def answer(self, dt: float):
@@ -348,7 +347,7 @@ class Dynamics(RigidBodies):
         pairs = self.query.broad_phase.count_found()
         if pairs > self._room:
             raise CapacityError(
-                f"{pairs} object pairs, there is room for {self._room}: make it with pair_capacity={pairs}"
+                f"{pairs} object pairs, there is room for {self._room}: make it with capacity=Buffers(pairs={pairs})"
             )
         self.query.result().check()
 

@@ -234,7 +234,6 @@ class ObjectArrays:
         pool: `ObjectPool` for kernels.
         state: State of each object, NumPy int32 (n,), the host's copy of pool.state.
         generation: Of the arrays; retired where the scene makes others.
-        filter_generation: Of the pairs filtered out of the broad phase of these objects.
     """
 
     def __init__(self, worlds, statics, device):
@@ -247,7 +246,7 @@ class ObjectArrays:
         self.pool.is_static = _upload(np.asarray(statics, np.int32), wp.int32, device)
         self.pool.rotation = wp.zeros(count, dtype=wp.mat33d, device=device)
         self.pool.position = wp.zeros(count, dtype=wp.vec3d, device=device)
-        self.generation, self.filter_generation = Generation(device), Generation(device)
+        self.generation = Generation(device)
         self._pointed = 0
 
     def stage_states(self, state, generation: Generation):

@@ -14,6 +14,7 @@ PARTS = {
 SUMMARIES = {
     "fit_figure_6": update.fit_figure_6,
     "fitted_moves": update.fitted_moves,
+    "step_sizes": budget.step_sizes,
     "thin": update.thin,
     "compare_simplifiers": simplify.compare_simplifiers,
 }

@@ -74,3 +74,8 @@ def trace_budget(context):
         names = ("frames", "within", "within_tenth", "worst", "turns", "error_mean")
         about = {"case": "budget", "controller": controller, "objects": loaded.scene.object_count}
         yield about | {name: judged[name] for name in names}
+
+
+def step_sizes(rows):
+    """Return the rows with the sizes of steps, as figure 4 shows them."""
+    return [row | {"moved": abs(row["moved"])} if "moved" in row else row for row in rows]

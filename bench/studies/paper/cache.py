@@ -3,10 +3,11 @@
 import numpy as np
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 from ...baselines.wp_bvh import FaceBvh
 from ...cases.memory import count_bytes
-from ...inside import RecordedUpdate, active_build, upload_lods
+from ...inside import active_build, upload_lods
 from .meshes import paper_models
 
 COUNTS = (10, 50, 200)
@@ -36,8 +37,7 @@ def measure_bytes(model, device):
     """Return the bytes of a model's arrays and of one tree state."""
     scene = ab.Scene(device)
     scene.add(model)
-    models, states, _ = scene.arrays()
-    return count_bytes(models.pool), count_bytes(states.pool)
+    return tuple(map(count_bytes, scene.batch().pools[:2]))
 
 
 def cache_bytes(model, lods) -> int:
@@ -60,13 +60,15 @@ def time_changes(context, model, lods):
             continue
         scene.set_lods([high])
         # By the kind of refit that the library takes.
-        there, back = RecordedUpdate(scene, [low]), RecordedUpdate(scene, [high])
-        times = context.time_graphs({"there": there.launch, "back": back.launch})
+        launches = {"there": testing.repeat_update(scene.set_lods([low]))}
+        back = scene.set_lods([high])
+        fraction = back.k[0] / model.face_count
+        times = context.time_graphs(launches | {"back": testing.repeat_update(back)})
         upload_lods(scene)
         vertices, faces, _ = model.mesh_at(low)
         rebuilt = context.time_alone({"bvh": FaceBvh(vertices, faces, context.device).rebuild})["bvh"]
         built = context.time_launches({"build": lambda v=vertices, f=faces: active_build(v, f)}, 1, on_core=True)
-        row = {"k_share": back.stats.k[0] / model.face_count, "update_ms": (times["there"] + times["back"]) / 2}
+        row = {"k_share": fraction, "update_ms": (times["there"] + times["back"]) / 2}
         rows.append(row | {"bvh_ms": rebuilt, "build_ms": built["build"]})
     found = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     ratios = [row["bvh_ms"] / row["update_ms"] for row in rows]

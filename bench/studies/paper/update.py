@@ -5,8 +5,9 @@ import math
 import numpy as np
 
 import warp_abtree as ab
+from warp_abtree import testing
 
-from ...cases.update import bound_nodes, check_update
+from ...cases.update import REFITS, bound_nodes, check_update
 from ...inside import upload_lods
 from ...tables import pick
 from .meshes import PosedPairs, paper_models
@@ -58,14 +59,18 @@ def count_ancestors(leaves) -> int:
 def time_move(context, scene, model, home, there):
     """Return the row of one LOD change, both kinds of refit checked against each other first."""
     scene.set_lods([home])
-    k, nodes, entries, moves = check_update(scene, [there], [home], model.face_count)
-    (forth, back), whole = moves["update"], moves["full"][0]
-    scene.set_lods([there])
+    k, nodes, entries, launches = check_update(scene, [there], [home], model.face_count)
+    refits = {}
+    for kind, full in REFITS.items():
+        scene.set_lods([home])
+        with testing.force_refits(full):
+            refits[kind] = testing.repeat_update(scene.set_lods([there]), refine=False)
+    part, whole = refits["update"], refits["full"]
     # In turn, at the same LOD: a refit repeated alone is one that the processor knows by heart.
-    times = context.time_graphs({"refit": forth.launch_refit, "full": whole.launch_refit})
+    times = context.time_graphs({"refit": part, "full": whole})
     scene.set_lods([home])
-    launches = {"there": forth.launch, "between": whole.launch_refit, "back": back.launch, "after": whole.launch_refit}
-    moved = context.time_graphs(launches)
+    forth, back = launches["update"]
+    moved = context.time_graphs({"there": forth, "between": whole, "back": back, "after": whole})
     upload_lods(scene)
     row = {"case": "move", "from_finest": home == model.lod_max, "model": model.name, "faces": model.face_count}
     row |= {"splits": home - there, "k": int(k[0]), "share": k[0] / model.face_count, "entries": entries}
@@ -117,8 +122,9 @@ def fit_figure_6(rows):
 
 
 def fitted_moves(rows):
-    """Return the rows of moves, each with the time that equation (1), scaled once a model, gives it."""
-    return [row | {"fitted_ms": fit_scale(moves) * row["bound"]} for _, moves in by_model(rows) for row in moves]
+    """Return the rows of moves from the finest LOD, each with the time of equation (1), scaled once a model."""
+    found = [row | {"fitted_ms": fit_scale(moves) * row["bound"]} for _, moves in by_model(rows) for row in moves]
+    return pick(found, from_finest=True)
 
 
 def find_crossover(fractions, logs):
@@ -170,11 +176,10 @@ def time_shares(context, model, lod, count, states):
     scene = posed.scene
     home = [model.lod_max] * scene.object_count
     there = [lod] * states + home[states:]
-    k, _, _, moves = check_update(scene, there, home, model.face_count)
+    k, _, _, launches = check_update(scene, there, home, model.face_count)
     if not (k < TENTH * model.face_count).all():
         raise RuntimeError(f"k is {k.max()} of {model.face_count}")
-    forth, back = moves["update"]
-    moved = context.time_graphs({"there": forth.launch, "back": back.launch})
+    moved = context.time_graphs(dict(zip(("there", "back"), launches["update"], strict=True)))
     upload_lods(scene)
     scene.set_lods(there)
     update = (moved["there"] + moved["back"]) / 2

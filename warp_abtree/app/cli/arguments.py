@@ -86,7 +86,7 @@ def add_query_arguments(sub):
     )
     sub.add_argument(
         "--precision",
-        choices=("exact", "float64", "float32"),
+        choices=("exact", "float32"),
         default="exact",
         help="signs of determinants: exact, or of the rounded ones (exact)",
     )

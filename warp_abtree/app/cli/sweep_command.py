@@ -34,7 +34,7 @@ def add_arguments(sub, positive):
     )
     sub.add_argument("--out", "-o", type=Path, required=True, metavar="DIR", help="folder to make, or to go on in")
     sub.add_argument("--output", choices=OUTPUTS, help="what to ask (any); of worlds count or poses (count)")
-    sub.add_argument("--precision", choices=("exact", "float64", "float32"), default="exact", help="as query (exact)")
+    sub.add_argument("--precision", choices=("exact", "float32"), default="exact", help="as query (exact)")
     for name in ("a", "b"):
         sub.add_argument(f"--lod-{name}", metavar="LOD", help=f"LOD of {name.upper()}, as query (finest)")
     sub.add_argument("--lods", type=Path, metavar="LODS.npy", help="LODs of both at each pose, (p, 2)")

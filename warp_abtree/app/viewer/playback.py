@@ -18,7 +18,7 @@ from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.scene_file import load_scene
 from warp_abtree.lod.selection import Camera
 from warp_abtree.model.model import Model
-from warp_abtree.query.narrow_phase import Result
+from warp_abtree.query.result import Result
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame, FrameRow, LodSweep, resolve_lod
 

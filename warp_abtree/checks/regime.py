@@ -1,0 +1,50 @@
+"""Which of several equivalent paths the library takes; `warp_abtree.testing` switches them, nothing else does."""
+
+from dataclasses import dataclass, field, replace
+
+
+@dataclass(frozen=True)
+class Regime:
+    """Choices that change no answer.
+
+    Attributes:
+        warps: Whether warps traverse object pairs; None: on CUDA they do, on the CPU threads.
+        warps_per_pair: Warps that share a single object pair; c pairs have 1 / sqrt(c) of that each.
+        stack_length: Items on a warp's stack before the rest goes depth-first; None is all there is room for.
+        key_bits: Bits of a sort key; an object pair and two faces that take more are sorted in two passes.
+        cpu_threads: Threads of a launch on the CPU; None is all that the process may use.
+        full_refit: Fraction of its faces past which a state is refitted whole, by kind of device, as measured. A slice
+            repeats faces, so k is smaller still; on a GPU few nodes take as long as many.
+    """
+
+    warps: bool | None = None
+    warps_per_pair: int = 128
+    stack_length: int | None = None
+    key_bits: int = 63
+    cpu_threads: int | None = None
+    full_refit: dict = field(default_factory=lambda: {"cpu": 0.5, "cuda": 0.01})
+
+
+_current = Regime()
+
+
+def current_regime() -> Regime:
+    """Return the regime that operators made now take."""
+    return _current
+
+
+def change_regime(**changes) -> Regime:
+    """Change choices from now on and return the regime before.
+
+    Raises:
+        TypeError: No such choice.
+    """
+    global _current
+    before, _current = _current, replace(_current, **changes)
+    return before
+
+
+def restore_regime(regime: Regime):
+    """Put a regime back."""
+    global _current
+    _current = regime

@@ -1,0 +1,140 @@
+"""Buffers of a query: pairs, what belongs to each, and lists of face pairs; replaced whole, or not at all."""
+
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import check_device
+from warp_abtree.kernels import poses
+from warp_abtree.kernels.traversal import face_pairs
+from warp_abtree.query.broad_phase import BroadPhase
+from warp_abtree.query.request import check_pair_room, check_within
+from warp_abtree.query.result import COUNTERS
+from warp_abtree.state.batch import Batch
+from warp_abtree.state.generation import LaunchGuard
+
+
+class QueryBuffers:
+    """Device lists of an operator about object pairs; see `Query` for the attributes that users read."""
+
+    batch: Batch
+    device: wp.Device
+    precision: str
+    guard: LaunchGuard
+    broad_phase: BroadPhase | None
+    hits: Any  # `Hits`
+    near: Any
+    pairs: wp.array
+    pair_count: wp.array
+    pair_poses: wp.array
+    within: wp.array  # where asked
+    _within: np.ndarray
+    _given: np.ndarray  # pairs on the host
+    _torn: bool
+
+    def _make_hits(self):
+        hits = face_pairs.Hits()
+        for name in ("total", "unsure_total", "hard_total"):
+            setattr(hits, name, wp.zeros(1, dtype=wp.int32, device=self.device))
+        return hits
+
+    def set_pairs(self, pairs, within=None):
+        """Query other pairs from now on, in the room there is if they fit; within None keeps the distances.
+
+        Raises:
+            ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
+        """
+        if self.broad_phase is not None:
+            raise ValueError("this query takes its pairs from the broad phase")
+        check_device(self.device, "giving a query other pairs")
+        self._check_whole()
+        pairs = self.batch.check_pairs(pairs)
+        if within is not None and self.near is None:
+            raise ValueError("this query was made without within")
+        if self.near is not None:
+            within = check_within(self._within if within is None else within, len(pairs))
+        # What may fail for lack of memory comes before anything that changes the query.
+        rows = wp.array(pairs, dtype=wp.vec2i, device=self.device)
+        distances = self._upload_within(within)
+        made = []
+        if len(pairs) > len(self.pairs):
+            made = self._make_room(wp.empty(len(pairs), dtype=wp.vec2i, device=self.device))
+        with self._changing():
+            if made:
+                self._replace(made)
+            self.guard.forget()
+            if len(pairs):
+                wp.copy(self.pairs, rows, count=len(pairs))
+            self.pair_count.fill_(len(pairs))
+            self._given = pairs
+            self._within = within
+            self._fill_within(distances)
+
+    @contextmanager
+    def _changing(self):
+        """Refuse the query for good where a change of what belongs together is interrupted."""
+        before, self._torn = self._torn, True
+        yield
+        self._torn = before
+
+    def _check_whole(self):
+        if self._torn:
+            raise RuntimeError("this query was interrupted while its buffers changed; make a new one")
+
+    def _replace(self, made):
+        """Put new arrays, (owner, attribute, array), in the place of old ones."""
+        self.guard.buffers.advance()
+        with self._changing():
+            for owner, name, array in made:
+                setattr(owner, name, array)
+
+    def _pair_arrays(self, room: int) -> list:
+        """Return (owner, attribute, new array) of whatever has an entry a pair."""
+        made = [(self, "pair_poses", wp.empty(room, dtype=poses.PairPose, device=self.device))]
+        for hits in (self.hits, self.near):
+            if hits is not None:
+                made.append((hits, "any_hit", wp.zeros(room, dtype=wp.int32, device=self.device)))
+                for name in ("count", *COUNTERS):
+                    made.append((hits, name, wp.zeros(room, dtype=wp.int64, device=self.device)))
+        if self.near is not None:
+            made.append((self, "within", wp.empty(room, dtype=wp.float64, device=self.device)))
+        return made
+
+    def _make_room(self, pairs) -> list:
+        """Return (owner, attribute, new array) of a device list of pairs, and of whatever belongs to a pair."""
+        check_pair_room(len(pairs))
+        made = [*self._pair_arrays(len(pairs)), (self, "pairs", pairs)]
+        if self.broad_phase is not None:
+            made.append((self.broad_phase, "pairs", pairs))
+        return made
+
+    def _take_pairs(self, pairs):
+        """Take a device list of pairs and make room for whatever belongs to a pair: all of it, or nothing changes."""
+        made = self._make_room(pairs)
+        with self._changing():
+            self._replace(made)
+            if self.broad_phase is not None:
+                self._fill_within(None)
+
+    def _upload_within(self, within):
+        """Return distances of pairs on the device, None where there are none or one for all."""
+        if self.near is None or within.ndim == 0 or not len(within):
+            return None
+        return wp.array(within, dtype=wp.float64, device=self.device)
+
+    def _fill_within(self, distances):
+        if distances is not None:
+            wp.copy(self.within, distances, count=len(distances))
+        elif self.near is not None and self._within.ndim == 0:
+            self.within.fill_(float(self._within))
+
+    def _resize_uncertain(self, capacity: int):
+        hard = capacity if self.precision == "exact" else 0
+        made = [("unsure", capacity), ("hard", hard)]
+        self._replace([(self.hits, name, wp.empty(room, dtype=wp.vec3i, device=self.device)) for name, room in made])
+
+    def resize(self, capacity: int):
+        """Make room for a number of intersecting face pairs."""
+        self._replace([(self.hits, "face", wp.empty(capacity, dtype=wp.vec3i, device=self.device))])

@@ -1,0 +1,96 @@
+"""What a query is asked, and the room that it is given."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_abtree.checks.arguments import to_numpy, whole_number
+from warp_abtree.kernels.arithmetic import predicates
+from warp_abtree.kernels.traversal import face_pairs
+
+OUTPUTS = {"any": face_pairs.OUTPUT_ANY, "count": face_pairs.OUTPUT_COUNT, "faces": face_pairs.OUTPUT_FACES}
+PRECISIONS = {"exact": predicates.EXACT, "float32": predicates.FLOAT32}
+
+# A launch of 32 threads a pair stays within 2^31.
+PAIRS_MAX = 2**26
+# Entries that an int32 numbers.
+LIST_MAX = 2**31 - 1
+
+
+class CapacityError(RuntimeError):
+    """A buffer was too small and work was lost; the message names the demand."""
+
+
+@dataclass(frozen=True)
+class Buffers:
+    """Room of a query's lists; None is a guess. `run()` makes more room, `launch()` cannot.
+
+    Attributes:
+        hits: Intersecting face pairs, where they are listed.
+        pairs: Object pairs; by default those given, or a guess for the broad phase.
+        uncertain: Face pairs between float32 and the later stages; not needed on the CPU.
+
+    Raises:
+        ValueError: A number that is out of range.
+    """
+
+    hits: int | None = None
+    pairs: int | None = None
+    uncertain: int | None = None
+
+    def __post_init__(self):
+        for name, most in (("hits", LIST_MAX), ("pairs", PAIRS_MAX), ("uncertain", LIST_MAX)):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, whole_number(value, f"buffers: {name}", 1, most))
+
+
+def check_capacity(capacity) -> Buffers:
+    """Return the buffers of a query.
+
+    Args:
+        capacity: `Buffers`, or the hits that there is room for.
+
+    Raises:
+        ValueError: A number that is out of range, or none.
+    """
+    if isinstance(capacity, Buffers):
+        return capacity
+    return Buffers(None if capacity is None else whole_number(capacity, "capacity", 1, LIST_MAX))
+
+
+def check_request(output: str, precision: str):
+    """Check what is asked of a query.
+
+    Raises:
+        ValueError: An unknown output or precision, or contacts, which another operator finds.
+    """
+    if output not in (*OUTPUTS, "contacts"):
+        raise ValueError(f"output {output!r} is none of 'any', 'count', 'faces', 'contacts'")
+    if precision not in tuple(PRECISIONS):
+        raise ValueError(f"precision {precision!r} is neither 'exact' nor 'float32'")
+    if output == "contacts":
+        raise ValueError("output 'contacts' is found by ab.ContactQuery, or Scene.intersect")
+
+
+def check_within(within, pair_count=None) -> np.ndarray:
+    """Return distances [world units] as float64, () or (p,).
+
+    Raises:
+        ValueError: Another shape (for pairs of the broad phase any but a scalar), a distance that is negative, infinite
+            or no number.
+    """
+    within = to_numpy(within, "within").astype(np.float64)
+    if within.shape != () and within.shape != (pair_count,):
+        known = "pairs of the broad phase: one distance for all" if pair_count is None else f"{pair_count} pairs"
+        raise ValueError(f"within: shape {within.shape} given for {known}")
+    bad = np.flatnonzero(~(np.isfinite(within) & (within >= 0)))
+    if len(bad):
+        raise ValueError(f"within: {within.flat[bad[0]]} of pair {bad[0]} is no finite distance of 0 or more")
+    return within
+
+
+def check_pair_room(count: int):
+    """Raise CapacityError for more object pairs than a launch holds."""
+    if count > PAIRS_MAX:
+        raise CapacityError(f"{count} object pairs at a time, more than 2^26; ask them in parts")

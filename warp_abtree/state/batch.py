@@ -1,0 +1,126 @@
+"""Batch: models, tree states and posed objects on one device, with the object pairs that the broad phase leaves out."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import check_device, to_numpy
+from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
+from warp_abtree.state.generation import Generation
+from warp_abtree.state.lod_update import LodUpdate, set_object_lods
+
+
+class Batch:
+    """What queries are about: the objects of a device, the tree states that they stand at, and their models.
+
+    `Scene.batch()` returns that of a scene, which makes another when objects are added; `Pipeline` and `sweep` make
+    their own, on the same models.
+
+    Args:
+        models, states: Arrays of one device.
+        objects: Arrays of the same device.
+        object_model: Model of each object, int (n,).
+        excluded: Keys of pairs that the broad phase leaves out, see `exclusion_keys`.
+
+    Attributes:
+        models, states, objects, object_model, excluded: As given.
+        device: Of the arrays.
+        lods: LOD of each object as the host knows it, int (n,); -1 before `set_lods`.
+        filter_generation: `Generation` of the excluded pairs.
+    """
+
+    def __init__(self, models: ModelArrays, states: StateArrays, objects: ObjectArrays, object_model, excluded=()):
+        self.device = states.device
+        self.models, self.states, self.objects = models, states, objects
+        self.object_model = np.asarray(object_model)
+        self.lods = np.full(len(self.object_model), -1, np.int64)
+        self.excluded = np.asarray(excluded, np.int64)
+        self.filter_generation = Generation(self.device)
+        self._retired = False
+
+    @property
+    def object_count(self) -> int:
+        """How many objects there are."""
+        return len(self.object_model)
+
+    @property
+    def pools(self) -> list:
+        """`ModelPool`, `StatePool` and `ObjectPool` for kernels."""
+        return [self.models.pool, self.states.pool, self.objects.pool]
+
+    def with_own_states(self) -> Batch:
+        """Return a batch of the same models and objects, posed alike, that has no tree state yet."""
+        placed = self.objects.pool
+        objects = ObjectArrays(placed.world.numpy(), placed.is_static.numpy(), self.device)
+        wp.copy(objects.pool.rotation, placed.rotation)
+        wp.copy(objects.pool.position, placed.position)
+        return Batch(self.models, StateArrays(self.models, self.device), objects, self.object_model, self.excluded)
+
+    def set_lods(self, lods) -> LodUpdate:
+        """Bring every object to an LOD, int (n,) within its model's range: wholly, or not at all."""
+        with self.states.change():
+            stats = set_object_lods(self.models, self.states, self.objects, self.object_model, lods)
+            self.lods = np.array(lods)
+        return stats
+
+    def mend(self):
+        """Make tree states anew that an interrupted change of LODs has left torn."""
+        if not self.states.torn:
+            return
+        check_device(self.device, "making tree states anew")
+        self.states.reset()
+        self.objects.state = np.full(self.object_count, -1, np.int32)
+        set_object_lods(self.models, self.states, self.objects, self.object_model, self.lods)
+        self.states.generation.resume()
+        self.states.torn = False
+
+    def retire(self):
+        """Refuse operators from now on: the scene has other objects."""
+        self.states.generation.advance()
+        self.objects.generation.advance()
+        self._retired = True
+
+    def check(self, user: str):
+        """Raise RuntimeError where the batch is no longer that of its scene; name its user, such as "query"."""
+        if self._retired:
+            raise RuntimeError(f"objects were added to the scene since this {user} was made; make a new one")
+        self.mend()
+
+    def exclude(self, keys):
+        """Leave these pairs out of every later broad phase, and no others."""
+        self.filter_generation.advance()
+        self.excluded = keys
+
+    def check_pairs(self, pairs) -> np.ndarray:
+        """Return object pairs as int32 (p, 2), see `check_pairs`."""
+        return check_pairs(pairs, self.object_count)
+
+
+def check_pairs(pairs, object_count: int) -> np.ndarray:
+    """Return object pairs as int32 (p, 2).
+
+    Raises:
+        ValueError: Wrong shape, an index that is no object, an object paired with itself.
+    """
+    pairs = to_numpy(pairs, "pairs")
+    if pairs.shape in ((0,), (0, 2)):
+        return np.empty((0, 2), np.int32)
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind not in "iu":
+        raise ValueError(f"pairs: shape {pairs.shape} and type {pairs.dtype}, not whole numbers of shape (p, 2)")
+    if pairs.min() < 0 or pairs.max() >= object_count:
+        bad = np.flatnonzero(((pairs < 0) | (pairs >= object_count)).any(1))
+        raise ValueError(
+            f"pairs: pair {bad[0]} is {tuple(pairs[bad[0]].tolist())}, the scene has {object_count} objects"
+        )
+    same = pairs[:, 0] == pairs[:, 1]
+    if same.any():
+        first = int(same.argmax())
+        raise ValueError(f"pairs: pair {first} pairs object {pairs[first, 0]} with itself")
+    return pairs.astype(np.int32)
+
+
+def exclusion_keys(pairs: np.ndarray) -> np.ndarray:
+    """Return sorted unique keys i * 2^32 + j, i < j, of pairs (p, 2) in either order, int64."""
+    pairs = np.sort(np.asarray(pairs, np.int64).reshape(-1, 2), axis=1)
+    return np.unique((pairs[:, 0] << 32) + pairs[:, 1])

@@ -1,0 +1,121 @@
+"""LOD updates that the device plans, inside a captured graph: LODs are read there, and no launch waits for the host."""
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels.arrays import LEVEL_MAX
+from warp_abtree.kernels.update import work_lists
+from warp_abtree.state.arrays import ModelArrays, StateArrays
+from warp_abtree.state.batch import Batch
+from warp_abtree.state.lod_update import build_states, full_refit_fraction
+from warp_abtree.state.work_lists import WorkLists, active_update, make_level_lists, refine_meshes
+
+# LODs wanted on the device that are out of range, and the lowest index that had one.
+NO_FAULTS = (0, 2**31 - 1)
+
+
+class DeviceLodUpdate(WorkLists):
+    """Bring every state of a pool to LODs that stand on the device, planned there: allocates once, launches many.
+
+    The worklists have room for the worst case: every state moves, by the longest slice that is not refitted whole.
+    From the first launch on, LODs of states are known on the device only (`StatePool.lod`).
+
+    Args:
+        models, states: A pool that grows no more.
+
+    Attributes:
+        wanted: LOD of each state, device int32 (s,), to be written before a launch.
+        faults: LODs wanted out of range (the nearer end is taken) and the lowest state that had one, device int32 (2,).
+    """
+
+    def __init__(self, models: ModelArrays, states: StateArrays):
+        self.models, self.states = models, states
+        device = states.device
+        owner = np.array([slot.model for slot in states.slots])
+        bounds = [len(bound) for bound in models.split_bounds]
+        longest = np.array([bound[-1] - bound[0] for bound in models.split_bounds])
+        partial_max = np.minimum(longest, np.floor(full_refit_fraction(device) * models.face_count).astype(np.int64))
+        entries, depth = partial_max[owner], models.depth[owner]
+        levels = range(int(depth.max()) + 1)
+        level_room = [int(np.sum(depth >= level)) << level for level in levels]
+        marked_room = [int(np.minimum(entries, 1 << level)[depth >= level].sum()) for level in levels]
+        whole_room = np.array([np.sum(depth >= level) for level in range(int(LEVEL_MAX))])
+        count = len(owner)
+
+        def upload(values):
+            return wp.array(np.asarray(values, np.int64), dtype=wp.int32, device=device)
+
+        def room(length, dtype=wp.int32):
+            return wp.zeros(length, dtype=dtype, device=device)
+
+        self.splits = work_lists.SplitTable()
+        self.splits.bound = upload(np.concatenate(models.split_bounds))
+        self.splits.bound_start = upload(np.cumsum(bounds) - bounds)
+        self.splits.partial_max = upload(partial_max)
+        self.splits.depth = upload(models.depth)
+        plan = work_lists.UpdatePlan()
+        plan.partial_total, plan.full_total = room(1, wp.int64), room(1, wp.int64)
+        for name in ("partial_state", "slice_start", "entry_end", "full_state", "face_end"):
+            setattr(plan, name, room(count))
+        plan.changed_count, plan.marked_count = room(count), room(count)
+        plan.whole_count = room(int(LEVEL_MAX))
+        plan.whole_start = upload(np.cumsum(whole_room) - whole_room)
+        plan.whole_state = room(int(whole_room.sum()))
+        make_level_lists(plan, marked_room, device)
+        self.wanted = upload([slot.lod for slot in states.slots])
+        self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=device)
+        super().__init__(plan, int(entries.sum()), int(models.face_count[owner].sum()), level_room, device)
+
+    def launch(self):
+        """Refine meshes and update trees. Launches only: six, and one for each level that has much to refit.
+
+        Where it is interrupted, the next launch refits every state whole.
+        """
+        try:
+            self._launch()
+        except BaseException:
+            self.states.pool.lod.fill_(int(work_lists.UNKNOWN))
+            raise
+
+    def _launch(self):
+        count = len(self.wanted)
+        wp.launch(work_lists.clear_plan_kernel, max(count, int(LEVEL_MAX)), [self.plan], device=self.device)
+        inputs = [self.models.pool, self.splits, self.wanted, self.states.pool, self.plan, self.faults]
+        wp.launch(work_lists.plan_update_kernel, count, inputs, device=self.device)
+        refine_meshes(self.models.pool, self.states.pool, self)
+        active_update(self.models.pool, self.states.pool, self)
+
+
+class LevelStates:
+    """Serve LODs that stand on the device from states made beforehand, one a level: no tree is ever updated.
+
+    Args:
+        batch: Without states.
+        levels: LODs of each model that states are made for, rising.
+        lods: LOD that each object starts at, int (n,).
+
+    Attributes:
+        wanted: LOD of each object, device int32 (n,), to be written before a launch; the coarsest level that is not
+            coarser serves it.
+        faults: LODs wanted below 0 or beyond the last level (the nearer end is taken) and the lowest object that had
+            one, device int32 (2,).
+
+    Raises:
+        ValueError: The pool would pass 2^30 nodes.
+    """
+
+    def __init__(self, batch: Batch, levels, lods):
+        self.batch, self.device = batch, batch.device
+        starts = np.concatenate([[0], np.cumsum([len(part) for part in levels])])
+        state_model = np.repeat(np.arange(len(levels)), np.diff(starts))
+        build_states(batch.models, batch.states, state_model, np.concatenate(levels))
+        batch.objects.set_states(starts[batch.object_model])
+        self._level_start = wp.array(starts, dtype=wp.int32, device=self.device)
+        self.wanted = wp.array(np.asarray(lods), dtype=wp.int32, device=self.device)
+        self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=self.device)
+
+    def launch(self):
+        """Point objects at other states. One launch."""
+        _, states, objects = self.batch.pools
+        inputs = [states, self._level_start, self.wanted, objects, self.faults]
+        wp.launch(work_lists.pick_state_kernel, len(self.wanted), inputs, device=self.device)

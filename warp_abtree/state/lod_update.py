@@ -1,0 +1,227 @@
+"""LOD updates that the host plans: which state serves which target, and the faces I, R and D that change."""
+
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.arrays import LEVEL_MAX
+from warp_abtree.kernels.update import refit
+from warp_abtree.kernels.update.work_lists import UpdatePlan
+from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
+from warp_abtree.state.work_lists import WorkLists, active_update, make_level_lists, refine_meshes
+
+
+def full_refit_fraction(device) -> float:
+    """Return the fraction of its faces past which a state is refitted whole."""
+    return current_regime().full_refit["cuda" if device.is_cuda else "cpu"]
+
+
+def choose_states(states: StateArrays, wanted: set, used: set) -> tuple[list, dict]:
+    """Choose a state for every wanted (model, lod).
+
+    States that stand at a target stay; every other target takes the nearest state that no target keeps, in place,
+    else a new state that starts as a copy of the nearest. Nearest is by the length of the slice between them.
+
+    Returns:
+        The moves, (state, lod, source) each, where source is the state that it starts from: itself, another, or -1 for
+        none; and the state of every wanted (model, lod).
+    """
+    stand = {(states.slots[s].model, states.slots[s].lod): s for s in used}
+    chosen = {key: stand[key] for key in wanted if key in stand}
+    kept = set(chosen.values())
+    by_model: dict[int, list[int]] = {}
+    for s in sorted(used):
+        by_model.setdefault(states.slots[s].model, []).append(s)
+    movable = {model: [s for s in ids if s not in kept] for model, ids in by_model.items()}
+
+    def distance(key, state):
+        if state < 0:  # there is no state of this model yet
+            return 0
+        bounds = states.models.split_bounds[key[0]]
+        return abs(int(bounds[states.slots[state].lod]) - int(bounds[key[1]]))
+
+    moves, copies = [], []
+    for key in sorted(wanted - chosen.keys()):
+        spare = movable.get(key[0], [])
+        if spare:
+            state = min(spare, key=partial(distance, key))
+            spare.remove(state)
+            chosen[key] = state
+            moves.append((state, key[1], state))
+        else:
+            copies.append(key)
+    sources = [min(by_model.get(key[0], [-1]), key=partial(distance, key)) for key in copies]
+    for state, key, source in zip(states.reserve([key[0] for key in copies]), copies, sources, strict=True):
+        chosen[key] = state
+        moves.append((state, key[1], source))
+    return moves, chosen
+
+
+class LodUpdate(WorkLists):
+    """What a change of LODs does, one entry an updated state: allocated when made, then launched once.
+
+    Args:
+        moves: (state, lod, source) of each update, as `choose_states` returns them.
+
+    Attributes:
+        state, lod: State and its new LOD, int32 (u,).
+        source: State that each starts from, itself, another, or -1 for none, int32 (u,).
+        full: Whether the whole tree is refitted, bool (u,).
+        slice_length: Faces in the slice between the LODs, repeats included; 0 where full, int64 (u,).
+    """
+
+    def __init__(self, models: ModelArrays, states: StateArrays, moves: list):
+        self.models, self.states = models, states
+        self.state, self.lod, self.source = np.array(moves, np.int32).reshape(-1, 3).T
+        owner = np.array([states.slots[s].model for s in self.state], np.int64)
+        self._owner, self._face_count = owner, models.face_count[owner]
+        slice_start = self._measure_slices()
+        plan, entries, faces, level_room = self._list_work(models.depth[owner], slice_start)
+        super().__init__(plan, entries, faces, level_room, states.device)
+        self._copies = self._plan_copies()
+
+    def __repr__(self):
+        return f"LodUpdate({len(self.state)} states updated, {int(np.sum(self.full))} of them whole)"
+
+    @property
+    def k(self) -> np.ndarray:
+        """Distinct faces inserted, removed or deformed, int32 (u,). Waits for the device."""
+        return self.plan.changed_count.numpy()[self.state]
+
+    @property
+    def nodes_refitted(self) -> np.ndarray:
+        """Nodes refitted, leaves among them, int32 (u,). Waits for the device.
+
+        At most k (log2 n - log2 k + 2) - 1 where the update is partial (equation 1, n rounded up to a power of two).
+        """
+        marked = self.plan.marked_count.numpy()[self.state]
+        return np.where(self.full, 2 * self._face_count - 1, marked).astype(np.int32)
+
+    def _measure_slices(self):
+        """Find the slice of each update: the faces touched between two LODs are contiguous, whatever the distance."""
+        start, self.slice_length = (np.zeros(len(self.state), np.int64) for _ in range(2))
+        self.full = np.ones(len(self.state), bool)
+        fraction = full_refit_fraction(self.states.device)
+        for i in np.flatnonzero(self.source >= 0):
+            bounds = self.models.split_bounds[self._owner[i]]
+            low, high = sorted((int(self.lod[i]), self.states.slots[self.source[i]].lod))
+            touched = int(bounds[high] - bounds[low])
+            if touched <= fraction * self._face_count[i]:
+                self.full[i], start[i], self.slice_length[i] = False, bounds[low], touched
+        return start
+
+    def _list_work(self, depth, slice_start):
+        """Return the plan for kernels, and the room of entries, faces and levels."""
+        partial_id = np.flatnonzero(~self.full)
+        # Deepest first, so that the states that have a level are the first of the list.
+        whole = np.flatnonzero(self.full)
+        whole = whole[np.argsort(-depth[whole], kind="stable")]
+        entry_end, face_end = np.cumsum(self.slice_length[partial_id]), np.cumsum(self._face_count[whole])
+        entries = int(entry_end[-1]) if len(partial_id) else 0
+        faces = int(face_end[-1]) if len(whole) else 0
+        levels = range(int(depth.max()) + 1 if len(depth) else 0)
+        whole_count = np.array([np.sum(depth[whole] >= level) for level in range(int(LEVEL_MAX))], np.int64)
+        marked_room = [min(entries, int(np.sum(depth[partial_id] >= level)) << level) for level in levels]
+        level_room = [room + (int(whole_count[level]) << level) for level, room in enumerate(marked_room)]
+        device, plan = self.states.device, UpdatePlan()
+
+        def upload(values, dtype=wp.int32):
+            return wp.array(np.asarray(values, np.int64), dtype=dtype, device=device)
+
+        plan.partial_total = upload([(len(partial_id) << 32) + entries], wp.int64)
+        plan.partial_state = upload(self.state[partial_id])
+        plan.slice_start = upload(slice_start[partial_id])
+        plan.entry_end = upload(entry_end)
+        plan.full_total = upload([(len(whole) << 32) + faces], wp.int64)
+        plan.full_state = plan.whole_state = upload(self.state[whole])
+        plan.face_end = upload(face_end)
+        plan.whole_count = upload(whole_count)
+        plan.whole_start = wp.zeros(int(LEVEL_MAX), dtype=wp.int32, device=device)
+        state_count = len(self.states.slots)
+        plan.changed_count, plan.marked_count = (wp.zeros(state_count, wp.int32, device=device) for _ in range(2))
+        make_level_lists(plan, marked_room, device)
+        return plan, entries, faces, level_room
+
+    def _plan_copies(self) -> list:
+        """Return the launches that copy the source of every state that starts from another: kernel, dim and inputs."""
+        models, pool = self.models, self.states.pool
+        copied = np.flatnonzero((self.source >= 0) & (self.source != self.state))
+
+        def launches(kernel, rows, lengths):
+            if not len(rows):
+                return []
+            end = np.cumsum(lengths[self._owner[rows]])
+            ends = [np.asarray(values, np.int32) for values in (end, self.source[rows], self.state[rows])]
+            arrays = [wp.array(values, dtype=wp.int32, device=self.states.device) for values in ends]
+            return [(kernel, int(end[-1]), [*arrays, pool])]
+
+        return [
+            *launches(refit.copy_face_kernel, copied, models.face_count),
+            *launches(refit.copy_node_kernel, copied[~self.full[copied]], models.node_count),
+        ]
+
+    def launch(self):
+        """Move the states, copies before anything moves; only launches and small transfers."""
+        models, states = self.models, self.states
+        states.touch()
+        if not len(self.state):
+            return
+        for state, lod in zip(self.state.tolist(), self.lod.tolist()):
+            states.slots[state].lod = lod
+        states.upload_slots()
+        for state in self.state[self.source < 0]:
+            slot = states.slots[state]
+            end = slot.face_start + int(models.face_count[slot.model])
+            states.pool.face_corner[slot.face_start : end].fill_(wp.vec4i(-1, -1, -1, -1))
+        for kernel, threads, inputs in self._copies:
+            wp.launch(kernel, dim=threads, inputs=inputs, device=states.device)
+        self.relaunch()
+
+    def relaunch(self):
+        """Refine meshes and update trees from the LODs that stand there. Launches only."""
+        refine_meshes(self.models.pool, self.states.pool, self)
+        self.refit()
+
+    def refit(self):
+        """Update trees alone, from the corners that stand there. Launches only."""
+        active_update(self.models.pool, self.states.pool, self)
+
+
+def build_states(models: ModelArrays, states: StateArrays, state_model, lods) -> list:
+    """Make a state for each model and LOD of two lists, of its own each, and return their ids.
+
+    Raises:
+        ValueError: The pool would pass 2^30 nodes.
+    """
+    ids = states.reserve(state_model)
+    LodUpdate(models, states, [(state, int(lod), -1) for state, lod in zip(ids, lods, strict=True)]).launch()
+    return ids
+
+
+def set_object_lods(
+    models: ModelArrays, states: StateArrays, objects: ObjectArrays, object_model: np.ndarray, lods: np.ndarray
+) -> LodUpdate:
+    """Bring every object to an LOD: refine meshes, update trees, share states; states that no object uses are freed.
+
+    All that it needs is allocated before the first state in use changes (`StateArrays.change`).
+
+    Args:
+        object_model: Model of each object, int (n,).
+        lods: Target LOD of each object, int (n,), within its model's range.
+    """
+    keys, inverse = np.unique((object_model.astype(np.int64) << 32) + lods, return_inverse=True)
+    wanted = [(key >> 32, key & (2**32 - 1)) for key in keys.tolist()]
+    used = set(np.unique(objects.state[objects.state >= 0]).tolist())
+    moves, chosen = choose_states(states, set(wanted), used)
+    update = LodUpdate(models, states, moves)
+    serving = np.array([chosen[key] for key in wanted], np.int32)[inverse.reshape(-1)]
+    moved = not np.array_equal(serving, objects.state)
+    staged = objects.stage_states(serving, states.generation) if moved else None
+    update.launch()
+    if moved:
+        for state in used - set(chosen.values()):
+            states.free.setdefault(states.slots[state].model, []).append(state)
+        objects.set_states(serving, staged)
+    return update
