@@ -2,20 +2,16 @@
 
 import numpy as np
 
-from warp_abtree.app.pictures.plot import draw_controllers
-from warp_abtree.app.toml.scene_file import load_scene
-from warp_abtree.jobs.shards import SweepJob, ThisProcess, run_shards
-from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, FLOAT64
-from warp_abtree.kernels.arithmetic.predicates import UNSURE as UNCERTAIN
-from warp_abtree.kernels.triangle.float32_filter import SCREEN_UNIT as FLOAT32_UNIT
-from warp_abtree.kernels.triangle.float32_filter import screen_triangles as float32_filter
+from warp_abtree.app import draw_controllers, load_scene
+from warp_abtree.jobs import SweepJob, ThisProcess, run_shards
+from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
+from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, float32_filter_triangles
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
 from warp_abtree.lod.timing import WorkClock
 from warp_abtree.model.mesh import load_mesh
 from warp_abtree.model.tree import active_build
+from warp_abtree.simulate.budget_report import budget_report, step_response
 from warp_abtree.simulate.frame import FrameRow
-from warp_abtree.simulate.frame import judge_budget as budget_report
-from warp_abtree.simulate.frame import judge_step as step_response
 from warp_abtree.state.lod_update import full_refit_fraction
 
 __all__ = [
@@ -23,7 +19,6 @@ __all__ = [
     "FILTER",
     "FLOAT32",
     "FLOAT32_UNIT",
-    "FLOAT64",
     "UNCERTAIN",
     "FrameRow",
     "SweepJob",
@@ -33,7 +28,7 @@ __all__ = [
     "budget_report",
     "decide_triangles",
     "draw_controllers",
-    "float32_filter",
+    "float32_filter_triangles",
     "full_refit_fraction",
     "load_mesh",
     "load_scene",

@@ -7,6 +7,8 @@ model.
 
 import warp as wp
 
+from warp_abtree.kernels import native
+
 INACTIVE = wp.constant(0)
 ACTIVE = wp.constant(1)
 DEFORMED = wp.constant(2)
@@ -42,17 +44,7 @@ class ModelPool:
     centre: wp.array(dtype=wp.vec3d)
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    // 32 bytes lie in one sector: two loads, where three numbers of 24 bytes would take three.
-    const double2* p = (const double2*)vertices.data + 2 * (long long)i;
-    const double2 xy = __ldg(p);
-    return wp::vec_t<3, wp::float64>(xy.x, xy.y, __ldg(&p[1].x));
-#else
-    const wp::vec_t<4, wp::float64>& p = vertices.data[i];
-    return wp::vec_t<3, wp::float64>(p[0], p[1], p[2]);
-#endif
-""")
+@wp.func_native(native.body("numbers.cuh", "load_vertex"))
 def load_vertex(vertices: wp.array(dtype=wp.vec4d), i: wp.int32) -> wp.vec3d:
     """Return a position of `ModelPool.vertex_pos`, which nothing writes during a kernel."""
     ...

@@ -11,18 +11,18 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class RigidContacts:
-    """The arrays of `newton.Contacts` that its solvers read of rigid contacts, one entry a contact; count [1]."""
+    """Rigid contacts of `newton.Contacts` as its solvers read them; shape [rigid_contact_max] except count."""
 
-    count: wp.array(dtype=wp.int32)
-    shape0: wp.array(dtype=wp.int32)
-    shape1: wp.array(dtype=wp.int32)
-    point0: wp.array(dtype=wp.vec3)
-    point1: wp.array(dtype=wp.vec3)
-    offset0: wp.array(dtype=wp.vec3)
-    offset1: wp.array(dtype=wp.vec3)
-    normal: wp.array(dtype=wp.vec3)
-    margin0: wp.array(dtype=wp.float32)
-    margin1: wp.array(dtype=wp.float32)
+    count: wp.array(dtype=wp.int32)  # [1], contacts
+    shape0: wp.array(dtype=wp.int32)  # first shape of each contact
+    shape1: wp.array(dtype=wp.int32)  # second shape
+    point0: wp.array(dtype=wp.vec3)  # contact point of shape 0 [m], body frame
+    point1: wp.array(dtype=wp.vec3)  # contact point of shape 1 [m], body frame
+    offset0: wp.array(dtype=wp.vec3)  # from point0 to the surface with margin [m], body frame
+    offset1: wp.array(dtype=wp.vec3)  # from point1 to the surface with margin [m], body frame
+    normal: wp.array(dtype=wp.vec3)  # unit, from shape 0 to shape 1, world
+    margin0: wp.array(dtype=wp.float32)  # surface margin of shape 0 [m]
+    margin1: wp.array(dtype=wp.float32)  # surface margin of shape 1 [m]
 
 
 @wp.func

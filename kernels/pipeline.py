@@ -50,7 +50,7 @@ def place_object_kernel(
 def tally_demand_kernel(
     pair_count: wp.array(dtype=wp.int32),
     hit_total: wp.array(dtype=wp.int32),
-    unsure_total: wp.array(dtype=wp.int32),
+    uncertain_total: wp.array(dtype=wp.int32),
     launched: wp.array(dtype=wp.int32),
     demand_inout: wp.array(dtype=wp.int64),
 ):
@@ -61,5 +61,5 @@ def tally_demand_kernel(
     """
     demand_inout[0] = wp.max(demand_inout[0], wp.int64(wp.uint32(pair_count[0])))
     demand_inout[1] = wp.max(demand_inout[1], wp.int64(wp.uint32(hit_total[0])))
-    demand_inout[2] = wp.max(demand_inout[2], wp.int64(wp.uint32(unsure_total[0])))
+    demand_inout[2] = wp.max(demand_inout[2], wp.int64(wp.uint32(uncertain_total[0])))
     demand_inout[3] = wp.max(demand_inout[3], wp.int64(launched[1]))

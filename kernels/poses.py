@@ -21,27 +21,23 @@ ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
 class PairPose:
     """The pose of B in A's frame, A the object with the smaller index.
 
-    rotation, translation map B's model frame to A's in float64. rotation32, translation32 map coordinates about the
-    models' centres in float32, the transpose and back32 the other way. margin serves boxes; scale, a power of two that
-    brings the larger model to about unit size, and error serve `screen_triangles`. within is a distance that margin
-    covers too, 0 for intersection. node_* and corner_* say where the trees and face corners of both lie in the pools,
-    swapped whether the pair names B first. In this order nothing is padded, which would be stored byte by byte.
+    In this order nothing is padded, which would be stored byte by byte.
     """
 
-    rotation: wp.mat33d
-    translation: wp.vec3d
-    rotation32: wp.mat33
-    translation32: wp.vec3
-    back32: wp.vec3
-    margin: wp.float32
-    error: wp.float32
-    swapped: wp.int32
-    scale: wp.float64
-    within: wp.float64
-    node_a: wp.int32
-    node_b: wp.int32
-    corner_a: wp.int32
-    corner_b: wp.int32
+    rotation: wp.mat33d  # B's model frame to A's
+    translation: wp.vec3d  # B's model frame to A's
+    rotation32: wp.mat33  # coordinates of B about its model's centre to those of A about its own; the transpose back
+    translation32: wp.vec3  # the same, of B to A
+    back32: wp.vec3  # the same, of A to B
+    margin: wp.float32  # that boxes are widened by
+    error: wp.float32  # of a coordinate of `float32_filter_triangles`, twice
+    swapped: wp.int32  # 1 where the pair names B first
+    scale: wp.float64  # power of two that brings the larger model to about unit size
+    within: wp.float64  # distance that `margin` covers too, 0 for intersection
+    node_a: wp.int32  # where A's tree lies in the pool
+    node_b: wp.int32  # where B's tree lies in the pool
+    corner_a: wp.int32  # where A's face corners lie in the pool
+    corner_b: wp.int32  # where B's face corners lie in the pool
 
 
 @wp.func
@@ -60,7 +56,7 @@ def pose_point(rotation: wp.mat33d, translation: wp.vec3d, p: wp.vec3d):
 
 
 @wp.func
-def relate_objects(objects: ObjectPool, a: wp.int32, b: wp.int32):
+def relative_pose(objects: ObjectPool, a: wp.int32, b: wp.int32):
     """Return R = Ra^T Rb and t = Ra^T (tb - ta), each entry the sum of its three products from left to right."""
     ra = objects.rotation[a]
     rb = objects.rotation[b]
@@ -101,7 +97,7 @@ def pair_pose(
     gap along a unit axis is a distance, so `within` adds to the margin; a column is longer than 1 by at most
     `skewed`. `whole` says that all faces are asked for, not one hit, which float32 may find first.
     """
-    r, t = relate_objects(objects, a, b)
+    r, t = relative_pose(objects, a, b)
     state_a = objects.state[a]
     state_b = objects.state[b]
     centre_a = models.centre[states.model[state_a]]
@@ -128,7 +124,7 @@ def pair_pose(
     margin64 = ROUNDING_64 * (size + wp.float64(2.0) * (reach_c + reach_b) + reach_a)
     margin64 = margin64 + wp.float64(4.0) * skewed * (reach_b + far)
     margin32 = ROUNDING_32 * (reach_a + reach_b + far)
-    # Of a coordinate in `screen_triangles`; docs/exactness.md has the terms, which need `near` below.
+    # Of a coordinate in `float32_filter_triangles`; docs/exactness.md has the terms, which need `near` below.
     off32 = UNIT_32 * (wp.float64(2.0) * reach_a + wp.float64(13.0) * reach_b + wp.float64(3.0) * far)
 
     pose = PairPose()

@@ -39,12 +39,13 @@ def main(words=None):
     found = {}
     for controller in ("paper", "predictive"):
         frame = run(controller=controller, budget_ms=budget)
-        found[controller] = verdict = ab.judge_budget(frame.history)
+        found[controller] = verdict = ab.budget_report(frame.history)
         if verdict is None:
             raise SystemExit("the first second is not judged: give more frames")
         print(
-            f"{controller:>10}: {verdict['within']:.0%} of frames within it, {verdict['within_tenth']:.0%} within 10 % "
-            f"more, worst {verdict['worst']:.2f} times it, mean error {verdict['error_mean']:.3g}"
+            f"{controller:>10}: {verdict['within']:.0%} of frames within it, "
+            f"{verdict['within_110_percent']:.0%} within 10 % more, worst {verdict['worst']:.2f} times it, "
+            f"mean error {verdict['error_mean']:.3g}"
         )
     return found
 

@@ -61,7 +61,7 @@ def test_wheel_holds_the_package(wheel):
     held = {name for name in file.namelist() if ".dist-info/" not in name}
     assert {name.split("/")[0] for name in held} == {"warp_abtree"}
     expected = {f"warp_abtree/{name}" for name in sources("warp_abtree", (".py", ".typed"))}
-    expected |= {f"warp_abtree/kernels/{name}" for name in sources("kernels")}
+    expected |= {f"warp_abtree/kernels/{name}" for name in sources("kernels", (".py", ".h", ".cuh"))}
     expected |= {f"warp_abtree/scenes/{name}" for name in sources("scenes", (".py", ".toml"))}
     assert held == expected
     # An installed package has the kernels themselves, not the bridge to a checkout.
@@ -89,7 +89,8 @@ def test_source_distribution_holds_what_a_wheel_needs(dist):
     with tarfile.open(path) as file:
         held = {name.split("/", 1)[1] for name in file.getnames() if "/" in name}
     for folder in ("warp_abtree", "kernels", "scenes", "tests", "bench", "docs"):
-        expected = {f"{folder}/{name}" for name in sources(folder, (".py", ".toml", ".md", ".png", ".svg"))}
+        suffixes = (".py", ".h", ".cuh", ".toml", ".md", ".png", ".svg")
+        expected = {f"{folder}/{name}" for name in sources(folder, suffixes)}
         assert expected <= held, expected - held
     assert {"pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md", "warp_abtree/py.typed"} <= held
     assert not [name for name in held if "__pycache__" in name or name.startswith((".git", "build/", "dist/"))]
@@ -139,7 +140,7 @@ def test_scenes_are_found_by_name(tmp_path, monkeypatch):
 # Names that leave the package root, which then exports those of the page alone: their packages have them.
 LEAVING = set(
     """
-    FrameRow LodSweep RayPool ReplayClock SceneError SweepJob ThisProcess TreeState UpdateStats WorkClock
+    FrameRow LodSweep RayPool ReplayClock SceneError SweepJob ThisProcess TreeState WorkClock
     WorldsJob budget_report describe_mesh draw_controllers judge_budget judge_step load_mesh load_scene
     mesh_from_arrays read_shards resolve_lod run_shards step_response
     """.split()

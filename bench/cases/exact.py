@@ -9,7 +9,7 @@ import time
 import numpy as np
 import warp as wp
 
-from ..inside import EXACT, FILTER, FLOAT32, FLOAT32_UNIT, FLOAT64, UNCERTAIN, decide_triangles, float32_filter
+from ..inside import EXACT, FILTER, FLOAT32, FLOAT32_UNIT, UNCERTAIN, decide_triangles, float32_filter_triangles
 from ..triangle_pairs import ADVERSARIAL, make_chunk
 from ..verify import load_oracle
 
@@ -20,12 +20,12 @@ WHOLE_EVERY = 64
 ORDERS = [
     (p, q, swap) for p in itertools.permutations(range(3)) for q in itertools.permutations(range(3)) for swap in (0, 1)
 ]
-STAGES = ("float32_stage_ns", "float64_stage_ns", "exact_stage_ns", "float64_ns", "float32_ns")
+STAGES = ("float32_stage_ns", "float64_stage_ns", "exact_stage_ns", "float32_ns")
 
 
 def run(device, count=100_000, processes=2):
     """Yield one row a kind of pair: pairs asked, fraction that intersect (meet), disagreements of any stage with the
-    truth, fractions left to float64 and to expansions, error rates of float64 and float32 alone, time a pair [ns].
+    truth, fractions left to float64 and to expansions, error rate of float32 alone, time a pair [ns].
 
     Raises:
         RuntimeError: An answer was wrong, or the tests' oracle is not at hand.
@@ -33,7 +33,7 @@ def run(device, count=100_000, processes=2):
     device = wp.get_device(device)
     if load_oracle() is None:
         raise RuntimeError("the exact oracle is not at hand; run this in a checkout with its tests")
-    for mode in (FILTER, EXACT, FLOAT64, FLOAT32):
+    for mode in (FILTER, EXACT, FLOAT32):
         ask(mode, make_chunk(("random", 0, 1)), device)  # compile before anything is timed
     ask_float32(make_chunk(("random", 0, 1)), device)
     jobs, tallies = list_jobs(count), {}
@@ -43,7 +43,7 @@ def run(device, count=100_000, processes=2):
         for at, (job, truth) in enumerate(zip(jobs, pool.imap(find_truth, jobs))):
             if job[0] not in tallies and tallies:
                 yield describe_tally(device, *list(tallies.items())[-1])
-            check_chunk(job, truth, device, tallies.setdefault(job[0], np.zeros(12)))
+            check_chunk(job, truth, device, tallies.setdefault(job[0], np.zeros(10)))
             done, wrong = (int(sum(tally[k] for tally in tallies.values())) for k in (0, 2))
             line = f"{at + 1}/{len(jobs)} chunks, {done} pairs, {wrong} wrong, {time.perf_counter() - begin:.0f} s"
             print(f"{job[0]}: {line}", file=sys.stderr, flush=True)
@@ -110,7 +110,7 @@ def float32_pair_kernel(
     answer_out: wp.array(dtype=wp.int32),
 ):
     i = wp.tid()
-    answer_out[i] = float32_filter(
+    answer_out[i] = float32_filter_triangles(
         error, unit, corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
     )
 
@@ -128,7 +128,7 @@ def time_launch(kernel, inputs, count, device):
 
 
 def ask(mode, pairs, device):
-    """Return the answers of float64 or exact signs, int32 (count,), and the time [s]."""
+    """Return the answers of signs in a mode, int32 (count,), and the time [s]."""
     corners = wp.array(np.ascontiguousarray(pairs).reshape(-1, 6, 3), dtype=wp.vec3d, device=device)
     return time_launch(pair_test(int(mode)), [corners], len(pairs), device)
 
@@ -169,20 +169,18 @@ def check_chunk(job, truth, device, tally):
     again, double_time = ask(FILTER, pairs[to_float64], device)
     to_exact = to_float64[again == UNCERTAIN]
     _, exact_time = ask(EXACT, pairs[to_exact], device)
-    plain, plain_time = ask(FLOAT64, pairs, device)
     unproven, unproven_time = ask_float32(pairs, device, proven=False)
     rest = np.flatnonzero(unproven == UNCERTAIN)
     unproven[rest], rest_time = ask(FLOAT32, unit_size(pairs[rest]), device)
     tally += [
-        len(truth), truth.sum(), len(wrong), len(to_float64), len(to_exact),
-        (plain != truth).sum(), (unproven != truth).sum(),
-        single_time, double_time, exact_time, plain_time, unproven_time + rest_time,
+        len(truth), truth.sum(), len(wrong), len(to_float64), len(to_exact), (unproven != truth).sum(),
+        single_time, double_time, exact_time, unproven_time + rest_time,
     ]  # fmt: skip
 
 
 def describe_tally(device, kind, tally):
     """Turn a tally into a row."""
-    pairs, hits, wrong, to_float64, to_exact, plain, unproven, *times = tally.tolist()
+    pairs, hits, wrong, to_float64, to_exact, unproven, *times = tally.tolist()
     return {
         "device": device.name,
         "kind": kind,
@@ -191,7 +189,6 @@ def describe_tally(device, kind, tally):
         "disagreements": int(wrong),
         "to_float64": float(f"{to_float64 / pairs:.3g}"),
         "to_exact": float(f"{to_exact / pairs:.3g}"),
-        "float64_errors": float(f"{plain / pairs:.3g}"),
         "float32_errors": float(f"{unproven / pairs:.3g}"),
         **{name: round(1e9 * t / pairs, 1) for name, t in zip(STAGES, times, strict=True)},
     }

@@ -66,9 +66,9 @@ def run(device, devices=None, quick=False):
 def time_worker(device, model, count, repeats):
     """Return the row of a shard asked on one device, on the CPU by one core: poses on the host, answers there."""
     job = SweepJob(model, model, random_poses(count, longest_side(model)))
-    asker, item = job.asker(), job.item(0, count)
+    runner, task = job.runner(), job.task(0, count)
     with testing.regime(cpu_threads=1):
-        times = time_rounds({"shard": time_call(lambda: asker.ask(item, device), device)}, repeats)["shard"]
+        times = time_rounds({"shard": time_call(lambda: runner.run(task, device), device)}, repeats)["shard"]
     row = {"case": "worker", "device": device.name, "faces": model.face_count, "poses": count}
     return row | summarise("shard", times) | {"worker_mposes_s": float(f"{count / np.median(times) / 1e3:.4g}")}
 
@@ -78,9 +78,9 @@ class IdlePool:
 
     workers, lost = 1, 0
 
-    def ask(self, job, ranges):
+    def run(self, job, ranges):
         for start, stop in ranges:
-            yield start, stop, {"any": np.zeros(len(job.item(start, stop)[1]), bool)}
+            yield start, stop, {"any": np.zeros(len(job.task(start, stop)[1]), bool)}
 
 
 def time_driver(model, count):
@@ -138,11 +138,11 @@ def scale_shards(devices, model, sizes):
             job = SweepJob(model, model, poses[:count], shard=shard)
             ranges = [(start, start + shard) for start in range(0, count, shard)]
             pool = ThisProcess(devices[:parts])
-            answers = {start: columns["any"] for start, _, columns in pool.ask(job, ranges)}
+            answers = {start: columns["any"] for start, _, columns in pool.run(job, ranges)}
             if not np.array_equal(np.concatenate([answers[start] for start, _ in ranges]), expected[:count]):
                 raise RuntimeError(f"shards: {parts} devices answer otherwise than one")
             runs[parts, times] = time_call(
-                lambda pool=pool, job=job, ranges=ranges: deque(pool.ask(job, ranges), 0), devices[0]
+                lambda pool=pool, job=job, ranges=ranges: deque(pool.run(job, ranges), 0), devices[0]
             )
         found = time_rounds(runs, repeats)
 

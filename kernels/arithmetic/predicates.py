@@ -19,13 +19,12 @@ from warp_abtree.kernels.arithmetic.int128 import integer_orient2d, integer_orie
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-# How signs are made. FILTER answers UNSURE where the bound leaves the sign open; EXACT goes on.
+# How signs are made. FILTER answers UNCERTAIN where the bound leaves the sign open; EXACT goes on.
 FILTER = wp.constant(0)
-FLOAT64 = wp.constant(1)
-FLOAT32 = wp.constant(2)
-EXACT = wp.constant(3)
+FLOAT32 = wp.constant(1)
+EXACT = wp.constant(2)
 # So large that no sum of three signs with one of these among them is 3 or -3.
-UNSURE = wp.constant(8)
+UNCERTAIN = wp.constant(8)
 
 BOUND_3D = wp.constant(wp.float64((8.0 + 128.0 * 2.0**-53) * 2.0**-53))
 BOUND_2D = wp.constant(wp.float64((3.0 + 16.0 * 2.0**-53) * 2.0**-53))
@@ -39,9 +38,9 @@ def plain_sign(x: wp.float64):
 
 @wp.func
 def filtered_sign(x: Any, bound: Any):
-    """Return the sign of a value that errs by at most a bound, or UNSURE; a bound of 0 makes 0 a sure sign."""
+    """Return the sign of a value that errs by at most a bound, or UNCERTAIN; a bound of 0 makes 0 a sure sign."""
     # Without branches: which sign it is cannot be predicted.
-    open = wp.where(bound == type(bound)(0.0), 0, UNSURE)
+    open = wp.where(bound == type(bound)(0.0), 0, UNCERTAIN)
     return wp.where(x > bound, 1, wp.where(x < -bound, -1, open))
 
 
@@ -50,9 +49,9 @@ def resolve_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, size: w
     """Return a sign that float64 leaves open, `size` the sum of magnitudes. Not inlined: long, and rarely called."""
     bound = BOUND_DOUBLE * size
     sign = filtered_sign(double_orient3d(a, b, c, d), bound)
-    if sign == UNSURE:
+    if sign == UNCERTAIN:
         sign = integer_orient3d(a, b, c, d, bound)
-    if sign == UNSURE:
+    if sign == UNCERTAIN:
         sign = exact_orient3d(a, b, c, d)
     return sign
 
@@ -62,9 +61,9 @@ def resolve_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, size: wp.float64):
     """Return a sign that float64 leaves open, as `resolve_orient3d`."""
     bound = BOUND_DOUBLE * size
     sign = filtered_sign(double_orient2d(a, b, c), bound)
-    if sign == UNSURE:
+    if sign == UNCERTAIN:
         sign = integer_orient2d(a, b, c, bound)
-    if sign == UNSURE:
+    if sign == UNCERTAIN:
         sign = exact_orient2d(a, b, c)
     return sign
 
@@ -83,7 +82,7 @@ def fused_sum(u: wp.vec3d, x: wp.float64, y: wp.float64, z: wp.float64):
 
 @wp.func
 def filter_rows(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
-    """Return the sign of det(u, v, w) of three differences or UNSURE, and the sum of magnitudes."""
+    """Return the sign of det(u, v, w) of three differences or UNCERTAIN, and the sum of magnitudes."""
     x, x_size = fused_minor(v[1], w[2], v[2], w[1])
     y, y_size = fused_minor(w[1], u[2], w[2], u[1])
     z, z_size = fused_minor(u[1], v[2], u[2], v[1])
@@ -94,7 +93,7 @@ def filter_rows(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
 
 @wp.func
 def filter_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return the sign of `orient3d` or UNSURE, and the sum of magnitudes."""
+    """Return the sign of `orient3d` or UNCERTAIN, and the sum of magnitudes."""
     return filter_rows(a - d, b - d, c - d)
 
 
@@ -105,7 +104,7 @@ def sum_sizes64(v: wp.vec3d):
 
 @wp.func
 def filter_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return the sign of `orient_edges` or UNSURE.
+    """Return the sign of `orient_edges` or UNCERTAIN.
 
     Rows may be taken from one another: det(a - d, b - c, c - d) and det(a - c, b - d, c - d) are the same number. Ends
     of edges that are laid on one another nearly coincide, so one of the two has rows that are nearly nothing, and an
@@ -118,29 +117,24 @@ def filter_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 
 
 @wp.func
-def plain_orient3d(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return the sign of `orient3d` of rounded determinants, unguarded."""
+def plain_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Return the sign of `orient3d` of a determinant rounded to float32, unguarded."""
     u = a - d
     v = b - d
     w = c - d
-    if mode == FLOAT32:
-        return plain_sign(wp.float64(wp.dot(wp.vec3(u), wp.cross(wp.vec3(v), wp.vec3(w)))))
-    x = v[1] * w[2] - v[2] * w[1]
-    y = w[1] * u[2] - w[2] * u[1]
-    z = u[1] * v[2] - u[2] * v[1]
-    return plain_sign((u[0] * x + v[0] * y) + w[0] * z)
+    return plain_sign(wp.float64(wp.dot(wp.vec3(u), wp.cross(wp.vec3(v), wp.vec3(w)))))
 
 
 @wp.func
 def orient3d(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return on which side of plane (a, b, c) point d lies: 1 below, -1 above, 0 on it, or UNSURE.
+    """Return on which side of plane (a, b, c) point d lies: 1 below, -1 above, 0 on it, or UNCERTAIN.
 
     Seen from above, a, b and c turn counterclockwise.
     """
-    if mode == FLOAT32 or mode == FLOAT64:
-        return plain_orient3d(mode, a, b, c, d)
+    if mode == FLOAT32:
+        return plain_orient3d(a, b, c, d)
     sign, size = filter_orient3d(a, b, c, d)
-    if mode == EXACT and sign == UNSURE:
+    if mode == EXACT and sign == UNCERTAIN:
         sign = resolve_orient3d(a, b, c, d, size)
     return sign
 
@@ -148,24 +142,24 @@ def orient3d(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
 @wp.func
 def orient_edges(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """Return `orient3d` of the ends of two edges, a b and c d."""
-    if mode == FLOAT32 or mode == FLOAT64:
-        return plain_orient3d(mode, a, b, c, d)
+    if mode == FLOAT32:
+        return plain_orient3d(a, b, c, d)
     sign = filter_edges(a, b, c, d)
-    if mode == EXACT and sign == UNSURE:
+    if mode == EXACT and sign == UNCERTAIN:
         sign = orient3d(EXACT, a, b, c, d)
     return sign
 
 
 @wp.func
 def orient2d(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
-    """Return 1 where a, b, c turn counterclockwise, -1 clockwise, 0 where they are collinear, or UNSURE."""
+    """Return 1 where a, b, c turn counterclockwise, -1 clockwise, 0 where they are collinear, or UNCERTAIN."""
     left = (a[0] - c[0]) * (b[1] - c[1])
     right = (a[1] - c[1]) * (b[0] - c[0])
-    if mode == FLOAT64 or mode == FLOAT32:
+    if mode == FLOAT32:
         return plain_sign(left - right)
     size = wp.abs(left) + wp.abs(right)
     sign = filtered_sign(left - right, BOUND_2D * size)
-    if sign == UNSURE:
+    if sign == UNCERTAIN:
         if a == b or a == c or b == c:
             sign = 0
         elif mode == EXACT:

@@ -1,6 +1,6 @@
-"""Rigid bodies: which pairs matter, islands and sleep, and motion of one step.
+"""Rigid bodies: their state, sleeping islands, and the motion of one step.
 
-A body's frame has its origin at the centre of mass and its axes along the principal axes of inertia.
+A body frame has its origin at the centre of mass and its axes along the principal axes of inertia.
 """
 
 import warp as wp
@@ -11,78 +11,72 @@ from warp_abtree.kernels.poses import rotate_quaternion
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-FIXED = wp.constant(0)
+STATIC = wp.constant(0)
 ASLEEP = wp.constant(1)
-AWAKE = wp.constant(2)
-DRIVEN = wp.constant(3)
-"""Roles: what never moves in this step, rigid bodies at rest and in motion, and what moves as it is told."""
+DYNAMIC = wp.constant(2)
+KINEMATIC = wp.constant(3)
+"""Motion type of an object in this step: at rest for good, a sleeping rigid body, one in motion, prescribed motion."""
 
 HALF = wp.constant(wp.float64(0.5))
 
 
 @wp.struct
 class Bodies:
-    """One entry an object.
+    """Rigid bodies, one entry an object. Bodies that are not rigid have infinite mass: inverses are 0."""
 
-    Static: rank among the rigid bodies of its world; driven, whether its motion is prescribed; inverse_mass,
-    inverse_moment (principal), 0 unless rigid; centre of mass and principal axes (columns) in the model's frame, 0 and
-    1 unless rigid; restitution, friction; slop [world units] that contacts may keep; sleep_speed [world units/s]; reach
-    from the centre of mass [world units].
-    State: role; position [world units] and rotation (x y z w) of the body's frame; velocity [world units/s];
-    momentum, angular, about the centre of mass, world frame; spin [rad/s] of driven objects; rest, how long it has been
-    slow [s]. Of one step: inverse_inertia, world frame; push and turn, as velocity and momentum but for corrections of
-    place; island and island_rest; bid, of the colouring.
-    """
-
-    rank: wp.array(dtype=wp.int32)
-    driven: wp.array(dtype=wp.int32)
-    inverse_mass: wp.array(dtype=wp.float64)
-    inverse_moment: wp.array(dtype=wp.vec3d)
-    centre: wp.array(dtype=wp.vec3d)
-    axes: wp.array(dtype=wp.mat33d)
-    restitution: wp.array(dtype=wp.float64)
-    friction: wp.array(dtype=wp.float64)
-    slop: wp.array(dtype=wp.float64)
-    sleep_speed: wp.array(dtype=wp.float64)
-    reach: wp.array(dtype=wp.float64)
-    role: wp.array(dtype=wp.int32)
-    position: wp.array(dtype=wp.vec3d)
-    rotation: wp.array(dtype=wp.vec4d)
-    velocity: wp.array(dtype=wp.vec3d)
-    momentum: wp.array(dtype=wp.vec3d)
-    spin: wp.array(dtype=wp.vec3d)
-    rest: wp.array(dtype=wp.float64)
-    inverse_inertia: wp.array(dtype=wp.mat33d)
-    push: wp.array(dtype=wp.vec3d)
-    turn: wp.array(dtype=wp.vec3d)
-    island: wp.array(dtype=wp.int32)
-    island_rest: wp.array(dtype=wp.float64)
-    bid: wp.array(dtype=wp.int64)
+    # static
+    rank: wp.array(dtype=wp.int32)  # rank among the rigid bodies of the same world
+    prescribed: wp.array(dtype=wp.int32)  # 1 if the motion is prescribed
+    inverse_mass: wp.array(dtype=wp.float64)  # [1 / mass]
+    inverse_moment: wp.array(dtype=wp.vec3d)  # of the principal moments of inertia
+    centre: wp.array(dtype=wp.vec3d)  # centre of mass, model frame [world units]
+    axes: wp.array(dtype=wp.mat33d)  # principal axes as columns, model frame
+    restitution: wp.array(dtype=wp.float64)  # coefficient, 0 to 1
+    friction: wp.array(dtype=wp.float64)  # coefficient of Coulomb's law
+    slop: wp.array(dtype=wp.float64)  # penetration that is not corrected [world units]
+    sleep_speed: wp.array(dtype=wp.float64)  # below it a body counts as at rest [world units/s]
+    bounding_radius: wp.array(dtype=wp.float64)  # about the centre of mass [world units]
+    # state
+    motion_type: wp.array(dtype=wp.int32)  # STATIC, ASLEEP, DYNAMIC or KINEMATIC
+    position: wp.array(dtype=wp.vec3d)  # of the body frame [world units]
+    rotation: wp.array(dtype=wp.vec4d)  # of the body frame, x y z w
+    velocity: wp.array(dtype=wp.vec3d)  # of the centre of mass [world units/s]
+    momentum: wp.array(dtype=wp.vec3d)  # angular momentum about the centre of mass, world frame
+    angular_velocity: wp.array(dtype=wp.vec3d)  # of kinematic objects alone [rad/s]
+    rest_time: wp.array(dtype=wp.float64)  # how long the body has been slow [s]
+    # of one step
+    inverse_inertia: wp.array(dtype=wp.mat33d)  # world frame
+    pseudo_velocity: wp.array(dtype=wp.vec3d)  # of the position correction [world units/s]
+    pseudo_momentum: wp.array(dtype=wp.vec3d)  # its angular momentum
+    island: wp.array(dtype=wp.int32)  # parent in the union-find forest of islands
+    island_rest_time: wp.array(dtype=wp.float64)  # at a root: least rest_time of the island [s]
+    bid: wp.array(dtype=wp.int64)  # highest bid of the graph coloring
 
 
 @wp.func
-def pair_matters(roles: wp.array(dtype=wp.int32), i: wp.int32, j: wp.int32):
-    """Return whether a contact of two objects can move either of them."""
-    if roles.shape[0] == 0:
+def pair_matters(motion_type: wp.array(dtype=wp.int32), i: wp.int32, j: wp.int32):
+    """Return whether a contact of two objects can move either of them; an empty array keeps all pairs."""
+    if motion_type.shape[0] == 0:
         return True
-    low = wp.min(roles[i], roles[j])
-    high = wp.max(roles[i], roles[j])
-    return high == AWAKE or low == AWAKE or (high == DRIVEN and low == ASLEEP)
+    low = wp.min(motion_type[i], motion_type[j])
+    high = wp.max(motion_type[i], motion_type[j])
+    return high == DYNAMIC or low == DYNAMIC or (high == KINEMATIC and low == ASLEEP)
 
 
 @wp.kernel
 def make_pair_key_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
-    roles: wp.array(dtype=wp.int32),
+    motion_type: wp.array(dtype=wp.int32),
+    # out
     order_out: wp.array(dtype=wp.int32),
     key_out: wp.array(dtype=wp.int64),
 ):
-    """Make the key first * 2^32 + second of each pair that matters; others go behind them all."""
+    """Make the key first * 2^32 + second of each pair that matters; others sort behind all of them."""
     p = wp.tid()
     order_out[p] = p
     key_out[p] = LAST_KEY
-    if p < pair_count[0] and pair_matters(roles, pairs[p][0], pairs[p][1]):
+    if p < pair_count[0] and pair_matters(motion_type, pairs[p][0], pairs[p][1]):
         key_out[p] = (wp.int64(pairs[p][0]) << wp.int64(32)) | wp.int64(pairs[p][1])
 
 
@@ -90,7 +84,7 @@ def make_pair_key_kernel(
 def place_pair_kernel(
     key: wp.array(dtype=wp.int64), pair_count_inout: wp.array(dtype=wp.int32), pairs_out: wp.array(dtype=wp.vec2i)
 ):
-    """Put the pairs in the order of their keys and count them; a count beyond the room stays, as the demand."""
+    """Write the pairs in key order and count them; a count beyond the capacity stays, as the demand."""
     p = wp.tid()
     room = pairs_out.shape[0]
     if p < room and key[p] != LAST_KEY:
@@ -101,7 +95,7 @@ def place_pair_kernel(
     after = bool(True)
     if p < room:
         after = key[p] == LAST_KEY
-    # One thread alone stands where the pairs end, whatever the count is.
+    # Exactly one thread stands where the pairs end.
     if before and after and pair_count_inout[0] <= room and pair_count_inout[0] >= 0:
         pair_count_inout[0] = p
 
@@ -116,8 +110,8 @@ def multiply_quaternion(p: wp.vec4d, q: wp.vec4d):
 
 
 @wp.func
-def turn_quaternion(v: wp.vec3d):
-    """Return the rotation by a vector, axis times angle [rad]."""
+def quaternion_exp(v: wp.vec3d):
+    """Return the quaternion of a rotation vector, axis times angle [rad]."""
     angle = wp.length(v)
     scale = HALF
     if angle > wp.float64(1.0e-8):
@@ -126,33 +120,33 @@ def turn_quaternion(v: wp.vec3d):
 
 
 @wp.func
-def turn_axis(axis: wp.int32, angle: wp.float64, q: wp.vec4d, momentum: wp.vec3d):
-    """Turn a body about one of its own axes; its momentum in its own frame turns the other way."""
+def rotate_about_axis(axis: wp.int32, angle: wp.float64, q: wp.vec4d, momentum: wp.vec3d):
+    """Rotate a body about one of its own axes; its momentum in the body frame rotates the other way."""
     v = wp.vec3d()
     v[axis] = angle
     j = (axis + 1) % 3
     k = (axis + 2) % 3
     c = wp.cos(angle)
     s = wp.sin(angle)
-    turned = momentum
-    turned[j] = c * momentum[j] + s * momentum[k]
-    turned[k] = c * momentum[k] - s * momentum[j]
-    return multiply_quaternion(q, turn_quaternion(v)), turned
+    rotated = momentum
+    rotated[j] = c * momentum[j] + s * momentum[k]
+    rotated[k] = c * momentum[k] - s * momentum[j]
+    return multiply_quaternion(q, quaternion_exp(v)), rotated
 
 
 @wp.func
-def rotate_free(q: wp.vec4d, momentum: wp.vec3d, inverse_moment: wp.vec3d, dt: wp.float64):
-    """Return where a free body turns within a time, its angular momentum [world frame] kept.
+def integrate_rotation(q: wp.vec4d, momentum: wp.vec3d, inverse_moment: wp.vec3d, dt: wp.float64):
+    """Return the rotation of a free body after a time; its angular momentum [world frame] is constant.
 
-    The kinetic energy is split into that of the three axes, about each of which the motion is a plain rotation; a
-    symmetric product of them is symplectic, so that the energy swings and does not drift.
+    The kinetic energy is split into that of the three axes, each of which gives a plain rotation. Their symmetric
+    product is symplectic: the energy oscillates and does not drift.
     Source: McLachlan 1993, Explicit Lie-Poisson integration and the Euler equations; Reich 1994.
     """
     m = wp.transpose(rotate_quaternion(q)) * momentum
     for k in range(5):
         axis = wp.where(k < 3, k, 4 - k)
         part = wp.where(k == 2, dt, HALF * dt)
-        q, m = turn_axis(axis, part * m[axis] * inverse_moment[axis], q, m)
+        q, m = rotate_about_axis(axis, part * m[axis] * inverse_moment[axis], q, m)
     return q / wp.length(q)
 
 
@@ -173,14 +167,15 @@ def begin_step_kernel(
     target_rotation: wp.array(dtype=wp.mat33d),
     target_position: wp.array(dtype=wp.vec3d),
     objects: ObjectPool,
+    # state
     bodies_inout: Bodies,
 ):
-    """Set what one step starts from; driven objects get the velocity that takes them to their targets."""
+    """Initialise a step; kinematic objects get the velocity that takes them to their targets."""
     i = wp.tid()
-    bodies_inout.push[i] = wp.vec3d()
-    bodies_inout.turn[i] = wp.vec3d()
+    bodies_inout.pseudo_velocity[i] = wp.vec3d()
+    bodies_inout.pseudo_momentum[i] = wp.vec3d()
     bodies_inout.island[i] = i
-    bodies_inout.island_rest[i] = wp.float64(wp.inf)
+    bodies_inout.island_rest_time[i] = wp.float64(wp.inf)
     bodies_inout.bid[i] = wp.int64(0)
     if bodies_inout.inverse_mass[i] > wp.float64(0.0):
         r = rotate_quaternion(bodies_inout.rotation[i])
@@ -188,100 +183,96 @@ def begin_step_kernel(
         return
     bodies_inout.position[i] = objects.position[i]
     bodies_inout.velocity[i] = wp.vec3d()
-    bodies_inout.spin[i] = wp.vec3d()
-    bodies_inout.role[i] = FIXED
-    if bodies_inout.driven[i] != 0 and target_position.shape[0] > 0:
+    bodies_inout.angular_velocity[i] = wp.vec3d()
+    bodies_inout.motion_type[i] = STATIC
+    if bodies_inout.prescribed[i] != 0 and target_position.shape[0] > 0:
         velocity = (target_position[i] - objects.position[i]) / dt
-        spin = rotation_vector(target_rotation[i] * wp.transpose(objects.rotation[i])) / dt
+        angular_velocity = rotation_vector(target_rotation[i] * wp.transpose(objects.rotation[i])) / dt
         bodies_inout.velocity[i] = velocity
-        bodies_inout.spin[i] = spin
-        if wp.length(velocity) + wp.length(spin) > wp.float64(0.0):
-            bodies_inout.role[i] = DRIVEN
+        bodies_inout.angular_velocity[i] = angular_velocity
+        if wp.length(velocity) + wp.length(angular_velocity) > wp.float64(0.0):
+            bodies_inout.motion_type[i] = KINEMATIC
 
 
 @wp.kernel
-def unite_island_kernel(
+def unite_islands_kernel(
     pair_count: wp.array(dtype=wp.int32), pairs: wp.array(dtype=wp.vec2i), manifolds: Manifolds, bodies_inout: Bodies
 ):
-    """Unite the islands of two rigid bodies that touch; what a driven object touches is not at rest."""
+    """Unite the islands of two rigid bodies in contact; contact with a moving kinematic object resets the rest time."""
     p = wp.tid()
     if p >= pair_count[0] or manifolds.count[p] == 0:
         return
     i = pairs[p][0]
     j = pairs[p][1]
     zero = wp.float64(0.0)
-    if bodies_inout.role[i] == DRIVEN:
-        bodies_inout.rest[j] = zero
-    if bodies_inout.role[j] == DRIVEN:
-        bodies_inout.rest[i] = zero
+    if bodies_inout.motion_type[i] == KINEMATIC:
+        bodies_inout.rest_time[j] = zero
+    if bodies_inout.motion_type[j] == KINEMATIC:
+        bodies_inout.rest_time[i] = zero
     if bodies_inout.inverse_mass[i] > zero and bodies_inout.inverse_mass[j] > zero:
         unite_roots(bodies_inout.island, i, j)
 
 
 @wp.kernel
-def rest_island_kernel(bodies_inout: Bodies):
-    """Find how long each island has been slow: the least of its bodies' times."""
+def measure_island_rest_kernel(bodies_inout: Bodies):
+    """Find the rest time of each island: the least of its bodies' times."""
     i = wp.tid()
     if bodies_inout.inverse_mass[i] > wp.float64(0.0):
-        wp.atomic_min(bodies_inout.island_rest, find_root(bodies_inout.island, i), bodies_inout.rest[i])
+        wp.atomic_min(bodies_inout.island_rest_time, find_root(bodies_inout.island, i), bodies_inout.rest_time[i])
 
 
 @wp.kernel
-def wake_body_kernel(sleep_time: wp.float64, bodies_inout: Bodies):
-    """Put islands that have been slow for long to sleep, wake all others."""
+def update_sleep_kernel(sleep_time: wp.float64, bodies_inout: Bodies):
+    """Put islands that have rested for `sleep_time` to sleep, and wake all others."""
     i = wp.tid()
     if bodies_inout.inverse_mass[i] == wp.float64(0.0):
         return
-    if bodies_inout.island_rest[find_root(bodies_inout.island, i)] >= sleep_time:
-        bodies_inout.role[i] = ASLEEP
+    if bodies_inout.island_rest_time[find_root(bodies_inout.island, i)] >= sleep_time:
+        bodies_inout.motion_type[i] = ASLEEP
         bodies_inout.velocity[i] = wp.vec3d()
         bodies_inout.momentum[i] = wp.vec3d()
         return
-    bodies_inout.role[i] = AWAKE
+    bodies_inout.motion_type[i] = DYNAMIC
 
 
 @wp.kernel
-def accelerate_body_kernel(change: wp.vec3d, bodies_inout: Bodies):
-    """Change the velocity of each body that is awake by what gravity adds in a step."""
+def apply_gravity_kernel(velocity_change: wp.vec3d, bodies_inout: Bodies):
+    """Add the velocity change of a step under gravity to every dynamic body."""
     i = wp.tid()
-    if bodies_inout.role[i] == AWAKE:
-        bodies_inout.velocity[i] += change
-
-
-@wp.func
-def pose_body(bodies: Bodies, objects: ObjectPool, i: wp.int32):
-    """Put an object where its body is."""
-    rotation = rotate_quaternion(bodies.rotation[i]) * wp.transpose(bodies.axes[i])
-    objects.rotation[i] = rotation
-    objects.position[i] = bodies.position[i] - rotation * bodies.centre[i]
+    if bodies_inout.motion_type[i] == DYNAMIC:
+        bodies_inout.velocity[i] += velocity_change
 
 
 @wp.kernel
-def move_body_kernel(
+def integrate_kernel(
     dt: wp.float64,
     target_rotation: wp.array(dtype=wp.mat33d),
     target_position: wp.array(dtype=wp.vec3d),
+    # state
     bodies_inout: Bodies,
     objects_inout: ObjectPool,
 ):
-    """Move each body with its new velocity and the correction of its place, and time how long it has been slow."""
+    """Move each body by its velocity and its position correction, pose its object, and update its rest time."""
     i = wp.tid()
-    if bodies_inout.role[i] == DRIVEN:
+    if bodies_inout.motion_type[i] == KINEMATIC:
         objects_inout.rotation[i] = target_rotation[i]
         objects_inout.position[i] = target_position[i]
-    if bodies_inout.role[i] != AWAKE:
+    if bodies_inout.motion_type[i] != DYNAMIC:
         return
-    spin = bodies_inout.inverse_inertia[i] * bodies_inout.momentum[i]
-    speed = wp.length(bodies_inout.velocity[i]) + bodies_inout.reach[i] * wp.length(spin)
-    bodies_inout.rest[i] = wp.where(speed < bodies_inout.sleep_speed[i], bodies_inout.rest[i] + dt, wp.float64(0.0))
-    bodies_inout.position[i] += dt * (bodies_inout.velocity[i] + bodies_inout.push[i])
-    q = rotate_free(bodies_inout.rotation[i], bodies_inout.momentum[i], bodies_inout.inverse_moment[i], dt)
-    turn = bodies_inout.inverse_inertia[i] * bodies_inout.turn[i]
-    if wp.dot(turn, turn) > wp.float64(0.0):
-        correction = turn_quaternion(dt * turn)
+    angular_velocity = bodies_inout.inverse_inertia[i] * bodies_inout.momentum[i]
+    speed = wp.length(bodies_inout.velocity[i]) + bodies_inout.bounding_radius[i] * wp.length(angular_velocity)
+    at_rest = speed < bodies_inout.sleep_speed[i]
+    bodies_inout.rest_time[i] = wp.where(at_rest, bodies_inout.rest_time[i] + dt, wp.float64(0.0))
+    bodies_inout.position[i] += dt * (bodies_inout.velocity[i] + bodies_inout.pseudo_velocity[i])
+    q = integrate_rotation(bodies_inout.rotation[i], bodies_inout.momentum[i], bodies_inout.inverse_moment[i], dt)
+    pseudo_angular_velocity = bodies_inout.inverse_inertia[i] * bodies_inout.pseudo_momentum[i]
+    if wp.dot(pseudo_angular_velocity, pseudo_angular_velocity) > wp.float64(0.0):
+        correction = quaternion_exp(dt * pseudo_angular_velocity)
         q = multiply_quaternion(correction, q)
         q = q / wp.length(q)
-        # Momentum turns along, or the kinetic energy would change.
+        # The momentum rotates along, otherwise the kinetic energy would change.
         bodies_inout.momentum[i] = rotate_quaternion(correction) * bodies_inout.momentum[i]
     bodies_inout.rotation[i] = q
-    pose_body(bodies_inout, objects_inout, i)
+    rotation = rotate_quaternion(q) * wp.transpose(bodies_inout.axes[i])
+    objects_inout.rotation[i] = rotation
+    objects_inout.position[i] = bodies_inout.position[i] - rotation * bodies_inout.centre[i]

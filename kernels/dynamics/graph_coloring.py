@@ -1,83 +1,81 @@
-"""Colours of touching pairs, so that no body that moves is in two pairs of one colour.
+"""Graph coloring of the pairs in contact: no dynamic body is in two pairs of one color.
 
-Round by round every pair left bids for its bodies, and takes the round's colour where it has won both.
+In each round every uncolored pair bids for its bodies, and takes the color of the round where it has won both.
 Source: Luby 1986; Jones and Plassmann 1993.
 """
 
 import warp as wp
 
 from warp_abtree.kernels.contact.manifold import Manifolds
-from warp_abtree.kernels.dynamics.bodies import AWAKE, Bodies
+from warp_abtree.kernels.dynamics.bodies import DYNAMIC, Bodies
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-COLOURS = wp.constant(24)
-"""Colours of pairs; the pairs left over take colour COLOURS and are relaxed one after another."""
+COLOR_COUNT = wp.constant(24)
+"""Number of colors. Pairs left over have the color COLOR_COUNT and are relaxed one after another."""
 
-NO_COLOUR = wp.constant(127)
-
-
-@wp.func
-def is_active(bodies: Bodies, manifolds: Manifolds, p: wp.int32, pair: wp.vec2i):
-    return manifolds.count[p] > 0 and (bodies.role[pair[0]] == AWAKE or bodies.role[pair[1]] == AWAKE)
+INACTIVE = wp.constant(127)
+"""Color of pairs that are not solved."""
 
 
 @wp.func
-def make_bid(p: wp.int32, colour: wp.int32, pair: wp.vec2i, bodies: Bodies):
-    """Return a number that no other pair has: later colours outbid earlier ones, pairs are in no order otherwise.
+def make_bid(p: wp.int32, color: wp.int32, pair: wp.vec2i, bodies: Bodies):
+    """Return the bid of a pair: later rounds outbid earlier ones; within a round it is a hash, then the pair's number.
 
-    Ranks in their worlds, not numbers in the scene, decide, so that a world goes the same way alone and among others.
+    The hash is of ranks in a world, not of object numbers, so a world has the same coloring alone and among others.
+
+    Bits: 63..56 round + 1 | 55 zero | 54..31 hash | 30..0 pair
     """
     mixed = wp.uint32(bodies.rank[pair[0]]) * wp.uint32(40503) + wp.uint32(bodies.rank[pair[1]])
     mixed = (mixed ^ (mixed >> wp.uint32(15))) * wp.uint32(739982445)
     mixed = (mixed ^ (mixed >> wp.uint32(12))) & wp.uint32(0xFFFFFF)
-    return (wp.int64(colour + 1) << wp.int64(56)) | (wp.int64(mixed) << wp.int64(31)) | wp.int64(p)
+    return (wp.int64(color + 1) << wp.int64(56)) | (wp.int64(mixed) << wp.int64(31)) | wp.int64(p)
 
 
 @wp.kernel
-def begin_colour_kernel(
+def begin_coloring_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
     manifolds: Manifolds,
     bodies: Bodies,
+    # out
     order_out: wp.array(dtype=wp.int32),
-    colour_out: wp.array(dtype=wp.int32),
+    color_out: wp.array(dtype=wp.int32),
 ):
-    """Give all pairs to be solved the last colour, others none."""
+    """Give COLOR_COUNT to the pairs with contact points and a dynamic body, INACTIVE to all others."""
     p = wp.tid()
     order_out[p] = p
-    colour_out[p] = NO_COLOUR
-    if p < pair_count[0] and is_active(bodies, manifolds, p, pairs[p]):
-        colour_out[p] = COLOURS
+    color_out[p] = INACTIVE
+    if p < pair_count[0] and manifolds.count[p] > 0:
+        if bodies.motion_type[pairs[p][0]] == DYNAMIC or bodies.motion_type[pairs[p][1]] == DYNAMIC:
+            color_out[p] = COLOR_COUNT
 
 
 @wp.kernel
-def bid_colour_kernel(
-    colour: wp.int32, pairs: wp.array(dtype=wp.vec2i), pair_colour: wp.array(dtype=wp.int32), bodies_inout: Bodies
+def bid_kernel(
+    color: wp.int32, pairs: wp.array(dtype=wp.vec2i), pair_color: wp.array(dtype=wp.int32), bodies_inout: Bodies
 ):
-    """Bid for both bodies of each pair that is left."""
+    """Bid for both bodies of each uncolored pair."""
     p = wp.tid()
-    if pair_colour[p] != COLOURS:
+    if pair_color[p] != COLOR_COUNT:
         return
     for k in range(2):
         i = pairs[p][k]
-        if bodies_inout.role[i] == AWAKE:
-            wp.atomic_max(bodies_inout.bid, i, make_bid(p, colour, pairs[p], bodies_inout))
+        if bodies_inout.motion_type[i] == DYNAMIC:
+            wp.atomic_max(bodies_inout.bid, i, make_bid(p, color, pairs[p], bodies_inout))
 
 
 @wp.kernel
-def take_colour_kernel(
-    colour: wp.int32, pairs: wp.array(dtype=wp.vec2i), bodies: Bodies, pair_colour_inout: wp.array(dtype=wp.int32)
+def assign_color_kernel(
+    color: wp.int32, pairs: wp.array(dtype=wp.vec2i), bodies: Bodies, pair_color_inout: wp.array(dtype=wp.int32)
 ):
-    """Give a colour to the pairs that won both bodies."""
+    """Give a color to the pairs that won both bodies."""
     p = wp.tid()
-    if pair_colour_inout[p] != COLOURS:
+    if pair_color_inout[p] != COLOR_COUNT:
         return
-    bid = make_bid(p, colour, pairs[p], bodies)
-    won = bool(True)
+    bid = make_bid(p, color, pairs[p], bodies)
     for k in range(2):
         i = pairs[p][k]
-        if bodies.role[i] == AWAKE and bodies.bid[i] != bid:
-            won = False
-    if won:
-        pair_colour_inout[p] = colour
+        if bodies.motion_type[i] == DYNAMIC and bodies.bid[i] != bid:
+            return
+    pair_color_inout[p] = color

@@ -1,8 +1,8 @@
-"""Certified deviation: how far the original surface lies from the surface after every merge; one serial replay.
+"""Certified one-sided Hausdorff distance of the original surface from the surface after every merge; a serial replay.
 
-Every original triangle is registered with up to SLOTS active faces that cover it within the running maximum (see
-kernels/cover.py). A registration stays true until its face moves or dies; then the triangle is covered anew by its
-other faces and by those about the merge.
+Every original triangle is registered with up to SLOTS active faces that cover it within the running maximum
+(`triangle_cover`). A registration is valid until its face moves or dies; then the triangle is covered again by its
+other faces and by those around the merge.
 """
 
 import warp as wp
@@ -14,8 +14,8 @@ from warp_abtree.kernels.progressive.triangle_cover import (
     Replay,
     add_near,
     add_ring,
+    cover_distance_sq,
     cover_triangle,
-    piece_distance_sq,
 )
 from warp_abtree.kernels.progressive.vertex_forest import (
     Rings,
@@ -28,13 +28,13 @@ from warp_abtree.kernels.progressive.vertex_forest import (
 wp.set_module_options({"enable_backward": False})
 
 
-# counter: what the kernel carries from launch to launch
+# Entries of `counter`, kept between launches.
 NEXT_MERGE = wp.constant(0)
 LIVE_FACES = wp.constant(1)
 STAMP = wp.constant(2)
 FREE_SLOTS = wp.constant(3)
-QUEUED = wp.constant(4)  # triangles that the last merge covered anew
-INDEXED = wp.constant(5)  # active faces when the tree was built; 0: never; -1: a piece vanishes and it must be built
+QUEUED = wp.constant(4)  # triangles covered again at the last merge
+INDEXED = wp.constant(5)  # active faces when the Bvh was built; 0: not yet; -1: the next merge needs a new one
 
 SEARCH_REACH = wp.constant(wp.float64(2.0**-10))
 
@@ -100,12 +100,12 @@ def register_triangle(replay: Replay, scratch: Scratch, t: int, used: int, free:
 
 @wp.func
 def search_all(replay: Replay, scratch: Scratch, rings: Rings, limit: wp.float64):
-    """Return the active face that bounds the triangle in hand best, or any that does within `limit`.
+    """Return the active face with the least bound for the current triangle, or any within `limit`.
 
-    The tree only proposes faces, some of them dead by now; what they bound is measured.
+    The Bvh is of an earlier surface and proposes faces only, dead ones too; their bounds are measured.
     """
-    lower = wp.min(scratch.piece[0], wp.min(scratch.piece[1], scratch.piece[2]))
-    upper = wp.max(scratch.piece[0], wp.max(scratch.piece[1], scratch.piece[2]))
+    lower = wp.min(scratch.polygon[0], wp.min(scratch.polygon[1], scratch.polygon[2]))
+    upper = wp.max(scratch.polygon[0], wp.max(scratch.polygon[1], scratch.polygon[2]))
     best = int(-1)
     bound = wp.float64(wp.inf)
     reach = wp.max(wp.sqrt(limit), SEARCH_REACH)
@@ -117,19 +117,19 @@ def search_all(replay: Replay, scratch: Scratch, rings: Rings, limit: wp.float64
         while bound > limit and wp.bvh_query_next(query, i):
             f = replay.bvh_face[i]
             if rings.corner_node[3 * f] >= 0:
-                distance = piece_distance_sq(replay, scratch, 3, f, bound)
+                distance = cover_distance_sq(replay, scratch, 3, f, bound)
                 if distance < bound:
                     best = f
                     bound = distance
-        # a face that bounds within the reach meets the box searched, so none was missed
+        # Invariant: a face with a bound within `reach` overlaps the box of this query.
         searching = bound > limit and bound > reach * reach
         reach = wp.where(best < 0, reach * wp.float64(2.0), wp.sqrt(bound) * wp.float64(1.001))
     return best
 
 
 @wp.func
-def piece_vanishes(rings: Rings, a: int, b: int):
-    """Tell whether merging a and b leaves their piece without a face."""
+def component_vanishes(rings: Rings, a: int, b: int):
+    """Tell whether merging a and b removes the last faces of their connected component."""
     if rings.degree[a] + rings.degree[b] > 2 * count_dying(rings, a, b):
         return False
     return not third_vertices_live(rings, a, b)
@@ -157,7 +157,7 @@ def queue_ring(replay: Replay, rings: Rings, queued: int, node: int, stamp: int)
 
 @wp.func
 def third_rings(replay: Replay, scratch: Scratch, rings: Rings, a: int, b: int, stamp: int):
-    """Make the faces at the third corners of those that die with (a, b) candidates; return how many these are."""
+    """Make the faces around the third corners of the faces that die with (a, b) candidates; return their count."""
     near_count = int(0)
     k = rings.head[a]
     while k >= 0:
@@ -218,15 +218,15 @@ def cover_queued(
     shared: int,
     limit: wp.float64,
 ):
-    """Register triangle t anew, about the merge or wherever its other faces are; return the square of its bound."""
+    """Cover triangle t again, with faces around the merge and its other faces; return its squared bound."""
     for k in range(3):
-        scratch.piece[k] = replay.triangle_pos[t, k]
+        scratch.polygon[k] = replay.triangle_pos[t, k]
     face_count = replay.face_slot.shape[0]
     free = counter[FREE_SLOTS]
     scratch.used[0] = first
     used = int(0)
     if rings.corner_node[3 * first] >= 0:
-        if piece_distance_sq(replay, scratch, 3, first, limit) <= limit:
+        if cover_distance_sq(replay, scratch, 3, first, limit) <= limit:
             used = int(1)
     if used == 0:
         own = counter[STAMP] + 1
@@ -261,7 +261,7 @@ def replay_merge(
     c: int,
     limit: wp.float64,
 ):
-    """Merge nodes a and b into c, cover anew what stood on their faces; return the square of the bound."""
+    """Merge nodes a and b into c and cover the triangles of their faces again; return the squared bound."""
     stamp = counter[STAMP] + 1
     counter[STAMP] = stamp
     queued = queue_ring(replay, rings, 0, a, stamp)
@@ -300,11 +300,11 @@ def replay_merges_kernel(
     # Out:
     bound_sq_out: wp.array(dtype=wp.float64),
 ):
-    """Apply merges until `cover_budget` triangles have been covered anew (serial, dim=1).
+    """Apply merges until `cover_budget` triangles have been covered again (serial, dim=1).
 
     Args:
         merge_pair: The two nodes of each merge, shape [m, 2].
-        bound_sq_out: Square of the running maximum after each merge, normalised, shape [m].
+        bound_sq_out: Squared running maximum after each merge, normalised, shape [m].
     Invariant: every registered triangle lies within the running maximum of the faces that it is registered with.
     """
     j = counter_inout[NEXT_MERGE]
@@ -317,20 +317,12 @@ def replay_merges_kernel(
         a = merge_pair[j, 0]
         b = merge_pair[j, 1]
         if 2 * counter_inout[LIVE_FACES] < counter_inout[INDEXED] or counter_inout[INDEXED] == 0:
-            searchable = not piece_vanishes(rings_inout, a, b)
+            searchable = not component_vanishes(rings_inout, a, b)
         if not searchable:
             counter_inout[INDEXED] = -1
             break
-        limit = replay_merge(
-            replay_inout,
-            scratch_inout,
-            rings_inout,
-            counter_inout,
-            a,
-            b,
-            vertex_count + j,
-            limit,
-        )
+        c = vertex_count + j
+        limit = replay_merge(replay_inout, scratch_inout, rings_inout, counter_inout, a, b, c, limit)
         covers += counter_inout[QUEUED] + 1
         bound_sq_out[j] = limit
         j += 1

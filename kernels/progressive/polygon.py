@@ -1,6 +1,6 @@
-"""Closest points on a triangle, and convex pieces of a triangle cut by planes.
+"""Point-triangle distance, and convex polygons cut from a triangle by planes.
 
-A piece is a convex polygon. One is in hand (`scratch.piece`, the caller counts its corners), others wait on a stack.
+One polygon is current (`scratch.polygon`; its corner count is a variable of the caller), others lie on a stack.
 Source: Ericson, Real-Time Collision Detection, section 5.1.5 (closest point).
 """
 
@@ -8,20 +8,20 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-STACK = wp.constant(64)  # pieces that wait
-CORNERS = wp.constant(16)  # of a piece
+STACK = wp.constant(64)  # polygons on the stack
+CORNERS = wp.constant(16)  # of a polygon
 
 
 @wp.struct
 class Scratch:
-    """Room for one cover."""
+    """Working memory of one triangle that is cut into polygons."""
 
-    near: wp.array(dtype=int)  # [face_count], candidates; those of the merge before those of the triangle
-    used: wp.array(dtype=int)  # [SLOTS], faces that pieces stand on
-    waiting: wp.array2d(dtype=wp.vec3d)  # [STACK, CORNERS], pieces
-    waiting_count: wp.array(dtype=int)  # [STACK], corners of each
-    piece: wp.array(dtype=wp.vec3d)  # [CORNERS], the piece in hand
-    inner: wp.array(dtype=wp.vec3d)  # [CORNERS]
+    near: wp.array(dtype=int)  # [face_count], faces to cover with; those of the merge before those of the triangle
+    used: wp.array(dtype=int)  # [SLOTS], faces that cover a polygon
+    stack: wp.array2d(dtype=wp.vec3d)  # [STACK, CORNERS], polygons still to be covered
+    stack_count: wp.array(dtype=int)  # [STACK], corners of each
+    polygon: wp.array(dtype=wp.vec3d)  # [CORNERS], current polygon
+    clipped: wp.array(dtype=wp.vec3d)  # [CORNERS], part of it that a cut keeps
 
 
 @wp.func
@@ -35,10 +35,10 @@ def segment_distance_sq(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
 
 
 @wp.func
-def face_distance_sq(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Return the squared distance to a point of the triangle: the closest, and never less than that.
+def triangle_distance_sq(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """Return the squared distance of a point to a triangle, never less than the true one up to rounding.
 
-    A triangle so thin that its barycentrics are noise is measured by its edges.
+    A triangle too thin for accurate barycentric coordinates is measured by its edges.
     """
     zero = wp.float64(0.0)
     ab = b - a
@@ -70,89 +70,134 @@ def face_distance_sq(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 
 
 @wp.func
-def load_piece(scratch: Scratch, row: int):
-    for i in range(scratch.waiting_count[row]):
-        scratch.piece[i] = scratch.waiting[row, i]
-    return scratch.waiting_count[row]
+def face_distance_sq(face_pos: wp.array2d(dtype=wp.vec3d), f: int, p: wp.vec3d):
+    return triangle_distance_sq(p, face_pos[f, 0], face_pos[f, 1], face_pos[f, 2])
 
 
 @wp.func
-def store_piece(scratch: Scratch, row: int, count: int):
+def interval_distance(p: wp.float64, lower: wp.float64, upper: wp.float64):
+    below = lower - p
+    above = p - upper
+    most = wp.where(below > above, below, above)
+    return wp.where(most > wp.float64(0.0), most, wp.float64(0.0))
+
+
+@wp.func
+def box_distance_sq(p: wp.vec3d, lower: wp.vec3d, upper: wp.vec3d):
+    x = interval_distance(p[0], lower[0], upper[0])
+    y = interval_distance(p[1], lower[1], upper[1])
+    z = interval_distance(p[2], lower[2], upper[2])
+    return x * x + y * y + z * z
+
+
+@wp.func
+def polygon_distance_sq(face_pos: wp.array2d(dtype=wp.vec3d), scratch: Scratch, count: int, f: int, enough: wp.float64):
+    """Return the largest squared distance of the current polygon's corners to face f.
+
+    The maximum over corners is that over the polygon, as the distance to one triangle is a convex function. Stops at
+    the first value above `enough`.
+    """
+    worst = wp.float64(0.0)
+    i = int(0)
+    while i < count and worst <= enough:
+        worst = wp.max(worst, face_distance_sq(face_pos, f, scratch.polygon[i]))
+        i += 1
+    return worst
+
+
+@wp.func
+def polygon_middle(scratch: Scratch, count: int):
+    sum = wp.vec3d()
     for i in range(count):
-        scratch.waiting[row, i] = scratch.piece[i]
-    scratch.waiting_count[row] = count
+        sum = sum + scratch.polygon[i]
+    return sum / wp.float64(count)
 
 
 @wp.func
-def cut_piece(scratch: Scratch, count: int, row: int, normal: wp.vec3d, origin: wp.vec3d, margin: wp.float64):
-    """Cut the piece in hand by a plane; keep what lies along the normal, put the rest into a row of the stack.
+def load_polygon(scratch: Scratch, row: int):
+    for i in range(scratch.stack_count[row]):
+        scratch.polygon[i] = scratch.stack[row, i]
+    return scratch.stack_count[row]
 
-    Returns the corners kept, 0 if none. Corners within `margin` count for either side, lest slivers come off.
+
+@wp.func
+def store_polygon(scratch: Scratch, row: int, count: int):
+    for i in range(count):
+        scratch.stack[row, i] = scratch.polygon[i]
+    scratch.stack_count[row] = count
+
+
+@wp.func
+def cut_polygon(scratch: Scratch, count: int, row: int, normal: wp.vec3d, origin: wp.vec3d, margin: wp.float64):
+    """Cut the current polygon by a plane: keep the side of the normal, write the rest to a row of the stack.
+
+    Returns the number of corners kept, 0 if none. Corners within `margin` of the plane belong to both sides, which
+    prevents slivers.
     """
     above = int(0)
     below = int(0)
     for i in range(count):
-        height = wp.dot(normal, scratch.piece[i] - origin)
+        height = wp.dot(normal, scratch.polygon[i] - origin)
         above += int(height > margin)
         below += int(height < -margin)
     if below == 0:
-        scratch.waiting_count[row] = 0
+        scratch.stack_count[row] = 0
         return count
     if above == 0:
-        store_piece(scratch, row, count)
+        store_polygon(scratch, row, count)
         return int(0)
     kept = int(0)
     rest = int(0)
     for i in range(count):
-        p = scratch.piece[i]
-        q = scratch.piece[(i + 1) % count]
+        p = scratch.polygon[i]
+        q = scratch.polygon[(i + 1) % count]
         sp = wp.dot(normal, p - origin)
         sq = wp.dot(normal, q - origin)
         if sp >= -margin:
-            scratch.inner[kept] = p
+            scratch.clipped[kept] = p
             kept += 1
         else:
-            scratch.waiting[row, rest] = p
+            scratch.stack[row, rest] = p
             rest += 1
         if (sp >= -margin) != (sq >= -margin):
             t = wp.min(wp.max(sp / (sp - sq), wp.float64(0.0)), wp.float64(1.0))
             x = p + (q - p) * t
-            scratch.inner[kept] = x
+            scratch.clipped[kept] = x
             kept += 1
-            scratch.waiting[row, rest] = x
+            scratch.stack[row, rest] = x
             rest += 1
-    scratch.waiting_count[row] = rest
+    scratch.stack_count[row] = rest
     for i in range(kept):
-        scratch.piece[i] = scratch.inner[i]
+        scratch.polygon[i] = scratch.clipped[i]
     return kept
 
 
 @wp.func
-def halve_piece(scratch: Scratch, count: int, top: int):
-    """Cut the piece in hand across its longest edge; stack both parts, return the new top."""
+def halve_polygon(scratch: Scratch, count: int, top: int):
+    """Cut the current polygon across its longest edge; push both parts, return the new top."""
     longest = wp.float64(-1.0)
     edge = int(0)
     for i in range(count):
-        size = wp.length_sq(scratch.piece[(i + 1) % count] - scratch.piece[i])
+        size = wp.length_sq(scratch.polygon[(i + 1) % count] - scratch.polygon[i])
         if size > longest:
             longest = size
             edge = i
-    p = scratch.piece[edge]
-    q = scratch.piece[(edge + 1) % count]
-    kept = cut_piece(scratch, count, top, wp.normalize(q - p), p + (q - p) * wp.float64(0.5), wp.float64(0.0))
-    if scratch.waiting_count[top] > 0:
+    p = scratch.polygon[edge]
+    q = scratch.polygon[(edge + 1) % count]
+    kept = cut_polygon(scratch, count, top, wp.normalize(q - p), p + (q - p) * wp.float64(0.5), wp.float64(0.0))
+    if scratch.stack_count[top] > 0:
         top += 1
     if kept > 0:
-        store_piece(scratch, top, kept)
+        store_polygon(scratch, top, kept)
         top += 1
     return top
 
 
 @wp.func
-def split_piece(
+def split_polygon(
     face_pos: wp.array2d(dtype=wp.vec3d), scratch: Scratch, count: int, top: int, f: int, margin: wp.float64
 ):
-    """Cut the piece in hand by the prism over face f, or across if that leaves it whole; return the new top."""
+    """Cut the current polygon by the prism over face f, or in half if that leaves it whole; return the new top."""
     a = face_pos[f, 0]
     normal = wp.cross(face_pos[f, 1] - a, face_pos[f, 2] - a)
     bottom = top
@@ -163,12 +208,12 @@ def split_piece(
             if kept > 0:
                 p = face_pos[f, k]
                 side = wp.normalize(wp.cross(normal, face_pos[f, (k + 1) % 3] - p))
-                kept = cut_piece(scratch, kept, top, side, p, margin)
-                if scratch.waiting_count[top] > 0:
+                kept = cut_polygon(scratch, kept, top, side, p, margin)
+                if scratch.stack_count[top] > 0:
                     top += 1
     if kept > 0:
-        store_piece(scratch, top, kept)
+        store_polygon(scratch, top, kept)
         top += 1
     if top - bottom == 1:
-        top = halve_piece(scratch, load_piece(scratch, bottom), bottom)
+        top = halve_polygon(scratch, load_polygon(scratch, bottom), bottom)
     return top

@@ -1,4 +1,4 @@
-"""Vertex forest: corner rings of its nodes, and what `vertex_parent` alone says about every face.
+"""Vertex forest: the rings of its nodes, and the merges that touch each face.
 
 Ring of a node: a singly linked list of face corners, head[node] -> corner -> next[corner] -> ... -1.
 Corner 3 f + k is corner k of face f. A face is dead iff corner_node[3 f] < 0; dead corners stay in the rings of
@@ -12,9 +12,11 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Rings:
+    """The faces about every node, as lists of their corners."""
+
     head: wp.array(dtype=int)  # [node_capacity], first corner or -1
     degree: wp.array(dtype=int)  # [node_capacity], live faces
-    next: wp.array(dtype=int)  # [3 face_count]
+    next: wp.array(dtype=int)  # [3 face_count], next corner of the ring or -1
     corner_node: wp.array(dtype=int)  # [3 face_count], active node of each corner
 
 
@@ -98,52 +100,13 @@ def third_vertices_live(rings: Rings, a: int, b: int):
 
 
 @wp.func
-def has_face(rings: Rings, node: int, i: int, j: int):
-    """Tell whether a live face joins node, i and j."""
-    k = rings.head[node]
-    while k >= 0:
-        f = k // 3
-        if rings.corner_node[3 * f] >= 0:
-            if third_corner(f, i, j, rings.corner_node) == node:
-                return True
-        k = rings.next[k]
-    return False
+def face_corners(face_vertex: wp.array2d(dtype=int), f: int):
+    return wp.vec3i(face_vertex[f, 0], face_vertex[f, 1], face_vertex[f, 2])
 
 
 @wp.func
-def joins(rings: Rings, a: int, b: int):
-    """Tell whether a live face has a and b."""
-    k = rings.head[a]
-    while k >= 0:
-        f = k // 3
-        if rings.corner_node[3 * f] >= 0:
-            if third_corner(f, a, b, rings.corner_node) >= 0:
-                return True
-        k = rings.next[k]
-    return False
-
-
-@wp.func
-def breaks_link(rings: Rings, a: int, b: int):
-    """Tell whether merging a and b violates the link condition: link(a) and link(b) share more than link(ab).
-
-    Opposite edges are compared as faces, (a, i, j) against (b, i, j); that i and j are neighbours proves nothing.
-    """
-    k = rings.head[a]
-    while k >= 0:
-        f = k // 3
-        if rings.corner_node[3 * f] >= 0:
-            i = rings.corner_node[3 * f + (k + 1) % 3]
-            j = rings.corner_node[3 * f + (k + 2) % 3]
-            if i != b and j != b:
-                if has_face(rings, b, i, j):
-                    return True
-                if joins(rings, b, i) and not has_face(rings, a, b, i):
-                    return True
-                if joins(rings, b, j) and not has_face(rings, a, b, j):
-                    return True
-        k = rings.next[k]
-    return False
+def are_distinct(corner: wp.vec3i):
+    return corner[0] != corner[1] and corner[1] != corner[2] and corner[2] != corner[0]
 
 
 @wp.kernel
@@ -160,18 +123,15 @@ def link_rings_kernel(
     """
     f = face_count - 1
     while f >= 0:
-        x = face_vertex[f, 0]
-        y = face_vertex[f, 1]
-        z = face_vertex[f, 2]
-        if x == y or y == z or z == x:
-            rings_inout.corner_node[3 * f] = -1
-        else:
+        if are_distinct(face_corners(face_vertex, f)):
             for k in range(3):
                 v = face_vertex[f, k]
                 rings_inout.corner_node[3 * f + k] = v
                 rings_inout.next[3 * f + k] = rings_inout.head[v]
                 rings_inout.head[v] = 3 * f + k
                 rings_inout.degree[v] = rings_inout.degree[v] + 1
+        else:
+            rings_inout.corner_node[3 * f] = -1
         f -= 1
 
 
@@ -182,6 +142,24 @@ def next_merge(node: int, node_count: int, vertex_parent: wp.array(dtype=int)):
     if p < 0:
         p = node_count
     return p
+
+
+@wp.func
+def climb_face(corner: wp.vec3i, node_count: int, vertex_parent: wp.array(dtype=int)):
+    """Apply the next merge that touches a face.
+
+    Returns the node that the merge makes (node_count if there is none), the corners after it, and whether the face
+    still has three and more merges may come.
+    """
+    a = next_merge(corner[0], node_count, vertex_parent)
+    b = next_merge(corner[1], node_count, vertex_parent)
+    c = next_merge(corner[2], node_count, vertex_parent)
+    node = wp.min(a, wp.min(b, c))
+    after = wp.vec3i(
+        wp.where(a == node, node, corner[0]), wp.where(b == node, node, corner[1]), wp.where(c == node, node, corner[2])
+    )
+    alive = node < node_count and int(a == node) + int(b == node) + int(c == node) < 2
+    return node, after, alive
 
 
 @wp.kernel
@@ -202,37 +180,21 @@ def count_events_kernel(
     """
     merge_count = node_count - vertex_count
     for f in range(face_vertex.shape[0]):
-        x = face_vertex[f, 0]
-        y = face_vertex[f, 1]
-        z = face_vertex[f, 2]
-        split = int(0)
-        alive = int(1)
-        if x == y or y == z or z == x:
-            split = merge_count + 1
-            alive = int(0)
-        while alive == 1:
-            px = next_merge(x, node_count, vertex_parent)
-            py = next_merge(y, node_count, vertex_parent)
-            pz = next_merge(z, node_count, vertex_parent)
-            p = wp.min(px, wp.min(py, pz))
-            if p == node_count:
-                alive = int(0)
-            else:
-                j = p - vertex_count
-                i = merge_count - 1 - j
+        corner = face_corners(face_vertex, f)
+        alive = are_distinct(corner)
+        split = wp.where(alive, 0, merge_count + 1)
+        while alive:
+            node, corner, alive = climb_face(corner, node_count, vertex_parent)
+            if node < node_count:
+                i = node_count - 1 - node
                 split_size_inout[i] = split_size_inout[i] + wp.int64(1)
-                if int(px == p) + int(py == p) + int(pz == p) > 1:
-                    split = merge_count - j
-                    alive = int(0)
-                x = wp.where(px == p, p, x)
-                y = wp.where(py == p, p, y)
-                z = wp.where(pz == p, p, z)
+                if not alive:
+                    split = i + 1
         face_split_out[f] = split
 
 
 @wp.kernel
 def fill_events_kernel(
-    vertex_count: int,
     node_count: int,
     face_vertex: wp.array2d(dtype=int),
     vertex_parent: wp.array(dtype=int),
@@ -246,27 +208,12 @@ def fill_events_kernel(
     Args:
         split_cursor_inout: Start of every slice, shape [m]; ends as the end of every slice.
     """
-    merge_count = node_count - vertex_count
     for f in range(face_vertex.shape[0]):
-        x = face_vertex[f, 0]
-        y = face_vertex[f, 1]
-        z = face_vertex[f, 2]
-        alive = int(1)
-        if x == y or y == z or z == x:
-            alive = int(0)
-        while alive == 1:
-            px = next_merge(x, node_count, vertex_parent)
-            py = next_merge(y, node_count, vertex_parent)
-            pz = next_merge(z, node_count, vertex_parent)
-            p = wp.min(px, wp.min(py, pz))
-            if p == node_count:
-                alive = int(0)
-            else:
-                i = merge_count - 1 - (p - vertex_count)
+        corner = face_corners(face_vertex, f)
+        alive = are_distinct(corner)
+        while alive:
+            node, corner, alive = climb_face(corner, node_count, vertex_parent)
+            if node < node_count:
+                i = node_count - 1 - node
                 split_face_out[split_cursor_inout[i]] = f
                 split_cursor_inout[i] = split_cursor_inout[i] + wp.int64(1)
-                if int(px == p) + int(py == p) + int(pz == p) > 1:
-                    alive = int(0)
-                x = wp.where(px == p, p, x)
-                y = wp.where(py == p, p, y)
-                z = wp.where(pz == p, p, z)

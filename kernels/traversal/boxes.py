@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from warp_abtree.kernels import native
+
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
@@ -41,13 +43,7 @@ def round_up_vec(x: wp.vec3d):
     return wp.vec3(round_up(x[0]), round_up(x[1]), round_up(x[2]))
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __fmaf_rn(a, b, c);
-#else
-    return __builtin_fmaf(a, b, c);
-#endif
-""")
+@wp.func_native(native.body("numbers.cuh", "fuse32"))
 def fuse32(a: wp.float32, b: wp.float32, c: wp.float32) -> wp.float32:
     """Return a b + c, rounded once on every device: half the work, and never less exact where a bound is at hand."""
     ...
@@ -65,12 +61,12 @@ def map_point(rotation: wp.mat33, translation: wp.vec3, p: wp.vec3):
 
 @wp.struct
 class PosedBox:
-    """Twice the centre and the whole width of a box along the axes of its own frame, and along those of the other."""
+    """A box along the axes of its own frame, and its image along those of the other frame."""
 
-    sum: wp.vec3
-    size: wp.vec3
-    turned_sum: wp.vec3
-    turned_size: wp.vec3
+    sum: wp.vec3  # twice the centre, own frame
+    size: wp.vec3  # whole width, own frame
+    posed_sum: wp.vec3  # twice the centre, other frame
+    posed_size: wp.vec3  # whole width, other frame
 
 
 @wp.func
@@ -82,18 +78,15 @@ def pose_box(lower: wp.vec3, upper: wp.vec3, rotation: wp.mat33, translation: wp
     box = PosedBox()
     box.sum = upper + lower
     box.size = upper - lower
-    box.turned_sum = map_point(rotation, translation + translation, box.sum)
+    box.posed_sum = map_point(rotation, translation + translation, box.sum)
     for i in range(3):
         reach = fuse32(wp.abs(rotation[i, 2]), box.size[2], margin + margin)
         reach = fuse32(wp.abs(rotation[i, 1]), box.size[1], reach)
-        box.turned_size[i] = fuse32(wp.abs(rotation[i, 0]), box.size[0], reach)
+        box.posed_size[i] = fuse32(wp.abs(rotation[i, 0]), box.size[0], reach)
     return box
 
 
-@wp.func_native("""
-    return (wp::abs(p[0]) <= u[0]) & (wp::abs(p[1]) <= u[1]) & (wp::abs(p[2]) <= u[2])
-         & (wp::abs(q[0]) <= v[0]) & (wp::abs(q[1]) <= v[1]) & (wp::abs(q[2]) <= v[2]);
-""")
+@wp.func_native(native.body("numbers.cuh", "all_within"))
 def all_within(p: wp.vec3, u: wp.vec3, q: wp.vec3, v: wp.vec3) -> bool:
     """Return whether |p| <= u and |q| <= v in every component, without the branches that `and` would be."""
     ...
@@ -106,4 +99,4 @@ def boxes_overlap(a: PosedBox, b: PosedBox):
     Each axis has a box in whose frame it is an axis, and the other's image there, wider by the margin of `PairPose`,
     which covers the rounding of everything here and of the poses, so that no pair of points that meet is ever pruned.
     """
-    return all_within(a.sum - b.turned_sum, a.size + b.turned_size, a.turned_sum - b.sum, a.turned_size + b.size)
+    return all_within(a.sum - b.posed_sum, a.size + b.posed_size, a.posed_sum - b.sum, a.posed_size + b.size)

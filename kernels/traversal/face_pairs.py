@@ -1,19 +1,20 @@
-"""Pairs of faces of an object pair: the stages that decide them, and the report of those that meet."""
+"""Face pairs of an object pair: the stages that decide them, and the report of those that meet."""
 
 import warp as wp
 
-from warp_abtree.kernels.arithmetic.predicates import FLOAT32, UNSURE
+from warp_abtree.kernels import native
+from warp_abtree.kernels.arithmetic.predicates import FLOAT32, UNCERTAIN
 from warp_abtree.kernels.arrays import ModelPool, StatePool, load_vertex
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.traversal.boxes import map_point
 from warp_abtree.kernels.traversal.nodes import load_constant
 from warp_abtree.kernels.triangle.distance import triangles_near
 from warp_abtree.kernels.triangle.float32_filter import (
-    SCREEN_UNIT,
-    are_open,
-    cross_triangles,
-    part_triangles,
-    turn_corners,
+    FLOAT32_UNIT,
+    are_uncertain,
+    intersect_straddling,
+    plane_signs,
+    rotate_corners,
 )
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
 
@@ -29,37 +30,23 @@ WITHIN = wp.constant(-1)
 
 @wp.struct
 class Hits:
-    """Results of a batch of pairs.
+    """Results of a batch of pairs. Lists are full where their total is beyond their shape, which is then the demand."""
 
-    any_hit, count: shape [pair]. face: (pair, face a, face b), a of the pair's first object, shape [capacity]; total
-    numbers them and may wrap, the demand is the sum of count. node_tests to exact_tests: work done,
-    shape [pair]; float64_tests are the triangle tests that float32 left open, exact_tests those that took exact signs.
-    unsure: (pair, face of the lower object, face of the higher) that float32 left open, shape [capacity]; hard: those
-    that float64 left open too, of the same shape where there is such a stage.
-    """
-
-    any_hit: wp.array(dtype=wp.int32)
-    count: wp.array(dtype=wp.int64)
-    face: wp.array(dtype=wp.vec3i)
-    total: wp.array(dtype=wp.int32)
-    node_tests: wp.array(dtype=wp.int64)
-    triangle_tests: wp.array(dtype=wp.int64)
-    float64_tests: wp.array(dtype=wp.int64)
-    exact_tests: wp.array(dtype=wp.int64)
-    unsure: wp.array(dtype=wp.vec3i)
-    unsure_total: wp.array(dtype=wp.int32)
-    hard: wp.array(dtype=wp.vec3i)
-    hard_total: wp.array(dtype=wp.int32)
+    any_hit: wp.array(dtype=wp.int32)  # whether it intersects, 0 or 1, shape [pair]
+    count: wp.array(dtype=wp.int64)  # face pairs that intersect, shape [pair]
+    face: wp.array(dtype=wp.vec3i)  # (pair, face of its first object, face of its second), shape [capacity]
+    total: wp.array(dtype=wp.int32)  # numbers `face` and may wrap: the demand is the sum of `count`
+    node_tests: wp.array(dtype=wp.int64)  # pairs of boxes compared, shape [pair]
+    triangle_tests: wp.array(dtype=wp.int64)  # face pairs tested, shape [pair]
+    float64_tests: wp.array(dtype=wp.int64)  # those that are uncertain in float32, shape [pair]
+    exact_tests: wp.array(dtype=wp.int64)  # those that are inexact in float64 and took exact signs, shape [pair]
+    uncertain: wp.array(dtype=wp.vec3i)  # (pair, face of the lower object, face of the higher), shape [capacity]
+    uncertain_total: wp.array(dtype=wp.int32)  # numbers `uncertain`
+    inexact: wp.array(dtype=wp.vec3i)  # as `uncertain`, of the same shape where there is an exact stage
+    inexact_total: wp.array(dtype=wp.int32)  # numbers `inexact`
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    int4 x = __ldg((const int4*)corners.data + i);
-    return wp::vec_t<4, wp::int32>(x.x, x.y, x.z, x.w);
-#else
-    return corners.data[i];
-#endif
-""")
+@wp.func_native(native.body("numbers.cuh", "load_corner"))
 def load_corner(corners: wp.array(dtype=wp.vec4i), i: wp.int32) -> wp.vec4i: ...
 
 
@@ -85,13 +72,13 @@ def near_of_b(models: ModelPool, pose: PairPose, vertex: wp.int32):
 
 
 @wp.func
-def screen_bounds(mode: wp.int32, pose: PairPose):
+def float32_bounds(mode: wp.int32, pose: PairPose):
     """Return the error of coordinates and of arithmetic that signs allow for; none for FLOAT32."""
-    return wp.where(mode == FLOAT32, 0.0, pose.error), wp.where(mode == FLOAT32, 0.0, SCREEN_UNIT)
+    return wp.where(mode == FLOAT32, 0.0, pose.error), wp.where(mode == FLOAT32, 0.0, FLOAT32_UNIT)
 
 
 @wp.func
-def part_faces(
+def face_plane_signs(
     mode: wp.int32,
     models: ModelPool,
     states: StatePool,
@@ -99,13 +86,13 @@ def part_faces(
     face_a: wp.int32,
     face_b: wp.int32,
 ):
-    """Return PARTED where float32 says that the plane of one of two active faces parts them, else what it says."""
+    """Return SEPARATED where the plane of one of two active faces separates them in float32, else the signs."""
     if mode == WITHIN or (mode != FLOAT32 and pose.error == wp.inf):
         return 0
     a = load_corner_ids(states, pose.corner_a + face_a)
     b = load_corner_ids(states, pose.corner_b + face_b)
-    error, unit = screen_bounds(mode, pose)
-    return part_triangles(
+    error, unit = float32_bounds(mode, pose)
+    return plane_signs(
         error,
         unit,
         near_of_a(models, pose, a[0]),
@@ -118,7 +105,7 @@ def part_faces(
 
 
 @wp.func
-def cross_faces(
+def intersect_straddling_faces(
     mode: wp.int32,
     models: ModelPool,
     states: StatePool,
@@ -127,14 +114,14 @@ def cross_faces(
     face_b: wp.int32,
     signs: wp.int32,
 ):
-    """Test active faces that no plane parts, with the signs of `part_faces`, in float32; return 1, 0 or UNSURE."""
-    error, unit = screen_bounds(mode, pose)
-    if are_open(unit, signs):
-        return UNSURE
+    """Test straddling faces in float32, with the signs of `face_plane_signs`; return 1, 0 or UNCERTAIN."""
+    error, unit = float32_bounds(mode, pose)
+    if are_uncertain(unit, signs):
+        return UNCERTAIN
     a = load_corner_ids(states, pose.corner_a + face_a)
     b = load_corner_ids(states, pose.corner_b + face_b)
-    p1, q1, r1, p2, q2, r2 = turn_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
-    return cross_triangles(
+    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
+    return intersect_straddling(
         error,
         unit,
         near_of_a(models, pose, p1),
@@ -155,7 +142,7 @@ def test_faces(
     face_a: wp.int32,
     face_b: wp.int32,
 ):
-    """Test one active face of A against one of B in float64, in A's frame; return 1, 0 or UNSURE."""
+    """Test one active face of A against one of B in float64, in A's frame; return 1, 0 or UNCERTAIN."""
     a = states.face_corner[pose.corner_a + face_a]
     b = states.face_corner[pose.corner_b + face_b]
     a0 = load_vertex(models.vertex_pos, a[0])
@@ -174,7 +161,7 @@ def test_faces(
 
 
 @wp.func
-def try_faces(
+def try_straddling_faces(
     mode: wp.int32,
     models: ModelPool,
     states: StatePool,
@@ -183,17 +170,17 @@ def try_faces(
     face_b: wp.int32,
     signs: wp.int32,
 ):
-    """Return whether faces that no plane parts meet as the first stage sees it: 1, 0 or UNSURE; or WITHIN, whole."""
+    """Return whether straddling faces meet in the first stage: 1, 0 or UNCERTAIN; for WITHIN, in all stages."""
     if mode == WITHIN:
         return test_faces(mode, models, states, pose, face_a, face_b)
-    return cross_faces(mode, models, states, pose, face_a, face_b, signs)
+    return intersect_straddling_faces(mode, models, states, pose, face_a, face_b, signs)
 
 
 @wp.func
-def defer_faces(slot: wp.int32, pair: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
-    """Put a pair of faces on the list that the settling passes work off, if there is room."""
-    if slot >= 0 and slot < hits.unsure.shape[0]:
-        hits.unsure[slot] = wp.vec3i(pair, face_a, face_b)
+def defer_uncertain(slot: wp.int32, pair: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+    """Put a face pair on the list of uncertain ones, if there is room."""
+    if slot >= 0 and slot < hits.uncertain.shape[0]:
+        hits.uncertain[slot] = wp.vec3i(pair, face_a, face_b)
 
 
 @wp.func

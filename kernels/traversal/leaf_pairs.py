@@ -1,54 +1,61 @@
-"""Face pairs that wait on a warp's stack, in two parts: planes first, and only of those that are left the edges.
+"""Leaf pairs that wait in a warp's lists, in two passes: planes first, and only of straddling pairs the edges.
 
-All threads of a warp come here together.
+A pair is separated where the plane of one face has the other on one side, else it straddles. All lanes of a warp come
+here together.
 """
 
 import warp as wp
 
-from warp_abtree.kernels.arithmetic.predicates import UNSURE
+from warp_abtree.kernels.arithmetic.predicates import UNCERTAIN
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal.face_pairs import OUTPUT_FACES, Hits, defer_faces, part_faces, report_hit, try_faces
+from warp_abtree.kernels.traversal.face_pairs import (
+    OUTPUT_FACES,
+    Hits,
+    defer_uncertain,
+    face_plane_signs,
+    report_hit,
+    try_straddling_faces,
+)
+from warp_abtree.kernels.traversal.node_pair import item_first, item_second
 from warp_abtree.kernels.traversal.warp_stack import (
-    CROSSING_START,
     STACK_LENGTH,
-    item_first,
-    item_second,
-    push_crossing,
+    STRADDLING_START,
+    push_straddling,
     read_item,
     read_signs,
     reserve_slot,
     warp_lane,
     warp_sync,
 )
-from warp_abtree.kernels.triangle.float32_filter import PARTED
+from warp_abtree.kernels.triangle.float32_filter import SEPARATED
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def part_candidates(
+def separate_leaf_pairs(
     mode: wp.int32,
     items: wp.uint64,
     first: wp.int32,
     popped: wp.int32,
-    crossing: wp.int32,
+    straddling: wp.int32,
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
 ):
-    """Look which of the face pairs that waited a plane parts, one a thread; return how many wait that none does."""
+    """Drop the leaf pairs that a plane separates, one a lane; return how many straddling pairs wait then."""
     lane = warp_lane()
     item = read_item(items, STACK_LENGTH + first + wp.min(lane, popped - 1))
-    signs = part_faces(mode, models, states, pose, item_first(item), item_second(item))
-    signs = wp.where(lane < popped, signs, PARTED)
-    crossing = push_crossing(items, crossing, signs != PARTED, item, signs)
+    signs = face_plane_signs(mode, models, states, pose, item_first(item), item_second(item))
+    signs = wp.where(lane < popped, signs, SEPARATED)
+    straddling = push_straddling(items, straddling, signs != SEPARATED, item, signs)
     warp_sync()
-    return crossing
+    return straddling
 
 
 @wp.func
-def test_crossing(
+def test_straddling(
     output: wp.int32,
     mode: wp.int32,
     items: wp.uint64,
@@ -60,11 +67,12 @@ def test_crossing(
     pose: PairPose,
     hits: Hits,
 ):
-    """Test face pairs that no plane parts, one a thread; return whether this one met, and whether that is open."""
+    """Test straddling pairs, one a lane; return whether this lane's meets, and whether it is uncertain."""
     lane = warp_lane()
     at = first + wp.min(lane, popped - 1)
-    item = read_item(items, CROSSING_START + at)
-    meet = try_faces(mode, models, states, pose, item_first(item), item_second(item), read_signs(items, at))
+    item = read_item(items, STRADDLING_START + at)
+    signs = read_signs(items, at)
+    meet = try_straddling_faces(mode, models, states, pose, item_first(item), item_second(item), signs)
     meet = wp.where(lane < popped, meet, 0)
     warp_sync()
     found = meet == 1
@@ -74,7 +82,7 @@ def test_crossing(
             report_hit(slot, pair, pose.swapped, item_first(item), item_second(item), hits)
     if found:
         hits.any_hit[pair] = 1
-    slot = reserve_slot(hits.unsure_total, meet == UNSURE)
-    if meet == UNSURE:
-        defer_faces(slot, pair, item_first(item), item_second(item), hits)
-    return found, meet == UNSURE
+    slot = reserve_slot(hits.uncertain_total, meet == UNCERTAIN)
+    if meet == UNCERTAIN:
+        defer_uncertain(slot, pair, item_first(item), item_second(item), hits)
+    return found, meet == UNCERTAIN

@@ -1,86 +1,98 @@
-"""One visit of the dual-tree traversal: two skip nodes, up to four pairs of boxes, and what follows of each.
+"""The node pair test of the dual-tree traversal: two skip nodes, up to four pairs of boxes, and the items they emit.
 
-An item is a pair of heap indices, each with its sign bit set where the visit compares that node and the next one, its
-sibling. Each record says what its subtree goes on with, so a coarse LOD costs no more visits than a tree built for it.
-A box is posed once a visit, for both boxes that it is compared with.
+An item is a pair of nodes to test, or, in lists of their own, of the faces of two leaves; the same on both backends:
+
+    63 62                    32 31 30                     0
+    [s|        node of A       |s|        node of B       ]    s: this node and the next one, its sibling
+    [0|        face of A       |0|        face of B       ]
+
+Nodes are heap indices. Each record says what its subtree goes on with, so a coarse LOD costs no more tests than a tree
+built for it. A box is posed once a test, for both boxes that it is compared with.
 Source: Liu et al. 2006, section 3.2.2, ACTIVE-INTERSECT.
 """
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import StatePool
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.boxes import PosedBox, boxes_overlap, pose_box
-from warp_abtree.kernels.traversal.nodes import Node, load_constant_node
-from warp_abtree.kernels.traversal.warp_stack import four_items, item_first, item_second, pack_item
+from warp_abtree.kernels.traversal.nodes import Node, load_constant_node, load_node
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-INDEX_BITS = wp.constant(2**31 - 1)
-# What a visit leaves is counted in one number: items to visit in the low half, face pairs in the high half.
-ITEM_STEP, FACE_STEP = wp.constant(1), wp.constant(1 << 16)
+INDEX_MASK = wp.constant(2**31 - 1)
+# What a test emits is counted in one word: leaf pairs << 16 | items.
+EMIT_ITEM, EMIT_LEAVES = wp.constant(1), wp.constant(1 << 16)
+
+four_items = wp.types.vector(length=4, dtype=wp.int64)
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    // One operation, as which the compiler does not see that the sum is a union of bits.
-    int down;
-    asm("mad.lo.s32 %0, %1, 2, %2;" : "=r"(down) : "r"(node), "r"(1 << 31));
-    return down;
-#else
-    return (node * 2) | (1 << 31);
-#endif
-""")
+@wp.func_native("return ((long long)x << 32) | (unsigned int)y;")
+def pack_item(x: wp.int32, y: wp.int32) -> wp.int64: ...
+
+
+@wp.func_native("return (int)(item >> 32);")
+def item_first(item: wp.int64) -> wp.int32: ...
+
+
+@wp.func_native("return (int)item;")
+def item_second(item: wp.int64) -> wp.int32: ...
+
+
+@wp.func_native(native.body("numbers.cuh", "children_of"))
 def children_of(node: wp.int32) -> wp.int32:
-    """Return what an item holds that compares the children of a node."""
+    """Return the half of an item that names both children of a node."""
     ...
 
 
-@wp.struct
-class Branch:
-    """A child in a visit: its box in both frames, and what it stands for.
+@wp.func
+def first_item(states: StatePool, pose: PairPose):
+    """Return the item that compares the roots."""
+    return pack_item(load_node(states, pose.node_a + 1).skip, load_node(states, pose.node_b + 1).skip)
 
-    down: what an item holds that compares its children; not for a leaf. span: minus the sum of the box's extents;
-    not negative at a leaf, whose face number its bits are.
-    """
+
+@wp.struct
+class Child:
+    """A node in a node pair test: its box in both frames, and what it stands for."""
 
     box: PosedBox
-    span: wp.float32
-    skip: wp.int32
-    down: wp.int32
-    face: wp.int32
+    span: wp.float32  # minus the sum of the box's extents; not negative at a leaf, whose face number its bits are
+    skip: wp.int32  # half an item that compares this node alone
+    down: wp.int32  # half an item that compares its children; not for a leaf
+    face: wp.int32  # face number of a leaf, negative at an inner node
 
 
 @wp.func
-def make_branch(box: PosedBox, node: Node):
-    branch = Branch()
-    branch.box = box
-    branch.span = wp.cast(node.face, wp.float32)
-    branch.skip = node.skip
-    branch.down = children_of(node.skip)
-    branch.face = node.face
-    return branch
+def make_child(box: PosedBox, node: Node):
+    child = Child()
+    child.box = box
+    child.span = wp.cast(node.face, wp.float32)
+    child.skip = node.skip
+    child.down = children_of(node.skip)
+    child.face = node.face
+    return child
 
 
 @wp.func
-def branch_of_a(pose: PairPose, node: Node):
+def child_of_a(pose: PairPose, node: Node):
     back = wp.transpose(pose.rotation32)
-    return make_branch(pose_box(node.lower, node.upper, back, pose.back32, pose.margin), node)
+    return make_child(pose_box(node.lower, node.upper, back, pose.back32, pose.margin), node)
 
 
 @wp.func
-def branch_of_b(pose: PairPose, node: Node):
-    return make_branch(pose_box(node.lower, node.upper, pose.rotation32, pose.translation32, pose.margin), node)
+def child_of_b(pose: PairPose, node: Node):
+    return make_child(pose_box(node.lower, node.upper, pose.rotation32, pose.translation32, pose.margin), node)
 
 
 @wp.func
-def next_item(a: Branch, b: Branch):
-    """Return the item that two overlapping branches leave: their faces, where both are leaves.
+def next_item(a: Child, b: Child):
+    """Return the item that two overlapping children emit: their faces, where both are leaves.
 
-    Else the visit goes down both, or only the one that is more than twice as large as the other, or no leaf.
+    Else the next test goes down both, or only the one that is more than twice as large as the other, or no leaf.
     """
-    # The sign of a union of bits: both are leaves unless one has none. A leaf beside a larger box, whose span is
-    # negative, never goes down.
+    # `face` is negative for inner nodes, so the OR of both is negative unless both are leaves. A leaf beside a larger
+    # box, whose span is negative, never goes down.
     leaves = (a.face | b.face) >= 0
     x = wp.where(leaves, a.face, wp.where(a.span + a.span <= b.span, a.down, a.skip))
     y = wp.where(leaves, b.face, wp.where(b.span + b.span <= a.span, b.down, b.skip))
@@ -88,10 +100,10 @@ def next_item(a: Branch, b: Branch):
 
 
 @wp.func
-def step_of_pair(used: wp.int32, a: Branch, b: Branch):
-    """Return what two branches add to the count of what follows if they overlap and `used` is negative."""
-    step = wp.where((a.face | b.face) >= 0, FACE_STEP, ITEM_STEP)
-    return wp.where(boxes_overlap(a.box, b.box), wp.where(used < 0, step, 0), 0)
+def emit_of_pair(used: wp.int32, a: Child, b: Child):
+    """Return what two children add to the count of what is emitted if they overlap and `used` is negative."""
+    emitted = wp.where((a.face | b.face) >= 0, EMIT_LEAVES, EMIT_ITEM)
+    return wp.where(boxes_overlap(a.box, b.box), wp.where(used < 0, emitted, 0), 0)
 
 
 @wp.func
@@ -103,32 +115,32 @@ def count_used(used: wp.vec4i):
 
 
 @wp.func
-def visit_item(states: StatePool, pose: PairPose, item: wp.int64, live: wp.int32):
-    """Compare what an item names; return the items that follow, the step of each, and the pairs compared.
+def compare_node_pair(states: StatePool, pose: PairPose, item: wp.int64, live: wp.int32):
+    """Compare what an item names; return the items that follow, what each emits, and the pairs of boxes compared.
 
-    live is -1, or 0 where nothing is asked of the item, which still names nodes. No branches: the threads of a warp
-    stay together, and all loads are under way at once. A node that is compared alone is its own sibling.
+    live is -1, or 0 where nothing is asked of the item, which still names nodes. No branches: the lanes of a warp stay
+    together, and all loads are under way at once. A node that is compared alone is its own sibling.
     """
     x = item_first(item)
     y = item_second(item)
     two_a = wp.where(x < 0, 1, 0)
     two_b = wp.where(y < 0, 1, 0)
-    at_a = pose.node_a + (x & INDEX_BITS)
-    at_b = pose.node_b + (y & INDEX_BITS)
+    at_a = pose.node_a + (x & INDEX_MASK)
+    at_b = pose.node_b + (y & INDEX_MASK)
     node_a0 = load_constant_node(states, at_a)
     node_a1 = load_constant_node(states, at_a + two_a)
     node_b0 = load_constant_node(states, at_b)
     node_b1 = load_constant_node(states, at_b + two_b)
-    a0 = branch_of_a(pose, node_a0)
-    a1 = branch_of_a(pose, node_a1)
-    b0 = branch_of_b(pose, node_b0)
-    b1 = branch_of_b(pose, node_b1)
+    a0 = child_of_a(pose, node_a0)
+    a1 = child_of_a(pose, node_a1)
+    b0 = child_of_b(pose, node_b0)
+    b1 = child_of_b(pose, node_b1)
     used = wp.vec4i(live, y & live, x & live, x & y & live)
-    steps = wp.vec4i(
-        step_of_pair(used[0], a0, b0),
-        step_of_pair(used[1], a0, b1),
-        step_of_pair(used[2], a1, b0),
-        step_of_pair(used[3], a1, b1),
+    emitted = wp.vec4i(
+        emit_of_pair(used[0], a0, b0),
+        emit_of_pair(used[1], a0, b1),
+        emit_of_pair(used[2], a1, b0),
+        emit_of_pair(used[3], a1, b1),
     )
     items = four_items(next_item(a0, b0), next_item(a0, b1), next_item(a1, b0), next_item(a1, b1))
-    return items, steps, count_used(used)
+    return items, emitted, count_used(used)

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import StatePool
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -11,27 +12,21 @@ SPAN_MIN = wp.constant(wp.float32(2.0**-126))
 
 @wp.struct
 class Node:
-    """A box [model units, about the model's centre] and what the node stands for.
+    """A box [model units, about the model's centre] and what the node stands for; two entries of 16 bytes a record:
 
-    skip: the node itself if it has two active children or is a leaf, else what its one active child stands for; -1
-    where nothing below is active. face: of a skip node that is a leaf, else negative: as float32 bits, minus the sum of
-    the box's extents, but never 0, which `store_node` sees to.
+    127        96 95         64 63         32 31          0
+    [    skip    |   lower z   |   lower y   |  lower x   ]
+    [    face    |   upper z   |   upper y   |  upper x   ]
     """
 
-    lower: wp.vec3
-    upper: wp.vec3
-    skip: wp.int32
+    lower: wp.vec3  # least corner
+    upper: wp.vec3  # greatest corner
+    skip: wp.int32  # this node if a leaf or of two active children, else what its active child stands for; -1 for none
+    # Face number if `skip` is a leaf, else negative: the float32 bits of minus the box's extents' sum, never of 0.
     face: wp.int32
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    float4 x = __ldg((const float4*)values.data + i);
-    return wp::vec_t<4, wp::float32>(x.x, x.y, x.z, x.w);
-#else
-    return values.data[i];
-#endif
-""")
+@wp.func_native(native.body("numbers.cuh", "load_constant"))
 def load_constant(values: wp.array(dtype=wp.vec4), i: wp.int64) -> wp.vec4: ...
 
 

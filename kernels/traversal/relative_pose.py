@@ -6,15 +6,14 @@ from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.generation import record_launch
 from warp_abtree.kernels.poses import PairPose, pair_pose
 from warp_abtree.kernels.traversal.face_pairs import OUTPUT_ANY, Hits
-from warp_abtree.kernels.traversal.load_balance import NO_UNIT, Work, part_count
+from warp_abtree.kernels.traversal.load_balance import NO_UNIT, Work, units_per_pair
 from warp_abtree.kernels.triangle.distance import DISTANCE_MAX, pad_distance
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.kernel
-def relate_pair_kernel(
-    parts_max: wp.int32,
+def relative_pose_kernel(
     output: wp.int32,
     models: ModelPool,
     states: StatePool,
@@ -42,14 +41,14 @@ def relate_pair_kernel(
         stale = record_launch(work_out.record)
         work_out.counter[0] = 0
         work_out.counter[1] = 0
-        work_out.counter[2] = wp.where(stale, 0, count * part_count(parts_max, count))
+        work_out.counter[2] = wp.where(stale, 0, count * units_per_pair(work_out.warps_per_pair, count))
         work_out.counter[3] = wp.where(stale, NO_UNIT, 0)
     if p >= pairs.shape[0]:
         return
     if p == 0:
         hits_out.total[0] = 0
-        hits_out.unsure_total[0] = 0
-        hits_out.hard_total[0] = 0
+        hits_out.uncertain_total[0] = 0
+        hits_out.inexact_total[0] = 0
     hits_out.any_hit[p] = 0
     hits_out.count[p] = wp.int64(0)
     hits_out.node_tests[p] = wp.int64(0)

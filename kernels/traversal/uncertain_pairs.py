@@ -1,14 +1,12 @@
-"""The passes over face pairs that float32 left open: float64 for all of them, exact signs for the few that it leaves.
+"""The passes over uncertain face pairs: float64 for all of them, exact signs for the few that are inexact there.
 
 Each pass works off a list of its own, so that the threads of a warp do much the same. A block is a warp: neighbours on
 a list are of the same few object pairs, and count for them together.
 """
 
-import functools
-
 import warp as wp
 
-from warp_abtree.kernels.arithmetic.predicates import EXACT, UNSURE
+from warp_abtree.kernels.arithmetic.predicates import EXACT, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.arrays import ModelPool, StatePool, load_vertex
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.traversal.face_pairs import (
@@ -21,16 +19,16 @@ from warp_abtree.kernels.traversal.face_pairs import (
 )
 from warp_abtree.kernels.traversal.warp_stack import (
     count_flags,
-    keep_item,
-    read_kept,
+    push_signed_pair,
+    read_signed_pair,
     reserve_slot,
-    warp_kept,
+    signed_pairs,
     warp_lane,
     warp_size,
     warp_sync,
 )
-from warp_abtree.kernels.triangle.float32_filter import PARTED, turn_corners
-from warp_abtree.kernels.triangle.float64_filter import JOINED, UNDECIDED, filter_crossing, filter_planes
+from warp_abtree.kernels.triangle.float32_filter import SEPARATED, rotate_corners
+from warp_abtree.kernels.triangle.float64_filter import SHARED_CORNER, UNDECIDED, filter_planes, filter_straddling
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
@@ -50,7 +48,7 @@ def report_item(output: wp.int32, pair_poses: wp.array(dtype=PairPose), item: wp
 
 
 @wp.func
-def settle_item(
+def resolve_item(
     mode: wp.int32,
     output: wp.int32,
     models: ModelPool,
@@ -72,52 +70,46 @@ def settle_item(
 def items_at_once(count: wp.int32, threads: wp.int32):
     """Return how many face pairs of a list a warp takes at a time: as many as it has threads, or fewer of a short list.
 
-    Threads that go different ways wait for one another, those of different warps do not.
+    Divergence serialises lanes within a warp, not across warps.
     """
     warps = threads / warp_size()
     return wp.clamp((count + warps - 1) / warps, 1, warp_size())
 
 
 @wp.func
-def defer_hard(hits: Hits, hard: bool, item: wp.vec3i):
-    """Put a face pair on the list that `settle_hard_kernel` works off. For all threads of a warp."""
-    count_flags(hits.exact_tests, item[0], hard)
-    slot = reserve_slot(hits.hard_total, hard)
-    if hard:
-        hits.hard[slot] = item
+def defer_inexact(hits: Hits, inexact: bool, item: wp.vec3i):
+    """Put a face pair on the list that `resolve_inexact_kernel` works off. For all threads of a warp."""
+    count_flags(hits.exact_tests, item[0], inexact)
+    slot = reserve_slot(hits.inexact_total, inexact)
+    if inexact:
+        hits.inexact[slot] = item
 
 
-@functools.cache
-def settle_traversal(mode: int):
-    """Return the kernel that decides what `warp_traversal` left open by rounded determinants, FLOAT64 or FLOAT32."""
-
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=80)
-    def settle_faces_kernel(
-        threads: wp.int32,
-        output: wp.int32,
-        models: ModelPool,
-        states: StatePool,
-        pair_poses: wp.array(dtype=PairPose),
-        hits_inout: Hits,
-    ):
-        """Decide the face pairs on the list of those left open: every so many-th a thread."""
-        lane = warp_lane()
-        end = wp.min(hits_inout.unsure_total[0], hits_inout.unsure.shape[0])
-        at_once = items_at_once(end, threads)
-        first = at_once * (wp.tid() / warp_size())
-        while first < end:
-            waits = lane < wp.min(at_once, end - first)
-            item = wp.vec3i()
-            if waits:
-                item = hits_inout.unsure[first + lane]
-            settle_item(wp.static(mode), output, models, states, pair_poses, waits, item, hits_inout)
-            first += wp.min(at_once * (threads / warp_size()), end - first)
-
-    return settle_faces_kernel
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=80)
+def resolve_rounded_kernel(
+    threads: wp.int32,
+    output: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pair_poses: wp.array(dtype=PairPose),
+    hits_inout: Hits,
+):
+    """Decide the uncertain face pairs of FLOAT32 by rounded determinants: every so many-th a thread."""
+    lane = warp_lane()
+    end = wp.min(hits_inout.uncertain_total[0], hits_inout.uncertain.shape[0])
+    at_once = items_at_once(end, threads)
+    first = at_once * (wp.tid() / warp_size())
+    while first < end:
+        waits = lane < wp.min(at_once, end - first)
+        item = wp.vec3i()
+        if waits:
+            item = hits_inout.uncertain[first + lane]
+        resolve_item(FLOAT32, output, models, states, pair_poses, waits, item, hits_inout)
+        first += wp.min(at_once * (threads / warp_size()), end - first)
 
 
 @wp.func
-def part_item(models: ModelPool, states: StatePool, pose: PairPose, item: wp.vec3i):
+def item_plane_signs(models: ModelPool, states: StatePool, pose: PairPose, item: wp.vec3i):
     """Return what `filter_planes` says of a face pair."""
     a = load_corner_ids(states, pose.corner_a + item[1])
     b = load_corner_ids(states, pose.corner_b + item[2])
@@ -132,12 +124,12 @@ def part_item(models: ModelPool, states: StatePool, pose: PairPose, item: wp.vec
 
 
 @wp.func
-def cross_item(models: ModelPool, states: StatePool, pose: PairPose, item: wp.vec3i, signs: wp.int32):
-    """Return whether faces meet that no plane parts, with the signs of `filter_planes`: 1, 0 or UNSURE."""
+def intersect_straddling_item(models: ModelPool, states: StatePool, pose: PairPose, item: wp.vec3i, signs: wp.int32):
+    """Return whether straddling faces meet, with the signs of `filter_planes`: 1, 0 or UNCERTAIN."""
     a = load_corner_ids(states, pose.corner_a + item[1])
     b = load_corner_ids(states, pose.corner_b + item[2])
-    p1, q1, r1, p2, q2, r2 = turn_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
-    return filter_crossing(
+    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
+    return filter_straddling(
         load_vertex(models.vertex_pos, p1),
         load_vertex(models.vertex_pos, q1),
         load_vertex(models.vertex_pos, r1),
@@ -148,9 +140,9 @@ def cross_item(models: ModelPool, states: StatePool, pose: PairPose, item: wp.ve
 
 
 @wp.func
-def settle_crossing(
+def resolve_straddling(
     output: wp.int32,
-    kept: wp.uint64,
+    list: wp.uint64,
     first: wp.int32,
     popped: wp.int32,
     models: ModelPool,
@@ -158,22 +150,22 @@ def settle_crossing(
     pair_poses: wp.array(dtype=PairPose),
     hits: Hits,
 ):
-    """Decide face pairs that no plane parts, one a thread, and report those that meet."""
+    """Decide straddling pairs, one a lane, and report those that meet."""
     lane = warp_lane()
-    waiting = read_kept(kept, first + wp.min(lane, popped - 1))
+    waiting = read_signed_pair(list, first + wp.min(lane, popped - 1))
     item = wp.vec3i(waiting[0], waiting[1], waiting[2])
     p = item[0]
     meet = wp.int32(1)
-    if waiting[3] != JOINED:
-        meet = cross_item(models, states, pair_poses[p], item, waiting[3])
+    if waiting[3] != SHARED_CORNER:
+        meet = intersect_straddling_item(models, states, pair_poses[p], item, waiting[3])
     meet = wp.where(lane < popped, meet, 0)
     warp_sync()
     report_item(output, pair_poses, item, meet == 1, hits)
-    defer_hard(hits, meet == UNSURE, item)
+    defer_inexact(hits, meet == UNCERTAIN, item)
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=96)
-def filter_faces_kernel(
+def float64_filter_kernel(
     threads: wp.int32,
     output: wp.int32,
     models: ModelPool,
@@ -181,35 +173,35 @@ def filter_faces_kernel(
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
-    """Decide the face pairs on the list of those left open, every so many-th a thread, and list what float64 leaves.
+    """Decide the uncertain face pairs, every so many-th a thread, and list those that are inexact in float64.
 
-    Planes first: most pairs are parted, and only those that are left take edges, when a warp of them waits.
+    Planes first: they separate most pairs, and only straddling pairs take edges, when a warp of them waits.
     """
     lane = warp_lane()
-    kept = warp_kept()
-    end = wp.min(hits_inout.unsure_total[0], hits_inout.unsure.shape[0])
+    list = signed_pairs()
+    end = wp.min(hits_inout.uncertain_total[0], hits_inout.uncertain.shape[0])
     at_once = items_at_once(end, threads)
     first = at_once * (wp.tid() / warp_size())
-    crossing = wp.int32(0)
-    while first < end or crossing > 0:
+    straddling = wp.int32(0)
+    while first < end or straddling > 0:
         if first < end:
-            item = hits_inout.unsure[first + wp.min(lane, end - 1 - first)]
-            signs = wp.int32(PARTED)
+            item = hits_inout.uncertain[first + wp.min(lane, end - 1 - first)]
+            signs = wp.int32(SEPARATED)
             waits = lane < wp.min(at_once, end - first)
             if waits and not (output == OUTPUT_ANY and hits_inout.any_hit[item[0]] != 0):
-                signs = part_item(models, states, pair_poses[item[0]], item)
-            crossing = keep_item(kept, crossing, signs >= 0, item, signs)
-            defer_hard(hits_inout, signs == UNDECIDED, item)
+                signs = item_plane_signs(models, states, pair_poses[item[0]], item)
+            straddling = push_signed_pair(list, straddling, signs >= 0, item, signs)
+            defer_inexact(hits_inout, signs == UNDECIDED, item)
             warp_sync()
             first += wp.min(at_once * (threads / warp_size()), end - first)
-        if crossing >= warp_size() or (first >= end and crossing > 0):
-            popped = wp.min(crossing, warp_size())
-            crossing -= popped
-            settle_crossing(output, kept, crossing, popped, models, states, pair_poses, hits_inout)
+        if straddling >= warp_size() or (first >= end and straddling > 0):
+            popped = wp.min(straddling, warp_size())
+            straddling -= popped
+            resolve_straddling(output, list, straddling, popped, models, states, pair_poses, hits_inout)
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=168)
-def settle_hard_kernel(
+def resolve_inexact_kernel(
     threads: wp.int32,
     output: wp.int32,
     models: ModelPool,
@@ -217,15 +209,15 @@ def settle_hard_kernel(
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
-    """Decide the face pairs that float64 left open by exact signs: every so many-th a thread."""
+    """Decide the inexact face pairs by exact signs: every so many-th a thread."""
     lane = warp_lane()
-    end = hits_inout.hard_total[0]
+    end = hits_inout.inexact_total[0]
     at_once = items_at_once(end, threads)
     first = at_once * (wp.tid() / warp_size())
     while first < end:
         waits = lane < wp.min(at_once, end - first)
         item = wp.vec3i()
         if waits:
-            item = hits_inout.hard[first + lane]
-        settle_item(EXACT, output, models, states, pair_poses, waits, item, hits_inout)
+            item = hits_inout.inexact[first + lane]
+        resolve_item(EXACT, output, models, states, pair_poses, waits, item, hits_inout)
         first += wp.min(at_once * (threads / warp_size()), end - first)

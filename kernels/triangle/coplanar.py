@@ -18,7 +18,7 @@ def separates_line(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, inner: wp.vec2d, p:
 
 
 @wp.func
-def overlap_flat(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d, q: wp.vec2d, r: wp.vec2d):
+def overlap_coplanar(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d, q: wp.vec2d, r: wp.vec2d):
     """Return whether no edge line separates two closed plane triangles.
 
     Complete for two triangles, and for a triangle and a segment or a point: every edge of their Minkowski difference
@@ -62,7 +62,7 @@ def widest_axis(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 def intersect_coplanar(
     mode: wp.int32, axis: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d
 ):
-    return overlap_flat(
+    return overlap_coplanar(
         mode,
         drop_axis(a, axis),
         drop_axis(b, axis),

@@ -1,6 +1,6 @@
 """The first of three stages: triangle against triangle in float32, with a proven bound on the error of each sign.
 
-It comes in two parts: the planes part most pairs of faces, and only of those that are left the edges are compared.
+It comes in two parts: planes separate most face pairs; only of those that straddle both planes, edges are compared.
 Source: as `intersect_triangles`.
 
 Coordinates are about A's centre, scaled to about unit size, each off the exact one by less than half of `error`, so
@@ -9,23 +9,29 @@ determinant of rows u, v, w by at most error (|u||v| + |v||w| + |w||u|), where r
 terms of higher order. Its own arithmetic, u . (v x w), adds eight roundings: 8 2^-24 |u||v||w| to first order, for
 which `unit` is 9 2^-24. docs/exactness.md has the terms. With error and unit 0 every sign is the computed one.
 
-`vector.screen_waiting` is the same for 16 pairs at a time: what changes here changes there, and tests compare them.
+`simd.simd_float32_filter` is the same for 16 pairs at a time: what changes here changes there, and tests compare them.
+
+The word of six signs, two bits each, + where the sign is positive and - where it is negative, or -1 for SEPARATED:
+
+    11 10 9  8  7  6  5  4  3  2  1  0
+    [+|-][+|-][+|-][+|-][+|-][+|-]
+     a0   a1   a2   b0   b1   b2      a corner of A against B's plane, then of B against A's
 """
 
 from typing import Any
 
 import warp as wp
 
-from warp_abtree.kernels.arithmetic.predicates import UNSURE, filtered_sign
+from warp_abtree.kernels import native
+from warp_abtree.kernels.arithmetic.predicates import UNCERTAIN, filtered_sign
 from warp_abtree.kernels.traversal.boxes import fuse32
 from warp_abtree.kernels.triangle.intersect import rotate_first
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-SCREEN_UNIT = wp.constant(9.0 * 2.0**-24)
+FLOAT32_UNIT = wp.constant(9.0 * 2.0**-24)
 
-# Six signs in one number, of A's corners and then of B's: two bits each, whether it is positive and negative.
-PARTED = wp.constant(-1)
+SEPARATED = wp.constant(-1)
 SIGNS_OF_A, SIGNS_OF_B, POSITIVE = wp.constant(0xFC0), wp.constant(0x3F), wp.constant(0xAAA)
 
 
@@ -46,14 +52,7 @@ def sum_sizes(v: wp.vec3):
     return (wp.abs(v[0]) + wp.abs(v[1])) + wp.abs(v[2])
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return wp::max(x, wp::max(y, z));
-#else
-    const wp::float32 m = y > z ? y : z;
-    return x > m ? x : m;
-#endif
-""")
+@wp.func_native(native.body("numbers.cuh", "largest"))
 def largest(x: wp.float32, y: wp.float32, z: wp.float32) -> wp.float32:
     """Return the largest of three; on the CPU without the branches that `wp.max` has for NaN, which may pass by."""
     ...
@@ -82,37 +81,13 @@ def heights_over_plane(
     return wp.vec3(dot32(w0, normal), dot32(w1, normal), dot32(w2, normal)), bound
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    // x < y is the sign bit of x - y, also where they are nearly the same, infinite or no numbers.
-    const int p0 = __float_as_int(__fsub_rn(bound, x[0])), n0 = __float_as_int(__fadd_rn(x[0], bound));
-    const int p1 = __float_as_int(__fsub_rn(bound, x[1])), n1 = __float_as_int(__fadd_rn(x[1], bound));
-    const int p2 = __float_as_int(__fsub_rn(bound, x[2])), n2 = __float_as_int(__fadd_rn(x[2], bound));
-    return (p0 & p1 & p2) | (n0 & n1 & n2);
-#else
-    const bool over = (x[0] > bound) & (x[1] > bound) & (x[2] > bound);
-    const bool under = (x[0] < -bound) & (x[1] < -bound) & (x[2] < -bound);
-    return -(over | under);
-#endif
-""")
+@wp.func_native(native.body("numbers.cuh", "one_sided"))
 def one_sided(x: wp.vec3, bound: wp.float32) -> wp.int32:
     """Return a negative number where three numbers that err by at most a bound have the same sign, not 0."""
     ...
 
 
-@wp.func_native("""
-    int all = signs;
-    for (int k = 0; k < 3; ++k) {
-#if defined(__CUDA_ARCH__)
-        // Each takes the sign bit of a number from the right, as in `one_sided`.
-        all = __funnelshift_l(__float_as_int(__fsub_rn(bound, x[k])), all, 1);
-        all = __funnelshift_l(__float_as_int(__fadd_rn(x[k], bound)), all, 1);
-#else
-        all = all * 4 + (x[k] > bound) * 2 + (x[k] < -bound);
-#endif
-    }
-    return all;
-""")
+@wp.func_native(native.body("numbers.cuh", "add_signs"))
 def add_signs(signs: wp.int32, x: wp.vec3, bound: wp.float32) -> wp.int32:
     """Return signs with those of three more numbers after them."""
     ...
@@ -127,7 +102,7 @@ def side_of_plane(error: wp.float32, unit: wp.float32, a: wp.vec3, b: wp.vec3, c
 
 
 @wp.func
-def part_triangles(
+def plane_signs(
     error: wp.float32,
     unit: wp.float32,
     a0: wp.vec3,
@@ -137,23 +112,23 @@ def part_triangles(
     b1: wp.vec3,
     b2: wp.vec3,
 ):
-    """Return PARTED where one of two triangles lies on one side of the other's plane, else all signs. No branches."""
+    """Return SEPARATED where one triangle lies on one side of the other's plane, else all signs. No branches."""
     w = b0 - a0
     of_a, bound_a = heights_over_plane(error, unit, b1 - b0, b2 - b0, w, b0 - a1, b0 - a2)
     of_b, bound_b = heights_over_plane(error, unit, a1 - a0, a2 - a0, -w, a0 - b1, a0 - b2)
     signs = add_signs(add_signs(0, of_a, bound_a), of_b, bound_b)
-    return wp.where((one_sided(of_a, bound_a) | one_sided(of_b, bound_b)) < 0, PARTED, signs)
+    return wp.where((one_sided(of_a, bound_a) | one_sided(of_b, bound_b)) < 0, SEPARATED, signs)
 
 
 @wp.func
-def are_open(unit: wp.float32, signs: wp.int32):
-    """Return whether signs of planes that part nothing leave it to the next stage: a shared plane, or one unknown.
+def are_uncertain(unit: wp.float32, signs: wp.int32):
+    """Return whether signs of straddling triangles leave it to the next stage: a shared plane, or a sign unknown.
 
     A sign that is neither positive nor negative is unknown, or 0 where there are no errors.
     """
     known = ((signs >> 1) | signs) & (POSITIVE >> 1)
-    flat = (known & SIGNS_OF_A) == 0 or (known & SIGNS_OF_B) == 0
-    return flat or (known != (POSITIVE >> 1) and unit != 0.0)
+    coplanar = (known & SIGNS_OF_A) == 0 or (known & SIGNS_OF_B) == 0
+    return coplanar or (known != (POSITIVE >> 1) and unit != 0.0)
 
 
 @wp.func
@@ -169,8 +144,8 @@ def find_alone_in(signs: wp.int32):
 
 
 @wp.func
-def turn_corners(signs: wp.int32, a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b2: Any):
-    """Return both triangles' corners, or their ids, as `turn_triangles` does; in any order where a triangle is flat."""
+def rotate_corners(signs: wp.int32, a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b2: Any):
+    """Return both triangles' corners, or their ids, as `rotate_triangles`; in any order where these are coplanar."""
     alone_a, back_a = find_alone_in(signs >> 6)
     alone_b, back_b = find_alone_in(signs)
     p1, q1, r1 = rotate_first(alone_a, a0, a1, a2)
@@ -186,7 +161,7 @@ def turn_corners(signs: wp.int32, a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b
 
 
 @wp.func
-def cross_triangles(
+def intersect_straddling(
     error: wp.float32,
     unit: wp.float32,
     p1: wp.vec3,
@@ -196,18 +171,18 @@ def cross_triangles(
     q2: wp.vec3,
     r2: wp.vec3,
 ):
-    """Return 1 where two closed triangles meet whose planes tell all signs, 0 where not, UNSURE where it is open.
+    """Return 1 where two closed triangles meet whose planes tell all signs, 0 where not, UNCERTAIN where it is open.
 
-    The corners come turned.
+    The corners come rotated.
     """
     first = side_of_plane(error, unit, p1, q1, p2, q2)
     second = side_of_plane(error, unit, p1, r1, r2, p2)
-    meet = wp.where(first == UNSURE or second == UNSURE, UNSURE, 1)
+    meet = wp.where(first == UNCERTAIN or second == UNCERTAIN, UNCERTAIN, 1)
     return wp.where(first == 1 or second == 1, 0, meet)
 
 
 @wp.func
-def screen_triangles(
+def float32_filter_triangles(
     error: wp.float32,
     unit: wp.float32,
     a0: wp.vec3,
@@ -217,8 +192,8 @@ def screen_triangles(
     b1: wp.vec3,
     b2: wp.vec3,
 ):
-    """Return 1 where two closed triangles meet, 0 where they do not, UNSURE where float32 cannot tell: both parts."""
-    signs = part_triangles(error, unit, a0, a1, a2, b0, b1, b2)
-    p1, q1, r1, p2, q2, r2 = turn_corners(signs, a0, a1, a2, b0, b1, b2)
-    meet = wp.where(are_open(unit, signs), UNSURE, cross_triangles(error, unit, p1, q1, r1, p2, q2, r2))
-    return wp.where(signs == PARTED, 0, meet)
+    """Return 1 where two closed triangles meet, 0 where not, UNCERTAIN where float32 cannot tell: both parts."""
+    signs = plane_signs(error, unit, a0, a1, a2, b0, b1, b2)
+    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a0, a1, a2, b0, b1, b2)
+    meet = wp.where(are_uncertain(unit, signs), UNCERTAIN, intersect_straddling(error, unit, p1, q1, r1, p2, q2, r2))
+    return wp.where(signs == SEPARATED, 0, meet)

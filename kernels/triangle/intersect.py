@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, UNSURE, orient3d, orient_edges
+from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, UNCERTAIN, orient3d, orient_edges
 from warp_abtree.kernels.traversal.warp_stack import lowest_bit
 from warp_abtree.kernels.triangle.coplanar import intersect_coplanar, intersect_degenerate, widest_axis
 
@@ -35,7 +35,7 @@ def rotate_first(i: wp.int32, a: Any, b: Any, c: Any):
 
 
 @wp.func
-def turn_triangles(
+def rotate_triangles(
     sa0: wp.int32,
     sa1: wp.int32,
     sa2: wp.int32,
@@ -116,7 +116,7 @@ def find_signs(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.ve
     for k in range(6):
         a, b, c, d = pick_corners(k, a0, a1, a2, b0, b1, b2)
         sign = orient3d(FILTER, a, b, c, d)
-        if sign == UNSURE:
+        if sign == UNCERTAIN:
             pending |= 1 << k
         else:
             signs |= (sign + 1) << (2 * k)
@@ -141,11 +141,11 @@ def intersect_exactly(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1
         return 0
     if flat_a or (sb0 == 0 and sb1 == 0 and sb2 == 0):
         return wp.where(intersect_special(EXACT, a0, a1, a2, b0, b1, b2), 1, 0)
-    p1, q1, r1, p2, q2, r2 = turn_triangles(sa0, sa1, sa2, sb0, sb1, sb2, a0, a1, a2, b0, b1, b2)
+    p1, q1, r1, p2, q2, r2 = rotate_triangles(sa0, sa1, sa2, sb0, sb1, sb2, a0, a1, a2, b0, b1, b2)
     first = orient_edges(FILTER, p1, q1, p2, q2)
     second = orient_edges(FILTER, p1, r1, r2, p2)
-    while first != 1 and second != 1 and wp.max(first, second) == UNSURE:
-        one = first == UNSURE
+    while first != 1 and second != 1 and wp.max(first, second) == UNCERTAIN:
+        one = first == UNCERTAIN
         sign = orient3d(EXACT, p1, wp.where(one, q1, r1), wp.where(one, p2, r2), wp.where(one, q2, p2))
         first = wp.where(one, sign, first)
         second = wp.where(one, second, sign)
@@ -176,7 +176,7 @@ def intersect_triangles(
     special = (sa0 == 0 and sa1 == 0 and sa2 == 0) or (sb0 == 0 and sb1 == 0 and sb2 == 0)
     if special:
         return wp.where(intersect_special(mode, a0, a1, a2, b0, b1, b2), 1, 0)
-    p1, q1, r1, p2, q2, r2 = turn_triangles(sa0, sa1, sa2, sb0, sb1, sb2, a0, a1, a2, b0, b1, b2)
+    p1, q1, r1, p2, q2, r2 = rotate_triangles(sa0, sa1, sa2, sb0, sb1, sb2, a0, a1, a2, b0, b1, b2)
     first = orient_edges(mode, p1, q1, p2, q2)
     second = orient_edges(mode, p1, r1, r2, p2)
     return wp.where(first == 1 or second == 1, 0, 1)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.arrays import DEFORMED, ModelPool, StatePool
-from warp_abtree.kernels.update.work_lists import UpdatePlan, find_update, item_count, list_length
+from warp_abtree.kernels.update.work_lists import UpdateLists, find_update, item_count, list_length
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -20,7 +20,7 @@ def find_depth(node: wp.int32):
 
 
 @wp.func
-def mark_path(leaf: wp.int32, state: wp.int32, states: StatePool, plan: UpdatePlan):
+def mark_path(leaf: wp.int32, state: wp.int32, states: StatePool, plan: UpdateLists):
     """Mark a leaf and its ancestors as far as no earlier walk has marked them; return how many there were."""
     node_start = states.node_start[state]
     node = leaf
@@ -38,7 +38,7 @@ def mark_path(leaf: wp.int32, state: wp.int32, states: StatePool, plan: UpdatePl
 
 
 @wp.kernel
-def mark_path_kernel(step: wp.int32, models: ModelPool, states_inout: StatePool, plan_inout: UpdatePlan):
+def mark_path_kernel(step: wp.int32, models: ModelPool, states_inout: StatePool, plan_inout: UpdateLists):
     """Walk from the leaf of each affected face to the root and mark what no earlier walk has marked.
 
     Whoever marks a node first appends (state, node) to the worklist of its level, so a batch costs O(k (log n - log k

@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.update.work_lists import UpdatePlan, find_update, item_count, list_length
+from warp_abtree.kernels.update.work_lists import UpdateLists, find_update, item_count, list_length
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -40,7 +40,7 @@ def refine_face(models: ModelPool, states: StatePool, state: wp.int32, face: wp.
 
 
 @wp.kernel
-def refine_slice_kernel(step: wp.int32, models: ModelPool, plan: UpdatePlan, states_inout: StatePool):
+def refine_slice_kernel(step: wp.int32, models: ModelPool, plan: UpdateLists, states_inout: StatePool):
     """Refine every face that the slices of partial updates list.
 
     A slice may list a face twice; both threads write the same corners, whichever old ones they read.
@@ -61,7 +61,7 @@ def refine_slice_kernel(step: wp.int32, models: ModelPool, plan: UpdatePlan, sta
 
 
 @wp.kernel
-def refine_all_kernel(step: wp.int32, models: ModelPool, states_inout: StatePool, plan_inout: UpdatePlan):
+def refine_all_kernel(step: wp.int32, models: ModelPool, states_inout: StatePool, plan_inout: UpdateLists):
     """Refine every face of the states under full update and count those that change.
 
     Args:

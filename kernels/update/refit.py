@@ -5,7 +5,7 @@ import warp as wp
 from warp_abtree.kernels.arrays import ACTIVE, INACTIVE, ModelPool, StatePool, load_vertex
 from warp_abtree.kernels.traversal.boxes import round_down_vec, round_up_vec
 from warp_abtree.kernels.traversal.nodes import Node, empty_node, load_node, store_node
-from warp_abtree.kernels.update.work_lists import UpdatePlan
+from warp_abtree.kernels.update.work_lists import UpdateLists
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -65,7 +65,7 @@ def refit_node(models: ModelPool, states: StatePool, state: wp.int32, node: wp.i
 
 @wp.func
 def refit_level(
-    first: wp.int32, step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdatePlan, states: StatePool
+    first: wp.int32, step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdateLists, states: StatePool
 ):
     """Refit every so many-th of a level's nodes: those marked, and all of the states under full update.
 
@@ -91,7 +91,7 @@ def refit_level(
 
 
 @wp.kernel
-def refit_level_kernel(step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdatePlan, states_inout: StatePool):
+def refit_level_kernel(step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdateLists, states_inout: StatePool):
     """Refit what an update asks for on one level.
 
     Args:
@@ -109,7 +109,7 @@ def block_sync(): ...
 
 
 @wp.kernel
-def refit_top_kernel(step: wp.int32, levels: wp.int32, models: ModelPool, plan: UpdatePlan, states_inout: StatePool):
+def refit_top_kernel(step: wp.int32, levels: wp.int32, models: ModelPool, plan: UpdateLists, states_inout: StatePool):
     """Refit what an update asks for on so many levels from the root on, deepest first: one block for all of them.
 
     Args:

@@ -19,7 +19,7 @@ UNKNOWN = wp.constant(-1)
 
 
 @wp.struct
-class UpdatePlan:
+class UpdateLists:
     """States under update: those that refit what a slice of faces touches, and those that are refitted whole.
 
     Partial updates: partial_total (1,) holds updates * 2^32 + entries of all slices; partial_state, slice_start (into
@@ -82,7 +82,7 @@ def find_update(item_end: wp.array(dtype=wp.int32), update_count: wp.int32, item
 
 
 @wp.kernel
-def clear_plan_kernel(plan_out: UpdatePlan):
+def clear_plan_kernel(plan_out: UpdateLists):
     """Empty every list and counter, a thread a state, and LEVEL_MAX threads at least."""
     i = wp.tid()
     if i == 0:
@@ -97,7 +97,7 @@ def clear_plan_kernel(plan_out: UpdatePlan):
 
 
 @wp.func
-def list_partial(plan: UpdatePlan, state: wp.int32, begin: wp.int32, length: wp.int32):
+def list_partial(plan: UpdateLists, state: wp.int32, begin: wp.int32, length: wp.int32):
     before = wp.atomic_add(plan.partial_total, 0, (wp.int64(1) << LIST_SHIFT) + wp.int64(length))
     u = wp.int32(before >> LIST_SHIFT)
     plan.partial_state[u] = state
@@ -106,7 +106,7 @@ def list_partial(plan: UpdatePlan, state: wp.int32, begin: wp.int32, length: wp.
 
 
 @wp.func
-def list_full(plan: UpdatePlan, state: wp.int32, face_count: wp.int32, depth: wp.int32):
+def list_full(plan: UpdateLists, state: wp.int32, face_count: wp.int32, depth: wp.int32):
     before = wp.atomic_add(plan.full_total, 0, (wp.int64(1) << LIST_SHIFT) + wp.int64(face_count))
     u = wp.int32(before >> LIST_SHIFT)
     plan.full_state[u] = state
@@ -130,7 +130,7 @@ def plan_update_kernel(
     splits: SplitTable,
     wanted: wp.array(dtype=wp.int32),
     states_inout: StatePool,
-    plan_inout: UpdatePlan,
+    plan_inout: UpdateLists,
     faults_inout: wp.array(dtype=wp.int32),
 ):
     """Compare each state's LOD with the wanted one and list the states that move; the faces between are one slice.

@@ -318,5 +318,5 @@ def test_herd(device):
     result = frame.step()
     row = frame.history[0]
     assert row.objects >= 200 and len(loaded.models) == 3 and row.states > 5
-    assert len(np.unique(loaded.worlds)) >= 16 and 0 < row.touching < row.pairs
+    assert len(np.unique(loaded.worlds)) >= 16 and 0 < row.intersecting < row.pairs
     assert np.array_equal(loaded.worlds[result.pairs[:, 0]], loaded.worlds[result.pairs[:, 1]])

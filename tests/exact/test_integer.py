@@ -8,7 +8,7 @@ import warp as wp
 from oracles.signs import COUNT, KINDS, true_terms
 
 from warp_abtree.kernels.arithmetic.int128 import integer_orient2d, integer_orient3d
-from warp_abtree.kernels.arithmetic.predicates import UNSURE
+from warp_abtree.kernels.arithmetic.predicates import UNCERTAIN
 
 pytestmark = pytest.mark.slow
 
@@ -65,10 +65,10 @@ def test_integers_tell_small_determinants(device, kind, dim, share):
     wp.launch(kernel, len(points), [*arrays, out], device=device)
     told = 0
     for rows, value, b, sign in zip(points.tolist(), values, bound, out.numpy().tolist(), strict=True):
-        assert sign in ((value > 0) - (value < 0), int(UNSURE))
+        assert sign in ((value > 0) - (value < 0), int(UNCERTAIN))
         unit = unit_of(rows)
         small = unit is None or Fraction(b) < Fraction(2) ** (unit + 122)
-        assert sign != int(UNSURE) or not small
+        assert sign != int(UNCERTAIN) or not small
         told += small
     assert told > 3 or kind == "random"
 
@@ -81,4 +81,4 @@ def test_integers_leave_what_is_no_number(device, dim):
     kernel, dtype = (integer3d_kernel, wp.vec3d) if dim == 3 else (integer2d_kernel, wp.vec2d)
     bounds = wp.array([1.0, 1.0, 1.0, np.inf], dtype=wp.float64, device=device)
     wp.launch(kernel, 4, [bounds, wp.array(points, dtype=dtype, device=device), out], device=device)
-    assert out.numpy().tolist() == [1, int(UNSURE), int(UNSURE), int(UNSURE)]
+    assert out.numpy().tolist() == [1, int(UNCERTAIN), int(UNCERTAIN), int(UNCERTAIN)]

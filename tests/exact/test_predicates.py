@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 from helpers.orient import orient2d_kernel
-from oracles.signs import COUNT, KINDS, find_signs, random_floats, true_signs, true_terms
+from oracles.signs import COUNT, KINDS, find_signs, random_floats, rounded_signs, true_signs, true_terms
 
 from warp_abtree.kernels.arithmetic.double_word import double_orient2d, double_orient3d
 from warp_abtree.kernels.arithmetic.expansion import exact_orient2d, exact_orient3d, two_product, two_sum
@@ -17,16 +17,14 @@ from warp_abtree.kernels.arithmetic.predicates import (
     EXACT,
     FILTER,
     FLOAT32,
-    FLOAT64,
-    UNSURE,
+    UNCERTAIN,
     orient3d,
     orient_edges,
 )
-from warp_abtree.kernels.traversal import dual_tree as traverse
-from warp_abtree.kernels.traversal import face_pairs as faces
-from warp_abtree.kernels.traversal import uncertain_pairs as settle
+from warp_abtree.kernels.traversal import dual_tree, simd, uncertain_pairs
+from warp_abtree.kernels.traversal.face_pairs import WITHIN
 from warp_abtree.kernels.triangle.float32_filter import (
-    SCREEN_UNIT,
+    FLOAT32_UNIT,
     add_signs,
     heights_over_plane,
     one_sided,
@@ -101,7 +99,7 @@ def double2d_kernel(points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.f
 
 
 @wp.kernel
-def screen_kernel(
+def float32_signs_kernel(
     error: wp.array(dtype=wp.float32),
     unit: wp.float32,
     points: wp.array2d(dtype=wp.vec3),
@@ -113,7 +111,7 @@ def screen_kernel(
     signs = add_signs(0, heights, bound)
     for k in range(3):
         pair = (signs >> (4 - 2 * k)) & 3
-        out[i, k] = wp.where(pair == 2, 1, wp.where(pair == 1, -1, wp.where(bound == 0.0, 0, UNSURE)))
+        out[i, k] = wp.where(pair == 2, 1, wp.where(pair == 1, -1, wp.where(bound == 0.0, 0, UNCERTAIN)))
     out[i, 6] = one_sided(heights, bound)
     out[i, 3] = side_of_plane(error[i], unit, a, b, c, d)
     out[i, 4] = side_of_plane(error[i], unit, a, b, c, e)
@@ -176,18 +174,14 @@ def test_signs(device, dim, kind):
     np.testing.assert_array_equal(find_signs(kernel, EXACT, points, device), truth)
     np.testing.assert_array_equal(find_signs(expansion, 0, points, device), truth)
     filtered = find_signs(kernel, FILTER, points, device)
-    sure = filtered != int(UNSURE)
+    sure = filtered != int(UNCERTAIN)
     np.testing.assert_array_equal(filtered[sure], truth[sure])
-    plain = find_signs(kernel, FLOAT64, points, device)
-    assert set(np.unique(plain)) <= {-1, 0, 1}
-    np.testing.assert_array_equal(plain[sure], truth[sure])
     if kind == "random":
         assert sure.all()
         assert (find_signs(kernel, FLOAT32, points, device) == truth).mean() > 0.99
-    elif kind in ("flat", "large flat"):
-        assert (plain != truth).any() and not sure[plain != truth].any(), "float64 alone is not good enough here"
-    elif kind.endswith("lattice"):
-        np.testing.assert_array_equal(plain, truth)  # these determinants are small integers
+    elif kind in ("coplanar", "large coplanar"):
+        wrong = rounded_signs(points) != truth
+        assert wrong.any() and not sure[wrong].any(), "float64 alone is not good enough here"
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -197,7 +191,7 @@ def test_signs_of_edges(device, kind):
     truth = true_signs(points)
     np.testing.assert_array_equal(find_signs(orient_edges_kernel, EXACT, points, device), truth)
     filtered = find_signs(orient_edges_kernel, FILTER, points, device)
-    sure = filtered != int(UNSURE)
+    sure = filtered != int(UNCERTAIN)
     np.testing.assert_array_equal(filtered[sure], truth[sure])
     if kind == "random":
         assert sure.all()
@@ -215,11 +209,11 @@ def test_edges_laid_on_one_another_need_no_more_than_float64(device, across, sha
     points = np.concatenate([first, second[:, ::-1] if across else second], 1)
     truth = true_signs(points)
     filtered = find_signs(orient_edges_kernel, FILTER, points, device)
-    sure = filtered != int(UNSURE)
+    sure = filtered != int(UNCERTAIN)
     np.testing.assert_array_equal(filtered[sure], truth[sure])
     np.testing.assert_array_equal(find_signs(orient_edges_kernel, EXACT, points, device), truth)
     assert (truth == 0).all() == shared and sure.mean() >= (1.0 if shared else 0.97)
-    assert shared or (find_signs(orient3d_kernel, FILTER, points, device) != int(UNSURE)).mean() < 0.3
+    assert shared or (find_signs(orient3d_kernel, FILTER, points, device) != int(UNCERTAIN)).mean() < 0.3
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -253,7 +247,7 @@ def test_the_filter_is_tight(device):
     rng = np.random.default_rng(5)
     points = rng.normal(size=(2000, 4, 3))
     points[:, 3] = points[:, :3].mean(1) + 1e-12 * rng.normal(size=(2000, 3))
-    assert (find_signs(orient3d_kernel, FILTER, points, device) != int(UNSURE)).mean() > 0.95
+    assert (find_signs(orient3d_kernel, FILTER, points, device) != int(UNCERTAIN)).mean() > 0.95
 
 
 # --- float32, the first stage ----------------------------------------------------------------------------------------
@@ -264,7 +258,7 @@ def screen_signs(error, unit, points, device):
     out = wp.zeros((len(points), 7), dtype=wp.int32, device=device)
     error = wp.array(error, dtype=wp.float32, device=device)
     points = wp.array(points.astype(np.float32), dtype=wp.vec3, device=device)
-    wp.launch(screen_kernel, len(points), [error, float(unit), points, out], device=device)
+    wp.launch(float32_signs_kernel, len(points), [error, float(unit), points, out], device=device)
     signs = out.numpy()
     np.testing.assert_array_equal(signs[:, 6] < 0, np.abs(signs[:, :3].sum(1)) == 3)
     return signs[:, :6]
@@ -283,7 +277,7 @@ def true_sides(points):
 
 
 @pytest.mark.parametrize("off", [2.0**-26, 2.0**-20, 2.0**-10])
-@pytest.mark.parametrize("kind", ["random", "lattice", "flat", "large flat"])
+@pytest.mark.parametrize("kind", ["random", "lattice", "coplanar", "large coplanar"])
 def test_screen_is_right_where_it_is_sure(device, kind, off):
     """Coordinates moved by up to `off`, in a random or in the worst direction, and rounded to float32."""
     rng = np.random.default_rng(7)
@@ -296,32 +290,35 @@ def test_screen_is_right_where_it_is_sure(device, kind, off):
     shift = np.where(rng.random((COUNT, 1, 1)) < 0.5, worst, rng.uniform(-1, 1, points.shape)) * off
     moved = (points + shift).astype(np.float32)
     error = 2.02 * np.abs(moved - points).max((1, 2))
-    signs = screen_signs(error, SCREEN_UNIT, moved, device)
-    sure = signs != int(UNSURE)
+    signs = screen_signs(error, FLOAT32_UNIT, moved, device)
+    sure = signs != int(UNCERTAIN)
     np.testing.assert_array_equal(signs[sure], truth[sure])
-    plain = screen_signs(0 * error, SCREEN_UNIT, moved, device)
+    plain = screen_signs(0 * error, FLOAT32_UNIT, moved, device)
     if kind != "random":
-        assert (plain != truth)[plain != int(UNSURE)].any(), "coordinates that are off must be reckoned with here"
+        assert (plain != truth)[plain != int(UNCERTAIN)].any(), "coordinates that are off must be reckoned with here"
     elif off < 1e-6:
         assert sure[:, [0, 1, 3, 4]].mean() > 0.98, "the sixth point lies in the plane but for the shift"
-    far = screen_signs(np.full(COUNT, np.inf), SCREEN_UNIT, moved, device)
-    assert (far == int(UNSURE)).all()
+    far = screen_signs(np.full(COUNT, np.inf), FLOAT32_UNIT, moved, device)
+    assert (far == int(UNCERTAIN)).all()
 
 
-@pytest.mark.parametrize("kind", ["random", "flat", "large flat"])
+@pytest.mark.parametrize("kind", ["random", "coplanar", "large coplanar"])
 def test_screen_covers_its_own_rounding(device, kind):
     """Coordinates that float32 holds exactly: only the arithmetic rounds."""
     points = screen_points(np.random.default_rng(8), kind).astype(np.float32).astype(float)
     truth = true_sides(points)
-    signs = screen_signs(np.zeros(COUNT), SCREEN_UNIT, points, device)
-    sure = signs != int(UNSURE)
+    signs = screen_signs(np.zeros(COUNT), FLOAT32_UNIT, points, device)
+    sure = signs != int(UNCERTAIN)
     np.testing.assert_array_equal(signs[sure], truth[sure])
     plain = screen_signs(np.zeros(COUNT), 0.0, points, device)
-    assert (plain != int(UNSURE)).all()
+    assert (plain != int(UNCERTAIN)).all()
     assert (plain != truth).any() == (kind != "random"), "float32 alone is good enough for points at random only"
 
 
 # --- no contraction --------------------------------------------------------------------------------------------------
+
+
+PASSES = ("resolve_rounded", "float64_filter", "resolve_inexact")
 
 
 def test_modules_with_signs_do_not_contract():
@@ -345,10 +342,10 @@ def test_modules_with_signs_do_not_contract():
         "arithmetic.int128",
     )
     modules = [wp.get_module(importlib.import_module(f"warp_abtree.kernels.{name}").__name__) for name in names]
-    makers = [traverse.thread_traversal, settle.settle_traversal]
-    makers += [functools.partial(traverse.warp_traversal, for_any=for_any) for for_any in (False, True)]
-    modules += [make(int(mode)).module for mode in (EXACT, FLOAT64, FLOAT32, faces.WITHIN) for make in makers]
-    modules += [settle.filter_faces_kernel.module, settle.settle_hard_kernel.module]
+    makers = [simd.thread_traversal]
+    makers += [functools.partial(dual_tree.warp_traversal, for_any=for_any) for for_any in (False, True)]
+    modules += [make(int(mode)).module for mode in (EXACT, FLOAT32, WITHIN) for make in makers]
+    modules += [getattr(uncertain_pairs, f"{name}_kernel").module for name in PASSES]
     assert [m.name for m in modules if m.options["fuse_fp"] or m.options["fast_math"]] == []
 
 
@@ -380,13 +377,13 @@ def test_ptx_is_not_contracted(tmp_path, fuse_fp):
 def test_ptx_of_the_traversal_is_not_contracted(tmp_path):
     """The kernels that pose vertices, bound signs and test boxes; without exact signs they have no float64 fma."""
     for for_any in (False, True):
-        text = ptx_of(traverse.warp_traversal(int(EXACT), for_any).module, tmp_path / f"screen_{for_any}")
+        text = ptx_of(dual_tree.warp_traversal(int(EXACT), for_any).module, tmp_path / f"warp_{for_any}")
         assert len(re.findall(r"\bmul\.rn\.f32", text)) > 50
         # In float32 the kernel itself asks for fused operations, the same on every device.
         assert {x for x in find_contraction(text) if x != "fma.rn.f32"} == set()
-    text = ptx_of(settle.filter_faces_kernel.module, tmp_path / "filter")
+    text = ptx_of(uncertain_pairs.float64_filter_kernel.module, tmp_path / "filter")
     assert len(re.findall(r"\bmul\.rn\.f64", text)) > 50
     assert {x for x in find_contraction(text) if x != "fma.rn.f64"} == set()
-    text = ptx_of(settle.settle_traversal(int(FLOAT64)).module, tmp_path / "settle")
+    text = ptx_of(uncertain_pairs.resolve_rounded_kernel.module, tmp_path / "rounded")
     assert len(re.findall(r"\bmul\.rn\.f64", text)) > 50
     assert find_contraction(text) == []

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from oracles import triangle as oracle
 
-from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, UNSURE
+from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, UNCERTAIN
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
 
 pytestmark = pytest.mark.slow
@@ -34,7 +34,7 @@ def meet(pairs, device):
         answers = wp.zeros(len(pairs), dtype=wp.int32, device=device)
         wp.launch(intersect_pair_kernel, dim=len(pairs), inputs=[int(mode), corners, answers], device=device)
         found[mode] = answers.numpy()
-    sure = found[FILTER] != int(UNSURE)
+    sure = found[FILTER] != int(UNCERTAIN)
     np.testing.assert_array_equal(found[FILTER][sure], found[EXACT][sure])
     return found[EXACT] != 0
 

@@ -8,25 +8,30 @@ import warp as wp
 from helpers.samples import contact_poses, sample
 
 import warp_abtree as ab
-from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, UNSURE
+from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal import face_pairs
-from warp_abtree.kernels.traversal.dual_tree import WAITING_ROOM, first_item
-from warp_abtree.kernels.traversal.face_pairs import cross_faces, part_faces
-from warp_abtree.kernels.traversal.node_pair import FACE_STEP, ITEM_STEP, visit_item
-from warp_abtree.kernels.traversal.simd import (
-    ITEMS_AT_ONCE,
-    ROOM_FOR_ONE,
-    STACK_ROOM,
-    descend,
-    screen_waiting,
-    single_node,
-    take_slots,
+from warp_abtree.kernels.traversal.face_pairs import face_plane_signs, intersect_straddling_faces
+from warp_abtree.kernels.traversal.node_pair import (
+    EMIT_ITEM,
+    EMIT_LEAVES,
+    compare_node_pair,
+    first_item,
+    item_first,
+    item_second,
 )
-from warp_abtree.kernels.traversal.simd_float64 import filter_waiting
-from warp_abtree.kernels.traversal.warp_stack import item_first, item_second, pack_item
-from warp_abtree.kernels.triangle.float32_filter import PARTED, SCREEN_UNIT
+from warp_abtree.kernels.traversal.simd import (
+    CPU_STACK_LENGTH,
+    DEPTH_FIRST_LENGTH,
+    ITEMS_AT_ONCE,
+    WAITING_LENGTH,
+    descend,
+    simd_float32_filter,
+    simd_float64_filter,
+)
+from warp_abtree.kernels.traversal.warp_stack import take_slots
+from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, SEPARATED
 
 pytestmark = pytest.mark.slow
 
@@ -67,8 +72,8 @@ def screen_one_kernel(
     i = wp.tid()
     pose = made_pose(rotation, translation, scale, error, corner_b)
     a, b = item_first(faces[i]), item_second(faces[i])
-    signs = part_faces(mode, models, states, pose, a, b)
-    meet_out[i] = wp.where(signs == PARTED, 0, cross_faces(mode, models, states, pose, a, b, signs))
+    signs = face_plane_signs(mode, models, states, pose, a, b)
+    meet_out[i] = wp.where(signs == SEPARATED, 0, intersect_straddling_faces(mode, models, states, pose, a, b, signs))
 
 
 @wp.kernel
@@ -88,7 +93,7 @@ def screen_all_kernel(
 ):
     pose = made_pose(rotation, translation, scale, error, corner_b)
     waiting = faces_inout.shape[0] - OVER
-    counts = screen_waiting(models, states, pose, error, unit, first_ends, waiting, faces_inout, open_out)
+    counts = simd_float32_filter(models, states, pose, error, unit, first_ends, waiting, faces_inout, open_out)
     for i in range(3):
         count_out[i] = counts[i]
 
@@ -98,7 +103,7 @@ def near_points(kind, rng, count):
     points = rng.uniform(-1, 1, (count, 3))
     if kind == "lattice":
         points = rng.integers(-1, 2, (count, 3)).astype(float)
-    elif kind == "flat":
+    elif kind == "coplanar":
         points[:, 2] = 1e-7 * points[:, 2]
     elif kind == "wild":
         points = points * 10.0 ** rng.integers(-44, 39, (count, 1))
@@ -108,7 +113,7 @@ def near_points(kind, rng, count):
 
 
 @pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize("kind", ["random", "lattice", "flat", "wild"])
+@pytest.mark.parametrize("kind", ["random", "lattice", "coplanar", "wild"])
 def test_screens_the_same_as_one_by_one(kind, turned):
     rng = np.random.default_rng(5)
     face_count, ask_count = 200, 3011  # no multiple of 16
@@ -134,7 +139,7 @@ def test_screens_the_same_as_one_by_one(kind, turned):
             faces = wp.array(np.append(asked, [UNTOUCHED] * OVER), dtype=wp.int64, device=CPU)
             left = filled(ask_count + OVER)
             counts = wp.zeros(3, dtype=wp.int64, device=CPU)
-            unit = 0.0 if error == 0.0 else float(SCREEN_UNIT)
+            unit = 0.0 if error == 0.0 else float(FLOAT32_UNIT)
             inputs = [first_ends, error, unit, models, states, *placed, face_count, faces, left, counts]
             wp.launch(screen_all_kernel, dim=1, inputs=inputs, device=CPU)
             met, unsure, tested = counts.numpy()
@@ -142,12 +147,12 @@ def test_screens_the_same_as_one_by_one(kind, turned):
             ends = first_ends and len(hit) > 0
             assert tested == (min(ask_count, 16 * (hit[0] // 16 + 1)) if ends else ask_count)
             np.testing.assert_array_equal(faces.numpy()[:met], asked[:tested][meet[:tested] == 1])
-            np.testing.assert_array_equal(left.numpy()[:unsure], asked[:tested][meet[:tested] == int(UNSURE)])
+            np.testing.assert_array_equal(left.numpy()[:unsure], asked[:tested][meet[:tested] == int(UNCERTAIN)])
             assert (left.numpy()[unsure + OVER :] == UNTOUCHED).all()
             assert (faces.numpy()[16 * math.ceil(ask_count / 16) :] == UNTOUCHED).all()
-        seen.append(np.bincount(meet, minlength=int(UNSURE) + 1) > 0)
-    assert seen[1][[0, 1, int(UNSURE)]].all() or kind in ("flat", "wild")
-    assert np.isin(meet, [0, int(UNSURE)]).all(), "no sign is sure where the bound is no number"
+        seen.append(np.bincount(meet, minlength=int(UNCERTAIN) + 1) > 0)
+    assert seen[1][[0, 1, int(UNCERTAIN)]].all() or kind in ("coplanar", "wild")
+    assert np.isin(meet, [0, int(UNCERTAIN)]).all(), "no sign is sure where the bound is no number"
 
 
 # --- the float64 stage -----------------------------------------------------------------------------------------------
@@ -195,7 +200,7 @@ def filter_all_kernel(
     count_out: wp.array(dtype=wp.int64),
 ):
     pose = pose64(rotation, translation, corner_b)
-    counts = filter_waiting(models, states, pose, first_ends, met, waiting, open_inout, faces_inout)
+    counts = simd_float64_filter(models, states, pose, first_ends, met, waiting, open_inout, faces_inout)
     for i in range(3):
         count_out[i] = counts[i]
 
@@ -275,7 +280,7 @@ def test_filters_the_same_as_one_by_one(kind):
     items = wp.array(asked, dtype=wp.int64, device=CPU)
     wp.launch(filter_one_kernel, dim=ask_count, inputs=[*placed, items, plain, exact], device=CPU)
     plain, exact = plain.numpy(), exact.numpy()
-    met, unsure = plain == 1, plain == int(UNSURE)
+    met, unsure = plain == 1, plain == int(UNCERTAIN)
     with np.errstate(invalid="ignore"):
         x, y, z = (points[:, k : k + 1] * rotation[:, k] for k in range(3))
         posed = ((x + y) + z) + shift
@@ -307,26 +312,26 @@ def test_filters_the_same_as_one_by_one(kind):
 
 
 @wp.kernel
-def visit_all_kernel(
+def compare_all_kernel(
     states: StatePool,
     pair_poses: wp.array(dtype=PairPose),
     stack_inout: wp.array(dtype=wp.int64),
     found_out: wp.array(dtype=wp.int64),
     count_out: wp.array(dtype=wp.int64),
 ):
-    """Traverse pair 0 by `visit_item`, one item at a time."""
+    """Traverse pair 0 by `compare_node_pair`, one item at a time."""
     pose = pair_poses[0]
     stack_inout[0] = first_item(states, pose)
     top, found, compared = wp.int32(1), wp.int32(0), wp.int32(0)
     while top > 0:
         top -= 1
-        items, steps, tests = visit_item(states, pose, stack_inout[top], -1)
+        items, steps, tests = compare_node_pair(states, pose, stack_inout[top], -1)
         compared += tests
         for k in range(4):
-            if steps[k] == ITEM_STEP:
+            if steps[k] == EMIT_ITEM:
                 stack_inout[top] = items[k]
                 top += 1
-            if steps[k] == FACE_STEP:
+            if steps[k] == EMIT_LEAVES:
                 found_out[found] = items[k]
                 found += 1
     count_out[0] = wp.int64(found)
@@ -349,7 +354,7 @@ def descend_kernel(
     pose = pair_poses[0]
     root = first_item(states, pose)
     for i in range(times):
-        stack_inout[i] = pack_item(single_node(item_first(root)), single_node(item_second(root)))
+        stack_inout[i] = root
     top, found, compared = wp.int32(times), wp.int32(0), wp.int64(0)
     while top > 0:
         progress = descend(states, pose, at_once, ready, top, stack_inout, faces_inout)
@@ -375,7 +380,7 @@ def filled(count):
 
 
 @pytest.mark.parametrize("names", [("torus", "torus"), ("soup", "torus"), ("torus", "soup")], ids="-".join)
-def test_descends_as_visits_do(names):
+def test_descends_as_node_pair_tests_do(names):
     """The same pairs of boxes and faces, whatever is taken at once, in any order and at any level of detail."""
     a, b = (sample(name) for name in names)
     for lods in ((a.lod_max, b.lod_max), (a.lod_for(fraction=0.3), b.lod_for(fraction=0.1)), (0, b.lod_max)):
@@ -386,12 +391,12 @@ def test_descends_as_visits_do(names):
         query = ab.Query(scene, "faces", pairs=[(0, 1)])
         query.launch()
         states = query.arrays[1].pool
-        plain, compared = traverse(visit_all_kernel, [], states, query.pair_poses, [filled(4096)], 10**6)
+        plain, compared = traverse(compare_all_kernel, [], states, query.pair_poses, [filled(4096)], 10**6)
         assert compared == query.hits.node_tests.numpy()[0] and len(plain) == query.hits.triangle_tests.numpy()[0]
         assert len(plain) > 0
         for at_once in (1, 2, 7, ITEMS_AT_ONCE):
-            for ready in (1, WAITING_ROOM - 4 * ITEMS_AT_ONCE - 4):
-                stack, faces = filled(STACK_ROOM + 1), filled(WAITING_ROOM + 1)
+            for ready in (1, WAITING_LENGTH - 4 * ITEMS_AT_ONCE - 4):
+                stack, faces = filled(CPU_STACK_LENGTH + 1), filled(WAITING_LENGTH + 1)
                 found, visited = traverse(
                     descend_kernel, [at_once, ready, 1], states, query.pair_poses, [stack, faces], 10**6
                 )
@@ -408,15 +413,15 @@ def test_descends_in_little_room():
     query = ab.Query(scene, "faces", pairs=[(0, 1)])
     query.launch()
     states = query.arrays[1].pool
-    plain, compared = traverse(visit_all_kernel, [], states, query.pair_poses, [filled(4096)], 10**6)
-    times = STACK_ROOM - ROOM_FOR_ONE
-    stack, faces = filled(STACK_ROOM + 64), filled(WAITING_ROOM + 64)
+    plain, compared = traverse(compare_all_kernel, [], states, query.pair_poses, [filled(4096)], 10**6)
+    times = CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH
+    stack, faces = filled(CPU_STACK_LENGTH + 64), filled(WAITING_LENGTH + 64)
     buffers, room = [stack, faces], times * len(plain)
     found, visited = traverse(descend_kernel, [ITEMS_AT_ONCE, 100, times], states, query.pair_poses, buffers, room)
     np.testing.assert_array_equal(found, np.repeat(plain, times))
     assert visited == times * compared
-    assert (stack.numpy()[STACK_ROOM:] == UNTOUCHED).all() and stack.numpy()[times] != UNTOUCHED
-    assert (faces.numpy()[WAITING_ROOM:] == UNTOUCHED).all()
+    assert (stack.numpy()[CPU_STACK_LENGTH:] == UNTOUCHED).all() and stack.numpy()[times] != UNTOUCHED
+    assert (faces.numpy()[WAITING_LENGTH:] == UNTOUCHED).all()
 
 
 @wp.kernel

@@ -13,8 +13,8 @@ from oracles.signs import true_signs
 from oracles.triangle import into_frame_of_a, quaternion_matrix
 
 import warp_abtree as ab
-from warp_abtree.kernels.arithmetic.predicates import UNSURE
-from warp_abtree.kernels.triangle.float32_filter import SCREEN_UNIT, side_of_plane
+from warp_abtree.kernels.arithmetic.predicates import UNCERTAIN
+from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, side_of_plane
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -141,7 +141,7 @@ SIDES = [
 @wp.kernel
 def find_side_kernel(points: wp.array2d(dtype=wp.vec3), side_out: wp.array(dtype=wp.int32)):
     i = wp.tid()
-    side_out[i] = side_of_plane(0.0, SCREEN_UNIT, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
+    side_out[i] = side_of_plane(0.0, FLOAT32_UNIT, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
 
 
 def test_the_bound_of_determinants_covers_roundings_that_add_up(device):
@@ -152,5 +152,5 @@ def test_the_bound_of_determinants_covers_roundings_that_add_up(device):
     sides = wp.zeros(len(points), dtype=wp.int32, device=device)
     wp.launch(find_side_kernel, len(points), [wp.array(points, dtype=wp.vec3, device=device), sides], device=device)
     sides = sides.numpy()
-    sure = sides != int(UNSURE)
+    sure = sides != int(UNCERTAIN)
     np.testing.assert_array_equal(sides[sure], true_signs(points)[sure])

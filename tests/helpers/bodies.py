@@ -1,13 +1,13 @@
 """Bodies and scenes that rigid-body tests start from."""
 
+from functools import cache
+
 import numpy as np
 import trimesh
 
 import warp_abtree as ab
 
 FLOOR = (0, 0, -0.5, 0, 0, 0, 1)
-
-
 NO_GRAVITY = {"gravity": (0, 0, 0)}
 
 
@@ -22,15 +22,8 @@ def box(*extents, splits=0):
     return model_of(mesh)
 
 
-CUBE, BRICK = box(1, 1, 1), box(1, 0.7, 0.5)
-
-
-GROUND = box(8, 8, 1)
-
-
+CUBE, BRICK, GROUND = box(1, 1, 1), box(1, 0.7, 0.5), box(8, 8, 1)
 BALL = model_of(trimesh.creation.icosphere(1, 0.5))
-
-
 TORUS = model_of(trimesh.creation.torus(0.5, 0.2, 8, 6))
 
 
@@ -49,3 +42,22 @@ def make(device, *placed, world=0, **options):
 
 def on_ground(device, *placed, **options):
     return make(device, (GROUND, FLOOR, True), *placed, **options)
+
+
+def bits(dynamics):
+    """Return poses, velocities and angular velocities, (n, 13)."""
+    return np.concatenate([dynamics.poses(), *dynamics.velocities()], axis=1)
+
+
+def run(dynamics, steps, dt=1 / 120):
+    """Step, and return `bits`."""
+    for _ in range(steps):
+        dynamics.step(dt)
+    return bits(dynamics)
+
+
+@cache
+def ring_and_ball():
+    """Return two models that frames move."""
+    ring = trimesh.creation.torus(major_radius=0.5, minor_radius=0.15, major_sections=24, minor_sections=12)
+    return ab.Model.load(ring), ab.Model.load(trimesh.creation.icosphere(subdivisions=2, radius=0.4))

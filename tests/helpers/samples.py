@@ -46,6 +46,12 @@ def grid(size):
     return vertices, np.concatenate([near, far])
 
 
+def line(direction, count=20):
+    """Faces without area: every corner on one line, but for rounding."""
+    i = np.arange(count - 2)
+    return np.arange(count)[:, None] ** 1.5 * np.array(direction), np.stack([i, i + 1, i + 2], 1)
+
+
 def repeated(vertices, faces):
     """Every face twice, the second time turned."""
     return vertices, np.concatenate([faces, np.asarray(faces)[:, [1, 2, 0]]])
@@ -129,19 +135,25 @@ def true_faces(model_a, lod_a, pose_a, model_b, lod_b, pose_b):
     return np.stack([ids_a[hits[:, 0]], ids_b[hits[:, 1]]], 1)
 
 
-def raw_state(scene, i):
-    """Return the bytes behind an object's tree state: float32 boxes as stored, not as `tree_state` widens them."""
-    models, states, objects = scene.batch().models, scene.batch().states, scene.batch().objects
-    slot = states.slots[objects.state[i]]
-    model = scene.models[slot.model]
+def stored_state(scene_models, batch, state):
+    """Return the bytes of a tree state: float32 boxes as stored, not as `tree_state` widens them."""
+    states = batch.states
+    slot = states.slots[state]
+    model = scene_models[slot.model]
     nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
     corners = states.pool.face_corner.numpy()[slot.face_start : slot.face_start + model.face_count, :3]
     return {
-        "lod": slot.lod,
+        "lod": int(states.pool.lod.numpy()[state]),
         "status": states.pool.node_status.numpy()[nodes],
         **dict(zip(("lower", "upper", "skip"), states.read_nodes(slot, model.tree.node_count))),
-        "corner": np.where(corners < 0, -1, corners - models.vertex_start[slot.model]),
+        "corner": np.where(corners < 0, -1, corners - batch.models.vertex_start[slot.model]),
     }
+
+
+def raw_state(scene, i):
+    """Return the bytes of an object's tree state."""
+    batch = scene.batch()
+    return stored_state(scene.models, batch, batch.objects.state[i])
 
 
 # A ball, and a ring that moves through it to and fro; tests add what they ask about.

@@ -2,7 +2,20 @@
 
 import numpy as np
 
-from helpers.samples import raw_state
+import warp_abtree as ab
+from helpers.samples import raw_state, sample
+
+TURN = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])
+
+
+def pair_scene(device):
+    """Return a scene of three objects at several LODs, one in every world, with a pair filtered out."""
+    scene = ab.Scene(device)
+    scene.add(sample("small ball"), lod=30)
+    scene.add(sample("box"), (0.5, 0.25, 0, 0, 0, 0, 1))
+    scene.add(sample("small ball"), (0, 0.5, 0, 0, 0, 0, 1), world=-1, static=True, lod=12)
+    scene.filter([(0, 1)])
+    return scene
 
 
 def everything(scene):

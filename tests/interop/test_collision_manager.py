@@ -329,25 +329,25 @@ def test_places_are_used_again_and_given_up(device):
     other = ab.CollisionManager(device)
     for k in range(30):
         other.add_object(k, SHAPES["torus"], trimesh.transformations.translation_matrix((0, 0, 0.4 * k)))
-    before = ours._scene
+    before = ours._placed.scene
     for _ in range(3):
         ours.in_collision_single(SHAPES["box"])
         ours.add_object("x", SHAPES["box"])
         ours.remove_object("x")
-    assert ours._scene is before and ours._scene.object_count == 5
+    assert ours._placed.scene is before and ours._placed.scene.object_count == 5
     answers = [ours.in_collision_other(other, True) for _ in range(3)]
     assert answers[0] == answers[1] == answers[2] and len(answers[0][1]) > 2
-    assert ours._scene.object_count == 4, "more places left than taken, and than 16"
+    assert ours._placed.scene.object_count == 4, "more places left than taken, and than 16"
     assert ours.in_collision_internal(True) == (True, expected)
-    assert other.in_collision_internal(True)[0] and other._scene.object_count == 30
-    arrays = ours._scene.batch()
+    assert other.in_collision_internal(True)[0] and other._placed.scene.object_count == 30
+    arrays = ours._placed.scene.batch()
     for _ in range(3):
         ours.in_collision_single(SHAPES["ball"], random_transform(np.random.default_rng(0), 1))
         ours.set_transform(0, np.eye(4))
-    assert ours._scene.object_count == 5 and ours._scene.batch() is not arrays
-    arrays = ours._scene.batch()
+    assert ours._placed.scene.object_count == 5 and ours._placed.scene.batch() is not arrays
+    arrays = ours._placed.scene.batch()
     ours.in_collision_single(SHAPES["ball"])
-    assert ours._scene.batch() is arrays, "the second time nothing is made anew"
+    assert ours._placed.scene.batch() is arrays, "the second time nothing is made anew"
 
 
 def test_equal_meshes_share_a_model_that_goes_with_them(device):
@@ -355,8 +355,8 @@ def test_equal_meshes_share_a_model_that_goes_with_them(device):
     mesh = trimesh.creation.box((1, 2, 3.25))
     for k, manager in enumerate(managers):
         manager.add_object(k, mesh.copy())
-    model = managers[0]._scene.models[0]
-    assert managers[1]._scene.models == [model]
+    model = managers[0]._placed.scene.models[0]
+    assert managers[1]._placed.scene.models == [model]
     gone, known = weakref.ref(model), len(convex._SHAPES)
     del managers, manager, model
     gc.collect()
@@ -368,7 +368,7 @@ def test_models_as_meshes(device):
     ours = ab.CollisionManager(device)
     ours.add_object("a", model)
     ours.add_object("b", model, trimesh.transformations.translation_matrix((0.5, 0, 0)))
-    assert ours.in_collision_internal() and ours._scene.models == [model]
+    assert ours.in_collision_internal() and ours._placed.scene.models == [model]
 
 
 # What is refused, before anything changes.
@@ -402,4 +402,4 @@ def test_bad_input(device):
     with pytest.raises(ValueError, match="no device"):
         ab.CollisionManager("nothing:7")
     assert ours.in_collision_single(ball, return_names=True) == (True, {"a"})
-    assert ours._scene.object_count == 2 and collision_manager.EXTERNAL == "__external"
+    assert ours._placed.scene.object_count == 2 and collision_manager.EXTERNAL == "__external"

@@ -1,7 +1,5 @@
-"""Shards that are damaged, altered or of another job: found out by reading, done again or refused by the next run."""
+"""Shards that are damaged, altered or of another job: detected when read, computed again or refused by the next run."""
 
-import contextlib
-import io
 import json
 import sys
 import tracemalloc
@@ -9,21 +7,12 @@ import zipfile
 
 import numpy as np
 import pytest
-from helpers.samples import random_poses, sample
+from helpers.jobs import ColumnJob, contents, job_of, pair, poses_of, run, shard_at
 
-import warp_abtree as ab
-from warp_abtree.app.cli.main import main
-from warp_abtree.jobs import shard_folder
+from warp_abtree.jobs import SweepJob, read_shards, shard_folder
 from warp_abtree.jobs.shard_folder import MANIFEST
 
-COUNT, SHARD = 60, 20
 FILES = ("npz", "parquet")
-OUTPUTS = ("any", "count", "faces", "contacts")
-
-
-def job_of(output="count", seed=0, count=COUNT, shard=SHARD):
-    poses = random_poses(np.random.default_rng(seed), count, 1.6)
-    return ab.SweepJob(sample("torus"), sample("small ball"), poses, output=output, shard=shard)
 
 
 @pytest.fixture(params=FILES)
@@ -31,18 +20,6 @@ def file(request):
     if request.param == "parquet":
         pytest.importorskip("pyarrow")
     return request.param
-
-
-def run(job, out, file, **options):
-    return ab.run_shards(job, out, file=file, pool=ab.ThisProcess("cpu"), **options)
-
-
-def contents(out):
-    return {path.name: path.read_bytes() for path in out.iterdir()}
-
-
-def shard_at(out, k):
-    return sorted(out.glob("shard-*"))[k]
 
 
 def load(path):
@@ -73,21 +50,9 @@ def store(path, columns, stamp):
 
 
 def change(path, alter):
-    """Write a shard anew, valid but for one altered column, or all."""
+    """Write a valid shard with other columns; alter(columns, name of one of them) returns these."""
     columns, stamp = load(path)
     store(path, alter(columns, "count" if "count" in columns else "face_a"), stamp)
-
-
-def empty(path):
-    path.write_bytes(b"")
-
-
-def truncate(path):
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-def drop_the_last_byte(path):
-    path.write_bytes(path.read_bytes()[:-1])
 
 
 def flip_a_byte(path):
@@ -108,78 +73,66 @@ def flip_a_byte(path):
     path.write_bytes(data)
 
 
-def alter_a_value(path):
-    change(path, lambda columns, name: {**columns, name: columns[name] + (np.arange(len(columns[name])) == 3)})
-
-
-def alter_a_type(path):
-    change(path, lambda columns, name: {**columns, name: columns[name].astype(np.int16)})
-
-
-def remove_rows(path):
-    change(path, lambda columns, _: {name: values[:-3] for name, values in columns.items()})
-
-
-def remove_a_column(path):
-    change(path, lambda columns, _: dict(list(columns.items())[1:]))
-
-
-def remove_the_stamp(path):
-    store(path, load(path)[0], {})
-
-
 def remove_the_digest(path):
     columns, stamp = load(path)
     store(path, columns, {name: text for name, text in stamp.items() if "digest" not in str(name)})
 
 
-def write_junk(path):
-    path.write_bytes(b"PK\x03\x04 PAR1 junk" * 9)
-
-
-def take_the_next(path):
-    """Put the next shard of the same job in the place of this one."""
+def copy_the_next(path):
+    """Replace a shard by the next one of the same job."""
     path.write_bytes(shard_at(path.parent, sorted(path.parent.glob("shard-*")).index(path) + 1).read_bytes())
 
 
-DAMAGE = (
-    *(empty, truncate, drop_the_last_byte, flip_a_byte, alter_a_value, alter_a_type, remove_rows, remove_a_column),
-    *(remove_the_stamp, remove_the_digest, write_junk, take_the_next),
-)
+DAMAGE = {
+    "empty": lambda path: path.write_bytes(b""),
+    "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "last byte lost": lambda path: path.write_bytes(path.read_bytes()[:-1]),
+    "junk": lambda path: path.write_bytes(b"PK\x03\x04 PAR1 junk" * 9),
+    "bit flipped": flip_a_byte,
+    "value": lambda path: change(
+        path, lambda columns, name: {**columns, name: columns[name] + (np.arange(len(columns[name])) == 3)}
+    ),
+    "type": lambda path: change(path, lambda columns, name: {**columns, name: columns[name].astype(np.int16)}),
+    "rows lost": lambda path: change(path, lambda columns, _: {name: values[:-3] for name, values in columns.items()}),
+    "column lost": lambda path: change(path, lambda columns, _: dict(list(columns.items())[1:])),
+    "no stamp": lambda path: store(path, load(path)[0], {}),
+    "no digest": remove_the_digest,
+    "another shard": copy_the_next,
+}
 
 
-@pytest.mark.parametrize("damage", DAMAGE, ids=lambda damage: damage.__name__)
+@pytest.mark.parametrize("damage", DAMAGE)
 @pytest.mark.parametrize("output", ["count", "faces"])
-def test_a_damaged_shard_is_found_out_and_done_again(tmp_path, monkeypatch, file, output, damage):
+def test_a_damaged_shard_is_detected_and_computed_again(tmp_path, monkeypatch, file, output, damage):
     job, out = job_of(output), tmp_path / "out"
     run(job, out, file)
     whole, path = contents(out), shard_at(out, 1)
-    damage(path)
+    DAMAGE[damage](path)
     assert path.read_bytes() != whole[path.name]
-    read = ab.read_shards(out)
+    read = read_shards(out)
     assert next(read)[:2] == (0, 20)
     with pytest.raises(ValueError, match="run the job again") as caught:
         next(read)
     assert str(path) in str(caught.value) and len(str(caught.value).splitlines()) == 1
-    asked, told = [], []
-    monkeypatch.setattr(job, "item", lambda *part, plain=job.item: asked.append(part) or plain(*part))
+    computed, told = [], []
+    monkeypatch.setattr(job, "task", lambda *part, plain=job.task: computed.append(part) or plain(*part))
     done = run(job, out, file, progress=lambda *call: told.append(call))
-    assert asked == [(20, 40)] and (done["shards"], done["found"], done["damaged"]) == (3, 2, 1)
+    assert computed == [(20, 40)] and (done["shards"], done["found"], done["damaged"]) == (3, 2, 1)
     assert told == [*(("check", k, 3) for k in (1, 2, 3)), ("shards", 2, 3), ("shards", 3, 3)]
     assert contents(out) == whole
-    assert [part[:2] for part in ab.read_shards(out)] == [(0, 20), (20, 40), (40, 60)]
+    assert [part[:2] for part in read_shards(out)] == [(0, 20), (20, 40), (40, 60)]
     assert run(job, out, file)["damaged"] == 0
 
 
 @pytest.mark.parametrize("output", ["count", "contacts"])
 @pytest.mark.slow
 def test_no_flipped_bit_changes_what_is_read(tmp_path, file, output):
-    """Flip a bit of every byte, or of some: it is found out, or it is in a byte that does not matter."""
+    """Flip a bit of every byte, or of some: it is detected, or the byte has no meaning."""
     out = tmp_path / "out"
     run(job_of(output, count=8, shard=8), out, file)
     path, manifest = shard_at(out, 0), json.loads((out / MANIFEST).read_text())
     expected = shard_folder._read_shard(path, manifest, 0, 8)
-    data, found_out = path.read_bytes(), 0
+    data, detected = path.read_bytes(), 0
     for place in range(0, len(data), 1 if output == "count" else 101):
         changed = bytearray(data)
         changed[place] ^= 1 << place % 8
@@ -188,16 +141,16 @@ def test_no_flipped_bit_changes_what_is_read(tmp_path, file, output):
             found = shard_folder._read_shard(path, manifest, 0, 8)
         except shard_folder.DamagedShard as error:
             assert str(path) in str(error)
-            found_out += 1
+            detected += 1
             continue
         assert list(found) == list(expected)
         for name, values in expected.items():
             assert found[name].dtype == values.dtype and found[name].tobytes() == values.tobytes()
-    assert found_out > 0
+    assert detected > 0
 
 
-def test_a_damaged_header_asks_for_no_memory(tmp_path):
-    out, job = tmp_path / "out", Job(count=6000, shard=2000)
+def test_a_damaged_header_allocates_no_memory(tmp_path):
+    out, job = tmp_path / "out", ColumnJob(count=6000, shard=2000)
     run(job, out, "npz")
     path = shard_at(out, 1)
     data = path.read_bytes()
@@ -206,20 +159,20 @@ def test_a_damaged_header_asks_for_no_memory(tmp_path):
     path.write_bytes(data.replace(shape + b" " * (len(huge) - len(shape)), huge, 1))
     assert path.stat().st_size == len(data)
     with pytest.raises(ValueError, match=r"damaged .*count\.npy"):
-        list(ab.read_shards(out))
+        list(read_shards(out))
     assert run(job, out, "npz")["damaged"] == 1 and path.read_bytes() == data
 
 
 @pytest.mark.parametrize("place", [0, 1])
 def test_a_shard_of_another_job_is_refused(tmp_path, file, place):
-    """Also under the name of another range than its own."""
+    """Also under the name of another range."""
     job, out = job_of(), tmp_path / "out"
     run(job, out, file)
     run(job_of(seed=1), tmp_path / "other", file)
     path = shard_at(out, place)
     path.write_bytes(shard_at(tmp_path / "other", 1).read_bytes())
     shard_at(out, 2).unlink()
-    empty(shard_at(out, 1 - place))
+    shard_at(out, 1 - place).write_bytes(b"")
     before = contents(out)
     with pytest.raises(ValueError, match="a shard of another job") as caught:
         run(job, out, file)
@@ -228,63 +181,39 @@ def test_a_shard_of_another_job_is_refused(tmp_path, file, place):
     assert (run(job, out, file)["damaged"], run(job, out, file)["found"]) == (1, 3)
     path.write_bytes(before[path.name])
     with pytest.raises(ValueError, match="a shard of another job") as caught:
-        list(ab.read_shards(out))
+        list(read_shards(out))
     assert str(path) in str(caught.value)
 
 
 @pytest.mark.parametrize(
     "name", ["shard-000000000000-000000000030.npz", "shard-000000000060-000000000080.npz", "shard-{}-{}.parquet"]
 )
-def test_a_shard_whose_name_is_none_of_the_job_is_refused(tmp_path, name):
+def test_a_shard_with_a_name_of_another_job_is_refused(tmp_path, name):
     job, out = job_of(), tmp_path / "out"
     run(job, out, "npz")
     path = out / name.format(f"{0:012d}", f"{20:012d}")
     path.write_bytes(shard_at(out, 0).read_bytes())
     before = contents(out)
-    for ask in (lambda: run(job, out, "npz"), lambda: list(ab.read_shards(out))):
+    for ask in (lambda: run(job, out, "npz"), lambda: list(read_shards(out))):
         with pytest.raises(ValueError, match="a shard of another job") as caught:
             ask()
         assert str(path) in str(caught.value) and contents(out) == before
 
 
-@pytest.mark.parametrize("output", OUTPUTS)
+@pytest.mark.parametrize("output", ["any", "count", "faces", "contacts"])
 def test_shards_of_every_output_pass_their_check(tmp_path, file, output):
-    """With shards that have no row, and a last one that is shorter."""
-    poses = random_poses(np.random.default_rng(0), 50, 1.6)
+    """With a shard without rows, and a shorter last one."""
+    poses = poses_of(50)
     poses[20:40, :3] += 9
-    job = ab.SweepJob(sample("torus"), sample("small ball"), poses, output=output, shard=20)
+    job = SweepJob(*pair(), poses, output=output, shard=20)
     run(job, tmp_path / "out", file)
-    rows = [len(next(iter(columns.values()))) for _, _, columns in ab.read_shards(tmp_path / "out")]
+    rows = [len(next(iter(columns.values()))) for _, _, columns in read_shards(tmp_path / "out")]
     assert rows == [20, 20, 10] if output in ("any", "count") else rows[1] == 0 < min(rows[0], rows[2])
     assert run(job, tmp_path / "out", file)["found"] == 3
-    assert not set(shard_folder.STAMP) & {
-        name for _, _, columns in ab.read_shards(tmp_path / "out") for name in columns
-    }
+    assert not set(shard_folder.STAMP) & {name for _, _, columns in read_shards(tmp_path / "out") for name in columns}
 
 
 # Rows.
-
-
-class Job:
-    """Columns of any length, for a job of whole numbers."""
-
-    unit = "pose"
-
-    def __init__(self, count=4, shard=2, rows=None, size=1, output="count"):
-        self.count, self.shard, self.rows, self.size, self.output = count, shard, rows, size, output
-
-    def describe(self):
-        return {"count": self.count, "shard": self.shard, "output": self.output}
-
-    def item(self, start, stop):
-        return start, stop
-
-    def asker(self):
-        return self
-
-    def ask(self, item, device=None):
-        rows = (self.size * (item[1] - item[0]),) * 2 if self.rows is None else self.rows
-        return {"count": np.arange(rows[0]), "more": np.arange(rows[1])}
 
 
 @pytest.mark.parametrize(
@@ -298,10 +227,10 @@ class Job:
     ],
 )
 def test_rows_are_counted(tmp_path, monkeypatch, rows, output, fault):
-    job = Job(rows=rows, output=output)
+    job = ColumnJob(rows=rows, output=output)
     if fault is None:
         run(job, tmp_path / "out", "npz")
-        assert len(list(ab.read_shards(tmp_path / "out"))) == 2
+        assert len(list(read_shards(tmp_path / "out"))) == 2
         return
     with pytest.raises(RuntimeError, match=f"shard 0 to 2 was answered with {fault}"):
         run(job, tmp_path / "out", "npz")
@@ -310,21 +239,21 @@ def test_rows_are_counted(tmp_path, monkeypatch, rows, output, fault):
         patch.setattr(shard_folder, "_row_fault", lambda *_: None)
         run(job, tmp_path / "out", "npz")
     with pytest.raises(ValueError, match=f"shard-000000000000-000000000002.npz: holds {fault}"):
-        next(ab.read_shards(tmp_path / "out"))
+        next(read_shards(tmp_path / "out"))
     job.rows = None
     assert run(job, tmp_path / "out", "npz")["damaged"] == 2
 
 
-def test_one_shard_is_held_while_all_are_checked(tmp_path):
+def test_one_column_is_in_memory_while_all_are_checked(tmp_path):
     size = 100_000
-    job = Job(count=40, shard=10, size=size, output="rows")  # 16 MB a shard
+    job = ColumnJob(count=40, shard=10, size=size, output="rows")  # 16 MB a shard
     run(job, tmp_path / "out", "npz")
     tracemalloc.start()
     try:
         assert run(job, tmp_path / "out", "npz")["found"] == 4
         checked = tracemalloc.get_traced_memory()[1]
         tracemalloc.reset_peak()
-        for _, _, columns in ab.read_shards(tmp_path / "out"):
+        for _, _, columns in read_shards(tmp_path / "out"):
             assert len(columns["count"]) == 10 * size
             del columns
         read = tracemalloc.get_traced_memory()[1]
@@ -353,7 +282,7 @@ def test_an_altered_manifest_is_refused(tmp_path, change, what):
     change(held)
     (out / MANIFEST).write_text(json.dumps(held))
     before = contents(out)
-    for ask in (lambda: run(job, out, "npz"), lambda: list(ab.read_shards(out))):
+    for ask in (lambda: run(job, out, "npz"), lambda: list(read_shards(out))):
         with pytest.raises(ValueError, match=what) as caught:
             ask()
         assert str(out / MANIFEST) in str(caught.value) and contents(out) == before
@@ -364,7 +293,7 @@ def test_parquet_without_pyarrow_is_no_damage(tmp_path, monkeypatch):
     run(job_of(), tmp_path / "out", "parquet")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(ValueError, match=r"^Parquet needs PyArrow"):
-        list(ab.read_shards(tmp_path / "out"))
+        list(read_shards(tmp_path / "out"))
 
 
 def test_a_shard_that_may_not_be_read_is_no_damage(tmp_path, monkeypatch):
@@ -373,28 +302,6 @@ def test_a_shard_that_may_not_be_read_is_no_damage(tmp_path, monkeypatch):
     path = shard_at(out, 1)
     path.unlink()
     path.mkdir()
-    for ask in (lambda: run(job_of(), out, "npz"), lambda: list(ab.read_shards(out))):
+    for ask in (lambda: run(job_of(), out, "npz"), lambda: list(read_shards(out))):
         with pytest.raises(OSError, match=path.name):
             ask()
-
-
-def test_the_command_says_what_was_damaged(tmp_path):
-    for name in ("torus", "small ball"):
-        sample(name).save(tmp_path / f"{name[0]}.npz")
-    np.save(tmp_path / "poses.npy", random_poses(np.random.default_rng(0), COUNT, 1.6))
-    files = [tmp_path / name for name in ("t.npz", "s.npz", "poses.npy")]
-    words = [str(word) for word in (*files, "--out", tmp_path / "out", "--shard", SHARD)]
-    words = ["sweep", *words, "--ray", "none", "--device", "cpu"]
-
-    def command(*more):
-        shown = io.StringIO()
-        with contextlib.redirect_stdout(shown):
-            assert main([*words, *more]) == 0
-        return shown.getvalue()
-
-    assert "damaged" not in command()
-    truncate(shard_at(tmp_path / "out", 0))
-    assert "in 3 shards, 2 found there, 1 damaged and done again, by one process" in command()
-    empty(shard_at(tmp_path / "out", 2))
-    found = json.loads(command("--json"))
-    assert (found["shards"], found["found"], found["damaged"]) == (3, 2, 1)

@@ -87,9 +87,9 @@ def cover_triangle_kernel(
     used_out: wp.array(dtype=int),
     bound_sq_out: wp.array(dtype=wp.float64),
 ):
-    """Cover the triangle in hand, beginning at the one face in scratch.near (serial, dim=1)."""
+    """Cover the current triangle, beginning at the one face in scratch.near (serial, dim=1)."""
     for k in range(3):
-        scratch.piece[k] = replay.triangle_pos[0, k]
+        scratch.polygon[k] = replay.triangle_pos[0, k]
     bound_sq, used = cover_triangle(replay, scratch, rings, 1, 1, 1, room, FLOOR * FLOOR)
     used_out[0] = used
     bound_sq_out[0] = bound_sq
@@ -126,10 +126,10 @@ def test_a_cover_on_fewer_faces_than_it_wants_is_measured_again(device, room):
     replay.face_stamp = filled(len(faces), -1)
     scratch = Scratch()
     scratch.near, scratch.used = filled(len(faces), len(faces) // 4), filled(int(SLOTS), -1)
-    scratch.waiting = wp.zeros((int(STACK), int(CORNERS)), dtype=wp.vec3d, device=device)
-    scratch.waiting_count = filled(int(STACK), 0)
-    scratch.piece = wp.zeros(int(CORNERS), dtype=wp.vec3d, device=device)
-    scratch.inner = wp.zeros(int(CORNERS), dtype=wp.vec3d, device=device)
+    scratch.stack = wp.zeros((int(STACK), int(CORNERS)), dtype=wp.vec3d, device=device)
+    scratch.stack_count = filled(int(STACK), 0)
+    scratch.polygon = wp.zeros(int(CORNERS), dtype=wp.vec3d, device=device)
+    scratch.clipped = wp.zeros(int(CORNERS), dtype=wp.vec3d, device=device)
     used, bound_sq = filled(1, 0), wp.zeros(1, dtype=wp.float64, device=device)
     wp.launch(cover_triangle_kernel, 1, [room, replay, scratch, rings], [used, bound_sq], device=device)
     count, bound = int(used.numpy()[0]), float(np.sqrt(bound_sq.numpy()[0]))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import real_mesh_path
-from helpers.samples import crumbs, grid, of_trimesh, sample, soup
+from helpers.samples import crumbs, grid, line, of_trimesh, sample, soup
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracles.distance import brute_distances, exact_distance_sq, farthest_distance, lattice_points
@@ -28,12 +28,6 @@ def square_comb(teeth):
             a, b, c, d = (place.setdefault(p, len(place)) for p in corner)
             faces += [[a, b, c], [a, c, d]]
     return np.array(list(place)), np.array(faces)
-
-
-def line(direction, count=20):
-    """Faces without area: every corner on one line, but for rounding."""
-    i = np.arange(count - 2)
-    return np.arange(count)[:, None] ** 1.5 * np.array(direction), np.stack([i, i + 1, i + 2], 1)
 
 
 def turned(vertices, faces, seed=0):

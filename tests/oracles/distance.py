@@ -47,25 +47,31 @@ def measure_distance_kernel(mesh: wp.uint64, points: wp.array[wp.vec3], distance
     distance_out[i] = wp.length(points[i] - foot)
 
 
-def farthest_distance(triangles, corners):
-    """Return the greatest distance of some triangles from others that a search by points finds.
-
-    Warp's own query in float32 says which triangles have the farthest points, and which points of theirs; what it
-    misjudges makes the answer less, never more.
-    """
+def estimate_distances(points, corners):
+    """Return distances of points to triangles by Warp's own query, in float32."""
     low, size = corners.min((0, 1)), np.ptp(corners, axis=(0, 1)).max()
     soup = wp.array(((corners - low) / size).reshape(-1, 3), dtype=wp.vec3, device="cpu")
     surface = wp.Mesh(soup, wp.array(np.arange(3 * len(corners)), dtype=int, device="cpu"))
+    place = wp.array((points - low) / size, dtype=wp.vec3, device="cpu")
+    distance = wp.empty(len(points), dtype=float, device="cpu")
+    wp.launch(measure_distance_kernel, len(points), [surface.id, place], [distance], device="cpu")
+    return distance.numpy()
 
-    def measure(points):
-        place = wp.array((points - low) / size, dtype=wp.vec3, device="cpu")
-        distance = wp.empty(len(points), dtype=float, device="cpu")
-        wp.launch(measure_distance_kernel, len(points), [surface.id, place], [distance], device="cpu")
-        return distance.numpy()
 
-    coarse = measure(lattice_points(triangles, 6)).reshape(len(triangles), -1).max(1)
+def farthest_points(points, corners, count):
+    """Return the points that seem farthest from triangles; an error of the estimate can only hide some."""
+    return points[np.argsort(estimate_distances(points, corners))[-count:]]
+
+
+def farthest_distance(triangles, corners):
+    """Return the greatest distance of some triangles from others that a search by points finds.
+
+    Estimates choose the triangles with the farthest points, and these points; their errors make the answer less, never
+    more.
+    """
+    coarse = estimate_distances(lattice_points(triangles, 6), corners).reshape(len(triangles), -1).max(1)
     points = lattice_points(triangles[np.argsort(coarse)[-40:]], 100)
-    return brute_distances(points[np.argsort(measure(points))[-20:]], corners).max()
+    return brute_distances(farthest_points(points, corners, 20), corners).max()
 
 
 def exact_distance_sq(point, corners):

@@ -31,6 +31,15 @@ def fcl_faces(vertices_a, faces_a, vertices_b, faces_b, pose_a, pose_b):
     return {(contact.b1, contact.b2) for contact in result.contacts}
 
 
+def fcl_distance(vertices_a, faces_a, vertices_b, faces_b, pose_a, pose_b):
+    """Distance of two meshes that do not intersect, after FCL."""
+    import fcl
+
+    a = _fcl_object(fcl, vertices_a, faces_a, pose_a)
+    b = _fcl_object(fcl, vertices_b, faces_b, pose_b)
+    return fcl.distance(a, b, fcl.DistanceRequest(), fcl.DistanceResult())
+
+
 @dataclass
 class Verdict:
     """Sorted lists of (face of A, face of B), each pair that only one side reported, by who is wrong."""

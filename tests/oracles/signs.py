@@ -24,7 +24,7 @@ def random_points(rng, dim):
     return rng.normal(size=(COUNT, dim + 1, dim))
 
 
-def flat_points(rng, dim):
+def coplanar_points(rng, dim):
     """The last point on the plane or line of the others, up to rounding and two units in the last place."""
     points = random_points(rng, dim) + 2.0 ** rng.integers(-3, 20, (COUNT, 1, 1)) * rng.normal(size=(COUNT, 1, dim))
     weight = rng.choice([0.0, 0.25, 0.5, 1.0, -1.0, 0.3], (COUNT, dim - 1, 1))
@@ -43,20 +43,20 @@ def mixed_points(rng, dim):
     return rng.choice(values, (COUNT, dim + 1, dim))
 
 
-def tiny_flat_points(rng, dim):
-    points = flat_points(rng, dim) * 2.0**-285
+def tiny_coplanar_points(rng, dim):
+    points = coplanar_points(rng, dim) * 2.0**-285
     return np.where(np.abs(points) < TINY, 0.0, points)
 
 
 KINDS = {
     "random": random_points,
     "lattice": lattice_points,
-    "flat": flat_points,
+    "coplanar": coplanar_points,
     "tiny lattice": lambda rng, dim: lattice_points(rng, dim) * TINY,
     "tiny grid": grid_points,
-    "tiny flat": tiny_flat_points,
+    "tiny coplanar": tiny_coplanar_points,
     "mixed": mixed_points,
-    "large flat": lambda rng, dim: flat_points(rng, dim) * 2.0**150,
+    "large coplanar": lambda rng, dim: coplanar_points(rng, dim) * 2.0**150,
     "large lattice": lambda rng, dim: lattice_points(rng, dim) * 2.0**150,
 }
 
@@ -77,6 +77,16 @@ def true_terms(rows):
 def true_signs(points):
     values = [sum(true_terms(rows)) for rows in points.tolist()]
     return np.array([(x > 0) - (x < 0) for x in values])
+
+
+def rounded_signs(points):
+    """Return the signs of determinants whose products and sums are rounded to float64."""
+    u = points[:, :-1] - points[:, -1:]
+    if points.shape[2] == 2:
+        return np.sign(u[:, 0, 0] * u[:, 1, 1] - u[:, 0, 1] * u[:, 1, 0])
+    u, v, w = u.transpose(1, 2, 0)
+    x, y, z = v[1] * w[2] - v[2] * w[1], w[1] * u[2] - w[2] * u[1], u[1] * v[2] - u[2] * v[1]
+    return np.sign((u[0] * x + v[0] * y) + w[0] * z)
 
 
 def find_signs(kernel, mode, points, device):

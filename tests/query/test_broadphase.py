@@ -185,8 +185,10 @@ def test_thousand_worlds(device):
     expected = np.argwhere(np.triu((worlds[:, None] == worlds) | shared, 1))
     np.testing.assert_array_equal(pairs, expected)
     assert len(pairs) == 3 * 1000 + 2 * 3000 + 1
-    result = scene.intersect(precision="exact")
+    result = scene.intersect()
     np.testing.assert_array_equal(result.pairs[np.lexsort(result.pairs.T[::-1])], expected)
+    apart = [(i, i + 1) for i in range(9) if worlds[i] != worlds[i + 1]]
+    assert scene.intersect(apart).any.all(), "a pair that is asked for is tested whatever its worlds"
 
 
 def test_every_world_only(device):
@@ -213,8 +215,8 @@ def test_filter_adds_up_and_outlives_changes(device):
     scene.add(box)
     scene.set_lods([0] * 5)
     np.testing.assert_array_equal(scene.broad_phase(), [(0, 2), (0, 4), (1, 2), (1, 3), (1, 4), (2, 4), (3, 4)])
-    assert scene.intersect([(0, 1)], precision="exact").any.all(), "a pair that is asked for is tested all the same"
-    assert len(scene.intersect(precision="exact").pairs) == 7
+    assert scene.intersect([(0, 1)]).any.all(), "a pair that is asked for is tested all the same"
+    assert len(scene.intersect().pairs) == 7
 
 
 def test_distances_beyond_float32(device):
@@ -229,7 +231,7 @@ def test_distances_beyond_float32(device):
     lower, upper = posed_boxes(scene, poses)
     needed = set(map(tuple, np.argwhere(np.triu(overlaps(lower, upper, 0.0), 1)).tolist()))
     assert needed <= found
-    meets = scene.intersect(precision="exact")
+    meets = scene.intersect()
     assert {tuple(pair) for pair, hit in zip(meets.pairs.tolist(), meets.any, strict=True) if hit} == needed
 
 

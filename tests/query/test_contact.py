@@ -1,13 +1,12 @@
 """Contacts: ends against exact clipping, definitions, symmetries, and sums over object pairs."""
 
-from fractions import Fraction
-
 import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from helpers.contacts import check_summaries, distance, exact_normal, lies_in_plane, shared_polygon, unit
 from helpers.samples import STILL, contact_poses, sample, soup
-from oracles.triangle import _cross, _dot, _half_spaces, _sub, into_frame_of_a, quaternion_matrix
+from oracles.triangle import _cross, into_frame_of_a, quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree.kernels.triangle.segment import intersect_faces
@@ -16,40 +15,6 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
 QUARTER = (0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0)
-
-
-def exact(triangle):
-    return [tuple(Fraction(float(x)) for x in p) for p in triangle]
-
-
-def shared_polygon(a, b):
-    """Corners of the intersection of two closed triangles, float64 (n, 3), by clipping B with A's half-spaces."""
-    polygon = exact(b)
-    for normal, origin in _half_spaces(exact(a)):
-        side = [_dot(normal, _sub(p, origin)) for p in polygon]
-        clipped = []
-        for k in range(len(polygon)):
-            p, q, s, t = polygon[k - 1], polygon[k], side[k - 1], side[k]
-            if s * t < 0:
-                clipped.append(tuple(x + (y - x) * s / (s - t) for x, y in zip(p, q, strict=True)))
-            if t >= 0:
-                clipped.append(q)
-        polygon = clipped
-    return np.array([[float(x) for x in p] for p in polygon])
-
-
-def exact_normal(t):
-    a, b, c = exact(t)
-    return _cross(_sub(b, a), _sub(c, a))
-
-
-def unit(v):
-    """Unit vector of exact components; zero stays."""
-    scale = max(abs(x) for x in v)
-    if scale == 0:
-        return np.zeros(3)
-    v = np.array([float(x / scale) for x in v])
-    return v / np.linalg.norm(v)
 
 
 def slivers(count, seed):
@@ -128,7 +93,7 @@ def test_ends_and_normals_equal_exact_clipping(device, case):
         normals = exact_normal(a), exact_normal(b)
         np.testing.assert_allclose(row["normal_a"], unit(normals[0]), atol=1e-12)
         np.testing.assert_allclose(row["normal_b"], unit(normals[1]), atol=1e-12)
-        in_plane = all(_dot(normals[0], _sub(p, exact(a)[0])) == 0 for p in exact(b))
+        in_plane = lies_in_plane(b, a)
         assert row["coplanar"] == (any(normals[0]) and any(normals[1]) and in_plane)
         along = unit(_cross(*normals)) @ (row["p1"] - row["p0"])
         assert row["coplanar"] or along >= -room
@@ -151,28 +116,7 @@ def check_fields(result):
     lower = np.where((result.pairs[rows["pair"], 0] < result.pairs[rows["pair"], 1])[:, None], 1, -1)
     alike = ~clear & (length[0] > 0)
     np.testing.assert_allclose(rows["normal"][alike], (lower * rows["normal_a"])[alike], atol=1e-6)
-    check_sums(result)
-
-
-def check_sums(result):
-    rows, sums = result.contacts, result.pair_contacts
-    assert len(sums) == len(result.pairs) and sums["count"].dtype == np.int64
-    np.testing.assert_array_equal(sums["count"], result.count)
-    for p, summed in enumerate(sums):
-        mine = rows[rows["pair"] == p]
-        if not len(mine):
-            assert np.isnan(summed["point"]).all() and np.isnan(summed["normal"]).all() and summed["depth"] == 0
-            continue
-        weight = np.linalg.norm(mine["p1"] - mine["p0"], axis=1)
-        weight = weight if weight.any() else np.ones(len(mine))
-        point, normal, total = np.zeros(3), np.zeros(3), 0.0
-        for row, w in zip(mine, weight, strict=True):
-            point, normal, total = point + w * (row["p0"] + row["p1"]) / 2, normal + w * row["normal"], total + w
-        size = np.abs(mine["p0"]).max()
-        np.testing.assert_allclose(summed["point"], point / total, atol=1e-13 * max(size, 1e-300))
-        if np.linalg.norm(normal / total) > 1e-4:
-            np.testing.assert_allclose(summed["normal"], normal / np.linalg.norm(normal), atol=1e-10)
-        assert abs(np.linalg.norm(summed["normal"]) - 1) < 1e-15 and summed["depth"] >= 0
+    check_summaries(result)
 
 
 def mirror(contacts):
@@ -239,19 +183,6 @@ def test_contacts_name_their_faces_and_need_no_pickle(device, tmp_path):
         for back in (read, file["contacts"]):
             assert back.dtype == result.contacts.dtype and back.tobytes() == result.contacts.tobytes()
         assert file["pair_contacts"].tobytes() == result.pair_contacts.tobytes()
-
-
-def distance(corners, p):
-    """Distance of a point from a triangle, by trimesh, or from the nearest edge where it has no area."""
-    best = np.inf
-    for a, b in zip(corners, np.roll(corners, 1, 0), strict=True):
-        d = b - a
-        t = np.clip((p - a) @ d / (d @ d), 0, 1) if d @ d > 0 else 0.0
-        best = min(best, np.linalg.norm(a + t * d - p))
-    n = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    if n @ n > 0:
-        best = min(best, np.linalg.norm(trimesh.triangles.closest_point(corners[None], p[None])[0] - p))
-    return best
 
 
 def test_common_motion(device):
@@ -428,32 +359,6 @@ def test_tori(device):
             np.testing.assert_allclose(tube, 0.35, atol=0.005)
 
 
-# What is asked for, and what is not there.
-
-
-def test_float32_empty_and_refused(device):
-    scene, _ = two(device, "ball", "torus", pose_b=(0.9, 0, 0, 0, 0, 0, 1))
-    full, small = contacts_of(scene), contacts_of(scene, contact_dtype=np.float32)
-    for name in VECTORS:
-        assert small.contacts[name].dtype == np.float32
-        np.testing.assert_array_equal(small.contacts[name], full.contacts[name].astype(np.float32))
-    for name in ("point", "normal", "depth"):
-        assert small.pair_contacts[name].dtype == np.float32
-        np.testing.assert_array_equal(small.pair_contacts[name], full.pair_contacts[name].astype(np.float32))
-    for wrong in (np.int32, np.float16, "double trouble", np.complex128):
-        with pytest.raises(ValueError, match="contact_dtype"):
-            contacts_of(scene, contact_dtype=wrong)
-    for pairs in ([], np.empty((0, 2), int)):
-        none = scene.intersect(np.array(pairs, int), output="contacts")
-        assert none.contacts.shape == none.pair_contacts.shape == (0,) and none.contacts["p0"].shape == (0, 3)
-    plain = scene.intersect([(0, 1)], output="faces")
-    assert plain.contacts is None and plain.pair_contacts is None
-    scene.set_poses([STILL, (9, 0, 0, 0, 0, 0, 1)])
-    apart = contacts_of(scene)
-    assert len(apart.contacts) == 0 and apart.contacts.dtype == full.contacts.dtype
-    check_sums(apart)
-
-
 @wp.kernel
 def join_faces_kernel(corners: wp.array2d(dtype=wp.vec3d), ends_out: wp.array2d(dtype=wp.vec3d)):
     i = wp.tid()
@@ -488,8 +393,7 @@ def test_faces_that_do_not_meet_get_a_point_between(device):
     assert (away.sum(1)[:200] < [np.linalg.norm(c[:3, None] - c[3:], axis=2).min() + 1e-9 for c in corners[:200]]).all()
 
 
-@pytest.mark.parametrize("precision", ["float32"])
 @pytest.mark.slow
-def test_coarser_precision(device, precision):
+def test_rounded_signs_give_whole_contacts(device):
     scene, _ = two(device, "small ball", "small ball", pose_b=(1e-7, 0, 0, 0, 0, 0, 1))
-    check_fields(contacts_of(scene, precision=precision))
+    check_fields(contacts_of(scene, precision="float32"))

@@ -3,93 +3,13 @@
 import numpy as np
 import pytest
 import warp as wp
+from helpers.contacts import CHUNK, check_summaries
 from helpers.samples import STILL, contact_poses, random_poses, sample
 
 import warp_abtree as ab
 from warp_abtree import testing
 
-CHUNK = 32  # contacts that are summed from left to right before sums are; part of the definition
 FAR = (9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-
-
-# Sums in their stated order, in plain Python.
-
-
-def dot(u, v):
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
-
-
-def cross(u, v):
-    return np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
-
-
-def scaled(v):
-    """Return the largest component's magnitude, and the vector divided by it."""
-    largest = np.abs(v).max()
-    return largest, v / largest if largest else v
-
-
-def length(v):
-    largest, u = scaled(v)
-    return largest * np.sqrt(dot(u, u))
-
-
-def summed(terms):
-    """Sum chunks of terms from left to right, then their sums."""
-    sums = []
-    for k in range(0, len(terms), CHUNK):
-        total = terms[0] * 0.0
-        for term in terms[k : k + CHUNK]:
-            total = total + term
-        sums.append(total)
-    total = terms[0] * 0.0
-    for part in sums:
-        total = total + part
-    return total
-
-
-def summary(rows):
-    """Return (point, normal, depth) of a pair's contacts; None as depth where there is no curve to tell it."""
-    origin, count = rows["p0"][0], len(rows)
-    lengths = [length(q - p) for p, q in zip(rows["p0"], rows["p1"])]
-    total = summed(lengths)
-    weights = [x / total for x in lengths] if total else [1.0 / count] * count
-    ends = list(zip(weights, rows["p0"], rows["p1"]))
-    middle = summed([w * (0.5 * (p - origin) + 0.5 * (q - origin)) for w, p, q in ends])
-    mean = summed([w * n for w, n in zip(weights, rows["normal"])])
-    assert length(mean) > 2.0**-20
-    _, n = scaled(mean)
-    n = n / np.sqrt(dot(n, n))
-    areas, changes = [np.float64(0)], [np.float64(0)]
-    for row in rows:
-        r, s = row["p0"] - origin - middle, row["p1"] - row["p0"]
-        cosine = dot(row["normal_a"], row["normal_b"])
-        square = 1.0 - cosine * cosine
-        away = row["normal_b"] - row["normal_a"] * cosine
-        flat = square < 2.0**-40
-        areas.append(0.0 if row["coplanar"] else 0.5 * dot(n, cross(r, s)))
-        changes.append(0.0 if row["coplanar"] or flat else dot(n, row["normal_b"]) / square * dot(away, cross(s, n)))
-    area, change = summed(areas[1:]), summed(changes[1:])
-    return origin + middle, n, -area / change if area * change < 0 else None
-
-
-def check_summaries(result):
-    """Compare every pair's summary to the bit; return how often the contact curve told the depth."""
-    curves = 0
-    assert len(result.pair_contacts) == len(result.pairs)
-    np.testing.assert_array_equal(result.pair_contacts["count"], result.count)
-    for p, got in enumerate(result.pair_contacts):
-        rows = result.contacts[result.contacts["pair"] == p]
-        assert len(rows) == result.count[p]
-        if not len(rows):
-            assert np.isnan(got["point"]).all() and np.isnan(got["normal"]).all() and got["depth"] == 0
-            continue
-        point, normal, depth = summary(rows)
-        assert got["point"].tobytes() == point.tobytes()
-        assert got["normal"].tobytes() == normal.tobytes()
-        assert depth is None or got["depth"] <= depth
-        curves += got["depth"] == depth
-    return curves
 
 
 def teeth(count, seed, points=False):
@@ -225,30 +145,6 @@ def test_pairs_of_the_broad_phase(device, room):
     check_device_arrays(query, result)
     plain = scene.intersect(result.pairs, output="contacts")
     same(result, plain)
-    query = ab.ContactQuery(scene, capacity=ab.Buffers(pairs=5))
-    query.launch()
-    with pytest.raises(ab.CapacityError, match=f"{len(result.pairs)} object pairs .* room for 5"):
-        query.result().check()
-
-
-def test_overflow_names_the_demand(device):
-    scene, pairs = touching(device)
-    whole = scene.intersect(pairs, output="contacts")
-    demand = len(whole.contacts)
-    known = {row.tobytes() for row in whole.contacts}
-    for capacity in (1, 31, demand // 2, demand - 1):
-        query = ab.ContactQuery(scene, pairs, capacity=capacity)
-        query.launch()
-        part = query.result()
-        with pytest.raises(ab.CapacityError, match=f"^{demand} intersecting .* room for {capacity}: .*hits={demand}"):
-            part.check()
-        np.testing.assert_array_equal(part.count, whole.count)
-        assert len(part.contacts) == len(part.faces) == capacity
-        assert (np.lexsort(part.faces.T[::-1]) == np.arange(capacity)).all()
-        assert {row.tobytes() for row in part.contacts} <= known
-        np.testing.assert_array_equal(query.start.numpy(), np.searchsorted(part.faces[:, 0], np.arange(len(pairs) + 1)))
-        same(query.run(), whole)
-    ab.ContactQuery(scene, pairs, capacity=demand).run()
 
 
 def test_nothing_to_find(device):
@@ -261,8 +157,11 @@ def test_nothing_to_find(device):
     assert len(result.contacts) == 0 and result.faces.shape == (0, 3) and len(result.pair_contacts) == 2
     check_summaries(result)
     check_device_arrays(query, result)
+    assert result.contacts.dtype == scene.intersect(pairs, output="contacts").contacts.dtype
+    plain = scene.intersect(pairs, output="faces")
+    assert plain.contacts is None and plain.pair_contacts is None
     query.set_pairs([])
-    for none in (query.run(), ab.ContactQuery(scene, []).run()):
+    for none in (query.run(), ab.ContactQuery(scene, []).run(), scene.intersect([], output="contacts")):
         assert none.contacts.shape == none.pair_contacts.shape == none.count.shape == (0,)
         assert none.faces.shape == (0, 3) and none.faces.dtype == np.int32 and none.contacts["p0"].shape == (0, 3)
     lone = ab.Scene(device)
@@ -325,31 +224,14 @@ def test_a_graph_takes_poses_to_contacts(device, given):
 def test_float32(device):
     scene, pairs = touching(device, pairs=3)
     full, query = ab.ContactQuery(scene, pairs).run(), ab.ContactQuery(scene, pairs, contact_dtype=np.float32)
-    small = query.run()
-    for part in ("contacts", "pair_contacts"):
-        for name in getattr(full, part).dtype.names:
-            wanted = getattr(full, part)[name]
-            wanted = wanted.astype(np.float32) if wanted.dtype == np.float64 else wanted
-            assert getattr(small, part)[name].tobytes() == wanted.tobytes()
+    for small in (query.run(), scene.intersect(pairs, output="contacts", contact_dtype=np.float32)):
+        for part in ("contacts", "pair_contacts"):
+            for name in getattr(full, part).dtype.names:
+                wanted = getattr(full, part)[name]
+                wanted = wanted.astype(np.float32) if wanted.dtype == np.float64 else wanted
+                found = getattr(small, part)[name]
+                assert found.dtype == wanted.dtype and found.tobytes() == wanted.tobytes()
     assert query.contacts.p0.dtype == wp.vec3d
-
-
-def test_refused(device):
-    scene, pairs = touching(device, pairs=1)
-    with pytest.raises(ValueError, match=r"ab\.ContactQuery"):
-        ab.Query(scene, "contacts", pairs=pairs)
-    with pytest.raises(ValueError, match="contact_dtype"):
-        ab.ContactQuery(scene, pairs, contact_dtype=np.int64)
-    with pytest.raises(ValueError, match="precision"):
-        ab.ContactQuery(scene, pairs, precision="best")
-    with pytest.raises(ValueError, match="capacity"):
-        ab.ContactQuery(scene, pairs, capacity=0)
-    with pytest.raises(ab.CapacityError, match="fewer than 2"):
-        ab.ContactQuery(scene, pairs, capacity=2**30)
-    query = ab.ContactQuery(scene, pairs)
-    scene.add(sample("box"))
-    with pytest.raises(RuntimeError, match="make a new one"):
-        query.launch()
 
 
 def test_skewed_matrices(device):

@@ -5,26 +5,11 @@ import itertools
 import numpy as np
 import pytest
 import trimesh
-from helpers.samples import random_poses
+from helpers.bodies import about, box, model_of
+from helpers.samples import STILL, random_poses
+from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
-from warp_abtree.simulate.body_state import matrices_of
-
-
-def model_of(mesh):
-    return ab.Model.from_arrays(np.asarray(mesh.vertices), np.asarray(mesh.faces), base_faces=4)
-
-
-def box(*extents, splits=0):
-    mesh = trimesh.creation.box(extents)
-    for _ in range(splits):
-        mesh = mesh.subdivide()
-    return model_of(mesh)
-
-
-def about(axis, angle):
-    axis = np.asarray(axis, float) / np.linalg.norm(axis)
-    return (*(np.sin(angle / 2) * axis), np.cos(angle / 2))
 
 
 def ask(device, *placed, **options):
@@ -38,7 +23,7 @@ def ask(device, *placed, **options):
 
 def clip_area_vector(half, pose, other_half, other_pose):
     """Area vector of that part of the faces of one box that lies within another, by clipping each face: an oracle."""
-    r, r2 = matrices_of([pose[3:], other_pose[3:]])
+    r, r2 = quaternion_matrix(pose[3:]), quaternion_matrix(other_pose[3:])
     total = np.zeros(3)
     for axis, sign in itertools.product(range(3), (-1, 1)):
         u, v = (axis + 1) % 3, (axis + 2) % 3
@@ -61,15 +46,19 @@ def clip_area_vector(half, pose, other_half, other_pose):
     return total
 
 
+def check_upward(points, tolerance=1e-9):
+    np.testing.assert_allclose(points["normal"], np.tile([0, 0, 1.0], (len(points["pair"]), 1)), atol=tolerance)
+
+
 @pytest.mark.parametrize("splits", [(0, 0), (2, 0), (0, 2), (2, 2)])
 def test_a_box_on_a_floor_has_its_four_corners(device, splits):
     floor, cube = box(4, 4, 1, splits=splits[0]), box(1, 0.8, 0.6, splits=splits[1])
     turned = about((0, 0, 1), 0.3)
     _, result = ask(device, (floor, (0, 0, -0.5, 0, 0, 0, 1)), (cube, (0.1, 0.2, 0.29, *turned)))
     points = result.points
-    np.testing.assert_allclose(points["normal"], np.tile([0, 0, 1.0], (len(points["pair"]), 1)), atol=1e-12)
+    check_upward(points, 1e-12)
     np.testing.assert_allclose(points["depth"], 0.01, atol=1e-12)
-    r = matrices_of([turned])[0]
+    r = quaternion_matrix(turned)
     for x, y in itertools.product((-0.5, 0.5), (-0.4, 0.4)):
         corner = r @ [x, y, -0.3] + [0.1, 0.2, 0.29]
         away = np.linalg.norm(points["point"] - corner, axis=1)
@@ -80,10 +69,10 @@ def test_a_box_on_a_floor_has_its_four_corners(device, splits):
 def test_equal_boxes_in_a_stack_push_upwards(device):
     cube = box(1, 1, 1)
     for shift in ((0, 0), (0.02, 0.01), (0.3, 0.0), (0.4, -0.4)):
-        _, result = ask(device, (cube, (0, 0, 0, 0, 0, 0, 1)), (cube, (*shift, 0.995, 0, 0, 0, 1)))
+        _, result = ask(device, (cube, STILL), (cube, (*shift, 0.995, 0, 0, 0, 1)))
         points = result.points
         assert len(points["pair"]) >= 4
-        np.testing.assert_allclose(points["normal"], np.tile([0, 0, 1.0], (len(points["pair"]), 1)), atol=1e-9)
+        check_upward(points)
         np.testing.assert_allclose(points["depth"], 0.005, atol=1e-9)
         spread = np.ptp(points["point"][:, :2], axis=0)
         np.testing.assert_allclose(spread, 1 - np.abs(shift), atol=1e-5)
@@ -93,24 +82,26 @@ def test_edges_across_edges_push_along_their_cross_product(device):
     bar = box(4, 0.5, 0.5)
     first = (0, 0, 0, *about((1, 0, 0), np.pi / 4))
     half = np.sqrt(0.125)
-    over = matrices_of([about((0, 0, 1), np.pi / 2)])[0] @ matrices_of([about((1, 0, 0), np.pi / 4)])[0]
+    over = quaternion_matrix(about((0, 0, 1), np.pi / 2)) @ quaternion_matrix(about((1, 0, 0), np.pi / 4))
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = over, [0, 0, 2 * half - 0.02]
     start = np.eye(4)
-    start[:3, :3] = matrices_of([first[3:]])[0]
+    start[:3, :3] = quaternion_matrix(first[3:])
     _, result = ask(device, (bar, start), (bar, pose))
     points = result.points
-    np.testing.assert_allclose(points["normal"], np.tile([0, 0, 1.0], (len(points["pair"]), 1)), atol=1e-9)
+    check_upward(points)
     assert points["depth"].max() == pytest.approx(0.02, abs=1e-9)
     assert np.abs(points["point"][:, :2]).max() < 0.05
 
 
 def test_a_corner_is_pushed_by_floor_and_walls_each_its_own_way(device):
     corner = trimesh.util.concatenate(
-        [trimesh.creation.box((4, 4, 1)).apply_translation(t) for t in ((0, 0, -0.5),)]
-        + [trimesh.creation.box((1, 4, 4)).apply_translation((-2.5, 0, 2))]
+        [
+            trimesh.creation.box((4, 4, 1)).apply_translation((0, 0, -0.5)),
+            trimesh.creation.box((1, 4, 4)).apply_translation((-2.5, 0, 2)),
+        ]
     )
-    _, result = ask(device, (model_of(corner), (0, 0, 0, 0, 0, 0, 1)), (box(1, 1, 1), (-1.51, 0.1, 0.495, 0, 0, 0, 1)))
+    _, result = ask(device, (model_of(corner), STILL), (box(1, 1, 1), (-1.51, 0.1, 0.495, 0, 0, 0, 1)))
     normals = result.points["normal"]
     up, aside = np.abs(normals - [0, 0, 1]).max(1) < 1e-9, np.abs(normals - [1, 0, 0]).max(1) < 1e-9
     assert up.sum() >= 2 and aside.sum() >= 2
@@ -148,37 +139,36 @@ def test_separate_contacts_are_separate_loops(device):
     )
     tile = trimesh.creation.box((1.5, 1.5, 0.5))
     tiles = model_of(trimesh.util.concatenate([tile.copy().apply_translation((x, y, -0.25)) for x, y in legs]))
-    query, result = ask(device, (tiles, (0, 0, 0, 0, 0, 0, 1)), (table, (0, 0, -0.01, 0, 0, 0, 1)))
+    query, result = ask(device, (tiles, STILL), (table, (0, 0, -0.01, 0, 0, 0, 1)))
     assert len(set(query.curves.loop.numpy()[: result.count[0]].tolist())) == 4
     points = result.points
     assert len(points["pair"]) == 4, "legs are boxes: what lies between their outermost corners adds nothing"
     quadrants = {tuple(np.sign(p[:2]).astype(int)) for p in points["point"]}
     assert len(quadrants) == 4, "the points are spread over all legs"
-    np.testing.assert_allclose(points["normal"][:, 2], 1, atol=1e-9)
+    check_upward(points)
 
 
 def test_apart_inside_and_touching(device):
     cube, small, sheet = box(1, 1, 1), box(0.2, 0.2, 0.2), ([[-2, -2, 0], [2, -2, 0], [0, 3, 0.0]], [[0, 1, 2]])
-    still = (0, 0, 0, 0, 0, 0, 1)
-    _, inside = ask(device, (cube, still), (small, still), pairs=[(0, 1)])
+    _, inside = ask(device, (cube, STILL), (small, STILL), pairs=[(0, 1)])
     assert not inside.any[0] and len(inside.points["pair"]) == 0
-    _, touching = ask(device, (cube, still), (cube, (0, 0, 1, 0, 0, 0, 1)))
+    _, touching = ask(device, (cube, STILL), (cube, (0, 0, 1, 0, 0, 0, 1)))
     assert touching.any[0] and np.all(touching.points["depth"] == 0)
-    np.testing.assert_allclose(touching.points["normal"][:, 2], 1, atol=1e-9)
-    _, flat = ask(device, (ab.Model.from_arrays(*sheet), still), (small, (0, 0, 0.09, 0, 0, 0, 1)))
-    np.testing.assert_allclose(flat.points["normal"][:, 2], 1, atol=1e-9)
+    check_upward(touching.points)
+    _, flat = ask(device, (ab.Model.from_arrays(*sheet), STILL), (small, (0, 0, 0.09, 0, 0, 0, 1)))
+    check_upward(flat.points)
     np.testing.assert_allclose(flat.points["depth"], 0.01, atol=1e-9)
 
 
 def test_a_pair_named_the_other_way_turns_its_normals(device):
     cube = box(1, 1, 1)
-    placed = (cube, (0, 0, 0, 0, 0, 0, 1)), (cube, (0.3, 0.2, 0.9, *about((1, 2, 3), 0.4)))
+    placed = (cube, STILL), (cube, (0.3, 0.2, 0.9, *about((1, 2, 3), 0.4)))
     forth = ask(device, *placed, pairs=[(0, 1)])[1].points
     back = ask(device, *placed, pairs=[(1, 0)])[1].points
-    order = lambda rows: rows[np.lexsort(np.round(rows, 9).T)]  # noqa: E731
     assert len(forth["pair"]) == len(back["pair"])
     np.testing.assert_allclose(np.sort(forth["depth"]), np.sort(back["depth"]), atol=1e-12)
-    np.testing.assert_allclose(order(forth["normal"]), order(-back["normal"]), atol=1e-9)
+    turned = [rows[np.lexsort(np.round(rows, 9).T)] for rows in (forth["normal"], -back["normal"])]
+    np.testing.assert_allclose(*turned, atol=1e-9)
 
 
 def test_room_grows_and_changes_nothing(device):

@@ -1,13 +1,17 @@
-"""Whole results, byte for byte: every device gives what one core of the CPU gives, NaNs of no contacts too."""
+"""Whole results, byte for byte: every device, and any number of threads, gives what one thread of the CPU gives."""
 
 import numpy as np
 import pytest
+import warp as wp
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.kernels.traversal.simd import take_slots
+from warp_abtree.query.cpu_threads import launch_on_cores
 
 MODELS = ("torus", "small ball", "box", "crumbs", "soup", "twins")
+COUNTERS = ("node_tests", "triangle_tests", "exact_tests")
 NAN_BITS = 0x7FF8000000000000
 
 
@@ -36,9 +40,9 @@ def fields(result):
 @pytest.mark.parametrize("output", ["any", "count", "faces", "contacts"])
 def test_results(device, output, real):
     options = {"output": output, "within": 0.05, "contact_dtype": real}
-    one_core = ab.ContactQuery if output == "contacts" else ab.Query
+    operator = ab.ContactQuery if output == "contacts" else ab.Query
     scene = make_scene("cpu")
-    query = one_core(scene, pairs=pairs(), within=0.05, **({} if output == "contacts" else {"output": output}))
+    query = operator(scene, pairs=pairs(), within=0.05, **({} if output == "contacts" else {"output": output}))
     if output == "contacts":
         query.contact_dtype = real
     with testing.regime(cpu_threads=1):
@@ -46,6 +50,57 @@ def test_results(device, output, real):
     found = make_scene(device).intersect(pairs(), **options)
     assert fields(found) == fields(expected)
     assert expected.any.any() and not expected.any.all()
+
+
+@pytest.mark.parametrize("output", ["any", "count", "faces"])
+@pytest.mark.slow
+def test_any_number_of_threads(output):
+    query = ab.Query(make_scene("cpu"), output, pairs=pairs(), within=0.05)
+
+    def ask(threads):
+        with testing.regime(cpu_threads=threads):
+            result = query.run()
+        result.check()
+        return [fields(result), *(getattr(result, name).tolist() for name in COUNTERS)]
+
+    expected = ask(1)
+    for threads in (2, 3, 5):
+        assert all(ask(threads) == expected for _ in range(8))
+
+
+def test_a_capture_records_all_threads():
+    query = ab.Query(make_scene("cpu"), "faces", pairs=pairs())
+    with testing.regime(cpu_threads=4):
+        expected = query.run().faces
+        with wp.ScopedCapture("cpu") as capture:
+            query.launch()
+    query.hits.total.fill_(-1)
+    query.hits.face.fill_(0)
+    wp.capture_launch(capture.graph)
+    np.testing.assert_array_equal(query.result().faces, expected)
+
+
+@wp.kernel
+def count_item_kernel(count: wp.int32, taken_inout: wp.array(dtype=wp.int32), seen_inout: wp.array(dtype=wp.int32)):
+    i = take_slots(taken_inout, 1)
+    while i < count:
+        seen_inout[i] = seen_inout[i] + 1
+        i = take_slots(taken_inout, 1)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 7])
+def test_threads_take_every_item_once(threads):
+    for count in (1, 15, 16, 17, 1000):
+        seen, taken = (wp.zeros(length, dtype=wp.int32, device="cpu") for length in (count, 1))
+        launch_on_cores(count_item_kernel, count, [count, taken, seen], wp.get_device("cpu"), threads)
+        assert (seen.numpy() == 1).all() and taken.numpy()[0] == count + min(threads, count)
+
+
+def test_a_failure_on_a_thread_is_raised():
+    seen, taken = (wp.zeros(length, dtype=wp.int32, device="cpu") for length in (100, 1))
+    with pytest.raises(Exception, match="seen_inout"):
+        launch_on_cores(count_item_kernel, 100, [100, taken, 3.5], wp.get_device("cpu"), 2)
+    assert not seen.numpy().any()
 
 
 def test_pairs_without_contacts(device):

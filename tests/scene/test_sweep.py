@@ -12,7 +12,7 @@ from helpers.gpu_query import GpuQuery
 from helpers.samples import SHAPES, STILL, random_poses, sample
 
 import warp_abtree as ab
-from warp_abtree.checks.device_lock import device_turn
+from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.scene import sweep as pose_sweep
 
 
@@ -109,7 +109,7 @@ def test_lists_that_overflow_lose_nothing(device, output, monkeypatch, small_chu
     found = ab.sweep(box, box, poses, output=output, device=device)
     np.testing.assert_array_equal(found, getattr(expected, output))
     (posed,) = pose_sweep._kept.values()
-    assert len(posed.chunks[7].chunk_query.query.hits.unsure) > 1
+    assert len(posed.chunks[7].chunk_query.query.hits.uncertain) > 1
 
 
 def test_no_poses(device):
@@ -251,10 +251,10 @@ def test_threads_take_turns_on_a_gpu_alone():
         entered = threading.Event()
 
         def work():
-            with device_turn(device):
+            with device_lock(device):
                 entered.set()
 
-        with device_turn(gpus[0]), device_turn(gpus[0]):  # within its own turn a thread may ask again
+        with device_lock(gpus[0]), device_lock(gpus[0]):  # within its own turn a thread may ask again
             thread = threading.Thread(target=work)
             thread.start()
             at_once = entered.wait(0.2)

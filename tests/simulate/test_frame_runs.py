@@ -6,20 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
+from helpers.bodies import ring_and_ball
 
 import warp_abtree as ab
 from warp_abtree.lod.controllers import PaperController, ToleranceController
-from warp_abtree.lod.selection import Camera
 from warp_abtree.lod.timing import STAGES, ReplayClock
+from warp_abtree.lod.view import Camera
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
 def models():
-    ring = trimesh.creation.torus(major_radius=0.5, minor_radius=0.15, major_sections=24, minor_sections=12)
-    return ab.Model.load(ring), ab.Model.load(trimesh.creation.icosphere(subdivisions=2, radius=0.4))
+    return ring_and_ball()
 
 
 WARMED_UP = """

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 import trimesh
-from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, NO_GRAVITY, TORUS, about, box, make, on_ground
+from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, NO_GRAVITY, TORUS, about, bits, box, make, on_ground, run
 
 import warp_abtree as ab
-from warp_abtree.kernels.dynamics import graph_coloring as colour
-from warp_abtree.simulate.body_state import quaternions_of
+from warp_abtree.kernels.dynamics import graph_coloring
 
 pytestmark = pytest.mark.slow
 
@@ -25,21 +24,10 @@ def heap(count=9, seed=0):
     ]
 
 
-class Coloured(ab.Dynamics):
-    """Relaxes colour by colour, as on a GPU, on any device."""
+class ByColor(ab.Dynamics):
+    """Relaxes one color after another on any device, as on a GPU."""
 
-    in_turn = False
-
-
-def bits(dynamics):
-    velocity, spin = dynamics.velocities()
-    return np.concatenate([dynamics.poses(), velocity, spin], axis=1)
-
-
-def run(dynamics, steps, dt=1 / 120):
-    for _ in range(steps):
-        dynamics.step(dt)
-    return bits(dynamics)
+    sequential = False
 
 
 OPTIONS = {"restitution": 0.3, "friction": 0.6}
@@ -47,7 +35,7 @@ OPTIONS = {"restitution": 0.3, "friction": 0.6}
 
 def test_a_heap_is_the_same_when_repeated_and_however_it_is_relaxed(device):
     found = []
-    for kind in (ab.Dynamics, ab.Dynamics, Coloured):
+    for kind in (ab.Dynamics, ab.Dynamics, ByColor):
         scene = ab.Scene(device)
         scene.add(GROUND, pose=FLOOR, static=True)
         for model, pose in heap():
@@ -58,13 +46,13 @@ def test_a_heap_is_the_same_when_repeated_and_however_it_is_relaxed(device):
     assert np.array_equal(found[0], found[1]) and np.array_equal(found[0], found[2])
 
 
-def test_more_touching_bodies_than_colours(device):
-    """A plate with 36 cubes on it: a body in more pairs than there are colours, the rest of which go in turn."""
+def test_a_body_in_more_contacts_than_colors(device):
+    """A plate with 36 cubes: the pairs beyond the number of colors are relaxed in turn."""
     cube = box(0.3, 0.3, 0.3)
     cubes = [(cube, (0.6 * x - 1.5, 0.6 * y - 1.5, 0.2495 + 0.1, 0, 0, 0, 1)) for x in range(6) for y in range(6)]
     plate = box(4, 4, 0.2)
     found = []
-    for kind in (ab.Dynamics, Coloured):
+    for kind in (ab.Dynamics, ByColor):
         scene = ab.Scene(device)
         scene.add(GROUND, pose=FLOOR, static=True)
         scene.add(plate, pose=(0, 0, 0.0995, 0, 0, 0, 1))
@@ -72,10 +60,10 @@ def test_more_touching_bodies_than_colours(device):
             scene.add(model, pose=pose)
         dynamics = kind(scene, sleep_speed=0)
         run(dynamics, 10)
-        used = dynamics._colour.numpy()
-        assert (used == int(colour.COLOURS)).sum() == 36 + 1 - int(colour.COLOURS)
+        used = dynamics._pair_color.numpy()
+        assert (used == int(graph_coloring.COLOR_COUNT)).sum() == 36 + 1 - int(graph_coloring.COLOR_COUNT)
         pairs = dynamics.query.pairs.numpy()
-        for c in range(int(colour.COLOURS)):
+        for c in range(int(graph_coloring.COLOR_COUNT)):
             movers = pairs[used == c].ravel()
             movers = movers[movers > 0]
             assert len(set(movers.tolist())) == len(movers)
@@ -143,7 +131,7 @@ def test_a_frame_steps_and_reports(device):
         assert result.pairs.tolist() == stepped.query.result().pairs.tolist()
         assert frame.history[-1].hits == result.count.sum()
     assert np.array_equal(bits(stepped), bits(framed))
-    assert max(row.touching for row in frame.history) > 4
+    assert max(row.intersecting for row in frame.history) > 4
 
 
 def test_a_frame_drives_kinematic_objects(device):
@@ -171,16 +159,6 @@ def test_poses_that_a_user_sets(device):
     np.testing.assert_allclose(dynamics.poses()[1, :2], [1, 2], atol=1e-12)
 
 
-def test_quaternions_of_all_rotations():
-    rng = np.random.default_rng(0)
-    q = rng.normal(size=(200, 4))
-    q = np.concatenate([q, np.eye(4), [[1, 1, 0, 0], [0, 1, 1, 1e-12], [1e-9, 1, 0, 1]]])
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    from warp_abtree.simulate.body_state import matrices_of
-
-    np.testing.assert_allclose(matrices_of(quaternions_of(matrices_of(q))), matrices_of(q), atol=1e-14)
-
-
 @pytest.mark.parametrize(
     "options, message",
     [
@@ -194,7 +172,7 @@ def test_quaternions_of_all_rotations():
         ({"kinematic": [5]}, "kinematic"),
         ({"kinematic": [True]}, "kinematic"),
         ({"velocity": (np.nan, 0, 0)}, "velocity: a number is not finite"),
-        ({"spin": (1, 2)}, "spin: shape"),
+        ({"angular_velocity": (1, 2)}, "angular_velocity: shape"),
         ({"iterations": 0}, "iterations"),
         ({"slop": -1}, "slop"),
         ({"sleep_time": 0}, "sleep_time"),
@@ -237,7 +215,7 @@ def test_one_body_alone_and_none_at_all(device):
 def test_an_off_centre_mesh_turns_about_its_centre_of_mass(device):
     mesh = trimesh.creation.box((1, 0.5, 0.2)).apply_translation((5, 1, -2))
     model = ab.Model.from_arrays(mesh.vertices, mesh.faces, base_faces=4)
-    dynamics = make(device, (model, (-5, -1, 2, 0, 0, 0, 1)), spin=(0, 0, np.pi), **NO_GRAVITY)
+    dynamics = make(device, (model, (-5, -1, 2, 0, 0, 0, 1)), angular_velocity=(0, 0, np.pi), **NO_GRAVITY)
     run(dynamics, 50, 0.01)
     r = about((0, 0, 1), np.pi / 2)
     pose = dynamics.poses()[0]

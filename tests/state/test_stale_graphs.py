@@ -6,7 +6,7 @@ import weakref
 import numpy as np
 import pytest
 import warp as wp
-from helpers.samples import random_poses, sample
+from helpers.samples import STILL, random_poses, sample
 
 import warp_abtree as ab
 
@@ -33,13 +33,13 @@ def make_scene(device, count=4):
     return scene
 
 
-def capture(device, operator):
+def capture(device, operator, *arguments):
     with wp.ScopedCapture(device) as captured:
-        operator.launch()
+        operator.launch(*arguments)
     return captured.graph
 
 
-def rungs(count):
+def levels(count):
     """Return LODs that differ from one another."""
     return sample("torus").lod_max - 7 * np.arange(count)
 
@@ -58,16 +58,36 @@ def test_the_first_launch_is_captured(device, operator, pairs):
     np.testing.assert_array_equal(result.count[order], expected.count)
 
 
+CHANGES = {
+    "more tree states": lambda scene: scene.set_lods(levels(4)),
+    "another object": lambda scene: (scene.add(sample("torus")), scene.intersect([(0, 4)])),
+    "filtered pairs": lambda scene: scene.filter(PAIRS[:1]),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("pairs", [PAIRS, None], ids=["given", "found"])
-def test_a_pool_that_grows(device, operator, pairs):
-    """More LODs than before take more tree states: a replay is refused, a launch and a new capture are not."""
+def test_a_replay_after_arrays_were_replaced_is_refused(device, operator, pairs, change):
+    """A launch and a new capture are not, where the query still fits the scene; filters concern found pairs alone."""
     scene = make_scene(device)
     query = operator(scene, pairs=pairs, capacity=20_000)
     graph = capture(device, query)
-    scene.set_lods(rungs(4))
+    CHANGES[change](scene)
+    if change == "filtered pairs" and pairs is not None:
+        for launch in (lambda: wp.capture_launch(graph), query.launch):
+            launch()
+            assert query.result().count[0] > 0
+        return
     wp.capture_launch(graph)
     with pytest.raises(RuntimeError, match=STALE):
         query.result()
+    if change != "more tree states":
+        with pytest.raises(RuntimeError, match="filtered" if change == "filtered pairs" else "new one"):
+            query.launch()
+        fresh = operator(scene, pairs=pairs, capacity=20_000)
+        fresh.launch()
+        assert ([0, 1] in fresh.result().pairs.tolist()) == (change != "filtered pairs")
+        return
     expected = scene.intersect(pairs, output="count").count.sum()
     query.launch()
     assert query.result().count.sum() == expected > 100
@@ -81,10 +101,10 @@ def test_a_pool_that_grows(device, operator, pairs):
 def test_lods_in_the_room_there_is(device, operator):
     """A graph goes on through changes of LODs that take no more states than there were."""
     scene = make_scene(device)
-    scene.set_lods(rungs(4))
+    scene.set_lods(levels(4))
     query = operator(scene, pairs=PAIRS, capacity=20_000)
     graph = capture(device, query)
-    for lods in (rungs(4) - 3, np.zeros(4, int), rungs(4)[::-1], np.full(4, 40), rungs(4) - 9):
+    for lods in (levels(4) - 3, np.zeros(4, int), levels(4)[::-1], np.full(4, 40), levels(4) - 9):
         scene.set_lods(lods)
         wp.capture_launch(graph)
         result = query.result()
@@ -119,31 +139,6 @@ def test_many_changes_of_lods(device):
     assert 1 <= refused <= 4
 
 
-@pytest.mark.parametrize("pairs", [PAIRS, None], ids=["given", "found"])
-def test_an_object_is_added(device, operator, pairs):
-    scene = make_scene(device)
-    query = operator(scene, pairs=pairs, capacity=20_000)
-    graph = capture(device, query)
-    scene.add(sample("torus"))
-    scene.intersect([(0, 4)])
-    wp.capture_launch(graph)
-    with pytest.raises(RuntimeError, match=STALE):
-        query.result()
-
-
-def test_pairs_are_filtered_out(device, operator):
-    """That concerns graphs that run the broad phase, and no others."""
-    scene = make_scene(device)
-    found, given = operator(scene, capacity=20_000), operator(scene, pairs=PAIRS, capacity=20_000)
-    graphs = [capture(device, query) for query in (found, given)]
-    scene.filter(PAIRS[:1])
-    for graph in graphs:
-        wp.capture_launch(graph)
-    with pytest.raises(RuntimeError, match=STALE):
-        found.result()
-    assert given.result().count[0] > 0
-
-
 def test_buffers_that_grow(device, operator):
     """The replay writes into memory that is still the graph's own, and its results are refused."""
     scene = make_scene(device)
@@ -175,7 +170,7 @@ def test_a_graph_keeps_its_arrays(device, kind):
     alive = [weakref.ref(array) for array in kept]
     query.run()
     known, ids = objects.state, objects.state.numpy().tolist()
-    scene.set_lods(rungs(4))
+    scene.set_lods(levels(4))
     assert known.numpy().tolist() == ids, "the states of the pool that the graph knows, and no others"
     del known
     scene.add(sample("box"))
@@ -230,7 +225,7 @@ def test_poses_of_a_graph(device):
     graph = capture(device, poses)
     wp.capture_launch(graph)
     poses.check()
-    scene.set_lods(rungs(4))  # which replaces nothing that poses lie in
+    scene.set_lods(levels(4))  # which replaces nothing that poses lie in
     wp.capture_launch(graph)
     poses.check()
     scene.add(sample("torus"))
@@ -245,7 +240,7 @@ def test_bodies_of_a_graph(device):
     scene.set_poses(np.array([(3.0 * k, 0, 0, 0, 0, 0, 1) for k in range(3)]))
     bodies = ab.Dynamics(scene, gravity=(0, 0, 0), capacity=ab.Buffers(8, pairs=1))
     bodies.step(1e-4)
-    graph = capture_step(device, bodies)
+    graph = capture(device, bodies, 1e-4)
     wp.capture_launch(graph)
     bodies.check()
     scene.set_poses(np.array([(0.2 * k, 0, 0, 0, 0, 0, 1) for k in range(3)]))
@@ -255,14 +250,8 @@ def test_bodies_of_a_graph(device):
         bodies.check()
 
 
-def capture_step(device, bodies):
-    with wp.ScopedCapture(device) as captured:
-        bodies.launch(1e-4)
-    return captured.graph
-
-
 CALLS = {
-    "set_poses": lambda scene, query, frame: scene.set_poses(np.tile([0, 0, 0, 0, 0, 0, 1.0], (4, 1))),
+    "set_poses": lambda scene, query, frame: scene.set_poses(np.tile(STILL, (4, 1))),
     "set_lods": lambda scene, query, frame: scene.set_lods([3] * 4),
     "add": lambda scene, query, frame: scene.add(sample("torus")),
     "broad_phase": lambda scene, query, frame: scene.broad_phase(),
@@ -272,9 +261,7 @@ CALLS = {
     "ContactQuery": lambda scene, query, frame: ab.ContactQuery(scene, capacity=1000),
     "FrameGraph": lambda scene, query, frame: ab.FrameGraph(scene),
     "PoseInput": lambda scene, query, frame: ab.PoseInput(scene),
-    "sweep": lambda scene, query, frame: ab.sweep(
-        sample("torus"), sample("torus"), [(0, 0, 0, 0, 0, 0, 1)], device=scene.device
-    ),
+    "sweep": lambda scene, query, frame: ab.sweep(scene.models[0], scene.models[0], [STILL], device=scene.device),
     "run": lambda scene, query, frame: query.run(),
     "result": lambda scene, query, frame: query.result(),
     "set_pairs": lambda scene, query, frame: query.set_pairs(PAIRS[:1]),

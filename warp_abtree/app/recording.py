@@ -4,7 +4,6 @@ A recording holds the scene file's text, so that it runs without it; meshes that
 and be the same. Run again, a controller hears the times of the recording, and every row must come out bit for bit.
 """
 
-import hashlib
 import json
 import zipfile
 from dataclasses import asdict, dataclass, fields
@@ -134,7 +133,7 @@ class Recording:
         objects = self.settings["objects"]
         loaded = load_scene(self.settings["path"], device, progress, objects, self.text)
         for (name, model), known in zip(loaded.models.items(), self.models):
-            if digest(model) != known:
+            if model.digest != known:
                 raise ValueError(f"{path}: the mesh of models.{name} is not the one of the recording")
         if (len(loaded.models), loaded.scene.object_count) != (len(self.models), self.lods.shape[1]):
             raise ValueError(f"{path}: a damaged recording (the scene has other objects)")
@@ -154,15 +153,6 @@ class Recording:
 
 def _is_real(name):
     return name == "time" or name.endswith("_ms") or name.startswith("error_")
-
-
-def digest(model) -> str:
-    """Return what tells a model's mesh from others."""
-    found = hashlib.sha256()
-    for array in model.mesh_at(model.lod_max):
-        found.update(np.ascontiguousarray(array).tobytes())
-    found.update(str((model.face_count, model.lod_max)).encode())
-    return found.hexdigest()
 
 
 def record_run(loaded: SceneFile, frames: int, replay=None, keep=True, progress=None, **options):
@@ -201,5 +191,5 @@ def record_run(loaded: SceneFile, frames: int, replay=None, keep=True, progress=
         "budget_ms": None if control.controller in ("none", "tolerance") else control.budget_ms,
         "device": str(scene.device),
     }
-    models = [digest(model) for model in loaded.models.values()] if keep else []
+    models = [model.digest for model in loaded.models.values()] if keep else []
     return frame, Recording(loaded.text, settings, models, list(frame.history), lods, poses)

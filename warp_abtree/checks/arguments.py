@@ -124,3 +124,41 @@ def whole_number(value, what: str, low: int, high: int) -> int:
     if not low <= value <= high:
         raise ValueError(f"{what} {value} is outside {low} .. {high}")
     return int(value)
+
+
+def finite_array(values, what: str, shape: tuple) -> np.ndarray:
+    """Return finite numbers of a shape as float64.
+
+    Raises:
+        ValueError: Another shape, or a number that is not finite.
+    """
+    array = to_numpy(values, what).astype(np.float64)
+    if array.shape != shape or not np.isfinite(array).all():
+        wanted = "a finite number" if shape == () else f"{' by '.join(map(str, shape))} finite numbers"
+        raise ValueError(f"{what}: {values!r} is not {wanted}")
+    return array
+
+
+def positive(value, what: str) -> float:
+    """Return a finite number above 0 as float.
+
+    Raises:
+        ValueError: It is none.
+    """
+    number = float(finite_array(value, what, ()))
+    if not number > 0:
+        raise ValueError(f"{what} {value!r} is not above 0")
+    return number
+
+
+def broadcast_rows(values, what: str, shape: tuple) -> np.ndarray:
+    """Return a copy of numbers as float64, broadcast to a shape: one row, or number, serves all objects.
+
+    Raises:
+        ValueError: It does not broadcast.
+    """
+    values = np.asarray(values, np.float64)
+    try:
+        return np.broadcast_to(values, shape).copy()
+    except ValueError:
+        raise ValueError(f"{what}: shape {values.shape} does not stretch to {shape}") from None

@@ -1,117 +1,27 @@
-"""Poses from any array framework without copies; scenes from and to trimesh, glTF and USD."""
+"""Scenes from and to trimesh, glTF and USD."""
 
 from pathlib import Path
 
 import numpy as np
 import trimesh
-import warp as wp
 
-from warp_abtree.checks.arguments import check_device, wrap_array
-from warp_abtree.kernels import pipeline as kernels
-from warp_abtree.model.mesh import MeshError, load_mesh, triangulate
+from warp_abtree.checks.arguments import first_line
+from warp_abtree.model.mesh import MeshError, load_mesh
 from warp_abtree.model.model import Model
-from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
+from warp_abtree.model.obj import triangulate
+from warp_abtree.scene.poses import RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
-from warp_abtree.state.device_update import NO_FAULTS
-from warp_abtree.state.generation import STALE_GRAPH, LaunchGuard
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-# Two stretches that differ by this part are one.
+# Stretches within this relative difference share a model.
 STRETCH_TOLERANCE = 1e-9
-
-# Poses.
-
-
-class PoseInput:
-    """Poses of a scene's objects from device memory, as an operator: nothing passes through the host.
-
-    For `Query` and `ContactQuery` what `FrameGraph.poses` is for a frame. `launch()` only launches, so that a CUDA
-    graph can capture it.
-
-    Args:
-        scene: `Scene` with all its objects.
-
-    Attributes:
-        poses: x y z qx qy qz qw [world units, unit quaternion], device float64 (n, 7); those of the scene at first.
-            `wp.to_torch(poses)` and the like give views to write to.
-    """
-
-    def __init__(self, scene):
-        check_device(scene.device, "making a PoseInput")
-        self.scene = scene
-        self.device = scene.device
-        self._batch = scene.batch()
-        self._guard = LaunchGuard(self.device, self._batch.objects.generation)
-        count = scene.object_count
-        self.poses = wp.empty((count, 7), dtype=wp.float64, device=self.device)
-        self._faults = wp.array(NO_FAULTS, dtype=wp.int32, device=self.device)
-        wp.launch(kernels.read_pose_kernel, count, [self._batch.objects.pool, self.poses], device=self.device)
-
-    def launch(self, poses=None):
-        """Place every object. Launches only.
-
-        Args:
-            poses: (n, 7) array of any framework on the scene's device, float64 (read where it lies) or float32 (copied
-                to `poses` on the device); None reads what stands in `poses`. A graph keeps the address that it was
-                captured with: capture `launch()`, and write to `poses`.
-
-        Raises:
-            ValueError: Another shape, type or device; nothing is changed.
-            RuntimeError: Objects were added to the scene since this was made.
-        """
-        self._batch.check("pose input")
-        check_device(self.device)
-        with self._guard.launching(self):
-            self._launch(poses)
-
-    def _launch(self, poses):
-        rows = self.poses if poses is None else self._check(wrap_array(poses, "poses"))
-        if rows.dtype == wp.float32:
-            wp.utils.array_cast(rows, self.poses)
-            rows = self.poses
-        inputs = [QUATERNION_TOLERANCE, rows, self._batch.objects.pool, self._faults, self._guard.record()]
-        wp.launch(kernels.place_object_kernel, len(self.poses), inputs, device=self.device)
-
-    def _check(self, rows):
-        if rows.shape != self.poses.shape or rows.dtype not in (wp.float32, wp.float64):
-            kind = getattr(rows.dtype, "__name__", rows.dtype)
-            raise ValueError(
-                f"poses: shape {tuple(rows.shape)} of {kind}, not {tuple(self.poses.shape)} of float32 or float64"
-            )
-        if rows.device != self.device:
-            raise ValueError(f"poses: on {rows.device}, the scene is on {self.device}; Scene.set_poses copies them")
-        return rows
-
-    def check(self):
-        """Raise what was wrong with poses since the last call. Waits for the device.
-
-        Raises:
-            ValueError: A pose was not finite, or a quaternion off unit length by more than 1e-3; its object kept the
-                pose before.
-            RuntimeError: Poses were set by a graph captured before objects were added to the scene; they are lost.
-        """
-        check_device(self.device, "PoseInput.check")
-        stale = self._guard.launched.numpy()[1]
-        if stale:
-            self._guard.clear_stale()
-            raise RuntimeError(f"poses since the last check are lost: the graph {STALE_GRAPH}")
-        count, first = self._faults.numpy().tolist()
-        self._faults.assign(np.array(NO_FAULTS, np.int32))
-        if count:
-            raise ValueError(
-                f"poses: {count} rows since the last check were not finite or not of unit quaternions; the first "
-                f"object that had one is {first}, and kept its pose"
-            )
-
-
-# Scenes in.
 
 
 def scene_from_trimesh(source, device=None, base_faces=10, progress=None):
     """Make a scene of a trimesh.Scene: every node that holds a mesh becomes an object.
 
-    Nodes of one geometry share a model. A transform that is not rigid is split: its stretch goes into the model, and
-    nodes of one stretch share that. Points and paths are left out.
+    Nodes of one geometry share a model. Of a transform that is not rigid, the stretch goes into the model, which nodes
+    of equal stretch share. Points and paths are ignored.
 
     Args:
         source: trimesh.Scene.
@@ -147,7 +57,7 @@ def scene_from_trimesh(source, device=None, base_faces=10, progress=None):
             match = stretch, model
             known.append(match)
         if match[0] is not stretch and not (match[0] == np.eye(3)).all():
-            # What the model's stretch differs by goes back into the pose.
+            # The pose takes up the small difference of the two stretches.
             pose = pose.copy()
             pose[:3, :3] = pose[:3, :3] @ stretch @ np.linalg.inv(match[0])
         scene.add(match[1], pose)
@@ -156,7 +66,7 @@ def scene_from_trimesh(source, device=None, base_faces=10, progress=None):
 
 
 def _split_transform(transform, node):
-    """Return a rigid matrix and a symmetric stretch (3, 3) whose product is an affine transform; mirrors stretch."""
+    """Split an affine transform into a rigid matrix and a symmetric stretch (3, 3), which has the mirror if any."""
     linear = transform[:3, :3]
     if not np.isfinite(transform).all() or np.abs(transform[3] - [0, 0, 0, 1]).max() > 0:
         raise MeshError(f"node {node!r}: its transform is not finite and affine")
@@ -175,7 +85,7 @@ def _stretched(mesh, stretch):
     if (stretch == np.eye(3)).all():
         return mesh
     faces = np.asarray(mesh.faces)
-    # A mirrored surface keeps its outside.
+    # Reversed faces keep the outside of a mirrored surface.
     faces = faces if np.linalg.det(stretch) > 0 else faces[:, ::-1]
     return trimesh.Trimesh(np.asarray(mesh.vertices) @ stretch.T, faces, process=False)
 
@@ -184,8 +94,8 @@ def scene_from_file(path, device=None, base_faces=10, progress=None):
     """Make a scene of a file: every node that holds a mesh becomes an object, equal meshes share a model.
 
     Args:
-        path: GLB or glTF, or whatever else trimesh reads; USD (extra `usd`), at the stage's first time, in the file's
-            units and axes. Of USD, prims of type Mesh count, instances and those of point instancers included.
+        path: GLB, glTF or another format of trimesh; USD (extra `usd`), at the stage's first time, in the file's units
+            and axes. Objects of USD are the prims of type Mesh, including instances and those of point instancers.
         device, base_faces, progress: As for `scene_from_trimesh`.
 
     Returns:
@@ -202,7 +112,7 @@ def scene_from_file(path, device=None, base_faces=10, progress=None):
     except MeshError:
         raise
     except Exception as error:  # trimesh's readers raise whatever goes wrong inside them
-        raise MeshError(f"{path}: cannot be read: {str(error).splitlines()[0] if str(error) else error!r}") from None
+        raise MeshError(f"{path}: cannot be read: {first_line(error)}") from None
     try:
         return scene_from_trimesh(source, device, base_faces, progress)
     except MeshError as error:
@@ -272,21 +182,17 @@ def _usd_mesh(mesh, time, where):
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-# Scenes out.
-
-
 def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 40), colour=(176, 176, 176)):
-    """Return a scene as a trimesh.Scene, meshes at their LODs where they stand. Waits for the device.
+    """Return a scene as a trimesh.Scene, with the meshes at their LODs and poses. Waits for the device.
 
-    `to_trimesh(scene, result).export("hits.glb")` writes what a viewer of glTF shows.
+    `to_trimesh(scene, result).export("hits.glb")` writes a file for viewers of glTF.
 
     Args:
         scene: `Scene`.
-        result: `Result` of the scene as it stands: with faces, those that meet are coloured, else whole objects that
-            do.
-        names: Node of each object, n different strings; by default "object 0" and on.
-        world: Leave out objects that are neither in this world nor in every one.
-        hit_colour, colour: Red, green, blue, 0 to 255, of what meets and of the rest.
+        result: `Result` of the scene at its poses: intersecting faces are coloured, or whole objects if it has none.
+        names: Node name of each object, n different strings; by default "object 0" and so on.
+        world: Include only objects of this world and those in every world.
+        hit_colour, colour: Red, green, blue, 0 to 255, of intersecting faces or objects and of the rest.
 
     Raises:
         ValueError: names are not n different strings, or the result names objects that the scene does not have.
@@ -297,7 +203,7 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
         raise ValueError(f"names: not {count} different strings")
     if result is not None and len(result.pairs) and int(result.pairs.max()) >= count:
         raise ValueError(f"result: asks object {int(result.pairs.max())}, the scene has {count}")
-    hit = _faces_hit(scene, result)
+    hit = _intersecting_faces(scene, result)
     objects = scene.batch().objects.pool
     worlds = objects.world.numpy()
     poses = np.tile(np.eye(4), (count, 1, 1))
@@ -310,7 +216,7 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
         vertices, faces, face_ids = model.mesh_at(lod)
         if i in hit:
             red = np.isin(face_ids, hit[i]) if hit[i] is not None else np.ones(len(faces), bool)
-            # Colours of glTF belong to corners: faces of two colours share none.
+            # glTF has colours per vertex: faces of two colours must not share any.
             vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
             colours = np.repeat(np.where(red[:, None], hit_colour, colour), 3, axis=0)
             geometry = f"{names[i]} hit"
@@ -326,8 +232,8 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
     return made
 
 
-def _faces_hit(scene, result):
-    """Return the faces of each object that meet others, None for all of them; objects that meet none are missing."""
+def _intersecting_faces(scene, result):
+    """Return the intersecting faces of each intersecting object, None for all of its faces."""
     if result is None:
         return {}
     if result.faces is None:

@@ -1,27 +1,17 @@
-"""Work for several machines: `RayPool` does the shards of a job on Ray, `WorldsJob` runs a scene's worlds as shards.
-
-`warp-abtree sweep` does both from the command line.
-"""
+"""Jobs on Ray: one actor per GPU or CPU core of a cluster."""
 
 import contextlib
-import copy
-import dataclasses
-import hashlib
 import os
 import signal
 import threading
 from collections import deque
 
-import numpy as np
-
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.regime import change_regime
-from warp_abtree.jobs.shards import hash_model
-from warp_abtree.scene.scene import Scene
 
-# Shards that a worker has at a time, so that it never waits for the next.
+# Shards sent to a worker at a time: one running, one queued.
 AHEAD = 2
-# Times that a shard, or the start of a worker, may fail with its worker before the run gives up.
+# A run is given up when one shard, or the start of a worker, has ended so many workers.
 ATTEMPTS = 3
 
 
@@ -35,7 +25,7 @@ def _import_ray():
 
 @contextlib.contextmanager
 def _sigterm_kept():
-    """Give a program that handles SIGTERM its handler back; Ray puts another in its place."""
+    """Restore the program's handler of SIGTERM, which Ray replaces."""
     before = signal.getsignal(signal.SIGTERM)
     try:
         yield
@@ -44,37 +34,38 @@ def _sigterm_kept():
             signal.signal(signal.SIGTERM, before)
 
 
-class _Worker:
-    """What an actor holds: the asker of a job, which came once, through the object store."""
+class _Actor:
+    """Ray actor: holds the task runner of a job, which came once, through the object store."""
 
-    def __init__(self, asker, device):
-        change_regime(cpu_threads=1 if device == "cpu" else None)  # an actor a core
-        self.asker, self.device = asker, device
+    def __init__(self, runner, device):
+        change_regime(cpu_threads=1 if device == "cpu" else None)  # one actor per core
+        self.runner, self.device = runner, device
 
     def ready(self):
         return os.getpid()
 
-    def ask(self, item):
-        return self.asker.ask(item, self.device)
+    def run(self, task):
+        return self.runner.run(task, self.device)
 
 
 class RayPool:
-    """Does the shards of a job on Ray, an actor a GPU, or a CPU core where there is none.
+    """Pool of workers on Ray: one actor per GPU, or per CPU core if there is none.
 
-    What a job is about goes through the object store once. A worker that ends is replaced, and its shards are done
-    again; answers are written by whoever asks, so that no machine needs to share a disk.
+    Models are sent through the object store once. A worker that ends is replaced, and its shards are computed again.
+    The calling process writes all shards, so machines need no shared disk.
 
     Args:
-        address: Of a running cluster, as for `ray.init`; None starts Ray here, for as long as the pool is open.
-        workers: How many; None is as many as there are GPUs, or CPU cores.
+        address: Address of a running cluster, as for `ray.init`; None starts Ray on this machine while the pool is
+            open.
+        workers: Number of workers; None is one per GPU, or per CPU core.
 
     Attributes:
-        workers: How many.
-        pids: Process of each worker that runs.
+        workers: Number of workers.
+        pids: Process id of each running worker.
         lost: Workers that ended before their work, in the last job.
 
     Raises:
-        ValueError: Ray is not installed, or does not start or answer; workers is no whole number from 1.
+        ValueError: Ray is not installed, does not start or does not answer; workers is not a whole number from 1.
     """
 
     def __init__(self, address=None, workers=None):
@@ -113,209 +104,101 @@ class RayPool:
             self._own = False
             self.ray.shutdown()
 
-    def _start(self, asker):
-        share = {"num_gpus": 1, "num_cpus": 0} if self.on_gpus else {"num_cpus": 1}
-        actor = self.ray.remote(_Worker).options(**share).remote(asker, "cuda:0" if self.on_gpus else "cpu")
-        return actor, actor.ready.remote()
-
-    def ask(self, job, ranges):
-        """Yield (start, stop, columns) of each range, once, in the order in which they are done.
+    def run(self, job, ranges):
+        """Yield (start, stop, columns) of each range, once, in order of completion.
 
         Raises:
-            RuntimeError: A shard lost its worker three times, or workers do not start.
+            RuntimeError: A shard ended its worker three times, or workers do not start.
         """
-        ray = self.ray
         self.lost = 0
-        asker = ray.put(job.asker())
-        waiting, under_way = deque(ranges), {}  # reference: (actor, range), range None while it starts
-        failed: dict = {}
-        actors: list = []
-
-        def start():
-            actor, ready = self._start(asker)
-            actors.append(actor)
-            under_way[ready] = actor, None
-
-        def feed(actor):
-            if waiting:
-                part = waiting.popleft()
-                under_way[actor.ask.remote(job.item(*part))] = actor, part
-
-        def lose(actor, cause):
-            """Take back what an actor was doing, and start another."""
-            self.lost += 1
-            self.pids.pop(actor, None)
-            with contextlib.suppress(Exception):
-                ray.kill(actor)  # of a machine that went, it may be alive
-            actors.remove(actor)
-            mine = [ref for ref, (owner, _) in under_way.items() if owner is actor]
-            # Only the shard at work can have ended it; those behind had not begun. A start counts for itself.
-            for turn, ref in enumerate(mine):
-                part = under_way.pop(ref)[1]
-                if turn == 0:
-                    failed[part] = failed.get(part, 0) + 1
-                    if failed[part] == ATTEMPTS:
-                        what = "workers do not start" if part is None else f"shard {part} ended its worker"
-                        raise RuntimeError(f"{what}, {ATTEMPTS} times: {cause}")
-                if part is not None:
-                    waiting.appendleft(part)
-            start()
-
+        running = _Run(self, job, ranges)
         try:
-            for _ in range(min(self.workers, len(waiting))):
-                start()
-            while waiting or any(part is not None for _, part in under_way.values()):
-                done, _ = ray.wait(list(under_way), num_returns=1)
-                actor, part = under_way[done[0]]
-                try:
-                    answer = ray.get(done[0])
-                except ray.exceptions.RayTaskError as error:
-                    raise error.cause from None
-                except (ray.exceptions.RayActorError, ray.exceptions.ObjectLostError) as error:
-                    lose(actor, " ".join(str(error).split())[:300])
-                    continue
-                del under_way[done[0]]
-                if part is None:
-                    self.pids[actor] = answer
-                    failed.pop(None, None)
-                    for _ in range(AHEAD):
-                        feed(actor)
-                    continue
-                feed(actor)
-                del done
-                yield *part, answer
+            yield from running.results()
         finally:
             self.pids.clear()
-            for actor in actors:
-                with contextlib.suppress(Exception):
-                    ray.kill(actor)
+            running.kill_actors()
 
 
-# Worlds of a scene.
+class _Run:
+    """State of one job on a `RayPool`: the actors, and which shards each has been sent.
 
-
-class WorldsJob:
-    """A scene file's worlds, run frame by frame, as a job for `run_shards`: worlds are dealt to shards.
-
-    The models are built here, once. Objects of world -1 are in every shard, so none of them may be a rigid body; two of
-    them are asked in none.
-
-    Args:
-        scene: `SceneFile`.
-        frames: Frames to run; None is the file's own number.
-        output: "count": a row a world and frame, with the candidate pairs, those that intersect, and the intersecting
-            face pairs. "poses": a row an object and frame, with its pose.
-        shard: Worlds a shard.
-
-    Raises:
-        ValueError: A scene without worlds, or whose LODs a controller chooses by the clock; a rigid body in world -1;
-            an unknown output, or frames or worlds a shard that are no whole number from 1.
+    Attributes:
+        left: Ranges not sent yet.
+        running: (actor, range) by Ray reference; the range is None while the actor starts.
+        failures: How often each range has ended its actor; of None, how often an actor has failed to start.
     """
 
-    unit = "world"
+    def __init__(self, pool, job, ranges):
+        self.pool, self.ray, self.job = pool, pool.ray, job
+        self.runner = self.ray.put(job.runner())
+        self.left, self.running = deque(ranges), {}
+        self.failures: dict = {}
+        self.actors: list = []
 
-    def __init__(self, scene, frames=None, output="count", shard=64):
-        if output not in ("count", "poses"):
-            raise ValueError(f"output {output!r} of worlds is none of 'count', 'poses'")
-        if scene.control.controller != "none":
-            raise ValueError(f"{scene.path}: [lod] goes by the clock of one device; worlds in shards need fixed LODs")
-        self.frames = whole_number(scene.frames if frames is None else frames, "frames", 1, 2**31 - 1)
-        self.output, self.shard = output, whole_number(shard, "shard", 1, 2**31 - 1)
-        self.worlds = np.unique(scene.worlds[scene.worlds >= 0])
-        self.count = len(self.worlds)
-        if not self.count:
-            raise ValueError(f"{scene.path}: no object is in a world of its own")
-        objects = scene.scene
-        self._parts = {
-            "models": objects.models,
-            "object_model": np.array(objects.object_model),
-            "static": np.array(objects._static, bool),
-            "importance": np.array(objects.object_importance),
-        }
-        free = (scene.worlds < 0) & ~self._parts["static"] & ~scene.kinematic
-        if scene.dynamics is not None and free.any():
-            raise ValueError(f"{scene.path}: object {np.flatnonzero(free)[0]} is a rigid body in world -1")
-        self._scene = scene
+    def start_actor(self):
+        on_gpus = self.pool.on_gpus
+        share = {"num_gpus": 1, "num_cpus": 0} if on_gpus else {"num_cpus": 1}
+        actor = self.ray.remote(_Actor).options(**share).remote(self.runner, "cuda:0" if on_gpus else "cpu")
+        ready = actor.ready.remote()
+        self.actors.append(actor)
+        self.running[ready] = actor, None
 
-    def describe(self) -> dict:
-        """Return all that the answers depend on, for JSON."""
-        return {
-            "kind": "worlds",
-            "count": self.count,
-            "shard": self.shard,
-            "models": [hash_model(model) for model in self._parts["models"]],
-            "scene": hashlib.sha256(self._scene.text.encode()).hexdigest(),
-            "objects": len(self._scene.worlds),
-            "frames": self.frames,
-            "output": self.output,
-        }
+    def send(self, actor):
+        """Send the next shard to an actor."""
+        if self.left:
+            part = self.left.popleft()
+            self.running[actor.run.remote(self.job.task(*part))] = actor, part
 
-    def item(self, start, stop):
-        """Return what a worker is sent for a shard."""
-        return self.worlds[start:stop]
+    def replace_actor(self, actor, cause):
+        """Take back the shards of an actor that ended, and start another."""
+        self.pool.lost += 1
+        self.pool.pids.pop(actor, None)
+        self.kill(actor)  # it may be alive if its machine was disconnected
+        self.actors.remove(actor)
+        lost = [reference for reference, (owner, _) in self.running.items() if owner is actor]
+        # Only the first can have ended the actor; the others were queued behind it.
+        for place, reference in enumerate(lost):
+            part = self.running.pop(reference)[1]
+            if place == 0:
+                self.failures[part] = self.failures.get(part, 0) + 1
+                if self.failures[part] == ATTEMPTS:
+                    what = "workers do not start" if part is None else f"shard {part} ended its worker"
+                    raise RuntimeError(f"{what}, {ATTEMPTS} times: {cause}")
+            if part is not None:
+                self.left.appendleft(part)
+        self.start_actor()
 
-    def asker(self) -> "WorldsAsker":
-        """Return what a worker is sent once."""
-        # Cameras and scenes stay here: workers make scenes of their own.
-        return WorldsAsker(dataclasses.replace(self._scene, scene=None), self._parts, self.frames, self.output)
-
-
-class WorldsAsker:
-    """Runs shards of a `WorldsJob` on one device."""
-
-    def __init__(self, scene, parts, frames, output):
-        self.scene, self.parts, self.frames, self.output = scene, parts, frames, output
-
-    def ask(self, worlds, device=None) -> dict:
-        """Return the columns of a shard, arrays of one length."""
-        rows = np.flatnonzero(np.isin(self.scene.worlds, worlds) | (self.scene.worlds < 0))
-        part = self._cut(rows, device)
-        bodies = part.make_bodies()
-        frame = part.frame(bodies=bodies)
-        own = part.worlds >= 0
-        columns: list = []
-        for number in range(self.frames):
-            if self.scene.sweeps:
-                part.scene.set_lods(self.scene.lods_at(number * part.time_step)[rows])
-            poses = part.motion.poses(number * part.time_step) if bodies is None else bodies.poses()
-            result = frame.step()
-            if self.output == "poses":
-                poses = poses[own]
-                columns.append((np.full(len(poses), number), rows[own], part.worlds[own], poses))
+    def results(self):
+        """Yield (start, stop, columns) of each shard, in order of completion."""
+        ray = self.ray
+        for _ in range(min(self.pool.workers, len(self.left))):
+            self.start_actor()
+        while self.left or any(part is not None for _, part in self.running.values()):
+            done, _ = ray.wait(list(self.running), num_returns=1)
+            actor, part = self.running[done[0]]
+            try:
+                answer = ray.get(done[0])
+            except ray.exceptions.RayTaskError as error:
+                raise error.cause from None
+            except (ray.exceptions.RayActorError, ray.exceptions.ObjectLostError) as error:
+                self.replace_actor(actor, " ".join(str(error).split())[:300])
                 continue
-            world = part.worlds[result.pairs].reshape(-1, 2).max(1, initial=-1)
-            shared = world >= 0
-            place = np.searchsorted(worlds, world[shared])
-            counts = [
-                np.bincount(place, values[shared], len(worlds)).astype(np.int64)
-                for values in (np.ones(len(world)), result.any, result.count)
-            ]
-            columns.append((np.full(len(worlds), number), worlds, *counts))
-        merged = [np.concatenate(parts) for parts in zip(*columns)]
-        if self.output == "poses":
-            names = ("frame", "object", "world", "x", "y", "z", "qx", "qy", "qz", "qw")
-            return dict(zip(names, (*merged[:3], *np.ascontiguousarray(merged[3].T))))
-        return dict(zip(("frame", "world", "pairs", "intersecting", "face_pairs"), merged))
+            del self.running[done[0]]
+            if part is None:
+                self.pool.pids[actor] = answer
+                self.failures.pop(None, None)
+                for _ in range(AHEAD):
+                    self.send(actor)
+                continue
+            self.send(actor)
+            del done  # Ray frees the answer with its last reference
+            yield *part, answer
 
-    def _cut(self, rows, device):
-        """Return the scene file of some objects, on a device."""
-        whole, parts = self.scene, self.parts
-        motion = copy.copy(whole.motion)  # made anew, it would normalise once more
-        for field in dataclasses.fields(motion):
-            setattr(motion, field.name, getattr(whole.motion, field.name)[rows])
-        poses, lods = motion.poses(0.0), whole.lods_at(0.0)[rows]
-        scene = Scene(device)
-        for place, i in enumerate(rows.tolist()):
-            model = parts["models"][parts["object_model"][i]]
-            importance, static = int(parts["importance"][i]), bool(parts["static"][i])
-            scene.add(model, poses[place], int(whole.worlds[i]), int(lods[place]), importance, static)
-        return dataclasses.replace(
-            whole,
-            scene=scene,
-            motion=motion,
-            sweeps=[],
-            worlds=whole.worlds[rows],
-            base_lods=lods,
-            kinematic=whole.kinematic[rows],
-            body={name: values[rows] for name, values in whole.body.items()},
-        )
+    def kill(self, actor):
+        with contextlib.suppress(Exception):
+            self.ray.kill(actor)
+
+    def kill_actors(self):
+        """Stop all actors."""
+        for actor in self.actors:
+            self.kill(actor)

@@ -1,7 +1,7 @@
-"""The folder of a job: `job.json`, which names the job by a hash, and a file for each range of poses (or worlds).
+"""The folder of a job: `job.json` with a hash of the job, and a file for each range of poses (or worlds).
 
-A shard holds, beside its columns, the hash of its job, its range, and a digest of all three, in arrays of the .npz file
-or in the metadata of the Parquet schema. All shards that are found are read and checked, one column at a time.
+Beside its columns a shard has the hash of its job, its range, and a digest of all three, in arrays of the .npz file or
+in the metadata of the Parquet schema. Existing shards are read and checked, one column at a time.
 """
 
 import hashlib
@@ -25,15 +25,15 @@ STAMP = ("job", "range", "digest")
 
 
 class DamagedShard(ValueError):
-    """A file is not what was written for its range of the job."""
+    """A shard's file is not what was written for its range of the job."""
 
 
 class ShardFolder:
     """The folder of one job.
 
     Attributes:
-        left: Ranges still to be done, in order, as keys.
-        damaged: Ranges whose file is there and damaged; they are left, too.
+        left: Ranges still to be computed, in order, as keys.
+        damaged: Ranges whose file is damaged; they are in `left` too.
     """
 
     def __init__(self, out, job, file):
@@ -48,10 +48,10 @@ class ShardFolder:
         self.damaged: list = []
 
     def open(self, progress=None):
-        """Make the folder, or check what it holds of this job.
+        """Make the folder, or check the shards that it holds of this job.
 
         Args:
-            progress: Called as progress("check", done, total) after each shard that is found.
+            progress: Called as progress("check", done, total) after each existing shard.
 
         Raises:
             ValueError: It holds another job, or a shard of another, or something else. Nothing is changed.
@@ -63,7 +63,7 @@ class ShardFolder:
             raise ValueError(f"{self.path}: there is no folder {self.path.parent}")
         self.path.mkdir(exist_ok=True)
         if not (self.path / MANIFEST).exists():
-            if any(entry.suffix != SUFFIX for entry in self.path.iterdir()):  # half a manifest is none
+            if any(entry.suffix != SUFFIX for entry in self.path.iterdir()):  # half a manifest may be left
                 raise ValueError(f"{self.path}: is not empty and holds no {MANIFEST}")
             with atomic_write(self.path / MANIFEST, "w", encoding="utf-8") as file:
                 json.dump(self.manifest, file, indent=1)
@@ -113,8 +113,8 @@ class ShardFolder:
 def read_shards(out) -> Iterator[tuple[int, int, dict]]:
     """Yield (start, stop, columns) of each shard of a finished job, in order; columns are arrays by name.
 
-    For "any" and "count" a row is a pose from `start`; for "faces" and "contacts" a face pair, its pose in the column
-    `pose`. Parquet has the column `pose` always, and vectors as three columns. A shard is checked before it is given.
+    For "any" and "count" a row is a pose, from `start` on; for "faces" and "contacts" a face pair, with its pose in the
+    column `pose`. Parquet always has the column `pose`, and vectors as three columns. Each shard is checked first.
 
     Raises:
         ValueError: No such folder, shards are missing, or a shard is damaged, altered or of another job; it names the
@@ -140,7 +140,7 @@ def read_shards(out) -> Iterator[tuple[int, int, dict]]:
 
 
 def _read_shard(path, manifest, start, stop, keep=True) -> dict:
-    """Check a shard and return its columns, none unless they are kept.
+    """Check a shard and return its columns, none if not `keep`.
 
     Raises:
         DamagedShard: It is not what was written for this range.
@@ -161,10 +161,10 @@ def _read_shard(path, manifest, start, stop, keep=True) -> dict:
                 rows.add(len(values))
                 if keep:
                     columns[name] = values
-                del values  # before the next is read
+                del values  # frees it before the next is read
         except MemoryError:
             raise
-        except Exception as error:  # what a reader makes of damage is of many types
+        except Exception as error:  # readers raise many types on damaged data
             raise DamagedShard(f"{path}: damaged ({first_line(error)})") from None
     if set(stamp) != set(STAMP) or stamp["digest"] != _close_digest(digest, stamp["job"], stamp["range"]):
         raise DamagedShard(f"{path}: damaged or altered")
@@ -181,7 +181,7 @@ def _read_shard(path, manifest, start, stop, keep=True) -> dict:
 def _read_npz(file):
     """Yield names and arrays."""
     with zipfile.ZipFile(file) as archive:
-        # Headers are trusted only after this: a damaged one may ask for any amount of memory.
+        # First, as a damaged header may ask for any amount of memory.
         damaged = archive.testzip()
         if damaged is not None:
             raise ValueError(f"checksum of {damaged}")
@@ -221,17 +221,17 @@ def _close_digest(digest, job, part) -> str:
 
 
 def _row_fault(job, lengths, start, stop) -> str | None:
-    """Say what is wrong with the lengths of a shard's columns; None if nothing is."""
+    """Return what is wrong with the lengths of a shard's columns, or None."""
     if len(lengths) != 1:
         return "columns of different lengths" if lengths else "no columns"
     rows, expected = min(lengths), (stop - start) * job.get("frames", 1)
-    if job.get("output") in ("any", "count") and rows != expected:  # a row a pose, or a world and frame
+    if job.get("output") in ("any", "count") and rows != expected:  # a row per pose, or per world and frame
         return f"{rows} rows, not {expected}"
     return None
 
 
 def _flat(columns):
-    """Yield names and columns, those of vectors by axis: a table has no wider ones."""
+    """Yield names and columns, vectors as one column per axis."""
     for name, values in columns.items():
         if values.ndim == 1:
             yield name, values

@@ -1,7 +1,7 @@
-"""Controllers of LODs: each frame they hear what the last one did and give the LODs of the next.
+"""Controllers of LODs: each frame they take the feedback of the last one and return the LODs of the next.
 
-All have one method, `next_lods(feedback)`, and one attribute, `budget_ms` (None where they hold no budget). They never
-read a clock: time reaches them in the feedback, so they repeat themselves on counted work or recorded times.
+All have one method, `next_lods(feedback)`, and one attribute, `budget_ms` (None without a budget). They never read a
+clock: times are part of the feedback, so that runs repeat on counted work or recorded times.
 """
 
 import math
@@ -12,33 +12,28 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_abtree.lod.selection import (
-    Camera,
-    Ladder,
-    PaperSelection,
-    PredictedSelection,
-    ToleranceSelection,
-    View,
-    positive,
-)
+from warp_abtree.checks.arguments import positive
+from warp_abtree.lod.selection import PaperSelection, PredictedSelection, ToleranceSelection
 from warp_abtree.lod.timing import COST_STAGES
+from warp_abtree.lod.view import Camera, View
 from warp_abtree.query.result import Result
+from warp_abtree.state.ladder import Ladder
 
-# A test of two triangles costs about as much as so many tests of two boxes.
 TRIANGLE_WORK = 4.0
+"""Cost of a test of two triangles in tests of two boxes, about."""
 
 
 @dataclass(frozen=True)
 class Feedback:
-    """What a controller hears before a frame.
+    """What a controller is told before a frame.
 
     Attributes:
-        time: Of the frame to come [s].
-        stage_ms: Stages of the frame before by name [ms]; empty before the first. `select_ms`, `refine_ms`, `broad_ms`
-            and `query_ms` make T.
-        nodes_refitted: Nodes that it refitted.
+        time: Time of the next frame [s].
+        stage_ms: Stages of the last frame by name [ms]; empty before the first. The sum of `select_ms`, `refine_ms`,
+            `broad_ms` and `query_ms` is T.
+        nodes_refitted: Nodes that the last frame refitted.
         lods_changed: Whether it changed any LOD.
-        result: What its query found, with the tests of every pair; None before the first.
+        result: Result of its query, with the tests of every pair; None before the first.
     """
 
     time: float
@@ -49,7 +44,7 @@ class Feedback:
 
     @property
     def cost_ms(self) -> float:
-        """T', the time of interference detection in the frame before [ms]; NaN before the first."""
+        """T', the time of interference detection in the last frame [ms]; NaN before the first."""
         return sum(self.stage_ms[name] for name in COST_STAGES) if self.stage_ms else math.nan
 
 
@@ -58,7 +53,7 @@ class Controller:
 
     Args:
         scene: `Scene` with all its objects.
-        camera: `Camera`, or a function from time [s] to one; None, and every object is near and still.
+        camera: `Camera`, or a function from time [s] to one; None takes every object as near and still.
         window: Frames over which motion on the screen is measured.
 
     Attributes:
@@ -67,7 +62,7 @@ class Controller:
     """
 
     budget_ms: float | None = None
-    _selection: Any  # of warp_abtree.lod
+    selection: Any  # its operator, of `warp_abtree.lod.selection`
 
     def __init__(self, scene, camera: Camera | Callable[[float], Camera] | None = None, window: int = 10):
         if not (camera is None or isinstance(camera, Camera) or callable(camera)):
@@ -79,7 +74,7 @@ class Controller:
         """Return the LOD of every object for the coming frame, int32 (n,) on the device, overwritten by the next call.
 
         Args:
-            feedback: The frame before, or a first `Feedback` of a time alone.
+            feedback: Of the last frame; at first, a `Feedback` with a time alone.
 
         Raises:
             RuntimeError: The scene's objects changed since the controller was made.
@@ -88,16 +83,16 @@ class Controller:
         if self.camera is not None:
             self.view.look(self.camera if isinstance(self.camera, Camera) else self.camera(feedback.time))
             self.view.launch()
-        self._hear(feedback)
-        self._selection.launch()
-        return self._selection.lods
+        self._update(feedback)
+        self.selection.launch()
+        return self.selection.lods
 
-    def _hear(self, feedback):
-        """Bring what the selection needs of the feedback to the device."""
+    def _update(self, feedback):
+        """Upload what the selection needs of the feedback."""
 
 
 class PaperController(Controller):
-    """The paper's selection model: LODs climb and fall by powers of two about a budget (section 4.2).
+    """The paper's selection model: LODs rise and fall by powers of two about a budget (section 4.2).
 
     Args:
         scene, camera, window: As in `Controller`.
@@ -115,11 +110,11 @@ class PaperController(Controller):
         if threshold_ms is not None:
             threshold_ms = positive(threshold_ms, "threshold_ms")
         super().__init__(scene, camera, window)
-        self._selection = PaperSelection(self.view, budget_ms, threshold_ms, Ladder(scene.models, steps))
+        self.selection = PaperSelection(self.view, budget_ms, threshold_ms, Ladder(scene.models, steps))
         self.budget_ms = budget_ms
 
-    def _hear(self, feedback):
-        self._selection.cost.fill_(feedback.cost_ms)
+    def _update(self, feedback):
+        self.selection.cost.fill_(feedback.cost_ms)
 
 
 class ToleranceController(Controller):
@@ -137,17 +132,17 @@ class ToleranceController(Controller):
 
     def __init__(self, scene, tolerance, camera=None, loosest=64.0, steps=50, spacing="ratio", window=10):
         super().__init__(scene, camera, window)
-        self._selection = ToleranceSelection(self.view, tolerance, loosest, Ladder(scene.models, steps, spacing))
+        self.selection = ToleranceSelection(self.view, tolerance, loosest, Ladder(scene.models, steps, spacing))
 
 
 class CostFit:
-    """A line through work and time, least squares with forgetting; slope and intercept are at least 0.
+    """Least-squares fit of time against work with exponential forgetting; slope and intercept are at least 0.
 
-    Where the work hardly varies the line goes through the origin. A time more than twice off the line counts as twice,
-    so that a single hitch of the machine moves it little.
+    Where the work hardly varies the line goes through the origin. A time off the line by more than a factor of 2 is
+    clamped to it, so that a single hitch of the machine moves the line little.
 
     Args:
-        forget: Weight that an observation keeps at each next one.
+        forget: Factor on the weight of an observation at each new one.
     """
 
     def __init__(self, forget: float = 0.9):
@@ -155,7 +150,7 @@ class CostFit:
         self.sums = np.zeros(5)
 
     def add(self, work: float, time: float):
-        """Take one observation."""
+        """Add an observation."""
         slope, intercept = self.line()
         expected = slope * work + intercept
         if self.sums[0] > 2 and expected > 0:
@@ -179,17 +174,14 @@ class CostFit:
 class PredictiveController(Controller):
     """Hold a budget with the finest common tolerance whose cost is predicted to fit, loosened object by object.
 
-    The cost is predicted from the tests of the last frame's pairs and the rates at which this machine has lately worked
-    (see `warp_abtree.lod.PredictedSelection`); tests are taken to grow as a power of the faces, fitted as it goes.
+    The cost is predicted from the tests of the last frame's pairs and the recent rates of this machine (see
+    `warp_abtree.lod.selection.PredictedSelection`); tests grow as a power of the faces, with a fitted exponent.
 
     Args:
         scene, camera, window: As in `Controller`.
         budget_ms: T [ms].
         steps, spacing: As in `Ladder`.
-        options: aim, low, patience, loosest of `PredictedSelection`.
-
-    Attributes:
-        predicted_ms: What the frame to come is predicted to cost [ms]; NaN before the second. Waits for the device.
+        options: aim, low, hold_frames, loosest of `PredictedSelection`.
 
     Raises:
         TypeError, ValueError: As `PaperController`.
@@ -199,17 +191,17 @@ class PredictiveController(Controller):
         self.budget_ms = positive(budget_ms, "budget_ms")
         super().__init__(scene, camera, window)
         ladder = Ladder(scene.models, steps, spacing)
-        self._selection = PredictedSelection(self.view, self.budget_ms, ladder=ladder, **options)
+        self.selection = PredictedSelection(self.view, self.budget_ms, ladder=ladder, **options)
         self._query, self._refine, self._rest = CostFit(), CostFit(), CostFit()
         self._exponent, self._drift = 1.0, 0.0
 
     @property
     def predicted_ms(self) -> float:
-        """Return what the frame to come is predicted to cost [ms], NaN before the second. Waits for the device."""
-        choice = self._selection.choice.numpy()
+        """Predicted cost of the next frame [ms], NaN before the second. Waits for the device."""
+        choice = self.selection.choice.numpy()
         return float(choice[1] + choice[2])
 
-    def _hear(self, feedback):
+    def _update(self, feedback):
         if feedback.result is None:
             return
         stages, result, count = feedback.stage_ms, feedback.result, self.scene.object_count
@@ -219,7 +211,7 @@ class PredictiveController(Controller):
             first, second = (np.bincount(result.pairs[:, side], tests, count) for side in (0, 1))
             work = 0.5 * (first + second)
         total = float(tests.sum())
-        self._learn_growth(total)
+        self._fit_exponent(total)
         self._query.add(total, stages["query_ms"])
         self._rest.add(0.0, stages["select_ms"] + stages["broad_ms"])
         if feedback.lods_changed:
@@ -227,23 +219,23 @@ class PredictiveController(Controller):
         per_work, fixed = self._query.line()
         per_node, change = (0.0 if math.isnan(rate) else rate for rate in self._refine.line())
         fixed += self._rest.line()[1]
-        # Both ways on the safe side: a climb costs more than fitted, a fall spares less.
+        # Conservative both ways: a climb costs more than fitted, a fall saves less.
         up, down = self._exponent + 0.2, max(self._exponent - 0.2, 0.1)
         grown = math.exp(self._drift)
-        self._selection.rate.assign(np.array([fixed, per_work * grown, change, per_node, up, down]))
-        self._selection.work.assign(work)
+        self.selection.rate.assign(np.array([fixed, per_work * grown, change, per_node, up, down]))
+        self.selection.work.assign(work)
 
-    def _learn_growth(self, total):
-        """Compare the tests counted with those predicted: the exponent where LODs moved, the drift where they stood."""
-        _, _, _, predicted, before = self._selection.choice.numpy()
+    def _fit_exponent(self, total):
+        """Fit to the tests counted, against those predicted: the exponent if LODs changed, the drift if not."""
+        _, _, _, predicted, before = self.selection.choice.numpy()
         if not (predicted > 0 and before > 0 and total > 0):
             self._drift *= 0.8
             return
-        moved, found = math.log(predicted / before), math.log(total / before)
-        if abs(moved) > 0.02:
-            exponent = self._exponent + 0.2 if moved > 0 else max(self._exponent - 0.2, 0.1)
-            slope = min(max(exponent * found / moved, 0.1), 1.5)
-            self._exponent += min(abs(moved), 0.2) * (slope - self._exponent)
-            found -= moved
+        expected, found = math.log(predicted / before), math.log(total / before)
+        if abs(expected) > 0.02:
+            exponent = self._exponent + 0.2 if expected > 0 else max(self._exponent - 0.2, 0.1)
+            slope = min(max(exponent * found / expected, 0.1), 1.5)
+            self._exponent += min(abs(expected), 0.2) * (slope - self._exponent)
+            found -= expected
         self._drift += 0.2 * (min(max(found, -0.2), 0.2) - self._drift)
         self._drift = max(self._drift, 0.0)

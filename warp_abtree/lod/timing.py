@@ -1,4 +1,4 @@
-"""Stages of a frame, and the clocks that time them: the machine's, one that counts work, one that replays a run."""
+"""Stages of a frame, and the clocks that time them: the host's, one that counts work, one that replays a run."""
 
 import csv
 import json
@@ -32,7 +32,7 @@ candidate pair, a query, a test of two boxes, a test of two triangles: about tho
 
 
 class ReplayClock:
-    """A clock that reads as it did in a recorded run, so that the run repeats itself, controllers and all.
+    """A clock that replays the times of a recorded run, so that the run repeats itself exactly.
 
     Args:
         rows: The history of that run: `FrameRow`s, or the .json or .csv file that `Frame.record` wrote.
@@ -80,13 +80,13 @@ def _read_rows(path):
 
 
 class WorkClock:
-    """A clock that runs on counted work alone: frames with it are the same on every machine.
+    """A clock that advances with counted work alone: frames are the same on every machine.
 
     Args:
-        rates: Seconds a unit of work, by name; those left out are as in RATES.
+        rates: Seconds a unit of work, by name; the others are as in RATES.
 
     Attributes:
-        seconds: What it reads.
+        seconds: Its reading.
 
     Raises:
         ValueError: An unknown name, or a rate that is negative or not finite.
@@ -108,7 +108,7 @@ class WorkClock:
         return self.seconds
 
     def charge(self, **work):
-        """Go on by some units of work."""
+        """Advance by some units of work."""
         self.seconds += sum(self.rates[name] * count for name, count in work.items())
 
 
@@ -120,7 +120,7 @@ class Timer:
         clock: Seconds, read len(STAGES) + 1 times a frame; None is the host's clock, on CUDA events.
 
     Attributes:
-        counts_work: Whether the clock wants to be told the counted work of each stage.
+        counts_work: Whether the clock takes the counted work of each stage.
     """
 
     def __init__(self, device, clock):

@@ -1,33 +1,22 @@
-"""Meshes: load, validate, weld, and say what was found.
+"""Triangle meshes: load, validate, weld and describe.
 
-A face keeps the index that it has in the source, at every later step. OBJ is read here, since trimesh groups its faces
-by material and takes quads out of line; every other format is read by trimesh, whose order is kept (for polygons in PLY
-and OFF: triangles first, then quads, then the rest).
+A face keeps the index that it has in the source, at every later step.
 """
 
-import gzip
-import io
 import os
-import warnings
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import trimesh
-import warp as wp
 
 from warp_abtree.checks.arguments import first_line
+from warp_abtree.model.obj import MeshError, read_file, read_warp_asset, split_file_name
 
 FACE_LIMIT = 2**30  # int32 forest ids count up to two nodes a vertex, and heap indices up to two a face
 EXTENT_LIMITS = (2.0**-100, 2.0**100)  # boxes are float32
 COORDINATE_MIN = 2.0**-290  # smaller ones are 0
 COORDINATE_MAX = 2.0**300  # products of three stay finite
-WARP_ASSETS = ("bunny", "bear", "rocks")
-
-
-class MeshError(ValueError):
-    """Say in one line what is wrong with a mesh, and where."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +59,19 @@ def load_mesh(source, name=None):
         MeshError: The source cannot be read, or holds no mesh that can be used.
     """
     if isinstance(source, trimesh.parent.Geometry):
-        return _from_geometry(source, "trimesh" if name is None else name)
+        return _join_geometry(source, "trimesh" if name is None else name)
     if not isinstance(source, str | os.PathLike):
         raise MeshError(f"cannot load a mesh from {type(source).__name__}; give a path, a trimesh.Trimesh or arrays")
     if isinstance(source, str) and source.startswith("warp:"):
         asset = source[len("warp:") :]
-        return _build(*_read_warp_asset(source, asset), asset if name is None else name, where=source)
-    return _load_file(Path(source), name)
+        return _weld_mesh(*read_warp_asset(source, asset), asset if name is None else name, where=source)
+    path = Path(source)
+    found = read_file(path)
+    name = split_file_name(path)[0] if name is None else name
+    if isinstance(found, trimesh.Scene):
+        return _join_geometry(found, name, where=str(path))
+    vertices, faces = found
+    return _weld_mesh(vertices, faces, name, where=str(path))
 
 
 def mesh_from_arrays(vertices, faces, name="arrays"):
@@ -94,7 +89,7 @@ def mesh_from_arrays(vertices, faces, name="arrays"):
         MeshError: Wrong shape or type, no faces, coordinates not finite or beyond 2^300, an index out of range, or an
             extent outside 2^-100 .. 2^100.
     """
-    return _build(vertices, faces, name, where=name)
+    return _weld_mesh(vertices, faces, name, where=name)
 
 
 def describe_mesh(mesh):
@@ -141,7 +136,7 @@ def describe_mesh(mesh):
 # Validation and welding.
 
 
-def _build(vertices, faces, name, where):
+def _weld_mesh(vertices, faces, name, where):
     vertices = _checked_vertices(vertices, where)
     faces = _checked_faces(faces, len(vertices), where)
     file_vertex_count = len(vertices)
@@ -274,46 +269,7 @@ def component_labels(faces, vertex_count):
     return label
 
 
-# Reading.
-
-
-def _load_file(path, name):
-    if path.is_dir():
-        raise MeshError(f"{path}: is a folder, not a mesh file")
-    if not path.is_file():
-        raise MeshError(f"{path}: no such file")
-    suffixes = [suffix.lower() for suffix in path.suffixes]
-    zipped = suffixes[-1:] == [".gz"] and suffixes[-2:] != [".tar", ".gz"]
-    kind = "".join(suffixes[-2:-1] if zipped else suffixes[-2:] if suffixes[-2:] == [".tar", ".gz"] else suffixes[-1:])
-    kind = kind.removeprefix(".")
-    if name is None:
-        stem = path.name.removesuffix(path.suffixes[-1]) if zipped else path.name
-        name = stem[: len(stem) - len(kind) - 1] if kind else stem
-    try:
-        data = path.read_bytes()
-        if zipped:
-            data = gzip.decompress(data)
-    except (OSError, EOFError, zlib.error) as error:
-        raise MeshError(f"{path}: cannot be read: {first_line(error)}") from None
-    if kind == "npz":
-        raise MeshError(f"{path}: not a mesh file; a built model is read by Model.open")
-    if kind == "obj":
-        return _build(*_parse_obj(data, str(path)), name, where=str(path))
-    known = trimesh.available_formats()
-    if kind not in known:
-        raise MeshError(f"{path}: unknown extension '{kind}'; known here: {' '.join(sorted(known))}")
-    try:
-        with warnings.catch_warnings():
-            # Older NumPy only warns where a number in a text file cannot be read, and cuts the file short there.
-            warnings.filterwarnings("error", message="string or file could not be read")
-            resolver = trimesh.resolvers.FilePathResolver(str(path))
-            scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
-    except Exception as error:  # trimesh's readers raise whatever goes wrong inside them
-        raise MeshError(f"{path}: cannot be read as {kind}: {first_line(error)}") from None
-    return _from_geometry(scene, name, where=str(path))
-
-
-def _from_geometry(geometry, name, where=None):
+def _join_geometry(geometry, name, where=None):
     """Join the triangles of a trimesh object; points and paths beside them are left out."""
     where = name if where is None else where
     if isinstance(geometry, trimesh.Scene):
@@ -345,116 +301,4 @@ def _from_geometry(geometry, name, where=None):
     if not faces:
         kinds = sorted({type(part).__name__ for part, _ in placed})
         raise MeshError(f"{where}: no faces (it holds {', '.join(kinds)})")
-    return _build(np.concatenate(vertices), np.concatenate(faces), name, where)
-
-
-def _parse_obj(data, where) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and triangles of an OBJ file; only `v` and `f` lines matter here."""
-    vertices, corners, counts = [], [], []
-    for number, line in enumerate(data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines(), start=1):
-        fields = line.split()
-        kind = fields[0] if fields else b""
-        if kind != b"v" and kind != b"f":
-            continue
-        if b"#" in line:
-            fields = line.split(b"#", 1)[0].split()
-        try:
-            if kind == b"v":
-                x, y, z = fields[1:4]
-                vertices.append((float(x), float(y), float(z)))
-                continue
-            if b"/" in line:
-                fields = [field.split(b"/", 1)[0] for field in fields]
-            polygon = [int(field) for field in fields[1:]]
-            if len(polygon) < 3:
-                raise ValueError
-        except ValueError:
-            text = line.decode(errors="replace").strip()
-            raise MeshError(f"{where}: line {number} cannot be read: {text[:60]}") from None
-        if min(polygon) <= 0:
-            # A negative index counts back from the last vertex so far.
-            polygon = [index if index > 0 else len(vertices) + index + 1 if index else 0 for index in polygon]
-            if min(polygon) <= 0:
-                raise MeshError(f"{where}: line {number} refers to a vertex before the first")
-        corners.extend(polygon)
-        counts.append(len(polygon))
-    if not counts:
-        raise MeshError(f"{where}: no faces")
-    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-    try:
-        indices = np.array(corners, dtype=np.int64) - 1
-    except OverflowError:
-        raise MeshError(f"{where}: a face refers to vertex {max(corners)}, but there are {len(points)}") from None
-    return points, triangulate(points, np.array(counts), indices, where)
-
-
-def _read_warp_asset(source, asset) -> tuple[np.ndarray, np.ndarray]:
-    if asset not in WARP_ASSETS:
-        raise MeshError(f"{source}: unknown; Warp's meshes are {', '.join('warp:' + each for each in WARP_ASSETS)}")
-    try:
-        from pxr import Usd, UsdGeom
-    except ImportError:
-        raise MeshError(f"{source}: reading it needs usd-core: pip install warp-abtree[usd]") from None
-    path = Path(wp.__file__).parent / "examples" / "assets" / f"{asset}.usd"
-    if not path.is_file():
-        raise MeshError(f"{source}: {path} is missing from this installation of Warp")
-    stage = Usd.Stage.Open(str(path))
-    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/root/{asset}"))  # its transform is the identity in all three files
-    vertices = np.array(mesh.GetPointsAttr().Get(), dtype=np.float64)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get())
-    return vertices, triangulate(vertices, counts, np.array(mesh.GetFaceVertexIndicesAttr().Get()), source)
-
-
-# Polygons.
-
-
-def triangulate(vertices, counts, corners, where):
-    """Cut polygons into triangles, in place: polygon p gives counts[p] - 2 of them."""
-    if (counts == 3).all():
-        return corners.reshape(-1, 3)
-    if corners.min() < 0 or corners.max() >= len(vertices):
-        raise MeshError(f"{where}: a face refers to vertex {corners.max()}, but there are {len(vertices)}")
-    polygon_start = np.cumsum(counts) - counts
-    triangle_start = np.cumsum(counts - 2) - (counts - 2)
-    polygon = np.repeat(np.arange(len(counts)), counts - 2)
-    apex = polygon_start[polygon]
-    second = apex + 1 + np.arange(len(polygon)) - triangle_start[polygon]
-    triangles = np.stack([corners[apex], corners[second], corners[second + 1]], axis=1)
-
-    # Three in five polygons of warp:rocks are not convex. A fan's cross products sum to the polygon's area vector.
-    with np.errstate(invalid="ignore", over="ignore"):
-        a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
-        cross = np.cross(b - a, c - a)
-        area = np.add.reduceat(cross, triangle_start)
-        fold = np.einsum("ij,ij->i", cross, area[polygon]) < -1e-9 * np.einsum("ij,ij->i", area, area)[polygon]
-    for p in np.unique(polygon[fold]):
-        ring = corners[polygon_start[p] : polygon_start[p] + counts[p]]
-        drop = np.argmax(np.abs(area[p]))
-        flat = np.delete(vertices[ring], drop, axis=1) * (1.0, (1.0, -1.0, 1.0)[drop] * np.sign(area[p][drop]))
-        triangles[triangle_start[p] :][: counts[p] - 2] = ring[_clip_ears(flat)]
-    return triangles
-
-
-def _clip_ears(points):
-    """Cut a counterclockwise polygon of the plane into triangles that do not fold; return their corners."""
-
-    def turn(i, j, k):
-        (ax, ay), (bx, by), (cx, cy) = points[i], points[j], points[k]
-        return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-
-    points = [tuple(point) for point in points.tolist()]
-    ring, triangles = list(range(len(points))), []
-    while len(ring) > 3:
-        candidates = list(zip(ring[-1:] + ring[:-1], ring, ring[1:] + ring[:1]))
-        for i, j, k in candidates:
-            others = [x for x in ring if points[x] not in (points[i], points[j], points[k])]
-            if turn(i, j, k) > 0.0 and not any(
-                turn(i, j, x) >= 0.0 and turn(j, k, x) >= 0.0 and turn(k, i, x) >= 0.0 for x in others
-            ):
-                break
-        else:
-            # No ear: the polygon crosses itself, or is flat to rounding. Any cut will do.
-            i, j, k = max(candidates, key=lambda corner: turn(*corner))
-        triangles.append((i, j, k))
-        ring.remove(j)
-    return [*triangles, tuple(ring)]
+    return _weld_mesh(np.concatenate(vertices), np.concatenate(faces), name, where)

@@ -2,7 +2,9 @@
 
 import hashlib
 import zipfile
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +31,7 @@ _MEMBERS = (*_ARRAYS, "leaf_node", "name")
 
 
 class ModelError(ValueError):
-    """A model file that is not one, or not whole."""
+    """A file that is no model file, or is damaged."""
 
 
 class Model:
@@ -39,7 +41,7 @@ class Model:
     in the file at every LOD.
 
     Attributes:
-        name: Where the mesh came from.
+        name: Name for people, by default that of the mesh file.
         progressive: `ProgressiveMesh`.
         tree: `Tree`.
         dropped_faces: Faces that welding left without three distinct corners, int32; never active.
@@ -81,6 +83,15 @@ class Model:
         """Build a model from vertices (v, 3) and faces (n, 3); see `load`."""
         return cls.load(mesh_from_arrays(vertices, faces, name=name), base_faces, progress)
 
+    @cached_property
+    def digest(self) -> str:
+        """Hash of mesh, collapses and tree, hexadecimal; equal for equal models whatever their names."""
+        return _hash_arrays({name: value for name, value in self._arrays().items() if name != "name"}).hex()
+
+    def _arrays(self) -> dict[str, Any]:
+        arrays = {name: getattr(self.progressive, name) for name in _ARRAYS}
+        return arrays | {"leaf_node": self.tree.leaf_node, "name": np.array(self.name)}
+
     @property
     def face_count(self) -> int:
         """Faces of the original mesh, dropped ones included."""
@@ -115,11 +126,11 @@ class Model:
         distance. Neither bounds the other: where a LOD closes a gap, "inward" may be 0 and "outward" large.
 
         Args:
-            side: "inward": how far a point of the original surface can lie from the surface at the LOD. Found when the
-                model is built; falls with the LOD. "outward": how far a point of the surface at the LOD can lie from
-                the original surface; as a rule within 1 % of the largest distance. Found when asked for, on one core of
-                the CPU, and kept: 2 to 4 us for each face of the original, more for soups of long faces. Need not fall
-                with the LOD.
+            side: "inward": largest distance of a point of the original surface from the surface at the LOD. Computed
+                when the model is built; falls with the LOD. "outward": largest distance of a point of the surface at
+                the LOD from the original surface; usually within 1 % of the true one. Computed on demand on one core of
+                the CPU, then cached: 2 to 4 us for each face of the original, more for soups of long faces. Not
+                monotone in the LOD.
 
         Raises:
             ValueError: lod is no whole number from 0 to lod_max, or side is another word.
@@ -132,10 +143,10 @@ class Model:
         raise ValueError(f"model {self.name!r}: side {side!r} is neither 'inward' nor 'outward'")
 
     def lod_for(self, fraction: float | None = None, tolerance: float | None = None) -> int:
-        """Return the LOD nearest to a share of the faces, or the coarsest whose inward error is within a tolerance.
+        """Return the LOD nearest to a fraction of the faces, or the coarsest whose inward error is within a tolerance.
 
         Args:
-            fraction: Share of face_count, in (0, 1].
+            fraction: Fraction of face_count, in (0, 1].
             tolerance: Largest `error_at(lod)` [model units], at least 0: of the original from the LOD, not outward.
 
         Raises:
@@ -144,23 +155,23 @@ class Model:
         return self.progressive.lod_for(fraction=fraction, tolerance=tolerance)
 
     def save(self, path):
-        """Write the model to an .npz file; the file appears whole or not at all.
+        """Write the model to an .npz file, atomically.
 
         Raises:
             OSError: The file cannot be written.
         """
-        arrays = {name: getattr(self.progressive, name) for name in _ARRAYS}
-        arrays |= {"leaf_node": self.tree.leaf_node, "name": np.array(self.name)}
-        about = {"format": np.array(FORMAT_NAME), "version": np.array(FORMAT_VERSION), "digest": _digest(arrays)}
+        arrays = self._arrays()
+        digest = np.frombuffer(_hash_arrays(arrays), np.uint8)
+        about: dict[str, Any] = {"format": np.array(FORMAT_NAME), "version": np.array(FORMAT_VERSION), "digest": digest}
         with atomic_write(path) as file:
-            np.savez_compressed(file, **about, **arrays)
+            np.savez_compressed(file, **about | arrays)
 
     @classmethod
     def open(cls, path) -> "Model":
-        """Read a model that `save` wrote, and check it whole.
+        """Read a model that `save` wrote, and check all of it.
 
         Raises:
-            ModelError: The file is missing, no such file, truncated, altered, or of another version.
+            ModelError: The file is missing, no model file, truncated, altered, or of another version.
         """
         path = Path(path)
         try:
@@ -177,24 +188,24 @@ class Model:
         except Exception as error:  # zlib.error and struct.error of a damaged archive
             raise ModelError(f"{path}: damaged ({type(error).__name__}: {error})") from None
         model = _assemble(path, dict(arrays))
-        # What fits together may still be wrong: a bound, a position.
-        if not isinstance(digest, np.ndarray) or not np.array_equal(digest, _digest(arrays)):
+        # Consistent arrays may still have altered values, such as a bound.
+        if not isinstance(digest, np.ndarray) or digest.tobytes() != _hash_arrays(arrays):
             raise ModelError(f"{path}: altered since it was saved")
         return model
 
 
-def _digest(arrays):
-    """Return a hash of all members, uint8 (32,)."""
+def _hash_arrays(arrays: dict) -> bytes:
+    """Return a hash of the names, types, shapes and values of arrays, 32 bytes."""
     found = hashlib.blake2b(digest_size=32)
-    for name in _MEMBERS:
+    for name in arrays:
         value = np.ascontiguousarray(arrays[name])
         found.update(f"{name} {value.dtype.str} {value.shape}".encode())
         found.update(value.tobytes())
-    return np.frombuffer(found.digest(), np.uint8)
+    return found.digest()
 
 
 def _check_format(path, file):
-    """Check that an opened file calls itself a model of the version that this library reads."""
+    """Check the format name, version and members of an opened file."""
     if not isinstance(file, np.lib.npyio.NpzFile) or not {"format", "version"} <= set(file.files):
         raise ModelError(f"{path}: not a warp_abtree model file")
     form, version = file["format"], file["version"]

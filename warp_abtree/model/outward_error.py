@@ -1,7 +1,7 @@
-"""The other side of a LOD's error: a certified bound on how far its surface lies from the original, when asked for.
+"""The outward error of a LOD: a certified bound on the distance of its surface from the original, computed on demand.
 
-Rounding. A cut moves a corner of a piece by at most sqrt(3) 2^-52 in a frame where coordinates are within 1/2; then the
-parts cover the piece but for that, so after 192 cuts in one another the pieces cover the face but for 192 times that.
+Rounding. A cut moves a corner of a polygon by at most sqrt(3) 2^-52 in a frame where coordinates are within 1/2; the
+parts then cover the polygon up to that distance, and after 192 nested cuts they cover the face up to 192 times that.
 Distances of corners are measured to points of original faces, both rounded. `progressive.ROUNDING` covers all of it.
 """
 
@@ -10,15 +10,14 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.progressive import outward_bound as outward
-from warp_abtree.kernels.progressive import polygon as piece
-from warp_abtree.model.progressive import ROUNDING, find_frame
+from warp_abtree.kernels.progressive import outward_bound
+from warp_abtree.model.progressive import ROUNDING, find_frame, make_scratch
 
 
 class OutwardError:
-    """Bounds on the distance of any point of the surface at a LOD from the original surface, found when asked for.
+    """Bounds on the distance of any point of the surface at a LOD from the original surface, computed on demand.
 
-    Keeps what it found and, since the first call, about 120 bytes for each face of the original. Neither is pickled.
+    Caches its results and, from the first call on, about 120 bytes for each face of the original; neither is pickled.
     """
 
     def __init__(self, progressive, tree):
@@ -44,23 +43,25 @@ class OutwardError:
         centre, scale, original = self._index
         vertices = (vertices - centre) / scale
         corner = vertices[faces]
-        # Corners and middles first: a face whose bound is below the greatest of their distances is not cut.
+        # Corners and middles first: a face whose bound is below their greatest distance is not cut.
         used, first = np.unique(faces, return_index=True)
         point = np.concatenate([vertices[used], corner.mean(1)])
         guess = np.concatenate([face_ids[first // 3], face_ids])
         distance_sq = wp.zeros(len(point), dtype=wp.float64, device="cpu")
         inputs = [_cpu(point, wp.vec3d), _cpu(guess, int), original, distance_sq]
-        wp.launch(outward.measure_points_kernel, dim=len(point), inputs=inputs, device="cpu")
+        wp.launch(outward_bound.measure_points_kernel, dim=len(point), inputs=inputs, device="cpu")
         bound_sq = wp.zeros(len(corner), dtype=wp.float64, device="cpu")
         inputs = [float(distance_sq.numpy().max()), _cpu(corner, wp.vec3d), _cpu(face_ids, int), original]
-        wp.launch(outward.bound_faces_kernel, dim=1, inputs=[*inputs, *_scratch(), bound_sq], device="cpu")
+        rows = outward_bound.ROWS
+        inputs += [make_scratch(1, 1, rows), wp.zeros(rows, dtype=int, device="cpu"), bound_sq]
+        wp.launch(outward_bound.bound_faces_kernel, dim=1, inputs=inputs, device="cpu")
         # ROUNDING is of coordinates up to 1/2; merged vertices may lie outside the box of the original ones.
         reach = max(1.0, 2 * float(np.abs(point).max()))
         return float(scale * (np.sqrt(bound_sq.numpy().max()) + ROUNDING * reach))
 
     @cached_property
     def _index(self):
-        """Return the frame, and in it the original faces with boxes over the tree, from the leaves up."""
+        """Return the frame, and in it the original faces with a box for each node of the tree."""
         progressive, tree = self.progressive, self.tree
         centre, scale = find_frame(progressive.vertex_pos[: progressive.vertex_count])
         corner = (progressive.vertex_pos[progressive.face_vertex] - centre) / scale
@@ -76,7 +77,7 @@ class OutwardError:
             node = node[tree.node_face[node] < 0]
             lower[node] = np.minimum(lower[2 * node], lower[2 * node + 1])
             upper[node] = np.maximum(upper[2 * node], upper[2 * node + 1])
-        original = outward.Original()
+        original = outward_bound.Original()
         original.face_pos = _cpu(corner, wp.vec3d)
         original.node_lower, original.node_upper = _cpu(lower, wp.vec3), _cpu(upper, wp.vec3)
         original.node_face = _cpu(tree.node_face, int)
@@ -85,13 +86,3 @@ class OutwardError:
 
 def _cpu(values, dtype):
     return wp.array(values, dtype=dtype, device="cpu")
-
-
-def _scratch():
-    """Return room for the pieces of one face, and for their depths."""
-    scratch, corners = piece.Scratch(), int(piece.CORNERS)
-    scratch.near, scratch.used = (wp.zeros(1, dtype=int, device="cpu") for _ in range(2))
-    scratch.waiting = wp.zeros((outward.ROWS, corners), dtype=wp.vec3d, device="cpu")
-    scratch.waiting_count = wp.zeros(outward.ROWS, dtype=int, device="cpu")
-    scratch.piece, scratch.inner = (wp.zeros(corners, dtype=wp.vec3d, device="cpu") for _ in range(2))
-    return scratch, wp.zeros(outward.ROWS, dtype=int, device="cpu")

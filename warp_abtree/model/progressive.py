@@ -8,19 +8,15 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
-from warp_abtree.kernels.progressive import collapse
-from warp_abtree.kernels.progressive import hausdorff_bound as deviation
-from warp_abtree.kernels.progressive import polygon as piece
-from warp_abtree.kernels.progressive import vertex_forest as forest
+from warp_abtree.kernels.progressive import collapse, hausdorff_bound, polygon, triangle_cover, vertex_forest
+from warp_abtree.kernels.progressive.heap import Heap
+from warp_abtree.kernels.progressive.quadric import Quadric
 
-MERGES_PER_LAUNCH = 25_000
-COVERS_PER_LAUNCH = 200_000
-HEAP_ROOM = (2, 256)  # entries to begin with: so many an edge, and so many more
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
 
-# What rounding can hide from a bound, in units of the frame (coordinates about 1/2, so 2^-54 each): reading the
-# vertices of both surfaces, a closest point of some ten operations, and the points of at most 64 cuts by three planes
-# each, every one within 2^-52 a coordinate of the segment that it cuts: 192 sqrt(3) 2^-52 and a little, under 2^-43.
+# Error of a bound by rounding, in units of the frame (coordinates about 1/2, so 2^-54 each): reading the vertices of
+# both surfaces, a closest point of some ten operations, and the points of at most 64 cuts by three planes each, every
+# one within 2^-52 a coordinate of the segment that it cuts: 192 sqrt(3) 2^-52 and a little, under 2^-43.
 ROUNDING = 2.0**-43
 
 
@@ -109,12 +105,13 @@ class ProgressiveMesh:
         return self.vertex_pos[used], faces.reshape(-1, 3).astype(np.int32), face_ids
 
     def lod_for(self, fraction=None, tolerance=None):
-        """Return the LOD for exactly one of two wishes.
+        """Return the LOD for exactly one of two requests.
 
         Args:
-            fraction: Part of `face_count` in (0, 1]; the LOD whose active count is nearest, the finer of equals.
+            fraction: Fraction of `face_count` in (0, 1]; the LOD whose active count is nearest, the finer of equals.
             tolerance: Largest error [model units], >= 0; the coarsest LOD whose `lod_error` is within it.
-        Raises ValueError for any other value, or unless one wish is given.
+
+        Raises ValueError for any other value, or unless exactly one is given.
         """
         if (fraction is None) == (tolerance is None):
             raise ValueError("lod_for takes exactly one of fraction= and tolerance=")
@@ -128,7 +125,22 @@ class ProgressiveMesh:
         return int(self.lod_max - np.argmin(miss[::-1]))
 
 
-def build_progressive(mesh, base_faces=10, link_condition=False, progress=None):
+@dataclass(frozen=True)
+class LaunchSizes:
+    """Work of one launch of the builder's serial kernels; the result does not depend on it.
+
+    Attributes:
+        merges, covers: Merges of the collapse, and triangles covered by the error bound, per launch.
+        heap_per_edge, heap_extra: Initial entries of the heap for each edge, and beyond these.
+    """
+
+    merges: int = 25_000
+    covers: int = 200_000
+    heap_per_edge: int = 2
+    heap_extra: int = 256
+
+
+def build_progressive(mesh, base_faces=10, progress=None, sizes=LaunchSizes()):
     """Collapse a mesh to a base of about `base_faces` faces and certify the error of every LOD on the way.
 
     The sequence for a larger base is a prefix of that for a smaller one, and does not depend on the mesh's scale by
@@ -137,8 +149,9 @@ def build_progressive(mesh, base_faces=10, link_condition=False, progress=None):
     Args:
         mesh: Anything with `vertices` float64 [v, 3], `faces` int32 [n_f, 3].
         base_faces: Stop when no more faces than this are left, >= 1.
-        link_condition: Put merges that break the link condition after all others.
         progress: Called as progress(stage, done, total) between launches; stages "collapse" and "LOD bounds".
+        sizes: `LaunchSizes`.
+
     Raises ValueError for empty, non-finite or oversized meshes, bad indices, base_faces < 1, or if no face has three
     distinct corners.
     Source: Garland and Heckbert 1997 (collapse).
@@ -146,10 +159,10 @@ def build_progressive(mesh, base_faces=10, link_condition=False, progress=None):
     vertices, faces = _checked(mesh, base_faces)
     report = progress if progress is not None else lambda stage, done, total: None
     centre, scale = find_frame(vertices)
-    parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), bool(link_condition), report)
+    parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), report, sizes)
     vertex_pos = np.concatenate([vertices, centre + scale * pos[len(vertices) :]])
     face_split, split_start, split_face = _splits(parent, faces, len(vertices))
-    lod_error = _deviation(vertex_pos, parent, faces, report)
+    lod_error = _bound_errors(vertex_pos, parent, faces, report, sizes.covers)
     return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, lod_error)
 
 
@@ -204,67 +217,69 @@ def _cpu(values, dtype):
     return wp.array(values, dtype=dtype, device="cpu")
 
 
-def _filled(count, value, dtype=int):
-    return wp.full(count, value, dtype=dtype, device="cpu")
+def _filled(count, value):
+    return wp.full(count, value, dtype=int, device="cpu")
+
+
+def _points(*shape):
+    return wp.zeros(shape, dtype=wp.vec3d, device="cpu")
+
+
+def _launch(kernel, *inputs):
+    wp.launch(kernel, dim=1, inputs=inputs, device="cpu")
 
 
 def _linked_rings(faces, face_array, node_capacity):
-    """Return `forest.Rings` of the original mesh with room for `node_capacity` nodes."""
-    rings = forest.Rings()
+    """Return `vertex_forest.Rings` of the original mesh with room for `node_capacity` nodes."""
+    rings = vertex_forest.Rings()
     rings.head = _filled(node_capacity, -1)
     rings.degree = _filled(node_capacity, 0)
     rings.next = _filled(3 * len(faces), -1)
     rings.corner_node = _filled(3 * len(faces), -1)
-    wp.launch(forest.link_rings_kernel, dim=1, inputs=[len(faces), face_array, rings], device="cpu")
+    _launch(vertex_forest.link_rings_kernel, len(faces), face_array, rings)
     return rings
 
 
-def _collapse(pos, faces, base_faces, link_condition, report):
+def _collapse(pos, faces, base_faces, report, sizes):
     """Run the collapse; return vertex_parent int32 [n_v+m] and all normalised positions float64 [n_v+m, 3]."""
     vertex_count, capacity = len(pos), 2 * len(pos)
     edges, boundary = _edges(faces)
     face_array = _cpu(faces, int)
     surface = collapse.Surface()
     surface.pos = _cpu(np.concatenate([pos, np.zeros_like(pos)]), wp.vec3d)
-    surface.quadric = wp.zeros(capacity, dtype=collapse.Quadric, device="cpu")
+    surface.quadric = wp.zeros(capacity, dtype=Quadric, device="cpu")
     surface.parent = _filled(capacity, -1)
     surface.stamp = _filled(capacity, -1)
     rings = _linked_rings(faces, face_array, capacity)
-    wp.launch(
-        collapse.weigh_faces_kernel,
-        dim=1,
-        inputs=[len(faces), face_array, _cpu(boundary, wp.int8), surface],
-        device="cpu",
-    )
-    heap = collapse.Heap()
-    size = len(edges)
-    room = HEAP_ROOM[0] * size + HEAP_ROOM[1]
+    _launch(collapse.weigh_faces_kernel, len(faces), face_array, _cpu(boundary, wp.int8), surface)
+    heap, size = Heap(), len(edges)
+    room = sizes.heap_per_edge * size + sizes.heap_extra
     heap.pair = _cpu(np.resize(edges, room), wp.int64)
     heap.key = wp.zeros(room, dtype=wp.float64, device="cpu")
-    wp.launch(collapse.price_edges_kernel, dim=1, inputs=[size, heap.pair, surface, heap.key], device="cpu")
+    _launch(collapse.price_edges_kernel, size, heap.pair, surface, heap.key)
     start_live = int(_distinct(faces).sum())
     counter = _cpu(np.array([size, 0, start_live, collapse.RUNNING], dtype=np.int32), int)
-    wp.launch(collapse.compact_heap_kernel, dim=1, inputs=[surface, heap, counter], device="cpu")
+    _launch(collapse.compact_heap_kernel, surface, heap, counter)
     state = counter.numpy()  # shares the memory
     goal = max(start_live - base_faces, 1)
     while state[3] != int(collapse.FINISHED):
         if state[3] == int(collapse.HEAP_FULL):
             heap = _roomier_heap(surface, heap, counter)
-        sizes = [vertex_count, base_faces, MERGES_PER_LAUNCH, len(heap.key), int(link_condition)]
-        wp.launch(collapse.collapse_edges_kernel, dim=1, inputs=[*sizes, surface, rings, heap, counter], device="cpu")
+        limits = [vertex_count, base_faces, sizes.merges, len(heap.key)]
+        _launch(collapse.collapse_edges_kernel, *limits, surface, rings, heap, counter)
         report("collapse", min(start_live - int(state[2]), goal), goal)
     nodes = vertex_count + int(state[1])
     return surface.parent.numpy()[:nodes].copy(), surface.pos.numpy()[:nodes]
 
 
 def _roomier_heap(surface, heap, counter):
-    """Drop stale entries; where that leaves the heap fairly full, or a hub's edges want more, return a larger one."""
+    """Drop stale entries; return a larger heap if more than three quarters or the next merge's edges do not fit."""
     before = int(counter.numpy()[0])
-    wp.launch(collapse.compact_heap_kernel, dim=1, inputs=[surface, heap, counter], device="cpu")
+    _launch(collapse.compact_heap_kernel, surface, heap, counter)
     size, capacity = int(counter.numpy()[0]), len(heap.key)
     if 4 * size <= 3 * capacity < 4 * before:
         return heap
-    larger = collapse.Heap()
+    larger = Heap()
     larger.key = wp.zeros(capacity + capacity // 2 + 64, dtype=wp.float64, device="cpu")
     larger.pair = wp.zeros(capacity + capacity // 2 + 64, dtype=wp.int64, device="cpu")
     wp.copy(larger.key, heap.key, count=size)
@@ -279,41 +294,42 @@ def _splits(parent, faces, vertex_count):
     face_array, parent_array = _cpu(faces, int), _cpu(parent, int)
     size = wp.zeros(merge_count + 1, dtype=wp.int64, device="cpu")
     face_split = wp.zeros(len(faces), dtype=int, device="cpu")
-    inputs = [vertex_count, node_count, face_array, parent_array]
-    wp.launch(forest.count_events_kernel, dim=1, inputs=[*inputs, size, face_split], device="cpu")
+    _launch(vertex_forest.count_events_kernel, vertex_count, node_count, face_array, parent_array, size, face_split)
     split_start = np.concatenate([[0], np.cumsum(size.numpy()[:merge_count])]).astype(np.int64)
     split_face = wp.zeros(int(split_start[-1]), dtype=int, device="cpu")
     cursor = _cpu(split_start.copy(), wp.int64)
-    wp.launch(forest.fill_events_kernel, dim=1, inputs=[*inputs, cursor, split_face], device="cpu")
+    _launch(vertex_forest.fill_events_kernel, node_count, face_array, parent_array, cursor, split_face)
     return face_split.numpy(), split_start, split_face.numpy()
 
 
-def _deviation(vertex_pos, parent, faces, report):
-    """Return lod_error float64 [m+1]."""
+def make_scratch(candidates, faces, rows):
+    """Return `polygon.Scratch` for so many candidate faces, covering faces and polygons on the stack."""
+    scratch, corners = polygon.Scratch(), int(polygon.CORNERS)
+    scratch.near, scratch.used = _filled(candidates, 0), _filled(faces, 0)
+    scratch.stack, scratch.stack_count = _points(rows, corners), _filled(rows, 0)
+    scratch.polygon, scratch.clipped = _points(corners), _points(corners)
+    return scratch
+
+
+def _bound_errors(vertex_pos, parent, faces, report, covers):
+    """Return lod_error float64 [m+1]; `covers` triangles are covered per launch."""
     centre, scale = find_frame(vertex_pos[np.unique(faces)])
-    merge_count, face_count = _merge_count(parent), len(faces)
-    vertex_count = len(parent) - merge_count
+    child = np.flatnonzero(parent >= 0)
+    merge_count, face_count = len(child) // 2, len(faces)  # every merge has exactly two children
     if merge_count == 0:
         return np.zeros(1)
-    child = np.flatnonzero(parent >= 0)
     pair = child[np.argsort(parent[child], kind="stable")].reshape(-1, 2)
-    rings = _linked_rings(faces, _cpu(faces, int), len(parent))
+    face_array = _cpu(faces, int)
+    rings = _linked_rings(faces, face_array, len(parent))
     replay = _replay((vertex_pos - centre) / scale, face_count)
-    scratch = piece.Scratch()
-    scratch.near = _filled(face_count, 0)
-    scratch.used = _filled(deviation.SLOTS, 0)
-    scratch.waiting = wp.zeros((piece.STACK, piece.CORNERS), dtype=wp.vec3d, device="cpu")
-    scratch.waiting_count = _filled(piece.STACK, 0)
-    scratch.piece = wp.zeros(piece.CORNERS, dtype=wp.vec3d, device="cpu")
-    scratch.inner = wp.zeros(piece.CORNERS, dtype=wp.vec3d, device="cpu")
+    scratch = make_scratch(face_count, triangle_cover.SLOTS, polygon.STACK)
     counter = _filled(6, 0)
-    inputs = [face_count, _cpu(faces, int), rings.corner_node, replay, counter]
-    wp.launch(deviation.start_replay_kernel, dim=1, inputs=inputs, device="cpu")
+    _launch(hausdorff_bound.start_replay_kernel, face_count, face_array, rings.corner_node, replay, counter)
     bound_sq = wp.zeros(merge_count, dtype=wp.float64, device="cpu")
-    inputs = [vertex_count, merge_count, COVERS_PER_LAUNCH, _cpu(pair, int), replay, scratch, rings, counter, bound_sq]
+    inputs = [len(parent) - merge_count, merge_count, covers, _cpu(pair, int)]
     state = counter.numpy()  # shares the memory
     while state[0] < merge_count:
-        wp.launch(deviation.replay_merges_kernel, dim=1, inputs=inputs, device="cpu")
+        _launch(hausdorff_bound.replay_merges_kernel, *inputs, replay, scratch, rings, counter, bound_sq)
         if state[5] < 0:
             bvh = _index(replay, rings)
             replay.bvh, state[5] = bvh.id, state[1]
@@ -322,20 +338,14 @@ def _deviation(vertex_pos, parent, faces, report):
     return np.append(error[::-1], 0.0)
 
 
-def _merge_count(parent):
-    # every merge has exactly two children
-    return int(np.count_nonzero(parent >= 0)) // 2
-
-
 def _replay(pos, face_count):
-    replay = deviation.Replay()
+    replay = triangle_cover.Replay()
     replay.pos = _cpu(pos, wp.vec3d)
-    for name in ("triangle_pos", "face_pos"):
-        setattr(replay, name, wp.zeros((face_count, 3), dtype=wp.vec3d, device="cpu"))
-    replay.face_box = wp.zeros((face_count, 2), dtype=wp.vec3d, device="cpu")
+    replay.triangle_pos, replay.face_pos = _points(face_count, 3), _points(face_count, 3)
+    replay.face_box = _points(face_count, 2)
     for name in ("face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face"):
         setattr(replay, name, _filled(face_count, -1))
-    pooled = 3 * face_count + 4096  # a pool that runs dry loosens bounds, no more
+    pooled = 3 * face_count + 4096  # an empty pool loosens bounds only
     for name in ("slot_face", "slot_triangle", "slot_sibling", "slot_next", "slot_last"):
         setattr(replay, name, _filled(face_count + pooled, -1))
     replay.free_slot = _filled(pooled, 0)
@@ -344,7 +354,7 @@ def _replay(pos, face_count):
 
 
 def _index(replay, rings):
-    """Return a wp.Bvh over the active faces, for triangles whose piece vanishes."""
+    """Return a wp.Bvh over the active faces, for triangles whose connected component vanishes."""
     active = np.flatnonzero(rings.corner_node.numpy()[::3] >= 0).astype(np.int32)
     corners = replay.face_pos.numpy()[active]
     lower, upper = corners.min(axis=1).astype(np.float32), corners.max(axis=1).astype(np.float32)

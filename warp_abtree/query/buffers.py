@@ -36,7 +36,7 @@ class QueryBuffers:
 
     def _make_hits(self):
         hits = face_pairs.Hits()
-        for name in ("total", "unsure_total", "hard_total"):
+        for name in ("total", "uncertain_total", "inexact_total"):
             setattr(hits, name, wp.zeros(1, dtype=wp.int32, device=self.device))
         return hits
 
@@ -131,8 +131,8 @@ class QueryBuffers:
             self.within.fill_(float(self._within))
 
     def _resize_uncertain(self, capacity: int):
-        hard = capacity if self.precision == "exact" else 0
-        made = [("unsure", capacity), ("hard", hard)]
+        inexact = capacity if self.precision == "exact" else 0
+        made = [("uncertain", capacity), ("inexact", inexact)]
         self._replace([(self.hits, name, wp.empty(room, dtype=wp.vec3i, device=self.device)) for name, room in made])
 
     def resize(self, capacity: int):

@@ -6,11 +6,10 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.traversal import dual_tree as traverse
+from warp_abtree.kernels.traversal import dual_tree, simd, uncertain_pairs
 from warp_abtree.kernels.traversal import face_pairs as faces
 from warp_abtree.kernels.traversal import load_balance as share
 from warp_abtree.kernels.traversal import relative_pose as relate
-from warp_abtree.kernels.traversal import uncertain_pairs as settle
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.buffers import QueryBuffers
@@ -32,8 +31,8 @@ UNCERTAIN_ROOM = 65536
 # Warps that one multiprocessor runs at a time by their registers: of the traversal, of float64, of exact signs.
 WARPS_A_PROCESSOR = 16
 FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
-# So that each finds a mailbox for all that it gives away at once.
-WARPS_MAX = share.MAILBOX_COUNT // int(share.SHARES_AT_ONCE)
+# So that each finds a slot for all that it gives away at once.
+WARPS_MAX = share.SLOT_COUNT // int(share.DONATIONS_AT_ONCE)
 
 EXACT = int(PRECISIONS["exact"])
 
@@ -114,11 +113,11 @@ class Query(QueryBuffers):
 
     def _make_work(self):
         work, device = share.Work(), self.device
-        slots = share.MAILBOX_COUNT if self.uses_warps() else 0
+        slots = share.SLOT_COUNT if self.uses_warps() else 0
         work.counter = wp.zeros(share.COUNTER_COUNT, dtype=wp.int32, device=device)
         work.flag = wp.zeros(slots, dtype=wp.int32, device=device)
         work.owner = wp.empty(slots, dtype=wp.vec2i, device=device)
-        work.item = wp.empty(slots * share.MAILBOX_ITEMS, dtype=wp.int64, device=device)
+        work.item = wp.empty(slots * share.SLOT_ITEMS, dtype=wp.int64, device=device)
         work.record = self.guard.record()
         self.guard.write_to(work.record)
         return work
@@ -162,26 +161,27 @@ class Query(QueryBuffers):
     def _launch_traversal(self, within, hits, mode, output):
         pools = self.batch.pools
         room = len(self.pairs)
-        parts_max = self._regime.warps_per_pair
-        inputs = [parts_max, output, *pools, self.pair_count, self.pairs, within]
+        warps_per_pair = self._regime.warps_per_pair
+        self.work.warps_per_pair = warps_per_pair
+        inputs = [output, *pools, self.pair_count, self.pairs, within]
         self.guard.record()
         inputs += [self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
-        wp.launch(relate.relate_pair_kernel, dim=dim, inputs=inputs, device=self.device)
+        wp.launch(relate.relative_pose_kernel, dim=dim, inputs=inputs, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits]
         if not self.uses_warps():
             cores = current_regime().cpu_threads or core_count()
             # A launch on a further core costs some 50 us: the work of many pairs apart, of less than one in contact.
             least = 32 if output == int(faces.OUTPUT_ANY) else 1
-            launch_on_cores(traverse.thread_traversal(mode), room, [*inputs, self.work], self.device, cores, least)
+            launch_on_cores(simd.thread_traversal(mode), room, [*inputs, self.work], self.device, cores, least)
             return
         # More than there are parts: those that find none wait for shares.
-        warps = max(room, int(4 * parts_max * math.sqrt(room)) + 1)
+        warps = max(room, int(4 * warps_per_pair * math.sqrt(room)) + 1)
         warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         wp.launch(
-            traverse.warp_traversal(mode, output == int(faces.OUTPUT_ANY)),
+            dual_tree.warp_traversal(mode, output == int(faces.OUTPUT_ANY)),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
-            inputs=[parts_max, self._stack_length(), *inputs, self.work],
+            inputs=[self._stack_length(), *inputs, self.work],
             block_dim=WARP_SIZE,
             device=self.device,
         )
@@ -196,11 +196,11 @@ class Query(QueryBuffers):
             return
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
         self._launch_traversal(self._no_distance, self.hits, mode, output)
-        if len(self.hits.unsure):
-            first = settle.filter_faces_kernel if mode == EXACT else settle.settle_traversal(mode)
+        if len(self.hits.uncertain):
+            first = uncertain_pairs.float64_filter_kernel if mode == EXACT else uncertain_pairs.resolve_rounded_kernel
             passes = [(first, FILTER_WARPS_A_PROCESSOR)]
             if mode == EXACT:
-                passes.append((settle.settle_hard_kernel, EXACT_WARPS_A_PROCESSOR))
+                passes.append((uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR))
             models, states, _ = self.batch.pools
             for kernel, warps in passes:
                 threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
@@ -261,7 +261,7 @@ class Query(QueryBuffers):
     def grow_uncertain(self):
         """Make room for the face pairs that wait, as far as there can be, and traverse again until all find it."""
         # How many wait varies for `any`, where the first hit of a pair ends its traversal.
-        while 0 < len(self.hits.unsure) < min(LIST_MAX, demand := self._sum(self.hits.float64_tests)):
+        while 0 < len(self.hits.uncertain) < min(LIST_MAX, demand := self._sum(self.hits.float64_tests)):
             self._resize_uncertain(min(2 * demand, LIST_MAX))
             self.traverse()
 

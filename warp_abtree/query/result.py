@@ -85,7 +85,7 @@ class Result:
         self.pairs = pairs
         self._pair_demand, self._pair_room = pair_demand, len(query.pairs)
         self._hit_demand, self._hit_room = 0, len(hits.face)
-        self._uncertain_room = len(hits.unsure)
+        self._uncertain_room = len(hits.uncertain)
         self.any = hits.any_hit.numpy()[:p] != 0
         # Any: who asked for them knows that they are not None.
         self.apart: Any = None if near is None else near.any_hit.numpy()[:p] == 0

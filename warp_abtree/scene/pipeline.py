@@ -142,7 +142,7 @@ class FrameGraph:
     def _fit_uncertain(self, capacity):
         """Make room for the uncertain face pairs, unless that room was given; then say what it lacks."""
         given = check_capacity(capacity).uncertain
-        needed, room = int(self._demand.numpy()[2]), len(self.query.hits.unsure)
+        needed, room = int(self._demand.numpy()[2]), len(self.query.hits.uncertain)
         if not 0 < room < needed:
             return
         if given is None:
@@ -164,7 +164,7 @@ class FrameGraph:
             self._set_objects()
             self.query.launch()
             hits, launched = self.query.hits, self.query.guard.launched
-            inputs = [self.query.pair_count, hits.total, hits.unsure_total, launched, self._demand]
+            inputs = [self.query.pair_count, hits.total, hits.uncertain_total, launched, self._demand]
             wp.launch(kernels.tally_demand_kernel, 1, inputs, device=self.device)
 
     def _set_objects(self):
@@ -237,8 +237,8 @@ class FrameGraph:
         room = {"pairs": (found, len(self.query.pairs))}
         if self.query.output == "faces":
             room["hits"] = hits, len(self.query.hits.face)
-        if len(self.query.hits.unsure):
-            room["uncertain"] = unsure, len(self.query.hits.unsure)
+        if len(self.query.hits.uncertain):
+            room["uncertain"] = unsure, len(self.query.hits.uncertain)
         for name, (demand, places) in room.items():
             if demand > places:
                 needed = f"Buffers({name}={demand})"

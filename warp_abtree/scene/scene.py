@@ -62,7 +62,7 @@ class Scene:
         self.object_model: list[int] = []
         self.object_importance: list[int] = []
         self._world: list[int] = []
-        self._static: list[bool] = []
+        self.object_static: list[bool] = []
         self._added_pose: list[np.ndarray] = []
         self._lod: list[int] = []
         self._excluded = np.empty(0, np.int64)
@@ -107,7 +107,7 @@ class Scene:
         known = next((i for i, other in enumerate(self.models) if other is model), len(self.models))
         self._retire()
         count = self.object_count
-        columns: list[list] = [self._world, self._static, self._added_pose, self._lod]
+        columns: list[list] = [self._world, self.object_static, self._added_pose, self._lod]
         columns += [self.object_importance, self.object_model]
         try:
             if known == len(self.models):
@@ -146,7 +146,7 @@ class Scene:
             check_device(self.device, "making a scene's arrays")
             models = ModelArrays(self.models, self.device)
             states = StateArrays(models, self.device)
-            objects = ObjectArrays(self._world, self._static, self.device)
+            objects = ObjectArrays(self._world, self.object_static, self.device)
             batch = Batch(models, states, objects, self.object_model, self._excluded)
             batch.set_lods(np.array(self._lod))
             self._place_added(objects.pool)

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy
-from warp_abtree.checks.device_lock import device_turn
+from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.sweep import NONE_REFUSED, place_matrix_kernel, place_quaternion_kernel, report_chunk_kernel
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request
@@ -207,7 +207,7 @@ class _ChunkQuery:
 
     def _begin(self, slot, poses, start, count):
         self._load(slot, poses, start, count)
-        slot.uncertain_room = len(self.query.hits.unsure)
+        slot.uncertain_room = len(self.query.hits.uncertain)
         if count != self.count:
             self.query.pair_count.fill_(count)
             self.count = count
@@ -277,7 +277,7 @@ class _ChunkQuery:
         return np.concatenate(parts)
 
     def is_small(self):
-        return len(self.query.hits.face) + len(self.query.hits.unsure) <= KEPT_ROWS
+        return len(self.query.hits.face) + len(self.query.hits.uncertain) <= KEPT_ROWS
 
 
 def _keep(key, posed):
@@ -317,7 +317,7 @@ def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precisi
     check_request(output, precision)
     pair = Scene(device)
     check_device(pair.device, "ab.sweep")
-    with device_turn(pair.device):
+    with device_lock(pair.device):
         return _sweep(pair, (model_a, model_b), poses, (lod_a, lod_b), output, precision)
 
 

@@ -53,7 +53,7 @@ class DeviceLodUpdate(WorkLists):
         self.splits.bound_start = upload(np.cumsum(bounds) - bounds)
         self.splits.partial_max = upload(partial_max)
         self.splits.depth = upload(models.depth)
-        plan = work_lists.UpdatePlan()
+        plan = work_lists.UpdateLists()
         plan.partial_total, plan.full_total = room(1, wp.int64), room(1, wp.int64)
         for name in ("partial_state", "slice_start", "entry_end", "full_state", "face_end"):
             setattr(plan, name, room(count))

@@ -8,7 +8,7 @@ import warp as wp
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import refit
-from warp_abtree.kernels.update.work_lists import UpdatePlan
+from warp_abtree.kernels.update.work_lists import UpdateLists
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.work_lists import WorkLists, active_update, make_level_lists, refine_meshes
 
@@ -125,7 +125,7 @@ class LodUpdate(WorkLists):
         whole_count = np.array([np.sum(depth[whole] >= level) for level in range(int(LEVEL_MAX))], np.int64)
         marked_room = [min(entries, int(np.sum(depth[partial_id] >= level)) << level) for level in levels]
         level_room = [room + (int(whole_count[level]) << level) for level, room in enumerate(marked_room)]
-        device, plan = self.states.device, UpdatePlan()
+        device, plan = self.states.device, UpdateLists()
 
         def upload(values, dtype=wp.int32):
             return wp.array(np.asarray(values, np.int64), dtype=dtype, device=device)

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_abtree.kernels.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import mark, refine, refit
-from warp_abtree.kernels.update.work_lists import UpdatePlan
+from warp_abtree.kernels.update.work_lists import UpdateLists
 
 # Nodes of a level that one block refits, at most: a launch costs about as much. And the threads of that block.
 TOP_ROOM = 1024
@@ -34,19 +34,19 @@ class WorkLists:
     """What the kernels of an update of many tree states work through, and the most that there can be of it.
 
     Attributes:
-        plan: `UpdatePlan` for kernels.
+        plan: `UpdateLists` for kernels.
         entry_room, face_room: Faces in the slices of partial updates, and of states under full update, at most.
         level_room: Nodes to refit on each level, the root's first, at most; as many entries as there are levels.
     """
 
-    plan: UpdatePlan
+    plan: UpdateLists
     entry_room: int
     face_room: int
     level_room: list
     device: wp.Device
 
 
-def make_level_lists(plan: UpdatePlan, marked_room: list, device):
+def make_level_lists(plan: UpdateLists, marked_room: list, device):
     """Make the worklists of an update, each of its own length."""
     room = np.zeros(int(LEVEL_MAX), np.int64)
     room[: len(marked_room)] = marked_room

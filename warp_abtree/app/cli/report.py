@@ -188,7 +188,7 @@ def print_summary(summary):
     table = [["a frame", "mean", "min", "max"]]
     for name, label in (
         ("pairs", "candidate pairs"),
-        ("touching", "pairs that intersect"),
+        ("intersecting", "pairs that intersect"),
         ("hits", "intersecting face pairs"),
         ("faces", "active faces"),
         ("states", "tree states"),
@@ -222,8 +222,9 @@ def _print_budget(summary):
         return
     print(
         f"after the first second: {100 * budget['within']:.1f} % of {budget['frames']} frames within it, "
-        f"{100 * budget['within_tenth']:.1f} % within 10 % more; the worst took {budget['worst']:.2f} of it, "
-        f"{budget['longest_over']} in a row were over; LODs turned back {budget['turns']:.2f} times a second and object"
+        f"{100 * budget['within_110_percent']:.1f} % within 10 % more; the worst took {budget['worst']:.2f} of it, "
+        f"{budget['longest_over']} in a row were over; "
+        f"the LOD of an object reversed {budget['oscillations']:.2f} times a second"
     )
 
 

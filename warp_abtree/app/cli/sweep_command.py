@@ -8,8 +8,7 @@ from pathlib import Path
 
 from warp_abtree.app.cli.report import print_json
 from warp_abtree.app.toml.scene_file import load_scene
-from warp_abtree.jobs.ray_pool import RayPool, WorldsJob
-from warp_abtree.jobs.shards import SweepJob, ThisProcess, run_shards
+from warp_abtree.jobs import RayPool, SweepJob, ThisProcess, WorldsJob, run_shards
 from warp_abtree.model.model import Model
 from warp_abtree.simulate.frame import resolve_lod
 

@@ -7,14 +7,15 @@ import numpy as np
 
 from warp_abtree.app.toml import keys as keys_of
 from warp_abtree.lod.controllers import PaperController, PredictiveController, ToleranceController
-from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.view import Camera
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.rigid_bodies import Dynamics, Kinematic
+from warp_abtree.simulate.motion import Kinematic
+from warp_abtree.simulate.rigid_bodies import Dynamics
 
 CONTROLLERS = ("predictive", "paper", "tolerance", "none")
 # Which options of [lod] each controller hears.
 _OPTIONS = {
-    "predictive": ("steps", "spacing", "window", "aim", "low", "patience", "loosest"),
+    "predictive": ("steps", "spacing", "window", "aim", "low", "hold_frames", "loosest"),
     "paper": ("steps", "window", "threshold_ms"),
     "tolerance": ("steps", "spacing", "window", "loosest"),
 }
@@ -143,7 +144,7 @@ def read_lod(keys: keys_of.Keys | None) -> LodControl:
         "threshold_ms": keys_of.LENGTH,
         "aim": keys_of.PART,
         "low": keys_of.PART,
-        "patience": keys_of.whole(0, 2**30),
+        "hold_frames": keys_of.whole(0, 2**30),
         "loosest": keys_of.number(1.0),
     }
     options = {name: keys.take(name, check) for name, check in checks.items() if name in keys.values}
@@ -190,8 +191,8 @@ class DynamicsSettings:
             kinematic: Which objects follow the motion, bool (n,).
             body: density, restitution and friction of each object, (n,).
         """
-        spin = motion.axis * motion.rate[:, None]
-        moving = {"velocity": motion.velocity, "spin": spin, "kinematic": kinematic}
+        angular_velocity = motion.axis * motion.rate[:, None]
+        moving = {"velocity": motion.velocity, "angular_velocity": angular_velocity, "kinematic": kinematic}
         return Dynamics(scene, **self.options, **body, **moving)
 
 

@@ -56,7 +56,7 @@
     steps = 50                       # LODs that objects may stand at; spacing = "ratio" or "operations" (not paper)
     window = 10                      # frames over which motion on the screen is measured
     threshold_ms = 0.8               # paper: t; a tenth of the budget by default
-    aim = 0.9                        # predictive: parts of the budget; also low, patience, loosest
+    aim = 0.9                        # predictive: parts of the budget; also low, hold_frames, loosest
     loosest = 64.0                   # predictive, tolerance: most that a tolerance is loosened
 
     [camera]                         # whom LODs are for: near, still objects come first
@@ -117,7 +117,8 @@ from warp_abtree.app.toml.keys import Keys, SceneError
 from warp_abtree.app.toml.models import read_model
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame, LodSweep, resolve_lod
-from warp_abtree.simulate.rigid_bodies import Dynamics, Kinematic
+from warp_abtree.simulate.motion import Kinematic
+from warp_abtree.simulate.rigid_bodies import Dynamics
 
 OBJECT_LIMIT = 1_000_000  # of one entry
 

@@ -14,7 +14,7 @@ from warp_abtree.app.viewer import text as view_text
 from warp_abtree.app.viewer.playback import OWN, STILL
 from warp_abtree.app.viewer.render_data import tree_depth
 from warp_abtree.app.viewer.viewer_scene import Composer, Settings, Stage
-from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.view import Camera
 
 FRAME_SECONDS = 1 / 30  # between moments that are sent, at the least
 TEXT_SECONDS = 0.2  # between changes of numbers and plots while it plays

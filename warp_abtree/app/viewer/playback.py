@@ -16,7 +16,7 @@ from warp_abtree.app.recording import FORMAT_NAME, Recording
 from warp_abtree.app.toml.control import LodControl
 from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.scene_file import load_scene
-from warp_abtree.lod.selection import Camera
+from warp_abtree.lod.view import Camera
 from warp_abtree.model.model import Model
 from warp_abtree.query.result import Result
 from warp_abtree.scene.scene import Scene

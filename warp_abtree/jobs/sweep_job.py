@@ -1,37 +1,27 @@
-"""Jobs that take long, in shards: each a file that appears whole or not at all, so that a job can be gone on with.
+"""One pair of models at many poses, as a job."""
 
-The same job writes the same bytes, whoever does it; `shard_folder` says what is written and how it is checked.
-"""
-
-import dataclasses
 import hashlib
 import os
-from collections import deque
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from warp_abtree.checks.arguments import to_numpy, whole_number
-from warp_abtree.checks.atomic_write import sweep_up
-from warp_abtree.checks.device_lock import device_turn
-from warp_abtree.jobs.shard_folder import ShardFolder
 from warp_abtree.model.model import Model
 from warp_abtree.query.request import check_request
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep import sweep
 
-# Poses of a shard, and rows looked at in one piece while a job is checked.
+# Poses of a shard, and rows read at a time while a job is checked.
 READ_ROWS = SHARD = 65536
-# Objects and bytes of tree states of a scene that asks contacts, or LODs that change from pose to pose.
+# Limits of the scene that finds contacts, or LODs that differ between poses: poses at a time, bytes of tree states.
 SCENE_POSES, STATE_BYTES, BYTES_A_FACE = 4096, 2**28, 190
 
 
 class _Rows:
-    """Rows of numbers, in memory or in an .npy file of which no more is read than what is asked."""
+    """Rows of numbers in memory, or in an .npy file that is read in parts."""
 
     path: Any  # of the file; None in memory
 
@@ -58,7 +48,7 @@ class _Rows:
         self.count, self.width = shape
 
     def read(self, start, stop) -> np.ndarray:
-        """Return rows, of an array in memory without a copy."""
+        """Return a range of rows, without a copy if they are in memory."""
         if self.array is not None:
             return self.array[start:stop]
         row = self.width * self.dtype.itemsize
@@ -69,17 +59,17 @@ class _Rows:
             raise ValueError(f"{self.what}: {self.path} ends before row {stop}")
         return rows.reshape(-1, self.width)
 
-    def check(self, judge) -> str:
-        """Look at all rows and return a hash of them; judge(first row, rows) raises where one is bad."""
+    def hash_checked(self, check) -> str:
+        """Return a hash of all rows; check(index of the first, rows) is called on each part and raises on bad rows."""
         found = hashlib.sha256(f"{self.dtype.str} {self.count}".encode())
         for start in range(0, self.count, READ_ROWS):
             rows = self.read(start, min(start + READ_ROWS, self.count))
-            judge(start, rows)
+            check(start, rows)
             found.update(rows.tobytes())
         return found.hexdigest()
 
 
-def _judge_poses(start, rows):
+def _check_poses(start, rows):
     rows = rows.astype(np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
         norm = np.sqrt((rows[:, 3:] ** 2).sum(1))
@@ -94,36 +84,26 @@ def _judge_poses(start, rows):
         )
 
 
-def hash_model(model) -> str:
-    """Return a hash of a model's mesh, collapses and tree."""
-    found = hashlib.sha256()
-    arrays = [getattr(model.progressive, field.name) for field in dataclasses.fields(model.progressive)]
-    for array in (*arrays, model.tree.leaf_node):
-        found.update(f"{array.dtype.str} {array.shape}".encode())
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()
-
-
 class SweepJob:
-    """One pair of models at very many poses, or LODs, as a job for `run_shards`.
+    """One pair of models at many poses, or LODs, as a job for `run_shards`.
 
-    All poses and LODs are looked at here, in pieces.
+    The constructor checks all poses and LODs, part by part.
 
     Args:
         model_a, model_b: `Model`; may be the same.
         poses: (p, 7) as for `sweep`, an array or the path of an .npy file.
         lods: LODs of A and B: (2,) for all poses, or (p, 2), an array or the path of an .npy file; None is the finest.
-            Poses whose LODs are those of the pose before, or of others near it, are asked faster.
+            Poses with the LODs of nearby poses are faster.
         output: "any", "count", "faces" or "contacts".
         precision: As for `sweep`.
-        shard: Poses a shard.
+        shard: Poses per shard.
 
     Attributes:
         count: Poses.
 
     Raises:
         TypeError: model_a or model_b is no Model.
-        ValueError: Bad poses or LODs, the first of which is named, or an unknown option.
+        ValueError: Bad poses or LODs (the message names the first), or an unknown option.
     """
 
     unit = "pose"
@@ -145,19 +125,19 @@ class SweepJob:
         self.count = self.poses.count
         if self.lods is not None and self.lods.count != self.count:
             raise ValueError(f"lods: {self.lods.count} given for {self.count} poses")
-        asked = self.fixed if self.lods is None else self.lods.check(self._judge_lods)
+        known_lods = self.fixed if self.lods is None else self.lods.hash_checked(self._check_lods)
         self._known = {
             "kind": "sweep",
             "count": self.count,
             "shard": self.shard,
-            "models": [hash_model(model) for model in self.models],
-            "poses": self.poses.check(_judge_poses),
-            "lods": asked,
+            "models": [model.digest for model in self.models],
+            "poses": self.poses.hash_checked(_check_poses),
+            "lods": known_lods,
             "output": output,
             "precision": precision,
         }
 
-    def _judge_lods(self, start, rows):
+    def _check_lods(self, start, rows):
         top = np.array([model.lod_max for model in self.models])
         bad = np.flatnonzero(~((rows >= 0) & (rows <= top) & (rows == np.floor(rows))).all(1))
         if len(bad):
@@ -167,32 +147,32 @@ class SweepJob:
             )
 
     def describe(self) -> dict:
-        """Return all that the answers depend on, for JSON."""
+        """Return everything that determines the results, for JSON."""
         return self._known
 
-    def item(self, start, stop):
-        """Return what a worker is sent for a shard."""
+    def task(self, start, stop):
+        """Return the input of one shard, sent to a worker."""
         lods = None if self.lods is None else self.lods.read(start, stop).astype(np.int64)
         return start, self.poses.read(start, stop), lods
 
-    def asker(self) -> "SweepAsker":
-        """Return what a worker is sent once."""
-        return SweepAsker(self.models, self.fixed, self.output, self.precision)
+    def runner(self) -> "SweepRunner":
+        """Return the task runner, sent to each worker once."""
+        return SweepRunner(self.models, self.fixed, self.output, self.precision)
 
 
-class SweepAsker:
-    """Asks shards of a `SweepJob` on one device; pickled without what it keeps there."""
+class SweepRunner:
+    """Task runner of a `SweepJob` on one device; pickled without its scene."""
 
     def __init__(self, models, fixed, output, precision):
         self.models, self.fixed, self.output, self.precision = models, fixed, output, precision
-        self._scene: Any = None  # a Scene once it is asked for
+        self._scene: Any = None  # made at the first use
 
     def __getstate__(self):
         return {**vars(self), "_scene": None}
 
-    def ask(self, item, device=None) -> dict:
+    def run(self, task, device=None) -> dict:
         """Return the columns of a shard, arrays of one length."""
-        start, poses, lods = item
+        start, poses, lods = task
         if lods is None and self.output != "contacts":
             options = {"output": self.output, "precision": self.precision, "device": device}
             (model_a, model_b), (lod_a, lod_b) = self.models, self.fixed
@@ -202,7 +182,7 @@ class SweepAsker:
         room = self._make_scene(len(poses), device)
         for first in range(0, len(poses), room):
             part = slice(first, first + room)
-            result = self._ask_scene(poses[part], None if lods is None else lods[part], room)
+            result = self._intersect(poses[part], None if lods is None else lods[part], room)
             if self.output in ("any", "count"):
                 parts.append({self.output: getattr(result, self.output)})
                 continue
@@ -214,7 +194,7 @@ class SweepAsker:
         return {name: np.concatenate([columns[name] for columns in parts]) for name in parts[0]}
 
     def _make_scene(self, count, device) -> int:
-        """Make a scene with an A and a B for each of so many poses, unless there is one; return how many."""
+        """Make the scene, with an A and a B for each pose, at the first call; return how many poses it holds."""
         if self._scene is None:
             faces = sum(model.face_count for model in self.models)
             room = min(SCENE_POSES, count, max(1, STATE_BYTES // (BYTES_A_FACE * faces)))
@@ -225,8 +205,8 @@ class SweepAsker:
             self._scene = scene
         return self._scene.object_count // 2
 
-    def _ask_scene(self, poses, lods, room):
-        """Ask up to `room` poses; objects without one stay where they are."""
+    def _intersect(self, poses, lods, room):
+        """Intersect A and B at up to `room` poses; the other objects stay at the origin."""
         count = len(poses)
         placed = np.zeros((2 * room, 7))
         placed[:, 6] = 1.0
@@ -242,111 +222,3 @@ class SweepAsker:
 
 def _name_faces(faces, start) -> dict:
     return {"pose": faces[:, 0].astype(np.int64) + start, "face_a": faces[:, 1], "face_b": faces[:, 2]}
-
-
-# Doing a job.
-
-
-class ThisProcess:
-    """Does the shards of a job here, on one device or several, a thread for each of these.
-
-    Args:
-        device: Warp device, or a list of them; None for Warp's default.
-    """
-
-    lost = 0
-
-    def __init__(self, device=None):
-        names = list(device) if isinstance(device, list | tuple) else [device]
-        if not names:
-            raise ValueError("device: an empty list")
-        self.devices = [Scene(name).device for name in names]
-        self.workers = len(self.devices)
-
-    def ask(self, job, ranges):
-        """Yield (start, stop, columns) of each range, once, in any order."""
-        askers = [job.asker() for _ in self.devices]
-        waiting = deque(ranges)
-
-        def ask(k, part):
-            item = job.item(*part)  # each thread reads what it asks
-            with device_turn(self.devices[k]):
-                return askers[k].ask(item, self.devices[k])
-
-        # Kernels load on one thread at a time.
-        for k in range(self.workers):
-            if waiting:
-                part = waiting.popleft()
-                yield *part, ask(k, part)
-        if self.workers == 1:
-            while waiting:
-                part = waiting.popleft()
-                yield *part, ask(0, part)
-            return
-        threads = [ThreadPoolExecutor(1, thread_name_prefix="warp_abtree shard") for _ in askers]
-        under_way: dict = {}
-        before = wp.get_device()
-
-        def feed(k):
-            if waiting:
-                part = waiting.popleft()
-                under_way[threads[k].submit(ask, k, part)] = k, part
-
-        try:
-            for k in [*range(self.workers)] * 2:  # one at work, one ahead
-                feed(k)
-            while under_way:
-                for answered in wait(under_way, return_when=FIRST_COMPLETED).done:
-                    k, part = under_way.pop(answered)
-                    feed(k)
-                    yield *part, answered.result()
-        finally:
-            for thread in threads:
-                thread.shutdown(cancel_futures=True)
-            if wp.get_device() != before:  # threads share Warp's default
-                wp.set_device(before)
-
-
-def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:
-    """Do a job and write each shard as it comes; shards that are there already are checked and not done again.
-
-    A shard that is damaged, cut short or altered is done again. Memory is that of a few shards, whatever the size of
-    the job. One run at a time writes to a folder.
-
-    Args:
-        job: `SweepJob`, or `WorldsJob`.
-        out: Folder to make, or to go on in.
-        file: "npz", or "parquet", which needs pyarrow.
-        pool: What does the shards: `RayPool`, or `ThisProcess` by default.
-        progress: Called as progress("shards", done, total) after each, those found among them; before that as
-            progress("check", done, total) after each that is found and read.
-
-    Returns:
-        A dict: shards, found (those that were there and whole), damaged (those that were there and done again), count,
-        workers, and lost, workers that ended before their work.
-
-    Raises:
-        ValueError: The folder holds another job, a shard of another or something else; bad options. Nothing is written.
-        OSError: A file cannot be read or written.
-        RuntimeError: Work was lost again and again.
-    """
-    folder = ShardFolder(out, job, file)
-    pool = ThisProcess() if pool is None else pool
-    total, left = len(folder.left), folder.left
-    folder.open(progress)
-    found = done = total - len(left)
-    if progress is not None:
-        progress("shards", done, total)
-    for start, stop, columns in pool.ask(job, list(left)) if left else ():
-        if (start, stop) not in left:
-            raise RuntimeError(f"shard {start} to {stop} was answered twice")
-        folder.write(start, stop, columns)
-        del left[start, stop]
-        done += 1
-        if progress is not None:
-            progress("shards", done, total)
-    if left:
-        raise RuntimeError(f"{len(left)} of {total} shards were not answered")
-    sweep_up(folder.path)
-    about = {"shards": total, "found": found, "damaged": len(folder.damaged), "count": job.count}
-    return {**about, "workers": pool.workers, "lost": pool.lost}

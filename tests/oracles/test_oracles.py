@@ -6,8 +6,9 @@ import random
 import numpy as np
 import pytest
 import trimesh
-from oracles import abtree as abtree
-from oracles import triangle as triangle
+from helpers.samples import STILL, random_poses
+
+from oracles import abtree, triangle
 from oracles.peers import fcl_faces, judge
 
 # --- triangles -------------------------------------------------------------------------------------------------------
@@ -87,31 +88,26 @@ def orders(a, b):
         yield q, p
 
 
-@pytest.mark.parametrize("other, meets, case", KNOWN, ids=[case for _, _, case in KNOWN])
-def test_known_answers_in_every_vertex_order(other, meets, case):
-    for a, b in orders(FLAT, other):
+LINE, POINT = [(0, 0, 0), (2, 2, 2), (1, 1, 1)], [(1, 2, 3)] * 3
+# Segments and points: both triangles, and whether they meet.
+DEGENERATE = [
+    (LINE, [(3, 3, 3), (1, 1, 1), (9, 9, 9)], True),
+    (LINE, [(3, 3, 3), (4, 4, 4), (9, 9, 9)], False),
+    (LINE, [(1, 0, 0), (2, 1, 1), (3, 2, 2)], False),
+    (LINE, [(2, 0, 1), (0, 2, 1), (0, 2, 1)], True),
+    (LINE, [(2, 0, 1), (0, 2, 2), (0, 2, 2)], False),
+    (POINT, POINT, True),
+    (POINT, [(1, 2, 4)] * 3, False),
+    (POINT, [(0, 1, 2), (1, 2, 3), (2, 3, 4)], True),
+    ([(3, 4, 5)] * 3, [(0, 1, 2), (1, 2, 3), (2, 3, 4)], False),
+]
+
+
+@pytest.mark.parametrize("one, other, meets", [*((FLAT, other, meets) for other, meets, _ in KNOWN), *DEGENERATE])
+def test_known_answers_in_every_vertex_order(one, other, meets):
+    for a, b in orders(one, other):
         assert triangle.triangles_intersect(a, b) is meets
         assert triangle.triangles_intersect_fractions(a, b) is meets
-
-
-@pytest.mark.parametrize(
-    "a, b, meets",
-    [
-        ([(0, 0, 0), (2, 2, 2), (1, 1, 1)], [(3, 3, 3), (1, 1, 1), (9, 9, 9)], True),
-        ([(0, 0, 0), (2, 2, 2), (1, 1, 1)], [(3, 3, 3), (4, 4, 4), (9, 9, 9)], False),
-        ([(0, 0, 0), (2, 2, 2), (1, 1, 1)], [(1, 0, 0), (2, 1, 1), (3, 2, 2)], False),
-        ([(0, 0, 0), (2, 2, 2), (1, 1, 1)], [(2, 0, 1), (0, 2, 1), (0, 2, 1)], True),
-        ([(0, 0, 0), (2, 2, 2), (1, 1, 1)], [(2, 0, 1), (0, 2, 2), (0, 2, 2)], False),
-        ([(1, 2, 3)] * 3, [(1, 2, 3)] * 3, True),
-        ([(1, 2, 3)] * 3, [(1, 2, 4)] * 3, False),
-        ([(1, 2, 3)] * 3, [(0, 1, 2), (1, 2, 3), (2, 3, 4)], True),
-        ([(3, 4, 5)] * 3, [(0, 1, 2), (1, 2, 3), (2, 3, 4)], False),
-    ],
-)
-def test_known_answers_between_segments_and_points(a, b, meets):
-    for p, q in orders(a, b):
-        assert triangle.triangles_intersect(p, q) is meets
-        assert triangle.triangles_intersect_fractions(p, q) is meets
 
 
 @pytest.mark.slow
@@ -136,7 +132,7 @@ def test_filter_rejects_only_what_is_apart():
 
 def test_brute_force_equals_the_exact_test_of_every_pair():
     ball, ring = trimesh.creation.icosphere(subdivisions=1), trimesh.creation.torus(0.9, 0.4, 8, 6)
-    pose_a, pose_b = random_poses(2, 11, 0.3)
+    pose_a, pose_b = random_poses(np.random.default_rng(11), 2, 0.3)
     hits = triangle.brute_force_faces(ball.vertices, ball.faces, ring.vertices, ring.faces, pose_a, pose_b)
     points = triangle.into_frame_of_a(ring.vertices, pose_a, pose_b)
     every = list(itertools.product(range(len(ball.faces)), range(len(ring.faces))))
@@ -146,7 +142,7 @@ def test_brute_force_equals_the_exact_test_of_every_pair():
 
 
 def test_relative_pose_is_the_rigid_motion():
-    pose_a, pose_b = random_poses(2, 12, 3.0)
+    pose_a, pose_b = random_poses(np.random.default_rng(12), 2, 3.0)
     points = np.random.default_rng(13).normal(size=(50, 3))
     (ra, ta), (rb, tb) = triangle.pose_matrix(pose_a), triangle.pose_matrix(pose_b)
     assert np.allclose(ra @ ra.T, np.eye(3)) and np.isclose(np.linalg.det(ra), 1)
@@ -155,11 +151,6 @@ def test_relative_pose_is_the_rigid_motion():
     assert np.allclose(triangle.into_frame_of_a(points, pose_a, pose_b), expected, rtol=0, atol=1e-13)
     tiny = triangle.transform(np.eye(3), np.zeros(3), [[2.0**-291, 2.0**-290, -(2.0**-300)]])
     assert tiny.tolist() == [[0.0, 2.0**-290, 0.0]]
-
-
-def random_poses(count, seed, spread):
-    rng = np.random.default_rng(seed)
-    return np.concatenate([rng.uniform(-spread, spread, (count, 3)), rng.normal(size=(count, 4))], 1)
 
 
 # --- the tree --------------------------------------------------------------------------------------------------------
@@ -303,14 +294,13 @@ def test_intersect_finds_every_pair():
 
     faces_a = [f for f in range(len(one.face_vertex)) if one.is_active(f, lod_a)]
     faces_b = [g for g in range(len(two.face_vertex)) if two.is_active(g, lod_b)]
-    still = (0, 0, 0, 0, 0, 0, 1)
     expected = triangle.brute_force_faces(
         one.vertex_pos,
         [one.corners(f, lod_a) for f in faces_a],
         two.vertex_pos,
         [two.corners(g, lod_b) for g in faces_b],
-        still,
-        still,
+        STILL,
+        STILL,
     )
     hits = abtree.active_intersect(tree_a, tree_b, overlap, primitive_test)
     assert hits == [(faces_a[i], faces_b[j]) for i, j in expected]
@@ -324,7 +314,13 @@ def test_intersect_finds_every_pair():
 def test_fcl_agrees_but_for_what_it_gets_wrong(seed):
     pytest.importorskip("fcl")
     ball, ring = trimesh.creation.icosphere(subdivisions=3), trimesh.creation.torus(0.9, 0.3, 32, 24)
-    pair = (ball.vertices, ball.faces, ring.vertices, ring.faces, *random_poses(2, 20 + seed, 0.3))
+    pair = (
+        ball.vertices,
+        ball.faces,
+        ring.vertices,
+        ring.faces,
+        *random_poses(np.random.default_rng(20 + seed), 2, 0.3),
+    )
     ours, peer = triangle.brute_force_faces(*pair), fcl_faces(*pair)
     verdict = judge(ours, peer, *pair)
     assert verdict.ours_wrong == []
@@ -334,7 +330,7 @@ def test_fcl_agrees_but_for_what_it_gets_wrong(seed):
 
 def test_judge_names_the_culprit():
     ball = trimesh.creation.icosphere(subdivisions=1)
-    pair = (ball.vertices, ball.faces, ball.vertices, ball.faces, *random_poses(2, 30, 0.2))
+    pair = (ball.vertices, ball.faces, ball.vertices, ball.faces, *random_poses(np.random.default_rng(30), 2, 0.2))
     truth = [tuple(hit) for hit in triangle.brute_force_faces(*pair).tolist()]
     miss = next((f, g) for f in range(80) for g in range(80) if (f, g) not in truth)
     verdict = judge([miss, *truth[2:]], truth[1:], *pair)

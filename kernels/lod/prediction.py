@@ -1,0 +1,288 @@
+"""Selection by a predicted budget: the finest position on the tolerance scale whose predicted cost fits.
+
+The tolerance scale has a tolerance for every DITHER positions, 0 the coarsest. A candidate is a change of the position;
+candidates are ordered from the finest to the coarsest, `stay` (no change) among them, and the last, `held`, leaves
+every object at its level whatever the view. Every kernel is linear in the number of objects.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.lod.ladder import LodPool
+from warp_abtree.kernels.lod.tolerance import loosening
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+CHUNKS = wp.constant(256)
+"""Threads that share the objects of one candidate: sums have one order on every device."""
+
+DITHER = wp.constant(4)
+"""Positions a tolerance: objects of one level move to the next in so many groups."""
+
+POSITIONS_PER_OCTAVE = wp.constant(16)
+"""Positions that double a tolerance."""
+
+GOLDEN = wp.constant(wp.uint32(2654435761))
+"""2^32 over the golden ratio: its multiples spread evenly (Knuth, The Art of Computer Programming 3, 6.4)."""
+
+RATE_FIXED = wp.constant(0)
+RATE_WORK = wp.constant(1)
+RATE_CHANGE = wp.constant(2)
+RATE_NODE = wp.constant(3)
+RATE_UP = wp.constant(4)
+RATE_DOWN = wp.constant(5)
+"""Entries of `Prediction.rate`: ms of a frame, a unit of work, a change of any LOD, a node refitted; two exponents."""
+
+
+@wp.struct
+class Prediction:
+    """What each candidate would cost."""
+
+    change: wp.array(dtype=wp.int32)  # [candidate] change of the position
+    rate: wp.array(dtype=wp.float64)  # [6] see the RATE constants
+    power_up: wp.array(dtype=wp.float64)  # [level] faces to the exponent with which tests grow
+    power_down: wp.array(dtype=wp.float64)  # [level] faces to the exponent with which tests fall
+    chunk_work: wp.array(dtype=wp.float64)  # [candidate * CHUNKS + chunk] tests
+    chunk_moved: wp.array(dtype=wp.int32)  # [candidate * CHUNKS + chunk] objects that change level
+    used: wp.array(dtype=wp.int32)  # [(candidate * models + model) * level_count + level] 1 if an object stands there
+    work: wp.array(dtype=wp.float64)  # [candidate] tests
+    moved: wp.array(dtype=wp.int32)  # [candidate] objects that change level
+    nodes: wp.array(dtype=wp.float64)  # [candidate] nodes refitted
+
+
+@wp.func
+def level_at(lods: LodPool, i: wp.int32, position: wp.int32, offset: wp.int32):
+    """Return the level of an object at a position; a hash of its number spreads objects over neighbouring positions."""
+    part = wp.int32((wp.uint32(i) * GOLDEN) >> wp.uint32(30))
+    tolerance = wp.clamp(wp.max(position - offset + part, 0) / DITHER, 0, lods.tolerance_count - 1)
+    return lods.tolerance_level[lods.object_model[i] * lods.tolerance_count + tolerance]
+
+
+@wp.kernel
+def update_offset_kernel(
+    loosest: wp.float64, lods: LodPool, focus: wp.array(dtype=wp.float64), offset_inout: wp.array(dtype=wp.int32)
+):
+    """Convert the loosening of an object to positions, rounded down.
+
+    Hysteresis: the offset follows only beyond a tolerance, so that an object between two levels does not flicker.
+    """
+    i = wp.tid()
+    octaves = wp.log2(loosening(focus[i], lods.importance[i], loosest))
+    offset = wp.int32(wp.floor(octaves * wp.float64(POSITIONS_PER_OCTAVE)))
+    if offset < offset_inout[i] or offset > offset_inout[i] + DITHER:
+        offset_inout[i] = offset
+
+
+@wp.kernel
+def raise_faces_kernel(lods: LodPool, prediction: Prediction):
+    """Raise the faces of every level to the two exponents."""
+    k = wp.tid()
+    faces = wp.float64(wp.max(lods.faces[k], 1))
+    prediction.power_up[k] = wp.pow(faces, prediction.rate[RATE_UP])
+    prediction.power_down[k] = wp.pow(faces, prediction.rate[RATE_DOWN])
+
+
+@wp.kernel
+def predict_work_kernel(
+    # static
+    model_count: wp.int32,
+    lods: LodPool,
+    # state
+    scale: wp.array(dtype=wp.int32),
+    offset: wp.array(dtype=wp.int32),
+    level: wp.array(dtype=wp.int32),
+    work: wp.array(dtype=wp.float64),
+    # out
+    prediction: Prediction,
+):
+    """Predict the tests of every object for every candidate; one thread a candidate and chunk of the objects.
+
+    Args:
+        level: Of each object now. work: Tests of the last frame, each pair's shared by its two objects.
+    """
+    k, chunk = wp.tid()
+    n = lods.object_model.shape[0]
+    held = prediction.change.shape[0] - 1
+    total = wp.float64(0.0)
+    moved = wp.int32(0)
+    i = chunk
+    while i < n:
+        model = lods.object_model[i]
+        now = level[i]
+        then = now
+        if k < held:
+            then = level_at(lods, i, scale[0] + prediction.change[k], offset[i])
+        prediction.used[(k * model_count + model) * lods.level_count + then] = 1
+        a = model * lods.level_count + now
+        b = model * lods.level_count + then
+        share = work[i]
+        if then != now:
+            moved += 1
+            if lods.faces[b] > lods.faces[a]:
+                share = share * prediction.power_up[b] / prediction.power_up[a]
+            else:
+                share = share * prediction.power_down[b] / prediction.power_down[a]
+        total += share
+        i += CHUNKS
+    prediction.chunk_work[k * CHUNKS + chunk] = total
+    prediction.chunk_moved[k * CHUNKS + chunk] = moved
+
+
+@wp.kernel
+def sum_chunk_kernel(prediction: Prediction):
+    """Sum the chunks of one candidate, in order."""
+    k = wp.tid()
+    work = wp.float64(0.0)
+    moved = wp.int32(0)
+    for chunk in range(CHUNKS):
+        work += prediction.chunk_work[k * CHUNKS + chunk]
+        moved += prediction.chunk_moved[k * CHUNKS + chunk]
+    prediction.work[k] = work
+    prediction.moved[k] = moved
+
+
+@wp.func
+def predict_nodes(entries: wp.int32, faces: wp.int32, full_share: wp.float64):
+    """Return about how many nodes an LOD change refits, by equation 1, from the entries of its slice.
+
+    A slice lists each face about twice.
+    """
+    whole = wp.float64(2 * faces - 1)
+    if wp.float64(entries) > full_share * wp.float64(faces):
+        return whole
+    k = wp.max(wp.float64(entries) * wp.float64(0.5), wp.float64(1.0))
+    return wp.min(k * (wp.log2(wp.float64(faces)) - wp.log2(k) + wp.float64(2.0)), whole)
+
+
+@wp.kernel
+def predict_refit_kernel(model_count: wp.int32, full_share: wp.float64, lods: LodPool, prediction: Prediction):
+    """Predict the nodes of one model that a candidate refits.
+
+    A level without a tree state is reached from the nearest level with one.
+    """
+    k, model = wp.tid()
+    held = prediction.change.shape[0] - 1
+    first = model * lods.level_count
+    wanted = (k * model_count + model) * lods.level_count
+    present = (held * model_count + model) * lods.level_count
+    total = wp.float64(0.0)
+    for r in range(lods.level_count):
+        if prediction.used[wanted + r] == 0 or prediction.used[present + r] != 0:
+            continue
+        nearest = wp.int32(2147483647)
+        for s in range(lods.level_count):
+            if prediction.used[present + s] != 0:
+                nearest = wp.min(nearest, wp.abs(lods.entry[first + r] - lods.entry[first + s]))
+        total += predict_nodes(nearest, lods.face_count[model], full_share)
+    wp.atomic_add(prediction.nodes, k, wp.floor(total))
+
+
+@wp.func
+def steady_cost(prediction: Prediction, k: wp.int32):
+    """Return the time that a candidate takes in every frame [ms]."""
+    return prediction.rate[RATE_FIXED] + prediction.rate[RATE_WORK] * prediction.work[k]
+
+
+@wp.func
+def transition_cost(prediction: Prediction, k: wp.int32):
+    """Return the time that a candidate takes in its first frame alone [ms]."""
+    cost = prediction.rate[RATE_NODE] * prediction.nodes[k]
+    if prediction.moved[k] > 0:
+        cost += prediction.rate[RATE_CHANGE]
+    return cost
+
+
+@wp.func
+def choose_fall(limit: wp.float64, stay: wp.int32, prediction: Prediction):
+    """Return the finest candidate below `stay` whose steady cost is within a limit [ms], else the coarsest."""
+    k = stay + 1
+    coarsest = prediction.change.shape[0] - 2
+    while k < coarsest and not steady_cost(prediction, k) <= limit:
+        k += 1
+    return k
+
+
+@wp.func
+def choose_climb(limit: wp.float64, budget: wp.float64, stay: wp.int32, prediction: Prediction):
+    """Return the finest candidate whose steady cost is within a limit and its first frame within the budget [ms]."""
+    k = wp.int32(0)
+    while k < stay:
+        cost = steady_cost(prediction, k)
+        if cost <= limit and cost + transition_cost(prediction, k) <= budget:
+            return k
+        k += 1
+    return stay
+
+
+@wp.kernel
+def choose_position_kernel(
+    # static
+    budget: wp.float64,
+    aim: wp.float64,
+    low: wp.float64,
+    hold_frames: wp.int32,
+    position_max: wp.int32,
+    stay: wp.int32,
+    # state
+    prediction: Prediction,
+    scale_inout: wp.array(dtype=wp.int32),
+    # out
+    choice_out: wp.array(dtype=wp.float64),
+):
+    """Choose a position on the tolerance scale; one thread.
+
+    If `held` is over the budget: fall to the finest candidate within `aim` of it. If following the view at the same
+    position costs under `low` of it: climb to the finest within `aim` whose transition fits into the budget. Between
+    the two: follow the view, if its transition fits. A transition that does not fit, of a climb or of the view, is held
+    for `hold_frames` and made then, otherwise a scene with expensive refits would never refine.
+
+    Args:
+        scale_inout: Position, and frames that a transition has been held.
+        choice_out: Candidate, its steady and transition cost [ms], its work, the work of `held`.
+    """
+    held = prediction.change.shape[0] - 1
+    chosen = stay
+    waits = wp.int32(0)
+    steady = steady_cost(prediction, stay)
+    transition = transition_cost(prediction, stay)
+    if steady_cost(prediction, held) > budget:
+        chosen = choose_fall(aim * budget, stay, prediction)
+    elif steady + transition > budget:
+        chosen = held
+        waits = 1
+    elif steady + transition < low * budget and scale_inout[0] < position_max:
+        chosen = choose_climb(aim * budget, budget, stay, prediction)
+        if chosen == stay and steady_cost(prediction, stay - 1) <= aim * budget:
+            waits = 1
+    if waits == 1 and scale_inout[1] >= hold_frames:
+        waits = 0
+        if chosen == held:
+            chosen = stay
+        else:
+            chosen = stay - 1
+    scale_inout[1] = wp.where(waits == 1, scale_inout[1] + 1, 0)
+    scale_inout[0] = wp.clamp(scale_inout[0] + prediction.change[chosen], 0, position_max)
+    choice_out[0] = wp.float64(chosen)
+    choice_out[1] = steady_cost(prediction, chosen)
+    choice_out[2] = transition_cost(prediction, chosen)
+    choice_out[3] = prediction.work[chosen]
+    choice_out[4] = prediction.work[held]
+
+
+@wp.kernel
+def set_level_kernel(
+    # static
+    held: wp.int32,
+    lods: LodPool,
+    # state
+    scale: wp.array(dtype=wp.int32),
+    offset: wp.array(dtype=wp.int32),
+    choice: wp.array(dtype=wp.float64),
+    level_inout: wp.array(dtype=wp.int32),
+    # out
+    lod_out: wp.array(dtype=wp.int32),
+):
+    """Give every object its level at the position, unless the choice is `held`."""
+    i = wp.tid()
+    if wp.int32(choice[0]) != held:
+        level_inout[i] = level_at(lods, i, scale[0], offset[i])
+    lod_out[i] = lods.lod[lods.object_model[i] * lods.level_count + level_inout[i]]

@@ -1,0 +1,70 @@
+"""View of each object: its distance, motion on the screen, and focus (section 4.1 of the paper)."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.struct
+class ViewArrays:
+    """Camera, and what it measures of each object."""
+
+    # static
+    window: wp.int32  # frames of which `motion` is the sum
+    object_model: wp.array(dtype=wp.int32)  # [object] model
+    centre: wp.array(dtype=wp.vec3d)  # [model] middle, model frame [model units]
+    camera: wp.array(dtype=wp.float64)  # [15] eye [world units]; rows right, up, back; focal length, W [pixels]; D
+    # state
+    frame: wp.array(dtype=wp.int32)  # [1] frames measured
+    screen: wp.array(dtype=wp.vec3d)  # [object] x, y on the screen a frame ago [pixels], 1 if in front of the camera
+    path: wp.array(dtype=wp.float64)  # [slot * objects + object] motion in each frame of the window [pixels]
+    # out
+    distance: wp.array(dtype=wp.float64)  # [object] alpha [world units]
+    motion: wp.array(dtype=wp.float64)  # [object] gamma [pixels]
+    focus: wp.array(dtype=wp.float64)  # [object] f, 0 to 1
+
+
+@wp.func
+def project_point(camera: wp.array(dtype=wp.float64), p: wp.vec3d):
+    """Return x and y on the screen [pixels], and 1 if the point is in front of the camera, else 0."""
+    d = wp.vec3d(p[0] - camera[0], p[1] - camera[1], p[2] - camera[2])
+    x = (camera[3] * d[0] + camera[4] * d[1]) + camera[5] * d[2]
+    y = (camera[6] * d[0] + camera[7] * d[1]) + camera[8] * d[2]
+    depth = -((camera[9] * d[0] + camera[10] * d[1]) + camera[11] * d[2])
+    if not depth > camera[14] * wp.float64(1.0e-6):
+        return wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
+    return wp.vec3d(camera[12] * x / depth, camera[12] * y / depth, wp.float64(1.0))
+
+
+@wp.kernel
+def measure_view_kernel(
+    rotation: wp.array(dtype=wp.mat33d), position: wp.array(dtype=wp.vec3d), view_inout: ViewArrays
+):
+    """Measure alpha, gamma and f of every object."""
+    i = wp.tid()
+    n = view_inout.object_model.shape[0]
+    camera = view_inout.camera
+    p = rotation[i] * view_inout.centre[view_inout.object_model[i]] + position[i]
+    distance = wp.length(wp.vec3d(p[0] - camera[0], p[1] - camera[1], p[2] - camera[2]))
+    place = project_point(camera, p)
+    before = view_inout.screen[i]
+    moved = wp.float64(0.0)
+    if place[2] > wp.float64(0.0) and before[2] > wp.float64(0.0):
+        moved = wp.length(place - before)
+    view_inout.screen[i] = place
+    view_inout.path[(view_inout.frame[0] % view_inout.window) * n + i] = moved
+    motion = wp.float64(0.0)
+    for slot in range(view_inout.window):
+        motion += view_inout.path[slot * n + i]
+    view_inout.distance[i] = distance
+    view_inout.motion[i] = motion
+    wide = camera[13]
+    far = camera[14]
+    f = wp.min((far - distance) / far, (wide - motion) / wide)
+    view_inout.focus[i] = wp.clamp(f, wp.float64(0.0), wp.float64(1.0))
+
+
+@wp.kernel
+def advance_frame_kernel(frame_inout: wp.array(dtype=wp.int32)):
+    """Count a frame."""
+    frame_inout[0] = frame_inout[0] + 1

@@ -1,0 +1,118 @@
+// The queue of dynamic load balancing between warps: counters, and slots that idle warps wait at.
+#pragma once
+#include "builtin.h"
+#include "sizes.h"
+
+inline CUDA_CALLABLE wp::int32 take_unit(wp::array_t<wp::int32> counter) {
+#if defined(__CUDA_ARCH__)
+    int unit = 0;
+    if (threadIdx.x == 0)
+        unit = atomicAdd(counter.data + 3, 1);
+    return __shfl_sync(0xffffffffu, unit, 0);
+#else
+    return __atomic_fetch_add(counter.data + 3, 1, __ATOMIC_RELAXED);
+#endif
+}
+
+inline CUDA_CALLABLE wp::int64 load_tickets(wp::array_t<wp::int32> counter) {
+#if defined(__CUDA_ARCH__)
+    // One load of both, past the first-level cache.
+    return *(const volatile long long*)counter.data;
+#else
+    return 0;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 count_idle(wp::int64 tickets) {
+    const int idle = (int)(tickets >> 32) - (int)tickets;
+#if defined(__CUDA_ARCH__)
+    // Lanes that were not together read at different times; what follows needs the same number in all.
+    return __shfl_sync(0xffffffffu, idle, 0);
+#else
+    return idle;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 await_donation(wp::array_t<wp::int32> counter, wp::array_t<wp::int32> flag) {
+#if defined(__CUDA_ARCH__)
+#include "sizes.h"
+    int slot = -1;
+    if (threadIdx.x == 0) {
+        int ticket = atomicAdd(counter.data + 1, 1);
+        const volatile int* mine = (const volatile int*)(flag.data + (ticket & (SLOT_COUNT - 1)));
+        __threadfence();
+        // The warp that ends the last unit terminates those that have tickets by then.
+        if (*(const volatile int*)(counter.data + 2) != 0) {
+            int got = *mine;
+            while (got != ticket + 1 && got != -1) {
+                __nanosleep(100);
+                got = *mine;
+            }
+            if (got != -1)
+                slot = ticket & (SLOT_COUNT - 1);
+        }
+        __threadfence();
+    }
+    __syncwarp();
+    return __shfl_sync(0xffffffffu, slot, 0);
+#else
+    return -1;
+#endif
+}
+
+inline CUDA_CALLABLE void free_slot(wp::array_t<wp::int32> flag, wp::int32 slot) {
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+    if (threadIdx.x == 0) {
+        __threadfence();
+        *(volatile int*)(flag.data + slot) = 0;
+    }
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 claim_slot(wp::array_t<wp::int32> counter, wp::array_t<wp::int32> flag) {
+#if defined(__CUDA_ARCH__)
+#include "sizes.h"
+    int ticket = 0;
+    if (threadIdx.x == 0) {
+        atomicAdd(counter.data + 2, 1);
+        ticket = atomicAdd(counter.data, 1);
+        while (*(const volatile int*)(flag.data + (ticket & (SLOT_COUNT - 1))) != 0)
+            __nanosleep(100);
+        __threadfence();
+    }
+    __syncwarp();
+    return __shfl_sync(0xffffffffu, ticket, 0);
+#else
+    return 0;
+#endif
+}
+
+inline CUDA_CALLABLE void fill_slot(wp::array_t<wp::int32> flag, wp::int32 ticket) {
+#if defined(__CUDA_ARCH__)
+#include "sizes.h"
+    __threadfence();
+    __syncwarp();
+    if (threadIdx.x == 0)
+        *(volatile int*)(flag.data + (ticket & (SLOT_COUNT - 1))) = ticket + 1;
+#endif
+}
+
+inline CUDA_CALLABLE void end_unit(wp::array_t<wp::int32> counter, wp::array_t<wp::int32> flag) {
+#if defined(__CUDA_ARCH__)
+#include "sizes.h"
+    int left = 1;
+    if (threadIdx.x == 0) {
+        __threadfence();  // a slot that this warp has freed, before the last one fills it with -1
+        left = atomicSub(counter.data + 2, 1) - 1;
+        __threadfence();
+    }
+    __syncwarp();
+    if (__shfl_sync(0xffffffffu, left, 0) != 0)
+        return;
+    for (int i = threadIdx.x; i < SLOT_COUNT / 4; i += 32)
+        ((int4*)flag.data)[i] = make_int4(-1, -1, -1, -1);
+#else
+    counter.data[2] -= 1;
+#endif
+}

@@ -1,0 +1,97 @@
+// Comparisons without branches, and loads that the compiler would not widen by itself.
+#pragma once
+#include "builtin.h"
+
+inline CUDA_CALLABLE wp::vec_t<4, wp::float32> load_constant(wp::array_t<wp::vec_t<4, wp::float32>> values,
+                                                             wp::int64 i) {
+#if defined(__CUDA_ARCH__)
+    float4 x = __ldg((const float4*)values.data + i);
+    return wp::vec_t<4, wp::float32>(x.x, x.y, x.z, x.w);
+#else
+    return values.data[i];
+#endif
+}
+
+inline CUDA_CALLABLE wp::vec_t<4, wp::int32> load_corner(wp::array_t<wp::vec_t<4, wp::int32>> corners, wp::int32 i) {
+#if defined(__CUDA_ARCH__)
+    int4 x = __ldg((const int4*)corners.data + i);
+    return wp::vec_t<4, wp::int32>(x.x, x.y, x.z, x.w);
+#else
+    return corners.data[i];
+#endif
+}
+
+inline CUDA_CALLABLE wp::vec_t<3, wp::float64> load_vertex(wp::array_t<wp::vec_t<4, wp::float64>> vertices,
+                                                           wp::int32 i) {
+#if defined(__CUDA_ARCH__)
+    // 32 bytes lie in one sector: two loads, where three numbers of 24 bytes would take three.
+    const double2* p = (const double2*)vertices.data + 2 * (long long)i;
+    const double2 xy = __ldg(p);
+    return wp::vec_t<3, wp::float64>(xy.x, xy.y, __ldg(&p[1].x));
+#else
+    const wp::vec_t<4, wp::float64>& p = vertices.data[i];
+    return wp::vec_t<3, wp::float64>(p[0], p[1], p[2]);
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 children_of(wp::int32 node) {
+#if defined(__CUDA_ARCH__)
+    // One operation, as which the compiler does not see that the sum is a union of bits.
+    int down;
+    asm("mad.lo.s32 %0, %1, 2, %2;" : "=r"(down) : "r"(node), "r"(1 << 31));
+    return down;
+#else
+    return (node * 2) | (1 << 31);
+#endif
+}
+
+inline CUDA_CALLABLE bool all_within(wp::vec_t<3, wp::float32> p, wp::vec_t<3, wp::float32> u,
+                                     wp::vec_t<3, wp::float32> q, wp::vec_t<3, wp::float32> v) {
+    return (wp::abs(p[0]) <= u[0]) & (wp::abs(p[1]) <= u[1]) & (wp::abs(p[2]) <= u[2]) & (wp::abs(q[0]) <= v[0]) &
+           (wp::abs(q[1]) <= v[1]) & (wp::abs(q[2]) <= v[2]);
+}
+
+inline CUDA_CALLABLE wp::float32 fuse32(wp::float32 a, wp::float32 b, wp::float32 c) {
+#if defined(__CUDA_ARCH__)
+    return __fmaf_rn(a, b, c);
+#else
+    return __builtin_fmaf(a, b, c);
+#endif
+}
+
+inline CUDA_CALLABLE wp::float32 largest(wp::float32 x, wp::float32 y, wp::float32 z) {
+#if defined(__CUDA_ARCH__)
+    return wp::max(x, wp::max(y, z));
+#else
+    const wp::float32 m = y > z ? y : z;
+    return x > m ? x : m;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 one_sided(wp::vec_t<3, wp::float32> x, wp::float32 bound) {
+#if defined(__CUDA_ARCH__)
+    // x < y is the sign bit of x - y, also where they are nearly the same, infinite or no numbers.
+    const int p0 = __float_as_int(__fsub_rn(bound, x[0])), n0 = __float_as_int(__fadd_rn(x[0], bound));
+    const int p1 = __float_as_int(__fsub_rn(bound, x[1])), n1 = __float_as_int(__fadd_rn(x[1], bound));
+    const int p2 = __float_as_int(__fsub_rn(bound, x[2])), n2 = __float_as_int(__fadd_rn(x[2], bound));
+    return (p0 & p1 & p2) | (n0 & n1 & n2);
+#else
+    const bool over = (x[0] > bound) & (x[1] > bound) & (x[2] > bound);
+    const bool under = (x[0] < -bound) & (x[1] < -bound) & (x[2] < -bound);
+    return -(over | under);
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 add_signs(wp::int32 signs, wp::vec_t<3, wp::float32> x, wp::float32 bound) {
+    int all = signs;
+    for (int k = 0; k < 3; ++k) {
+#if defined(__CUDA_ARCH__)
+        // Each takes the sign bit of a number from the right, as in `one_sided`.
+        all = __funnelshift_l(__float_as_int(__fsub_rn(bound, x[k])), all, 1);
+        all = __funnelshift_l(__float_as_int(__fadd_rn(x[k], bound)), all, 1);
+#else
+        all = all * 4 + (x[k] > bound) * 2 + (x[k] < -bound);
+#endif
+    }
+    return all;
+}

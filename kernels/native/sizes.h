@@ -1,0 +1,41 @@
+// Sizes that native code and kernels share; `native.constant` reads them, one literal a line.
+#pragma once
+
+constexpr int WARP_SIZE = 32;
+
+// A warp's items in shared memory: node pairs, then leaf pairs, then straddling pairs and their signs.
+constexpr int STACK_LENGTH = 512;
+constexpr int LEAF_PAIR_LENGTH = 160;
+constexpr int STRADDLING_LENGTH = 64;
+constexpr int STRADDLING_START = 672;
+constexpr int SIGNS_START = 736;
+constexpr int ITEM_BYTES = 8;
+static_assert((STACK_LENGTH & (STACK_LENGTH - 1)) == 0, "the stack is a ring");
+static_assert(LEAF_PAIR_LENGTH >= (WARP_SIZE - 1) + 4 * WARP_SIZE, "fewer than a warp wait, a test emits 4 a lane");
+static_assert(STRADDLING_LENGTH >= (WARP_SIZE - 1) + WARP_SIZE, "fewer than a warp wait, a test adds 1 a lane");
+static_assert(STRADDLING_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
+static_assert(SIGNS_START == STRADDLING_START + STRADDLING_LENGTH, "signs lie behind the straddling pairs");
+static_assert((STACK_LENGTH + LEAF_PAIR_LENGTH) * ITEM_BYTES < 1 << 16, "`push_children` packs two byte offsets");
+
+// Slots of the queue in which idle warps wait, each with room for so many items: one a lane.
+constexpr int SLOT_COUNT = 8192;
+constexpr int SLOT_ITEMS = 32;
+static_assert((SLOT_COUNT & (SLOT_COUNT - 1)) == 0, "a ticket's low bits are its slot");
+static_assert(SLOT_COUNT % (4 * WARP_SIZE) == 0, "flags are written four a lane");
+static_assert(SLOT_ITEMS == WARP_SIZE, "a lane moves one item");
+
+// The CPU: node pairs taken at once, and the stack's length. Depth first leaves three items a level, 31 levels deep; a
+// node pair test writes over four more, and divisions round.
+constexpr int ITEMS_AT_ONCE = 64;
+constexpr int CPU_STACK_LENGTH = 1024;
+constexpr int DEPTH_FIRST_LENGTH = 101;
+static_assert(DEPTH_FIRST_LENGTH == 3 * 31 + 8, "depth first always fits");
+static_assert(CPU_STACK_LENGTH >= DEPTH_FIRST_LENGTH + 4 * ITEMS_AT_ONCE, "so many at once fit at the start");
+
+// Straddling pairs that wait for their last two signs on the CPU, the last 16 of them written over.
+constexpr int STRADDLING_ROOM = 256;
+static_assert(STRADDLING_ROOM % 8 == 0, "corners are found 8 at a time");
+
+constexpr int UNCERTAIN = 8;
+constexpr double COORDINATE_MIN = 0x1p-290;
+constexpr double BOUND_3D = 0x1.0000000000008p-50;

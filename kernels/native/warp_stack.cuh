@@ -1,0 +1,182 @@
+// A warp's lists in shared memory, and what its lanes do together. On the CPU a warp is one thread.
+#pragma once
+#include "builtin.h"
+#include "sizes.h"
+
+inline CUDA_CALLABLE wp::int32 warp_size() {
+#if defined(__CUDA_ARCH__)
+    return 32;
+#else
+    return 1;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 warp_lane() {
+#if defined(__CUDA_ARCH__)
+    return threadIdx.x;
+#else
+    return 0;
+#endif
+}
+
+inline CUDA_CALLABLE wp::uint64 warp_stack() {
+#include "sizes.h"
+#if defined(__CUDA_ARCH__)
+    __shared__ long long items[SIGNS_START + STRADDLING_LENGTH / 2];
+    // Through another lane, so that the address is held and not computed again at every use.
+    return __shfl_sync(0xffffffffu, (unsigned int)__cvta_generic_to_shared(items), 0);
+#else
+    static long long items[SIGNS_START + STRADDLING_LENGTH / 2];
+    return (wp::uint64)items;
+#endif
+}
+
+inline CUDA_CALLABLE void warp_sync() {
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+}
+
+inline CUDA_CALLABLE wp::int64 read_item(wp::uint64 items, wp::int32 i) {
+#if defined(__CUDA_ARCH__)
+    long long item;
+    asm volatile("ld.shared.b64 %0, [%1];" : "=l"(item) : "r"((unsigned int)items + 8 * i) : "memory");
+    return item;
+#else
+    return ((const long long*)items)[i];
+#endif
+}
+
+inline CUDA_CALLABLE void write_item(wp::uint64 items, wp::int32 i, wp::int64 item) {
+#if defined(__CUDA_ARCH__)
+    asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * i), "l"(item) : "memory");
+#else
+    ((long long*)items)[i] = item;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int64 push_children(wp::uint64 items, wp::int32 end, wp::int32 leaf_end,
+                                             wp::vec_t<4, wp::int32> emitted, wp::vec_t<4, wp::int64> children) {
+#include "sizes.h"
+#if defined(__CUDA_ARCH__)
+    const unsigned int mine = (emitted[0] + emitted[1]) + (emitted[2] + emitted[3]);
+    unsigned int sum = mine;
+// What came from a lane is added, nothing where there is none.
+#pragma unroll
+    for (int step = 1; step < 32; step <<= 1)
+        asm volatile(
+            "{ .reg .pred from; .reg .b32 other;"
+            " shfl.sync.up.b32 other|from, %0, %1, 0, 0xffffffff; @from add.u32 %0, %0, other; }"
+            : "+r"(sum)
+            : "r"(step));
+    const unsigned int total = __shfl_sync(0xffffffffu, sum, 31);
+    // Bytes from the start: on the stack in the low half, among the leaf pairs in the high half.
+    unsigned int place = ((end & (STACK_LENGTH - 1)) | (STACK_LENGTH + leaf_end) << 16) * 8 + (sum - mine) * 8;
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+        const unsigned int at = emitted[k] > 1 ? place >> 16 : place & (8 * STACK_LENGTH - 1);
+        asm volatile(
+            "{ .reg .pred used; setp.ne.u32 used, %0, 0; @used st.shared.v2.b32 [%1], {%2, %3}; }" ::"r"(emitted[k]),
+            "r"((unsigned int)items + at), "r"((int)children[k]), "r"((int)(children[k] >> 32))
+            : "memory");
+        place += 8 * emitted[k];
+    }
+#else
+    long long* stack = (long long*)items;
+    int total = 0;
+    for (int k = 0; k < 4; ++k) {
+        if (emitted[k] > 1)
+            stack[STACK_LENGTH + leaf_end + (total >> 16)] = children[k];
+        else if (emitted[k] == 1)
+            stack[(end + total) & (STACK_LENGTH - 1)] = children[k];
+        total += emitted[k];
+    }
+#endif
+    return ((long long)(leaf_end + (total >> 16)) << 32) | (unsigned int)(end + (total & 0xffff));
+}
+
+inline CUDA_CALLABLE wp::int32 hold_uniform(wp::int32 x) {
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(0xffffffffu, x, 0);
+#else
+    return x;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 push_straddling(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item,
+                                               wp::int32 signs) {
+#include "sizes.h"
+#if defined(__CUDA_ARCH__)
+    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    const unsigned int at = end + __popc(votes & ((1u << threadIdx.x) - 1u)), start = items;
+    asm volatile(
+        "{ .reg .pred used; setp.ne.s32 used, %0, 0;"
+        " @used st.shared.b64 [%1], %2; @used st.shared.b32 [%3], %4; }" ::"r"((int)flag),
+        "r"(start + 8 * (STRADDLING_START + at)), "l"(item), "r"(start + 8 * SIGNS_START + 4 * at), "r"(signs)
+        : "memory");
+    return end + __popc(votes);
+#else
+    if (flag) {
+        ((long long*)items)[STRADDLING_START + end] = item;
+        ((int*)items)[2 * SIGNS_START + end] = signs;
+    }
+    return end + flag;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 read_signs(wp::uint64 items, wp::int32 i) {
+#include "sizes.h"
+#if defined(__CUDA_ARCH__)
+    int signs;
+    asm volatile("ld.shared.b32 %0, [%1];"
+                 : "=r"(signs)
+                 : "r"((unsigned int)items + 8 * SIGNS_START + 4 * i)
+                 : "memory");
+    return signs;
+#else
+    return ((const int*)items)[2 * SIGNS_START + i];
+#endif
+}
+
+inline CUDA_CALLABLE wp::uint64 signed_pairs() {
+#include "sizes.h"
+#if defined(__CUDA_ARCH__)
+    __shared__ int4 items[STRADDLING_LENGTH];
+    return __cvta_generic_to_shared(items);
+#else
+    static int items[STRADDLING_LENGTH * 4];
+    return (wp::uint64)items;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 push_signed_pair(wp::uint64 list, wp::int32 end, bool flag, wp::vec_t<3, wp::int32> item,
+                                                wp::int32 signs) {
+#if defined(__CUDA_ARCH__)
+    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    const unsigned int at = (unsigned int)list + 16 * (end + __popc(votes & ((1u << threadIdx.x) - 1u)));
+    if (flag)
+        asm volatile("st.shared.v4.b32 [%0], {%1, %2, %3, %4};" ::"r"(at), "r"(item[0]), "r"(item[1]), "r"(item[2]),
+                     "r"(signs)
+                     : "memory");
+    return end + __popc(votes);
+#else
+    int* to = (int*)list + 4 * end;
+    for (int k = 0; flag && k < 4; ++k)
+        to[k] = k < 3 ? item[k] : signs;
+    return end + flag;
+#endif
+}
+
+inline CUDA_CALLABLE wp::vec_t<4, wp::int32> read_signed_pair(wp::uint64 list, wp::int32 i) {
+    wp::vec_t<4, wp::int32> x;
+#if defined(__CUDA_ARCH__)
+    asm volatile("ld.shared.v4.b32 {%0, %1, %2, %3}, [%4];"
+                 : "=r"(x[0]), "=r"(x[1]), "=r"(x[2]), "=r"(x[3])
+                 : "r"((unsigned int)list + 16 * i)
+                 : "memory");
+#else
+    for (int k = 0; k < 4; ++k)
+        x[k] = ((const int*)list)[4 * i + k];
+#endif
+    return x;
+}

@@ -1,0 +1,144 @@
+"""Contacts by definition: exact clipping of triangles, distances, and sums over a pair's contacts to the bit."""
+
+from fractions import Fraction
+
+import numpy as np
+import trimesh
+from oracles.triangle import _cross, _dot, _half_spaces, _sub
+
+CHUNK = 32  # contacts that are summed from left to right before sums are; part of the definition
+
+
+def exact(triangle):
+    return [tuple(Fraction(float(x)) for x in p) for p in triangle]
+
+
+def shared_polygon(a, b):
+    """Corners of the intersection of two closed triangles, float64 (n, 3), by clipping B with A's half-spaces."""
+    polygon = exact(b)
+    for normal, origin in _half_spaces(exact(a)):
+        side = [_dot(normal, _sub(p, origin)) for p in polygon]
+        clipped = []
+        for k in range(len(polygon)):
+            p, q, s, t = polygon[k - 1], polygon[k], side[k - 1], side[k]
+            if s * t < 0:
+                clipped.append(tuple(x + (y - x) * s / (s - t) for x, y in zip(p, q, strict=True)))
+            if t >= 0:
+                clipped.append(q)
+        polygon = clipped
+    return np.array([[float(x) for x in p] for p in polygon])
+
+
+def exact_normal(t):
+    a, b, c = exact(t)
+    return _cross(_sub(b, a), _sub(c, a))
+
+
+def lies_in_plane(b, a):
+    """Whether triangle B lies in the plane of A; of any that has no area, always."""
+    normal = exact_normal(a)
+    return all(_dot(normal, _sub(p, exact(a)[0])) == 0 for p in exact(b))
+
+
+def unit(v):
+    """Unit vector of exact components; zero stays."""
+    scale = max(abs(x) for x in v)
+    if scale == 0:
+        return np.zeros(3)
+    v = np.array([float(x / scale) for x in v])
+    return v / np.linalg.norm(v)
+
+
+def distance(corners, p):
+    """Distance of a point from a triangle, by trimesh, or from the nearest edge where it has no area."""
+    best = np.inf
+    for a, b in zip(corners, np.roll(corners, 1, 0), strict=True):
+        d = b - a
+        t = np.clip((p - a) @ d / (d @ d), 0, 1) if d @ d > 0 else 0.0
+        best = min(best, np.linalg.norm(a + t * d - p))
+    n = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    if n @ n > 0:
+        best = min(best, np.linalg.norm(trimesh.triangles.closest_point(corners[None], p[None])[0] - p))
+    return best
+
+
+# Sums over an object pair's contacts in their stated order, in plain Python.
+
+
+def dot(u, v):
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+def cross(u, v):
+    return np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+
+
+def scaled(v):
+    """Return the largest component's magnitude, and the vector divided by it."""
+    largest = np.abs(v).max()
+    return largest, v / largest if largest else v
+
+
+def length(v):
+    largest, u = scaled(v)
+    return largest * np.sqrt(dot(u, u))
+
+
+def summed(terms):
+    """Sum chunks of terms from left to right, then their sums."""
+    sums = []
+    for k in range(0, len(terms), CHUNK):
+        total = terms[0] * 0.0
+        for term in terms[k : k + CHUNK]:
+            total = total + term
+        sums.append(total)
+    total = terms[0] * 0.0
+    for part in sums:
+        total = total + part
+    return total
+
+
+def summary(rows):
+    """Return (point, normal, depth) of a pair's contacts; None for what the mean normal and the curve do not tell."""
+    origin, count = rows["p0"][0], len(rows)
+    lengths = [length(q - p) for p, q in zip(rows["p0"], rows["p1"])]
+    total = summed(lengths)
+    weights = [x / total for x in lengths] if total else [1.0 / count] * count
+    ends = list(zip(weights, rows["p0"], rows["p1"]))
+    middle = summed([w * (0.5 * (p - origin) + 0.5 * (q - origin)) for w, p, q in ends])
+    mean = summed([w * n for w, n in zip(weights, rows["normal"])])
+    if length(mean) <= 2.0**-20:
+        return origin + middle, None, None
+    _, n = scaled(mean)
+    n = n / np.sqrt(dot(n, n))
+    areas, changes = [np.float64(0)], [np.float64(0)]
+    for row in rows:
+        r, s = row["p0"] - origin - middle, row["p1"] - row["p0"]
+        cosine = dot(row["normal_a"], row["normal_b"])
+        square = 1.0 - cosine * cosine
+        away = row["normal_b"] - row["normal_a"] * cosine
+        flat = square < 2.0**-40
+        areas.append(0.0 if row["coplanar"] else 0.5 * dot(n, cross(r, s)))
+        changes.append(0.0 if row["coplanar"] or flat else dot(n, row["normal_b"]) / square * dot(away, cross(s, n)))
+    area, change = summed(areas[1:]), summed(changes[1:])
+    return origin + middle, n, -area / change if area * change < 0 else None
+
+
+def check_summaries(result):
+    """Compare every pair's summary to the bit; return how often the contact curve told the depth."""
+    curves = 0
+    assert len(result.pair_contacts) == len(result.pairs) and result.pair_contacts["count"].dtype == np.int64
+    np.testing.assert_array_equal(result.pair_contacts["count"], result.count)
+    for p, got in enumerate(result.pair_contacts):
+        rows = result.contacts[result.contacts["pair"] == p]
+        assert len(rows) == result.count[p]
+        if not len(rows):
+            assert np.isnan(got["point"]).all() and np.isnan(got["normal"]).all() and got["depth"] == 0
+            continue
+        point, normal, depth = summary(rows)
+        assert got["point"].tobytes() == point.tobytes()
+        assert normal is None or got["normal"].tobytes() == normal.tobytes()
+        assert abs(np.linalg.norm(got["normal"]) - 1) < 1e-15
+        assert 0 <= got["depth"] and (depth is None or got["depth"] <= depth)
+        curves += got["depth"] == depth
+    return curves

@@ -1,0 +1,103 @@
+"""Shards on a local Ray of two workers: the bytes of one process, also after a kill or an interrupt."""
+
+import os
+import signal
+import sys
+
+import numpy as np
+import pytest
+from helpers.jobs import contents, job_of, load_worlds, run, stop_after
+
+from warp_abtree.jobs import RayPool, WorldsJob, run_shards
+
+
+@pytest.fixture(scope="module")
+def pool():
+    pytest.importorskip("ray")
+    with RayPool(workers=2) as made:
+        yield made
+
+
+def check_against_one_process(job, folder, pool, **options):
+    """Run a job on Ray and in this process; return what the former reports."""
+    run(job, folder / "plain", device="cuda:0" if pool.on_gpus else "cpu")
+    done = run_shards(job, folder / "ray", pool=pool, **options)
+    assert contents(folder / "ray") == contents(folder / "plain")
+    return done
+
+
+@pytest.mark.parametrize("output", ["count", "contacts"])
+def test_ray_writes_the_same_bytes(tmp_path, pool, output):
+    done = check_against_one_process(job_of(output, count=400, shard=25), tmp_path, pool)
+    assert (done["shards"], done["workers"], done["lost"]) == (16, 2, 0)
+
+
+def test_a_killed_worker_is_replaced(tmp_path, pool):
+    killed = []
+
+    def kill(_, done, total):
+        if done >= 5 and not killed and pool.pids:
+            killed.append(next(iter(pool.pids.values())))
+            os.kill(killed[0], signal.SIGKILL)
+
+    done = check_against_one_process(job_of("faces", count=400, shard=10), tmp_path, pool, progress=kill)
+    assert killed and done["lost"] == 1
+
+
+def test_an_interrupted_run_continues(tmp_path, pool):
+    job = job_of(count=400, shard=10)
+    with pytest.raises(KeyboardInterrupt):
+        run_shards(job, tmp_path / "ray", pool=pool, progress=stop_after(7))
+    assert check_against_one_process(job, tmp_path, pool)["found"] == 7
+
+
+def test_ray_runs_worlds(tmp_path, pool):
+    check_against_one_process(WorldsJob(load_worlds(tmp_path, "[dynamics]"), 4, "poses", 2), tmp_path, pool)
+
+
+class Runner:
+    """Fails, or ends its worker, at one task."""
+
+    def __init__(self, how):
+        self.how = how
+
+    def run(self, task, device=None):
+        if task == 20 and self.how == "end":
+            os._exit(1)
+        if task == 20:
+            raise ValueError("no such task: 20")
+        return {"any": np.zeros(10, bool)}
+
+
+class Job:
+    unit, count, shard = "pose", 40, 10
+
+    def __init__(self, how):
+        self.how = how
+
+    def describe(self):
+        return {"count": self.count, "shard": self.shard}
+
+    def task(self, start, stop):
+        return start
+
+    def runner(self):
+        return Runner(self.how)
+
+
+@pytest.mark.parametrize("how", ["end", "fail"])
+def test_a_shard_that_cannot_be_computed_is_given_up(tmp_path, pool, how):
+    pool.ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import the tests
+    error, what = RuntimeError, r"shard \(20, 30\) ended its worker, 3 times"
+    if how == "fail":
+        error, what = ValueError, "^no such task: 20$"
+    with pytest.raises(error, match=what):
+        run_shards(Job(how), tmp_path / "out", pool=pool)
+    held = sorted(path.name for path in (tmp_path / "out").glob("shard-*"))
+    assert "shard-000000000020-000000000030.npz" not in held
+
+
+@pytest.mark.parametrize("workers", [0, -1, 1.5])
+def test_workers_are_counted_from_one(workers):
+    with pytest.raises(ValueError, match=f"^workers {workers} is "):
+        RayPool(workers=workers)

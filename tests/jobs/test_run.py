@@ -1,0 +1,169 @@
+"""Running jobs: one folder per job, atomic files, continued after an interrupt, the same bytes on several devices."""
+
+import contextlib
+import threading
+
+import numpy as np
+import pytest
+from helpers.jobs import contents, job_of, lods_of, pair, poses_of, read, run, stop_after
+
+from warp_abtree.jobs import SweepJob, ThisProcess, read_shards, run_shards, shard_folder, sweep_job
+from warp_abtree.jobs import run as running
+from warp_abtree.jobs.shard_folder import MANIFEST
+
+
+@pytest.mark.parametrize("output", ["count", "contacts"])
+def test_several_devices_of_one_process_write_the_same(device, tmp_path, output):
+    job = SweepJob(*pair(), poses_of(), lods_of(100), output=output, shard=7)
+    run(job, tmp_path / "one", device=device)
+    assert run(job, tmp_path / "three", device=[device] * 3)["workers"] == 3
+    assert contents(tmp_path / "three") == contents(tmp_path / "one")
+    with pytest.raises(KeyboardInterrupt):
+        run(job, tmp_path / "four", device=[device] * 4, progress=stop_after(6))
+    assert run(job, tmp_path / "four", device=[device] * 2)["found"] == 6
+    assert contents(tmp_path / "four") == contents(tmp_path / "one")
+    with pytest.raises(ValueError, match="an empty list"):
+        ThisProcess([])
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_every_shard_is_computed_under_the_device_lock(tmp_path, monkeypatch, count):
+    """With one device too: another thread may use the same GPU."""
+    held, locked = threading.local(), []
+
+    @contextlib.contextmanager
+    def lock(device):
+        held.device = device
+        yield
+        held.device = None
+
+    def record(runner, task, device=None, plain=sweep_job.SweepRunner.run):
+        locked.append(device is not None and getattr(held, "device", None) == device)
+        return plain(runner, task, device)
+
+    monkeypatch.setattr(running, "device_lock", lock)
+    monkeypatch.setattr(sweep_job.SweepRunner, "run", record)
+    run(job_of(count=100), tmp_path / "out", device=["cpu"] * count)
+    assert locked == [True] * 5
+
+
+def test_a_job_without_poses_has_no_shards(tmp_path):
+    done = run(SweepJob(*pair(), np.empty((0, 7))), tmp_path / "out")
+    assert done["shards"] == 0 and list(read_shards(tmp_path / "out")) == []
+
+
+# Interrupts.
+
+
+def test_an_interrupted_job_continues(tmp_path, monkeypatch):
+    job, again = (job_of("faces", count=100, shard=9) for _ in range(2))
+    out = tmp_path / "out"
+    run(job, tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        run(job, out, progress=stop_after(4))
+    assert len(list(out.glob("shard-*.npz"))) == 4
+    with pytest.raises(ValueError, match="8 of 12 shards are missing"):
+        list(read_shards(out))
+    (out / "shard-000000000099-000000000100.npz.77.partial").write_bytes(b"half")
+    computed = []
+    monkeypatch.setattr(again, "task", lambda *part: computed.append(part) or job.task(*part))
+    assert run(again, out)["found"] == 4
+    assert computed == [(start, min(start + 9, 100)) for start in range(36, 100, 9)]
+    assert contents(out) == contents(tmp_path / "whole")
+    assert run(again, out)["found"] == 12
+
+
+def test_a_write_that_fails_leaves_no_file(tmp_path, monkeypatch):
+    def fail(file, **columns):
+        file.write(b"half")
+        raise OSError("no space left")
+
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="no space left"):
+        patch.setattr(np, "savez", fail)
+        run(job_of(), tmp_path / "out")
+    assert list(contents(tmp_path / "out")) == [MANIFEST]
+    assert run(job_of(), tmp_path / "out")["found"] == 0
+
+
+def test_a_run_interrupted_at_its_first_file_continues(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / f"{MANIFEST}.1.partial").write_text("{")
+    assert run(job_of(), out)["shards"] == 3
+    assert not list(out.glob("*.partial"))
+
+
+# Folders.
+
+
+def test_names_have_room_for_more_than_twelve_digits(tmp_path):
+    job = {"count": 2 * 10**12, "shard": 10**12, "file": "npz"}
+    for part in shard_folder._ranges(job):
+        (tmp_path / shard_folder._shard_name(*part, "npz")).touch()
+    assert list(shard_folder._find_shards(tmp_path, job)) == [(0, 10**12), (10**12, 2 * 10**12)]
+
+
+def test_a_folder_is_of_one_job(tmp_path):
+    options = {"output": "any", "shard": 50}
+    run(SweepJob(*pair(), poses_of(), **options), tmp_path / "out")
+    before = contents(tmp_path / "out")
+    models, last = pair(), poses_of()
+    last[99, 0] = np.nextafter(last[99, 0], 9)
+    for arguments, more, what in (
+        ((*models, last), {}, "poses"),
+        ((*models, poses_of()), {"output": "count"}, "output"),
+        ((*models, poses_of()), {"shard": 51}, "shard"),
+        ((*models, poses_of(), [3, 3]), {}, "lods"),
+        ((*models[::-1], poses_of()), {}, "models"),
+    ):
+        with pytest.raises(ValueError, match=f"holds another job; not the same: .*{what}"):
+            run(SweepJob(*arguments, **{**options, **more}), tmp_path / "out")
+    assert contents(tmp_path / "out") == before
+
+
+def test_folders_that_are_no_jobs_are_refused(tmp_path):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").write_text("text")
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / MANIFEST).write_text("{")
+    for out, what in (
+        (tmp_path / "full", "is not empty and holds no job.json"),
+        (tmp_path / "full" / "thesis.txt", "is a file"),
+        (tmp_path / "none" / "out", "there is no folder"),
+        (tmp_path / "bad", "damaged"),
+    ):
+        with pytest.raises(ValueError, match=what):
+            run(job_of(), out)
+    with pytest.raises(ValueError, match=r"holds no job\.json"):
+        list(read_shards(tmp_path / "full"))
+    with pytest.raises(ValueError, match="file 'csv'"):
+        run(job_of(), tmp_path / "new", "csv")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("deal", "what"),
+    [(lambda r: [r[0], *r], "answered twice"), (lambda r: r[:1], "2 of 3 shards were not answered")],
+)
+def test_a_pool_that_answers_twice_or_not_at_all_is_detected(tmp_path, deal, what):
+    class Pool(ThisProcess):
+        def run(self, job, ranges):
+            return super().run(job, deal(ranges))
+
+    with pytest.raises(RuntimeError, match=what):
+        run_shards(job_of(), tmp_path / "out", pool=Pool("cpu"))
+
+
+def test_parquet_has_the_same_columns(tmp_path):
+    pytest.importorskip("pyarrow")
+    for output in ("count", "contacts"):
+        for file in ("npz", "parquet"):
+            run(job_of(output, count=50), tmp_path / f"{output}.{file}", file)
+        plain, table = read(tmp_path / f"{output}.npz"), read(tmp_path / f"{output}.parquet")
+        if output == "count":
+            np.testing.assert_array_equal(table.pop("pose"), np.arange(50))
+        for name, values in plain.items():
+            if values.ndim == 2:
+                table[name] = np.stack([table.pop(f"{name}_{axis}") for axis in "xyz"], 1)
+            np.testing.assert_array_equal(table.pop(name), values)
+        assert not table

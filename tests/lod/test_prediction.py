@@ -1,0 +1,122 @@
+"""The selection by a predicted budget against plain Python."""
+
+import math
+
+import numpy as np
+import pytest
+from helpers.lods import selection_models, strewn
+
+from warp_abtree.lod.selection import PredictedSelection, tolerance_scale
+from warp_abtree.lod.view import View
+from warp_abtree.state.ladder import Ladder
+
+
+@pytest.fixture(scope="module")
+def models():
+    return selection_models()
+
+
+def plain_level(selection, i, position, offset):
+    scene = selection.view.scene
+    part = (i * 2654435761 % 2**32) >> 30
+    levels = tolerance_scale(selection.ladder)
+    level = min(max((position - offset + part), 0) // 4, len(levels) - 1)
+    if level == 0:
+        return 0
+    errors = selection.ladder.error[scene.object_model[i]]
+    return int(np.argmax(errors <= levels[level]))
+
+
+def plain_nodes(model, ladder, k, held, wanted):
+    """Nodes of equation 1 for every level wanted that nobody stands at, from the nearest that somebody does."""
+    total, n = 0.0, model.face_count
+    starts = [int(model.progressive.split_start[lod]) for lod in ladder.lod[k]]
+    for level in wanted - held:
+        entries = min(abs(starts[level] - starts[other]) for other in held)
+        if entries > n / 2:
+            total += 2 * n - 1
+        else:
+            faces = max(entries / 2, 1)
+            total += min(faces * (math.log2(n) - math.log2(faces) + 2), 2 * n - 1)
+    return math.floor(total)
+
+
+@pytest.mark.usefixtures("half_refitted_in_part")
+def test_prediction_is_that_of_plain_python(models, device):
+    rng = np.random.default_rng(4)
+    scene = strewn(models, 50, device)
+    view = View(scene)
+    selection = PredictedSelection(view, 10.0, ladder=Ladder(models, 25, "ratio"), loosest=16.0, hold_frames=2)
+    level, ways = np.zeros(50, int), set()
+    for frame in range(24):
+        if frame % 8 == 0:
+            focus = rng.uniform(0, 1, 50)
+            view.focus.assign(focus)
+        work = rng.uniform(0, 100, 50) * (rng.uniform(size=50) < 0.7)
+        up, down = rng.uniform(0.2, 1.2, 2)
+        # Dear and cheap frames by turns, so that the position climbs, falls, stays and holds.
+        rate = [1.0, {10: 9e-3, 5: 4e-3, 2: 4e-3}.get(frame % 12, 1e-3), 1.0, [1e-3, 0.1][frame // 6 % 2], up, down]
+        position = int(selection.scale.numpy()[0])
+        waited = int(selection.scale.numpy()[1])
+        selection.rate.assign(rate)
+        selection.work.assign(work)
+        selection.launch()
+        offset = selection.offset.numpy()
+        loose = np.minimum(np.array(scene.object_importance) / np.maximum(focus, 1e-9), 16.0)
+        assert (offset <= np.floor(16 * np.log2(loose) + 1e-9)).all() and (offset >= 16 * np.log2(loose) - 6).all()
+        steps = selection.changes
+        assert steps[:-2] == sorted(steps[:-2], reverse=True) and steps[-2] == -selection.position_max
+        lasting, moving, totals = [], [], []
+        for k, step in enumerate(steps):
+            held = k == len(steps) - 1
+            then = [level[i] if held else plain_level(selection, i, position + step, offset[i]) for i in range(50)]
+            faces = selection.ladder.faces[scene.object_model]
+            ratio = faces[np.arange(50), then] / faces[np.arange(50), level]
+            total = float(np.sum(work * ratio ** np.where(ratio > 1, up, down)))
+            nodes = 0
+            for m, model in enumerate(scene.models):
+                mine = np.array(scene.object_model) == m
+                present, wanted = set(level[mine].tolist()), set(np.array(then)[mine].tolist())
+                nodes += plain_nodes(model, selection.ladder, m, present, wanted)
+            assert selection.prediction.work.numpy()[k] == pytest.approx(total, rel=1e-12)
+            assert selection.prediction.moved.numpy()[k] == np.count_nonzero(np.array(then) != level)
+            assert selection.prediction.nodes.numpy()[k] == pytest.approx(nodes, abs=1)
+            totals.append(total)
+            lasting.append(rate[0] + rate[1] * total)
+            moving.append(rate[2] * (list(then) != list(level)) + rate[3] * nodes)
+        way, chosen, waited = plain_choice(lasting, moving, steps.index(0), position, selection, waited)
+        ways.add(way)
+        assert int(selection.choice.numpy()[0]) == chosen, frame
+        assert selection.choice.numpy()[3:].tolist() == pytest.approx([totals[chosen], totals[-1]], rel=1e-12)
+        position = min(max(position + steps[chosen], 0), selection.position_max)
+        assert selection.scale.numpy().tolist() == [position, waited]
+        if chosen < len(steps) - 1:
+            level = np.array([plain_level(selection, i, position, offset[i]) for i in range(50)])
+        assert selection.level.numpy().tolist() == level.tolist()
+        assert selection.lods.numpy().tolist() == selection.ladder.lod[scene.object_model, level].tolist()
+    assert ways == {"fall", "hold", "follow late", "climb", "wait", "climb late", "stay"}
+
+
+def plain_choice(lasting, moving, stay, position, selection, waited):
+    """The rule as its docstring has it; return its name, the candidate, and how many frames a move has waited."""
+    budget, held = selection.budget, len(lasting) - 1
+    aim, low = selection.aim * budget, selection.low * budget
+    cost = lasting[stay] + moving[stay]
+    late = waited >= selection.hold_frames
+    if lasting[held] > budget:
+        return "fall", min([k for k in range(stay + 1, held) if lasting[k] <= aim], default=held - 1), 0
+    if cost > budget:
+        return ("follow late", stay, 0) if late else ("hold", held, waited + 1)
+    if cost < low and position < selection.position_max:
+        fits = [k for k in range(stay) if lasting[k] <= aim and lasting[k] + moving[k] <= budget]
+        if fits:
+            return "climb", min(fits), 0
+        if lasting[stay - 1] <= aim:
+            return ("climb late", stay - 1, 0) if late else ("wait", stay, waited + 1)
+    return "stay", stay, 0
+
+
+def test_without_a_frame_the_dial_stands(models, device):
+    selection = PredictedSelection(View(strewn(models, 9, device)), 10.0)
+    selection.launch()
+    assert selection.scale.numpy().tolist() == [0, 0] and not selection.lods.numpy().any()

@@ -1,0 +1,255 @@
+"""Selection of LODs on the device against plain Python written from section 4.2 of the paper and from figure 4."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.lods import selection_models, strewn
+
+import warp_abtree as ab
+from warp_abtree.lod.selection import PaperSelection, PredictedSelection, ToleranceSelection
+from warp_abtree.lod.view import Camera, View
+from warp_abtree.state.ladder import Ladder
+
+# Figure 4 by hand: g in frames 1 to 10, Case 1 until frame 5 and Case 2 from frame 6. Rows are Q1, Q2, Q3.
+FIGURE_4 = [
+    [1, 2, 4, 8, 16, 8, 4, 2, 1, 0],
+    [0, 1, 2, 4, 8, 8, 4, 2, 1, 0],
+    [0, 0, 1, 2, 4, 8, 4, 2, 1, 0],
+]
+
+
+@pytest.fixture(scope="module")
+def models():
+    return selection_models()
+
+
+# The paper's formulas, from its text and errata alone.
+
+
+def case_of(cost, budget, threshold):
+    difference = cost - budget
+    if difference <= -threshold:
+        return 1
+    return 2 if difference > 0 else 3
+
+
+def g_printed(cases, i, importance, mirror=True):
+    """g of section 4.2 for frame i (from 1), cases a list of all frames so far.
+
+    j is the closest previous frame after which the case became what it is. In Case 2 both i and j are counted from the
+    start of the preceding run of Case 1 (erratum); without `mirror` they are absolute, as printed.
+    """
+
+    def case(frame):
+        return cases[frame - 1] if frame >= 1 else None
+
+    j = i - 1
+    while case(j) == case(i):
+        j -= 1
+    if case(i) == 1:
+        return 2 ** (i - j - importance) if i - j >= importance else 0
+    if case(i) == 3:
+        return 0
+    if mirror:
+        end = j
+        while end >= 1 and case(end) != 1:
+            end -= 1
+        start = end
+        while case(start) == 1:
+            start -= 1
+        i, j = i - j + end - start, end - start
+    return 2 ** (2 * j - i - 1) if 2 * j >= i + 1 else 0
+
+
+@pytest.mark.parametrize("mirror", [True, False])
+def test_oracle_is_figure_4(mirror):
+    cases = [1] * 5 + [2] * 5
+    for importance, curve in enumerate(FIGURE_4, 1):
+        # The figure's climb starts at frame 1, where absolute numbers and those of the mirror are the same.
+        assert [g_printed(cases, i, importance, mirror) for i in range(1, 11)] == curve
+
+
+def test_printed_g2_explodes_and_the_mirror_does_not():
+    cases = [3] * 20 + [1] * 5 + [2] * 4
+    assert [g_printed(cases, i, 1) for i in range(26, 30)] == [8, 4, 2, 1]
+    assert g_printed(cases, 26, 1, mirror=False) == 2**23
+
+
+def run_paper(scene, costs, budget=10.0, threshold=None, steps=50, start=0.0, focus=None):
+    """Return the levels after each cost, (frames + 1, n), and the LODs."""
+    view = View(scene)
+    if focus is not None:
+        view.focus.assign(focus)
+    selection = PaperSelection(view, budget, threshold, Ladder(scene.models, steps))
+    selection.level.fill_(start)
+    levels, lods = [selection.level.numpy().copy()], []
+    for cost in costs:
+        selection.cost.fill_(cost)
+        selection.launch()
+        levels.append(selection.level.numpy().copy())
+        lods.append(selection.lods.numpy().copy())
+    return np.array(levels), np.array(lods)
+
+
+def test_figure_4(models, device):
+    scene = ab.Scene(device=device)
+    for importance in (1, 2, 3):
+        scene.add(models[0], importance=importance)
+    # Room on both sides, so that no end of the ladder hides a step.
+    levels, _ = run_paper(scene, [5.0] * 5 + [15.0] * 5, steps=400, start=200.0)
+    moved = np.diff(levels, axis=0).T
+    assert moved[:, :5].tolist() == [curve[:5] for curve in FIGURE_4]
+    assert (-moved[:, 5:9]).tolist() == [curve[5:9] for curve in FIGURE_4]
+    # Erratum: the figure ends with 0, and a scene over its budget would stay so; the smallest step goes on.
+    assert moved[:, 9].tolist() == [-1, -1, -1]
+
+
+@pytest.mark.parametrize("threshold", [None, 4.0])
+def test_selection_follows_the_paper(models, device, threshold):
+    """Random times: every case follows every other, at every distance and speed."""
+    rng = np.random.default_rng(5)
+    scene = strewn(models, 18, device)
+    focus = rng.uniform(0, 1, 18)
+    focus[:2] = 0.0, 1.0
+    # Times come in runs, or a climb would never be long.
+    costs = np.repeat(rng.choice([2.0, 7.0, 9.0, 9.5, 10.0, 10.5, 30.0], 60), rng.integers(1, 7, 60))
+    levels, lods = run_paper(scene, costs, threshold=threshold, focus=focus)
+    cases = [case_of(cost, 10.0, threshold or 1.0) for cost in costs]
+    assert {(a, b) for a, b in pairwise(cases)} == {(a, b) for a in (1, 2, 3) for b in (1, 2, 3)}
+    level = np.zeros(18)
+    for i, case in enumerate(cases, 1):
+        for k in range(18):
+            g = g_printed(cases, i, scene.object_importance[k])
+            step = focus[k] * g if case == 1 else -max(g, 1) if case == 2 else 0.0
+            level[k] = min(max(level[k] + step, 0.0), 50.0)
+            lod_max = scene.models[scene.object_model[k]].lod_max
+            assert abs(lods[i - 1, k] - level[k] * lod_max / 50) <= 0.5 * lod_max / 50 + 0.5
+        assert np.array_equal(levels[i], level), i
+    assert levels.max() == 50 and (levels[1:] == 0).any()
+
+
+def test_everything_starts_and_stays_at_the_coarsest_without_a_frame(models, device):
+    scene = strewn(models, 6, device)
+    levels, lods = run_paper(scene, [math.nan, math.nan])
+    assert not levels.any() and not lods.any()
+
+
+# Ladders.
+
+
+def test_paper_ladder_has_equal_operations(models):
+    ladder = Ladder(models, 50)
+    for model, lods, errors, faces in zip(models, ladder.lod, ladder.error, ladder.faces):
+        assert len(lods) == 51 and (lods[0], lods[-1]) == (0, model.lod_max)
+        assert np.abs(lods - np.arange(51) * model.lod_max / 50).max() <= 0.5
+        assert errors.tolist() == [model.error_at(int(lod)) for lod in lods]
+        assert faces.tolist() == [len(model.mesh_at(int(lod))[2]) for lod in lods]
+
+
+def test_ratio_ladder_has_equal_ratios(models):
+    ladder = Ladder(models, 20, "ratio")
+    for model, lods, faces in zip(models, ladder.lod, ladder.faces):
+        assert (lods[0], lods[-1]) == (0, model.lod_max) and (np.diff(lods) >= 0).all()
+        wanted = faces[0] * (faces[-1] / faces[0]) ** (np.arange(21) / 20)
+        assert (faces >= wanted * (1 - 1e-9)).all()
+        for level in range(1, 20):  # a coarser LOD would not do
+            assert lods[level] == 0 or len(model.mesh_at(int(lods[level]) - 1)[2]) < wanted[level]
+
+
+@pytest.mark.parametrize("wrong", [{"steps": 0}, {"steps": 2.5}, {"spacing": "equal"}])
+def test_ladder_refuses(models, wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        Ladder(models, **wrong)
+
+
+# Tolerances.
+
+
+def test_tolerance_gives_the_coarsest_rung_within_it(models, device):
+    rng = np.random.default_rng(3)
+    scene = strewn(models, 60, device)
+    view = View(scene)
+    ladder = Ladder(models, 30, "ratio")
+    selection = ToleranceSelection(view, 0.0, loosest=8.0, ladder=ladder)
+    seen = set()
+    for tolerance in (0.0, 1e-4, 2e-3, 0.01, 0.05, 1.0, 100.0):
+        focus = np.round(rng.uniform(0, 1, 60), 3)
+        focus[:3] = 0.0, 1.0, 0.5
+        view.focus.assign(focus)
+        selection.tolerance.fill_(tolerance)
+        selection.launch()
+        lods = selection.lods.numpy()
+        for i in range(60):
+            beta, model = scene.object_importance[i], scene.models[scene.object_model[i]]
+            allowed = tolerance * (8.0 if focus[i] == 0 else min(beta / focus[i], 8.0))
+            assert model.error_at(int(lods[i])) <= allowed
+            fits = [lod for lod in ladder.lod[scene.object_model[i]].tolist() if model.error_at(lod) <= allowed]
+            assert lods[i] == min(fits)
+            seen.add(int(lods[i]))
+    assert len(seen) > 15
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda view: PaperSelection(view, 0.0),
+        lambda view: PaperSelection(view, math.nan),
+        lambda view: PaperSelection(view, 8.0, threshold=-1.0),
+        lambda view: ToleranceSelection(view, -1e-9),
+        lambda view: ToleranceSelection(view, math.nan),
+        lambda view: ToleranceSelection(view, 1.0, loosest=0.5),
+        lambda view: PredictedSelection(view, -8.0),
+        lambda view: PredictedSelection(view, 8.0, low=0.95, aim=0.9),
+        lambda view: PredictedSelection(view, 8.0, hold_frames=-1),
+        lambda view: View(view.scene, window=0),
+    ],
+)
+def test_selections_refuse(models, make):
+    view = View(strewn(models, 3, "cpu"))
+    with pytest.raises(ValueError):
+        make(view)
+
+
+# Graphs.
+
+
+@pytest.mark.parametrize("kind", ["paper", "tolerance", "predicted"])
+def test_selection_runs_in_a_captured_graph(models, device, kind):
+    """One graph, launched again and again while cameras, poses and costs change, gives what plain launches give."""
+
+    def make(scene):
+        view = View(scene)
+        if kind == "paper":
+            return view, PaperSelection(view, 10.0)
+        return view, ToleranceSelection(view, 0.01) if kind == "tolerance" else PredictedSelection(view, 10.0)
+
+    def launch(view, selection):
+        view.launch()
+        selection.launch()
+
+    scene = strewn(models, 30, device)
+    plain, captured = make(scene), make(scene)
+    launch(*make(scene))  # loads the kernels
+    with wp.ScopedCapture(device=device) as capture:
+        launch(*captured)
+    wp.synchronize_device(device)
+    seen = []
+    for frame in range(6):
+        camera = Camera.look_at((0, frame, 8), (0, 0, 0), far=30.0)
+        for view, selection in (plain, captured):
+            view.look(camera)
+            if kind == "paper":
+                selection.cost.fill_([3.0, 3.0, 3.0, 20.0, 20.0, 3.0][frame])
+            if kind == "predicted":
+                selection.rate.assign([1.0, [1e-4, 1.0][frame == 4], 0.0, 0.0, 1.0, 0.5])
+                selection.work.fill_(10.0)
+        launch(*plain)
+        wp.capture_launch(capture.graph)
+        lods = plain[1].lods.numpy().copy()
+        assert np.array_equal(captured[1].lods.numpy(), lods), frame
+        assert np.array_equal(captured[0].motion.numpy(), plain[0].motion.numpy())
+        seen.append(tuple(lods))
+    assert len(set(seen)) > 2

@@ -1,0 +1,144 @@
+"""Buffers that are too small: the error names the demand, room for the demand is enough, and `run` makes room."""
+
+import re
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import warp as wp
+from conftest import slow
+from helpers.gpu_query import GpuQuery
+from helpers.resources import MORE_PAIRS, PAIRS, check_scene, describe, make_scene
+from helpers.samples import sample
+
+import warp_abtree as ab
+from warp_abtree.query import request
+
+# Operator, options (pairs are found by the broad phase unless given), and the buffer that is too small.
+KINDS = {
+    "hits": (ab.Query, dict(output="faces", pairs=...), "hits"),
+    "contacts": (ab.ContactQuery, dict(pairs=...), "hits"),
+    "found pairs": (ab.Query, dict(output="faces"), "pairs"),
+    "pairs of contacts": (ab.ContactQuery, {}, "pairs"),
+    "uncertain pairs": (GpuQuery, dict(output="faces", pairs=...), "uncertain"),
+}
+
+
+@pytest.fixture
+def crowd(device):
+    scene = make_scene(device)
+    for _ in range(2):
+        scene.add(sample("twins"))
+    return scene
+
+
+@pytest.mark.parametrize("kind", [*list(KINDS)[:-1], *slow("uncertain pairs")])
+def test_overflow_names_the_demand(crowd, kind):
+    """Counts are whole all the same, and what there was room for are rows of the whole answer, in order."""
+    operator, options, name = KINDS[kind]
+    whole = crowd.intersect(output="contacts")
+    options = {**options, **({"pairs": whole.pairs} if "pairs" in options else {})}
+    ample = {} if name == "hits" else {"hits": len(whole.faces)}
+
+    def named_demand(room):
+        query = operator(crowd, **options, capacity=ab.Buffers(**{**ample, name: room}))
+        query.launch()
+        result = query.result()
+        with pytest.raises(ab.CapacityError) as caught:
+            result.check()
+        pattern = rf"(\d+) [\w\s]*, the query has room for {room}: [^\n]*Buffers\({name}=\1\)"
+        found = re.fullmatch(pattern, str(caught.value))
+        assert found, caught.value
+        if name == "hits":
+            np.testing.assert_array_equal(result.count, whole.count)
+            assert len(result.faces) == room and (np.lexsort(result.faces.T[::-1]) == np.arange(room)).all()
+            assert {row.tobytes() for row in result.faces} <= {row.tobytes() for row in whole.faces}
+        if kind == "contacts":
+            assert {row.tobytes() for row in result.contacts} <= {row.tobytes() for row in whole.contacts}
+            rows = np.searchsorted(result.faces[:, 0], np.arange(len(whole.pairs) + 1))
+            np.testing.assert_array_equal(query.start.numpy(), rows)
+        grown = query.run()
+        assert grown.faces.shape == whole.faces.shape and len(grown.pairs) == len(whole.pairs)
+        if "pairs" in options:
+            np.testing.assert_array_equal(grown.faces, whole.faces)
+        return int(found.group(1))
+
+    demand = named_demand(1)
+    assert demand == {"hits": len(whole.faces), "pairs": len(whole.pairs), "uncertain": demand}[name] > 8
+    for room in (demand // 2, demand - 1):
+        assert named_demand(room) == demand
+    query = operator(crowd, **options, capacity=ab.Buffers(**{**ample, name: demand}))
+    query.launch()
+    result = query.result()
+    result.check()
+    assert len(result.faces) == len(whole.faces)
+
+
+def test_a_scene_grows_its_buffers(device):
+    """More hits, and more pairs, than the room that a query of one pair starts with."""
+    scene = ab.Scene(device)
+    for _ in range(5):
+        scene.add(sample("torus"))
+    result = scene.intersect([(0, 1)], output="faces")
+    assert len(result.faces) == result.count[0] > 1024
+    assert len(scene.broad_phase()) == len(scene.intersect().pairs) == 10
+
+
+@contextmanager
+def little_memory(device):
+    """Leave a device less memory than the largest buffer takes."""
+    if wp.get_device(device).is_cuda:
+        spare = wp.get_device(device).free_memory - 2**33
+        hog = wp.empty((max(spare >> 20, 1), 2**20), dtype=wp.uint8, device=device)
+        yield hog
+        return
+    resource = pytest.importorskip("resource")
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            used = int(file.read().split()[0]) * resource.getpagesize()
+    except OSError:
+        pytest.skip("no way here to tell how much memory the process uses")
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + 2**33, hard))
+    try:
+        yield None
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+LARGEST = 2**31 - 1
+
+
+@pytest.mark.slow
+def test_the_error_names_the_bytes(device):
+    """The largest buffers that may be asked for, for real: so many entries of three integers."""
+    scene = make_scene(device)
+    before = check_scene(None, scene)
+    query = ab.Query(scene, "faces", pairs=PAIRS)
+    answers = describe(query.run())
+    with little_memory(device):
+        for call in (
+            lambda: ab.Query(scene, "faces", pairs=PAIRS, capacity=LARGEST),
+            lambda: GpuQuery(scene, "faces", pairs=PAIRS, capacity=ab.Buffers(uncertain=LARGEST)),
+            lambda: query.resize(LARGEST),
+        ):
+            with pytest.raises(RuntimeError, match=f"{12 * LARGEST} bytes on device '{device}'"):
+                call()
+            check_scene(before, scene)
+            assert describe(query.run()) == answers
+
+
+def test_more_pairs_than_a_launch_holds(device, monkeypatch):
+    monkeypatch.setattr(request, "PAIRS_MAX", len(MORE_PAIRS))
+    scene = make_scene(device)
+    before = check_scene(None, scene)
+    query = ab.Query(scene, "faces", pairs=PAIRS)
+    answers = describe(query.run())
+    with pytest.raises(ValueError, match="buffers: pairs 13 is outside"):
+        ab.Query(scene, "any", capacity=ab.Buffers(pairs=13))
+    many = np.concatenate([MORE_PAIRS, PAIRS])
+    for call in (lambda: query.set_pairs(many), lambda: scene.intersect(many), lambda: ab.Query(scene, pairs=many)):
+        with pytest.raises(ab.CapacityError, match="15 object pairs at a time"):
+            call()
+        check_scene(before, scene)
+        assert describe(query.run()) == answers

@@ -1,0 +1,182 @@
+"""Frames that lose work or are given bad numbers: served as stated, and told once by the next check."""
+
+import warnings
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.frames import add_objects, check_same, check_states, replay, set_lods, tops
+from helpers.gpu_query import GpuQuery
+from helpers.samples import random_poses, sample
+
+import warp_abtree as ab
+from warp_abtree.query import narrow_phase
+from warp_abtree.scene import pipeline
+
+pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
+
+
+def test_bad_poses(device):
+    scene = add_objects(device, ["ball"] * 5, spread=0.3)
+    frame = ab.FrameGraph(scene, "count")
+    good = random_poses(np.random.default_rng(10), 5, 0.3)
+    frame.poses.assign(good)
+    frame.launch()
+    before = frame.result()
+    launch = replay(frame)
+    for column, value in ((0, np.nan), (2, np.inf), (4, np.nan), (5, -np.inf), (slice(3, 7), 0.0), (slice(3, 7), 0.6)):
+        rows = good.copy()
+        rows[3, column] = rows[2, column] = value
+        frame.poses.assign(rows)
+        launch()
+        check_same(frame.result(), before)
+        launch()
+        frame.poses.assign(good)
+        launch()  # a good frame hides nothing
+        with pytest.raises(ValueError, match=r"poses: 4 rows .* is 2, and kept"):
+            frame.check()
+        frame.check()
+    rows = good.copy()
+    rows[:, 3:] *= [[1.0009], [0.9991], [1], [1], [1]]
+    frame.poses.assign(rows)
+    launch()
+    frame.check()
+    scene.set_poses(rows)
+    check_same(frame.result(), scene.intersect(output="count"))
+
+
+# Levels of each model (None: every LOD), and (object, LOD asked, LOD served); "top" is the object's finest.
+BAD_LODS = {
+    "every LOD": (None, [(1, -1, 0), (0, "top+1", "top"), (2, 2**31 - 1, "top"), (2, -(2**31), 0)]),
+    "both ends": ("ends", [(1, -1, 0), (0, "top+1", "top"), (2, 2**31 - 1, "top"), (2, -(2**31), 0)]),
+    "a short ladder": ([[5, 20], [7]], [(0, 21, 20), (2, 10**6, 20)]),
+}
+
+
+@pytest.mark.parametrize("case", BAD_LODS)
+def test_bad_lods(device, case):
+    scene = add_objects(device, ["ball", "torus", "ball"])
+    ladder, wishes = BAD_LODS[case]
+    ladder = [[0, model.lod_max] for model in scene.models] if ladder == "ends" else ladder
+    frame = ab.FrameGraph(scene, "count", ladder=ladder)
+    finest = frame.lods.numpy().copy()
+    if ladder is None or case == "both ends":
+        np.testing.assert_array_equal(finest, tops(scene))
+    else:
+        np.testing.assert_array_equal(finest, [20, 7, 20])
+    launch = replay(frame)
+    for i, wish, served in wishes:
+        named = {"top": finest[i], "top+1": finest[i] + 1}
+        lods = finest.astype(np.int64)
+        lods[i] = named.get(wish, wish)
+        set_lods(frame, lods)
+        launch()
+        set_lods(frame, finest)
+        lods[i] = named.get(served, served)
+        scene.set_lods(lods)
+        check_states(frame, scene)
+        launch()
+        with pytest.raises(ValueError, match=f"lods: 1 entries .* is {i}, and took"):
+            frame.check()
+        frame.check()
+
+
+def test_lost_work_is_told(device):
+    """Also frames later, when all is well again; and `run` makes room."""
+    scene = add_objects(device, ["ball"] * 6, spread=0.2)
+    near = random_poses(np.random.default_rng(11), 6, 0.2)
+    far = near + np.arange(6)[:, None] * [9.0, 0, 0, 0, 0, 0, 0]
+    scene.set_poses(near)
+    expected = scene.intersect(output="faces")
+    hits = len(expected.faces)
+    scene.set_poses(far)
+    for options, message in (
+        ({"hits": 2 * hits, "pairs": 14}, "pairs=15.*for 14"),
+        ({"hits": hits - 1, "pairs": 15}, f"hits={hits}.* for {hits - 1}"),
+        ({"hits": hits, "pairs": 15}, None),
+    ):
+        frame = ab.FrameGraph(scene, "faces", capacity=ab.Buffers(**options))
+        launch = replay(frame)
+        for poses in (far, near, far):
+            frame.poses.assign(poses)
+            launch()
+        if message is None:
+            frame.check()
+        else:
+            with pytest.raises(ab.CapacityError, match=message):
+                frame.check()
+            frame.check()
+        frame.poses.assign(near)
+        check_same(frame.run(), expected)
+        frame.launch()
+        frame.check()
+        check_same(frame.result(), expected)
+
+
+def test_one_check_tells_all_that_was_wrong(device):
+    scene = add_objects(device, ["small ball"] * 2, spread=0.1)
+    frame = ab.FrameGraph(scene, output="faces", capacity=1)
+    poses = frame.poses.numpy().copy()
+    frame.poses.fill_(np.nan)
+    frame.lods.fill_(10**6)
+    frame.launch()
+    frame.poses.assign(poses)
+    with pytest.raises(ab.CapacityError, match=r"hits=.*poses: 2 rows.*lods: 2 entries"):
+        frame.check()
+
+
+REFUSED = [
+    (dict(groups=[0, 1]), "groups: .*shape"),
+    (dict(groups=[0.0, 1.0, 0.0]), "groups: .*type float64"),
+    (dict(groups=[0, 0, 1]), "groups: .*group 0 holds objects of several models"),
+    (dict(groups=[0, 2, 0]), "groups: .*without gaps"),
+    (dict(groups=[-1, 0, -1]), "groups: .*numbered -1 to 0"),
+    (dict(ladder=[[1]]), "1 lists of LODs given for 2 models"),
+    (dict(ladder=[[1], []]), "no LOD for model 1"),
+    (dict(ladder=[[1], [10**6]]), "LOD 1000000 is outside"),
+    (dict(groups=[0, 1, 0], ladder=[[0], [0]]), "give one of them"),
+    (dict(output="all"), "none of 'any'"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), REFUSED)
+def test_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        ab.FrameGraph(add_objects("cpu", ["ball", "torus", "ball"]), **options)
+
+
+@pytest.fixture
+def coincident(device, monkeypatch):
+    """A scene of coincident objects, asked as on CUDA: float32 leaves many pairs of faces open."""
+    monkeypatch.setattr(pipeline, "Query", GpuQuery)
+    monkeypatch.setattr(narrow_phase, "UNCERTAIN_ROOM", 16)
+    scene = ab.Scene(device)
+    for _ in range(3):
+        scene.add(sample("twins"))
+    return scene
+
+
+@pytest.mark.slow
+def test_the_room_of_the_first_frame_is_made(coincident):
+    frame = ab.FrameGraph(coincident, output="count")
+    needed = int(frame.run().float64_tests.sum())
+    assert len(frame.query.hits.unsure) >= needed > 16
+    frame = ab.FrameGraph(coincident, output="count")
+    wp.capture_launch(frame.capture())
+    frame.check()
+    np.testing.assert_array_equal(frame.result().count, coincident.intersect(output="count").count)
+
+
+@pytest.mark.slow
+def test_a_room_that_is_too_small_is_told_at_construction(coincident):
+    needed = int(ab.FrameGraph(coincident, output="count").run().float64_tests.sum())
+    with pytest.warns(RuntimeWarning, match=f"=8: .* leave {needed} .*uncertain={needed}"):
+        frame = ab.FrameGraph(coincident, output="count", capacity=ab.Buffers(uncertain=8))
+    wp.capture_launch(frame.capture())
+    with pytest.raises(ab.CapacityError, match=f"needed .*uncertain={needed}.*room for 8"):
+        frame.check()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        frame = ab.FrameGraph(coincident, output="count", capacity=ab.Buffers(uncertain=needed))
+    wp.capture_launch(frame.capture())
+    frame.check()

@@ -1,0 +1,92 @@
+"""Prescribed motion against closed forms and a bouncing point, and the quaternions that it turns by."""
+
+import math
+
+import numpy as np
+import pytest
+
+import warp_abtree as ab
+from warp_abtree.checks.quaternions import matrices_of, multiply_quaternions, quaternions_about, quaternions_of
+
+
+def rotate(quaternion, vector):
+    """Turn a vector by a quaternion x y z w as the product q v q*."""
+    x, y, z, w = quaternion
+    turned = multiply_quaternions(multiply_quaternions(quaternion, [*vector, 0.0]), [-x, -y, -z, w])
+    assert abs(turned[3]) < 1e-12
+    return turned[:3]
+
+
+def rodrigues(axis, angle, vector):
+    axis, vector = np.asarray(axis) / np.linalg.norm(axis), np.asarray(vector)
+    along = axis * (axis @ vector)
+    return along + (vector - along) * math.cos(angle) + np.cross(axis, vector) * math.sin(angle)
+
+
+def bounce(start, way, period, phase, time, steps=20_000):
+    """Walk from one end to the other and back in small steps, turning round at the ends."""
+    s, direction = 0.0, 1.0
+    for _ in range(round(steps * (time / period + phase))):
+        s += direction * 2.0 / steps
+        if s >= 1.0 - 1e-9 or s <= 1e-9:
+            direction = -direction
+    return np.asarray(start) + s * np.asarray(way)
+
+
+def test_motion_in_a_straight_line():
+    motion = ab.Kinematic(position=[[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]], velocity=[[1.0, 0.0, -2.0], [0.0, 0.5, 0.0]])
+    assert np.allclose(motion.poses(4.0), [[5, 2, -5, 0, 0, 0, 1], [0, 2, 0, 0, 0, 0, 1]])
+    assert np.allclose(motion.poses(-1.0)[:, :3], [[0, 2, 5], [0, -0.5, 0]])
+
+
+def test_turning_follows_rodrigues():
+    rng = np.random.default_rng(1)
+    axis, rate = rng.normal(size=(8, 3)), rng.uniform(-3, 3, 8)
+    start = rng.normal(size=(8, 4))
+    start /= np.linalg.norm(start, axis=1, keepdims=True)
+    motion = ab.Kinematic(position=np.zeros((8, 3)), rotation=start, axis=axis, rate=rate)
+    buffer = np.empty((8, 7))
+    for time in (0.0, 0.3, 7.7, -2.0):
+        poses = motion.poses(time)
+        assert motion.poses(time, out=buffer) is buffer and np.array_equal(buffer, poses)
+        assert np.allclose(np.linalg.norm(poses[:, 3:], axis=1), 1.0, atol=1e-15)
+        for i in range(8):
+            vector = rng.normal(size=3)
+            expected = rodrigues(axis[i], rate[i] * time, rotate(start[i], vector))
+            assert np.allclose(rotate(poses[i, 3:], vector), expected, atol=1e-12)
+
+
+def test_quarter_turn_is_right_handed():
+    assert np.allclose(rotate(quaternions_about([0, 0, 1], np.pi / 2), [1, 0, 0]), [0, 1, 0])
+
+
+@pytest.mark.parametrize("time", [0.0, 0.4, 1.0, 1.3, 2.0, 5.9])
+def test_shuttle_reflects_at_its_ends(time):
+    start, way = [0.5, 0.0, 1.0], [1.0, -2.0, 0.5]
+    motion = ab.Kinematic(position=[start], shuttle=way, period=2.0, phase=0.25)
+    assert np.allclose(motion.poses(time)[0, :3], bounce(start, way, 2.0, 0.25, time), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"position": [0.0, 0.0, 0.0]},
+        {"velocity": np.zeros((2, 3))},
+        {"velocity": [np.nan, 0, 0]},
+        {"rotation": [0.0, 0.0, 0.0, 2.0]},
+        {"axis": [0.0, 0.0, 0.0], "rate": 1.0},
+        {"period": 0.0},
+        {"period": np.nan},
+    ],
+)
+def test_motion_refuses(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        ab.Kinematic(**{"position": np.zeros((3, 3)), **wrong})
+
+
+def test_quaternions_of_all_rotations():
+    rng = np.random.default_rng(0)
+    q = rng.normal(size=(200, 4))
+    q = np.concatenate([q, np.eye(4), [[1, 1, 0, 0], [0, 1, 1, 1e-12], [1e-9, 1, 0, 1]]])
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    np.testing.assert_allclose(matrices_of(quaternions_of(matrices_of(q))), matrices_of(q), atol=1e-14)

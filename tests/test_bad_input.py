@@ -1,0 +1,278 @@
+"""Bad arguments and files of every package: each refused by one line that names what is wrong."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from helpers.samples import SHAPES, sample
+
+import warp_abtree as ab
+from warp_abtree.app.cli.main import main
+from warp_abtree.lod.timing import ReplayClock, WorkClock
+from warp_abtree.lod.view import Camera
+from warp_abtree.model.mesh import load_mesh
+
+SCENE = """
+[models.ball]
+shape = "icosphere"
+subdivisions = 1
+[[objects]]
+model = "ball"
+count = 3
+"""
+
+
+def balls(device="cpu", count=2):
+    scene = ab.Scene(device)
+    for i in range(count):
+        scene.add(sample("small ball"), pose=(0.1 * i, 0, 0, 0, 0, 0, 1), world=i)
+    return scene
+
+
+def write_scene(tmp_path, text=SCENE):
+    path = tmp_path / "s.toml"
+    path.write_text(text)
+    return path
+
+
+# Scene files and the command line.
+
+
+@pytest.mark.parametrize("count", [0, -1, 1.5, 2.0, "x", True, np.int32(0), np.nan])
+def test_a_number_of_objects_is_whole_and_above_0(tmp_path, count):
+    with pytest.raises(ValueError, match=r"^objects [^\n]*$"):
+        ab.load_scene(write_scene(tmp_path), device="cpu", objects=count)
+
+
+def test_a_number_of_objects_of_numpy(tmp_path):
+    loaded = ab.load_scene(write_scene(tmp_path), device="cpu", objects=np.int64(5))
+    assert loaded.scene.object_count == 5 and type(loaded.objects) is int
+
+
+def test_the_spacing_of_a_file_belongs_to_its_controller(tmp_path):
+    """The paper's controller has no spacing; given on the command line instead of the file's, it goes without."""
+    text = SCENE + '[lod]\nbudget_ms = 8\nspacing = "ratio"\n'
+    with pytest.raises(ab.SceneError, match=r"s\.toml: lod.spacing: "):
+        ab.load_scene(write_scene(tmp_path, text + 'controller = "paper"\n'), device="cpu")
+    assert ab.load_scene(write_scene(tmp_path, text), device="cpu").frame(controller="paper").run(1)
+
+
+def status_of(capsys, *words):
+    """Return the exit status of a command, and its lines on stderr."""
+    capsys.readouterr()
+    try:
+        status = main([str(word) for word in words])
+    except SystemExit as end:
+        status = end.code
+    return status, capsys.readouterr().err.splitlines()
+
+
+@pytest.mark.parametrize("count", ["0", "-1", "1.5", "x"])
+@pytest.mark.parametrize("command", ["run", "view", "picture"])
+def test_a_number_of_objects_on_the_command_line(capsys, command, count):
+    more = ["--out", "x.png"] if command == "picture" else []
+    status, lines = status_of(capsys, command, "rain", *more, "--objects", count)
+    assert status == 2 and len(lines) == 1 and f"--objects: '{count}' is no whole number" in lines[0]
+
+
+@pytest.mark.parametrize(
+    "words", ["nosuch", "--device cpu nosuch", "query --nosuch", "paper --x", "--device cpu paper"], ids=str
+)
+def test_a_benchmark_that_there_is_not(capsys, words):
+    pytest.importorskip("bench")
+    status, lines = status_of(capsys, "bench", *words.split())
+    assert status == 2 and len(lines) == 1
+    if words.endswith(" nosuch") or words == "nosuch":
+        assert all(f"'{name}'" in lines[0] for name in ("paper", "tradeoff", "all", "query", "update"))
+    if words.endswith("cpu paper"):
+        assert "before its options" in lines[0]
+
+
+# Frames, clocks, cameras, controllers, bodies.
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("time_step", [0, -1, 0.0, np.nan, np.inf, "x", None]),
+        ("output", ["everything", None, 3]),
+        ("lods", ["paper", 3, [0, 0]]),
+        ("clock", [3.0, "cpu"]),
+    ],
+)
+def test_a_frame_refuses_when_it_is_made(name, values):
+    scene = balls()
+    for value in values:
+        with pytest.raises(ValueError, match=name):
+            ab.Frame(scene, **{name: value})
+
+
+def test_a_summary_is_of_frames(device):
+    frame = ab.Frame(balls(device), output="contacts")
+    with pytest.raises(ValueError, match="none has run"):
+        frame.summary()
+    assert frame.step().contacts is not None
+    assert frame.summary()["frames"] == 1
+
+
+@pytest.mark.parametrize("name", ["rows.csv", "rows.json"])
+def test_a_history_into_a_folder_that_is_not_there(tmp_path, name):
+    path = tmp_path / "missing" / name
+    frame = ab.Frame(balls())
+    frame.step()
+    with pytest.raises(FileNotFoundError) as caught:
+        frame.record(path)
+    assert str(path) in str(caught.value) and "partial" not in str(caught.value)
+
+
+@pytest.mark.parametrize("rate", [np.nan, -1e-9, np.inf, "fast", None, [1.0, 2.0]])
+def test_rates_of_work(rate):
+    with pytest.raises(ValueError, match="rates: 'query'"):
+        WorkClock({"query": rate})
+    assert WorkClock({"query": 0}).rates["query"] == 0
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_recorded_times_are_finite(tmp_path, value):
+    path = tmp_path / "rows.csv"
+    stages = ["select_ms", "refine_ms", "move_ms", "broad_ms", "query_ms", "answer_ms"]
+    path.write_text(",".join(stages) + f"\n0,0,0,0,{value},0\n")
+    with pytest.raises(ValueError, match=r"rows\.csv: .*not finite"):
+        ReplayClock(path)
+
+
+NOT_FINITE = np.diag([1.0, np.nan, 1.0])
+
+
+@pytest.mark.parametrize(
+    "view", [np.eye(3) * (1 + 0j), NOT_FINITE, np.full((3, 3), np.inf), np.eye(4), np.ones((3, 3)), "x"]
+)
+def test_the_view_of_a_camera(view):
+    with np.errstate(all="ignore"), pytest.raises(ValueError, match=r"^view: "):
+        Camera(np.zeros(3), view)
+    with pytest.raises(ValueError, match=r"^eye: "):
+        Camera(np.zeros(3) + 1j, np.eye(3))
+
+
+@pytest.mark.parametrize("value", ["x", "8", None, np.nan, -1.0, [8.0], 1j])
+def test_controllers_name_the_argument(value):
+    scene = balls()
+    for make, name in (
+        (lambda: ab.PaperController(scene, value), "budget_ms"),
+        (lambda: ab.PredictiveController(scene, value), "budget_ms"),
+        (lambda: ab.ToleranceController(scene, value), "tolerance"),
+        (lambda: ab.PaperController(scene, 8.0, threshold_ms=value), "threshold_ms"),
+    ):
+        if (name, value) != ("threshold_ms", None):
+            with pytest.raises(ValueError, match=rf"^{name}\b"):
+                make()
+
+
+@pytest.mark.parametrize("name", ["density", "friction", "slop", "sleep_speed"])
+def test_bodies_of_infinite_numbers_are_refused(device, name):
+    with pytest.raises(ValueError, match=f"{name}: inf of object 0"):
+        ab.Dynamics(balls(device, 1), **{name: np.inf})
+
+
+# Meshes and models.
+
+
+@pytest.mark.parametrize("index", [4, 2**31, 2**63, 10**30, -(10**30)])
+@pytest.mark.parametrize("face", ["f 1 2 {}", "f 1 2 3 {}", "f {0}/1 2/1 3/1"])
+def test_an_index_of_obj_beyond_the_vertices(tmp_path, index, face):
+    path = tmp_path / "big.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + face.format(index) + "\n")
+    with pytest.raises(ab.MeshError, match=r"big\.obj: .*vert[^\n]*$"):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize("count", [0, 1.5, np.nan, np.inf, "ten", None, True])
+def test_faces_of_a_base_are_a_whole_number(count):
+    with pytest.raises(ValueError, match="base_faces"):
+        ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], base_faces=count)
+
+
+def test_a_built_model_is_opened_not_loaded(tmp_path):
+    path = tmp_path / "ball.npz"
+    sample("small ball").save(path)
+    for load in (ab.Model.load, load_mesh):
+        with pytest.raises(ab.MeshError, match=r"ball\.npz: .*Model\.open"):
+            load(path)
+
+
+def test_info_reads_a_built_model(tmp_path, capsys):
+    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0], [5, 5, 5]]
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices] + ["f 1 3 2", "f 1 2 4", "f 2 3 4", "f 3 1 4", "f 1 5 6"]
+    (tmp_path / "m.obj").write_text("\n".join(lines))
+    model = ab.Model.load(tmp_path / "m.obj")
+    model.save(tmp_path / "m.npz")
+    found = {}
+    for name in ("m.obj", "m.npz"):
+        assert main(["info", str(tmp_path / name), "--json", "--device", "cpu"]) == 0
+        found[name] = json.loads(capsys.readouterr().out)
+    own = {"lods": model.lod_max + 1, "base_faces": len(model.mesh_at(0)[2])}
+    of_file = ("file_vertices", "unreferenced_vertices", "welded_vertices")
+    assert found["m.obj"]["dropped_faces"] == 1
+    assert found["m.npz"] == {key: value for key, value in found["m.obj"].items() if key not in of_file} | own
+    assert main(["info", str(tmp_path / "m.npz"), "--device", "cpu"]) == 0
+    assert re.search(r"^lods +\d", capsys.readouterr().out, re.M)
+
+
+# Model files with one array changed. Arrays that fit one another in type, length and range, but are not one mesh's:
+
+
+def first_merged(arrays):
+    """Return where vertices that merges made begin."""
+    return len(arrays["vertex_parent"]) - (len(arrays["lod_error"]) - 1)
+
+
+def move_merged(value, arrays):
+    value = value.copy()
+    value[first_merged(arrays) :] *= 2.0**130
+    return value
+
+
+def move_child(value, arrays):
+    value = value.copy()
+    first = first_merged(arrays)
+    child = np.flatnonzero((value[:first] >= 0) & (value[:first] < len(value) - 1))[0]
+    value[child] = len(value) - 1
+    return value
+
+
+INCONSISTENT = {
+    "scaled up": ("vertex_pos", lambda x, _: x * 2.0**150),
+    "scaled down": ("vertex_pos", lambda x, _: x * 2.0**-150),
+    "in a point": ("vertex_pos", lambda x, _: 0 * x),
+    "merged vertices far away": ("vertex_pos", move_merged),
+    "all roots": ("vertex_parent", lambda x, _: np.full_like(x, -1)),
+    "a merge of three": ("vertex_parent", move_child),
+    "faces reversed": ("face_vertex", lambda x, _: x[::-1]),
+    "faces without area": ("face_vertex", lambda x, _: np.repeat(x[:, :1], 3, axis=1)),
+    "splits reversed": ("face_split", lambda x, _: x[::-1]),
+    "always there": ("face_split", lambda x, _: 0 * x),
+    "another slice": ("split_face", lambda x, _: np.roll(x, 1)),
+    "slices at the end": ("split_start", lambda x, _: np.where(np.arange(len(x)) > 0, x[-1], 0)),
+}
+# Arrays that would make a mesh, but not the one saved.
+ALTERED = {
+    "half the size": ("vertex_pos", lambda x, _: x * 0.5),
+    "half the error": ("lod_error", lambda x, _: x * 0.5),
+    "leaves swapped": ("leaf_node", lambda x, _: np.concatenate([x[1::-1], x[2:]])),
+    "another name": ("name", lambda *_: np.array("boll")),
+}
+
+
+@pytest.mark.parametrize("case", [*INCONSISTENT, *ALTERED])
+def test_model_files_that_were_altered_are_refused(tmp_path, case):
+    path = tmp_path / "m.npz"
+    ab.Model.from_arrays(*SHAPES["small ball"](), base_faces=4, name="ball").save(path)
+    ab.Model.open(path)
+    name, change = {**INCONSISTENT, **ALTERED}[case]
+    with np.load(path) as file:
+        arrays = dict(file)
+    arrays[name] = change(arrays[name], arrays)
+    np.savez(path, **arrays)
+    with pytest.raises(ab.ModelError, match=r"m\.npz: " + ("altered since it was saved" if case in ALTERED else "")):
+        ab.Model.open(path)

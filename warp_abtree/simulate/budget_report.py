@@ -1,0 +1,59 @@
+"""How well a run of frames held its time budget: `budget_report`, and `step_response` after a load step."""
+
+import numpy as np
+
+
+def budget_report(rows, budget_ms: float | None = None, after: float = 1.0) -> dict | None:
+    """Report how frames held a budget.
+
+    Args:
+        rows: `FrameRow`s in their order.
+        budget_ms: T [ms]; None takes the budget of each row, and rows without one are left out.
+        after: Frames before this time in the scene [s] are left out.
+
+    Returns:
+        None where no row is left, else a dict: frames; within and within_110_percent, fractions of the frames within T
+        and 1.1 T; worst, the greatest cost over T; longest_over, the longest run of frames over 1.1 T; oscillations,
+        how often the LOD of an object reversed its direction, a second; error_mean, the mean `Model.error_at` [world
+        units].
+    """
+    rows = [row for row in rows if row.time >= after and (budget_ms or row.budget_ms) is not None]
+    if not rows:
+        return None
+    ratio = np.array([row.cost_ms / (budget_ms or row.budget_ms) for row in rows])
+    # Where the runs of frames over the limit begin and end.
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], ratio > 1.1, [0]]).astype(int)))
+    span = (rows[-1].time - rows[0].time) * len(rows) / max(len(rows) - 1, 1)
+    oscillations = sum(row.oscillations / row.objects for row in rows)
+    return {
+        "frames": len(rows),
+        "within": float(np.mean(ratio <= 1.0)),
+        "within_110_percent": float(np.mean(ratio <= 1.1)),
+        "worst": float(ratio.max()),
+        "longest_over": int((edges[1::2] - edges[::2]).max(initial=0)),
+        "oscillations": float(oscillations / span) if span > 0 else 0.0,
+        "error_mean": float(np.mean([row.error_mean for row in rows])),
+    }
+
+
+def step_response(rows, frame: int, budget_ms: float | None = None) -> dict:
+    """Report how the budget was regained after the load rose at a frame.
+
+    Args:
+        rows: `FrameRow`s in their order.
+        frame: Number of the first frame under the higher load.
+        budget_ms: T [ms]; None takes the budget of the row at `frame`.
+
+    Returns:
+        A dict: peak, the greatest cost over T from that frame on; frames, the number of frames from it on before the
+        first within 1.1 T, None if there is none.
+
+    Raises:
+        ValueError: There is no such frame, or no budget.
+    """
+    rows = [row for row in rows if row.frame >= frame]
+    if not rows or (budget_ms or rows[0].budget_ms) is None:
+        raise ValueError(f"there is no frame {frame}, or no budget to compare with")
+    ratio = np.array([row.cost_ms for row in rows]) / (budget_ms or rows[0].budget_ms)
+    back = np.flatnonzero(ratio <= 1.1)
+    return {"peak": float(ratio.max()), "frames": int(back[0]) if len(back) else None}
