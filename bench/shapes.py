@@ -96,12 +96,17 @@ def centre_and_radius(model):
     return centre, np.linalg.norm(points - centre, axis=1).max()
 
 
-def scene_of_pairs(device, model, poses):
-    """Return a scene of objects at poses (2 P, 7), and its pairs (P, 2): 2p with 2p + 1."""
+def scene_of_objects(device, model, poses):
+    """Return a scene of a model at each pose."""
     scene = ab.Scene(device=device)
     for pose in poses:
         scene.add(model, pose=pose)
-    return scene, np.arange(len(poses)).reshape(-1, 2)
+    return scene
+
+
+def scene_of_pairs(device, model, poses):
+    """Return a scene of objects at poses (2 P, 7), and its pairs (P, 2): 2p with 2p + 1."""
+    return scene_of_objects(device, model, poses), np.arange(len(poses)).reshape(-1, 2)
 
 
 def scene_of_poses(device, model_a, model_b, poses):

@@ -7,7 +7,7 @@ import warp as wp
 
 import warp_abtree as ab
 
-from ..shapes import knot, random_directions
+from ..shapes import knot, random_directions, scene_of_objects
 from ..timing import capture, summarise_all, time_call, time_graph, time_rounds
 from .memory import count_bytes
 
@@ -138,9 +138,7 @@ def run(device, quick=False):
 def run_objects(device, model, levels, count, ladder, repeats):
     """Return the row of one number of objects and one way to keep states."""
     gc.collect()  # scenes and their queries hold each other
-    scene = ab.Scene(device)
-    for pose in grid_poses(count):
-        scene.add(model, pose)
+    scene = scene_of_objects(device, model, grid_poses(count))
     frames = DeviceFrames(scene, levels, ladder)
     host = HostFrames(scene, frames, repeats)
     runs = {"frame": time_graph(frames.graph, device) if device.is_cuda else time_call(frames.replay, device)}

@@ -10,7 +10,7 @@ import warp_abtree as ab
 
 from ..baselines.wp_bvh import BvhFaces
 from ..roofline import find_peaks, roofline
-from ..shapes import knot, knot_model, longest_side, pair_poses, scene_of_pairs, world_poses
+from ..shapes import knot, knot_model, longest_side, pair_poses, scene_of_objects, scene_of_pairs, world_poses
 from ..timing import fit_slope, summarise_all, time_in_turn, upper_half
 from .memory import memory_columns
 
@@ -174,7 +174,7 @@ def check_worlds(scene, model, poses, result):
         raise RuntimeError("the broad phase pairs objects of different worlds")
     every = np.stack(np.triu_indices(object_count, 1), 1)
     for number in range(0, world_count, max(1, world_count // CHECKED)):
-        alone = scene_of_pairs(scene.device, model, poses[number])[0].intersect(every, output="faces")
+        alone = scene_of_objects(scene.device, model, poses[number]).intersect(every, output="faces")
         expected = np.concatenate([every[alone.faces[:, 0]], alone.faces[:, 1:]], 1)
         rows = result.faces[np.isin(result.faces[:, 0], np.flatnonzero(world[:, 0] == number))]
         found = np.concatenate([result.pairs[rows[:, 0]] - number * object_count, rows[:, 1:]], 1)

@@ -76,10 +76,3 @@ class PosedPairs:
         still = np.tile([0.0, 0, 0, 0, 0, 0, 1], (self._first_count, 1))
         self.poses = np.concatenate([still, self.motions.poses(self._free - depth * self._size)])
         self.scene.set_poses(self.poses)
-
-    def like(self, model, device):
-        """Return a scene of another model, the same objects at the same poses."""
-        scene = ab.Scene(device)
-        for pose in self.poses:
-            scene.add(model, pose)
-        return scene

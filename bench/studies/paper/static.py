@@ -2,6 +2,7 @@
 
 import warp_abtree as ab
 
+from ...shapes import scene_of_objects
 from .meshes import PosedPairs, paper_models
 
 FRACTIONS = (1.0, 0.5, 0.3, 0.2, 0.1, 0.05, 0.03, 0.02, 0.01)
@@ -37,7 +38,7 @@ def compare_static(context, model, lod, posed):
     vertices, faces, face_ids = model.mesh_at(lod)
     # A model whose base is the whole mesh: nothing is collapsed, its tree is built over these faces alone.
     fixed = ab.Model.from_arrays(vertices, faces, base_faces=len(faces))
-    scenes = {"ours": posed.scene, "static": posed.like(fixed, context.device)}
+    scenes = {"ours": posed.scene, "static": scene_of_objects(context.device, fixed, posed.poses)}
     queries = {who: ab.Query(scene, "faces", pairs=posed.pairs) for who, scene in scenes.items()}
     found = {who: query.run() for who, query in queries.items()}
     named = found["static"].faces.copy()
