@@ -50,6 +50,18 @@ class SolverOptions:
     capacity: Buffers | int | None = None
 
 
+class BodyContacts(ManifoldQuery):
+    """Contact points of the pairs in which a body can move."""
+
+    def __init__(self, scene, bodies, capacity):
+        self._motion_type = bodies.motion_type
+        super().__init__(scene, None, capacity)
+
+    def make_pair_keys(self, order, keys):
+        inputs = [self.pair_count, self.pairs, self._motion_type, order, keys]
+        wp.launch(body_kernels.make_body_pair_key_kernel, len(self.pairs), inputs, device=self.device)
+
+
 class Dynamics(RigidBodies):
     """Rigid bodies of a scene, moved step by step; docs/dynamics.md says what it is and what it is not.
 
@@ -102,7 +114,7 @@ class Dynamics(RigidBodies):
             wp.empty(0, dtype=wp.mat33d, device=self.device),
             wp.empty(0, dtype=wp.vec3d, device=self.device),
         )
-        self.query = ManifoldQuery(scene, None, solver.capacity, roles=self.bodies.motion_type)
+        self.query = BodyContacts(scene, self.bodies, solver.capacity)
         self._constraints, self._warm_start = constraint_kernels.Constraints(), constraint_kernels.WarmStart()
         self._room, self._interrupted = 0, False
         self._grow()
