@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 import warp_abtree as ab
-from warp_abtree.app.pictures import picture, plot
-from warp_abtree.app.viewer import render_data as parts
+from warp_abtree.app import scene_geometry as geometry
+from warp_abtree.app.pictures.render import Panel, draw
+from warp_abtree.app.styles import COLOURS
 
 FOLDER = Path(__file__).parent
 INK, PALE, BLUE, RED, GREEN = "#33373d", "#d5d8dc", "#3b76c4", "#d4472f", "#2f9e58"
@@ -32,14 +33,14 @@ def draw_lods():
         vertices, faces, _ = model.mesh_at(lod)
         error = "the original" if lod == model.lod_max else f"error at most {model.error_at(lod):.2g}"
         title = f"LOD {lod:,} of {model.lod_max:,}\n{len(faces):,} faces, {error}"
-        panels.append(plot.Panel(title, vertices[faces], np.tile(plot.COLOURS[0][0], (len(faces), 1))))
+        panels.append(Panel(title, vertices[faces], np.tile(COLOURS[0][0], (len(faces), 1))))
     legend = [
         (
-            plot.COLOURS[0][0],
+            COLOURS[0][0],
             f"bunny; its box has a diagonal of {np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0)):.2g}",
         )
     ]
-    plot.draw(
+    draw(
         panels, FOLDER / "concept_lods.png", "One model, every level of detail", legend, (0.15, 0.3, 1), (0, 1, 0), 300
     )
 
@@ -167,22 +168,20 @@ def draw_traversal():
     eye, up = (0.3, 0.5, 1.0), (0, 1, 0)
     vertices, faces, _ = model.mesh_at(model.lod_max)
     panels = []
-    corners = [plot.place(pose, vertices)[faces] for pose in poses]
-    camera = plot.Camera.around(np.concatenate(corners).reshape(-1, 3), eye, up)
+    where = np.array(poses)
+    corners = [geometry.place(where, np.full(len(faces), k), vertices[faces]) for k in (0, 1)]
     for level in (2, 5, 8):
-        triangles, colours = list(corners), [np.tile(plot.COLOURS[k][0], (len(faces), 1)) for k in (0, 1)]
-        for side in (0, 1):
+        triangles, colours = list(corners), [np.tile(COLOURS[k][0], (len(faces), 1)) for k in (0, 1)]
+        lines = []
+        for side, colour in enumerate(((0.75, 0.15, 0.1), (0.1, 0.25, 0.7))):
             nodes = sorted({pair[side] for pair in found[level]})
-            lines = parts.box_lines(np.stack([states[side].lower[nodes], states[side].upper[nodes]], axis=1))
-            lines = plot.place(poses[side], lines.reshape(-1, 3)).reshape(-1, 2, 3)
-            strips = picture.ribbons(lines, camera, 0.006 * camera.radius)
-            triangles.append(strips)
-            colours.append(np.tile(((0.75, 0.15, 0.1), (0.1, 0.25, 0.7))[side], (len(strips), 1)))
+            edges = geometry.box_lines(np.stack([states[side].lower[nodes], states[side].upper[nodes]], axis=1))
+            lines.append((geometry.place(where, np.full(len(edges), side), edges), colour))
         title = f"level {level}: {len(found[level]):,} of {4**level:,} pairs of nodes overlap"
-        panels.append(plot.Panel(f"{title}\n", np.concatenate(triangles), np.concatenate(colours)))
+        panels.append(Panel(f"{title}\n", np.concatenate(triangles), np.concatenate(colours), lines))
     legend = [((0.75, 0.15, 0.1), "nodes of the first"), ((0.1, 0.25, 0.7), "nodes of the second")]
     title = f"From two roots to {count:,} intersecting pairs of {len(faces):,} by {len(faces):,} faces"
-    plot.draw(panels, FOLDER / "concept_traversal.png", title, legend, eye, up, 380)
+    draw(panels, FOLDER / "concept_traversal.png", title, legend, eye, up, 380)
 
 
 # The dials.

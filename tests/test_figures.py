@@ -27,7 +27,7 @@ def drawn(tmp_path_factory):
             titles[path.name] = [title, *(panel.title for panel in panels)]
             path.touch()
 
-        patch.setattr(figures.plot, "draw", draw)  # which tests/test_cli_run.py holds; here what it is given
+        patch.setattr(figures, "draw", draw)  # tests of pictures cover it; here what it is given
         figures.main()
     return figures.FOLDER, titles
 

@@ -1,6 +1,6 @@
 """Batched mesh-mesh interference queries at any level of detail, on NVIDIA Warp."""
 
-from warp_abtree.app.pictures.plot import draw_controllers
+from warp_abtree.app.pictures.plots import draw_controllers
 from warp_abtree.app.toml.scene_file import SceneError, load_scene
 from warp_abtree.checks.arguments import wrap_array
 from warp_abtree.checks.version import __version__ as __version__

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -11,11 +12,12 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.samples import SHUTTLE_SCENE
+from helpers.viewer import run_command as run
 
 import warp_abtree as ab
-from warp_abtree.app.cli import main as cli
-from warp_abtree.app.cli import report
-from warp_abtree.app.pictures import plot
+from warp_abtree.app.cli import run_command
+from warp_abtree.app.pictures import scenes
+from warp_abtree.app.styles import STAGE_LABELS
 
 SCENE = (
     SHUTTLE_SCENE
@@ -41,13 +43,6 @@ def files(tmp_path, monkeypatch):
     Path("junk.npz").write_bytes(b"junk")
     Path("folder.npz").mkdir()
     return tmp_path
-
-
-def run(capsys, *arguments, status=0):
-    """Run the command line; return its stdout, and stderr's lines."""
-    assert cli.main([str(argument) for argument in arguments]) == status
-    captured = capsys.readouterr()
-    return captured.out, captured.err.splitlines()
 
 
 def test_run_for_people(files, capsys):
@@ -79,7 +74,7 @@ def test_run_under_a_budget(files, capsys):
         run(capsys, "run", "scene.toml", "--budget", "0.05s", "--controller", "paper", "--json", "--device", "cpu")[0]
     )
     assert (found["budget_ms"], found["controller"]) == (50, "paper") and found["budget"] is None
-    assert found["stages"]["select_ms"]["total"] > 0 and set(found["stages"]) == set(report.STAGES)
+    assert found["stages"]["select_ms"]["total"] > 0 and set(found["stages"]) == {*STAGE_LABELS, *run_command.SUMS}
     cost = sum(found["stages"][name]["total"] for name in ("select_ms", "refine_ms", "broad_ms", "query_ms"))
     assert found["stages"]["cost_ms"]["total"] == pytest.approx(cost)
     shown, _ = run(capsys, "run", "scene.toml", "--budget", 50, "--device", "cpu")
@@ -99,15 +94,15 @@ def test_a_recorded_run_runs_again(files, capsys, device):
     assert first == again and first["replay"] == "run.npz" and first["budget_ms"] == 2
     rows = json.loads(Path("rows.json").read_text())
     with np.load("run.npz") as file:
-        assert [row["query_ms"] for row in rows] == file["row_query_ms"].tolist()
-        assert [row["hits"] for row in rows] == file["row_hits"].tolist()
         arrays = {name: file[name] for name in file.files}
+    recorded = json.loads(str(arrays["rows"]))
+    assert recorded == [{name: row[name] for name in recorded[0]} for row in rows]
     shown, _ = run(capsys, "run", "run.npz", "--frames", 2)
     assert "2 frames" in shown and "as recorded in run.npz" in shown
     errors = run(capsys, "run", "run.npz", "--frames", 9, status=2)[1]
     assert len(errors) == 1 and "run.npz has 5 frames" in errors[0]
-    arrays["row_hits"][3] += 1
-    np.savez("run.npz", **arrays)
+    recorded[3]["hits"] += 1
+    np.savez("run.npz", **{**arrays, "rows": np.array(json.dumps(recorded))})
     shown, errors = run(capsys, "run", "run.npz", status=1)
     assert not shown and len(errors) == 1 and "run.npz: frame 3: hits is " in errors[0]
 
@@ -130,22 +125,29 @@ def test_plot(files, capsys):
 
 def test_plot_without_matplotlib(files, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    for option in (("--plot", "plots"), ("--picture", "out.png")):
+    for option, needs in ((("--plot", "plots"), "Matplotlib"), (("--picture", "out.png"), "pyvista and Matplotlib")):
         errors = run(capsys, "run", "scene.toml", *option, status=2)[1]
-        assert errors == [f"warp-abtree: {option[0]} needs Matplotlib: pip install matplotlib"]
+        assert errors == [f"warp-abtree: {option[0]} needs {needs}: pip install warp-abtree[pictures]"]
     assert not Path("plots").exists()
 
 
 def test_picture_of_a_controlled_run_shows_its_lods(files, capsys, monkeypatch):
-    shown = []
-    monkeypatch.setattr(plot, "draw", lambda panels, *_, **__: shown.append([len(panel.triangles) for panel in panels]))
-    run(capsys, "run", "scene.toml", "--frames", 1, "--budget", "1s", "--picture", "out.png", "--device", "cpu")
-    run(capsys, "run", "scene.toml", "--frames", 1, "--picture", "out.png", "--device", "cpu")
-    assert len(shown[0]) == 1 and len(shown[1]) == 2 and shown[0][0] <= 20 < shown[1][1]
+    pytest.importorskip("pyvista")
+    titles = []
+    monkeypatch.setattr(scenes, "draw", lambda panels, *_, **__: titles.append([panel.title for panel in panels]))
+    words = "run scene.toml --frames 1 --picture out.png --device cpu".split()
+    run(capsys, *words, "--budget", "1s")
+    run(capsys, *words)
+    # The controller begins at the coarsest LOD; a sweep is drawn at both of its ends.
+    top = ab.load_scene("scene.toml", device="cpu").models["ball"].lod_max
+    lods = [[re.match(r"ball at LOD (\d+) of (\d+)", title).groups() for title in panels] for panels in titles]
+    assert lods[0] == [("0", str(top))]
+    assert [of for _, of in lods[1]] == [str(top)] * 2 and int(lods[1][0][0]) == top > int(lods[1][1][0]) > 0
 
 
 @pytest.mark.slow
 def test_picture_of_rigid_bodies(files, capsys):
+    pytest.importorskip("pyvista")
     text = SCENE.split("[[lod_sweep]]")[0].replace("shuttle = { by = [0.4, 0, 0], period = 2 }", "velocity = [9, 0, 0]")
     Path("bodies.toml").write_text(text + "[dynamics]\ngravity = [0, 0, 0]\n")
     run(capsys, "run", "bodies.toml", "--frames", 1, "--picture", "first.png", "--device", "cpu")
@@ -156,6 +158,7 @@ def test_picture_of_rigid_bodies(files, capsys):
 
 @pytest.mark.slow
 def test_picture(files, capsys):
+    pytest.importorskip("pyvista")
     shown, _ = run(capsys, "run", "scene.toml", "--frames", 2, "--picture", "out.png")
     assert "wrote out.png" in shown
     image = matplotlib.image.imread("out.png")[:, :, :3]
@@ -169,89 +172,3 @@ def test_picture(files, capsys):
         assert np.mean((green > 1.8 * red) & (green > 1.8 * blue)) > 0.002, "intersecting faces of the ball"
         assert np.mean((red > 2 * blue) & (green > 2 * blue)) > 0.002, "intersecting faces of the ring"
     assert sorted(path.name for path in files.glob("out*")) == ["out.png"]
-
-
-def test_struck_faces_are_coloured(files):
-    loaded = ab.load_scene("scene.toml", device="cpu")
-    scene, poses = loaded.scene, loaded.motion.poses(0.3)
-    scene.set_lods(loaded.lods_at(0.7))
-    panel = plot.make_panel(scene, poses, [0, 1], subject=0)
-    hits = scene.intersect(np.array([[0, 1]]), output="faces").faces
-    begin = 0
-    for side, pose in enumerate(poses):
-        vertices, faces, ids = scene.models[side].mesh_at(int(scene.lods[side]))
-        here = slice(begin, begin + len(ids))
-        begin = here.stop
-        struck = (panel.colours[here] == plot.COLOURS[side][1]).all(axis=1)
-        assert set(ids[struck].tolist()) == set(hits[:, 1 + side].tolist()) and 0 < struck.sum() < len(ids)
-        assert np.allclose(panel.triangles[here], vertices[faces] + pose[:3])
-    assert begin == len(panel.triangles) and f"{len(hits):,} intersecting face pairs" in panel.title
-
-
-def test_pixels_show_the_nearest_triangle():
-    rng = np.random.default_rng(5)
-    corner, inverse = rng.uniform(-6, 30, (40, 3, 2)), rng.uniform(0.5, 2.0, (40, 3))
-    corner[3], corner[4] = corner[3, 0], np.linspace(corner[4, 0], corner[4, 1], 3)  # no area
-    front, depth = plot.rasterise(corner, inverse, 24, 20)
-    for y in range(20):
-        for x in range(24):
-            best, nearest = -1, 0.0
-            for t in set(range(40)) - {3, 4}:
-                a, b, c = corner[t]
-                try:
-                    u, v = np.linalg.solve(np.stack([b - a, c - a], axis=1), np.array([x + 0.5, y + 0.5]) - a)
-                except np.linalg.LinAlgError:
-                    continue
-                value = inverse[t] @ [1 - u - v, u, v]
-                if min(u, v, 1 - u - v) >= 0 and value > nearest:
-                    best, nearest = t, value
-            assert front[y, x] == best and depth[y, x] == pytest.approx(nearest)
-
-
-def test_placing_points():
-    half = 0.5**0.5
-    assert np.allclose(
-        plot.place([1, 2, 3, 0, 0, half, half], np.array([[1.0, 0, 0], [0, 1, 5]])), [[1, 3, 3], [0, 2, 8]]
-    )
-
-
-# Bad input.
-
-BAD = [
-    (("run", "gone.toml"), "gone.toml"),
-    (("run", "bad.toml"), "bad.toml: scene.speed: unknown key"),
-    (("run", "broken.toml"), "line 1"),
-    (("run", "scene.toml", "--frames", "0"), "--frames"),
-    (("run", "scene.toml", "--picture", "out.jpg"), "must end in .png"),
-    (("run", "scene.toml", "--picture", "gone/out.png"), "no folder gone"),
-    (("run", "scene.toml", "--record", "rows.xls"), ".csv or .json or .npz"),
-    (("run", "scene.toml", "--record", "gone/run.npz"), "no folder gone"),
-    (("run", "scene.toml", "--plot", "gone/plots"), "no folder gone"),
-    (("run", "scene.toml", "--plot", "ball.obj"), "ball.obj"),
-    (("run", "scene.toml", "--objects", "0"), "--objects"),
-    (("run", "scene.toml", "--objects", "5"), "count or worlds"),
-    (("run", "scene.toml", "--budget", "soon"), "'soon' is no time above 0"),
-    (("run", "scene.toml", "--budget", "0ms"), "no time above 0"),
-    (("run", "scene.toml", "--budget", "-3ms"), "--budget"),
-    (("run", "scene.toml", "--budget", "infs"), "no time above 0"),
-    (("run", "scene.toml", "--controller", "magic"), "--controller"),
-    (("run", "scene.toml", "--controller", "paper"), "needs a budget"),
-    (("run", "scene.toml", "--controller", "tolerance"), "needs lod.tolerance"),
-    (("run", "scene.toml", "--controller", "none", "--budget", "3"), "holds no budget"),
-    (("run", "gone.npz"), "gone.npz: No such file"),
-    (("run", "junk.npz"), "junk.npz: not a recording"),
-    (("run", "face.npz"), "face.npz: not a recording of a run"),
-    (("run", "folder.npz"), "folder.npz"),
-    (("run", "junk.npz", "--record", "junk.npz"), "junk.npz: is read"),
-    (("run", "junk.npz", "--budget", "3"), "--budget: a recording runs again as it was"),
-    (("run", "junk.npz", "--controller", "paper"), "--controller: a recording"),
-    (("run", "junk.npz", "--objects", "3"), "--objects: a recording"),
-]
-
-
-@pytest.mark.parametrize(("arguments", "message"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
-def test_bad_input_gives_one_line(files, capsys, arguments, message):
-    before = sorted(files.iterdir())
-    shown, errors = run(capsys, *arguments, status=2)
-    assert len(errors) == 1 and message in errors[0] and errors[0].startswith("warp-abtree: ")
-    assert not shown and sorted(files.iterdir()) == before

@@ -124,7 +124,7 @@ def record_frames(path):
 
 
 def record_query(path):
-    from warp_abtree.app.cli.report import record_found
+    from warp_abtree.app.cli.query_command import record_found
 
     record_found(run_frame()[1], path)
 
@@ -132,7 +132,7 @@ def record_query(path):
 def save_recording(path):
     from warp_abtree.app.recording import Recording
 
-    Recording("", {}, [], run_frame()[0].history, np.zeros((1, 2), np.int32), np.zeros((1, 2, 7))).save(path)
+    Recording("", None, [], run_frame()[0].history, np.zeros((1, 2), np.int32), np.zeros((1, 2, 7))).save(path)
 
 
 def draw_picture(path):
@@ -140,9 +140,9 @@ def draw_picture(path):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from warp_abtree.app.pictures import plot
+    from warp_abtree.app.pictures.render import write_png
 
-    plot._write_png(FigureCanvasAgg(Figure((1, 1))), path)
+    write_png(FigureCanvasAgg(Figure((1, 1))), path)
 
 
 def record_page(path):
@@ -154,14 +154,14 @@ def record_page(path):
 
     recorder = SimpleNamespace(insert_sleep=lambda _: None, as_html=lambda: "<body></body>")
     server = SimpleNamespace(get_scene_serializer=lambda: recorder)
-    moment = SimpleNamespace(row=None, number=0)
-    drawing = SimpleNamespace(contact_count=0)
-    page = SimpleNamespace(settings=None, playing=True, advance=lambda: drawing, moment=moment)
-    source = SimpleNamespace(time_step=0.1, title="", scene=SimpleNamespace(object_count=0, device="cpu"))
+    snapshot = SimpleNamespace(row=None, number=0)
+    data = SimpleNamespace(contact_count=0)
+    page = SimpleNamespace(settings=None, playing=True, advance=lambda: data, snapshot=snapshot)
+    playback = SimpleNamespace(time_step=0.1, title="", scene=SimpleNamespace(object_count=0, device="cpu"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(view_record, "Page", lambda *_, **__: page)
         patch.setattr(view_text, "time_picture", lambda _: "")
-        view_record.record_page(server, source, path, 1)
+        view_record.record_page(server, playback, path, 1)
 
 
 def make_shards(path):

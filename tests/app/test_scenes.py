@@ -1,15 +1,16 @@
 """The scenes of the project at small sizes, generated shapes, controllers from files, and recorded runs."""
 
-import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import convert, toml
 from oracles.triangle import brute_force_faces
 
 import warp_abtree as ab
-from warp_abtree.app.recording import FORMAT_VERSION, Recording, record_run
+from warp_abtree.app.toml.model_tables import AnyShape
+from warp_abtree.app.toml.shapes import GENERATED
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 # A machine so slow that few objects are a load.
@@ -105,15 +106,9 @@ def load_ours(name, device, changes=(), **options):
     ],
 )
 def test_generated_solids(tmp_path, text, faces, volume):
-    from warp_abtree.app.toml import keys as scene_keys
-    from warp_abtree.app.toml import models as scene_models
-
-    parameters = {}
-    exec(text, {}, parameters)
-    name = parameters.pop("shape")
-    checked = {key: check(parameters[key]) for key, check in scene_models.SHAPES[name].items()}
-    mesh = scene_models.OWN[name](**checked)
-    assert len(mesh.faces) == faces and mesh.is_volume and scene_keys is not None
+    table = convert(toml.decode(text), AnyShape)
+    mesh = GENERATED[table.__struct_config__.tag](**table.parameters())
+    assert len(mesh.faces) == faces and mesh.is_volume
     if volume is None:
         u = np.linspace(0, 2 * np.pi, 100_001)
         r = np.cos(3 * u) + 2
@@ -124,10 +119,8 @@ def test_generated_solids(tmp_path, text, faces, volume):
 
 @pytest.mark.slow
 def test_a_nut_runs_on_its_bolt(device):
-    from warp_abtree.app.toml import models as scene_models
-
-    bolt = ab.Model.load(scene_models.bolt(1.0, 3.0, 0.5, 3.0, (48, 181)))
-    nut = ab.Model.load(scene_models.nut(1.0, 0.5, 0.5, 3.0, (48, 31)))
+    bolt = ab.Model.load(GENERATED["bolt"](1.0, 3.0, 0.5, 3.0, (48, 181)))
+    nut = ab.Model.load(GENERATED["nut"](1.0, 0.5, 0.5, 3.0, (48, 31)))
     turns = np.array([0.0, 1 / 3, 0.75, 1.0, 1.5])
 
     def count(rise, turns):
@@ -347,86 +340,3 @@ def test_table1_stands_at_the_face_counts_of_the_paper(device):
     assert models["cow"].name == "cow (a knot)"
     rows = loaded.frame().run(8)
     assert rows[0].faces == 4204 + 5804 + 1000 and rows[7].faces < rows[0].faces and rows[0].hits > 0
-
-
-# Recordings.
-
-
-@pytest.mark.parametrize("text", [RINGS, BODIES], ids=["prescribed", "bodies"])
-def test_a_recorded_run_runs_again(tmp_path, device, text):
-    # A budget that every machine keeps, so that LODs climb.
-    frame, first = record_run(load(tmp_path, text, device=device, objects=12), 8, budget_ms=1e4)
-    assert len({row.cost_ms for row in first.rows}) == 8, "real times"
-    path = tmp_path / "run.npz"
-    first.save(path)
-    assert [entry.name for entry in tmp_path.iterdir() if "partial" in entry.name] == []
-    opened = Recording.open(path)
-    assert opened.rows == frame.history and opened.settings == first.settings
-    (tmp_path / "scene.toml").unlink()
-    loaded = opened.load_scene(path, device)
-    assert loaded.scene.object_count == first.lods.shape[1] < 15
-    again, second = record_run(loaded, 8, opened, budget_ms=1e4)
-    assert again.history == frame.history and opened.difference(second) is None
-    assert second.lods.tobytes() == first.lods.tobytes() and second.poses.tobytes() == first.poses.tobytes()
-    assert len(np.unique(first.lods)) > 1 and not np.array_equal(first.poses[0], first.poses[-1])
-    if text is RINGS:
-        assert np.array_equal(first.poses[3], loaded.motion.poses(3 * 0.1))
-
-
-def test_a_difference_is_named(tmp_path):
-    _, first = record_run(load(tmp_path, RINGS, objects=12), 4)
-    _, second = record_run(load(tmp_path, RINGS, objects=12), 4, first)
-    assert first.difference(second) is None
-    second.lods[2, 5] += 1
-    assert first.difference(second) == "frame 2: lods are not those recorded"
-    _, other = record_run(load(tmp_path, RINGS.replace("degrees", "degrees"), objects=12), 4, first, controller="none")
-    assert "frame 0: " in first.difference(other)
-
-
-def test_damaged_recordings_are_refused(tmp_path):
-    _, recording = record_run(load(tmp_path, RINGS, objects=8), 2)
-    path = tmp_path / "run.npz"
-    recording.save(path)
-    with np.load(path) as file:
-        good = {name: file[name] for name in file.files}
-    settings = json.loads(str(good["settings"]))
-    bad = [
-        ({"format": np.array("x")}, "not a recording of a run"),
-        ({"version": np.array(FORMAT_VERSION + 1)}, f"version {FORMAT_VERSION + 1}"),
-        ({"lods": good["lods"][:1]}, "lods: shape"),
-        ({"lods": good["lods"].astype(np.int64)}, "int64"),
-        ({"poses": good["poses"][:, :, :6]}, "poses: shape"),
-        ({"row_hits": good["row_hits"][:1]}, "row_hits"),
-        ({"settings": np.array("{}")}, "is missing"),
-        ({"settings": np.array("{")}, "damaged"),
-        ({"settings": np.array(json.dumps({**settings, "objects": "many"}))}, "objects is 'many'"),
-        ({"poses": np.array([{}], dtype=object)}, "not a recording"),
-    ]
-    for changes, message in bad:
-        np.savez(path, **{**good, **changes})
-        with pytest.raises(ValueError, match=message) as caught:
-            Recording.open(path)
-        assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
-    np.savez(path, **{name: value for name, value in good.items() if name != "row_hits"})
-    with pytest.raises(ValueError, match="row_hits' is missing"):
-        Recording.open(path)
-    for content in (b"", b"junk", b"PK\x03\x04junk"):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match="not a recording"):
-            Recording.open(path)
-    with pytest.raises(ValueError, match="No such file"):
-        Recording.open(tmp_path / "gone.npz")
-
-
-def test_another_mesh_is_noticed(tmp_path):
-    import trimesh
-
-    trimesh.creation.box().export(tmp_path / "m.obj")
-    loaded = load(tmp_path, '[models.m]\nmesh = "m.obj"\n[[objects]]\nmodel = "m"\n')
-    _, recording = record_run(loaded, 1)
-    trimesh.creation.box([1, 1, 2]).export(tmp_path / "m.obj")
-    with pytest.raises(ValueError, match=r"run.npz: the mesh of models.m is not"):
-        recording.load_scene("run.npz")
-    (tmp_path / "m.obj").unlink()
-    with pytest.raises(ab.SceneError, match=r"m.obj: no such file"):
-        recording.load_scene("run.npz")

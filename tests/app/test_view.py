@@ -1,17 +1,18 @@
-"""What the viewer sends, without a browser: parts of a moment, and a stage that notes what it hears."""
+"""What the viewer sends, without a browser: geometry of a snapshot, and a viewer scene that notes what it hears."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.viewer import SCENE, make_models, make_source, write_scene
+from helpers.viewer import SCENE, make_models, make_playback, place, write_scene
 
-from warp_abtree.app.pictures.plot import COLOURS, place
-from warp_abtree.app.viewer import render_data as parts
+from warp_abtree.app import scene_geometry as geometry
+from warp_abtree.app.open_playback import open_playback
+from warp_abtree.app.render_data import Settings, compose, objects_of_world
+from warp_abtree.app.styles import COLOURS
 from warp_abtree.app.viewer import text as view_text
 from warp_abtree.app.viewer import viewer_scene as stages
-from warp_abtree.app.viewer.playback import open_source
-from warp_abtree.app.viewer.viewer_scene import Composer, Settings, Stage
+from warp_abtree.app.viewer.viewer_scene import ViewerScene
 
 
 @pytest.fixture(scope="module")
@@ -20,30 +21,30 @@ def models():
 
 
 @pytest.fixture
-def source(models, device):
-    return make_source(models, device)
+def playback(models, device):
+    return make_playback(models, device)
 
 
-# Parts.
+# Geometry.
 
 
-def test_struck_faces_and_triangles(source):
-    moment = source.again("faces")
-    result = moment.result
-    struck = parts.struck_faces(result)
+def test_intersecting_faces_and_triangles(playback):
+    snapshot = playback.query("faces")
+    result = snapshot.result
+    intersecting = geometry.intersecting_faces(result)
     expected = set()
     for pair, a, b in result.faces.tolist():
         expected |= {(int(result.pairs[pair, 0]), a), (int(result.pairs[pair, 1]), b)}
-    assert [tuple(row) for row in struck.tolist()] == sorted(expected) and len(expected) > 50
-    cache = parts.MeshCache(source.scene)
-    flat = parts.struck_triangles(cache, moment, struck, lift=0)
-    assert sum(map(len, flat.values())) == len(struck)
+    assert [tuple(row) for row in intersecting.tolist()] == sorted(expected) and len(expected) > 50
+    cache = geometry.MeshCache(playback.scene)
+    flat = geometry.intersecting_triangles(cache, snapshot, intersecting, lift=0)
+    assert sum(map(len, flat.values())) == len(intersecting)
     for owner, corners in flat.items():
-        mine = [(i, face) for i, face in struck.tolist() if source.scene.object_model[i] == owner]
+        mine = [(i, face) for i, face in intersecting.tolist() if playback.scene.object_model[i] == owner]
         for (i, face), found in list(zip(mine, corners))[::7]:
-            vertices, faces, ids = source.scene.models[owner].mesh_at(int(moment.lods[i]))
-            assert np.allclose(found, place(moment.poses[i], vertices[faces[ids == face][0]]), atol=1e-6)
-    lifted = parts.struck_triangles(cache, moment, struck, lift=0.01)
+            vertices, faces, ids = playback.scene.models[owner].mesh_at(int(snapshot.lods[i]))
+            assert np.allclose(found, place(snapshot.poses[i], vertices[faces[ids == face][0]]), atol=1e-6)
+    lifted = geometry.intersecting_triangles(cache, snapshot, intersecting, lift=0.01)
     for owner, corners in lifted.items():
         above, below = np.split(corners, 2)
         step = 0.5 * (above - below)
@@ -51,30 +52,30 @@ def test_struck_faces_and_triangles(source):
         assert np.allclose(np.linalg.norm(step, axis=2), 0.01 * cache.diagonals[owner], rtol=1e-3)
         edge = flat[owner][:, 1] - flat[owner][:, 0]
         assert np.abs(np.einsum("ti,ti->t", edge, step[:, 0])).max() < 1e-5
-    only = parts.struck_faces(result, np.array([True, True, False]))
-    assert set(only[:, 0].tolist()) == {0, 1} and len(only) < len(struck)
+    only = geometry.intersecting_faces(result, np.array([True, True, False]))
+    assert set(only[:, 0].tolist()) == {0, 1} and len(only) < len(intersecting)
 
 
-def test_contact_lines(source, monkeypatch):
-    result = source.again("contacts").result
-    segments, normals = parts.contact_lines(result, 0.2)
+def test_contact_lines(playback, monkeypatch):
+    result = playback.query("contacts").result
+    segments, normals = geometry.contact_lines(result, 0.2)
     assert len(segments) == len(result.contacts) > 50
     assert np.allclose(segments[:, 0], result.contacts["p0"], atol=1e-6)
     assert np.allclose(segments[:, 1], result.contacts["p1"], atol=1e-6)
     assert np.allclose(normals[:, 0], segments.mean(axis=1), atol=1e-6)
     assert np.allclose(normals[:, 1] - normals[:, 0], 0.2 * result.contacts["normal"], atol=1e-6)
-    monkeypatch.setattr(parts, "LINES", 7)
-    fewer, _ = parts.contact_lines(result, 0.2)
+    monkeypatch.setattr(geometry, "LINES", 7)
+    fewer, _ = geometry.contact_lines(result, 0.2)
     assert len(fewer) == 7 and np.array_equal(fewer[[0, -1]], segments[[0, -1]])
 
 
 @pytest.mark.parametrize("share", [1.0, 0.2])
-def test_boxes_of_a_level_hold_the_faces_under_its_nodes(source, share):
-    scene, model = source.scene, source.scene.models[1]
-    source.hand[1] = model.lod_for(fraction=share)
-    moment = source.again("count")
+def test_boxes_of_a_level_hold_the_faces_under_its_nodes(playback, share):
+    scene, model = playback.scene, playback.scene.models[1]
+    playback.held[1] = model.lod_for(fraction=share)
+    snapshot = playback.query("count")
     tree = scene.tree_state(1)
-    vertices, faces, ids = model.mesh_at(source.hand[1])
+    vertices, faces, ids = model.mesh_at(playback.held[1])
     n = model.face_count
     order = np.argsort([int(tree.face_node[f]) * 2 ** (40 - int(tree.face_node[f]).bit_length()) for f in range(n)])
     for level in (0, 1, 4):
@@ -84,61 +85,61 @@ def test_boxes_of_a_level_hold_the_faces_under_its_nodes(source, share):
             if under.any():
                 corners = vertices[faces[under]].reshape(-1, 3)
                 expected.append((corners.min(axis=0), corners.max(axis=0)))
-        found = parts.level_boxes(tree, level)
+        found = geometry.level_boxes(tree, level)
         assert found.shape == (len(expected), 2, 3) and np.allclose(found, expected, atol=1e-5)
-        lines, count = parts.tree_lines(scene, moment, [1, 0], level)
+        lines, count = geometry.tree_lines(scene, snapshot, [1, 0], level)
         assert count >= len(expected) and len(lines) == 12 * count
-        first = place(moment.poses[1], parts.box_lines(found).reshape(-1, 3)).reshape(-1, 2, 3)
+        first = place(snapshot.poses[1], geometry.box_lines(found).reshape(-1, 3)).reshape(-1, 2, 3)
         assert np.allclose(lines[: len(first)], first, atol=1e-5)
-    deepest = parts.tree_depth(scene, [1])
-    assert len(parts.level_boxes(tree, deepest)) > 0 and len(parts.level_boxes(tree, deepest + 1)) == 0
+    deepest = geometry.tree_depth(scene, [1])
+    assert len(geometry.level_boxes(tree, deepest)) > 0 and len(geometry.level_boxes(tree, deepest + 1)) == 0
 
 
 def test_edges_of_a_box():
-    lines = parts.box_lines(np.array([[[0, 0, 0], [1, 2, 4]], [[5, 5, 5], [6, 6, 6.0]]]))
+    lines = geometry.box_lines(np.array([[[0, 0, 0], [1, 2, 4]], [[5, 5, 5], [6, 6, 6.0]]]))
     assert lines.shape == (24, 2, 3)
     spans = np.abs(lines[:12, 1] - lines[:12, 0])
     assert (np.count_nonzero(spans, axis=1) == 1).all() and spans.sum(axis=0).tolist() == [4, 8, 16]
     assert len({tuple(np.sort(line, axis=0).ravel()) for line in lines[:12]}) == 12
 
 
-def test_boxes_drawn_are_limited_and_counted(source, monkeypatch):
-    moment = source.again("count")
-    monkeypatch.setattr(parts, "BOXES", 10)
-    lines, count = parts.tree_lines(source.scene, moment, [0, 1, 2], 3)
+def test_boxes_drawn_are_limited_and_counted(playback, monkeypatch):
+    snapshot = playback.query("count")
+    monkeypatch.setattr(geometry, "BOXES", 10)
+    lines, count = geometry.tree_lines(playback.scene, snapshot, [0, 1, 2], 3)
     assert count == 24 and len(lines) == 12 * 10
 
 
-def test_colours(source):
-    lods = source.scene.lods
-    plain = parts.object_colours(source.scene, lods, picked=2)
+def test_colours(playback):
+    lods = playback.scene.lods
+    plain = geometry.object_colours(playback.scene, lods, picked=2)
     assert plain[0].tolist() == [round(255 * part) for part in COLOURS[0][0]]
     assert plain[1].tolist() == [round(255 * part) for part in COLOURS[1][0]]
-    assert plain[2].tolist() == [round(255 * part) for part in parts.PICKED]
-    by_lod = parts.object_colours(source.scene, np.array([0, lods[1], 1]), by_lod=True)
-    assert by_lod[0].tolist() == np.round(255 * parts.COARSE).tolist()
-    assert by_lod[1].tolist() == np.round(255 * parts.FINE).tolist()
+    assert plain[2].tolist() == [round(255 * part) for part in geometry.PICKED]
+    by_lod = geometry.object_colours(playback.scene, np.array([0, lods[1], 1]), by_lod=True)
+    assert by_lod[0].tolist() == np.round(255 * geometry.COARSE).tolist()
+    assert by_lod[1].tolist() == np.round(255 * geometry.FINE).tolist()
 
 
-def test_meshes_are_kept_as_long_as_they_fit(source, monkeypatch):
-    cache = parts.MeshCache(source.scene)
+def test_meshes_are_kept_as_long_as_they_fit(playback, monkeypatch):
+    cache = geometry.MeshCache(playback.scene)
     first = cache.mesh(0, 100)
     assert cache.mesh(0, 100) is first
-    monkeypatch.setattr(parts, "CACHED_FACES", 200)
+    monkeypatch.setattr(geometry, "CACHED_FACES", 200)
     second = cache.mesh(0, 120)
     assert cache.mesh(0, 120) is second and cache.mesh(0, 100) is not first
 
 
-def test_bounds_hold_all_that_is_shown(source):
-    moment = source.again("count")
-    centre, radius = parts.bounds(parts.MeshCache(source.scene), moment, np.arange(3))
+def test_bounds_hold_all_that_is_shown(playback):
+    snapshot = playback.query("count")
+    centre, radius = geometry.bounds(geometry.MeshCache(playback.scene), snapshot, np.arange(3))
     for i in range(3):
-        vertices = source.scene.models[source.scene.object_model[i]].mesh_at(int(moment.lods[i]))[0]
-        assert np.linalg.norm(place(moment.poses[i], vertices) - centre, axis=1).max() <= radius * (1 + 1e-9)
+        vertices = playback.scene.models[playback.scene.object_model[i]].mesh_at(int(snapshot.lods[i]))[0]
+        assert np.linalg.norm(place(snapshot.poses[i], vertices) - centre, axis=1).max() <= radius * (1 + 1e-9)
     assert radius < 6
 
 
-# The stage.
+# The viewer scene.
 
 
 class Handle:
@@ -180,65 +181,68 @@ class Api:
 
 
 class Show:
-    """A stage on an `Api`, and a clock that stands until it is told otherwise."""
+    """A `ViewerScene` on an `Api`, and a clock that stands until it is told otherwise."""
 
-    def __init__(self, source):
-        self.source, self.api, self.time, self.picked = source, Api(), 0.0, []
-        self.composer = Composer(source)
-        self.stage = Stage(self.api, self.composer.cache, self.picked.append, clock=lambda: self.time)
+    def __init__(self, playback):
+        self.playback, self.api, self.time, self.picked = playback, Api(), 0.0, []
+        self.cache = geometry.MeshCache(playback.scene)
+        self.viewer_scene = ViewerScene(self.api, self.cache, self.picked.append, clock=lambda: self.time)
         self.settings = Settings()
 
     def show(self):
-        drawing = self.composer.compose(self.source.again(self.settings.output), self.settings)
-        self.stage.show(drawing, self.settings)
-        return drawing, self.api.heard()
+        snapshot = self.playback.query(self.settings.output)
+        shown = objects_of_world(self.playback.worlds, self.settings.world)
+        data = compose(self.cache, snapshot, shown, self.settings)
+        camera = self.playback.camera
+        self.viewer_scene.show(data, self.settings, camera and camera(snapshot.time))
+        return data, self.api.heard()
 
 
-def test_only_changes_are_sent(source):
-    show = Show(source)
-    drawing, heard = show.show()
+def test_only_changes_are_sent(playback):
+    show = Show(playback)
+    data, heard = show.show()
     assert {name for name, _ in heard} == {
         "/objects/0",
         "/objects/1",
         "/objects/2",
-        "/struck/0",
-        "/struck/1",
+        "/intersecting/0",
+        "/intersecting/1",
         "/contacts",
     }
-    assert show.stage.sent > 0 and drawing.struck_count > 0
-    assert show.api.handles["/struck/0"].color == tuple(round(255 * part) for part in COLOURS[0][1])
-    sent = show.stage.sent
-    assert show.show()[1] == [] and show.stage.sent == sent
-    source.move(2, (50, 0, 0, 0, 0, 0, 1))
+    assert show.viewer_scene.sent > 0 and data.intersecting_count > 0
+    assert show.api.handles["/intersecting/0"].color == tuple(round(255 * part) for part in COLOURS[0][1])
+    sent = show.viewer_scene.sent
+    assert show.show()[1] == [] and show.viewer_scene.sent == sent
+    playback.move(2, (50, 0, 0, 0, 0, 0, 1))
     heard = show.show()[1]
     assert ("/objects/2", "position") in heard and ("/objects/2", "vertices") not in heard
     assert not [entry for entry in heard if entry[0] in ("/objects/0", "/objects/1")]
-    assert ("/struck/0", "vertices") in heard and ("/contacts", "points") in heard
-    source.hand[1] = 40
-    drawing, heard = show.show()
+    assert ("/intersecting/0", "vertices") in heard and ("/contacts", "points") in heard
+    playback.held[1] = 40
+    data, heard = show.show()
     assert {key for name, key in heard if name == "/objects/1"} == {"vertices", "faces"}
-    assert len(show.api.handles["/objects/1"].faces) == show.composer.cache.count(1, 40)
-    assert drawing.faces == 2 * 320 + show.composer.cache.count(1, 40)
-    assert drawing.error_mean == pytest.approx(source.scene.models[1].error_at(40) / 3)
-    source.move(0, (-50, 0, 0, 0, 0, 0, 1))
+    assert len(show.api.handles["/objects/1"].faces) == show.cache.count(1, 40)
+    assert data.faces == 2 * 320 + show.cache.count(1, 40)
+    assert data.error_mean == pytest.approx(playback.scene.models[1].error_at(40) / 3)
+    playback.move(0, (-50, 0, 0, 0, 0, 0, 1))
     heard = show.show()[1]
     assert ("/contacts", "visible") in heard and not show.api.handles["/contacts"].visible
-    assert not show.api.handles["/struck/1"].visible
+    assert not show.api.handles["/intersecting/1"].visible
 
 
-def test_settings_reach_the_stage(source):
-    show = Show(source)
-    show.settings.struck = show.settings.contacts = False
+def test_settings_reach_the_viewer_scene(playback):
+    show = Show(playback)
+    show.settings.intersecting = show.settings.contacts = False
     assert show.settings.output == "count"
     _, heard = show.show()
     assert {name for name, _ in heard} == {"/objects/0", "/objects/1", "/objects/2"}
-    show.settings.struck = True
-    assert show.settings.output == "faces" and ("/struck/0", "add_mesh_simple") in show.show()[1]
+    show.settings.intersecting = True
+    assert show.settings.output == "faces" and ("/intersecting/0", "add_mesh_simple") in show.show()[1]
     show.settings.normals = True
     assert show.settings.output == "contacts" and ("/normals", "add_line_segments") in show.show()[1]
     show.settings.level, show.settings.picked = 2, 1
-    drawing, heard = show.show()
-    assert ("/tree", "add_line_segments") in heard and ("/objects/1", "color") in heard and drawing.box_count == 4
+    data, heard = show.show()
+    assert ("/tree", "add_line_segments") in heard and ("/objects/1", "color") in heard and data.box_count == 4
     show.settings.every_tree = True
     assert show.show()[0].box_count == 12
     show.settings.level = -1
@@ -248,10 +252,10 @@ def test_settings_reach_the_stage(source):
     assert sorted(show.show()[1]) == [(f"/objects/{i}", "wireframe") for i in range(3)]
 
 
-def test_objects_of_a_model_and_lod_are_instances_of_one_mesh(source, monkeypatch):
-    monkeypatch.setattr(stages, "ALONE", 0)
-    show = Show(source)
-    top = [model.lod_max for model in source.scene.models]
+def test_objects_of_a_model_and_lod_are_instances_of_one_mesh(playback, monkeypatch):
+    monkeypatch.setattr(stages, "SINGLE_LIMIT", 0)
+    show = Show(playback)
+    top = [model.lod_max for model in playback.scene.models]
     _, heard = show.show()
     ball, ring = f"/meshes/0/{top[0]}", f"/meshes/1/{top[1]}"
     assert [name for name, kind in heard if kind == "add_batched_meshes_simple"] == [ball, ring]
@@ -263,30 +267,30 @@ def test_objects_of_a_model_and_lod_are_instances_of_one_mesh(source, monkeypatc
     show.api.handles[ring].click(SimpleNamespace(instance_index=0))
     handle.click(SimpleNamespace(instance_index=7))
     assert show.picked == [2, 1]
-    assert show.show()[1] == [] and not show.stage.waits
+    assert show.show()[1] == [] and not show.viewer_scene.waits
     # A new mesh is sent out of sight; the object changes to it when the browser has had its time.
-    source.hand[2] = 100
+    playback.held[2] = 100
     _, heard = show.show()
-    assert (f"/meshes/0/{100}", "add_batched_meshes_simple") in heard and show.stage.waits
+    assert (f"/meshes/0/{100}", "add_batched_meshes_simple") in heard and show.viewer_scene.waits
     coarse = show.api.handles["/meshes/0/100"]
     assert not coarse.visible and len(handle.batched_positions) == 2
-    source.hand[2] = 90
+    playback.held[2] = 90
     show.show()
     assert "/meshes/0/90" not in show.api.handles, "one mesh at a time is waited for"
     show.time = 1.0
     show.show()
     assert coarse.visible and len(coarse.batched_positions) == 1 and len(handle.batched_positions) == 1
     coarse.click(SimpleNamespace(instance_index=0))
-    assert show.picked[-1] == 2 and show.stage.waits and "/meshes/0/90" in show.api.handles
+    assert show.picked[-1] == 2 and show.viewer_scene.waits and "/meshes/0/90" in show.api.handles
     show.time = 2.0
     show.show()
-    assert not show.stage.waits and not coarse.visible and show.api.handles["/meshes/0/90"].visible
+    assert not show.viewer_scene.waits and not coarse.visible and show.api.handles["/meshes/0/90"].visible
     # Meshes that the browser has are not sent again.
-    source.hand[2] = 100
+    playback.held[2] = 100
     heard = show.show()[1]
     sent = {entry for entry in heard if entry[0].startswith("/meshes")}
     assert sent == {("/meshes/0/100", "visible"), ("/meshes/0/90", "visible")} and coarse.visible
-    source.hand[0] = 100
+    playback.held[0] = 100
     show.show()
     assert len(coarse.batched_positions) == 2
     for index in (0, 1):
@@ -294,56 +298,56 @@ def test_objects_of_a_model_and_lod_are_instances_of_one_mesh(source, monkeypatc
     assert show.picked[-2:] == [0, 2]
 
 
-def test_hidden_meshes_go_in_time(source, monkeypatch):
-    monkeypatch.setattr(stages, "ALONE", 0)
+def test_hidden_meshes_go_in_time(playback, monkeypatch):
+    monkeypatch.setattr(stages, "SINGLE_LIMIT", 0)
     monkeypatch.setattr(stages, "HIDDEN_MESHES", 2)
-    show = Show(source)
+    show = Show(playback)
     for k in range(6):
-        source.hand[0] = 20 + k
+        playback.held[0] = 20 + k
         show.show()
         show.time += 1
     show.show()
     gone = [name for name, handle in show.api.handles.items() if handle.gone]
     assert gone == ["/meshes/0/20", "/meshes/0/21", "/meshes/0/22"]
-    source.hand[0] = 20
+    playback.held[0] = 20
     show.show()
     assert not show.api.handles["/meshes/0/20"].gone, "it came back"
 
 
 def test_worlds_and_the_camera_of_the_scene(tmp_path):
     text = SCENE + "[camera]\neye = [0, 0, 5]\ntarget = [0, 0, 0]\n"
-    source = open_source([str(write_scene(tmp_path, text))], "cpu")
-    show = Show(source)
-    drawing, heard = show.show()
-    assert drawing.shown.tolist() == [0, 1] and ("/camera", "add_camera_frustum") in heard
+    playback = open_playback([str(write_scene(tmp_path, text))], "cpu")
+    show = Show(playback)
+    data, heard = show.show()
+    assert data.shown.tolist() == [0, 1] and ("/camera", "add_camera_frustum") in heard
     camera = show.api.handles["/camera"]
     assert np.allclose(camera.position, [0, 0, 5])
     # Seen from there, z of the frustum points to the target and y down.
     w, x, y, z = camera.wxyz
     assert np.allclose(place((0, 0, 0, x, y, z, w), np.eye(3)), [[1, 0, 0], [0, -1, 0], [0, 0, -1]])
     show.settings.world = 2
-    drawing, heard = show.show()
-    assert drawing.shown.tolist() == [3] and ("/objects/3", "add_mesh_simple") in heard
-    assert not show.api.handles["/objects/0"].visible and drawing.contact_count == 0
+    data, heard = show.show()
+    assert data.shown.tolist() == [3] and ("/objects/3", "add_mesh_simple") in heard
+    assert not show.api.handles["/objects/0"].visible and data.contact_count == 0
 
 
 # Words.
 
 
-def test_numbers_of_an_object(source):
-    moment = source.again("count")
-    cache = parts.MeshCache(source.scene)
-    assert view_text.numbers(source, moment, cache, None) == view_text.NOBODY
-    found = view_text.numbers(source, moment, cache, 1)
+def test_numbers_of_an_object(playback):
+    snapshot = playback.query("count")
+    cache = geometry.MeshCache(playback.scene)
+    assert view_text.numbers(playback, snapshot, cache, None) == view_text.NOBODY
+    found = view_text.numbers(playback, snapshot, cache, 1)
     assert "| faces | 576 of 576 |" in found and "| meets | #0, #2 |" in found
-    assert f"| intersecting face pairs | {moment.result.count.sum():,} |" in found
-    source.hand[0] = 7
-    found = view_text.numbers(source, source.again("count"), cache, 0)
-    assert f"7 of {source.scene.models[0].lod_max}, held" in found and "| objects on its tree | 1 |" in found
+    assert f"| intersecting face pairs | {snapshot.result.count.sum():,} |" in found
+    playback.held[0] = 7
+    found = view_text.numbers(playback, playback.query("count"), cache, 0)
+    assert f"7 of {playback.scene.models[0].lod_max}, held" in found and "| objects on its tree | 1 |" in found
 
 
-def test_times_are_stacked(source):
-    rows = [source.step("count").row for _ in range(4)]
+def test_times_are_stacked(playback):
+    rows = [playback.step("count").row for _ in range(4)]
     plot = view_text.time_plot(rows)
     assert len(plot["data"]) == len(plot["series"])
     assert plot["data"][0].tolist() == [0, 1, 2, 3]

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import PIL.Image
 import pytest
-from helpers.viewer import SCENE, make_models, make_source, write_scene
+from helpers.viewer import SCENE, make_models, make_playback, write_scene
 
-from warp_abtree.app.viewer.playback import open_source
+from warp_abtree.app.open_playback import open_playback
 
 pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 playwright = pytest.importorskip("playwright.sync_api", reason="the browser is driven by playwright (extra dev)")
@@ -59,13 +59,13 @@ class Visit:
         field.press("Enter")
 
     def drag(self, label, part):
-        """Drag the thumb of a slider to a part of its way."""
+        """Drag the thumb of a slider to a part of its mode."""
         thumb = self.control(label, "*[@role='slider']")
         thumb.scroll_into_view_if_needed()
-        box, way = thumb.bounding_box(), thumb.locator("xpath=..").bounding_box()
+        box, mode = thumb.bounding_box(), thumb.locator("xpath=..").bounding_box()
         self.tab.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
         self.tab.mouse.down()
-        self.tab.mouse.move(way["x"] + part * way["width"], box["y"] + box["height"] / 2, steps=8)
+        self.tab.mouse.move(mode["x"] + part * mode["width"], box["y"] + box["height"] / 2, steps=8)
         self.tab.mouse.up()
 
     def numbers(self):
@@ -90,7 +90,7 @@ class Visit:
 
 
 def coloured(pixels):
-    """Count pixels of the scene, and those of struck faces: bright green on the balls, bright yellow on the ring."""
+    """Count pixels of the scene, and of intersecting faces: bright green on the balls, bright yellow on the ring."""
     red, green, blue = pixels[:, : SIZE["width"] // 2].reshape(-1, 3).T
     return {
         "any": int(np.count_nonzero(np.minimum(np.minimum(red, green), blue) < 235)),
@@ -115,7 +115,7 @@ def whole(text):
 
 
 @pytest.fixture
-def serve_source():
+def serve_playback():
     """Serve pages about sources in threads, and end them."""
     from warp_abtree.app.viewer.command import serve
     from warp_abtree.app.viewer.page import Page
@@ -123,8 +123,8 @@ def serve_source():
     with serve() as server:
         started = []
 
-        def start(source):
-            page = Page(server, source)
+        def start(playback):
+            page = Page(server, playback)
             thread = threading.Thread(target=page.run)
             thread.start()
             started.append((page, thread))
@@ -137,22 +137,22 @@ def serve_source():
             assert not thread.is_alive()
 
 
-def test_meshes_in_a_browser(browser, serve_source, tmp_path):
-    source = make_source(make_models(), "cpu")
-    page, address = serve_source(source)
+def test_meshes_in_a_browser(browser, serve_playback, tmp_path):
+    playback = make_playback(make_models(), "cpu")
+    page, address = serve_playback(playback)
     visit = Visit(browser, address, tmp_path)
     first = visit.wait_for(lambda found: "faces shown" in found)
     assert first["faces shown"] == f"{2 * 320 + 576:,}" and first["state"] == "paused"
     hits = whole(first["intersecting face pairs"])
-    assert hits == page.moment.result.count.sum() > 0
+    assert hits == page.snapshot.result.count.sum() > 0
     plain = wait_for_picture(visit, "meshes", lambda found: found["green"] > 300 and found["yellow"] > 150)
 
     # A slider changes the LODs, and the faces shown, down to what the models have there.
     visit.drag("hold all at [%]", 0.3)
 
     def held():
-        of = zip(source.scene.object_model, page.moment.lods)
-        return [len(source.scene.models[owner].mesh_at(int(lod))[1]) for owner, lod in of]
+        of = zip(playback.scene.object_model, page.snapshot.lods)
+        return [len(playback.scene.models[owner].mesh_at(int(lod))[1]) for owner, lod in of]
 
     visit.wait_for(lambda found: whole(found["faces shown"]) == sum(held()) < 500)
     bigger = wait_for_picture(visit, "meshes_coarse", lambda found: found["green"] > 1.2 * plain["green"])
@@ -182,12 +182,12 @@ def test_meshes_in_a_browser(browser, serve_source, tmp_path):
     visit.tab.close()
 
 
-def test_a_scene_plays_in_a_browser(browser, serve_source, tmp_path):
+def test_a_scene_plays_in_a_browser(browser, serve_playback, tmp_path):
     path = write_scene(
         tmp_path, SCENE.replace("worlds = 2", "worlds = 2\ngrid = { size = [5, 5, 1], spacing = [3, 3, 3] }")
     )
-    source = open_source([str(path)], "cpu")
-    page, address = serve_source(source)
+    playback = open_playback([str(path)], "cpu")
+    page, address = serve_playback(playback)
     visit = Visit(browser, address, tmp_path)
     visit.wait_for(lambda found: found.get("frame") is None and "time" in found)
     visit.tab.get_by_role("button", name="play").click()
@@ -198,7 +198,7 @@ def test_a_scene_plays_in_a_browser(browser, serve_source, tmp_path):
     visit.tab.get_by_role("button", name="step").click()
     stepped = visit.wait_for(lambda found: found["time"] != paused["time"])
     number = int(stepped["time"].rsplit(" ", 1)[1].replace(",", ""))
-    assert number == page.moment.number == int(paused["time"].rsplit(" ", 1)[1].replace(",", "")) + 1
+    assert number == page.snapshot.number == int(paused["time"].rsplit(" ", 1)[1].replace(",", "")) + 1
     visit.give("budget [ms]", 40)
     visit.tab.get_by_role("button", name="step").click()
     assert visit.wait_for(lambda found: "budget" in found)["budget"] == "40 ms"
@@ -216,10 +216,10 @@ def test_a_standalone_page_in_a_browser(browser, tmp_path):
     from warp_abtree.app.viewer.command import serve
     from warp_abtree.app.viewer.web_record import record_page
 
-    source = open_source([str(write_scene(tmp_path))], "cpu")
+    playback = open_playback([str(write_scene(tmp_path))], "cpu")
     path = tmp_path / "page.html"
     with serve() as server:
-        record_page(server, source, path, 3)
+        record_page(server, playback, path, 3)
     requests = []
     visit = Visit(browser, "about:blank", tmp_path)
     visit.tab.on("request", lambda request: requests.append(request.url))

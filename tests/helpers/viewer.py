@@ -1,12 +1,15 @@
-"""Models, scene files and playbacks that tests of the viewer show."""
+"""Models, scene files and playbacks that tests of applications use, and a runner of commands."""
 
 from pathlib import Path
 
+import numpy as np
 import trimesh
+from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
 from helpers.samples import SHUTTLE_SCENE
-from warp_abtree.app.viewer.playback import MeshSource
+from warp_abtree.app.cli.main import main
+from warp_abtree.app.playback import MeshPlayback
 
 SCENE = (
     SHUTTLE_SCENE
@@ -43,6 +46,11 @@ position = [0, 0.2, 0]
 """
 
 
+def place(pose, points):
+    """Return points (n, 3) of a model in the world."""
+    return np.asarray(points) @ quaternion_matrix(pose[3:]).T + pose[:3]
+
+
 def write_scene(folder, text=SCENE):
     path = Path(folder, "scene.toml")
     path.write_text(text)
@@ -53,9 +61,16 @@ def make_models():
     return [ab.Model.load(trimesh.creation.icosphere(2)), ab.Model.load(trimesh.creation.torus(1.0, 0.3, 24, 12))]
 
 
-def make_source(models, device):
+def make_playback(models, device):
     """Return a ball in a turned ring, and another ball that meets the ring."""
     half = 0.5**0.5
     poses = [(0, 0, 0, 0, 0, 0, 1), (0.6, 0.1, 0, half, 0, 0, half), (2.1, 0.2, 0.1, 0, 0, 0, 1)]
     chosen = [models[0], models[1], models[0]]
-    return MeshSource(chosen, poses, [model.lod_max for model in chosen], device)
+    return MeshPlayback(chosen, poses, [model.lod_max for model in chosen], device)
+
+
+def run_command(capsys, *arguments, status=0):
+    """Run the command line; return its stdout, and stderr's lines."""
+    assert main([str(argument) for argument in arguments]) == status
+    captured = capsys.readouterr()
+    return captured.out, captured.err.splitlines()

@@ -1,26 +1,39 @@
-"""Recorded runs: what every frame did, with poses, LODs and the clock, in one .npz file that runs again.
+"""Recorded runs: the row, poses and LODs of every frame in one .npz file.
 
-A recording holds the scene file's text, so that it runs without it; meshes that the text names must lie where they did,
-and be the same. Run again, a controller hears the times of the recording, and every row must come out bit for bit.
+A recording holds the text of the scene file, so that it needs no other file but the meshes that the text names, which
+must be the same.
 """
 
-import json
 import zipfile
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from warp_abtree.app.toml.decode import import_msgspec
 from warp_abtree.app.toml.scene_file import SceneFile, load_scene
 from warp_abtree.checks.atomic_write import atomic_write
-from warp_abtree.lod.timing import ReplayClock
 from warp_abtree.simulate.frame import FrameRow
 
-FORMAT_NAME, FORMAT_VERSION = "warp_abtree recording", 1
-COLUMNS = tuple(field.name for field in fields(FrameRow))
-_OPTIONAL = ("hits", "budget_ms")  # NaN in the file where they are None
-_SETTINGS = {"path": str, "objects": int, "controller": str, "budget_ms": float, "device": str}
+FORMAT_NAME, FORMAT_VERSION = "warp_abtree recording", 2
+
+
+@dataclass
+class RunSettings:
+    """What a run was asked for.
+
+    Attributes:
+        path: Of the scene file.
+        objects: Number of objects, None for the file's own.
+        controller, budget_ms: As for `SceneFile.frame`.
+        device: Warp device.
+    """
+
+    path: str
+    objects: int | None
+    controller: str
+    budget_ms: float | None
+    device: str
 
 
 @dataclass(eq=False)
@@ -29,15 +42,15 @@ class Recording:
 
     Attributes:
         text: The scene file.
-        settings: path of the scene file, objects asked for or None, controller, budget_ms or None, and device.
-        models: Digest of each model's mesh.
+        settings: What was asked for.
+        models: `Model.digest` of each model.
         rows: One `FrameRow` a frame.
         lods: LOD of every object in each frame, int32 (frames, n).
         poses: Pose of every object in each frame, x y z qx qy qz qw, float64 (frames, n, 7).
     """
 
     text: str
-    settings: dict
+    settings: RunSettings
     models: list
     rows: list
     lods: np.ndarray
@@ -45,30 +58,23 @@ class Recording:
 
     def save(self, path):
         """Write to an .npz file; it appears whole or not at all."""
-        table = [asdict(row) for row in self.rows]
-        columns: dict[str, Any] = {}
-        for name in COLUMNS:
-            values = [row[name] for row in table]
-            if name in _OPTIONAL:
-                columns[f"row_{name}"] = np.array([np.nan if value is None else value for value in values], np.float64)
-            else:
-                columns[f"row_{name}"] = np.array(values, np.float64 if _is_real(name) else np.int64)
+        encode = import_msgspec(path).json.encode
         with atomic_write(path) as file:
             np.savez_compressed(
                 file,
                 format=np.array(FORMAT_NAME),
                 version=np.array(FORMAT_VERSION),
                 text=np.array(self.text),
-                settings=np.array(json.dumps(self.settings)),
+                settings=np.array(encode(self.settings).decode()),
+                rows=np.array(encode(self.rows).decode()),
                 models=np.array(self.models),
                 lods=self.lods,
                 poses=self.poses,
-                **columns,
             )
 
     @classmethod
     def open(cls, path) -> "Recording":
-        """Read what `save` wrote; nothing in the file is run.
+        """Read what `save` wrote; nothing in the file is executed.
 
         Raises:
             ValueError: With what is wrong with the file.
@@ -86,38 +92,19 @@ class Recording:
         version = str(arrays.get("version"))
         if version != str(FORMAT_VERSION):
             raise ValueError(f"{path}: a recording of version {version}, not {FORMAT_VERSION}")
+        decode = import_msgspec(path).json.decode
         try:
-            return cls._from_arrays(arrays)
-        except (ValueError, KeyError, TypeError, OverflowError) as error:
+            settings = decode(str(arrays["settings"]), type=RunSettings)
+            rows = decode(str(arrays["rows"]), type=list[FrameRow])
+            lods, poses = arrays["lods"], arrays["poses"]
+            shapes = (len(rows), *lods.shape[1:2]), (*lods.shape[:2], 7)
+            for name, array, shape, kind in zip(("lods", "poses"), (lods, poses), shapes, ("int32", "float64")):
+                if array.shape != shape or array.dtype != kind or array.ndim < 2 or not array.size:
+                    raise ValueError(f"{name}: shape {array.shape} and type {array.dtype} of {len(rows)} frames")
+            return cls(str(arrays["text"]), settings, arrays["models"].tolist(), rows, lods, poses)
+        except (ValueError, KeyError) as error:
             what = f"{error} is missing" if isinstance(error, KeyError) else error
             raise ValueError(f"{path}: a damaged recording ({what})") from None
-
-    @classmethod
-    def _from_arrays(cls, arrays):
-        settings = json.loads(str(arrays["settings"]))
-        for name, kind in _SETTINGS.items():
-            if not isinstance(settings[name], kind) and (settings[name] is not None or name in ("path", "controller")):
-                raise ValueError(f"settings: {name} is {settings[name]!r}")
-        lods, poses = arrays["lods"], arrays["poses"]
-        frames = len(arrays["row_frame"])
-        if lods.ndim != 2 or len(lods) != frames or lods.dtype != np.int32 or not frames:
-            raise ValueError(f"lods: shape {lods.shape} and type {lods.dtype} of {frames} frames")
-        if poses.shape != (*lods.shape, 7) or poses.dtype != np.float64:
-            raise ValueError(f"poses: shape {poses.shape} and type {poses.dtype} of {frames} frames")
-        columns = {}
-        for name in COLUMNS:
-            column = arrays[f"row_{name}"]
-            real = _is_real(name) or name in _OPTIONAL
-            if column.shape != (frames,) or column.dtype != (np.float64 if real else np.int64):
-                raise ValueError(f"row_{name}: shape {column.shape} and type {column.dtype} of {frames} frames")
-            if name not in _OPTIONAL and not np.isfinite(column).all():
-                raise ValueError(f"row_{name}: a number is not finite")
-            columns[name] = column.tolist()
-            if name in _OPTIONAL:
-                whole = int if name == "hits" else float
-                columns[name] = [None if np.isnan(value) else whole(value) for value in columns[name]]
-        rows = [FrameRow(*values) for values in zip(*(columns[name] for name in COLUMNS))]
-        return cls(str(arrays["text"]), settings, arrays["models"].tolist(), rows, lods, poses)
 
     def load_scene(self, path, device=None, progress=None) -> SceneFile:
         """Return the scene of the recording.
@@ -130,8 +117,7 @@ class Recording:
             SceneError: A mesh is missing.
             ValueError: A mesh is another.
         """
-        objects = self.settings["objects"]
-        loaded = load_scene(self.settings["path"], device, progress, objects, self.text)
+        loaded = load_scene(self.settings.path, device, progress, self.settings.objects, self.text)
         for (name, model), known in zip(loaded.models.items(), self.models):
             if model.digest != known:
                 raise ValueError(f"{path}: the mesh of models.{name} is not the one of the recording")
@@ -139,29 +125,13 @@ class Recording:
             raise ValueError(f"{path}: a damaged recording (the scene has other objects)")
         return loaded
 
-    def difference(self, other: "Recording") -> str | None:
-        """Return the first difference of another run, as far as both go, to the bit; None if there is none."""
-        for i, (mine, its) in enumerate(zip(self.rows, other.rows)):
-            for name in COLUMNS:
-                if getattr(mine, name) != getattr(its, name):
-                    return f"frame {i}: {name} is {getattr(its, name)}, recorded is {getattr(mine, name)}"
-            for name in ("lods", "poses"):
-                if getattr(self, name)[i].tobytes() != getattr(other, name)[i].tobytes():
-                    return f"frame {i}: {name} are not those recorded"
-        return None
 
-
-def _is_real(name):
-    return name == "time" or name.endswith("_ms") or name.startswith("error_")
-
-
-def record_run(loaded: SceneFile, frames: int, replay=None, keep=True, progress=None, **options):
+def record_run(loaded: SceneFile, frames: int, keep=True, progress=None, **options):
     """Run a scene from its start.
 
     Args:
         loaded: What `load_scene` returned.
         frames: How many.
-        replay: `Recording` whose clock the run reads.
         keep: Whether poses are kept.
         progress: Called as progress(done, total) after each frame.
         options: Of `SceneFile.frame`.
@@ -170,8 +140,6 @@ def record_run(loaded: SceneFile, frames: int, replay=None, keep=True, progress=
         The `Frame`, and the `Recording`, whose poses are empty unless kept.
     """
     bodies = loaded.make_bodies()
-    if replay is not None:
-        options["clock"] = ReplayClock(replay.rows)
     frame = loaded.frame(bodies=bodies, **options)
     scene = loaded.scene
     lods = np.empty((frames, scene.object_count), np.int32)
@@ -184,12 +152,12 @@ def record_run(loaded: SceneFile, frames: int, replay=None, keep=True, progress=
         if progress is not None:
             progress(i + 1, frames)
     control = loaded.control.asked(options.get("controller"), options.get("budget_ms"))
-    settings = {
-        "path": str(Path(loaded.path).absolute()),
-        "objects": loaded.objects,
-        "controller": control.controller,
-        "budget_ms": None if control.controller in ("none", "tolerance") else control.budget_ms,
-        "device": str(scene.device),
-    }
+    settings = RunSettings(
+        path=str(Path(loaded.path).absolute()),
+        objects=loaded.objects,
+        controller=control.controller,
+        budget_ms=None if control.controller in ("none", "tolerance") else control.budget_ms,
+        device=str(scene.device),
+    )
     models = [model.digest for model in loaded.models.values()] if keep else []
     return frame, Recording(loaded.text, settings, models, list(frame.history), lods, poses)

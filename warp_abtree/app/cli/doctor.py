@@ -3,6 +3,8 @@
 import importlib.metadata
 import os
 import platform
+import re
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -17,62 +19,54 @@ from warp_abtree.scene.scene import Scene
 
 SUMMARY = "say what this machine has, what is missing, and whether its devices answer right"
 EXAMPLES = ("", "--json", "--device cpu")
-CORE = {"warp-lang": "1.19", "numpy": "", "trimesh": ""}
-# Of each extra: what it is for, and its packages with the least version; tests hold them against pyproject.toml.
+CORE = ("warp-lang>=1.19", "numpy", "trimesh")
+# Of each extra its use and its packages; tests compare them with pyproject.toml.
 EXTRAS = {
-    "usd": ("meshes inside Warp, USD files", {"usd-core": "", "tomli": ""}),
-    "view": ("viewer and pictures", {"matplotlib": "", "viser": "1.1", "tomli": ""}),
-    "dynamics": ("bodies whose meshes are open", {"scipy": "", "networkx": ""}),
-    "newton": ("contacts for Newton's solvers", {"newton": "1.8"}),
-    "cluster": ("sweeps on Ray, Parquet files", {"ray": "", "pyarrow": ""}),
-    "cli": ("tables and bars, completion in shells", {"rich": "", "shtab": ""}),
+    "app": ("scene files, tables and bars, completion in shells", ("msgspec", "rich", "shtab", "tomli")),
+    "view": ("viewer", ("viser>=1.1",)),
+    "pictures": ("pictures and plots", ("pyvista", "matplotlib")),
+    "usd": ("meshes inside Warp, USD files", ("usd-core",)),
+    "dynamics": ("bodies whose meshes are open", ("scipy", "networkx")),
+    "newton": ("contacts for Newton's solvers", ("newton>=1.8",)),
+    "cluster": ("sweeps on Ray, Parquet files", ("ray", "pyarrow")),
 }
 OLD_PYTHON_ONLY = ("tomli",)  # Python 3.11 has tomllib
-
-# Two triangles that cross, and where the second one passes the first by.
-_CROSSING = ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0.25, 0.25, -1], [0.25, 0.25, 1], [2, 2, 0]])
-_AWAY = (0, 0, 3, 0, 0, 0, 1)
+# Two triangles that cross, and a pose of the second one at which they do not.
+CROSSING = ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0.25, 0.25, -1], [0.25, 0.25, 1], [2, 2, 0]])
+AWAY = (0, 0, 3, 0, 0, 0, 1)
 
 
 def _numbers(version) -> tuple:
-    parts = []
-    for part in version.split("."):
-        digits = part[: len(part) - len(part.lstrip("0123456789"))]
-        if not digits:
-            break
-        parts.append(int(digits))
-    return tuple(parts)
+    """Return the numbers that a version begins with, up to the first part that is none."""
+    return tuple(map(int, re.sub(r"[^\d.].*", "", version).strip(".").split("."))) if version[:1].isdigit() else ()
 
 
-def check_package(name, least="") -> dict:
-    """Return a package's installed version, or None, and whether that is new enough."""
-    try:
-        version = importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return {"version": None, "ok": False, "needs": f"{name}>={least}" if least else name}
-    return {
-        "version": version,
-        "ok": _numbers(version) >= _numbers(least),
-        "needs": f"{name}>={least}" if least else name,
-    }
-
-
-def check_extras() -> dict:
-    """Return for each extra what it is for, its packages as `check_package`, and whether all are there."""
+def check_packages(needs) -> dict:
+    """Return for each requirement, as "viser>=1.1", the installed version or None, and whether that is new enough."""
     found = {}
-    for extra, (purpose, packages) in EXTRAS.items():
-        kept = {name: least for name, least in packages.items() if _is_needed(name)}
-        checked = {name: check_package(name, least) for name, least in kept.items()}
-        found[extra] = {"for": purpose, "packages": checked, "ok": all(each["ok"] for each in checked.values())}
+    for need in needs:
+        name, _, least = need.partition(">=")
+        try:
+            version = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            version = None
+        found[name] = {"version": version, "ok": version is not None, "needs": need}
+        if version is not None:
+            found[name]["ok"] = _numbers(version) >= _numbers(least)
     return found
 
 
-def _is_needed(name) -> bool:
-    return name not in OLD_PYTHON_ONLY or sys.version_info < (3, 11)
+def check_extras() -> dict:
+    """Return for each extra its use, its packages, and whether all are installed."""
+    found = {}
+    for extra, (use, needs) in EXTRAS.items():
+        packages = check_packages(need for need in needs if need not in OLD_PYTHON_ONLY or sys.version_info < (3, 11))
+        found[extra] = {"for": use, "packages": packages, "ok": all(each["ok"] for each in packages.values())}
+    return found
 
 
 def check_device(device) -> dict:
-    """Ask a device a question whose answer is known.
+    """Query a device where the answer is known.
 
     Returns:
         alias, name, architecture, memory [bytes, None for the CPU], ok, seconds that the answer took, with loading
@@ -89,20 +83,20 @@ def check_device(device) -> dict:
     begin = time.perf_counter()
     try:
         scene = Scene(device)
-        first, second = (Model.from_arrays(vertices, [[0, 1, 2]]) for vertices in _CROSSING)
+        first, second = (Model.from_arrays(vertices, [[0, 1, 2]]) for vertices in CROSSING)
         scene.add(first)
         scene.add(second)
-        scene.add(second, pose=_AWAY)
+        scene.add(second, pose=AWAY)
         answer = scene.intersect([[0, 1], [0, 2], [1, 2]], output="count").count.tolist()
         error = None if answer == [1, 0, 0] else f"a wrong answer: {answer}"
-    except Exception as problem:  # whatever it is, it is what the doctor is asked about
+    except Exception as problem:  # of any kind: it is the finding
         error = " ".join(str(problem).split()) or type(problem).__name__
     return {**found, "ok": error is None, "seconds": time.perf_counter() - begin, "error": error}
 
 
 def check_cache() -> dict:
-    """Return where Warp keeps compiled kernels, how many modules and bytes stand there, and whether it can write."""
-    folder = Path(wp.config.kernel_cache_dir or "")  # set since Warp was started
+    """Return the folder of Warp's compiled kernels, its modules and bytes, and whether it can be written."""
+    folder = Path(wp.config.kernel_cache_dir or "")  # set by the start of Warp
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {
         "folder": str(folder),
@@ -119,7 +113,7 @@ def examine(devices=None) -> dict:
         devices: Warp devices to ask; None is all.
     """
     checked = [check_device(device) for device in (wp.get_devices() if devices is None else devices)]
-    core = {name: check_package(name, least) for name, least in CORE.items()}
+    core = check_packages(CORE)
     found = {
         "warp_abtree": __version__,
         "folder": str(Path(__file__).parents[2]),
@@ -133,19 +127,10 @@ def examine(devices=None) -> dict:
         "kernel_cache": check_cache(),
         "scenes": {"folder": str(scene_folder()), "names": scene_names()},
     }
-    missing = [each["needs"] for extra in found["extras"].values() for each in extra["packages"].values()]
-    found["install"] = list(dict.fromkeys(needs for needs in missing if not _has(found, needs)))
+    packages = [each for extra in found["extras"].values() for each in extra["packages"].values()]
+    found["install"] = [each["needs"] for each in packages if not each["ok"]]
     found["usable"] = bool(checked) and all(each["ok"] for each in (*checked, *core.values()))
     return found
-
-
-def _has(found, needs) -> bool:
-    return all(
-        each["ok"]
-        for extra in found["extras"].values()
-        for each in extra["packages"].values()
-        if each["needs"] == needs
-    )
 
 
 def _cuda_driver():
@@ -199,9 +184,5 @@ def print_findings(found):
     )
     print(f"scenes: {', '.join(found['scenes']['names'])} ({found['scenes']['folder']})")
     if found["install"]:
-        print(f"what is missing: pip install {' '.join(_quoted(needs) for needs in found['install'])}")
+        print(f"what is missing: pip install {shlex.join(found['install'])}")
     print("usable" if found["usable"] else "not usable as it is")
-
-
-def _quoted(needs) -> str:
-    return f"'{needs}'" if ">" in needs else needs

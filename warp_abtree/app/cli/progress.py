@@ -1,4 +1,4 @@
-"""What stderr shows while people wait: a progress bar, a word about kernels being compiled, and no banner of Warp."""
+"""Messages on stderr during long work: a progress bar, a word about kernels being compiled, and no banner of Warp."""
 
 import contextlib
 import os
@@ -12,38 +12,16 @@ import warp as wp
 NOTICE_DELAY = 1.5  # seconds of compiling before a word about it
 
 
-def _start_bar(stage):
-    """Return a bar of rich on stderr that runs, and its task; None where rich is not installed."""
-    try:
-        from rich import progress
-        from rich.console import Console
-    except ImportError:
-        return None
-    columns = progress.TextColumn("{task.description}"), progress.BarColumn(), progress.TaskProgressColumn()
-    # No thread of its own redraws it: that would take time from frames that are being timed.
-    console = Console(stderr=True)
-    bar = progress.Progress(
-        *columns, progress.TimeRemainingColumn(), console=console, transient=True, auto_refresh=False
-    )
-    bar.start()
-    return bar, bar.add_task(stage)
-
-
 class Progress:
-    """A bar on stderr: redrawn in place on a terminal, a line a stage otherwise; drawn only once a stage takes long.
-
-    On the terminal of the process rich draws it, where that is installed.
+    """On a terminal a bar of rich, where that is installed; otherwise a line a stage. Short stages are not shown.
 
     Args:
         stream: Where to write; None for sys.stderr.
         delay: Seconds before a stage is shown.
     """
 
-    WIDTH = 30
-
     def __init__(self, stream=None, delay=0.5, clock=time.monotonic):
         self.stream = sys.stderr if stream is None else stream
-        self.live = self.stream.isatty()
         self.delay, self.clock = delay, clock
         self.stage, self.began, self.shown = None, 0.0, None
         self._bar = None
@@ -53,36 +31,38 @@ class Progress:
         now = self.clock()
         if stage != self.stage:
             self.close()
-            self.stage, self.began, self.shown = stage, now, None
+            self.stage, self.began = stage, now
         if now - self.began < self.delay:
             return
-        part = min(done / total, 1.0) if total else 1.0
-        if self.live and self.stream is sys.stderr and self.shown is None:
-            self._bar = _start_bar(stage)
-        if self.live and self.shown is not None and now - self.shown <= 0.05 and part < 1.0:
-            return
-        if self._bar is not None:
-            bar, task = self._bar
-            bar.update(task, completed=part, total=1.0, refresh=True)
-        elif self.live:
-            drawn = "#" * round(self.WIDTH * part)
-            self.stream.write(f"\r{stage:<12} [{drawn:<{self.WIDTH}}] {100 * part:3.0f} %")
-        elif self.shown is None:
-            self.stream.write(f"{stage} ...\n")
-        else:
+        if self.shown is None:
+            self._bar = _start_bar(self.stream, stage) if self.stream.isatty() else None
+            if self._bar is None:
+                print(f"{stage} ...", file=self.stream, flush=True)
+        elif self._bar is None or (now - self.shown <= 0.05 and done < total):
             return
         self.shown = now
-        self.stream.flush()
+        if self._bar is not None:
+            bar, task = self._bar
+            bar.update(task, completed=done, total=max(total, 1), refresh=True)
 
     def close(self):
-        """End the line of the last stage."""
+        """End the bar of the last stage."""
         if self._bar is not None:
             self._bar[0].stop()
-            self._bar = None
-        elif self.live and self.shown is not None:
-            self.stream.write("\r\x1b[K")
-            self.stream.flush()
-        self.stage = self.shown = None
+        self._bar = self.stage = self.shown = None
+
+
+def _start_bar(stream, stage):
+    """Return a running bar of rich, and its task; None where rich is not installed."""
+    try:
+        from rich import progress
+        from rich.console import Console
+    except ImportError:
+        return None
+    # No thread of its own redraws it: that would take time from frames that are being timed.
+    bar = progress.Progress(console=Console(file=stream), transient=True, auto_refresh=False)
+    bar.start()
+    return bar, bar.add_task(stage)
 
 
 def start_warp():
@@ -109,7 +89,7 @@ def compile_notice(stream=None, delay=NOTICE_DELAY):
     finished = threading.Event()
 
     def compiling():
-        # While Warp compiles a module, a folder with the process id stands in its cache.
+        # While Warp compiles a module, its cache has a folder whose name contains the process id.
         try:
             return any(f"_p{os.getpid()}_t" in entry.name for entry in os.scandir(wp.config.kernel_cache_dir))
         except (OSError, TypeError):

@@ -6,10 +6,11 @@ import sys
 import time
 from pathlib import Path
 
+from warp_abtree.app.cli.arguments import PRECISIONS, Parser, positive
+from warp_abtree.app.cli.model_commands import load_model
 from warp_abtree.app.cli.report import print_json
 from warp_abtree.app.toml.scene_file import load_scene
 from warp_abtree.jobs import RayPool, SweepJob, ThisProcess, WorldsJob, run_shards
-from warp_abtree.model.model import Model
 from warp_abtree.simulate.frame import resolve_lod
 
 SUMMARY = "ask a pair of models at millions of poses, or run the worlds of a scene, into shards"
@@ -22,21 +23,21 @@ OUTPUTS = ("any", "count", "faces", "contacts", "poses")
 SHARDS = {"poses": 65536, "worlds": 64}
 
 
-def add_arguments(sub, positive):
-    """Add the arguments of the command to its parser; `positive` is the type of whole numbers from 1."""
-    sub.add_argument(
+def add_arguments(sub: Parser):
+    """Add the arguments of the command to its parser."""
+    sub.add_file(
         "source",
         nargs="+",
         metavar="SCENE_OR_MODELS",
         help="two meshes or models and POSES.npy, (p, 7) poses of the second in the frame of the first; or a scene of "
         "two objects and POSES.npy; or a scene alone, whose worlds are run",
     )
-    sub.add_argument("--out", "-o", type=Path, required=True, metavar="DIR", help="folder to make, or to go on in")
+    sub.add_file("--out", "-o", type=Path, required=True, metavar="DIR", help="folder to make, or to go on in")
     sub.add_argument("--output", choices=OUTPUTS, help="what to ask (any); of worlds count or poses (count)")
-    sub.add_argument("--precision", choices=("exact", "float32"), default="exact", help="as query (exact)")
+    sub.add_argument("--precision", choices=PRECISIONS, default="exact", help="as query (exact)")
     for name in ("a", "b"):
         sub.add_argument(f"--lod-{name}", metavar="LOD", help=f"LOD of {name.upper()}, as query (finest)")
-    sub.add_argument("--lods", type=Path, metavar="LODS.npy", help="LODs of both at each pose, (p, 2)")
+    sub.add_file("--lods", type=Path, metavar="LODS.npy", help="LODs of both at each pose, (p, 2)")
     sub.add_argument("--frames", type=positive, metavar="N", help="frames to run worlds (the scene's own number)")
     sub.add_argument("--objects", type=positive, metavar="N", help="about so many objects, as run")
     sub.add_argument("--shard", type=positive, metavar="N", help="poses (65536) or worlds (64) a file")
@@ -104,12 +105,12 @@ def _make_job(options, progress):
         models, lods = [scene.models[m] for m in scene.object_model], scene.lods.tolist()
     else:
         raise ValueError("sweep takes two models and POSES.npy, a scene and POSES.npy, or a scene")
-    for place, wish in enumerate((options.lod_a, options.lod_b)):
-        if wish is not None and options.lods is not None:
+    for place, request in enumerate((options.lod_a, options.lod_b)):
+        if request is not None and options.lods is not None:
             raise ValueError("--lods: LODs come from the file, or from --lod-a and --lod-b")
-        if wish is not None:
+        if request is not None:
             try:
-                lods[place] = resolve_lod(models[place], wish)
+                lods[place] = resolve_lod(models[place], request)
             except ValueError as error:
                 raise ValueError(f"--lod-{'ab'[place]}: {error}") from None
     if options.output == "poses":
@@ -130,13 +131,3 @@ def _make_worlds(options, source, progress):
         raise ValueError("--precision: worlds are asked exactly")
     scene = load_scene(source[0], device="cpu", progress=progress, objects=options.objects)
     return WorldsJob(scene, options.frames, options.output or "count", options.shard or SHARDS["worlds"])
-
-
-def is_model(source) -> bool:
-    """Return whether a path is one of a built model."""
-    return source.lower().endswith(".npz")
-
-
-def load_model(source, progress) -> Model:
-    """Open a built model, or build one of a mesh."""
-    return Model.open(source) if is_model(source) else Model.load(source, progress=progress)

@@ -8,8 +8,9 @@ import logging
 import socket
 from pathlib import Path
 
+from warp_abtree.app.cli.arguments import Parser, milliseconds, positive
 from warp_abtree.app.cli.report import check_output
-from warp_abtree.app.viewer.playback import add_source_arguments, open_source
+from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 
 PORT = 8080
 SUMMARY = "look at a scene, a recorded run or meshes in the browser"
@@ -22,17 +23,13 @@ EXAMPLES = (
 )
 
 
-def add_arguments(sub, positive, milliseconds):
-    """Add the arguments of the command to its parser.
-
-    Args:
-        positive, milliseconds: Types of the command line's numbers.
-    """
-    add_source_arguments(sub, positive)
+def add_arguments(sub: Parser):
+    """Add the arguments of the command to its parser."""
+    add_playback_arguments(sub)
     sub.add_argument("--budget", type=milliseconds, metavar="TIME", help="time of a frame to hold, as 8ms or 0.008s")
     sub.add_argument("--host", default="127.0.0.1", help="address to serve at (127.0.0.1, this machine alone)")
     sub.add_argument("--port", type=int, metavar="P", help=f"port to serve at ({PORT}, or the next one that is free)")
-    sub.add_argument("--record", type=Path, metavar="HTML", help="write a page that needs no server, and end")
+    sub.add_file("--record", type=Path, metavar="HTML", help="write a page that needs no server, and end")
     sub.add_argument("--frames", type=positive, metavar="N", help="frames of --record (the scene's own number)")
 
 
@@ -95,27 +92,29 @@ def view(options, progress):
     if options.port is not None or options.host != "127.0.0.1":
         check_port(options.host, 0 if options.port is None else options.port)
     named = {"objects": options.objects, "poses": options.pose, "lod": options.lod}
-    source = open_source(options.source, options.device, progress, **named)
+    playback = open_playback(options.source, options.device, progress, **named)
     if options.budget is not None:
-        if source.length is not None:
+        if playback.length is not None:
             raise ValueError("--budget: a recording holds its LODs")
-        source.choose("scene" if source.control.controller in ("predictive", "paper") else "predictive", options.budget)
+        playback.choose(
+            "scene" if playback.control.controller in ("predictive", "paper") else "predictive", options.budget
+        )
     progress.close()
     gc.collect()
     gc.freeze()
     with serve(options.host, PORT if options.port is None else options.port) as server:
         if options.record:
-            frames = source.frames if options.frames is None else options.frames
-            record_page(server, source, options.record, frames, progress=progress)
+            frames = playback.frames if options.frames is None else options.frames
+            record_page(server, playback, options.record, frames, progress=progress)
             progress.close()
             print(json.dumps({"page": str(options.record)}) if options.json else f"wrote {options.record}")
             return
         if options.port and server.get_port() != options.port:
             raise ValueError(f"{options.host}:{options.port}: cannot be served at")
-        page = Page(server, source)
+        page = Page(server, playback)
         shown = "localhost" if options.host in ("127.0.0.1", "0.0.0.0") else options.host
         address = f"http://{shown}:{server.get_port()}"
-        found = {"address": address, "title": source.title, "objects": source.scene.object_count}
+        found = {"address": address, "title": playback.title, "objects": playback.scene.object_count}
         with contextlib.suppress(KeyboardInterrupt):  # from when the address is told
-            print(json.dumps(found) if options.json else f"{source.title}: {address} (Ctrl-C ends)", flush=True)
+            print(json.dumps(found) if options.json else f"{playback.title}: {address} (Ctrl-C ends)", flush=True)
             page.run()

@@ -1,6 +1,6 @@
-"""The page of the viewer: its panel, and the loop that turns what people do into moments on the stage.
+"""The page of the viewer: its panel, and the loop that turns events into snapshots of the viewer's scene.
 
-The server calls back in threads of its own; callbacks only leave a note, and the one thread that runs `Page.run` acts.
+The server calls back in threads of its own; callbacks only put an event in a queue, and the thread of `Page.run` acts.
 """
 
 import math
@@ -10,21 +10,22 @@ from typing import Any
 
 import numpy as np
 
+from warp_abtree.app import scene_geometry as geometry
+from warp_abtree.app.playback import HOLD, OWN
+from warp_abtree.app.render_data import Settings, compose, objects_of_world
 from warp_abtree.app.viewer import text as view_text
-from warp_abtree.app.viewer.playback import OWN, STILL
-from warp_abtree.app.viewer.render_data import tree_depth
-from warp_abtree.app.viewer.viewer_scene import Composer, Settings, Stage
+from warp_abtree.app.viewer.viewer_scene import ViewerScene
 from warp_abtree.lod.view import Camera
 
-FRAME_SECONDS = 1 / 30  # between moments that are sent, at the least
+FRAME_SECONDS = 1 / 30  # between snapshots that are sent, at least
 TEXT_SECONDS = 0.2  # between changes of numbers and plots while it plays
 PLOTTED = 240  # frames
 BUDGETS = (0.5, 100.0)  # of the slider [ms]
 LIGHT = 0.6
-DISTANCE = 1.6  # of the first camera, in radii of what is shown
-WAYS = {
+DISTANCE = 1.8  # of the first camera, in radii of what is shown
+MODES = {
     OWN: "as the scene says",
-    STILL: "hold as they are",
+    HOLD: "hold as they are",
     "predictive": "budget, predicted",
     "paper": "budget, as in the paper",
     "tolerance": "tolerance",
@@ -32,63 +33,70 @@ WAYS = {
 
 
 class Page:
-    """A page about a source, on a viser server.
+    """A page about a playback, on a viser server.
 
     Args:
         server: `viser.ViserServer`; the page does not stop it.
-        source: `Source`.
+        playback: `Playback`.
         clock: Seconds, by which the browser is given time.
 
     Attributes:
-        settings: `Settings` as people left them.
-        playing: Whether it goes on by itself.
-        moments: Sent so far.
-        rate: Moments a second, of late.
+        settings: `Settings` of the panel.
+        playing: Whether frames follow one another.
+        snapshot: `Snapshot` that is shown.
+        snapshots: How many were sent so far.
+        rate: Snapshots a second, smoothed.
+        cache: `MeshCache` of the scene.
     """
 
-    def __init__(self, server, source, clock=time.monotonic):
-        self.server, self.source = server, source
-        self.composer = Composer(source)
-        self.stage = Stage(server.scene, self.composer.cache, on_pick=lambda i: self._note(self._pick, i), clock=clock)
-        self.settings = Settings(world=source.look.world)
-        if not len(self.composer.shown(self.settings)):
-            self.settings.world = int(source.worlds.max())
-        self.playing, self.moments, self.rate = False, 0, 0.0
-        self._notes: queue.SimpleQueue = queue.SimpleQueue()
+    def __init__(self, server, playback, clock=time.monotonic):
+        self.server, self.playback = server, playback
+        self.cache = geometry.MeshCache(playback.scene)
+        self.viewer_scene = ViewerScene(server.scene, self.cache, lambda i: self._post(self._pick, i), clock)
+        self.settings = Settings(world=playback.view.world)
+        if not len(self.shown):
+            self.settings.world = int(playback.worlds.max())
+        self.playing, self.snapshots, self.rate = False, 0, 0.0
+        self._events: queue.SimpleQueue = queue.SimpleQueue()
         self._closed = False
         self._rows: list = []
         self._steps, self._dirty = 0, True
-        self._text_time = self._moment_time = -math.inf
+        self._text_time = self._snapshot_time = -math.inf
         self._gizmo, self._plotted = None, False
-        server.scene.set_up_direction(tuple(source.look.up))
+        server.scene.set_up_direction(tuple(playback.view.up))
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         server.gui.main_panel.dock_right()
-        server.gui.set_panel_label(source.title)
+        server.gui.set_panel_label(playback.title)
         self._light()
         self._build()
         server.on_client_connect(self._watch)
-        self.moment = source.again(self.settings.output)
+        self.snapshot = playback.query(self.settings.output)
         self._place_camera()
+
+    @property
+    def shown(self) -> np.ndarray:
+        """Indices of the objects that are shown."""
+        return objects_of_world(self.playback.worlds, self.settings.world)
 
     # The panel.
 
     def _build(self):
-        gui, source = self.server.gui, self.source
+        gui, playback = self.server.gui, self.playback
         with gui.add_folder("Time"):
             buttons = gui.add_button_group("run", ("play", "step", "restart"))
-            buttons.on_click(lambda event: self._note(self._run_button, event.target.value))
+            buttons.on_click(lambda event: self._post(self._run_button, event.target.value))
             self._frame_slider = None
-            if source.length is not None and source.length > 1:
-                self._frame_slider = gui.add_slider("frame", 0, source.length - 1, 1, 0)
+            if playback.length is not None and playback.length > 1:
+                self._frame_slider = gui.add_slider("frame", 0, playback.length - 1, 1, 0)
                 self._hear(self._frame_slider, self._seek)
             self._state = gui.add_markdown("")
         with gui.add_folder("Level of detail"):
-            names = [WAYS[way] for way in source.ways()]
-            self._way = gui.add_dropdown("chosen", names, initial_value=names[0])
-            self._hear(self._way, lambda _: self._choose())
+            names = [MODES[mode] for mode in playback.modes()]
+            self._mode = gui.add_dropdown("chosen", names, initial_value=names[0])
+            self._hear(self._mode, lambda _: self._choose())
             self._budget: Any = None  # a slider of viser
             if len(names) > 2:
-                first = min(max(getattr(source, "budget_ms", None) or 16.0, BUDGETS[0]), BUDGETS[1])
+                first = min(max(getattr(playback, "budget_ms", None) or 16.0, BUDGETS[0]), BUDGETS[1])
                 hint = "T: selection, refinement, broad phase and query of a frame"
                 self._budget = gui.add_slider("budget [ms]", *BUDGETS, 0.5, first, hint=hint)
                 self._hear(self._budget, self._set_budget)
@@ -99,11 +107,11 @@ class Page:
             )
             self._hear(self._all_lod, self._hold_all)
             release = gui.add_button("release all")
-            release.on_click(lambda _: self._note(self._release, None))
+            release.on_click(lambda _: self._post(self._release, None))
         with gui.add_folder("Show"):
             self._build_show(gui)
         with gui.add_folder("Picked object"):
-            count = source.scene.object_count
+            count = playback.scene.object_count
             self._picked = gui.add_number("object", -1, min=-1, max=count - 1, step=1, hint="or click it; -1 is none")
             self._hear(self._picked, lambda i: self._pick(int(i), from_number=True))
             self._lod = gui.add_slider(
@@ -111,7 +119,7 @@ class Page:
             )
             self._hear(self._lod, self._hold_picked)
             self._own = gui.add_button("release it", disabled=True)
-            self._own.on_click(lambda _: self._note(self._release, self.settings.picked))
+            self._own.on_click(lambda _: self._post(self._release, self.settings.picked))
             self._numbers = gui.add_markdown(view_text.NOBODY)
         with gui.add_folder("Frame times [ms]"):
             self._plot = gui.add_uplot(**view_text.time_plot([], PLOTTED), height=220)
@@ -121,34 +129,34 @@ class Page:
             handle = gui.add_checkbox(label, getattr(self.settings, name), hint=hint)
             self._hear(handle, lambda value: setattr(self.settings, name, value))
 
-        box("intersecting faces", "struck")
+        box("intersecting faces", "intersecting")
         box("contacts", "contacts")
         box("contact normals", "normals", "from the first object of a pair to the second")
         box("wireframe", "wireframe")
         box("colours by LOD", "by_lod", "blue is coarse, yellow fine")
         look = gui.add_button("look at all of it")
-        look.on_click(lambda event: self._note(self._look, event.client))
-        depth = tree_depth(self.source.scene, range(self.source.scene.object_count))
+        look.on_click(lambda event: self._post(self._look, event.client))
+        depth = geometry.tree_depth(self.playback.scene, range(self.playback.scene.object_count))
         level = gui.add_slider("tree level", -1, depth, 1, -1, hint="boxes of the active nodes at a level; -1 is none")
         self._hear(level, lambda value: setattr(self.settings, "level", int(value)))
         box("trees of all objects", "every_tree", "in the place of the picked one's")
-        worlds = np.unique(self.source.worlds)
+        worlds = np.unique(self.playback.worlds)
         if len(worlds) > 1 and worlds.max() > 0:
             world = gui.add_number("world", self.settings.world, min=0, max=int(worlds.max()), step=1)
             self._hear(world, lambda value: setattr(self.settings, "world", int(value)))
 
     def _hear(self, handle, act):
-        """Act on a value that a person set; values that the page sets itself come without a client."""
+        """Act on a value that the user set; values that the page sets itself come without a client."""
 
         @handle.on_update
         def _(event):
             if event.client is not None:
-                self._note(lambda: act(handle.value))
+                self._post(lambda: act(handle.value))
 
-    def _note(self, act, *arguments):
-        self._notes.put((act, arguments))
+    def _post(self, act, *arguments):
+        self._events.put((act, arguments))
 
-    # What people do. These run in the thread of `run`.
+    # Actions of the user, in the thread of `run`.
 
     def _run_button(self, name):
         if name == "play":
@@ -156,53 +164,53 @@ class Page:
         elif name == "step":
             self.playing, self._steps = False, self._steps + 1
         else:
-            self.source.restart()
+            self.playback.restart()
             self._rows.clear()
 
     def _seek(self, number):
         self.playing = False
-        self.source.seek(int(number))
+        self.playback.seek(int(number))
 
-    def _chosen_way(self):
-        names = self.source.ways()
-        return next(way for way in names if WAYS[way] == self._way.value)
+    def _chosen_mode(self):
+        names = self.playback.modes()
+        return next(mode for mode in names if MODES[mode] == self._mode.value)
 
     def _choose(self, budget_ms=None):
-        way = self._chosen_way()
-        if budget_ms is None and way in ("predictive", "paper"):
+        mode = self._chosen_mode()
+        if budget_ms is None and mode in ("predictive", "paper"):
             budget_ms = self._budget.value
-        self.source.choose(way, budget_ms)
+        self.playback.choose(mode, budget_ms)
 
     def _set_budget(self, value):
         """Hold a budget, by the predictive controller where none holds one yet."""
-        way = self._chosen_way()
-        own = self.source.control.controller if way == OWN else way
+        mode = self._chosen_mode()
+        own = self.playback.control.controller if mode == OWN else mode
         if own not in ("predictive", "paper"):
-            self._way.value = WAYS["predictive"]
+            self._mode.value = MODES["predictive"]
         self._choose(float(value))
 
     def _set_for_page(self, value):
-        self.source.for_page = value
-        self._choose(None if self.source.budget_ms is None else self._budget.value)
+        self.playback.for_page = value
+        self._choose(None if self.playback.budget_ms is None else self._budget.value)
 
     def _lod_of(self, i, percent):
-        return round(percent / 100 * self.source.scene.models[self.source.scene.object_model[i]].lod_max)
+        return round(percent / 100 * self.playback.scene.models[self.playback.scene.object_model[i]].lod_max)
 
     def _hold_all(self, percent):
-        for i in range(self.source.scene.object_count):
-            self.source.hand[i] = self._lod_of(i, percent)
+        for i in range(self.playback.scene.object_count):
+            self.playback.held[i] = self._lod_of(i, percent)
         self._show_own_lod()
 
     def _hold_picked(self, percent):
         if self.settings.picked is not None:
-            self.source.hand[self.settings.picked] = self._lod_of(self.settings.picked, percent)
+            self.playback.held[self.settings.picked] = self._lod_of(self.settings.picked, percent)
             self._own.disabled = False
 
     def _release(self, i):
         if i is None:
-            self.source.hand.clear()
+            self.playback.held.clear()
         else:
-            self.source.hand.pop(i, None)
+            self.playback.held.pop(i, None)
         self._own.disabled = True
 
     def _pick(self, i, from_number=False):
@@ -215,10 +223,10 @@ class Page:
 
     def _show_own_lod(self):
         i = self.settings.picked
-        self._own.disabled = i is None or i not in self.source.hand
+        self._own.disabled = i is None or i not in self.playback.held
         if i is not None:
-            top = self.source.scene.models[self.source.scene.object_model[i]].lod_max
-            lod = self.source.hand.get(i, int(self.moment.lods[i]))
+            top = self.playback.scene.models[self.playback.scene.object_model[i]].lod_max
+            lod = self.playback.held.get(i, int(self.snapshot.lods[i]))
             self._lod.value = round(200 * lod / max(top, 1)) / 2
 
     def _show_gizmo(self):
@@ -227,10 +235,10 @@ class Page:
             self._gizmo.remove()
             self._gizmo = None
         i = self.settings.picked
-        if i is None or not self.source.can_move:
+        if i is None or not self.playback.can_move:
             return
-        pose = self.moment.poses[i]
-        size = 0.35 * self.composer.cache.diagonals[self.source.scene.object_model[i]]
+        pose = self.snapshot.poses[i]
+        size = 0.35 * self.cache.diagonals[self.playback.scene.object_model[i]]
         gizmo = self.server.scene.add_transform_controls(
             "/gizmo", scale=size, position=pose[:3], wxyz=pose[[6, 3, 4, 5]], depth_test=False
         )
@@ -238,7 +246,7 @@ class Page:
         @gizmo.on_update
         def _(event):
             wxyz = np.asarray(event.target.wxyz, np.float64)
-            self._note(self.source.move, i, np.concatenate([event.target.position, wxyz[1:], wxyz[:1]]))
+            self._post(self.playback.move, i, np.concatenate([event.target.position, wxyz[1:], wxyz[:1]]))
 
         self._gizmo = gizmo
 
@@ -249,24 +257,24 @@ class Page:
 
         The environment stays as it is: a standalone page would make it anew whenever it begins again.
         """
-        scene, up, eye = self.server.scene, np.asarray(self.source.look.up), np.asarray(self.source.look.eye)
+        scene, up, eye = self.server.scene, np.asarray(self.playback.view.up), np.asarray(self.playback.view.eye)
         scene.configure_default_lights(False)
-        way = up - np.cross(up, eye) + 0.6 * eye
-        scene.add_light_directional("/light", position=tuple(way), intensity=LIGHT, cast_shadow=False)
+        direction = up - np.cross(up, eye) + 0.6 * eye
+        scene.add_light_directional("/light", position=tuple(direction), intensity=LIGHT, cast_shadow=False)
 
     def _place_camera(self):
-        centre, radius = self.composer.frame_of(self.moment, self.settings)
+        centre, radius = geometry.bounds(self.cache, self.snapshot, self.shown)
         first = self.server.initial_camera
         first.look_at = tuple(centre)
-        first.position = tuple(centre + DISTANCE * radius * np.asarray(self.source.look.eye))
-        first.up = tuple(self.source.look.up)
+        first.position = tuple(centre + DISTANCE * radius * np.asarray(self.playback.view.eye))
+        first.up = tuple(self.playback.view.up)
         first.near, first.far = radius / 500, 200 * radius
 
     def _look(self, client):
         """Bring the camera of a page back to where it sees all."""
         if client is not None:
-            centre, radius = self.composer.frame_of(self.moment, self.settings)
-            client.camera.position = centre + DISTANCE * radius * np.asarray(self.source.look.eye)
+            centre, radius = geometry.bounds(self.cache, self.snapshot, self.shown)
+            client.camera.position = centre + DISTANCE * radius * np.asarray(self.playback.view.eye)
             client.camera.look_at = centre
 
     def _watch(self, client):
@@ -282,8 +290,8 @@ class Page:
                 found = Camera.look_at(camera.position, camera.look_at, far=far, **options)
             except ValueError:
                 return
-            if hasattr(self.source, "page_camera"):
-                self.source.page_camera = found
+            if hasattr(self.playback, "page_camera"):
+                self.playback.page_camera = found
 
     # The loop.
 
@@ -293,19 +301,19 @@ class Page:
         while not self._closed and time.monotonic() < end:
             if not (self.playing or self._steps or self._dirty):
                 try:
-                    self._act(self._notes.get(timeout=0.1))
+                    self._act(self._events.get(timeout=0.1))
                 except queue.Empty:
                     self._catch_up()
                     continue
             while True:
                 try:
-                    self._act(self._notes.get_nowait())
+                    self._act(self._events.get_nowait())
                 except queue.Empty:
                     break
             if self._closed:
                 return
             self.advance()
-            wait = self._moment_time + FRAME_SECONDS - time.monotonic()
+            wait = self._snapshot_time + FRAME_SECONDS - time.monotonic()
             if wait > 0:
                 time.sleep(wait)
             self._measure_rate()
@@ -313,7 +321,7 @@ class Page:
     def close(self):
         """End `run`, from any thread."""
         self._closed = True
-        self._notes.put((lambda: None, ()))
+        self._events.put((lambda: None, ()))
 
     def _act(self, note):
         act, arguments = note
@@ -325,47 +333,50 @@ class Page:
         self._dirty = True
 
     def advance(self):
-        """Make the next moment, a frame on if it plays or steps, and send what changed."""
+        """Make the next snapshot, a frame on if it plays or steps, and send what changed."""
         moves = self.playing or self._steps > 0
         try:
-            self.moment = (self.source.step if moves else self.source.again)(self.settings.output)
+            self.snapshot = (self.playback.step if moves else self.playback.query)(self.settings.output)
         except RuntimeError as error:
             self.playing = False
             for client in self.server.get_clients().values():
                 client.add_notification("This frame failed", str(error), color="red")
-        if self.moment.row is not None:
-            self._rows.append(self.moment.row)
+        if self.snapshot.row is not None:
+            self._rows.append(self.snapshot.row)
             del self._rows[:-PLOTTED]
         self._steps, self._dirty = max(self._steps - 1, 0), False
-        drawing = self._drawing = self.composer.compose(self.moment, self.settings)
-        with self.server.atomic():
-            self.stage.show(drawing, self.settings)
-        self.moments += 1
+        data = self._data = compose(self.cache, self.snapshot, self.shown, self.settings)
+        self._send()
+        self.snapshots += 1
         now = time.monotonic()
         if not self.playing or now - self._text_time >= TEXT_SECONDS:
             self._text_time = now
-            self._say(drawing)
-        return drawing
+            self._say(data)
+        return data
 
     def _catch_up(self):
-        """Show the last moment again where the browser was not ready for all of it."""
-        if self.stage.waits:
-            with self.server.atomic():
-                self.stage.show(self._drawing, self.settings)
+        """Show the last snapshot again where the browser was not ready for all of it."""
+        if self.viewer_scene.waits:
+            self._send()
+
+    def _send(self):
+        camera = self.playback.camera
+        with self.server.atomic():
+            self.viewer_scene.show(self._data, self.settings, camera and camera(self.snapshot.time))
 
     def _measure_rate(self):
         now = time.monotonic()
-        span = now - self._moment_time
-        self._moment_time = now
+        span = now - self._snapshot_time
+        self._snapshot_time = now
         self.rate = 0.0 if span > 1 else 0.9 * self.rate + 0.1 / span if self.rate else 1 / span
 
-    def _say(self, drawing):
-        self._state.content = view_text.state(self, drawing)
+    def _say(self, data):
+        self._state.content = view_text.state(self, data)
         if self._frame_slider is not None:
-            self._frame_slider.value = self.moment.number
-        if self.settings.picked is not None and self.settings.picked not in self.source.hand:
+            self._frame_slider.value = self.snapshot.number
+        if self.settings.picked is not None and self.settings.picked not in self.playback.held:
             self._show_own_lod()
-        self._numbers.content = view_text.numbers(self.source, self.moment, self.composer.cache, self.settings.picked)
+        self._numbers.content = view_text.numbers(self.playback, self.snapshot, self.cache, self.settings.picked)
         if self._rows or self._plotted:
             self._plotted = bool(self._rows)
             plot = view_text.time_plot(self._rows, PLOTTED)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from warp_abtree.app.pictures.plot import STAGE_LABELS
+from warp_abtree.app.styles import STAGE_LABELS
 
 NOBODY = "Click an object, or give its number."
 PARTNERS = 8  # named of the objects that one meets
@@ -18,56 +18,56 @@ def _table(rows) -> str:
     return "\n".join(["| | |", "|:--|--:|", *(f"| {key} | {value} |" for key, value in rows)])
 
 
-def state(page, drawing) -> str:
-    """Return the numbers of a moment as a table."""
-    moment, source = page.moment, page.source
-    result = moment.result
+def state(page, data) -> str:
+    """Return the numbers of a snapshot as a table."""
+    snapshot, playback = page.snapshot, page.playback
+    result = snapshot.result
     rows = [
         ("state", "playing" if page.playing else "paused"),
-        ("time", f"{moment.time:.3f} s, frame {moment.number:,}"),
-        ("objects shown", f"{len(drawing.shown):,} of {source.scene.object_count:,}"),
-        ("faces shown", f"{drawing.faces:,}"),
+        ("time", f"{snapshot.time:.3f} s, frame {snapshot.number:,}"),
+        ("objects shown", f"{len(data.shown):,} of {playback.scene.object_count:,}"),
+        ("faces shown", f"{data.faces:,}"),
         ("pairs that meet", f"{int(np.count_nonzero(result.any)):,} of {len(result.pairs):,} near"),
-        ("certified error, mean", f"{drawing.error_mean:.3g}"),
-        ("intersecting face pairs", f"{drawing.contact_count:,}"),
-        ("intersecting faces", f"{drawing.struck_count:,}"),
+        ("certified error, mean", f"{data.error_mean:.3g}"),
+        ("intersecting face pairs", f"{data.contact_count:,}"),
+        ("intersecting faces", f"{data.intersecting_count:,}"),
     ]
     if page.settings.level >= 0:
-        rows.append((f"active nodes at level {page.settings.level}", f"{drawing.box_count:,}"))
-    if moment.row is not None:
-        rows.append(("frame", f"{moment.row.total_ms:.1f} ms on {source.scene.device}"))
-        rows.append(("select to query", f"{moment.row.cost_ms:.1f} ms"))
-        if moment.row.budget_ms is not None:
-            rows.append(("budget", f"{moment.row.budget_ms:g} ms"))
+        rows.append((f"active nodes at level {page.settings.level}", f"{data.box_count:,}"))
+    if snapshot.row is not None:
+        rows.append(("frame", f"{snapshot.row.total_ms:.1f} ms on {playback.scene.device}"))
+        rows.append(("select to query", f"{snapshot.row.cost_ms:.1f} ms"))
+        if snapshot.row.budget_ms is not None:
+            rows.append(("budget", f"{snapshot.row.budget_ms:g} ms"))
     if page.playing:
         rows.append(("page", f"{page.rate:.0f} frames a second"))
     return _table(rows)
 
 
-def numbers(source, moment, cache, i) -> str:
+def numbers(playback, snapshot, cache, i) -> str:
     """Return the numbers of an object as a table."""
     if i is None:
         return NOBODY
-    scene, lod = source.scene, int(moment.lods[i])
+    scene, lod = playback.scene, int(snapshot.lods[i])
     owner = scene.object_model[i]
     model = scene.models[owner]
-    result = moment.result
+    result = snapshot.result
     meets = np.flatnonzero((result.pairs == i).any(axis=1) & result.any) if len(result.pairs) else []
     others = [int(a + b - i) for a, b in result.pairs[meets]] if len(meets) else []
-    sharing = int(np.count_nonzero((np.array(scene.object_model) == owner) & (moment.lods == lod)))
+    sharing = int(np.count_nonzero((np.array(scene.object_model) == owner) & (snapshot.lods == lod)))
     rows = [
-        ("object", _escape(source.name_of(i))),
-        ("LOD", f"{lod:,} of {model.lod_max:,}{', held' if i in source.hand else ''}"),
+        ("object", _escape(playback.name_of(i))),
+        ("LOD", f"{lod:,} of {model.lod_max:,}{', held' if i in playback.held else ''}"),
         ("faces", f"{cache.count(owner, lod):,} of {model.face_count:,}"),
         ("certified error", f"{model.error_at(lod):.3g}"),
         ("objects on its tree", f"{sharing:,}"),
-        ("position", " ".join(f"{value:.3f}" for value in moment.poses[i, :3])),
+        ("position", " ".join(f"{value:.3f}" for value in snapshot.poses[i, :3])),
         ("meets", ", ".join(f"#{other}" for other in others[:PARTNERS]) + (" …" if len(others) > PARTNERS else "")),
     ]
     if result.count is not None and len(meets):
         rows.append(("intersecting face pairs", f"{int(result.count[meets].sum()):,}"))
-    if int(source.worlds[i]) != 0:
-        rows.append(("world", "every one" if source.worlds[i] < 0 else f"{source.worlds[i]}"))
+    if int(playback.worlds[i]) != 0:
+        rows.append(("world", "every one" if playback.worlds[i] < 0 else f"{playback.worlds[i]}"))
     return _table(rows)
 
 
@@ -114,7 +114,7 @@ def time_top(rows) -> float:
 
 
 def time_picture(rows) -> str:
-    """Return frame times by stage as an SVG drawing, with its legend; empty without rows.
+    """Return frame times by stage as an SVG data, with its legend; empty without rows.
 
     Args:
         rows: `FrameRow`s, or None where a frame has none.

@@ -19,42 +19,39 @@ canvas {{ opacity: 1 !important; }}
 </style><details id="about" open><summary>{title}</summary>{text}{plot}</details>"""
 
 
-def record_page(server, source, path: Path, frames: int, settings=None, progress=None):
-    """Run a source for some frames and write a page that plays them and needs no server.
+def record_page(server, playback, path: Path, frames: int, progress=None):
+    """Run a playback for some frames and write a page that plays them and needs no server.
 
     Args:
         server: `viser.ViserServer` that nobody uses otherwise.
-        source: `Source` at its start.
+        playback: `Playback` at its start.
         path: File to write; it appears whole or not at all.
         frames: How many.
-        settings: What to change of the page's `Settings` by name.
         progress: Called as progress(stage, done, total).
     """
     played = 0.0
-    page = Page(server, source, clock=lambda: played)
-    for name, value in (settings or {}).items():
-        setattr(page.settings, name, value)
+    page = Page(server, playback, clock=lambda: played)
     page.playing = True
     rows, hits = [], []
     recorder: Any = None  # of viser
     for done in range(1, frames + 1):
-        drawing = page.advance()
+        data = page.advance()
         if not page.playing:
-            raise RuntimeError(f"frame {page.moment.number} failed")
+            raise RuntimeError(f"frame {page.snapshot.number} failed")
         if recorder is None:
             # From here on the recorder hears every change; what stands already it takes as the start.
             recorder = server.get_scene_serializer()
-        recorder.insert_sleep(source.time_step)
-        played += source.time_step
-        rows.append(page.moment.row)
-        hits.append(drawing.contact_count)
+        recorder.insert_sleep(playback.time_step)
+        played += playback.time_step
+        rows.append(page.snapshot.row)
+        hits.append(data.contact_count)
         if progress is not None:
             progress("frames", done, frames)
     text = (
-        f"<div>{source.scene.object_count:,} objects, {frames:,} frames on {source.scene.device}; "
+        f"<div>{playback.scene.object_count:,} objects, {frames:,} frames on {playback.scene.device}; "
         f"{min(hits):,} to {max(hits):,} intersecting face pairs</div>"
     )
-    about = PANEL.format(title=html.escape(source.title), text=text, plot=view_text.time_picture(rows))
+    about = PANEL.format(title=html.escape(playback.title), text=text, plot=view_text.time_picture(rows))
     written = recorder.as_html()
     end = written.rindex("</body>")
     with atomic_write(path, "w", encoding="utf-8") as file:

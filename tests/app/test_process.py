@@ -1,7 +1,10 @@
-"""SIGINT and SIGTERM stop every command, whatever its parent ignores or blocks, and leave no half-written file."""
+"""The process of a command: progress on stderr, and SIGINT and SIGTERM, which leave no half-written file."""
 
+import functools
+import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,6 +19,7 @@ from helpers.samples import SHUTTLE_SCENE
 
 import warp_abtree as ab
 from warp_abtree.app.cli import main as cli
+from warp_abtree.app.cli import progress as progress_module
 from warp_abtree.jobs import ray_pool as cluster
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -159,7 +163,7 @@ def test_ray_leaves_a_program_its_handler(monkeypatch):
     ray.init = lambda **_: signal.signal(signal.SIGTERM, theirs)
     monkeypatch.setattr(cluster, "_import_ray", lambda: ray)
     try:
-        for ours, kept in ((cli._terminate, cli._terminate), (signal.SIG_DFL, theirs)):
+        for ours, kept in ((cli.terminate, cli.terminate), (signal.SIG_DFL, theirs)):
             signal.signal(signal.SIGTERM, ours)
             ab.RayPool(workers=1).close()
             assert signal.getsignal(signal.SIGTERM) is kept
@@ -180,3 +184,76 @@ def test_a_program_handles_signals(monkeypatch, capsys):
     finally:
         for number, handler in zip(BOTH, before):
             signal.signal(number, handler)
+
+
+# Progress.
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_on_a_terminal_is_a_bar(monkeypatch):
+    pytest.importorskip("rich")
+    monkeypatch.setenv("TERM", "xterm")
+    stream, clock = Terminal(), iter([0.0, 0.1, 1.0, 2.0])
+    progress = progress_module.Progress(stream, clock=lambda: next(clock))
+    for done in (0, 1, 5, 10):
+        progress("LOD bounds", done, 10)
+    progress.close()
+    shown = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", stream.getvalue())
+    assert list(dict.fromkeys(re.findall(r"LOD bounds .* (\d+)%", shown.replace("\r", "\n")))) == ["0", "50", "100"]
+    assert stream.getvalue().endswith("\x1b[2K"), "the bar is cleared"
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_progress_without_a_bar_is_a_line_a_stage(monkeypatch, terminal):
+    monkeypatch.setitem(sys.modules, "rich", None)
+    stream, clock = (Terminal if terminal else io.StringIO)(), iter(range(100))
+    progress = progress_module.Progress(stream, clock=lambda: next(clock))
+    for stage in ("collapse", "LOD bounds"):
+        for done in range(5):
+            progress(stage, done, 4)
+    progress.close()
+    assert stream.getvalue() == "collapse ...\nLOD bounds ...\n"
+
+
+@pytest.mark.slow
+def test_no_label_can_be_taken_for_an_error(tmp_path, monkeypatch, capsys):
+    """Of any command, were every stage to take long."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "Progress", functools.partial(progress_module.Progress, delay=-1.0))
+    (tmp_path / "scene.toml").write_text(SHUTTLE_SCENE)
+    trimesh.creation.icosphere(2).export("ball.obj")
+    np.save("poses.npy", np.eye(7)[[6, 6]])
+    model = ["collapse ...", "LOD bounds ..."]
+    sweep = "sweep ball.npz ball.npz poses.npy --out answers --ray none"
+    for words, labels in (
+        ("build ball.obj ball.npz", [*model, "outward bounds ..."]),
+        ("query ball.obj ball.obj", model),
+        ("run scene.toml", [*model, *model, "frames ..."]),
+        ("picture scene.toml --out picture.png", [*model, *model]),
+        (sweep, ["shards ..."]),
+        (sweep, ["check ...", "shards ..."]),
+    ):
+        assert cli.main([*words.split(), "--device", "cpu"]) == 0
+        lines = [line for line in capsys.readouterr().err.splitlines() if "compiling kernels" not in line]
+        assert lines == labels
+        assert not [line for line in lines if re.match(r"error|warning|failed|fatal", line, re.IGNORECASE)]
+
+
+def test_compiling_is_announced(tmp_path):
+    stream = io.StringIO()
+    cache = tmp_path / "cache"
+    (cache / f"wp_module_p{os.getpid()}_t1").mkdir(parents=True)
+    before, progress_module.wp.config.kernel_cache_dir = progress_module.wp.config.kernel_cache_dir, str(cache)
+    try:
+        with progress_module.compile_notice(stream, delay=0.0):
+            for _ in range(100):
+                if stream.getvalue():
+                    break
+                progress_module.time.sleep(0.05)
+    finally:
+        progress_module.wp.config.kernel_cache_dir = before
+    assert stream.getvalue().count("\n") == 1 and "compiling" in stream.getvalue()

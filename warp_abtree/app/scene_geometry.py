@@ -1,20 +1,20 @@
-"""What a moment of a scene looks like, as arrays: instances by model and LOD, struck faces, contacts, boxes of trees.
+"""Geometry of a scene at one time, as arrays in the world: intersecting faces, contacts, boxes of trees, bounds.
 
-Nothing here knows of a browser, a file or a canvas; `view_stage` sends these parts, `picture` draws them.
+The viewer sends these arrays to the browser, and pictures draw them.
 """
 
 import numpy as np
 
-from warp_abtree.app.pictures.plot import COLOURS
+from warp_abtree.app.styles import COLOURS
 from warp_abtree.scene.scene import Scene
 
-LIFT = 1.5e-3  # of a model's diagonal: struck faces stand out by so much, on both sides, over the mesh below
-NORMAL = 0.1  # length of a normal, in diagonals of the middling object shown
-LINES = 20_000  # contacts drawn, spread evenly over more
-BOXES = 4_000  # boxes of trees drawn
+LIFT = 1.5e-3  # of a model's diagonal: offset of intersecting faces from the mesh, to both sides
+NORMAL = 0.1  # length of a normal, in diagonals of the median object shown
+LINES = 20_000  # contacts drawn at most, spread evenly over all
+BOXES = 4_000  # boxes of trees drawn at most
 PICKED = (0.95, 0.50, 0.20)
 COARSE, FINE = np.array((0.16, 0.24, 0.60)), np.array((1.0, 0.80, 0.20))
-CACHED_FACES = 4_000_000  # that a cache of meshes holds
+CACHED_FACES = 4_000_000  # that a cache of meshes keeps
 # Corners of a box joined by its twelve edges; bit a of a corner's number says lower or upper along axis a.
 EDGES = np.array([(c, c | bit) for c in range(8) for bit in (1, 2, 4) if not c & bit])
 
@@ -31,14 +31,14 @@ def rotations(poses) -> np.ndarray:
     return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
 
 
-def place_each(poses, objects, points) -> np.ndarray:
-    """Return points (t, k, 3) where the poses of their objects (t,) put them."""
+def place(poses, objects, points) -> np.ndarray:
+    """Return points (t, k, 3) of objects (t,) in the world."""
     turn = rotations(poses)[objects]
     return np.einsum("tij,tkj->tki", turn, points) + poses[objects, None, :3]
 
 
 class MeshCache:
-    """Meshes of models at LODs; the least recently used go once there are too many faces.
+    """Meshes of models at LODs; the least recently used are dropped when there are too many faces.
 
     Args:
         scene: `Scene`.
@@ -96,7 +96,7 @@ def object_colours(scene: Scene, lods, picked=None, by_lod=False) -> np.ndarray:
     """Return the colour of every object, uint8 (n, 3): its model's, or its LOD's; the picked one stands out."""
     model = np.array(scene.object_model)
     if by_lod:
-        # Most of what happens to LODs happens far below the finest.
+        # The cube root spreads the coarse LODs, where most changes happen.
         part = np.cbrt(lods / np.maximum(np.array([m.lod_max for m in scene.models])[model], 1))[:, None]
         colours = COARSE + part * (FINE - COARSE)
     else:
@@ -106,11 +106,11 @@ def object_colours(scene: Scene, lods, picked=None, by_lod=False) -> np.ndarray:
     return np.round(255 * colours).astype(np.uint8)
 
 
-# What was found.
+# Results.
 
 
-def struck_faces(result, shown=None) -> np.ndarray:
-    """Return (object, face) of every face that meets another, each once, sorted, int64 (k, 2).
+def intersecting_faces(result, shown=None) -> np.ndarray:
+    """Return (object, face) of every intersecting face, each once, sorted, int64 (k, 2).
 
     Args:
         result: With faces.
@@ -126,21 +126,21 @@ def struck_faces(result, shown=None) -> np.ndarray:
     return np.stack([keys >> 32, keys & 0xFFFFFFFF], axis=1)
 
 
-def struck_triangles(cache: MeshCache, moment, struck, lift=LIFT) -> dict[int, np.ndarray]:
-    """Return struck faces in the world by model, float32 (t, 3, 3).
+def intersecting_triangles(cache: MeshCache, snapshot, intersecting, lift=LIFT) -> dict[int, np.ndarray]:
+    """Return intersecting faces in the world by model, float32 (t, 3, 3).
 
     Args:
-        struck: (object, face), as `struck_faces` returns them.
-        lift: Each face is there twice, moved along its normal by so much of the model's diagonal to either side; 0, and
-            it is there once.
+        intersecting: (object, face), as `intersecting_faces` returns them.
+        lift: Offset along the normal in diagonals of the model: each face is returned twice, to either side. With 0
+            it is returned once.
     """
     found: dict[int, list] = {}
-    keys = mesh_keys(cache.scene, moment.lods)[struck[:, 0]]
+    keys = mesh_keys(cache.scene, snapshot.lods)[intersecting[:, 0]]
     for key, rows in group_objects(keys, np.arange(len(keys))).items():
         owner, lod = split_key(key)
-        rows = struck[rows]
+        rows = intersecting[rows]
         vertices, faces, face_ids = cache.mesh(owner, lod)
-        corners = place_each(moment.poses, rows[:, 0], vertices[faces[np.searchsorted(face_ids, rows[:, 1])]])
+        corners = place(snapshot.poses, rows[:, 0], vertices[faces[np.searchsorted(face_ids, rows[:, 1])]])
         if lift:
             normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             length = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -156,7 +156,7 @@ def contact_lines(result, length, shown=None):
     Args:
         result: With contacts.
         length: Of a normal [units].
-        shown: As for `struck_faces`.
+        shown: As for `intersecting_faces`.
     """
     contacts = result.contacts
     if contacts is None or not len(contacts):
@@ -200,7 +200,7 @@ def box_lines(boxes) -> np.ndarray:
     return corners[:, EDGES].reshape(-1, 2, 3)
 
 
-def tree_lines(scene: Scene, moment, objects, level: int):
+def tree_lines(scene: Scene, snapshot, objects, level: int):
     """Return the edges of the boxes of active nodes of some objects' trees in the world, and how many boxes there are.
 
     Objects that share a model and a LOD share a tree. At most BOXES are drawn, those of the first objects.
@@ -210,22 +210,22 @@ def tree_lines(scene: Scene, moment, objects, level: int):
     """
     trees, lines, count = {}, [], 0
     for i in objects:
-        key = scene.object_model[i], int(moment.lods[i])
+        key = scene.object_model[i], int(snapshot.lods[i])
         if key not in trees:
             trees[key] = level_boxes(scene.tree_state(int(i)), level)
         boxes = trees[key][: max(BOXES - count, 0)]
         count += len(trees[key])
         if len(boxes):
             edges = box_lines(boxes)
-            lines.append(place_each(moment.poses, np.full(len(edges), i), edges))
+            lines.append(place(snapshot.poses, np.full(len(edges), i), edges))
     return np.concatenate(lines or [np.empty((0, 2, 3))]).astype(np.float32), count
 
 
-def bounds(cache: MeshCache, moment, shown) -> tuple[np.ndarray, float]:
+def bounds(cache: MeshCache, snapshot, shown) -> tuple[np.ndarray, float]:
     """Return the centre and radius of a ball around the shown objects [units]."""
     model = np.array(cache.scene.object_model)[shown]
     centres = np.array([m.centre for m in cache.scene.models])[model]
-    points = place_each(moment.poses, shown, centres[:, None])[:, 0]
+    points = place(snapshot.poses, shown, centres[:, None])[:, 0]
     reach = 0.5 * np.array(cache.diagonals)[model]
     lower, upper = (points - reach[:, None]).min(axis=0), (points + reach[:, None]).max(axis=0)
     centre = 0.5 * (lower + upper)

@@ -1,0 +1,181 @@
+"""`warp-abtree query`: one query of two meshes at a pose and two LODs."""
+
+import csv
+import time
+from pathlib import Path
+
+import numpy as np
+
+from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISIONS, Parser
+from warp_abtree.app.cli.model_commands import active_count, load_model
+from warp_abtree.app.cli.report import check_output, print_json, print_table
+from warp_abtree.checks.atomic_write import atomic_write
+from warp_abtree.scene.scene import Scene
+from warp_abtree.simulate.frame import resolve_lod
+
+SUMMARY = "intersect two meshes, A at the origin and B at a pose"
+EXAMPLES = (
+    "cow.obj warp:bunny --pose 0.2 0 0 0 0 0 1",
+    "cow.npz cow.npz --pose -0.5 0 0 0 0 0 1 --lod-a 0.25 --lod-b tol:0.01 --output faces --json",
+    "cow.npz cow.npz --pose 0.2 0 0 0 0 0 1 --output contacts --record contacts.csv",
+)
+OUTPUTS = ("any", "count", "faces", "contacts")
+LISTED_FACES = 20  # face pairs or contacts that are printed
+
+
+def add_arguments(sub: Parser):
+    """Add the arguments of the command to its parser."""
+    sub.add_file("a", metavar="A", help=f"{MESHES}, or a model that build wrote (.npz)")
+    sub.add_file("b", metavar="B", help="the same")
+    identity = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    sub.add_pose("pose of B in the frame of A: position and unit quaternion (0 0 0 0 0 0 1)", default=identity)
+    sub.add_argument("--lod-a", default="finest", metavar="LOD", help=f"LOD of A: {LOD_HELP} (finest)")
+    sub.add_argument("--lod-b", default="finest", metavar="LOD", help="the same for B (finest)")
+    sub.add_argument("--output", choices=OUTPUTS, default="count", help="what to ask (count)")
+    about = "signs of determinants: exact, or of the rounded ones (exact)"
+    sub.add_argument("--precision", choices=PRECISIONS, default="exact", help=about)
+    about = "write face pairs and contacts as .csv, or the whole result as .npz"
+    sub.add_file("--record", type=Path, metavar="FILE", help=about)
+
+
+def query(options, progress):
+    """Intersect two meshes at a pose and two LODs."""
+    if options.record:
+        check_output(options.record, [".csv", ".npz"], inputs=(options.a, options.b))
+        if options.record.suffix.lower() == ".csv" and options.output in ("any", "count"):
+            raise ValueError(f"{options.record}: a row is a face pair; ask --output faces or contacts, or write .npz")
+    scene, models = _make_scene(options, progress)
+    pair = np.array([[0, 1]])
+    asked = {"output": options.output, "precision": options.precision}
+    scene.intersect(pair, **asked)  # loads the kernels, so that the time below is the query's
+    begin = time.perf_counter()
+    found = scene.intersect(pair, **asked)
+    spent = 1e3 * (time.perf_counter() - begin)
+    lods = scene.lods.tolist()
+    result = {
+        "intersects": bool(found.any[0]),
+        "count": None if found.count is None else int(found.count[0]),
+        "bound": sum(model.error_at(lod) for model, lod in zip(models, lods)),
+        "lods": lods,
+        "active_faces": [active_count(model, lod) for model, lod in zip(models, lods)],
+        "node_tests": int(found.node_tests[0]),
+        "triangle_tests": int(found.triangle_tests[0]),
+        "milliseconds": spent,
+        "device": str(scene.device),
+        "precision": options.precision,
+    }
+    if found.faces is not None:
+        result["faces"] = found.faces[:, 1:]
+    if found.contacts is not None:
+        result |= {"contacts": _flat_contacts(found.contacts), "pair_contacts": found.pair_contacts[0]}
+    if options.record:
+        record_found(found, options.record)
+        result["written"] = [str(options.record)]
+    if options.json:
+        print_json(result)
+        return
+    print_query(result, models, found)
+    if options.record:
+        print(f"wrote {options.record}")
+
+
+def _make_scene(options, progress):
+    """Return a scene of both meshes, and their models."""
+    scene = Scene(device=options.device)
+    models = [load_model(options.a, progress)]
+    models.append(models[0] if options.b == options.a else load_model(options.b, progress))
+    progress.close()
+    lods = []
+    for option, model, request in (("--lod-a", models[0], options.lod_a), ("--lod-b", models[1], options.lod_b)):
+        try:
+            lods.append(resolve_lod(model, request))
+        except ValueError as error:
+            raise ValueError(f"{option}: {error}") from None
+    scene.add(models[0], lod=lods[0])
+    try:
+        scene.add(models[1], pose=options.pose, lod=lods[1])
+    except ValueError as error:
+        raise ValueError(f"--{error}") from None
+    return scene, models
+
+
+def _flat_contacts(contacts) -> list[dict]:
+    """Return the contacts of one object pair as a dictionary each, their faces under `face_a` and `face_b`."""
+    names = contacts.dtype.names[2:]
+    return [
+        {"face_a": a, "face_b": b, **{name: row[name] for name in names}}
+        for row, (a, b) in zip(contacts, contacts["faces"].tolist())
+    ]
+
+
+def print_query(result, models, found):
+    """Print the result of a query and what it took.
+
+    Args:
+        result: Values that `query --json` prints.
+        models: The two `Model`.
+        found: `Result` of the one object pair.
+    """
+    for letter, model, lod, active in zip("AB", models, result["lods"], result["active_faces"]):
+        print(f"{letter}: {model.name}, LOD {lod:,} of {model.lod_max:,}, {active:,} of {model.face_count:,} faces")
+    print("they intersect" if result["intersects"] else "they do not intersect")
+    if result["count"] is not None:
+        print(f"intersecting face pairs: {result['count']:,}")
+    if found.pair_contacts is not None and result["count"]:
+        pair = found.pair_contacts[0]
+        print(f"mean point of the contacts: {_vector(pair['point'])}")
+        print(f"mean normal, from A to B: {_vector(pair['normal'])}")
+        print(f"depth along it, an estimate: {pair['depth']:.6g}")
+    print(f"the originals are within this of the surfaces queried, error(A) + error(B): {result['bound']:.6g}")
+    print(
+        f"{result['milliseconds']:.3g} ms on {result['device']}, precision {result['precision']}: "
+        f"{result['node_tests']:,} node tests, {result['triangle_tests']:,} triangle tests"
+    )
+    if found.faces is not None and len(found.faces):
+        _print_faces(found)
+
+
+def _vector(values, digits=6):
+    return " ".join(f"{value + 0.0:.{digits}g}" for value in values.tolist())  # + 0.0: no minus before a zero
+
+
+def _print_faces(found):
+    """Print a line for each of the first face pairs, with their contacts if there are any."""
+    table = [["face of A", "face of B"]]
+    if found.contacts is not None:
+        table[0] += [*"p0 x,y,z,p1 x,y,z,normal x,y,z".split(","), ""]
+    for row, (a, b) in enumerate(found.faces[:LISTED_FACES, 1:].tolist()):
+        table.append([f"{a:9}", f"{b:9}"])
+        if found.contacts is not None:
+            contact = found.contacts[row]
+            for name in ("p0", "p1", "normal"):
+                table[-1] += _vector(contact[name], digits=4).split()
+            table[-1].append("coplanar" if contact["coplanar"] else "")
+    print_table(table)
+    if len(found.faces) > LISTED_FACES:
+        print(f"and {len(found.faces) - LISTED_FACES:,} more; --json lists all, --record writes them")
+
+
+def record_found(found, path: Path):
+    """Write the result of a query of one object pair; the file appears whole or not at all.
+
+    A .npz file holds the arrays of `Result` by their names. A .csv file has a row for each face pair, with its contact
+    if there is one; the summary over an object pair has no place there.
+    """
+    if path.suffix.lower() == ".npz":
+        names = ("any", "count", "faces", "contacts", "pair_contacts")
+        arrays = {name: getattr(found, name) for name in names if getattr(found, name) is not None}
+        with atomic_write(path) as file:
+            np.savez(file, **arrays)
+        return
+    header, columns = ["face_a", "face_b"], [found.faces[:, 1:]]
+    if found.contacts is not None:
+        for name in ("p0", "p1", "normal_a", "normal_b", "normal"):
+            header += [f"{name}_{axis}" for axis in "xyz"]
+            columns.append(found.contacts[name])
+        header.append("coplanar")
+        columns.append(found.contacts["coplanar"].astype(int)[:, None])
+    with atomic_write(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows([entry for part in parts for entry in part] for parts in zip(*(c.tolist() for c in columns)))

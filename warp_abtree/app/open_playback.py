@@ -1,0 +1,109 @@
+"""Opens what `view` and `picture` are given on the command line."""
+
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from warp_abtree.app.cli.arguments import Parser, positive
+from warp_abtree.app.playback import MeshPlayback, Playback, RecordedPlayback, ScenePlayback
+from warp_abtree.app.recording import FORMAT_NAME, Recording
+from warp_abtree.app.toml.folder import find_scene
+from warp_abtree.app.toml.scene_file import load_scene
+from warp_abtree.model.model import Model
+from warp_abtree.scene.scene import Scene
+from warp_abtree.simulate.frame import resolve_lod
+
+OVERLAP = 0.25  # of the smaller extent: by so much a mesh without a pose reaches into the one before
+
+
+def open_playback(paths, device=None, progress=None, objects=None, poses=(), lod=None) -> Playback:
+    """Open what the command line names.
+
+    Args:
+        paths: One scene file (.toml) or recorded run (.npz), or meshes and built models (.npz).
+        device, progress: As for `load_scene`.
+        objects: As for `load_scene`; for scene files.
+        poses: Of the meshes after the first, (k, 7); those left out are laid beside the mesh before, a little inside.
+        lod: LOD of every mesh as for `resolve_lod`; None is the finest.
+
+    Raises:
+        ValueError: With what is wrong with them; SceneError, MeshError and ModelError among them.
+    """
+    paths = [str(find_scene(path)) for path in paths]
+    suffixes = [Path(path).suffix.lower() for path in paths]
+    recorded = len(paths) == 1 and suffixes[0] == ".npz" and _is_recording(paths[0])
+    if recorded or ".toml" in suffixes:
+        if len(paths) > 1:
+            raise ValueError(f"{paths[suffixes.index('.toml')]}: a scene file is looked at alone")
+        for name, value in (("--pose", len(poses)), ("--lod", lod is not None)):
+            if value:
+                raise ValueError(f"{name}: for meshes; {paths[0]} says where its objects are and at which LODs")
+    if recorded:
+        if objects is not None:
+            raise ValueError("--objects: a recording has its own")
+        recording = Recording.open(paths[0])
+        return RecordedPlayback(recording, recording.load_scene(paths[0], device=device, progress=progress))
+    if ".toml" in suffixes:
+        return ScenePlayback(load_scene(paths[0], device=device, progress=progress, objects=objects))
+    if objects is not None:
+        raise ValueError("--objects: for scene files")
+    return _open_meshes(paths, device, progress, poses, lod)
+
+
+def _open_meshes(paths, device, progress, poses, lod) -> MeshPlayback:
+    if len(poses) >= len(paths):
+        raise ValueError(f"--pose: {len(poses)} given for the {len(paths) - 1} meshes after the first")
+    Scene(device=device)  # refuses a device that does not exist before models are built
+    known: dict[str, Model] = {}
+    for path in paths:
+        if path not in known:
+            built = Path(path).suffix.lower() == ".npz"
+            known[path] = Model.open(path) if built else Model.load(path, progress=progress)
+    models = [known[path] for path in paths]
+    try:
+        lods = [resolve_lod(model, "finest" if lod is None else lod) for model in models]
+    except ValueError as error:
+        raise ValueError(f"--lod: {error}") from None
+    places = lay_out(models)
+    if len(poses):
+        places[1 : 1 + len(poses)] = poses
+    try:
+        return MeshPlayback(models, places, lods, device)
+    except ValueError as error:
+        raise ValueError(f"--{error}") from None
+
+
+def add_playback_arguments(sub: Parser):
+    """Add the arguments that name what is shown."""
+    about = "one scene file (.toml) or recorded run (.npz); or meshes and built models (.npz)"
+    sub.add_file("source", nargs="+", metavar="SCENE_OR_MESHES", help=about)
+    about = "pose of the second mesh, again for the third; without it each stands beside the one before, a bit inside"
+    sub.add_pose(about, action="append", default=[])
+    sub.add_argument("--lod", metavar="LOD", help="LOD of meshes, as for query (finest)")
+    sub.add_argument("--objects", type=positive, metavar="N", help="about so many objects of a scene, as for run")
+
+
+def _is_recording(path) -> bool:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return str(file["format"]) == FORMAT_NAME
+    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile):
+        return False
+
+
+def lay_out(models) -> np.ndarray:
+    """Return poses (n, 7) in a row along x, in which each model reaches a little into the one before."""
+    places = np.zeros((len(models), 7))
+    places[:, 6] = 1.0
+    boxes = []
+    for model in models:
+        vertices = model.mesh_at(model.lod_max)[0]
+        boxes.append((vertices.min(axis=0), vertices.max(axis=0)))
+    middle = 0.5 * (boxes[0][0] + boxes[0][1])
+    for i in range(1, len(models)):
+        (before_lower, before_upper), (lower, upper) = boxes[i - 1], boxes[i]
+        places[i, :3] = middle - 0.5 * (lower + upper)
+        inside = OVERLAP * min(upper[0] - lower[0], before_upper[0] - before_lower[0])
+        places[i, 0] = places[i - 1, 0] + before_upper[0] - inside - lower[0]
+    return places

@@ -1,0 +1,171 @@
+"""Images of triangles and lines by pyvista (VTK), off-screen, and figures of them side by side by Matplotlib."""
+
+from __future__ import annotations
+
+import ctypes.util
+import math
+import os
+import sys
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from warp_abtree.checks.atomic_write import atomic_write
+from warp_abtree.lod.view import Camera
+
+BACKGROUND = (1.0, 1.0, 1.0)
+VIEW_ANGLE = 25.0  # degrees
+LEGEND_WIDTH = 190  # pixels of an entry
+LINE_WIDTH = 2.5  # pixels
+LINE_LIFT = 0.0015  # of the distance to the eye: lines are moved towards it by so much, before the faces they lie on
+# Directions to the lights in the frame of the camera (right, up, towards the eye), and their strengths.
+AMBIENT = 0.42
+LIGHTS = (((-0.45, 0.75, 0.60), 0.58), ((0.80, 0.05, 0.45), 0.18))
+
+
+@dataclass
+class Panel:
+    """One view of a scene.
+
+    Attributes:
+        title: Above it; may have several lines.
+        triangles: Corners in the world [units], float64 (t, 3, 3).
+        colours: Of each, float64 (t, 3), 0 to 1.
+        lines: (ends in the world (k, 2, 3), colour) of each kind of line.
+    """
+
+    title: str
+    triangles: np.ndarray
+    colours: np.ndarray
+    lines: list = field(default_factory=list)
+
+
+def import_pyvista(what: str):
+    """Return pyvista, silent; `what` names what needs it.
+
+    Raises:
+        ValueError: pyvista, Matplotlib, or any OpenGL that draws without a display is missing.
+    """
+    try:
+        import matplotlib  # noqa: F401
+        import pyvista
+        from vtkmodules.vtkCommonCore import vtkLogger
+    except ImportError:
+        raise ValueError(f"{what} needs pyvista and Matplotlib: pip install warp-abtree[pictures]") from None
+    # VTK ends the process where it finds none of these.
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        if not (ctypes.util.find_library("EGL") or ctypes.util.find_library("OSMesa")):
+            raise ValueError(f"{what} needs a display, EGL or OSMesa (Debian: apt-get install libegl1)")
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it warns of a display that is not there
+    return pyvista
+
+
+def camera_around(points, eye, up) -> Camera:
+    """Return a camera that looks from the direction `eye` and sees all points (n, 3)."""
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    centre = 0.5 * (lower + upper)
+    radius = float(np.linalg.norm(points - centre, axis=1).max()) or 1.0
+    angle = math.radians(VIEW_ANGLE)
+    eye = centre + radius / math.sin(0.5 * angle) * np.asarray(eye) / np.linalg.norm(eye)
+    return Camera.look_at(eye, centre, up, field_of_view=angle, size=(1, 1), far=100 * radius)
+
+
+def render(panel: Panel, camera: Camera, size: int) -> np.ndarray:
+    """Return an image of a panel, uint8 (size, size, 3)."""
+    pyvista = import_pyvista("a picture")
+    plotter = pyvista.Plotter(off_screen=True, window_size=(size, size), lighting="none")
+    try:
+        plotter.set_background(BACKGROUND)
+        plotter.enable_anti_aliasing("ssaa")
+        for direction, strength in LIGHTS:
+            plotter.add_light(pyvista.Light(position=direction, intensity=strength, light_type="camera light"))
+        faces = np.arange(3 * len(panel.triangles)).reshape(-1, 3)
+        mesh = pyvista.PolyData.from_regular_faces(panel.triangles.reshape(-1, 3), faces)
+        mesh.cell_data["colour"] = np.round(255 * panel.colours).astype(np.uint8)
+        shading = {"ambient": AMBIENT, "diffuse": 1.0, "specular": 0.0, "lighting": True}
+        edges = {"show_edges": True, "edge_color": "black", "edge_opacity": 0.3, "line_width": 1}
+        plotter.add_mesh(mesh, scalars="colour", rgb=True, **shading, **edges)
+        for ends, colour in panel.lines:
+            if len(ends):
+                points = np.asarray(ends, np.float64).reshape(-1, 3)
+                lines = pyvista.line_segments_from_points(points + LINE_LIFT * (camera.eye - points))
+                plotter.add_mesh(lines, color=colour, line_width=LINE_WIDTH, lighting=False)
+        view = plotter.camera
+        view.position, view.focal_point, view.up = camera.eye, camera.eye - camera.view[2], camera.view[1]
+        view.view_angle = math.degrees(camera.field_of_view)
+        plotter.reset_camera_clipping_range()
+        return plotter.screenshot(None, return_img=True)
+    finally:
+        plotter.close()
+
+
+def draw(panels: list[Panel], path, title: str, legend, eye, up, size: int = 620):
+    """Write panels side by side, seen by one camera, to a PNG file.
+
+    Args:
+        panels: `Panel`s of the same place.
+        path: File to write.
+        title: Above all panels.
+        legend: (colour, label) of each entry below.
+        eye, up: Directions to the eye and upwards in the world.
+        size: Pixels along a panel's side.
+
+    Raises:
+        ValueError: pyvista or Matplotlib is not installed.
+    """
+    import_pyvista("a picture")
+    import matplotlib.patches
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    drawn = [part for panel in panels for part in (panel.triangles, *(ends for ends, _ in panel.lines))]
+    camera = camera_around(np.concatenate([np.reshape(part, (-1, 3)) for part in drawn]), eye, up)
+    images = _crop([render(panel, camera, size) for panel in panels])
+    rows, columns = images[0].shape[:2]
+    gap, head, panel_head = 16, 44, 50
+    width = len(panels) * columns + (len(panels) + 1) * gap
+    # Pairs of entries, plain and intersecting, stay side by side.
+    across = max(1, min(len(legend) // 2, width // (2 * LEGEND_WIDTH)))
+    foot = 40 + 20 * (-(-len(legend) // (2 * across)) - 1)
+    height = head + panel_head + rows + foot
+    dpi = 100
+    figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor=BACKGROUND)
+    canvas = FigureCanvasAgg(figure)
+    middle: dict = {"ha": "center", "va": "center"}
+    figure.text(0.5, 1 - 0.5 * head / height, title, **middle, fontsize=15, fontweight="bold", color="0.15")
+    for i, (panel, image) in enumerate(zip(panels, images)):
+        left = gap + i * (columns + gap)
+        axes = figure.add_axes((left / width, foot / height, columns / width, rows / height))
+        axes.imshow(image, interpolation="nearest", aspect="auto")
+        axes.set_axis_off()
+        x, y = (left + 0.5 * columns) / width, 1 - (head + 0.5 * panel_head) / height
+        figure.text(x, y, panel.title, **middle, fontsize=10.5, color="0.25", linespacing=1.35)
+    # The legend fills columns first.
+    lines = [legend[i : i + 2 * across] for i in range(0, len(legend), 2 * across)]
+    entries = [line[i] for i in range(2 * across) for line in lines if i < len(line)]
+    handles = [matplotlib.patches.Patch(facecolor=colour, edgecolor="0.4", label=label) for colour, label in entries]
+    figure.legend(
+        handles=handles, loc="lower center", ncols=2 * across, frameon=False, fontsize=10.5, borderaxespad=0.6
+    )
+    write_png(canvas, path)
+
+
+def write_png(canvas, path):
+    """Write a canvas of Matplotlib as a PNG of 256 colours, less than half the size; the file appears whole or not."""
+    import PIL.Image
+
+    canvas.draw()
+    image = PIL.Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
+    image = image.quantize(256, PIL.Image.Quantize.MEDIANCUT, kmeans=1, dither=PIL.Image.Dither.NONE)
+    with atomic_write(path) as file:
+        image.save(file, format="PNG", optimize=True)
+
+
+def _crop(images):
+    """Cut the empty margin that all images share, and leave a little."""
+    drawn = np.any([(image < 250).any(axis=2) for image in images], axis=0)
+    if not drawn.any():
+        return images
+    rows, columns = np.flatnonzero(drawn.any(axis=1)), np.flatnonzero(drawn.any(axis=0))
+    y, x = max(rows[0] - 8, 0), max(columns[0] - 8, 0)
+    return [image[y : rows[-1] + 9, x : columns[-1] + 9] for image in images]

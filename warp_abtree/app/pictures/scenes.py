@@ -1,0 +1,148 @@
+"""Pictures of scenes: objects at their LODs and poses, intersecting faces coloured, contacts, boxes of trees."""
+
+import numpy as np
+
+from warp_abtree.app import scene_geometry as geometry
+from warp_abtree.app.pictures.render import Panel, draw
+from warp_abtree.app.render_data import RenderData, Settings, Snapshot, compose, objects_of_world
+from warp_abtree.app.styles import BOX_COLOUR, COLOURS, CONTACT_COLOUR, NORMAL_COLOUR
+from warp_abtree.scene.scene import Scene
+
+SIZE = 800  # pixels
+
+
+def make_panel(cache: geometry.MeshCache, data: RenderData, title: str | None = None) -> Panel:
+    """Return a picture of render data.
+
+    Args:
+        title: First line of the title; None counts objects and faces.
+    """
+    triangles, colours = [], []
+    for key, members in geometry.group_objects(data.keys, data.shown).items():
+        vertices, faces, _ = cache.mesh(*geometry.split_key(key))
+        corners = np.repeat(vertices[faces][None], len(members), axis=0).reshape(-1, 3, 3)
+        owners = np.repeat(members, len(faces))
+        triangles.append(geometry.place(data.poses, owners, corners))
+        colours.append(data.colours[owners] / 255)
+    for model, corners in data.intersecting.items():
+        triangles.append(corners.astype(np.float64))
+        colours.append(np.tile(COLOURS[model % len(COLOURS)][1], (len(corners), 1)))
+    count = len(data.shown)
+    title = title or f"{count:,} object{'' if count == 1 else 's'}, {data.faces:,} faces"
+    title += f"\n{data.contact_count:,} intersecting face pairs"
+    if data.box_count:
+        title += f", {data.box_count:,} boxes"
+    lines = [(data.segments, CONTACT_COLOUR), (data.normals, NORMAL_COLOUR), (data.boxes, BOX_COLOUR)]
+    return Panel(title, np.concatenate(triangles), np.concatenate(colours), lines)
+
+
+def make_legend(scene: Scene, panels: list[RenderData], level: int = -1) -> list:
+    """Return (colour, label) of the models, and of the kinds of lines that panels of one scene show."""
+    legend = []
+    for model in dict.fromkeys(np.array(scene.object_model)[panels[0].shown].tolist()):
+        plain, bright = COLOURS[model % len(COLOURS)]
+        name = scene.models[model].name
+        legend.append((plain, name))
+        if any(model in data.intersecting for data in panels):
+            legend.append((bright, f"{name}, intersecting"))
+    layers = [("segments", CONTACT_COLOUR, "contacts"), ("normals", NORMAL_COLOUR, "normals")]
+    layers.append(("boxes", BOX_COLOUR, f"active nodes at level {level}"))
+    return legend + [(colour, label) for name, colour, label in layers if any(len(getattr(d, name)) for d in panels)]
+
+
+def draw_snapshot(scene: Scene, snapshot: Snapshot, shown, path, title: str, view, settings: Settings, size: int):
+    """Draw a snapshot of a scene to a PNG file.
+
+    Args:
+        shown: Indices of the objects drawn, rising.
+        title: Above.
+        view: eye and up, directions in the world.
+        size: Pixels along a side.
+    """
+    cache = geometry.MeshCache(scene)
+    data = compose(cache, snapshot, shown, settings)
+    (eye, up), legend = view, make_legend(scene, [data], settings.level)
+    draw([make_panel(cache, data)], path, title, legend, eye, up, size)
+
+
+def draw_objects(scene: Scene, poses, path, title="", objects=None, eye=(0.4, 0.35, 1.0), up=(0, 1, 0), **options):
+    """Draw objects of a scene at its LODs to a PNG file, intersecting faces coloured on both.
+
+    The scene's poses are those of the picture afterwards.
+
+    Args:
+        scene: `Scene`.
+        poses: Of every object, x y z and a quaternion x y z w, (n, 7).
+        path: File to write.
+        title: Above.
+        objects: Indices of those drawn; None for all. Intersections with others are not coloured.
+        eye, up: Directions to the eye and upwards in the world.
+        options: contacts, normals: whether they are drawn; level: of the boxes of trees; size: pixels along a side.
+
+    Raises:
+        ValueError: Bad poses, an object that is none, or pyvista is not installed.
+    """
+    size, level = options.pop("size", SIZE), options.pop("level", None)
+    settings = Settings(**{"contacts": False, **options}, level=-1 if level is None else level, every_tree=True)
+    objects = np.arange(scene.object_count) if objects is None else np.unique(objects)
+    if not len(objects) or objects[0] < 0 or objects[-1] >= scene.object_count:
+        raise ValueError(f"objects: from {scene.object_count} objects none is chosen, or one that does not exist")
+    scene.set_poses(poses)
+    result = scene.intersect(output=settings.output)
+    snapshot = Snapshot(0, 0.0, np.asarray(poses, np.float64), scene.lods, result, None)
+    draw_snapshot(scene, snapshot, objects, path, title, (eye, up), settings, size)
+
+
+def panel_lods(loaded) -> list[np.ndarray]:
+    """Return the LODs of all objects in each panel: both ends of the sweeps, or what the file's [picture] asks for."""
+    fractions = [loaded.picture.lods or (sweep.start, sweep.turn) for sweep in loaded.sweeps]
+    chosen = [loaded.base_lods.copy() for _ in range(len(fractions[0]) if fractions else 1)]
+    for sweep, each in zip(loaded.sweeps, fractions):
+        for lods, fraction in zip(chosen, each):
+            sweep.apply(fraction, lods)
+    return chosen
+
+
+def draw_scene(loaded, path, time: float, poses=None, lods=None):
+    """Draw a scene file's picture at one time and several LODs: both sides of an LOD switch, the same poses.
+
+    The scene's LODs are what they were afterwards, its poses those of the picture.
+
+    Args:
+        loaded: What `load_scene` returned.
+        path: PNG file to write.
+        time: Time of the poses [s], unless the file's `[picture]` has one.
+        poses: Pose of every object, (n, 7), in the place of those of the time.
+        lods: LOD of every object, (n,), for one panel in the place of the file's.
+
+    Raises:
+        ValueError: The world to draw has no object, or pyvista is not installed.
+    """
+    scene, view = loaded.scene, loaded.picture
+    time = time if view.time is None else view.time
+    poses = loaded.motion.poses(time) if poses is None else poses
+    shown = objects_of_world(loaded.worlds, view.world)
+    if len(shown) == 0:
+        raise ValueError(f"{loaded.path}: picture.world: no object is in world {view.world}")
+    swept = [model for sweep in loaded.sweeps for model, indices in sweep.objects if np.isin(indices, shown).any()]
+    cache, panels = geometry.MeshCache(scene), []
+    before = scene.lods
+    scene.set_poses(poses)
+    try:
+        for chosen in panel_lods(loaded) if lods is None else [lods]:
+            scene.set_lods(chosen)
+            snapshot = Snapshot(0, time, poses, scene.lods, scene.intersect(output="faces"), None)
+            panels.append(compose(cache, snapshot, shown, Settings(contacts=False)))
+    finally:
+        scene.set_lods(before)
+    drawn = [make_panel(cache, data, _swept_title(scene, data, swept[0]) if swept else None) for data in panels]
+    draw(drawn, path, loaded.title, make_legend(scene, panels), view.eye, view.up)
+
+
+def _swept_title(scene, data, model) -> str:
+    """Return the LODs at which a panel shows a swept model, and its faces."""
+    keys = [geometry.split_key(key) for key in data.keys[data.shown]]
+    lods = [lod for owner, lod in keys if scene.models[owner] is model]
+    faces = sum(len(model.mesh_at(lod)[2]) for lod in lods)
+    span = f"{min(lods):,}" if min(lods) == max(lods) else f"{min(lods):,} to {max(lods):,}"
+    return f"{model.name} at LOD {span} of {model.lod_max:,}: {faces:,} faces"

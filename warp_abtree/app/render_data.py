@@ -1,0 +1,132 @@
+"""What is drawn of a scene at one time: `compose` makes `RenderData` of a `Snapshot`, for viewer and pictures."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from warp_abtree.app import scene_geometry as geometry
+from warp_abtree.query.result import Result
+from warp_abtree.simulate.frame import FrameRow
+
+NO_LINES = np.empty((0, 2, 3), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """A scene at one time, and the result of its query.
+
+    Attributes:
+        number, time: Frame from 0, and time in the scene [s].
+        poses: x y z qx qy qz qw of every object, float64 (n, 7).
+        lods: LOD of every object, int32 (n,).
+        result: `Result` of the query.
+        row: `FrameRow` of the frame; None where the scene was only queried again.
+    """
+
+    number: int
+    time: float
+    poses: np.ndarray
+    lods: np.ndarray
+    result: Result
+    row: FrameRow | None
+
+
+@dataclass
+class Settings:
+    """What is shown.
+
+    Attributes:
+        world: The one shown; objects of world -1 are in every one.
+        intersecting, contacts, normals: Whether intersecting faces are coloured, contacts and their normals drawn.
+        wireframe: Whether meshes are drawn as their edges.
+        by_lod: Whether colours tell LODs in the place of models.
+        level: Of the boxes of trees, -1 for none.
+        every_tree: Whether the boxes are of all objects in the place of the picked one.
+        picked: Index of an object, or None.
+    """
+
+    world: int = 0
+    intersecting: bool = True
+    contacts: bool = True
+    normals: bool = False
+    wireframe: bool = False
+    by_lod: bool = False
+    level: int = -1
+    every_tree: bool = False
+    picked: int | None = None
+
+    @property
+    def output(self) -> str:
+        """The output that a query needs for it."""
+        return "contacts" if self.contacts or self.normals else "faces" if self.intersecting else "count"
+
+
+@dataclass(eq=False)
+class RenderData:
+    """A snapshot as arrays in the world.
+
+    Attributes:
+        poses, keys, colours: Of every object: float64 (n, 7), `mesh_keys`, uint8 (n, 3).
+        intersecting: Intersecting faces by model, float32 (t, 3, 3).
+        segments, normals, boxes: Lines, float32 (k, 2, 3).
+        shown: Indices of the objects that are shown.
+        intersecting_count, contact_count, box_count: How many there are, drawn or not.
+        faces: Active faces of the shown objects together.
+        error_mean: Mean certified error of the shown objects [units].
+    """
+
+    poses: np.ndarray
+    keys: np.ndarray
+    colours: np.ndarray
+    intersecting: dict
+    segments: np.ndarray
+    normals: np.ndarray
+    boxes: np.ndarray
+    shown: np.ndarray
+    intersecting_count: int
+    contact_count: int
+    box_count: int
+    faces: int
+    error_mean: float
+
+
+def objects_of_world(worlds, world: int) -> np.ndarray:
+    """Return the indices of the objects of a world; those of world -1 are in every one."""
+    return np.flatnonzero((worlds == world) | (worlds == -1))
+
+
+def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Settings) -> RenderData:
+    """Return what to draw.
+
+    Args:
+        shown: Indices of the objects that are shown, rising.
+    """
+    scene, result = cache.scene, snapshot.result
+    inside = np.zeros(scene.object_count, bool)
+    inside[shown] = True
+    intersecting = geometry.intersecting_faces(result, inside)
+    segments, normals = geometry.contact_lines(result, geometry.normal_length(cache, shown), inside)
+    boxes, box_count = NO_LINES, 0
+    if settings.level >= 0:
+        picked = [i for i in [settings.picked] if i is not None and inside[i]]
+        objects = shown if settings.every_tree else picked
+        boxes, box_count = geometry.tree_lines(scene, snapshot, objects, settings.level)
+    keys = geometry.mesh_keys(scene, snapshot.lods)
+    distinct, repeats = np.unique(keys[shown], return_counts=True)
+    meshes = [(*geometry.split_key(key), n) for key, n in zip(distinct.tolist(), repeats.tolist())]
+    pairs = inside[result.pairs].all(axis=1) if len(result.pairs) else np.zeros(0, bool)
+    return RenderData(
+        poses=snapshot.poses,
+        keys=keys,
+        colours=geometry.object_colours(scene, snapshot.lods, settings.picked, settings.by_lod),
+        intersecting=geometry.intersecting_triangles(cache, snapshot, intersecting) if settings.intersecting else {},
+        segments=segments if settings.contacts else NO_LINES,
+        normals=normals if settings.normals else NO_LINES,
+        boxes=boxes,
+        shown=shown,
+        intersecting_count=len(intersecting),
+        contact_count=int(result.count[pairs].sum()) if result.count is not None else 0,
+        box_count=box_count,
+        faces=sum(cache.count(model, lod) * n for model, lod, n in meshes),
+        error_mean=sum(scene.models[model].error_at(lod) * n for model, lod, n in meshes) / max(len(shown), 1),
+    )

@@ -1,0 +1,170 @@
+"""Objects of scene files: the copies that an entry of [[objects]] stands for, and how each moves."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from warp_abtree.app.toml.control import unit
+from warp_abtree.app.toml.decode import SceneError, fail
+
+OBJECT_LIMIT = 1_000_000  # of one entry of [[objects]]
+MATERIAL = ("density", "restitution", "friction")
+
+
+@dataclass(eq=False)
+class ObjectGroup:
+    """The objects of one entry; arrays have a row each.
+
+    Attributes:
+        key: Of the entry in its file.
+        table: `ObjectTable`.
+        world: World, int (n,).
+        motion: Arguments of `Kinematic`.
+        kinematic: Whether it moves as told among rigid bodies, bool (n,).
+        material: density, restitution and friction, (n,) each; NaN without [dynamics].
+    """
+
+    key: str
+    table: Any
+    world: np.ndarray
+    motion: dict
+    kinematic: np.ndarray
+    material: dict
+
+
+def make_group(path, key: str, table, dynamics, rng) -> ObjectGroup:
+    """Lay out the copies of an entry.
+
+    Args:
+        path: The scene file.
+        key: Of the entry.
+        table: `ObjectTable`.
+        dynamics: `DynamicsTable`, or None.
+        rng: NumPy generator of what is random.
+
+    Raises:
+        SceneError: Too many copies, or keys of rigid bodies where there are none.
+    """
+    _check_dynamics(path, key, table, dynamics)
+    for name in ("count", "worlds"):
+        if (getattr(table, name) or 1) > OBJECT_LIMIT:
+            fail(path, f"{key}.{name}", f"more than {OBJECT_LIMIT} objects")
+    offsets = _copy_offsets(path, key, table)
+    if len(offsets) * table.worlds > OBJECT_LIMIT:
+        fail(path, f"{key}.worlds", f"more than {OBJECT_LIMIT} objects")
+    count = len(offsets) * table.worlds
+    motion = {
+        "position": np.tile(offsets + table.position, (table.worlds, 1)),
+        "rotation": np.tile(_quaternion(table.rotation), (count, 1)),
+        "velocity": np.tile(table.velocity, (count, 1)),
+        "axis": np.tile([0.0, 0.0, 1.0], (count, 1)),
+        "shuttle": np.zeros((count, 3)),
+        "period": np.full(count, np.inf),
+        **{name: np.zeros(count) for name in ("rate", "phase")},
+    }
+    if table.turn is not None:
+        motion["axis"][:], motion["rate"][:] = unit(table.turn.axis), math.radians(table.turn.degrees)
+    if table.shuttle is not None:
+        motion["shuttle"][:], motion["period"][:] = table.shuttle.by, table.shuttle.period
+        motion["phase"][:] = table.shuttle.phase
+    _scatter(table.random, motion, rng)
+    material = {}
+    for name in MATERIAL:
+        own = getattr(table, name)
+        value = np.nan if dynamics is None else getattr(dynamics, name) if own is None else own
+        material[name] = np.full(count, value)
+    world = np.repeat(np.arange(table.world, table.world + table.worlds), len(offsets))
+    return ObjectGroup(key, table, world, motion, np.full(count, table.kinematic), material)
+
+
+def _check_dynamics(path, key, table, dynamics):
+    """Refuse keys that rigid bodies alone have, or that they cannot have."""
+    if dynamics is None:
+        given = [name for name in MATERIAL if getattr(table, name) is not None]
+        for name in [*(["kinematic"] if table.kinematic else []), *given]:
+            fail(path, f"{key}.{name}", "the scene has no [dynamics]")
+    elif not table.static and not table.kinematic and table.shuttle is not None:
+        fail(path, f"{key}.shuttle", "a rigid body goes its own way; kinematic = true lets it shuttle")
+
+
+def _quaternion(rotation) -> np.ndarray:
+    """Return the quaternion x y z w of a `RotationTable`, or of None."""
+    if rotation is None:
+        return np.array([0.0, 0.0, 0.0, 1.0])
+    if rotation.quaternion is not None:
+        return np.array(rotation.quaternion)
+    half = math.radians(rotation.degrees) / 2
+    return np.append(unit(rotation.axis) * math.sin(half), math.cos(half))
+
+
+def _copy_offsets(path, key, table) -> np.ndarray:
+    """Return the offset of every copy within one world, (count, 3)."""
+    count, grid = table.count, table.grid
+    if grid is None:
+        return np.zeros((count or 1, 3))
+    size, spacing = np.array(grid.size), np.array(grid.spacing)
+    grows = size == 0
+    layer = math.prod(size[~grows].tolist())
+    if count is not None:
+        size = np.where(grows, -(-count // layer), size)
+    if layer > OBJECT_LIMIT:
+        fail(path, f"{key}.grid.size", f"more than {OBJECT_LIMIT} objects")
+    cells = np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), axis=-1).reshape(-1, 3)
+    if count is not None:
+        cells = cells[np.argsort(cells[:, grows][:, 0], kind="stable")][:count]
+    return (cells - np.where(grows, 0, (size - 1) / 2)) * spacing
+
+
+def _scatter(table, motion, rng):
+    """Add what a `RandomTable` asks for; always draw the same numbers, so that one key does not change another."""
+    count = len(motion["position"])
+    box = rng.uniform(-1, 1, (count, 3))
+    direction, axis, rotation = (
+        vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        for vectors in (rng.normal(size=(count, width)) for width in (3, 3, 4))
+    )
+    speed, rate, phase = rng.uniform(0, 1, (3, count))
+    motion["position"] += box * table.position
+    motion["velocity"] += direction * (speed * table.velocity)[:, None]
+    if table.rotation:
+        motion["rotation"][:] = rotation
+    if table.turn is not None:
+        motion["axis"][:], motion["rate"][:] = axis, rate * math.radians(table.turn)
+    if table.phase:
+        motion["phase"][:] = phase
+
+
+def make_groups(path, tables, dynamics, seed: int, objects: int | None = None) -> list[ObjectGroup]:
+    """Lay out all entries of [[objects]].
+
+    Args:
+        path: The scene file.
+        tables: `ObjectTable`s.
+        dynamics: `DynamicsTable` or None.
+        seed: Of what is random.
+        objects: About so many objects in all: every `worlds`, or else `count`, is multiplied by the same number; None
+            keeps them.
+
+    Raises:
+        SceneError: As `make_group`, or no entry has worlds or a count to multiply.
+    """
+
+    def make(tables):
+        return [
+            make_group(path, f"objects[{i}]", table, dynamics, np.random.default_rng([seed, i]))
+            for i, table in enumerate(tables)
+        ]
+
+    groups = make(tables)
+    if objects is None:
+        return groups
+    keys = ["worlds" if table.worlds > 1 else "count" for table in tables]
+    scaled = [
+        len(group.world) if (getattr(table, key) or 1) > 1 else 0 for group, key, table in zip(groups, keys, tables)
+    ]
+    if not any(scaled):
+        raise SceneError(f"{path}: no entry of [[objects]] has a count or worlds, which another number would change")
+    factor = (objects - (sum(len(group.world) for group in groups) - sum(scaled))) / sum(scaled)
+    return make([table.multiply(key, factor) if n else table for table, key, n in zip(tables, keys, scaled)])

@@ -1,0 +1,272 @@
+"""Every table of a scene file: a struct is a table, a field is a key with its type and limits; other keys are refused.
+
+Lengths are in the scene's units, angles in degrees, times in seconds. `SceneTable` is the whole file:
+
+    [scene]
+    title = "Two balls"
+    [models.ball]
+    shape = "icosphere"
+    [[objects]]
+    model = "ball"
+    worlds = 16
+"""
+
+import math
+from typing import Annotated, Literal, get_args
+
+from msgspec import Meta, field
+from msgspec.structs import replace
+
+from warp_abtree.app.toml.fields import (
+    ORIGIN,
+    Copies,
+    Count,
+    Fraction,
+    NonEmpty,
+    NotNegative,
+    Positive,
+    Restitution,
+    Table,
+    Vector,
+    check_direction,
+)
+from warp_abtree.app.toml.model_tables import SHAPES
+from warp_abtree.app.toml.objects import OBJECT_LIMIT
+
+
+class HeadTable(Table):
+    """[scene]"""
+
+    title: str | None = None  # the file's name without its suffix by default
+    frames: Count = 60  # that `run` makes
+    time_step: Positive = 1 / 60  # between frames
+    seed: Annotated[int, Meta(ge=0, le=2**31 - 1)] = 0  # of everything under `random`
+
+
+# Objects.
+
+
+class RotationTable(Table):
+    """rotation of [[objects]]: an axis with an angle, or a quaternion."""
+
+    axis: Vector | None = None
+    degrees: float | None = None
+    quaternion: tuple[float, float, float, float] | None = None  # x, y, z, w
+
+    def __post_init__(self):
+        if (self.quaternion is None) == (self.axis is None):
+            raise ValueError("give axis and degrees, or quaternion")
+        if (self.degrees is None) != (self.axis is None):
+            raise ValueError(f"the key {'axis' if self.axis is None else 'degrees'!r} is missing")
+        check_direction("axis", self.axis)
+        if self.quaternion is not None and not abs(math.hypot(*self.quaternion) - 1) <= 1e-3:
+            raise ValueError(f"quaternion: its norm is {math.hypot(*self.quaternion):.6g}, off 1 by more than 1e-3")
+
+
+class TurnTable(Table, kw_only=True):
+    """turn of [[objects]]: a steady rotation about the object's origin."""
+
+    axis: Vector
+    degrees: float  # a second
+
+    def __post_init__(self):
+        check_direction("axis", self.axis)
+
+
+class ShuttleTable(Table, kw_only=True):
+    """shuttle of [[objects]]: there and back."""
+
+    by: Vector
+    period: Positive
+    phase: float = 0.0  # in periods
+
+
+class GridTable(Table):
+    """grid of [[objects]]: copies on a grid around the position.
+
+    Along an axis of size 0 it grows from the position, layer by layer, with `count`.
+    """
+
+    size: tuple[Annotated[int, Meta(ge=0, le=OBJECT_LIMIT)], ...]
+    spacing: Vector
+
+    def __post_init__(self):
+        if len(self.size) != 3:
+            raise ValueError("size: give three numbers")
+
+
+class RandomTable(Table):
+    """random of [[objects]]: seeded, each copy its own, up to so much."""
+
+    position: tuple[NotNegative, NotNegative, NotNegative] = ORIGIN  # along each axis, to both sides
+    rotation: bool = False
+    velocity: NotNegative = 0.0  # in any direction
+    turn: NotNegative | None = None  # degrees a second about any axis
+    phase: bool = False  # of the shuttle
+
+
+class ObjectTable(Table, kw_only=True):
+    """[[objects]]: one object, or many."""
+
+    model: str | NonEmpty[str]  # of a list each in turn
+    name: str | None = None  # for lod_sweep
+    position: Vector = ORIGIN
+    rotation: RotationTable | None = None
+    world: Annotated[int, Meta(ge=-1, le=2**30)] = 0  # objects of different worlds never meet; -1 is in every world
+    static: bool = False  # static objects never meet each other
+    kinematic: bool = False  # with [dynamics]: moves as told, and pushes
+    density: Positive | None = None  # with [dynamics]; these three are those of [dynamics] by default
+    restitution: Restitution | None = None
+    friction: NotNegative | None = None
+    importance: Annotated[int, Meta(ge=1, le=3)] = 1  # 1 (most), 2 or 3, for the selection of LODs
+    # A number with a decimal point is a fraction of the faces; a whole number, "finest", "coarsest" or "tol:0.01"; of a
+    # list each in turn.
+    lod: int | float | str | NonEmpty[int | float | str] = "finest"
+    velocity: Vector = ORIGIN
+    turn: TurnTable | None = None
+    shuttle: ShuttleTable | None = None
+    count: Copies | None = None  # copies in the same world
+    grid: GridTable | None = None
+    worlds: Copies = 1  # and all of them once in each of so many worlds
+    random: RandomTable = field(default_factory=RandomTable)
+
+    def __post_init__(self):
+        if self.static and self.kinematic:
+            raise ValueError("kinematic: a static object does not move")
+        if self.world < 0 and self.worlds > 1:
+            raise ValueError("worlds: the world -1 is every world already")
+        if self.grid is not None and self.grid.size.count(0) != (self.count is not None):
+            raise ValueError("give count or grid, not both, unless the size of the grid is 0 along one axis")
+
+    def multiply(self, key: str, factor: float) -> "ObjectTable":
+        """Return the entry with a number of copies multiplied, 1 at the least."""
+        return replace(self, **{key: max(1, round(factor * getattr(self, key)))})
+
+
+# LODs.
+
+
+class SweepTable(Table, kw_only=True):
+    """[[lod_sweep]]: fine to coarse and back, in equal ratios."""
+
+    model: str | None = None  # all objects of a model, or
+    objects: str | NonEmpty[str] | None = None  # those of these names
+    start: Fraction = field(name="from")  # of the faces
+    turn: Fraction = field(name="to")
+    period: Positive  # there and back
+
+    def __post_init__(self):
+        if (self.model is None) == (self.objects is None):
+            raise ValueError("give one of model and objects")
+
+
+Controller = Literal["predictive", "paper", "tolerance"]
+Spacing = Literal["ratio", "operations"]
+
+
+class LodTable(Table):
+    """[lod]: a controller chooses LODs, in the place of sweeps."""
+
+    controller: Controller | None = None  # "predictive" where a budget is given, else "tolerance"
+    budget_ms: Positive | None = None  # T: selection, refinement, broad phase and query of a frame [ms]
+    tolerance: NotNegative | None = None  # error of an important, still object at the eye
+    steps: Annotated[int, Meta(ge=1, le=10_000)] | None = None  # levels of the LOD ladder above the coarsest
+    spacing: Spacing | None = None  # of the levels; not for "paper"
+    window: Annotated[int, Meta(ge=1, le=1000)] | None = None  # frames over which motion on the screen is measured
+    threshold_ms: Positive | None = None  # paper: t; a tenth of the budget by default
+    aim: Fraction | None = None  # predictive: fraction of the budget to aim at,
+    low: Fraction | None = None  # below which LODs rise,
+    hold_frames: Annotated[int, Meta(ge=0, le=2**30)] | None = None  # after so many frames
+    loosest: Annotated[float, Meta(ge=1)] | None = None  # predictive, tolerance: most that a tolerance is loosened
+
+    def __post_init__(self):
+        if self.controller == "paper" and self.spacing is not None:
+            raise ValueError("spacing: the LODs of the paper's controller are equal numbers of operations apart")
+        if not (self.low or 0.0) <= (self.aim or 1.0):
+            raise ValueError("low: is above aim")
+        if self.controller is None and self.budget_ms is None and self.tolerance is None:
+            raise ValueError("give budget_ms or tolerance")
+
+
+class CameraKeyTable(Table, kw_only=True):
+    """[[camera.keys]]: the camera goes straight from one key to the next."""
+
+    time: float = 0.0
+    eye: Vector
+    target: Vector
+
+
+class CameraTable(Table):
+    """[camera]: whom LODs are for; near, still objects come first. Give eye and target, or keys."""
+
+    eye: Vector | None = None
+    target: Vector | None = None
+    up: Vector = (0.0, 1.0, 0.0)
+    field_of_view: Annotated[float, Meta(ge=1, le=170)] = 60.0  # vertical
+    size: tuple[Annotated[int, Meta(ge=1, le=2**20)], Annotated[int, Meta(ge=1, le=2**20)]] = (1920, 1080)  # pixels
+    far: Positive = 100.0  # how far one sees: D of the paper
+    loop: bool = False  # whether the keys begin again
+    keys: list[CameraKeyTable] = field(default_factory=list)
+
+    def __post_init__(self):
+        check_direction("up", self.up)
+        if self.keys and (self.eye is not None or self.target is not None):
+            raise ValueError("give eye and target, or [[camera.keys]], not both")
+        for name in ("eye", "target"):
+            if not self.keys and getattr(self, name) is None:
+                raise ValueError(f"the key {name!r} is missing")
+
+
+class DynamicsTable(Table):
+    """[dynamics]: objects that are neither static nor kinematic are rigid bodies; velocity and turn start them."""
+
+    density: Positive = 1.0
+    restitution: Restitution = 0.0
+    friction: NotNegative = 0.5
+    gravity: Vector = (0.0, -9.81, 0.0)
+    iterations: Annotated[int, Meta(ge=1, le=10_000)] | None = None  # of the contact solver in a step
+    sleep_time: Positive | None = None  # at rest before bodies sleep
+
+    def options(self) -> dict:
+        """Return the arguments of `Dynamics` that the file gives."""
+        given = {name: getattr(self, name) for name in ("gravity", "iterations", "sleep_time")}
+        return {name: value for name, value in given.items() if value is not None}
+
+
+class PictureTable(Table):
+    """[picture]: for `run --picture`, and where `view` and `picture` look from."""
+
+    eye: Vector = (0.4, 0.35, 1.0)  # direction from the scene to the eye
+    up: Vector = (0.0, 1.0, 0.0)
+    world: Annotated[int, Meta(ge=0, le=2**31 - 1)] = 0  # the world drawn
+    time: float | None = None  # the last frame by default, which rigid bodies always show
+    lods: Fraction | NonEmpty[Fraction] | None = None  # of swept objects, a panel each; by default both ends
+
+    def __post_init__(self):
+        check_direction("eye", self.eye)
+        check_direction("up", self.up)
+
+
+class SceneTable(Table, kw_only=True):
+    """The whole file."""
+
+    scene: HeadTable = field(default_factory=HeadTable)
+    models: dict[str, dict]  # each is a `ModelTable` or a `Shape`
+    objects: list[ObjectTable] = field(default_factory=list)
+    lod_sweep: list[SweepTable] = field(default_factory=list)
+    lod: LodTable | None = None
+    camera: CameraTable | None = None
+    dynamics: DynamicsTable | None = None
+    picture: PictureTable = field(default_factory=PictureTable)
+
+    def __post_init__(self):
+        if self.dynamics is not None and self.picture.time is not None:
+            raise ValueError("picture.time: rigid bodies are drawn as the last frame leaves them")
+
+
+# Keys whose values are names, and the names.
+CHOICES = {
+    "controller": get_args(Controller),
+    "spacing": get_args(Spacing),
+    "shape": tuple(SHAPES),
+}
