@@ -1,63 +1,54 @@
-"""python -m bench NAME [--device D] [--json FILE] [...]: one of the cases below, its rows printed as they come.
+"""python -m bench CASE [--device D] [--json FILE] [...]: one of the cases below, its rows printed as they come.
 
-python -m bench paper|tradeoff|all --out DIR [...]: a study, see `bench/study.py`.
+python -m bench paper|tradeoff|all --out DIR [...]: a study, see `python -m bench paper --help`.
 """
 
+import argparse
 import datetime
+import importlib
 import inspect
 import json
 import platform
 import sys
+from pathlib import Path
 
 import numpy as np
 import warp as wp
 
 import warp_abtree as ab
 
-from . import (
-    budget,
-    build,
-    exact,
-    frame,
-    memory,
-    peers,
-    plots,
-    precision,
-    query,
-    scale,
-    scaling,
-    study,
-    sweep,
-    update,
+from . import tables
+
+CASES = (
+    "baselines",
+    "budget",
+    "build",
+    "exact",
+    "frame",
+    "memory",
+    "precision",
+    "query",
+    "scale",
+    "scaling",
+    "sweep",
+    "update",
 )
-
-CASES = {
-    "budget": budget.run,
-    "build": build.run,
-    "exact": exact.run,
-    "frame": frame.run,
-    "memory": memory.run,
-    "peers": peers.run,
-    "precision": precision.run,
-    "query": query.run,
-    "scale": scale.run,
-    "scaling": scaling.run,
-    "sweep": sweep.run,
-    "update": update.run,
-}
-FIGURES = {"build": build.FIGURES, "scale": scale.FIGURES, "update": update.FIGURES}
-# Cases that take the folder of their figures themselves, and how each draws what it kept there.
-DRAWN = {"budget": budget.draw_saved}
+STUDIES = ("paper", "tradeoff", "all")
+FIGURES = ("build", "scale", "update")  # laid out in cases/figures.toml
 # What only some cases take, by the name of their argument.
-OPTIONS = ("count", "devices", "predict", "processes", "quick", "largest", "models")
+OPTIONS = ("count", "devices", "processes", "quick", "largest", "models")
 
 
-def main(argv=None):
-    argv = list(sys.argv[1:] if argv is None else argv)
-    if argv and argv[0] in study.STUDY_NAMES:
-        return study.main(argv)
-    parser = study.Parser(prog="python -m bench", description=__doc__)
-    parser.add_argument("name", choices=[*study.STUDY_NAMES, *sorted(CASES)])
+class Parser(argparse.ArgumentParser):
+    """A parser that says what is wrong in one line."""
+
+    def error(self, message):
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def case_parser():
+    parser = Parser(prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", choices=[*STUDIES, *CASES])
     parser.add_argument("--device", default=None)
     parser.add_argument("--json", metavar="FILE", help="write the rows to a file as well")
     parser.add_argument("--quick", action="store_true", default=None, help="the smallest sizes, to try a case out")
@@ -67,35 +58,42 @@ def main(argv=None):
     parser.add_argument("--rows", metavar="FILE", help="with --plots: draw what --json wrote, in place of a run")
     parser.add_argument("--count", type=int, help="exact: random pairs; a tenth as many adversarial ones")
     parser.add_argument("--devices", help="scaling: Warp devices with commas between (cpu,cpu)")
-    parser.add_argument("--predict", metavar="FILE", help="scaling: read what --json wrote, and predict from it")
     parser.add_argument("--processes", type=int, help="exact: processes that run the oracle")
+    return parser
+
+
+def main(argv=None):
+    argv = list(sys.argv[1:] if argv is None else argv)
+    if argv and argv[0] in STUDIES:
+        return importlib.import_module("bench.studies.study").main(argv)
+    parser = case_parser()
     options = parser.parse_args(argv)
-    if options.name in study.STUDY_NAMES:
+    if options.name in STUDIES:
         parser.error(f"a study is named before its options: {options.name} ...")
-    run = CASES[options.name]
+    case = importlib.import_module(f"bench.cases.{options.name}")
     asked = {name: getattr(options, name) for name in OPTIONS if getattr(options, name) is not None}
     for name in asked:
-        if name not in inspect.signature(run).parameters:
+        if name not in inspect.signature(case.run).parameters:
             parser.error(f"{options.name} takes no --{name}")
-    if options.plots and options.name not in (*FIGURES, *DRAWN):
+    if options.plots and options.name not in (*FIGURES, "budget"):
         parser.error(f"{options.name} takes no --plots")
     if options.rows and (not options.plots or options.json):
         parser.error("--rows goes with --plots, without --json")
-    if options.name in DRAWN and options.rows:
-        print(DRAWN[options.name](options.rows))
-        return 0
-    if options.name in DRAWN and options.plots:
-        asked["plots"] = options.plots
+    if options.name == "budget":  # which draws itself, from the rows of its frames
+        if options.rows:
+            print(case.draw_saved(options.rows))
+            return 0
+        asked |= {"plots": options.plots} if options.plots else {}
     if options.rows:
-        with open(options.rows) as file:
-            rows = json.load(file)["rows"]
+        rows = json.loads(Path(options.rows).read_text(encoding="utf-8"))["rows"]
     else:
-        rows = print_rows(run(options.device, **asked))
+        rows = print_rows(case.run(options.device, **asked))
     if options.json:
-        with open(options.json, "w") as file:
-            json.dump({**describe_run(), "rows": rows}, file, indent=1)
+        Path(options.json).write_text(json.dumps({**describe_run(), "rows": rows}, indent=1), encoding="utf-8")
     if options.plots and options.name in FIGURES:
-        print(plots.draw(rows, FIGURES[options.name], options.plots), flush=True)
+        layout = tables.read_layout("cases/figures.toml")
+        figures = [figure for figure in layout["figure"] if figure["case"] == options.name]
+        print(tables.draw(figures, rows, options.plots), flush=True)
     return 0
 
 

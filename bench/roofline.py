@@ -28,8 +28,8 @@ whether a cache has them or not; stacks in shared memory or registers are left o
 import time
 
 import numpy as np
-import warp as wp
 
+COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 NODE_BYTES, NODE_FLOPS = 32, 64
 TRIANGLE_BYTES, TRIANGLE_FLOPS, HIT_FLOPS = 2 * 16 + 6 * 16, 18 + 54 + 68, 68 + 2 * 42
 FLOAT64_BYTES, FLOAT64_FLOPS = 2 * 16 + 6 * 24, 63 + 18 + 3 * 16
@@ -75,10 +75,7 @@ def find_peaks(device):
 
 def count_work(result):
     """Return bytes, float32 and float64 operations that a result's counters stand for."""
-    nodes, triangles, doubles, exact = (
-        int(getattr(result, name).sum(dtype=np.int64))
-        for name in ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
-    )
+    nodes, triangles, doubles, exact = (int(getattr(result, name).sum(dtype=np.int64)) for name in COUNTERS)
     hits = int(result.any.sum() if result.count is None else result.count.sum(dtype=np.int64))
     written = hits if result.faces is not None else 0
     size = NODE_BYTES * nodes + TRIANGLE_BYTES * triangles + FLOAT64_BYTES * doubles + EXACT_BYTES * exact
@@ -126,13 +123,3 @@ def update_roofline(changed, refitted, entries, milliseconds, peaks) -> dict:
         row["memory_share"] = float(f"{size / peaks[0] / seconds:.3g}")
         row["floor_ms"] = float(f"{1e3 * size / peaks[0]:.4g}")
     return row
-
-
-def used_memory(device) -> dict:
-    """Return columns of memory [MiB] in use on a CUDA device: Warp's pool, and all that is taken; none on the CPU."""
-    if device.is_cpu:
-        return {}
-    wp.synchronize_device(device)
-    taken = device.total_memory - device.free_memory
-    pool = wp.get_mempool_used_mem_current(device) if wp.is_mempool_enabled(device) else None
-    return {"pool_mib": None if pool is None else round(pool / 2**20, 1), "taken_mib": round(taken / 2**20, 1)}

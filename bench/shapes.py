@@ -1,4 +1,4 @@
-"""Meshes, models and poses of the benchmarks, made the same to the bit everywhere."""
+"""Meshes and poses of the benchmarks, reproducible to the bit."""
 
 from pathlib import Path
 
@@ -33,26 +33,6 @@ def knot(face_target):
     return vertices.astype(np.float32), faces.astype(np.int32)
 
 
-def pair_poses(pair_count, distance, seed=0):
-    """Return float32 (2 P, 7): objects 2p and 2p+1 form pair p, both turned at random, their centres at a distance."""
-    rng = np.random.default_rng(seed)
-    q = rng.normal(size=(2 * pair_count, 4))
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    d = rng.normal(size=(pair_count, 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    x = np.zeros((2 * pair_count, 7), np.float32)
-    x[:, 3:] = q
-    x[1::2, :3] = d * distance
-    return x
-
-
-def centre_and_radius(model):
-    """Return the middle of a model's box and the radius of the ball about it that holds the model."""
-    points = model.mesh_at(model.lod_max)[0]
-    centre = (points.min(0) + points.max(0)) / 2
-    return centre, np.linalg.norm(points - centre, axis=1).max()
-
-
 def knot_model(face_target, folder=None):
     """Return the model of `knot`, which takes minutes for a million faces; a folder keeps it between runs."""
     if folder is None:
@@ -62,3 +42,77 @@ def knot_model(face_target, folder=None):
         path.parent.mkdir(parents=True, exist_ok=True)
         ab.Model.from_arrays(*knot(face_target), name=f"knot {face_target}").save(path)
     return ab.Model.open(path)
+
+
+def random_directions(rng, *shape):
+    """Return unit vectors of the last dimension of a shape: with four, rotations as quaternions."""
+    vectors = rng.normal(size=shape)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def pair_poses(pair_count, distance, seed=0):
+    """Return float32 (2 P, 7): objects 2p and 2p+1 form pair p, any rotations, their centres at a distance."""
+    rng = np.random.default_rng(seed)
+    poses = np.zeros((2 * pair_count, 7), np.float32)
+    poses[:, 3:] = random_directions(rng, 2 * pair_count, 4)
+    poses[1::2, :3] = random_directions(rng, pair_count, 3) * distance
+    return poses
+
+
+def random_poses(count, size, seed=0):
+    """Return float64 (count, 7): any rotation, positions in a cube whose side is twice a size."""
+    rng = np.random.default_rng(seed)
+    turns = random_directions(rng, count, 4)
+    return np.concatenate([size * rng.uniform(-1, 1, (count, 3)), turns], 1)
+
+
+def world_poses(world_count, object_count, size, seed=0):
+    """Return float64 (worlds, objects, 7): any rotation, positions in a cube of a mesh's size."""
+    rng = np.random.default_rng(seed)
+    turns = random_directions(rng, world_count, object_count, 4)
+    return np.concatenate([size * rng.uniform(-0.5, 0.5, (world_count, object_count, 3)), turns], -1)
+
+
+def rotation_matrices(quaternions):
+    """Return float64 (n, 3, 3) of unit quaternions (n, 4) x y z w."""
+    x, y, z, w = quaternions.T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, 1) for row in rows], 1)
+
+
+def longest_side(model) -> float:
+    """Return the longest side of a model's box [model units]."""
+    return float(np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())
+
+
+def centre_and_radius(model):
+    """Return the middle of a model's box and the radius of the ball about it that holds the model."""
+    points = model.mesh_at(model.lod_max)[0]
+    centre = (points.min(0) + points.max(0)) / 2
+    return centre, np.linalg.norm(points - centre, axis=1).max()
+
+
+def scene_of_objects(device, model, poses):
+    """Return a scene of a model at each pose."""
+    scene = ab.Scene(device=device)
+    for pose in poses:
+        scene.add(model, pose=pose)
+    return scene
+
+
+def scene_of_pairs(device, model, poses):
+    """Return a scene of objects at poses (2 P, 7), and its pairs (P, 2): 2p with 2p + 1."""
+    return scene_of_objects(device, model, poses), np.arange(len(poses)).reshape(-1, 2)
+
+
+def scene_of_poses(device, model_a, model_b, poses):
+    """Return a scene of A at the origin and B at each pose, and its pairs (0, 1), (0, 2), ..."""
+    scene = ab.Scene(device=device)
+    scene.add(model_a)
+    for pose in poses:
+        scene.add(model_b, pose)
+    return scene, np.stack([np.zeros(len(poses), np.int32), np.arange(1, len(poses) + 1, dtype=np.int32)], 1)

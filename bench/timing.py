@@ -1,5 +1,8 @@
-"""Times of launches: graph replays between events on CUDA, wall clock on the CPU, two things in turn in one process."""
+"""Times of launches: graph replays between events on CUDA, a clock of the host on the CPU, things in turn."""
 
+import contextlib
+import gc
+import os
 import time
 
 import numpy as np
@@ -29,17 +32,17 @@ def time_graph(graph, device):
     return run
 
 
-def time_wall(launch, device, clock=time.perf_counter):
-    """Return a callable that calls something, waits for the device and returns the time [ms] by the wall clock.
+def time_call(call, device="cpu", clock=time.perf_counter):
+    """Return a callable that calls something, waits for the device and returns the time [ms].
 
     Args:
-        clock: Another clock [s]: `time.thread_time` leaves out what else the machine does, and other threads' work.
+        clock: `time.thread_time` leaves out other threads and processes.
     """
 
     def run():
         wp.synchronize_device(device)
         begin = clock()
-        launch()
+        call()
         wp.synchronize_device(device)
         return 1e3 * (clock() - begin)
 
@@ -49,7 +52,7 @@ def time_wall(launch, device, clock=time.perf_counter):
 def time_both(call, device):
     """Call something that cannot be captured; return its time [ms] by the wall clock and between events.
 
-    The second is that of the stream, its waits for the host included; on the CPU there is none, and it is the first.
+    The second includes the stream's waits for the host; on the CPU it is the first.
     """
     wp.synchronize_device(device)
     events = []
@@ -66,7 +69,7 @@ def time_both(call, device):
 
 
 def time_rounds(runs: dict, repeats) -> dict:
-    """Return the sorted times of callables that return a time each, asked in turn; the first rounds do not count."""
+    """Return the sorted times of callables that return a time each, in turn; the first rounds do not count."""
     times = {name: [] for name in runs}
     for turn in range(WARM_UP + repeats):
         for name, run in runs.items():
@@ -82,17 +85,18 @@ def make_runs(launches: dict, device, clock=time.perf_counter) -> dict:
     for name, launch in launches.items():
         launch()
         wp.synchronize_device(device)
-        runs[name] = time_graph(capture(launch, device), device) if device.is_cuda else time_wall(launch, device, clock)
+        runs[name] = time_graph(capture(launch, device), device) if device.is_cuda else time_call(launch, device, clock)
     return runs
 
 
 def time_in_turn(launches: dict, device, repeats=15, clock=time.perf_counter) -> dict:
-    """Return the sorted times [ms] of each launch, measured alternately; compilation is over before.
-
-    Args:
-        clock: Of the CPU, see `time_wall`; on CUDA times are those between events.
-    """
+    """Return the sorted times [ms] of each launch, measured alternately after compilation: events on CUDA."""
     return time_rounds(make_runs(launches, device, clock), repeats)
+
+
+def medians(times: dict) -> dict:
+    """Return the median of each list of times."""
+    return {name: float(np.median(values)) for name, values in times.items()}
 
 
 def summarise(name, times) -> dict:
@@ -103,8 +107,53 @@ def summarise(name, times) -> dict:
     }
 
 
+def summarise_all(times: dict) -> dict:
+    """Return the columns of all times, see `summarise`."""
+    return {key: value for name, values in times.items() for key, value in summarise(name, values).items()}
+
+
+def ratio_of(times, base) -> float:
+    """Return the ratio of two medians."""
+    return round(float(np.median(times) / np.median(base)), 2)
+
+
 def fit_slope(sizes, times):
     """Return the slope of the line through (log size, log time): 1 is proportional, 0 constant; None of one point."""
     if len(sizes) < 2:
         return None
     return round(float(np.polyfit(np.log(np.asarray(sizes, float)), np.log(np.asarray(times, float)), 1)[0]), 3)
+
+
+def upper_half(values):
+    """Return the upper half of sorted points, where a line has found its slope; all of one or two."""
+    return values[len(values) // 2 - 1 :] if len(values) > 2 else values
+
+
+@contextlib.contextmanager
+def one_core():
+    """Hold this thread, and those it starts, on one core; yield its number, None where the system has no such call."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield None
+        return
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(allowed)})
+    try:
+        yield max(allowed)
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+def core_count() -> int:
+    """Return the cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def no_garbage_collection():
+    """Keep Python's collector out of the times: it would visit the contacts that baselines make by the thousand."""
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()

@@ -17,6 +17,9 @@ DEFORMED = wp.constant(2)
 LEVEL_MAX = wp.constant(31)
 """Levels that a tree of at most 2^30 leaves can have."""
 
+LAST_KEY = wp.constant(wp.int64(2**63 - 1))
+"""Sorts behind all keys."""
+
 
 @wp.struct
 class ModelPool:

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.arrays import LAST_KEY, ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.generation import LaunchRecord, is_stale
 from warp_abtree.kernels.traversal.boxes import round_down, round_up
 from warp_abtree.kernels.traversal.nodes import load_node
@@ -119,3 +119,44 @@ def find_pair_kernel(
         query = wp.bvh_query_aabb(bvh, lower[i], upper[i], root)
         while wp.bvh_query_next(query, j):
             append_pair(i, j, objects, excluded, pair_count_inout, pairs_out)
+
+
+@wp.func
+def pair_key(pair: wp.vec2i):
+    """Return first object * 2^32 + second object, which sorts pairs by their objects."""
+    return (wp.int64(pair[0]) << wp.int64(32)) | wp.int64(pair[1])
+
+
+@wp.kernel
+def make_pair_key_kernel(
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    order_out: wp.array(dtype=wp.int32),
+    key_out: wp.array(dtype=wp.int64),
+):
+    """Make the key of each pair; places behind the last sort behind all of them."""
+    p = wp.tid()
+    order_out[p] = p
+    key_out[p] = LAST_KEY
+    if p < pair_count[0]:
+        key_out[p] = pair_key(pairs[p])
+
+
+@wp.kernel
+def place_pair_kernel(
+    key: wp.array(dtype=wp.int64), pair_count_inout: wp.array(dtype=wp.int32), pairs_out: wp.array(dtype=wp.vec2i)
+):
+    """Write the pairs in key order and count them; a count beyond the capacity stays, as the demand."""
+    p = wp.tid()
+    room = pairs_out.shape[0]
+    if p < room and key[p] != LAST_KEY:
+        pairs_out[p] = wp.vec2i(wp.int32(key[p] >> wp.int64(32)), wp.int32(key[p] & wp.int64(0x7FFFFFFF)))
+    before = bool(True)
+    if p > 0:
+        before = key[p - 1] != LAST_KEY
+    after = bool(True)
+    if p < room:
+        after = key[p] == LAST_KEY
+    # Exactly one thread stands where the pairs end.
+    if before and after and pair_count_inout[0] <= room and pair_count_inout[0] >= 0:
+        pair_count_inout[0] = p

@@ -5,7 +5,7 @@ A loop is a set of contacts that faces link: two contacts of a pair that share a
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.arrays import LAST_KEY, ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.contact.contact import Contacts, load_corners, pair_direction
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
@@ -30,7 +30,6 @@ FAVOUR = wp.constant(wp.float64(2.0**-5))
 # The deepest point is among those chosen if this part of its depth is more than theirs.
 DEEPER = wp.constant(wp.float64(0.9))
 CORNERS = wp.constant(8)
-LAST_KEY = wp.constant(wp.int64(0x7FFFFFFFFFFFFFFF))
 
 
 @wp.struct

@@ -5,8 +5,9 @@ A body frame has its origin at the centre of mass and its axes along the princip
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ObjectPool
-from warp_abtree.kernels.contact.manifold import LAST_KEY, Manifolds, find_root, unite_roots
+from warp_abtree.kernels.arrays import LAST_KEY, ObjectPool
+from warp_abtree.kernels.broad_phase import pair_key
+from warp_abtree.kernels.contact.manifold import Manifolds, find_root, unite_roots
 from warp_abtree.kernels.poses import rotate_quaternion
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -55,16 +56,14 @@ class Bodies:
 
 @wp.func
 def pair_matters(motion_type: wp.array(dtype=wp.int32), i: wp.int32, j: wp.int32):
-    """Return whether a contact of two objects can move either of them; an empty array keeps all pairs."""
-    if motion_type.shape[0] == 0:
-        return True
+    """Return whether a contact of two objects can move either of them."""
     low = wp.min(motion_type[i], motion_type[j])
     high = wp.max(motion_type[i], motion_type[j])
     return high == DYNAMIC or low == DYNAMIC or (high == KINEMATIC and low == ASLEEP)
 
 
 @wp.kernel
-def make_pair_key_kernel(
+def make_body_pair_key_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
     motion_type: wp.array(dtype=wp.int32),
@@ -77,27 +76,7 @@ def make_pair_key_kernel(
     order_out[p] = p
     key_out[p] = LAST_KEY
     if p < pair_count[0] and pair_matters(motion_type, pairs[p][0], pairs[p][1]):
-        key_out[p] = (wp.int64(pairs[p][0]) << wp.int64(32)) | wp.int64(pairs[p][1])
-
-
-@wp.kernel
-def place_pair_kernel(
-    key: wp.array(dtype=wp.int64), pair_count_inout: wp.array(dtype=wp.int32), pairs_out: wp.array(dtype=wp.vec2i)
-):
-    """Write the pairs in key order and count them; a count beyond the capacity stays, as the demand."""
-    p = wp.tid()
-    room = pairs_out.shape[0]
-    if p < room and key[p] != LAST_KEY:
-        pairs_out[p] = wp.vec2i(wp.int32(key[p] >> wp.int64(32)), wp.int32(key[p] & wp.int64(0x7FFFFFFF)))
-    before = bool(True)
-    if p > 0:
-        before = key[p - 1] != LAST_KEY
-    after = bool(True)
-    if p < room:
-        after = key[p] == LAST_KEY
-    # Exactly one thread stands where the pairs end.
-    if before and after and pair_count_inout[0] <= room and pair_count_inout[0] >= 0:
-        pair_count_inout[0] = p
+        key_out[p] = pair_key(pairs[p])
 
 
 @wp.func

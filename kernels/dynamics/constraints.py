@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ObjectPool
-from warp_abtree.kernels.contact.manifold import LAST_KEY, POINTS, Manifolds
+from warp_abtree.kernels.arrays import LAST_KEY, ObjectPool
+from warp_abtree.kernels.contact.manifold import POINTS, Manifolds
 from warp_abtree.kernels.dynamics.bodies import DYNAMIC, Bodies
 from warp_abtree.kernels.dynamics.graph_coloring import INACTIVE
 

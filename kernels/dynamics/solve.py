@@ -7,13 +7,7 @@ import warp as wp
 
 from warp_abtree.kernels.contact.manifold import POINTS, Manifolds
 from warp_abtree.kernels.dynamics.bodies import DYNAMIC, Bodies
-from warp_abtree.kernels.dynamics.constraints import (
-    Constraints,
-    Point,
-    WarmStart,
-    make_point,
-    relative_velocity,
-)
+from warp_abtree.kernels.dynamics.constraints import Constraints, Point, WarmStart, make_point, relative_velocity
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -59,41 +53,21 @@ def normal_pseudo_velocity(constraints: Constraints, bodies: Bodies, c: Point):
 
 
 @wp.func
-def apply_body_impulse(bodies: Bodies, i: wp.int32, arm: wp.vec3d, impulse: wp.vec3d):
-    """Apply an impulse to a dynamic body at the end of an arm."""
-    if bodies.motion_type[i] == DYNAMIC:
-        bodies.velocity[i] += bodies.inverse_mass[i] * impulse
-        bodies.momentum[i] += wp.cross(arm, impulse)
-
-
-@wp.func
-def apply_impulse(constraints: Constraints, bodies: Bodies, c: Point, impulse: wp.vec3d):
-    """Apply an impulse to the second object of a point, and its opposite to the first."""
-    apply_body_impulse(bodies, c.a, constraints.arm_a[c.pair, c.column], -impulse)
-    apply_body_impulse(bodies, c.b, constraints.arm_b[c.pair, c.column], impulse)
-
-
-@wp.func
-def apply_body_pseudo_impulse(bodies: Bodies, i: wp.int32, arm: wp.vec3d, impulse: wp.vec3d):
-    """Apply a pseudo-impulse to a dynamic body at the end of an arm."""
-    if bodies.motion_type[i] == DYNAMIC:
-        bodies.pseudo_velocity[i] += bodies.inverse_mass[i] * impulse
-        bodies.pseudo_momentum[i] += wp.cross(arm, impulse)
-
-
-@wp.func
-def apply_pseudo_impulse(constraints: Constraints, bodies: Bodies, c: Point, impulse: wp.vec3d):
-    """Apply a pseudo-impulse to the second object of a point, and its opposite to the first."""
-    apply_body_pseudo_impulse(bodies, c.a, constraints.arm_a[c.pair, c.column], -impulse)
-    apply_body_pseudo_impulse(bodies, c.b, constraints.arm_b[c.pair, c.column], impulse)
-
-
-@wp.func
-def clear_pseudo_velocity(bodies: Bodies, i: wp.int32):
-    """Set the pseudo-velocity of a dynamic body to 0."""
-    if bodies.motion_type[i] == DYNAMIC:
-        bodies.pseudo_velocity[i] = wp.vec3d()
-        bodies.pseudo_momentum[i] = wp.vec3d()
+def apply_impulse(
+    velocity: wp.array(dtype=wp.vec3d),
+    momentum: wp.array(dtype=wp.vec3d),
+    constraints: Constraints,
+    bodies: Bodies,
+    c: Point,
+    impulse: wp.vec3d,
+):
+    """Apply an impulse to the second object of a point and its opposite to the first: to velocities, or pseudo ones."""
+    if bodies.motion_type[c.a] == DYNAMIC:
+        velocity[c.a] -= bodies.inverse_mass[c.a] * impulse
+        momentum[c.a] -= wp.cross(constraints.arm_a[c.pair, c.column], impulse)
+    if bodies.motion_type[c.b] == DYNAMIC:
+        velocity[c.b] += bodies.inverse_mass[c.b] * impulse
+        momentum[c.b] += wp.cross(constraints.arm_b[c.pair, c.column], impulse)
 
 
 @wp.func
@@ -111,7 +85,9 @@ def solve_friction(constraints: Constraints, bodies: Bodies, c: Point, limit: wp
     if length > limit:
         new = new * (limit / length)
     constraints.friction_impulse[c.pair, c.column] = new
-    apply_impulse(constraints, bodies, c, (new[0] - old[0]) * t + (new[1] - old[1]) * s)
+    apply_impulse(
+        bodies.velocity, bodies.momentum, constraints, bodies, c, (new[0] - old[0]) * t + (new[1] - old[1]) * s
+    )
 
 
 @wp.func
@@ -129,21 +105,24 @@ def find_stopping_impulses(manifolds: Manifolds, constraints: Constraints, bodie
             speed = normal_velocity(constraints, bodies, c) + normal_pseudo_velocity(constraints, bodies, c)
             before = constraints.impulse[p, k]
             constraints.impulse[p, k] = wp.max(before - constraints.mass[p, k] * speed, zero)
-            apply_pseudo_impulse(constraints, bodies, c, (constraints.impulse[p, k] - before) * c.normal)
+            change = (constraints.impulse[p, k] - before) * c.normal
+            apply_impulse(bodies.pseudo_velocity, bodies.pseudo_momentum, constraints, bodies, c, change)
             k += 1
         round += 1
     approach = zero
-    change = zero
+    response = zero
     k = wp.int32(0)
     while k < manifolds.count[p]:
         c = make_point(manifolds, pair, p, k)
         approach -= constraints.impulse[p, k] * normal_velocity(constraints, bodies, c)
-        change += constraints.impulse[p, k] * normal_pseudo_velocity(constraints, bodies, c)
+        response += constraints.impulse[p, k] * normal_pseudo_velocity(constraints, bodies, c)
         k += 1
-    clear_pseudo_velocity(bodies, pair[0])
-    clear_pseudo_velocity(bodies, pair[1])
-    if change > zero:
-        return (wp.float64(1.0) + constraints.restitution[p]) * wp.max(approach, zero) / change
+    for side in range(2):
+        if bodies.motion_type[pair[side]] == DYNAMIC:
+            bodies.pseudo_velocity[pair[side]] = wp.vec3d()
+            bodies.pseudo_momentum[pair[side]] = wp.vec3d()
+    if response > zero:
+        return (wp.float64(1.0) + constraints.restitution[p]) * wp.max(approach, zero) / response
     return zero
 
 
@@ -168,7 +147,9 @@ def apply_restitution(manifolds: Manifolds, constraints: Constraints, bodies: Bo
     k = wp.int32(0)
     while k < manifolds.count[p]:
         c = make_point(manifolds, pair, p, k)
-        apply_impulse(constraints, bodies, c, scale * constraints.impulse[p, k] * c.normal)
+        apply_impulse(
+            bodies.velocity, bodies.momentum, constraints, bodies, c, scale * constraints.impulse[p, k] * c.normal
+        )
         k += 1
     k = wp.int32(0)
     while k < manifolds.count[p]:
@@ -195,7 +176,7 @@ def apply_warm_start(warm_start: WarmStart, constraints: Constraints, bodies: Bo
     v = wp.vec2d(wp.dot(friction, t), wp.dot(friction, s))
     constraints.impulse[c.pair, c.column] = impulse
     constraints.friction_impulse[c.pair, c.column] = v
-    apply_impulse(constraints, bodies, c, impulse * c.normal + v[0] * t + v[1] * s)
+    apply_impulse(bodies.velocity, bodies.momentum, constraints, bodies, c, impulse * c.normal + v[0] * t + v[1] * s)
 
 
 @wp.func
@@ -203,10 +184,10 @@ def relax_velocity(constraints: Constraints, bodies: Bodies, c: Point):
     """Relax a point: the tangential velocity within the friction cone, then the normal velocity."""
     before = constraints.impulse[c.pair, c.column]
     solve_friction(constraints, bodies, c, constraints.friction[c.pair] * before)
-    change = constraints.mass[c.pair, c.column] * normal_velocity(constraints, bodies, c)
-    after = wp.max(before - change, wp.float64(0.0))
+    correction = constraints.mass[c.pair, c.column] * normal_velocity(constraints, bodies, c)
+    after = wp.max(before - correction, wp.float64(0.0))
     constraints.impulse[c.pair, c.column] = after
-    apply_impulse(constraints, bodies, c, (after - before) * c.normal)
+    apply_impulse(bodies.velocity, bodies.momentum, constraints, bodies, c, (after - before) * c.normal)
 
 
 @wp.func
@@ -230,7 +211,8 @@ def relax_position(constraints: Constraints, bodies: Bodies, c: Point):
     if threshold == zero or constraints.impulse[c.pair, c.column] <= zero:
         after = wp.max(before - mass * (separation - wp.max(bias, zero)), zero)
     constraints.pseudo_impulse[c.pair, c.column] = after
-    apply_pseudo_impulse(constraints, bodies, c, (after - before) * c.normal)
+    change = (after - before) * c.normal
+    apply_impulse(bodies.pseudo_velocity, bodies.pseudo_momentum, constraints, bodies, c, change)
 
 
 @wp.kernel

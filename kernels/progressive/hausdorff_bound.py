@@ -7,7 +7,6 @@ other faces and by those around the merge.
 
 import warp as wp
 
-from warp_abtree.kernels.progressive.polygon import Scratch
 from warp_abtree.kernels.progressive.triangle_cover import (
     FLOOR,
     SLOTS,
@@ -18,7 +17,6 @@ from warp_abtree.kernels.progressive.triangle_cover import (
     cover_triangle,
 )
 from warp_abtree.kernels.progressive.vertex_forest import (
-    Rings,
     absorb_ring,
     count_dying,
     third_corner,
@@ -28,7 +26,7 @@ from warp_abtree.kernels.progressive.vertex_forest import (
 wp.set_module_options({"enable_backward": False})
 
 
-# Entries of `counter`, kept between launches.
+# Entries of `Replay.counter`, kept between launches.
 NEXT_MERGE = wp.constant(0)
 LIVE_FACES = wp.constant(1)
 STAMP = wp.constant(2)
@@ -40,11 +38,11 @@ SEARCH_REACH = wp.constant(wp.float64(2.0**-10))
 
 
 @wp.func
-def set_face(replay: Replay, corner_node: wp.array(dtype=int), f: int):
+def set_face(replay: Replay, f: int):
     """Take an active face's corners from the forest."""
-    a = replay.pos[corner_node[3 * f]]
-    b = replay.pos[corner_node[3 * f + 1]]
-    c = replay.pos[corner_node[3 * f + 2]]
+    a = replay.pos[replay.rings.corner_node[3 * f]]
+    b = replay.pos[replay.rings.corner_node[3 * f + 1]]
+    c = replay.pos[replay.rings.corner_node[3 * f + 2]]
     replay.face_pos[f, 0] = a
     replay.face_pos[f, 1] = b
     replay.face_pos[f, 2] = c
@@ -85,27 +83,27 @@ def release_triangle(replay: Replay, t: int, face_count: int, free: int):
 
 
 @wp.func
-def register_triangle(replay: Replay, scratch: Scratch, t: int, used: int, free: int):
-    """Register triangle t with the faces in scratch.used; return how many pooled slots are left."""
-    register_slot(replay, t, scratch.used[0])
+def register_triangle(replay: Replay, t: int, used: int, free: int):
+    """Register triangle t with the faces in replay.scratch.used; return how many pooled slots are left."""
+    register_slot(replay, t, replay.scratch.used[0])
     for k in range(1, used):
         free -= 1
         slot = replay.free_slot[free]
         replay.slot_triangle[slot] = t
         replay.slot_sibling[slot] = replay.slot_sibling[t]
         replay.slot_sibling[t] = slot
-        register_slot(replay, slot, scratch.used[k])
+        register_slot(replay, slot, replay.scratch.used[k])
     return free
 
 
 @wp.func
-def search_all(replay: Replay, scratch: Scratch, rings: Rings, limit: wp.float64):
+def search_all(replay: Replay, limit: wp.float64):
     """Return the active face with the least bound for the current triangle, or any within `limit`.
 
     The Bvh is of an earlier surface and proposes faces only, dead ones too; their bounds are measured.
     """
-    lower = wp.min(scratch.polygon[0], wp.min(scratch.polygon[1], scratch.polygon[2]))
-    upper = wp.max(scratch.polygon[0], wp.max(scratch.polygon[1], scratch.polygon[2]))
+    lower = wp.min(replay.scratch.polygon[0], wp.min(replay.scratch.polygon[1], replay.scratch.polygon[2]))
+    upper = wp.max(replay.scratch.polygon[0], wp.max(replay.scratch.polygon[1], replay.scratch.polygon[2]))
     best = int(-1)
     bound = wp.float64(wp.inf)
     reach = wp.max(wp.sqrt(limit), SEARCH_REACH)
@@ -116,8 +114,8 @@ def search_all(replay: Replay, scratch: Scratch, rings: Rings, limit: wp.float64
         i = int(0)
         while bound > limit and wp.bvh_query_next(query, i):
             f = replay.bvh_face[i]
-            if rings.corner_node[3 * f] >= 0:
-                distance = cover_distance_sq(replay, scratch, 3, f, bound)
+            if replay.rings.corner_node[3 * f] >= 0:
+                distance = cover_distance_sq(replay, 3, f, bound)
                 if distance < bound:
                     best = f
                     bound = distance
@@ -128,20 +126,20 @@ def search_all(replay: Replay, scratch: Scratch, rings: Rings, limit: wp.float64
 
 
 @wp.func
-def component_vanishes(rings: Rings, a: int, b: int):
+def component_vanishes(replay: Replay, a: int, b: int):
     """Tell whether merging a and b removes the last faces of their connected component."""
-    if rings.degree[a] + rings.degree[b] > 2 * count_dying(rings, a, b):
+    if replay.rings.degree[a] + replay.rings.degree[b] > 2 * count_dying(replay.rings, a, b):
         return False
-    return not third_vertices_live(rings, a, b)
+    return not third_vertices_live(replay.rings, a, b)
 
 
 @wp.func
-def queue_ring(replay: Replay, rings: Rings, queued: int, node: int, stamp: int):
+def queue_ring(replay: Replay, queued: int, node: int, stamp: int):
     """Queue every triangle registered with a live face at a node; return the new count."""
-    k = rings.head[node]
+    k = replay.rings.head[node]
     while k >= 0:
         f = k // 3
-        if rings.corner_node[3 * f] >= 0:
+        if replay.rings.corner_node[3 * f] >= 0:
             slot = replay.face_slot[f]
             while slot >= 0:
                 t = replay.slot_triangle[slot]
@@ -151,28 +149,28 @@ def queue_ring(replay: Replay, rings: Rings, queued: int, node: int, stamp: int)
                     replay.queue_face[queued] = f
                     queued += 1
                 slot = replay.slot_next[slot]
-        k = rings.next[k]
+        k = replay.rings.next[k]
     return queued
 
 
 @wp.func
-def third_rings(replay: Replay, scratch: Scratch, rings: Rings, a: int, b: int, stamp: int):
+def third_rings(replay: Replay, a: int, b: int, stamp: int):
     """Make the faces around the third corners of the faces that die with (a, b) candidates; return their count."""
     near_count = int(0)
-    k = rings.head[a]
+    k = replay.rings.head[a]
     while k >= 0:
         f = k // 3
-        if rings.corner_node[3 * f] >= 0:
-            third = third_corner(f, a, b, rings.corner_node)
+        if replay.rings.corner_node[3 * f] >= 0:
+            third = third_corner(f, a, b, replay.rings.corner_node)
             if third >= 0:
-                other = rings.head[third]
+                other = replay.rings.head[third]
                 while other >= 0:
                     g = other // 3
-                    if rings.corner_node[3 * g] >= 0:
-                        if third_corner(g, a, b, rings.corner_node) < 0:
-                            near_count = add_near(replay, scratch, near_count, stamp, stamp, g)
-                    other = rings.next[other]
-        k = rings.next[k]
+                    if replay.rings.corner_node[3 * g] >= 0:
+                        if third_corner(g, a, b, replay.rings.corner_node) < 0:
+                            near_count = add_near(replay, near_count, stamp, stamp, g)
+                    other = replay.rings.next[other]
+        k = replay.rings.next[k]
     return near_count
 
 
@@ -180,10 +178,8 @@ def third_rings(replay: Replay, scratch: Scratch, rings: Rings, a: int, b: int, 
 def start_replay_kernel(
     face_count: int,
     face_vertex: wp.array2d(dtype=int),
-    corner_node: wp.array(dtype=int),
     # In and out:
     replay_inout: Replay,
-    counter_inout: wp.array(dtype=int),
 ):
     """Register every original triangle with itself (serial, dim=1).
 
@@ -194,95 +190,74 @@ def start_replay_kernel(
     for f in range(face_count):
         for k in range(3):
             replay_inout.triangle_pos[f, k] = replay_inout.pos[face_vertex[f, k]]
-        if corner_node[3 * f] >= 0:
-            set_face(replay_inout, corner_node, f)
+        if replay_inout.rings.corner_node[3 * f] >= 0:
+            set_face(replay_inout, f)
             replay_inout.slot_triangle[f] = f
             register_slot(replay_inout, f, f)
             live += 1
-    counter_inout[LIVE_FACES] = live
+    replay_inout.counter[LIVE_FACES] = live
     pooled = replay_inout.free_slot.shape[0]
     for k in range(pooled):
         replay_inout.free_slot[k] = face_count + pooled - 1 - k
-    counter_inout[FREE_SLOTS] = pooled
+    replay_inout.counter[FREE_SLOTS] = pooled
 
 
 @wp.func
-def cover_queued(
-    replay: Replay,
-    scratch: Scratch,
-    rings: Rings,
-    counter: wp.array(dtype=int),
-    t: int,
-    first: int,
-    near_count: int,
-    shared: int,
-    limit: wp.float64,
-):
+def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: int, limit: wp.float64):
     """Cover triangle t again, with faces around the merge and its other faces; return its squared bound."""
     for k in range(3):
-        scratch.polygon[k] = replay.triangle_pos[t, k]
+        replay.scratch.polygon[k] = replay.triangle_pos[t, k]
     face_count = replay.face_slot.shape[0]
-    free = counter[FREE_SLOTS]
-    scratch.used[0] = first
+    free = replay.counter[FREE_SLOTS]
+    replay.scratch.used[0] = first
     used = int(0)
-    if rings.corner_node[3 * first] >= 0:
-        if cover_distance_sq(replay, scratch, 3, first, limit) <= limit:
+    if replay.rings.corner_node[3 * first] >= 0:
+        if cover_distance_sq(replay, 3, first, limit) <= limit:
             used = int(1)
     if used == 0:
-        own = counter[STAMP] + 1
-        counter[STAMP] = own
+        own = replay.counter[STAMP] + 1
+        replay.counter[STAMP] = own
         slot = t
         while slot >= 0:
             f = replay.slot_face[slot]
-            if rings.corner_node[3 * f] >= 0:
-                near_count = add_near(replay, scratch, near_count, shared, own, f)
+            if replay.rings.corner_node[3 * f] >= 0:
+                near_count = add_near(replay, near_count, shared, own, f)
             slot = replay.slot_sibling[slot]
         if near_count == 0:
-            f = search_all(replay, scratch, rings, limit)
+            f = search_all(replay, limit)
             for k in range(3):
-                near_count = add_ring(replay, scratch, rings, near_count, shared, own, rings.corner_node[3 * f + k])
+                near_count = add_ring(replay, near_count, shared, own, replay.rings.corner_node[3 * f + k])
         free = release_triangle(replay, t, face_count, free)
         room = wp.min(SLOTS, 1 + free)
-        limit, used = cover_triangle(replay, scratch, rings, near_count, shared, own, room, limit)
+        limit, used = cover_triangle(replay, near_count, shared, own, room, limit)
     else:
         free = release_triangle(replay, t, face_count, free)
-    counter[FREE_SLOTS] = register_triangle(replay, scratch, t, used, free)
+    replay.counter[FREE_SLOTS] = register_triangle(replay, t, used, free)
     return limit
 
 
 @wp.func
-def replay_merge(
-    replay: Replay,
-    scratch: Scratch,
-    rings: Rings,
-    counter: wp.array(dtype=int),
-    a: int,
-    b: int,
-    c: int,
-    limit: wp.float64,
-):
+def replay_merge(replay: Replay, a: int, b: int, c: int, limit: wp.float64):
     """Merge nodes a and b into c and cover the triangles of their faces again; return the squared bound."""
-    stamp = counter[STAMP] + 1
-    counter[STAMP] = stamp
-    queued = queue_ring(replay, rings, 0, a, stamp)
-    queued = queue_ring(replay, rings, queued, b, stamp)
-    dying = count_dying(rings, a, b)
+    stamp = replay.counter[STAMP] + 1
+    replay.counter[STAMP] = stamp
+    queued = queue_ring(replay, 0, a, stamp)
+    queued = queue_ring(replay, queued, b, stamp)
+    dying = count_dying(replay.rings, a, b)
     near_count = int(0)
-    if rings.degree[a] + rings.degree[b] == 2 * dying:
-        near_count = third_rings(replay, scratch, rings, a, b, stamp)
-    tail = absorb_ring(rings, a, a, b, c, -1)
-    tail = absorb_ring(rings, b, a, b, c, tail)
-    near_count = add_ring(replay, scratch, rings, near_count, stamp, stamp, c)
-    k = rings.head[c]
+    if replay.rings.degree[a] + replay.rings.degree[b] == 2 * dying:
+        near_count = third_rings(replay, a, b, stamp)
+    tail = absorb_ring(replay.rings, a, a, b, c, -1)
+    tail = absorb_ring(replay.rings, b, a, b, c, tail)
+    near_count = add_ring(replay, near_count, stamp, stamp, c)
+    k = replay.rings.head[c]
     while k >= 0:
-        set_face(replay, rings.corner_node, k // 3)
-        k = rings.next[k]
+        set_face(replay, k // 3)
+        k = replay.rings.next[k]
     for i in range(queued):
-        limit = cover_queued(
-            replay, scratch, rings, counter, replay.queue[i], replay.queue_face[i], near_count, stamp, limit
-        )
-    counter[LIVE_FACES] = counter[LIVE_FACES] - dying
-    counter[QUEUED] = queued
+        limit = cover_queued(replay, replay.queue[i], replay.queue_face[i], near_count, stamp, limit)
+    replay.counter[LIVE_FACES] = replay.counter[LIVE_FACES] - dying
+    replay.counter[QUEUED] = queued
     return limit
 
 
@@ -294,9 +269,6 @@ def replay_merges_kernel(
     merge_pair: wp.array2d(dtype=int),
     # In and out:
     replay_inout: Replay,
-    scratch_inout: Scratch,
-    rings_inout: Rings,
-    counter_inout: wp.array(dtype=int),
     # Out:
     bound_sq_out: wp.array(dtype=wp.float64),
 ):
@@ -307,7 +279,7 @@ def replay_merges_kernel(
         bound_sq_out: Squared running maximum after each merge, normalised, shape [m].
     Invariant: every registered triangle lies within the running maximum of the faces that it is registered with.
     """
-    j = counter_inout[NEXT_MERGE]
+    j = replay_inout.counter[NEXT_MERGE]
     limit = FLOOR * FLOOR
     if j > 0:
         limit = bound_sq_out[j - 1]
@@ -316,14 +288,14 @@ def replay_merges_kernel(
     while searchable and j < merge_count and covers < cover_budget:
         a = merge_pair[j, 0]
         b = merge_pair[j, 1]
-        if 2 * counter_inout[LIVE_FACES] < counter_inout[INDEXED] or counter_inout[INDEXED] == 0:
-            searchable = not component_vanishes(rings_inout, a, b)
+        if 2 * replay_inout.counter[LIVE_FACES] < replay_inout.counter[INDEXED] or replay_inout.counter[INDEXED] == 0:
+            searchable = not component_vanishes(replay_inout, a, b)
         if not searchable:
-            counter_inout[INDEXED] = -1
+            replay_inout.counter[INDEXED] = -1
             break
         c = vertex_count + j
-        limit = replay_merge(replay_inout, scratch_inout, rings_inout, counter_inout, a, b, c, limit)
-        covers += counter_inout[QUEUED] + 1
+        limit = replay_merge(replay_inout, a, b, c, limit)
+        covers += replay_inout.counter[QUEUED] + 1
         bound_sq_out[j] = limit
         j += 1
-    counter_inout[NEXT_MERGE] = j
+    replay_inout.counter[NEXT_MERGE] = j

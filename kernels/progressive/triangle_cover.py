@@ -42,6 +42,9 @@ class Replay:
     linked one.
     """
 
+    counter: wp.array(dtype=int)  # [6], see `hausdorff_bound`
+    rings: Rings  # of the vertex forest
+    scratch: Scratch  # of the current triangle
     pos: wp.array(dtype=wp.vec3d)  # [node_count], normalised
     triangle_pos: wp.array2d(dtype=wp.vec3d)  # [face_count, 3], original triangles
     face_pos: wp.array2d(dtype=wp.vec3d)  # [face_count, 3], current corners of active faces
@@ -62,21 +65,21 @@ class Replay:
 
 
 @wp.func
-def cover_distance_sq(replay: Replay, scratch: Scratch, count: int, f: int, enough: wp.float64):
+def cover_distance_sq(replay: Replay, count: int, f: int, enough: wp.float64):
     """Return the largest squared distance of the current polygon to active face f, or any value above `enough`.
 
     The face's box comes first: a corner farther than `enough` from it decides.
     """
     beyond = wp.max(BOX_SLACK * enough, BOX_MIN)
     for i in range(count):
-        least = box_distance_sq(scratch.polygon[i], replay.face_box[f, 0], replay.face_box[f, 1])
+        least = box_distance_sq(replay.scratch.polygon[i], replay.face_box[f, 0], replay.face_box[f, 1])
         if least > beyond:
             return least
-    return polygon_distance_sq(replay.face_pos, scratch, count, f, enough)
+    return polygon_distance_sq(replay.face_pos, replay.scratch, count, f, enough)
 
 
 @wp.func
-def nearest_face(replay: Replay, scratch: Scratch, count: int, near_count: int, limit: wp.float64):
+def nearest_face(replay: Replay, count: int, near_count: int, limit: wp.float64):
     """Return the candidate with the least bound for the current polygon, or the first within `limit`, and its bound.
 
     -1 and infinity if there is no candidate.
@@ -85,20 +88,20 @@ def nearest_face(replay: Replay, scratch: Scratch, count: int, near_count: int, 
     best_bound = wp.float64(wp.inf)
     i = int(0)
     while i < near_count and best_bound > limit:
-        bound = cover_distance_sq(replay, scratch, count, scratch.near[i], best_bound)
+        bound = cover_distance_sq(replay, count, replay.scratch.near[i], best_bound)
         if bound < best_bound:
-            best = scratch.near[i]
+            best = replay.scratch.near[i]
             best_bound = bound
         i += 1
     return best, best_bound
 
 
 @wp.func
-def point_nearest_face(replay: Replay, scratch: Scratch, near_count: int, p: wp.vec3d):
+def point_nearest_face(replay: Replay, near_count: int, p: wp.vec3d):
     best = int(-1)
     best_distance = wp.float64(wp.inf)
     for i in range(near_count):
-        f = scratch.near[i]
+        f = replay.scratch.near[i]
         gap = box_distance_sq(p, replay.face_box[f, 0], replay.face_box[f, 1])
         if gap <= wp.max(BOX_SLACK * best_distance, BOX_MIN):
             distance = face_distance_sq(replay.face_pos, f, p)
@@ -109,142 +112,120 @@ def point_nearest_face(replay: Replay, scratch: Scratch, near_count: int, p: wp.
 
 
 @wp.func
-def add_near(replay: Replay, scratch: Scratch, near_count: int, shared: int, own: int, f: int):
+def add_near(replay: Replay, near_count: int, shared: int, own: int, f: int):
     """Make face f a candidate unless it is one: `own` stamps those of this triangle, `shared` those of the merge."""
     if replay.face_stamp[f] == shared or replay.face_stamp[f] == own:
         return near_count
     replay.face_stamp[f] = own
-    scratch.near[near_count] = f
+    replay.scratch.near[near_count] = f
     return near_count + 1
 
 
 @wp.func
-def add_ring(replay: Replay, scratch: Scratch, rings: Rings, near_count: int, shared: int, own: int, node: int):
+def add_ring(replay: Replay, near_count: int, shared: int, own: int, node: int):
     """Make every live face at a node a candidate; return the new count."""
-    k = rings.head[node]
+    k = replay.rings.head[node]
     while k >= 0:
-        if rings.corner_node[3 * (k // 3)] >= 0:
-            near_count = add_near(replay, scratch, near_count, shared, own, k // 3)
-        k = rings.next[k]
+        if replay.rings.corner_node[3 * (k // 3)] >= 0:
+            near_count = add_near(replay, near_count, shared, own, k // 3)
+        k = replay.rings.next[k]
     return near_count
 
 
 @wp.func
-def approach_point(
-    replay: Replay,
-    scratch: Scratch,
-    rings: Rings,
-    near_count: int,
-    shared: int,
-    own: int,
-    p: wp.vec3d,
-    limit: wp.float64,
-):
+def approach_point(replay: Replay, near_count: int, shared: int, own: int, p: wp.vec3d, limit: wp.float64):
     """Walk over the active surface towards p, from the nearest candidate until within `limit` or at a local minimum.
 
     Visited faces become candidates. Otherwise a triangle covered by a face at the limit could move to that face's
     neighbours only, and the bound would grow merge by merge.
     Returns the squared distance and the new count.
     """
-    f = point_nearest_face(replay, scratch, near_count, p)
+    f = point_nearest_face(replay, near_count, p)
     distance = face_distance_sq(replay.face_pos, f, p)
     moving = bool(True)
     while moving and distance > limit:
         moving = bool(False)
         i = near_count
         for k in range(3):
-            near_count = add_ring(replay, scratch, rings, near_count, shared, own, rings.corner_node[3 * f + k])
+            near_count = add_ring(replay, near_count, shared, own, replay.rings.corner_node[3 * f + k])
         while i < near_count:
-            other = face_distance_sq(replay.face_pos, scratch.near[i], p)
+            other = face_distance_sq(replay.face_pos, replay.scratch.near[i], p)
             if other < distance:
                 distance = other
-                f = scratch.near[i]
+                f = replay.scratch.near[i]
                 moving = bool(True)
             i += 1
     return distance, near_count
 
 
 @wp.func
-def approach_polygon(
-    replay: Replay,
-    scratch: Scratch,
-    rings: Rings,
-    count: int,
-    near_count: int,
-    shared: int,
-    own: int,
-    limit: wp.float64,
-):
+def approach_polygon(replay: Replay, count: int, near_count: int, shared: int, own: int, limit: wp.float64):
     """Walk towards every corner of the current polygon.
 
     Returns a squared lower bound for any partition over the candidates, and their new count.
     """
     least = wp.float64(0.0)
     for i in range(count):
-        distance, near_count = approach_point(
-            replay, scratch, rings, near_count, shared, own, scratch.polygon[i], limit
-        )
+        distance, near_count = approach_point(replay, near_count, shared, own, replay.scratch.polygon[i], limit)
         least = wp.max(least, distance)
     return least, near_count
 
 
 @wp.func
-def use_face(replay: Replay, scratch: Scratch, count: int, used: int, room: int, f: int):
+def use_face(replay: Replay, count: int, used: int, room: int, f: int):
     """Assign the current polygon to face f, or to a face already used if there is no room for f.
 
     Returns how many faces are used; the chosen one becomes the last entry of `scratch.used`.
     """
     at = int(-1)
     for i in range(used):
-        if scratch.used[i] == f:
+        if replay.scratch.used[i] == f:
             at = i
     if at < 0 and used < room:
-        scratch.used[used] = f
+        replay.scratch.used[used] = f
         return used + 1
     if at < 0:
         best = wp.float64(wp.inf)
         for i in range(used):
-            bound = cover_distance_sq(replay, scratch, count, scratch.used[i], best)
+            bound = cover_distance_sq(replay, count, replay.scratch.used[i], best)
             if bound < best:
                 best = bound
                 at = i
-    other = scratch.used[at]
-    scratch.used[at] = scratch.used[used - 1]
-    scratch.used[used - 1] = other
+    other = replay.scratch.used[at]
+    replay.scratch.used[at] = replay.scratch.used[used - 1]
+    replay.scratch.used[used - 1] = other
     return used
 
 
 @wp.func
-def cover_triangle(
-    replay: Replay, scratch: Scratch, rings: Rings, near_count: int, shared: int, own: int, room: int, limit: wp.float64
-):
+def cover_triangle(replay: Replay, near_count: int, shared: int, own: int, room: int, limit: wp.float64):
     """Cut the current triangle into polygons that each lie near one candidate; list these faces in `scratch.used`.
 
     Returns the squared bound, at least `limit`, and how many faces are used.
     """
-    store_polygon(scratch, 0, 3)
+    store_polygon(replay.scratch, 0, 3)
     top = int(1)
     cuts = int(0)
     used = int(0)
     while top > 0:
         top -= 1
-        count = load_polygon(scratch, top)
-        best, bound = nearest_face(replay, scratch, count, near_count, limit)
+        count = load_polygon(replay.scratch, top)
+        best, bound = nearest_face(replay, count, near_count, limit)
         final = bound <= limit
         if not final:
             before = near_count
-            least, near_count = approach_polygon(replay, scratch, rings, count, near_count, shared, own, limit)
+            least, near_count = approach_polygon(replay, count, near_count, shared, own, limit)
             if near_count > before:
-                best, bound = nearest_face(replay, scratch, count, near_count, limit)
+                best, bound = nearest_face(replay, count, near_count, limit)
             final = bound <= wp.max(SLACK_SQ * least, limit) or cuts >= CUTS
             final = final or top + 4 >= STACK or count + 4 > CORNERS
         if final:
-            used = use_face(replay, scratch, count, used, room, best)
-            if scratch.used[used - 1] != best:
-                bound = cover_distance_sq(replay, scratch, count, scratch.used[used - 1], wp.float64(wp.inf))
+            used = use_face(replay, count, used, room, best)
+            if replay.scratch.used[used - 1] != best:
+                bound = cover_distance_sq(replay, count, replay.scratch.used[used - 1], wp.float64(wp.inf))
             limit = wp.max(limit, bound)
         else:
             cuts += 1
-            over = point_nearest_face(replay, scratch, near_count, polygon_middle(scratch, count))
-            top = split_polygon(replay.face_pos, scratch, count, top, over, FLOOR + MARGIN * wp.sqrt(limit))
+            over = point_nearest_face(replay, near_count, polygon_middle(replay.scratch, count))
+            top = split_polygon(replay.face_pos, replay.scratch, count, top, over, FLOOR + MARGIN * wp.sqrt(limit))
     return limit, used

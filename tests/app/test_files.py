@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.study import write_text
+from bench.tables import write_json
 from warp_abtree.checks import atomic_write as files
 from warp_abtree.checks.atomic_write import SUFFIX, atomic_write, sweep_up
 
@@ -179,7 +179,7 @@ SHARD = "shard-000000000000-000000000001"
     ("write", "name"),
     [
         (write_bytes, "bytes"),
-        (lambda path: write_text(path, "text"), "study.json"),
+        (lambda path: write_json(path, {"study": "x", "parts": {}}), "study.json"),
         (save_model, "model.npz"),
         (record_frames, "rows.csv"),
         (record_frames, "rows.json"),

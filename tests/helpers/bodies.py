@@ -1,4 +1,4 @@
-"""Bodies and scenes that rigid-body tests start from."""
+"""Bodies, models and scenes that tests of motion and of LOD selection start from."""
 
 from functools import cache
 
@@ -61,3 +61,23 @@ def ring_and_ball():
     """Return two models that frames move."""
     ring = trimesh.creation.torus(major_radius=0.5, minor_radius=0.15, major_sections=24, minor_sections=12)
     return ab.Model.load(ring), ab.Model.load(trimesh.creation.icosphere(subdivisions=2, radius=0.4))
+
+
+@cache
+def selection_models():
+    """Return a ring, a ball off its origin, and a box."""
+    ring = trimesh.creation.torus(major_radius=0.5, minor_radius=0.2, major_sections=24, minor_sections=12)
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.4)
+    ball.apply_translation([0.3, -0.2, 0.1])
+    return ab.Model.load(ring), ab.Model.load(ball), ab.Model.load(trimesh.creation.box(), base_faces=6)
+
+
+def strewn(models, count, device, seed=0):
+    """Return a scene with objects of all models and importances at random places."""
+    rng = np.random.default_rng(seed)
+    scene = ab.Scene(device=device)
+    for i in range(count):
+        turn = rng.normal(size=4)
+        pose = np.concatenate([rng.uniform(-4, 4, 3), turn / np.linalg.norm(turn)])
+        scene.add(models[i % len(models)], pose, importance=1 + i // len(models) % 3)
+    return scene

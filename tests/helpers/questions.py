@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 import warp_abtree as ab
-from helpers.samples import sample
+from helpers.samples import contact_poses, sample
 
 QUARTERS = [
     np.eye(3)[list(order)] * np.array(signs)[:, None]
@@ -20,13 +20,44 @@ def sort_rows(rows):
     return rows[np.lexsort(rows.T[::-1])]
 
 
-def ask(device, cases, **options):
-    """Return the result for cases (model a, lod a, pose a, model b, lod b, pose b) in one scene, pair p the p-th."""
+def scene_of(device, cases):
+    """Return a scene of cases (model a, lod a, pose a, model b, lod b, pose b): case p is objects (2 p, 2 p + 1)."""
     scene = ab.Scene(device)
     for model_a, lod_a, pose_a, model_b, lod_b, pose_b in cases:
         scene.add(model_a, pose_a, lod=lod_a)
         scene.add(model_b, pose_b, lod=lod_b)
-    return scene.intersect(np.arange(2 * len(cases)).reshape(-1, 2), **{"output": "faces", **options})
+    return scene
+
+
+def pairs_of(cases):
+    return np.arange(2 * len(cases)).reshape(-1, 2)
+
+
+def ask(device, cases, **options):
+    """Return the result for cases in one scene, pair p the p-th."""
+    return scene_of(device, cases).intersect(pairs_of(cases), **{"output": "faces", **options})
+
+
+def in_a_row(device, name, places):
+    """Return a scene of copies of a sample at places along x."""
+    scene = ab.Scene(device)
+    for x in places:
+        scene.add(sample(name), (x, 0, 0, 0, 0, 0, 1))
+    return scene
+
+
+def random_lod(rng, model, most_faces):
+    """Return a LOD of at most about so many faces, all sizes equally likely on a logarithmic scale."""
+    most = min(most_faces, model.face_count)
+    return model.lod_for(fraction=most ** rng.uniform(0.4, 1.0) / model.face_count)
+
+
+def random_case(rng, names, most_faces):
+    """Return a case of two samples in contact at random LODs."""
+    model_a, model_b = map(sample, names)
+    lods = [random_lod(rng, model, most_faces) for model in (model_a, model_b)]
+    pose_a, pose_b = contact_poses(rng, model_a, lods[0], model_b, lods[1])
+    return model_a, lods[0], pose_a, model_b, lods[1], pose_b
 
 
 def to_matrix(rotation, translation):

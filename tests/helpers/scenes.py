@@ -1,11 +1,13 @@
-"""Scenes, and all that can be read of one."""
+"""Scenes that several tests start from, all that can be read of one, and comparisons of captured frames with them."""
 
 import numpy as np
+import warp as wp
 
 import warp_abtree as ab
-from helpers.samples import raw_state, sample
+from helpers.samples import random_poses, raw_state, sample, stored_state
 
 TURN = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])
+CROWD = ("small ball", "torus", "soup", "lattice soup", "twins", "crumbs", "one", "small ball", "torus")
 
 
 def pair_scene(device):
@@ -26,3 +28,71 @@ def everything(scene):
     held += [array.numpy() for array in (pool.rotation, pool.position, pool.world, pool.is_static, pool.state)]
     held += [value for i in range(scene.object_count) for value in raw_state(scene, i).values()]
     return [np.asarray(value).tobytes() for value in held]
+
+
+def add_objects(device, names=CROWD, seed=0, spread=0.6, **options):
+    scene = ab.Scene(device)
+    for name, pose in zip(names, random_poses(np.random.default_rng(seed), len(names), spread)):
+        scene.add(sample(name), pose, **options)
+    return scene
+
+
+def tops(scene):
+    return np.array([scene.models[m].lod_max for m in scene.object_model])
+
+
+def random_lods(rng, lods, top):
+    """One LOD each: small steps, jumps to the ends and anywhere, and some that stay."""
+    lods = np.clip(lods + rng.integers(-6, 7, len(top)) * rng.choice([0, 1, 1, 4], len(top)), 0, top)
+    jump = rng.random(len(top))
+    lods = np.where(jump < 0.1, rng.integers(0, top + 1), lods)
+    return np.where(jump > 0.93, rng.choice([0, 1]) * top, lods)
+
+
+def replay(frame):
+    """Return a function that replays the frame's graph."""
+    graph = frame.capture()
+    return lambda: wp.capture_launch(graph)
+
+
+def set_lods(frame, lods):
+    frame.lods.assign(np.asarray(lods).astype(np.int32))
+
+
+def check_states(frame, scene):
+    """Check that every object's state in a frame holds the bits of a state built at the scene's LODs."""
+    fresh = ab.Scene(scene.device)
+    for m, lod in zip(scene.object_model, scene.lods):
+        fresh.add(scene.models[m], lod=int(lod))
+    for i in range(scene.object_count):
+        truth = raw_state(fresh, i)
+        state = stored_state(scene.models, frame.batch, frame.batch.objects.pool.state.numpy()[i])
+        for name, value in truth.items():
+            assert np.asarray(value).tobytes() == np.asarray(state[name]).tobytes(), (i, name)
+
+
+def by_pair(result):
+    """Return a result's answers with its pairs in order, each a NumPy array."""
+    order = np.lexsort((result.pairs[:, 1], result.pairs[:, 0]))
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    values = {"pairs": result.pairs[order], "any": result.any[order]}
+    for name in ("count", "apart", "pair_contacts"):
+        if getattr(result, name) is not None:
+            values[name] = getattr(result, name)[order]
+    if result.faces is not None:
+        faces = np.concatenate([rank[result.faces[:, :1]], result.faces[:, 1:]], 1)
+        rows = np.lexsort((faces[:, 2], faces[:, 1], faces[:, 0]))
+        values["faces"] = faces[rows]
+        if result.contacts is not None:
+            values["contacts"] = result.contacts[rows]
+            values["contacts"]["pair"] = values["faces"][:, 0]
+    return values
+
+
+def check_same(result, expected):
+    """Check that two results hold the same answers, whatever the order of their pairs."""
+    got, wanted = by_pair(result), by_pair(expected)
+    assert got.keys() == wanted.keys()
+    for name, value in wanted.items():
+        assert np.array_equal(got[name].astype(value.dtype).tobytes(), value.tobytes()), name

@@ -1,4 +1,4 @@
-"""CollisionManager: the same calls on trimesh's, with FCL behind it; contacts on both surfaces; places given back."""
+"""CollisionManager against trimesh's, which uses FCL; contacts on both surfaces; slots reused and released."""
 
 import gc
 import itertools
@@ -11,11 +11,11 @@ import trimesh
 from oracles.triangle import brute_force_faces
 
 import warp_abtree as ab
-from warp_abtree.interop import collision_manager, nearest
-from warp_abtree.interop import convex_solid as convex
+from warp_abtree.interop import collision_manager, convex_solid, nearest
 
 pytest.importorskip("fcl")
 from trimesh.collision import CollisionManager as TrimeshManager
+from trimesh.transformations import translation_matrix as shift
 
 
 def shapes():
@@ -60,9 +60,13 @@ def fill(managers, rng, count, spread, prefix=""):
             manager.add_object(f"{prefix}{k}", mesh, transform)
 
 
-def bare(answer):
-    """Leave the contacts out of an answer."""
-    return answer[:2] if isinstance(answer, tuple) else answer
+def assert_same_names(theirs, ours, call, *arguments):
+    """Compare one call of both managers, with names and without; return the names. Other managers come in pairs."""
+    theirs_of, ours_of = ([a[k] if isinstance(a, tuple) else a for a in arguments] for k in (0, 1))
+    expected = getattr(theirs, call)(*theirs_of, return_names=True)
+    assert getattr(ours, call)(*ours_of, return_names=True) == expected
+    assert getattr(ours, call)(*ours_of) == getattr(theirs, call)(*theirs_of) == expected[0]
+    return expected[1]
 
 
 # The same answers.
@@ -76,21 +80,14 @@ def test_names_on_random_scenes(device, monkeypatch):
     for spread in (0.8, 1.5, 2.5, 4.0) * 3:
         theirs, ours = both(device)
         fill((theirs, ours), rng, 9, spread)
-        expected = theirs.in_collision_internal(return_names=True)
-        assert ours.in_collision_internal(return_names=True) == expected
-        assert ours.in_collision_internal() == theirs.in_collision_internal() == expected[0]
-        hits, misses = hits + len(expected[1]), misses + 36 - len(expected[1])
+        found = assert_same_names(theirs, ours, "in_collision_internal")
+        hits, misses = hits + len(found), misses + 36 - len(found)
         for mesh in SHAPES.values():
-            transform = random_transform(rng, spread)
-            asked = mesh, transform
-            expected = theirs.in_collision_single(*asked, return_names=True)
-            assert ours.in_collision_single(*asked, return_names=True) == expected
-            assert ours.in_collision_single(*asked) == theirs.in_collision_single(*asked) == expected[0]
+            assert_same_names(theirs, ours, "in_collision_single", mesh, random_transform(rng, spread))
         others = both(device)
         fill(others, rng, 6, spread, "other ")
-        expected = theirs.in_collision_other(others[0], return_names=True)
-        assert ours.in_collision_other(others[1], return_names=True) == expected
-        assert others[1].in_collision_internal(True) == others[0].in_collision_internal(True)
+        assert_same_names(theirs, ours, "in_collision_other", others)
+        assert_same_names(*others, "in_collision_internal")
     assert hits > 50 and misses > 50
 
 
@@ -119,13 +116,13 @@ def test_a_scene_that_changes(device):
 @pytest.mark.parametrize("name", SHAPES)
 def test_solids_as_trimesh_takes_them(device, name):
     mesh = SHAPES[name]
-    assert convex.is_convex(mesh) == mesh.is_convex
+    assert convex_solid.is_convex(mesh) == mesh.is_convex
     crumb = trimesh.creation.icosphere(subdivisions=0, radius=0.01)
     theirs, ours = both(device)
     for manager in (theirs, ours):
         manager.add_object(name, mesh)
     for at in itertools.product((-0.4, 0.0, 0.4), repeat=3):
-        transform = trimesh.transformations.translation_matrix(at)
+        transform = shift(at)
         assert ours.in_collision_single(crumb, transform) == theirs.in_collision_single(crumb, transform)
     surfaces = ab.CollisionManager(device, convex_solids=False)
     surfaces.add_object(name, mesh)
@@ -152,7 +149,7 @@ def test_contacts_lie_on_both_faces(device):
         a, b = sorted(contact.names)
         for name in (a, b):
             gap = distance_to_face(SHAPES[name], placed[name], contact.index(name), contact.point)
-            if gap > 1e-12:  # of a part inside a solid
+            if gap > 1e-12:  # a component inside a solid
                 assert SHAPES[name].is_convex and (contact.segment[0] == contact.segment[1]).all()
                 corner = trimesh.transform_points(SHAPES[name].triangles[contact.index(name)][:1], placed[name])[0]
                 assert abs((contact.point - corner) @ contact.normal) == pytest.approx(contact.depth)
@@ -160,9 +157,9 @@ def test_contacts_lie_on_both_faces(device):
 
 
 def test_face_pairs_against_brute_force(device):
-    """The pair of a contact is a pair of faces that meet, and none is missed; indices are the meshes' own."""
+    """The contacts are exactly the intersecting pairs of faces, with the indices of the meshes."""
     a, b = SHAPES["torus"], SHAPES["cylinder"]
-    transform = trimesh.transformations.translation_matrix((0.5, 0.1, 0.02))
+    transform = shift((0.5, 0.1, 0.02))
     ours = ab.CollisionManager(device)
     ours.add_object("a", a)
     found, names, contacts = ours.in_collision_single(b, transform, return_names=True, return_data=True)
@@ -176,10 +173,10 @@ def test_face_pairs_against_brute_force(device):
     assert names == {("a", "b")} and [[x.index("a"), x.index("b")] for x in contacts] == expected.tolist()
 
 
-def test_a_part_inside_a_solid(device):
+def test_a_component_inside_a_solid(device):
     ours = ab.CollisionManager(device)
-    ours.add_object("box", SHAPES["large box"], trimesh.transformations.translation_matrix((5, 0, 0)))
-    crumb, at = trimesh.creation.box((0.2, 0.2, 0.2)), trimesh.transformations.translation_matrix((5.5, 0, 0))
+    ours.add_object("box", SHAPES["large box"], shift((5, 0, 0)))
+    crumb, at = trimesh.creation.box((0.2, 0.2, 0.2)), shift((5.5, 0, 0))
     inner = ab.CollisionManager(device)
     inner.add_object("crumb", crumb, at)
     for answer in (ours.in_collision_single(crumb, at, True, True), ours.in_collision_other(inner, True, True)):
@@ -189,10 +186,10 @@ def test_a_part_inside_a_solid(device):
         assert contact.depth == pytest.approx(0.6) and contact.point[0] == pytest.approx(5.4)
         assert np.allclose(contact.normal, [1, 0, 0])
         assert (SHAPES["large box"].triangles[contact.index("box")][:, 0] == 1).all()
-    # One part out of several is enough, and the name of the solid may come second.
+    # One component of several is enough, and the solid may be the second of the pair.
     parts = trimesh.util.concatenate([crumb, crumb.copy().apply_translation((50, 0, 0))])
-    assert ours.in_collision_single(parts, trimesh.transformations.translation_matrix((-45, 0, 0)))
-    assert not ours.in_collision_single(parts, trimesh.transformations.translation_matrix((-40, 0, 0)))
+    assert ours.in_collision_single(parts, shift((-45, 0, 0)))
+    assert not ours.in_collision_single(parts, shift((-40, 0, 0)))
     hollow = ab.CollisionManager(device)
     hollow.add_object("crumb", crumb)
     assert hollow.in_collision_single(SHAPES["large box"]) and not hollow.in_collision_single(SHAPES["torus"])
@@ -212,9 +209,9 @@ def test_distances_on_random_scenes(device, monkeypatch, chunk):
         fill((theirs, ours), rng, 5, spread)
         others = both(device)
         fill(others, rng, 4, spread, "other ")
-        asked = [("internal", (None,)), *(("internal", (f"{k}",)) for k in range(5)), ("other", ())]
-        asked += [("single", (mesh, random_transform(rng, spread))) for mesh in SHAPES.values()]
-        for kind, arguments in asked:
+        calls = [("internal", (None,)), *(("internal", (f"{k}",)) for k in range(5)), ("other", ())]
+        calls += [("single", (mesh, random_transform(rng, spread))) for mesh in SHAPES.values()]
+        for kind, arguments in calls:
             named = {"return_name" if kind == "single" else "return_names": True}
             expected, found = (
                 getattr(manager, f"min_distance_{kind}")(*(arguments if kind != "other" else (other,)), **named)
@@ -280,15 +277,13 @@ def test_known_distances(device, gap):
     fine = trimesh.creation.box((1, 1, 1)).subdivide().subdivide().subdivide()
     ours = ab.CollisionManager(device)
     ours.add_object("a", fine)
-    distance, data = ours.min_distance_single(
-        fine, trimesh.transformations.translation_matrix((1 + gap, 0, 0)), return_data=True
-    )
+    distance, data = ours.min_distance_single(fine, shift((1 + gap, 0, 0)), return_data=True)
     assert distance == pytest.approx((1 + gap) - 1, rel=1e-12)
     assert data.point("a")[0] == 0.5 and data.point("__external")[0] == pytest.approx(0.5 + gap, rel=1e-15)
     assert ours.min_distance_single(fine, np.eye(4)) == 0
 
 
-def test_nothing_to_ask(device):
+def test_managers_without_objects(device):
     theirs, ours = both(device)
     ball = SHAPES["ball"]
     assert ours.in_collision_internal(True, True) == theirs.in_collision_internal(True, True) == (False, set(), [])
@@ -301,7 +296,7 @@ def test_nothing_to_ask(device):
     assert ours.in_collision_internal(True) == (False, set()) and ours.min_distance_internal() == math.inf
 
 
-# Objects that come and go.
+# Objects added and removed.
 
 
 def test_replaced_and_changed_meshes(device):
@@ -309,7 +304,7 @@ def test_replaced_and_changed_meshes(device):
     mesh = trimesh.creation.box((1, 1, 1))
     ours.add_object("a", mesh)
     ball = SHAPES["ball"]
-    at = trimesh.transformations.translation_matrix((1.2, 0, 0))
+    at = shift((1.2, 0, 0))
     assert not ours.in_collision_single(ball, at)
     mesh.apply_scale(2)
     assert not ours.in_collision_single(ball, at), "what was added stays as it was"
@@ -320,15 +315,15 @@ def test_replaced_and_changed_meshes(device):
     assert not ours.in_collision_single(ball, at)
 
 
-def test_places_are_used_again_and_given_up(device):
+def test_slots_are_reused_and_released(device):
     ours = ab.CollisionManager(device)
     for k in range(4):
-        ours.add_object(k, SHAPES["ball"], trimesh.transformations.translation_matrix((0.7 * k, 0, 0)))
+        ours.add_object(k, SHAPES["ball"], shift((0.7 * k, 0, 0)))
     expected = {(0, 1), (1, 2), (2, 3)}
     assert ours.in_collision_internal(True) == (True, expected)
     other = ab.CollisionManager(device)
     for k in range(30):
-        other.add_object(k, SHAPES["torus"], trimesh.transformations.translation_matrix((0, 0, 0.4 * k)))
+        other.add_object(k, SHAPES["torus"], shift((0, 0, 0.4 * k)))
     before = ours._placed.scene
     for _ in range(3):
         ours.in_collision_single(SHAPES["box"])
@@ -337,7 +332,7 @@ def test_places_are_used_again_and_given_up(device):
     assert ours._placed.scene is before and ours._placed.scene.object_count == 5
     answers = [ours.in_collision_other(other, True) for _ in range(3)]
     assert answers[0] == answers[1] == answers[2] and len(answers[0][1]) > 2
-    assert ours._placed.scene.object_count == 4, "more places left than taken, and than 16"
+    assert ours._placed.scene.object_count == 4, "more slots are free than used, and than 16"
     assert ours.in_collision_internal(True) == (True, expected)
     assert other.in_collision_internal(True)[0] and other._placed.scene.object_count == 30
     arrays = ours._placed.scene.batch()
@@ -347,7 +342,7 @@ def test_places_are_used_again_and_given_up(device):
     assert ours._placed.scene.object_count == 5 and ours._placed.scene.batch() is not arrays
     arrays = ours._placed.scene.batch()
     ours.in_collision_single(SHAPES["ball"])
-    assert ours._placed.scene.batch() is arrays, "the second time nothing is made anew"
+    assert ours._placed.scene.batch() is arrays, "the second call uploads nothing but poses"
 
 
 def test_equal_meshes_share_a_model_that_goes_with_them(device):
@@ -357,21 +352,21 @@ def test_equal_meshes_share_a_model_that_goes_with_them(device):
         manager.add_object(k, mesh.copy())
     model = managers[0]._placed.scene.models[0]
     assert managers[1]._placed.scene.models == [model]
-    gone, known = weakref.ref(model), len(convex._SHAPES)
+    gone, known = weakref.ref(model), len(convex_solid._SHAPES)
     del managers, manager, model
     gc.collect()
-    assert gone() is None and len(convex._SHAPES) < known
+    assert gone() is None and len(convex_solid._SHAPES) < known
 
 
 def test_models_as_meshes(device):
     model = ab.Model.load(SHAPES["torus"])
     ours = ab.CollisionManager(device)
     ours.add_object("a", model)
-    ours.add_object("b", model, trimesh.transformations.translation_matrix((0.5, 0, 0)))
+    ours.add_object("b", model, shift((0.5, 0, 0)))
     assert ours.in_collision_internal() and ours._placed.scene.models == [model]
 
 
-# What is refused, before anything changes.
+# Bad input, refused before anything changes.
 
 
 def test_bad_input(device):

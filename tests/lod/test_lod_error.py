@@ -82,15 +82,13 @@ def test_no_vertex_lies_beyond_the_error():
 def cover_triangle_kernel(
     room: int,
     replay: Replay,
-    scratch: Scratch,
-    rings: Rings,
     used_out: wp.array(dtype=int),
     bound_sq_out: wp.array(dtype=wp.float64),
 ):
     """Cover the current triangle, beginning at the one face in scratch.near (serial, dim=1)."""
     for k in range(3):
-        scratch.polygon[k] = replay.triangle_pos[0, k]
-    bound_sq, used = cover_triangle(replay, scratch, rings, 1, 1, 1, room, FLOOR * FLOOR)
+        replay.scratch.polygon[k] = replay.triangle_pos[0, k]
+    bound_sq, used = cover_triangle(replay, 1, 1, 1, room, FLOOR * FLOOR)
     used_out[0] = used
     bound_sq_out[0] = bound_sq
 
@@ -130,8 +128,9 @@ def test_a_cover_on_fewer_faces_than_it_wants_is_measured_again(device, room):
     scratch.stack_count = filled(int(STACK), 0)
     scratch.polygon = wp.zeros(int(CORNERS), dtype=wp.vec3d, device=device)
     scratch.clipped = wp.zeros(int(CORNERS), dtype=wp.vec3d, device=device)
+    replay.scratch, replay.rings = scratch, rings
     used, bound_sq = filled(1, 0), wp.zeros(1, dtype=wp.float64, device=device)
-    wp.launch(cover_triangle_kernel, 1, [room, replay, scratch, rings], [used, bound_sq], device=device)
+    wp.launch(cover_triangle_kernel, 1, [room, replay], [used, bound_sq], device=device)
     count, bound = int(used.numpy()[0]), float(np.sqrt(bound_sq.numpy()[0]))
     assert count == room if room <= 5 else count > 5, "there is no want of room here"
     surface = [exact(vertices[faces[f]]) for f in scratch.used.numpy()[:count].tolist()]

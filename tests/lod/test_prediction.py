@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.lods import selection_models, strewn
+from helpers.bodies import selection_models, strewn
 
 from warp_abtree.lod.selection import PredictedSelection, tolerance_scale
 from warp_abtree.lod.view import View

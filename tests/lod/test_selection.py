@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import warp as wp
-from helpers.lods import selection_models, strewn
+from helpers.bodies import selection_models, strewn
 
 import warp_abtree as ab
 from warp_abtree.lod.selection import PaperSelection, PredictedSelection, ToleranceSelection

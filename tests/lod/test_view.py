@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from helpers.lods import selection_models, strewn
+from helpers.bodies import selection_models, strewn
 
 from warp_abtree.lod.view import Camera, View
 

@@ -304,17 +304,6 @@ def test_bad_input_is_refused():
     for lod in (-1, progressive.lod_max + 1, 0.5):
         with pytest.raises(ValueError, match="lod"):
             progressive.mesh_at(lod)
-    broken = mesh.vertices.copy()
-    broken[3, 1] = np.nan
-    for vertices, faces in (
-        (broken, mesh.faces),
-        (mesh.vertices, mesh.faces + 1),
-        (mesh.vertices, mesh.faces[:0]),
-        (mesh.vertices, mesh.faces[:, :2]),
-        (mesh.vertices, np.zeros((4, 3), int)),
-    ):
-        with pytest.raises(ValueError):
-            build_progressive(SimpleNamespace(vertices=vertices, faces=faces))
 
 
 @pytest.mark.parametrize("name", REAL_MESHES)

@@ -347,32 +347,3 @@ def set_lod(tree, lod):
     sets = tree.mesh.sets_between(tree.lod, lod)
     tree.lod = lod
     return active_update(*sets, tree)
-
-
-def active_intersect(tree_a, tree_b, overlap, primitive_test):
-    """ACTIVE-INTERSECT(T, T'): all intersecting pairs of active primitives.
-
-    The paper leaves open which node of a pair to open: here the one nearer to its root.
-
-    Args:
-        overlap: overlap(range_a, range_b) -> bool, ranges as (lower, upper) about the respective model's centre; it
-            places the boxes, and may only answer False where they are apart.
-        primitive_test: primitive_test(face_a, face_b) -> bool.
-    """
-    hits = []
-
-    def visit(x, y):
-        if x.status != ACTIVE or y.status != ACTIVE or not overlap(x.range, y.range):
-            return
-        if x.is_leaf and y.is_leaf:
-            if primitive_test(x.index, y.index):
-                hits.append((x.index, y.index))
-        elif y.is_leaf or (not x.is_leaf and x.number <= y.number):
-            visit(x.left, y)
-            visit(x.right, y)
-        else:
-            visit(x, y.left)
-            visit(x, y.right)
-
-    visit(tree_a.root, tree_b.root)
-    return sorted(hits)

@@ -6,7 +6,7 @@ import random
 import numpy as np
 import pytest
 import trimesh
-from helpers.samples import STILL, random_poses
+from helpers.samples import random_poses
 
 from oracles import abtree, triangle
 from oracles.peers import fcl_faces, judge
@@ -243,68 +243,6 @@ def test_split_is_the_median_on_the_longest_axis():
     position = [p for y in (9, 4, 4, 0) for p in ((0, y, 0), (1, y, 0), (0, y + 1, 0))]
     mesh = abtree.Progressive([-1] * 12, position, np.arange(12).reshape(4, 3).tolist(), [0] * 4, [0], [])
     assert [leaf.number for leaf in abtree.active_build(mesh).leaf] == [7, 5, 6, 4]
-
-
-def mark_as_printed(removed, deformed, inserted, tree):
-    """Algorithm 2 to the letter, for a tree in which every node but a leaf has both children."""
-    for x in removed:
-        while x is not None and x.parent is not None:
-            sibling = x.parent.left if x is x.parent.right else x.parent.right
-            if sibling.status == abtree.INACTIVE:
-                x.status = abtree.INACTIVE
-                return
-            x = x.parent
-    for x in deformed + inserted:
-        while x is not None:
-            x.status, x = abtree.DEFORMED, x.parent
-
-
-def test_erratum_of_algorithm_2():
-    """The printed marking leaves a removed leaf active, and drops the rest at the first inactive sibling."""
-    tree = abtree.active_build(soup_mesh(4, 3))
-    a, b, c = tree.root.left.left, tree.root.left.right, tree.root.right.left
-    for node in tree.nodes():
-        node.status = abtree.ACTIVE
-    mark_as_printed([a], [], [], tree)
-    assert a.status == abtree.ACTIVE
-    a.status = abtree.INACTIVE
-    mark_as_printed([b], [c], [], tree)
-    assert (b.status, tree.root.left.status, c.status) == (abtree.INACTIVE, abtree.ACTIVE, abtree.ACTIVE)
-    a.status = b.status = tree.root.left.status = abtree.ACTIVE
-    abtree.active_mark([], [a.index, b.index], [c.index], tree)
-    marked = [a, b, tree.root.left, c, tree.root.right, tree.root]
-    assert [x.status for x in marked] == [abtree.INACTIVE] * 3 + [abtree.DEFORMED] * 3
-
-
-def test_intersect_finds_every_pair():
-    one, two = ball_mesh(1), ball_mesh(2)
-    two.vertex_pos = [[x + 0.7, y + 0.4, z - 0.2] for x, y, z in two.vertex_pos]
-    shift = [q - p for p, q in zip(one.centre(), two.centre(), strict=True)]
-    lod_a, lod_b = one.lod_max // 2, two.lod_max // 3
-    tree_a, tree_b = abtree.active_build(one, lod_a), abtree.active_build(two, lod_b)
-
-    def overlap(a, b):
-        slack = 1e-6
-        return all(a[0][k] <= b[1][k] + shift[k] + slack and b[0][k] + shift[k] <= a[1][k] + slack for k in range(3))
-
-    def primitive_test(f, g):
-        return triangle.triangles_intersect(
-            [one.vertex_pos[v] for v in one.corners(f, lod_a)], [two.vertex_pos[v] for v in two.corners(g, lod_b)]
-        )
-
-    faces_a = [f for f in range(len(one.face_vertex)) if one.is_active(f, lod_a)]
-    faces_b = [g for g in range(len(two.face_vertex)) if two.is_active(g, lod_b)]
-    expected = triangle.brute_force_faces(
-        one.vertex_pos,
-        [one.corners(f, lod_a) for f in faces_a],
-        two.vertex_pos,
-        [two.corners(g, lod_b) for g in faces_b],
-        STILL,
-        STILL,
-    )
-    hits = abtree.active_intersect(tree_a, tree_b, overlap, primitive_test)
-    assert hits == [(faces_a[i], faces_b[j]) for i, j in expected]
-    assert len(hits) > 10
 
 
 # --- peers -----------------------------------------------------------------------------------------------------------

@@ -83,9 +83,9 @@ objects = st.lists(
 @given(objects, st.lists(st.tuples(st.integers(0, 24), st.integers(0, 24)), max_size=8))
 def test_random_scenes_equal_brute_force(device, things, excluded):
     """Positions on a lattice, so that boxes often touch."""
-    names, positions, turns, worlds, statics, lods = zip(*things, strict=True)
-    turns = np.array(turns) / np.linalg.norm(turns, axis=1, keepdims=True)
-    poses = np.concatenate([0.5 * np.array(positions), turns], 1)
+    names, positions, quaternions, worlds, statics, lods = zip(*things, strict=True)
+    quaternions = np.array(quaternions) / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    poses = np.concatenate([0.5 * np.array(positions), quaternions], 1)
     scene = make_scene(device, [sample(name) for name in names], poses, worlds, statics, lods)
     check_pairs(scene, poses, worlds, statics)
     excluded = [(i, j) for i, j in excluded if i != j and max(i, j) < len(things)]

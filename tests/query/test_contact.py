@@ -273,20 +273,21 @@ def test_two_faces(device, other, ends, normal, coplanar):
             np.testing.assert_allclose(contact["normal"], turn * np.array(normal) / np.linalg.norm(normal), atol=1e-15)
 
 
-@pytest.mark.parametrize("other", ["cross", "line", "touch"])
-def test_two_segments(device, other):
+@pytest.mark.parametrize(
+    "other, ends",
+    [
+        ([(0.5, -1, 0), (0.5, 1, 0), (0.5, 3, 0)], [(0.5, 0, 0)] * 2),
+        ([(1.5, 0, 0), (2, 0, 0), (4, 0, 0)], [(1.5, 0, 0), (2, 0, 0)]),
+        ([(2, 0, 0), (2, 0, 1), (2, 0, 2)], [(2, 0, 0)] * 2),
+    ],
+    ids=["across", "along", "touching"],
+)
+def test_two_segments(device, other, ends):
     """Faces without area have no normals; the contact's points from one centre to the other."""
-    a = [(0, 0, 0), (1, 0, 0), (2, 0, 0)]
-    b = {
-        "cross": [(0.5, -1, 0), (0.5, 1, 0), (0.5, 3, 0)],
-        "line": [(1.5, 0, 0), (2, 0, 0), (4, 0, 0)],
-        "touch": [(2, 0, 0), (2, 0, 1), (2, 0, 2)],
-    }[other]
-    ends = {"cross": [(0.5, 0, 0)] * 2, "line": [(1.5, 0, 0), (2, 0, 0)], "touch": [(2, 0, 0)] * 2}[other]
-    contact, _ = one_pair(device, a, b)
+    contact, _ = one_pair(device, [(0, 0, 0), (1, 0, 0), (2, 0, 0)], other)
     np.testing.assert_array_equal(sorted(map(tuple, (contact["p0"], contact["p1"]))), ends)
     assert not contact["normal_a"].any() and not contact["normal_b"].any() and not contact["coplanar"]
-    direction = (np.min(b, 0) + np.max(b, 0)) / 2 - [1, 0, 0]
+    direction = (np.min(other, 0) + np.max(other, 0)) / 2 - [1, 0, 0]
     np.testing.assert_allclose(contact["normal"], direction / np.linalg.norm(direction), atol=1e-6)
 
 

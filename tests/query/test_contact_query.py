@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from helpers.contacts import CHUNK, check_summaries
+from helpers.questions import in_a_row, pairs_of, scene_of
 from helpers.samples import STILL, contact_poses, random_poses, sample
 
 import warp_abtree as ab
@@ -40,14 +41,13 @@ def test_sums_of_every_length(device, points):
 def touching(device, names=("ball", "torus", "soup", "lattice soup"), pairs=12, seed=0):
     """A scene of pairs of objects (2 p, 2 p + 1) in contact, and one object far away."""
     rng = np.random.default_rng(seed)
-    scene = ab.Scene(device)
+    cases = []
     for p in range(pairs):
-        models = [sample(names[p % len(names)]), sample(names[(p // 2 + 1) % len(names)])]
-        poses = contact_poses(rng, models[0], models[0].lod_max, models[1], models[1].lod_max)
-        for model, pose in zip(models, poses):
-            scene.add(model, pose)
-    scene.add(models[0], (50.0, 0, 0, 0, 0, 0, 1))
-    pairs = np.arange(2 * pairs).reshape(-1, 2)
+        a, b = sample(names[p % len(names)]), sample(names[(p // 2 + 1) % len(names)])
+        poses = contact_poses(rng, a, a.lod_max, b, b.lod_max)
+        cases.append((a, None, poses[0], b, None, poses[1]))
+    scene, pairs = scene_of(device, cases), pairs_of(cases)
+    scene.add(sample("ball"), (50.0, 0, 0, 0, 0, 0, 1))
     pairs[1::2] = pairs[1::2, ::-1]
     return scene, np.concatenate([pairs, [(0, len(pairs) * 2)], pairs[:3]])
 
@@ -171,10 +171,7 @@ def test_nothing_to_find(device):
 
 def test_other_poses_and_distances(device):
     """A query goes on with the poses of each launch, and proves distances beside contacts."""
-    ball = sample("ball")
-    scene = ab.Scene(device)
-    for x in (0, 1.5, 4):
-        scene.add(ball, (x, 0, 0, 0, 0, 0, 1))
+    scene = in_a_row(device, "ball", (0, 1.5, 4))
     query = ab.ContactQuery(scene, [(0, 1), (1, 2), (0, 2)], within=1.0)
     np.testing.assert_array_equal(query.run().apart, [False, False, True])
     first = query.result()

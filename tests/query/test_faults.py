@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from helpers.faults import Interruption, MemoryShortage
-from helpers.gpu_query import GpuQuery
-from helpers.resources import (
+from helpers.faults import (
     MORE_PAIRS,
     PAIRS,
+    Interruption,
+    MemoryShortage,
     add_objects,
     check_buffer_lengths,
     check_scene,
     describe,
     make_scene,
 )
+from helpers.gpu_query import GpuQuery
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab

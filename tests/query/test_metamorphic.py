@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import slow
 from helpers.gpu_query import GpuQuery
-from helpers.questions import QUARTERS, ask, coarse, sort_rows, to_matrix
+from helpers.questions import QUARTERS, ask, coarse, pairs_of, scene_of, sort_rows, to_matrix
 from helpers.samples import contact_poses, random_poses, sample, true_faces
 from oracles.triangle import pose_matrix, relative_pose
 
@@ -42,11 +42,11 @@ def grid_poses(names, count=3):
     poses = []
     for _ in range(count):
         (a, *_), (b, *_) = map(grid_mesh, names)
-        turns = [QUARTERS[k] for k in rng.integers(0, len(QUARTERS), 2)]
+        rotations = [QUARTERS[k] for k in rng.integers(0, len(QUARTERS), 2)]
         place = rng.integers(-1000, 1000, 3) / GRID
         p, q = 0.875 * a[rng.integers(len(a))], 0.875 * b[rng.integers(len(b))]
-        goal = turns[0] @ p + place - turns[1] @ q
-        poses.append((to_matrix(turns[0], place), to_matrix(turns[1], np.round(goal * GRID) / GRID)))
+        goal = rotations[0] @ p + place - rotations[1] @ q
+        poses.append((to_matrix(rotations[0], place), to_matrix(rotations[1], np.round(goal * GRID) / GRID)))
     if names[0] == names[1]:
         poses[-1] = poses[-1][:1] * 2
     return poses
@@ -59,12 +59,8 @@ def ask_models(device, model_a, model_b, poses):
 
 
 def ask_query(make_query, device, cases):
-    """Return the result for cases, as `ask` takes them, from a query of some kind."""
-    scene = ab.Scene(device)
-    for model_a, _, pose_a, model_b, _, pose_b in cases:
-        scene.add(model_a, pose_a)
-        scene.add(model_b, pose_b)
-    return make_query(scene, "faces", pairs=np.arange(2 * len(cases)).reshape(-1, 2)).run()
+    """Return the result for cases from a query of some kind."""
+    return make_query(scene_of(device, cases), "faces", pairs=pairs_of(cases)).run()
 
 
 def check_equal(found, expected):
@@ -92,15 +88,9 @@ def plain(device, names, models):
 
 @pytest.mark.slow
 def test_swapped_objects(device, names, models, plain):
-    """As A and B, and as first and second of a pair: four ways to ask one question."""
+    """As A and B; test_intersect names pairs the other way round."""
     swapped = ask_models(device, *models[::-1], [pair[::-1] for pair in grid_poses(names)])
     check_equal([sort_rows(rows[:, ::-1]) for rows in swapped], plain)
-    scene = ab.Scene(device)
-    for poses in grid_poses(names):
-        for model, pose in zip(models, poses, strict=True):
-            scene.add(model, pose)
-    result = scene.intersect([(2 * p + 1, 2 * p) for p in range(len(plain))], output="faces")
-    check_equal([sort_rows(result.faces[result.faces[:, 0] == p][:, :0:-1]) for p in range(len(plain))], plain)
 
 
 def test_common_motion(device, names, models, plain):

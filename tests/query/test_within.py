@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import warp as wp
+from helpers.questions import in_a_row, pairs_of, random_case, random_lod, scene_of
 from helpers.samples import SHAPES, STILL, contact_poses, random_poses, sample
 from oracles.distance import brute_distances
 from oracles.peers import fcl_distance
@@ -50,27 +51,13 @@ def mesh_distance(model_a, lod_a, pose_a, model_b, lod_b, pose_b):
     return surface_distance(vertices_a[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b])
 
 
-def small_lod(rng, model, faces=FACES):
-    return model.lod_for(fraction=min(1.0, rng.uniform(0.1, 1) * faces / model.face_count))
-
-
 def posed_pairs(rng, device, pairs, faces=FACES, gap=2.0):
-    """Return a scene of objects (2 p, 2 p + 1), in contact or moved apart by up to a gap, and what each object is."""
-    scene, cases = ab.Scene(device), []
-    for names in pairs:
-        model_a, model_b = map(sample, names)
-        lods = [small_lod(rng, model, faces) for model in (model_a, model_b)]
-        pose_a, pose_b = contact_poses(rng, model_a, lods[0], model_b, lods[1])
+    """Return a scene and its cases, of pairs of samples in contact or moved apart by up to a gap."""
+    cases = [random_case(rng, names, faces) for names in pairs]
+    for case in cases:
         away = rng.normal(size=3)
-        pose_b[:3] += (1 + gap * rng.random()) * away / np.linalg.norm(away) * (rng.random() < 0.7)
-        scene.add(model_a, pose_a, lod=lods[0])
-        scene.add(model_b, pose_b, lod=lods[1])
-        cases.append((model_a, lods[0], pose_a, model_b, lods[1], pose_b))
-    return scene, cases
-
-
-def pairs_of(cases):
-    return np.arange(2 * len(cases)).reshape(-1, 2)
+        case[5][:3] += (1 + gap * rng.random()) * away / np.linalg.norm(away) * (rng.random() < 0.7)
+    return scene_of(device, cases), cases
 
 
 def check_distances(scene, pairs, distances, close=1e-9):
@@ -103,7 +90,7 @@ def test_equals_brute_force(device):
 def test_single_faces_equal_brute_force(device, kind):
     """All ways in which two triangles can be closest, parallel ones and faces without area too."""
     rng = np.random.default_rng(2)
-    scene, cases = ab.Scene(device), []
+    cases = []
     for _ in range(200):
         a, b = rng.normal(size=(2, 3, 3))
         b += rng.normal(size=3) * 2
@@ -125,9 +112,8 @@ def test_single_faces_equal_brute_force(device, kind):
         if min(len(np.unique(a, axis=0)), len(np.unique(b, axis=0))) < 3:
             continue
         models = [ab.Model.from_arrays(corners, [(0, 1, 2)]) for corners in (a, b)]
-        for model in models:
-            scene.add(model)
         cases.append((models[0], 0, STILL, models[1], 0, STILL))
+    scene = scene_of(device, cases)
     distances = distances_of(scene, cases)
     assert (distances > 0).sum() > 100
     check_distances(scene, pairs_of(cases), distances)
@@ -154,17 +140,16 @@ def test_coarse_proof_holds_for_the_original_meshes(device):
     """Apart by more than both errors at any LODs: then the finest meshes do not intersect."""
     rng = np.random.default_rng(4)
     names = ("torus", "ball", "capsule", "soup")
-    coarse, fine, within = ab.Scene(device), ab.Scene(device), []
+    cases, within = [], []
     for _ in range(300):
-        pair = [sample(name) for name in rng.choice(names, 2)]
-        lods = [int(model.lod_max * rng.random() ** 0.3) for model in pair]
-        poses = contact_poses(rng, pair[0], lods[0], pair[1], lods[1])
+        a, b = [sample(name) for name in rng.choice(names, 2)]
+        lods = [int(model.lod_max * rng.random() ** 0.3) for model in (a, b)]
+        poses = contact_poses(rng, a, lods[0], b, lods[1])
         poses[1][:3] += rng.normal(size=3) * rng.random()
-        for model, lod, pose in zip(pair, lods, poses, strict=True):
-            coarse.add(model, pose, lod=lod)
-            fine.add(model, pose)
-        within.append(sum(model.error_at(lod) for model, lod in zip(pair, lods, strict=True)))
-    pairs = np.arange(600).reshape(-1, 2)
+        cases.append((a, lods[0], poses[0], b, lods[1], poses[1]))
+        within.append(a.error_at(lods[0]) + b.error_at(lods[1]))
+    coarse, pairs = scene_of(device, cases), pairs_of(cases)
+    fine = scene_of(device, [(a, None, pose_a, b, None, pose_b) for a, _, pose_a, b, _, pose_b in cases])
     result, truth = coarse.intersect(pairs, within=within), fine.intersect(pairs)
     assert not (result.apart & truth.any).any()
     assert result.apart.sum() > 30 and (~result.apart & ~truth.any).sum() > 5
@@ -193,10 +178,8 @@ def test_scaling_by_a_power_of_two_changes_nothing(device, exponent):
     for name in ("soup", "small ball"):
         vertices, faces = SHAPES[name]()
         models[sample(name)] = ab.Model.from_arrays(np.ldexp(vertices, exponent), faces, base_faces=4)
-    scaled = ab.Scene(device)
-    for case in cases:
-        for model, lod, pose in (case[:3], case[3:]):
-            scaled.add(models[model], pose * ([2.0**exponent] * 3 + [1] * 4), lod=lod)
+    by = np.array([2.0**exponent] * 3 + [1] * 4)
+    scaled = scene_of(device, [(models[a], i, by * p, models[b], j, by * q) for a, i, p, b, j, q in cases])
     distances = distances_of(plain, cases)
     for factor in (0, 1 - 1e-13, 1 - 1e-15, 1, 1 + 1e-15, 1 + 1e-13, 2):
         one = plain.intersect(pairs_of(cases), within=factor * distances)
@@ -211,16 +194,15 @@ def test_far_from_the_origin(device, far):
     shift = np.array([far, -far, 0.3 * far, 0, 0, 0, 0])
     vertices, faces, _ = sample("small ball").mesh_at(sample("small ball").lod_max)
     remote = ab.Model.from_arrays(vertices + shift[:3], faces, base_faces=4)
-    scene, cases = ab.Scene(device), []
+    cases = []
     for k in range(20):
         model = remote if k % 2 else sample("torus")
-        lod, other = small_lod(rng, model), sample("soup")
+        lod, other = random_lod(rng, model, FACES), sample("soup")
         pose_a, pose_b = contact_poses(rng, model, lod, other, 40)
         pose_b[:3] += 3 * rng.normal(size=3)
         case = (model, lod, pose_a + shift, other, 40, pose_b + shift)
         cases.append((*case[3:], *case[:3]) if k % 4 < 2 else case)
-        for x in (cases[-1][:3], cases[-1][3:]):
-            scene.add(x[0], x[2], lod=x[1])
+    scene = scene_of(device, cases)
     distances = distances_of(scene, cases)
     assert (distances > 0.01).sum() > 5
     distances[distances < 0.01] = 0
@@ -230,9 +212,7 @@ def test_far_from_the_origin(device, far):
 
 @pytest.mark.parametrize("far", [1e9, 1e30, 1e39, 1e299])
 def test_far_pairs_and_huge_distances(device, far):
-    scene = ab.Scene(device)
-    for x in (0, far, -far):
-        scene.add(sample("box"), (x, 0, 0, 0, 0, 0, 1))
+    scene = in_a_row(device, "box", (0, far, -far))
     pairs = [(0, 1), (1, 0), (1, 2)]
     for within, apart in ((0, 1), (far / 2, 1), (0.99 * far, 1), (1.01 * far, 0), (2.1 * far, 0), (1.7e308, 0)):
         result = scene.intersect(pairs, within=within)
@@ -241,9 +221,7 @@ def test_far_pairs_and_huge_distances(device, far):
 
 
 def test_distances_that_overflow(device):
-    scene = ab.Scene(device)
-    for x in (1.7e308, -1.7e308):
-        scene.add(sample("box"), (x, 0, 0, 0, 0, 0, 1))
+    scene = in_a_row(device, "box", (1.7e308, -1.7e308))
     assert scene.intersect([(0, 1)], within=1e300).apart[0]
     assert not scene.intersect([(0, 1)], within=1.7e308).any[0]
 
@@ -308,9 +286,7 @@ def test_regimes_and_outputs_agree(device):
 
 
 def test_query_takes_other_pairs_and_distances(device):
-    scene = ab.Scene(device)
-    for x in (0, 1.5, 4, 9):
-        scene.add(sample("box"), (x, 0, 0, 0, 0, 0, 1))
+    scene = in_a_row(device, "box", (0, 1.5, 4, 9))
     query = ab.Query(scene, "any", pairs=[(0, 1), (1, 2)], within=1.0)
     np.testing.assert_array_equal(query.run().apart, [False, True])
     query.set_pairs([(0, 1), (0, 2), (2, 3)])

@@ -5,7 +5,8 @@ import copy
 import numpy as np
 import pytest
 import warp as wp
-from helpers.frames import (
+from helpers.samples import random_poses, raw_state, sample
+from helpers.scenes import (
     CROWD,
     add_objects,
     check_same,
@@ -15,7 +16,6 @@ from helpers.frames import (
     set_lods,
     tops,
 )
-from helpers.samples import random_poses, raw_state, sample
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab

@@ -8,6 +8,7 @@ from helpers.scenes import TURN, everything, pair_scene
 import warp_abtree as ab
 
 NAN, INF = float("nan"), float("inf")
+BOX_TOP = sample("box").lod_max
 
 
 def with_entry(array, index, value):
@@ -50,7 +51,7 @@ OBJECTS = {
     "importance": (dict(importance=4), "importance", "4"),
     "importance not finite": (dict(importance=NAN), "importance"),
     "LOD below": (dict(lod=-1), "LOD", "-1", "box"),
-    "LOD above": (dict(lod=999), "LOD", "999", "box"),
+    "LOD above": (dict(lod=BOX_TOP + 1), "LOD", str(BOX_TOP + 1), "box"),
     "half a LOD": (dict(lod=1.5), "LOD", "1.5"),
     "LOD not finite": (dict(lod=NAN), "LOD", "nan"),
     "LOD as text": (dict(lod="fine"), "LOD", "fine"),
@@ -66,7 +67,7 @@ LODS = {
     "a column": ([[1], [2], [3]], "(3, 1)"),
     "one for all": (3, "()"),
     "below": ([1, -1, 2], "object 1", "-1"),
-    "above": ([1, 2, 10**6], "object 2", "1000000"),
+    "above": ([1, BOX_TOP + 1, 2], "object 1", str(BOX_TOP + 1)),
     "far above": ([1, 2, 2**62], "object 2"),
     "halves": ([1, 0.5, 2],),
     "not finite": ([1, NAN, 2],),

@@ -145,8 +145,6 @@ def test_frame_refuses(models):
         ab.Frame(make_scene(models), ab.Kinematic(position=[[0.0, 0.0, 0.0]]))
     with pytest.raises(ValueError, match="time_step"):
         ab.Frame(make_scene(models), time_step=np.nan)
-    with pytest.raises(ValueError, match="no motion"):
-        ab.Frame(make_scene(models)).poses_at(0.0)
 
 
 # Clocks and controllers.

@@ -6,6 +6,7 @@ import trimesh
 from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, NO_GRAVITY, TORUS, about, bits, box, make, on_ground, run
 
 import warp_abtree as ab
+from warp_abtree import testing
 from warp_abtree.kernels.dynamics import graph_coloring
 
 pytestmark = pytest.mark.slow
@@ -24,23 +25,14 @@ def heap(count=9, seed=0):
     ]
 
 
-class ByColor(ab.Dynamics):
-    """Relaxes one color after another on any device, as on a GPU."""
-
-    sequential = False
-
-
 OPTIONS = {"restitution": 0.3, "friction": 0.6}
 
 
 def test_a_heap_is_the_same_when_repeated_and_however_it_is_relaxed(device):
     found = []
-    for kind in (ab.Dynamics, ab.Dynamics, ByColor):
-        scene = ab.Scene(device)
-        scene.add(GROUND, pose=FLOOR, static=True)
-        for model, pose in heap():
-            scene.add(model, pose=pose)
-        dynamics = kind(scene, **OPTIONS)
+    for by_color in (False, False, True):
+        with testing.regime(relax_by_color=by_color):
+            dynamics = on_ground(device, *heap(), **OPTIONS)
         found.append(run(dynamics, 120))
         assert dynamics.query.manifolds.count.numpy().sum() > 8
     assert np.array_equal(found[0], found[1]) and np.array_equal(found[0], found[2])
@@ -52,13 +44,9 @@ def test_a_body_in_more_contacts_than_colors(device):
     cubes = [(cube, (0.6 * x - 1.5, 0.6 * y - 1.5, 0.2495 + 0.1, 0, 0, 0, 1)) for x in range(6) for y in range(6)]
     plate = box(4, 4, 0.2)
     found = []
-    for kind in (ab.Dynamics, ByColor):
-        scene = ab.Scene(device)
-        scene.add(GROUND, pose=FLOOR, static=True)
-        scene.add(plate, pose=(0, 0, 0.0995, 0, 0, 0, 1))
-        for model, pose in cubes:
-            scene.add(model, pose=pose)
-        dynamics = kind(scene, sleep_speed=0)
+    for by_color in (False, True):
+        with testing.regime(relax_by_color=by_color):
+            dynamics = on_ground(device, (plate, (0, 0, 0.0995, 0, 0, 0, 1)), *cubes, sleep_speed=0)
         run(dynamics, 10)
         used = dynamics._pair_color.numpy()
         assert (used == int(graph_coloring.COLOR_COUNT)).sum() == 36 + 1 - int(graph_coloring.COLOR_COUNT)

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import warp as wp
 from conftest import slow
-from helpers.faults import FAULTS, Interruption, MemoryShortage
-from helpers.resources import (
+from helpers.faults import (
+    FAULTS,
     MORE_PAIRS,
     PAIRS,
+    Interruption,
+    MemoryShortage,
     add_objects,
     check_answers,
     check_buffer_lengths,
@@ -164,7 +166,7 @@ def test_pairs_are_filtered_out(device, monkeypatch):
     )
 
 
-QUESTIONS = {
+REQUESTS = {
     "any": dict(),
     "faces": dict(output="faces"),
     "contacts": dict(output="contacts"),
@@ -174,11 +176,11 @@ QUESTIONS = {
 
 
 @pytest.mark.parametrize("pairs", ["given", *slow("found")])
-@pytest.mark.parametrize("question", QUESTIONS)
+@pytest.mark.parametrize("asked", REQUESTS)
 @pytest.mark.parametrize("kind", ["interruption", *slow("memory")])
-def test_questions(device, monkeypatch, kind, question, pairs):
+def test_requests(device, monkeypatch, kind, asked, pairs):
     """More pairs than the scene was asked before, with what belongs to each, and more hits than it had room for."""
-    fault, options = FAULTS[kind](device, monkeypatch), QUESTIONS[question]
+    fault, options = FAULTS[kind](device, monkeypatch), REQUESTS[asked]
     pairs = MORE_PAIRS if pairs == "given" else None
     untouched = check_scene(None, make_scene(device))
     expected = describe(make_scene(device).intersect(pairs, **options))

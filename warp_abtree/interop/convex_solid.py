@@ -1,4 +1,4 @@
-"""What the host knows of a model's original mesh: its box, outermost corners, and the planes of a convex solid."""
+"""A model's original mesh on the host: its box, extreme corners, and the planes of a convex solid."""
 
 import weakref
 
@@ -11,14 +11,14 @@ from warp_abtree.model.model import Model
 
 
 class Shape:
-    """A model and what the host knows of its original mesh, float64, model frame.
+    """A model and its original mesh on the host, float64, model frame.
 
     Attributes:
         model: `Model`.
-        middle, half: Its box, (3,) each.
-        probes: Corners farthest along each axis, both ways: (6 c, 3) of its c components.
-        probe_faces: A face at each, (6 c,).
-        planes: Outer unit normals and offsets of a convex solid's faces, and the faces, or None.
+        middle, half: Centre and half extents of its box, (3,) each.
+        probes: Extreme corners of its c components along each axis in both directions, (6 c, 3).
+        probe_faces: A face at each probe, (6 c,).
+        planes: Outer unit normals and offsets of a convex solid's faces, and their indices, or None.
     """
 
     def __init__(self, model, convex):
@@ -50,22 +50,22 @@ class Shape:
             self.planes = normals, np.einsum("ij,ij->i", normals, a[wide]), face_ids[wide]
 
     def node_boxes(self) -> NodeBoxes:
-        """Return the boxes of the model's tree at its original mesh, made at the first use."""
+        """Return the boxes of the tree at the finest LOD, computed at the first call."""
         if self._node_boxes is None:
             self._node_boxes = NodeBoxes(self.model)
         return self._node_boxes
 
     def find_inside(self, pose, other, other_pose):
-        """Find what of another shape lies inside this one, where it is a solid and the two surfaces do not meet.
+        """Find a component of another shape inside this solid; the two surfaces must not intersect.
 
-        No corner of a part is inside where one is not, or the surfaces would meet; the deepest tells best.
+        A component is then inside or outside as a whole, so its probes decide.
 
         Args:
             pose, other_pose: Rigid (4, 4) matrices [world units].
 
         Returns:
-            None, or the deepest probe of `other` [world units], the outer normal [world] of the plane nearest to it,
-            its depth under that, that plane's face, and a face of `other` at the probe.
+            None, or the deepest probe of `other` [world units], the outer normal [world] of the nearest plane, the
+            depth below that plane, its face, and a face of `other` at the probe.
         """
         if self.planes is None:
             return None
@@ -85,12 +85,12 @@ class Shape:
         return world[probe] + pose[:3, 3], normal, depth, int(face_ids[plane]), int(other.probe_faces[probe])
 
 
-# Managers share the shapes of equal meshes, and so their models, as long as one of them holds any.
+# Shapes of equal meshes are shared by all managers while any of them uses one.
 _SHAPES = weakref.WeakValueDictionary()
 
 
 def shape_of(mesh) -> Shape:
-    """Return the shape of a mesh's content, or of a model."""
+    """Return the shape of a mesh, by content, or of a model."""
     key: tuple | None = ("model", id(mesh)) if isinstance(mesh, Model) else None
     if isinstance(mesh, trimesh.Trimesh):
         key = (hash(mesh), len(mesh.vertices), len(mesh.faces))
@@ -102,7 +102,7 @@ def shape_of(mesh) -> Shape:
         shape = Shape(mesh, is_convex(trimesh.Trimesh(vertices, faces, process=False)))
     else:
         source = load_mesh(mesh)
-        # Only the original is asked, so no collapses are made.
+        # Only the finest LOD is used, so there is nothing to collapse.
         model = Model.load(source, base_faces=len(source.faces))
         shape = Shape(model, isinstance(mesh, trimesh.Trimesh) and is_convex(mesh))
     if key is not None:
@@ -111,7 +111,7 @@ def shape_of(mesh) -> Shape:
 
 
 def is_convex(mesh) -> bool:
-    """Return `mesh.is_convex` of trimesh, without the graph package that it takes."""
+    """Return `mesh.is_convex` of trimesh, without the graph package that trimesh needs for it."""
     if not mesh.is_watertight:
         return False
     faces = np.asarray(mesh.faces)

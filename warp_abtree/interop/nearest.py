@@ -1,13 +1,12 @@
-"""Least distance of posed original meshes, on the host: branch and bound over their AB-Trees' boxes.
+"""Least distance of posed original meshes, on the host: branch and bound over the boxes of their AB-Trees.
 
-Every box of the tree is asked for a distance that it keeps for certain; what is farther than some pair of faces is left
-out. The distance found is that of two faces, and no two faces are nearer: it is the least, to the rounding of
-coordinates.
+Pairs of nodes whose boxes are farther apart than some pair of faces are pruned; the bounds allow for rounding, so the
+result is the least distance of all pairs of faces, to the rounding of coordinates.
 """
 
 import numpy as np
 
-# Pairs of nodes looked at at a time: the nearest first, so that few others are looked at.
+# Node pairs expanded at a time, the nearest first.
 CHUNK = 2**12
 ROUNDING = 2.0**-44
 
@@ -16,7 +15,7 @@ class NodeBoxes:
     """Boxes over an original mesh at every node of its tree, float64, model frame.
 
     Attributes:
-        middle, half: Per heap node, (nodes, 3); half is negative where no face lies.
+        middle, half: Centre and half extents of each heap node, (nodes, 3); half is negative without a face.
         radius: Length of half, (nodes,).
         face: Face of a leaf, else -1, (nodes,).
     """
@@ -28,11 +27,7 @@ class NodeBoxes:
         lower[tree.leaf_node], upper[tree.leaf_node] = corners.min(1), corners.max(1)
         dropped = tree.leaf_node[model.dropped_faces]
         lower[dropped], upper[dropped] = np.inf, -np.inf
-        for level in range(tree.depth - 1, -1, -1):
-            nodes = np.arange(1 << level, 2 << level)
-            inner = nodes[tree.node_face[nodes] < 0]
-            lower[inner] = np.minimum(lower[2 * inner], lower[2 * inner + 1])
-            upper[inner] = np.maximum(upper[2 * inner], upper[2 * inner + 1])
+        tree.merge_boxes(lower, upper)
         used = (lower <= upper).all(1)
         self.middle, self.half = np.zeros_like(lower), np.full_like(lower, -1.0)
         self.middle[used] = 0.5 * lower[used] + 0.5 * upper[used]
@@ -49,7 +44,9 @@ class _Search:
         used = {shapes[i]: None for i in np.unique(pairs).tolist()}
         boxes = [shape.node_boxes() for shape in used]
         start = np.cumsum([0, *(len(part.face) for part in boxes)])
-        self.start = dict(zip(used, start.tolist()))
+        first_node = dict(zip(used, start.tolist()))
+        # Nodes of all shapes are numbered consecutively; those of each pair's shapes begin here, (2, p).
+        self.start = np.array([[first_node[shapes[i]] for i in column.tolist()] for column in pairs.T])
         self.middle, self.half, self.radius, self.face = (
             np.concatenate([getattr(part, name) for part in boxes]) for name in ("middle", "half", "radius", "face")
         )
@@ -57,22 +54,19 @@ class _Search:
         back = a[:, :3, :3].transpose(0, 2, 1)
         self.rotation = back @ b[:, :3, :3]
         self.shift = np.einsum("nij,nj->ni", back, b[:, :3, 3] - a[:, :3, 3])
-        # A frame off orthonormal by s measures lengths to within 1.5 s of themselves.
+        # A frame that deviates from orthonormal by s changes lengths by a factor within 1 +- 1.5 s.
         skew = [np.abs(r.transpose(0, 2, 1) @ r - np.eye(3)).max((1, 2)) for r in (a[:, :3, :3], b[:, :3, :3])]
         self.stretch = 1 + 4 * (skew[0] + skew[1]) + ROUNDING
         reach = max(float(np.abs(part.middle[1]).max() + part.radius[1]) for part in boxes)
         size = reach + np.linalg.norm(self.shift, axis=1)
-        # Faces are measured in the world, where coordinates round as far as objects lie from its origin.
+        # Distances of faces are computed in the world, with rounding relative to the distance from its origin.
         world = np.linalg.norm(a[:, :3, 3], axis=1) + np.linalg.norm(b[:, :3, 3], axis=1)
         self.slack = size * (4 * (skew[0] + skew[1]) + ROUNDING) + world * ROUNDING
         self.bound = upper
         self.found = None
 
-    def root_of(self, slot) -> int:
-        return self.start[self.shapes[slot]] + 1
-
     def walk_corners(self, pair):
-        """Lower `bound` by walking from corner to nearest corner of the other object; ends at some near pair."""
+        """Lower `bound` to the distance of two close corners, found by alternating nearest-corner searches."""
         a, b = (self._corners(self.pairs[pair, k]) for k in (0, 1))
         i, best = 0, np.inf
         while True:
@@ -90,7 +84,7 @@ class _Search:
         return corners @ pose[:3, :3].T + pose[:3, 3]
 
     def measure_boxes(self, pair, a, b):
-        """Return what boxes keep apart for certain, and lower `bound` to what some of them do not exceed."""
+        """Return lower bounds on the distances of boxes, and lower `bound` to the least of their upper bounds."""
         middle = np.einsum("nij,nj->ni", self.rotation[pair], self.middle[b]) + self.shift[pair] - self.middle[a]
         half = np.einsum("nij,nj->ni", np.abs(self.rotation[pair]), self.half[b]) + self.half[a]
         gap = np.linalg.norm(np.maximum(np.abs(middle) - half, 0), axis=1)
@@ -99,7 +93,7 @@ class _Search:
         return gap / self.stretch[pair] - self.slack[pair]
 
     def measure_faces(self, pair, face_a, face_b):
-        """Measure pairs of faces, and keep the nearest."""
+        """Compute distances of pairs of faces, and keep the nearest pair."""
         a, b = (self._posed(self.pairs[pair, k], face) for k, face in enumerate((face_a, face_b)))
         distance, point_a, point_b = triangle_distances(a, b)
         k = int(distance.argmin())
@@ -116,9 +110,9 @@ class _Search:
         return corners
 
     def children(self, pair, a, b):
-        """Return the pairs of nodes under others: both children of the larger node, as far as there are faces."""
+        """Return the child pairs of node pairs: each child with faces of the larger node, and the other node."""
         down_a = (self.face[b] >= 0) | ((self.face[a] < 0) & (self.radius[a] >= self.radius[b]))
-        first_a, first_b = self._base(0, pair), self._base(1, pair)
+        first_a, first_b = self.start[:, pair]
         rows = []
         for k in (0, 1):
             rows.append((pair, np.where(down_a, 2 * a - first_a + k, a), np.where(down_a, b, 2 * b - first_b + k)))
@@ -126,29 +120,24 @@ class _Search:
         kept = (self.half[a] >= 0).all(1) & (self.half[b] >= 0).all(1)
         return pair[kept], a[kept], b[kept]
 
-    def _base(self, side, pair):
-        if not hasattr(self, "_bases"):
-            self._bases = [np.array([self.start[self.shapes[i]] for i in column.tolist()]) for column in self.pairs.T]
-        return self._bases[side][pair]
-
 
 def find_nearest(shapes, poses, pairs, upper, likely):
-    """Find the least distance of object pairs whose surfaces do not meet.
+    """Find the least distance of object pairs whose surfaces do not intersect.
 
     Args:
-        shapes: Of each object, with `model` and `node_boxes()`.
+        shapes: Shape of each object, with `model` and `node_boxes()`.
         poses: Rigid matrices of the objects [world units], float64 (n, 4, 4).
         pairs: Object indices, (p, 2), p > 0.
-        upper: Distance that some pair does not exceed.
+        upper: Upper bound on the least distance.
         likely: Index of a pair that may be the nearest.
 
     Returns:
-        Distance, index of the pair, its two faces, and the two points that are nearest [world units].
+        Distance, index of the pair, its two faces, and the two nearest points [world units].
     """
     search = _Search(shapes, poses, pairs, upper * (1 + ROUNDING))
     pair = np.arange(len(pairs))
     search.walk_corners(likely)
-    a, b = (np.array([search.root_of(i) for i in column.tolist()]) for column in pairs.T)
+    a, b = search.start + 1
     stack = [(search.measure_boxes(pair, a, b), pair, a, b)]
     while stack:
         kept = stack.pop()
@@ -208,7 +197,7 @@ def _ratio(p, q):
 
 
 def _join_edges(p0, p1, q0, q1):
-    """Return the nearest points of segments."""
+    """Return the nearest points of pairs of segments."""
     e, f, r = p1 - p0, q1 - q0, p0 - q0
     ee, ff, ef, er, fr = _dot(e, e), _dot(f, f), _dot(e, f), _dot(e, r), _dot(f, r)
     s = np.clip(_ratio(ef * fr - er * ff, ee * ff - ef * ef), 0, 1)
@@ -218,7 +207,7 @@ def _join_edges(p0, p1, q0, q1):
 
 
 def _drop_on_face(p, corners):
-    """Return the feet of points on the planes of triangles, and whether they lie inside."""
+    """Return the projections of points to the planes of triangles, and whether they lie inside."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     normal = np.cross(b - a, c - a)
     area = _dot(normal, normal)

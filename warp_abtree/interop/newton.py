@@ -1,13 +1,13 @@
 """Contacts for Newton's solvers: `NewtonContacts` fills a `newton.Contacts` from intersecting meshes.
 
-Where a loop with Newton calls `model.collide(state, contacts)`, call `collide` here instead: bodies' poses become those
-of a scene's objects, `ManifoldQuery` finds their contact points, and these are written as Newton writes its own:
-shapes, points and offsets in the frames of their bodies, normals from the first shape to the second, margins. All on
-the device, in the order of pairs, the same when repeated.
+Replace `model.collide(state, contacts)` by `collide` here: the poses of bodies are copied to a scene's objects,
+`ManifoldQuery` finds the contact points, and these are written in Newton's conventions: shapes, points and offsets in
+body frames, normals from the first shape to the second, margins. Everything stays on the device, in the order of pairs,
+and is deterministic.
 
-Meshes have contacts once they cross, never before, so Newton's `gap` has no part in it: solvers that want contacts
-ahead of touch get none. Depths and normals are those of `warp_abtree.query.manifold`. Soft contacts are left alone.
-Tried with Newton 1.8 (extra `newton`), which calls its contacts experimental.
+Only intersecting meshes have contacts, so Newton's `gap` is ignored: there are no contacts ahead of touch. Depths and
+normals are those of `warp_abtree.query.manifold`. Soft contacts are not changed. Tested with Newton 1.8 (extra
+`newton`), which calls its contacts experimental.
 """
 
 import numpy as np
@@ -22,34 +22,34 @@ from warp_abtree.scene.scene import Scene
 FIELDS = ("shape0", "shape1", "point0", "point1", "offset0", "offset1", "normal", "margin0", "margin1")
 
 
-def _kept_apart(model, shapes):
-    """Return the object pairs that Newton never tests: filtered, of one body, or of groups that do not meet."""
+def _excluded_pairs(model, shapes):
+    """Return the object pairs that Newton never tests: filtered, of one body, or of groups that do not collide."""
     i, j = np.triu_indices(len(shapes), 1)
     a, b = shapes[i], shapes[j]
     body = model.shape_body.numpy()
     group = model.shape_collision_group.numpy()
     low, high = np.minimum(group[a], group[b]), np.maximum(group[a], group[b])
-    # Positive groups meet themselves and negative ones, negative ones all but themselves, 0 nothing.
-    meet = (low != 0) & (high != 0) & np.where(low > 0, low == high, low != high)
+    # Positive groups collide with themselves and negative ones, negative ones with all but themselves, 0 with none.
+    collide = (low != 0) & (high != 0) & np.where(low > 0, low == high, low != high)
     filtered = {tuple(sorted(pair)) for pair in model.shape_collision_filter_pairs}
     listed = np.array([tuple(sorted(pair)) in filtered for pair in zip(a.tolist(), b.tolist())], bool)
-    apart = ~meet | listed | ((body[a] == body[b]) & (body[a] >= 0))
-    return np.stack([i, j], axis=1)[apart]
+    excluded = ~collide | listed | ((body[a] == body[b]) & (body[a] >= 0))
+    return np.stack([i, j], axis=1)[excluded]
 
 
 class NewtonContacts:
-    """Finds contacts of Newton's mesh shapes: allocates once, collides many times.
+    """Contacts of Newton's mesh shapes: allocates once, collides many times.
 
     Args:
-        model: `newton.Model`. Its shapes that are meshes, on one device; all others are left out, their contacts too.
-        models: `Model` of each shape by its index, where it should be another than the shape's mesh, as one built
-            before; in the shape's frame, scaled. Shapes of one mesh and scale share a model.
+        model: `newton.Model`. Shapes that are no meshes are ignored, with their contacts.
+        models: `Model` by shape index, to replace the shape's mesh, for example by one built before; in the shape's
+            frame, scaled. Shapes of one mesh and scale share a model.
         capacity: As for `ManifoldQuery`; `collide` makes more room, `launch` does not.
 
     Attributes:
-        scene: The `Scene` of the shapes, all at their finest LOD; `scene.set_lods` changes that.
+        scene: `Scene` of the shapes, at their finest LODs; `scene.set_lods` changes these.
         shapes: Newton's shape of each object, int32 (n,).
-        query: The `ManifoldQuery`.
+        query: `ManifoldQuery`.
 
     Raises:
         ImportError: Newton is not installed.
@@ -81,7 +81,7 @@ class NewtonContacts:
                     known[key] = Model.from_arrays(vertices, np.asarray(source.indices).reshape(-1, 3))
                 own = known[key]
             self.scene.add(own, world=int(world[shape]), static=bool(body[shape] < 0))
-        self.scene.filter(_kept_apart(model, self.shapes))
+        self.scene.filter(_excluded_pairs(model, self.shapes))
         self._ids = wp.array(self.shapes, dtype=wp.int32, device=self.device)
         self._no_body = wp.empty(0, dtype=wp.transform, device=self.device)
         self._place(model.body_q)
@@ -94,12 +94,12 @@ class NewtonContacts:
         self._end = wp.zeros(room, dtype=wp.int32, device=self.device)
 
     def contacts(self, rigid_contact_max=None):
-        """Return an empty `newton.Contacts` for rigid contacts; by default with room for 8 of each pair there is."""
+        """Return an empty `newton.Contacts` for rigid contacts; by default with room for 8 of each pair."""
         room = POINTS_MAX * len(self.query.pairs) if rigid_contact_max is None else rigid_contact_max
         return self.newton.Contacts(room, 0, device=self.device)
 
     def collide(self, state, contacts):
-        """Write the contacts of a state's poses, and of no others, into `contacts`. Waits for the device.
+        """Replace the contents of `contacts` by the contacts at a state's poses. Waits for the device.
 
         Raises:
             CapacityError: `contacts` has too little room; the message names the demand.
@@ -112,14 +112,14 @@ class NewtonContacts:
         self.check(contacts)
 
     def launch(self, state, contacts):
-        """Do as `collide` does in the room there is. Launches only, so that a CUDA graph can capture it."""
+        """Do the same within the present capacity. Launches only, so that a CUDA graph can capture it."""
         with self.query.guard.launching(self):
             self._place(state.body_q)
             self.query.launch()
             self._write(state.body_q, contacts)
 
     def check(self, contacts):
-        """Raise where the last contacts did not fit. Waits for the device.
+        """Raise an error if the last contacts did not fit. Waits for the device.
 
         Raises:
             CapacityError: The message names the demand.

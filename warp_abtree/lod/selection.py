@@ -177,6 +177,9 @@ class PredictedSelection(Selection):
         scale: Position (0 is the coarsest), and frames that a change has been held, int32 (2,) on the device.
         choice: Candidate, its steady and transition cost [ms], its work, the work in place, float64 (5,) on the device.
         level, lods: Level and LOD of each object, int32 (n,) on the device.
+        offset: Positions by which each object is loosened, int32 (n,) on the device.
+        changes: Change of the position of each candidate; the last leaves every object at its level.
+        prediction: What each candidate would cost, `kernels.lod.prediction.Prediction`.
 
     Raises:
         ValueError: A number out of range; low and aim must rise: 0 < low <= aim <= 1.
@@ -192,7 +195,6 @@ class PredictedSelection(Selection):
         loosened = int(math.log2(self.loosest) * int(prediction.POSITIONS_PER_OCTAVE))
         self.position_max = int(prediction.DITHER) * (self.pool.tolerance_count - 1) + loosened
         self.stay = len(CLIMBS)
-        # The last candidate leaves every object at its level.
         falls = [step for step in FALLS if step > -self.position_max]
         self.changes = [*CLIMBS, 0, *falls, -self.position_max, 0]
         self.prediction = self._make_prediction()

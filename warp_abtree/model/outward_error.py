@@ -72,11 +72,7 @@ class OutwardError:
         # the next float32, whichever way the conversion rounded
         lower[leaf] = np.nextafter(corner[there].min(1).astype(np.float32), np.float32(-np.inf))
         upper[leaf] = np.nextafter(corner[there].max(1).astype(np.float32), np.float32(np.inf))
-        for level in range(tree.depth - 1, -1, -1):
-            node = np.arange(1 << level, 2 << level)
-            node = node[tree.node_face[node] < 0]
-            lower[node] = np.minimum(lower[2 * node], lower[2 * node + 1])
-            upper[node] = np.maximum(upper[2 * node], upper[2 * node + 1])
+        tree.merge_boxes(lower, upper)
         original = outward_bound.Original()
         original.face_pos = _cpu(corner, wp.vec3d)
         original.node_lower, original.node_upper = _cpu(lower, wp.vec3), _cpu(upper, wp.vec3)

@@ -147,16 +147,20 @@ def build_progressive(mesh, base_faces=10, progress=None, sizes=LaunchSizes()):
     powers of two. It stops early only where every further merge would kill the last face.
 
     Args:
-        mesh: Anything with `vertices` float64 [v, 3], `faces` int32 [n_f, 3].
+        mesh: `Mesh`.
         base_faces: Stop when no more faces than this are left, >= 1.
         progress: Called as progress(stage, done, total) between launches; stages "collapse" and "LOD bounds".
         sizes: `LaunchSizes`.
 
-    Raises ValueError for empty, non-finite or oversized meshes, bad indices, base_faces < 1, or if no face has three
-    distinct corners.
+    Raises:
+        ValueError: base_faces is no whole number from 1, or the mesh has 2^29 vertices or 2^31 / 3 faces.
+
     Source: Garland and Heckbert 1997 (collapse).
     """
-    vertices, faces = _checked(mesh, base_faces)
+    whole_number(base_faces, "base_faces", 1, 2**62)
+    vertices, faces = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces)
+    if 2 * len(vertices) >= NODE_LIMIT or 3 * len(faces) >= 2**31:
+        raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
     report = progress if progress is not None else lambda stage, done, total: None
     centre, scale = find_frame(vertices)
     parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), report, sizes)
@@ -164,25 +168,6 @@ def build_progressive(mesh, base_faces=10, progress=None, sizes=LaunchSizes()):
     face_split, split_start, split_face = _splits(parent, faces, len(vertices))
     lod_error = _bound_errors(vertex_pos, parent, faces, report, sizes.covers)
     return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, lod_error)
-
-
-def _checked(mesh, base_faces):
-    whole_number(base_faces, "base_faces", 1, 2**62)
-    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
-    faces = np.ascontiguousarray(mesh.faces, dtype=np.int32)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise ValueError(f"vertices and faces must be [n, 3], got {vertices.shape} and {faces.shape}")
-    if len(faces) == 0 or len(vertices) == 0:
-        raise ValueError("the mesh is empty")
-    if 2 * len(vertices) >= NODE_LIMIT or 3 * len(faces) >= 2**31:
-        raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
-    if not np.isfinite(vertices).all():
-        raise ValueError("a vertex is not finite")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise ValueError(f"faces index vertices {faces.min()}..{faces.max()} of {len(vertices)}")
-    if not _distinct(faces).any():
-        raise ValueError("no face has three distinct corners")
-    return vertices, faces
 
 
 def _distinct(faces):
@@ -320,18 +305,16 @@ def _bound_errors(vertex_pos, parent, faces, report, covers):
         return np.zeros(1)
     pair = child[np.argsort(parent[child], kind="stable")].reshape(-1, 2)
     face_array = _cpu(faces, int)
-    rings = _linked_rings(faces, face_array, len(parent))
     replay = _replay((vertex_pos - centre) / scale, face_count)
-    scratch = make_scratch(face_count, triangle_cover.SLOTS, polygon.STACK)
-    counter = _filled(6, 0)
-    _launch(hausdorff_bound.start_replay_kernel, face_count, face_array, rings.corner_node, replay, counter)
+    replay.rings = _linked_rings(faces, face_array, len(parent))
+    _launch(hausdorff_bound.start_replay_kernel, face_count, face_array, replay)
     bound_sq = wp.zeros(merge_count, dtype=wp.float64, device="cpu")
     inputs = [len(parent) - merge_count, merge_count, covers, _cpu(pair, int)]
-    state = counter.numpy()  # shares the memory
+    state = replay.counter.numpy()  # shares the memory
     while state[0] < merge_count:
-        _launch(hausdorff_bound.replay_merges_kernel, *inputs, replay, scratch, rings, counter, bound_sq)
+        _launch(hausdorff_bound.replay_merges_kernel, *inputs, replay, bound_sq)
         if state[5] < 0:
-            bvh = _index(replay, rings)
+            bvh = _index(replay)
             replay.bvh, state[5] = bvh.id, state[1]
         report("LOD bounds", int(state[0]), merge_count)
     error = scale * (np.sqrt(bound_sq.numpy()) + ROUNDING)
@@ -340,6 +323,8 @@ def _bound_errors(vertex_pos, parent, faces, report, covers):
 
 def _replay(pos, face_count):
     replay = triangle_cover.Replay()
+    replay.counter = _filled(6, 0)
+    replay.scratch = make_scratch(face_count, triangle_cover.SLOTS, polygon.STACK)
     replay.pos = _cpu(pos, wp.vec3d)
     replay.triangle_pos, replay.face_pos = _points(face_count, 3), _points(face_count, 3)
     replay.face_box = _points(face_count, 2)
@@ -353,9 +338,9 @@ def _replay(pos, face_count):
     return replay
 
 
-def _index(replay, rings):
+def _index(replay):
     """Return a wp.Bvh over the active faces, for triangles whose connected component vanishes."""
-    active = np.flatnonzero(rings.corner_node.numpy()[::3] >= 0).astype(np.int32)
+    active = np.flatnonzero(replay.rings.corner_node.numpy()[::3] >= 0).astype(np.int32)
     corners = replay.face_pos.numpy()[active]
     lower, upper = corners.min(axis=1).astype(np.float32), corners.max(axis=1).astype(np.float32)
     replay.bvh_face = _cpu(active, int)

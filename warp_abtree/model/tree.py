@@ -38,6 +38,14 @@ class Tree:
         node_face[leaf_node] = np.arange(n, dtype=np.int32)
         return cls(leaf_node, node_face, find_depth(n))
 
+    def merge_boxes(self, lower: np.ndarray, upper: np.ndarray):
+        """Compute the boxes of inner nodes from those of the leaves, in place; shape (node_count, 3) each."""
+        for level in range(self.depth - 1, -1, -1):
+            node = np.arange(1 << level, 2 << level)
+            node = node[self.node_face[node] < 0]
+            lower[node] = np.minimum(lower[2 * node], lower[2 * node + 1])
+            upper[node] = np.maximum(upper[2 * node], upper[2 * node + 1])
+
     @property
     def node_count(self) -> int:
         """Length of the node arrays: heap indices 0 .. 2^(depth+1)-1, 2n-1 of them in use."""

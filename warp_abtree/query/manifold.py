@@ -24,8 +24,8 @@ section 3; that the boundary curve gives it is Stokes' theorem.
 
 import warp as wp
 
+from warp_abtree.kernels import broad_phase
 from warp_abtree.kernels.contact import manifold
-from warp_abtree.kernels.dynamics import bodies
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.result import POINTS_MAX, ManifoldResult, Result
 
@@ -37,8 +37,6 @@ class ManifoldQuery(ContactQuery):
 
     Args:
         scene, pairs, capacity, precision: As for `ContactQuery`.
-        roles: Device int32 (n,) of `kernels.bodies` roles: pairs of the broad phase in which nothing can move are left
-            out. None keeps all.
 
     Attributes:
         manifolds: Points of each pair, device arrays (pair capacity, POINTS) of `kernels.manifold.Manifolds`, float64.
@@ -51,9 +49,8 @@ class ManifoldQuery(ContactQuery):
     pair_key: wp.array
     _pair_order: wp.array
 
-    def __init__(self, scene, pairs=None, capacity=None, precision="exact", roles=None):
+    def __init__(self, scene, pairs=None, capacity=None, precision="exact"):
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
-        self.roles = wp.empty(0, dtype=wp.int32, device=scene.device) if roles is None else roles
         super().__init__(scene, pairs, capacity, precision)
 
     def _place_arrays(self, capacity: int) -> list:
@@ -81,13 +78,17 @@ class ManifoldQuery(ContactQuery):
             self._sort_pairs()
         self.traverse()
 
+    def make_pair_keys(self, order, keys):
+        """Write the place and the key of each pair of the broad phase; pairs of the last key are left out."""
+        inputs = [self.pair_count, self.pairs, order, keys]
+        wp.launch(broad_phase.make_pair_key_kernel, len(self.pairs), inputs, device=self.device)
+
     def _sort_pairs(self):
         room = len(self.pairs)
-        inputs = [self.pair_count, self.pairs, self.roles, self._pair_order, self.pair_key]
-        self._launch_kernel(bodies.make_pair_key_kernel, room, inputs)
+        self.make_pair_keys(self._pair_order, self.pair_key)
         with wp.ScopedDevice(self.device):
             wp.utils.radix_sort_pairs(self.pair_key, self._pair_order, room)
-        self._launch_kernel(bodies.place_pair_kernel, room + 1, [self.pair_key, self.pair_count, self.pairs])
+        self._launch_kernel(broad_phase.place_pair_kernel, room + 1, [self.pair_key, self.pair_count, self.pairs])
 
     def find_contacts(self):
         """Sort the hits in place, make their contacts, and reduce them to points. Launches only."""

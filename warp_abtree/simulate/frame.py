@@ -249,16 +249,6 @@ class Frame:
             self.scene.intersect(self.scene.broad_phase(), output=self.output)
         wp.synchronize_device(self.scene.device)
 
-    def poses_at(self, time: float) -> np.ndarray:
-        """Return the poses of a time [s], (n, 7), in a buffer that the next call overwrites.
-
-        Raises:
-            ValueError: The scene has no motion.
-        """
-        if self.motion is None:
-            raise ValueError("the scene has no motion")
-        return self.motion.poses(time, out=self._poses)
-
     def step(self) -> Result:
         """Run the next frame, append its row, and return what the query found. Waits for the device."""
         number, scene, timer = len(self.history), self.scene, self._timer
@@ -270,7 +260,7 @@ class Frame:
         refitted = _sum(stats.nodes_refitted) if stats is not None and timer.counts_work else 0
         timer.mark(lod_change=int(stats is not None), node_refitted=refitted)
         if self.motion is not None:
-            poses = self.poses_at(time)
+            poses = self.motion.poses(time, out=self._poses)
             if poses is not None:
                 scene.set_poses(poses)
         timer.mark(posed=0 if self.motion is None else scene.object_count)
@@ -326,22 +316,19 @@ class Frame:
         """
         if not self.history:
             raise ValueError("a summary is of frames, and none has run")
-        columns = {name: [row.as_dict()[name] for row in self.history] for name in FrameRow.names()}
-        found: dict[str, Any] = {"frames": len(self.history), "objects": self.scene.object_count}
+        rows = [row.as_dict() for row in self.history]
+        found: dict[str, Any] = {"frames": len(rows), "objects": self.scene.object_count, "stages": {}}
         counts = "states", "pairs", "intersecting", "hits", "faces", "nodes_refitted", "node_tests", "triangle_tests"
         for name in (*counts, "error_mean", "error_max"):
-            values = np.array([math.nan if value is None else value for value in columns[name]], np.float64)
+            values = np.array([math.nan if row[name] is None else row[name] for row in rows], np.float64)
             found[name] = {"mean": float(values.mean()), "min": float(values.min()), "max": float(values.max())}
-        found["lod_min"], found["lod_max"] = min(columns["lod_min"]), max(columns["lod_max"])
-        found["stages"] = {}
         for name in (*STAGES, "total_ms", "cost_ms"):
-            values = np.array(columns[name])
-            found["stages"][name] = {
-                "mean": float(values.mean()),
-                "p95": float(np.percentile(values, 95)),
-                "total": float(values.sum()),
-            }
-        found["budget_ms"] = columns["budget_ms"][-1]
+            values = np.array([row[name] for row in rows])
+            p95 = float(np.percentile(values, 95))
+            found["stages"][name] = {"mean": float(values.mean()), "p95": p95, "total": float(values.sum())}
+        found["lod_min"] = min(row["lod_min"] for row in rows)
+        found["lod_max"] = max(row["lod_max"] for row in rows)
+        found["budget_ms"] = rows[-1]["budget_ms"]
         found["budget"] = budget_report(self.history, after=after)
         return found
 

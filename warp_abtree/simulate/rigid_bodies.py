@@ -4,6 +4,11 @@ One step: contacts where the bodies stand (`ManifoldQuery`, at most 8 points a p
 impulses by projected Gauss-Seidel with warm starting and Coulomb friction; position correction by split impulses;
 semi-implicit Euler with a symplectic rotation; islands at rest fall asleep. All in float64, with the same bits when
 repeated on one device, and for a world alone or among others. docs/dynamics.md has each part, figures, and limits.
+
+Momentum and angular momentum of bodies that only meet each other are conserved to rounding without gravity; under
+gravity position corrections change angular momentum. Restitution adds no energy, converged or not, and conserves it for
+1 and no friction; resting impulses add none but what a warm start leaves. Energy oscillates: of a free tumble by the
+fraction (angular velocity dt)^2, under gravity by m g v dt / 2, as in semi-implicit Euler.
 """
 
 from contextlib import contextmanager
@@ -15,6 +20,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import positive, whole_number
 from warp_abtree.checks.quaternions import matrices_of
+from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.dynamics import bodies as body_kernels
 from warp_abtree.kernels.dynamics import constraints as constraint_kernels
 from warp_abtree.kernels.dynamics import graph_coloring, solve
@@ -48,6 +54,18 @@ class SolverOptions:
     sleep_speed: Any = None
     sleep_time: float = 0.5
     capacity: Buffers | int | None = None
+
+
+class BodyContacts(ManifoldQuery):
+    """Contact points of the pairs in which a body can move."""
+
+    def __init__(self, scene, bodies, capacity):
+        self._motion_type = bodies.motion_type
+        super().__init__(scene, None, capacity)
+
+    def make_pair_keys(self, order, keys):
+        inputs = [self.pair_count, self.pairs, self._motion_type, order, keys]
+        wp.launch(body_kernels.make_body_pair_key_kernel, len(self.pairs), inputs, device=self.device)
 
 
 class Dynamics(RigidBodies):
@@ -96,15 +114,17 @@ class Dynamics(RigidBodies):
         super().__init__(scene, density, restitution, friction, gravity, kinematic, solver.slop, solver.sleep_speed)
         self.iterations = whole_number(solver.iterations, "iterations", 1, 10_000)
         self.sleep_time = positive(solver.sleep_time, "sleep_time")
+        by_color = current_regime().relax_by_color
+        self._by_color = not self.device.is_cpu if by_color is None else by_color
         self.time = 0.0
         self.set_velocities(velocity, angular_velocity)
         self._targets = (
             wp.empty(0, dtype=wp.mat33d, device=self.device),
             wp.empty(0, dtype=wp.vec3d, device=self.device),
         )
-        self.query = ManifoldQuery(scene, None, solver.capacity, roles=self.bodies.motion_type)
+        self.query = BodyContacts(scene, self.bodies, solver.capacity)
         self._constraints, self._warm_start = constraint_kernels.Constraints(), constraint_kernels.WarmStart()
-        self._room, self._interrupted = 0, False
+        self._room, self._interrupted = -1, False
         self._grow()
 
     def _grow(self):
@@ -129,7 +149,7 @@ class Dynamics(RigidBodies):
             if struct is self._warm_start:
                 if name == "key":
                     array.fill_(int(body_kernels.LAST_KEY))
-                if self._room:
+                if self._room > 0:
                     old = getattr(struct, name)
                     wp.copy(array.flatten(), old.flatten(), count=old.size)
         with self._changing():
@@ -273,18 +293,13 @@ class Dynamics(RigidBodies):
         wp.copy(self._sorted_color, color, count=room)
         with wp.ScopedDevice(self.device):
             wp.utils.radix_sort_pairs(self._sorted_color, self._sorted_pair, room, end_bit=7)
-        if launch_only or self.sequential:
+        if launch_only or not self._by_color:
             return range(COLOR_COUNT + 1)
         return [c for c in np.unique(color.numpy()).tolist() if c < INACTIVE]
 
-    @property
-    def sequential(self) -> bool:
-        """Whether one thread relaxes all pairs, which is fastest on the CPU."""
-        return self.device.is_cpu
-
     def _relax(self, stage, rounds, colors):
         """Relax all pairs: by one thread in one launch, or a launch for each color of each round."""
-        if self.sequential:
+        if not self._by_color:
             self._launch_relaxation(1, stage, 0, 0, COLOR_COUNT, rounds)
             return
         for turn in range(rounds):

@@ -1,0 +1,62 @@
+"""python-fcl: a BVHModel (OBB tree with RSS) of each mesh, or convex solids by GJK."""
+
+import numpy as np
+
+from .interface import PoseLoop
+
+ALL_CONTACTS = 2**31 - 1
+
+
+def make_tree(fcl, vertices, faces):
+    """Return a BVHModel of a mesh."""
+    tree = fcl.BVHModel()
+    tree.beginModel(len(vertices), len(faces))
+    tree.addSubModel(vertices, faces)
+    tree.endModel()
+    return tree
+
+
+def make_convex(fcl, vertices, faces):
+    """Return a convex solid."""
+    corners = np.concatenate([np.full((len(faces), 1), 3), faces], 1).flatten()
+    return fcl.Convex(vertices, len(faces), corners)
+
+
+class Fcl(PoseLoop):
+    """python-fcl.
+
+    Args:
+        make: Makes a shape of a mesh.
+    """
+
+    name = "python-fcl"
+
+    def __init__(self, a, b, matrices, make=make_tree):
+        import fcl
+
+        self.fcl = fcl
+        shape_a = make(fcl, *a)
+        self.shape_b = shape_a if b is a else make(fcl, *b)
+        self.a = fcl.CollisionObject(shape_a, fcl.Transform())
+        self.yes_no = fcl.CollisionRequest()
+        self.all = fcl.CollisionRequest(num_max_contacts=ALL_CONTACTS, enable_contact=True)
+        self.place(matrices)
+
+    def place(self, matrices):
+        """Make an object of B for each pose."""
+        transforms = [self.fcl.Transform(matrix[:3, :3], matrix[:3, 3]) for matrix in matrices]
+        self.b = [self.fcl.CollisionObject(self.shape_b, transform) for transform in transforms]
+
+    def _collide(self, request):
+        answers = []
+        for b in self.b:
+            result = self.fcl.CollisionResult()
+            self.fcl.collide(self.a, b, request, result)
+            answers.append(result)
+        return answers
+
+    def any(self):
+        return [result.is_collision for result in self._collide(self.yes_no)]
+
+    def faces(self):
+        return self._collide(self.all)

@@ -1,0 +1,128 @@
+"""Newton's mesh-mesh narrow phase, where the package `newton` is installed: by BVH, and by SDF (CUDA only).
+
+Another question, and an approximate answer: it looks for points of the edges of one mesh inside the other, by a search
+over signed distances, and keeps a few contacts a pair, without face numbers. So only whether a pair intersects can be
+compared. All shapes share one mesh with one BVH or SDF; margins and gaps are 0, so that contacts are those of surfaces
+that pass through each other. Pairs are given, so its broad phase is a test of their boxes.
+"""
+
+import warnings
+
+import numpy as np
+import warp as wp
+
+from ..timing import capture
+from .interface import Operator
+
+SDF_RESOLUTION = 64
+CONTACTS_PER_PAIR = 512  # what is left of them after reduction
+CANDIDATES_PER_HIT = 4
+
+
+class Newton(Operator):
+    """Newton's pipeline over given pairs of one mesh.
+
+    Args:
+        hits: About how many face pairs intersect, for the size of its buffers.
+        sdf: Voxels along the longest side of a signed distance field, 0 for the BVH.
+
+    Raises:
+        ImportError: Newton is not installed.
+        RuntimeError: A signed distance field is asked for on the CPU.
+    """
+
+    def __init__(self, vertices, faces, poses, hits, device, sdf=0):
+        import newton
+
+        self.pair_count = len(poses) // 2
+        mesh = newton.Mesh(vertices, faces.reshape(-1), compute_inertia=False)
+        if sdf:
+            mesh.build_sdf(device=device, max_resolution=sdf)
+        builder = newton.ModelBuilder()
+        config = newton.ModelBuilder.ShapeConfig(density=0.0, margin=0.0, gap=0.0)
+        for pose in poses.tolist():
+            body = builder.add_body(xform=wp.transform(*pose), mass=1.0)
+            builder.add_shape_mesh(body, mesh=mesh, cfg=config)
+        pairs = wp.array(np.arange(2 * self.pair_count).reshape(-1, 2), dtype=wp.vec2i, device=device)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of inertia, and of large buffers
+            self.model = builder.finalize(device=device)
+            self.pipeline = newton.CollisionPipeline(
+                self.model,
+                broad_phase="explicit",
+                shape_pairs_filtered=pairs,
+                rigid_contact_max=CONTACTS_PER_PAIR * self.pair_count,
+                max_triangle_pairs=max(1_000_000, CANDIDATES_PER_HIT * hits),
+                contact_reduction_hashtable_size_factor=1.0,
+                verify_buffers=False,
+            )
+            self.state = self.model.state()
+            self.contacts = self.pipeline.contacts()
+
+    def launch(self):
+        self.pipeline.collide(self.state, self.contacts)
+
+    def check(self):
+        """Raise where a buffer overflowed in the last launch. Waits for the device.
+
+        Raises:
+            RuntimeError: The message names the buffer.
+        """
+        narrow = self.pipeline.narrow_phase
+        reducer = narrow.global_contact_reducer
+        lost = {
+            "contacts": int(self.contacts.rigid_contact_count.numpy()[0]) - self.contacts.rigid_contact_max,
+            "pairs": int(narrow.shape_pairs_mesh_mesh_count.numpy()[0]) - len(narrow.shape_pairs_mesh_mesh),
+            "candidates": int(reducer.buffer_overflows.numpy()[0]),
+            "hash table entries": int(reducer.ht_insert_failures.numpy()[0]),
+        }
+        for what, count in lost.items():
+            if count > 0:
+                raise RuntimeError(f"Newton lost {count} {what}")
+
+    def result(self):
+        """Return whether each pair has a contact, bool (p,), and the number of contacts.
+
+        Raises:
+            RuntimeError: It lost something for lack of room, or has contacts between objects of different pairs.
+        """
+        self.check()
+        count = int(self.contacts.rigid_contact_count.numpy()[0])
+        shapes = np.stack([getattr(self.contacts, f"rigid_contact_shape{i}").numpy()[:count] for i in (0, 1)], 1)
+        pair = shapes // 2
+        if count and not (pair[:, 0] == pair[:, 1]).all():
+            raise RuntimeError("Newton reports contacts between objects of different pairs")
+        found = np.zeros(self.pair_count, bool)
+        found[pair[:, 0]] = True
+        return found, count
+
+    def compare(self, any_hit):
+        """Return columns: contacts kept, pairs that it misses and invents beside the exact answer, bool (p,)."""
+        found, count = self.result()
+        missed, invented = int((any_hit & ~found).sum()), int((found & ~any_hit).sum())
+        return {"contacts": count, "any_missed": missed, "any_invented": invented}
+
+
+def make_newton(vertices, faces, poses, hits, device, refused=None):
+    """Return the baselines that can be made, by name, and why the others cannot.
+
+    Args:
+        refused: Why none is wanted, None where they are.
+    """
+    made, skipped = {}, {}
+    for name, sdf in (("newton_bvh", 0), (f"newton_sdf{SDF_RESOLUTION}", SDF_RESOLUTION)):
+        if refused is not None:
+            skipped[name] = refused
+        elif sdf and not device.is_cuda:
+            skipped[name] = "its signed distance fields need CUDA"
+        else:
+            try:
+                baseline = Newton(vertices, faces, poses, hits, device, sdf)
+                baseline.launch()  # compiles it
+                baseline.check()
+                if device.is_cuda:
+                    capture(baseline.launch, device)
+                made[name] = baseline
+            except Exception as error:  # another package's failure must not cost the rest of a run
+                skipped[name] = f"{type(error).__name__}: {error}"
+    return made, skipped

@@ -1,0 +1,194 @@
+"""Triangle pairs, random and adversarial, against integer arithmetic: disagreements, fractions, error rates, times."""
+
+import functools
+import itertools
+import multiprocessing
+import sys
+import time
+
+import numpy as np
+import warp as wp
+
+from ..inside import EXACT, FILTER, FLOAT32, FLOAT32_UNIT, UNCERTAIN, decide_triangles, float32_filter_triangles
+from ..triangle_pairs import ADVERSARIAL, make_chunk
+from ..verify import load_oracle
+
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+CHUNK = 20_000
+# Every so many adversarial pairs, one is asked in all orders; the others in one order each, in turn.
+WHOLE_EVERY = 64
+ORDERS = [
+    (p, q, swap) for p in itertools.permutations(range(3)) for q in itertools.permutations(range(3)) for swap in (0, 1)
+]
+STAGES = ("float32_stage_ns", "float64_stage_ns", "exact_stage_ns", "float32_ns")
+
+
+def run(device, count=100_000, processes=2):
+    """Yield one row a kind of pair: pairs asked, fraction that intersect (meet), disagreements of any stage with the
+    truth, fractions left to float64 and to expansions, error rate of float32 alone, time a pair [ns].
+
+    Raises:
+        RuntimeError: An answer was wrong, or the tests' oracle is not at hand.
+    """
+    device = wp.get_device(device)
+    if load_oracle() is None:
+        raise RuntimeError("the exact oracle is not at hand; run this in a checkout with its tests")
+    for mode in (FILTER, EXACT, FLOAT32):
+        ask(mode, make_chunk(("random", 0, 1)), device)  # compile before anything is timed
+    ask_float32(make_chunk(("random", 0, 1)), device)
+    jobs, tallies = list_jobs(count), {}
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        begin = time.perf_counter()
+        # Kinds end in the order of the jobs, so a kind's row is whole when the next one starts.
+        for at, (job, truth) in enumerate(zip(jobs, pool.imap(find_truth, jobs))):
+            if job[0] not in tallies and tallies:
+                yield describe_tally(device, *list(tallies.items())[-1])
+            check_chunk(job, truth, device, tallies.setdefault(job[0], np.zeros(10)))
+            done, wrong = (int(sum(tally[k] for tally in tallies.values())) for k in (0, 2))
+            line = f"{at + 1}/{len(jobs)} chunks, {done} pairs, {wrong} wrong, {time.perf_counter() - begin:.0f} s"
+            print(f"{job[0]}: {line}", file=sys.stderr, flush=True)
+    yield describe_tally(device, *list(tallies.items())[-1])
+    if any(tally[2] for tally in tallies.values()):
+        raise RuntimeError("exact signs gave a wrong answer")
+
+
+def list_jobs(count):
+    """Return the chunks of a run: count / 10 adversarial pairs, then count random ones."""
+    counts = {kind: -(-(count // 10) // len(ADVERSARIAL)) for kind in ADVERSARIAL} | {"random": count}
+    jobs = []
+    for kind, total in counts.items():
+        starts = range(0, total, CHUNK)
+        jobs += [(kind, number, min(CHUNK, total - start)) for number, start in enumerate(starts)]
+    return jobs
+
+
+def find_truth(job):
+    """Return the exact answers for a chunk, bool (count,)."""
+    oracle = load_oracle()
+    pairs = make_chunk(job)
+    if job[0] == "extreme":  # no common exponent
+        return np.array([oracle.triangles_intersect(a, b) for a, b in pairs])
+    points = pairs.reshape(-1, 3)
+    index = np.arange(len(points)).reshape(-1, 2, 3)
+    rows = np.arange(len(pairs))
+    return oracle.pairs_intersect(points, index[:, 0], points, index[:, 1], np.stack([rows, rows], 1))
+
+
+def reorder_pairs(pairs):
+    """Return the pairs in their orders, and the row that each one comes from."""
+    rows = np.arange(len(pairs))
+    whole = np.repeat(rows[::WHOLE_EVERY], len(ORDERS))
+    order = np.concatenate([rows % len(ORDERS), np.arange(len(whole)) % len(ORDERS)])
+    rows = np.concatenate([rows, whole])
+    reordered = np.empty((len(rows), 2, 3, 3))
+    for k, (p, q, swap) in enumerate(ORDERS):
+        chosen = order == k
+        reordered[chosen, swap] = pairs[rows[chosen], 0][:, p]
+        reordered[chosen, 1 - swap] = pairs[rows[chosen], 1][:, q]
+    return reordered, rows
+
+
+@functools.cache
+def pair_test(mode):
+    """Return the kernel that tests triangles corners[i, :3] and corners[i, 3:] in a mode of `predicates`."""
+
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    def test_pair_kernel(corners: wp.array2d(dtype=wp.vec3d), answer_out: wp.array(dtype=wp.int32)):
+        i = wp.tid()
+        answer_out[i] = decide_triangles(
+            wp.static(mode), corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
+        )
+
+    return test_pair_kernel
+
+
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+def float32_pair_kernel(
+    error: wp.float32,
+    unit: wp.float32,
+    corners: wp.array2d(dtype=wp.vec3),
+    answer_out: wp.array(dtype=wp.int32),
+):
+    i = wp.tid()
+    answer_out[i] = float32_filter_triangles(
+        error, unit, corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
+    )
+
+
+def time_launch(kernel, inputs, count, device):
+    """Return a kernel's answers, int32 (count,), and the time of its launch [s]."""
+    answers = wp.zeros(count, dtype=wp.int32, device=device)
+    if count == 0:
+        return answers.numpy(), 0.0
+    wp.synchronize_device(device)
+    begin = time.perf_counter()
+    wp.launch(kernel, dim=count, inputs=[*inputs, answers], device=device)
+    wp.synchronize_device(device)
+    return answers.numpy(), time.perf_counter() - begin
+
+
+def ask(mode, pairs, device):
+    """Return the answers of signs in a mode, int32 (count,), and the time [s]."""
+    corners = wp.array(np.ascontiguousarray(pairs).reshape(-1, 6, 3), dtype=wp.vec3d, device=device)
+    return time_launch(pair_test(int(mode)), [corners], len(pairs), device)
+
+
+def ask_float32(pairs, device, proven=True):
+    """Return the answers of the float32 stage, with its bound or without, and the time [s]."""
+    near = unit_size(pairs).astype(np.float32)
+    # Coordinates of at most 1 are off by at most 2^-25, differences by twice as much.
+    error, unit = (1.02 * 2.0**-24, float(FLOAT32_UNIT)) if proven else (0.0, 0.0)
+    corners = wp.array(near.reshape(-1, 6, 3), dtype=wp.vec3, device=device)
+    return time_launch(float32_pair_kernel, [error, unit, corners], len(pairs), device)
+
+
+def unit_size(pairs):
+    """Scale each pair to about unit size by a power of two, as the library does for float32."""
+    exponent = np.frexp(np.abs(pairs).max((1, 2, 3), keepdims=True))[1]
+    return np.ldexp(pairs, -exponent)
+
+
+def check_chunk(job, truth, device, tally):
+    """Compare one chunk on a device with the truth, and add to the tally of its kind."""
+    pairs, rows = make_chunk(job), np.arange(len(truth))
+    if job[0] != "random":
+        pairs, rows = reorder_pairs(pairs)
+    truth = truth[rows]
+    # Every stage is asked about every pair, so that each is held to the truth wherever it is certain.
+    single, single_time = ask_float32(pairs, device)
+    double, _ = ask(FILTER, pairs, device)
+    exact, _ = ask(EXACT, pairs, device)
+    wrong = np.flatnonzero(
+        ((single != truth) & (single != UNCERTAIN)) | ((double != truth) & (double != UNCERTAIN)) | (exact != truth)
+    )
+    for i in wrong[:3]:
+        answers = f"stages {single[i]}, {double[i]}, {exact[i]}"
+        print(f"{job[0]}: {pairs[i].tolist()}: exact {truth[i]}, {answers}", file=sys.stderr, flush=True)
+    # As a query does: the next stage for what the one before left uncertain.
+    to_float64 = np.flatnonzero(single == UNCERTAIN)
+    again, double_time = ask(FILTER, pairs[to_float64], device)
+    to_exact = to_float64[again == UNCERTAIN]
+    _, exact_time = ask(EXACT, pairs[to_exact], device)
+    unproven, unproven_time = ask_float32(pairs, device, proven=False)
+    rest = np.flatnonzero(unproven == UNCERTAIN)
+    unproven[rest], rest_time = ask(FLOAT32, unit_size(pairs[rest]), device)
+    tally += [
+        len(truth), truth.sum(), len(wrong), len(to_float64), len(to_exact), (unproven != truth).sum(),
+        single_time, double_time, exact_time, unproven_time + rest_time,
+    ]  # fmt: skip
+
+
+def describe_tally(device, kind, tally):
+    """Turn a tally into a row."""
+    pairs, hits, wrong, to_float64, to_exact, unproven, *times = tally.tolist()
+    return {
+        "device": device.name,
+        "kind": kind,
+        "pairs": int(pairs),
+        "meet": round(hits / pairs, 4),
+        "disagreements": int(wrong),
+        "to_float64": float(f"{to_float64 / pairs:.3g}"),
+        "to_exact": float(f"{to_exact / pairs:.3g}"),
+        "float32_errors": float(f"{unproven / pairs:.3g}"),
+        **{name: round(1e9 * t / pairs, 1) for name, t in zip(STAGES, times, strict=True)},
+    }

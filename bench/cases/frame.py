@@ -1,0 +1,154 @@
+"""One frame on the device, captured on CUDA, of many objects with changing LODs, beside the same work from the host."""
+
+import gc
+
+import numpy as np
+import warp as wp
+
+import warp_abtree as ab
+
+from ..shapes import knot, random_directions, scene_of_objects
+from ..timing import capture, summarise_all, time_call, time_graph, time_rounds
+from .memory import count_bytes
+
+FULL = {"faces": 5000, "objects": (16, 256, 4096), "repeats": 15}
+QUICK = {"faces": 300, "objects": (16,), "repeats": 3}
+OBJECTS_MAX_CPU = 256  # more take seconds a frame
+STEPS = 50  # levels of the LOD ladder, between a tenth of the operations and all
+SPACING = 1.6  # between neighbours on a cubic grid; a knot is about 2 long and wide
+
+
+@wp.kernel
+def drive_kernel(
+    levels: wp.array(dtype=wp.int32),
+    start: wp.array2d(dtype=wp.float64),
+    time: wp.array(dtype=wp.int32),
+    lods_out: wp.array(dtype=wp.int32),
+    poses_out: wp.array2d(dtype=wp.float64),
+):
+    """Move each object to and fro, and its LOD up and down the levels, by one every second frame on average."""
+    i = wp.tid()
+    phase = (time[0] + 37 * i) % (4 * levels.shape[0])
+    level = phase / 2
+    if level >= levels.shape[0]:
+        level = 2 * levels.shape[0] - 1 - level
+    lods_out[i] = levels[level]
+    for k in range(7):
+        poses_out[i, k] = start[i, k]
+    poses_out[i, i % 3] = start[i, i % 3] + wp.float64(0.2) * wp.sin(wp.float64(0.05) * wp.float64(phase))
+
+
+@wp.kernel
+def count_frame_kernel(time_inout: wp.array(dtype=wp.int32)):
+    time_inout[0] = time_inout[0] + 1
+
+
+def grid_poses(count):
+    """Return float64 (count, 7): a cubic grid of objects with any rotation."""
+    side = int(np.ceil(count ** (1 / 3)))
+    place = np.stack(np.unravel_index(np.arange(count), (side, side, side)), 1)
+    return np.concatenate([SPACING * place, random_directions(np.random.default_rng(0), count, 4)], 1)
+
+
+class DeviceFrames:
+    """A captured frame and the kernels that drive it, one graph."""
+
+    def __init__(self, scene, levels, ladder):
+        count = scene.object_count
+        device = self.device = scene.device
+        self.frame = ab.FrameGraph(
+            scene, "count", capacity=ab.Buffers(pairs=16 * count), ladder=[levels] if ladder else None
+        )
+        self.time = wp.zeros(1, dtype=wp.int32, device=device)
+        self.inputs = [
+            wp.array(levels, dtype=wp.int32, device=device),
+            wp.array(self.frame.poses.numpy(), dtype=wp.float64, device=device),
+            self.time,
+            self.frame.lods,
+            self.frame.poses,
+        ]
+        self.launch()
+        self.graph = capture(self.launch, device) if device.is_cuda else None
+
+    def launch(self):
+        wp.launch(count_frame_kernel, 1, [self.time], device=self.device)
+        wp.launch(drive_kernel, len(self.frame.poses), self.inputs, device=self.device)
+        self.frame.launch()
+
+    def replay(self):
+        if self.graph is None:
+            self.launch()  # on all cores, which a graph of the CPU does not use
+        else:
+            wp.capture_launch(self.graph)
+
+    def replay_and_read(self):
+        self.replay()
+        return self.frame.result()
+
+
+class HostFrames:
+    """The same frames by `set_poses`, `set_lods` and `intersect`, from poses and LODs on the host.
+
+    Raises:
+        RuntimeError: The captured frames answer otherwise.
+    """
+
+    def __init__(self, scene, device_frames: DeviceFrames, count):
+        self.scene, self.moves, self.turn = scene, [], 0
+        frame = device_frames.frame
+        device_frames.time.zero_()
+        for _ in range(count):
+            result = device_frames.replay_and_read()
+            frame.check()
+            self.moves.append((frame.poses.numpy().copy(), frame.lods.numpy().copy()))
+            answer = self.step()
+            order = np.lexsort((result.pairs[:, 1], result.pairs[:, 0]))
+            same = np.array_equal(result.pairs[order], answer.pairs)
+            if not same or not np.array_equal(result.count[order], answer.count):
+                raise RuntimeError("the captured frame and the host's differ")
+            refitted = 0 if frame.marked_count is None else int(frame.marked_count.numpy().sum())
+            self.found = {"pairs": len(answer.pairs), "hits": int(answer.count.sum()), "nodes_refitted": refitted}
+
+    def step(self):
+        poses, lods = self.moves[self.turn % len(self.moves)]
+        self.turn += 1
+        self.scene.set_poses(poses)
+        self.scene.set_lods(lods)
+        return self.scene.intersect(output="count")
+
+
+def run(device, quick=False):
+    """Yield one row a number of objects and way to keep states: one an object, or one a level of a ladder.
+
+    pairs, hits and nodes_refitted are those of the last frame checked. frame is a frame by itself; frame_read the same
+    with its results read by the host; host what set_poses, set_lods and intersect take for it; ratio host over
+    frame_read.
+    """
+    device = wp.get_device(device)
+    sizes = QUICK if quick else FULL
+    model = ab.Model.from_arrays(*knot(sizes["faces"]))
+    levels = np.unique(np.linspace(model.lod_max // 10, model.lod_max, STEPS).astype(np.int32))
+    for count in sizes["objects"]:
+        if count > OBJECTS_MAX_CPU and device.is_cpu:
+            continue
+        for ladder in (False, True):
+            yield run_objects(device, model, levels, count, ladder, sizes["repeats"])
+
+
+def run_objects(device, model, levels, count, ladder, repeats):
+    """Return the row of one number of objects and one way to keep states."""
+    gc.collect()  # scenes and their queries hold each other
+    scene = scene_of_objects(device, model, grid_poses(count))
+    frames = DeviceFrames(scene, levels, ladder)
+    host = HostFrames(scene, frames, repeats)
+    runs = {"frame": time_graph(frames.graph, device) if device.is_cuda else time_call(frames.replay, device)}
+    runs |= {"frame_read": time_call(frames.replay_and_read, device), "host": time_call(host.step, device)}
+    frames.time.zero_()
+    times = time_rounds(runs, repeats)
+    frames.frame.check()
+    states = frames.frame.query.batch.states
+    row = {"device": device.name, "faces": model.face_count, "objects": count, "ladder": ladder} | host.found
+    row |= {"states": len(states.slots), "state_mib": round(count_bytes(states.pool) / 2**20, 1)}
+    row |= summarise_all(times)
+    row["ratio"] = round(row["host_ms"] / row["frame_read_ms"], 2)
+    return row

@@ -1,0 +1,182 @@
+"""Time and memory against the number of object pairs, of faces and of worlds, and the slopes of the log-log lines."""
+
+import gc
+import time
+
+import numpy as np
+import warp as wp
+
+import warp_abtree as ab
+
+from ..baselines.wp_bvh import BvhFaces
+from ..roofline import find_peaks, roofline
+from ..shapes import knot, knot_model, longest_side, pair_poses, scene_of_objects, scene_of_pairs, world_poses
+from ..timing import fit_slope, summarise_all, time_in_turn, upper_half
+from .memory import memory_columns
+
+SIZES = {
+    "cuda": {
+        "pairs": {"faces": 5000, "counts": (1, 10, 100, 1000, 10_000, 100_000)},
+        "faces": {"sizes": (200, 1000, 5000, 20_000, 100_000, 250_000, 1_000_000), "pairs": (1, 64)},
+        "worlds": {"faces": 1000, "objects": 4, "counts": (1, 4, 16, 64, 256, 1024, 4096, 16_384)},
+        "repeats": 11,
+    },
+    "cpu": {
+        "pairs": {"faces": 500, "counts": (1, 10, 100, 1000, 10_000)},
+        "faces": {"sizes": (200, 1000, 5000, 20_000, 60_000, 250_000, 1_000_000), "pairs": (1, 64)},
+        "worlds": {"faces": 500, "objects": 4, "counts": (1, 4, 16, 64, 256, 1024)},
+        "repeats": 5,
+    },
+}
+QUICK = {
+    "pairs": {"faces": 200, "counts": (1, 4, 16)},
+    "faces": {"sizes": (200, 600), "pairs": (1, 3)},
+    "worlds": {"faces": 200, "objects": 4, "counts": (1, 8)},
+    "repeats": 2,
+}
+LARGEST_CPU = 60_000  # unless more is asked for
+DISTANCE = 0.9
+# Pairs and worlds asked again by themselves, where other numbers of warps work on each.
+CHECKED = 3
+
+
+def run(device, quick=False, largest=None, models=None):
+    """Yield one row a size, and after each sweep one with the slopes of its lines, all sizes and the upper half.
+
+    Each launch lists all face pairs; build_s is the time to make scene and query, first_s that of the first run, which
+    compiles and grows buffers. Memory is that of scene and query, before there is a baseline. broad is the broad phase
+    of worlds alone; its work is not counted in the roofline, its time is.
+    """
+    device = wp.get_device(device)
+    sizes = QUICK if quick else SIZES["cuda" if device.is_cuda else "cpu"]
+    timing = find_peaks(device), sizes["repeats"]
+    model, rows = knot_model(sizes["pairs"]["faces"], models), []
+    for count in sizes["pairs"]["counts"]:
+        rows.append(run_pairs("pairs", device, model, sizes["pairs"]["faces"], count, *timing))
+        yield rows[-1]
+    yield describe_slope("pairs", "pairs", rows)
+    rows = []
+    for face_target in sizes["faces"]["sizes"]:
+        if face_target > (largest or (LARGEST_CPU if device.is_cpu else face_target)):
+            continue
+        model = knot_model(face_target, models)
+        for count in sizes["faces"]["pairs"]:
+            rows.append(run_pairs("faces", device, model, face_target, count, *timing))
+            yield rows[-1]
+    for count in sizes["faces"]["pairs"]:
+        yield describe_slope("faces", "faces", [row for row in rows if row["pairs"] == count]) | {"pairs": count}
+    model, rows = knot_model(sizes["worlds"]["faces"], models), []
+    for count in sizes["worlds"]["counts"]:
+        rows.append(run_worlds(device, model, count, sizes["worlds"]["objects"], *timing))
+        yield rows[-1]
+    yield describe_slope("worlds", "worlds", rows)
+
+
+def describe_slope(sweep, x, rows) -> dict:
+    """Return the row of a sweep's slopes."""
+    row = {"sweep": f"{sweep}: slope", "sizes": len(rows)}
+    half = upper_half(rows)
+    for name in ("ours_ms", "peer_ms", "broad_ms", "arrays_mib", "pool_mib"):
+        if rows and name in rows[0]:
+            for label, some in ((f"{name}_slope", rows), (f"{name}_slope_upper", half)):
+                row[label] = fit_slope([r[x] for r in some], [r[name] for r in some])
+    return row
+
+
+def run_first(query):
+    """Return the first result of a query, and the time that it took [s]."""
+    begin = time.perf_counter()
+    return query.run(), time.perf_counter() - begin
+
+
+def run_pairs(sweep, device, model, face_target, pair_count, peaks, repeats):
+    """Return the row of one batch of pairs of a model, beside wp.Bvh."""
+    gc.collect()  # scenes and their queries hold each other
+    poses = pair_poses(pair_count, DISTANCE)
+    begin = time.perf_counter()
+    scene, pairs = scene_of_pairs(device, model, poses)
+    query = ab.Query(scene, "faces", pairs=pairs)
+    build = time.perf_counter() - begin
+    result, first = run_first(query)
+    memory = memory_columns(scene, query)
+    check_alone(scene, result)
+    vertices, faces = knot(face_target)
+    constructor = None if len(faces) > 100_000 else "sah"  # SAH is built on the host
+    peer = BvhFaces(vertices, faces, poses, 2 * len(result.faces) + 1024, device, constructor)
+    row = {"sweep": sweep, "device": device.name, "faces": model.face_count, "pairs": pair_count}
+    row |= {"hits": len(result.faces), "node_tests": int(result.node_tests.sum(dtype=np.int64))}
+    row |= {"build_s": round(build, 3), "first_s": round(first, 3)}
+    row |= time_query(query, {"peer": peer.launch}, result, repeats)
+    row["us_a_pair"] = round(1e3 * row["ours_ms"] / pair_count, 3)
+    row["ratio"] = round(row["peer_ms"] / row["ours_ms"], 2)
+    return row | memory | roofline(result, row["ours_ms"], peaks)
+
+
+def time_query(query, others, result, repeats):
+    """Return columns of times of a query and others, in turn.
+
+    Raises:
+        RuntimeError: The timed answer is not the checked one.
+    """
+    times = time_in_turn({"ours": query.launch} | others, query.device, repeats)
+    query.launch()
+    known = [tuple(row) for row in np.column_stack([result.pairs, result.count]).tolist()]
+    count = int(query.pair_count.numpy()[0])
+    again = np.column_stack([query.pairs.numpy()[:count].reshape(-1, 2), query.hits.count.numpy()[:count]]).tolist()
+    if sorted(known) != sorted(map(tuple, again)):
+        raise RuntimeError("the timed query's answer differs from the checked one")
+    return summarise_all(times)
+
+
+def check_alone(scene, result):
+    """Ask a few pairs by themselves.
+
+    Raises:
+        RuntimeError: Their face pairs differ from those in the batch.
+    """
+    for pair in range(0, len(result.pairs), max(1, len(result.pairs) // CHECKED)):
+        alone = scene.intersect(result.pairs[pair : pair + 1], output="faces").faces
+        if not np.array_equal(alone[:, 1:], result.faces[result.faces[:, 0] == pair][:, 1:]):
+            raise RuntimeError(f"pair {pair} by itself has other face pairs than in the batch")
+
+
+def run_worlds(device, model, world_count, object_count, peaks, repeats):
+    """Return the row of many worlds of a few objects each: broad phase and narrow phase in one launch."""
+    gc.collect()
+    poses = world_poses(world_count, object_count, longest_side(model))
+    begin = time.perf_counter()
+    scene = ab.Scene(device=device)
+    for world in range(world_count):
+        for pose in poses[world]:
+            scene.add(model, pose=pose, world=world)
+    query = ab.Query(scene, "faces")
+    build = time.perf_counter() - begin
+    result, first = run_first(query)
+    memory = memory_columns(scene, query)
+    check_worlds(scene, model, poses, result)
+    row = {"sweep": "worlds", "device": device.name, "faces": model.face_count, "worlds": world_count}
+    row |= {"objects": scene.object_count, "pairs": len(result.pairs), "hits": len(result.faces)}
+    row |= {"build_s": round(build, 3), "first_s": round(first, 3)}
+    row |= time_query(query, {"broad": query.broad_phase.launch}, result, repeats)
+    row["us_a_world"] = round(1e3 * row["ours_ms"] / world_count, 3)
+    return row | memory | roofline(result, row["ours_ms"], peaks)
+
+
+def check_worlds(scene, model, poses, result):
+    """Ask all pairs of objects of a few worlds, each world in a scene of its own.
+
+    Raises:
+        RuntimeError: Worlds mix, or a world by itself has other face pairs than among the others.
+    """
+    world_count, object_count = poses.shape[:2]
+    world = result.pairs // object_count
+    if (world[:, 0] != world[:, 1]).any():
+        raise RuntimeError("the broad phase pairs objects of different worlds")
+    every = np.stack(np.triu_indices(object_count, 1), 1)
+    for number in range(0, world_count, max(1, world_count // CHECKED)):
+        alone = scene_of_objects(scene.device, model, poses[number]).intersect(every, output="faces")
+        expected = np.concatenate([every[alone.faces[:, 0]], alone.faces[:, 1:]], 1)
+        rows = result.faces[np.isin(result.faces[:, 0], np.flatnonzero(world[:, 0] == number))]
+        found = np.concatenate([result.pairs[rows[:, 0]] - number * object_count, rows[:, 1:]], 1)
+        if not np.array_equal(found[np.lexsort(found.T[::-1])], expected[np.lexsort(expected.T[::-1])]):
+            raise RuntimeError(f"world {number} by itself has other face pairs than among the others")

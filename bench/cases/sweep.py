@@ -1,0 +1,106 @@
+"""Yes or no for one pair of models at many random poses: the launch by itself, a wp.Bvh baseline, and `sweep`.
+
+The launch is that of a query over posed objects. `sweep` is timed as called, from poses to answers on the host: poses
+in float64 and float32 on the host, and in float32 on the device.
+"""
+
+import gc
+
+import numpy as np
+import warp as wp
+
+import warp_abtree as ab
+
+from ..baselines.wp_bvh import BvhAny, find_constructor
+from ..meshes import real_meshes
+from ..roofline import find_peaks, roofline
+from ..shapes import knot, longest_side, random_poses, scene_of_poses
+from ..timing import summarise, summarise_all, time_call, time_in_turn, time_rounds
+from .memory import memory_columns, used_memory
+
+FULL = {"faces": 5000, "counts": (1024, 65536), "sweep_counts": (1024, 65536, 2**21), "repeats": 11}
+CPU = {"faces": 5000, "counts": (1024, 16384), "sweep_counts": (1024, 65536), "repeats": 5}
+QUICK = {"faces": 300, "counts": (16,), "sweep_counts": (16, 40), "repeats": 1}
+
+
+def run(device, quick=False):
+    """Yield one row a model and number of poses: the launch beside wp.Bvh, with memory and roofline, then `sweep`.
+
+    meet is the fraction of poses that intersect; million poses a second from medians. Memory is that of scene and
+    query, before there is a baseline, whose answers are counted against ours; those of every `sweep` must be ours.
+    """
+    device = wp.get_device(device)
+    sizes = QUICK if quick else CPU if device.is_cpu else FULL
+    peaks = find_peaks(device)
+    knots = ab.Model.from_arrays(*knot(sizes["faces"]))
+    real = real_meshes({"cow 5,804": ("cow",)})
+    for name, (model,) in {f"knot {knots.face_count:,}": (knots,), **real}.items():
+        for count in sizes["counts"]:
+            yield {"device": device.name, "model": name} | run_launch(device, model, count, sizes["repeats"], peaks)
+        for count in sizes["sweep_counts"]:
+            yield {"device": device.name, "model": name} | run_sweep(device, model, count, sizes["repeats"])
+
+
+def mposes(count, milliseconds):
+    """Return million poses a second."""
+    return float(f"{count / milliseconds / 1e3:.4g}")
+
+
+def run_launch(device, model, count, repeats, peaks):
+    """Return the columns of launches over posed objects."""
+    gc.collect()  # scenes and their queries hold each other
+    poses = random_poses(count, longest_side(model))
+    scene, pairs = scene_of_poses(device, model, model, poses)
+    query = ab.Query(scene, "any", pairs=pairs)
+    result = query.run()
+    row = {"case": "launch", "poses": count, "meet": round(float(result.any.mean()), 4)}
+    memory = memory_columns(scene, query)
+    mesh = model.mesh_at(model.lod_max)[:2]
+    both = np.zeros((2 * count, 7), np.float32)
+    both[::2, 6], both[1::2] = 1, poses
+    constructor = find_constructor(*mesh, both[: 2 * min(64, count)], device)
+    peer = BvhAny(*mesh, both, device, constructor)
+    times = time_in_turn({"launch": query.launch, "peer": peer.launch}, device, repeats)
+    query.launch()
+    if not np.array_equal(query.result().any, result.any):
+        raise RuntimeError("the timed query's answer differs from the checked one")
+    peer.launch()
+    found = peer.result()
+    row |= {"peer_missed": int((result.any & ~found).sum()), "peer_invented": int((found & ~result.any).sum())}
+    row |= summarise_all(times)
+    row["launch_mposes_s"] = mposes(count, row["launch_ms"])
+    row["ratio"] = round(row["peer_ms"] / row["launch_ms"], 2)
+    return row | memory | roofline(result, row["launch_ms"], peaks)
+
+
+def run_sweep(device, model, count, repeats):
+    """Return the columns of `sweep`, in turn with poses of each kind."""
+    gc.collect()
+    poses = random_poses(count, longest_side(model))
+    single = poses.astype(np.float32)
+    kinds = {"sweep": poses, "sweep32": single, "sweep_on_device": wp.array(single, dtype=wp.float32, device=device)}
+    answers = {kind: ab.sweep(model, model, rows, device=device) for kind, rows in kinds.items()}
+    check_sweep(device, model, single, answers["sweep32"])
+    if not np.array_equal(answers["sweep32"], answers["sweep_on_device"]):
+        raise RuntimeError("poses on the host and on the device are answered differently")
+    runs = {
+        kind: time_call(lambda rows=rows: ab.sweep(model, model, rows, device=device), device)
+        for kind, rows in kinds.items()
+    }
+    row = {"case": "sweep", "poses": count, "meet": round(float(answers["sweep32"].mean()), 4)}
+    for kind, values in time_rounds(runs, min(repeats, 5)).items():
+        row |= summarise(kind, values)
+        row[f"{kind}_mposes_s"] = mposes(count, row[f"{kind}_ms"])
+    return row | used_memory(device)
+
+
+def check_sweep(device, model, poses, found, checked=1024):
+    """Ask some poses of a sweep as objects of a scene.
+
+    Raises:
+        RuntimeError: The answers differ.
+    """
+    some = np.unique(np.linspace(0, len(poses) - 1, checked).astype(int))
+    scene, pairs = scene_of_poses(device, model, model, poses[some])
+    if not np.array_equal(scene.intersect(pairs).any, found[some]):
+        raise RuntimeError("the sweep and the query differ")

@@ -1,0 +1,206 @@
+"""Time of ACTIVE-UPDATE against k, beside a full refit of the same state and a tree built from scratch; many states.
+
+The library chooses between both kinds of refit; here each is forced, so that both are measured on the same states, in
+turn. Their bits are compared before anything is timed.
+"""
+
+import copy
+import math
+
+import numpy as np
+import warp as wp
+
+import warp_abtree as ab
+from warp_abtree import testing
+
+from ..baselines.wp_bvh import FaceBvh
+from ..inside import active_build, full_refit_fraction, read_bits, state_lods, upload_lods
+from ..roofline import find_peaks, update_roofline
+from ..shapes import knot_model
+from ..timing import WARM_UP, fit_slope, make_runs, medians, summarise, time_both, time_call, time_in_turn, time_rounds
+from .memory import memory_columns
+
+# Fractions of the splits between the finest LOD and the other.
+FRACTIONS = (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.5, 0.9)
+FULL = {
+    "faces": (4000, 16000, 64000, 250_000, 1_000_000),
+    "fractions": FRACTIONS,
+    "states": (1, 16, 256, 4096),
+    "state_faces": 500,
+    "repeats": 7,
+}
+QUICK = {"faces": (200, 600), "fractions": (0.01, 0.1, 0.9), "states": (1, 12), "state_faces": 200, "repeats": 2}
+LARGEST_CPU = 64000
+STATES_PER_MODEL = 8
+REFITS = {"update": False, "full": True}  # whether states are refitted whole
+SETTLE = 2  # times there and back, the last of which counts
+
+
+def run(device, quick=False, largest=None, models=None):
+    """Yield one row a fraction of a mesh, one a mesh with its crossover, and one a number of states moved at once.
+
+    Columns: nodes and bytes are those of the partial update, counted; memory is that of the scene, before there is a
+    baseline. entries are the faces of the slice between the LODs, repeats included; full tells whether the library
+    would refit the whole tree. bvh_build boxes the faces at the LOD and builds a wp.Bvh over them; host_build is
+    ACTIVE-BUILD over the finest mesh. crossover_* are where the update costs as much as a full refit: the least
+    measured if it always does, None if it never does.
+    """
+    device = wp.get_device(device)
+    sizes = QUICK if quick else FULL
+    peaks = find_peaks(device)
+    limit = largest or (LARGEST_CPU if device.is_cpu else max(sizes["faces"]))
+    for face_target in sizes["faces"]:
+        if face_target <= limit:
+            yield from run_mesh(device, knot_model(face_target, models), sizes, peaks)
+    for count in sizes["states"]:
+        yield run_states(device, knot_model(sizes["state_faces"], models), count, sizes["repeats"], peaks)
+
+
+def bound_nodes(k, faces):
+    """Return the bound on nodes refitted, equation (1), faces rounded up to a power of two."""
+    return k * (math.ceil(math.log2(faces)) - math.log2(k) + 2) - 1 if k else 0
+
+
+def same_bits(one, other) -> bool:
+    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def check_update(scene, there, back, faces):
+    """Move to other LODs and back by both kinds of refit and compare all bits.
+
+    Returns:
+        k and nodes refitted of each state by the partial update, faces in its slices, and by kind of refit the launches
+        that repeat the updates there and back.
+
+    Raises:
+        RuntimeError: Bits or k differ, the bound of equation (1) is passed, or states have changed places.
+    """
+    begin, start = state_lods(scene), read_bits(scene)
+    launches, bits, counts = {}, {}, {}
+    for kind in REFITS:
+        with testing.force_refits(REFITS[kind]):
+            forth = scene.set_lods(there)
+            counts[kind] = forth.k[np.argsort(forth.state)]
+            if not REFITS[kind]:
+                k, nodes, entries = forth.k.copy(), forth.nodes_refitted.copy(), int(forth.slice_length.sum())
+            forth = testing.repeat_update(forth)
+            bits[kind] = read_bits(scene)
+            home = testing.repeat_update(scene.set_lods(back))
+        if state_lods(scene) != begin:
+            raise RuntimeError("states do not return to where they were")
+        if not same_bits(start, read_bits(scene)):
+            raise RuntimeError(f"{kind}: the way back leaves other bits than were there before")
+        launches[kind] = forth, home
+    if not np.array_equal(counts["update"], counts["full"]):
+        raise RuntimeError(f"a partial update changes {k.sum()} faces, a full refit {counts['full'].sum()}")
+    if not same_bits(bits["update"], bits["full"]):
+        raise RuntimeError("a partial update and a full refit leave different bits")
+    if any(nodes[i] > bound_nodes(int(k[i]), faces) for i in range(len(k))):
+        raise RuntimeError("more nodes refitted than equation (1) allows")
+    return k, nodes, entries, launches
+
+
+def time_update(scene, there, back, launches, repeats):
+    """Return columns of times [ms].
+
+    update, full: device time of refinement, marking and refit, there and back: graph replays on CUDA. wall: whole calls
+    of `set_lods` as the library chooses, planning and uploads included; update_wall and full_wall as forced; stream
+    beside them: the same between events on CUDA. In turn, but each time there and back twice, of which the second
+    counts: what one kind of refit leaves in the caches is of no use to the other.
+    """
+    device = scene.device
+    ways = {(kind, way): launch for kind, both in launches.items() for way, launch in enumerate(both)}
+    runs = make_runs(ways, device)
+    calls = {"": None, "update_": "update", "full_": "full"}
+    times = {name: [] for name in [*REFITS, *(call + clock for call in calls for clock in ("wall", "stream"))]}
+    for turn in range(WARM_UP + repeats):
+        for kind in REFITS:
+            taken = [[runs[kind, way]() for way in (0, 1)] for _ in range(SETTLE)]
+            times[kind] += taken[-1] if turn >= WARM_UP else []
+    upload_lods(scene)
+    for turn in range(WARM_UP + repeats):
+        for call, kind in calls.items():
+            with testing.force_refits(None if kind is None else REFITS[kind]):
+                taken = [
+                    time_both(lambda lods=lods: scene.set_lods(lods), device)
+                    for _ in range(SETTLE)
+                    for lods in (there, back)
+                ]
+            for i, clock in enumerate(("wall", "stream")):
+                times[call + clock] += [both[i] for both in taken[-2:]] if turn >= WARM_UP else []
+    row = {}
+    for name, values in times.items():
+        if device.is_cuda or not name.endswith("stream"):
+            row |= summarise(name, values)
+    row["ratio"] = round(row["full_ms"] / row["update_ms"], 2)
+    return row
+
+
+def find_crossover(rows, column):
+    """Return the value of a column where an update starts to cost as much as a full refit, None if it never does."""
+    x = [row[column] for row in rows]
+    excess = [math.log(row["update_ms"] / row["full_ms"]) for row in rows]
+    for i in range(len(rows) - 1, 0, -1):
+        if excess[i - 1] < 0 <= excess[i]:
+            part = -excess[i - 1] / (excess[i] - excess[i - 1])
+            return round(math.exp(math.log(x[i - 1]) * (1 - part) + math.log(x[i]) * part))
+    return x[0] if excess[0] >= 0 else None
+
+
+def run_mesh(device, model, sizes, peaks):
+    """Yield the rows of one mesh."""
+    scene = ab.Scene(device=device)
+    scene.add(model)
+    finest, repeats, rows = model.lod_max, sizes["repeats"], []
+    memory = memory_columns(scene)
+    for step in sorted({max(1, round(fraction * finest)) for fraction in sizes["fractions"]}):
+        k, nodes, entries, launches = check_update(scene, [finest - step], [finest], model.face_count)
+        vertices, faces, _ = model.mesh_at(finest - step)
+        baseline = FaceBvh(vertices, faces, device)
+        row = {"device": device.name, "case": "one state", "faces": model.face_count, "splits": step}
+        row |= {"k": int(k[0]), "share": float(f"{k[0] / model.face_count:.4g}"), "entries": entries}
+        row |= {"nodes_refitted": int(nodes[0]), "bound": int(bound_nodes(int(k[0]), model.face_count))}
+        row["full"] = entries > full_refit_fraction(device) * model.face_count  # what the library chooses
+        row |= time_update(scene, [finest - step], [finest], launches, repeats)
+        # Not in turn with the others, whose tree it would drive out of the caches.
+        row |= summarise("bvh_build", time_in_turn({"build": baseline.rebuild}, device, repeats)["build"])
+        row |= memory | update_roofline(row["k"], row["nodes_refitted"], entries, row["update_ms"], peaks)
+        rows.append(row)
+        yield row
+    vertices, faces, _ = model.mesh_at(finest)
+    host = time_rounds({"build": time_call(lambda: active_build(vertices, faces))}, 3)
+    crossover = find_crossover(rows, "k")
+    yield {
+        "device": device.name,
+        "case": "crossover",
+        "faces": model.face_count,
+        "crossover_k": crossover,
+        "crossover_share": crossover and round(crossover / model.face_count, 4),
+        "crossover_entries": find_crossover(rows, "entries"),
+        "full_share": full_refit_fraction(device),
+        "slope": fit_slope([row["k"] for row in rows], [row["update_ms"] for row in rows]),
+        "host_build_ms": round(medians(host)["build"], 2),
+    }
+
+
+def run_states(device, model, count, repeats, peaks):
+    """Return the row of many states of a model, each at a LOD of its own, moved by a few splits in one call."""
+    step = model.lod_max // STATES_PER_MODEL
+    scene = ab.Scene(device=device)
+    back = []
+    for i in range(count):
+        if i % STATES_PER_MODEL == 0:
+            clone = copy.copy(model)  # another model to the scene: no state is shared
+        back.append(model.lod_max - step * (i % STATES_PER_MODEL))
+        scene.add(clone, lod=back[-1])
+    there = [lod - max(1, step // 4) for lod in back]
+    k, nodes, entries, launches = check_update(scene, there, back, model.face_count)
+    if len(k) != count:
+        raise RuntimeError(f"{len(k)} states moved in place of {count}")
+    row = {"device": device.name, "case": "many states", "faces": model.face_count, "states": count}
+    row |= {"k": int(k.sum()), "entries": entries, "nodes_refitted": int(nodes.sum())}
+    row["bound"] = int(sum(bound_nodes(int(x), model.face_count) for x in k))
+    row |= time_update(scene, there, back, launches, repeats)
+    row["us_a_state"] = round(1e3 * row["update_ms"] / count, 3)
+    row |= memory_columns(scene)
+    return row | update_roofline(row["k"], row["nodes_refitted"], entries, row["update_ms"], peaks)

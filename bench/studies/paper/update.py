@@ -1,0 +1,196 @@
+"""Figure 6: the update against k, with the crossover, and the update's share of the query time."""
+
+import math
+
+import numpy as np
+
+import warp_abtree as ab
+from warp_abtree import testing
+
+from ...cases.update import REFITS, bound_nodes, check_update
+from ...inside import upload_lods
+from ...tables import pick
+from .meshes import PosedPairs, paper_models
+
+# Fractions of the splits between the finest LOD and the other; the last is the base mesh, where k = n.
+FRACTIONS = (1e-5, 1e-4, 3e-4, 0.001, 0.003, 0.006, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.75, 1.0)
+QUICK_FRACTIONS = (1e-5, 0.003, 0.03, 0.1, 0.3, 1.0)
+CLOSE_TO_N = 0.5  # "except for the cases when k is very close to n"
+TENTH = 0.1  # k of all faces, at most
+# Name, and how far B is pushed into A as a fraction of A's longest side.
+CONFIGURATIONS = (("touching", 0.001), ("light", 0.03), ("deep", 0.2))
+
+
+def run_figure_6(context):
+    """Yield one row a model and k, and one a model and k of random faces, only counted.
+
+    A model goes from its finest level of detail to a coarser one; k faces change. Marking and refit are timed alone, as
+    the paper's figure 6 has them, as captured launches (one core on the CPU), beside a refit of the whole tree. Nodes
+    are counted by the marking itself.
+    """
+    for model in paper_models(context):
+        context.progress(model.name)
+        scene = ab.Scene(context.device)
+        scene.add(model)
+        finest = model.lod_max
+        steps = {max(1, round(fraction * finest)) for fraction in context.size(FRACTIONS, QUICK_FRACTIONS)}
+        # The split that touches the fewest faces: k as near to 1 as the mesh has it.
+        least = int(np.argmin(np.diff(model.progressive.split_start)))
+        for home, there in [(least + 1, least), *((finest, finest - step) for step in sorted(steps))]:
+            yield time_move(context, scene, model, home, there)
+        leaf_node, rng = model.tree.leaf_node, np.random.default_rng(0)
+        for k in np.unique(np.geomspace(1, model.face_count, 25).round().astype(int)):
+            leaves = leaf_node[rng.choice(model.face_count, k, replace=False)]
+            row = {"case": "random faces", "model": model.name, "faces": model.face_count, "k": int(k)}
+            yield row | {"nodes": count_ancestors(leaves), "bound": bound_nodes(int(k), model.face_count)}
+
+
+def count_ancestors(leaves) -> int:
+    """Return how many nodes a bottom-up marking of these leaves marks, themselves among them."""
+    marked, nodes = np.empty(0, int), np.asarray(leaves)
+    while len(nodes):
+        # Leaves stand on two levels, so a node may come up twice.
+        marked = np.union1d(marked, nodes)
+        nodes = np.unique(nodes >> 1)
+        nodes = nodes[nodes > 0]
+    return len(marked)
+
+
+def time_move(context, scene, model, home, there):
+    """Return the row of one LOD change, both kinds of refit checked against each other first."""
+    scene.set_lods([home])
+    k, nodes, entries, launches = check_update(scene, [there], [home], model.face_count)
+    refits = {}
+    for kind, full in REFITS.items():
+        scene.set_lods([home])
+        with testing.force_refits(full):
+            refits[kind] = testing.repeat_update(scene.set_lods([there]), refine=False)
+    part, whole = refits["update"], refits["full"]
+    # In turn, at the same LOD: a refit repeated alone is one that the processor knows by heart.
+    times = context.time_graphs({"refit": part, "full": whole})
+    scene.set_lods([home])
+    forth, back = launches["update"]
+    moved = context.time_graphs({"there": forth, "between": whole, "back": back, "after": whole})
+    upload_lods(scene)
+    row = {"case": "move", "from_finest": home == model.lod_max, "model": model.name, "faces": model.face_count}
+    row |= {"splits": home - there, "k": int(k[0]), "share": k[0] / model.face_count, "entries": entries}
+    row |= {"nodes": int(nodes[0]), "bound": bound_nodes(int(k[0]), model.face_count)}
+    row |= {"refit_ms": times["refit"], "full_ms": times["full"]}
+    return row | {"update_ms": (moved["there"] + moved["back"]) / 2}
+
+
+def by_model(rows):
+    """Yield (model, its rows of moves in the order of k)."""
+    for name in dict.fromkeys(row["model"] for row in rows):
+        yield name, sorted(pick(rows, model=name, case="move"), key=lambda row: (row["k"], row["splits"]))
+
+
+def correlate(rows, one, other):
+    return float(np.corrcoef([row[one] for row in rows], [row[other] for row in rows])[0, 1])
+
+
+def fit_scale(moves) -> float:
+    """Return the time a node of equation (1) [ms], fitted up to k = n/2."""
+    near = [row for row in moves if row["share"] <= CLOSE_TO_N]
+    bound, time = (np.array([row[key] for row in near], float) for key in ("bound", "refit_ms"))
+    return float(bound @ time / (bound @ bound))
+
+
+def fit_figure_6(rows):
+    """Return a row a model: correlation with equation (1), its one scale, the greatest deviations, the crossover."""
+    found = []
+    for name, moves in by_model(rows):
+        near = [row for row in moves if row["share"] <= CLOSE_TO_N]
+        logs = np.log([row["refit_ms"] / row["full_ms"] for row in moves])
+        used = [row["nodes"] / row["bound"] for row in moves]
+        found.append(
+            {
+                "model": name,
+                "faces": moves[0]["faces"],
+                "k_min": moves[0]["k"],
+                "correlation": correlate(near, "bound", "refit_ms"),
+                "correlation_all": correlate(moves, "bound", "refit_ms"),
+                "correlation_nodes": correlate(near, "nodes", "refit_ms"),
+                "correlation_counted": correlate(near, "bound", "nodes"),
+                "ns_a_node": 1e6 * fit_scale(moves),
+                "nodes_of_bound_min": min(used),
+                "nodes_of_bound_max": max(used),
+                "crossover": find_crossover([row["share"] for row in moves], logs),
+            }
+        )
+    return found
+
+
+def fitted_moves(rows):
+    """Return the rows of moves from the finest LOD, each with the time of equation (1), scaled once a model."""
+    found = [row | {"fitted_ms": fit_scale(moves) * row["bound"]} for _, moves in by_model(rows) for row in moves]
+    return pick(found, from_finest=True)
+
+
+def find_crossover(fractions, logs):
+    """Return the k/n from which on a full refit costs less: interpolated, 0 if always, None if never."""
+    above = np.flatnonzero(np.asarray(logs) < 0)
+    if not len(above):
+        return 0.0
+    i = int(above[-1])
+    if i == len(logs) - 1:
+        return None
+    part = -logs[i] / (logs[i + 1] - logs[i])
+    return float(math.exp(math.log(fractions[i]) * (1 - part) + math.log(fractions[i + 1]) * part))
+
+
+def thin(rows):
+    """Leave two rows of three away; those with the least and the greatest k stay."""
+    return [row for _, moves in by_model(rows) for row in moves[:-1:3] + moves[-1:]]
+
+
+def find_tenth(model) -> int:
+    """Return the coarsest LOD whose way from the finest changes less than a tenth of the faces."""
+    slices, starts = model.progressive.split_face, model.progressive.split_start
+    low, high = 1, model.lod_max
+    while low < high:
+        middle = (low + high + 1) // 2
+        changed = len(np.unique(slices[starts[model.lod_max - middle] :]))
+        low, high = (middle, high) if changed < TENTH * model.face_count else (low, middle - 1)
+    return model.lod_max - low
+
+
+def run_share(context):
+    """Yield one row a model, configuration and number of object pairs.
+
+    Pairs of one model in random rotations: just touching, pushed into each other by 3 % and by 20 % of the longest
+    side. The first object of every pair, with a tree state of its own, moves between the finest level of detail and the
+    coarsest one for which k stays below 10 % of the faces; then all intersecting face pairs are asked. Where 32 pairs
+    share one state, one update serves all.
+    """
+    most = context.size(32, 4)
+    for model in paper_models(context, largest=False):
+        context.progress(model.name)
+        for count, states in [(1, 1), (most, most), (most, 1)]:
+            yield from time_shares(context, model, find_tenth(model), count, states)
+
+
+def time_shares(context, model, lod, count, states):
+    """Yield the rows of a number of pairs and states, one a configuration."""
+    posed = PosedPairs(model, count, context.device, first_count=states, steps=context.size(32, 12))
+    scene = posed.scene
+    home = [model.lod_max] * scene.object_count
+    there = [lod] * states + home[states:]
+    k, _, _, launches = check_update(scene, there, home, model.face_count)
+    if not (k < TENTH * model.face_count).all():
+        raise RuntimeError(f"k is {k.max()} of {model.face_count}")
+    moved = context.time_graphs(dict(zip(("there", "back"), launches["update"], strict=True)))
+    upload_lods(scene)
+    scene.set_lods(there)
+    update = (moved["there"] + moved["back"]) / 2
+    for name, depth in CONFIGURATIONS:
+        posed.push(depth)
+        row = {"model": model.name, "faces": model.face_count, "configuration": name, "pairs": count}
+        row |= {"states": states, "k": int(k.max()), "k_share": k.max() / model.face_count, "update_ms": update}
+        for output in ("faces", "any"):
+            query = ab.Query(scene, output, pairs=posed.pairs)
+            result = query.run()
+            row[f"{output}_ms"] = context.time_graphs({"query": query.launch})["query"]
+            if output == "faces":
+                row["hits"] = len(result.faces)
+        yield row | {"ratio": update / row["faces_ms"], "ratio_any": update / row["any_ms"]}

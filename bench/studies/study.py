@@ -1,0 +1,181 @@
+"""Studies: `python -m bench paper|tradeoff|all --out DIR`.
+
+A study is a package with PARTS, functions that yield rows, and SUMMARIES, functions of rows that its tables and figures
+use. It writes DIR/STUDY.json after each part, and in the end STUDY.md and figures, laid out in STUDY.toml.
+"""
+
+import argparse
+import functools
+import importlib
+import json
+import platform
+import shlex
+import sys
+import time
+from pathlib import Path
+
+import warp as wp
+
+import warp_abtree as ab
+
+from .. import tables, timing
+from ..__main__ import STUDIES, Parser, describe_run
+from ..meshes import ModelFolder
+
+
+class Context:
+    """What a part may use.
+
+    Attributes:
+        device: `wp.Device`.
+        quick: Whether the smallest sizes are asked: all parts together take less than two minutes on two cores.
+        notes: What the tables say below, such as a library that is not installed.
+    """
+
+    def __init__(self, device, quick, models):
+        self.device, self.quick, self.models, self.notes = wp.get_device(device), quick, models, []
+
+    def size(self, full, quick):
+        """Return one of two sizes."""
+        return quick if self.quick else full
+
+    def model(self, *names, base_faces=10) -> ab.Model:
+        """Return the model of the first mesh at hand, see `meshes.ModelFolder.load`; built once and kept on disk."""
+        model = self.models.load(names, base_faces)
+        if model.name != names[0]:
+            self.note(f"{names[0]} is not at hand; {model.name} stands in for it.")
+        return model
+
+    def library(self, module):
+        """Return an optional module, or None and note that."""
+        try:
+            return importlib.import_module(module)
+        except ImportError as error:
+            self.note(f"{module} is skipped: {error}.")
+            return None
+
+    def note(self, text):
+        """Note something once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def progress(self, text):
+        """Say what is being done."""
+        print(f"  {text}", file=sys.stderr, flush=True)
+
+    def time_graphs(self, launches: dict, repeats=None) -> dict:
+        """Return the median time [ms] of launches by name, captured as graphs on any device and replayed in turn.
+
+        On the CPU a graph costs no Python a launch and runs in this thread, whose own CPU time is taken: others on the
+        machine count for little. Turns keep the order of the dict, so launches there and back may stand side by side.
+        """
+        runs = {}
+        for name, launch in launches.items():
+            launch()
+            graph = timing.capture(launch, self.device)
+            replay = functools.partial(wp.capture_launch, graph)
+            runs[name] = timing.time_graph(graph, self.device) if self.device.is_cuda else timed(replay)
+        return timing.medians(timing.time_rounds(runs, repeats or self.size(21, 5)))
+
+    def time_alone(self, launches: dict) -> dict:
+        """Return the median time [ms] of launches that a graph of the CPU cannot hold, by name, in turn.
+
+        As `time_graphs`, but on the CPU called as they are: comparable with it but for some microseconds a launch.
+        """
+        if self.device.is_cuda:
+            return self.time_graphs(launches)
+        runs = {name: timed(launch) for name, launch in launches.items()}
+        return timing.medians(timing.time_rounds(runs, self.size(21, 5)))
+
+    def time_launches(self, launches, repeats=None, on_core=False) -> dict:
+        """Return the median time [ms] of launches by name, in turn: on CUDA of graph replays.
+
+        Else the CPU time of one thread on one core, each launch once untimed before: caches are full of what ran
+        before, which may have been large.
+
+        Args:
+            on_core: Whether these run on the host whatever the device.
+        """
+        repeats = repeats or self.size(9 if self.device.is_cuda and not on_core else 7, 3)
+        if self.device.is_cuda and not on_core:
+            return timing.medians(timing.time_in_turn(launches, self.device, repeats))
+        clocked = {name: timed(launch) for name, launch in launches.items()}
+        runs = {name: lambda run=run: (run(), run())[1] for name, run in clocked.items()}
+        with timing.one_core(), timing.no_garbage_collection():
+            return timing.medians(timing.time_rounds(runs, repeats))
+
+
+def timed(call):
+    """Return a callable that calls something and returns the CPU time of this thread [ms]."""
+    return timing.time_call(call, "cpu", time.thread_time)
+
+
+def describe_device(device) -> str:
+    """Return what a device calls itself."""
+    if device.is_cuda:
+        return device.name
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        name = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        name = platform.processor() or platform.machine()
+    return f"{name}, {timing.core_count()} cores"
+
+
+def find_study(name):
+    """Return the package of a study."""
+    return importlib.import_module(f"{__package__}.{name}")
+
+
+def run_part(run, context, command) -> dict:
+    """Run a part; return its rows, notes and the circumstances."""
+    begin = time.perf_counter()
+    rows = [{key: tables.plain(value) for key, value in row.items()} for row in run(context)]
+    about = {"device": describe_device(context.device), "quick": context.quick, **describe_run(), "command": command}
+    about["seconds"] = tables.plain(time.perf_counter() - begin)
+    return {"run": about, "notes": context.notes, "rows": rows}
+
+
+def run_study(name, options, command):
+    """Run the parts of a study and write what they found."""
+    file = options.out / f"{name}.json"
+    study = {"study": name, "parts": {}}
+    if options.only and file.is_file():
+        study = json.loads(file.read_text(encoding="utf-8"))
+    models = ModelFolder(options.models or options.out / "models")
+    for part, run in find_study(name).PARTS.items():
+        if options.only and part not in options.only:
+            continue
+        print(f"{name}: {part}", file=sys.stderr, flush=True)
+        study["parts"][part] = run_part(run, Context(options.device, options.quick, models), command)
+        tables.write_json(file, study)
+    (options.out / f"{name}.md").write_text(tables.study_page(study), encoding="utf-8")
+    figures = tables.read_layout(f"studies/{name}.toml")["figure"]
+    print(tables.draw(figures, functools.partial(tables.select_rows, study=study), options.out))
+    print(f"wrote {file} and {name}.md")
+
+
+def main(argv) -> int:
+    """Run `python -m bench paper|tradeoff|all`."""
+    parser = Parser(prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", choices=STUDIES)
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="where to write")
+    parser.add_argument("--device", default=None, help='Warp device; by default the first GPU, else "cpu"')
+    parser.add_argument("--quick", action="store_true", help="the smallest sizes: under two minutes on two cores")
+    parser.add_argument("--models", type=Path, metavar="DIR", help="keep built models there (OUT/models)")
+    parser.add_argument("--only", nargs="+", metavar="PART", help="run these parts alone; others are kept from before")
+    options = parser.parse_args(argv)
+    wp.config.log_level = wp.LOG_WARNING
+    names = STUDIES[:-1] if options.name == "all" else (options.name,)
+    parts = [part for name in names for part in find_study(name).PARTS]
+    unknown = set(options.only or ()) - set(parts)
+    if unknown:
+        parser.error(f"no part {', '.join(sorted(unknown))}; there are {', '.join(parts)}")
+    try:
+        ab.Scene(options.device)
+        options.out.mkdir(parents=True, exist_ok=True)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    for name in names:
+        run_study(name, options, shlex.join(["python", "-m", "bench", *argv]))
+    return 0

@@ -1,0 +1,233 @@
+"""Competitors: other ways to trade accuracy for speed, each a point of time against error beside our LODs.
+
+All answer yes or no for the same poses, and are taken along the same motions to where they first say yes. The truth is
+the exact answer on the finest meshes. A query is timed over all poses, apart to deep; python-fcl in a loop of its own
+calls on one core, its objects made before; ours as one batch, on the CPU on one core as well; Newton as one batch on
+the GPU. On a core, the CPU time of the thread counts. The surfaces of hulls are asked, too, which on a way in from
+outside is the same as asking the solids.
+"""
+
+import time
+from functools import partial
+from importlib import metadata
+
+import numpy as np
+import trimesh
+import warp as wp
+
+import warp_abtree as ab
+
+from ...baselines.fcl import Fcl, make_convex, make_tree
+from ...baselines.newton import Newton
+from ...shapes import rotation_matrices
+from .workload import find_front, judge_answers, judge_contact, workloads
+
+FRACTIONS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
+QUICK_FRACTIONS = (0.02, 0.1, 0.5, 1)
+SDF_RESOLUTIONS = (32, 64, 128)
+NEWTON_POSES = 1024  # at a time: its time a pose hardly falls beyond, and a body is to be set up for each
+BASE_FACES = 10
+OURS, OURS_WITHIN, OURS_FCL = "our LODs", "our LODs, within both errors", "our LODs, python-fcl"
+SIMPLIFIED, HULL, NEWTON_SDF = "fast-simplification, python-fcl", "convex hull, python-fcl", "Newton, SDF"
+
+
+class FclPoses:
+    """python-fcl over two shapes at any poses."""
+
+    def __init__(self, a, b, make=make_tree):
+        self.fcl = Fcl(a, b, (), make)
+
+    def place(self, poses):
+        matrices = np.tile(np.eye(4), (len(poses), 1, 1))
+        matrices[:, :3, :3], matrices[:, :3, 3] = rotation_matrices(poses[:, 3:]), poses[:, :3]
+        self.fcl.place(matrices)
+
+    def intersects(self, poses):
+        """Return whether A and B intersect at each pose, bool (n,)."""
+        self.place(poses)
+        return np.array(self.fcl.any(), bool)
+
+
+class NewtonPoses:
+    """Newton's narrow phase over one mesh, brought to unit size; a number of poses at a time.
+
+    Raises:
+        RuntimeError: It lost contacts for lack of room.
+    """
+
+    def __init__(self, workload, room, hits, device, sdf):
+        vertices, faces, _ = workload.a.mesh_at(workload.a.lod_max)
+        self.scale, self.room, self.far = 1 / workload.size, room, workload.motions.far
+        self.rows = np.zeros((2 * room, 7), np.float32)
+        self.rows[:, 6] = 1
+        self._fill(np.tile(self.far, (room, 1)))
+        self.newton = Newton(vertices * self.scale, faces, self.rows, hits, device, sdf)
+
+    def _fill(self, poses):
+        self.rows[1::2] = self.far
+        self.rows[1 : 2 * len(poses) : 2] = poses
+        self.rows[1::2, :3] *= self.scale
+
+    def place(self, poses):
+        self._fill(poses)
+        self.newton.state.body_q.assign(self.rows)
+
+    def intersects(self, poses):
+        """Return whether it has a contact at each pose, bool (n,)."""
+        found = []
+        for start in range(0, len(poses), self.room):
+            part = poses[start : start + self.room]
+            self.place(part)
+            self.newton.launch()
+            found.append(self.newton.result()[0][: len(part)])
+        return np.concatenate(found)
+
+
+# --- shapes ----------------------------------------------------------------------------------------------------------
+
+
+def simplify(library, vertices, faces, fraction):
+    """Return a mesh simplified by fast-simplification; its threshold is absolute, so it is brought to unit size.
+
+    Asked for fewer faces than our base meshes have, it may leave none.
+    """
+    if fraction == 1:
+        return vertices, faces
+    fraction, scale = max(fraction, BASE_FACES / len(faces)), np.ptp(vertices, axis=0).max()
+    points, kept = library.simplify(vertices / scale, faces.astype(np.int32), target_reduction=1 - fraction)
+    return points.astype(float) * scale, kept.astype(np.int32)
+
+
+def convex_hull(vertices, faces):
+    """Return the hull of a mesh, by trimesh (Qhull)."""
+    hull = trimesh.Trimesh(vertices, faces, process=False).convex_hull
+    return np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int32)
+
+
+def find_version(package):
+    """Return the version of an installed package."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+# --- points ----------------------------------------------------------------------------------------------------------
+
+
+def measure(workload, method, setting, intersects, **more):
+    """Return the row of a point, time aside."""
+    row = {"case": "point", "workload": workload.name, "method": method, "setting": setting} | more
+    answers = judge_answers(intersects(workload.poses), workload.truth)
+    return row | answers | judge_contact(workload.first_contact(intersects))
+
+
+def our_points(context, workload):
+    """Yield the points of our LODs, and of "not proved farther apart than both errors" at the same LODs."""
+    poses = workload.timed_poses()
+    where = "GPU" if context.device.is_cuda else "CPU core"
+    for value in context.size(FRACTIONS, QUICK_FRACTIONS):
+        lods, setting = workload.lods(fraction=value), f"{value:.3g} of the faces"
+        bound, about = workload.bound(lods), {"share": workload.fraction(lods), "where": where}
+        scene = workload.scene(lods)
+        found = [(None, measure(workload, OURS, setting, scene.intersects, **about))]
+        if bound > 0:
+            near = partial(scene.near, within=bound)
+            found.append((bound, measure(workload, OURS_WITHIN, setting, near, **about)))
+        scene.place(poses)
+        for within, row in found:
+            query = ab.Query(scene.scene, "any", pairs=scene.pairs[: len(poses)], within=within)
+            query.run()
+            yield row, query.launch if within is None else query.prove_apart
+
+
+def fcl_point(workload, method, setting, meshes, make=make_tree, **more):
+    """Return a point of python-fcl on other meshes of A and B."""
+    query = FclPoses(meshes[0], meshes[-1], make)
+    row = measure(workload, method, setting, query.intersects, where="CPU core", **more)
+    face_count = workload.a.face_count + workload.b.face_count
+    row["share"] = (len(meshes[0][1]) + len(meshes[-1][1])) / face_count
+    query.place(workload.poses)
+    return row, query.fcl.any
+
+
+def fcl_points(context, workload):
+    """Yield the points of python-fcl on meshes simplified by others and by us, on hulls and on decompositions."""
+    if context.library("fcl") is None:
+        return
+    models = [workload.a] if workload.a is workload.b else [workload.a, workload.b]
+    library = context.library("fast_simplification")
+    whole = [model.mesh_at(model.lod_max)[:2] for model in models]
+    for value in context.size(FRACTIONS, QUICK_FRACTIONS):
+        setting = f"{value:.3g} of the faces"
+        ours = [model.mesh_at(model.lod_for(fraction=value))[:2] for model in models]
+        yield fcl_point(workload, OURS_FCL, setting, ours)
+        simplified = [] if library is None else [simplify(library, *mesh, value) for mesh in whole]
+        if simplified and all(len(mesh[1]) for mesh in simplified):
+            yield fcl_point(workload, SIMPLIFIED, setting, simplified)
+        elif simplified:
+            context.note(f"fast-simplification leaves no face of {workload.name} at {setting}.")
+    begin = time.perf_counter()
+    hulls = [convex_hull(*mesh) for mesh in whole]
+    made = {"pieces": len(models), "build_s": time.perf_counter() - begin}
+    made["made_by"] = f"trimesh {find_version('trimesh')}"
+    yield fcl_point(workload, HULL, "GJK", hulls, make_convex, **made)
+    yield fcl_point(workload, HULL, "BVHModel", hulls, **made)
+
+
+def newton_points(context, workload):
+    """Yield the points of Newton's signed distance fields at three resolutions, timed already."""
+    if not context.device.is_cuda:
+        context.note("Newton is skipped: its signed distance fields need CUDA.")
+        return
+    if workload.a is not workload.b:
+        context.note(f"Newton is skipped for {workload.name}: the pipeline it is asked through holds one mesh.")
+        return
+    if context.library("newton") is None:
+        return
+    poses = workload.timed_poses(NEWTON_POSES)
+    hits = int(workload.finest.ask(workload.poses, "count").count.sum()) * (len(poses) // len(workload.poses))
+    for sdf in SDF_RESOLUTIONS:
+        setting = f"{sdf} voxels"
+        try:
+            begin = time.perf_counter()
+            query = NewtonPoses(workload, len(poses), hits, context.device, sdf)
+            wp.synchronize_device(context.device)
+            seconds = time.perf_counter() - begin
+            row = measure(workload, NEWTON_SDF, setting, query.intersects, share=1.0, build_s=seconds, where="GPU")
+            query.place(poses)
+            row["us"] = 1e3 * context.time_launches({"run": query.newton.launch}, 5)["run"] / len(poses)
+            query.newton.check()
+            yield row, None
+        except Exception as error:  # another package's failure must not cost the rest of a run
+            context.note(f"{NEWTON_SDF} {setting} is skipped for {workload.name}: {type(error).__name__}: {error}")
+
+
+def run(context):
+    """Yield one row a workload, method and setting."""
+    names = "python-fcl", "fast-simplification", "trimesh", "newton"
+    context.note(f"Versions: {', '.join(f'{name} {find_version(name)}' for name in names)}.")
+    for workload in workloads(context):
+        found = []
+        for points in (our_points, newton_points, fcl_points):
+            for row, launch in points(context, workload):
+                context.progress(f"{workload.name}: {row['method']}, {row['setting']}")
+                found.append((row, launch))
+        yield from time_points(context, workload, found)
+
+
+def time_points(context, workload, found):
+    """Return the rows of (row, launch) with their times, taken in turn, and which no other one beats in time and error.
+
+    Launches are of all poses; on a GPU ours are of the tiled ones. Rows without a launch are timed already.
+    """
+    rows = [row for row, _ in found]
+    for on_gpu in (False, True):
+        mine = {k: launch for k, (row, launch) in enumerate(found) if launch and (row["where"] == "GPU") == on_gpu}
+        times = context.time_launches(mine, on_core=not on_gpu) if mine else {}
+        count = len(workload.timed_poses() if on_gpu else workload.poses)
+        for k, milliseconds in times.items():
+            rows[k]["us"] = 1e3 * milliseconds / count
+    for row, front in zip(rows, find_front([r["us"] for r in rows], [r["contact_mean"] for r in rows]), strict=True):
+        row["front"] = bool(front)
+    return rows

@@ -1,0 +1,141 @@
+"""What the trade-off is measured on: two models, motions of B towards A, and poses along them."""
+
+import numpy as np
+
+from ...shapes import longest_side
+from ..motions import POSES_AT_A_TIME, SCAN_STEPS, Motions, PoseScene, find_first_contact
+
+REAL = {
+    "cow": ("cow", "cow"),
+    "fandisk": ("fandisk", "fandisk"),
+    "homer": ("homer", "homer"),
+    "rocker-arm": ("rocker-arm", "rocker-arm"),
+    "bunny": ("stanford-bunny", "stanford-bunny"),
+    "env-rob": ("fcl-env", "fcl-rob"),
+}
+WITHOUT_REAL = {"warp bear": ("warp:bear",) * 2, "warp bunny": ("warp:bunny",) * 2, "warp rocks": ("warp:rocks",) * 2}
+KNOT = {"knot": ("knot:5000",) * 2}
+QUICK = ("cow", "env-rob", "warp bear")
+# Distances along a motion from the first contact, of the longest side; below 0 B is further in.
+OFFSETS = (0.1, 0.03, 0.01, 0.003, -0.003, -0.01, -0.03, -0.1, -0.3)
+
+
+def workloads(context):
+    """Yield the workloads at hand: real meshes against themselves, and a robot against its surroundings."""
+    for source in (REAL, WITHOUT_REAL, KNOT):
+        found = {name: pair for name, pair in source.items() if all(map(context.models.has, pair))}
+        if found:
+            break
+    if source is not REAL:
+        context.note(f"The real meshes are not at hand; {', '.join(found)} in their place.")
+    names = [name for name in QUICK if name in found] or list(found)[:2]
+    for name in names if context.quick else found:
+        context.progress(name)
+        a, b = found[name]
+        model_a = context.model(a)
+        yield Workload(context, name, model_a, model_a if a == b else context.model(b))
+
+
+class Workload:
+    """Two models, motions with their first contact at the finest LODs, exact, and poses about it.
+
+    Attributes:
+        size: The longest side of the larger model's box; errors are given as fractions of it.
+        low, high: Where each motion is first in contact, and last free.
+        poses, offset: Poses (n, 7) of the first motions, from apart through touching to deep, and where they are from
+            the first contact, in sizes; at 0 both sides of it.
+        finest, truth: A scene of both at their finest LODs, and its answer at each pose.
+    """
+
+    def __init__(self, context, name, model_a, model_b):
+        self.name, self.a, self.b, self.device = name, model_a, model_b, context.device
+        self.size = max(longest_side(model_a), longest_side(model_b))
+        count, posed = context.size((64, 24), (12, 6))
+        self.motions = Motions(np.random.default_rng(7), 2 * count, model_a, model_b)
+        self.steps = context.size(SCAN_STEPS, 64)
+        self.finest = self.scene((model_a.lod_max, model_b.lod_max), min(POSES_AT_A_TIME, 16 * count))
+        low, high = find_first_contact(self.finest.intersects, self.motions, self.steps)
+        chosen = np.flatnonzero(~np.isnan(low))[:count]
+        self.motions.keep(chosen)
+        self.low, self.high = low[chosen], high[chosen]
+        which = np.tile(np.arange(min(posed, len(chosen))), len(OFFSETS) + 2)
+        along = [self.low[:posed] + offset * self.size for offset in OFFSETS]
+        along = np.concatenate([*along, self.low[:posed], self.high[:posed]])
+        offset = np.repeat([*OFFSETS, 0.0, 0.0], len(which) // (len(OFFSETS) + 2))
+        kept = along >= 0
+        self.offset = offset[kept]
+        self.poses = self.motions.poses(along[kept], which[kept])
+        self.truth = self.finest.intersects(self.poses)
+
+    def scene(self, lods, room=None):
+        """Return a scene at LODs of A and B, with room for the poses to time."""
+        room = room or max(len(self.timed_poses()), self.finest.room)
+        return PoseScene(self.device, (self.a, self.b), lods, self.motions.far, room)
+
+    def lods(self, fraction=None, tolerance=None):
+        """Return LODs of A and B: of a fraction of the faces (0 is the base), or whose errors sum to a tolerance.
+
+        Args:
+            tolerance: Of the size.
+        """
+        if fraction == 0:
+            return 0, 0
+        if fraction is not None:
+            return tuple(model.lod_for(fraction=fraction) for model in (self.a, self.b))
+        return tuple(model.lod_for(tolerance=tolerance * self.size / 2) for model in (self.a, self.b))
+
+    def bound(self, lods):
+        """Return error(A) + error(B) [model units]."""
+        return self.a.error_at(lods[0]) + self.b.error_at(lods[1])
+
+    def fraction(self, lods):
+        """Return the fraction of the faces that is active."""
+        counts = [len(model.mesh_at(lod)[1]) for model, lod in zip((self.a, self.b), lods, strict=True)]
+        return sum(counts) / (self.a.face_count + self.b.face_count)
+
+    def first_contact(self, intersects):
+        """Return the error of the first contact along each motion [sizes]: above 0 too early, below 0 too late.
+
+        NaN where there is none.
+        """
+        low, _ = find_first_contact(intersects, self.motions, self.steps)
+        return (low - self.low) / self.size
+
+    def timed_poses(self, least=POSES_AT_A_TIME):
+        """Return poses to time: all of them, on CUDA several times over, at least so many: work for the device."""
+        times = -(-least // len(self.poses)) if self.device.is_cuda else 1
+        return np.tile(self.poses, (times, 1))
+
+
+def judge_answers(found, truth):
+    """Return columns of yes-or-no answers beside the truth: counts, precision and recall (None of nothing)."""
+    hits, invented, missed = (int(x.sum()) for x in (found & truth, found & ~truth, ~found & truth))
+    row = {"poses": len(truth), "meet": int(truth.sum()), "missed": missed, "invented": invented}
+    row["precision"] = hits / (hits + invented) if hits + invented else None
+    return row | {"recall": hits / (hits + missed) if hits + missed else None}
+
+
+def judge_contact(error):
+    """Return columns of errors of the first contact [sizes]: mean and largest size, and the largest of either sign."""
+    known = error[~np.isnan(error)]
+    if not len(known):
+        return {"contact_mean": None, "contact_max": None, "early_max": None, "late_max": None, "never": len(error)}
+    return {
+        "contact_mean": float(np.abs(known).mean()),
+        "contact_max": float(np.abs(known).max()),
+        "early_max": float(max(0.0, known.max())),
+        "late_max": float(max(0.0, -known.min())),
+        "early": float((known > 0).mean()),
+        "late": float((known < 0).mean()),
+        "never": int(np.isnan(error).sum()),
+    }
+
+
+def find_front(costs, errors):
+    """Return which points no other one beats in one and equals in the other at least, bool (n,); None is infinite."""
+    points = np.array([(a, np.inf if b is None else b) for a, b in zip(costs, errors, strict=True)], float)
+    front = []
+    for cost, error in points:
+        better = (points[:, 0] <= cost) & (points[:, 1] <= error) & ((points[:, 0] < cost) | (points[:, 1] < error))
+        front.append(not better.any())
+    return front

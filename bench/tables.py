@@ -1,0 +1,231 @@
+"""python -m bench.tables STUDY.json ...: write STUDY.md beside it, as for the pages in docs/data.
+
+Rows as JSON, as Markdown tables and as figures. What tables and figures show is laid out in TOML files beside the cases
+and studies.
+"""
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from warp_abtree.checks.atomic_write import atomic_write
+
+from .timing import fit_slope, upper_half
+
+try:
+    import tomllib
+except ModuleNotFoundError:  # Python 3.10
+    import tomli as tomllib
+
+HERE = Path(__file__).parent
+SHOWN_RUN = ("device", "date", "command", "seconds", "warp", "warp_abtree", "numpy", "python")
+DIGITS = 5  # significant ones of a number that is kept
+# Okabe and Ito's colours, which people with any colour vision tell apart; lines differ by dashes and markers as well.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+DASHES = ("-", "--", ":", "-.")
+STYLE = {"svg.hashsalt": "warp_abtree", "svg.fonttype": "none", "font.size": 9, "lines.markersize": 4}
+PANEL = (4.6, 3.9)  # inches
+
+
+def read_layout(name) -> dict:
+    """Return the tables and figures of a TOML file of this folder."""
+    return tomllib.loads((HERE / name).read_text(encoding="utf-8"))
+
+
+def pick(rows, **where) -> list:
+    """Return the rows that have all of these values."""
+    return [row for row in rows if all(row.get(name) == value for name, value in where.items())]
+
+
+# --- JSON ------------------------------------------------------------------------------------------------------------
+
+
+def plain(value):
+    """Return a value of a row as JSON keeps it: floats to `DIGITS` significant digits, no NaN."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None
+    if value is None or isinstance(value, str):
+        return value
+    raise TypeError(f"a row holds a {type(value).__name__}")
+
+
+def write_json(path, study):
+    """Write a study, {"study": name, "parts": {name: {"run", "notes", "rows"}}}, a row on a line."""
+    parts = [
+        f'{json.dumps(name)}: {{"run": {json.dumps(part["run"])}, "notes": {json.dumps(part["notes"])}, "rows": [\n'
+        + ",\n".join(map(json.dumps, part["rows"]))
+        + "\n]}"
+        for name, part in study["parts"].items()
+    ]
+    with atomic_write(path, "w", encoding="utf-8") as file:
+        file.write(f'{{"study": {json.dumps(study["study"])}, "parts": {{\n' + ",\n".join(parts) + "\n}}\n")
+
+
+# --- Markdown --------------------------------------------------------------------------------------------------------
+
+
+def shown(value, form="") -> str:
+    """Return a value as a table prints it."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return value.replace("|", "\\|") if isinstance(value, str) else format(value, form)
+
+
+def select_rows(layout, study):
+    """Return the rows of a table or figure: of its part, chosen by `where`, and summarised where it says so."""
+    rows = pick(study["parts"].get(layout["part"], {"rows": []})["rows"], **layout.get("where", {}))
+    if rows and "select" in layout:
+        rows = importlib.import_module(f"bench.studies.{study['study']}").SUMMARIES[layout["select"]](rows)
+    return rows
+
+
+def markdown_table(layout, study) -> str:
+    """Return a table of a study as Markdown."""
+    rows = select_rows(layout, study)
+    if not rows:
+        return "Not measured in this run."
+    columns = [(name, heading, *form, "")[:3] for name, heading, *form in layout["columns"]]
+    left = [any(isinstance(row.get(name), str) for row in rows) for name, _, _ in columns]
+    lines = [[heading for _, heading, _ in columns], ["---" if is_left else "--:" for is_left in left]]
+    lines += [[shown(row.get(name), form) for name, _, form in columns] for row in rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def markdown_run(study) -> str:
+    """Return device, date, versions and command as a Markdown list; seconds are summed."""
+    runs = [part["run"] for part in study["parts"].values()]
+    lines = []
+    for key in SHOWN_RUN:
+        values = [run[key] for run in runs]
+        text = f"{sum(values):.0f}" if key == "seconds" else ", ".join(dict.fromkeys(map(str, values)))
+        lines.append(f"- {key}: `{text}`" if key == "command" else f"- {key}: {text}")
+    if any(run["quick"] for run in runs):
+        lines.append("- size: quick, to try the parts out, not to be quoted")
+    return "\n".join(lines)
+
+
+def study_page(study) -> str:
+    """Return all tables of a study as one Markdown page."""
+    (title,) = {part["run"]["device"] for part in study["parts"].values()} or {"nothing"}
+    blocks = [f"# Study {study['study']}: {title}", markdown_run(study)]
+    for table in read_layout(f"studies/{study['study']}.toml")["table"]:
+        if table["part"] in study["parts"]:
+            blocks += [f"## {table['title']}", markdown_table(table, study)]
+            blocks += [table["note"]] if "note" in table else []
+    blocks += [note for part in study["parts"].values() for note in part["notes"]]
+    return "\n\n".join(blocks) + "\n"
+
+
+# --- figures ---------------------------------------------------------------------------------------------------------
+
+
+def draw(figures, rows, folder) -> str:
+    """Draw figures of rows as SVG; return the line that says what was drawn, or why nothing was.
+
+    Args:
+        figures: As in a layout: file, and panels side by side, each with title, x and y (columns, y with what they are
+            called), xlabel, ylabel; also where (column to value), by (column whose values are lines of their own),
+            unit (the word after these values), split (column whose values are panels of their own), slope (whether
+            labels show it), xscale and yscale ("log").
+        rows: A list; or a function that returns those of a figure.
+    """
+    try:
+        import matplotlib
+    except ImportError as error:
+        return f"plots skipped: {error}"
+    from matplotlib.figure import Figure
+
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    drawn = []
+    with matplotlib.rc_context(STYLE):
+        for figure in figures:
+            found = rows(figure) if callable(rows) else rows
+            panels = [pair for panel in figure["panels"] for pair in split_panel(panel, found)]
+            panels = [(panel, lines) for panel, own in panels if (lines := find_lines(own, panel))]
+            if not panels:
+                continue
+            columns = min(3, len(panels))
+            lines = -(-len(panels) // columns)
+            canvas = Figure(figsize=(PANEL[0] * columns, PANEL[1] * lines), layout="constrained")
+            axes = list(canvas.subplots(lines, columns, squeeze=False).flat)
+            for place, (panel, points) in zip(axes, panels):
+                draw_panel(place, panel, points)
+            for place in axes[len(panels) :]:
+                place.remove()
+            canvas.savefig(Path(folder) / figure["file"], metadata={"Date": None})
+            drawn.append(figure["file"])
+    return f"plots in {folder}: {', '.join(drawn) or 'none'}"
+
+
+def split_panel(panel, rows):
+    """Return (panel, its rows), one for each value of the column that splits it."""
+    rows = pick(rows, **panel.get("where", {}))
+    if "split" not in panel:
+        return [(panel, rows)]
+    values = list(dict.fromkeys(row[panel["split"]] for row in rows))
+    shared = {"order": list(dict.fromkeys(row.get(panel.get("by")) for row in rows))}
+    return [
+        (panel | shared | {"title": str(value), "legend": i == 0}, pick(rows, **{panel["split"]: value}))
+        for i, value in enumerate(values)
+    ]
+
+
+def find_lines(rows, panel) -> dict:
+    """Return the points of a panel's lines, by (column, value of `by`)."""
+    lines = {}
+    for row in rows:
+        for column in panel["y"]:
+            x, y = row.get(panel["x"]), row.get(column)
+            logarithmic = panel.get("yscale", "log") == "log", panel.get("xscale", "log") == "log"
+            if x is not None and y is not None and (y or not logarithmic[0]) and (x or not logarithmic[1]):
+                lines.setdefault((column, row.get(panel.get("by"))), []).append((x, y))
+    return lines
+
+
+def draw_panel(axes, panel, lines):
+    columns, parts = list(panel["y"]), panel.get("order") or list(dict.fromkeys(part for _, part in lines))
+    for set_scale, name in ((axes.set_xscale, "xscale"), (axes.set_yscale, "yscale")):
+        scale = panel.get(name, "log")
+        set_scale(scale, **({"linthresh": panel["least"], "linscale": 0.4} if scale == "symlog" else {}))
+    for (column, part), points in lines.items():
+        x, y = zip(*points, strict=True) if panel.get("unsorted") else zip(*sorted(points), strict=True)
+        label = panel["y"][column]
+        if "by" in panel:
+            name = f"{part:,} {panel['unit'].removesuffix('s' if part == 1 else '')}" if "unit" in panel else part
+            label = f"{label}, {name}" if label else name
+        slope = fit_slope(upper_half(x), upper_half(y)) if panel.get("slope") else None
+        label += "" if slope is None else f": slope {slope:.2f}"
+        turn = columns.index(column)
+        colour = parts.index(part) if "by" in panel else turn
+        style = {"color": COLOURS[colour % len(COLOURS)], "linewidth": 1.4}
+        style["linestyle"] = DASHES[turn % len(DASHES)]
+        style["marker"] = MARKERS[max(turn, colour) % len(MARKERS)] if panel.get("markers", True) else ""
+        axes.plot(x, y, label=label, **style)
+    axes.set(title=panel.get("title", ""), xlabel=panel["xlabel"], ylabel=panel["ylabel"])
+    if "least" in panel:  # no error is negative
+        axes.set_ylim(bottom=-0.3 * panel["least"])
+    axes.grid(True, alpha=0.3)
+    if panel.get("legend", True):
+        axes.legend(fontsize=8, framealpha=0.9)
+
+
+def main(files) -> int:
+    """Write the pages of studies."""
+    for file in map(Path, files):
+        study = json.loads(file.read_text(encoding="utf-8"))
+        file.with_suffix(".md").write_text(study_page(study), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

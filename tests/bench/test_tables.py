@@ -1,0 +1,151 @@
+"""Rows as JSON, Markdown and figures; the command of studies; docs that repeat their data."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench import __main__ as main
+from bench import meshes, tables
+from bench.studies import study
+from warp_abtree.app.cli import bench_command
+from warp_abtree.app.cli import main as cli
+
+DATA = Path(__file__).resolve().parents[2] / "docs" / "data"
+RUN = {"device": "it", "date": "2026-11-22", "command": "python", "seconds": 1.5, "quick": False}
+RUN |= {"warp": "1", "warp_abtree": "1", "numpy": "1", "python": "3"}
+ROWS = [{"model": "a|b", "share": 0.5, "faces": 1200}, {"model": "c", "share": None, "faces": 7}]
+LAYOUT = {"part": "toy", "columns": [["model", "mesh"], ["share", "of all", ".1%"], ["faces", "faces", ",d"]]}
+
+
+def toy_study(rows=ROWS):
+    return {"study": "paper", "parts": {"toy": {"run": RUN, "notes": ["A <note>."], "rows": rows}}}
+
+
+def test_values_of_rows():
+    assert tables.plain(np.float64(1 / 3)) == 0.33333 and tables.plain(np.int32(7)) == 7
+    assert tables.plain(np.bool_(True)) is True and tables.plain(float("inf")) is None
+    with pytest.raises(TypeError):
+        tables.plain(np.zeros(2))
+    assert [tables.shown(x, ".1%") for x in (0.5, None, True, "text")] == ["50.0%", "-", "yes", "text"]
+    assert tables.pick([{"a": 1, "b": 2}, {"a": 1}], a=1, b=2) == [{"a": 1, "b": 2}]
+
+
+def test_markdown():
+    found = tables.markdown_table(LAYOUT, toy_study())
+    assert found == "| mesh | of all | faces |\n| --- | --: | --: |\n| a\\|b | 50.0% | 1,200 |\n| c | - | 7 |"
+    assert "| c |" in tables.markdown_table(LAYOUT | {"where": {"faces": 7}}, toy_study())
+    assert tables.markdown_table(LAYOUT, toy_study([])) == "Not measured in this run."
+    assert "- seconds: 2" in tables.markdown_run(toy_study()) and "A <note>." in tables.study_page(toy_study())
+
+
+def test_json_is_read_back(tmp_path):
+    tables.write_json(tmp_path / "toy.json", toy_study())
+    assert json.loads((tmp_path / "toy.json").read_text()) == toy_study()
+    tables.write_json(tmp_path / "toy.json", {"study": "paper", "parts": {}})
+    assert json.loads((tmp_path / "toy.json").read_text())["parts"] == {}
+
+
+def test_figures(tmp_path, monkeypatch):
+    figures = [one for one in tables.read_layout("cases/figures.toml")["figure"] if one["case"] == "scale"]
+    rows = [{"sweep": "pairs", "pairs": n, "ours_ms": 2.0 * n, "peer_ms": 3.0 * n, "arrays_mib": 1.0} for n in (1, 10)]
+    lines = tables.find_lines(rows, figures[0]["panels"][0])
+    assert lines == {("ours_ms", None): [(1, 2.0), (10, 20.0)], ("peer_ms", None): [(1, 3.0), (10, 30.0)]}
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "matplotlib", None)
+        assert tables.draw(figures, rows, tmp_path).startswith("plots skipped: ")
+    assert not list(tmp_path.iterdir())
+    pytest.importorskip("matplotlib")
+    assert "scale_time.svg, scale_memory.svg" in tables.draw(figures, rows, tmp_path / "new")
+    drawn = (tmp_path / "new" / "scale_time.svg").read_text()
+    assert "ours: slope 1.00" in drawn and "time of a launch [ms]" in drawn and "object pairs" in drawn
+    assert "faces a mesh" not in drawn, "no panel without rows"
+    tables.draw(figures, rows, tmp_path / "new")
+    assert (tmp_path / "new" / "scale_time.svg").read_text() == drawn, "the same rows, the same file"
+
+
+def test_command_draws_earlier_rows(tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    file = tmp_path / "rows.json"
+    row = {"case": "one state", "faces": 100, "full_ms": 1.0}
+    file.write_text(json.dumps({"rows": [row | {"k": k, "update_ms": 0.1 * k} for k in (1, 10)]}))
+    assert main.main(["update", "--rows", str(file), "--plots", str(tmp_path)]) == 0
+    assert "update_time.svg" in capsys.readouterr().out
+    assert "update, 100 faces: slope 1.00" in (tmp_path / "update_time.svg").read_text()
+    with pytest.raises(SystemExit):
+        main.main(["update", "--rows", str(file)])
+
+
+@pytest.mark.parametrize("file", sorted(DATA.glob("*.json")), ids=lambda path: path.name)
+def test_pages_repeat_their_data(file, tmp_path):
+    """python -m bench.tables docs/data/*.json writes the pages; all tables and figures have rows."""
+    data = json.loads(file.read_text(encoding="utf-8"))
+    page = tables.study_page(data)
+    assert file.with_suffix(".md").read_text(encoding="utf-8") == page and "Not measured" not in page
+    assert not any(part["run"]["quick"] for part in data["parts"].values())
+    assert set(data["parts"]) == set(study.find_study(data["study"]).PARTS)
+    pytest.importorskip("matplotlib")
+    figures = tables.read_layout(f"studies/{data['study']}.toml")["figure"]
+    said = tables.draw(figures, lambda figure: tables.select_rows(figure, data), tmp_path)
+    assert all(figure["file"] in said for figure in figures)
+
+
+@pytest.mark.parametrize("name", study.STUDIES[:-1])
+def test_layouts_name_parts_and_summaries(name):
+    layout, found = tables.read_layout(f"studies/{name}.toml"), study.find_study(name)
+    for one in (*layout["table"], *layout["figure"]):
+        assert one["part"] in found.PARTS and one.get("select", "thin") in {"thin", *found.SUMMARIES}
+    for kind, key in (("table", "name"), ("figure", "file")):
+        names = [one[key] for one in layout[kind]]
+        assert len(set(names)) == len(names)
+
+
+def test_study_is_written_part_by_part(tmp_path, monkeypatch, capsys):
+    ran = []
+
+    def part(name):
+        def run(context):
+            ran.append(name)
+            context.note("Once.")
+            context.note("Once.")
+            yield {"x": np.float32(context.size(2, 1)), "gap": float("nan")}
+
+        return run
+
+    found = study.find_study("paper")
+    monkeypatch.setattr(found, "PARTS", {"one": part("one"), "two": part("two")})
+    words = ["paper", "--out", str(tmp_path), "--device", "cpu", "--quick"]
+    assert main.main(words) == 0 and main.main([*words, "--only", "two"]) == 0
+    assert ran == ["one", "two", "two"] and "wrote" in capsys.readouterr().out
+    parts = json.loads((tmp_path / "paper.json").read_text())["parts"]
+    assert set(parts) == {"one", "two"} and parts["one"]["rows"] == [{"x": 1.0, "gap": None}]
+    assert parts["one"]["notes"] == ["Once."] and parts["two"]["run"]["command"].endswith("--only two")
+    assert "quick" in (tmp_path / "paper.md").read_text()
+
+
+def test_models_are_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("ABTREE_MESHES", str(tmp_path))
+    folder = meshes.ModelFolder(tmp_path / "models")
+    assert not folder.has("cow") and folder.has("knot:200")
+    model = folder.load(["cow", "knot:200"])
+    assert model.name == "knot:200" and folder.file("knot:200", 10).is_file()
+    monkeypatch.setattr(meshes, "knot", None)  # not built again
+    again = meshes.ModelFolder(tmp_path / "models").load(["knot:200"])
+    assert np.array_equal(again.tree.leaf_node, model.tree.leaf_node)
+    with pytest.raises(ValueError, match="ABTREE_MESHES"):
+        folder.load(["cow", "fandisk 4204"])
+
+
+def test_command_hands_over(tmp_path, capsys):
+    with pytest.raises(ValueError, match="checkout"):
+        bench_command.bench(["paper"], tmp_path)
+    with pytest.raises(ValueError, match="name a benchmark"):
+        bench_command.bench([])
+    out = ["bench", "paper", "--out", str(tmp_path / "out")]
+    for words, message in ((["--only", "nothing"], "no part nothing"), (["--device", "tpu"], "no device 'tpu'")):
+        with pytest.raises(SystemExit) as stop:
+            cli.main([*out, *words])
+        assert stop.value.code == 2 and message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,191 @@
+"""Poses from arrays of other frameworks on the same memory, and results as such arrays."""
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from helpers.samples import random_poses
+
+import warp_abtree as ab
+
+
+def rings(device, count=6):
+    scene = ab.Scene(device)
+    ring = ab.Model.load(trimesh.creation.torus(0.6, 0.2, 16, 8))
+    for k in range(count):
+        scene.add(ring, pose=(0.3 * k, 0, 0, 0, 0, 0, 1))
+    return scene
+
+
+@pytest.fixture
+def scene(device):
+    return rings(device)
+
+
+def poses_of(seed, count=6):
+    return random_poses(np.random.default_rng(seed), count, 0.8)
+
+
+def expected(scene, poses):
+    """Answers of another scene, whose poses go through the host."""
+    other = ab.Scene(scene.device)
+    for pose in poses:
+        other.add(scene.models[0], pose=pose)
+    return other.intersect(other.broad_phase(), output="count")
+
+
+def answer(scene, query):
+    query.launch()
+    pairs = query.pairs.numpy()[: query.pair_count.numpy()[0]]
+    order = np.lexsort((pairs[:, 1], pairs[:, 0]))
+    return pairs[order].tolist(), query.hits.count.numpy()[: len(pairs)][order].tolist()
+
+
+def assert_same(scene, query, poses):
+    wanted = expected(scene, poses)
+    assert answer(scene, query) == (wanted.pairs.tolist(), wanted.count.tolist())
+    assert wanted.count.sum() > 0
+
+
+def test_poses_from_warp(scene):
+    poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
+    found = poses.poses.numpy()
+    assert np.allclose(found[:, 0], 0.3 * np.arange(6)) and np.allclose(found[:, 1:], [0, 0, 0, 0, 0, 1])
+    rows = poses_of(1)
+    given = wp.array(rows, dtype=wp.float64, device=scene.device)
+    poses.launch(given)
+    assert_same(scene, query, rows)
+    assert np.array_equal(poses.poses.numpy(), found), "float64 is read where it lies"
+    single = rows.astype(np.float32)
+    poses.launch(wp.array(single, dtype=wp.float32, device=scene.device))
+    assert_same(scene, query, single)
+    poses.poses.assign(poses_of(2))
+    poses.launch()
+    assert_same(scene, query, poses_of(2))
+    poses.check()
+
+
+def test_captured_with_a_query(scene):
+    poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
+    poses.launch()
+    query.launch()
+    with wp.ScopedCapture(scene.device) as capture:
+        poses.launch()
+        query.launch()
+    for seed in (3, 4):
+        poses.poses.assign(poses_of(seed))
+        wp.capture_launch(capture.graph)
+        pairs, counts = answer(scene, query)
+        wanted = expected(scene, poses_of(seed))
+        assert (pairs, counts) == (wanted.pairs.tolist(), wanted.count.tolist())
+
+
+def test_poses_that_are_refused(scene):
+    poses = ab.PoseInput(scene)
+    good = poses_of(5)
+    for bad, message in (
+        (np.zeros((6, 7), int), r"shape \(6, 7\) of int64, not \(6, 7\) of float32 or float64"),
+        (np.zeros((5, 7)), r"shape \(5, 7\)"),
+        (np.zeros((6, 4, 4)), r"shape \(6, 4, 4\)"),
+        ([[0.0] * 7] * 6, "list is no array"),
+        (np.array(["x"]), "cannot be shared"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            poses.launch(bad)
+    if str(scene.device) != "cpu":
+        with pytest.raises(ValueError, match="on cpu, the scene is on cuda"):
+            poses.launch(good)
+    poses.launch(wp.array(good, dtype=wp.float64, device=scene.device))
+    rows = poses_of(6)
+    rows[2, 3:] *= 1.01
+    rows[4, 0] = math.nan
+    poses.launch(wp.array(rows, dtype=wp.float64, device=scene.device))
+    with pytest.raises(ValueError, match=r"2 rows since the last check.* first object that had one is 2"):
+        poses.check()
+    poses.check()
+    rows[[2, 4]] = good[[2, 4]]
+    assert_same(scene, ab.Query(scene, "count"), rows)
+    scene.add(scene.models[0])
+    with pytest.raises(RuntimeError, match="make a new one"):
+        poses.launch()
+
+
+def test_numpy_shares_memory():
+    for writable in (True, False):
+        rows = poses_of(7)
+        rows.setflags(write=writable)
+        shared = ab.wrap_array(rows)
+        assert shared.ptr == rows.ctypes.data and shared.dtype == wp.float64 and shared.shape == rows.shape
+    part = poses_of(8, 12)[::2]
+    assert ab.wrap_array(part).ptr == part.ctypes.data
+    assert np.array_equal(ab.wrap_array(part).numpy(), part)
+
+
+def test_numpy_poses():
+    scene = rings("cpu")
+    poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
+    poses.launch(poses_of(9, 12)[::2])
+    assert_same(scene, query, poses_of(9, 12)[::2])
+
+
+def test_torch(scene):
+    torch = pytest.importorskip("torch")
+    place = wp.device_to_torch(scene.device)
+    rows = poses_of(10)
+    poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
+    for kind in (torch.float64, torch.float32):
+        tensor = torch.tensor(rows, dtype=kind, device=place, requires_grad=True)
+        assert ab.wrap_array(tensor).ptr == tensor.data_ptr()
+        poses.launch(tensor)
+        assert_same(scene, query, tensor.detach().cpu().numpy())
+    # Poses computed in place, results read in place.
+    view = wp.to_torch(poses.poses)
+    assert view.data_ptr() == poses.poses.ptr
+    view.copy_(torch.tensor(poses_of(11)))
+    poses.launch()
+    assert_same(scene, query, poses_of(11))
+    hit = wp.to_torch(query.hits.any_hit)
+    assert hit.data_ptr() == query.hits.any_hit.ptr
+    assert int((hit[: int(query.pair_count.numpy()[0])] != 0).sum()) == int(expected(scene, poses_of(11)).any.sum())
+    frame = ab.FrameGraph(scene, output="count")
+    wp.to_torch(frame.poses).copy_(torch.tensor(poses_of(12)))
+    frame.launch()
+    assert wp.to_torch(frame.query.hits.count).sum() == expected(scene, poses_of(12)).count.sum()
+    contacts = ab.ContactQuery(scene, capacity=4096)
+    contacts.launch()
+    p0 = wp.to_torch(contacts.contacts.p0)
+    assert p0.shape == (4096, 3) and p0.data_ptr() == contacts.contacts.p0.ptr
+    count = int(wp.to_torch(contacts.start)[-1])
+    assert np.array_equal(p0[:count].cpu().numpy(), contacts.result().contacts["p0"]) and count > 0
+
+
+def test_jax(scene):
+    jax = pytest.importorskip("jax")
+    jax.config.update("jax_enable_x64", True)
+    try:
+        place = wp.device_to_jax(scene.device)
+    except RuntimeError as error:  # a jax without this kind of device
+        pytest.skip(str(error))
+    rows = poses_of(13)
+    poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
+    for kind in (np.float64, np.float32):
+        array = jax.device_put(rows.astype(kind), place)
+        assert ab.wrap_array(array).ptr == array.unsafe_buffer_pointer()
+        poses.launch(array)
+        assert_same(scene, query, np.asarray(array))
+    hit = wp.to_jax(query.hits.any_hit)
+    assert hit.unsafe_buffer_pointer() == query.hits.any_hit.ptr
+
+
+def test_cupy(scene):
+    cupy = pytest.importorskip("cupy")
+    if not scene.device.is_cuda:
+        pytest.skip("CuPy has no arrays on the CPU")
+    poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
+    array = cupy.asarray(poses_of(14))
+    assert ab.wrap_array(array).ptr == array.data.ptr
+    poses.launch(array)
+    assert_same(scene, query, poses_of(14))
+    assert cupy.from_dlpack(query.hits.any_hit).data.ptr == query.hits.any_hit.ptr
