@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.render_data import RenderData, Settings
 from warp_abtree.app.styles import BOX_COLOUR, COLOURS, CONTACT_COLOUR, NORMAL_COLOUR, to_bytes
+from warp_abtree.checks.quaternions import quaternions_of
 
 CAMERA_COLOUR = (90, 90, 90)
 SINGLE_LIMIT = 24  # objects up to which each has its own mesh; with more, those of a model and LOD are instances of one
@@ -216,9 +216,7 @@ class ViewerScene:
 
     def _show_camera(self, camera):
         # viser's cameras look along z with y down; the rows of `view` are right, up and back.
-        turn = np.eye(4)
-        turn[:3, :3] = camera.view.T * (1.0, -1.0, -1.0)
-        wxyz = trimesh.transformations.quaternion_from_matrix(turn)
+        wxyz = quaternions_of((camera.view.T * (1.0, -1.0, -1.0))[None])[0, [3, 0, 1, 2]]
         options = {"fov": float(camera.field_of_view), "aspect": camera.size[0] / camera.size[1]}
         options |= {"thickness": 1.5, "thickness_units": "screen", "color": CAMERA_COLOUR}
         arrays = {"position": np.asarray(camera.eye, np.float64), "wxyz": wxyz}
