@@ -147,7 +147,7 @@ def draw_picture(path):
 
 
 def record_page(path):
-    """Write a page of a source with one frame, whose drawing is left out."""
+    """Write a page of a playback with one frame, whose data is left out."""
     from types import SimpleNamespace
 
     from warp_abtree.app.viewer import text as view_text

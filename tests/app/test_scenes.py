@@ -265,9 +265,9 @@ def test_rigid_bodies_of_a_file(tmp_path, device):
     assert np.flatnonzero(~bodies.rigid).tolist() == [24, 25]
     assert bodies.kinematic.tolist() == [False] * 24 + [True, False]
     assert bodies.gravity.tolist() == [0, -1, 0]
-    velocity, spin = bodies.velocities()
+    velocity, angular_velocity = bodies.velocities()
     assert np.allclose(velocity[:24], [0, 0, 1]) and np.allclose(velocity[24:], 0)
-    assert 1 < np.linalg.norm(spin[:24], axis=1).max() <= math.radians(200)
+    assert 1 < np.linalg.norm(angular_velocity[:24], axis=1).max() <= math.radians(200)
     frame = loaded.frame(controller="none", bodies=bodies)
     start = bodies.poses()
     frame.run(4)
