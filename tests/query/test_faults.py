@@ -196,7 +196,7 @@ def test_frames(device, interruption, kind):
     options = {"output": "count", "pairs": MORE_PAIRS, **FRAMES[kind]}
 
     def make(captured=True):
-        frame = ab.FrameGraph(add_objects(device), **options)
+        frame = ab.Pipeline(add_objects(device), **options)
         graph = frame.capture() if captured else None
         frame.lods.assign(np.array([20, 41, 9, 33], np.int32))
         return frame, graph
@@ -223,7 +223,7 @@ def test_a_capture(device, interruption):
     """An interrupted capture leaves the frame as it was; it can be captured again."""
 
     def make():
-        return ab.FrameGraph(add_objects(device), output="count", pairs=MORE_PAIRS)
+        return ab.Pipeline(add_objects(device), output="count", pairs=MORE_PAIRS)
 
     def check(before, frame):
         wp.capture_launch(frame.capture())
