@@ -127,7 +127,7 @@ def test_frames(device):
     """Poses and LODs set on the device."""
     results = []
     for where in ("cpu", device):
-        frame = ab.FrameGraph(make_scene(where), output="contacts", pairs=pairs(), capacity=2**17)
+        frame = ab.Pipeline(make_scene(where), output="contacts", pairs=pairs(), capacity=2**17)
         frame.launch()
         frame.check()
         results.append(fields(frame.result()))
