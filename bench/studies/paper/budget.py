@@ -11,11 +11,7 @@ from .meshes import paper_models
 
 SCENE = Path(__file__).resolve().parents[3] / "scenes" / "focus.toml"
 # Figure 4, read off the picture: g in frames 1 to 10, Case 1 until frame 5, Case 2 from frame 6; Q1, Q2, Q3.
-FIGURE_4 = (
-    (1, 2, 4, 8, 16, 8, 4, 2, 1, 0),
-    (0, 1, 2, 4, 8, 8, 4, 2, 1, 0),
-    (0, 0, 1, 2, 4, 8, 4, 2, 1, 0),
-)
+FIGURE_4 = ((1, 2, 4, 8, 16, 8, 4, 2, 1, 0), (0, 1, 2, 4, 8, 8, 4, 2, 1, 0), (0, 0, 1, 2, 4, 8, 4, 2, 1, 0))
 # Costs over T, a frame each: a climb and a pause first, so that no end of the ladder hides a step; then the figure.
 BEFORE = (0.5,) * 6 + (0.95,)
 COURSE = (0.5,) * 5 + (1.5,) * 5
