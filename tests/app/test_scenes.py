@@ -9,8 +9,10 @@ from msgspec import convert, toml
 from oracles.triangle import brute_force_faces
 
 import warp_abtree as ab
+from warp_abtree.app import SceneError, load_scene
 from warp_abtree.app.toml.model_tables import AnyShape
 from warp_abtree.app.toml.shapes import GENERATED
+from warp_abtree.lod.timing import WorkClock
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 # A machine so slow that few objects are a load.
@@ -70,7 +72,7 @@ position = [0, -3, 0]
 def load(tmp_path, text, **options):
     path = tmp_path / "scene.toml"
     path.write_text(text, encoding="utf-8")
-    return ab.load_scene(path, **{"device": "cpu", **options})
+    return load_scene(path, **{"device": "cpu", **options})
 
 
 def load_ours(name, device, changes=(), **options):
@@ -79,7 +81,7 @@ def load_ours(name, device, changes=(), **options):
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
-    return ab.load_scene(SCENES / f"{name}.toml", device=device, text=text, **options)
+    return load_scene(SCENES / f"{name}.toml", device=device, text=text, **options)
 
 
 # Shapes.
@@ -163,7 +165,7 @@ def test_a_shape_stands_in_for_meshes_that_are_not_there(tmp_path):
     trimesh.creation.box().export(tmp_path / "box.obj")
     model = load(tmp_path, text).models["m"]
     assert (model.name, model.face_count) == ("m (box.obj)", 12)
-    with pytest.raises(ab.SceneError, match=r"gone.obj: no such file"):
+    with pytest.raises(SceneError, match=r"gone.obj: no such file"):
         load(tmp_path, text.replace('"box.obj"', '"gone.obj"').replace('shape = "icosphere"\n', ""))
 
 
@@ -186,7 +188,7 @@ def test_another_number_of_objects(tmp_path):
         loaded = load(tmp_path, text, objects=asked)
         assert loaded.scene.object_count == 3 * worlds + count + 1
         assert loaded.worlds.max() == worlds - 1
-    with pytest.raises(ab.SceneError, match="count or worlds"):
+    with pytest.raises(SceneError, match="count or worlds"):
         load(tmp_path, ball + row + "grid = { size = [2, 2, 2], spacing = [1, 1, 1] }\n", objects=3)
 
 
@@ -238,8 +240,8 @@ def test_controllers_of_a_file(tmp_path):
 def test_near_objects_refine(tmp_path, device):
     """With counted work in the place of time: at one budget, errors rise with the distance from the camera."""
     loaded = load_ours("focus", device, [("size = [10, 5, 0]", "size = [2, 2, 0]")], objects=80)
-    finest = loaded.frame(controller="none", clock=ab.WorkClock(RATES)).run(1)[0].cost_ms
-    frame = loaded.frame(budget_ms=finest / 3, clock=ab.WorkClock(RATES))
+    finest = loaded.frame(controller="none", clock=WorkClock(RATES)).run(1)[0].cost_ms
+    frame = loaded.frame(budget_ms=finest / 3, clock=WorkClock(RATES))
     frame.run(90)
     time = frame.history[-1].time
     away = np.linalg.norm(loaded.motion.poses(time)[:, :3] - loaded.camera(time).eye, axis=1)
@@ -249,7 +251,7 @@ def test_near_objects_refine(tmp_path, device):
     assert 0 < error[near].mean() < 0.9 * error[~near].mean()
     assert frame.summary()["budget"]["within_110_percent"] >= 0.95
     assert loaded.camera(8.0).eye[2] < loaded.motion.position[:, 2].min(), "the camera comes out behind the field"
-    again = loaded.frame(budget_ms=finest / 3, clock=ab.WorkClock(RATES))
+    again = loaded.frame(budget_ms=finest / 3, clock=WorkClock(RATES))
     assert np.array_equal(loaded.scene.batch().objects.pool.position.numpy(), loaded.motion.poses(0.0)[:, :3])
     assert [row.error_mean for row in again.run(12)] == [row.error_mean for row in frame.history[:12]]
 
@@ -263,9 +265,9 @@ def test_rigid_bodies_of_a_file(tmp_path, device):
     assert np.flatnonzero(~bodies.rigid).tolist() == [24, 25]
     assert bodies.kinematic.tolist() == [False] * 24 + [True, False]
     assert bodies.gravity.tolist() == [0, -1, 0]
-    velocity, spin = bodies.velocities()
+    velocity, angular_velocity = bodies.velocities()
     assert np.allclose(velocity[:24], [0, 0, 1]) and np.allclose(velocity[24:], 0)
-    assert 1 < np.linalg.norm(spin[:24], axis=1).max() <= math.radians(200)
+    assert 1 < np.linalg.norm(angular_velocity[:24], axis=1).max() <= math.radians(200)
     frame = loaded.frame(controller="none", bodies=bodies)
     start = bodies.poses()
     frame.run(4)
@@ -285,7 +287,7 @@ def test_rigid_bodies_of_a_file(tmp_path, device):
 def test_rain(device):
     loaded = load_ours("rain", device, [("cells = [128, 128]", "cells = [16, 16]")], objects=30)
     assert 29 <= loaded.scene.object_count <= 31 and loaded.frames >= 300
-    frame = loaded.frame(budget_ms=12, clock=ab.WorkClock(RATES))
+    frame = loaded.frame(budget_ms=12, clock=WorkClock(RATES))
     frame.run(90)
     late = frame.history[60:]
     assert min(row.intersecting for row in late) > 5 and frame.history[0].intersecting < 5

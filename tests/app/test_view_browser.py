@@ -59,13 +59,13 @@ class Visit:
         field.press("Enter")
 
     def drag(self, label, part):
-        """Drag the thumb of a slider to a part of its mode."""
+        """Drag the thumb of a slider to a fraction of its range."""
         thumb = self.control(label, "*[@role='slider']")
         thumb.scroll_into_view_if_needed()
-        box, mode = thumb.bounding_box(), thumb.locator("xpath=..").bounding_box()
+        box, track = thumb.bounding_box(), thumb.locator("xpath=..").bounding_box()
         self.tab.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
         self.tab.mouse.down()
-        self.tab.mouse.move(mode["x"] + part * mode["width"], box["y"] + box["height"] / 2, steps=8)
+        self.tab.mouse.move(track["x"] + part * track["width"], box["y"] + box["height"] / 2, steps=8)
         self.tab.mouse.up()
 
     def numbers(self):
@@ -206,7 +206,7 @@ def test_a_scene_plays_in_a_browser(browser, serve_playback, tmp_path):
     shown = visit.wait_for(lambda found: found["objects shown"].startswith("25 "))
     assert shown["objects shown"] == "25 of 52"
     assert wait_for_picture(visit, "instances", lambda found: found["any"] > 2000)
-    assert len(page.stage._meshes) >= 1, "many objects are instances"
+    assert len(page.viewer_scene._meshes) >= 1, "many objects are instances"
     assert visit.tab.locator(".uplot canvas").count() == 1
     assert not visit.faults
     visit.tab.close()

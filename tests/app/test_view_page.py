@@ -17,7 +17,7 @@ import pytest
 import trimesh
 from helpers.viewer import make_models, make_playback, write_scene
 
-import warp_abtree as ab
+from warp_abtree.app import load_scene
 from warp_abtree.app.cli import main as cli
 from warp_abtree.app.open_playback import open_playback
 
@@ -91,11 +91,11 @@ def test_what_people_do_reaches_the_scene(page):
     page._post(page._pick, 1)
     page._post(page._hold_picked, 10.0)
     page.run(seconds=0.2)
-    assert page.snapshot.lods[1] == 28 and page._picked.value == 1 and not page._own.disabled
+    assert page.snapshot.lods[1] == 28 and page._picked.value == 1 and not page._release_button.disabled
     assert "28 of 282, held" in page._numbers.content and page._gizmo is not None
     page._post(page._release, 1)
     page.run(seconds=0.2)
-    assert page.snapshot.lods[1] == 282 and page.snapshot.lods[0] == round(0.5 * top) and page._own.disabled
+    assert page.snapshot.lods[1] == 282 and page.snapshot.lods[0] == round(0.5 * top) and page._release_button.disabled
     page._post(page._set_budget, 7.0)
     page.run(seconds=0.2)
     assert page.playback.budget_ms == 7.0 and page._mode.value == "budget, predicted"
@@ -176,7 +176,7 @@ def test_a_recording_has_a_slider_of_frames(files, server):
     from warp_abtree.app.recording import record_run
     from warp_abtree.app.viewer.page import Page
 
-    record_run(ab.load_scene("scene.toml", device="cpu"), 4)[1].save("run.npz")
+    record_run(load_scene("scene.toml", device="cpu"), 4)[1].save("run.npz")
     page = Page(server, open_playback(["run.npz"], "cpu"))
     page._post(page._seek, 2)
     page.run(seconds=0.3)

@@ -6,6 +6,7 @@ The viewer sends these arrays to the browser, and pictures draw them.
 import numpy as np
 
 from warp_abtree.app.styles import COLOURS
+from warp_abtree.checks.quaternions import matrices_of
 from warp_abtree.scene.scene import Scene
 
 LIFT = 1.5e-3  # of a model's diagonal: offset of intersecting faces from the mesh, to both sides
@@ -19,21 +20,9 @@ CACHED_FACES = 4_000_000  # that a cache of meshes keeps
 EDGES = np.array([(c, c | bit) for c in range(8) for bit in (1, 2, 4) if not c & bit])
 
 
-def rotations(poses) -> np.ndarray:
-    """Return the rotation matrices of poses x y z qx qy qz qw, float64 (n, 3, 3)."""
-    q = poses[:, 3:] / np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    x, y, z, w = q.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
-
-
 def place(poses, objects, points) -> np.ndarray:
     """Return points (t, k, 3) of objects (t,) in the world."""
-    turn = rotations(poses)[objects]
+    turn = matrices_of(poses[:, 3:])[objects]
     return np.einsum("tij,tkj->tki", turn, points) + poses[objects, None, :3]
 
 

@@ -145,7 +145,7 @@ def _write(options, loaded, frame, recording) -> list[Path]:
     if options.plot:
         options.plot.mkdir(exist_ok=True)
         top = np.array([model.lod_max for model in loaded.scene.models])[loaded.scene.object_model]
-        title = f"{loaded.title}: {recording.settings['controller']} on {loaded.scene.device}"
+        title = f"{loaded.title}: {recording.settings.controller} on {loaded.scene.device}"
         draw_run(frame.history, recording.lods / np.maximum(top, 1), options.plot / PLOT_NAME, title)
     return list(filter(None, (options.record, options.picture, options.plot and options.plot / PLOT_NAME)))
 

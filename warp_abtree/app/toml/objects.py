@@ -48,12 +48,11 @@ def make_group(path, key: str, table, dynamics, rng) -> ObjectGroup:
         SceneError: Too many copies, or keys of rigid bodies where there are none.
     """
     _check_dynamics(path, key, table, dynamics)
-    for name in ("count", "worlds"):
-        if (getattr(table, name) or 1) > OBJECT_LIMIT:
-            fail(path, f"{key}.{name}", f"more than {OBJECT_LIMIT} objects")
-    offsets = _copy_offsets(path, key, table)
-    if len(offsets) * table.worlds > OBJECT_LIMIT:
-        fail(path, f"{key}.worlds", f"more than {OBJECT_LIMIT} objects")
+    layer = 1 if table.grid is None else math.prod(n for n in table.grid.size if n)
+    if max(table.count or 1, layer) * table.worlds > OBJECT_LIMIT:
+        cause = "worlds" if table.worlds > 1 else "grid.size" if layer > 1 else "count"
+        fail(path, f"{key}.{cause}", f"more than {OBJECT_LIMIT} objects")
+    offsets = _copy_offsets(table)
     count = len(offsets) * table.worlds
     motion = {
         "position": np.tile(offsets + table.position, (table.worlds, 1)),
@@ -99,7 +98,7 @@ def _quaternion(rotation) -> np.ndarray:
     return np.append(unit(rotation.axis) * math.sin(half), math.cos(half))
 
 
-def _copy_offsets(path, key, table) -> np.ndarray:
+def _copy_offsets(table) -> np.ndarray:
     """Return the offset of every copy within one world, (count, 3)."""
     count, grid = table.count, table.grid
     if grid is None:
@@ -109,8 +108,6 @@ def _copy_offsets(path, key, table) -> np.ndarray:
     layer = math.prod(size[~grows].tolist())
     if count is not None:
         size = np.where(grows, -(-count // layer), size)
-    if layer > OBJECT_LIMIT:
-        fail(path, f"{key}.grid.size", f"more than {OBJECT_LIMIT} objects")
     cells = np.stack(np.meshgrid(*(np.arange(n) for n in size), indexing="ij"), axis=-1).reshape(-1, 3)
     if count is not None:
         cells = cells[np.argsort(cells[:, grows][:, 0], kind="stable")][:count]

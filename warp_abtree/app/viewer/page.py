@@ -88,24 +88,24 @@ class Page:
             self._frame_slider = None
             if playback.length is not None and playback.length > 1:
                 self._frame_slider = gui.add_slider("frame", 0, playback.length - 1, 1, 0)
-                self._hear(self._frame_slider, self._seek)
+                self._on_change(self._frame_slider, self._seek)
             self._state = gui.add_markdown("")
         with gui.add_folder("Level of detail"):
             names = [MODES[mode] for mode in playback.modes()]
             self._mode = gui.add_dropdown("chosen", names, initial_value=names[0])
-            self._hear(self._mode, lambda _: self._choose())
+            self._on_change(self._mode, lambda _: self._choose())
             self._budget: Any = None  # a slider of viser
             if len(names) > 2:
                 first = min(max(getattr(playback, "budget_ms", None) or 16.0, BUDGETS[0]), BUDGETS[1])
                 hint = "T: selection, refinement, broad phase and query of a frame"
                 self._budget = gui.add_slider("budget [ms]", *BUDGETS, 0.5, first, hint=hint)
-                self._hear(self._budget, self._set_budget)
+                self._on_change(self._budget, self._set_budget)
                 self._for_page = gui.add_checkbox("for this page's camera", False, hint="near objects come first")
-                self._hear(self._for_page, self._set_for_page)
+                self._on_change(self._for_page, self._set_for_page)
             self._all_lod = gui.add_slider(
                 "hold all at [%]", 0.0, 100.0, 0.5, 100.0, hint="of the finest LOD, for every object"
             )
-            self._hear(self._all_lod, self._hold_all)
+            self._on_change(self._all_lod, self._hold_all)
             release = gui.add_button("release all")
             release.on_click(lambda _: self._post(self._release, None))
         with gui.add_folder("Show"):
@@ -113,13 +113,13 @@ class Page:
         with gui.add_folder("Picked object"):
             count = playback.scene.object_count
             self._picked = gui.add_number("object", -1, min=-1, max=count - 1, step=1, hint="or click it; -1 is none")
-            self._hear(self._picked, lambda i: self._pick(int(i), from_number=True))
+            self._on_change(self._picked, lambda i: self._pick(int(i), from_number=True))
             self._lod = gui.add_slider(
                 "hold it at [%]", 0.0, 100.0, 0.5, 100.0, disabled=True, hint="of its finest LOD"
             )
-            self._hear(self._lod, self._hold_picked)
-            self._own = gui.add_button("release it", disabled=True)
-            self._own.on_click(lambda _: self._post(self._release, self.settings.picked))
+            self._on_change(self._lod, self._hold_picked)
+            self._release_button = gui.add_button("release it", disabled=True)
+            self._release_button.on_click(lambda _: self._post(self._release, self.settings.picked))
             self._numbers = gui.add_markdown(view_text.NOBODY)
         with gui.add_folder("Frame times [ms]"):
             self._plot = gui.add_uplot(**view_text.time_plot([], PLOTTED), height=220)
@@ -127,7 +127,7 @@ class Page:
     def _build_show(self, gui):
         def box(label, name, hint=None):
             handle = gui.add_checkbox(label, getattr(self.settings, name), hint=hint)
-            self._hear(handle, lambda value: setattr(self.settings, name, value))
+            self._on_change(handle, lambda value: setattr(self.settings, name, value))
 
         box("intersecting faces", "intersecting")
         box("contacts", "contacts")
@@ -138,14 +138,14 @@ class Page:
         look.on_click(lambda event: self._post(self._look, event.client))
         depth = geometry.tree_depth(self.playback.scene, range(self.playback.scene.object_count))
         level = gui.add_slider("tree level", -1, depth, 1, -1, hint="boxes of the active nodes at a level; -1 is none")
-        self._hear(level, lambda value: setattr(self.settings, "level", int(value)))
+        self._on_change(level, lambda value: setattr(self.settings, "level", int(value)))
         box("trees of all objects", "every_tree", "in the place of the picked one's")
         worlds = np.unique(self.playback.worlds)
         if len(worlds) > 1 and worlds.max() > 0:
             world = gui.add_number("world", self.settings.world, min=0, max=int(worlds.max()), step=1)
-            self._hear(world, lambda value: setattr(self.settings, "world", int(value)))
+            self._on_change(world, lambda value: setattr(self.settings, "world", int(value)))
 
-    def _hear(self, handle, act):
+    def _on_change(self, handle, act):
         """Act on a value that the user set; values that the page sets itself come without a client."""
 
         @handle.on_update
@@ -199,31 +199,31 @@ class Page:
     def _hold_all(self, percent):
         for i in range(self.playback.scene.object_count):
             self.playback.held[i] = self._lod_of(i, percent)
-        self._show_own_lod()
+        self._show_held_lod()
 
     def _hold_picked(self, percent):
         if self.settings.picked is not None:
             self.playback.held[self.settings.picked] = self._lod_of(self.settings.picked, percent)
-            self._own.disabled = False
+            self._release_button.disabled = False
 
     def _release(self, i):
         if i is None:
             self.playback.held.clear()
         else:
             self.playback.held.pop(i, None)
-        self._own.disabled = True
+        self._release_button.disabled = True
 
     def _pick(self, i, from_number=False):
         self.settings.picked = None if i < 0 else i
         if not from_number:
             self._picked.value = i
         self._lod.disabled = i < 0
-        self._show_own_lod()
+        self._show_held_lod()
         self._show_gizmo()
 
-    def _show_own_lod(self):
+    def _show_held_lod(self):
         i = self.settings.picked
-        self._own.disabled = i is None or i not in self.playback.held
+        self._release_button.disabled = i is None or i not in self.playback.held
         if i is not None:
             top = self.playback.scene.models[self.playback.scene.object_model[i]].lod_max
             lod = self.playback.held.get(i, int(self.snapshot.lods[i]))
@@ -253,29 +253,30 @@ class Page:
     # Cameras.
 
     def _light(self):
-        """Put a soft light in the place of viser's own, which wash colours out beside its environment.
+        """Put a soft light in the place of viser's own, which bleach colours beside its environment.
 
         The environment stays as it is: a standalone page would make it anew whenever it begins again.
         """
-        scene, up, eye = self.server.scene, np.asarray(self.playback.view.up), np.asarray(self.playback.view.eye)
+        scene, view = self.server.scene, self.playback.view
         scene.configure_default_lights(False)
-        direction = up - np.cross(up, eye) + 0.6 * eye
+        direction = view.up - np.cross(view.up, view.eye) + 0.6 * view.eye
         scene.add_light_directional("/light", position=tuple(direction), intensity=LIGHT, cast_shadow=False)
 
-    def _place_camera(self):
+    def _overview(self):
+        """Return where a camera sees all that is shown: its position, what it looks at, and the radius of that."""
         centre, radius = geometry.bounds(self.cache, self.snapshot, self.shown)
+        return centre + DISTANCE * radius * self.playback.view.eye, centre, radius
+
+    def _place_camera(self):
         first = self.server.initial_camera
-        first.look_at = tuple(centre)
-        first.position = tuple(centre + DISTANCE * radius * np.asarray(self.playback.view.eye))
-        first.up = tuple(self.playback.view.up)
+        position, centre, radius = self._overview()
+        first.position, first.look_at, first.up = tuple(position), tuple(centre), tuple(self.playback.view.up)
         first.near, first.far = radius / 500, 200 * radius
 
     def _look(self, client):
         """Bring the camera of a page back to where it sees all."""
         if client is not None:
-            centre, radius = geometry.bounds(self.cache, self.snapshot, self.shown)
-            client.camera.position = centre + DISTANCE * radius * np.asarray(self.playback.view.eye)
-            client.camera.look_at = centre
+            client.camera.position, client.camera.look_at, _ = self._overview()
 
     def _watch(self, client):
         """Follow the camera of a page that opened."""
@@ -323,8 +324,8 @@ class Page:
         self._closed = True
         self._events.put((lambda: None, ()))
 
-    def _act(self, note):
-        act, arguments = note
+    def _act(self, event):
+        act, arguments = event
         try:
             act(*arguments)
         except ValueError as error:
@@ -351,7 +352,7 @@ class Page:
         now = time.monotonic()
         if not self.playing or now - self._text_time >= TEXT_SECONDS:
             self._text_time = now
-            self._say(data)
+            self._show_text(data)
         return data
 
     def _catch_up(self):
@@ -370,12 +371,12 @@ class Page:
         self._snapshot_time = now
         self.rate = 0.0 if span > 1 else 0.9 * self.rate + 0.1 / span if self.rate else 1 / span
 
-    def _say(self, data):
+    def _show_text(self, data):
         self._state.content = view_text.state(self, data)
         if self._frame_slider is not None:
             self._frame_slider.value = self.snapshot.number
         if self.settings.picked is not None and self.settings.picked not in self.playback.held:
-            self._show_own_lod()
+            self._show_held_lod()
         self._numbers.content = view_text.numbers(self.playback, self.snapshot, self.cache, self.settings.picked)
         if self._rows or self._plotted:
             self._plotted = bool(self._rows)

@@ -1,4 +1,4 @@
-"""What the viewer says in words, numbers and plots."""
+"""Texts, numbers and plots of the viewer."""
 
 import numpy as np
 
@@ -114,7 +114,7 @@ def time_top(rows) -> float:
 
 
 def time_picture(rows) -> str:
-    """Return frame times by stage as an SVG data, with its legend; empty without rows.
+    """Return frame times by stage as an SVG drawing, with its legend; empty without rows.
 
     Args:
         rows: `FrameRow`s, or None where a frame has none.

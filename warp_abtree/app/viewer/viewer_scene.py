@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.render_data import RenderData, Settings
 from warp_abtree.app.styles import BOX_COLOUR, COLOURS, CONTACT_COLOUR, NORMAL_COLOUR, to_bytes
+from warp_abtree.checks.quaternions import quaternions_of
 
 CAMERA_COLOUR = (90, 90, 90)
 SINGLE_LIMIT = 24  # objects up to which each has its own mesh; with more, those of a model and LOD are instances of one
@@ -65,12 +65,13 @@ class ViewerScene:
         self._show_single(data, data.shown if few else data.shown[:0])
         self._show_instances(data, data.shown[:0] if few else data.shown)
         for owner in range(len(self.cache.scene.models)):
-            corners = data.intersecting.get(owner)
+            corners = data.intersecting.get(owner, ())
             self._show_triangles(f"/intersecting/{owner}", corners, COLOURS[owner % len(COLOURS)][1])
         self._show_lines("/contacts", data.segments, CONTACT_COLOUR, 3.0)
         self._show_lines("/normals", data.normals, NORMAL_COLOUR, 1.5)
         self._show_lines("/tree", data.boxes, BOX_COLOUR, 1.0)
-        self._show_camera(camera)
+        if camera is not None:
+            self._show_camera(camera)
 
     def _update(self, node: _Node, **arrays):
         """Assign the arrays that differ from those sent last."""
@@ -191,60 +192,35 @@ class ViewerScene:
 
     # Layers over them.
 
-    def _show_triangles(self, name, corners, colour):
+    def _show_layer(self, name, arrays, add, **options):
+        """Show arrays as a node that `add` makes at first; without arrays hide it."""
         node = self._layers.get(name)
-        if corners is None or not len(corners):
-            if node is not None:
-                self._visible(node, False)
-            return
-        vertices = corners.reshape(-1, 3)
-        arrays = {"vertices": vertices, "faces": np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)}
-        if node is None:
-            options = {"flat_shading": True, "side": "double", "cast_shadow": False, "receive_shadow": False}
-            handle = self.api.add_mesh_simple(name, **arrays, color=to_bytes(colour), **options)
-            self._layers[name] = _Node(handle, arrays)
+        if node is None and arrays:
+            self._layers[name] = _Node(add(name, **arrays, **options), dict(arrays))
             self.sent += sum(array.nbytes for array in arrays.values())
-            return
-        self._update(node, **arrays)
-        self._visible(node, True)
+        elif node is not None:
+            self._update(node, **arrays)
+            self._visible(node, bool(arrays))
+
+    def _show_triangles(self, name, corners, colour):
+        arrays = {}
+        if len(corners):
+            vertices = corners.reshape(-1, 3)
+            arrays = {"vertices": vertices, "faces": np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)}
+        options = {"flat_shading": True, "side": "double", "cast_shadow": False, "receive_shadow": False}
+        self._show_layer(name, arrays, self.api.add_mesh_simple, color=to_bytes(colour), **options)
 
     def _show_lines(self, name, lines, colour, width):
-        node = self._layers.get(name)
-        if not len(lines):
-            if node is not None:
-                self._visible(node, False)
-            return
-        if node is None:
-            handle = self.api.add_line_segments(
-                name, lines, to_bytes(colour), thickness=width, thickness_units="screen"
-            )
-            self._layers[name] = _Node(handle, {"points": lines})
-            self.sent += lines.nbytes
-            return
-        self._update(node, points=lines)
-        self._visible(node, True)
+        options = {"colors": to_bytes(colour), "thickness": width, "thickness_units": "screen"}
+        self._show_layer(name, {"points": lines} if len(lines) else {}, self.api.add_line_segments, **options)
 
     def _show_camera(self, camera):
-        if camera is None:
-            return
-        node = self._layers.get("/camera")
-        if node is None:
-            width, height = camera.size
-            handle = self.api.add_camera_frustum(
-                "/camera",
-                fov=float(camera.field_of_view),
-                aspect=width / height,
-                scale=0.03 * camera.far,
-                thickness=1.5,
-                thickness_units="screen",
-                color=CAMERA_COLOUR,
-            )
-            node = self._layers["/camera"] = _Node(handle, {})
         # viser's cameras look along z with y down; the rows of `view` are right, up and back.
-        turn = np.eye(4)
-        turn[:3, :3] = camera.view.T * (1.0, -1.0, -1.0)
-        wxyz = trimesh.transformations.quaternion_from_matrix(turn)
-        self._update(node, position=np.asarray(camera.eye, np.float64), wxyz=wxyz)
+        wxyz = quaternions_of((camera.view.T * (1.0, -1.0, -1.0))[None])[0, [3, 0, 1, 2]]
+        options = {"fov": float(camera.field_of_view), "aspect": camera.size[0] / camera.size[1]}
+        options |= {"thickness": 1.5, "thickness_units": "screen", "color": CAMERA_COLOUR}
+        arrays = {"position": np.asarray(camera.eye, np.float64), "wxyz": wxyz}
+        self._show_layer("/camera", arrays, self.api.add_camera_frustum, scale=0.03 * camera.far, **options)
 
 
 def _linear(colours) -> np.ndarray:
