@@ -56,13 +56,13 @@ def test_a_query_that_is_wrong_is_noticed(posed):
     """A face pair too few, and one too many, beside a baseline that has them right."""
     scene, result = posed
     model, poses, truth = scene.models[0], pair_poses(3, 0.2), result.faces
-    assert query.check_peer(truth, truth, model, poses)["judged"] == 0
-    row = query.check_peer(truth[1:], truth, model, poses)
+    assert query.check_baseline(truth, truth, model, poses)["judged"] == 0
+    row = query.check_baseline(truth[1:], truth, model, poses)
     assert (row["judged"], row["ours_wrong"], row["peer_missed"]) == (1, 0, 1)
     apart = np.array([[0, 0, 0]]) if (0, 0, 0) not in set(map(tuple, truth.tolist())) else np.array([[0, 0, 1]])
     for ours in (truth[1:], np.concatenate([truth, apart])):
         with pytest.raises(RuntimeError, match="1 of 1 face pairs"):
-            query.check_peer(truth, ours, model, poses)
+            query.check_baseline(truth, ours, model, poses)
 
 
 def test_a_sweep_that_answers_otherwise_is_noticed(device):

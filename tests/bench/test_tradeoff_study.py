@@ -13,7 +13,7 @@ from bench import tables
 from bench.shapes import knot
 from bench.studies.motions import Motions, PoseScene, find_first_contact, rotate
 from bench.studies.study import Context
-from bench.studies.tradeoff import SUMMARIES, bounds, competitors, dials, lods, regions, summaries, workload
+from bench.studies.tradeoff import SUMMARIES, bounds, competitors, lods, regions, settings, summaries, workload
 from warp_abtree.query.contacts import contact_dtypes
 
 pytestmark = pytest.mark.slow
@@ -47,7 +47,7 @@ def box_workload(device, offset_b=0.0):
     boxes = SimpleNamespace(a=model, b=moved, device=device, size=1.0)
     boxes.motions = Motions(np.random.default_rng(0), 3, model, moved)
     boxes.motions.away[:] = np.eye(3)
-    boxes.motions.turns[:] = 0, 0, 0, 1
+    boxes.motions.rotations[:] = 0, 0, 0, 1
     return boxes
 
 
@@ -222,8 +222,8 @@ def test_wrong_lods_are_noticed(context):
     assert not lods.is_coarsest(other, 0.05)
 
 
-def test_dials(context):
-    rows = rows_of(context, dials, "dials")
+def test_settings(context):
+    rows = rows_of(context, settings, "settings")
     for row in by(rows, case="precision", setting="exact"):
         assert row["missed"] == row["invented"] == row["faces_missed"] == row["faces_invented"] == 0
     laid = by(rows, case="precision", setting="float32", poses_kind="coincident meshes", value=1)[0]
@@ -231,10 +231,10 @@ def test_dials(context):
     touching = by(rows, case="precision", setting="exact", poses_kind="at first contact", value=1)[0]
     assert touching["meet"] == touching["poses"] / 2, "one side of each first contact meets, exactly"
     for value in (0.1, 1):
-        tests = [by(rows, case="output", setting=name, value=value)[0]["node_tests"] for name in dials.OUTPUTS]
+        tests = [by(rows, case="output", setting=name, value=value)[0]["node_tests"] for name in settings.OUTPUTS]
         assert tests[0] < tests[1] == tests[2] == tests[3]
     margins = by(rows, case="margin", value=0.1)
-    assert [row["factor"] for row in margins] == list(dials.FACTORS)
+    assert [row["factor"] for row in margins] == list(settings.FACTORS)
     assert margins[0]["recall"] < 1 and all(row["recall"] == 1 and not row["late_max"] for row in margins[3:])
     assert [row["invented"] for row in margins] == sorted(row["invented"] for row in margins)
 
@@ -278,7 +278,7 @@ def test_competitors(context):
     assert bool(by(points, method=competitors.SIMPLIFIED)) != skipped, "a competitor runs or is named as skipped"
 
 
-def test_cheapest_rung_has_only_finer_ones_within_the_error():
+def test_cheapest_level_has_only_finer_ones_within_the_error():
     rows = [{"share": s, "e": e} for s, e in ((1, 0), (0.5, 0.1), (0.2, 0.3), (0.1, 0.2), (0.01, None))]
     assert [summaries.cheapest(rows, "e", limit)["share"] for limit in (0, 0.1, 0.25, 0.3)] == [1, 0.5, 0.5, 0.1]
 
