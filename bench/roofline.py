@@ -5,11 +5,11 @@ addition, subtraction, multiplication or comparison of real numbers, a fused mul
 choices and integers cost nothing, and nothing is loaded twice within one test. Bytes are those requested of memory,
 whether a cache has them or not; stacks in shared memory or registers are left out.
 
-* node test (kernels/traversal): four child pairs load four records of 32 bytes and pose four boxes: 6 operations for sum
+* node test (kernels/traversal): four child pairs load four records of 32 bytes, pose four boxes: 6 operations for sum
   and size, 18 for the image of the sum, 15 for that of the size; 6 more widen each of A's two. A comparison is 6
   subtractions, 6 additions, 6 comparisons, and 4 to choose what follows. In all 2 (45 + 39) + 4 * 22 = 256, so 64
   operations and 32 bytes a test. (Two child pairs take the same work for half as many tests.)
-* triangle test (kernels/triangle/float32_filter.py): 2 corner triples in 16 bytes and 6 vertices of 16; 18 operations to
+* triangle test (kernels/triangle/float32_filter.py): 2 corner triples in 16 bytes, 6 vertices of 16; 18 operations to
   scale six corners and 54 to pose three. A plane and three signs: 15 for differences, 9 for the normal, 10 for sizes of
   vectors and 2 for the largest, 11 for the bound, 15 for dot products, 6 for signs, 68 in all. Most pairs end there.
   An intersecting pair takes a second plane and two more signs of 42 each: 152 more.
