@@ -15,6 +15,7 @@ from helpers.samples import SHUTTLE_SCENE
 from helpers.viewer import run_command as run
 
 import warp_abtree as ab
+from warp_abtree.app import load_scene
 from warp_abtree.app.cli import run_command
 from warp_abtree.app.pictures import scenes
 from warp_abtree.app.styles import STAGE_LABELS
@@ -139,7 +140,7 @@ def test_picture_of_a_controlled_run_shows_its_lods(files, capsys, monkeypatch):
     run(capsys, *words, "--budget", "1s")
     run(capsys, *words)
     # The controller begins at the coarsest LOD; a sweep is drawn at both of its ends.
-    top = ab.load_scene("scene.toml", device="cpu").models["ball"].lod_max
+    top = load_scene("scene.toml", device="cpu").models["ball"].lod_max
     lods = [[re.match(r"ball at LOD (\d+) of (\d+)", title).groups() for title in panels] for panels in titles]
     assert lods[0] == [("0", str(top))]
     assert [of for _, of in lods[1]] == [str(top)] * 2 and int(lods[1][0][0]) == top > int(lods[1][1][0]) > 0

@@ -1,13 +1,14 @@
 """Scene files: what a good one makes, and the one line that a bad one gives."""
 
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-import warp_abtree as ab
+from warp_abtree.app import SceneError, load_scene
 from warp_abtree.app.pictures.scenes import panel_lods
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
@@ -18,7 +19,7 @@ ONE = BALL + '[[objects]]\nmodel = "ball"\n'
 def load(tmp_path, text):
     path = tmp_path / "scene.toml"
     path.write_text(text, encoding="utf-8")
-    return ab.load_scene(path, device="cpu")
+    return load_scene(path, device="cpu")
 
 
 # Good ones.
@@ -283,7 +284,7 @@ def test_sweep_of_a_named_object(tmp_path):
     ],
 )
 def test_what_is_wrong_is_said(tmp_path, text, message):
-    with pytest.raises(ab.SceneError) as caught:
+    with pytest.raises(SceneError) as caught:
         load(tmp_path, text)
     assert message in str(caught.value)
     assert str(caught.value).startswith(str(tmp_path / "scene.toml"))
@@ -293,22 +294,28 @@ def test_what_is_wrong_is_said(tmp_path, text, message):
 def test_bodies_without_a_mass_are_named(tmp_path):
     sheet = '[models.sheet]\nshape = "terrain"\nextents = [1, 1]\ncells = [2, 2]\nbumps = 0\nwaves = 1\nrim = 0\n'
     loaded = load(tmp_path, sheet + '[[objects]]\nmodel = "sheet"\n[dynamics]\n')
-    with pytest.raises(ab.SceneError, match=r"scene.toml: objects: model 'sheet' is flat"):
+    with pytest.raises(SceneError, match=r"scene.toml: objects: model 'sheet' is flat"):
         loaded.frame()
 
 
 def test_file_that_is_none(tmp_path):
     for path in (tmp_path / "gone.toml", tmp_path):
-        with pytest.raises(ab.SceneError, match=str(path)):
-            ab.load_scene(path, device="cpu")
+        with pytest.raises(SceneError, match=str(path)):
+            load_scene(path, device="cpu")
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ab.SceneError, match="not valid TOML"):
-        ab.load_scene(tmp_path / "bytes.toml", device="cpu")
+    with pytest.raises(SceneError, match="not valid TOML"):
+        load_scene(tmp_path / "bytes.toml", device="cpu")
+
+
+def test_without_msgspec_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "msgspec", None)
+    with pytest.raises(SceneError, match=r"scene.toml: scene files need msgspec: pip install warp-abtree\[app\]$"):
+        load(tmp_path, ONE)
 
 
 def test_device_that_is_none():
     with pytest.raises(ValueError, match="no device"):
-        ab.load_scene(SCENES / "herd.toml", device="cuda:99")
+        load_scene(SCENES / "herd.toml", device="cuda:99")
 
 
 # The scenes of the project.
@@ -316,7 +323,7 @@ def test_device_that_is_none():
 
 def test_bunny_tori(device):
     pytest.importorskip("pxr")
-    loaded = ab.load_scene(SCENES / "bunny_tori.toml", device=device)
+    loaded = load_scene(SCENES / "bunny_tori.toml", device=device)
     frame = loaded.frame(output="faces")
     rows = frame.run(3)
     assert all(row.objects == 6 and row.hits > 0 for row in rows)
@@ -325,7 +332,7 @@ def test_bunny_tori(device):
 
 def test_herd(device):
     pytest.importorskip("pxr")
-    loaded = ab.load_scene(SCENES / "herd.toml", device=device)
+    loaded = load_scene(SCENES / "herd.toml", device=device)
     frame = loaded.frame(output="any")
     result = frame.step()
     row = frame.history[0]

@@ -9,6 +9,7 @@ from msgspec import convert, toml
 from oracles.triangle import brute_force_faces
 
 import warp_abtree as ab
+from warp_abtree.app import SceneError, load_scene
 from warp_abtree.app.toml.model_tables import AnyShape
 from warp_abtree.app.toml.shapes import GENERATED
 
@@ -70,7 +71,7 @@ position = [0, -3, 0]
 def load(tmp_path, text, **options):
     path = tmp_path / "scene.toml"
     path.write_text(text, encoding="utf-8")
-    return ab.load_scene(path, **{"device": "cpu", **options})
+    return load_scene(path, **{"device": "cpu", **options})
 
 
 def load_ours(name, device, changes=(), **options):
@@ -79,7 +80,7 @@ def load_ours(name, device, changes=(), **options):
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
-    return ab.load_scene(SCENES / f"{name}.toml", device=device, text=text, **options)
+    return load_scene(SCENES / f"{name}.toml", device=device, text=text, **options)
 
 
 # Shapes.
@@ -163,7 +164,7 @@ def test_a_shape_stands_in_for_meshes_that_are_not_there(tmp_path):
     trimesh.creation.box().export(tmp_path / "box.obj")
     model = load(tmp_path, text).models["m"]
     assert (model.name, model.face_count) == ("m (box.obj)", 12)
-    with pytest.raises(ab.SceneError, match=r"gone.obj: no such file"):
+    with pytest.raises(SceneError, match=r"gone.obj: no such file"):
         load(tmp_path, text.replace('"box.obj"', '"gone.obj"').replace('shape = "icosphere"\n', ""))
 
 
@@ -186,7 +187,7 @@ def test_another_number_of_objects(tmp_path):
         loaded = load(tmp_path, text, objects=asked)
         assert loaded.scene.object_count == 3 * worlds + count + 1
         assert loaded.worlds.max() == worlds - 1
-    with pytest.raises(ab.SceneError, match="count or worlds"):
+    with pytest.raises(SceneError, match="count or worlds"):
         load(tmp_path, ball + row + "grid = { size = [2, 2, 2], spacing = [1, 1, 1] }\n", objects=3)
 
 

@@ -17,7 +17,7 @@ import pytest
 import trimesh
 from helpers.viewer import make_models, make_playback, write_scene
 
-import warp_abtree as ab
+from warp_abtree.app import load_scene
 from warp_abtree.app.cli import main as cli
 from warp_abtree.app.open_playback import open_playback
 
@@ -176,7 +176,7 @@ def test_a_recording_has_a_slider_of_frames(files, server):
     from warp_abtree.app.recording import record_run
     from warp_abtree.app.viewer.page import Page
 
-    record_run(ab.load_scene("scene.toml", device="cpu"), 4)[1].save("run.npz")
+    record_run(load_scene("scene.toml", device="cpu"), 4)[1].save("run.npz")
     page = Page(server, open_playback(["run.npz"], "cpu"))
     page._post(page._seek, 2)
     page.run(seconds=0.3)
