@@ -23,28 +23,22 @@ LAST_KEY = wp.constant(wp.int64(2**63 - 1))
 
 @wp.struct
 class ModelPool:
-    """Static data of every model, concatenated.
+    """Static data of every model, concatenated: per vertex of the forest, per face, per node, per model."""
 
-    Per vertex of the forest: vertex_parent (global id, -1 at a root), vertex_pos [model units] (x, y, z, 0),
-    vertex_near, the same about the model's centre in float32.
-    Per face: face_vertex (global ids), face_split, leaf_node (the indexed list). Per node: node_face (-1 inside).
-    Per model: starts into these, counts, centre [model units].
-    """
-
-    vertex_parent: wp.array(dtype=wp.int32)
-    vertex_pos: wp.array(dtype=wp.vec4d)
-    vertex_near: wp.array(dtype=wp.vec4)
-    face_vertex: wp.array(dtype=wp.vec3i)
-    face_split: wp.array(dtype=wp.int32)
-    split_face: wp.array(dtype=wp.int32)
-    leaf_node: wp.array(dtype=wp.int32)
-    node_face: wp.array(dtype=wp.int32)
-    face_start: wp.array(dtype=wp.int32)
-    face_count: wp.array(dtype=wp.int32)
-    node_start: wp.array(dtype=wp.int32)
-    finest_limit: wp.array(dtype=wp.int32)
-    lod_max: wp.array(dtype=wp.int32)
-    centre: wp.array(dtype=wp.vec3d)
+    vertex_parent: wp.array(dtype=wp.int32)  # global id, -1 at a root, shape [vertex]
+    vertex_pos: wp.array(dtype=wp.vec4d)  # x, y, z, 0 [model units], shape [vertex]
+    vertex_near: wp.array(dtype=wp.vec4)  # the same about the model's centre, shape [vertex]
+    face_vertex: wp.array(dtype=wp.vec3i)  # global ids of the original corners, shape [face]
+    face_split: wp.array(dtype=wp.int32)  # least LOD at which the face is active, shape [face]
+    split_face: wp.array(dtype=wp.int32)  # faces that each vertex split inserts or deforms, slice by slice
+    leaf_node: wp.array(dtype=wp.int32)  # node of each face, the indexed list of the paper, shape [face]
+    node_face: wp.array(dtype=wp.int32)  # face of a leaf, -1 at an inner node, -1 without a node, shape [node]
+    face_start: wp.array(dtype=wp.int32)  # where its faces begin, shape [model]
+    face_count: wp.array(dtype=wp.int32)  # shape [model]
+    node_start: wp.array(dtype=wp.int32)  # where its nodes begin, shape [model]
+    finest_limit: wp.array(dtype=wp.int32)  # ids of vertices below it are original ones, shape [model]
+    lod_max: wp.array(dtype=wp.int32)  # vertex splits of the finest LOD, shape [model]
+    centre: wp.array(dtype=wp.vec3d)  # of the box of its vertices [model units], shape [model]
 
 
 @wp.func_native(native.body("numbers.cuh", "load_vertex"))
@@ -55,27 +49,23 @@ def load_vertex(vertices: wp.array(dtype=wp.vec4d), i: wp.int32) -> wp.vec3d:
 
 @wp.struct
 class StatePool:
-    """Everything that a level of detail decides: one entry a model at a LOD.
+    """Everything that a level of detail decides: one entry a model at a LOD."""
 
-    Per node: node_status, and node_box, two entries of 16 bytes for a record (`nodes.Node`). Per face:
-    face_corner, the active ancestors (global vertex ids) of the three corners, -1 where the face is inactive.
-    """
-
-    model: wp.array(dtype=wp.int32)
-    lod: wp.array(dtype=wp.int32)
-    node_start: wp.array(dtype=wp.int32)
-    face_start: wp.array(dtype=wp.int32)
-    node_status: wp.array(dtype=wp.int32)
-    node_box: wp.array(dtype=wp.vec4)
-    face_corner: wp.array(dtype=wp.vec4i)
+    model: wp.array(dtype=wp.int32)  # shape [state]
+    lod: wp.array(dtype=wp.int32)  # vertex splits applied, shape [state]
+    node_start: wp.array(dtype=wp.int32)  # where its nodes begin, shape [state]
+    face_start: wp.array(dtype=wp.int32)  # where its faces begin, shape [state]
+    node_status: wp.array(dtype=wp.int32)  # INACTIVE, ACTIVE or DEFORMED, shape [node]
+    node_box: wp.array(dtype=wp.vec4)  # records of `nodes.Node`, two entries of 16 bytes each, shape [2 node]
+    face_corner: wp.array(dtype=wp.vec4i)  # active ancestors of its corners, -1 where inactive, shape [face]
 
 
 @wp.struct
 class ObjectPool:
-    """Posed objects: x_world = rotation x_model + position [world units]."""
+    """Posed objects: x_world = rotation x_model + position."""
 
-    state: wp.array(dtype=wp.int32)
-    world: wp.array(dtype=wp.int32)
-    is_static: wp.array(dtype=wp.int32)
-    rotation: wp.array(dtype=wp.mat33d)
-    position: wp.array(dtype=wp.vec3d)
+    state: wp.array(dtype=wp.int32)  # tree state, shape [object]
+    world: wp.array(dtype=wp.int32)  # -1 is every world, shape [object]
+    is_static: wp.array(dtype=wp.int32)  # 0 or 1, shape [object]
+    rotation: wp.array(dtype=wp.mat33d)  # shape [object]
+    position: wp.array(dtype=wp.vec3d)  # [world units], shape [object]

@@ -9,21 +9,15 @@ STALE = wp.constant(-2)
 
 @wp.struct
 class LaunchRecord:
-    """The generations of arrays that a launch was given, those in force when it runs, and what became of it.
+    """The generations of arrays that a launch was given, those in force when it runs, and what became of it."""
 
-    states, filter, buffers: given; a captured graph keeps those of its capture.
-    states_now, filter_now, buffers_now: in force, shape [1].
-    launched: generation of the buffers that the last launch used, or STALE; and 1 if any launch was stale since this
-    was cleared, shape [2].
-    """
-
-    states: wp.int32
-    filter: wp.int32
-    buffers: wp.int32
-    states_now: wp.array(dtype=wp.int32)
-    filter_now: wp.array(dtype=wp.int32)
-    buffers_now: wp.array(dtype=wp.int32)
-    launched: wp.array(dtype=wp.int32)
+    states: wp.int32  # of the tree states given; a captured graph keeps those of its capture
+    filter: wp.int32  # of the filter given
+    buffers: wp.int32  # of the buffers given
+    states_now: wp.array(dtype=wp.int32)  # in force, shape [1]
+    filter_now: wp.array(dtype=wp.int32)  # in force, shape [1]
+    buffers_now: wp.array(dtype=wp.int32)  # in force, shape [1]
+    launched: wp.array(dtype=wp.int32)  # buffers of the last launch or STALE; 1 if any was stale, shape [2]
 
 
 @wp.func

@@ -1,4 +1,12 @@
-"""Poses of objects, and the pose of one object in the frame of another."""
+"""Poses of objects, and the pose of one object in the frame of another, with margins that cover all rounding.
+
+The margin of boxes covers every rounding between the exact x' of B's vertices and the float32 box test. With
+u = 2^-24, r_a and r_b the reach of the root boxes and s the largest component of the translation between the centres,
+these sum to less than 9 u r_b + 5 u s + 2 u r_a on A's axes and 9 u r_a + 8.7 u s + 2 u r_b on B's, so 9 u of each are
+taken (docs/exactness.md has the terms). The float64 part covers x' itself and the shift between centres, and `skew` a
+rotation that is not orthonormal to the last bit, on whose columns B's axes are taken. A gap along a unit axis is a
+distance, so `within` adds to the margin; a column is longer than 1 by at most `skew`.
+"""
 
 import warp as wp
 
@@ -78,24 +86,33 @@ def reach_box(lower: wp.vec3, upper: wp.vec3):
 
 
 @wp.func
+def measure_rotation(r: wp.mat33d):
+    """Return how far R^T R and R are off the identity, the largest entries."""
+    skew = wp.float64(0.0)
+    size = wp.float64(0.0)
+    for i in range(3):
+        for j in range(3):
+            one = wp.where(i == j, wp.float64(1.0), wp.float64(0.0))
+            gram = sum_products(r[0, i], r[0, j], r[1, i], r[1, j], r[2, i], r[2, j])
+            skew = wp.max(skew, wp.abs(gram - one))
+            size = wp.max(size, wp.abs(r[i, j] - one))
+    return skew, size
+
+
+@wp.func
+def unit_scale(reach: wp.float64):
+    """Return the power of two that brings a size to about 1: the exponent of a float32 without its digits."""
+    exponent = wp.cast(wp.float32(reach), wp.int32) & 0x7F800000
+    return wp.float64(1.0) / wp.float64(wp.cast(exponent, wp.float32))
+
+
+@wp.func
 def pair_pose(
-    whole: bool,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    a: wp.int32,
-    b: wp.int32,
-    within: wp.float64,
+    whole: bool, models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32, within: wp.float64
 ):
     """Return the `PairPose` of B in A's frame, for points that meet or lie within a distance in A's frame.
 
-    The margin covers every rounding between the exact x' of B's vertices and the float32 box test. With u = 2^-24,
-    r_a and r_b the reach of the root boxes and s the largest component of the translation between the centres,
-    these sum to less than 9 u r_b + 5 u s + 2 u r_a on A's axes and 9 u r_a + 8.7 u s + 2 u r_b on B's, so 9 u of each
-    are taken (docs/exactness.md has the terms). The float64 part covers x' itself and the shift between
-    centres, and `skewed` a rotation that is not orthonormal to the last bit, on whose columns B's axes are taken. A
-    gap along a unit axis is a distance, so `within` adds to the margin; a column is longer than 1 by at most
-    `skewed`. `whole` says that all faces are asked for, not one hit, which float32 may find first.
+    `whole` says that all faces are asked for, not one hit, which float32 may find first.
     """
     r, t = relative_pose(objects, a, b)
     state_a = objects.state[a]
@@ -109,20 +126,14 @@ def pair_pose(
     shift = wp.vec3d()
     size = wp.float64(0.0)
     far = wp.float64(0.0)
-    skewed = wp.float64(0.0)
-    turned = wp.float64(0.0)
     for i in range(3):
         shift[i] = (sum_products(r[i, 0], centre_b[0], r[i, 1], centre_b[1], r[i, 2], centre_b[2]) + t[i]) - centre_a[i]
         far = wp.max(far, wp.abs(shift[i]))
         size = wp.max(size, wp.abs(t[i]) + wp.abs(centre_a[i]))
-        for j in range(3):
-            one = wp.where(i == j, wp.float64(1.0), wp.float64(0.0))
-            gram = sum_products(r[0, i], r[0, j], r[1, i], r[1, j], r[2, i], r[2, j])
-            skewed = wp.max(skewed, wp.abs(gram - one))
-            turned = wp.max(turned, wp.abs(r[i, j] - one))
+    skew, rotation_size = measure_rotation(r)
     reach_c = wp.max(wp.max(wp.abs(centre_b[0]), wp.abs(centre_b[1])), wp.abs(centre_b[2]))
     margin64 = ROUNDING_64 * (size + wp.float64(2.0) * (reach_c + reach_b) + reach_a)
-    margin64 = margin64 + wp.float64(4.0) * skewed * (reach_b + far)
+    margin64 = margin64 + wp.float64(4.0) * skew * (reach_b + far)
     margin32 = ROUNDING_32 * (reach_a + reach_b + far)
     # Of a coordinate in `float32_filter_triangles`; docs/exactness.md has the terms, which need `near` below.
     off32 = UNIT_32 * (wp.float64(2.0) * reach_a + wp.float64(13.0) * reach_b + wp.float64(3.0) * far)
@@ -136,15 +147,13 @@ def pair_pose(
     pose.corner_a = states.face_start[state_a]
     pose.corner_b = states.face_start[state_b]
     pose.rotation32 = wp.mat33(r)
-    # The exponent of a float32 without its digits is a power of two.
-    exponent = wp.cast(wp.float32(wp.max(reach_a, reach_b)), wp.int32) & 0x7F800000
-    pose.scale = wp.float64(1.0) / wp.float64(wp.cast(exponent, wp.float32))
+    pose.scale = unit_scale(wp.max(reach_a, reach_b))
     pose.error = wp.float32(pose.scale * wp.float64(2.02) * (off32 + margin64))
     if wp.max(reach_a, reach_b) < REACH_MIN or wp.max(reach_a, reach_b) > REACH_MAX:
         pose.error = wp.inf
     same = states.model[state_a] == states.model[state_b] and states.lod[state_a] == states.lod[state_b]
-    if whole and same and far + wp.float64(3.0) * turned * reach_b <= off32:
-        # A mesh laid on itself: no vertex is farther from its twin than float32 can tell.
+    if whole and same and far + wp.float64(3.0) * rotation_size * reach_b <= off32:
+        # Coincident meshes: no vertex is farther from its twin than float32 can tell.
         pose.error = wp.inf
     # A margin that no box passes, for pairs that are apart for certain and perhaps beyond float32, or even float64: a
     # distance that overflowed gives infinity or NaN.
@@ -156,7 +165,7 @@ def pair_pose(
         pose.translation32 = wp.vec3(shift)
         for i in range(3):
             pose.back32[i] = -wp.float32(sum_products(r[0, i], shift[0], r[1, i], shift[1], r[2, i], shift[2]))
-        pose.margin = wp.float32(margin64 + margin32 + within * (wp.float64(1.0) + skewed + ROUNDING_32))
+        pose.margin = wp.float32(margin64 + margin32 + within * (wp.float64(1.0) + skew + ROUNDING_32))
     return pose
 
 

@@ -7,7 +7,9 @@ import argparse
 import gc
 from pathlib import Path
 
-import warp_abtree as ab
+from warp_abtree.app import load_scene
+from warp_abtree.lod.timing import WorkClock
+from warp_abtree.simulate.budget_report import budget_report
 
 
 def main(words=None):
@@ -18,9 +20,9 @@ def main(words=None):
     parser.add_argument("--part", type=float, default=3.0, help="the budget is the finest frame's time over this")
     parser.add_argument("--count-work", action="store_true", help="count tests in place of time, which repeats")
     arguments = parser.parse_args(words)
-    clock = ab.WorkClock() if arguments.count_work else None
+    clock = WorkClock() if arguments.count_work else None
     path = Path(__file__).with_name("focus.toml")
-    loaded = ab.load_scene(path, device=arguments.device, objects=arguments.objects)
+    loaded = load_scene(path, device=arguments.device, objects=arguments.objects)
 
     def run(**options):
         frame = loaded.frame(clock=clock, **options)
@@ -39,7 +41,7 @@ def main(words=None):
     found = {}
     for controller in ("paper", "predictive"):
         frame = run(controller=controller, budget_ms=budget)
-        found[controller] = verdict = ab.budget_report(frame.history)
+        found[controller] = verdict = budget_report(frame.history)
         if verdict is None:
             raise SystemExit("the first second is not judged: give more frames")
         print(

@@ -1,4 +1,4 @@
-"""Worlds on several GPUs: a `FrameGraph` a device, captured once, launched by a thread of its own. Meant to be copied.
+"""Worlds on several GPUs: a `Pipeline` a device, captured once, launched by a thread of its own. Meant to be copied.
 
 Worlds never meet, so devices have nothing to tell each other: a simulator's kernel moves the objects where they are,
 answers stay there, and the host only launches. Without a GPU the CPU is the only device; a device may be named twice:
@@ -71,7 +71,7 @@ def main(words=None):
     options = {"output": "count", "ladder": [[model.lod_max]]}  # objects share one tree
     made = zip(devices, dealt)
     frames = [
-        ab.FrameGraph(make_scene(model, part, d), capacity=ab.Buffers(pairs=PAIRS * len(part)), **options)
+        ab.Pipeline(make_scene(model, part, d), capacity=ab.Buffers(pairs=PAIRS * len(part)), **options)
         for d, part in made
     ]
     graphs = [capture(frame) for frame in frames]  # kernels load here, on one thread

@@ -8,6 +8,7 @@ import pytest
 from helpers.samples import SHAPES, sample
 
 import warp_abtree as ab
+from warp_abtree.app import SceneError, load_scene
 from warp_abtree.app.cli.main import main
 from warp_abtree.lod.timing import ReplayClock, WorkClock
 from warp_abtree.lod.view import Camera
@@ -42,20 +43,20 @@ def write_scene(tmp_path, text=SCENE):
 @pytest.mark.parametrize("count", [0, -1, 1.5, 2.0, "x", True, np.int32(0), np.nan])
 def test_a_number_of_objects_is_whole_and_above_0(tmp_path, count):
     with pytest.raises(ValueError, match=r"^objects [^\n]*$"):
-        ab.load_scene(write_scene(tmp_path), device="cpu", objects=count)
+        load_scene(write_scene(tmp_path), device="cpu", objects=count)
 
 
 def test_a_number_of_objects_of_numpy(tmp_path):
-    loaded = ab.load_scene(write_scene(tmp_path), device="cpu", objects=np.int64(5))
+    loaded = load_scene(write_scene(tmp_path), device="cpu", objects=np.int64(5))
     assert loaded.scene.object_count == 5 and type(loaded.objects) is int
 
 
 def test_the_spacing_of_a_file_belongs_to_its_controller(tmp_path):
     """The paper's controller has no spacing; given on the command line instead of the file's, it goes without."""
     text = SCENE + '[lod]\nbudget_ms = 8\nspacing = "ratio"\n'
-    with pytest.raises(ab.SceneError, match=r"s\.toml: lod.spacing: "):
-        ab.load_scene(write_scene(tmp_path, text + 'controller = "paper"\n'), device="cpu")
-    assert ab.load_scene(write_scene(tmp_path, text), device="cpu").frame(controller="paper").run(1)
+    with pytest.raises(SceneError, match=r"s\.toml: lod.spacing: "):
+        load_scene(write_scene(tmp_path, text + 'controller = "paper"\n'), device="cpu")
+    assert load_scene(write_scene(tmp_path, text), device="cpu").frame(controller="paper").run(1)
 
 
 def status_of(capsys, *words):

@@ -16,6 +16,7 @@ import pytest
 
 import warp_abtree as ab
 from warp_abtree import app, jobs
+from warp_abtree.app import SceneError, load_scene
 from warp_abtree.app.toml.folder import find_scene, scene_folder, scene_names
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -132,9 +133,9 @@ def test_scenes_are_found_by_name(tmp_path, monkeypatch):
     assert find_scene("bunny_tori") == ROOT / "scenes" / "bunny_tori.toml"
     Path("bunny_tori.toml").write_text("")
     assert find_scene("bunny_tori.toml") == Path("bunny_tori.toml")
-    with pytest.raises(ab.SceneError, match=r"gone\.toml: No such file.*scenes that come.*bunny_tori, "):
-        ab.load_scene("gone.toml", device="cpu")
-    assert ab.load_scene("needle", device="cpu").path == ROOT / "scenes" / "needle.toml"
+    with pytest.raises(SceneError, match=r"gone\.toml: No such file.*scenes that come.*bunny_tori, "):
+        load_scene("gone.toml", device="cpu")
+    assert load_scene("needle", device="cpu").path == ROOT / "scenes" / "needle.toml"
 
 
 # Names that leave the package root, which then exports those of the page alone: their packages have them.

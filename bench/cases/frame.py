@@ -56,7 +56,7 @@ class DeviceFrames:
     def __init__(self, scene, levels, ladder):
         count = scene.object_count
         device = self.device = scene.device
-        self.frame = ab.FrameGraph(
+        self.frame = ab.Pipeline(
             scene, "count", capacity=ab.Buffers(pairs=16 * count), ladder=[levels] if ladder else None
         )
         self.time = wp.zeros(1, dtype=wp.int32, device=device)

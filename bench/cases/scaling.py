@@ -162,7 +162,7 @@ class WorldFrames:
         scene = ab.Scene(device)
         for row, pose in enumerate(poses[0]):
             scene.add(model, pose, world=row // OBJECTS)
-        self.frame = ab.FrameGraph(scene, "count", ladder=[[model.lod_max]])
+        self.frame = ab.Pipeline(scene, "count", ladder=[[model.lod_max]])
         self.poses = [wp.array(rows, dtype=wp.float64, device=self.device) for rows in poses]
         self.answers = [self.answer(rows) for rows in self.poses]
         self.graph = capture(self.launch, self.device) if self.device.is_cuda else None

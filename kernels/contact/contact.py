@@ -14,15 +14,14 @@ SHORTEST_NORMAL = wp.constant(wp.float64(2.0**-20))
 
 @wp.struct
 class Contacts:
-    """One entry an intersecting face pair: ends [world units, world frame] and unit normals, first and second object
-    in the order in which the pair names them; coplanar 0 or 1."""
+    """One entry an intersecting face pair, its objects in the order in which the pair names them, world frame."""
 
-    p0: wp.array(dtype=wp.vec3d)
-    p1: wp.array(dtype=wp.vec3d)
-    normal_a: wp.array(dtype=wp.vec3d)
-    normal_b: wp.array(dtype=wp.vec3d)
-    normal: wp.array(dtype=wp.vec3d)
-    coplanar: wp.array(dtype=wp.int32)
+    p0: wp.array(dtype=wp.vec3d)  # first end [world units]
+    p1: wp.array(dtype=wp.vec3d)  # second end [world units]
+    normal_a: wp.array(dtype=wp.vec3d)  # unit normal of the first object's face
+    normal_b: wp.array(dtype=wp.vec3d)  # unit normal of the second object's face
+    normal: wp.array(dtype=wp.vec3d)  # unit normal of the contact, from the first object to the second
+    coplanar: wp.array(dtype=wp.int32)  # 0 or 1
 
 
 @wp.func

@@ -6,6 +6,7 @@ then one thread a pair its chunks in theirs, so that no bit depends on the devic
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.contact.contact import SHORTEST_NORMAL, Contacts, load_corners, pair_direction
 from warp_abtree.kernels.poses import PairPose, pose_point
@@ -16,37 +17,32 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 CHUNK = wp.constant(32)
 # Squared sine of the angle between two planes, under which their line runs away too fast to tell how fast.
-FLATTEST = wp.constant(wp.float64(2.0**-40))
+LEAST_SINE_SQUARED = wp.constant(wp.float64(2.0**-40))
 
 
 @wp.struct
 class PairContacts:
-    """One entry an object pair: mean point [world units, world frame], unit mean normal, depth [world units]."""
+    """One entry an object pair, world frame."""
 
-    point: wp.array(dtype=wp.vec3d)
-    normal: wp.array(dtype=wp.vec3d)
-    depth: wp.array(dtype=wp.float64)
+    point: wp.array(dtype=wp.vec3d)  # mean point [world units]
+    normal: wp.array(dtype=wp.vec3d)  # unit mean normal
+    depth: wp.array(dtype=wp.float64)  # [world units]
 
 
 @wp.struct
 class ChunkSums:
-    """Sums over each chunk, and what a pair's chunks need of each other.
+    """Sums over each chunk, and what a pair's chunks need of each other."""
 
-    span: (pair, first contact, end); length; point from the pair's first end, and normal, both weighted; area that the
-    contact curve encloses, and how fast it changes; front, back: extent of the faces along the normal. Shape [chunk].
-    total: length of all contacts, or 0; middle: mean point from the first end. Shape [pair].
-    """
-
-    span: wp.array(dtype=wp.vec3i)
-    length: wp.array(dtype=wp.float64)
-    point: wp.array(dtype=wp.vec3d)
-    normal: wp.array(dtype=wp.vec3d)
-    area: wp.array(dtype=wp.float64)
-    change: wp.array(dtype=wp.float64)
-    front: wp.array(dtype=wp.float64)
-    back: wp.array(dtype=wp.float64)
-    total: wp.array(dtype=wp.float64)
-    middle: wp.array(dtype=wp.vec3d)
+    span: wp.array(dtype=wp.vec3i)  # (pair, first contact, end), shape [chunk]
+    length: wp.array(dtype=wp.float64)  # sum of lengths, shape [chunk]
+    point: wp.array(dtype=wp.vec3d)  # weighted, from the pair's first end, shape [chunk]
+    normal: wp.array(dtype=wp.vec3d)  # weighted, shape [chunk]
+    area: wp.array(dtype=wp.float64)  # that the contact curve encloses, shape [chunk]
+    change: wp.array(dtype=wp.float64)  # how fast the area changes, shape [chunk]
+    front: wp.array(dtype=wp.float64)  # how far the first object's faces reach along the normal, shape [chunk]
+    back: wp.array(dtype=wp.float64)  # how far the second's reach against it, shape [chunk]
+    total: wp.array(dtype=wp.float64)  # length of all contacts, or 0, shape [pair]
+    middle: wp.array(dtype=wp.vec3d)  # mean point from the first end, shape [pair]
 
 
 @wp.func
@@ -131,14 +127,7 @@ def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_in
     sums_inout.normal[c] = normal
 
 
-@wp.func_native("""
-    // NumPy's NaN: devices differ in the sign and payload of the NaN that they make.
-    union {
-        long long bits;
-        wp::float64 x;
-    } nan = {0x7ff8000000000000ll};
-    return wp::vec_t<3, wp::float64>(nan.x, nan.x, nan.x);
-""")
+@wp.func_native(native.body("numbers.cuh", "no_vector"))
 def no_vector() -> wp.vec3d:
     """Return three NaNs of the bits 0x7ff8000000000000 on every device."""
     ...
@@ -196,7 +185,7 @@ def loop_change(segment: wp.vec3d, normal_a: wp.vec3d, normal_b: wp.vec3d, n: wp
     """
     cosine = wp.dot(normal_a, normal_b)
     square = wp.float64(1.0) - cosine * cosine
-    if square < FLATTEST:
+    if square < LEAST_SINE_SQUARED:
         return wp.float64(0.0)
     y = wp.dot(n, normal_b) / square
     return y * wp.dot(normal_b - normal_a * cosine, wp.cross(segment, n))

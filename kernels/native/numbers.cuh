@@ -95,3 +95,12 @@ inline CUDA_CALLABLE wp::int32 add_signs(wp::int32 signs, wp::vec_t<3, wp::float
     }
     return all;
 }
+
+inline CUDA_CALLABLE wp::vec_t<3, wp::float64> no_vector() {
+    // NumPy's NaN: devices differ in the sign and payload of the NaN that they make.
+    union {
+        long long bits;
+        wp::float64 x;
+    } nan = {0x7ff8000000000000ll};
+    return wp::vec_t<3, wp::float64>(nan.x, nan.x, nan.x);
+}

@@ -56,7 +56,7 @@ def first_item(states: StatePool, pose: PairPose):
 class Child:
     """A node in a node pair test: its box in both frames, and what it stands for."""
 
-    box: PosedBox
+    box: PosedBox  # in its own frame and in the other one
     span: wp.float32  # minus the sum of the box's extents; not negative at a leaf, whose face number its bits are
     skip: wp.int32  # half an item that compares this node alone
     down: wp.int32  # half an item that compares its children; not for a leaf

@@ -27,7 +27,7 @@ def find_alone(s0: wp.int32, s1: wp.int32, s2: wp.int32):
 
 @wp.func
 def rotate_first(i: wp.int32, a: Any, b: Any, c: Any):
-    """Return the corners turned so that corner i comes first."""
+    """Return the corners rotated so that corner i comes first."""
     first = wp.where(i == 0, a, wp.where(i == 1, b, c))
     second = wp.where(i == 0, b, wp.where(i == 1, c, a))
     third = wp.where(i == 0, c, wp.where(i == 1, a, b))
@@ -35,28 +35,15 @@ def rotate_first(i: wp.int32, a: Any, b: Any, c: Any):
 
 
 @wp.func
-def rotate_triangles(
-    sa0: wp.int32,
-    sa1: wp.int32,
-    sa2: wp.int32,
-    sb0: wp.int32,
-    sb1: wp.int32,
-    sb2: wp.int32,
-    a0: Any,
-    a1: Any,
-    a2: Any,
-    b0: Any,
-    b1: Any,
-    b2: Any,
-):
+def rotate_triangles(sa: wp.vec3i, sb: wp.vec3i, a0: Any, a1: Any, a2: Any, b0: Any, b1: Any, b2: Any):
     """Return both triangles, each with the corner first that is alone on its side of the other's plane.
 
-    Each is turned so that the other's lone corner lies on the positive side of its plane. The planes meet in a line; on
-    it the triangles are the intervals between edges p q and p r, and two more signs order the ends: they meet unless
+    Each is rotated so that the other's lone corner lies on the positive side of its plane. The planes meet in a line;
+    on it the triangles are the intervals between edges p q and p r, and two more signs order the ends: they meet unless
     orient_edges(p1, q1, p2, q2) or orient_edges(p1, r1, r2, p2) is 1.
     """
-    alone_a, side_a = find_alone(sa0, sa1, sa2)
-    alone_b, side_b = find_alone(sb0, sb1, sb2)
+    alone_a, side_a = find_alone(sa[0], sa[1], sa[2])
+    alone_b, side_b = find_alone(sb[0], sb[1], sb[2])
     p1, q1, r1 = rotate_first(alone_a, a0, a1, a2)
     p2, q2, r2 = rotate_first(alone_b, b0, b1, b2)
     back_a = side_a < 0
@@ -107,7 +94,7 @@ def unpack_sign(signs: wp.int32, k: wp.int32):
 
 @wp.func
 def find_signs(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
-    """Return the six exact signs of `intersect_triangles`, 1 added, two bits each; for a flat A not all of B's.
+    """Return the six exact signs of `intersect_triangles`, 1 added, two bits each; for a coplanar A not all of B's.
 
     Threads of a warp have different signs open: each takes its own next, so that they need not wait for one another.
     """
@@ -136,12 +123,12 @@ def intersect_exactly(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1
     signs = find_signs(a0, a1, a2, b0, b1, b2)
     sa0, sa1, sa2 = unpack_sign(signs, 0), unpack_sign(signs, 1), unpack_sign(signs, 2)
     sb0, sb1, sb2 = unpack_sign(signs, 3), unpack_sign(signs, 4), unpack_sign(signs, 5)
-    flat_a = sa0 == 0 and sa1 == 0 and sa2 == 0
-    if is_one_sided(sa0, sa1, sa2) or (not flat_a and is_one_sided(sb0, sb1, sb2)):
+    coplanar_a = sa0 == 0 and sa1 == 0 and sa2 == 0
+    if is_one_sided(sa0, sa1, sa2) or (not coplanar_a and is_one_sided(sb0, sb1, sb2)):
         return 0
-    if flat_a or (sb0 == 0 and sb1 == 0 and sb2 == 0):
+    if coplanar_a or (sb0 == 0 and sb1 == 0 and sb2 == 0):
         return wp.where(intersect_special(EXACT, a0, a1, a2, b0, b1, b2), 1, 0)
-    p1, q1, r1, p2, q2, r2 = rotate_triangles(sa0, sa1, sa2, sb0, sb1, sb2, a0, a1, a2, b0, b1, b2)
+    p1, q1, r1, p2, q2, r2 = rotate_triangles(wp.vec3i(sa0, sa1, sa2), wp.vec3i(sb0, sb1, sb2), a0, a1, a2, b0, b1, b2)
     first = orient_edges(FILTER, p1, q1, p2, q2)
     second = orient_edges(FILTER, p1, r1, r2, p2)
     while first != 1 and second != 1 and wp.max(first, second) == UNCERTAIN:
@@ -176,7 +163,7 @@ def intersect_triangles(
     special = (sa0 == 0 and sa1 == 0 and sa2 == 0) or (sb0 == 0 and sb1 == 0 and sb2 == 0)
     if special:
         return wp.where(intersect_special(mode, a0, a1, a2, b0, b1, b2), 1, 0)
-    p1, q1, r1, p2, q2, r2 = rotate_triangles(sa0, sa1, sa2, sb0, sb1, sb2, a0, a1, a2, b0, b1, b2)
+    p1, q1, r1, p2, q2, r2 = rotate_triangles(wp.vec3i(sa0, sa1, sa2), wp.vec3i(sb0, sb1, sb2), a0, a1, a2, b0, b1, b2)
     first = orient_edges(mode, p1, q1, p2, q2)
     second = orient_edges(mode, p1, r1, r2, p2)
     return wp.where(first == 1 or second == 1, 0, 1)

@@ -20,45 +20,39 @@ UNKNOWN = wp.constant(-1)
 
 @wp.struct
 class UpdateLists:
-    """States under update: those that refit what a slice of faces touches, and those that are refitted whole.
+    """States under update: those that refit what a slice of faces touches (partial), and those refitted whole (full).
 
-    Partial updates: partial_total (1,) holds updates * 2^32 + entries of all slices; partial_state, slice_start (into
-    split_face) and entry_end (running total of slice lengths) have one entry an update.
-    Full updates: full_total (1,) holds updates * 2^32 + faces; full_state and face_end (running total) have one entry
-    an update. whole_state lists, from whole_start[level] on, the whole_count[level] of them whose trees have a level.
-    Worklists: level_node lists, from level_start[level] on, the level_count[level] marked nodes as (state, node).
-    Counters: changed_count and marked_count, faces that change and nodes refitted, shape [state].
+    A total holds two counts in one word, so that one atomic takes an update's place and its items' places:
+
+        63           32 31            0
+        [   updates    |    items     ]    items: entries of all slices, or faces
     """
 
-    partial_total: wp.array(dtype=wp.int64)
-    partial_state: wp.array(dtype=wp.int32)
-    slice_start: wp.array(dtype=wp.int32)
-    entry_end: wp.array(dtype=wp.int32)
-    full_total: wp.array(dtype=wp.int64)
-    full_state: wp.array(dtype=wp.int32)
-    face_end: wp.array(dtype=wp.int32)
-    whole_count: wp.array(dtype=wp.int32)
-    whole_start: wp.array(dtype=wp.int32)
-    whole_state: wp.array(dtype=wp.int32)
-    level_count: wp.array(dtype=wp.int32)
-    level_start: wp.array(dtype=wp.int32)
-    level_node: wp.array(dtype=wp.vec2i)
-    changed_count: wp.array(dtype=wp.int32)
-    marked_count: wp.array(dtype=wp.int32)
+    partial_total: wp.array(dtype=wp.int64)  # updates and entries of all slices, shape [1]
+    partial_state: wp.array(dtype=wp.int32)  # shape [partial update]
+    slice_start: wp.array(dtype=wp.int32)  # into split_face, shape [partial update]
+    entry_end: wp.array(dtype=wp.int32)  # running total of slice lengths, shape [partial update]
+    full_total: wp.array(dtype=wp.int64)  # updates and faces, shape [1]
+    full_state: wp.array(dtype=wp.int32)  # shape [full update]
+    face_end: wp.array(dtype=wp.int32)  # running total of faces, shape [full update]
+    whole_count: wp.array(dtype=wp.int32)  # full updates whose trees have the level, shape [level]
+    whole_start: wp.array(dtype=wp.int32)  # where they begin in whole_state, shape [level]
+    whole_state: wp.array(dtype=wp.int32)  # states of full updates, level by level
+    level_count: wp.array(dtype=wp.int32)  # marked nodes, shape [level]
+    level_start: wp.array(dtype=wp.int32)  # where they begin in level_node, shape [level]
+    level_node: wp.array(dtype=wp.vec2i)  # (state, node), level by level
+    changed_count: wp.array(dtype=wp.int32)  # faces that change, shape [state]
+    marked_count: wp.array(dtype=wp.int32)  # nodes refitted, shape [state]
 
 
 @wp.struct
 class SplitTable:
-    """Where the slices of each model lie, one entry a model.
+    """Where the slices of each model lie."""
 
-    bound: split_start of every model, as places in the pool's split_face; bound_start: where a model's begin in it.
-    partial_max: the longest slice that a partial update takes. depth: of the tree.
-    """
-
-    bound: wp.array(dtype=wp.int32)
-    bound_start: wp.array(dtype=wp.int32)
-    partial_max: wp.array(dtype=wp.int32)
-    depth: wp.array(dtype=wp.int32)
+    bound: wp.array(dtype=wp.int32)  # split_start of every model, as places in the pool's split_face
+    bound_start: wp.array(dtype=wp.int32)  # where a model's begin in `bound`, shape [model]
+    partial_max: wp.array(dtype=wp.int32)  # longest slice that a partial update takes, shape [model]
+    depth: wp.array(dtype=wp.int32)  # of the tree, shape [model]
 
 
 @wp.func

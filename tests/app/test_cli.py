@@ -18,6 +18,7 @@ from helpers.viewer import run_command as run
 import warp_abtree as ab
 from warp_abtree.app.cli import doctor, model_commands, query_command, report
 from warp_abtree.app.cli import main as cli
+from warp_abtree.model.mesh import describe_mesh, load_mesh
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -58,7 +59,7 @@ def test_info(files, capsys):
     assert re.search(r"^faces +320$", shown, re.M) and re.search(r"^open edges +0$", shown, re.M) and not errors
     found = json.loads(run(capsys, "info", "ball.obj", "--json", "--device", "cpu")[0])
     assert found["faces"] == 320 and found["components"] == 1 and found["closed"] is True
-    assert found == ab.describe_mesh(ab.load_mesh("ball.obj"))
+    assert found == describe_mesh(load_mesh("ball.obj"))
 
 
 def test_build(files, capsys):

@@ -15,6 +15,7 @@ import pytest
 from bench.tables import write_json
 from warp_abtree.checks import atomic_write as files
 from warp_abtree.checks.atomic_write import SUFFIX, atomic_write, sweep_up
+from warp_abtree.jobs import SweepJob, ThisProcess, run_shards
 
 SIZE = 200_000
 
@@ -169,7 +170,7 @@ def make_shards(path):
 
     model = ab.Model.from_arrays(np.eye(3), [[0, 1, 2]])
     file = path.suffix[1:] if path.suffix != ".json" else "npz"
-    ab.run_shards(ab.SweepJob(model, model, np.eye(7)[6:]), path.parent, file=file, pool=ab.ThisProcess("cpu"))
+    run_shards(SweepJob(model, model, np.eye(7)[6:]), path.parent, file=file, pool=ThisProcess("cpu"))
 
 
 SHARD = "shard-000000000000-000000000001"

@@ -20,6 +20,7 @@ from helpers.samples import SHUTTLE_SCENE
 import warp_abtree as ab
 from warp_abtree.app.cli import main as cli
 from warp_abtree.app.cli import progress as progress_module
+from warp_abtree.jobs import RayPool
 from warp_abtree.jobs import ray_pool as cluster
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -165,7 +166,7 @@ def test_ray_leaves_a_program_its_handler(monkeypatch):
     try:
         for ours, kept in ((cli.terminate, cli.terminate), (signal.SIG_DFL, theirs)):
             signal.signal(signal.SIGTERM, ours)
-            ab.RayPool(workers=1).close()
+            RayPool(workers=1).close()
             assert signal.getsignal(signal.SIGTERM) is kept
     finally:
         signal.signal(signal.SIGTERM, before)

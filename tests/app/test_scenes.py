@@ -12,6 +12,7 @@ import warp_abtree as ab
 from warp_abtree.app import SceneError, load_scene
 from warp_abtree.app.toml.model_tables import AnyShape
 from warp_abtree.app.toml.shapes import GENERATED
+from warp_abtree.lod.timing import WorkClock
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 # A machine so slow that few objects are a load.
@@ -239,8 +240,8 @@ def test_controllers_of_a_file(tmp_path):
 def test_near_objects_refine(tmp_path, device):
     """With counted work in the place of time: at one budget, errors rise with the distance from the camera."""
     loaded = load_ours("focus", device, [("size = [10, 5, 0]", "size = [2, 2, 0]")], objects=80)
-    finest = loaded.frame(controller="none", clock=ab.WorkClock(RATES)).run(1)[0].cost_ms
-    frame = loaded.frame(budget_ms=finest / 3, clock=ab.WorkClock(RATES))
+    finest = loaded.frame(controller="none", clock=WorkClock(RATES)).run(1)[0].cost_ms
+    frame = loaded.frame(budget_ms=finest / 3, clock=WorkClock(RATES))
     frame.run(90)
     time = frame.history[-1].time
     away = np.linalg.norm(loaded.motion.poses(time)[:, :3] - loaded.camera(time).eye, axis=1)
@@ -250,7 +251,7 @@ def test_near_objects_refine(tmp_path, device):
     assert 0 < error[near].mean() < 0.9 * error[~near].mean()
     assert frame.summary()["budget"]["within_110_percent"] >= 0.95
     assert loaded.camera(8.0).eye[2] < loaded.motion.position[:, 2].min(), "the camera comes out behind the field"
-    again = loaded.frame(budget_ms=finest / 3, clock=ab.WorkClock(RATES))
+    again = loaded.frame(budget_ms=finest / 3, clock=WorkClock(RATES))
     assert np.array_equal(loaded.scene.batch().objects.pool.position.numpy(), loaded.motion.poses(0.0)[:, :3])
     assert [row.error_mean for row in again.run(12)] == [row.error_mean for row in frame.history[:12]]
 
@@ -286,7 +287,7 @@ def test_rigid_bodies_of_a_file(tmp_path, device):
 def test_rain(device):
     loaded = load_ours("rain", device, [("cells = [128, 128]", "cells = [16, 16]")], objects=30)
     assert 29 <= loaded.scene.object_count <= 31 and loaded.frames >= 300
-    frame = loaded.frame(budget_ms=12, clock=ab.WorkClock(RATES))
+    frame = loaded.frame(budget_ms=12, clock=WorkClock(RATES))
     frame.run(90)
     late = frame.history[60:]
     assert min(row.intersecting for row in late) > 5 and frame.history[0].intersecting < 5

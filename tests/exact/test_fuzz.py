@@ -7,6 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import warp_abtree as ab
+from warp_abtree.app import SceneError, load_scene
 
 relaxed = settings(deadline=None, max_examples=250, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -114,8 +115,8 @@ def test_scene_files(tmp_path, data):
     path = tmp_path / "scene.toml"
     path.write_text("".join(text), encoding="utf-8")
     try:
-        loaded = ab.load_scene(path, device="cpu")
-    except ab.SceneError as error:
+        loaded = load_scene(path, device="cpu")
+    except SceneError as error:
         assert "scene.toml" in str(error) and "\n" not in str(error)
     else:
         assert loaded is not None
@@ -131,5 +132,5 @@ def test_any_file_for_any_other(tmp_path, junk):
     path = tmp_path / "a.toml"
     path.write_bytes(junk)
     if junk:
-        with pytest.raises(ab.SceneError, match=r"a\.toml"):
-            ab.load_scene(path, device="cpu")
+        with pytest.raises(SceneError, match=r"a\.toml"):
+            load_scene(path, device="cpu")

@@ -253,7 +253,7 @@ def test_the_filter_is_tight(device):
 # --- float32, the first stage ----------------------------------------------------------------------------------------
 
 
-def screen_signs(error, unit, points, device):
+def float32_signs(error, unit, points, device):
     """Return signs (count, 6) of three points against a plane, all at once and one by one; points [count, 6, 3]."""
     out = wp.zeros((len(points), 7), dtype=wp.int32, device=device)
     error = wp.array(error, dtype=wp.float32, device=device)
@@ -264,7 +264,7 @@ def screen_signs(error, unit, points, device):
     return signs[:, :6]
 
 
-def screen_points(rng, kind):
+def float32_points(rng, kind):
     """Six points about the origin of at most unit size: the fourth is that of a kind, two more lie nearby."""
     points = KINDS[kind](rng, 3)
     points = np.concatenate([points, points[:, 3:] + 1e-3 * rng.normal(size=points[:, 3:].shape), points[:, :1]], 1)
@@ -278,10 +278,10 @@ def true_sides(points):
 
 @pytest.mark.parametrize("off", [2.0**-26, 2.0**-20, 2.0**-10])
 @pytest.mark.parametrize("kind", ["random", "lattice", "coplanar", "large coplanar"])
-def test_screen_is_right_where_it_is_sure(device, kind, off):
+def test_float32_filter_is_right_where_it_is_sure(device, kind, off):
     """Coordinates moved by up to `off`, in a random or in the worst direction, and rounded to float32."""
     rng = np.random.default_rng(7)
-    points = screen_points(rng, kind)
+    points = float32_points(rng, kind)
     normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])[:, None]
     height = rng.choice([0.0, 0.5, 1.0, 2.0, 4.0], (COUNT, 1, 1)) * off * np.sign(normal)
     points[:, 3:] += height
@@ -290,27 +290,27 @@ def test_screen_is_right_where_it_is_sure(device, kind, off):
     shift = np.where(rng.random((COUNT, 1, 1)) < 0.5, worst, rng.uniform(-1, 1, points.shape)) * off
     moved = (points + shift).astype(np.float32)
     error = 2.02 * np.abs(moved - points).max((1, 2))
-    signs = screen_signs(error, FLOAT32_UNIT, moved, device)
+    signs = float32_signs(error, FLOAT32_UNIT, moved, device)
     sure = signs != int(UNCERTAIN)
     np.testing.assert_array_equal(signs[sure], truth[sure])
-    plain = screen_signs(0 * error, FLOAT32_UNIT, moved, device)
+    plain = float32_signs(0 * error, FLOAT32_UNIT, moved, device)
     if kind != "random":
         assert (plain != truth)[plain != int(UNCERTAIN)].any(), "coordinates that are off must be reckoned with here"
     elif off < 1e-6:
         assert sure[:, [0, 1, 3, 4]].mean() > 0.98, "the sixth point lies in the plane but for the shift"
-    far = screen_signs(np.full(COUNT, np.inf), FLOAT32_UNIT, moved, device)
+    far = float32_signs(np.full(COUNT, np.inf), FLOAT32_UNIT, moved, device)
     assert (far == int(UNCERTAIN)).all()
 
 
 @pytest.mark.parametrize("kind", ["random", "coplanar", "large coplanar"])
-def test_screen_covers_its_own_rounding(device, kind):
+def test_float32_filter_covers_its_own_rounding(device, kind):
     """Coordinates that float32 holds exactly: only the arithmetic rounds."""
-    points = screen_points(np.random.default_rng(8), kind).astype(np.float32).astype(float)
+    points = float32_points(np.random.default_rng(8), kind).astype(np.float32).astype(float)
     truth = true_sides(points)
-    signs = screen_signs(np.zeros(COUNT), FLOAT32_UNIT, points, device)
+    signs = float32_signs(np.zeros(COUNT), FLOAT32_UNIT, points, device)
     sure = signs != int(UNCERTAIN)
     np.testing.assert_array_equal(signs[sure], truth[sure])
-    plain = screen_signs(np.zeros(COUNT), 0.0, points, device)
+    plain = float32_signs(np.zeros(COUNT), 0.0, points, device)
     assert (plain != int(UNCERTAIN)).all()
     assert (plain != truth).any() == (kind != "random"), "float32 alone is good enough for points at random only"
 

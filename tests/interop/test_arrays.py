@@ -149,7 +149,7 @@ def test_torch(scene):
     hit = wp.to_torch(query.hits.any_hit)
     assert hit.data_ptr() == query.hits.any_hit.ptr
     assert int((hit[: int(query.pair_count.numpy()[0])] != 0).sum()) == int(expected(scene, poses_of(11)).any.sum())
-    frame = ab.FrameGraph(scene, output="count")
+    frame = ab.Pipeline(scene, output="count")
     wp.to_torch(frame.poses).copy_(torch.tensor(poses_of(12)))
     frame.launch()
     assert wp.to_torch(frame.query.hits.count).sum() == expected(scene, poses_of(12)).count.sum()

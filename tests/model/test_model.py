@@ -320,7 +320,7 @@ def test_saving_replaces(tmp_path):
 @pytest.mark.parametrize("lod", [-1, 10**6, 0.5, float("nan"), float("inf"), True, "1", None])
 def test_lods_are_checked(lod):
     model = sample("twins")
-    for call in (model.mesh_at, model.error_at):
+    for call in (model.mesh_at, model.error_at, lambda lod: model.error_at(lod, side="outward")):
         with pytest.raises(ValueError, match="LOD") as caught:
             call(lod)
         assert str(lod) in str(caught.value)

@@ -147,7 +147,7 @@ def test_lods_pairs_distances_and_transforms(device, framework):
     query.set_pairs(framework(PAIRS[:2]), framework(within[:2]))
     assert describe(query.run()) == describe(first.intersect(PAIRS[:2], output="faces", within=within[:2]))
     assert describe(ab.ContactQuery(second, framework(PAIRS)).run()) == describe(first.intersect(PAIRS, "contacts"))
-    frame = ab.FrameGraph(second, output="count", pairs=framework(PAIRS), groups=framework(np.arange(4)))
+    frame = ab.Pipeline(second, output="count", pairs=framework(PAIRS), groups=framework(np.arange(4)))
     np.testing.assert_array_equal(frame.run().count, first.intersect(PAIRS, output="count").count)
     second.filter(framework(PAIRS[:2]))
     np.testing.assert_array_equal(second.broad_phase(), [(0, 2), (0, 3), (1, 3), (2, 3)])

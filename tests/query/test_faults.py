@@ -55,19 +55,21 @@ def test_a_query_is_given_more_pairs(device, memory, kind):
     make_query, options = QUERIES[kind]
 
     def make():
-        return make_query(make_scene(device), **options)
+        scene = make_scene(device)
+        return scene, make_query(scene, **options)
 
-    def check(before, query):
+    def check(before, made):
+        scene, query = made
         check_buffer_lengths([query])
-        now = [*check_scene(None, query.scene), *describe(query.run())]
+        now = [*check_scene(None, scene), *describe(query.run())]
         assert before is None or now == before
         return now
 
-    count, _ = memory.everywhere(make, lambda query: query.set_pairs(MORE_PAIRS), check)
+    count, _ = memory.everywhere(make, lambda made: made[1].set_pairs(MORE_PAIRS), check)
     assert count > 5
-    query = make()
+    scene, query = make()
     query.set_pairs(MORE_PAIRS)
-    assert describe(query.run()) == describe(make_query(query.scene, **{**options, "pairs": MORE_PAIRS}).run())
+    assert describe(query.run()) == describe(make_query(scene, **{**options, "pairs": MORE_PAIRS}).run())
 
 
 GROWING = {
@@ -92,13 +94,13 @@ def test_a_query_grows(device, memory, kind):
     def make():
         scene = make_scene(device)
         scene.add(scene.models[0], random_poses(np.random.default_rng(1), 1, 0.4)[0], lod=scene.lods[0])
-        return make_query(scene, **options)
+        return scene, make_query(scene, **options)
 
-    def check(before, query):
-        check_buffer_lengths([query])
-        return check_scene(before, query.scene)
+    def check(before, made):
+        check_buffer_lengths([made[1]])
+        return check_scene(before, made[0])
 
-    count, result = memory.everywhere(make, lambda query: query.run(), check)
+    count, result = memory.everywhere(make, lambda made: made[1].run(), check)
     assert count >= 1 and result.any.any()
 
 
@@ -194,7 +196,7 @@ def test_frames(device, interruption, kind):
     options = {"output": "count", "pairs": MORE_PAIRS, **FRAMES[kind]}
 
     def make(captured=True):
-        frame = ab.FrameGraph(add_objects(device), **options)
+        frame = ab.Pipeline(add_objects(device), **options)
         graph = frame.capture() if captured else None
         frame.lods.assign(np.array([20, 41, 9, 33], np.int32))
         return frame, graph
@@ -221,7 +223,7 @@ def test_a_capture(device, interruption):
     """An interrupted capture leaves the frame as it was; it can be captured again."""
 
     def make():
-        return ab.FrameGraph(add_objects(device), output="count", pairs=MORE_PAIRS)
+        return ab.Pipeline(add_objects(device), output="count", pairs=MORE_PAIRS)
 
     def check(before, frame):
         wp.capture_launch(frame.capture())

@@ -7,7 +7,7 @@ from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.kernels.traversal.simd import take_slots
+from warp_abtree.kernels.traversal.warp_stack import take_slots
 from warp_abtree.query.cpu_threads import launch_on_cores
 
 MODELS = ("torus", "small ball", "box", "crumbs", "soup", "twins")
@@ -127,7 +127,7 @@ def test_frames(device):
     """Poses and LODs set on the device."""
     results = []
     for where in ("cpu", device):
-        frame = ab.FrameGraph(make_scene(where), output="contacts", pairs=pairs(), capacity=2**17)
+        frame = ab.Pipeline(make_scene(where), output="contacts", pairs=pairs(), capacity=2**17)
         frame.launch()
         frame.check()
         results.append(fields(frame.result()))

@@ -34,7 +34,7 @@ def test_random_walk_in_a_graph(device):
     rng = np.random.default_rng(1)
     names = rng.permutation(np.repeat(NAMES, 3))
     scene = add_objects(device, names)
-    frame = ab.FrameGraph(scene, capacity=ab.Buffers(pairs=1000))
+    frame = ab.Pipeline(scene, capacity=ab.Buffers(pairs=1000))
     launch = replay(frame)
     singles = [add_objects(device, [name]) for name in names]
     lods, top, kinds = scene.lods, tops(scene), []
@@ -58,7 +58,7 @@ def test_random_walk_in_a_graph(device):
 def test_random_walk_of_real_meshes(device, name):
     rng = np.random.default_rng(2)
     scene = add_objects(device, [name] * 3, spread=3.0)
-    frame = ab.FrameGraph(scene)
+    frame = ab.Pipeline(scene)
     launch, top = replay(frame), tops(scene)
     for _ in range(4):
         for _ in range(3):
@@ -83,7 +83,7 @@ def test_all_states_at_the_crossover(device, monkeypatch):
         moves.append(max(span for span in spans if span[0] <= half))
     lengths, low, high = np.array(moves).T
     assert (lengths > 0.9 * np.array([scene.models[m].face_count // 2 for m in scene.object_model])).all()
-    frame = ab.FrameGraph(scene)
+    frame = ab.Pipeline(scene)
     plan = frame._update.plan
     starts = np.append(plan.level_start.numpy(), len(plan.level_node))
     for lods in (low, high, low, high):
@@ -151,7 +151,7 @@ def test_answers_are_those_of_the_scene(device, case, captured):
             return np.array([min(level for level in part if level >= lod) for part, lod in zip(parts, lods)])
 
     hits = 60000 if options["output"] in ("faces", "contacts") else None
-    frame = ab.FrameGraph(scene, **options, capacity=ab.Buffers(hits, pairs=36))
+    frame = ab.Pipeline(scene, **options, capacity=ab.Buffers(hits, pairs=36))
     if group is not None:
         assert len(frame.lods) == len(frame.batch.states.slots) == len(frame.changed_count) == 7
     if snap is not None:
@@ -169,7 +169,7 @@ def test_worlds_statics_filter(device):
         scene.add(sample(CROWD[i % len(CROWD)]), pose, world=i % 3 - 1, static=i % 4 < 2)
     pairs = scene.broad_phase()
     scene.filter(pairs[::3])
-    frame = ab.FrameGraph(scene, "count")
+    frame = ab.Pipeline(scene, "count")
     kept = len(scene.broad_phase())
     assert 0 < kept < len(pairs)
     assert ask_both(scene, frame, replay(frame), rng, 4, output="count") > 20
@@ -177,7 +177,7 @@ def test_worlds_statics_filter(device):
 
 def test_one_object(device):
     scene = add_objects(device, ["ball"])
-    frame = ab.FrameGraph(scene, "faces")
+    frame = ab.Pipeline(scene, "faces")
     frame.lods.fill_(3)
     wp.capture_launch(frame.capture())
     result = frame.result()
@@ -205,7 +205,7 @@ def control_kernel(
 def test_a_controller_in_the_same_graph(device):
     """Nothing comes from the host between frames: a kernel writes poses and LODs, and the graph goes on from them."""
     scene = add_objects(device)
-    frame = ab.FrameGraph(scene, "faces", capacity=60000)
+    frame = ab.Pipeline(scene, "faces", capacity=60000)
     start, top = frame.poses.numpy().copy(), tops(scene)
     time = wp.zeros(len(top), dtype=wp.int32, device=device)
     inputs = [wp.array(top, dtype=wp.int32, device=device), time, frame.lods, frame.poses]
@@ -236,7 +236,7 @@ def test_the_start_is_the_scene(device):
     poses = random_poses(np.random.default_rng(8), len(CROWD), 0.5)
     scene.set_poses(poses)
     before = copy.deepcopy([raw_state(scene, i) for i in range(len(CROWD))])
-    frame = ab.FrameGraph(scene, "count")
+    frame = ab.Pipeline(scene, "count")
     np.testing.assert_array_equal(frame.lods.numpy(), lods)
     np.testing.assert_array_equal(frame.poses.numpy()[:, :3], poses[:, :3])
     turned = [
@@ -283,16 +283,16 @@ def test_launches_of_a_frame(device, monkeypatch, name, levels):
         scene = add_objects(device, [name] * count)
         large = sum(count << level > 1024 for level in range(levels))  # nodes of all states on a level
         for options, own in (({}, 6 + large), ({"ladder": [[0, 1]]}, 1)):
-            frame = ab.FrameGraph(scene, "count", **options)
+            frame = ab.Pipeline(scene, "count", **options)
             launched = count_launches(monkeypatch, frame.capture)
             assert len(launched) == 1 + own + 2 + narrow + 1
-            frame = ab.FrameGraph(scene, "count", pairs=[(0, 1)], within=1.0, **options)
+            frame = ab.Pipeline(scene, "count", pairs=[(0, 1)], within=1.0, **options)
             assert len(count_launches(monkeypatch, frame.capture)) == 1 + own + narrow + 2 + 1
 
 
 def test_a_frame_waits_for_nothing(device, monkeypatch):
     """A launch moves not a byte between host and device, and allocates none."""
-    frame = ab.FrameGraph(add_objects(device), "faces")
+    frame = ab.Pipeline(add_objects(device), "faces")
 
     def refuse(*args, **options):
         raise AssertionError("a frame waits, or moves data")

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
 
 def test_bad_poses(device):
     scene = add_objects(device, ["ball"] * 5, spread=0.3)
-    frame = ab.FrameGraph(scene, "count")
+    frame = ab.Pipeline(scene, "count")
     good = random_poses(np.random.default_rng(10), 5, 0.3)
     frame.poses.assign(good)
     frame.launch()
@@ -58,7 +58,7 @@ def test_bad_lods(device, case):
     scene = add_objects(device, ["ball", "torus", "ball"])
     ladder, asked = BAD_LODS[case]
     ladder = [[0, model.lod_max] for model in scene.models] if ladder == "ends" else ladder
-    frame = ab.FrameGraph(scene, "count", ladder=ladder)
+    frame = ab.Pipeline(scene, "count", ladder=ladder)
     finest = frame.lods.numpy().copy()
     np.testing.assert_array_equal(finest, [20, 7, 20] if case == "a short ladder" else tops(scene))
     launch = replay(frame)
@@ -92,7 +92,7 @@ def test_lost_work_is_told(device):
         ({"hits": hits - 1, "pairs": 15}, f"hits={hits}.* for {hits - 1}"),
         ({"hits": hits, "pairs": 15}, None),
     ):
-        frame = ab.FrameGraph(scene, "faces", capacity=ab.Buffers(**options))
+        frame = ab.Pipeline(scene, "faces", capacity=ab.Buffers(**options))
         launch = replay(frame)
         for poses in (far, near, far):
             frame.poses.assign(poses)
@@ -112,7 +112,7 @@ def test_lost_work_is_told(device):
 
 def test_one_check_tells_all_that_was_wrong(device):
     scene = add_objects(device, ["small ball"] * 2, spread=0.1)
-    frame = ab.FrameGraph(scene, output="faces", capacity=1)
+    frame = ab.Pipeline(scene, output="faces", capacity=1)
     poses = frame.poses.numpy().copy()
     frame.poses.fill_(np.nan)
     frame.lods.fill_(10**6)
@@ -139,7 +139,7 @@ REFUSED = [
 @pytest.mark.parametrize(("options", "message"), REFUSED)
 def test_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        ab.FrameGraph(add_objects("cpu", ["ball", "torus", "ball"]), **options)
+        ab.Pipeline(add_objects("cpu", ["ball", "torus", "ball"]), **options)
 
 
 @pytest.fixture
@@ -155,10 +155,10 @@ def coincident(device, monkeypatch):
 
 @pytest.mark.slow
 def test_the_room_of_the_first_frame_is_made(coincident):
-    frame = ab.FrameGraph(coincident, output="count")
+    frame = ab.Pipeline(coincident, output="count")
     needed = int(frame.run().float64_tests.sum())
     assert len(frame.query.hits.uncertain) >= needed > 16
-    frame = ab.FrameGraph(coincident, output="count")
+    frame = ab.Pipeline(coincident, output="count")
     wp.capture_launch(frame.capture())
     frame.check()
     np.testing.assert_array_equal(frame.result().count, coincident.intersect(output="count").count)
@@ -166,14 +166,14 @@ def test_the_room_of_the_first_frame_is_made(coincident):
 
 @pytest.mark.slow
 def test_a_room_that_is_too_small_is_told_at_construction(coincident):
-    needed = int(ab.FrameGraph(coincident, output="count").run().float64_tests.sum())
+    needed = int(ab.Pipeline(coincident, output="count").run().float64_tests.sum())
     with pytest.warns(RuntimeWarning, match=f"=8: .* leave {needed} .*uncertain={needed}"):
-        frame = ab.FrameGraph(coincident, output="count", capacity=ab.Buffers(uncertain=8))
+        frame = ab.Pipeline(coincident, output="count", capacity=ab.Buffers(uncertain=8))
     wp.capture_launch(frame.capture())
     with pytest.raises(ab.CapacityError, match=f"needed .*uncertain={needed}.*room for 8"):
         frame.check()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        frame = ab.FrameGraph(coincident, output="count", capacity=ab.Buffers(uncertain=needed))
+        frame = ab.Pipeline(coincident, output="count", capacity=ab.Buffers(uncertain=needed))
     wp.capture_launch(frame.capture())
     frame.check()

@@ -196,7 +196,7 @@ def test_an_empty_scene(device):
         scene.intersect,
         lambda: scene.intersect([]),
         lambda: ab.Query(scene),
-        lambda: ab.FrameGraph(scene),
+        lambda: ab.Pipeline(scene),
         lambda: ab.Frame(scene),
     ):
         with pytest.raises(ValueError, match=r"^the scene has no object$"):

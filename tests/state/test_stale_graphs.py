@@ -203,7 +203,7 @@ def test_results_without_a_launch(device, operator):
 
 def test_a_frame_whose_buffers_grow(device):
     """`run` outside a graph grows them; the graph of before says so, at the result and at the check."""
-    frame = ab.FrameGraph(make_scene(device), output="faces", pairs=PAIRS, capacity=8)
+    frame = ab.Pipeline(make_scene(device), output="faces", pairs=PAIRS, capacity=8)
     graph = frame.capture()
     expected = frame.run().faces
     wp.capture_launch(graph)
@@ -259,7 +259,7 @@ CALLS = {
     "tree_state": lambda scene, query, frame: scene.tree_state(0),
     "Query": lambda scene, query, frame: ab.Query(scene, "count"),
     "ContactQuery": lambda scene, query, frame: ab.ContactQuery(scene, capacity=1000),
-    "FrameGraph": lambda scene, query, frame: ab.FrameGraph(scene),
+    "Pipeline": lambda scene, query, frame: ab.Pipeline(scene),
     "PoseInput": lambda scene, query, frame: ab.PoseInput(scene),
     "sweep": lambda scene, query, frame: ab.sweep(scene.models[0], scene.models[0], [STILL], device=scene.device),
     "run": lambda scene, query, frame: query.run(),
@@ -275,7 +275,7 @@ CALLS = {
 def test_what_waits_is_refused_in_a_capture(device, call):
     """In one sentence, and nothing has changed: neither the scene nor the graph."""
     scene = make_scene(device)
-    query, frame = ab.Query(scene, "count", pairs=PAIRS), ab.FrameGraph(scene, output="count", pairs=PAIRS)
+    query, frame = ab.Query(scene, "count", pairs=PAIRS), ab.Pipeline(scene, output="count", pairs=PAIRS)
     expected = query.run().count
     lods = scene.lods
     with wp.ScopedCapture(device) as captured:

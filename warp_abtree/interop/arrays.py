@@ -13,7 +13,7 @@ from warp_abtree.state.generation import STALE_GRAPH, LaunchGuard
 class PoseInput:
     """Operator that sets the poses of a scene's objects from device memory, without the host.
 
-    It is to `Query` and `ContactQuery` what `FrameGraph.poses` is to a frame. `launch()` only launches, so that a CUDA
+    It is to `Query` and `ContactQuery` what `Pipeline.poses` is to a frame. `launch()` only launches, so that a CUDA
     graph can capture it.
 
     Args:

@@ -21,12 +21,12 @@ COORDINATE_MAX = 2.0**300  # products of three stay finite
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Hold a welded triangle mesh.
+    """A welded triangle mesh.
 
     Attributes:
-        vertices: Positions [model units], float64, shape [v, 3]; all distinct, all referenced, in the source's order.
-        faces: Corners, int32, shape [n_f, 3]; in the source's order.
-        dropped_faces: Faces that welding left without three distinct corners, int32, ascending; they keep their index.
+        vertices: Positions [model units], float64, shape [v, 3]; distinct, referenced, in the order of the source.
+        faces: Corners, int32, shape [n_f, 3]; in the order of the source.
+        dropped_faces: Faces without three distinct corners after welding, int32, ascending; they keep their index.
         name: Name for people.
         file_vertex_count: Vertices in the source.
         unreferenced_count: Vertices of the source that no face refers to.
@@ -93,12 +93,11 @@ def mesh_from_arrays(vertices, faces, name="arrays"):
 
 
 def describe_mesh(mesh):
-    """Say what a mesh is made of, as a dictionary that JSON can hold.
+    """Return counts and sizes of a mesh, as a dictionary for JSON.
 
-    Edges, components, duplicates and zero areas are counted over the faces that were not dropped. An area is zero to
-    rounding: its float64 cross product lies within that product's own error bound. Two faces with the same three
-    corners in any order are duplicates; each one after the first counts. Faces that share a vertex are of one
-    component. A mesh is closed if no edge belongs to one face only.
+    Dropped faces are not counted. An area is zero if its float64 cross product is within the error bound of its
+    computation. Faces with the same three corners in any order are duplicates; each one after the first counts. Faces
+    that share a vertex are of one component. A mesh is closed if no edge belongs to one face only.
 
     Args:
         mesh: A Mesh.
@@ -136,6 +135,41 @@ def describe_mesh(mesh):
 # Validation and welding.
 
 
+def _join_geometry(geometry, name, where=None):
+    """Join the triangles of a trimesh object; points and paths are ignored."""
+    where = name if where is None else where
+    if isinstance(geometry, trimesh.Scene):
+        placed = [
+            (geometry.geometry[part], pose) for pose, part in map(geometry.graph.get, geometry.graph.nodes_geometry)
+        ]
+    else:
+        placed = [(geometry, np.eye(4))]
+    if not placed:
+        raise MeshError(f"{where}: no faces")
+    vertices, faces, vertex_count = [], [], 0
+    for mesh, pose in placed:
+        if not isinstance(mesh, trimesh.Trimesh):
+            continue
+        part_vertices, part_faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+        if part_faces.size == 0:
+            continue
+        # Checked before joining: then an index too large would point into the next part.
+        part_faces = _checked_faces(part_faces, len(part_vertices), where)
+        pose = np.asarray(pose, dtype=np.float64)
+        if not np.array_equal(pose, np.eye(4)):
+            with np.errstate(invalid="ignore", over="ignore"):
+                part_vertices = part_vertices @ pose[:3, :3].T + pose[:3, 3]
+            if np.linalg.det(pose[:3, :3]) < 0.0:
+                part_faces = part_faces[:, ::-1]  # keeps the outside of a mirrored surface
+        vertices.append(part_vertices)
+        faces.append(part_faces + vertex_count)
+        vertex_count += len(part_vertices)
+    if not faces:
+        kinds = sorted({type(part).__name__ for part, _ in placed})
+        raise MeshError(f"{where}: no faces (it holds {', '.join(kinds)})")
+    return _weld_mesh(np.concatenate(vertices), np.concatenate(faces), name, where)
+
+
 def _weld_mesh(vertices, faces, name, where):
     vertices = _checked_vertices(vertices, where)
     faces = _checked_faces(faces, len(vertices), where)
@@ -144,7 +178,7 @@ def _weld_mesh(vertices, faces, name, where):
     referenced = np.zeros(file_vertex_count, dtype=bool)
     referenced[faces] = True
     used = np.flatnonzero(referenced)
-    # Makes -0.0 the same as 0.0, and products of three coordinates free of underflow, so that exact signs are exact.
+    # Makes -0.0 equal to 0.0, and products of three coordinates free of underflow, which exact predicates require.
     positions = np.where(np.abs(vertices[used]) < COORDINATE_MIN, 0.0, vertices[used])
     first, distinct = _weld(positions)
     new_index = np.full(file_vertex_count, -1, dtype=np.int32)
@@ -175,14 +209,14 @@ def _weld_mesh(vertices, faces, name, where):
     )
 
 
-def _as_array(values, what, kinds, where):
+def _as_array(values, what, where):
     try:
         array = np.asarray(values)
     except (ValueError, TypeError) as error:
         raise MeshError(f"{where}: {what} do not form an array: {first_line(error)}") from None
     if array.size == 0:
         raise MeshError(f"{where}: no {what}")
-    if array.dtype.kind not in kinds:
+    if array.dtype.kind not in "iuf":
         raise MeshError(f"{where}: {what} have type {array.dtype}, not a number that can be used")
     if array.ndim != 2 or array.shape[1] != 3:
         raise MeshError(f"{where}: {what} have shape {array.shape}, not (n, 3)")
@@ -191,7 +225,7 @@ def _as_array(values, what, kinds, where):
 
 def _checked_vertices(vertices, where):
     with np.errstate(over="ignore"):
-        vertices = _as_array(vertices, "vertices", "iuf", where).astype(np.float64)
+        vertices = _as_array(vertices, "vertices", where).astype(np.float64)
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         index = int(np.argmin(finite))
@@ -200,7 +234,7 @@ def _checked_vertices(vertices, where):
 
 
 def _checked_faces(faces, vertex_count, where):
-    faces = _as_array(faces, "faces", "iuf", where)
+    faces = _as_array(faces, "faces", where)
     if len(faces) > FACE_LIMIT:
         raise MeshError(f"{where}: {len(faces)} faces, but at most 2^30 are possible")
     if faces.dtype.kind == "f":
@@ -231,7 +265,7 @@ def _weld(positions):
     return np.flatnonzero(is_first), (np.cumsum(is_first) - 1)[representative]
 
 
-# What describe_mesh counts.
+# Description.
 
 
 def _zero_area(vertices, faces):
@@ -267,38 +301,3 @@ def component_labels(faces, vertex_count):
         corner_label = label[pending]
         pending = pending[(corner_label != corner_label[:, :1]).any(axis=1)]
     return label
-
-
-def _join_geometry(geometry, name, where=None):
-    """Join the triangles of a trimesh object; points and paths beside them are left out."""
-    where = name if where is None else where
-    if isinstance(geometry, trimesh.Scene):
-        placed = [
-            (geometry.geometry[part], pose) for pose, part in map(geometry.graph.get, geometry.graph.nodes_geometry)
-        ]
-    else:
-        placed = [(geometry, np.eye(4))]
-    if not placed:
-        raise MeshError(f"{where}: no faces")
-    vertices, faces, vertex_count = [], [], 0
-    for mesh, pose in placed:
-        if not isinstance(mesh, trimesh.Trimesh):
-            continue
-        part_vertices, part_faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
-        if part_faces.size == 0:
-            continue
-        # Before the parts are joined, when an index too large would point into the next one.
-        part_faces = _checked_faces(part_faces, len(part_vertices), where)
-        pose = np.asarray(pose, dtype=np.float64)
-        if not np.array_equal(pose, np.eye(4)):
-            with np.errstate(invalid="ignore", over="ignore"):
-                part_vertices = part_vertices @ pose[:3, :3].T + pose[:3, 3]
-            if np.linalg.det(pose[:3, :3]) < 0.0:
-                part_faces = part_faces[:, ::-1]  # a mirrored surface keeps its outside
-        vertices.append(part_vertices)
-        faces.append(part_faces + vertex_count)
-        vertex_count += len(part_vertices)
-    if not faces:
-        kinds = sorted({type(part).__name__ for part, _ in placed})
-        raise MeshError(f"{where}: no faces (it holds {', '.join(kinds)})")
-    return _weld_mesh(np.concatenate(vertices), np.concatenate(faces), name, where)

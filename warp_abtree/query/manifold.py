@@ -25,7 +25,7 @@ section 3; that the boundary curve gives it is Stokes' theorem.
 import warp as wp
 
 from warp_abtree.kernels import broad_phase
-from warp_abtree.kernels.contact import manifold
+from warp_abtree.kernels.contact import manifold, points
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.result import POINTS_MAX, ManifoldResult, Result
 
@@ -106,7 +106,7 @@ class ManifoldQuery(ContactQuery):
         self._launch_kernel(manifold.average_loop_kernel, capacity, inputs)
         inputs = [*pools, self.pairs, self.pair_poses, start, rows, self.contacts, curves]
         self._launch_kernel(manifold.find_candidate_kernel, capacity, inputs)
-        self._launch_kernel(manifold.spread_point_kernel, room, [pools[2], self.pairs, start, curves, self.manifolds])
+        self._launch_kernel(points.spread_point_kernel, room, [pools[2], self.pairs, start, curves, self.manifolds])
 
     def _sort_keys(self, count, bits):
         with wp.ScopedDevice(self.device):

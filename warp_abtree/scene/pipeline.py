@@ -52,7 +52,7 @@ def check_ladder(ladder, models) -> list:
     return levels
 
 
-class FrameGraph:
+class Pipeline:
     """A frame as an operator: sets poses, brings trees to LODs, runs broad and narrow phase, all on the device.
 
     `launch()` only launches, on arrays that are allocated once, so that a graph can capture it, on CUDA and the CPU,
@@ -100,7 +100,7 @@ class FrameGraph:
     """
 
     def __init__(self, scene, output="any", groups=None, ladder=None, **request):
-        check_device(scene.device, "making a FrameGraph")
+        check_device(scene.device, "making a Pipeline")
         self.batch = batch = scene.batch().with_own_states()
         self.device = batch.device
         if groups is not None and ladder is not None:
@@ -194,7 +194,7 @@ class FrameGraph:
         Raises:
             ValueError: As `check`.
         """
-        check_device(self.device, "FrameGraph.run (launch can)")
+        check_device(self.device, "Pipeline.run (launch can)")
         with self.query.guard.launching(self):
             self._set_objects()
             result = self.query.run()
@@ -203,7 +203,7 @@ class FrameGraph:
 
     def clear_faults(self):
         """Forget what `check` would raise."""
-        check_device(self.device, "FrameGraph.clear_faults")
+        check_device(self.device, "Pipeline.clear_faults")
         self._bad_poses.assign(np.array(NO_FAULTS, np.int32))
         self._update.faults.assign(np.array(NO_FAULTS, np.int32))
         self._demand.zero_()
@@ -219,7 +219,7 @@ class FrameGraph:
             CapacityError: Pairs, hits or face pairs that float32 leaves open outran their buffers; names the demand,
                 and whatever else was wrong.
         """
-        check_device(self.device, "FrameGraph.check")
+        check_device(self.device, "Pipeline.check")
         poses, lods, demand = self._bad_poses.numpy().copy(), self._update.faults.numpy().copy(), self._demand.numpy()
         found, hits, unsure, stale = (int(value) for value in demand)
         self.clear_faults()
@@ -242,7 +242,7 @@ class FrameGraph:
         for name, (demand, places) in room.items():
             if demand > places:
                 needed = f"Buffers({name}={demand})"
-                lost.append(f"a frame since the last check needed {needed}, the frame graph has room for {places}")
+                lost.append(f"a frame since the last check needed {needed}, the pipeline has room for {places}")
         if stale:
             stale_frame = f"a frame since the last check is lost: its graph {STALE_GRAPH}"
             raise RuntimeError("; ".join([stale_frame, *lost, *wrong]))

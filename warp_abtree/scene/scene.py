@@ -205,7 +205,7 @@ class Scene:
             ValueError: Wrong shape or a LOD out of range; nothing is changed.
             RuntimeError: The device is out of memory, or a launch fails; LODs and answers are as before.
         """
-        check_device(self.device, "Scene.set_lods (FrameGraph.lods can)")
+        check_device(self.device, "Scene.set_lods (Pipeline.lods can)")
         lods = to_numpy(lods, "lods")
         if lods.shape != (self.object_count,):
             raise ValueError(f"lods: shape {lods.shape} given for {self.object_count} objects")
