@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from bench import __main__ as bench
 from warp_abtree.app import load_scene
 from warp_abtree.app.cli import main as cli
 
@@ -130,6 +131,11 @@ def test_commands_parse(page):
         assert cli.make_parser().parse_args(words).command == words[0]
         for word in words:
             assert not word.startswith("scenes/") or (ROOT / word).is_file()
+
+
+def test_benchmarks_exist():
+    named = {name for page in PAGES for name in re.findall(r"python -m bench (\w+)", page.read_text(encoding="utf-8"))}
+    assert len(named) > 10 and named <= {*bench.CASES, *bench.STUDIES}
 
 
 def test_readme_has_one_line_for_the_run_and_one_for_the_tests():

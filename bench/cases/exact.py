@@ -104,10 +104,7 @@ def pair_test(mode):
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
 def float32_pair_kernel(
-    error: wp.float32,
-    unit: wp.float32,
-    corners: wp.array2d(dtype=wp.vec3),
-    answer_out: wp.array(dtype=wp.int32),
+    error: wp.float32, unit: wp.float32, corners: wp.array2d(dtype=wp.vec3), answer_out: wp.array(dtype=wp.int32)
 ):
     i = wp.tid()
     answer_out[i] = float32_filter_triangles(

@@ -184,7 +184,7 @@ def time_shares(context, model, lod, count, states):
     scene.set_lods(there)
     update = (moved["there"] + moved["back"]) / 2
     for name, depth in CONFIGURATIONS:
-        posed.push(depth)
+        posed.place(depth)
         row = {"model": model.name, "faces": model.face_count, "configuration": name, "pairs": count}
         row |= {"states": states, "k": int(k.max()), "k_share": k.max() / model.face_count, "update_ms": update}
         for output in ("faces", "any"):
