@@ -5,18 +5,15 @@ import io
 import pickle
 import zipfile
 
-import hypothesis.strategies as st
 import numpy as np
 import pytest
-from helpers.samples import SHAPES, sample, soup
-from hypothesis import HealthCheck, given, settings
+from helpers.samples import SHAPES, sample
 
 import warp_abtree as ab
 from warp_abtree.model.model import FORMAT_VERSION, Model
 
 ARRAYS = ("vertex_parent", "vertex_pos", "face_vertex", "face_split", "split_start", "split_face", "lod_error")
 MEMBERS = (*ARRAYS, "leaf_node", "format", "version", "name")
-FILES = settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def with_errors(model):
@@ -83,15 +80,6 @@ def test_round_trip_is_exact(tmp_path, name):
         for mine, theirs in zip(model.mesh_at(lod), opened.mesh_at(lod), strict=True):
             np.testing.assert_array_equal(mine, theirs)
     assert [p.name for p in tmp_path.iterdir()] == ["a model.npz"]
-
-
-@FILES
-@given(st.integers(1, 30), st.integers(0, 2**31), st.sampled_from([1.0, 2.0**90, 2.0**-90]))
-def test_round_trip_of_soups(tmp_path, count, seed, scale):
-    vertices, faces = soup(count, seed)
-    model = with_errors(ab.Model.from_arrays(vertices * scale, faces, base_faces=1))
-    model.save(tmp_path / "soup.npz")
-    assert_same(model, Model.open(tmp_path / "soup.npz"))
 
 
 def test_equal_models_have_equal_digests(tmp_path):
