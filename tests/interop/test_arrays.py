@@ -134,9 +134,10 @@ def jax_array(rows, device):
     jax = pytest.importorskip("jax")
     jax.config.update("jax_enable_x64", True)
     try:
-        array = jax.device_put(rows, wp.device_to_jax(device))
+        place = wp.device_to_jax(device)
     except RuntimeError as error:  # a jax without this kind of device
         pytest.skip(str(error))
+    array = jax.device_put(rows, place)
     return array, array.unsafe_buffer_pointer(), wp.to_jax, lambda view: view.unsafe_buffer_pointer()
 
 

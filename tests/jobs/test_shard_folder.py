@@ -31,42 +31,22 @@ def refuse(job, out, *words, error=ValueError):
     assert before is None or contents(out) == before
 
 
-def load(path):
-    """Return the columns and the stamp of a shard, unchecked."""
-    if path.suffix == ".npz":
-        with np.load(path) as held:
-            arrays = dict(held)
-        return arrays, {name: arrays.pop(name) for name in shard_folder.STAMP}
-    from pyarrow import parquet
-
-    table = parquet.read_table(path)
-    return {name: table[name].to_numpy() for name in table.column_names}, table.schema.metadata
-
-
-def store(path, columns, stamp):
-    """Write a valid file of some columns, with a stamp or without."""
-    if path.suffix == ".npz":
-        np.savez(path, **stamp, **columns)
-        return
-    import pyarrow
-    from pyarrow import parquet
-
-    table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})
-    parquet.write_table(table.replace_schema_metadata(stamp), path)
-
-
 # Damage, by what it does to a shard's file.
 
 
-def change(path, alter):
-    """Write a valid shard with other columns; alter(columns, name of one of them) returns these."""
-    columns, stamp = load(path)
-    store(path, alter(columns, "count" if "count" in columns else "face_a"), stamp)
+def rewrite(alter):
+    """Return what writes a valid .npz of other arrays: alter(arrays, name of a column) returns these."""
+
+    def damage(path):
+        with np.load(path) as held:
+            arrays = dict(held)
+        np.savez(path, **alter(arrays, "count" if "count" in arrays else "face_a"))
+
+    return damage
 
 
-def remove_the_digest(path):
-    columns, stamp = load(path)
-    store(path, columns, {name: text for name, text in stamp.items() if "digest" not in str(name)})
+def without(arrays, name):
+    return {key: values for key, values in arrays.items() if key != name}
 
 
 def copy_the_next(path):
@@ -76,20 +56,20 @@ def copy_the_next(path):
 
 DAMAGE = {
     "half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
-    "value": lambda path: change(
-        path, lambda columns, name: {**columns, name: columns[name] + (np.arange(len(columns[name])) == 3)}
-    ),
-    "type": lambda path: change(path, lambda columns, name: {**columns, name: columns[name].astype(np.int16)}),
-    "rows lost": lambda path: change(path, lambda columns, _: {name: values[:-3] for name, values in columns.items()}),
-    "column lost": lambda path: change(path, lambda columns, _: dict(list(columns.items())[1:])),
-    "no digest": remove_the_digest,
     "another shard": copy_the_next,
+    "value": rewrite(lambda held, name: {**held, name: held[name] + (np.arange(len(held[name])) == 3)}),
+    "type": rewrite(lambda held, name: {**held, name: held[name].astype(np.int16)}),
+    "rows lost": rewrite(lambda held, _: {name: part[:-3] if part.ndim else part for name, part in held.items()}),
+    "column lost": rewrite(without),
+    "no digest": rewrite(lambda held, _: without(held, "digest")),
 }
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
 @pytest.mark.parametrize("output", ["count", "faces"])
 def test_a_damaged_shard_is_detected_and_computed_again(tmp_path, monkeypatch, file, output, damage):
+    if file == "parquet" and damage not in ("half", "another shard"):
+        pytest.skip("written for .npz")
     job, out = job_of(output), tmp_path / "out"
     run(job, out, file)
     whole, path = contents(out), shard_at(out, 1)
