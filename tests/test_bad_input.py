@@ -100,6 +100,7 @@ def test_a_benchmark_that_there_is_not(capsys, words):
         ("output", ["everything", None, 3]),
         ("lods", ["paper", 3, [0, 0]]),
         ("clock", [3.0, "cpu"]),
+        ("motion", [ab.Kinematic(np.zeros((99, 3)))]),
     ],
 )
 def test_a_frame_refuses_when_it_is_made(name, values):
