@@ -1,4 +1,4 @@
-"""The AB-Tree: its build, and that every walk of LODs ends at the very bits of a rebuild and of the plain oracle."""
+"""The AB-Tree: its build, and walks of LODs, whose states equal a rebuild and the plain oracle to the bit."""
 
 import hypothesis.strategies as st
 import numpy as np
@@ -65,7 +65,7 @@ def assert_same_bits(state, other):
 
 
 class Walker:
-    """Scenes to compare: one walks, one is made anew at the same LODs; and the oracle's rebuilds, remembered."""
+    """A scene whose LODs walk, compared with a new scene at the same LODs and with the oracle's rebuilds, cached."""
 
     def __init__(self, models, objects, device):
         self.models, self.device = models, device
@@ -135,7 +135,7 @@ class Walker:
         mesh = self.scene.models[owner].progressive
         n = mesh.face_count
         starts = [before[state]] if state in before else [b for b in before.values() if b[0] == owner]
-        # A copy starts from the nearest state of its model; which one of two equally near is nobody's business.
+        # A copy starts from the nearest state of its model; of two equally near, either one.
         span = [abs(int(mesh.split_start[lod]) - int(mesh.split_start[b[1]])) for b in starts]
         sources = [b[1] for b, s in zip(starts, span, strict=True) if s == min(span)]
         slices = [mesh.split_face[slice(*sorted((mesh.split_start[a], mesh.split_start[lod])))] for a in sources]
@@ -154,7 +154,7 @@ class Walker:
 
 
 def random_lods(rng, lods, tops):
-    """One LOD an object: small steps, jumps to the ends and anywhere, and objects that stay."""
+    """One LOD per object: small steps, jumps to the ends and anywhere, and objects that stay."""
     step = rng.integers(-8, 9, len(tops)) * rng.choice([0, 1, 1, 4], len(tops))
     lods = np.clip(lods + step, 0, tops)
     jump = rng.random(len(tops))
@@ -285,7 +285,7 @@ def test_objects_share_states(device):
     stats = scene.set_lods([10, 5, 20, 30])
     assert len(stats.state) == len(stats.k) == len(stats.nodes_refitted) == 0
 
-    stats = scene.set_lods([20, 5, 30, 11])  # only one target is new, and 10 is the state that nobody keeps
+    stats = scene.set_lods([20, 5, 30, 11])  # only one target is new, and 10 is the state that no object keeps
     assert stats.state.tolist() == [stay[0]] and stats.lod.tolist() == [11]
     assert objects.state.tolist() == [stay[2], stay[1], stay[3], stay[0]]
 

@@ -167,7 +167,7 @@ def test_the_room_of_the_first_frame_is_made(coincident):
 @pytest.mark.slow
 def test_a_room_that_is_too_small_is_told_at_construction(coincident):
     needed = int(ab.Pipeline(coincident, output="count").run().float64_tests.sum())
-    with pytest.warns(RuntimeWarning, match=f"=8: .* leave {needed} .*uncertain={needed}"):
+    with pytest.warns(RuntimeWarning, match=rf"=8\): .* leave {needed} .*uncertain={needed}"):
         frame = ab.Pipeline(coincident, output="count", capacity=ab.Buffers(uncertain=8))
     wp.capture_launch(frame.capture())
     with pytest.raises(ab.CapacityError, match=f"needed .*uncertain={needed}.*room for 8"):
