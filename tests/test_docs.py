@@ -166,15 +166,15 @@ def test_planning_example(device, tmp_path):
     fcl = pytest.importorskip("trimesh.collision").CollisionManager
     pytest.importorskip("fcl")
     parts = runpy.run_path(str(ROOT / "scenes" / "planning.py"))
-    peer = fcl()
-    peer.add_object("bin", parts["make_bin"](6))
+    other = fcl()
+    other.add_object("bin", parts["make_bin"](6))
     gripper = parts["make_gripper"]()
-    peer.add_object("gripper", gripper)
+    other.add_object("gripper", gripper)
     for pose, expected in zip(parts["sample_grasps"](400)[:60], hit):
         matrix = trimesh.transformations.quaternion_matrix(np.roll(pose[3:], 1))
         matrix[:3, 3] = pose[:3]
-        peer.set_transform("gripper", matrix)
-        assert peer.in_collision_internal() == expected
+        other.set_transform("gripper", matrix)
+        assert other.in_collision_internal() == expected
 
 
 def test_worlds_example(device):

@@ -17,8 +17,10 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree.app import draw_controllers, load_scene
+from warp_abtree.simulate.budget_report import budget_report, step_response
+from warp_abtree.simulate.frame import FrameRow
 
-from ..inside import FrameRow, budget_report, draw_controllers, load_scene, step_response
 from ..shapes import knot
 from ..timing import medians, one_core, time_in_turn
 

@@ -9,7 +9,16 @@ import time
 import numpy as np
 import warp as wp
 
-from ..inside import EXACT, FILTER, FLOAT32, FLOAT32_UNIT, UNCERTAIN, decide_triangles, float32_filter_triangles
+from warp_abtree.testing import (
+    EXACT,
+    FILTER,
+    FLOAT32,
+    FLOAT32_UNIT,
+    UNCERTAIN,
+    decide_triangles,
+    float32_filter_triangles,
+)
+
 from ..triangle_pairs import ADVERSARIAL, make_chunk
 from ..verify import load_oracle
 

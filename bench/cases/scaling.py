@@ -19,8 +19,8 @@ import warp as wp
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.jobs import SweepJob, ThisProcess, run_shards
 
-from ..inside import SweepJob, ThisProcess, run_shards
 from ..shapes import knot, longest_side, random_poses, world_poses
 from ..timing import capture, summarise, time_call, time_rounds
 

@@ -12,9 +12,9 @@ import warp as wp
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.testing import active_build, full_refit_fraction, read_bits, state_lods, upload_lods
 
 from ..baselines.wp_bvh import FaceBvh
-from ..inside import active_build, full_refit_fraction, read_bits, state_lods, upload_lods
 from ..roofline import find_peaks, update_roofline
 from ..shapes import knot_model
 from ..timing import WARM_UP, fit_slope, make_runs, medians, summarise, time_both, time_call, time_in_turn, time_rounds

@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 
 import warp_abtree as ab
+from warp_abtree.app import load_scene
+from warp_abtree.lod.timing import WorkClock
+from warp_abtree.simulate.budget_report import budget_report
 
-from ...inside import WorkClock, budget_report, load_scene
 from .meshes import paper_models
 
 SCENE = Path(__file__).resolve().parents[3] / "scenes" / "focus.toml"

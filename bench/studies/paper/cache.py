@@ -4,10 +4,10 @@ import numpy as np
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.testing import active_build, upload_lods
 
 from ...baselines.wp_bvh import FaceBvh
 from ...cases.memory import count_bytes
-from ...inside import active_build, upload_lods
 from .meshes import paper_models
 
 COUNTS = (10, 50, 200)

@@ -6,9 +6,9 @@ import numpy as np
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.testing import upload_lods
 
 from ...cases.update import REFITS, bound_nodes, check_update
-from ...inside import upload_lods
 from ...tables import pick
 from .meshes import PosedPairs, paper_models
 
