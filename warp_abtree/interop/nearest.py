@@ -22,12 +22,9 @@ class NodeBoxes:
 
     def __init__(self, model):
         progressive, tree = model.progressive, model.tree
-        corners = progressive.vertex_pos[progressive.face_vertex]
-        lower, upper = np.full((tree.node_count, 3), np.inf), np.full((tree.node_count, 3), -np.inf)
-        lower[tree.leaf_node], upper[tree.leaf_node] = corners.min(1), corners.max(1)
-        dropped = tree.leaf_node[model.dropped_faces]
-        lower[dropped], upper[dropped] = np.inf, -np.inf
-        tree.merge_boxes(lower, upper)
+        kept = np.delete(np.arange(model.face_count), model.dropped_faces)
+        corners = progressive.vertex_pos[progressive.face_vertex[kept]]
+        lower, upper = tree.node_boxes(kept, corners.min(1), corners.max(1))
         used = (lower <= upper).all(1)
         self.middle, self.half = np.zeros_like(lower), np.full_like(lower, -1.0)
         self.middle[used] = 0.5 * lower[used] + 0.5 * upper[used]
@@ -42,7 +39,7 @@ class _Search:
     def __init__(self, shapes, poses, pairs, upper):
         self.shapes, self.poses, self.pairs = shapes, poses, pairs
         used = {shapes[i]: None for i in np.unique(pairs).tolist()}
-        boxes = [shape.node_boxes() for shape in used]
+        boxes = [shape.node_boxes for shape in used]
         start = np.cumsum([0, *(len(part.face) for part in boxes)])
         first_node = dict(zip(used, start.tolist()))
         # Nodes of all shapes are numbered consecutively; those of each pair's shapes begin here, (2, p).
@@ -125,7 +122,7 @@ def find_nearest(shapes, poses, pairs, upper, likely):
     """Find the least distance of object pairs whose surfaces do not intersect.
 
     Args:
-        shapes: Shape of each object, with `model` and `node_boxes()`.
+        shapes: Shape of each object, with `model` and `node_boxes`.
         poses: Rigid matrices of the objects [world units], float64 (n, 4, 4).
         pairs: Object indices, (p, 2), p > 0.
         upper: Upper bound on the least distance.

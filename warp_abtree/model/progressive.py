@@ -12,6 +12,10 @@ from warp_abtree.kernels.progressive import collapse, hausdorff_bound, polygon, 
 from warp_abtree.kernels.progressive.heap import Heap
 from warp_abtree.kernels.progressive.quadric import Quadric
 
+# Merges, and triangles covered by the error bound, per launch of a serial kernel.
+MERGES, COVERS = 25_000, 200_000
+# Entries of the heap at first: for each edge, and beyond these.
+HEAP_PER_EDGE, HEAP_EXTRA = 2, 256
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
 
 # Error of a bound by rounding, in units of the frame (coordinates about 1/2, so 2^-54 each): reading the vertices of
@@ -125,22 +129,7 @@ class ProgressiveMesh:
         return int(self.lod_max - np.argmin(miss[::-1]))
 
 
-@dataclass(frozen=True)
-class LaunchSizes:
-    """Work of one launch of the builder's serial kernels; the result does not depend on it.
-
-    Attributes:
-        merges, covers: Merges of the collapse, and triangles covered by the error bound, per launch.
-        heap_per_edge, heap_extra: Initial entries of the heap for each edge, and beyond these.
-    """
-
-    merges: int = 25_000
-    covers: int = 200_000
-    heap_per_edge: int = 2
-    heap_extra: int = 256
-
-
-def build_progressive(mesh, base_faces=10, progress=None, sizes=LaunchSizes()):
+def build_progressive(mesh, base_faces=10, progress=None):
     """Collapse a mesh to a base of about `base_faces` faces and certify the error of every LOD on the way.
 
     The sequence for a larger base is a prefix of that for a smaller one, and does not depend on the mesh's scale by
@@ -150,7 +139,6 @@ def build_progressive(mesh, base_faces=10, progress=None, sizes=LaunchSizes()):
         mesh: `Mesh`.
         base_faces: Stop when no more faces than this are left, >= 1.
         progress: Called as progress(stage, done, total) between launches; stages "collapse" and "LOD bounds".
-        sizes: `LaunchSizes`.
 
     Raises:
         ValueError: base_faces is no whole number from 1, or the mesh has 2^29 vertices or 2^31 / 3 faces.
@@ -163,10 +151,10 @@ def build_progressive(mesh, base_faces=10, progress=None, sizes=LaunchSizes()):
         raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
     report = progress if progress is not None else lambda stage, done, total: None
     centre, scale = find_frame(vertices)
-    parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), report, sizes)
+    parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), report)
     vertex_pos = np.concatenate([vertices, centre + scale * pos[len(vertices) :]])
     face_split, split_start, split_face = _splits(parent, faces, len(vertices))
-    lod_error = _bound_errors(vertex_pos, parent, faces, report, sizes.covers)
+    lod_error = _bound_errors(vertex_pos, parent, faces, report)
     return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, lod_error)
 
 
@@ -198,7 +186,8 @@ def _edges(faces):
     return pair[first], boundary.reshape(faces.shape)
 
 
-def _cpu(values, dtype):
+def cpu_array(values, dtype):
+    """Return a Warp array on the CPU."""
     return wp.array(values, dtype=dtype, device="cpu")
 
 
@@ -225,32 +214,32 @@ def _linked_rings(faces, face_array, node_capacity):
     return rings
 
 
-def _collapse(pos, faces, base_faces, report, sizes):
+def _collapse(pos, faces, base_faces, report):
     """Run the collapse; return vertex_parent int32 [n_v+m] and all normalised positions float64 [n_v+m, 3]."""
     vertex_count, capacity = len(pos), 2 * len(pos)
     edges, boundary = _edges(faces)
-    face_array = _cpu(faces, int)
+    face_array = cpu_array(faces, int)
     surface = collapse.Surface()
-    surface.pos = _cpu(np.concatenate([pos, np.zeros_like(pos)]), wp.vec3d)
+    surface.pos = cpu_array(np.concatenate([pos, np.zeros_like(pos)]), wp.vec3d)
     surface.quadric = wp.zeros(capacity, dtype=Quadric, device="cpu")
     surface.parent = _filled(capacity, -1)
     surface.stamp = _filled(capacity, -1)
     rings = _linked_rings(faces, face_array, capacity)
-    _launch(collapse.weigh_faces_kernel, len(faces), face_array, _cpu(boundary, wp.int8), surface)
+    _launch(collapse.weigh_faces_kernel, len(faces), face_array, cpu_array(boundary, wp.int8), surface)
     heap, size = Heap(), len(edges)
-    room = sizes.heap_per_edge * size + sizes.heap_extra
-    heap.pair = _cpu(np.resize(edges, room), wp.int64)
+    room = HEAP_PER_EDGE * size + HEAP_EXTRA
+    heap.pair = cpu_array(np.resize(edges, room), wp.int64)
     heap.key = wp.zeros(room, dtype=wp.float64, device="cpu")
     _launch(collapse.price_edges_kernel, size, heap.pair, surface, heap.key)
     start_live = int(_distinct(faces).sum())
-    counter = _cpu(np.array([size, 0, start_live, collapse.RUNNING], dtype=np.int32), int)
+    counter = cpu_array(np.array([size, 0, start_live, collapse.RUNNING], dtype=np.int32), int)
     _launch(collapse.compact_heap_kernel, surface, heap, counter)
     state = counter.numpy()  # shares the memory
     goal = max(start_live - base_faces, 1)
     while state[3] != int(collapse.FINISHED):
         if state[3] == int(collapse.HEAP_FULL):
             heap = _roomier_heap(surface, heap, counter)
-        limits = [vertex_count, base_faces, sizes.merges, len(heap.key)]
+        limits = [vertex_count, base_faces, MERGES, len(heap.key)]
         _launch(collapse.collapse_edges_kernel, *limits, surface, rings, heap, counter)
         report("collapse", min(start_live - int(state[2]), goal), goal)
     nodes = vertex_count + int(state[1])
@@ -276,13 +265,13 @@ def _splits(parent, faces, vertex_count):
     """Return face_split int32 [n_f], split_start int64 [m+1] and split_face int32 of a forest."""
     node_count = len(parent)
     merge_count = node_count - vertex_count
-    face_array, parent_array = _cpu(faces, int), _cpu(parent, int)
+    face_array, parent_array = cpu_array(faces, int), cpu_array(parent, int)
     size = wp.zeros(merge_count + 1, dtype=wp.int64, device="cpu")
     face_split = wp.zeros(len(faces), dtype=int, device="cpu")
     _launch(vertex_forest.count_events_kernel, vertex_count, node_count, face_array, parent_array, size, face_split)
     split_start = np.concatenate([[0], np.cumsum(size.numpy()[:merge_count])]).astype(np.int64)
     split_face = wp.zeros(int(split_start[-1]), dtype=int, device="cpu")
-    cursor = _cpu(split_start.copy(), wp.int64)
+    cursor = cpu_array(split_start.copy(), wp.int64)
     _launch(vertex_forest.fill_events_kernel, node_count, face_array, parent_array, cursor, split_face)
     return face_split.numpy(), split_start, split_face.numpy()
 
@@ -296,20 +285,20 @@ def make_scratch(candidates, faces, rows):
     return scratch
 
 
-def _bound_errors(vertex_pos, parent, faces, report, covers):
-    """Return lod_error float64 [m+1]; `covers` triangles are covered per launch."""
+def _bound_errors(vertex_pos, parent, faces, report):
+    """Return lod_error float64 [m+1]."""
     centre, scale = find_frame(vertex_pos[np.unique(faces)])
     child = np.flatnonzero(parent >= 0)
     merge_count, face_count = len(child) // 2, len(faces)  # every merge has exactly two children
     if merge_count == 0:
         return np.zeros(1)
     pair = child[np.argsort(parent[child], kind="stable")].reshape(-1, 2)
-    face_array = _cpu(faces, int)
+    face_array = cpu_array(faces, int)
     replay = _replay((vertex_pos - centre) / scale, face_count)
     replay.rings = _linked_rings(faces, face_array, len(parent))
     _launch(hausdorff_bound.start_replay_kernel, face_count, face_array, replay)
     bound_sq = wp.zeros(merge_count, dtype=wp.float64, device="cpu")
-    inputs = [len(parent) - merge_count, merge_count, covers, _cpu(pair, int)]
+    inputs = [len(parent) - merge_count, merge_count, COVERS, cpu_array(pair, int)]
     state = replay.counter.numpy()  # shares the memory
     while state[0] < merge_count:
         _launch(hausdorff_bound.replay_merges_kernel, *inputs, replay, bound_sq)
@@ -325,7 +314,7 @@ def _replay(pos, face_count):
     replay = triangle_cover.Replay()
     replay.counter = _filled(6, 0)
     replay.scratch = make_scratch(face_count, triangle_cover.SLOTS, polygon.STACK)
-    replay.pos = _cpu(pos, wp.vec3d)
+    replay.pos = cpu_array(pos, wp.vec3d)
     replay.triangle_pos, replay.face_pos = _points(face_count, 3), _points(face_count, 3)
     replay.face_box = _points(face_count, 2)
     for name in ("face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face"):
@@ -343,5 +332,5 @@ def _index(replay):
     active = np.flatnonzero(replay.rings.corner_node.numpy()[::3] >= 0).astype(np.int32)
     corners = replay.face_pos.numpy()[active]
     lower, upper = corners.min(axis=1).astype(np.float32), corners.max(axis=1).astype(np.float32)
-    replay.bvh_face = _cpu(active, int)
-    return wp.Bvh(_cpu(lower, wp.vec3), _cpu(upper, wp.vec3))
+    replay.bvh_face = cpu_array(active, int)
+    return wp.Bvh(cpu_array(lower, wp.vec3), cpu_array(upper, wp.vec3))
