@@ -194,14 +194,10 @@ def test_cubes_face_to_face(device, restitution):
 @pytest.mark.slow
 def test_a_closed_elastic_scene_gains_no_energy(device):
     """Bound: 1e-4 of the energy over 10,000 steps. The tumbling of bodies swings it; no bounce adds to it."""
-    wall, half = box(5, 5, 1), np.sqrt(0.5)
-    turns = {0: (0, half, 0, half), 1: (half, 0, 0, half), 2: (0, 0, 0, 1)}
-    walls = []
-    for axis, turn in turns.items():
-        for side in (-1, 1):
-            place = np.zeros(3)
-            place[axis] = 2.0 * side
-            walls.append((wall, (*place, *turn), True))
+    half = np.sqrt(0.5)
+    turns = ((0, half, 0, half), (half, 0, 0, half), (0, 0, 0, 1))
+    places = [(2.0 * side * np.eye(3)[axis], turn) for axis, turn in enumerate(turns) for side in (-1, 1)]
+    walls = [(box(5, 5, 1), (*place, *turn), True) for place, turn in places]
     bodies = [(BRICK, (-0.7, -0.7, 0, *about((1, 1, 0), 0.5))), (BALL, (0.7, -0.6, 0.3, 0, 0, 0, 1))]
     bodies.append((TORUS, (0, 0.7, -0.2, *about((0, 1, 1), 0.8))))
     velocity, omega = np.zeros((9, 3)), np.zeros((9, 3))
