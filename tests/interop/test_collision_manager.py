@@ -53,11 +53,14 @@ def both(device):
     return TrimeshManager(), ab.CollisionManager(device)
 
 
+def of_both(managers, call, *arguments):
+    for manager in managers:
+        getattr(manager, call)(*arguments)
+
+
 def fill(managers, rng, count, spread, prefix=""):
     for k in range(count):
-        mesh, transform = SHAPES[rng.choice(list(SHAPES))], random_transform(rng, spread)
-        for manager in managers:
-            manager.add_object(f"{prefix}{k}", mesh, transform)
+        of_both(managers, "add_object", f"{prefix}{k}", SHAPES[rng.choice(list(SHAPES))], random_transform(rng, spread))
 
 
 def assert_same_names(theirs, ours, call, *arguments):
@@ -99,17 +102,13 @@ def test_a_scene_that_changes(device):
     for step in range(40):
         name = rng.choice(names)
         if step % 3 == 0:
-            for manager in managers:
-                manager.remove_object(name)
+            of_both(managers, "remove_object", name)
             names.remove(name)
         elif step % 3 == 1:
             name, mesh, transform = f"new {step}", SHAPES[rng.choice(list(SHAPES))], random_transform(rng, 1.2)
-            for manager in managers:
-                manager.add_object(name, mesh, transform)
+            of_both(managers, "add_object", name, mesh, transform)
             names.append(name)
-        transform = random_transform(rng, 1.2)
-        for manager in managers:
-            manager.set_transform(names[step % len(names)], transform)
+        of_both(managers, "set_transform", names[step % len(names)], random_transform(rng, 1.2))
         assert ours.in_collision_internal(True) == theirs.in_collision_internal(True)
 
 
@@ -118,9 +117,8 @@ def test_solids_as_trimesh_takes_them(device, name):
     mesh = SHAPES[name]
     assert convex_solid.is_convex(mesh) == mesh.is_convex
     crumb = trimesh.creation.icosphere(subdivisions=0, radius=0.01)
-    theirs, ours = both(device)
-    for manager in (theirs, ours):
-        manager.add_object(name, mesh)
+    theirs, ours = managers = both(device)
+    of_both(managers, "add_object", name, mesh)
     for at in itertools.product((-0.4, 0.0, 0.4), repeat=3):
         transform = shift(at)
         assert ours.in_collision_single(crumb, transform) == theirs.in_collision_single(crumb, transform)
