@@ -110,6 +110,9 @@ def test_a_scene_that_changes(device):
             names.append(name)
         of_both(managers, "set_transform", names[step % len(names)], random_transform(rng, 1.2))
         assert ours.in_collision_internal(True) == theirs.in_collision_internal(True)
+    others = both(device)
+    fill(others, rng, 5, 1.2, "other ")
+    assert len(assert_same_names(theirs, ours, "in_collision_other", others)) > 3
 
 
 @pytest.mark.parametrize("name", SHAPES)
