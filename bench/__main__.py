@@ -25,7 +25,6 @@ CASES = (
     "build",
     "exact",
     "frame",
-    "memory",
     "precision",
     "query",
     "scale",
@@ -53,7 +52,7 @@ def case_parser():
     parser.add_argument("--json", metavar="FILE", help="write the rows to a file as well")
     parser.add_argument("--quick", action="store_true", default=None, help="the smallest sizes, to try a case out")
     parser.add_argument("--largest", type=int, metavar="FACES", help="build, scale, update: leave larger meshes out")
-    parser.add_argument("--models", metavar="DIR", help="build, memory, scale, update: keep the models there")
+    parser.add_argument("--models", metavar="DIR", help="build, scale, update: keep the models there")
     parser.add_argument("--plots", metavar="DIR", help="budget, build, scale, update: draw figures there")
     parser.add_argument("--rows", metavar="FILE", help="with --plots: draw what --json wrote, in place of a run")
     parser.add_argument("--count", type=int, help="exact: random pairs; a tenth as many adversarial ones")

@@ -1,4 +1,4 @@
-"""One core against one core: ours beside FCL in C++, python-fcl, trimesh and Coal, where installed, on posed pairs.
+"""One core against one core: ours beside FCL in C++, python-fcl and trimesh, where installed, on posed pairs.
 
 A workload is one model against another at 200 poses, half of them intersecting. Answers are compared before anything is
 timed. Times are those that the thread ran. Ours is timed from the launch to the sorted result on the host; a baseline
@@ -14,7 +14,6 @@ import warp as wp
 import warp_abtree as ab
 from warp_abtree import testing
 
-from ..baselines.coal import Coal
 from ..baselines.fcl import Fcl
 from ..baselines.fcl_cpp import FclCpp
 from ..baselines.trimesh import Trimesh
@@ -30,7 +29,7 @@ REAL = {
 }
 FULL = {"faces": 5000, "poses": 200, "repeats": 5}
 QUICK = {"faces": 300, "poses": 6, "repeats": 1}
-BASELINES = (FclCpp, Fcl, Trimesh, Coal)
+BASELINES = (FclCpp, Fcl, Trimesh)
 IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 
 

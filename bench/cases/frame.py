@@ -7,9 +7,9 @@ import warp as wp
 
 import warp_abtree as ab
 
+from ..memory import count_bytes
 from ..shapes import knot, random_directions, scene_of_objects
 from ..timing import capture, summarise_all, time_call, time_graph, time_rounds
-from .memory import count_bytes
 
 FULL = {"faces": 5000, "objects": (16, 256, 4096), "repeats": 15}
 QUICK = {"faces": 300, "objects": (16,), "repeats": 3}

@@ -11,11 +11,11 @@ from warp_abtree import testing
 
 from ..baselines.newton import make_newton
 from ..baselines.wp_bvh import BvhFaces, find_constructor
+from ..memory import memory_columns
 from ..roofline import COUNTERS, find_peaks, roofline
 from ..shapes import knot, pair_poses, scene_of_pairs
 from ..timing import ratio_of, summarise, summarise_all, time_call, time_in_turn, time_rounds
 from ..verify import count_differences, judge_disputed
-from .memory import memory_columns
 
 FULL = {"faces": 5000, "pairs": (1, 64, 1024, 8192), "distances": (0.9, 0.2), "repeats": 15}
 QUICK = {"faces": 300, "pairs": (1, 4), "distances": (0.2,), "repeats": 3}

@@ -9,10 +9,10 @@ import warp as wp
 import warp_abtree as ab
 
 from ..baselines.wp_bvh import BvhFaces
+from ..memory import memory_columns
 from ..roofline import find_peaks, roofline
 from ..shapes import knot, knot_model, longest_side, pair_poses, scene_of_objects, scene_of_pairs, world_poses
 from ..timing import fit_slope, summarise_all, time_in_turn, upper_half
-from .memory import memory_columns
 
 SIZES = {
     "cuda": {

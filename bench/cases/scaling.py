@@ -1,4 +1,4 @@
-"""Scaling over devices, and the rates of a worker and a driver of sharded jobs.
+"""Scaling over devices: captured frames of many worlds, and the shards of a job.
 
 Frames: worlds of four objects, broad phase, face pairs counted, a captured frame a device that a thread of its own
 launches; poses change and answers stay on the devices, so that the host transfers nothing. Shards: those of a
@@ -8,8 +8,6 @@ all numbers of devices in turn. A CPU has one core.
 """
 
 import os
-import tempfile
-import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -19,22 +17,22 @@ import warp as wp
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.jobs import SweepJob, ThisProcess, run_shards
+from warp_abtree.jobs import SweepJob, ThisProcess
 
 from ..shapes import knot, longest_side, random_poses, world_poses
 from ..timing import capture, summarise, time_call, time_rounds
 
 SIZES = {
-    "cuda": {"faces": 5000, "worlds": 8192, "frames": 8, "repeats": 9, "driver": 2**21, "shards": 2**23},
-    "cpu": {"faces": 2000, "worlds": 512, "frames": 2, "repeats": 7, "driver": 2**20, "shards": 2**18},
+    "cuda": {"faces": 5000, "worlds": 8192, "frames": 8, "repeats": 9, "shards": 2**23},
+    "cpu": {"faces": 2000, "worlds": 512, "frames": 2, "repeats": 7, "shards": 2**18},
 }
-QUICK = {"faces": 300, "worlds": 8, "frames": 2, "repeats": 1, "driver": 4096, "shards": 64}
+QUICK = {"faces": 300, "worlds": 8, "frames": 2, "repeats": 1, "shards": 64}
 OBJECTS = 4  # a world
 SHARD = 65536
 
 
 def run(device, devices=None, quick=False):
-    """Yield the rates of a worker and a driver of shards, then a row a workload, way and device count.
+    """Yield one row a workload, way and number of devices.
 
     Args:
         devices: Names with commas between; None is twice the CPU, or `device` alone.
@@ -43,43 +41,8 @@ def run(device, devices=None, quick=False):
     first = wp.get_device(devices[0])
     sizes = QUICK if quick else SIZES["cuda" if first.is_cuda else "cpu"]
     model = ab.Model.from_arrays(*knot(sizes["faces"]))
-    yield time_worker(first, model, min(SHARD, sizes["driver"]), sizes["repeats"])
-    yield time_driver(model, sizes["driver"])
     yield from scale_frames(devices, model, sizes)
     yield from scale_shards(devices, model, sizes)
-
-
-def time_worker(device, model, count, repeats):
-    """Return the row of a shard asked on one device, on the CPU by one core: poses on the host, answers there."""
-    job = SweepJob(model, model, random_poses(count, longest_side(model)))
-    runner, task = job.runner(), job.task(0, count)
-    with testing.regime(cpu_threads=1):
-        times = time_rounds({"shard": time_call(lambda: runner.run(task, device), device)}, repeats)["shard"]
-    row = {"case": "worker", "device": device.name, "faces": model.face_count, "poses": count}
-    return row | summarise("shard", times) | {"worker_mposes_s": float(f"{count / np.median(times) / 1e3:.4g}")}
-
-
-class IdlePool:
-    """A pool that answers at once: what is left is what the driver does, reading poses and writing shards."""
-
-    workers, lost = 1, 0
-
-    def run(self, job, ranges):
-        for start, stop in ranges:
-            yield start, stop, {"any": np.zeros(len(job.task(start, stop)[1]), bool)}
-
-
-def time_driver(model, count):
-    """Return how many poses a second a driver checks, and reads and writes, with workers that take no time."""
-    with tempfile.TemporaryDirectory() as folder:
-        np.save(f"{folder}/poses.npy", random_poses(count, 1.0))
-        begin = time.perf_counter()
-        job = SweepJob(model, model, f"{folder}/poses.npy", shard=min(SHARD, count))
-        made = time.perf_counter()
-        run_shards(job, f"{folder}/out", pool=IdlePool())
-        done = time.perf_counter()
-    rates = {"check_mposes_s": count / (made - begin) / 1e6, "driver_mposes_s": count / (done - made) / 1e6}
-    return {"case": "driver", "poses": count} | {name: float(f"{rate:.4g}") for name, rate in rates.items()}
 
 
 def list_sizes(devices) -> list:

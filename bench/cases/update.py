@@ -15,10 +15,10 @@ from warp_abtree import testing
 from warp_abtree.testing import active_build, full_refit_fraction, read_bits, state_lods, upload_lods
 
 from ..baselines.wp_bvh import FaceBvh
+from ..memory import memory_columns
 from ..roofline import find_peaks, update_roofline
 from ..shapes import knot_model
 from ..timing import WARM_UP, fit_slope, make_runs, medians, summarise, time_both, time_call, time_in_turn, time_rounds
-from .memory import memory_columns
 
 # Fractions of the splits between the finest LOD and the other.
 FRACTIONS = (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.5, 0.9)

@@ -77,16 +77,6 @@ class Context:
             runs[name] = timing.time_graph(graph, self.device) if self.device.is_cuda else timed(replay)
         return timing.medians(timing.time_rounds(runs, repeats or self.size(21, 5)))
 
-    def time_alone(self, launches: dict) -> dict:
-        """Return the median time [ms] of launches that a graph of the CPU cannot hold, by name, in turn.
-
-        As `time_graphs`, but on the CPU called as they are: comparable with it but for some microseconds a launch.
-        """
-        if self.device.is_cuda:
-            return self.time_graphs(launches)
-        runs = {name: timed(launch) for name, launch in launches.items()}
-        return timing.medians(timing.time_rounds(runs, self.size(21, 5)))
-
     def time_launches(self, launches, repeats=None, on_core=False) -> dict:
         """Return the median time [ms] of launches by name, in turn: on CUDA of graph replays.
 
