@@ -6,59 +6,49 @@ the CPU time of its thread, so that what else the machine does is left out.
 
 import contextlib
 import gc
-import json
 import time
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import warp as wp
 
-import warp_abtree as ab
 from warp_abtree.app import draw_controllers, load_scene
 from warp_abtree.simulate.budget_report import budget_report
-from warp_abtree.simulate.frame import FrameRow
 
-from ..shapes import knot
-from ..timing import medians, one_core, time_in_turn
+from ..timing import one_core
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 NAMES = ("rain", "focus")
 OBJECTS = {"cpu": {"rain": 300, "focus": 300}, "cuda": {"rain": 4000, "focus": 1500}}
 # What is asked where bodies do not ask: a GPU counts so fast that LODs save little of a frame.
 OUTPUT = {"cpu": "count", "cuda": "contacts"}
-FULL = {"frames": 240, "selected": 100_000}
-QUICK = {"frames": 75, "selected": 200}
-QUICK_OBJECTS = 40
+FRAMES, QUICK_FRAMES, QUICK_OBJECTS = 240, 75, 40
 BREACH = 3.5  # how often the finest LODs take the budget
 CONTROLLERS = ("none", "coarsest", "predictive", "paper", "tolerance")
 CONSTANT_LODS = ("none", "coarsest")
 
 
 def run(device, quick=False, plots=None):
-    """Yield one row of selection alone, then one a scene and controller, over all frames after the first second.
+    """Yield one row a scene and controller, over all frames after the first second.
 
-    Row "select": what selection alone takes for many objects, with the view and the paper's controller, a tolerance or
-    the prediction; launches, as one graph on CUDA.
-    Rows "hold": budget_ms is T; breach and breach_p5, how often the finest LODs took it, in the median and in 19 of 20
+    budget_ms is T; breach and breach_p5, how often the finest LODs took it, in the median and in 19 of 20
     frames; within and within_110_percent, fractions of frames within T and T + 10 %; worst, the greatest cost over T;
     longest_over, most frames in a row over T + 10 %; oscillations, how often the LOD of an object reversed, a second;
     errors are certified [world units]. "none" has the finest LODs, "coarsest" the coarsest: no budget below can be
     held. Where LODs are fixed, adds is what a frame takes beyond the sum of its stages, over that sum (median).
 
     Args:
-        plots: Folder for a figure a scene and the rows of its frames, None draws nothing.
+        plots: Folder for a figure a scene, None draws nothing.
     """
     device = wp.get_device(device)
     kind = "cuda" if device.is_cuda else "cpu"
-    sizes = QUICK if quick else FULL
+    frames = QUICK_FRAMES if quick else FRAMES
     with contextlib.nullcontext() if device.is_cuda else one_core() as core:
         clock = None if core is None else time.thread_time
-        yield time_selection(device, sizes["selected"])
         for name in NAMES:
             collect()
             objects = QUICK_OBJECTS if quick else OBJECTS[kind][name]
-            yield from BudgetScene(device, name, objects, clock).run(sizes["frames"], plots)
+            yield from BudgetScene(device, name, objects, clock).run(frames, plots)
 
 
 def collect():
@@ -66,28 +56,6 @@ def collect():
     gc.unfreeze()
     gc.collect()
     gc.freeze()
-
-
-def time_selection(device, count):
-    """Return the row "select"."""
-    rng = np.random.default_rng(0)
-    models = [ab.Model.from_arrays(*knot(faces)) for faces in (200, 400, 600)]
-    scene = ab.Scene(device)
-    for i, place in enumerate(rng.uniform(-50, 50, (count, 3)).tolist()):
-        scene.add(models[i % 3], (*place, 0, 0, 0, 1), importance=1 + i % 3)
-    camera, feedback = ab.Camera.look_at((0, 0, 60), (0, 0, 0)), ab.Feedback(0.0)
-    controllers = {
-        "paper": ab.PaperController(scene, 8.0),
-        "tolerance": ab.ToleranceController(scene, 0.01),
-        "predictive": ab.PredictiveController(scene, 8.0),
-    }
-    launches = {"view": controllers["paper"].view.launch}
-    for name, controller in controllers.items():
-        controller.view.look(camera)
-        launches[name] = lambda controller=controller: (controller.view.launch(), controller.next_lods(feedback))
-    times = medians(time_in_turn(launches, device))
-    row = {"case": "select", "device": device.name, "objects": count}
-    return row | {f"{name}_ms": round(value, 4) for name, value in times.items()}
 
 
 class BudgetScene:
@@ -119,7 +87,8 @@ class BudgetScene:
             runs[controller] = frame.history
         if plots is not None:
             title = f"{self.loaded.title}: {scene.object_count:,} objects, {scene.device.name}"
-            print(save_plots(Path(plots), self.name, title, self.budget, runs), flush=True)
+            Path(plots).mkdir(parents=True, exist_ok=True)
+            draw_controllers(runs, self.budget, Path(plots) / f"budget-{self.name}.png", title)
 
     def run_controller(self, controller, frames):
         """Run the scene from its start; return the frame, and what it adds to its stages (median of the frames)."""
@@ -162,20 +131,3 @@ def describe_hold(frame, budget):
         "faces": round(float(np.mean([row.faces for row in rows]))),
         "hits": round(float(np.mean([row.hits for row in rows]))),
     }
-
-
-def save_plots(folder, name, title, budget, runs) -> str:
-    """Write the rows of all frames, and a figure of them; return what was drawn."""
-    folder.mkdir(parents=True, exist_ok=True)
-    kept = {"title": title, "budget_ms": budget, "runs": {key: [asdict(row) for row in runs[key]] for key in runs}}
-    (folder / f"budget-{name}.json").write_text(json.dumps(kept), encoding="utf-8")
-    return draw_saved(folder / f"budget-{name}.json")
-
-
-def draw_saved(path) -> str:
-    """Draw what `save_plots` wrote, beside it; return what was drawn."""
-    kept = json.loads(Path(path).read_text(encoding="utf-8"))
-    runs = {key: [FrameRow(**row) for row in rows] for key, rows in kept["runs"].items()}
-    drawn = Path(path).with_suffix(".png")
-    draw_controllers(runs, kept["budget_ms"], drawn, kept["title"])
-    return f"plots: {drawn}"
