@@ -8,7 +8,6 @@ Erratum (a) of the paper is explained at `active_mark`.
 """
 
 import math
-import random
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -92,40 +91,6 @@ class Progressive:
         """Centre of the box of the original vertices; 0.5 * lower + 0.5 * upper cannot overflow."""
         points = self.vertex_pos[: self.vertex_count]
         return [0.5 * min(p[k] for p in points) + 0.5 * max(p[k] for p in points) for k in range(3)]
-
-
-def random_progressive(vertices, faces, seed=0, base_faces=4, jitter=0.05):
-    """Collapse random edges of a small mesh, nonmanifold or not, and write down what happened.
-
-    Everything is found by replaying the collapses on explicit corner lists, so face_split and the slices are facts
-    of the replay and not derived from the vertex forest.
-    """
-    rng = random.Random(seed)
-    position = [list(map(float, v)) for v in vertices]
-    face_vertex = [list(map(int, f)) for f in faces]
-    parent = [NONE] * len(position)
-    corner = {f: list(c) for f, c in enumerate(face_vertex) if len(set(c)) == 3}
-    death = {}  # face -> merge that removed it
-    touched = []  # per merge, the faces that it removed or deformed
-    while len(corner) > base_faces:
-        a, b = rng.sample(corner[rng.choice(list(corner))], 2)
-        new, merge = len(position), len(touched)
-        position.append([(position[a][k] + position[b][k]) / 2 + rng.uniform(-jitter, jitter) for k in range(3)])
-        parent.append(NONE)
-        parent[a] = parent[b] = new
-        touched.append([f for f, c in corner.items() if a in c or b in c])
-        for f in touched[-1]:
-            corner[f] = [new if v in (a, b) else v for v in corner[f]]
-            if len(set(corner[f])) < 3:
-                del corner[f]
-                death[f] = merge
-    m = len(touched)
-    split = [m - death[f] if f in death else (0 if f in corner else m + 1) for f in range(len(face_vertex))]
-    start, flat = [0], []
-    for slice_faces in reversed(touched):
-        flat += slice_faces
-        start.append(len(flat))
-    return Progressive(parent, position, face_vertex, split, start, flat)
 
 
 # --- the tree --------------------------------------------------------------------------------------------------------

@@ -1,9 +1,9 @@
 """Exact triangle intersection for closed sets, from first principles, and brute force over all face pairs.
 
-Touching counts, coplanar overlap counts, and a triangle of zero area is the segment or point that it is. Two exact
-tests are written on different grounds and check each other: `triangles_intersect` asks whether an edge of one meets the
-other, in integers; `triangles_intersect_fractions` clips one by the half-spaces of the other, in fractions. A float64
-is an integer times a power of two, so integers on a common exponent are exact.
+Touching counts, coplanar overlap counts, and a triangle of zero area is the segment or point that it is.
+`triangles_intersect` asks whether an edge of one meets the other, in integers: a float64 is an integer times a power of
+two, so integers on a common exponent are exact. `shared_polygon` clips one by the half-spaces of the other, in
+fractions; contacts need its corners, and each checks the other.
 """
 
 from fractions import Fraction
@@ -81,15 +81,15 @@ def integer_points(*arrays):
     return result
 
 
-def _sub(a, b):
+def sub(a, b):
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
-def _dot(a, b):
+def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _cross(a, b):
+def cross(a, b):
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
@@ -118,13 +118,13 @@ def _segments_meet_2d(p, q, r, s, i, j):
 
 
 def _segments_meet(p, q, r, s):
-    d, e, f = _sub(q, p), _sub(s, r), _sub(r, p)
-    normal = _cross(d, e)
+    d, e, f = sub(q, p), sub(s, r), sub(r, p)
+    normal = cross(d, e)
     if normal != ZERO:
-        return _dot(normal, f) == 0 and _segments_meet_2d(p, q, r, s, *_kept_axes(normal))
+        return dot(normal, f) == 0 and _segments_meet_2d(p, q, r, s, *_kept_axes(normal))
     # Parallel, or one of them a point. On a common line, lexicographic order is order along the line.
     line = d if d != ZERO else e
-    return _cross(f, line) == ZERO and max(min(p, q), min(r, s)) <= min(max(p, q), max(r, s))
+    return cross(f, line) == ZERO and max(min(p, q), min(r, s)) <= min(max(p, q), max(r, s))
 
 
 def _segment_meets_triangle(p, q, side_p, side_q, triangle, normal):
@@ -139,11 +139,11 @@ def _segment_meets_triangle(p, q, side_p, side_q, triangle, normal):
             return True
         return any(_segments_meet_2d(p, q, r, s, i, j) for r, s in ((a, b), (b, c), (c, a)))
     # One point of the segment is in the plane; it is inside iff the line passes all edges on the same side.
-    d, a, b, c = _sub(q, p), _sub(a, p), _sub(b, p), _sub(c, p)
-    s, t = _dot(d, _cross(a, b)), _dot(d, _cross(b, c))
+    d, a, b, c = sub(q, p), sub(a, p), sub(b, p), sub(c, p)
+    s, t = dot(d, cross(a, b)), dot(d, cross(b, c))
     if _apart_sides(s, -t):
         return False
-    u = _dot(d, _cross(c, a))
+    u = dot(d, cross(c, a))
     return (s >= 0 and t >= 0 and u >= 0) or (s <= 0 and t <= 0 and u <= 0)
 
 
@@ -161,19 +161,19 @@ def triangles_intersect_integer(a, b):
     be interior to both: it lies on an edge of one, hence some edge of one meets the other. A triangle of zero area is
     the segment between its lexicographically first and last corner.
     """
-    normal_a = _cross(_sub(a[1], a[0]), _sub(a[2], a[0]))
-    normal_b = _cross(_sub(b[1], b[0]), _sub(b[2], b[0]))
+    normal_a = cross(sub(a[1], a[0]), sub(a[2], a[0]))
+    normal_b = cross(sub(b[1], b[0]), sub(b[2], b[0]))
     if normal_a == ZERO and normal_b == ZERO:
         return _segments_meet(min(a), max(a), min(b), max(b))
     if normal_a == ZERO:
         a, b, normal_a, normal_b = b, a, normal_b, normal_a
     if normal_b == ZERO:
         p, q = min(b), max(b)
-        return _segment_meets_triangle(p, q, _dot(normal_a, _sub(p, a[0])), _dot(normal_a, _sub(q, a[0])), a, normal_a)
-    sides_b = [_dot(normal_a, _sub(p, a[0])) for p in b]
+        return _segment_meets_triangle(p, q, dot(normal_a, sub(p, a[0])), dot(normal_a, sub(q, a[0])), a, normal_a)
+    sides_b = [dot(normal_a, sub(p, a[0])) for p in b]
     if min(sides_b) > 0 or max(sides_b) < 0:
         return False
-    sides_a = [_dot(normal_b, _sub(p, b[0])) for p in a]
+    sides_a = [dot(normal_b, sub(p, b[0])) for p in a]
     if min(sides_a) > 0 or max(sides_a) < 0:
         return False
     return _edge_meets_triangle(b, sides_b, a, normal_a) or _edge_meets_triangle(a, sides_a, b, normal_b)
@@ -200,30 +200,30 @@ def pairs_intersect(points_a, faces_a, points_b, faces_b, pairs):
 def _half_spaces(triangle):
     """Half-spaces (normal, point), normal . (x - point) >= 0, whose intersection is the closed triangle."""
     a, b, c = triangle
-    normal = _cross(_sub(b, a), _sub(c, a))
+    normal = cross(sub(b, a), sub(c, a))
     if any(normal):
-        planes = [(normal, a), (_sub(ZERO, normal), a)]
+        planes = [(normal, a), (sub(ZERO, normal), a)]
         # normal x edge points inwards, as the corners run counterclockwise about their own normal.
-        return planes + [(_cross(normal, _sub(q, p)), p) for p, q in ((a, b), (b, c), (c, a))]
+        return planes + [(cross(normal, sub(q, p)), p) for p, q in ((a, b), (b, c), (c, a))]
     p, q = min(triangle), max(triangle)
-    d = _sub(q, p)
+    d = sub(q, p)
     if any(d):
         unit = tuple(Fraction(int(k == min(range(3), key=lambda k: abs(d[k])))) for k in range(3))
-        across = _cross(d, unit)
-        walls = [across, _cross(d, across)]
-        ends = [(d, p), (_sub(ZERO, d), q)]
+        across = cross(d, unit)
+        walls = [across, cross(d, across)]
+        ends = [(d, p), (sub(ZERO, d), q)]
     else:
         walls = [tuple(Fraction(int(k == axis)) for k in range(3)) for axis in range(3)]
         ends = []
-    return ends + [(sign, p) for wall in walls for sign in (wall, _sub(ZERO, wall))]
+    return ends + [(sign, p) for wall in walls for sign in (wall, sub(ZERO, wall))]
 
 
-def triangles_intersect_fractions(a, b):
-    """As `triangles_intersect`, by clipping triangle B with every half-space of triangle A, slowly."""
+def shared_polygon(a, b):
+    """Corners of the intersection of two closed triangles, by clipping B with every half-space of A; empty if apart."""
     a, b = ([tuple(Fraction(float(x)) for x in p) for p in t] for t in (a, b))
     polygon = b
     for normal, origin in _half_spaces(a):
-        side = [_dot(normal, _sub(p, origin)) for p in polygon]
+        side = [dot(normal, sub(p, origin)) for p in polygon]
         clipped = []
         for k in range(len(polygon)):
             p, q, s, t = polygon[k - 1], polygon[k], side[k - 1], side[k]
@@ -232,7 +232,7 @@ def triangles_intersect_fractions(a, b):
             if t >= 0:
                 clipped.append(q)
         polygon = clipped
-    return bool(polygon)
+    return polygon
 
 
 # --- brute force -----------------------------------------------------------------------------------------------------

@@ -26,12 +26,9 @@ def clip_area_vector(half, pose, other_half, other_pose):
     r, r2 = quaternion_matrix(pose[3:]), quaternion_matrix(other_pose[3:])
     total = np.zeros(3)
     for axis, sign in itertools.product(range(3), (-1, 1)):
-        u, v = (axis + 1) % 3, (axis + 2) % 3
-        polygon = []
-        for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
-            corner = np.zeros(3)
-            corner[axis], corner[u], corner[v] = sign * half[axis], a * half[u], b * half[v]
-            polygon.append(r2.T @ (r @ corner + pose[:3] - other_pose[:3]))
+        corners = np.tile(sign * half.astype(float), (4, 1))
+        corners[:, [axis - 2, axis - 1]] = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half[[axis - 2, axis - 1]]
+        polygon = [r2.T @ (r @ corner + pose[:3] - other_pose[:3]) for corner in corners]
         for k, s in itertools.product(range(3), (-1, 1)):
             kept = []
             for p, q in zip(polygon, polygon[1:] + polygon[:1]):
@@ -42,7 +39,7 @@ def clip_area_vector(half, pose, other_half, other_pose):
                     kept.append(p + (q - p) * at_p / (at_p - at_q))
             polygon = kept
         for p, q in itertools.pairwise(polygon[1:]):
-            total += 0.5 * sign * abs(np.linalg.norm(np.cross(p - polygon[0], q - polygon[0]))) * r[:, axis]
+            total += 0.5 * sign * np.linalg.norm(np.cross(p - polygon[0], q - polygon[0])) * r[:, axis]
     return total
 
 
@@ -50,7 +47,7 @@ def check_upward(points, tolerance=1e-9):
     np.testing.assert_allclose(points["normal"], np.tile([0, 0, 1.0], (len(points["pair"]), 1)), atol=tolerance)
 
 
-@pytest.mark.parametrize("splits", [(0, 0), (2, 0), (0, 2), (2, 2)])
+@pytest.mark.parametrize("splits", [(0, 0), (2, 2)])
 def test_a_box_on_a_floor_has_its_four_corners(device, splits):
     floor, cube = box(4, 4, 1, splits=splits[0]), box(1, 0.8, 0.6, splits=splits[1])
     turned = about((0, 0, 1), 0.3)

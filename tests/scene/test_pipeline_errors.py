@@ -24,7 +24,7 @@ def test_bad_poses(device):
     frame.launch()
     before = frame.result()
     launch = replay(frame)
-    for column, value in ((0, np.nan), (2, np.inf), (4, np.nan), (5, -np.inf), (slice(3, 7), 0.0), (slice(3, 7), 0.6)):
+    for column, value in ((0, np.nan), (5, -np.inf), (slice(3, 7), 0.0), (slice(3, 7), 0.6)):
         rows = good.copy()
         rows[3, column] = rows[2, column] = value
         frame.poses.assign(rows)
@@ -127,7 +127,6 @@ REFUSED = [
     (dict(groups=[0.0, 1.0, 0.0]), "groups: .*type float64"),
     (dict(groups=[0, 0, 1]), "groups: .*group 0 holds objects of several models"),
     (dict(groups=[0, 2, 0]), "groups: .*without gaps"),
-    (dict(groups=[-1, 0, -1]), "groups: .*numbered -1 to 0"),
     (dict(ladder=[[1]]), "1 lists of LODs given for 2 models"),
     (dict(ladder=[[1], []]), "no LOD for model 1"),
     (dict(ladder=[[1], [10**6]]), "LOD 1000000 is outside"),
@@ -154,26 +153,21 @@ def coincident(device, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_room_of_the_first_frame_is_made(coincident):
+def test_the_room_of_the_first_frame(coincident):
+    """It is made unless given; one too small is told at construction, and lost frames at the check."""
     frame = ab.Pipeline(coincident, output="count")
     needed = int(frame.run().float64_tests.sum())
     assert len(frame.query.hits.uncertain) >= needed > 16
-    frame = ab.Pipeline(coincident, output="count")
-    wp.capture_launch(frame.capture())
-    frame.check()
-    np.testing.assert_array_equal(frame.result().count, coincident.intersect(output="count").count)
-
-
-@pytest.mark.slow
-def test_a_room_that_is_too_small_is_told_at_construction(coincident):
-    needed = int(ab.Pipeline(coincident, output="count").run().float64_tests.sum())
     with pytest.warns(RuntimeWarning, match=rf"=8\): .* leave {needed} .*uncertain={needed}"):
         frame = ab.Pipeline(coincident, output="count", capacity=ab.Buffers(uncertain=8))
     wp.capture_launch(frame.capture())
     with pytest.raises(ab.CapacityError, match=f"needed .*uncertain={needed}.*room for 8"):
         frame.check()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        frame = ab.Pipeline(coincident, output="count", capacity=ab.Buffers(uncertain=needed))
-    wp.capture_launch(frame.capture())
-    frame.check()
+    expected = coincident.intersect(output="count").count
+    for capacity in (None, ab.Buffers(uncertain=needed)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            frame = ab.Pipeline(coincident, output="count", capacity=capacity)
+        wp.capture_launch(frame.capture())
+        frame.check()
+        np.testing.assert_array_equal(frame.result().count, expected)
