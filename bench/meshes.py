@@ -10,8 +10,8 @@ import re
 from pathlib import Path
 
 import warp_abtree as ab
+from warp_abtree.model.mesh import load_mesh
 
-from .inside import load_mesh
 from .shapes import knot
 
 ROOT = Path(__file__).resolve().parents[1]

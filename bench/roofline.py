@@ -1,28 +1,27 @@
 """Bytes and operations of a query, counted from its result's counters, beside what the device can do.
 
-Counted is what the algorithm cannot do without, so every share below is a lower bound of the true one: an operation is
-an addition, subtraction, multiplication or comparison of real numbers, a fused multiply-add is two; absolute values,
-choices and integers cost nothing, and nothing is loaded twice within one test. Bytes are those asked of memory,
+Counted is what the algorithm cannot do without, so every fraction of a peak is a lower bound: an operation is an
+addition, subtraction, multiplication or comparison of real numbers, a fused multiply-add is two; absolute values,
+choices and integers cost nothing, and nothing is loaded twice within one test. Bytes are those requested of memory,
 whether a cache has them or not; stacks in shared memory or registers are left out.
 
-* node test (kernels/visit.py, boxes.py): a visit of four comparisons loads four records of 32 bytes. It poses four
-  boxes: 6 operations for sum and size, 18 for the image of the sum, 15 for that of the size; 6 more widen each of A's
-  two. A comparison is 6 subtractions, 6 additions, 6 comparisons, and 4 to choose what follows. In all
-  2 (45 + 39) + 4 * 22 = 256, so 64 operations and 32 bytes a test. (A visit of two comparisons does the same work for
-  half as many tests.)
-* triangle test (kernels/faces.py, screen.py): 2 corner triples in 16 bytes and 6 vertices of 16; 18 operations to scale
-  six corners and 54 to pose three. A plane and three signs: 15 for differences, 9 for the normal, 10 for sizes of
+* node test (kernels/traversal): four child pairs load four records of 32 bytes, pose four boxes: 6 operations for sum
+  and size, 18 for the image of the sum, 15 for that of the size; 6 more widen each of A's two. A comparison is 6
+  subtractions, 6 additions, 6 comparisons, and 4 to choose what follows. In all 2 (45 + 39) + 4 * 22 = 256, so 64
+  operations and 32 bytes a test. (Two child pairs take the same work for half as many tests.)
+* triangle test (kernels/triangle/float32_filter.py): 2 corner triples in 16 bytes, 6 vertices of 16; 18 operations to
+  scale six corners and 54 to pose three. A plane and three signs: 15 for differences, 9 for the normal, 10 for sizes of
   vectors and 2 for the largest, 11 for the bound, 15 for dot products, 6 for signs, 68 in all. Most pairs end there.
-  A pair that meets goes through a second plane and two more signs of 42 each: 152 more.
-* float64 test (kernels/faces.py, predicates.py): 2 corner triples and 6 vertices of 24 bytes; 63 operations to pose
+  An intersecting pair takes a second plane and two more signs of 42 each: 152 more.
+* float64 test (kernels/triangle/float64_filter.py): 2 corner triples and 6 vertices of 24 bytes; 63 operations to pose
   three, and at least one plane, 18, and three signs of 16 each, in float64.
-* exact test: the same again, and at least one sign in double words (kernels/double_word.py): 54 for differences, 120
-  for minors, 30 and 40 for the rest.
+* exact test: the same again, and at least one sign in double words (kernels/arithmetic/double_word.py): 54 for
+  differences, 120 for minors, 30 and 40 for the rest.
 * an object pair: a relative pose of 200 bytes, written and read; a hit: 12 bytes.
-* update (kernels/refine.py, mark.py, refit.py): an entry of a slice reads its face and that face's leaf, 8 bytes, and
-  writes the face's corners, 16. A node is appended to a worklist and read from there, 16 bytes, its face number is read
-  and its status written, 8, and its record written, 32. A leaf reads its corners and three vertices of 24 bytes, 88, an
-  inner node the records of its children, 64. Walks up the forest and atomics are left out.
+* update (kernels/update): an entry of a slice reads its face and that face's leaf, 8 bytes, and writes the face's
+  corners, 16. A node is appended to a work list and read from there, 16 bytes, its face number is read and its status
+  written, 8, and its record written, 32. A leaf reads its corners and three vertices of 24 bytes, 88, an inner node the
+  records of its children, 64. Walks up the forest and atomics are left out.
 """
 
 import time
@@ -85,7 +84,7 @@ def count_work(result):
 
 
 def roofline(result, milliseconds, peaks) -> dict:
-    """Return columns: node tests a second, work, rates, and what shares of the peaks they are.
+    """Return columns: node tests a second, work, rates, and what fractions of the peaks they are.
 
     floor_ms is the time that the scarcest of the three would take if it alone were at its peak all the time.
     """
@@ -109,7 +108,7 @@ def roofline(result, milliseconds, peaks) -> dict:
 
 
 def update_roofline(changed, refitted, entries, milliseconds, peaks) -> dict:
-    """Return columns of an update: nodes refitted a second, bytes, their rate and their share of the peak.
+    """Return columns of an update: nodes refitted a second, bytes, their rate and their fraction of the peak.
 
     Args:
         changed: k, the leaves among the nodes refitted.

@@ -157,7 +157,7 @@ def draw(figures, rows, folder) -> str:
             columns = min(3, len(panels))
             lines = -(-len(panels) // columns)
             canvas = Figure(figsize=(PANEL[0] * columns, PANEL[1] * lines), layout="constrained")
-            axes = list(canvas.subplots(lines, columns, squeeze=False).flat)
+            axes = list(canvas.subplots(lines, columns, squeeze=False).ravel())
             for place, (panel, points) in zip(axes, panels):
                 draw_panel(place, panel, points)
             for place in axes[len(panels) :]:

@@ -184,10 +184,10 @@ def draw_traversal():
     draw(panels, FOLDER / "concept_traversal.png", title, legend, eye, up, 380)
 
 
-# The dials.
+# Speed against accuracy.
 
 
-def draw_dials():
+def draw_tradeoff():
     """What a coarser LOD saves and costs: tests counted, answers compared, no times."""
     model = ab.Model.load("warp:bunny")
     rng = np.random.default_rng(0)
@@ -226,14 +226,14 @@ def draw_dials():
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3)
     figure.tight_layout(w_pad=3)
-    save(figure, "concept_dials.svg")
+    save(figure, "concept_tradeoff.svg")
 
 
 def main():
     draw_lods()
     draw_trees()
     draw_traversal()
-    draw_dials()
+    draw_tradeoff()
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def tally_demand_kernel(
     launched: wp.array(dtype=wp.int32),
     demand_inout: wp.array(dtype=wp.int64),
 ):
-    """Keep the greatest demand of any frame: object pairs, face pairs that meet, face pairs that float32 leaves open.
+    """Keep the greatest demand of any frame: object pairs, face pairs that meet, uncertain face pairs.
 
     The last entry becomes 1 once a frame was stale (`LaunchRecord.launched`).
     Counts past 2^31 are kept, since one thread a pair or hit takes an int32 past its sign bit, not around.

@@ -22,7 +22,7 @@ NONE_REFUSED = wp.constant(2**31 - 1)
 
 # report: what a chunk tells the host
 REFUSED = wp.constant(0)  # first pose that is none, NONE_REFUSED if all are
-UNCERTAIN = wp.constant(1)  # face pairs that float32 left open
+UNCERTAIN = wp.constant(1)  # face pairs that float32 leaves to the later stages
 
 
 @wp.func

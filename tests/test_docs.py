@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from bench import __main__ as bench
 from warp_abtree.app import load_scene
 from warp_abtree.app.cli import main as cli
 
@@ -132,6 +133,11 @@ def test_commands_parse(page):
             assert not word.startswith("scenes/") or (ROOT / word).is_file()
 
 
+def test_benchmarks_exist():
+    named = {name for page in PAGES for name in re.findall(r"python -m bench (\w+)", page.read_text(encoding="utf-8"))}
+    assert len(named) > 10 and named <= {*bench.CASES, *bench.STUDIES}
+
+
 def test_readme_has_one_line_for_the_run_and_one_for_the_tests():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     for marker, end in (("main-command", "--picture bunny_tori.png"), ("test-command", '-m "not slow"')):
@@ -160,15 +166,15 @@ def test_planning_example(device, tmp_path):
     fcl = pytest.importorskip("trimesh.collision").CollisionManager
     pytest.importorskip("fcl")
     parts = runpy.run_path(str(ROOT / "scenes" / "planning.py"))
-    peer = fcl()
-    peer.add_object("bin", parts["make_bin"](6))
+    other = fcl()
+    other.add_object("bin", parts["make_bin"](6))
     gripper = parts["make_gripper"]()
-    peer.add_object("gripper", gripper)
+    other.add_object("gripper", gripper)
     for pose, expected in zip(parts["sample_grasps"](400)[:60], hit):
         matrix = trimesh.transformations.quaternion_matrix(np.roll(pose[3:], 1))
         matrix[:3, 3] = pose[:3]
-        peer.set_transform("gripper", matrix)
-        assert peer.in_collision_internal() == expected
+        other.set_transform("gripper", matrix)
+        assert other.in_collision_internal() == expected
 
 
 def test_worlds_example(device):

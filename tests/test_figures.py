@@ -38,7 +38,7 @@ def test_all_pictures_of_the_page_are_drawn(drawn):
     assert sorted(named) == sorted(path.name for path in DOCS.glob("concept_*") if path.suffix in (".png", ".svg"))
 
 
-@pytest.mark.parametrize("name", ["concept_tree.svg", "concept_dials.svg"])
+@pytest.mark.parametrize("name", ["concept_tree.svg", "concept_tradeoff.svg"])
 def test_vector_pictures_say_what_the_library_finds(drawn, name):
     def words(folder):
         return re.findall(r"<text[^>]*>([^<]*)</text>", (folder / name).read_text(encoding="utf-8"))

@@ -1,171 +1,41 @@
-"""The floor plan: which package may import which, and how files are laid out. Sources are read, not run."""
+"""The floor plan: which package may import which, and how files are laid out; and that each rule catches its breaks."""
 
 import ast
 import re
 import sys
-from pathlib import Path
 
 import pytest
-
-ROOT = Path(__file__).resolve().parents[1]
-# Each package may import itself, `checks`, kernels, and what stands in its row.
-CORE = ["checks", "model", "state", "query", "scene", "lod", "simulate"]
-MAY_IMPORT = {name: set(CORE[:place]) for place, name in enumerate(CORE)}
-MAY_IMPORT |= {"interop": set(CORE), "jobs": set(CORE), "app": {*CORE, "interop", "jobs"}}
-CORE_DEPENDENCIES = {"warp", "numpy", "trimesh", "warp_abtree"}
-FILE_LINES, FOLDER_FILES, FUNCTION_LINES = 500, 12, 60
-
-PACKAGE = sorted(path for name in MAY_IMPORT for path in (ROOT / "warp_abtree" / name).rglob("*.py"))
-KERNELS = sorted((ROOT / "kernels").rglob("*.py"))
-USERS = sorted(path for folder in ("bench", "scenes") for path in (ROOT / folder).rglob("*.py"))
-TESTS = sorted((ROOT / "tests").rglob("*.py"))
-
-
-def parse(source):
-    return ast.parse(source.read_text(encoding="utf-8") if isinstance(source, Path) else source)
-
-
-def imports(tree, package):
-    """Yield every imported (module, name, line); name is None for `import module`, relative imports made absolute."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield alias.name, None, node.lineno
-        elif isinstance(node, ast.ImportFrom):
-            parents = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
-            module = ".".join([*parents, *([node.module] if node.module else [])])
-            for alias in node.names:
-                yield module, alias.name, node.lineno
-
-
-def package_of(path):
-    """Return the dotted package of a module of warp_abtree."""
-    return ".".join(path.relative_to(ROOT).parent.parts)
-
-
-def direction_faults(tree, package):
-    """List what a module imports of warp_abtree against the direction of the packages."""
-    faults = []
-    own = package.split(".")[1]
-    for module, name, line in imports(tree, package):
-        parts = module.split(".")
-        if parts[0] != "warp_abtree":
-            continue
-        if len(parts) == 1:
-            faults.append(f"line {line}: imports {name or module} of the package's root")
-        elif parts[1] not in {own, "kernels", *MAY_IMPORT[own]}:
-            faults.append(f"line {line}: {own} imports {parts[1]}")
-    return faults
-
-
-def dynamic_import_faults(tree):
-    """List imports by a string of what is the project's own."""
-    faults = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("import_module", "__import__"):
-            if node.args and "warp_abtree" in ast.unparse(node.args[0]):
-                faults.append(f"line {node.lineno}: {ast.unparse(node)}")
-    return faults
-
-
-def import_edges(path):
-    """Return the modules of warp_abtree that a module imports when it is itself imported."""
-    top = ast.Module([node for node in parse(path).body if isinstance(node, ast.Import | ast.ImportFrom)], [])
-    return {
-        found
-        for module, name, _ in imports(top, package_of(path))
-        if module.split(".")[0] == "warp_abtree"
-        for found in [f"{module}.{name}", module]
-    }
-
-
-def find_cycle(edges):
-    """Return modules that import one another in a circle, [] where there is none."""
-    done, trail = set(), []
-
-    def walk(module):
-        if module in trail:
-            return trail[trail.index(module) :]
-        if module in done or module not in edges:
-            return []
-        trail.append(module)
-        for other in sorted(edges[module] & edges.keys()):
-            if other != module and (found := walk(other)):
-                return found
-        done.add(trail.pop())
-        return []
-
-    return next((found for module in sorted(edges) if (found := walk(module))), [])
-
-
-def documented():
-    """Return the dotted names of the API reference."""
-    pages = (path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").rglob("*.md")))
-    return {name for page in pages for name in re.findall(r"^::: ([\w.]+)$", page, re.M)}
-
-
-def outside_faults(tree, public, package, known=frozenset()):
-    """List what a user of the library takes from it beyond its public names and the modules of the API reference."""
-    public, faults, aliases = {*public, "testing"}, [], set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            aliases |= {alias.asname or "warp_abtree" for alias in node.names if alias.name == "warp_abtree"}
-    for module, name, line in imports(tree, package):
-        parts = module.split(".")
-        if parts[0] != "warp_abtree" or parts[1:2] in (["testing"], ["checks"]) or {module, f"{module}.{name}"} & known:
-            continue
-        if len(parts) > 1 or (name is not None and name not in public):
-            faults.append(f"line {line}: {module}{'.' + name if name else ''} is not public")
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in aliases:
-            if node.attr not in public:
-                faults.append(f"line {node.lineno}: warp_abtree.{node.attr} is not public")
-    return faults
-
-
-def kernel_import_faults(tree):
-    """List imports of a kernel file that leave kernels/, or are relative."""
-    faults = []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.level:
-            faults.append(f"line {node.lineno}: relative import")
-    for module, name, line in imports(tree, "warp_abtree.kernels"):
-        inside = module.startswith("warp_abtree.kernels") or (module == "warp_abtree" and name == "kernels")
-        root = module.split(".")[0]
-        if not inside and root not in {"warp", "numpy"} and root not in sys.stdlib_module_names:
-            faults.append(f"line {line}: imports {module}")
-    return faults
-
-
-def is_kernel(function):
-    decorators = [node.func if isinstance(node, ast.Call) else node for node in function.decorator_list]
-    return any(ast.unparse(node) in ("wp.kernel", "warp.kernel", "kernel") for node in decorators)
-
-
-def kernel_faults(tree):
-    """List kernels that are misnamed, too long, or whose outputs do not come last."""
-    faults = []
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.FunctionDef):
-            continue
-        if is_kernel(node) != node.name.endswith("_kernel"):
-            faults.append(f"{node.name}: kernels, and only kernels, are named *_kernel")
-        if not is_kernel(node):
-            continue
-        if node.end_lineno - node.lineno + 1 >= FUNCTION_LINES:
-            faults.append(f"{node.name}: {node.end_lineno - node.lineno + 1} lines")
-        names = [argument.arg for argument in node.args.args]
-        group = [2 if name.endswith("_out") else 1 if name.endswith("_inout") else 0 for name in names]
-        if group != sorted(group):
-            faults.append(f"{node.name}: arguments {names} are not in the order inputs, _inout, _out")
-    return faults
-
-
-def public_names():
-    for node in parse(ROOT / "warp_abtree" / "__init__.py").body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
-            return {*ast.literal_eval(node.value), "__version__"}
-    return {"__version__"}
+from layout_rules import (
+    CORE_DEPENDENCIES,
+    FILES,
+    FOLDER_FILES,
+    KERNELS,
+    MAY_IMPORT,
+    NATIVE,
+    NATIVE_LINES,
+    PACKAGE,
+    PUBLIC_MAX,
+    ROOT,
+    TESTS,
+    USERS,
+    banned_faults,
+    direction_faults,
+    documented,
+    find_cycle,
+    hidden_import_faults,
+    import_edges,
+    imports,
+    kernel_faults,
+    kernel_import_faults,
+    outside_faults,
+    package_of,
+    parse,
+    private_faults,
+    public_names,
+    size_faults,
+    snippet_faults,
+    struct_faults,
+)
 
 
 def shown(path):
@@ -177,12 +47,17 @@ def test_every_module_stands_in_a_package():
     assert at_root == {"__init__.py", "__main__.py", "testing.py"}
     folders = {path.name for path in (ROOT / "warp_abtree").iterdir() if path.is_dir() and path.name != "__pycache__"}
     assert folders == {*MAY_IMPORT, "kernels"}
+    taken = {
+        module.split(".")[1] for module, _, _ in imports(parse(ROOT / "warp_abtree" / "__init__.py"), "warp_abtree")
+    }
+    assert "app" not in taken, "nothing imports app"
 
 
 @pytest.mark.parametrize("path", PACKAGE, ids=shown)
 def test_packages_import_those_below(path):
     tree = parse(path)
     assert not direction_faults(tree, package_of(path))
+    assert not private_faults(tree)
     if package_of(path).split(".")[1] == "app":
         return
     at_import = ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], [])
@@ -197,27 +72,51 @@ def test_no_module_imports_itself_by_way_of_others():
 
 @pytest.mark.parametrize("path", USERS, ids=shown)
 def test_users_use_the_public_api(path):
-    if path == ROOT / "bench" / "inside.py":  # what bench takes from the inside stands there alone
-        return
-    assert not outside_faults(parse(path), public_names(), "bench", documented())
+    tree = parse(path)
+    assert not outside_faults(tree, {*public_names(), "__version__"}, "bench", documented())
+    assert not private_faults(tree)
+
+
+def test_public_names_are_those_of_the_reference():
+    names = public_names()
+    assert len(names) == len(set(names)) <= PUBLIC_MAX and names == sorted(names)
+    pages = "\n".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").rglob("*.md")))
+    entries = re.findall(r"^::: warp_abtree\.(\w+)$", pages, re.M)
+    assert sorted(entries) == names, "each public name stands once in the API reference"
 
 
 @pytest.mark.parametrize("path", KERNELS, ids=shown)
 def test_kernels(path):
-    tree = parse(path)
+    tree, text = parse(path), path.read_text(encoding="utf-8")
     assert not kernel_import_faults(tree)
     assert not kernel_faults(tree)
+    assert not struct_faults(tree, text)
+    assert not snippet_faults(tree)
 
 
-@pytest.mark.parametrize("path", [*PACKAGE, *KERNELS, *USERS, *TESTS], ids=shown)
+@pytest.mark.parametrize("path", FILES, ids=shown)
 def test_files(path):
-    tree = parse(path)
-    assert not [line for module, _, line in imports(tree, "x") if module.split(".")[0] == "kernels"], (
-        "import warp_abtree.kernels, or every kernel exists twice"
-    )
-    assert not [line for module, _, line in imports(tree, "x") if module.split(".")[-1].startswith("test_")]
-    assert path.name == "test_predicates.py" or not dynamic_import_faults(tree)
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= FILE_LINES
+    tree, text = parse(path), path.read_text(encoding="utf-8")
+    assert not hidden_import_faults(tree)
+    assert not size_faults(tree, text)
+    assert not banned_faults(tree)
+
+
+def test_folders_hold_few_files():
+    folders = {path.parent for path in (*FILES, *NATIVE)}
+    counts = {shown(folder): len([p for p in (*FILES, *NATIVE) if p.parent == folder]) for folder in folders}
+    assert {folder: count for folder, count in counts.items() if count > FOLDER_FILES + 1} == {}, "__init__.py apart"
+
+
+def test_files_of_tests_have_names_of_their_own():
+    names = [path.name for path in TESTS if path.name.startswith("test_")]
+    assert sorted(names) == sorted(set(names)), "pytest imports them by their names"
+
+
+def test_native_code_stands_in_its_folder():
+    assert {path.parent for path in NATIVE} == {ROOT / "kernels" / "native"}
+    lengths = {shown(path): len(path.read_text(encoding="utf-8").splitlines()) for path in NATIVE}
+    assert {name: count for name, count in lengths.items() if count > NATIVE_LINES} == {}
 
 
 def test_kernel_folders_hold_no_code_in_init():
@@ -254,10 +153,27 @@ def test_rule_of_cycles_catches():
     assert not find_cycle({"a": {"b", "c"}, "b": {"c"}, "c": {"numpy"}})
 
 
-def test_rule_of_dynamic_imports_catches():
-    assert dynamic_import_faults(parse('importlib.import_module("warp_abtree.mesh")'))
-    assert dynamic_import_faults(parse('__import__(f"warp_abtree.{name}")'))
-    assert not dynamic_import_faults(parse('importlib.import_module("tomllib")'))
+@pytest.mark.parametrize(
+    "source",
+    [
+        'importlib.import_module("warp_abtree.mesh")',
+        '__import__(f"warp_abtree.{name}")',
+        "from test_scene import everything",
+        "import kernels.mark",
+    ],
+)
+def test_rule_of_hidden_imports_catches(source):
+    assert hidden_import_faults(parse(source))
+    assert not hidden_import_faults(parse('importlib.import_module("tomllib")\nfrom helpers.scenes import everything'))
+
+
+@pytest.mark.parametrize(
+    "source", ["scene._states", "frame.query._given = 1", "from warp_abtree.scene.sweep import _kept", "sweep._kept"]
+)
+def test_rule_of_private_names_catches(source):
+    assert private_faults(parse(source))
+    fine = "class A:\n    def f(self, other):\n        self._x = other._x\n        super()._y()\n        os._exit(0)"
+    assert not private_faults(parse(fine))
 
 
 @pytest.mark.parametrize(
@@ -287,7 +203,6 @@ def test_rule_of_the_public_api_catches(source):
         "@wp.kernel(module='unique')\ndef f_kernel(a_inout: int, b: int):\n    pass",
         "@wp.kernel\ndef f(a: int):\n    pass",
         "@wp.func\ndef f_kernel(a: int):\n    pass",
-        "@wp.kernel\ndef f_kernel(a: int):\n" + "    pass\n" * 60,
     ],
 )
 def test_rule_of_kernels_catches(source):
@@ -299,3 +214,43 @@ def test_rule_of_kernels_catches(source):
 def test_rule_of_kernel_imports_catches(source):
     assert kernel_import_faults(parse(source))
     assert not kernel_import_faults(parse("import warp as wp\nfrom warp_abtree.kernels.poses import x\nimport math"))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "x = 1\n" * 401,
+        "def f():\n" + "    pass\n" * 60,
+        f"def f(self, {', '.join(f'a{i}' for i in range(11))}):\n    pass",
+        f"def f(*, {', '.join(f'a{i}' for i in range(11))}):\n    pass",
+    ],
+)
+def test_rule_of_sizes_catches(source):
+    assert size_faults(parse(source), source)
+    marked = (
+        "def f(\n    # static\n"
+        + "".join(f"    a{i},\n" for i in range(9))
+        + "    # state\n    b,\n    c,\n):\n    pass"
+    )
+    fine = "x = 1\n" * 330 + "def f():\n" + "    pass\n" * 59
+    assert not size_faults(parse(fine), fine) and not size_faults(parse(marked), marked)
+
+
+@pytest.mark.parametrize(
+    "source", ["@wp.struct\nclass A:\n    x: int  # [m]\n    y: int", "@wp.func\ndef pack_item(a: int):\n    return a"]
+)
+def test_rule_of_structs_and_words_catches(source):
+    assert struct_faults(parse(source), source)
+    fine = '"""\n[ x | y ]"""\n@wp.struct\nclass A:\n    # how far [m]\n    x: int\ndef pack_x(a):\n    pass'
+    assert not struct_faults(parse(fine), fine)
+
+
+def test_rule_of_native_code_catches():
+    assert snippet_faults(parse('CODE = """' + "int x = 0;\n" * 16 + '"""'))
+    assert not snippet_faults(parse('CODE = """' + "int x = 0;\n" * 15 + '"""\n"""' + "Prose; more.\n" * 20 + '"""'))
+
+
+@pytest.mark.parametrize("source", ["rung = 1", "def settle_hard_kernel(): pass", "self.wish", "class Mailbox: pass"])
+def test_rule_of_names_catches(source):
+    assert banned_faults(parse(source))
+    assert not banned_faults(parse("rungs_of_the_sea = strung = 1".replace("rungs_of_the_sea", "sprung")))

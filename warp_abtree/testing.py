@@ -1,13 +1,39 @@
-"""The door to the inside for tests and benchmarks: equivalent paths are switched here, and answers stay the same."""
+"""The door to the inside for tests and benchmarks: regimes are switched here, stages of the exact test are named.
+
+Regimes change no answer.
+"""
 
 from contextlib import contextmanager
 
+import numpy as np
 import warp as wp
 
 from warp_abtree.checks.regime import Regime, change_regime, current_regime, restore_regime
-from warp_abtree.state.lod_update import LodUpdate
+from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
+from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, float32_filter_triangles
+from warp_abtree.kernels.triangle.float64_filter import decide_triangles
+from warp_abtree.model.tree import active_build
+from warp_abtree.state.lod_update import LodUpdate, full_refit_fraction
 
-__all__ = ["Regime", "current_regime", "force_refits", "regime", "repeat_update"]
+__all__ = [
+    "EXACT",
+    "FILTER",
+    "FLOAT32",
+    "FLOAT32_UNIT",
+    "UNCERTAIN",
+    "Regime",
+    "active_build",
+    "current_regime",
+    "decide_triangles",
+    "float32_filter_triangles",
+    "force_refits",
+    "full_refit_fraction",
+    "read_bits",
+    "regime",
+    "repeat_update",
+    "state_lods",
+    "upload_lods",
+]
 
 
 @contextmanager
@@ -46,3 +72,22 @@ def repeat_update(update: LodUpdate, refine: bool = True):
         update.relaunch() if refine else update.refit()
 
     return launch
+
+
+def read_bits(scene) -> list:
+    """Return boxes, statuses and corners bit by bit, one row a state, in the order of model and LOD. Waits."""
+    states = scene.batch().states
+    order = np.lexsort(([slot.lod for slot in states.slots], [slot.model for slot in states.slots]))
+    pool, node_end = states.pool, states.node_total
+    arrays = [pool.node_box[: 2 * node_end], pool.node_status[:node_end], pool.face_corner[: states.face_total]]
+    return [array.numpy().view(np.int32).reshape(len(states.slots), -1)[order] for array in arrays]
+
+
+def state_lods(scene) -> list:
+    """Return the LOD of every state."""
+    return [slot.lod for slot in scene.batch().states.slots]
+
+
+def upload_lods(scene):
+    """Write the host's LODs of the states to the device, after repeated launches."""
+    scene.batch().states.upload_slots()

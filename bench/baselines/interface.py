@@ -1,7 +1,6 @@
 """What baselines have in common.
 
-A `PoseLoop` answers pose by pose on the host; an `Operator` allocates once and launches all pairs on a device. Both are
-made with all that they need beforehand, so that only queries are timed.
+A `PoseLoop` answers pose by pose on the host; an `Operator` allocates once and launches all pairs on a device.
 """
 
 from abc import ABC, abstractmethod

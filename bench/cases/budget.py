@@ -17,8 +17,10 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree.app import draw_controllers, load_scene
+from warp_abtree.simulate.budget_report import budget_report, step_response
+from warp_abtree.simulate.frame import FrameRow
 
-from ..inside import FrameRow, budget_report, draw_controllers, load_scene, step_response
 from ..shapes import knot
 from ..timing import medians, one_core, time_in_turn
 
@@ -36,7 +38,7 @@ PROBED = 8  # frames of each kind that a probe times
 BREACH = 3.5  # how often the finest LODs take the budget
 ROOM = 2.0  # how often the coarsest LODs must fit into the budget, or meshes are made finer
 CONTROLLERS = ("none", "coarsest", "predictive", "paper", "tolerance")
-FIXED = ("none", "coarsest")
+CONSTANT_LODS = ("none", "coarsest")
 FAR = 1000.0  # where objects are kept until the load rises [world units]
 
 
@@ -47,8 +49,8 @@ def run(device, quick=False, plots=None):
     the prediction; launches, as one graph on CUDA.
     Rows "probe": what the finest and the coarsest LODs take at a scale of the meshes, and whether that scale is taken.
     Rows "hold": budget_ms is T; breach and breach_p5, how often the finest LODs took it, in the median and in 19 of 20
-    frames; within and within_tenth, fractions of frames within T and T + 10 %; worst, the greatest cost over T;
-    longest_over, most frames in a row over T + 10 %; turns, how often the LOD of an object turned back, a second;
+    frames; within and within_110_percent, fractions of frames within T and T + 10 %; worst, the greatest cost over T;
+    longest_over, most frames in a row over T + 10 %; oscillations, how often the LOD of an object reversed, a second;
     errors are certified [world units]. "none" has the finest LODs, "coarsest" the coarsest: no budget below can be
     held. Where LODs are fixed, adds is what a frame takes beyond the sum of its stages, over that sum (median).
     Rows "step": half of the objects join at one frame, without a camera, T from the finest LODs after it. load is how
@@ -131,12 +133,12 @@ class BudgetScene:
         for controller in CONTROLLERS:
             frame, adds = self.run_controller(controller)
             if controller == "none":
-                costs = settled_costs(frame)
+                costs = steady_costs(frame)
                 self.budget = float(np.median(costs)) / BREACH
                 breach = {"breach": BREACH, "breach_p5": round(float(np.percentile(costs, 5)) / self.budget, 2)}
             row = {"case": "hold"} | self.about | {"frames": len(frame.history), "budget_ms": round(self.budget, 3)}
-            row |= breach | {"controller": controller} | judge_hold(frame, self.budget)
-            yield row | ({"adds": round(adds, 4)} if controller in FIXED else {})
+            row |= breach | {"controller": controller} | describe_hold(frame, self.budget)
+            yield row | ({"adds": round(adds, 4)} if controller in CONSTANT_LODS else {})
             runs[controller] = frame.history
         yield from self.run_step()
         if plots is not None:
@@ -177,7 +179,7 @@ class BudgetScene:
         """Run the scene from its start; return the frame, and what it adds to its stages (median of the frames)."""
         loaded, frames = self.loaded, self.sizes["frames"]
         bodies = loaded.make_bodies()
-        asked = {"controller": "none" if controller in FIXED else controller}
+        asked = {"controller": "none" if controller in CONSTANT_LODS else controller}
         if controller in ("predictive", "paper"):
             asked["budget_ms"] = self.budget
         frame = loaded.frame(self.output, bodies=bodies, **asked, **self.options)
@@ -213,7 +215,7 @@ class BudgetScene:
                 load = BREACH * budget / float(np.median(costs[:step]))
             row = {"case": "step"} | self.about | {"frames": len(costs), "budget_ms": round(budget, 3)}
             row |= {"breach": BREACH, "load": round(load, 2), "controller": controller}
-            yield row | judge_step(frame, step, budget)
+            yield row | describe_step(frame, step, budget)
 
 
 class LoadStep:
@@ -237,24 +239,24 @@ class LoadStep:
         return out
 
 
-def settled_costs(frame):
+def steady_costs(frame):
     """Return T' of all frames after the first second [ms]."""
     return np.array([row.cost_ms for row in frame.history if row.time >= 1.0])
 
 
-def judge_hold(frame, budget):
+def describe_hold(frame, budget):
     """Return the columns of one run."""
-    found, costs = budget_report(frame.history, budget), settled_costs(frame)
+    found, costs = budget_report(frame.history, budget), steady_costs(frame)
     rows = [row for row in frame.history if row.time >= 1.0]
     return {
         "judged": found["frames"],
         "within": round(found["within"], 4),
-        "within_tenth": round(found["within_110_percent"], 4),
+        "within_110_percent": round(found["within_110_percent"], 4),
         "worst": round(found["worst"], 2),
         "longest_over": found["longest_over"],
         "cost_ms": round(float(np.median(costs)), 3),
         "cost_p95_ms": round(float(np.percentile(costs, 95)), 3),
-        "turns": round(found["oscillations"], 3),
+        "oscillations": round(found["oscillations"], 3),
         "error_mean": round(found["error_mean"], 5),
         "error_max": round(max(row.error_max for row in rows), 5),
         "faces": round(float(np.mean([row.faces for row in rows]))),
@@ -262,14 +264,14 @@ def judge_hold(frame, budget):
     }
 
 
-def judge_step(frame, step, budget):
+def describe_step(frame, step, budget):
     """Return the columns of one load step."""
     found, costs = step_response(frame.history, step, budget), np.array([row.cost_ms for row in frame.history])
     return {
         "before": round(float(np.median(costs[step // 2 : step])) / budget, 2),
         "peak": round(found["peak"], 2),
         "back_after": found["frames"],
-        "within_tenth": round(float(np.mean(costs[step:] <= 1.1 * budget)), 4),
+        "within_110_percent": round(float(np.mean(costs[step:] <= 1.1 * budget)), 4),
         "error_mean": round(float(np.mean([row.error_mean for row in frame.history[step:]])), 5),
     }
 

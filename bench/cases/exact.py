@@ -9,7 +9,16 @@ import time
 import numpy as np
 import warp as wp
 
-from ..inside import EXACT, FILTER, FLOAT32, FLOAT32_UNIT, UNCERTAIN, decide_triangles, float32_filter_triangles
+from warp_abtree.testing import (
+    EXACT,
+    FILTER,
+    FLOAT32,
+    FLOAT32_UNIT,
+    UNCERTAIN,
+    decide_triangles,
+    float32_filter_triangles,
+)
+
 from ..triangle_pairs import ADVERSARIAL, make_chunk
 from ..verify import load_oracle
 
@@ -104,10 +113,7 @@ def pair_test(mode):
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
 def float32_pair_kernel(
-    error: wp.float32,
-    unit: wp.float32,
-    corners: wp.array2d(dtype=wp.vec3),
-    answer_out: wp.array(dtype=wp.int32),
+    error: wp.float32, unit: wp.float32, corners: wp.array2d(dtype=wp.vec3), answer_out: wp.array(dtype=wp.int32)
 ):
     i = wp.tid()
     answer_out[i] = float32_filter_triangles(

@@ -59,19 +59,19 @@ def run_batch(device, model, mesh, pair_count, distance, constructor, sizes, pea
     first = time.perf_counter() - begin
     query = ab.Query(scene, output="faces", pairs=pairs, capacity=max(1, len(whole.faces)))
     memory = memory_columns(scene, query)
-    peer = BvhFaces(*mesh, poses, 4 * len(whole.faces) + 1024, device, constructor)
+    baseline = BvhFaces(*mesh, poses, 4 * len(whole.faces) + 1024, device, constructor)
     row = {"device": device.name, "faces": len(mesh[1]), "pairs": pair_count, "distance": distance}
     row["hits"] = len(whole.faces)
     row |= {name: int(getattr(whole, name).sum(dtype=np.int64)) for name in COUNTERS}
     row |= {"first_s": round(first, 3), "peer": f"wp.Bvh {constructor}"}
     newton, skipped = make_newton(*mesh, poses, len(whole.faces), device, refuse_newton(device, pair_count))
-    launches = {"ours": query.launch, "peer": peer.launch} | {name: other.launch for name, other in newton.items()}
+    launches = {"ours": query.launch, "peer": baseline.launch} | {name: other.launch for name, other in newton.items()}
     times = time_in_turn(launches, device, repeats)
     again = query.result()
     again.check()
     if not np.array_equal(again.faces, whole.faces):
         raise RuntimeError("the timed query's answer differs from the checked one")
-    row |= check_peer(peer.result(), whole.faces, model, poses)
+    row |= check_baseline(baseline.result(), whole.faces, model, poses)
     for name, other in newton.items():
         row |= {f"{name}_{key}": value for key, value in other.compare(whole.any).items()}
     for name, values in times.items():
@@ -79,9 +79,9 @@ def run_batch(device, model, mesh, pair_count, distance, constructor, sizes, pea
         if name != "ours":
             row["ratio" if name == "peer" else f"{name}_ratio"] = ratio_of(values, times["ours"])
     if device.is_cpu:
-        row |= time_one_core(query, peer, device, repeats)
+        row |= time_one_core(query, baseline, device, repeats)
     row |= {f"{name}_skipped": why for name, why in skipped.items()}
-    runs = {"result": time_call(query.result, device), "peer_result": time_call(peer.result, device)}
+    runs = {"result": time_call(query.result, device), "peer_result": time_call(baseline.result, device)}
     row |= summarise_all(time_rounds(runs, min(repeats, 3)))
     row["sorted_ms"] = round(row["ours_ms"] + row["result_ms"], 4)
     row["peer_sorted_ms"] = round(row["peer_ms"] + row["peer_result_ms"], 4)
@@ -89,7 +89,7 @@ def run_batch(device, model, mesh, pair_count, distance, constructor, sizes, pea
     return row | memory | roofline(again, row["ours_ms"], peaks)
 
 
-def check_peer(found, ours, model, poses):
+def check_baseline(found, ours, model, poses):
     """Return the columns of what the peer finds beside ours.
 
     Raises:
@@ -99,14 +99,14 @@ def check_peer(found, ours, model, poses):
     row["peer_missed"], row["peer_invented"] = count_differences(found, ours)
     mesh = model.mesh_at(model.lod_max)[:2]
     judged = judge_disputed(
-        found, ours, (mesh, mesh), lambda pair: poses[2 * pair : 2 * pair + 2], "the peer", most=JUDGED
+        found, ours, (mesh, mesh), lambda pair: poses[2 * pair : 2 * pair + 2], "wp.Bvh", most=JUDGED
     )
     return row | {"judged": judged or 0, "ours_wrong": None if judged is None else 0}
 
 
-def time_one_core(query, peer, device, repeats):
+def time_one_core(query, baseline, device, repeats):
     """Return columns of launches of both on one core: the time [ms] that the thread ran, and the peer's over ours."""
-    launches = {"one_core": query.launch, "peer_one_core": peer.launch}
+    launches = {"one_core": query.launch, "peer_one_core": baseline.launch}
     with testing.regime(cpu_threads=1):
         times = time_in_turn(launches, device, repeats, time.thread_time)
     ratio = ratio_of(times["peer_one_core"], times["one_core"])

@@ -102,11 +102,11 @@ def run_pairs(sweep, device, model, face_target, pair_count, peaks, repeats):
     check_alone(scene, result)
     vertices, faces = knot(face_target)
     constructor = None if len(faces) > 100_000 else "sah"  # SAH is built on the host
-    peer = BvhFaces(vertices, faces, poses, 2 * len(result.faces) + 1024, device, constructor)
+    baseline = BvhFaces(vertices, faces, poses, 2 * len(result.faces) + 1024, device, constructor)
     row = {"sweep": sweep, "device": device.name, "faces": model.face_count, "pairs": pair_count}
     row |= {"hits": len(result.faces), "node_tests": int(result.node_tests.sum(dtype=np.int64))}
     row |= {"build_s": round(build, 3), "first_s": round(first, 3)}
-    row |= time_query(query, {"peer": peer.launch}, result, repeats)
+    row |= time_query(query, {"peer": baseline.launch}, result, repeats)
     row["us_a_pair"] = round(1e3 * row["ours_ms"] / pair_count, 3)
     row["ratio"] = round(row["peer_ms"] / row["ours_ms"], 2)
     return row | memory | roofline(result, row["ours_ms"], peaks)

@@ -19,28 +19,14 @@ import warp as wp
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.jobs import SweepJob, ThisProcess, run_shards
 
-from ..inside import SweepJob, ThisProcess, run_shards
 from ..shapes import knot, longest_side, random_poses, world_poses
 from ..timing import capture, summarise, time_call, time_rounds
 
 SIZES = {
-    "cuda": {
-        "faces": 5000,
-        "worlds": 8192,
-        "frames": 8,
-        "repeats": 9,
-        "driver": 2**21,
-        "shards": 2**23,
-    },
-    "cpu": {
-        "faces": 2000,
-        "worlds": 512,
-        "frames": 2,
-        "repeats": 7,
-        "driver": 2**20,
-        "shards": 2**18,
-    },
+    "cuda": {"faces": 5000, "worlds": 8192, "frames": 8, "repeats": 9, "driver": 2**21, "shards": 2**23},
+    "cpu": {"faces": 2000, "worlds": 512, "frames": 2, "repeats": 7, "driver": 2**20, "shards": 2**18},
 }
 QUICK = {"faces": 300, "worlds": 8, "frames": 2, "repeats": 1, "driver": 4096, "shards": 64}
 OBJECTS = 4  # a world

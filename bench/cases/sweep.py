@@ -59,13 +59,13 @@ def run_launch(device, model, count, repeats, peaks):
     both = np.zeros((2 * count, 7), np.float32)
     both[::2, 6], both[1::2] = 1, poses
     constructor = find_constructor(*mesh, both[: 2 * min(64, count)], device)
-    peer = BvhAny(*mesh, both, device, constructor)
-    times = time_in_turn({"launch": query.launch, "peer": peer.launch}, device, repeats)
+    baseline = BvhAny(*mesh, both, device, constructor)
+    times = time_in_turn({"launch": query.launch, "peer": baseline.launch}, device, repeats)
     query.launch()
     if not np.array_equal(query.result().any, result.any):
         raise RuntimeError("the timed query's answer differs from the checked one")
-    peer.launch()
-    found = peer.result()
+    baseline.launch()
+    found = baseline.result()
     row |= {"peer_missed": int((result.any & ~found).sum()), "peer_invented": int((found & ~result.any).sum())}
     row |= summarise_all(times)
     row["launch_mposes_s"] = mposes(count, row["launch_ms"])

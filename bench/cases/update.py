@@ -12,9 +12,9 @@ import warp as wp
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.testing import active_build, full_refit_fraction, read_bits, state_lods, upload_lods
 
 from ..baselines.wp_bvh import FaceBvh
-from ..inside import active_build, full_refit_fraction, read_bits, state_lods, upload_lods
 from ..roofline import find_peaks, update_roofline
 from ..shapes import knot_model
 from ..timing import WARM_UP, fit_slope, make_runs, medians, summarise, time_both, time_call, time_in_turn, time_rounds
@@ -33,7 +33,7 @@ QUICK = {"faces": (200, 600), "fractions": (0.01, 0.1, 0.9), "states": (1, 12), 
 LARGEST_CPU = 64000
 STATES_PER_MODEL = 8
 REFITS = {"update": False, "full": True}  # whether states are refitted whole
-SETTLE = 2  # times there and back, the last of which counts
+ROUND_TRIPS = 2  # times there and back, the last of which counts
 
 
 def run(device, quick=False, largest=None, models=None):
@@ -115,7 +115,7 @@ def time_update(scene, there, back, launches, repeats):
     times = {name: [] for name in [*REFITS, *(call + clock for call in calls for clock in ("wall", "stream"))]}
     for turn in range(WARM_UP + repeats):
         for kind in REFITS:
-            taken = [[runs[kind, way]() for way in (0, 1)] for _ in range(SETTLE)]
+            taken = [[runs[kind, way]() for way in (0, 1)] for _ in range(ROUND_TRIPS)]
             times[kind] += taken[-1] if turn >= WARM_UP else []
     upload_lods(scene)
     for turn in range(WARM_UP + repeats):
@@ -123,7 +123,7 @@ def time_update(scene, there, back, launches, repeats):
             with testing.force_refits(None if kind is None else REFITS[kind]):
                 taken = [
                     time_both(lambda lods=lods: scene.set_lods(lods), device)
-                    for _ in range(SETTLE)
+                    for _ in range(ROUND_TRIPS)
                     for lods in (there, back)
                 ]
             for i, clock in enumerate(("wall", "stream")):

@@ -34,7 +34,7 @@ class Motions:
 
     def __init__(self, rng, count, model_a, model_b):
         (self.centre_a, radius_a), (self.centre_b, radius_b) = map(centre_and_radius, (model_a, model_b))
-        self.away, self.turns = random_directions(rng, count, 3), random_directions(rng, count, 4)
+        self.away, self.rotations = random_directions(rng, count, 3), random_directions(rng, count, 4)
         self.reach = 1.05 * (radius_a + radius_b)
         self.far = np.array([*self.centre_a + FAR * (radius_a + radius_b), 0, 0, 0, 1.0])
 
@@ -43,7 +43,7 @@ class Motions:
 
     def keep(self, chosen):
         """Keep some of the motions."""
-        self.away, self.turns = self.away[chosen], self.turns[chosen]
+        self.away, self.rotations = self.away[chosen], self.rotations[chosen]
 
     def poses(self, along, which=None):
         """Return poses of B in A's frame, float64 (n, 7), its centre a distance from A's.
@@ -53,7 +53,7 @@ class Motions:
             which: Motions, (n,); None is all in turn.
         """
         which = np.arange(len(self)) if which is None else which
-        turns = self.turns[which]
+        turns = self.rotations[which]
         place = self.centre_a + np.asarray(along)[:, None] * self.away[which] - rotate(turns, self.centre_b)
         return np.concatenate([place, turns], 1)
 

@@ -1,4 +1,4 @@
-"""Signs in double-word arithmetic: twice float64's digits with a proven bound, for what the float64 filter leaves open.
+"""Signs in double-word arithmetic: twice the digits of float64 with a proven bound, for signs uncertain in float64.
 
 A double word is the sum of two float64 numbers, the second at most half a unit in the last place of the first. With
 u = 2^-53 a product below errs by at most 5 u^2 of itself and a sum by 3 u^2 + 13 u^3 (Joldes, Muller and Popescu 2017,

@@ -54,14 +54,6 @@ class Bodies:
     bid: wp.array(dtype=wp.int64)  # highest bid of the graph coloring
 
 
-@wp.func
-def pair_matters(motion_type: wp.array(dtype=wp.int32), i: wp.int32, j: wp.int32):
-    """Return whether a contact of two objects can move either of them."""
-    low = wp.min(motion_type[i], motion_type[j])
-    high = wp.max(motion_type[i], motion_type[j])
-    return high == DYNAMIC or low == DYNAMIC or (high == KINEMATIC and low == ASLEEP)
-
-
 @wp.kernel
 def make_body_pair_key_kernel(
     pair_count: wp.array(dtype=wp.int32),
@@ -71,11 +63,15 @@ def make_body_pair_key_kernel(
     order_out: wp.array(dtype=wp.int32),
     key_out: wp.array(dtype=wp.int64),
 ):
-    """Make the key first * 2^32 + second of each pair that matters; others sort behind all of them."""
+    """Make the key first * 2^32 + second of each pair whose contact can move a body; others sort behind all of them."""
     p = wp.tid()
     order_out[p] = p
     key_out[p] = LAST_KEY
-    if p < pair_count[0] and pair_matters(motion_type, pairs[p][0], pairs[p][1]):
+    if p >= pair_count[0]:
+        return
+    low = wp.min(motion_type[pairs[p][0]], motion_type[pairs[p][1]])
+    high = wp.max(motion_type[pairs[p][0]], motion_type[pairs[p][1]])
+    if high == DYNAMIC or low == DYNAMIC or (high == KINEMATIC and low == ASLEEP):
         key_out[p] = pair_key(pairs[p])
 
 

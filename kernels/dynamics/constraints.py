@@ -126,13 +126,11 @@ def find_match(warm_start: WarmStart, row: wp.int32, radius: wp.float64, point: 
     """Return the nearest unused point of a pair of the step before within a radius, or -1."""
     best = wp.int32(-1)
     nearest = radius * radius
-    k = wp.int32(0)
-    while k < warm_start.count[row]:
+    for k in range(warm_start.count[row]):
         r = warm_start.point[row, k] - point
         if ((used >> k) & 1) == 0 and wp.dot(r, r) <= nearest:
             nearest = wp.dot(r, r)
             best = k
-        k += 1
     return best
 
 
@@ -174,8 +172,7 @@ def prepare_constraints_kernel(
     if row < warm_start.key.shape[0]:
         known = warm_start.key[row] == key[p]
     used = wp.int32(0)
-    k = wp.int32(0)
-    while k < manifolds.count[p]:
+    for k in range(manifolds.count[p]):
         x = manifolds.point[p, k]
         c = make_point(manifolds, pairs[p], p, k)
         constraints_out.arm_a[p, k] = x - bodies.position[a]
@@ -191,7 +188,6 @@ def prepare_constraints_kernel(
             if match >= 0:
                 used = used | (1 << match)
                 constraints_out.match[p, k] = row * POINTS + match
-        k += 1
 
 
 @wp.kernel
@@ -219,11 +215,9 @@ def save_impulses_kernel(
     warm_start_out.count[p] = manifolds.count[p]
     a = pairs[p][0]
     to_local = wp.transpose(objects.rotation[a])
-    k = wp.int32(0)
-    while k < manifolds.count[p]:
+    for k in range(manifolds.count[p]):
         t = constraints.tangent[p, k]
         v = constraints.friction_impulse[p, k]
         warm_start_out.point[p, k] = to_local * (manifolds.point[p, k] - objects.position[a])
         warm_start_out.impulse[p, k] = constraints.impulse[p, k]
         warm_start_out.friction_impulse[p, k] = v[0] * t + v[1] * wp.cross(manifolds.normal[p, k], t)
-        k += 1

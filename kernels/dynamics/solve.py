@@ -99,24 +99,20 @@ def find_stopping_impulses(manifolds: Manifolds, constraints: Constraints, bodie
     zero = wp.float64(0.0)
     round = wp.int32(0)
     while round < RESTITUTION_ROUNDS:
-        k = wp.int32(0)
-        while k < manifolds.count[p]:
+        for k in range(manifolds.count[p]):
             c = make_point(manifolds, pair, p, k)
             speed = normal_velocity(constraints, bodies, c) + normal_pseudo_velocity(constraints, bodies, c)
             before = constraints.impulse[p, k]
             constraints.impulse[p, k] = wp.max(before - constraints.mass[p, k] * speed, zero)
             change = (constraints.impulse[p, k] - before) * c.normal
             apply_impulse(bodies.pseudo_velocity, bodies.pseudo_momentum, constraints, bodies, c, change)
-            k += 1
         round += 1
     approach = zero
     response = zero
-    k = wp.int32(0)
-    while k < manifolds.count[p]:
+    for k in range(manifolds.count[p]):
         c = make_point(manifolds, pair, p, k)
         approach -= constraints.impulse[p, k] * normal_velocity(constraints, bodies, c)
         response += constraints.impulse[p, k] * normal_pseudo_velocity(constraints, bodies, c)
-        k += 1
     for side in range(2):
         if bodies.motion_type[pair[side]] == DYNAMIC:
             bodies.pseudo_velocity[pair[side]] = wp.vec3d()
@@ -136,27 +132,21 @@ def apply_restitution(manifolds: Manifolds, constraints: Constraints, bodies: Bo
     Source: Smith et al. 2012, Reflections on Simultaneous Impact (generalized reflections), a pair at a time.
     """
     fastest = wp.float64(0.0)
-    k = wp.int32(0)
-    while k < manifolds.count[p]:
+    for k in range(manifolds.count[p]):
         fastest = wp.min(fastest, normal_velocity(constraints, bodies, make_point(manifolds, pair, p, k)))
         constraints.impulse[p, k] = wp.float64(0.0)
-        k += 1
     if not (fastest < -constraints.threshold[p]):
         return
     scale = find_stopping_impulses(manifolds, constraints, bodies, pair, p)
-    k = wp.int32(0)
-    while k < manifolds.count[p]:
+    for k in range(manifolds.count[p]):
         c = make_point(manifolds, pair, p, k)
         apply_impulse(
             bodies.velocity, bodies.momentum, constraints, bodies, c, scale * constraints.impulse[p, k] * c.normal
         )
-        k += 1
-    k = wp.int32(0)
-    while k < manifolds.count[p]:
+    for k in range(manifolds.count[p]):
         c = make_point(manifolds, pair, p, k)
         constraints.friction_impulse[p, k] = wp.vec2d()
         solve_friction(constraints, bodies, c, constraints.friction[p] * scale * constraints.impulse[p, k])
-        k += 1
 
 
 @wp.func
@@ -249,8 +239,7 @@ def relax_kernel(
             if stage == RESTITUTION:
                 apply_restitution(manifolds, constraints_inout, bodies_inout, pairs[p], p)
             else:
-                i = wp.int32(0)
-                while i < manifolds.count[p]:
+                for i in range(manifolds.count[p]):
                     k = wp.where(backward != 0, manifolds.count[p] - 1 - i, i)
                     c = make_point(manifolds, pairs[p], p, k)
                     if stage == WARM_START:
@@ -259,6 +248,5 @@ def relax_kernel(
                         relax_velocity(constraints_inout, bodies_inout, c)
                     else:
                         relax_position(constraints_inout, bodies_inout, c)
-                    i += 1
             turn += relaxation.threads
         round += 1

@@ -23,6 +23,11 @@ class Heap:
 
 @wp.func
 def pack_pair(a: int, b: int, stage: int):
+    """Return an edge as one word, its lower vertex first, so that ties of keys have one order.
+
+    63          32 31          2 1     0
+    [ lower vertex | higher vertex | stage ]
+    """
     low = wp.int64(wp.min(a, b))
     high = wp.int64(wp.max(a, b))
     return (low << wp.int64(32)) | (high << wp.int64(2)) | wp.int64(stage)

@@ -18,7 +18,11 @@ UNDECIDED, SHARED_CORNER = wp.constant(-2), wp.constant(1 << 12)
 
 @wp.func
 def pack_signs(s0: wp.int32, s1: wp.int32, s2: wp.int32):
-    """Return three signs as two bits each, whether it is positive and whether negative."""
+    """Return three signs as two bits each, whether it is positive and whether negative.
+
+    5   4 3   2 1   0
+    [ s0 | s1 | s2 ]    of each: positive, negative
+    """
     over = wp.where(s0 > 0, 32, 0) | wp.where(s1 > 0, 8, 0) | wp.where(s2 > 0, 2, 0)
     under = wp.where(s0 < 0, 16, 0) | wp.where(s1 < 0, 4, 0) | wp.where(s2 < 0, 1, 0)
     return over | under

@@ -157,7 +157,7 @@ def plan_update_kernel(
 @wp.kernel
 def pick_state_kernel(
     states: StatePool,
-    rung_start: wp.array(dtype=wp.int32),
+    lod_start: wp.array(dtype=wp.int32),
     wanted: wp.array(dtype=wp.int32),
     objects_inout: ObjectPool,
     faults_inout: wp.array(dtype=wp.int32),
@@ -165,14 +165,14 @@ def pick_state_kernel(
     """Point each object at the coarsest state of its model that is not coarser than the wanted LOD.
 
     Args:
-        rung_start: Where the states of each model begin, by rising LOD, shape [model + 1].
+        lod_start: Where the states of each model begin, by rising LOD, shape [model + 1].
         wanted: LOD of each object; one out of range is a fault and served by the nearer end.
         faults_inout: As `note_fault`, by object.
     """
     i = wp.tid()
     model = states.model[objects_inout.state[i]]
     # The last one where all are coarser.
-    rung = wp.lower_bound(states.lod, rung_start[model], rung_start[model + 1], wanted[i])
-    if wanted[i] < 0 or wanted[i] > states.lod[rung]:
+    slot = wp.lower_bound(states.lod, lod_start[model], lod_start[model + 1], wanted[i])
+    if wanted[i] < 0 or wanted[i] > states.lod[slot]:
         note_fault(faults_inout, i)
-    objects_inout.state[i] = rung
+    objects_inout.state[i] = slot

@@ -17,8 +17,7 @@ from warp_abtree.app.cli import main as cli
 from warp_abtree.app.cli.run_command import first_difference
 from warp_abtree.app.open_playback import lay_out, open_playback
 from warp_abtree.app.playback import RecordedPlayback, ScenePlayback
-from warp_abtree.app.recording import FORMAT_VERSION, Recording, record_run
-from warp_abtree.lod.timing import ReplayClock
+from warp_abtree.app.recording import FORMAT_VERSION, Recording, record_run, recorded_clock
 
 FRAMES = 4
 TURNING = SHUTTLE_SCENE + "random = { rotation = true, turn = 90 }\n"
@@ -85,7 +84,7 @@ def test_poses_are_those_that_were_asked_at(tmp_path, text):
 @pytest.mark.parametrize("text", [TURNING, FALLING], ids=["prescribed", "bodies"])
 def test_one_bit_of_one_pose_is_a_difference(tmp_path, text):
     _, first = record_run(load(tmp_path, text), FRAMES)
-    _, second = record_run(load(tmp_path, text), FRAMES, clock=ReplayClock(first.rows))
+    _, second = record_run(load(tmp_path, text), FRAMES, clock=recorded_clock(first.rows))
     assert first_difference(first, second) is None
     for place in np.ndindex(first.poses.shape):
         for bit in (0, 30, 63):  # the last also tells the zeros apart
@@ -95,7 +94,7 @@ def test_one_bit_of_one_pose_is_a_difference(tmp_path, text):
             assert first_difference(first, replace(second, poses=poses)) == told
     second.lods[2, 1] += 1
     assert first_difference(first, second) == "frame 2: lods are not those recorded"
-    _, other = record_run(load(tmp_path, text), FRAMES, clock=ReplayClock(first.rows), budget_ms=1e4)
+    _, other = record_run(load(tmp_path, text), FRAMES, clock=recorded_clock(first.rows), budget_ms=1e4)
     assert "frame 0: " in first_difference(first, other)
 
 
@@ -111,7 +110,7 @@ def test_a_recorded_run_runs_again_without_its_scene_file(tmp_path, device, text
     assert opened.rows == frame.history and opened.settings == first.settings
     (tmp_path / "scene.toml").unlink()
     loaded = opened.load_scene(path, device)
-    again, second = record_run(loaded, 8, budget_ms=1e4, clock=ReplayClock(opened.rows))
+    again, second = record_run(loaded, 8, budget_ms=1e4, clock=recorded_clock(opened.rows))
     assert again.history == frame.history and first_difference(opened, second) is None
     assert len(np.unique(first.lods)) > 1 and not np.array_equal(first.poses[0], first.poses[-1])
 

@@ -1,6 +1,7 @@
 """Scene files: what a good one makes, and the one line that a bad one gives."""
 
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -304,6 +305,12 @@ def test_file_that_is_none(tmp_path):
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SceneError, match="not valid TOML"):
         load_scene(tmp_path / "bytes.toml", device="cpu")
+
+
+def test_without_msgspec_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "msgspec", None)
+    with pytest.raises(SceneError, match=r"scene.toml: scene files need msgspec: pip install warp-abtree\[app\]$"):
+        load(tmp_path, ONE)
 
 
 def test_device_that_is_none():

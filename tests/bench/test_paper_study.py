@@ -95,7 +95,7 @@ def test_share_of_the_query(context, model):
 def test_posed_pairs_touch_at_the_depth_asked(model, device):
     posed = meshes.PosedPairs(model, 4, device, first_count=4, steps=12)
     for depth, hits in ((-0.01, 0), (-1e-9, 0), (1e-9, 4)):
-        posed.push(depth)
+        posed.place(depth)
         assert posed.scene.intersect(posed.pairs).any.sum() == hits
 
 

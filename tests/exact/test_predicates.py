@@ -1,7 +1,6 @@
 """Expansions and signs of all three stages against fractions, and that no compiler contracts them."""
 
 import functools
-import importlib
 import re
 from fractions import Fraction
 
@@ -11,6 +10,8 @@ import warp as wp
 from helpers.orient import orient2d_kernel
 from oracles.signs import COUNT, KINDS, find_signs, random_floats, rounded_signs, true_signs, true_terms
 
+from warp_abtree.kernels import poses
+from warp_abtree.kernels.arithmetic import double_word, expansion, int128, predicates
 from warp_abtree.kernels.arithmetic.double_word import double_orient2d, double_orient3d
 from warp_abtree.kernels.arithmetic.expansion import exact_orient2d, exact_orient3d, two_product, two_sum
 from warp_abtree.kernels.arithmetic.predicates import (
@@ -21,8 +22,18 @@ from warp_abtree.kernels.arithmetic.predicates import (
     orient3d,
     orient_edges,
 )
-from warp_abtree.kernels.traversal import dual_tree, simd, uncertain_pairs
+from warp_abtree.kernels.traversal import (
+    boxes,
+    dual_tree,
+    face_pairs,
+    leaf_pairs,
+    node_pair,
+    nodes,
+    simd,
+    uncertain_pairs,
+)
 from warp_abtree.kernels.traversal.face_pairs import WITHIN
+from warp_abtree.kernels.triangle import coplanar, float32_filter, float64_filter, intersect
 from warp_abtree.kernels.triangle.float32_filter import (
     FLOAT32_UNIT,
     add_signs,
@@ -30,6 +41,7 @@ from warp_abtree.kernels.triangle.float32_filter import (
     one_sided,
     side_of_plane,
 )
+from warp_abtree.kernels.update import refit
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
@@ -321,27 +333,30 @@ def test_float32_filter_covers_its_own_rounding(device, kind):
 PASSES = ("resolve_rounded", "float64_filter", "resolve_inexact")
 
 
+# Modules that compute signs.
+SIGNED = (
+    predicates,
+    expansion,
+    intersect,
+    coplanar,
+    boxes,
+    poses,
+    dual_tree,
+    uncertain_pairs,
+    refit,
+    float32_filter,
+    face_pairs,
+    leaf_pairs,
+    node_pair,
+    nodes,
+    double_word,
+    float64_filter,
+    int128,
+)
+
+
 def test_modules_with_signs_do_not_contract():
-    names = (
-        "arithmetic.predicates",
-        "arithmetic.expansion",
-        "triangle.intersect",
-        "triangle.coplanar",
-        "traversal.boxes",
-        "poses",
-        "traversal.dual_tree",
-        "traversal.uncertain_pairs",
-        "update.refit",
-        "triangle.float32_filter",
-        "traversal.face_pairs",
-        "traversal.leaf_pairs",
-        "traversal.node_pair",
-        "traversal.nodes",
-        "arithmetic.double_word",
-        "triangle.float64_filter",
-        "arithmetic.int128",
-    )
-    modules = [wp.get_module(importlib.import_module(f"warp_abtree.kernels.{name}").__name__) for name in names]
+    modules = [wp.get_module(module.__name__) for module in SIGNED]
     makers = [simd.thread_traversal]
     makers += [functools.partial(dual_tree.warp_traversal, for_any=for_any) for for_any in (False, True)]
     modules += [make(int(mode)).module for mode in (EXACT, FLOAT32, WITHIN) for make in makers]

@@ -4,7 +4,7 @@ import numpy as np
 
 import warp_abtree as ab
 from helpers.samples import STILL, random_poses, sample
-from warp_abtree.app.toml.scene_file import load_scene
+from warp_abtree.app import load_scene
 from warp_abtree.jobs import SweepJob, ThisProcess, read_shards, run_shards
 
 MODELS = ("torus", "small ball")

@@ -4,9 +4,8 @@ import os
 import signal
 import sys
 
-import numpy as np
 import pytest
-from helpers.jobs import contents, job_of, load_worlds, run, stop_after
+from helpers.jobs import ColumnJob, contents, job_of, load_worlds, run, stop_after
 
 from warp_abtree.jobs import RayPool, WorldsJob, run_shards
 
@@ -55,44 +54,30 @@ def test_ray_runs_worlds(tmp_path, pool):
     check_against_one_process(WorldsJob(load_worlds(tmp_path, "[dynamics]"), 4, "poses", 2), tmp_path, pool)
 
 
-class Runner:
+class FailingJob(ColumnJob):
     """Fails, or ends its worker, at one task."""
 
     def __init__(self, how):
+        super().__init__(count=40, shard=10)
         self.how = how
 
     def run(self, task, device=None):
-        if task == 20 and self.how == "end":
+        if task[0] == 20 and self.how == "end":
             os._exit(1)
-        if task == 20:
+        if task[0] == 20:
             raise ValueError("no such task: 20")
-        return {"any": np.zeros(10, bool)}
-
-
-class Job:
-    unit, count, shard = "pose", 40, 10
-
-    def __init__(self, how):
-        self.how = how
-
-    def describe(self):
-        return {"count": self.count, "shard": self.shard}
-
-    def task(self, start, stop):
-        return start
-
-    def runner(self):
-        return Runner(self.how)
+        return super().run(task)
 
 
 @pytest.mark.parametrize("how", ["end", "fail"])
 def test_a_shard_that_cannot_be_computed_is_given_up(tmp_path, pool, how):
-    pool.ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import the tests
+    for module in (__name__, ColumnJob.__module__):  # workers cannot import the tests
+        pool.ray.cloudpickle.register_pickle_by_value(sys.modules[module])
     error, what = RuntimeError, r"shard \(20, 30\) ended its worker, 3 times"
     if how == "fail":
         error, what = ValueError, "^no such task: 20$"
     with pytest.raises(error, match=what):
-        run_shards(Job(how), tmp_path / "out", pool=pool)
+        run_shards(FailingJob(how), tmp_path / "out", pool=pool)
     held = sorted(path.name for path in (tmp_path / "out").glob("shard-*"))
     assert "shard-000000000020-000000000030.npz" not in held
 

@@ -73,18 +73,6 @@ def test_an_interrupted_job_continues(tmp_path, monkeypatch):
     assert run(again, out)["found"] == 12
 
 
-def test_a_write_that_fails_leaves_no_file(tmp_path, monkeypatch):
-    def fail(file, **columns):
-        file.write(b"half")
-        raise OSError("no space left")
-
-    with monkeypatch.context() as patch, pytest.raises(OSError, match="no space left"):
-        patch.setattr(np, "savez", fail)
-        run(job_of(), tmp_path / "out")
-    assert list(contents(tmp_path / "out")) == [MANIFEST]
-    assert run(job_of(), tmp_path / "out")["found"] == 0
-
-
 def test_a_run_interrupted_at_its_first_file_continues(tmp_path):
     out = tmp_path / "out"
     out.mkdir()

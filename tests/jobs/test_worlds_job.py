@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.jobs import load_worlds, read, run
 
-from warp_abtree.app.toml.scene_file import load_scene
+from warp_abtree.app import load_scene
 from warp_abtree.jobs import WorldsJob
 
 LOD_SWEEP = '[[lod_sweep]]\nmodel = "ring"\nfrom = 1.0\nto = 0.2\nperiod = 0.1'

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from helpers.bodies import selection_models, strewn
 
-from warp_abtree.lod.selection import PredictedSelection, tolerance_scale
-from warp_abtree.lod.view import View
-from warp_abtree.state.ladder import Ladder
+from warp_abtree.lod.controllers import PredictiveController
+from warp_abtree.lod.selection import tolerance_scale
 
 
 @pytest.fixture(scope="module")
@@ -45,13 +44,12 @@ def plain_nodes(model, ladder, k, held, wanted):
 def test_prediction_is_that_of_plain_python(models, device):
     rng = np.random.default_rng(4)
     scene = strewn(models, 50, device)
-    view = View(scene)
-    selection = PredictedSelection(view, 10.0, ladder=Ladder(models, 25, "ratio"), loosest=16.0, hold_frames=2)
+    selection = PredictiveController(scene, 10.0, steps=25, loosest=16.0, hold_frames=2)
     level, ways = np.zeros(50, int), set()
     for frame in range(24):
         if frame % 8 == 0:
             focus = rng.uniform(0, 1, 50)
-            view.focus.assign(focus)
+            selection.view.focus.assign(focus)
         work = rng.uniform(0, 100, 50) * (rng.uniform(size=50) < 0.7)
         up, down = rng.uniform(0.2, 1.2, 2)
         # Dear and cheap frames by turns, so that the position climbs, falls, stays and holds.
@@ -99,7 +97,7 @@ def test_prediction_is_that_of_plain_python(models, device):
 
 def plain_choice(lasting, moving, stay, position, selection, waited):
     """The rule as its docstring has it; return its name, the candidate, and how many frames a move has waited."""
-    budget, held = selection.budget, len(lasting) - 1
+    budget, held = selection.budget_ms, len(lasting) - 1
     aim, low = selection.aim * budget, selection.low * budget
     cost = lasting[stay] + moving[stay]
     late = waited >= selection.hold_frames
@@ -114,9 +112,3 @@ def plain_choice(lasting, moving, stay, position, selection, waited):
         if lasting[stay - 1] <= aim:
             return ("climb late", stay - 1, 0) if late else ("wait", stay, waited + 1)
     return "stay", stay, 0
-
-
-def test_without_a_frame_the_dial_stands(models, device):
-    selection = PredictedSelection(View(strewn(models, 9, device)), 10.0)
-    selection.launch()
-    assert selection.scale.numpy().tolist() == [0, 0] and not selection.lods.numpy().any()

@@ -1,6 +1,5 @@
 """Selection of LODs on the device against plain Python written from section 4.2 of the paper and from figure 4."""
 
-import math
 from itertools import pairwise
 
 import numpy as np
@@ -9,8 +8,8 @@ import warp as wp
 from helpers.bodies import selection_models, strewn
 
 import warp_abtree as ab
-from warp_abtree.lod.selection import PaperSelection, PredictedSelection, ToleranceSelection
-from warp_abtree.lod.view import Camera, View
+from warp_abtree.lod.controllers import Feedback, PaperController, PredictiveController, ToleranceController
+from warp_abtree.lod.view import Camera
 from warp_abtree.state.ladder import Ladder
 
 # Figure 4 by hand: g in frames 1 to 10, Case 1 until frame 5 and Case 2 from frame 6. Rows are Q1, Q2, Q3.
@@ -36,11 +35,11 @@ def case_of(cost, budget, threshold):
     return 2 if difference > 0 else 3
 
 
-def g_printed(cases, i, importance, mirror=True):
+def g_printed(cases, i, importance):
     """g of section 4.2 for frame i (from 1), cases a list of all frames so far.
 
     j is the closest previous frame after which the case became what it is. In Case 2 both i and j are counted from the
-    start of the preceding run of Case 1 (erratum); without `mirror` they are absolute, as printed.
+    start of the preceding run of Case 1 (erratum).
     """
 
     def case(frame):
@@ -53,44 +52,38 @@ def g_printed(cases, i, importance, mirror=True):
         return 2 ** (i - j - importance) if i - j >= importance else 0
     if case(i) == 3:
         return 0
-    if mirror:
-        end = j
-        while end >= 1 and case(end) != 1:
-            end -= 1
-        start = end
-        while case(start) == 1:
-            start -= 1
-        i, j = i - j + end - start, end - start
+    end = j
+    while end >= 1 and case(end) != 1:
+        end -= 1
+    start = end
+    while case(start) == 1:
+        start -= 1
+    i, j = i - j + end - start, end - start
     return 2 ** (2 * j - i - 1) if 2 * j >= i + 1 else 0
 
 
-@pytest.mark.parametrize("mirror", [True, False])
-def test_oracle_is_figure_4(mirror):
-    cases = [1] * 5 + [2] * 5
+@pytest.mark.parametrize("before", [0, 20])
+def test_oracle_is_figure_4_wherever_the_climb_starts(before):
+    cases = [3] * before + [1] * 5 + [2] * 5
     for importance, curve in enumerate(FIGURE_4, 1):
-        # The figure's climb starts at frame 1, where absolute numbers and those of the mirror are the same.
-        assert [g_printed(cases, i, importance, mirror) for i in range(1, 11)] == curve
+        assert [g_printed(cases, before + i, importance) for i in range(1, 11)] == curve
 
 
-def test_printed_g2_explodes_and_the_mirror_does_not():
-    cases = [3] * 20 + [1] * 5 + [2] * 4
-    assert [g_printed(cases, i, 1) for i in range(26, 30)] == [8, 4, 2, 1]
-    assert g_printed(cases, 26, 1, mirror=False) == 2**23
+def stages(cost):
+    """Return stages that cost so much; movement is not among them."""
+    return {"select_ms": 0.25, "refine_ms": 0.5, "move_ms": 100.0, "broad_ms": 0.25, "query_ms": cost - 1.0}
 
 
-def run_paper(scene, costs, budget=10.0, threshold=None, steps=50, start=0.0, focus=None):
+def run_paper(scene, costs, start=0.0, focus=None, **options):
     """Return the levels after each cost, (frames + 1, n), and the LODs."""
-    view = View(scene)
+    controller = PaperController(scene, 10.0, **options)
     if focus is not None:
-        view.focus.assign(focus)
-    selection = PaperSelection(view, budget, threshold, Ladder(scene.models, steps))
-    selection.level.fill_(start)
-    levels, lods = [selection.level.numpy().copy()], []
+        controller.view.focus.assign(focus)
+    controller.level.fill_(start)
+    levels, lods = [controller.level.numpy().copy()], []
     for cost in costs:
-        selection.cost.fill_(cost)
-        selection.launch()
-        levels.append(selection.level.numpy().copy())
-        lods.append(selection.lods.numpy().copy())
+        lods.append(controller.next_lods(Feedback(0.0, stages(cost))).numpy().copy())
+        levels.append(controller.level.numpy().copy())
     return np.array(levels), np.array(lods)
 
 
@@ -116,7 +109,7 @@ def test_selection_follows_the_paper(models, device, threshold):
     focus[:2] = 0.0, 1.0
     # Times come in runs, or a climb would never be long.
     costs = np.repeat(rng.choice([2.0, 7.0, 9.0, 9.5, 10.0, 10.5, 30.0], 60), rng.integers(1, 7, 60))
-    levels, lods = run_paper(scene, costs, threshold=threshold, focus=focus)
+    levels, lods = run_paper(scene, costs, threshold_ms=threshold, focus=focus)
     cases = [case_of(cost, 10.0, threshold or 1.0) for cost in costs]
     assert {(a, b) for a, b in pairwise(cases)} == {(a, b) for a in (1, 2, 3) for b in (1, 2, 3)}
     level = np.zeros(18)
@@ -131,10 +124,11 @@ def test_selection_follows_the_paper(models, device, threshold):
     assert levels.max() == 50 and (levels[1:] == 0).any()
 
 
-def test_everything_starts_and_stays_at_the_coarsest_without_a_frame(models, device):
-    scene = strewn(models, 6, device)
-    levels, lods = run_paper(scene, [math.nan, math.nan])
-    assert not levels.any() and not lods.any()
+@pytest.mark.parametrize("kind", [PaperController, PredictiveController])
+def test_everything_stays_at_the_coarsest_without_a_frame(models, device, kind):
+    controller = kind(strewn(models, 6, device), 10.0)
+    for _ in range(2):
+        assert not controller.next_lods(Feedback(0.0)).numpy().any() and not controller.level.numpy().any()
 
 
 # Ladders.
@@ -159,33 +153,24 @@ def test_ratio_ladder_has_equal_ratios(models):
             assert lods[level] == 0 or len(model.mesh_at(int(lods[level]) - 1)[2]) < wanted[level]
 
 
-@pytest.mark.parametrize("wrong", [{"steps": 0}, {"steps": 2.5}, {"spacing": "equal"}])
-def test_ladder_refuses(models, wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        Ladder(models, **wrong)
-
-
 # Tolerances.
 
 
-def test_tolerance_gives_the_coarsest_rung_within_it(models, device):
+def test_tolerance_gives_the_coarsest_level_within_it(models, device):
     rng = np.random.default_rng(3)
     scene = strewn(models, 60, device)
-    view = View(scene)
-    ladder = Ladder(models, 30, "ratio")
-    selection = ToleranceSelection(view, 0.0, loosest=8.0, ladder=ladder)
-    seen = set()
+    controller = ToleranceController(scene, 0.0, loosest=8.0, steps=30)
+    ladder, seen = Ladder(models, 30, "ratio"), set()
+    assert controller.budget_ms is None
     for tolerance in (0.0, 1e-4, 2e-3, 0.01, 0.05, 1.0, 100.0):
         focus = np.round(rng.uniform(0, 1, 60), 3)
         focus[:3] = 0.0, 1.0, 0.5
-        view.focus.assign(focus)
-        selection.tolerance.fill_(tolerance)
-        selection.launch()
-        lods = selection.lods.numpy()
+        controller.view.focus.assign(focus)
+        controller.tolerance.fill_(tolerance)
+        lods = controller.next_lods(Feedback(0.0)).numpy()
         for i in range(60):
             beta, model = scene.object_importance[i], scene.models[scene.object_model[i]]
             allowed = tolerance * (8.0 if focus[i] == 0 else min(beta / focus[i], 8.0))
-            assert model.error_at(int(lods[i])) <= allowed
             fits = [lod for lod in ladder.lod[scene.object_model[i]].tolist() if model.error_at(lod) <= allowed]
             assert lods[i] == min(fits)
             seen.add(int(lods[i]))
@@ -193,63 +178,63 @@ def test_tolerance_gives_the_coarsest_rung_within_it(models, device):
 
 
 @pytest.mark.parametrize(
-    "make",
+    ("make", "error", "words"),
     [
-        lambda view: PaperSelection(view, 0.0),
-        lambda view: PaperSelection(view, math.nan),
-        lambda view: PaperSelection(view, 8.0, threshold=-1.0),
-        lambda view: ToleranceSelection(view, -1e-9),
-        lambda view: ToleranceSelection(view, math.nan),
-        lambda view: ToleranceSelection(view, 1.0, loosest=0.5),
-        lambda view: PredictedSelection(view, -8.0),
-        lambda view: PredictedSelection(view, 8.0, low=0.95, aim=0.9),
-        lambda view: PredictedSelection(view, 8.0, hold_frames=-1),
-        lambda view: View(view.scene, window=0),
+        (lambda scene: PaperController(scene, 8.0, camera=(0, 0, 1)), TypeError, "camera is a tuple"),
+        (lambda scene: PaperController(scene, 8.0, window=0), ValueError, "window 0 is outside"),
+        (lambda scene: PaperController(scene, 8.0, steps=0), ValueError, "steps 0 is outside"),
+        (lambda scene: PaperController(scene, 8.0, steps=2.5), ValueError, "steps 2.5 is not a whole number"),
+        (lambda scene: ToleranceController(scene, -1e-9), ValueError, "tolerance -1e-09 is below 0"),
+        (lambda scene: ToleranceController(scene, 1.0, loosest=0.5), ValueError, "loosest 0.5 is below 1"),
+        (lambda scene: ToleranceController(scene, 1.0, spacing="equal"), ValueError, "spacing 'equal' is none of"),
+        (lambda scene: PredictiveController(scene, 8.0, low=0.95), ValueError, "low 0.95 and aim 0.9 do not rise"),
+        (lambda scene: PredictiveController(scene, 8.0, hold_frames=-1), ValueError, "hold_frames -1 is outside"),
     ],
 )
-def test_selections_refuse(models, make):
-    view = View(strewn(models, 3, "cpu"))
-    with pytest.raises(ValueError):
-        make(view)
+def test_controllers_refuse(models, make, error, words):
+    with pytest.raises(error, match=words):
+        make(strewn(models, 3, "cpu"))
+
+
+def test_a_controller_refuses_another_scene_than_it_was_made_for(models, device):
+    scene = strewn(models, 3, device)
+    controller = PaperController(scene, 8.0)
+    scene.add(models[0])
+    for call in (controller.view.launch, lambda: controller.next_lods(Feedback(0.0))):
+        with pytest.raises(RuntimeError, match="objects were added"):
+            call()
 
 
 # Graphs.
 
 
-@pytest.mark.parametrize("kind", ["paper", "tolerance", "predicted"])
+@pytest.mark.parametrize("kind", [PaperController, ToleranceController, PredictiveController])
 def test_selection_runs_in_a_captured_graph(models, device, kind):
-    """One graph, launched again and again while cameras, poses and costs change, gives what plain launches give."""
+    """One graph, launched while cameras and costs change, gives what `next_lods` gives."""
 
-    def make(scene):
-        view = View(scene)
-        if kind == "paper":
-            return view, PaperSelection(view, 10.0)
-        return view, ToleranceSelection(view, 0.01) if kind == "tolerance" else PredictedSelection(view, 10.0)
-
-    def launch(view, selection):
-        view.launch()
-        selection.launch()
+    def camera_at(time):
+        return Camera.look_at((0, time, 8), (0, 0, 0), far=30.0)
 
     scene = strewn(models, 30, device)
-    plain, captured = make(scene), make(scene)
-    launch(*make(scene))  # loads the kernels
+    value = 0.01 if kind is ToleranceController else 10.0
+    plain, captured = kind(scene, value, camera_at), kind(scene, value)
+    kind(scene, value, camera_at).next_lods(Feedback(0.0))  # loads the kernels
     with wp.ScopedCapture(device=device) as capture:
-        launch(*captured)
+        captured.view.launch()
+        captured.launch()
     wp.synchronize_device(device)
     seen = []
-    for frame in range(6):
-        camera = Camera.look_at((0, frame, 8), (0, 0, 0), far=30.0)
-        for view, selection in (plain, captured):
-            view.look(camera)
-            if kind == "paper":
-                selection.cost.fill_([3.0, 3.0, 3.0, 20.0, 20.0, 3.0][frame])
-            if kind == "predicted":
-                selection.rate.assign([1.0, [1e-4, 1.0][frame == 4], 0.0, 0.0, 1.0, 0.5])
-                selection.work.fill_(10.0)
-        launch(*plain)
+    for frame, cost in enumerate([3.0, 3.0, 3.0, 20.0, 20.0, 3.0]):
+        captured.view.look(camera_at(frame))
+        if kind is PaperController:
+            captured.cost.fill_(cost)
+        if kind is PredictiveController:
+            for controller in (plain, captured):
+                controller.rate.assign([1.0, [1e-4, 1.0][frame == 4], 0.0, 0.0, 1.0, 0.5])
+                controller.work.fill_(10.0)
+        lods = plain.next_lods(Feedback(frame, stages(cost))).numpy().copy()
         wp.capture_launch(capture.graph)
-        lods = plain[1].lods.numpy().copy()
-        assert np.array_equal(captured[1].lods.numpy(), lods), frame
-        assert np.array_equal(captured[0].motion.numpy(), plain[0].motion.numpy())
+        assert np.array_equal(captured.lods.numpy(), lods), frame
+        assert np.array_equal(captured.view.motion.numpy(), plain.view.motion.numpy())
         seen.append(tuple(lods))
     assert len(set(seen)) > 2

@@ -5,18 +5,15 @@ import io
 import pickle
 import zipfile
 
-import hypothesis.strategies as st
 import numpy as np
 import pytest
-from helpers.samples import SHAPES, crumbs, plain, sample, soup
-from hypothesis import HealthCheck, given, settings
+from helpers.samples import SHAPES, sample
 
 import warp_abtree as ab
 from warp_abtree.model.model import FORMAT_VERSION, Model
 
 ARRAYS = ("vertex_parent", "vertex_pos", "face_vertex", "face_split", "split_start", "split_face", "lod_error")
 MEMBERS = (*ARRAYS, "leaf_node", "format", "version", "name")
-FILES = settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def with_errors(model):
@@ -85,24 +82,6 @@ def test_round_trip_is_exact(tmp_path, name):
     assert [p.name for p in tmp_path.iterdir()] == ["a model.npz"]
 
 
-def test_dropped_faces_survive(tmp_path):
-    vertices, faces = crumbs(3)
-    model = with_errors(ab.Model.from_arrays(vertices, np.concatenate([[[1, 1, 2]], faces]), base_faces=1))
-    model.save(tmp_path / "m.npz")
-    opened = Model.open(tmp_path / "m.npz")
-    assert opened.dropped_faces.tolist() == [0]
-    assert_same(model, opened)
-
-
-@FILES
-@given(st.integers(1, 30), st.integers(0, 2**31), st.sampled_from([1.0, 2.0**90, 2.0**-90]))
-def test_round_trip_of_soups(tmp_path, count, seed, scale):
-    vertices, faces = soup(count, seed)
-    model = with_errors(ab.Model.from_arrays(vertices * scale, faces, base_faces=1))
-    model.save(tmp_path / "soup.npz")
-    assert_same(model, Model.open(tmp_path / "soup.npz"))
-
-
 def test_equal_models_have_equal_digests(tmp_path):
     """Saved and opened, used, renamed and copied to a worker it is the same; that of any other array is not."""
     model = ab.Model.from_arrays(*SHAPES["crumbs"]())
@@ -149,30 +128,19 @@ def test_flipped_bytes_are_noticed(tmp_path, content):
     assert opened < 200
 
 
-@settings(FILES, max_examples=60)
-@given(st.binary(max_size=200))
-def test_any_bytes_are_refused(tmp_path, data):
-    (tmp_path / "any.npz").write_bytes(data)
-    refuse(tmp_path / "any.npz")
-
-
 # Another kind of file, another version, another content.
 
 
 def test_files_that_are_no_models_are_refused(tmp_path):
-    refuse(tmp_path / "absent.npz", "no such file")
-    refuse(tmp_path)
     np.save(tmp_path / "array.npy", np.zeros(3))
-    refuse(tmp_path / "array.npy")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    refuse(tmp_path / "other.npz", "not a warp_abtree model")
     (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    refuse(tmp_path / "mesh.obj")
-    (tmp_path / "empty.npz").write_bytes(b"")
-    refuse(tmp_path / "empty.npz")
     with zipfile.ZipFile(tmp_path / "zip.npz", "w") as archive:
         archive.writestr("format.npy", b"text")
-    refuse(tmp_path / "zip.npz")
+    for name in ("", "array.npy", "mesh.obj", "zip.npz"):
+        refuse(tmp_path / name)
+    refuse(tmp_path / "absent.npz", "no such file")
+    refuse(tmp_path / "other.npz", "not a warp_abtree model")
 
 
 class Bomb:
@@ -185,7 +153,7 @@ class Bomb:
         return open, (str(self.path), "w")
 
 
-def test_pickles_are_never_run(tmp_path, parts):
+def test_pickles_are_never_run_and_missing_arrays_are_named(tmp_path, parts):
     trace = tmp_path / "trace"
     (tmp_path / "pickle.npz").write_bytes(pickle.dumps(Bomb(trace)))
     refuse(tmp_path / "pickle.npz")
@@ -194,68 +162,41 @@ def test_pickles_are_never_run(tmp_path, parts):
     np.save(tmp_path / "object.npy", array, allow_pickle=True)
     refuse(tmp_path / "object.npy")
     for name in MEMBERS:
-        with open(tmp_path / "model.npz", "wb") as file:
-            np.savez(file, allow_pickle=True, **{**parts, name: array})
-        refuse(tmp_path / "model.npz")
+        refuse(write(tmp_path / "model.npz", {**parts, name: array}))
+        # np.load hands out members without the ending .npy raw, pickles too: bytes, not arrays.
+        path = write(tmp_path / "model.npz", {key: value for key, value in parts.items() if key != name})
+        refuse(path, *([repr(name)] if name not in ("version", "format") else []))
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr(name, pickle.dumps(Bomb(trace)))
+        refuse(path)
     assert not trace.exists()
     np.load(tmp_path / "object.npy", allow_pickle=True)
     assert trace.exists(), "the bomb would have worked"
 
 
-def test_members_that_are_no_arrays_are_refused(tmp_path, parts):
-    """np.load hands out members without the ending .npy raw, pickles too: bytes, not arrays."""
-    trace = tmp_path / "trace"
-    for name in MEMBERS:
-        path = write(tmp_path / "model.npz", {key: value for key, value in parts.items() if key != name})
-        with zipfile.ZipFile(path, "a") as archive:
-            archive.writestr(name, pickle.dumps(Bomb(trace)))
-        refuse(path)
-    assert not trace.exists()
-
-
 def test_other_versions_are_refused(tmp_path, parts):
-    for version in (0, FORMAT_VERSION + 1, -1, FORMAT_VERSION + 0.5, float("nan"), "new", [1, 1]):
+    for version in (FORMAT_VERSION + 1, FORMAT_VERSION + 0.5, "new", [1, 1]):
         refuse(write(tmp_path / "m.npz", {**parts, "version": np.array(version)}))
     path = write(tmp_path / "m.npz", {**parts, "version": np.array(7)})
     refuse(path, "version 7", str(FORMAT_VERSION))
     refuse(write(tmp_path / "f.npz", {**parts, "format": np.array("soup")}), "not a warp_abtree model")
 
 
-def test_missing_arrays_are_named(tmp_path, parts):
-    for name in MEMBERS:
-        path = write(tmp_path / "m.npz", {key: value for key, value in parts.items() if key != name})
-        refuse(path, *([repr(name)] if name not in ("version", "format") else []))
-
-
 @pytest.mark.parametrize("name", [*ARRAYS, "leaf_node"])
 def test_types_and_shapes_are_checked(tmp_path, parts, name):
     good = parts[name]
-    for bad in (
-        good.astype(np.complex128),
-        good.astype(str),
-        good.astype(np.float32),
-        good.astype(bool),
-        good.reshape(-1) if good.ndim == 2 else good[:, None],
-        good[:0],
-        good[None],
-        good[:-1],
-        np.concatenate([good, good[-1:]]),
-        good[0],
-    ):
+    for bad in (good.astype(np.complex128), good.astype(np.float32), good[:0], good[None], good[:-1], good[0]):
         refuse(write(tmp_path / "m.npz", {**parts, name: bad}))
 
 
 # What each array must not hold: (array, index, value).
 BAD_VALUES = {
     "position not finite": ("vertex_pos", (3, 1), np.nan),
-    "position infinite": ("vertex_pos", (-1, 0), np.inf),
     "corner below": ("face_vertex", (4, 0), -1),
     "corner above": ("face_vertex", (4, 0), 42),
     "parent is its own child": ("vertex_parent", 5, 5),
     "parent among the originals": ("vertex_parent", 5, 6),
-    "parent out of range": ("vertex_parent", 5, 10**6),
     "parent below its child": ("vertex_parent", -1, 42),
-    "no parent has -2": ("vertex_parent", 5, -2),
     "split below": ("face_split", 2, -1),
     "split above": ("face_split", 2, 10**6),
     "start not 0": ("split_start", 0, 1),
@@ -264,13 +205,9 @@ BAD_VALUES = {
     "no such face": ("split_face", 0, 160),
     "negative face": ("split_face", 0, -1),
     "error not finite": ("lod_error", 0, np.inf),
-    "error unknown": ("lod_error", 4, np.nan),
     "error rises": ("lod_error", 4, 9.0),
     "error at the end": ("lod_error", -1, 0.001),
-    "error below 0": ("lod_error", -1, -1.0),
     "leaf inside the tree": ("leaf_node", 0, 5),
-    "leaf out of range": ("leaf_node", 0, 512),
-    "no leaf": ("leaf_node", 3, -1),
     "two faces in one leaf": ("leaf_node", slice(2, 4), 190),
 }
 
@@ -302,48 +239,32 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
             with_errors(sample("twins")).save(target)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["m.npz"]
-    assert_same(model, Model.open(path))
-
-
-def test_saving_replaces(tmp_path):
-    path = tmp_path / "m.npz"
-    for name in ("twins", "three"):
-        with_errors(sample(name)).save(path)
-        assert_same(with_errors(sample(name)), Model.open(path))
+    monkeypatch.undo()
+    with_errors(sample("twins")).save(path)
+    assert_same(with_errors(sample("twins")), Model.open(path))
     with pytest.raises(OSError):
-        with_errors(sample("three")).save(tmp_path / "absent" / "m.npz")
+        model.save(tmp_path / "absent" / "m.npz")
 
 
 # Arguments.
 
 
-@pytest.mark.parametrize("lod", [-1, 10**6, 0.5, float("nan"), float("inf"), True, "1", None])
-def test_lods_are_checked(lod):
+def test_lods_and_requests_of_lods_are_checked():
     model = sample("twins")
-    for call in (model.mesh_at, model.error_at, lambda lod: model.error_at(lod, side="outward")):
-        with pytest.raises(ValueError, match="LOD") as caught:
-            call(lod)
-        assert str(lod) in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        dict(fraction=0.1, tolerance=0.1),
-        dict(fraction=0.0),
-        dict(fraction=-0.1),
-        dict(fraction=1.001),
-        dict(fraction=float("nan")),
-        dict(fraction="half"),
-        dict(tolerance=-1e-9),
-        dict(tolerance=float("nan")),
-        dict(tolerance="fine"),
-    ],
-)
-def test_requests_of_lods_are_checked(options):
-    with pytest.raises((ValueError, TypeError), match=r"fraction|tolerance"):
-        sample("twins").lod_for(**options)
+    for lod in (-1, 10**6, 0.5, True, "1"):
+        for call in (model.mesh_at, model.error_at, lambda lod: model.error_at(lod, side="outward")):
+            with pytest.raises(ValueError, match=f"LOD.*{lod}"):
+                call(lod)
+    for options in ({}, {"fraction": 0.1, "tolerance": 0.1}):
+        with pytest.raises(ValueError, match=r"fraction|tolerance"):
+            model.lod_for(**options)
+    for name, values in (
+        ("fraction", (0.0, 1.001, float("nan"), "half")),
+        ("tolerance", (-1e-9, float("nan"), "fine")),
+    ):
+        for value in values:
+            with pytest.raises((ValueError, TypeError), match=name):
+                model.lod_for(**{name: value})
 
 
 def test_requests_of_lods_are_met():
@@ -357,17 +278,6 @@ def test_requests_of_lods_are_met():
     for tolerance in (0.0, 1e-3, errors[7], 0.5, 1.0, float("inf")):
         lod = model.lod_for(tolerance=tolerance)
         assert errors[lod] <= tolerance and (lod == 0 or errors[lod - 1] > tolerance)
-
-
-@pytest.mark.parametrize("name", ["soup", "crumbs", "lattice soup"])
-def test_mesh_at_is_what_the_forest_says(name):
-    model, mesh = sample(name), plain(sample(name))
-    for lod in range(0, model.lod_max + 1, 7):
-        vertices, faces, ids = model.mesh_at(lod)
-        assert (vertices.dtype, faces.dtype, ids.dtype) == (np.float64, np.int32, np.int32)
-        assert ids.tolist() == [f for f in range(model.face_count) if mesh.is_active(f, lod)]
-        expected = [[mesh.vertex_pos[v] for v in mesh.corners(f, lod)] for f in ids]
-        np.testing.assert_array_equal(vertices[faces], expected)
 
 
 def test_bad_sources_are_refused():

@@ -6,7 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import trimesh
-from conftest import real_mesh_path
+from conftest import real_mesh_path, slow
 from helpers.samples import crumbs, grid, line, of_trimesh, sample, soup
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -56,21 +56,6 @@ def some_lods(model, count=6):
 
 
 # Validity.
-
-
-@pytest.mark.parametrize("teeth", [2, 3, 4])
-@pytest.mark.slow
-def test_a_comb_whose_gaps_are_closed(teeth):
-    """Every point of the original lies in the surface at a LOD, which fills gaps and so lies far from the original."""
-    model = ab.Model.from_arrays(*square_comb(teeth), base_faces=2)
-    closed = [lod for lod in range(model.lod_max) if model.error_at(lod) < 1e-8]
-    far = 0.0
-    for lod in closed:
-        measured = brute_distances(lattice_points(corners_at(model, lod), 64), original(model)).max()
-        bound = model.error_at(lod, side="outward")
-        assert measured - 1e-15 <= bound <= 1.02 * measured + 1e-9
-        far = max(far, measured)
-    assert 0.15 < far < 0.25
 
 
 def test_the_original_is_0_away():
@@ -170,31 +155,20 @@ SHAPES = {
 }
 
 
-def check_tight(model, lod):
-    measured = farthest_distance(corners_at(model, lod), original(model))
-    bound, size = model.error_at(lod, side="outward"), np.ptp(original(model), axis=(0, 1)).max()
-    assert measured - 1e-15 * size <= bound <= 1.03 * measured + 1e-12 * size
-
-
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", [*SHAPES, *slow("cow", "fandisk", "rocker-arm", "stanford-bunny")])
 def test_it_is_tight(name):
-    model = ab.Model.from_arrays(*SHAPES[name](), base_faces=4)
-    for fraction in (0.5, 0.2, 0.05):
-        check_tight(model, model.lod_for(fraction=fraction))
+    known = name in SHAPES
+    model = ab.Model.from_arrays(*SHAPES[name](), base_faces=4) if known else ab.Model.load(real_mesh_path(name))
+    size = np.ptp(original(model), axis=(0, 1)).max()
+    for fraction in (0.5, 0.2, 0.05) if known else (0.1, 0.01):
+        lod = model.lod_for(fraction=fraction)
+        measured = farthest_distance(corners_at(model, lod), original(model))
+        assert measured - 1e-15 * size <= model.error_at(lod, side="outward") <= 1.03 * measured + 1e-12 * size
 
 
-@pytest.mark.parametrize("name", ["cow", "fandisk", "rocker-arm", "stanford-bunny"])
-@pytest.mark.slow
-def test_it_is_tight_on_real_meshes(name):
-    model = ab.Model.load(real_mesh_path(name))
-    for fraction in (0.1, 0.01):
-        check_tight(model, model.lod_for(fraction=fraction))
-
-
-@pytest.mark.parametrize("power", [-90, -3, 1, 60])
-@pytest.mark.parametrize("shape", ["torus", "comb", "soup"])
-def test_scale_changes_nothing(shape, power):
-    vertices, faces = SHAPES[shape]()
+@pytest.mark.parametrize("power", [-90, 60])
+def test_scale_changes_nothing(power):
+    vertices, faces = SHAPES["comb"]()
     one = ab.Model.from_arrays(vertices, faces, base_faces=4)
     other = ab.Model.from_arrays(np.ldexp(vertices, power), faces, base_faces=4)
     for lod in some_lods(one):
@@ -204,17 +178,13 @@ def test_scale_changes_nothing(shape, power):
 # Arguments and caching.
 
 
-@pytest.mark.parametrize("side", ["out", "Outward", "", None, 1, ["outward"]])
-def test_other_sides_are_refused(side):
-    with pytest.raises(ValueError, match="'inward' nor 'outward'") as caught:
-        sample("ball").error_at(3, side=side)
-    assert repr(side) in str(caught.value)
-
-
-def test_inward_is_the_default():
+def test_sides_are_two_and_inward_is_the_default():
     model = sample("ball")
-    for lod in some_lods(model):
-        assert model.error_at(lod) == model.error_at(lod, side="inward") == model.progressive.lod_error[lod]
+    assert model.error_at(3) == model.error_at(3, side="inward") == model.progressive.lod_error[3]
+    for side in ("Outward", None, ["outward"]):
+        with pytest.raises(ValueError, match="'inward' nor 'outward'") as caught:
+            model.error_at(3, side=side)
+        assert repr(side) in str(caught.value)
 
 
 def test_it_is_computed_once_and_not_pickled(monkeypatch):

@@ -191,17 +191,13 @@ def test_soups(mesh, base_faces):
     check_error(mesh, progressive, steps=4, count=500)
 
 
-@pytest.mark.parametrize("name", MESHES)
-def test_the_base_is_reached(name):
-    count = build_progressive(mesh_from_arrays(*MESHES[name]()), base_faces=4).active_count(0)
-    assert count == 6 if name == "same face often" else 0 < count <= 4  # no merge leaves a copy of one face
-
-
 def test_base_prefix(mesh):
-    """A larger base is a prefix of the sequence for a smaller one."""
+    """The base is reached, and a larger one is a prefix of the sequence for a smaller one."""
     long = build_progressive(mesh, base_faces=1)
-    for base_faces in (2, 10, 100):
+    for base_faces in (4, 100):
         short = build_progressive(mesh, base_faces=base_faces)
+        left = short.active_count(0)  # no merge leaves a copy of one face
+        assert 0 < left <= base_faces or left == len(mesh.faces) == 6
         cut, nodes = long.lod_max - short.lod_max, len(short.vertex_parent)
         assert cut >= 0
         parent = long.vertex_parent[:nodes]
@@ -241,7 +237,7 @@ def test_a_full_heap_loses_nothing(mesh):
     assert_same(build_progressive(mesh, base_faces=1), build_progressive(mesh, base_faces=1, sizes=small))
 
 
-@pytest.mark.parametrize("power", [-90, -3, 1, 60])
+@pytest.mark.parametrize("power", [-90, 60])
 def test_scale_changes_nothing(mesh, power):
     """Scaling by a power of two gives the same forest and scales positions and errors to the bit."""
     scaled = SimpleNamespace(vertices=np.ldexp(mesh.vertices, power), faces=mesh.faces)
@@ -278,15 +274,16 @@ def test_error_bounds_what_is_measured(mesh):
     check_error(mesh, build_progressive(mesh, base_faces=1))
 
 
+@pytest.mark.parametrize(("name", "limit"), [("torus", 1.3), ("bumpy grid", 1.5), ("cow", 1.2), ("fandisk", 1.2)])
 @pytest.mark.slow
-def test_error_is_tight():
-    for name, limit in (("torus", 1.3), ("sphere", 1.3), ("bumpy grid", 1.5)):
-        mesh = mesh_from_arrays(*MESHES[name]())
-        progressive = build_progressive(mesh, base_faces=4)
-        worst = 0.0
-        for lod in np.linspace(progressive.lod_max - 1, 0, 40).astype(int):
-            worst = max(worst, measured_error(mesh, progressive, lod))
-            assert progressive.lod_error[lod] <= limit * worst, name
+def test_error_is_tight(name, limit, real_mesh_path):
+    mesh = mesh_from_arrays(*MESHES[name]()) if name in MESHES else load_mesh(real_mesh_path(name))
+    progressive = build_progressive(mesh, base_faces=4 if name in MESHES else 10)
+    lods = np.linspace(progressive.lod_max - 1, 0, 40).astype(int)
+    worst = 0.0
+    for lod in lods if name in MESHES else [progressive.lod_for(fraction=fraction) for fraction in (0.1, 0.01)]:
+        worst = max(worst if name in MESHES else 0.0, measured_error(mesh, progressive, lod))
+        assert progressive.lod_error[lod] <= limit * worst
 
 
 def test_flat_regions_cost_nothing():
@@ -315,13 +312,3 @@ def test_real_meshes(name, real_mesh_path):
     if len(mesh.faces) < 30_000:
         replay(mesh, progressive)
     check_error(mesh, progressive, steps=4, count=2000)
-
-
-@pytest.mark.parametrize("name", ["cow", "fandisk"])
-@pytest.mark.slow
-def test_error_is_tight_on_real_meshes(name, real_mesh_path):
-    mesh = load_mesh(real_mesh_path(name))
-    progressive = build_progressive(mesh)
-    for fraction in (0.1, 0.01):
-        lod = progressive.lod_for(fraction=fraction)
-        assert progressive.lod_error[lod] <= 1.2 * measured_error(mesh, progressive, lod)

@@ -272,7 +272,7 @@ def _strictly_beside(a, b):
 
 
 def provably_apart(a, b):
-    """Float64 filter for triangle pairs a, b [k, 3, 3]: True only where they cannot meet, False where unsure."""
+    """Float64 filter for triangle pairs a, b [k, 3, 3]: True only where they cannot meet, False where uncertain."""
     if max(np.abs(a).max(initial=0.0), np.abs(b).max(initial=0.0)) > 1e100:
         return np.zeros(len(a), bool)
     return _strictly_beside(a, b) | _strictly_beside(b, a)
@@ -287,8 +287,8 @@ def brute_force_faces(vertices_a, faces_a, vertices_b, faces_b, pose_a, pose_b):
     faces_a, faces_b = np.asarray(faces_a), np.asarray(faces_b)
     candidates = box_pairs(points_a[faces_a], points_b[faces_b])
     blocks = np.array_split(candidates, len(candidates) // 100_000 + 1)
-    unsure = np.concatenate(
+    uncertain = np.concatenate(
         [p[~provably_apart(points_a[faces_a[p[:, 0]]], points_b[faces_b[p[:, 1]]])] for p in blocks]
     )
-    hits = unsure[pairs_intersect(points_a, faces_a, points_b, faces_b, unsure)]
+    hits = uncertain[pairs_intersect(points_a, faces_a, points_b, faces_b, uncertain)]
     return hits[np.lexsort((hits[:, 1], hits[:, 0]))].astype(np.int32)

@@ -251,17 +251,6 @@ def test_corrections_of_place_leave_velocity_and_energy(device):
     assert found[2] == pytest.approx(start[2], rel=1e-3)
 
 
-@pytest.mark.parametrize("restitution", [0.5, 0.8])
-def test_a_drop_rebounds_by_restitution(device, restitution):
-    dynamics = on_ground(device, (CUBE, (0, 0, 1.5, 0, 0, 0, 1)), restitution=restitution)
-    heights = []
-    for _ in range(400):
-        dynamics.step(1 / 480)
-        heights.append(dynamics.poses()[1, 2] - 0.5)
-    landed = int(np.argmin(heights[:230]))
-    assert max(heights[landed:]) == pytest.approx(restitution**2, abs=0.01)
-
-
 # Friction.
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import warp_abtree as ab
-from warp_abtree.checks.quaternions import matrices_of, multiply_quaternions, quaternions_about, quaternions_of
+from warp_abtree.checks.quaternions import matrices_of, multiply_quaternions, quaternions_of
 
 
 def rotate(quaternion, vector):
@@ -56,11 +56,7 @@ def test_turning_follows_rodrigues():
             assert np.allclose(rotate(poses[i, 3:], vector), expected, atol=1e-12)
 
 
-def test_quarter_turn_is_right_handed():
-    assert np.allclose(rotate(quaternions_about([0, 0, 1], np.pi / 2), [1, 0, 0]), [0, 1, 0])
-
-
-@pytest.mark.parametrize("time", [0.0, 0.4, 1.0, 1.3, 2.0, 5.9])
+@pytest.mark.parametrize("time", [0.0, 1.3, 5.9])
 def test_shuttle_reflects_at_its_ends(time):
     start, way = [0.5, 0.0, 1.0], [1.0, -2.0, 0.5]
     motion = ab.Kinematic(position=[start], shuttle=way, period=2.0, phase=0.25)

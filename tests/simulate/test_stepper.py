@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, NO_GRAVITY, TORUS, about, bits, box, make, on_ground, run
 
 import warp_abtree as ab
@@ -73,29 +74,17 @@ def test_worlds_alone_and_together_are_the_same(device):
         assert np.array_equal(found[1 + world :: 3], alone[1:]), world
 
 
-def test_launches_do_what_steps_do(device):
+def test_launches_of_a_graph_do_what_steps_do(device):
     stepped = on_ground(device, *heap(), **OPTIONS)
     launched = on_ground(device, *heap(), **OPTIONS, capacity=ab.Buffers(4096, pairs=256))
+    run(stepped, 1), run(launched, 1)
+    with wp.ScopedCapture(launched.device) as capture:
+        launched.launch(1 / 120)
     for _ in range(60):
         stepped.step(1 / 120)
-        launched.launch(1 / 120)
+        wp.capture_launch(capture.graph)
         launched.check()
     assert np.array_equal(bits(stepped), bits(launched))
-
-
-def test_a_graph_does_what_launches_do():
-    if not ab.Scene().device.is_cuda:
-        pytest.skip("needs CUDA")
-    import warp as wp
-
-    plain, captured = (on_ground(None, *heap(), **OPTIONS, capacity=ab.Buffers(4096, pairs=256)) for _ in range(2))
-    run(plain, 1), run(captured, 1)
-    with wp.ScopedCapture(captured.device) as capture:
-        captured.launch(1 / 120)
-    for _ in range(60):
-        plain.launch(1 / 120)
-        wp.capture_launch(capture.graph)
-    assert np.array_equal(bits(plain), bits(captured))
 
 
 def test_room_grows_and_its_lack_is_told(device):
@@ -152,10 +141,8 @@ def test_poses_that_a_user_sets(device):
     [
         ({"density": 0}, "density: 0.0 of object 0 is not above 0"),
         ({"density": [1, np.nan]}, "density: nan of object 1"),
-        ({"density": [1, 2, 3]}, "density: shape"),
         ({"restitution": 1.1}, "restitution: 1.1 .* at most 1"),
         ({"friction": -0.1}, "friction: -0.1"),
-        ({"gravity": (0, 0)}, "gravity"),
         ({"gravity": (0, 0, np.inf)}, "gravity"),
         ({"kinematic": [5]}, "kinematic"),
         ({"kinematic": [True]}, "kinematic"),

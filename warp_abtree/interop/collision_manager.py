@@ -73,14 +73,29 @@ class CollisionManager:
             self._placed = PlacedShapes(self.device)
             self._slots = {name: self._placed.add(shape, matrix) for name, shape, matrix in kept}
 
+    def _external(self, mesh, transform):
+        return [(EXTERNAL, shape_of(mesh), self._matrix(transform, EXTERNAL))]
+
     @contextmanager
-    def _guests(self, placed):
-        """Add shapes with their matrices for the duration of one call; yield their slots."""
+    def _pairs_with(self, guests):
+        """Add guests for the duration of one call.
+
+        Args:
+            guests: Name, `Shape` and matrix of each, or a manager that has them.
+
+        Yields:
+            Pairs of slots (own, guest), and a function of an index that returns the pair's names.
+        """
+        if not isinstance(guests, list | CollisionManager):
+            raise TypeError(f"other_manager is a {type(guests).__name__}, not a warp_abtree.CollisionManager")
+        guests = guests.placed_objects() if isinstance(guests, CollisionManager) else guests
         slots = []
         try:
-            for shape, matrix in placed:
+            for _, shape, matrix in guests:
                 slots.append(self._placed.add(shape, matrix))
-            yield np.array(slots, np.int32)
+            names, own = self._own()
+            pairs = np.stack([np.repeat(own, len(slots)), np.tile(np.array(slots, np.int32), len(own))], 1)
+            yield pairs, lambda k: (names[k // len(slots)], guests[k % len(slots)][0])
         finally:
             for slot in slots:
                 self._placed.remove(slot)
@@ -152,14 +167,8 @@ class CollisionManager:
         Returns:
             Whether it collides, alone or first of a tuple.
         """
-        with self._guests([(shape_of(mesh), self._matrix(transform, EXTERNAL))]) as guests:
-            names, own = self._own()
-            pairs, kept = self._overlapping(np.stack([own, np.full(len(own), guests[0])], 1))
-            first_only = not (return_names or return_data)
-            any_hit, hits, contacts = self._collide(
-                pairs, [(names[k], EXTERNAL) for k in kept], return_data, first_only
-            )
-        return _join(any_hit, (return_names, {first for first, _ in hits}), (return_data, contacts))
+        any_hit, hits, contacts = self._collide_with(self._external(mesh, transform), return_names, return_data)
+        return _join(any_hit, (return_names, {name for name, _ in hits}), (return_data, contacts))
 
     def in_collision_internal(self, return_names=False, return_data=False):
         """Find the pairs of objects that collide. Waits for the device.
@@ -196,10 +205,7 @@ class CollisionManager:
         Raises:
             TypeError: Not a `CollisionManager` of this library.
         """
-        with self._others(other_manager) as (pairs, names):
-            pairs, kept = self._overlapping(pairs)
-            named = [names(k) for k in kept]
-            any_hit, hits, contacts = self._collide(pairs, named, return_data, not (return_names or return_data))
+        any_hit, hits, contacts = self._collide_with(other_manager, return_names, return_data)
         return _join(any_hit, (return_names, set(hits)), (return_data, contacts))
 
     # Distances.
@@ -215,12 +221,9 @@ class CollisionManager:
         Returns:
             Distance [world units], 0 if they collide, infinite without objects; alone or first of a tuple.
         """
-        with self._guests([(shape_of(mesh), self._matrix(transform, EXTERNAL))]) as guests:
-            names, own = self._own()
-            pairs = np.stack([own, np.full(len(own), guests[0])], 1)
-            distance, pair, data = self._nearest(pairs, lambda k: (names[k], EXTERNAL))
-        name = None if pair is None else pair[0]
-        return _join(distance, (return_name, name), (return_data, data))
+        with self._pairs_with(self._external(mesh, transform)) as (pairs, names):
+            distance, pair, data = self._nearest(pairs, names)
+        return _join(distance, (return_name, pair and pair[0]), (return_data, data))
 
     def min_distance_internal(self, name=None, return_names=False, return_data=False):
         """Return the least distance of two objects, or of one from the others. Waits for the device.
@@ -243,8 +246,7 @@ class CollisionManager:
             with_name = (own[i] == slot) | (own[j] == slot)
             i, j = i[with_name], j[with_name]
         distance, pair, data = self._nearest(np.stack([own[i], own[j]], 1), lambda k: (names[i[k]], names[j[k]]))
-        pair = None if pair is None else tuple(sorted(pair))
-        return _join(distance, (return_names, pair), (return_data, data))
+        return _join(distance, (return_names, pair and tuple(sorted(pair))), (return_data, data))
 
     def min_distance_other(self, other_manager, return_names=False, return_data=False):
         """Return the least distance of an object here from one of another manager. Waits for the device.
@@ -260,27 +262,18 @@ class CollisionManager:
         Raises:
             TypeError: Not a `CollisionManager` of this library.
         """
-        with self._others(other_manager) as (pairs, names):
+        with self._pairs_with(other_manager) as (pairs, names):
             distance, pair, data = self._nearest(pairs, names)
         return _join(distance, (return_names, pair), (return_data, data))
 
     # Computation.
 
-    @contextmanager
-    def _others(self, other):
-        """Add another manager's objects; yield pairs (here, there) and a function of a pair's names."""
-        if not isinstance(other, CollisionManager):
-            raise TypeError(f"other_manager is a {type(other).__name__}, not a warp_abtree.CollisionManager")
-        theirs = other.placed_objects()
-        with self._guests([(shape, matrix) for _, shape, matrix in theirs]) as guests:
-            names, own = self._own()
-            pairs = np.stack([np.repeat(own, len(guests)), np.tile(guests, len(own))], 1)
-            yield pairs, lambda k: (names[k // len(theirs)], theirs[k % len(theirs)][0])
-
-    def _overlapping(self, pairs):
-        """Return the pairs whose boxes overlap, and their indices."""
-        kept = np.flatnonzero(self._placed.gaps(pairs) == 0)
-        return pairs[kept], kept
+    def _collide_with(self, guests, return_names, return_data):
+        """Return what `_collide` does for all pairs of an object and a guest whose boxes overlap."""
+        with self._pairs_with(guests) as (pairs, names):
+            kept = np.flatnonzero(self._placed.gaps(pairs) == 0)
+            named = [names(k) for k in kept.tolist()]
+            return self._collide(pairs[kept], named, return_data, not (return_names or return_data))
 
     def _collide(self, pairs, names, return_data, first_only=False):
         """Return whether any pair collides, names of those that do, and their contacts if requested.

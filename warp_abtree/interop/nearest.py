@@ -22,12 +22,9 @@ class NodeBoxes:
 
     def __init__(self, model):
         progressive, tree = model.progressive, model.tree
-        corners = progressive.vertex_pos[progressive.face_vertex]
-        lower, upper = np.full((tree.node_count, 3), np.inf), np.full((tree.node_count, 3), -np.inf)
-        lower[tree.leaf_node], upper[tree.leaf_node] = corners.min(1), corners.max(1)
-        dropped = tree.leaf_node[model.dropped_faces]
-        lower[dropped], upper[dropped] = np.inf, -np.inf
-        tree.merge_boxes(lower, upper)
+        kept = np.delete(np.arange(model.face_count), model.dropped_faces)
+        corners = progressive.vertex_pos[progressive.face_vertex[kept]]
+        lower, upper = tree.node_boxes(kept, corners.min(1), corners.max(1))
         used = (lower <= upper).all(1)
         self.middle, self.half = np.zeros_like(lower), np.full_like(lower, -1.0)
         self.middle[used] = 0.5 * lower[used] + 0.5 * upper[used]

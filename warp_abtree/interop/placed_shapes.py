@@ -65,11 +65,14 @@ class PlacedShapes:
             self.scene.set_poses(self.poses[: self.scene.object_count])
             self._moved = False
 
+    def _model_boxes(self):
+        boxes = np.array([(shape.middle, shape.half) for shape in self.shapes]).reshape(-1, 2, 3)
+        return boxes[:, 0], boxes[:, 1]
+
     def boxes(self):
         """Return centres and half extents of all boxes in the world, (n, 3) each, rounded outwards."""
         poses = self.poses[: len(self.shapes)]
-        middle = np.array([shape.middle for shape in self.shapes]).reshape(-1, 3)
-        half = np.array([shape.half for shape in self.shapes]).reshape(-1, 3)
+        middle, half = self._model_boxes()
         rotation, position = poses[:, :3, :3], poses[:, :3, 3]
         size = np.linalg.norm(middle, axis=1) + np.linalg.norm(half, axis=1)
         skew = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0)
@@ -102,8 +105,7 @@ class PlacedShapes:
         """Return which pairs may have a component of one inside the other: a solid's box contains a corner of it."""
         nested = np.zeros(len(pairs), bool)
         solid = np.array([shape.planes is not None for shape in self.shapes])
-        middle = np.array([shape.middle for shape in self.shapes])
-        half = np.array([shape.half for shape in self.shapes])
+        middle, half = self._model_boxes()
         several = np.array([len(shape.probes) > 6 for shape in self.shapes])
         # A connected shape that is inside has its first corner inside; the components of others are tested later.
         corner = np.array([shape.probes[0] for shape in self.shapes])

@@ -8,7 +8,7 @@ import trimesh
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.model.mesh import MeshError, load_mesh
 from warp_abtree.model.model import Model
-from warp_abtree.model.obj import triangulate
+from warp_abtree.model.obj import read_usd_mesh
 from warp_abtree.scene.poses import RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
 
@@ -133,8 +133,11 @@ def _read_usd(path) -> trimesh.Scene:
     scene, known = trimesh.Scene(), {}
 
     def add(prim, name, transform):
-        mesh = _usd_mesh(UsdGeom.Mesh(prim), time, f"{path}: {prim.GetPath()}")
-        if mesh is not None:
+        source = UsdGeom.Mesh(prim)
+        found = read_usd_mesh(source, time, f"{path}: {prim.GetPath()}")
+        if found is not None:
+            faces = found[1] if source.GetOrientationAttr().Get(time) != "leftHanded" else found[1][:, ::-1]
+            mesh = trimesh.Trimesh(found[0], faces, process=False)
             key = mesh.vertices.tobytes(), mesh.faces.tobytes()
             if key not in known:
                 known[key] = str(prim.GetPath())
@@ -165,21 +168,6 @@ def _read_usd(path) -> trimesh.Scene:
 
     visit(stage.GetPseudoRoot(), "", places.GetLocalToWorldTransform)
     return scene
-
-
-def _usd_mesh(mesh, time, where):
-    points, counts = mesh.GetPointsAttr().Get(time), mesh.GetFaceVertexCountsAttr().Get(time)
-    if not points or not counts:
-        return None
-    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(time))
-    counts = np.array(counts)
-    if (counts < 3).any() or counts.sum() != len(corners):
-        raise MeshError(f"{where}: its face counts do not fit its indices")
-    vertices = np.array(points, np.float64)
-    faces = triangulate(vertices, counts, corners, where)
-    if mesh.GetOrientationAttr().Get(time) == "leftHanded":
-        faces = faces[:, ::-1]
-    return trimesh.Trimesh(vertices, faces, process=False)
 
 
 def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 40), colour=(176, 176, 176)):

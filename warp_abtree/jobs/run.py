@@ -38,14 +38,11 @@ class ThisProcess:
                 return runners[k].run(task, self.devices[k])
 
         # The first shard of each device loads kernels, which only one thread may do at a time.
-        for k in range(self.workers):
-            if left:
-                part = left.popleft()
-                yield *part, run(k, part)
-        if self.workers == 1:
-            while left:
-                part = left.popleft()
-                yield *part, run(0, part)
+        alone = len(left) if self.workers == 1 else min(self.workers, len(left))
+        for k in range(alone):
+            part = left.popleft()
+            yield *part, run(k % self.workers, part)
+        if not left:
             return
         threads = [ThreadPoolExecutor(1, thread_name_prefix="warp_abtree shard") for _ in runners]
         running: dict = {}
@@ -96,19 +93,17 @@ def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:
     """
     folder = ShardFolder(out, job, file)
     pool = ThisProcess() if pool is None else pool
+    report = progress or (lambda stage, done, total: None)
     total, left = len(folder.left), folder.left
-    folder.open(progress)
-    found = done = total - len(left)
-    if progress is not None:
-        progress("shards", done, total)
+    folder.open(report)
+    found = total - len(left)
+    report("shards", found, total)
     for start, stop, columns in pool.run(job, list(left)) if left else ():
         if (start, stop) not in left:
             raise RuntimeError(f"shard {start} to {stop} was answered twice")
         folder.write(start, stop, columns)
         del left[start, stop]
-        done += 1
-        if progress is not None:
-            progress("shards", done, total)
+        report("shards", total - len(left), total)
     if left:
         raise RuntimeError(f"{len(left)} of {total} shards were not answered")
     sweep_up(folder.path)

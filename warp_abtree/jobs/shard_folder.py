@@ -47,7 +47,7 @@ class ShardFolder:
         self.left = dict.fromkeys(_ranges(known))
         self.damaged: list = []
 
-    def open(self, progress=None):
+    def open(self, progress):
         """Make the folder, or check the shards that it holds of this job.
 
         Args:
@@ -79,8 +79,7 @@ class ShardFolder:
                 del self.left[part]
             except DamagedShard:
                 self.damaged.append(part)
-            if progress is not None:
-                progress("check", done, len(shards))
+            progress("check", done, len(shards))
 
     def write(self, start, stop, columns):
         """Write the shard of a range.

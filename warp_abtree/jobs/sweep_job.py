@@ -10,7 +10,7 @@ import numpy as np
 from warp_abtree.checks.arguments import to_numpy, whole_number
 from warp_abtree.model.model import Model
 from warp_abtree.query.request import check_request
-from warp_abtree.scene.poses import QUATERNION_TOLERANCE
+from warp_abtree.scene.poses import check_poses
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep import sweep
 
@@ -23,41 +23,41 @@ SCENE_POSES, STATE_BYTES, BYTES_A_FACE = 4096, 2**28, 190
 class _Rows:
     """Rows of numbers in memory, or in an .npy file that is read in parts."""
 
-    path: Any  # of the file; None in memory
-
     def __init__(self, source, what, width):
-        self.what, self.path, self.array = what, None, None
+        self.what = what
+        self.path: Any = None  # of the file; None in memory
+        self.array = None
         if isinstance(source, str | os.PathLike):
             self.path = Path(source)
-            try:
-                mapped = np.load(self.path, mmap_mode="r", allow_pickle=False)
-            except FileNotFoundError:
-                raise ValueError(f"{what}: {source}: no such file") from None
-            except (OSError, ValueError, EOFError) as error:
-                raise ValueError(f"{what}: {source} cannot be read as .npy ({error})") from None
-            if not isinstance(mapped, np.memmap) or not mapped.flags.c_contiguous:
-                raise ValueError(f"{what}: {source} is not an .npy file of one array in C order")
-            self.dtype, shape, self.offset = mapped.dtype, mapped.shape, mapped.offset
         else:
             self.array = to_numpy(source, what)
-            self.dtype, shape = self.array.dtype, self.array.shape
-        if self.dtype.kind not in "iuf":
-            raise ValueError(f"{what}: type {self.dtype} holds no real numbers")
-        if len(shape) != 2 or shape[1] != width:
-            raise ValueError(f"{what}: shape {shape}, not (p, {width})")
-        self.count, self.width = shape
+        rows = self._open()
+        if rows.dtype.kind not in "iuf":
+            raise ValueError(f"{what}: type {rows.dtype} holds no real numbers")
+        if rows.ndim != 2 or rows.shape[1] != width:
+            raise ValueError(f"{what}: shape {rows.shape}, not (p, {width})")
+        self.dtype, self.count = rows.dtype, len(rows)
+
+    def _open(self) -> np.ndarray:
+        """Return all rows; those of a file are mapped, so that only what is used of them is in memory."""
+        if self.array is not None:
+            return self.array
+        try:
+            rows = np.load(self.path, mmap_mode="r", allow_pickle=False)
+        except FileNotFoundError:
+            raise ValueError(f"{self.what}: {self.path}: no such file") from None
+        except (OSError, ValueError, EOFError) as error:
+            raise ValueError(f"{self.what}: {self.path} cannot be read as .npy ({error})") from None
+        if not isinstance(rows, np.memmap) or not rows.flags.c_contiguous:
+            raise ValueError(f"{self.what}: {self.path} is not an .npy file of one array in C order")
+        return rows
 
     def read(self, start, stop) -> np.ndarray:
         """Return a range of rows, without a copy if they are in memory."""
-        if self.array is not None:
-            return self.array[start:stop]
-        row = self.width * self.dtype.itemsize
-        with open(self.path, "rb") as file:
-            file.seek(self.offset + start * row)
-            rows = np.fromfile(file, self.dtype, (stop - start) * self.width)
-        if len(rows) != (stop - start) * self.width:
+        rows = self._open()[start:stop]
+        if len(rows) != stop - start:
             raise ValueError(f"{self.what}: {self.path} ends before row {stop}")
-        return rows.reshape(-1, self.width)
+        return rows if self.array is not None else np.array(rows)
 
     def hash_checked(self, check) -> str:
         """Return a hash of all rows; check(index of the first, rows) is called on each part and raises on bad rows."""
@@ -67,21 +67,6 @@ class _Rows:
             check(start, rows)
             found.update(rows.tobytes())
         return found.hexdigest()
-
-
-def _check_poses(start, rows):
-    rows = rows.astype(np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):
-        norm = np.sqrt((rows[:, 3:] ** 2).sum(1))
-    bad = np.flatnonzero(~np.isfinite(rows).all(1))
-    if len(bad):
-        raise ValueError(f"poses: pose {start + bad[0]} is not finite")
-    bad = np.flatnonzero(~(np.abs(norm - 1) <= QUATERNION_TOLERANCE))
-    if len(bad):
-        raise ValueError(
-            f"poses: pose {start + bad[0]} has a quaternion of norm {norm[bad[0]]:.6g}, "
-            f"off 1 by more than {QUATERNION_TOLERANCE}"
-        )
 
 
 class SweepJob:
@@ -131,7 +116,7 @@ class SweepJob:
             "count": self.count,
             "shard": self.shard,
             "models": [model.digest for model in self.models],
-            "poses": self.poses.hash_checked(_check_poses),
+            "poses": self.poses.hash_checked(lambda start, rows: check_poses(rows, first=start)),
             "lods": known_lods,
             "output": output,
             "precision": precision,

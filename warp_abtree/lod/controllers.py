@@ -1,26 +1,37 @@
-"""Controllers of LODs: each frame they take the feedback of the last one and return the LODs of the next.
+"""Controllers of LODs: each frame they take the feedback of the last one and select the LODs of the next.
 
 All have one method, `next_lods(feedback)`, and one attribute, `budget_ms` (None without a budget). They never read a
-clock: times are part of the feedback, so that runs repeat on counted work or recorded times.
+clock: times are part of the feedback, so that runs repeat on counted work. They allocate once; `launch` only launches,
+so that a graph can capture it.
+
+Source: Liu et al. 2006, section 4, and figure 4. Errata, kept here: g2 is printed with the absolute frame number and
+would explode; figure 4 counts from the start of the last climb, so that a descent mirrors it. In Case 2 the change is
+signed: the LOD falls. After the mirror g2 is 0 for ever and a scene over budget would stay so; here the smallest step,
+one level a frame, goes on. f is clamped to [0, 1], where an object is beyond D or its path longer than W.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import positive
-from warp_abtree.lod.selection import PaperSelection, PredictedSelection, ToleranceSelection
-from warp_abtree.lod.timing import COST_STAGES
+from warp_abtree.checks.arguments import finite_array, positive, whole_number
+from warp_abtree.kernels.lod import paper, prediction, tolerance
+from warp_abtree.lod.selection import lod_pool
+from warp_abtree.lod.timing import COST_STAGES, CostFit
 from warp_abtree.lod.view import Camera, View
 from warp_abtree.query.result import Result
 from warp_abtree.state.ladder import Ladder
+from warp_abtree.state.lod_update import full_refit_fraction
 
 TRIANGLE_WORK = 4.0
 """Cost of a test of two triangles in tests of two boxes, about."""
+
+# Changes of the position on the tolerance scale that are candidates, finest first, in steps of 2^(1/16).
+CLIMBS = (8, 4, 2, 1)
+FALLS = tuple(-round(2.0 ** (i / 2)) for i in range(21) if i not in (1, 3))
 
 
 @dataclass(frozen=True)
@@ -49,26 +60,28 @@ class Feedback:
 
 
 class Controller:
-    """What all controllers share: the view of the scene.
+    """What all controllers share.
 
     Args:
         scene: `Scene` with all its objects.
         camera: `Camera`, or a function from time [s] to one; None takes every object as near and still.
         window: Frames over which motion on the screen is measured.
+        ladder: `Ladder` of the scene's models.
 
     Attributes:
         budget_ms: T [ms], None without a budget.
-        lods: LODs last given, int32 (n,) on the device.
+        view: `View` of the scene.
+        lods: LODs last selected, int32 (n,) on the device.
     """
 
     budget_ms: float | None = None
-    selection: Any  # its operator, of `warp_abtree.lod.selection`
 
-    def __init__(self, scene, camera: Camera | Callable[[float], Camera] | None = None, window: int = 10):
+    def __init__(self, scene, camera: Camera | Callable[[float], Camera] | None, window: int, ladder: Ladder):
         if not (camera is None or isinstance(camera, Camera) or callable(camera)):
             raise TypeError(f"camera is a {type(camera).__name__}, neither a Camera nor a function of time")
-        self.scene, self.camera = scene, camera
-        self.view = View(scene, window)
+        self.scene, self.camera, self.ladder, self.device = scene, camera, ladder, scene.device
+        self.view, self.pool = View(scene, window), lod_pool(ladder, scene)
+        self.lods = self._zeros(scene.object_count, wp.int32)
 
     def next_lods(self, feedback: Feedback) -> wp.array:
         """Return the LOD of every object for the coming frame, int32 (n,) on the device, overwritten by the next call.
@@ -84,15 +97,27 @@ class Controller:
             self.view.look(self.camera if isinstance(self.camera, Camera) else self.camera(feedback.time))
             self.view.launch()
         self._update(feedback)
-        self.selection.launch()
-        return self.selection.lods
+        self.launch()
+        return self.lods
+
+    def launch(self):
+        """Select the LODs of a frame as `view` stands. Launches only."""
+        raise NotImplementedError
 
     def _update(self, feedback):
         """Upload what the selection needs of the feedback."""
 
+    def _zeros(self, length, dtype=wp.float64):
+        return wp.zeros(length, dtype=dtype, device=self.device)
+
+    def _launch(self, kernel, dim, *inputs):
+        wp.launch(kernel, dim=dim, inputs=list(inputs), device=self.device)
+
 
 class PaperController(Controller):
     """The paper's selection model: LODs rise and fall by powers of two about a budget (section 4.2).
+
+    Every object starts at its coarsest LOD.
 
     Args:
         scene, camera, window: As in `Controller`.
@@ -100,25 +125,38 @@ class PaperController(Controller):
         threshold_ms: t [ms]; None is 10 % of T.
         steps: Delta LOD is the operations of a model divided by this.
 
+    Attributes:
+        cost: T', the time of the last frame [ms], float64 (1,) on the device; NaN at first.
+        level: Level of each object on the LOD ladder, with its fraction, float64 (n,) on the device.
+
     Raises:
         TypeError: camera is neither a `Camera` nor a function.
         ValueError: Anything else is out of range.
     """
 
     def __init__(self, scene, budget_ms, camera=None, threshold_ms=None, steps: int = 50, window: int = 10):
-        budget_ms = positive(budget_ms, "budget_ms")
-        if threshold_ms is not None:
-            threshold_ms = positive(threshold_ms, "threshold_ms")
-        super().__init__(scene, camera, window)
-        self.selection = PaperSelection(self.view, budget_ms, threshold_ms, Ladder(scene.models, steps))
-        self.budget_ms = budget_ms
+        self.budget_ms = positive(budget_ms, "budget_ms")
+        self.threshold = 0.1 * self.budget_ms if threshold_ms is None else positive(threshold_ms, "threshold_ms")
+        super().__init__(scene, camera, window, Ladder(scene.models, steps))
+        self.cost = wp.full(1, math.nan, dtype=wp.float64, device=self.device)
+        # Case of the last launch, frames it has lasted, frames of the last climb.
+        self._case, self.level = self._zeros(3, wp.int32), self._zeros(len(self.lods))
 
     def _update(self, feedback):
-        self.selection.cost.fill_(feedback.cost_ms)
+        self.cost.fill_(feedback.cost_ms)
+
+    def launch(self):
+        """Select the LODs of a frame as `view` stands. Launches only."""
+        self._launch(paper.advance_case_kernel, 1, self.budget_ms, self.threshold, self.cost, self._case)
+        inputs = self.pool, self.view.focus, self._case, self.level, self.lods
+        self._launch(paper.advance_level_kernel, len(self.lods), *inputs)
 
 
 class ToleranceController(Controller):
-    """A tolerance in the world for every object, looser where it is far, fast or unimportant (section 4.1).
+    """The coarsest LOD whose certified error is within each object's own tolerance.
+
+    That is the tolerance times beta / f: twice it at half of D, or where an object crosses half the screen in `window`
+    frames, since far and fast objects matter less (section 4.1); three times it for objects that are not important.
 
     Args:
         scene, camera, window: As in `Controller`.
@@ -126,79 +164,120 @@ class ToleranceController(Controller):
         loosest: Most that a tolerance is loosened.
         steps, spacing: As in `Ladder`.
 
+    Attributes:
+        tolerance: float64 (1,) on the device; may be written between frames.
+
     Raises:
         TypeError, ValueError: As `PaperController`.
     """
 
     def __init__(self, scene, tolerance, camera=None, loosest=64.0, steps=50, spacing="ratio", window=10):
-        super().__init__(scene, camera, window)
-        self.selection = ToleranceSelection(self.view, tolerance, loosest, Ladder(scene.models, steps, spacing))
+        value = float(finite_array(tolerance, "tolerance", ()))
+        if not value >= 0:
+            raise ValueError(f"tolerance {tolerance!r} is below 0")
+        self.loosest = check_loosest(loosest)
+        super().__init__(scene, camera, window, Ladder(scene.models, steps, spacing))
+        self.tolerance = wp.full(1, value, dtype=wp.float64, device=self.device)
+
+    def launch(self):
+        """Select the LODs of a frame as `view` stands. Launches only."""
+        inputs = self.loosest, self.pool, self.view.focus, self.tolerance, self.lods
+        self._launch(tolerance.select_tolerance_kernel, len(self.lods), *inputs)
 
 
-class CostFit:
-    """Least-squares fit of time against work with exponential forgetting; slope and intercept are at least 0.
+def check_loosest(loosest) -> float:
+    """Return the most that a tolerance is loosened, at least 1.
 
-    Where the work hardly varies the line goes through the origin. A time off the line by more than a factor of 2 is
-    clamped to it, so that a single hitch of the machine moves the line little.
-
-    Args:
-        forget: Factor on the weight of an observation at each new one.
+    Raises:
+        ValueError: It is below 1 or not finite.
     """
-
-    def __init__(self, forget: float = 0.9):
-        self.forget = forget
-        self.sums = np.zeros(5)
-
-    def add(self, work: float, time: float):
-        """Add an observation."""
-        slope, intercept = self.line()
-        expected = slope * work + intercept
-        if self.sums[0] > 2 and expected > 0:
-            time = min(max(time, 0.5 * expected), 2.0 * expected)
-        self.sums = self.forget * self.sums + [1.0, work, time, work * work, work * time]
-
-    def line(self) -> tuple[float, float]:
-        """Return slope and intercept, NaN before the first observation."""
-        weight, x, y, xx, xy = self.sums.tolist()
-        if weight == 0:
-            return math.nan, math.nan
-        x, y, xx, xy = x / weight, y / weight, xx / weight, xy / weight
-        if x <= 0:
-            return 0.0, y
-        slope, spread = y / x, xx - x * x
-        if spread > 1e-4 * x * x:
-            slope = min(max((xy - x * y) / spread, 0.0), slope)
-        return slope, y - slope * x
+    if not positive(loosest, "loosest") >= 1:
+        raise ValueError(f"loosest {loosest!r} is below 1")
+    return float(loosest)
 
 
 class PredictiveController(Controller):
-    """Hold a budget with the finest common tolerance whose cost is predicted to fit, loosened object by object.
+    """Hold a budget with the finest common tolerance whose predicted cost fits, loosened as in `ToleranceController`.
 
-    The cost is predicted from the tests of the last frame's pairs and the recent rates of this machine (see
-    `warp_abtree.lod.selection.PredictedSelection`); tests grow as a power of the faces, with a fitted exponent.
+    The common tolerance is a position on a scale in steps of 2^(1/16). Each frame takes some finer and coarser
+    positions as candidates. It predicts their tests from the last frame's tests of every object and the faces it would
+    have (tests grow as a power of the faces, with a fitted exponent), and the nodes refitted from the levels without a
+    tree state yet; with the recent rates of this machine it takes the finest position that keeps the budget
+    (`choose_position_kernel`).
 
     Args:
         scene, camera, window: As in `Controller`.
         budget_ms: T [ms].
         steps, spacing: As in `Ladder`.
-        options: aim, low, hold_frames, loosest of `PredictedSelection`.
+        aim: Fraction of the budget that a change goes for.
+        low: Fraction of the budget under which it climbs. Between `low` and 1 the position stays: hysteresis.
+        hold_frames: Frames for which a change is held if its refit does not fit into the budget, before it is made.
+        loosest: Most that a tolerance is loosened.
+
+    Attributes:
+        rate: float64 (6,) on the device: ms of a frame, of a unit of work, of any change of LODs, of a node refitted;
+            exponents of the faces with which tests grow and fall. NaN at first: no change.
+        work: Tests of each object in the last frame, float64 (n,) on the device.
+        choice: Candidate chosen, its cost in every frame and in the first alone [ms], its tests, those of no change;
+            float64 (5,) on the device.
+        scale: Position, and frames that a change has been held, int32 (2,) on the device.
+        offset: Positions by which each object is loosened, int32 (n,) on the device.
+        changes: Change of the position of each candidate; the last leaves every object at its level.
+        prediction: What each candidate would cost, `kernels.lod.prediction.Prediction`.
 
     Raises:
-        TypeError, ValueError: As `PaperController`.
+        TypeError, ValueError: As `PaperController`; low and aim must rise: 0 < low <= aim <= 1.
     """
 
-    def __init__(self, scene, budget_ms, camera=None, steps=50, spacing="ratio", window=10, **options):
+    def __init__(
+        self,
+        scene,
+        budget_ms,
+        camera=None,
+        steps=50,
+        spacing="ratio",
+        window=10,
+        aim=0.9,
+        low=0.75,
+        hold_frames=30,
+        loosest=64.0,
+    ):
         self.budget_ms = positive(budget_ms, "budget_ms")
-        super().__init__(scene, camera, window)
-        ladder = Ladder(scene.models, steps, spacing)
-        self.selection = PredictedSelection(self.view, self.budget_ms, ladder=ladder, **options)
+        self.aim, self.low = positive(aim, "aim"), positive(low, "low")
+        if not self.low <= self.aim <= 1:
+            raise ValueError(f"low {low!r} and aim {aim!r} do not rise to at most 1")
+        self.hold_frames = whole_number(hold_frames, "hold_frames", 0, 2**30)
+        self.loosest = check_loosest(loosest)
+        super().__init__(scene, camera, window, Ladder(scene.models, steps, spacing))
+        loosened = int(math.log2(self.loosest) * int(prediction.POSITIONS_PER_OCTAVE))
+        self.position_max = int(prediction.DITHER) * (self.pool.tolerance_count - 1) + loosened
+        falls = [step for step in FALLS if step > -self.position_max]
+        self.changes = [*CLIMBS, 0, *falls, -self.position_max, 0]
+        self.prediction = self._make_prediction()
+        self.rate, count = self.prediction.rate, len(self.lods)
+        self.work, self.choice = self._zeros(count), self._zeros(5)
+        self.scale, self.offset = self._zeros(2, wp.int32), self._zeros(count, wp.int32)
+        self.level = self._zeros(count, wp.int32)
         self._query, self._refine, self._rest = CostFit(), CostFit(), CostFit()
         self._exponent, self._drift = 1.0, 0.0
+
+    def _make_prediction(self):
+        candidates, levels = len(self.changes), self.ladder.lod.size
+        made = prediction.Prediction()
+        made.change = wp.array(np.array(self.changes, np.int32), dtype=wp.int32, device=self.device)
+        made.rate = wp.full(6, math.nan, dtype=wp.float64, device=self.device)
+        made.power_up, made.power_down = self._zeros(levels), self._zeros(levels)
+        chunks = candidates * int(prediction.CHUNKS)
+        made.chunk_work, made.chunk_moved = self._zeros(chunks), self._zeros(chunks, wp.int32)
+        made.used = self._zeros(candidates * levels, wp.int32)
+        made.work, made.moved = self._zeros(candidates), self._zeros(candidates, wp.int32)
+        made.nodes = self._zeros(candidates)
+        return made
 
     @property
     def predicted_ms(self) -> float:
         """Predicted cost of the next frame [ms], NaN before the second. Waits for the device."""
-        choice = self.selection.choice.numpy()
+        choice = self.choice.numpy()
         return float(choice[1] + choice[2])
 
     def _update(self, feedback):
@@ -222,12 +301,12 @@ class PredictiveController(Controller):
         # Conservative both ways: a climb costs more than fitted, a fall saves less.
         up, down = self._exponent + 0.2, max(self._exponent - 0.2, 0.1)
         grown = math.exp(self._drift)
-        self.selection.rate.assign(np.array([fixed, per_work * grown, change, per_node, up, down]))
-        self.selection.work.assign(work)
+        self.rate.assign(np.array([fixed, per_work * grown, change, per_node, up, down]))
+        self.work.assign(work)
 
     def _fit_exponent(self, total):
         """Fit to the tests counted, against those predicted: the exponent if LODs changed, the drift if not."""
-        _, _, _, predicted, before = self.selection.choice.numpy()
+        _, _, _, predicted, before = self.choice.numpy()
         if not (predicted > 0 and before > 0 and total > 0):
             self._drift *= 0.8
             return
@@ -239,3 +318,21 @@ class PredictiveController(Controller):
             found -= expected
         self._drift += 0.2 * (min(max(found, -0.2), 0.2) - self._drift)
         self._drift = max(self._drift, 0.0)
+
+    def launch(self):
+        """Predict, choose and select the LODs of a frame as `view` stands. Launches only."""
+        predicted, pool, count = self.prediction, self.pool, len(self.lods)
+        candidates, models = len(self.changes), len(self.ladder.models)
+        predicted.used.zero_()
+        predicted.nodes.zero_()
+        self._launch(prediction.update_offset_kernel, count, self.loosest, pool, self.view.focus, self.offset)
+        self._launch(prediction.raise_faces_kernel, len(predicted.power_up), pool, predicted)
+        inputs = models, pool, self.scale, self.offset, self.level, self.work, predicted
+        self._launch(prediction.predict_work_kernel, (candidates, int(prediction.CHUNKS)), *inputs)
+        share = full_refit_fraction(self.device)
+        self._launch(prediction.predict_refit_kernel, (candidates, models), models, share, pool, predicted)
+        self._launch(prediction.sum_chunk_kernel, candidates, predicted)
+        limits = self.budget_ms, self.aim, self.low, self.hold_frames, self.position_max, len(CLIMBS)
+        self._launch(prediction.choose_position_kernel, 1, *limits, predicted, self.scale, self.choice)
+        place = self.scale, self.offset, self.choice, self.level, self.lods
+        self._launch(prediction.set_level_kernel, count, candidates - 1, pool, *place)

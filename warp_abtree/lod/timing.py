@@ -1,9 +1,6 @@
-"""Stages of a frame, and the clocks that time them: the host's, one that counts work, one that replays a run."""
+"""Stages of a frame, the clocks that time them, and the fit of times to counted work."""
 
-import csv
-import json
-import os
-from pathlib import Path
+import math
 from time import perf_counter
 from typing import Any
 
@@ -29,54 +26,6 @@ RATES = {
 }
 """Seconds that `WorkClock` takes for an object selected, any change of LODs, a node refitted, an object posed, a
 candidate pair, a query, a test of two boxes, a test of two triangles: about those of a CPU."""
-
-
-class ReplayClock:
-    """A clock that replays the times of a recorded run, so that the run repeats itself exactly.
-
-    Args:
-        rows: The history of that run: `FrameRow`s, or the .json or .csv file that `Frame.record` wrote.
-
-    Raises:
-        ValueError: A file that is missing, or no such history.
-    """
-
-    def __init__(self, rows):
-        if isinstance(rows, str | os.PathLike):
-            rows = _read_rows(Path(rows))
-        else:
-            rows = [row.as_dict() for row in rows]
-        stages = np.array([[row[stage] for stage in STAGES] for row in rows], np.float64).reshape(-1, len(STAGES))
-        ticks = np.concatenate([np.zeros((len(rows), 1)), np.round(1e6 * stages)], axis=1)
-        self._ticks = iter((1e-9 * np.cumsum(ticks)).tolist())
-        self._frames = len(rows)
-
-    def __call__(self) -> float:
-        """Return the next reading [s].
-
-        Raises:
-            RuntimeError: The recorded run was not that long.
-        """
-        try:
-            return next(self._ticks)
-        except StopIteration:
-            raise RuntimeError(f"the recorded clock ends after {self._frames} frames") from None
-
-
-def _read_rows(path):
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            rows = json.load(file) if path.suffix.lower() == ".json" else list(csv.DictReader(file))
-        if not rows:
-            raise ValueError("no frames")
-        rows = [{stage: float(row[stage]) for stage in STAGES} for row in rows]
-        if not np.isfinite([list(row.values()) for row in rows]).all():
-            raise ValueError("a stage is not finite")
-        return rows
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror or error}") from None
-    except (ValueError, KeyError, TypeError, AttributeError, csv.Error) as error:
-        raise ValueError(f"{path}: not the history of a run ({type(error).__name__}: {error})") from None
 
 
 class WorkClock:
@@ -156,3 +105,37 @@ class Timer:
         else:
             spans = np.diff(self._marks).tolist()
         return {stage: span / 1e6 for stage, span in zip(STAGES, spans, strict=True)}
+
+
+class CostFit:
+    """Least-squares fit of time against work with exponential forgetting; slope and intercept are at least 0.
+
+    Where the work hardly varies the line goes through the origin. A time off the line by more than a factor of 2 is
+    clamped to it, so that a single hitch of the machine moves the line little.
+    """
+
+    FORGET = 0.9  # factor on the weight of an observation at each new one
+
+    def __init__(self):
+        self.sums = np.zeros(5)
+
+    def add(self, work: float, time: float):
+        """Add an observation."""
+        slope, intercept = self.line()
+        expected = slope * work + intercept
+        if self.sums[0] > 2 and expected > 0:
+            time = min(max(time, 0.5 * expected), 2.0 * expected)
+        self.sums = self.FORGET * self.sums + [1.0, work, time, work * work, work * time]
+
+    def line(self) -> tuple[float, float]:
+        """Return slope and intercept, NaN before the first observation."""
+        weight, x, y, xx, xy = self.sums.tolist()
+        if weight == 0:
+            return math.nan, math.nan
+        x, y, xx, xy = x / weight, y / weight, xx / weight, xy / weight
+        if x <= 0:
+            return 0.0, y
+        slope, spread = y / x, xx - x * x
+        if spread > 1e-4 * x * x:
+            slope = min(max((xy - x * y) / spread, 0.0), slope)
+        return slope, y - slope * x

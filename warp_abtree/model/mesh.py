@@ -121,7 +121,7 @@ def describe_mesh(mesh):
         "welded_vertices": mesh.welded_count,
         "dropped_faces": len(mesh.dropped_faces),
         "zero_area_faces": int(np.count_nonzero(_zero_area(mesh.vertices, faces))),
-        "duplicate_faces": len(corners) - _distinct_rows(corners),
+        "duplicate_faces": len(corners) - len(np.unique(corners, axis=0)),
         "open_edges": open_edges,
         "nonmanifold_edges": int(np.count_nonzero(edge_faces > 2)),
         "components": len(np.unique(component_labels(faces, vertex_count)[np.unique(faces)])),
@@ -276,11 +276,6 @@ def _zero_area(vertices, faces):
     for p, q in ((y1 * z2, z1 * y2), (z1 * x2, x1 * z2), (x1 * y2, y1 * x2)):
         zero &= np.abs(p - q) <= 2.0**-50 * (np.abs(p) + np.abs(q))
     return zero
-
-
-def _distinct_rows(rows):
-    ordered = rows[np.lexsort(rows.T)]
-    return 1 + int(np.count_nonzero((ordered[1:] != ordered[:-1]).any(axis=1)))
 
 
 def component_labels(faces, vertex_count):

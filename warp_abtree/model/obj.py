@@ -123,9 +123,19 @@ def read_warp_asset(source, asset) -> tuple[np.ndarray, np.ndarray]:
         raise MeshError(f"{source}: {path} is missing from this installation of Warp")
     stage = Usd.Stage.Open(str(path))
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/root/{asset}"))  # its transform is the identity in all three files
-    vertices = np.array(mesh.GetPointsAttr().Get(), dtype=np.float64)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get())
-    return vertices, triangulate(vertices, counts, np.array(mesh.GetFaceVertexIndicesAttr().Get()), source)
+    return read_usd_mesh(mesh, Usd.TimeCode.Default(), source)
+
+
+def read_usd_mesh(mesh, time, where):
+    """Return vertices and triangles of a `UsdGeom.Mesh`, None without any; raise MeshError if they do not fit."""
+    points, counts = mesh.GetPointsAttr().Get(time), mesh.GetFaceVertexCountsAttr().Get(time)
+    if not points or not counts:
+        return None
+    vertices, counts = np.array(points, np.float64), np.array(counts)
+    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(time))
+    if (counts < 3).any() or counts.sum() != len(corners):
+        raise MeshError(f"{where}: its face counts do not fit its indices")
+    return vertices, triangulate(vertices, counts, corners, where)
 
 
 # Polygons.

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.progressive import outward_bound
-from warp_abtree.model.progressive import ROUNDING, find_frame, make_scratch
+from warp_abtree.model.progressive import ROUNDING, cpu_array, find_frame, make_scratch
 
 
 class OutwardError:
@@ -48,10 +48,10 @@ class OutwardError:
         point = np.concatenate([vertices[used], corner.mean(1)])
         guess = np.concatenate([face_ids[first // 3], face_ids])
         distance_sq = wp.zeros(len(point), dtype=wp.float64, device="cpu")
-        inputs = [_cpu(point, wp.vec3d), _cpu(guess, int), original, distance_sq]
+        inputs = [cpu_array(point, wp.vec3d), cpu_array(guess, int), original, distance_sq]
         wp.launch(outward_bound.measure_points_kernel, dim=len(point), inputs=inputs, device="cpu")
         bound_sq = wp.zeros(len(corner), dtype=wp.float64, device="cpu")
-        inputs = [float(distance_sq.numpy().max()), _cpu(corner, wp.vec3d), _cpu(face_ids, int), original]
+        inputs = [float(distance_sq.numpy().max()), cpu_array(corner, wp.vec3d), cpu_array(face_ids, int), original]
         rows = outward_bound.ROWS
         inputs += [make_scratch(1, 1, rows), wp.zeros(rows, dtype=int, device="cpu"), bound_sq]
         wp.launch(outward_bound.bound_faces_kernel, dim=1, inputs=inputs, device="cpu")
@@ -65,20 +65,13 @@ class OutwardError:
         progressive, tree = self.progressive, self.tree
         centre, scale = find_frame(progressive.vertex_pos[: progressive.vertex_count])
         corner = (progressive.vertex_pos[progressive.face_vertex] - centre) / scale
-        lower = np.full((tree.node_count, 3), np.inf, np.float32)
-        upper = np.full((tree.node_count, 3), -np.inf, np.float32)
         there = progressive.face_split <= progressive.lod_max
-        leaf = tree.leaf_node[there]
         # the next float32, whichever way the conversion rounded
-        lower[leaf] = np.nextafter(corner[there].min(1).astype(np.float32), np.float32(-np.inf))
-        upper[leaf] = np.nextafter(corner[there].max(1).astype(np.float32), np.float32(np.inf))
-        tree.merge_boxes(lower, upper)
+        lower = np.nextafter(corner[there].min(1).astype(np.float32), np.float32(-np.inf))
+        upper = np.nextafter(corner[there].max(1).astype(np.float32), np.float32(np.inf))
+        lower, upper = tree.node_boxes(there, lower, upper)
         original = outward_bound.Original()
-        original.face_pos = _cpu(corner, wp.vec3d)
-        original.node_lower, original.node_upper = _cpu(lower, wp.vec3), _cpu(upper, wp.vec3)
-        original.node_face = _cpu(tree.node_face, int)
+        original.face_pos = cpu_array(corner, wp.vec3d)
+        original.node_lower, original.node_upper = cpu_array(lower, wp.vec3), cpu_array(upper, wp.vec3)
+        original.node_face = cpu_array(tree.node_face, int)
         return centre, scale, original
-
-
-def _cpu(values, dtype):
-    return wp.array(values, dtype=dtype, device="cpu")

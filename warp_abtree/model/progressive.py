@@ -198,7 +198,8 @@ def _edges(faces):
     return pair[first], boundary.reshape(faces.shape)
 
 
-def _cpu(values, dtype):
+def cpu_array(values, dtype):
+    """Return a Warp array on the CPU."""
     return wp.array(values, dtype=dtype, device="cpu")
 
 
@@ -229,21 +230,21 @@ def _collapse(pos, faces, base_faces, report, sizes):
     """Run the collapse; return vertex_parent int32 [n_v+m] and all normalised positions float64 [n_v+m, 3]."""
     vertex_count, capacity = len(pos), 2 * len(pos)
     edges, boundary = _edges(faces)
-    face_array = _cpu(faces, int)
+    face_array = cpu_array(faces, int)
     surface = collapse.Surface()
-    surface.pos = _cpu(np.concatenate([pos, np.zeros_like(pos)]), wp.vec3d)
+    surface.pos = cpu_array(np.concatenate([pos, np.zeros_like(pos)]), wp.vec3d)
     surface.quadric = wp.zeros(capacity, dtype=Quadric, device="cpu")
     surface.parent = _filled(capacity, -1)
     surface.stamp = _filled(capacity, -1)
     rings = _linked_rings(faces, face_array, capacity)
-    _launch(collapse.weigh_faces_kernel, len(faces), face_array, _cpu(boundary, wp.int8), surface)
+    _launch(collapse.weigh_faces_kernel, len(faces), face_array, cpu_array(boundary, wp.int8), surface)
     heap, size = Heap(), len(edges)
     room = sizes.heap_per_edge * size + sizes.heap_extra
-    heap.pair = _cpu(np.resize(edges, room), wp.int64)
+    heap.pair = cpu_array(np.resize(edges, room), wp.int64)
     heap.key = wp.zeros(room, dtype=wp.float64, device="cpu")
     _launch(collapse.price_edges_kernel, size, heap.pair, surface, heap.key)
     start_live = int(_distinct(faces).sum())
-    counter = _cpu(np.array([size, 0, start_live, collapse.RUNNING], dtype=np.int32), int)
+    counter = cpu_array(np.array([size, 0, start_live, collapse.RUNNING], dtype=np.int32), int)
     _launch(collapse.compact_heap_kernel, surface, heap, counter)
     state = counter.numpy()  # shares the memory
     goal = max(start_live - base_faces, 1)
@@ -276,13 +277,13 @@ def _splits(parent, faces, vertex_count):
     """Return face_split int32 [n_f], split_start int64 [m+1] and split_face int32 of a forest."""
     node_count = len(parent)
     merge_count = node_count - vertex_count
-    face_array, parent_array = _cpu(faces, int), _cpu(parent, int)
+    face_array, parent_array = cpu_array(faces, int), cpu_array(parent, int)
     size = wp.zeros(merge_count + 1, dtype=wp.int64, device="cpu")
     face_split = wp.zeros(len(faces), dtype=int, device="cpu")
     _launch(vertex_forest.count_events_kernel, vertex_count, node_count, face_array, parent_array, size, face_split)
     split_start = np.concatenate([[0], np.cumsum(size.numpy()[:merge_count])]).astype(np.int64)
     split_face = wp.zeros(int(split_start[-1]), dtype=int, device="cpu")
-    cursor = _cpu(split_start.copy(), wp.int64)
+    cursor = cpu_array(split_start.copy(), wp.int64)
     _launch(vertex_forest.fill_events_kernel, node_count, face_array, parent_array, cursor, split_face)
     return face_split.numpy(), split_start, split_face.numpy()
 
@@ -304,12 +305,12 @@ def _bound_errors(vertex_pos, parent, faces, report, covers):
     if merge_count == 0:
         return np.zeros(1)
     pair = child[np.argsort(parent[child], kind="stable")].reshape(-1, 2)
-    face_array = _cpu(faces, int)
+    face_array = cpu_array(faces, int)
     replay = _replay((vertex_pos - centre) / scale, face_count)
     replay.rings = _linked_rings(faces, face_array, len(parent))
     _launch(hausdorff_bound.start_replay_kernel, face_count, face_array, replay)
     bound_sq = wp.zeros(merge_count, dtype=wp.float64, device="cpu")
-    inputs = [len(parent) - merge_count, merge_count, covers, _cpu(pair, int)]
+    inputs = [len(parent) - merge_count, merge_count, covers, cpu_array(pair, int)]
     state = replay.counter.numpy()  # shares the memory
     while state[0] < merge_count:
         _launch(hausdorff_bound.replay_merges_kernel, *inputs, replay, bound_sq)
@@ -325,7 +326,7 @@ def _replay(pos, face_count):
     replay = triangle_cover.Replay()
     replay.counter = _filled(6, 0)
     replay.scratch = make_scratch(face_count, triangle_cover.SLOTS, polygon.STACK)
-    replay.pos = _cpu(pos, wp.vec3d)
+    replay.pos = cpu_array(pos, wp.vec3d)
     replay.triangle_pos, replay.face_pos = _points(face_count, 3), _points(face_count, 3)
     replay.face_box = _points(face_count, 2)
     for name in ("face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face"):
@@ -343,5 +344,5 @@ def _index(replay):
     active = np.flatnonzero(replay.rings.corner_node.numpy()[::3] >= 0).astype(np.int32)
     corners = replay.face_pos.numpy()[active]
     lower, upper = corners.min(axis=1).astype(np.float32), corners.max(axis=1).astype(np.float32)
-    replay.bvh_face = _cpu(active, int)
-    return wp.Bvh(_cpu(lower, wp.vec3), _cpu(upper, wp.vec3))
+    replay.bvh_face = cpu_array(active, int)
+    return wp.Bvh(cpu_array(lower, wp.vec3), cpu_array(upper, wp.vec3))

@@ -38,13 +38,17 @@ class Tree:
         node_face[leaf_node] = np.arange(n, dtype=np.int32)
         return cls(leaf_node, node_face, find_depth(n))
 
-    def merge_boxes(self, lower: np.ndarray, upper: np.ndarray):
-        """Compute the boxes of inner nodes from those of the leaves, in place; shape (node_count, 3) each."""
+    def node_boxes(self, faces, face_lower: np.ndarray, face_upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return minima and maxima of all nodes over some faces, (node_count, 3) each, infinite where there is none."""
+        lower = np.full((self.node_count, 3), np.inf, face_lower.dtype)
+        upper = np.full((self.node_count, 3), -np.inf, face_upper.dtype)
+        lower[self.leaf_node[faces]], upper[self.leaf_node[faces]] = face_lower, face_upper
         for level in range(self.depth - 1, -1, -1):
             node = np.arange(1 << level, 2 << level)
             node = node[self.node_face[node] < 0]
             lower[node] = np.minimum(lower[2 * node], lower[2 * node + 1])
             upper[node] = np.maximum(upper[2 * node], upper[2 * node + 1])
+        return lower, upper
 
     @property
     def node_count(self) -> int:

@@ -45,9 +45,7 @@ ends and signs; sums follow the order of the faces as named, so that its summary
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.contact import contact
-from warp_abtree.kernels.contact import sort_hits as order
-from warp_abtree.kernels.contact import summary as reduce
+from warp_abtree.kernels.contact import contact, sort_hits, summary
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import CapacityError
 from warp_abtree.query.result import VECTORS, ContactResult, Result, contact_dtypes
@@ -67,7 +65,7 @@ class ContactQuery(Query):
     Attributes:
         faces: The last launch's `Result.faces`, device vec3i (capacity,), sorted.
         contacts: Their contacts, device arrays (capacity,) of `kernels.contact.Contacts`, float64.
-        pair_contacts: Their summaries, device arrays (pair capacity,) of `kernels.reduce.PairContacts`, float64.
+        pair_contacts: Their summaries, device arrays (pair capacity,) of `kernels.summary.PairContacts`, float64.
         start: Where the rows of pair p start in faces and contacts, device int32 (pair capacity + 1,): they end at
             start[p + 1], and all of them at the last entry. Places behind that hold nothing.
         hits, pairs, pair_count, near: As for `Query`. Where hits.count sums to more than the capacity, contacts are
@@ -84,8 +82,8 @@ class ContactQuery(Query):
     def __init__(self, scene, pairs=None, capacity=None, precision="exact", within=None, contact_dtype=np.float64):
         contact_dtypes(contact_dtype)
         self.contact_dtype = contact_dtype
-        self.contacts, self.pair_contacts = contact.Contacts(), reduce.PairContacts()
-        self._sums = reduce.ChunkSums()
+        self.contacts, self.pair_contacts = contact.Contacts(), summary.PairContacts()
+        self._sums = summary.ChunkSums()
         super().__init__(scene, "faces", pairs, capacity, precision, within)
 
     def resize(self, capacity: int):
@@ -134,7 +132,7 @@ class ContactQuery(Query):
     @staticmethod
     def _chunk_count(places: int, pairs: int) -> int:
         """Return how many chunks there may be: `first_chunk` of the pair after the last, if all places are taken."""
-        return places // int(reduce.CHUNK) + pairs
+        return places // int(summary.CHUNK) + pairs
 
     def traverse(self):
         """Run the narrow phase over the pairs in place and make the contacts. Launches only."""
@@ -164,11 +162,11 @@ class ContactQuery(Query):
         total, face = self.hits.total, self.hits.face
         for number, widths in enumerate(self._passes()):
             inputs = [room, wp.vec3i(*widths), number == 0, total, face, self._order, self._key]
-            self._launch_kernel(order.make_key_kernel, capacity, inputs)
+            self._launch_kernel(sort_hits.make_key_kernel, capacity, inputs)
             with wp.ScopedDevice(self.device):
                 wp.utils.radix_sort_pairs(self._key, self._order, capacity, end_bit=sum(widths))
-        self._launch_kernel(order.place_row_kernel, capacity, [total, face, self._order, self.faces])
-        self._launch_kernel(order.start_pair_kernel, room + 1, [capacity, sum(widths[1:]), self._key, self.start])
+        self._launch_kernel(sort_hits.place_row_kernel, capacity, [total, face, self._order, self.faces])
+        self._launch_kernel(sort_hits.start_pair_kernel, room + 1, [capacity, sum(widths[1:]), self._key, self.start])
 
     def _find(self):
         posed = [*self.batch.pools, self.pairs, self.pair_poses]
@@ -178,10 +176,10 @@ class ContactQuery(Query):
         room, chunks = len(self.pairs), len(self._sums.span)
         pools = self.batch.pools
         start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
-        self._launch_kernel(reduce.sum_length_kernel, chunks, [start, contacts, sums])
-        self._launch_kernel(reduce.total_length_kernel, room, [start, sums])
-        self._launch_kernel(reduce.sum_mean_kernel, chunks, [start, contacts, sums])
-        self._launch_kernel(reduce.average_contact_kernel, room, [*pools, self.pairs, start, sums, means])
+        self._launch_kernel(summary.sum_length_kernel, chunks, [start, contacts, sums])
+        self._launch_kernel(summary.total_length_kernel, room, [start, sums])
+        self._launch_kernel(summary.sum_mean_kernel, chunks, [start, contacts, sums])
+        self._launch_kernel(summary.average_contact_kernel, room, [*pools, self.pairs, start, sums, means])
         posed = [*pools, self.pairs, self.pair_poses]
-        self._launch_kernel(reduce.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
-        self._launch_kernel(reduce.measure_depth_kernel, room, [*pools, self.pairs, start, contacts, sums, means])
+        self._launch_kernel(summary.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
+        self._launch_kernel(summary.measure_depth_kernel, room, [*pools, self.pairs, start, contacts, sums, means])

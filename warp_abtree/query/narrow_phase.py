@@ -6,10 +6,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.traversal import dual_tree, simd, uncertain_pairs
-from warp_abtree.kernels.traversal import face_pairs as faces
-from warp_abtree.kernels.traversal import load_balance as share
-from warp_abtree.kernels.traversal import relative_pose as relate
+from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, relative_pose, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.buffers import QueryBuffers
@@ -32,7 +29,7 @@ UNCERTAIN_ROOM = 65536
 WARPS_A_PROCESSOR = 16
 FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
 # So that each finds a slot for all that it gives away at once.
-WARPS_MAX = share.SLOT_COUNT // int(share.DONATIONS_AT_ONCE)
+WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
 EXACT = int(PRECISIONS["exact"])
 
@@ -112,12 +109,12 @@ class Query(QueryBuffers):
         self.resize((room.hits or max(1024, 16 * len(self.pairs))) if output == "faces" else 0)
 
     def _make_work(self):
-        work, device = share.Work(), self.device
-        slots = share.SLOT_COUNT if self.uses_warps() else 0
-        work.counter = wp.zeros(share.COUNTER_COUNT, dtype=wp.int32, device=device)
+        work, device = load_balance.Work(), self.device
+        slots = load_balance.SLOT_COUNT if self.uses_warps() else 0
+        work.counter = wp.zeros(load_balance.COUNTER_COUNT, dtype=wp.int32, device=device)
         work.flag = wp.zeros(slots, dtype=wp.int32, device=device)
         work.owner = wp.empty(slots, dtype=wp.vec2i, device=device)
-        work.item = wp.empty(slots * share.SLOT_ITEMS, dtype=wp.int64, device=device)
+        work.item = wp.empty(slots * load_balance.SLOT_ITEMS, dtype=wp.int64, device=device)
         work.record = self.guard.record()
         self.guard.write_to(work.record)
         return work
@@ -156,7 +153,7 @@ class Query(QueryBuffers):
         room = len(self.pairs)
         if self.near is None or room == 0:
             return
-        self._launch_traversal(self.within, self.near, int(faces.WITHIN), int(faces.OUTPUT_ANY))
+        self._launch_traversal(self.within, self.near, int(face_pairs.WITHIN), int(face_pairs.OUTPUT_ANY))
 
     def _launch_traversal(self, within, hits, mode, output):
         pools = self.batch.pools
@@ -167,19 +164,19 @@ class Query(QueryBuffers):
         self.guard.record()
         inputs += [self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
-        wp.launch(relate.relative_pose_kernel, dim=dim, inputs=inputs, device=self.device)
+        wp.launch(relative_pose.relative_pose_kernel, dim=dim, inputs=inputs, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits]
         if not self.uses_warps():
             cores = current_regime().cpu_threads or core_count()
             # A launch on a further core costs some 50 us: the work of many pairs apart, of less than one in contact.
-            least = 32 if output == int(faces.OUTPUT_ANY) else 1
+            least = 32 if output == int(face_pairs.OUTPUT_ANY) else 1
             launch_on_cores(simd.thread_traversal(mode), room, [*inputs, self.work], self.device, cores, least)
             return
         # More than there are parts: those that find none wait for shares.
         warps = max(room, int(4 * warps_per_pair * math.sqrt(room)) + 1)
         warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         wp.launch(
-            dual_tree.warp_traversal(mode, output == int(faces.OUTPUT_ANY)),
+            dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
             inputs=[self._stack_length(), *inputs, self.work],
             block_dim=WARP_SIZE,

@@ -221,7 +221,7 @@ class Pipeline:
         """
         check_device(self.device, "Pipeline.check")
         poses, lods, demand = self._bad_poses.numpy().copy(), self._update.faults.numpy().copy(), self._demand.numpy()
-        found, hits, unsure, stale = (int(value) for value in demand)
+        found, hits, uncertain, stale = (int(value) for value in demand)
         self.clear_faults()
         wrong, lost = [], []
         if poses[0]:
@@ -238,7 +238,7 @@ class Pipeline:
         if self.query.output == "faces":
             room["hits"] = hits, len(self.query.hits.face)
         if len(self.query.hits.uncertain):
-            room["uncertain"] = unsure, len(self.query.hits.uncertain)
+            room["uncertain"] = uncertain, len(self.query.hits.uncertain)
         for name, (demand, places) in room.items():
             if demand > places:
                 needed = f"Buffers({name}={demand})"

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import is_device_array, to_numpy, wrap_array
-from warp_abtree.kernels import place_poses as place
+from warp_abtree.kernels import place_poses
 
 QUATERNION_TOLERANCE = 1e-3
 RIGID_TOLERANCE = 1e-6
@@ -92,7 +92,7 @@ def place_rows(rows, pool):
     matrices = rows.shape[1] == 16
     first = wp.full(1, NONE_BAD, dtype=wp.int32, device=rows.device)
     inputs = [wp.float64(RIGID_TOLERANCE if matrices else QUATERNION_TOLERANCE), rows, first]
-    wp.launch(place.pose_check(rows.dtype, rows.shape[1]), len(rows), inputs, device=rows.device)
+    wp.launch(place_poses.pose_check(rows.dtype, rows.shape[1]), len(rows), inputs, device=rows.device)
     bad = int(first.numpy()[0])
     if bad != NONE_BAD:
         row = rows[bad : bad + 1].numpy()
@@ -105,4 +105,4 @@ def place_rows(rows, pool):
 
 def launch_place(rows, pool):
     """Set the objects of a pool from sound rows of 7 or 16 numbers. One launch: all objects move, or none."""
-    wp.launch(place.pose_setter(rows.dtype, rows.shape[1]), len(rows), [rows, pool], device=rows.device)
+    wp.launch(place_poses.pose_setter(rows.dtype, rows.shape[1]), len(rows), [rows, pool], device=rows.device)

@@ -42,6 +42,15 @@ def object_mask(chosen, count):
     return mask
 
 
+def zeros_of(struct, rows, columns, device):
+    """Return a struct of device arrays that are 0: `rows` entries each, or rows and columns."""
+    made = struct()
+    for name, variable in struct.vars.items():
+        shape = rows if variable.type.ndim == 1 else (rows, columns)
+        setattr(made, name, wp.zeros(shape, dtype=variable.type.dtype, device=device))
+    return made
+
+
 @dataclass(frozen=True)
 class MassProperties:
     """Mass properties of a model at density 1, in the model's frame.
@@ -139,9 +148,7 @@ class RigidBodies:
     def _fill_bodies(self, density, slop, sleep_speed):
         """Allocate the arrays of all bodies, and write what stays for good."""
         scene, rigid, n = self.scene, self.rigid, self.scene.object_count
-        self.bodies = kernels.Bodies()
-        for name, variable in kernels.Bodies.vars.items():
-            setattr(self.bodies, name, wp.zeros(n, dtype=variable.type.dtype, device=self.device))
+        self.bodies = zeros_of(kernels.Bodies, n, 0, self.device)
         models = sorted({scene.object_model[i] for i in np.flatnonzero(rigid)})
         found = {m: mass_properties(scene.models[m]) for m in models}
         self.properties = [found[m] if r else None for m, r in zip(scene.object_model, rigid)]

@@ -10,13 +10,6 @@ from warp_abtree.checks.quaternions import multiply_quaternions, quaternions_abo
 
 NORM_TOLERANCE = 1e-3
 
-# Defaults of `Kinematic`: a row, or a number, for all objects.
-_IDENTITY: Any = (0.0, 0.0, 0.0, 1.0)
-_ZERO_ROW: Any = (0.0, 0.0, 0.0)
-_Z_AXIS: Any = (0.0, 0.0, 1.0)
-_ZERO: Any = 0.0
-_INFINITE: Any = np.inf
-
 
 def triangle_wave(phase) -> np.ndarray:
     """Return 0 at whole numbers, 1 halfway between them, linear in between; any shape, float64."""
@@ -48,14 +41,14 @@ class Kinematic:
             1e-3, a rotation about an axis of length 0, a period not above 0.
     """
 
-    position: np.ndarray
-    rotation: np.ndarray = _IDENTITY
-    velocity: np.ndarray = _ZERO_ROW
-    axis: np.ndarray = _Z_AXIS
-    rate: np.ndarray = _ZERO
-    shuttle: np.ndarray = _ZERO_ROW
-    period: np.ndarray = _INFINITE
-    phase: np.ndarray = _ZERO
+    position: Any
+    rotation: Any = (0.0, 0.0, 0.0, 1.0)
+    velocity: Any = (0.0, 0.0, 0.0)
+    axis: Any = (0.0, 0.0, 1.0)
+    rate: Any = 0.0
+    shuttle: Any = (0.0, 0.0, 0.0)
+    period: Any = np.inf
+    phase: Any = 0.0
 
     def __post_init__(self):
         self.position = np.array(self.position, np.float64)

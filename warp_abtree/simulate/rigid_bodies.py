@@ -30,7 +30,7 @@ from warp_abtree.query.manifold import POINTS_MAX, ManifoldQuery
 from warp_abtree.query.request import Buffers, CapacityError
 from warp_abtree.scene.poses import check_poses
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.body_state import RigidBodies
+from warp_abtree.simulate.body_state import RigidBodies, zeros_of
 
 COLOR_COUNT, INACTIVE = int(graph_coloring.COLOR_COUNT), int(graph_coloring.INACTIVE)
 
@@ -94,10 +94,6 @@ class Dynamics(RigidBodies):
         ValueError: A number out of range or of the wrong shape, or a body without a volume.
     """
 
-    _pair_color: wp.array
-    _sorted_color: wp.array
-    _sorted_pair: wp.array
-
     def __init__(
         self,
         scene: Scene,
@@ -118,12 +114,9 @@ class Dynamics(RigidBodies):
         self._by_color = not self.device.is_cpu if by_color is None else by_color
         self.time = 0.0
         self.set_velocities(velocity, angular_velocity)
-        self._targets = (
-            wp.empty(0, dtype=wp.mat33d, device=self.device),
-            wp.empty(0, dtype=wp.vec3d, device=self.device),
-        )
+        self._targets = tuple(wp.empty(0, dtype=kind, device=self.device) for kind in (wp.mat33d, wp.vec3d))
         self.query = BodyContacts(scene, self.bodies, solver.capacity)
-        self._constraints, self._warm_start = constraint_kernels.Constraints(), constraint_kernels.WarmStart()
+        self._warm_start = constraint_kernels.WarmStart()
         self._room, self._interrupted = -1, False
         self._grow()
 
@@ -132,29 +125,19 @@ class Dynamics(RigidBodies):
         room = len(self.query.pairs)
         if room == self._room:
             return
-
-        def made(owner, name, shape, dtype):
-            return owner, name, wp.zeros(shape, dtype=dtype, device=self.device)
-
-        arrays = [made(self, "_pair_color", room, wp.int32)]
-        arrays += [made(self, name, 2 * room, wp.int32) for name in ("_sorted_color", "_sorted_pair")]
-        for kind, struct in (
-            (constraint_kernels.Constraints, self._constraints),
-            (constraint_kernels.WarmStart, self._warm_start),
-        ):
-            for name, variable in kind.vars.items():
-                shape = room if variable.type.ndim == 1 else (room, POINTS_MAX)
-                arrays.append(made(struct, name, shape, variable.type.dtype))
-        for struct, name, array in arrays:
-            if struct is self._warm_start:
-                if name == "key":
-                    array.fill_(int(body_kernels.LAST_KEY))
-                if self._room > 0:
-                    old = getattr(struct, name)
-                    wp.copy(array.flatten(), old.flatten(), count=old.size)
+        constraints = zeros_of(constraint_kernels.Constraints, room, POINTS_MAX, self.device)
+        warm_start = zeros_of(constraint_kernels.WarmStart, room, POINTS_MAX, self.device)
+        warm_start.key.fill_(int(body_kernels.LAST_KEY))
+        if self._room > 0:
+            for name in constraint_kernels.WarmStart.vars:
+                old = getattr(self._warm_start, name)
+                wp.copy(getattr(warm_start, name).flatten(), old.flatten(), count=old.size)
+        color, sorted_color, sorted_pair = (
+            wp.zeros(size, dtype=wp.int32, device=self.device) for size in (room, 2 * room, 2 * room)
+        )
         with self._changing():
-            for owner, name, array in arrays:
-                setattr(owner, name, array)
+            self._constraints, self._warm_start = constraints, warm_start
+            self._pair_color, self._sorted_color, self._sorted_pair = color, sorted_color, sorted_pair
             self._room = room
 
     @contextmanager

@@ -5,24 +5,22 @@ from pathlib import Path
 import numpy as np
 
 import warp_abtree as ab
+from warp_abtree.app import load_scene
+from warp_abtree.lod.timing import WorkClock
+from warp_abtree.simulate.budget_report import budget_report
 
-from ...inside import WorkClock, budget_report, load_scene
 from .meshes import paper_models
 
 SCENE = Path(__file__).resolve().parents[3] / "scenes" / "focus.toml"
 # Figure 4, read off the picture: g in frames 1 to 10, Case 1 until frame 5, Case 2 from frame 6; Q1, Q2, Q3.
-FIGURE_4 = (
-    (1, 2, 4, 8, 16, 8, 4, 2, 1, 0),
-    (0, 1, 2, 4, 8, 8, 4, 2, 1, 0),
-    (0, 0, 1, 2, 4, 8, 4, 2, 1, 0),
-)
+FIGURE_4 = ((1, 2, 4, 8, 16, 8, 4, 2, 1, 0), (0, 1, 2, 4, 8, 8, 4, 2, 1, 0), (0, 0, 1, 2, 4, 8, 4, 2, 1, 0))
 # Costs over T, a frame each: a climb and a pause first, so that no end of the ladder hides a step; then the figure.
 BEFORE = (0.5,) * 6 + (0.95,)
 COURSE = (0.5,) * 5 + (1.5,) * 5
 STEPS = 100
 CONTROLLERS = ("paper", "predictive")
 BREACH = 3.0  # T is a third of the median frame at the finest LODs
-SETTLED = 1.0  # seconds of a scene before frames are judged
+AFTER = 1.0  # seconds of a scene before frames are judged
 
 
 def run(context):
@@ -62,7 +60,7 @@ def trace_budget(context):
     loaded = load_scene(SCENE, device=context.device, objects=objects)
     finest = loaded.frame(controller="none", clock=WorkClock())
     finest.run(frames // 2)
-    budget = float(np.median([row.cost_ms for row in finest.history if row.time >= SETTLED / 2])) / BREACH
+    budget = float(np.median([row.cost_ms for row in finest.history if row.time >= AFTER / 2])) / BREACH
     for controller in CONTROLLERS:
         context.progress(f"{controller} controller")
         frame = loaded.frame(controller=controller, budget_ms=budget, clock=WorkClock())
@@ -70,10 +68,10 @@ def trace_budget(context):
         for row in frame.history[::2]:
             cost = {"cost": row.cost_ms / budget, "faces": row.faces}
             yield {"case": "trace", "controller": controller, "time": row.time} | cost
-        judged = budget_report(frame.history, budget, after=SETTLED)
+        judged = budget_report(frame.history, budget, after=AFTER)
         about = {"case": "budget", "controller": controller, "objects": loaded.scene.object_count}
         about |= {name: judged[name] for name in ("frames", "within", "worst", "error_mean")}
-        yield about | {"within_tenth": judged["within_110_percent"], "turns": judged["oscillations"]}
+        yield about | {"within_110_percent": judged["within_110_percent"], "oscillations": judged["oscillations"]}
 
 
 def step_sizes(rows):

@@ -4,10 +4,10 @@ import numpy as np
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.testing import active_build, upload_lods
 
 from ...baselines.wp_bvh import FaceBvh
 from ...cases.memory import count_bytes
-from ...inside import active_build, upload_lods
 from .meshes import paper_models
 
 COUNTS = (10, 50, 200)
@@ -71,5 +71,4 @@ def time_changes(context, model, lods):
         row = {"k_share": fraction, "update_ms": (times["there"] + times["back"]) / 2}
         rows.append(row | {"bvh_ms": rebuilt, "build_ms": built["build"]})
     found = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-    ratios = [row["bvh_ms"] / row["update_ms"] for row in rows]
-    return found | {"changes": len(rows), "ratio": found["bvh_ms"] / found["update_ms"], "ratio_min": min(ratios)}
+    return found | {"changes": len(rows), "ratio": found["bvh_ms"] / found["update_ms"]}

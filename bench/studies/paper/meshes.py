@@ -56,7 +56,7 @@ class PosedPairs:
     Attributes:
         scene: `Scene`; its first objects are A.
         pairs: Object pairs, int (count, 2).
-        poses: Of all objects since the last push, (objects, 7).
+        poses: Of all objects since they were placed, (objects, 7).
     """
 
     def __init__(self, model, count, device, first_count=1, share=False, steps=32):
@@ -71,7 +71,7 @@ class PosedPairs:
             self.scene.add(model)
         self.pairs = np.stack([np.arange(count) % first_count, first_count + np.arange(count)], 1)
 
-    def push(self, depth):
+    def place(self, depth):
         """Pose every B so far behind its first contact, as a fraction of A's longest side."""
         still = np.tile([0.0, 0, 0, 0, 0, 0, 1], (self._first_count, 1))
         self.poses = np.concatenate([still, self.motions.poses(self._free - depth * self._size)])

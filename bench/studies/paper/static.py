@@ -21,7 +21,7 @@ def run(context):
         context.progress(model.name)
         count = context.size(1024 if context.device.is_cuda else 64, 8)
         posed = PosedPairs(model, count, context.device, share=True, steps=context.size(32, 12))
-        posed.push(DEPTH)
+        posed.place(DEPTH)
         lods = {model.lod_for(fraction=fraction) if fraction < 1 else model.lod_max for fraction in fractions}
         for lod in sorted(lods, reverse=True):
             yield compare_static(context, model, lod, posed)

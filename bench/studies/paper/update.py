@@ -6,9 +6,9 @@ import numpy as np
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.testing import upload_lods
 
 from ...cases.update import REFITS, bound_nodes, check_update
-from ...inside import upload_lods
 from ...tables import pick
 from .meshes import PosedPairs, paper_models
 
@@ -184,7 +184,7 @@ def time_shares(context, model, lod, count, states):
     scene.set_lods(there)
     update = (moved["there"] + moved["back"]) / 2
     for name, depth in CONFIGURATIONS:
-        posed.push(depth)
+        posed.place(depth)
         row = {"model": model.name, "faces": model.face_count, "configuration": name, "pairs": count}
         row |= {"states": states, "k": int(k.max()), "k_share": k.max() / model.face_count, "update_ms": update}
         for output in ("faces", "any"):

@@ -1,8 +1,8 @@
 """What speed costs in accuracy, setting by setting, against the exact answer at the finest LODs."""
 
-from . import bounds, competitors, dials, lods, summaries
+from . import bounds, competitors, lods, settings, summaries
 
-PARTS = {"lods": lods.run, "dials": dials.run, "bounds": bounds.run, "competitors": competitors.run}
+PARTS = {"lods": lods.run, "settings": settings.run, "bounds": bounds.run, "competitors": competitors.run}
 SUMMARIES = {
     function.__name__: function
     for function in (

@@ -35,8 +35,8 @@ def farthest(igl, rng, mesh, other):
 def surface_rows(context, models):
     """Yield one row a model: how many LODs were tried, in how many a point lies beyond the bound, and how tight it is.
 
-    excess is the largest distance less the bound [longest side]. back_* are distances from the mesh at a LOD to the
-    original, of which nothing is promised.
+    used_* are the largest distances over the bound; back_max the same from the mesh at a LOD to the original, of which
+    nothing is promised.
     """
     igl = context.library("igl")
     if igl is None:
@@ -58,9 +58,7 @@ def surface_rows(context, models):
                 back.append(farthest(igl, rng, coarse, original) / size / bound)
         row = {"case": "surface", "workload": name, "faces": model.face_count, "configurations": count}
         row |= {"points": count * SURFACE_POINTS, "violations": int((np.array(excess) > ROUNDING).sum())}
-        row |= {"excess": max(excess), "used_median": float(np.median(tight)), "used_max": max(tight)}
-        back_columns = {"back_configurations": len(back), "back_beyond": int((np.array(back) > 1).sum())}
-        yield row | back_columns | {"back_max": max(back)}
+        yield row | {"used_median": float(np.median(tight)), "used_max": max(tight), "back_max": max(back)}
 
 
 def apart_row(context, workload, rng):

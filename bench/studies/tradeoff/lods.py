@@ -5,14 +5,13 @@ import numpy as np
 import warp_abtree as ab
 
 from .regions import compare_normals, compare_regions, make_regions, resultants
-from .workload import find_front, judge_answers, judge_contact, workloads
+from .workload import judge_answers, judge_contact, workloads
 
 FRACTIONS = (0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
 # Of the longest side, both models' errors together.
 TOLERANCES = (0.1, 0.05, 0.02, 0.01, 0.005, 0.002)
 QUICK_FRACTIONS = (0, 0.02, 0.1, 0.5, 1)
 QUICK_TOLERANCES = (0.05, 0.01)
-GAP_BISECTIONS = 16
 CLEAR = 0.5  # length of the mean of a pose's normals from which on they are said to agree
 
 
@@ -20,24 +19,6 @@ def is_coarsest(model, tolerance):
     """Return whether `lod_for` gives the coarsest LOD within a tolerance, found by going through all of them."""
     within = [lod for lod in range(model.lod_max + 1) if model.error_at(lod) <= tolerance]
     return model.lod_for(tolerance=tolerance) == min(within)
-
-
-def find_gaps(workload, error):
-    """Return the distance of the finest surfaces where coarse ones first touch [sizes]: 0 where those are too late.
-
-    By bisection on `within`, so to 2^-16 of the error of the first contact, which is the most it can be.
-    """
-    early = np.flatnonzero(error > 0)
-    gaps = np.where(np.isnan(error), np.nan, 0.0)
-    if len(early):
-        poses = workload.motions.poses(workload.low[early] + error[early] * workload.size, early)
-        low, high = np.zeros(len(early)), 1.001 * error[early]
-        for _ in range(GAP_BISECTIONS):
-            middle = (low + high) / 2
-            near = workload.finest.near(poses, middle * workload.size)
-            low, high = np.where(near, low, middle), np.where(near, middle, high)
-        gaps[early] = high
-    return gaps
 
 
 class LodLevels:
@@ -59,14 +40,10 @@ class LodLevels:
         scene = workload.scene(lods)
         found = scene.ask(workload.poses, "contacts")
         error = workload.first_contact(scene.intersects)
-        gaps = find_gaps(workload, error)
-        known, bound = gaps[~np.isnan(gaps)], workload.bound(lods) / workload.size
+        bound = workload.bound(lods) / workload.size
         row = {"case": "level", "workload": workload.name, "kind": kind, "value": value}
-        row |= {"lod_a": lods[0], "lod_b": lods[1], "faces": workload.a.face_count + workload.b.face_count}
-        row |= {"share": workload.fraction(lods), "size": workload.size, "bound": bound}
+        row |= {"share": workload.fraction(lods), "bound": bound}
         row |= judge_answers(found.any, exact.any) | judge_contact(error)
-        row |= {"gap_mean": float(known.mean()) if len(known) else None, "gap_max": float(known.max(initial=0.0))}
-        row["gap_over_bound"] = int((known > bound + 1e-4 * np.abs(error[~np.isnan(gaps)])).sum())
         if bound:
             row["contact_over_bound"] = int((np.abs(error) > bound).sum())
         row |= compare_regions(make_regions(found.contacts, len(workload.poses), workload.size), self.regions)
@@ -85,7 +62,7 @@ class LodLevels:
             yield about | judge_answers(found.any[at], exact.any[at])
 
     def time(self, context):
-        """Return the rows with their times, taken in turn, and which levels no other one beats in time and error."""
+        """Return the rows with their times, taken in turn."""
         poses, launches = self.workload.timed_poses(), {}
         for number, (row, scene) in enumerate(zip(self.rows, self.scenes, strict=True)):
             scene.place(poses)
@@ -99,13 +76,10 @@ class LodLevels:
                 query.run().check()
                 launches[number, output] = query.launch
         for (number, output), milliseconds in context.time_launches(launches).items():
-            self.rows[number] |= {f"{output}_us": 1e3 * milliseconds / len(poses), "timed_poses": len(poses)}
+            self.rows[number][f"{output}_us"] = 1e3 * milliseconds / len(poses)
         finest = next(row for row in self.rows if (row["kind"], row["value"]) == ("fraction", 1))
-        for output, error, name in (("any", "contact_mean", "contact"), ("contacts", "region_mean", "region")):
-            costs = [row[f"{output}_us"] for row in self.rows]
-            fronts = find_front(costs, [row.get(error) for row in self.rows])
-            for row, front in zip(self.rows, fronts, strict=True):
-                row |= {f"{output}_cost": row[f"{output}_us"] / finest[f"{output}_us"], f"{name}_front": front}
+        for row in self.rows:
+            row |= {f"{output}_cost": row[f"{output}_us"] / finest[f"{output}_us"] for output in ("any", "contacts")}
         return self.rows
 
 

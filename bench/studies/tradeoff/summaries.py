@@ -5,7 +5,7 @@ import numpy as np
 from ...tables import pick
 
 SUMMED = ("poses", "meet", "missed", "invented", "hits", "faces_missed", "faces_invented")
-LARGEST = ("early_max", "late_max", "contact_max", "gap_max", "region_hausdorff_max")
+LARGEST = ("early_max", "late_max", "contact_max", "region_hausdorff_max")
 RATIOS = ("us", "cost", "build_s", "of_finest")
 RATIOS += ("any_cost", "contacts_cost", "node_tests_cost", "contacts_node_tests_cost")
 SHOWN_OFFSETS = (0.01, 0.1, 0.5)  # fractions of the faces

@@ -12,12 +12,11 @@ from warp_abtree.app.cli.report import check_output, print_json, print_table
 from warp_abtree.app.pictures.plots import draw_run
 from warp_abtree.app.pictures.render import import_pyvista
 from warp_abtree.app.pictures.scenes import draw_scene
-from warp_abtree.app.recording import Recording, record_run
+from warp_abtree.app.recording import Recording, record_run, recorded_clock
 from warp_abtree.app.styles import STAGE_LABELS
 from warp_abtree.app.toml.control import CONTROLLERS
 from warp_abtree.app.toml.folder import scene_names
 from warp_abtree.app.toml.scene_file import load_scene
-from warp_abtree.lod.timing import ReplayClock
 
 SUMMARY = "run a scene frame by frame and time its stages"
 EXAMPLES = (
@@ -64,7 +63,7 @@ def run(options, progress):
         if frames > recorded:
             raise ValueError(f"--frames: {options.scene} has {recorded} frames")
         asked: dict = {"controller": replay.settings.controller, "budget_ms": replay.settings.budget_ms}
-        asked["clock"] = ReplayClock(replay.rows)
+        asked["clock"] = recorded_clock(replay.rows)
     else:
         loaded = load_scene(options.scene, device=options.device, progress=progress, objects=options.objects)
         frames = loaded.frames if options.frames is None else options.frames

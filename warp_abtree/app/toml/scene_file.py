@@ -157,7 +157,7 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
     owners = _add_objects(path, scene, groups, models)
     loaded = SceneFile(
         path=path,
-        title=tables.scene.title or path.stem,
+        title=path.stem if tables.scene.title is None else tables.scene.title,
         text=text,
         objects=objects,
         frames=tables.scene.frames,

@@ -54,7 +54,7 @@ def terrain(extents, cells, bumps, waves, rim):
 
 
 def _thread(height, turn, pitch):
-    """Return the fraction of a thread's depth that stands at a height and a turn: 0 at the crest, 1 at the root."""
+    """Return the fraction of a thread's depth at a height and an angle: 0 at the crest, 1 at the root."""
     phase = height / pitch - turn / (2 * np.pi)
     return np.abs(2 * (phase - np.floor(phase)) - 1)
 

@@ -19,6 +19,7 @@ from msgspec.structs import replace
 
 from warp_abtree.app.toml.fields import (
     ORIGIN,
+    Cells,
     Copies,
     Count,
     Fraction,
@@ -31,7 +32,6 @@ from warp_abtree.app.toml.fields import (
     check_direction,
 )
 from warp_abtree.app.toml.model_tables import SHAPES
-from warp_abtree.app.toml.objects import OBJECT_LIMIT
 
 
 class HeadTable(Table):
@@ -87,12 +87,8 @@ class GridTable(Table):
     Along an axis of size 0 it grows from the position, layer by layer, with `count`.
     """
 
-    size: tuple[Annotated[int, Meta(ge=0, le=OBJECT_LIMIT)], ...]
+    size: tuple[Cells, Cells, Cells]
     spacing: Vector
-
-    def __post_init__(self):
-        if len(self.size) != 3:
-            raise ValueError("size: give three numbers")
 
 
 class RandomTable(Table):
@@ -197,7 +193,7 @@ class CameraKeyTable(Table, kw_only=True):
 
 
 class CameraTable(Table):
-    """[camera]: whom LODs are for; near, still objects come first. Give eye and target, or keys."""
+    """[camera]: the viewer that LODs are chosen for; near, still objects come first. Give eye and target, or keys."""
 
     eye: Vector | None = None
     target: Vector | None = None

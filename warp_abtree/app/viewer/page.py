@@ -283,7 +283,7 @@ class Page:
 
         @client.camera.on_update
         def _(camera):
-            # A camera that stands on what it looks at, as before its first frame, sees nothing.
+            # Before its first frame a camera has its eye at its target.
             try:
                 size = camera.image_width, camera.image_height
                 options = {"up": camera.up_direction, "field_of_view": float(camera.fov), "size": size}

@@ -82,7 +82,7 @@ def time_plot(rows, window: int = 0) -> dict:
     frames = np.array([row.frame for row in rows], np.float64)
     stages = np.array([[getattr(row, name) for row in rows] for name in STAGE_LABELS], np.float64)
     stages = stages.reshape(len(STAGE_LABELS), -1)
-    # Where there is no budget its line lies on the axis; NaN would leave the plot without a scale.
+    # Without a budget its line is on the axis; NaN would leave the plot without a scale.
     budgets = np.array([row.budget_ms or 0.0 for row in rows], np.float64)
     missing = max(window - len(rows), 0)
     frames = np.concatenate([np.arange(-missing, 0) + (rows[0].frame if rows else 0), frames])

@@ -23,7 +23,7 @@ def record_page(server, playback, path: Path, frames: int, progress=None):
     """Run a playback for some frames and write a page that plays them and needs no server.
 
     Args:
-        server: `viser.ViserServer` that nobody uses otherwise.
+        server: `viser.ViserServer` without clients.
         playback: `Playback` at its start.
         path: File to write; it appears whole or not at all.
         frames: How many.
@@ -39,7 +39,7 @@ def record_page(server, playback, path: Path, frames: int, progress=None):
         if not page.playing:
             raise RuntimeError(f"frame {page.snapshot.number} failed")
         if recorder is None:
-            # From here on the recorder hears every change; what stands already it takes as the start.
+            # From here on the recorder receives every change; the scene as it is becomes the start.
             recorder = server.get_scene_serializer()
         recorder.insert_sleep(playback.time_step)
         played += playback.time_step

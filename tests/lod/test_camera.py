@@ -95,11 +95,3 @@ def test_view_measures_distance_motion_and_focus(models, device):
         assert np.allclose(view.focus.numpy(), focus, atol=1e-9)
         before += sum(place is None for place in last)
     assert 0 < before < 8 * 40 and (alpha > 3.5).any() and 0 < np.mean(np.array(focus) > 0) < 1
-
-
-def test_a_selection_refuses_another_scene_than_it_was_made_for(models, device):
-    scene = strewn(models, 3, device)
-    view = View(scene)
-    scene.add(models[0])
-    with pytest.raises(RuntimeError, match="objects were added"):
-        view.launch()

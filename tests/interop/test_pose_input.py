@@ -113,41 +113,63 @@ def test_poses_that_are_refused(scene):
 
 
 def test_numpy_shares_memory():
-    for writable in (True, False):
-        rows = poses_of(7)
-        rows.setflags(write=writable)
-        shared = ab.wrap_array(rows)
-        assert shared.ptr == rows.ctypes.data and shared.dtype == wp.float64 and shared.shape == rows.shape
-    part = poses_of(8, 12)[::2]
-    assert ab.wrap_array(part).ptr == part.ctypes.data
-    assert np.array_equal(ab.wrap_array(part).numpy(), part)
-
-
-def test_numpy_poses():
+    rows, part = poses_of(7), poses_of(8, 12)[::2]
+    rows.setflags(write=False)
+    for given in (rows, part):
+        shared = ab.wrap_array(given)
+        assert shared.ptr == given.ctypes.data and shared.dtype == wp.float64 and shared.shape == given.shape
     scene = rings("cpu")
     poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
-    poses.launch(poses_of(9, 12)[::2])
-    assert_same(scene, query, poses_of(9, 12)[::2])
+    poses.launch(part)
+    assert_same(scene, query, part)
 
 
-def test_torch(scene):
+def torch_array(rows, device):
     torch = pytest.importorskip("torch")
-    place = wp.device_to_torch(scene.device)
-    rows = poses_of(10)
+    tensor = torch.tensor(rows, device=wp.device_to_torch(device), requires_grad=True)
+    return tensor, tensor.data_ptr(), wp.to_torch, lambda view: view.data_ptr()
+
+
+def jax_array(rows, device):
+    jax = pytest.importorskip("jax")
+    jax.config.update("jax_enable_x64", True)
+    try:
+        place = wp.device_to_jax(device)
+    except RuntimeError as error:  # a jax without this kind of device
+        pytest.skip(str(error))
+    array = jax.device_put(rows, place)
+    return array, array.unsafe_buffer_pointer(), wp.to_jax, lambda view: view.unsafe_buffer_pointer()
+
+
+def cupy_array(rows, device):
+    cupy = pytest.importorskip("cupy")
+    if not device.is_cuda:
+        pytest.skip("CuPy has no arrays on the CPU")
+    array = cupy.asarray(rows)
+    return array, array.data.ptr, cupy.from_dlpack, lambda view: view.data.ptr
+
+
+@pytest.mark.parametrize("framework", [torch_array, jax_array, cupy_array])
+def test_arrays_of_frameworks_share_memory(scene, framework):
     poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
-    for kind in (torch.float64, torch.float32):
-        tensor = torch.tensor(rows, dtype=kind, device=place, requires_grad=True)
-        assert ab.wrap_array(tensor).ptr == tensor.data_ptr()
-        poses.launch(tensor)
-        assert_same(scene, query, tensor.detach().cpu().numpy())
-    # Poses computed in place, results read in place.
+    for kind in (np.float64, np.float32):
+        rows = poses_of(10).astype(kind)
+        array, address, view_of, address_of = framework(rows, scene.device)
+        assert ab.wrap_array(array).ptr == address
+        poses.launch(array)
+        assert_same(scene, query, rows)
+    assert address_of(view_of(query.hits.any_hit)) == query.hits.any_hit.ptr
+
+
+def test_poses_and_results_in_place_in_torch(scene):
+    torch = pytest.importorskip("torch")
+    poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
     view = wp.to_torch(poses.poses)
     assert view.data_ptr() == poses.poses.ptr
     view.copy_(torch.tensor(poses_of(11)))
     poses.launch()
     assert_same(scene, query, poses_of(11))
     hit = wp.to_torch(query.hits.any_hit)
-    assert hit.data_ptr() == query.hits.any_hit.ptr
     assert int((hit[: int(query.pair_count.numpy()[0])] != 0).sum()) == int(expected(scene, poses_of(11)).any.sum())
     frame = ab.Pipeline(scene, output="count")
     wp.to_torch(frame.poses).copy_(torch.tensor(poses_of(12)))
@@ -159,33 +181,3 @@ def test_torch(scene):
     assert p0.shape == (4096, 3) and p0.data_ptr() == contacts.contacts.p0.ptr
     count = int(wp.to_torch(contacts.start)[-1])
     assert np.array_equal(p0[:count].cpu().numpy(), contacts.result().contacts["p0"]) and count > 0
-
-
-def test_jax(scene):
-    jax = pytest.importorskip("jax")
-    jax.config.update("jax_enable_x64", True)
-    try:
-        place = wp.device_to_jax(scene.device)
-    except RuntimeError as error:  # a jax without this kind of device
-        pytest.skip(str(error))
-    rows = poses_of(13)
-    poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
-    for kind in (np.float64, np.float32):
-        array = jax.device_put(rows.astype(kind), place)
-        assert ab.wrap_array(array).ptr == array.unsafe_buffer_pointer()
-        poses.launch(array)
-        assert_same(scene, query, np.asarray(array))
-    hit = wp.to_jax(query.hits.any_hit)
-    assert hit.unsafe_buffer_pointer() == query.hits.any_hit.ptr
-
-
-def test_cupy(scene):
-    cupy = pytest.importorskip("cupy")
-    if not scene.device.is_cuda:
-        pytest.skip("CuPy has no arrays on the CPU")
-    poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
-    array = cupy.asarray(poses_of(14))
-    assert ab.wrap_array(array).ptr == array.data.ptr
-    poses.launch(array)
-    assert_same(scene, query, poses_of(14))
-    assert cupy.from_dlpack(query.hits.any_hit).data.ptr == query.hits.any_hit.ptr

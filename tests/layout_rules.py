@@ -1,0 +1,266 @@
+"""Rules of the floor plan: each lists the breaks of one rule in a parsed source. Sources are read, not run."""
+
+import ast
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+# Each package may import itself, `checks`, kernels, and what stands in its row.
+CORE = ["checks", "model", "state", "query", "scene", "lod", "simulate"]
+MAY_IMPORT = {name: set(CORE[:place]) for place, name in enumerate(CORE)}
+MAY_IMPORT |= {"interop": set(CORE), "jobs": set(CORE), "app": {*CORE, "interop", "jobs"}}
+CORE_DEPENDENCIES = {"warp", "numpy", "trimesh", "warp_abtree"}
+# What users, benchmarks among them, may import beside public names.
+OPEN = {"checks", "testing"}
+PUBLIC_MAX, FILE_LINES, FOLDER_FILES, FUNCTION_LINES, ARGUMENTS, NATIVE_LINES, SNIPPET_LINES = (
+    32,
+    400,
+    12,
+    60,
+    10,
+    200,
+    15,
+)
+WARP_PRIVATE = {"_cls"}  # what tells a struct from other objects
+# Names of the old house and words made at home; the field's stand in their place (a word or a part of snake_case).
+BANNED = """asker carriers cover_piece crossing_faces dial hungry judge_budget judge_step left_open lodladder mailbox
+    patience peer peers rivals rub_point bounce_pair rung rungs send_home settle_hard settle_faces turned_in unsure
+    within_tenth wish""".split()
+
+PACKAGE = sorted(path for name in MAY_IMPORT for path in (ROOT / "warp_abtree" / name).rglob("*.py"))
+KERNELS = sorted((ROOT / "kernels").rglob("*.py"))
+NATIVE = sorted(path for path in (ROOT / "kernels").rglob("*") if path.suffix in (".h", ".cuh", ".cpp", ".cu"))
+USERS = sorted(path for folder in ("bench", "scenes") for path in (ROOT / folder).rglob("*.py"))
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
+FILES = [*PACKAGE, *KERNELS, *USERS, *TESTS]
+
+
+def parse(source):
+    return ast.parse(source.read_text(encoding="utf-8") if isinstance(source, Path) else source)
+
+
+def imports(tree, package):
+    """Yield every imported (module, name, line); name is None for `import module`, relative imports made absolute."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, None, node.lineno
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            module = ".".join([*parents, *([node.module] if node.module else [])])
+            for alias in node.names:
+                yield module, alias.name, node.lineno
+
+
+def package_of(path):
+    """Return the dotted package of a module of warp_abtree."""
+    return ".".join(path.relative_to(ROOT).parent.parts)
+
+
+def direction_faults(tree, package):
+    """List what a module imports of warp_abtree against the direction of the packages."""
+    faults = []
+    own = package.split(".")[1]
+    for module, name, line in imports(tree, package):
+        parts = module.split(".")
+        if parts[0] != "warp_abtree":
+            continue
+        if len(parts) == 1:
+            faults.append(f"line {line}: imports {name or module} of the package's root")
+        elif parts[1] not in {own, "kernels", *MAY_IMPORT[own]}:
+            faults.append(f"line {line}: {own} imports {parts[1]}")
+    return faults
+
+
+def hidden_import_faults(tree):
+    """List imports by a string of what is the project's own, and tests that import tests."""
+    faults = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("import_module", "__import__"):
+            if node.args and "warp_abtree" in ast.unparse(node.args[0]):
+                faults.append(f"line {node.lineno}: {ast.unparse(node)}")
+    for module, _, line in imports(tree, "x"):
+        if module.split(".")[-1].startswith("test_"):
+            faults.append(f"line {line}: imports {module}")
+        if module.split(".")[0] == "kernels":
+            faults.append(f"line {line}: import warp_abtree.kernels, or every kernel exists twice")
+    return faults
+
+
+def private_faults(tree):
+    """List private names of other modules and other objects; a class may use those of its own instances."""
+    own = {
+        node.name if isinstance(node, ast.FunctionDef) else node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+        or (isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in ("self", "cls"))
+    }
+    faults = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and re.match("_[a-z]", node.attr):
+            of = ast.unparse(node.value)
+            if of not in ("self", "cls", "super()", "os", "np") and node.attr not in own | WARP_PRIVATE:
+                faults.append(f"line {node.lineno}: {of}.{node.attr} is private")
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("warp_abtree"):
+            names = [alias.name for alias in node.names if re.match("_[a-z]", alias.name)]
+            faults += [f"line {node.lineno}: {name} of {node.module} is private" for name in names]
+    return faults
+
+
+def import_edges(path):
+    """Return the modules of warp_abtree that a module imports when it is itself imported."""
+    top = ast.Module([node for node in parse(path).body if isinstance(node, ast.Import | ast.ImportFrom)], [])
+    return {
+        found
+        for module, name, _ in imports(top, package_of(path))
+        if module.split(".")[0] == "warp_abtree"
+        for found in [f"{module}.{name}", module]
+    }
+
+
+def find_cycle(edges):
+    """Return modules that import one another in a circle, [] where there is none."""
+    done, trail = set(), []
+
+    def walk(module):
+        if module in trail:
+            return trail[trail.index(module) :]
+        if module in done or module not in edges:
+            return []
+        trail.append(module)
+        for other in sorted(edges[module] & edges.keys()):
+            if other != module and (found := walk(other)):
+                return found
+        done.add(trail.pop())
+        return []
+
+    return next((found for module in sorted(edges) if (found := walk(module))), [])
+
+
+def documented():
+    """Return the dotted names of the API reference."""
+    pages = (path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").rglob("*.md")))
+    return {name for page in pages for name in re.findall(r"^::: ([\w.]+)$", page, re.M)}
+
+
+def outside_faults(tree, public, package, known=frozenset()):
+    """List what a user of the library takes from it beyond its public names and the modules of the API reference."""
+    public, faults, aliases = {*public, *OPEN}, [], set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            aliases |= {alias.asname or "warp_abtree" for alias in node.names if alias.name == "warp_abtree"}
+    for module, name, line in imports(tree, package):
+        parts = module.split(".")
+        if parts[0] != "warp_abtree" or (len(parts) > 1 and parts[1] in OPEN) or {module, f"{module}.{name}"} & known:
+            continue
+        if len(parts) > 1 or (name is not None and name not in public):
+            faults.append(f"line {line}: {module}{'.' + name if name else ''} is not public")
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in aliases:
+            if node.attr not in public:
+                faults.append(f"line {node.lineno}: warp_abtree.{node.attr} is not public")
+    return faults
+
+
+def kernel_import_faults(tree):
+    """List imports of a kernel file that leave kernels/, or are relative."""
+    faults = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            faults.append(f"line {node.lineno}: relative import")
+    for module, name, line in imports(tree, "warp_abtree.kernels"):
+        inside = module.startswith("warp_abtree.kernels") or (module == "warp_abtree" and name == "kernels")
+        root = module.split(".")[0]
+        if not inside and root not in {"warp", "numpy"} and root not in sys.stdlib_module_names:
+            faults.append(f"line {line}: imports {module}")
+    return faults
+
+
+def is_kernel(function):
+    decorators = [node.func if isinstance(node, ast.Call) else node for node in function.decorator_list]
+    return any(ast.unparse(node) in ("wp.kernel", "warp.kernel", "kernel") for node in decorators)
+
+
+def kernel_faults(tree):
+    """List kernels that are misnamed, or whose outputs do not come last."""
+    faults = []
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.FunctionDef):
+            continue
+        if is_kernel(node) != node.name.endswith("_kernel"):
+            faults.append(f"{node.name}: kernels, and only kernels, are named *_kernel")
+        if not is_kernel(node):
+            continue
+        names = [argument.arg for argument in node.args.args]
+        group = [2 if name.endswith("_out") else 1 if name.endswith("_inout") else 0 for name in names]
+        if group != sorted(group):
+            faults.append(f"{node.name}: arguments {names} are not in the order inputs, _inout, _out")
+    return faults
+
+
+def size_faults(tree, text):
+    """List functions that are too long or take too many arguments, and a file that is too long."""
+    count = len(text.splitlines())
+    faults = [f"{count} lines"] if count > FILE_LINES else []
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.FunctionDef):
+            continue
+        lines = node.end_lineno - node.lineno + 1
+        if lines > FUNCTION_LINES:
+            faults.append(f"{node.name}: {lines} lines")
+        names = [argument.arg for argument in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+        taken = [name for name in names if name not in ("self", "cls")]
+        if len(taken) > ARGUMENTS and not grouped(node, text):
+            faults.append(f"{node.name}: {len(taken)} arguments")
+    return faults
+
+
+def grouped(function, text):
+    """Return whether a signature marks the groups of its arguments, as kernels and their functions may."""
+    signature = text.splitlines()[function.lineno - 1 : function.body[0].lineno - 1]
+    return {"# static", "# state"} <= {line.strip() for line in signature}
+
+
+def struct_faults(tree, text):
+    """List fields of kernel structs without a comment beside or above them, and packed words without a diagram."""
+    faults, lines = [], text.splitlines()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef) and any("struct" in ast.unparse(mark) for mark in node.decorator_list):
+            for field in node.body:
+                if isinstance(field, ast.AnnAssign):
+                    above = lines[field.lineno - 2].strip()
+                    if "#" not in lines[field.lineno - 1] and not above.startswith("#"):
+                        faults.append(f"line {field.lineno}: {node.name}.{field.target.id} has no comment")
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("pack_"):
+            if not re.search(r"^ *\[.*\|.*\]", text, re.M):
+                faults.append(f"{node.name}: no bit diagram in its file")
+    return faults
+
+
+def snippet_faults(tree):
+    """List strings that hold more native code than a few lines."""
+    faults = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            code = [line for line in node.value.splitlines() if re.search(r"[;{}]\s*(//.*|\\)?$", line)]
+            if len(code) > SNIPPET_LINES:
+                faults.append(f"line {node.lineno}: {len(code)} lines of native code")
+    return faults
+
+
+def banned_faults(tree):
+    """List identifiers that hold a word of the old house."""
+    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    names |= {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    names |= {node.arg for node in ast.walk(tree) if isinstance(node, ast.arg)}
+    names |= {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    banned = re.compile(rf"(^|_)({'|'.join(BANNED)})(_|$)")
+    return sorted(name for name in names if banned.search(name.lower()))
+
+
+def public_names():
+    for node in parse(ROOT / "warp_abtree" / "__init__.py").body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            return ast.literal_eval(node.value)
+    return []
