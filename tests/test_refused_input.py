@@ -66,14 +66,6 @@ def status_of(capsys, *words):
     return status, capsys.readouterr().err.splitlines()
 
 
-@pytest.mark.parametrize("count", ["0", "1.5", "x"])
-@pytest.mark.parametrize("command", ["run", "view", "picture"])
-def test_a_number_of_objects_on_the_command_line(capsys, command, count):
-    more = ["--out", "x.png"] if command == "picture" else []
-    status, lines = status_of(capsys, command, "rain", *more, "--objects", count)
-    assert status == 2 and len(lines) == 1 and f"--objects: '{count}' is no whole number" in lines[0]
-
-
 @pytest.mark.parametrize("words", ["nosuch", "--device cpu nosuch", "query --nosuch", "--device cpu paper"], ids=str)
 def test_a_benchmark_that_there_is_not(capsys, words):
     pytest.importorskip("bench")

@@ -22,18 +22,10 @@ EMPTY = ((math.inf,) * 3, (-math.inf,) * 3)
 
 @dataclass
 class Progressive:
-    """A progressive mesh as plain lists; n_v original vertices, n_f faces, m merges.
+    """A progressive mesh as plain lists, by the definitions of the library's.
 
-    Merge j makes vertex node n_v + j. `lod` counts vertex splits from the base mesh, so m is the original, and
-    merge j is the one that takes lod m - j to m - j - 1.
-
-    Fields:
-        vertex_parent: Parent of each vertex node, -1 at a root, length n_v + m.
-        vertex_pos: Position of each vertex node [model units], length n_v + m.
-        face_vertex: Original corners of each face, length n_f.
-        face_split: Face f is active iff lod >= face_split[f], length n_f; m + 1 for a face that is never active.
-        split_start: Slice i of split_face is split_start[i] .. split_start[i+1], length m + 1.
-        split_face: Faces that the split from lod i to i + 1 inserts or deforms.
+    `lod` counts vertex splits from the base mesh. Face f is active iff lod >= face_split[f]; slice i of split_face holds
+    the faces that the split from lod i to i + 1 inserts or deforms.
     """
 
     vertex_parent: list
@@ -138,12 +130,7 @@ class ABTree:
                 stack += [node.right, node.left]
 
     def flat(self):
-        """Heap-indexed copy of the state, for comparison with flat arrays.
-
-        Returns:
-            Dict of NumPy arrays: status int8 [size], lower and upper float32 [size, 3], skip int32 [size] (-1: none),
-            face_node int32 [n_f]. size is 2^(depth+1); a number without a node reads as inactive.
-        """
+        """Return the state as flat arrays by heap index, of length 2^(depth+1); without a node, a number is inactive."""
         numbered = {node.number: node for node in self.nodes()}
         size = 2 << (max(numbered).bit_length() - 1)
         state = {

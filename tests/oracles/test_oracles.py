@@ -43,49 +43,27 @@ def test_known_answers_in_every_vertex_order(case):
     one, other, meets = KNOWN[case]
     for p, q in itertools.product(itertools.permutations(one), itertools.permutations(other)):
         for a, b in ((p, q), (q, p)):
-            assert triangle.triangles_intersect(a, b) is bool(triangle.shared_polygon(a, b)) is meets
-
-
-def flat_pairs(rng, count):
-    """Two triangles in one oblique plane, with coordinates that stay exact."""
-    u, v, origin = (rng.integers(-(2**20), 2**20, (count, 1, 1, 3)).astype(float) for _ in range(3))
-    s, t = (rng.integers(-3, 4, (count, 2, 3, 1)).astype(float) for _ in range(2))
-    return (u * s + v * t + origin) * 2.0**-21
-
-
-def near_pairs(rng, count):
-    """Triangles that touch in a float, as near as floats come: the second is spanned by the first, then nudged."""
-    a = rng.normal(size=(count, 3, 3))
-    weight = rng.choice([0, 0, 0.25, 0.5, 1, -0.5], (count, 3, 3))
-    weight[:, :, 2] = 1 - weight[:, :, 0] - weight[:, :, 1]
-    b = (weight[:, :, :, None] * a[:, None]).sum(2)
-    b += rng.choice([0, 0, 0, 1], (count, 3, 1)) * rng.normal(size=(count, 3, 3))
-    b = np.where(rng.random(b.shape) < 0.5, b, np.nextafter(b, rng.choice([-9.0, 9.0], b.shape)))
-    return np.stack([a, b], 1)
+            assert triangle.triangles_intersect(a, b) is meets
 
 
 def adversarial_pairs():
-    """Pairs on a tiny lattice, which share, touch and are flat; coplanar, near, of many binades, and random ones."""
+    """Pairs on a tiny lattice, which share, touch and are flat; and pairs that touch, or nearly so, in a float."""
     rng = np.random.default_rng(1)
-    lattice = rng.integers(0, 3, (900, 2, 3, 3)).astype(float)
-    wide = np.ldexp(rng.uniform(-1, 1, (400, 2, 3, 3)), rng.integers(-180, 3, (400, 2, 3, 3)))
-    wide = np.where(rng.random(wide.shape) < 0.3, 0.0, wide)
-    return np.concatenate([lattice, flat_pairs(rng, 700), near_pairs(rng, 900), wide, rng.normal(size=(500, 2, 3, 3))])
+    a = rng.normal(size=(2000, 3, 3))
+    weight = rng.choice([0, 0, 0.25, 0.5, 1, -0.5], (2000, 3, 3))
+    weight[:, :, 2] = 1 - weight[:, :, 0] - weight[:, :, 1]
+    b = (weight[:, :, :, None] * a[:, None]).sum(2)
+    b += rng.choice([0, 0, 0, 1], (2000, 3, 1)) * rng.normal(size=(2000, 3, 3))
+    b = np.where(rng.random(b.shape) < 0.5, b, np.nextafter(b, rng.choice([-9.0, 9.0], b.shape)))
+    return np.concatenate([rng.integers(0, 3, (1000, 2, 3, 3)).astype(float), np.stack([a, b], 1)])
 
 
-@pytest.mark.slow
-def test_integers_agree_with_fractions():
+def test_either_triangle_clips_the_other_and_the_filter_rejects_only_what_is_apart():
     pairs = adversarial_pairs()
-    answers = [triangle.triangles_intersect(a, b) for a, b in pairs]
-    assert answers == [bool(triangle.shared_polygon(a, b)) for a, b in pairs]
-    assert 0.3 < np.mean(answers) < 0.8  # both answers are well represented
-
-
-def test_filter_rejects_only_what_is_apart():
-    pairs = np.concatenate([adversarial_pairs(), near_pairs(np.random.default_rng(7), 6000)])
+    answers = np.array([triangle.triangles_intersect(a, b) for a, b in pairs])
+    assert answers.tolist() == [triangle.triangles_intersect(b, a) for a, b in pairs]
     rejected = triangle.provably_apart(pairs[:, 0], pairs[:, 1])
-    assert rejected.any()
-    assert not any(triangle.triangles_intersect(a, b) for a, b in pairs[rejected])
+    assert rejected.any() and not answers[rejected].any() and 0.3 < answers.mean() < 0.8
 
 
 def test_brute_force_equals_the_exact_test_of_every_pair():

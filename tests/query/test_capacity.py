@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from conftest import slow
 from helpers.faults import MORE_PAIRS, PAIRS, check_scene, describe, make_scene
-from helpers.gpu_query import GpuQuery
+from helpers.questions import GpuQuery
 from helpers.samples import sample
 
 import warp_abtree as ab

@@ -77,7 +77,7 @@ def test_ends_and_normals_equal_exact_clipping(device, case):
     for row in rows[np.random.default_rng(0).permutation(len(rows))[:120]]:
         a = triangles(models[0], row["faces"][0])
         b = into_frame_of_a(triangles(models[1], row["faces"][1]), STILL, pose)
-        polygon = np.array(shared_polygon(a, b), float)
+        polygon = shared_polygon(a, b)
         room = 4e-12 * max(np.ptp(a, axis=0).max(), np.ptp(b, axis=0).max()) + 1e-15 * np.abs([a, b]).max()
         for end in (row["p0"], row["p1"]):
             assert np.linalg.norm(polygon - end, axis=1).min() <= room
@@ -189,56 +189,46 @@ def test_powers_of_two_scale_every_bit(device):
 # Known cases.
 
 
-def one_pair(device, a, b):
-    """The only contact of one triangle with another; each model has one face."""
-    scene = ab.Scene(device)
-    for corners in (a, b):
-        scene.add(ab.Model.from_arrays(np.array(corners, float), [[0, 1, 2]]))
-    result = contacts_of(scene)
-    check_fields(result)
-    assert len(result.contacts) == 1
-    return result.contacts[0], result.pair_contacts[0]
+FLOOR, ROD = [(0, 0, 0), (2, 0, 0), (0, 2, 0)], [(0, 0, 0), (1, 0, 0), (2, 0, 0)]
+# Two faces, the ends of their contact, its normal, and whether they are coplanar.
+KNOWN = {
+    "across": (FLOOR, [(0.5, 0.5, -1), (0.5, 0.5, 1), (1.5, 0.5, 1)], [(0.5, 0.5, 0), (1, 0.5, 0)], (0, -1, 1), False),
+    "a corner shared": (FLOOR, [(2, 0, 0), (4, 0, 1), (4, 0, -1)], [(2, 0, 0)] * 2, None, False),
+    "opposite windings": (FLOOR, [(0, 0, 0), (0, 2, 0), (2, 0, 0)], [(2, 0, 0), (0, 2, 0)], (0, 0, 1), True),
+    "a segment through": (FLOOR, [(0.5, 0.5, z) for z in (-1, 0, 1)], [(0.5, 0.5, 0)] * 2, (0, 0, 1), False),
+    "a segment in the plane": (
+        FLOOR,
+        [(x, 0.5, 0) for x in (-1, 1, 3)],
+        [(0, 0.5, 0), (1.5, 0.5, 0)],
+        (0, 0, 1),
+        False,
+    ),
+    # Faces without area have no normals; the contact's points from one centre to the other.
+    "segments across": (ROD, [(0.5, y, 0) for y in (-1, 1, 3)], [(0.5, 0, 0)] * 2, (-0.5, 1, 0), False),
+    "segments along": (ROD, [(1.5, 0, 0), (2, 0, 0), (4, 0, 0)], [(1.5, 0, 0), (2, 0, 0)], (1, 0, 0), False),
+}
 
 
-FLOOR = [(0, 0, 0), (2, 0, 0), (0, 2, 0)]
-
-
-@pytest.mark.parametrize(
-    "other, ends, normal, coplanar",
-    [
-        ([(0.5, 0.5, -1), (0.5, 0.5, 1), (1.5, 0.5, 1)], [(0.5, 0.5, 0), (1, 0.5, 0)], (0, -1, 1), False),
-        ([(2, 0, 0), (4, 0, 1), (4, 0, -1)], [(2, 0, 0)] * 2, None, False),  # a corner shared
-        ([(0, 0, 0), (2, 0, 0), (0, 0, 2)], [(0, 0, 0), (2, 0, 0)], None, False),  # an edge shared
-        ([(0, 0, 0), (0, 2, 0), (2, 0, 0)], [(2, 0, 0), (0, 2, 0)], (0, 0, 1), True),  # opposite windings
-        ([(1, 1, 0), (3, 1, 0), (1, 3, 0)], [(1, 1, 0)] * 2, (0, 0, 1), True),  # coplanar, touching in a point
-        ([(0.5, 0.5, -1), (0.5, 0.5, 0), (0.5, 0.5, 1)], [(0.5, 0.5, 0)] * 2, (0, 0, 1), False),  # a segment through
-        ([(-1, 0.5, 0), (1, 0.5, 0), (3, 0.5, 0)], [(0, 0.5, 0), (1.5, 0.5, 0)], (0, 0, 1), False),  # one in the plane
-    ],
-)
-def test_two_faces(device, other, ends, normal, coplanar):
-    for a, b, sign in ((FLOOR, other, 1), (other, FLOOR, -1)):
-        contact, summed = one_pair(device, a, b)
+@pytest.mark.parametrize("case", KNOWN)
+def test_known_faces(device, case):
+    one, other, ends, normal, coplanar = KNOWN[case]
+    for a, b, sign in ((one, other, 1), (other, one, -1)):
+        scene = ab.Scene(device)
+        for corners in (a, b):
+            scene.add(ab.Model.from_arrays(np.array(corners, float), [[0, 1, 2]]))
+        result = contacts_of(scene)
+        check_fields(result)
+        (contact,), (summed,) = result.contacts, result.pair_contacts
         got = sorted(map(tuple, (contact["p0"], contact["p1"])))
         np.testing.assert_allclose(got, sorted(ends), atol=1e-15)
         assert contact["coplanar"] == coplanar
+        assert one is FLOOR or not (contact["normal_a"].any() or contact["normal_b"].any())
         np.testing.assert_allclose(summed["point"], np.mean(ends, 0), atol=1e-15)
         if normal is not None:
             # Faces that look the same way: the normal is the lower object's, whichever it is.
-            turn = 1 if np.allclose(contact["normal_a"], contact["normal_b"]) else sign
-            np.testing.assert_allclose(contact["normal"], turn * np.array(normal) / np.linalg.norm(normal), atol=1e-15)
-
-
-def test_two_segments(device):
-    """Faces without area have no normals; the contact's points from one centre to the other."""
-    for other, ends in (
-        ([(0.5, -1, 0), (0.5, 1, 0), (0.5, 3, 0)], [(0.5, 0, 0)] * 2),
-        ([(1.5, 0, 0), (2, 0, 0), (4, 0, 0)], [(1.5, 0, 0), (2, 0, 0)]),
-    ):
-        contact, _ = one_pair(device, [(0, 0, 0), (1, 0, 0), (2, 0, 0)], other)
-        np.testing.assert_array_equal(sorted(map(tuple, (contact["p0"], contact["p1"]))), ends)
-        assert not contact["normal_a"].any() and not contact["normal_b"].any() and not contact["coplanar"]
-        direction = (np.min(other, 0) + np.max(other, 0)) / 2 - [1, 0, 0]
-        np.testing.assert_allclose(contact["normal"], direction / np.linalg.norm(direction), atol=1e-6)
+            same_way = contact["normal_a"].any() and np.allclose(contact["normal_a"], contact["normal_b"])
+            wanted = (1 if same_way else sign) * np.array(normal) / np.linalg.norm(normal)
+            np.testing.assert_allclose(contact["normal"], wanted, atol=1e-15 if one is FLOOR else 1e-6)
 
 
 def test_boxes(device):

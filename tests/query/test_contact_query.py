@@ -160,11 +160,10 @@ def test_a_graph_takes_poses_to_contacts(device, given):
     scene, pairs = touching(device)
     if not given and not scene.device.is_cuda:
         pytest.skip("a tree of boxes is built anew in CUDA graphs only")
-    capacity = 60000 if given else 500000
-    query = ab.ContactQuery(scene, pairs if given else None, capacity=ab.Buffers(capacity, pairs=400))
-    query.launch()
-    rng = np.random.default_rng(3)
+    capacity = ab.Buffers(60_000 if given else 500_000, pairs=400)
+    query, rng = ab.ContactQuery(scene, pairs if given else None, capacity=capacity), np.random.default_rng(3)
     for recapture in range(2):
+        query.launch()
         with wp.ScopedCapture(query.device) as capture:
             query.launch()
         for _ in range(3):
@@ -178,10 +177,8 @@ def test_a_graph_takes_poses_to_contacts(device, given):
             check_device_arrays(query, result)
             same(result, scene.intersect(result.pairs, output="contacts"))
         if given and not recapture:
-            pairs = np.concatenate([pairs, pairs[::-1, ::-1]])
-            query.set_pairs(pairs)
-        query.resize(capacity + 10000)
-        query.launch()
+            query.set_pairs(np.concatenate([pairs, pairs[::-1, ::-1]]))
+        query.resize(capacity.hits + 10_000)
 
 
 # What is asked for, and what is refused.

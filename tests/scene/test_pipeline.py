@@ -54,21 +54,6 @@ def test_random_walk_in_a_graph(device):
     assert kinds.count(True) > 30 and kinds.count(False) > 150
 
 
-def test_random_walk_of_real_meshes(device):
-    rng = np.random.default_rng(2)
-    scene = add_objects(device, ["cow", "fcl-env", "cow"], spread=3.0)
-    frame = ab.Pipeline(scene)
-    launch, top = replay(frame), tops(scene)
-    for _ in range(4):
-        for _ in range(3):
-            lods = (top * rng.choice([0.0, 0.1, 0.5, 0.9, 1.0], 3)).astype(int) + rng.integers(-30, 31, 3)
-            set_lods(frame, np.clip(lods, 0, top))
-            launch()
-            frame.check()
-        scene.set_lods(np.clip(lods, 0, top))
-        check_states(frame, scene)
-
-
 def test_all_states_at_the_crossover(device, monkeypatch):
     """Worklists hold the longest slices that are not refitted whole, of all states at once; few threads take turns."""
     monkeypatch.setattr(work_lists, "THREADS_AT_ONCE", 1)
@@ -201,20 +186,15 @@ def test_the_start_is_the_scene(device):
 # What it costs.
 
 
-def count_launches(monkeypatch, call):
+def count_launches(monkeypatch, frame):
     launched, launch = [], wp.launch
-
-    def record(kernel, *args, **options):
-        launched.append(kernel.key)
-        launch(kernel, *args, **options)
-
     with monkeypatch.context() as patch:
-        patch.setattr(wp, "launch", record)
-        call()
-    return launched
+        patch.setattr(wp, "launch", lambda *args, **options: (launched.append(1), launch(*args, **options)))
+        frame.capture()
+    return len(launched)
 
 
-@pytest.mark.parametrize("name, levels", [("five", 4), ("small ball", 10), ("torus", 12)])
+@pytest.mark.parametrize("name, levels", [("five", 4), ("torus", 12)])
 def test_launches_of_a_frame(device, monkeypatch, name, levels):
     """As many as the docstring states, however many objects there are and whatever they do."""
     narrow = 4 if wp.get_device(device).is_cuda else 2
@@ -222,11 +202,9 @@ def test_launches_of_a_frame(device, monkeypatch, name, levels):
         scene = add_objects(device, [name] * count)
         large = sum(count << level > 1024 for level in range(levels))  # nodes of all states on a level
         for options, own in (({}, 6 + large), ({"ladder": [[0, 1]]}, 1)):
-            frame = ab.Pipeline(scene, "count", **options)
-            launched = count_launches(monkeypatch, frame.capture)
-            assert len(launched) == 1 + own + 2 + narrow + 1
+            assert count_launches(monkeypatch, ab.Pipeline(scene, "count", **options)) == 1 + own + 2 + narrow + 1
             frame = ab.Pipeline(scene, "count", pairs=[(0, 1)], within=1.0, **options)
-            assert len(count_launches(monkeypatch, frame.capture)) == 1 + own + narrow + 2 + 1
+            assert count_launches(monkeypatch, frame) == 1 + own + narrow + 2 + 1
 
 
 def test_a_frame_waits_for_nothing(device, monkeypatch):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
-from helpers.gpu_query import GpuQuery
+from helpers.questions import GpuQuery
 from helpers.samples import SHAPES, STILL, random_poses, sample
 
 import warp_abtree as ab
@@ -227,8 +227,7 @@ def test_two_threads(device):
 
 
 def test_threads_take_turns_on_a_gpu_alone():
-    gpus = [SimpleNamespace(is_cuda=True, alias=f"cuda:{i}") for i in (98, 98, 99)]
-    cpu = SimpleNamespace(is_cuda=False, alias="cpu")
+    first, same, other = (SimpleNamespace(is_cuda=True, alias=f"cuda:{i}") for i in (98, 98, 99))
 
     def enters(device):
         """Whether another thread has a turn at once while this one has one on the first GPU."""
@@ -238,7 +237,7 @@ def test_threads_take_turns_on_a_gpu_alone():
             with device_lock(device):
                 entered.set()
 
-        with device_lock(gpus[0]), device_lock(gpus[0]):  # within its own turn a thread may ask again
+        with device_lock(first), device_lock(first):  # within its own turn a thread may ask again
             thread = threading.Thread(target=work)
             thread.start()
             at_once = entered.wait(0.2)
@@ -246,4 +245,4 @@ def test_threads_take_turns_on_a_gpu_alone():
         assert entered.is_set()
         return at_once
 
-    assert not enters(gpus[1]) and enters(gpus[2]) and enters(cpu)
+    assert not enters(same) and enters(other) and enters(SimpleNamespace(is_cuda=False, alias="cpu"))

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 import warp as wp
-from helpers.gpu_query import GpuQuery
+from helpers.questions import GpuQuery
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
