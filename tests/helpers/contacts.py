@@ -3,7 +3,6 @@
 from fractions import Fraction
 
 import numpy as np
-import trimesh
 from oracles.triangle import cross, dot, sub
 
 CHUNK = 32  # contacts that are summed from left to right before sums are; part of the definition
@@ -31,19 +30,6 @@ def unit(v):
         return np.zeros(3)
     v = np.array([float(x / scale) for x in v])
     return v / np.linalg.norm(v)
-
-
-def distance(corners, p):
-    """Distance of a point from a triangle, by trimesh, or from the nearest edge where it has no area."""
-    best = np.inf
-    for a, b in zip(corners, np.roll(corners, 1, 0), strict=True):
-        d = b - a
-        t = np.clip((p - a) @ d / (d @ d), 0, 1) if d @ d > 0 else 0.0
-        best = min(best, np.linalg.norm(a + t * d - p))
-    n = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    if n @ n > 0:
-        best = min(best, np.linalg.norm(trimesh.triangles.closest_point(corners[None], p[None])[0] - p))
-    return best
 
 
 # Sums over an object pair's contacts in their stated order, in plain Python.

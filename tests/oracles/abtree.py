@@ -24,8 +24,8 @@ EMPTY = ((math.inf,) * 3, (-math.inf,) * 3)
 class Progressive:
     """A progressive mesh as plain lists, by the definitions of the library's.
 
-    `lod` counts vertex splits from the base mesh. Face f is active iff lod >= face_split[f]; slice i of split_face holds
-    the faces that the split from lod i to i + 1 inserts or deforms.
+    `lod` counts vertex splits from the base mesh. Face f is active iff lod >= face_split[f]; slice i of split_face
+    lists the faces that the split from lod i to i + 1 inserts or deforms.
     """
 
     vertex_parent: list
@@ -130,7 +130,7 @@ class ABTree:
                 stack += [node.right, node.left]
 
     def flat(self):
-        """Return the state as flat arrays by heap index, of length 2^(depth+1); without a node, a number is inactive."""
+        """Return the state as arrays by heap index, of length 2^(depth+1); numbers without a node are inactive."""
         numbered = {node.number: node for node in self.nodes()}
         size = 2 << (max(numbered).bit_length() - 1)
         state = {

@@ -70,9 +70,8 @@ def test_overflow_names_the_demand(crowd, kind):
         assert named_demand(room) == demand
     query = operator(crowd, **options, capacity=ab.Buffers(**{**ample, name: demand}))
     query.launch()
-    result = query.result()
-    result.check()
-    assert len(result.faces) == len(whole.faces)
+    query.result().check()
+    assert len(query.result().faces) == len(whole.faces)
 
 
 LARGEST = 2**31 - 1
