@@ -5,7 +5,7 @@ import warp as wp
 from warp_abtree.kernels.arrays import ACTIVE, INACTIVE, ModelPool, StatePool, load_vertex
 from warp_abtree.kernels.traversal.boxes import round_down_vec, round_up_vec
 from warp_abtree.kernels.traversal.nodes import Node, empty_node, load_node, store_node
-from warp_abtree.kernels.update.work_lists import UpdateLists
+from warp_abtree.kernels.update.work_lists import UpdateLists, find_update
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -92,11 +92,7 @@ def refit_level(
 
 @wp.kernel
 def refit_level_kernel(step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdateLists, states_inout: StatePool):
-    """Refit what an update asks for on one level.
-
-    Args:
-        step: Threads of this launch.
-    """
+    """Refit what an update asks for on one level."""
     refit_level(wp.tid(), step, level, models, plan, states_inout)
 
 
@@ -110,11 +106,7 @@ def block_sync(): ...
 
 @wp.kernel
 def refit_top_kernel(step: wp.int32, levels: wp.int32, models: ModelPool, plan: UpdateLists, states_inout: StatePool):
-    """Refit what an update asks for on so many levels from the root on, deepest first: one block for all of them.
-
-    Args:
-        step: Threads of this launch, which are one block.
-    """
+    """Refit what an update asks for on so many levels from the root on, deepest first: one block for all of them."""
     level = levels - 1
     while level >= 0:
         refit_level(wp.tid(), step, level, models, plan, states_inout)
@@ -129,18 +121,10 @@ def copy_node_kernel(
     target_state: wp.array(dtype=wp.int32),
     states_inout: StatePool,
 ):
-    """Copy the nodes of whole states.
-
-    Args:
-        node_end: Running total of node counts, shape [copy_count].
-    """
-    tid = wp.tid()
-    u = wp.lower_bound(node_end, tid + 1)
-    begin = wp.int32(0)
-    if u > 0:
-        begin = node_end[u - 1]
-    source = states_inout.node_start[source_state[u]] + tid - begin
-    target = states_inout.node_start[target_state[u]] + tid - begin
+    """Copy the nodes of whole states, given the running total of their counts."""
+    u, i = find_update(node_end, node_end.shape[0], wp.tid())
+    source = states_inout.node_start[source_state[u]] + i
+    target = states_inout.node_start[target_state[u]] + i
     states_inout.node_status[target] = states_inout.node_status[source]
     store_node(states_inout, target, load_node(states_inout, source))
 
@@ -152,16 +136,8 @@ def copy_face_kernel(
     target_state: wp.array(dtype=wp.int32),
     states_inout: StatePool,
 ):
-    """Copy the face corners of whole states.
-
-    Args:
-        face_end: Running total of face counts, shape [copy_count].
-    """
-    tid = wp.tid()
-    u = wp.lower_bound(face_end, tid + 1)
-    begin = wp.int32(0)
-    if u > 0:
-        begin = face_end[u - 1]
-    source = states_inout.face_start[source_state[u]] + tid - begin
-    target = states_inout.face_start[target_state[u]] + tid - begin
+    """Copy the face corners of whole states, given the running total of their counts."""
+    u, i = find_update(face_end, face_end.shape[0], wp.tid())
+    source = states_inout.face_start[source_state[u]] + i
+    target = states_inout.face_start[target_state[u]] + i
     states_inout.face_corner[target] = states_inout.face_corner[source]
