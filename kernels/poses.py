@@ -1,9 +1,9 @@
 """Poses of objects, and the pose of one object in the frame of another, with margins that cover all rounding.
 
-The margin of boxes covers every rounding between the exact x' of B's vertices and the float32 box test, its float64 part
-x' itself and the shift between centres, and `skew` a rotation that is not orthonormal to the last bit, on whose columns
-B's axes are taken: docs/exactness.md has the terms. A gap along a unit axis is a distance, so `within` adds to the
-margin; a column is longer than 1 by at most `skew`.
+The margin of boxes covers every rounding between the exact x' of B's vertices and the float32 box test, its float64
+part x' itself and the shift between centres, and `skew` a rotation that is not orthonormal to the last bit, on whose
+columns B's axes are taken: docs/exactness.md has the terms. A gap along a unit axis is a distance, so `within` adds to
+the margin; a column is longer than 1 by at most `skew`.
 """
 
 import warp as wp

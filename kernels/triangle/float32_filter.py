@@ -3,8 +3,8 @@
 It comes in two parts: planes separate most face pairs; only of those that straddle both planes, edges are compared.
 Source: as `intersect_triangles`.
 
-Coordinates are about A's centre, scaled to about unit size; differences of corners are off by less than `error`, and the
-arithmetic of a determinant by `unit` of its size. docs/exactness.md proves the bound. With both 0 every sign is the
+Coordinates are about A's centre, scaled to about unit size; differences of corners are off by less than `error`, and
+the arithmetic of a determinant by `unit` of its size. docs/exactness.md proves the bound. With both 0 every sign is the
 computed one.
 
 `simd.simd_float32_filter` is the same for 16 pairs at a time: what changes here changes there, and tests compare them.

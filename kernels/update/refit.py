@@ -5,7 +5,7 @@ import warp as wp
 from warp_abtree.kernels.arrays import ACTIVE, INACTIVE, ModelPool, StatePool, load_vertex
 from warp_abtree.kernels.traversal.boxes import round_down_vec, round_up_vec
 from warp_abtree.kernels.traversal.nodes import Node, empty_node, load_node, store_node
-from warp_abtree.kernels.update.work_lists import UpdateLists, find_update
+from warp_abtree.kernels.update.work_lists import UpdateLists
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -122,9 +122,13 @@ def copy_node_kernel(
     states_inout: StatePool,
 ):
     """Copy the nodes of whole states, given the running total of their counts."""
-    u, i = find_update(node_end, node_end.shape[0], wp.tid())
-    source = states_inout.node_start[source_state[u]] + i
-    target = states_inout.node_start[target_state[u]] + i
+    tid = wp.tid()
+    u = wp.lower_bound(node_end, tid + 1)
+    begin = wp.int32(0)
+    if u > 0:
+        begin = node_end[u - 1]
+    source = states_inout.node_start[source_state[u]] + tid - begin
+    target = states_inout.node_start[target_state[u]] + tid - begin
     states_inout.node_status[target] = states_inout.node_status[source]
     store_node(states_inout, target, load_node(states_inout, source))
 
@@ -137,7 +141,11 @@ def copy_face_kernel(
     states_inout: StatePool,
 ):
     """Copy the face corners of whole states, given the running total of their counts."""
-    u, i = find_update(face_end, face_end.shape[0], wp.tid())
-    source = states_inout.face_start[source_state[u]] + i
-    target = states_inout.face_start[target_state[u]] + i
+    tid = wp.tid()
+    u = wp.lower_bound(face_end, tid + 1)
+    begin = wp.int32(0)
+    if u > 0:
+        begin = face_end[u - 1]
+    source = states_inout.face_start[source_state[u]] + tid - begin
+    target = states_inout.face_start[target_state[u]] + tid - begin
     states_inout.face_corner[target] = states_inout.face_corner[source]
