@@ -44,7 +44,7 @@ def to_jax(values, device):
 def to_transforms(values, device):
     """Return an array of Warp's transforms, of what is shaped like them, with gaps between them."""
     kinds = {np.dtype(np.float32): wp.transformf, np.dtype(np.float64): wp.transformd}
-    options = {"dtype": kinds[values.dtype]} if values.shape[1:] == (7,) else {}
+    options = {"dtype": kinds[values.dtype]} if values.shape[1:] == (7,) and values.dtype in kinds else {}
     return wp.array(np.repeat(values, 2, 0), device=device, **options)[::2]
 
 
