@@ -40,13 +40,10 @@ def write_scene(tmp_path, text=SCENE):
 # Scene files and the command line.
 
 
-@pytest.mark.parametrize("count", [0, -1, 1.5, 2.0, "x", True, np.int32(0), np.nan])
-def test_a_number_of_objects_is_whole_and_above_0(tmp_path, count):
-    with pytest.raises(ValueError, match=r"^objects [^\n]*$"):
-        load_scene(write_scene(tmp_path), device="cpu", objects=count)
-
-
-def test_a_number_of_objects_of_numpy(tmp_path):
+def test_a_number_of_objects_is_whole_and_above_0(tmp_path):
+    for count in (0, 1.5, "x", True, np.nan):
+        with pytest.raises(ValueError, match=r"^objects [^\n]*$"):
+            load_scene(write_scene(tmp_path), device="cpu", objects=count)
     loaded = load_scene(write_scene(tmp_path), device="cpu", objects=np.int64(5))
     assert loaded.scene.object_count == 5 and type(loaded.objects) is int
 
@@ -69,17 +66,7 @@ def status_of(capsys, *words):
     return status, capsys.readouterr().err.splitlines()
 
 
-@pytest.mark.parametrize("count", ["0", "-1", "1.5", "x"])
-@pytest.mark.parametrize("command", ["run", "view", "picture"])
-def test_a_number_of_objects_on_the_command_line(capsys, command, count):
-    more = ["--out", "x.png"] if command == "picture" else []
-    status, lines = status_of(capsys, command, "rain", *more, "--objects", count)
-    assert status == 2 and len(lines) == 1 and f"--objects: '{count}' is no whole number" in lines[0]
-
-
-@pytest.mark.parametrize(
-    "words", ["nosuch", "--device cpu nosuch", "query --nosuch", "paper --x", "--device cpu paper"], ids=str
-)
+@pytest.mark.parametrize("words", ["nosuch", "--device cpu nosuch", "query --nosuch", "--device cpu paper"], ids=str)
 def test_a_benchmark_that_there_is_not(capsys, words):
     pytest.importorskip("bench")
     status, lines = status_of(capsys, "bench", *words.split())
@@ -93,21 +80,19 @@ def test_a_benchmark_that_there_is_not(capsys, words):
 # Frames, clocks, cameras, controllers, bodies.
 
 
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        ("time_step", [0, -1, 0.0, np.nan, np.inf, "x", None]),
-        ("output", ["everything", None, 3]),
-        ("lods", ["paper", 3, [0, 0]]),
-        ("clock", [3.0, "cpu"]),
-        ("motion", [ab.Kinematic(np.zeros((99, 3)))]),
-    ],
-)
-def test_a_frame_refuses_when_it_is_made(name, values):
+def test_a_frame_refuses_when_it_is_made():
+    bad = {
+        "time_step": [0, np.nan, "x"],
+        "output": ["everything", None],
+        "lods": ["paper", [0, 0]],
+        "clock": [3.0, "cpu"],
+        "motion": [ab.Kinematic(np.zeros((99, 3)))],
+    }
     scene = balls()
-    for value in values:
-        with pytest.raises(ValueError, match=name):
-            ab.Frame(scene, **{name: value})
+    for name, values in bad.items():
+        for value in values:
+            with pytest.raises(ValueError, match=name):
+                ab.Frame(scene, **{name: value})
 
 
 def test_a_summary_is_of_frames(device):
@@ -128,27 +113,22 @@ def test_a_history_into_a_folder_that_is_not_there(tmp_path, name):
     assert str(path) in str(caught.value) and "partial" not in str(caught.value)
 
 
-@pytest.mark.parametrize("rate", [np.nan, -1e-9, np.inf, "fast", None, [1.0, 2.0]])
-def test_rates_of_work(rate):
-    with pytest.raises(ValueError, match="rates: 'query'"):
-        WorkClock({"query": rate})
+def test_rates_of_work():
+    for rate in (np.nan, -1e-9, "fast", [1.0, 2.0]):
+        with pytest.raises(ValueError, match="rates: 'query'"):
+            WorkClock({"query": rate})
     assert WorkClock({"query": 0}).rates["query"] == 0
 
 
-NOT_FINITE = np.diag([1.0, np.nan, 1.0])
-
-
-@pytest.mark.parametrize(
-    "view", [np.eye(3) * (1 + 0j), NOT_FINITE, np.full((3, 3), np.inf), np.eye(4), np.ones((3, 3)), "x"]
-)
-def test_the_view_of_a_camera(view):
-    with np.errstate(all="ignore"), pytest.raises(ValueError, match=r"^view: "):
-        Camera(np.zeros(3), view)
+def test_the_view_of_a_camera():
+    for view in (np.eye(3) * (1 + 0j), np.diag([1.0, np.nan, 1.0]), np.eye(4), "x"):
+        with np.errstate(all="ignore"), pytest.raises(ValueError, match=r"^view: "):
+            Camera(np.zeros(3), view)
     with pytest.raises(ValueError, match=r"^eye: "):
         Camera(np.zeros(3) + 1j, np.eye(3))
 
 
-@pytest.mark.parametrize("value", ["x", "8", None, np.nan, -1.0, [8.0], 1j])
+@pytest.mark.parametrize("value", ["8", None, np.nan, -1.0, [8.0]])
 def test_controllers_name_the_argument(value):
     scene = balls()
     for make, name in (
@@ -171,7 +151,7 @@ def test_bodies_of_infinite_numbers_are_refused(device, name):
 # Meshes and models.
 
 
-@pytest.mark.parametrize("index", [4, 2**31, 2**63, 10**30, -(10**30)])
+@pytest.mark.parametrize("index", [4, 2**31, -(10**30)])
 @pytest.mark.parametrize("face", ["f 1 2 {}", "f 1 2 3 {}", "f {0}/1 2/1 3/1"])
 def test_an_index_of_obj_beyond_the_vertices(tmp_path, index, face):
     path = tmp_path / "big.obj"
@@ -180,7 +160,7 @@ def test_an_index_of_obj_beyond_the_vertices(tmp_path, index, face):
         load_mesh(path)
 
 
-@pytest.mark.parametrize("count", [0, 1.5, np.nan, np.inf, "ten", None, True])
+@pytest.mark.parametrize("count", [1.5, np.inf, "ten", None, True])
 def test_faces_of_a_base_are_a_whole_number(count):
     with pytest.raises(ValueError, match="base_faces"):
         ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], base_faces=count)
@@ -212,48 +192,26 @@ def test_info_reads_a_built_model(tmp_path, capsys):
     assert re.search(r"^lods +\d", capsys.readouterr().out, re.M)
 
 
-# Model files with one array changed. Arrays that fit one another in type, length and range, but are not one mesh's:
-
-
-def first_merged(arrays):
-    """Return where vertices that merges made begin."""
-    return len(arrays["vertex_parent"]) - (len(arrays["lod_error"]) - 1)
-
-
-def move_merged(value, arrays):
-    value = value.copy()
-    value[first_merged(arrays) :] *= 2.0**130
-    return value
-
-
-def move_child(value, arrays):
-    value = value.copy()
-    first = first_merged(arrays)
-    child = np.flatnonzero((value[:first] >= 0) & (value[:first] < len(value) - 1))[0]
-    value[child] = len(value) - 1
-    return value
-
-
+# Model files with one array changed: arrays that fit in type, length and range, but are not one mesh's,
 INCONSISTENT = {
-    "scaled up": ("vertex_pos", lambda x, _: x * 2.0**150),
-    "scaled down": ("vertex_pos", lambda x, _: x * 2.0**-150),
-    "in a point": ("vertex_pos", lambda x, _: 0 * x),
-    "merged vertices far away": ("vertex_pos", move_merged),
-    "all roots": ("vertex_parent", lambda x, _: np.full_like(x, -1)),
-    "a merge of three": ("vertex_parent", move_child),
-    "faces reversed": ("face_vertex", lambda x, _: x[::-1]),
-    "faces without area": ("face_vertex", lambda x, _: np.repeat(x[:, :1], 3, axis=1)),
-    "splits reversed": ("face_split", lambda x, _: x[::-1]),
-    "always there": ("face_split", lambda x, _: 0 * x),
-    "another slice": ("split_face", lambda x, _: np.roll(x, 1)),
-    "slices at the end": ("split_start", lambda x, _: np.where(np.arange(len(x)) > 0, x[-1], 0)),
+    "scaled up": ("vertex_pos", lambda x: x * 2.0**150),
+    "in a point": ("vertex_pos", lambda x: 0 * x),
+    "last merge far away": ("vertex_pos", lambda x: np.append(x[:-1], x[-1:] * 2.0**130 + 2.0**130, 0)),
+    "all roots": ("vertex_parent", lambda x: np.full_like(x, -1)),
+    "a merge of three": ("vertex_parent", lambda x: np.where(np.arange(len(x)) == np.argmax(x >= 0), len(x) - 1, x)),
+    "faces reversed": ("face_vertex", lambda x: x[::-1]),
+    "faces without area": ("face_vertex", lambda x: np.repeat(x[:, :1], 3, axis=1)),
+    "splits reversed": ("face_split", lambda x: x[::-1]),
+    "always there": ("face_split", lambda x: 0 * x),
+    "another slice": ("split_face", lambda x: np.roll(x, 1)),
+    "slices at the end": ("split_start", lambda x: np.where(np.arange(len(x)) > 0, x[-1], 0)),
 }
-# Arrays that would make a mesh, but not the one saved.
+# and arrays that would make a mesh, but not the one saved.
 ALTERED = {
-    "half the size": ("vertex_pos", lambda x, _: x * 0.5),
-    "half the error": ("lod_error", lambda x, _: x * 0.5),
-    "leaves swapped": ("leaf_node", lambda x, _: np.concatenate([x[1::-1], x[2:]])),
-    "another name": ("name", lambda *_: np.array("boll")),
+    "half the size": ("vertex_pos", lambda x: x * 0.5),
+    "half the error": ("lod_error", lambda x: x * 0.5),
+    "leaves swapped": ("leaf_node", lambda x: np.concatenate([x[1::-1], x[2:]])),
+    "another name": ("name", lambda _: np.array("boll")),
 }
 
 
@@ -265,7 +223,7 @@ def test_model_files_that_were_altered_are_refused(tmp_path, case):
     name, change = {**INCONSISTENT, **ALTERED}[case]
     with np.load(path) as file:
         arrays = dict(file)
-    arrays[name] = change(arrays[name], arrays)
+    arrays[name] = change(arrays[name])
     np.savez(path, **arrays)
     with pytest.raises(ab.ModelError, match=r"m\.npz: " + ("altered since it was saved" if case in ALTERED else "")):
         ab.Model.open(path)

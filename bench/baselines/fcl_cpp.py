@@ -26,8 +26,7 @@ def _run(command):
     """
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
-        complaints = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()
-        raise ImportError(f"{command[0]}: {complaints[0] if complaints else 'failed'}")
+        raise ImportError(f"{command[0]}: {next(iter(done.stderr.splitlines()), 'failed')}")
     return done.stdout
 
 

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 import warp_abtree as ab
 from bench.shapes import knot
-from bench.studies.paper import budget, cache, meshes, simplify, static, update
+from bench.studies.paper import budget, meshes, static, update
 from bench.studies.study import Context
 
 pytestmark = pytest.mark.slow
@@ -111,47 +110,8 @@ def test_static_trees_answer_the_same(context, monkeypatch):
         list(static.run(context))
 
 
-def test_surface_error(device):
-    """A sphere beside a greater one: every distance is the difference of the radii, give or take a facet's sag."""
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
-    found = simplify.surface_error((vertices, faces), (1.1 * vertices, faces), 5000, device)
-    assert found == pytest.approx((0.1, 0.1, 0.1), abs=2e-3)
-    # A mesh that lacks a half: the original is far from it, not the other way.
-    half = faces[vertices[faces][:, :, 0].mean(1) > 0]
-    _, there, worst = simplify.surface_error((vertices, faces), (vertices, half), 5000, device)
-    _, back, _ = simplify.surface_error((vertices, half), (vertices, faces), 5000, device)
-    assert there == worst > 1 and back < 1e-6
-
-
-def test_simplify(context):
-    rows = list(simplify.run(context))
-    ours = [row for row in rows if row["simplifier"] == simplify.OURS]
-    assert all(row["there"] <= row["certified"] + 1e-6 for row in ours)
-    compared = simplify.compare_simplifiers(rows)
-    assert [row["ours_mean"] for row in compared] == [row["mean"] for row in ours[: len(compared)]]
-
-
-@pytest.mark.parametrize("name", list(simplify.SIMPLIFIERS))
-def test_simplifiers(name):
-    module, call = simplify.SIMPLIFIERS[name]
-    library = pytest.importorskip(module)
-    ball = trimesh.creation.icosphere(subdivisions=3)
-    vertices, faces = call(library, ball.vertices, ball.faces, 200)
-    assert 150 < len(faces) <= 202 and np.abs(np.linalg.norm(vertices, axis=1) - 1).max() < 0.1
-
-
 def test_figure_4(context):
     rows = list(budget.step_figure_4(context))
     same = [abs(row["moved"]) == row["paper"] for row in rows]
     # In frame 10, still over the budget, the figure stands still where ours goes on by one step: an erratum.
     assert len(rows) == 30 and sum(same) == 27 and all(same[:27])
-
-
-def test_cache_is_counted(context, model):
-    lods = [0, model.lod_max]
-    found = [model.mesh_at(lod) for lod in lods]
-    bytes_ = sum(24 * len(v) + 12 * len(f) + 32 * (2 * len(f) - 1) for v, f, _ in found)
-    assert cache.cache_bytes(model, lods) == bytes_
-    row = cache.time_changes(context, model, ab.Ladder([model], 9, "ratio").lod[0])
-    assert row["changes"] == 3 and 0 < row["k_share"] <= 1 and row["bvh_ms"] > 0

@@ -13,7 +13,7 @@ from bench import tables
 from bench.shapes import knot
 from bench.studies.motions import Motions, PoseScene, find_first_contact, rotate
 from bench.studies.study import Context
-from bench.studies.tradeoff import SUMMARIES, bounds, competitors, lods, regions, settings, summaries, workload
+from bench.studies.tradeoff import SUMMARIES, competitors, lods, regions, settings, summaries, workload
 from warp_abtree.query.contacts import contact_dtypes
 
 pytestmark = pytest.mark.slow
@@ -237,27 +237,6 @@ def test_settings(context):
     assert [row["factor"] for row in margins] == list(settings.FACTORS)
     assert margins[0]["recall"] < 1 and all(row["recall"] == 1 and not row["late_max"] for row in margins[3:])
     assert [row["invented"] for row in margins] == sorted(row["invented"] for row in margins)
-
-
-def test_bounds(context):
-    pytest.importorskip("igl")
-    rows = rows_of(context, bounds, "bounds")
-    (surface,), (apart,) = by(rows, case="surface"), by(rows, case="apart")
-    assert surface["violations"] == apart["violations"] == 0 and surface["configurations"] >= 60
-    assert 0.5 < surface["used_max"] <= 1 + 1e-6 and apart["proved"] > 0.05 and apart["coarse_missed"] > 0.05
-
-
-def test_broken_bounds_are_noticed(context):
-    """Errors halved, and none at all: points lie beyond the bound, and pairs that meet are proved apart."""
-    model = context.model("knot")
-    model.progressive.lod_error[:] *= 0.5
-    if pytest.importorskip("igl"):
-        (row,) = bounds.surface_rows(context, {"knot": model})
-        assert row["violations"] > 10 and row["used_max"] > 1
-    model.progressive.lod_error[:] = 0
-    found = workload.Workload(context, "knot", model, model)
-    found.bound = lambda lods: 1e-3
-    assert bounds.apart_row(context, found, np.random.default_rng(0))["violations"] > 0
 
 
 def test_competitors(context):

@@ -1,7 +1,5 @@
 """Figure 6: the update against k, with the crossover, and the update's share of the query time."""
 
-import math
-
 import numpy as np
 
 import warp_abtree as ab
@@ -10,6 +8,7 @@ from warp_abtree.testing import upload_lods
 
 from ...cases.update import REFITS, bound_nodes, check_update
 from ...tables import pick
+from ...timing import crossover
 from .meshes import PosedPairs, paper_models
 
 # Fractions of the splits between the finest LOD and the other; the last is the base mesh, where k = n.
@@ -115,7 +114,7 @@ def fit_figure_6(rows):
                 "ns_a_node": 1e6 * fit_scale(moves),
                 "nodes_of_bound_min": min(used),
                 "nodes_of_bound_max": max(used),
-                "crossover": find_crossover([row["share"] for row in moves], logs),
+                "crossover": crossover([row["share"] for row in moves], logs, 0.0),
             }
         )
     return found
@@ -125,18 +124,6 @@ def fitted_moves(rows):
     """Return the rows of moves from the finest LOD, each with the time of equation (1), scaled once a model."""
     found = [row | {"fitted_ms": fit_scale(moves) * row["bound"]} for _, moves in by_model(rows) for row in moves]
     return pick(found, from_finest=True)
-
-
-def find_crossover(fractions, logs):
-    """Return the k/n from which on a full refit costs less: interpolated, 0 if always, None if never."""
-    above = np.flatnonzero(np.asarray(logs) < 0)
-    if not len(above):
-        return 0.0
-    i = int(above[-1])
-    if i == len(logs) - 1:
-        return None
-    part = -logs[i] / (logs[i + 1] - logs[i])
-    return float(math.exp(math.log(fractions[i]) * (1 - part) + math.log(fractions[i + 1]) * part))
 
 
 def thin(rows):

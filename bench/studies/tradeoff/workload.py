@@ -118,17 +118,14 @@ def judge_answers(found, truth):
 def judge_contact(error):
     """Return columns of errors of the first contact [sizes]: mean and largest size, and the largest of either sign."""
     known = error[~np.isnan(error)]
-    if not len(known):
-        return {"contact_mean": None, "contact_max": None, "early_max": None, "late_max": None, "never": len(error)}
-    return {
-        "contact_mean": float(np.abs(known).mean()),
-        "contact_max": float(np.abs(known).max()),
-        "early_max": float(max(0.0, known.max())),
-        "late_max": float(max(0.0, -known.min())),
-        "early": float((known > 0).mean()),
-        "late": float((known < 0).mean()),
-        "never": int(np.isnan(error).sum()),
-    }
+    row = {"never": int(np.isnan(error).sum())} | dict.fromkeys(
+        ("contact_mean", "contact_max", "early_max", "late_max")
+    )
+    if len(known):
+        row |= {"contact_mean": float(np.abs(known).mean()), "contact_max": float(np.abs(known).max())}
+        row |= {"early_max": float(max(0.0, known.max())), "late_max": float(max(0.0, -known.min()))}
+        row |= {"early": float((known > 0).mean()), "late": float((known < 0).mean())}
+    return row
 
 
 def find_front(costs, errors):
