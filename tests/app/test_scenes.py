@@ -135,17 +135,6 @@ def test_a_nut_runs_on_its_bolt(device):
     assert (count(-1, turns[1:3]) > 0).all() and (count(2, turns[1:3]) > 0).all(), "otherwise it is not"
 
 
-def test_terrain_is_an_open_sheet_that_faces_up(tmp_path):
-    text = '[models.t]\nshape = "terrain"\nextents = [8, 4]\ncells = [10, 6]\nbumps = 0.1\nwaves = 2\nrim = 1\n'
-    model = load(tmp_path, text + '[[objects]]\nmodel = "t"\n').models["t"]
-    vertices, faces, _ = model.mesh_at(model.lod_max)
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    assert (np.cross(b - a, c - a)[:, 1] > 0).all() and len(faces) == 120
-    assert np.allclose(np.ptp(vertices, axis=0)[[0, 2]], [8, 4])
-    corner = np.abs(vertices[:, [0, 2]]).sum(axis=1).argmax()
-    assert vertices[corner, 1] == pytest.approx(2.0, abs=0.11) == vertices[:, 1].max()
-
-
 def test_faces_are_brought_to_a_number(tmp_path):
     sizes = {"fewer": 200, "more": 1500, "odd": 201}
     text = "".join(f'[models.{n}]\nshape = "icosphere"\nsubdivisions = 2\nfaces = {f}\n' for n, f in sizes.items())

@@ -13,7 +13,6 @@ import numpy as np
 from warp_abtree.app.toml.decode import import_msgspec
 from warp_abtree.app.toml.scene_file import SceneFile, load_scene
 from warp_abtree.checks.atomic_write import atomic_write
-from warp_abtree.lod.timing import STAGES
 from warp_abtree.simulate.frame import FrameRow
 
 FORMAT_NAME, FORMAT_VERSION = "warp_abtree recording", 2
@@ -125,13 +124,6 @@ class Recording:
         if (len(loaded.models), loaded.scene.object_count) != (len(self.models), self.lods.shape[1]):
             raise ValueError(f"{path}: a damaged recording (the scene has other objects)")
         return loaded
-
-
-def recorded_clock(rows):
-    """Return a clock that reads the times of recorded frames again, so that their run repeats itself exactly."""
-    stages = np.array([[getattr(row, stage) for stage in STAGES] for row in rows])
-    ticks = np.concatenate([np.zeros((len(rows), 1)), np.round(1e6 * stages)], axis=1)
-    return iter((1e-9 * np.cumsum(ticks)).tolist()).__next__
 
 
 def record_run(loaded: SceneFile, frames: int, keep=True, progress=None, **options):

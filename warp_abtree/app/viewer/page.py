@@ -99,7 +99,7 @@ class Page:
                 first = min(max(getattr(playback, "budget_ms", None) or 16.0, BUDGETS[0]), BUDGETS[1])
                 hint = "T: selection, refinement, broad phase and query of a frame"
                 self._budget = gui.add_slider("budget [ms]", *BUDGETS, 0.5, first, hint=hint)
-                self._on_change(self._budget, self._set_budget)
+                self._on_change(self._budget, lambda _: self._choose())
                 self._for_page = gui.add_checkbox("for this page's camera", False, hint="near objects come first")
                 self._on_change(self._for_page, self._set_for_page)
             self._all_lod = gui.add_slider(
@@ -107,19 +107,14 @@ class Page:
             )
             self._on_change(self._all_lod, self._hold_all)
             release = gui.add_button("release all")
-            release.on_click(lambda _: self._post(self._release, None))
+            release.on_click(lambda _: self._post(self.playback.held.clear))
         with gui.add_folder("Show"):
             self._build_show(gui)
         with gui.add_folder("Picked object"):
-            count = playback.scene.object_count
-            self._picked = gui.add_number("object", -1, min=-1, max=count - 1, step=1, hint="or click it; -1 is none")
-            self._on_change(self._picked, lambda i: self._pick(int(i), from_number=True))
             self._lod = gui.add_slider(
                 "hold it at [%]", 0.0, 100.0, 0.5, 100.0, disabled=True, hint="of its finest LOD"
             )
             self._on_change(self._lod, self._hold_picked)
-            self._release_button = gui.add_button("release it", disabled=True)
-            self._release_button.on_click(lambda _: self._post(self._release, self.settings.picked))
             self._numbers = gui.add_markdown(view_text.NOBODY)
         with gui.add_folder("Frame times [ms]"):
             self._plot = gui.add_uplot(**view_text.time_plot([], PLOTTED), height=220)
@@ -171,27 +166,14 @@ class Page:
         self.playing = False
         self.playback.seek(int(number))
 
-    def _chosen_mode(self):
-        names = self.playback.modes()
-        return next(mode for mode in names if MODES[mode] == self._mode.value)
-
-    def _choose(self, budget_ms=None):
-        mode = self._chosen_mode()
-        if budget_ms is None and mode in ("predictive", "paper"):
-            budget_ms = self._budget.value
-        self.playback.choose(mode, budget_ms)
-
-    def _set_budget(self, value):
-        """Hold a budget, by the predictive controller where none holds one yet."""
-        mode = self._chosen_mode()
-        own = self.playback.control.controller if mode == OWN else mode
-        if own not in ("predictive", "paper"):
-            self._mode.value = MODES["predictive"]
-        self._choose(float(value))
+    def _choose(self):
+        """Choose LODs in the mode of the panel; the slider is the budget of the modes that hold one."""
+        mode = next(mode for mode in self.playback.modes() if MODES[mode] == self._mode.value)
+        self.playback.choose(mode, self._budget.value if mode in ("predictive", "paper") else None)
 
     def _set_for_page(self, value):
         self.playback.for_page = value
-        self._choose(None if self.playback.budget_ms is None else self._budget.value)
+        self._choose()
 
     def _lod_of(self, i, percent):
         return round(percent / 100 * self.playback.scene.models[self.playback.scene.object_model[i]].lod_max)
@@ -204,26 +186,16 @@ class Page:
     def _hold_picked(self, percent):
         if self.settings.picked is not None:
             self.playback.held[self.settings.picked] = self._lod_of(self.settings.picked, percent)
-            self._release_button.disabled = False
 
-    def _release(self, i):
-        if i is None:
-            self.playback.held.clear()
-        else:
-            self.playback.held.pop(i, None)
-        self._release_button.disabled = True
-
-    def _pick(self, i, from_number=False):
-        self.settings.picked = None if i < 0 else i
-        if not from_number:
-            self._picked.value = i
-        self._lod.disabled = i < 0
+    def _pick(self, i):
+        """Pick an object; a click on the picked one leaves none."""
+        self.settings.picked = None if i == self.settings.picked else i
+        self._lod.disabled = self.settings.picked is None
         self._show_held_lod()
         self._show_gizmo()
 
     def _show_held_lod(self):
         i = self.settings.picked
-        self._release_button.disabled = i is None or i not in self.playback.held
         if i is not None:
             top = self.playback.scene.models[self.playback.scene.object_model[i]].lod_max
             lod = self.playback.held.get(i, int(self.snapshot.lods[i]))

@@ -4,7 +4,7 @@ import numpy as np
 
 from warp_abtree.app.styles import STAGE_LABELS
 
-NOBODY = "Click an object, or give its number."
+NOBODY = "Click an object."
 PARTNERS = 8  # named of the objects that one meets
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b")
 
@@ -71,7 +71,7 @@ def numbers(playback, snapshot, cache, i) -> str:
     return _table(rows)
 
 
-def time_plot(rows, window: int = 0) -> dict:
+def time_plot(rows, window: int) -> dict:
     """Return data and series for a uPlot of frame times: stages stacked, the greatest sum behind.
 
     Args:
@@ -111,33 +111,3 @@ def time_top(rows) -> float:
     wanted = max(1.1 * float(np.percentile([row.total_ms for row in rows], 95)), rows[-1].budget_ms or 0.0, 1e-3)
     power = 10.0 ** np.floor(np.log10(wanted))
     return float(next(power * step for step in (1, 1.5, 2, 3, 5, 7, 10) if power * step >= wanted * (1 - 1e-9)))
-
-
-def time_picture(rows) -> str:
-    """Return frame times by stage as an SVG drawing, with its legend; empty without rows.
-
-    Args:
-        rows: `FrameRow`s, or None where a frame has none.
-    """
-    rows = [row for row in rows if row is not None]
-    if len(rows) < 2:
-        return ""
-    plot = time_plot(rows)
-    sums = plot["data"][1:-1]
-    # One hitch must not flatten the rest.
-    top = max(float(np.percentile(sums[0], 99)) * 1.2, 1e-6)
-    x = np.linspace(34, 336, len(rows))
-    shapes, legend = [], []
-    for series, values in zip(plot["series"][1:-1], sums):
-        y = 96 - 90 * np.minimum(values / top, 1.0)
-        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y))
-        shapes.append(f'<polygon fill="{series["stroke"]}" points="34,96 {points} 336,96"/>')
-        legend.append(f'<span style="color:{series["stroke"]}">&#9632;</span> {series["label"]}')
-    marks = f'<text x="30" y="12" text-anchor="end">{top:.3g}</text><text x="30" y="98" text-anchor="end">0</text>'
-    marks += f'<text x="34" y="110">frame {rows[0].frame}</text>'
-    marks += f'<text x="336" y="110" text-anchor="end">{rows[-1].frame}</text>'
-    drawn = "".join(shapes)
-    return (
-        f'<svg viewBox="0 0 340 114" font-size="10" fill="#444" role="img" aria-label="time of frames by stage">'
-        f"{drawn}{marks}</svg><div>ms a frame: {' '.join(reversed(legend))}</div>"
-    )
