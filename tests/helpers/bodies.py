@@ -72,9 +72,9 @@ def selection_models():
     return ab.Model.load(ring), ab.Model.load(ball), ab.Model.load(trimesh.creation.box(), base_faces=6)
 
 
-def strewn(models, count, device, seed=0):
-    """Return a scene with objects of all models and importances at random places."""
-    rng = np.random.default_rng(seed)
+def strewn(count, device):
+    """Return a scene with objects of all `selection_models` and importances at random places."""
+    rng, models = np.random.default_rng(0), selection_models()
     scene = ab.Scene(device=device)
     for i in range(count):
         turn = rng.normal(size=4)

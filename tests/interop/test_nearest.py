@@ -14,9 +14,7 @@ class Shape:
 
     def __init__(self, vertices, faces):
         self.model = ab.Model.from_arrays(vertices, faces, base_faces=10**6)
-
-    def node_boxes(self):
-        return NodeBoxes(self.model)
+        self.node_boxes = NodeBoxes(self.model)
 
 
 def all_distances(shapes, poses):

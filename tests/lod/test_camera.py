@@ -5,14 +5,9 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from helpers.bodies import selection_models, strewn
+from helpers.bodies import strewn
 
 from warp_abtree.lod.view import Camera, View
-
-
-@pytest.fixture(scope="module")
-def models():
-    return selection_models()
 
 
 def f_printed(alpha, gamma, far, wide):
@@ -64,10 +59,10 @@ def test_camera_refuses_to_look_nowhere(along):
         Camera.look_at((0, 0, 0), along)
 
 
-def test_view_measures_distance_motion_and_focus(models, device):
+def test_view_measures_distance_motion_and_focus(device):
     """Moving objects, a moving camera, objects beyond D, behind the eye, and passing it."""
     rng = np.random.default_rng(2)
-    scene = strewn(models, 40, device)
+    scene = strewn(40, device)
     view = View(scene, window=3)
     ways, last, before = [], [None] * 40, 0
     for _ in range(8):

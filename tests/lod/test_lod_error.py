@@ -6,6 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
+from helpers.samples import grid
+from oracles.distance import exact_distance_sq
 
 from warp_abtree.kernels.progressive.polygon import CORNERS, STACK, Scratch
 from warp_abtree.kernels.progressive.triangle_cover import FLOOR, SLOTS, Replay, cover_triangle
@@ -15,47 +17,15 @@ from warp_abtree.model.progressive import build_progressive
 wp.set_module_options({"enable_backward": False})
 
 
-def dot(u, v):
-    return sum(x * y for x, y in zip(u, v, strict=True))
-
-
-def minus(u, v):
-    return [x - y for x, y in zip(u, v, strict=True)]
-
-
-def cross(u, v):
-    return [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
-
-
-def segment_distance_sq(p, a, b):
-    e, r = minus(b, a), minus(p, a)
-    size = dot(e, e)
-    along = min(max(dot(e, r) / size, 0), 1) if size else 0
-    rest = [x - along * y for x, y in zip(r, e, strict=True)]
-    return dot(rest, rest)
-
-
-def triangle_distance_sq(p, corners):
-    """Return the squared distance of a point to a triangle, all in fractions."""
-    a, b, c = corners
-    normal = cross(minus(b, a), minus(c, a))
-    if any(normal) and all(dot(cross(minus(v, u), minus(p, u)), normal) >= 0 for u, v in ((a, b), (b, c), (c, a))):
-        return dot(minus(p, a), normal) ** 2 / dot(normal, normal)
-    return min(segment_distance_sq(p, u, v) for u, v in ((a, b), (b, c), (c, a)))
+def bumpy_sheet(seed):
+    """Nine vertices about a plane, eight faces."""
+    vertices, faces = grid(2)
+    vertices += np.random.default_rng(seed).uniform(-0.3, 0.3, (9, 3))
+    return SimpleNamespace(vertices=vertices, faces=faces.astype(np.int32))
 
 
 def exact(points):
     return [[Fraction(x) for x in point] for point in points.tolist()]
-
-
-def bumpy_sheet(seed):
-    """Nine vertices about a plane, eight faces."""
-    rng = np.random.default_rng(seed)
-    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(3.0), np.arange(3.0)))
-    vertices = np.stack([x, y, 0 * x], 1) + rng.uniform(-0.3, 0.3, (9, 3))
-    corner = np.array([0, 1, 3, 4])[:, None]
-    faces = np.concatenate([corner + [0, 1, 4], corner + [0, 4, 3]]).astype(np.int32)
-    return SimpleNamespace(vertices=vertices, faces=faces)
 
 
 def test_no_vertex_lies_beyond_the_error():
@@ -66,9 +36,7 @@ def test_no_vertex_lies_beyond_the_error():
         original = exact(progressive.vertex_pos[: progressive.vertex_count])
         for lod in range(progressive.lod_max):
             vertices, faces, _ = progressive.mesh_at(lod)
-            surface = exact(vertices)
-            corners = [[surface[v] for v in face] for face in faces.tolist()]
-            farthest = max(min(triangle_distance_sq(p, face) for face in corners) for p in original)
+            farthest = max(exact_distance_sq(p, vertices[faces]) for p in original)
             bound = Fraction(float(progressive.lod_error[lod])) ** 2
             assert farthest <= bound
             close += farthest > bound * (1 - Fraction(2) ** -36)
@@ -93,18 +61,12 @@ def cover_triangle_kernel(
     bound_sq_out[0] = bound_sq
 
 
-def fine_sheet(size):
-    """A sheet over the unit square with ridges."""
-    x, y = (axis.ravel() / size - 0.5 for axis in np.meshgrid(np.arange(size + 1.0), np.arange(size + 1.0)))
-    corner = (np.arange(size)[:, None] * (size + 1) + np.arange(size)).ravel()[:, None]
-    faces = np.concatenate([corner + [0, 1, size + 2], corner + [0, size + 2, size + 1]]).astype(np.int32)
-    return np.stack([x, y, 0.02 * np.sin(40 * x)], 1), faces
-
-
 @pytest.mark.parametrize("room", [1, 2, 5, int(SLOTS)])
 def test_a_cover_on_fewer_faces_than_it_wants_is_measured_again(device, room):
     """Pieces that find no room stand on a face that is used already, perhaps a far one, and the bound must say so."""
-    vertices, faces = fine_sheet(10)
+    vertices, faces = grid(10)
+    vertices[:, :2] = vertices[:, :2] / 10 - 0.5
+    vertices[:, 2] = 0.02 * np.sin(40 * vertices[:, 0])
     triangle = np.array([[-0.45, -0.4, 0.0], [0.45, -0.3, 0.0], [0.0, 0.45, 0.0]])
 
     def array(values, dtype):
@@ -133,8 +95,8 @@ def test_a_cover_on_fewer_faces_than_it_wants_is_measured_again(device, room):
     wp.launch(cover_triangle_kernel, 1, [room, replay], [used, bound_sq], device=device)
     count, bound = int(used.numpy()[0]), float(np.sqrt(bound_sq.numpy()[0]))
     assert count == room if room <= 5 else count > 5, "there is no want of room here"
-    surface = [exact(vertices[faces[f]]) for f in scratch.used.numpy()[:count].tolist()]
+    surface = vertices[faces[scratch.used.numpy()[:count]]]
     weights = [(i, j, 6 - i - j) for i in range(7) for j in range(7 - i)]
     points = np.array(weights) @ triangle / 6
     limit = Fraction(bound + 2.0**-43) ** 2
-    assert all(min(triangle_distance_sq(p, face) for face in surface) <= limit for p in exact(points))
+    assert all(exact_distance_sq(p, surface) <= limit for p in exact(points))

@@ -4,15 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from helpers.bodies import selection_models, strewn
+from helpers.bodies import strewn
 
 from warp_abtree.lod.controllers import PredictiveController
 from warp_abtree.lod.selection import tolerance_scale
-
-
-@pytest.fixture(scope="module")
-def models():
-    return selection_models()
 
 
 def plain_level(selection, i, position, offset):
@@ -41,9 +36,9 @@ def plain_nodes(model, ladder, k, held, wanted):
 
 
 @pytest.mark.usefixtures("half_refitted_in_part")
-def test_prediction_is_that_of_plain_python(models, device):
+def test_prediction_is_that_of_plain_python(device):
     rng = np.random.default_rng(4)
-    scene = strewn(models, 50, device)
+    scene = strewn(50, device)
     selection = PredictiveController(scene, 10.0, steps=25, loosest=16.0, hold_frames=2)
     level, ways = np.zeros(50, int), set()
     for frame in range(24):

@@ -20,11 +20,6 @@ FIGURE_4 = [
 ]
 
 
-@pytest.fixture(scope="module")
-def models():
-    return selection_models()
-
-
 # The paper's formulas, from its text and errata alone.
 
 
@@ -87,10 +82,10 @@ def run_paper(scene, costs, start=0.0, focus=None, **options):
     return np.array(levels), np.array(lods)
 
 
-def test_figure_4(models, device):
+def test_figure_4(device):
     scene = ab.Scene(device=device)
     for importance in (1, 2, 3):
-        scene.add(models[0], importance=importance)
+        scene.add(selection_models()[0], importance=importance)
     # Room on both sides, so that no end of the ladder hides a step.
     levels, _ = run_paper(scene, [5.0] * 5 + [15.0] * 5, steps=400, start=200.0)
     moved = np.diff(levels, axis=0).T
@@ -101,10 +96,10 @@ def test_figure_4(models, device):
 
 
 @pytest.mark.parametrize("threshold", [None, 4.0])
-def test_selection_follows_the_paper(models, device, threshold):
+def test_selection_follows_the_paper(device, threshold):
     """Random times: every case follows every other, at every distance and speed."""
     rng = np.random.default_rng(5)
-    scene = strewn(models, 18, device)
+    scene = strewn(18, device)
     focus = rng.uniform(0, 1, 18)
     focus[:2] = 0.0, 1.0
     # Times come in runs, or a climb would never be long.
@@ -125,8 +120,8 @@ def test_selection_follows_the_paper(models, device, threshold):
 
 
 @pytest.mark.parametrize("kind", [PaperController, PredictiveController])
-def test_everything_stays_at_the_coarsest_without_a_frame(models, device, kind):
-    controller = kind(strewn(models, 6, device), 10.0)
+def test_everything_stays_at_the_coarsest_without_a_frame(device, kind):
+    controller = kind(strewn(6, device), 10.0)
     for _ in range(2):
         assert not controller.next_lods(Feedback(0.0)).numpy().any() and not controller.level.numpy().any()
 
@@ -134,7 +129,8 @@ def test_everything_stays_at_the_coarsest_without_a_frame(models, device, kind):
 # Ladders.
 
 
-def test_paper_ladder_has_equal_operations(models):
+def test_paper_ladder_has_equal_operations():
+    models = selection_models()
     ladder = Ladder(models, 50)
     for model, lods, errors, faces in zip(models, ladder.lod, ladder.error, ladder.faces):
         assert len(lods) == 51 and (lods[0], lods[-1]) == (0, model.lod_max)
@@ -143,7 +139,8 @@ def test_paper_ladder_has_equal_operations(models):
         assert faces.tolist() == [len(model.mesh_at(int(lod))[2]) for lod in lods]
 
 
-def test_ratio_ladder_has_equal_ratios(models):
+def test_ratio_ladder_has_equal_ratios():
+    models = selection_models()
     ladder = Ladder(models, 20, "ratio")
     for model, lods, faces in zip(models, ladder.lod, ladder.faces):
         assert (lods[0], lods[-1]) == (0, model.lod_max) and (np.diff(lods) >= 0).all()
@@ -156,11 +153,11 @@ def test_ratio_ladder_has_equal_ratios(models):
 # Tolerances.
 
 
-def test_tolerance_gives_the_coarsest_level_within_it(models, device):
+def test_tolerance_gives_the_coarsest_level_within_it(device):
     rng = np.random.default_rng(3)
-    scene = strewn(models, 60, device)
+    scene = strewn(60, device)
     controller = ToleranceController(scene, 0.0, loosest=8.0, steps=30)
-    ladder, seen = Ladder(models, 30, "ratio"), set()
+    ladder, seen = Ladder(selection_models(), 30, "ratio"), set()
     assert controller.budget_ms is None
     for tolerance in (0.0, 1e-4, 2e-3, 0.01, 0.05, 1.0, 100.0):
         focus = np.round(rng.uniform(0, 1, 60), 3)
@@ -191,15 +188,15 @@ def test_tolerance_gives_the_coarsest_level_within_it(models, device):
         (lambda scene: PredictiveController(scene, 8.0, hold_frames=-1), ValueError, "hold_frames -1 is outside"),
     ],
 )
-def test_controllers_refuse(models, make, error, words):
+def test_controllers_refuse(make, error, words):
     with pytest.raises(error, match=words):
-        make(strewn(models, 3, "cpu"))
+        make(strewn(3, "cpu"))
 
 
-def test_a_controller_refuses_another_scene_than_it_was_made_for(models, device):
-    scene = strewn(models, 3, device)
+def test_a_controller_refuses_another_scene_than_it_was_made_for(device):
+    scene = strewn(3, device)
     controller = PaperController(scene, 8.0)
-    scene.add(models[0])
+    scene.add(selection_models()[0])
     for call in (controller.view.launch, lambda: controller.next_lods(Feedback(0.0))):
         with pytest.raises(RuntimeError, match="objects were added"):
             call()
@@ -209,13 +206,13 @@ def test_a_controller_refuses_another_scene_than_it_was_made_for(models, device)
 
 
 @pytest.mark.parametrize("kind", [PaperController, ToleranceController, PredictiveController])
-def test_selection_runs_in_a_captured_graph(models, device, kind):
+def test_selection_runs_in_a_captured_graph(device, kind):
     """One graph, launched while cameras and costs change, gives what `next_lods` gives."""
 
     def camera_at(time):
         return Camera.look_at((0, time, 8), (0, 0, 0), far=30.0)
 
-    scene = strewn(models, 30, device)
+    scene = strewn(30, device)
     value = 0.01 if kind is ToleranceController else 10.0
     plain, captured = kind(scene, value, camera_at), kind(scene, value)
     kind(scene, value, camera_at).next_lods(Feedback(0.0))  # loads the kernels

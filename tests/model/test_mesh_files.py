@@ -129,25 +129,6 @@ def test_warp_meshes(name, faces):
     assert np.abs(np.cross(b - a, c - a).sum(axis=0)).max() < 1e-9 * report["diagonal"] ** 2
 
 
-@pytest.mark.parametrize(
-    "name, faces, components, nonmanifold, closed",
-    [
-        ("cow", 5804, 1, 0, True),
-        ("fcl-env", 2180, 85, 0, False),
-        ("fcl-rob", 216, 4, 27, False),
-        ("stanford-bunny", 69451, 1, 0, False),
-    ],
-)
-def test_real_meshes(real_mesh_path, name, faces, components, nonmanifold, closed):
-    path = real_mesh_path(name)
-    mesh = load_mesh(path)
-    report = describe_mesh(mesh)
-    found = report["faces"], report["components"], report["nonmanifold_edges"], report["closed"]
-    assert found == (faces, components, nonmanifold, closed)
-    shape = trimesh.load(gzip.open(path), file_type="obj", process=False)
-    np.testing.assert_array_equal(mesh.vertices[mesh.faces], shape.vertices[shape.faces])
-
-
 # Errors.
 
 

@@ -121,12 +121,12 @@ def test_no_point_is_farther(model, share):
 EXACT = {
     "flat grid": lambda: turned(*grid(2), seed=1),
     "line": lambda: line((1.0, 2.0, -1.0), 9),
-    **{f"line, seed {seed}": lambda seed=seed: line(np.random.default_rng(seed).normal(size=3), 6) for seed in (1, 9)},
+    "turned line": lambda: line(np.random.default_rng(9).normal(size=3), 6),
     "box": lambda: turned(*of_trimesh(trimesh.creation.box())),
     "comb": lambda: turned(*square_comb(2)),
     "soup": lambda: soup(12, 5),
     "lattice soup": lambda: soup(20, 6, lattice=3),
-    **{f"far away, seed {seed}": lambda seed=seed: far_grid(seed) for seed in (0, 2, 4)},
+    "far away": lambda: far_grid(0),
 }
 
 

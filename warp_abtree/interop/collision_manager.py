@@ -157,28 +157,22 @@ class CollisionManager:
     # Collisions.
 
     def in_collision_single(self, mesh, transform=None, return_names=False, return_data=False):
-        """Find the objects that collide with another mesh. Waits for the device.
+        """Return whether another mesh collides with any object, alone or first of a tuple. Waits for the device.
 
         Args:
             mesh, transform: As for `add_object`.
-            return_names: Return the names of these objects too, a set.
+            return_names: Return the names of those that it collides with too, a set.
             return_data: Return the contacts too, a list of `ContactData`, in which the mesh is named "__external".
-
-        Returns:
-            Whether it collides, alone or first of a tuple.
         """
         any_hit, hits, contacts = self._collide_with(self._external(mesh, transform), return_names, return_data)
         return _join(any_hit, (return_names, {name for name, _ in hits}), (return_data, contacts))
 
     def in_collision_internal(self, return_names=False, return_data=False):
-        """Find the pairs of objects that collide. Waits for the device.
+        """Return whether any two objects collide, alone or first of a tuple. Waits for the device.
 
         Args:
             return_names: Return the pairs of names too, a set of tuples, each in alphabetical order.
             return_data: Return the contacts too, a list of `ContactData`.
-
-        Returns:
-            Whether any collide, alone or first of a tuple.
         """
         name_of = {slot: name for name, slot in self._slots.items()}
         self._placed.upload()
@@ -192,15 +186,12 @@ class CollisionManager:
         return _join(any_hit, (return_names, {tuple(sorted(names)) for names in hits}), (return_data, contacts))
 
     def in_collision_other(self, other_manager, return_names=False, return_data=False):
-        """Find the pairs of an object here and one of another manager that collide. Waits for the device.
+        """Return whether any object collides with one of another manager, alone or first of a tuple. Waits.
 
         Args:
             other_manager: `CollisionManager`, of any device.
             return_names: Return the pairs of names too, a set of tuples (name here, name there).
             return_data: Return the contacts too, a list of `ContactData`.
-
-        Returns:
-            Whether any collide, alone or first of a tuple.
 
         Raises:
             TypeError: Not a `CollisionManager` of this library.
@@ -211,15 +202,14 @@ class CollisionManager:
     # Distances.
 
     def min_distance_single(self, mesh, transform=None, return_name=False, return_data=False):
-        """Return the distance of another mesh from the nearest object. Waits for the device.
+        """Return the distance [world units] of another mesh from the nearest object. Waits for the device.
+
+        0 if they collide, infinite without objects; alone or first of a tuple.
 
         Args:
             mesh, transform: As for `add_object`.
             return_name: Return the nearest object's name too; None if there is none.
             return_data: Return a `DistanceData` too; None if there is none.
-
-        Returns:
-            Distance [world units], 0 if they collide, infinite without objects; alone or first of a tuple.
         """
         with self._pairs_with(self._external(mesh, transform)) as (pairs, names):
             distance, pair, data = self._nearest(pairs, names)

@@ -1,6 +1,7 @@
 """A model's original mesh on the host: its box, extreme corners, and the planes of a convex solid."""
 
 import weakref
+from functools import cached_property
 
 import numpy as np
 import trimesh
@@ -23,7 +24,6 @@ class Shape:
 
     def __init__(self, model, convex):
         self.model = model
-        self._node_boxes = None
         faces = np.delete(model.progressive.face_vertex, model.dropped_faces, axis=0)
         face_ids = np.delete(np.arange(model.face_count), model.dropped_faces)
         vertices = model.progressive.vertex_pos[: model.vertex_count]
@@ -49,11 +49,10 @@ class Shape:
             normals = normals[wide] / length[wide, None]
             self.planes = normals, np.einsum("ij,ij->i", normals, a[wide]), face_ids[wide]
 
+    @cached_property
     def node_boxes(self) -> NodeBoxes:
-        """Return the boxes of the tree at the finest LOD, computed at the first call."""
-        if self._node_boxes is None:
-            self._node_boxes = NodeBoxes(self.model)
-        return self._node_boxes
+        """Boxes of the tree at the finest LOD."""
+        return NodeBoxes(self.model)
 
     def find_inside(self, pose, other, other_pose):
         """Find a component of another shape inside this solid; the two surfaces must not intersect.

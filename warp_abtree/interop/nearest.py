@@ -39,7 +39,7 @@ class _Search:
     def __init__(self, shapes, poses, pairs, upper):
         self.shapes, self.poses, self.pairs = shapes, poses, pairs
         used = {shapes[i]: None for i in np.unique(pairs).tolist()}
-        boxes = [shape.node_boxes() for shape in used]
+        boxes = [shape.node_boxes for shape in used]
         start = np.cumsum([0, *(len(part.face) for part in boxes)])
         first_node = dict(zip(used, start.tolist()))
         # Nodes of all shapes are numbered consecutively; those of each pair's shapes begin here, (2, p).
@@ -122,7 +122,7 @@ def find_nearest(shapes, poses, pairs, upper, likely):
     """Find the least distance of object pairs whose surfaces do not intersect.
 
     Args:
-        shapes: Shape of each object, with `model` and `node_boxes()`.
+        shapes: Shape of each object, with `model` and `node_boxes`.
         poses: Rigid matrices of the objects [world units], float64 (n, 4, 4).
         pairs: Object indices, (p, 2), p > 0.
         upper: Upper bound on the least distance.

@@ -120,12 +120,10 @@ class PlacedShapes:
     def find_contained(self, pair, names):
         """Return a `ContactData` if a component of one object is inside the other; surfaces must not intersect."""
         for outer, inner in (pair, pair[::-1]):
-            shape, other = self.shapes[outer], self.shapes[inner]
-            found = shape.find_inside(self.poses[outer], other, self.poses[inner])
+            found = self.shapes[outer].find_inside(self.poses[outer], self.shapes[inner], self.poses[inner])
             if found is not None:
-                point, normal, depth, face_outer, face_inner = found
-                first = outer == pair[0]
-                faces = (face_outer, face_inner) if first else (face_inner, face_outer)
-                normal = normal if first else -normal
+                point, normal, depth, *faces = found
+                if outer != pair[0]:
+                    faces, normal = faces[::-1], -normal
                 return ContactData(names, faces, np.stack([point, point]), normal, depth)
         return None

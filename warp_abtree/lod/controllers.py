@@ -215,11 +215,9 @@ class PredictiveController(Controller):
         loosest: Most that a tolerance is loosened.
 
     Attributes:
-        rate: float64 (6,) on the device: ms of a frame, of a unit of work, of any change of LODs, of a node refitted;
-            exponents of the faces with which tests grow and fall. NaN at first: no change.
+        rate: See the RATE constants of `kernels.lod.prediction`, float64 (6,) on the device; NaN at first: no change.
         work: Tests of each object in the last frame, float64 (n,) on the device.
-        choice: Candidate chosen, its cost in every frame and in the first alone [ms], its tests, those of no change;
-            float64 (5,) on the device.
+        choice: See `choose_position_kernel`, float64 (5,) on the device.
         scale: Position, and frames that a change has been held, int32 (2,) on the device.
         offset: Positions by which each object is loosened, int32 (n,) on the device.
         changes: Change of the position of each candidate; the last leaves every object at its level.

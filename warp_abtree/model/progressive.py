@@ -12,6 +12,10 @@ from warp_abtree.kernels.progressive import collapse, hausdorff_bound, polygon, 
 from warp_abtree.kernels.progressive.heap import Heap
 from warp_abtree.kernels.progressive.quadric import Quadric
 
+# Merges, and triangles covered by the error bound, per launch of a serial kernel.
+MERGES, COVERS = 25_000, 200_000
+# Entries of the heap at first: for each edge, and beyond these.
+HEAP_PER_EDGE, HEAP_EXTRA = 2, 256
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
 
 # Error of a bound by rounding, in units of the frame (coordinates about 1/2, so 2^-54 each): reading the vertices of
@@ -125,22 +129,7 @@ class ProgressiveMesh:
         return int(self.lod_max - np.argmin(miss[::-1]))
 
 
-@dataclass(frozen=True)
-class LaunchSizes:
-    """Work of one launch of the builder's serial kernels; the result does not depend on it.
-
-    Attributes:
-        merges, covers: Merges of the collapse, and triangles covered by the error bound, per launch.
-        heap_per_edge, heap_extra: Initial entries of the heap for each edge, and beyond these.
-    """
-
-    merges: int = 25_000
-    covers: int = 200_000
-    heap_per_edge: int = 2
-    heap_extra: int = 256
-
-
-def build_progressive(mesh, base_faces=10, progress=None, sizes=LaunchSizes()):
+def build_progressive(mesh, base_faces=10, progress=None):
     """Collapse a mesh to a base of about `base_faces` faces and certify the error of every LOD on the way.
 
     The sequence for a larger base is a prefix of that for a smaller one, and does not depend on the mesh's scale by
@@ -150,7 +139,6 @@ def build_progressive(mesh, base_faces=10, progress=None, sizes=LaunchSizes()):
         mesh: `Mesh`.
         base_faces: Stop when no more faces than this are left, >= 1.
         progress: Called as progress(stage, done, total) between launches; stages "collapse" and "LOD bounds".
-        sizes: `LaunchSizes`.
 
     Raises:
         ValueError: base_faces is no whole number from 1, or the mesh has 2^29 vertices or 2^31 / 3 faces.
@@ -163,10 +151,10 @@ def build_progressive(mesh, base_faces=10, progress=None, sizes=LaunchSizes()):
         raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
     report = progress if progress is not None else lambda stage, done, total: None
     centre, scale = find_frame(vertices)
-    parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), report, sizes)
+    parent, pos = _collapse((vertices - centre) / scale, faces, int(base_faces), report)
     vertex_pos = np.concatenate([vertices, centre + scale * pos[len(vertices) :]])
     face_split, split_start, split_face = _splits(parent, faces, len(vertices))
-    lod_error = _bound_errors(vertex_pos, parent, faces, report, sizes.covers)
+    lod_error = _bound_errors(vertex_pos, parent, faces, report)
     return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, lod_error)
 
 
@@ -226,7 +214,7 @@ def _linked_rings(faces, face_array, node_capacity):
     return rings
 
 
-def _collapse(pos, faces, base_faces, report, sizes):
+def _collapse(pos, faces, base_faces, report):
     """Run the collapse; return vertex_parent int32 [n_v+m] and all normalised positions float64 [n_v+m, 3]."""
     vertex_count, capacity = len(pos), 2 * len(pos)
     edges, boundary = _edges(faces)
@@ -239,7 +227,7 @@ def _collapse(pos, faces, base_faces, report, sizes):
     rings = _linked_rings(faces, face_array, capacity)
     _launch(collapse.weigh_faces_kernel, len(faces), face_array, cpu_array(boundary, wp.int8), surface)
     heap, size = Heap(), len(edges)
-    room = sizes.heap_per_edge * size + sizes.heap_extra
+    room = HEAP_PER_EDGE * size + HEAP_EXTRA
     heap.pair = cpu_array(np.resize(edges, room), wp.int64)
     heap.key = wp.zeros(room, dtype=wp.float64, device="cpu")
     _launch(collapse.price_edges_kernel, size, heap.pair, surface, heap.key)
@@ -251,7 +239,7 @@ def _collapse(pos, faces, base_faces, report, sizes):
     while state[3] != int(collapse.FINISHED):
         if state[3] == int(collapse.HEAP_FULL):
             heap = _roomier_heap(surface, heap, counter)
-        limits = [vertex_count, base_faces, sizes.merges, len(heap.key)]
+        limits = [vertex_count, base_faces, MERGES, len(heap.key)]
         _launch(collapse.collapse_edges_kernel, *limits, surface, rings, heap, counter)
         report("collapse", min(start_live - int(state[2]), goal), goal)
     nodes = vertex_count + int(state[1])
@@ -297,8 +285,8 @@ def make_scratch(candidates, faces, rows):
     return scratch
 
 
-def _bound_errors(vertex_pos, parent, faces, report, covers):
-    """Return lod_error float64 [m+1]; `covers` triangles are covered per launch."""
+def _bound_errors(vertex_pos, parent, faces, report):
+    """Return lod_error float64 [m+1]."""
     centre, scale = find_frame(vertex_pos[np.unique(faces)])
     child = np.flatnonzero(parent >= 0)
     merge_count, face_count = len(child) // 2, len(faces)  # every merge has exactly two children
@@ -310,7 +298,7 @@ def _bound_errors(vertex_pos, parent, faces, report, covers):
     replay.rings = _linked_rings(faces, face_array, len(parent))
     _launch(hausdorff_bound.start_replay_kernel, face_count, face_array, replay)
     bound_sq = wp.zeros(merge_count, dtype=wp.float64, device="cpu")
-    inputs = [len(parent) - merge_count, merge_count, covers, cpu_array(pair, int)]
+    inputs = [len(parent) - merge_count, merge_count, COVERS, cpu_array(pair, int)]
     state = replay.counter.numpy()  # shares the memory
     while state[0] < merge_count:
         _launch(hausdorff_bound.replay_merges_kernel, *inputs, replay, bound_sq)
