@@ -35,7 +35,7 @@ from warp_abtree.app.cli import main as cli
 from warp_abtree.simulate import frame
 
 def hang(file=None, *_, **__):
-    if file is not None:
+    if hasattr(file, "write"):
         file.write(b"half" if "b" in file.mode else "half")
         file.flush()
     print("{}", flush=True)
