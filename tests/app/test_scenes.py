@@ -10,8 +10,8 @@ from oracles.triangle import brute_force_faces
 
 import warp_abtree as ab
 from warp_abtree.app import SceneError, load_scene
-from warp_abtree.app.toml.model_tables import AnyShape
 from warp_abtree.app.toml.shapes import GENERATED
+from warp_abtree.app.toml.tables import AnyShape
 from warp_abtree.lod.timing import WorkClock
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"

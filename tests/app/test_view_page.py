@@ -66,7 +66,7 @@ def test_a_page_stands_until_it_is_told_to_play(page):
     assert page.snapshots == 2 and page.snapshot.row.frame == 0 and not page.playing
     page._post(page._run_button, "play")
     page.run(seconds=0.5)
-    assert page.playing and page.snapshot.number > 2 and page.rate > 0 and len(page._rows) == page.snapshot.number + 1
+    assert page.playing and page.snapshot.number > 2 and len(page._rows) == page.snapshot.number + 1
     page._post(page._run_button, "play")
     page.run(seconds=0.2)
     number = page.snapshot.number

@@ -3,19 +3,27 @@
 A playback owns its scene: one thread steps, queries and changes it.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warp_abtree.app.render_data import Snapshot
-from warp_abtree.app.toml.control import CONTROLLERS, LodControl, PictureView
+from warp_abtree.app.toml.control import CONTROLLERS, LodControl
 from warp_abtree.lod.view import Camera
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame, LodSweep
 
 SWEEP_PERIOD = 8.0  # seconds from the finest LOD of a mesh to its base and back
 OWN, HOLD = "scene", "hold"  # LODs as the scene chooses them, and as they are
+
+
+class MeshView(NamedTuple):
+    """How meshes are looked at: directions to the eye and upwards, and the world that is shown."""
+
+    eye: tuple[float, float, float] = (0.4, 0.35, 1.0)
+    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    world: int = 0
 
 
 class Playback:
@@ -27,7 +35,7 @@ class Playback:
         time_step: Between frames [s].
         frames: How many `--record` takes.
         length: Number of frames, None where they never end.
-        view: `PictureView` to begin with.
+        view: eye and up, directions, and world, to begin with.
         camera: Called with a time [s], returns the `Camera` that LODs are for; or None.
         control: `LodControl` of the file.
         chosen: LOD of every object before those that are held, int (n,).
@@ -237,7 +245,7 @@ class MeshPlayback(LivePlayback):
             start = _fraction_at(model, lods[mine[0]])
             self._sweeps.append(LodSweep([(model, mine)], start, min(start, _fraction_at(model, 0)), SWEEP_PERIOD))
         names = " and ".join(dict.fromkeys(model.name for model in models))
-        super().__init__(scene, names, np.zeros(len(models), int), 1 / 30, round(15 * SWEEP_PERIOD) + 1, PictureView())
+        super().__init__(scene, names, np.zeros(len(models), int), 1 / 30, round(15 * SWEEP_PERIOD) + 1, MeshView())
 
     def _begin(self):
         self._placed = self._start.copy()

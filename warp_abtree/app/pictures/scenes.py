@@ -95,7 +95,9 @@ def draw_objects(scene: Scene, poses, path, title="", objects=None, eye=(0.4, 0.
 
 def panel_lods(loaded) -> list[np.ndarray]:
     """Return the LODs of all objects in each panel: both ends of the sweeps, or what the file's [picture] asks for."""
-    fractions = [loaded.picture.lods or (sweep.start, sweep.turn) for sweep in loaded.sweeps]
+    asked = loaded.picture.lods
+    asked = [asked] if isinstance(asked, float) else asked
+    fractions = [asked or (sweep.start, sweep.turn) for sweep in loaded.sweeps]
     chosen = [loaded.base_lods.copy() for _ in range(len(fractions[0]) if fractions else 1)]
     for sweep, each in zip(loaded.sweeps, fractions):
         for lods, fraction in zip(chosen, each):

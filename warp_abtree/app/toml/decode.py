@@ -50,7 +50,7 @@ def read_tables(path: Path, text: str | None = None):
         SceneError: The file is missing or wrong, or msgspec is not installed.
     """
     msgspec = import_msgspec(path)
-    from warp_abtree.app.toml import model_tables, tables
+    from warp_abtree.app.toml import tables
 
     try:
         text = path.read_bytes().decode() if text is None else text
@@ -75,9 +75,7 @@ def read_tables(path: Path, text: str | None = None):
     scene = convert(tree, tables.SceneTable)
     models = {}
     for name, table in scene.models.items():
-        models[name] = convert(
-            table, model_tables.AnyShape if "shape" in table else model_tables.ModelTable, f"models.{name}"
-        )
+        models[name] = convert(table, tables.AnyShape if "shape" in table else tables.ModelTable, f"models.{name}")
     return text, msgspec.structs.replace(scene, models=models)
 
 
@@ -107,7 +105,7 @@ def _explain(error: str, where: str, choices: dict) -> tuple[str, str]:
         return f"{key}.{found[1]}".strip("."), "unknown key"
     if found := re.match(r"Object missing required field `(.*)`$", message):
         return key.strip(".") or "the file", f"the key {found[1]!r} is missing"
-    if found := re.match(r"([a-z_.]+): (.*)", message):  # raised by a table about one of its keys
+    if found := re.match(r"([a-z_.\[\]0-9]+): (.*)", message):  # raised by a table about one of its keys
         return f"{key}.{found[1]}".strip("."), found[2]
     names = choices.get(key.rpartition(".")[2])
     if message.startswith("Invalid") and names:

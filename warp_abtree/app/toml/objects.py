@@ -6,11 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from warp_abtree.app.toml.control import unit
 from warp_abtree.app.toml.decode import SceneError, fail
 
 OBJECT_LIMIT = 1_000_000  # of one entry of [[objects]]
 MATERIAL = ("density", "restitution", "friction")
+
+
+def unit(vector) -> np.ndarray:
+    """Return the direction of a vector that is not 0, of length 1."""
+    vector = np.array(vector) / np.abs(vector).max()  # no square overflows or underflows
+    return vector / np.linalg.norm(vector)
 
 
 @dataclass(eq=False)

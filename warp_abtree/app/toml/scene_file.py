@@ -1,6 +1,6 @@
 """Scenes as TOML files: `load_scene` checks a file, builds its models and places its objects.
 
-The keys of a file are the fields of the structs in `warp_abtree.app.toml.tables` and `model_tables`.
+The keys of a file are the fields of the structs in `warp_abtree.app.toml.tables`.
 """
 
 import os
@@ -10,14 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_abtree.app.toml.control import (
-    CameraPath,
-    LodControl,
-    PictureView,
-    make_camera,
-    make_control,
-    make_view,
-)
+from warp_abtree.app.toml.control import LodControl, make_control
 from warp_abtree.app.toml.decode import SceneError, fail, read_tables
 from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.models import build_model
@@ -44,8 +37,8 @@ class SceneFile:
         worlds: World of each object, int (n,).
         base_lods: LOD of each object before sweeps, int64 (n,).
         sweeps: `LodSweep`s.
-        picture: `PictureView`.
-        camera: Called with a time [s] returns a `Camera`; None without [camera].
+        picture: `PictureTable`.
+        camera: `CameraTable`, called with a time [s] returns a `Camera`; None without [camera].
         control: `LodControl` of [lod].
         dynamics: `DynamicsTable`, None without [dynamics].
         kinematic: Whether each object moves as told among rigid bodies, bool (n,).
@@ -64,8 +57,8 @@ class SceneFile:
     worlds: np.ndarray
     base_lods: np.ndarray
     sweeps: list
-    picture: PictureView
-    camera: CameraPath | None
+    picture: Any
+    camera: Any
     control: LodControl
     dynamics: Any
     kinematic: np.ndarray
@@ -145,8 +138,7 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
     text, tables = read_tables(path, text)
     if not tables.objects:
         fail(path, "the file", "no [[objects]]")
-    camera, control = make_camera(path, tables.camera), make_control(path, tables.lod)
-    picture = make_view(path, tables.picture)
+    control = make_control(path, tables.lod)
     groups = make_groups(path, tables.objects, tables.dynamics, tables.scene.seed, objects)
     _check_names(path, tables)
     try:
@@ -168,8 +160,8 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
         worlds=np.concatenate([group.world for group in groups]),
         base_lods=scene.lods.astype(np.int64),
         sweeps=[_make_sweep(table, models, owners) for table in tables.lod_sweep],
-        picture=picture,
-        camera=camera,
+        picture=tables.picture,
+        camera=tables.camera,
         control=control,
         dynamics=tables.dynamics,
         kinematic=np.concatenate([group.kinematic for group in groups]),

@@ -13,6 +13,7 @@ import numpy as np
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.playback import HOLD, OWN
 from warp_abtree.app.render_data import Settings, compose, objects_of_world
+from warp_abtree.app.toml.objects import unit
 from warp_abtree.app.viewer import text as view_text
 from warp_abtree.app.viewer.viewer_scene import ViewerScene
 from warp_abtree.lod.view import Camera
@@ -45,7 +46,6 @@ class Page:
         playing: Whether frames follow one another.
         snapshot: `Snapshot` that is shown.
         snapshots: How many were sent so far.
-        rate: Snapshots a second, smoothed.
         cache: `MeshCache` of the scene.
     """
 
@@ -54,16 +54,17 @@ class Page:
         self.cache = geometry.MeshCache(playback.scene)
         self.viewer_scene = ViewerScene(server.scene, self.cache, lambda i: self._post(self._pick, i), clock)
         self.settings = Settings(world=playback.view.world)
+        self._eye, self._up = unit(playback.view.eye), unit(playback.view.up)
         if not len(self.shown):
             self.settings.world = int(playback.worlds.max())
-        self.playing, self.snapshots, self.rate = False, 0, 0.0
+        self.playing, self.snapshots = False, 0
         self._events: queue.SimpleQueue = queue.SimpleQueue()
         self._closed = False
         self._rows: list = []
         self._steps, self._dirty = 0, True
         self._text_time = self._snapshot_time = -math.inf
         self._gizmo, self._plotted = None, False
-        server.scene.set_up_direction(tuple(playback.view.up))
+        server.scene.set_up_direction(tuple(self._up))
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         server.gui.main_panel.dock_right()
         server.gui.set_panel_label(playback.title)
@@ -229,20 +230,20 @@ class Page:
 
         The environment stays as it is: a standalone page would make it anew whenever it begins again.
         """
-        scene, view = self.server.scene, self.playback.view
+        scene = self.server.scene
         scene.configure_default_lights(False)
-        direction = view.up - np.cross(view.up, view.eye) + 0.6 * view.eye
+        direction = self._up - np.cross(self._up, self._eye) + 0.6 * self._eye
         scene.add_light_directional("/light", position=tuple(direction), intensity=LIGHT, cast_shadow=False)
 
     def _overview(self):
         """Return where a camera sees all that is shown: its position, what it looks at, and the radius of that."""
         centre, radius = geometry.bounds(self.cache, self.snapshot, self.shown)
-        return centre + DISTANCE * radius * self.playback.view.eye, centre, radius
+        return centre + DISTANCE * radius * self._eye, centre, radius
 
     def _place_camera(self):
         first = self.server.initial_camera
         position, centre, radius = self._overview()
-        first.position, first.look_at, first.up = tuple(position), tuple(centre), tuple(self.playback.view.up)
+        first.position, first.look_at, first.up = tuple(position), tuple(centre), tuple(self._up)
         first.near, first.far = radius / 500, 200 * radius
 
     def _look(self, client):
@@ -289,7 +290,7 @@ class Page:
             wait = self._snapshot_time + FRAME_SECONDS - time.monotonic()
             if wait > 0:
                 time.sleep(wait)
-            self._measure_rate()
+            self._snapshot_time = time.monotonic()
 
     def close(self):
         """End `run`, from any thread."""
@@ -336,12 +337,6 @@ class Page:
         camera = self.playback.camera
         with self.server.atomic():
             self.viewer_scene.show(self._data, self.settings, camera and camera(self.snapshot.time))
-
-    def _measure_rate(self):
-        now = time.monotonic()
-        span = now - self._snapshot_time
-        self._snapshot_time = now
-        self.rate = 0.0 if span > 1 else 0.9 * self.rate + 0.1 / span if self.rate else 1 / span
 
     def _show_text(self, data):
         self._state.content = view_text.state(self, data)

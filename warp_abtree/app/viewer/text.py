@@ -39,8 +39,6 @@ def state(page, data) -> str:
         rows.append(("select to query", f"{snapshot.row.cost_ms:.1f} ms"))
         if snapshot.row.budget_ms is not None:
             rows.append(("budget", f"{snapshot.row.budget_ms:g} ms"))
-    if page.playing:
-        rows.append(("page", f"{page.rate:.0f} frames a second"))
     return _table(rows)
 
 
