@@ -3,9 +3,7 @@
 import csv
 import io
 import json
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -19,8 +17,6 @@ import warp_abtree as ab
 from warp_abtree.app.cli import doctor, model_commands, report
 from warp_abtree.app.cli import main as cli
 from warp_abtree.model.mesh import describe_mesh, load_mesh
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -37,18 +33,6 @@ def files(tmp_path, monkeypatch):
     Path("text.mesh").write_text("hello\n")
     Path("folder.npz").mkdir()
     return tmp_path
-
-
-def run_process(*arguments, cwd, **environment):
-    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    return subprocess.run(
-        [sys.executable, "-m", "warp_abtree", *map(str, arguments)],
-        cwd=cwd,
-        env={**os.environ, "PYTHONPATH": path, **environment},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
 
 
 # info and build.
@@ -219,7 +203,7 @@ def test_doctor_finds_what_is_wrong(capsys, monkeypatch):
 
 
 def test_doctor_knows_the_extras():
-    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    text = (Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8")
     extras = set(re.findall(r"^(\w+) = \[", text.split("optional-dependencies]")[1].split("\n[")[0], re.M))
     assert set(doctor.EXTRAS) == extras - {"bench", "docs", "test", "dev"}
     for extra, (_, needs) in doctor.EXTRAS.items():
@@ -228,22 +212,26 @@ def test_doctor_knows_the_extras():
     assert re.findall('"(.*?)"', re.search(r"^dependencies = \[(.*)\]$", text, re.M)[1]) == list(doctor.CORE)
 
 
-def test_completion(capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "shtab", None)
-    assert "needs shtab: pip install" in run(capsys, "--print-completion", "bash", status=2)[1][0]
-    monkeypatch.undo()
+@pytest.mark.parametrize(
+    ("module", "words", "message"),
+    [
+        ("shtab", "--print-completion bash", "--print-completion needs shtab: pip install warp-abtree[app]"),
+        ("msgspec", "run rain", "rain.toml: scene files need msgspec: pip install warp-abtree[app]"),
+        ("viser", "view ball.obj", "view needs viser: pip install warp-abtree[view]"),
+        ("matplotlib", "run rain --plot .", "--plot needs Matplotlib: pip install warp-abtree[pictures]"),
+        ("pyvista", "run rain --picture out.png", "--picture needs pyvista and Matplotlib: pip install"),
+        ("pyvista", "picture ball.obj --out out.png", "picture needs pyvista and Matplotlib: pip install"),
+    ],
+)
+def test_an_extra_that_is_missing_is_named(files, capsys, monkeypatch, module, words, message):
+    monkeypatch.setitem(sys.modules, module, None)
+    shown, errors = run(capsys, *words.split(), status=2)
+    assert not shown and len(errors) == 1 and message in errors[0]
+
+
+def test_completion(capsys):
     pytest.importorskip("shtab")
     with pytest.raises(SystemExit) as caught:
         cli.main(["--print-completion", "bash"])
     shown = capsys.readouterr().out
     assert not caught.value.code and "--lod-a" in shown and "doctor" in shown and "compgen" in shown
-
-
-# As people start it.
-
-
-@pytest.mark.slow
-def test_process_is_quiet(files):
-    done = run_process("query", "ball.obj", "ring.ply", "--json", "--device", "cpu", cwd=files)
-    assert done.returncode == 0 and json.loads(done.stdout)["intersects"] is True
-    assert done.stderr == ""

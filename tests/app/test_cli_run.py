@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import re
-import sys
 from pathlib import Path
 
 import matplotlib.image
@@ -77,14 +76,6 @@ def test_plot(files, capsys):
         assert near.sum() > 100, ("LODs", "budget", "error")[part]
     assert [path.name for path in Path("plots").iterdir()] == ["frames.png"]
     run(capsys, "run", "scene.toml", "--frames", 2, "--plot", "plots", "--device", "cpu")
-
-
-def test_plot_without_matplotlib(files, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    for option, needs in ((("--plot", "plots"), "Matplotlib"), (("--picture", "out.png"), "pyvista and Matplotlib")):
-        errors = run(capsys, "run", "scene.toml", *option, status=2)[1]
-        assert errors == [f"warp-abtree: {option[0]} needs {needs}: pip install warp-abtree[pictures]"]
-    assert not Path("plots").exists()
 
 
 def test_picture_of_a_controlled_run_shows_its_lods(files, capsys, monkeypatch):

@@ -286,12 +286,20 @@ def test_rain(device):
     assert height.min() > -0.6 and np.median(height) < 2.5
 
 
-def test_worlds(device):
-    assert "worlds = 4096" in (SCENES / "worlds.toml").read_text()
-    loaded = load_ours("worlds", device, objects=16)
-    assert np.bincount(loaded.worlds).tolist() == [2] * 8
-    result = loaded.frame().step()
-    assert (np.diff(result.pairs, axis=1) == 8).all() and result.any.any()
+@pytest.mark.parametrize(
+    ("name", "objects", "frames", "each", "size"),
+    [("bunny_tori", 6, 3, 6, 1), ("herd", None, 1, 200, 16), ("worlds", 16, 1, 16, 8)],
+)
+def test_scenes_of_the_project_intersect(device, name, objects, frames, each, size):
+    if name != "worlds":
+        pytest.importorskip("pxr")
+    loaded = load_ours(name, device, objects=objects if name == "worlds" else None)
+    frame = loaded.frame(output="any")
+    frame.run(frames - 1)
+    result = frame.step()
+    assert loaded.scene.object_count >= each and len(np.unique(loaded.worlds)) >= size
+    assert all(0 < row.intersecting for row in frame.history) and result.any.any()
+    assert np.array_equal(loaded.worlds[result.pairs[:, 0]], loaded.worlds[result.pairs[:, 1]])
 
 
 def test_needle(device):

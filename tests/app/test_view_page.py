@@ -3,7 +3,6 @@
 import base64
 import re
 import socket
-import sys
 import threading
 import time
 from pathlib import Path
@@ -24,7 +23,6 @@ def files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_scene(tmp_path)
     trimesh.creation.box().export("box.obj")
-    Path("bad.toml").write_text("[scene]\nspeed = 3\n")
     return tmp_path
 
 
@@ -130,13 +128,6 @@ def test_a_port_that_is_taken(files, capsys):
         port = other.getsockname()[1]
         assert cli.main(["view", "box.obj", "--port", str(port)]) == 2
     assert f"127.0.0.1:{port}: cannot be served at (Address already in use)" in capsys.readouterr().err
-
-
-def test_without_viser(files, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    assert cli.main(["view", "box.obj"]) == 2
-    errors = capsys.readouterr().err.splitlines()
-    assert len(errors) == 1 and "view needs viser: pip install warp-abtree[view]" in errors[0]
 
 
 def test_a_recording_has_a_slider_of_frames(files, server):

@@ -30,17 +30,13 @@ class Playback:
     """What all playbacks share.
 
     Attributes:
-        scene, title: `Scene`, and what to call it.
         worlds: World of each object, int (n,); -1 is in every one.
-        time_step: Between frames [s].
         frames: How many `--record` takes.
         length: Number of frames, None where they never end.
         view: eye and up, directions, and world, to begin with.
         camera: Called with a time [s], returns the `Camera` that LODs are for; or None.
-        control: `LodControl` of the file.
         chosen: LOD of every object before those that are held, int (n,).
         held: LOD by object index, of objects whose LOD the user holds.
-        can_move: Whether the user may move objects.
     """
 
     can_move = False
@@ -200,11 +196,7 @@ class LivePlayback(Playback):
 
 
 class ScenePlayback(LivePlayback):
-    """A scene file.
-
-    Args:
-        loaded: What `load_scene` returned.
-    """
+    """A scene file, as `load_scene` returned it."""
 
     def __init__(self, loaded):
         self.loaded = loaded
@@ -221,14 +213,7 @@ class ScenePlayback(LivePlayback):
 
 
 class MeshPlayback(LivePlayback):
-    """Meshes at poses, whose LODs sweep from where they start to the base and back; the user may move them.
-
-    Args:
-        models: `Model`s, one an object.
-        poses: One each, (n, 7).
-        lods: LODs at the start.
-        device: Warp device.
-    """
+    """Meshes at poses (n, 7), whose LODs sweep from where they start to the base and back; the user may move them."""
 
     can_move = True
 
@@ -276,11 +261,7 @@ def _fraction_at(model, lod) -> float:
 
 
 class RecordedPlayback(Playback):
-    """A recorded run: poses and LODs as they were, queried anew; times are those of the recording.
-
-    Args:
-        recording, loaded: `Recording`, and the scene file in it.
-    """
+    """A recorded run: poses and LODs as they were, queried anew; times are those of the recording."""
 
     length: int
 

@@ -50,9 +50,8 @@ def check_packages(needs) -> dict:
             version = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             version = None
-        found[name] = {"version": version, "ok": version is not None, "needs": need}
-        if version is not None:
-            found[name]["ok"] = _numbers(version) >= _numbers(least)
+        new_enough = version is not None and _numbers(version) >= _numbers(least)
+        found[name] = {"version": version, "ok": new_enough, "needs": need}
     return found
 
 
@@ -66,12 +65,7 @@ def check_extras() -> dict:
 
 
 def check_device(device) -> dict:
-    """Query a device where the answer is known.
-
-    Returns:
-        alias, name, architecture, memory [bytes, None for the CPU], ok, seconds that the answer took, with loading
-        and, the first time, compiling of kernels; error, what went wrong, or None.
-    """
+    """Query a device where the answer is known; the seconds include loading and, at first, compiling of kernels."""
     gpu = device.is_cuda
     found = {
         "device": device.alias,

@@ -74,13 +74,7 @@ def check_output(path, suffixes, inputs=(), make=False):
     """Refuse a file that could not be written, or that is one of the inputs, before any work.
 
     Args:
-        path: File.
-        suffixes: That its name may have.
-        inputs: Files that are read.
         make: Whether its folder will be made in the one above.
-
-    Raises:
-        ValueError: With what is wrong.
     """
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: the name must end in {' or '.join(suffixes)}")

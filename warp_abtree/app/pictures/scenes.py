@@ -51,14 +51,7 @@ def make_legend(scene: Scene, panels: list[RenderData], level: int = -1) -> list
 
 
 def draw_snapshot(scene: Scene, snapshot: Snapshot, shown, path, title: str, view, settings: Settings, size: int):
-    """Draw a snapshot of a scene to a PNG file.
-
-    Args:
-        shown: Indices of the objects drawn, rising.
-        title: Above.
-        view: eye and up, directions in the world.
-        size: Pixels along a side.
-    """
+    """Draw the shown objects of a snapshot to a PNG file; `view` is the directions to the eye and upwards."""
     cache = geometry.MeshCache(scene)
     data = compose(cache, snapshot, shown, settings)
     (eye, up), legend = view, make_legend(scene, [data], settings.level)

@@ -17,19 +17,12 @@ _OPTIONS = {
 
 @dataclass(frozen=True)
 class LodControl:
-    """Which controller chooses LODs, and with what.
+    """Which controller chooses LODs, and with what."""
 
-    Attributes:
-        controller: One of CONTROLLERS; "none" leaves LODs to the objects and their sweeps.
-        budget_ms: T [ms], or None.
-        tolerance: Of the tolerance controller [units], or None.
-        options: Those that the file gives, by name.
-    """
-
-    controller: str = "none"
-    budget_ms: float | None = None
-    tolerance: float | None = None
-    options: dict = field(default_factory=dict)
+    controller: str = "none"  # of CONTROLLERS; "none" leaves LODs to the objects and their sweeps
+    budget_ms: float | None = None  # T [ms]
+    tolerance: float | None = None  # of the tolerance controller [units]
+    options: dict = field(default_factory=dict)  # those that the file gives, by name
 
     def asked(self, controller: str | None = None, budget_ms: float | None = None) -> "LodControl":
         """Return this with another controller or budget; a budget alone asks the predictive one where none holds it.

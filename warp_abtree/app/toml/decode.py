@@ -40,15 +40,7 @@ def import_msgspec(path):
 
 
 def read_tables(path: Path, text: str | None = None):
-    """Return the text of a scene file and its `SceneTable`, whose models are `ModelTable`s.
-
-    Args:
-        path: TOML file.
-        text: TOML in the place of what the file holds.
-
-    Raises:
-        SceneError: The file is missing or wrong, or msgspec is not installed.
-    """
+    """Return the text of a scene file, or `text` in its place, and its `SceneTable`, whose models are `ModelTable`s."""
     msgspec = import_msgspec(path)
     from warp_abtree.app.toml import tables
 
@@ -95,8 +87,7 @@ def _explain(error: str, where: str, choices: dict) -> tuple[str, str]:
     """Return the key that an error of msgspec is about, and what is wrong, in the words of TOML.
 
     Args:
-        error: "MESSAGE - at `$.PATH`", or a message alone about the whole table.
-        where: Key of the whole table.
+        error: "MESSAGE - at `$.PATH`", or a message alone about the whole table, whose key is `where`.
         choices: Names that a key may have.
     """
     message, _, place = error.partition(" - at `$")

@@ -24,45 +24,26 @@ from warp_abtree.simulate.rigid_bodies import Dynamics
 
 @dataclass(eq=False)
 class SceneFile:
-    """A scene as a file describes it.
-
-    Attributes:
-        path, title: Where it came from.
-        text: The file.
-        objects: The number of objects that was asked for, None for the file's own.
-        frames, time_step: How many frames, and the time between them [s].
-        models: `Model` by name.
-        scene: `Scene` with every object at its start.
-        motion: `Kinematic` of all objects; that of rigid bodies is how they start.
-        worlds: World of each object, int (n,).
-        base_lods: LOD of each object before sweeps, int64 (n,).
-        sweeps: `LodSweep`s.
-        picture: `PictureTable`.
-        camera: `CameraTable`, called with a time [s] returns a `Camera`; None without [camera].
-        control: `LodControl` of [lod].
-        dynamics: `DynamicsTable`, None without [dynamics].
-        kinematic: Whether each object moves as told among rigid bodies, bool (n,).
-        body: density, restitution and friction of each object, (n,).
-    """
+    """A scene as a file describes it."""
 
     path: Path
     title: str
-    text: str
-    objects: int | None
+    text: str  # the file
+    objects: int | None  # the number of objects that was asked for, None for the file's own
     frames: int
-    time_step: float
-    models: dict
-    scene: Scene
-    motion: Kinematic
-    worlds: np.ndarray
-    base_lods: np.ndarray
-    sweeps: list
-    picture: Any
-    camera: Any
-    control: LodControl
-    dynamics: Any
-    kinematic: np.ndarray
-    body: dict
+    time_step: float  # between frames [s]
+    models: dict  # `Model` by name
+    scene: Scene  # with every object at its start
+    motion: Kinematic  # of all objects; that of rigid bodies is how they start
+    worlds: np.ndarray  # world of each object, int (n,)
+    base_lods: np.ndarray  # LOD of each object before sweeps, int64 (n,)
+    sweeps: list  # `LodSweep`s
+    picture: Any  # `PictureTable`
+    camera: Any  # `CameraTable`, called with a time [s] returns a `Camera`; None without [camera]
+    control: LodControl  # of [lod]
+    dynamics: Any  # `DynamicsTable`, None without [dynamics]
+    kinematic: np.ndarray  # whether each object moves as told among rigid bodies, bool (n,)
+    body: dict  # density, restitution and friction of each object, (n,)
 
     def lods_at(self, time: float) -> np.ndarray:
         """Return the LOD of every object at a time [s] without a controller, int64 (n,)."""

@@ -291,12 +291,12 @@ class CameraTable(Table):
 
     def __post_init__(self):
         check_direction("up", self.up)
-        if self.keys and (self.eye is not None or self.target is not None):
+        if not self.keys:
+            if self.eye is None or self.target is None:
+                raise ValueError(f"the key {'eye' if self.eye is None else 'target'!r} is missing")
+            self.keys = [CameraKeyTable(eye=self.eye, target=self.target)]
+        elif self.eye is not None or self.target is not None:
             raise ValueError("give eye and target, or [[camera.keys]], not both")
-        for name in ("eye", "target"):
-            if not self.keys and getattr(self, name) is None:
-                raise ValueError(f"the key {name!r} is missing")
-        self.keys = self.keys or [CameraKeyTable(eye=self.eye, target=self.target)]
         times = [key.time for key in self.keys]
         for i, time in enumerate(times):
             if i and not time > times[i - 1]:

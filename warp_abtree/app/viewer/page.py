@@ -34,19 +34,13 @@ MODES = {
 
 
 class Page:
-    """A page about a playback, on a viser server.
-
-    Args:
-        server: `viser.ViserServer`; the page does not stop it.
-        playback: `Playback`.
-        clock: Seconds, by which the browser is given time.
+    """A page about a playback, on a viser server, which the page does not stop.
 
     Attributes:
         settings: `Settings` of the panel.
         playing: Whether frames follow one another.
         snapshot: `Snapshot` that is shown.
         snapshots: How many were sent so far.
-        cache: `MeshCache` of the scene.
     """
 
     def __init__(self, server, playback, clock=time.monotonic):

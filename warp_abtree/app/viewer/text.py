@@ -9,11 +9,6 @@ PARTNERS = 8  # named of the objects that one meets
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b")
 
 
-def _escape(text) -> str:
-    """Return a text as Markdown shows it letter by letter."""
-    return "".join(f"\\{letter}" if letter in "\\`*_{}[]<>()#+-.!|" else letter for letter in str(text))
-
-
 def _table(rows) -> str:
     return "\n".join(["| | |", "|:--|--:|", *(f"| {key} | {value} |" for key, value in rows)])
 
@@ -54,7 +49,7 @@ def numbers(playback, snapshot, cache, i) -> str:
     others = [int(a + b - i) for a, b in result.pairs[meets]] if len(meets) else []
     sharing = int(np.count_nonzero((np.array(scene.object_model) == owner) & (snapshot.lods == lod)))
     rows = [
-        ("object", _escape(playback.name_of(i))),
+        ("object", f"`{playback.name_of(i)}`"),
         ("LOD", f"{lod:,} of {model.lod_max:,}{', held' if i in playback.held else ''}"),
         ("faces", f"{cache.count(owner, lod):,} of {model.face_count:,}"),
         ("certified error", f"{model.error_at(lod):.3g}"),
@@ -72,28 +67,20 @@ def numbers(playback, snapshot, cache, i) -> str:
 def time_plot(rows, window: int) -> dict:
     """Return data and series for a uPlot of frame times: stages stacked, the greatest sum behind.
 
-    Args:
-        rows: `FrameRow`s.
-        window: Frames to show at least; those before the first row took no time. A uPlot that begins without any data
-            never finds its axis.
+    At least `window` frames are shown; those before the first row took no time. A uPlot that begins without any data
+    never finds its axis.
     """
-    frames = np.array([row.frame for row in rows], np.float64)
-    stages = np.array([[getattr(row, name) for row in rows] for name in STAGE_LABELS], np.float64)
-    stages = stages.reshape(len(STAGE_LABELS), -1)
-    # Without a budget its line is on the axis; NaN would leave the plot without a scale.
-    budgets = np.array([row.budget_ms or 0.0 for row in rows], np.float64)
     missing = max(window - len(rows), 0)
-    frames = np.concatenate([np.arange(-missing, 0) + (rows[0].frame if rows else 0), frames])
-    stages = np.pad(stages, ((0, 0), (missing, 0)))
-    budgets = np.pad(budgets, (missing, 0))
-    sums = np.cumsum(stages, axis=0)
+    first = rows[0].frame if rows else 0
+    frames = np.array([*range(first - missing, first), *(row.frame for row in rows)], np.float64)
+    # Without a budget its line is on the axis; NaN would leave the plot without a scale.
+    names = (*STAGE_LABELS, "budget_ms")
+    times = np.array([[0.0] * missing + [getattr(row, name) or 0.0 for row in rows] for name in names])
+    data = [frames, *np.cumsum(times[:-1], axis=0)[::-1], times[-1]]  # the budget is drawn last, over the stages
     series: list[dict] = [{"label": "frame"}]
-    data = [frames]
-    for i, label in reversed(list(enumerate(STAGE_LABELS.values()))):
-        series.append({"label": label, "stroke": COLOURS[i], "fill": COLOURS[i] + "c0", "width": 1})
-        data.append(sums[i])
+    for label, colour in zip(reversed(STAGE_LABELS.values()), reversed(COLOURS)):
+        series.append({"label": label, "stroke": colour, "fill": colour + "c0", "width": 1})
     series.append({"label": "budget", "stroke": "#ff0000", "width": 1.5})
-    data.append(budgets)  # drawn last, over the stages
     return {
         "data": tuple(data),
         "series": tuple(series),

@@ -8,25 +8,13 @@ from warp_abtree.app.viewer.page import Page
 from warp_abtree.checks.atomic_write import atomic_write
 
 # The canvas would fade in whenever the run begins again.
-PANEL = """<style>
-canvas {{ opacity: 1 !important; }}
-#about {{ position: fixed; left: 12px; bottom: 52px; z-index: 10; max-width: 300px; padding: 8px 12px;
-  border-radius: 6px; box-shadow: 0 1px 4px #0004; background: rgba(255, 255, 255, 0.9); color: #222;
-  font: 13px/1.4 sans-serif; }}
-#about summary {{ font-weight: bold; cursor: pointer; }}
-</style><details id="about" open><summary>{title}</summary>{text}</details>"""
+PANEL = """<style>canvas {{ opacity: 1 !important; }}
+#about {{ position: fixed; left: 12px; bottom: 52px; font: 13px sans-serif; }}</style>
+<details id="about" open><summary>{title}</summary>{text}</details>"""
 
 
 def record_page(server, playback, path: Path, frames: int, progress=None):
-    """Run a playback for some frames and write a page that plays them and needs no server.
-
-    Args:
-        server: `viser.ViserServer` without clients.
-        playback: `Playback` at its start.
-        path: File to write; it appears whole or not at all.
-        frames: How many.
-        progress: Called as progress(stage, done, total).
-    """
+    """Run a playback from its start for some frames and write a page that plays them and needs no server."""
     played = 0.0
     page = Page(server, playback, clock=lambda: played)
     page.playing = True
