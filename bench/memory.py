@@ -8,17 +8,6 @@ def count_bytes(holder):
     return sum(value.capacity for value in vars(holder).values() if isinstance(value, wp.array))
 
 
-def held_mib(scene, query=None) -> float:
-    """Return what the arrays of a scene, and of a query over it, hold [MiB]; the tree of the broad phase left out."""
-    total = sum(map(count_bytes, scene.batch().pools))
-    if query is not None:
-        total += count_bytes(query) + count_bytes(query.hits)
-        if query.broad_phase is not None:
-            # Its pairs are the query's.
-            total += count_bytes(query.broad_phase) - query.pairs.capacity - query.pair_count.capacity
-    return round(total / 2**20, 3)
-
-
 def used_memory(device) -> dict:
     """Return columns of memory [MiB] in use on a CUDA device: Warp's pool, and all that is taken; none on the CPU."""
     if device.is_cpu:
@@ -30,5 +19,11 @@ def used_memory(device) -> dict:
 
 
 def memory_columns(scene, query=None) -> dict:
-    """Return the columns of a scene's memory [MiB], and of a query's over it."""
-    return {"arrays_mib": held_mib(scene, query)} | used_memory(scene.device)
+    """Return the columns of a scene's memory [MiB], and of a query's over it; the tree of the broad phase left out."""
+    total = sum(map(count_bytes, scene.batch().pools))
+    if query is not None:
+        total += count_bytes(query) + count_bytes(query.hits)
+        if query.broad_phase is not None:
+            # Its pairs are the query's.
+            total += count_bytes(query.broad_phase) - query.pairs.capacity - query.pair_count.capacity
+    return {"arrays_mib": round(total / 2**20, 3)} | used_memory(scene.device)

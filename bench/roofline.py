@@ -1,9 +1,7 @@
 """Bytes and operations of a query, counted from its result's counters, beside what the device can do.
 
-Counted is what the algorithm cannot do without, so every fraction of a peak is a lower bound: an operation is an
-addition, subtraction, multiplication or comparison of real numbers, a fused multiply-add is two; absolute values,
-choices and integers cost nothing, and nothing is loaded twice within one test. Bytes are those requested of memory,
-whether a cache has them or not; stacks in shared memory or registers are left out.
+Counted is what the algorithm cannot do without, so every fraction of a peak is a lower bound: real additions,
+subtractions, multiplications, comparisons (a fused multiply-add is two), and bytes requested of memory, cached or not.
 
 * node test (kernels/traversal): four child pairs load four records of 32 bytes, pose four boxes: 6 operations for sum
   and size, 18 for the image of the sum, 15 for that of the size; 6 more widen each of A's two. A comparison is 6

@@ -33,8 +33,8 @@ IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 
 
 def run(device, quick=False):
-    """Yield one row a workload and baseline (column peer): differences, queries a second of both and ratios (ours over
-    the peer), and one a workload of ours on one core and on all."""
+    """Yield one row a workload and baseline (column peer): differences, queries a second of both, and ratios (ours over
+    the peer)."""
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
     knots = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
@@ -43,8 +43,6 @@ def run(device, quick=False):
             workload = Workload(name, *models, device, sizes)
             workload.about["core"] = core
             yield from workload.run()
-        del workload.about["core"]
-        yield workload.about | workload.time_cores()
 
 
 def random_matrices(rng, vertices_a, vertices_b, count):

@@ -66,7 +66,7 @@ class BudgetScene:
     """
 
     def __init__(self, device, name, objects, clock):
-        self.name, self.now, self.budget = name, clock or time.perf_counter, None
+        self.name, self.budget = name, None
         self.options = {} if clock is None else {"clock": clock}
         self.output = OUTPUT["cuda" if device.is_cuda else "cpu"]
         self.loaded = load_scene(SCENES / f"{name}.toml", device, objects=objects)
@@ -76,14 +76,14 @@ class BudgetScene:
         scene, runs, breach = self.loaded.scene, {}, {}
         about = {"case": "hold", "scene": self.name, "device": scene.device.name, "objects": scene.object_count}
         for controller in CONTROLLERS:
-            frame, adds = self.run_controller(controller, frames)
+            frame = self.run_controller(controller, frames)
             if controller == "none":
                 costs = steady_costs(frame)
                 self.budget = float(np.median(costs)) / BREACH
                 breach = {"breach": BREACH, "breach_p5": round(float(np.percentile(costs, 5)) / self.budget, 2)}
             row = about | {"frames": len(frame.history), "budget_ms": round(self.budget, 3)} | breach
             row |= {"controller": controller} | describe_hold(frame, self.budget)
-            yield row | ({"adds": round(adds, 4)} if controller in CONSTANT_LODS else {})
+            yield row
             runs[controller] = frame.history
         if plots is not None:
             title = f"{self.loaded.title}: {scene.object_count:,} objects, {scene.device.name}"
@@ -91,7 +91,7 @@ class BudgetScene:
             draw_controllers(runs, self.budget, Path(plots) / f"budget-{self.name}.png", title)
 
     def run_controller(self, controller, frames):
-        """Run the scene from its start; return the frame, and what it adds to its stages (median of the frames)."""
+        """Run the scene from its start and return the frame."""
         asked = {"controller": "none" if controller in CONSTANT_LODS else controller}
         if controller in ("predictive", "paper"):
             asked["budget_ms"] = self.budget
@@ -100,12 +100,8 @@ class BudgetScene:
             lods = 0 * self.loaded.base_lods
             frame.lods = lambda time: lods
         collect()
-        adds = []
-        for _ in range(frames):
-            begin = self.now()
-            frame.step()
-            adds.append(1e3 * (self.now() - begin) / frame.history[-1].total_ms - 1.0)
-        return frame, float(np.median(adds))
+        frame.run(frames)
+        return frame
 
 
 def steady_costs(frame):

@@ -12,7 +12,7 @@ from ..baselines.wp_bvh import BvhFaces
 from ..memory import memory_columns
 from ..meshes import knot_model
 from ..roofline import find_peaks, roofline
-from ..shapes import knot, longest_side, pair_poses, scene_of_pairs, scene_of_worlds, world_poses
+from ..shapes import longest_side, pair_poses, scene_of_pairs, scene_of_worlds, world_poses
 from ..timing import fit_slope, summarise_all, time_in_turn, upper_half
 
 SIZES = {
@@ -53,16 +53,14 @@ def run(device, quick=False, largest=None, models=None):
     timing = find_peaks(device), sizes["repeats"]
     model, rows = knot_model(sizes["pairs"]["faces"], models), []
     for count in sizes["pairs"]["counts"]:
-        rows.append(run_pairs("pairs", device, model, sizes["pairs"]["faces"], count, *timing))
+        rows.append(run_pairs("pairs", device, model, count, *timing))
         yield rows[-1]
     yield describe_slope("pairs", "pairs", rows)
-    rows = []
-    for face_target in sizes["faces"]["sizes"]:
-        if face_target > (largest or (LARGEST_CPU if device.is_cpu else face_target)):
-            continue
+    rows, limit = [], largest or (LARGEST_CPU if device.is_cpu else max(sizes["faces"]["sizes"]))
+    for face_target in [size for size in sizes["faces"]["sizes"] if size <= limit]:
         model = knot_model(face_target, models)
         for count in sizes["faces"]["pairs"]:
-            rows.append(run_pairs("faces", device, model, face_target, count, *timing))
+            rows.append(run_pairs("faces", device, model, count, *timing))
             yield rows[-1]
     for count in sizes["faces"]["pairs"]:
         yield describe_slope("faces", "faces", [row for row in rows if row["pairs"] == count]) | {"pairs": count}
@@ -90,7 +88,7 @@ def run_first(query):
     return query.run(), time.perf_counter() - begin
 
 
-def run_pairs(sweep, device, model, face_target, pair_count, peaks, repeats):
+def run_pairs(sweep, device, model, pair_count, peaks, repeats):
     """Return the row of one batch of pairs of a model, beside wp.Bvh."""
     gc.collect()  # scenes and their queries hold each other
     poses = pair_poses(pair_count, DISTANCE)
@@ -102,7 +100,7 @@ def run_pairs(sweep, device, model, face_target, pair_count, peaks, repeats):
     memory = memory_columns(scene, query)
     for pair in range(0, pair_count, max(1, pair_count // CHECKED)):
         check_alone(scene, result, pairs[pair : pair + 1])
-    vertices, faces = knot(face_target)
+    vertices, faces, _ = model.mesh_at(model.lod_max)
     constructor = None if len(faces) > 100_000 else "sah"  # SAH is built on the host
     baseline = BvhFaces(vertices, faces, poses, 2 * len(result.faces) + 1024, device, constructor)
     row = {"sweep": sweep, "device": device.name, "faces": model.face_count, "pairs": pair_count}

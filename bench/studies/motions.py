@@ -34,10 +34,6 @@ class Motions:
     def __len__(self):
         return len(self.away)
 
-    def keep(self, chosen):
-        """Keep some of the motions."""
-        self.away, self.rotations = self.away[chosen], self.rotations[chosen]
-
     def poses(self, along, which=None):
         """Return poses of B in A's frame, float64 (n, 7), its centre a distance from A's.
 

@@ -276,5 +276,3 @@ def test_bad_sources_are_refused():
     for source in (None, 3, "no/such/file.obj"):
         with pytest.raises(ab.MeshError):
             Model.load(source)
-    with pytest.raises(ValueError, match="base_faces"):
-        Model.from_arrays(*SHAPES["box"](), base_faces=0)

@@ -8,6 +8,7 @@ Erratum (a) of the paper is explained at `active_mark`.
 """
 
 import math
+from collections import namedtuple
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -148,12 +149,8 @@ class ABTree:
         return state
 
 
-@dataclass
-class Update:
-    """What one ACTIVE-UPDATE cost: k distinct faces, and the number of nodes marked (equation 1 bounds it)."""
-
-    k: int
-    nodes_refitted: int
+# What one ACTIVE-UPDATE cost: k distinct faces, and the number of nodes marked (equation 1 bounds it).
+Update = namedtuple("Update", "k nodes_refitted")
 
 
 def refit_bound(n, k):

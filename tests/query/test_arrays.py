@@ -9,6 +9,7 @@ from helpers.samples import random_poses, sample
 from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
+from warp_abtree.scene import sweep as pose_sweep
 from warp_abtree.scene.poses import device_rows
 
 
@@ -40,8 +41,17 @@ def to_jax(values, device):
     return jax.device_put(values, jax.devices("cuda" if device.is_cuda else "cpu")[0])
 
 
+def to_transforms(values, device):
+    """Return an array of Warp's transforms, of what is shaped like them, with gaps between them."""
+    kinds = {np.dtype(np.float32): wp.transformf, np.dtype(np.float64): wp.transformd}
+    options = {"dtype": kinds[values.dtype]} if values.shape[1:] == (7,) and values.dtype in kinds else {}
+    return wp.array(np.repeat(values, 2, 0), device=device, **options)[::2]
+
+
 FRAMEWORKS = {
     "warp": lambda values, device: wp.array(values, device=device),
+    "strided": lambda values, device: wp.array(np.repeat(values, 2, 0), device=device)[::2],
+    "transforms": to_transforms,
     "dlpack": lambda values, device: speaking(wp.array(values, device=device), "__dlpack__", "__dlpack_device__"),
     "interface": on_gpu(lambda values, device: speaking(wp.array(values, device=device), "__cuda_array_interface__")),
     "torch": to_torch,
@@ -75,8 +85,9 @@ def poses_of(shape, real, count=4):
 
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("shape", ["quaternions", "matrices"])
-def test_poses(device, framework, shape, real):
+def test_poses(device, framework, shape, real, monkeypatch):
     """The same bits as from NumPy, for a scene and a sweep; and a sweep answers what a scene does."""
+    monkeypatch.setattr(pose_sweep, "CHUNKS", (64,))
     poses = poses_of(shape, real)
     first, second = make_scene(device), make_scene(device)
     first.set_poses(poses)

@@ -186,9 +186,6 @@ def test_powers_of_two_scale_every_bit(device):
                 np.testing.assert_array_equal(rows[name], np.ldexp(wanted[name], k) if scaled else wanted[name])
 
 
-# Known cases.
-
-
 FLOOR, ROD = [(0, 0, 0), (2, 0, 0), (0, 2, 0)], [(0, 0, 0), (1, 0, 0), (2, 0, 0)]
 # Two faces, the ends of their contact, its normal, and whether they are coplanar.
 KNOWN = {

@@ -115,7 +115,6 @@ OPERATORS = {
     "manifolds": lambda scene: ab.ManifoldQuery(scene, capacity=ab.Buffers(pairs=2, hits=8)),
 }
 CALLS = {
-    "launch": lambda query: query.launch(),
     "run": lambda query: query.run(),
     "set_pairs": lambda query: query.set_pairs([*MORE_PAIRS, *MORE_PAIRS]) if query.broad_phase is None else None,
     "result": lambda query: (query.launch(), query.result()),

@@ -125,14 +125,11 @@ def rounded(name):
     return ab.Model.from_arrays(np.round(vertices / unit * 4096) / 4096, faces)
 
 
-def check_pair(device, model_a, pose_a, model_b, pose_b, lods=(None, None)):
-    """Compare one pair with brute force and return its faces."""
-    scene = ab.Scene(device)
-    scene.add(model_a, pose_a, lod=lods[0])
-    scene.add(model_b, pose_b, lod=lods[1])
-    faces = ask(scene, [(0, 1)]).faces[:, 1:]
-    lod_a, lod_b = scene.lods
-    np.testing.assert_array_equal(faces, true_faces(model_a, lod_a, pose_a, model_b, lod_b, pose_b))
+def check_pair(device, model_a, pose_a, model_b, pose_b, lod):
+    """Compare one pair at one LOD with brute force and return its faces."""
+    case = (model_a, lod, pose_a, model_b, lod, pose_b)
+    faces = ask(scene_of(device, [case]), [(0, 1)]).faces[:, 1:]
+    np.testing.assert_array_equal(faces, true_faces(*case))
     return faces
 
 
@@ -147,15 +144,13 @@ def test_coincident_meshes_equal_brute_force(device, name, place):
     lod = model.lod_for(fraction=min(1.0, 1500 / model.face_count))
     anywhere = random_poses(np.random.default_rng(10), 1, 1.0)[0]
     pose = {"still": STILL, "quarter turn": QUARTER_TURN, "any turn": anywhere}[place]
-    faces = check_pair(device, model, pose, model, pose, (lod, lod))
+    faces = check_pair(device, model, pose, model, pose, lod)
     if place != "any turn":
         assert {(f, f) for f in model.mesh_at(lod)[2]} <= set(map(tuple, faces.tolist()))
     if place == "quarter turn":
-        np.testing.assert_array_equal(check_pair(device, model, STILL, model, STILL, (lod, lod)), faces)
+        np.testing.assert_array_equal(check_pair(device, model, STILL, model, STILL, lod), faces)
     if place == "any turn" and name in ("cow", "fandisk", "fcl-env", "torus"):  # few pairs of the others differ
-        scene = ab.Scene(device)
-        for _ in range(2):
-            scene.add(model, pose, lod=lod)
+        scene = scene_of(device, [(model, lod, pose) * 2])
         rounded_faces = scene.intersect([(0, 1)], "faces", precision="float32").faces[:, 1:]
         assert not np.array_equal(rounded_faces, faces), "the case is too easy to tell exact signs from others"
 
@@ -164,9 +159,9 @@ def test_coincident_meshes_equal_brute_force(device, name, place):
 def test_touching_boxes(device, shift):
     """Faces, edges and corners that touch count; one unit in the last place farther, they do not."""
     box = sample("box")
-    assert len(check_pair(device, box, STILL, box, (*shift, 0, 0, 0, 1))) > 0
+    assert len(check_pair(device, box, STILL, box, (*shift, 0, 0, 0, 1), box.lod_max)) > 0
     beyond = [np.nextafter(x, 9) if x == 1 else x for x in shift]
-    assert len(check_pair(device, box, STILL, box, (*beyond, 0, 0, 0, 1))) == 0
+    assert len(check_pair(device, box, STILL, box, (*beyond, 0, 0, 0, 1), box.lod_max)) == 0
 
 
 @pytest.mark.parametrize("far", [1e6, 1e30, 1e39, 1e300, 1.7e308])
@@ -187,9 +182,6 @@ def test_pairs_far_apart(device, far):
     apart = [pair not in meets for pair in pairs]
     assert (result.node_tests[apart] <= 2).all() and (result.triangle_tests[apart] == 0).all()
     assert (result.count[~np.array(apart)] >= ball.face_count).all()
-
-
-# Regimes and work.
 
 
 @pytest.mark.parametrize("room", [STACK_LENGTH, 0])
@@ -224,25 +216,20 @@ def test_warps_give_the_same_answers(device, room, parts):
         assert visits["any"] < visits["count"], "a pair ends at its first hit"
 
 
-@pytest.mark.parametrize("name", ["torus", "soup"])
-def test_coincident_meshes_go_to_float64_at_once(device, name):
+def test_coincident_meshes_go_to_float64_at_once(device):
     """Of twins in one place all faces, of a copy's those that float32 leaves open: the answers are the same."""
-    model = sample(name)
-    for pose in (STILL, random_poses(np.random.default_rng(12), 1, 1.0)[0]):
-        scene = ab.Scene(device)
-        beside = (*np.asarray(pose[:3]) + 1e-4, *pose[3:])
-        for placed, at in ((model, pose), (model, pose), (copy.copy(model), pose), (model, beside)):
-            scene.add(placed, at)
-        result = ask(scene, [(0, 1), (0, 2), (0, 3)])
-        first, second, _ = (result.faces[result.faces[:, 0] == p, 1:] for p in range(3))
-        np.testing.assert_array_equal(first, second)
-        tested, left = result.triangle_tests, result.float64_tests
-        assert left[0] == tested[0] == tested[1] > left[1]
-        assert left[2] < tested[2]
-        coarse = model.lod_for(fraction=0.3)
-        scene.set_lods([model.lod_max, coarse, coarse, coarse])
-        apart = ask(scene, [(0, 1), (0, 2)])  # no twins
-        assert (apart.float64_tests < apart.triangle_tests).all() and np.ptp(apart.float64_tests) == 0
+    model, pose = sample("soup"), random_poses(np.random.default_rng(12), 1, 1.0)[0]
+    scene = ab.Scene(device)
+    for placed in (model, model, copy.copy(model)):
+        scene.add(placed, pose)
+    result = ask(scene, [(0, 1), (0, 2)])
+    first, second = (result.faces[result.faces[:, 0] == p, 1:] for p in range(2))
+    np.testing.assert_array_equal(first, second)
+    tested, left = result.triangle_tests, result.float64_tests
+    assert left[0] == tested[0] == tested[1] > left[1]
+    scene.set_lods([model.lod_max, *[model.lod_for(fraction=0.3)] * 2])
+    apart = ask(scene, [(0, 1), (0, 2)])  # no twins
+    assert (apart.float64_tests < apart.triangle_tests).all() and np.ptp(apart.float64_tests) == 0
 
 
 @pytest.mark.parametrize("name", [*slow("cow", "rocker-arm", "stanford-bunny"), "torus"])

@@ -138,9 +138,6 @@ def test_coarse_proof_holds_for_the_original_meshes(device):
     assert (~coarse.intersect(pairs).any & truth.any).any(), "coarse meshes alone give wrong answers here"
 
 
-# Touching, scales, places, poses.
-
-
 @pytest.mark.parametrize("exponent", [-60, 31])
 def test_scaling_by_a_power_of_two_changes_nothing(device, exponent):
     rng = np.random.default_rng(5)
@@ -189,9 +186,6 @@ def test_far_pairs_and_huge_distances(device, far):
         assert not result.any.any()
     scene = in_a_row(device, "box", (1.7e308, -1.7e308))
     assert scene.intersect([(0, 1)], within=1e300).apart[0] and not scene.intersect([(0, 1)], within=1.7e308).any[0]
-
-
-# Operators, regimes, input.
 
 
 @pytest.mark.slow

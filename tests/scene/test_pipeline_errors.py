@@ -1,6 +1,7 @@
 """Frames that lose work or are given bad numbers: served as stated, and told once by the next check."""
 
 import warnings
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -87,12 +88,9 @@ def test_lost_work_is_told(device):
         for poses in (far, near, far):
             frame.poses.assign(poses)
             launch()
-        if message is None:
+        with pytest.raises(ab.CapacityError, match=message) if message else nullcontext():
             frame.check()
-        else:
-            with pytest.raises(ab.CapacityError, match=message):
-                frame.check()
-            frame.check()
+        frame.check()
         frame.poses.assign(near)
         check_same(frame.run(), expected)
         frame.launch()
@@ -113,12 +111,10 @@ def test_one_check_tells_all_that_was_wrong(device):
 
 
 REFUSED = [
-    (dict(groups=[0, 1]), "groups: .*shape"),
     (dict(groups=[0.0, 1.0, 0.0]), "groups: .*type float64"),
     (dict(groups=[0, 0, 1]), "groups: .*group 0 holds objects of several models"),
     (dict(groups=[0, 2, 0]), "groups: .*without gaps"),
     (dict(ladder=[[1]]), "1 lists of LODs given for 2 models"),
-    (dict(ladder=[[1], []]), "no LOD for model 1"),
     (dict(ladder=[[1], [10**6]]), "LOD 1000000 is outside"),
     (dict(groups=[0, 1, 0], ladder=[[0], [0]]), "give one of them"),
     (dict(output="all"), "none of 'any'"),

@@ -49,9 +49,6 @@ def test_matrices_are_taken_as_they_are(device, dtype):
         np.testing.assert_array_equal(position, poses[:, :3, 3].astype(np.float64))
 
 
-# What holds across changes.
-
-
 def test_add_keeps_poses_and_lods(device):
     scene = pair_scene(device)
     scene.set_poses(random_poses(np.random.default_rng(3), 3, 5.0))

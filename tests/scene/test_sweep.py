@@ -56,26 +56,6 @@ def test_same_as_a_scene(device, names, precision, small_chunks):
             assert found.dtype == getattr(expected, output).dtype
 
 
-@pytest.mark.parametrize("real", [np.float32, np.float64])
-def test_poses_of_every_kind(device, real, small_chunks):
-    """Rows and transforms, on the host and on the device, whole and in part; float32 counts as what it is."""
-    models, poses = [sample("torus"), sample("soup")], mixed_poses(2).astype(real)
-    expected = ask_scene(device, models, poses.astype(np.float64), [None, None], output="count").count
-    assert 3 < np.count_nonzero(expected) < 26
-    scalar, transform = pose_sweep.SCALARS[poses.dtype], {4: wp.transformf, 8: wp.transformd}[poses.itemsize]
-    apart = np.zeros((2 * len(poses), 7), real)
-    apart[::2] = poses
-    for asked in (
-        poses.tolist(),
-        apart[::2],
-        wp.array(apart, dtype=scalar, device=device)[::2],
-        wp.array(poses, dtype=transform, device=device),
-        wp.array(apart, dtype=transform, device=device)[::2],
-        wp.array(poses, dtype=transform, device="cpu"),
-    ):
-        np.testing.assert_array_equal(ab.sweep(*models, asked, output="count", device=device), expected)
-
-
 def test_more_poses_than_before_and_fewer(device, monkeypatch):
     monkeypatch.setattr(pose_sweep, "CHUNKS", (2, 5, 20))
     models, poses = [sample("torus"), sample("soup")], mixed_poses()

@@ -143,19 +143,6 @@ def test_given_pairs_need_no_broad_phase(device, allocations):
     assert fresh._broad_phase is None
 
 
-@pytest.mark.slow
-def test_contacts_cost_only_those_who_ask(device, allocations):
-    scene = make_scene(device, 60)
-    scene.batch()
-    pairs = np.arange(60).reshape(-1, 2)
-    for output in ("any", "faces", "contacts"):
-        make_scene(device, 60).intersect(pairs, output=output)
-    faces, _ = allocations.gained(lambda: scene.intersect(pairs, output="faces"))
-    again, _ = allocations.gained(lambda: [scene.intersect(pairs, output="faces") for _ in range(3)])
-    contacts, _ = allocations.gained(lambda: scene.intersect(pairs, output="contacts"))
-    assert abs(again) <= SLACK and contacts > faces
-
-
 def test_a_sweep_needs_no_more_for_more_poses(device, allocations, monkeypatch):
     """Besides models and states, a chunk; the same for twenty chunks."""
     pose_sweep._kept.clear()

@@ -21,7 +21,7 @@ CONFIGURATIONS = (("touching", 0.001), ("light", 0.03), ("deep", 0.2))
 
 
 def run_figure_6(context):
-    """Yield one row a model and k, and one a model and k of random faces, only counted.
+    """Yield one row a model and k.
 
     A model goes from its finest level of detail to a coarser one; k faces change. Marking and refit are timed alone, as
     the paper's figure 6 has them, as captured launches (one core on the CPU), beside a refit of the whole tree. Nodes
@@ -37,22 +37,6 @@ def run_figure_6(context):
         least = int(np.argmin(np.diff(model.progressive.split_start)))
         for home, there in [(least + 1, least), *((finest, finest - step) for step in sorted(steps))]:
             yield time_move(context, scene, model, home, there)
-        leaf_node, rng = model.tree.leaf_node, np.random.default_rng(0)
-        for k in np.unique(np.geomspace(1, model.face_count, 25).round().astype(int)):
-            leaves = leaf_node[rng.choice(model.face_count, k, replace=False)]
-            row = {"case": "random faces", "model": model.name, "faces": model.face_count, "k": int(k)}
-            yield row | {"nodes": count_ancestors(leaves), "bound": bound_nodes(int(k), model.face_count)}
-
-
-def count_ancestors(leaves) -> int:
-    """Return how many nodes a bottom-up marking of these leaves marks, themselves among them."""
-    marked, nodes = np.empty(0, int), np.asarray(leaves)
-    while len(nodes):
-        # Leaves stand on two levels, so a node may come up twice.
-        marked = np.union1d(marked, nodes)
-        nodes = np.unique(nodes >> 1)
-        nodes = nodes[nodes > 0]
-    return len(marked)
 
 
 def time_move(context, scene, model, home, there):

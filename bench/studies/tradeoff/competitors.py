@@ -77,9 +77,6 @@ class NewtonPoses(Newton):
         return np.concatenate(found)
 
 
-# --- shapes ----------------------------------------------------------------------------------------------------------
-
-
 def simplify(library, vertices, faces, fraction):
     """Return a mesh simplified by fast-simplification; its threshold is absolute, so it is brought to unit size.
 
@@ -96,17 +93,6 @@ def convex_hull(vertices, faces):
     """Return the hull of a mesh, by trimesh (Qhull)."""
     hull = trimesh.Trimesh(vertices, faces, process=False).convex_hull
     return np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int32)
-
-
-def find_version(package):
-    """Return the version of an installed package."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "not installed"
-
-
-# --- points ----------------------------------------------------------------------------------------------------------
 
 
 def measure(workload, method, setting, intersects, **more):
@@ -199,7 +185,8 @@ def newton_points(context, workload):
 def run(context):
     """Yield one row a workload, method and setting."""
     names = "python-fcl", "fast-simplification", "trimesh", "newton"
-    context.note(f"Versions: {', '.join(f'{name} {find_version(name)}' for name in names)}.")
+    versions = {package.name: package.version for package in metadata.distributions()}
+    context.note(f"Versions: {', '.join(f'{name} {versions.get(name)}' for name in names)}.")
     for workload in workloads(context):
         found = []
         for points in (our_points, newton_points, fcl_points):

@@ -56,7 +56,7 @@ class Workload:
         self.finest = self.scene((model_a.lod_max, model_b.lod_max), min(POSES_AT_A_TIME, 16 * count))
         low, high = find_first_contact(self.finest.intersects, self.motions, self.steps)
         chosen = np.flatnonzero(~np.isnan(low))[:count]
-        self.motions.keep(chosen)
+        self.motions.away, self.motions.rotations = self.motions.away[chosen], self.motions.rotations[chosen]
         self.low, self.high = low[chosen], high[chosen]
         which = np.tile(np.arange(min(posed, len(chosen))), len(OFFSETS) + 2)
         along = [self.low[:posed] + offset * self.size for offset in OFFSETS]
