@@ -126,7 +126,7 @@ def test_study(name, device, tmp_path, monkeypatch):
     for table in tables.read_layout(f"studies/{name}.toml")["table"]:
         shown = tables.select_rows(table, found)
         absent = [key for key, *_ in table["columns"] if not any(key in row for row in shown)]
-        assert shown and (not absent or table["part"] == "competitors"), (table["name"], absent)
+        assert shown and not absent, (table["name"], absent)
     assert "Not measured" not in (tmp_path / f"{name}.md").read_text()
     globals()[f"check_{name}"](parts, KnotFolder().model)
 
