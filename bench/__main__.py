@@ -9,6 +9,7 @@ import importlib
 import inspect
 import json
 import platform
+import shlex
 import sys
 from pathlib import Path
 
@@ -64,27 +65,21 @@ def main(argv=None):
     asked = {key: value for key, value in vars(options).items() if key in taken - {"device"} and value is not None}
     if name in STUDIES:
         try:
-            case.run(options.device, **asked)
+            case.run(options.device, **asked, command=shlex.join(["python", "-m", "bench", *argv]))
         except case.StudyError as error:
             parser.error(str(error))
         return 0
-    rows = print_rows(case.run(options.device, **asked))
+    wp.config.log_level = wp.LOG_WARNING
+    rows = []
+    for row in case.run(options.device, **asked):
+        rows.append(row)
+        print("  ".join(f"{key}={value}" for key, value in row.items()), flush=True)
     if options.json:
         Path(options.json).write_text(json.dumps({**describe_run(), "rows": rows}, indent=1), encoding="utf-8")
     if name in FIGURES and options.plots:
         figures = tables.pick(tables.read_layout("cases/figures.toml")["figure"], case=name)
         print(tables.draw(figures, rows, options.plots), flush=True)
     return 0
-
-
-def print_rows(found):
-    """Print rows as they come and return them."""
-    wp.config.log_level = wp.LOG_WARNING
-    rows = []
-    for row in found:
-        rows.append(row)
-        print("  ".join(f"{key}={value}" for key, value in row.items()), flush=True)
-    return rows
 
 
 def describe_run():

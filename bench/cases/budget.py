@@ -25,7 +25,6 @@ OUTPUT = {"cpu": "count", "cuda": "contacts"}
 FRAMES, QUICK_FRAMES, QUICK_OBJECTS = 240, 75, 40
 BREACH = 3.5  # how often the finest LODs take the budget
 CONTROLLERS = ("none", "coarsest", "predictive", "paper", "tolerance")
-CONSTANT_LODS = ("none", "coarsest")
 
 
 def run(device, quick=False, plots=None):
@@ -92,7 +91,7 @@ class BudgetScene:
 
     def run_controller(self, controller, frames):
         """Run the scene from its start and return the frame."""
-        asked = {"controller": "none" if controller in CONSTANT_LODS else controller}
+        asked = {"controller": "none" if controller == "coarsest" else controller}
         if controller in ("predictive", "paper"):
             asked["budget_ms"] = self.budget
         frame = self.loaded.frame(self.output, bodies=self.loaded.make_bodies(), **asked, **self.options)

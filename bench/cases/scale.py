@@ -74,10 +74,9 @@ def run(device, quick=False, largest=None, models=None):
 def describe_slope(sweep, x, rows) -> dict:
     """Return the row of a sweep's slopes."""
     row = {"sweep": f"{sweep}: slope", "sizes": len(rows)}
-    half = upper_half(rows)
     for name in ("ours_ms", "peer_ms", "broad_ms", "arrays_mib", "pool_mib"):
         if rows and name in rows[0]:
-            for label, some in ((f"{name}_slope", rows), (f"{name}_slope_upper", half)):
+            for label, some in ((f"{name}_slope", rows), (f"{name}_slope_upper", upper_half(rows))):
                 row[label] = fit_slope([r[x] for r in some], [r[name] for r in some])
     return row
 

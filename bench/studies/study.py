@@ -7,7 +7,6 @@ use. It writes DIR/STUDY.json after each part, and in the end STUDY.md and figur
 import importlib
 import json
 import platform
-import shlex
 import sys
 import time
 from functools import partial
@@ -104,18 +103,17 @@ def find_study(name):
     return importlib.import_module(f"{__package__}.{name}")
 
 
-def run_part(run, context) -> dict:
+def run_part(run, context, command) -> dict:
     """Run a part; return its rows, notes and the circumstances."""
     begin = time.perf_counter()
     rows = [{key: tables.plain(value) for key, value in row.items()} for row in run(context)]
     device = context.device.name if context.device.is_cuda else f"{platform.processor()}, {timing.core_count()} cores"
-    about = {"device": device, "quick": context.quick, **describe_run()}
-    about |= {"command": shlex.join(["python", "-m", "bench", *sys.argv[1:]])}
+    about = {"device": device, "quick": context.quick, **describe_run(), "command": command}
     about["seconds"] = tables.plain(time.perf_counter() - begin)
     return {"run": about, "notes": context.notes, "rows": rows}
 
 
-def run_study(name, out, only, make_context):
+def run_study(name, out, only, command, make_context):
     """Run the parts of a study, or some of them, and write what they found."""
     file = out / f"{name}.json"
     study = {"study": name, "parts": {}}
@@ -125,7 +123,7 @@ def run_study(name, out, only, make_context):
         if only and part not in only:
             continue
         print(f"{name}: {part}", file=sys.stderr, flush=True)
-        study["parts"][part] = run_part(run_rows, make_context())
+        study["parts"][part] = run_part(run_rows, make_context(), command)
         tables.write_json(file, study)
     (out / f"{name}.md").write_text(tables.study_page(study), encoding="utf-8")
     figures = tables.read_layout(f"studies/{name}.toml")["figure"]
@@ -137,7 +135,7 @@ class StudyError(ValueError):
     """What was asked for is not there."""
 
 
-def run(device, name, out, quick=False, models=None, only=None):
+def run(device, name, out, quick=False, models=None, only=None, command=None):
     """Run a study, or all of them.
 
     Raises:
@@ -157,4 +155,4 @@ def run(device, name, out, quick=False, models=None, only=None):
         raise StudyError(str(error)) from error
     folder = ModelFolder(models or out / "models")
     for name in names:
-        run_study(name, out, only, partial(Context, device, quick, folder))
+        run_study(name, out, only, command, partial(Context, device, quick, folder))

@@ -55,21 +55,6 @@ def test_fcl_in_cpp_finds_what_brute_force_finds():
             assert sorted(map(tuple, found.face_pairs(answer))) == sorted(map(tuple, truth.tolist()))
 
 
-def test_fcl_in_cpp_is_named_where_it_cannot_be_compiled(monkeypatch):
-    for name, value in (("PATH", "/nowhere"), ("CXX", "no-such-compiler")):
-        fcl_cpp.load_library.cache_clear()
-        with monkeypatch.context() as patch:
-            patch.setenv(name, value)
-            with pytest.raises(ImportError, match="no "):
-                fcl_cpp.FclCpp(cube(), cube(), np.eye(4)[None])
-    fcl_cpp.load_library.cache_clear()
-
-
-def test_newton_is_named_where_it_is_not_asked(device):
-    made, skipped = newton.make_newton(*knot(200), pair_poses(1, 0.2), 10, wp.get_device(device), "too many")
-    assert made == {} and set(skipped.values()) == {"too many"} and len(skipped) == 2
-
-
 def test_newton_agrees_on_which_pairs_intersect(device):
     pytest.importorskip("newton")
     poses = pair_poses(6, 0.2)

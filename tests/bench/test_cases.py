@@ -9,47 +9,36 @@ import warp as wp
 from bench import __main__ as main
 from bench.baselines.newton import SDF_RESOLUTION
 from bench.cases import budget, build, scaling
+from bench.tables import pick
 from warp_abtree import testing
 
 pytestmark = pytest.mark.slow
 MORE = {"scaling": ["--devices", "{0},{0}"], "exact": ["--processes", "1"]}
 
 
-def rows_of(rows, **where):
-    return [row for row in rows if all(row.get(key) == value for key, value in where.items())]
-
-
 def check_query(rows):
     assert [row["pairs"] for row in rows] == [1, 4]
     for row in rows:
-        assert row["triangle_tests"] >= row["hits"] > 0 and row["node_tests"] > row["triangle_tests"]
         assert row["peer_hits"] - row["peer_invented"] + row["peer_missed"] == row["hits"] and row["ours_wrong"] == 0
         assert row["ratio"] == pytest.approx(row["peer_ms"] / row["ours_ms"], rel=0.2, abs=0.02)
-        assert row["bytes"] >= 32 * row["node_tests"] + 120 * row["triangle_tests"] + 12 * row["hits"]
         assert row["node_tests_per_s"] == pytest.approx(1e3 * row["node_tests"] / row["ours_ms"], rel=0.01)
         for name in ("newton_bvh", f"newton_sdf{SDF_RESOLUTION}"):
             assert (f"{name}_ms" in row) != (f"{name}_skipped" in row), "a baseline runs or is named as skipped"
 
 
 def check_update(rows):
-    one = rows_of(rows, case="one state")
-    faces = sorted({row["faces"] for row in one})
-    assert len(faces) == 2 and len(rows_of(rows, case="crossover")) == 2
-    for n in faces:
-        k = [row["k"] for row in rows_of(one, faces=n)]
-        assert 0 < k[0] <= k[1] < k[2] <= n
-    for row in one:
+    assert [row["faces"] for row in pick(rows, case="crossover")] == [168, 576]
+    for row in pick(rows, case="one state"):
         assert row["k"] <= row["nodes_refitted"] <= row["bound"] and row["entries"] >= row["k"]
         share = testing.current_regime().full_refit["cpu" if row["device"] == "CPU" else "cuda"]
         assert row["full"] == (row["entries"] > share * row["faces"]) and row["arrays_mib"] > 0
-        assert row["nodes_per_s"] == pytest.approx(1e3 * row["nodes_refitted"] / row["update_ms"], rel=0.01)
-    many = rows_of(rows, case="many states")
+    many = pick(rows, case="many states")
     assert [row["states"] for row in many] == [1, 12] and many[1]["nodes_refitted"] > 10 * many[0]["nodes_refitted"]
     assert testing.current_regime().full_refit == {"cpu": 0.5, "cuda": 0.01}, "what was forced is put back"
 
 
 def check_scale(rows):
-    pairs, meshes, worlds = (rows_of(rows, sweep=name) for name in ("pairs", "faces", "worlds"))
+    pairs, meshes, worlds = (pick(rows, sweep=name) for name in ("pairs", "faces", "worlds"))
     assert [row["pairs"] for row in pairs] == [1, 4, 16]
     assert [(row["faces"], row["pairs"]) for row in meshes] == [(168, 1), (168, 3), (576, 1), (576, 3)]
     grown = 2**20 * (meshes[2]["arrays_mib"] - meshes[0]["arrays_mib"]) / (576 - 168)
@@ -144,12 +133,3 @@ def test_large_meshes_are_left_out_and_models_kept(device, tmp_path, capsys):
     words = ["update", "--device", device, "--quick", "--largest", "300", "--models", str(tmp_path)]
     assert main.main(words) == 0 and "faces=576" not in capsys.readouterr().out
     assert [path.name for path in tmp_path.iterdir()] == ["knot-200-base10.npz"]
-
-
-@pytest.mark.parametrize(
-    "words", [["query", "--largest", "5"], ["baselines", "--plots", "x"], ["paper", "--json", "x"]]
-)
-def test_command_refuses_options_of_other_cases(words, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main.main([*words, "--device", "cpu"])
-    assert stop.value.code == 2 and "python -m bench: " in capsys.readouterr().err

@@ -32,21 +32,16 @@ def test_bound_of_equation_1():
     assert bound_nodes(0, 5) == 0
 
 
-class Counted:
-    """1,000 node tests at 32 bytes and 64 operations, a pair of 400 bytes; 100 triangle tests, 10 of them hits."""
-
-    node_tests, triangle_tests = np.array([1000]), np.array([100])
-    float64_tests, exact_tests = np.array([3]), np.array([1])
-    any, count, faces, pairs = np.array([True]), np.array([10]), (), (0,)
-
-
 def test_work_of_a_result():
-    size, single, double = roofline.count_work(Counted)
+    """1,000 node tests at 32 bytes and 64 operations, a pair of 400 bytes; 100 triangle tests, 10 of them hits."""
+    counters = {"node_tests": 1000, "triangle_tests": 100, "float64_tests": 3, "exact_tests": 1, "count": 10}
+    result = SimpleNamespace(faces=(), pairs=(0,), **{name: np.array([value]) for name, value in counters.items()})
+    size, single, double = roofline.count_work(result)
     assert size == 32 * 1000 + 128 * 100 + 176 * 3 + 176 + 400 + 12 * 10
     assert single == 64 * 1000 + 140 * 100 + 152 * 7 and double == 129 * 3 + 373
-    row = roofline.roofline(Counted, 1.0, (1e9, 1e9, 1e9))
+    row = roofline.roofline(result, 1.0, (1e9, 1e9, 1e9))
     assert row["floor_ms"] == pytest.approx(max(size, single, double) * 1e-6, rel=1e-3)
-    assert row["node_tests_per_s"] == 1e6 and "floor_ms" not in roofline.roofline(Counted, 1.0, None)
+    assert row["node_tests_per_s"] == 1e6 and "floor_ms" not in roofline.roofline(result, 1.0, None)
 
 
 def test_work_of_an_update():

@@ -126,7 +126,7 @@ def test_study(name, device, tmp_path, monkeypatch):
     for table in tables.read_layout(f"studies/{name}.toml")["table"]:
         shown = tables.select_rows(table, found)
         absent = [key for key, *_ in table["columns"] if not any(key in row for row in shown)]
-        assert shown and (not absent or table["part"] == "competitors"), (table["name"], absent)
+        assert shown and not absent, (table["name"], absent)
     assert "Not measured" not in (tmp_path / f"{name}.md").read_text()
     globals()[f"check_{name}"](parts, KnotFolder().model)
 
@@ -152,22 +152,17 @@ def test_a_static_tree_over_other_vertices_is_noticed(context, monkeypatch):
         list(static.run(context))
 
 
-def test_study_is_written_part_by_part(tmp_path, monkeypatch):
-    ran = []
+def test_parts_asked_alone_keep_the_others(tmp_path, monkeypatch):
+    def run(context):
+        context.note("Once.")
+        context.note("Once.")
+        yield {"x": np.float32(context.size(2, 1)), "gap": float("nan")}
 
-    def part(name):
-        def run(context):
-            ran.append(name)
-            context.note("Once.")
-            context.note("Once.")
-            yield {"x": np.float32(context.size(2, 1)), "gap": float("nan")}
-
-        return run
-
-    monkeypatch.setattr(study.find_study("paper"), "PARTS", {"one": part("one"), "two": part("two")})
+    monkeypatch.setattr(study.find_study("paper"), "PARTS", {"one": run, "two": run})
     words = ["paper", "--out", str(tmp_path), "--device", "cpu", "--quick"]
-    assert main.main(words) == 0 and main.main([*words, "--only", "two"]) == 0
-    assert ran == ["one", "two", "two"]
+    assert main.main(words) == 0
+    before = json.loads((tmp_path / "paper.json").read_text())["parts"]
+    assert main.main([*words, "--only", "two"]) == 0
     parts = json.loads((tmp_path / "paper.json").read_text())["parts"]
-    assert set(parts) == {"one", "two"} and parts["one"]["rows"] == [{"x": 1.0, "gap": None}]
-    assert parts["one"]["notes"] == ["Once."] and "quick" in (tmp_path / "paper.md").read_text()
+    assert parts["one"] == before["one"] and parts["two"]["run"]["command"].endswith("--quick --only two")
+    assert parts["one"]["rows"] == [{"x": 1.0, "gap": None}] and parts["one"]["notes"] == ["Once."]

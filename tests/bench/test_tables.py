@@ -40,12 +40,6 @@ def test_markdown():
     assert "- seconds: 2" in tables.markdown_run(toy_study()) and "A <note>." in tables.study_page(toy_study())
 
 
-def test_json_is_read_back(tmp_path):
-    for study_found in (toy_study(), {"study": "paper", "parts": {}}):
-        tables.write_json(tmp_path / "toy.json", study_found)
-        assert json.loads((tmp_path / "toy.json").read_text()) == study_found
-
-
 def test_figures(tmp_path, monkeypatch):
     figures = tables.pick(tables.read_layout("cases/figures.toml")["figure"], case="scale")
     rows = [{"sweep": "pairs", "pairs": n, "ours_ms": 2.0 * n, "peer_ms": 3.0 * n, "arrays_mib": 1.0} for n in (1, 10)]
