@@ -1,22 +1,18 @@
-"""`warp-abtree run`: what it prints, records, draws and runs again, and one line with status 2 for anything bad."""
+"""`warp-abtree run`: what it prints, records and draws."""
 
 import csv
 import io
 import json
 import re
-import sys
 from pathlib import Path
 
 import matplotlib.image
 import numpy as np
 import pytest
-import trimesh
 from helpers.samples import SHUTTLE_SCENE
 from helpers.viewer import run_command as run
 
-import warp_abtree as ab
 from warp_abtree.app import load_scene
-from warp_abtree.app.cli import run_command
 from warp_abtree.app.pictures import scenes
 from warp_abtree.app.styles import STAGE_LABELS
 
@@ -34,24 +30,10 @@ period = 2
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
-    """Work in a folder with a scene, and files that are none."""
+    """Work in a folder with a scene."""
     monkeypatch.chdir(tmp_path)
-    trimesh.creation.box().export("ball.obj")
-    ab.Model.from_arrays(np.eye(3), [[0, 1, 2]]).save("face.npz")
     Path("scene.toml").write_text(SCENE)
-    Path("bad.toml").write_text("[scene]\nspeed = 3\n")
-    Path("broken.toml").write_text("[scene\n")
-    Path("junk.npz").write_bytes(b"junk")
-    Path("folder.npz").mkdir()
     return tmp_path
-
-
-def test_run_for_people(files, capsys):
-    shown, errors = run(capsys, "run", "scene.toml", "--device", "cpu")
-    for text in ("4 frames on cpu", "2 objects of 2 models in 1 world,", "refine and refit", "broad phase", "p95"):
-        assert text in shown
-    # A machine that has not run these before says that it compiles kernels.
-    assert not [line for line in errors if "compiling kernels" not in line]
 
 
 def test_run_for_programs(files, capsys):
@@ -68,50 +50,22 @@ def test_run_for_programs(files, capsys):
 
 def test_run_under_a_budget(files, capsys):
     shown, errors = run(capsys, "run", "scene.toml", "--frames", 8, "--budget", "50ms", "--device", "cpu")
-    for text in ("select LODs", "answer", "budget: 50 ms, predictive controller", "certified error", "of 4 frames"):
-        assert text in shown
+    for line in ("controller +predictive", "budget ms +50", "select_ms +[\\d.]+", "budget +frames 4, .*", "objects +2"):
+        assert re.search(f"^{line}", shown, re.M), line
     assert not errors
     found = json.loads(
         run(capsys, "run", "scene.toml", "--budget", "0.05s", "--controller", "paper", "--json", "--device", "cpu")[0]
     )
     assert (found["budget_ms"], found["controller"]) == (50, "paper") and found["budget"] is None
-    assert found["stages"]["select_ms"]["total"] > 0 and set(found["stages"]) == {*STAGE_LABELS, *run_command.SUMS}
+    assert found["stages"]["select_ms"]["total"] > 0 and set(found["stages"]) == {*STAGE_LABELS, "cost_ms", "total_ms"}
     cost = sum(found["stages"][name]["total"] for name in ("select_ms", "refine_ms", "broad_ms", "query_ms"))
     assert found["stages"]["cost_ms"]["total"] == pytest.approx(cost)
-    shown, _ = run(capsys, "run", "scene.toml", "--budget", 50, "--device", "cpu")
-    assert "no frame after the first second" in shown
-    shown, _ = run(capsys, "run", "scene.toml", "--controller", "none", "--device", "cpu")
-    assert "budget" not in shown and "certified error" in shown
-
-
-def test_a_recorded_run_runs_again(files, capsys, device):
-    words = "--frames 5 --budget 2ms --device".split()
-    shown, _ = run(capsys, "run", "scene.toml", *words, device, "--record", "run.npz")
-    assert shown.endswith("wrote run.npz\n")
-    Path("scene.toml").unlink()
-    first = json.loads(run(capsys, "run", "run.npz", "--json", "--record", "rows.json")[0])
-    again = json.loads(run(capsys, "run", "run.npz", "--json", "--record", "rows.csv")[0])
-    assert (first.pop("written"), again.pop("written")) == (["rows.json"], ["rows.csv"])
-    assert first == again and first["replay"] == "run.npz" and first["budget_ms"] == 2
-    rows = json.loads(Path("rows.json").read_text())
-    with np.load("run.npz") as file:
-        arrays = {name: file[name] for name in file.files}
-    recorded = json.loads(str(arrays["rows"]))
-    assert recorded == [{name: row[name] for name in recorded[0]} for row in rows]
-    shown, _ = run(capsys, "run", "run.npz", "--frames", 2)
-    assert "2 frames" in shown and "as recorded in run.npz" in shown
-    errors = run(capsys, "run", "run.npz", "--frames", 9, status=2)[1]
-    assert len(errors) == 1 and "run.npz has 5 frames" in errors[0]
-    recorded[3]["hits"] += 1
-    np.savez("run.npz", **{**arrays, "rows": np.array(json.dumps(recorded))})
-    shown, errors = run(capsys, "run", "run.npz", status=1)
-    assert not shown and len(errors) == 1 and "run.npz: frame 3: hits is " in errors[0]
 
 
 @pytest.mark.slow
 def test_plot(files, capsys):
     shown, _ = run(capsys, "run", "scene.toml", "--frames", 6, "--budget", "20ms", "--plot", "plots", "--device", "cpu")
-    assert shown.endswith(f"wrote {Path('plots', 'frames.png')}\n")
+    assert re.search(f"^written +{Path('plots', 'frames.png')}$", shown, re.M)
     image = matplotlib.image.imread(Path("plots", "frames.png"))[:, :, :3]
     red, green, blue = image.reshape(-1, 3).T
     assert image.shape[0] > 800 and np.mean((red > 0.98) & (green > 0.98) & (blue > 0.98)) > 0.3, "background"
@@ -122,14 +76,6 @@ def test_plot(files, capsys):
         assert near.sum() > 100, ("LODs", "budget", "error")[part]
     assert [path.name for path in Path("plots").iterdir()] == ["frames.png"]
     run(capsys, "run", "scene.toml", "--frames", 2, "--plot", "plots", "--device", "cpu")
-
-
-def test_plot_without_matplotlib(files, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    for option, needs in ((("--plot", "plots"), "Matplotlib"), (("--picture", "out.png"), "pyvista and Matplotlib")):
-        errors = run(capsys, "run", "scene.toml", *option, status=2)[1]
-        assert errors == [f"warp-abtree: {option[0]} needs {needs}: pip install warp-abtree[pictures]"]
-    assert not Path("plots").exists()
 
 
 def test_picture_of_a_controlled_run_shows_its_lods(files, capsys, monkeypatch):
@@ -161,7 +107,7 @@ def test_picture_of_rigid_bodies(files, capsys):
 def test_picture(files, capsys):
     pytest.importorskip("pyvista")
     shown, _ = run(capsys, "run", "scene.toml", "--frames", 2, "--picture", "out.png")
-    assert "wrote out.png" in shown
+    assert re.search("^written +out.png$", shown, re.M)
     image = matplotlib.image.imread("out.png")[:, :, :3]
     assert image.shape[1] > 600
     # Both panels show plain and intersecting faces of both models.

@@ -1,25 +1,24 @@
 """Pictures: what is drawn where, in which colours, and one line with status 2 for anything bad."""
 
 import json
-import sys
-from pathlib import Path
 
 import matplotlib.image
 import numpy as np
 import pytest
 import trimesh
 from helpers.viewer import BODIES, make_models, make_playback, write_scene
+from helpers.viewer import run_command as run
 
 from warp_abtree.app import draw_objects, load_scene
 from warp_abtree.app import scene_geometry as geometry
-from warp_abtree.app.cli import main as cli
 from warp_abtree.app.open_playback import open_playback
 from warp_abtree.app.pictures import command, scenes
-from warp_abtree.app.pictures.render import Panel, camera_around, render
+from warp_abtree.app.pictures.render import camera_around
 from warp_abtree.app.recording import record_run
 from warp_abtree.app.render_data import Settings, compose
 from warp_abtree.app.styles import BOX_COLOUR, COLOURS
 
+SMALL = ("--size", 200, "--device", "cpu")
 EYE, UP = (0.4, 0.35, 1.0), (0, 1, 0)
 
 
@@ -28,14 +27,7 @@ def files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_scene(tmp_path)
     trimesh.creation.icosphere(2).export("ball.obj")
-    Path("bad.toml").write_text("[scene]\nspeed = 3\n")
     return tmp_path
-
-
-def run(capsys, *arguments, status=0):
-    assert cli.main(["picture", *map(str, arguments)]) == status
-    captured = capsys.readouterr()
-    return captured.out, captured.err.splitlines()
 
 
 def count(path, colour, reach=0.12):
@@ -78,21 +70,6 @@ def test_the_camera_sees_all_points():
     assert np.abs(local[:, :2] / local[:, 2:]).max() <= np.tan(0.5 * camera.field_of_view)
 
 
-def test_the_nearest_face_is_seen():
-    """Of two squares, one behind the other, and of one that cuts through both."""
-    pytest.importorskip("pyvista")
-    square = np.array([[[-1.0, -1, 0], [1, -1, 0], [1, 1, 0]], [[-1, -1, 0], [1, 1, 0], [-1, 1, 0]]])
-    wall = square[:, :, [2, 1, 0]] * 0.5
-    triangles = np.concatenate([square, square + [0, 0, 0.5], wall + [0.5, 0, 0.5]])
-    colours = np.repeat(np.eye(3), 2, axis=0)
-    camera = camera_around(triangles.reshape(-1, 3), (0.0, 0, 1), UP)
-    image = render(Panel("", triangles, colours), camera, 200).astype(int)
-    assert image.shape == (200, 200, 3) and (image[:3] == 255).all()
-    middle = image[100, 60]
-    assert middle[1] > 2 * middle[0] and middle[1] > 2 * middle[2], "the front square hides the one behind"
-    assert (image.argmax(axis=2) == 2)[(image.min(axis=2) < 60)].any(), "the wall stands out before the front square"
-
-
 def test_draw_objects(tmp_path, device):
     pytest.importorskip("pyvista")
     playback = make_playback(make_models(), device)
@@ -113,10 +90,12 @@ def test_draw_objects(tmp_path, device):
 
 def test_picture_of_meshes(files, capsys):
     pytest.importorskip("pyvista")
-    shown, _ = run(capsys, "ball.obj", "ball.obj", "--contacts", "--out", "balls.png", "--size", 300, "--device", "cpu")
+    shown, _ = run(
+        capsys, "picture", "ball.obj", "ball.obj", "--contacts", "--out", "balls.png", "--size", 300, "--device", "cpu"
+    )
     assert shown == "wrote balls.png\n" and count("balls.png", COLOURS[0][1]) > 300
     words = "--pose 9 0 0 0 0 0 1 --lod 0.2 --tree 2 --json --size 300 --device cpu".split()
-    shown, _ = run(capsys, "ball.obj", "ball.obj", *words, "-o", "apart.png")
+    shown, _ = run(capsys, "picture", "ball.obj", "ball.obj", *words, "-o", "apart.png")
     assert json.loads(shown) == {"picture": "apart.png", "objects": 2, "frame": 0}
     assert count("apart.png", BOX_COLOUR) > count("balls.png", BOX_COLOUR)
 
@@ -125,14 +104,32 @@ def test_picture_of_meshes(files, capsys):
 def test_picture_of_a_frame(files, capsys):
     pytest.importorskip("pyvista")
     for frame in (0, 3):
-        run(capsys, "scene.toml", "--frame", frame, "--out", f"{frame}.png", "--size", 200, "--device", "cpu")
+        run(
+            capsys, "picture", "scene.toml", "--frame", frame, "--out", f"{frame}.png", "--size", 200, "--device", "cpu"
+        )
     first, last = (matplotlib.image.imread(name) for name in ("0.png", "3.png"))
     assert first.shape != last.shape or not np.array_equal(first, last)
     loaded = load_scene("scene.toml", device="cpu")
     record_run(loaded, 4)[1].save("run.npz")
-    run(capsys, "run.npz", "--frame", 3, "--out", "again.png", "--size", 200, "--device", "cpu")
+    run(capsys, "picture", "run.npz", "--frame", 3, "--out", "again.png", *SMALL)
     assert np.array_equal(last, matplotlib.image.imread("again.png"))
-    run(capsys, "scene.toml", "--world", 2, "--eye", 0, 0, 1, "--out", "world.png", "--size", 200, "--device", "cpu")
+    run(
+        capsys,
+        "picture",
+        "scene.toml",
+        "--world",
+        2,
+        "--eye",
+        0,
+        0,
+        1,
+        "--out",
+        "world.png",
+        "--size",
+        200,
+        "--device",
+        "cpu",
+    )
     assert count("world.png", COLOURS[0][0]) < count("0.png", COLOURS[0][0])
 
 
@@ -144,10 +141,3 @@ def test_frames_go_as_far_as_they_are_asked(tmp_path, device):
     for _ in range(6):
         expected = other.step("count")
     assert np.array_equal(snapshot.poses, expected.poses) and snapshot.poses[1, 1] < 0.5
-
-
-@pytest.mark.parametrize("name", ["pyvista", "matplotlib"])
-def test_without_pictures(files, capsys, monkeypatch, name):
-    monkeypatch.setitem(sys.modules, name, None)
-    errors = run(capsys, "ball.obj", "--out", "out.png", status=2)[1]
-    assert errors == ["warp-abtree: picture needs pyvista and Matplotlib: pip install warp-abtree[pictures]"]

@@ -1,6 +1,5 @@
 """The process of a command: progress on stderr, and SIGINT and SIGTERM, which leave no half-written file."""
 
-import functools
 import io
 import json
 import os
@@ -9,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,8 +24,30 @@ from warp_abtree.jobs import RayPool
 from warp_abtree.jobs import ray_pool as cluster
 
 ROOT = Path(__file__).resolve().parents[2]
-STATUS = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}
-BOTH = (signal.SIGINT, signal.SIGTERM)
+INTERRUPT, TERMINATE = signal.SIGINT, signal.SIGTERM
+BOTH = (INTERRUPT, TERMINATE)
+# What a command of this process runs until the signal comes, which a line on stdout asks for.
+HANG = """
+import sys, time
+import numpy as np
+import warp_abtree as ab
+from warp_abtree.app.cli import main as cli
+from warp_abtree.simulate import frame
+
+def hang(file=None, *_, **__):
+    if hasattr(file, "write"):
+        file.write(b"half" if "b" in file.mode else "half")
+        file.flush()
+    print("{}", flush=True)
+    time.sleep(60)
+
+PLACE = hang
+sys.exit(cli.main())
+"""
+BUILD = "build ball.obj new.npz"
+QUERY = "query ball.obj ball.obj --output faces --record new.npz"
+SWEEP = "sweep ball.npz ball.npz poses.npy --out answers --ray none"
+VIEW = "view ball.obj ball.obj --port 0 --json"
 
 
 def ignore():
@@ -35,35 +57,6 @@ def ignore():
 
 def block():
     signal.pthread_sigmask(signal.SIG_BLOCK, BOTH)
-
-
-def handle_plainly():
-    for number in BOTH:
-        signal.signal(number, signal.SIG_DFL)
-
-
-# What a command of this process runs until the signal comes; told on stdout.
-HANG = """
-import contextlib, sys, time
-import numpy as np
-import warp_abtree as ab
-from warp_abtree.app.cli import main as cli
-from warp_abtree.simulate import frame
-
-def hang(file=None, *_, **__):
-    if file is not None:
-        file.write(b"half" if "b" in file.mode else "half")
-        file.flush()
-    print("now", flush=True)
-    time.sleep(60)
-
-"""
-WRITES = {
-    "np.savez": HANG + "np.savez = hang",
-    "np.savez_compressed": HANG + "np.savez_compressed = hang",
-    "csv": HANG + "frame.csv.DictWriter = hang",
-    "frames": HANG + "ab.Frame.step = lambda _: hang()",
-}
 
 
 @pytest.fixture
@@ -76,72 +69,53 @@ def files(tmp_path, monkeypatch):
     return tmp_path
 
 
-def start(command, before):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(command, env=environment, preexec_fn=before, **pipes)
-
-
-def stop(process, number):
-    """Send a signal once the process has told that it is at it; return stdout's rest and the lines of stderr."""
-    try:
-        first = process.stdout.readline()
-        assert first, process.stderr.read()
-        process.send_signal(number)
-        shown, errors = process.communicate(timeout=30)
-    finally:
-        process.kill()
-        process.wait()
-    return first, shown, [line for line in errors.splitlines() if "compiling kernels" not in line]
-
-
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize("number", BOTH, ids=lambda number: number.name)
 @pytest.mark.parametrize(
-    ("words", "where", "before", "old"),
+    ("words", "place", "before", "number", "status", "left"),
     [
-        ("build ball.obj new.npz", "np.savez_compressed", ignore, None),
+        (BUILD, "np.savez_compressed", ignore, INTERRUPT, 130, []),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
             for case in (
-                ("build ball.obj new.npz", "np.savez_compressed", block, "new.npz"),
-                ("run scene.toml --record new.csv", "csv", handle_plainly, "new.csv"),
-                ("run scene.toml --record new.npz", "frames", ignore, None),
-                ("query ball.obj ball.obj --output faces --record new.npz", "np.savez", ignore, "new.npz"),
-                ("sweep ball.npz ball.npz poses.npy --out answers --ray none", "np.savez", ignore, None),
+                (BUILD, "np.savez_compressed", block, TERMINATE, 143, []),
+                ("run scene.toml --record new.csv", "frame.csv.DictWriter", None, TERMINATE, 143, []),
+                ("run scene.toml --record new.npz", "ab.Frame.step", ignore, INTERRUPT, 130, []),
+                (QUERY, "np.savez", block, INTERRUPT, 130, []),
+                (SWEEP, "np.savez", ignore, TERMINATE, 143, ["answers", "answers/job.json"]),
+                (VIEW, "_", ignore, INTERRUPT, 0, []),  # an interrupt is how people end it
+                (VIEW, "_", block, TERMINATE, 143, []),
             )
         ),
     ],
 )
-def test_a_signal_stops_a_command(files, words, where, before, old, number):
-    if old:
-        Path(old).write_text("old")
-    script = WRITES[where] + "\nsys.exit(cli.main())"
-    process = start([sys.executable, "-c", script, *words.split(), "--device", "cpu"], before)
-    known = {path.name for path in files.iterdir()}
-    first, shown, errors = stop(process, number)
-    status, word = STATUS[number]
-    assert first == "now\n" and not shown
-    assert process.returncode == status and errors == [f"warp-abtree: {word}"]
-    left = {path.name for path in files.iterdir()} - known
-    assert left == ({"answers"} if words.startswith("sweep") else set())
-    assert not left or [path.name for path in Path("answers").iterdir()] == ["job.json"]
-    assert old is None or Path(old).read_text() == "old"
-
-
-@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-@pytest.mark.parametrize("number", BOTH, ids=lambda number: number.name)
-@pytest.mark.parametrize("before", [ignore, block, handle_plainly], ids=lambda before: before.__name__)
-@pytest.mark.slow
-def test_a_signal_stops_the_page(files, number, before):
-    pytest.importorskip("viser")
-    words = "view ball.obj ball.obj --port 0 --json --device cpu".split()
-    process = start([sys.executable, "-m", "warp_abtree", *words], before)
-    first, shown, errors = stop(process, number)
-    assert json.loads(first)["objects"] == 2 and not shown
-    # An interrupt is how people end it.
-    expected = (0, []) if number == signal.SIGINT else (143, ["warp-abtree: terminated"])
-    assert (process.returncode, errors) == expected
+def test_a_signal_stops_a_command(files, words, place, before, number, status, left):
+    for name in re.findall(r"new\.\w+", words):
+        Path(name).write_text("old")
+    known = set(files.rglob("*"))
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(
+        [sys.executable, "-c", HANG.replace("PLACE", place), *words.split(), "--device", "cpu"],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        preexec_fn=before,
+        **pipes,
+    ) as process:
+        try:
+            first = process.stdout.readline()
+            assert first, process.stderr.read()
+            found = json.loads(first)
+            if found:
+                assert found["objects"] == 2 and found["title"] == "ball"
+                with urllib.request.urlopen(found["address"], timeout=20) as answer:
+                    assert answer.status == 200 and b"<html" in answer.read(2000)
+            process.send_signal(number)
+            shown, errors = process.communicate(timeout=30)
+        finally:
+            process.kill()
+    told = {0: [], 130: ["warp-abtree: interrupted"], 143: ["warp-abtree: terminated"]}[status]
+    assert [line for line in errors.splitlines() if "compiling kernels" not in line] == told
+    assert (process.returncode, shown) == (status, "")
+    assert sorted(str(path.relative_to(files)) for path in set(files.rglob("*")) - known) == left
+    assert all(path.read_text() == "old" for path in files.glob("new.*"))
 
 
 def test_a_caller_keeps_its_signals(files, capsys, monkeypatch):
@@ -170,21 +144,6 @@ def test_ray_leaves_a_program_its_handler(monkeypatch):
             assert signal.getsignal(signal.SIGTERM) is kept
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def test_a_program_handles_signals(monkeypatch, capsys):
-    before = [signal.getsignal(number) for number in BOTH]
-    try:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        monkeypatch.setattr(sys, "argv", ["warp-abtree", "info", "warp:cat"])
-        assert cli.main() == 2
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        with pytest.raises(cli.Terminated) as caught:
-            signal.raise_signal(signal.SIGTERM)
-        assert caught.value.code == 143
-    finally:
-        for number, handler in zip(BOTH, before):
-            signal.signal(number, handler)
 
 
 # Progress.
@@ -220,41 +179,13 @@ def test_progress_without_a_bar_is_a_line_a_stage(monkeypatch, terminal):
     assert stream.getvalue() == "collapse ...\nLOD bounds ...\n"
 
 
-@pytest.mark.slow
-def test_no_label_can_be_taken_for_an_error(tmp_path, monkeypatch, capsys):
-    """Of any command, were every stage to take long."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "Progress", functools.partial(progress_module.Progress, delay=-1.0))
-    (tmp_path / "scene.toml").write_text(SHUTTLE_SCENE)
-    trimesh.creation.icosphere(2).export("ball.obj")
-    np.save("poses.npy", np.eye(7)[[6, 6]])
-    model = ["collapse ...", "LOD bounds ..."]
-    sweep = "sweep ball.npz ball.npz poses.npy --out answers --ray none"
-    for words, labels in (
-        ("build ball.obj ball.npz", [*model, "outward bounds ..."]),
-        ("query ball.obj ball.obj", model),
-        ("run scene.toml", [*model, *model, "frames ..."]),
-        ("picture scene.toml --out picture.png", [*model, *model]),
-        (sweep, ["shards ..."]),
-        (sweep, ["check ...", "shards ..."]),
-    ):
-        assert cli.main([*words.split(), "--device", "cpu"]) == 0
-        lines = [line for line in capsys.readouterr().err.splitlines() if "compiling kernels" not in line]
-        assert lines == labels
-        assert not [line for line in lines if re.match(r"error|warning|failed|fatal", line, re.IGNORECASE)]
-
-
-def test_compiling_is_announced(tmp_path):
+def test_compiling_is_announced(tmp_path, monkeypatch):
     stream = io.StringIO()
-    cache = tmp_path / "cache"
-    (cache / f"wp_module_p{os.getpid()}_t1").mkdir(parents=True)
-    before, progress_module.wp.config.kernel_cache_dir = progress_module.wp.config.kernel_cache_dir, str(cache)
-    try:
-        with progress_module.compile_notice(stream, delay=0.0):
-            for _ in range(100):
-                if stream.getvalue():
-                    break
-                progress_module.time.sleep(0.05)
-    finally:
-        progress_module.wp.config.kernel_cache_dir = before
+    (tmp_path / f"wp_module_p{os.getpid()}_t1").mkdir()
+    monkeypatch.setattr(progress_module.wp.config, "kernel_cache_dir", str(tmp_path))
+    with progress_module.compile_notice(stream, delay=0.0):
+        for _ in range(100):
+            if stream.getvalue():
+                break
+            progress_module.time.sleep(0.05)
     assert stream.getvalue().count("\n") == 1 and "compiling" in stream.getvalue()

@@ -10,8 +10,8 @@ from oracles.triangle import brute_force_faces
 
 import warp_abtree as ab
 from warp_abtree.app import SceneError, load_scene
-from warp_abtree.app.toml.model_tables import AnyShape
 from warp_abtree.app.toml.shapes import GENERATED
+from warp_abtree.app.toml.tables import AnyShape
 from warp_abtree.lod.timing import WorkClock
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
@@ -133,17 +133,6 @@ def test_a_nut_runs_on_its_bolt(device):
 
     assert (count(1, turns) == 0).all(), "along the thread it is free"
     assert (count(-1, turns[1:3]) > 0).all() and (count(2, turns[1:3]) > 0).all(), "otherwise it is not"
-
-
-def test_terrain_is_an_open_sheet_that_faces_up(tmp_path):
-    text = '[models.t]\nshape = "terrain"\nextents = [8, 4]\ncells = [10, 6]\nbumps = 0.1\nwaves = 2\nrim = 1\n'
-    model = load(tmp_path, text + '[[objects]]\nmodel = "t"\n').models["t"]
-    vertices, faces, _ = model.mesh_at(model.lod_max)
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    assert (np.cross(b - a, c - a)[:, 1] > 0).all() and len(faces) == 120
-    assert np.allclose(np.ptp(vertices, axis=0)[[0, 2]], [8, 4])
-    corner = np.abs(vertices[:, [0, 2]]).sum(axis=1).argmax()
-    assert vertices[corner, 1] == pytest.approx(2.0, abs=0.11) == vertices[:, 1].max()
 
 
 def test_faces_are_brought_to_a_number(tmp_path):
@@ -297,12 +286,20 @@ def test_rain(device):
     assert height.min() > -0.6 and np.median(height) < 2.5
 
 
-def test_worlds(device):
-    assert "worlds = 4096" in (SCENES / "worlds.toml").read_text()
-    loaded = load_ours("worlds", device, objects=16)
-    assert np.bincount(loaded.worlds).tolist() == [2] * 8
-    result = loaded.frame().step()
-    assert (np.diff(result.pairs, axis=1) == 8).all() and result.any.any()
+@pytest.mark.parametrize(
+    ("name", "objects", "frames", "each", "size"),
+    [("bunny_tori", 6, 3, 6, 1), ("herd", None, 1, 200, 16), ("worlds", 16, 1, 16, 8)],
+)
+def test_scenes_of_the_project_intersect(device, name, objects, frames, each, size):
+    if name != "worlds":
+        pytest.importorskip("pxr")
+    loaded = load_ours(name, device, objects=objects if name == "worlds" else None)
+    frame = loaded.frame(output="any")
+    frame.run(frames - 1)
+    result = frame.step()
+    assert loaded.scene.object_count >= each and len(np.unique(loaded.worlds)) >= size
+    assert all(0 < row.intersecting for row in frame.history) and result.any.any()
+    assert np.array_equal(loaded.worlds[result.pairs[:, 0]], loaded.worlds[result.pairs[:, 1]])
 
 
 def test_needle(device):

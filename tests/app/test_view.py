@@ -31,41 +31,38 @@ def playback(models, device):
 def test_intersecting_faces_and_triangles(playback):
     snapshot = playback.query("faces")
     result = snapshot.result
-    intersecting = geometry.intersecting_faces(result)
+    intersecting = geometry.intersecting_faces(result, np.ones(3, bool))
     expected = set()
     for pair, a, b in result.faces.tolist():
         expected |= {(int(result.pairs[pair, 0]), a), (int(result.pairs[pair, 1]), b)}
     assert [tuple(row) for row in intersecting.tolist()] == sorted(expected) and len(expected) > 50
     cache = geometry.MeshCache(playback.scene)
-    flat = geometry.intersecting_triangles(cache, snapshot, intersecting, lift=0)
-    assert sum(map(len, flat.values())) == len(intersecting)
-    for owner, corners in flat.items():
+    lifted = geometry.intersecting_triangles(cache, snapshot, intersecting)
+    assert sum(map(len, lifted.values())) == 2 * len(intersecting)
+    for owner, pair in lifted.items():
+        above, below = np.split(pair, 2)
+        corners, step = 0.5 * (above + below), 0.5 * (above - below)
+        assert np.allclose(np.linalg.norm(step, axis=2), geometry.LIFT * cache.diagonals[owner], rtol=1e-3)
+        edge = corners[:, 1] - corners[:, 0]
+        assert np.abs(np.einsum("ti,ti->t", edge, step[:, 0])).max() < 1e-5
         mine = [(i, face) for i, face in intersecting.tolist() if playback.scene.object_model[i] == owner]
         for (i, face), found in list(zip(mine, corners))[::7]:
             vertices, faces, ids = playback.scene.models[owner].mesh_at(int(snapshot.lods[i]))
             assert np.allclose(found, place(snapshot.poses[i], vertices[faces[ids == face][0]]), atol=1e-6)
-    lifted = geometry.intersecting_triangles(cache, snapshot, intersecting, lift=0.01)
-    for owner, corners in lifted.items():
-        above, below = np.split(corners, 2)
-        step = 0.5 * (above - below)
-        assert np.allclose(0.5 * (above + below), flat[owner], atol=1e-5)
-        assert np.allclose(np.linalg.norm(step, axis=2), 0.01 * cache.diagonals[owner], rtol=1e-3)
-        edge = flat[owner][:, 1] - flat[owner][:, 0]
-        assert np.abs(np.einsum("ti,ti->t", edge, step[:, 0])).max() < 1e-5
     only = geometry.intersecting_faces(result, np.array([True, True, False]))
     assert set(only[:, 0].tolist()) == {0, 1} and len(only) < len(intersecting)
 
 
 def test_contact_lines(playback, monkeypatch):
     result = playback.query("contacts").result
-    segments, normals = geometry.contact_lines(result, 0.2)
+    segments, normals = geometry.contact_lines(result, 0.2, np.ones(3, bool))
     assert len(segments) == len(result.contacts) > 50
     assert np.allclose(segments[:, 0], result.contacts["p0"], atol=1e-6)
     assert np.allclose(segments[:, 1], result.contacts["p1"], atol=1e-6)
     assert np.allclose(normals[:, 0], segments.mean(axis=1), atol=1e-6)
     assert np.allclose(normals[:, 1] - normals[:, 0], 0.2 * result.contacts["normal"], atol=1e-6)
     monkeypatch.setattr(geometry, "LINES", 7)
-    fewer, _ = geometry.contact_lines(result, 0.2)
+    fewer, _ = geometry.contact_lines(result, 0.2, np.ones(3, bool))
     assert len(fewer) == 7 and np.array_equal(fewer[[0, -1]], segments[[0, -1]])
 
 
@@ -93,14 +90,6 @@ def test_boxes_of_a_level_hold_the_faces_under_its_nodes(playback, share):
         assert np.allclose(lines[: len(first)], first, atol=1e-5)
     deepest = geometry.tree_depth(scene, [1])
     assert len(geometry.level_boxes(tree, deepest)) > 0 and len(geometry.level_boxes(tree, deepest + 1)) == 0
-
-
-def test_edges_of_a_box():
-    lines = geometry.box_lines(np.array([[[0, 0, 0], [1, 2, 4]], [[5, 5, 5], [6, 6, 6.0]]]))
-    assert lines.shape == (24, 2, 3)
-    spans = np.abs(lines[:12, 1] - lines[:12, 0])
-    assert (np.count_nonzero(spans, axis=1) == 1).all() and spans.sum(axis=0).tolist() == [4, 8, 16]
-    assert len({tuple(np.sort(line, axis=0).ravel()) for line in lines[:12]}) == 12
 
 
 def test_boxes_drawn_are_limited_and_counted(playback, monkeypatch):
@@ -348,7 +337,7 @@ def test_numbers_of_an_object(playback):
 
 def test_times_are_stacked(playback):
     rows = [playback.step("count").row for _ in range(4)]
-    plot = view_text.time_plot(rows)
+    plot = view_text.time_plot(rows, 0)
     assert len(plot["data"]) == len(plot["series"])
     assert plot["data"][0].tolist() == [0, 1, 2, 3]
     assert np.allclose(plot["data"][1], [row.total_ms for row in rows])
@@ -362,5 +351,3 @@ def test_times_are_stacked(playback):
     assert view_text.time_top(times) == 3 and view_text.time_top([]) == 1
     times[-1].budget_ms = 50.0
     assert view_text.time_top(times) == 50
-    drawn = view_text.time_picture(rows)
-    assert drawn.count("<polygon") == 6 and "broad phase" in drawn and view_text.time_picture([None, rows[0]]) == ""

@@ -18,17 +18,12 @@ OVERLAP = 0.25  # of the smaller extent: by so much a mesh without a pose reache
 
 
 def open_playback(paths, device=None, progress=None, objects=None, poses=(), lod=None) -> Playback:
-    """Open what the command line names.
+    """Open one scene file (.toml) or recorded run (.npz), or meshes and built models (.npz).
 
     Args:
-        paths: One scene file (.toml) or recorded run (.npz), or meshes and built models (.npz).
-        device, progress: As for `load_scene`.
-        objects: As for `load_scene`; for scene files.
+        device, progress, objects: As for `load_scene`; objects for scene files alone.
         poses: Of the meshes after the first, (k, 7); those left out are laid beside the mesh before, a little inside.
         lod: LOD of every mesh as for `resolve_lod`; None is the finest.
-
-    Raises:
-        ValueError: With what is wrong with them; SceneError, MeshError and ModelError among them.
     """
     paths = [str(find_scene(path)) for path in paths]
     suffixes = [Path(path).suffix.lower() for path in paths]

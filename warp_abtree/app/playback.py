@@ -3,13 +3,13 @@
 A playback owns its scene: one thread steps, queries and changes it.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from warp_abtree.app.render_data import Snapshot
-from warp_abtree.app.toml.control import CONTROLLERS, LodControl, PictureView
+from warp_abtree.app.toml.control import CONTROLLERS, LodControl
 from warp_abtree.lod.view import Camera
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame, LodSweep
@@ -18,21 +18,25 @@ SWEEP_PERIOD = 8.0  # seconds from the finest LOD of a mesh to its base and back
 OWN, HOLD = "scene", "hold"  # LODs as the scene chooses them, and as they are
 
 
+class MeshView(NamedTuple):
+    """How meshes are looked at: directions to the eye and upwards, and the world that is shown."""
+
+    eye: tuple[float, float, float] = (0.4, 0.35, 1.0)
+    up: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    world: int = 0
+
+
 class Playback:
     """What all playbacks share.
 
     Attributes:
-        scene, title: `Scene`, and what to call it.
         worlds: World of each object, int (n,); -1 is in every one.
-        time_step: Between frames [s].
         frames: How many `--record` takes.
         length: Number of frames, None where they never end.
-        view: `PictureView` to begin with.
+        view: eye and up, directions, and world, to begin with.
         camera: Called with a time [s], returns the `Camera` that LODs are for; or None.
-        control: `LodControl` of the file.
         chosen: LOD of every object before those that are held, int (n,).
         held: LOD by object index, of objects whose LOD the user holds.
-        can_move: Whether the user may move objects.
     """
 
     can_move = False
@@ -192,11 +196,7 @@ class LivePlayback(Playback):
 
 
 class ScenePlayback(LivePlayback):
-    """A scene file.
-
-    Args:
-        loaded: What `load_scene` returned.
-    """
+    """A scene file, as `load_scene` returned it."""
 
     def __init__(self, loaded):
         self.loaded = loaded
@@ -213,14 +213,7 @@ class ScenePlayback(LivePlayback):
 
 
 class MeshPlayback(LivePlayback):
-    """Meshes at poses, whose LODs sweep from where they start to the base and back; the user may move them.
-
-    Args:
-        models: `Model`s, one an object.
-        poses: One each, (n, 7).
-        lods: LODs at the start.
-        device: Warp device.
-    """
+    """Meshes at poses (n, 7), whose LODs sweep from where they start to the base and back; the user may move them."""
 
     can_move = True
 
@@ -237,7 +230,7 @@ class MeshPlayback(LivePlayback):
             start = _fraction_at(model, lods[mine[0]])
             self._sweeps.append(LodSweep([(model, mine)], start, min(start, _fraction_at(model, 0)), SWEEP_PERIOD))
         names = " and ".join(dict.fromkeys(model.name for model in models))
-        super().__init__(scene, names, np.zeros(len(models), int), 1 / 30, round(15 * SWEEP_PERIOD) + 1, PictureView())
+        super().__init__(scene, names, np.zeros(len(models), int), 1 / 30, round(15 * SWEEP_PERIOD) + 1, MeshView())
 
     def _begin(self):
         self._placed = self._start.copy()
@@ -268,11 +261,7 @@ def _fraction_at(model, lod) -> float:
 
 
 class RecordedPlayback(Playback):
-    """A recorded run: poses and LODs as they were, queried anew; times are those of the recording.
-
-    Args:
-        recording, loaded: `Recording`, and the scene file in it.
-    """
+    """A recorded run: poses and LODs as they were, queried anew; times are those of the recording."""
 
     length: int
 

@@ -13,7 +13,6 @@ import numpy as np
 from warp_abtree.app.toml.decode import import_msgspec
 from warp_abtree.app.toml.scene_file import SceneFile, load_scene
 from warp_abtree.checks.atomic_write import atomic_write
-from warp_abtree.lod.timing import STAGES
 from warp_abtree.simulate.frame import FrameRow
 
 FORMAT_NAME, FORMAT_VERSION = "warp_abtree recording", 2
@@ -21,41 +20,25 @@ FORMAT_NAME, FORMAT_VERSION = "warp_abtree recording", 2
 
 @dataclass
 class RunSettings:
-    """What a run was asked for.
+    """What a run was asked for."""
 
-    Attributes:
-        path: Of the scene file.
-        objects: Number of objects, None for the file's own.
-        controller, budget_ms: As for `SceneFile.frame`.
-        device: Warp device.
-    """
-
-    path: str
-    objects: int | None
-    controller: str
+    path: str  # of the scene file
+    objects: int | None  # their number, None for the file's own
+    controller: str  # and budget_ms as for `SceneFile.frame`
     budget_ms: float | None
-    device: str
+    device: str  # of Warp
 
 
 @dataclass(eq=False)
 class Recording:
-    """A run, frame by frame.
+    """A run, frame by frame."""
 
-    Attributes:
-        text: The scene file.
-        settings: What was asked for.
-        models: `Model.digest` of each model.
-        rows: One `FrameRow` a frame.
-        lods: LOD of every object in each frame, int32 (frames, n).
-        poses: Pose of every object in each frame, x y z qx qy qz qw, float64 (frames, n, 7).
-    """
-
-    text: str
+    text: str  # the scene file
     settings: RunSettings
-    models: list
-    rows: list
-    lods: np.ndarray
-    poses: np.ndarray
+    models: list  # `Model.digest` of each model
+    rows: list  # one `FrameRow` a frame
+    lods: np.ndarray  # of every object in each frame, int32 (frames, n)
+    poses: np.ndarray  # of every object in each frame, x y z qx qy qz qw, float64 (frames, n, 7)
 
     def save(self, path):
         """Write to an .npz file; it appears whole or not at all."""
@@ -108,15 +91,10 @@ class Recording:
             raise ValueError(f"{path}: a damaged recording ({what})") from None
 
     def load_scene(self, path, device=None, progress=None) -> SceneFile:
-        """Return the scene of the recording.
-
-        Args:
-            path: Of the recording, for messages.
-            device, progress: As for `load_scene`.
+        """Return the scene of the recording; `path` is the recording's, for messages.
 
         Raises:
-            SceneError: A mesh is missing.
-            ValueError: A mesh is another.
+            ValueError: A mesh is missing, or another one.
         """
         loaded = load_scene(self.settings.path, device, progress, self.settings.objects, self.text)
         for (name, model), known in zip(loaded.models.items(), self.models):
@@ -127,19 +105,10 @@ class Recording:
         return loaded
 
 
-def recorded_clock(rows):
-    """Return a clock that reads the times of recorded frames again, so that their run repeats itself exactly."""
-    stages = np.array([[getattr(row, stage) for stage in STAGES] for row in rows])
-    ticks = np.concatenate([np.zeros((len(rows), 1)), np.round(1e6 * stages)], axis=1)
-    return iter((1e-9 * np.cumsum(ticks)).tolist()).__next__
-
-
 def record_run(loaded: SceneFile, frames: int, keep=True, progress=None, **options):
     """Run a scene from its start.
 
     Args:
-        loaded: What `load_scene` returned.
-        frames: How many.
         keep: Whether poses are kept.
         progress: Called as progress(done, total) after each frame.
         options: Of `SceneFile.frame`.

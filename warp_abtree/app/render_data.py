@@ -13,47 +13,29 @@ NO_LINES = np.empty((0, 2, 3), np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A scene at one time, and the result of its query.
+    """A scene at one time, and the result of its query."""
 
-    Attributes:
-        number, time: Frame from 0, and time in the scene [s].
-        poses: x y z qx qy qz qw of every object, float64 (n, 7).
-        lods: LOD of every object, int32 (n,).
-        result: `Result` of the query.
-        row: `FrameRow` of the frame; None where the scene was only queried again.
-    """
-
-    number: int
-    time: float
-    poses: np.ndarray
-    lods: np.ndarray
-    result: Result
-    row: FrameRow | None
+    number: int  # of the frame, from 0
+    time: float  # in the scene [s]
+    poses: np.ndarray  # x y z qx qy qz qw of every object, float64 (n, 7)
+    lods: np.ndarray  # of every object, int32 (n,)
+    result: Result  # of the query
+    row: FrameRow | None  # of the frame; None where the scene was only queried again
 
 
 @dataclass
 class Settings:
-    """What is shown.
+    """What is shown."""
 
-    Attributes:
-        world: The one shown; objects of world -1 are in every one.
-        intersecting, contacts, normals: Whether intersecting faces are coloured, contacts and their normals drawn.
-        wireframe: Whether meshes are drawn as their edges.
-        by_lod: Whether colours tell LODs in the place of models.
-        level: Of the boxes of trees, -1 for none.
-        every_tree: Whether the boxes are of all objects in the place of the picked one.
-        picked: Index of an object, or None.
-    """
-
-    world: int = 0
-    intersecting: bool = True
+    world: int = 0  # objects of world -1 are in every one
+    intersecting: bool = True  # whether intersecting faces are coloured
     contacts: bool = True
-    normals: bool = False
+    normals: bool = False  # of contacts
     wireframe: bool = False
-    by_lod: bool = False
-    level: int = -1
-    every_tree: bool = False
-    picked: int | None = None
+    by_lod: bool = False  # whether colours tell LODs in the place of models
+    level: int = -1  # of the boxes of trees, -1 for none
+    every_tree: bool = False  # whether the boxes are of all objects in the place of the picked one
+    picked: int | None = None  # index of an object
 
     @property
     def output(self) -> str:
@@ -63,31 +45,21 @@ class Settings:
 
 @dataclass(eq=False)
 class RenderData:
-    """A snapshot as arrays in the world.
+    """A snapshot as arrays in the world."""
 
-    Attributes:
-        poses, keys, colours: Of every object: float64 (n, 7), `mesh_keys`, uint8 (n, 3).
-        intersecting: Intersecting faces by model, float32 (t, 3, 3).
-        segments, normals, boxes: Lines, float32 (k, 2, 3).
-        shown: Indices of the objects that are shown.
-        intersecting_count, contact_count, box_count: How many there are, drawn or not.
-        faces: Active faces of the shown objects together.
-        error_mean: Mean certified error of the shown objects [units].
-    """
-
-    poses: np.ndarray
-    keys: np.ndarray
-    colours: np.ndarray
-    intersecting: dict
-    segments: np.ndarray
-    normals: np.ndarray
-    boxes: np.ndarray
-    shown: np.ndarray
-    intersecting_count: int
-    contact_count: int
-    box_count: int
-    faces: int
-    error_mean: float
+    poses: np.ndarray  # of every object, float64 (n, 7)
+    keys: np.ndarray  # `mesh_keys` of every object
+    colours: np.ndarray  # of every object, uint8 (n, 3)
+    intersecting: dict  # intersecting faces by model, float32 (t, 3, 3)
+    segments: np.ndarray  # of contacts, float32 (k, 2, 3)
+    normals: np.ndarray  # of contacts, float32 (k, 2, 3)
+    boxes: np.ndarray  # edges of boxes of trees, float32 (k, 2, 3)
+    shown: np.ndarray  # indices of the objects that are shown
+    intersecting_count: int  # of faces, drawn or not
+    contact_count: int  # drawn or not
+    box_count: int  # drawn or not
+    faces: int  # active faces of the shown objects together
+    error_mean: float  # mean certified error of the shown objects [units]
 
 
 def objects_of_world(worlds, world: int) -> np.ndarray:

@@ -70,12 +70,7 @@ def split_key(key) -> tuple[int, int]:
 
 
 def group_objects(keys, objects) -> dict[int, np.ndarray]:
-    """Return the objects of each key, those of a key in their order.
-
-    Args:
-        keys: Of every object, int (n,).
-        objects: Indices of those to group.
-    """
+    """Return objects by their key, those of a key in their order; `keys` are of every object."""
     order = objects[np.argsort(keys[objects], kind="stable")]
     found, starts = np.unique(keys[order], return_index=True)
     return dict(zip(found.tolist(), np.split(order, starts[1:]))) if len(order) else {}
@@ -98,31 +93,19 @@ def object_colours(scene: Scene, lods, picked=None, by_lod=False) -> np.ndarray:
 # Results.
 
 
-def intersecting_faces(result, shown=None) -> np.ndarray:
-    """Return (object, face) of every intersecting face, each once, sorted, int64 (k, 2).
-
-    Args:
-        result: With faces.
-        shown: Whether each object is shown, bool (n,); pairs of others are left out.
-    """
+def intersecting_faces(result, shown) -> np.ndarray:
+    """Return (object, face) of every intersecting face of pairs that are shown, each once, sorted, int64 (k, 2)."""
     faces, pairs = result.faces, result.pairs
     if faces is None or not len(faces):
         return np.empty((0, 2), np.int64)
-    if shown is not None:
-        faces = faces[shown[pairs].all(axis=1)[faces[:, 0]]]
+    faces = faces[shown[pairs].all(axis=1)[faces[:, 0]]]
     objects = pairs[faces[:, 0]].astype(np.int64)
     keys = np.unique((objects << 32) + faces[:, 1:])
     return np.stack([keys >> 32, keys & 0xFFFFFFFF], axis=1)
 
 
-def intersecting_triangles(cache: MeshCache, snapshot, intersecting, lift=LIFT) -> dict[int, np.ndarray]:
-    """Return intersecting faces in the world by model, float32 (t, 3, 3).
-
-    Args:
-        intersecting: (object, face), as `intersecting_faces` returns them.
-        lift: Offset along the normal in diagonals of the model: each face is returned twice, to either side. With 0
-            it is returned once.
-    """
+def intersecting_triangles(cache: MeshCache, snapshot, intersecting) -> dict[int, np.ndarray]:
+    """Return intersecting faces in the world by model, LIFT above each face and below it, float32 (t, 3, 3)."""
     found: dict[int, list] = {}
     keys = mesh_keys(cache.scene, snapshot.lods)[intersecting[:, 0]]
     for key, rows in group_objects(keys, np.arange(len(keys))).items():
@@ -130,28 +113,20 @@ def intersecting_triangles(cache: MeshCache, snapshot, intersecting, lift=LIFT) 
         rows = intersecting[rows]
         vertices, faces, face_ids = cache.mesh(owner, lod)
         corners = place(snapshot.poses, rows[:, 0], vertices[faces[np.searchsorted(face_ids, rows[:, 1])]])
-        if lift:
-            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            length = np.linalg.norm(normal, axis=1, keepdims=True)
-            step = (lift * cache.diagonals[owner] * normal / np.where(length > 0, length, 1.0))[:, None]
-            corners = np.concatenate([corners + step, corners - step])
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        step = (LIFT * cache.diagonals[owner] * normal / np.where(length > 0, length, 1.0))[:, None]
+        corners = np.concatenate([corners + step, corners - step])
         found.setdefault(owner, []).append(corners.astype(np.float32))
     return {owner: np.concatenate(parts) for owner, parts in found.items()}
 
 
-def contact_lines(result, length, shown=None):
-    """Return segments of contacts and their normals in the world, float32 (k, 2, 3) both.
-
-    Args:
-        result: With contacts.
-        length: Of a normal [units].
-        shown: As for `intersecting_faces`.
-    """
+def contact_lines(result, length, shown):
+    """Return segments of contacts of shown pairs and their normals in the world, float32 (k, 2, 3) both."""
     contacts = result.contacts
     if contacts is None or not len(contacts):
         return np.empty((2, 0, 2, 3), np.float32)
-    if shown is not None:
-        contacts = contacts[shown[result.pairs].all(axis=1)[contacts["pair"]]]
+    contacts = contacts[shown[result.pairs].all(axis=1)[contacts["pair"]]]
     if len(contacts) > LINES:
         contacts = contacts[np.linspace(0, len(contacts) - 1, LINES).astype(int)]
     p0, p1 = contacts["p0"], contacts["p1"]

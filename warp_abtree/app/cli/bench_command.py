@@ -9,14 +9,7 @@ EXAMPLES = ("paper --out found --quick", "tradeoff --out found --device cuda:0",
 
 
 def bench(arguments, folder=None) -> int:
-    """Run `python -m bench` with these arguments and return its exit status.
-
-    Args:
-        folder: The checkout; None is the one that this package lies in.
-
-    Raises:
-        ValueError: No argument, or no checkout.
-    """
+    """Run `python -m bench` of a checkout, by default the one of this package, and return its exit status."""
     folder = Path(__file__).resolve().parents[3] if folder is None else Path(folder)
     if not (folder / "bench" / "__main__.py").is_file() or not (folder / "pyproject.toml").is_file():
         raise ValueError("the benchmarks come with a checkout of the project, not with the installed package")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import warp as wp
 
-from warp_abtree.app.cli import report
+from warp_abtree.app.cli.report import print_result
 from warp_abtree.app.toml.folder import scene_folder, scene_names
 from warp_abtree.checks.version import __version__
 from warp_abtree.model.model import Model
@@ -50,9 +50,8 @@ def check_packages(needs) -> dict:
             version = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
             version = None
-        found[name] = {"version": version, "ok": version is not None, "needs": need}
-        if version is not None:
-            found[name]["ok"] = _numbers(version) >= _numbers(least)
+        new_enough = version is not None and _numbers(version) >= _numbers(least)
+        found[name] = {"version": version, "ok": new_enough, "needs": need}
     return found
 
 
@@ -66,12 +65,7 @@ def check_extras() -> dict:
 
 
 def check_device(device) -> dict:
-    """Query a device where the answer is known.
-
-    Returns:
-        alias, name, architecture, memory [bytes, None for the CPU], ok, seconds that the answer took, with loading
-        and, the first time, compiling of kernels; error, what went wrong, or None.
-    """
+    """Query a device where the answer is known; the seconds include loading and, at first, compiling of kernels."""
     gpu = device.is_cuda
     found = {
         "device": device.alias,
@@ -145,44 +139,10 @@ def doctor(options, progress) -> int:
     """Examine this machine; the exit status is 0 where it is usable, else 1."""
     devices = None if options.device is None else [Scene(device=options.device).device]
     found = examine(devices)
-    if options.json:
-        report.print_json(found)
-    else:
-        print_findings(found)
+    if not options.json:
+        for extra in found["extras"].values():
+            packages = extra["packages"].items()
+            extra["packages"] = ", ".join(f"{name} {each['version'] or 'missing'}" for name, each in packages)
+        found["install"] = f"pip install {shlex.join(found['install'])}" if found["install"] else None
+    print_result(found, options.json)
     return 0 if found["usable"] else 1
-
-
-def print_findings(found):
-    """Print what `examine` found."""
-    versions = ", ".join(f"{name} {each['version'] or 'missing'}" for name, each in found["packages"].items())
-    print(f"warp_abtree {found['warp_abtree']} in {found['folder']}")
-    print(f"Python {found['python']} on {found['system']}, {found['cores']} cores; {versions}")
-    print(f"CUDA driver: {found['cuda_driver'] or 'none, so no GPU is used'}\n")
-    rows = [["device", "name", "memory", "two triangles"]]
-    for each in found["devices"]:
-        memory = "" if each["memory_bytes"] is None else f"{each['memory_bytes'] / 2**30:.0f} GiB"
-        name = each["name"] if each["memory_bytes"] is None else f"{each['name']} ({each['architecture']})"
-        rows.append([each["device"], name, memory, f"{'right' if each['ok'] else 'failed'}, {each['seconds']:.2f} s"])
-    report.print_table(rows, left=3)
-    for each in found["devices"]:
-        if each["error"]:
-            print(f"{each['device']}: {each['error']}")
-    print()
-    rows = [["extra", "for", "packages"]]
-    for name, extra in found["extras"].items():
-        packages = ", ".join(
-            f"{package} {'missing' if each['version'] is None else each['version'] + ('' if each['ok'] else ' (old)')}"
-            for package, each in extra["packages"].items()
-        )
-        rows.append([name, extra["for"], packages])
-    report.print_table(rows, left=3)
-    print()
-    cache = found["kernel_cache"]
-    print(
-        f"kernel cache: {cache['folder']}, {cache['modules']} modules, {cache['bytes'] / 1e6:.0f} MB"
-        f"{'' if cache['writable'] else ', not writable'} (WARP_CACHE_PATH moves it)"
-    )
-    print(f"scenes: {', '.join(found['scenes']['names'])} ({found['scenes']['folder']})")
-    if found["install"]:
-        print(f"what is missing: pip install {shlex.join(found['install'])}")
-    print("usable" if found["usable"] else "not usable as it is")

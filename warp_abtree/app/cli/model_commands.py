@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.app.cli.arguments import MESHES, Parser, positive
-from warp_abtree.app.cli.report import check_output, print_json, print_table
+from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.model.mesh import describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model
 from warp_abtree.scene.scene import Scene
@@ -42,11 +42,7 @@ def info(options, progress):
     """Print what a mesh file or a built model holds."""
     Scene(device=options.device)
     found = _describe_model(options.mesh) if is_model(options.mesh) else describe_mesh(load_mesh(options.mesh))
-    if options.json:
-        print_json(found)
-        return
-    for key, value in found.items():
-        print(f"{key.replace('_', ' '):<22}{_shown(value)}")
+    print_result(found, options.json)
 
 
 def _describe_model(path) -> dict:
@@ -56,14 +52,6 @@ def _describe_model(path) -> dict:
     for key in ("file_vertices", "unreferenced_vertices", "welded_vertices"):
         del found[key]  # a model does not keep them
     return found | {"lods": model.lod_max + 1, "base_faces": active_count(model, 0)}
-
-
-def _shown(value) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, list):
-        return " ".join(_shown(entry) for entry in value)
-    return f"{value:.6g}" if isinstance(value, float) else f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def add_build_arguments(sub: Parser):
@@ -101,20 +89,4 @@ def build(options, progress):
         "seconds": seconds,
         "errors": rows,
     }
-    (print_json if options.json else print_build)(result)
-
-
-def print_build(result):
-    """Print the size of a model, and both sides of its error at some fractions of the faces."""
-    print(
-        f"{result['file']}: {result['faces']:,} faces, {result['vertices']:,} vertices, {result['lods']:,} LODs, "
-        f"base of {result['base_faces']:,} faces, built in {result['seconds']:.2f} s, {result['bytes'] / 1e6:.1f} MB"
-    )
-    print("certified errors: no point of the one surface is farther than this from the other")
-    table = [["faces", "", "LOD", "original to LOD", "of the diagonal", "LOD to original", "of the diagonal"]]
-    for row in result["errors"]:
-        table.append([f"{100 * row['share']:g} %", f"{row['faces']:,}", f"{row['lod']:,}"])
-        for side in ("inward", "outward"):
-            error = row[f"error_{side}"]
-            table[-1] += [f"{error:.3g}", f"{100 * error / result['diagonal']:.3g} %"]
-    print_table(table)
+    print_result(result, options.json)

@@ -8,7 +8,7 @@ import numpy as np
 
 from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISIONS, Parser
 from warp_abtree.app.cli.model_commands import active_count, load_model
-from warp_abtree.app.cli.report import check_output, print_json, print_table
+from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import resolve_lod
@@ -20,7 +20,6 @@ EXAMPLES = (
     "cow.npz cow.npz --pose 0.2 0 0 0 0 0 1 --output contacts --record contacts.csv",
 )
 OUTPUTS = ("any", "count", "faces", "contacts")
-LISTED_FACES = 20  # face pairs or contacts that are printed
 
 
 def add_arguments(sub: Parser):
@@ -67,16 +66,11 @@ def query(options, progress):
     if found.faces is not None:
         result["faces"] = found.faces[:, 1:]
     if found.contacts is not None:
-        result |= {"contacts": _flat_contacts(found.contacts), "pair_contacts": found.pair_contacts[0]}
+        result |= {"contacts": _flat_contacts(found.contacts), "pair_contacts": _named(found.pair_contacts[0])}
     if options.record:
         record_found(found, options.record)
         result["written"] = [str(options.record)]
-    if options.json:
-        print_json(result)
-        return
-    print_query(result, models, found)
-    if options.record:
-        print(f"wrote {options.record}")
+    print_result(result, options.json)
 
 
 def _make_scene(options, progress):
@@ -102,58 +96,11 @@ def _make_scene(options, progress):
 def _flat_contacts(contacts) -> list[dict]:
     """Return the contacts of one object pair as a dictionary each, their faces under `face_a` and `face_b`."""
     names = contacts.dtype.names[2:]
-    return [
-        {"face_a": a, "face_b": b, **{name: row[name] for name in names}}
-        for row, (a, b) in zip(contacts, contacts["faces"].tolist())
-    ]
+    return [{"face_a": row["faces"][0], "face_b": row["faces"][1], **_named(row, names)} for row in contacts]
 
 
-def print_query(result, models, found):
-    """Print the result of a query and what it took.
-
-    Args:
-        result: Values that `query --json` prints.
-        models: The two `Model`.
-        found: `Result` of the one object pair.
-    """
-    for letter, model, lod, active in zip("AB", models, result["lods"], result["active_faces"]):
-        print(f"{letter}: {model.name}, LOD {lod:,} of {model.lod_max:,}, {active:,} of {model.face_count:,} faces")
-    print("they intersect" if result["intersects"] else "they do not intersect")
-    if result["count"] is not None:
-        print(f"intersecting face pairs: {result['count']:,}")
-    if found.pair_contacts is not None and result["count"]:
-        pair = found.pair_contacts[0]
-        print(f"mean point of the contacts: {_vector(pair['point'])}")
-        print(f"mean normal, from A to B: {_vector(pair['normal'])}")
-        print(f"depth along it, an estimate: {pair['depth']:.6g}")
-    print(f"the originals are within this of the surfaces queried, error(A) + error(B): {result['bound']:.6g}")
-    print(
-        f"{result['milliseconds']:.3g} ms on {result['device']}, precision {result['precision']}: "
-        f"{result['node_tests']:,} node tests, {result['triangle_tests']:,} triangle tests"
-    )
-    if found.faces is not None and len(found.faces):
-        _print_faces(found)
-
-
-def _vector(values, digits=6):
-    return " ".join(f"{value + 0.0:.{digits}g}" for value in values.tolist())  # + 0.0: no minus before a zero
-
-
-def _print_faces(found):
-    """Print a line for each of the first face pairs, with their contacts if there are any."""
-    table = [["face of A", "face of B"]]
-    if found.contacts is not None:
-        table[0] += [*"p0 x,y,z,p1 x,y,z,normal x,y,z".split(","), ""]
-    for row, (a, b) in enumerate(found.faces[:LISTED_FACES, 1:].tolist()):
-        table.append([f"{a:9}", f"{b:9}"])
-        if found.contacts is not None:
-            contact = found.contacts[row]
-            for name in ("p0", "p1", "normal"):
-                table[-1] += _vector(contact[name], digits=4).split()
-            table[-1].append("coplanar" if contact["coplanar"] else "")
-    print_table(table)
-    if len(found.faces) > LISTED_FACES:
-        print(f"and {len(found.faces) - LISTED_FACES:,} more; --json lists all, --record writes them")
+def _named(row, names=None) -> dict:
+    return {name: row[name] for name in names or row.dtype.names}
 
 
 def record_found(found, path: Path):

@@ -1,12 +1,13 @@
-"""What all commands print and check: JSON for programs, tables for people, names of files that are written."""
+"""What all commands print and check: JSON for programs, lines and tables for people, files that are written."""
 
 import json
 import math
 import os
-import sys
 from pathlib import Path
 
 import numpy as np
+
+LISTED = 20  # rows of a table that are printed
 
 
 def plain(value):
@@ -27,49 +28,53 @@ def print_json(value):
     print(json.dumps(plain(value), indent=1, allow_nan=False))
 
 
-def print_table(rows, left=1):
-    """Print rows of texts, the first of them headings; on a terminal by rich, where it is installed.
+def print_result(result: dict, as_json: bool):
+    """Print the result of a command, for programs or for people."""
+    (print_json if as_json else print_report)(result)
 
-    Args:
-        left: How many columns are aligned to the left; the others to the right.
-    """
-    if sys.stdout.isatty() and _print_rich_table(rows, left):
-        return
+
+def print_report(result: dict):
+    """Print a result for people: a line for each value, a table for each list or dictionary of rows."""
+    for key, value in result.items():
+        heading = key.replace("_", " ")
+        if isinstance(value, dict) and all(isinstance(row, dict) for row in value.values()):
+            value = [{heading: name} | row for name, row in value.items()]
+        rows = len(value) if isinstance(value, list | np.ndarray) else 0
+        if rows and (isinstance(value, np.ndarray) or isinstance(value[0], dict)):
+            print(f"\n{heading}:")
+            table = [list(row.values()) if isinstance(row, dict) else row for row in value[:LISTED]]
+            print_table([*([list(value[0])] if isinstance(value, list) else []), *table])
+            print(f"and {rows - LISTED:,} more; --json lists all\n" if rows > LISTED else "")
+        elif value is not None:
+            print(f"{heading:<24}{_shown(value)}")
+
+
+def _shown(value) -> str:
+    """Return a value as people read it."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key.replace('_', ' ')} {_shown(entry)}" for key, entry in value.items())
+    if isinstance(value, list | tuple | np.ndarray):
+        return " ".join(map(_shown, value))
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, float | np.floating):
+        return f"{value + 0.0:.6g}"  # + 0.0: no minus before a zero
+    return f"{value:,}" if isinstance(value, int | np.integer) else "" if value is None else str(value)
+
+
+def print_table(rows):
+    """Print rows of values, aligned to the left."""
+    rows = [[_shown(value) for value in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows)]
     for row in rows:
-        cells = zip(row, widths)
-        print("  ".join(f"{cell:{'<' if i < left else '>'}{n}}" for i, (cell, n) in enumerate(cells)).rstrip())
-
-
-def _print_rich_table(rows, left) -> bool:
-    """Print a table by rich; return whether rich is installed."""
-    try:
-        from rich import box
-        from rich.console import Console
-        from rich.table import Table
-        from rich.text import Text
-    except ImportError:
-        return False
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for i, heading in enumerate(rows[0]):
-        table.add_column(Text(heading), justify="left" if i < left else "right", overflow="fold")
-    for row in rows[1:]:
-        table.add_row(*(Text(cell) for cell in row))
-    Console().print(table)
-    return True
+        print("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths)).rstrip())
 
 
 def check_output(path, suffixes, inputs=(), make=False):
     """Refuse a file that could not be written, or that is one of the inputs, before any work.
 
     Args:
-        path: File.
-        suffixes: That its name may have.
-        inputs: Files that are read.
         make: Whether its folder will be made in the one above.
-
-    Raises:
-        ValueError: With what is wrong.
     """
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: the name must end in {' or '.join(suffixes)}")

@@ -12,6 +12,7 @@ from warp_abtree.app.pictures.scenes import SIZE, draw_snapshot
 from warp_abtree.app.playback import RecordedPlayback
 from warp_abtree.app.render_data import Settings, Snapshot, objects_of_world
 from warp_abtree.app.scene_geometry import tree_depth
+from warp_abtree.app.toml.objects import unit
 
 SUMMARY = "draw a scene, a recorded run or meshes to a PNG file"
 EXAMPLES = (
@@ -41,8 +42,8 @@ def picture(options, progress):
     _check(options)
     named = {"objects": options.objects, "poses": options.pose, "lod": options.lod}
     playback = open_playback(options.source, options.device, progress, **named)
-    eye = playback.view.eye if options.eye is None else options.eye
-    up = playback.view.up if options.up is None else options.up
+    eye = unit(playback.view.eye) if options.eye is None else options.eye
+    up = unit(playback.view.up) if options.up is None else options.up
     if not np.isfinite([*eye, *up]).all() or not np.linalg.norm(np.cross(eye, up)) > 1e-6:
         raise ValueError("--eye: eye and up are not finite, of no length, or point the same way")
     world = playback.view.world if options.world is None else options.world

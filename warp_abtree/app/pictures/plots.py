@@ -9,22 +9,20 @@ from warp_abtree.app.styles import STAGE_LABELS
 from warp_abtree.simulate.frame import FrameRow
 
 
-def draw_run(rows: list[FrameRow], fractions, path, title: str):
-    """Draw LODs, times by stage and certified error of a run over its frames, to a PNG file.
-
-    Args:
-        rows: One a frame.
-        fractions: LOD of every object over its finest, (frames, n).
-        path: File to write.
-        title: Above.
-    """
+def _make_figure(size, title):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 10), dpi=100, facecolor=BACKGROUND, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    lods, times, errors = figure.subplots(3, 1, sharex=True)
+    figure = Figure(figsize=size, dpi=100, facecolor=BACKGROUND, layout="constrained")
+    FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize=14, fontweight="bold", color="0.15")
+    return figure
+
+
+def draw_run(rows: list[FrameRow], fractions, path, title: str):
+    """Draw LODs (fractions of the finest, (frames, n)), times by stage and certified error of a run to a PNG file."""
+    figure = _make_figure((10, 10), title)
+    lods, times, errors = figure.subplots(3, 1, sharex=True)
     frames = np.array([row.frame for row in rows])
 
     low, tenth, middle, ninth, high = np.percentile(fractions, (0, 10, 50, 90, 100), axis=1)
@@ -52,7 +50,7 @@ def draw_run(rows: list[FrameRow], fractions, path, title: str):
     for axes in (lods, times, errors):
         axes.grid(True, alpha=0.3)
         axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-    write_png(canvas, path)
+    write_png(figure.canvas, path)
 
 
 # By controller: label, colour (Okabe and Ito 2008: distinct with any colour vision), dashes, width.
@@ -77,17 +75,13 @@ def draw_controllers(runs: dict[str, list[FrameRow]], budget_ms: float, path, ti
     Raises:
         ValueError: No run, or one of an unknown controller.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     unknown = set(runs) - set(CONTROLLER_STYLES)
     if unknown or not runs:
         raise ValueError(f"runs: {sorted(unknown)} are none of {', '.join(CONTROLLER_STYLES)}, or there are none")
-    figure = Figure(figsize=(9, 8.4), dpi=100, facecolor=BACKGROUND, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
+    figure = _make_figure((9, 8.4), title)
     times, faces, errors = figure.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.0, 1.0))
-    figure.suptitle(title, fontsize=13, fontweight="bold", color="0.15")
     most = max(row.faces for rows in runs.values() for row in rows)
     for name, (label, colour, dash, width) in CONTROLLER_STYLES.items():
         rows = runs.get(name)
@@ -120,4 +114,4 @@ def draw_controllers(runs: dict[str, list[FrameRow]], budget_ms: float, path, ti
         axes.grid(True, alpha=0.3)
     handles, labels = times.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize="small")
-    write_png(canvas, path)
+    write_png(figure.canvas, path)

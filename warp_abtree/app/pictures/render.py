@@ -25,19 +25,12 @@ LIGHTS = (((-0.45, 0.75, 0.60), 0.58), ((0.80, 0.05, 0.45), 0.18))
 
 @dataclass
 class Panel:
-    """One view of a scene.
+    """One view of a scene."""
 
-    Attributes:
-        title: Above it; may have several lines.
-        triangles: Corners in the world [units], float64 (t, 3, 3).
-        colours: Of each, float64 (t, 3), 0 to 1.
-        lines: (ends in the world (k, 2, 3), colour) of each kind of line.
-    """
-
-    title: str
-    triangles: np.ndarray
-    colours: np.ndarray
-    lines: list = field(default_factory=list)
+    title: str  # above it; may have several lines
+    triangles: np.ndarray  # corners in the world [units], float64 (t, 3, 3)
+    colours: np.ndarray  # of each triangle, float64 (t, 3), 0 to 1
+    lines: list = field(default_factory=list)  # (ends in the world (k, 2, 3), colour) of each kind of line
 
 
 def import_pyvista(what: str):
@@ -103,15 +96,9 @@ def draw(panels: list[Panel], path, title: str, legend, eye, up, size: int = 620
     """Write panels side by side, seen by one camera, to a PNG file.
 
     Args:
-        panels: `Panel`s of the same place.
-        path: File to write.
-        title: Above all panels.
         legend: (colour, label) of each entry below.
         eye, up: Directions to the eye and upwards in the world.
         size: Pixels along a panel's side.
-
-    Raises:
-        ValueError: pyvista or Matplotlib is not installed.
     """
     import_pyvista("a picture")
     import matplotlib.patches

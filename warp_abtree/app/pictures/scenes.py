@@ -51,14 +51,7 @@ def make_legend(scene: Scene, panels: list[RenderData], level: int = -1) -> list
 
 
 def draw_snapshot(scene: Scene, snapshot: Snapshot, shown, path, title: str, view, settings: Settings, size: int):
-    """Draw a snapshot of a scene to a PNG file.
-
-    Args:
-        shown: Indices of the objects drawn, rising.
-        title: Above.
-        view: eye and up, directions in the world.
-        size: Pixels along a side.
-    """
+    """Draw the shown objects of a snapshot to a PNG file; `view` is the directions to the eye and upwards."""
     cache = geometry.MeshCache(scene)
     data = compose(cache, snapshot, shown, settings)
     (eye, up), legend = view, make_legend(scene, [data], settings.level)
@@ -95,7 +88,9 @@ def draw_objects(scene: Scene, poses, path, title="", objects=None, eye=(0.4, 0.
 
 def panel_lods(loaded) -> list[np.ndarray]:
     """Return the LODs of all objects in each panel: both ends of the sweeps, or what the file's [picture] asks for."""
-    fractions = [loaded.picture.lods or (sweep.start, sweep.turn) for sweep in loaded.sweeps]
+    asked = loaded.picture.lods
+    asked = [asked] if isinstance(asked, float) else asked
+    fractions = [asked or (sweep.start, sweep.turn) for sweep in loaded.sweeps]
     chosen = [loaded.base_lods.copy() for _ in range(len(fractions[0]) if fractions else 1)]
     for sweep, each in zip(loaded.sweeps, fractions):
         for lods, fraction in zip(chosen, each):

@@ -40,17 +40,9 @@ def import_msgspec(path):
 
 
 def read_tables(path: Path, text: str | None = None):
-    """Return the text of a scene file and its `SceneTable`, whose models are `ModelTable`s.
-
-    Args:
-        path: TOML file.
-        text: TOML in the place of what the file holds.
-
-    Raises:
-        SceneError: The file is missing or wrong, or msgspec is not installed.
-    """
+    """Return the text of a scene file, or `text` in its place, and its `SceneTable`, whose models are `ModelTable`s."""
     msgspec = import_msgspec(path)
-    from warp_abtree.app.toml import model_tables, tables
+    from warp_abtree.app.toml import tables
 
     try:
         text = path.read_bytes().decode() if text is None else text
@@ -75,9 +67,7 @@ def read_tables(path: Path, text: str | None = None):
     scene = convert(tree, tables.SceneTable)
     models = {}
     for name, table in scene.models.items():
-        models[name] = convert(
-            table, model_tables.AnyShape if "shape" in table else model_tables.ModelTable, f"models.{name}"
-        )
+        models[name] = convert(table, tables.AnyShape if "shape" in table else tables.ModelTable, f"models.{name}")
     return text, msgspec.structs.replace(scene, models=models)
 
 
@@ -97,8 +87,7 @@ def _explain(error: str, where: str, choices: dict) -> tuple[str, str]:
     """Return the key that an error of msgspec is about, and what is wrong, in the words of TOML.
 
     Args:
-        error: "MESSAGE - at `$.PATH`", or a message alone about the whole table.
-        where: Key of the whole table.
+        error: "MESSAGE - at `$.PATH`", or a message alone about the whole table, whose key is `where`.
         choices: Names that a key may have.
     """
     message, _, place = error.partition(" - at `$")
@@ -107,7 +96,7 @@ def _explain(error: str, where: str, choices: dict) -> tuple[str, str]:
         return f"{key}.{found[1]}".strip("."), "unknown key"
     if found := re.match(r"Object missing required field `(.*)`$", message):
         return key.strip(".") or "the file", f"the key {found[1]!r} is missing"
-    if found := re.match(r"([a-z_.]+): (.*)", message):  # raised by a table about one of its keys
+    if found := re.match(r"([a-z_.\[\]0-9]+): (.*)", message):  # raised by a table about one of its keys
         return f"{key}.{found[1]}".strip("."), found[2]
     names = choices.get(key.rpartition(".")[2])
     if message.startswith("Invalid") and names:

@@ -17,12 +17,6 @@ from warp_abtree.model.model import Model
 def build_model(path: Path, name: str, table, progress=None) -> Model:
     """Build the model that [models.NAME] describes.
 
-    Args:
-        path: The scene file.
-        name: NAME.
-        table: `ModelTable`.
-        progress: As for `load_scene`.
-
     Raises:
         SceneError: A mesh is missing or bad, or its coordinates leave the range of numbers.
     """

@@ -6,43 +6,32 @@ from typing import Any
 
 import numpy as np
 
-from warp_abtree.app.toml.control import unit
 from warp_abtree.app.toml.decode import SceneError, fail
 
 OBJECT_LIMIT = 1_000_000  # of one entry of [[objects]]
 MATERIAL = ("density", "restitution", "friction")
 
 
+def unit(vector) -> np.ndarray:
+    """Return the direction of a vector that is not 0, of length 1."""
+    vector = np.array(vector) / np.abs(vector).max()  # no square overflows or underflows
+    return vector / np.linalg.norm(vector)
+
+
 @dataclass(eq=False)
 class ObjectGroup:
-    """The objects of one entry; arrays have a row each.
+    """The objects of one entry; arrays have a row each."""
 
-    Attributes:
-        key: Of the entry in its file.
-        table: `ObjectTable`.
-        world: World, int (n,).
-        motion: Arguments of `Kinematic`.
-        kinematic: Whether it moves as told among rigid bodies, bool (n,).
-        material: density, restitution and friction, (n,) each; NaN without [dynamics].
-    """
-
-    key: str
-    table: Any
-    world: np.ndarray
-    motion: dict
-    kinematic: np.ndarray
-    material: dict
+    key: str  # of the entry in its file
+    table: Any  # `ObjectTable`
+    world: np.ndarray  # int (n,)
+    motion: dict  # arguments of `Kinematic`
+    kinematic: np.ndarray  # whether it moves as told among rigid bodies, bool (n,)
+    material: dict  # density, restitution and friction, (n,) each; NaN without [dynamics]
 
 
 def make_group(path, key: str, table, dynamics, rng) -> ObjectGroup:
-    """Lay out the copies of an entry.
-
-    Args:
-        path: The scene file.
-        key: Of the entry.
-        table: `ObjectTable`.
-        dynamics: `DynamicsTable`, or None.
-        rng: NumPy generator of what is random.
+    """Lay out the copies of the entry `key`, an `ObjectTable`; `rng` draws what is random.
 
     Raises:
         SceneError: Too many copies, or keys of rigid bodies where there are none.
@@ -137,15 +126,9 @@ def make_groups(path, tables, dynamics, seed: int, objects: int | None = None) -
     """Lay out all entries of [[objects]].
 
     Args:
-        path: The scene file.
-        tables: `ObjectTable`s.
-        dynamics: `DynamicsTable` or None.
         seed: Of what is random.
         objects: About so many objects in all: every `worlds`, or else `count`, is multiplied by the same number; None
             keeps them.
-
-    Raises:
-        SceneError: As `make_group`, or no entry has worlds or a count to multiply.
     """
 
     def make(tables):

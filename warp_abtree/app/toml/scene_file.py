@@ -1,6 +1,6 @@
 """Scenes as TOML files: `load_scene` checks a file, builds its models and places its objects.
 
-The keys of a file are the fields of the structs in `warp_abtree.app.toml.tables` and `model_tables`.
+The keys of a file are the fields of the structs in `warp_abtree.app.toml.tables`.
 """
 
 import os
@@ -10,14 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_abtree.app.toml.control import (
-    CameraPath,
-    LodControl,
-    PictureView,
-    make_camera,
-    make_control,
-    make_view,
-)
+from warp_abtree.app.toml.control import LodControl, make_control
 from warp_abtree.app.toml.decode import SceneError, fail, read_tables
 from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.models import build_model
@@ -31,45 +24,26 @@ from warp_abtree.simulate.rigid_bodies import Dynamics
 
 @dataclass(eq=False)
 class SceneFile:
-    """A scene as a file describes it.
-
-    Attributes:
-        path, title: Where it came from.
-        text: The file.
-        objects: The number of objects that was asked for, None for the file's own.
-        frames, time_step: How many frames, and the time between them [s].
-        models: `Model` by name.
-        scene: `Scene` with every object at its start.
-        motion: `Kinematic` of all objects; that of rigid bodies is how they start.
-        worlds: World of each object, int (n,).
-        base_lods: LOD of each object before sweeps, int64 (n,).
-        sweeps: `LodSweep`s.
-        picture: `PictureView`.
-        camera: Called with a time [s] returns a `Camera`; None without [camera].
-        control: `LodControl` of [lod].
-        dynamics: `DynamicsTable`, None without [dynamics].
-        kinematic: Whether each object moves as told among rigid bodies, bool (n,).
-        body: density, restitution and friction of each object, (n,).
-    """
+    """A scene as a file describes it."""
 
     path: Path
     title: str
-    text: str
-    objects: int | None
+    text: str  # the file
+    objects: int | None  # the number of objects that was asked for, None for the file's own
     frames: int
-    time_step: float
-    models: dict
-    scene: Scene
-    motion: Kinematic
-    worlds: np.ndarray
-    base_lods: np.ndarray
-    sweeps: list
-    picture: PictureView
-    camera: CameraPath | None
-    control: LodControl
-    dynamics: Any
-    kinematic: np.ndarray
-    body: dict
+    time_step: float  # between frames [s]
+    models: dict  # `Model` by name
+    scene: Scene  # with every object at its start
+    motion: Kinematic  # of all objects; that of rigid bodies is how they start
+    worlds: np.ndarray  # world of each object, int (n,)
+    base_lods: np.ndarray  # LOD of each object before sweeps, int64 (n,)
+    sweeps: list  # `LodSweep`s
+    picture: Any  # `PictureTable`
+    camera: Any  # `CameraTable`, called with a time [s] returns a `Camera`; None without [camera]
+    control: LodControl  # of [lod]
+    dynamics: Any  # `DynamicsTable`, None without [dynamics]
+    kinematic: np.ndarray  # whether each object moves as told among rigid bodies, bool (n,)
+    body: dict  # density, restitution and friction of each object, (n,)
 
     def lods_at(self, time: float) -> np.ndarray:
         """Return the LOD of every object at a time [s] without a controller, int64 (n,)."""
@@ -145,8 +119,7 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
     text, tables = read_tables(path, text)
     if not tables.objects:
         fail(path, "the file", "no [[objects]]")
-    camera, control = make_camera(path, tables.camera), make_control(path, tables.lod)
-    picture = make_view(path, tables.picture)
+    control = make_control(path, tables.lod)
     groups = make_groups(path, tables.objects, tables.dynamics, tables.scene.seed, objects)
     _check_names(path, tables)
     try:
@@ -168,8 +141,8 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
         worlds=np.concatenate([group.world for group in groups]),
         base_lods=scene.lods.astype(np.int64),
         sweeps=[_make_sweep(table, models, owners) for table in tables.lod_sweep],
-        picture=picture,
-        camera=camera,
+        picture=tables.picture,
+        camera=tables.camera,
         control=control,
         dynamics=tables.dynamics,
         kinematic=np.concatenate([group.kinematic for group in groups]),

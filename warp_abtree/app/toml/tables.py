@@ -11,27 +11,41 @@ Lengths are in the scene's units, angles in degrees, times in seconds. `SceneTab
     worlds = 16
 """
 
+import functools
 import math
-from typing import Annotated, Literal, get_args
+import operator
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from msgspec import Meta, field
+import numpy as np
+from msgspec import Meta, Struct, defstruct, field
 from msgspec.structs import replace
 
-from warp_abtree.app.toml.fields import (
-    ORIGIN,
-    Cells,
-    Copies,
-    Count,
-    Fraction,
-    NonEmpty,
-    NotNegative,
-    Positive,
-    Restitution,
-    Table,
-    Vector,
-    check_direction,
-)
-from warp_abtree.app.toml.model_tables import SHAPES
+from warp_abtree.app.toml.objects import OBJECT_LIMIT, unit
+from warp_abtree.lod.view import Camera
+
+T = TypeVar("T")
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Fraction = Annotated[float, Meta(gt=0, le=1)]
+Count = Annotated[int, Meta(ge=1, le=2**31 - 1)]
+Cells = Annotated[int, Meta(ge=0, le=OBJECT_LIMIT)]
+Copies = Annotated[int, Meta(ge=1, le=OBJECT_LIMIT)]
+Restitution = Annotated[float, Meta(ge=0, le=1)]
+TerrainCells = Annotated[int, Meta(ge=1, le=4096)]
+Sections = Annotated[int, Meta(ge=3, le=10_000)]
+NonEmpty = Annotated[list[T], Meta(min_length=1)]
+Vector = tuple[float, float, float]
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+class Table(Struct, forbid_unknown_fields=True):
+    """What all tables share."""
+
+
+def check_direction(key, vector):
+    """Refuse a direction of no length."""
+    if vector is not None and not any(vector):
+        raise ValueError(f"{key}: a direction of no length")
 
 
 class HeadTable(Table):
@@ -41,6 +55,73 @@ class HeadTable(Table):
     frames: Count = 60  # that `run` makes
     time_step: Positive = 1 / 60  # between frames
     seed: Annotated[int, Meta(ge=0, le=2**31 - 1)] = 0  # of everything under `random`
+
+
+# Models.
+
+
+class ModelTable(Table):
+    """[models.NAME]: a mesh, a shape of SHAPES, or both, where the shape stands in where no mesh is found."""
+
+    # Path from the scene file's folder, or "warp:bunny", "warp:bear", "warp:rocks"; of a list the first that is found.
+    mesh: str | NonEmpty[str] | None = None
+    size: Positive | None = None  # scales the longest extent to this length, or
+    scale: Positive | None = None  # scales all coordinates
+    centre: bool = False  # moves the middle of the box to the model's origin
+    faces: Count | None = None  # brings the mesh to so many, or one less: by Loop subdivision and edge collapses
+    base_faces: Count = 10  # faces of the coarsest LOD
+
+    def __post_init__(self):
+        if self.mesh is None and self.__struct_config__.tag is None:
+            raise ValueError("give mesh or shape")
+        if self.size is not None and self.scale is not None:
+            raise ValueError("give size or scale, not both")
+
+    def parameters(self) -> dict:
+        """Return the parameters of the shape that the file gives, by name."""
+        own = [name for name in self.__struct_fields__ if name not in ModelTable.__struct_fields__]
+        return {name: getattr(self, name) for name in own if getattr(self, name) is not None}
+
+
+Pair = tuple[Sections, Sections]
+# The parameters of each shape; those of trimesh have its names and defaults.
+SHAPES: dict[str, dict] = {
+    "box": {"extents": tuple[Positive, Positive, Positive]},
+    "icosphere": {"subdivisions": Annotated[int, Meta(ge=0, le=8)], "radius": Positive},
+    "uv_sphere": {"radius": Positive, "count": Pair},
+    "cylinder": {"radius": Positive, "height": Positive, "sections": Sections},
+    "cone": {"radius": Positive, "height": Positive, "sections": Sections},
+    "capsule": {"radius": Positive, "height": Positive, "count": Pair},
+    "annulus": {"r_min": Positive, "r_max": Positive, "height": Positive, "sections": Sections},
+    "torus": {
+        **{"major_radius": Positive, "minor_radius": Positive},
+        **{"major_sections": Sections, "minor_sections": Sections},
+    },
+    # A trefoil tube; sections along it and around it.
+    "knot": {"radius": Positive, "tube_radius": Positive, "sections": Pair},
+    # An open sheet in a basin, y upwards; extents and cells along x and z, bumps and rim are heights.
+    "terrain": {
+        **{"extents": tuple[Positive, Positive], "cells": tuple[TerrainCells, TerrainCells]},
+        **{"bumps": NotNegative, "waves": NotNegative, "rim": NotNegative},
+    },
+    # A threaded rod along z, its head of a width across the flats; sections around and along.
+    "bolt": {"radius": Positive, "length": Positive, "pitch": Positive, "head": Positive, "sections": Pair},
+    # A nut for a bolt of the same radius and pitch, of a width across the flats; sections around and along.
+    "nut": {"radius": Positive, "height": Positive, "pitch": Positive, "width": Positive, "sections": Pair},
+    # A profile of points [radius, z], z rising, turned about z.
+    "revolve": {"profile": Annotated[list[tuple[Positive, float]], Meta(min_length=2)], "sections": Sections},
+}
+_TABLES = (
+    defstruct(
+        name,
+        [(key, kind | None, None) for key, kind in parameters.items()],
+        bases=(ModelTable,),
+        tag_field="shape",
+        tag=name,
+    )
+    for name, parameters in SHAPES.items()
+)
+AnyShape: Any = functools.reduce(operator.or_, _TABLES)
 
 
 # Objects.
@@ -193,7 +274,11 @@ class CameraKeyTable(Table, kw_only=True):
 
 
 class CameraTable(Table):
-    """[camera]: the viewer that LODs are chosen for; near, still objects come first. Give eye and target, or keys."""
+    """[camera]: the viewer that LODs are chosen for; near, still objects come first. Give eye and target, or keys.
+
+    Called with a time [s], returns a `Camera`: it goes straight from one key to the next, and stands still before the
+    first and after the last.
+    """
 
     eye: Vector | None = None
     target: Vector | None = None
@@ -206,11 +291,28 @@ class CameraTable(Table):
 
     def __post_init__(self):
         check_direction("up", self.up)
-        if self.keys and (self.eye is not None or self.target is not None):
+        if not self.keys:
+            if self.eye is None or self.target is None:
+                raise ValueError(f"the key {'eye' if self.eye is None else 'target'!r} is missing")
+            self.keys = [CameraKeyTable(eye=self.eye, target=self.target)]
+        elif self.eye is not None or self.target is not None:
             raise ValueError("give eye and target, or [[camera.keys]], not both")
-        for name in ("eye", "target"):
-            if not self.keys and getattr(self, name) is None:
-                raise ValueError(f"the key {name!r} is missing")
+        times = [key.time for key in self.keys]
+        for i, time in enumerate(times):
+            if i and not time > times[i - 1]:
+                raise ValueError(f"keys[{i}].time: {time} is not after the one before, {times[i - 1]}")
+            self(time)
+
+    def __call__(self, time: float) -> Camera:
+        times = [key.time for key in self.keys]
+        if self.loop and times[-1] > times[0]:
+            time = times[0] + (time - times[0]) % (times[-1] - times[0])
+        eye, target = (
+            [np.interp(time, times, line) for line in zip(*points)]
+            for points in ([key.eye for key in self.keys], [key.target for key in self.keys])
+        )
+        angle = math.radians(self.field_of_view)
+        return Camera.look_at(eye, target, unit(self.up), field_of_view=angle, size=self.size, far=self.far)
 
 
 class DynamicsTable(Table):
@@ -241,6 +343,8 @@ class PictureTable(Table):
     def __post_init__(self):
         check_direction("eye", self.eye)
         check_direction("up", self.up)
+        if not np.linalg.norm(np.cross(unit(self.eye), unit(self.up))) > 1e-6:
+            raise ValueError("up: points along eye")
 
 
 class SceneTable(Table, kw_only=True):

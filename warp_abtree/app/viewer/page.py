@@ -13,6 +13,7 @@ import numpy as np
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.playback import HOLD, OWN
 from warp_abtree.app.render_data import Settings, compose, objects_of_world
+from warp_abtree.app.toml.objects import unit
 from warp_abtree.app.viewer import text as view_text
 from warp_abtree.app.viewer.viewer_scene import ViewerScene
 from warp_abtree.lod.view import Camera
@@ -33,20 +34,13 @@ MODES = {
 
 
 class Page:
-    """A page about a playback, on a viser server.
-
-    Args:
-        server: `viser.ViserServer`; the page does not stop it.
-        playback: `Playback`.
-        clock: Seconds, by which the browser is given time.
+    """A page about a playback, on a viser server, which the page does not stop.
 
     Attributes:
         settings: `Settings` of the panel.
         playing: Whether frames follow one another.
         snapshot: `Snapshot` that is shown.
         snapshots: How many were sent so far.
-        rate: Snapshots a second, smoothed.
-        cache: `MeshCache` of the scene.
     """
 
     def __init__(self, server, playback, clock=time.monotonic):
@@ -54,16 +48,17 @@ class Page:
         self.cache = geometry.MeshCache(playback.scene)
         self.viewer_scene = ViewerScene(server.scene, self.cache, lambda i: self._post(self._pick, i), clock)
         self.settings = Settings(world=playback.view.world)
+        self._eye, self._up = unit(playback.view.eye), unit(playback.view.up)
         if not len(self.shown):
             self.settings.world = int(playback.worlds.max())
-        self.playing, self.snapshots, self.rate = False, 0, 0.0
+        self.playing, self.snapshots = False, 0
         self._events: queue.SimpleQueue = queue.SimpleQueue()
         self._closed = False
         self._rows: list = []
         self._steps, self._dirty = 0, True
         self._text_time = self._snapshot_time = -math.inf
         self._gizmo, self._plotted = None, False
-        server.scene.set_up_direction(tuple(playback.view.up))
+        server.scene.set_up_direction(tuple(self._up))
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         server.gui.main_panel.dock_right()
         server.gui.set_panel_label(playback.title)
@@ -99,7 +94,7 @@ class Page:
                 first = min(max(getattr(playback, "budget_ms", None) or 16.0, BUDGETS[0]), BUDGETS[1])
                 hint = "T: selection, refinement, broad phase and query of a frame"
                 self._budget = gui.add_slider("budget [ms]", *BUDGETS, 0.5, first, hint=hint)
-                self._on_change(self._budget, self._set_budget)
+                self._on_change(self._budget, lambda _: self._choose())
                 self._for_page = gui.add_checkbox("for this page's camera", False, hint="near objects come first")
                 self._on_change(self._for_page, self._set_for_page)
             self._all_lod = gui.add_slider(
@@ -107,19 +102,14 @@ class Page:
             )
             self._on_change(self._all_lod, self._hold_all)
             release = gui.add_button("release all")
-            release.on_click(lambda _: self._post(self._release, None))
+            release.on_click(lambda _: self._post(self.playback.held.clear))
         with gui.add_folder("Show"):
             self._build_show(gui)
         with gui.add_folder("Picked object"):
-            count = playback.scene.object_count
-            self._picked = gui.add_number("object", -1, min=-1, max=count - 1, step=1, hint="or click it; -1 is none")
-            self._on_change(self._picked, lambda i: self._pick(int(i), from_number=True))
             self._lod = gui.add_slider(
                 "hold it at [%]", 0.0, 100.0, 0.5, 100.0, disabled=True, hint="of its finest LOD"
             )
             self._on_change(self._lod, self._hold_picked)
-            self._release_button = gui.add_button("release it", disabled=True)
-            self._release_button.on_click(lambda _: self._post(self._release, self.settings.picked))
             self._numbers = gui.add_markdown(view_text.NOBODY)
         with gui.add_folder("Frame times [ms]"):
             self._plot = gui.add_uplot(**view_text.time_plot([], PLOTTED), height=220)
@@ -171,27 +161,14 @@ class Page:
         self.playing = False
         self.playback.seek(int(number))
 
-    def _chosen_mode(self):
-        names = self.playback.modes()
-        return next(mode for mode in names if MODES[mode] == self._mode.value)
-
-    def _choose(self, budget_ms=None):
-        mode = self._chosen_mode()
-        if budget_ms is None and mode in ("predictive", "paper"):
-            budget_ms = self._budget.value
-        self.playback.choose(mode, budget_ms)
-
-    def _set_budget(self, value):
-        """Hold a budget, by the predictive controller where none holds one yet."""
-        mode = self._chosen_mode()
-        own = self.playback.control.controller if mode == OWN else mode
-        if own not in ("predictive", "paper"):
-            self._mode.value = MODES["predictive"]
-        self._choose(float(value))
+    def _choose(self):
+        """Choose LODs in the mode of the panel; the slider is the budget of the modes that hold one."""
+        mode = next(mode for mode in self.playback.modes() if MODES[mode] == self._mode.value)
+        self.playback.choose(mode, self._budget.value if mode in ("predictive", "paper") else None)
 
     def _set_for_page(self, value):
         self.playback.for_page = value
-        self._choose(None if self.playback.budget_ms is None else self._budget.value)
+        self._choose()
 
     def _lod_of(self, i, percent):
         return round(percent / 100 * self.playback.scene.models[self.playback.scene.object_model[i]].lod_max)
@@ -204,26 +181,16 @@ class Page:
     def _hold_picked(self, percent):
         if self.settings.picked is not None:
             self.playback.held[self.settings.picked] = self._lod_of(self.settings.picked, percent)
-            self._release_button.disabled = False
 
-    def _release(self, i):
-        if i is None:
-            self.playback.held.clear()
-        else:
-            self.playback.held.pop(i, None)
-        self._release_button.disabled = True
-
-    def _pick(self, i, from_number=False):
-        self.settings.picked = None if i < 0 else i
-        if not from_number:
-            self._picked.value = i
-        self._lod.disabled = i < 0
+    def _pick(self, i):
+        """Pick an object; a click on the picked one leaves none."""
+        self.settings.picked = None if i == self.settings.picked else i
+        self._lod.disabled = self.settings.picked is None
         self._show_held_lod()
         self._show_gizmo()
 
     def _show_held_lod(self):
         i = self.settings.picked
-        self._release_button.disabled = i is None or i not in self.playback.held
         if i is not None:
             top = self.playback.scene.models[self.playback.scene.object_model[i]].lod_max
             lod = self.playback.held.get(i, int(self.snapshot.lods[i]))
@@ -257,20 +224,20 @@ class Page:
 
         The environment stays as it is: a standalone page would make it anew whenever it begins again.
         """
-        scene, view = self.server.scene, self.playback.view
+        scene = self.server.scene
         scene.configure_default_lights(False)
-        direction = view.up - np.cross(view.up, view.eye) + 0.6 * view.eye
+        direction = self._up - np.cross(self._up, self._eye) + 0.6 * self._eye
         scene.add_light_directional("/light", position=tuple(direction), intensity=LIGHT, cast_shadow=False)
 
     def _overview(self):
         """Return where a camera sees all that is shown: its position, what it looks at, and the radius of that."""
         centre, radius = geometry.bounds(self.cache, self.snapshot, self.shown)
-        return centre + DISTANCE * radius * self.playback.view.eye, centre, radius
+        return centre + DISTANCE * radius * self._eye, centre, radius
 
     def _place_camera(self):
         first = self.server.initial_camera
         position, centre, radius = self._overview()
-        first.position, first.look_at, first.up = tuple(position), tuple(centre), tuple(self.playback.view.up)
+        first.position, first.look_at, first.up = tuple(position), tuple(centre), tuple(self._up)
         first.near, first.far = radius / 500, 200 * radius
 
     def _look(self, client):
@@ -317,7 +284,7 @@ class Page:
             wait = self._snapshot_time + FRAME_SECONDS - time.monotonic()
             if wait > 0:
                 time.sleep(wait)
-            self._measure_rate()
+            self._snapshot_time = time.monotonic()
 
     def close(self):
         """End `run`, from any thread."""
@@ -364,12 +331,6 @@ class Page:
         camera = self.playback.camera
         with self.server.atomic():
             self.viewer_scene.show(self._data, self.settings, camera and camera(self.snapshot.time))
-
-    def _measure_rate(self):
-        now = time.monotonic()
-        span = now - self._snapshot_time
-        self._snapshot_time = now
-        self.rate = 0.0 if span > 1 else 0.9 * self.rate + 0.1 / span if self.rate else 1 / span
 
     def _show_text(self, data):
         self._state.content = view_text.state(self, data)

@@ -4,14 +4,9 @@ import numpy as np
 
 from warp_abtree.app.styles import STAGE_LABELS
 
-NOBODY = "Click an object, or give its number."
+NOBODY = "Click an object."
 PARTNERS = 8  # named of the objects that one meets
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b")
-
-
-def _escape(text) -> str:
-    """Return a text as Markdown shows it letter by letter."""
-    return "".join(f"\\{letter}" if letter in "\\`*_{}[]<>()#+-.!|" else letter for letter in str(text))
 
 
 def _table(rows) -> str:
@@ -39,8 +34,6 @@ def state(page, data) -> str:
         rows.append(("select to query", f"{snapshot.row.cost_ms:.1f} ms"))
         if snapshot.row.budget_ms is not None:
             rows.append(("budget", f"{snapshot.row.budget_ms:g} ms"))
-    if page.playing:
-        rows.append(("page", f"{page.rate:.0f} frames a second"))
     return _table(rows)
 
 
@@ -56,7 +49,7 @@ def numbers(playback, snapshot, cache, i) -> str:
     others = [int(a + b - i) for a, b in result.pairs[meets]] if len(meets) else []
     sharing = int(np.count_nonzero((np.array(scene.object_model) == owner) & (snapshot.lods == lod)))
     rows = [
-        ("object", _escape(playback.name_of(i))),
+        ("object", f"`{playback.name_of(i)}`"),
         ("LOD", f"{lod:,} of {model.lod_max:,}{', held' if i in playback.held else ''}"),
         ("faces", f"{cache.count(owner, lod):,} of {model.face_count:,}"),
         ("certified error", f"{model.error_at(lod):.3g}"),
@@ -71,31 +64,23 @@ def numbers(playback, snapshot, cache, i) -> str:
     return _table(rows)
 
 
-def time_plot(rows, window: int = 0) -> dict:
+def time_plot(rows, window: int) -> dict:
     """Return data and series for a uPlot of frame times: stages stacked, the greatest sum behind.
 
-    Args:
-        rows: `FrameRow`s.
-        window: Frames to show at least; those before the first row took no time. A uPlot that begins without any data
-            never finds its axis.
+    At least `window` frames are shown; those before the first row took no time. A uPlot that begins without any data
+    never finds its axis.
     """
-    frames = np.array([row.frame for row in rows], np.float64)
-    stages = np.array([[getattr(row, name) for row in rows] for name in STAGE_LABELS], np.float64)
-    stages = stages.reshape(len(STAGE_LABELS), -1)
-    # Without a budget its line is on the axis; NaN would leave the plot without a scale.
-    budgets = np.array([row.budget_ms or 0.0 for row in rows], np.float64)
     missing = max(window - len(rows), 0)
-    frames = np.concatenate([np.arange(-missing, 0) + (rows[0].frame if rows else 0), frames])
-    stages = np.pad(stages, ((0, 0), (missing, 0)))
-    budgets = np.pad(budgets, (missing, 0))
-    sums = np.cumsum(stages, axis=0)
+    first = rows[0].frame if rows else 0
+    frames = np.array([*range(first - missing, first), *(row.frame for row in rows)], np.float64)
+    # Without a budget its line is on the axis; NaN would leave the plot without a scale.
+    names = (*STAGE_LABELS, "budget_ms")
+    times = np.array([[0.0] * missing + [getattr(row, name) or 0.0 for row in rows] for name in names])
+    data = [frames, *np.cumsum(times[:-1], axis=0)[::-1], times[-1]]  # the budget is drawn last, over the stages
     series: list[dict] = [{"label": "frame"}]
-    data = [frames]
-    for i, label in reversed(list(enumerate(STAGE_LABELS.values()))):
-        series.append({"label": label, "stroke": COLOURS[i], "fill": COLOURS[i] + "c0", "width": 1})
-        data.append(sums[i])
+    for label, colour in zip(reversed(STAGE_LABELS.values()), reversed(COLOURS)):
+        series.append({"label": label, "stroke": colour, "fill": colour + "c0", "width": 1})
     series.append({"label": "budget", "stroke": "#ff0000", "width": 1.5})
-    data.append(budgets)  # drawn last, over the stages
     return {
         "data": tuple(data),
         "series": tuple(series),
@@ -111,33 +96,3 @@ def time_top(rows) -> float:
     wanted = max(1.1 * float(np.percentile([row.total_ms for row in rows], 95)), rows[-1].budget_ms or 0.0, 1e-3)
     power = 10.0 ** np.floor(np.log10(wanted))
     return float(next(power * step for step in (1, 1.5, 2, 3, 5, 7, 10) if power * step >= wanted * (1 - 1e-9)))
-
-
-def time_picture(rows) -> str:
-    """Return frame times by stage as an SVG drawing, with its legend; empty without rows.
-
-    Args:
-        rows: `FrameRow`s, or None where a frame has none.
-    """
-    rows = [row for row in rows if row is not None]
-    if len(rows) < 2:
-        return ""
-    plot = time_plot(rows)
-    sums = plot["data"][1:-1]
-    # One hitch must not flatten the rest.
-    top = max(float(np.percentile(sums[0], 99)) * 1.2, 1e-6)
-    x = np.linspace(34, 336, len(rows))
-    shapes, legend = [], []
-    for series, values in zip(plot["series"][1:-1], sums):
-        y = 96 - 90 * np.minimum(values / top, 1.0)
-        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y))
-        shapes.append(f'<polygon fill="{series["stroke"]}" points="34,96 {points} 336,96"/>')
-        legend.append(f'<span style="color:{series["stroke"]}">&#9632;</span> {series["label"]}')
-    marks = f'<text x="30" y="12" text-anchor="end">{top:.3g}</text><text x="30" y="98" text-anchor="end">0</text>'
-    marks += f'<text x="34" y="110">frame {rows[0].frame}</text>'
-    marks += f'<text x="336" y="110" text-anchor="end">{rows[-1].frame}</text>'
-    drawn = "".join(shapes)
-    return (
-        f'<svg viewBox="0 0 340 114" font-size="10" fill="#444" role="img" aria-label="time of frames by stage">'
-        f"{drawn}{marks}</svg><div>ms a frame: {' '.join(reversed(legend))}</div>"
-    )

@@ -33,12 +33,6 @@ class ViewerScene:
     A few objects have a mesh each, whose vertices follow the LOD. Many are instances: an object changes to another mesh
     only after the browser has had the time to prepare that; otherwise it would vanish for a few frames.
 
-    Args:
-        api: `scene` of a viser server.
-        cache: `MeshCache`.
-        on_pick: Called with the index of an object that is clicked, in a thread of the server.
-        clock: Seconds.
-
     Attributes:
         sent: Bytes of arrays sent so far.
         waits: Whether objects still show an earlier LOD, so that `show` should be called again soon.

@@ -1,38 +1,24 @@
-"""A standalone page of a run: viser's own client with the recorded scene inside, and times in a corner."""
+"""A standalone page of a run: viser's own client with the recorded scene inside, and a title in a corner."""
 
 import html
 from pathlib import Path
 from typing import Any
 
-from warp_abtree.app.viewer import text as view_text
 from warp_abtree.app.viewer.page import Page
 from warp_abtree.checks.atomic_write import atomic_write
 
 # The canvas would fade in whenever the run begins again.
-PANEL = """<style>
-canvas {{ opacity: 1 !important; }}
-#about {{ position: fixed; left: 12px; bottom: 52px; z-index: 10; max-width: 300px; padding: 8px 12px;
-  border-radius: 6px; box-shadow: 0 1px 4px #0004; background: rgba(255, 255, 255, 0.9); color: #222;
-  font: 13px/1.4 sans-serif; }}
-#about summary {{ font-weight: bold; cursor: pointer; }}
-#about svg {{ display: block; width: 100%; height: auto; margin-top: 6px; }}
-</style><details id="about" open><summary>{title}</summary>{text}{plot}</details>"""
+PANEL = """<style>canvas {{ opacity: 1 !important; }}
+#about {{ position: fixed; left: 12px; bottom: 52px; font: 13px sans-serif; }}</style>
+<details id="about" open><summary>{title}</summary>{text}</details>"""
 
 
 def record_page(server, playback, path: Path, frames: int, progress=None):
-    """Run a playback for some frames and write a page that plays them and needs no server.
-
-    Args:
-        server: `viser.ViserServer` without clients.
-        playback: `Playback` at its start.
-        path: File to write; it appears whole or not at all.
-        frames: How many.
-        progress: Called as progress(stage, done, total).
-    """
+    """Run a playback from its start for some frames and write a page that plays them and needs no server."""
     played = 0.0
     page = Page(server, playback, clock=lambda: played)
     page.playing = True
-    rows, hits = [], []
+    hits = []
     recorder: Any = None  # of viser
     for done in range(1, frames + 1):
         data = page.advance()
@@ -43,7 +29,6 @@ def record_page(server, playback, path: Path, frames: int, progress=None):
             recorder = server.get_scene_serializer()
         recorder.insert_sleep(playback.time_step)
         played += playback.time_step
-        rows.append(page.snapshot.row)
         hits.append(data.contact_count)
         if progress is not None:
             progress("frames", done, frames)
@@ -51,7 +36,7 @@ def record_page(server, playback, path: Path, frames: int, progress=None):
         f"<div>{playback.scene.object_count:,} objects, {frames:,} frames on {playback.scene.device}; "
         f"{min(hits):,} to {max(hits):,} intersecting face pairs</div>"
     )
-    about = PANEL.format(title=html.escape(playback.title), text=text, plot=view_text.time_picture(rows))
+    about = PANEL.format(title=html.escape(playback.title), text=text)
     written = recorder.as_html()
     end = written.rindex("</body>")
     with atomic_write(path, "w", encoding="utf-8") as file:
