@@ -9,12 +9,7 @@ The reference is exact and knows no boxes.
 
 import numpy as np
 import pytest
-<<<<<<< HEAD
-from helpers.gpu_query import GpuQuery
-=======
-from helpers.orient import orient2d_kernel
 from helpers.questions import GpuQuery
->>>>>>> main
 from helpers.samples import random_quaternions
 from oracles.triangle import into_frame_of_a, quaternion_matrix, triangles_intersect
 
