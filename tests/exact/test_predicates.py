@@ -172,7 +172,7 @@ def check_filter(kernel, points, truth, device):
     return sure
 
 
-@pytest.mark.parametrize(("form", "kind"), CASES, ids="-".join)
+@pytest.mark.parametrize(("form", "kind"), CASES, ids=map("-".join, CASES))
 def test_signs(device, form, kind):
     """EXACT and the expansions alone are always right, FILTER wherever it is sure, and 0 is as good as any sign."""
     dim, kernel = FORMS[form]
