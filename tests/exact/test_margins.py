@@ -9,14 +9,11 @@ The reference is exact and knows no boxes.
 
 import numpy as np
 import pytest
-from helpers.orient import orient2d_kernel
 from helpers.questions import GpuQuery
 from helpers.samples import random_quaternions
-from oracles.signs import find_signs, rounded_signs, true_signs
 from oracles.triangle import into_frame_of_a, quaternion_matrix, triangles_intersect
 
 import warp_abtree as ab
-from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, UNCERTAIN
 
 COUNT = 150
 FACE = [[0, 1, 2]]
@@ -112,20 +109,3 @@ def test_faces_that_touch_are_never_missed(device, regime, speck_first, make_que
         assert triangles_intersect(a, into_frame_of_a(b, pose_a, pose_b))
     missed = np.flatnonzero(~ask_touching(device, cases, make_query))
     assert missed.tolist() == []
-
-
-def test_the_filter_in_two_dimensions_is_never_sure_and_wrong(device):
-    """Points nearly on a line; every difference, product and sum of the determinant rounds."""
-    rng = np.random.default_rng(12)
-    points = np.empty((20_000, 3, 2))
-    a, b, c = points[:, 0], points[:, 1], points[:, 2]
-    c[:] = rng.uniform(1, 2, c.shape)
-    a[:] = rng.uniform(-0.1, 0.1, a.shape)
-    b[:] = c + rng.uniform(0.5, 2.0, (len(b), 1)) * (a - c) + 2.0**-52 * rng.integers(-4, 5, b.shape)
-    truth = true_signs(points)
-    filtered = find_signs(orient2d_kernel, FILTER, points, device)
-    sure = filtered != int(UNCERTAIN)
-    np.testing.assert_array_equal(filtered[sure], truth[sure])
-    wrong = rounded_signs(points) != truth
-    assert wrong.mean() > 0.1 and sure.any(), "the points are too easy or too hard"
-    np.testing.assert_array_equal(find_signs(orient2d_kernel, EXACT, points, device), truth)

@@ -1,7 +1,5 @@
 """The triangle test against exact arithmetic, degenerate cases above all."""
 
-from itertools import permutations
-
 import numpy as np
 import pytest
 import warp as wp
@@ -13,8 +11,6 @@ from warp_abtree.kernels.triangle.float64_filter import decide_triangles
 pytestmark = pytest.mark.slow
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
-ORDERS = [(p, q) for p in permutations(range(3)) for q in permutations(range(3))]
 
 
 @wp.kernel
@@ -105,29 +101,18 @@ KINDS = {
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_answers_are_exact(device, kind):
+    """At any power of two, and in any order of triangles and corners."""
     make, count = KINDS[kind]
-    pairs = make(np.random.default_rng(1), count)
+    rng = np.random.default_rng(1)
+    pairs = make(rng, count)
     expected = truth(pairs)
     assert 0.02 < expected.mean() < 0.99, "both answers need to occur"
-    wrong = np.flatnonzero(meet(pairs, device) != expected)
+    order = rng.permuted(np.tile(np.arange(3), (count, 2, 1)), axis=2)
+    pairs = np.take_along_axis(pairs, order[:, :, :, None], 2)
+    pairs = np.where(rng.random((count, 1, 1, 1)) < 0.5, pairs, pairs[:, ::-1])
+    scale = rng.choice([0, -280, -100, -30, 30, 100, 280], (count, 1, 1, 1))
+    wrong = np.flatnonzero(meet(np.ldexp(pairs, scale), device) != expected)
     assert len(wrong) == 0, f"{len(wrong)} wrong, first: {pairs[wrong[0]].tolist()}, exact {expected[wrong[0]]}"
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_answers_do_not_depend_on_order(device, kind):
-    pairs = KINDS[kind][0](np.random.default_rng(2), 1200)
-    expected = truth(pairs)
-    for p, q in ORDERS:
-        turned = np.stack([pairs[:, 0][:, p], pairs[:, 1][:, q]], 1)
-        np.testing.assert_array_equal(meet(turned, device), expected)
-        np.testing.assert_array_equal(meet(turned[:, ::-1], device), expected)
-
-
-@pytest.mark.parametrize("exponent", [-280, -100, -30, 30, 100, 280])
-def test_answers_do_not_depend_on_scale(device, exponent):
-    rng = np.random.default_rng(3)
-    pairs = np.concatenate([make(rng, 500) for make, _ in KINDS.values()])
-    np.testing.assert_array_equal(meet(np.ldexp(pairs, exponent), device), truth(pairs))
 
 
 def test_certain_answers_survive_rounding(device):

@@ -1,7 +1,8 @@
-"""Kernels that ask for single signs."""
+"""Kernels that ask for single signs and sums."""
 
 import warp as wp
 
+from warp_abtree.kernels.arithmetic.expansion import two_sum
 from warp_abtree.kernels.arithmetic.predicates import orient2d
 
 # Signs are exact only where no multiplication and addition are contracted into one rounding.
@@ -12,3 +13,14 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 def orient2d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.int32)):
     i = wp.tid()
     out[i] = orient2d(mode, points[i, 0], points[i, 1], points[i, 2])
+
+
+@wp.kernel
+def sum_of_product_kernel(
+    a: wp.array(dtype=wp.float64), b: wp.array(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)
+):
+    """The product invites contraction: fused into the sum, it is not the rounded one."""
+    i = wp.tid()
+    high, low = two_sum(a[i] * b[i], a[i])
+    out[0, i] = high
+    out[1, i] = low
