@@ -32,9 +32,14 @@ def real_meshes(pairs) -> dict:
     """Return the models of named tuples of meshes, where the folder in ABTREE_MESHES has all of a tuple."""
     if not os.environ.get("ABTREE_MESHES"):
         return {}
+    folder = ModelFolder(None)
     at_hand = {key: names for key, names in pairs.items() if all(map(mesh_file, names))}
-    models = {name: ab.Model.load(mesh_file(name)) for names in at_hand.values() for name in names}
-    return {key: tuple(models[name] for name in names) for key, names in at_hand.items()}
+    return {key: tuple(folder.load([name]) for name in names) for key, names in at_hand.items()}
+
+
+def knot_model(face_target, folder=None) -> ab.Model:
+    """Return the model of a knot, which takes minutes for a million faces; a folder keeps it between runs."""
+    return ModelFolder(folder).load([f"knot:{face_target}"])
 
 
 def has_source(name) -> bool:
@@ -50,14 +55,14 @@ class ModelFolder:
     """Models in a folder, by name and faces of the base mesh; those in use stay in memory.
 
     Args:
-        folder: Made when the first model is kept.
+        folder: Made when the first model is kept; None keeps no files.
     """
 
     def __init__(self, folder):
-        self.folder = Path(folder)
+        self.folder = None if folder is None else Path(folder)
         self._open = {}
 
-    def file(self, name, base_faces) -> Path:
+    def file(self, name, base_faces=10) -> Path:
         """Return where a model lies, or would."""
         return self.folder / f"{re.sub('[^a-z0-9-]+', '-', name.lower())}-base{base_faces}.npz"
 
@@ -72,23 +77,24 @@ class ModelFolder:
             ValueError: None is at hand.
         """
         for name in names:
-            if self.file(name, base_faces).is_file() or has_source(name):
-                return self._load(name, base_faces)
+            if has_source(name) or (self.folder and self.file(name, base_faces).is_file()):
+                key = name, base_faces
+                self._open[key] = self._open.get(key) or self._load(name, base_faces)
+                return self._open[key]
         raise ValueError(f"none of {', '.join(names)} is at hand: set ABTREE_MESHES, or install the extra `usd`")
 
     def _load(self, name, base_faces):
-        key = name, base_faces
-        if key not in self._open:
-            file = self.file(name, base_faces)
-            if not file.is_file():
-                self.folder.mkdir(parents=True, exist_ok=True)
-                self._make(name, base_faces).save(file)
-            self._open[key] = ab.Model.open(file)
-        return self._open[key]
+        if self.folder is None:
+            return self._make(name, base_faces)
+        file = self.file(name, base_faces)
+        if not file.is_file():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._make(name, base_faces).save(file)
+        return ab.Model.open(file)
 
     def _make(self, name, base_faces):
         if name in COLLAPSED:
-            whole, face_count = self._load(COLLAPSED[name][0], 10), COLLAPSED[name][1]
+            whole, face_count = self.load(COLLAPSED[name][:1]), COLLAPSED[name][1]
             vertices, faces, _ = whole.mesh_at(whole.lod_for(fraction=face_count / whole.face_count))
         elif name.startswith("knot:"):
             vertices, faces = knot(int(name.removeprefix("knot:")))

@@ -1,9 +1,7 @@
 """Bytes and operations of a query, counted from its result's counters, beside what the device can do.
 
-Counted is what the algorithm cannot do without, so every fraction of a peak is a lower bound: an operation is an
-addition, subtraction, multiplication or comparison of real numbers, a fused multiply-add is two; absolute values,
-choices and integers cost nothing, and nothing is loaded twice within one test. Bytes are those requested of memory,
-whether a cache has them or not; stacks in shared memory or registers are left out.
+Counted is what the algorithm cannot do without, so every fraction of a peak is a lower bound: real additions,
+subtractions, multiplications, comparisons (a fused multiply-add is two), and bytes requested of memory, cached or not.
 
 * node test (kernels/traversal): four child pairs load four records of 32 bytes, pose four boxes: 6 operations for sum
   and size, 18 for the image of the sum, 15 for that of the size; 6 more widen each of A's two. A comparison is 6
@@ -24,8 +22,6 @@ whether a cache has them or not; stacks in shared memory or registers are left o
   records of its children, 64. Walks up the forest and atomics are left out.
 """
 
-import time
-
 import numpy as np
 
 COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
@@ -45,30 +41,8 @@ PEAKS = {
 }
 
 
-def measure_peaks(side=1024, words=2**25):
-    """Return what the processor reaches, all its cores: memory by a copy, operations by a product of matrices."""
-
-    def least(run):
-        times = []
-        for _ in range(5):
-            begin = time.perf_counter()
-            run()
-            times.append(time.perf_counter() - begin)
-        return min(times)
-
-    a, b = np.ones(words, np.float32), np.zeros(words, np.float32)
-    peaks = [2 * a.nbytes / least(lambda: np.copyto(b, a))]
-    for dtype in (np.float32, np.float64):
-        m = np.ones((side, side), dtype)
-        out = np.empty_like(m)
-        peaks.append(2 * side**3 / least(lambda m=m, out=out: np.matmul(m, m, out=out)))
-    return tuple(peaks)
-
-
 def find_peaks(device):
-    """Return a device's peaks as in `PEAKS`: measured on the CPU, published on CUDA; None for a name not listed."""
-    if device.is_cpu:
-        return measure_peaks()
+    """Return a device's published peaks as in `PEAKS`; None for the CPU and for a name not listed."""
     return next((peaks for name, peaks in PEAKS.items() if name in device.name), None)
 
 

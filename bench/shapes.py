@@ -1,7 +1,5 @@
 """Meshes and poses of the benchmarks, reproducible to the bit."""
 
-from pathlib import Path
-
 import numpy as np
 
 import warp_abtree as ab
@@ -31,17 +29,6 @@ def knot(face_target):
     a, b, c, d = i * nv + j, i2 * nv + j, i2 * nv + j2, i * nv + j2
     faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
     return vertices.astype(np.float32), faces.astype(np.int32)
-
-
-def knot_model(face_target, folder=None):
-    """Return the model of `knot`, which takes minutes for a million faces; a folder keeps it between runs."""
-    if folder is None:
-        return ab.Model.from_arrays(*knot(face_target), name=f"knot {face_target}")
-    path = Path(folder) / f"knot-{face_target}.npz"
-    if not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        ab.Model.from_arrays(*knot(face_target), name=f"knot {face_target}").save(path)
-    return ab.Model.open(path)
 
 
 def random_directions(rng, *shape):
@@ -101,6 +88,15 @@ def scene_of_objects(device, model, poses):
     scene = ab.Scene(device=device)
     for pose in poses:
         scene.add(model, pose=pose)
+    return scene
+
+
+def scene_of_worlds(device, model, poses):
+    """Return a scene of a model at poses (worlds, objects, 7), each row of them a world of its own."""
+    scene = ab.Scene(device=device)
+    for world, rows in enumerate(poses):
+        for pose in rows:
+            scene.add(model, pose, world=world)
     return scene
 
 

@@ -41,9 +41,6 @@ def pick(rows, **where) -> list:
     return [row for row in rows if all(row.get(name) == value for name, value in where.items())]
 
 
-# --- JSON ------------------------------------------------------------------------------------------------------------
-
-
 def plain(value):
     """Return a value of a row as JSON keeps it: floats to `DIGITS` significant digits, no NaN."""
     if isinstance(value, bool | np.bool_):
@@ -67,9 +64,6 @@ def write_json(path, study):
     ]
     with atomic_write(path, "w", encoding="utf-8") as file:
         file.write(f'{{"study": {json.dumps(study["study"])}, "parts": {{\n' + ",\n".join(parts) + "\n}}\n")
-
-
-# --- Markdown --------------------------------------------------------------------------------------------------------
 
 
 def shown(value, form="") -> str:
@@ -124,9 +118,6 @@ def study_page(study) -> str:
             blocks += [table["note"]] if "note" in table else []
     blocks += [note for part in study["parts"].values() for note in part["notes"]]
     return "\n\n".join(blocks) + "\n"
-
-
-# --- figures ---------------------------------------------------------------------------------------------------------
 
 
 def draw(figures, rows, folder) -> str:

@@ -4,6 +4,7 @@ import contextlib
 import gc
 import os
 import time
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -16,6 +17,11 @@ def capture(launch, device):
     with wp.ScopedCapture(device) as captured:
         launch()
     return captured.graph
+
+
+def make_replay(launch, device):
+    """Return a callable that replays a launch as a graph on CUDA, and launches on the CPU, on all of its cores."""
+    return partial(wp.capture_launch, capture(launch, device)) if device.is_cuda else launch
 
 
 def time_graph(graph, device):
@@ -47,25 +53,6 @@ def time_call(call, device="cpu", clock=time.perf_counter):
         return 1e3 * (clock() - begin)
 
     return run
-
-
-def time_both(call, device):
-    """Call something that cannot be captured; return its time [ms] by the wall clock and between events.
-
-    The second includes the stream's waits for the host; on the CPU it is the first.
-    """
-    wp.synchronize_device(device)
-    events = []
-    if device.is_cuda:
-        events = [wp.Event(device, enable_timing=True) for _ in range(2)]
-        wp.get_stream(device).record_event(events[0])
-    begin = time.perf_counter()
-    call()
-    if events:
-        wp.get_stream(device).record_event(events[1])
-    wp.synchronize_device(device)
-    wall = 1e3 * (time.perf_counter() - begin)
-    return wall, wp.get_event_elapsed_time(*events) if events else wall
 
 
 def time_rounds(runs: dict, repeats) -> dict:
@@ -122,6 +109,21 @@ def fit_slope(sizes, times):
     if len(sizes) < 2:
         return None
     return round(float(np.polyfit(np.log(np.asarray(sizes, float)), np.log(np.asarray(times, float)), 1)[0]), 3)
+
+
+def crossover(x, excess, always):
+    """Return the x, on a logarithmic scale, from which on an excess stays above 0.
+
+    Args:
+        always: What to return where it is above 0 everywhere; where it ends below, None is returned.
+    """
+    below = np.flatnonzero(np.asarray(excess) < 0)
+    if not len(below):
+        return always
+    i = int(below[-1])
+    if i == len(x) - 1:
+        return None
+    return float(np.exp(np.interp(0, excess[i : i + 2], np.log(x[i : i + 2]))))
 
 
 def upper_half(values):

@@ -120,22 +120,8 @@ def clear_tiny(pairs):
     return np.where(np.abs(pairs) < CLEARED, 0.0, pairs)
 
 
-ADVERSARIAL = {
-    make.__name__: make
-    for make in (
-        lattice,
-        coplanar,
-        nearly_coplanar,
-        touching,
-        ulp_perturbed,
-        shared,
-        nearly_shared,
-        collinear,
-        zero_area,
-        sliver,
-        extreme,
-    )
-}
+TOUCHING = (lattice, coplanar, nearly_coplanar, touching, ulp_perturbed, shared, nearly_shared)
+ADVERSARIAL = {make.__name__: make for make in (*TOUCHING, collinear, zero_area, sliver, extreme)}
 KINDS = {"random": generic, **ADVERSARIAL}
 
 

@@ -44,7 +44,6 @@ class ModelPool:
 @wp.func_native(native.body("numbers.cuh", "load_vertex"))
 def load_vertex(vertices: wp.array(dtype=wp.vec4d), i: wp.int32) -> wp.vec3d:
     """Return a position of `ModelPool.vertex_pos`, which nothing writes during a kernel."""
-    ...
 
 
 @wp.struct

@@ -30,12 +30,7 @@ def place_object_kernel(
     faults_inout: wp.array(dtype=wp.int32),
     record_inout: LaunchRecord,
 ):
-    """Set rotation and position from x y z qx qy qz qw, one row an object; a bad row moves nothing and is a fault.
-
-    Args:
-        tolerance: How far a quaternion's norm may be off 1.
-        faults_inout: As `note_fault`, by object.
-    """
+    """Set rotation and position from x y z qx qy qz qw, one row an object; a bad row moves nothing and is a fault."""
     i = wp.tid()
     if i == 0:
         record_launch(record_inout)

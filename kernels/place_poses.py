@@ -78,49 +78,47 @@ def is_matrix_pose(tolerance: wp.float64, poses: wp.array2d(dtype=Any), i: wp.in
     return last and is_finite(read_column(poses, i)) and is_rigid(tolerance, read_rotation(poses, i))
 
 
-# Of four kernels and two types most programs need one: each is a module of its own, compiled when it is first used.
+@wp.func
+def read_turn(poses: wp.array2d(dtype=Any), i: wp.int32):
+    return rotate_quaternion(read_quaternion(poses, i))
+
+
+def pose_readers(width: int):
+    """Return what checks a pose and what reads its position and rotation.
+
+    Rows of 7 numbers are x y z qx qy qz qw of a unit quaternion; rows of 16 a rigid 4x4 matrix, taken as it is.
+    """
+    if width == 7:
+        return is_quaternion_pose, read_position, read_turn
+    return is_matrix_pose, read_column, read_rotation
+
+
+# Of two widths and two types most programs need one: each is a module of its own, compiled when it is first used.
 
 
 @cache
 def pose_check(real, width: int):
-    """Return the kernel that finds the first row that is no pose, of 7 numbers or of 16."""
+    """Return the kernel that finds the first row that is no pose."""
+    is_pose, _, _ = pose_readers(width)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
-    def check_quaternion_kernel(
-        tolerance: wp.float64, poses: wp.array2d(dtype=real), first_inout: wp.array(dtype=wp.int32)
-    ):
+    def check_pose_kernel(tolerance: wp.float64, poses: wp.array2d(dtype=real), first_inout: wp.array(dtype=wp.int32)):
         i = wp.tid()
-        if not is_quaternion_pose(tolerance, poses, i):
+        if not is_pose(tolerance, poses, i):
             wp.atomic_min(first_inout, 0, i)
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
-    def check_matrix_kernel(
-        tolerance: wp.float64, poses: wp.array2d(dtype=real), first_inout: wp.array(dtype=wp.int32)
-    ):
-        i = wp.tid()
-        if not is_matrix_pose(tolerance, poses, i):
-            wp.atomic_min(first_inout, 0, i)
-
-    return check_quaternion_kernel if width == 7 else check_matrix_kernel
+    return check_pose_kernel
 
 
 @cache
 def pose_setter(real, width: int):
-    """Return the kernel that sets rotation and position [world units], one row an object.
-
-    Rows of 7 numbers are x y z qx qy qz qw of a unit quaternion; rows of 16 a rigid 4x4 matrix, taken as it is.
-    """
+    """Return the kernel that sets rotation and position [world units], one row an object."""
+    _, position_of, rotation_of = pose_readers(width)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
-    def set_quaternion_kernel(poses: wp.array2d(dtype=real), objects_inout: ObjectPool):
+    def set_pose_kernel(poses: wp.array2d(dtype=real), objects_inout: ObjectPool):
         i = wp.tid()
-        objects_inout.position[i] = read_position(poses, i)
-        objects_inout.rotation[i] = rotate_quaternion(read_quaternion(poses, i))
+        objects_inout.position[i] = position_of(poses, i)
+        objects_inout.rotation[i] = rotation_of(poses, i)
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
-    def set_matrix_kernel(poses: wp.array2d(dtype=real), objects_inout: ObjectPool):
-        i = wp.tid()
-        objects_inout.position[i] = read_column(poses, i)
-        objects_inout.rotation[i] = read_rotation(poses, i)
-
-    return set_quaternion_kernel if width == 7 else set_matrix_kernel
+    return set_pose_kernel

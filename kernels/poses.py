@@ -1,11 +1,9 @@
 """Poses of objects, and the pose of one object in the frame of another, with margins that cover all rounding.
 
-The margin of boxes covers every rounding between the exact x' of B's vertices and the float32 box test. With
-u = 2^-24, r_a and r_b the reach of the root boxes and s the largest component of the translation between the centres,
-these sum to less than 9 u r_b + 5 u s + 2 u r_a on A's axes and 9 u r_a + 8.7 u s + 2 u r_b on B's, so 9 u of each are
-taken (docs/exactness.md has the terms). The float64 part covers x' itself and the shift between centres, and `skew` a
-rotation that is not orthonormal to the last bit, on whose columns B's axes are taken. A gap along a unit axis is a
-distance, so `within` adds to the margin; a column is longer than 1 by at most `skew`.
+The margin of boxes covers every rounding between the exact x' of B's vertices and the float32 box test, its float64
+part x' itself and the shift between centres, and `skew` a rotation that is not orthonormal to the last bit, on whose
+columns B's axes are taken: docs/exactness.md has the terms. A gap along a unit axis is a distance, so `within` adds to
+the margin; a column is longer than 1 by at most `skew`.
 """
 
 import warp as wp

@@ -1,22 +1,15 @@
 """A chunk of a sweep: poses checked and set on the device, answers packed for the host."""
 
-from typing import Any
+from functools import cache
 
 import warp as wp
 
 from warp_abtree.kernels.arrays import ObjectPool
-from warp_abtree.kernels.place_poses import (
-    is_matrix_pose,
-    is_quaternion_pose,
-    read_column,
-    read_position,
-    read_quaternion,
-    read_rotation,
-)
-from warp_abtree.kernels.poses import rotate_quaternion
+from warp_abtree.kernels.place_poses import pose_readers
 from warp_abtree.kernels.traversal.face_pairs import Hits
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
 
 NONE_REFUSED = wp.constant(2**31 - 1)
 
@@ -34,51 +27,26 @@ def refuse_pose(objects: ObjectPool, report: wp.array(dtype=wp.int32), i: wp.int
     wp.atomic_min(report, REFUSED, i)
 
 
-@wp.kernel
-def place_quaternion_kernel(
-    tolerance: wp.float64,
-    poses: wp.array2d(dtype=Any),
-    objects_inout: ObjectPool,
-    report_inout: wp.array(dtype=wp.int32),
-):
-    """Set objects 1, 2, ... from x y z qx qy qz qw, and note the first row that is no pose.
+@cache
+def pose_placer(real, width: int):
+    """Return the kernel that sets objects 1, 2, ... from poses, and notes the first row that is none."""
+    is_pose, position_of, rotation_of = pose_readers(width)
 
-    Args:
-        tolerance: How far the norm of a quaternion may be off 1.
-        poses: float32 or float64, shape [capacity, 7].
-    """
-    i = wp.tid()
-    if is_quaternion_pose(tolerance, poses, i):
-        objects_inout.position[i + 1] = read_position(poses, i)
-        objects_inout.rotation[i + 1] = rotate_quaternion(read_quaternion(poses, i))
-    else:
-        refuse_pose(objects_inout, report_inout, i)
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    def place_pose_kernel(
+        tolerance: wp.float64,
+        poses: wp.array2d(dtype=real),
+        objects_inout: ObjectPool,
+        report_inout: wp.array(dtype=wp.int32),
+    ):
+        i = wp.tid()
+        if is_pose(tolerance, poses, i):
+            objects_inout.position[i + 1] = position_of(poses, i)
+            objects_inout.rotation[i + 1] = rotation_of(poses, i)
+        else:
+            refuse_pose(objects_inout, report_inout, i)
 
-
-@wp.kernel
-def place_matrix_kernel(
-    tolerance: wp.float64,
-    poses: wp.array2d(dtype=Any),
-    objects_inout: ObjectPool,
-    report_inout: wp.array(dtype=wp.int32),
-):
-    """Set objects 1, 2, ... from rigid 4x4 matrices, taken as they are, and note the first row that is none.
-
-    Args:
-        tolerance: How far R^T R may be off the identity.
-        poses: float32 or float64, shape [capacity, 16].
-    """
-    i = wp.tid()
-    if is_matrix_pose(tolerance, poses, i):
-        objects_inout.position[i + 1] = read_column(poses, i)
-        objects_inout.rotation[i + 1] = read_rotation(poses, i)
-    else:
-        refuse_pose(objects_inout, report_inout, i)
-
-
-for _kernel in (place_quaternion_kernel, place_matrix_kernel):
-    for _real in (wp.float32, wp.float64):
-        wp.overload(_kernel, {"poses": wp.array2d(dtype=_real)})
+    return place_pose_kernel
 
 
 @wp.kernel

@@ -37,16 +37,10 @@ def write_scene(tmp_path, text=SCENE):
     return path
 
 
-# Scene files and the command line.
-
-
-@pytest.mark.parametrize("count", [0, -1, 1.5, 2.0, "x", True, np.int32(0), np.nan])
-def test_a_number_of_objects_is_whole_and_above_0(tmp_path, count):
-    with pytest.raises(ValueError, match=r"^objects [^\n]*$"):
-        load_scene(write_scene(tmp_path), device="cpu", objects=count)
-
-
-def test_a_number_of_objects_of_numpy(tmp_path):
+def test_a_number_of_objects_is_whole_and_above_0(tmp_path):
+    for count in (0, 1.5, "x", True, np.nan):
+        with pytest.raises(ValueError, match=r"^objects [^\n]*$"):
+            load_scene(write_scene(tmp_path), device="cpu", objects=count)
     loaded = load_scene(write_scene(tmp_path), device="cpu", objects=np.int64(5))
     assert loaded.scene.object_count == 5 and type(loaded.objects) is int
 
@@ -69,17 +63,7 @@ def status_of(capsys, *words):
     return status, capsys.readouterr().err.splitlines()
 
 
-@pytest.mark.parametrize("count", ["0", "-1", "1.5", "x"])
-@pytest.mark.parametrize("command", ["run", "view", "picture"])
-def test_a_number_of_objects_on_the_command_line(capsys, command, count):
-    more = ["--out", "x.png"] if command == "picture" else []
-    status, lines = status_of(capsys, command, "rain", *more, "--objects", count)
-    assert status == 2 and len(lines) == 1 and f"--objects: '{count}' is no whole number" in lines[0]
-
-
-@pytest.mark.parametrize(
-    "words", ["nosuch", "--device cpu nosuch", "query --nosuch", "paper --x", "--device cpu paper"], ids=str
-)
+@pytest.mark.parametrize("words", ["nosuch", "--device cpu nosuch", "query --nosuch", "--device cpu paper"], ids=str)
 def test_a_benchmark_that_there_is_not(capsys, words):
     pytest.importorskip("bench")
     status, lines = status_of(capsys, "bench", *words.split())
@@ -90,24 +74,44 @@ def test_a_benchmark_that_there_is_not(capsys, words):
         assert "before its options" in lines[0]
 
 
-# Frames, clocks, cameras, controllers, bodies.
+def refuse(name, make, *values):
+    """Yield calls of a maker by a name that must be in the error, one a bad value."""
+    yield from ((name, lambda value=value: make(value)) for value in values)
 
 
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        ("time_step", [0, -1, 0.0, np.nan, np.inf, "x", None]),
-        ("output", ["everything", None, 3]),
-        ("lods", ["paper", 3, [0, 0]]),
-        ("clock", [3.0, "cpu"]),
-        ("motion", [ab.Kinematic(np.zeros((99, 3)))]),
-    ],
-)
-def test_a_frame_refuses_when_it_is_made(name, values):
-    scene = balls()
-    for value in values:
-        with pytest.raises(ValueError, match=name):
-            ab.Frame(scene, **{name: value})
+def bodies(name):
+    return lambda value: ab.Dynamics(balls(count=1), **{name: value})
+
+
+BAD_NUMBERS = ("8", None, np.nan, -1.0, [8.0])
+REFUSED = [
+    *refuse("time_step", lambda x: ab.Frame(balls(), time_step=x), 0, np.nan, "x"),
+    *refuse("output", lambda x: ab.Frame(balls(), output=x), "everything", None),
+    *refuse("lods", lambda x: ab.Frame(balls(), lods=x), "paper", [0, 0]),
+    *refuse("clock", lambda x: ab.Frame(balls(), clock=x), 3.0, "cpu"),
+    *refuse("motion", lambda x: ab.Frame(balls(), motion=x), ab.Kinematic(np.zeros((99, 3)))),
+    *refuse("rates: 'query'", lambda x: WorkClock({"query": x}), np.nan, -1e-9, "fast", [1.0, 2.0]),
+    *refuse(r"^view: ", lambda x: Camera(np.zeros(3), x), np.eye(3) + 0j, np.diag([1.0, np.nan, 1.0]), np.eye(4), "x"),
+    *refuse(r"^eye: ", lambda x: Camera(x, np.eye(3)), np.zeros(3) + 1j),
+    *refuse(r"^budget_ms\b", lambda x: ab.PaperController(balls(), x), *BAD_NUMBERS),
+    *refuse(r"^budget_ms\b", lambda x: ab.PredictiveController(balls(), x), *BAD_NUMBERS),
+    *refuse(r"^tolerance\b", lambda x: ab.ToleranceController(balls(), x), *BAD_NUMBERS),
+    *refuse(r"^threshold_ms\b", lambda x: ab.PaperController(balls(), 8.0, threshold_ms=x), "8", np.nan, -1.0),
+    *[call for name in ("density", "friction", "slop") for call in refuse(f"{name}: inf of", bodies(name), np.inf)],
+    *refuse(
+        "base_faces", lambda x: ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], base_faces=x), 1.5, np.inf, "ten", True
+    ),
+]
+
+
+@pytest.mark.parametrize(("message", "call"), REFUSED)
+def test_bad_arguments_are_named(message, call):
+    with np.errstate(all="ignore"), pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_a_rate_of_work_may_be_0():
+    assert WorkClock({"query": 0}).rates["query"] == 0
 
 
 def test_a_summary_is_of_frames(device):
@@ -128,62 +132,13 @@ def test_a_history_into_a_folder_that_is_not_there(tmp_path, name):
     assert str(path) in str(caught.value) and "partial" not in str(caught.value)
 
 
-@pytest.mark.parametrize("rate", [np.nan, -1e-9, np.inf, "fast", None, [1.0, 2.0]])
-def test_rates_of_work(rate):
-    with pytest.raises(ValueError, match="rates: 'query'"):
-        WorkClock({"query": rate})
-    assert WorkClock({"query": 0}).rates["query"] == 0
-
-
-NOT_FINITE = np.diag([1.0, np.nan, 1.0])
-
-
-@pytest.mark.parametrize(
-    "view", [np.eye(3) * (1 + 0j), NOT_FINITE, np.full((3, 3), np.inf), np.eye(4), np.ones((3, 3)), "x"]
-)
-def test_the_view_of_a_camera(view):
-    with np.errstate(all="ignore"), pytest.raises(ValueError, match=r"^view: "):
-        Camera(np.zeros(3), view)
-    with pytest.raises(ValueError, match=r"^eye: "):
-        Camera(np.zeros(3) + 1j, np.eye(3))
-
-
-@pytest.mark.parametrize("value", ["x", "8", None, np.nan, -1.0, [8.0], 1j])
-def test_controllers_name_the_argument(value):
-    scene = balls()
-    for make, name in (
-        (lambda: ab.PaperController(scene, value), "budget_ms"),
-        (lambda: ab.PredictiveController(scene, value), "budget_ms"),
-        (lambda: ab.ToleranceController(scene, value), "tolerance"),
-        (lambda: ab.PaperController(scene, 8.0, threshold_ms=value), "threshold_ms"),
-    ):
-        if (name, value) != ("threshold_ms", None):
-            with pytest.raises(ValueError, match=rf"^{name}\b"):
-                make()
-
-
-@pytest.mark.parametrize("name", ["density", "friction", "slop", "sleep_speed"])
-def test_bodies_of_infinite_numbers_are_refused(device, name):
-    with pytest.raises(ValueError, match=f"{name}: inf of object 0"):
-        ab.Dynamics(balls(device, 1), **{name: np.inf})
-
-
-# Meshes and models.
-
-
-@pytest.mark.parametrize("index", [4, 2**31, 2**63, 10**30, -(10**30)])
+@pytest.mark.parametrize("index", [4, 2**31, -(10**30)])
 @pytest.mark.parametrize("face", ["f 1 2 {}", "f 1 2 3 {}", "f {0}/1 2/1 3/1"])
 def test_an_index_of_obj_beyond_the_vertices(tmp_path, index, face):
     path = tmp_path / "big.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + face.format(index) + "\n")
     with pytest.raises(ab.MeshError, match=r"big\.obj: .*vert[^\n]*$"):
         load_mesh(path)
-
-
-@pytest.mark.parametrize("count", [0, 1.5, np.nan, np.inf, "ten", None, True])
-def test_faces_of_a_base_are_a_whole_number(count):
-    with pytest.raises(ValueError, match="base_faces"):
-        ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], base_faces=count)
 
 
 def test_a_built_model_is_opened_not_loaded(tmp_path):
@@ -212,48 +167,21 @@ def test_info_reads_a_built_model(tmp_path, capsys):
     assert re.search(r"^lods +\d", capsys.readouterr().out, re.M)
 
 
-# Model files with one array changed. Arrays that fit one another in type, length and range, but are not one mesh's:
-
-
-def first_merged(arrays):
-    """Return where vertices that merges made begin."""
-    return len(arrays["vertex_parent"]) - (len(arrays["lod_error"]) - 1)
-
-
-def move_merged(value, arrays):
-    value = value.copy()
-    value[first_merged(arrays) :] *= 2.0**130
-    return value
-
-
-def move_child(value, arrays):
-    value = value.copy()
-    first = first_merged(arrays)
-    child = np.flatnonzero((value[:first] >= 0) & (value[:first] < len(value) - 1))[0]
-    value[child] = len(value) - 1
-    return value
-
-
+# Model files with one array changed: arrays that fit in type, length and range, but are not one mesh's,
 INCONSISTENT = {
-    "scaled up": ("vertex_pos", lambda x, _: x * 2.0**150),
-    "scaled down": ("vertex_pos", lambda x, _: x * 2.0**-150),
-    "in a point": ("vertex_pos", lambda x, _: 0 * x),
-    "merged vertices far away": ("vertex_pos", move_merged),
-    "all roots": ("vertex_parent", lambda x, _: np.full_like(x, -1)),
-    "a merge of three": ("vertex_parent", move_child),
-    "faces reversed": ("face_vertex", lambda x, _: x[::-1]),
-    "faces without area": ("face_vertex", lambda x, _: np.repeat(x[:, :1], 3, axis=1)),
-    "splits reversed": ("face_split", lambda x, _: x[::-1]),
-    "always there": ("face_split", lambda x, _: 0 * x),
-    "another slice": ("split_face", lambda x, _: np.roll(x, 1)),
-    "slices at the end": ("split_start", lambda x, _: np.where(np.arange(len(x)) > 0, x[-1], 0)),
+    "scaled up": ("vertex_pos", lambda x: x * 2.0**150),
+    "all roots": ("vertex_parent", lambda x: np.full_like(x, -1)),
+    "faces reversed": ("face_vertex", lambda x: x[::-1]),
+    "splits reversed": ("face_split", lambda x: x[::-1]),
+    "another slice": ("split_face", lambda x: np.roll(x, 1)),
+    "slices at the end": ("split_start", lambda x: np.where(np.arange(len(x)) > 0, x[-1], 0)),
 }
-# Arrays that would make a mesh, but not the one saved.
+# and arrays that would make a mesh, but not the one saved.
 ALTERED = {
-    "half the size": ("vertex_pos", lambda x, _: x * 0.5),
-    "half the error": ("lod_error", lambda x, _: x * 0.5),
-    "leaves swapped": ("leaf_node", lambda x, _: np.concatenate([x[1::-1], x[2:]])),
-    "another name": ("name", lambda *_: np.array("boll")),
+    "half the size": ("vertex_pos", lambda x: x * 0.5),
+    "half the error": ("lod_error", lambda x: x * 0.5),
+    "leaves swapped": ("leaf_node", lambda x: np.concatenate([x[1::-1], x[2:]])),
+    "another name": ("name", lambda _: np.array("boll")),
 }
 
 
@@ -265,7 +193,7 @@ def test_model_files_that_were_altered_are_refused(tmp_path, case):
     name, change = {**INCONSISTENT, **ALTERED}[case]
     with np.load(path) as file:
         arrays = dict(file)
-    arrays[name] = change(arrays[name], arrays)
+    arrays[name] = change(arrays[name])
     np.savez(path, **arrays)
     with pytest.raises(ab.ModelError, match=r"m\.npz: " + ("altered since it was saved" if case in ALTERED else "")):
         ab.Model.open(path)

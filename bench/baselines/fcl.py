@@ -1,8 +1,10 @@
-"""python-fcl: a BVHModel (OBB tree with RSS) of each mesh, or convex solids by GJK."""
+"""python-fcl: a BVHModel (OBB tree with RSS) of each mesh, or convex solids by GJK.
+
+Baselines that answer pose by pose have `any`, whether A at the origin and B intersect at each pose, and `faces`, an
+answer a pose from which `face_pairs` reads all intersecting face pairs. Without the library they raise ImportError.
+"""
 
 import numpy as np
-
-from .interface import PoseLoop
 
 ALL_CONTACTS = 2**31 - 1
 
@@ -22,10 +24,12 @@ def make_convex(fcl, vertices, faces):
     return fcl.Convex(vertices, len(faces), corners)
 
 
-class Fcl(PoseLoop):
+class Fcl:
     """python-fcl.
 
     Args:
+        a, b: Vertices float64 (v, 3) and faces int32 (f, 3); one object if both are one mesh.
+        matrices: Poses of B, float64 (n, 4, 4).
         make: Makes a shape of a mesh.
     """
 
@@ -60,3 +64,8 @@ class Fcl(PoseLoop):
 
     def faces(self):
         return self._collide(self.all)
+
+    @staticmethod
+    def face_pairs(answer):
+        """Return the face numbers in one answer, (k, 2)."""
+        return [(contact.b1, contact.b2) for contact in answer.contacts]

@@ -11,8 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from .interface import PoseLoop
-
 SOURCE = Path(__file__).with_name("fcl_cpp.cpp")
 # Not for this processor alone: FCL's own library is not, and both must lay out Eigen's types alike.
 FLAGS = ["-std=c++17", "-O3", "-DNDEBUG", "-shared", "-fPIC"]
@@ -26,8 +24,7 @@ def _run(command):
     """
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
-        complaints = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()
-        raise ImportError(f"{command[0]}: {complaints[0] if complaints else 'failed'}")
+        raise ImportError(f"{command[0]}: {next(iter(done.stderr.splitlines()), 'failed')}")
     return done.stdout
 
 
@@ -55,7 +52,7 @@ def _pointer(array):
     return ctypes.c_void_p(array.ctypes.data)
 
 
-class FclCpp(PoseLoop):
+class FclCpp:
     """FCL called from C++: a BVHModel (OBB tree with RSS) of each mesh; face pairs without points of contact."""
 
     name = "fcl-c++"

@@ -12,14 +12,13 @@ import numpy as np
 import warp as wp
 
 from ..timing import capture
-from .interface import Operator
 
 SDF_RESOLUTION = 64
 CONTACTS_PER_PAIR = 512  # what is left of them after reduction
 CANDIDATES_PER_HIT = 4
 
 
-class Newton(Operator):
+class Newton:
     """Newton's pipeline over given pairs of one mesh.
 
     Args:
@@ -58,6 +57,10 @@ class Newton(Operator):
             )
             self.state = self.model.state()
             self.contacts = self.pipeline.contacts()
+
+    def place(self, poses):
+        """Move all objects, float32 (2 p, 7)."""
+        self.state.body_q.assign(poses)
 
     def launch(self):
         self.pipeline.collide(self.state, self.contacts)

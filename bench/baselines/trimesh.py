@@ -1,9 +1,7 @@
 """trimesh: two CollisionManagers of one object each, which hold python-fcl's trees; B is moved for each pose."""
 
-from .interface import PoseLoop
 
-
-class Trimesh(PoseLoop):
+class Trimesh:
     name = "trimesh"
 
     def __init__(self, a, b, matrices):

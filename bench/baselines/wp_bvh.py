@@ -3,11 +3,12 @@
 A baseline for time only: its triangle test has an absolute epsilon and invents pairs on fine meshes.
 """
 
+import functools
+
 import numpy as np
 import warp as wp
 
 from ..timing import medians, time_in_turn
-from .interface import Operator
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,44 +37,37 @@ def place_face(asked: BvhPairs, pair: wp.int32, a: wp.int32):
     return p, q, r
 
 
-@wp.kernel
-def find_faces_kernel(asked: BvhPairs, hits_out: wp.array(dtype=wp.vec3i), total_out: wp.array(dtype=wp.int32)):
-    tid = wp.tid()
-    pair = tid // asked.face_count
-    a = tid % asked.face_count
-    p, q, r = place_face(asked, pair, a)
-    query = wp.bvh_query_aabb(asked.bvh, wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r)))
-    b = wp.int32(0)
-    while wp.bvh_query_next(query, b):
-        face = asked.faces[b]
-        u = asked.vertices[face[0]]
-        v = asked.vertices[face[1]]
-        w = asked.vertices[face[2]]
-        if wp.intersect_tri_tri(p, q, r, u, v, w) != 0:
-            slot = wp.atomic_add(total_out, 0, 1)
-            if slot < hits_out.shape[0]:
-                hits_out[slot] = wp.vec3i(pair, a, b)
+@functools.cache
+def find_kernel(yes_no):
+    """Return the kernel that lists face pairs and counts them, int32 (1,); or that answers yes or no, int32 (p,), and
+    leaves a pair alone once it is known to intersect."""
 
+    @wp.kernel(module="unique", enable_backward=False)
+    def find_faces_kernel(asked: BvhPairs, hits_out: wp.array(dtype=wp.vec3i), found_inout: wp.array(dtype=wp.int32)):
+        tid = wp.tid()
+        pair = tid // asked.face_count
+        a = tid % asked.face_count
+        if wp.static(yes_no):
+            if found_inout[pair] != 0:
+                return
+        p, q, r = place_face(asked, pair, a)
+        query = wp.bvh_query_aabb(asked.bvh, wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r)))
+        b = wp.int32(0)
+        while wp.bvh_query_next(query, b):
+            face = asked.faces[b]
+            u = asked.vertices[face[0]]
+            v = asked.vertices[face[1]]
+            w = asked.vertices[face[2]]
+            if wp.intersect_tri_tri(p, q, r, u, v, w) != 0:
+                if wp.static(yes_no):
+                    found_inout[pair] = 1
+                    return
+                else:
+                    slot = wp.atomic_add(found_inout, 0, 1)
+                    if slot < hits_out.shape[0]:
+                        hits_out[slot] = wp.vec3i(pair, a, b)
 
-@wp.kernel
-def find_any_kernel(asked: BvhPairs, any_inout: wp.array(dtype=wp.int32)):
-    """As `find_faces_kernel`, but a pair that is known to intersect is left alone."""
-    tid = wp.tid()
-    pair = tid // asked.face_count
-    a = tid % asked.face_count
-    if any_inout[pair] != 0:
-        return
-    p, q, r = place_face(asked, pair, a)
-    query = wp.bvh_query_aabb(asked.bvh, wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r)))
-    b = wp.int32(0)
-    while wp.bvh_query_next(query, b):
-        face = asked.faces[b]
-        u = asked.vertices[face[0]]
-        v = asked.vertices[face[1]]
-        w = asked.vertices[face[2]]
-        if wp.intersect_tri_tri(p, q, r, u, v, w) != 0:
-            any_inout[pair] = 1
-            return
+    return find_faces_kernel
 
 
 @wp.kernel
@@ -116,24 +110,26 @@ class FaceBvh:
         self.bvh.rebuild()
 
 
-class BvhFaces(FaceBvh, Operator):
+class BvhFaces(FaceBvh):
     """All face pairs.
 
     Args:
         capacity: Face pairs that there is room for.
     """
 
+    yes_no = False
+
     def __init__(self, vertices, faces, poses, capacity, device, constructor="sah"):
         super().__init__(vertices, faces, device, constructor)
         self.pair_count = len(poses) // 2
         self.asked.poses = wp.array(np.asarray(poses, np.float32), dtype=wp.transform, device=device)
         self.hits = wp.empty(capacity, dtype=wp.vec3i, device=device)
-        self.total = wp.zeros(1, dtype=wp.int32, device=device)
+        self.found = wp.zeros(self.pair_count if self.yes_no else 1, dtype=wp.int32, device=device)
 
     def launch(self):
-        self.total.zero_()
-        inputs = [self.asked, self.hits, self.total]
-        wp.launch(find_faces_kernel, self.pair_count * self.asked.face_count, inputs, device=self.device)
+        self.found.zero_()
+        inputs = [self.asked, self.hits, self.found]
+        wp.launch(find_kernel(self.yes_no), self.pair_count * self.asked.face_count, inputs, device=self.device)
 
     def result(self) -> np.ndarray:
         """Return the rows found, int32 (k, 3), sorted.
@@ -141,7 +137,7 @@ class BvhFaces(FaceBvh, Operator):
         Raises:
             RuntimeError: There was no room for all of them.
         """
-        total = int(self.total.numpy()[0])
+        total = int(self.found.numpy()[0])
         if total > len(self.hits):
             raise RuntimeError(f"the wp.Bvh baseline found {total} face pairs, with room for {len(self.hits)}")
         rows = self.hits.numpy()[:total].reshape(-1, 3)
@@ -151,18 +147,14 @@ class BvhFaces(FaceBvh, Operator):
 class BvhAny(BvhFaces):
     """Yes or no."""
 
+    yes_no = True
+
     def __init__(self, vertices, faces, poses, device, constructor="sah"):
         super().__init__(vertices, faces, poses, 0, device, constructor)
-        self.any = wp.zeros(self.pair_count, dtype=wp.int32, device=device)
-
-    def launch(self):
-        self.any.zero_()
-        inputs = [self.asked, self.any]
-        wp.launch(find_any_kernel, self.pair_count * self.asked.face_count, inputs, device=self.device)
 
     def result(self) -> np.ndarray:
         """Return whether each pair intersects, bool (p,)."""
-        return self.any.numpy() != 0
+        return self.found.numpy() != 0
 
 
 def find_constructor(vertices, faces, poses, device, repeats=5) -> str:

@@ -1,9 +1,9 @@
-"""One core against one core: ours beside FCL in C++, python-fcl, trimesh and Coal, where installed, on posed pairs.
+"""One core against one core: ours beside FCL in C++, python-fcl and trimesh, where installed, on posed pairs.
 
 A workload is one model against another at 200 poses, half of them intersecting. Answers are compared before anything is
 timed. Times are those that the thread ran. Ours is timed from the launch to the sorted result on the host; a baseline
 over a loop of its own calls, objects made before, until the library has its contacts; no face numbers are read from
-them. Then ours on all cores is timed in turn with ours on one, by the wall clock.
+them.
 """
 
 import time
@@ -12,15 +12,13 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
-from warp_abtree import testing
 
-from ..baselines.coal import Coal
 from ..baselines.fcl import Fcl
 from ..baselines.fcl_cpp import FclCpp
 from ..baselines.trimesh import Trimesh
 from ..meshes import real_meshes
 from ..shapes import knot, random_directions, rotation_matrices, scene_of_poses
-from ..timing import core_count, no_garbage_collection, one_core, ratio_of, summarise, time_in_turn
+from ..timing import no_garbage_collection, one_core, ratio_of, summarise, time_in_turn
 from ..verify import judge_disputed
 
 REAL = {
@@ -30,13 +28,13 @@ REAL = {
 }
 FULL = {"faces": 5000, "poses": 200, "repeats": 5}
 QUICK = {"faces": 300, "poses": 6, "repeats": 1}
-BASELINES = (FclCpp, Fcl, Trimesh, Coal)
+BASELINES = (FclCpp, Fcl, Trimesh)
 IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 
 
 def run(device, quick=False):
-    """Yield one row a workload and baseline (column peer): differences, queries a second of both and ratios (ours over
-    the peer), and one a workload of ours on one core and on all."""
+    """Yield one row a workload and baseline (column peer): differences, queries a second of both, and ratios (ours over
+    the peer)."""
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
     knots = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
@@ -45,8 +43,6 @@ def run(device, quick=False):
             workload = Workload(name, *models, device, sizes)
             workload.about["core"] = core
             yield from workload.run()
-        del workload.about["core"]
-        yield workload.about | workload.time_cores()
 
 
 def random_matrices(rng, vertices_a, vertices_b, count):
@@ -73,15 +69,9 @@ def half_in_contact(scene, pairs, vertices_a, vertices_b, seed=0):
     return rng.permutation(np.stack([*kept[True][: (count + 1) // 2], *kept[False][: count // 2]]))
 
 
-def run_to_host(query, cores=None):
-    """Return a callable that launches a query on some cores and returns its result."""
-
-    def run():
-        with testing.regime(cpu_threads=cores):
-            query.launch()
-            return query.result()
-
-    return run
+def run_to_host(query):
+    """Return a callable that launches a query and returns its result."""
+    return lambda: (query.launch(), query.result())[1]
 
 
 class Workload:
@@ -160,14 +150,3 @@ class Workload:
         """Return the columns of a batch's times [ms], with queries a second."""
         per_second = round(1e3 * len(self.matrices) / float(np.median(times)))
         return {f"{name}_per_s": per_second} | summarise(name, times)
-
-    def time_cores(self):
-        """Return columns of ours on all cores of this process and how many times faster than on one that is."""
-        row = {"cores": core_count()}
-        for output, query in self.queries.items():
-            launches = {"all": run_to_host(query), "one": run_to_host(query, 1)}
-            with no_garbage_collection():
-                times = time_in_turn(launches, wp.get_device("cpu"), self.repeats)
-            row |= summarise(f"all_{output}", times["all"]) | summarise(f"one_{output}", times["one"])
-            row[f"{output}_ratio"] = ratio_of(times["one"], times["all"])
-        return row

@@ -10,30 +10,29 @@ import time
 from pathlib import Path
 
 import numpy as np
+import trimesh
 import warp as wp
 
 import warp_abtree as ab
 
 from ..baselines.wp_bvh import FaceBvh
+from ..meshes import ModelFolder
 from ..shapes import knot
-from ..surfaces import distances, sample_surface
 from ..timing import fit_slope, summarise_all, time_call
 
 FULL = {"faces": (200, 1000, 5000, 20_000, 60_000, 250_000, 1_000_000), "repeats": (5, 1), "samples": 2000}
 QUICK = {"faces": (200, 600), "repeats": (2, 1), "samples": 100}
 LARGE = 100_000  # faces from which on a build is timed once
-PEAK_LEAST = 20_000  # a smaller build fits into memory that the process had before
 CHECKED_FRACTIONS = (0.3, 0.05)  # of the faces: LODs whose certified errors are checked
 BASE_FACES = 10
 BASELINE = "fast_simplification"
-STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 def run(device, quick=False, largest=None, models=None):
     """Yield one row a mesh, and one of the slopes of its lines.
 
     Times are those that one thread of the host ran, in turn with the baselines'; of the device only bvh_build, a wp.Bvh
-    over the boxes of the faces. peak is what a build takes at most above what was there, model what the arrays hold.
+    over the boxes of the faces. model_mib is what the arrays of a model hold.
     tightness is the least of certified error over what was measured at some points, at least 1 where the bound holds.
     """
     device = wp.get_device(device)
@@ -46,10 +45,33 @@ def run(device, quick=False, largest=None, models=None):
                 rows.append(run_mesh(device, face_target, sizes, Path(models or folder)))
                 yield rows[-1]
     row = {"case": "slope", "sizes": len(rows)}
-    for name in ("build_ms", "collapse_ms", "error_ms", "tree_ms", "open_ms", "peak_mib", "file_mib"):
+    for name in ("build_ms", "collapse_ms", "error_ms", "tree_ms", "open_ms", "file_mib"):
         some = [r for r in rows if r.get(name)]
         row[f"{name}_slope"] = fit_slope([r["faces"] for r in some], [r[name] for r in some])
     yield row
+
+
+@wp.kernel(enable_backward=False)
+def distance_kernel(
+    mesh: wp.uint64, points: wp.array(dtype=wp.vec3), reach: wp.float32, distance_out: wp.array(dtype=wp.float32)
+):
+    """Find the distance of each point to a mesh."""
+    i = wp.tid()
+    query = wp.mesh_query_point_no_sign(mesh, points[i], reach)
+    distance_out[i] = reach
+    if query.result:
+        distance_out[i] = wp.length(wp.mesh_eval_position(mesh, query.face, query.u, query.v) - points[i])
+
+
+def distances(points, vertices, faces, device="cpu"):
+    """Return the distance of each point to a mesh, found in float32 about the mesh's middle."""
+    middle, reach = (vertices.min(0) + vertices.max(0)) / 2, 2 * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    corners = wp.array((vertices - middle).astype(np.float32), dtype=wp.vec3, device=device)
+    mesh = wp.Mesh(corners, wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device=device))
+    found = wp.zeros(len(points), dtype=wp.float32, device=device)
+    queried = wp.array((points - middle).astype(np.float32), dtype=wp.vec3, device=device)
+    wp.launch(distance_kernel, len(points), [mesh.id, queried, reach, found], device=device)
+    return found.numpy().astype(np.float64)
 
 
 def check_model(model, samples):
@@ -59,7 +81,7 @@ def check_model(model, samples):
         RuntimeError: A point lies farther from a LOD than its certified error, or a LOD lacks faces.
     """
     vertices, faces, _ = model.mesh_at(model.lod_max)
-    points = sample_surface(np.random.default_rng(0), vertices, faces, samples)
+    points, _ = trimesh.sample.sample_surface(trimesh.Trimesh(vertices, faces, process=False), samples, seed=0)
     rounding = 1e-6 * np.ptp(vertices, axis=0).max()  # of float32
     least = np.inf
     for fraction in CHECKED_FRACTIONS:
@@ -73,38 +95,6 @@ def check_model(model, samples):
         if farthest > rounding:
             least = min(least, model.error_at(lod) / farthest)
     return least
-
-
-def check_same(model, other):
-    """Compare all arrays of two models.
-
-    Raises:
-        RuntimeError: They differ.
-    """
-    for part in ("progressive", "tree"):
-        for name, value in vars(getattr(model, part)).items():
-            if isinstance(value, np.ndarray) and not np.array_equal(value, getattr(getattr(other, part), name)):
-                raise RuntimeError(f"{name} of the opened model differs from the saved one's")
-
-
-def read_status(name):
-    """Return a size of this process [bytes], None where the system does not tell."""
-    if not STATUS.is_file():
-        return None
-    line = next(line for line in STATUS.read_text().splitlines() if line.startswith(name))
-    return 1024 * int(line.split()[1])
-
-
-def peak_of(call):
-    """Call something; return what it returns and by how much memory rose meanwhile [bytes], None if not known."""
-    gc.collect()
-    try:
-        CLEAR.write_text("5")  # the peak starts from here
-    except OSError:
-        return call(), None
-    before = read_status("VmRSS")
-    found = call()
-    return found, max(0, read_status("VmHWM") - before)
 
 
 def build(vertices, faces, name):
@@ -136,15 +126,14 @@ def run_mesh(device, face_target, sizes, folder):
     """Return the row of one mesh."""
     gc.collect()
     vertices, faces = knot(face_target)
-    name = f"knot {face_target}"
+    name = f"knot:{face_target}"
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"knot-{face_target}.npz"
-    (model, first), peak = peak_of(lambda: build(vertices, faces, name))
+    path = ModelFolder(folder).file(name)
+    model, first = build(vertices, faces, name)
     row = {"case": "build", "device": device.name, "faces": len(faces), "lod_max": model.lod_max}
     tightness = check_model(model, sizes["samples"])
     row["tightness"] = round(tightness, 2) if np.isfinite(tightness) else None
     model.save(path)
-    check_same(model, ab.Model.open(path))
     simplify, skipped = find_simplifier(vertices, faces)
     bvh = FaceBvh(vertices, faces, device)
     runs = {"save": lambda: model.save(path), "open": lambda: ab.Model.open(path)}
@@ -162,8 +151,7 @@ def run_mesh(device, face_target, sizes, folder):
     row["faces_per_s"] = round(1e3 * len(faces) / row["build_ms"])
     held = [*vars(model.progressive).values(), *vars(model.tree).values()]
     held = sum(value.nbytes for value in held if isinstance(value, np.ndarray))
-    sizes_of = {"peak": peak if len(faces) >= PEAK_LEAST else None, "model": held, "file": path.stat().st_size}
-    for key, value in sizes_of.items():
-        row[f"{key}_mib"] = None if value is None else round(value / 2**20, 2)
-        row[f"{key}_bytes_a_face"] = None if value is None else round(value / len(faces), 1)
+    for key, value in {"model": held, "file": path.stat().st_size}.items():
+        row[f"{key}_mib"] = round(value / 2**20, 2)
+        row[f"{key}_bytes_a_face"] = round(value / len(faces), 1)
     return row

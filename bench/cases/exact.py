@@ -23,6 +23,7 @@ from ..triangle_pairs import ADVERSARIAL, make_chunk
 from ..verify import load_oracle
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+COUNT, QUICK_COUNT = 100_000, 110
 CHUNK = 20_000
 # Every so many adversarial pairs, one is asked in all orders; the others in one order each, in turn.
 WHOLE_EVERY = 64
@@ -32,7 +33,7 @@ ORDERS = [
 STAGES = ("float32_stage_ns", "float64_stage_ns", "exact_stage_ns", "float32_ns")
 
 
-def run(device, count=100_000, processes=2):
+def run(device, count=None, processes=2, quick=False):
     """Yield one row a kind of pair: pairs asked, fraction that intersect (meet), disagreements of any stage with the
     truth, fractions left to float64 and to expansions, error rate of float32 alone, time a pair [ns].
 
@@ -45,19 +46,14 @@ def run(device, count=100_000, processes=2):
     for mode in (FILTER, EXACT, FLOAT32):
         ask(mode, make_chunk(("random", 0, 1)), device)  # compile before anything is timed
     ask_float32(make_chunk(("random", 0, 1)), device)
-    jobs, tallies = list_jobs(count), {}
+    jobs, wrong = list_jobs(count or (QUICK_COUNT if quick else COUNT)), 0
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        begin = time.perf_counter()
-        # Kinds end in the order of the jobs, so a kind's row is whole when the next one starts.
-        for at, (job, truth) in enumerate(zip(jobs, pool.imap(find_truth, jobs))):
-            if job[0] not in tallies and tallies:
-                yield describe_tally(device, *list(tallies.items())[-1])
-            check_chunk(job, truth, device, tallies.setdefault(job[0], np.zeros(10)))
-            done, wrong = (int(sum(tally[k] for tally in tallies.values())) for k in (0, 2))
-            line = f"{at + 1}/{len(jobs)} chunks, {done} pairs, {wrong} wrong, {time.perf_counter() - begin:.0f} s"
-            print(f"{job[0]}: {line}", file=sys.stderr, flush=True)
-    yield describe_tally(device, *list(tallies.items())[-1])
-    if any(tally[2] for tally in tallies.values()):
+        chunks = zip(jobs, pool.imap(find_truth, jobs), strict=True)
+        for kind, group in itertools.groupby(chunks, key=lambda chunk: chunk[0][0]):
+            tally = sum(check_chunk(job, truth, device) for job, truth in group)
+            wrong += tally[2]
+            yield describe_tally(device, kind, tally)
+    if wrong:
         raise RuntimeError("exact signs gave a wrong answer")
 
 
@@ -154,8 +150,9 @@ def unit_size(pairs):
     return np.ldexp(pairs, -exponent)
 
 
-def check_chunk(job, truth, device, tally):
-    """Compare one chunk on a device with the truth, and add to the tally of its kind."""
+def check_chunk(job, truth, device):
+    """Compare one chunk on a device with the truth; return its tally."""
+    print(f"{job[0]}: chunk {job[1]}, {len(truth)} pairs", file=sys.stderr, flush=True)
     pairs, rows = make_chunk(job), np.arange(len(truth))
     if job[0] != "random":
         pairs, rows = reorder_pairs(pairs)
@@ -178,10 +175,8 @@ def check_chunk(job, truth, device, tally):
     unproven, unproven_time = ask_float32(pairs, device, proven=False)
     rest = np.flatnonzero(unproven == UNCERTAIN)
     unproven[rest], rest_time = ask(FLOAT32, unit_size(pairs[rest]), device)
-    tally += [
-        len(truth), truth.sum(), len(wrong), len(to_float64), len(to_exact), (unproven != truth).sum(),
-        single_time, double_time, exact_time, unproven_time + rest_time,
-    ]  # fmt: skip
+    counts = [len(truth), truth.sum(), len(wrong), len(to_float64), len(to_exact), (unproven != truth).sum()]
+    return np.array([*counts, single_time, double_time, exact_time, unproven_time + rest_time], float)
 
 
 def describe_tally(device, kind, tally):

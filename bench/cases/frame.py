@@ -7,9 +7,9 @@ import warp as wp
 
 import warp_abtree as ab
 
+from ..memory import count_bytes
 from ..shapes import knot, random_directions, scene_of_objects
-from ..timing import capture, summarise_all, time_call, time_graph, time_rounds
-from .memory import count_bytes
+from ..timing import make_replay, make_runs, summarise_all, time_call, time_rounds
 
 FULL = {"faces": 5000, "objects": (16, 256, 4096), "repeats": 15}
 QUICK = {"faces": 300, "objects": (16,), "repeats": 3}
@@ -68,18 +68,12 @@ class DeviceFrames:
             self.frame.poses,
         ]
         self.launch()
-        self.graph = capture(self.launch, device) if device.is_cuda else None
+        self.replay = make_replay(self.launch, device)
 
     def launch(self):
         wp.launch(count_frame_kernel, 1, [self.time], device=self.device)
         wp.launch(drive_kernel, len(self.frame.poses), self.inputs, device=self.device)
         self.frame.launch()
-
-    def replay(self):
-        if self.graph is None:
-            self.launch()  # on all cores, which a graph of the CPU does not use
-        else:
-            wp.capture_launch(self.graph)
 
     def replay_and_read(self):
         self.replay()
@@ -141,7 +135,7 @@ def run_objects(device, model, levels, count, ladder, repeats):
     scene = scene_of_objects(device, model, grid_poses(count))
     frames = DeviceFrames(scene, levels, ladder)
     host = HostFrames(scene, frames, repeats)
-    runs = {"frame": time_graph(frames.graph, device) if device.is_cuda else time_call(frames.replay, device)}
+    runs = make_runs({"frame": frames.launch}, device)
     runs |= {"frame_read": time_call(frames.replay_and_read, device), "host": time_call(host.step, device)}
     frames.time.zero_()
     times = time_rounds(runs, repeats)

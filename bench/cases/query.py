@@ -11,11 +11,11 @@ from warp_abtree import testing
 
 from ..baselines.newton import make_newton
 from ..baselines.wp_bvh import BvhFaces, find_constructor
+from ..memory import memory_columns
 from ..roofline import COUNTERS, find_peaks, roofline
 from ..shapes import knot, pair_poses, scene_of_pairs
 from ..timing import ratio_of, summarise, summarise_all, time_call, time_in_turn, time_rounds
 from ..verify import count_differences, judge_disputed
-from .memory import memory_columns
 
 FULL = {"faces": 5000, "pairs": (1, 64, 1024, 8192), "distances": (0.9, 0.2), "repeats": 15}
 QUICK = {"faces": 300, "pairs": (1, 4), "distances": (0.2,), "repeats": 3}
@@ -64,7 +64,9 @@ def run_batch(device, model, mesh, pair_count, distance, constructor, sizes, pea
     row["hits"] = len(whole.faces)
     row |= {name: int(getattr(whole, name).sum(dtype=np.int64)) for name in COUNTERS}
     row |= {"first_s": round(first, 3), "peer": f"wp.Bvh {constructor}"}
-    newton, skipped = make_newton(*mesh, poses, len(whole.faces), device, refuse_newton(device, pair_count))
+    limit = NEWTON_PAIRS_MAX["cuda" if device.is_cuda else "cpu"]
+    refused = None if pair_count <= limit else f"more than {limit} pairs take minutes"
+    newton, skipped = make_newton(*mesh, poses, len(whole.faces), device, refused)
     launches = {"ours": query.launch, "peer": baseline.launch} | {name: other.launch for name, other in newton.items()}
     times = time_in_turn(launches, device, repeats)
     again = query.result()
@@ -111,9 +113,3 @@ def time_one_core(query, baseline, device, repeats):
         times = time_in_turn(launches, device, repeats, time.thread_time)
     ratio = ratio_of(times["peer_one_core"], times["one_core"])
     return summarise("one_core", times["one_core"]) | {"one_core_ratio": ratio}
-
-
-def refuse_newton(device, pair_count) -> str | None:
-    """Return why Newton is not asked about so many pairs, None where it is."""
-    limit = NEWTON_PAIRS_MAX["cuda" if device.is_cuda else "cpu"]
-    return None if pair_count <= limit else f"more than {limit} pairs take minutes"

@@ -9,10 +9,11 @@ import warp as wp
 import warp_abtree as ab
 
 from ..baselines.wp_bvh import BvhFaces
+from ..memory import memory_columns
+from ..meshes import knot_model
 from ..roofline import find_peaks, roofline
-from ..shapes import knot, knot_model, longest_side, pair_poses, scene_of_objects, scene_of_pairs, world_poses
+from ..shapes import longest_side, pair_poses, scene_of_pairs, scene_of_worlds, world_poses
 from ..timing import fit_slope, summarise_all, time_in_turn, upper_half
-from .memory import memory_columns
 
 SIZES = {
     "cuda": {
@@ -52,16 +53,14 @@ def run(device, quick=False, largest=None, models=None):
     timing = find_peaks(device), sizes["repeats"]
     model, rows = knot_model(sizes["pairs"]["faces"], models), []
     for count in sizes["pairs"]["counts"]:
-        rows.append(run_pairs("pairs", device, model, sizes["pairs"]["faces"], count, *timing))
+        rows.append(run_pairs("pairs", device, model, count, *timing))
         yield rows[-1]
     yield describe_slope("pairs", "pairs", rows)
-    rows = []
-    for face_target in sizes["faces"]["sizes"]:
-        if face_target > (largest or (LARGEST_CPU if device.is_cpu else face_target)):
-            continue
+    rows, limit = [], largest or (LARGEST_CPU if device.is_cpu else max(sizes["faces"]["sizes"]))
+    for face_target in [size for size in sizes["faces"]["sizes"] if size <= limit]:
         model = knot_model(face_target, models)
         for count in sizes["faces"]["pairs"]:
-            rows.append(run_pairs("faces", device, model, face_target, count, *timing))
+            rows.append(run_pairs("faces", device, model, count, *timing))
             yield rows[-1]
     for count in sizes["faces"]["pairs"]:
         yield describe_slope("faces", "faces", [row for row in rows if row["pairs"] == count]) | {"pairs": count}
@@ -89,7 +88,7 @@ def run_first(query):
     return query.run(), time.perf_counter() - begin
 
 
-def run_pairs(sweep, device, model, face_target, pair_count, peaks, repeats):
+def run_pairs(sweep, device, model, pair_count, peaks, repeats):
     """Return the row of one batch of pairs of a model, beside wp.Bvh."""
     gc.collect()  # scenes and their queries hold each other
     poses = pair_poses(pair_count, DISTANCE)
@@ -99,8 +98,9 @@ def run_pairs(sweep, device, model, face_target, pair_count, peaks, repeats):
     build = time.perf_counter() - begin
     result, first = run_first(query)
     memory = memory_columns(scene, query)
-    check_alone(scene, result)
-    vertices, faces = knot(face_target)
+    for pair in range(0, pair_count, max(1, pair_count // CHECKED)):
+        check_alone(scene, result, pairs[pair : pair + 1])
+    vertices, faces, _ = model.mesh_at(model.lod_max)
     constructor = None if len(faces) > 100_000 else "sah"  # SAH is built on the host
     baseline = BvhFaces(vertices, faces, poses, 2 * len(result.faces) + 1024, device, constructor)
     row = {"sweep": sweep, "device": device.name, "faces": model.face_count, "pairs": pair_count}
@@ -128,16 +128,19 @@ def time_query(query, others, result, repeats):
     return summarise_all(times)
 
 
-def check_alone(scene, result):
-    """Ask a few pairs by themselves.
+def check_alone(scene, result, pairs):
+    """Ask some pairs by themselves, int (p, 2).
 
     Raises:
-        RuntimeError: Their face pairs differ from those in the batch.
+        RuntimeError: Their face pairs differ from those among all others.
     """
-    for pair in range(0, len(result.pairs), max(1, len(result.pairs) // CHECKED)):
-        alone = scene.intersect(result.pairs[pair : pair + 1], output="faces").faces
-        if not np.array_equal(alone[:, 1:], result.faces[result.faces[:, 0] == pair][:, 1:]):
-            raise RuntimeError(f"pair {pair} by itself has other face pairs than in the batch")
+    alone = scene.intersect(pairs, output="faces")
+    asked = set(map(tuple, np.asarray(pairs).tolist()))
+    expected = {(*pairs[pair], a, b) for pair, a, b in alone.faces.tolist()}
+    chosen = [tuple(pair) in asked for pair in result.pairs.tolist()]
+    rows = result.faces[np.isin(result.faces[:, 0], np.flatnonzero(chosen))]
+    if {(*result.pairs[pair], a, b) for pair, a, b in rows.tolist()} != expected:
+        raise RuntimeError(f"pairs {sorted(asked)} by themselves have other face pairs than among all others")
 
 
 def run_worlds(device, model, world_count, object_count, peaks, repeats):
@@ -145,15 +148,12 @@ def run_worlds(device, model, world_count, object_count, peaks, repeats):
     gc.collect()
     poses = world_poses(world_count, object_count, longest_side(model))
     begin = time.perf_counter()
-    scene = ab.Scene(device=device)
-    for world in range(world_count):
-        for pose in poses[world]:
-            scene.add(model, pose=pose, world=world)
+    scene = scene_of_worlds(device, model, poses)
     query = ab.Query(scene, "faces")
     build = time.perf_counter() - begin
     result, first = run_first(query)
     memory = memory_columns(scene, query)
-    check_worlds(scene, model, poses, result)
+    check_worlds(scene, result, world_count, object_count)
     row = {"sweep": "worlds", "device": device.name, "faces": model.face_count, "worlds": world_count}
     row |= {"objects": scene.object_count, "pairs": len(result.pairs), "hits": len(result.faces)}
     row |= {"build_s": round(build, 3), "first_s": round(first, 3)}
@@ -162,21 +162,15 @@ def run_worlds(device, model, world_count, object_count, peaks, repeats):
     return row | memory | roofline(result, row["ours_ms"], peaks)
 
 
-def check_worlds(scene, model, poses, result):
-    """Ask all pairs of objects of a few worlds, each world in a scene of its own.
+def check_worlds(scene, result, world_count, object_count):
+    """Ask all pairs of objects of a few worlds.
 
     Raises:
         RuntimeError: Worlds mix, or a world by itself has other face pairs than among the others.
     """
-    world_count, object_count = poses.shape[:2]
     world = result.pairs // object_count
     if (world[:, 0] != world[:, 1]).any():
         raise RuntimeError("the broad phase pairs objects of different worlds")
     every = np.stack(np.triu_indices(object_count, 1), 1)
     for number in range(0, world_count, max(1, world_count // CHECKED)):
-        alone = scene_of_objects(scene.device, model, poses[number]).intersect(every, output="faces")
-        expected = np.concatenate([every[alone.faces[:, 0]], alone.faces[:, 1:]], 1)
-        rows = result.faces[np.isin(result.faces[:, 0], np.flatnonzero(world[:, 0] == number))]
-        found = np.concatenate([result.pairs[rows[:, 0]] - number * object_count, rows[:, 1:]], 1)
-        if not np.array_equal(found[np.lexsort(found.T[::-1])], expected[np.lexsort(expected.T[::-1])]):
-            raise RuntimeError(f"world {number} by itself has other face pairs than among the others")
+        check_alone(scene, result, number * object_count + every)

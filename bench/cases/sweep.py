@@ -12,11 +12,11 @@ import warp as wp
 import warp_abtree as ab
 
 from ..baselines.wp_bvh import BvhAny, find_constructor
+from ..memory import memory_columns, used_memory
 from ..meshes import real_meshes
 from ..roofline import find_peaks, roofline
 from ..shapes import knot, longest_side, random_poses, scene_of_poses
 from ..timing import summarise, summarise_all, time_call, time_in_turn, time_rounds
-from .memory import memory_columns, used_memory
 
 FULL = {"faces": 5000, "counts": (1024, 65536), "sweep_counts": (1024, 65536, 2**21), "repeats": 11}
 CPU = {"faces": 5000, "counts": (1024, 16384), "sweep_counts": (1024, 65536), "repeats": 5}

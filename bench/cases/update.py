@@ -15,10 +15,21 @@ from warp_abtree import testing
 from warp_abtree.testing import active_build, full_refit_fraction, read_bits, state_lods, upload_lods
 
 from ..baselines.wp_bvh import FaceBvh
+from ..memory import memory_columns
+from ..meshes import knot_model
 from ..roofline import find_peaks, update_roofline
-from ..shapes import knot_model
-from ..timing import WARM_UP, fit_slope, make_runs, medians, summarise, time_both, time_call, time_in_turn, time_rounds
-from .memory import memory_columns
+from ..timing import (
+    WARM_UP,
+    crossover,
+    fit_slope,
+    make_runs,
+    medians,
+    summarise,
+    summarise_all,
+    time_call,
+    time_in_turn,
+    time_rounds,
+)
 
 # Fractions of the splits between the finest LOD and the other.
 FRACTIONS = (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.5, 0.9)
@@ -104,47 +115,29 @@ def time_update(scene, there, back, launches, repeats):
     """Return columns of times [ms].
 
     update, full: device time of refinement, marking and refit, there and back: graph replays on CUDA. wall: whole calls
-    of `set_lods` as the library chooses, planning and uploads included; update_wall and full_wall as forced; stream
-    beside them: the same between events on CUDA. In turn, but each time there and back twice, of which the second
-    counts: what one kind of refit leaves in the caches is of no use to the other.
+    of `set_lods` as the library chooses, planning and uploads included. In turn, but each time there and back twice, of
+    which the second counts: what one kind of refit leaves in the caches is of no use to the other.
     """
     device = scene.device
     ways = {(kind, way): launch for kind, both in launches.items() for way, launch in enumerate(both)}
     runs = make_runs(ways, device)
-    calls = {"": None, "update_": "update", "full_": "full"}
-    times = {name: [] for name in [*REFITS, *(call + clock for call in calls for clock in ("wall", "stream"))]}
+    times = {kind: [] for kind in REFITS}
     for turn in range(WARM_UP + repeats):
         for kind in REFITS:
             taken = [[runs[kind, way]() for way in (0, 1)] for _ in range(ROUND_TRIPS)]
             times[kind] += taken[-1] if turn >= WARM_UP else []
     upload_lods(scene)
-    for turn in range(WARM_UP + repeats):
-        for call, kind in calls.items():
-            with testing.force_refits(None if kind is None else REFITS[kind]):
-                taken = [
-                    time_both(lambda lods=lods: scene.set_lods(lods), device)
-                    for _ in range(ROUND_TRIPS)
-                    for lods in (there, back)
-                ]
-            for i, clock in enumerate(("wall", "stream")):
-                times[call + clock] += [both[i] for both in taken[-2:]] if turn >= WARM_UP else []
-    row = {}
-    for name, values in times.items():
-        if device.is_cuda or not name.endswith("stream"):
-            row |= summarise(name, values)
-    row["ratio"] = round(row["full_ms"] / row["update_ms"], 2)
-    return row
+    calls = {"there": lambda: scene.set_lods(there), "back": lambda: scene.set_lods(back)}
+    walls = time_rounds({way: time_call(call, device) for way, call in calls.items()}, repeats)
+    row = summarise_all(times | {"wall": walls["there"] + walls["back"]})
+    return row | {"ratio": round(row["full_ms"] / row["update_ms"], 2)}
 
 
 def find_crossover(rows, column):
-    """Return the value of a column where an update starts to cost as much as a full refit, None if it never does."""
+    """Return the value of a column where an update starts to cost as much as a full refit: the least if it always does,
+    None if it never does."""
     x = [row[column] for row in rows]
-    excess = [math.log(row["update_ms"] / row["full_ms"]) for row in rows]
-    for i in range(len(rows) - 1, 0, -1):
-        if excess[i - 1] < 0 <= excess[i]:
-            part = -excess[i - 1] / (excess[i] - excess[i - 1])
-            return round(math.exp(math.log(x[i - 1]) * (1 - part) + math.log(x[i]) * part))
-    return x[0] if excess[0] >= 0 else None
+    return crossover(x, [math.log(row["update_ms"] / row["full_ms"]) for row in rows], x[0])
 
 
 def run_mesh(device, model, sizes, peaks):
@@ -169,14 +162,14 @@ def run_mesh(device, model, sizes, peaks):
         yield row
     vertices, faces, _ = model.mesh_at(finest)
     host = time_rounds({"build": time_call(lambda: active_build(vertices, faces))}, 3)
-    crossover = find_crossover(rows, "k")
+    k, entries = (find_crossover(rows, column) for column in ("k", "entries"))
     yield {
         "device": device.name,
         "case": "crossover",
         "faces": model.face_count,
-        "crossover_k": crossover,
-        "crossover_share": crossover and round(crossover / model.face_count, 4),
-        "crossover_entries": find_crossover(rows, "entries"),
+        "crossover_k": k and round(k),
+        "crossover_share": k and round(k / model.face_count, 4),
+        "crossover_entries": entries and round(entries),
         "full_share": full_refit_fraction(device),
         "slope": fit_slope([row["k"] for row in rows], [row["update_ms"] for row in rows]),
         "host_build_ms": round(medians(host)["build"], 2),

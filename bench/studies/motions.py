@@ -8,19 +8,12 @@ import numpy as np
 
 import warp_abtree as ab
 
-from ..shapes import centre_and_radius, random_directions, scene_of_poses
+from ..shapes import centre_and_radius, random_directions, rotation_matrices, scene_of_poses
 
 SCAN_STEPS = 256
 BISECTIONS = 32
 POSES_AT_A_TIME = 4096
 FAR = 1e3  # radii away: where poses that nobody asked for are put
-
-
-def rotate(quaternions, point):
-    """Return a point rotated by unit quaternions (n, 4) x y z w."""
-    u, w = quaternions[:, :3], quaternions[:, 3:]
-    cross = np.cross(u, point)
-    return point + 2 * (w * cross + np.cross(u, cross))
 
 
 class Motions:
@@ -41,10 +34,6 @@ class Motions:
     def __len__(self):
         return len(self.away)
 
-    def keep(self, chosen):
-        """Keep some of the motions."""
-        self.away, self.rotations = self.away[chosen], self.rotations[chosen]
-
     def poses(self, along, which=None):
         """Return poses of B in A's frame, float64 (n, 7), its centre a distance from A's.
 
@@ -53,9 +42,9 @@ class Motions:
             which: Motions, (n,); None is all in turn.
         """
         which = np.arange(len(self)) if which is None else which
-        turns = self.rotations[which]
-        place = self.centre_a + np.asarray(along)[:, None] * self.away[which] - rotate(turns, self.centre_b)
-        return np.concatenate([place, turns], 1)
+        centre_b = rotation_matrices(self.rotations[which]) @ self.centre_b
+        place = self.centre_a + np.asarray(along)[:, None] * self.away[which] - centre_b
+        return np.concatenate([place, self.rotations[which]], 1)
 
 
 def find_first_contact(intersects, motions, steps=SCAN_STEPS, bisections=BISECTIONS):

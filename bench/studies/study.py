@@ -4,14 +4,13 @@ A study is a package with PARTS, functions that yield rows, and SUMMARIES, funct
 use. It writes DIR/STUDY.json after each part, and in the end STUDY.md and figures, laid out in STUDY.toml.
 """
 
-import argparse
-import functools
 import importlib
 import json
 import platform
 import shlex
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import warp as wp
@@ -19,7 +18,7 @@ import warp as wp
 import warp_abtree as ab
 
 from .. import tables, timing
-from ..__main__ import STUDIES, Parser, describe_run
+from ..__main__ import STUDIES, describe_run
 from ..meshes import ModelFolder
 
 
@@ -73,19 +72,9 @@ class Context:
         for name, launch in launches.items():
             launch()
             graph = timing.capture(launch, self.device)
-            replay = functools.partial(wp.capture_launch, graph)
+            replay = partial(wp.capture_launch, graph)
             runs[name] = timing.time_graph(graph, self.device) if self.device.is_cuda else timed(replay)
         return timing.medians(timing.time_rounds(runs, repeats or self.size(21, 5)))
-
-    def time_alone(self, launches: dict) -> dict:
-        """Return the median time [ms] of launches that a graph of the CPU cannot hold, by name, in turn.
-
-        As `time_graphs`, but on the CPU called as they are: comparable with it but for some microseconds a launch.
-        """
-        if self.device.is_cuda:
-            return self.time_graphs(launches)
-        runs = {name: timed(launch) for name, launch in launches.items()}
-        return timing.medians(timing.time_rounds(runs, self.size(21, 5)))
 
     def time_launches(self, launches, repeats=None, on_core=False) -> dict:
         """Return the median time [ms] of launches by name, in turn: on CUDA of graph replays.
@@ -110,72 +99,62 @@ def timed(call):
     return timing.time_call(call, "cpu", time.thread_time)
 
 
-def describe_device(device) -> str:
-    """Return what a device calls itself."""
-    if device.is_cuda:
-        return device.name
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        name = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        name = platform.processor() or platform.machine()
-    return f"{name}, {timing.core_count()} cores"
-
-
 def find_study(name):
     """Return the package of a study."""
     return importlib.import_module(f"{__package__}.{name}")
 
 
-def run_part(run, context, command) -> dict:
+def run_part(run, context) -> dict:
     """Run a part; return its rows, notes and the circumstances."""
     begin = time.perf_counter()
     rows = [{key: tables.plain(value) for key, value in row.items()} for row in run(context)]
-    about = {"device": describe_device(context.device), "quick": context.quick, **describe_run(), "command": command}
+    device = context.device.name if context.device.is_cuda else f"{platform.processor()}, {timing.core_count()} cores"
+    about = {"device": device, "quick": context.quick, **describe_run()}
+    about |= {"command": shlex.join(["python", "-m", "bench", *sys.argv[1:]])}
     about["seconds"] = tables.plain(time.perf_counter() - begin)
     return {"run": about, "notes": context.notes, "rows": rows}
 
 
-def run_study(name, options, command):
-    """Run the parts of a study and write what they found."""
-    file = options.out / f"{name}.json"
+def run_study(name, out, only, make_context):
+    """Run the parts of a study, or some of them, and write what they found."""
+    file = out / f"{name}.json"
     study = {"study": name, "parts": {}}
-    if options.only and file.is_file():
+    if only and file.is_file():
         study = json.loads(file.read_text(encoding="utf-8"))
-    models = ModelFolder(options.models or options.out / "models")
-    for part, run in find_study(name).PARTS.items():
-        if options.only and part not in options.only:
+    for part, run_rows in find_study(name).PARTS.items():
+        if only and part not in only:
             continue
         print(f"{name}: {part}", file=sys.stderr, flush=True)
-        study["parts"][part] = run_part(run, Context(options.device, options.quick, models), command)
+        study["parts"][part] = run_part(run_rows, make_context())
         tables.write_json(file, study)
-    (options.out / f"{name}.md").write_text(tables.study_page(study), encoding="utf-8")
+    (out / f"{name}.md").write_text(tables.study_page(study), encoding="utf-8")
     figures = tables.read_layout(f"studies/{name}.toml")["figure"]
-    print(tables.draw(figures, functools.partial(tables.select_rows, study=study), options.out))
+    print(tables.draw(figures, partial(tables.select_rows, study=study), out))
     print(f"wrote {file} and {name}.md")
 
 
-def main(argv) -> int:
-    """Run `python -m bench paper|tradeoff|all`."""
-    parser = Parser(prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("name", choices=STUDIES)
-    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="where to write")
-    parser.add_argument("--device", default=None, help='Warp device; by default the first GPU, else "cpu"')
-    parser.add_argument("--quick", action="store_true", help="the smallest sizes: under two minutes on two cores")
-    parser.add_argument("--models", type=Path, metavar="DIR", help="keep built models there (OUT/models)")
-    parser.add_argument("--only", nargs="+", metavar="PART", help="run these parts alone; others are kept from before")
-    options = parser.parse_args(argv)
+class StudyError(ValueError):
+    """What was asked for is not there."""
+
+
+def run(device, name, out, quick=False, models=None, only=None):
+    """Run a study, or all of them.
+
+    Raises:
+        StudyError: There is no such part, device or folder.
+    """
     wp.config.log_level = wp.LOG_WARNING
-    names = STUDIES[:-1] if options.name == "all" else (options.name,)
+    names = STUDIES[:-1] if name == "all" else (name,)
     parts = [part for name in names for part in find_study(name).PARTS]
-    unknown = set(options.only or ()) - set(parts)
+    unknown = set(only or ()) - set(parts)
     if unknown:
-        parser.error(f"no part {', '.join(sorted(unknown))}; there are {', '.join(parts)}")
+        raise StudyError(f"no part {', '.join(sorted(unknown))}; there are {', '.join(parts)}")
     try:
-        ab.Scene(options.device)
-        options.out.mkdir(parents=True, exist_ok=True)
+        ab.Scene(device)
+        out = Path(out)
+        out.mkdir(parents=True, exist_ok=True)
     except (ValueError, OSError) as error:
-        parser.error(str(error))
+        raise StudyError(str(error)) from error
+    folder = ModelFolder(models or out / "models")
     for name in names:
-        run_study(name, options, shlex.join(["python", "-m", "bench", *argv]))
-    return 0
+        run_study(name, out, only, partial(Context, device, quick, folder))

@@ -1,9 +1,7 @@
 """Exact signs of determinants known to be small, in 128-bit integers that wrap: most often those that are 0.
 
-A row of differences is whole multiples of a power of two, the lowest bit set in any number of it, so the determinant is
-a whole multiple of the product G of its rows' powers. Computed modulo 2^128 it is right to the bit once it is known to
-lie within 2^126 G. Double words leave a sign open only where it lies within 2^-98 P, P its sum of magnitudes, so that
-is so wherever P < 2^223 G: unless coordinates of a row differ in magnitude by some 2^19.
+A determinant is a whole multiple of G, the product over its rows of the lowest bit set in any number of a row. Computed
+modulo 2^128 it is right to the bit once it is known to lie within 2^126 G; docs/exactness.md says where that is so.
 """
 
 import warp as wp
@@ -16,10 +14,8 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 @wp.func_native(native.body("int128.h", "integer_orient3d"))
 def integer_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, bound: wp.float64) -> wp.int32:
     """Return the sign of det(a - d, b - d, c - d), within 4 times a bound, or UNCERTAIN where 128 bits are too few."""
-    ...
 
 
 @wp.func_native(native.body("int128.h", "integer_orient2d"))
 def integer_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, bound: wp.float64) -> wp.int32:
     """Return the sign of det(a - c, b - c), within 4 times a bound, or UNCERTAIN where 128 bits are too few."""
-    ...

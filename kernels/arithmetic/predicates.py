@@ -1,12 +1,9 @@
 """Orientation signs: a float64 determinant with a proven error bound; where it leaves the sign open, the same in double
 words, then in wrapping integers, and at last expansions.
 
-Bounds. With e = 2^-53 and no overflow, the determinants below err by at most (8 + 128 e) e P in 3D, with fused
-multiply-add by name, and (3 + 16 e) e P in 2D, P the same sum with every product and difference of products replaced by
-the sum of magnitudes, computed in the same arithmetic (docs/exactness.md, after Shewchuk 1997, sections 4.3 and 4.4).
-Underflow: coordinates are 0 or at least 2^-290, hence
-differences are multiples of 2^-342 and products of three of 2^-1026: what falls below float64's normal range lies on
-its grid of 2^-1074 and is not rounded at all. So P is 0 only where every product has a factor 0, and the sign is 0.
+With e = 2^-53 the determinants below err by at most (8 + 128 e) e P in 3D and (3 + 16 e) e P in 2D, P the same sum with
+every product and difference of products replaced by the sum of magnitudes, computed in the same arithmetic. Coordinates
+are 0 or at least 2^-290, so underflow rounds nothing, and where P is 0 the sign is 0. docs/exactness.md has the proofs.
 """
 
 from typing import Any

@@ -130,7 +130,6 @@ def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_in
 @wp.func_native(native.body("numbers.cuh", "no_vector"))
 def no_vector() -> wp.vec3d:
     """Return three NaNs of the bits 0x7ff8000000000000 on every device."""
-    ...
 
 
 @wp.kernel

@@ -230,11 +230,9 @@ def relax_kernel(
     stage = relaxation.stage
     start = wp.lower_bound(color, 0, room, relaxation.first_color)
     end = wp.lower_bound(color, 0, room, relaxation.last_color + 1)
-    round = wp.int32(0)
-    while round < relaxation.rounds:
+    for round in range(relaxation.rounds):
         backward = wp.where(stage == VELOCITY, (relaxation.backward + round) % 2, 0)
-        turn = wp.tid()
-        while turn < end - start:
+        for turn in range(wp.tid(), end - start, relaxation.threads):
             p = order[wp.where(backward != 0, end - 1 - turn, start + turn)]
             if stage == RESTITUTION:
                 apply_restitution(manifolds, constraints_inout, bodies_inout, pairs[p], p)
@@ -248,5 +246,3 @@ def relax_kernel(
                         relax_velocity(constraints_inout, bodies_inout, c)
                     else:
                         relax_position(constraints_inout, bodies_inout, c)
-            turn += relaxation.threads
-        round += 1

@@ -54,25 +54,21 @@ balance_code = functools.partial(native.body, "load_balance.cuh")
 @wp.func_native(balance_code("take_unit"))
 def take_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
     """Return the number of a unit of work that no other warp has; from the number of units on there is none."""
-    ...
 
 
 @wp.func_native(balance_code("load_tickets"))
 def load_tickets(counter: wp.array(dtype=wp.int32)) -> wp.int64:
     """Return the tickets taken and, in the low half, those served, to be subtracted when they have arrived."""
-    ...
 
 
 @wp.func_native(balance_code("count_idle"))
 def count_idle(tickets: wp.int64) -> wp.int32:
     """Return about how many warps wait for a donation."""
-    ...
 
 
 @wp.func_native(balance_code("await_donation"))
 def await_donation(counter: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32)) -> wp.int32:
     """Wait for a donation; return its slot, or -1 when all work is done."""
-    ...
 
 
 @wp.func_native(balance_code("free_slot"))
@@ -82,19 +78,16 @@ def free_slot(flag: wp.array(dtype=wp.int32), slot: wp.int32): ...
 @wp.func_native(balance_code("claim_slot"))
 def claim_slot(counter: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32)) -> wp.int32:
     """Return the next ticket to serve, its slot free."""
-    ...
 
 
 @wp.func_native(balance_code("fill_slot"))
 def fill_slot(flag: wp.array(dtype=wp.int32), ticket: wp.int32):
     """Hand over what this warp has put into the slot of a ticket."""
-    ...
 
 
 @wp.func_native(balance_code("end_unit"))
 def end_unit(counter: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32)):
     """End a unit or a donation; the last one terminates all warps that wait."""
-    ...
 
 
 @wp.func

@@ -43,7 +43,6 @@ def item_second(item: wp.int64) -> wp.int32: ...
 @wp.func_native(native.body("numbers.cuh", "children_of"))
 def children_of(node: wp.int32) -> wp.int32:
     """Return the half of an item that names both children of a node."""
-    ...
 
 
 @wp.func

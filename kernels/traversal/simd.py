@@ -51,7 +51,6 @@ def descend(
 
     Returns the items left on the stack, the leaf pairs that wait, and the pairs of boxes compared.
     """
-    ...
 
 
 @wp.func_native(native.body("simd_float32_filter.h", "simd_float32_filter"))
@@ -72,7 +71,6 @@ def simd_float32_filter(
 
     Returns how many met, which stand in front of the list then, how many are uncertain, and how many were tested.
     """
-    ...
 
 
 @wp.func_native(native.body("simd_float64_filter.h", "simd_float64_filter"))
@@ -93,7 +91,6 @@ def simd_float64_filter(
     Returns how many have met then, how many are inexact, which stand in front of their list then, and how many were
     tested.
     """
-    ...
 
 
 @wp.func

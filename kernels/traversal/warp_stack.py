@@ -38,7 +38,6 @@ def warp_stack() -> wp.uint64:
 
     Its stack, its leaf pairs, those that straddle each other's planes, and the signs of these, half an item each.
     """
-    ...
 
 
 @wp.func_native(stack_code("read_item"))
@@ -57,43 +56,36 @@ def push_children(
 
     Returns both ends as an item, that of the leaf pairs first.
     """
-    ...
 
 
 @wp.func_native(stack_code("hold_uniform"))
 def hold_uniform(x: wp.int32) -> wp.int32:
     """Return a number that is the same in all lanes, so that it is held and not computed again where it is used."""
-    ...
 
 
 @wp.func_native(stack_code("push_straddling"))
 def push_straddling(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, signs: wp.int32) -> wp.int32:
     """Append the leaf pairs whose flag is set, with their signs, to the straddling pairs; return the new end."""
-    ...
 
 
 @wp.func_native(stack_code("read_signs"))
 def read_signs(items: wp.uint64, i: wp.int32) -> wp.int32:
     """Return the signs of the i-th straddling pair."""
-    ...
 
 
 @wp.func_native(stack_code("signed_pairs"))
 def signed_pairs() -> wp.uint64:
     """Return where this warp holds face pairs with their signs, an address in shared memory on CUDA."""
-    ...
 
 
 @wp.func_native(stack_code("push_signed_pair"))
 def push_signed_pair(list: wp.uint64, end: wp.int32, flag: bool, item: wp.vec3i, signs: wp.int32) -> wp.int32:
     """Append the face pairs whose flag is set, with their signs, to a list; return the new end."""
-    ...
 
 
 @wp.func_native(stack_code("read_signed_pair"))
 def read_signed_pair(list: wp.uint64, i: wp.int32) -> wp.vec4i:
     """Return the i-th face pair of a list, and its signs."""
-    ...
 
 
 @wp.func_native(vote_code("warp_any"))
@@ -107,22 +99,18 @@ def lowest_bit(bits: wp.int32) -> wp.int32: ...
 @wp.func_native(vote_code("reserve_slot"))
 def reserve_slot(total: wp.array(dtype=wp.int32), flag: bool) -> wp.int32:
     """Count the set flags into total[0] with one atomic a warp; return the slot of each lane whose flag is set."""
-    ...
 
 
 @wp.func_native(vote_code("take_slots"))
 def take_slots(total: wp.array(dtype=wp.int32), count: wp.int32) -> wp.int32:
     """Count more into total[0] and return what it was; on the CPU, Warp's own atomics race with other threads."""
-    ...
 
 
 @wp.func_native(vote_code("add_warp_sum"))
 def add_warp_sum(totals: wp.array(dtype=wp.int64), i: wp.int32, x: wp.int32):
     """Add a value of every lane to totals[i] with one atomic a warp."""
-    ...
 
 
 @wp.func_native(vote_code("count_flags"))
 def count_flags(totals: wp.array(dtype=wp.int64), i: wp.int32, flag: bool):
     """Count the set flags into totals[i], i >= 0 of each lane, with one atomic for those that share it."""
-    ...

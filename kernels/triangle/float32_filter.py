@@ -3,11 +3,9 @@
 It comes in two parts: planes separate most face pairs; only of those that straddle both planes, edges are compared.
 Source: as `intersect_triangles`.
 
-Coordinates are about A's centre, scaled to about unit size, each off the exact one by less than half of `error`, so
-that differences of corners are off by less than `error`. With |x| the sum of a vector's magnitudes, that moves a
-determinant of rows u, v, w by at most error (|u||v| + |v||w| + |w||u|), where rows are taken 2 error longer for the
-terms of higher order. Its own arithmetic, u . (v x w), adds eight roundings: 8 2^-24 |u||v||w| to first order, for
-which `unit` is 9 2^-24. docs/exactness.md has the terms. With error and unit 0 every sign is the computed one.
+Coordinates are about A's centre, scaled to about unit size; differences of corners are off by less than `error`, and
+the arithmetic of a determinant by `unit` of its size. docs/exactness.md proves the bound. With both 0 every sign is the
+computed one.
 
 `simd.simd_float32_filter` is the same for 16 pairs at a time: what changes here changes there, and tests compare them.
 
@@ -55,7 +53,6 @@ def sum_sizes(v: wp.vec3):
 @wp.func_native(native.body("numbers.cuh", "largest"))
 def largest(x: wp.float32, y: wp.float32, z: wp.float32) -> wp.float32:
     """Return the largest of three; on the CPU without the branches that `wp.max` has for NaN, which may pass by."""
-    ...
 
 
 @wp.func
@@ -84,13 +81,11 @@ def heights_over_plane(
 @wp.func_native(native.body("numbers.cuh", "one_sided"))
 def one_sided(x: wp.vec3, bound: wp.float32) -> wp.int32:
     """Return a negative number where three numbers that err by at most a bound have the same sign, not 0."""
-    ...
 
 
 @wp.func_native(native.body("numbers.cuh", "add_signs"))
 def add_signs(signs: wp.int32, x: wp.vec3, bound: wp.float32) -> wp.int32:
     """Return signs with those of three more numbers after them."""
-    ...
 
 
 @wp.func

@@ -41,11 +41,7 @@ def mark_path(leaf: wp.int32, state: wp.int32, states: StatePool, plan: UpdateLi
 def mark_path_kernel(step: wp.int32, models: ModelPool, states_inout: StatePool, plan_inout: UpdateLists):
     """Walk from the leaf of each affected face to the root and mark what no earlier walk has marked.
 
-    Whoever marks a node first appends (state, node) to the worklist of its level, so a batch costs O(k (log n - log k
-    + 2)).
-
-    Args:
-        step: Threads of this launch.
+    Whoever marks a node first appends (state, node) to the worklist of its level: O(k (log n - log k + 2)) a batch.
     Source: Liu et al. 2006, section 3.2.2 and Algorithm 2. As printed it returns from the whole operation at the
         first removed leaf with an inactive sibling and leaves one with an active sibling untouched; its text says
         what is meant: a node is inactive iff no active primitive lies under it, and boxes are smallest. So removed,

@@ -44,9 +44,6 @@ def refine_slice_kernel(step: wp.int32, models: ModelPool, plan: UpdateLists, st
     """Refine every face that the slices of partial updates list.
 
     A slice may list a face twice; both threads write the same corners, whichever old ones they read.
-
-    Args:
-        step: Threads of this launch.
     """
     updates = list_length(plan.partial_total)
     entries = item_count(plan.partial_total)
@@ -62,11 +59,7 @@ def refine_slice_kernel(step: wp.int32, models: ModelPool, plan: UpdateLists, st
 
 @wp.kernel
 def refine_all_kernel(step: wp.int32, models: ModelPool, states_inout: StatePool, plan_inout: UpdateLists):
-    """Refine every face of the states under full update and count those that change.
-
-    Args:
-        step: Threads of this launch.
-    """
+    """Refine every face of the states under full update and count those that change."""
     updates = list_length(plan_inout.full_total)
     faces = item_count(plan_inout.full_total)
     item = wp.tid()

@@ -92,11 +92,7 @@ def refit_level(
 
 @wp.kernel
 def refit_level_kernel(step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdateLists, states_inout: StatePool):
-    """Refit what an update asks for on one level.
-
-    Args:
-        step: Threads of this launch.
-    """
+    """Refit what an update asks for on one level."""
     refit_level(wp.tid(), step, level, models, plan, states_inout)
 
 
@@ -110,11 +106,7 @@ def block_sync(): ...
 
 @wp.kernel
 def refit_top_kernel(step: wp.int32, levels: wp.int32, models: ModelPool, plan: UpdateLists, states_inout: StatePool):
-    """Refit what an update asks for on so many levels from the root on, deepest first: one block for all of them.
-
-    Args:
-        step: Threads of this launch, which are one block.
-    """
+    """Refit what an update asks for on so many levels from the root on, deepest first: one block for all of them."""
     level = levels - 1
     while level >= 0:
         refit_level(wp.tid(), step, level, models, plan, states_inout)
@@ -129,11 +121,7 @@ def copy_node_kernel(
     target_state: wp.array(dtype=wp.int32),
     states_inout: StatePool,
 ):
-    """Copy the nodes of whole states.
-
-    Args:
-        node_end: Running total of node counts, shape [copy_count].
-    """
+    """Copy the nodes of whole states, given the running total of their counts."""
     tid = wp.tid()
     u = wp.lower_bound(node_end, tid + 1)
     begin = wp.int32(0)
@@ -152,11 +140,7 @@ def copy_face_kernel(
     target_state: wp.array(dtype=wp.int32),
     states_inout: StatePool,
 ):
-    """Copy the face corners of whole states.
-
-    Args:
-        face_end: Running total of face counts, shape [copy_count].
-    """
+    """Copy the face corners of whole states, given the running total of their counts."""
     tid = wp.tid()
     u = wp.lower_bound(face_end, tid + 1)
     begin = wp.int32(0)

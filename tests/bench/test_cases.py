@@ -1,52 +1,25 @@
-"""Benchmarks at their smallest sizes: rows make sense, and the checks catch wrong answers. No time is judged."""
+"""Benchmarks at their smallest sizes, through the command: rows make sense. No time is judged."""
 
-import functools
 import json
 import math
 
-import numpy as np
 import pytest
 import warp as wp
-from helpers.samples import sample
 
-import warp_abtree as ab
 from bench import __main__ as main
 from bench.baselines.newton import SDF_RESOLUTION
-from bench.cases import baselines, budget, build, exact, frame, memory, precision, query, scale, scaling, sweep, update
+from bench.cases import budget, build, scaling
 from warp_abtree import testing
 
 pytestmark = pytest.mark.slow
+MORE = {"scaling": ["--devices", "{0},{0}"], "exact": ["--processes", "1"]}
 
 
-def run_case(case, device, **options):
-    """Return the rows of a case, every number in them finite and no time or size negative."""
-    rows = list(case.run(device, **options))
-    assert rows
-    for row in rows:
-        for key, value in row.items():
-            if isinstance(value, float):
-                assert math.isfinite(value), (key, row)
-            if value is not None and key.endswith(("_ms", "_s", "_mib", "bytes")) and not key.startswith("host"):
-                assert value >= 0, (key, row)
-        for key in [key for key in row if key.endswith("_p95_ms")]:
-            assert row[key] >= row[key.replace("_p95", "")] > 0
-    return rows
+def rows_of(rows, **where):
+    return [row for row in rows if all(row.get(key) == value for key, value in where.items())]
 
 
-def rows_of(rows, key, value):
-    return [row for row in rows if row.get(key) == value]
-
-
-@pytest.fixture(autouse=True)
-def no_real_meshes(monkeypatch):
-    monkeypatch.delenv("ABTREE_MESHES", raising=False)
-
-
-# --- cases -----------------------------------------------------------------------------------------------------------
-
-
-def test_query(device):
-    rows = run_case(query, device, quick=True)
+def check_query(rows):
     assert [row["pairs"] for row in rows] == [1, 4]
     for row in rows:
         assert row["triangle_tests"] >= row["hits"] > 0 and row["node_tests"] > row["triangle_tests"]
@@ -54,204 +27,129 @@ def test_query(device):
         assert row["ratio"] == pytest.approx(row["peer_ms"] / row["ours_ms"], rel=0.2, abs=0.02)
         assert row["bytes"] >= 32 * row["node_tests"] + 120 * row["triangle_tests"] + 12 * row["hits"]
         assert row["node_tests_per_s"] == pytest.approx(1e3 * row["node_tests"] / row["ours_ms"], rel=0.01)
-        if "floor_ms" in row:
-            shares = [row[f"{name}_share"] for name in ("memory", "float32", "float64")]
-            assert max(shares) == pytest.approx(row["floor_ms"] / row["ours_ms"], rel=0.02)
         for name in ("newton_bvh", f"newton_sdf{SDF_RESOLUTION}"):
             assert (f"{name}_ms" in row) != (f"{name}_skipped" in row), "a baseline runs or is named as skipped"
 
 
-def test_update(device):
-    rows = run_case(update, device, quick=True)
-    one = rows_of(rows, "case", "one state")
+def check_update(rows):
+    one = rows_of(rows, case="one state")
     faces = sorted({row["faces"] for row in one})
-    assert len(faces) == 2 and len(rows_of(rows, "case", "crossover")) == 2
+    assert len(faces) == 2 and len(rows_of(rows, case="crossover")) == 2
     for n in faces:
-        k = [row["k"] for row in one if row["faces"] == n]
+        k = [row["k"] for row in rows_of(one, faces=n)]
         assert 0 < k[0] <= k[1] < k[2] <= n
     for row in one:
         assert row["k"] <= row["nodes_refitted"] <= row["bound"] and row["entries"] >= row["k"]
-        assert row["full"] == (row["entries"] > update.full_refit_fraction(wp.get_device(device)) * row["faces"])
-        assert row["bvh_build_ms"] > 0 and row["wall_ms"] > 0 and row["arrays_mib"] > 0
+        share = testing.current_regime().full_refit["cpu" if row["device"] == "CPU" else "cuda"]
+        assert row["full"] == (row["entries"] > share * row["faces"]) and row["arrays_mib"] > 0
         assert row["nodes_per_s"] == pytest.approx(1e3 * row["nodes_refitted"] / row["update_ms"], rel=0.01)
-    many = rows_of(rows, "case", "many states")
-    assert [row["states"] for row in many] == [1, 12]
-    assert many[1]["k"] > many[0]["k"] and many[1]["nodes_refitted"] > 10 * many[0]["nodes_refitted"]
+    many = rows_of(rows, case="many states")
+    assert [row["states"] for row in many] == [1, 12] and many[1]["nodes_refitted"] > 10 * many[0]["nodes_refitted"]
     assert testing.current_regime().full_refit == {"cpu": 0.5, "cuda": 0.01}, "what was forced is put back"
 
 
-def test_update_leaves_large_meshes_out(device):
-    rows = run_case(update, device, quick=True, largest=300)
-    assert {row["faces"] for row in rows_of(rows, "case", "one state")} == {168}
-
-
-def test_scale(device, tmp_path):
-    rows = run_case(scale, device, quick=True, models=tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["knot-200.npz", "knot-600.npz"]
-    pairs, meshes, worlds = (rows_of(rows, "sweep", name) for name in ("pairs", "faces", "worlds"))
+def check_scale(rows):
+    pairs, meshes, worlds = (rows_of(rows, sweep=name) for name in ("pairs", "faces", "worlds"))
     assert [row["pairs"] for row in pairs] == [1, 4, 16]
-    assert [row["hits"] for row in pairs] == sorted(row["hits"] for row in pairs)
     assert [(row["faces"], row["pairs"]) for row in meshes] == [(168, 1), (168, 3), (576, 1), (576, 3)]
     grown = 2**20 * (meshes[2]["arrays_mib"] - meshes[0]["arrays_mib"]) / (576 - 168)
     assert 180 < grown < 300, "bytes a face, of the model and its state"
     assert [(row["worlds"], row["objects"]) for row in worlds] == [(1, 4), (8, 32)]
     assert all(row["pairs"] <= 6 * row["worlds"] for row in worlds) and worlds[1]["hits"] > worlds[0]["hits"]
-    for row in [*pairs, *meshes, *worlds]:
-        assert row["bytes"] >= 32 * row["node_tests_per_s"] * 1e-3 * row["ours_ms"] * 0.99 > 0
     slopes = [row for row in rows if row["sweep"].endswith("slope")]
-    assert len(slopes) == 4 and all(row["ours_ms_slope"] is not None for row in slopes)
-    assert all(0 < row["arrays_mib_slope"] <= 1.05 for row in slopes), "memory grows, and no faster than what is asked"
+    assert len(slopes) == 4 and all(0 < row["arrays_mib_slope"] <= 1.05 for row in slopes)
 
 
-def test_other_cases(device):
-    rows = run_case(memory, device, quick=True)
-    assert [row["objects"] for row in rows] == [2, 32] and rows[1]["states"] == 16
-    assert all(row["hits"] > 0 for row in run_case(precision, device, quick=True)[-2:])
-    rows = run_case(sweep, device, quick=True)
+def check_sweep(rows):
     assert [(row["case"], row["poses"]) for row in rows] == [("launch", 16), ("sweep", 16), ("sweep", 40)]
-    assert all(0 < row["meet"] < 1 for row in rows)
-    assert rows[0]["peer_missed"] == rows[0]["peer_invented"] == 0 and rows[0]["node_tests_per_s"] > 0
-    rows = run_case(frame, device, quick=True)
+    assert all(0 < row["meet"] < 1 for row in rows) and rows[0]["peer_missed"] == rows[0]["peer_invented"] == 0
+
+
+def check_frame(rows):
     assert [row["ladder"] for row in rows] == [False, True] and rows[0]["hits"] == rows[1]["hits"] > 0
-    rows = run_case(exact, device, count=110, processes=1)
-    assert all(row["disagreements"] == 0 for row in rows)
+
+
+def check_precision(rows):
+    assert all(row["hits"] > 0 for row in rows[-2:]) and rows[-1]["to_float64"] == 1
+
+
+def check_exact(rows):
+    assert len(rows) == 12 and all(row["disagreements"] == 0 for row in rows)
     assert sum(row["pairs"] for row in rows) > 110 and any(row["float32_errors"] > 0 for row in rows)
 
 
-def test_baselines(device):
-    pytest.importorskip("fcl")
-    *rows, cores = run_case(baselines, device, quick=True)
-    ran = [row for row in rows if "skipped" not in row]
-    assert {row["peer"] for row in rows} == {"fcl-c++", "python-fcl", "trimesh", "coal"} and ran
-    assert cores["cores"] >= 1 and cores["faces_ratio"] > 0
-    for row in ran:
-        assert row["meet"] == 3 and row["faces_missed"] == row["faces_invented"] == row["ours_wrong"] == 0
+def check_baselines(rows):
+    assert {row["peer"] for row in rows} == {"fcl-c++", "python-fcl", "trimesh"}
+    for row in rows:
+        answered = "skipped" in row or row["faces_missed"] == row["faces_invented"] == row["ours_wrong"] == 0
+        assert row["meet"] == 3 and row["ours_any_per_s"] > 0 and answered
 
 
-def test_build(device, tmp_path):
-    *rows, slopes = run_case(build, device, quick=True, models=tmp_path)
-    assert [row["faces"] for row in rows] == [168, 576]
+def check_build(rows):
+    *rows, slopes = rows
+    assert [row["faces"] for row in rows] == [168, 576] and slopes["build_ms_slope"] is not None
     for row in rows:
         assert row["tightness"] >= 1 and row["lod_max"] > row["faces"] / 3
         stages = sum(row[f"{name}_ms"] for name in ("collapse", "error", "tree"))
         assert stages == pytest.approx(row["build_ms"], rel=0.5) and row["error_ms"] > 0
         assert (build.BASELINE + "_ms" in row) != (build.BASELINE + "_skipped" in row)
-        assert ab.Model.open(tmp_path / f"knot-{200 if row['faces'] == 168 else 600}.npz").face_count == row["faces"]
-        assert 60 < row["model_bytes_a_face"] < 150 and row["file_mib"] > 0 and row["peak_mib"] is None
-    assert slopes["build_ms_slope"] is not None
+        assert 60 < row["model_bytes_a_face"] < 150 and row["file_mib"] > 0
 
 
-def test_budget(device, monkeypatch, tmp_path):
-    monkeypatch.setattr(budget, "QUICK", {"frames": 63, "step": 6, "probe": 12, "selected": 200})
-    monkeypatch.setattr(budget, "QUICK_OBJECTS", 12)
-    monkeypatch.setattr(budget, "SCALES", {"cpu": (1,), "cuda": (1,)})
-    coarse = [("256", "64"), ("128", "32"), ("96", "24"), ("80", "20"), ("64]", "16]"), ("64\n", "16\n")]
-    monkeypatch.setattr(
-        budget, "scale_sections", lambda text, _: functools.reduce(lambda t, c: t.replace(*c), coarse, text)
-    )
-    select, *rows = budget.run(device, quick=True, plots=tmp_path)
-    assert select["case"] == "select" and select["objects"] == 200
-    assert all(select[f"{name}_ms"] > 0 for name in ("view", "paper", "tolerance", "predictive"))
-    cases = (("probe", (None,)), ("hold", budget.CONTROLLERS), ("step", ("none", "predictive", "paper")))
-    expected = [(s, case, name) for s in ("rain", "focus") for case, names in cases for name in names]
-    assert [(row["scene"], row["case"], row.get("controller")) for row in rows] == expected
+def check_budget(rows):
+    expected = [(scene, name) for scene in ("rain", "focus") for name in budget.CONTROLLERS]
+    assert [(row["scene"], row["controller"]) for row in rows] == expected
     for row in rows:
-        if row["case"] == "probe":
-            assert row["finest_ms"] > 0 and row["coarsest_ms"] > 0 and row["taken"]
-        if row["case"] == "hold":
-            assert row["judged"] == 3 and 0 <= row["within"] <= row["within_110_percent"] <= 1 and row["budget_ms"] > 0
-            assert (row["error_max"] == 0) == (row["controller"] == "none") and row["cost_ms"] <= row["cost_p95_ms"]
-            assert ("adds" in row) == (row["controller"] in ("none", "coarsest"))
-            if row["controller"] == "none":
-                assert row["cost_ms"] == pytest.approx(3.5 * row["budget_ms"], abs=0.01)
-        if row["case"] == "step" and row["controller"] == "none":
-            assert row["within_110_percent"] <= 0.5 and row["load"] > 0
-    for name in ("rain", "focus"):
-        kept = json.loads((tmp_path / f"budget-{name}.json").read_text())
-        assert len(kept["runs"]) == 5 and all(len(history) == 63 for history in kept["runs"].values())
-        picture = tmp_path / f"budget-{name}.png"
-        picture.unlink()
-        assert budget.draw_saved(tmp_path / f"budget-{name}.json").endswith(f"budget-{name}.png")
-        assert 10_000 < picture.stat().st_size < 150_000
+        assert row["judged"] == 3 and 0 <= row["within"] <= row["within_110_percent"] <= 1 and row["budget_ms"] > 0
+        assert (row["error_max"] == 0) == (row["controller"] == "none") and row["cost_ms"] <= row["cost_p95_ms"]
+        if row["controller"] == "none":
+            assert row["cost_ms"] == pytest.approx(3.5 * row["budget_ms"], abs=0.01)
 
 
-def test_sections_are_scaled():
-    text = (budget.SCENES / "rain.toml").read_text()
-    found = budget.scale_sections(text, 4).splitlines()
-    changed = {(a, b) for a, b in zip(text.splitlines(), found) if a != b}
-    assert changed == {
-        ("cells = [128, 128]", "cells = [512, 512]"),
-        ("major_sections = 128", "major_sections = 512"),
-        ("minor_sections = 64", "minor_sections = 256"),
-        ("sections = [256, 32]", "sections = [1024, 128]"),
-        ("sections = [96, 80]", "sections = [384, 320]"),
-    }
-
-
-def test_a_load_rises_when_objects_join():
-    poses = np.random.default_rng(0).normal(size=(4, 50, 7))
-    motion, out = budget.LoadStep(poses, 2, 0.1), np.empty((50, 7))
-    for number in range(6):
-        found = motion.poses(0.1 * number, out)
-        same = (found == poses[min(number, 3)]).all(axis=1)
-        assert same.all() if number >= 2 else 10 < same.sum() < 40
-    apart = np.sort(motion.poses(0.0, out)[:, 0])
-    assert (np.diff(apart[apart > 500]) > 900).all(), "objects that wait are far from each other"
-
-
-# --- several devices -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("count", [1, 2, 4, 5])
-def test_numbers_of_devices(count):
-    numbers = {1: [1], 2: [1, 2], 4: [1, 2, 4], 5: [1, 2, 4, 5]}[count]
-    assert scaling.list_sizes(["cpu"] * count) == sorted({(n, times) for n in numbers for times in (1, n)})
-
-
-def check_scaling(rows, name):
+def check_scaling(rows):
     assert [(row["way"], row["devices"]) for row in rows] == [("strong", 1), ("strong", 2), ("weak", 1), ("weak", 2)]
-    sizes = [row[name] for row in rows]
-    assert sizes[:3] == sizes[:1] * 3 and sizes[3] == 2 * sizes[0]
-    assert rows[0]["efficiency"] == rows[2]["efficiency"] == 1
-    assert testing.current_regime().cpu_threads is None
+    assert [row["worlds"] for row in rows] == [8, 8, 8, 16]
+    assert rows[0]["efficiency"] == rows[2]["efficiency"] == 1 and testing.current_regime().cpu_threads is None
+    assert scaling.list_sizes(["cpu"] * 5) == [(1, 1), (2, 1), (2, 2), (4, 1), (4, 4), (5, 1), (5, 5)]
 
 
-def test_frames_on_devices_are_timed(device, monkeypatch):
-    model = sample("small ball")
-    rows = list(scaling.scale_frames([device, device], model, scaling.QUICK))
-    check_scaling(rows, "worlds")
-    assert all(row["frame_ms"] > 0 for row in rows)
-    whole = scaling.WorldFrames.answer
-    monkeypatch.setattr(scaling.WorldFrames, "answer", lambda self, rows: whole(self, rows)[:-1])
-    with pytest.raises(RuntimeError, match="frames: 2 devices answer otherwise than one"):
-        list(scaling.scale_frames([device, device], model, scaling.QUICK))
-
-
-def test_shards_on_devices_are_timed(device):
-    model = sample("small ball")
-    rows = list(scaling.scale_shards([device, device], model, scaling.QUICK))
-    check_scaling(rows, "poses")
-    assert rows[3]["mposes_s"] > 0
-    driver = scaling.time_driver(model, 4096)
-    assert driver["driver_mposes_s"] > 0 and driver["check_mposes_s"] > 0
-    assert scaling.time_worker(wp.get_device(device), model, 64, 1)["worker_mposes_s"] > 0
-
-
-# --- the command -----------------------------------------------------------------------------------------------------
-
-
-def test_command_writes_rows(tmp_path, capsys):
-    file = tmp_path / "rows.json"
-    assert main.main(["query", "--device", "cpu", "--quick", "--json", str(file)]) == 0
+@pytest.mark.parametrize("name", main.CASES)
+def test_case(name, device, tmp_path, monkeypatch, capsys):
+    """Every number is finite, no time or size is negative, and each case's own facts hold."""
+    monkeypatch.delenv("ABTREE_MESHES", raising=False)
+    monkeypatch.setattr(budget, "QUICK_FRAMES", 63)
+    monkeypatch.setattr(budget, "QUICK_OBJECTS", 12)
+    if name == "baselines":
+        pytest.importorskip("fcl")
+    file, plots = tmp_path / "rows.json", ["--plots", str(tmp_path)] if name in ("budget", "scale") else []
+    more = [word.format(device) for word in MORE.get(name, [])]
+    assert main.main([name, "--device", device, "--quick", "--json", str(file), *more, *plots]) == 0
     written = json.loads(file.read_text())
-    assert written["warp"] == wp.config.version and len(written["date"]) == 10 and len(written["rows"]) == 2
-    assert f"pairs={written['rows'][1]['pairs']}" in capsys.readouterr().out
+    assert written["warp"] == wp.config.version and f"{[*written['rows'][-1]][-1]}=" in capsys.readouterr().out
+    for row in written["rows"]:
+        for key, value in row.items():
+            assert not isinstance(value, float) or math.isfinite(value), (key, row)
+            if value is not None and key.endswith(("_ms", "_s", "_mib", "bytes")):
+                assert value >= 0, (key, row)
+            if key.endswith("_p95_ms"):
+                assert value >= row[key.replace("_p95", "")] > 0
+    globals()[f"check_{name}"](written["rows"])
+    if plots:
+        pytest.importorskip("matplotlib")
+        drawn = {"budget": ["budget-rain.png", "budget-focus.png"], "scale": ["scale_time.svg", "scale_memory.svg"]}
+        assert all((tmp_path / picture).stat().st_size > 10_000 for picture in drawn[name])
+
+
+def test_large_meshes_are_left_out_and_models_kept(device, tmp_path, capsys):
+    words = ["update", "--device", device, "--quick", "--largest", "300", "--models", str(tmp_path)]
+    assert main.main(words) == 0 and "faces=576" not in capsys.readouterr().out
+    assert [path.name for path in tmp_path.iterdir()] == ["knot-200-base10.npz"]
 
 
 @pytest.mark.parametrize(
-    "words", [["query", "--largest", "5"], ["baselines", "--plots", "x"], ["memory", "--count", "1"]]
+    "words", [["query", "--largest", "5"], ["baselines", "--plots", "x"], ["paper", "--json", "x"]]
 )
 def test_command_refuses_options_of_other_cases(words, capsys):
     with pytest.raises(SystemExit) as stop:
         main.main([*words, "--device", "cpu"])
-    assert stop.value.code == 2 and f"{words[0]} takes no {words[1]}" in capsys.readouterr().err
+    assert stop.value.code == 2 and "python -m bench: " in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Rows as JSON, Markdown and figures; the command of studies; docs that repeat their data."""
+"""Rows as JSON, Markdown and figures; models kept; docs that repeat their data."""
 
 import json
 import sys
@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import __main__ as main
 from bench import meshes, tables
 from bench.studies import study
 from warp_abtree.app.cli import bench_command
@@ -42,21 +41,17 @@ def test_markdown():
 
 
 def test_json_is_read_back(tmp_path):
-    tables.write_json(tmp_path / "toy.json", toy_study())
-    assert json.loads((tmp_path / "toy.json").read_text()) == toy_study()
-    tables.write_json(tmp_path / "toy.json", {"study": "paper", "parts": {}})
-    assert json.loads((tmp_path / "toy.json").read_text())["parts"] == {}
+    for study_found in (toy_study(), {"study": "paper", "parts": {}}):
+        tables.write_json(tmp_path / "toy.json", study_found)
+        assert json.loads((tmp_path / "toy.json").read_text()) == study_found
 
 
 def test_figures(tmp_path, monkeypatch):
-    figures = [one for one in tables.read_layout("cases/figures.toml")["figure"] if one["case"] == "scale"]
+    figures = tables.pick(tables.read_layout("cases/figures.toml")["figure"], case="scale")
     rows = [{"sweep": "pairs", "pairs": n, "ours_ms": 2.0 * n, "peer_ms": 3.0 * n, "arrays_mib": 1.0} for n in (1, 10)]
-    lines = tables.find_lines(rows, figures[0]["panels"][0])
-    assert lines == {("ours_ms", None): [(1, 2.0), (10, 20.0)], ("peer_ms", None): [(1, 3.0), (10, 30.0)]}
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "matplotlib", None)
         assert tables.draw(figures, rows, tmp_path).startswith("plots skipped: ")
-    assert not list(tmp_path.iterdir())
     pytest.importorskip("matplotlib")
     assert "scale_time.svg, scale_memory.svg" in tables.draw(figures, rows, tmp_path / "new")
     drawn = (tmp_path / "new" / "scale_time.svg").read_text()
@@ -64,18 +59,6 @@ def test_figures(tmp_path, monkeypatch):
     assert "faces a mesh" not in drawn, "no panel without rows"
     tables.draw(figures, rows, tmp_path / "new")
     assert (tmp_path / "new" / "scale_time.svg").read_text() == drawn, "the same rows, the same file"
-
-
-def test_command_draws_earlier_rows(tmp_path, capsys):
-    pytest.importorskip("matplotlib")
-    file = tmp_path / "rows.json"
-    row = {"case": "one state", "faces": 100, "full_ms": 1.0}
-    file.write_text(json.dumps({"rows": [row | {"k": k, "update_ms": 0.1 * k} for k in (1, 10)]}))
-    assert main.main(["update", "--rows", str(file), "--plots", str(tmp_path)]) == 0
-    assert "update_time.svg" in capsys.readouterr().out
-    assert "update, 100 faces: slope 1.00" in (tmp_path / "update_time.svg").read_text()
-    with pytest.raises(SystemExit):
-        main.main(["update", "--rows", str(file)])
 
 
 @pytest.mark.parametrize("file", sorted(DATA.glob("*.json")), ids=lambda path: path.name)
@@ -90,39 +73,6 @@ def test_pages_repeat_their_data(file, tmp_path):
     figures = tables.read_layout(f"studies/{data['study']}.toml")["figure"]
     said = tables.draw(figures, lambda figure: tables.select_rows(figure, data), tmp_path)
     assert all(figure["file"] in said for figure in figures)
-
-
-@pytest.mark.parametrize("name", study.STUDIES[:-1])
-def test_layouts_name_parts_and_summaries(name):
-    layout, found = tables.read_layout(f"studies/{name}.toml"), study.find_study(name)
-    for one in (*layout["table"], *layout["figure"]):
-        assert one["part"] in found.PARTS and one.get("select", "thin") in {"thin", *found.SUMMARIES}
-    for kind, key in (("table", "name"), ("figure", "file")):
-        names = [one[key] for one in layout[kind]]
-        assert len(set(names)) == len(names)
-
-
-def test_study_is_written_part_by_part(tmp_path, monkeypatch, capsys):
-    ran = []
-
-    def part(name):
-        def run(context):
-            ran.append(name)
-            context.note("Once.")
-            context.note("Once.")
-            yield {"x": np.float32(context.size(2, 1)), "gap": float("nan")}
-
-        return run
-
-    found = study.find_study("paper")
-    monkeypatch.setattr(found, "PARTS", {"one": part("one"), "two": part("two")})
-    words = ["paper", "--out", str(tmp_path), "--device", "cpu", "--quick"]
-    assert main.main(words) == 0 and main.main([*words, "--only", "two"]) == 0
-    assert ran == ["one", "two", "two"] and "wrote" in capsys.readouterr().out
-    parts = json.loads((tmp_path / "paper.json").read_text())["parts"]
-    assert set(parts) == {"one", "two"} and parts["one"]["rows"] == [{"x": 1.0, "gap": None}]
-    assert parts["one"]["notes"] == ["Once."] and parts["two"]["run"]["command"].endswith("--only two")
-    assert "quick" in (tmp_path / "paper.md").read_text()
 
 
 def test_models_are_kept(tmp_path, monkeypatch):

@@ -9,8 +9,8 @@ The reference is exact and knows no boxes.
 
 import numpy as np
 import pytest
-from helpers.gpu_query import GpuQuery
 from helpers.orient import orient2d_kernel
+from helpers.questions import GpuQuery
 from helpers.samples import random_quaternions
 from oracles.signs import find_signs, rounded_signs, true_signs
 from oracles.triangle import into_frame_of_a, quaternion_matrix, triangles_intersect

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 from conftest import slow
-from helpers.gpu_query import GpuQuery
+from helpers.questions import GpuQuery
 from helpers.samples import true_faces
 from oracles.signs import true_signs
 from oracles.triangle import into_frame_of_a, quaternion_matrix

@@ -3,8 +3,7 @@
 from fractions import Fraction
 
 import numpy as np
-import trimesh
-from oracles.triangle import _cross, _dot, _half_spaces, _sub
+from oracles.triangle import cross, dot, sub
 
 CHUNK = 32  # contacts that are summed from left to right before sums are; part of the definition
 
@@ -13,31 +12,15 @@ def exact(triangle):
     return [tuple(Fraction(float(x)) for x in p) for p in triangle]
 
 
-def shared_polygon(a, b):
-    """Corners of the intersection of two closed triangles, float64 (n, 3), by clipping B with A's half-spaces."""
-    polygon = exact(b)
-    for normal, origin in _half_spaces(exact(a)):
-        side = [_dot(normal, _sub(p, origin)) for p in polygon]
-        clipped = []
-        for k in range(len(polygon)):
-            p, q, s, t = polygon[k - 1], polygon[k], side[k - 1], side[k]
-            if s * t < 0:
-                clipped.append(tuple(x + (y - x) * s / (s - t) for x, y in zip(p, q, strict=True)))
-            if t >= 0:
-                clipped.append(q)
-        polygon = clipped
-    return np.array([[float(x) for x in p] for p in polygon])
-
-
 def exact_normal(t):
     a, b, c = exact(t)
-    return _cross(_sub(b, a), _sub(c, a))
+    return cross(sub(b, a), sub(c, a))
 
 
 def lies_in_plane(b, a):
     """Whether triangle B lies in the plane of A; of any that has no area, always."""
     normal = exact_normal(a)
-    return all(_dot(normal, _sub(p, exact(a)[0])) == 0 for p in exact(b))
+    return all(dot(normal, sub(p, exact(a)[0])) == 0 for p in exact(b))
 
 
 def unit(v):
@@ -49,28 +32,7 @@ def unit(v):
     return v / np.linalg.norm(v)
 
 
-def distance(corners, p):
-    """Distance of a point from a triangle, by trimesh, or from the nearest edge where it has no area."""
-    best = np.inf
-    for a, b in zip(corners, np.roll(corners, 1, 0), strict=True):
-        d = b - a
-        t = np.clip((p - a) @ d / (d @ d), 0, 1) if d @ d > 0 else 0.0
-        best = min(best, np.linalg.norm(a + t * d - p))
-    n = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    if n @ n > 0:
-        best = min(best, np.linalg.norm(trimesh.triangles.closest_point(corners[None], p[None])[0] - p))
-    return best
-
-
 # Sums over an object pair's contacts in their stated order, in plain Python.
-
-
-def dot(u, v):
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
-
-
-def cross(u, v):
-    return np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
 
 
 def scaled(v):

@@ -51,26 +51,28 @@ def make_scene(device):
     return scene
 
 
+def answers(scene):
+    found = describe(scene.intersect(PAIRS, output="faces"))
+    return found + describe(scene.intersect(MORE_PAIRS, output="count"))
+
+
 def check_scene(before, scene):
     """Return all that a scene holds and answers, or check that it still does."""
     states = scene.batch().states.pool
     now = [getattr(states, name).numpy().tobytes() for name in SLOT_COLUMNS]
-    now += [*everything(scene), *describe(scene.intersect(PAIRS, output="faces"))]
-    now += describe(scene.intersect(MORE_PAIRS, output="count"))
+    now += [*everything(scene), *answers(scene)]
     assert before is None or now == before
     return now
 
 
 def check_answers(before, scene):
     """Return all that a scene answers, or check that it still does; states may have moved in the pool."""
-    now = [scene.lods.tobytes(), *describe(scene.intersect(PAIRS, output="faces"))]
-    now += describe(scene.intersect(MORE_PAIRS, output="count"))
-    now.append(scene.broad_phase().tobytes())
+    objects = scene.batch().objects.pool
+    now = [scene.lods, *answers(scene), scene.broad_phase(), objects.rotation.numpy(), objects.position.numpy()]
     for i in range(scene.object_count):
         state = scene.tree_state(i)
-        now += [state.lod, *(getattr(state, name).tobytes() for name in ("status", "lower", "upper", "skip"))]
-    objects = scene.batch().objects.pool
-    now += [objects.rotation.numpy().tobytes(), objects.position.numpy().tobytes()]
+        now += [state.lod, state.status, state.lower, state.upper, state.skip]
+    now = [np.asarray(value).tobytes() for value in now]
     assert before is None or now == before
     return now
 
@@ -180,16 +182,9 @@ class Interruption(Fault):
     def __init__(self, device, monkeypatch):
         super().__init__(device)
         allocator = wp.get_device(device).get_allocator()
-        for owner, name in (
-            (wp, "launch"),
-            (wp, "copy"),
-            (wp.utils, "radix_sort_pairs"),
-            (wp.array, "fill_"),
-            (wp.array, "zero_"),
-            (wp.array, "assign"),
-            (wp.Bvh, "rebuild"),
-            (allocator, "allocate"),
-        ):
+        steps = [(wp, "launch"), (wp, "copy"), (wp.utils, "radix_sort_pairs"), (wp.Bvh, "rebuild")]
+        steps += [(wp.array, "fill_"), (wp.array, "zero_"), (wp.array, "assign"), (allocator, "allocate")]
+        for owner, name in steps:
             monkeypatch.setattr(owner, name, self._counted(getattr(owner, name)))
 
     def _counted(self, original):

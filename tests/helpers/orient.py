@@ -2,9 +2,10 @@
 
 import warp as wp
 
-from warp_abtree.kernels.arithmetic.predicates import (
-    orient2d,
-)
+from warp_abtree.kernels.arithmetic.predicates import orient2d
+
+# Signs are exact only where no multiplication and addition are contracted into one rounding.
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.kernel

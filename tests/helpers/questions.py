@@ -7,6 +7,7 @@ import numpy as np
 
 import warp_abtree as ab
 from helpers.samples import contact_poses, sample
+from warp_abtree import testing
 
 QUARTERS = [
     np.eye(3)[list(order)] * np.array(signs)[:, None]
@@ -14,6 +15,12 @@ QUARTERS = [
     for signs in itertools.product((1.0, -1.0), repeat=3)
     if np.linalg.det(np.eye(3)[list(order)] * np.array(signs)[:, None]) > 0
 ]
+
+
+def GpuQuery(*arguments, **options):
+    """Return a query that takes the CUDA regime on every device."""
+    with testing.regime(warps=True):
+        return ab.Query(*arguments, **options)
 
 
 def sort_rows(rows):

@@ -57,13 +57,6 @@ def g_printed(cases, i, importance):
     return 2 ** (2 * j - i - 1) if 2 * j >= i + 1 else 0
 
 
-@pytest.mark.parametrize("before", [0, 20])
-def test_oracle_is_figure_4_wherever_the_climb_starts(before):
-    cases = [3] * before + [1] * 5 + [2] * 5
-    for importance, curve in enumerate(FIGURE_4, 1):
-        assert [g_printed(cases, before + i, importance) for i in range(1, 11)] == curve
-
-
 def stages(cost):
     """Return stages that cost so much; movement is not among them."""
     return {"select_ms": 0.25, "refine_ms": 0.5, "move_ms": 100.0, "broad_ms": 0.25, "query_ms": cost - 1.0}
@@ -119,24 +112,7 @@ def test_selection_follows_the_paper(device, threshold):
     assert levels.max() == 50 and (levels[1:] == 0).any()
 
 
-@pytest.mark.parametrize("kind", [PaperController, PredictiveController])
-def test_everything_stays_at_the_coarsest_without_a_frame(device, kind):
-    controller = kind(strewn(6, device), 10.0)
-    for _ in range(2):
-        assert not controller.next_lods(Feedback(0.0)).numpy().any() and not controller.level.numpy().any()
-
-
 # Ladders.
-
-
-def test_paper_ladder_has_equal_operations():
-    models = selection_models()
-    ladder = Ladder(models, 50)
-    for model, lods, errors, faces in zip(models, ladder.lod, ladder.error, ladder.faces):
-        assert len(lods) == 51 and (lods[0], lods[-1]) == (0, model.lod_max)
-        assert np.abs(lods - np.arange(51) * model.lod_max / 50).max() <= 0.5
-        assert errors.tolist() == [model.error_at(int(lod)) for lod in lods]
-        assert faces.tolist() == [len(model.mesh_at(int(lod))[2]) for lod in lods]
 
 
 def test_ratio_ladder_has_equal_ratios():

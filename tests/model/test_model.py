@@ -101,21 +101,13 @@ def test_equal_models_have_equal_digests(tmp_path):
 # Damage.
 
 
-def test_truncated_files_are_refused(tmp_path, content):
-    path = tmp_path / "cut.npz"
-    lengths = np.unique(np.concatenate([np.arange(0, 64), np.linspace(0, len(content) - 1, 150).astype(int)]))
-    for length in lengths:
-        path.write_bytes(content[:length])
-        refuse(path)
-
-
-def test_flipped_bytes_are_noticed(tmp_path, content):
+def test_flipped_and_lost_bytes_are_noticed(tmp_path, content):
     """A file is refused, or opens as it was saved where the byte has no meaning."""
     rng = np.random.default_rng(1)
     path, model = tmp_path / "flipped.npz", with_errors(sample("twins"))
     opened = 0
     for _ in range(400):
-        data = bytearray(content)
+        data = bytearray(content if rng.random() < 0.8 else content[: rng.integers(1, len(content))])
         for at in rng.integers(0, len(data), rng.integers(1, 4)):
             data[at] ^= 1 << rng.integers(8)
         path.write_bytes(data)
@@ -136,7 +128,8 @@ def test_files_that_are_no_models_are_refused(tmp_path):
     (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with zipfile.ZipFile(tmp_path / "zip.npz", "w") as archive:
         archive.writestr("format.npy", b"text")
-    for name in ("", "array.npy", "mesh.obj", "zip.npz"):
+    (tmp_path / "empty.npz").touch()
+    for name in ("", "array.npy", "mesh.obj", "zip.npz", "empty.npz"):
         refuse(tmp_path / name)
     refuse(tmp_path / "absent.npz", "no such file")
     refuse(tmp_path / "other.npz", "not a warp_abtree model")
@@ -283,5 +276,3 @@ def test_bad_sources_are_refused():
     for source in (None, 3, "no/such/file.obj"):
         with pytest.raises(ab.MeshError):
             Model.load(source)
-    with pytest.raises(ValueError, match="base_faces"):
-        Model.from_arrays(*SHAPES["box"](), base_faces=0)

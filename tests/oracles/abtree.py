@@ -8,7 +8,7 @@ Erratum (a) of the paper is explained at `active_mark`.
 """
 
 import math
-import random
+from collections import namedtuple
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,18 +23,10 @@ EMPTY = ((math.inf,) * 3, (-math.inf,) * 3)
 
 @dataclass
 class Progressive:
-    """A progressive mesh as plain lists; n_v original vertices, n_f faces, m merges.
+    """A progressive mesh as plain lists, by the definitions of the library's.
 
-    Merge j makes vertex node n_v + j. `lod` counts vertex splits from the base mesh, so m is the original, and
-    merge j is the one that takes lod m - j to m - j - 1.
-
-    Fields:
-        vertex_parent: Parent of each vertex node, -1 at a root, length n_v + m.
-        vertex_pos: Position of each vertex node [model units], length n_v + m.
-        face_vertex: Original corners of each face, length n_f.
-        face_split: Face f is active iff lod >= face_split[f], length n_f; m + 1 for a face that is never active.
-        split_start: Slice i of split_face is split_start[i] .. split_start[i+1], length m + 1.
-        split_face: Faces that the split from lod i to i + 1 inserts or deforms.
+    `lod` counts vertex splits from the base mesh. Face f is active iff lod >= face_split[f]; slice i of split_face
+    lists the faces that the split from lod i to i + 1 inserts or deforms.
     """
 
     vertex_parent: list
@@ -94,40 +86,6 @@ class Progressive:
         return [0.5 * min(p[k] for p in points) + 0.5 * max(p[k] for p in points) for k in range(3)]
 
 
-def random_progressive(vertices, faces, seed=0, base_faces=4, jitter=0.05):
-    """Collapse random edges of a small mesh, nonmanifold or not, and write down what happened.
-
-    Everything is found by replaying the collapses on explicit corner lists, so face_split and the slices are facts
-    of the replay and not derived from the vertex forest.
-    """
-    rng = random.Random(seed)
-    position = [list(map(float, v)) for v in vertices]
-    face_vertex = [list(map(int, f)) for f in faces]
-    parent = [NONE] * len(position)
-    corner = {f: list(c) for f, c in enumerate(face_vertex) if len(set(c)) == 3}
-    death = {}  # face -> merge that removed it
-    touched = []  # per merge, the faces that it removed or deformed
-    while len(corner) > base_faces:
-        a, b = rng.sample(corner[rng.choice(list(corner))], 2)
-        new, merge = len(position), len(touched)
-        position.append([(position[a][k] + position[b][k]) / 2 + rng.uniform(-jitter, jitter) for k in range(3)])
-        parent.append(NONE)
-        parent[a] = parent[b] = new
-        touched.append([f for f, c in corner.items() if a in c or b in c])
-        for f in touched[-1]:
-            corner[f] = [new if v in (a, b) else v for v in corner[f]]
-            if len(set(corner[f])) < 3:
-                del corner[f]
-                death[f] = merge
-    m = len(touched)
-    split = [m - death[f] if f in death else (0 if f in corner else m + 1) for f in range(len(face_vertex))]
-    start, flat = [0], []
-    for slice_faces in reversed(touched):
-        flat += slice_faces
-        start.append(len(flat))
-    return Progressive(parent, position, face_vertex, split, start, flat)
-
-
 # --- the tree --------------------------------------------------------------------------------------------------------
 
 
@@ -173,12 +131,7 @@ class ABTree:
                 stack += [node.right, node.left]
 
     def flat(self):
-        """Heap-indexed copy of the state, for comparison with flat arrays.
-
-        Returns:
-            Dict of NumPy arrays: status int8 [size], lower and upper float32 [size, 3], skip int32 [size] (-1: none),
-            face_node int32 [n_f]. size is 2^(depth+1); a number without a node reads as inactive.
-        """
+        """Return the state as arrays by heap index, of length 2^(depth+1); numbers without a node are inactive."""
         numbered = {node.number: node for node in self.nodes()}
         size = 2 << (max(numbered).bit_length() - 1)
         state = {
@@ -196,12 +149,8 @@ class ABTree:
         return state
 
 
-@dataclass
-class Update:
-    """What one ACTIVE-UPDATE cost: k distinct faces, and the number of nodes marked (equation 1 bounds it)."""
-
-    k: int
-    nodes_refitted: int
+# What one ACTIVE-UPDATE cost: k distinct faces, and the number of nodes marked (equation 1 bounds it).
+Update = namedtuple("Update", "k nodes_refitted")
 
 
 def refit_bound(n, k):

@@ -1,9 +1,8 @@
 """Exact triangle intersection for closed sets, from first principles, and brute force over all face pairs.
 
-Touching counts, coplanar overlap counts, and a triangle of zero area is the segment or point that it is. Two exact
-tests are written on different grounds and check each other: `triangles_intersect` asks whether an edge of one meets the
-other, in integers; `triangles_intersect_fractions` clips one by the half-spaces of the other, in fractions. A float64
-is an integer times a power of two, so integers on a common exponent are exact.
+Touching counts, coplanar overlap counts, and a triangle of zero area is the segment or point that it is. One triangle
+is clipped by the half-spaces of the other, in integers: a float64 is an integer times a power of two, so integers on a
+common exponent are exact.
 """
 
 from fractions import Fraction
@@ -60,10 +59,7 @@ def into_frame_of_a(points_b, pose_a, pose_b):
     return transform(*relative_pose(*pose_matrix(pose_a), *pose_matrix(pose_b)), points_b)
 
 
-# --- exact test in integers ------------------------------------------------------------------------------------------
-
-ZERO = (0, 0, 0)
-KEPT_AXES = ((1, 2), (2, 0), (0, 1))  # the two axes left when one is dropped
+# --- exact test -------------------------------------------------------------------------------------------------------
 
 
 def integer_points(*arrays):
@@ -81,107 +77,71 @@ def integer_points(*arrays):
     return result
 
 
-def _sub(a, b):
+ZERO = (0, 0, 0)
+
+
+def sub(a, b):
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
-def _dot(a, b):
+def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _cross(a, b):
+def cross(a, b):
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-def _kept_axes(normal):
-    """Axes of a projection that is one-to-one on a plane with this (nonzero) normal."""
-    return KEPT_AXES[0 if normal[0] else 1 if normal[1] else 2]
-
-
-def _turn(a, b, c, i, j):
-    return (b[i] - a[i]) * (c[j] - a[j]) - (b[j] - a[j]) * (c[i] - a[i])
-
-
-def _apart_sides(s, t):
-    return (s > 0 and t > 0) or (s < 0 and t < 0)
-
-
-def _segments_meet_2d(p, q, r, s, i, j):
-    """Closed segments, points included: boxes overlap, and neither lies strictly on one side of the other's line."""
-    for k in (i, j):
-        if max(p[k], q[k]) < min(r[k], s[k]) or max(r[k], s[k]) < min(p[k], q[k]):
-            return False
-    return not (
-        _apart_sides(_turn(p, q, r, i, j), _turn(p, q, s, i, j))
-        or _apart_sides(_turn(r, s, p, i, j), _turn(r, s, q, i, j))
-    )
-
-
-def _segments_meet(p, q, r, s):
-    d, e, f = _sub(q, p), _sub(s, r), _sub(r, p)
-    normal = _cross(d, e)
-    if normal != ZERO:
-        return _dot(normal, f) == 0 and _segments_meet_2d(p, q, r, s, *_kept_axes(normal))
-    # Parallel, or one of them a point. On a common line, lexicographic order is order along the line.
-    line = d if d != ZERO else e
-    return _cross(f, line) == ZERO and max(min(p, q), min(r, s)) <= min(max(p, q), max(r, s))
-
-
-def _segment_meets_triangle(p, q, side_p, side_q, triangle, normal):
-    """Closed segment or point against a triangle of nonzero area; side_p, side_q: normal . (p - triangle[0]), ..."""
-    if _apart_sides(side_p, side_q):
-        return False
+def _half_spaces(triangle):
+    """Yield half-spaces (normal, point), normal . (x - point) >= 0, whose intersection is the closed triangle."""
     a, b, c = triangle
-    if side_p == 0 and side_q == 0:
-        i, j = _kept_axes(normal)
-        s, t, u = _turn(a, b, p, i, j), _turn(b, c, p, i, j), _turn(c, a, p, i, j)
-        if (s >= 0 and t >= 0 and u >= 0) or (s <= 0 and t <= 0 and u <= 0):
-            return True
-        return any(_segments_meet_2d(p, q, r, s, i, j) for r, s in ((a, b), (b, c), (c, a)))
-    # One point of the segment is in the plane; it is inside iff the line passes all edges on the same side.
-    d, a, b, c = _sub(q, p), _sub(a, p), _sub(b, p), _sub(c, p)
-    s, t = _dot(d, _cross(a, b)), _dot(d, _cross(b, c))
-    if _apart_sides(s, -t):
-        return False
-    u = _dot(d, _cross(c, a))
-    return (s >= 0 and t >= 0 and u >= 0) or (s <= 0 and t <= 0 and u <= 0)
+    normal = cross(sub(b, a), sub(c, a))
+    if any(normal):
+        yield from ((normal, a), (sub(ZERO, normal), a))
+        # normal x edge points inwards, as the corners run counterclockwise about their own normal.
+        yield from ((cross(normal, sub(q, p)), p) for p, q in ((a, b), (b, c), (c, a)))
+        return
+    p, q = min(triangle), max(triangle)
+    d = sub(q, p)
+    walls = [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    if any(d):
+        yield from ((d, p), (sub(ZERO, d), q))
+        across = cross(d, walls[min(range(3), key=lambda k: abs(d[k]))])
+        walls = [across, cross(d, across)]
+    yield from ((sign, p) for wall in walls for sign in (wall, sub(ZERO, wall)))
 
 
-def _edge_meets_triangle(edges_of, sides, triangle, normal):
-    return any(
-        _segment_meets_triangle(edges_of[k - 1], edges_of[k], sides[k - 1], sides[k], triangle, normal)
-        for k in range(3)
-    )
+def _clip(a, b):
+    """Corners of the intersection of two closed triangles of exact numbers, by clipping B with every half-space of A.
 
-
-def triangles_intersect_integer(a, b):
-    """Whether two triangles (triples of integer triples) meet.
-
-    The intersection is convex and bounded, so if it is not empty it has an extreme point, and an extreme point cannot
-    be interior to both: it lies on an edge of one, hence some edge of one meets the other. A triangle of zero area is
-    the segment between its lexicographically first and last corner.
+    A corner (x, y, z, w), w > 0, is the point (x, y, z) / w, so that nothing is divided.
     """
-    normal_a = _cross(_sub(a[1], a[0]), _sub(a[2], a[0]))
-    normal_b = _cross(_sub(b[1], b[0]), _sub(b[2], b[0]))
-    if normal_a == ZERO and normal_b == ZERO:
-        return _segments_meet(min(a), max(a), min(b), max(b))
-    if normal_a == ZERO:
-        a, b, normal_a, normal_b = b, a, normal_b, normal_a
-    if normal_b == ZERO:
-        p, q = min(b), max(b)
-        return _segment_meets_triangle(p, q, _dot(normal_a, _sub(p, a[0])), _dot(normal_a, _sub(q, a[0])), a, normal_a)
-    sides_b = [_dot(normal_a, _sub(p, a[0])) for p in b]
-    if min(sides_b) > 0 or max(sides_b) < 0:
-        return False
-    sides_a = [_dot(normal_b, _sub(p, b[0])) for p in a]
-    if min(sides_a) > 0 or max(sides_a) < 0:
-        return False
-    return _edge_meets_triangle(b, sides_b, a, normal_a) or _edge_meets_triangle(a, sides_a, b, normal_b)
+    polygon = [(*p, 1) for p in b]
+    for normal, origin in _half_spaces(a):
+        offset = dot(normal, origin)
+        side = [dot(normal, p) - offset * p[3] for p in polygon]
+        if max(side) < 0:
+            return []
+        clipped = []
+        for k, (q, t) in enumerate(zip(polygon, side, strict=True)):
+            p, s = polygon[k - 1], side[k - 1]
+            if s * t < 0:
+                clipped.append(tuple(abs(t) * x + abs(s) * y for x, y in zip(p, q, strict=True)))
+            if t >= 0:
+                clipped.append(q)
+        polygon = clipped
+    return polygon
 
 
 def triangles_intersect(a, b):
     """Whether two closed triangles of float64 coordinates, (3, 3) each, meet; exact."""
-    return triangles_intersect_integer(*map(tuple, integer_points(a, b)))
+    return bool(_clip(*integer_points(a, b)))
+
+
+def shared_polygon(a, b):
+    """Corners of the intersection of two closed triangles, float64 (n, 3), each rounded once."""
+    a, b = ([tuple(map(Fraction, p)) for p in np.asarray(t, np.float64).tolist()] for t in (a, b))
+    return np.array([[float(x / w) for x in point] for *point, w in _clip(a, b)])
 
 
 def pairs_intersect(points_a, faces_a, points_b, faces_b, pairs):
@@ -190,49 +150,8 @@ def pairs_intersect(points_a, faces_a, points_b, faces_b, pairs):
     faces_a, faces_b = np.asarray(faces_a).tolist(), np.asarray(faces_b).tolist()
     answers = np.zeros(len(pairs), bool)
     for k, (i, j) in enumerate(pairs):
-        answers[k] = triangles_intersect_integer(tuple(ia[v] for v in faces_a[i]), tuple(ib[v] for v in faces_b[j]))
+        answers[k] = bool(_clip([ia[v] for v in faces_a[i]], [ib[v] for v in faces_b[j]]))
     return answers
-
-
-# --- exact test in fractions -----------------------------------------------------------------------------------------
-
-
-def _half_spaces(triangle):
-    """Half-spaces (normal, point), normal . (x - point) >= 0, whose intersection is the closed triangle."""
-    a, b, c = triangle
-    normal = _cross(_sub(b, a), _sub(c, a))
-    if any(normal):
-        planes = [(normal, a), (_sub(ZERO, normal), a)]
-        # normal x edge points inwards, as the corners run counterclockwise about their own normal.
-        return planes + [(_cross(normal, _sub(q, p)), p) for p, q in ((a, b), (b, c), (c, a))]
-    p, q = min(triangle), max(triangle)
-    d = _sub(q, p)
-    if any(d):
-        unit = tuple(Fraction(int(k == min(range(3), key=lambda k: abs(d[k])))) for k in range(3))
-        across = _cross(d, unit)
-        walls = [across, _cross(d, across)]
-        ends = [(d, p), (_sub(ZERO, d), q)]
-    else:
-        walls = [tuple(Fraction(int(k == axis)) for k in range(3)) for axis in range(3)]
-        ends = []
-    return ends + [(sign, p) for wall in walls for sign in (wall, _sub(ZERO, wall))]
-
-
-def triangles_intersect_fractions(a, b):
-    """As `triangles_intersect`, by clipping triangle B with every half-space of triangle A, slowly."""
-    a, b = ([tuple(Fraction(float(x)) for x in p) for p in t] for t in (a, b))
-    polygon = b
-    for normal, origin in _half_spaces(a):
-        side = [_dot(normal, _sub(p, origin)) for p in polygon]
-        clipped = []
-        for k in range(len(polygon)):
-            p, q, s, t = polygon[k - 1], polygon[k], side[k - 1], side[k]
-            if s * t < 0:
-                clipped.append(tuple(x + (y - x) * s / (s - t) for x, y in zip(p, q, strict=True)))
-            if t >= 0:
-                clipped.append(q)
-        polygon = clipped
-    return bool(polygon)
 
 
 # --- brute force -----------------------------------------------------------------------------------------------------
@@ -240,21 +159,12 @@ def triangles_intersect_fractions(a, b):
 
 def box_pairs(a, b):
     """All (i, j) whose closed boxes overlap, for triangles a [n, 3, 3] and b [m, 3, 3]; comparisons are exact."""
-    order = np.argsort(a[:, :, 0].min(1), kind="stable")
-    lower_b, upper_b = b.min(1), b.max(1)
-    found = []
-    for block in np.array_split(order, max(1, len(order) // 128)):
-        if not len(block):
-            continue
-        lower, upper = a[block].min(1), a[block].max(1)
-        near = np.flatnonzero(((lower_b <= upper.max(0)) & (upper_b >= lower.min(0))).all(1))
-        overlap = np.ones((len(block), len(near)), bool)
-        for k in range(3):
-            overlap &= lower[:, None, k] <= upper_b[near, k]
-            overlap &= upper[:, None, k] >= lower_b[near, k]
-        i, j = np.nonzero(overlap)
-        found.append(np.stack([block[i], near[j]], 1))
-    return np.concatenate(found) if found else np.zeros((0, 2), np.int64)
+    found = [np.zeros((0, 2), np.int64)]
+    for start in range(0, len(a), 128):
+        block = a[start : start + 128]
+        near = (block.min(1)[:, None] <= b.max(1)) & (block.max(1)[:, None] >= b.min(1))
+        found.append(np.argwhere(near.all(2)) + [start, 0])
+    return np.concatenate(found)
 
 
 def _strictly_beside(a, b):
@@ -272,7 +182,7 @@ def _strictly_beside(a, b):
 
 
 def provably_apart(a, b):
-    """Float64 filter for triangle pairs a, b [k, 3, 3]: True only where they cannot meet, False where unsure."""
+    """Float64 filter for triangle pairs a, b [k, 3, 3]: True only where they cannot meet, False where uncertain."""
     if max(np.abs(a).max(initial=0.0), np.abs(b).max(initial=0.0)) > 1e100:
         return np.zeros(len(a), bool)
     return _strictly_beside(a, b) | _strictly_beside(b, a)
@@ -287,8 +197,8 @@ def brute_force_faces(vertices_a, faces_a, vertices_b, faces_b, pose_a, pose_b):
     faces_a, faces_b = np.asarray(faces_a), np.asarray(faces_b)
     candidates = box_pairs(points_a[faces_a], points_b[faces_b])
     blocks = np.array_split(candidates, len(candidates) // 100_000 + 1)
-    unsure = np.concatenate(
+    uncertain = np.concatenate(
         [p[~provably_apart(points_a[faces_a[p[:, 0]]], points_b[faces_b[p[:, 1]]])] for p in blocks]
     )
-    hits = unsure[pairs_intersect(points_a, faces_a, points_b, faces_b, unsure)]
+    hits = uncertain[pairs_intersect(points_a, faces_a, points_b, faces_b, uncertain)]
     return hits[np.lexsort((hits[:, 1], hits[:, 0]))].astype(np.int32)

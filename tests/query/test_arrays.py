@@ -4,34 +4,19 @@ import numpy as np
 import pytest
 import warp as wp
 from helpers.faults import describe
+from helpers.questions import to_matrix
 from helpers.samples import random_poses, sample
+from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
+from warp_abtree.scene import sweep as pose_sweep
 from warp_abtree.scene.poses import device_rows
 
 
-class DlpackArray:
-    """An array that speaks DLPack and nothing else."""
-
-    def __init__(self, array):
-        self.array = array
-
-    def __dlpack__(self, **options):
-        return self.array.__dlpack__(**options)
-
-    def __dlpack_device__(self):
-        return self.array.__dlpack_device__()
-
-
-class InterfaceArray:
-    """An array on a GPU that has `__cuda_array_interface__` and nothing else."""
-
-    def __init__(self, array):
-        self.array = array
-
-    @property
-    def __cuda_array_interface__(self):
-        return self.array.__cuda_array_interface__
+def speaking(array, *names):
+    """Return an array that has some attributes of another and nothing else."""
+    own = {name: property(lambda _, name=name: getattr(array, name)) for name in names}
+    return type("Array", (), own)()
 
 
 def on_gpu(make):
@@ -56,13 +41,21 @@ def to_jax(values, device):
     return jax.device_put(values, jax.devices("cuda" if device.is_cuda else "cpu")[0])
 
 
+def to_transforms(values, device):
+    """Return an array of Warp's transforms, of what is shaped like them, with gaps between them."""
+    kinds = {np.dtype(np.float32): wp.transformf, np.dtype(np.float64): wp.transformd}
+    options = {"dtype": kinds[values.dtype]} if values.shape[1:] == (7,) and values.dtype in kinds else {}
+    return wp.array(np.repeat(values, 2, 0), device=device, **options)[::2]
+
+
 FRAMEWORKS = {
     "warp": lambda values, device: wp.array(values, device=device),
-    "dlpack": lambda values, device: DlpackArray(wp.array(values, device=device)),
-    "interface": on_gpu(lambda values, device: InterfaceArray(wp.array(values, device=device))),
+    "strided": lambda values, device: wp.array(np.repeat(values, 2, 0), device=device)[::2],
+    "transforms": to_transforms,
+    "dlpack": lambda values, device: speaking(wp.array(values, device=device), "__dlpack__", "__dlpack_device__"),
+    "interface": on_gpu(lambda values, device: speaking(wp.array(values, device=device), "__cuda_array_interface__")),
     "torch": to_torch,
     "cupy": on_gpu(lambda values, _: pytest.importorskip("cupy").asarray(values)),
-    "numba": on_gpu(lambda values, _: pytest.importorskip("numba.cuda").to_device(values)),
     "jax": to_jax,
 }
 
@@ -84,23 +77,17 @@ def make_scene(device):
 
 
 def poses_of(shape, real, count=4):
-    poses = random_poses(np.random.default_rng(2), count, 0.4).astype(real)
+    poses = random_poses(np.random.default_rng(2), count, 0.4)
     if shape == "matrices":
-        matrices = np.tile(np.eye(4), (count, 1, 1))
-        x, y, z, w = poses[:, 3:].astype(np.float64).T
-        # A turn about z alone is rigid to the last bit but one, in either precision.
-        angle = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        matrices[:, 0, 0] = matrices[:, 1, 1] = np.cos(angle)
-        matrices[:, 1, 0], matrices[:, 0, 1] = np.sin(angle), -np.sin(angle)
-        matrices[:, :3, 3] = poses[:, :3]
-        return matrices.astype(real)
-    return poses
+        return np.array([to_matrix(*pose_matrix(pose)) for pose in poses]).astype(real)
+    return poses.astype(real)
 
 
 @pytest.mark.parametrize("real", [np.float32, np.float64])
 @pytest.mark.parametrize("shape", ["quaternions", "matrices"])
-def test_poses(device, framework, shape, real):
-    """The same bits as from NumPy, for a scene and a sweep."""
+def test_poses(device, framework, shape, real, monkeypatch):
+    """The same bits as from NumPy, for a scene and a sweep; and a sweep answers what a scene does."""
+    monkeypatch.setattr(pose_sweep, "CHUNKS", (64,))
     poses = poses_of(shape, real)
     first, second = make_scene(device), make_scene(device)
     first.set_poses(poses)
@@ -109,28 +96,15 @@ def test_poses(device, framework, shape, real):
         expected = getattr(first.batch().objects.pool, name).numpy()
         assert getattr(second.batch().objects.pool, name).numpy().tobytes() == expected.tobytes()
     model, many = sample("torus"), poses_of(shape, real, 500)
-    for output in ("count", "faces"):
-        expected = ab.sweep(model, model, many, output=output, device=device)
-        np.testing.assert_array_equal(ab.sweep(model, model, framework(many), output=output, device=device), expected)
-        assert len(expected) >= 500 and expected.any()
-
-
-def test_poses_of_both_kinds_agree(device):
-    """A sweep over matrices answers what one over their quaternions answers, and a scene at each of them."""
-    model = sample("torus")
-    matrices = poses_of("matrices", np.float64, 50)
-    quaternions = np.zeros((50, 7))
-    quaternions[:, :3] = matrices[:, :3, 3]
-    half = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0]) / 2
-    quaternions[:, 5], quaternions[:, 6] = np.sin(half), np.cos(half)
-    found = ab.sweep(model, model, matrices, output="count", device=device)
-    np.testing.assert_array_equal(found, ab.sweep(model, model, quaternions, output="count", device=device))
     scene = ab.Scene(device)
     scene.add(model)
-    for matrix in matrices:
-        scene.add(model, matrix)
-    pairs = np.stack([np.zeros(50, int), np.arange(1, 51)], 1)
-    np.testing.assert_array_equal(found, scene.intersect(pairs, output="count").count)
+    for pose in many:
+        scene.add(model, pose)
+    expected = scene.intersect([(0, i + 1) for i in range(500)], output="faces")
+    assert expected.any.any()
+    for output in ("count", "faces"):
+        found = ab.sweep(model, model, framework(many), output=output, device=device)
+        np.testing.assert_array_equal(found, getattr(expected, output))
 
 
 def test_lods_pairs_distances_and_transforms(device, framework):
@@ -169,19 +143,19 @@ def test_what_lies_elsewhere_is_refused_or_copied(device, framework):
         (np.where(np.arange(7) == 1, np.nan, poses), "pose 0 is not finite"),
         (poses[:3], "3 given for 4 objects"),
         (poses[:, :6], "neither"),
-        (np.diag([1, 1, 1, 2.0]) * np.ones((4, 1, 1)), "matrix 0 is not rigid"),
         (np.diag([1, 1, -1, 1.0]) * np.ones((4, 1, 1)), "matrix 0 is not rigid"),
         (np.eye(4) * np.array([1, 1, 1 + 1e-5])[[0, 1, 2, 0]][:, None, None], "matrix 2 is not rigid"),
     ):
         with pytest.raises(ValueError, match=what):
             scene.set_poses(framework(values))
         np.testing.assert_array_equal(scene.batch().objects.pool.position.numpy(), before)
-    for call in (
-        lambda: scene.set_lods(framework(np.array([0, 1, 2, 10**6]))),
-        lambda: scene.intersect(framework(np.array([(0, 7)]))),
-        lambda: ab.sweep(sample("torus"), sample("torus"), framework(bad), device=device),
+    for call, what in (
+        (lambda: scene.set_lods(framework(np.array([0, 1, 2, 10**6]))), "object 3 asks"),
+        (lambda: scene.intersect(framework(np.array([(0, 7)]))), "has 4 objects"),
+        (lambda: ab.sweep(sample("torus"), sample("torus"), framework(bad), device=device), "pose 2 has a quaternion"),
+        (lambda: scene.set_poses(framework(np.ones((4, 7), bool))), "poses: "),
     ):
-        with pytest.raises(ValueError, match=r"object 3 asks|has 4 objects|pose 2 has a quaternion of norm 1\.5"):
+        with pytest.raises(ValueError, match=what):
             call()
 
 
@@ -192,18 +166,10 @@ def test_what_is_on_the_gpu_is_read_there(device):
     if not target.is_cuda:
         assert device_rows(rows, target) is None
         return
-    assert device_rows(rows, target).ptr == rows.ptr
     matrices = wp.array(poses_of("matrices", np.float32), device=device)
-    assert device_rows(matrices, target).ptr == matrices.ptr and device_rows(matrices, target).shape == (4, 16)
     transforms = wp.array(rows.numpy(), dtype=wp.transformd, device=device)
-    assert device_rows(transforms, target).ptr == transforms.ptr and device_rows(transforms, target).shape == (4, 7)
+    for array, width in ((rows, 7), (matrices, 16), (transforms, 7)):
+        assert device_rows(array, target).ptr == array.ptr and device_rows(array, target).shape == (4, width)
     across = wp.array(np.ascontiguousarray(rows.numpy().T), device=device).transpose()
     np.testing.assert_array_equal(device_rows(across, target).numpy(), rows.numpy())
     assert device_rows(wp.array(rows.numpy(), device="cpu"), target) is None
-
-
-def test_no_numbers(device):
-    scene = make_scene(device)
-    for values in (wp.array(np.ones((4, 7), bool), device=device), [[1], [1, 2]], object()):
-        with pytest.raises(ValueError, match="poses: "):
-            scene.set_poses(values)

@@ -5,9 +5,10 @@ from fractions import Fraction
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+from helpers.questions import sort_rows
 from helpers.samples import STILL, random_poses, raw_state, sample
 from hypothesis import HealthCheck, given, settings
-from oracles.triangle import into_frame_of_a, pose_matrix, triangles_intersect
+from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
 
@@ -40,20 +41,17 @@ def check_pairs(scene, poses, worlds, statics, excluded=()):
     """Compare with brute force: all pairs that overlap, and none that float32 can tell apart. Returns the pairs."""
     pairs = scene.broad_phase()
     assert pairs.dtype == np.int32 and pairs.ndim == 2 and pairs.shape[1] == 2
-    assert (pairs[:, 0] < pairs[:, 1]).all()
-    found = list(map(tuple, pairs.tolist()))
-    assert found == sorted(set(found)), "sorted, each once"
+    np.testing.assert_array_equal(pairs, np.unique(pairs, axis=0), "sorted, each once")
     worlds, statics = np.array(worlds), np.array(statics)
     may = (worlds[:, None] == worlds) | (worlds[:, None] == -1) | (worlds == -1)
     may &= ~(statics[:, None] & statics)
     for i, j in excluded:
         may[i, j] = may[j, i] = False
-    may = np.triu(may, 1)
+    may, found = np.triu(may, 1), np.zeros_like(may)
+    found[pairs[:, 0], pairs[:, 1]] = True
     lower, upper = posed_boxes(scene, poses)
-    needed = np.argwhere(may & overlaps(lower, upper, -1e-13))
-    allowed = np.argwhere(may & overlaps(lower, upper, 3e-7))
-    assert set(map(tuple, needed.tolist())) <= set(found)
-    assert set(found) <= set(map(tuple, allowed.tolist()))
+    assert not (may & overlaps(lower, upper, -1e-13) & ~found).any()
+    assert not (found & ~(may & overlaps(lower, upper, 3e-7))).any()
     return pairs
 
 
@@ -107,12 +105,11 @@ def test_many_objects_after_moves_and_lods(device):
     assert len(check_pairs(scene, poses, worlds, statics)) > 600
 
 
-@pytest.mark.parametrize("offset", [1e4, 1e6, -3e7])
-def test_far_from_the_origin_nothing_is_missed(device, offset):
+def test_far_from_the_origin_nothing_is_missed(device):
     """Boxes in the world are float32: far away they are coarser, never too small."""
     rng = np.random.default_rng(2)
     poses = random_poses(rng, 120, 4.0)
-    poses[:, :3] += [offset, 0, -offset]
+    poses[:, :3] += [-3e7, 0, 3e7]
     scene = make_scene(device, [sample("crumbs")] * 120, poses, [0] * 120, [False] * 120)
     assert len(check_pairs(scene, poses, [0] * 120, [False] * 120)) > 100
 
@@ -151,58 +148,18 @@ def test_boxes_in_the_world_contain_what_they_box(device, far):
             assert most < Fraction(upper) < most + 4 * room
 
 
-def test_faces_that_touch_far_from_their_origins_are_candidates(device):
-    """Corners of root boxes that meet in one point, where float64 rounds the boxes apart."""
-    rng = np.random.default_rng(5)
-    scene = ab.Scene(device)
-    for world in range(30):
-        poses, faces = np.tile(np.eye(4), (2, 1, 1)), []
-        for pose, side in zip(poses, (1, -1), strict=True):
-            pose[:3, :3] = pose_matrix(random_poses(rng, 1, 1.0)[0])[0]
-            # The first corner is that end of its box which goes farthest along the world's first axis.
-            inward = -side * np.sign(pose[0, :3]) * rng.uniform(0.2, 1.0, (2, 3))
-            faces.append(2.0**36 * rng.normal(size=3) + np.concatenate([np.zeros((1, 3)), inward]))
-            pose[:3, 3] = -pose[:3, :3] @ faces[-1][0]
-        first = into_frame_of_a(faces[1][:1], *poses)
-        faces[0] += first - faces[0][:1]
-        faces[0][0] = first
-        assert triangles_intersect(faces[0], into_frame_of_a(faces[1], *poses))
-        for face, pose in zip(faces, poses, strict=True):
-            scene.add(ab.Model.from_arrays(face, [[0, 1, 2]]), pose, world=world)
-    np.testing.assert_array_equal(scene.broad_phase(), np.arange(60).reshape(-1, 2))
-
-
 def test_thousand_worlds(device):
     """Everything overlaps everything, and only worlds keep it apart."""
-    box = sample("box")
-    scene = ab.Scene(device)
-    worlds = np.concatenate([np.repeat(np.arange(1000), 3), [-1, -1]])
-    worlds = np.random.default_rng(3).permutation(np.where(worlds < 0, -1, 1001 * worlds))
+    scene, worlds = ab.Scene(device), np.concatenate([1001 * np.repeat(np.arange(1000), 3), [-1, -1]])
+    worlds = np.random.default_rng(3).permutation(worlds)
     for world in worlds:
-        scene.add(box, world=int(world))
-    pairs = scene.broad_phase()
+        scene.add(sample("box"), world=int(world))
     shared = (worlds[:, None] == -1) | (worlds == -1)
     expected = np.argwhere(np.triu((worlds[:, None] == worlds) | shared, 1))
-    np.testing.assert_array_equal(pairs, expected)
-    assert len(pairs) == 3 * 1000 + 2 * 3000 + 1
-    result = scene.intersect()
-    np.testing.assert_array_equal(result.pairs[np.lexsort(result.pairs.T[::-1])], expected)
+    np.testing.assert_array_equal(scene.broad_phase(), expected)
+    np.testing.assert_array_equal(sort_rows(scene.intersect().pairs), expected)
     apart = [(i, i + 1) for i in range(9) if worlds[i] != worlds[i + 1]]
     assert scene.intersect(apart).any.all(), "a pair that is asked for is tested whatever its worlds"
-
-
-def test_every_world_only(device):
-    """Objects that are in every world meet each other even where there is no other world."""
-    box = sample("box")
-    scene = make_scene(device, [box] * 4, [STILL] * 4, [-1] * 4, [False, False, True, True])
-    np.testing.assert_array_equal(scene.broad_phase(), [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3)])
-
-
-def test_touching_and_apart(device):
-    box = sample("box")
-    poses = np.array([STILL, (1, 0, 0, 0, 0, 0, 1), (2.001, 0, 0, 0, 0, 0, 1), (1, 1, 1, 0, 0, 0, 1)])
-    scene = make_scene(device, [box] * 4, poses, [0] * 4, [False] * 4)
-    np.testing.assert_array_equal(scene.broad_phase(), [(0, 1), (0, 3), (1, 3)])
 
 
 def test_filter_adds_up_and_outlives_changes(device):
@@ -240,17 +197,14 @@ def test_frames_off_orthonormal_hide_no_pair(device, order):
     """Matrices rigid within 1e-6 are taken as they are: faces that meet by the exact test are candidates."""
     model = sample("box")
     shrunk = np.diag([1 - 4.9e-7] * 3 + [1.0])
-    found = []
+    meets = []
     for gap in (-9.5e-7, 0.0, 4.0e-7, 4.9e-7, 9e-7):
-        scene = ab.Scene(device)
+        scene, other = ab.Scene(device), np.eye(4)
         # The boxes' faces lie half a unit from their middles; only the first frame is off.
-        other = np.eye(4)
         other[0, 3] = order * (1 + gap / 2)
         scene.add(model, shrunk)
         scene.add(model, other)
-        pairs = scene.broad_phase().tolist()
-        met = scene.intersect([(0, 1)]).any[0]
-        assert pairs or not met
-        np.testing.assert_array_equal(scene.intersect().any, [met] if pairs else [])
-        found.append((met, len(pairs)))
-    assert found[0][0] and found[2][0] and not found[-1][0], found
+        meets.append(scene.intersect([(0, 1)]).any[0])
+        assert len(scene.broad_phase()) or not meets[-1]
+        assert scene.intersect().any.any() == meets[-1]
+    assert meets[0] and meets[2] and not meets[-1], meets

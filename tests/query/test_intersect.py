@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from conftest import slow
-from helpers.questions import pairs_of, random_case, scene_of
+from helpers.questions import pairs_of, random_case, scene_of, sort_rows
 from helpers.samples import REAL_MESHES, STILL, WARP_MESHES, contact_poses, random_poses, sample, true_faces
 from oracles.peers import fcl_faces, judge
 from oracles.triangle import into_frame_of_a
@@ -18,17 +18,8 @@ from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-SHAPE_PAIRS = [
-    ("ball", "torus"),
-    ("capsule", "box"),
-    ("crumbs", "crumbs"),
-    ("soup", "ball"),
-    ("soup", "lattice soup"),
-    ("grid", "torus"),
-    ("twins", "twins"),
-    ("one", "soup"),
-    ("two", "three"),
-]
+SHAPE_PAIRS = [("capsule", "box"), ("crumbs", "crumbs"), ("soup", "ball"), ("soup", "lattice soup")]
+SHAPE_PAIRS += [("grid", "torus"), ("twins", "twins"), ("two", "three")]
 REAL_PAIRS = list(zip(REAL_MESHES, REAL_MESHES[1:] + REAL_MESHES[:1], strict=True))
 BUNDLED_PAIRS = [("warp:bunny", "warp:bear"), ("warp:rocks", "fcl-env")]
 BRUTE_FACES = 2500
@@ -39,7 +30,7 @@ def ask(scene, pairs, output="faces"):
 
 
 def check_cases(device, cases):
-    """Compare faces with brute force; any and count with faces; swapped and shuffled batches with plain ones."""
+    """Compare faces with brute force; any and count with faces; swapped pairs with plain ones."""
     scene = scene_of(device, cases)
     expected, pairs = [true_faces(*case) for case in cases], pairs_of(cases)
     result = ask(scene, pairs)
@@ -47,20 +38,7 @@ def check_cases(device, cases):
     np.testing.assert_array_equal(result.faces, rows)
     check_agreement(scene, pairs, result)
 
-    mirrored = ask(scene, pairs[:, ::-1])
-    swapped = rows[:, [0, 2, 1]]
-    np.testing.assert_array_equal(mirrored.faces, swapped[np.lexsort(swapped.T[::-1])])
-
-    rng = np.random.default_rng(0)
-    order = rng.integers(0, len(pairs), 3 * len(pairs))
-    turned = rng.random(len(order)) < 0.5
-    batch = np.where(turned[:, None], pairs[order][:, ::-1], pairs[order])
-    result = ask(scene, batch)
-    np.testing.assert_array_equal(result.count, [len(expected[p]) for p in order])
-    for row, (p, flip) in enumerate(zip(order, turned, strict=True)):
-        faces = expected[p][:, ::-1] if flip else expected[p]
-        got = result.faces[result.faces[:, 0] == row][:, 1:]
-        np.testing.assert_array_equal(got, faces[np.lexsort(faces.T[::-1])])
+    np.testing.assert_array_equal(ask(scene, pairs[:, ::-1]).faces, sort_rows(rows[:, [0, 2, 1]]))
     return expected
 
 
@@ -86,7 +64,7 @@ def test_faces_equal_brute_force(device, names):
     assert sum(map(len, check_cases(device, cases))) > 0
 
 
-@pytest.mark.parametrize("names", [*SHAPE_PAIRS[:4], *slow(*REAL_PAIRS, WARP_MESHES[:2])], ids="-".join)
+@pytest.mark.parametrize("names", [*SHAPE_PAIRS[:3], *slow(*REAL_PAIRS, WARP_MESHES[:2])], ids="-".join)
 def test_agrees_with_fcl(device, names):
     """Any LOD up to the original; FCL's own mistakes are told apart by the exact test."""
     pytest.importorskip("fcl")
@@ -98,9 +76,9 @@ def test_agrees_with_fcl(device, names):
         ours = result.faces[result.faces[:, 0] == p][:, 1:]
         rows = np.stack([np.searchsorted(ids_a, ours[:, 0]), np.searchsorted(ids_b, ours[:, 1])], 1)
         pair = (*mesh_a, *mesh_b, pose_a, pose_b)
-        verdict = judge(rows, fcl_faces(*pair), *pair)
-        assert verdict.ours_wrong == []
-        wrong += len(verdict.peer_wrong)
+        ours_wrong, theirs_wrong = judge(rows, fcl_faces(*pair), *pair)
+        assert ours_wrong == []
+        wrong += len(theirs_wrong)
     assert wrong <= 0.02 * len(result.faces) + 2
     assert len(result.faces) > 0
 
@@ -147,23 +125,18 @@ def rounded(name):
     return ab.Model.from_arrays(np.round(vertices / unit * 4096) / 4096, faces)
 
 
-def check_pair(device, model_a, pose_a, model_b, pose_b, lods=(None, None)):
-    """Compare one pair with brute force and return its faces."""
-    scene = ab.Scene(device)
-    scene.add(model_a, pose_a, lod=lods[0])
-    scene.add(model_b, pose_b, lod=lods[1])
-    faces = ask(scene, [(0, 1)]).faces[:, 1:]
-    lod_a, lod_b = scene.lods
-    np.testing.assert_array_equal(faces, true_faces(model_a, lod_a, pose_a, model_b, lod_b, pose_b))
+def check_pair(device, model_a, pose_a, model_b, pose_b, lod):
+    """Compare one pair at one LOD with brute force and return its faces."""
+    case = (model_a, lod, pose_a, model_b, lod, pose_b)
+    faces = ask(scene_of(device, [case]), [(0, 1)]).faces[:, 1:]
+    np.testing.assert_array_equal(faces, true_faces(*case))
     return faces
 
 
 QUARTER_TURN = np.array([[0, -1, 0, 0.5], [1, 0, 0, 0.25], [0, 0, 1, 3], [0, 0, 0, 1]])
 
 
-@pytest.mark.parametrize(
-    "name", ["torus", "soup", "grid", "crumbs", *slow("cow", "fandisk", "fcl-env", "fcl-rob", "homer", "woody")]
-)
+@pytest.mark.parametrize("name", ["torus", "soup", "grid", *slow("cow", "fandisk", "fcl-env", "woody")])
 @pytest.mark.parametrize("place", ["still", "quarter turn", *slow("any turn")])
 def test_coincident_meshes_equal_brute_force(device, name, place):
     """Every face is coplanar with its twin and touches its neighbours; at any other pose, a rounding apart."""
@@ -171,20 +144,13 @@ def test_coincident_meshes_equal_brute_force(device, name, place):
     lod = model.lod_for(fraction=min(1.0, 1500 / model.face_count))
     anywhere = random_poses(np.random.default_rng(10), 1, 1.0)[0]
     pose = {"still": STILL, "quarter turn": QUARTER_TURN, "any turn": anywhere}[place]
-    faces = check_pair(device, model, pose, model, pose, (lod, lod))
+    faces = check_pair(device, model, pose, model, pose, lod)
     if place != "any turn":
         assert {(f, f) for f in model.mesh_at(lod)[2]} <= set(map(tuple, faces.tolist()))
     if place == "quarter turn":
-        np.testing.assert_array_equal(check_pair(device, model, STILL, model, STILL, (lod, lod)), faces)
-    if place == "any turn" and name in (
-        "cow",
-        "fandisk",
-        "fcl-env",
-        "torus",
-    ):  # of the others, few pairs differ, perhaps none
-        scene = ab.Scene(device)
-        for _ in range(2):
-            scene.add(model, pose, lod=lod)
+        np.testing.assert_array_equal(check_pair(device, model, STILL, model, STILL, lod), faces)
+    if place == "any turn" and name in ("cow", "fandisk", "fcl-env", "torus"):  # few pairs of the others differ
+        scene = scene_of(device, [(model, lod, pose) * 2])
         rounded_faces = scene.intersect([(0, 1)], "faces", precision="float32").faces[:, 1:]
         assert not np.array_equal(rounded_faces, faces), "the case is too easy to tell exact signs from others"
 
@@ -193,9 +159,9 @@ def test_coincident_meshes_equal_brute_force(device, name, place):
 def test_touching_boxes(device, shift):
     """Faces, edges and corners that touch count; one unit in the last place farther, they do not."""
     box = sample("box")
-    assert len(check_pair(device, box, STILL, box, (*shift, 0, 0, 0, 1))) > 0
+    assert len(check_pair(device, box, STILL, box, (*shift, 0, 0, 0, 1), box.lod_max)) > 0
     beyond = [np.nextafter(x, 9) if x == 1 else x for x in shift]
-    assert len(check_pair(device, box, STILL, box, (*beyond, 0, 0, 0, 1))) == 0
+    assert len(check_pair(device, box, STILL, box, (*beyond, 0, 0, 0, 1), box.lod_max)) == 0
 
 
 @pytest.mark.parametrize("far", [1e6, 1e30, 1e39, 1e300, 1.7e308])
@@ -216,18 +182,6 @@ def test_pairs_far_apart(device, far):
     apart = [pair not in meets for pair in pairs]
     assert (result.node_tests[apart] <= 2).all() and (result.triangle_tests[apart] == 0).all()
     assert (result.count[~np.array(apart)] >= ball.face_count).all()
-
-
-# Regimes and work.
-
-
-def test_nothing_asked(device):
-    scene = ab.Scene(device)
-    scene.add(sample("box"))
-    for pairs in ([], np.empty((0, 2), int), None):
-        result = ask(scene, pairs)
-        assert result.any.shape == result.count.shape == (0,)
-        assert result.faces.shape == (0, 3) and result.pairs.shape == (0, 2)
 
 
 @pytest.mark.parametrize("room", [STACK_LENGTH, 0])
@@ -262,25 +216,20 @@ def test_warps_give_the_same_answers(device, room, parts):
         assert visits["any"] < visits["count"], "a pair ends at its first hit"
 
 
-@pytest.mark.parametrize("name", ["torus", "soup", "ball"])
-def test_coincident_meshes_go_to_float64_at_once(device, name):
+def test_coincident_meshes_go_to_float64_at_once(device):
     """Of twins in one place all faces, of a copy's those that float32 leaves open: the answers are the same."""
-    model = sample(name)
-    for pose in (STILL, random_poses(np.random.default_rng(12), 1, 1.0)[0]):
-        scene = ab.Scene(device)
-        beside = (*np.asarray(pose[:3]) + 1e-4, *pose[3:])
-        for placed, at in ((model, pose), (model, pose), (copy.copy(model), pose), (model, beside)):
-            scene.add(placed, at)
-        result = ask(scene, [(0, 1), (0, 2), (0, 3)])
-        first, second, _ = (result.faces[result.faces[:, 0] == p, 1:] for p in range(3))
-        np.testing.assert_array_equal(first, second)
-        tested, left = result.triangle_tests, result.float64_tests
-        assert left[0] == tested[0] == tested[1] > left[1]
-        assert left[2] < tested[2]
-        coarse = model.lod_for(fraction=0.3)
-        scene.set_lods([model.lod_max, coarse, coarse, coarse])
-        apart = ask(scene, [(0, 1), (0, 2)])  # no twins
-        assert (apart.float64_tests < apart.triangle_tests).all() and np.ptp(apart.float64_tests) == 0
+    model, pose = sample("soup"), random_poses(np.random.default_rng(12), 1, 1.0)[0]
+    scene = ab.Scene(device)
+    for placed in (model, model, copy.copy(model)):
+        scene.add(placed, pose)
+    result = ask(scene, [(0, 1), (0, 2)])
+    first, second = (result.faces[result.faces[:, 0] == p, 1:] for p in range(2))
+    np.testing.assert_array_equal(first, second)
+    tested, left = result.triangle_tests, result.float64_tests
+    assert left[0] == tested[0] == tested[1] > left[1]
+    scene.set_lods([model.lod_max, *[model.lod_for(fraction=0.3)] * 2])
+    apart = ask(scene, [(0, 1), (0, 2)])  # no twins
+    assert (apart.float64_tests < apart.triangle_tests).all() and np.ptp(apart.float64_tests) == 0
 
 
 @pytest.mark.parametrize("name", [*slow("cow", "rocker-arm", "stanford-bunny"), "torus"])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.bodies import about, box, model_of
+from helpers.questions import to_matrix
 from helpers.samples import STILL, random_poses
 from oracles.triangle import quaternion_matrix
 
@@ -26,12 +27,9 @@ def clip_area_vector(half, pose, other_half, other_pose):
     r, r2 = quaternion_matrix(pose[3:]), quaternion_matrix(other_pose[3:])
     total = np.zeros(3)
     for axis, sign in itertools.product(range(3), (-1, 1)):
-        u, v = (axis + 1) % 3, (axis + 2) % 3
-        polygon = []
-        for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
-            corner = np.zeros(3)
-            corner[axis], corner[u], corner[v] = sign * half[axis], a * half[u], b * half[v]
-            polygon.append(r2.T @ (r @ corner + pose[:3] - other_pose[:3]))
+        corners = np.tile(sign * half.astype(float), (4, 1))
+        corners[:, [axis - 2, axis - 1]] = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * half[[axis - 2, axis - 1]]
+        polygon = [r2.T @ (r @ corner + pose[:3] - other_pose[:3]) for corner in corners]
         for k, s in itertools.product(range(3), (-1, 1)):
             kept = []
             for p, q in zip(polygon, polygon[1:] + polygon[:1]):
@@ -42,7 +40,7 @@ def clip_area_vector(half, pose, other_half, other_pose):
                     kept.append(p + (q - p) * at_p / (at_p - at_q))
             polygon = kept
         for p, q in itertools.pairwise(polygon[1:]):
-            total += 0.5 * sign * abs(np.linalg.norm(np.cross(p - polygon[0], q - polygon[0]))) * r[:, axis]
+            total += 0.5 * sign * np.linalg.norm(np.cross(p - polygon[0], q - polygon[0])) * r[:, axis]
     return total
 
 
@@ -50,7 +48,7 @@ def check_upward(points, tolerance=1e-9):
     np.testing.assert_allclose(points["normal"], np.tile([0, 0, 1.0], (len(points["pair"]), 1)), atol=tolerance)
 
 
-@pytest.mark.parametrize("splits", [(0, 0), (2, 0), (0, 2), (2, 2)])
+@pytest.mark.parametrize("splits", [(0, 0), (2, 2)])
 def test_a_box_on_a_floor_has_its_four_corners(device, splits):
     floor, cube = box(4, 4, 1, splits=splits[0]), box(1, 0.8, 0.6, splits=splits[1])
     turned = about((0, 0, 1), 0.3)
@@ -79,29 +77,25 @@ def test_equal_boxes_in_a_stack_push_upwards(device):
 
 
 def test_edges_across_edges_push_along_their_cross_product(device):
-    bar = box(4, 0.5, 0.5)
-    first = (0, 0, 0, *about((1, 0, 0), np.pi / 4))
-    half = np.sqrt(0.125)
-    over = quaternion_matrix(about((0, 0, 1), np.pi / 2)) @ quaternion_matrix(about((1, 0, 0), np.pi / 4))
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = over, [0, 0, 2 * half - 0.02]
-    start = np.eye(4)
-    start[:3, :3] = quaternion_matrix(first[3:])
-    _, result = ask(device, (bar, start), (bar, pose))
-    points = result.points
+    bar, half = box(4, 0.5, 0.5), np.sqrt(0.125)
+    on_edge = quaternion_matrix(about((1, 0, 0), np.pi / 4))
+    across = quaternion_matrix(about((0, 0, 1), np.pi / 2)) @ on_edge
+    placed = (bar, to_matrix(on_edge, 0)), (bar, to_matrix(across, [0, 0, 2 * half - 0.02]))
+    points = ask(device, *placed)[1].points
     check_upward(points)
     assert points["depth"].max() == pytest.approx(0.02, abs=1e-9)
     assert np.abs(points["point"][:, :2]).max() < 0.05
 
 
+def boxes_at(*placed):
+    """Return one model of boxes (extents, place of the middle)."""
+    parts = [trimesh.creation.box(extents).apply_translation(place) for extents, place in placed]
+    return model_of(trimesh.util.concatenate(parts))
+
+
 def test_a_corner_is_pushed_by_floor_and_walls_each_its_own_way(device):
-    corner = trimesh.util.concatenate(
-        [
-            trimesh.creation.box((4, 4, 1)).apply_translation((0, 0, -0.5)),
-            trimesh.creation.box((1, 4, 4)).apply_translation((-2.5, 0, 2)),
-        ]
-    )
-    _, result = ask(device, (model_of(corner), STILL), (box(1, 1, 1), (-1.51, 0.1, 0.495, 0, 0, 0, 1)))
+    corner = boxes_at(((4, 4, 1), (0, 0, -0.5)), ((1, 4, 4), (-2.5, 0, 2)))
+    _, result = ask(device, (corner, STILL), (box(1, 1, 1), (-1.51, 0.1, 0.495, 0, 0, 0, 1)))
     normals = result.points["normal"]
     up, aside = np.abs(normals - [0, 0, 1]).max(1) < 1e-9, np.abs(normals - [1, 0, 0]).max(1) < 1e-9
     assert up.sum() >= 2 and aside.sum() >= 2
@@ -133,12 +127,8 @@ def test_a_loop_points_along_the_area_vector(device, splits):
 def test_separate_contacts_are_separate_loops(device):
     """A table whose four legs stand in a floor, each on faces of its own; its normals point up at every leg."""
     legs = [(x, y) for x in (-1, 1) for y in (-1, 1)]
-    parts = [trimesh.creation.box((0.2, 0.2, 1)).apply_translation((x, y, 0.5)) for x, y in legs]
-    table = model_of(
-        trimesh.util.concatenate([*parts, trimesh.creation.box((3, 3, 0.2)).apply_translation((0, 0, 1.2))])
-    )
-    tile = trimesh.creation.box((1.5, 1.5, 0.5))
-    tiles = model_of(trimesh.util.concatenate([tile.copy().apply_translation((x, y, -0.25)) for x, y in legs]))
+    table = boxes_at(*(((0.2, 0.2, 1), (x, y, 0.5)) for x, y in legs), ((3, 3, 0.2), (0, 0, 1.2)))
+    tiles = boxes_at(*(((1.5, 1.5, 0.5), (x, y, -0.25)) for x, y in legs))
     query, result = ask(device, (tiles, STILL), (table, (0, 0, -0.01, 0, 0, 0, 1)))
     assert len(set(query.curves.loop.numpy()[: result.count[0]].tolist())) == 4
     points = result.points

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from helpers.faults import describe
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
@@ -12,7 +13,7 @@ from warp_abtree.query.cpu_threads import launch_on_cores
 
 MODELS = ("torus", "small ball", "box", "crumbs", "soup", "twins")
 COUNTERS = ("node_tests", "triangle_tests", "exact_tests")
-NAN_BITS = 0x7FF8000000000000
+PAIRS = np.array([(i, j) for i in range(18) for j in range(18) if i != j] + [(0, 18), (18, 3)])
 
 
 def make_scene(device):
@@ -25,43 +26,58 @@ def make_scene(device):
     return scene
 
 
-def pairs():
-    return np.array([(i, j) for i in range(18) for j in range(18) if i != j] + [(0, 18), (18, 3)])
-
-
-def fields(result):
-    """Return the bytes of all that a result answers."""
-    names = ("pairs", "any", "count", "faces", "contacts", "pair_contacts", "apart")
-    found = {name: getattr(result, name) for name in names if getattr(result, name) is not None}
-    return {name: np.ascontiguousarray(array).tobytes() for name, array in found.items()}
-
-
-@pytest.mark.parametrize("real", [np.float64, np.float32])
-@pytest.mark.parametrize("output", ["any", "count", "faces", "contacts"])
-def test_results(device, output, real):
-    options = {"output": output, "within": 0.05, "contact_dtype": real}
-    operator = ab.ContactQuery if output == "contacts" else ab.Query
-    scene = make_scene("cpu")
-    query = operator(scene, pairs=pairs(), within=0.05, **({} if output == "contacts" else {"output": output}))
-    if output == "contacts":
-        query.contact_dtype = real
+@pytest.mark.parametrize("output", ["any", "count", "faces", "contacts", "contacts of float32"])
+def test_one_thread_and_any_device(device, output):
+    options = {"contact_dtype": np.float32} if output.endswith("32") else {}
+    operator, scene = ab.ContactQuery if "contacts" in output else ab.Query, make_scene("cpu")
+    query = operator(scene, pairs=PAIRS, within=0.05, **({} if "contacts" in output else {"output": output}), **options)
     with testing.regime(cpu_threads=1):
         expected = query.run()
-    found = make_scene(device).intersect(pairs(), **options)
-    assert fields(found) == fields(expected)
+    found = make_scene(device).intersect(PAIRS, output.split()[0], within=0.05, **options)
+    assert describe(found) == describe(expected)
     assert expected.any.any() and not expected.any.all()
 
 
-@pytest.mark.parametrize("output", ["any", "count", "faces"])
+def ask_manifolds(device):
+    result = ab.ManifoldQuery(make_scene(device)).run()
+    return [*describe(result), *(result.points[name].tobytes() for name in ("pair", "point", "normal", "depth"))]
+
+
+def ask_pipeline(device):
+    frame = ab.Pipeline(make_scene(device), output="contacts", pairs=PAIRS, capacity=2**17)
+    frame.launch()
+    frame.check()
+    return describe(frame.result())
+
+
+def read_trees(device):
+    scene, names = make_scene(device), ("status", "lower", "upper", "skip", "face_node")
+    states = [scene.tree_state(i) for i in range(scene.object_count)]
+    return [getattr(state, name).tobytes() for state in states for name in names]
+
+
+def ask_sweeps(device):
+    poses = random_poses(np.random.default_rng(9), 400, 1.6)
+    models = sample("torus"), sample("twins")
+    found = [ab.sweep(*models, poses, output=output, device=device) for output in ("any", "count", "faces")]
+    assert all(len(np.unique(values)) > 1 for values in found)
+    return [values.tobytes() for values in found]
+
+
+@pytest.mark.parametrize("ask", [ask_manifolds, ask_pipeline, read_trees, ask_sweeps])
+def test_any_device(device, ask):
+    assert ask(device) == ask("cpu")
+
+
 @pytest.mark.slow
-def test_any_number_of_threads(output):
-    query = ab.Query(make_scene("cpu"), output, pairs=pairs(), within=0.05)
+def test_any_number_of_threads():
+    query = ab.Query(make_scene("cpu"), "faces", pairs=PAIRS, within=0.05)
 
     def ask(threads):
         with testing.regime(cpu_threads=threads):
             result = query.run()
         result.check()
-        return [fields(result), *(getattr(result, name).tolist() for name in COUNTERS)]
+        return [describe(result), *(getattr(result, name).tolist() for name in COUNTERS)]
 
     expected = ask(1)
     for threads in (2, 3, 5):
@@ -69,7 +85,7 @@ def test_any_number_of_threads(output):
 
 
 def test_a_capture_records_all_threads():
-    query = ab.Query(make_scene("cpu"), "faces", pairs=pairs())
+    query = ab.Query(make_scene("cpu"), "faces", pairs=PAIRS)
     with testing.regime(cpu_threads=4):
         expected = query.run().faces
         with wp.ScopedCapture("cpu") as capture:
@@ -88,64 +104,11 @@ def count_item_kernel(count: wp.int32, taken_inout: wp.array(dtype=wp.int32), se
         i = take_slots(taken_inout, 1)
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3, 7])
-def test_threads_take_every_item_once(threads):
-    for count in (1, 15, 16, 17, 1000):
+def test_threads_take_every_item_once_and_raise_what_fails():
+    for threads, count in ((1, 17), (2, 1), (3, 1000), (7, 16), (2, 100)):
         seen, taken = (wp.zeros(length, dtype=wp.int32, device="cpu") for length in (count, 1))
         launch_on_cores(count_item_kernel, count, [count, taken, seen], wp.get_device("cpu"), threads)
         assert (seen.numpy() == 1).all() and taken.numpy()[0] == count + min(threads, count)
-
-
-def test_a_failure_on_a_thread_is_raised():
-    seen, taken = (wp.zeros(length, dtype=wp.int32, device="cpu") for length in (100, 1))
+    taken.zero_()
     with pytest.raises(Exception, match="seen_inout"):
         launch_on_cores(count_item_kernel, 100, [100, taken, 3.5], wp.get_device("cpu"), 2)
-    assert not seen.numpy().any()
-
-
-def test_pairs_without_contacts(device):
-    """Their point and normal are one stated NaN, in the results and in the arrays on the device."""
-    query = ab.ContactQuery(make_scene(device), pairs=pairs())
-    result = query.run()
-    without = result.count == 0
-    assert without.sum() > 2
-    for name in ("point", "normal"):
-        for array in (result.pair_contacts[name], getattr(query.pair_contacts, name).numpy()):
-            assert (np.ascontiguousarray(array[without]).view(np.uint64) == NAN_BITS).all()
-            assert np.isfinite(array[~without]).all()
-    assert (result.pair_contacts["depth"][without].view(np.uint64) == 0).all()
-
-
-def test_manifolds(device):
-    expected, found = (ab.ManifoldQuery(make_scene(where)).run() for where in ("cpu", device))
-    assert fields(found) == fields(expected)
-    for name in ("pair", "point", "normal", "depth"):
-        assert found.points[name].tobytes() == expected.points[name].tobytes()
-
-
-def test_frames(device):
-    """Poses and LODs set on the device."""
-    results = []
-    for where in ("cpu", device):
-        frame = ab.Pipeline(make_scene(where), output="contacts", pairs=pairs(), capacity=2**17)
-        frame.launch()
-        frame.check()
-        results.append(fields(frame.result()))
-    assert results[0] == results[1]
-
-
-def test_trees(device):
-    expected, found = make_scene("cpu"), make_scene(device)
-    for i in range(expected.object_count):
-        one, other = expected.tree_state(i), found.tree_state(i)
-        for name in ("status", "lower", "upper", "skip", "face_node"):
-            assert getattr(other, name).tobytes() == getattr(one, name).tobytes()
-
-
-@pytest.mark.parametrize("output", ["any", "count", "faces"])
-def test_sweeps(device, output):
-    poses = random_poses(np.random.default_rng(9), 400, 1.6)
-    expected, found = (
-        ab.sweep(sample("torus"), sample("twins"), poses, output=output, device=where) for where in ("cpu", device)
-    )
-    assert found.tobytes() == expected.tobytes() and len(np.unique(expected)) > 1

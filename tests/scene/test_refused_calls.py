@@ -20,138 +20,97 @@ def with_entry(array, index, value):
 # What is given, and words that the message needs beside the name of the argument.
 POSES = {
     "not finite": (with_entry(STILL, 1, NAN), "finite"),
-    "infinite": (with_entry(STILL, 0, INF), "finite"),
-    "quaternion not finite": (with_entry(STILL, 5, NAN), "finite"),
+    "quaternion not finite": (with_entry(STILL, 5, INF), "finite"),
     "not normalised": (with_entry(STILL, 6, 1.002), "quaternion", "1.002"),
     "no quaternion": (np.zeros(7), "quaternion"),
-    "too short": (STILL[:6], "shape"),
-    "too long": ([*STILL, 0.0], "shape"),
     "a number": (1.0, "shape"),
     "skewed": (with_entry(TURN, (0, 0), 1e-4), "rigid"),
     "mirror": (np.diag([1.0, 1.0, -1.0, 1.0]), "rigid"),
-    "scaled": (2 * np.eye(4), "rigid"),
     "bad last row": (with_entry(np.eye(4), (3, 0), 1e-9), "rigid"),
     "matrix not finite": (with_entry(np.eye(4), (0, 3), INF), "finite"),
     "3 by 4": (np.eye(4)[:3], "shape"),
     "text": ("origin",),
-    "none": (None,),
     "complex": (np.array(STILL, complex),),
     "ragged": ([0, 0, 0, [0, 0, 0, 1]],),
 }
-OBJECTS = {
-    "no model": (dict(model="box.obj"), "model", "str"),
-    "mesh for a model": (dict(model=None), "model", "NoneType"),
-    "world below -1": (dict(world=-2), "world", "-2"),
-    "world too large": (dict(world=2**31), "world"),
-    "half a world": (dict(world=0.5), "world", "0.5"),
-    "world not finite": (dict(world=NAN), "world", "nan"),
-    "world infinite": (dict(world=INF), "world", "inf"),
-    "world as text": (dict(world="main"), "world", "main"),
-    "no world": (dict(world=None), "world", "None"),
-    "importance": (dict(importance=4), "importance", "4"),
-    "importance not finite": (dict(importance=NAN), "importance"),
-    "LOD below": (dict(lod=-1), "LOD", "-1", "box"),
-    "LOD above": (dict(lod=BOX_TOP + 1), "LOD", str(BOX_TOP + 1), "box"),
-    "half a LOD": (dict(lod=1.5), "LOD", "1.5"),
-    "LOD not finite": (dict(lod=NAN), "LOD", "nan"),
-    "LOD as text": (dict(lod="fine"), "LOD", "fine"),
-    "LOD as truth": (dict(lod=True), "LOD", "True"),
-    "static as text": (dict(static="no"), "static"),
-    "static as a number": (dict(static=1), "static"),
-    "no static": (dict(static=None), "static"),
-    "static as an array": (dict(static=np.array([True])), "static"),
-}
-LODS = {
-    "too few": ([1, 2], "(2,)", "3"),
-    "too many": ([1, 2, 3, 4], "(4,)", "3"),
-    "a column": ([[1], [2], [3]], "(3, 1)"),
-    "one for all": (3, "()"),
-    "below": ([1, -1, 2], "object 1", "-1"),
-    "above": ([1, BOX_TOP + 1, 2], "object 1", str(BOX_TOP + 1)),
-    "far above": ([1, 2, 2**62], "object 2"),
-    "halves": ([1, 0.5, 2],),
-    "not finite": ([1, NAN, 2],),
-    "infinite": ([1.0, INF, 2],),
-    "text": (["a", "b", "c"],),
-    "none": ([None] * 3,),
-    "truths": ([True, False, True],),
-    "ragged": ([1, [2], 3],),
-}
-PAIRS = {
-    "no such object": ([(0, 1), (0, 3)], "pair 1", "(0, 3)"),
-    "negative": ([(-1, 0)], "pair 0", "(-1, 0)"),
-    "huge": ([(0, 2**40)], "pair 0"),
-    "with itself": ([(0, 1), (1, 2), (2, 2)], "pair 2", "itself"),
-    "triples": ([(0, 1, 2)], "(1, 3)"),
-    "a row": ([0, 1], "(2,)"),
-    "halves": ([(0, 0.5)], "float64"),
-    "floats": ([(0.0, 1.0)], "float64"),
-    "truths": ([(False, True)], "bool"),
-    "text": ("all of them",),
-    "ragged": ([(0, 1), (1,)],),
-}
+OBJECTS = [
+    (dict(model="box.obj"), "model", "str"),
+    (dict(model=None), "model", "NoneType"),
+    (dict(world=-2), "world", "-2"),
+    (dict(world=0.5), "world", "0.5"),
+    (dict(world=NAN), "world", "nan"),
+    (dict(importance=4), "importance", "4"),
+    (dict(lod=-1), "LOD", "-1", "box"),
+    (dict(lod=BOX_TOP + 1), "LOD", str(BOX_TOP + 1), "box"),
+    (dict(lod=1.5), "LOD", "1.5"),
+    (dict(lod=True), "LOD", "True"),
+    (dict(static=1), "static"),
+]
+LODS = [
+    ([1, 2], "(2,)", "3"),
+    (3, "()"),
+    ([1, -1, 2], "object 1", "-1"),
+    ([1, BOX_TOP + 1, 2], "object 1", str(BOX_TOP + 1)),
+    ([1, 2, 2**62], "object 2"),
+    ([1, NAN, 2],),
+    (["a", "b", "c"],),
+    ([True, False, True],),
+    ([1, [2], 3],),
+]
+PAIRS = [
+    ([(0, 1), (0, 3)], "pair 1", "(0, 3)"),
+    ([(-1, 0)], "pair 0", "(-1, 0)"),
+    ([(0, 1), (1, 2), (2, 2)], "pair 2", "itself"),
+    ([(0, 1, 2)], "(1, 3)"),
+    ([(0.0, 1.0)], "float64"),
+    ([(False, True)], "bool"),
+    ("all of them",),
+    ([(0, 1), (1,)],),
+]
 OPTIONS = [
     (dict(output="some"), "output", "'some'"),
-    (dict(output=None), "output", "None"),
-    (dict(precision="float16"), "precision", "'float16'"),
     (dict(precision="float64"), "precision", "'float64'"),
-    *[(dict(within=x), "within") for x in (-1, -1e-300, NAN, INF, [1, 2, 3], [[1]], [1, -1], [1, NAN], "1", [], True)],
+    *[(dict(within=x), "within") for x in (-1e-300, NAN, INF, [1, 2, 3], [[1]], [1, -1], "1", [], True)],
 ]
-ROOMS = [0, -1, 2**31, NAN, INF, "many"]
-DTYPES = [np.int32, np.int64, np.float16, "double trouble", np.complex128]
-
-
-def three_poses(case):
-    """Return poses of which the second of three is bad, and whether a message can say which."""
-    pose = POSES[case][0]
-    array = np.asarray(pose) if case not in ("ragged", "none") else None
-    good = np.eye(4) if array is not None and array.ndim == 2 else np.array(STILL)
-    if array is not None and array.shape == good.shape and array.dtype.kind == "f":
-        return np.stack([good, array, good]), True
-    return (pose if case in ("none", "text") else [pose] * 3), False
 
 
 def refused_calls():
     """Yield (name, call of a scene of three objects, words that the error needs)."""
+    box, two = sample("box"), [(0, 1), (1, 0)]
     for name, (pose, *words) in POSES.items():
-        yield f"add at a pose {name}", lambda scene, pose=pose: scene.add(sample("box"), pose), ["pose", *words]
-        poses, numbered = three_poses(name)
-        words = ["pose", *words, *"1" * numbered]
-        yield f"set_poses {name}", lambda scene, poses=poses: scene.set_poses(poses), words
-    for count in (0, 2, 4):
-        poses = np.tile(STILL, (count, 1))
-        yield f"{count} poses", lambda scene, poses=poses: scene.set_poses(poses), ["poses", str(count), "3"]
-    for name, (options, *words) in OBJECTS.items():
-        options = {"model": "box", **options}
-        if options["model"] == "box":
-            yield f"add {name}", lambda scene, o=options: scene.add(**{**o, "model": sample("box")}), words
-        else:
-            yield f"add {name}", lambda scene, options=options: scene.add(**options), words
-    for name, (lods, *words) in LODS.items():
-        yield f"set_lods {name}", lambda scene, lods=lods: scene.set_lods(lods), ["lods", *words]
-    for name, (pairs, *words) in PAIRS.items():
+        yield f"add {name}", lambda scene, pose=pose: scene.add(box, pose), ["pose", *words]
+        poses = [pose] * 3 if name != "text" else pose
+        if isinstance(pose, np.ndarray) and pose.dtype == float and pose.shape in ((7,), (4, 4)):
+            good = np.eye(4) if pose.ndim == 2 else np.array(STILL)
+            poses, words = np.stack([good, pose, good]), [*words, "1"]
+        yield f"set_poses {name}", lambda scene, poses=poses: scene.set_poses(poses), ["pose", *words]
+    yield "too many poses", lambda scene: scene.set_poses(np.tile(STILL, (4, 1))), ["poses", "4", "3"]
+    for options, *words in OBJECTS:
+        yield f"add {options}", lambda scene, o=options: scene.add(**{"model": box, **o}), words
+    for lods, *words in LODS:
+        yield f"set_lods {lods}", lambda scene, lods=lods: scene.set_lods(lods), ["lods", *words]
+    for pairs, *words in PAIRS:
         words = ["pairs", *words]
-        yield f"intersect {name}", lambda scene, pairs=pairs: scene.intersect(pairs), words
-        yield f"filter {name}", lambda scene, pairs=pairs: scene.filter(pairs), words
-        yield f"query {name}", lambda scene, pairs=pairs: ab.Query(scene, pairs=pairs), words
-    two = [(0, 1), (1, 0)]
+        yield f"intersect {pairs}", lambda scene, pairs=pairs: scene.intersect(pairs), words
+        yield f"filter {pairs}", lambda scene, pairs=pairs: scene.filter(pairs), words
+        yield f"query {pairs}", lambda scene, pairs=pairs: ab.Query(scene, pairs=pairs), words
     for options, *words in OPTIONS:
         yield f"intersect {options}", lambda scene, options=options: scene.intersect(two, **options), words
         yield f"query {options}", lambda scene, options=options: ab.Query(scene, pairs=two, **options), words
     yield "distances of found pairs", lambda scene: ab.Query(scene, within=[1, 2]), ["within"]
     yield "query of contacts", lambda scene: ab.Query(scene, "contacts", pairs=two), ["ab.ContactQuery"]
     yield "contacts precision", lambda scene: ab.ContactQuery(scene, two, precision="best"), ["precision"]
-    for dtype in DTYPES:
+    for dtype in (np.int32, np.float16, "double trouble"):
         words = ["contact_dtype"]
         yield f"contact {dtype}", lambda s, dtype=dtype: s.intersect(two, "contacts", contact_dtype=dtype), words
         yield f"contacts {dtype}", lambda s, dtype=dtype: ab.ContactQuery(s, two, contact_dtype=dtype), words
-    for room in ROOMS:
+    for room in (0, 2**31, NAN, "many"):
         yield f"query {room}", lambda s, room=room: ab.Query(s, capacity=room), ["capacity", str(room)]
         yield f"contacts {room}", lambda s, room=room: ab.ContactQuery(s, capacity=room), ["capacity", str(room)]
         for name in ("hits", "pairs", "uncertain"):
             words = [f"buffers: {name} ", str(room)]
             yield f"{name} {room}", lambda _, name=name, room=room: ab.Buffers(**{name: room}), words
-    for i in (-1, 3, 2**40, 0.5, NAN, INF, "first", None):
+    for i in (-1, 3, 0.5, "first", None):
         yield f"tree_state {i}", lambda scene, i=i: scene.tree_state(i), ["object", str(i)]
 
 
@@ -168,9 +127,7 @@ def test_a_refused_call_leaves_no_trace(device, case):
         call(scene)
     assert type(caught.value) is error
     message = str(caught.value)
-    assert "\n" not in message
-    for word in words:
-        assert word in message
+    assert "\n" not in message and all(word in message for word in words), message
     assert scene.batch() is batch, "a refused call makes nothing anew"
     assert everything(scene) == before
 
@@ -180,7 +137,7 @@ def test_contacts_beyond_any_memory(device):
         ab.ContactQuery(pair_scene(device), [(0, 1)], capacity=2**30)
 
 
-@pytest.mark.parametrize("name", ["cuda:99", "tpu", 7, ""])
+@pytest.mark.parametrize("name", ["cuda:99", 7, ""])
 def test_missing_devices_are_named(name):
     with pytest.raises(ValueError, match=r"no device .* cpu"):
         ab.Scene(name)
@@ -188,8 +145,7 @@ def test_missing_devices_are_named(name):
 
 def test_an_empty_scene(device):
     scene = ab.Scene(device)
-    assert scene.object_count == 0 and len(scene.lods) == 0
-    assert scene.broad_phase().shape == (0, 2)
+    assert scene.object_count == 0 and len(scene.lods) == 0 and scene.broad_phase().shape == (0, 2)
     for call in (
         lambda: scene.set_lods([]),
         lambda: scene.set_poses(np.empty((0, 7))),

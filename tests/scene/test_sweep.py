@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
-from helpers.gpu_query import GpuQuery
+from helpers.questions import GpuQuery
 from helpers.samples import SHAPES, STILL, random_poses, sample
 
 import warp_abtree as ab
@@ -56,30 +56,6 @@ def test_same_as_a_scene(device, names, precision, small_chunks):
             assert found.dtype == getattr(expected, output).dtype
 
 
-@pytest.mark.parametrize("real", [np.float32, np.float64])
-def test_poses_of_every_kind(device, real, small_chunks):
-    """Rows and transforms, on the host and on the device, whole and in part; float32 counts as what it is."""
-    models, poses = [sample("torus"), sample("soup")], mixed_poses(2).astype(real)
-    expected = ask_scene(device, models, poses.astype(np.float64), [None, None], output="count")
-    assert 3 < expected.any.sum() < 26
-    scalar, transform = pose_sweep.SCALARS[poses.dtype], {4: wp.transformf, 8: wp.transformd}[poses.itemsize]
-    apart = np.zeros((2 * len(poses), 7), real)
-    apart[::2] = poses
-    for asked in (
-        poses,
-        poses.tolist(),
-        apart[::2],
-        wp.array(poses, dtype=scalar, device=device),
-        wp.array(apart, dtype=scalar, device=device)[::2],
-        wp.array(poses, dtype=transform, device=device),
-        wp.array(apart, dtype=transform, device=device)[::2],
-        wp.array(poses, dtype=transform, device="cpu"),
-    ):
-        for output in ("any", "count"):
-            found = ab.sweep(*models, asked, output=output, device=device)
-            np.testing.assert_array_equal(found, getattr(expected, output))
-
-
 def test_more_poses_than_before_and_fewer(device, monkeypatch):
     monkeypatch.setattr(pose_sweep, "CHUNKS", (2, 5, 20))
     models, poses = [sample("torus"), sample("soup")], mixed_poses()
@@ -92,9 +68,8 @@ def test_more_poses_than_before_and_fewer(device, monkeypatch):
     assert sorted(next(iter(pose_sweep._kept.values())).chunks) == [2, 5, 20]
 
 
-@pytest.mark.parametrize("output", ["any", "count", "faces"])
 @pytest.mark.slow
-def test_lists_that_overflow_lose_nothing(device, output, monkeypatch, small_chunks):
+def test_lists_that_overflow_lose_nothing(device, monkeypatch, small_chunks):
     """The CUDA regime, with room for one uncertain face pair; boxes lie flush."""
     box = sample("box")
     poses = np.tile(np.array(STILL), (20, 1))
@@ -102,26 +77,18 @@ def test_lists_that_overflow_lose_nothing(device, output, monkeypatch, small_chu
     expected = ask_scene(device, [box, box], poses, [None, None], output="faces")
     assert expected.any[:11].all() and not expected.any[11:].any()
     monkeypatch.setattr(pose_sweep, "Query", partial(GpuQuery, capacity=ab.Buffers(uncertain=1)))
-    found = ab.sweep(box, box, poses, output=output, device=device)
-    np.testing.assert_array_equal(found, getattr(expected, output))
+    np.testing.assert_array_equal(ab.sweep(box, box, poses, output="faces", device=device), expected.faces)
     (posed,) = pose_sweep._kept.values()
     assert len(posed.chunks[7].chunk_query.query.hits.uncertain) > 1
 
 
-def test_no_poses(device):
-    torus = sample("torus")
-    for output, shape in (("any", (0,)), ("count", (0,)), ("faces", (0, 3))):
-        assert ab.sweep(torus, torus, np.empty((0, 7)), output=output, device=device).shape == shape
-
-
-@pytest.mark.parametrize("output", ["any", "faces"])
 @pytest.mark.parametrize("kind", ["host", "device"])
-def test_the_first_bad_pose_is_named(device, output, kind, small_chunks):
+def test_the_first_bad_pose_is_named(device, kind, small_chunks):
     torus, poses = sample("torus"), mixed_poses()
 
     def ask(asked):
         asked = wp.array(asked, dtype=wp.float64, device=device) if kind == "device" else asked
-        return ab.sweep(torus, torus, asked, output=output, device=device)
+        return ab.sweep(torus, torus, asked, output="faces", device=device)
 
     expected = ask(poses)
     for column, factor, what in (
@@ -140,25 +107,20 @@ def test_the_first_bad_pose_is_named(device, output, kind, small_chunks):
     assert len(ab.sweep(torus, torus, just, device=device)) == len(poses)
 
 
-REFUSED = [
-    ("shape", {"poses": np.zeros((2, 6))}),
-    ("shape", {"poses": np.tile(np.eye(4), (3, 1, 1))[:, :3]}),
-    ("matrix 2 is not rigid", {"poses": np.eye(4) * [[[1.0]], [[1.0]], [[2.0]]]}),
-    ("no real numbers", {"poses": np.array([STILL, STILL], complex)}),
-    ("LOD", {"lod_b": 10**6}),
-    ("output 'all'", {"output": "all"}),
-    ("ContactQuery", {"output": "contacts"}),
-    ("precision 'half'", {"precision": "half"}),
-    ("no device", {"device": "cuda:99"}),
-    ("not a Model", {"model_b": "torus"}),
-]
-
-
-@pytest.mark.parametrize(("what", "options"), REFUSED)
-def test_refused(device, what, options):
-    asked = {"model_a": sample("torus"), "model_b": sample("torus"), "poses": [STILL, STILL], "device": device}
-    with pytest.raises(TypeError if what == "not a Model" else ValueError, match=what):
-        ab.sweep(**{**asked, **options})
+def test_refused(device):
+    torus = sample("torus")
+    asked = {"model_a": torus, "model_b": torus, "poses": [STILL, STILL], "device": device}
+    for what, options in (
+        ("shape", {"poses": np.zeros((2, 6))}),
+        ("matrix 2 is not rigid", {"poses": np.eye(4) * [[[1.0]], [[1.0]], [[2.0]]]}),
+        ("LOD", {"lod_b": 10**6}),
+        ("ContactQuery", {"output": "contacts"}),
+        ("precision 'half'", {"precision": "half"}),
+        ("no device", {"device": "cuda:99"}),
+        ("not a Model", {"model_b": "torus"}),
+    ):
+        with pytest.raises(TypeError if what == "not a Model" else ValueError, match=what):
+            ab.sweep(**{**asked, **options})
     assert not pose_sweep._kept
 
 
@@ -169,23 +131,20 @@ def new_model(name="box"):
     return ab.Model.from_arrays(*SHAPES[name](), base_faces=4)
 
 
-def test_a_pair_of_models_is_set_up_once(device, monkeypatch):
+def test_a_pair_of_models_is_set_up_once(device):
     """Models, states and, for the same output, buffers."""
-    made = []
-    monkeypatch.setattr(pose_sweep, "_PosedModels", lambda *x, kind=pose_sweep._PosedModels: made.append(1) or kind(*x))
     a, b, poses = new_model(), new_model("torus"), mixed_poses()
     first = ab.sweep(a, b, poses, device=device)
     (posed,) = pose_sweep._kept.values()
     (chunk,) = posed.chunks.values()
     kept = chunk.chunk_query
     assert np.array_equal(ab.sweep(a, b, poses, device=device), first)
-    assert chunk.chunk_query is kept and made == [1]
+    assert chunk.chunk_query is kept and [*pose_sweep._kept.values()] == [posed]
     ab.sweep(a, b, poses, output="count", device=device)
-    assert chunk.chunk_query is not kept and made == [1], "of one output, so that memory stays bounded"
-    for options in ({"lod_a": 0}, {"lod_b": 3}):
-        ab.sweep(a, b, poses, device=device, **options)
-    ab.sweep(b, a, poses, device=device)
-    assert made == [1] * 4
+    assert chunk.chunk_query is not kept and [*pose_sweep._kept.values()] == [posed], "of one output: memory is bounded"
+    for models, options in (((a, b), {"lod_a": 0}), ((a, b), {"lod_b": 3}), ((b, a), {})):
+        ab.sweep(*models, poses, device=device, **options)
+    assert len(pose_sweep._kept) == 4
 
 
 def test_what_is_kept_is_bounded_and_goes_with_its_models(device):
@@ -233,8 +192,8 @@ def test_two_threads(device):
         thread.start()
     for thread in threads:
         thread.join()
-    for i in range(2):
-        assert len(found[i]) == 10 and all(np.array_equal(x, expected[i]) for x in found[i])
+    for answers, values in zip(found, expected, strict=True):
+        assert len(answers) == 10 and all(np.array_equal(answer, values) for answer in answers)
     if stream is not None:  # where they do not, Warp may be left on the null stream, which cannot be captured
         assert wp.get_stream(device) is stream
         with wp.ScopedCapture(device):
@@ -242,8 +201,7 @@ def test_two_threads(device):
 
 
 def test_threads_take_turns_on_a_gpu_alone():
-    gpus = [SimpleNamespace(is_cuda=True, alias=f"cuda:{i}") for i in (98, 98, 99)]
-    cpu = SimpleNamespace(is_cuda=False, alias="cpu")
+    first, same, other = (SimpleNamespace(is_cuda=True, alias=f"cuda:{i}") for i in (98, 98, 99))
 
     def enters(device):
         """Whether another thread has a turn at once while this one has one on the first GPU."""
@@ -253,7 +211,7 @@ def test_threads_take_turns_on_a_gpu_alone():
             with device_lock(device):
                 entered.set()
 
-        with device_lock(gpus[0]), device_lock(gpus[0]):  # within its own turn a thread may ask again
+        with device_lock(first), device_lock(first):  # within its own turn a thread may ask again
             thread = threading.Thread(target=work)
             thread.start()
             at_once = entered.wait(0.2)
@@ -261,4 +219,4 @@ def test_threads_take_turns_on_a_gpu_alone():
         assert entered.is_set()
         return at_once
 
-    assert not enters(gpus[1]) and enters(gpus[2]) and enters(cpu)
+    assert not enters(same) and enters(other) and enters(SimpleNamespace(is_cuda=False, alias="cpu"))

@@ -53,25 +53,17 @@ def test_nothing_is_loaded_after_the_warm_up(device, kind):
     assert changed >= 3 and hits > 0
 
 
-class InWorlds(ab.Kinematic):
-    """Motion of the objects of worlds 0, 1, ... and of one, the last, that is in all of them."""
-
-    def __init__(self, worlds):
-        rng = np.random.default_rng(7)
-        rows = [(rng.uniform(-0.8, 0.8, (4, 3)), rng.uniform(-1, 1, (4, 3)), rng.uniform(1, 3, 4)) for _ in range(3)]
-        place, velocity, rate = (np.concatenate([rows[w][k] for w in worlds]) for k in range(3))
-        shared = np.zeros((1, 3))
-        super().__init__(
-            np.concatenate([place, shared]),
-            velocity=np.concatenate([velocity, shared]),
-            axis=(1, 2, 3),
-            rate=np.append(rate, 0.0),
-        )
+def motion_of(worlds):
+    """Return the motion of the objects of some worlds and of one, the last, that is in all of them."""
+    rng = np.random.default_rng(7)
+    rows = [(rng.uniform(-0.8, 0.8, (4, 3)), rng.uniform(-1, 1, (4, 3)), rng.uniform(1, 3, 4)) for _ in range(3)]
+    place, velocity, rate = (np.concatenate([*(rows[w][k] for w in worlds), 0 * rows[0][k][:1]]) for k in range(3))
+    return ab.Kinematic(place, velocity=velocity, axis=(1, 2, 3), rate=rate)
 
 
 def run_worlds(device, worlds, kind, moved):
     """Run some of three worlds together; return LODs, pairs and hits by world and frame."""
-    scene, motion = ab.Scene(device=device), InWorlds(worlds)
+    scene, motion = ab.Scene(device=device), motion_of(worlds)
     for place, world in enumerate(worlds):
         for i in range(4):
             scene.add(ring_and_ball()[i % 2], world=place, importance=1 + (world + i) % 3)
@@ -80,8 +72,7 @@ def run_worlds(device, worlds, kind, moved):
     camera = Camera.look_at((0, 0, 3), (0, 0, 0), far=10.0)
     lods = PaperController(scene, 8.0, camera) if kind == "paper" else ToleranceController(scene, 0.01, camera)
     if moved == "bodies":
-        velocity = np.array(motion.velocity)
-        motion = ab.Dynamics(scene, restitution=0.4, gravity=(0, 0, -3), velocity=velocity).motion()
+        motion = ab.Dynamics(scene, restitution=0.4, gravity=(0, 0, -3), velocity=motion.velocity).motion()
     ticks = np.cumsum(np.random.default_rng(3).uniform(0, 1.5e-3, 30 * (len(STAGES) + 1)))
     frame = ab.Frame(scene, motion, lods, clock=iter(ticks.tolist()).__next__, output="faces")
     found = {world: [] for world in worlds}

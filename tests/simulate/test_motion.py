@@ -1,4 +1,4 @@
-"""Prescribed motion against closed forms and a bouncing point, and the quaternions that it turns by."""
+"""Prescribed motion against closed forms, and the quaternions that it turns by."""
 
 import math
 
@@ -21,16 +21,6 @@ def rodrigues(axis, angle, vector):
     axis, vector = np.asarray(axis) / np.linalg.norm(axis), np.asarray(vector)
     along = axis * (axis @ vector)
     return along + (vector - along) * math.cos(angle) + np.cross(axis, vector) * math.sin(angle)
-
-
-def bounce(start, way, period, phase, time, steps=20_000):
-    """Walk from one end to the other and back in small steps, turning round at the ends."""
-    s, direction = 0.0, 1.0
-    for _ in range(round(steps * (time / period + phase))):
-        s += direction * 2.0 / steps
-        if s >= 1.0 - 1e-9 or s <= 1e-9:
-            direction = -direction
-    return np.asarray(start) + s * np.asarray(way)
 
 
 def test_motion_in_a_straight_line():
@@ -56,11 +46,10 @@ def test_turning_follows_rodrigues():
             assert np.allclose(rotate(poses[i, 3:], vector), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("time", [0.0, 1.3, 5.9])
-def test_shuttle_reflects_at_its_ends(time):
-    start, way = [0.5, 0.0, 1.0], [1.0, -2.0, 0.5]
-    motion = ab.Kinematic(position=[start], shuttle=way, period=2.0, phase=0.25)
-    assert np.allclose(motion.poses(time)[0, :3], bounce(start, way, 2.0, 0.25, time), atol=1e-3)
+@pytest.mark.parametrize(("time", "way"), [(0.0, 0.5), (0.5, 1.0), (0.8, 0.7), (1.5, 0.0), (1.7, 0.2), (6.5, 1.0)])
+def test_shuttle_reflects_at_its_ends(time, way):
+    motion = ab.Kinematic(position=[[0.5, 0.0, 1.0]], shuttle=[1.0, -2.0, 0.5], period=2.0, phase=0.25)
+    assert np.allclose(motion.poses(time)[0, :3], [0.5 + way, -2.0 * way, 1.0 + 0.5 * way])
 
 
 @pytest.mark.parametrize(

@@ -94,17 +94,6 @@ def test_a_frame_steps_and_reports(device):
     assert max(row.intersecting for row in frame.history) > 4
 
 
-def test_a_frame_drives_kinematic_objects(device):
-    scene = ab.Scene(device)
-    scene.add(GROUND, pose=FLOOR)
-    scene.add(CUBE, pose=(0, 0, 0.4985, 0, 0, 0, 1))
-    dynamics = ab.Dynamics(scene, kinematic=[True, False])
-    path = ab.Kinematic(position=[FLOOR[:3], (9, 9, 9)], velocity=[(0.3, 0, 0), (0, 0, 0)])
-    ab.Frame(scene, motion=dynamics.motion(path), time_step=0.01).run(50)
-    np.testing.assert_allclose(dynamics.poses()[0], [0.15, 0, -0.5, 0, 0, 0, 1], atol=1e-15)
-    assert dynamics.velocities()[0][1, 0] == pytest.approx(0.3, abs=0.01)
-
-
 def test_poses_that_a_user_sets(device):
     dynamics = on_ground(device, (BRICK, (0, 0, 3, 0, 0, 0, 1)))
     run(dynamics, 10)

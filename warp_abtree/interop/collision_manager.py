@@ -186,7 +186,7 @@ class CollisionManager:
         return _join(any_hit, (return_names, {tuple(sorted(names)) for names in hits}), (return_data, contacts))
 
     def in_collision_other(self, other_manager, return_names=False, return_data=False):
-        """Return whether any object collides with one of another manager, alone or first of a tuple. Waits.
+        """Return whether any object collides with one of another manager, alone or first of a tuple.
 
         Args:
             other_manager: `CollisionManager`, of any device.
@@ -216,15 +216,14 @@ class CollisionManager:
         return _join(distance, (return_name, pair and pair[0]), (return_data, data))
 
     def min_distance_internal(self, name=None, return_names=False, return_data=False):
-        """Return the least distance of two objects, or of one from the others. Waits for the device.
+        """Return the least distance [world units] of two objects, or of one from the others. Waits for the device.
+
+        0 if they collide, infinite without two objects; alone or first of a tuple.
 
         Args:
             name: One of the two objects; None for any.
             return_names: Return the two names too, a tuple in alphabetical order; None without two objects.
             return_data: Return a `DistanceData` too; None without two objects.
-
-        Returns:
-            Distance [world units], 0 if they collide, infinite without two objects; alone or first of a tuple.
 
         Raises:
             ValueError: No object has this name.
@@ -239,15 +238,14 @@ class CollisionManager:
         return _join(distance, (return_names, pair and tuple(sorted(pair))), (return_data, data))
 
     def min_distance_other(self, other_manager, return_names=False, return_data=False):
-        """Return the least distance of an object here from one of another manager. Waits for the device.
+        """Return the least distance [world units] of an object from one of another manager. Waits for the device.
+
+        0 if they collide, infinite without two objects; alone or first of a tuple.
 
         Args:
             other_manager: `CollisionManager`, of any device.
             return_names: Return the names too, a tuple (name here, name there); None if a manager is empty.
             return_data: Return a `DistanceData` too; None if a manager is empty.
-
-        Returns:
-            Distance [world units], 0 if they collide, infinite without two objects; alone or first of a tuple.
 
         Raises:
             TypeError: Not a `CollisionManager` of this library.

@@ -92,13 +92,14 @@ class Result:
         # On the CPU numpy() shares the memory that the next launch writes.
         for name in COUNTERS:
             setattr(self, name, getattr(hits, name).numpy()[:p].copy())
-        self.count: Any = hits.count.numpy()[:p].copy() if query.output != "any" else None
+        count: Any = hits.count.numpy()[:p].copy() if query.output != "any" else None
+        self.count = count
         self.faces: Any = None
         self.contacts: Any = None
         self.pair_contacts: Any = None
         self.points: Any = None
         if query.output == "faces":
-            self._hit_demand = int(hits.count.numpy()[:p].sum())
+            self._hit_demand = int(count.sum())
             self._read_hits(query)
 
     def _read_hits(self, query):

@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.device_lock import device_lock
-from warp_abtree.kernels.sweep import NONE_REFUSED, place_matrix_kernel, place_quaternion_kernel, report_chunk_kernel
+from warp_abtree.kernels.sweep import NONE_REFUSED, pose_placer, report_chunk_kernel
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE, check_poses, device_rows
@@ -28,8 +28,8 @@ KEPT_PAIRS = 4
 KEPT_ROWS = 2**20
 
 SCALARS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
-# Numbers of a row, and what sets objects from rows: quaternions, and matrices.
-PLACING = {7: (place_quaternion_kernel, QUATERNION_TOLERANCE), 16: (place_matrix_kernel, RIGID_TOLERANCE)}
+# By the numbers of a row: quaternions, and matrices.
+TOLERANCE = {7: QUATERNION_TOLERANCE, 16: RIGID_TOLERANCE}
 ANSWERS = {"any": np.dtype(bool), "count": np.dtype(np.int64)}
 
 _kept: dict[tuple, "_PosedModels"] = {}
@@ -195,8 +195,8 @@ class _ChunkQuery:
 
     def _place(self, slot):
         slot.report.fill_(NONE_REFUSED)
-        kernel, tolerance = PLACING[slot.width]
-        inputs = [wp.float64(tolerance), slot.poses, self.objects.pool, slot.report]
+        kernel = pose_placer(slot.poses.dtype, slot.width)
+        inputs = [wp.float64(TOLERANCE[slot.width]), slot.poses, self.objects.pool, slot.report]
         wp.launch(kernel, self.count, inputs, device=self.device)
 
     def _launch(self, slot):

@@ -61,7 +61,6 @@ class MassProperties:
         moments: Principal moments of inertia about the centre, ascending, float64 (3,).
         axes: Principal axes, a rotation matrix with unit columns, float64 (3, 3).
         bounding_radius: Largest distance of a vertex from the centre [units].
-        convex_hull: Whether they are those of the convex hull, because the mesh is not closed.
     """
 
     volume: float
@@ -69,7 +68,10 @@ class MassProperties:
     moments: np.ndarray
     axes: np.ndarray
     bounding_radius: float
-    convex_hull: bool
+
+
+IMMOVABLE = MassProperties(np.inf, np.zeros(3), np.full(3, np.inf), np.eye(3), np.inf)
+"""What stands for the mass properties of an object that is no rigid body."""
 
 
 def mass_properties(model: Model) -> MassProperties:
@@ -86,8 +88,7 @@ def mass_properties(model: Model) -> MassProperties:
     mesh = trimesh.Trimesh((vertices - middle) / size, faces, process=False, validate=False)
     flat = f"model {model.name!r} is flat: it has no mass, so it must be static"
     with np.errstate(all="ignore"):
-        convex_hull = not mesh.is_volume
-        if convex_hull:
+        if not mesh.is_volume:
             try:
                 mesh = mesh.convex_hull
             except ImportError as error:
@@ -110,7 +111,6 @@ def mass_properties(model: Model) -> MassProperties:
         moments=moments * size**5,
         axes=axes,
         bounding_radius=float(radius * size),
-        convex_hull=convex_hull,
     )
 
 
@@ -152,13 +152,11 @@ class RigidBodies:
         models = sorted({scene.object_model[i] for i in np.flatnonzero(rigid)})
         found = {m: mass_properties(scene.models[m]) for m in models}
         self.properties = [found[m] if r else None for m, r in zip(scene.object_model, rigid)]
-        self.mass, self._moments = np.full(n, np.inf), np.full((n, 3), np.inf)
-        self._centre, self._axes = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
-        radius, rank = np.full(n, np.inf), np.zeros(n, np.int64)
-        for i in np.flatnonzero(rigid):
-            own = found[scene.object_model[i]]
-            self.mass[i], self._moments[i] = density[i] * own.volume, density[i] * own.moments
-            self._centre[i], self._axes[i], radius[i] = own.centre, own.axes, own.bounding_radius
+        own = [IMMOVABLE if found is None else found for found in self.properties]
+        self.mass = density * [found.volume for found in own]
+        self._moments = density[:, None] * [found.moments for found in own]
+        self._centre, self._axes = np.array([found.centre for found in own]), np.array([found.axes for found in own])
+        radius, rank = np.array([found.bounding_radius for found in own]), np.zeros(n, np.int64)
         rank[rigid] = _ranks(self._objects.pool.world.numpy()[rigid])
         if sleep_speed is None:
             sleep_speed = SLEEP_SPEED * np.sqrt(np.linalg.norm(self.gravity) * np.where(rigid, radius, 0.0))

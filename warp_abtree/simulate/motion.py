@@ -7,8 +7,7 @@ import numpy as np
 
 from warp_abtree.checks.arguments import broadcast_rows
 from warp_abtree.checks.quaternions import multiply_quaternions, quaternions_about
-
-NORM_TOLERANCE = 1e-3
+from warp_abtree.scene.poses import check_poses
 
 
 def triangle_wave(phase) -> np.ndarray:
@@ -64,10 +63,8 @@ class Kinematic:
                 raise ValueError(f"{name}: a number is not finite")
         if not (self.period > 0).all():
             raise ValueError("period: not above 0")
-        norm = np.linalg.norm(self.rotation, axis=1, keepdims=True)
-        if (np.abs(norm - 1) > NORM_TOLERANCE).any():
-            raise ValueError("rotation: the norm of a quaternion is off 1 by more than 1e-3")
-        self.rotation /= norm
+        check_poses(np.concatenate([self.position, self.rotation], axis=1), "rotation")
+        self.rotation /= np.linalg.norm(self.rotation, axis=1, keepdims=True)
         length = np.linalg.norm(self.axis, axis=1, keepdims=True)
         if ((length[:, 0] == 0) & (self.rate != 0)).any():
             raise ValueError("axis: an object rotates about an axis of length 0")

@@ -1,6 +1,6 @@
 """The paper's experiments again: `python -m bench paper --out DIR`."""
 
-from . import budget, cache, meshes, simplify, static, update
+from . import budget, meshes, static, update
 
 PARTS = {
     "table1": meshes.run,
@@ -8,13 +8,10 @@ PARTS = {
     "share": update.run_share,
     "static": static.run,
     "figure4": budget.run,
-    "simplify": simplify.run,
-    "cache": cache.run,
 }
 SUMMARIES = {
     "fit_figure_6": update.fit_figure_6,
     "fitted_moves": update.fitted_moves,
     "step_sizes": budget.step_sizes,
     "thin": update.thin,
-    "compare_simplifiers": simplify.compare_simplifiers,
 }

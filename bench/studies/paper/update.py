@@ -1,7 +1,5 @@
 """Figure 6: the update against k, with the crossover, and the update's share of the query time."""
 
-import math
-
 import numpy as np
 
 import warp_abtree as ab
@@ -10,6 +8,7 @@ from warp_abtree.testing import upload_lods
 
 from ...cases.update import REFITS, bound_nodes, check_update
 from ...tables import pick
+from ...timing import crossover
 from .meshes import PosedPairs, paper_models
 
 # Fractions of the splits between the finest LOD and the other; the last is the base mesh, where k = n.
@@ -22,7 +21,7 @@ CONFIGURATIONS = (("touching", 0.001), ("light", 0.03), ("deep", 0.2))
 
 
 def run_figure_6(context):
-    """Yield one row a model and k, and one a model and k of random faces, only counted.
+    """Yield one row a model and k.
 
     A model goes from its finest level of detail to a coarser one; k faces change. Marking and refit are timed alone, as
     the paper's figure 6 has them, as captured launches (one core on the CPU), beside a refit of the whole tree. Nodes
@@ -38,22 +37,6 @@ def run_figure_6(context):
         least = int(np.argmin(np.diff(model.progressive.split_start)))
         for home, there in [(least + 1, least), *((finest, finest - step) for step in sorted(steps))]:
             yield time_move(context, scene, model, home, there)
-        leaf_node, rng = model.tree.leaf_node, np.random.default_rng(0)
-        for k in np.unique(np.geomspace(1, model.face_count, 25).round().astype(int)):
-            leaves = leaf_node[rng.choice(model.face_count, k, replace=False)]
-            row = {"case": "random faces", "model": model.name, "faces": model.face_count, "k": int(k)}
-            yield row | {"nodes": count_ancestors(leaves), "bound": bound_nodes(int(k), model.face_count)}
-
-
-def count_ancestors(leaves) -> int:
-    """Return how many nodes a bottom-up marking of these leaves marks, themselves among them."""
-    marked, nodes = np.empty(0, int), np.asarray(leaves)
-    while len(nodes):
-        # Leaves stand on two levels, so a node may come up twice.
-        marked = np.union1d(marked, nodes)
-        nodes = np.unique(nodes >> 1)
-        nodes = nodes[nodes > 0]
-    return len(marked)
 
 
 def time_move(context, scene, model, home, there):
@@ -115,7 +98,7 @@ def fit_figure_6(rows):
                 "ns_a_node": 1e6 * fit_scale(moves),
                 "nodes_of_bound_min": min(used),
                 "nodes_of_bound_max": max(used),
-                "crossover": find_crossover([row["share"] for row in moves], logs),
+                "crossover": crossover([row["share"] for row in moves], logs, 0.0),
             }
         )
     return found
@@ -125,18 +108,6 @@ def fitted_moves(rows):
     """Return the rows of moves from the finest LOD, each with the time of equation (1), scaled once a model."""
     found = [row | {"fitted_ms": fit_scale(moves) * row["bound"]} for _, moves in by_model(rows) for row in moves]
     return pick(found, from_finest=True)
-
-
-def find_crossover(fractions, logs):
-    """Return the k/n from which on a full refit costs less: interpolated, 0 if always, None if never."""
-    above = np.flatnonzero(np.asarray(logs) < 0)
-    if not len(above):
-        return 0.0
-    i = int(above[-1])
-    if i == len(logs) - 1:
-        return None
-    part = -logs[i] / (logs[i + 1] - logs[i])
-    return float(math.exp(math.log(fractions[i]) * (1 - part) + math.log(fractions[i + 1]) * part))
 
 
 def thin(rows):

@@ -1,17 +1,16 @@
 """What speed costs in accuracy, setting by setting, against the exact answer at the finest LODs."""
 
-from . import bounds, competitors, lods, settings, summaries
+from functools import partial
 
-PARTS = {"lods": lods.run, "settings": settings.run, "bounds": bounds.run, "competitors": competitors.run}
+from . import competitors, lods, settings, summaries
+
+PARTS = {"lods": lods.run, "settings": settings.run, "competitors": competitors.run}
 SUMMARIES = {
-    function.__name__: function
-    for function in (
-        summaries.over_meshes,
-        summaries.choose,
-        summaries.by_offset,
-        summaries.precisions,
-        summaries.outputs,
-        summaries.margins,
-        summaries.over_workloads,
-    )
+    "over_meshes": summaries.over_meshes,
+    "choose": summaries.choose,
+    "by_offset": summaries.by_offset,
+    "precisions": summaries.precisions,
+    "outputs": partial(summaries.summarise, names=("value", "setting")),
+    "margins": partial(summaries.summarise, names=("value", "factor")),
+    "over_workloads": summaries.over_workloads,
 }

@@ -31,59 +31,50 @@ OURS, OURS_WITHIN, OURS_FCL = "our LODs", "our LODs, within both errors", "our L
 SIMPLIFIED, HULL, NEWTON_SDF = "fast-simplification, python-fcl", "convex hull, python-fcl", "Newton, SDF"
 
 
-class FclPoses:
+class FclPoses(Fcl):
     """python-fcl over two shapes at any poses."""
-
-    def __init__(self, a, b, make=make_tree):
-        self.fcl = Fcl(a, b, (), make)
 
     def place(self, poses):
         matrices = np.tile(np.eye(4), (len(poses), 1, 1))
-        matrices[:, :3, :3], matrices[:, :3, 3] = rotation_matrices(poses[:, 3:]), poses[:, :3]
-        self.fcl.place(matrices)
+        if len(poses):
+            matrices[:, :3, :3], matrices[:, :3, 3] = rotation_matrices(poses[:, 3:]), poses[:, :3]
+        super().place(matrices)
 
     def intersects(self, poses):
         """Return whether A and B intersect at each pose, bool (n,)."""
         self.place(poses)
-        return np.array(self.fcl.any(), bool)
+        return np.array(self.any(), bool)
 
 
-class NewtonPoses:
-    """Newton's narrow phase over one mesh, brought to unit size; a number of poses at a time.
-
-    Raises:
-        RuntimeError: It lost contacts for lack of room.
-    """
+class NewtonPoses(Newton):
+    """Newton's narrow phase over one mesh, brought to unit size; a number of poses at a time."""
 
     def __init__(self, workload, room, hits, device, sdf):
         vertices, faces, _ = workload.a.mesh_at(workload.a.lod_max)
         self.scale, self.room, self.far = 1 / workload.size, room, workload.motions.far
-        self.rows = np.zeros((2 * room, 7), np.float32)
-        self.rows[:, 6] = 1
-        self._fill(np.tile(self.far, (room, 1)))
-        self.newton = Newton(vertices * self.scale, faces, self.rows, hits, device, sdf)
+        super().__init__(vertices * self.scale, faces, self.pair_rows([]), hits, device, sdf)
 
-    def _fill(self, poses):
-        self.rows[1::2] = self.far
-        self.rows[1 : 2 * len(poses) : 2] = poses
-        self.rows[1::2, :3] *= self.scale
-
-    def place(self, poses):
-        self._fill(poses)
-        self.newton.state.body_q.assign(self.rows)
+    def pair_rows(self, poses):
+        """Return the poses of all pairs, float32 (2 room, 7): A at the origin, B at poses, the rest of the Bs away."""
+        rows = np.zeros((2 * self.room, 7), np.float32)
+        rows[::2, 6], rows[1::2] = 1, self.far
+        rows[1 : 2 * len(poses) : 2] = np.reshape(poses, (-1, 7))
+        rows[1::2, :3] *= self.scale
+        return rows
 
     def intersects(self, poses):
-        """Return whether it has a contact at each pose, bool (n,)."""
+        """Return whether it has a contact at each pose, bool (n,).
+
+        Raises:
+            RuntimeError: It lost contacts for lack of room.
+        """
         found = []
         for start in range(0, len(poses), self.room):
             part = poses[start : start + self.room]
-            self.place(part)
-            self.newton.launch()
-            found.append(self.newton.result()[0][: len(part)])
+            self.place(self.pair_rows(part))
+            self.launch()
+            found.append(self.result()[0][: len(part)])
         return np.concatenate(found)
-
-
-# --- shapes ----------------------------------------------------------------------------------------------------------
 
 
 def simplify(library, vertices, faces, fraction):
@@ -102,17 +93,6 @@ def convex_hull(vertices, faces):
     """Return the hull of a mesh, by trimesh (Qhull)."""
     hull = trimesh.Trimesh(vertices, faces, process=False).convex_hull
     return np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int32)
-
-
-def find_version(package):
-    """Return the version of an installed package."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "not installed"
-
-
-# --- points ----------------------------------------------------------------------------------------------------------
 
 
 def measure(workload, method, setting, intersects, **more):
@@ -143,12 +123,12 @@ def our_points(context, workload):
 
 def fcl_point(workload, method, setting, meshes, make=make_tree, **more):
     """Return a point of python-fcl on other meshes of A and B."""
-    query = FclPoses(meshes[0], meshes[-1], make)
+    query = FclPoses(meshes[0], meshes[-1], (), make)
     row = measure(workload, method, setting, query.intersects, where="CPU core", **more)
     face_count = workload.a.face_count + workload.b.face_count
     row["share"] = (len(meshes[0][1]) + len(meshes[-1][1])) / face_count
     query.place(workload.poses)
-    return row, query.fcl.any
+    return row, query.any
 
 
 def fcl_points(context, workload):
@@ -194,9 +174,9 @@ def newton_points(context, workload):
             wp.synchronize_device(context.device)
             seconds = time.perf_counter() - begin
             row = measure(workload, NEWTON_SDF, setting, query.intersects, share=1.0, build_s=seconds, where="GPU")
-            query.place(poses)
-            row["us"] = 1e3 * context.time_launches({"run": query.newton.launch}, 5)["run"] / len(poses)
-            query.newton.check()
+            query.place(query.pair_rows(poses))
+            row["us"] = 1e3 * context.time_launches({"run": query.launch}, 5)["run"] / len(poses)
+            query.check()
             yield row, None
         except Exception as error:  # another package's failure must not cost the rest of a run
             context.note(f"{NEWTON_SDF} {setting} is skipped for {workload.name}: {type(error).__name__}: {error}")
@@ -205,7 +185,8 @@ def newton_points(context, workload):
 def run(context):
     """Yield one row a workload, method and setting."""
     names = "python-fcl", "fast-simplification", "trimesh", "newton"
-    context.note(f"Versions: {', '.join(f'{name} {find_version(name)}' for name in names)}.")
+    versions = {package.name: package.version for package in metadata.distributions()}
+    context.note(f"Versions: {', '.join(f'{name} {versions.get(name)}' for name in names)}.")
     for workload in workloads(context):
         found = []
         for points in (our_points, newton_points, fcl_points):

@@ -15,12 +15,6 @@ QUICK_TOLERANCES = (0.05, 0.01)
 CLEAR = 0.5  # length of the mean of a pose's normals from which on they are said to agree
 
 
-def is_coarsest(model, tolerance):
-    """Return whether `lod_for` gives the coarsest LOD within a tolerance, found by going through all of them."""
-    within = [lod for lod in range(model.lod_max + 1) if model.error_at(lod) <= tolerance]
-    return model.lod_for(tolerance=tolerance) == min(within)
-
-
 class LodLevels:
     """A workload at one level of detail after another, beside the exact answer."""
 
@@ -50,10 +44,6 @@ class LodLevels:
         row |= compare_normals(found.pair_contacts, exact.pair_contacts, self.clear)
         row |= {"contacts": len(found.contacts), "contacts_node_tests": float(found.node_tests.mean())}
         row["node_tests"] = float(scene.ask(workload.poses, "any").node_tests.mean())
-        if kind == "tolerance":
-            models = {workload.a, workload.b}
-            row["within_tolerance"] = bool(bound <= value)
-            row["coarsest"] = all(is_coarsest(model, value * workload.size / 2) for model in models)
         self.rows.append(row)
         self.scenes.append(scene)
         for offset in np.unique(workload.offset) if kind == "fraction" else ():

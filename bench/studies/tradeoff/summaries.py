@@ -49,7 +49,7 @@ def aggregate(rows) -> dict:
     return row
 
 
-def summarise(rows, *names) -> list:
+def summarise(rows, names) -> list:
     """Return one row for each combination of the values of columns."""
     return [aggregate(members) | dict(zip(names, key, strict=True)) for key, members in group(rows, *names).items()]
 
@@ -120,18 +120,8 @@ def by_offset(rows):
 
 def precisions(rows):
     """Return one row a fraction of the faces, kind of poses and precision."""
-    found = summarise(rows, "value", "poses_kind", "setting")
+    found = summarise(rows, ("value", "poses_kind", "setting"))
     return sorted(found, key=lambda row: (-row["value"], row["poses_kind"]))
-
-
-def outputs(rows):
-    """Return one row a fraction of the faces and output."""
-    return summarise(rows, "value", "setting")
-
-
-def margins(rows):
-    """Return one row a fraction of the faces and margin."""
-    return summarise(rows, "value", "factor")
 
 
 def over_workloads(rows):

@@ -56,7 +56,7 @@ class Workload:
         self.finest = self.scene((model_a.lod_max, model_b.lod_max), min(POSES_AT_A_TIME, 16 * count))
         low, high = find_first_contact(self.finest.intersects, self.motions, self.steps)
         chosen = np.flatnonzero(~np.isnan(low))[:count]
-        self.motions.keep(chosen)
+        self.motions.away, self.motions.rotations = self.motions.away[chosen], self.motions.rotations[chosen]
         self.low, self.high = low[chosen], high[chosen]
         which = np.tile(np.arange(min(posed, len(chosen))), len(OFFSETS) + 2)
         along = [self.low[:posed] + offset * self.size for offset in OFFSETS]
@@ -118,17 +118,14 @@ def judge_answers(found, truth):
 def judge_contact(error):
     """Return columns of errors of the first contact [sizes]: mean and largest size, and the largest of either sign."""
     known = error[~np.isnan(error)]
-    if not len(known):
-        return {"contact_mean": None, "contact_max": None, "early_max": None, "late_max": None, "never": len(error)}
-    return {
-        "contact_mean": float(np.abs(known).mean()),
-        "contact_max": float(np.abs(known).max()),
-        "early_max": float(max(0.0, known.max())),
-        "late_max": float(max(0.0, -known.min())),
-        "early": float((known > 0).mean()),
-        "late": float((known < 0).mean()),
-        "never": int(np.isnan(error).sum()),
-    }
+    row = {"never": int(np.isnan(error).sum())} | dict.fromkeys(
+        ("contact_mean", "contact_max", "early_max", "late_max")
+    )
+    if len(known):
+        row |= {"contact_mean": float(np.abs(known).mean()), "contact_max": float(np.abs(known).max())}
+        row |= {"early_max": float(max(0.0, known.max())), "late_max": float(max(0.0, -known.min()))}
+        row |= {"early": float((known > 0).mean()), "late": float((known < 0).mean())}
+    return row
 
 
 def find_front(costs, errors):

@@ -1,5 +1,4 @@
-"""The study of speed against accuracy: its measures on cases known by hand, and its parts at small sizes. No time is
-judged."""
+"""The measures of benchmarks and studies on cases known by hand."""
 
 import math
 from types import SimpleNamespace
@@ -9,34 +8,73 @@ import pytest
 import trimesh
 
 import warp_abtree as ab
-from bench import tables
-from bench.shapes import knot
-from bench.studies.motions import Motions, PoseScene, find_first_contact, rotate
-from bench.studies.study import Context
-from bench.studies.tradeoff import SUMMARIES, bounds, competitors, lods, regions, settings, summaries, workload
+from bench import roofline, timing
+from bench.cases.update import bound_nodes, find_crossover
+from bench.studies.motions import Motions, PoseScene, find_first_contact
+from bench.studies.paper import update
+from bench.studies.tradeoff import regions, summaries, workload
 from warp_abtree.query.contacts import contact_dtypes
 
 pytestmark = pytest.mark.slow
 
 
-class SmallModels:
-    """One knot for every mesh, in a folder that has none of the others."""
-
-    def __init__(self, folder, faces=400):
-        self.folder, self.model = folder, ab.Model.from_arrays(*knot(faces), name="knot")
-
-    def has(self, name):
-        return name.startswith("knot")
-
-    def load(self, names, base_faces):
-        return self.model
+def test_slope_and_crossover():
+    assert timing.fit_slope([1, 10, 100], [2.0, 20.0, 200.0]) == 1 and timing.fit_slope([3], [1.0]) is None
+    rows = [{"k": k, "update_ms": k / 100, "full_ms": 1.0} for k in (1, 10, 80, 125, 1000)]
+    assert find_crossover(rows, "k") == pytest.approx(100)
+    assert find_crossover(rows[:3], "k") is None and find_crossover(rows[3:], "k") == 125
+    assert timing.crossover([0.1, 1.0], [1.0, 2.0], 0.0) == 0.0
 
 
-@pytest.fixture
-def context(device, tmp_path, monkeypatch):
-    """A quick context; two tolerances that the knot has LODs for."""
-    monkeypatch.setattr(lods, "QUICK_TOLERANCES", (0.2, 0.05))
-    return Context(device, True, SmallModels(tmp_path))
+def test_bound_of_equation_1():
+    """One face of n: its path, log2 n + 1 nodes; all of a full tree: 2 n - 1."""
+    assert bound_nodes(1, 1024) == 11 and bound_nodes(1024, 1024) == 2047
+    assert bound_nodes(0, 5) == 0
+
+
+class Counted:
+    """1,000 node tests at 32 bytes and 64 operations, a pair of 400 bytes; 100 triangle tests, 10 of them hits."""
+
+    node_tests, triangle_tests = np.array([1000]), np.array([100])
+    float64_tests, exact_tests = np.array([3]), np.array([1])
+    any, count, faces, pairs = np.array([True]), np.array([10]), (), (0,)
+
+
+def test_work_of_a_result():
+    size, single, double = roofline.count_work(Counted)
+    assert size == 32 * 1000 + 128 * 100 + 176 * 3 + 176 + 400 + 12 * 10
+    assert single == 64 * 1000 + 140 * 100 + 152 * 7 and double == 129 * 3 + 373
+    row = roofline.roofline(Counted, 1.0, (1e9, 1e9, 1e9))
+    assert row["floor_ms"] == pytest.approx(max(size, single, double) * 1e-6, rel=1e-3)
+    assert row["node_tests_per_s"] == 1e6 and "floor_ms" not in roofline.roofline(Counted, 1.0, None)
+
+
+def test_work_of_an_update():
+    """3 leaves and 5 inner nodes from a slice of 4 entries, in a millisecond at a peak of 1 GB/s."""
+    row = roofline.update_roofline(3, 8, 4, 1.0, (1e9, 1e9, 1e9))
+    assert row["bytes"] == 24 * 4 + 56 * 8 + 88 * 3 + 64 * 5 and row["nodes_per_s"] == 8000
+    assert row["memory_share"] == pytest.approx(row["bytes"] / 1e6, rel=0.01)
+    assert "floor_ms" not in roofline.update_roofline(3, 8, 4, 1.0, None)
+
+
+def test_peaks_by_name():
+    names = ("NVIDIA H200", "NVIDIA H100 80GB HBM3", "NVIDIA H100 PCIe", "CPU")
+    found = [roofline.find_peaks(SimpleNamespace(name=name)) for name in names]
+    assert [peaks and peaks[0] for peaks in found] == [4.8e12, 3.35e12, 2.0e12, None]
+
+
+def test_fit_of_figure_6():
+    """Times that are 3 ns a node of equation (1) give that back, and the crossover with a flat full refit."""
+    rows = []
+    for fraction in np.geomspace(0.001, 1, 40):
+        k = fraction * 1000
+        bound = bound_nodes(k, 1000)
+        row = {"case": "move", "model": "m", "faces": 1000, "splits": 1, "k": k, "share": fraction, "nodes": bound / 2}
+        rows.append(row | {"bound": bound, "refit_ms": 3e-6 * bound, "full_ms": 3e-6 * 1200, "from_finest": True})
+    (fit,) = update.fit_figure_6(rows)
+    assert fit["ns_a_node"] == pytest.approx(3.0) and fit["correlation"] == pytest.approx(1.0)
+    assert bound_nodes(1000 * fit["crossover"], 1000) == pytest.approx(1200, rel=0.02)
+    assert update.fitted_moves(rows)[7]["fitted_ms"] == pytest.approx(rows[7]["refit_ms"])
 
 
 def box_workload(device, offset_b=0.0):
@@ -53,30 +91,6 @@ def box_workload(device, offset_b=0.0):
 
 def box_scene(boxes, room):
     return PoseScene(boxes.device, (boxes.a, boxes.b), (0, 0), boxes.motions.far, room)
-
-
-def rows_of(context, part, name):
-    """Return the rows of a part; they are finite, and every table of the part has rows."""
-    rows = list(part.run(context))
-    study = {"study": "tradeoff", "parts": {name: {"rows": rows}}}
-    for table in tables.read_layout("studies/tradeoff.toml")["table"]:
-        if table["part"] == name:
-            found = tables.select_rows(table, study)
-            assert found and all(any(column[0] in row for row in found) for column in table["columns"]), table["name"]
-    for row in rows:
-        for name, value in row.items():
-            if isinstance(value, float):
-                assert math.isfinite(value), (name, row)
-            if name in ("precision", "recall", "share") and value is not None and row["case"] != "precision":
-                assert 0 <= value <= 1, (name, row)
-    return rows
-
-
-def by(rows, **where):
-    return [row for row in rows if all(row.get(name) == value for name, value in where.items())]
-
-
-# --- motions and the first contact -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("offset", [0.0, 3.0])
@@ -106,12 +120,6 @@ def test_distances_proved(device):
     assert scene.near(poses, [0.3, 0.2, 0.3]).tolist() == [True, False, True]
 
 
-def test_rotation_by_quaternions():
-    half = math.sqrt(0.5)
-    turned = rotate(np.array([[0, 0, half, half], [0, 0, 0, 1.0]]), np.array([1.0, 2, 3]))
-    assert turned == pytest.approx(np.array([[-2, 1, 3], [1, 2, 3]]))
-
-
 def test_judged_answers():
     found = workload.judge_answers(np.array([1, 1, 0, 0, 1], bool), np.array([1, 0, 1, 0, 1], bool))
     assert (found["missed"], found["invented"]) == (1, 1)
@@ -126,9 +134,6 @@ def test_judged_answers():
 def test_front():
     points = [(1, 5), (2, 3), (2, 4), (3, 3), (4, 0), (1, 5)]
     assert workload.find_front(*zip(*points, strict=True)) == [True, True, False, False, True, True]
-
-
-# --- contact regions -------------------------------------------------------------------------------------------------
 
 
 def make_contacts(rows):
@@ -193,91 +198,6 @@ def test_resultants():
     assert regions.resultants(contacts, 4).tolist() == [0.5, 0, 1, 0]
 
 
-# --- parts -----------------------------------------------------------------------------------------------------------
-
-
-def test_levels_of_detail(context):
-    pytest.importorskip("scipy")
-    rows = rows_of(context, lods, "lods")
-    levels = by(rows, case="level")
-    finest = by(levels, kind="fraction", value=1)[0]
-    assert finest["missed"] == finest["invented"] == finest["contacts_missed"] == finest["contacts_invented"] == 0
-    for name in ("bound", "contact_max", "region_hausdorff_max", "normal_p95"):
-        assert finest[name] == 0, name
-    assert finest["any_cost"] == 1 and 0 < finest["meet"] < finest["poses"]
-    coarse = by(levels, kind="fraction", value=0.1)[0]
-    assert coarse["contact_mean"] > 1e-4 and coarse["missed"] + coarse["invented"] > 0 and coarse["region_mean"] > 1e-4
-    assert coarse["share"] == pytest.approx(0.1, abs=0.02) and coarse["node_tests"] < finest["node_tests"]
-    for row in by(levels, kind="tolerance"):
-        assert row["within_tolerance"] and row["coarsest"] and 0 < row["bound"] <= row["value"]
-    at = by(rows, case="offset", value=0.1)
-    assert sum(row["missed"] for row in at) == coarse["missed"] and len(at) == 10
-
-
-def test_wrong_lods_are_noticed(context):
-    model = context.model("knot")
-    assert lods.is_coarsest(model, 0.05)
-    other = SimpleNamespace(lod_max=model.lod_max, error_at=model.error_at)
-    other.lod_for = lambda tolerance: model.lod_for(tolerance=tolerance) + 1
-    assert not lods.is_coarsest(other, 0.05)
-
-
-def test_settings(context):
-    rows = rows_of(context, settings, "settings")
-    for row in by(rows, case="precision", setting="exact"):
-        assert row["missed"] == row["invented"] == row["faces_missed"] == row["faces_invented"] == 0
-    laid = by(rows, case="precision", setting="float32", poses_kind="coincident meshes", value=1)[0]
-    assert laid["faces_missed"] > 0 and laid["faces_invented"] > 0
-    touching = by(rows, case="precision", setting="exact", poses_kind="at first contact", value=1)[0]
-    assert touching["meet"] == touching["poses"] / 2, "one side of each first contact meets, exactly"
-    for value in (0.1, 1):
-        tests = [by(rows, case="output", setting=name, value=value)[0]["node_tests"] for name in settings.OUTPUTS]
-        assert tests[0] < tests[1] == tests[2] == tests[3]
-    margins = by(rows, case="margin", value=0.1)
-    assert [row["factor"] for row in margins] == list(settings.FACTORS)
-    assert margins[0]["recall"] < 1 and all(row["recall"] == 1 and not row["late_max"] for row in margins[3:])
-    assert [row["invented"] for row in margins] == sorted(row["invented"] for row in margins)
-
-
-def test_bounds(context):
-    pytest.importorskip("igl")
-    rows = rows_of(context, bounds, "bounds")
-    (surface,), (apart,) = by(rows, case="surface"), by(rows, case="apart")
-    assert surface["violations"] == apart["violations"] == 0 and surface["configurations"] >= 60
-    assert 0.5 < surface["used_max"] <= 1 + 1e-6 and apart["proved"] > 0.05 and apart["coarse_missed"] > 0.05
-
-
-def test_broken_bounds_are_noticed(context):
-    """Errors halved, and none at all: points lie beyond the bound, and pairs that meet are proved apart."""
-    model = context.model("knot")
-    model.progressive.lod_error[:] *= 0.5
-    if pytest.importorskip("igl"):
-        (row,) = bounds.surface_rows(context, {"knot": model})
-        assert row["violations"] > 10 and row["used_max"] > 1
-    model.progressive.lod_error[:] = 0
-    found = workload.Workload(context, "knot", model, model)
-    found.bound = lambda lods: 1e-3
-    assert bounds.apart_row(context, found, np.random.default_rng(0))["violations"] > 0
-
-
-def test_competitors(context):
-    pytest.importorskip("fcl")
-    rows = rows_of(context, competitors, "competitors")
-    points = by(rows, case="point")
-    ours, theirs = (by(points, method=name) for name in (competitors.OURS, competitors.OURS_FCL))
-    assert len(ours) == len(theirs) == 4
-    for one, other in zip(ours, theirs, strict=True):
-        assert (one["missed"], one["invented"]) == (other["missed"], other["invented"])
-        assert one["contact_mean"] == pytest.approx(other["contact_mean"], abs=1e-6)
-    for row in by(points, method=competitors.HULL):
-        assert row["missed"] == 0 and row["late_max"] < 1e-6 and row["contact_mean"] > 1e-3
-    for row in by(points, method=competitors.OURS_WITHIN):
-        assert row["recall"] == 1 and row["late_max"] == 0
-    assert any(row["front"] for row in points) and not all(row["front"] for row in points)
-    skipped = any(note.startswith("fast_simplification is skipped") for note in context.notes)
-    assert bool(by(points, method=competitors.SIMPLIFIED)) != skipped, "a competitor runs or is named as skipped"
-
-
 def test_cheapest_level_has_only_finer_ones_within_the_error():
     rows = [{"share": s, "e": e} for s, e in ((1, 0), (0.5, 0.1), (0.2, 0.3), (0.1, 0.2), (0.01, None))]
     assert [summaries.cheapest(rows, "e", limit)["share"] for limit in (0, 0.1, 0.25, 0.3)] == [1, 0.5, 0.5, 0.1]
@@ -287,7 +207,6 @@ def test_means_over_workloads():
     rows = [{"workload": name, "value": 1, "poses": 4, "meet": 2, "missed": 1, "invented": 0} for name in "ab"]
     rows[0] |= {"cost": 1.0, "early_max": 0.1, "bound": 1.0}
     rows[1] |= {"cost": 4.0, "early_max": 0.3, "bound": 2.0}
-    (row,) = summaries.summarise(rows, "value")
+    (row,) = summaries.summarise(rows, ["value"])
     assert (row["poses"], row["recall"], row["precision"], row["workloads"]) == (8, 0.5, 1.0, 2)
     assert (row["cost"], row["early_max"], row["bound"]) == (pytest.approx(2.0), 0.3, 1.5)
-    assert SUMMARIES["outputs"] is summaries.outputs
