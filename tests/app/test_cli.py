@@ -83,7 +83,10 @@ def test_query_against_the_library(files, capsys):
     bound = ball.error_at(found["lods"][0]) + ring.error_at(900)
     assert found["bound"] == (pytest.approx(bound) if np.isfinite(bound) else None)
 
-    assert answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1)["count"] == 0
+    apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "contacts")
+    nowhere = [None, None, None]
+    assert apart["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere, "depth": 0}
+    assert apart["count"] == 0 and apart["faces"] == apart["contacts"] == []
     shown, _ = run(capsys, "query", "ball.obj", "ring.ply", "--output", "contacts", "--device", "cpu")
     assert "intersects              yes\n" in shown and len(re.findall(r"^\d+ +\d+$", shown, re.M)) == report.LISTED
     assert re.search(r"^and \d+ more; --json lists all$", shown, re.M) and "face_a  face_b  p0" in shown

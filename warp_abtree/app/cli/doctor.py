@@ -1,5 +1,6 @@
 """`warp-abtree doctor`: what this machine has, what is missing, and whether its devices answer right."""
 
+import contextlib
 import importlib.metadata
 import os
 import platform
@@ -22,7 +23,7 @@ EXAMPLES = ("", "--json", "--device cpu")
 CORE = ("warp-lang>=1.19", "numpy", "trimesh")
 # Of each extra its use and its packages; tests compare them with pyproject.toml.
 EXTRAS = {
-    "app": ("scene files, tables and bars, completion in shells", ("msgspec", "rich", "shtab", "tomli")),
+    "app": ("scene files, progress bars, completion in shells", ("msgspec", "rich", "shtab", "tomli")),
     "view": ("viewer", ("viser>=1.1",)),
     "pictures": ("pictures and plots", ("pyvista", "matplotlib")),
     "usd": ("meshes inside Warp, USD files", ("usd-core",)),
@@ -91,21 +92,22 @@ def check_device(device) -> dict:
 def check_cache() -> dict:
     """Return the folder of Warp's compiled kernels, its modules and bytes, and whether it can be written."""
     folder = Path(wp.config.kernel_cache_dir or "")  # set by the start of Warp
-    files = [path for path in folder.rglob("*") if path.is_file()]
+    modules, size = 0, 0
+    for place, folders, files in os.walk(folder):  # other processes may be writing there
+        modules += len(folders) if place == str(folder) else 0
+        for name in files:
+            with contextlib.suppress(FileNotFoundError):
+                size += os.path.getsize(os.path.join(place, name))
     return {
         "folder": str(folder),
-        "modules": sum(1 for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else 0,
-        "bytes": sum(path.stat().st_size for path in files),
+        "modules": modules,
+        "bytes": size,
         "writable": os.access(folder, os.W_OK),
     }
 
 
 def examine(devices=None) -> dict:
-    """Return all that `warp-abtree doctor --json` prints.
-
-    Args:
-        devices: Warp devices to ask; None is all.
-    """
+    """Return all that `warp-abtree doctor --json` prints, about some Warp devices or all."""
     checked = [check_device(device) for device in (wp.get_devices() if devices is None else devices)]
     core = check_packages(CORE)
     found = {
