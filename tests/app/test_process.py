@@ -95,7 +95,7 @@ def test_a_signal_stops_a_command(files, words, place, before, number, status, l
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(
         [sys.executable, "-c", HANG.replace("PLACE", place), *words.split(), "--device", "cpu"],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
         preexec_fn=before,
         **pipes,
     ) as process:

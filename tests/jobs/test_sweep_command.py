@@ -95,7 +95,8 @@ def test_without_ray_one_line_says_so(tmp_path, monkeypatch):
     np.save(tmp_path / "poses.npy", poses_of())
     asked = [tmp_path / "a.npz", tmp_path / "a.npz", tmp_path / "poses.npy", "--out", tmp_path / "out"]
     status, _, err = command(*asked)
-    assert status == 0 and err == "Ray is not installed (pip install ray): this process does all shards\n"
+    first, *_ = err.splitlines()  # a word about kernels being compiled may follow
+    assert status == 0 and first == "Ray is not installed (pip install ray): this process does all shards"
     assert len(read(tmp_path / "out")["any"]) == 100
     status, _, err = command(*asked, "--workers", "2")
     assert status == 2 and "need Ray" in err
