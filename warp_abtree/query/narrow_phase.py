@@ -11,14 +11,7 @@ from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.buffers import QueryBuffers
 from warp_abtree.query.cpu_threads import core_count, launch_on_cores
-from warp_abtree.query.request import (
-    LIST_MAX,
-    OUTPUTS,
-    PRECISIONS,
-    check_capacity,
-    check_request,
-    check_within,
-)
+from warp_abtree.query.request import LIST_MAX, OUTPUTS, PRECISIONS, check_capacity, check_request, check_within
 from warp_abtree.query.result import Result
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
@@ -111,6 +104,7 @@ class Query(QueryBuffers):
     def _make_work(self):
         work, device = load_balance.Work(), self.device
         slots = load_balance.SLOT_COUNT if self.uses_warps() else 0
+        work.warps_per_pair = self._regime.warps_per_pair
         work.counter = wp.zeros(load_balance.COUNTER_COUNT, dtype=wp.int32, device=device)
         work.flag = wp.zeros(slots, dtype=wp.int32, device=device)
         work.owner = wp.empty(slots, dtype=wp.vec2i, device=device)
@@ -158,8 +152,6 @@ class Query(QueryBuffers):
     def _launch_traversal(self, within, hits, mode, output):
         pools = self.batch.pools
         room = len(self.pairs)
-        warps_per_pair = self._regime.warps_per_pair
-        self.work.warps_per_pair = warps_per_pair
         inputs = [output, *pools, self.pair_count, self.pairs, within]
         self.guard.record()
         inputs += [self.pair_poses, hits, self.work]
@@ -172,8 +164,8 @@ class Query(QueryBuffers):
             least = 32 if output == int(face_pairs.OUTPUT_ANY) else 1
             launch_on_cores(simd.thread_traversal(mode), room, [*inputs, self.work], self.device, cores, least)
             return
-        # More than there are parts: those that find none wait for shares.
-        warps = max(room, int(4 * warps_per_pair * math.sqrt(room)) + 1)
+        # More than there are pairs: idle warps wait for donations.
+        warps = max(room, int(4 * self._regime.warps_per_pair * math.sqrt(room)) + 1)
         warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         wp.launch(
             dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
