@@ -60,17 +60,6 @@ def world_poses(world_count, object_count, size, seed=0):
     return np.concatenate([size * rng.uniform(-0.5, 0.5, (world_count, object_count, 3)), turns], -1)
 
 
-def rotation_matrices(quaternions):
-    """Return float64 (n, 3, 3) of unit quaternions (n, 4) x y z w."""
-    x, y, z, w = quaternions.T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, 1) for row in rows], 1)
-
-
 def longest_side(model) -> float:
     """Return the longest side of a model's box [model units]."""
     return float(np.ptp(model.mesh_at(model.lod_max)[0], axis=0).max())

@@ -12,12 +12,13 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree.checks.quaternions import matrices_of
 
 from ..baselines.fcl import Fcl
 from ..baselines.fcl_cpp import FclCpp
 from ..baselines.trimesh import Trimesh
 from ..meshes import real_meshes
-from ..shapes import knot, random_directions, rotation_matrices, scene_of_poses
+from ..shapes import knot, random_directions, scene_of_poses
 from ..timing import no_garbage_collection, one_core, ratio_of, summarise, time_in_turn
 from ..verify import judge_disputed
 
@@ -50,7 +51,7 @@ def random_matrices(rng, vertices_a, vertices_b, count):
     centre_a, centre_b = ((points.min(0) + points.max(0)) / 2 for points in (vertices_a, vertices_b))
     reach = np.ptp(vertices_a, axis=0) / 2 + np.linalg.norm(vertices_b - centre_b, axis=1).max()
     matrices = np.zeros((count, 4, 4))
-    matrices[:, :3, :3] = rotation_matrices(random_directions(rng, count, 4))
+    matrices[:, :3, :3] = matrices_of(random_directions(rng, count, 4))
     matrices[:, :3, 3] = centre_a + reach * rng.uniform(-1, 1, (count, 3)) - matrices[:, :3, :3] @ centre_b
     matrices[:, 3, 3] = 1
     return matrices

@@ -7,8 +7,9 @@ straight line in a random direction; where it is on its way is the distance of t
 import numpy as np
 
 import warp_abtree as ab
+from warp_abtree.checks.quaternions import matrices_of
 
-from ..shapes import centre_and_radius, random_directions, rotation_matrices, scene_of_poses
+from ..shapes import centre_and_radius, random_directions, scene_of_poses
 
 SCAN_STEPS = 256
 BISECTIONS = 32
@@ -42,7 +43,7 @@ class Motions:
             which: Motions, (n,); None is all in turn.
         """
         which = np.arange(len(self)) if which is None else which
-        centre_b = rotation_matrices(self.rotations[which]) @ self.centre_b
+        centre_b = matrices_of(self.rotations[which]) @ self.centre_b
         place = self.centre_a + np.asarray(along)[:, None] * self.away[which] - centre_b
         return np.concatenate([place, self.rotations[which]], 1)
 

@@ -16,10 +16,10 @@ import trimesh
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree.checks.quaternions import matrices_of
 
 from ...baselines.fcl import Fcl, make_convex, make_tree
 from ...baselines.newton import Newton
-from ...shapes import rotation_matrices
 from .workload import find_front, judge_answers, judge_contact, workloads
 
 FRACTIONS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
@@ -37,7 +37,7 @@ class FclPoses(Fcl):
     def place(self, poses):
         matrices = np.tile(np.eye(4), (len(poses), 1, 1))
         if len(poses):
-            matrices[:, :3, :3], matrices[:, :3, 3] = rotation_matrices(poses[:, 3:]), poses[:, :3]
+            matrices[:, :3, :3], matrices[:, :3, 3] = matrices_of(poses[:, 3:]), poses[:, :3]
         super().place(matrices)
 
     def intersects(self, poses):
