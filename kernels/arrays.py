@@ -35,6 +35,7 @@ class ModelPool:
     node_face: wp.array(dtype=wp.int32)  # face of a leaf, -1 at an inner node, -1 without a node, shape [node]
     face_start: wp.array(dtype=wp.int32)  # where its faces begin, shape [model]
     face_count: wp.array(dtype=wp.int32)  # shape [model]
+    depth: wp.array(dtype=wp.int32)  # of its tree, shape [model]
     node_start: wp.array(dtype=wp.int32)  # where its nodes begin, shape [model]
     finest_limit: wp.array(dtype=wp.int32)  # ids of vertices below it are original ones, shape [model]
     lod_max: wp.array(dtype=wp.int32)  # vertex splits of the finest LOD, shape [model]

@@ -56,12 +56,8 @@ def force_refits(full: bool | None):
     return regime(full_refit=fraction)
 
 
-def repeat_update(update: LodUpdate, refine: bool = True):
-    """Return a launch that does an update of `Scene.set_lods` again, from whatever LODs stand there.
-
-    Args:
-        refine: Whether meshes are refined too, or trees refitted alone.
-    """
+def repeat_update(update: LodUpdate):
+    """Return a launch that does an update of `Scene.set_lods` again, from whatever LODs stand there."""
     states = update.states
     targets = wp.clone(states.pool.lod)  # the next update writes in place
 
@@ -69,7 +65,7 @@ def repeat_update(update: LodUpdate, refine: bool = True):
         for name in ("changed_count", "marked_count", "level_count"):
             getattr(update.plan, name).zero_()
         states.pool.lod = targets
-        update.relaunch() if refine else update.refit()
+        update.relaunch()
 
     return launch
 

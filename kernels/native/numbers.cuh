@@ -12,6 +12,24 @@ inline CUDA_CALLABLE wp::vec_t<4, wp::float32> load_constant(wp::array_t<wp::vec
 #endif
 }
 
+inline CUDA_CALLABLE wp::vec_t<4, wp::float32> load_entry(wp::array_t<wp::vec_t<4, wp::float32>> values, wp::int64 i) {
+#if defined(__CUDA_ARCH__)
+    float4 x = *((const float4*)values.data + i);
+    return wp::vec_t<4, wp::float32>(x.x, x.y, x.z, x.w);
+#else
+    return values.data[i];
+#endif
+}
+
+inline CUDA_CALLABLE void store_entry(wp::array_t<wp::vec_t<4, wp::float32>> values, wp::int64 i,
+                                      wp::vec_t<4, wp::float32> value) {
+#if defined(__CUDA_ARCH__)
+    *((float4*)values.data + i) = make_float4(value[0], value[1], value[2], value[3]);
+#else
+    values.data[i] = value;
+#endif
+}
+
 inline CUDA_CALLABLE wp::vec_t<4, wp::int32> load_corner(wp::array_t<wp::vec_t<4, wp::int32>> corners, wp::int32 i) {
 #if defined(__CUDA_ARCH__)
     int4 x = __ldg((const int4*)corners.data + i);

@@ -30,6 +30,14 @@ class Node:
 def load_constant(values: wp.array(dtype=wp.vec4), i: wp.int64) -> wp.vec4: ...
 
 
+@wp.func_native(native.body("numbers.cuh", "load_entry"))
+def load_entry(values: wp.array(dtype=wp.vec4), i: wp.int64) -> wp.vec4: ...
+
+
+@wp.func_native(native.body("numbers.cuh", "store_entry"))
+def store_entry(values: wp.array(dtype=wp.vec4), i: wp.int64, value: wp.vec4): ...
+
+
 @wp.func
 def unpack_node(low: wp.vec4, high: wp.vec4):
     node = Node()
@@ -44,7 +52,7 @@ def unpack_node(low: wp.vec4, high: wp.vec4):
 def load_node(states: StatePool, at: wp.int32):
     """Return the record of a node in the pool."""
     i = wp.int64(2) * wp.int64(at)
-    return unpack_node(states.node_box[i], states.node_box[i + wp.int64(1)])
+    return unpack_node(load_entry(states.node_box, i), load_entry(states.node_box, i + wp.int64(1)))
 
 
 @wp.func
@@ -63,8 +71,8 @@ def store_node(states: StatePool, at: wp.int32, node: Node):
     if face < 0:
         extent = ((upper[0] - lower[0]) + (upper[1] - lower[1])) + (upper[2] - lower[2])
         face = wp.cast(-wp.max(extent, SPAN_MIN), wp.int32)
-    states.node_box[i] = wp.vec4(lower[0], lower[1], lower[2], wp.cast(node.skip, wp.float32))
-    states.node_box[i + wp.int64(1)] = wp.vec4(upper[0], upper[1], upper[2], wp.cast(face, wp.float32))
+    store_entry(states.node_box, i, wp.vec4(lower[0], lower[1], lower[2], wp.cast(node.skip, wp.float32)))
+    store_entry(states.node_box, i + wp.int64(1), wp.vec4(upper[0], upper[1], upper[2], wp.cast(face, wp.float32)))
 
 
 @wp.func

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ACTIVE, INACTIVE, ModelPool, StatePool, load_vertex
 from warp_abtree.kernels.traversal.boxes import round_down_vec, round_up_vec
 from warp_abtree.kernels.traversal.nodes import Node, empty_node, load_node, store_node
@@ -11,10 +12,11 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def refit_leaf(models: ModelPool, states: StatePool, state: wp.int32, node: wp.int32, face: wp.int32):
+def refit_leaf(
+    models: ModelPool, states: StatePool, state: wp.int32, node: wp.int32, face: wp.int32, corner: wp.vec4i
+):
     """Box one face about the model's centre, or empty the leaf of an inactive face."""
     at = states.node_start[state] + node
-    corner = states.face_corner[states.face_start[state] + face]
     if corner[0] < 0:
         states.node_status[at] = INACTIVE
         store_node(states, at, empty_node())
@@ -58,7 +60,8 @@ def refit_inner(states: StatePool, state: wp.int32, node: wp.int32):
 def refit_node(models: ModelPool, states: StatePool, state: wp.int32, node: wp.int32):
     face = models.node_face[models.node_start[states.model[state]] + node]
     if face >= 0:
-        refit_leaf(models, states, state, node, face)
+        corner = states.face_corner[states.face_start[state] + face]
+        refit_leaf(models, states, state, node, face, corner)
     else:
         refit_inner(states, state, node)
 
@@ -96,11 +99,7 @@ def refit_level_kernel(step: wp.int32, level: wp.int32, models: ModelPool, plan:
     refit_level(wp.tid(), step, level, models, plan, states_inout)
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-""")
+@wp.func_native(native.body("block_marks.cuh", "block_sync"))
 def block_sync(): ...
 
 

@@ -16,18 +16,23 @@ ITEM_MASK = wp.constant(wp.int64(2**32 - 1))
 
 # LOD of a state whose last update was interrupted.
 UNKNOWN = wp.constant(-1)
+# Length that stands for all faces in the place of a slice.
+WHOLE = wp.constant(-1)
 
 
 @wp.struct
 class UpdateLists:
     """States under update: those that refit what a slice of faces touches (partial), and those refitted whole (full).
 
-    A total holds two counts in one word, so that one atomic takes an update's place and its items' places:
+    A block updates a state by itself (`block_update`) or all threads work through lists, level by level. A total holds two counts in one word, so that one atomic takes an update's place and its items' places:
 
         63           32 31            0
         [   updates    |    items     ]    items: entries of all slices, or faces
     """
 
+    block_count: wp.array(dtype=wp.int32)  # states that a block updates each, shape [1]
+    block_state: wp.array(dtype=wp.int32)  # shape [block's update]
+    block_slice: wp.array(dtype=wp.vec2i)  # start in split_face, and length or WHOLE, shape [block's update]
     partial_total: wp.array(dtype=wp.int64)  # updates and entries of all slices, shape [1]
     partial_state: wp.array(dtype=wp.int32)  # shape [partial update]
     slice_start: wp.array(dtype=wp.int32)  # into split_face, shape [partial update]
@@ -52,7 +57,8 @@ class SplitTable:
     bound: wp.array(dtype=wp.int32)  # split_start of every model, as places in the pool's split_face
     bound_start: wp.array(dtype=wp.int32)  # where a model's begin in `bound`, shape [model]
     partial_max: wp.array(dtype=wp.int32)  # longest slice that a partial update takes, shape [model]
-    depth: wp.array(dtype=wp.int32)  # of the tree, shape [model]
+    block_max: wp.array(dtype=wp.int32)  # longest slice that a block takes, shape [model]
+    block_whole: wp.array(dtype=wp.int32)  # whether a block refits it whole, 0 or 1, shape [model]
 
 
 @wp.func
@@ -80,6 +86,7 @@ def clear_plan_kernel(plan_out: UpdateLists):
     """Empty every list and counter, a thread a state, and LEVEL_MAX threads at least."""
     i = wp.tid()
     if i == 0:
+        plan_out.block_count[0] = 0
         plan_out.partial_total[0] = wp.int64(0)
         plan_out.full_total[0] = wp.int64(0)
     if i < LEVEL_MAX:
@@ -88,6 +95,13 @@ def clear_plan_kernel(plan_out: UpdateLists):
     if i < plan_out.changed_count.shape[0]:
         plan_out.changed_count[i] = 0
         plan_out.marked_count[i] = 0
+
+
+@wp.func
+def list_block(plan: UpdateLists, state: wp.int32, begin: wp.int32, length: wp.int32):
+    u = wp.atomic_add(plan.block_count, 0, 1)
+    plan.block_state[u] = state
+    plan.block_slice[u] = wp.vec2i(begin, length)
 
 
 @wp.func
@@ -142,14 +156,21 @@ def plan_update_kernel(
     if lod == old:
         return
     states_inout.lod[s] = lod
-    if old == UNKNOWN:
-        list_full(plan_inout, s, models.face_count[model], splits.depth[model])
-        return
-    at = splits.bound_start[model]
-    begin = splits.bound[at + wp.min(lod, old)]
-    length = splits.bound[at + wp.max(lod, old)] - begin
-    if length > splits.partial_max[model]:
-        list_full(plan_inout, s, models.face_count[model], splits.depth[model])
+    begin = wp.int32(0)
+    length = wp.int32(WHOLE)
+    if old != UNKNOWN:
+        at = splits.bound_start[model]
+        begin = splits.bound[at + wp.min(lod, old)]
+        length = splits.bound[at + wp.max(lod, old)] - begin
+        if length > splits.partial_max[model]:
+            length = WHOLE
+    if length == WHOLE:
+        if splits.block_whole[model] != 0:
+            list_block(plan_inout, s, begin, length)
+        else:
+            list_full(plan_inout, s, models.face_count[model], models.depth[model])
+    elif length <= splits.block_max[model]:
+        list_block(plan_inout, s, begin, length)
     else:
         list_partial(plan_inout, s, begin, length)
 

@@ -69,6 +69,7 @@ class ModelArrays:
         pool.node_face = joined([model.tree.node_face for model in models], wp.int32)
         pool.face_start = _upload(self.face_start[:-1].astype(np.int32), wp.int32, device)
         pool.face_count = _upload(self.face_count.astype(np.int32), wp.int32, device)
+        pool.depth = _upload(self.depth.astype(np.int32), wp.int32, device)
         pool.node_start = _upload(self.node_start[:-1].astype(np.int32), wp.int32, device)
         finest = [s + f.vertex_count for f, s in zip(forests, self.vertex_start[:-1], strict=True)]
         pool.finest_limit = _upload(np.array(finest, np.int32), wp.int32, device)

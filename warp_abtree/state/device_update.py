@@ -8,7 +8,7 @@ from warp_abtree.kernels.update import work_lists
 from warp_abtree.state.arrays import ModelArrays, StateArrays
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.lod_update import build_states, full_refit_fraction
-from warp_abtree.state.work_lists import WorkLists, active_update, make_level_lists, refine_meshes
+from warp_abtree.state.work_lists import WorkLists, active_update, block_limits, make_level_lists, refine_meshes
 
 # LODs wanted on the device that are out of range, and the lowest index that had one.
 NO_FAULTS = (0, 2**31 - 1)
@@ -35,12 +35,16 @@ class DeviceLodUpdate(WorkLists):
         bounds = [len(bound) for bound in models.split_bounds]
         longest = np.array([bound[-1] - bound[0] for bound in models.split_bounds])
         partial_max = np.minimum(longest, np.floor(full_refit_fraction(device) * models.face_count).astype(np.int64))
-        entries, depth = partial_max[owner], models.depth[owner]
+        count = len(owner)
+        block_max, block_whole = block_limits(models, count, device)
+        # What no block takes has room in the lists.
+        entries = np.where(partial_max > block_max, partial_max, 0)[owner]
+        faces = np.where(block_whole, 0, models.face_count)[owner]
+        depth = np.where(entries + faces > 0, models.depth[owner], -1)
         levels = range(int(depth.max()) + 1)
         level_room = [int(np.sum(depth >= level)) << level for level in levels]
         marked_room = [int(np.minimum(entries, 1 << level)[depth >= level].sum()) for level in levels]
-        whole_room = np.array([np.sum(depth >= level) for level in range(int(LEVEL_MAX))])
-        count = len(owner)
+        whole_room = np.array([np.sum((depth >= level) & (faces > 0)) for level in range(int(LEVEL_MAX))])
 
         def upload(values):
             return wp.array(np.asarray(values, np.int64), dtype=wp.int32, device=device)
@@ -52,9 +56,11 @@ class DeviceLodUpdate(WorkLists):
         self.splits.bound = upload(np.concatenate(models.split_bounds))
         self.splits.bound_start = upload(np.cumsum(bounds) - bounds)
         self.splits.partial_max = upload(partial_max)
-        self.splits.depth = upload(models.depth)
+        self.splits.block_max = upload(np.minimum(block_max, 2**31 - 1))
+        self.splits.block_whole = upload(block_whole)
         plan = work_lists.UpdateLists()
         plan.partial_total, plan.full_total = room(1, wp.int64), room(1, wp.int64)
+        plan.block_count, plan.block_state, plan.block_slice = room(1), room(count), room(count, wp.vec2i)
         for name in ("partial_state", "slice_start", "entry_end", "full_state", "face_end"):
             setattr(plan, name, room(count))
         plan.changed_count, plan.marked_count = room(count), room(count)
@@ -64,7 +70,7 @@ class DeviceLodUpdate(WorkLists):
         make_level_lists(plan, marked_room, device)
         self.wanted = upload([slot.lod for slot in states.slots])
         self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=device)
-        super().__init__(plan, int(entries.sum()), int(models.face_count[owner].sum()), level_room, device)
+        super().__init__(plan, count, int(entries.sum()), int(faces.sum()), level_room, device)
 
     def launch(self):
         """Refine meshes and update trees. Launches only: six, and one for each level that has much to refit.
@@ -82,6 +88,7 @@ class DeviceLodUpdate(WorkLists):
         wp.launch(work_lists.clear_plan_kernel, max(count, int(LEVEL_MAX)), [self.plan], device=self.device)
         inputs = [self.models.pool, self.splits, self.wanted, self.states.pool, self.plan, self.faults]
         wp.launch(work_lists.plan_update_kernel, count, inputs, device=self.device)
+        self.update_by_blocks(self.models.pool, self.states.pool)
         refine_meshes(self.models.pool, self.states.pool, self)
         active_update(self.models.pool, self.states.pool, self)
 

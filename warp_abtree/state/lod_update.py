@@ -8,9 +8,9 @@ import warp as wp
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import refit
-from warp_abtree.kernels.update.work_lists import UpdateLists
+from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
-from warp_abtree.state.work_lists import WorkLists, active_update, make_level_lists, refine_meshes
+from warp_abtree.state.work_lists import WorkLists, active_update, block_limits, make_level_lists, refine_meshes
 
 
 def full_refit_fraction(device) -> float:
@@ -78,8 +78,9 @@ class LodUpdate(WorkLists):
         owner = np.array([states.slots[s].model for s in self.state], np.int64)
         self._owner, self._face_count = owner, models.face_count[owner]
         slice_start = self._measure_slices()
-        plan, entries, faces, level_room = self._list_work(models.depth[owner], slice_start)
-        super().__init__(plan, entries, faces, level_room, states.device)
+        blocks = self._take_blocks()
+        plan, *rooms = self._list_work(models.depth[owner], slice_start, blocks)
+        super().__init__(plan, int(blocks.sum()), *rooms, states.device)
         self._copies = self._plan_copies()
 
     def __repr__(self):
@@ -112,16 +113,22 @@ class LodUpdate(WorkLists):
                 self.full[i], start[i], self.slice_length[i] = False, bounds[low], touched
         return start
 
-    def _list_work(self, depth, slice_start):
+    def _take_blocks(self):
+        """Return which updates a block takes each, bool (u,)."""
+        longest, whole = block_limits(self.models, len(self.state), self.states.device)
+        return np.where(self.full, whole[self._owner], self.slice_length <= longest[self._owner])
+
+    def _list_work(self, depth, slice_start, blocks):
         """Return the plan for kernels, and the room of entries, faces and levels."""
-        partial_id = np.flatnonzero(~self.full)
+        partial_id = np.flatnonzero(~self.full & ~blocks)
         # Deepest first, so that the states that have a level are the first of the list.
-        whole = np.flatnonzero(self.full)
+        whole = np.flatnonzero(self.full & ~blocks)
         whole = whole[np.argsort(-depth[whole], kind="stable")]
         entry_end, face_end = np.cumsum(self.slice_length[partial_id]), np.cumsum(self._face_count[whole])
         entries = int(entry_end[-1]) if len(partial_id) else 0
         faces = int(face_end[-1]) if len(whole) else 0
-        levels = range(int(depth.max()) + 1 if len(depth) else 0)
+        listed = depth[~blocks]
+        levels = range(int(listed.max()) + 1 if len(listed) else 0)
         whole_count = np.array([np.sum(depth[whole] >= level) for level in range(int(LEVEL_MAX))], np.int64)
         marked_room = [min(entries, int(np.sum(depth[partial_id] >= level)) << level) for level in levels]
         level_room = [room + (int(whole_count[level]) << level) for level, room in enumerate(marked_room)]
@@ -130,6 +137,10 @@ class LodUpdate(WorkLists):
         def upload(values, dtype=wp.int32):
             return wp.array(np.asarray(values, np.int64), dtype=dtype, device=device)
 
+        slices = np.stack([slice_start, np.where(self.full, int(WHOLE), self.slice_length)], 1)
+        plan.block_count = upload([blocks.sum()])
+        plan.block_state = upload(self.state[blocks])
+        plan.block_slice = upload(slices[blocks], wp.vec2i)
         plan.partial_total = upload([(len(partial_id) << 32) + entries], wp.int64)
         plan.partial_state = upload(self.state[partial_id])
         plan.slice_start = upload(slice_start[partial_id])
@@ -181,11 +192,8 @@ class LodUpdate(WorkLists):
 
     def relaunch(self):
         """Refine meshes and update trees from the LODs that stand there. Launches only."""
+        self.update_by_blocks(self.models.pool, self.states.pool)
         refine_meshes(self.models.pool, self.states.pool, self)
-        self.refit()
-
-    def refit(self):
-        """Update trees alone, from the corners that stand there. Launches only."""
         active_update(self.models.pool, self.states.pool, self)
 
 

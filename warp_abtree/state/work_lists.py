@@ -9,12 +9,17 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.arrays import LEVEL_MAX
-from warp_abtree.kernels.update import mark, refine, refit
+from warp_abtree.kernels.update import block_update, mark, refine, refit
 from warp_abtree.kernels.update.work_lists import UpdateLists
 
 # Nodes of a level that one block refits, at most: a launch costs about as much. And the threads of that block.
 TOP_ROOM = 1024
 TOP_THREADS = 512
+# On a GPU: faces of a slice, or of a tree, that a block updates where there are fewer states than multiprocessors; with
+# more states, as many times more. Threads of a block, with few states and with many, and blocks of a launch, at most.
+BLOCK_SLICE, BLOCK_FACES = 4096, 4096
+FEW_THREADS, MANY_THREADS = 1024, 128
+BLOCKS_MOST = 8192
 # Threads that a GPU runs at a time, of each multiprocessor: more take turns over what they work off.
 THREADS_AT_ONCE = 2048
 
@@ -29,21 +34,53 @@ def launch_items(kernel, items: int, inputs: list, device):
         wp.launch(kernel, dim=step, inputs=[step, *inputs], device=device)
 
 
+def block_limits(models, state_count: int, device):
+    """Return the longest slice that a block takes of each model, 0 where none, and whether it refits them whole.
+
+    Args:
+        models: `ModelArrays`.
+        state_count: States that may be updated at once.
+    """
+    fits = models.depth <= block_update.BLOCK_DEPTH
+    if not device.is_cuda:
+        return np.where(fits, models.split_start[-1], 0), fits
+    times = max(1.0, state_count / device.sm_count)
+    return np.where(fits, int(times * BLOCK_SLICE), 0), fits & (models.face_count <= times * BLOCK_FACES)
+
+
 @dataclass
 class WorkLists:
     """What the kernels of an update of many tree states work through, and the most that there can be of it.
 
     Attributes:
         plan: `UpdateLists` for kernels.
+        block_room: States that a block updates each, at most.
         entry_room, face_room: Faces in the slices of partial updates, and of states under full update, at most.
         level_room: Nodes to refit on each level, the root's first, at most; as many entries as there are levels.
     """
 
     plan: UpdateLists
+    block_room: int
     entry_room: int
     face_room: int
     level_room: list
     device: wp.Device
+
+    def __post_init__(self):
+        # Marks lie in shared memory on CUDA.
+        words = 1 if self.device.is_cuda else int(block_update.MARK_WORDS)
+        self._scratch = wp.empty(words, dtype=wp.uint32, device=self.device)
+
+    def update_by_blocks(self, models, states):
+        """Refine meshes and update trees of the states that a block takes each. One launch."""
+        if not self.block_room:
+            return
+        few = self.device.is_cuda and self.block_room <= self.device.sm_count
+        threads = (FEW_THREADS if few else MANY_THREADS) if self.device.is_cuda else 1
+        blocks = min(self.block_room, BLOCKS_MOST) if self.device.is_cuda else 1
+        inputs = [blocks, threads, models, self._scratch, states, self.plan]
+        kernel = block_update.update_state_kernel
+        wp.launch(kernel, (blocks, threads), inputs, block_dim=threads, device=self.device)
 
 
 def make_level_lists(plan: UpdateLists, marked_room: list, device):
@@ -79,7 +116,7 @@ def active_walk(models, states, work: WorkLists):
     top = next((level for level, room in enumerate(work.level_room) if room > TOP_ROOM), len(work.level_room))
     for level in reversed(range(top, len(work.level_room))):
         launch_items(refit.refit_level_kernel, work.level_room[level], [level, models, work.plan, states], work.device)
-    if top:
+    if any(work.level_room[:top]):
         threads = TOP_THREADS if work.device.is_cuda else 1
         inputs = [threads, top, models, work.plan, states]
         wp.launch(refit.refit_top_kernel, threads, inputs, block_dim=threads, device=work.device)

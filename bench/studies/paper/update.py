@@ -47,7 +47,7 @@ def time_move(context, scene, model, home, there):
     for kind, full in REFITS.items():
         scene.set_lods([home])
         with testing.force_refits(full):
-            refits[kind] = testing.repeat_update(scene.set_lods([there]), refine=False)
+            refits[kind] = testing.repeat_update(scene.set_lods([there]))
     part, whole = refits["update"], refits["full"]
     # In turn, at the same LOD: a refit repeated alone is one that the processor knows by heart.
     times = context.time_graphs({"refit": part, "full": whole})
