@@ -8,12 +8,15 @@ other faces and by those around the merge.
 import warp as wp
 
 from warp_abtree.kernels.progressive.triangle_cover import (
+    COVERS_AT_ONCE,
     FLOOR,
     SLOTS,
+    Covers,
     Replay,
     add_near,
     add_ring,
     cover_distance_sq,
+    cover_ring,
     cover_triangle,
 )
 from warp_abtree.kernels.progressive.vertex_forest import (
@@ -23,7 +26,7 @@ from warp_abtree.kernels.progressive.vertex_forest import (
     third_vertices_live,
 )
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 # Entries of `Replay.counter`, kept between launches.
@@ -237,7 +240,42 @@ def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: in
 
 
 @wp.func
-def replay_merge(replay: Replay, a: int, b: int, c: int, limit: wp.float64):
+def register_covers(replay: Replay, covers: Covers, begin: int, end: int):
+    """Register triangles of the queue with the faces that were found to cover them."""
+    face_count = replay.face_slot.shape[0]
+    free = replay.counter[FREE_SLOTS]
+    for i in range(begin, end):
+        t = covers.triangle[i]
+        free = release_triangle(replay, t, face_count, free)
+        used = covers.count[i - begin]
+        for k in range(used):
+            replay.scratch.used[k] = covers.face[i - begin, k]
+        free = register_triangle(replay, t, used, free)
+    replay.counter[FREE_SLOTS] = free
+
+
+@wp.func
+def cover_queue(
+    replay: Replay, covers: Covers, merge: wp.vec3i, queued: int, near_count: int, shared: int, limit: wp.float64
+):
+    """Cover every queued triangle again, 8 faces at a time where that does it; return the squared bound."""
+    i = int(0)
+    while i < queued:
+        end = i
+        if replay.counter[FREE_SLOTS] >= COVERS_AT_ONCE * SLOTS:
+            covers.limit[0] = limit
+            end = cover_ring(replay, covers, merge, near_count, i, wp.min(i + COVERS_AT_ONCE, queued))
+            limit = covers.limit[0]
+            register_covers(replay, covers, i, end)
+        if end < wp.min(i + COVERS_AT_ONCE, queued):
+            limit = cover_queued(replay, replay.queue[end], replay.queue_face[end], near_count, shared, limit)
+            end += 1
+        i = end
+    return limit
+
+
+@wp.func
+def replay_merge(replay: Replay, covers: Covers, a: int, b: int, c: int, limit: wp.float64):
     """Merge nodes a and b into c and cover the triangles of their faces again; return the squared bound."""
     stamp = replay.counter[STAMP] + 1
     replay.counter[STAMP] = stamp
@@ -254,8 +292,7 @@ def replay_merge(replay: Replay, a: int, b: int, c: int, limit: wp.float64):
     while k >= 0:
         set_face(replay, k // 3)
         k = replay.rings.next[k]
-    for i in range(queued):
-        limit = cover_queued(replay, replay.queue[i], replay.queue_face[i], near_count, stamp, limit)
+    limit = cover_queue(replay, covers, wp.vec3i(a, b, c), queued, near_count, stamp, limit)
     replay.counter[LIVE_FACES] = replay.counter[LIVE_FACES] - dying
     replay.counter[QUEUED] = queued
     return limit
@@ -269,6 +306,7 @@ def replay_merges_kernel(
     merge_pair: wp.array2d(dtype=int),
     # In and out:
     replay_inout: Replay,
+    covers_inout: Covers,
     # Out:
     bound_sq_out: wp.array(dtype=wp.float64),
 ):
@@ -294,7 +332,7 @@ def replay_merges_kernel(
             replay_inout.counter[INDEXED] = -1
             break
         c = vertex_count + j
-        limit = replay_merge(replay_inout, a, b, c, limit)
+        limit = replay_merge(replay_inout, covers_inout, a, b, c, limit)
         covers += replay_inout.counter[QUEUED] + 1
         bound_sq_out[j] = limit
         j += 1

@@ -6,6 +6,7 @@ upper bound. A partition along the prisms over the faces gives zero where the su
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.progressive.polygon import (
     CORNERS,
     STACK,
@@ -20,8 +21,9 @@ from warp_abtree.kernels.progressive.polygon import (
 )
 from warp_abtree.kernels.progressive.vertex_forest import Rings
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
+COVERS_AT_ONCE = wp.constant(native.constant("COVERS_AT_ONCE"))
 CUTS = wp.constant(64)  # cuts of a triangle at one merge, at most
 SLOTS = wp.constant(32)  # faces that cover a triangle, at most
 
@@ -62,6 +64,31 @@ class Replay:
     triangle_stamp: wp.array(dtype=int)  # [face_count], last merge that queued the triangle
     queue: wp.array(dtype=int)  # [face_count], triangles to cover again
     queue_face: wp.array(dtype=int)  # [face_count], a face that covered each: the first to try
+
+
+@wp.struct
+class Covers:
+    """Triangles to cover at a merge, and the faces found for each."""
+
+    triangle: wp.array(dtype=int)  # [any], triangles in order
+    first: wp.array(dtype=int)  # [any], a face that covered each: the first to try
+    near: wp.array(dtype=int)  # [any], faces around the merge
+    count: wp.array(dtype=int)  # [COVERS_AT_ONCE], faces that cover each triangle
+    face: wp.array2d(dtype=int)  # [COVERS_AT_ONCE, SLOTS], these faces
+    limit: wp.array(dtype=wp.float64)  # [1], squared running maximum
+
+
+@wp.func_native(native.body("cover_ring.h", "cover_ring"))
+def cover_ring(
+    replay: Replay, covers: Covers, merge: wp.vec3i, near_count: wp.int32, begin: wp.int32, end: wp.int32
+) -> wp.int32:
+    """Cover triangles again, 8 faces at a time, number by number as `cover_triangle`, and raise the running maximum.
+
+    Args:
+        merge: The two nodes of the merge and the one that it makes; the forest may be that before the merge or after.
+
+    Returns where it stopped: `end`, or a triangle that only `cover_triangle` can cover, as other faces may be nearer.
+    """
 
 
 @wp.func

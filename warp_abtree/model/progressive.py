@@ -297,11 +297,16 @@ def _bound_errors(vertex_pos, parent, faces, report):
     replay = _replay((vertex_pos - centre) / scale, face_count)
     replay.rings = _linked_rings(faces, face_array, len(parent))
     _launch(hausdorff_bound.start_replay_kernel, face_count, face_array, replay)
+    covers = triangle_cover.Covers()
+    covers.triangle, covers.first, covers.near = replay.queue, replay.queue_face, replay.scratch.near
+    covers.count = _filled(triangle_cover.COVERS_AT_ONCE, 0)
+    covers.face = wp.zeros((triangle_cover.COVERS_AT_ONCE, triangle_cover.SLOTS), dtype=int, device="cpu")
+    covers.limit = wp.zeros(1, dtype=wp.float64, device="cpu")
     bound_sq = wp.zeros(merge_count, dtype=wp.float64, device="cpu")
     inputs = [len(parent) - merge_count, merge_count, COVERS, cpu_array(pair, int)]
     state = replay.counter.numpy()  # shares the memory
     while state[0] < merge_count:
-        _launch(hausdorff_bound.replay_merges_kernel, *inputs, replay, bound_sq)
+        _launch(hausdorff_bound.replay_merges_kernel, *inputs, replay, covers, bound_sq)
         if state[5] < 0:
             bvh = _index(replay)
             replay.bvh, state[5] = bvh.id, state[1]
