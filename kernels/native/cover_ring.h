@@ -247,6 +247,13 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
     for (int i = 0; i < near_count; ++i)
         add(covers.near.data[i]);
     load_groups(0);
+    auto slot_at = [&](int slot) { return replay.slot.data + SLOT_FIELDS * (wp::int64)slot; };
+    auto corners_of = [&](int t) { return (const double*)replay.triangle_pos.data + 9 * (wp::int64)t; };
+    for (int i = begin; i < end; ++i) {
+        const double* corner = corners_of(covers.triangle.data[i]);
+        __builtin_prefetch(corner);
+        __builtin_prefetch(corner + 8);
+    }
     // Bounds by the first face to try of each triangle, 8 triangles at a time.
     alignas(64) double first_bound[COVERS_AT_ONCE];
     for (int i = begin; i < end; i += 8) {
@@ -255,7 +262,7 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
         bits has_first = {};
         for (int k = 0; k < 8 && i + k < end; ++k) {
             const int first = find(covers.first.data[i + k]);
-            const double* from = (const double*)replay.triangle_pos.data + 9 * (wp::int64)covers.triangle.data[i + k];
+            const double* from = corners_of(covers.triangle.data[i + k]);
             has_first[k] = -(first >= 0);
             for (int x = 0; x < 9; ++x)
                 corner[x][k] = from[x];
@@ -282,8 +289,8 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
         }
         faces = near_count;
         groups = (faces + 7) / 8;
-        for (int slot = t; slot >= 0; slot = replay.slot_sibling.data[slot]) {
-            const int f = replay.slot_face.data[slot];
+        for (int slot = t; slot >= 0; slot = slot_at(slot)[SLOT_SIBLING]) {
+            const int f = slot_at(slot)[SLOT_FACE];
             if (is_live(f) && find(f) < 0) {
                 if (faces == NEAR_ROOM)
                     return i;
@@ -294,7 +301,7 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
             return i;
         if (faces > near_count)
             load_groups(near_count >> 3);
-        const double* corner = (const double*)replay.triangle_pos.data + 9 * (wp::int64)t;
+        const double* corner = corners_of(t);
         stack[0].count = rows = 3;
         for (int k = 0; k < 3; ++k) {
             stack[0].corner[k] =

@@ -10,6 +10,12 @@ import warp as wp
 from warp_abtree.kernels.progressive.triangle_cover import (
     COVERS_AT_ONCE,
     FLOOR,
+    SLOT_FACE,
+    SLOT_LAST,
+    SLOT_NEXT,
+    SLOT_SIBLING,
+    SLOT_STAMP,
+    SLOT_TRIANGLE,
     SLOTS,
     Covers,
     Replay,
@@ -56,11 +62,11 @@ def set_face(replay: Replay, f: int):
 @wp.func
 def register_slot(replay: Replay, slot: int, f: int):
     first = replay.face_slot[f]
-    replay.slot_face[slot] = f
-    replay.slot_next[slot] = first
-    replay.slot_last[slot] = -1
+    replay.slot[slot, SLOT_FACE] = f
+    replay.slot[slot, SLOT_NEXT] = first
+    replay.slot[slot, SLOT_LAST] = -1
     if first >= 0:
-        replay.slot_last[first] = slot
+        replay.slot[first, SLOT_LAST] = slot
     replay.face_slot[f] = slot
 
 
@@ -69,19 +75,19 @@ def release_triangle(replay: Replay, t: int, face_count: int, free: int):
     """End every registration of triangle t; return how many pooled slots are free."""
     slot = t
     while slot >= 0:
-        before = replay.slot_last[slot]
-        after = replay.slot_next[slot]
+        before = replay.slot[slot, SLOT_LAST]
+        after = replay.slot[slot, SLOT_NEXT]
         if before >= 0:
-            replay.slot_next[before] = after
+            replay.slot[before, SLOT_NEXT] = after
         else:
-            replay.face_slot[replay.slot_face[slot]] = after
+            replay.face_slot[replay.slot[slot, SLOT_FACE]] = after
         if after >= 0:
-            replay.slot_last[after] = before
+            replay.slot[after, SLOT_LAST] = before
         if slot >= face_count:
             replay.free_slot[free] = slot
             free += 1
-        slot = replay.slot_sibling[slot]
-    replay.slot_sibling[t] = -1
+        slot = replay.slot[slot, SLOT_SIBLING]
+    replay.slot[t, SLOT_SIBLING] = -1
     return free
 
 
@@ -92,9 +98,9 @@ def register_triangle(replay: Replay, t: int, used: int, free: int):
     for k in range(1, used):
         free -= 1
         slot = replay.free_slot[free]
-        replay.slot_triangle[slot] = t
-        replay.slot_sibling[slot] = replay.slot_sibling[t]
-        replay.slot_sibling[t] = slot
+        replay.slot[slot, SLOT_TRIANGLE] = t
+        replay.slot[slot, SLOT_SIBLING] = replay.slot[t, SLOT_SIBLING]
+        replay.slot[t, SLOT_SIBLING] = slot
         register_slot(replay, slot, replay.scratch.used[k])
     return free
 
@@ -145,13 +151,13 @@ def queue_ring(replay: Replay, queued: int, node: int, stamp: int):
         if replay.rings.corner_node[3 * f] >= 0:
             slot = replay.face_slot[f]
             while slot >= 0:
-                t = replay.slot_triangle[slot]
-                if replay.triangle_stamp[t] != stamp:
-                    replay.triangle_stamp[t] = stamp
+                t = replay.slot[slot, SLOT_TRIANGLE]
+                if replay.slot[t, SLOT_STAMP] != stamp:
+                    replay.slot[t, SLOT_STAMP] = stamp
                     replay.queue[queued] = t
                     replay.queue_face[queued] = f
                     queued += 1
-                slot = replay.slot_next[slot]
+                slot = replay.slot[slot, SLOT_NEXT]
         k = replay.rings.next[k]
     return queued
 
@@ -187,7 +193,7 @@ def start_replay_kernel(
     """Register every original triangle with itself (serial, dim=1).
 
     Args:
-        replay_inout: `face_slot`, `slot_sibling` and the stamps must hold -1.
+        replay_inout: `face_slot`, `slot` and the stamps must hold -1.
     """
     live = int(0)
     for f in range(face_count):
@@ -195,7 +201,7 @@ def start_replay_kernel(
             replay_inout.triangle_pos[f, k] = replay_inout.pos[face_vertex[f, k]]
         if replay_inout.rings.corner_node[3 * f] >= 0:
             set_face(replay_inout, f)
-            replay_inout.slot_triangle[f] = f
+            replay_inout.slot[f, SLOT_TRIANGLE] = f
             register_slot(replay_inout, f, f)
             live += 1
     replay_inout.counter[LIVE_FACES] = live
@@ -222,10 +228,10 @@ def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: in
         replay.counter[STAMP] = own
         slot = t
         while slot >= 0:
-            f = replay.slot_face[slot]
+            f = replay.slot[slot, SLOT_FACE]
             if replay.rings.corner_node[3 * f] >= 0:
                 near_count = add_near(replay, near_count, shared, own, f)
-            slot = replay.slot_sibling[slot]
+            slot = replay.slot[slot, SLOT_SIBLING]
         if near_count == 0:
             f = search_all(replay, limit)
             for k in range(3):

@@ -27,6 +27,15 @@ COVERS_AT_ONCE = wp.constant(native.constant("COVERS_AT_ONCE"))
 CUTS = wp.constant(64)  # cuts of a triangle at one merge, at most
 SLOTS = wp.constant(32)  # faces that cover a triangle, at most
 
+# Entries of a slot, which lie side by side in memory.
+SLOT_FACE = wp.constant(native.constant("SLOT_FACE"))  # the face that its triangle is registered with
+SLOT_TRIANGLE = wp.constant(1)
+SLOT_SIBLING = wp.constant(native.constant("SLOT_SIBLING"))  # next slot of the same triangle, or -1
+SLOT_NEXT = wp.constant(3)  # doubly linked list of each face's slots
+SLOT_LAST = wp.constant(4)  # the other direction
+SLOT_STAMP = wp.constant(5)  # last merge that queued the triangle; of a triangle's own slot
+SLOT_FIELDS = wp.constant(native.constant("SLOT_FIELDS"))
+
 # Coordinates are within 1/2 and rounded at 2^-53: smaller bounds in flat regions are noise, not worth a cut.
 FLOOR = wp.constant(wp.float64(2.0**-46))
 MARGIN = wp.constant(wp.float64(0.05))  # of the bound: how far a polygon may extend beyond the edge of a prism
@@ -53,15 +62,10 @@ class Replay:
     face_box: wp.array2d(dtype=wp.vec3d)  # [face_count, 2], lower and upper corner of the box of each
     bvh: wp.uint64  # wp.Bvh over the boxes of bvh_face; 0 until a component vanishes
     bvh_face: wp.array(dtype=int)  # [any], faces that were active when the Bvh was built
-    slot_face: wp.array(dtype=int)  # [slot_count], face that the slot's triangle is registered with
-    slot_triangle: wp.array(dtype=int)  # [slot_count]; slot t is triangle t's own, those from face_count are pooled
-    slot_sibling: wp.array(dtype=int)  # [slot_count], next slot of the same triangle, or -1
-    slot_next: wp.array(dtype=int)  # [slot_count], doubly linked list of each face's slots
-    slot_last: wp.array(dtype=int)  # [slot_count], the other direction
+    slot: wp.array2d(dtype=int)  # [slot_count, SLOT_FIELDS], slot t is triangle t's own, those from face_count are pooled
     free_slot: wp.array(dtype=int)  # [slot_count - face_count], stack of pooled slots not in use
     face_slot: wp.array(dtype=int)  # [face_count], first slot or -1
     face_stamp: wp.array(dtype=int)  # [face_count], last candidate set that held the face
-    triangle_stamp: wp.array(dtype=int)  # [face_count], last merge that queued the triangle
     queue: wp.array(dtype=int)  # [face_count], triangles to cover again
     queue_face: wp.array(dtype=int)  # [face_count], a face that covered each: the first to try
 

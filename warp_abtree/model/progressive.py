@@ -322,11 +322,10 @@ def _replay(pos, face_count):
     replay.pos = cpu_array(pos, wp.vec3d)
     replay.triangle_pos, replay.face_pos = _points(face_count, 3), _points(face_count, 3)
     replay.face_box = _points(face_count, 2)
-    for name in ("face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face"):
+    for name in ("face_slot", "face_stamp", "queue", "queue_face"):
         setattr(replay, name, _filled(face_count, -1))
     pooled = 3 * face_count + 4096  # an empty pool loosens bounds only
-    for name in ("slot_face", "slot_triangle", "slot_sibling", "slot_next", "slot_last"):
-        setattr(replay, name, _filled(face_count + pooled, -1))
+    replay.slot = _filled((face_count + pooled, triangle_cover.SLOT_FIELDS), -1)
     replay.free_slot = _filled(pooled, 0)
     replay.bvh_face = _filled(1, 0)
     return replay
