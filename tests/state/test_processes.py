@@ -13,7 +13,7 @@ import pytest
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
-from warp_abtree.query.cpu_threads import core_count
+from warp_abtree.checks.cpu_threads import core_count
 
 START = """
 import os, sys, tempfile

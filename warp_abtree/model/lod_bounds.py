@@ -1,0 +1,99 @@
+"""Certified errors of all LODs: a replay of the collapse sequence that keeps up with it."""
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels.progressive import hausdorff_bound, polygon, triangle_cover
+from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, points
+
+# Triangles covered per launch, about.
+COVERS = 200_000
+# Pooled slots for each face, and beyond these; an empty pool loosens bounds only.
+POOL_PER_FACE, POOL_EXTRA = 3, 4096
+
+# Error of a bound by rounding, in units of the frame (coordinates about 1/2, so 2^-54 each): reading the vertices of
+# both surfaces, a closest point of some ten operations, and the points of at most 64 cuts by three planes each, every
+# one within 2^-52 a coordinate of the segment that it cuts: 192 sqrt(3) 2^-52 and a little, under 2^-43.
+ROUNDING = 2.0**-43
+
+
+class LodBounds:
+    """Bounds on the distance of any point of the original surface from the surface after each merge.
+
+    Attributes:
+        done: Merges that are bounded.
+    """
+
+    def __init__(self, vertices, faces):
+        self._vertex_count, face_count = len(vertices), len(faces)
+        self._centre, self._scale = find_frame(vertices[np.unique(faces)])
+        face_array = cpu_array(faces, int)
+        self._pos = np.zeros((2 * len(vertices), 3))
+        self._pos[: len(vertices)] = (vertices - self._centre) / self._scale
+        self._replay = _new_replay(self._pos, face_count)
+        self._replay.rings = linked_rings(faces, face_array, 2 * len(vertices))
+        launch(hausdorff_bound.start_replay_kernel, face_count, face_array, self._replay)
+        self._covers = _new_covers(self._replay)
+        self._pair = filled((len(vertices), 2), 0)
+        self._bound_sq = wp.zeros(len(vertices), dtype=wp.float64, device="cpu")
+        self._state = self._replay.counter.numpy()  # shares the memory
+        self._known = 0
+
+    @property
+    def done(self):
+        """Merges that are bounded."""
+        return int(self._state[0])
+
+    def add(self, pair, merged):
+        """Take the next merges: their nodes int32 [k, 2], and the positions that they make [model units], [k, 3]."""
+        begin, end = self._known, self._known + len(pair)
+        self._pair.numpy()[begin:end] = pair
+        self._pos[self._vertex_count + begin : self._vertex_count + end] = (merged - self._centre) / self._scale
+        self._known = end
+
+    def advance(self):
+        """Bound some of the merges that are known."""
+        inputs = [self._vertex_count, self._known, COVERS, self._pair, self._replay, self._covers, self._bound_sq]
+        launch(hausdorff_bound.replay_merges_kernel, *inputs)
+        if self._state[5] < 0:
+            bvh = _index(self._replay)
+            self._replay.bvh, self._state[5] = bvh.id, self._state[1]
+            self._bvh = bvh  # lives as long as it is asked
+
+    def errors(self):
+        """Return lod_error, float64 [m+1]."""
+        error = self._scale * (np.sqrt(self._bound_sq.numpy()[: self._known]) + ROUNDING)
+        return np.append(error[::-1], 0.0)
+
+
+def _new_replay(pos, face_count):
+    replay = triangle_cover.Replay()
+    replay.counter = filled(6, 0)
+    replay.scratch = make_scratch(face_count, triangle_cover.SLOTS, polygon.STACK)
+    replay.pos = wp.array(pos, dtype=wp.vec3d, device="cpu", copy=False)
+    replay.triangle_pos, replay.face_pos = points(face_count, 3), points(face_count, 3)
+    replay.face_box = points(face_count, 2)
+    for name in ("face_slot", "face_stamp", "queue", "queue_face"):
+        setattr(replay, name, filled(face_count, -1))
+    pooled = POOL_PER_FACE * face_count + POOL_EXTRA
+    replay.slot = filled((face_count + pooled, triangle_cover.SLOT_FIELDS), -1)
+    replay.free_slot = filled(pooled, 0)
+    replay.bvh_face = filled(1, 0)
+    return replay
+
+
+def _new_covers(replay):
+    covers, rows = triangle_cover.Covers(), triangle_cover.COVERS_AT_ONCE
+    covers.triangle, covers.first, covers.near = replay.queue, replay.queue_face, replay.scratch.near
+    covers.count, covers.face = filled(rows, 0), filled((rows, triangle_cover.SLOTS), 0)
+    covers.limit = wp.zeros(1, dtype=wp.float64, device="cpu")
+    return covers
+
+
+def _index(replay):
+    """Return a wp.Bvh over the active faces, for triangles whose connected component vanishes."""
+    active = np.flatnonzero(replay.rings.corner_node.numpy()[::3] >= 0).astype(np.int32)
+    corners = replay.face_pos.numpy()[active]
+    lower, upper = corners.min(axis=1).astype(np.float32), corners.max(axis=1).astype(np.float32)
+    replay.bvh_face = cpu_array(active, int)
+    return wp.Bvh(cpu_array(lower, wp.vec3), cpu_array(upper, wp.vec3))
