@@ -10,6 +10,8 @@ from warp_abtree import testing
 
 # JAX would take three quarters of a GPU's memory for itself.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+# No test reads or writes the user's models; those of the cache name a folder of their own.
+os.environ["WARP_ABTREE_CACHE"] = "off"
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 

@@ -104,7 +104,7 @@ def build(vertices, faces, name):
     def progress(stage, done, total):
         end[stage] = time.thread_time()
 
-    model = ab.Model.from_arrays(vertices, faces, base_faces=BASE_FACES, progress=progress, name=name)
+    model = ab.Model.from_arrays(vertices, faces, base_faces=BASE_FACES, progress=progress, name=name, cache=False)
     stop, collapse = time.thread_time(), end.get("collapse", begin)
     error = end.get("LOD bounds", collapse)
     stages = {"collapse": collapse - begin, "error": error - collapse, "tree": stop - error, "build": stop - begin}

@@ -38,7 +38,7 @@ class Collapse:
         surface.quadric = wp.zeros(2 * len(pos), dtype=Quadric, device="cpu")
         surface.parent = filled(2 * len(pos), -1)
         surface.stamp = filled(2 * len(pos), -1)
-        self._merge_pair = filled((len(pos), 2), 0)
+        self._merge_pair = filled((len(pos), 2), 0, wp.vec2i)
         self.pair = self._merge_pair.numpy()  # shares the memory
         self._rings = linked_rings(faces, face_array, 2 * len(pos))
         launch(collapse.weigh_faces_kernel, len(faces), face_array, cpu_array(boundary, wp.int8), surface)

@@ -13,7 +13,7 @@ def cpu_array(values, dtype):
 
 def filled(shape, value, dtype=int):
     """Return an array on the CPU, in memory of NumPy's: that lies on huge pages where the system has them."""
-    memory = np.full(shape, value, np.int32 if dtype is int else np.float64)
+    memory = np.full(shape, value, np.float64 if dtype is wp.vec3d else np.int32)
     return wp.array(memory, dtype=dtype, device="cpu", copy=False)
 
 
