@@ -71,11 +71,11 @@ def repeat_update(update: LodUpdate):
 
 
 def read_bits(scene) -> list:
-    """Return boxes, statuses and corners bit by bit, one row a state, in the order of model and LOD. Waits."""
+    """Return boxes, skip links and corners bit by bit, one row a state, in the order of model and LOD. Waits."""
     states = scene.batch().states
     order = np.lexsort(([slot.lod for slot in states.slots], [slot.model for slot in states.slots]))
     pool, node_end = states.pool, states.node_total
-    arrays = [pool.node_box[: 2 * node_end], pool.node_status[:node_end], pool.face_corner[: states.face_total]]
+    arrays = [pool.node_box[: 2 * node_end], pool.face_corner[: states.face_total]]
     return [array.numpy().view(np.int32).reshape(len(states.slots), -1)[order] for array in arrays]
 
 
