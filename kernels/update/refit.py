@@ -12,9 +12,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def refit_leaf(
-    models: ModelPool, states: StatePool, state: wp.int32, node: wp.int32, face: wp.int32, corner: wp.vec4i
-):
+def refit_leaf(models: ModelPool, states: StatePool, state: wp.int32, node: wp.int32, face: wp.int32, corner: wp.vec4i):
     """Box one face about the model's centre, or empty the leaf of an inactive face."""
     at = states.node_start[state] + node
     if corner[0] < 0:

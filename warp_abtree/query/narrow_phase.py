@@ -156,7 +156,9 @@ class Query(QueryBuffers):
         self.guard.record()
         inputs += [self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
-        wp.launch(relative_pose.relative_pose_kernel, dim=dim, inputs=inputs, device=self.device)
+        # A warp a block: few pairs lie on as many multiprocessors.
+        kernel = relative_pose.relative_pose_kernel
+        wp.launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits]
         if not self.uses_warps():
             cores = current_regime().cpu_threads or core_count()
