@@ -62,8 +62,9 @@ def repeat_update(update: LodUpdate):
     targets = wp.clone(states.pool.lod)  # the next update writes in place
 
     def launch():
-        for name in ("changed_count", "marked_count", "level_count"):
-            getattr(update.plan, name).zero_()
+        if update.entry_room or update.face_room:
+            for name in ("changed_count", "marked_count", "level_count"):
+                getattr(update.plan, name).zero_()
         states.pool.lod = targets
         update.relaunch()
 

@@ -4,6 +4,8 @@ import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
 from warp_abtree.kernels.poses import PairPose, pose_point
+from warp_abtree.kernels.traversal.uncertain_pairs import items_at_once
+from warp_abtree.kernels.traversal.warp_stack import warp_lane, warp_size
 from warp_abtree.kernels.triangle.segment import face_normal, intersect_faces, unit_vector
 from warp_abtree.kernels.triangle.segment_filter import filter_normal, filter_segment
 
@@ -170,9 +172,10 @@ def find_deferred_kernel(
     deferred: Deferred,
     contacts_out: Contacts,
 ):
-    """Compute deferred contacts by exact signs, every so many-th a thread."""
-    k = wp.tid()
-    while k < deferred.total[0]:
+    """Compute deferred contacts by exact signs: few at a time in each warp of so many threads."""
+    at_once = items_at_once(deferred.total[0], step)
+    k = at_once * (wp.tid() / warp_size()) + warp_lane()
+    while warp_lane() < at_once and k < deferred.total[0]:
         i = deferred.place[k]
         p = faces[i][0]
         own = contact_objects(pairs, pair_poses, p)
@@ -184,4 +187,4 @@ def find_deferred_kernel(
         normal_b = face_normal(corner[3], corner[4], corner[5])
         write_contact(models, states, objects, own, i, p0, p1, normal_a, normal_b, contacts_out)
         contacts_out.coplanar[i] = coplanar
-        k += step
+        k += at_once * (step / warp_size())

@@ -13,6 +13,16 @@ inline CUDA_CALLABLE wp::uint64 block_marks(wp::array_t<wp::uint32> scratch) {
 #endif
 }
 
+inline CUDA_CALLABLE wp::uint64 shallow_marks(wp::array_t<wp::uint32> scratch) {
+#include "sizes.h"
+#if defined(__CUDA_ARCH__)
+    __shared__ unsigned int words[SHALLOW_WORDS];
+    return (unsigned int)__cvta_generic_to_shared(words);
+#else
+    return (wp::uint64)scratch.data;
+#endif
+}
+
 inline CUDA_CALLABLE wp::uint32 read_word(wp::uint64 marks, wp::int32 i) {
 #if defined(__CUDA_ARCH__)
     unsigned int word;

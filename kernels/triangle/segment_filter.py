@@ -1,24 +1,63 @@
-"""The segment that two faces in general position share, where float64 alone is sure of it: no expansions, no arrays.
+"""The segment that two faces in general position share: no expansions, no arrays.
 
-What it is sure of has the bits of `segment`, which decides the rest.
+What this is sure of has the bits of `segment`, which decides the rest: a determinant whose float64 value may err too
+much there is the sum of an expansion, off the float64 number next to it by nothing but a tie that double words exclude.
 """
 
 import warp as wp
 
-from warp_abtree.kernels.arithmetic.predicates import UNCERTAIN, drop_axis, filter_orient3d, plain_sign
+from warp_abtree.kernels.arithmetic.double_word import BOUND_DOUBLE, double_orient2d, double_orient3d, round_double
+from warp_abtree.kernels.arithmetic.predicates import (
+    BOUND_2D,
+    BOUND_3D,
+    UNCERTAIN,
+    drop_axis,
+    filter_orient3d,
+    plain_sign,
+)
 from warp_abtree.kernels.triangle.intersect import find_alone, is_one_sided, rotate_triangles
-from warp_abtree.kernels.triangle.segment import cross_edge, round_area, round_volume, unit_vector
+from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR, cross_edge, round_area, round_volume, unit_vector
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
+@wp.func(inline=False)
+def extend_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, size: wp.float64):
+    """Return det(a - d, b - d, c - d) rounded once, or NaN. Not inlined: long, and rarely called."""
+    return round_double(double_orient3d(a, b, c, d), BOUND_DOUBLE * size)
+
+
+@wp.func(inline=False)
+def extend_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, size: wp.float64):
+    """Return det(a - c, b - c) rounded once, or NaN."""
+    return round_double(double_orient2d(a, b, c), BOUND_DOUBLE * size)
+
+
+@wp.func
+def filter_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Return `signed_volume`, or NaN."""
+    value, size = round_volume(a, b, c, d)
+    if BOUND_3D * size > RELATIVE_ERROR * wp.abs(value):
+        value = extend_volume(a, b, c, d, size)
+    return value
+
+
+@wp.func
+def filter_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
+    """Return `signed_area`, or NaN."""
+    value, size = round_area(a, b, c)
+    if BOUND_2D * size > RELATIVE_ERROR * wp.abs(value):
+        value = extend_area(a, b, c, size)
+    return value
+
+
 @wp.func
 def filter_normal(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Return `face_normal` and whether it is that."""
-    x, sure_x = round_area(drop_axis(a, 0), drop_axis(b, 0), drop_axis(c, 0))
-    y, sure_y = round_area(drop_axis(a, 1), drop_axis(b, 1), drop_axis(c, 1))
-    z, sure_z = round_area(drop_axis(a, 2), drop_axis(b, 2), drop_axis(c, 2))
-    return unit_vector(wp.vec3d(x, y, z)), sure_x and sure_y and sure_z
+    """Return `face_normal`, and whether it is sure of it."""
+    x = filter_area(drop_axis(a, 0), drop_axis(b, 0), drop_axis(c, 0))
+    y = filter_area(drop_axis(a, 1), drop_axis(b, 1), drop_axis(c, 1))
+    z = filter_area(drop_axis(a, 2), drop_axis(b, 2), drop_axis(c, 2))
+    return unit_vector(wp.vec3d(x, y, z)), x == x and y == y and z == z
 
 
 @wp.func
@@ -34,16 +73,12 @@ def filter_segment(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: w
 
     Source: as `cross_planes`, whose names these are.
     """
-    u0, sure_u0 = round_volume(b0, b1, b2, a0)
-    u1, sure_u1 = round_volume(b0, b1, b2, a1)
-    u2, sure_u2 = round_volume(b0, b1, b2, a2)
-    v0, sure_v0 = round_volume(a0, a1, a2, b0)
-    v1, sure_v1 = round_volume(a0, a1, a2, b1)
-    v2, sure_v2 = round_volume(a0, a1, a2, b2)
-    sure = sure_u0 and sure_u1 and sure_u2 and sure_v0 and sure_v1 and sure_v2
+    u0, u1, u2 = filter_volume(b0, b1, b2, a0), filter_volume(b0, b1, b2, a1), filter_volume(b0, b1, b2, a2)
+    v0, v1, v2 = filter_volume(a0, a1, a2, b0), filter_volume(a0, a1, a2, b1), filter_volume(a0, a1, a2, b2)
     sa = wp.vec3i(plain_sign(u0), plain_sign(u1), plain_sign(u2))
     sb = wp.vec3i(plain_sign(v0), plain_sign(v1), plain_sign(v2))
-    sure = sure and sa[0] * sa[1] * sa[2] * sb[0] * sb[1] * sb[2] != 0
+    # NaN has no sign.
+    sure = sa[0] * sa[1] * sa[2] * sb[0] * sb[1] * sb[2] != 0
     sure = sure and not is_one_sided(sa[0], sa[1], sa[2]) and not is_one_sided(sb[0], sb[1], sb[2])
     _, side_a = find_alone(sa[0], sa[1], sa[2])
     _, side_b = find_alone(sb[0], sb[1], sb[2])

@@ -14,9 +14,11 @@ from warp_abtree.kernels.update.refine import refine_face
 from warp_abtree.kernels.update.refit import block_sync, refit_inner, refit_leaf, unite_nodes
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
 
 BLOCK_DEPTH = native.constant("BLOCK_DEPTH")  # of the deepest tree that a block updates
+SHALLOW_DEPTH = native.constant("SHALLOW_DEPTH")
 MARK_WORDS = native.constant("MARK_WORDS")
 # Marks follow two words that count faces changed and nodes marked: a bit a node, deformed; then another a node, set
 # while two deformed children are to come.
@@ -29,6 +31,11 @@ marks_code = functools.partial(native.body, "block_marks.cuh")
 @wp.func_native(marks_code("block_marks"))
 def block_marks(scratch: wp.array(dtype=wp.uint32)) -> wp.uint64:
     """Return where this block's marks lie: an address in shared memory on CUDA, on the CPU that of `scratch`."""
+
+
+@wp.func_native(marks_code("shallow_marks"))
+def shallow_marks(scratch: wp.array(dtype=wp.uint32)) -> wp.uint64:
+    """Return the same for trees of SHALLOW_DEPTH at most."""
 
 
 @wp.func_native(marks_code("read_word"))
@@ -213,44 +220,53 @@ def update_whole(own: BlockThread, models: ModelPool, states: StatePool):
         refit_level(own, models, states, top)
 
 
-@wp.kernel(cuda_max_registers=64)
-def update_state_kernel(
-    blocks: wp.int32,
-    threads: wp.int32,
-    models: ModelPool,
-    scratch: wp.array(dtype=wp.uint32),
-    states_inout: StatePool,
-    plan_inout: UpdateLists,
-):
-    """Bring one state after another to its LOD, a block each.
+@functools.cache
+def state_update(shallow: bool):
+    """Return the kernel that brings states to their LODs, for trees of SHALLOW_DEPTH or of BLOCK_DEPTH at most."""
+    find_marks = shallow_marks if shallow else block_marks
 
-    Source: Liu et al. 2006, section 3.2.2, ACTIVE-UPDATE; Algorithms 1 to 3.
-    """
-    block, thread = wp.tid()
-    own = BlockThread()
-    own.thread = thread
-    own.threads = threads
-    own.marks = block_marks(scratch)
-    update = wp.int32(block)
-    while update < plan_inout.block_count[0]:
-        own.state = plan_inout.block_state[update]
-        model = states_inout.model[own.state]
-        own.face_start = models.face_start[model]
-        own.depth = models.depth[model]
-        own.twice_start = MARK_START + (2 << own.depth)
-        slice = plan_inout.block_slice[update]
-        block_sync()
-        clear_marks(own, slice[1] == WHOLE)
-        block_sync()
-        if slice[1] == WHOLE:
-            update_whole(own, models, states_inout)
-        else:
-            refine_slice(own, models, states_inout, slice)
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=64)
+    def update_state_kernel(
+        blocks: wp.int32,
+        threads: wp.int32,
+        models: ModelPool,
+        scratch: wp.array(dtype=wp.uint32),
+        states_inout: StatePool,
+        plan_inout: UpdateLists,
+    ):
+        """Bring one state after another to its LOD, a block each.
+
+        Source: Liu et al. 2006, section 3.2.2, ACTIVE-UPDATE; Algorithms 1 to 3.
+        """
+        block, thread = wp.tid()
+        own = BlockThread()
+        own.thread = thread
+        own.threads = threads
+        own.marks = find_marks(scratch)
+        update = wp.int32(block)
+        while update < plan_inout.block_count[0]:
+            own.state = plan_inout.block_state[update]
+            model = states_inout.model[own.state]
+            own.face_start = models.face_start[model]
+            own.depth = models.depth[model]
+            own.twice_start = MARK_START + (2 << own.depth)
+            slice = plan_inout.block_slice[update]
             block_sync()
-            refit_slice(own, models, states_inout, slice)
-        block_sync()
-        if thread == 0:
-            marked = wp.int32(read_word(own.marks, MARKED))
-            plan_inout.changed_count[own.state] = wp.int32(read_word(own.marks, CHANGED))
-            plan_inout.marked_count[own.state] = wp.where(slice[1] == WHOLE, 2 * models.face_count[model] - 1, marked)
-        update += blocks
+            clear_marks(own, slice[1] == WHOLE)
+            block_sync()
+            if slice[1] == WHOLE:
+                update_whole(own, models, states_inout)
+            else:
+                refine_slice(own, models, states_inout, slice)
+                block_sync()
+                refit_slice(own, models, states_inout, slice)
+            block_sync()
+            if thread == 0:
+                marked = wp.int32(read_word(own.marks, MARKED))
+                plan_inout.changed_count[own.state] = wp.int32(read_word(own.marks, CHANGED))
+                plan_inout.marked_count[own.state] = wp.where(
+                    slice[1] == WHOLE, 2 * models.face_count[model] - 1, marked
+                )
+            update += blocks
+
+    return update_state_kernel

@@ -51,8 +51,8 @@ from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import CapacityError
 from warp_abtree.query.result import VECTORS, ContactResult, Result, contact_dtypes
 
-# Threads of a block that find contacts, and those deferred; and threads of these that a multiprocessor runs at a time.
-FIND_THREADS, DEFERRED_THREADS, THREADS_AT_ONCE = 64, 64, 256
+# Warps that a multiprocessor runs at a time, by their registers, of those that find deferred contacts.
+DEFERRED_WARPS = 8
 
 
 class ContactQuery(Query):
@@ -183,11 +183,10 @@ class ContactQuery(Query):
     def _find(self):
         posed = [*self.batch.pools, self.pairs, self.pair_poses]
         inputs = [*posed, self.start, self.faces, self._deferred, self.contacts]
-        self._launch_kernel(contact.find_contact_kernel, self._places, inputs, FIND_THREADS)
-        threads = THREADS_AT_ONCE * self.device.sm_count if self.device.is_cuda else 1
-        step = min(self._places, threads)
+        self._launch_kernel(contact.find_contact_kernel, self._places, inputs, WARP_SIZE)
+        step = DEFERRED_WARPS * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
         inputs = [step, *posed, self.faces, self._deferred, self.contacts]
-        self._launch_kernel(contact.find_deferred_kernel, step, inputs, DEFERRED_THREADS)
+        self._launch_kernel(contact.find_deferred_kernel, step, inputs, WARP_SIZE)
 
     def _reduce(self):
         room, chunks = len(self.pairs), len(self._sums.span)

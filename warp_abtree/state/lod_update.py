@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import LEVEL_MAX
-from warp_abtree.kernels.update import refit
+from warp_abtree.kernels.update import block_update, refit
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.work_lists import WorkLists, active_update, block_limits, make_level_lists, refine_meshes
@@ -80,7 +80,8 @@ class LodUpdate(WorkLists):
         slice_start = self._measure_slices()
         blocks = self._take_blocks()
         plan, *rooms = self._list_work(models.depth[owner], slice_start, blocks)
-        super().__init__(plan, int(blocks.sum()), *rooms, states.device)
+        shallow = bool((models.depth <= block_update.SHALLOW_DEPTH).all())
+        super().__init__(plan, int(blocks.sum()), shallow, *rooms, states.device)
         self._copies = self._plan_copies()
 
     def __repr__(self):
