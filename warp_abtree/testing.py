@@ -13,7 +13,8 @@ from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, UN
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, float32_filter_triangles
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
 from warp_abtree.model.tree import active_build
-from warp_abtree.state.lod_update import LodUpdate, full_refit_fraction
+from warp_abtree.state.lod_update import LodUpdate
+from warp_abtree.state.work_lists import full_refit_fraction
 
 __all__ = [
     "EXACT",

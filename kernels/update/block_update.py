@@ -1,4 +1,4 @@
-"""Refinement and ACTIVE-UPDATE of a tree state by one block: marks in shared memory, any number of states in one launch.
+"""Refinement and ACTIVE-UPDATE of a tree state by one block, marks in shared memory: many states in one launch.
 
 Leaves the same bits and counts as the level lists of `mark`, `refine` and `refit`, which serve larger trees.
 """

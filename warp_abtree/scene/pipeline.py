@@ -75,8 +75,8 @@ class Pipeline:
     Tree states, and so memory, come in one of two ways:
 
     * One an object, or one a group of objects, updated in place by the AB-Tree's own update, a full refit where more
-      than half of the faces may change, on CUDA a fifth: any LOD, some 80 to 130 bytes a face and state, up to a tenth of
-      that for worklists. They have room for all states to change at once.
+      than half of the faces may change, on CUDA a fifth: any LOD, some 80 to 130 bytes a face and state, up to a tenth
+      of that for worklists. They have room for all states to change at once.
     * With a ladder, one a model and level, made beforehand: an LOD change costs an index. The less memory where a model
       has more objects than levels.
 

@@ -22,6 +22,8 @@ TOP_THREADS = 512
 BLOCK_SLICE, BLOCK_FACES = 1024, 4096
 SHALLOW_THREADS, THREADS = 64, 1024
 BLOCKS_MOST = 8192
+# Fraction of the longest slice of a partial update that level lists take.
+LISTED_FRACTION = 0.1
 # Threads that a GPU runs at a time, of each multiprocessor: more take turns over what they work off.
 THREADS_AT_ONCE = 2048
 
@@ -48,6 +50,23 @@ def block_limits(models, state_count: int, device):
         return np.where(fits, models.split_start[-1], 0), fits
     times = max(1.0, state_count / device.sm_count)
     return np.where(fits, int(times * BLOCK_SLICE), 0), fits & (models.face_count <= times * BLOCK_FACES)
+
+
+def partial_limit(models, block_max, device):
+    """Return the longest slice of each model that a partial update takes; negative where all are refitted whole.
+
+    On a GPU level lists with little on each level take as long as with much, so few faces are worth it.
+
+    Args:
+        block_max: As `block_limits` returns it.
+    """
+    most = full_refit_fraction(device) * models.face_count
+    return np.floor(np.maximum(np.minimum(block_max, most), LISTED_FRACTION * most)).astype(np.int64)
+
+
+def full_refit_fraction(device) -> float:
+    """Return the fraction of its faces past which a state is refitted whole."""
+    return current_regime().full_refit["cuda" if device.is_cuda else "cpu"]
 
 
 @dataclass
