@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.arrays import LEVEL_MAX
-from warp_abtree.kernels.update import block_update, refit
+from warp_abtree.kernels.update import refit
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.work_lists import (
@@ -82,8 +82,7 @@ class LodUpdate(WorkLists):
         slice_start = self._measure_slices(partial_limit(models, longest, states.device))
         blocks = np.where(self.full, whole[owner], self.slice_length <= longest[owner])
         plan, *rooms = self._list_work(models.depth[owner], slice_start, blocks)
-        shallow = bool((models.depth <= block_update.SHALLOW_DEPTH).all())
-        super().__init__(plan, int(blocks.sum()), shallow, *rooms, states.device)
+        super().__init__(plan, int(blocks.sum()), int(models.depth.max()), *rooms, states.device)
         self._copies = self._plan_copies()
 
     def __repr__(self):
