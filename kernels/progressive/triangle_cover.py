@@ -62,9 +62,7 @@ class Replay:
     face_box: wp.array2d(dtype=wp.vec3d)  # [face_count, 2], lower and upper corner of the box of each
     bvh: wp.uint64  # wp.Bvh over the boxes of bvh_face; 0 until a component vanishes
     bvh_face: wp.array(dtype=int)  # [any], faces that were active when the Bvh was built
-    slot: wp.array2d(
-        dtype=int
-    )  # [slot_count, SLOT_FIELDS]; those from face_count on are pooled
+    slot: wp.array2d(dtype=int)  # [slot_count, SLOT_FIELDS]; those from face_count on are pooled
     free_slot: wp.array(dtype=int)  # [slot_count - face_count], stack of pooled slots not in use
     face_slot: wp.array(dtype=int)  # [face_count], first slot or -1
     face_stamp: wp.array(dtype=int)  # [face_count], last candidate set that held the face
