@@ -23,9 +23,9 @@ def built(monkeypatch):
     """Names of the meshes that were built, in order."""
     names, build = [], model_module.build_progressive
 
-    def note(mesh, **options):
+    def note(mesh, *options, **more):
         names.append(mesh.name)
-        return build(mesh, **options)
+        return build(mesh, *options, **more)
 
     monkeypatch.setattr(model_module, "build_progressive", note)
     return names

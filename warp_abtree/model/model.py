@@ -91,8 +91,11 @@ class Model:
             key = mesh_key(mesh, *options)
             model = find_model(key, cls.open)
         if model is None:
-            progressive = build_progressive(mesh, base_faces=base_faces, progress=progress)
-            model = cls(progressive, active_build(mesh.vertices, mesh.faces), mesh.name)
+            trees = []
+            progressive = build_progressive(
+                mesh, base_faces, progress, then=lambda: trees.append(active_build(mesh.vertices, mesh.faces))
+            )
+            model = cls(progressive, trees[0], mesh.name)
             if cache:
                 keep_model(key, _file_members(progressive, model.tree, mesh.name))
         return model if model.name == mesh.name else cls(model.progressive, model.tree, mesh.name)

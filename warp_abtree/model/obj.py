@@ -6,6 +6,7 @@ whose face order is kept (for polygons in PLY and OFF: triangles first, then qua
 
 import gzip
 import io
+import itertools
 import warnings
 import zlib
 from pathlib import Path
@@ -16,6 +17,8 @@ import warp as wp
 
 from warp_abtree.checks.arguments import first_line
 
+# How lines of plain OBJ files begin; in others, a `v` or `f` might stand behind a tab, say.
+PLAIN_STARTS = {b"", b"v ", b"f ", b"vn", b"vt", b"vp", b"# ", b"#", b"o ", b"g ", b"s ", b"us", b"mt"}
 WARP_ASSETS = ("bunny", "bear", "rocks")
 
 
@@ -70,8 +73,31 @@ def read_file(path: Path):
         raise MeshError(f"{path}: cannot be read as {kind}: {first_line(error)}") from None
 
 
+def _parse_plain_obj(data) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return vertices and triangles of an OBJ file where each `v` has three numbers and each `f` three plain indices.
+
+    None for any other file, and for one that has mistakes.
+    """
+    lines = data.splitlines()
+    if b"\\" in data or not {line[:2] for line in lines} <= PLAIN_STARTS:
+        return None
+    vertices = [line[2:].split() for line in lines if line[:2] == b"v "]
+    faces = [line[2:].split() for line in lines if line[:2] == b"f "]
+    if not faces or set(map(len, vertices)) != {3} or set(map(len, faces)) != {3}:
+        return None
+    try:
+        points = np.array(list(map(float, itertools.chain.from_iterable(vertices))))
+        corners = np.array(list(map(int, itertools.chain.from_iterable(faces))), dtype=np.int64)
+    except (ValueError, OverflowError):
+        return None
+    return (points.reshape(-1, 3), corners.reshape(-1, 3) - 1) if corners.min() > 0 else None
+
+
 def parse_obj(data, where) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and triangles of an OBJ file; only `v` and `f` lines matter here."""
+    plain = _parse_plain_obj(data)
+    if plain is not None:
+        return plain
     vertices, corners, counts = [], [], []
     for number, line in enumerate(data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines(), start=1):
         fields = line.split()

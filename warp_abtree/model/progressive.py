@@ -123,7 +123,7 @@ class ProgressiveMesh:
         return int(self.lod_max - np.argmin(miss[::-1]))
 
 
-def build_progressive(mesh, base_faces=10, progress=None):
+def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     """Collapse a mesh to a base of about `base_faces` faces and certify the error of every LOD on the way.
 
     The sequence for a larger base is a prefix of that for a smaller one, and does not depend on the mesh's scale by
@@ -133,6 +133,7 @@ def build_progressive(mesh, base_faces=10, progress=None):
         mesh: `Mesh`.
         base_faces: Stop when no more faces than this are left, >= 1.
         progress: Called as progress(stage, done, total) between launches; stages "collapse" and "LOD bounds".
+        then: Called when the collapse has ended, perhaps by another thread while errors are certified.
 
     Raises:
         ValueError: base_faces is no whole number from 1, or the mesh has 2^29 vertices or 2^31 / 3 faces.
@@ -146,21 +147,26 @@ def build_progressive(mesh, base_faces=10, progress=None):
     report = progress if progress is not None else lambda stage, done, total: None
     centre, scale = find_frame(vertices)
     collapse, bounds = Collapse((vertices - centre) / scale, faces, int(base_faces)), LodBounds(vertices, faces)
+
+    def finish():
+        parent = collapse.parents()
+        return parent, _splits(parent, faces, len(vertices)), then()
+
     if (current_regime().cpu_threads or core_count()) == 1:
         for removed in collapse.steps():
             report("collapse", removed, collapse.goal)
         merged = _follow(collapse, bounds, centre, scale, report)
+        parent, splits, _ = finish()
     else:
-        running = workers(1).submit(collapse.run)
+        running = workers(1).submit(lambda: [collapse.run(), finish()][1])
         try:
             merged = _follow(collapse, bounds, centre, scale, report)
         finally:
             collapse.stop()
             wait_for([running])
-        running.result()
-    parent, vertex_pos = collapse.parents(), np.concatenate([vertices, *merged])
-    face_split, split_start, split_face = _splits(parent, faces, len(vertices))
-    return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, bounds.errors())
+        parent, splits, _ = running.result()
+    vertex_pos = np.concatenate([vertices, *merged])
+    return ProgressiveMesh(parent, vertex_pos, faces, *splits, bounds.errors())
 
 
 def _follow(collapse, bounds, centre, scale, report):
