@@ -4,8 +4,9 @@
 #include "polygon_cuts.h"
 
 template <class Replay, class Covers>
-wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge, wp::int32 near_count,
-                     wp::int32 begin, wp::int32 end) {
+wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge, wp::int32 near_begin,
+                     wp::int32 near_count, wp::int32 begin, wp::int32 end, wp::int32 row, wp::float64 limit,
+                     bool raises) {
 #if defined(__CUDA_ARCH__)
     __trap();  // models are built on the host
 #else
@@ -24,11 +25,12 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
     for (double* x = &near.place[0][0][0]; x != &near.place[0][0][0] + NEAR_ROOM * 9; ++x)
         *x = 0.0;
     for (int i = 0; i < near_count; ++i)
-        near.add(covers.near.data[i]);
+        near.add(covers.near.data[near_begin + i]);
     near.load_groups(0);
     auto slot_at = [&](int slot) { return replay.slot.data + SLOT_FIELDS * (wp::int64)slot; };
     auto corners_of = [&](int t) { return (const double*)replay.triangle_pos.data + 9 * (wp::int64)t; };
-    double limit = covers.limit.data[0];
+    const int columns = covers.face.shape[1];
+    const double start = limit;
     int used[COVER_SLOTS], count = 0;
     // As `cover_triangle`, of the one polygon on the stack; false where that has to do it.
     auto cover_triangle = [&]() {
@@ -95,11 +97,13 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
         }
         *(lanes*)(first_bound + (i - begin)) = has_first ? found : lanes{} + __builtin_inf();
     }
-    for (int i = begin; i < end; ++i) {
+    for (int i = begin; i < end; ++i, ++row) {
         const int t = covers.triangle.data[i];
-        int* found = covers.face.data + COVER_SLOTS * (i - begin);
+        int* found = covers.face.data + columns * (wp::int64)row;
+        limit = raises ? limit : start;
         if (first_bound[i - begin] <= limit) {
-            covers.count.data[i - begin] = 1;
+            covers.count.data[row] = 1;
+            covers.limit.data[row] = limit;
             found[0] = covers.first.data[i];
             continue;
         }
@@ -118,12 +122,12 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
         if (near.count > near_count)
             near.load_groups(near_count >> 3);
         cuts.start(corners_of(t));
-        if (!cover_triangle())
+        if (!cover_triangle() || count > columns)
             return i;
-        covers.count.data[i - begin] = count;
+        covers.count.data[row] = count;
         for (int k = 0; k < count; ++k)
             found[k] = near.face[used[k]];
-        covers.limit.data[0] = limit;
+        covers.limit.data[row] = limit;
     }
 #endif
     return end;

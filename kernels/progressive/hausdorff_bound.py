@@ -246,16 +246,16 @@ def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: in
 
 
 @wp.func
-def register_covers(replay: Replay, covers: Covers, begin: int, end: int):
-    """Register triangles of the queue with the faces that were found to cover them."""
+def register_covers(replay: Replay, covers: Covers, begin: int, end: int, row: int):
+    """Register triangles with the faces that were found to cover them, for the first at `row`."""
     face_count = replay.face_slot.shape[0]
     free = replay.counter[FREE_SLOTS]
     for i in range(begin, end):
         t = covers.triangle[i]
         free = release_triangle(replay, t, face_count, free)
-        used = covers.count[i - begin]
+        used = covers.count[row + i - begin]
         for k in range(used):
-            replay.scratch.used[k] = covers.face[i - begin, k]
+            replay.scratch.used[k] = covers.face[row + i - begin, k]
         free = register_triangle(replay, t, used, free)
     replay.counter[FREE_SLOTS] = free
 
@@ -269,15 +269,27 @@ def cover_queue(
     while i < queued:
         end = i
         if replay.counter[FREE_SLOTS] >= COVERS_AT_ONCE * SLOTS:
-            covers.limit[0] = limit
-            end = cover_ring(replay, covers, merge, near_count, i, wp.min(i + COVERS_AT_ONCE, queued))
-            limit = covers.limit[0]
-            register_covers(replay, covers, i, end)
+            end = wp.min(i + COVERS_AT_ONCE, queued)
+            end = cover_ring(replay, covers, merge, 0, near_count, i, end, 0, limit, True)
+            if end > i:
+                limit = covers.limit[end - i - 1]
+            register_covers(replay, covers, i, end, 0)
         if end < wp.min(i + COVERS_AT_ONCE, queued):
             limit = cover_queued(replay, replay.queue[end], replay.queue_face[end], near_count, shared, limit)
             end += 1
         i = end
     return limit
+
+
+@wp.func
+def move_faces(replay: Replay, a: int, b: int, c: int):
+    """Merge nodes a and b into c in the forest, and give the faces about c their corners."""
+    tail = absorb_ring(replay.rings, a, a, b, c, -1)
+    tail = absorb_ring(replay.rings, b, a, b, c, tail)
+    k = replay.rings.head[c]
+    while k >= 0:
+        set_face(replay, k // 3)
+        k = replay.rings.next[k]
 
 
 @wp.func
@@ -291,13 +303,8 @@ def replay_merge(replay: Replay, covers: Covers, a: int, b: int, c: int, limit: 
     near_count = int(0)
     if replay.rings.degree[a] + replay.rings.degree[b] == 2 * dying:
         near_count = third_rings(replay, a, b, stamp)
-    tail = absorb_ring(replay.rings, a, a, b, c, -1)
-    tail = absorb_ring(replay.rings, b, a, b, c, tail)
+    move_faces(replay, a, b, c)
     near_count = add_ring(replay, near_count, stamp, stamp, c)
-    k = replay.rings.head[c]
-    while k >= 0:
-        set_face(replay, k // 3)
-        k = replay.rings.next[k]
     limit = cover_queue(replay, covers, wp.vec3i(a, b, c), queued, near_count, stamp, limit)
     replay.counter[LIVE_FACES] = replay.counter[LIVE_FACES] - dying
     replay.counter[QUEUED] = queued

@@ -72,24 +72,35 @@ class Replay:
 
 @wp.struct
 class Covers:
-    """Triangles to cover at a merge, and the faces found for each."""
+    """Triangles to cover, and the faces found for each; of one merge, or of all merges of a window."""
 
     triangle: wp.array(dtype=int)  # [any], triangles in order
     first: wp.array(dtype=int)  # [any], a face that covered each: the first to try
-    near: wp.array(dtype=int)  # [any], faces around the merge
-    count: wp.array(dtype=int)  # [COVERS_AT_ONCE], faces that cover each triangle
-    face: wp.array2d(dtype=int)  # [COVERS_AT_ONCE, SLOTS], these faces
-    limit: wp.array(dtype=wp.float64)  # [1], squared running maximum
+    near: wp.array(dtype=int)  # [any], faces around a merge
+    count: wp.array(dtype=int)  # [rows], faces that cover each triangle
+    face: wp.array2d(dtype=int)  # [rows, any], these faces
+    limit: wp.array(dtype=wp.float64)  # [rows], squared running maximum after each triangle
 
 
 @wp.func_native(native.body("cover_ring.h", "cover_ring"))
 def cover_ring(
-    replay: Replay, covers: Covers, merge: wp.vec3i, near_count: wp.int32, begin: wp.int32, end: wp.int32
+    replay: Replay,
+    covers: Covers,
+    merge: wp.vec3i,
+    near_begin: wp.int32,
+    near_count: wp.int32,
+    begin: wp.int32,
+    end: wp.int32,
+    row: wp.int32,
+    limit: wp.float64,
+    raises: bool,
 ) -> wp.int32:
-    """Cover triangles again, 8 faces at a time, number by number as `cover_triangle`, and raise the running maximum.
+    """Cover triangles of a merge again, 8 faces at a time, number by number as `cover_triangle`.
 
     Args:
         merge: The two nodes of the merge and the one that it makes; the forest may be that before the merge or after.
+        begin, end: Triangles, at most COVERS_AT_ONCE; what is found for the first goes to `row`.
+        limit: Squared running maximum, which a triangle raises for those after it, if `raises`.
 
     Returns where it stopped: `end`, or a triangle that only `cover_triangle` can cover, as other faces may be nearer.
     """

@@ -11,7 +11,7 @@ import warp as wp
 from warp_abtree.kernels.progressive import collapse
 from warp_abtree.kernels.progressive.heap import Heap
 from warp_abtree.kernels.progressive.quadric import Quadric
-from warp_abtree.model.cpu_arrays import cpu_array, filled, launch, linked_rings
+from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings
 
 # Merges per launch.
 MERGES = 25_000
@@ -20,15 +20,18 @@ HEAP_PER_EDGE, HEAP_EXTRA = 2, 256
 
 
 class Collapse:
-    """The collapse of a mesh whose vertices are normalised.
+    """The collapse of a mesh.
 
     Attributes:
+        frame: Centre and scale of normalised positions [model units].
         pos: Positions of all nodes, normalised, float64 [2 n_v, 3]; those of the merges that `follow` returned stand.
         pair: The two nodes of each merge, the lower one first, int32 [n_v, 2].
         goal: Faces to be removed.
     """
 
-    def __init__(self, pos, faces, base_faces):
+    def __init__(self, vertices, faces, base_faces):
+        self.frame = centre, scale = find_frame(vertices)
+        pos = (vertices - centre) / scale
         self.vertex_count, self.base_faces = len(pos), base_faces
         edges, boundary = _edges(faces)
         face_array = cpu_array(faces, int)

@@ -3,9 +3,12 @@
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.progressive import hausdorff_bound, polygon, triangle_cover
+from warp_abtree.checks.cpu_threads import launch_on_cores
+from warp_abtree.kernels.progressive import hausdorff_bound, merge_window, polygon, triangle_cover
 from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, points
 
+# Faces from which on several cores gain.
+LEAST_FACES = 20_000
 # Triangles covered per launch, about.
 COVERS = 200_000
 # Pooled slots for each face, and beyond these; an empty pool loosens bounds only.
@@ -37,7 +40,7 @@ class LodBounds:
         self._pair = filled((len(vertices), 2), 0)
         self._bound_sq = wp.zeros(len(vertices), dtype=wp.float64, device="cpu")
         self._state = self._replay.counter.numpy()  # shares the memory
-        self._known = 0
+        self._known, self._window = 0, None
 
     @property
     def done(self):
@@ -51,9 +54,34 @@ class LodBounds:
         self._pos[self._vertex_count + begin : self._vertex_count + end] = (merged - self._centre) / self._scale
         self._known = end
 
-    def advance(self):
-        """Bound some of the merges that are known."""
-        inputs = [self._vertex_count, self._known, COVERS, self._pair, self._replay, self._covers, self._bound_sq]
+    def advance(self, cores=1):
+        """Bound some of the merges that are known, on so many cores."""
+        if cores > 1 and len(self._replay.face_slot) >= LEAST_FACES:
+            self._advance_together(cores)
+        else:
+            self._advance_alone(self._known)
+
+    def _advance_together(self, cores):
+        """Bound merges window by window."""
+        if self._window is None:
+            self._window = _new_window(self._replay)
+        cpu, window, bounds = wp.get_device("cpu"), self._window, self._bound_sq
+        inputs = [self._vertex_count, self._known, self._pair, self._replay, window]
+        state = window.counter.numpy()  # shares the memory
+        covered = 0
+        while covered < COVERS and self.done < self._known:
+            launch(merge_window.gather_window_kernel, *inputs)
+            merges, triangles, blocks, _ = state.tolist()
+            if merges == 0:
+                self._advance_alone(self.done + 1)
+                continue
+            launch_on_cores(merge_window.cover_window_kernel, blocks, [self._replay, bounds, window], cpu, cores, 4)
+            launch(merge_window.register_window_kernel, window, self._replay, self._covers, bounds)
+            covered += triangles
+
+    def _advance_alone(self, merges):
+        """Bound merges one after the other, at most up to a number of them."""
+        inputs = [self._vertex_count, merges, COVERS, self._pair, self._replay, self._covers, self._bound_sq]
         launch(hausdorff_bound.replay_merges_kernel, *inputs)
         if self._state[5] < 0:
             bvh = _index(self._replay)
@@ -86,8 +114,26 @@ def _new_covers(replay):
     covers, rows = triangle_cover.Covers(), triangle_cover.COVERS_AT_ONCE
     covers.triangle, covers.first, covers.near = replay.queue, replay.queue_face, replay.scratch.near
     covers.count, covers.face = filled(rows, 0), filled((rows, triangle_cover.SLOTS), 0)
-    covers.limit = wp.zeros(1, dtype=wp.float64, device="cpu")
+    covers.limit = wp.zeros(rows, dtype=wp.float64, device="cpu")
     return covers
+
+
+def _new_window(replay):
+    window, covers = merge_window.Window(), triangle_cover.Covers()
+    merges, face_count = int(merge_window.MERGE_ROOM), len(replay.face_slot)
+    rows = face_count + int(merge_window.TRIANGLE_ROOM)
+    blocks = merges + rows // int(triangle_cover.COVERS_AT_ONCE) + 1
+    window.counter = filled(4, 0)
+    window.merge = filled((merges, 3), 0, wp.vec3i)
+    window.start, window.near_start = filled(merges + 1, 0), filled(merges + 1, 0)
+    window.block_merge, window.block_start = filled(blocks, 0), filled(blocks, 0)
+    window.face_mark = filled(face_count, -1)
+    covers.triangle, covers.first, covers.count = filled(rows, 0), filled(rows, 0), filled(rows, 0)
+    covers.near = filled((merges + 1) * int(merge_window.NEAR_MOST), 0)
+    covers.face = filled((rows, merge_window.COLUMNS), 0)
+    covers.limit = wp.zeros(rows, dtype=wp.float64, device="cpu")
+    window.covers = covers
+    return window
 
 
 def _index(replay):

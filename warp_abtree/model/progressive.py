@@ -12,7 +12,7 @@ from warp_abtree.checks.cpu_threads import core_count, wait_for, workers
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.progressive import vertex_forest
 from warp_abtree.model.collapse import Collapse
-from warp_abtree.model.cpu_arrays import cpu_array, find_frame, launch
+from warp_abtree.model.cpu_arrays import cpu_array, launch
 from warp_abtree.model.lod_bounds import LodBounds
 
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
@@ -145,22 +145,22 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     if 2 * len(vertices) >= NODE_LIMIT or 3 * len(faces) >= 2**31:
         raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
     report = progress if progress is not None else lambda stage, done, total: None
-    centre, scale = find_frame(vertices)
-    collapse, bounds = Collapse((vertices - centre) / scale, faces, int(base_faces)), LodBounds(vertices, faces)
+    collapse, bounds = Collapse(vertices, faces, int(base_faces)), LodBounds(vertices, faces)
 
     def finish():
         parent = collapse.parents()
         return parent, _splits(parent, faces, len(vertices)), then()
 
-    if (current_regime().cpu_threads or core_count()) == 1:
+    threads = current_regime().cpu_threads or core_count()
+    if threads == 1:
         for removed in collapse.steps():
             report("collapse", removed, collapse.goal)
-        merged = _follow(collapse, bounds, centre, scale, report)
+        merged = _follow(collapse, bounds, lambda: 1, report)
         parent, splits, _ = finish()
     else:
         running = workers(1).submit(lambda: [collapse.run(), finish()][1])
         try:
-            merged = _follow(collapse, bounds, centre, scale, report)
+            merged = _follow(collapse, bounds, lambda: threads if running.done() else threads - 1, report)
         finally:
             collapse.stop()
             wait_for([running])
@@ -169,8 +169,9 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     return ProgressiveMesh(parent, vertex_pos, faces, *splits, bounds.errors())
 
 
-def _follow(collapse, bounds, centre, scale, report):
+def _follow(collapse, bounds, cores, report):
     """Bound the merges of a collapse while it goes on; return the positions that they make [model units], in parts."""
+    centre, scale = collapse.frame
     merged, known, ended = [], 0, False
     while not ended or bounds.done < known:
         if bounds.done == known or not ended:
@@ -180,7 +181,7 @@ def _follow(collapse, bounds, centre, scale, report):
             merged.append(centre + scale * collapse.pos[first : first + known - begin])
             bounds.add(collapse.pair[begin:known], merged[-1])
         if bounds.done < known:
-            bounds.advance()
+            bounds.advance(cores())
             if ended:
                 report("LOD bounds", bounds.done, known)
     return merged
