@@ -166,7 +166,7 @@ def cover_window_kernel(
     # Out:
     window_out: Window,
 ):
-    """Take one block of triangles after the other and cover it; CPU only, a thread a core. A count of 0: not covered."""
+    """Take one block of triangles after the other; CPU only, a thread a core. Those not covered get a count of 0."""
     limit = FLOOR * FLOOR
     j = replay.counter[NEXT_MERGE]
     if j > 0:
@@ -179,9 +179,7 @@ def cover_window_kernel(
         near = window_out.near_start[w]
         near_count = window_out.near_start[w + 1] - near
         while i < end:
-            i = cover_ring(
-                replay, window_out.covers, window_out.merge[w], near, near_count, i, end, i, limit, False
-            )
+            i = cover_ring(replay, window_out.covers, window_out.merge[w], near, near_count, i, end, i, limit, False)
             if i < end:
                 window_out.covers.count[i] = 0
                 i += 1

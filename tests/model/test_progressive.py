@@ -222,12 +222,13 @@ def test_components_go_last_and_smallest_first():
     assert np.array_equal(falls, np.arange(len(falls))), "a component went before an ordinary merge"
 
 
-@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("threads", [1, 2, 5])
 def test_the_result_does_not_depend_on_launches(mesh, monkeypatch, threads):
     first = build_progressive(mesh, base_faces=1)
     calls = []
     monkeypatch.setattr(collapse, "MERGES", 3)
     monkeypatch.setattr(lod_bounds, "COVERS", 1)
+    monkeypatch.setattr(lod_bounds, "LEAST_FACES", 1)
     with testing.regime(cpu_threads=threads):
         assert_same(first, build_progressive(mesh, base_faces=1, progress=lambda *call: calls.append(call)))
     assert {stage for stage, _, _ in calls} <= {"collapse", "LOD bounds"}

@@ -57,9 +57,10 @@ class Collapse:
         self._moved = threading.Condition()
 
     def run(self):
-        """Collapse to the base mesh, or until `stop`."""
+        """Collapse to the base mesh, or until `stop`; return whether the base mesh was reached."""
         for _ in self.steps():
             pass
+        return self._state[3] == int(collapse.FINISHED)
 
     def steps(self):
         """Do the same, and yield how many faces are removed after each launch."""

@@ -7,8 +7,8 @@ from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.kernels.progressive import hausdorff_bound, merge_window, polygon, triangle_cover
 from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, points
 
-# Faces from which on several cores gain.
-LEAST_FACES = 20_000
+# Cores and faces from which on windows gain: gathering them takes half as long again as going on merge by merge.
+LEAST_CORES, LEAST_FACES = 4, 20_000
 # Triangles covered per launch, about.
 COVERS = 200_000
 # Pooled slots for each face, and beyond these; an empty pool loosens bounds only.
@@ -56,7 +56,7 @@ class LodBounds:
 
     def advance(self, cores=1):
         """Bound some of the merges that are known, on so many cores."""
-        if cores > 1 and len(self._replay.face_slot) >= LEAST_FACES:
+        if cores >= LEAST_CORES and len(self._replay.face_slot) >= LEAST_FACES:
             self._advance_together(cores)
         else:
             self._advance_alone(self._known)

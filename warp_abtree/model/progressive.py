@@ -149,24 +149,27 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
 
     def finish():
         parent = collapse.parents()
-        return parent, _splits(parent, faces, len(vertices)), then()
+        splits = _splits(parent, faces, len(vertices))
+        then()
+        return parent, splits
 
     threads = current_regime().cpu_threads or core_count()
     if threads == 1:
         for removed in collapse.steps():
             report("collapse", removed, collapse.goal)
         merged = _follow(collapse, bounds, lambda: 1, report)
-        parent, splits, _ = finish()
+        forest = finish()
     else:
-        running = workers(1).submit(lambda: [collapse.run(), finish()][1])
+        running = workers(1).submit(lambda: finish() if collapse.run() else None)
         try:
             merged = _follow(collapse, bounds, lambda: threads if running.done() else threads - 1, report)
         finally:
             collapse.stop()
             wait_for([running])
-        parent, splits, _ = running.result()
+        forest = running.result()
+    parent, (face_split, split_start, split_face) = forest
     vertex_pos = np.concatenate([vertices, *merged])
-    return ProgressiveMesh(parent, vertex_pos, faces, *splits, bounds.errors())
+    return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, bounds.errors())
 
 
 def _follow(collapse, bounds, cores, report):
