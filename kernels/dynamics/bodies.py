@@ -1,78 +1,46 @@
-"""Rigid bodies: their state, sleeping islands, and the motion of one step.
+"""Rigid bodies: their state, and the motion of one step.
 
 A body frame has its origin at the centre of mass and its axes along the principal axes of inertia.
 """
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import LAST_KEY, ObjectPool
-from warp_abtree.kernels.broad_phase import pair_key
-from warp_abtree.kernels.contact.manifold import Manifolds, find_root, unite_roots
+from warp_abtree.kernels.arrays import ObjectPool
 from warp_abtree.kernels.poses import rotate_quaternion
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 STATIC = wp.constant(0)
-ASLEEP = wp.constant(1)
+KINEMATIC = wp.constant(1)
 DYNAMIC = wp.constant(2)
-KINEMATIC = wp.constant(3)
-"""Motion type of an object in this step: at rest for good, a sleeping rigid body, one in motion, prescribed motion."""
+"""Motion type of an object: it stands, its motion is prescribed, or it is a rigid body."""
 
 HALF = wp.constant(wp.float64(0.5))
 
 
 @wp.struct
 class Bodies:
-    """Rigid bodies, one entry an object. Bodies that are not rigid have infinite mass: inverses are 0."""
+    """Bodies, one entry an object. Those that are not DYNAMIC have infinite mass: inverses are 0."""
 
     # static
+    motion_type: wp.array(dtype=wp.int32)  # STATIC, KINEMATIC or DYNAMIC
     rank: wp.array(dtype=wp.int32)  # rank among the rigid bodies of the same world
-    prescribed: wp.array(dtype=wp.int32)  # 1 if the motion is prescribed
     inverse_mass: wp.array(dtype=wp.float64)  # [1 / mass]
     inverse_moment: wp.array(dtype=wp.vec3d)  # of the principal moments of inertia
     centre: wp.array(dtype=wp.vec3d)  # centre of mass, model frame [world units]
     axes: wp.array(dtype=wp.mat33d)  # principal axes as columns, model frame
-    restitution: wp.array(dtype=wp.float64)  # coefficient, 0 to 1
     friction: wp.array(dtype=wp.float64)  # coefficient of Coulomb's law
-    slop: wp.array(dtype=wp.float64)  # penetration that is not corrected [world units]
-    sleep_speed: wp.array(dtype=wp.float64)  # below it a body counts as at rest [world units/s]
     bounding_radius: wp.array(dtype=wp.float64)  # about the centre of mass [world units]
     # state
-    motion_type: wp.array(dtype=wp.int32)  # STATIC, ASLEEP, DYNAMIC or KINEMATIC
     position: wp.array(dtype=wp.vec3d)  # of the body frame [world units]
     rotation: wp.array(dtype=wp.vec4d)  # of the body frame, x y z w
     velocity: wp.array(dtype=wp.vec3d)  # of the centre of mass [world units/s]
-    momentum: wp.array(dtype=wp.vec3d)  # angular momentum about the centre of mass, world frame
-    angular_velocity: wp.array(dtype=wp.vec3d)  # of kinematic objects alone [rad/s]
-    rest_time: wp.array(dtype=wp.float64)  # how long the body has been slow [s]
+    momentum: wp.array(dtype=wp.vec3d)  # angular momentum, world frame; of kinematic objects angular velocity [rad/s]
     # of one step
-    inverse_inertia: wp.array(dtype=wp.mat33d)  # world frame
+    inverse_inertia: wp.array(dtype=wp.mat33d)  # world frame; of kinematic objects the identity
     pseudo_velocity: wp.array(dtype=wp.vec3d)  # of the position correction [world units/s]
     pseudo_momentum: wp.array(dtype=wp.vec3d)  # its angular momentum
-    island: wp.array(dtype=wp.int32)  # parent in the union-find forest of islands
-    island_rest_time: wp.array(dtype=wp.float64)  # at a root: least rest_time of the island [s]
     bid: wp.array(dtype=wp.int64)  # highest bid of the graph coloring
-
-
-@wp.kernel
-def make_body_pair_key_kernel(
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    motion_type: wp.array(dtype=wp.int32),
-    # out
-    order_out: wp.array(dtype=wp.int32),
-    key_out: wp.array(dtype=wp.int64),
-):
-    """Make the key first * 2^32 + second of each pair whose contact can move a body; others sort behind all of them."""
-    p = wp.tid()
-    order_out[p] = p
-    key_out[p] = LAST_KEY
-    if p >= pair_count[0]:
-        return
-    low = wp.min(motion_type[pairs[p][0]], motion_type[pairs[p][1]])
-    high = wp.max(motion_type[pairs[p][0]], motion_type[pairs[p][1]])
-    if high == DYNAMIC or low == DYNAMIC or (high == KINEMATIC and low == ASLEEP):
-        key_out[p] = pair_key(pairs[p])
 
 
 @wp.func
@@ -139,83 +107,29 @@ def rotation_vector(r: wp.mat33d):
 @wp.kernel
 def begin_step_kernel(
     dt: wp.float64,
+    velocity_change: wp.vec3d,
     target_rotation: wp.array(dtype=wp.mat33d),
     target_position: wp.array(dtype=wp.vec3d),
     objects: ObjectPool,
     # state
     bodies_inout: Bodies,
 ):
-    """Initialise a step; kinematic objects get the velocity that takes them to their targets."""
+    """Initialise a step: gravity changes velocities; kinematic objects get those that take them to their targets."""
     i = wp.tid()
     bodies_inout.pseudo_velocity[i] = wp.vec3d()
     bodies_inout.pseudo_momentum[i] = wp.vec3d()
-    bodies_inout.island[i] = i
-    bodies_inout.island_rest_time[i] = wp.float64(wp.inf)
     bodies_inout.bid[i] = wp.int64(0)
-    if bodies_inout.inverse_mass[i] > wp.float64(0.0):
+    if bodies_inout.motion_type[i] == DYNAMIC:
         r = rotate_quaternion(bodies_inout.rotation[i])
         bodies_inout.inverse_inertia[i] = r * wp.diag(bodies_inout.inverse_moment[i]) * wp.transpose(r)
+        bodies_inout.velocity[i] += velocity_change
         return
     bodies_inout.position[i] = objects.position[i]
-    bodies_inout.velocity[i] = wp.vec3d()
-    bodies_inout.angular_velocity[i] = wp.vec3d()
-    bodies_inout.motion_type[i] = STATIC
-    if bodies_inout.prescribed[i] != 0 and target_position.shape[0] > 0:
-        velocity = (target_position[i] - objects.position[i]) / dt
-        angular_velocity = rotation_vector(target_rotation[i] * wp.transpose(objects.rotation[i])) / dt
-        bodies_inout.velocity[i] = velocity
-        bodies_inout.angular_velocity[i] = angular_velocity
-        if wp.length(velocity) + wp.length(angular_velocity) > wp.float64(0.0):
-            bodies_inout.motion_type[i] = KINEMATIC
-
-
-@wp.kernel
-def unite_islands_kernel(
-    pair_count: wp.array(dtype=wp.int32), pairs: wp.array(dtype=wp.vec2i), manifolds: Manifolds, bodies_inout: Bodies
-):
-    """Unite the islands of two rigid bodies in contact; contact with a moving kinematic object resets the rest time."""
-    p = wp.tid()
-    if p >= pair_count[0] or manifolds.count[p] == 0:
-        return
-    i = pairs[p][0]
-    j = pairs[p][1]
-    zero = wp.float64(0.0)
     if bodies_inout.motion_type[i] == KINEMATIC:
-        bodies_inout.rest_time[j] = zero
-    if bodies_inout.motion_type[j] == KINEMATIC:
-        bodies_inout.rest_time[i] = zero
-    if bodies_inout.inverse_mass[i] > zero and bodies_inout.inverse_mass[j] > zero:
-        unite_roots(bodies_inout.island, i, j)
-
-
-@wp.kernel
-def measure_island_rest_kernel(bodies_inout: Bodies):
-    """Find the rest time of each island: the least of its bodies' times."""
-    i = wp.tid()
-    if bodies_inout.inverse_mass[i] > wp.float64(0.0):
-        wp.atomic_min(bodies_inout.island_rest_time, find_root(bodies_inout.island, i), bodies_inout.rest_time[i])
-
-
-@wp.kernel
-def update_sleep_kernel(sleep_time: wp.float64, bodies_inout: Bodies):
-    """Put islands that have rested for `sleep_time` to sleep, and wake all others."""
-    i = wp.tid()
-    if bodies_inout.inverse_mass[i] == wp.float64(0.0):
-        return
-    if bodies_inout.island_rest_time[find_root(bodies_inout.island, i)] >= sleep_time:
-        bodies_inout.motion_type[i] = ASLEEP
-        bodies_inout.velocity[i] = wp.vec3d()
-        bodies_inout.momentum[i] = wp.vec3d()
-        return
-    bodies_inout.motion_type[i] = DYNAMIC
-
-
-@wp.kernel
-def apply_gravity_kernel(velocity_change: wp.vec3d, bodies_inout: Bodies):
-    """Add the velocity change of a step under gravity to every dynamic body."""
-    i = wp.tid()
-    if bodies_inout.motion_type[i] == DYNAMIC:
-        bodies_inout.velocity[i] += velocity_change
+        rotation = target_rotation[i] * wp.transpose(objects.rotation[i])
+        bodies_inout.velocity[i] = (target_position[i] - objects.position[i]) / dt
+        bodies_inout.momentum[i] = rotation_vector(rotation) / dt
+        bodies_inout.inverse_inertia[i] = wp.identity(n=3, dtype=wp.float64)
 
 
 @wp.kernel
@@ -227,17 +141,13 @@ def integrate_kernel(
     bodies_inout: Bodies,
     objects_inout: ObjectPool,
 ):
-    """Move each body by its velocity and its position correction, pose its object, and update its rest time."""
+    """Move each body by its velocity and its position correction, and pose its object."""
     i = wp.tid()
     if bodies_inout.motion_type[i] == KINEMATIC:
         objects_inout.rotation[i] = target_rotation[i]
         objects_inout.position[i] = target_position[i]
     if bodies_inout.motion_type[i] != DYNAMIC:
         return
-    angular_velocity = bodies_inout.inverse_inertia[i] * bodies_inout.momentum[i]
-    speed = wp.length(bodies_inout.velocity[i]) + bodies_inout.bounding_radius[i] * wp.length(angular_velocity)
-    at_rest = speed < bodies_inout.sleep_speed[i]
-    bodies_inout.rest_time[i] = wp.where(at_rest, bodies_inout.rest_time[i] + dt, wp.float64(0.0))
     bodies_inout.position[i] += dt * (bodies_inout.velocity[i] + bodies_inout.pseudo_velocity[i])
     q = integrate_rotation(bodies_inout.rotation[i], bodies_inout.momentum[i], bodies_inout.inverse_moment[i], dt)
     pseudo_angular_velocity = bodies_inout.inverse_inertia[i] * bodies_inout.pseudo_momentum[i]

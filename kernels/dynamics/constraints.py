@@ -2,15 +2,19 @@
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import LAST_KEY, ObjectPool
-from warp_abtree.kernels.contact.manifold import POINTS, Manifolds
+from warp_abtree.kernels.arrays import ObjectPool
+from warp_abtree.kernels.broad_phase import pair_key
+from warp_abtree.kernels.contact.manifold import Manifolds
 from warp_abtree.kernels.dynamics.bodies import DYNAMIC, Bodies
-from warp_abtree.kernels.dynamics.graph_coloring import INACTIVE
+from warp_abtree.kernels.dynamics.graph_coloring import COLOR_COUNT, INACTIVE
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BAUMGARTE = wp.constant(wp.float64(0.2))
 """Fraction of the penetration that one step corrects."""
+
+SLOP = wp.constant(wp.float64(2.0**-9))
+"""Penetration that is not corrected, as a fraction of the bounding radius."""
 
 MATCH_RADIUS = wp.constant(wp.float64(0.05))
 """Largest distance of a point from its match in the step before, as a fraction of the bounding radius."""
@@ -29,11 +33,8 @@ class Constraints:
     impulse: wp.array2d(dtype=wp.float64)  # accumulated, along the normal
     friction_impulse: wp.array2d(dtype=wp.vec2d)  # accumulated, along the tangents
     pseudo_impulse: wp.array2d(dtype=wp.float64)  # accumulated, of the position correction
-    match: wp.array2d(dtype=wp.int32)  # point in `WarmStart`, row * POINTS + column, or -1
-    restitution: wp.array(dtype=wp.float64)  # [pair] coefficient
     friction: wp.array(dtype=wp.float64)  # [pair] coefficient
-    threshold: wp.array(dtype=wp.float64)  # [pair] approach speed below which nothing bounces [world units/s]
-    both_rigid: wp.array(dtype=wp.int32)  # [pair] 1 if both are rigid bodies
+    color: wp.array(dtype=wp.int32)  # [pair] 0 .. COLOR_COUNT, or INACTIVE
 
 
 @wp.struct
@@ -71,17 +72,17 @@ def make_point(manifolds: Manifolds, pair: wp.vec2i, p: wp.int32, k: wp.int32):
 
 
 @wp.func
-def velocity_at(bodies: Bodies, i: wp.int32, arm: wp.vec3d):
-    """Return the velocity of a body at the end of an arm."""
-    angular_velocity = bodies.angular_velocity[i] + bodies.inverse_inertia[i] * bodies.momentum[i]
-    return bodies.velocity[i] + wp.cross(angular_velocity, arm)
-
-
-@wp.func
-def relative_velocity(constraints: Constraints, bodies: Bodies, c: Point):
-    """Return the velocity of the second object relative to the first at a point."""
-    velocity = velocity_at(bodies, c.b, constraints.arm_b[c.pair, c.column])
-    return velocity - velocity_at(bodies, c.a, constraints.arm_a[c.pair, c.column])
+def relative_velocity(
+    velocity: wp.array(dtype=wp.vec3d),
+    momentum: wp.array(dtype=wp.vec3d),
+    constraints: Constraints,
+    bodies: Bodies,
+    c: Point,
+):
+    """Return the velocity, or pseudo-velocity, of the second object relative to the first at a point."""
+    at_a = velocity[c.a] + wp.cross(bodies.inverse_inertia[c.a] * momentum[c.a], constraints.arm_a[c.pair, c.column])
+    at_b = velocity[c.b] + wp.cross(bodies.inverse_inertia[c.b] * momentum[c.b], constraints.arm_b[c.pair, c.column])
+    return at_b - at_a
 
 
 @wp.func
@@ -134,43 +135,48 @@ def find_match(warm_start: WarmStart, row: wp.int32, radius: wp.float64, point: 
     return best
 
 
+@wp.func
+def set_warm_start(warm_start: WarmStart, row: wp.int32, column: wp.int32, constraints: Constraints, c: Point):
+    """Take the impulses of a point of the step before."""
+    t = constraints.tangent[c.pair, c.column]
+    friction = warm_start.friction_impulse[row, column]
+    constraints.impulse[c.pair, c.column] = warm_start.impulse[row, column]
+    constraints.friction_impulse[c.pair, c.column] = wp.vec2d(
+        wp.dot(friction, t), wp.dot(friction, wp.cross(c.normal, t))
+    )
+
+
 @wp.kernel
 def prepare_constraints_kernel(
     # static
     dt: wp.float64,
-    threshold: wp.float64,
+    fast: wp.float64,
     # state
-    key: wp.array(dtype=wp.int64),
     pairs: wp.array(dtype=wp.vec2i),
-    pair_color: wp.array(dtype=wp.int32),
     objects: ObjectPool,
     manifolds: Manifolds,
     warm_start: WarmStart,
     bodies: Bodies,
     # out
+    order_out: wp.array(dtype=wp.int32),
     constraints_out: Constraints,
 ):
-    """Set up the constraints of one pair a thread, before gravity; slow points are matched with the step before.
-
-    Args:
-        threshold: Approach speed below which nothing bounces [world units/s].
-    """
+    """Set up the constraints of one pair a thread; points no faster than `fast` are matched with the step before."""
     p = wp.tid()
-    if pair_color[p] == INACTIVE:
+    order_out[p] = p
+    constraints_out.color[p] = INACTIVE
+    if manifolds.count[p] == 0:
         return
     a = pairs[p][0]
     b = pairs[p][1]
-    zero = wp.float64(0.0)
-    constraints_out.threshold[p] = threshold
-    constraints_out.both_rigid[p] = wp.where(bodies.inverse_mass[a] > zero and bodies.inverse_mass[b] > zero, 1, 0)
-    constraints_out.restitution[p] = wp.max(bodies.restitution[a], bodies.restitution[b])
+    if bodies.motion_type[a] != DYNAMIC and bodies.motion_type[b] != DYNAMIC:
+        return
+    constraints_out.color[p] = COLOR_COUNT
     constraints_out.friction[p] = wp.sqrt(bodies.friction[a] * bodies.friction[b])
-    slop = wp.min(bodies.slop[a], bodies.slop[b])
-    radius = MATCH_RADIUS * wp.min(bodies.bounding_radius[a], bodies.bounding_radius[b])
-    row = wp.lower_bound(warm_start.key, key[p])
-    known = bool(False)
-    if row < warm_start.key.shape[0]:
-        known = warm_start.key[row] == key[p]
+    radius = wp.min(bodies.bounding_radius[a], bodies.bounding_radius[b])
+    key = pair_key(pairs[p])
+    row = wp.min(wp.lower_bound(warm_start.key, key), warm_start.key.shape[0] - 1)
+    known = warm_start.key[row] == key
     used = wp.int32(0)
     for k in range(manifolds.count[p]):
         x = manifolds.point[p, k]
@@ -178,25 +184,24 @@ def prepare_constraints_kernel(
         constraints_out.arm_a[p, k] = x - bodies.position[a]
         constraints_out.arm_b[p, k] = x - bodies.position[b]
         set_effective_mass(bodies, constraints_out, c)
-        constraints_out.bias[p, k] = BAUMGARTE * (manifolds.depth[p, k] - slop) / dt
+        constraints_out.bias[p, k] = BAUMGARTE * (manifolds.depth[p, k] - SLOP * radius) / dt
+        constraints_out.impulse[p, k] = wp.float64(0.0)
         constraints_out.friction_impulse[p, k] = wp.vec2d()
-        constraints_out.pseudo_impulse[p, k] = zero
-        constraints_out.match[p, k] = -1
-        if known and wp.abs(wp.dot(c.normal, relative_velocity(constraints_out, bodies, c))) <= threshold:
+        constraints_out.pseudo_impulse[p, k] = wp.float64(0.0)
+        velocity = relative_velocity(bodies.velocity, bodies.momentum, constraints_out, bodies, c)
+        if known and wp.abs(wp.dot(c.normal, velocity)) <= fast:
             local = wp.transpose(objects.rotation[a]) * (x - objects.position[a])
-            match = find_match(warm_start, row, radius, local, used)
+            match = find_match(warm_start, row, MATCH_RADIUS * radius, local, used)
             if match >= 0:
                 used = used | (1 << match)
-                constraints_out.match[p, k] = row * POINTS + match
+                set_warm_start(warm_start, row, match, constraints_out, c)
 
 
 @wp.kernel
 def save_impulses_kernel(
     # state
-    pair_count: wp.array(dtype=wp.int32),
     key: wp.array(dtype=wp.int64),
     pairs: wp.array(dtype=wp.vec2i),
-    pair_color: wp.array(dtype=wp.int32),
     objects: ObjectPool,
     manifolds: Manifolds,
     constraints: Constraints,
@@ -205,19 +210,13 @@ def save_impulses_kernel(
 ):
     """Save the impulses of one pair a thread for the next step, with points relative to the first object."""
     p = wp.tid()
-    warm_start_out.key[p] = LAST_KEY
-    warm_start_out.count[p] = 0
-    if p >= pair_count[0]:
-        return
     warm_start_out.key[p] = key[p]
-    if pair_color[p] == INACTIVE:
-        return
     warm_start_out.count[p] = manifolds.count[p]
     a = pairs[p][0]
-    to_local = wp.transpose(objects.rotation[a])
     for k in range(manifolds.count[p]):
         t = constraints.tangent[p, k]
         v = constraints.friction_impulse[p, k]
-        warm_start_out.point[p, k] = to_local * (manifolds.point[p, k] - objects.position[a])
+        local = wp.transpose(objects.rotation[a]) * (manifolds.point[p, k] - objects.position[a])
+        warm_start_out.point[p, k] = local
         warm_start_out.impulse[p, k] = constraints.impulse[p, k]
         warm_start_out.friction_impulse[p, k] = v[0] * t + v[1] * wp.cross(manifolds.normal[p, k], t)

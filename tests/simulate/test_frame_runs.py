@@ -72,7 +72,7 @@ def run_worlds(device, worlds, kind, moved):
     camera = Camera.look_at((0, 0, 3), (0, 0, 0), far=10.0)
     lods = PaperController(scene, 8.0, camera) if kind == "paper" else ToleranceController(scene, 0.01, camera)
     if moved == "bodies":
-        motion = ab.Dynamics(scene, restitution=0.4, gravity=(0, 0, -3), velocity=motion.velocity).motion()
+        motion = ab.Dynamics(scene, gravity=(0, 0, -3), velocity=motion.velocity).motion()
     ticks = np.cumsum(np.random.default_rng(3).uniform(0, 1.5e-3, 30 * (len(STAGES) + 1)))
     frame = ab.Frame(scene, motion, lods, clock=iter(ticks.tolist()).__next__, output="faces")
     found = {world: [] for world in worlds}

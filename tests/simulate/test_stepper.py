@@ -25,18 +25,15 @@ def heap(count=9, seed=0):
     ]
 
 
-OPTIONS = {"restitution": 0.3, "friction": 0.6}
-
-
 def fall(device, steps=80, **options):
     """Return where a heap falls, `bits`, by plain steps."""
-    return run(on_ground(device, *heap(), **OPTIONS, **options), steps)
+    return run(on_ground(device, *heap(), **options), steps)
 
 
 @pytest.mark.parametrize("by_color", [False, True])
 def test_a_heap_falls_the_same_again_however_it_is_relaxed(device, by_color):
     with testing.regime(relax_by_color=by_color):
-        dynamics = on_ground(device, *heap(), **OPTIONS)
+        dynamics = on_ground(device, *heap())
     assert np.array_equal(run(dynamics, 80), fall(device))
     assert dynamics.query.manifolds.count.numpy().sum() > 8
 
@@ -49,12 +46,12 @@ def test_a_body_in_more_contacts_than_colors(device):
     found = []
     for by_color in (False, True):
         with testing.regime(relax_by_color=by_color):
-            dynamics = on_ground(device, (plate, (0, 0, 0.0995, 0, 0, 0, 1)), *cubes, sleep_speed=0)
+            dynamics = on_ground(device, (plate, (0, 0, 0.0995, 0, 0, 0, 1)), *cubes)
         run(dynamics, 10)
-        used = dynamics._pair_color.numpy()
-        assert (used == int(graph_coloring.COLOR_COUNT)).sum() == 36 + 1 - int(graph_coloring.COLOR_COUNT)
+        used, count = dynamics.constraints.color.numpy(), int(graph_coloring.COLOR_COUNT)
+        assert (used == count).sum() == 36 + 1 - count
         pairs = dynamics.query.pairs.numpy()
-        for c in range(int(graph_coloring.COLOR_COUNT)):
+        for c in range(count):
             movers = pairs[used == c].ravel()
             movers = movers[movers > 0]
             assert len(set(movers.tolist())) == len(movers)
@@ -64,7 +61,7 @@ def test_a_body_in_more_contacts_than_colors(device):
 
 
 def test_launches_of_a_graph_do_what_steps_do(device):
-    dynamics = on_ground(device, *heap(), **OPTIONS, capacity=ab.Buffers(4096, pairs=256))
+    dynamics = on_ground(device, *heap(), capacity=ab.Buffers(4096, pairs=256))
     run(dynamics, 1)
     with wp.ScopedCapture(dynamics.device) as capture:
         dynamics.launch(1 / 120)
@@ -76,7 +73,7 @@ def test_launches_of_a_graph_do_what_steps_do(device):
 
 def test_capacity_grows_in_steps_and_is_refused_in_launches(device):
     assert np.array_equal(fall(device, capacity=ab.Buffers(1, pairs=1)), fall(device))
-    short = on_ground(device, *heap(), **OPTIONS, capacity=ab.Buffers(4096, pairs=1))
+    short = on_ground(device, *heap(), capacity=ab.Buffers(4096, pairs=1))
     with pytest.raises(ab.CapacityError, match="pairs="):
         for _ in range(80):
             short.launch(1 / 120)
@@ -84,7 +81,7 @@ def test_capacity_grows_in_steps_and_is_refused_in_launches(device):
 
 
 def test_a_frame_steps_and_reports(device):
-    dynamics = on_ground(device, *heap(), **OPTIONS)
+    dynamics = on_ground(device, *heap())
     frame = ab.Frame(dynamics.scene, motion=dynamics.motion(), time_step=1 / 120)
     for _ in range(80):
         result = frame.step()
@@ -111,18 +108,12 @@ def test_poses_that_a_user_sets(device):
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"density": 0}, "density: 0.0 of object 0 is not above 0"),
-        ({"density": [1, np.nan]}, "density: nan of object 1"),
-        ({"restitution": 1.1}, "restitution: 1.1 .* at most 1"),
-        ({"friction": -0.1}, "friction: -0.1"),
+        ({"friction": [1, -0.1]}, "friction: -0.1 of object 1 is not at least 0"),
         ({"gravity": (0, 0, np.inf)}, "gravity"),
         ({"kinematic": [5]}, "kinematic"),
         ({"kinematic": [True]}, "kinematic"),
         ({"velocity": (np.nan, 0, 0)}, "velocity: a number is not finite"),
         ({"angular_velocity": (1, 2)}, "angular_velocity: shape"),
-        ({"iterations": 0}, "iterations"),
-        ({"slop": -1}, "slop"),
-        ({"sleep_time": 0}, "sleep_time"),
         ({"capacity": 0}, "capacity"),
     ],
 )
@@ -151,5 +142,5 @@ def test_bad_use_is_refused():
 
 def test_a_scene_without_bodies_stands(device):
     still = make(device, (GROUND, FLOOR, True), (GROUND, FLOOR, True))
-    assert np.isinf(still.mass).all() and still.energy() == 0
+    assert np.isinf(still.mass).all()
     assert np.array_equal(run(still, 3)[:, :7], np.tile(FLOOR, (2, 1)))
