@@ -29,7 +29,6 @@ class Bodies:
     inverse_moment: wp.array(dtype=wp.vec3d)  # of the principal moments of inertia
     centre: wp.array(dtype=wp.vec3d)  # centre of mass, model frame [world units]
     axes: wp.array(dtype=wp.mat33d)  # principal axes as columns, model frame
-    friction: wp.array(dtype=wp.float64)  # coefficient of Coulomb's law
     bounding_radius: wp.array(dtype=wp.float64)  # about the centre of mass [world units]
     # state
     position: wp.array(dtype=wp.vec3d)  # of the body frame [world units]
@@ -108,8 +107,7 @@ def rotation_vector(r: wp.mat33d):
 def begin_step_kernel(
     dt: wp.float64,
     velocity_change: wp.vec3d,
-    target_rotation: wp.array(dtype=wp.mat33d),
-    target_position: wp.array(dtype=wp.vec3d),
+    targets: ObjectPool,
     objects: ObjectPool,
     # state
     bodies_inout: Bodies,
@@ -126,8 +124,8 @@ def begin_step_kernel(
         return
     bodies_inout.position[i] = objects.position[i]
     if bodies_inout.motion_type[i] == KINEMATIC:
-        rotation = target_rotation[i] * wp.transpose(objects.rotation[i])
-        bodies_inout.velocity[i] = (target_position[i] - objects.position[i]) / dt
+        rotation = targets.rotation[i] * wp.transpose(objects.rotation[i])
+        bodies_inout.velocity[i] = (targets.position[i] - objects.position[i]) / dt
         bodies_inout.momentum[i] = rotation_vector(rotation) / dt
         bodies_inout.inverse_inertia[i] = wp.identity(n=3, dtype=wp.float64)
 
@@ -135,8 +133,7 @@ def begin_step_kernel(
 @wp.kernel
 def integrate_kernel(
     dt: wp.float64,
-    target_rotation: wp.array(dtype=wp.mat33d),
-    target_position: wp.array(dtype=wp.vec3d),
+    targets: ObjectPool,
     # state
     bodies_inout: Bodies,
     objects_inout: ObjectPool,
@@ -144,8 +141,8 @@ def integrate_kernel(
     """Move each body by its velocity and its position correction, and pose its object."""
     i = wp.tid()
     if bodies_inout.motion_type[i] == KINEMATIC:
-        objects_inout.rotation[i] = target_rotation[i]
-        objects_inout.position[i] = target_position[i]
+        objects_inout.rotation[i] = targets.rotation[i]
+        objects_inout.position[i] = targets.position[i]
     if bodies_inout.motion_type[i] != DYNAMIC:
         return
     bodies_inout.position[i] += dt * (bodies_inout.velocity[i] + bodies_inout.pseudo_velocity[i])

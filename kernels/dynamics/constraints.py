@@ -33,7 +33,6 @@ class Constraints:
     impulse: wp.array2d(dtype=wp.float64)  # accumulated, along the normal
     friction_impulse: wp.array2d(dtype=wp.vec2d)  # accumulated, along the tangents
     pseudo_impulse: wp.array2d(dtype=wp.float64)  # accumulated, of the position correction
-    friction: wp.array(dtype=wp.float64)  # [pair] coefficient
     color: wp.array(dtype=wp.int32)  # [pair] 0 .. COLOR_COUNT, or INACTIVE
 
 
@@ -172,7 +171,6 @@ def prepare_constraints_kernel(
     if bodies.motion_type[a] != DYNAMIC and bodies.motion_type[b] != DYNAMIC:
         return
     constraints_out.color[p] = COLOR_COUNT
-    constraints_out.friction[p] = wp.sqrt(bodies.friction[a] * bodies.friction[b])
     radius = wp.min(bodies.bounding_radius[a], bodies.bounding_radius[b])
     key = pair_key(pairs[p])
     row = wp.min(wp.lower_bound(warm_start.key, key), warm_start.key.shape[0] - 1)

@@ -27,6 +27,7 @@ class Relaxation:
     last_color: wp.int32  # last color of the range
     rounds: wp.int32  # rounds over the range; more than 1 needs a single thread
     threads: wp.int32  # threads of the launch
+    friction: wp.float64  # coefficient of Coulomb's law
     fast: wp.float64  # separation speed of points whose position is not corrected [world units/s]; 0 without gravity
 
 
@@ -57,8 +58,6 @@ def apply_impulse(
 @wp.func
 def solve_friction(constraints: Constraints, bodies: Bodies, c: Point, limit: wp.float64):
     """Stop the tangential velocity of a point, with an accumulated impulse of at most `limit`."""
-    if constraints.friction[c.pair] == wp.float64(0.0):
-        return
     t = constraints.tangent[c.pair, c.column]
     s = wp.cross(c.normal, t)
     velocity = relative_velocity(bodies.velocity, bodies.momentum, constraints, bodies, c)
@@ -84,10 +83,10 @@ def apply_warm_start(constraints: Constraints, bodies: Bodies, c: Point):
 
 
 @wp.func
-def relax_velocity(constraints: Constraints, bodies: Bodies, c: Point):
+def relax_velocity(constraints: Constraints, bodies: Bodies, c: Point, friction: wp.float64):
     """Relax a point: the tangential velocity within the friction cone, then the normal velocity."""
     before = constraints.impulse[c.pair, c.column]
-    solve_friction(constraints, bodies, c, constraints.friction[c.pair] * before)
+    solve_friction(constraints, bodies, c, friction * before)
     correction = constraints.mass[c.pair, c.column] * normal_velocity(constraints, bodies, c)
     after = wp.max(before - correction, wp.float64(0.0))
     constraints.impulse[c.pair, c.column] = after
@@ -154,6 +153,6 @@ def relax_kernel(
                 if stage == WARM_START:
                     apply_warm_start(constraints_inout, bodies_inout, c)
                 elif stage == VELOCITY:
-                    relax_velocity(constraints_inout, bodies_inout, c)
+                    relax_velocity(constraints_inout, bodies_inout, c, relaxation.friction)
                 else:
                     relax_position(constraints_inout, bodies_inout, c, relaxation.fast)

@@ -217,7 +217,7 @@ KEY = "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\ntarget = [0, 0, 0]\n"
         (SWEPT + 'model = "ball"\n[lod]\nbudget_ms = 1\n', "lod: LODs are swept, or chosen by a controller"),
         (ONE + "[picture]\neye = [0, 2, 0]\n", "picture.up: points along eye"),
         (ONE + "kinematic = true\n", "objects[0].kinematic: the scene has no [dynamics]"),
-        (ONE + "friction = 2\n", "objects[0].friction: the scene has no [dynamics]"),
+        (ONE + "density = 2\n[dynamics]\n", "objects[0].density: unknown key"),
         (ONE + "[dynamics]\nrestitution = 0.5\n", "dynamics.restitution: unknown key"),
         (ONE + "static = true\nkinematic = true\n[dynamics]\n", "objects[0].kinematic: a static object"),
         (ONE + "shuttle = { by = [1, 0, 0], period = 1 }\n[dynamics]\n", "objects[0].shuttle: a rigid body"),

@@ -12,7 +12,7 @@ import warp_abtree as ab
 from warp_abtree.app import load_scene
 from warp_abtree.lod.controllers import Feedback, PredictiveController
 from warp_abtree.lod.timing import CostFit, WorkClock
-from warp_abtree.simulate.budget_report import budget_report, step_response
+from warp_abtree.simulate.budget_report import budget_report
 
 # A machine so slow that a hundred objects are a load.
 RATES = {"node_test": 1e-7, "triangle_test": 2e-7}
@@ -96,8 +96,7 @@ def test_a_load_step_is_over_in_two_frames(exponent):
     plant = Plant(8.0, exponent=exponent)
     plant.run(120)
     costs = plant.run(120, load=3.0)
-    found = step_response(plant.rows, 120)
-    assert found["peak"] > 2 and found["frames"] <= 2
+    assert costs[120:].max() > 2 * 5.0 and costs[120:123].min() <= 1.1 * 5.0
     assert costs[60:120].max() <= 5.0 and costs[125:].max() <= 5.5
     # It uses what it has, on both sides.
     assert costs[60:120].mean() > 0.7 * 5.0 and costs[200:].mean() > 0.7 * 5.0
@@ -127,7 +126,7 @@ def test_a_slower_machine_is_learned():
     plant = Plant()
     plant.run(100)
     costs = plant.run(100, hitch=2.0)
-    assert step_response(plant.rows, 100)["frames"] <= 10
+    assert costs[100:111].min() <= 1.1 * 5.0
     assert costs[130:].max() <= 5.5
 
 

@@ -132,5 +132,4 @@ class WorldsRunner:
             worlds=whole.worlds[rows],
             base_lods=lods,
             kinematic=whole.kinematic[rows],
-            friction=whole.friction[rows],
         )

@@ -7,10 +7,11 @@ import trimesh
 import warp as wp
 
 from warp_abtree.checks.arguments import broadcast_rows, finite_array, first_line
-from warp_abtree.checks.quaternions import matrices_of, quaternions_of
+from warp_abtree.checks.quaternions import quaternions_of
+from warp_abtree.kernels.arrays import ObjectPool
 from warp_abtree.kernels.dynamics import bodies as kernels
 from warp_abtree.model.model import Model
-from warp_abtree.scene.poses import check_poses
+from warp_abtree.scene.poses import check_poses, launch_place
 from warp_abtree.scene.scene import Scene
 
 
@@ -114,25 +115,22 @@ class RigidBodies:
         bodies: Device arrays of all objects, `kernels.dynamics.bodies.Bodies`.
         mass: Mass at density 1, (n,), inf unless rigid.
         rigid, kinematic: Which objects are rigid bodies, and which have prescribed motion, bool (n,).
-        target_rotation, target_position: Where kinematic objects are at the end of the next step, device arrays (n,).
+        targets: `ObjectPool` of the poses that kinematic objects have at the end of the next step.
     """
 
-    def __init__(self, scene: Scene, friction, gravity, kinematic):
+    def __init__(self, scene: Scene, gravity, kinematic):
         self.scene, self.device = scene, scene.device
         n = scene.object_count
         self._pool = scene.batch().objects.pool
         self.gravity = finite_array(gravity, "gravity", (3,))
         self.kinematic = object_mask(kinematic, n)
         self.rigid = ~self.kinematic & (self._pool.is_static.numpy() == 0)
-        friction = broadcast_rows(friction, "friction", (n,))
-        for i in np.flatnonzero(~(np.isfinite(friction) & (friction >= 0)))[:1]:
-            raise ValueError(f"friction: {friction[i]} of object {i} is not at least 0 and finite")
-        self._fill_bodies(friction)
-        self.target_rotation = wp.zeros(n, dtype=wp.mat33d, device=self.device)
-        self.target_position = wp.zeros(n, dtype=wp.vec3d, device=self.device)
+        self._fill_bodies()
+        self.targets = ObjectPool()
+        self.targets.rotation, self.targets.position = wp.clone(self._pool.rotation), wp.clone(self._pool.position)
         self.read_poses()
 
-    def _fill_bodies(self, friction):
+    def _fill_bodies(self):
         """Allocate the arrays of all bodies, and write what stays for good."""
         scene, rigid, n = self.scene, self.rigid, self.scene.object_count
         self.bodies = zeros_of(kernels.Bodies, n, 0, self.device)
@@ -151,7 +149,6 @@ class RigidBodies:
             centre=self._centre,
             axes=self._axes,
             bounding_radius=np.array([one.bounding_radius for one in own]),
-            friction=friction,
         )
 
     def _upload(self, **values):
@@ -169,20 +166,16 @@ class RigidBodies:
 
     def clear_targets(self):
         """Let kinematic objects stand where they are."""
-        wp.copy(self.target_rotation, self._pool.rotation)
-        wp.copy(self.target_position, self._pool.position)
+        wp.copy(self.targets.rotation, self._pool.rotation)
+        wp.copy(self.targets.position, self._pool.position)
 
     def set_targets(self, targets):
         """Set the poses of kinematic objects at the end of the next step; see `Dynamics.step`."""
         targets = check_poses(targets, "targets")
         if len(targets) != len(self.mass):
             raise ValueError(f"targets: {len(targets)} given for {len(self.mass)} objects")
-        if targets.ndim == 2:
-            rotation, position = matrices_of(targets[:, 3:]), targets[:, :3]
-        else:
-            rotation, position = targets[:, :3, :3], targets[:, :3, 3]
-        self.target_rotation.assign(np.ascontiguousarray(rotation))
-        self.target_position.assign(np.ascontiguousarray(position))
+        rows = wp.array(targets.reshape(len(targets), -1), dtype=wp.float64, device=self.device)
+        launch_place(rows, self.targets)
 
     def set_velocities(self, velocity, angular_velocity):
         """Set the velocities of rigid bodies. Waits for the device.

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import positive
+from warp_abtree.checks.arguments import finite_array, positive
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import LAST_KEY
 from warp_abtree.kernels.dynamics import bodies as body_kernels
@@ -37,7 +37,7 @@ class Dynamics(RigidBodies):
 
     Args:
         scene: `Scene` with all its objects; its poses are where the bodies start, and where `step` puts them.
-        friction: Coulomb's coefficient, 0 or more; one for all or (n,). A pair has the geometric mean of two.
+        friction: Coulomb's coefficient, 0 or more.
         gravity: Acceleration [world units/s^2], (3,).
         kinematic: Objects whose motion is prescribed: indices, or bool (n,).
         velocity: Initial velocity of the centres of mass [world units/s], (3,) or (n, 3).
@@ -56,14 +56,17 @@ class Dynamics(RigidBodies):
     def __init__(
         self,
         scene: Scene,
-        friction=0.5,
+        friction: float = 0.5,
         gravity=(0.0, 0.0, -9.81),
         kinematic=(),
         velocity=(0.0, 0.0, 0.0),
         angular_velocity=(0.0, 0.0, 0.0),
         capacity: Buffers | int | None = None,
     ):
-        super().__init__(scene, friction, gravity, kinematic)
+        super().__init__(scene, gravity, kinematic)
+        self.friction = float(finite_array(friction, "friction", ()))
+        if self.friction < 0:
+            raise ValueError(f"friction {friction!r} is below 0")
         self.set_velocities(velocity, angular_velocity)
         by_color = current_regime().relax_by_color
         self._by_color = not self.device.is_cpu if by_color is None else by_color
@@ -131,11 +134,10 @@ class Dynamics(RigidBodies):
         """Do the second half of `step`: impulses, and motion. Launches only."""
         self._check_whole()
         n, room, query, bodies = len(self.mass), self._room, self.query, self.bodies
-        targets = [self.target_rotation, self.target_position]
         fast = 2.0 * float(np.linalg.norm(self.gravity)) * dt
         posed = [query.pairs, self._pool, query.manifolds]
         with self._changing():
-            inputs = [dt, wp.vec3d(*(dt * self.gravity)), *targets, self._pool, bodies]
+            inputs = [dt, wp.vec3d(*(dt * self.gravity)), self.targets, self._pool, bodies]
             self._launch(body_kernels.begin_step_kernel, n, inputs)
             inputs = [dt, fast, *posed, self._warm_start, bodies, self._sorted_pair, self.constraints]
             self._launch(constraint_kernels.prepare_constraints_kernel, room, inputs)
@@ -145,7 +147,7 @@ class Dynamics(RigidBodies):
             self._relax(solve.POSITION, ITERATIONS, fast)
             inputs = [query.pair_key, *posed, self.constraints, self._warm_start]
             self._launch(constraint_kernels.save_impulses_kernel, room, inputs)
-            self._launch(body_kernels.integrate_kernel, n, [dt, *targets, bodies, self._pool])
+            self._launch(body_kernels.integrate_kernel, n, [dt, self.targets, bodies, self._pool])
 
     def launch(self, dt: float):
         """Move all bodies by one step. Launches only: after a `step`, a CUDA graph can capture it, with this dt.
@@ -203,7 +205,8 @@ class Dynamics(RigidBodies):
 
     def _launch_relaxation(self, threads, stage, backward, first_color, last_color, rounds, fast):
         relaxation = solve.Relaxation()
-        relaxation.stage, relaxation.backward, relaxation.threads, relaxation.fast = int(stage), backward, threads, fast
+        relaxation.stage, relaxation.backward, relaxation.threads = int(stage), backward, threads
+        relaxation.friction, relaxation.fast = self.friction, fast
         relaxation.first_color, relaxation.last_color, relaxation.rounds = first_color, last_color, rounds
         inputs = [relaxation, self._sorted_pair, self._sorted_color, self.query.pairs, self.query.manifolds]
         self._launch(solve.relax_kernel, threads, [*inputs, self.constraints, self.bodies])

@@ -26,7 +26,6 @@ class ObjectGroup:
     world: np.ndarray  # int (n,)
     motion: dict  # arguments of `Kinematic`
     kinematic: np.ndarray  # whether it moves as told among rigid bodies, bool (n,)
-    friction: np.ndarray  # (n,); NaN without [dynamics]
 
 
 def make_group(path, key: str, table, dynamics, rng) -> ObjectGroup:
@@ -57,17 +56,15 @@ def make_group(path, key: str, table, dynamics, rng) -> ObjectGroup:
         motion["shuttle"][:], motion["period"][:] = table.shuttle.by, table.shuttle.period
         motion["phase"][:] = table.shuttle.phase
     _scatter(table.random, motion, rng)
-    friction = np.nan if dynamics is None else dynamics.friction if table.friction is None else table.friction
     world = np.repeat(np.arange(table.world, table.world + table.worlds), len(offsets))
-    return ObjectGroup(key, table, world, motion, np.full(count, table.kinematic), np.full(count, friction))
+    return ObjectGroup(key, table, world, motion, np.full(count, table.kinematic))
 
 
 def _check_dynamics(path, key, table, dynamics):
     """Refuse keys that rigid bodies alone have, or that they cannot have."""
     if dynamics is None:
-        for name, given in (("kinematic", table.kinematic), ("friction", table.friction is not None)):
-            if given:
-                fail(path, f"{key}.{name}", "the scene has no [dynamics]")
+        if table.kinematic:
+            fail(path, f"{key}.kinematic", "the scene has no [dynamics]")
     elif not table.static and not table.kinematic and table.shuttle is not None:
         fail(path, f"{key}.shuttle", "a rigid body goes its own way; kinematic = true lets it shuttle")
 

@@ -43,7 +43,6 @@ class SceneFile:
     control: LodControl  # of [lod]
     dynamics: Any  # `DynamicsTable`, None without [dynamics]
     kinematic: np.ndarray  # whether each object moves as told among rigid bodies, bool (n,)
-    friction: np.ndarray  # of each object, (n,); NaN without [dynamics]
 
     def lods_at(self, time: float) -> np.ndarray:
         """Return the LOD of every object at a time [s] without a controller, int64 (n,)."""
@@ -64,7 +63,7 @@ class SceneFile:
         try:
             return Dynamics(
                 self.scene,
-                friction=self.friction,
+                friction=self.dynamics.friction,
                 gravity=self.dynamics.gravity,
                 kinematic=self.kinematic,
                 velocity=self.motion.velocity,
@@ -151,7 +150,6 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
         control=control,
         dynamics=tables.dynamics,
         kinematic=np.concatenate([group.kinematic for group in groups]),
-        friction=np.concatenate([group.friction for group in groups]),
     )
     scene.set_lods(loaded.lods_at(0.0))
     scene.set_poses(motion.poses(0.0))

@@ -191,7 +191,6 @@ class ObjectTable(Table, kw_only=True):
     world: Annotated[int, Meta(ge=-1, le=2**30)] = 0  # objects of different worlds never meet; -1 is in every world
     static: bool = False  # static objects never meet each other
     kinematic: bool = False  # with [dynamics]: moves as told, and pushes
-    friction: NotNegative | None = None  # with [dynamics], whose friction is the default
     importance: Annotated[int, Meta(ge=1, le=3)] = 1  # 1 (most), 2 or 3, for the selection of LODs
     # A number with a decimal point is a fraction of the faces; a whole number, "finest", "coarsest" or "tol:0.01"; of a
     # list each in turn.
