@@ -26,12 +26,11 @@ class Constraints:
 
     arm_a: wp.array2d(dtype=wp.vec3d)  # from the centre of mass of the first body
     arm_b: wp.array2d(dtype=wp.vec3d)  # from that of the second
-    tangent: wp.array2d(dtype=wp.vec3d)  # the first tangent; the second is normal x tangent
     mass: wp.array2d(dtype=wp.float64)  # effective mass along the normal
-    tangent_mass: wp.array2d(dtype=wp.mat22d)  # effective mass along the tangents
+    tangent_mass: wp.array2d(dtype=wp.mat33d)  # effective mass across the normal, world frame
     bias: wp.array2d(dtype=wp.float64)  # separation speed that the position correction aims for [world units/s]
     impulse: wp.array2d(dtype=wp.float64)  # accumulated, along the normal
-    friction_impulse: wp.array2d(dtype=wp.vec2d)  # accumulated, along the tangents
+    friction_impulse: wp.array2d(dtype=wp.vec3d)  # accumulated, across the normal, world frame
     pseudo_impulse: wp.array2d(dtype=wp.float64)  # accumulated, of the position correction
     color: wp.array(dtype=wp.int32)  # [pair] 0 .. COLOR_COUNT, or INACTIVE
 
@@ -85,40 +84,26 @@ def relative_velocity(
 
 
 @wp.func
-def response(bodies: Bodies, i: wp.int32, arm: wp.vec3d, u: wp.vec3d, v: wp.vec3d):
-    """Return the velocity along v at the end of an arm that an impulse of 1 along u gives."""
+def mobility(bodies: Bodies, i: wp.int32, arm: wp.vec3d):
+    """Return the matrix that takes an impulse at the end of an arm to the velocity that it gives there."""
     if bodies.motion_type[i] != DYNAMIC:
-        return wp.float64(0.0)
-    angular_velocity = bodies.inverse_inertia[i] * wp.cross(arm, u)
-    return bodies.inverse_mass[i] * wp.dot(u, v) + wp.dot(angular_velocity, wp.cross(arm, v))
-
-
-@wp.func
-def perpendicular(n: wp.vec3d):
-    """Return a unit vector perpendicular to a unit vector."""
-    zero = wp.float64(0.0)
-    v = wp.vec3d(-n[2], zero, n[0])
-    if wp.abs(n[0]) < wp.abs(n[1]):
-        v = wp.vec3d(zero, n[2], -n[1])
-    return wp.normalize(v)
+        return wp.mat33d()
+    cross = wp.skew(arm)
+    return bodies.inverse_mass[i] * wp.identity(n=3, dtype=wp.float64) - cross * bodies.inverse_inertia[i] * cross
 
 
 @wp.func
 def set_effective_mass(bodies: Bodies, constraints: Constraints, c: Point):
-    """Set the tangent of a point, and the effective masses along the normal and both tangents."""
-    n = c.normal
-    t = perpendicular(n)
-    s = wp.cross(n, t)
-    arm_a = constraints.arm_a[c.pair, c.column]
-    arm_b = constraints.arm_b[c.pair, c.column]
-    nn = response(bodies, c.a, arm_a, n, n) + response(bodies, c.b, arm_b, n, n)
-    tt = response(bodies, c.a, arm_a, t, t) + response(bodies, c.b, arm_b, t, t)
-    ts = response(bodies, c.a, arm_a, t, s) + response(bodies, c.b, arm_b, t, s)
-    ss = response(bodies, c.a, arm_a, s, s) + response(bodies, c.b, arm_b, s, s)
-    det = tt * ss - ts * ts
-    constraints.tangent[c.pair, c.column] = t
-    constraints.mass[c.pair, c.column] = wp.float64(1.0) / nn
-    constraints.tangent_mass[c.pair, c.column] = wp.mat22d(ss / det, -ts / det, -ts / det, tt / det)
+    """Set the effective masses of a point along the normal and across it."""
+    k = mobility(bodies, c.a, constraints.arm_a[c.pair, c.column])
+    k += mobility(bodies, c.b, constraints.arm_b[c.pair, c.column])
+    along = wp.dot(c.normal, k * c.normal)
+    normal = wp.outer(c.normal, c.normal)
+    across = wp.identity(n=3, dtype=wp.float64) - normal
+    constraints.mass[c.pair, c.column] = wp.float64(1.0) / along
+    # The inverse within the tangent plane: along the normal the matrix is made `along`, and its inverse taken off.
+    tangent_mass = wp.inverse(across * k * across + along * normal) - normal / along
+    constraints.tangent_mass[c.pair, c.column] = tangent_mass
 
 
 @wp.func
@@ -132,17 +117,6 @@ def find_match(warm_start: WarmStart, row: wp.int32, radius: wp.float64, point: 
             nearest = wp.dot(r, r)
             best = k
     return best
-
-
-@wp.func
-def set_warm_start(warm_start: WarmStart, row: wp.int32, column: wp.int32, constraints: Constraints, c: Point):
-    """Take the impulses of a point of the step before."""
-    t = constraints.tangent[c.pair, c.column]
-    friction = warm_start.friction_impulse[row, column]
-    constraints.impulse[c.pair, c.column] = warm_start.impulse[row, column]
-    constraints.friction_impulse[c.pair, c.column] = wp.vec2d(
-        wp.dot(friction, t), wp.dot(friction, wp.cross(c.normal, t))
-    )
 
 
 @wp.kernel
@@ -184,7 +158,7 @@ def prepare_constraints_kernel(
         set_effective_mass(bodies, constraints_out, c)
         constraints_out.bias[p, k] = BAUMGARTE * (manifolds.depth[p, k] - SLOP * radius) / dt
         constraints_out.impulse[p, k] = wp.float64(0.0)
-        constraints_out.friction_impulse[p, k] = wp.vec2d()
+        constraints_out.friction_impulse[p, k] = wp.vec3d()
         constraints_out.pseudo_impulse[p, k] = wp.float64(0.0)
         velocity = relative_velocity(bodies.velocity, bodies.momentum, constraints_out, bodies, c)
         if known and wp.abs(wp.dot(c.normal, velocity)) <= fast:
@@ -192,7 +166,9 @@ def prepare_constraints_kernel(
             match = find_match(warm_start, row, MATCH_RADIUS * radius, local, used)
             if match >= 0:
                 used = used | (1 << match)
-                set_warm_start(warm_start, row, match, constraints_out, c)
+                friction = warm_start.friction_impulse[row, match]
+                constraints_out.impulse[p, k] = warm_start.impulse[row, match]
+                constraints_out.friction_impulse[p, k] = friction - wp.dot(friction, c.normal) * c.normal
 
 
 @wp.kernel
@@ -212,9 +188,7 @@ def save_impulses_kernel(
     warm_start_out.count[p] = manifolds.count[p]
     a = pairs[p][0]
     for k in range(manifolds.count[p]):
-        t = constraints.tangent[p, k]
-        v = constraints.friction_impulse[p, k]
         local = wp.transpose(objects.rotation[a]) * (manifolds.point[p, k] - objects.position[a])
         warm_start_out.point[p, k] = local
         warm_start_out.impulse[p, k] = constraints.impulse[p, k]
-        warm_start_out.friction_impulse[p, k] = v[0] * t + v[1] * wp.cross(manifolds.normal[p, k], t)
+        warm_start_out.friction_impulse[p, k] = constraints.friction_impulse[p, k]

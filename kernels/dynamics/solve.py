@@ -58,27 +58,20 @@ def apply_impulse(
 @wp.func
 def solve_friction(constraints: Constraints, bodies: Bodies, c: Point, limit: wp.float64):
     """Stop the tangential velocity of a point, with an accumulated impulse of at most `limit`."""
-    t = constraints.tangent[c.pair, c.column]
-    s = wp.cross(c.normal, t)
     velocity = relative_velocity(bodies.velocity, bodies.momentum, constraints, bodies, c)
     old = constraints.friction_impulse[c.pair, c.column]
-    tangential = wp.vec2d(wp.dot(t, velocity), wp.dot(s, velocity))
-    new = old - constraints.tangent_mass[c.pair, c.column] * tangential
+    new = old - constraints.tangent_mass[c.pair, c.column] * velocity
     length = wp.length(new)
     if length > limit:
         new = new * (limit / length)
     constraints.friction_impulse[c.pair, c.column] = new
-    apply_impulse(
-        bodies.velocity, bodies.momentum, constraints, bodies, c, (new[0] - old[0]) * t + (new[1] - old[1]) * s
-    )
+    apply_impulse(bodies.velocity, bodies.momentum, constraints, bodies, c, new - old)
 
 
 @wp.func
 def apply_warm_start(constraints: Constraints, bodies: Bodies, c: Point):
     """Apply the impulses that a point has from the step before."""
-    t = constraints.tangent[c.pair, c.column]
-    v = constraints.friction_impulse[c.pair, c.column]
-    impulse = constraints.impulse[c.pair, c.column] * c.normal + v[0] * t + v[1] * wp.cross(c.normal, t)
+    impulse = constraints.impulse[c.pair, c.column] * c.normal + constraints.friction_impulse[c.pair, c.column]
     apply_impulse(bodies.velocity, bodies.momentum, constraints, bodies, c, impulse)
 
 
