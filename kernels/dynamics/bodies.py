@@ -6,7 +6,6 @@ A body frame has its origin at the centre of mass and its axes along the princip
 import warp as wp
 
 from warp_abtree.kernels.arrays import ObjectPool
-from warp_abtree.kernels.poses import rotate_quaternion
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -32,7 +31,7 @@ class Bodies:
     bounding_radius: wp.array(dtype=wp.float64)  # about the centre of mass [world units]
     # state
     position: wp.array(dtype=wp.vec3d)  # of the body frame [world units]
-    rotation: wp.array(dtype=wp.vec4d)  # of the body frame, x y z w
+    rotation: wp.array(dtype=wp.quatd)  # of the body frame, x y z w
     velocity: wp.array(dtype=wp.vec3d)  # of the centre of mass [world units/s]
     momentum: wp.array(dtype=wp.vec3d)  # angular momentum, world frame; of kinematic objects angular velocity [rad/s]
     # of one step
@@ -43,64 +42,29 @@ class Bodies:
 
 
 @wp.func
-def multiply_quaternion(p: wp.vec4d, q: wp.vec4d):
-    """Return the rotation q followed by p, x y z w."""
-    u = wp.vec3d(p[0], p[1], p[2])
-    v = wp.vec3d(q[0], q[1], q[2])
-    w = p[3] * v + q[3] * u + wp.cross(u, v)
-    return wp.vec4d(w[0], w[1], w[2], p[3] * q[3] - wp.dot(u, v))
-
-
-@wp.func
-def quaternion_exp(v: wp.vec3d):
+def rotation_by(v: wp.vec3d):
     """Return the quaternion of a rotation vector, axis times angle [rad]."""
-    angle = wp.length(v)
-    scale = HALF
-    if angle > wp.float64(1.0e-8):
-        scale = wp.sin(HALF * angle) / angle
-    return wp.vec4d(scale * v[0], scale * v[1], scale * v[2], wp.cos(HALF * angle))
+    return wp.quat_from_axis_angle(wp.normalize(v), wp.length(v))
 
 
 @wp.func
-def rotate_about_axis(axis: wp.int32, angle: wp.float64, q: wp.vec4d, momentum: wp.vec3d):
-    """Rotate a body about one of its own axes; its momentum in the body frame rotates the other way."""
-    v = wp.vec3d()
-    v[axis] = angle
-    j = (axis + 1) % 3
-    k = (axis + 2) % 3
-    c = wp.cos(angle)
-    s = wp.sin(angle)
-    rotated = momentum
-    rotated[j] = c * momentum[j] + s * momentum[k]
-    rotated[k] = c * momentum[k] - s * momentum[j]
-    return multiply_quaternion(q, quaternion_exp(v)), rotated
-
-
-@wp.func
-def integrate_rotation(q: wp.vec4d, momentum: wp.vec3d, inverse_moment: wp.vec3d, dt: wp.float64):
+def integrate_rotation(q: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d, dt: wp.float64):
     """Return the rotation of a free body after a time; its angular momentum [world frame] is constant.
 
     The kinetic energy is split into that of the three axes, each of which gives a plain rotation. Their symmetric
     product is symplectic: the energy oscillates and does not drift.
     Source: McLachlan 1993, Explicit Lie-Poisson integration and the Euler equations; Reich 1994.
     """
-    m = wp.transpose(rotate_quaternion(q)) * momentum
+    m = wp.quat_rotate_inv(q, momentum)
     for k in range(5):
         axis = wp.where(k < 3, k, 4 - k)
         part = wp.where(k == 2, dt, HALF * dt)
-        q, m = rotate_about_axis(axis, part * m[axis] * inverse_moment[axis], q, m)
-    return q / wp.length(q)
-
-
-@wp.func
-def rotation_vector(r: wp.mat33d):
-    """Return axis times angle [rad] of a rotation by less than half a turn."""
-    v = HALF * wp.vec3d(r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1])
-    sine = wp.length(v)
-    angle = wp.atan2(sine, HALF * (r[0, 0] + r[1, 1] + r[2, 2] - wp.float64(1.0)))
-    if sine > wp.float64(0.0):
-        v = v * (angle / sine)
-    return v
+        v = wp.vec3d()
+        v[axis] = part * m[axis] * inverse_moment[axis]
+        turn = rotation_by(v)
+        q = q * turn
+        m = wp.quat_rotate_inv(turn, m)
+    return wp.normalize(q)
 
 
 @wp.kernel
@@ -118,15 +82,16 @@ def begin_step_kernel(
     bodies_inout.pseudo_momentum[i] = wp.vec3d()
     bodies_inout.bid[i] = wp.int64(0)
     if bodies_inout.motion_type[i] == DYNAMIC:
-        r = rotate_quaternion(bodies_inout.rotation[i])
+        r = wp.quat_to_matrix(bodies_inout.rotation[i])
         bodies_inout.inverse_inertia[i] = r * wp.diag(bodies_inout.inverse_moment[i]) * wp.transpose(r)
         bodies_inout.velocity[i] += velocity_change
         return
     bodies_inout.position[i] = objects.position[i]
     if bodies_inout.motion_type[i] == KINEMATIC:
-        rotation = targets.rotation[i] * wp.transpose(objects.rotation[i])
+        turn = wp.quat_from_matrix(targets.rotation[i] * wp.transpose(objects.rotation[i]))
+        axis, angle = wp.quat_to_axis_angle(turn)
         bodies_inout.velocity[i] = (targets.position[i] - objects.position[i]) / dt
-        bodies_inout.momentum[i] = rotation_vector(rotation) / dt
+        bodies_inout.momentum[i] = (angle / dt) * axis
         bodies_inout.inverse_inertia[i] = wp.identity(n=3, dtype=wp.float64)
 
 
@@ -147,14 +112,11 @@ def integrate_kernel(
         return
     bodies_inout.position[i] += dt * (bodies_inout.velocity[i] + bodies_inout.pseudo_velocity[i])
     q = integrate_rotation(bodies_inout.rotation[i], bodies_inout.momentum[i], bodies_inout.inverse_moment[i], dt)
-    pseudo_angular_velocity = bodies_inout.inverse_inertia[i] * bodies_inout.pseudo_momentum[i]
-    if wp.dot(pseudo_angular_velocity, pseudo_angular_velocity) > wp.float64(0.0):
-        correction = quaternion_exp(dt * pseudo_angular_velocity)
-        q = multiply_quaternion(correction, q)
-        q = q / wp.length(q)
-        # The momentum rotates along, otherwise the kinetic energy would change.
-        bodies_inout.momentum[i] = rotate_quaternion(correction) * bodies_inout.momentum[i]
+    correction = rotation_by(dt * (bodies_inout.inverse_inertia[i] * bodies_inout.pseudo_momentum[i]))
+    q = wp.normalize(correction * q)
+    # The momentum rotates along, otherwise the kinetic energy would change.
+    bodies_inout.momentum[i] = wp.quat_rotate(correction, bodies_inout.momentum[i])
     bodies_inout.rotation[i] = q
-    rotation = rotate_quaternion(q) * wp.transpose(bodies_inout.axes[i])
+    rotation = wp.quat_to_matrix(q) * wp.transpose(bodies_inout.axes[i])
     objects_inout.rotation[i] = rotation
     objects_inout.position[i] = bodies_inout.position[i] - rotation * bodies_inout.centre[i]

@@ -1,5 +1,7 @@
 """The stepper as a program: repeatable to the bit however it runs, room that grows, frames, and what it refuses."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import warp as wp
@@ -14,26 +16,26 @@ pytestmark = pytest.mark.slow
 SHAPES = (BRICK, TORUS, BALL)
 
 
-def heap(count=9, seed=0):
+def heap(device, count=9, **options):
     """Bodies that fall onto each other."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     turns = rng.normal(size=(count, 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
     places = [*rng.uniform(-0.4, 0.4, (count, 2)).T, 0.6 + 0.5 * np.arange(count)]
-    return [
-        (SHAPES[i % 3], (*place, *(turn / np.linalg.norm(turn))))
-        for i, (place, turn) in enumerate(zip(np.transpose(places), turns))
-    ]
+    poses = np.concatenate([np.transpose(places), turns], axis=1)
+    return on_ground(device, *((SHAPES[i % 3], pose) for i, pose in enumerate(poses)), **options)
 
 
-def fall(device, steps=80, **options):
+@cache
+def fall(device):
     """Return where a heap falls, `bits`, by plain steps."""
-    return run(on_ground(device, *heap(), **options), steps)
+    return run(heap(device), 80)
 
 
 @pytest.mark.parametrize("by_color", [False, True])
 def test_a_heap_falls_the_same_again_however_it_is_relaxed(device, by_color):
     with testing.regime(relax_by_color=by_color):
-        dynamics = on_ground(device, *heap())
+        dynamics = heap(device)
     assert np.array_equal(run(dynamics, 80), fall(device))
     assert dynamics.query.manifolds.count.numpy().sum() > 8
 
@@ -61,7 +63,7 @@ def test_a_body_in_more_contacts_than_colors(device):
 
 
 def test_launches_of_a_graph_do_what_steps_do(device):
-    dynamics = on_ground(device, *heap(), capacity=ab.Buffers(4096, pairs=256))
+    dynamics = heap(device, capacity=ab.Buffers(4096, pairs=256))
     run(dynamics, 1)
     with wp.ScopedCapture(dynamics.device) as capture:
         dynamics.launch(1 / 120)
@@ -72,8 +74,8 @@ def test_launches_of_a_graph_do_what_steps_do(device):
 
 
 def test_capacity_grows_in_steps_and_is_refused_in_launches(device):
-    assert np.array_equal(fall(device, capacity=ab.Buffers(1, pairs=1)), fall(device))
-    short = on_ground(device, *heap(), capacity=ab.Buffers(4096, pairs=1))
+    assert np.array_equal(run(heap(device, capacity=ab.Buffers(1, pairs=1)), 80), fall(device))
+    short = heap(device, capacity=ab.Buffers(4096, pairs=1))
     with pytest.raises(ab.CapacityError, match="pairs="):
         for _ in range(80):
             short.launch(1 / 120)
@@ -81,7 +83,7 @@ def test_capacity_grows_in_steps_and_is_refused_in_launches(device):
 
 
 def test_a_frame_steps_and_reports(device):
-    dynamics = on_ground(device, *heap())
+    dynamics = heap(device)
     frame = ab.Frame(dynamics.scene, motion=dynamics.motion(), time_step=1 / 120)
     for _ in range(80):
         result = frame.step()

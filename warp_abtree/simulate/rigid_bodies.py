@@ -192,24 +192,22 @@ class Dynamics(RigidBodies):
 
     def _relax(self, stage, rounds, fast):
         """Relax all pairs: by one thread in one launch, or a launch for each color of each round."""
+        each, colors = solve.Relaxation(), range(COLOR_COUNT + 1)
+        each.stage, each.friction, each.fast = int(stage), self.friction, fast
+        arrays = [self._sorted_pair, self._sorted_color, self.query.pairs, self.query.manifolds]
+        inputs = [each, *arrays, self.constraints, self.bodies]
         if not self._by_color:
-            self._launch_relaxation(1, stage, 0, 0, COLOR_COUNT, rounds, fast)
+            each.last_color, each.rounds, each.threads = COLOR_COUNT, rounds, 1
+            self._launch(solve.relax_kernel, 1, inputs)
             return
+        each.rounds = 1
         for turn in range(rounds):
-            backward = turn % 2 if stage == solve.VELOCITY else 0
-            colors = range(COLOR_COUNT + 1)
-            for color in reversed(colors) if backward else colors:
+            each.backward = turn % 2 if stage == solve.VELOCITY else 0
+            for color in reversed(colors) if each.backward else colors:
                 # The pairs without a color of their own are relaxed one after another.
-                threads = self._room if color < COLOR_COUNT else 1
-                self._launch_relaxation(threads, stage, backward, color, color, 1, fast)
-
-    def _launch_relaxation(self, threads, stage, backward, first_color, last_color, rounds, fast):
-        relaxation = solve.Relaxation()
-        relaxation.stage, relaxation.backward, relaxation.threads = int(stage), backward, threads
-        relaxation.friction, relaxation.fast = self.friction, fast
-        relaxation.first_color, relaxation.last_color, relaxation.rounds = first_color, last_color, rounds
-        inputs = [relaxation, self._sorted_pair, self._sorted_color, self.query.pairs, self.query.manifolds]
-        self._launch(solve.relax_kernel, threads, [*inputs, self.constraints, self.bodies])
+                each.threads = self._room if color < COLOR_COUNT else 1
+                each.first_color = each.last_color = color
+                self._launch(solve.relax_kernel, each.threads, inputs)
 
 
 class SteppedMotion:
