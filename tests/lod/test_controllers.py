@@ -109,6 +109,10 @@ def test_it_goes_back_to_the_finest_when_the_load_ends():
     assert plant.rows[119].error_mean > 0 and plant.rows[-1].error_mean == 0
     # And there it stays: nothing is left to climb to.
     assert all(row.error_mean == 0 for row in plant.rows[-60:])
+    plant = Plant(budget_ms=1e-3)
+    for _ in range(30):
+        plant.step(1.0 / plant.load)
+        assert not plant.lods.any(), "more than the coarsest costs stays coarsest"
 
 
 def test_a_single_hitch_changes_no_lod():
@@ -128,13 +132,6 @@ def test_a_slower_machine_is_learned():
     costs = plant.run(100, hitch=2.0)
     assert costs[100:111].min() <= 1.1 * 5.0
     assert costs[130:].max() <= 5.5
-
-
-def test_more_than_the_coarsest_stays_coarsest():
-    plant = Plant(budget_ms=1e-3)
-    for _ in range(30):
-        plant.step(1.0 / plant.load)
-        assert not plant.lods.any()
 
 
 def predict_frames(growth):
@@ -157,12 +154,11 @@ def test_growth_that_lasts_is_predicted():
     assert (np.diff(ratio[:30]) > 0).all() and ratio[29] == pytest.approx(1.0, abs=1e-3)
     assert ratio[30] == pytest.approx(1.03, abs=2e-3) and ratio[59] == pytest.approx(1.0, abs=1e-3)
     assert (ratio[62:90] > 1.02).all(), "each frame is predicted to cost what the one before it did"
-
-
-def test_growth_is_forgotten_where_nothing_is_tested():
-    up = np.arange(1, 31) * 0.03
     ratio = predict_frames([*up, *[-math.inf] * 20, *[0.0] * 3])
-    assert ratio[29] == pytest.approx(1.0, abs=1e-3) and ratio[51:] == pytest.approx(1.0, abs=2e-3)
+    assert ratio[29] == pytest.approx(1.0, abs=1e-3)
+    assert ratio[51:] == pytest.approx(1.0, abs=2e-3), "it is forgotten where nothing is tested"
+    ratio = predict_frames([0.0, 1.1, 1.1])
+    assert ratio[0] == pytest.approx(1.0, abs=1e-3) and 1.0 < ratio[2] < 1.05, "a leap is not taken for growth"
 
 
 def test_a_climb_is_not_taken_for_growth():
@@ -173,12 +169,6 @@ def test_a_climb_is_not_taken_for_growth():
         assert len(plant.rows) < 60
     plant.step()
     assert len(plant.rows) > 10 and plant.controller.predicted_ms == pytest.approx(plant.rows[-1].cost_ms, rel=5e-3)
-
-
-def test_a_leap_of_the_load_is_not_taken_for_growth():
-    """Tests triple at once: the frame after is predicted a few percent dearer, not twice as dear."""
-    ratio = predict_frames([0.0, 1.1, 1.1])
-    assert ratio[0] == pytest.approx(1.0, abs=1e-3) and 1.0 < ratio[2] < 1.05
 
 
 def test_the_tests_of_a_pair_are_shared_by_its_objects():

@@ -21,7 +21,7 @@ from warp_abtree.kernels.dynamics import bodies as body_kernels
 from warp_abtree.kernels.dynamics import constraints as constraint_kernels
 from warp_abtree.kernels.dynamics import graph_coloring, solve
 from warp_abtree.query.manifold import POINTS_MAX, ManifoldQuery
-from warp_abtree.query.request import Buffers, CapacityError
+from warp_abtree.query.request import Buffers
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.body_state import RigidBodies, zeros_of
 
@@ -165,13 +165,7 @@ class Dynamics(RigidBodies):
         Raises:
             CapacityError: Names the demand.
         """
-        assert self.query.broad_phase is not None  # the query was made without pairs
-        pairs = self.query.broad_phase.count_found()
-        if pairs > self._room:
-            raise CapacityError(
-                f"{pairs} object pairs, there is room for {self._room}: make it with capacity=Buffers(pairs={pairs})"
-            )
-        self.query.result().check()
+        self.query.result(with_points=False).check()
 
     def motion(self, prescribed=None) -> "SteppedMotion":
         """Return what a `Frame` takes as motion: steps of this, with kinematic objects on a prescribed path."""
