@@ -44,19 +44,10 @@ def test_sweep_goes_down_and_up_in_equal_ratios():
 
 
 def test_lod_requests():
-    for request, lod in (
-        ("finest", RING.lod_max),
-        ("coarsest", 0),
-        (17, 17),
-        ("17", 17),
-        (0.25, RING.lod_for(fraction=0.25)),
-        ("0.25", RING.lod_for(fraction=0.25)),
-        (1.0, RING.lod_max),
-        ("1", 1),
-        ("tol:1e30", RING.lod_for(tolerance=1e30)),
-        ("tol:0", RING.lod_for(tolerance=0)),
-    ):
-        assert resolve_lod(RING, request) == lod, request
+    top, quarter = RING.lod_max, RING.lod_for(fraction=0.25)
+    requests = "finest", "coarsest", 17, "17", 0.25, "0.25", 1.0, "1", "tol:1e30", "tol:0"
+    lods = [top, 0, 17, 17, quarter, quarter, top, 1, *(RING.lod_for(tolerance=x) for x in (1e30, 0))]
+    assert [resolve_lod(RING, request) for request in requests] == lods
     for request in ("", "fine", "tol:", "tol:x", "tol:-1", "tol:nan", "nan", 0.0, 1.5, -1, RING.lod_max + 1, "2.0"):
         with pytest.raises(ValueError):
             resolve_lod(RING, request)

@@ -1,12 +1,8 @@
 """Rigid bodies that respond to the contacts of their meshes: `Dynamics`.
 
-One step: contacts where the bodies stand (`ManifoldQuery`, at most 8 points a pair); gravity; contact impulses by
-projected Gauss-Seidel with warm starting and Coulomb friction; position correction by split impulses; semi-implicit
-Euler with a symplectic rotation. All in float64, with the same bits when repeated on one device, and for a world alone
-or among others. docs/dynamics.md has each part, figures, and limits.
-
-Contacts are inelastic. Momentum and angular momentum of bodies that only meet each other are conserved to rounding
-without gravity; under gravity position corrections change angular momentum.
+One step: contacts where the bodies stand (`ManifoldQuery`); gravity; contact impulses by projected Gauss-Seidel with
+warm starting and Coulomb friction; position correction by split impulses; semi-implicit Euler with a symplectic
+rotation. All in float64; docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
 """
 
 from contextlib import contextmanager
