@@ -25,7 +25,9 @@ def make_bid(p: wp.int32, color: wp.int32, pair: wp.vec2i, bodies: Bodies):
 
     Bits: 63..56 round + 1 | 55 zero | 54..31 hash | 30..0 pair
     """
-    mixed = wp.rand_init(bodies.rank[pair[0]], bodies.rank[pair[1]]) & wp.uint32(0xFFFFFF)
+    mixed = wp.uint32(bodies.rank[pair[0]]) * wp.uint32(40503) + wp.uint32(bodies.rank[pair[1]])
+    mixed = (mixed ^ (mixed >> wp.uint32(15))) * wp.uint32(739982445)
+    mixed = (mixed ^ (mixed >> wp.uint32(12))) & wp.uint32(0xFFFFFF)
     return (wp.int64(color + 1) << wp.int64(56)) | (wp.int64(mixed) << wp.int64(31)) | wp.int64(p)
 
 

@@ -56,19 +56,6 @@ def apply_impulse(
 
 
 @wp.func
-def solve_friction(constraints: Constraints, bodies: Bodies, c: Point, limit: wp.float64):
-    """Stop the tangential velocity of a point, with an accumulated impulse of at most `limit`."""
-    velocity = relative_velocity(bodies.velocity, bodies.momentum, constraints, bodies, c)
-    old = constraints.friction_impulse[c.pair, c.column]
-    new = old - constraints.tangent_mass[c.pair, c.column] * velocity
-    length = wp.length(new)
-    if length > limit:
-        new = new * (limit / length)
-    constraints.friction_impulse[c.pair, c.column] = new
-    apply_impulse(bodies.velocity, bodies.momentum, constraints, bodies, c, new - old)
-
-
-@wp.func
 def apply_warm_start(constraints: Constraints, bodies: Bodies, c: Point):
     """Apply the impulses that a point has from the step before."""
     impulse = constraints.impulse[c.pair, c.column] * c.normal + constraints.friction_impulse[c.pair, c.column]
@@ -79,7 +66,14 @@ def apply_warm_start(constraints: Constraints, bodies: Bodies, c: Point):
 def relax_velocity(constraints: Constraints, bodies: Bodies, c: Point, friction: wp.float64):
     """Relax a point: the tangential velocity within the friction cone, then the normal velocity."""
     before = constraints.impulse[c.pair, c.column]
-    solve_friction(constraints, bodies, c, friction * before)
+    velocity = relative_velocity(bodies.velocity, bodies.momentum, constraints, bodies, c)
+    old = constraints.friction_impulse[c.pair, c.column]
+    new = old - constraints.tangent_mass[c.pair, c.column] * velocity
+    length = wp.length(new)
+    if length > friction * before:
+        new = new * (friction * before / length)
+    constraints.friction_impulse[c.pair, c.column] = new
+    apply_impulse(bodies.velocity, bodies.momentum, constraints, bodies, c, new - old)
     correction = constraints.mass[c.pair, c.column] * normal_velocity(constraints, bodies, c)
     after = wp.max(before - correction, wp.float64(0.0))
     constraints.impulse[c.pair, c.column] = after

@@ -35,9 +35,6 @@ def totals(dynamics):
     return momentum, angular, energy
 
 
-# Mass.
-
-
 def test_mass_properties_of_a_box_off_its_origin():
     a, b, c = 2.0, 1.0, 0.5
     mesh = trimesh.creation.box((a, b, c)).apply_translation((3, -2, 1))
@@ -61,9 +58,6 @@ def test_an_open_mesh_has_the_mass_of_its_convex_hull(monkeypatch):
     monkeypatch.setattr(trimesh.convex, "ConvexHull", missing)
     with pytest.raises(ValueError, match="'open' is not closed: its convex hull needs scipy"):
         mass_properties(ab.Model.from_arrays(mesh.vertices, mesh.faces[1:], name="open"))
-
-
-# Free motion.
 
 
 def tumble(moments, momentum, rotation, time, steps):
@@ -106,9 +100,6 @@ def test_gravity_is_semi_implicit_euler(device):
     falls = 1 - np.cumsum(np.full(10, 8 * 0.125))
     np.testing.assert_allclose(dynamics.velocities()[0][0], [0.5, 0, 1 + 0 - 8 * 1.25], rtol=1e-15)
     np.testing.assert_allclose(dynamics.poses()[0, :3], [0.625, 0, 0.125 * falls.sum()], rtol=1e-14)
-
-
-# What collisions keep.
 
 
 @pytest.mark.parametrize("friction", [0, 0.5])
@@ -166,9 +157,6 @@ def test_corrections_of_place_leave_velocity_and_energy(device):
     assert found[2] == pytest.approx(start[2], rel=1e-3)
 
 
-# Friction.
-
-
 @pytest.mark.parametrize("angle, friction", [(0.3, 0.4), (0.5, 0.2), (0.4, 0.0)])
 def test_a_box_on_a_slope_sticks_or_slides(device, angle, friction):
     turn = about((0, 1, 0), angle)
@@ -182,9 +170,6 @@ def test_a_box_on_a_slope_sticks_or_slides(device, angle, friction):
     assert slid[0] == pytest.approx(0.5 * pull, rel=0.06, abs=1e-3)
     assert np.abs(slid[1:]).max() < 0.1 * abs(slid[0]) + 2e-3
     assert (np.abs(dynamics.velocities()[0]).max() < 1e-6) == (pull == 0)
-
-
-# Rest.
 
 
 def test_boxes_come_to_rest_on_a_plane(device):
@@ -232,9 +217,6 @@ def test_a_torus_falls_over_a_peg_and_stays(device):
     assert np.hypot(x, y) < 0.8 - 0.25 - 0.3 + 0.05, "the peg stands in the hole"
     assert z == pytest.approx(0.25, abs=0.005)
     assert abs(matrices_of(dynamics.poses()[2:, 3:])[0, 2, 2]) > 0.999
-
-
-# Kinematic objects.
 
 
 def test_a_kinematic_floor_carries_and_stops(device):

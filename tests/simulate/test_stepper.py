@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 import warp as wp
-from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, TORUS, about, bits, box, make, on_ground, run
+from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, TORUS, bits, box, make, on_ground, run
 
 import warp_abtree as ab
 from warp_abtree import testing
@@ -91,20 +91,6 @@ def test_a_frame_steps_and_reports(device):
         assert frame.history[-1].hits == result.count.sum()
     assert np.array_equal(bits(dynamics), fall(device))
     assert max(row.intersecting for row in frame.history) > 4
-
-
-def test_poses_that_a_user_sets(device):
-    dynamics = on_ground(device, (BRICK, (0, 0, 3, 0, 0, 0, 1)))
-    run(dynamics, 10)
-    poses = dynamics.poses()
-    poses[1, :3], poses[1, 3:] = [1, 2, 5], about((1, 1, 0), 1.0)
-    dynamics.scene.set_poses(poses)
-    dynamics.read_poses()
-    dynamics.set_velocities((0, 0, 0), (0, 0, 1))
-    np.testing.assert_allclose(dynamics.velocities()[1][1], [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(dynamics.poses(), poses, atol=1e-12)
-    run(dynamics, 1)
-    np.testing.assert_allclose(dynamics.poses()[1, :2], [1, 2], atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,14 @@ def _ranks(worlds):
     return ranks
 
 
+def _finite_rows(values, what, count):
+    """Return a vector for each of `count` objects, float64 (count, 3)."""
+    values = broadcast_rows(values, what, (count, 3))
+    if not np.isfinite(values).all():
+        raise ValueError(f"{what}: a number is not finite")
+    return values
+
+
 class RigidBodies:
     """State of the bodies of a scene; `Dynamics` documents the arguments.
 
@@ -118,51 +126,40 @@ class RigidBodies:
         targets: `ObjectPool` of the poses that kinematic objects have at the end of the next step.
     """
 
-    def __init__(self, scene: Scene, gravity, kinematic):
-        self.scene, self.device = scene, scene.device
-        n = scene.object_count
-        self._pool = scene.batch().objects.pool
+    def __init__(self, scene: Scene, gravity, kinematic, velocity, angular_velocity):
+        self.scene, self.device, n = scene, scene.device, scene.object_count
+        self._pool = pool = scene.batch().objects.pool
         self.gravity = finite_array(gravity, "gravity", (3,))
         self.kinematic = object_mask(kinematic, n)
-        self.rigid = ~self.kinematic & (self._pool.is_static.numpy() == 0)
-        self._fill_bodies()
-        self.targets = ObjectPool()
-        self.targets.rotation, self.targets.position = wp.clone(self._pool.rotation), wp.clone(self._pool.position)
-        self.read_poses()
-
-    def _fill_bodies(self):
-        """Allocate the arrays of all bodies, and write what stays for good."""
-        scene, rigid, n = self.scene, self.rigid, self.scene.object_count
-        self.bodies = zeros_of(kernels.Bodies, n, 0, self.device)
-        models = sorted({scene.object_model[i] for i in np.flatnonzero(rigid)})
+        self.rigid = ~self.kinematic & (pool.is_static.numpy() == 0)
+        velocity = _finite_rows(velocity, "velocity", n)
+        angular_velocity = _finite_rows(angular_velocity, "angular_velocity", n)
+        models = sorted({scene.object_model[i] for i in np.flatnonzero(self.rigid)})
         found = {m: mass_properties(scene.models[m]) for m in models}
-        own = [found[m] if r else IMMOVABLE for m, r in zip(scene.object_model, rigid)]
+        own = [found[m] if r else IMMOVABLE for m, r in zip(scene.object_model, self.rigid)]
         self.mass, self._moments = np.array([one.volume for one in own]), np.array([one.moments for one in own])
-        self._centre, self._axes = np.array([one.centre for one in own]), np.array([one.axes for one in own])
+        self._axes, centre = np.array([one.axes for one in own]), np.array([one.centre for one in own])
         rank = np.zeros(n, np.int64)
-        rank[rigid] = _ranks(self._pool.world.numpy()[rigid])
-        self._upload(
-            motion_type=np.select([rigid, self.kinematic], [int(kernels.DYNAMIC), int(kernels.KINEMATIC)], 0),
-            rank=rank,
-            inverse_mass=1 / self.mass,
-            inverse_moment=1 / self._moments,
-            centre=self._centre,
-            axes=self._axes,
-            bounding_radius=np.array([one.bounding_radius for one in own]),
-        )
-
-    def _upload(self, **values):
-        for name, array in values.items():
-            getattr(self.bodies, name).assign(array)
-
-    def read_poses(self):
-        """Take all poses from the scene, as after `Scene.set_poses`. Waits for the device."""
-        rotation = self._pool.rotation.numpy()
-        self._upload(
-            position=self._pool.position.numpy() + np.einsum("nij,nj->ni", rotation, self._centre),
-            rotation=quaternions_of(rotation @ self._axes),
-        )
-        self.clear_targets()
+        rank[self.rigid] = _ranks(pool.world.numpy()[self.rigid])
+        rotation, rigid, frames = pool.rotation.numpy(), self.rigid[:, None], self._frames()
+        local = np.einsum("nji,nj->ni", frames, angular_velocity) * np.where(rigid, self._moments, 0.0)
+        self.bodies = zeros_of(kernels.Bodies, n, 0, self.device)
+        for name, values in {
+            "motion_type": np.select([self.rigid, self.kinematic], [int(kernels.DYNAMIC), int(kernels.KINEMATIC)], 0),
+            "rank": rank,
+            "inverse_mass": 1 / self.mass,
+            "inverse_moment": 1 / self._moments,
+            "centre": centre,
+            "axes": self._axes,
+            "bounding_radius": np.array([one.bounding_radius for one in own]),
+            "position": pool.position.numpy() + np.einsum("nij,nj->ni", rotation, centre),
+            "rotation": quaternions_of(frames),
+            "velocity": np.where(rigid, velocity, 0.0),
+            "momentum": np.einsum("nij,nj->ni", frames, local),
+        }.items():
+            getattr(self.bodies, name).assign(values)
+        self.targets = ObjectPool()
+        self.targets.rotation, self.targets.position = wp.clone(pool.rotation), wp.clone(pool.position)
 
     def clear_targets(self):
         """Let kinematic objects stand where they are."""
@@ -176,26 +173,6 @@ class RigidBodies:
             raise ValueError(f"targets: {len(targets)} given for {len(self.mass)} objects")
         rows = wp.array(targets.reshape(len(targets), -1), dtype=wp.float64, device=self.device)
         launch_place(rows, self.targets)
-
-    def set_velocities(self, velocity, angular_velocity):
-        """Set the velocities of rigid bodies. Waits for the device.
-
-        Args:
-            velocity: Of the centres of mass [world units/s], (3,) or (n, 3).
-            angular_velocity: In the world frame [rad/s], (3,) or (n, 3).
-
-        Raises:
-            ValueError: Wrong shape, or a number that is not finite; nothing is changed.
-        """
-        shape = (len(self.mass), 3)
-        velocity = broadcast_rows(velocity, "velocity", shape)
-        angular_velocity = broadcast_rows(angular_velocity, "angular_velocity", shape)
-        for name, values in (("velocity", velocity), ("angular_velocity", angular_velocity)):
-            if not np.isfinite(values).all():
-                raise ValueError(f"{name}: a number is not finite")
-        rigid, frames = self.rigid[:, None], self._frames()
-        local = np.einsum("nji,nj->ni", frames, angular_velocity) * np.where(rigid, self._moments, 0.0)
-        self._upload(velocity=np.where(rigid, velocity, 0.0), momentum=np.einsum("nij,nj->ni", frames, local))
 
     def _frames(self):
         """Return the rotation matrices of the body frames, (n, 3, 3). Waits for the device."""

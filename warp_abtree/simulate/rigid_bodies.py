@@ -59,11 +59,10 @@ class Dynamics(RigidBodies):
         angular_velocity=(0.0, 0.0, 0.0),
         capacity: Buffers | int | None = None,
     ):
-        super().__init__(scene, gravity, kinematic)
+        super().__init__(scene, gravity, kinematic, velocity, angular_velocity)
         self.friction = float(finite_array(friction, "friction", ()))
         if self.friction < 0:
             raise ValueError(f"friction {friction!r} is below 0")
-        self.set_velocities(velocity, angular_velocity)
         by_color = current_regime().relax_by_color
         self._by_color = not self.device.is_cpu if by_color is None else by_color
         self.query = ManifoldQuery(scene, None, capacity)
