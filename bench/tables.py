@@ -194,7 +194,7 @@ def draw_panel(axes, panel, lines):
     for (column, part), points in lines.items():
         x, y = zip(*(points if panel.get("unsorted") else sorted(points)), strict=True)
         name = f"{part:,} {panel['unit'].removesuffix('s' if part == 1 else '')}" if "unit" in panel else part
-        label = ", ".join(filter(None, (panel["y"][column], "by" in panel and name)))
+        label = ", ".join(str(text) for text in (panel["y"][column], name if "by" in panel else "") if text != "")
         if panel.get("slope") and len(x) > 1:
             label += f": slope {fit_slope(upper_half(x), upper_half(y)):.2f}"
         turn = columns.index(column)
