@@ -145,19 +145,17 @@ def test_contacts_lie_on_both_faces(device):
 
 def test_face_pairs_against_brute_force(device):
     """The contacts are exactly the intersecting pairs of faces, with the indices of the meshes."""
-    a, b = SHAPES["torus"], SHAPES["cylinder"]
-    transform = shift((0.5, 0.1, 0.02))
-    ours = ab.CollisionManager(device)
+    a, b, place = SHAPES["torus"], SHAPES["cylinder"], (0.5, 0.1, 0.02)
+    ours, other = ab.CollisionManager(device), ab.CollisionManager(device)
     ours.add_object("a", a)
-    found, names, contacts = ours.in_collision_single(b, transform, return_names=True, return_data=True)
-    still, moved = [0, 0, 0, 0, 0, 0, 1], [0.5, 0.1, 0.02, 0, 0, 0, 1]
-    expected = brute_force_faces(a.vertices, a.faces, b.vertices, b.faces, still, moved)
-    assert found and names == {"a"} and len(expected) > 20
-    assert [[x.index("a"), x.index("__external")] for x in contacts] == expected.tolist()
-    other = ab.CollisionManager(device)
-    other.add_object("b", b, transform)
+    other.add_object("b", b, shift(place))
+    still, moved = [0, 0, 0, 0, 0, 0, 1], [*place, 0, 0, 0, 1]
+    expected = brute_force_faces(a.vertices, a.faces, b.vertices, b.faces, still, moved).tolist()
+    assert len(expected) > 20
+    found, names, contacts = ours.in_collision_single(b, shift(place), return_names=True, return_data=True)
+    assert found and names == {"a"} and [[x.index("a"), x.index("__external")] for x in contacts] == expected
     _, names, contacts = ours.in_collision_other(other, True, True)
-    assert names == {("a", "b")} and [[x.index("a"), x.index("b")] for x in contacts] == expected.tolist()
+    assert names == {("a", "b")} and [[x.index("a"), x.index("b")] for x in contacts] == expected
 
 
 def test_a_component_inside_a_solid(device):
@@ -195,24 +193,20 @@ def test_distances_on_random_scenes(device, monkeypatch, chunk):
     rng = np.random.default_rng(4)
     apart = 0
     for spread in (2.5, 4.0, 8.0):
-        theirs, ours = both(device)
-        fill((theirs, ours), rng, 5, spread)
-        others = both(device)
+        managers, others = both(device), both(device)
+        fill(managers, rng, 5, spread)
         fill(others, rng, 4, spread, "other ")
-        calls = [("internal", (None,)), *(("internal", (f"{k}",)) for k in range(5)), ("other", ())]
+        calls = [("internal", (name,)) for name in (None, *map(str, range(5)))] + [("other", ())]
         calls += [("single", (mesh, random_transform(rng, spread))) for mesh in SHAPES.values()]
         for kind, arguments in calls:
             named = {"return_name" if kind == "single" else "return_names": True}
             expected, found = (
                 getattr(manager, f"min_distance_{kind}")(*(arguments if kind != "other" else (other,)), **named)
-                for manager, other in zip((theirs, ours), others)
+                for manager, other in zip(managers, others)
             )
             assert found[0] == pytest.approx(max(expected[0], 0), abs=1e-5), (kind, arguments)
-            if expected[0] > 1e-5:
-                apart += 1
-                assert found[1] == expected[1]
-            else:
-                assert found[0] == 0
+            assert found[1] == expected[1] if expected[0] > 1e-5 else found[0] == 0
+            apart += expected[0] > 1e-5
     assert apart > 15
 
 
