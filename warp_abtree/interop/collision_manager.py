@@ -13,8 +13,7 @@ from warp_abtree.interop.placed_shapes import PlacedShapes
 from warp_abtree.scene.poses import check_poses
 
 EXTERNAL = "__external"  # trimesh's name for a mesh that is not in the manager
-# Pairs tested first if one collision is enough.
-FIRST_PAIRS = 64
+FIRST_PAIRS = 64  # tested first if one collision is enough
 
 
 def _join(first, *rest):
@@ -135,11 +134,7 @@ class CollisionManager:
         self._slots[name] = self._placed.add(shape, matrix)
 
     def remove_object(self, name):
-        """Remove an object.
-
-        Raises:
-            ValueError: No object has this name.
-        """
+        """Remove an object; raise ValueError if none has this name."""
         self._placed.remove(self._slot(name))
         del self._slots[name]
         self._release_slots()

@@ -6,8 +6,7 @@ result is the least distance of all pairs of faces, to the rounding of coordinat
 
 import numpy as np
 
-# Node pairs expanded at a time, the nearest first.
-CHUNK = 2**12
+CHUNK = 2**12  # node pairs expanded at a time, the nearest first
 ROUNDING = 2.0**-44
 
 
