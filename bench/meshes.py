@@ -51,11 +51,7 @@ def has_source(name) -> bool:
 
 
 class ModelFolder:
-    """Models in a folder, by name and faces of the base mesh; those in use stay in memory.
-
-    Args:
-        folder: Made when the first model is kept; None keeps no files.
-    """
+    """Models in a folder, by name and faces of the base mesh; those in use stay in memory. None keeps no files."""
 
     def __init__(self, folder):
         self.folder = None if folder is None else Path(folder)

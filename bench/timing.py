@@ -38,8 +38,7 @@ def time_events(replay, device):
 def time_call(call, device="cpu", clock=time.perf_counter):
     """Return a callable that calls something, waits for the device and returns the time [ms].
 
-    Args:
-        clock: `time.thread_time` leaves out other threads and processes.
+    The clock `time.thread_time` leaves out other threads and processes.
     """
 
     def run():
@@ -110,11 +109,8 @@ def fit_slope(sizes, times):
 
 
 def crossover(x, excess, always):
-    """Return the x, on a logarithmic scale, from which on an excess stays above 0.
-
-    Args:
-        always: What to return where it is above 0 everywhere; where it ends below, None is returned.
-    """
+    """Return the x, on a logarithmic scale, from which on an excess stays above 0: None where it ends below, and
+    `always` where it is above 0 everywhere."""
     below = np.flatnonzero(np.asarray(excess) < 0)
     if not len(below):
         return always

@@ -1,9 +1,8 @@
 """Newton's mesh-mesh narrow phase, where the package `newton` is installed: by BVH, and by SDF (CUDA only).
 
-Another question, and an approximate answer: it looks for points of the edges of one mesh inside the other, by a search
-over signed distances, and keeps a few contacts a pair, without face numbers. So only whether a pair intersects can be
-compared. All shapes share one mesh with one BVH or SDF; margins and gaps are 0, so that contacts are those of surfaces
-that pass through each other. Pairs are given, so its broad phase is a test of their boxes.
+Another question, and an approximate answer: it looks for points of the edges of one mesh inside the other and keeps a
+few contacts a pair, without face numbers, so only whether a pair intersects can be compared. All shapes share one mesh;
+margins and gaps are 0, so that contacts are those of surfaces that pass through each other.
 """
 
 import warnings
@@ -66,8 +65,7 @@ class Newton:
 
     def check(self):
         """Raise a RuntimeError that names a buffer that overflowed in the last launch. Waits for the device."""
-        narrow = self.pipeline.narrow_phase
-        reducer = narrow.global_contact_reducer
+        narrow, reducer = self.pipeline.narrow_phase, self.pipeline.narrow_phase.global_contact_reducer
         lost = {
             "contacts": int(self.contacts.rigid_contact_count.numpy()[0]) - self.contacts.rigid_contact_max,
             "pairs": int(narrow.shape_pairs_mesh_mesh_count.numpy()[0]) - len(narrow.shape_pairs_mesh_mesh),

@@ -31,12 +31,8 @@ CONTROLLERS = ("none", "coarsest", "predictive", "paper", "tolerance")
 def run(device, quick=False, plots=None):
     """Yield one row a scene and controller, over all frames after the first second.
 
-    budget_ms is T; within and within_110_percent, fractions of frames within T and T + 10 %; worst, the greatest cost
-    over T; oscillations, how often the LOD of an object reversed, a second; errors are certified [world units]. "none"
-    has the finest LODs, "coarsest" the coarsest: no budget below can be held.
-
-    Args:
-        plots: Folder for a figure a scene, None draws nothing.
+    budget_ms is T; for what is judged see `budget_report`. "none" has the finest LODs, "coarsest" the coarsest: no
+    budget below can be held. plots is a folder for a figure a scene, None draws nothing.
     """
     device = wp.get_device(device)
     kind = "cuda" if device.is_cuda else "cpu"

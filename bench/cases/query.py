@@ -29,12 +29,10 @@ JUDGED = 300  # face pairs that the oracle decides
 def run(device, quick=False):
     """Yield one row a case: what was asked and found, times of ours and of each baseline, memory and the roofline.
 
-    Columns: first_s is the first run: it compiles or loads kernels and grows buffers. ours and peer (wp.Bvh) are
-    launches, whose face pairs lie on the device in no order; result and peer_result the time to bring them to the host
-    and sort them there. ratio is the peer's launch over ours; on the CPU ours has all cores, and one_core and
-    one_core_ratio are of both on one. Errors are counted against the exact answer; judged says how many face pairs on
-    which the peer differs the exact oracle decided, ours_wrong in how many it sides with the peer. Memory is that of
-    scene and query, before there are baselines.
+    Columns: first_s is the first run, which compiles and grows buffers. ours and peer (wp.Bvh) are launches, result and
+    peer_result the time to bring face pairs to the host and sort them there. On the CPU ours has all cores; one_core
+    and one_core_ratio are of both on one. judged says how many face pairs on which the peer differs the exact oracle
+    decided, ours_wrong in how many it sides with the peer. Memory is that of scene and query, before the baselines.
     """
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL

@@ -43,9 +43,8 @@ CHECKED = 3  # pairs and worlds asked again by themselves, where other numbers o
 def run(device, quick=False, largest=None, models=None):
     """Yield one row a size, and after each sweep one with the slopes of its lines, all sizes and the upper half.
 
-    Each launch lists all face pairs; build_s is the time to make scene and query, first_s that of the first run, which
-    compiles and grows buffers. Memory is that of scene and query, before there is a baseline. broad is the broad phase
-    of worlds alone.
+    build_s is the time to make scene and query, first_s that of the first run, which compiles and grows buffers. Memory
+    is that of scene and query, before there is a baseline. broad is the broad phase of worlds alone.
     """
     device = wp.get_device(device)
     sizes = QUICK if quick else SIZES["cuda" if device.is_cuda else "cpu"]

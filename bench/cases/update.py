@@ -33,10 +33,9 @@ ROUND_TRIPS = 2  # times there and back, the last of which counts
 def run(device, quick=False, largest=None, models=None):
     """Yield one row a fraction of a mesh, one a mesh with its crossover, and one a number of states moved at once.
 
-    Columns: nodes are those of the partial update, counted; memory is that of the scene, before there is a baseline.
-    entries are the faces of the slice between the LODs, repeats included; full tells whether the library would refit
-    the whole tree. bvh_build boxes the faces at the LOD and builds a wp.Bvh over them. crossover_* are where the update
-    costs as much as a full refit: the least measured if it always does, None if it never does.
+    Columns: nodes are those of the partial update, counted; entries are the faces of the slice between the LODs,
+    repeats included; full tells whether the library would refit the whole tree. bvh_build boxes the faces at the LOD
+    and builds a wp.Bvh over them. For crossover_* see `find_crossover`.
     """
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
@@ -116,8 +115,7 @@ def measure_update(scene, there, back, faces, repeats):
 
 
 def find_crossover(rows, column):
-    """Return the value of a column where an update starts to cost as much as a full refit: the least if it always does,
-    None if it never does."""
+    """Return where in a column an update starts to cost as much as a full refit: the least if always, None if never."""
     x = [row[column] for row in rows]
     return crossover(x, [math.log(row["update_ms"] / row["full_ms"]) for row in rows], x[0])
 

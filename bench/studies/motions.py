@@ -82,15 +82,9 @@ def find_first_contact(intersects, motions, steps=SCAN_STEPS, bisections=BISECTI
 
 
 class PoseScene:
-    """A scene of A and a number of Bs, all Bs of one LOD: any number of poses, so many at a time.
+    """A scene of A and a number of Bs, room, all of one LOD: any number of poses, so many at a time.
 
-    Args:
-        models, lods: Of A and B.
-        far: Pose of the Bs that are not asked.
-        room: Number of Bs.
-
-    Attributes:
-        scene, pairs: The `ab.Scene`, and its pairs (0, 1), (0, 2), ...
+    Bs that are not asked stand at the pose far; pairs are (0, 1), (0, 2), ...
     """
 
     def __init__(self, device, models, lods, far, room):

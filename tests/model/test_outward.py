@@ -155,15 +155,6 @@ def test_it_is_tight(name):
         assert measured - 1e-15 * size <= model.error_at(lod, side="outward") <= 1.03 * measured + 1e-12 * size
 
 
-@pytest.mark.parametrize("power", [-90, 60])
-def test_scale_changes_nothing(power):
-    vertices, faces = SHAPES["comb"]()
-    one = ab.Model.from_arrays(vertices, faces, base_faces=4)
-    other = ab.Model.from_arrays(np.ldexp(vertices, power), faces, base_faces=4)
-    for lod in some_lods(one):
-        assert np.ldexp(one.error_at(lod, side="outward"), power) == other.error_at(lod, side="outward")
-
-
 def test_sides_are_two_and_what_is_computed_is_kept(monkeypatch):
     """Inward is the default; outward is computed once and not pickled."""
     model = sample("ball")

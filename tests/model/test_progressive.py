@@ -14,7 +14,9 @@ from oracles.distance import brute_distances, farthest_points
 
 from warp_abtree.model import progressive as builder
 from warp_abtree.model.mesh import describe_mesh, load_mesh, mesh_from_arrays
+from warp_abtree.model.outward_error import OutwardError
 from warp_abtree.model.progressive import build_progressive
+from warp_abtree.model.tree import active_build
 
 FUZZ = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.too_slow])
 FOREST = ("vertex_parent", "vertex_pos", "face_vertex", "face_split", "split_start", "split_face", "lod_error")
@@ -233,6 +235,9 @@ def test_scale_changes_nothing(mesh, power):
     assert_same(one, other, ("vertex_parent", "face_split", "split_start", "split_face"))
     assert np.array_equal(np.ldexp(one.vertex_pos, power), other.vertex_pos)
     assert np.array_equal(np.ldexp(one.lod_error, power), other.lod_error)
+    bounds = [OutwardError(each, active_build(each.vertex_pos, each.face_vertex)) for each in (one, other)]
+    for lod in {0, one.lod_max // 2}:
+        assert np.ldexp(bounds[0].at(lod), power) == bounds[1].at(lod)
 
 
 @pytest.mark.parametrize("offset", [1e3, 1e9])

@@ -1,10 +1,9 @@
 """Competitors: other ways to trade accuracy for speed, each a point of time against error beside our LODs.
 
-All answer yes or no for the same poses, and are taken along the same motions to where they first say yes. The truth is
-the exact answer on the finest meshes. A query is timed over all poses, apart to deep; python-fcl in a loop of its own
-calls on one core, its objects made before; ours as one batch, on the CPU on one core as well; Newton as one batch on
-the GPU. On a core, the CPU time of the thread counts. The surfaces of hulls are asked, too, which on a way in from
-outside is the same as asking the solids.
+All answer yes or no for the same poses, and are taken along the same motions to where they first say yes. A query is
+timed over all poses, apart to deep; python-fcl in a loop of its own calls on one core, its objects made before; ours as
+one batch, on the CPU on one core as well; Newton as one batch on the GPU. Hulls are asked as solids and as surfaces,
+which on a way in from outside is the same.
 """
 
 import time
