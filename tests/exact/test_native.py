@@ -7,6 +7,7 @@ import pkgutil
 import re
 
 import pytest
+from conftest import slow
 
 from warp_abtree import kernels
 from warp_abtree.kernels import native
@@ -18,25 +19,17 @@ build = pytest.importorskip("warp._src.build", reason="where Warp keeps its comp
 FILES = sorted(path.name for path in native.FOLDER.iterdir())
 
 
-def stubs():
-    """Yield every function of the kernels whose body is in a file."""
-    bodies = {code: (file, name) for file in FILES for name, (_, code) in native.functions(file).items()}
-    for info in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}."):
-        if info.name != native.__name__:
-            module = importlib.import_module(info.name)
-            for name, function in vars(module).items():
-                snippet = getattr(function, "native_snippet", None)
-                if snippet in bodies and function.func.__module__ == info.name:
-                    yield name, function, bodies[snippet]
-
-
 def test_every_function_has_one_stub_of_its_name_and_parameters():
-    found = {}
-    for name, function, (file, written) in stubs():
-        assert name == written
-        assert list(inspect.signature(function.func).parameters) == native.functions(file)[written][0], name
-        found[name] = file
-    assert found == {name: file for file in FILES for name in native.functions(file)}
+    functions = [(file, name, *native.functions(file)[name]) for file in FILES for name in native.functions(file)]
+    bodies = {code: (name, parameters) for _, name, parameters, code in functions}
+    found = []
+    for info in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}."):
+        for name, function in vars(importlib.import_module(info.name)).items() if info.name != native.__name__ else ():
+            snippet = getattr(function, "native_snippet", None)
+            if snippet in bodies and function.func.__module__ == info.name:
+                assert (name, list(inspect.signature(function.func).parameters)) == bodies[snippet]
+                found.append(name)
+    assert sorted(found) == sorted(name for _, name, _, _ in functions)
 
 
 def test_constants_are_those_of_python():
@@ -64,14 +57,9 @@ def test_included_files_are_part_of_the_text():
     assert not any("#include" in body for file in FILES for _, body in native.functions(file).values())
 
 
-def test_files_compile_together(tmp_path):
-    assert compile_alone("".join(f'#include "{file}"\n' for file in FILES), tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("file", FILES)
-def test_file_compiles_alone(tmp_path, file):
-    assert compile_alone(f'#include "{file}"\n', tmp_path)
+@pytest.mark.parametrize("files", [FILES, *slow(*([file] for file in FILES))], ids=lambda files: "+".join(files)[:20])
+def test_files_compile_together_and_alone(tmp_path, files):
+    assert compile_alone("".join(f'#include "{file}"\n' for file in files), tmp_path)
 
 
 def test_static_assertions_hold_sizes_together(tmp_path):

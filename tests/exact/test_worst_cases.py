@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 from conftest import slow
-from helpers.questions import GpuQuery
+from helpers.questions import GpuQuery, launch, pairs_of, scene_of
 from helpers.samples import true_faces
 from oracles.signs import true_signs
 from oracles.triangle import into_frame_of_a, quaternion_matrix
@@ -22,30 +22,12 @@ U = 2.0**-24
 STILL = np.eye(4)
 
 
-QUERIES = pytest.mark.parametrize("make_query", [ab.Query, *slow(GpuQuery)], ids=["threads", "as on CUDA"])
-
-
 def mirrored(corners):
     """Return a model of a face and its mirror image in the origin, which is the model's centre to the bit."""
     model = ab.Model.from_arrays(np.concatenate([corners, -corners]), [[0, 1, 2], [3, 4, 5]])
     assert not model.centre.any()
     return model
 
-
-def check_faces(device, make_query, cases):
-    """Compare the faces that meet with exact brute force; the first faces of all cases (A, B, pose of B) do."""
-    scene = ab.Scene(device)
-    for a, b, pose in cases:
-        scene.add(a)
-        scene.add(b, pose)
-    found = make_query(scene, "faces", pairs=np.arange(2 * len(cases)).reshape(-1, 2)).run().faces
-    for k, (a, b, pose) in enumerate(cases):
-        truth = true_faces(a, a.lod_max, STILL, b, b.lod_max, pose)
-        assert [0, 0] in truth.tolist()
-        np.testing.assert_array_equal(found[found[:, 0] == k][:, 1:], truth)
-
-
-# --- margins of boxes ------------------------------------------------------------------------------------------------
 
 # Quaternion of B; lower and upper ends of the boxes of A's and B's face, float32; which end is that of the corner in
 # which both meet. Roundings come to 6.7 times u (r_a + r_b + s) along an axis of B in the first case, to 5.2 times that
@@ -91,14 +73,6 @@ def touching_boxes(quaternion, lower_a, upper_a, lower_b, upper_b, high_a, high_
     return mirrored(a), mirrored(b), pose
 
 
-@QUERIES
-def test_the_margin_of_boxes_covers_roundings_that_add_up(device, make_query):
-    check_faces(device, make_query, [touching_boxes(*case) for case in BOXES])
-
-
-# --- the float32 stage -----------------------------------------------------------------------------------------------
-
-
 def rounded_apart():
     """Return A, B and the pose of B: a speck whose first corner lies on A's large face, in float32 4 u above it.
 
@@ -116,9 +90,16 @@ def rounded_apart():
     return mirrored(a), mirrored(b), pose
 
 
-@QUERIES
-def test_the_error_of_coordinates_covers_roundings_that_add_up(device, make_query):
-    check_faces(device, make_query, [rounded_apart()])
+@pytest.mark.parametrize("make_query", [ab.Query, *slow(GpuQuery)], ids=["threads", "as on CUDA"])
+def test_margins_and_errors_cover_roundings_that_add_up(device, make_query):
+    """Compare the faces that meet with exact brute force; the first faces of each pair do."""
+    cases = [rounded_apart(), *[touching_boxes(*case) for case in BOXES]]
+    scene = scene_of(device, [(a, None, STILL, b, None, pose) for a, b, pose in cases])
+    found = make_query(scene, "faces", pairs=pairs_of(cases)).run().faces
+    for k, (a, b, pose) in enumerate(cases):
+        truth = true_faces(a, a.lod_max, STILL, b, b.lod_max, pose)
+        assert [0, 0] in truth.tolist()
+        np.testing.assert_array_equal(found[found[:, 0] == k][:, 1:], truth)
 
 
 # Float32 determinants of the wrong sign, 1.40 and 1.44 times u |u||v||w| beyond 0, of 9 that the bound has.
@@ -139,7 +120,7 @@ SIDES = [
 
 
 @wp.kernel
-def find_side_kernel(points: wp.array2d(dtype=wp.vec3), side_out: wp.array(dtype=wp.int32)):
+def side_kernel(points: wp.array2d[wp.vec3], side_out: wp.array[int]):
     i = wp.tid()
     side_out[i] = side_of_plane(0.0, FLOAT32_UNIT, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
 
@@ -149,8 +130,6 @@ def test_the_bound_of_determinants_covers_roundings_that_add_up(device):
     assert (points == points.astype(np.float32)).all()
     # Rows that change places change the sign, and the order of roundings with it.
     points = np.concatenate([points[:, order] for order in ([0, 1, 2, 3], [1, 2, 0, 3], [2, 0, 1, 3], [1, 0, 2, 3])])
-    sides = wp.zeros(len(points), dtype=wp.int32, device=device)
-    wp.launch(find_side_kernel, len(points), [wp.array(points, dtype=wp.vec3, device=device), sides], device=device)
-    sides = sides.numpy()
+    sides = launch(side_kernel, device, len(points), points)
     sure = sides != int(UNCERTAIN)
     np.testing.assert_array_equal(sides[sure], true_signs(points)[sure])

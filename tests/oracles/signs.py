@@ -6,7 +6,6 @@ Points are (count, dim + 1, dim), for 3 and for 2 dimensions.
 from fractions import Fraction
 
 import numpy as np
-import warp as wp
 
 COUNT = 400
 TINY = 2.0**-290
@@ -87,12 +86,3 @@ def rounded_signs(points):
     u, v, w = u.transpose(1, 2, 0)
     x, y, z = v[1] * w[2] - v[2] * w[1], w[1] * u[2] - w[2] * u[1], u[1] * v[2] - u[2] * v[1]
     return np.sign((u[0] * x + v[0] * y) + w[0] * z)
-
-
-def find_signs(kernel, mode, points, device):
-    dtype = wp.vec3d if points.shape[2] == 3 else wp.vec2d
-    out = wp.zeros(len(points), dtype=wp.int32, device=device)
-    wp.launch(
-        kernel, dim=len(points), inputs=[int(mode), wp.array(points, dtype=dtype, device=device), out], device=device
-    )
-    return out.numpy()
