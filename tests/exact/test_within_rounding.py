@@ -9,11 +9,14 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import warp as wp
-from conftest import slow
-from helpers.questions import GpuQuery, ask, launch
+from helpers.questions import ask, launch
 from helpers.samples import random_quaternions
 
 import warp_abtree as ab
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.poses import pair_pose
+from warp_abtree.kernels.traversal.boxes import boxes_overlap, pose_box
+from warp_abtree.kernels.traversal.nodes import load_node
 from warp_abtree.kernels.triangle.distance import triangles_near
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -140,15 +143,27 @@ def test_distances_allow_for_frames_off_orthonormal(device, case):
     np.testing.assert_array_equal(apart, [False, case != "A's face is moved"])
 
 
-@pytest.mark.parametrize("make_query", [ab.Query, *slow(GpuQuery)], ids=["threads", "as on CUDA"])
-def test_widened_boxes_allow_for_frames_off_orthonormal(device, make_query):
+@wp.kernel
+def leaves_kernel(within: wp.float64, models: ModelPool, states: StatePool, objects: ObjectPool, out: wp.array[int]):
+    """Compare the box of each of A's two faces with B's."""
+    i = wp.tid()
+    pose = pair_pose(True, models, states, objects, 0, 1, within)
+    a = load_node(states, pose.node_a + 2 + i)
+    b = load_node(states, pose.node_b + 1)
+    posed_a = pose_box(a.lower, a.upper, wp.transpose(pose.rotation32), pose.back32, pose.margin)
+    posed_b = pose_box(b.lower, b.upper, pose.rotation32, pose.translation32, pose.margin)
+    out[i] = wp.where(boxes_overlap(posed_a, posed_b), 1, 0)
+
+
+def test_widened_boxes_allow_for_frames_off_orthonormal(device):
     """Corners of A at (1, 1, 1) and (-1, -1, -1), B about the middle: sqrt(3) along a column that is longer than 1."""
     spread = 2.0**-20 * np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
     scene = ab.Scene(device)
     scene.add(ab.Model.from_arrays(np.concatenate([1 - spread, spread - 1]), [[0, 1, 2], [3, 4, 5]]))
     scene.add(ab.Model.from_arrays(spread - 2.0**-21, FACE))
+    pools = scene.batch().pools
     third, across = np.ones(3) / np.sqrt(3.0), np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0)
     turn = np.stack([third, across, np.cross(third, across)], 1) * (1 + 2.0**-12)
-    scene.batch().objects.pool.rotation.assign(np.stack([np.eye(3), turn]))
-    for within, apart in ((math.sqrt(3.0), False), (0.99 * math.sqrt(3.0), True)):
-        assert make_query(scene, "any", pairs=[(0, 1)], within=within).run().apart[0] == apart
+    pools[2].rotation.assign(np.stack([np.eye(3), turn]))
+    for within, expected in ((math.sqrt(3.0), 1), (0.99 * math.sqrt(3.0), 0)):
+        assert launch(leaves_kernel, device, 2, within, *pools).tolist() == [expected] * 2

@@ -10,8 +10,7 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
-from helpers.samples import random_poses, sample
-from helpers.scenes import everything
+from helpers import scenes
 from warp_abtree.kernels.contact.summary import CHUNK
 from warp_abtree.query.contacts import VECTORS
 from warp_abtree.state.arrays import SLOT_COLUMNS
@@ -32,13 +31,8 @@ def describe(result):
     return [None if value is None else np.asarray(value).tobytes() for value in values]
 
 
-def add_objects(device, count=4):
-    scene = ab.Scene(device)
-    poses = random_poses(np.random.default_rng(1), count, 0.4)
-    for i in range(count):
-        model = sample(("small ball", "torus")[i % 2])
-        scene.add(model, poses[i], lod=model.lod_for(fraction=(0.4, 0.2)[i % 2]))
-    return scene
+def add_objects(device):
+    return scenes.add_objects(device, ("small ball", "torus") * 2, seed=1, spread=0.4, fractions=(0.4, 0.2))
 
 
 def make_scene(device):
@@ -60,7 +54,7 @@ def check_scene(before, scene):
     """Return all that a scene holds and answers, or check that it still does."""
     states = scene.batch().states.pool
     now = [getattr(states, name).numpy().tobytes() for name in SLOT_COLUMNS]
-    now += [*everything(scene), *answers(scene)]
+    now += [*scenes.everything(scene), *answers(scene)]
     assert before is None or now == before
     return now
 

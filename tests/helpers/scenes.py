@@ -30,10 +30,12 @@ def everything(scene):
     return [np.asarray(value).tobytes() for value in held]
 
 
-def add_objects(device, names=CROWD, seed=0, spread=0.6, **options):
+def add_objects(device, names=CROWD, seed=0, spread=0.6, fractions=(1.0,)):
+    """Return a scene of samples at random poses, with fractions of their faces, which repeat."""
     scene = ab.Scene(device)
-    for name, pose in zip(names, random_poses(np.random.default_rng(seed), len(names), spread)):
-        scene.add(sample(name), pose, **options)
+    for i, pose in enumerate(random_poses(np.random.default_rng(seed), len(names), spread)):
+        model = sample(names[i])
+        scene.add(model, pose, lod=model.lod_for(fraction=fractions[i % len(fractions)]))
     return scene
 
 
