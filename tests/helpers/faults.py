@@ -5,6 +5,7 @@ Every step of a call fails in turn, on what is made anew each time.
 
 import re
 import threading
+from contextlib import contextmanager
 
 import numpy as np
 import warp as wp
@@ -21,13 +22,10 @@ MORE_PAIRS = np.array([(i, j) for i in range(4) for j in range(4) if i != j])
 
 def describe(result):
     """Return results, LOD statistics or arrays as comparable bytes."""
-    if isinstance(result, ab.Result):
-        values = [result.pairs, result.any, result.count, result.faces, result.apart]
-        values += [result.contacts, result.pair_contacts]
-    elif hasattr(result, "nodes_refitted"):
-        values = [result.state, result.lod, result.full, result.k, result.nodes_refitted]
-    else:
-        values = [result]
+    names = ("pairs", "any", "count", "faces", "apart", "contacts", "pair_contacts")
+    if hasattr(result, "nodes_refitted"):
+        names = ("state", "lod", "full", "k", "nodes_refitted")
+    values = [result] if isinstance(result, np.ndarray) or result is None else [getattr(result, n) for n in names]
     return [None if value is None else np.asarray(value).tobytes() for value in values]
 
 
@@ -93,6 +91,15 @@ def check_buffer_lengths(queries):
         assert {len(room) for room in rooms} == {len(query.pairs)}
 
 
+@contextmanager
+def refusing(*sentences, kind=RuntimeError):
+    """Allow an error that says one of some sentences, and no other."""
+    try:
+        yield
+    except kind as error:
+        assert any(sentence in str(error) for sentence in sentences), error
+
+
 SHORTAGE = r"Failed to allocate \d+ bytes on device '{}'"
 
 
@@ -112,12 +119,9 @@ class Fault:
         raise NotImplementedError
 
     def everywhere(self, make, call, check):
-        """Repeat a call on what is made anew, its first, second, third ... step failing, until it succeeds.
+        """Repeat call(make()), its first, second, third ... step failing, until it succeeds.
 
-        Args:
-            make: Returns what the call is made on.
-            call: Called as call(made).
-            check: Called as check(before, made) after each failure; with before None it returns what must not change.
+        After each failure check(before, made) is called; with None for `before` it returns what must not change.
 
         Returns:
             How many steps there are, and what the call returned without a fault.
