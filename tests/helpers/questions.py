@@ -31,7 +31,9 @@ def launch(kernel, device, shape, *inputs, columns=0):
     """
     types, given = [argument.type for argument in kernel.adj.args], []
     for value, kind in zip(inputs, types):
-        given.append(wp.array(value, dtype=kind.dtype, device=device) if hasattr(value, "__len__") else value)
+        given.append(
+            wp.array(value, dtype=kind.dtype, device=device) if isinstance(value, (list, np.ndarray)) else value
+        )
     out = wp.zeros((shape, columns) if columns else shape, dtype=types[-1].dtype, device=device)
     wp.launch(kernel, shape, [*given, out], device=device)
     return out.numpy()

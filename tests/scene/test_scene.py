@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.questions import sort_rows, to_matrix
 from helpers.samples import random_poses, raw_state, sample, true_faces
-from helpers.scenes import TURN, pair_scene
+from helpers.scenes import TURN, add_objects, pair_scene
 from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
@@ -65,15 +65,10 @@ def test_add_keeps_poses_and_lods(device):
 
 def test_a_query_follows_poses_and_lods(device):
     """Launched again after every change; its answers are those of a scene made so from the start."""
-    rng = np.random.default_rng(4)
-    models = [sample("torus"), sample("capsule"), sample("torus"), sample("crumbs")]
-    scene = ab.Scene(device)
-    for model in models:
-        scene.add(model)
-    pairs = [(0, 1), (2, 0), (3, 1), (2, 3)]
-    asked = ab.Query(scene, "faces", pairs=pairs)
-    found = ab.Query(scene, "faces", capacity=20_000)
-    hits = 0
+    rng, hits, pairs = np.random.default_rng(4), 0, [[0, 1], [2, 0], [3, 1], [2, 3]]
+    scene = add_objects(device, ["torus", "capsule", "torus", "crumbs"])
+    models = [scene.models[m] for m in scene.object_model]
+    asked, found = (ab.Query(scene, "faces", pairs=given, capacity=20_000) for given in (pairs, None))
     for _ in range(6):
         poses = random_poses(rng, 4, 0.6)
         lods = [int(rng.integers(10, model.lod_max)) for model in models]
@@ -88,7 +83,7 @@ def test_a_query_follows_poses_and_lods(device):
                 faces = faces if result.pairs[p, 0] == i else sort_rows(faces[:, ::-1])
                 np.testing.assert_array_equal(result.faces[result.faces[:, 0] == p][:, 1:], faces)
                 hits += len(faces)
-        assert asked.result().pairs.tolist() == list(map(list, pairs))
+        assert asked.result().pairs.tolist() == pairs
     assert hits > 100
 
 
