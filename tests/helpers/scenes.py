@@ -76,14 +76,10 @@ def check_states(frame, scene):
 def by_pair(result):
     """Return a result's answers with its pairs in order, each a NumPy array."""
     order = np.lexsort((result.pairs[:, 1], result.pairs[:, 0]))
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    values = {"pairs": result.pairs[order], "any": result.any[order]}
-    for name in ("count", "apart", "pair_contacts"):
-        if getattr(result, name) is not None:
-            values[name] = getattr(result, name)[order]
+    values = {name: getattr(result, name) for name in ("pairs", "any", "count", "apart", "pair_contacts")}
+    values = {name: value[order] for name, value in values.items() if value is not None}
     if result.faces is not None:
-        faces = np.concatenate([rank[result.faces[:, :1]], result.faces[:, 1:]], 1)
+        faces = np.concatenate([np.argsort(order)[result.faces[:, :1]], result.faces[:, 1:]], 1)
         rows = np.lexsort((faces[:, 2], faces[:, 1], faces[:, 0]))
         values["faces"] = faces[rows]
         if result.contacts is not None:

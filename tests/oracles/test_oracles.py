@@ -10,8 +10,6 @@ from helpers.samples import plain, random_poses, sample
 
 from oracles import abtree, triangle
 
-# --- triangles -------------------------------------------------------------------------------------------------------
-
 FLAT, LINE = [(0, 0, 0), (4, 0, 0), (0, 4, 0)], [(0, 0, 0), (2, 2, 2), (1, 1, 1)]
 
 # Two triangles, and whether they meet.
@@ -70,9 +68,6 @@ def test_brute_force_equals_the_exact_test_of_every_pair():
     meets = triangle.pairs_intersect(ball.vertices, ball.faces, points, ring.faces, every)
     assert hits.tolist() == np.array(every)[meets].tolist()
     assert len(hits) > 20
-
-
-# --- the tree --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["one", "three", "soup"])
