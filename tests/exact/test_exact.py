@@ -109,9 +109,6 @@ def test_scaling_by_powers_of_two_changes_no_bit(device):
         assert all(other == faces[0] for other in faces)
 
 
-PAIRS = [("warp:bunny", "warp:bear"), ("torus", "ball")]
-
-
 def check_all(device, cases):
     """Compare cases, in one batch, with exact brute force; return how many faces meet."""
     result = ask(device, cases)
@@ -121,30 +118,11 @@ def check_all(device, cases):
     return result.count
 
 
-def contact(rng, names):
-    models = [ab.Model.from_arrays(*coarse(name), base_faces=10**6) for name in names]
-    poses = contact_poses(rng, models[0], models[0].lod_max, models[1], models[1].lod_max)
-    return models, poses
-
-
-@pytest.mark.parametrize("names", PAIRS, ids="-".join)
-@pytest.mark.slow
-def test_every_scale_is_exact(device, names):
-    """1e-6 to 1e6 by powers of ten; that scaling rounds, so each size is a case of its own."""
-    _, poses = contact(np.random.default_rng(5), names)
-    cases = []
-    for power in range(-6, 7):
-        scale = 10.0**power
-        a, b = (ab.Model.from_arrays(coarse(n)[0] * scale, coarse(n)[1], base_faces=10**6) for n in names)
-        by = np.array([scale] * 3 + [1.0] * 4)
-        cases.append((a, None, poses[0] * by, b, None, poses[1] * by))
-    assert (check_all(device, cases) > 0).all()
-
-
-@pytest.mark.parametrize("names", PAIRS, ids="-".join)
+@pytest.mark.parametrize("names", [("warp:bunny", "warp:bear"), ("torus", "ball")], ids="-".join)
 def test_every_distance_from_the_origin_is_exact(device, names):
     """Up to 1e7 model sizes, of the poses and of the models' own coordinates."""
-    models, poses = contact(np.random.default_rng(6), names)
+    models = [ab.Model.from_arrays(*coarse(name), base_faces=10**6) for name in names]
+    poses = contact_poses(np.random.default_rng(6), models[0], models[0].lod_max, models[1], models[1].lod_max)
     way = np.array([1.0, -0.7, 0.3])
     cases = []
     for power in (*range(8), 13):

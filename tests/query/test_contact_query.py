@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from helpers.contacts import CHUNK, check_summaries
 from helpers.questions import in_a_row, pairs_of, scene_of
-from helpers.samples import STILL, contact_poses, random_poses, sample
+from helpers.samples import STILL, contact_poses, sample
 
 import warp_abtree as ab
 from warp_abtree import testing
@@ -137,32 +137,6 @@ def test_other_poses_and_distances(device):
     same(query.run(), scene.intersect(query.pairs.numpy(), output="contacts"))
     np.testing.assert_array_equal(query.result().any, [False, True, False])
     np.testing.assert_array_equal(first.contacts, kept, "results on the host stay as they were")
-
-
-@pytest.mark.parametrize("given", [True, False])
-def test_a_graph_takes_poses_to_contacts(device, given):
-    scene, pairs = touching(device)
-    if not given and not scene.device.is_cuda:
-        pytest.skip("a tree of boxes is built anew in CUDA graphs only")
-    capacity = ab.Buffers(60_000 if given else 500_000, pairs=400)
-    query, rng = ab.ContactQuery(scene, pairs if given else None, capacity=capacity), np.random.default_rng(3)
-    for recapture in range(2):
-        query.launch()
-        with wp.ScopedCapture(query.device) as capture:
-            query.launch()
-        for _ in range(3):
-            scene.set_poses(random_poses(rng, scene.object_count, 1.5))
-            query.start.fill_(-1)
-            query.pair_contacts.depth.fill_(-1.0)
-            wp.capture_launch(capture.graph)
-            result = query.result()
-            result.check()
-            assert len(result.contacts) > 100
-            check_device_arrays(query, result)
-            same(result, scene.intersect(result.pairs, output="contacts"))
-        if given and not recapture:
-            query.set_pairs(np.concatenate([pairs, pairs[::-1, ::-1]]))
-        query.resize(capacity.hits + 10_000)
 
 
 def test_float32(device):
