@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from helpers.questions import in_a_row
-from helpers.samples import SHAPES, sample
+from helpers.samples import SHAPES, SHUTTLE_SCENE, sample
 from helpers.viewer import write_scene
 
 import warp_abtree as ab
@@ -16,14 +16,7 @@ from warp_abtree.lod.timing import WorkClock
 from warp_abtree.lod.view import Camera
 from warp_abtree.model.mesh import load_mesh
 
-SCENE = """
-[models.ball]
-shape = "icosphere"
-subdivisions = 1
-[[objects]]
-model = "ball"
-count = 3
-"""
+SCENE = SHUTTLE_SCENE + '[[objects]]\nmodel = "ball"\ncount = 4\n'
 
 
 def balls(device="cpu", count=2):

@@ -56,8 +56,6 @@ def test_sums_and_products_lose_nothing(device, kind):
     assert [Fraction(h) + Fraction(t) for h, t in zip(high.tolist(), low.tolist())] == exact
 
 
-# --- signs, and the double word of a determinant ----------------------------------------------------------------------
-
 STAGES = ("filter", "float32", "exact", "expansion", "integer", "double")  # the first three by their modes
 
 
@@ -171,9 +169,6 @@ def test_the_filter_is_tight(device):
     assert (ask(device, "3D", points)["filter"] != int(UNCERTAIN)).mean() > 0.95
 
 
-# --- signs of small determinants by integers that wrap ----------------------------------------------------------------
-
-
 def unit_of(rows):
     """Return the power of two that a determinant is a whole multiple of, None where a row is 0."""
     *rows, last = [[Fraction(x) for x in row] for row in rows]
@@ -222,9 +217,6 @@ def test_integers_leave_what_is_no_number(device, form):
     assert found.tolist() == [1, *[int(UNCERTAIN)] * 3]
 
 
-# --- float32, the first stage ----------------------------------------------------------------------------------------
-
-
 @wp.kernel
 def float32_kernel(unit: wp.float32, error: wp.array[wp.float32], points: wp.array2d[wp.vec3], out: wp.array2d[int]):
     """Signs of three points against a plane at once, one by one, and whether all are on one side."""
@@ -255,7 +247,7 @@ def float32_points(rng, kind):
 
 
 def check_sides(error, points, truth, device):
-    """Compare what float32 is sure of; return that, and where it would be wrong of coordinates without an error."""
+    """Compare the signs that float32 is sure of; return which those are."""
     signs = float32_signs(error, FLOAT32_UNIT, points, device)
     sure = signs != int(UNCERTAIN)
     np.testing.assert_array_equal(signs[sure], truth[sure])

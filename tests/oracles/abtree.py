@@ -133,16 +133,10 @@ def refit_bound(n, k):
     return k * ((n - 1).bit_length() - math.log2(k) + 2) - 1 if k else 0
 
 
-def round_down(value):
-    """Largest float32 strictly below a float64, as the boxes want it: outwards even where the value is exact."""
+def round_out(value, end):
+    """Return the next float32 strictly beyond a float64 on the side of an end: outwards even where it is exact."""
     f = np.float32(value)
-    return float(np.nextafter(f, np.float32(-np.inf)) if float(f) >= value else f)
-
-
-def round_up(value):
-    """Smallest float32 strictly above a float64."""
-    f = np.float32(value)
-    return float(np.nextafter(f, np.float32(np.inf)) if float(f) <= value else f)
+    return float(f if end * (float(f) - value) > 0 else np.nextafter(f, np.float32(end * np.inf)))
 
 
 def active_build(mesh, lod=None):
@@ -233,8 +227,8 @@ def active_refit(tree, node):
     if node.is_leaf:
         corners = [tree.mesh.vertex_pos[v] for v in tree.mesh.corners(node.index, tree.lod)]
         moved = [[p[k] - tree.centre[k] for k in range(3)] for p in corners]
-        lower = tuple(round_down(min(p[k] for p in moved)) for k in range(3))
-        upper = tuple(round_up(max(p[k] for p in moved)) for k in range(3))
+        lower = tuple(round_out(min(p[k] for p in moved), -1) for k in range(3))
+        upper = tuple(round_out(max(p[k] for p in moved), 1) for k in range(3))
         node.range, node.skip = (lower, upper), node
     else:
         children = [c for c in (node.left, node.right) if c.status == ACTIVE]

@@ -74,9 +74,6 @@ def test_overflow_names_the_demand(crowd, kind):
     assert len(query.result().faces) == len(whole.faces)
 
 
-LARGEST = 2**31 - 1
-
-
 @pytest.fixture
 def asked(device):
     """A scene, a query about it, and a check that both are as they were."""
@@ -103,13 +100,13 @@ def test_the_error_names_the_bytes(device, asked, monkeypatch):
 
     monkeypatch.setattr(allocator, "allocate", refuse_large)
     for call in (
-        lambda: ab.Query(scene, "faces", pairs=PAIRS, capacity=LARGEST),
-        lambda: GpuQuery(scene, "faces", pairs=PAIRS, capacity=ab.Buffers(uncertain=LARGEST)),
-        lambda: query.resize(LARGEST),
+        lambda: ab.Query(scene, "faces", pairs=PAIRS, capacity=2**31 - 1),
+        lambda: GpuQuery(scene, "faces", pairs=PAIRS, capacity=ab.Buffers(uncertain=2**31 - 1)),
+        lambda: query.resize(2**31 - 1),
     ):
         with pytest.raises(RuntimeError, match=f"bytes on device '{device}'"):
             call()
-        assert sizes[-1] == 12 * LARGEST
+        assert sizes[-1] == 12 * (2**31 - 1)
         check()
 
 

@@ -4,12 +4,14 @@ import itertools
 
 import numpy as np
 import pytest
+import warp as wp
 from helpers.questions import in_a_row, pairs_of, random_case, random_lod, scene_of
 from helpers.samples import SHAPES, STILL, contact_poses, sample
 from oracles.distance import brute_distances
 from oracles.triangle import into_frame_of_a
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 NAMES = ("box", "small ball", "crumbs", "soup", "torus", "three", "capsule", "one")
 FACES = 60
@@ -173,6 +175,30 @@ def test_far_pairs_and_huge_distances(device, far):
         assert not result.any.any()
     scene = in_a_row(device, "box", (1.7e308, -1.7e308))
     assert scene.intersect([(0, 1)], within=1e300).apart[0] and not scene.intersect([(0, 1)], within=1.7e308).any[0]
+
+
+@pytest.mark.slow
+def test_regimes_and_outputs_agree(device):
+    rng = np.random.default_rng(8)
+    scene, cases = posed_pairs(rng, device, [("torus", "soup")] * 30, faces=400)
+    pairs = pairs_of(cases)
+    within = rng.choice([0, 0.1, 0.5, 1.0], len(pairs))
+    expected = scene.intersect(pairs, within=within)
+    assert 3 < expected.apart.sum() < 27
+    # On CUDA only warps work on pairs: the thread's visit is in the CPU's vector instructions.
+    for warps, output in itertools.product((True,) if scene.device.is_cuda else (False, True), ("any", "faces")):
+        with testing.regime(warps=warps, warps_per_pair=20):
+            query = ab.Query(scene, output, pairs=pairs, within=within)
+        result, plain = query.run(), scene.intersect(pairs, output)
+        np.testing.assert_array_equal(result.apart, expected.apart)
+        assert plain.apart is None
+        for name in ("any", "count", "faces"):
+            np.testing.assert_array_equal(getattr(result, name), getattr(plain, name))
+    query.near.any_hit.fill_(7)
+    with wp.ScopedCapture(query.device) as capture:
+        query.launch()
+    wp.capture_launch(capture.graph)
+    np.testing.assert_array_equal(query.result().apart, expected.apart)
 
 
 def test_query_takes_other_pairs_and_distances(device):
