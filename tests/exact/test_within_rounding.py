@@ -74,13 +74,9 @@ def turn_of(quaternion):
     """Return the rotation of a quaternion, normalised, in fractions."""
     x, y, z, w = fractions(quaternion)
     s = 2 / (x * x + y * y + z * z + w * w)
-    return np.array(
-        [
-            [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
-            [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
-            [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
-        ]
-    )
+    first = 1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)
+    second = s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)
+    return np.array([first, second, (s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y))])
 
 
 def is_apart(device, faces, poses, distances):

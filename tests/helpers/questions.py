@@ -10,12 +10,9 @@ import warp_abtree as ab
 from helpers.samples import contact_poses, sample
 from warp_abtree import testing
 
-QUARTERS = [
-    np.eye(3)[list(order)] * np.array(signs)[:, None]
-    for order in itertools.permutations(range(3))
-    for signs in itertools.product((1.0, -1.0), repeat=3)
-    if np.linalg.det(np.eye(3)[list(order)] * np.array(signs)[:, None]) > 0
-]
+SIGNS = itertools.product((1.0, -1.0), repeat=3)
+QUARTERS = [np.eye(3)[[*order]] * np.array([signs]).T for signs in SIGNS for order in itertools.permutations(range(3))]
+QUARTERS = [turn for turn in QUARTERS if np.linalg.det(turn) > 0]
 
 
 def GpuQuery(*arguments, **options):
