@@ -154,6 +154,14 @@ def meeting_nodes(states, poses, levels):
     return found
 
 
+def box_lines(boxes):
+    """Return the edges of boxes (b, 2, 3), (12 b, 2, 3)."""
+    # Bit a of a corner's number says lower or upper along axis a.
+    corner = np.arange(8)
+    corners = np.stack([boxes[:, (corner >> axis) & 1, axis] for axis in range(3)], axis=-1)
+    return corners[:, [(c, c | bit) for c in range(8) for bit in (1, 2, 4) if not c & bit]].reshape(-1, 2, 3)
+
+
 def draw_traversal():
     """Two rings, and the nodes that a traversal still holds at some levels."""
     model = ab.Model.load(trimesh.creation.torus(1.0, 0.3, 48, 24))
@@ -175,7 +183,7 @@ def draw_traversal():
         lines = []
         for side, colour in enumerate(((0.75, 0.15, 0.1), (0.1, 0.25, 0.7))):
             nodes = sorted({pair[side] for pair in found[level]})
-            edges = geometry.box_lines(np.stack([states[side].lower[nodes], states[side].upper[nodes]], axis=1))
+            edges = box_lines(np.stack([states[side].lower[nodes], states[side].upper[nodes]], axis=1))
             lines.append((geometry.place(where, np.full(len(edges), side), edges), colour))
         title = f"level {level}: {len(found[level]):,} of {4**level:,} pairs of nodes overlap"
         panels.append(Panel(f"{title}\n", np.concatenate(triangles), np.concatenate(colours), lines))

@@ -10,28 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-import warp as wp
 from helpers.viewer import run_command as run
 
 import warp_abtree as ab
-from warp_abtree.app.cli import doctor, model_commands, report
 from warp_abtree.app.cli import main as cli
+from warp_abtree.app.cli import model_commands, report
 from warp_abtree.model.mesh import describe_mesh, load_mesh
 
 
 @pytest.fixture
 def files(tmp_path, monkeypatch):
-    """Work in a folder with meshes, and files that are none."""
+    """Work in a folder with meshes."""
     monkeypatch.chdir(tmp_path)
     trimesh.creation.icosphere(subdivisions=2).export("ball.obj")
     trimesh.creation.torus(major_radius=1.0, minor_radius=0.3).export("ring.ply")
     trimesh.creation.box().export("box.obj")
-    ab.Model.from_arrays(np.eye(3), [[0, 1, 2]]).save("face.npz")
-    Path("junk.obj").write_text("hello\n")
-    Path("nan.obj").write_text("v 0 0 0\nv 1 nan 0\nv 0 1 0\nf 1 2 3\n")
-    Path("junk.npz").write_bytes(b"junk")
-    Path("text.mesh").write_text("hello\n")
-    Path("folder.npz").mkdir()
     return tmp_path
 
 
@@ -163,7 +156,7 @@ def test_lost_work_is_status_1(files, capsys, monkeypatch):
 
 
 def test_help_has_examples(capsys):
-    for command in ("info", "build", "query", "run", "sweep", "view", "picture", "bench", "doctor"):
+    for command in ("info", "build", "query", "run", "sweep", "view", "picture", "bench"):
         with pytest.raises(SystemExit) as caught:
             cli.main([command, "--help"])
         assert caught.value.code == 0
@@ -178,41 +171,7 @@ def test_help_has_examples(capsys):
     assert capsys.readouterr().out == f"warp-abtree {ab.__version__}\n"
 
 
-# doctor, tables and completion.
-
-
-def test_doctor(capsys):
-    found = json.loads(run(capsys, "doctor", "--json")[0])
-    assert [each["device"] for each in found["devices"]] == [device.alias for device in wp.get_devices()]
-    assert found["usable"] is True and all(each["ok"] for each in found["devices"])
-    assert found["warp_abtree"] == ab.__version__ and found["packages"]["numpy"]["version"] == np.__version__
-    assert found["kernel_cache"]["modules"] > 0 and "bunny_tori" in found["scenes"]["names"]
-    shown, errors = run(capsys, "doctor", "--device", "cpu")
-    assert re.search(r"^cpu .*yes", shown, re.M) and shown.endswith("usable                  yes\n") and not errors
-    assert ("pip install" in shown) == bool(found["install"])
-
-
-def test_doctor_finds_what_is_wrong(capsys, monkeypatch):
-    monkeypatch.setattr(doctor, "CROSSING", (doctor.CROSSING[0], doctor.CROSSING[0]))
-    shown, _ = run(capsys, "doctor", "--device", "cpu", status=0)  # they touch: still the right counts
-    monkeypatch.setattr(doctor, "AWAY", (0, 0, 0, 0, 0, 0, 1))
-    shown, _ = run(capsys, "doctor", "--device", "cpu", status=1)
-    assert "a wrong answer: [1, 1, 1]" in shown and shown.endswith("usable                  no\n")
-    monkeypatch.setattr(doctor, "CORE", ["warp-lang>=999"])
-    monkeypatch.setattr(doctor, "EXTRAS", {"view": ("to see", ["numpy", "no-such-thing>=2.1", "trimesh>=999"])})
-    found = json.loads(run(capsys, "doctor", "--json", "--device", "cpu", status=1)[0])
-    assert found["install"] == ["no-such-thing>=2.1", "trimesh>=999"] and found["packages"]["warp-lang"]["ok"] is False
-    assert found["extras"]["view"]["ok"] is False and found["extras"]["view"]["packages"]["numpy"]["ok"] is True
-
-
-def test_doctor_knows_the_extras():
-    text = (Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8")
-    extras = set(re.findall(r"^(\w+) = \[", text.split("optional-dependencies]")[1].split("\n[")[0], re.M))
-    assert set(doctor.EXTRAS) == extras - {"bench", "docs", "test", "dev"}
-    for extra, (_, needs) in doctor.EXTRAS.items():
-        line = re.search(rf"^{extra} = \[(.*)\]$", text, re.M)[1]
-        assert [item.split(";")[0].strip() for item in re.findall(r'"([^"]*)"', line)] == list(needs)
-    assert re.findall('"(.*?)"', re.search(r"^dependencies = \[(.*)\]$", text, re.M)[1]) == list(doctor.CORE)
+# Extras and completion.
 
 
 @pytest.mark.parametrize(
@@ -237,4 +196,4 @@ def test_completion(capsys):
     with pytest.raises(SystemExit) as caught:
         cli.main(["--print-completion", "bash"])
     shown = capsys.readouterr().out
-    assert not caught.value.code and "--lod-a" in shown and "doctor" in shown and "compgen" in shown
+    assert not caught.value.code and "--lod-a" in shown and "sweep" in shown and "compgen" in shown

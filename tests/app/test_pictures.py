@@ -9,14 +9,14 @@ import trimesh
 from helpers.viewer import BODIES, make_models, make_playback, write_scene
 from helpers.viewer import run_command as run
 
-from warp_abtree.app import draw_objects, load_scene
+from warp_abtree.app import load_scene
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.open_playback import open_playback
 from warp_abtree.app.pictures import command, scenes
 from warp_abtree.app.pictures.render import camera_around
 from warp_abtree.app.recording import record_run
 from warp_abtree.app.render_data import Settings, compose
-from warp_abtree.app.styles import BOX_COLOUR, COLOURS
+from warp_abtree.app.styles import COLOURS
 
 SMALL = ("--size", 200, "--device", "cpu")
 EYE, UP = (0.4, 0.35, 1.0), (0, 1, 0)
@@ -41,7 +41,7 @@ def count(path, colour, reach=0.12):
 def test_a_panel_holds_what_the_title_counts(device):
     playback = make_playback(make_models(), device)
     cache, snapshot = geometry.MeshCache(playback.scene), playback.query("contacts")
-    settings = Settings(level=1, every_tree=True)
+    settings = Settings()
     data = compose(cache, snapshot, np.arange(3), settings)
     panel = scenes.make_panel(cache, data)
     # Plain faces come first, then both sides of each intersecting one.
@@ -53,10 +53,10 @@ def test_a_panel_holds_what_the_title_counts(device):
     bright = np.array([COLOURS[0][1], COLOURS[1][1]])
     marked = (panel.colours[:, None] == bright).all(axis=2).any(axis=1)
     assert marked.sum() == 2 * len(met) and not marked[:faces].any()
-    assert panel.title == f"3 objects, 1,216 faces\n{len(hits):,} intersecting face pairs, 6 boxes"
-    assert [len(lines) for lines, _ in panel.lines] == [len(snapshot.result.contacts), 0, 12 * 6]
-    labels = [label for _, label in scenes.make_legend(playback.scene, [data], 1)]
-    assert len(labels) == 6 and labels[-2:] == ["contacts", "active nodes at level 1"]
+    assert panel.title == f"3 objects, 1,216 faces\n{len(hits):,} intersecting face pairs"
+    assert [len(lines) for lines, _ in panel.lines] == [len(snapshot.result.contacts)]
+    labels = [label for _, label in scenes.make_legend(playback.scene, [data])]
+    assert len(labels) == 5 and labels[-1] == "contacts"
     alone = scenes.make_panel(cache, compose(cache, snapshot, np.array([0]), Settings()))
     assert len(alone.triangles) == 320 and alone.title == "1 object, 320 faces\n0 intersecting face pairs"
 
@@ -70,66 +70,28 @@ def test_the_camera_sees_all_points():
     assert np.abs(local[:, :2] / local[:, 2:]).max() <= np.tan(0.5 * camera.field_of_view)
 
 
-def test_draw_objects(tmp_path, device):
-    pytest.importorskip("pyvista")
-    playback = make_playback(make_models(), device)
-    path = tmp_path / "three.png"
-    poses = playback.query("count").poses
-    draw_objects(playback.scene, poses, path, "Three", contacts=True, size=300)
-    assert count(path, COLOURS[0][1]) > 200 and count(path, COLOURS[1][1]) > 200
-    apart = poses + np.arange(3)[:, None] * [10, 0, 0, 0, 0, 0, 0]
-    other = tmp_path / "apart.png"
-    draw_objects(playback.scene, apart, other, size=300)
-    # Two swatches of the legend are all that is left of them.
-    assert count(other, COLOURS[0][1]) < 0.9 * count(path, COLOURS[0][1])
-    for wrong in ([], [3], [-1]):
-        with pytest.raises(ValueError, match="objects: from 3"):
-            draw_objects(playback.scene, poses, other, objects=wrong)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["apart.png", "three.png"]
-
-
 def test_picture_of_meshes(files, capsys):
     pytest.importorskip("pyvista")
-    shown, _ = run(
-        capsys, "picture", "ball.obj", "ball.obj", "--contacts", "--out", "balls.png", "--size", 300, "--device", "cpu"
-    )
-    assert shown == "wrote balls.png\n" and count("balls.png", COLOURS[0][1]) > 300
-    words = "--pose 9 0 0 0 0 0 1 --lod 0.2 --tree 2 --json --size 300 --device cpu".split()
-    shown, _ = run(capsys, "picture", "ball.obj", "ball.obj", *words, "-o", "apart.png")
+    run(capsys, "picture", *"ball.obj ball.obj --contacts --out balls.png --size 300 --device cpu".split())
+    assert count("balls.png", COLOURS[0][1]) > 300
+    words = "ball.obj ball.obj --pose 9 0 0 0 0 0 1 --lod 0.2 --json --size 300 --device cpu -o apart.png"
+    shown, _ = run(capsys, "picture", *words.split())
     assert json.loads(shown) == {"picture": "apart.png", "objects": 2, "frame": 0}
-    assert count("apart.png", BOX_COLOUR) > count("balls.png", BOX_COLOUR)
+    assert not count("apart.png", COLOURS[0][1])
 
 
 @pytest.mark.slow
 def test_picture_of_a_frame(files, capsys):
     pytest.importorskip("pyvista")
     for frame in (0, 3):
-        run(
-            capsys, "picture", "scene.toml", "--frame", frame, "--out", f"{frame}.png", "--size", 200, "--device", "cpu"
-        )
+        run(capsys, "picture", "scene.toml", "--frame", frame, "--out", f"{frame}.png", *SMALL)
     first, last = (matplotlib.image.imread(name) for name in ("0.png", "3.png"))
     assert first.shape != last.shape or not np.array_equal(first, last)
     loaded = load_scene("scene.toml", device="cpu")
     record_run(loaded, 4)[1].save("run.npz")
     run(capsys, "picture", "run.npz", "--frame", 3, "--out", "again.png", *SMALL)
     assert np.array_equal(last, matplotlib.image.imread("again.png"))
-    run(
-        capsys,
-        "picture",
-        "scene.toml",
-        "--world",
-        2,
-        "--eye",
-        0,
-        0,
-        1,
-        "--out",
-        "world.png",
-        "--size",
-        200,
-        "--device",
-        "cpu",
-    )
+    run(capsys, "picture", "scene.toml", *"--world 2 --eye 0 0 1 --out world.png".split(), *SMALL)
     assert count("world.png", COLOURS[0][0]) < count("0.png", COLOURS[0][0])
 
 

@@ -5,9 +5,9 @@ import signal
 import sys
 
 import pytest
-from helpers.jobs import ColumnJob, contents, job_of, load_worlds, run, stop_after
+from helpers.jobs import ColumnJob, contents, job_of, run, stop_after
 
-from warp_abtree.jobs import RayPool, WorldsJob, run_shards
+from warp_abtree.jobs import RayPool, run_shards
 
 
 @pytest.fixture(scope="module")
@@ -48,10 +48,6 @@ def test_an_interrupted_run_continues(tmp_path, pool):
     with pytest.raises(KeyboardInterrupt):
         run_shards(job, tmp_path / "ray", pool=pool, progress=stop_after(7))
     assert check_against_one_process(job, tmp_path, pool)["found"] == 7
-
-
-def test_ray_runs_worlds(tmp_path, pool):
-    check_against_one_process(WorldsJob(load_worlds(tmp_path, "[dynamics]"), 4, "poses", 2), tmp_path, pool)
 
 
 class FailingJob(ColumnJob):

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.app.cli.arguments import Parser, positive
+from warp_abtree.app.cli.model_commands import load_model, lod_at
 from warp_abtree.app.playback import MeshPlayback, Playback, RecordedPlayback, ScenePlayback
 from warp_abtree.app.recording import FORMAT_NAME, Recording
 from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.scene_file import load_scene
 from warp_abtree.model.model import Model
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.frame import resolve_lod
 
 OVERLAP = 0.25  # of the smaller extent: by so much a mesh without a pose reaches into the one before
 
@@ -53,13 +53,9 @@ def _open_meshes(paths, device, progress, poses, lod) -> MeshPlayback:
     known: dict[str, Model] = {}
     for path in paths:
         if path not in known:
-            built = Path(path).suffix.lower() == ".npz"
-            known[path] = Model.open(path) if built else Model.load(path, progress=progress)
+            known[path] = load_model(path, progress)
     models = [known[path] for path in paths]
-    try:
-        lods = [resolve_lod(model, "finest" if lod is None else lod) for model in models]
-    except ValueError as error:
-        raise ValueError(f"--lod: {error}") from None
+    lods = [lod_at("--lod", model, "finest" if lod is None else lod) for model in models]
     places = lay_out(models)
     if len(poses):
         places[1 : 1 + len(poses)] = poses

@@ -10,7 +10,6 @@ import warp as wp
 
 from warp_abtree.app.render_data import Snapshot
 from warp_abtree.app.toml.control import CONTROLLERS, LodControl
-from warp_abtree.lod.view import Camera
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame, LodSweep
 
@@ -31,23 +30,19 @@ class Playback:
 
     Attributes:
         worlds: World of each object, int (n,); -1 is in every one.
-        frames: How many `--record` takes.
         length: Number of frames, None where they never end.
         view: eye and up, directions, and world, to begin with.
         camera: Called with a time [s], returns the `Camera` that LODs are for; or None.
-        chosen: LOD of every object before those that are held, int (n,).
-        held: LOD by object index, of objects whose LOD the user holds.
+        chosen: LOD of every object, int (n,).
     """
 
-    can_move = False
     length: int | None = None
     _poses: Any = None
 
-    def __init__(self, scene, title, worlds, time_step, frames, view, camera=None, control=None):
+    def __init__(self, scene, title, worlds, time_step, view, camera=None, control=None):
         self.scene, self.title, self.worlds = scene, title, np.asarray(worlds)
-        self.time_step, self.frames, self.view = time_step, frames, view
+        self.time_step, self.view = time_step, view
         self.camera, self.control = camera, control or LodControl()
-        self.held: dict[int, int] = {}
         self.number = 0
         self.chosen = scene.lods
         self._poses = None
@@ -56,16 +51,6 @@ class Playback:
     def time(self) -> float:
         """Time of the last snapshot in the scene [s]."""
         return self.number * self.time_step
-
-    def name_of(self, i) -> str:
-        """Return what to call an object."""
-        return f"{self.scene.models[self.scene.object_model[i]].name} #{i}"
-
-    def with_held(self, lods) -> np.ndarray:
-        """Return LODs with those that are held in their places, int32 (n,)."""
-        lods = np.array(lods, np.int32)
-        lods[list(self.held)] = list(self.held.values())
-        return lods
 
     def modes(self) -> list[str]:
         """Return the modes of choosing LODs, as `choose` takes them."""
@@ -79,11 +64,15 @@ class Playback:
         """Choose LODs in one of `modes`."""
         raise NotImplementedError
 
+    def hold(self, lods):
+        """Hold LODs of all objects, (n,), until others are chosen."""
+        self.choose(HOLD)
+        self.chosen = np.array(lods, np.int32)
+
     def query(self, output) -> Snapshot:
         """Query the scene as it is, after LODs, poses or the output changed. Waits for the device."""
-        wanted = self.with_held(self.chosen)
-        if not np.array_equal(wanted, self.scene.lods):
-            self.scene.set_lods(wanted)
+        if not np.array_equal(self.chosen, self.scene.lods):
+            self.scene.set_lods(self.chosen)
         return self._snapshot(self.scene.intersect(output=output), None)
 
     def _snapshot(self, result, row):
@@ -92,7 +81,7 @@ class Playback:
 
 
 class _Chooser:
-    """Chooses LODs for a `Frame`: by a controller or a function of time, or not at all; held LODs stay."""
+    """Chooses LODs for a `Frame`: by a controller or a function of time, or not at all."""
 
     def __init__(self, playback):
         self.playback = playback
@@ -108,23 +97,16 @@ class _Chooser:
             playback.chosen = inner.next_lods(feedback).numpy().copy()
         elif inner is not None:
             playback.chosen = np.array(inner(feedback.time), np.int32)
-        return wp.array(playback.with_held(playback.chosen), dtype=wp.int32, device="cpu")
+        return wp.array(playback.chosen, dtype=wp.int32, device="cpu")
 
 
 class LivePlayback(Playback):
-    """A scene that runs: each step is a frame, timed by stage.
-
-    Attributes:
-        page_camera: `Camera` of the page, None until it is known.
-        for_page: Whether controllers choose LODs for that camera in the place of the scene's.
-    """
+    """A scene that runs: each step is a frame, timed by stage."""
 
     def __init__(self, *arguments, **options):
         super().__init__(*arguments, **options)
         self._chooser = _Chooser(self)
         self._mode, self._budget = OWN, None
-        self.page_camera: Camera | None = None
-        self.for_page = False
         self.restart()
 
     def _begin(self) -> tuple:
@@ -137,9 +119,8 @@ class LivePlayback(Playback):
 
     def restart(self):
         """Go back to the start; the mode of choosing LODs stays."""
-        self._frame, self._bodies, own = self._begin()
-        self._own = own
-        self.number, self.chosen = 0, self.scene.lods
+        self._frame, self._bodies, self._own = self._begin()
+        self.number, self.chosen, self._first = 0, self.scene.lods, self.scene.lods
         self._poses = self._poses_now()
         self._frame.lods = self._chooser
         self.choose(self._mode, self._budget)
@@ -156,22 +137,13 @@ class LivePlayback(Playback):
         """
         if mode == HOLD:
             inner, self.chosen = None, self.scene.lods
-        elif mode == OWN and (self.control.controller == "none" or (budget_ms is None and not self.for_page)):
+        elif mode == OWN and (self.control.controller == "none" or budget_ms is None):
             inner = self._own
+            self.chosen = self._first if inner is None else self.chosen
         else:
-            inner = self._control(self.control.controller if mode == OWN else mode, budget_ms)
+            name = self.control.controller if mode == OWN else mode
+            inner = self.control.asked(name, budget_ms).make(self.scene, self.camera)
         self._chooser.inner, self._mode, self._budget = inner, mode, budget_ms
-
-    def _control(self, name, budget_ms):
-        if name == "tolerance":
-            budget_ms = None
-        camera = self._camera_at if self.for_page or self.camera is not None else None
-        return self.control.asked(name, budget_ms).make(self.scene, camera)
-
-    def _camera_at(self, time):
-        if self.camera is None or (self.for_page and self.page_camera is not None):
-            return self.page_camera or Camera.look_at(eye=(0, 0, 1), target=(0, 0, 0))
-        return self.camera(time)
 
     @property
     def budget_ms(self) -> float | None:
@@ -200,7 +172,7 @@ class ScenePlayback(LivePlayback):
 
     def __init__(self, loaded):
         self.loaded = loaded
-        head = loaded.scene, loaded.title, loaded.worlds, loaded.time_step, loaded.frames, loaded.picture
+        head = loaded.scene, loaded.title, loaded.worlds, loaded.time_step, loaded.picture
         super().__init__(*head, camera=loaded.camera, control=loaded.control)
 
     def _begin(self):
@@ -213,13 +185,10 @@ class ScenePlayback(LivePlayback):
 
 
 class MeshPlayback(LivePlayback):
-    """Meshes at poses (n, 7), whose LODs sweep from where they start to the base and back; the user may move them."""
-
-    can_move = True
+    """Meshes at poses (n, 7), whose LODs sweep from where they start to the base and back."""
 
     def __init__(self, models, poses, lods, device=None):
         self._start = np.array(poses, np.float64)
-        self._placed = self._start.copy()
         scene = Scene(device=device)
         for model, pose, lod in zip(models, poses, lods):
             scene.add(model, pose=pose, lod=lod)
@@ -230,11 +199,9 @@ class MeshPlayback(LivePlayback):
             start = _fraction_at(model, lods[mine[0]])
             self._sweeps.append(LodSweep([(model, mine)], start, min(start, _fraction_at(model, 0)), SWEEP_PERIOD))
         names = " and ".join(dict.fromkeys(model.name for model in models))
-        super().__init__(scene, names, np.zeros(len(models), int), 1 / 30, round(15 * SWEEP_PERIOD) + 1, MeshView())
+        super().__init__(scene, names, np.zeros(len(models), int), 1 / 30, MeshView())
 
     def _begin(self):
-        self._placed = self._start.copy()
-        self.scene.set_poses(self._placed)
         self.scene.set_lods(self._first)
         frame = Frame(self.scene, None, self._sweep, time_step=self.time_step)
         frame.warm_up()
@@ -247,13 +214,7 @@ class MeshPlayback(LivePlayback):
         return lods
 
     def _poses_now(self):
-        return self._placed
-
-    def move(self, i, pose):
-        """Put an object to a pose."""
-        self._placed[i] = pose
-        self.scene.set_poses(self._placed)
-        self._poses = self._placed
+        return self._start
 
 
 def _fraction_at(model, lod) -> float:
@@ -266,7 +227,7 @@ class RecordedPlayback(Playback):
     length: int
 
     def __init__(self, recording, loaded):
-        head = loaded.scene, loaded.title, loaded.worlds, loaded.time_step, len(recording.rows), loaded.picture
+        head = loaded.scene, loaded.title, loaded.worlds, loaded.time_step, loaded.picture
         super().__init__(*head, camera=loaded.camera)
         self.recording, self.length = recording, len(recording.rows)
         self._mode = OWN

@@ -24,9 +24,7 @@ class RunSettings:
 
     path: str  # of the scene file
     objects: int | None  # their number, None for the file's own
-    controller: str  # and budget_ms as for `SceneFile.frame`
-    budget_ms: float | None
-    device: str  # of Warp
+    controller: str  # as for `SceneFile.frame`
 
 
 @dataclass(eq=False)
@@ -129,12 +127,6 @@ def record_run(loaded: SceneFile, frames: int, keep=True, progress=None, **optio
         if progress is not None:
             progress(i + 1, frames)
     control = loaded.control.asked(options.get("controller"), options.get("budget_ms"))
-    settings = RunSettings(
-        path=str(Path(loaded.path).absolute()),
-        objects=loaded.objects,
-        controller=control.controller,
-        budget_ms=None if control.controller in ("none", "tolerance") else control.budget_ms,
-        device=str(scene.device),
-    )
+    settings = RunSettings(str(Path(loaded.path).absolute()), loaded.objects, control.controller)
     models = [model.digest for model in loaded.models.values()] if keep else []
     return frame, Recording(loaded.text, settings, models, list(frame.history), lods, poses)

@@ -4,8 +4,6 @@ import numpy as np
 
 from warp_abtree.app.styles import STAGE_LABELS
 
-NOBODY = "Click an object."
-PARTNERS = 8  # named of the objects that one meets
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b")
 
 
@@ -27,40 +25,11 @@ def state(page, data) -> str:
         ("intersecting face pairs", f"{data.contact_count:,}"),
         ("intersecting faces", f"{data.intersecting_count:,}"),
     ]
-    if page.settings.level >= 0:
-        rows.append((f"active nodes at level {page.settings.level}", f"{data.box_count:,}"))
     if snapshot.row is not None:
         rows.append(("frame", f"{snapshot.row.total_ms:.1f} ms on {playback.scene.device}"))
         rows.append(("select to query", f"{snapshot.row.cost_ms:.1f} ms"))
         if snapshot.row.budget_ms is not None:
             rows.append(("budget", f"{snapshot.row.budget_ms:g} ms"))
-    return _table(rows)
-
-
-def numbers(playback, snapshot, cache, i) -> str:
-    """Return the numbers of an object as a table."""
-    if i is None:
-        return NOBODY
-    scene, lod = playback.scene, int(snapshot.lods[i])
-    owner = scene.object_model[i]
-    model = scene.models[owner]
-    result = snapshot.result
-    meets = np.flatnonzero((result.pairs == i).any(axis=1) & result.any) if len(result.pairs) else []
-    others = [int(a + b - i) for a, b in result.pairs[meets]] if len(meets) else []
-    sharing = int(np.count_nonzero((np.array(scene.object_model) == owner) & (snapshot.lods == lod)))
-    rows = [
-        ("object", f"`{playback.name_of(i)}`"),
-        ("LOD", f"{lod:,} of {model.lod_max:,}{', held' if i in playback.held else ''}"),
-        ("faces", f"{cache.count(owner, lod):,} of {model.face_count:,}"),
-        ("certified error", f"{model.error_at(lod):.3g}"),
-        ("objects on its tree", f"{sharing:,}"),
-        ("position", " ".join(f"{value:.3f}" for value in snapshot.poses[i, :3])),
-        ("meets", ", ".join(f"#{other}" for other in others[:PARTNERS]) + (" …" if len(others) > PARTNERS else "")),
-    ]
-    if result.count is not None and len(meets):
-        rows.append(("intersecting face pairs", f"{int(result.count[meets].sum()):,}"))
-    if int(playback.worlds[i]) != 0:
-        rows.append(("world", "every one" if playback.worlds[i] < 0 else f"{playback.worlds[i]}"))
     return _table(rows)
 
 
