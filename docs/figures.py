@@ -34,15 +34,9 @@ def draw_lods():
         error = "the original" if lod == model.lod_max else f"error at most {model.error_at(lod):.2g}"
         title = f"LOD {lod:,} of {model.lod_max:,}\n{len(faces):,} faces, {error}"
         panels.append(Panel(title, vertices[faces], np.tile(COLOURS[0][0], (len(faces), 1))))
-    legend = [
-        (
-            COLOURS[0][0],
-            f"bunny; its box has a diagonal of {np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0)):.2g}",
-        )
-    ]
-    draw(
-        panels, FOLDER / "concept_lods.png", "One model, every level of detail", legend, (0.15, 0.3, 1), (0, 1, 0), 300
-    )
+    size = np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0))
+    legend, view = [(COLOURS[0][0], f"bunny; its box has a diagonal of {size:.2g}")], ((0.15, 0.3, 1), (0, 1, 0))
+    draw(panels, FOLDER / "concept_lods.png", "One model, every level of detail", legend, *view, 300)
 
 
 # The tree.
@@ -57,12 +51,9 @@ def place_of(node):
 def draw_tree(axes, tree, title, marked=()):
     nodes = [node for node in range(1, len(tree.node_face)) if tree.used[node]]
     for colour, width, chosen in ((PALE, 0.8, False), (RED, 1.4, True)):
-        ways = [
-            (place_of(node), place_of(node // 2), (np.nan, np.nan))
-            for node in nodes
-            if (node in marked) is chosen and node > 1
-        ]
-        axes.plot(*np.array([point for way in ways for point in way] or [(np.nan, np.nan)]).T, color=colour, lw=width)
+        children = [node for node in nodes if (node in marked) is chosen and node > 1]
+        ways = [point for node in children for point in (place_of(node), place_of(node // 2), (np.nan, np.nan))]
+        axes.plot(*np.array(ways or [(np.nan, np.nan)]).T, color=colour, lw=width)
     kinds: dict[tuple, list] = {}
     for node in nodes:
         leaf, active = tree.node_face[node] >= 0, tree.status[node] != 0
@@ -192,56 +183,10 @@ def draw_traversal():
     draw(panels, FOLDER / "concept_traversal.png", title, legend, eye, up, 380)
 
 
-# Speed against accuracy.
-
-
-def draw_tradeoff():
-    """What a coarser LOD saves and costs: tests counted, answers compared, no times."""
-    model = ab.Model.load("warp:bunny")
-    rng = np.random.default_rng(0)
-    poses = np.zeros((400, 7))
-    poses[:, :3] = rng.normal(size=(400, 3))
-    poses[:, :3] *= rng.uniform(0.6, 1.6, (400, 1)) / np.linalg.norm(poses[:, :3], axis=1, keepdims=True)
-    poses[:, 3:] = rng.normal(size=(400, 4))
-    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    diagonal = np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0))
-    shares = np.array([1, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01, 0.005])
-    rows = []
-    for share in shares:
-        lod = model.lod_for(fraction=share)
-        scene = ab.Scene("cpu")
-        scene.add(model, lod=lod)
-        for pose in poses:
-            scene.add(model, pose, lod=lod)
-        pairs = np.stack([np.zeros(400, int), np.arange(1, 401)], 1)
-        found = scene.intersect(pairs, output="count")
-        tests = int(found.node_tests.sum() + found.triangle_tests.sum())
-        rows.append((model.error_at(lod) / diagonal, tests, found.any))
-    error = 100 * np.array([row[0] for row in rows])
-    tests = 100 * np.array([row[1] for row in rows]) / rows[0][1]
-    wrong = 100 * np.array([np.mean(row[2] != rows[0][2]) for row in rows])
-    figure = Figure(figsize=(7.4, 2.6))
-    left, right = figure.subplots(1, 2)
-    left.plot(100 * shares, tests, "o-", color=BLUE)
-    left.set(ylabel="tests of boxes and faces [%]", ylim=(0, 105))
-    right.plot(100 * shares, error, "o-", color=RED, label="certified error [% of the diagonal]")
-    right.plot(100 * shares, wrong, "s--", color=GREEN, label="answers yes or no that differ [%]")
-    right.set_ylim(bottom=0)
-    right.legend(frameon=False, fontsize=8)
-    for axes in (left, right):
-        axes.set(xscale="log", xlabel="faces [%]", xticks=[100, 10, 1], xticklabels=["100", "10", "1"])
-        axes.invert_xaxis()
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(alpha=0.3)
-    figure.tight_layout(w_pad=3)
-    save(figure, "concept_tradeoff.svg")
-
-
 def main():
     draw_lods()
     draw_trees()
     draw_traversal()
-    draw_tradeoff()
 
 
 if __name__ == "__main__":
