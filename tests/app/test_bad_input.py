@@ -73,6 +73,14 @@ CASES = [
     ("picture ball.obj --lod 9999 --out out.png", "--lod: model"),
     ("picture ball.obj --pose 0 0 0 0 0 0 1 --out out.png", "--pose: 1 given for the 0 meshes"),
     ("picture ball.obj face.npz --pose 0 0 0 0 0 0 2 --out out.png", "--pose: pose 0 has a quaternion"),
+    ("sweep ball.obj ball.obj --out x", "POSES.npy is missing"),
+    ("sweep scene.toml --out x", "POSES.npy is missing"),
+    ("sweep ball.obj poses.npy --out x", "is no scene; a sweep takes two models, or one twice"),
+    ("sweep ball.obj ball.obj ball.obj poses.npy --out x", "two models and POSES.npy"),
+    ("sweep scene.toml poses.npy --out x", "takes a scene of two"),
+    ("sweep face.npz face.npz poses.npy --out x --lods lods.npy --lod-a 3", "--lods: LODs come from"),
+    ("sweep face.npz face.npz poses.npy --out x --lod-b tall", "--lod-b: LOD 'tall'"),
+    ("sweep face.npz face.npz poses.npy --out x --workers 2 --ray none", "--workers: they are Ray's"),
     ("view", "SCENE_OR_MESHES"),
     ("view gone.obj", "gone.obj"),
     ("view ball.obj --port 70000", "--port: 70000 is outside"),
@@ -99,6 +107,7 @@ def folder(tmp_path_factory):
     for name, text in FILES.items():
         (path / name).write_text(text)
     (path / "folder.npz").mkdir()
+    np.save(path / "poses.npy", np.eye(7)[6:])
     return path
 
 

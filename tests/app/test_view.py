@@ -1,7 +1,5 @@
 """What the viewer sends, without a browser: geometry of a snapshot, and a viewer scene that notes what it hears."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from helpers.viewer import make_models, make_playback, place, write_scene
@@ -10,7 +8,6 @@ from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.open_playback import open_playback
 from warp_abtree.app.render_data import Settings, compose, objects_of_world
 from warp_abtree.app.styles import COLOURS
-from warp_abtree.app.viewer import text as view_text
 from warp_abtree.app.viewer import viewer_scene as stages
 from warp_abtree.app.viewer.viewer_scene import ViewerScene
 
@@ -242,21 +239,3 @@ def test_worlds_are_shown_one_at_a_time(tmp_path):
     data, heard = show.show()
     assert data.shown.tolist() == [3] and ("/objects/3", "add_mesh_simple") in heard
     assert not show.api.handles["/objects/0"].visible and data.contact_count == 0
-
-
-def test_times_are_stacked(playback):
-    rows = [playback.step("count").row for _ in range(4)]
-    plot = view_text.time_plot(rows, 0)
-    assert len(plot["data"]) == len(plot["series"])
-    assert plot["data"][0].tolist() == [0, 1, 2, 3]
-    assert np.allclose(plot["data"][1], [row.total_ms for row in rows])
-    assert np.allclose(plot["data"][-2], [row.select_ms for row in rows])
-    assert plot["data"][-1].tolist() == [0] * 4
-    wide = view_text.time_plot(rows, 10)["data"]
-    assert wide[0].tolist() == list(range(-6, 4)) and wide[1][:6].tolist() == [0] * 6
-    assert [part[6:].tolist() for part in wide[1:-1]] == [part.tolist() for part in plot["data"][1:-1]]
-    assert len(view_text.time_plot([], 10)["data"][0]) == 10
-    times = [SimpleNamespace(total_ms=ms, budget_ms=None) for ms in (*[2.1] * 99, 900.0)]
-    assert view_text.time_top(times) == 3 and view_text.time_top([]) == 1
-    times[-1].budget_ms = 50.0
-    assert view_text.time_top(times) == 50

@@ -59,6 +59,8 @@ def test_an_interrupted_job_continues(tmp_path, monkeypatch):
     job, again = (job_of("faces", count=100, shard=9) for _ in range(2))
     out = tmp_path / "out"
     run(job, tmp_path / "whole")
+    out.mkdir()
+    (out / f"{MANIFEST}.1.partial").write_text("{")  # of a run interrupted at its first file
     with pytest.raises(KeyboardInterrupt):
         run(job, out, progress=stop_after(4))
     assert len(list(out.glob("shard-*.npz"))) == 4
@@ -69,16 +71,8 @@ def test_an_interrupted_job_continues(tmp_path, monkeypatch):
     monkeypatch.setattr(again, "task", lambda *part: computed.append(part) or job.task(*part))
     assert run(again, out)["found"] == 4
     assert computed == [(start, min(start + 9, 100)) for start in range(36, 100, 9)]
-    assert contents(out) == contents(tmp_path / "whole")
+    assert contents(out) == contents(tmp_path / "whole") and not list(out.glob("*.partial"))
     assert run(again, out)["found"] == 12
-
-
-def test_a_run_interrupted_at_its_first_file_continues(tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / f"{MANIFEST}.1.partial").write_text("{")
-    assert run(job_of(), out)["shards"] == 3
-    assert not list(out.glob("*.partial"))
 
 
 # Folders.
@@ -110,18 +104,17 @@ def test_a_folder_is_of_one_job(tmp_path):
 
 
 def test_folders_that_are_no_jobs_are_refused(tmp_path):
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "thesis.txt").write_text("text")
-    (tmp_path / "bad").mkdir()
-    (tmp_path / "bad" / MANIFEST).write_text("{")
+    for name, text in (("full/thesis.txt", "text"), (f"bad/{MANIFEST}", "{")):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text(text)
     for out, what in (
-        (tmp_path / "full", "is not empty and holds no job.json"),
-        (tmp_path / "full" / "thesis.txt", "is a file"),
-        (tmp_path / "none" / "out", "there is no folder"),
-        (tmp_path / "bad", "damaged"),
+        ("full", "is not empty and holds no job.json"),
+        ("full/thesis.txt", "is a file"),
+        ("none/out", "there is no folder"),
+        ("bad", "damaged"),
     ):
         with pytest.raises(ValueError, match=what):
-            run(job_of(), out)
+            run(job_of(), tmp_path / out)
     with pytest.raises(ValueError, match=r"holds no job\.json"):
         list(read_shards(tmp_path / "full"))
     with pytest.raises(ValueError, match="file 'csv'"):
@@ -142,16 +135,16 @@ def test_a_pool_that_answers_twice_or_not_at_all_is_detected(tmp_path, deal, wha
         run_shards(job_of(), tmp_path / "out", pool=Pool("cpu"))
 
 
-def test_parquet_has_the_same_columns(tmp_path):
+@pytest.mark.parametrize("output", ["count", "contacts"])
+def test_parquet_has_the_same_columns(tmp_path, output):
     pytest.importorskip("pyarrow")
-    for output in ("count", "contacts"):
-        for file in ("npz", "parquet"):
-            run(job_of(output, count=50), tmp_path / f"{output}.{file}", file)
-        plain, table = read(tmp_path / f"{output}.npz"), read(tmp_path / f"{output}.parquet")
-        if output == "count":
-            np.testing.assert_array_equal(table.pop("pose"), np.arange(50))
-        for name, values in plain.items():
-            if values.ndim == 2:
-                table[name] = np.stack([table.pop(f"{name}_{axis}") for axis in "xyz"], 1)
-            np.testing.assert_array_equal(table.pop(name), values)
-        assert not table
+    for file in ("npz", "parquet"):
+        run(job_of(output, count=50), tmp_path / file, file)
+    table = read(tmp_path / "parquet")
+    if output == "count":
+        np.testing.assert_array_equal(table.pop("pose"), np.arange(50))
+    for name, values in read(tmp_path / "npz").items():
+        if values.ndim == 2:
+            table[name] = np.stack([table.pop(f"{name}_{axis}") for axis in "xyz"], 1)
+        np.testing.assert_array_equal(table.pop(name), values)
+    assert not table

@@ -21,10 +21,10 @@ def file(request):
     return request.param
 
 
-def refuse(job, out, *words, error=ValueError):
-    """Check that a run and a reader refuse a folder, naming all words, and change nothing."""
+def refuse(job, out, *words, error=ValueError, file="npz", readers=True):
+    """Check that a run, and a reader, refuse a folder, naming all words, and change nothing."""
     before = contents(out) if error is ValueError else None
-    for call in (lambda: run(job, out), lambda: list(read_shards(out))):
+    for call in [lambda: run(job, out, file), lambda: list(read_shards(out))][: 1 + readers]:
         with pytest.raises(error) as caught:
             call()
         assert all(word in str(caught.value) for word in words)
@@ -117,16 +117,15 @@ def test_no_flipped_bit_changes_what_is_read(tmp_path, file, output):
 
 def test_a_damaged_header_allocates_no_memory(tmp_path):
     out, job = tmp_path / "out", ColumnJob(count=6000, shard=2000)
-    run(job, out, "npz")
+    run(job, out)
     path = shard_at(out, 1)
     data = path.read_bytes()
     shape, huge = b"'shape': (2000,), }", b"'shape': (%d,), }" % 10**15
     assert data.count(shape) == 2
     path.write_bytes(data.replace(shape + b" " * (len(huge) - len(shape)), huge, 1))
-    assert path.stat().st_size == len(data)
     with pytest.raises(ValueError, match=r"damaged .*count\.npy"):
         list(read_shards(out))
-    assert run(job, out, "npz")["damaged"] == 1 and path.read_bytes() == data
+    assert run(job, out)["damaged"] == 1 and path.read_bytes() == data
 
 
 @pytest.mark.parametrize("place", [0, 1])
@@ -137,18 +136,13 @@ def test_a_shard_of_another_job_is_refused(tmp_path, file, place):
     run(job_of(seed=1), tmp_path / "other", file)
     path = shard_at(out, place)
     path.write_bytes(shard_at(tmp_path / "other", 1).read_bytes())
-    shard_at(out, 2).unlink()
     shard_at(out, 1 - place).write_bytes(b"")
-    before = contents(out)
-    with pytest.raises(ValueError, match="a shard of another job") as caught:
-        run(job, out, file)
-    assert str(path) in str(caught.value) and contents(out) == before
+    held = path.read_bytes()
+    refuse(job, out, "a shard of another job", str(path), file=file, readers=place == 0)
     path.unlink()
     assert (run(job, out, file)["damaged"], run(job, out, file)["found"]) == (1, 3)
-    path.write_bytes(before[path.name])
-    with pytest.raises(ValueError, match="a shard of another job") as caught:
-        list(read_shards(out))
-    assert str(path) in str(caught.value)
+    path.write_bytes(held)
+    refuse(job, out, "a shard of another job", str(path), file=file)
 
 
 @pytest.mark.parametrize(
@@ -156,7 +150,7 @@ def test_a_shard_of_another_job_is_refused(tmp_path, file, place):
 )
 def test_a_shard_with_a_name_of_another_job_is_refused(tmp_path, name):
     job, out = job_of(), tmp_path / "out"
-    run(job, out, "npz")
+    run(job, out)
     path = out / name.format(f"{0:012d}", f"{20:012d}")
     path.write_bytes(shard_at(out, 0).read_bytes())
     refuse(job, out, "a shard of another job", str(path))
@@ -185,34 +179,29 @@ def test_shards_of_every_output_pass_their_check(tmp_path, file, output):
         ((3, 3), "any", "3 rows, not 2"),
         ((2, 1), "count", "columns of different lengths"),
         ((2, 1), "faces", "columns of different lengths"),
-        ((9, 9), "faces", None),
     ],
 )
 def test_rows_are_counted(tmp_path, monkeypatch, rows, output, fault):
-    job = ColumnJob(rows=rows, output=output)
-    if fault is None:
-        run(job, tmp_path / "out", "npz")
-        assert len(list(read_shards(tmp_path / "out"))) == 2
-        return
+    job, out = ColumnJob(rows=rows, output=output), tmp_path / "out"
     with pytest.raises(RuntimeError, match=f"shard 0 to 2 was answered with {fault}"):
-        run(job, tmp_path / "out", "npz")
-    assert list(contents(tmp_path / "out")) == [MANIFEST]
+        run(job, out)
+    assert list(contents(out)) == [MANIFEST]
     with monkeypatch.context() as patch:
         patch.setattr(shard_folder, "_row_fault", lambda *_: None)
-        run(job, tmp_path / "out", "npz")
+        run(job, out)
     with pytest.raises(ValueError, match=f"shard-000000000000-000000000002.npz: holds {fault}"):
-        next(read_shards(tmp_path / "out"))
+        next(read_shards(out))
     job.rows = None
-    assert run(job, tmp_path / "out", "npz")["damaged"] == 2
+    assert run(job, out)["damaged"] == 2
 
 
 def test_one_column_is_in_memory_while_all_are_checked(tmp_path):
     size = 100_000
     job = ColumnJob(count=40, shard=10, size=size, output="rows")  # 16 MB a shard
-    run(job, tmp_path / "out", "npz")
+    run(job, tmp_path / "out")
     tracemalloc.start()
     try:
-        assert run(job, tmp_path / "out", "npz")["found"] == 4
+        assert run(job, tmp_path / "out")["found"] == 4
         checked = tracemalloc.get_traced_memory()[1]
         tracemalloc.reset_peak()
         for _, _, columns in read_shards(tmp_path / "out"):
@@ -231,33 +220,28 @@ def test_one_column_is_in_memory_while_all_are_checked(tmp_path):
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        (lambda held: held.update(version=1), "not of warp_abtree shards, version 2"),
-        (lambda held: held["job"].update(count=40), "the hash is not that of the job"),
-        (lambda held: held.update(hash="0" * 64), "the hash is not that of the job"),
-        (lambda held: held.pop("job"), "the hash is not that of the job"),
+        ({"version": 1}, "not of warp_abtree shards, version 2"),
+        ({"job": {"count": 40}}, "the hash is not that of the job"),
+        ({"hash": "0" * 64}, "the hash is not that of the job"),
+        ({"job": None}, "the hash is not that of the job"),
     ],
 )
 def test_an_altered_manifest_is_refused(tmp_path, change, what):
     job, out = job_of(), tmp_path / "out"
-    run(job, out, "npz")
+    run(job, out)
     held = json.loads((out / MANIFEST).read_text())
-    change(held)
-    (out / MANIFEST).write_text(json.dumps(held))
+    (out / MANIFEST).write_text(json.dumps(held | change))
     refuse(job, out, what, str(out / MANIFEST))
 
 
-def test_parquet_without_pyarrow_is_no_damage(tmp_path, monkeypatch):
-    pytest.importorskip("pyarrow")
-    run(job_of(), tmp_path / "out", "parquet")
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(ValueError, match=r"^Parquet needs PyArrow"):
-        list(read_shards(tmp_path / "out"))
-
-
-def test_a_shard_that_may_not_be_read_is_no_damage(tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    run(job_of(), out, "npz")
-    path = shard_at(out, 1)
+def test_missing_readers_and_rights_are_no_damage(tmp_path, monkeypatch):
+    run(job_of(), tmp_path / "out")
+    path = shard_at(tmp_path / "out", 1)
     path.unlink()
     path.mkdir()
-    refuse(job_of(), out, path.name, error=OSError)
+    refuse(job_of(), tmp_path / "out", path.name, error=OSError)
+    pytest.importorskip("pyarrow")
+    run(job_of(), tmp_path / "table", "parquet")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ValueError, match=r"^Parquet needs PyArrow"):
+        list(read_shards(tmp_path / "table"))

@@ -13,13 +13,12 @@ import numpy as np
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.playback import HOLD, OWN
 from warp_abtree.app.render_data import Settings, compose, objects_of_world
+from warp_abtree.app.styles import STAGE_LABELS
 from warp_abtree.app.toml.objects import unit
-from warp_abtree.app.viewer import text as view_text
 from warp_abtree.app.viewer.viewer_scene import ViewerScene
 
 FRAME_SECONDS = 1 / 30  # between snapshots that are sent, at least
-TEXT_SECONDS = 0.2  # between changes of numbers and plots while it plays
-PLOTTED = 240  # frames
+TEXT_SECONDS = 0.2  # between changes of numbers while it plays
 BUDGETS = (0.5, 100.0)  # of the slider [ms]
 LIGHT = 0.6
 DISTANCE = 1.8  # of the first camera, in radii of what is shown
@@ -53,10 +52,8 @@ class Page:
         self.playing, self.snapshots = False, 0
         self._events: queue.SimpleQueue = queue.SimpleQueue()
         self._closed = False
-        self._rows: list = []
         self._steps, self._dirty = 0, True
         self._text_time = self._snapshot_time = -math.inf
-        self._plotted = False
         server.scene.set_up_direction(tuple(self._up))
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         server.gui.main_panel.dock_right()
@@ -99,8 +96,6 @@ class Page:
             self._on_change(self._all_lod, self._hold_all)
         with gui.add_folder("Show"):
             self._build_show(gui)
-        with gui.add_folder("Frame times [ms]"):
-            self._plot = gui.add_uplot(**view_text.time_plot([], PLOTTED), height=220)
 
     def _build_show(self, gui):
         def box(label, name, hint=None):
@@ -135,7 +130,6 @@ class Page:
             self.playing, self._steps = False, self._steps + 1
         else:
             self.playback.restart()
-            self._rows.clear()
 
     def _seek(self, number):
         self.playing = False
@@ -217,9 +211,6 @@ class Page:
             self.playing = False
             for client in self.server.get_clients().values():
                 client.add_notification("This frame failed", str(error), color="red")
-        if self.snapshot.row is not None:
-            self._rows.append(self.snapshot.row)
-            del self._rows[:-PLOTTED]
         self._steps, self._dirty = max(self._steps - 1, 0), False
         self._data = compose(self.cache, self.snapshot, self.shown, self.settings)
         self._send()
@@ -234,12 +225,23 @@ class Page:
             self.viewer_scene.show(self._data)
 
     def _show_text(self):
-        self._state.content = view_text.state(self, self._data)
+        """Show the numbers of the snapshot as a table."""
+        data, snapshot, playback = self._data, self.snapshot, self.playback
+        row, result = snapshot.row, snapshot.result
+        rows = [
+            ("state", "playing" if self.playing else "paused"),
+            ("time", f"{snapshot.time:.3f} s, frame {snapshot.number:,}"),
+            ("objects shown", f"{len(data.shown):,} of {playback.scene.object_count:,}"),
+            ("faces shown", f"{data.faces:,}"),
+            ("pairs that meet", f"{int(np.count_nonzero(result.any)):,} of {len(result.pairs):,} near"),
+            ("certified error, mean", f"{data.error_mean:.3g}"),
+            ("intersecting face pairs", f"{data.contact_count:,}"),
+            ("intersecting faces", f"{data.intersecting_count:,}"),
+        ]
+        if row is not None:
+            rows += [(label, f"{getattr(row, name):.1f} ms") for name, label in STAGE_LABELS.items()]
+            rows += [("select to query", f"{row.cost_ms:.1f} ms"), ("frame", f"{row.total_ms:.1f} ms")]
+            rows += [("budget", f"{row.budget_ms:g} ms")] if row.budget_ms is not None else []
+        self._state.content = "\n".join(["| | |", "|:--|--:|", *(f"| {key} | {value} |" for key, value in rows)])
         if self._frame_slider is not None:
-            self._frame_slider.value = self.snapshot.number
-        if self._rows or self._plotted:
-            self._plotted = bool(self._rows)
-            plot = view_text.time_plot(self._rows, PLOTTED)
-            self._plot.data = plot["data"]
-            if self._plot.scales != plot["scales"]:
-                self._plot.scales = plot["scales"]
+            self._frame_slider.value = snapshot.number
