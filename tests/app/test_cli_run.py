@@ -1,4 +1,4 @@
-"""`warp-abtree run`: what it prints, records and draws."""
+"""`warp-abtree run` and `picture`: what they print, record and draw."""
 
 import csv
 import io
@@ -9,12 +9,15 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
-from helpers.viewer import SCENE, write_scene
+import trimesh
+from helpers.viewer import BODIES, SCENE, write_scene
 from helpers.viewer import run_command as run
 
 from warp_abtree.app import load_scene
-from warp_abtree.app.pictures import scenes
-from warp_abtree.app.styles import STAGE_LABELS
+from warp_abtree.app.open_playback import open_playback
+from warp_abtree.app.pictures import command, scenes
+from warp_abtree.app.recording import record_run
+from warp_abtree.app.styles import COLOURS, STAGE_LABELS
 
 
 @pytest.fixture
@@ -103,3 +106,54 @@ def test_picture(scene):
         assert np.mean((green > 1.8 * red) & (green > 1.8 * blue)) > 0.002, "intersecting faces of the ball"
         assert np.mean((red > 2 * blue) & (green > 2 * blue)) > 0.002, "intersecting faces of the ring"
     assert sorted(path.name for path in Path().glob("out*")) == ["out.png"]
+
+
+# picture.
+
+
+def count(path, colour, reach=0.12):
+    """Count pixels whose colour is in the direction of another: light only makes it darker."""
+    image = matplotlib.image.imread(path)[:, :, :3].reshape(-1, 3).astype(float)
+    length = np.linalg.norm(image, axis=1)
+    near = np.linalg.norm(image / np.maximum(length, 1e-6)[:, None] - np.array(colour) / np.linalg.norm(colour), axis=1)
+    return int(np.count_nonzero((near < reach) & (length > 0.15)))
+
+
+@pytest.fixture
+def picture(tmp_path, monkeypatch, capsys):
+    """Work in a folder with a scene, a mesh and a recording; give a function that draws them."""
+    pytest.importorskip("pyvista")
+    monkeypatch.chdir(tmp_path)
+    trimesh.creation.icosphere(2).export("ball.obj")
+    record_run(load_scene(write_scene(tmp_path), device="cpu"), 4)[1].save("run.npz")
+    return lambda words: run(capsys, "picture", *words.split(), *"--size 250 --device cpu".split())[0]
+
+
+def test_picture_of_meshes(picture):
+    picture("ball.obj ball.obj --out balls.png")
+    assert count("balls.png", COLOURS[0][1]) > 200
+    shown = picture("ball.obj ball.obj --pose 9 0 0 0 0 0 1 --lod 0.2 --json -o apart.png")
+    assert json.loads(shown) == {"picture": "apart.png", "objects": 2, "frame": 0}
+    assert not count("apart.png", COLOURS[0][1])
+
+
+@pytest.mark.slow
+def test_picture_of_a_frame(picture):
+    picture("scene.toml --frame 0 --out first.png")
+    picture("scene.toml --frame 3 --out last.png")
+    picture("run.npz --frame 3 --out again.png")
+    first, last, again = (matplotlib.image.imread(f"{name}.png") for name in ("first", "last", "again"))
+    assert first.shape != last.shape or not np.array_equal(first, last)
+    assert np.array_equal(last, again)
+    picture("scene.toml --world 2 --eye 0 0 1 --out world.png")
+    assert count("world.png", COLOURS[0][0]) < count("first.png", COLOURS[0][0])
+
+
+def test_frames_go_as_far_as_they_are_asked(tmp_path, device):
+    playback = open_playback([write_scene(tmp_path, BODIES)], device)
+    snapshot = command.go_to(playback, 5, "contacts")
+    assert snapshot.number == 5 and snapshot.result.contacts is not None
+    other = open_playback([tmp_path / "scene.toml"], device)
+    for _ in range(6):
+        expected = other.step("count")
+    assert np.array_equal(snapshot.poses, expected.poses) and snapshot.poses[1, 1] < 0.5

@@ -107,7 +107,7 @@ def test_another_mesh_is_noticed(tmp_path):
 
 
 def test_meshes_sweep_and_stay_where_they_are_held(device):
-    playback = make_playback(make_models(), device)
+    playback = make_playback(device)
     lods = [playback.step("count").lods for _ in range(3)]
     top = [playback.scene.models[i].lod_max for i in playback.scene.object_model]
     assert lods[0].tolist() == top and (lods[2] < top).all()

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from helpers.viewer import write_scene
 
 from warp_abtree.app import SceneError, load_scene
 from warp_abtree.app.pictures.scenes import panel_lods
@@ -15,9 +16,7 @@ ONE = BALL + '[[objects]]\nmodel = "ball"\n'
 
 
 def load(tmp_path, text):
-    path = tmp_path / "scene.toml"
-    path.write_text(text, encoding="utf-8")
-    return load_scene(path, device="cpu")
+    return load_scene(write_scene(tmp_path, text), device="cpu")
 
 
 # Good ones.

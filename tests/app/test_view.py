@@ -1,25 +1,22 @@
-"""What the viewer sends, without a browser: geometry of a snapshot, and a viewer scene that notes what it hears."""
+"""Geometry of a snapshot, panels of pictures, and what a viewer scene sends to something that notes what it hears."""
 
 import numpy as np
 import pytest
-from helpers.viewer import make_models, make_playback, place, write_scene
+from helpers.viewer import make_playback, place, write_scene
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.open_playback import open_playback
+from warp_abtree.app.pictures import scenes
+from warp_abtree.app.pictures.render import camera_around
 from warp_abtree.app.render_data import Settings, compose, objects_of_world
 from warp_abtree.app.styles import COLOURS
 from warp_abtree.app.viewer import viewer_scene as stages
 from warp_abtree.app.viewer.viewer_scene import ViewerScene
 
 
-@pytest.fixture(scope="module")
-def models():
-    return make_models()
-
-
 @pytest.fixture
-def playback(models, device):
-    return make_playback(models, device)
+def playback(device):
+    return make_playback(device)
 
 
 # Geometry.
@@ -50,31 +47,11 @@ def test_intersecting_faces_and_triangles(playback):
     assert set(only[:, 0].tolist()) == {0, 1} and len(only) < len(intersecting)
 
 
-def test_contact_lines(playback, monkeypatch):
-    result = playback.query("contacts").result
-    segments = geometry.contact_lines(result, np.ones(3, bool))
-    assert len(segments) == len(result.contacts) > 50
-    assert np.allclose(segments, np.stack([result.contacts["p0"], result.contacts["p1"]], 1), atol=1e-6)
-    monkeypatch.setattr(geometry, "LINES", 7)
-    fewer = geometry.contact_lines(result, np.ones(3, bool))
-    assert len(fewer) == 7 and np.array_equal(fewer[[0, -1]], segments[[0, -1]])
-
-
 def test_colours(playback):
-    lods = playback.scene.lods
-    plain = geometry.object_colours(playback.scene, lods)
-    assert plain[:2].tolist() == [[round(255 * part) for part in COLOURS[i][0]] for i in (0, 1)]
-    by_lod = geometry.object_colours(playback.scene, np.array([0, lods[1], 1]), by_lod=True)
+    lods = np.array([0, playback.scene.lods[1], 1])
+    plain, by_lod = (geometry.object_colours(playback.scene, lods, by_lod=by_lod) for by_lod in (False, True))
+    assert np.array_equal(plain[:2], np.round([255 * np.array(COLOURS[i][0]) for i in (0, 1)]))
     assert np.array_equal(by_lod[:2], np.round([255 * geometry.COARSE, 255 * geometry.FINE]))
-
-
-def test_meshes_are_kept_as_long_as_they_fit(playback, monkeypatch):
-    cache = geometry.MeshCache(playback.scene)
-    first = cache.mesh(0, 100)
-    assert cache.mesh(0, 100) is first
-    monkeypatch.setattr(geometry, "CACHED_FACES", 200)
-    second = cache.mesh(0, 120)
-    assert cache.mesh(0, 120) is second and cache.mesh(0, 100) is not first
 
 
 def test_bounds_hold_all_that_is_shown(playback):
@@ -86,21 +63,53 @@ def test_bounds_hold_all_that_is_shown(playback):
     assert radius < 6
 
 
+# Panels of pictures.
+
+
+def test_a_panel_holds_what_the_title_counts(playback):
+    cache, snapshot = geometry.MeshCache(playback.scene), playback.query("faces")
+    settings = Settings()
+    data = compose(cache, snapshot, np.arange(3), settings)
+    panel = scenes.make_panel(cache, data)
+    # Plain faces come first, then both sides of each intersecting one.
+    faces, hits = 2 * 320 + 576, snapshot.result.faces
+    met = {(int(snapshot.result.pairs[row[0], side]), row[1 + side]) for row in hits.tolist() for side in (0, 1)}
+    assert len(panel.triangles) == len(panel.colours) == faces + 2 * len(met)
+    first = playback.scene.models[0].mesh_at(int(snapshot.lods[0]))
+    assert np.allclose(panel.triangles[:320], first[0][first[1]] + snapshot.poses[0, :3])
+    bright = np.array([COLOURS[0][1], COLOURS[1][1]])
+    marked = (panel.colours[:, None] == bright).all(axis=2).any(axis=1)
+    assert marked.sum() == 2 * len(met) and not marked[:faces].any()
+    assert panel.title == f"3 objects, 1,216 faces\n{len(hits):,} intersecting face pairs"
+    assert len(scenes.make_legend(playback.scene, [data])) == 4
+    alone = scenes.make_panel(cache, compose(cache, snapshot, np.array([0]), Settings()))
+    assert len(alone.triangles) == 320 and alone.title == "1 object, 320 faces\n0 intersecting face pairs"
+
+
+def test_the_camera_sees_all_points():
+    eye = (0.4, 0.35, 1.0)
+    points = np.random.default_rng(3).normal(size=(500, 3)) * [5, 1, 0.2] + [10, 0, 0]
+    camera = camera_around(points, eye, (0, 1, 0))
+    assert np.allclose(camera.view[2], np.array(eye) / np.linalg.norm(eye)) and camera.view[1, 1] > 0
+    local = (points - camera.eye) @ camera.view.T
+    assert (local[:, 2] < 0).all()
+    assert np.abs(local[:, :2] / local[:, 2:]).max() <= np.tan(0.5 * camera.field_of_view)
+
+
 # The viewer scene.
 
 
 class Handle:
     """Notes what it is given."""
 
-    def __init__(self, log, name):
-        self.__dict__.update(log=log, name=name, gone=False)
+    def __init__(self, log, name, options):
+        self.__dict__.update(options, log=log, name=name, gone=False)
 
     def __setattr__(self, key, value):
         self.log.append((self.name, key))
         self.__dict__[key] = value
 
     def remove(self):
-        self.log.append((self.name, "remove"))
         self.__dict__["gone"] = True
 
 
@@ -111,17 +120,12 @@ class Api:
         self.log, self.handles = [], {}
 
     def __getattr__(self, kind):
-        def add(name, *arrays, **options):
+        def add(name, **options):
             self.log.append((name, kind))
-            handle = self.handles[name] = Handle(self.log, name)
-            handle.__dict__.update(options, arrays=arrays)
-            return handle
+            self.handles[name] = Handle(self.log, name, options)
+            return self.handles[name]
 
         return add
-
-    def heard(self):
-        log, self.log[:] = list(self.log), []
-        return log
 
 
 class Show:
@@ -146,13 +150,14 @@ class Show:
         snapshot = playback.query(self.settings.output)
         data = compose(self.cache, snapshot, objects_of_world(playback.worlds, self.settings.world), self.settings)
         self.viewer_scene.show(data)
-        return data, self.api.heard()
+        heard, self.api.log[:] = list(self.api.log), []
+        return data, heard
 
 
 def test_only_changes_are_sent(playback):
     show = Show(playback)
     data, heard = show.show()
-    kinds = ("objects/0", "objects/1", "objects/2", "intersecting/0", "intersecting/1", "contacts")
+    kinds = ("objects/0", "objects/1", "objects/2", "intersecting/0", "intersecting/1")
     assert {name for name, _ in heard} == {f"/{kind}" for kind in kinds}
     assert show.viewer_scene.sent > 0 and data.intersecting_count > 0
     assert show.api.handles["/intersecting/0"].color == tuple(round(255 * part) for part in COLOURS[0][1])
@@ -161,26 +166,23 @@ def test_only_changes_are_sent(playback):
     heard = show.show(moved={2: 50})[1]
     assert ("/objects/2", "position") in heard and ("/objects/2", "vertices") not in heard
     assert not [entry for entry in heard if entry[0] in ("/objects/0", "/objects/1")]
-    assert ("/intersecting/0", "vertices") in heard and ("/contacts", "points") in heard
+    assert ("/intersecting/0", "vertices") in heard
     data, heard = show.show({1: 40})
     assert {key for name, key in heard if name == "/objects/1"} == {"vertices", "faces"}
     assert len(show.api.handles["/objects/1"].faces) == show.cache.count(1, 40)
     assert data.faces == 2 * 320 + show.cache.count(1, 40)
     assert data.error_mean == pytest.approx(playback.scene.models[1].error_at(40) / 3)
     heard = show.show(moved={0: -50})[1]
-    assert ("/contacts", "visible") in heard and not show.api.handles["/contacts"].visible
-    assert not show.api.handles["/intersecting/1"].visible
+    assert ("/intersecting/1", "visible") in heard and not show.api.handles["/intersecting/1"].visible
 
 
 def test_settings_reach_the_viewer_scene(playback):
     show = Show(playback)
-    show.settings.intersecting = show.settings.contacts = False
+    show.settings.intersecting = False
     assert show.settings.output == "count"
     assert {name for name, _ in show.show()[1]} == {"/objects/0", "/objects/1", "/objects/2"}
     show.settings.intersecting = True
     assert show.settings.output == "faces" and ("/intersecting/0", "add_mesh_simple") in show.show()[1]
-    show.settings.contacts = True
-    assert show.settings.output == "contacts" and ("/contacts", "add_line_segments") in show.show()[1]
     show.settings.by_lod = True
     assert sorted(show.show()[1]) == [(f"/objects/{i}", "color") for i in range(3)]
 
@@ -238,4 +240,4 @@ def test_worlds_are_shown_one_at_a_time(tmp_path):
     show.settings.world = 2
     data, heard = show.show()
     assert data.shown.tolist() == [3] and ("/objects/3", "add_mesh_simple") in heard
-    assert not show.api.handles["/objects/0"].visible and data.contact_count == 0
+    assert not show.api.handles["/objects/0"].visible and data.pair_count == 0

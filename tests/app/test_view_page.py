@@ -9,7 +9,7 @@ import time
 import numpy as np
 import PIL.Image
 import pytest
-from helpers.viewer import make_models, make_playback, run_command, write_scene
+from helpers.viewer import make_playback, run_command, write_scene
 
 from warp_abtree.app import load_scene
 from warp_abtree.app.open_playback import open_playback
@@ -44,7 +44,7 @@ def left_over(before):
 
 @pytest.fixture
 def page(server, device):
-    page = Page(server, make_playback(make_models(), device))
+    page = Page(server, make_playback(device))
     page.run(seconds=0.3)
     return page
 
@@ -111,7 +111,7 @@ def count_green(tab) -> int:
 def test_a_page_draws_and_its_controls_reach_the_scene():
     playwright = pytest.importorskip("playwright.sync_api", reason="the browser is driven by playwright (extra dev)")
     with serve() as server, playwright.sync_playwright() as driver:
-        page = Page(server, make_playback(make_models(), "cpu"))
+        page = Page(server, make_playback("cpu"))
         thread = threading.Thread(target=page.run)
         thread.start()
         try:

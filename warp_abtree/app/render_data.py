@@ -27,13 +27,12 @@ class Settings:
 
     world: int = 0  # objects of world -1 are in every one
     intersecting: bool = True  # whether intersecting faces are coloured
-    contacts: bool = True
     by_lod: bool = False  # whether colours tell LODs in the place of models
 
     @property
     def output(self) -> str:
         """The output that a query needs for it."""
-        return "contacts" if self.contacts else "faces" if self.intersecting else "count"
+        return "faces" if self.intersecting else "count"
 
 
 @dataclass(eq=False)
@@ -44,10 +43,9 @@ class RenderData:
     keys: np.ndarray  # `mesh_keys` of every object
     colours: np.ndarray  # of every object, uint8 (n, 3)
     intersecting: dict  # intersecting faces by model, float32 (t, 3, 3)
-    segments: np.ndarray  # of contacts, float32 (k, 2, 3)
     shown: np.ndarray  # indices of the objects that are shown
     intersecting_count: int  # of faces, drawn or not
-    contact_count: int  # drawn or not
+    pair_count: int  # of intersecting faces, drawn or not
     faces: int  # active faces of the shown objects together
     error_mean: float  # mean certified error of the shown objects [units]
 
@@ -76,10 +74,9 @@ def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Sett
         keys=keys,
         colours=geometry.object_colours(scene, snapshot.lods, settings.by_lod),
         intersecting=geometry.intersecting_triangles(cache, snapshot, intersecting) if settings.intersecting else {},
-        segments=geometry.contact_lines(result, inside),
         shown=shown,
         intersecting_count=len(intersecting),
-        contact_count=int(result.count[pairs].sum()) if result.count is not None else 0,
+        pair_count=int(result.count[pairs].sum()) if result.count is not None else 0,
         faces=sum(cache.count(model, lod) * n for model, lod, n in meshes),
         error_mean=sum(scene.models[model].error_at(lod) * n for model, lod, n in meshes) / max(len(shown), 1),
     )

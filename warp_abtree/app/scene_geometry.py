@@ -1,4 +1,4 @@
-"""Geometry of a scene at one time, as arrays in the world: intersecting faces, contacts, bounds.
+"""Geometry of a scene at one time, as arrays in the world: intersecting faces, bounds.
 
 The viewer sends these arrays to the browser, and pictures draw them.
 """
@@ -10,7 +10,6 @@ from warp_abtree.checks.quaternions import matrices_of
 from warp_abtree.scene.scene import Scene
 
 LIFT = 1.5e-3  # of a model's diagonal: offset of intersecting faces from the mesh, to both sides
-LINES = 20_000  # contacts drawn at most
 COARSE, FINE = np.array((0.16, 0.24, 0.60)), np.array((1.0, 0.80, 0.20))
 CACHED_FACES = 4_000_000  # that a cache of meshes keeps
 
@@ -112,17 +111,6 @@ def intersecting_triangles(cache: MeshCache, snapshot, intersecting) -> dict[int
         corners = np.concatenate([corners + step, corners - step])
         found.setdefault(owner, []).append(corners.astype(np.float32))
     return {owner: np.concatenate(parts) for owner, parts in found.items()}
-
-
-def contact_lines(result, shown) -> np.ndarray:
-    """Return the segments of contacts of shown pairs in the world, float32 (k, 2, 3); LINES at most, evenly spread."""
-    contacts = result.contacts
-    if contacts is None or not len(contacts):
-        return np.empty((0, 2, 3), np.float32)
-    contacts = contacts[shown[result.pairs].all(axis=1)[contacts["pair"]]]
-    if len(contacts) > LINES:
-        contacts = contacts[np.linspace(0, len(contacts) - 1, LINES).astype(int)]
-    return np.stack([contacts["p0"], contacts["p1"]], axis=1).astype(np.float32)
 
 
 def bounds(cache: MeshCache, snapshot, shown) -> tuple[np.ndarray, float]:

@@ -16,7 +16,7 @@ from warp_abtree.app.toml.objects import unit
 SUMMARY = "draw a scene, a recorded run or meshes to a PNG file"
 EXAMPLES = (
     "scenes/bunny_tori.toml --frame 30 --out tori.png",
-    "warp:bunny warp:bunny --lod 0.1 --contacts --out bunnies.png",
+    "warp:bunny warp:bunny --lod 0.1 --out bunnies.png",
     "cow.obj --lod tol:0.01 --eye 1 0.3 0.5 --out cow.png",
 )
 
@@ -26,7 +26,6 @@ def add_arguments(sub: Parser):
     add_playback_arguments(sub)
     sub.add_file("--out", "-o", type=Path, required=True, metavar="PNG", help="file to write")
     sub.add_argument("--frame", type=int, default=0, metavar="N", help="frame of a scene or recording to draw (0)")
-    sub.add_argument("--contacts", action="store_true", help="draw the segments in which faces meet")
     for name, what in (("eye", "direction to the eye"), ("up", "direction upwards")):
         sub.add_argument(f"--{name}", nargs=3, type=float, metavar=("X", "Y", "Z"), help=f"{what} (the scene's own)")
     sub.add_argument("--world", type=int, metavar="W", help="world to draw (the scene's own)")
@@ -47,7 +46,7 @@ def picture(options, progress):
     objects = objects_of_world(playback.worlds, world)
     if not len(objects):
         raise ValueError(f"--world: no object is in world {world}")
-    settings = Settings(world, contacts=options.contacts)
+    settings = Settings(world)
     snapshot = go_to(playback, options.frame, settings.output, progress)
     progress.close()
     draw_snapshot(playback.scene, snapshot, objects, options.out, playback.title, (eye, up), settings, options.size)

@@ -1,11 +1,11 @@
-"""Pictures of scenes: objects at their LODs and poses, intersecting faces coloured, contacts."""
+"""Pictures of scenes: objects at their LODs and poses, intersecting faces coloured."""
 
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.pictures.render import Panel, draw
 from warp_abtree.app.render_data import RenderData, Settings, Snapshot, compose, objects_of_world
-from warp_abtree.app.styles import COLOURS, CONTACT_COLOUR
+from warp_abtree.app.styles import COLOURS
 from warp_abtree.scene.scene import Scene
 
 SIZE = 800  # pixels
@@ -29,12 +29,12 @@ def make_panel(cache: geometry.MeshCache, data: RenderData, title: str | None = 
         colours.append(np.tile(COLOURS[model % len(COLOURS)][1], (len(corners), 1)))
     count = len(data.shown)
     title = title or f"{count:,} object{'' if count == 1 else 's'}, {data.faces:,} faces"
-    title += f"\n{data.contact_count:,} intersecting face pairs"
-    return Panel(title, np.concatenate(triangles), np.concatenate(colours), [(data.segments, CONTACT_COLOUR)])
+    title += f"\n{data.pair_count:,} intersecting face pairs"
+    return Panel(title, np.concatenate(triangles), np.concatenate(colours))
 
 
 def make_legend(scene: Scene, panels: list[RenderData]) -> list:
-    """Return (colour, label) of the models, and of the contacts, that panels of one scene show."""
+    """Return (colour, label) of the models that panels of one scene show."""
     legend = []
     for model in dict.fromkeys(np.array(scene.object_model)[panels[0].shown].tolist()):
         plain, bright = COLOURS[model % len(COLOURS)]
@@ -42,7 +42,7 @@ def make_legend(scene: Scene, panels: list[RenderData]) -> list:
         legend.append((plain, name))
         if any(model in data.intersecting for data in panels):
             legend.append((bright, f"{name}, intersecting"))
-    return legend + [(CONTACT_COLOUR, "contacts")] * any(len(data.segments) for data in panels)
+    return legend
 
 
 def draw_snapshot(scene: Scene, snapshot: Snapshot, shown, path, title: str, view, settings: Settings, size: int):
@@ -94,7 +94,7 @@ def draw_scene(loaded, path, time: float, poses=None, lods=None):
         for chosen in panel_lods(loaded) if lods is None else [lods]:
             scene.set_lods(chosen)
             snapshot = Snapshot(0, time, poses, scene.lods, scene.intersect(output="faces"), None)
-            panels.append(compose(cache, snapshot, shown, Settings(contacts=False)))
+            panels.append(compose(cache, snapshot, shown, Settings()))
     finally:
         scene.set_lods(before)
     drawn = [make_panel(cache, data, _swept_title(scene, data, swept[0]) if swept else None) for data in panels]

@@ -103,7 +103,6 @@ class Page:
             self._on_change(handle, lambda value: setattr(self.settings, name, value))
 
         box("intersecting faces", "intersecting")
-        box("contacts", "contacts")
         box("colours by LOD", "by_lod", "blue is coarse, yellow fine")
         worlds = np.unique(self.playback.worlds)
         if len(worlds) > 1 and worlds.max() > 0:
@@ -235,7 +234,7 @@ class Page:
             ("faces shown", f"{data.faces:,}"),
             ("pairs that meet", f"{int(np.count_nonzero(result.any)):,} of {len(result.pairs):,} near"),
             ("certified error, mean", f"{data.error_mean:.3g}"),
-            ("intersecting face pairs", f"{data.contact_count:,}"),
+            ("intersecting face pairs", f"{data.pair_count:,}"),
             ("intersecting faces", f"{data.intersecting_count:,}"),
         ]
         if row is not None:

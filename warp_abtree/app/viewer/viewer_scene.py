@@ -8,7 +8,7 @@ import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.render_data import RenderData
-from warp_abtree.app.styles import COLOURS, CONTACT_COLOUR, to_bytes
+from warp_abtree.app.styles import COLOURS, to_bytes
 
 SINGLE_LIMIT = 24  # objects up to which each has its own mesh; with more, those of a model and LOD are instances of one
 READY_SECONDS = 0.25  # that a browser takes to draw instances of a new mesh
@@ -54,9 +54,6 @@ class ViewerScene:
         for owner in range(len(self.cache.scene.models)):
             corners = data.intersecting.get(owner, ())
             self._show_triangles(f"/intersecting/{owner}", corners, COLOURS[owner % len(COLOURS)][1])
-        options = {"colors": to_bytes(CONTACT_COLOUR), "thickness": 3.0, "thickness_units": "screen"}
-        segments = {"points": data.segments} if len(data.segments) else {}
-        self._show_layer("/contacts", segments, self.api.add_line_segments, **options)
 
     def _update(self, node: _Node, **arrays):
         """Assign the arrays that differ from those sent last."""
@@ -161,23 +158,18 @@ class ViewerScene:
         node.sent["visible"] = visible
         return node
 
-    # Layers over them.
-
-    def _show_layer(self, name, arrays, add, **options):
-        """Show arrays as a node that `add` makes at first; without arrays hide it."""
-        node = self._layers.get(name)
-        if node is None and arrays:
-            self._layers[name] = self._added(add(name, **arrays, **options), arrays)
-        elif node is not None:
-            self._update(node, **arrays)
-            self._visible(node, bool(arrays))
-
     def _show_triangles(self, name, corners, colour):
-        arrays = {}
+        """Show triangles as a node of their own; without any hide it."""
+        node, arrays = self._layers.get(name), {}
         if len(corners):
             vertices = corners.reshape(-1, 3)
             arrays = {"vertices": vertices, "faces": np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)}
-        self._show_layer(name, arrays, self.api.add_mesh_simple, color=to_bytes(colour), **PLAIN)
+        if node is None and arrays:
+            handle = self.api.add_mesh_simple(name, **arrays, color=to_bytes(colour), **PLAIN)
+            self._layers[name] = self._added(handle, arrays)
+        elif node is not None:
+            self._update(node, **arrays)
+            self._visible(node, bool(arrays))
 
 
 def _linear(colours) -> np.ndarray:
