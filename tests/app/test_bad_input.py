@@ -7,8 +7,6 @@ from helpers.samples import SHUTTLE_SCENE
 from helpers.viewer import run_command, write_scene
 
 import warp_abtree as ab
-from warp_abtree.app import load_scene
-from warp_abtree.app.recording import record_run
 
 # A command line, and a part of what is said of it.
 CASES = [
@@ -42,11 +40,10 @@ CASES = [
     ("query ball.obj ball.obj --record out.csv", "ask --output faces or contacts"),
     ("query ball.obj face.npz --record face.npz", "face.npz: is read"),
     ("run gone.toml", "gone.toml"),
-    ("run run.npz", "run.npz: is no scene; view and picture show recordings"),
     ("run bad.toml", "bad.toml: scene.speed: unknown key"),
     ("run scene.toml --frames 0", "--frames"),
     ("run scene.toml --picture out.jpg", "must end in .png"),
-    ("run scene.toml --record rows.xls", ".csv or .json or .npz"),
+    ("run scene.toml --record rows.xls", ".csv or .json"),
     ("run scene.toml --plot gone/plots", "no folder gone"),
     ("run one.toml --objects 5", "count or worlds"),
     ("run scene.toml --budget soon", "'soon' is no time above 0"),
@@ -64,8 +61,6 @@ CASES = [
     ("picture ball.obj --eye 0 1 0 --out out.png", "--eye: eye and up"),
     ("picture ball.obj --eye nan 1 0 --out out.png", "--eye: eye and up"),
     ("picture ball.obj --world 3 --out out.png", "--world: no object is in world 3"),
-    ("picture run.npz --frame 2 --out out.png", "--frame: the recording has 2 frames"),
-    ("picture run.npz --objects 2 --out out.png", "--objects: a recording has its own"),
     ("picture junk.npz --out out.png", "junk.npz"),
     ("picture scene.toml --lod 0.5 --out out.png", "--lod: for meshes"),
     ("picture scene.toml --pose 0 0 0 0 0 0 1 --out out.png", "--pose: for meshes"),
@@ -85,7 +80,6 @@ CASES = [
     ("view gone.obj", "gone.obj"),
     ("view ball.obj --port 70000", "--port: 70000 is outside"),
     ("view ball.obj --host no.such.host.invalid", "no.such.host.invalid:0: cannot be served at"),
-    ("view run.npz --budget 3ms", "--budget: a recording holds its LODs"),
 ]
 FILES = {
     "junk.obj": "hello\n",
@@ -99,11 +93,11 @@ FILES = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Give a folder with a mesh, a model, a scene and a recording, and files that are none."""
+    """Give a folder with a mesh, a model and a scene, and files that are none."""
     path = tmp_path_factory.mktemp("files")
     trimesh.creation.icosphere(subdivisions=2).export(path / "ball.obj")
     ab.Model.from_arrays(np.eye(3), [[0, 1, 2]]).save(path / "face.npz")
-    record_run(load_scene(write_scene(path), device="cpu"), 2)[1].save(path / "run.npz")
+    write_scene(path)
     for name, text in FILES.items():
         (path / name).write_text(text)
     (path / "folder.npz").mkdir()

@@ -17,7 +17,6 @@ import warp_abtree as ab
 from bench.tables import write_json
 from warp_abtree.app.cli.query_command import record_found
 from warp_abtree.app.pictures.render import write_png
-from warp_abtree.app.recording import Recording
 from warp_abtree.checks import atomic_write as files
 from warp_abtree.checks.atomic_write import SUFFIX, atomic_write, sweep_up
 from warp_abtree.jobs import SweepJob, ThisProcess, run_shards
@@ -110,10 +109,6 @@ def run_frame():
     return frame, frame.step()
 
 
-def save_recording(path):
-    Recording("", None, [], run_frame()[0].history, np.zeros((1, 2), np.int32), np.zeros((1, 2, 7))).save(path)
-
-
 def make_shards(path):
     file = path.suffix[1:] if path.suffix != ".json" else "npz"
     run_shards(SweepJob(MODEL, MODEL, np.eye(7)[6:]), path.parent, file=file, pool=ThisProcess("cpu"))
@@ -132,7 +127,6 @@ SHARD = "shard-000000000000-000000000001"
         (lambda path: run_frame()[0].record(path), "rows.json"),
         (lambda path: record_found(run_frame()[1], path), "found.csv"),
         (lambda path: record_found(run_frame()[1], path), "found.npz"),
-        (save_recording, "run.npz"),
         (lambda path: write_png(FigureCanvasAgg(Figure((1, 1))), path), "picture.png"),
         (make_shards, "job.json"),
         (make_shards, f"{SHARD}.npz"),

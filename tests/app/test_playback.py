@@ -1,109 +1,15 @@
-"""Recorded runs, and playbacks of scene files, recordings and meshes: the poses, LODs and rows that were used."""
+"""Playbacks of scene files and meshes: the poses, LODs and rows of their frames."""
 
 import itertools
-import json
 
 import numpy as np
 import pytest
-import trimesh
-from helpers.samples import SHUTTLE_SCENE
 from helpers.viewer import BODIES, make_models, make_playback, write_scene
-from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
-from warp_abtree.app import SceneError, load_scene
+from warp_abtree.app import load_scene
 from warp_abtree.app.open_playback import lay_out, open_playback
-from warp_abtree.app.playback import RecordedPlayback, ScenePlayback
-from warp_abtree.app.recording import FORMAT_VERSION, Recording, record_run
-
-FRAMES = 4
-TURNING = SHUTTLE_SCENE + "random = { rotation = true, turn = 90 }\n"
-FALLING = (
-    TURNING.replace("shuttle = { by = [0.4, 0, 0], period = 2 }", "velocity = [1, 0, 2]")
-    + "[dynamics]\ngravity = [0, -1, 0]\n"
-)
-
-
-def watch(loaded) -> list:
-    """Return the list into which positions and rotations go whenever a frame asks what intersects."""
-    used, make = [], loaded.frame
-
-    def make_watched(**options):
-        frame = make(**options)
-        place, name = (frame.motion, "find") if hasattr(frame.motion, "find") else (loaded.scene, "intersect")
-        ask = getattr(place, name)
-
-        def ask_watched(*arguments, **named):
-            pool = loaded.scene.batch().objects.pool
-            used.append((pool.position.numpy().copy(), pool.rotation.numpy().copy()))
-            return ask(*arguments, **named)
-
-        setattr(place, name, ask_watched)
-        return frame
-
-    loaded.frame = make_watched
-    return used
-
-
-@pytest.mark.parametrize("text", [TURNING, FALLING], ids=["prescribed", "bodies"])
-def test_poses_are_those_that_were_asked_at(tmp_path, text):
-    loaded = load_scene(write_scene(tmp_path, text), device="cpu")
-    used = watch(loaded)
-    _, recording = record_run(loaded, FRAMES)
-    recording.save(tmp_path / "run.npz")
-    assert len(used) == FRAMES
-    assert all(len({arrays[k].tobytes() for arrays in used}) == FRAMES for k in (0, 1))
-    for poses in (recording.poses, Recording.open(tmp_path / "run.npz").poses):
-        assert poses.shape == (FRAMES, 2, 7) and poses.dtype == np.float64
-        for i, (position, rotation) in enumerate(used):
-            assert poses[i, :, :3].tobytes() == position.tobytes()
-            turned = [quaternion_matrix(quaternion) for quaternion in poses[i, :, 3:]]
-            np.testing.assert_allclose(turned, rotation, rtol=0, atol=1e-14)
-        assert poses.tobytes() == recording.poses.tobytes()
-
-
-def test_damaged_recordings_are_refused(tmp_path):
-    path = tmp_path / "run.npz"
-    record_run(load_scene(write_scene(tmp_path, TURNING), device="cpu"), 2)[1].save(path)
-    with np.load(path) as file:
-        good = {name: file[name] for name in file.files}
-    settings, (row, _) = (json.loads(str(good[name])) for name in ("settings", "rows"))
-    for changes, message in (
-        ({"format": np.array("x")}, "not a recording of a run"),
-        ({"version": np.array(FORMAT_VERSION + 1)}, f"version {FORMAT_VERSION + 1}"),
-        ({"lods": good["lods"][:1]}, "lods: shape"),
-        ({"lods": good["lods"].astype(np.int64)}, "int64"),
-        ({"poses": good["poses"][:, :, :6]}, "poses: shape"),
-        ({"rows": np.array(json.dumps([{**row, "hits": 0.5}, row]))}, "damaged .*int.* got .*float.*hits"),
-        ({"rows": None}, "rows' is missing"),
-        ({"settings": np.array("{")}, "damaged"),
-        ({"settings": np.array(json.dumps({**settings, "objects": "many"}))}, "damaged .*objects"),
-        ({"poses": np.array([{}], dtype=object)}, "not a recording"),
-        (b"", "not a recording"),
-        (b"PK\x03\x04junk", "not a recording"),
-    ):
-        if isinstance(changes, bytes):
-            path.write_bytes(changes)
-        else:
-            np.savez(path, **{name: array for name, array in (good | changes).items() if array is not None})
-        with pytest.raises(ValueError, match=message) as caught:
-            Recording.open(path)
-        assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
-
-
-def test_another_mesh_is_noticed(tmp_path):
-    path = write_scene(tmp_path, '[models.m]\nmesh = "m.obj"\n[[objects]]\nmodel = "m"\n')
-    trimesh.creation.box().export(tmp_path / "m.obj")
-    _, recording = record_run(load_scene(path, device="cpu"), 1)
-    trimesh.creation.box([1, 1, 2]).export(tmp_path / "m.obj")
-    with pytest.raises(ValueError, match=r"run.npz: the mesh of models.m is not"):
-        recording.load_scene("run.npz")
-    (tmp_path / "m.obj").unlink()
-    with pytest.raises(SceneError, match=r"m.obj: no such file"):
-        recording.load_scene("run.npz")
-
-
-# Playbacks.
+from warp_abtree.app.playback import ScenePlayback
 
 
 def test_meshes_sweep_and_stay_where_they_are_held(device):
@@ -165,24 +71,6 @@ def test_rigid_bodies_are_shown_where_they_stand(tmp_path, device):
             scene.add(playback.scene.models[playback.scene.object_model[i]], snapshot.poses[i])
         assert len(scene.intersect(output="faces").faces) == len(snapshot.result.faces)
     assert any(len(snapshot.result.faces) for snapshot in snapshots)
-
-
-def test_a_recording_is_shown_as_it_was(tmp_path, device):
-    _, recording = record_run(load_scene(write_scene(tmp_path), device=device), 4)
-    recording.save(tmp_path / "run.npz")
-    playback = open_playback([tmp_path / "run.npz"], device)
-    assert isinstance(playback, RecordedPlayback) and playback.length == 4 and playback.modes() == ["scene", "hold"]
-    for k in (0, 1, 2, 3, 0):
-        snapshot = playback.step("count")
-        assert snapshot.number == k and np.array_equal(snapshot.lods, recording.lods[k])
-        assert np.array_equal(snapshot.poses, recording.poses[k])
-        assert snapshot.row == recording.rows[k] and snapshot.result.count.sum() == recording.rows[k].hits
-    playback.seek(2)
-    assert playback.query("count").result.count.sum() == recording.rows[2].hits
-    playback.hold([2] * len(playback.chosen))
-    assert playback.step("count").lods[0] == 2
-    with pytest.raises(ValueError, match="holds its LODs"):
-        playback.choose("predictive", 3.0)
 
 
 def test_meshes_side_by_side_reach_into_each_other():

@@ -11,10 +11,6 @@ import PIL.Image
 import pytest
 from helpers.viewer import make_playback, run_command, write_scene
 
-from warp_abtree.app import load_scene
-from warp_abtree.app.open_playback import open_playback
-from warp_abtree.app.recording import record_run
-
 pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 
 from warp_abtree.app.viewer.command import serve
@@ -89,15 +85,6 @@ def test_a_port_that_is_taken(tmp_path, capsys):
         port = other.getsockname()[1]
         _, errors = run_command(capsys, "view", write_scene(tmp_path), "--port", port, status=2)
     assert f"127.0.0.1:{port}: cannot be served at (Address already in use)" in errors[0]
-
-
-def test_a_recording_has_a_slider_of_frames(tmp_path, server):
-    record_run(load_scene(write_scene(tmp_path), device="cpu"), 4)[1].save(tmp_path / "run.npz")
-    page = Page(server, open_playback([tmp_path / "run.npz"], "cpu"))
-    act(page, page._seek, 2, seconds=0.3)
-    assert page.snapshot.number == 2 and page._frame_slider.value == 2 and page._budget is None
-    act(page, page._run_button, "step", seconds=0.3)
-    assert page.snapshot.number == 3 and page.snapshot.row.frame == 3
 
 
 def count_green(tab) -> int:

@@ -5,7 +5,7 @@ import threading
 
 import numpy as np
 import pytest
-from helpers.jobs import contents, job_of, lods_of, pair, poses_of, read, run, stop_after
+from helpers.jobs import contents, job_of, lods_of, pair, poses_of, run, stop_after
 
 from warp_abtree.jobs import SweepJob, ThisProcess, read_shards, run_shards, shard_folder, sweep_job
 from warp_abtree.jobs import run as running
@@ -86,20 +86,19 @@ def test_names_have_room_for_more_than_twelve_digits(tmp_path):
 
 
 def test_a_folder_is_of_one_job(tmp_path):
-    options = {"output": "any", "shard": 50}
-    run(SweepJob(*pair(), poses_of(), **options), tmp_path / "out")
+    (a, b), poses, last = pair(), poses_of(), poses_of()
+    run(SweepJob(a, b, poses, shard=50), tmp_path / "out")
     before = contents(tmp_path / "out")
-    models, last = pair(), poses_of()
     last[99, 0] = np.nextafter(last[99, 0], 9)
-    for arguments, more, what in (
-        ((*models, last), {}, "poses"),
-        ((*models, poses_of()), {"output": "count"}, "output"),
-        ((*models, poses_of()), {"shard": 51}, "shard"),
-        ((*models, poses_of(), [3, 3]), {}, "lods"),
-        ((*models[::-1], poses_of()), {}, "models"),
+    for what, other in (
+        ("poses", SweepJob(a, b, last, shard=50)),
+        ("output", SweepJob(a, b, poses, shard=50, output="count")),
+        ("shard", SweepJob(a, b, poses, shard=51)),
+        ("lods", SweepJob(a, b, poses, [3, 3], shard=50)),
+        ("models", SweepJob(b, a, poses, shard=50)),
     ):
         with pytest.raises(ValueError, match=f"holds another job; not the same: .*{what}"):
-            run(SweepJob(*arguments, **{**options, **more}), tmp_path / "out")
+            run(other, tmp_path / "out")
     assert contents(tmp_path / "out") == before
 
 
@@ -133,18 +132,3 @@ def test_a_pool_that_answers_twice_or_not_at_all_is_detected(tmp_path, deal, wha
 
     with pytest.raises(RuntimeError, match=what):
         run_shards(job_of(), tmp_path / "out", pool=Pool("cpu"))
-
-
-@pytest.mark.parametrize("output", ["count", "contacts"])
-def test_parquet_has_the_same_columns(tmp_path, output):
-    pytest.importorskip("pyarrow")
-    for file in ("npz", "parquet"):
-        run(job_of(output, count=50), tmp_path / file, file)
-    table = read(tmp_path / "parquet")
-    if output == "count":
-        np.testing.assert_array_equal(table.pop("pose"), np.arange(50))
-    for name, values in read(tmp_path / "npz").items():
-        if values.ndim == 2:
-            table[name] = np.stack([table.pop(f"{name}_{axis}") for axis in "xyz"], 1)
-        np.testing.assert_array_equal(table.pop(name), values)
-    assert not table

@@ -1,4 +1,4 @@
-"""What `view` and `picture` show: a scene file that runs, a recorded run, or meshes; one snapshot after another.
+"""What `view` and `picture` show: a scene file that runs, or meshes; one snapshot after another.
 
 A playback owns its scene: one thread steps, queries and changes it.
 """
@@ -25,61 +25,6 @@ class MeshView(NamedTuple):
     world: int = 0
 
 
-class Playback:
-    """What all playbacks share.
-
-    Attributes:
-        worlds: World of each object, int (n,); -1 is in every one.
-        length: Number of frames, None where they never end.
-        view: eye and up, directions, and world, to begin with.
-        camera: Called with a time [s], returns the `Camera` that LODs are for; or None.
-        chosen: LOD of every object, int (n,).
-    """
-
-    length: int | None = None
-    _poses: Any = None
-
-    def __init__(self, scene, title, worlds, time_step, view, camera=None, control=None):
-        self.scene, self.title, self.worlds = scene, title, np.asarray(worlds)
-        self.time_step, self.view = time_step, view
-        self.camera, self.control = camera, control or LodControl()
-        self.number = 0
-        self.chosen = scene.lods
-        self._poses = None
-
-    @property
-    def time(self) -> float:
-        """Time of the last snapshot in the scene [s]."""
-        return self.number * self.time_step
-
-    def modes(self) -> list[str]:
-        """Return the modes of choosing LODs, as `choose` takes them."""
-        modes = [OWN, HOLD]
-        if self.length is None:
-            names = [name for name in CONTROLLERS if name != "none"]
-            modes += [name for name in names if name != "tolerance" or self.control.tolerance is not None]
-        return modes
-
-    def choose(self, mode, budget_ms=None):
-        """Choose LODs in one of `modes`."""
-        raise NotImplementedError
-
-    def hold(self, lods):
-        """Hold LODs of all objects, (n,), until others are chosen."""
-        self.choose(HOLD)
-        self.chosen = np.array(lods, np.int32)
-
-    def query(self, output) -> Snapshot:
-        """Query the scene as it is, after LODs, poses or the output changed. Waits for the device."""
-        if not np.array_equal(self.chosen, self.scene.lods):
-            self.scene.set_lods(self.chosen)
-        return self._snapshot(self.scene.intersect(output=output), None)
-
-    def _snapshot(self, result, row):
-        result.check()
-        return Snapshot(self.number, self.time, self._poses.copy(), self.scene.lods, result, row)
-
-
 class _Chooser:
     """Chooses LODs for a `Frame`: by a controller or a function of time, or not at all."""
 
@@ -100,11 +45,20 @@ class _Chooser:
         return wp.array(playback.chosen, dtype=wp.int32, device="cpu")
 
 
-class LivePlayback(Playback):
-    """A scene that runs: each step is a frame, timed by stage."""
+class Playback:
+    """A scene that runs: each step is a frame, timed by stage.
 
-    def __init__(self, *arguments, **options):
-        super().__init__(*arguments, **options)
+    Attributes:
+        worlds: World of each object, int (n,); -1 is in every one.
+        view: eye and up, directions, and world, to begin with.
+        camera: Called with a time [s], returns the `Camera` that LODs are for; or None.
+        chosen: LOD of every object, int (n,).
+    """
+
+    def __init__(self, scene, title, worlds, time_step, view, camera=None, control=None):
+        self.scene, self.title, self.worlds = scene, title, np.asarray(worlds)
+        self.time_step, self.view = time_step, view
+        self.camera, self.control = camera, control or LodControl()
         self._chooser = _Chooser(self)
         self._mode, self._budget = OWN, None
         self.restart()
@@ -124,6 +78,16 @@ class LivePlayback(Playback):
         self._poses = self._poses_now()
         self._frame.lods = self._chooser
         self.choose(self._mode, self._budget)
+
+    @property
+    def time(self) -> float:
+        """Time of the last snapshot in the scene [s]."""
+        return self.number * self.time_step
+
+    def modes(self) -> list[str]:
+        """Return the modes of choosing LODs, as `choose` takes them."""
+        names = [name for name in CONTROLLERS if name != "none"]
+        return [OWN, HOLD, *(name for name in names if name != "tolerance" or self.control.tolerance is not None)]
 
     def choose(self, mode, budget_ms=None):
         """Choose LODs in one of `modes`.
@@ -145,10 +109,25 @@ class LivePlayback(Playback):
             inner = self.control.asked(name, budget_ms).make(self.scene, self.camera)
         self._chooser.inner, self._mode, self._budget = inner, mode, budget_ms
 
+    def hold(self, lods):
+        """Hold LODs of all objects, (n,), until others are chosen."""
+        self.choose(HOLD)
+        self.chosen = np.array(lods, np.int32)
+
     @property
     def budget_ms(self) -> float | None:
         """T that is held [ms], or None."""
         return self._chooser.budget_ms
+
+    def query(self, output) -> Snapshot:
+        """Query the scene as it is, after LODs, poses or the output changed. Waits for the device."""
+        if not np.array_equal(self.chosen, self.scene.lods):
+            self.scene.set_lods(self.chosen)
+        return self._snapshot(self.scene.intersect(output=output), None)
+
+    def _snapshot(self, result, row):
+        result.check()
+        return Snapshot(self.number, self.time, self._poses.copy(), self.scene.lods, result, row)
 
     def step(self, output) -> Snapshot:
         """Run the next frame. Waits for the device.
@@ -167,7 +146,7 @@ class LivePlayback(Playback):
         return self._snapshot(result, row)
 
 
-class ScenePlayback(LivePlayback):
+class ScenePlayback(Playback):
     """A scene file, as `load_scene` returned it."""
 
     def __init__(self, loaded):
@@ -184,7 +163,7 @@ class ScenePlayback(LivePlayback):
         return self.loaded.motion.poses(self.time) if self._bodies is None else self._bodies.poses()
 
 
-class MeshPlayback(LivePlayback):
+class MeshPlayback(Playback):
     """Meshes at poses (n, 7), whose LODs sweep from where they start to the base and back."""
 
     def __init__(self, models, poses, lods, device=None):
@@ -219,41 +198,3 @@ class MeshPlayback(LivePlayback):
 
 def _fraction_at(model, lod) -> float:
     return len(model.mesh_at(lod)[2]) / model.face_count
-
-
-class RecordedPlayback(Playback):
-    """A recorded run: poses and LODs as they were, queried anew; times are those of the recording."""
-
-    length: int
-
-    def __init__(self, recording, loaded):
-        head = loaded.scene, loaded.title, loaded.worlds, loaded.time_step, loaded.picture
-        super().__init__(*head, camera=loaded.camera)
-        self.recording, self.length = recording, len(recording.rows)
-        self._mode = OWN
-        self.restart()
-
-    def restart(self):
-        """Go back to the first frame."""
-        self.seek(0)
-        self._fresh = True
-
-    def choose(self, mode, budget_ms=None):
-        """Take LODs from the recording ("scene"), or leave them as they are ("hold")."""
-        if mode not in (OWN, HOLD):
-            raise ValueError("a recording holds its LODs")
-        self._mode, self.chosen = mode, self.scene.lods
-
-    def seek(self, number):
-        """Go to a frame."""
-        self.number, self._fresh = int(number) % self.length, False
-        if self._mode == OWN:
-            self.chosen = self.recording.lods[self.number].copy()
-        self._poses = self.recording.poses[self.number]
-        self.scene.set_poses(self._poses)
-
-    def step(self, output) -> Snapshot:
-        """Show the next frame, after the last the first. Waits for the device."""
-        self.seek(self.number if self._fresh else self.number + 1)
-        snapshot = self.query(output)
-        return self._snapshot(snapshot.result, self.recording.rows[self.number])

@@ -258,9 +258,8 @@ def _find_shards(path, job) -> dict[tuple[int, int], Path]:
     """
     held = {entry.name for entry in path.iterdir() if SHARD_NAME.match(entry.name)}
     names = {part: _shard_name(*part, job["file"]) for part in _ranges(job)}
-    other = sorted(held.difference(names.values()))
-    if other:
-        raise ValueError(f"{path / other[0]}: a shard of another job")
+    for other in sorted(held.difference(names.values())):
+        raise ValueError(f"{path / other}: a shard of another job")
     return {part: path / name for part, name in names.items() if name in held}
 
 

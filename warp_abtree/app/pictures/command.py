@@ -9,11 +9,10 @@ from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 from warp_abtree.app.pictures.render import import_pyvista
 from warp_abtree.app.pictures.scenes import SIZE, draw_snapshot
-from warp_abtree.app.playback import RecordedPlayback
 from warp_abtree.app.render_data import Settings, Snapshot, objects_of_world
 from warp_abtree.app.toml.objects import unit
 
-SUMMARY = "draw a scene, a recorded run or meshes to a PNG file"
+SUMMARY = "draw a scene or meshes to a PNG file"
 EXAMPLES = (
     "scenes/bunny_tori.toml --frame 30 --out tori.png",
     "warp:bunny warp:bunny --lod 0.1 --out bunnies.png",
@@ -25,7 +24,7 @@ def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
     add_playback_arguments(sub)
     sub.add_file("--out", "-o", type=Path, required=True, metavar="PNG", help="file to write")
-    sub.add_argument("--frame", type=int, default=0, metavar="N", help="frame of a scene or recording to draw (0)")
+    sub.add_argument("--frame", type=int, default=0, metavar="N", help="frame of a scene to draw (0)")
     for name, what in (("eye", "direction to the eye"), ("up", "direction upwards")):
         sub.add_argument(f"--{name}", nargs=3, type=float, metavar=("X", "Y", "Z"), help=f"{what} (the scene's own)")
     sub.add_argument("--world", type=int, metavar="W", help="world to draw (the scene's own)")
@@ -63,16 +62,7 @@ def _check(options):
 
 
 def go_to(playback, frame: int, output, progress=None) -> Snapshot:
-    """Return the snapshot of a frame; a scene runs the frames before it.
-
-    Raises:
-        ValueError: A recording that is not that long.
-    """
-    if isinstance(playback, RecordedPlayback):
-        if frame >= playback.length:
-            raise ValueError(f"--frame: the recording has {playback.length} frames, from 0")
-        playback.seek(frame)
-        return playback.query(output)
+    """Return the snapshot of a frame; a scene runs the frames before it."""
     if frame == 0:
         return playback.query(output)
     for done in range(frame + 1):

@@ -1,4 +1,4 @@
-"""`warp-abtree view`: a page in the browser about a scene, a recorded run or meshes."""
+"""`warp-abtree view`: a page in the browser about a scene or meshes."""
 
 import contextlib
 import gc
@@ -11,12 +11,11 @@ from warp_abtree.app.cli.arguments import Parser, milliseconds
 from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 
 PORT = 8080
-SUMMARY = "look at a scene, a recorded run or meshes in the browser"
+SUMMARY = "look at a scene or meshes in the browser"
 EXAMPLES = (
     "scenes/bunny_tori.toml",
     "warp:bunny warp:bunny --pose 0.3 0 0 0 0 0 1",
     "scenes/focus.toml --objects 500 --budget 20ms",
-    "rain.npz",
 )
 
 
@@ -84,8 +83,6 @@ def view(options, progress):
     named = {"objects": options.objects, "poses": options.pose, "lod": options.lod}
     playback = open_playback(options.source, options.device, progress, **named)
     if options.budget is not None:
-        if playback.length is not None:
-            raise ValueError("--budget: a recording holds its LODs")
         playback.choose(
             "scene" if playback.control.controller in ("predictive", "paper") else "predictive", options.budget
         )

@@ -6,7 +6,6 @@ The server calls back in threads of its own; callbacks only put an event in a qu
 import math
 import queue
 import time
-from typing import Any
 
 import numpy as np
 
@@ -75,21 +74,15 @@ class Page:
         with gui.add_folder("Time"):
             buttons = gui.add_button_group("run", ("play", "step", "restart"))
             buttons.on_click(lambda event: self._post(self._run_button, event.target.value))
-            self._frame_slider = None
-            if playback.length is not None and playback.length > 1:
-                self._frame_slider = gui.add_slider("frame", 0, playback.length - 1, 1, 0)
-                self._on_change(self._frame_slider, self._seek)
             self._state = gui.add_markdown("")
         with gui.add_folder("Level of detail"):
             names = [MODES[mode] for mode in playback.modes()]
             self._mode = gui.add_dropdown("chosen", names, initial_value=names[0])
             self._on_change(self._mode, lambda _: self._choose())
-            self._budget: Any = None  # a slider of viser
-            if len(names) > 2:
-                first = min(max(getattr(playback, "budget_ms", None) or 16.0, BUDGETS[0]), BUDGETS[1])
-                hint = "T: selection, refinement, broad phase and query of a frame"
-                self._budget = gui.add_slider("budget [ms]", *BUDGETS, 0.5, first, hint=hint)
-                self._on_change(self._budget, lambda _: self._choose())
+            first = min(max(playback.budget_ms or 16.0, BUDGETS[0]), BUDGETS[1])
+            hint = "T: selection, refinement, broad phase and query of a frame"
+            self._budget = gui.add_slider("budget [ms]", *BUDGETS, 0.5, first, hint=hint)
+            self._on_change(self._budget, lambda _: self._choose())
             self._all_lod = gui.add_slider(
                 "hold all at [%]", 0.0, 100.0, 0.5, 100.0, hint="of the finest LOD, for every object"
             )
@@ -129,10 +122,6 @@ class Page:
             self.playing, self._steps = False, self._steps + 1
         else:
             self.playback.restart()
-
-    def _seek(self, number):
-        self.playing = False
-        self.playback.seek(int(number))
 
     def _choose(self):
         """Choose LODs in the mode of the panel; the slider is the budget of the modes that hold one."""
@@ -242,5 +231,3 @@ class Page:
             rows += [("select to query", f"{row.cost_ms:.1f} ms"), ("frame", f"{row.total_ms:.1f} ms")]
             rows += [("budget", f"{row.budget_ms:g} ms")] if row.budget_ms is not None else []
         self._state.content = "\n".join(["| | |", "|:--|--:|", *(f"| {key} | {value} |" for key, value in rows)])
-        if self._frame_slider is not None:
-            self._frame_slider.value = snapshot.number
