@@ -14,7 +14,7 @@ from warp_abtree.app.pictures.render import Panel, draw
 from warp_abtree.app.styles import COLOURS
 
 FOLDER = Path(__file__).parent
-INK, PALE, BLUE, RED, GREEN = "#33373d", "#d5d8dc", "#3b76c4", "#d4472f", "#2f9e58"
+INK, PALE, BLUE, RED = "#33373d", "#d5d8dc", "#3b76c4", "#d4472f"
 
 # The same file each time it is drawn.
 matplotlib.rcParams.update({"svg.hashsalt": "warp_abtree", "font.size": 9, "svg.fonttype": "none"})
@@ -136,12 +136,10 @@ def meeting_nodes(states, poses, levels):
             if (low_a <= high_b).all() and (low_b <= high_a).all():
                 kept.append((a, b))
         found.append(kept)
-        children = [
-            [(x, y) for x in (2 * a, 2 * a + 1) for y in (2 * b, 2 * b + 1)]
-            for a, b in kept
-            if 2 * a + 1 < len(states[0].status) and 2 * b + 1 < len(states[1].status)
-        ]
-        pairs = [(a, b) for each in children for a, b in each if states[0].status[a] and states[1].status[b]]
+        counts = [len(state.status) for state in states]
+        inner = [(2 * a, 2 * b) for a, b in kept if 2 * a + 1 < counts[0] and 2 * b + 1 < counts[1]]
+        children = [(a + i, b + j) for a, b in inner for i in (0, 1) for j in (0, 1)]
+        pairs = [(a, b) for a, b in children if states[0].status[a] and states[1].status[b]]
     return found
 
 
