@@ -79,10 +79,6 @@ def refuse(name, make, *values):
     yield from ((name, lambda value=value: make(value)) for value in values)
 
 
-def bodies(name):
-    return lambda value: ab.Dynamics(balls(count=1), **{name: value})
-
-
 BAD_NUMBERS = ("8", None, np.nan, -1.0, [8.0])
 REFUSED = [
     *refuse("time_step", lambda x: ab.Frame(balls(), time_step=x), 0, np.nan, "x"),
@@ -97,7 +93,7 @@ REFUSED = [
     *refuse(r"^budget_ms\b", lambda x: ab.PredictiveController(balls(), x), *BAD_NUMBERS),
     *refuse(r"^tolerance\b", lambda x: ab.ToleranceController(balls(), x), *BAD_NUMBERS),
     *refuse(r"^threshold_ms\b", lambda x: ab.PaperController(balls(), 8.0, threshold_ms=x), "8", np.nan, -1.0),
-    *[call for name in ("density", "friction", "slop") for call in refuse(f"{name}: inf of", bodies(name), np.inf)],
+    *refuse("friction", lambda x: ab.Dynamics(balls(count=1), friction=x), np.inf),
     *refuse(
         "base_faces", lambda x: ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], base_faces=x), 1.5, np.inf, "ten", True
     ),

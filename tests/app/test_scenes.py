@@ -40,7 +40,9 @@ random = { rotation = true, turn = 200, phase = true }
 STEERED = CONTROL + RINGS + CAMERA
 BODIES = (
     "dynamics = { gravity = [0, -1, 0], friction = 0.25 }"
-    + RINGS.replace("shuttle = { by = [0.5, 0.1, 0.2], period = 1 }", "velocity = [0, 0, 1]\ndensity = 2.0")
+    + RINGS.replace("shuttle = { by = [0.5, 0.1, 0.2], period = 1 }", "velocity = [0, 0, 1]").replace(
+        ", phase = true", ""
+    )
     + """
 [[objects]]
 model = "ring"
@@ -223,8 +225,8 @@ def test_near_objects_refine(tmp_path, device):
 def test_rigid_bodies_of_a_file(tmp_path, device):
     loaded = load(tmp_path, BODIES, device=device)
     bodies = loaded.make_bodies()
-    assert bodies.mass[0] / 2 == pytest.approx(2 * math.pi**2 * 0.6 * 0.2**2, rel=0.05)
-    assert loaded.models["ring"].face_count == 2048 and bodies.gravity.tolist() == [0, -1, 0]
+    assert bodies.mass[0] == pytest.approx(2 * math.pi**2 * 0.6 * 0.2**2, rel=0.05)
+    assert loaded.models["ring"].face_count == 2048
     assert np.flatnonzero(~bodies.rigid).tolist() == [24, 25]
     assert bodies.kinematic.tolist() == [False] * 24 + [True, False]
     velocity, angular_velocity = bodies.velocities()
