@@ -132,5 +132,4 @@ class WorldsRunner:
             worlds=whole.worlds[rows],
             base_lods=lods,
             kinematic=whole.kinematic[rows],
-            body={name: values[rows] for name, values in whole.body.items()},
         )

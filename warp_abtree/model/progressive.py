@@ -12,8 +12,12 @@ from warp_abtree.kernels.progressive import collapse, hausdorff_bound, polygon, 
 from warp_abtree.kernels.progressive.heap import Heap
 from warp_abtree.kernels.progressive.quadric import Quadric
 
-MERGES, COVERS = 25_000, 200_000  # and triangles covered by the error bound, per launch of a serial kernel
-HEAP_PER_EDGE, HEAP_EXTRA = 2, 256  # entries of the heap at first: for each edge, and beyond these
+# Merges, and triangles covered by the error bound, per launch of a serial kernel.
+MERGES, COVERS = 25_000, 200_000
+# Entries of the heap at first: for each edge, and beyond these.
+HEAP_PER_EDGE, HEAP_EXTRA = 2, 256
+# Slots of faces that cover triangles together: for each face, and beyond these. None left loosens bounds only.
+SLOTS_PER_FACE, SLOTS_EXTRA = 3, 4096
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
 
 # Error of a bound by rounding, in units of the frame (coordinates about 1/2, so 2^-54 each): reading the vertices of
@@ -304,7 +308,7 @@ def _replay(pos, face_count):
     replay.face_box = _zeros((face_count, 2), wp.vec3d)
     for name in ("face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face"):
         setattr(replay, name, _filled(face_count, -1))
-    pooled = 3 * face_count + 4096  # an empty pool loosens bounds only
+    pooled = SLOTS_PER_FACE * face_count + SLOTS_EXTRA
     for name in ("slot_face", "slot_triangle", "slot_sibling", "slot_next", "slot_last"):
         setattr(replay, name, _filled(face_count + pooled, -1))
     replay.free_slot = _filled(pooled, 0)
