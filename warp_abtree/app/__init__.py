@@ -1,7 +1,6 @@
 """Applications of the library: scene files, pictures, the viewer and the command line."""
 
-from warp_abtree.app.pictures.scenes import draw_objects
 from warp_abtree.app.toml.decode import SceneError
 from warp_abtree.app.toml.scene_file import SceneFile, load_scene
 
-__all__ = ["SceneError", "SceneFile", "draw_objects", "load_scene"]
+__all__ = ["SceneError", "SceneFile", "load_scene"]

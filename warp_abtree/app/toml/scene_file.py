@@ -28,8 +28,6 @@ class SceneFile:
 
     path: Path
     title: str
-    text: str  # the file
-    objects: int | None  # the number of objects that was asked for, None for the file's own
     frames: int
     time_step: float  # between frames [s]
     models: dict  # `Model` by name
@@ -120,7 +118,7 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
         raise ValueError(f"objects {objects!r} is not a whole number")
     objects = None if objects is None else whole_number(objects, "objects", 1, 2**31 - 1)
     path, scene = find_scene(path), Scene(device=device)
-    text, tables = read_tables(path, text)
+    tables = read_tables(path, text)
     if not tables.objects:
         fail(path, "the file", "no [[objects]]")
     control = make_control(path, tables.lod)
@@ -135,8 +133,6 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
     loaded = SceneFile(
         path=path,
         title=path.stem if tables.scene.title is None else tables.scene.title,
-        text=text,
-        objects=objects,
         frames=tables.scene.frames,
         time_step=tables.scene.time_step,
         models=models,
