@@ -19,16 +19,15 @@ def drawn(tmp_path_factory):
     spec = importlib.util.spec_from_file_location("figures", DOCS / "figures.py")
     figures = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(figures)
-    figures.FOLDER = tmp_path_factory.mktemp("figures")
     titles = {}
-    with pytest.MonkeyPatch.context() as patch:
 
-        def draw(panels, path, title, *_):
-            titles[path.name] = [title, *(panel.title for panel in panels)]
-            path.touch()
+    def draw(panels, path, title, *_):
+        titles[path.name] = [title, *(panel.title for panel in panels)]
+        path.touch()
 
-        patch.setattr(figures, "draw", draw)  # tests of pictures cover it; here what it is given
-        figures.main()
+    # Tests of pictures cover what draws; here it is what it is given.
+    figures.FOLDER, figures.draw = tmp_path_factory.mktemp("figures"), draw
+    figures.main()
     return figures.FOLDER, titles
 
 
