@@ -26,8 +26,8 @@ def balls(device="cpu", count=2):
 def test_a_number_of_objects_is_whole_and_above_0(tmp_path):
     for count in (0, 1.5, "x", True, np.nan):
         with pytest.raises(ValueError, match=r"^objects [^\n]*$"):
-            load_scene(write_scene(tmp_path, SCENE), device="cpu", objects=count)
-    loaded = load_scene(write_scene(tmp_path, SCENE), device="cpu", objects=np.int64(5))
+            load_scene(write_scene(tmp_path), device="cpu", objects=count)
+    loaded = load_scene(write_scene(tmp_path), device="cpu", objects=np.int64(5))
     assert loaded.scene.object_count == 5
 
 

@@ -49,8 +49,7 @@ def check_paper(parts, model):
     assert {row["k"] for row in moves if row["splits"] == model.lod_max} == {model.face_count}
     assert all(row["nodes"] <= row["bound"] for row in parts["figure6"]) and all(row["refit_ms"] > 0 for row in moves)
     assert all(row["k"] == len(changed_faces(model, row["splits"])) for row in pick(moves, from_finest=True))
-    for row in parts["share"]:
-        assert row["k"] < 0.1 * model.face_count and row["ratio"] > 0
+    assert all(row["k"] < 0.1 * model.face_count and row["ratio"] > 0 for row in parts["share"])
     hits = [[row["hits"] for row in pick(parts["share"], configuration=name)] for name in ("touching", "deep")]
     assert all(few <= many for few, many in zip(*hits, strict=True))
     assert all(row["ours_nodes"] == row["static_nodes"] for row in pick(parts["static"], share=1.0))
@@ -75,9 +74,8 @@ def check_tradeoff(parts, model):
     rows = parts["competitors"]
     ours, theirs = (pick(rows, method=name) for name in (competitors.OURS, competitors.OURS_FCL))
     assert len(ours) == len(theirs) == 4
-    for one, other in zip(ours, theirs, strict=True):
-        assert (one["missed"], one["invented"]) == (other["missed"], other["invented"])
-        assert one["contact_mean"] == pytest.approx(other["contact_mean"], abs=1e-6)
+    for name in ("missed", "invented", "contact_mean"):
+        assert [row[name] for row in ours] == pytest.approx([row[name] for row in theirs], abs=1e-6)
     for row in pick(rows, method=competitors.HULL):
         assert row["missed"] == 0 and row["late_max"] < 1e-6 and row["contact_mean"] > 1e-3
     assert any(row["front"] for row in rows) and not all(row["front"] for row in rows)

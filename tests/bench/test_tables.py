@@ -62,13 +62,11 @@ def test_models_are_kept(tmp_path, monkeypatch):
 
 
 def test_command_hands_over(tmp_path, capsys):
-    with pytest.raises(ValueError, match="checkout"):
-        bench_command.bench(["paper"], tmp_path)
-    with pytest.raises(ValueError, match="name a benchmark"):
-        bench_command.bench([])
-    out = ["bench", "paper", "--out", str(tmp_path / "out")]
+    for words, folder, message in ((["paper"], tmp_path, "checkout"), ([], None, "name a benchmark")):
+        with pytest.raises(ValueError, match=message):
+            bench_command.bench(words, folder)
     for words, message in ((["--only", "nothing"], "no part nothing"), (["--device", "tpu"], "no device 'tpu'")):
         with pytest.raises(SystemExit) as stop:
-            cli.main([*out, *words])
+            cli.main(["bench", "paper", "--out", str(tmp_path / "out"), *words])
         assert stop.value.code == 2 and message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

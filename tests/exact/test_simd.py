@@ -34,11 +34,9 @@ Items = wp.array[wp.int64]
 
 @wp.struct
 class Posed:
-    """Faces of two models, and the pose between them."""
-
-    models: ModelPool
-    states: StatePool
-    pose: PairPose
+    models: ModelPool  # vertices of both
+    states: StatePool  # faces of both
+    pose: PairPose  # of B in A's frame
 
 
 def posed_faces(field, points, corners, **pose):

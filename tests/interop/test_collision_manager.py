@@ -20,22 +20,18 @@ from trimesh.transformations import translation_matrix as shift
 
 def shapes():
     """Convex solids, surfaces with holes, an open sheet, and one of several parts."""
-    rng = np.random.default_rng(0)
-    ball, box = trimesh.creation.icosphere(subdivisions=1, radius=0.5), trimesh.creation.box((0.7, 0.9, 0.5))
-    parts = [trimesh.creation.icosphere(subdivisions=0, radius=0.1) for _ in range(5)]
-    for part in parts:
-        part.apply_translation(rng.uniform(-0.5, 0.5, 3))
-    sheet = trimesh.creation.icosphere(subdivisions=2, radius=0.8)
-    sheet = trimesh.Trimesh(sheet.vertices, sheet.faces[:60], process=False)
+    rng, create = np.random.default_rng(0), trimesh.creation
+    crumbs = [create.icosphere(subdivisions=0, radius=0.1) for _ in range(5)]
+    sheet = create.icosphere(subdivisions=2, radius=0.8)
     return {
-        "ball": ball,
-        "box": box,
-        "large box": trimesh.creation.box((2, 2, 2)),
-        "cylinder": trimesh.creation.cylinder(0.3, 1.2, sections=12),
-        "torus": trimesh.creation.torus(0.6, 0.2, 16, 8),
-        "annulus": trimesh.creation.annulus(0.3, 0.5, 0.6, sections=12),
-        "crumbs": trimesh.util.concatenate(parts),
-        "sheet": sheet,
+        "ball": create.icosphere(subdivisions=1, radius=0.5),
+        "box": create.box((0.7, 0.9, 0.5)),
+        "large box": create.box((2, 2, 2)),
+        "cylinder": create.cylinder(0.3, 1.2, sections=12),
+        "torus": create.torus(0.6, 0.2, 16, 8),
+        "annulus": create.annulus(0.3, 0.5, 0.6, sections=12),
+        "crumbs": trimesh.util.concatenate([part.apply_translation(rng.uniform(-0.5, 0.5, 3)) for part in crumbs]),
+        "sheet": trimesh.Trimesh(sheet.vertices, sheet.faces[:60], process=False),
     }
 
 
@@ -269,10 +265,9 @@ def test_known_distances(device, gap):
 
 def test_managers_without_objects(device):
     theirs, ours = both(device)
-    ball = SHAPES["ball"]
-    assert ours.in_collision_internal(True, True) == theirs.in_collision_internal(True, True) == (False, set(), [])
-    assert ours.in_collision_single(ball, None, True, True) == (False, set(), [])
-    assert ours.in_collision_other(ours) is False
+    ball, none = SHAPES["ball"], (False, set(), [])
+    assert ours.in_collision_internal(True, True) == theirs.in_collision_internal(True, True) == none
+    assert ours.in_collision_single(ball, None, True, True) == none and ours.in_collision_other(ours) is False
     assert ours.min_distance_internal(return_names=True) == (math.inf, None)
     assert ours.min_distance_single(ball, return_name=True, return_data=True) == (math.inf, None, None)
     assert ours.min_distance_other(ours) == math.inf

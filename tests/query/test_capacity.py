@@ -113,6 +113,7 @@ def test_the_error_names_the_bytes(device, asked, monkeypatch):
 def test_more_pairs_than_a_launch_holds(asked, monkeypatch):
     monkeypatch.setattr(request, "PAIRS_MAX", len(MORE_PAIRS))
     scene, query, check = asked
+    ab.Query(scene, pairs=MORE_PAIRS)  # as many as it holds
     with pytest.raises(ValueError, match="buffers: pairs 13 is outside"):
         ab.Query(scene, "any", capacity=ab.Buffers(pairs=13))
     many = np.concatenate([MORE_PAIRS, PAIRS])
