@@ -20,7 +20,7 @@ import warp_abtree as ab
 
 from . import tables
 
-CASES = ("baselines", "budget", "build", "exact", "frame", "precision", "query", "scale", "scaling", "sweep", "update")
+CASES = tuple("baselines budget build exact frame host precision query scale scaling sweep update".split())
 STUDIES = ("paper", "tradeoff", "all")
 FIGURES = ("build", "scale", "update")  # cases whose figures are laid out in cases/figures.toml
 # A case, and a study, takes the options that its function `run` has as arguments.

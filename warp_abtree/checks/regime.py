@@ -15,6 +15,7 @@ class Regime:
         cpu_threads: Threads of a launch on the CPU; None is all that the process may use.
         full_refit: Fraction of its faces past which a state is refitted whole, by kind of device, as measured. A slice
             repeats faces, so k is smaller still; on a GPU few nodes take as long as many.
+        packs_results: Whether results are packed and sorted on the device before they are brought over; None: on CUDA.
         relax_by_color: Whether contacts of rigid bodies are relaxed by color, a thread a pair; None: on CUDA they are,
             on the CPU one thread relaxes them all.
     """
@@ -25,6 +26,7 @@ class Regime:
     key_bits: int = 63
     cpu_threads: int | None = None
     full_refit: dict = field(default_factory=lambda: {"cpu": 0.5, "cuda": 0.01})
+    packs_results: bool | None = None
     relax_by_color: bool | None = None
 
 

@@ -338,7 +338,7 @@ class SteppedMotion:
         self.find(time_step)
 
     def find(self, time_step: float):
-        """Find the contacts of the step from here; return a `ManifoldResult` without points. Waits for the device."""
+        """Find the contacts of the step from here; return a `Result` without points. Waits for the device."""
         targets = None if self.prescribed is None else self.prescribed.poses(self._time + time_step)
         self.dynamics.find(time_step, targets)
         return self.dynamics.query.result(with_points=False)

@@ -143,13 +143,15 @@ class LaunchGuard:
         """Let results count as none until the next launch."""
         self.launched[:1].fill_(NOT_LAUNCHED)
 
-    def check(self):
-        """Raise where the results are not of a whole launch on the arrays in use. Waits for the device.
+    def check(self, launched: int):
+        """Raise where the results are not of a whole launch on the arrays in use.
+
+        Args:
+            launched: First entry of the array of this name, as it was read.
 
         Raises:
             RuntimeError: Nothing was launched, or a launch was interrupted, or it was of a stale graph.
         """
-        launched = int(self.launched.numpy()[0])
         if launched == NOT_LAUNCHED:
             raise RuntimeError("there is no result: nothing was launched since this was made or given other pairs")
         if launched == INTERRUPTED:
