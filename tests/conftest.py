@@ -45,6 +45,13 @@ def real_mesh_path_fixture():
     return real_mesh_path
 
 
+@pytest.fixture(params=["blocks", "lists"])
+def update_path(request):
+    """Update tree states both ways: a block each, and all by level lists."""
+    with testing.regime(block_updates=request.param == "blocks"):
+        yield
+
+
 @pytest.fixture
 def half_refitted_in_part():
     """Refit states in part up to half of their faces on every device, also where the whole costs less."""

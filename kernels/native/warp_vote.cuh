@@ -10,6 +10,24 @@ inline CUDA_CALLABLE bool warp_any(bool flag) {
 #endif
 }
 
+inline CUDA_CALLABLE wp::float64 add_in_order(wp::float64 sum, wp::float64 x, wp::int32 count) {
+#if defined(__CUDA_ARCH__)
+    for (int lane = 0; lane < count; ++lane)
+        sum += __shfl_sync(0xffffffffu, x, lane);
+    return sum;
+#else
+    return sum + x;
+#endif
+}
+
+inline CUDA_CALLABLE wp::float64 warp_max(wp::float64 x) {
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step >>= 1)
+        x = wp::max(x, __shfl_xor_sync(0xffffffffu, x, step));
+#endif
+    return x;
+}
+
 inline CUDA_CALLABLE wp::int32 lowest_bit(wp::int32 bits) {
 #if defined(__CUDA_ARCH__)
     return __ffs(bits) - 1;

@@ -92,6 +92,15 @@ def read_signed_pair(list: wp.uint64, i: wp.int32) -> wp.vec4i:
 def warp_any(flag: bool) -> bool: ...
 
 
+@wp.func_native(vote_code("add_in_order"))
+def add_in_order(sum: wp.float64, x: wp.float64, count: wp.int32) -> wp.float64:
+    """Return a sum and the numbers of so many lanes, added one after the other; on the CPU, of the one thread."""
+
+
+@wp.func_native(vote_code("warp_max"))
+def warp_max(x: wp.float64) -> wp.float64: ...
+
+
 @wp.func_native(vote_code("lowest_bit"))
 def lowest_bit(bits: wp.int32) -> wp.int32: ...
 

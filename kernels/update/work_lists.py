@@ -24,7 +24,8 @@ WHOLE = wp.constant(-1)
 class UpdateLists:
     """States under update: those that refit what a slice of faces touches (partial), and those refitted whole (full).
 
-    A block updates a state by itself (`block_update`) or all threads work through lists, level by level. A total holds two counts in one word, so that one atomic takes an update's place and its items' places:
+    A block updates a state by itself (`block_update`), or all threads work through lists, level by level. A total holds
+    two counts in one word, so that one atomic takes an update's place and its items' places:
 
         63           32 31            0
         [   updates    |    items     ]    items: entries of all slices, or faces

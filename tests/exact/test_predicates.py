@@ -73,13 +73,13 @@ def expansion2d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec2d), out: 
 @wp.kernel
 def double3d_kernel(points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=wp.float64)):
     i = wp.tid()
-    out[i] = double_orient3d(points[i, 0], points[i, 1], points[i, 2], points[i, 3])
+    out[i] = double_orient3d(points[i, 0], points[i, 1], points[i, 2], points[i, 3])[0]
 
 
 @wp.kernel
 def double2d_kernel(points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.float64)):
     i = wp.tid()
-    out[i] = double_orient2d(points[i, 0], points[i, 1], points[i, 2])
+    out[i] = double_orient2d(points[i, 0], points[i, 1], points[i, 2])[0]
 
 
 @wp.kernel

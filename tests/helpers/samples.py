@@ -141,11 +141,15 @@ def stored_state(scene_models, batch, state):
     slot = states.slots[state]
     model = scene_models[slot.model]
     nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
+    marked = np.unpackbits(states.pool.node_mark.numpy().view(np.uint8), bitorder="little")[nodes]
+    lower, upper, skip = states.read_nodes(slot, model.tree.node_count)
     corners = states.pool.face_corner.numpy()[slot.face_start : slot.face_start + model.face_count, :3]
     return {
         "lod": int(states.pool.lod.numpy()[state]),
-        "status": states.pool.node_status.numpy()[nodes],
-        **dict(zip(("lower", "upper", "skip"), states.read_nodes(slot, model.tree.node_count))),
+        "status": np.where(marked, 2, skip >= 0).astype(np.int32),
+        "lower": lower,
+        "upper": upper,
+        "skip": skip,
         "corner": np.where(corners < 0, -1, corners - batch.models.vertex_start[slot.model]),
     }
 

@@ -145,6 +145,7 @@ class Walker:
 
 @pytest.mark.parametrize("name", ["cow", "fcl-env", "woody"])
 @pytest.mark.slow
+@pytest.mark.usefixtures("update_path")
 def test_random_walk_of_real_meshes(device, name):
     rng = np.random.default_rng(4)
     walker = Walker([sample(name)], [0, 0, 0], device)
@@ -165,6 +166,7 @@ soups = st.builds(
 shares = st.lists(st.tuples(*[st.floats(0, 1)] * 3), min_size=1, max_size=6)
 
 
+@pytest.mark.usefixtures("update_path")
 @settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(soups, soups, shares)
 def test_walks_over_soups(device, first, second, walk):

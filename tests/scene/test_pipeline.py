@@ -19,6 +19,7 @@ from helpers.scenes import (
 from oracles.triangle import pose_matrix, quaternion_matrix
 
 import warp_abtree as ab
+from warp_abtree import testing
 from warp_abtree.state import work_lists
 
 pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
@@ -26,6 +27,7 @@ pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
 NAMES = ("one", "two", "small ball", "crumbs", "grid", "soup", "lattice soup", "twins")
 
 
+@pytest.mark.usefixtures("update_path")
 def test_random_walk_in_a_graph(device):
     """Bits of a rebuild, and the counters of the host's path, which moves a scene of one object in the same steps."""
     rng = np.random.default_rng(1)
@@ -64,7 +66,8 @@ def test_all_states_at_the_crossover(device, monkeypatch):
         moves.append((start[high[low]] - start[low], low, high[low]))
         assert moves[-1][0] > 0.9 * half
     lengths, low, high = np.array(moves).T
-    frame = ab.Pipeline(scene)
+    with testing.regime(block_updates=False):
+        frame = ab.Pipeline(scene)
     plan = frame._update.plan
     starts = np.append(plan.level_start.numpy(), len(plan.level_node))
     for lods in (low, high, low, high):
@@ -192,9 +195,12 @@ def test_launches_of_a_frame(device, monkeypatch, name, levels):
     for count in (2, 40):
         scene = add_objects(device, [name] * count)
         large = sum(count << level > 1024 for level in range(levels))  # nodes of all states on a level
-        for options, own in (({}, 6 + large), ({"ladder": [[0, 1]]}, 1)):
-            assert count_launches(monkeypatch, ab.Pipeline(scene, "count", **options)) == 1 + own + 2 + narrow + 1
-            frame = ab.Pipeline(scene, "count", pairs=[(0, 1)], within=1.0, **options)
+        for blocks, options, own in ((True, {}, 3), (False, {}, 6 + large), (True, {"ladder": [[0, 1]]}, 1)):
+            with testing.regime(block_updates=blocks):
+                frame = ab.Pipeline(scene, "count", **options)
+            assert count_launches(monkeypatch, frame) == 1 + own + 2 + narrow + 1
+            with testing.regime(block_updates=blocks):
+                frame = ab.Pipeline(scene, "count", pairs=[(0, 1)], within=1.0, **options)
             assert count_launches(monkeypatch, frame) == 1 + own + narrow + 2 + 1
 
 

@@ -26,7 +26,7 @@ from warp_abtree.query.result import Result
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.budget_report import budget_report
 from warp_abtree.simulate.motion import triangle_wave
-from warp_abtree.state.lod_update import full_refit_fraction
+from warp_abtree.state.work_lists import full_refit_fraction
 
 
 def resolve_lod(model: Model, request) -> int:

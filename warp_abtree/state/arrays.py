@@ -116,13 +116,12 @@ class StateArrays:
 
     def _allocate_nodes(self, count):
         old, kept = self.pool, self.node_total
-        status = wp.zeros(count, dtype=wp.int32, device=self.device)
+        mark = wp.zeros(count // 32 + 1, dtype=wp.uint32, device=self.device)
         box = wp.empty(2 * count, dtype=wp.vec4, device=self.device)
         if kept:
-            wp.copy(status, old.node_status, count=kept)
             wp.copy(box, old.node_box, count=2 * kept)
         self.generation.advance()
-        self.pool.node_status, self.pool.node_box = status, box
+        self.pool.node_mark, self.pool.node_box = mark, box
         wp.launch(clear_node_kernel, count - kept, [kept, self.pool], device=self.device)
         self.node_room = count
 
@@ -224,7 +223,7 @@ class StateArrays:
         """Forget all states; the pool keeps its room."""
         self.slots, self.free = [], {}
         self.node_total = self.face_total = 0
-        self.pool.node_status.zero_()
+        self.pool.node_mark.zero_()
         wp.launch(clear_node_kernel, self.node_room, [0, self.pool], device=self.device)
 
 

@@ -5,17 +5,18 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import LEVEL_MAX
-from warp_abtree.kernels.update import refit
+from warp_abtree.kernels.update import block_update, refit
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
-from warp_abtree.state.work_lists import WorkLists, active_update, block_limits, make_level_lists, refine_meshes
-
-
-def full_refit_fraction(device) -> float:
-    """Return the fraction of its faces past which a state is refitted whole."""
-    return current_regime().full_refit["cuda" if device.is_cuda else "cpu"]
+from warp_abtree.state.work_lists import (
+    WorkLists,
+    active_update,
+    block_limits,
+    make_level_lists,
+    partial_limit,
+    refine_meshes,
+)
 
 
 def choose_states(states: StateArrays, wanted: set, used: set) -> tuple[list, dict]:
@@ -77,10 +78,12 @@ class LodUpdate(WorkLists):
         self.state, self.lod, self.source = np.array(moves, np.int32).reshape(-1, 3).T
         owner = np.array([states.slots[s].model for s in self.state], np.int64)
         self._owner, self._face_count = owner, models.face_count[owner]
-        slice_start = self._measure_slices()
-        blocks = self._take_blocks()
+        longest, whole = block_limits(models, len(self.state), states.device)
+        slice_start = self._measure_slices(partial_limit(models, longest, states.device))
+        blocks = np.where(self.full, whole[owner], self.slice_length <= longest[owner])
         plan, *rooms = self._list_work(models.depth[owner], slice_start, blocks)
-        super().__init__(plan, int(blocks.sum()), *rooms, states.device)
+        shallow = bool((models.depth <= block_update.SHALLOW_DEPTH).all())
+        super().__init__(plan, int(blocks.sum()), shallow, *rooms, states.device)
         self._copies = self._plan_copies()
 
     def __repr__(self):
@@ -100,23 +103,17 @@ class LodUpdate(WorkLists):
         marked = self.plan.marked_count.numpy()[self.state]
         return np.where(self.full, 2 * self._face_count - 1, marked).astype(np.int32)
 
-    def _measure_slices(self):
+    def _measure_slices(self, limit):
         """Find the slice of each update: the faces touched between two LODs are contiguous, whatever the distance."""
         start, self.slice_length = (np.zeros(len(self.state), np.int64) for _ in range(2))
         self.full = np.ones(len(self.state), bool)
-        fraction = full_refit_fraction(self.states.device)
         for i in np.flatnonzero(self.source >= 0):
             bounds = self.models.split_bounds[self._owner[i]]
             low, high = sorted((int(self.lod[i]), self.states.slots[self.source[i]].lod))
             touched = int(bounds[high] - bounds[low])
-            if touched <= fraction * self._face_count[i]:
+            if touched <= limit[self._owner[i]]:
                 self.full[i], start[i], self.slice_length[i] = False, bounds[low], touched
         return start
-
-    def _take_blocks(self):
-        """Return which updates a block takes each, bool (u,)."""
-        longest, whole = block_limits(self.models, len(self.state), self.states.device)
-        return np.where(self.full, whole[self._owner], self.slice_length <= longest[self._owner])
 
     def _list_work(self, depth, slice_start, blocks):
         """Return the plan for kernels, and the room of entries, faces and levels."""
