@@ -20,7 +20,7 @@ COUNT_COLUMNS = wp.constant(5)
 BLOCK_DIM = 256
 
 
-@wp.func_native(native.body("records.h", "store_flag"))
+@wp.func_native(native.body("numbers.cuh", "store_flag"))
 def store_flag(words: wp.array(dtype=wp.int64), at: wp.int64, flag: wp.int32):
     """Write a byte of 0 or 1 at a place counted in bytes."""
 

@@ -1,7 +1,9 @@
 """Contacts and their summaries for readers: as records in the layout of `Result.contacts`, or as arrays of a type.
 
-A record is packed without padding, so that its numbers lie at any byte; one thread writes one number, neighbours side
-by side.
+A record has no padding, so that its numbers lie at any byte; one thread writes one number, neighbours side by side:
+
+    [ pair 4 | faces 2 x 4 | p0, p1, normal_a, normal_b, normal 5 x 3 x 4 or 8 | coplanar 1 ] bytes of a contact
+    [ count 8 | point, normal 2 x 3 x 4 or 8 | depth 4 or 8 ] bytes of a summary
 """
 
 import functools
@@ -19,12 +21,12 @@ wp.set_module_options(MODULE_OPTIONS)
 CONTACT_NUMBERS, PAIR_NUMBERS = 19, 8
 
 
-@wp.func_native(native.body("records.h", "store_bits"))
+@wp.func_native(native.body("numbers.cuh", "store_bits"))
 def store_bits(bytes: wp.array(dtype=wp.uint8), at: wp.int32, size: wp.int32, bits: wp.int64):
     """Write the lowest bytes of a word, the lowest first."""
 
 
-@wp.func_native(native.body("records.h", "round_to_float32"))
+@wp.func_native(native.body("numbers.cuh", "round_to_float32"))
 def round_to_float32(x: wp.float64) -> wp.float32:
     """Return a number as float32, infinite beyond its range, NaN of the bits 0x7fc00000."""
 

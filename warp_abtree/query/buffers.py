@@ -55,6 +55,11 @@ class QueryBuffers:
             raise ValueError("this query was made without within")
         if self.near is not None:
             within = check_within(self._within if within is None else within, len(pairs))
+        self.replace_pairs(pairs, within)
+
+    def replace_pairs(self, pairs: np.ndarray, within):
+        """Do what `set_pairs` does, with pairs and distances that are checked, None without."""
+        self._check_whole()
         # What may fail for lack of memory comes before anything that changes the query.
         made = []
         if len(pairs) > len(self.pairs):

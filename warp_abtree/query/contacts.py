@@ -51,6 +51,7 @@ from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import CapacityError
 from warp_abtree.query.result import VECTORS, Found, contact_dtypes
 from warp_abtree.query.sorting import sort_on_device
+from warp_abtree.query.staging import first_rows
 
 # Warps that a multiprocessor runs at a time, by their registers, of those that find deferred contacts.
 DEFERRED_WARPS = 8
@@ -245,9 +246,7 @@ class ContactQuery(Query):
         self._launch_kernel(pack.contact_copier(real), count, [self.faces, self.contacts, *found.contacts.values()])
         self._launch_kernel(pack.summary_copier(real), pairs, [self.pair_contacts, *means.values()])
         found.pair_contacts = {"count": found.count, **means}
-        found.faces = self._empty(count, wp.vec3i)
-        if count:
-            wp.copy(found.faces, self.faces, count=count)
+        found.faces = wp.clone(first_rows(self.faces, count))
 
     def _real(self):
         return wp.float64 if np.dtype(self.contact_dtype) == np.float64 else wp.float32

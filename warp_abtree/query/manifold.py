@@ -29,6 +29,7 @@ from warp_abtree.kernels import broad_phase
 from warp_abtree.kernels.contact import manifold, points
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.result import Found, Result
+from warp_abtree.query.staging import first_rows
 
 POINTS_MAX = int(manifold.POINTS)
 
@@ -121,7 +122,7 @@ class ManifoldQuery(ContactQuery):
 
     def _read_rows(self, found: Found, count: int, device: bool):
         pairs, names = len(found.pairs), ("point", "normal", "depth")
-        arrays = {name: getattr(self.manifolds, name)[:pairs] for name in ("count", *names)}
+        arrays = {name: first_rows(getattr(self.manifolds, name), pairs) for name in ("count", *names)}
         if device:
             found.points = {name: wp.clone(array) for name, array in arrays.items()}
             return

@@ -11,7 +11,7 @@ from warp_abtree.kernels import results as kernels
 from warp_abtree.query.buffers import QueryBuffers
 from warp_abtree.query.result import COUNTERS, Found, Result, Totals
 from warp_abtree.query.sorting import sort_on_device, sort_passes, sort_rows
-from warp_abtree.query.staging import Staging, view_memory
+from warp_abtree.query.staging import Staging, first_rows, view_memory
 
 HEADER, COLUMNS = int(kernels.HEADER_WORDS), int(kernels.COUNT_COLUMNS)
 
@@ -115,7 +115,7 @@ class QueryReadout(QueryBuffers):
         column, words = 8 * n, [part(8 * HEADER + 8 * n * k, wp.int64) for k in range(COLUMNS)]
         flags = 8 * HEADER + column * COLUMNS
         if self.broad_phase is None:
-            pairs = wp.clone(self.pairs[:n])
+            pairs = wp.clone(first_rows(self.pairs, n))
         else:
             pairs, flags = part(flags, wp.vec2i), flags + column
         apart = None if self.near is None else part(flags + n, wp.bool)

@@ -22,6 +22,11 @@ def view_memory(pointer: int, dtype, count: int, device="cpu", owner=None) -> wp
     return wp.array(ptr=pointer, dtype=dtype, shape=(count,), device=device, deleter=lambda *_, owner=owner: None)
 
 
+def first_rows(array: wp.array, count: int) -> wp.array:
+    """Return the first rows of an array, which Warp does not slice to none."""
+    return array[:count] if count else wp.empty((0, *array.shape[1:]), dtype=array.dtype, device=array.device)
+
+
 def _host_memory() -> int:
     """Return the bytes of the machine's memory, or a guess."""
     try:
