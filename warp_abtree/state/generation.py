@@ -77,10 +77,11 @@ def find_arrays(value) -> dict:
 
 
 def _holds_arrays(kind) -> bool:
-    """Return whether a class is the library's, or made from one, but for what outlives its operators."""
+    """Return whether a class is the library's, but for what outlives its operators and what no graph uses."""
     names = [f"{base.__module__}.{base.__name__}" for base in kind.__mro__]
     own = any(name.startswith("warp_abtree.") for name in names)
-    return own and not {"warp_abtree.scene.scene.Scene", "warp_abtree.model.model.Model"} & set(names)
+    others = {"scene.scene.Scene", "model.model.Model", "query.staging.Staging"}
+    return own and not {f"warp_abtree.{name}" for name in others} & set(names)
 
 
 class LaunchGuard:
