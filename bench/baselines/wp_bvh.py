@@ -11,7 +11,6 @@ import warp as wp
 from ..timing import medians, time_in_turn
 
 wp.set_module_options({"enable_backward": False})
-
 CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")
 
 
@@ -24,17 +23,6 @@ class BvhPairs:
     vertices: wp.array(dtype=wp.vec3)  # (v,)
     faces: wp.array(dtype=wp.vec3i)  # (f,)
     poses: wp.array(dtype=wp.transform)  # of objects, (2 p,)
-
-
-@wp.func
-def place_face(asked: BvhPairs, pair: wp.int32, a: wp.int32):
-    """Return the corners of a face of object 2 `pair` in the frame of object 2 `pair` + 1."""
-    relative = wp.transform_multiply(wp.transform_inverse(asked.poses[2 * pair + 1]), asked.poses[2 * pair])
-    face = asked.faces[a]
-    p = wp.transform_point(relative, asked.vertices[face[0]])
-    q = wp.transform_point(relative, asked.vertices[face[1]])
-    r = wp.transform_point(relative, asked.vertices[face[2]])
-    return p, q, r
 
 
 @functools.cache
@@ -50,14 +38,18 @@ def find_kernel(yes_no):
         if wp.static(yes_no):
             if found_inout[pair] != 0:
                 return
-        p, q, r = place_face(asked, pair, a)
+        relative = wp.transform_multiply(wp.transform_inverse(asked.poses[2 * pair + 1]), asked.poses[2 * pair])
+        face = asked.faces[a]
+        p = wp.transform_point(relative, asked.vertices[face[0]])
+        q = wp.transform_point(relative, asked.vertices[face[1]])
+        r = wp.transform_point(relative, asked.vertices[face[2]])
         query = wp.bvh_query_aabb(asked.bvh, wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r)))
         b = wp.int32(0)
         while wp.bvh_query_next(query, b):
-            face = asked.faces[b]
-            u = asked.vertices[face[0]]
-            v = asked.vertices[face[1]]
-            w = asked.vertices[face[2]]
+            other = asked.faces[b]
+            u = asked.vertices[other[0]]
+            v = asked.vertices[other[1]]
+            w = asked.vertices[other[2]]
             if wp.intersect_tri_tri(p, q, r, u, v, w) != 0:
                 if wp.static(yes_no):
                     found_inout[pair] = 1
@@ -94,36 +86,33 @@ class FaceBvh:
         self.asked.face_count = len(faces)
         self.asked.vertices = wp.array(vertices, dtype=wp.vec3, device=device)
         self.asked.faces = wp.array(faces, dtype=wp.vec3i, device=device)
-        self.lower, self.upper = (wp.empty(len(faces), dtype=wp.vec3, device=device) for _ in range(2))
-        self._box()
+        self.boxes = [wp.empty(len(faces), dtype=wp.vec3, device=device) for _ in range(2)]
+        self.bvh = None
+        self.rebuild()
         wp.synchronize_device(device)  # some constructors work on the host
-        self.bvh = wp.Bvh(self.lower, self.upper, constructor=constructor)
+        self.bvh = wp.Bvh(*self.boxes, constructor=constructor)
         self.asked.bvh = self.bvh.id
-
-    def _box(self):
-        arrays = [self.asked, self.lower, self.upper]
-        wp.launch(box_face_kernel, dim=self.asked.face_count, inputs=arrays, device=self.device)
 
     def rebuild(self):
         """Box the faces and build the tree from scratch."""
-        self._box()
-        self.bvh.rebuild()
+        wp.launch(box_face_kernel, dim=self.asked.face_count, inputs=[self.asked, *self.boxes], device=self.device)
+        if self.bvh is not None:
+            self.bvh.rebuild()
 
 
-class BvhFaces(FaceBvh):
-    """All face pairs.
+class BvhPosed(FaceBvh):
+    """All face pairs of posed pairs, or yes or no.
 
     Args:
-        capacity: Face pairs that there is room for.
+        capacity: Face pairs that there is room for, None asks yes or no.
     """
-
-    yes_no = False
 
     def __init__(self, vertices, faces, poses, capacity, device, constructor="sah"):
         super().__init__(vertices, faces, device, constructor)
+        self.yes_no = capacity is None
         self.pair_count = len(poses) // 2
         self.asked.poses = wp.array(np.asarray(poses, np.float32), dtype=wp.transform, device=device)
-        self.hits = wp.empty(capacity, dtype=wp.vec3i, device=device)
+        self.hits = wp.empty(capacity or 0, dtype=wp.vec3i, device=device)
         self.found = wp.zeros(self.pair_count if self.yes_no else 1, dtype=wp.int32, device=device)
 
     def launch(self):
@@ -132,29 +121,14 @@ class BvhFaces(FaceBvh):
         wp.launch(find_kernel(self.yes_no), self.pair_count * self.asked.face_count, inputs, device=self.device)
 
     def result(self) -> np.ndarray:
-        """Return the rows found, int32 (k, 3), sorted.
-
-        Raises:
-            RuntimeError: There was no room for all of them.
-        """
+        """Return the rows found, int32 (k, 3), sorted; or whether each pair intersects, bool (p,)."""
+        if self.yes_no:
+            return self.found.numpy() != 0
         total = int(self.found.numpy()[0])
         if total > len(self.hits):
             raise RuntimeError(f"the wp.Bvh baseline found {total} face pairs, with room for {len(self.hits)}")
         rows = self.hits.numpy()[:total].reshape(-1, 3)
         return rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))]
-
-
-class BvhAny(BvhFaces):
-    """Yes or no."""
-
-    yes_no = True
-
-    def __init__(self, vertices, faces, poses, device, constructor="sah"):
-        super().__init__(vertices, faces, poses, 0, device, constructor)
-
-    def result(self) -> np.ndarray:
-        """Return whether each pair intersects, bool (p,)."""
-        return self.found.numpy() != 0
 
 
 def find_constructor(vertices, faces, poses, device, repeats=5) -> str:
@@ -164,7 +138,7 @@ def find_constructor(vertices, faces, poses, device, repeats=5) -> str:
         if name == "lbvh" and device.is_cpu:  # there it is sah
             continue
         try:
-            launches[name] = BvhFaces(vertices, faces, poses, 0, device, name).launch
+            launches[name] = BvhPosed(vertices, faces, poses, 0, device, name).launch
         except (RuntimeError, ValueError):  # not compiled in
             continue
     times = medians(time_in_turn(launches, device, repeats))

@@ -12,7 +12,7 @@ from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_ve
 from warp_abtree.kernels.contact.contact import SHORTEST_NORMAL, Contacts, contact_objects, pair_direction
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.traversal.nodes import load_node
-from warp_abtree.kernels.traversal.warp_stack import add_in_order, warp_lane, warp_max, warp_size
+from warp_abtree.kernels.traversal.warp_stack import add_in_order, six_numbers, warp_lane, warp_max, warp_size
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -79,16 +79,18 @@ def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_
     """Locate one chunk a warp and sum the lengths of its contacts."""
     c = wp.tid() / warp_size()
     span = locate_chunk(c, start)
-    length = wp.float64(0.0)
+    sums = six_numbers()
+    length = six_numbers()
     first = wp.int32(span[1])
     while first < span[2]:
         k = wp.min(first + warp_lane(), span[2] - 1)
         count = wp.min(span[2] - first, warp_size())
-        length = add_in_order(length, measure_length(contacts.p1[k] - contacts.p0[k]), count)
+        length[0] = measure_length(contacts.p1[k] - contacts.p0[k])
+        sums = add_in_order(sums, length, count)
         first += warp_size()
     if warp_lane() == 0:
         sums_out.span[c] = span
-        sums_out.length[c] = length
+        sums_out.length[c] = sums[0]
 
 
 @wp.kernel
@@ -102,14 +104,6 @@ def total_length_kernel(start: wp.array(dtype=wp.int32), sums_inout: ChunkSums):
         total += sums_inout.length[c]
         c += 1
     sums_inout.total[p] = total
-
-
-@wp.func
-def add_vectors_in_order(sum: wp.vec3d, x: wp.vec3d, count: wp.int32):
-    """Return a sum and the vectors of so many lanes, added one after the other."""
-    for i in range(3):
-        sum[i] = add_in_order(sum[i], x[i], count)
-    return sum
 
 
 @wp.kernel
@@ -126,8 +120,7 @@ def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_in
     origin = contacts.p0[start[p]]
     half = wp.float64(0.5)
     total = sums_inout.total[p]
-    point = wp.vec3d()
-    normal = wp.vec3d()
+    sums = six_numbers()
     first = wp.int32(span[1])
     while first < span[2]:
         k = wp.min(first + warp_lane(), span[2] - 1)
@@ -136,12 +129,13 @@ def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_in
         if total != wp.float64(0.0):
             weight = measure_length(contacts.p1[k] - contacts.p0[k]) / total
         middle = weight * (half * (contacts.p0[k] - origin) + half * (contacts.p1[k] - origin))
-        point = add_vectors_in_order(point, middle, count)
-        normal = add_vectors_in_order(normal, weight * contacts.normal[k], count)
+        normal = weight * contacts.normal[k]
+        both = six_numbers(middle[0], middle[1], middle[2], normal[0], normal[1], normal[2])
+        sums = add_in_order(sums, both, count)
         first += warp_size()
     if warp_lane() == 0:
-        sums_inout.point[c] = point
-        sums_inout.normal[c] = normal
+        sums_inout.point[c] = wp.vec3d(sums[0], sums[1], sums[2])
+        sums_inout.normal[c] = wp.vec3d(sums[3], sums[4], sums[5])
 
 
 @wp.func_native(native.body("numbers.cuh", "no_vector"))
@@ -231,8 +225,7 @@ def sum_loop_kernel(
     own = contact_objects(pairs, pair_poses, p)
     front = -wp.float64(wp.inf)
     back = -wp.float64(wp.inf)
-    area = wp.float64(0.0)
-    change = wp.float64(0.0)
+    sums = six_numbers()
     first = wp.int32(span[1])
     while first < span[2]:
         k = wp.min(first + warp_lane(), span[2] - 1)
@@ -252,19 +245,17 @@ def sum_loop_kernel(
         # About the mean point, since for an open curve the area depends on where it is measured from.
         r = contacts.p0[k] - origin - sums_inout.middle[p]
         s = contacts.p1[k] - contacts.p0[k]
-        more = wp.float64(0.0)
-        faster = wp.float64(0.0)
+        parts = six_numbers()
         if contacts.coplanar[k] == 0:
-            more = wp.float64(0.5) * wp.dot(n, wp.cross(r, s))
-            faster = loop_change(s, contacts.normal_a[k], contacts.normal_b[k], n)
-        area = add_in_order(area, more, count)
-        change = add_in_order(change, faster, count)
+            parts[0] = wp.float64(0.5) * wp.dot(n, wp.cross(r, s))
+            parts[1] = loop_change(s, contacts.normal_a[k], contacts.normal_b[k], n)
+        sums = add_in_order(sums, parts, count)
         first += warp_size()
     front = warp_max(front)
     back = -warp_max(back)
     if warp_lane() == 0:
-        sums_inout.area[c] = area
-        sums_inout.change[c] = change
+        sums_inout.area[c] = sums[0]
+        sums_inout.change[c] = sums[1]
         sums_inout.front[c] = front
         sums_inout.back[c] = back
 

@@ -85,6 +85,12 @@ inline CUDA_CALLABLE void fetch_entry(wp::array_t<wp::vec_t<4, wp::float32>> val
 #endif
 }
 
+inline CUDA_CALLABLE void fetch_corner(wp::array_t<wp::vec_t<4, wp::int32>> values, wp::int32 i) {
+#if defined(__CUDA_ARCH__)
+    asm volatile("{ .reg .b32 unused; ld.global.ca.b32 unused, [%0]; }" ::"l"((const int4*)values.data + i));
+#endif
+}
+
 inline CUDA_CALLABLE void block_sync() {
 #if defined(__CUDA_ARCH__)
     __syncthreads();

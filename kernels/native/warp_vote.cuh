@@ -10,13 +10,30 @@ inline CUDA_CALLABLE bool warp_any(bool flag) {
 #endif
 }
 
-inline CUDA_CALLABLE wp::float64 add_in_order(wp::float64 sum, wp::float64 x, wp::int32 count) {
+inline CUDA_CALLABLE wp::vec_t<6, wp::float64> add_in_order(wp::vec_t<6, wp::float64> sum, wp::vec_t<6, wp::float64> x,
+                                                            wp::int32 count) {
 #if defined(__CUDA_ARCH__)
-    for (int lane = 0; lane < count; ++lane)
-        sum += __shfl_sync(0xffffffffu, x, lane);
+    // A column a lane, and one more so that rows begin in banks of their own; then a row a lane.
+    __shared__ double values[6][33];
+    const int lane = threadIdx.x, row = lane < 6 ? lane : 5;
+    double total = sum[0];
+#pragma unroll
+    for (int k = 0; k < 6; ++k) {
+        values[k][lane] = x[k];
+        total = row == k ? sum[k] : total;
+    }
+    __syncwarp();
+    for (int i = 0; i < count; ++i)
+        total += values[row][i];
+    __syncwarp();
+#pragma unroll
+    for (int k = 0; k < 6; ++k)
+        sum[k] = __shfl_sync(0xffffffffu, total, k);
     return sum;
 #else
-    return sum + x;
+    for (int k = 0; k < 6; ++k)
+        sum[k] += x[k];
+    return sum;
 #endif
 }
 

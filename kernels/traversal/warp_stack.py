@@ -16,6 +16,8 @@ WARP_SIZE = native.constant("WARP_SIZE")
 STACK_LENGTH = native.constant("STACK_LENGTH")  # node pairs
 STRADDLING_START = native.constant("STRADDLING_START")
 
+six_numbers = wp.types.vector(length=6, dtype=wp.float64)
+
 stack_code = functools.partial(native.body, "warp_stack.cuh")
 vote_code = functools.partial(native.body, "warp_vote.cuh")
 
@@ -93,8 +95,8 @@ def warp_any(flag: bool) -> bool: ...
 
 
 @wp.func_native(vote_code("add_in_order"))
-def add_in_order(sum: wp.float64, x: wp.float64, count: wp.int32) -> wp.float64:
-    """Return a sum and the numbers of so many lanes, added one after the other; on the CPU, of the one thread."""
+def add_in_order(sum: six_numbers, x: six_numbers, count: wp.int32) -> six_numbers:
+    """Return sums and the numbers of so many lanes, added one after the other; on the CPU, of the one thread."""
 
 
 @wp.func_native(vote_code("warp_max"))

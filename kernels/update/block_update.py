@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.traversal.nodes import load_node, store_node
+from warp_abtree.kernels.traversal.nodes import Node, load_node, store_node
 from warp_abtree.kernels.update.refine import refine_face
 from warp_abtree.kernels.update.refit import block_sync, refit_inner, refit_leaf, unite_nodes
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
@@ -65,6 +65,10 @@ def fetch_entry(values: wp.array(dtype=wp.vec4), i: wp.int64):
     """Bring an entry near, so that a later load of it takes less time."""
 
 
+@wp.func_native(marks_code("fetch_corner"))
+def fetch_corner(values: wp.array(dtype=wp.vec4i), i: wp.int32): ...
+
+
 @wp.struct
 class BlockThread:
     """A thread of the block that updates a state."""
@@ -107,8 +111,8 @@ def mark_ancestors(own: BlockThread, states: StatePool, leaf: wp.int32):
 
 
 @wp.func
-def refine_slice(own: BlockThread, models: ModelPool, states: StatePool, slice: wp.vec2i):
-    """Refine each face of a slice and refit its leaf, and mark the nodes above."""
+def mark_slice(own: BlockThread, models: ModelPool, states: StatePool, slice: wp.vec2i):
+    """Mark the leaf of each face of a slice and the nodes above, and count both."""
     changed = wp.int32(0)
     marked = wp.int32(0)
     entry = own.thread
@@ -117,10 +121,8 @@ def refine_slice(own: BlockThread, models: ModelPool, states: StatePool, slice: 
         leaf = models.leaf_node[own.face_start + face]
         # A slice may list a face twice.
         if mark_bit(own.marks, MARK_START + leaf):
+            fetch_corner(states.face_corner, states.face_start[own.state] + face)
             marked += 1 + mark_ancestors(own, states, leaf)
-            corner = refine_face(models, states, own.state, face)
-            states.face_corner[states.face_start[own.state] + face] = corner
-            refit_leaf(models, states, own.state, leaf, face, corner)
             changed += 1
         entry += own.threads
     if changed > 0:
@@ -129,14 +131,14 @@ def refine_slice(own: BlockThread, models: ModelPool, states: StatePool, slice: 
 
 
 @wp.func
-def refit_ancestors(own: BlockThread, states: StatePool, leaf: wp.int32):
+def refit_ancestors(own: BlockThread, states: StatePool, leaf: wp.int32, record: Node):
     """Refit the ancestors of a leaf up to the first that waits for another child: who comes second goes on.
 
     Source: Liu et al. 2006, section 3.2.2, ACTIVE-REFIT.
     """
     start = states.node_start[own.state]
     node = leaf
-    box = load_node(states, start + node)
+    box = record
     while node > 1:
         if unmark_bit(own.marks, own.twice_start + (node >> 1)):
             break
@@ -148,12 +150,16 @@ def refit_ancestors(own: BlockThread, states: StatePool, leaf: wp.int32):
 
 @wp.func
 def refit_slice(own: BlockThread, models: ModelPool, states: StatePool, slice: wp.vec2i):
-    """Refit what is above the leaves of a slice, each leaf once."""
+    """Refine each face of a slice, once, and refit its leaf and what is above."""
     entry = own.thread
     while entry < slice[1]:
-        leaf = models.leaf_node[own.face_start + models.split_face[slice[0] + entry]]
+        face = models.split_face[slice[0] + entry]
+        leaf = models.leaf_node[own.face_start + face]
         if unmark_bit(own.marks, MARK_START + leaf):
-            refit_ancestors(own, states, leaf)
+            corner = refine_face(models, states, own.state, face)
+            states.face_corner[states.face_start[own.state] + face] = corner
+            record = refit_leaf(models, states, own.state, leaf, face, corner)
+            refit_ancestors(own, states, leaf, record)
         entry += own.threads
 
 
@@ -250,14 +256,14 @@ def state_update(shallow: bool):
             own.face_start = models.face_start[model]
             own.depth = models.depth[model]
             own.twice_start = MARK_START + (2 << own.depth)
-            slice = plan_inout.block_slice[update]
+            slice = wp.vec2i(plan_inout.block_start[update], plan_inout.block_length[update])
             block_sync()
             clear_marks(own, slice[1] == WHOLE)
             block_sync()
             if slice[1] == WHOLE:
                 update_whole(own, models, states_inout)
             else:
-                refine_slice(own, models, states_inout, slice)
+                mark_slice(own, models, states_inout, slice)
                 block_sync()
                 refit_slice(own, models, states_inout, slice)
             block_sync()

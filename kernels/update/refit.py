@@ -13,21 +13,19 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.func
 def refit_leaf(models: ModelPool, states: StatePool, state: wp.int32, node: wp.int32, face: wp.int32, corner: wp.vec4i):
-    """Box one face about the model's centre, or empty the leaf of an inactive face."""
-    at = states.node_start[state] + node
-    if corner[0] < 0:
-        store_node(states, at, empty_node())
-        return
-    centre = models.centre[states.model[state]]
-    a = load_vertex(models.vertex_pos, corner[0]) - centre
-    b = load_vertex(models.vertex_pos, corner[1]) - centre
-    c = load_vertex(models.vertex_pos, corner[2]) - centre
-    leaf = Node()
-    leaf.lower = round_down_vec(wp.min(a, wp.min(b, c)))
-    leaf.upper = round_up_vec(wp.max(a, wp.max(b, c)))
-    leaf.skip = node
-    leaf.face = face
-    store_node(states, at, leaf)
+    """Box one face about the model's centre, or empty the leaf of an inactive face; return its record."""
+    leaf = empty_node()
+    if corner[0] >= 0:
+        centre = models.centre[states.model[state]]
+        a = load_vertex(models.vertex_pos, corner[0]) - centre
+        b = load_vertex(models.vertex_pos, corner[1]) - centre
+        c = load_vertex(models.vertex_pos, corner[2]) - centre
+        leaf.lower = round_down_vec(wp.min(a, wp.min(b, c)))
+        leaf.upper = round_up_vec(wp.max(a, wp.max(b, c)))
+        leaf.skip = node
+        leaf.face = face
+    store_node(states, states.node_start[state] + node, leaf)
+    return leaf
 
 
 @wp.func

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.arrays import LEVEL_MAX
-from warp_abtree.kernels.update import block_update, work_lists
+from warp_abtree.kernels.update import work_lists
 from warp_abtree.state.arrays import ModelArrays, StateArrays
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.lod_update import build_states
@@ -67,8 +67,17 @@ class DeviceLodUpdate(WorkLists):
         self.splits.block_whole = upload(block_whole)
         plan = work_lists.UpdateLists()
         plan.partial_total, plan.full_total = room(1, wp.int64), room(1, wp.int64)
-        plan.block_count, plan.block_state, plan.block_slice = room(1), room(count), room(count, wp.vec2i)
-        for name in ("partial_state", "slice_start", "entry_end", "full_state", "face_end"):
+        plan.block_count = room(1)
+        for name in (
+            "block_state",
+            "block_start",
+            "block_length",
+            "partial_state",
+            "slice_start",
+            "entry_end",
+            "full_state",
+            "face_end",
+        ):
             setattr(plan, name, room(count))
         plan.changed_count, plan.marked_count = room(count), room(count)
         plan.whole_count = room(int(LEVEL_MAX))
@@ -77,9 +86,10 @@ class DeviceLodUpdate(WorkLists):
         make_level_lists(plan, marked_room, device)
         self.wanted = upload([slot.lod for slot in states.slots])
         self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=device)
-        shallow = bool((models.depth <= block_update.SHALLOW_DEPTH).all())
         blocks = count if (block_whole | (block_max > 0)).any() else 0
-        super().__init__(plan, blocks, shallow, int(entries.sum()), int(faces.sum()), level_room, device)
+        super().__init__(
+            plan, blocks, int(models.depth.max()), int(entries.sum()), int(faces.sum()), level_room, device
+        )
 
     def launch(self):
         """Refine meshes and update trees. Launches only: three, and where there are trees that no block takes four more

@@ -17,10 +17,11 @@ from warp_abtree.kernels.update.work_lists import UpdateLists
 TOP_ROOM = 1024
 TOP_THREADS = 512
 # On a GPU: faces of a slice, or of a tree, that a block updates where there are fewer states than multiprocessors; with
-# more states, as many times more. Threads of a block, of many states with shallow trees and of others; and blocks of a
-# launch, at most.
+# more states, as many times more. Threads of a block: of many states with trees of at most SMALL_DEPTH, with shallow
+# ones, and of others. And blocks of a launch, at most.
 BLOCK_SLICE, BLOCK_FACES = 1024, 4096
-SHALLOW_THREADS, THREADS = 64, 1024
+SMALL_DEPTH = 10
+SMALL_THREADS, SHALLOW_THREADS, THREADS = 64, 128, 1024
 BLOCKS_MOST = 8192
 # Fraction of the longest slice of a partial update that level lists take.
 LISTED_FRACTION = 0.1
@@ -61,7 +62,8 @@ def partial_limit(models, block_max, device):
         block_max: As `block_limits` returns it.
     """
     most = full_refit_fraction(device) * models.face_count
-    return np.floor(np.maximum(np.minimum(block_max, most), LISTED_FRACTION * most)).astype(np.int64)
+    listed = LISTED_FRACTION * most if device.is_cuda else most
+    return np.floor(np.maximum(np.minimum(block_max, most), listed)).astype(np.int64)
 
 
 def full_refit_fraction(device) -> float:
@@ -76,14 +78,14 @@ class WorkLists:
     Attributes:
         plan: `UpdateLists` for kernels.
         block_room: States that a block updates each, at most.
-        shallow: Whether no tree is deeper than `block_update.SHALLOW_DEPTH`.
+        depth: Of the deepest tree.
         entry_room, face_room: Faces in the slices of partial updates, and of states under full update, at most.
         level_room: Nodes to refit on each level, the root's first, at most; as many entries as there are levels.
     """
 
     plan: UpdateLists
     block_room: int
-    shallow: bool
+    depth: int
     entry_room: int
     face_room: int
     level_room: list
@@ -100,8 +102,9 @@ class WorkLists:
             return
         blocks, threads, shallow = 1, 1, False
         if self.device.is_cuda:
-            shallow = self.shallow and self.block_room > self.device.sm_count
-            blocks, threads = min(self.block_room, BLOCKS_MOST), SHALLOW_THREADS if shallow else THREADS
+            shallow = self.depth <= block_update.SHALLOW_DEPTH and self.block_room > self.device.sm_count
+            few_faces = SMALL_THREADS if self.depth <= SMALL_DEPTH else SHALLOW_THREADS
+            blocks, threads = min(self.block_room, BLOCKS_MOST), few_faces if shallow else THREADS
         inputs = [blocks, threads, models, self._scratch, states, self.plan]
         kernel = block_update.state_update(shallow)
         wp.launch(kernel, (blocks, threads), inputs, block_dim=threads, device=self.device)
