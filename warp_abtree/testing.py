@@ -12,7 +12,6 @@ from warp_abtree.checks.regime import Regime, change_regime, current_regime, res
 from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, float32_filter_triangles
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
-from warp_abtree.model.tree import active_build
 from warp_abtree.state.lod_update import LodUpdate
 from warp_abtree.state.work_lists import full_refit_fraction
 
@@ -23,7 +22,6 @@ __all__ = [
     "FLOAT32_UNIT",
     "UNCERTAIN",
     "Regime",
-    "active_build",
     "current_regime",
     "decide_triangles",
     "float32_filter_triangles",

@@ -256,7 +256,7 @@ def state_update(shallow: bool):
             own.face_start = models.face_start[model]
             own.depth = models.depth[model]
             own.twice_start = MARK_START + (2 << own.depth)
-            slice = plan_inout.block_slice[update]
+            slice = wp.vec2i(plan_inout.block_start[update], plan_inout.block_length[update])
             block_sync()
             clear_marks(own, slice[1] == WHOLE)
             block_sync()

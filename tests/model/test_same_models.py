@@ -94,8 +94,8 @@ def test_a_model_keeps_its_digest(name, threads, monkeypatch):
 def test_covers_of_one_face_at_a_time_give_the_same(mesh, monkeypatch):
     """Where slots may run out, triangles are covered face by face: the same arithmetic without vectors."""
     first = ab.Model.from_arrays(*mesh, base_faces=4)
-    monkeypatch.setattr(lod_bounds, "POOL_PER_FACE", 0)
-    monkeypatch.setattr(lod_bounds, "POOL_EXTRA", int(COVERS_AT_ONCE * SLOTS) - 1)
+    monkeypatch.setattr(lod_bounds, "SLOTS_PER_FACE", 0)
+    monkeypatch.setattr(lod_bounds, "SLOTS_EXTRA", int(COVERS_AT_ONCE * SLOTS) - 1)
     assert ab.Model.from_arrays(*mesh, base_faces=4).digest == first.digest
 
 

@@ -12,7 +12,7 @@ LEAST_CORES, LEAST_FACES = 4, 20_000
 # Triangles covered per launch, about.
 COVERS = 200_000
 # Pooled slots for each face, and beyond these; an empty pool loosens bounds only.
-POOL_PER_FACE, POOL_EXTRA = 3, 4096
+SLOTS_PER_FACE, SLOTS_EXTRA = 3, 4096
 
 # Error of a bound by rounding, in units of the frame (coordinates about 1/2, so 2^-54 each): reading the vertices of
 # both surfaces, a closest point of some ten operations, and the points of at most 64 cuts by three planes each, every
@@ -103,7 +103,7 @@ def _new_replay(pos, face_count):
     replay.face_box = points(face_count, 2)
     for name in ("face_slot", "face_stamp", "queue", "queue_face"):
         setattr(replay, name, filled(face_count, -1))
-    pooled = POOL_PER_FACE * face_count + POOL_EXTRA
+    pooled = SLOTS_PER_FACE * face_count + SLOTS_EXTRA
     replay.slot = filled((face_count + pooled, triangle_cover.SLOT_FIELDS), -1)
     replay.free_slot = filled(pooled, 0)
     replay.bvh_face = filled(1, 0)

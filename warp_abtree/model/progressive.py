@@ -91,8 +91,7 @@ class ProgressiveMesh:
     def mesh_at(self, lod):
         """Return the surface at a LOD: used vertices float64 [v, 3], faces int32 [f, 3], face ids int32 [f].
 
-        Faces are in the order of the original file, their ids are indices of original faces; at m the vertices are the
-        original ones in their order. Raises ValueError outside 0..m.
+        Faces are in the order of the original, and so are the vertices at m. Raises ValueError outside 0..m.
         """
         active = self.active_vertices(lod)
         face_ids = np.flatnonzero(self.face_split <= lod).astype(np.int32)
@@ -103,14 +102,8 @@ class ProgressiveMesh:
         return self.vertex_pos[used], faces.reshape(-1, 3).astype(np.int32), face_ids
 
     def lod_for(self, fraction=None, tolerance=None):
-        """Return the LOD for exactly one of two requests.
-
-        Args:
-            fraction: Fraction of `face_count` in (0, 1]; the LOD whose active count is nearest, the finer of equals.
-            tolerance: Largest error [model units], >= 0; the coarsest LOD whose `lod_error` is within it.
-
-        Raises ValueError for any other value, or unless exactly one is given.
-        """
+        """Return the LOD whose active count is nearest to a fraction of the faces, the finer of equals; or the coarsest
+        whose `lod_error` is within a tolerance. See `Model.lod_for`."""
         if (fraction is None) == (tolerance is None):
             raise ValueError("lod_for takes exactly one of fraction= and tolerance=")
         if tolerance is not None:
@@ -124,19 +117,17 @@ class ProgressiveMesh:
 
 
 def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
-    """Collapse a mesh to a base of about `base_faces` faces and certify the error of every LOD on the way.
+    """Collapse a `Mesh` to a base of about `base_faces` faces and certify the error of every LOD on the way.
 
     The sequence for a larger base is a prefix of that for a smaller one, and does not depend on the mesh's scale by
     powers of two. It stops early only where every further merge would kill the last face.
 
     Args:
-        mesh: `Mesh`.
         base_faces: Stop when no more faces than this are left, >= 1.
         progress: Called as progress(stage, done, total) between launches; stages "collapse" and "LOD bounds".
         then: Called when the collapse has ended, perhaps by another thread while errors are certified.
 
-    Raises:
-        ValueError: base_faces is no whole number from 1, or the mesh has 2^29 vertices or 2^31 / 3 faces.
+    Raises ValueError where base_faces is no whole number from 1, or the mesh has 2^29 vertices or 2^31 / 3 faces.
 
     Source: Garland and Heckbert 1997 (collapse).
     """
@@ -199,7 +190,7 @@ def _splits(parent, faces, vertex_count):
     face_split = wp.zeros(len(faces), dtype=int, device="cpu")
     launch(vertex_forest.count_events_kernel, vertex_count, node_count, face_array, parent_array, size, face_split)
     split_start = np.concatenate([[0], np.cumsum(size.numpy()[:merge_count])]).astype(np.int64)
-    split_face = wp.zeros(int(split_start[-1]), dtype=int, device="cpu")
+    split_face = _zeros(int(split_start[-1]), int)
     cursor = cpu_array(split_start.copy(), wp.int64)
     launch(vertex_forest.fill_events_kernel, node_count, face_array, parent_array, cursor, split_face)
     return face_split.numpy(), split_start, split_face.numpy()

@@ -1,6 +1,7 @@
 """ACTIVE-INTERSECT for a batch: `Query`."""
 
 import math
+from functools import partial
 
 import warp as wp
 
@@ -10,9 +11,9 @@ from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, relative_pose, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
-from warp_abtree.query.buffers import QueryBuffers
+from warp_abtree.query.readout import QueryReadout
 from warp_abtree.query.request import LIST_MAX, OUTPUTS, PRECISIONS, check_capacity, check_request, check_within
-from warp_abtree.query.result import Result
+from warp_abtree.query.result import Found, Result
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
 
@@ -32,7 +33,7 @@ def batch_of(source) -> Batch:
     return source if isinstance(source, Batch) else source.batch()
 
 
-class Query(QueryBuffers):
+class Query(QueryReadout):
     """Intersection of many object pairs as an operator: allocates once, launches many times.
 
     `launch()` only launches, so that a CUDA graph can capture it, the first launch too. Objects added to the scene ask
@@ -62,7 +63,6 @@ class Query(QueryBuffers):
         RuntimeError: A graph is being captured.
     """
 
-    result_type: type[Result] = Result
     growth = 1  # room that `run` makes, over the demand
 
     def __init__(self, scene, output="faces", pairs=None, capacity=None, precision="exact", within=None):
@@ -129,12 +129,20 @@ class Query(QueryBuffers):
         self._check_scene()
         with self.guard.launching(self):
             self._launch()
+            self.finish()
 
     def _launch(self):
         if self.broad_phase is not None:
             self.broad_phase.launch()
         self.prove_apart()
         self.traverse()
+
+    def finish(self, count: int | None = None):
+        """Make of the hits whatever else is asked. Launches only.
+
+        Args:
+            count: How many hits there are; None does what there is room for, as a graph must.
+        """
 
     def _check_scene(self):
         check_device(self.device)
@@ -200,34 +208,21 @@ class Query(QueryBuffers):
                 inputs = [threads, output, models, states, self.pair_poses, self.hits]
                 wp.launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
 
-    def result(self) -> Result:
-        """Return the results of the last launch on the host, sorted. Waits for the device.
+    def result(self, device: bool = False) -> Result:
+        """Return the results of the last launch, sorted. Waits for the device.
+
+        Args:
+            device: Whether the arrays stay on the device, as Warp arrays that no later launch changes.
 
         Raises:
             RuntimeError: There are none: nothing was launched, a launch was interrupted, or it was the replay of a
                 graph whose arrays were replaced.
         """
-        return self.result_type(self, *self._queried())
+        return self._read(device)
 
-    def _queried(self):
-        """Return the pairs of the last launch on the host, those there was room for, and how many there were.
-
-        Raises:
-            RuntimeError: As `result`.
-        """
-        check_device(self.device, "reading results")
-        self._check_whole()
-        if len(self.pairs):  # without room for pairs there are no launches
-            self.guard.check()
-        if self.broad_phase is None:
-            return self._given, len(self._given)
-        found = self.broad_phase.count_found()
-        return self.pairs.numpy()[: min(found, len(self.pairs))].reshape(-1, 2).copy(), found
-
-    def run(self) -> Result:
-        """Launch, grow buffers that were too small, and return the whole result. Waits for the device."""
-        self.grow()
-        result = self.result()
+    def run(self, device: bool = False) -> Result:
+        """Launch, grow buffers that were too small, and return the whole result, as `result`. Waits for the device."""
+        result = self._make_result(self._grow(partial(self._read_pairs, device)), device)
         result.check()
         return result
 
@@ -238,26 +233,41 @@ class Query(QueryBuffers):
             CapacityError: More pairs or hits than there can be room for.
             RuntimeError: As `launch`; or a graph is being captured.
         """
+        self._grow(lambda: Found(self._read_totals()))
+
+    def _grow(self, read) -> Found:
+        """Launch as `grow` and return what `read` finds of the last launch."""
         check_device(self.device, f"{type(self).__name__}.run (launch can)")
         self._check_scene()
         with self.guard.launching(self):
             self._launch()
-            if self.broad_phase is not None and self.broad_phase.count_found() > len(self.pairs):
-                room = self.growth * self.broad_phase.count_found()
-                self._take_pairs(wp.empty(room, dtype=wp.vec2i, device=self.device))
+            found = read()
+            if found.totals.pairs > len(self.pairs):
+                self._take_pairs(wp.empty(self.growth * found.totals.pairs, dtype=wp.vec2i, device=self.device))
                 self._launch()
-            self.grow_uncertain()
-            if self.output == "faces" and self._sum(self.hits.count) > len(self.hits.face):
-                self.resize(self.growth * self._sum(self.hits.count))
+                found = read()
+            found = self._grow_uncertain(read, found)
+            if found.totals.hits > len(self.hits.face):
+                self.resize(self.growth * found.totals.hits)
                 self.traverse()
+                found = read()
+            self.finish(found.totals.hits)
+        return found
 
     def grow_uncertain(self):
-        """Make room for the face pairs that wait, as far as there can be, and traverse again until all find it."""
-        # How many wait varies for `any`, where the first hit of a pair ends its traversal.
-        while 0 < len(self.hits.uncertain) < min(LIST_MAX, demand := self._sum(self.hits.float64_tests)):
-            self._resize_uncertain(min(2 * demand, LIST_MAX))
-            self.traverse()
+        """Make room for the face pairs that wait, as far as there can be, and launch again until all find it."""
 
-    @staticmethod
-    def _sum(counts) -> int:
-        return int(counts.numpy().sum())
+        def read():
+            return Found(self._read_totals())
+
+        first = read()
+        if self._grow_uncertain(read, first) is not first:
+            self.finish()
+
+    def _grow_uncertain(self, read, found: Found) -> Found:
+        # How many wait varies for `any`, where the first hit of a pair ends its traversal.
+        while 0 < len(self.hits.uncertain) < min(LIST_MAX, found.totals.uncertain):
+            self._resize_uncertain(min(2 * found.totals.uncertain, LIST_MAX))
+            self.traverse()
+            found = read()
+        return found

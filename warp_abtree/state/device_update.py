@@ -67,8 +67,17 @@ class DeviceLodUpdate(WorkLists):
         self.splits.block_whole = upload(block_whole)
         plan = work_lists.UpdateLists()
         plan.partial_total, plan.full_total = room(1, wp.int64), room(1, wp.int64)
-        plan.block_count, plan.block_state, plan.block_slice = room(1), room(count), room(count, wp.vec2i)
-        for name in ("partial_state", "slice_start", "entry_end", "full_state", "face_end"):
+        plan.block_count = room(1)
+        for name in (
+            "block_state",
+            "block_start",
+            "block_length",
+            "partial_state",
+            "slice_start",
+            "entry_end",
+            "full_state",
+            "face_end",
+        ):
             setattr(plan, name, room(count))
         plan.changed_count, plan.marked_count = room(count), room(count)
         plan.whole_count = room(int(LEVEL_MAX))

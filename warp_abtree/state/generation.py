@@ -77,10 +77,11 @@ def find_arrays(value) -> dict:
 
 
 def _holds_arrays(kind) -> bool:
-    """Return whether a class is the library's, or made from one, but for what outlives its operators."""
+    """Return whether a class is the library's, but for what outlives its operators and what no graph uses."""
     names = [f"{base.__module__}.{base.__name__}" for base in kind.__mro__]
     own = any(name.startswith("warp_abtree.") for name in names)
-    return own and not {"warp_abtree.scene.scene.Scene", "warp_abtree.model.model.Model"} & set(names)
+    others = {"scene.scene.Scene", "model.model.Model", "query.staging.Staging"}
+    return own and not {f"warp_abtree.{name}" for name in others} & set(names)
 
 
 class LaunchGuard:
@@ -143,13 +144,15 @@ class LaunchGuard:
         """Let results count as none until the next launch."""
         self.launched[:1].fill_(NOT_LAUNCHED)
 
-    def check(self):
-        """Raise where the results are not of a whole launch on the arrays in use. Waits for the device.
+    def check(self, launched: int):
+        """Raise where the results are not of a whole launch on the arrays in use.
+
+        Args:
+            launched: First entry of the array of this name, as it was read.
 
         Raises:
             RuntimeError: Nothing was launched, or a launch was interrupted, or it was of a stale graph.
         """
-        launched = int(self.launched.numpy()[0])
         if launched == NOT_LAUNCHED:
             raise RuntimeError("there is no result: nothing was launched since this was made or given other pairs")
         if launched == INTERRUPTED:

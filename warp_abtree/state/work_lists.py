@@ -17,8 +17,8 @@ from warp_abtree.kernels.update.work_lists import UpdateLists
 TOP_ROOM = 1024
 TOP_THREADS = 512
 # On a GPU: faces of a slice, or of a tree, that a block updates where there are fewer states than multiprocessors; with
-# more states, as many times more. Threads of a block, of many states with trees of at most SMALL_DEPTH, with shallow ones
-# and of others; and blocks of a launch, at most.
+# more states, as many times more. Threads of a block: of many states with trees of at most SMALL_DEPTH, with shallow
+# ones, and of others. And blocks of a launch, at most.
 BLOCK_SLICE, BLOCK_FACES = 1024, 4096
 SMALL_DEPTH = 10
 SMALL_THREADS, SHALLOW_THREADS, THREADS = 64, 128, 1024
