@@ -190,7 +190,7 @@ def _splits(parent, faces, vertex_count):
     face_split = wp.zeros(len(faces), dtype=int, device="cpu")
     launch(vertex_forest.count_events_kernel, vertex_count, node_count, face_array, parent_array, size, face_split)
     split_start = np.concatenate([[0], np.cumsum(size.numpy()[:merge_count])]).astype(np.int64)
-    split_face = _zeros(int(split_start[-1]), int)
+    split_face = wp.zeros(int(split_start[-1]), dtype=int, device="cpu")
     cursor = cpu_array(split_start.copy(), wp.int64)
     launch(vertex_forest.fill_events_kernel, node_count, face_array, parent_array, cursor, split_face)
     return face_split.numpy(), split_start, split_face.numpy()
