@@ -6,7 +6,6 @@ whose face order is kept (for polygons in PLY and OFF: triangles first, then qua
 
 import gzip
 import io
-import itertools
 import warnings
 import zlib
 from pathlib import Path
@@ -75,18 +74,26 @@ def _parse_plain_obj(data) -> tuple[np.ndarray, np.ndarray] | None:
     None for any other file, and for one that has mistakes.
     """
     lines = data.splitlines()
-    if b"\\" in data or not {line[:2] for line in lines} <= PLAIN_STARTS:
+    if any(mark in data for mark in (b"\\", b"\t", b"\v", b"\f")) or not {line[:2] for line in lines} <= PLAIN_STARTS:
         return None
-    vertices = [line[2:].split() for line in lines if line[:2] == b"v "]
-    faces = [line[2:].split() for line in lines if line[:2] == b"f "]
-    if not faces or set(map(len, vertices)) != {3} or set(map(len, faces)) != {3}:
+    points = _plain_triples([line[2:] for line in lines if line[:2] == b"v "], float)
+    corners = _plain_triples([line[2:] for line in lines if line[:2] == b"f "], int)
+    if points is None or corners is None or corners.min() <= 0:
         return None
+    return points, corners - 1
+
+
+def _plain_triples(rows, number) -> np.ndarray | None:
+    """Return the numbers of rows that have three each with a blank between them, [n, 3]; None if one has not."""
+    if {row.count(b" ") for row in rows} != {2}:
+        return None
+    words = b" ".join(rows).split()
     try:
-        points = np.array(list(map(float, itertools.chain.from_iterable(vertices))))
-        corners = np.array(list(map(int, itertools.chain.from_iterable(faces))), dtype=np.int64)
+        # Two blanks make three words at most, so every row has three if there are as many in all.
+        kind = np.float64 if number is float else np.int64
+        return np.array(list(map(number, words)), kind).reshape(-1, 3) if len(words) == 3 * len(rows) else None
     except (ValueError, OverflowError):
         return None
-    return (points.reshape(-1, 3), corners.reshape(-1, 3) - 1) if corners.min() > 0 else None
 
 
 def parse_obj(data, where) -> tuple[np.ndarray, np.ndarray]:
