@@ -114,10 +114,15 @@ class LaunchGuard:
 
     def record(self) -> LaunchRecord:
         """Return the record for a kernel about to be launched, with the generations as they are."""
+        self.given()
+        return self._record
+
+    def given(self) -> tuple:
+        """Bring the record up to date and return its generations: while they stand, so do all arrays of a launch."""
         given = self._states.given(), self._filter.given(), self.buffers.given()
         if given != self._given:
             self._record.states, self._record.filter, self._record.buffers = self._given = given
-        return self._record
+        return given
 
     def write_to(self, record: LaunchRecord):
         """Keep a record up to date that is part of another struct, in the place of the guard's own."""
