@@ -20,7 +20,10 @@ import warp_abtree as ab
 
 from . import tables
 
-CASES = ("baselines", "budget", "build", "exact", "frame", "host", "precision", "query", "scale", "sweep", "update")
+CASES = (
+    *("baselines", "budget", "build", "coarse", "exact", "frame"),
+    *("host", "precision", "query", "scale", "sweep", "update"),
+)
 STUDIES = ("paper", "tradeoff")
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml
 # A case, and a study, takes the options that its function `run` has as arguments.

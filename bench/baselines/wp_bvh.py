@@ -1,6 +1,8 @@
-"""What a Warp user writes today: one thread a face of A, a wp.Bvh over the faces of B, wp.intersect_tri_tri.
+"""What a Warp user writes and tunes: one thread a face of A, a wp.Bvh over the faces of B, wp.intersect_tri_tri.
 
-A baseline for time only: its triangle test has an absolute epsilon and invents pairs on fine meshes.
+Tuned: one relative pose a pair, corners face by face, faces along a Morton curve so that neighbouring threads walk
+alike, 64 threads a block, and the constructor that answers fastest (`find_constructor`). A baseline for time only: its
+triangle test has an absolute epsilon and invents pairs on fine meshes.
 """
 
 import functools
@@ -12,6 +14,8 @@ from ..timing import medians, time_in_turn
 
 wp.set_module_options({"enable_backward": False})
 CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")
+BLOCK_THREADS = 64
+MORTON_BITS = 10  # of each coordinate
 
 
 @wp.struct
@@ -20,9 +24,15 @@ class BvhPairs:
 
     face_count: wp.int32  # of the mesh
     bvh: wp.uint64  # over its faces
-    vertices: wp.array(dtype=wp.vec3)  # (v,)
-    faces: wp.array(dtype=wp.vec3i)  # (f,)
+    corners: wp.array(dtype=wp.vec3)  # three a face, (3 f,)
     poses: wp.array(dtype=wp.transform)  # of objects, (2 p,)
+    relative: wp.array(dtype=wp.transform)  # of each pair, A's frame to B's, (p,)
+
+
+@wp.kernel
+def relate_kernel(asked_inout: BvhPairs):
+    p = wp.tid()
+    asked_inout.relative[p] = wp.transform_inverse(asked_inout.poses[2 * p + 1]) * asked_inout.poses[2 * p]
 
 
 @functools.cache
@@ -38,19 +48,15 @@ def find_kernel(yes_no):
         if wp.static(yes_no):
             if found_inout[pair] != 0:
                 return
-        relative = wp.transform_multiply(wp.transform_inverse(asked.poses[2 * pair + 1]), asked.poses[2 * pair])
-        face = asked.faces[a]
-        p = wp.transform_point(relative, asked.vertices[face[0]])
-        q = wp.transform_point(relative, asked.vertices[face[1]])
-        r = wp.transform_point(relative, asked.vertices[face[2]])
+        relative = asked.relative[pair]
+        p = wp.transform_point(relative, asked.corners[3 * a])
+        q = wp.transform_point(relative, asked.corners[3 * a + 1])
+        r = wp.transform_point(relative, asked.corners[3 * a + 2])
         query = wp.bvh_query_aabb(asked.bvh, wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r)))
         b = wp.int32(0)
         while wp.bvh_query_next(query, b):
-            other = asked.faces[b]
-            u = asked.vertices[other[0]]
-            v = asked.vertices[other[1]]
-            w = asked.vertices[other[2]]
-            if wp.intersect_tri_tri(p, q, r, u, v, w) != 0:
+            u = asked.corners[3 * b]
+            if wp.intersect_tri_tri(p, q, r, u, asked.corners[3 * b + 1], asked.corners[3 * b + 2]) != 0:
                 if wp.static(yes_no):
                     found_inout[pair] = 1
                     return
@@ -64,13 +70,23 @@ def find_kernel(yes_no):
 
 @wp.kernel
 def box_face_kernel(asked: BvhPairs, lower_out: wp.array(dtype=wp.vec3), upper_out: wp.array(dtype=wp.vec3)):
-    tid = wp.tid()
-    face = asked.faces[tid]
-    p = asked.vertices[face[0]]
-    q = asked.vertices[face[1]]
-    r = asked.vertices[face[2]]
-    lower_out[tid] = wp.min(p, wp.min(q, r))
-    upper_out[tid] = wp.max(p, wp.max(q, r))
+    i = wp.tid()
+    p = asked.corners[3 * i]
+    q = asked.corners[3 * i + 1]
+    r = asked.corners[3 * i + 2]
+    lower_out[i] = wp.min(p, wp.min(q, r))
+    upper_out[i] = wp.max(p, wp.max(q, r))
+
+
+def morton_order(points) -> np.ndarray:
+    """Return the order of points (n, 3) along a Morton curve."""
+    low, size = points.min(0), max(np.ptp(points, axis=0).max(), 1e-30)
+    cell = ((points - low) / size * (2**MORTON_BITS - 1)).astype(np.int64)
+    code = np.zeros(len(points), np.int64)
+    for bit in range(MORTON_BITS):
+        for axis in range(3):
+            code |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
 
 
 class FaceBvh:
@@ -82,10 +98,11 @@ class FaceBvh:
 
     def __init__(self, vertices, faces, device, constructor=None):
         self.device = wp.get_device(device)
+        corners = np.asarray(vertices, np.float32)[faces]
+        self.face = morton_order(corners.mean(1))
         self.asked = BvhPairs()
         self.asked.face_count = len(faces)
-        self.asked.vertices = wp.array(vertices, dtype=wp.vec3, device=device)
-        self.asked.faces = wp.array(faces, dtype=wp.vec3i, device=device)
+        self.asked.corners = wp.array(corners[self.face].reshape(-1, 3), dtype=wp.vec3, device=device)
         self.boxes = [wp.empty(len(faces), dtype=wp.vec3, device=device) for _ in range(2)]
         self.bvh = None
         self.rebuild()
@@ -112,13 +129,16 @@ class BvhPosed(FaceBvh):
         self.yes_no = capacity is None
         self.pair_count = len(poses) // 2
         self.asked.poses = wp.array(np.asarray(poses, np.float32), dtype=wp.transform, device=device)
+        self.asked.relative = wp.empty(self.pair_count, dtype=wp.transform, device=device)
         self.hits = wp.empty(capacity or 0, dtype=wp.vec3i, device=device)
         self.found = wp.zeros(self.pair_count if self.yes_no else 1, dtype=wp.int32, device=device)
 
     def launch(self):
         self.found.zero_()
+        wp.launch(relate_kernel, self.pair_count, inputs=[self.asked], device=self.device)
+        kernel, threads = find_kernel(self.yes_no), self.pair_count * self.asked.face_count
         inputs = [self.asked, self.hits, self.found]
-        wp.launch(find_kernel(self.yes_no), self.pair_count * self.asked.face_count, inputs, device=self.device)
+        wp.launch(kernel, threads, inputs=inputs, block_dim=BLOCK_THREADS, device=self.device)
 
     def result(self) -> np.ndarray:
         """Return the rows found, int32 (k, 3), sorted; or whether each pair intersects, bool (p,)."""
@@ -128,6 +148,7 @@ class BvhPosed(FaceBvh):
         if total > len(self.hits):
             raise RuntimeError(f"the wp.Bvh baseline found {total} face pairs, with room for {len(self.hits)}")
         rows = self.hits.numpy()[:total].reshape(-1, 3)
+        rows = np.stack([rows[:, 0], self.face[rows[:, 1]], self.face[rows[:, 2]]], 1).astype(np.int32)
         return rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))]
 
 

@@ -94,6 +94,14 @@ def check_build(rows):
         assert row["lod_max"] > row["faces"] / 3 and row["file_mib"] > 0
 
 
+def check_coarse(rows):
+    assert [row["fraction"] for row in rows] == [1, 0.1, 0.01] and [row["faces"] for row in rows][:2] == [272, 28]
+    for row in rows:
+        assert row["hits"] > 0 and row["any_ratio"] == pytest.approx(
+            row["peer_any_ms"] / row["any_ms"], rel=0.2, abs=0.02
+        )
+
+
 def check_budget(rows):
     expected = [(scene, name) for scene in ("rain", "focus") for name in budget.CONTROLLERS]
     assert [(row["scene"], row["controller"]) for row in rows] == expected

@@ -82,8 +82,8 @@ class LodUpdate(WorkLists):
         slice_start = self._measure_slices(partial_limit(models, longest, states.device))
         blocks = np.where(self.full, whole[owner], self.slice_length <= longest[owner])
         plan = self._list_blocks(slice_start, blocks)
-        rooms = self._list_work(plan, slice_start, ~blocks)
-        super().__init__(plan, int(blocks.sum()), int(models.depth.max()), *rooms, states.device)
+        entries, faces, level_room = self._list_work(plan, slice_start, ~blocks)
+        super().__init__(plan, int(blocks.sum()), int(models.depth.max()), entries, faces, level_room, states.device)
         self._copies = self._plan_copies()
 
     def __repr__(self):
