@@ -59,7 +59,7 @@ def test_every_way_of_reading_is_the_same(device, output, given):
     options = {"pairs": MORE_PAIRS if given else None, "within": 0.05}
     if given:
         options["within"] = np.linspace(0.0, 0.5, len(MORE_PAIRS))
-    with testing.regime(packs_results=False if device == "cpu" else None):
+    with testing.regime(packs_results=False):
         query = make_query(scene, output, **options)
         expected = query.run()
         assert expected.any.any()

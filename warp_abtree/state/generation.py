@@ -103,7 +103,8 @@ class LaunchGuard:
         self._record = LaunchRecord()
         self._record.states_now, self._record.filter_now = states.now, self._filter.now
         self._record.buffers_now = self.buffers.now
-        self._record.launched = wp.array([NOT_LAUNCHED, 0], dtype=wp.int32, device=device)
+        self._record.launched = launched = wp.array([NOT_LAUNCHED, 0], dtype=wp.int32, device=device)
+        self._outcome = launched[:1]
         self._captured: dict = {}
         self._given: tuple = ()
 
@@ -143,11 +144,11 @@ class LaunchGuard:
 
     def __exit__(self, error, *_):
         if error is not None:
-            self.launched[:1].fill_(INTERRUPTED)
+            self._outcome.fill_(INTERRUPTED)
 
     def forget(self):
         """Let results count as none until the next launch."""
-        self.launched[:1].fill_(NOT_LAUNCHED)
+        self._outcome.fill_(NOT_LAUNCHED)
 
     def check(self, launched: int):
         """Raise where the results are not of a whole launch on the arrays in use.
