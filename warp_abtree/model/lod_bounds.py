@@ -65,9 +65,13 @@ class LodBounds:
         """Bound merges window by window."""
         if self._window is None:
             self._window = _new_window(self._replay)
-        cpu, window, bounds = wp.get_device("cpu"), self._window, self._bound_sq
+        window, bounds = self._window, self._bound_sq
         inputs = [self._vertex_count, self._known, self._pair, self._replay, window]
         state = window.counter.numpy()  # shares the memory
+
+        def cover():
+            launch(merge_window.cover_window_kernel, self._replay, bounds, window)
+
         covered = 0
         while covered < COVERS and self.done < self._known:
             launch(merge_window.gather_window_kernel, *inputs)
@@ -75,7 +79,7 @@ class LodBounds:
             if merges == 0:
                 self._advance_alone(self.done + 1)
                 continue
-            launch_on_cores(merge_window.cover_window_kernel, blocks, [self._replay, bounds, window], cpu, cores, 4)
+            launch_on_cores(cover, blocks, cores, 4)
             launch(merge_window.register_window_kernel, window, self._replay, self._covers, bounds)
             covered += triangles
 

@@ -65,7 +65,7 @@ class ContactQuery(Query):
     Args:
         scene, pairs, precision, within: As for `Query`.
         capacity: `Buffers`, or the contacts that there is room for, below 2^30. Room that stays empty takes 180 bytes a
-            contact and time to sort all the same.
+            contact and, in `launch`, time to sort all the same; `run` looks at what was found.
         contact_dtype: Type of the real numbers in `result()`, float64 or float32; those beyond float32 become infinite.
 
     Attributes:

@@ -11,6 +11,7 @@ from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, relative_pose, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
+from warp_abtree.query.commands import Commands
 from warp_abtree.query.readout import QueryReadout
 from warp_abtree.query.request import LIST_MAX, OUTPUTS, PRECISIONS, check_capacity, check_request, check_within
 from warp_abtree.query.result import Found, Result
@@ -78,6 +79,7 @@ class Query(QueryReadout):
         self.output, self.precision = output, precision
         self.device = batch.device
         self._torn = False
+        self._commands = Commands()
         self.guard = LaunchGuard(
             self.device, batch.states.generation, batch.filter_generation if pairs is None else None
         )
@@ -156,36 +158,55 @@ class Query(QueryReadout):
         room = len(self.pairs)
         if self.near is None or room == 0:
             return
-        self._launch_traversal(self.within, self.near, int(face_pairs.WITHIN), int(face_pairs.OUTPUT_ANY))
+        inputs = self.within, self.near, int(face_pairs.WITHIN), int(face_pairs.OUTPUT_ANY)
+        self._launch_search("within", partial(self._make_search, *inputs))
 
-    def _launch_traversal(self, within, hits, mode, output):
-        pools = self.batch.pools
-        room = len(self.pairs)
-        inputs = [output, *pools, self.pair_count, self.pairs, within]
-        self.guard.record()
-        inputs += [self.pair_poses, hits, self.work]
+    def _launch_search(self, name: str, make):
+        """Launch what `_make_search` makes: relative poses, the traversal, and passes over uncertain face pairs."""
+        # Also where all is captured: the kernels read the record.
+        given = self.guard.given()
+        if self.device.is_capturing:
+            make(wp.launch)
+            return
+        first, traversal, *passes = self._commands.find(name, given, make)
+        first.launch()
+        if self.uses_warps():
+            traversal.launch()
+        else:
+            cores = current_regime().cpu_threads or core_count()
+            launch_on_cores(traversal.launch, len(self.pairs), cores, self._least_pairs())
+        for command in passes:
+            command.launch()
+
+    def _least_pairs(self) -> int:
+        """Return the pairs that make a further core worth its while, which costs some 50 us.
+
+        Many of "any"; else about the root of the faces is the time that a pair in contact takes.
+        """
+        return 32 if self.output == "any" else max(1, int(50 / math.sqrt(self.batch.mean_faces)))
+
+    def _make_search(self, within, hits, mode, output, launch) -> list:
+        """Make the launches that bring relative poses and traverse all pairs, see `Commands.find`."""
+        pools, room = self.batch.pools, len(self.pairs)
+        inputs = [output, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
         # A warp a block: few pairs lie on as many multiprocessors.
         kernel = relative_pose.relative_pose_kernel
-        wp.launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
-        inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits]
+        first = launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
+        inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits, self.work]
         if not self.uses_warps():
-            cores = current_regime().cpu_threads or core_count()
-            # A launch on a further core costs some 50 us: the work of many pairs apart, of less than one in contact.
-            least = 32 if output == int(face_pairs.OUTPUT_ANY) else 1
-            launch_on_cores(simd.thread_traversal(mode), room, [*inputs, self.work], self.device, cores, least)
-            return
+            return [first, launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device)]
         # More than there are units, where these are few: idle warps wait for donations.
-        units = int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1
-        warps = max(room, units)
+        warps = max(room, int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1)
         warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
-        wp.launch(
+        traversal = launch(
             dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
-            inputs=[self._stack_length(), *inputs, self.work],
+            inputs=[self._stack_length(), *inputs],
             block_dim=WARP_SIZE,
             device=self.device,
         )
+        return [first, traversal]
 
     def _stack_length(self) -> int:
         length = self._regime.stack_length
@@ -195,18 +216,24 @@ class Query(QueryReadout):
         """Run the narrow phase over the pairs in place. Launches only."""
         if not len(self.pairs):
             return
+        self._launch_search("pairs", self._make_traversal)
+
+    def _make_traversal(self, launch) -> list:
+        """Make the launches of the narrow phase."""
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
-        self._launch_traversal(self._no_distance, self.hits, mode, output)
+        made = self._make_search(self._no_distance, self.hits, mode, output, launch)
+        passes = []
         if len(self.hits.uncertain):
             first = uncertain_pairs.float64_filter_kernel if mode == EXACT else uncertain_pairs.resolve_rounded_kernel
             passes = [(first, FILTER_WARPS_A_PROCESSOR)]
             if mode == EXACT:
                 passes.append((uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR))
-            models, states, _ = self.batch.pools
-            for kernel, warps in passes:
-                threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
-                inputs = [threads, output, models, states, self.pair_poses, self.hits]
-                wp.launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
+        models, states, _ = self.batch.pools
+        for kernel, warps in passes:
+            threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
+            inputs = [threads, output, models, states, self.pair_poses, self.hits]
+            made.append(launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
+        return made
 
     def result(self, device: bool = False) -> Result:
         """Return the results of the last launch, sorted. Waits for the device.
