@@ -24,6 +24,12 @@ wp.set_module_options(MODULE_OPTIONS)
 ITEMS_AT_ONCE = native.constant("ITEMS_AT_ONCE")
 CPU_STACK_LENGTH = native.constant("CPU_STACK_LENGTH")
 DEPTH_FIRST_LENGTH = native.constant("DEPTH_FIRST_LENGTH")
+SUBTREES_KEPT = 256
+SUBTREE_DEPTH, SUBTREE_RECORDS = native.constant("SUBTREE_DEPTH"), native.constant("SUBTREE_RECORDS")
+SLAB_HEADER = native.constant("SLAB_HEADER")
+NO_FLOOR = native.constant("NO_FLOOR")
+NODE_TESTS_PLAIN = 24576
+NEVER = 2**62
 
 # A thread tests so many face pairs at a time, so that its processor finds its way through either loop; an early hit
 # ends a pair for `any`.
@@ -35,21 +41,61 @@ long_counts = wp.types.vector(length=4, dtype=wp.int64)
 three_numbers = wp.types.vector(length=3, dtype=wp.int64)
 
 
+@wp.func_native(native.body("simd_subtrees.h", "take_thread"))
+def take_thread(counter: wp.array(dtype=wp.int32)) -> wp.int32:
+    """Return the number of a thread that no other thread of a launch has."""
+
+
 @wp.func_native(native.body("simd_descend.h", "descend"))
 def descend(
     states: StatePool,
     pose: PairPose,
     at_once: wp.int32,
     ready: wp.int32,
+    most: wp.int64,
+    floors: wp.vec2i,
     top: wp.int32,
     stack: wp.array(dtype=wp.int64),
     faces: wp.array(dtype=wp.int64),
-) -> three_numbers:
+    below: wp.array(dtype=wp.int64),
+) -> long_counts:
     """Test items from the top of a stack until there are none, or so many leaf pairs wait as are asked for.
 
-    The same as `compare_node_pair`, four pairs of boxes at a time.
+    The same as `compare_node_pair`, four pairs of boxes at a time. Ends also once so many pairs of boxes were compared,
+    or where items lie below floors: both nodes in subtrees whose roots are on these levels.
 
-    Returns the items left on the stack, the leaf pairs that wait, and the pairs of boxes compared.
+    Returns the items left on the stack, the leaf pairs that wait, the pairs of boxes compared, and the items listed
+    that lie below the floors.
+    """
+
+
+@wp.func_native(native.body("simd_subtrees.h", "open_subtrees"))
+def open_subtrees(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    thread: wp.int32,
+    first: bool,
+    memory: wp.array2d(dtype=wp.float32),
+) -> wp.vec2i:
+    """Choose the directions of slabs for an object pair; return its floors, see `descend`."""
+
+
+@wp.func_native(native.body("simd_subtrees.h", "descend_subtrees"))
+def descend_subtrees(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    thread: wp.int32,
+    ready: wp.int32,
+    top: wp.int32,
+    stack: wp.array(dtype=wp.int64),
+    memory: wp.array2d(dtype=wp.float32),
+    faces: wp.array(dtype=wp.int64),
+) -> three_numbers:
+    """Test items below the floors until there are none, or so many leaf pairs wait as are asked for.
+
+    Returns the items left on the stack, the leaf pairs that wait, and the pairs of nodes compared.
     """
 
 
@@ -91,6 +137,12 @@ def simd_float64_filter(
     Returns how many have met then, how many are inexact, which stand in front of their list then, and how many were
     tested.
     """
+
+
+def slab_memory_words(depth: int) -> int:
+    """Return the length of a thread's memory for slabs, for trees of a depth at most."""
+    slots = max(16, min(SUBTREES_KEPT, 2 ** max(0, depth - SUBTREE_DEPTH)))
+    return 16 + SLAB_HEADER + slots * (2 + 64 * SUBTREE_RECORDS)
 
 
 @wp.func
@@ -182,6 +234,7 @@ def thread_traversal(mode: int):
         states: StatePool,
         pair_count: wp.array(dtype=wp.int32),
         pair_poses: wp.array(dtype=PairPose),
+        memory: wp.array2d(dtype=wp.float32),
         hits_inout: Hits,
         work_inout: Work,
     ):
@@ -190,6 +243,8 @@ def thread_traversal(mode: int):
         stack = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
         faces = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
         uncertain = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
+        below = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
+        thread, opened = take_thread(work_inout.counter), wp.bool(False)
         at_once, ready = ITEMS_AT_ONCE, FACES_READY
         if output == OUTPUT_ANY:
             at_once, ready = ITEMS_FOR_ANY, FACES_FOR_ANY
@@ -202,12 +257,25 @@ def thread_traversal(mode: int):
                 error, unit = wp.float32(0.0), wp.float32(0.0)
             top, hit_count = wp.int32(1), wp.int64(0)
             tests = long_counts()
-            while top > 0:
-                progress = descend(states, pose, at_once, ready, top, stack, faces)
-                top, waiting = wp.int32(progress[0]), wp.int32(progress[1])
+            floors, most, deep = wp.vec2i(NO_FLOOR, NO_FLOOR), wp.int64(NODE_TESTS_PLAIN), wp.int32(0)
+            if thread >= memory.shape[0] or wp.static(mode == int(WITHIN)) or pose.error == wp.inf:
+                most = wp.int64(NEVER)
+            while top > 0 or deep > 0:
+                if top > 0 and tests[0] >= most:
+                    floors = open_subtrees(models, states, pose, thread, not opened, memory)
+                    opened, most = wp.bool(True), wp.int64(NEVER)
+                waiting, compared = wp.int32(0), wp.int64(0)
+                if deep > 0:
+                    inside = descend_subtrees(models, states, pose, thread, ready, deep, below, memory, faces)
+                    deep, waiting, compared = wp.int32(inside[0]), wp.int32(inside[1]), inside[2]
+                else:
+                    spare = most - tests[0]
+                    progress = descend(states, pose, at_once, ready, spare, floors, top, stack, faces, below)
+                    top, waiting, compared = wp.int32(progress[0]), wp.int32(progress[1]), progress[2]
+                    deep = wp.int32(progress[3])
                 if wp.static(mode == int(WITHIN)):
                     met, tested = resolve_faces(wp.static(mode), output, models, states, pose, 0, waiting, faces, faces)
-                    tests += long_counts(progress[2], wp.int64(tested), wp.int64(0), wp.int64(0))
+                    tests += long_counts(compared, wp.int64(tested), wp.int64(0), wp.int64(0))
                 else:
                     filtered = simd_float32_filter(
                         models, states, pose, error, unit, output == OUTPUT_ANY, waiting, faces, uncertain
@@ -216,12 +284,13 @@ def thread_traversal(mode: int):
                     met, resolved, inexact = resolve_uncertain(
                         wp.static(mode), output, models, states, pose, met, left, uncertain, faces
                     )
-                    tests += long_counts(progress[2], filtered[2], wp.int64(resolved), wp.int64(inexact))
+                    tests += long_counts(compared, filtered[2], wp.int64(resolved), wp.int64(inexact))
                 if met > 0:
                     hit_count += wp.int64(met)
                     report_hits(output, p, pose.swapped, met, faces, hits_inout)
                     if output == OUTPUT_ANY:
                         top = 0
+                        deep = 0
             write_counts(p, hit_count, tests, hits_inout)
             p = take_unit(work_inout.counter)
 

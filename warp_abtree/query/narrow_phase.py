@@ -113,11 +113,6 @@ class Query(QueryBuffers):
         self.guard.write_to(work.record)
         return work
 
-    def uses_warps(self) -> bool:
-        """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
-        warps = self._regime.warps
-        return self.device.is_cuda if warps is None else warps
-
     def launch(self):
         """Run broad phase (unless pairs were given) and narrow phase. Launches only.
 
@@ -157,12 +152,12 @@ class Query(QueryBuffers):
         inputs += [self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
         wp.launch(relative_pose.relative_pose_kernel, dim=dim, inputs=inputs, device=self.device)
-        inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits]
+        inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
         if not self.uses_warps():
             cores = current_regime().cpu_threads or core_count()
             # A launch on a further core costs some 50 us: the work of many pairs apart, of less than one in contact.
             least = 32 if output == int(face_pairs.OUTPUT_ANY) else 1
-            launch_on_cores(simd.thread_traversal(mode), room, [*inputs, self.work], self.device, cores, least)
+            launch_on_cores(simd.thread_traversal(mode), room, [*inputs, self.slab_memory, hits, self.work], self.device, cores, least)
             return
         # More than there are pairs: idle warps wait for donations.
         warps = max(room, int(4 * self._regime.warps_per_pair * math.sqrt(room)) + 1)
@@ -170,7 +165,7 @@ class Query(QueryBuffers):
         wp.launch(
             dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
-            inputs=[self._stack_length(), *inputs, self.work],
+            inputs=[self._stack_length(), *inputs, hits, self.work],
             block_dim=WARP_SIZE,
             device=self.device,
         )
