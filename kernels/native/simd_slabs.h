@@ -1,14 +1,16 @@
-// Slabs of the nodes of a subtree, along directions that an object pair shares: minima, maxima, 16 lanes each. The last
-// lane is none: there lie, as bits, `skip` with the minima and `face` with the maxima.
+// Slabs of the nodes of a subtree, along directions that an object pair shares. A record has minima and negated maxima,
+// 16 lanes each, in steps that divide A's size along a direction into 2^16, rounded outwards, and at most +-32767. For B
+// the directions are negated, so that both are apart where the sum of two lanes is positive. The last two lanes of
+// either are none: there lie `skip` with the minima and `face` with the maxima.
 #pragma once
 #include "builtin.h"
 #include "sizes.h"
 
 struct Slabs {
     typedef float lanes __attribute__((vector_size(64), aligned(64)));
-    struct Record {
-        lanes low, high;
-    };
+    typedef short Record __attribute__((vector_size(64), aligned(64)));
+    typedef int words __attribute__((vector_size(64), aligned(64)));
+    typedef short half __attribute__((vector_size(32)));
     struct Box {
         float lower[3];
         int skip;
@@ -18,23 +20,22 @@ struct Slabs {
     // What a thread keeps: a header, then of each object the roots of the subtrees in its slots, then records.
     struct Memory {
         int* header;  // whose axes these are, levels of the subtrees' roots
-        float *axes, *axes_b, *shift_b;
+        float *axes, *of_a, *of_b;  // unit directions, then scaled: three rows and a shift
         int slots, *roots;
         Record* records;
     };
     static Memory find_memory(float* data, int words, int thread) {
         const unsigned long long start = (unsigned long long)(data + (wp::int64)words * thread);
         float* base = (float*)((start + 63) & ~63ull);
-        const int slots = (words - 16 - SLAB_HEADER) / (2 + 64 * SUBTREE_RECORDS);
-        return Memory{(int*)base, base + 16, base + 64, base + 112, slots, (int*)base + SLAB_HEADER,
+        const int slots = (words - 16 - SLAB_HEADER) / (2 + 32 * SUBTREE_RECORDS);
+        return Memory{(int*)base, base + 16, base + 64, base + 128, slots, (int*)base + SLAB_HEADER,
                       (Record*)(base + SLAB_HEADER + 2 * slots)};
     }
     // One of both objects.
     struct Side {
         const Box* tree;
         const int* corners;  // four a face
-        lanes axis[3], shift;
-        float margin;
+        lanes axis[3], shift, margin;
         int floor;  // level of the subtrees' roots
         int* roots;  // of the subtrees in the slots, 0 for none
         Record* records;
@@ -52,20 +53,26 @@ struct Slabs {
         const int floor = level_of(node) + 1 - SUBTREE_DEPTH;
         return floor > 0 ? floor : 0;
     }
+    // Rounded outwards: NaN does not occur.
+    static half round_down(const lanes& x) {
+        const lanes least = lanes{} - 32767.0f, most = lanes{} + 32767.0f;
+        const lanes above = x < least ? least : x, within = above > most ? most : above;
+        return __builtin_convertvector(__builtin_convertvector(__builtin_elementwise_floor(within), words), half);
+    }
     // Twice the margin of boxes covers the rounding of a projection, see docs/exactness.md.
     static Record project(const Side& side, const void* near, int face) {
-        Record record;
+        lanes low = {}, high = {};
         for (int k = 0; k < 3; ++k) {
             const float* p = (const float*)near + 4 * (wp::int64)side.corners[4 * (wp::int64)face + k];
             lanes x = __builtin_elementwise_fma(side.axis[2], lanes{} + p[2], side.shift);
             x = __builtin_elementwise_fma(side.axis[1], lanes{} + p[1], x);
             x = __builtin_elementwise_fma(side.axis[0], lanes{} + p[0], x);
-            record.low = k == 0 ? x : (x < record.low ? x : record.low);
-            record.high = k == 0 ? x : (x > record.high ? x : record.high);
+            low = k == 0 ? x : (x < low ? x : low);
+            high = k == 0 ? x : (x > high ? x : high);
         }
-        record.low -= side.margin;
-        record.high += side.margin;
-        return record;
+        return __builtin_shufflevector(round_down(low - side.margin), round_down(-(high + side.margin)), 0, 1, 2, 3, 4,
+                                       5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25,
+                                       26, 27, 28, 29, 30, 31);
     }
     static void fill(const Side& side, const void* near, unsigned int root, Record* records) {
         unsigned int nodes[2 * SUBTREE_LEAVES];
@@ -77,7 +84,14 @@ struct Slabs {
                 nodes[count] = 2 * box.skip;
                 nodes[count + 1] = 2 * box.skip + 1;
                 count += 2;
-            }
+                __builtin_prefetch(side.tree + 2 * box.skip);
+            } else
+                __builtin_prefetch(side.corners + 4 * (wp::int64)box.face);
+        }
+        for (int i = 0; i < count; ++i) {
+            const Box& box = side.tree[nodes[i]];
+            for (int k = 0; k < 3 && box.face >= 0; ++k)
+                __builtin_prefetch((const float*)near + 4 * (wp::int64)side.corners[4 * (wp::int64)box.face + k]);
         }
         while (count-- > 0) {
             const unsigned int node = nodes[count];
@@ -87,11 +101,12 @@ struct Slabs {
                 record = project(side, near, box.face);
             else {
                 const Record* child = records + place_of(2 * box.skip, side.floor);
-                record.low = child[0].low < child[1].low ? child[0].low : child[1].low;
-                record.high = child[0].high > child[1].high ? child[0].high : child[1].high;
+                record = __builtin_elementwise_min(child[0], child[1]);
             }
-            record.low[15] = __builtin_bit_cast(float, box.skip);
-            record.high[15] = __builtin_bit_cast(float, box.face);
+            words whole = (words)record;
+            whole[7] = box.skip;
+            whole[15] = box.face;
+            record = (Record)whole;
             records[place_of(node, side.floor)] = record;
             if (box.skip != (int)node)
                 records[place_of(box.skip, side.floor)] = record;
@@ -146,10 +161,10 @@ struct Slabs {
         }
         for (int i = 0; i < SLAB_SAMPLES; ++i)
             least[i] = 1.0f;
-        for (int d = 0; d < 16; ++d) {
+        for (int d = 0; d < 14; ++d) {
             float n[3] = {d == 0 ? 1.0f : 0.0f, d == 1 ? 1.0f : 0.0f, d == 2 ? 1.0f : 0.0f};
             lanes given[GROUPS];
-            if (d >= 3 && d < 15) {
+            if (d >= 3) {
                 lanes gains[GROUPS] = {};
                 for (int i = 0; i < SLAB_SAMPLES; ++i)
                     for (int g = 0; g < GROUPS; ++g)

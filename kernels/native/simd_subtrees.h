@@ -32,11 +32,24 @@ wp::vec_t<2, wp::int32> open_subtrees(ModelPool models, StatePool states, PairPo
         kept.roots[kept.slots + i] = 0;
     const auto& r = pose.rotation.data;
     const auto& t = pose.translation32;
+    const Slabs::Box& whole = nodes[pose.node_a + 1];
     for (int d = 0; d < 16; ++d) {
-        const double x = kept.axes[d], y = kept.axes[16 + d], z = kept.axes[32 + d];
-        for (int j = 0; j < 3; ++j)
-            kept.axes_b[16 * j + d] = (float)((x * r[0][j] + y * r[1][j]) + z * r[2][j]);
-        kept.shift_b[d] = (float)((x * t[0] + y * t[1]) + z * t[2]);
+        const double n[3] = {kept.axes[d], kept.axes[16 + d], kept.axes[32 + d]};
+        double size = 0.0, middle = 0.0, shift = 0.0;
+        for (int j = 0; j < 3; ++j) {
+            const double low = whole.lower[j], high = whole.upper[j];
+            size += __builtin_elementwise_abs(n[j]) * (high - low);
+            middle += 0.5 * n[j] * (high + low);
+            shift += n[j] * t[j];
+        }
+        const double scale = d < 14 && size > 0.0 ? 65536.0 / size : 0.0;
+        for (int j = 0; j < 3; ++j) {
+            kept.of_a[16 * j + d] = (float)(scale * n[j]);
+            kept.of_b[16 * j + d] = (float)(-scale * ((n[0] * r[0][j] + n[1] * r[1][j]) + n[2] * r[2][j]));
+        }
+        kept.of_a[48 + d] = (float)(-scale * middle);
+        kept.of_b[48 + d] = (float)(scale * (middle - shift));
+        kept.of_b[64 + d] = (float)(scale * 2.0 * pose.margin);
     }
     kept.header[1] = floors[0] = Slabs::find_floor(nodes + pose.node_a);
     kept.header[2] = floors[1] = Slabs::find_floor(nodes + pose.node_b);
@@ -56,23 +69,22 @@ wp::vec_t<3, wp::int64> descend_subtrees(ModelPool models, StatePool states, Pai
 #include "simd_slabs.h"
         typedef Slabs::lanes lanes;
         typedef Slabs::Record Record;
-        typedef int bits __attribute__((vector_size(64)));
         typedef int ints __attribute__((vector_size(32)));
         typedef float eight __attribute__((vector_size(32)));
-        typedef bool flags __attribute__((ext_vector_type(16)));
+        typedef bool flags __attribute__((ext_vector_type(32)));
         typedef bool eight_flags __attribute__((ext_vector_type(8)));
         typedef wp::int64 longs __attribute__((vector_size(32)));
         typedef wp::int64 loose_longs __attribute__((vector_size(32), aligned(8)));
         const Slabs::Memory kept = Slabs::find_memory(memory.data, memory.shape[1], thread);
         const Slabs::Box* nodes = (const Slabs::Box*)states.node_box.data;
         const int* corners = (const int*)states.face_corner.data;
-        const lanes *of_a = (const lanes*)kept.axes, *of_b = (const lanes*)kept.axes_b;
+        const lanes *of_a = (const lanes*)kept.of_a, *of_b = (const lanes*)kept.of_b;
         const wp::int64 records_b = (wp::int64)SUBTREE_RECORDS * kept.slots;
         const Slabs::Side sides[2] = {
-            {nodes + pose.node_a, corners + 4 * (wp::int64)pose.corner_a, {of_a[0], of_a[1], of_a[2]}, lanes{}, 0.0f,
+            {nodes + pose.node_a, corners + 4 * (wp::int64)pose.corner_a, {of_a[0], of_a[1], of_a[2]}, of_a[3], lanes{},
              kept.header[1], kept.roots, kept.records},
-            {nodes + pose.node_b, corners + 4 * (wp::int64)pose.corner_b, {of_b[0], of_b[1], of_b[2]}, of_b[3],
-             2.0f * pose.margin, kept.header[2], kept.roots + kept.slots, kept.records + records_b}};
+            {nodes + pose.node_b, corners + 4 * (wp::int64)pose.corner_b, {of_b[0], of_b[1], of_b[2]}, of_b[3], of_b[4],
+             kept.header[2], kept.roots + kept.slots, kept.records + records_b}};
         const void* near = models.vertex_near.data;
         wp::int64* items = stack.data;
         wp::int64* found = faces.data;
@@ -112,6 +124,10 @@ wp::vec_t<3, wp::int64> descend_subtrees(ModelPool models, StatePool states, Pai
                 const Record* b = find(sides[1], (unsigned int)item, count > 0);
                 if (b == nullptr)
                     break;
+                for (int k = 0; k < 2; ++k) {
+                    __builtin_prefetch(a + k);
+                    __builtin_prefetch(b + k);
+                }
                 taken[count] =
                     Taken{a, b, (unsigned int)(PAIRS_USED >> (((turned & 3) << 2) | ((turned >> 28) & 48))) & 15};
             }
@@ -119,20 +135,15 @@ wp::vec_t<3, wp::int64> descend_subtrees(ModelPool models, StatePool states, Pai
             for (int i = 0; i < count; ++i) {
                 const Record *a = taken[i].a, *b = taken[i].b;
                 auto apart = [&](int k) {
-                    const bits gap = (a[k >> 1].low > b[k & 1].high) | (b[k & 1].low > a[k >> 1].high);
-                    return (unsigned int)__builtin_bit_cast(unsigned short, __builtin_convertvector(gap, flags)) &
-                           0x7fff;
+                    const Record gap = __builtin_elementwise_add_sat(a[k >> 1], b[k & 1]) > 0;
+                    return __builtin_bit_cast(unsigned int, __builtin_convertvector(gap, flags)) & 0x3fff3fff;
                 };
                 const unsigned int mask = ((apart(0) == 0) | (apart(1) == 0) << 1 | (apart(2) == 0) << 2 |
                                            (apart(3) == 0) << 3) &
                                           taken[i].used;
-                auto number = [](float x) { return __builtin_bit_cast(int, x); };
-                const int skip_a[2] = {number(a[0].low[15]), number(a[1].low[15])};
-                const int skip_b[2] = {number(b[0].low[15]), number(b[1].low[15])};
-                const int face_a[2] = {number(a[0].high[15]), number(a[1].high[15])};
-                const int face_b[2] = {number(b[0].high[15]), number(b[1].high[15])};
-                const ints skip = {skip_a[0], skip_a[0], skip_a[1], skip_a[1], skip_b[0], skip_b[1], skip_b[0], skip_b[1]};
-                const ints face = {face_a[0], face_a[0], face_a[1], face_a[1], face_b[0], face_b[1], face_b[0], face_b[1]};
+                const int *a0 = (const int*)a, *a1 = (const int*)(a + 1), *b0 = (const int*)b, *b1 = (const int*)(b + 1);
+                const ints skip = {a0[7], a0[7], a1[7], a1[7], b0[7], b1[7], b0[7], b1[7]};
+                const ints face = {a0[15], a0[15], a1[15], a1[15], b0[15], b1[15], b0[15], b1[15]};
                 const ints other = __builtin_shufflevector(face, face, 4, 5, 6, 7, 0, 1, 2, 3);
                 const eight span = (eight)face, other_span = (eight)other;
                 const ints inner = (face | other) < 0, down = (face < 0) & (span + span <= other_span);

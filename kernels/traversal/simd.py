@@ -24,17 +24,20 @@ wp.set_module_options(MODULE_OPTIONS)
 ITEMS_AT_ONCE = native.constant("ITEMS_AT_ONCE")
 CPU_STACK_LENGTH = native.constant("CPU_STACK_LENGTH")
 DEPTH_FIRST_LENGTH = native.constant("DEPTH_FIRST_LENGTH")
-SUBTREES_KEPT = 256
+SUBTREES_KEPT = 512
 SUBTREE_DEPTH, SUBTREE_RECORDS = native.constant("SUBTREE_DEPTH"), native.constant("SUBTREE_RECORDS")
 SLAB_HEADER = native.constant("SLAB_HEADER")
 NO_FLOOR = native.constant("NO_FLOOR")
 NODE_TESTS_PLAIN = 24576
 NEVER = 2**62
 
-# A thread tests so many face pairs at a time, so that its processor finds its way through either loop; an early hit
-# ends a pair for `any`.
-FACES_READY, FACES_FOR_ANY = wp.constant(128), wp.constant(1)
+# A thread tests so many face pairs at a time, so that its processor finds its way through either loop. For `any`, which
+# an early hit ends, few at first, and twice as many after each search without one, so that what an end wastes is at
+# most a part of what was needed.
+FACES_READY, FACES_FOR_ANY = wp.constant(128), wp.constant(4)
 ITEMS_FOR_ANY = wp.constant(8)
+# So many items leave room to go on depth first from any of them.
+STACK_TO_SHUFFLE = wp.constant(CPU_STACK_LENGTH // 2)
 WAITING_LENGTH = int(FACES_READY) + 4 * ITEMS_AT_ONCE + 16  # 16 are written at a time
 
 long_counts = wp.types.vector(length=4, dtype=wp.int64)
@@ -142,7 +145,7 @@ def simd_float64_filter(
 def slab_memory_words(depth: int) -> int:
     """Return the length of a thread's memory for slabs, for trees of a depth at most."""
     slots = max(16, min(SUBTREES_KEPT, 2 ** max(0, depth - SUBTREE_DEPTH)))
-    return 16 + SLAB_HEADER + slots * (2 + 64 * SUBTREE_RECORDS)
+    return 16 + SLAB_HEADER + slots * (2 + 32 * SUBTREE_RECORDS)
 
 
 @wp.func
@@ -214,6 +217,16 @@ def resolve_uncertain(
 
 
 @wp.func
+def shuffle_top(top: wp.int32, number: wp.int32, stack: wp.array(dtype=wp.int64)):
+    """Bring some item to the top of a stack: the next search for a hit begins elsewhere."""
+    if top > 1 and top <= STACK_TO_SHUFFLE:
+        at = wp.int32(wp.uint32(number) * wp.uint32(2654435769) >> wp.uint32(8)) % top
+        item = stack[at]
+        stack[at] = stack[top - 1]
+        stack[top - 1] = item
+
+
+@wp.func
 def write_counts(p: wp.int32, hit_count: wp.int64, tests: long_counts, hits: Hits):
     """Write what an object pair took: boxes, faces, those in float64 and those with exact signs."""
     hits.count[p] = hit_count
@@ -245,12 +258,12 @@ def thread_traversal(mode: int):
         uncertain = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
         below = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
         thread, opened = take_thread(work_inout.counter), wp.bool(False)
-        at_once, ready = ITEMS_AT_ONCE, FACES_READY
-        if output == OUTPUT_ANY:
-            at_once, ready = ITEMS_FOR_ANY, FACES_FOR_ANY
         p = take_unit(work_inout.counter)
         while p < count:
             pose = pair_poses[p]
+            at_once, ready = ITEMS_AT_ONCE, FACES_READY
+            if output == OUTPUT_ANY:
+                at_once, ready = ITEMS_FOR_ANY, FACES_FOR_ANY
             stack[0] = first_item(states, pose)
             error, unit = wp.float32(pose.error), wp.float32(FLOAT32_UNIT)
             if wp.static(mode == int(FLOAT32)):
@@ -291,6 +304,9 @@ def thread_traversal(mode: int):
                     if output == OUTPUT_ANY:
                         top = 0
                         deep = 0
+                elif output == OUTPUT_ANY:
+                    at_once, ready = wp.min(2 * at_once, ITEMS_AT_ONCE), wp.min(2 * ready, FACES_READY)
+                    shuffle_top(top, wp.int32(tests[0]), stack)
             write_counts(p, hit_count, tests, hits_inout)
             p = take_unit(work_inout.counter)
 
