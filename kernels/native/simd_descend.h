@@ -4,10 +4,9 @@
 #include "sizes.h"
 
 template <class StatePool, class PairPose>
-wp::vec_t<4, wp::int64> descend(StatePool states, PairPose pose, wp::int32 at_once, wp::int32 ready, wp::int64 most,
-                                wp::vec_t<2, wp::int32> floors, wp::int32 top, wp::array_t<wp::int64> stack,
-                                wp::array_t<wp::int64> faces, wp::array_t<wp::int64> below) {
-    wp::vec_t<4, wp::int64> result;
+wp::vec_t<3, wp::int64> descend(StatePool states, PairPose pose, wp::int32 at_once, wp::int32 ready, wp::int64 most,
+                                wp::int32 top, wp::array_t<wp::int64> stack, wp::array_t<wp::int64> faces) {
+    wp::vec_t<3, wp::int64> result;
 #if defined(__CUDA_ARCH__)
     __trap();  // warps have a traversal of their own
 #else
@@ -55,11 +54,7 @@ wp::vec_t<4, wp::int64> descend(StatePool states, PairPose pose, wp::int32 at_on
     wp::int64* items = stack.data;
     wp::int64* found = faces.data;
     wp::int64 compared = 0;
-    int end = top, waiting = 0, deep = 0;
-    // Whether a node, or both children of one, lie in a subtree whose root is on a level.
-    auto is_below = [](unsigned int half, int floor) {
-        return 31 - __builtin_clz(half & 0x7fffffff) - (int)(half >> 31) >= floor;
-    };
+    int end = top, waiting = 0;
     // Siblings lie side by side, so an item loads both, and names those of the four pairs that are in use: of two
     // siblings the first (even), the second (odd) or both (s), in A, times the same in B. Four bits for each choice,
     // by the item's bits that say so, from the highest: A is odd, s of B, B is odd, s of A.
@@ -126,30 +121,19 @@ wp::vec_t<4, wp::int64> descend(StatePool states, PairPose pose, wp::int32 at_on
         }
 #endif
     };
-    while (end > 0 && waiting < ready && compared < most && deep == 0) {
+    while (end > 0 && waiting < ready && compared < most) {
         const int room = (CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH - end) / 3, fits = room > 1 ? room : 1;
         const int wanted = at_once < fits ? at_once : fits, count = wanted < end ? wanted : end;
         end -= count;
         Taken taken[ITEMS_AT_ONCE];
-        int kept = 0;
-        if (floors[0] == NO_FLOOR)
-            for (; kept < count; ++kept)
-                taken[kept] = take(items[end + kept]);
-        else
-            for (int i = 0; i < count; ++i) {
-                const wp::int64 item = items[end + i];
-                if (is_below((unsigned int)(item >> 32), floors[0]) && is_below((unsigned int)item, floors[1]))
-                    below.data[deep++] = item;
-                else
-                    taken[kept++] = take(item);
-            }
-        for (int i = 0; i < kept; ++i)
+        for (int i = 0; i < count; ++i)
+            taken[i] = take(items[end + i]);
+        for (int i = 0; i < count; ++i)
             test(taken[i]);
     }
     result[0] = end;
     result[1] = waiting;
     result[2] = compared;
-    result[3] = deep;
 #endif
     return result;
 }

@@ -28,7 +28,7 @@ SUBTREES_KEPT = 512
 SUBTREE_DEPTH, SUBTREE_RECORDS = native.constant("SUBTREE_DEPTH"), native.constant("SUBTREE_RECORDS")
 SLAB_HEADER = native.constant("SLAB_HEADER")
 NO_FLOOR = native.constant("NO_FLOOR")
-NODE_TESTS_PLAIN = 24576
+NODE_TESTS_PLAIN, NODE_TESTS_A_HIT = 24576, 256
 NEVER = 2**62
 
 # A thread tests so many face pairs at a time, so that its processor finds its way through either loop. For `any`, which
@@ -56,19 +56,25 @@ def descend(
     at_once: wp.int32,
     ready: wp.int32,
     most: wp.int64,
-    floors: wp.vec2i,
     top: wp.int32,
     stack: wp.array(dtype=wp.int64),
     faces: wp.array(dtype=wp.int64),
-    below: wp.array(dtype=wp.int64),
-) -> long_counts:
+) -> three_numbers:
     """Test items from the top of a stack until there are none, or so many leaf pairs wait as are asked for.
 
-    The same as `compare_node_pair`, four pairs of boxes at a time. Ends also once so many pairs of boxes were compared,
-    or where items lie below floors: both nodes in subtrees whose roots are on these levels.
+    The same as `compare_node_pair`, four pairs of boxes at a time. Ends also once so many pairs of boxes were compared.
 
-    Returns the items left on the stack, the leaf pairs that wait, the pairs of boxes compared, and the items listed
-    that lie below the floors.
+    Returns the items left on the stack, the leaf pairs that wait, and the pairs of boxes compared.
+    """
+
+
+@wp.func_native(native.body("simd_subtrees.h", "move_below"))
+def move_below(
+    floors: wp.vec2i, top: wp.int32, stack: wp.array(dtype=wp.int64), below: wp.array(dtype=wp.int64)
+) -> wp.vec2i:
+    """Move items near the top of a stack to a list if both nodes lie in subtrees whose roots are on floors.
+
+    Returns the items left on the stack, and those on the list, at most ITEMS_AT_ONCE.
     """
 
 
@@ -81,7 +87,7 @@ def open_subtrees(
     first: bool,
     memory: wp.array2d(dtype=wp.float32),
 ) -> wp.vec2i:
-    """Choose the directions of slabs for an object pair; return its floors, see `descend`."""
+    """Choose the directions of slabs for an object pair; return its floors, see `move_below`."""
 
 
 @wp.func_native(native.body("simd_subtrees.h", "descend_subtrees"))
@@ -220,7 +226,7 @@ def resolve_uncertain(
 def shuffle_top(top: wp.int32, number: wp.int32, stack: wp.array(dtype=wp.int64)):
     """Bring some item to the top of a stack: the next search for a hit begins elsewhere."""
     if top > 1 and top <= STACK_TO_SHUFFLE:
-        at = wp.int32(wp.uint32(number) * wp.uint32(2654435769) >> wp.uint32(8)) % top
+        at = wp.int32(wp.uint32(number) * wp.uint32(40503) >> wp.uint32(8)) % top
         item = stack[at]
         stack[at] = stack[top - 1]
         stack[top - 1] = item
@@ -275,17 +281,21 @@ def thread_traversal(mode: int):
                 most = wp.int64(NEVER)
             while top > 0 or deep > 0:
                 if top > 0 and tests[0] >= most:
-                    floors = open_subtrees(models, states, pose, thread, not opened, memory)
-                    opened, most = wp.bool(True), wp.int64(NEVER)
+                    most = tests[0] + wp.int64(NODE_TESTS_PLAIN)
+                    if hit_count * wp.int64(NODE_TESTS_A_HIT) < tests[0]:
+                        floors = open_subtrees(models, states, pose, thread, not opened, memory)
+                        opened, most = wp.bool(True), wp.int64(NEVER)
                 waiting, compared = wp.int32(0), wp.int64(0)
+                if floors[0] != NO_FLOOR and deep == 0:
+                    moved = move_below(floors, top, stack, below)
+                    top, deep = moved[0], moved[1]
                 if deep > 0:
                     inside = descend_subtrees(models, states, pose, thread, ready, deep, below, memory, faces)
                     deep, waiting, compared = wp.int32(inside[0]), wp.int32(inside[1]), inside[2]
                 else:
-                    spare = most - tests[0]
-                    progress = descend(states, pose, at_once, ready, spare, floors, top, stack, faces, below)
+                    spare = wp.where(floors[0] == NO_FLOOR, most - tests[0], wp.int64(1))
+                    progress = descend(states, pose, at_once, ready, spare, top, stack, faces)
                     top, waiting, compared = wp.int32(progress[0]), wp.int32(progress[1]), progress[2]
-                    deep = wp.int32(progress[3])
                 if wp.static(mode == int(WITHIN)):
                     met, tested = resolve_faces(wp.static(mode), output, models, states, pose, 0, waiting, faces, faces)
                     tests += long_counts(compared, wp.int64(tested), wp.int64(0), wp.int64(0))
