@@ -20,7 +20,10 @@ import warp_abtree as ab
 
 from . import tables
 
-CASES = ("baselines", "budget", "build", "exact", "frame", "precision", "query", "scale", "scaling", "sweep", "update")
+CASES = (
+    *("assembly", "baselines", "budget", "build", "exact", "frame", "precision", "query", "scale", "scaling", "sweep"),
+    "update",
+)
 STUDIES = ("paper", "tradeoff", "all")
 FIGURES = ("build", "scale", "update")  # cases whose figures are laid out in cases/figures.toml
 # A case, and a study, takes the options that its function `run` has as arguments.

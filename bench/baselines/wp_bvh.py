@@ -17,12 +17,14 @@ CONSTRUCTORS = ("sah", "median", "lbvh", "cubql")
 
 @wp.struct
 class BvhPairs:
-    """Posed pairs of one mesh."""
+    """Posed pairs of meshes."""
 
-    face_count: wp.int32  # of the mesh
-    bvh: wp.uint64  # over its faces
-    vertices: wp.array(dtype=wp.vec3)  # (v,)
-    faces: wp.array(dtype=wp.vec3i)  # (f,)
+    face_count: wp.int32  # of A
+    vertices_a: wp.array(dtype=wp.vec3)  # (v,)
+    faces_a: wp.array(dtype=wp.vec3i)  # (f,)
+    bvh: wp.uint64  # over the faces of B
+    vertices: wp.array(dtype=wp.vec3)  # of B, (v,)
+    faces: wp.array(dtype=wp.vec3i)  # of B, (f,)
     poses: wp.array(dtype=wp.transform)  # of objects, (2 p,)
 
 
@@ -30,10 +32,10 @@ class BvhPairs:
 def place_face(asked: BvhPairs, pair: wp.int32, a: wp.int32):
     """Return the corners of a face of object 2 `pair` in the frame of object 2 `pair` + 1."""
     relative = wp.transform_multiply(wp.transform_inverse(asked.poses[2 * pair + 1]), asked.poses[2 * pair])
-    face = asked.faces[a]
-    p = wp.transform_point(relative, asked.vertices[face[0]])
-    q = wp.transform_point(relative, asked.vertices[face[1]])
-    r = wp.transform_point(relative, asked.vertices[face[2]])
+    face = asked.faces_a[a]
+    p = wp.transform_point(relative, asked.vertices_a[face[0]])
+    q = wp.transform_point(relative, asked.vertices_a[face[1]])
+    r = wp.transform_point(relative, asked.vertices_a[face[2]])
     return p, q, r
 
 
@@ -86,12 +88,16 @@ class FaceBvh:
 
     Args:
         constructor: One of `CONSTRUCTORS`, None for Warp's own choice.
+        other: Vertices and faces of A, where it is another mesh.
     """
 
-    def __init__(self, vertices, faces, device, constructor=None):
+    def __init__(self, vertices, faces, device, constructor=None, other=None):
         self.device = wp.get_device(device)
         self.asked = BvhPairs()
-        self.asked.face_count = len(faces)
+        vertices_a, faces_a = other or (vertices, faces)
+        self.asked.face_count = len(faces_a)
+        self.asked.vertices_a = wp.array(vertices_a, dtype=wp.vec3, device=device)
+        self.asked.faces_a = wp.array(faces_a, dtype=wp.vec3i, device=device)
         self.asked.vertices = wp.array(vertices, dtype=wp.vec3, device=device)
         self.asked.faces = wp.array(faces, dtype=wp.vec3i, device=device)
         self.lower, self.upper = (wp.empty(len(faces), dtype=wp.vec3, device=device) for _ in range(2))
@@ -102,7 +108,7 @@ class FaceBvh:
 
     def _box(self):
         arrays = [self.asked, self.lower, self.upper]
-        wp.launch(box_face_kernel, dim=self.asked.face_count, inputs=arrays, device=self.device)
+        wp.launch(box_face_kernel, dim=len(self.lower), inputs=arrays, device=self.device)
 
     def rebuild(self):
         """Box the faces and build the tree from scratch."""
@@ -119,8 +125,8 @@ class BvhFaces(FaceBvh):
 
     yes_no = False
 
-    def __init__(self, vertices, faces, poses, capacity, device, constructor="sah"):
-        super().__init__(vertices, faces, device, constructor)
+    def __init__(self, vertices, faces, poses, capacity, device, constructor="sah", other=None):
+        super().__init__(vertices, faces, device, constructor, other)
         self.pair_count = len(poses) // 2
         self.asked.poses = wp.array(np.asarray(poses, np.float32), dtype=wp.transform, device=device)
         self.hits = wp.empty(capacity, dtype=wp.vec3i, device=device)
@@ -149,22 +155,22 @@ class BvhAny(BvhFaces):
 
     yes_no = True
 
-    def __init__(self, vertices, faces, poses, device, constructor="sah"):
-        super().__init__(vertices, faces, poses, 0, device, constructor)
+    def __init__(self, vertices, faces, poses, device, constructor="sah", other=None):
+        super().__init__(vertices, faces, poses, 0, device, constructor, other)
 
     def result(self) -> np.ndarray:
         """Return whether each pair intersects, bool (p,)."""
         return self.found.numpy() != 0
 
 
-def find_constructor(vertices, faces, poses, device, repeats=5) -> str:
+def find_constructor(vertices, faces, poses, device, repeats=5, other=None) -> str:
     """Return the constructor whose tree answers fastest."""
     launches = {}
     for name in CONSTRUCTORS:
         if name == "lbvh" and device.is_cpu:  # there it is sah
             continue
         try:
-            launches[name] = BvhFaces(vertices, faces, poses, 0, device, name).launch
+            launches[name] = BvhFaces(vertices, faces, poses, 0, device, name, other).launch
         except (RuntimeError, ValueError):  # not compiled in
             continue
     times = medians(time_in_turn(launches, device, repeats))
