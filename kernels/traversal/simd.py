@@ -28,8 +28,9 @@ SUBTREES_KEPT = 512
 SUBTREE_DEPTH, SUBTREE_RECORDS = native.constant("SUBTREE_DEPTH"), native.constant("SUBTREE_RECORDS")
 SLAB_HEADER = native.constant("SLAB_HEADER")
 NO_FLOOR = native.constant("NO_FLOOR")
-NODE_TESTS_PLAIN, NODE_TESTS_A_HIT = 24576, 256
-NEVER = 2**62
+# Slabs are made where so many pairs of nodes were compared for a hit, or more.
+NODE_TESTS_A_HIT = wp.constant(wp.int64(256))
+NEVER = wp.constant(wp.int64(2**62))
 
 # A thread tests so many face pairs at a time, so that its processor finds its way through either loop. For `any`, which
 # an early hit ends, few at first, and twice as many after each search without one, so that what an end wastes is at
@@ -253,6 +254,7 @@ def thread_traversal(mode: int):
         states: StatePool,
         pair_count: wp.array(dtype=wp.int32),
         pair_poses: wp.array(dtype=PairPose),
+        plain_tests: wp.int32,
         memory: wp.array2d(dtype=wp.float32),
         hits_inout: Hits,
         work_inout: Work,
@@ -276,15 +278,15 @@ def thread_traversal(mode: int):
                 error, unit = wp.float32(0.0), wp.float32(0.0)
             top, hit_count = wp.int32(1), wp.int64(0)
             tests = long_counts()
-            floors, most, deep = wp.vec2i(NO_FLOOR, NO_FLOOR), wp.int64(NODE_TESTS_PLAIN), wp.int32(0)
+            floors, most, deep = wp.vec2i(NO_FLOOR, NO_FLOOR), wp.int64(plain_tests), wp.int32(0)
             if thread >= memory.shape[0] or wp.static(mode == int(WITHIN)) or pose.error == wp.inf:
-                most = wp.int64(NEVER)
+                most = NEVER
             while top > 0 or deep > 0:
                 if top > 0 and tests[0] >= most:
-                    most = tests[0] + wp.int64(NODE_TESTS_PLAIN)
-                    if hit_count * wp.int64(NODE_TESTS_A_HIT) < tests[0]:
+                    most = tests[0] + wp.int64(plain_tests)
+                    if hit_count * NODE_TESTS_A_HIT <= tests[0]:
                         floors = open_subtrees(models, states, pose, thread, not opened, memory)
-                        opened, most = wp.bool(True), wp.int64(NEVER)
+                        opened, most = wp.bool(True), NEVER
                 waiting, compared = wp.int32(0), wp.int64(0)
                 if floors[0] != NO_FLOOR and deep == 0:
                     moved = move_below(floors, top, stack, below)

@@ -339,7 +339,7 @@ def descend_kernel(
         stack_inout[i] = root
     top, found, compared = wp.int32(times), wp.int32(0), wp.int64(0)
     while top > 0:
-        progress = descend(states, pose, at_once, ready, top, stack_inout, faces_inout)
+        progress = descend(states, pose, at_once, ready, wp.int64(2**40), top, stack_inout, faces_inout)
         top = wp.int32(progress[0])
         compared += progress[2]
         for i in range(wp.int32(progress[1])):

@@ -157,7 +157,8 @@ class Query(QueryBuffers):
             cores = current_regime().cpu_threads or core_count()
             # A launch on a further core costs some 50 us: the work of many pairs apart, of less than one in contact.
             least = 32 if output == int(face_pairs.OUTPUT_ANY) else 1
-            launch_on_cores(simd.thread_traversal(mode), room, [*inputs, self.slab_memory, hits, self.work], self.device, cores, least)
+            inputs += [self._regime.plain_tests, self.slab_memory, hits, self.work]
+            launch_on_cores(simd.thread_traversal(mode), room, inputs, self.device, cores, least)
             return
         # More than there are pairs: idle warps wait for donations.
         warps = max(room, int(4 * self._regime.warps_per_pair * math.sqrt(room)) + 1)
