@@ -156,4 +156,7 @@ def make_bvh(meshes, matrices, device, hits):
     arguments = dict(device=device, other=meshes[0])
     constructor = find_constructor(*meshes[1], poses, **arguments)
     faces = BvhFaces(*meshes[1], poses, 10 * hits + 10**7, constructor=constructor, **arguments)
-    return {"faces": run_to_host(faces), "any": run_to_host(BvhAny(*meshes[1], poses, constructor=constructor, **arguments))}
+    return {
+        "faces": run_to_host(faces),
+        "any": run_to_host(BvhAny(*meshes[1], poses, constructor=constructor, **arguments)),
+    }

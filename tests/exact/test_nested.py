@@ -65,7 +65,9 @@ def test_nested_parts_equal_brute_force(gap):
             scene = scene_of(CPU, cases)
             found = scene.intersect(pairs_of(cases), "faces")
             np.testing.assert_array_equal(found.faces, rows)
-            np.testing.assert_array_equal(scene.intersect(pairs_of(cases), "any").any, [len(faces) > 0 for faces in truth])
+            np.testing.assert_array_equal(
+                scene.intersect(pairs_of(cases), "any").any, [len(faces) > 0 for faces in truth]
+            )
             tests[plain_tests] = found.node_tests.sum(), found.triangle_tests.sum()
     assert (1.3 * np.array(tests[0]) < tests[10**9]).all(), "slabs separate what boxes do not"
 
