@@ -1,6 +1,6 @@
 """python -m bench CASE [--device D] [--json FILE] [...]: one of the cases below, its rows printed as they come.
 
-python -m bench paper|tradeoff|all --out DIR [...]: a study. `python -m bench NAME --help` lists the options of a name.
+python -m bench paper|tradeoff --out DIR [...]: a study. `python -m bench NAME --help` lists the options of a name.
 """
 
 import argparse
@@ -21,11 +21,11 @@ import warp_abtree as ab
 from . import tables
 
 CASES = (
-    *("assembly", "baselines", "budget", "build", "exact", "frame", "precision", "query", "scale", "scaling", "sweep"),
+    *("assembly", "baselines", "budget", "build", "coarse", "exact", "frame", "precision", "query", "scale", "sweep"),
     "update",
 )
-STUDIES = ("paper", "tradeoff", "all")
-FIGURES = ("build", "scale", "update")  # cases whose figures are laid out in cases/figures.toml
+STUDIES = ("paper", "tradeoff")
+FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml
 # A case, and a study, takes the options that its function `run` has as arguments.
 OPTIONS = {
     "quick": {"action": "store_true", "default": None, "help": "the smallest sizes, to try a case out"},
@@ -35,7 +35,6 @@ OPTIONS = {
     "count": {"type": int, "help": "random pairs; a tenth as many adversarial ones"},
     "out": {"required": True, "metavar": "DIR", "help": "where to write JSON, tables and figures"},
     "only": {"nargs": "+", "metavar": "PART", "help": "run these parts alone; others are kept from before"},
-    "devices": {"help": "Warp devices with commas between (cpu,cpu)"},
     "processes": {"type": int, "help": "processes that run the oracle"},
 }
 

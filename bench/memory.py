@@ -13,9 +13,9 @@ def used_memory(device) -> dict:
     if device.is_cpu:
         return {}
     wp.synchronize_device(device)
+    pool = wp.get_mempool_used_mem_current(device) if wp.is_mempool_enabled(device) else 0
     taken = device.total_memory - device.free_memory
-    pool = wp.get_mempool_used_mem_current(device) if wp.is_mempool_enabled(device) else None
-    return {"pool_mib": None if pool is None else round(pool / 2**20, 1), "taken_mib": round(taken / 2**20, 1)}
+    return {"pool_mib": round(pool / 2**20, 1), "taken_mib": round(taken / 2**20, 1)}
 
 
 def memory_columns(scene, query=None) -> dict:

@@ -30,11 +30,10 @@ def mesh_file(name) -> Path | None:
 
 def real_meshes(pairs) -> dict:
     """Return the models of named tuples of meshes, where the folder in ABTREE_MESHES has all of a tuple."""
-    if not os.environ.get("ABTREE_MESHES"):
-        return {}
     folder = ModelFolder(None)
     at_hand = {key: names for key, names in pairs.items() if all(map(mesh_file, names))}
-    return {key: tuple(folder.load([name]) for name in names) for key, names in at_hand.items()}
+    found = at_hand if os.environ.get("ABTREE_MESHES") else {}
+    return {key: tuple(folder.load([name]) for name in names) for key, names in found.items()}
 
 
 def knot_model(face_target, folder=None) -> ab.Model:
@@ -52,11 +51,7 @@ def has_source(name) -> bool:
 
 
 class ModelFolder:
-    """Models in a folder, by name and faces of the base mesh; those in use stay in memory.
-
-    Args:
-        folder: Made when the first model is kept; None keeps no files.
-    """
+    """Models in a folder, by name and faces of the base mesh; those in use stay in memory. None keeps no files."""
 
     def __init__(self, folder):
         self.folder = None if folder is None else Path(folder)
@@ -77,20 +72,17 @@ class ModelFolder:
             ValueError: None is at hand.
         """
         for name in names:
-            if has_source(name) or (self.folder and self.file(name, base_faces).is_file()):
-                key = name, base_faces
-                self._open[key] = self._open.get(key) or self._load(name, base_faces)
+            key, file = (name, base_faces), self.folder and self.file(name, base_faces)
+            if key not in self._open and file and file.is_file():
+                self._open[key] = ab.Model.open(file)
+            elif key not in self._open and has_source(name):
+                self._open[key] = self._make(name, base_faces)
+                if file:
+                    self.folder.mkdir(parents=True, exist_ok=True)
+                    self._open[key].save(file)
+            if key in self._open:
                 return self._open[key]
         raise ValueError(f"none of {', '.join(names)} is at hand: set ABTREE_MESHES, or install the extra `usd`")
-
-    def _load(self, name, base_faces):
-        if self.folder is None:
-            return self._make(name, base_faces)
-        file = self.file(name, base_faces)
-        if not file.is_file():
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._make(name, base_faces).save(file)
-        return ab.Model.open(file)
 
     def _make(self, name, base_faces):
         if name in COLLAPSED:

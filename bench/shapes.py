@@ -3,6 +3,7 @@
 import numpy as np
 
 import warp_abtree as ab
+from warp_abtree.checks.quaternions import matrices_of
 
 
 def knot(face_target):
@@ -46,18 +47,18 @@ def pair_poses(pair_count, distance, seed=0):
     return poses
 
 
-def random_poses(count, size, seed=0):
-    """Return float64 (count, 7): any rotation, positions in a cube whose side is twice a size."""
+def random_poses(reach, *shape, seed=0):
+    """Return float64 (*shape, 7): any rotation, positions in a cube that reaches so far from the origin."""
     rng = np.random.default_rng(seed)
-    turns = random_directions(rng, count, 4)
-    return np.concatenate([size * rng.uniform(-1, 1, (count, 3)), turns], 1)
+    rotations = random_directions(rng, *shape, 4)
+    return np.concatenate([reach * rng.uniform(-1, 1, (*shape, 3)), rotations], -1)
 
 
-def world_poses(world_count, object_count, size, seed=0):
-    """Return float64 (worlds, objects, 7): any rotation, positions in a cube of a mesh's size."""
-    rng = np.random.default_rng(seed)
-    turns = random_directions(rng, world_count, object_count, 4)
-    return np.concatenate([size * rng.uniform(-0.5, 0.5, (world_count, object_count, 3)), turns], -1)
+def pose_matrices(poses):
+    """Return matrices float64 (n, 4, 4) of poses (n, 7)."""
+    matrices = np.tile(np.eye(4), (len(poses), 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = matrices_of(poses[:, 3:]), poses[:, :3]
+    return matrices
 
 
 def longest_side(model) -> float:
@@ -72,20 +73,11 @@ def centre_and_radius(model):
     return centre, np.linalg.norm(points - centre, axis=1).max()
 
 
-def scene_of_objects(device, model, poses):
-    """Return a scene of a model at each pose."""
+def scene_of_objects(device, model, poses, world_size=None):
+    """Return a scene of a model at poses (n, 7), all in one world or so many in each."""
     scene = ab.Scene(device=device)
-    for pose in poses:
-        scene.add(model, pose=pose)
-    return scene
-
-
-def scene_of_worlds(device, model, poses):
-    """Return a scene of a model at poses (worlds, objects, 7), each row of them a world of its own."""
-    scene = ab.Scene(device=device)
-    for world, rows in enumerate(poses):
-        for pose in rows:
-            scene.add(model, pose, world=world)
+    for i, pose in enumerate(poses):
+        scene.add(model, pose, world=i // world_size if world_size else 0)
     return scene
 
 

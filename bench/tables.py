@@ -27,7 +27,13 @@ DIGITS = 5  # significant ones of a number that is kept
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES = ("-", "--", ":", "-.")
-STYLE = {"svg.hashsalt": "warp_abtree", "svg.fonttype": "none", "font.size": 9, "lines.markersize": 4}
+STYLE = {
+    "svg.hashsalt": "warp_abtree",
+    "svg.fonttype": "none",
+    "font.size": 9,
+    "lines.markersize": 4,
+    "lines.linewidth": 1.4,
+}
 PANEL = (4.6, 3.9)  # inches
 
 
@@ -148,11 +154,8 @@ def draw(figures, rows, folder) -> str:
             columns = min(3, len(panels))
             lines = -(-len(panels) // columns)
             canvas = Figure(figsize=(PANEL[0] * columns, PANEL[1] * lines), layout="constrained")
-            axes = list(canvas.subplots(lines, columns, squeeze=False).ravel())
-            for place, (panel, points) in zip(axes, panels):
-                draw_panel(place, panel, points)
-            for place in axes[len(panels) :]:
-                place.remove()
+            for i, (panel, points) in enumerate(panels):
+                draw_panel(canvas.add_subplot(lines, columns, i + 1), panel, points)
             canvas.savefig(Path(folder) / figure["file"], metadata={"Date": None})
             drawn.append(figure["file"])
     return f"plots in {folder}: {', '.join(drawn) or 'none'}"
@@ -164,9 +167,9 @@ def split_panel(panel, rows):
     if "split" not in panel:
         return [(panel, rows)]
     values = list(dict.fromkeys(row[panel["split"]] for row in rows))
-    shared = {"order": list(dict.fromkeys(row.get(panel.get("by")) for row in rows))}
+    order = list(dict.fromkeys(row.get(panel.get("by")) for row in rows))
     return [
-        (panel | shared | {"title": str(value), "legend": i == 0}, pick(rows, **{panel["split"]: value}))
+        (panel | {"title": str(value), "legend": i == 0, "order": order}, pick(rows, **{panel["split"]: value}))
         for i, value in enumerate(values)
     ]
 
@@ -174,12 +177,12 @@ def split_panel(panel, rows):
 def find_lines(rows, panel) -> dict:
     """Return the points of a panel's lines, by (column, value of `by`)."""
     lines = {}
+    logarithmic = [panel.get(name, "log") == "log" for name in ("xscale", "yscale")]
     for row in rows:
         for column in panel["y"]:
-            x, y = row.get(panel["x"]), row.get(column)
-            logarithmic = panel.get("yscale", "log") == "log", panel.get("xscale", "log") == "log"
-            if x is not None and y is not None and (y or not logarithmic[0]) and (x or not logarithmic[1]):
-                lines.setdefault((column, row.get(panel.get("by"))), []).append((x, y))
+            point = row.get(panel["x"]), row.get(column)
+            if all(value is not None and (value or not log) for value, log in zip(point, logarithmic)):
+                lines.setdefault((column, row.get(panel.get("by"))), []).append(point)
     return lines
 
 
@@ -189,17 +192,14 @@ def draw_panel(axes, panel, lines):
         scale = panel.get(name, "log")
         set_scale(scale, **({"linthresh": panel["least"], "linscale": 0.4} if scale == "symlog" else {}))
     for (column, part), points in lines.items():
-        x, y = zip(*points, strict=True) if panel.get("unsorted") else zip(*sorted(points), strict=True)
-        label = panel["y"][column]
-        if "by" in panel:
-            name = f"{part:,} {panel['unit'].removesuffix('s' if part == 1 else '')}" if "unit" in panel else part
-            label = f"{label}, {name}" if label else name
-        slope = fit_slope(upper_half(x), upper_half(y)) if panel.get("slope") else None
-        label += "" if slope is None else f": slope {slope:.2f}"
+        x, y = zip(*(points if panel.get("unsorted") else sorted(points)), strict=True)
+        name = f"{part:,} {panel['unit'].removesuffix('s' if part == 1 else '')}" if "unit" in panel else part
+        label = ", ".join(str(text) for text in (panel["y"][column], name if "by" in panel else "") if text != "")
+        if panel.get("slope") and len(x) > 1:
+            label += f": slope {fit_slope(upper_half(x), upper_half(y)):.2f}"
         turn = columns.index(column)
         colour = parts.index(part) if "by" in panel else turn
-        style = {"color": COLOURS[colour % len(COLOURS)], "linewidth": 1.4}
-        style["linestyle"] = DASHES[turn % len(DASHES)]
+        style = {"color": COLOURS[colour % len(COLOURS)], "linestyle": DASHES[turn % len(DASHES)]}
         style["marker"] = MARKERS[max(turn, colour) % len(MARKERS)] if panel.get("markers", True) else ""
         axes.plot(x, y, label=label, **style)
     axes.set(title=panel.get("title", ""), xlabel=panel["xlabel"], ylabel=panel["ylabel"])

@@ -12,26 +12,23 @@ import warp as wp
 WARM_UP = 2  # rounds before the first that counts
 
 
-def capture(launch, device):
-    """Return a CUDA graph of a launch, whose modules are loaded."""
-    with wp.ScopedCapture(device) as captured:
+def make_replay(launch, device, captured=None):
+    """Return a callable that replays a launch as a graph, by default on CUDA alone; its modules are loaded."""
+    if not (device.is_cuda if captured is None else captured):
+        return launch
+    with wp.ScopedCapture(device) as capture:
         launch()
-    return captured.graph
+    return partial(wp.capture_launch, capture.graph)
 
 
-def make_replay(launch, device):
-    """Return a callable that replays a launch as a graph on CUDA, and launches on the CPU, on all of its cores."""
-    return partial(wp.capture_launch, capture(launch, device)) if device.is_cuda else launch
-
-
-def time_graph(graph, device):
+def time_events(replay, device):
     """Return a callable that replays a graph and returns its time [ms], between events."""
     begin, end = wp.Event(device, enable_timing=True), wp.Event(device, enable_timing=True)
 
     def run():
         with wp.ScopedDevice(device):
             wp.record_event(begin)
-            wp.capture_launch(graph)
+            replay()
             wp.record_event(end)
             return wp.get_event_elapsed_time(begin, end)
 
@@ -41,8 +38,7 @@ def time_graph(graph, device):
 def time_call(call, device="cpu", clock=time.perf_counter):
     """Return a callable that calls something, waits for the device and returns the time [ms].
 
-    Args:
-        clock: `time.thread_time` leaves out other threads and processes.
+    The clock `time.thread_time` leaves out other threads and processes.
     """
 
     def run():
@@ -66,13 +62,18 @@ def time_rounds(runs: dict, repeats) -> dict:
     return {name: sorted(values) for name, values in times.items()}
 
 
-def make_runs(launches: dict, device, clock=time.perf_counter) -> dict:
-    """Launch each thing once, in order, which compiles it; return callables that run one and return its time [ms]."""
+def make_runs(launches: dict, device, clock=time.perf_counter, captured=None) -> dict:
+    """Launch each thing once, in order, which compiles it; return callables that run one and return its time [ms].
+
+    Args:
+        captured: Whether launches become graphs; None is on CUDA alone. On the CPU a graph costs no Python a launch.
+    """
     runs = {}
     for name, launch in launches.items():
         launch()
         wp.synchronize_device(device)
-        runs[name] = time_graph(capture(launch, device), device) if device.is_cuda else time_call(launch, device, clock)
+        replay = make_replay(launch, device, captured)
+        runs[name] = time_events(replay, device) if device.is_cuda else time_call(replay, device, clock)
     return runs
 
 
@@ -86,17 +87,13 @@ def medians(times: dict) -> dict:
     return {name: float(np.median(values)) for name, values in times.items()}
 
 
-def summarise(name, times) -> dict:
-    """Return the columns of one thing's times [ms]: median and 95th percentile."""
-    return {
-        f"{name}_ms": round(float(np.median(times)), 4),
-        f"{name}_p95_ms": round(float(np.percentile(times, 95)), 4),
-    }
-
-
-def summarise_all(times: dict) -> dict:
-    """Return the columns of all times, see `summarise`."""
-    return {key: value for name, values in times.items() for key, value in summarise(name, values).items()}
+def summarise(times: dict) -> dict:
+    """Return the columns of times [ms] by name: median and 95th percentile."""
+    row = {}
+    for name, values in times.items():
+        row[f"{name}_ms"] = round(float(np.median(values)), 4)
+        row[f"{name}_p95_ms"] = round(float(np.percentile(values, 95)), 4)
+    return row
 
 
 def ratio_of(times, base) -> float:
@@ -112,11 +109,8 @@ def fit_slope(sizes, times):
 
 
 def crossover(x, excess, always):
-    """Return the x, on a logarithmic scale, from which on an excess stays above 0.
-
-    Args:
-        always: What to return where it is above 0 everywhere; where it ends below, None is returned.
-    """
+    """Return the x, on a logarithmic scale, from which on an excess stays above 0: None where it ends below, and
+    `always` where it is above 0 everywhere."""
     below = np.flatnonzero(np.asarray(excess) < 0)
     if not len(below):
         return always
@@ -143,11 +137,6 @@ def one_core():
         yield max(allowed)
     finally:
         os.sched_setaffinity(0, allowed)
-
-
-def core_count() -> int:
-    """Return the cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextlib.contextmanager

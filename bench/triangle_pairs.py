@@ -16,18 +16,20 @@ def lattice(rng, count):
     return np.floor(rng.random((count, 2, 3, 3)) * rng.integers(2, 7, (count, 1, 1, 1)))
 
 
+def in_plane(rng, u, v, origin):
+    """Return triangles in the plane of two vectors and a point, (count, 1, 1, 3) each."""
+    s, t = rng.integers(-3, 4, (2, len(u), 2, 3, 1)).astype(float)
+    return u * s + v * t + origin
+
+
 def coplanar(rng, count):
     """Both triangles in one oblique plane, exactly; some are segments and points."""
-    u, v, origin = rng.integers(-(2**9), 2**9, (3, count, 1, 1, 3)).astype(float)
-    s, t = rng.integers(-3, 4, (2, count, 2, 3, 1)).astype(float)
-    return u * s + v * t + origin
+    return in_plane(rng, *rng.integers(-(2**9), 2**9, (3, count, 1, 1, 3)).astype(float))
 
 
 def nearly_coplanar(rng, count):
     """The same, in a plane of real numbers, hence a rounding or two apart."""
-    u, v, origin = rng.normal(size=(3, count, 1, 1, 3))
-    s, t = rng.integers(-3, 4, (2, count, 2, 3, 1)).astype(float)
-    return u * s + v * t + origin
+    return in_plane(rng, *rng.normal(size=(3, count, 1, 1, 3)))
 
 
 def touch(rng, a):

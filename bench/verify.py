@@ -30,7 +30,7 @@ def count_differences(found, truth):
 
 
 def judge_disputed(found, ours, meshes, poses, name, most=None):
-    """Let the oracle decide face pairs that only one side reports.
+    """Let the oracle decide face pairs that only one side reports; return how many, None without the oracle.
 
     Args:
         found, ours: Rows (pair, face of A, face of B) of a baseline and of the library.
@@ -38,9 +38,6 @@ def judge_disputed(found, ours, meshes, poses, name, most=None):
         poses: Called with a pair; returns the poses of A and B.
         name: Of the baseline.
         most: Judge about so many, evenly chosen; None judges all.
-
-    Returns:
-        How many face pairs were judged; None without the oracle.
 
     Raises:
         RuntimeError: The library is wrong in one of them.

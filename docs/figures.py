@@ -14,7 +14,7 @@ from warp_abtree.app.pictures.render import Panel, draw
 from warp_abtree.app.styles import COLOURS
 
 FOLDER = Path(__file__).parent
-INK, PALE, BLUE, RED, GREEN = "#33373d", "#d5d8dc", "#3b76c4", "#d4472f", "#2f9e58"
+INK, PALE, BLUE, RED = "#33373d", "#d5d8dc", "#3b76c4", "#d4472f"
 
 # The same file each time it is drawn.
 matplotlib.rcParams.update({"svg.hashsalt": "warp_abtree", "font.size": 9, "svg.fonttype": "none"})
@@ -34,15 +34,9 @@ def draw_lods():
         error = "the original" if lod == model.lod_max else f"error at most {model.error_at(lod):.2g}"
         title = f"LOD {lod:,} of {model.lod_max:,}\n{len(faces):,} faces, {error}"
         panels.append(Panel(title, vertices[faces], np.tile(COLOURS[0][0], (len(faces), 1))))
-    legend = [
-        (
-            COLOURS[0][0],
-            f"bunny; its box has a diagonal of {np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0)):.2g}",
-        )
-    ]
-    draw(
-        panels, FOLDER / "concept_lods.png", "One model, every level of detail", legend, (0.15, 0.3, 1), (0, 1, 0), 300
-    )
+    size = np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0))
+    legend, view = [(COLOURS[0][0], f"bunny; its box has a diagonal of {size:.2g}")], ((0.15, 0.3, 1), (0, 1, 0))
+    draw(panels, FOLDER / "concept_lods.png", "One model, every level of detail", legend, *view, 300)
 
 
 # The tree.
@@ -57,12 +51,9 @@ def place_of(node):
 def draw_tree(axes, tree, title, marked=()):
     nodes = [node for node in range(1, len(tree.node_face)) if tree.used[node]]
     for colour, width, chosen in ((PALE, 0.8, False), (RED, 1.4, True)):
-        ways = [
-            (place_of(node), place_of(node // 2), (np.nan, np.nan))
-            for node in nodes
-            if (node in marked) is chosen and node > 1
-        ]
-        axes.plot(*np.array([point for way in ways for point in way] or [(np.nan, np.nan)]).T, color=colour, lw=width)
+        children = [node for node in nodes if (node in marked) is chosen and node > 1]
+        ways = [point for node in children for point in (place_of(node), place_of(node // 2), (np.nan, np.nan))]
+        axes.plot(*np.array(ways or [(np.nan, np.nan)]).T, color=colour, lw=width)
     kinds: dict[tuple, list] = {}
     for node in nodes:
         leaf, active = tree.node_face[node] >= 0, tree.status[node] != 0
@@ -145,13 +136,19 @@ def meeting_nodes(states, poses, levels):
             if (low_a <= high_b).all() and (low_b <= high_a).all():
                 kept.append((a, b))
         found.append(kept)
-        children = [
-            [(x, y) for x in (2 * a, 2 * a + 1) for y in (2 * b, 2 * b + 1)]
-            for a, b in kept
-            if 2 * a + 1 < len(states[0].status) and 2 * b + 1 < len(states[1].status)
-        ]
-        pairs = [(a, b) for each in children for a, b in each if states[0].status[a] and states[1].status[b]]
+        counts = [len(state.status) for state in states]
+        inner = [(2 * a, 2 * b) for a, b in kept if 2 * a + 1 < counts[0] and 2 * b + 1 < counts[1]]
+        children = [(a + i, b + j) for a, b in inner for i in (0, 1) for j in (0, 1)]
+        pairs = [(a, b) for a, b in children if states[0].status[a] and states[1].status[b]]
     return found
+
+
+def box_lines(boxes):
+    """Return the edges of boxes (b, 2, 3), (12 b, 2, 3)."""
+    # Bit a of a corner's number says lower or upper along axis a.
+    corner = np.arange(8)
+    corners = np.stack([boxes[:, (corner >> axis) & 1, axis] for axis in range(3)], axis=-1)
+    return corners[:, [(c, c | bit) for c in range(8) for bit in (1, 2, 4) if not c & bit]].reshape(-1, 2, 3)
 
 
 def draw_traversal():
@@ -175,7 +172,7 @@ def draw_traversal():
         lines = []
         for side, colour in enumerate(((0.75, 0.15, 0.1), (0.1, 0.25, 0.7))):
             nodes = sorted({pair[side] for pair in found[level]})
-            edges = geometry.box_lines(np.stack([states[side].lower[nodes], states[side].upper[nodes]], axis=1))
+            edges = box_lines(np.stack([states[side].lower[nodes], states[side].upper[nodes]], axis=1))
             lines.append((geometry.place(where, np.full(len(edges), side), edges), colour))
         title = f"level {level}: {len(found[level]):,} of {4**level:,} pairs of nodes overlap"
         panels.append(Panel(f"{title}\n", np.concatenate(triangles), np.concatenate(colours), lines))
@@ -184,56 +181,10 @@ def draw_traversal():
     draw(panels, FOLDER / "concept_traversal.png", title, legend, eye, up, 380)
 
 
-# Speed against accuracy.
-
-
-def draw_tradeoff():
-    """What a coarser LOD saves and costs: tests counted, answers compared, no times."""
-    model = ab.Model.load("warp:bunny")
-    rng = np.random.default_rng(0)
-    poses = np.zeros((400, 7))
-    poses[:, :3] = rng.normal(size=(400, 3))
-    poses[:, :3] *= rng.uniform(0.6, 1.6, (400, 1)) / np.linalg.norm(poses[:, :3], axis=1, keepdims=True)
-    poses[:, 3:] = rng.normal(size=(400, 4))
-    poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
-    diagonal = np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0))
-    shares = np.array([1, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01, 0.005])
-    rows = []
-    for share in shares:
-        lod = model.lod_for(fraction=share)
-        scene = ab.Scene("cpu")
-        scene.add(model, lod=lod)
-        for pose in poses:
-            scene.add(model, pose, lod=lod)
-        pairs = np.stack([np.zeros(400, int), np.arange(1, 401)], 1)
-        found = scene.intersect(pairs, output="count")
-        tests = int(found.node_tests.sum() + found.triangle_tests.sum())
-        rows.append((model.error_at(lod) / diagonal, tests, found.any))
-    error = 100 * np.array([row[0] for row in rows])
-    tests = 100 * np.array([row[1] for row in rows]) / rows[0][1]
-    wrong = 100 * np.array([np.mean(row[2] != rows[0][2]) for row in rows])
-    figure = Figure(figsize=(7.4, 2.6))
-    left, right = figure.subplots(1, 2)
-    left.plot(100 * shares, tests, "o-", color=BLUE)
-    left.set(ylabel="tests of boxes and faces [%]", ylim=(0, 105))
-    right.plot(100 * shares, error, "o-", color=RED, label="certified error [% of the diagonal]")
-    right.plot(100 * shares, wrong, "s--", color=GREEN, label="answers yes or no that differ [%]")
-    right.set_ylim(bottom=0)
-    right.legend(frameon=False, fontsize=8)
-    for axes in (left, right):
-        axes.set(xscale="log", xlabel="faces [%]", xticks=[100, 10, 1], xticklabels=["100", "10", "1"])
-        axes.invert_xaxis()
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(alpha=0.3)
-    figure.tight_layout(w_pad=3)
-    save(figure, "concept_tradeoff.svg")
-
-
 def main():
     draw_lods()
     draw_trees()
     draw_traversal()
-    draw_tradeoff()
 
 
 if __name__ == "__main__":

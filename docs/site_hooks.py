@@ -35,22 +35,14 @@ def on_files(files, config):
         if not path.endswith(".md"):
             title = path.rsplit("/", 1)[-1]
             text = f"# {title}\n\n`{path}`\n\n````{LANGUAGES[Path(path).suffix]}\n{text}````\n"
-        files.append(_generated(config, page_of(path), text))
-    names = sorted(path.name for path in (ROOT / "docs" / "data").glob("*.json"))
-    rows = "\n".join(f"- [{name}]({name})" for name in names)
-    files.append(_generated(config, "data/index.md", f"# Data\n\nThe runs behind the tables:\n\n{rows}\n"))
+        files.append(File.generated(config, page_of(path), content=text, inclusion=InclusionLevel.NOT_IN_NAV))
     return files
 
 
-def _generated(config, name, content):
-    return File.generated(config, name, content=content, inclusion=InclusionLevel.NOT_IN_NAV)
-
-
 def on_page_markdown(markdown, page, config, files):
-    """Point links to such files, and to the folder of data, at their pages."""
+    """Point links to such files at their pages."""
     if page.file.generated_by:
         return markdown
-    markdown = markdown.replace("](data)", "](data/index.md)")
 
     def to_page(match):
         path = target_of(page.file.src_uri, match[1])

@@ -9,11 +9,6 @@ import warp as wp
 
 from warp_abtree.kernels import native
 
-INACTIVE = wp.constant(0)
-ACTIVE = wp.constant(1)
-DEFORMED = wp.constant(2)
-"""Status of a node (Liu et al. 2006, section 3.2.1). Deformed lasts from ACTIVE-MARK to ACTIVE-WALK only."""
-
 LEVEL_MAX = wp.constant(31)
 """Levels that a tree of at most 2^30 leaves can have."""
 
@@ -55,7 +50,7 @@ class StatePool:
     lod: wp.array(dtype=wp.int32)  # vertex splits applied, shape [state]
     node_start: wp.array(dtype=wp.int32)  # where its nodes begin, shape [state]
     face_start: wp.array(dtype=wp.int32)  # where its faces begin, shape [state]
-    node_status: wp.array(dtype=wp.int32)  # INACTIVE, ACTIVE or DEFORMED, shape [node]
+    node_mark: wp.array(dtype=wp.uint32)  # a bit a node: deformed, from ACTIVE-MARK to ACTIVE-WALK, shape [node / 32]
     node_box: wp.array(dtype=wp.vec4)  # records of `nodes.Node`, two entries of 16 bytes each, shape [2 node]
     face_corner: wp.array(dtype=wp.vec4i)  # active ancestors of its corners, -1 where inactive, shape [face]
 

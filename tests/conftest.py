@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 from warp_abtree import testing
+from warp_abtree.state import work_lists
 
 # JAX would take three quarters of a GPU's memory for itself.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -43,6 +44,14 @@ def real_mesh_path(name):
 def real_mesh_path_fixture():
     """Give `real_mesh_path` to a test that does not import it."""
     return real_mesh_path
+
+
+@pytest.fixture(params=["blocks", "lists"])
+def update_path(request, monkeypatch):
+    """Update tree states both ways: a block each, and all by level lists, also where the whole costs less."""
+    monkeypatch.setattr(work_lists, "LISTED_FRACTION", 1.0)
+    with testing.regime(block_updates=request.param == "blocks"):
+        yield
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """What is shipped: wheel and source distribution hold the package, its kernels and scenes, and a wheel runs alone."""
 
 import email
-import importlib.util
 import json
 import os
 import re
@@ -23,20 +22,14 @@ ROOT = Path(__file__).resolve().parents[1]
 LEAST_SETUPTOOLS = 77  # for the licence as pyproject.toml writes it
 
 
-def modern_setuptools() -> bool:
-    try:
-        return int(importlib.import_module("setuptools").__version__.split(".")[0]) >= LEAST_SETUPTOOLS
-    except ImportError:
-        return False
-
-
 @pytest.fixture(scope="session")
 def dist(tmp_path_factory):
     """Give the folder of a built wheel and source distribution: of ABTREE_DIST, or built here."""
     if "ABTREE_DIST" in os.environ:
         return Path(os.environ["ABTREE_DIST"])
-    if importlib.util.find_spec("build") is None or not modern_setuptools():
-        pytest.skip(f"needs build and setuptools {LEAST_SETUPTOOLS}, or ABTREE_DIST; .ci/run gives that")
+    reason = f"needs build and setuptools {LEAST_SETUPTOOLS}, or ABTREE_DIST; .ci/run gives that"
+    pytest.importorskip("build", reason=reason)
+    pytest.importorskip("setuptools", str(LEAST_SETUPTOOLS), reason=reason)
     folder = tmp_path_factory.mktemp("packaging")
     left_out = shutil.ignore_patterns(".git", ".venv", "build", "dist", "*.egg-info", "__pycache__", ".*_cache")
     shutil.copytree(ROOT, folder / "source", ignore=left_out)
@@ -52,8 +45,8 @@ def wheel(dist):
         yield path, file
 
 
-def sources(folder, suffixes=(".py",)):
-    return {str(path.relative_to(ROOT / folder)) for path in (ROOT / folder).rglob("*") if path.suffix in suffixes}
+def sources(folder, suffixes):
+    return {path.relative_to(ROOT).as_posix() for path in (ROOT / folder).rglob("*") if path.suffix in suffixes}
 
 
 @pytest.mark.slow
@@ -61,9 +54,9 @@ def test_wheel_holds_the_package(wheel):
     _, file = wheel
     held = {name for name in file.namelist() if ".dist-info/" not in name}
     assert {name.split("/")[0] for name in held} == {"warp_abtree"}
-    expected = {f"warp_abtree/{name}" for name in sources("warp_abtree", (".py", ".typed"))}
-    expected |= {f"warp_abtree/kernels/{name}" for name in sources("kernels", (".py", ".h", ".cuh"))}
-    expected |= {f"warp_abtree/scenes/{name}" for name in sources("scenes", (".py", ".toml"))}
+    expected = sources("warp_abtree", (".py", ".typed"))
+    expected |= {f"warp_abtree/{name}" for name in sources("kernels", (".py", ".h", ".cuh"))}
+    expected |= {f"warp_abtree/{name}" for name in sources("scenes", (".py", ".toml"))}
     assert held == expected
     # An installed package has the kernels themselves, not the bridge to a checkout.
     assert file.read("warp_abtree/kernels/__init__.py") == (ROOT / "kernels" / "__init__.py").read_bytes()
@@ -77,11 +70,8 @@ def test_versions_agree(wheel):
     assert metadata["Version"] == ab.__version__ == path.name.split("-")[1]
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     assert ab.__version__ not in text and not re.search(r"^version = \"", text, re.M)
-    assert set(metadata.get_all("Provides-Extra")) == set(re.findall(r"^(\w+) = \[", extras_of(text), re.M))
-
-
-def extras_of(text):
-    return text.split("[project.optional-dependencies]")[1].split("\n[")[0]
+    extras = text.split("[project.optional-dependencies]")[1].split("\n[")[0]
+    assert set(metadata.get_all("Provides-Extra")) == set(re.findall(r"^(\w+) = \[", extras, re.M))
 
 
 @pytest.mark.slow
@@ -90,8 +80,7 @@ def test_source_distribution_holds_what_a_wheel_needs(dist):
     with tarfile.open(path) as file:
         held = {name.split("/", 1)[1] for name in file.getnames() if "/" in name}
     for folder in ("warp_abtree", "kernels", "scenes", "tests", "bench", "docs"):
-        suffixes = (".py", ".h", ".cuh", ".toml", ".md", ".png", ".svg")
-        expected = {f"{folder}/{name}" for name in sources(folder, suffixes)}
+        expected = sources(folder, (".py", ".h", ".cuh", ".toml", ".md", ".png", ".svg"))
         assert expected <= held, expected - held
     assert {"pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md", "warp_abtree/py.typed"} <= held
     assert not [name for name in held if "__pycache__" in name or name.startswith((".git", "build/", "dist/"))]
@@ -103,21 +92,14 @@ def test_wheel_runs_without_the_checkout(wheel, tmp_path):
     file.extractall(tmp_path / "installed")
     (tmp_path / "elsewhere").mkdir()
 
-    def command(*words):
-        return subprocess.run(
-            [sys.executable, "-m", "warp_abtree", *words],
-            cwd=tmp_path / "elsewhere",
-            env={**os.environ, "PYTHONPATH": str(tmp_path / "installed")},
-            capture_output=True,
-            text=True,
-            timeout=300,
-        )
+    def python(*words):
+        options = {"capture_output": True, "text": True, "timeout": 300, "cwd": tmp_path / "elsewhere"}
+        env = {**os.environ, "PYTHONPATH": str(tmp_path / "installed")}
+        return subprocess.run([sys.executable, *words], env=env, **options)
 
-    found = json.loads(command("doctor", "--json", "--device", "cpu").stdout)
-    assert found["usable"] and Path(found["folder"]) == tmp_path / "installed" / "warp_abtree"
-    assert Path(found["scenes"]["folder"]) == tmp_path / "installed" / "warp_abtree" / "scenes"
-    assert found["scenes"]["names"] == scene_names()
-    done = command("run", "needle", "--frames", "1", "--device", "cpu", "--json")
+    folder = python("-c", "from warp_abtree.app.toml.folder import *; print(scene_folder(), *scene_names())").stdout
+    assert folder.split() == [str(tmp_path / "installed" / "warp_abtree" / "scenes"), *scene_names()]
+    done = python(*"-m warp_abtree run needle --frames 1 --device cpu --json".split())
     assert done.returncode == 0 and json.loads(done.stdout)["frames"] == 1, done.stderr
 
 

@@ -12,8 +12,8 @@ from warp_abtree.checks.regime import Regime, change_regime, current_regime, res
 from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, float32_filter_triangles
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
-from warp_abtree.model.tree import active_build
-from warp_abtree.state.lod_update import LodUpdate, full_refit_fraction
+from warp_abtree.state.lod_update import LodUpdate
+from warp_abtree.state.work_lists import full_refit_fraction
 
 __all__ = [
     "EXACT",
@@ -22,7 +22,6 @@ __all__ = [
     "FLOAT32_UNIT",
     "UNCERTAIN",
     "Regime",
-    "active_build",
     "current_regime",
     "decide_triangles",
     "float32_filter_triangles",
@@ -62,8 +61,9 @@ def repeat_update(update: LodUpdate):
     targets = wp.clone(states.pool.lod)  # the next update writes in place
 
     def launch():
-        for name in ("changed_count", "marked_count", "level_count"):
-            getattr(update.plan, name).zero_()
+        if update.entry_room or update.face_room:
+            for name in ("changed_count", "marked_count", "level_count"):
+                getattr(update.plan, name).zero_()
         states.pool.lod = targets
         update.relaunch()
 
@@ -71,11 +71,11 @@ def repeat_update(update: LodUpdate):
 
 
 def read_bits(scene) -> list:
-    """Return boxes, statuses and corners bit by bit, one row a state, in the order of model and LOD. Waits."""
+    """Return boxes, skip links and corners bit by bit, one row a state, in the order of model and LOD. Waits."""
     states = scene.batch().states
     order = np.lexsort(([slot.lod for slot in states.slots], [slot.model for slot in states.slots]))
     pool, node_end = states.pool, states.node_total
-    arrays = [pool.node_box[: 2 * node_end], pool.node_status[:node_end], pool.face_corner[: states.face_total]]
+    arrays = [pool.node_box[: 2 * node_end], pool.face_corner[: states.face_total]]
     return [array.numpy().view(np.int32).reshape(len(states.slots), -1)[order] for array in arrays]
 
 

@@ -1,4 +1,4 @@
-"""python-fcl: a BVHModel (OBB tree with RSS) of each mesh, or convex solids by GJK.
+"""python-fcl, a BVHModel (OBB tree with RSS) of each mesh or convex solids by GJK; and trimesh, which calls it.
 
 Baselines that answer pose by pose have `any`, whether A at the origin and B intersect at each pose, and `faces`, an
 answer a pose from which `face_pairs` reads all intersecting face pairs. Without the library they raise ImportError.
@@ -9,42 +9,37 @@ import numpy as np
 ALL_CONTACTS = 2**31 - 1
 
 
-def make_tree(fcl, vertices, faces):
-    """Return a BVHModel of a mesh."""
-    tree = fcl.BVHModel()
-    tree.beginModel(len(vertices), len(faces))
-    tree.addSubModel(vertices, faces)
-    tree.endModel()
-    return tree
-
-
-def make_convex(fcl, vertices, faces):
-    """Return a convex solid."""
-    corners = np.concatenate([np.full((len(faces), 1), 3), faces], 1).flatten()
-    return fcl.Convex(vertices, len(faces), corners)
-
-
 class Fcl:
     """python-fcl.
 
     Args:
         a, b: Vertices float64 (v, 3) and faces int32 (f, 3); one object if both are one mesh.
         matrices: Poses of B, float64 (n, 4, 4).
-        make: Makes a shape of a mesh.
+        convex: Whether the meshes are convex solids.
     """
 
     name = "python-fcl"
 
-    def __init__(self, a, b, matrices, make=make_tree):
+    def __init__(self, a, b, matrices=(), convex=False):
         import fcl
 
-        self.fcl = fcl
-        shape_a = make(fcl, *a)
-        self.shape_b = shape_a if b is a else make(fcl, *b)
+        self.fcl, self.convex = fcl, convex
+        shape_a = self._make_shape(*a)
+        self.shape_b = shape_a if b is a else self._make_shape(*b)
         self.a = fcl.CollisionObject(shape_a, fcl.Transform())
         self.yes_no = fcl.CollisionRequest()
         self.all = fcl.CollisionRequest(num_max_contacts=ALL_CONTACTS, enable_contact=True)
         self.place(matrices)
+
+    def _make_shape(self, vertices, faces):
+        if self.convex:
+            corners = np.concatenate([np.full((len(faces), 1), 3), faces], 1).flatten()
+            return self.fcl.Convex(vertices, len(faces), corners)
+        tree = self.fcl.BVHModel()
+        tree.beginModel(len(vertices), len(faces))
+        tree.addSubModel(vertices, faces)
+        tree.endModel()
+        return tree
 
     def place(self, matrices):
         """Make an object of B for each pose."""
@@ -75,3 +70,35 @@ class Fcl:
     def face_pairs(answer):
         """Return the face numbers in one answer, (k, 2)."""
         return [(contact.b1, contact.b2) for contact in answer.contacts]
+
+
+class Trimesh:
+    """trimesh: two CollisionManagers of one object each, which hold python-fcl's trees; B is moved for each pose."""
+
+    name = "trimesh"
+
+    def __init__(self, a, b, matrices):
+        import fcl  # noqa: F401 - trimesh has its managers from it
+        import trimesh
+        from trimesh.collision import CollisionManager
+
+        self.a, self.b, self.matrices = CollisionManager(), CollisionManager(), matrices
+        self.a.add_object("a", trimesh.Trimesh(*a, process=False))
+        self.b.add_object("b", trimesh.Trimesh(*b, process=False))
+
+    def _collide(self, **wanted):
+        answers = []
+        for matrix in self.matrices:
+            self.b.set_transform("b", matrix)
+            answers.append(self.a.in_collision_other(self.b, **wanted))
+        return answers
+
+    def any(self):
+        return self._collide()
+
+    def faces(self):
+        return self._collide(return_data=True)
+
+    @staticmethod
+    def face_pairs(answer):
+        return [(contact.index("a"), contact.index("b")) for contact in answer[1]]

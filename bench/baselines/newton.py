@@ -1,9 +1,8 @@
 """Newton's mesh-mesh narrow phase, where the package `newton` is installed: by BVH, and by SDF (CUDA only).
 
-Another question, and an approximate answer: it looks for points of the edges of one mesh inside the other, by a search
-over signed distances, and keeps a few contacts a pair, without face numbers. So only whether a pair intersects can be
-compared. All shapes share one mesh with one BVH or SDF; margins and gaps are 0, so that contacts are those of surfaces
-that pass through each other. Pairs are given, so its broad phase is a test of their boxes.
+Another question, and an approximate answer: it looks for points of the edges of one mesh inside the other and keeps a
+few contacts a pair, without face numbers, so only whether a pair intersects can be compared. All shapes share one mesh;
+margins and gaps are 0, so that contacts are those of surfaces that pass through each other.
 """
 
 import warnings
@@ -11,7 +10,7 @@ import warnings
 import numpy as np
 import warp as wp
 
-from ..timing import capture
+from ..timing import make_replay
 
 SDF_RESOLUTION = 64
 CONTACTS_PER_PAIR = 512  # what is left of them after reduction
@@ -27,7 +26,6 @@ class Newton:
 
     Raises:
         ImportError: Newton is not installed.
-        RuntimeError: A signed distance field is asked for on the CPU.
     """
 
     def __init__(self, vertices, faces, poses, hits, device, sdf=0):
@@ -66,13 +64,8 @@ class Newton:
         self.pipeline.collide(self.state, self.contacts)
 
     def check(self):
-        """Raise where a buffer overflowed in the last launch. Waits for the device.
-
-        Raises:
-            RuntimeError: The message names the buffer.
-        """
-        narrow = self.pipeline.narrow_phase
-        reducer = narrow.global_contact_reducer
+        """Raise a RuntimeError that names a buffer that overflowed in the last launch. Waits for the device."""
+        narrow, reducer = self.pipeline.narrow_phase, self.pipeline.narrow_phase.global_contact_reducer
         lost = {
             "contacts": int(self.contacts.rigid_contact_count.numpy()[0]) - self.contacts.rigid_contact_max,
             "pairs": int(narrow.shape_pairs_mesh_mesh_count.numpy()[0]) - len(narrow.shape_pairs_mesh_mesh),
@@ -91,13 +84,10 @@ class Newton:
         """
         self.check()
         count = int(self.contacts.rigid_contact_count.numpy()[0])
-        shapes = np.stack([getattr(self.contacts, f"rigid_contact_shape{i}").numpy()[:count] for i in (0, 1)], 1)
-        pair = shapes // 2
-        if count and not (pair[:, 0] == pair[:, 1]).all():
+        first, second = (getattr(self.contacts, f"rigid_contact_shape{i}").numpy()[:count] // 2 for i in (0, 1))
+        if not np.array_equal(first, second):
             raise RuntimeError("Newton reports contacts between objects of different pairs")
-        found = np.zeros(self.pair_count, bool)
-        found[pair[:, 0]] = True
-        return found, count
+        return np.isin(np.arange(self.pair_count), first), count
 
     def compare(self, any_hit):
         """Return columns: contacts kept, pairs that it misses and invents beside the exact answer, bool (p,)."""
@@ -106,26 +96,18 @@ class Newton:
         return {"contacts": count, "any_missed": missed, "any_invented": invented}
 
 
-def make_newton(vertices, faces, poses, hits, device, refused=None):
-    """Return the baselines that can be made, by name, and why the others cannot.
-
-    Args:
-        refused: Why none is wanted, None where they are.
-    """
+def make_newton(vertices, faces, poses, hits, device):
+    """Return the baselines that can be made, by name, and why the others cannot."""
     made, skipped = {}, {}
     for name, sdf in (("newton_bvh", 0), (f"newton_sdf{SDF_RESOLUTION}", SDF_RESOLUTION)):
-        if refused is not None:
-            skipped[name] = refused
-        elif sdf and not device.is_cuda:
-            skipped[name] = "its signed distance fields need CUDA"
-        else:
-            try:
-                baseline = Newton(vertices, faces, poses, hits, device, sdf)
-                baseline.launch()  # compiles it
-                baseline.check()
-                if device.is_cuda:
-                    capture(baseline.launch, device)
-                made[name] = baseline
-            except Exception as error:  # another package's failure must not cost the rest of a run
-                skipped[name] = f"{type(error).__name__}: {error}"
+        try:
+            if sdf and not device.is_cuda:
+                raise RuntimeError("its signed distance fields need CUDA")
+            baseline = Newton(vertices, faces, poses, hits, device, sdf)
+            baseline.launch()  # compiles it
+            baseline.check()
+            make_replay(baseline.launch, device)
+            made[name] = baseline
+        except Exception as error:  # another package's failure must not cost the rest of a run
+            skipped[name] = f"{type(error).__name__}: {error}"
     return made, skipped

@@ -15,7 +15,7 @@ import warp as wp
 import warp_abtree as ab
 
 from ..baselines.fcl import Fcl
-from ..baselines.wp_bvh import BvhAny, BvhFaces, find_constructor
+from ..baselines.wp_bvh import BvhPosed, find_constructor
 from ..meshes import ModelFolder, mesh_file
 from ..shapes import scene_of_poses
 from ..timing import medians, no_garbage_collection, one_core, time_in_turn
@@ -155,8 +155,8 @@ def make_bvh(meshes, matrices, device, hits):
     poses[1::2] = [wp.transform(*wp.transform_decompose(wp.mat44(matrix))[:2]) for matrix in matrices]
     arguments = dict(device=device, other=meshes[0])
     constructor = find_constructor(*meshes[1], poses, **arguments)
-    faces = BvhFaces(*meshes[1], poses, 10 * hits + 10**7, constructor=constructor, **arguments)
-    return {
-        "faces": run_to_host(faces),
-        "any": run_to_host(BvhAny(*meshes[1], poses, constructor=constructor, **arguments)),
+    room = {"faces": 10 * hits + 10**7, "any": None}
+    made = {
+        output: BvhPosed(*meshes[1], poses, room[output], constructor=constructor, **arguments) for output in OUTPUTS
     }
+    return {output: run_to_host(baseline) for output, baseline in made.items()}

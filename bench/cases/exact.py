@@ -43,9 +43,10 @@ def run(device, count=None, processes=2, quick=False):
     device = wp.get_device(device)
     if load_oracle() is None:
         raise RuntimeError("the exact oracle is not at hand; run this in a checkout with its tests")
+    one = make_chunk(("random", 0, 1))
+    ask_float32(one, device)  # compile before anything is timed
     for mode in (FILTER, EXACT, FLOAT32):
-        ask(mode, make_chunk(("random", 0, 1)), device)  # compile before anything is timed
-    ask_float32(make_chunk(("random", 0, 1)), device)
+        ask(mode, one, device)
     jobs, wrong = list_jobs(count or (QUICK_COUNT if quick else COUNT)), 0
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
         chunks = zip(jobs, pool.imap(find_truth, jobs), strict=True)
@@ -60,17 +61,16 @@ def run(device, count=None, processes=2, quick=False):
 def list_jobs(count):
     """Return the chunks of a run: count / 10 adversarial pairs, then count random ones."""
     counts = {kind: -(-(count // 10) // len(ADVERSARIAL)) for kind in ADVERSARIAL} | {"random": count}
-    jobs = []
-    for kind, total in counts.items():
-        starts = range(0, total, CHUNK)
-        jobs += [(kind, number, min(CHUNK, total - start)) for number, start in enumerate(starts)]
-    return jobs
+    return [
+        (kind, number, min(CHUNK, total - start))
+        for kind, total in counts.items()
+        for number, start in enumerate(range(0, total, CHUNK))
+    ]
 
 
 def find_truth(job):
     """Return the exact answers for a chunk, bool (count,)."""
-    oracle = load_oracle()
-    pairs = make_chunk(job)
+    oracle, pairs = load_oracle(), make_chunk(job)
     if job[0] == "extreme":  # no common exponent
         return np.array([oracle.triangles_intersect(a, b) for a, b in pairs])
     points = pairs.reshape(-1, 3)
@@ -117,31 +117,29 @@ def float32_pair_kernel(
     )
 
 
-def time_launch(kernel, inputs, count, device):
-    """Return a kernel's answers, int32 (count,), and the time of its launch [s]."""
-    answers = wp.zeros(count, dtype=wp.int32, device=device)
-    if count == 0:
+def time_launch(kernel, inputs, pairs, dtype, device):
+    """Return a kernel's answers for pairs, int32 (count,), and the time of its launch [s]."""
+    corners = wp.array(np.ascontiguousarray(pairs).reshape(-1, 6, 3), dtype=dtype, device=device)
+    answers = wp.zeros(len(pairs), dtype=wp.int32, device=device)
+    if not len(pairs):
         return answers.numpy(), 0.0
     wp.synchronize_device(device)
     begin = time.perf_counter()
-    wp.launch(kernel, dim=count, inputs=[*inputs, answers], device=device)
+    wp.launch(kernel, dim=len(pairs), inputs=[*inputs, corners, answers], device=device)
     wp.synchronize_device(device)
     return answers.numpy(), time.perf_counter() - begin
 
 
 def ask(mode, pairs, device):
-    """Return the answers of signs in a mode, int32 (count,), and the time [s]."""
-    corners = wp.array(np.ascontiguousarray(pairs).reshape(-1, 6, 3), dtype=wp.vec3d, device=device)
-    return time_launch(pair_test(int(mode)), [corners], len(pairs), device)
+    """Return the answers of signs in a mode, and the time [s]."""
+    return time_launch(pair_test(int(mode)), [], pairs, wp.vec3d, device)
 
 
 def ask_float32(pairs, device, proven=True):
     """Return the answers of the float32 stage, with its bound or without, and the time [s]."""
-    near = unit_size(pairs).astype(np.float32)
     # Coordinates of at most 1 are off by at most 2^-25, differences by twice as much.
-    error, unit = (1.02 * 2.0**-24, float(FLOAT32_UNIT)) if proven else (0.0, 0.0)
-    corners = wp.array(near.reshape(-1, 6, 3), dtype=wp.vec3, device=device)
-    return time_launch(float32_pair_kernel, [error, unit, corners], len(pairs), device)
+    bound = [1.02 * 2.0**-24, float(FLOAT32_UNIT)] if proven else [0.0, 0.0]
+    return time_launch(float32_pair_kernel, bound, unit_size(pairs).astype(np.float32), wp.vec3, device)
 
 
 def unit_size(pairs):
@@ -152,7 +150,6 @@ def unit_size(pairs):
 
 def check_chunk(job, truth, device):
     """Compare one chunk on a device with the truth; return its tally."""
-    print(f"{job[0]}: chunk {job[1]}, {len(truth)} pairs", file=sys.stderr, flush=True)
     pairs, rows = make_chunk(job), np.arange(len(truth))
     if job[0] != "random":
         pairs, rows = reorder_pairs(pairs)
@@ -182,14 +179,7 @@ def check_chunk(job, truth, device):
 def describe_tally(device, kind, tally):
     """Turn a tally into a row."""
     pairs, hits, wrong, to_float64, to_exact, unproven, *times = tally.tolist()
-    return {
-        "device": device.name,
-        "kind": kind,
-        "pairs": int(pairs),
-        "meet": round(hits / pairs, 4),
-        "disagreements": int(wrong),
-        "to_float64": float(f"{to_float64 / pairs:.3g}"),
-        "to_exact": float(f"{to_exact / pairs:.3g}"),
-        "float32_errors": float(f"{unproven / pairs:.3g}"),
-        **{name: round(1e9 * t / pairs, 1) for name, t in zip(STAGES, times, strict=True)},
-    }
+    shares = {"meet": hits, "to_float64": to_float64, "to_exact": to_exact, "float32_errors": unproven}
+    row = {"device": device.name, "kind": kind, "pairs": int(pairs), "disagreements": int(wrong)}
+    row |= {name: float(f"{count / pairs:.3g}") for name, count in shares.items()}
+    return row | {name: round(1e9 * t / pairs, 1) for name, t in zip(STAGES, times, strict=True)}

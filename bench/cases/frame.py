@@ -9,7 +9,7 @@ import warp_abtree as ab
 
 from ..memory import count_bytes
 from ..shapes import knot, random_directions, scene_of_objects
-from ..timing import make_replay, make_runs, summarise_all, time_call, time_rounds
+from ..timing import make_replay, make_runs, ratio_of, summarise, time_call, time_rounds
 
 FULL = {"faces": 5000, "objects": (16, 256, 4096), "repeats": 15}
 QUICK = {"faces": 300, "objects": (16,), "repeats": 3}
@@ -50,25 +50,21 @@ def grid_poses(count):
     return np.concatenate([SPACING * place, random_directions(np.random.default_rng(0), count, 4)], 1)
 
 
-class DeviceFrames:
-    """A captured frame and the kernels that drive it, one graph."""
+class Frames:
+    """A captured frame and the kernels that drive it, one graph; and the same frames from the host.
+
+    Those take poses and LODs on the host to `set_poses`, `set_lods` and `intersect`.
+    """
 
     def __init__(self, scene, levels, ladder):
-        count = scene.object_count
-        device = self.device = scene.device
-        self.frame = ab.Pipeline(
-            scene, "count", capacity=ab.Buffers(pairs=16 * count), ladder=[levels] if ladder else None
-        )
-        self.time = wp.zeros(1, dtype=wp.int32, device=device)
-        self.inputs = [
-            wp.array(levels, dtype=wp.int32, device=device),
-            wp.array(self.frame.poses.numpy(), dtype=wp.float64, device=device),
-            self.time,
-            self.frame.lods,
-            self.frame.poses,
-        ]
+        self.scene, self.device, self.moves, self.turn = scene, scene.device, [], 0
+        room = ab.Buffers(pairs=16 * scene.object_count)
+        self.frame = ab.Pipeline(scene, "count", capacity=room, ladder=[levels] if ladder else None)
+        self.time = wp.zeros(1, dtype=wp.int32, device=self.device)
+        start, levels = wp.clone(self.frame.poses), wp.array(levels, dtype=wp.int32, device=self.device)
+        self.inputs = [levels, start, self.time, self.frame.lods, self.frame.poses]
         self.launch()
-        self.replay = make_replay(self.launch, device)
+        self.replay = make_replay(self.launch, self.device)
 
     def launch(self):
         wp.launch(count_frame_kernel, 1, [self.time], device=self.device)
@@ -79,36 +75,28 @@ class DeviceFrames:
         self.replay()
         return self.frame.result()
 
-
-class HostFrames:
-    """The same frames by `set_poses`, `set_lods` and `intersect`, from poses and LODs on the host.
-
-    Raises:
-        RuntimeError: The captured frames answer otherwise.
-    """
-
-    def __init__(self, scene, device_frames: DeviceFrames, count):
-        self.scene, self.moves, self.turn = scene, [], 0
-        frame = device_frames.frame
-        device_frames.time.zero_()
-        for _ in range(count):
-            result = device_frames.replay_and_read()
-            frame.check()
-            self.moves.append((frame.poses.numpy().copy(), frame.lods.numpy().copy()))
-            answer = self.step()
-            order = np.lexsort((result.pairs[:, 1], result.pairs[:, 0]))
-            same = np.array_equal(result.pairs[order], answer.pairs)
-            if not same or not np.array_equal(result.count[order], answer.count):
-                raise RuntimeError("the captured frame and the host's differ")
-            refitted = 0 if frame.marked_count is None else int(frame.marked_count.numpy().sum())
-            self.found = {"pairs": len(answer.pairs), "hits": int(answer.count.sum()), "nodes_refitted": refitted}
-
-    def step(self):
+    def host_frame(self):
         poses, lods = self.moves[self.turn % len(self.moves)]
         self.turn += 1
         self.scene.set_poses(poses)
         self.scene.set_lods(lods)
         return self.scene.intersect(output="count")
+
+    def check(self, count):
+        """Run some frames both ways and compare their answers; return columns of the last one."""
+        frame = self.frame
+        self.time.zero_()
+        for _ in range(count):
+            result = self.replay_and_read()
+            frame.check()
+            self.moves.append((frame.poses.numpy().copy(), frame.lods.numpy().copy()))
+            answer = self.host_frame()
+            order = np.lexsort((result.pairs[:, 1], result.pairs[:, 0]))
+            same = np.array_equal(result.pairs[order], answer.pairs)
+            if not same or not np.array_equal(result.count[order], answer.count):
+                raise RuntimeError("the captured frame and the host's differ")
+        refitted = 0 if frame.marked_count is None else int(frame.marked_count.numpy().sum())
+        return {"pairs": len(answer.pairs), "hits": int(answer.count.sum()), "nodes_refitted": refitted}
 
 
 def run(device, quick=False):
@@ -123,26 +111,15 @@ def run(device, quick=False):
     model = ab.Model.from_arrays(*knot(sizes["faces"]))
     levels = np.unique(np.linspace(model.lod_max // 10, model.lod_max, STEPS).astype(np.int32))
     for count in sizes["objects"]:
-        if count > OBJECTS_MAX_CPU and device.is_cpu:
-            continue
-        for ladder in (False, True):
-            yield run_objects(device, model, levels, count, ladder, sizes["repeats"])
-
-
-def run_objects(device, model, levels, count, ladder, repeats):
-    """Return the row of one number of objects and one way to keep states."""
-    gc.collect()  # scenes and their queries hold each other
-    scene = scene_of_objects(device, model, grid_poses(count))
-    frames = DeviceFrames(scene, levels, ladder)
-    host = HostFrames(scene, frames, repeats)
-    runs = make_runs({"frame": frames.launch}, device)
-    runs |= {"frame_read": time_call(frames.replay_and_read, device), "host": time_call(host.step, device)}
-    frames.time.zero_()
-    times = time_rounds(runs, repeats)
-    frames.frame.check()
-    states = frames.frame.query.batch.states
-    row = {"device": device.name, "faces": model.face_count, "objects": count, "ladder": ladder} | host.found
-    row |= {"states": len(states.slots), "state_mib": round(count_bytes(states.pool) / 2**20, 1)}
-    row |= summarise_all(times)
-    row["ratio"] = round(row["host_ms"] / row["frame_read_ms"], 2)
-    return row
+        for ladder in (False, True) if device.is_cuda or count <= OBJECTS_MAX_CPU else ():
+            gc.collect()  # scenes and their queries hold each other
+            frames = Frames(scene_of_objects(device, model, grid_poses(count)), levels, ladder)
+            row = {"device": device.name, "faces": model.face_count, "objects": count, "ladder": ladder}
+            row |= frames.check(sizes["repeats"])
+            runs = make_runs({"frame": frames.launch}, device)
+            runs |= {"frame_read": time_call(frames.replay_and_read, device)}
+            times = time_rounds(runs | {"host": time_call(frames.host_frame, device)}, sizes["repeats"])
+            frames.frame.check()
+            states = frames.frame.query.batch.states
+            row |= {"states": len(states.slots), "state_mib": round(count_bytes(states.pool) / 2**20, 1)}
+            yield row | summarise(times) | {"ratio": ratio_of(times["host"], times["frame_read"])}

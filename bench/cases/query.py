@@ -10,11 +10,11 @@ import warp_abtree as ab
 from warp_abtree import testing
 
 from ..baselines.newton import make_newton
-from ..baselines.wp_bvh import BvhFaces, find_constructor
+from ..baselines.wp_bvh import BvhPosed, find_constructor
 from ..memory import memory_columns
 from ..roofline import COUNTERS, find_peaks, roofline
 from ..shapes import knot, pair_poses, scene_of_pairs
-from ..timing import ratio_of, summarise, summarise_all, time_call, time_in_turn, time_rounds
+from ..timing import ratio_of, summarise, time_call, time_in_turn, time_rounds
 from ..verify import count_differences, judge_disputed
 
 FULL = {"faces": 5000, "pairs": (1, 64, 1024, 8192), "distances": (0.9, 0.2), "repeats": 15}
@@ -29,74 +29,65 @@ JUDGED = 300  # face pairs that the oracle decides
 def run(device, quick=False):
     """Yield one row a case: what was asked and found, times of ours and of each baseline, memory and the roofline.
 
-    Columns: first_s is the first run: it compiles or loads kernels and grows buffers. ours and peer (wp.Bvh) are
-    launches, whose face pairs lie on the device in no order; result and peer_result the time to bring them to the host
-    and sort them there; sorted and peer_sorted both together. ratio is the peer's launch over ours; on the CPU ours has
-    all cores, and one_core and one_core_ratio are of both on one. Errors are counted against the exact answer; judged
-    says how many face pairs on which the peer differs the exact oracle decided, ours_wrong in how many it sides with
-    the peer. Memory is that of scene and query, before there are baselines.
+    Columns: first_s is the first run, which compiles and grows buffers. ours and peer (wp.Bvh) are launches, result and
+    peer_result the time to bring face pairs to the host and sort them there. On the CPU ours has all cores; one_core
+    and one_core_ratio are of both on one. judged says how many face pairs on which the peer differs the exact oracle
+    decided, ours_wrong in how many it sides with the peer. Memory is that of scene and query, before the baselines.
     """
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
-    vertices, faces = knot(sizes["faces"])
-    model = ab.Model.from_arrays(vertices, faces, name=f"knot {len(faces):,}")
-    peaks = find_peaks(device)
-    constructor = find_constructor(vertices, faces, pair_poses(min(64, max(sizes["pairs"])), 0.9), device)
+    mesh = knot(sizes["faces"])
+    model = ab.Model.from_arrays(*mesh, name=f"knot {len(mesh[1]):,}")
+    constructor = find_constructor(*mesh, pair_poses(min(64, max(sizes["pairs"])), 0.9), device)
     for pair_count in sizes["pairs"]:
         for distance in sizes["distances"]:
             limit = PAIRS_MAX_CLOSE if device.is_cpu or distance < FAR else max(sizes["pairs"])
             if pair_count <= limit:
-                yield run_batch(device, model, (vertices, faces), pair_count, distance, constructor, sizes, peaks)
+                poses = pair_poses(pair_count, distance)
+                row = run_batch(device, model, mesh, poses, constructor, sizes["repeats"])
+                yield {"distance": distance} | row
 
 
-def run_batch(device, model, mesh, pair_count, distance, constructor, sizes, peaks):
+def run_batch(device, model, mesh, poses, constructor, repeats):
     """Return the row of one batch of pairs."""
     gc.collect()  # scenes and their queries hold each other
-    poses, repeats = pair_poses(pair_count, distance), sizes["repeats"]
     scene, pairs = scene_of_pairs(device, model, poses)
     begin = time.perf_counter()
     whole = scene.intersect(pairs, output="faces")
     first = time.perf_counter() - begin
     query = ab.Query(scene, output="faces", pairs=pairs, capacity=max(1, len(whole.faces)))
     memory = memory_columns(scene, query)
-    baseline = BvhFaces(*mesh, poses, 4 * len(whole.faces) + 1024, device, constructor)
-    row = {"device": device.name, "faces": len(mesh[1]), "pairs": pair_count, "distance": distance}
-    row["hits"] = len(whole.faces)
+    baseline = BvhPosed(*mesh, poses, 4 * len(whole.faces) + 1024, device, constructor)
+    row = {"device": device.name, "faces": len(mesh[1]), "pairs": len(pairs), "hits": len(whole.faces)}
     row |= {name: int(getattr(whole, name).sum(dtype=np.int64)) for name in COUNTERS}
     row |= {"first_s": round(first, 3), "peer": f"wp.Bvh {constructor}"}
-    limit = NEWTON_PAIRS_MAX["cuda" if device.is_cuda else "cpu"]
-    refused = None if pair_count <= limit else f"more than {limit} pairs take minutes"
-    newton, skipped = make_newton(*mesh, poses, len(whole.faces), device, refused)
+    newton, skipped = {}, {"newton": "more pairs take minutes"}
+    if len(pairs) <= NEWTON_PAIRS_MAX["cuda" if device.is_cuda else "cpu"]:
+        newton, skipped = make_newton(*mesh, poses, len(whole.faces), device)
     launches = {"ours": query.launch, "peer": baseline.launch} | {name: other.launch for name, other in newton.items()}
     times = time_in_turn(launches, device, repeats)
     again = query.result()
     again.check()
     if not np.array_equal(again.faces, whole.faces):
         raise RuntimeError("the timed query's answer differs from the checked one")
-    row |= check_baseline(baseline.result(), whole.faces, model, poses)
+    row |= check_baseline(baseline.result(), whole.faces, model, poses) | summarise(times)
+    row["ratio"] = ratio_of(times["peer"], times["ours"])
     for name, other in newton.items():
         row |= {f"{name}_{key}": value for key, value in other.compare(whole.any).items()}
-    for name, values in times.items():
-        row |= summarise(name, values)
-        if name != "ours":
-            row["ratio" if name == "peer" else f"{name}_ratio"] = ratio_of(values, times["ours"])
+        row[f"{name}_ratio"] = ratio_of(times[name], times["ours"])
     if device.is_cpu:
-        row |= time_one_core(query, baseline, device, repeats)
+        launches = {"one_core": query.launch, "peer_one_core": baseline.launch}
+        with testing.regime(cpu_threads=1):
+            times = time_in_turn(launches, device, repeats, time.thread_time)
+        row |= summarise(times) | {"one_core_ratio": ratio_of(times["peer_one_core"], times["one_core"])}
     row |= {f"{name}_skipped": why for name, why in skipped.items()}
     runs = {"result": time_call(query.result, device), "peer_result": time_call(baseline.result, device)}
-    row |= summarise_all(time_rounds(runs, min(repeats, 3)))
-    row["sorted_ms"] = round(row["ours_ms"] + row["result_ms"], 4)
-    row["peer_sorted_ms"] = round(row["peer_ms"] + row["peer_result_ms"], 4)
-    row["sorted_ratio"] = round(row["peer_sorted_ms"] / row["sorted_ms"], 2)
-    return row | memory | roofline(again, row["ours_ms"], peaks)
+    row |= summarise(time_rounds(runs, min(repeats, 3)))
+    return row | memory | roofline(again, row["ours_ms"], find_peaks(device))
 
 
 def check_baseline(found, ours, model, poses):
-    """Return the columns of what the peer finds beside ours.
-
-    Raises:
-        RuntimeError: The oracle finds ours wrong.
-    """
+    """Return the columns of what the peer finds beside ours; raise a RuntimeError where the oracle finds ours wrong."""
     row = {"peer_hits": len(found)}
     row["peer_missed"], row["peer_invented"] = count_differences(found, ours)
     mesh = model.mesh_at(model.lod_max)[:2]
@@ -104,12 +95,3 @@ def check_baseline(found, ours, model, poses):
         found, ours, (mesh, mesh), lambda pair: poses[2 * pair : 2 * pair + 2], "wp.Bvh", most=JUDGED
     )
     return row | {"judged": judged or 0, "ours_wrong": None if judged is None else 0}
-
-
-def time_one_core(query, baseline, device, repeats):
-    """Return columns of launches of both on one core: the time [ms] that the thread ran, and the peer's over ours."""
-    launches = {"one_core": query.launch, "peer_one_core": baseline.launch}
-    with testing.regime(cpu_threads=1):
-        times = time_in_turn(launches, device, repeats, time.thread_time)
-    ratio = ratio_of(times["peer_one_core"], times["one_core"])
-    return summarise("one_core", times["one_core"]) | {"one_core_ratio": ratio}

@@ -8,115 +8,105 @@ import warp as wp
 
 import warp_abtree as ab
 
-from ..baselines.wp_bvh import BvhFaces
+from ..baselines.wp_bvh import BvhPosed
 from ..memory import memory_columns
 from ..meshes import knot_model
-from ..roofline import find_peaks, roofline
-from ..shapes import longest_side, pair_poses, scene_of_pairs, scene_of_worlds, world_poses
-from ..timing import fit_slope, summarise_all, time_in_turn, upper_half
+from ..shapes import longest_side, pair_poses, random_poses, scene_of_objects
+from ..timing import fit_slope, ratio_of, summarise, time_in_turn, upper_half
 
 SIZES = {
     "cuda": {
         "pairs": {"faces": 5000, "counts": (1, 10, 100, 1000, 10_000, 100_000)},
         "faces": {"sizes": (200, 1000, 5000, 20_000, 100_000, 250_000, 1_000_000), "pairs": (1, 64)},
-        "worlds": {"faces": 1000, "objects": 4, "counts": (1, 4, 16, 64, 256, 1024, 4096, 16_384)},
+        "worlds": {"faces": 1000, "counts": (1, 4, 16, 64, 256, 1024, 4096, 16_384)},
         "repeats": 11,
     },
     "cpu": {
         "pairs": {"faces": 500, "counts": (1, 10, 100, 1000, 10_000)},
         "faces": {"sizes": (200, 1000, 5000, 20_000, 60_000, 250_000, 1_000_000), "pairs": (1, 64)},
-        "worlds": {"faces": 500, "objects": 4, "counts": (1, 4, 16, 64, 256, 1024)},
+        "worlds": {"faces": 500, "counts": (1, 4, 16, 64, 256, 1024)},
         "repeats": 5,
     },
 }
 QUICK = {
     "pairs": {"faces": 200, "counts": (1, 4, 16)},
     "faces": {"sizes": (200, 600), "pairs": (1, 3)},
-    "worlds": {"faces": 200, "objects": 4, "counts": (1, 8)},
+    "worlds": {"faces": 200, "counts": (1, 8)},
     "repeats": 2,
 }
 LARGEST_CPU = 60_000  # unless more is asked for
 DISTANCE = 0.9
-# Pairs and worlds asked again by themselves, where other numbers of warps work on each.
-CHECKED = 3
+OBJECTS = 4  # a world
+CHECKED = 3  # pairs and worlds asked again by themselves, where other numbers of warps work on each
 
 
 def run(device, quick=False, largest=None, models=None):
     """Yield one row a size, and after each sweep one with the slopes of its lines, all sizes and the upper half.
 
-    Each launch lists all face pairs; build_s is the time to make scene and query, first_s that of the first run, which
-    compiles and grows buffers. Memory is that of scene and query, before there is a baseline. broad is the broad phase
-    of worlds alone; its work is not counted in the roofline, its time is.
+    build_s is the time to make scene and query, first_s that of the first run, which compiles and grows buffers. Memory
+    is that of scene and query, before there is a baseline. broad is the broad phase of worlds alone.
     """
     device = wp.get_device(device)
     sizes = QUICK if quick else SIZES["cuda" if device.is_cuda else "cpu"]
-    timing = find_peaks(device), sizes["repeats"]
-    model, rows = knot_model(sizes["pairs"]["faces"], models), []
+    repeats, model, rows = sizes["repeats"], knot_model(sizes["pairs"]["faces"], models), []
     for count in sizes["pairs"]["counts"]:
-        rows.append(run_pairs("pairs", device, model, count, *timing))
+        rows.append({"sweep": "pairs"} | run_pairs(device, model, count, repeats))
         yield rows[-1]
-    yield describe_slope("pairs", "pairs", rows)
+    yield describe_slope("pairs", rows)
     rows, limit = [], largest or (LARGEST_CPU if device.is_cpu else max(sizes["faces"]["sizes"]))
     for face_target in [size for size in sizes["faces"]["sizes"] if size <= limit]:
         model = knot_model(face_target, models)
         for count in sizes["faces"]["pairs"]:
-            rows.append(run_pairs("faces", device, model, count, *timing))
+            rows.append({"sweep": "faces"} | run_pairs(device, model, count, repeats))
             yield rows[-1]
     for count in sizes["faces"]["pairs"]:
-        yield describe_slope("faces", "faces", [row for row in rows if row["pairs"] == count]) | {"pairs": count}
+        yield describe_slope("faces", [row for row in rows if row["pairs"] == count]) | {"pairs": count}
     model, rows = knot_model(sizes["worlds"]["faces"], models), []
     for count in sizes["worlds"]["counts"]:
-        rows.append(run_worlds(device, model, count, sizes["worlds"]["objects"], *timing))
+        rows.append({"sweep": "worlds"} | run_worlds(device, model, count, repeats))
         yield rows[-1]
-    yield describe_slope("worlds", "worlds", rows)
+    yield describe_slope("worlds", rows)
 
 
-def describe_slope(sweep, x, rows) -> dict:
+def describe_slope(sweep, rows) -> dict:
     """Return the row of a sweep's slopes."""
     row = {"sweep": f"{sweep}: slope", "sizes": len(rows)}
     for name in ("ours_ms", "peer_ms", "broad_ms", "arrays_mib", "pool_mib"):
         if rows and name in rows[0]:
             for label, some in ((f"{name}_slope", rows), (f"{name}_slope_upper", upper_half(rows))):
-                row[label] = fit_slope([r[x] for r in some], [r[name] for r in some])
+                row[label] = fit_slope([r[sweep] for r in some], [r[name] for r in some])
     return row
 
 
-def run_first(query):
-    """Return the first result of a query, and the time that it took [s]."""
-    begin = time.perf_counter()
-    return query.run(), time.perf_counter() - begin
-
-
-def run_pairs(sweep, device, model, pair_count, peaks, repeats):
-    """Return the row of one batch of pairs of a model, beside wp.Bvh."""
+def make_query(device, model, poses, pairs=None, world_size=None):
+    """Return a scene of a model at poses, a query of all face pairs, its first result, and columns of both."""
     gc.collect()  # scenes and their queries hold each other
-    poses = pair_poses(pair_count, DISTANCE)
     begin = time.perf_counter()
-    scene, pairs = scene_of_pairs(device, model, poses)
+    scene = scene_of_objects(device, model, poses, world_size)
     query = ab.Query(scene, "faces", pairs=pairs)
-    build = time.perf_counter() - begin
-    result, first = run_first(query)
-    memory = memory_columns(scene, query)
+    made = time.perf_counter()
+    result = query.run()
+    row = {"device": device.name, "faces": model.face_count, "pairs": len(result.pairs), "hits": len(result.faces)}
+    row |= {"build_s": round(made - begin, 3), "first_s": round(time.perf_counter() - made, 3)}
+    return scene, query, result, row | memory_columns(scene, query)
+
+
+def run_pairs(device, model, pair_count, repeats):
+    """Return the row of one batch of pairs of a model, beside wp.Bvh."""
+    poses, pairs = pair_poses(pair_count, DISTANCE), np.arange(2 * pair_count).reshape(-1, 2)
+    scene, query, result, row = make_query(device, model, poses, pairs)
     for pair in range(0, pair_count, max(1, pair_count // CHECKED)):
         check_alone(scene, result, pairs[pair : pair + 1])
     vertices, faces, _ = model.mesh_at(model.lod_max)
     constructor = None if len(faces) > 100_000 else "sah"  # SAH is built on the host
-    baseline = BvhFaces(vertices, faces, poses, 2 * len(result.faces) + 1024, device, constructor)
-    row = {"sweep": sweep, "device": device.name, "faces": model.face_count, "pairs": pair_count}
-    row |= {"hits": len(result.faces), "node_tests": int(result.node_tests.sum(dtype=np.int64))}
-    row |= {"build_s": round(build, 3), "first_s": round(first, 3)}
-    row |= time_query(query, {"peer": baseline.launch}, result, repeats)
-    row["us_a_pair"] = round(1e3 * row["ours_ms"] / pair_count, 3)
-    row["ratio"] = round(row["peer_ms"] / row["ours_ms"], 2)
-    return row | memory | roofline(result, row["ours_ms"], peaks)
+    baseline = BvhPosed(vertices, faces, poses, 2 * len(result.faces) + 1024, device, constructor)
+    times = time_query(query, {"peer": baseline.launch}, result, repeats)
+    row |= summarise(times) | {"ratio": ratio_of(times["peer"], times["ours"])}
+    return row | {"us_a_pair": round(1e3 * row["ours_ms"] / pair_count, 3)}
 
 
 def time_query(query, others, result, repeats):
-    """Return columns of times of a query and others, in turn.
-
-    Raises:
-        RuntimeError: The timed answer is not the checked one.
-    """
+    """Return the times of a query and others, in turn; the timed answer must be the checked one."""
     times = time_in_turn({"ours": query.launch} | others, query.device, repeats)
     query.launch()
     known = [tuple(row) for row in np.column_stack([result.pairs, result.count]).tolist()]
@@ -124,15 +114,11 @@ def time_query(query, others, result, repeats):
     again = np.column_stack([query.pairs.numpy()[:count].reshape(-1, 2), query.hits.count.numpy()[:count]]).tolist()
     if sorted(known) != sorted(map(tuple, again)):
         raise RuntimeError("the timed query's answer differs from the checked one")
-    return summarise_all(times)
+    return times
 
 
 def check_alone(scene, result, pairs):
-    """Ask some pairs by themselves, int (p, 2).
-
-    Raises:
-        RuntimeError: Their face pairs differ from those among all others.
-    """
+    """Ask some pairs by themselves, int (p, 2): their face pairs must be those among all others."""
     alone = scene.intersect(pairs, output="faces")
     asked = set(map(tuple, np.asarray(pairs).tolist()))
     expected = {(*pairs[pair], a, b) for pair, a, b in alone.faces.tolist()}
@@ -142,31 +128,17 @@ def check_alone(scene, result, pairs):
         raise RuntimeError(f"pairs {sorted(asked)} by themselves have other face pairs than among all others")
 
 
-def run_worlds(device, model, world_count, object_count, peaks, repeats):
+def run_worlds(device, model, world_count, repeats):
     """Return the row of many worlds of a few objects each: broad phase and narrow phase in one launch."""
-    gc.collect()
-    poses = world_poses(world_count, object_count, longest_side(model))
-    begin = time.perf_counter()
-    scene = scene_of_worlds(device, model, poses)
-    query = ab.Query(scene, "faces")
-    build = time.perf_counter() - begin
-    result, first = run_first(query)
-    memory = memory_columns(scene, query)
-    check_worlds(scene, result, world_count, object_count)
-    row = {"sweep": "worlds", "device": device.name, "faces": model.face_count, "worlds": world_count}
-    row |= {"objects": scene.object_count, "pairs": len(result.pairs), "hits": len(result.faces)}
-    row |= {"build_s": round(build, 3), "first_s": round(first, 3)}
-    row |= time_query(query, {"broad": query.broad_phase.launch}, result, repeats)
-    row["us_a_world"] = round(1e3 * row["ours_ms"] / world_count, 3)
-    return row | memory | roofline(result, row["ours_ms"], peaks)
+    poses = random_poses(longest_side(model) / 2, OBJECTS * world_count)
+    scene, query, result, row = make_query(device, model, poses, world_size=OBJECTS)
+    check_worlds(scene, result, world_count, OBJECTS)
+    row |= summarise(time_query(query, {"broad": query.broad_phase.launch}, result, repeats))
+    return row | {"worlds": world_count, "objects": scene.object_count}
 
 
 def check_worlds(scene, result, world_count, object_count):
-    """Ask all pairs of objects of a few worlds.
-
-    Raises:
-        RuntimeError: Worlds mix, or a world by itself has other face pairs than among the others.
-    """
+    """Ask all pairs of objects of a few worlds: no worlds mix, and each has the face pairs that it has by itself."""
     world = result.pairs // object_count
     if (world[:, 0] != world[:, 1]).any():
         raise RuntimeError("the broad phase pairs objects of different worlds")

@@ -11,12 +11,11 @@ import warp as wp
 
 import warp_abtree as ab
 
-from ..baselines.wp_bvh import BvhAny, find_constructor
+from ..baselines.wp_bvh import BvhPosed, find_constructor
 from ..memory import memory_columns, used_memory
 from ..meshes import real_meshes
-from ..roofline import find_peaks, roofline
 from ..shapes import knot, longest_side, random_poses, scene_of_poses
-from ..timing import summarise, summarise_all, time_call, time_in_turn, time_rounds
+from ..timing import ratio_of, summarise, time_call, time_in_turn, time_rounds
 
 FULL = {"faces": 5000, "counts": (1024, 65536), "sweep_counts": (1024, 65536, 2**21), "repeats": 11}
 CPU = {"faces": 5000, "counts": (1024, 16384), "sweep_counts": (1024, 65536), "repeats": 5}
@@ -24,21 +23,22 @@ QUICK = {"faces": 300, "counts": (16,), "sweep_counts": (16, 40), "repeats": 1}
 
 
 def run(device, quick=False):
-    """Yield one row a model and number of poses: the launch beside wp.Bvh, with memory and roofline, then `sweep`.
+    """Yield one row a model and number of poses: the launch beside wp.Bvh, with memory, then `sweep`.
 
     meet is the fraction of poses that intersect; million poses a second from medians. Memory is that of scene and
     query, before there is a baseline, whose answers are counted against ours; those of every `sweep` must be ours.
     """
     device = wp.get_device(device)
     sizes = QUICK if quick else CPU if device.is_cpu else FULL
-    peaks = find_peaks(device)
     knots = ab.Model.from_arrays(*knot(sizes["faces"]))
     real = real_meshes({"cow 5,804": ("cow",)})
     for name, (model,) in {f"knot {knots.face_count:,}": (knots,), **real}.items():
-        for count in sizes["counts"]:
-            yield {"device": device.name, "model": name} | run_launch(device, model, count, sizes["repeats"], peaks)
-        for count in sizes["sweep_counts"]:
-            yield {"device": device.name, "model": name} | run_sweep(device, model, count, sizes["repeats"])
+        for case, run_case, counts in (("launch", run_launch, "counts"), ("sweep", run_sweep, "sweep_counts")):
+            for count in sizes[counts]:
+                gc.collect()  # scenes and their queries hold each other
+                poses = random_poses(longest_side(model), count)
+                about = {"device": device.name, "model": name, "case": case, "poses": count}
+                yield about | run_case(device, model, poses, sizes["repeats"])
 
 
 def mposes(count, milliseconds):
@@ -46,20 +46,17 @@ def mposes(count, milliseconds):
     return float(f"{count / milliseconds / 1e3:.4g}")
 
 
-def run_launch(device, model, count, repeats, peaks):
+def run_launch(device, model, poses, repeats):
     """Return the columns of launches over posed objects."""
-    gc.collect()  # scenes and their queries hold each other
-    poses = random_poses(count, longest_side(model))
     scene, pairs = scene_of_poses(device, model, model, poses)
     query = ab.Query(scene, "any", pairs=pairs)
     result = query.run()
-    row = {"case": "launch", "poses": count, "meet": round(float(result.any.mean()), 4)}
-    memory = memory_columns(scene, query)
+    row = {"meet": round(float(result.any.mean()), 4)} | memory_columns(scene, query)
     mesh = model.mesh_at(model.lod_max)[:2]
-    both = np.zeros((2 * count, 7), np.float32)
+    both = np.zeros((2 * len(poses), 7), np.float32)
     both[::2, 6], both[1::2] = 1, poses
-    constructor = find_constructor(*mesh, both[: 2 * min(64, count)], device)
-    baseline = BvhAny(*mesh, both, device, constructor)
+    constructor = find_constructor(*mesh, both[: 2 * min(64, len(poses))], device)
+    baseline = BvhPosed(*mesh, both, None, device, constructor)
     times = time_in_turn({"launch": query.launch, "peer": baseline.launch}, device, repeats)
     query.launch()
     if not np.array_equal(query.result().any, result.any):
@@ -67,16 +64,12 @@ def run_launch(device, model, count, repeats, peaks):
     baseline.launch()
     found = baseline.result()
     row |= {"peer_missed": int((result.any & ~found).sum()), "peer_invented": int((found & ~result.any).sum())}
-    row |= summarise_all(times)
-    row["launch_mposes_s"] = mposes(count, row["launch_ms"])
-    row["ratio"] = round(row["peer_ms"] / row["launch_ms"], 2)
-    return row | memory | roofline(result, row["launch_ms"], peaks)
+    row |= summarise(times) | {"ratio": ratio_of(times["peer"], times["launch"])}
+    return row | {"launch_mposes_s": mposes(len(poses), row["launch_ms"])}
 
 
-def run_sweep(device, model, count, repeats):
+def run_sweep(device, model, poses, repeats):
     """Return the columns of `sweep`, in turn with poses of each kind."""
-    gc.collect()
-    poses = random_poses(count, longest_side(model))
     single = poses.astype(np.float32)
     kinds = {"sweep": poses, "sweep32": single, "sweep_on_device": wp.array(single, dtype=wp.float32, device=device)}
     answers = {kind: ab.sweep(model, model, rows, device=device) for kind, rows in kinds.items()}
@@ -87,19 +80,13 @@ def run_sweep(device, model, count, repeats):
         kind: time_call(lambda rows=rows: ab.sweep(model, model, rows, device=device), device)
         for kind, rows in kinds.items()
     }
-    row = {"case": "sweep", "poses": count, "meet": round(float(answers["sweep32"].mean()), 4)}
-    for kind, values in time_rounds(runs, min(repeats, 5)).items():
-        row |= summarise(kind, values)
-        row[f"{kind}_mposes_s"] = mposes(count, row[f"{kind}_ms"])
-    return row | used_memory(device)
+    row = {"meet": round(float(answers["sweep32"].mean()), 4)} | summarise(time_rounds(runs, min(repeats, 5)))
+    rates = {f"{kind}_mposes_s": mposes(len(poses), row[f"{kind}_ms"]) for kind in kinds}
+    return row | rates | used_memory(device)
 
 
 def check_sweep(device, model, poses, found, checked=1024):
-    """Ask some poses of a sweep as objects of a scene.
-
-    Raises:
-        RuntimeError: The answers differ.
-    """
+    """Ask some poses of a sweep as objects of a scene: the answers must be equal."""
     some = np.unique(np.linspace(0, len(poses) - 1, checked).astype(int))
     scene, pairs = scene_of_poses(device, model, model, poses[some])
     if not np.array_equal(scene.intersect(pairs).any, found[some]):

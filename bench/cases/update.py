@@ -12,34 +12,17 @@ import warp as wp
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.testing import active_build, full_refit_fraction, read_bits, state_lods, upload_lods
+from warp_abtree.testing import full_refit_fraction, read_bits, state_lods, upload_lods
 
 from ..baselines.wp_bvh import FaceBvh
 from ..memory import memory_columns
 from ..meshes import knot_model
-from ..roofline import find_peaks, update_roofline
-from ..timing import (
-    WARM_UP,
-    crossover,
-    fit_slope,
-    make_runs,
-    medians,
-    summarise,
-    summarise_all,
-    time_call,
-    time_in_turn,
-    time_rounds,
-)
+from ..timing import WARM_UP, crossover, fit_slope, make_runs, ratio_of, summarise, time_call, time_in_turn, time_rounds
 
 # Fractions of the splits between the finest LOD and the other.
 FRACTIONS = (1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.06, 0.1, 0.15, 0.2, 0.3, 0.5, 0.9)
-FULL = {
-    "faces": (4000, 16000, 64000, 250_000, 1_000_000),
-    "fractions": FRACTIONS,
-    "states": (1, 16, 256, 4096),
-    "state_faces": 500,
-    "repeats": 7,
-}
+FULL = {"faces": (4000, 16000, 64000, 250_000, 1_000_000), "states": (1, 16, 256, 4096), "state_faces": 500}
+FULL |= {"fractions": FRACTIONS, "repeats": 7}
 QUICK = {"faces": (200, 600), "fractions": (0.01, 0.1, 0.9), "states": (1, 12), "state_faces": 200, "repeats": 2}
 LARGEST_CPU = 64000
 STATES_PER_MODEL = 8
@@ -50,21 +33,18 @@ ROUND_TRIPS = 2  # times there and back, the last of which counts
 def run(device, quick=False, largest=None, models=None):
     """Yield one row a fraction of a mesh, one a mesh with its crossover, and one a number of states moved at once.
 
-    Columns: nodes and bytes are those of the partial update, counted; memory is that of the scene, before there is a
-    baseline. entries are the faces of the slice between the LODs, repeats included; full tells whether the library
-    would refit the whole tree. bvh_build boxes the faces at the LOD and builds a wp.Bvh over them; host_build is
-    ACTIVE-BUILD over the finest mesh. crossover_* are where the update costs as much as a full refit: the least
-    measured if it always does, None if it never does.
+    Columns: nodes are those of the partial update, counted; entries are the faces of the slice between the LODs,
+    repeats included; full tells whether the library would refit the whole tree. bvh_build boxes the faces at the LOD
+    and builds a wp.Bvh over them. For crossover_* see `find_crossover`.
     """
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
-    peaks = find_peaks(device)
     limit = largest or (LARGEST_CPU if device.is_cpu else max(sizes["faces"]))
     for face_target in sizes["faces"]:
         if face_target <= limit:
-            yield from run_mesh(device, knot_model(face_target, models), sizes, peaks)
+            yield from run_mesh(device, knot_model(face_target, models), sizes)
     for count in sizes["states"]:
-        yield run_states(device, knot_model(sizes["state_faces"], models), count, sizes["repeats"], peaks)
+        yield run_states(device, knot_model(sizes["state_faces"], models), count, sizes["repeats"])
 
 
 def bound_nodes(k, faces):
@@ -77,11 +57,8 @@ def same_bits(one, other) -> bool:
 
 
 def check_update(scene, there, back, faces):
-    """Move to other LODs and back by both kinds of refit and compare all bits.
-
-    Returns:
-        k and nodes refitted of each state by the partial update, faces in its slices, and by kind of refit the launches
-        that repeat the updates there and back.
+    """Move to other LODs and back by both kinds of refit and compare all bits; return k and nodes refitted of each
+    state by the partial update, faces in its slices, and by kind of refit the launches that repeat both updates.
 
     Raises:
         RuntimeError: Bits or k differ, the bound of equation (1) is passed, or states have changed places.
@@ -111,14 +88,18 @@ def check_update(scene, there, back, faces):
     return k, nodes, entries, launches
 
 
-def time_update(scene, there, back, launches, repeats):
-    """Return columns of times [ms].
+def measure_update(scene, there, back, faces, repeats):
+    """Check and time moves to other LODs and back; return their columns, times in [ms].
 
     update, full: device time of refinement, marking and refit, there and back: graph replays on CUDA. wall: whole calls
     of `set_lods` as the library chooses, planning and uploads included. In turn, but each time there and back twice, of
     which the second counts: what one kind of refit leaves in the caches is of no use to the other.
     """
     device = scene.device
+    k, nodes, entries, launches = check_update(scene, there, back, faces)
+    bound = int(sum(bound_nodes(int(each), faces) for each in k))
+    row = {"device": device.name, "faces": faces, "states": len(k), "k": int(k.sum()), "entries": entries}
+    row |= {"nodes_refitted": int(nodes.sum()), "bound": bound}
     ways = {(kind, way): launch for kind, both in launches.items() for way, launch in enumerate(both)}
     runs = make_runs(ways, device)
     times = {kind: [] for kind in REFITS}
@@ -129,54 +110,37 @@ def time_update(scene, there, back, launches, repeats):
     upload_lods(scene)
     calls = {"there": lambda: scene.set_lods(there), "back": lambda: scene.set_lods(back)}
     walls = time_rounds({way: time_call(call, device) for way, call in calls.items()}, repeats)
-    row = summarise_all(times | {"wall": walls["there"] + walls["back"]})
-    return row | {"ratio": round(row["full_ms"] / row["update_ms"], 2)}
+    row |= summarise(times | {"wall": walls["there"] + walls["back"]})
+    return row | {"ratio": ratio_of(times["full"], times["update"])}
 
 
 def find_crossover(rows, column):
-    """Return the value of a column where an update starts to cost as much as a full refit: the least if it always does,
-    None if it never does."""
+    """Return where in a column an update starts to cost as much as a full refit: the least if always, None if never."""
     x = [row[column] for row in rows]
     return crossover(x, [math.log(row["update_ms"] / row["full_ms"]) for row in rows], x[0])
 
 
-def run_mesh(device, model, sizes, peaks):
+def run_mesh(device, model, sizes):
     """Yield the rows of one mesh."""
     scene = ab.Scene(device=device)
     scene.add(model)
     finest, repeats, rows = model.lod_max, sizes["repeats"], []
     memory = memory_columns(scene)
     for step in sorted({max(1, round(fraction * finest)) for fraction in sizes["fractions"]}):
-        k, nodes, entries, launches = check_update(scene, [finest - step], [finest], model.face_count)
-        vertices, faces, _ = model.mesh_at(finest - step)
-        baseline = FaceBvh(vertices, faces, device)
-        row = {"device": device.name, "case": "one state", "faces": model.face_count, "splits": step}
-        row |= {"k": int(k[0]), "share": float(f"{k[0] / model.face_count:.4g}"), "entries": entries}
-        row |= {"nodes_refitted": int(nodes[0]), "bound": int(bound_nodes(int(k[0]), model.face_count))}
-        row["full"] = entries > full_refit_fraction(device) * model.face_count  # what the library chooses
-        row |= time_update(scene, [finest - step], [finest], launches, repeats)
+        row = {"case": "one state", "splits": step}
+        row |= measure_update(scene, [finest - step], [finest], model.face_count, repeats)
+        row["full"] = row["entries"] > full_refit_fraction(device) * model.face_count  # what the library chooses
+        baseline = FaceBvh(*model.mesh_at(finest - step)[:2], device)
         # Not in turn with the others, whose tree it would drive out of the caches.
-        row |= summarise("bvh_build", time_in_turn({"build": baseline.rebuild}, device, repeats)["build"])
-        row |= memory | update_roofline(row["k"], row["nodes_refitted"], entries, row["update_ms"], peaks)
+        row |= summarise(time_in_turn({"bvh_build": baseline.rebuild}, device, repeats)) | memory
         rows.append(row)
         yield row
-    vertices, faces, _ = model.mesh_at(finest)
-    host = time_rounds({"build": time_call(lambda: active_build(vertices, faces))}, 3)
-    k, entries = (find_crossover(rows, column) for column in ("k", "entries"))
-    yield {
-        "device": device.name,
-        "case": "crossover",
-        "faces": model.face_count,
-        "crossover_k": k and round(k),
-        "crossover_share": k and round(k / model.face_count, 4),
-        "crossover_entries": entries and round(entries),
-        "full_share": full_refit_fraction(device),
-        "slope": fit_slope([row["k"] for row in rows], [row["update_ms"] for row in rows]),
-        "host_build_ms": round(medians(host)["build"], 2),
-    }
+    row = {"device": device.name, "case": "crossover", "faces": model.face_count}
+    row |= {f"crossover_{name}": find_crossover(rows, name) for name in ("k", "entries")}
+    yield row | {"slope": fit_slope([row["k"] for row in rows], [row["update_ms"] for row in rows])}
 
 
-def run_states(device, model, count, repeats, peaks):
+def run_states(device, model, count, repeats):
     """Return the row of many states of a model, each at a LOD of its own, moved by a few splits in one call."""
     step = model.lod_max // STATES_PER_MODEL
     scene = ab.Scene(device=device)
@@ -187,13 +151,7 @@ def run_states(device, model, count, repeats, peaks):
         back.append(model.lod_max - step * (i % STATES_PER_MODEL))
         scene.add(clone, lod=back[-1])
     there = [lod - max(1, step // 4) for lod in back]
-    k, nodes, entries, launches = check_update(scene, there, back, model.face_count)
-    if len(k) != count:
-        raise RuntimeError(f"{len(k)} states moved in place of {count}")
-    row = {"device": device.name, "case": "many states", "faces": model.face_count, "states": count}
-    row |= {"k": int(k.sum()), "entries": entries, "nodes_refitted": int(nodes.sum())}
-    row["bound"] = int(sum(bound_nodes(int(x), model.face_count) for x in k))
-    row |= time_update(scene, there, back, launches, repeats)
-    row["us_a_state"] = round(1e3 * row["update_ms"] / count, 3)
-    row |= memory_columns(scene)
-    return row | update_roofline(row["k"], row["nodes_refitted"], entries, row["update_ms"], peaks)
+    row = {"case": "many states"} | measure_update(scene, there, back, model.face_count, repeats)
+    if row["states"] != count:
+        raise RuntimeError(f"{row['states']} states moved in place of {count}")
+    return row | memory_columns(scene)

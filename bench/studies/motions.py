@@ -22,8 +22,9 @@ class Motions:
 
     Attributes:
         away: Directions from A's centre, float64 (m, 3).
-        turns: Rotations of B, unit quaternions (m, 4).
+        rotations: Of B, unit quaternions (m, 4).
         reach: Distance of the centres at which nothing intersects yet.
+        far: Pose of B out of reach, (7,).
     """
 
     def __init__(self, rng, count, model_a, model_b):
@@ -81,60 +82,41 @@ def find_first_contact(intersects, motions, steps=SCAN_STEPS, bisections=BISECTI
 
 
 class PoseScene:
-    """A scene of A and a number of Bs, all Bs of one LOD: any number of poses, so many at a time.
+    """A scene of A and a number of Bs, room, all of one LOD: any number of poses, so many at a time.
 
-    Args:
-        models, lods: Of A and B.
-        far: Pose of the Bs that are not asked.
-        room: Number of Bs.
-
-    Attributes:
-        scene, pairs: The `ab.Scene`, and its pairs (0, 1), (0, 2), ...
+    Bs that are not asked stand at the pose far; pairs are (0, 1), (0, 2), ...
     """
 
     def __init__(self, device, models, lods, far, room):
         self.scene, self.pairs = scene_of_poses(device, *models, np.tile(far, (room, 1)))
         self.scene.set_lods([lods[0]] + [lods[1]] * room)
-        self.room = room
-        self._rows = np.tile(far, (room + 1, 1))
-        self._rows[0] = 0, 0, 0, 0, 0, 0, 1
-        self._far, self._queries = far, {}
+        self.room, self._far, self._queries = room, far, {}
 
     def place(self, poses):
         """Pose the first Bs, and put the others away."""
-        self._rows[1 : len(poses) + 1] = poses
-        self._rows[len(poses) + 1 :] = self._far
-        self.scene.set_poses(self._rows)
+        still, rest = [(0, 0, 0, 0, 0, 0, 1)], np.tile(self._far, (self.room - len(poses), 1))
+        self.scene.set_poses(np.concatenate([still, poses, rest]))
 
-    def _parts(self, poses):
-        """Place so many poses at a time; yield the slice of each part and its pairs."""
+    def _ask(self, poses, column, within=None):
+        """Return a column of the results at poses, so many at a time, with distances (n,) or without."""
+        if (within is None) not in self._queries:
+            options = {} if within is None else {"within": 0.0}
+            self._queries[within is None] = ab.Query(self.scene, "any", pairs=self.pairs, **options)
+        query, found = self._queries[within is None], np.zeros(len(poses), bool)
         for start in range(0, len(poses), self.room):
             part = slice(start, min(start + self.room, len(poses)))
             self.place(poses[part])
-            yield part, self.pairs[: part.stop - start]
-
-    def _query(self, **options):
-        key = tuple(options)
-        if key not in self._queries:
-            self._queries[key] = ab.Query(self.scene, "any", pairs=self.pairs, **options)
-        return self._queries[key]
+            query.set_pairs(self.pairs[: part.stop - start], **({} if within is None else {"within": within[part]}))
+            found[part] = getattr(query.run(), column)
+        return found
 
     def intersects(self, poses):
         """Return whether A and B intersect at each pose."""
-        query, found = self._query(), np.zeros(len(poses), bool)
-        for part, pairs in self._parts(poses):
-            query.set_pairs(pairs)
-            found[part] = query.run().any
-        return found
+        return self._ask(poses, "any")
 
     def near(self, poses, within):
         """Return whether A and B are not proved farther apart than a distance, at each pose."""
-        query, found = self._query(within=0.0), np.zeros(len(poses), bool)
-        within = np.broadcast_to(np.asarray(within, float), len(poses))
-        for part, pairs in self._parts(poses):
-            query.set_pairs(pairs, within=within[part])
-            found[part] = ~query.run().apart
-        return found
+        return ~self._ask(poses, "apart", np.broadcast_to(np.asarray(within, float), len(poses)))
 
     def ask(self, poses, output):
         """Return the `ab.Result` at poses, no more than there is room for."""

@@ -1,4 +1,4 @@
-"""Studies: `python -m bench paper|tradeoff|all --out DIR`.
+"""Studies: `python -m bench paper|tradeoff --out DIR`.
 
 A study is a package with PARTS, functions that yield rows, and SUMMARIES, functions of rows that its tables and figures
 use. It writes DIR/STUDY.json after each part, and in the end STUDY.md and figures, laid out in STUDY.toml.
@@ -6,6 +6,7 @@ use. It writes DIR/STUDY.json after each part, and in the end STUDY.md and figur
 
 import importlib
 import json
+import os
 import platform
 import sys
 import time
@@ -17,7 +18,7 @@ import warp as wp
 import warp_abtree as ab
 
 from .. import tables, timing
-from ..__main__ import STUDIES, describe_run
+from ..__main__ import describe_run
 from ..meshes import ModelFolder
 
 
@@ -61,19 +62,13 @@ class Context:
         """Say what is being done."""
         print(f"  {text}", file=sys.stderr, flush=True)
 
-    def time_graphs(self, launches: dict, repeats=None) -> dict:
+    def time_graphs(self, launches: dict) -> dict:
         """Return the median time [ms] of launches by name, captured as graphs on any device and replayed in turn.
 
-        On the CPU a graph costs no Python a launch and runs in this thread, whose own CPU time is taken: others on the
-        machine count for little. Turns keep the order of the dict, so launches there and back may stand side by side.
+        Turns keep the order of the dict, so launches there and back may stand side by side.
         """
-        runs = {}
-        for name, launch in launches.items():
-            launch()
-            graph = timing.capture(launch, self.device)
-            replay = partial(wp.capture_launch, graph)
-            runs[name] = timing.time_graph(graph, self.device) if self.device.is_cuda else timed(replay)
-        return timing.medians(timing.time_rounds(runs, repeats or self.size(21, 5)))
+        runs = timing.make_runs(launches, self.device, time.thread_time, captured=True)
+        return timing.medians(timing.time_rounds(runs, self.size(21, 5)))
 
     def time_launches(self, launches, repeats=None, on_core=False) -> dict:
         """Return the median time [ms] of launches by name, in turn: on CUDA of graph replays.
@@ -84,18 +79,14 @@ class Context:
         Args:
             on_core: Whether these run on the host whatever the device.
         """
-        repeats = repeats or self.size(9 if self.device.is_cuda and not on_core else 7, 3)
-        if self.device.is_cuda and not on_core:
+        on_gpu = self.device.is_cuda and not on_core
+        repeats = repeats or self.size(9 if on_gpu else 7, 3)
+        if on_gpu:
             return timing.medians(timing.time_in_turn(launches, self.device, repeats))
-        clocked = {name: timed(launch) for name, launch in launches.items()}
+        clocked = {name: timing.time_call(launch, clock=time.thread_time) for name, launch in launches.items()}
         runs = {name: lambda run=run: (run(), run())[1] for name, run in clocked.items()}
         with timing.one_core(), timing.no_garbage_collection():
             return timing.medians(timing.time_rounds(runs, repeats))
-
-
-def timed(call):
-    """Return a callable that calls something and returns the CPU time of this thread [ms]."""
-    return timing.time_call(call, "cpu", time.thread_time)
 
 
 def find_study(name):
@@ -107,28 +98,10 @@ def run_part(run, context, command) -> dict:
     """Run a part; return its rows, notes and the circumstances."""
     begin = time.perf_counter()
     rows = [{key: tables.plain(value) for key, value in row.items()} for row in run(context)]
-    device = context.device.name if context.device.is_cuda else f"{platform.processor()}, {timing.core_count()} cores"
+    device = context.device.name if context.device.is_cuda else f"{platform.processor()}, {os.cpu_count()} cores"
     about = {"device": device, "quick": context.quick, **describe_run(), "command": command}
     about["seconds"] = tables.plain(time.perf_counter() - begin)
     return {"run": about, "notes": context.notes, "rows": rows}
-
-
-def run_study(name, out, only, command, make_context):
-    """Run the parts of a study, or some of them, and write what they found."""
-    file = out / f"{name}.json"
-    study = {"study": name, "parts": {}}
-    if only and file.is_file():
-        study = json.loads(file.read_text(encoding="utf-8"))
-    for part, run_rows in find_study(name).PARTS.items():
-        if only and part not in only:
-            continue
-        print(f"{name}: {part}", file=sys.stderr, flush=True)
-        study["parts"][part] = run_part(run_rows, make_context(), command)
-        tables.write_json(file, study)
-    (out / f"{name}.md").write_text(tables.study_page(study), encoding="utf-8")
-    figures = tables.read_layout(f"studies/{name}.toml")["figure"]
-    print(tables.draw(figures, partial(tables.select_rows, study=study), out))
-    print(f"wrote {file} and {name}.md")
 
 
 class StudyError(ValueError):
@@ -136,14 +109,13 @@ class StudyError(ValueError):
 
 
 def run(device, name, out, quick=False, models=None, only=None, command=None):
-    """Run a study, or all of them.
+    """Run the parts of a study, or some of them, and write what they found.
 
     Raises:
         StudyError: There is no such part, device or folder.
     """
     wp.config.log_level = wp.LOG_WARNING
-    names = STUDIES[:-1] if name == "all" else (name,)
-    parts = [part for name in names for part in find_study(name).PARTS]
+    parts = find_study(name).PARTS
     unknown = set(only or ()) - set(parts)
     if unknown:
         raise StudyError(f"no part {', '.join(sorted(unknown))}; there are {', '.join(parts)}")
@@ -153,6 +125,15 @@ def run(device, name, out, quick=False, models=None, only=None, command=None):
         out.mkdir(parents=True, exist_ok=True)
     except (ValueError, OSError) as error:
         raise StudyError(str(error)) from error
-    folder = ModelFolder(models or out / "models")
-    for name in names:
-        run_study(name, out, only, command, partial(Context, device, quick, folder))
+    folder, file = ModelFolder(models or out / "models"), out / f"{name}.json"
+    study = {"study": name, "parts": {}}
+    if only and file.is_file():
+        study = json.loads(file.read_text(encoding="utf-8"))
+    for part in only or parts:
+        print(f"{name}: {part}", file=sys.stderr, flush=True)
+        study["parts"][part] = run_part(parts[part], Context(device, quick, folder), command)
+        tables.write_json(file, study)
+    (out / f"{name}.md").write_text(tables.study_page(study), encoding="utf-8")
+    figures = tables.read_layout(f"studies/{name}.toml")["figure"]
+    print(tables.draw(figures, partial(tables.select_rows, study=study), out))
+    print(f"wrote {file} and {name}.md")

@@ -59,8 +59,7 @@ def double_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     x = multiply_double(u0, minor_double(v1, w2, v2, w1))
     y = multiply_double(v0, minor_double(w1, u2, w2, u1))
     z = multiply_double(w0, minor_double(u1, v2, u2, v1))
-    value = add_double(add_double(x, y), z)
-    return value[0]
+    return add_double(add_double(x, y), z)
 
 
 @wp.func
@@ -68,5 +67,13 @@ def double_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
     """Return det(a - c, b - c) to about 2^-104 of its sum of magnitudes."""
     u0, u1 = subtract_exactly(a[0], c[0]), subtract_exactly(a[1], c[1])
     v0, v1 = subtract_exactly(b[0], c[0]), subtract_exactly(b[1], c[1])
-    value = minor_double(u0, v1, u1, v0)
-    return value[0]
+    return minor_double(u0, v1, u1, v0)
+
+
+@wp.func
+def round_double(value: wp.vec2d, bound: wp.float64):
+    """Return the float64 number next to what a double word stands for within a bound; NaN where that leaves two."""
+    # Twice the bound, for the rounding of these sums.
+    above = value[0] + (value[1] + wp.float64(2.0) * bound)
+    below = value[0] + (value[1] - wp.float64(2.0) * bound)
+    return wp.where(above == value[0] and below == value[0], value[0], wp.float64(wp.nan))

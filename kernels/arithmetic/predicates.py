@@ -45,7 +45,7 @@ def filtered_sign(x: Any, bound: Any):
 def resolve_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, size: wp.float64):
     """Return a sign uncertain in float64, `size` the sum of magnitudes. Not inlined: long, and rarely called."""
     bound = BOUND_DOUBLE * size
-    sign = filtered_sign(double_orient3d(a, b, c, d), bound)
+    sign = filtered_sign(double_orient3d(a, b, c, d)[0], bound)
     if sign == UNCERTAIN:
         sign = integer_orient3d(a, b, c, d, bound)
     if sign == UNCERTAIN:
@@ -57,7 +57,7 @@ def resolve_orient3d(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, size: w
 def resolve_orient2d(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, size: wp.float64):
     """Return a sign that is uncertain in float64, as `resolve_orient3d`."""
     bound = BOUND_DOUBLE * size
-    sign = filtered_sign(double_orient2d(a, b, c), bound)
+    sign = filtered_sign(double_orient2d(a, b, c)[0], bound)
     if sign == UNCERTAIN:
         sign = integer_orient2d(a, b, c, bound)
     if sign == UNCERTAIN:

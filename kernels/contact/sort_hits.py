@@ -61,13 +61,19 @@ def place_row_kernel(
 
 @wp.kernel
 def start_pair_kernel(
-    capacity: wp.int32, shift: wp.int32, key: wp.array(dtype=wp.int64), start_out: wp.array(dtype=wp.int32)
+    capacity: wp.int32,
+    shift: wp.int32,
+    key: wp.array(dtype=wp.int64),
+    start_out: wp.array(dtype=wp.int32),
+    deferred_total_out: wp.array(dtype=wp.int32),
 ):
-    """Find where the hits of one object pair a thread start, and after the last pair where they end.
+    """Find where the hits of one object pair a thread start, and after the last pair where they end; defer none yet.
 
     Args:
         key: Sorted keys of the last pass, with the pair above `shift` bits, then scratch, shape [2 capacity].
     """
     p = wp.tid()
+    if p == 0:
+        deferred_total_out[0] = 0
     # One more than there are keys: the search never looks at its end, and returns the place before it if all are less.
     start_out[p] = wp.lower_bound(key, 0, capacity + 1, wp.int64(p) << wp.int64(shift))

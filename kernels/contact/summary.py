@@ -1,16 +1,18 @@
 """One summary an object pair of its sorted contacts, in sums of a fixed shape.
 
-A chunk is CHUNK contacts of one pair, the pair's last one shorter. One thread a chunk sums its contacts in their order,
-then one thread a pair its chunks in theirs, so that no bit depends on the device or on the order in which threads run.
+A chunk is CHUNK contacts of one pair, the pair's last one shorter. One warp a chunk sums its contacts in their order
+(on the CPU a thread), then one thread a pair its chunks in theirs, so that no bit depends on the device or on the order
+in which threads run.
 """
 
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.contact.contact import SHORTEST_NORMAL, Contacts, load_corners, pair_direction
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.contact.contact import SHORTEST_NORMAL, Contacts, contact_objects, pair_direction
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.traversal.nodes import load_node
+from warp_abtree.kernels.traversal.warp_stack import add_in_order, six_numbers, warp_lane, warp_max, warp_size
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -74,16 +76,21 @@ def locate_chunk(c: wp.int32, start: wp.array(dtype=wp.int32)):
 
 @wp.kernel
 def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_out: ChunkSums):
-    """Locate one chunk a thread and sum the lengths of its contacts."""
-    c = wp.tid()
+    """Locate one chunk a warp and sum the lengths of its contacts."""
+    c = wp.tid() / warp_size()
     span = locate_chunk(c, start)
-    sums_out.span[c] = span
-    length = wp.float64(0.0)
-    k = span[1]
-    while k < span[2]:
-        length += measure_length(contacts.p1[k] - contacts.p0[k])
-        k += 1
-    sums_out.length[c] = length
+    sums = six_numbers()
+    length = six_numbers()
+    first = wp.int32(span[1])
+    while first < span[2]:
+        k = wp.min(first + warp_lane(), span[2] - 1)
+        count = wp.min(span[2] - first, warp_size())
+        length[0] = measure_length(contacts.p1[k] - contacts.p0[k])
+        sums = add_in_order(sums, length, count)
+        first += warp_size()
+    if warp_lane() == 0:
+        sums_out.span[c] = span
+        sums_out.length[c] = sums[0]
 
 
 @wp.kernel
@@ -105,7 +112,7 @@ def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_in
 
     Where all lengths vanish all weights are the same.
     """
-    c = wp.tid()
+    c = wp.tid() / warp_size()
     span = sums_inout.span[c]
     if span[1] >= span[2]:
         return
@@ -113,18 +120,22 @@ def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_in
     origin = contacts.p0[start[p]]
     half = wp.float64(0.5)
     total = sums_inout.total[p]
-    point = wp.vec3d()
-    normal = wp.vec3d()
-    k = span[1]
-    while k < span[2]:
+    sums = six_numbers()
+    first = wp.int32(span[1])
+    while first < span[2]:
+        k = wp.min(first + warp_lane(), span[2] - 1)
+        count = wp.min(span[2] - first, warp_size())
         weight = wp.float64(1.0) / wp.float64(start[p + 1] - start[p])
         if total != wp.float64(0.0):
             weight = measure_length(contacts.p1[k] - contacts.p0[k]) / total
-        point += weight * (half * (contacts.p0[k] - origin) + half * (contacts.p1[k] - origin))
-        normal += weight * contacts.normal[k]
-        k += 1
-    sums_inout.point[c] = point
-    sums_inout.normal[c] = normal
+        middle = weight * (half * (contacts.p0[k] - origin) + half * (contacts.p1[k] - origin))
+        normal = weight * contacts.normal[k]
+        both = six_numbers(middle[0], middle[1], middle[2], normal[0], normal[1], normal[2])
+        sums = add_in_order(sums, both, count)
+        first += warp_size()
+    if warp_lane() == 0:
+        sums_inout.point[c] = wp.vec3d(sums[0], sums[1], sums[2])
+        sums_inout.normal[c] = wp.vec3d(sums[3], sums[4], sums[5])
 
 
 @wp.func_native(native.body("numbers.cuh", "no_vector"))
@@ -203,44 +214,50 @@ def sum_loop_kernel(
     pair_contacts: PairContacts,
     sums_inout: ChunkSums,
 ):
-    """Sum what the depth needs of one chunk a thread: area within the contact curve, its change, extents of faces."""
-    c = wp.tid()
+    """Sum what the depth needs of one chunk a warp: area within the contact curve, its change, extents of faces."""
+    c = wp.tid() / warp_size()
     span = sums_inout.span[c]
     if span[1] >= span[2]:
         return
     p = span[0]
     n = pair_contacts.normal[p]
     origin = contacts.p0[start[p]]
-    swapped = pair_poses[p].swapped
-    a = wp.min(pairs[p][0], pairs[p][1])
+    own = contact_objects(pairs, pair_poses, p)
     front = -wp.float64(wp.inf)
-    back = wp.float64(wp.inf)
-    area = wp.float64(0.0)
-    change = wp.float64(0.0)
-    corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    k = span[1]
-    while k < span[2]:
-        load_corners(models, states, pair_poses[p], faces[k][1 + swapped], faces[k][2 - swapped], corner)
-        i = wp.int32(0)
-        while i < 6:
-            at = wp.dot(n, pose_point(objects.rotation[a], objects.position[a], corner[i]) - origin)
-            # Places 0..2 are the lower object's, which a swapped pair names second.
-            if (i < 3) == (swapped == 0):
-                front = wp.max(front, at)
-            else:
-                back = wp.min(back, at)
-            i += 1
+    back = -wp.float64(wp.inf)
+    sums = six_numbers()
+    first = wp.int32(span[1])
+    while first < span[2]:
+        k = wp.min(first + warp_lane(), span[2] - 1)
+        count = wp.min(span[2] - first, warp_size())
+        a = states.face_corner[pair_poses[p].corner_a + faces[k][1 + own.swapped]]
+        b = states.face_corner[pair_poses[p].corner_b + faces[k][2 - own.swapped]]
+        for i in range(3):
+            corner_a = load_vertex(models.vertex_pos, a[i])
+            corner_b = pose_point(
+                pair_poses[p].rotation, pair_poses[p].translation, load_vertex(models.vertex_pos, b[i])
+            )
+            reach_a = wp.dot(n, pose_point(objects.rotation[own.a], objects.position[own.a], corner_a) - origin)
+            reach_b = wp.dot(n, pose_point(objects.rotation[own.a], objects.position[own.a], corner_b) - origin)
+            # The normal goes from the object that the pair names first.
+            front = wp.max(front, wp.where(own.swapped == 0, reach_a, reach_b))
+            back = wp.max(back, -wp.where(own.swapped == 0, reach_b, reach_a))
         # About the mean point, since for an open curve the area depends on where it is measured from.
         r = contacts.p0[k] - origin - sums_inout.middle[p]
         s = contacts.p1[k] - contacts.p0[k]
+        parts = six_numbers()
         if contacts.coplanar[k] == 0:
-            area += wp.float64(0.5) * wp.dot(n, wp.cross(r, s))
-            change += loop_change(s, contacts.normal_a[k], contacts.normal_b[k], n)
-        k += 1
-    sums_inout.area[c] = area
-    sums_inout.change[c] = change
-    sums_inout.front[c] = front
-    sums_inout.back[c] = back
+            parts[0] = wp.float64(0.5) * wp.dot(n, wp.cross(r, s))
+            parts[1] = loop_change(s, contacts.normal_a[k], contacts.normal_b[k], n)
+        sums = add_in_order(sums, parts, count)
+        first += warp_size()
+    front = warp_max(front)
+    back = -warp_max(back)
+    if warp_lane() == 0:
+        sums_inout.area[c] = sums[0]
+        sums_inout.change[c] = sums[1]
+        sums_inout.front[c] = front
+        sums_inout.back[c] = back
 
 
 @wp.func

@@ -2,15 +2,19 @@
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import LAST_KEY, ObjectPool
-from warp_abtree.kernels.contact.manifold import POINTS, Manifolds
+from warp_abtree.kernels.arrays import ObjectPool
+from warp_abtree.kernels.broad_phase import pair_key
+from warp_abtree.kernels.contact.manifold import Manifolds
 from warp_abtree.kernels.dynamics.bodies import DYNAMIC, Bodies
-from warp_abtree.kernels.dynamics.graph_coloring import INACTIVE
+from warp_abtree.kernels.dynamics.graph_coloring import COLOR_COUNT, INACTIVE
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BAUMGARTE = wp.constant(wp.float64(0.2))
 """Fraction of the penetration that one step corrects."""
+
+SLOP = wp.constant(wp.float64(2.0**-9))
+"""Penetration that is not corrected, as a fraction of the bounding radius."""
 
 MATCH_RADIUS = wp.constant(wp.float64(0.05))
 """Largest distance of a point from its match in the step before, as a fraction of the bounding radius."""
@@ -22,18 +26,13 @@ class Constraints:
 
     arm_a: wp.array2d(dtype=wp.vec3d)  # from the centre of mass of the first body
     arm_b: wp.array2d(dtype=wp.vec3d)  # from that of the second
-    tangent: wp.array2d(dtype=wp.vec3d)  # the first tangent; the second is normal x tangent
     mass: wp.array2d(dtype=wp.float64)  # effective mass along the normal
-    tangent_mass: wp.array2d(dtype=wp.mat22d)  # effective mass along the tangents
+    tangent_mass: wp.array2d(dtype=wp.mat33d)  # effective mass across the normal, world frame
     bias: wp.array2d(dtype=wp.float64)  # separation speed that the position correction aims for [world units/s]
     impulse: wp.array2d(dtype=wp.float64)  # accumulated, along the normal
-    friction_impulse: wp.array2d(dtype=wp.vec2d)  # accumulated, along the tangents
+    friction_impulse: wp.array2d(dtype=wp.vec3d)  # accumulated, across the normal, world frame
     pseudo_impulse: wp.array2d(dtype=wp.float64)  # accumulated, of the position correction
-    match: wp.array2d(dtype=wp.int32)  # point in `WarmStart`, row * POINTS + column, or -1
-    restitution: wp.array(dtype=wp.float64)  # [pair] coefficient
-    friction: wp.array(dtype=wp.float64)  # [pair] coefficient
-    threshold: wp.array(dtype=wp.float64)  # [pair] approach speed below which nothing bounces [world units/s]
-    both_rigid: wp.array(dtype=wp.int32)  # [pair] 1 if both are rigid bodies
+    color: wp.array(dtype=wp.int32)  # [pair] 0 .. COLOR_COUNT, or INACTIVE
 
 
 @wp.struct
@@ -71,54 +70,40 @@ def make_point(manifolds: Manifolds, pair: wp.vec2i, p: wp.int32, k: wp.int32):
 
 
 @wp.func
-def velocity_at(bodies: Bodies, i: wp.int32, arm: wp.vec3d):
-    """Return the velocity of a body at the end of an arm."""
-    angular_velocity = bodies.angular_velocity[i] + bodies.inverse_inertia[i] * bodies.momentum[i]
-    return bodies.velocity[i] + wp.cross(angular_velocity, arm)
+def relative_velocity(
+    velocity: wp.array(dtype=wp.vec3d),
+    momentum: wp.array(dtype=wp.vec3d),
+    constraints: Constraints,
+    bodies: Bodies,
+    c: Point,
+):
+    """Return the velocity, or pseudo-velocity, of the second object relative to the first at a point."""
+    at_a = velocity[c.a] + wp.cross(bodies.inverse_inertia[c.a] * momentum[c.a], constraints.arm_a[c.pair, c.column])
+    at_b = velocity[c.b] + wp.cross(bodies.inverse_inertia[c.b] * momentum[c.b], constraints.arm_b[c.pair, c.column])
+    return at_b - at_a
 
 
 @wp.func
-def relative_velocity(constraints: Constraints, bodies: Bodies, c: Point):
-    """Return the velocity of the second object relative to the first at a point."""
-    velocity = velocity_at(bodies, c.b, constraints.arm_b[c.pair, c.column])
-    return velocity - velocity_at(bodies, c.a, constraints.arm_a[c.pair, c.column])
-
-
-@wp.func
-def response(bodies: Bodies, i: wp.int32, arm: wp.vec3d, u: wp.vec3d, v: wp.vec3d):
-    """Return the velocity along v at the end of an arm that an impulse of 1 along u gives."""
+def mobility(bodies: Bodies, i: wp.int32, arm: wp.vec3d):
+    """Return the matrix that takes an impulse at the end of an arm to the velocity that it gives there."""
     if bodies.motion_type[i] != DYNAMIC:
-        return wp.float64(0.0)
-    angular_velocity = bodies.inverse_inertia[i] * wp.cross(arm, u)
-    return bodies.inverse_mass[i] * wp.dot(u, v) + wp.dot(angular_velocity, wp.cross(arm, v))
-
-
-@wp.func
-def perpendicular(n: wp.vec3d):
-    """Return a unit vector perpendicular to a unit vector."""
-    zero = wp.float64(0.0)
-    v = wp.vec3d(-n[2], zero, n[0])
-    if wp.abs(n[0]) < wp.abs(n[1]):
-        v = wp.vec3d(zero, n[2], -n[1])
-    return wp.normalize(v)
+        return wp.mat33d()
+    cross = wp.skew(arm)
+    return bodies.inverse_mass[i] * wp.identity(n=3, dtype=wp.float64) - cross * bodies.inverse_inertia[i] * cross
 
 
 @wp.func
 def set_effective_mass(bodies: Bodies, constraints: Constraints, c: Point):
-    """Set the tangent of a point, and the effective masses along the normal and both tangents."""
-    n = c.normal
-    t = perpendicular(n)
-    s = wp.cross(n, t)
-    arm_a = constraints.arm_a[c.pair, c.column]
-    arm_b = constraints.arm_b[c.pair, c.column]
-    nn = response(bodies, c.a, arm_a, n, n) + response(bodies, c.b, arm_b, n, n)
-    tt = response(bodies, c.a, arm_a, t, t) + response(bodies, c.b, arm_b, t, t)
-    ts = response(bodies, c.a, arm_a, t, s) + response(bodies, c.b, arm_b, t, s)
-    ss = response(bodies, c.a, arm_a, s, s) + response(bodies, c.b, arm_b, s, s)
-    det = tt * ss - ts * ts
-    constraints.tangent[c.pair, c.column] = t
-    constraints.mass[c.pair, c.column] = wp.float64(1.0) / nn
-    constraints.tangent_mass[c.pair, c.column] = wp.mat22d(ss / det, -ts / det, -ts / det, tt / det)
+    """Set the effective masses of a point along the normal and across it."""
+    k = mobility(bodies, c.a, constraints.arm_a[c.pair, c.column])
+    k += mobility(bodies, c.b, constraints.arm_b[c.pair, c.column])
+    along = wp.dot(c.normal, k * c.normal)
+    normal = wp.outer(c.normal, c.normal)
+    across = wp.identity(n=3, dtype=wp.float64) - normal
+    constraints.mass[c.pair, c.column] = wp.float64(1.0) / along
+    # The inverse within the tangent plane: along the normal the matrix is made `along`, and its inverse taken off.
+    tangent_mass = wp.inverse(across * k * across + along * normal) - normal / along
+    constraints.tangent_mass[c.pair, c.column] = tangent_mass
 
 
 @wp.func
@@ -138,39 +123,32 @@ def find_match(warm_start: WarmStart, row: wp.int32, radius: wp.float64, point: 
 def prepare_constraints_kernel(
     # static
     dt: wp.float64,
-    threshold: wp.float64,
+    fast: wp.float64,
     # state
-    key: wp.array(dtype=wp.int64),
     pairs: wp.array(dtype=wp.vec2i),
-    pair_color: wp.array(dtype=wp.int32),
     objects: ObjectPool,
     manifolds: Manifolds,
     warm_start: WarmStart,
     bodies: Bodies,
     # out
+    order_out: wp.array(dtype=wp.int32),
     constraints_out: Constraints,
 ):
-    """Set up the constraints of one pair a thread, before gravity; slow points are matched with the step before.
-
-    Args:
-        threshold: Approach speed below which nothing bounces [world units/s].
-    """
+    """Set up the constraints of one pair a thread; points no faster than `fast` are matched with the step before."""
     p = wp.tid()
-    if pair_color[p] == INACTIVE:
+    order_out[p] = p
+    constraints_out.color[p] = INACTIVE
+    if manifolds.count[p] == 0:
         return
     a = pairs[p][0]
     b = pairs[p][1]
-    zero = wp.float64(0.0)
-    constraints_out.threshold[p] = threshold
-    constraints_out.both_rigid[p] = wp.where(bodies.inverse_mass[a] > zero and bodies.inverse_mass[b] > zero, 1, 0)
-    constraints_out.restitution[p] = wp.max(bodies.restitution[a], bodies.restitution[b])
-    constraints_out.friction[p] = wp.sqrt(bodies.friction[a] * bodies.friction[b])
-    slop = wp.min(bodies.slop[a], bodies.slop[b])
-    radius = MATCH_RADIUS * wp.min(bodies.bounding_radius[a], bodies.bounding_radius[b])
-    row = wp.lower_bound(warm_start.key, key[p])
-    known = bool(False)
-    if row < warm_start.key.shape[0]:
-        known = warm_start.key[row] == key[p]
+    if bodies.motion_type[a] != DYNAMIC and bodies.motion_type[b] != DYNAMIC:
+        return
+    constraints_out.color[p] = COLOR_COUNT
+    radius = wp.min(bodies.bounding_radius[a], bodies.bounding_radius[b])
+    key = pair_key(pairs[p])
+    row = wp.min(wp.lower_bound(warm_start.key, key), warm_start.key.shape[0] - 1)
+    known = warm_start.key[row] == key
     used = wp.int32(0)
     for k in range(manifolds.count[p]):
         x = manifolds.point[p, k]
@@ -178,25 +156,26 @@ def prepare_constraints_kernel(
         constraints_out.arm_a[p, k] = x - bodies.position[a]
         constraints_out.arm_b[p, k] = x - bodies.position[b]
         set_effective_mass(bodies, constraints_out, c)
-        constraints_out.bias[p, k] = BAUMGARTE * (manifolds.depth[p, k] - slop) / dt
-        constraints_out.friction_impulse[p, k] = wp.vec2d()
-        constraints_out.pseudo_impulse[p, k] = zero
-        constraints_out.match[p, k] = -1
-        if known and wp.abs(wp.dot(c.normal, relative_velocity(constraints_out, bodies, c))) <= threshold:
+        constraints_out.bias[p, k] = BAUMGARTE * (manifolds.depth[p, k] - SLOP * radius) / dt
+        constraints_out.impulse[p, k] = wp.float64(0.0)
+        constraints_out.friction_impulse[p, k] = wp.vec3d()
+        constraints_out.pseudo_impulse[p, k] = wp.float64(0.0)
+        velocity = relative_velocity(bodies.velocity, bodies.momentum, constraints_out, bodies, c)
+        if known and wp.abs(wp.dot(c.normal, velocity)) <= fast:
             local = wp.transpose(objects.rotation[a]) * (x - objects.position[a])
-            match = find_match(warm_start, row, radius, local, used)
+            match = find_match(warm_start, row, MATCH_RADIUS * radius, local, used)
             if match >= 0:
                 used = used | (1 << match)
-                constraints_out.match[p, k] = row * POINTS + match
+                friction = warm_start.friction_impulse[row, match]
+                constraints_out.impulse[p, k] = warm_start.impulse[row, match]
+                constraints_out.friction_impulse[p, k] = friction - wp.dot(friction, c.normal) * c.normal
 
 
 @wp.kernel
 def save_impulses_kernel(
     # state
-    pair_count: wp.array(dtype=wp.int32),
     key: wp.array(dtype=wp.int64),
     pairs: wp.array(dtype=wp.vec2i),
-    pair_color: wp.array(dtype=wp.int32),
     objects: ObjectPool,
     manifolds: Manifolds,
     constraints: Constraints,
@@ -205,19 +184,11 @@ def save_impulses_kernel(
 ):
     """Save the impulses of one pair a thread for the next step, with points relative to the first object."""
     p = wp.tid()
-    warm_start_out.key[p] = LAST_KEY
-    warm_start_out.count[p] = 0
-    if p >= pair_count[0]:
-        return
     warm_start_out.key[p] = key[p]
-    if pair_color[p] == INACTIVE:
-        return
     warm_start_out.count[p] = manifolds.count[p]
     a = pairs[p][0]
-    to_local = wp.transpose(objects.rotation[a])
     for k in range(manifolds.count[p]):
-        t = constraints.tangent[p, k]
-        v = constraints.friction_impulse[p, k]
-        warm_start_out.point[p, k] = to_local * (manifolds.point[p, k] - objects.position[a])
+        local = wp.transpose(objects.rotation[a]) * (manifolds.point[p, k] - objects.position[a])
+        warm_start_out.point[p, k] = local
         warm_start_out.impulse[p, k] = constraints.impulse[p, k]
-        warm_start_out.friction_impulse[p, k] = v[0] * t + v[1] * wp.cross(manifolds.normal[p, k], t)
+        warm_start_out.friction_impulse[p, k] = constraints.friction_impulse[p, k]

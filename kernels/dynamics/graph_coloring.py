@@ -6,13 +6,12 @@ Source: Luby 1986; Jones and Plassmann 1993.
 
 import warp as wp
 
-from warp_abtree.kernels.contact.manifold import Manifolds
 from warp_abtree.kernels.dynamics.bodies import DYNAMIC, Bodies
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-COLOR_COUNT = wp.constant(24)
-"""Number of colors. Pairs left over have the color COLOR_COUNT and are relaxed one after another."""
+COLOR_COUNT = wp.constant(16)
+"""Number of colors. Pairs without one have the color COLOR_COUNT; those left over are relaxed one after another."""
 
 INACTIVE = wp.constant(127)
 """Color of pairs that are not solved."""
@@ -30,25 +29,6 @@ def make_bid(p: wp.int32, color: wp.int32, pair: wp.vec2i, bodies: Bodies):
     mixed = (mixed ^ (mixed >> wp.uint32(15))) * wp.uint32(739982445)
     mixed = (mixed ^ (mixed >> wp.uint32(12))) & wp.uint32(0xFFFFFF)
     return (wp.int64(color + 1) << wp.int64(56)) | (wp.int64(mixed) << wp.int64(31)) | wp.int64(p)
-
-
-@wp.kernel
-def begin_coloring_kernel(
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    manifolds: Manifolds,
-    bodies: Bodies,
-    # out
-    order_out: wp.array(dtype=wp.int32),
-    color_out: wp.array(dtype=wp.int32),
-):
-    """Give COLOR_COUNT to the pairs with contact points and a dynamic body, INACTIVE to all others."""
-    p = wp.tid()
-    order_out[p] = p
-    color_out[p] = INACTIVE
-    if p < pair_count[0] and manifolds.count[p] > 0:
-        if bodies.motion_type[pairs[p][0]] == DYNAMIC or bodies.motion_type[pairs[p][1]] == DYNAMIC:
-            color_out[p] = COLOR_COUNT
 
 
 @wp.kernel

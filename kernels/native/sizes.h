@@ -47,11 +47,16 @@ static_assert(SUBTREE_RECORDS == 2 * SUBTREE_LEAVES, "one a node, by its place i
 constexpr int STRADDLING_ROOM = 256;
 static_assert(STRADDLING_ROOM % 8 == 0, "corners are found 8 at a time");
 
-// An update by one block: two counters, then a bit for each inner node and each face of a tree at most so deep.
+// An update by one block: two counters, then a bit for each node of a tree at most so deep, and another for each inner
+// node.
 constexpr int BLOCK_DEPTH = 16;
 constexpr int MARK_START = 64;
-constexpr int MARK_WORDS = 4098;
-static_assert(MARK_START % 32 == 0 && 32 * MARK_WORDS == MARK_START + 2 * (1 << BLOCK_DEPTH), "all marks have room");
+constexpr int MARK_WORDS = 6146;
+// Less for shallow trees, so that more blocks run at a time.
+constexpr int SHALLOW_DEPTH = 13;
+constexpr int SHALLOW_WORDS = 770;
+static_assert(32 * SHALLOW_WORDS == MARK_START + 3 * (1 << SHALLOW_DEPTH), "all marks have room");
+static_assert(MARK_START % 32 == 0 && 32 * MARK_WORDS == MARK_START + 3 * (1 << BLOCK_DEPTH), "all marks have room");
 
 constexpr int UNCERTAIN = 8;
 constexpr double COORDINATE_MIN = 0x1p-290;

@@ -16,6 +16,8 @@ WARP_SIZE = native.constant("WARP_SIZE")
 STACK_LENGTH = native.constant("STACK_LENGTH")  # node pairs
 STRADDLING_START = native.constant("STRADDLING_START")
 
+six_numbers = wp.types.vector(length=6, dtype=wp.float64)
+
 stack_code = functools.partial(native.body, "warp_stack.cuh")
 vote_code = functools.partial(native.body, "warp_vote.cuh")
 
@@ -90,6 +92,15 @@ def read_signed_pair(list: wp.uint64, i: wp.int32) -> wp.vec4i:
 
 @wp.func_native(vote_code("warp_any"))
 def warp_any(flag: bool) -> bool: ...
+
+
+@wp.func_native(vote_code("add_in_order"))
+def add_in_order(sum: six_numbers, x: six_numbers, count: wp.int32) -> six_numbers:
+    """Return sums and the numbers of so many lanes, added one after the other; on the CPU, of the one thread."""
+
+
+@wp.func_native(vote_code("warp_max"))
+def warp_max(x: wp.float64) -> wp.float64: ...
 
 
 @wp.func_native(vote_code("lowest_bit"))

@@ -52,8 +52,8 @@ def expand_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
 
 
 @wp.func
-def signed_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return det(a - d, b - d, c - d) with the sign of `orient3d` and a relative error of at most RELATIVE_ERROR."""
+def round_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Return det(a - d, b - d, c - d) as float64 has it, and the sum of magnitudes."""
     u = a - d
     v = b - d
     w = c - d
@@ -66,18 +66,32 @@ def signed_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     value = (u[0] * (v1w2 - v2w1) + v[0] * (w1u2 - w2u1)) + w[0] * (u1v2 - u2v1)
     size = wp.abs(u[0]) * (wp.abs(v1w2) + wp.abs(v2w1)) + wp.abs(v[0]) * (wp.abs(w1u2) + wp.abs(w2u1))
     size = size + wp.abs(w[0]) * (wp.abs(u1v2) + wp.abs(u2v1))
+    return value, size
+
+
+@wp.func
+def signed_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Return det(a - d, b - d, c - d) with the sign of `orient3d` and a relative error of at most RELATIVE_ERROR."""
+    value, size = round_volume(a, b, c, d)
     if BOUND_3D * size > RELATIVE_ERROR * wp.abs(value):
         value = expand_volume(a, b, c, d)
     return value
 
 
 @wp.func
-def signed_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
-    """Return det(a - c, b - c) with the sign of `orient2d` and a relative error of at most RELATIVE_ERROR."""
+def round_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
+    """Return det(a - c, b - c) as float64 has it, and the sum of magnitudes."""
     left = (a[0] - c[0]) * (b[1] - c[1])
     right = (a[1] - c[1]) * (b[0] - c[0])
     value = left - right
-    if BOUND_2D * (wp.abs(left) + wp.abs(right)) > RELATIVE_ERROR * wp.abs(value):
+    return value, wp.abs(left) + wp.abs(right)
+
+
+@wp.func
+def signed_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
+    """Return det(a - c, b - c) with the sign of `orient2d` and a relative error of at most RELATIVE_ERROR."""
+    value, size = round_area(a, b, c)
+    if BOUND_2D * size > RELATIVE_ERROR * wp.abs(value):
         value = expand_area(a, b, c)
     return value
 

@@ -1,4 +1,4 @@
-"""Refinement and ACTIVE-UPDATE of a tree state by one block: marks in shared memory, any number of states in one launch.
+"""Refinement and ACTIVE-UPDATE of a tree state by one block, marks in shared memory: many states in one launch.
 
 Leaves the same bits and counts as the level lists of `mark`, `refine` and `refit`, which serve larger trees.
 """
@@ -9,15 +9,19 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, StatePool
+from warp_abtree.kernels.traversal.nodes import Node, load_node, store_node
 from warp_abtree.kernels.update.refine import refine_face
-from warp_abtree.kernels.update.refit import block_sync, refit_inner, refit_leaf
+from warp_abtree.kernels.update.refit import block_sync, refit_inner, refit_leaf, unite_nodes
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
 
 BLOCK_DEPTH = native.constant("BLOCK_DEPTH")  # of the deepest tree that a block updates
+SHALLOW_DEPTH = native.constant("SHALLOW_DEPTH")
 MARK_WORDS = native.constant("MARK_WORDS")
-# Marks follow two words that count faces changed and nodes marked: a bit a node, then a bit a face.
+# Marks follow two words that count faces changed and nodes marked: a bit a node, deformed; then another a node, set
+# while two deformed children are to come.
 MARK_START = wp.constant(native.constant("MARK_START"))
 CHANGED, MARKED = wp.constant(0), wp.constant(1)
 
@@ -27,6 +31,11 @@ marks_code = functools.partial(native.body, "block_marks.cuh")
 @wp.func_native(marks_code("block_marks"))
 def block_marks(scratch: wp.array(dtype=wp.uint32)) -> wp.uint64:
     """Return where this block's marks lie: an address in shared memory on CUDA, on the CPU that of `scratch`."""
+
+
+@wp.func_native(marks_code("shallow_marks"))
+def shallow_marks(scratch: wp.array(dtype=wp.uint32)) -> wp.uint64:
+    """Return the same for trees of SHALLOW_DEPTH at most."""
 
 
 @wp.func_native(marks_code("read_word"))
@@ -46,6 +55,20 @@ def mark_bit(marks: wp.uint64, bit: wp.int32) -> bool:
     """Set a bit, and return whether it was not set."""
 
 
+@wp.func_native(marks_code("unmark_bit"))
+def unmark_bit(marks: wp.uint64, bit: wp.int32) -> bool:
+    """Clear a bit, and return whether it was set; the thread that finds it clear sees what the other has written."""
+
+
+@wp.func_native(marks_code("fetch_entry"))
+def fetch_entry(values: wp.array(dtype=wp.vec4), i: wp.int64):
+    """Bring an entry near, so that a later load of it takes less time."""
+
+
+@wp.func_native(marks_code("fetch_corner"))
+def fetch_corner(values: wp.array(dtype=wp.vec4i), i: wp.int32): ...
+
+
 @wp.struct
 class BlockThread:
     """A thread of the block that updates a state."""
@@ -56,44 +79,51 @@ class BlockThread:
     depth: wp.int32  # of its tree
     face_start: wp.int32  # of its model
     marks: wp.uint64  # of the block
+    twice_start: wp.int32  # where the second bits of nodes begin
 
 
 @wp.func
-def clear_marks(own: BlockThread, face_count: wp.int32):
-    bits = MARK_START + wp.max(1 << own.depth, 32) + face_count
+def clear_marks(own: BlockThread, counters_only: bool):
     word = own.thread
-    while word < (bits + 31) / 32:
+    bits = wp.where(counters_only, MARK_START, own.twice_start + (1 << own.depth))
+    while word <= (bits - 1) / 32:
         clear_word(own.marks, word)
         word += own.threads
 
 
 @wp.func
-def refine_slice(own: BlockThread, models: ModelPool, plan: UpdateLists, states: StatePool, update: wp.int32):
-    """Refine each face of a slice and refit its leaf, and mark the leaf's ancestors as far as no walk has marked them.
+def mark_ancestors(own: BlockThread, states: StatePool, leaf: wp.int32):
+    """Mark the ancestors of a leaf as far as no walk has marked them; return how many.
 
+    A node that two walks reach waits for both. Boxes of siblings, which refitting unites, are brought near meanwhile.
     Source: Liu et al. 2006, section 3.2.2, ACTIVE-MARK.
     """
-    slice = plan.block_slice[update]
-    face_mark = MARK_START + wp.max(1 << own.depth, 32)
+    node = leaf
+    marked = wp.int32(0)
+    while node > 1:
+        fetch_entry(states.node_box, wp.int64(2) * wp.int64(states.node_start[own.state] + (node ^ 1)))
+        node = node >> 1
+        if not mark_bit(own.marks, MARK_START + node):
+            mark_bit(own.marks, own.twice_start + node)
+            break
+        marked += 1
+    return marked
+
+
+@wp.func
+def mark_slice(own: BlockThread, models: ModelPool, states: StatePool, slice: wp.vec2i):
+    """Mark the leaf of each face of a slice and the nodes above, and count both."""
     changed = wp.int32(0)
     marked = wp.int32(0)
     entry = own.thread
     while entry < slice[1]:
         face = models.split_face[slice[0] + entry]
+        leaf = models.leaf_node[own.face_start + face]
         # A slice may list a face twice.
-        if mark_bit(own.marks, face_mark + face):
-            corner = refine_face(models, states, own.state, face)
-            states.face_corner[states.face_start[own.state] + face] = corner
-            node = models.leaf_node[own.face_start + face]
-            refit_leaf(models, states, own.state, node, face, corner)
+        if mark_bit(own.marks, MARK_START + leaf):
+            fetch_corner(states.face_corner, states.face_start[own.state] + face)
+            marked += 1 + mark_ancestors(own, states, leaf)
             changed += 1
-            marked += 1
-            node = node >> 1
-            while node > 0:
-                if not mark_bit(own.marks, MARK_START + node):
-                    break
-                marked += 1
-                node = node >> 1
         entry += own.threads
     if changed > 0:
         add_to_word(own.marks, CHANGED, changed)
@@ -101,20 +131,36 @@ def refine_slice(own: BlockThread, models: ModelPool, plan: UpdateLists, states:
 
 
 @wp.func
-def refit_marked(own: BlockThread, states: StatePool, level: wp.int32):
-    """Refit the marked nodes of a level, as many of them in a row for each thread as share them out."""
-    span = wp.max((1 << level) / own.threads, 1)
-    node = (1 << level) + own.thread * span
-    end = wp.min(node + span, 2 << level)
-    while node < end:
-        bits = read_word(own.marks, (MARK_START + node) / 32) >> wp.uint32(node & 31)
-        if span < 32:
-            bits = bits & ((wp.uint32(1) << wp.uint32(span)) - wp.uint32(1))
-        while bits != wp.uint32(0):
-            lowest = bits & (~bits + wp.uint32(1))
-            refit_inner(states, own.state, node + wp.int32(wp.bit_count(lowest - wp.uint32(1))))
-            bits = bits ^ lowest
-        node += 32
+def refit_ancestors(own: BlockThread, states: StatePool, leaf: wp.int32, record: Node):
+    """Refit the ancestors of a leaf up to the first that waits for another child: who comes second goes on.
+
+    Source: Liu et al. 2006, section 3.2.2, ACTIVE-REFIT.
+    """
+    start = states.node_start[own.state]
+    node = leaf
+    box = record
+    while node > 1:
+        if unmark_bit(own.marks, own.twice_start + (node >> 1)):
+            break
+        other = load_node(states, start + (node ^ 1))
+        node = node >> 1
+        box = unite_nodes(node, box, other)
+        store_node(states, start + node, box)
+
+
+@wp.func
+def refit_slice(own: BlockThread, models: ModelPool, states: StatePool, slice: wp.vec2i):
+    """Refine each face of a slice, once, and refit its leaf and what is above."""
+    entry = own.thread
+    while entry < slice[1]:
+        face = models.split_face[slice[0] + entry]
+        leaf = models.leaf_node[own.face_start + face]
+        if unmark_bit(own.marks, MARK_START + leaf):
+            corner = refine_face(models, states, own.state, face)
+            states.face_corner[states.face_start[own.state] + face] = corner
+            record = refit_leaf(models, states, own.state, leaf, face, corner)
+            refit_ancestors(own, states, leaf, record)
+        entry += own.threads
 
 
 @wp.func
@@ -136,64 +182,97 @@ def refine_whole(own: BlockThread, models: ModelPool, states: StatePool, face_co
 
 
 @wp.func
-def refit_whole(own: BlockThread, models: ModelPool, states: StatePool, level: wp.int32):
-    """Refit every inner node of a level."""
-    node = (1 << level) + own.thread
-    while node < 2 << level:
+def refit_subtree(own: BlockThread, models: ModelPool, states: StatePool, height: wp.int32):
+    """Refit the inner nodes of a thread's subtree, as high as that, each right after its children."""
+    node_start = models.node_start[states.model[own.state]]
+    done = wp.int32(0)
+    while height > 0 and done < 1 << height:
         # All leaves lie on the two deepest levels.
-        inner = level < own.depth - 1
-        if not inner:
-            inner = models.node_face[models.node_start[states.model[own.state]] + node] < 0
-        if inner:
+        done += 2
+        node = ((1 << own.depth) + (own.thread << height) + done - 2) >> 1
+        if models.node_face[node_start + node] < 0:
             refit_inner(states, own.state, node)
-        node += own.threads
+        ready = done >> 1
+        while (ready & 1) == 0:
+            node = node >> 1
+            ready = ready >> 1
+            refit_inner(states, own.state, node)
 
 
-@wp.kernel(cuda_max_registers=64)
-def update_state_kernel(
-    blocks: wp.int32,
-    threads: wp.int32,
-    models: ModelPool,
-    scratch: wp.array(dtype=wp.uint32),
-    states_inout: StatePool,
-    plan_inout: UpdateLists,
-):
-    """Bring one state after another to its LOD, a block each: faces and leaves first, then level by level.
+@wp.func
+def refit_level(own: BlockThread, models: ModelPool, states: StatePool, level: wp.int32):
+    """Refit the inner nodes of a level, one a thread at most."""
+    node = (1 << level) + own.thread
+    if node < 2 << level and models.node_face[models.node_start[states.model[own.state]] + node] < 0:
+        refit_inner(states, own.state, node)
+
+
+@wp.func
+def update_whole(own: BlockThread, models: ModelPool, states: StatePool):
+    """Refine every face and refit every node: leaves, then a subtree a thread, then level by level.
 
     Invariant: children of a level are final when it begins, since a barrier stands between levels.
-    Source: Liu et al. 2006, section 3.2.2, ACTIVE-UPDATE; Algorithms 1 to 3.
     """
-    block, thread = wp.tid()
-    own = BlockThread()
-    own.thread = thread
-    own.threads = threads
-    own.marks = block_marks(scratch)
-    update = wp.int32(block)
-    while update < plan_inout.block_count[0]:
-        own.state = plan_inout.block_state[update]
-        model = states_inout.model[own.state]
-        own.face_start = models.face_start[model]
-        own.depth = models.depth[model]
-        face_count = models.face_count[model]
-        whole = plan_inout.block_slice[update][1] == WHOLE
+    refine_whole(own, models, states, models.face_count[states.model[own.state]])
+    block_sync()
+    top = wp.int32(0)
+    while top < own.depth and 1 << top < own.threads:
+        top += 1
+    if own.thread < 1 << top:
+        refit_subtree(own, models, states, own.depth - top)
+    while top > 0:
         block_sync()
-        clear_marks(own, face_count)
-        block_sync()
-        if whole:
-            refine_whole(own, models, states_inout, face_count)
-        else:
-            refine_slice(own, models, plan_inout, states_inout, update)
-        level = own.depth - 1
-        while level >= 0:
+        top -= 1
+        refit_level(own, models, states, top)
+
+
+@functools.cache
+def state_update(shallow: bool):
+    """Return the kernel that brings states to their LODs, for trees of SHALLOW_DEPTH or of BLOCK_DEPTH at most."""
+    find_marks = shallow_marks if shallow else block_marks
+
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=64)
+    def update_state_kernel(
+        blocks: wp.int32,
+        threads: wp.int32,
+        models: ModelPool,
+        scratch: wp.array(dtype=wp.uint32),
+        states_inout: StatePool,
+        plan_inout: UpdateLists,
+    ):
+        """Bring one state after another to its LOD, a block each.
+
+        Source: Liu et al. 2006, section 3.2.2, ACTIVE-UPDATE; Algorithms 1 to 3.
+        """
+        block, thread = wp.tid()
+        own = BlockThread()
+        own.thread = thread
+        own.threads = threads
+        own.marks = find_marks(scratch)
+        update = wp.int32(block)
+        while update < plan_inout.block_count[0]:
+            own.state = plan_inout.block_state[update]
+            model = states_inout.model[own.state]
+            own.face_start = models.face_start[model]
+            own.depth = models.depth[model]
+            own.twice_start = MARK_START + (2 << own.depth)
+            slice = wp.vec2i(plan_inout.block_start[update], plan_inout.block_length[update])
             block_sync()
-            if whole:
-                refit_whole(own, models, states_inout, level)
+            clear_marks(own, slice[1] == WHOLE)
+            block_sync()
+            if slice[1] == WHOLE:
+                update_whole(own, models, states_inout)
             else:
-                refit_marked(own, states_inout, level)
-            level -= 1
-        block_sync()
-        if thread == 0:
-            plan_inout.changed_count[own.state] = wp.int32(read_word(own.marks, CHANGED))
-            marked = wp.int32(read_word(own.marks, MARKED))
-            plan_inout.marked_count[own.state] = wp.where(whole, 2 * face_count - 1, marked)
-        update += blocks
+                mark_slice(own, models, states_inout, slice)
+                block_sync()
+                refit_slice(own, models, states_inout, slice)
+            block_sync()
+            if thread == 0:
+                marked = wp.int32(read_word(own.marks, MARKED))
+                plan_inout.changed_count[own.state] = wp.int32(read_word(own.marks, CHANGED))
+                plan_inout.marked_count[own.state] = wp.where(
+                    slice[1] == WHOLE, 2 * models.face_count[model] - 1, marked
+                )
+            update += blocks
+
+    return update_state_kernel

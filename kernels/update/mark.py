@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import DEFORMED, ModelPool, StatePool
+from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.update.work_lists import UpdateLists, find_update, item_count, list_length
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -27,7 +27,9 @@ def mark_path(leaf: wp.int32, state: wp.int32, states: StatePool, plan: UpdateLi
     depth = find_depth(node)
     marked = wp.int32(0)
     while node > 0:
-        if wp.atomic_exch(states.node_status, node_start + node, DEFORMED) == DEFORMED:
+        at = node_start + node
+        bit = wp.uint32(1) << wp.uint32(at & 31)
+        if (wp.atomic_or(states.node_mark, at >> 5, bit) & bit) != wp.uint32(0):
             break
         slot = wp.atomic_add(plan.level_count, depth, 1)
         plan.level_node[plan.level_start[depth] + slot] = wp.vec2i(state, node)

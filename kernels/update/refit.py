@@ -1,9 +1,9 @@
-"""ACTIVE-WALK and ACTIVE-REFIT, level by level: boxes, status and skip links of marked nodes."""
+"""ACTIVE-WALK and ACTIVE-REFIT, level by level: boxes and skip links of marked nodes."""
 
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arrays import ACTIVE, INACTIVE, ModelPool, StatePool, load_vertex
+from warp_abtree.kernels.arrays import ModelPool, StatePool, load_vertex
 from warp_abtree.kernels.traversal.boxes import round_down_vec, round_up_vec
 from warp_abtree.kernels.traversal.nodes import Node, empty_node, load_node, store_node
 from warp_abtree.kernels.update.work_lists import UpdateLists
@@ -12,34 +12,28 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func
-def refit_leaf(
-    models: ModelPool, states: StatePool, state: wp.int32, node: wp.int32, face: wp.int32, corner: wp.vec4i
-):
-    """Box one face about the model's centre, or empty the leaf of an inactive face."""
-    at = states.node_start[state] + node
-    if corner[0] < 0:
-        states.node_status[at] = INACTIVE
-        store_node(states, at, empty_node())
-        return
-    centre = models.centre[states.model[state]]
-    a = load_vertex(models.vertex_pos, corner[0]) - centre
-    b = load_vertex(models.vertex_pos, corner[1]) - centre
-    c = load_vertex(models.vertex_pos, corner[2]) - centre
-    states.node_status[at] = ACTIVE
-    leaf = Node()
-    leaf.lower = round_down_vec(wp.min(a, wp.min(b, c)))
-    leaf.upper = round_up_vec(wp.max(a, wp.max(b, c)))
-    leaf.skip = node
-    leaf.face = face
-    store_node(states, at, leaf)
+def refit_leaf(models: ModelPool, states: StatePool, state: wp.int32, node: wp.int32, face: wp.int32, corner: wp.vec4i):
+    """Box one face about the model's centre, or empty the leaf of an inactive face; return its record."""
+    leaf = empty_node()
+    if corner[0] >= 0:
+        centre = models.centre[states.model[state]]
+        a = load_vertex(models.vertex_pos, corner[0]) - centre
+        b = load_vertex(models.vertex_pos, corner[1]) - centre
+        c = load_vertex(models.vertex_pos, corner[2]) - centre
+        leaf.lower = round_down_vec(wp.min(a, wp.min(b, c)))
+        leaf.upper = round_up_vec(wp.max(a, wp.max(b, c)))
+        leaf.skip = node
+        leaf.face = face
+    store_node(states, states.node_start[state] + node, leaf)
+    return leaf
 
 
 @wp.func
-def refit_inner(states: StatePool, state: wp.int32, node: wp.int32):
-    """Unite the children of a node; both are final."""
-    first = states.node_start[state] + 2 * node
-    left = load_node(states, first)
-    right = load_node(states, first + 1)
+def unite_nodes(node: wp.int32, left: Node, right: Node):
+    """Return the record of a node with these children, in either order.
+
+    It stands for the one child that is active, if the other is not.
+    """
     # An empty box is (+inf, -inf), so the union needs no case for an inactive child.
     whole = Node()
     whole.lower = wp.min(left.lower, right.lower)
@@ -52,8 +46,15 @@ def refit_inner(states: StatePool, state: wp.int32, node: wp.int32):
     elif right.skip < 0:
         whole.skip = left.skip
         whole.face = left.face
+    return whole
+
+
+@wp.func
+def refit_inner(states: StatePool, state: wp.int32, node: wp.int32):
+    """Unite the children of a node; both are final."""
+    first = states.node_start[state] + 2 * node
+    whole = unite_nodes(node, load_node(states, first), load_node(states, first + 1))
     store_node(states, states.node_start[state] + node, whole)
-    states.node_status[states.node_start[state] + node] = wp.where(whole.skip < 0, INACTIVE, ACTIVE)
 
 
 @wp.func
@@ -81,6 +82,8 @@ def refit_level(
     while item < items:
         if item < marked:
             listed = plan.level_node[plan.level_start[level] + item]
+            at = states.node_start[listed[0]] + listed[1]
+            wp.atomic_and(states.node_mark, at >> 5, ~(wp.uint32(1) << wp.uint32(at & 31)))
             refit_node(models, states, listed[0], listed[1])
         else:
             whole = item - marked
@@ -128,7 +131,6 @@ def copy_node_kernel(
         begin = node_end[u - 1]
     source = states_inout.node_start[source_state[u]] + tid - begin
     target = states_inout.node_start[target_state[u]] + tid - begin
-    states_inout.node_status[target] = states_inout.node_status[source]
     store_node(states_inout, target, load_node(states_inout, source))
 
 

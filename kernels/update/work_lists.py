@@ -24,7 +24,8 @@ WHOLE = wp.constant(-1)
 class UpdateLists:
     """States under update: those that refit what a slice of faces touches (partial), and those refitted whole (full).
 
-    A block updates a state by itself (`block_update`) or all threads work through lists, level by level. A total holds two counts in one word, so that one atomic takes an update's place and its items' places:
+    A block updates a state by itself (`block_update`), or all threads work through lists, level by level. A total holds
+    two counts in one word, so that one atomic takes an update's place and its items' places:
 
         63           32 31            0
         [   updates    |    items     ]    items: entries of all slices, or faces
@@ -32,7 +33,8 @@ class UpdateLists:
 
     block_count: wp.array(dtype=wp.int32)  # states that a block updates each, shape [1]
     block_state: wp.array(dtype=wp.int32)  # shape [block's update]
-    block_slice: wp.array(dtype=wp.vec2i)  # start in split_face, and length or WHOLE, shape [block's update]
+    block_start: wp.array(dtype=wp.int32)  # where its slice begins in split_face, shape [block's update]
+    block_length: wp.array(dtype=wp.int32)  # of its slice, or WHOLE, shape [block's update]
     partial_total: wp.array(dtype=wp.int64)  # updates and entries of all slices, shape [1]
     partial_state: wp.array(dtype=wp.int32)  # shape [partial update]
     slice_start: wp.array(dtype=wp.int32)  # into split_face, shape [partial update]
@@ -101,7 +103,8 @@ def clear_plan_kernel(plan_out: UpdateLists):
 def list_block(plan: UpdateLists, state: wp.int32, begin: wp.int32, length: wp.int32):
     u = wp.atomic_add(plan.block_count, 0, 1)
     plan.block_state[u] = state
-    plan.block_slice[u] = wp.vec2i(begin, length)
+    plan.block_start[u] = begin
+    plan.block_length[u] = length
 
 
 @wp.func

@@ -7,8 +7,6 @@ from helpers.samples import SHUTTLE_SCENE
 from helpers.viewer import run_command, write_scene
 
 import warp_abtree as ab
-from warp_abtree.app import load_scene
-from warp_abtree.app.recording import record_run
 
 # A command line, and a part of what is said of it.
 CASES = [
@@ -42,11 +40,10 @@ CASES = [
     ("query ball.obj ball.obj --record out.csv", "ask --output faces or contacts"),
     ("query ball.obj face.npz --record face.npz", "face.npz: is read"),
     ("run gone.toml", "gone.toml"),
-    ("run run.npz", "run.npz: is no scene; view and picture show recordings"),
     ("run bad.toml", "bad.toml: scene.speed: unknown key"),
     ("run scene.toml --frames 0", "--frames"),
     ("run scene.toml --picture out.jpg", "must end in .png"),
-    ("run scene.toml --record rows.xls", ".csv or .json or .npz"),
+    ("run scene.toml --record rows.xls", ".csv or .json"),
     ("run scene.toml --plot gone/plots", "no folder gone"),
     ("run one.toml --objects 5", "count or worlds"),
     ("run scene.toml --budget soon", "'soon' is no time above 0"),
@@ -60,13 +57,10 @@ CASES = [
     ("picture ball.obj scene.toml --out out.png", "a scene file is looked at alone"),
     ("picture ball.obj --out x.jpg", "must end in .png"),
     ("picture ball.obj --frame -1 --out out.png", "--frame: -1 is below 0"),
-    ("picture ball.obj --tree 40 --out out.png", "--tree: the deepest tree ends at level 9"),
     ("picture ball.obj --size 9 --out out.png", "--size: 9 is outside 50 .. 8000"),
     ("picture ball.obj --eye 0 1 0 --out out.png", "--eye: eye and up"),
     ("picture ball.obj --eye nan 1 0 --out out.png", "--eye: eye and up"),
     ("picture ball.obj --world 3 --out out.png", "--world: no object is in world 3"),
-    ("picture run.npz --frame 2 --out out.png", "--frame: the recording has 2 frames"),
-    ("picture run.npz --objects 2 --out out.png", "--objects: a recording has its own"),
     ("picture junk.npz --out out.png", "junk.npz"),
     ("picture scene.toml --lod 0.5 --out out.png", "--lod: for meshes"),
     ("picture scene.toml --pose 0 0 0 0 0 0 1 --out out.png", "--pose: for meshes"),
@@ -74,13 +68,18 @@ CASES = [
     ("picture ball.obj --lod 9999 --out out.png", "--lod: model"),
     ("picture ball.obj --pose 0 0 0 0 0 0 1 --out out.png", "--pose: 1 given for the 0 meshes"),
     ("picture ball.obj face.npz --pose 0 0 0 0 0 0 2 --out out.png", "--pose: pose 0 has a quaternion"),
+    ("sweep ball.obj ball.obj --out x", "POSES.npy is missing"),
+    ("sweep scene.toml --out x", "POSES.npy is missing"),
+    ("sweep ball.obj poses.npy --out x", "is no scene; a sweep takes two models, or one twice"),
+    ("sweep ball.obj ball.obj ball.obj poses.npy --out x", "two models and POSES.npy"),
+    ("sweep scene.toml poses.npy --out x", "takes a scene of two"),
+    ("sweep face.npz face.npz poses.npy --out x --lods lods.npy --lod-a 3", "--lods: LODs come from"),
+    ("sweep face.npz face.npz poses.npy --out x --lod-b tall", "--lod-b: LOD 'tall'"),
+    ("sweep face.npz face.npz poses.npy --out x --workers 2 --ray none", "--workers: they are Ray's"),
     ("view", "SCENE_OR_MESHES"),
     ("view gone.obj", "gone.obj"),
     ("view ball.obj --port 70000", "--port: 70000 is outside"),
     ("view ball.obj --host no.such.host.invalid", "no.such.host.invalid:0: cannot be served at"),
-    ("view ball.obj --frames 3", "--frames: of --record"),
-    ("view run.npz --budget 3ms", "--budget: a recording holds its LODs"),
-    ("view ball.obj --record page.txt", "must end in .html"),
 ]
 FILES = {
     "junk.obj": "hello\n",
@@ -94,14 +93,15 @@ FILES = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Give a folder with a mesh, a model, a scene and a recording, and files that are none."""
+    """Give a folder with a mesh, a model and a scene, and files that are none."""
     path = tmp_path_factory.mktemp("files")
     trimesh.creation.icosphere(subdivisions=2).export(path / "ball.obj")
     ab.Model.from_arrays(np.eye(3), [[0, 1, 2]]).save(path / "face.npz")
-    record_run(load_scene(write_scene(path), device="cpu"), 2)[1].save(path / "run.npz")
+    write_scene(path)
     for name, text in FILES.items():
         (path / name).write_text(text)
     (path / "folder.npz").mkdir()
+    np.save(path / "poses.npy", np.eye(7)[6:])
     return path
 
 

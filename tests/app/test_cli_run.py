@@ -1,4 +1,4 @@
-"""`warp-abtree run`: what it prints, records and draws."""
+"""`warp-abtree run` and `picture`: what they print, record and draw."""
 
 import csv
 import io
@@ -9,53 +9,42 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
-from helpers.samples import SHUTTLE_SCENE
+import trimesh
+from helpers.viewer import BODIES, SCENE, write_scene
 from helpers.viewer import run_command as run
 
 from warp_abtree.app import load_scene
-from warp_abtree.app.pictures import scenes
-from warp_abtree.app.styles import STAGE_LABELS
-
-SCENE = (
-    SHUTTLE_SCENE
-    + """
-[[lod_sweep]]
-objects = ["ball"]
-from = 1.0
-to = 0.1
-period = 2
-"""
-)
+from warp_abtree.app.open_playback import open_playback
+from warp_abtree.app.pictures import command, scenes
+from warp_abtree.app.styles import COLOURS, STAGE_LABELS
 
 
 @pytest.fixture
-def files(tmp_path, monkeypatch):
-    """Work in a folder with a scene."""
+def scene(tmp_path, monkeypatch, capsys):
+    """Work in a folder with a scene; give a function that runs it on the CPU."""
     monkeypatch.chdir(tmp_path)
-    Path("scene.toml").write_text(SCENE)
-    return tmp_path
+    write_scene(tmp_path)
+    return lambda words, file="scene.toml": run(capsys, "run", file, "--device", "cpu", *words.split())
 
 
-def test_run_for_programs(files, capsys):
-    found = json.loads(run(capsys, "run", "scene.toml", "--frames", 3, "--record", "rows.json", "--json")[0])
+def test_run_for_programs(scene):
+    found = json.loads(scene("--frames 3 --record rows.json --json")[0])
     rows = json.loads(Path("rows.json").read_text())
-    run(capsys, "run", "scene.toml", "--frames", 3, "--record", "rows.csv")
+    scene("--frames 3 --record rows.csv")
     table = list(csv.DictReader(io.StringIO(Path("rows.csv").read_text())))
     assert [row["hits"] for row in rows] == [int(row["hits"]) for row in table] and len(rows) == 3
-    assert found["frames"] == 3 and found["objects"] == 2 and found["models"] == 2 and found["worlds"] == 1
+    assert [found[name] for name in ("frames", "objects", "models", "worlds")] == [3, 4, 2, 3]
     assert found["hits"]["max"] == max(row["hits"] for row in rows) > 0
     assert found["stages"]["total_ms"]["total"] == pytest.approx(sum(row["total_ms"] for row in rows))
     assert found["lod_min"] == min(row["lod_min"] for row in rows)
 
 
-def test_run_under_a_budget(files, capsys):
-    shown, errors = run(capsys, "run", "scene.toml", "--frames", 8, "--budget", "50ms", "--device", "cpu")
-    for line in ("controller +predictive", "budget ms +50", "select_ms +[\\d.]+", "budget +frames 4, .*", "objects +2"):
+def test_run_under_a_budget(scene):
+    shown, errors = scene("--frames 8 --budget 50ms")
+    for line in ("controller +predictive", "budget ms +50", "select_ms +[\\d.]+", "budget +frames 4, .*", "objects +4"):
         assert re.search(f"^{line}", shown, re.M), line
     assert not errors
-    found = json.loads(
-        run(capsys, "run", "scene.toml", "--budget", "0.05s", "--controller", "paper", "--json", "--device", "cpu")[0]
-    )
+    found = json.loads(scene("--budget 0.05s --controller paper --json")[0])
     assert (found["budget_ms"], found["controller"]) == (50, "paper") and found["budget"] is None
     assert found["stages"]["select_ms"]["total"] > 0 and set(found["stages"]) == {*STAGE_LABELS, "cost_ms", "total_ms"}
     cost = sum(found["stages"][name]["total"] for name in ("select_ms", "refine_ms", "broad_ms", "query_ms"))
@@ -63,28 +52,25 @@ def test_run_under_a_budget(files, capsys):
 
 
 @pytest.mark.slow
-def test_plot(files, capsys):
-    shown, _ = run(capsys, "run", "scene.toml", "--frames", 6, "--budget", "20ms", "--plot", "plots", "--device", "cpu")
+def test_plot(scene):
+    shown, _ = scene("--frames 6 --budget 20ms --plot plots")
     assert re.search(f"^written +{Path('plots', 'frames.png')}$", shown, re.M)
     image = matplotlib.image.imread(Path("plots", "frames.png"))[:, :, :3]
-    red, green, blue = image.reshape(-1, 3).T
-    assert image.shape[0] > 800 and np.mean((red > 0.98) & (green > 0.98) & (blue > 0.98)) > 0.3, "background"
+    assert image.shape[0] > 800 and np.mean((image > 0.98).all(axis=2)) > 0.3, "background"
     third = len(image) // 3
-    for part, (r, g, b) in enumerate(((0.12, 0.47, 0.71), (1.0, 0.0, 0.0), (0.84, 0.15, 0.16))):
+    for part, colour in enumerate(((0.12, 0.47, 0.71), (1.0, 0.0, 0.0), (0.84, 0.15, 0.16))):
         panel = image[part * third : (part + 1) * third, :780]
-        near = np.abs(panel - (r, g, b)).max(axis=2) < 0.12
-        assert near.sum() > 100, ("LODs", "budget", "error")[part]
+        assert (np.abs(panel - colour).max(axis=2) < 0.12).sum() > 100, ("LODs", "budget", "error")[part]
     assert [path.name for path in Path("plots").iterdir()] == ["frames.png"]
-    run(capsys, "run", "scene.toml", "--frames", 2, "--plot", "plots", "--device", "cpu")
+    scene("--frames 2 --plot plots")
 
 
-def test_picture_of_a_controlled_run_shows_its_lods(files, capsys, monkeypatch):
+def test_picture_of_a_controlled_run_shows_its_lods(scene, monkeypatch):
     pytest.importorskip("pyvista")
     titles = []
     monkeypatch.setattr(scenes, "draw", lambda panels, *_, **__: titles.append([panel.title for panel in panels]))
-    words = "run scene.toml --frames 1 --picture out.png --device cpu".split()
-    run(capsys, *words, "--budget", "1s")
-    run(capsys, *words)
+    for words in ("--budget 1s", ""):
+        scene(f"--frames 1 --picture out.png {words}")
     # The controller begins at the coarsest LOD; a sweep is drawn at both of its ends.
     top = load_scene("scene.toml", device="cpu").models["ball"].lod_max
     lods = [[re.match(r"ball at LOD (\d+) of (\d+)", title).groups() for title in panels] for panels in titles]
@@ -93,20 +79,20 @@ def test_picture_of_a_controlled_run_shows_its_lods(files, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_picture_of_rigid_bodies(files, capsys):
+def test_picture_of_rigid_bodies(scene):
     pytest.importorskip("pyvista")
     text = SCENE.split("[[lod_sweep]]")[0].replace("shuttle = { by = [0.4, 0, 0], period = 2 }", "velocity = [9, 0, 0]")
     Path("bodies.toml").write_text(text + "[dynamics]\ngravity = [0, 0, 0]\n")
-    run(capsys, "run", "bodies.toml", "--frames", 1, "--picture", "first.png", "--device", "cpu")
-    run(capsys, "run", "bodies.toml", "--frames", 4, "--picture", "last.png", "--device", "cpu")
-    first, last = (matplotlib.image.imread(name) for name in ("first.png", "last.png"))
+    for frames in (1, 4):
+        scene(f"--frames {frames} --picture {frames}.png", "bodies.toml")
+    first, last = (matplotlib.image.imread(name) for name in ("1.png", "4.png"))
     assert first.shape != last.shape or not np.array_equal(first, last)
 
 
 @pytest.mark.slow
-def test_picture(files, capsys):
+def test_picture(scene):
     pytest.importorskip("pyvista")
-    shown, _ = run(capsys, "run", "scene.toml", "--frames", 2, "--picture", "out.png")
+    shown, _ = scene("--frames 2 --picture out.png")
     assert re.search("^written +out.png$", shown, re.M)
     image = matplotlib.image.imread("out.png")[:, :, :3]
     assert image.shape[1] > 600
@@ -118,4 +104,53 @@ def test_picture(files, capsys):
         assert np.mean((red > green) & (green > blue) & (red < 1.4 * blue) & (red < 0.95)) > 0.02, "ball"
         assert np.mean((green > 1.8 * red) & (green > 1.8 * blue)) > 0.002, "intersecting faces of the ball"
         assert np.mean((red > 2 * blue) & (green > 2 * blue)) > 0.002, "intersecting faces of the ring"
-    assert sorted(path.name for path in files.glob("out*")) == ["out.png"]
+    assert sorted(path.name for path in Path().glob("out*")) == ["out.png"]
+
+
+# picture.
+
+
+def count(path, colour, reach=0.12):
+    """Count pixels whose colour is in the direction of another: light only makes it darker."""
+    image = matplotlib.image.imread(path)[:, :, :3].reshape(-1, 3).astype(float)
+    length = np.linalg.norm(image, axis=1)
+    near = np.linalg.norm(image / np.maximum(length, 1e-6)[:, None] - np.array(colour) / np.linalg.norm(colour), axis=1)
+    return int(np.count_nonzero((near < reach) & (length > 0.15)))
+
+
+@pytest.fixture
+def picture(tmp_path, monkeypatch, capsys):
+    """Work in a folder with a scene and a mesh; give a function that draws them."""
+    pytest.importorskip("pyvista")
+    monkeypatch.chdir(tmp_path)
+    trimesh.creation.icosphere(2).export("ball.obj")
+    write_scene(tmp_path)
+    return lambda words: run(capsys, "picture", *words.split(), *"--size 250 --device cpu".split())[0]
+
+
+def test_picture_of_meshes(picture):
+    picture("ball.obj ball.obj --out balls.png")
+    assert count("balls.png", COLOURS[0][1]) > 200
+    shown = picture("ball.obj ball.obj --pose 9 0 0 0 0 0 1 --lod 0.2 --json -o apart.png")
+    assert json.loads(shown) == {"picture": "apart.png", "objects": 2, "frame": 0}
+    assert not count("apart.png", COLOURS[0][1])
+
+
+@pytest.mark.slow
+def test_picture_of_a_frame(picture):
+    picture("scene.toml --frame 0 --out first.png")
+    picture("scene.toml --frame 3 --out last.png")
+    first, last = (matplotlib.image.imread(f"{name}.png") for name in ("first", "last"))
+    assert first.shape != last.shape or not np.array_equal(first, last)
+    picture("scene.toml --world 2 --eye 0 0 1 --out world.png")
+    assert count("world.png", COLOURS[0][0]) < count("first.png", COLOURS[0][0])
+
+
+def test_frames_go_as_far_as_they_are_asked(tmp_path, device):
+    playback = open_playback([write_scene(tmp_path, BODIES)], device)
+    snapshot = command.go_to(playback, 5, "contacts")
+    assert snapshot.number == 5 and snapshot.result.contacts is not None
+    other = open_playback([tmp_path / "scene.toml"], device)
+    for _ in range(6):
+        expected = other.step("count")
+    assert np.array_equal(snapshot.poses, expected.poses) and snapshot.poses[1, 1] < 0.5

@@ -17,7 +17,6 @@ import warp_abtree as ab
 from bench.tables import write_json
 from warp_abtree.app.cli.query_command import record_found
 from warp_abtree.app.pictures.render import write_png
-from warp_abtree.app.recording import Recording
 from warp_abtree.checks import atomic_write as files
 from warp_abtree.checks.atomic_write import SUFFIX, atomic_write, sweep_up
 from warp_abtree.jobs import SweepJob, ThisProcess, run_shards
@@ -40,6 +39,12 @@ def start(script, *arguments):
     return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
+def end(processes):
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
 WRITER = f"""
 path, letter = sys.argv[1], sys.argv[2].encode()
 print("ready", flush=True)
@@ -57,8 +62,7 @@ def test_processes_that_write_one_path_never_tear_it(tmp_path):
     path.write_bytes(b"0" * SIZE)
     writers = [start(WRITER, path, letter) for letter in "abcd"]
     try:
-        for writer in writers:
-            assert writer.stdout.readline() == "ready\n"
+        assert [writer.stdout.readline() for writer in writers] == ["ready\n"] * 4
         for writer in writers:
             writer.stdin.write("\n")
             writer.stdin.flush()
@@ -69,14 +73,13 @@ def test_processes_that_write_one_path_never_tear_it(tmp_path):
             seen.add(found[:1])
         assert [writer.wait() for writer in writers] == [0] * 4
     finally:
-        for writer in writers:
-            writer.kill()
-            writer.communicate()
+        end(writers)
     assert len(seen) > 1 and [entry.name for entry in tmp_path.iterdir()] == ["model.npz"]
 
 
-def record(monkeypatch):
-    """Return the list into which calls of os.fsync and os.replace go: what is synced, and its size then."""
+@pytest.fixture
+def calls(monkeypatch):
+    """Give the list into which calls of os.fsync and os.replace go: what is synced, and its size then."""
     calls = []
 
     def fsync(opened, plain=os.fsync):
@@ -93,17 +96,6 @@ def record(monkeypatch):
     return calls
 
 
-def check_calls(calls, path):
-    """Check that a file was brought to the disk whole before it took its name, and its folder after."""
-    found = path.stat()
-    at = [call[2:] for call in calls].index((path.name,))
-    assert calls[at - 1 : at + 2] == [
-        ("file", found.st_ino, found.st_size),
-        ("replace", found.st_ino, path.name),
-        ("folder", path.parent.stat().st_ino),
-    ]
-
-
 def write_bytes(path):
     with atomic_write(path) as file:
         file.write(b"x" * 100)
@@ -115,10 +107,6 @@ def run_frame():
         scene.add(MODEL)
     frame = ab.Frame(scene, output="contacts")
     return frame, frame.step()
-
-
-def save_recording(path):
-    Recording("", None, [], run_frame()[0].history, np.zeros((1, 2), np.int32), np.zeros((1, 2, 7))).save(path)
 
 
 def make_shards(path):
@@ -139,7 +127,6 @@ SHARD = "shard-000000000000-000000000001"
         (lambda path: run_frame()[0].record(path), "rows.json"),
         (lambda path: record_found(run_frame()[1], path), "found.csv"),
         (lambda path: record_found(run_frame()[1], path), "found.npz"),
-        (save_recording, "run.npz"),
         (lambda path: write_png(FigureCanvasAgg(Figure((1, 1))), path), "picture.png"),
         (make_shards, "job.json"),
         (make_shards, f"{SHARD}.npz"),
@@ -147,12 +134,17 @@ SHARD = "shard-000000000000-000000000001"
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_every_writer_syncs_its_file_then_replaces_then_syncs_the_folder(tmp_path, monkeypatch, write, name):
+def test_every_writer_syncs_its_file_then_replaces_then_syncs_the_folder(tmp_path, calls, write, name):
     if name.endswith("parquet"):
         pytest.importorskip("pyarrow")
-    calls = record(monkeypatch)
     write(tmp_path / name)
-    check_calls(calls, tmp_path / name)
+    found = (tmp_path / name).stat()
+    at = [call[2:] for call in calls].index((name,))
+    assert calls[at - 1 : at + 2] == [
+        ("file", found.st_ino, found.st_size),
+        ("replace", found.st_ino, name),
+        ("folder", tmp_path.stat().st_ino),
+    ]
     assert not list(tmp_path.glob(f"*{SUFFIX}"))
 
 
@@ -191,15 +183,15 @@ def test_what_stood_there_stays_if_a_write_fails(tmp_path, monkeypatch, error, w
 def test_errors_name_the_path_that_was_asked_for(tmp_path):
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
-    for path, kind in (
-        (tmp_path / "missing" / "x.npz", FileNotFoundError),
-        (tmp_path / "file" / "x.npz", NotADirectoryError),
-        (tmp_path / "folder", IsADirectoryError),
-        (tmp_path / ("x" * 300), OSError),
+    for name, kind in (
+        ("missing/x.npz", FileNotFoundError),
+        ("file/x.npz", NotADirectoryError),
+        ("folder", IsADirectoryError),
+        ("x" * 300, OSError),
     ):
-        with pytest.raises(kind) as caught, atomic_write(path):
+        with pytest.raises(kind) as caught, atomic_write(tmp_path / name):
             pass
-        assert caught.value.filename == str(path) and SUFFIX not in str(caught.value)
+        assert caught.value.filename == str(tmp_path / name) and SUFFIX not in str(caught.value)
     with pytest.raises(FileNotFoundError) as caught, atomic_write(tmp_path / "copy"):
         open(tmp_path / "source")
     assert caught.value.filename == str(tmp_path / "source"), "the error is not about the copy"
@@ -234,9 +226,7 @@ def test_sweeping_up_leaves_what_another_process_is_writing(tmp_path):
         live.communicate("\n")
         assert live.returncode == 0
     finally:
-        for process in (live, dead):
-            process.kill()
-            process.communicate()
+        end((live, dead))
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"live": "half and half", "other": ""}
 
 

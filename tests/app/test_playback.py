@@ -1,142 +1,31 @@
-"""Recorded runs, and playbacks of scene files, recordings and meshes: the poses, LODs and rows that were used."""
+"""Playbacks of scene files and meshes: the poses, LODs and rows of their frames."""
 
 import itertools
-import json
 
 import numpy as np
 import pytest
-import trimesh
-from helpers.samples import SHUTTLE_SCENE
-from helpers.viewer import BODIES, SCENE, make_models, make_playback, write_scene
-from oracles.triangle import quaternion_matrix
+from helpers.viewer import BODIES, make_models, make_playback, write_scene
 
 import warp_abtree as ab
-from warp_abtree.app import SceneError, load_scene
+from warp_abtree.app import load_scene
 from warp_abtree.app.open_playback import lay_out, open_playback
-from warp_abtree.app.playback import RecordedPlayback, ScenePlayback
-from warp_abtree.app.recording import FORMAT_VERSION, Recording, record_run
-
-FRAMES = 4
-TURNING = SHUTTLE_SCENE + "random = { rotation = true, turn = 90 }\n"
-FALLING = (
-    TURNING.replace("shuttle = { by = [0.4, 0, 0], period = 2 }", "velocity = [1, 0, 2]")
-    + "[dynamics]\ngravity = [0, -1, 0]\n"
-)
+from warp_abtree.app.playback import ScenePlayback
 
 
-def load(tmp_path, text):
-    (tmp_path / "scene.toml").write_text(text)
-    return load_scene(tmp_path / "scene.toml", device="cpu")
-
-
-def watch(loaded) -> list:
-    """Return the list into which positions and rotations go whenever a frame asks what intersects."""
-    used, make = [], loaded.frame
-
-    def make_watched(**options):
-        frame = make(**options)
-        place, name = (frame.motion, "find") if hasattr(frame.motion, "find") else (loaded.scene, "intersect")
-        ask = getattr(place, name)
-
-        def ask_watched(*arguments, **named):
-            pool = loaded.scene.batch().objects.pool
-            used.append((pool.position.numpy().copy(), pool.rotation.numpy().copy()))
-            return ask(*arguments, **named)
-
-        setattr(place, name, ask_watched)
-        return frame
-
-    loaded.frame = make_watched
-    return used
-
-
-@pytest.mark.parametrize("text", [TURNING, FALLING], ids=["prescribed", "bodies"])
-def test_poses_are_those_that_were_asked_at(tmp_path, text):
-    loaded = load(tmp_path, text)
-    used = watch(loaded)
-    _, recording = record_run(loaded, FRAMES)
-    recording.save(tmp_path / "run.npz")
-    opened = Recording.open(tmp_path / "run.npz")
-    assert len(used) == FRAMES and len({position.tobytes() for position, _ in used}) == FRAMES
-    assert len({rotation.tobytes() for _, rotation in used}) == FRAMES
-    for poses in (recording.poses, opened.poses):
-        assert poses.shape == (FRAMES, 2, 7) and poses.dtype == np.float64
-        for i, (position, rotation) in enumerate(used):
-            assert poses[i, :, :3].tobytes() == position.tobytes()
-            turned = [quaternion_matrix(quaternion) for quaternion in poses[i, :, 3:]]
-            np.testing.assert_allclose(turned, rotation, rtol=0, atol=1e-14)
-    assert opened.poses.tobytes() == recording.poses.tobytes()
-
-
-def test_damaged_recordings_are_refused(tmp_path):
-    _, recording = record_run(load(tmp_path, TURNING), 2)
-    path = tmp_path / "run.npz"
-    recording.save(path)
-    with np.load(path) as file:
-        good = {name: file[name] for name in file.files}
-    settings, rows = (json.loads(str(good[name])) for name in ("settings", "rows"))
-    row = rows[0]
-    bad = [
-        ({"format": np.array("x")}, "not a recording of a run"),
-        ({"version": np.array(FORMAT_VERSION + 1)}, f"version {FORMAT_VERSION + 1}"),
-        ({"lods": good["lods"][:1]}, "lods: shape"),
-        ({"lods": good["lods"].astype(np.int64)}, "int64"),
-        ({"poses": good["poses"][:, :, :6]}, "poses: shape"),
-        ({"rows": np.array(json.dumps([{**row, "hits": 0.5}, row]))}, "damaged .*int.* got .*float.*hits"),
-        ({"settings": np.array("{")}, "damaged"),
-        ({"settings": np.array(json.dumps({**settings, "objects": "many"}))}, "damaged .*objects"),
-        ({"poses": np.array([{}], dtype=object)}, "not a recording"),
-    ]
-    for changes, message in bad:
-        np.savez(path, **{**good, **changes})
-        with pytest.raises(ValueError, match=message) as caught:
-            Recording.open(path)
-        assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
-    np.savez(path, **{name: value for name, value in good.items() if name != "rows"})
-    with pytest.raises(ValueError, match="rows' is missing"):
-        Recording.open(path)
-    for content in (b"", b"PK\x03\x04junk"):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match="not a recording"):
-            Recording.open(path)
-
-
-def test_another_mesh_is_noticed(tmp_path):
-    trimesh.creation.box().export(tmp_path / "m.obj")
-    loaded = load(tmp_path, '[models.m]\nmesh = "m.obj"\n[[objects]]\nmodel = "m"\n')
-    _, recording = record_run(loaded, 1)
-    trimesh.creation.box([1, 1, 2]).export(tmp_path / "m.obj")
-    with pytest.raises(ValueError, match=r"run.npz: the mesh of models.m is not"):
-        recording.load_scene("run.npz")
-    (tmp_path / "m.obj").unlink()
-    with pytest.raises(SceneError, match=r"m.obj: no such file"):
-        recording.load_scene("run.npz")
-
-
-# Playbacks.
-
-
-@pytest.fixture(scope="module")
-def models():
-    return make_models()
-
-
-@pytest.fixture
-def playback(models, device):
-    return make_playback(models, device)
-
-
-def test_meshes_sweep_and_stay_where_they_are_held(playback):
+def test_meshes_sweep_and_stay_where_they_are_held(device):
+    playback = make_playback(device)
     lods = [playback.step("count").lods for _ in range(3)]
     top = [playback.scene.models[i].lod_max for i in playback.scene.object_model]
     assert lods[0].tolist() == top and (lods[2] < top).all()
-    playback.held[1] = 5
+    lods = playback.scene.lods
+    lods[1] = 5
+    playback.hold(lods)
     snapshot = playback.query("faces")
-    assert snapshot.lods[1] == 5 and snapshot.lods[0] == lods[2][0] and snapshot.number == 2 and snapshot.row is None
+    assert snapshot.lods.tolist() == lods.tolist() and snapshot.number == 2 and snapshot.row is None
     after = playback.step("faces")
-    assert after.lods[1] == 5 and after.lods[0] < lods[2][0] and after.number == 3
-    assert after.row.hits == len(after.result.faces)
-    playback.held.clear()
+    assert after.lods.tolist() == lods.tolist() and after.number == 3 and after.row.hits == len(after.result.faces)
+    playback.choose("scene")
+    assert (playback.step("count").lods < top).all() and playback.scene.lods[1] > 5
     playback.choose("hold")
     before = playback.scene.lods
     assert playback.step("count").lods.tolist() == before.tolist()
@@ -145,19 +34,9 @@ def test_meshes_sweep_and_stay_where_they_are_held(playback):
     assert playback.step("count").lods.tolist() == top, "still held, from the start"
 
 
-def test_moving_a_mesh(playback):
-    before = playback.query("faces")
-    assert before.result.any.all() and len(before.result.any) == 2
-    playback.move(2, (50, 0, 0, 0, 0, 0, 1))
-    after = playback.query("faces")
-    assert len(after.result.pairs) == 1 and after.poses[2, 0] == 50 and before.poses[2, 0] != 50
-    playback.restart()
-    assert playback.query("faces").poses[2, 0] == before.poses[2, 0]
-
-
 def test_a_scene_plays_as_it_runs(tmp_path, device):
     path = write_scene(tmp_path)
-    playback = open_playback([str(path)], device)
+    playback = open_playback([path], device)
     assert isinstance(playback, ScenePlayback) and playback.modes() == ["scene", "hold", "predictive", "paper"]
     loaded = load_scene(path, device=device)
     frame = loaded.frame(output="faces")
@@ -172,33 +51,21 @@ def test_a_scene_plays_as_it_runs(tmp_path, device):
     with pytest.raises(ValueError, match="needs lod"):
         playback.choose("tolerance")
     assert playback.budget_ms == 50
-    playback.held[0] = 3
+    playback.hold([3] * len(playback.chosen))
     assert playback.step("count").lods[0] == 3
     playback.choose("scene")
-    assert playback.step("count").row.budget_ms is None
+    assert playback.step("count").row.budget_ms is None and playback.scene.lods[0] > 3
     playback.restart()
     assert playback.step("count").number == 0
 
 
-def test_controllers_look_from_the_page(tmp_path, device):
-    path = write_scene(tmp_path, SCENE + "[camera]\neye = [0, 0, 5]\ntarget = [0, 0, 0]\n")
-    playback = open_playback([str(path)], device)
-    seen = []
-    playback.choose("predictive", 9.0)
-    eye = ab.Camera.look_at(eye=(0, 9, 1), target=(0, 0, 0))
-    for playback.for_page, playback.page_camera in ((False, eye), (True, eye), (True, None)):
-        seen.append(playback._camera_at(0.0).eye.tolist())
-    assert seen == [[0, 0, 5], [0, 9, 1], [0, 0, 5]]
-
-
 def test_rigid_bodies_are_shown_where_they_stand(tmp_path, device):
-    playback = open_playback([str(write_scene(tmp_path, BODIES))], device)
+    playback = open_playback([write_scene(tmp_path, BODIES)], device)
     snapshots = [playback.step("contacts") for _ in range(20)]
+    snapshots.append(playback.query("contacts"))
     heights = [snapshot.poses[1, 1] for snapshot in snapshots]
-    assert (np.diff(heights[:8]) < 0).all()
-    again = playback.query("contacts")
-    assert again.poses[1, 1] == heights[-1]
-    for snapshot in (*snapshots, again):
+    assert (np.diff(heights[:8]) < 0).all() and heights[-1] == heights[-2]
+    for snapshot in snapshots:
         scene = ab.Scene(device=device)
         for i in range(2):
             scene.add(playback.scene.models[playback.scene.object_model[i]], snapshot.poses[i])
@@ -206,34 +73,10 @@ def test_rigid_bodies_are_shown_where_they_stand(tmp_path, device):
     assert any(len(snapshot.result.faces) for snapshot in snapshots)
 
 
-def test_a_recording_is_shown_as_it_was(tmp_path, device):
-    loaded = load_scene(write_scene(tmp_path), device=device)
-    _, recording = record_run(loaded, 4)
-    path = tmp_path / "run.npz"
-    recording.save(path)
-    playback = open_playback([str(path)], device)
-    assert (
-        isinstance(playback, RecordedPlayback)
-        and playback.length == playback.frames == 4
-        and playback.modes()[-1] == "hold"
-    )
-    for k in (0, 1, 2, 3, 0):
-        snapshot = playback.step("count")
-        assert snapshot.number == k and np.array_equal(snapshot.lods, recording.lods[k])
-        assert np.array_equal(snapshot.poses, recording.poses[k])
-        assert snapshot.row == recording.rows[k] and snapshot.result.count.sum() == recording.rows[k].hits
-    playback.seek(2)
-    assert playback.query("count").result.count.sum() == recording.rows[2].hits
-    playback.held[0] = 2
-    assert playback.step("count").lods[0] == 2
-    with pytest.raises(ValueError, match="holds its LODs"):
-        playback.choose("predictive", 3.0)
-
-
-def test_meshes_side_by_side_reach_into_each_other(models):
-    poses = lay_out([*models, models[0]])
+def test_meshes_side_by_side_reach_into_each_other():
+    ball, ring = make_models()
     boxes = []
-    for model, pose in zip((*models, models[0]), poses):
+    for model, pose in zip((ball, ring, ball), lay_out([ball, ring, ball])):
         vertices = model.mesh_at(model.lod_max)[0] + pose[:3]
         boxes.append((vertices.min(axis=0), vertices.max(axis=0)))
     for (_, upper), (lower, _) in itertools.pairwise(boxes):

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.samples import SHUTTLE_SCENE
+from helpers.viewer import write_scene
 
 import warp_abtree as ab
 from warp_abtree.app.cli import main as cli
@@ -62,11 +64,22 @@ def block():
 @pytest.fixture
 def files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("scene.toml").write_text(SHUTTLE_SCENE)
+    write_scene(tmp_path, SHUTTLE_SCENE)
     trimesh.creation.icosphere(1).export("ball.obj")
-    ab.Model.load(trimesh.creation.icosphere(1)).save("ball.npz")
+    ab.Model.load("ball.obj").save("ball.npz")
     np.save("poses.npy", np.eye(7)[[6] * 40])
     return tmp_path
+
+
+SLOW = [
+    (BUILD, "np.savez_compressed", block, TERMINATE, 143, []),
+    ("run scene.toml --record new.csv", "frame.csv.DictWriter", None, TERMINATE, 143, []),
+    ("run scene.toml --record new.json", "ab.Frame.step", ignore, INTERRUPT, 130, []),
+    (QUERY, "np.savez", block, INTERRUPT, 130, []),
+    (SWEEP, "np.savez", ignore, TERMINATE, 143, ["answers", "answers/job.json"]),
+    (VIEW, "_", ignore, INTERRUPT, 0, []),  # an interrupt is how people end it
+    (VIEW, "_", block, TERMINATE, 143, []),
+]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
@@ -74,18 +87,7 @@ def files(tmp_path, monkeypatch):
     ("words", "place", "before", "number", "status", "left"),
     [
         (BUILD, "np.savez_compressed", ignore, INTERRUPT, 130, []),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in (
-                (BUILD, "np.savez_compressed", block, TERMINATE, 143, []),
-                ("run scene.toml --record new.csv", "frame.csv.DictWriter", None, TERMINATE, 143, []),
-                ("run scene.toml --record new.npz", "ab.Frame.step", ignore, INTERRUPT, 130, []),
-                (QUERY, "np.savez", block, INTERRUPT, 130, []),
-                (SWEEP, "np.savez", ignore, TERMINATE, 143, ["answers", "answers/job.json"]),
-                (VIEW, "_", ignore, INTERRUPT, 0, []),  # an interrupt is how people end it
-                (VIEW, "_", block, TERMINATE, 143, []),
-            )
-        ),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW),
     ],
 )
 def test_a_signal_stops_a_command(files, words, place, before, number, status, left):
@@ -180,12 +182,10 @@ def test_progress_without_a_bar_is_a_line_a_stage(monkeypatch, terminal):
 
 
 def test_compiling_is_announced(tmp_path, monkeypatch):
-    stream = io.StringIO()
+    stream, now = io.StringIO(), time.monotonic()
     (tmp_path / f"wp_module_p{os.getpid()}_t1").mkdir()
     monkeypatch.setattr(progress_module.wp.config, "kernel_cache_dir", str(tmp_path))
     with progress_module.compile_notice(stream, delay=0.0):
-        for _ in range(100):
-            if stream.getvalue():
-                break
-            progress_module.time.sleep(0.05)
+        while not stream.getvalue() and time.monotonic() < now + 5:
+            time.sleep(0.05)
     assert stream.getvalue().count("\n") == 1 and "compiling" in stream.getvalue()

@@ -1,36 +1,27 @@
-"""The page on its server, without a browser; the standalone page; the command, and one line for anything bad."""
+"""The viewer's page on its server, without a browser and in a headless Chromium (playwright, extra dev)."""
 
-import base64
-import re
+import io
+import shutil
 import socket
 import threading
 import time
-from pathlib import Path
 
+import numpy as np
+import PIL.Image
 import pytest
-import trimesh
-from helpers.viewer import make_models, make_playback, write_scene
+from helpers.viewer import make_playback, run_command, write_scene
 
-from warp_abtree.app import load_scene
-from warp_abtree.app.cli import main as cli
-from warp_abtree.app.open_playback import open_playback
+pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 
-ROOT = Path(__file__).resolve().parents[2]
+from warp_abtree.app.viewer.command import serve
+from warp_abtree.app.viewer.page import Page
 
-
-@pytest.fixture
-def files(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_scene(tmp_path)
-    trimesh.creation.box().export("box.obj")
-    return tmp_path
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 
 
 @pytest.fixture
 def server():
-    pytest.importorskip("viser")
-    from warp_abtree.app.viewer.command import serve
-
     before = set(threading.enumerate())
     with serve() as server:
         yield server
@@ -49,96 +40,85 @@ def left_over(before):
 
 @pytest.fixture
 def page(server, device):
-    from warp_abtree.app.viewer.page import Page
-
-    page = Page(server, make_playback(make_models(), device))
+    page = Page(server, make_playback(device))
     page.run(seconds=0.3)
     return page
+
+
+def act(page, *action, seconds=0.2):
+    """Do what a user asks of a page, and let it run."""
+    page._post(*action)
+    page.run(seconds=seconds)
 
 
 @pytest.mark.slow
 def test_a_page_stands_until_it_is_told_to_play(page):
     assert page.snapshots == 1 and page.snapshot.number == 0 and "| state | paused |" in page._state.content
-    page._post(page._run_button, "step")
-    page.run(seconds=0.3)
+    act(page, page._run_button, "step", seconds=0.3)
     assert page.snapshots == 2 and page.snapshot.row.frame == 0 and not page.playing
-    page._post(page._run_button, "play")
-    page.run(seconds=0.5)
-    assert page.playing and page.snapshot.number > 2 and len(page._rows) == page.snapshot.number + 1
-    page._post(page._run_button, "play")
-    page.run(seconds=0.2)
+    act(page, page._run_button, "play", seconds=0.5)
+    assert page.playing and page.snapshot.number > 2
+    act(page, page._run_button, "play")
     number = page.snapshot.number
     page.run(seconds=0.2)
     assert page.snapshot.number == number
-    page._post(page._run_button, "restart")
-    page.run(seconds=0.2)
-    assert page.snapshot.number == 0 and not page._rows
+    act(page, page._run_button, "restart")
+    assert page.snapshot.number == 0
 
 
 @pytest.mark.slow
 def test_what_people_do_reaches_the_scene(page):
     top = page.playback.scene.models[0].lod_max
-    page._post(page._hold_all, 50.0)
-    page.run(seconds=0.2)
+    act(page, page._hold_all, 50.0)
     assert page.snapshot.lods.tolist() == [round(0.5 * top), 141, round(0.5 * top)]
-    page._post(page._pick, 1)
-    page._post(page._hold_picked, 10.0)
-    page.run(seconds=0.2)
-    assert page.snapshot.lods[1] == 28
-    assert "28 of 282, held" in page._numbers.content and page._gizmo is not None
-    page._post(page.playback.held.clear)
-    page.run(seconds=0.2)
-    assert page.snapshot.lods.tolist() == [top, 282, top]
     page._mode.value, page._budget.value = "budget, predicted", 7.0
-    page._post(page._choose)
-    page.run(seconds=0.2)
+    act(page, page._choose)
     assert page.playback.budget_ms == 7.0
-    page._post(page._run_button, "step")
-    page.run(seconds=0.3)
-    assert page.snapshot.row.budget_ms == 7.0
-    page._post(page._pick, 1)
-    page.run(seconds=0.2)
-    assert page.settings.picked is None and page._gizmo is None and page._lod.disabled
+    act(page, page._run_button, "step", seconds=0.3)
+    assert page.snapshot.row.budget_ms == 7.0 and "| budget | 7 ms |" in page._state.content
 
 
-def test_a_standalone_page_holds_all_that_it_shows(files, capsys):
-    msgspec, zstandard = pytest.importorskip("msgspec"), pytest.importorskip("zstandard")
-    pytest.importorskip("viser")
-    assert cli.main(["view", "scene.toml", "--record", "page.html", "--frames", "3", "--device", "cpu"]) == 0
-    assert capsys.readouterr().out == "wrote page.html\n"
-    page = Path("page.html").read_text(encoding="utf-8")
-    assert not re.findall(r"""(?:src|href)=["'](?:https?:|/)""", page), "nothing is fetched"
-    assert '<details id="about"' in page and "2 objects" not in page and "4 objects, 3 frames on cpu" in page
-    packed = base64.b64decode(re.search(r'__VISER_EMBED_DATA__="([^"]*)"', page)[1])
-    inner = zstandard.ZstdDecompressor().decompressobj().decompress(packed[8:])
-    found = msgspec.msgpack.decode(inner[8 : 8 + int.from_bytes(inner[:8], "little")], strict=False)
-    assert found["durationSeconds"] == pytest.approx(3 * 0.25)
-    names = [message.get("name") for _, message in found["messages"]]
-    assert {"/objects/0", "/objects/1", "/intersecting/0", "/intersecting/1", "/contacts"} <= set(names)
-    later = [message["name"] for time, message in found["messages"] if time > 0 and "name" in message]
-    assert "/objects/1" in later and "/contacts" in later
-    assert sorted(path.name for path in files.glob("page*")) == ["page.html"]
-
-
-def test_a_port_that_is_taken(files, capsys):
-    pytest.importorskip("viser")
+def test_a_port_that_is_taken(tmp_path, capsys):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        assert cli.main(["view", "box.obj", "--port", str(port)]) == 2
-    assert f"127.0.0.1:{port}: cannot be served at (Address already in use)" in capsys.readouterr().err
+        _, errors = run_command(capsys, "view", write_scene(tmp_path), "--port", port, status=2)
+    assert f"127.0.0.1:{port}: cannot be served at (Address already in use)" in errors[0]
 
 
-def test_a_recording_has_a_slider_of_frames(files, server):
-    from warp_abtree.app.recording import record_run
-    from warp_abtree.app.viewer.page import Page
+def count_green(tab) -> int:
+    """Count pixels of intersecting faces of the balls."""
+    pixels = np.array(PIL.Image.open(io.BytesIO(tab.screenshot())).convert("RGB")).astype(int)
+    red, green, blue = pixels[:, :500].reshape(-1, 3).T
+    return int(np.count_nonzero((green > 1.6 * red) & (green > 1.6 * blue) & (green > 60)))
 
-    record_run(load_scene("scene.toml", device="cpu"), 4)[1].save("run.npz")
-    page = Page(server, open_playback(["run.npz"], "cpu"))
-    page._post(page._seek, 2)
-    page.run(seconds=0.3)
-    assert page.snapshot.number == 2 and page._frame_slider.value == 2 and page._budget is None
-    page._post(page._run_button, "step")
-    page.run(seconds=0.3)
-    assert page.snapshot.number == 3 and page.snapshot.row.frame == 3
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here (Debian: apt-get install chromium)")
+def test_a_page_draws_and_its_controls_reach_the_scene():
+    playwright = pytest.importorskip("playwright.sync_api", reason="the browser is driven by playwright (extra dev)")
+    with serve() as server, playwright.sync_playwright() as driver:
+        page = Page(server, make_playback("cpu"))
+        thread = threading.Thread(target=page.run)
+        thread.start()
+        try:
+            chromium = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+            tab, faults = chromium.new_page(viewport={"width": 1000, "height": 640}), []
+            tab.set_default_timeout(40_000)
+            tab.on("pageerror", lambda error: faults.append(str(error)))
+            tab.goto(f"http://127.0.0.1:{server.get_port()}")
+            tab.get_by_text("paused").wait_for()
+            while count_green(tab) < 300:
+                tab.wait_for_timeout(300)
+            tab.get_by_role("checkbox", name="intersecting faces").uncheck()
+            tab.get_by_role("button", name="step").click()
+            tab.get_by_text("frame 0").wait_for()
+            while count_green(tab) > 50:
+                tab.wait_for_timeout(300)
+            assert page.snapshot.row.frame == 0 and not page.settings.intersecting
+            assert not faults
+            chromium.close()
+        finally:
+            page.close()
+            thread.join(timeout=20)
+        assert not thread.is_alive()

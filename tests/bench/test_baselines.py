@@ -6,53 +6,33 @@ import trimesh
 import warp as wp
 
 import warp_abtree as ab
-from bench.baselines import fcl_cpp, newton, wp_bvh
+from bench.baselines import newton, wp_bvh
 from bench.shapes import knot, pair_poses, scene_of_pairs
-from bench.verify import count_differences, load_oracle
+from bench.verify import count_differences
 
 pytestmark = pytest.mark.slow
 
 
-def cube(size=1.0):
-    box = trimesh.creation.box((size,) * 3)
-    return np.asarray(box.vertices), np.asarray(box.faces, np.int32)
-
-
 def test_wp_bvh_finds_what_brute_force_finds(device):
     """Separate boxes far above its epsilon: 12 faces each, poses without rotation."""
-    box, faces = cube()
+    box = trimesh.creation.box()
+    mesh = np.asarray(box.vertices), np.asarray(box.faces, np.int32)
     poses = np.zeros((4, 7), np.float32)
     poses[:, 6] = 1
     poses[1, :3] = 0.41, 0.27, 0.33
     poses[3, :3] = 3
-    found = wp_bvh.BvhFaces(box, faces, poses, 144, wp.get_device(device))
+    found = wp_bvh.BvhPosed(*mesh, poses, 144, wp.get_device(device))
     found.launch()
-    scene, pairs = scene_of_pairs(device, ab.Model.from_arrays(box, faces, base_faces=12), poses)
+    scene, pairs = scene_of_pairs(device, ab.Model.from_arrays(*mesh, base_faces=12), poses)
     truth = scene.intersect(pairs, "faces").faces
     assert len(truth) > 6 and count_differences(found.result(), truth) == (0, 0)
     found.rebuild()
     found.launch()
     assert np.array_equal(found.result(), truth)
-    small = wp_bvh.BvhFaces(box, faces, poses, 3, wp.get_device(device))
+    small = wp_bvh.BvhPosed(*mesh, poses, 3, wp.get_device(device))
     small.launch()
     with pytest.raises(RuntimeError, match="with room for 3"):
         small.result()
-
-
-def test_fcl_in_cpp_finds_what_brute_force_finds():
-    """Two meshes that differ, and one with itself; B is placed by its matrix."""
-    try:
-        fcl_cpp.load_library()
-    except ImportError as error:
-        pytest.skip(str(error))
-    matrices = np.tile(np.eye(4), (3, 1, 1))
-    matrices[:, :3, 3] = [[0.41, 0.27, 0.33], [5, 0, 0], [-0.4, -0.3, 0.2]]
-    for a, b in ((cube(), cube(0.7)), (cube(),) * 2):
-        found = fcl_cpp.FclCpp(a, b, matrices)
-        assert found.any().tolist() == [True, False, True]
-        for answer, matrix in zip(found.faces(), matrices, strict=True):
-            truth = load_oracle().brute_force_faces(*a, *b, np.eye(4), matrix)
-            assert sorted(map(tuple, found.face_pairs(answer))) == sorted(map(tuple, truth.tolist()))
 
 
 def test_newton_agrees_on_which_pairs_intersect(device):

@@ -8,12 +8,12 @@ import warp as wp
 
 from bench import __main__ as main
 from bench.baselines.newton import SDF_RESOLUTION
-from bench.cases import budget, build, scaling
+from bench.cases import budget, build
 from bench.tables import pick
 from warp_abtree import testing
 
 pytestmark = pytest.mark.slow
-MORE = {"scaling": ["--devices", "{0},{0}"], "exact": ["--processes", "1"]}
+PLOTS = {"budget": ["budget-rain.svg", "budget-focus.svg"], "scale": ["scale_time.svg", "scale_memory.svg"]}
 
 
 def check_query(rows):
@@ -34,7 +34,7 @@ def check_update(rows):
         assert row["full"] == (row["entries"] > share * row["faces"]) and row["arrays_mib"] > 0
     many = pick(rows, case="many states")
     assert [row["states"] for row in many] == [1, 12] and many[1]["nodes_refitted"] > 10 * many[0]["nodes_refitted"]
-    assert testing.current_regime().full_refit == {"cpu": 0.5, "cuda": 0.01}, "what was forced is put back"
+    assert testing.current_regime().full_refit == {"cpu": 0.5, "cuda": 0.2}, "what was forced is put back"
 
 
 def check_scale(rows):
@@ -59,7 +59,7 @@ def check_frame(rows):
 
 
 def check_precision(rows):
-    assert all(row["hits"] > 0 for row in rows[-2:]) and rows[-1]["to_float64"] == 1
+    assert rows[-1]["hits"] > 0 and rows[-1]["to_float64"] == 1
 
 
 def check_exact(rows):
@@ -68,21 +68,28 @@ def check_exact(rows):
 
 
 def check_baselines(rows):
-    assert {row["peer"] for row in rows} == {"fcl-c++", "python-fcl", "trimesh"}
+    assert {row["peer"] for row in rows} == {"python-fcl", "trimesh"}
     for row in rows:
-        answered = "skipped" in row or row["faces_missed"] == row["faces_invented"] == row["ours_wrong"] == 0
-        assert row["meet"] == 3 and row["ours_any_per_s"] > 0 and answered
+        assert row["faces_missed"] == row["faces_invented"] == row["ours_wrong"] == 0
+        assert row["meet"] == 3 and row["ours_any_per_s"] > 0 and row["faces_ratio"] > 0
 
 
 def check_build(rows):
     *rows, slopes = rows
     assert [row["faces"] for row in rows] == [168, 576] and slopes["build_ms_slope"] is not None
     for row in rows:
-        assert row["tightness"] >= 1 and row["lod_max"] > row["faces"] / 3
         stages = sum(row[f"{name}_ms"] for name in ("collapse", "error", "tree"))
         assert stages == pytest.approx(row["build_ms"], rel=0.5) and row["error_ms"] > 0
         assert (build.BASELINE + "_ms" in row) != (build.BASELINE + "_skipped" in row)
-        assert 60 < row["model_bytes_a_face"] < 150 and row["file_mib"] > 0
+        assert row["lod_max"] > row["faces"] / 3 and row["file_mib"] > 0
+
+
+def check_coarse(rows):
+    assert [row["fraction"] for row in rows] == [1, 0.1, 0.01] and [row["faces"] for row in rows][:2] == [272, 28]
+    for row in rows:
+        assert row["hits"] > 0 and row["any_ratio"] == pytest.approx(
+            row["peer_any_ms"] / row["any_ms"], rel=0.2, abs=0.02
+        )
 
 
 def check_budget(rows):
@@ -95,13 +102,6 @@ def check_budget(rows):
             assert row["cost_ms"] == pytest.approx(3.5 * row["budget_ms"], abs=0.01)
 
 
-def check_scaling(rows):
-    assert [(row["way"], row["devices"]) for row in rows] == [("strong", 1), ("strong", 2), ("weak", 1), ("weak", 2)]
-    assert [row["worlds"] for row in rows] == [8, 8, 8, 16]
-    assert rows[0]["efficiency"] == rows[2]["efficiency"] == 1 and testing.current_regime().cpu_threads is None
-    assert scaling.list_sizes(["cpu"] * 5) == [(1, 1), (2, 1), (2, 2), (4, 1), (4, 4), (5, 1), (5, 5)]
-
-
 @pytest.mark.parametrize("name", main.CASES)
 def test_case(name, device, tmp_path, monkeypatch, capsys):
     """Every number is finite, no time or size is negative, and each case's own facts hold."""
@@ -110,9 +110,9 @@ def test_case(name, device, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(budget, "QUICK_OBJECTS", 12)
     if name == "baselines":
         pytest.importorskip("fcl")
-    file, plots = tmp_path / "rows.json", ["--plots", str(tmp_path)] if name in ("budget", "scale") else []
-    more = [word.format(device) for word in MORE.get(name, [])]
-    assert main.main([name, "--device", device, "--quick", "--json", str(file), *more, *plots]) == 0
+    file, more = tmp_path / "rows.json", ["--plots", str(tmp_path)] if name in PLOTS else []
+    more += ["--processes", "1"] if name == "exact" else []
+    assert main.main([name, "--device", device, "--quick", "--json", str(file), *more]) == 0
     written = json.loads(file.read_text())
     assert written["warp"] == wp.config.version and f"{[*written['rows'][-1]][-1]}=" in capsys.readouterr().out
     for row in written["rows"]:
@@ -123,10 +123,9 @@ def test_case(name, device, tmp_path, monkeypatch, capsys):
             if key.endswith("_p95_ms"):
                 assert value >= row[key.replace("_p95", "")] > 0
     globals()[f"check_{name}"](written["rows"])
-    if plots:
+    if name in PLOTS:
         pytest.importorskip("matplotlib")
-        drawn = {"budget": ["budget-rain.png", "budget-focus.png"], "scale": ["scale_time.svg", "scale_memory.svg"]}
-        assert all((tmp_path / picture).stat().st_size > 10_000 for picture in drawn[name])
+        assert all((tmp_path / picture).stat().st_size > 10_000 for picture in PLOTS[name])
 
 
 def test_large_meshes_are_left_out_and_models_kept(device, tmp_path, capsys):

@@ -4,20 +4,13 @@ import numpy as np
 import pytest
 
 import warp_abtree as ab
-from bench.cases import build, query, scale, scaling, sweep, update
+from bench.cases import query, scale, sweep, update
 from bench.meshes import knot_model
-from bench.shapes import pair_poses, random_poses, scene_of_pairs, scene_of_worlds, world_poses
+from bench.shapes import pair_poses, random_poses, scene_of_objects, scene_of_pairs
 from bench.verify import count_differences
 from warp_abtree.state import lod_update, work_lists
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture
-def posed(device):
-    """A scene of 3 pairs of knots and all their face pairs."""
-    scene, pairs = scene_of_pairs(device, knot_model(300), pair_poses(3, 0.2))
-    return scene, scene.intersect(pairs, "faces")
 
 
 def test_differences_are_counted():
@@ -27,59 +20,56 @@ def test_differences_are_counted():
     assert count_differences(np.empty((0, 3)), truth) == (3, 0)
 
 
+def check_baseline(scene, theirs, ours):
+    return query.check_baseline(theirs, ours, scene.models[0], pair_poses(3, 0.2))
+
+
 def lose_a_hit(scene, result):
-    result.faces = np.delete(result.faces, -1, axis=0)
+    result.faces = result.faces[:-1]
     scale.check_alone(scene, result, result.pairs[2:])
 
 
 def time_another_count(scene, result):
-    timed = ab.Query(scene, "faces", pairs=result.pairs)
     result.count[1] += 1
-    scale.time_query(timed, {}, result, 1)
-
-
-def miss_a_pair(scene, result):
-    query.check_baseline(result.faces, result.faces[1:], scene.models[0], pair_poses(3, 0.2))
+    scale.time_query(ab.Query(scene, "faces", pairs=result.pairs), {}, result, 1)
 
 
 def invent_a_pair(scene, result):
     taken = set(map(tuple, result.faces.tolist()))
     apart = next((0, 0, b) for b in range(300) if (0, 0, b) not in taken)
-    ours = np.concatenate([result.faces, [apart]])
-    query.check_baseline(result.faces, ours, scene.models[0], pair_poses(3, 0.2))
+    check_baseline(scene, result.faces, np.concatenate([result.faces, [apart]]))
 
 
 def sweep_otherwise(scene, result):
-    poses = random_poses(20, 2.0).astype(np.float32)
+    poses = random_poses(2.0, 20).astype(np.float32)
     found = ab.sweep(scene.models[0], scene.models[0], poses, device=scene.device)
     sweep.check_sweep(scene.device, scene.models[0], poses, found)
     sweep.check_sweep(scene.device, scene.models[0], poses, ~found)
 
 
-@pytest.mark.parametrize(
-    ("fault", "message"),
-    [
-        (lose_a_hit, "by themselves have other face pairs"),
-        (time_another_count, "differs from the checked one"),
-        (miss_a_pair, "1 of 1 face pairs"),
-        (invent_a_pair, "1 of 1 face pairs"),
-        (sweep_otherwise, "the sweep and the query differ"),
-    ],
-)
-def test_a_wrong_answer_is_noticed(posed, fault, message):
-    with pytest.raises(RuntimeError, match=message):
-        fault(*posed)
+FAULTS = {
+    lose_a_hit: "by themselves have other face pairs",
+    time_another_count: "differs from the checked one",
+    lambda scene, result: check_baseline(scene, result.faces, result.faces[1:]): "1 of 1 face pairs",
+    invent_a_pair: "1 of 1 face pairs",
+    sweep_otherwise: "the sweep and the query differ",
+}
 
 
-def test_right_answers_pass(posed):
-    scene, result = posed
-    scale.check_alone(scene, result, result.pairs)
-    row = query.check_baseline(result.faces[1:], result.faces, scene.models[0], pair_poses(3, 0.2))
-    assert (row["judged"], row["ours_wrong"], row["peer_missed"]) == (1, 0, 1)
+def test_a_wrong_answer_is_noticed(device):
+    """Of 3 pairs of knots; right answers pass."""
+    scene, pairs = scene_of_pairs(device, knot_model(300), pair_poses(3, 0.2))
+    for fault, message in FAULTS.items():
+        result = scene.intersect(pairs, "faces")
+        scale.check_alone(scene, result, result.pairs)
+        row = check_baseline(scene, result.faces[1:], result.faces)
+        assert (row["judged"], row["ours_wrong"], row["peer_missed"]) == (1, 0, 1)
+        with pytest.raises(RuntimeError, match=message):
+            fault(scene, result)
 
 
 def test_worlds_alone_notice_a_lost_hit(device):
-    scene = scene_of_worlds(device, knot_model(200), world_poses(3, 3, 1.0))
+    scene = scene_of_objects(device, knot_model(200), random_poses(0.5, 9), 3)
     result = scene.intersect(output="faces")
     scale.check_worlds(scene, result, 3, 3)
     result.faces = np.delete(result.faces, 0, axis=0)
@@ -90,32 +80,12 @@ def test_worlds_alone_notice_a_lost_hit(device):
         scale.check_worlds(scene, result, 3, 3)
 
 
-def test_frames_that_answer_otherwise_are_noticed(device, monkeypatch):
-    whole = scaling.WorldFrames.answer
-    monkeypatch.setattr(scaling.WorldFrames, "answer", lambda self, rows: whole(self, rows)[:-1])
-    with pytest.raises(RuntimeError, match="frames: 2 devices answer otherwise than one"):
-        list(scaling.run(device, f"{device},{device}", quick=True))
-
-
-def test_a_model_whose_error_is_too_small_is_noticed(monkeypatch):
-    model = knot_model(600)
-    assert build.check_model(model, 100) >= 1
-    monkeypatch.setattr(ab.Model, "error_at", lambda self, lod, kept=ab.Model.error_at: 0.5 * kept(self, lod))
-    with pytest.raises(RuntimeError, match="beyond its error"):
-        build.check_model(model, 1000)
-
-
-def moved_scene(device, splits):
-    """Return a scene of one knot, LODs some splits below its finest and the finest, and its number of faces."""
+def test_an_update_that_forgets_nodes_is_noticed(device, monkeypatch):
     model = knot_model(300)
     scene = ab.Scene(device)
     scene.add(model)
-    return scene, [model.lod_max - splits], [model.lod_max], model.face_count
-
-
-def test_an_update_that_forgets_nodes_is_noticed(device, monkeypatch):
-    scene, there, back, faces = moved_scene(device, 5)
-    k, *_, launches = update.check_update(scene, there, back, faces)
+    move = scene, [model.lod_max - 5], [model.lod_max], model.face_count
+    k, *_, launches = update.check_update(*move)
     assert k[0] > 0 and set(launches) == {"update", "full"}
     whole = lod_update.active_update
 
@@ -130,4 +100,4 @@ def test_an_update_that_forgets_nodes_is_noticed(device, monkeypatch):
 
     monkeypatch.setattr(lod_update, "active_update", forget)
     with pytest.raises(RuntimeError, match="bits"):
-        update.check_update(scene, there, back, faces)
+        update.check_update(*move)

@@ -21,38 +21,20 @@ pytestmark = pytest.mark.slow
 def test_slope_and_crossover():
     assert timing.fit_slope([1, 10, 100], [2.0, 20.0, 200.0]) == 1 and timing.fit_slope([3], [1.0]) is None
     rows = [{"k": k, "update_ms": k / 100, "full_ms": 1.0} for k in (1, 10, 80, 125, 1000)]
-    assert find_crossover(rows, "k") == pytest.approx(100)
-    assert find_crossover(rows[:3], "k") is None and find_crossover(rows[3:], "k") == 125
-    assert timing.crossover([0.1, 1.0], [1.0, 2.0], 0.0) == 0.0
-
-
-def test_bound_of_equation_1():
-    """One face of n: its path, log2 n + 1 nodes; all of a full tree: 2 n - 1."""
-    assert bound_nodes(1, 1024) == 11 and bound_nodes(1024, 1024) == 2047
-    assert bound_nodes(0, 5) == 0
+    found = [find_crossover(some, "k") for some in (rows, rows[:3], rows[3:])]
+    assert found == [pytest.approx(100), None, 125] and timing.crossover([0.1, 1.0], [1.0, 2.0], 0.0) == 0.0
 
 
 def test_work_of_a_result():
     """1,000 node tests at 32 bytes and 64 operations, a pair of 400 bytes; 100 triangle tests, 10 of them hits."""
     counters = {"node_tests": 1000, "triangle_tests": 100, "float64_tests": 3, "exact_tests": 1, "count": 10}
-    result = SimpleNamespace(faces=(), pairs=(0,), **{name: np.array([value]) for name, value in counters.items()})
+    result = SimpleNamespace(pairs=(0,), **{name: np.array([value]) for name, value in counters.items()})
     size, single, double = roofline.count_work(result)
     assert size == 32 * 1000 + 128 * 100 + 176 * 3 + 176 + 400 + 12 * 10
     assert single == 64 * 1000 + 140 * 100 + 152 * 7 and double == 129 * 3 + 373
     row = roofline.roofline(result, 1.0, (1e9, 1e9, 1e9))
-    assert row["floor_ms"] == pytest.approx(max(size, single, double) * 1e-6, rel=1e-3)
-    assert row["node_tests_per_s"] == 1e6 and "floor_ms" not in roofline.roofline(result, 1.0, None)
-
-
-def test_work_of_an_update():
-    """3 leaves and 5 inner nodes from a slice of 4 entries, in a millisecond at a peak of 1 GB/s."""
-    row = roofline.update_roofline(3, 8, 4, 1.0, (1e9, 1e9, 1e9))
-    assert row["bytes"] == 24 * 4 + 56 * 8 + 88 * 3 + 64 * 5 and row["nodes_per_s"] == 8000
-    assert row["memory_share"] == pytest.approx(row["bytes"] / 1e6, rel=0.01)
-    assert "floor_ms" not in roofline.update_roofline(3, 8, 4, 1.0, None)
-
-
-def test_peaks_by_name():
+    assert row["memory_share"] == pytest.approx(1e-6 * size, rel=0.01) and row["node_tests_per_s"] == 1e6
+    assert "memory_share" not in roofline.roofline(result, 1.0, None)
     names = ("NVIDIA H200", "NVIDIA H100 80GB HBM3", "NVIDIA H100 PCIe", "CPU")
     found = [roofline.find_peaks(SimpleNamespace(name=name)) for name in names]
     assert [peaks and peaks[0] for peaks in found] == [4.8e12, 3.35e12, 2.0e12, None]
@@ -60,6 +42,8 @@ def test_peaks_by_name():
 
 def test_fit_of_figure_6():
     """Times that are 3 ns a node of equation (1) give that back, and the crossover with a flat full refit."""
+    # One face of n: its path, log2 n + 1 nodes; all of a full tree: 2 n - 1.
+    assert bound_nodes(1, 1024) == 11 and bound_nodes(1024, 1024) == 2047 and bound_nodes(0, 5) == 0
     rows = []
     for fraction in np.geomspace(0.001, 1, 40):
         k = fraction * 1000
@@ -72,50 +56,27 @@ def test_fit_of_figure_6():
     assert update.fitted_moves(rows)[7]["fitted_ms"] == pytest.approx(rows[7]["refit_ms"])
 
 
-def box_workload(device, offset_b=0.0):
-    """Two unit cubes, B's corners away from its own origin, that meet face to face along x."""
-    box = trimesh.creation.box()
-    model = ab.Model.from_arrays(box.vertices, box.faces, base_faces=12, name="box")
-    moved = ab.Model.from_arrays(box.vertices + offset_b, box.faces, base_faces=12, name="moved")
-    boxes = SimpleNamespace(a=model, b=moved, device=device, size=1.0)
-    boxes.motions = Motions(np.random.default_rng(0), 3, model, moved)
-    boxes.motions.away[:] = np.eye(3)
-    boxes.motions.rotations[:] = 0, 0, 0, 1
-    return boxes
-
-
-def box_scene(boxes, room):
-    return PoseScene(boxes.device, (boxes.a, boxes.b), (0, 0), boxes.motions.far, room)
-
-
 @pytest.mark.parametrize("offset", [0.0, 3.0])
 def test_first_contact_of_boxes(device, offset):
-    """Cubes of side 1 meet where their centres are 1 apart, wherever B's own origin is."""
-    boxes = box_workload(device, offset)
-    scene = box_scene(boxes, 8)
-    low, high = find_first_contact(scene.intersects, boxes.motions, steps=50)
+    """Cubes of side 1 meet where their centres are 1 apart, wherever B's own origin is; parts fit in the room."""
+    box = trimesh.creation.box()
+    model, moved = (ab.Model.from_arrays(box.vertices + x, box.faces, base_faces=12) for x in (0, offset))
+    motions = Motions(np.random.default_rng(0), 3, model, moved)
+    motions.away[:] = np.eye(3)
+    motions.rotations[:] = 0, 0, 0, 1
+    scene = PoseScene(device, (model, moved), (0, 0), motions.far, 2)
+    low, high = find_first_contact(scene.intersects, motions, steps=50)
     assert low == pytest.approx([1, 1, 1], abs=1e-9) and (high >= low).all()
-    assert scene.intersects(boxes.motions.poses(low)).all() and not scene.intersects(boxes.motions.poses(high)).any()
-
-
-def test_first_contact_that_never_comes():
-    motions = box_workload("cpu").motions
-    low, high = find_first_contact(lambda poses: poses[:, 0] > 0.4, motions, steps=16)
-    assert not np.isnan(low[0]) and np.isnan(low[1:]).all() and np.isnan(high[1:]).all()
-    found = workload.judge_contact(low - 1)
-    assert found["never"] == 2
-
-
-def test_distances_proved(device):
-    """Cubes 0.25 apart: near within 0.3, not within 0.2; what does not fit in the room is asked in parts."""
-    boxes = box_workload(device)
-    scene = box_scene(boxes, 2)
-    poses = boxes.motions.poses([1.25, 1.25, 1.25])
+    assert scene.intersects(motions.poses(low)).all() and not scene.intersects(motions.poses(high)).any()
+    poses = motions.poses([1.25, 1.25, 1.25])
     assert scene.near(poses, 0.3).tolist() == [True] * 3 and scene.near(poses, 0.2).tolist() == [False] * 3
     assert scene.near(poses, [0.3, 0.2, 0.3]).tolist() == [True, False, True]
+    low, high = find_first_contact(lambda poses: poses[:, 0] + offset > 0.4, motions, steps=16)
+    assert not np.isnan(low[0]) and np.isnan(low[1:]).all() and np.isnan(high[1:]).all()
+    assert workload.judge_contact(low - 1)["never"] == 2
 
 
-def test_judged_answers():
+def test_judged_answers_and_front():
     found = workload.judge_answers(np.array([1, 1, 0, 0, 1], bool), np.array([1, 0, 1, 0, 1], bool))
     assert (found["missed"], found["invented"]) == (1, 1)
     assert found["precision"] == found["recall"] == pytest.approx(2 / 3)
@@ -124,9 +85,6 @@ def test_judged_answers():
     assert error["contact_mean"] == pytest.approx(0.2) and error["contact_max"] == pytest.approx(0.3)
     assert (error["early_max"], error["late_max"], error["never"]) == (pytest.approx(0.1), pytest.approx(0.3), 1)
     assert workload.judge_contact(np.array([np.nan]))["contact_mean"] is None
-
-
-def test_front():
     points = [(1, 5), (2, 3), (2, 4), (3, 3), (4, 0), (1, 5)]
     assert workload.find_front(*zip(*points, strict=True)) == [True, True, False, False, True, True]
 
@@ -139,25 +97,25 @@ def make_contacts(rows):
     return contacts
 
 
-def test_regions_of_parallel_lines():
-    """Two poses with lines 0.005 and 0.3 apart; a third where one region is missing."""
-    truth = make_contacts([(0, (0, 0, 0), (1, 0, 0)), (1, (0, 0, 0), (2, 0, 0)), (2, (0, 0, 0), (1, 0, 0))])
-    found = make_contacts([(0, (0, 0.005, 0), (1, 0.005, 0)), (1, (0, 0, 0.3), (2, 0, 0.3))])
-    row = regions.compare_regions(regions.make_regions(found, 3, 1.0), regions.make_regions(truth, 3, 1.0))
+def compare(found, truth, poses, size=1.0):
+    return regions.compare_regions(*(regions.make_regions(make_contacts(x), poses, size) for x in (found, truth)))
+
+
+def test_regions_of_lines():
+    """Two poses with lines 0.005 and 0.3 apart; a third where one region is missing; one region half of another."""
+    truth = [(0, (0, 0, 0), (1, 0, 0)), (1, (0, 0, 0), (2, 0, 0)), (2, (0, 0, 0), (1, 0, 0))]
+    found = [(0, (0, 0.005, 0), (1, 0.005, 0)), (1, (0, 0, 0.3), (2, 0, 0.3))]
+    row = compare(found, truth, 3)
     assert row["contacts_missed"] == pytest.approx(2 / 3) and row["contacts_invented"] == 0.5
     assert [row["region_mean"], row["region_hausdorff"]] == pytest.approx([0.1525] * 2)
     assert row["region_hausdorff_max"] == pytest.approx(0.3)
-    scaled = regions.compare_regions(regions.make_regions(found, 3, 10.0), regions.make_regions(truth, 3, 10.0))
+    scaled = compare(found, truth, 3, 10.0)
     assert scaled["region_mean"] == pytest.approx(row["region_mean"] / 10), "distances are parts of the size"
-    same = regions.compare_regions(regions.make_regions(truth, 3, 1.0), regions.make_regions(truth, 3, 1.0))
+    same = compare(truth, truth, 3)
     assert same["contacts_missed"] == same["region_hausdorff_max"] == 0
-
-
-def test_region_that_lacks_half():
-    """One region is half of the other: nothing is far from it one way, and the mean the other way is an eighth."""
-    whole, half = make_contacts([(0, (0, 0, 0), (1, 0, 0))]), make_contacts([(0, (0, 0, 0), (0.5, 0, 0))])
-    for found, truth in ((half, whole), (whole, half)):
-        row = regions.compare_regions(regions.make_regions(found, 1, 1.0), regions.make_regions(truth, 1, 1.0))
+    # Nothing is far from the half one way, and the mean the other way is an eighth.
+    whole, half = [(0, (0, 0, 0), (1, 0, 0))], [(0, (0, 0, 0), (0.5, 0, 0))]
+    for row in (compare(half, whole, 1), compare(whole, half, 1)):
         assert row["region_mean"] == pytest.approx(0.125, rel=1e-3)
         assert row["region_hausdorff"] == pytest.approx(0.5, rel=1e-2)
 
@@ -180,25 +138,18 @@ def test_distances_equal_brute_force():
 def test_normals():
     pairs = np.zeros((2, 3), contact_dtypes()[1])
     pairs["count"] = [[1, 1, 0], [2, 1, 1]]
-    pairs["normal"][0] = (1, 0, 0), (0, 0, 1), (np.nan,) * 3
-    pairs["normal"][1] = (0, 1, 0), (0, 0, 1), (0, 0, 1)
+    pairs["normal"] = [[(1, 0, 0), (0, 0, 1), (np.nan,) * 3], [(0, 1, 0), (0, 0, 1), (0, 0, 1)]]
     row = regions.compare_normals(*pairs, np.array([False, True, True]))
     assert row["normal_mean"] == pytest.approx(45) and row["normal_clear_mean"] == pytest.approx(0)
-
-
-def test_resultants():
-    """Normals that agree, that cancel, weighted by length, and a pose without contacts."""
+    # Normals that agree, that cancel, weighted by length, and a pose without contacts.
     contacts = make_contacts([(0, (0, 0, 0), (1, 0, 0)), (0, (0, 0, 0), (3, 0, 0)), (2, (0, 0, 0), (1, 0, 0))])
     contacts["normal"] = (0, 0, 1), (0, 0, -1), (0, 1, 0)
     assert regions.resultants(contacts, 4).tolist() == [0.5, 0, 1, 0]
 
 
-def test_cheapest_level_has_only_finer_ones_within_the_error():
+def test_means_over_workloads():
     rows = [{"share": s, "e": e} for s, e in ((1, 0), (0.5, 0.1), (0.2, 0.3), (0.1, 0.2), (0.01, None))]
     assert [summaries.cheapest(rows, "e", limit)["share"] for limit in (0, 0.1, 0.25, 0.3)] == [1, 0.5, 0.5, 0.1]
-
-
-def test_means_over_workloads():
     rows = [{"workload": name, "value": 1, "poses": 4, "meet": 2, "missed": 1, "invented": 0} for name in "ab"]
     rows[0] |= {"cost": 1.0, "early_max": 0.1, "bound": 1.0}
     rows[1] |= {"cost": 4.0, "early_max": 0.3, "bound": 2.0}

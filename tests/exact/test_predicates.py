@@ -1,150 +1,108 @@
-"""Expansions and signs of all stages against fractions."""
+"""Expansions, and signs of all stages, against fractions."""
 
 from fractions import Fraction
 
 import numpy as np
 import pytest
 import warp as wp
-from helpers.orient import orient2d_kernel, sum_of_product_kernel
-from oracles.signs import COUNT, KINDS, find_signs, random_floats, rounded_signs, true_signs, true_terms
+from helpers.questions import launch
+from oracles.signs import COUNT, KINDS, random_floats, rounded_signs, true_signs, true_terms
 
 from warp_abtree.kernels.arithmetic.double_word import double_orient2d, double_orient3d
 from warp_abtree.kernels.arithmetic.expansion import exact_orient2d, exact_orient3d, two_product, two_sum
-from warp_abtree.kernels.arithmetic.predicates import (
-    EXACT,
-    FILTER,
-    FLOAT32,
-    UNCERTAIN,
-    orient3d,
-    orient_edges,
-)
-from warp_abtree.kernels.triangle.float32_filter import (
-    FLOAT32_UNIT,
-    add_signs,
-    heights_over_plane,
-    one_sided,
-    side_of_plane,
-)
+from warp_abtree.kernels.arithmetic.int128 import integer_orient2d, integer_orient3d
+from warp_abtree.kernels.arithmetic.predicates import UNCERTAIN, orient2d, orient3d, orient_edges
+from warp_abtree.kernels.triangle import float32_filter
+from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, add_signs, heights_over_plane, side_of_plane
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
-wp.set_module_options(MODULE_OPTIONS)
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.kernel
-def two_sum_kernel(a: wp.array(dtype=wp.float64), b: wp.array(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)):
+def words_kernel(a: wp.array[wp.float64], b: wp.array[wp.float64], words_out: wp.array2d[wp.vec2d]):
+    """High and low word of a sum, of a product, and of a sum that invites contraction with the product in it."""
     i = wp.tid()
-    high, low = two_sum(a[i], b[i])
-    out[0, i] = high
-    out[1, i] = low
-
-
-@wp.kernel
-def two_product_kernel(a: wp.array(dtype=wp.float64), b: wp.array(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)):
-    i = wp.tid()
-    high, low = two_product(a[i], b[i])
-    out[0, i] = high
-    out[1, i] = low
-
-
-@wp.kernel
-def orient3d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=wp.int32)):
-    i = wp.tid()
-    out[i] = orient3d(mode, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
-
-
-@wp.kernel
-def orient_edges_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=wp.int32)):
-    i = wp.tid()
-    out[i] = orient_edges(mode, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
-
-
-@wp.kernel
-def expansion3d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=wp.int32)):
-    i = wp.tid()
-    out[i] = exact_orient3d(points[i, 0], points[i, 1], points[i, 2], points[i, 3])
-
-
-@wp.kernel
-def expansion2d_kernel(mode: wp.int32, points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.int32)):
-    i = wp.tid()
-    out[i] = exact_orient2d(points[i, 0], points[i, 1], points[i, 2])
-
-
-@wp.kernel
-def double3d_kernel(points: wp.array2d(dtype=wp.vec3d), out: wp.array(dtype=wp.float64)):
-    i = wp.tid()
-    out[i] = double_orient3d(points[i, 0], points[i, 1], points[i, 2], points[i, 3])
-
-
-@wp.kernel
-def double2d_kernel(points: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.float64)):
-    i = wp.tid()
-    out[i] = double_orient2d(points[i, 0], points[i, 1], points[i, 2])
-
-
-@wp.kernel
-def float32_signs_kernel(
-    error: wp.array(dtype=wp.float32),
-    unit: wp.float32,
-    points: wp.array2d(dtype=wp.vec3),
-    out: wp.array2d(dtype=wp.int32),
-):
-    i = wp.tid()
-    a, b, c, d, e, f = points[i, 0], points[i, 1], points[i, 2], points[i, 3], points[i, 4], points[i, 5]
-    heights, bound = heights_over_plane(error[i], unit, b - a, c - a, a - d, a - e, a - f)
-    signs = add_signs(0, heights, bound)
     for k in range(3):
-        pair = (signs >> (4 - 2 * k)) & 3
-        out[i, k] = wp.where(pair == 2, 1, wp.where(pair == 1, -1, wp.where(bound == 0.0, 0, UNCERTAIN)))
-    out[i, 6] = one_sided(heights, bound)
-    out[i, 3] = side_of_plane(error[i], unit, a, b, c, d)
-    out[i, 4] = side_of_plane(error[i], unit, a, b, c, e)
-    out[i, 5] = side_of_plane(error[i], unit, a, b, c, f)
+        high, low = two_sum(a[i], b[i])
+        if k == 1:
+            high, low = two_product(a[i], b[i])
+        if k == 2:
+            high, low = two_sum(a[i] * b[i], a[i])
+        words_out[i, k] = wp.vec2d(high, low)
 
 
-def apply(kernel, a, b, device):
-    arrays = [wp.array(x, dtype=wp.float64, device=device) for x in (a, b)]
-    out = wp.zeros((2, len(a)), dtype=wp.float64, device=device)
-    wp.launch(kernel, dim=len(a), inputs=arrays, outputs=[out], device=device)
-    return out.numpy()
-
-
-def check_exact(got, expected, rounded):
-    high, low = got
-    np.testing.assert_array_equal(high, rounded)
-    for h, t, x in zip(high.tolist(), low.tolist(), expected):
-        assert Fraction(h) + Fraction(t) == x
-
-
-@pytest.mark.parametrize("kernel", [two_sum_kernel, sum_of_product_kernel], ids=lambda k: k.key)
-def test_two_sum_loses_nothing(device, kernel):
+@pytest.mark.parametrize("kind", ["sum", "product", "sum of product"])
+def test_sums_and_products_lose_nothing(device, kind):
+    """Products where the error is no smaller than float64's grid; whole multiples of 2^-342 are among that."""
     rng = np.random.default_rng(1)
-    a = random_floats(rng, 3000, -500, 450)
-    b = np.concatenate([np.ldexp(a[:2000], rng.integers(-110, 50, 2000)), random_floats(rng, 1000, -500, 450)])
-    b[:1000] *= -rng.uniform(1, 2, 1000)
-    if kernel is two_sum_kernel:
-        extreme = [0.0, -0.0, 5e-324, -5e-324, 2.0**-1022, 1.0, -1.0, np.nextafter(1, 2), 2.0**1022, -(2.0**1022)]
-        x, y = np.meshgrid(extreme, extreme)
-        a, b = np.concatenate([a, x.ravel()]), np.concatenate([b, y.ravel()])
-        first, second = a, b
+    if kind == "product":
+        a, b = random_floats(rng, 3000, -430, 500), random_floats(rng, 3000, -430, 500)
+        a[:500] = rng.integers(-(2**53), 2**53, 500) * 2.0**-342
+        b[:500] = rng.integers(-(2**53), 2**53, 500) * 2.0**-684
+        a[500:510], b[505:515] = 0.0, 0.0
+        rounded, exact = a * b, [Fraction(x) * Fraction(y) for x, y in zip(a.tolist(), b.tolist())]
     else:
-        first, second = a * b, a
-    expected = [Fraction(x) + Fraction(y) for x, y in zip(first.tolist(), second.tolist())]
-    check_exact(apply(kernel, a, b, device), expected, first + second)
+        a = random_floats(rng, 3000, -500, 450)
+        b = np.concatenate([np.ldexp(a[:2000], rng.integers(-110, 50, 2000)), random_floats(rng, 1000, -500, 450)])
+        b[:1000] *= -rng.uniform(1, 2, 1000)
+        if kind == "sum":
+            extreme = [0.0, -0.0, 5e-324, -5e-324, 2.0**-1022, 1.0, -1.0, np.nextafter(1, 2), 2.0**1022, -(2.0**1022)]
+            a, b = np.concatenate([[a, b], np.reshape(np.meshgrid(extreme, extreme), (2, -1))], 1)
+        first, second = (a, b) if kind == "sum" else (a * b, a)
+        rounded, exact = first + second, [Fraction(x) + Fraction(y) for x, y in zip(first.tolist(), second.tolist())]
+    words = launch(words_kernel, device, len(a), a, b, columns=3)
+    high, low = words[:, ["sum", "product", "sum of product"].index(kind)].T
+    np.testing.assert_array_equal(high, rounded)
+    assert [Fraction(h) + Fraction(t) for h, t in zip(high.tolist(), low.tolist())] == exact
 
 
-def test_two_product_loses_nothing(device):
-    """Wherever the error is no smaller than float64's grid; whole multiples of 2^-342 are among that."""
-    rng = np.random.default_rng(2)
-    a, b = random_floats(rng, 3000, -430, 500), random_floats(rng, 3000, -430, 500)
-    a[:500] = rng.integers(-(2**53), 2**53, 500) * 2.0**-342
-    b[:500] = rng.integers(-(2**53), 2**53, 500) * 2.0**-684
-    a[500:510], b[505:515] = 0.0, 0.0
-    expected = [Fraction(x) * Fraction(y) for x, y in zip(a.tolist(), b.tolist())]
-    check_exact(apply(two_product_kernel, a, b, device), expected, a * b)
+STAGES = ("filter", "float32", "exact", "expansion", "integer", "double")  # the first three by their modes
 
 
-# --- signs ------------------------------------------------------------------------------------------------------------
+@wp.kernel
+def stages2d_kernel(points: wp.array2d[wp.vec2d], bound: wp.array[wp.float64], out: wp.array2d[wp.float64]):
+    i = wp.tid()
+    a, b, c = points[i, 0], points[i, 1], points[i, 2]
+    for mode in range(3):
+        out[i, mode] = wp.float64(orient2d(mode, a, b, c))
+    out[i, 3] = wp.float64(exact_orient2d(a, b, c))
+    out[i, 4] = wp.float64(integer_orient2d(a, b, c, bound[i]))
+    out[i, 5] = double_orient2d(a, b, c)[0]
+
+
+@wp.kernel
+def stages3d_kernel(points: wp.array2d[wp.vec3d], bound: wp.array[wp.float64], out: wp.array2d[wp.float64]):
+    i = wp.tid()
+    a, b, c, d = points[i, 0], points[i, 1], points[i, 2], points[i, 3]
+    for mode in range(3):
+        out[i, mode] = wp.float64(orient3d(mode, a, b, c, d))
+    out[i, 3] = wp.float64(exact_orient3d(a, b, c, d))
+    out[i, 4] = wp.float64(integer_orient3d(a, b, c, d, bound[i]))
+    out[i, 5] = double_orient3d(a, b, c, d)[0]
+
+
+@wp.kernel
+def edges_kernel(points: wp.array2d[wp.vec3d], bound: wp.array[wp.float64], out: wp.array2d[wp.float64]):
+    i = wp.tid()
+    for mode in range(3):
+        out[i, mode] = wp.float64(orient_edges(mode, points[i, 0], points[i, 1], points[i, 2], points[i, 3]))
+
+
+FORMS = {"2D": (2, stages2d_kernel), "3D": (3, stages3d_kernel), "edges": (3, edges_kernel)}
+
+
+def ask(device, form, points, bound=None):
+    """Return what each stage says of points, by name."""
+    bound = np.zeros(len(points)) if bound is None else bound
+    return dict(zip(STAGES, launch(FORMS[form][1], device, len(points), points, bound, columns=6).T))
+
+
+def check_filter(found, truth):
+    """Compare the signs that the filter is sure of, and all exact ones; return which the filter is sure of."""
+    sure = found["filter"] != int(UNCERTAIN)
+    np.testing.assert_array_equal(found["filter"][sure], truth[sure])
+    np.testing.assert_array_equal(found["exact"], truth)
+    return sure
 
 
 def nearly_collinear(rng, dim):
@@ -157,41 +115,34 @@ def nearly_collinear(rng, dim):
     return points
 
 
-FORMS = {"2D": (2, orient2d_kernel), "3D": (3, orient3d_kernel), "edges": (3, orient_edges_kernel)}
-EXPANSIONS = {"2D": expansion2d_kernel, "3D": expansion3d_kernel}
 CASES = [(form, kind) for form in FORMS for kind in KINDS] + [("2D", "nearly collinear")]
 # Kinds on which determinants rounded to float64 have a wrong sign.
 ROUNDED_WRONG = {"coplanar", "large coplanar", "nearly collinear"}
 
 
-def check_filter(kernel, points, truth, device):
-    """Compare the signs that the filter is sure of; return which those are."""
-    signs = find_signs(kernel, FILTER, points, device)
-    sure = signs != int(UNCERTAIN)
-    np.testing.assert_array_equal(signs[sure], truth[sure])
-    return sure
-
-
 @pytest.mark.parametrize(("form", "kind"), CASES, ids=map("-".join, CASES))
 def test_signs(device, form, kind):
-    """EXACT and the expansions alone are always right, FILTER wherever it is sure, and 0 is as good as any sign."""
-    dim, kernel = FORMS[form]
-    make = KINDS.get(kind, nearly_collinear)
-    points = make(np.random.default_rng([3, dim]), dim)
-    truth = true_signs(points)
+    """Exact ones are always right, the filter's wherever it is sure, 0 is as good as any; double words keep a bound."""
+    dim, _ = FORMS[form]
+    points = KINDS.get(kind, nearly_collinear)(np.random.default_rng([3, dim]), dim)
+    truth, found = true_signs(points), ask(device, form, points)
     assert len(np.unique(truth)) >= 2
-    np.testing.assert_array_equal(find_signs(kernel, EXACT, points, device), truth)
-    if form in EXPANSIONS:
-        np.testing.assert_array_equal(find_signs(EXPANSIONS[form], 0, points, device), truth)
-    sure = check_filter(kernel, points, truth, device)
+    sure = check_filter(found, truth)
+    if form != "edges":
+        np.testing.assert_array_equal(found["expansion"], truth)
     if kind == "random":
-        assert sure.all()
-        assert (find_signs(kernel, FLOAT32, points, device) == truth).mean() > 0.99
+        assert sure.all() and (found["float32"] == truth).mean() > 0.99
     elif kind in ROUNDED_WRONG:
         wrong = rounded_signs(points) != truth
         assert (wrong.any() and not sure[wrong].any()) or form == "edges", "float64 alone is not good enough here"
     if kind == "nearly collinear":
         assert wrong.mean() > 0.1 and sure.any(), "the points are too easy or too hard"
+    elif form != "edges":
+        for value, rows in zip(found["double"].tolist(), points.tolist()):
+            terms = true_terms(rows)
+            off = abs(Fraction(value) - sum(terms))
+            # The high word alone is returned.
+            assert off <= Fraction(2) ** -53 * abs(Fraction(value)) + 20 * Fraction(2) ** -106 * sum(map(abs, terms))
 
 
 @pytest.mark.parametrize("across", [False, True])
@@ -205,24 +156,9 @@ def test_edges_laid_on_one_another_need_no_more_than_float64(device, across, sha
         second[:, 0] = first[:, 0]
     points = np.concatenate([first, second[:, ::-1] if across else second], 1)
     truth = true_signs(points)
-    sure = check_filter(orient_edges_kernel, points, truth, device)
-    np.testing.assert_array_equal(find_signs(orient_edges_kernel, EXACT, points, device), truth)
+    sure = check_filter(ask(device, "edges", points), truth)
     assert (truth == 0).all() == shared and sure.mean() >= (1.0 if shared else 0.97)
-    assert shared or (find_signs(orient3d_kernel, FILTER, points, device) != int(UNCERTAIN)).mean() < 0.3
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("kind", KINDS)
-def test_double_words_keep_their_bound(device, kind, dim):
-    points = KINDS[kind](np.random.default_rng([6, dim]), dim)
-    out = wp.zeros(len(points), dtype=wp.float64, device=device)
-    kernel, dtype = (double3d_kernel, wp.vec3d) if dim == 3 else (double2d_kernel, wp.vec2d)
-    wp.launch(kernel, len(points), [wp.array(points, dtype=dtype, device=device), out], device=device)
-    for value, rows in zip(out.numpy().tolist(), points.tolist()):
-        terms = true_terms(rows)
-        off = abs(Fraction(value) - sum(terms))
-        # The high word alone is returned.
-        assert off <= Fraction(2) ** -53 * abs(Fraction(value)) + 20 * Fraction(2) ** -106 * sum(map(abs, terms))
+    assert shared or (ask(device, "3D", points)["filter"] != int(UNCERTAIN)).mean() < 0.3
 
 
 def test_the_filter_is_tight(device):
@@ -230,19 +166,74 @@ def test_the_filter_is_tight(device):
     rng = np.random.default_rng(5)
     points = rng.normal(size=(2000, 4, 3))
     points[:, 3] = points[:, :3].mean(1) + 1e-12 * rng.normal(size=(2000, 3))
-    assert (find_signs(orient3d_kernel, FILTER, points, device) != int(UNCERTAIN)).mean() > 0.95
+    assert (ask(device, "3D", points)["filter"] != int(UNCERTAIN)).mean() > 0.95
 
 
-# --- float32, the first stage ----------------------------------------------------------------------------------------
+def unit_of(rows):
+    """Return the power of two that a determinant is a whole multiple of, None where a row is 0."""
+    *rows, last = [[Fraction(x) for x in row] for row in rows]
+    powers = [
+        [(x.numerator & -x.numerator).bit_length() - x.denominator.bit_length() for x in [*row, *last] if x != 0]
+        for row in rows
+    ]
+    return sum(map(min, powers)) if all(powers) else None
+
+
+def spread_points(rng, dim):
+    """The first row is a large power of two times a sum of the others, less the last point, which rounds nothing."""
+    last = rng.integers(-9, 10, (COUNT, 1, dim)).astype(float)
+    rows = rng.integers(-9, 10, (COUNT, dim - 1, dim)).astype(float)
+    first = (rng.integers(-9, 10, (COUNT, dim - 1, 1)) * rows).sum(1, keepdims=True)
+    return np.concatenate([first * 2.0 ** rng.integers(60, 200, (COUNT, 1, 1)), rows + last, last], 1)
+
+
+@pytest.mark.parametrize("share", [1, 4])
+@pytest.mark.parametrize("form", ["2D", "3D"])
+@pytest.mark.parametrize("kind", [*KINDS, "spread"])
+@pytest.mark.slow
+def test_integers_tell_small_determinants(device, kind, form, share):
+    """Right wherever they tell a sign of one within four times a bound, which they do within 2^122 units."""
+    points = KINDS.get(kind, spread_points)(np.random.default_rng([7, FORMS[form][0]]), FORMS[form][0])
+    values = [sum(true_terms(rows)) for rows in points.tolist()]
+    # No larger than the bound, or than 4 times the bound.
+    bound = [float(abs(x)) / share for x in values]
+    bound = [np.nextafter(b, np.inf) if 4 * Fraction(b) < abs(x) or b == 0 else b for x, b in zip(values, bound)]
+    told = 0
+    for rows, value, b, sign in zip(points.tolist(), values, bound, ask(device, form, points, bound)["integer"]):
+        assert sign in ((value > 0) - (value < 0), int(UNCERTAIN))
+        unit = unit_of(rows)
+        small = unit is None or Fraction(b) < Fraction(2) ** (unit + 122)
+        assert sign != int(UNCERTAIN) or not small
+        told += small
+    assert told > 3 or kind == "random"
+
+
+@pytest.mark.parametrize("form", ["2D", "3D"])
+def test_integers_leave_what_is_no_number(device, form):
+    dim, _ = FORMS[form]
+    points = np.tile(np.eye(dim + 1, dim), (4, 1, 1))
+    points[1, 0, 0], points[2, dim, 1] = np.nan, np.inf
+    found = ask(device, form, points, np.array([1.0, 1.0, 1.0, np.inf]))["integer"]
+    assert found.tolist() == [1, *[int(UNCERTAIN)] * 3]
+
+
+@wp.kernel
+def float32_kernel(unit: wp.float32, error: wp.array[wp.float32], points: wp.array2d[wp.vec3], out: wp.array2d[int]):
+    """Signs of three points against a plane at once, one by one, and whether all are on one side."""
+    i = wp.tid()
+    a, b, c, d, e, f = points[i, 0], points[i, 1], points[i, 2], points[i, 3], points[i, 4], points[i, 5]
+    heights, bound = heights_over_plane(error[i], unit, b - a, c - a, a - d, a - e, a - f)
+    signs = add_signs(0, heights, bound)
+    for k in range(3):
+        pair = (signs >> (4 - 2 * k)) & 3
+        out[i, k] = wp.where(pair == 2, 1, wp.where(pair == 1, -1, wp.where(bound == 0.0, 0, UNCERTAIN)))
+        out[i, 3 + k] = side_of_plane(error[i], unit, a, b, c, points[i, 3 + k])
+    out[i, 6] = float32_filter.one_sided(heights, bound)
 
 
 def float32_signs(error, unit, points, device):
     """Return signs (count, 6) of three points against a plane, all at once and one by one; points [count, 6, 3]."""
-    out = wp.zeros((len(points), 7), dtype=wp.int32, device=device)
-    error = wp.array(error, dtype=wp.float32, device=device)
-    points = wp.array(points.astype(np.float32), dtype=wp.vec3, device=device)
-    wp.launch(float32_signs_kernel, len(points), [error, float(unit), points, out], device=device)
-    signs = out.numpy()
+    signs = launch(float32_kernel, device, len(points), float(unit), error, points.astype(np.float32), columns=7)
     np.testing.assert_array_equal(signs[:, 6] < 0, np.abs(signs[:, :3].sum(1)) == 3)
     return signs[:, :6]
 
@@ -253,6 +244,14 @@ def float32_points(rng, kind):
     points = np.concatenate([points, points[:, 3:] + 1e-3 * rng.normal(size=points[:, 3:].shape), points[:, :1]], 1)
     points -= points[:, :1] + 1e-2 * rng.normal(size=(COUNT, 1, 3))
     return points / np.maximum(1e-200, np.abs(points).max((1, 2), keepdims=True))
+
+
+def check_sides(error, points, truth, device):
+    """Compare the signs that float32 is sure of; return which those are."""
+    signs = float32_signs(error, FLOAT32_UNIT, points, device)
+    sure = signs != int(UNCERTAIN)
+    np.testing.assert_array_equal(signs[sure], truth[sure])
+    return sure
 
 
 def true_sides(points):
@@ -266,23 +265,19 @@ def test_float32_filter_is_right_where_it_is_sure(device, kind, off):
     rng = np.random.default_rng(7)
     points = float32_points(rng, kind)
     normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])[:, None]
-    height = rng.choice([0.0, 0.5, 1.0, 2.0, 4.0], (COUNT, 1, 1)) * off * np.sign(normal)
-    points[:, 3:] += height
+    points[:, 3:] += rng.choice([0.0, 0.5, 1.0, 2.0, 4.0], (COUNT, 1, 1)) * off * np.sign(normal)
     truth = true_sides(points)
-    worst = np.concatenate([np.sign(normal) * np.ones((1, 3, 1)), -np.sign(normal) * np.ones((1, 3, 1))], 1)
+    worst = np.sign(normal) * np.repeat([1.0, -1.0], 3)[:, None]
     shift = np.where(rng.random((COUNT, 1, 1)) < 0.5, worst, rng.uniform(-1, 1, points.shape)) * off
     moved = (points + shift).astype(np.float32)
     error = 2.02 * np.abs(moved - points).max((1, 2))
-    signs = float32_signs(error, FLOAT32_UNIT, moved, device)
-    sure = signs != int(UNCERTAIN)
-    np.testing.assert_array_equal(signs[sure], truth[sure])
+    sure = check_sides(error, moved, truth, device)
     plain = float32_signs(0 * error, FLOAT32_UNIT, moved, device)
     if kind != "random":
         assert (plain != truth)[plain != int(UNCERTAIN)].any(), "coordinates that are off must be reckoned with here"
     elif off < 1e-6:
         assert sure[:, [0, 1, 3, 4]].mean() > 0.98, "the sixth point lies in the plane but for the shift"
-    far = float32_signs(np.full(COUNT, np.inf), FLOAT32_UNIT, moved, device)
-    assert (far == int(UNCERTAIN)).all()
+    assert (float32_signs(np.full(COUNT, np.inf), FLOAT32_UNIT, moved, device) == int(UNCERTAIN)).all()
 
 
 @pytest.mark.parametrize("kind", ["random", "coplanar", "large coplanar"])
@@ -290,9 +285,7 @@ def test_float32_filter_covers_its_own_rounding(device, kind):
     """Coordinates that float32 holds exactly: only the arithmetic rounds."""
     points = float32_points(np.random.default_rng(8), kind).astype(np.float32).astype(float)
     truth = true_sides(points)
-    signs = float32_signs(np.zeros(COUNT), FLOAT32_UNIT, points, device)
-    sure = signs != int(UNCERTAIN)
-    np.testing.assert_array_equal(signs[sure], truth[sure])
+    check_sides(np.zeros(COUNT), points, truth, device)
     plain = float32_signs(np.zeros(COUNT), 0.0, points, device)
     assert (plain != int(UNCERTAIN)).all()
     assert (plain != truth).any() == (kind != "random"), "float32 alone is good enough for points at random only"

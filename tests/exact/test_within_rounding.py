@@ -1,7 +1,6 @@
 """What a proof of distance allows for: its own rounding, poses that round, and frames that are not orthonormal.
 
-Each case names two points, one of either surface, and their distance in fractions, so no pair is farther apart than the
-least float64 over it.
+Each case names two points, one of either surface: no pair is farther apart than the least float64 over their distance.
 """
 
 import math
@@ -10,6 +9,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import warp as wp
+from helpers.questions import ask, launch
 from helpers.samples import random_quaternions
 
 import warp_abtree as ab
@@ -39,17 +39,11 @@ def distance_over(p, q):
     return d
 
 
-# --- gaps of triangles -----------------------------------------------------------------------------------------------
-
-
 @wp.kernel
-def find_near_kernel(
-    distance: wp.array(dtype=wp.float64), corners: wp.array2d(dtype=wp.vec3d), near_out: wp.array(dtype=wp.int32)
-):
+def near_kernel(distance: wp.array[wp.float64], corners: wp.array2d[wp.vec3d], near_out: wp.array[int]):
     i = wp.tid()
-    near_out[i] = triangles_near(
-        distance[i], corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
-    )
+    a, b, c, d, e, f = corners[i, 0], corners[i, 1], corners[i, 2], corners[i, 3], corners[i, 4], corners[i, 5]
+    near_out[i] = triangles_near(distance[i], a, b, c, d, e, f)
 
 
 def over_a_face(rng, height):
@@ -70,43 +64,27 @@ def over_a_face(rng, height):
 def test_gaps_allow_for_their_own_rounding(device, height):
     rng = np.random.default_rng(1)
     corners, distances = zip(*[over_a_face(rng, height) for _ in range(60)])
-    near = wp.zeros(len(corners), dtype=wp.int32, device=device)
-    inputs = [
-        wp.array(distances, dtype=wp.float64, device=device),
-        wp.array(np.array(corners), dtype=wp.vec3d, device=device),
-    ]
-    wp.launch(find_near_kernel, len(corners), inputs, [near], device=device)
-    assert near.numpy().all()
+    corners, distances = np.array(corners), np.array(distances)
+    assert launch(near_kernel, device, 60, distances, corners).all()
     # And for no more than that: a little less than the distance is proved.
-    inputs[0] = wp.array(np.array(distances) * (1 - 1e-4) - 2.0**-44, dtype=wp.float64, device=device)
-    wp.launch(find_near_kernel, len(corners), inputs, [near], device=device)
-    assert not near.numpy().any()
-
-
-# --- poses -----------------------------------------------------------------------------------------------------------
+    assert not launch(near_kernel, device, 60, distances * (1 - 1e-4) - 2.0**-44, corners).any()
 
 
 def turn_of(quaternion):
     """Return the rotation of a quaternion, normalised, in fractions."""
     x, y, z, w = fractions(quaternion)
     s = 2 / (x * x + y * y + z * z + w * w)
-    return np.array(
-        [
-            [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
-            [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
-            [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
-        ]
-    )
+    first = 1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)
+    second = s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)
+    return np.array([first, second, (s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y))])
 
 
-def is_apart(device, faces_a, poses_a, faces_b, poses_b, distances):
-    """Return which pairs of single faces are proved farther apart than their distances."""
-    scene = ab.Scene(device)
-    for a, pose_a, b, pose_b in zip(faces_a, poses_a, faces_b, poses_b, strict=True):
-        scene.add(ab.Model.from_arrays(a, FACE), pose_a)
-        scene.add(ab.Model.from_arrays(b, FACE), pose_b)
-    pairs = np.arange(2 * len(distances)).reshape(-1, 2)
-    return scene.intersect(pairs, output="any", within=distances).apart
+def is_apart(device, faces, poses, distances):
+    """Return which pairs of single faces, of A and of B, are proved farther apart than their distances."""
+    models = [[ab.Model.from_arrays(face, FACE) for face in of_one] for of_one in faces]
+    nones = [None] * len(distances)
+    cases = list(zip(models[0], nones, poses[0], models[1], nones, poses[1], strict=True))
+    return ask(device, cases, output="any", within=distances).apart
 
 
 @pytest.mark.parametrize(("far_a", "far_b"), [(0.0, 2.0**30), (2.0**30, 0.0), (2.0**30, 2.0**30)])
@@ -132,7 +110,7 @@ def test_distances_allow_for_poses_that_round(device, far_a, far_b):
             faces[k].append(place[k] + away)
             poses[k].append(np.concatenate([shift[k], q[k]]))
         distances.append(distance_over(world, point))
-    assert not is_apart(device, faces[0], poses[0], faces[1], poses[1], distances).any()
+    assert not is_apart(device, faces, poses, distances).any()
 
 
 def stretched(x, stretch):
@@ -157,14 +135,12 @@ def test_distances_allow_for_frames_off_orthonormal(device, case):
     spread = 2.0**-12 * np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
     a, b = np.array([place, 0.0, 0.0]) - spread, spread
     poses = stretched(0.0, stretch_a), stretched(start, stretch_b)
-    apart = is_apart(device, [a] * 2, [poses[0]] * 2, [b] * 2, [poses[1]] * 2, [distance, 0.5 * distance])
+    apart = is_apart(device, ([a] * 2, [b] * 2), ([poses[0]] * 2, [poses[1]] * 2), [distance, 0.5 * distance])
     np.testing.assert_array_equal(apart, [False, case != "A's face is moved"])
 
 
 @wp.kernel
-def near_leaves_kernel(
-    within: wp.float64, models: ModelPool, states: StatePool, objects: ObjectPool, overlap_out: wp.array(dtype=wp.int32)
-):
+def leaves_kernel(within: wp.float64, models: ModelPool, states: StatePool, objects: ObjectPool, out: wp.array[int]):
     """Compare the box of each of A's two faces with B's."""
     i = wp.tid()
     pose = pair_pose(True, models, states, objects, 0, 1, within)
@@ -172,7 +148,7 @@ def near_leaves_kernel(
     b = load_node(states, pose.node_b + 1)
     posed_a = pose_box(a.lower, a.upper, wp.transpose(pose.rotation32), pose.back32, pose.margin)
     posed_b = pose_box(b.lower, b.upper, pose.rotation32, pose.translation32, pose.margin)
-    overlap_out[i] = wp.where(boxes_overlap(posed_a, posed_b), 1, 0)
+    out[i] = wp.where(boxes_overlap(posed_a, posed_b), 1, 0)
 
 
 def test_widened_boxes_allow_for_frames_off_orthonormal(device):
@@ -181,13 +157,9 @@ def test_widened_boxes_allow_for_frames_off_orthonormal(device):
     scene = ab.Scene(device)
     scene.add(ab.Model.from_arrays(np.concatenate([1 - spread, spread - 1]), [[0, 1, 2], [3, 4, 5]]))
     scene.add(ab.Model.from_arrays(spread - 2.0**-21, FACE))
-    models, states, objects = (
-        part.pool for part in (scene.batch().models, scene.batch().states, scene.batch().objects)
-    )
+    pools = scene.batch().pools
     third, across = np.ones(3) / np.sqrt(3.0), np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0)
     turn = np.stack([third, across, np.cross(third, across)], 1) * (1 + 2.0**-12)
-    objects.rotation.assign(np.stack([np.eye(3), turn]))
-    overlap = wp.zeros(2, dtype=wp.int32, device=device)
+    pools[2].rotation.assign(np.stack([np.eye(3), turn]))
     for within, expected in ((math.sqrt(3.0), 1), (0.99 * math.sqrt(3.0), 0)):
-        wp.launch(near_leaves_kernel, 2, [within, models, states, objects], [overlap], device=device)
-        assert overlap.numpy().tolist() == [expected] * 2
+        assert launch(leaves_kernel, device, 2, within, *pools).tolist() == [expected] * 2

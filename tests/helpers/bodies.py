@@ -8,7 +8,6 @@ import trimesh
 import warp_abtree as ab
 
 FLOOR = (0, 0, -0.5, 0, 0, 0, 1)
-NO_GRAVITY = {"gravity": (0, 0, 0)}
 
 
 def model_of(mesh):

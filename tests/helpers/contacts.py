@@ -8,19 +8,15 @@ from oracles.triangle import cross, dot, sub
 CHUNK = 32  # contacts that are summed from left to right before sums are; part of the definition
 
 
-def exact(triangle):
-    return [tuple(Fraction(float(x)) for x in p) for p in triangle]
-
-
-def exact_normal(t):
-    a, b, c = exact(t)
+def exact_normal(triangle):
+    a, b, c = ([Fraction(x) for x in p] for p in np.asarray(triangle).tolist())
     return cross(sub(b, a), sub(c, a))
 
 
 def lies_in_plane(b, a):
     """Whether triangle B lies in the plane of A; of any that has no area, always."""
-    normal = exact_normal(a)
-    return all(dot(normal, sub(p, exact(a)[0])) == 0 for p in exact(b))
+    origin = [Fraction(x) for x in a[0].tolist()]
+    return all(dot(exact_normal(a), sub([Fraction(x) for x in p], origin)) == 0 for p in b.tolist())
 
 
 def unit(v):
@@ -30,9 +26,6 @@ def unit(v):
         return np.zeros(3)
     v = np.array([float(x / scale) for x in v])
     return v / np.linalg.norm(v)
-
-
-# Sums over an object pair's contacts in their stated order, in plain Python.
 
 
 def scaled(v):
@@ -48,16 +41,8 @@ def length(v):
 
 def summed(terms):
     """Sum chunks of terms from left to right, then their sums."""
-    sums = []
-    for k in range(0, len(terms), CHUNK):
-        total = terms[0] * 0.0
-        for term in terms[k : k + CHUNK]:
-            total = total + term
-        sums.append(total)
-    total = terms[0] * 0.0
-    for part in sums:
-        total = total + part
-    return total
+    zero = terms[0] * 0.0
+    return sum((sum(terms[k : k + CHUNK], zero) for k in range(0, len(terms), CHUNK)), zero)
 
 
 def summary(rows):

@@ -1,17 +1,14 @@
-"""Faults injected into a device, memory that ends and steps that raise; scenes to inject them into, and checks after.
-
-Every step of a call fails in turn, on what is made anew each time.
-"""
+"""Faults injected into a device, memory that ends and steps that raise; scenes to inject them into, and checks."""
 
 import re
 import threading
+from contextlib import contextmanager
 
 import numpy as np
 import warp as wp
 
 import warp_abtree as ab
-from helpers.samples import random_poses, sample
-from helpers.scenes import everything
+from helpers import scenes
 from warp_abtree.kernels.contact.summary import CHUNK
 from warp_abtree.query.contacts import VECTORS
 from warp_abtree.state.arrays import SLOT_COLUMNS
@@ -22,23 +19,15 @@ MORE_PAIRS = np.array([(i, j) for i in range(4) for j in range(4) if i != j])
 
 def describe(result):
     """Return results, LOD statistics or arrays as comparable bytes."""
-    if isinstance(result, ab.Result):
-        values = [result.pairs, result.any, result.count, result.faces, result.apart]
-        values += [result.contacts, result.pair_contacts]
-    elif hasattr(result, "nodes_refitted"):
-        values = [result.state, result.lod, result.full, result.k, result.nodes_refitted]
-    else:
-        values = [result]
+    names = ("pairs", "any", "count", "faces", "apart", "contacts", "pair_contacts")
+    if hasattr(result, "nodes_refitted"):
+        names = ("state", "lod", "full", "k", "nodes_refitted")
+    values = [result] if isinstance(result, np.ndarray) or result is None else [getattr(result, n) for n in names]
     return [None if value is None else np.asarray(value).tobytes() for value in values]
 
 
-def add_objects(device, count=4):
-    scene = ab.Scene(device)
-    poses = random_poses(np.random.default_rng(1), count, 0.4)
-    for i in range(count):
-        model = sample(("small ball", "torus")[i % 2])
-        scene.add(model, poses[i], lod=model.lod_for(fraction=(0.4, 0.2)[i % 2]))
-    return scene
+def add_objects(device):
+    return scenes.add_objects(device, ("small ball", "torus") * 2, seed=1, spread=0.4, fractions=(0.4, 0.2))
 
 
 def make_scene(device):
@@ -60,8 +49,8 @@ def check_scene(before, scene):
     """Return all that a scene holds and answers, or check that it still does."""
     states = scene.batch().states.pool
     now = [getattr(states, name).numpy().tobytes() for name in SLOT_COLUMNS]
-    now += [*everything(scene), *answers(scene)]
-    assert before is None or now == before
+    now += [*scenes.everything(scene), *answers(scene)]
+    assert before in (None, now)
     return now
 
 
@@ -69,61 +58,58 @@ def check_answers(before, scene):
     """Return all that a scene answers, or check that it still does; states may have moved in the pool."""
     objects = scene.batch().objects.pool
     now = [scene.lods, *answers(scene), scene.broad_phase(), objects.rotation.numpy(), objects.position.numpy()]
-    for i in range(scene.object_count):
-        state = scene.tree_state(i)
+    for state in map(scene.tree_state, range(scene.object_count)):
         now += [state.lod, state.status, state.lower, state.upper, state.skip]
     now = [np.asarray(value).tobytes() for value in now]
-    assert before is None or now == before
+    assert before in (None, now)
     return now
 
 
 def check_buffer_lengths(queries):
     """Check that all arrays with an entry a pair or a contact are of one length, or kernels write past an end."""
     for query in queries:
-        rooms = [query.pair_poses]
+        rooms = [query.pairs, query.pair_poses]
         for hits in (query.hits, query.near):
             if hits is not None:
                 rooms += [hits.any_hit, hits.count, hits.node_tests, hits.triangle_tests, hits.exact_tests]
-        if query.near is not None:
-            rooms.append(query.within)
-        if query.broad_phase is not None:
-            rooms.append(query.broad_phase.pairs)
+        rooms += [] if query.near is None else [query.within]
+        rooms += [] if query.broad_phase is None else [query.broad_phase.pairs]
         if isinstance(query, ab.ContactQuery):
             means, sums, contacts = query.pair_contacts, query._sums, query.contacts
             rooms += [means.point, means.normal, means.depth, sums.total, sums.middle, query.start[1:]]
-            places = [query.faces, *(getattr(contacts, name) for name in (*VECTORS, "coplanar"))]
-            places += [query._key[::2], query._order[::2]]
-            assert {len(array) for array in places} == {len(query.hits.face)}
+            places = [query.hits.face, query.faces, *(getattr(contacts, name) for name in (*VECTORS, "coplanar"))]
+            assert len({len(array) for array in (*places, query._key[::2], query._order[::2])}) == 1
             chunks = [sums.point, sums.normal, sums.length, sums.area, sums.change, sums.front, sums.back, sums.span]
             assert {len(array) for array in chunks} == {len(query.hits.face) // int(CHUNK) + len(query.pairs)}
-        assert {len(room) for room in rooms} == {len(query.pairs)}
+        assert len({len(room) for room in rooms}) == 1
+
+
+@contextmanager
+def refusing(*sentences, kind=RuntimeError):
+    """Allow an error that says one of some sentences, and no other."""
+    try:
+        yield
+    except kind as error:
+        assert any(sentence in str(error) for sentence in sentences), error
 
 
 SHORTAGE = r"Failed to allocate \d+ bytes on device '{}'"
 
 
 class Fault:
-    """Fails at a chosen step of a call; subclasses say what a step is and how it fails."""
+    """Fails at a chosen step of a call; subclasses say what a step is, how it fails, and what it leaves unchanged.
+
+    `inject` returns (failed, result) of a call whose steps fail after so many of them.
+    """
 
     def __init__(self, device):
         self.device = device
         self.left = None
 
-    def inject(self, call, count):
-        """Return (failed, result) of a call whose steps fail after `count` of them."""
-        raise NotImplementedError
-
-    def check_scene(self, before, scene):
-        """Return what a fault must leave unchanged in a scene, or check that it is still so."""
-        raise NotImplementedError
-
     def everywhere(self, make, call, check):
-        """Repeat a call on what is made anew, its first, second, third ... step failing, until it succeeds.
+        """Repeat call(make()), its first, second, third ... step failing, until it succeeds.
 
-        Args:
-            make: Returns what the call is made on.
-            call: Called as call(made).
-            check: Called as check(before, made) after each failure; with before None it returns what must not change.
+        After each failure check(before, made) is called; with None for `before` it returns what must not change.
 
         Returns:
             How many steps there are, and what the call returned without a fault.
@@ -168,8 +154,7 @@ class MemoryShortage(Fault):
         finally:
             self.left = None
 
-    def check_scene(self, before, scene):
-        return check_scene(before, scene)
+    check_scene = staticmethod(check_scene)
 
     def check_retry(self, made, make, call):
         """A call that failed once gives what it gives on a scene that saw no failure."""
@@ -210,8 +195,7 @@ class Interruption(Fault):
         finally:
             self.left = None
 
-    def check_scene(self, before, scene):
-        return check_answers(before, scene)
+    check_scene = staticmethod(check_answers)
 
 
 FAULTS = {"memory": MemoryShortage, "interruption": Interruption}

@@ -1,10 +1,9 @@
-"""Jobs of poses and of worlds, the folders that they write, and a job of made-up columns."""
+"""Jobs of poses, the folders that they write, and a job of made-up columns."""
 
 import numpy as np
 
 import warp_abtree as ab
 from helpers.samples import STILL, random_poses, sample
-from warp_abtree.app import load_scene
 from warp_abtree.jobs import SweepJob, ThisProcess, read_shards, run_shards
 
 MODELS = ("torus", "small ball")
@@ -83,35 +82,3 @@ class ColumnJob:
     def run(self, task, device=None):
         rows = (self.size * (task[1] - task[0]),) * 2 if self.rows is None else self.rows
         return {"count": np.arange(rows[0]), "more": np.arange(rows[1])}
-
-
-WORLDS = """
-[models.ring]
-shape = "torus"
-major_radius = 0.5
-minor_radius = 0.2
-major_sections = 16
-minor_sections = 10
-[models.floor]
-shape = "box"
-extents = [4, 0.5, 4]
-{dynamics}
-[[objects]]
-model = "floor"
-position = [0, -0.25, 0]
-world = -1
-static = true
-[[objects]]
-model = "ring"
-count = 3
-grid = {{ size = [1, 0, 1], spacing = [0.6, 0.35, 0.6] }}
-position = [0, 0.15, 0]
-worlds = 5
-random = {{ position = [0.2, 0, 0.2], rotation = true, turn = 60, velocity = 0.5 }}
-{rest}
-"""
-
-
-def load_worlds(tmp_path, dynamics="", rest="", name="scene.toml"):
-    (tmp_path / name).write_text(WORLDS.format(dynamics=dynamics, rest=rest))
-    return load_scene(tmp_path / name, device="cpu")

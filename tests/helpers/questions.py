@@ -1,26 +1,39 @@
-"""Queries as plain functions, and poses that float64 holds exactly."""
+"""Queries and kernels as plain functions, and poses that float64 holds exactly."""
 
 import itertools
 from functools import cache
 
 import numpy as np
+import warp as wp
 
 import warp_abtree as ab
 from helpers.samples import contact_poses, sample
 from warp_abtree import testing
 
-QUARTERS = [
-    np.eye(3)[list(order)] * np.array(signs)[:, None]
-    for order in itertools.permutations(range(3))
-    for signs in itertools.product((1.0, -1.0), repeat=3)
-    if np.linalg.det(np.eye(3)[list(order)] * np.array(signs)[:, None]) > 0
-]
+SIGNS = itertools.product((1.0, -1.0), repeat=3)
+QUARTERS = [np.eye(3)[[*order]] * np.array([signs]).T for signs in SIGNS for order in itertools.permutations(range(3))]
+QUARTERS = [turn for turn in QUARTERS if np.linalg.det(turn) > 0]
 
 
 def GpuQuery(*arguments, **options):
     """Return a query that takes the CUDA regime on every device."""
     with testing.regime(warps=True):
         return ab.Query(*arguments, **options)
+
+
+def launch(kernel, device, shape, *inputs, columns=0):
+    """Launch a kernel with a thread for each entry of a shape; return its last argument, so many columns for each.
+
+    Arrays of NumPy, and lists, become Warp's, of the types that the kernel names.
+    """
+    types, given = [argument.type for argument in kernel.adj.args], []
+    for value, kind in zip(inputs, types):
+        given.append(
+            wp.array(value, dtype=kind.dtype, device=device) if isinstance(value, (list, np.ndarray)) else value
+        )
+    out = wp.zeros((shape, columns) if columns else shape, dtype=types[-1].dtype, device=device)
+    wp.launch(kernel, shape, [*given, out], device=device)
+    return out.numpy()
 
 
 def sort_rows(rows):

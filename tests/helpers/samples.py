@@ -95,9 +95,7 @@ def sample(name, base_faces=4):
         return ab.Model.from_arrays(*SHAPES[name](), base_faces=base_faces, name=name)
     if name in WARP_MESHES:
         pytest.importorskip("pxr")
-        mesh = load_mesh(name)
-    else:
-        mesh = load_mesh(real_mesh_path(name))
+    mesh = load_mesh(name if name in WARP_MESHES else real_mesh_path(name))
     exponent = np.frexp(np.ptp(mesh.vertices, axis=0).max())[1] - 1
     return ab.Model.from_arrays(np.ldexp(mesh.vertices, -exponent), mesh.faces, base_faces=base_faces, name=name)
 
@@ -129,23 +127,26 @@ def contact_poses(rng, model_a, lod_a, model_b, lod_b, spread=1.0):
 
 def true_faces(model_a, lod_a, pose_a, model_b, lod_b, pose_b):
     """All intersecting (face of A, face of B) by exact brute force, as original face indices, sorted; A comes first."""
-    vertices_a, faces_a, ids_a = model_a.mesh_at(lod_a)
-    vertices_b, faces_b, ids_b = model_b.mesh_at(lod_b)
-    hits = brute_force_faces(vertices_a, faces_a, vertices_b, faces_b, pose_a, pose_b)
+    (*mesh_a, ids_a), (*mesh_b, ids_b) = model_a.mesh_at(lod_a), model_b.mesh_at(lod_b)
+    hits = brute_force_faces(*mesh_a, *mesh_b, pose_a, pose_b)
     return np.stack([ids_a[hits[:, 0]], ids_b[hits[:, 1]]], 1)
 
 
 def stored_state(scene_models, batch, state):
-    """Return the bytes of a tree state: float32 boxes as stored, not as `tree_state` widens them."""
+    """Return a tree state as it is stored, not with boxes as `tree_state` widens them."""
     states = batch.states
     slot = states.slots[state]
     model = scene_models[slot.model]
     nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
+    marked = np.unpackbits(states.pool.node_mark.numpy().view(np.uint8), bitorder="little")[nodes]
+    lower, upper, skip = states.read_nodes(slot, model.tree.node_count)
     corners = states.pool.face_corner.numpy()[slot.face_start : slot.face_start + model.face_count, :3]
     return {
         "lod": int(states.pool.lod.numpy()[state]),
-        "status": states.pool.node_status.numpy()[nodes],
-        **dict(zip(("lower", "upper", "skip"), states.read_nodes(slot, model.tree.node_count))),
+        "status": np.where(marked, 2, skip >= 0).astype(np.int32),
+        "lower": lower,
+        "upper": upper,
+        "skip": skip,
         "corner": np.where(corners < 0, -1, corners - batch.models.vertex_start[slot.model]),
     }
 

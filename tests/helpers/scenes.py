@@ -30,10 +30,12 @@ def everything(scene):
     return [np.asarray(value).tobytes() for value in held]
 
 
-def add_objects(device, names=CROWD, seed=0, spread=0.6, **options):
+def add_objects(device, names=CROWD, seed=0, spread=0.6, fractions=(1.0,)):
+    """Return a scene of samples at random poses, with fractions of their faces, which repeat."""
     scene = ab.Scene(device)
-    for name, pose in zip(names, random_poses(np.random.default_rng(seed), len(names), spread)):
-        scene.add(sample(name), pose, **options)
+    for i, pose in enumerate(random_poses(np.random.default_rng(seed), len(names), spread)):
+        model = sample(names[i])
+        scene.add(model, pose, lod=model.lod_for(fraction=fractions[i % len(fractions)]))
     return scene
 
 
@@ -74,14 +76,10 @@ def check_states(frame, scene):
 def by_pair(result):
     """Return a result's answers with its pairs in order, each a NumPy array."""
     order = np.lexsort((result.pairs[:, 1], result.pairs[:, 0]))
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    values = {"pairs": result.pairs[order], "any": result.any[order]}
-    for name in ("count", "apart", "pair_contacts"):
-        if getattr(result, name) is not None:
-            values[name] = getattr(result, name)[order]
+    values = {name: getattr(result, name) for name in ("pairs", "any", "count", "apart", "pair_contacts")}
+    values = {name: value[order] for name, value in values.items() if value is not None}
     if result.faces is not None:
-        faces = np.concatenate([rank[result.faces[:, :1]], result.faces[:, 1:]], 1)
+        faces = np.concatenate([np.argsort(order)[result.faces[:, :1]], result.faces[:, 1:]], 1)
         rows = np.lexsort((faces[:, 2], faces[:, 1], faces[:, 0]))
         values["faces"] = faces[rows]
         if result.contacts is not None:

@@ -1,5 +1,6 @@
 """Models, scene files and playbacks that tests of applications use, and a runner of commands."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -57,13 +58,14 @@ def write_scene(folder, text=SCENE):
     return path
 
 
+@cache
 def make_models():
     return [ab.Model.load(trimesh.creation.icosphere(2)), ab.Model.load(trimesh.creation.torus(1.0, 0.3, 24, 12))]
 
 
-def make_playback(models, device):
+def make_playback(device):
     """Return a ball in a turned ring, and another ball that meets the ring."""
-    half = 0.5**0.5
+    models, half = make_models(), 0.5**0.5
     poses = [(0, 0, 0, 0, 0, 0, 1), (0.6, 0.1, 0, half, 0, 0, half), (2.1, 0.2, 0.1, 0, 0, 0, 1)]
     chosen = [models[0], models[1], models[0]]
     return MeshPlayback(chosen, poses, [model.lod_max for model in chosen], device)

@@ -20,22 +20,18 @@ from trimesh.transformations import translation_matrix as shift
 
 def shapes():
     """Convex solids, surfaces with holes, an open sheet, and one of several parts."""
-    rng = np.random.default_rng(0)
-    ball, box = trimesh.creation.icosphere(subdivisions=1, radius=0.5), trimesh.creation.box((0.7, 0.9, 0.5))
-    parts = [trimesh.creation.icosphere(subdivisions=0, radius=0.1) for _ in range(5)]
-    for part in parts:
-        part.apply_translation(rng.uniform(-0.5, 0.5, 3))
-    sheet = trimesh.creation.icosphere(subdivisions=2, radius=0.8)
-    sheet = trimesh.Trimesh(sheet.vertices, sheet.faces[:60], process=False)
+    rng, create = np.random.default_rng(0), trimesh.creation
+    crumbs = [create.icosphere(subdivisions=0, radius=0.1) for _ in range(5)]
+    sheet = create.icosphere(subdivisions=2, radius=0.8)
     return {
-        "ball": ball,
-        "box": box,
-        "large box": trimesh.creation.box((2, 2, 2)),
-        "cylinder": trimesh.creation.cylinder(0.3, 1.2, sections=12),
-        "torus": trimesh.creation.torus(0.6, 0.2, 16, 8),
-        "annulus": trimesh.creation.annulus(0.3, 0.5, 0.6, sections=12),
-        "crumbs": trimesh.util.concatenate(parts),
-        "sheet": sheet,
+        "ball": create.icosphere(subdivisions=1, radius=0.5),
+        "box": create.box((0.7, 0.9, 0.5)),
+        "large box": create.box((2, 2, 2)),
+        "cylinder": create.cylinder(0.3, 1.2, sections=12),
+        "torus": create.torus(0.6, 0.2, 16, 8),
+        "annulus": create.annulus(0.3, 0.5, 0.6, sections=12),
+        "crumbs": trimesh.util.concatenate([part.apply_translation(rng.uniform(-0.5, 0.5, 3)) for part in crumbs]),
+        "sheet": trimesh.Trimesh(sheet.vertices, sheet.faces[:60], process=False),
     }
 
 
@@ -145,44 +141,42 @@ def test_contacts_lie_on_both_faces(device):
 
 def test_face_pairs_against_brute_force(device):
     """The contacts are exactly the intersecting pairs of faces, with the indices of the meshes."""
-    a, b = SHAPES["torus"], SHAPES["cylinder"]
-    transform = shift((0.5, 0.1, 0.02))
-    ours = ab.CollisionManager(device)
+    a, b, place = SHAPES["torus"], SHAPES["cylinder"], (0.5, 0.1, 0.02)
+    ours, other = ab.CollisionManager(device), ab.CollisionManager(device)
     ours.add_object("a", a)
-    found, names, contacts = ours.in_collision_single(b, transform, return_names=True, return_data=True)
-    still, moved = [0, 0, 0, 0, 0, 0, 1], [0.5, 0.1, 0.02, 0, 0, 0, 1]
-    expected = brute_force_faces(a.vertices, a.faces, b.vertices, b.faces, still, moved)
-    assert found and names == {"a"} and len(expected) > 20
-    assert [[x.index("a"), x.index("__external")] for x in contacts] == expected.tolist()
-    other = ab.CollisionManager(device)
-    other.add_object("b", b, transform)
+    other.add_object("b", b, shift(place))
+    still, moved = [0, 0, 0, 0, 0, 0, 1], [*place, 0, 0, 0, 1]
+    expected = brute_force_faces(a.vertices, a.faces, b.vertices, b.faces, still, moved).tolist()
+    assert len(expected) > 20
+    found, names, contacts = ours.in_collision_single(b, shift(place), return_names=True, return_data=True)
+    assert found and names == {"a"} and [[x.index("a"), x.index("__external")] for x in contacts] == expected
     _, names, contacts = ours.in_collision_other(other, True, True)
-    assert names == {("a", "b")} and [[x.index("a"), x.index("b")] for x in contacts] == expected.tolist()
+    assert names == {("a", "b")} and [[x.index("a"), x.index("b")] for x in contacts] == expected
 
 
 def test_a_component_inside_a_solid(device):
-    ours = ab.CollisionManager(device)
-    ours.add_object("box", SHAPES["large box"], shift((5, 0, 0)))
+    ours, inner, hollow = (ab.CollisionManager(device) for _ in range(3))
+    box = SHAPES["large box"]
+    ours.add_object("box", box, shift((5, 0, 0)))
     crumb, at = trimesh.creation.box((0.2, 0.2, 0.2)), shift((5.5, 0, 0))
-    inner = ab.CollisionManager(device)
     inner.add_object("crumb", crumb, at)
-    for answer in (ours.in_collision_single(crumb, at, True, True), ours.in_collision_other(inner, True, True)):
+    hollow.add_object("crumb", crumb)
+    for answer, name, normal in (
+        (ours.in_collision_single(crumb, at, True, True), "box", 1),
+        (ours.in_collision_other(inner, True, True), "box", 1),
+        (hollow.in_collision_single(box, shift((-0.5, 0, 0)), True, True), "__external", -1),
+    ):
         found, names, (contact,) = answer
-        assert found and len(names) == 1
         # Corners at 5.4 are deepest, 0.6 under the plane x = 6.
-        assert contact.depth == pytest.approx(0.6) and contact.point[0] == pytest.approx(5.4)
-        assert np.allclose(contact.normal, [1, 0, 0])
-        assert (SHAPES["large box"].triangles[contact.index("box")][:, 0] == 1).all()
+        assert found and len(names) == 1 and contact.depth == pytest.approx(0.6)
+        assert np.allclose(contact.normal, [normal, 0, 0])
+        assert contact.point[0] == pytest.approx(5.4 if name == "box" else -0.1)
+        assert (box.triangles[contact.index(name)][:, 0] == 1).all()
     # One component of several is enough, and the solid may be the second of the pair.
     parts = trimesh.util.concatenate([crumb, crumb.copy().apply_translation((50, 0, 0))])
     assert ours.in_collision_single(parts, shift((-45, 0, 0)))
     assert not ours.in_collision_single(parts, shift((-40, 0, 0)))
-    hollow = ab.CollisionManager(device)
-    hollow.add_object("crumb", crumb)
-    _, _, (contact,) = hollow.in_collision_single(SHAPES["large box"], shift((-0.5, 0, 0)), True, True)
-    assert np.allclose(contact.normal, [-1, 0, 0])
-    assert (SHAPES["large box"].triangles[contact.index("__external")][:, 0] == 1).all()
-    assert hollow.in_collision_single(SHAPES["large box"]) and not hollow.in_collision_single(SHAPES["torus"])
+    assert hollow.in_collision_single(box) and not hollow.in_collision_single(SHAPES["torus"])
 
 
 # Distances.
@@ -195,24 +189,20 @@ def test_distances_on_random_scenes(device, monkeypatch, chunk):
     rng = np.random.default_rng(4)
     apart = 0
     for spread in (2.5, 4.0, 8.0):
-        theirs, ours = both(device)
-        fill((theirs, ours), rng, 5, spread)
-        others = both(device)
+        managers, others = both(device), both(device)
+        fill(managers, rng, 5, spread)
         fill(others, rng, 4, spread, "other ")
-        calls = [("internal", (None,)), *(("internal", (f"{k}",)) for k in range(5)), ("other", ())]
+        calls = [("internal", (name,)) for name in (None, *map(str, range(5)))] + [("other", ())]
         calls += [("single", (mesh, random_transform(rng, spread))) for mesh in SHAPES.values()]
         for kind, arguments in calls:
             named = {"return_name" if kind == "single" else "return_names": True}
             expected, found = (
                 getattr(manager, f"min_distance_{kind}")(*(arguments if kind != "other" else (other,)), **named)
-                for manager, other in zip((theirs, ours), others)
+                for manager, other in zip(managers, others)
             )
             assert found[0] == pytest.approx(max(expected[0], 0), abs=1e-5), (kind, arguments)
-            if expected[0] > 1e-5:
-                apart += 1
-                assert found[1] == expected[1]
-            else:
-                assert found[0] == 0
+            assert found[1] == expected[1] if expected[0] > 1e-5 else found[0] == 0
+            apart += expected[0] > 1e-5
     assert apart > 15
 
 
@@ -275,10 +265,9 @@ def test_known_distances(device, gap):
 
 def test_managers_without_objects(device):
     theirs, ours = both(device)
-    ball = SHAPES["ball"]
-    assert ours.in_collision_internal(True, True) == theirs.in_collision_internal(True, True) == (False, set(), [])
-    assert ours.in_collision_single(ball, None, True, True) == (False, set(), [])
-    assert ours.in_collision_other(ours) is False
+    ball, none = SHAPES["ball"], (False, set(), [])
+    assert ours.in_collision_internal(True, True) == theirs.in_collision_internal(True, True) == none
+    assert ours.in_collision_single(ball, None, True, True) == none and ours.in_collision_other(ours) is False
     assert ours.min_distance_internal(return_names=True) == (math.inf, None)
     assert ours.min_distance_single(ball, return_name=True, return_data=True) == (math.inf, None, None)
     assert ours.min_distance_other(ours) == math.inf
@@ -293,8 +282,7 @@ def test_replaced_and_changed_meshes(device):
     ours = ab.CollisionManager(device)
     mesh = trimesh.creation.box((1, 1, 1))
     ours.add_object("a", mesh)
-    ball = SHAPES["ball"]
-    at = shift((1.2, 0, 0))
+    ball, at = SHAPES["ball"], shift((1.2, 0, 0))
     assert not ours.in_collision_single(ball, at)
     mesh.apply_scale(2)
     assert not ours.in_collision_single(ball, at), "what was added stays as it was"
@@ -306,12 +294,11 @@ def test_replaced_and_changed_meshes(device):
 
 
 def test_slots_are_reused_and_released(device):
-    ours = ab.CollisionManager(device)
+    ours, other = ab.CollisionManager(device), ab.CollisionManager(device)
     for k in range(4):
         ours.add_object(k, SHAPES["ball"], shift((0.7 * k, 0, 0)))
     expected = {(0, 1), (1, 2), (2, 3)}
     assert ours.in_collision_internal(True) == (True, expected)
-    other = ab.CollisionManager(device)
     for k in range(30):
         other.add_object(k, SHAPES["torus"], shift((0, 0, 0.4 * k)))
     before = ours._placed.scene
@@ -337,18 +324,12 @@ def test_equal_meshes_share_a_model_that_goes_with_them(device):
         manager.add_object(k, mesh.copy())
     model = managers[0]._placed.scene.models[0]
     assert managers[1]._placed.scene.models == [model]
+    managers[0].add_object(2, model, shift((0.5, 0, 0)))
+    assert managers[0].in_collision_internal() and managers[0]._placed.scene.models == [model]
     gone, known = weakref.ref(model), len(convex_solid._SHAPES)
     del managers, manager, model
     gc.collect()
     assert gone() is None and len(convex_solid._SHAPES) < known
-
-
-def test_models_as_meshes(device):
-    model = ab.Model.load(SHAPES["torus"])
-    ours = ab.CollisionManager(device)
-    ours.add_object("a", model)
-    ours.add_object("b", model, shift((0.5, 0, 0)))
-    assert ours.in_collision_internal() and ours._placed.scene.models == [model]
 
 
 # Bad input, refused before anything changes.
@@ -356,30 +337,29 @@ def test_models_as_meshes(device):
 
 def test_bad_input(device):
     ours = ab.CollisionManager(device)
-    ball = SHAPES["ball"]
+    ball, eye, rigid = SHAPES["ball"], np.eye(4), "transform of 'a'.*not rigid"
     ours.add_object("a", ball)
-    stretched = np.diag([1, 1, 2.0, 1])
-    for transform, message in (
-        (stretched, "transform of 'a'.*not rigid"),
-        (np.full((4, 4), np.nan), "not finite"),
+    cases = [
+        (lambda: ours.add_object("a", 3), ab.MeshError, "cannot load a mesh from int"),
+        (lambda: ours.in_collision_single(trimesh.Trimesh()), ab.MeshError, "no faces"),
+        (lambda: ours.set_transform("b", eye), ValueError, "b not in collision manager"),
+        (lambda: ours.min_distance_internal("b"), ValueError, "b not in collision manager"),
+        (lambda: ours.in_collision_other(TrimeshManager()), TypeError, r"not a warp_abtree\.CollisionManager"),
+        (lambda: ours.min_distance_other(TrimeshManager()), TypeError, r"not a warp_abtree\.CollisionManager"),
+        (lambda: ab.CollisionManager("nothing:7"), ValueError, "no device"),
+    ]
+    for bad, message in (
+        (np.diag([1, 1, 2.0, 1]), rigid),
+        (np.nan * eye, "not finite"),
         (np.eye(3), r"shape \(3, 3\), not \(4, 4\)"),
     ):
-        for call in (lambda t: ours.add_object("a", SHAPES["box"], t), lambda t: ours.set_transform("a", t)):
-            with pytest.raises(ValueError, match=message):
-                call(transform)
-        with pytest.raises(ValueError, match=message.replace("'a'", "'__external'")):
-            ours.in_collision_single(ball, transform)
-    with pytest.raises(ab.MeshError, match="cannot load a mesh from int"):
-        ours.add_object("a", 3)
-    with pytest.raises(ab.MeshError, match="no faces"):
-        ours.in_collision_single(trimesh.Trimesh())
-    for call in (lambda: ours.set_transform("b", np.eye(4)), lambda: ours.min_distance_internal("b")):
-        with pytest.raises(ValueError, match="b not in collision manager"):
+        cases += [
+            (lambda bad=bad: ours.add_object("a", SHAPES["box"], bad), ValueError, message),
+            (lambda bad=bad: ours.set_transform("a", bad), ValueError, message),
+            (lambda bad=bad: ours.in_collision_single(ball, bad), ValueError, message.replace("'a'", "'__external'")),
+        ]
+    for call, kind, message in cases:
+        with pytest.raises(kind, match=message):
             call()
-    for call in (ours.in_collision_other, ours.min_distance_other):
-        with pytest.raises(TypeError, match=r"not a warp_abtree\.CollisionManager"):
-            call(TrimeshManager())
-    with pytest.raises(ValueError, match="no device"):
-        ab.CollisionManager("nothing:7")
     assert ours.in_collision_single(ball, return_names=True) == (True, {"a"})
     assert ours._placed.scene.object_count == 2 and collision_manager.EXTERNAL == "__external"

@@ -17,38 +17,22 @@ class Shape:
         self.node_boxes = NodeBoxes(self.model)
 
 
-def all_distances(shapes, poses):
-    """Return the distances of all pairs of faces of two objects, (faces of A, faces of B)."""
-    posed = []
-    for shape, pose in zip(shapes, poses, strict=True):
-        progressive = shape.model.progressive
-        posed.append(progressive.vertex_pos[progressive.face_vertex] @ pose[:3, :3].T + pose[:3, 3])
-    i, j = (part.ravel() for part in np.indices((len(posed[0]), len(posed[1]))))
-    return triangle_distances(posed[0][i], posed[1][j])[0].reshape(len(posed[0]), -1)
-
-
 def test_frames_off_orthonormal_hide_no_face():
-    """In A's frame the nearest faces, 1 apart, look 1.0005 apart: it is off by as much as scenes take."""
+    """Frames are off by as much as scenes take; the faces in which the search begins are not the nearest."""
     skew = 2.0**-22
-    spread = 2.0**-12 * np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
-    # The faces in which the search begins are 1 + 2^-16 apart.
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
     near, far = np.array([0.0, 0.0, 0.0]), np.array([1024.0, 0.0, 0.0])
+    # In A's frame the nearest faces, 1 apart, look 1.0005 apart; the first are 1 + 2^-16 apart.
+    spread, poses = 2.0**-12 * corners, np.tile(np.eye(4), (2, 1, 1))
     a = np.concatenate([near - spread, far - spread])
     b = np.concatenate([near + (1 + 2.0**-16, 0, 0) + spread, far * (1 + skew) + (1, 0, 0) + spread])
     shapes = [Shape(corners, [[0, 1, 2], [3, 4, 5]]) for corners in (a, b)]
-    poses = np.tile(np.eye(4), (2, 1, 1))
     poses[0, :3, :3] *= 1 + skew
-    distance, _, face_a, face_b, *_ = find_nearest(shapes, poses, np.array([[0, 1]]), 2.0, 0)
-    assert (distance, face_a, face_b) == (1.0, 1, 1)
-
-
-def test_frames_off_orthonormal_make_no_bound_too_small():
-    """A pair 1 apart that looks nearer in A's frame leaves another in, 2^-16 nearer than it is."""
-    skew = 2.0**-22
-    spread = 2.0**-20 * np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 0.0, 1.0]])
-    far = np.array([1024.0, 0.0, 0.0])
+    distance, _, faces, _ = find_nearest(shapes, poses, np.array([[0, 1]]), 2.0, 0)
+    assert (distance, faces) == (1.0, (1, 1))
+    # A pair 1 apart that looks nearer in A's frame leaves another in, 2^-16 nearer than it is.
+    spread, poses = 2.0**-20 * corners, np.tile(np.eye(4), (4, 1, 1))
     begins = [far - spread, far * (1 - skew) + (1, 0, 0) + spread, -spread, spread + (1 - 2.0**-16, 0, 0)]
-    poses = np.tile(np.eye(4), (4, 1, 1))
     poses[0, :3, :3] *= 1 - skew
     shapes = [Shape(corners, [[0, 1, 2]]) for corners in begins]
     distance, pair, *_ = find_nearest(shapes, poses, np.array([[0, 1], [2, 3]]), 2.0, 0)
@@ -71,9 +55,8 @@ def test_roundings_hide_no_face(place):
             poses[:, :3, :3] = quaternion_matrix(q)
             poses[:, :3, 3] = -poses[0, :3, :3] @ middle
         below, above = rng.uniform(0.1, 1.0, (2, 2, 3)) * np.array([[[1, 1, -1]], [[1, 1, 1]]])
-        corners = [
-            np.concatenate([[z], z + away]) for z, away in zip(np.array([[0, 0, 0.1], [0, 0, 1.8]]), (below, above))
-        ]
-        shapes = [Shape(middle + part, [[0, 1, 2]]) for part in corners]
-        found = find_nearest(shapes, poses, np.array([[0, 1]]), 2.0, 0)
-        assert found is not None and found[0] == all_distances(shapes, poses).min()
+        heights = np.array([[0, 0, 0.1], [0, 0, 1.8]])
+        corners = [middle + np.concatenate([[z], z + away]) for z, away in zip(heights, (below, above))]
+        posed = [part @ pose[:3, :3].T + pose[:3, 3] for part, pose in zip(corners, poses)]
+        found = find_nearest([Shape(part, [[0, 1, 2]]) for part in corners], poses, np.array([[0, 1]]), 2.0, 0)
+        assert found is not None and found[0] == triangle_distances(posed[0][None], posed[1][None])[0][0]

@@ -37,11 +37,10 @@ def world_points(model, state, contacts):
     body, body_q = model.shape_body.numpy(), state.body_q.numpy()
     points = []
     for side in (0, 1):
-        shapes = getattr(contacts, f"rigid_contact_shape{side}").numpy()[:count]
-        local = getattr(contacts, f"rigid_contact_point{side}").numpy()[:count]
-        local = local + getattr(contacts, f"rigid_contact_offset{side}").numpy()[:count]
+        names = [f"rigid_contact_{name}{side}" for name in ("shape", "point", "offset")]
+        shapes, point, offset = (getattr(contacts, name).numpy()[:count] for name in names)
         poses = [np.eye(4) if body[s] < 0 else matrix(body_q[body[s]]) for s in shapes]
-        points.append(np.array([(m @ [*x, 1])[:3] for m, x in zip(poses, local)]).reshape(-1, 3))
+        points.append(np.array([(m @ [*x, 1])[:3] for m, x in zip(poses, point + offset)]).reshape(-1, 3))
     return points, contacts.rigid_contact_normal.numpy()[:count]
 
 
@@ -61,9 +60,8 @@ def test_a_cube_on_a_floor_has_its_corners(device):
     (first, second), normals = world_points(model, state, contacts)
     assert len(normals) == 4
     np.testing.assert_allclose(normals, np.tile([0, 0, 1], (4, 1)), atol=1e-6)
-    assert set(contacts.rigid_contact_shape0.numpy()[:4]) == {0} and set(contacts.rigid_contact_shape1.numpy()[:4]) == {
-        1
-    }
+    for side in (0, 1):
+        assert set(getattr(contacts, f"rigid_contact_shape{side}").numpy()[:4]) == {side}
     np.testing.assert_allclose((second - first) @ [0, 0, 1], -0.01, atol=1e-6)
     r = matrix([0, 0, 0, *placed((0, 0, 0), *turn)[3:]])[:3, :3]
     corners = np.array([r @ [x, y, 0] + [0.3, 0.2, 0] for x in (-0.5, 0.5) for y in (-0.4, 0.4)])

@@ -9,6 +9,7 @@ import trimesh
 import warp_abtree as ab
 
 TURN, SHIFT = trimesh.transformations.rotation_matrix, trimesh.transformations.translation_matrix
+BOX = trimesh.creation.box((1, 2, 3))
 GREY, RED = [176, 176, 176], [214, 39, 40]
 
 
@@ -31,22 +32,14 @@ def nodes_in_the_world(source):
 
 def assembly(with_extras=False):
     """Instances that are rigid, scaled alike, stretched and mirrored, under a parent that moves them all."""
-    ball, box = trimesh.creation.icosphere(subdivisions=1), trimesh.creation.box((1, 2, 3))
     source = trimesh.Scene()
     source.graph.update("parent", matrix=TURN(0.3, [1, 2, 3], [1, 0, 0]))
-
-    source.add_geometry(ball, node_name="ball 0", geom_name="ball", parent_node_name="parent")
-    source.add_geometry(box, node_name="box 0", geom_name="box", parent_node_name="parent")
+    for name, mesh in (("ball", trimesh.creation.icosphere(subdivisions=1)), ("box", BOX)):
+        source.add_geometry(mesh, node_name=f"{name} 0", geom_name=name, parent_node_name="parent")
     double, mirror, flat = np.diag([2, 2, 2, 1.0]), np.diag([1, -1, 1, 1.0]), np.diag([1, 0.5, 0.25, 1.0])
-    for k, matrix in enumerate(
-        (
-            TURN(1, [0, 1, 0], [0, 0, 2]),
-            TURN(1, [0, 1, 1]) @ double,
-            TURN(2, [3, 1, 0]) @ double,
-            TURN(0.4, [0, 0, 1]) @ mirror,
-            TURN(0.7, [0, 1, 0.2]) @ flat @ TURN(0.2, [1, 0, 0]),
-        )
-    ):
+    matrices = [TURN(1, [0, 1, 0], [0, 0, 2]), TURN(1, [0, 1, 1]) @ double, TURN(2, [3, 1, 0]) @ double]
+    matrices += [TURN(0.4, [0, 0, 1]) @ mirror, TURN(0.7, [0, 1, 0.2]) @ flat @ TURN(0.2, [1, 0, 0])]
+    for k, matrix in enumerate(matrices):
         for name in ("ball", "box"):
             source.graph.update(f"{name} {k + 1}", "parent", matrix=matrix, geometry=name)
     if with_extras:
@@ -73,7 +66,7 @@ def test_trimesh_scene_in():
         assert trimesh.Trimesh(vertices, faces).volume > 0, f"model {i} is inside out"
 
 
-def test_trimesh_scene_refused():
+def test_sources_refused(tmp_path):
     with pytest.raises(TypeError, match=r"Trimesh, not a trimesh\.Scene"):
         ab.scene_from_trimesh(trimesh.creation.box())
     with pytest.raises(ab.MeshError, match="no node with a mesh"):
@@ -82,9 +75,16 @@ def test_trimesh_scene_refused():
     flat.add_geometry(trimesh.creation.box(), node_name="plate", transform=np.diag([1, 1, 0, 1]))
     with pytest.raises(ab.MeshError, match="node 'plate': its transform is singular"):
         ab.scene_from_trimesh(flat)
+    with pytest.raises(ab.MeshError, match=r"gone\.glb: no such file"):
+        ab.scene_from_file(tmp_path / "gone.glb")
+    for suffix in ("glb", "txt", "usda"):
+        (tmp_path / f"junk.{suffix}").write_text("junk")
+        if suffix == "usda":
+            pytest.importorskip("pxr")
+        with pytest.raises(ab.MeshError, match=rf"junk\.{suffix}: cannot be read"):
+            ab.scene_from_file(tmp_path / f"junk.{suffix}")
 
 
-BOX = trimesh.creation.box((1, 2, 3))
 # Where the prims of `write_usd` are in the world.
 USD_PRIMS = {
     "/root/still": SHIFT([1, 2, 3]),
@@ -151,17 +151,6 @@ def test_usd_in(tmp_path, suffix):
         assert ((found.mean(1) - found.mean((0, 1))) * normal).sum(1).min() > 0, f"{name} is inside out"
 
 
-def test_files_refused(tmp_path):
-    with pytest.raises(ab.MeshError, match=r"gone\.glb: no such file"):
-        ab.scene_from_file(tmp_path / "gone.glb")
-    for suffix in ("glb", "usda", "txt"):
-        (tmp_path / f"junk.{suffix}").write_text("junk")
-        if suffix == "usda":
-            pytest.importorskip("pxr")
-        with pytest.raises(ab.MeshError, match=rf"junk\.{suffix}: cannot be read"):
-            ab.scene_from_file(tmp_path / f"junk.{suffix}")
-
-
 def red_faces(mesh):
     colours = np.asarray(mesh.visual.vertex_colors)[mesh.faces][..., :3]
     red = (colours == RED).all((1, 2))
@@ -169,39 +158,26 @@ def red_faces(mesh):
     return mesh.triangles[red]
 
 
-def rings(device, worlds):
-    scene = ab.Scene(device)
-    ring = ab.Model.load(trimesh.creation.torus(0.6, 0.2, 16, 8))
-    for world in worlds:
-        scene.add(ring, world=world)
-    return scene
-
-
 def test_coloured_result_out(device, tmp_path):
-    scene = rings(device, [0] * 6)
-    scene.set_lods([scene.models[0].lod_max, *[scene.models[0].lod_for(fraction=0.5)] * 5])
-    scene.set_poses([(0.5 * k + (k > 2) * 9, 0, 0, 0, 0, 0, 1) for k in range(6)])
+    scene, ring = ab.Scene(device), ab.Model.load(trimesh.creation.torus(0.6, 0.2, 16, 8))
+    for k in range(6):
+        scene.add(ring, (0.5 * k + (k > 2) * 9, 0, 0, 0, 0, 0, 1), lod=ring.lod_for(fraction=0.5) if k else None)
     result = scene.intersect(output="faces")
     assert len(result.faces)
+    intersecting = np.unique(result.pairs[result.any])
     ab.to_trimesh(scene, result).export(tmp_path / "hits.glb")
     meshes = nodes_in_the_world(trimesh.load_scene(tmp_path / "hits.glb", process=False))
+    whole = nodes_in_the_world(ab.to_trimesh(scene, scene.intersect(output="any"), names="abcdef"))
     assert sorted(meshes) == [f"object {i}" for i in range(6)]
-    for i in range(6):
-        mesh = meshes[f"object {i}"]
-        model = scene.models[0]
-        vertices, faces, ids = model.mesh_at(scene.lods[i])
-        assert len(mesh.faces) == len(faces)
+    for i, name in enumerate("abcdef"):
+        vertices, faces, ids = ring.mesh_at(scene.lods[i])
         rows = [result.faces[result.pairs[result.faces[:, 0], k] == i][:, 1 + k] for k in (0, 1)]
         hit = np.isin(ids, np.concatenate(rows))
         corners = vertices[faces[hit]] + [0.5 * i + (i > 2) * 9, 0, 0]
-        assert np.allclose(red_faces(mesh), corners, atol=1e-5) and hit.any() == (
-            i in np.unique(result.pairs[result.any])
-        )
-    whole = ab.to_trimesh(scene, scene.intersect(output="any"), names="abcdef")
-    hit = np.unique(result.pairs[result.any])
-    for i, name in enumerate("abcdef"):
-        mesh = nodes_in_the_world(whole)[name]
-        assert len(red_faces(mesh)) == (len(mesh.faces) if i in hit else 0)
+        mesh = meshes[f"object {i}"]
+        assert len(mesh.faces) == len(faces) and hit.any() == (i in intersecting)
+        assert np.allclose(red_faces(mesh), corners, atol=1e-5)
+        assert len(red_faces(whole[name])) == (len(whole[name].faces) if i in intersecting else 0)
 
 
 def test_plain_scene_out_and_in(tmp_path):
@@ -227,5 +203,7 @@ def test_plain_scene_out_and_in(tmp_path):
 
 
 def test_one_world_out():
-    scene = rings("cpu", (-1, 0, 1, 1))
+    scene = ab.Scene("cpu")
+    for world in (-1, 0, 1, 1):
+        scene.add(ab.Model.load(BOX), world=world)
     assert sorted(ab.to_trimesh(scene, world=1).graph.nodes_geometry) == ["object 0", "object 2", "object 3"]

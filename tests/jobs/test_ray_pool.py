@@ -5,9 +5,9 @@ import signal
 import sys
 
 import pytest
-from helpers.jobs import ColumnJob, contents, job_of, load_worlds, run, stop_after
+from helpers.jobs import ColumnJob, contents, job_of, run, stop_after
 
-from warp_abtree.jobs import RayPool, WorldsJob, run_shards
+from warp_abtree.jobs import RayPool, run_shards
 
 
 @pytest.fixture(scope="module")
@@ -50,36 +50,30 @@ def test_an_interrupted_run_continues(tmp_path, pool):
     assert check_against_one_process(job, tmp_path, pool)["found"] == 7
 
 
-def test_ray_runs_worlds(tmp_path, pool):
-    check_against_one_process(WorldsJob(load_worlds(tmp_path, "[dynamics]"), 4, "poses", 2), tmp_path, pool)
-
-
 class FailingJob(ColumnJob):
     """Fails, or ends its worker, at one task."""
 
-    def __init__(self, how):
-        super().__init__(count=40, shard=10)
-        self.how = how
-
     def run(self, task, device=None):
-        if task[0] == 20 and self.how == "end":
+        if task[0] == 20 and self.output == "end":
             os._exit(1)
         if task[0] == 20:
             raise ValueError("no such task: 20")
         return super().run(task)
 
 
-@pytest.mark.parametrize("how", ["end", "fail"])
-def test_a_shard_that_cannot_be_computed_is_given_up(tmp_path, pool, how):
+@pytest.mark.parametrize(
+    ("how", "error", "what"),
+    [
+        ("end", RuntimeError, r"shard \(20, 30\) ended its worker, 3 times"),
+        ("fail", ValueError, "^no such task: 20$"),
+    ],
+)
+def test_a_shard_that_cannot_be_computed_is_given_up(tmp_path, pool, how, error, what):
     for module in (__name__, ColumnJob.__module__):  # workers cannot import the tests
         pool.ray.cloudpickle.register_pickle_by_value(sys.modules[module])
-    error, what = RuntimeError, r"shard \(20, 30\) ended its worker, 3 times"
-    if how == "fail":
-        error, what = ValueError, "^no such task: 20$"
     with pytest.raises(error, match=what):
-        run_shards(FailingJob(how), tmp_path / "out", pool=pool)
-    held = sorted(path.name for path in (tmp_path / "out").glob("shard-*"))
-    assert "shard-000000000020-000000000030.npz" not in held
+        run_shards(FailingJob(count=40, shard=10, output=how), tmp_path / "out", pool=pool)
+    assert not (tmp_path / "out" / "shard-000000000020-000000000030.npz").exists()
 
 
 @pytest.mark.parametrize("workers", [0, -1, 1.5])

@@ -5,9 +5,9 @@ import threading
 
 import numpy as np
 import pytest
-from helpers.jobs import contents, job_of, lods_of, pair, poses_of, read, run, stop_after
+from helpers.jobs import contents, job_of, lods_of, pair, poses_of, run, stop_after
 
-from warp_abtree.jobs import SweepJob, ThisProcess, read_shards, run_shards, shard_folder, sweep_job
+from warp_abtree.jobs import SweepJob, ThisProcess, read_shards, run_shards, sweep_job
 from warp_abtree.jobs import run as running
 from warp_abtree.jobs.shard_folder import MANIFEST
 
@@ -52,13 +52,12 @@ def test_a_job_without_poses_has_no_shards(tmp_path):
     assert done["shards"] == 0 and list(read_shards(tmp_path / "out")) == []
 
 
-# Interrupts.
-
-
 def test_an_interrupted_job_continues(tmp_path, monkeypatch):
     job, again = (job_of("faces", count=100, shard=9) for _ in range(2))
     out = tmp_path / "out"
     run(job, tmp_path / "whole")
+    out.mkdir()
+    (out / f"{MANIFEST}.1.partial").write_text("{")  # of a run interrupted at its first file
     with pytest.raises(KeyboardInterrupt):
         run(job, out, progress=stop_after(4))
     assert len(list(out.glob("shard-*.npz"))) == 4
@@ -73,55 +72,35 @@ def test_an_interrupted_job_continues(tmp_path, monkeypatch):
     assert run(again, out)["found"] == 12
 
 
-def test_a_run_interrupted_at_its_first_file_continues(tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / f"{MANIFEST}.1.partial").write_text("{")
-    assert run(job_of(), out)["shards"] == 3
-    assert not list(out.glob("*.partial"))
-
-
-# Folders.
-
-
-def test_names_have_room_for_more_than_twelve_digits(tmp_path):
-    job = {"count": 2 * 10**12, "shard": 10**12, "file": "npz"}
-    for part in shard_folder._ranges(job):
-        (tmp_path / shard_folder._shard_name(*part, "npz")).touch()
-    assert list(shard_folder._find_shards(tmp_path, job)) == [(0, 10**12), (10**12, 2 * 10**12)]
-
-
 def test_a_folder_is_of_one_job(tmp_path):
-    options = {"output": "any", "shard": 50}
-    run(SweepJob(*pair(), poses_of(), **options), tmp_path / "out")
+    (a, b), poses, last = pair(), poses_of(), poses_of()
+    run(SweepJob(a, b, poses, shard=50), tmp_path / "out")
     before = contents(tmp_path / "out")
-    models, last = pair(), poses_of()
     last[99, 0] = np.nextafter(last[99, 0], 9)
-    for arguments, more, what in (
-        ((*models, last), {}, "poses"),
-        ((*models, poses_of()), {"output": "count"}, "output"),
-        ((*models, poses_of()), {"shard": 51}, "shard"),
-        ((*models, poses_of(), [3, 3]), {}, "lods"),
-        ((*models[::-1], poses_of()), {}, "models"),
+    for what, other in (
+        ("poses", SweepJob(a, b, last, shard=50)),
+        ("output", SweepJob(a, b, poses, shard=50, output="count")),
+        ("shard", SweepJob(a, b, poses, shard=51)),
+        ("lods", SweepJob(a, b, poses, [3, 3], shard=50)),
+        ("models", SweepJob(b, a, poses, shard=50)),
     ):
         with pytest.raises(ValueError, match=f"holds another job; not the same: .*{what}"):
-            run(SweepJob(*arguments, **{**options, **more}), tmp_path / "out")
+            run(other, tmp_path / "out")
     assert contents(tmp_path / "out") == before
 
 
 def test_folders_that_are_no_jobs_are_refused(tmp_path):
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "thesis.txt").write_text("text")
-    (tmp_path / "bad").mkdir()
-    (tmp_path / "bad" / MANIFEST).write_text("{")
+    for name, text in (("full/thesis.txt", "text"), (f"bad/{MANIFEST}", "{")):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text(text)
     for out, what in (
-        (tmp_path / "full", "is not empty and holds no job.json"),
-        (tmp_path / "full" / "thesis.txt", "is a file"),
-        (tmp_path / "none" / "out", "there is no folder"),
-        (tmp_path / "bad", "damaged"),
+        ("full", "is not empty and holds no job.json"),
+        ("full/thesis.txt", "is a file"),
+        ("none/out", "there is no folder"),
+        ("bad", "damaged"),
     ):
         with pytest.raises(ValueError, match=what):
-            run(job_of(), out)
+            run(job_of(), tmp_path / out)
     with pytest.raises(ValueError, match=r"holds no job\.json"):
         list(read_shards(tmp_path / "full"))
     with pytest.raises(ValueError, match="file 'csv'"):
@@ -140,18 +119,3 @@ def test_a_pool_that_answers_twice_or_not_at_all_is_detected(tmp_path, deal, wha
 
     with pytest.raises(RuntimeError, match=what):
         run_shards(job_of(), tmp_path / "out", pool=Pool("cpu"))
-
-
-def test_parquet_has_the_same_columns(tmp_path):
-    pytest.importorskip("pyarrow")
-    for output in ("count", "contacts"):
-        for file in ("npz", "parquet"):
-            run(job_of(output, count=50), tmp_path / f"{output}.{file}", file)
-        plain, table = read(tmp_path / f"{output}.npz"), read(tmp_path / f"{output}.parquet")
-        if output == "count":
-            np.testing.assert_array_equal(table.pop("pose"), np.arange(50))
-        for name, values in plain.items():
-            if values.ndim == 2:
-                table[name] = np.stack([table.pop(f"{name}_{axis}") for axis in "xyz"], 1)
-            np.testing.assert_array_equal(table.pop(name), values)
-        assert not table

@@ -1,102 +1,59 @@
-"""`warp-abtree sweep` in this process: the answers of the calls, what it prints, and one line for each wrong use."""
+"""`warp-abtree sweep` in this process: the answers of the calls, and what it prints. Bad input has its own test."""
 
-import contextlib
-import io
 import json
 
 import numpy as np
 import pytest
-from helpers.jobs import intersect, load_worlds, lods_of, pair, poses_of, read, shard_at
-from helpers.samples import sample
+from helpers.jobs import intersect, lods_of, pair, poses_of, read, shard_at
+from helpers.viewer import run_command
 
 import warp_abtree as ab
 from warp_abtree.app.cli import sweep_command
-from warp_abtree.app.cli.main import main
-
-HERE = ("--ray", "none", "--device", "cpu")
-
-
-def command(*words):
-    """Return the exit status of `warp-abtree sweep`, and what it printed."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        status = main(["sweep", *map(str, words)])
-    return status, out.getvalue(), err.getvalue()
 
 
 @pytest.fixture
-def files(tmp_path):
-    """Paths of two models, poses and LODs of both."""
+def sweep(tmp_path, monkeypatch, capsys):
+    """Give a function that sweeps in a folder with two models, poses and LODs, and returns what it prints as JSON."""
+    monkeypatch.chdir(tmp_path)
     for name, model in zip("ab", pair()):
-        model.save(tmp_path / f"{name}.npz")
-    np.save(tmp_path / "poses.npy", poses_of())
-    np.save(tmp_path / "lods.npy", lods_of(100))
-    return [tmp_path / name for name in ("a.npz", "b.npz", "poses.npy", "lods.npy")]
+        model.save(f"{name}.npz")
+    np.save("poses.npy", poses_of())
+    np.save("lods.npy", lods_of(100))
+
+    def sweep(words, here="--ray none --device cpu", status=0):
+        shown, errors = run_command(capsys, "sweep", *words.split(), *here.split(), "--json", status=status)
+        return json.loads(shown) if shown else None, errors
+
+    return sweep
 
 
-def test_answers_are_those_of_the_calls(tmp_path, files):
-    a, b, poses, lods = files
-    asked = (a, b, poses, "--out", tmp_path / "out", "--shard", 30, "--output", "count", *HERE)
-    status, text, _ = command(*asked, "--json")
-    assert status == 0 and json.loads(text)["shards"] == 4
-    np.testing.assert_array_equal(
-        read(tmp_path / "out")["count"], ab.sweep(*pair(), poses_of(), output="count", device="cpu")
-    )
-    status, text, _ = command(*asked)
-    assert status == 0 and "100 poses in 4 shards, 4 found there, by one process" in text
-    assert command(a, b, poses, "--out", tmp_path / "lods", "--lods", lods, *HERE)[0] == 0
+def test_answers_are_those_of_the_calls(sweep, tmp_path):
+    first, second = pair()
+    asked = "a.npz b.npz poses.npy --out out --shard 30 --output count"
+    assert sweep(asked)[0]["shards"] == 4 and sweep(asked)[0]["found"] == 4
+    expected = ab.sweep(first, second, poses_of(), output="count", device="cpu")
+    np.testing.assert_array_equal(read(tmp_path / "out")["count"], expected)
+    sweep("a.npz b.npz poses.npy --out lods --lods lods.npy")
     expected = intersect("cpu", poses_of(), lods_of(100), "any").any
     np.testing.assert_array_equal(read(tmp_path / "lods")["any"], expected)
-    half = pair()[0].lod_for(fraction=0.5)
-    assert command(a, a, poses, "--out", tmp_path / "half", "--lod-a", "0.5", *HERE)[0] == 0
-    expected = ab.sweep(pair()[0], pair()[0], poses_of(), half, device="cpu")
+    sweep("a.npz a.npz poses.npy --out half --lod-a 0.5")
+    expected = ab.sweep(first, first, poses_of(), first.lod_for(fraction=0.5), device="cpu")
     np.testing.assert_array_equal(read(tmp_path / "half")["any"], expected)
-    load_worlds(tmp_path)
-    words = ("--frames", 2, "--shard", 2, "--out", tmp_path / "worlds", *HERE)
-    status, text, _ = command(tmp_path / "scene.toml", *words)
-    assert status == 0 and "5 worlds in 3 shards" in text
 
 
-def test_wrong_uses_are_named(tmp_path, files):
-    a, b, poses, lods = files
-    load_worlds(tmp_path)
-    scene = tmp_path / "scene.toml"
-    for words, what in (
-        ([a, b], "POSES.npy is missing"),
-        ([a, poses], "is no scene; a sweep takes two models, or one twice"),
-        ([a, b, a, poses], "two models and POSES.npy"),
-        ([scene, poses], "takes a scene of two"),
-        ([a, b, poses, "--frames", 3], "--frames: goes with a scene"),
-        ([a, b, poses, "--lods", lods, "--lod-a", "3"], "--lods: LODs come from"),
-        ([a, b, poses, "--lod-b", "tall"], "--lod-b: LOD 'tall'"),
-        ([a, b, poses, "--output", "poses"], "--output poses: goes with a scene"),
-        ([scene, "--lod-a", "3"], "--lod-a: the scene gives LODs"),
-        ([a, b, poses, "--workers", 2], "--workers: they are Ray's"),
-    ):
-        status, _, err = command(*words, "--out", tmp_path / "x", *HERE)
-        assert status == 2 and what in err and err.count("\n") == 1, err
-    assert not (tmp_path / "x").exists()
+def test_found_shards_are_counted(sweep, tmp_path):
+    words = "a.npz b.npz poses.npy --out out --shard 40"
+    for place, text, counts in ((0, None, (3, 0, 0)), (0, b"PK", (3, 2, 1)), (2, b"", (3, 2, 1))):
+        if text is not None:
+            shard_at(tmp_path / "out", place).write_bytes(text)
+        found = sweep(words)[0]
+        assert (found["shards"], found["found"], found["damaged"]) == counts
 
 
-def test_found_shards_are_counted(tmp_path, files):
-    words = (*files[:3], "--out", tmp_path / "out", "--shard", 40, *HERE)
-    assert "damaged" not in command(*words)[1]
-    path = shard_at(tmp_path / "out", 0)
-    path.write_bytes(path.read_bytes()[:99])
-    assert "in 3 shards, 2 found there, 1 damaged and done again, by one process" in command(*words)[1]
-    shard_at(tmp_path / "out", 2).write_bytes(b"")
-    found = json.loads(command(*words, "--json")[1])
-    assert (found["shards"], found["found"], found["damaged"]) == (3, 2, 1)
-
-
-def test_without_ray_one_line_says_so(tmp_path, monkeypatch):
+def test_without_ray_one_line_says_so(sweep, tmp_path, monkeypatch):
     monkeypatch.setattr(sweep_command.importlib.util, "find_spec", lambda name: None)
-    sample("torus").save(tmp_path / "a.npz")
-    np.save(tmp_path / "poses.npy", poses_of())
-    asked = [tmp_path / "a.npz", tmp_path / "a.npz", tmp_path / "poses.npy", "--out", tmp_path / "out"]
-    status, _, err = command(*asked)
-    first, *_ = err.splitlines()  # a word about kernels being compiled may follow
-    assert status == 0 and first == "Ray is not installed (pip install ray): this process does all shards"
+    asked = "a.npz a.npz poses.npy --out out"
+    assert sweep(asked, "")[1] == ["Ray is not installed (pip install ray): this process does all shards"]
     assert len(read(tmp_path / "out")["any"]) == 100
-    status, _, err = command(*asked, "--workers", "2")
-    assert status == 2 and "need Ray" in err
+    _, (error,) = sweep(asked, "--workers 2", status=2)
+    assert "need Ray" in error

@@ -63,21 +63,21 @@ def test_bad_input_is_named(tmp_path, monkeypatch):
     lods[63, 1] = 10**6
     (tmp_path / "text.npy").write_text("text")
     np.save(tmp_path / "fortran.npy", np.asfortranarray(poses_of()))
-    for arguments, options, what in (
-        ((nan,), {}, "pose 42 is not finite"),
-        ((long,), {}, "pose 77 has a quaternion of norm 1.1"),
-        ((poses_of()[:, :6],), {}, r"poses: shape \(100, 6\)"),
-        ((poses_of(), lods), {}, "those of pose 63"),
-        ((poses_of(), lods[:9]), {}, "lods: 9 given for 100 poses"),
-        ((poses_of(), [0, 10**6]), {}, "LOD 1000000 is outside"),
-        ((tmp_path / "none.npy",), {}, "no such file"),
-        ((tmp_path / "text.npy",), {}, "cannot be read as .npy"),
-        ((tmp_path / "fortran.npy",), {}, "in C order"),
-        ((poses_of(),), {"output": "some"}, "output 'some'"),
-        ((poses_of(),), {"precision": "good"}, "precision 'good'"),
-        ((poses_of(),), {"shard": 0}, "shard 0 is outside"),
+    for poses, options, what in (
+        (nan, {}, "pose 42 is not finite"),
+        (long, {}, "pose 77 has a quaternion of norm 1.1"),
+        (poses_of()[:, :6], {}, r"poses: shape \(100, 6\)"),
+        (poses_of(), {"lods": lods}, "those of pose 63"),
+        (poses_of(), {"lods": lods[:9]}, "lods: 9 given for 100 poses"),
+        (poses_of(), {"lods": [0, 10**6]}, "LOD 1000000 is outside"),
+        (tmp_path / "none.npy", {}, "no such file"),
+        (tmp_path / "text.npy", {}, "cannot be read as .npy"),
+        (tmp_path / "fortran.npy", {}, "in C order"),
+        (poses_of(), {"output": "some"}, "output 'some'"),
+        (poses_of(), {"precision": "good"}, "precision 'good'"),
+        (poses_of(), {"shard": 0}, "shard 0 is outside"),
     ):
         with pytest.raises(ValueError, match=what):
-            SweepJob(*pair(), *arguments, **options)
+            SweepJob(*pair(), poses, **options)
     with pytest.raises(TypeError, match="not a Model"):
         SweepJob("torus", sample("torus"), poses_of())

@@ -11,14 +11,10 @@ from warp_abtree.lod.selection import tolerance_scale
 
 
 def plain_level(selection, i, position, offset):
-    scene = selection.view.scene
-    part = (i * 2654435761 % 2**32) >> 30
-    levels = tolerance_scale(selection.ladder)
+    part, levels = (i * 2654435761 % 2**32) >> 30, tolerance_scale(selection.ladder)
     level = min(max((position - offset + part), 0) // 4, len(levels) - 1)
-    if level == 0:
-        return 0
-    errors = selection.ladder.error[scene.object_model[i]]
-    return int(np.argmax(errors <= levels[level]))
+    errors = selection.ladder.error[selection.view.scene.object_model[i]]
+    return int(np.argmax(errors <= levels[level])) if level else 0
 
 
 def plain_nodes(model, ladder, k, held, wanted):
@@ -49,8 +45,7 @@ def test_prediction_is_that_of_plain_python(device):
         up, down = rng.uniform(0.2, 1.2, 2)
         # Dear and cheap frames by turns, so that the position climbs, falls, stays and holds.
         rate = [1.0, {10: 9e-3, 5: 4e-3, 2: 4e-3}.get(frame % 12, 1e-3), 1.0, [1e-3, 0.1][frame // 6 % 2], up, down]
-        position = int(selection.scale.numpy()[0])
-        waited = int(selection.scale.numpy()[1])
+        position, waited = map(int, selection.scale.numpy())
         selection.rate.assign(rate)
         selection.work.assign(work)
         selection.launch()
@@ -61,22 +56,21 @@ def test_prediction_is_that_of_plain_python(device):
         assert steps[:-2] == sorted(steps[:-2], reverse=True) and steps[-2] == -selection.position_max
         lasting, moving, totals = [], [], []
         for k, step in enumerate(steps):
-            held = k == len(steps) - 1
-            then = [level[i] if held else plain_level(selection, i, position + step, offset[i]) for i in range(50)]
+            then = np.array([plain_level(selection, i, position + step, offset[i]) for i in range(50)])
+            then = level if k == len(steps) - 1 else then
             faces = selection.ladder.faces[scene.object_model]
             ratio = faces[np.arange(50), then] / faces[np.arange(50), level]
             total = float(np.sum(work * ratio ** np.where(ratio > 1, up, down)))
             nodes = 0
             for m, model in enumerate(scene.models):
                 mine = np.array(scene.object_model) == m
-                present, wanted = set(level[mine].tolist()), set(np.array(then)[mine].tolist())
-                nodes += plain_nodes(model, selection.ladder, m, present, wanted)
+                nodes += plain_nodes(model, selection.ladder, m, set(level[mine].tolist()), set(then[mine].tolist()))
             assert selection.prediction.work.numpy()[k] == pytest.approx(total, rel=1e-12)
-            assert selection.prediction.moved.numpy()[k] == np.count_nonzero(np.array(then) != level)
+            assert selection.prediction.moved.numpy()[k] == np.count_nonzero(then != level)
             assert selection.prediction.nodes.numpy()[k] == pytest.approx(nodes, abs=1)
             totals.append(total)
             lasting.append(rate[0] + rate[1] * total)
-            moving.append(rate[2] * (list(then) != list(level)) + rate[3] * nodes)
+            moving.append(rate[2] * (then != level).any() + rate[3] * nodes)
         way, chosen, waited = plain_choice(lasting, moving, steps.index(0), position, selection, waited)
         ways.add(way)
         assert int(selection.choice.numpy()[0]) == chosen, frame

@@ -20,8 +20,7 @@ def with_errors(model):
     """Return the model with made-up errors."""
     m = model.lod_max
     errors = np.linspace(1.0, 0.0, m + 1) ** 3 if m else np.zeros(1)
-    progressive = dataclasses.replace(model.progressive, lod_error=errors)
-    return Model(progressive, model.tree, model.name)
+    return Model(dataclasses.replace(model.progressive, lod_error=errors), model.tree, model.name)
 
 
 def assert_same(model, other):
@@ -98,7 +97,7 @@ def test_equal_models_have_equal_digests(tmp_path):
     assert len(digests) == 2 + len(ARRAYS)
 
 
-# Damage.
+# Damage; another kind of file, another version, another content.
 
 
 def test_flipped_and_lost_bytes_are_noticed(tmp_path, content):
@@ -119,12 +118,8 @@ def test_flipped_and_lost_bytes_are_noticed(tmp_path, content):
     assert opened < 200
 
 
-# Another kind of file, another version, another content.
-
-
-def test_files_that_are_no_models_are_refused(tmp_path):
+def test_files_that_are_no_models_are_refused(tmp_path, parts):
     np.save(tmp_path / "array.npy", np.zeros(3))
-    np.savez(tmp_path / "other.npz", a=np.zeros(3))
     (tmp_path / "mesh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with zipfile.ZipFile(tmp_path / "zip.npz", "w") as archive:
         archive.writestr("format.npy", b"text")
@@ -132,7 +127,11 @@ def test_files_that_are_no_models_are_refused(tmp_path):
     for name in ("", "array.npy", "mesh.obj", "zip.npz", "empty.npz"):
         refuse(tmp_path / name)
     refuse(tmp_path / "absent.npz", "no such file")
-    refuse(tmp_path / "other.npz", "not a warp_abtree model")
+    refuse(write(tmp_path / "other.npz", {"a": np.zeros(3)}), "not a warp_abtree model")
+    for version in (FORMAT_VERSION + 1, FORMAT_VERSION + 0.5, "new", [1, 1]):
+        refuse(write(tmp_path / "m.npz", {**parts, "version": np.array(version)}))
+    refuse(write(tmp_path / "m.npz", {**parts, "version": np.array(7)}), "version 7", str(FORMAT_VERSION))
+    refuse(write(tmp_path / "m.npz", {**parts, "format": np.array("soup")}), "not a warp_abtree model")
 
 
 class Bomb:
@@ -166,50 +165,38 @@ def test_pickles_are_never_run_and_missing_arrays_are_named(tmp_path, parts):
     assert trace.exists(), "the bomb would have worked"
 
 
-def test_other_versions_are_refused(tmp_path, parts):
-    for version in (FORMAT_VERSION + 1, FORMAT_VERSION + 0.5, "new", [1, 1]):
-        refuse(write(tmp_path / "m.npz", {**parts, "version": np.array(version)}))
-    path = write(tmp_path / "m.npz", {**parts, "version": np.array(7)})
-    refuse(path, "version 7", str(FORMAT_VERSION))
-    refuse(write(tmp_path / "f.npz", {**parts, "format": np.array("soup")}), "not a warp_abtree model")
+# What each array must not hold: array, index, value.
+BAD_VALUES = [
+    ("vertex_pos", (3, 1), np.nan),
+    ("face_vertex", (4, 0), -1),
+    ("face_vertex", (4, 0), 42),
+    ("vertex_parent", 5, 5),  # its own child
+    ("vertex_parent", 5, 6),  # among the originals
+    ("vertex_parent", -1, 42),  # below its child
+    ("face_split", 2, -1),
+    ("face_split", 2, 10**6),
+    ("split_start", 0, 1),
+    ("split_start", 3, 10**6),
+    ("split_start", -1, 3),
+    ("split_face", 0, 160),  # no such face
+    ("split_face", 0, -1),
+    ("lod_error", 0, np.inf),
+    ("lod_error", 4, 9.0),  # rises
+    ("lod_error", -1, 0.001),
+    ("leaf_node", 0, 5),  # inside the tree
+    ("leaf_node", slice(2, 4), 190),  # two faces in one leaf
+]
 
 
-@pytest.mark.parametrize("name", [*ARRAYS, "leaf_node"])
-def test_types_and_shapes_are_checked(tmp_path, parts, name):
-    good = parts[name]
-    for bad in (good.astype(np.complex128), good.astype(np.float32), good[:0], good[None], good[:-1], good[0]):
+def test_types_shapes_and_values_are_checked(tmp_path, parts):
+    for name in (*ARRAYS, "leaf_node"):
+        good = parts[name]
+        for bad in (good.astype(np.complex128), good.astype(np.float32), good[:0], good[None], good[:-1], good[0]):
+            refuse(write(tmp_path / "m.npz", {**parts, name: bad}))
+    for name, index, value in BAD_VALUES:
+        bad = parts[name].copy()
+        bad[index] = value
         refuse(write(tmp_path / "m.npz", {**parts, name: bad}))
-
-
-# What each array must not hold: (array, index, value).
-BAD_VALUES = {
-    "position not finite": ("vertex_pos", (3, 1), np.nan),
-    "corner below": ("face_vertex", (4, 0), -1),
-    "corner above": ("face_vertex", (4, 0), 42),
-    "parent is its own child": ("vertex_parent", 5, 5),
-    "parent among the originals": ("vertex_parent", 5, 6),
-    "parent below its child": ("vertex_parent", -1, 42),
-    "split below": ("face_split", 2, -1),
-    "split above": ("face_split", 2, 10**6),
-    "start not 0": ("split_start", 0, 1),
-    "start falls": ("split_start", 3, 10**6),
-    "slices end elsewhere": ("split_start", -1, 3),
-    "no such face": ("split_face", 0, 160),
-    "negative face": ("split_face", 0, -1),
-    "error not finite": ("lod_error", 0, np.inf),
-    "error rises": ("lod_error", 4, 9.0),
-    "error at the end": ("lod_error", -1, 0.001),
-    "leaf inside the tree": ("leaf_node", 0, 5),
-    "two faces in one leaf": ("leaf_node", slice(2, 4), 190),
-}
-
-
-@pytest.mark.parametrize("case", BAD_VALUES)
-def test_values_are_checked(tmp_path, parts, case):
-    name, index, value = BAD_VALUES[case]
-    parts[name] = parts[name].copy()
-    parts[name][index] = value
-    refuse(write(tmp_path / "m.npz", parts))
 
 
 # Saving.
@@ -217,7 +204,7 @@ def test_values_are_checked(tmp_path, parts, case):
 
 def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "m.npz"
-    model = with_errors(sample("three"))
+    model, other = with_errors(sample("three")), with_errors(sample("twins"))
     model.save(path)
     before = path.read_bytes()
 
@@ -228,12 +215,12 @@ def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
     monkeypatch.setattr(np, "savez_compressed", fail)
     for target in (path, tmp_path / "new.npz"):
         with pytest.raises(OSError, match="disk full"):
-            with_errors(sample("twins")).save(target)
+            other.save(target)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["m.npz"]
     monkeypatch.undo()
-    with_errors(sample("twins")).save(path)
-    assert_same(with_errors(sample("twins")), Model.open(path))
+    other.save(path)
+    assert_same(other, Model.open(path))
     with pytest.raises(OSError):
         model.save(tmp_path / "absent" / "m.npz")
 
@@ -250,13 +237,13 @@ def test_lods_and_requests_of_lods_are_checked():
     for options in ({}, {"fraction": 0.1, "tolerance": 0.1}):
         with pytest.raises(ValueError, match=r"fraction|tolerance"):
             model.lod_for(**options)
-    for name, values in (
-        ("fraction", (0.0, 1.001, float("nan"), "half")),
-        ("tolerance", (-1e-9, float("nan"), "fine")),
-    ):
-        for value in values:
-            with pytest.raises((ValueError, TypeError), match=name):
-                model.lod_for(**{name: value})
+    bad = {"fraction": (0.0, 1.001, float("nan"), "half"), "tolerance": (-1e-9, float("nan"), "fine")}
+    for name, value in [(name, value) for name, values in bad.items() for value in values]:
+        with pytest.raises((ValueError, TypeError), match=name):
+            model.lod_for(**{name: value})
+    for source in (None, 3, "no/such/file.obj"):
+        with pytest.raises(ab.MeshError):
+            Model.load(source)
 
 
 def test_requests_of_lods_are_met():
@@ -270,9 +257,3 @@ def test_requests_of_lods_are_met():
     for tolerance in (0.0, 1e-3, errors[7], 0.5, 1.0, float("inf")):
         lod = model.lod_for(tolerance=tolerance)
         assert errors[lod] <= tolerance and (lod == 0 or errors[lod - 1] > tolerance)
-
-
-def test_bad_sources_are_refused():
-    for source in (None, 3, "no/such/file.obj"):
-        with pytest.raises(ab.MeshError):
-            Model.load(source)

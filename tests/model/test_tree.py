@@ -16,17 +16,6 @@ pytestmark = pytest.mark.usefixtures("half_refitted_in_part")
 # Build.
 
 
-def check_build(vertices, faces, expected):
-    tree = active_build(vertices, faces)
-    numbers = [leaf.number for leaf in expected.leaf]
-    assert tree.leaf_node.tolist() == numbers
-    assert tree.depth == (len(faces) - 1).bit_length()
-    assert tree.node_count == 2 << tree.depth
-    inverse = np.full(tree.node_count, -1)
-    inverse[numbers] = np.arange(len(faces))
-    assert tree.node_face.tolist() == inverse.tolist()
-
-
 def without_merges(vertices, faces):
     return oracle.Progressive([-1] * len(vertices), vertices.tolist(), faces.tolist(), [0] * len(faces), [0], [])
 
@@ -37,8 +26,13 @@ def without_merges(vertices, faces):
 )
 def test_build_of_soups_equals_the_oracle(count, seed, lattice, scale):
     vertices, faces = soup(count, seed, lattice)
-    vertices = vertices * scale
-    check_build(vertices, faces, oracle.active_build(without_merges(vertices, faces)))
+    tree = active_build(vertices * scale, faces)
+    numbers = [leaf.number for leaf in oracle.active_build(without_merges(vertices * scale, faces)).leaf]
+    assert tree.leaf_node.tolist() == numbers
+    assert tree.depth == (len(faces) - 1).bit_length() and tree.node_count == 2 << tree.depth
+    inverse = np.full(tree.node_count, -1)
+    inverse[numbers] = np.arange(len(faces))
+    assert tree.node_face.tolist() == inverse.tolist()
 
 
 def test_build_refuses_no_face():
@@ -58,52 +52,40 @@ class Walker:
     """A scene whose LODs walk, compared with a new scene at the same LODs and with the oracle's rebuilds, cached."""
 
     def __init__(self, models, objects, device):
-        self.models, self.device = models, device
-        self.objects = objects
+        self.models, self.objects, self.device, self.truth = models, objects, device, {}
         self.scene = ab.Scene(device)
         for m in objects:
             self.scene.add(models[m])
-        self.truth = {}
 
     def tops(self):
         return np.array([self.models[m].lod_max for m in self.objects])
 
-    def oracle_state(self, m, lod):
+    def oracle_state(self, m, lod, corner_type):
         """Return the raw state that the oracle's rebuild has at a LOD."""
         if (m, lod) not in self.truth:
             mesh = plain(self.models[m])
-            tree = oracle.active_build(mesh, lod)
-            flat = tree.flat()
+            flat = oracle.active_build(mesh, lod).flat()
             corner = [
                 mesh.corners(f, lod) if mesh.is_active(f, lod) else [-1] * 3 for f in range(len(mesh.face_vertex))
             ]
-            self.truth[m, lod] = {
-                "lod": lod,
-                "status": flat["status"].astype(np.int32),
-                "lower": flat["lower"],
-                "upper": flat["upper"],
-                "skip": flat["skip"],
-                "corner": np.array(corner, self.corner_type),
-            }
+            state = {"lod": lod, "status": flat["status"].astype(np.int32), "corner": np.array(corner, corner_type)}
+            self.truth[m, lod] = state | {name: flat[name] for name in ("lower", "upper", "skip")}
         return self.truth[m, lod]
 
     def check_states(self, lods, with_oracle=True):
         fresh = ab.Scene(self.device)
-        for m, lod in zip(self.objects, lods, strict=True):
-            fresh.add(self.models[m], lod=int(lod))
-        seen = set()
-        for i, (m, lod) in enumerate(zip(self.objects, lods, strict=True)):
-            if (m, lod) in seen:
-                continue
-            seen.add((m, lod))
+        placed = list(zip(self.objects, map(int, lods), strict=True))
+        for m, lod in placed:
+            fresh.add(self.models[m], lod=lod)
+        for m, lod in set(placed):
+            i = placed.index((m, lod))
             state = raw_state(self.scene, i)
             assert state["lod"] == lod
             assert state["status"].max() <= oracle.ACTIVE, "a node was left deformed"
             assert_same_bits(state, raw_state(fresh, i))
             if with_oracle:
-                self.corner_type = state["corner"].dtype
-                assert_same_bits(state, self.oracle_state(m, int(lod)))
-        return seen
+                assert_same_bits(state, self.oracle_state(m, lod, state["corner"].dtype))
+        return set(placed)
 
     def step(self, lods, with_oracle=True):
         """Set LODs; check states, sharing, counters and equation 1. Returns the number of partial updates."""
@@ -113,9 +95,8 @@ class Walker:
         seen = self.check_states(lods, with_oracle)
         assert len(set(objects.state.tolist())) == len(seen), "objects that share model and LOD share a state"
         assert len(set(stats.state.tolist())) == len(stats.state)
-        assert {(self.scene.models.index(self.models[m]), int(lod)) for m, lod in seen} == {
-            (states.slots[s].model, states.slots[s].lod) for s in objects.state
-        }
+        held = {(states.slots[s].model, states.slots[s].lod) for s in objects.state}
+        assert held == {(self.scene.models.index(self.models[m]), lod) for m, lod in seen}
         for row, (state, lod) in enumerate(zip(stats.state, stats.lod, strict=True)):
             self.check_counters(stats, row, before, state, int(lod), states, models, with_oracle)
         return int((~stats.full).sum())
@@ -145,6 +126,7 @@ class Walker:
 
 @pytest.mark.parametrize("name", ["cow", "fcl-env", "woody"])
 @pytest.mark.slow
+@pytest.mark.usefixtures("update_path")
 def test_random_walk_of_real_meshes(device, name):
     rng = np.random.default_rng(4)
     walker = Walker([sample(name)], [0, 0, 0], device)
@@ -165,6 +147,7 @@ soups = st.builds(
 shares = st.lists(st.tuples(*[st.floats(0, 1)] * 3), min_size=1, max_size=6)
 
 
+@pytest.mark.usefixtures("update_path")
 @settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(soups, soups, shares)
 def test_walks_over_soups(device, first, second, walk):

@@ -1,10 +1,7 @@
 """A serial AB-Tree in plain Python, after Algorithms 1 to 3 of Liu, Georganas and Roth 2006, section 3.2.
 
-This is the oracle for the library's parallel tree: the operations keep the paper's names and structure (linked nodes,
-recursion, one primitive at a time), and share no code with the library. What both sides must agree on to the bit is
-stated where it is computed: the median split, the heap numbering, and the rounding of leaf boxes.
-
-Erratum (a) of the paper is explained at `active_mark`.
+Operations keep the paper's names and structure, and share no code with the library's parallel tree. What both must
+agree on to the bit is stated where it is computed: the median split, the heap numbering, the rounding of leaf boxes.
 """
 
 import math
@@ -18,15 +15,11 @@ NONE = -1
 EMPTY = ((math.inf,) * 3, (-math.inf,) * 3)
 
 
-# --- the progressive mesh --------------------------------------------------------------------------------------------
-
-
 @dataclass
 class Progressive:
-    """A progressive mesh as plain lists, by the definitions of the library's.
+    """A progressive mesh as plain lists; `lod` counts vertex splits from the base mesh.
 
-    `lod` counts vertex splits from the base mesh. Face f is active iff lod >= face_split[f]; slice i of split_face
-    lists the faces that the split from lod i to i + 1 inserts or deforms.
+    Face f is active iff lod >= face_split[f]; slice i of split_face lists the faces that split i inserts or deforms.
     """
 
     vertex_parent: list
@@ -45,14 +38,9 @@ class Progressive:
     def lod_max(self):
         return len(self.split_start) - 1
 
-    @property
-    def vertex_count(self):
-        return len(self.vertex_parent) - self.lod_max
-
     def ancestor(self, vertex, lod):
         """Highest ancestor of an original vertex that exists at this lod."""
-        limit = self.vertex_count + self.lod_max - lod
-        while NONE < self.vertex_parent[vertex] < limit:
+        while NONE < self.vertex_parent[vertex] < len(self.vertex_parent) - lod:
             vertex = self.vertex_parent[vertex]
         return vertex
 
@@ -64,36 +52,23 @@ class Progressive:
         return lod >= self.face_split[face]
 
     def sets_between(self, lod_from, lod_to):
-        """The paper's sets I, R and D (inserted, removed, deformed) for a change of lod in either direction.
-
-        The faces touched by splits a .. b-1 are one contiguous slice, whichever way it is crossed.
-        """
-        low, high = min(lod_from, lod_to), max(lod_from, lod_to)
-        inserted, removed, deformed = [], [], []
-        for face in sorted(set(self.split_face[self.split_start[low] : self.split_start[high]])):
-            before, after = self.is_active(face, lod_from), self.is_active(face, lod_to)
-            if before and after:
-                deformed.append(face)
-            elif after:
-                inserted.append(face)
-            elif before:
-                removed.append(face)
-        return inserted, removed, deformed
+        """The paper's sets I, R and D (inserted, removed, deformed) for a change of lod in either direction."""
+        low, high = sorted((lod_from, lod_to))
+        touched = sorted(set(self.split_face[self.split_start[low] : self.split_start[high]]))
+        change = {face: (self.is_active(face, lod_from), self.is_active(face, lod_to)) for face in touched}
+        return [[f for f in touched if change[f] == kind] for kind in ((False, True), (True, False), (True, True))]
 
     def centre(self):
         """Centre of the box of the original vertices; 0.5 * lower + 0.5 * upper cannot overflow."""
-        points = self.vertex_pos[: self.vertex_count]
+        points = self.vertex_pos[: len(self.vertex_parent) - self.lod_max]
         return [0.5 * min(p[k] for p in points) + 0.5 * max(p[k] for p in points) for k in range(3)]
 
 
-# --- the tree --------------------------------------------------------------------------------------------------------
-
-
 class Node:
-    """A tree node with the fields of the paper, and two of ours.
+    """A tree node: range is (lower, upper), index the primitive of a leaf.
 
-    range is (lower, upper); index is the primitive of a leaf and None inside; number is the heap index (root 1,
-    children 2x and 2x+1); skip is the highest descendant-or-self that a traversal need visit.
+    Beside the paper's fields, number is the heap index (root 1, children 2x and 2x+1), and skip the highest
+    descendant-or-self that a traversal need visit.
     """
 
     __slots__ = ("index", "left", "number", "parent", "range", "right", "skip", "status")
@@ -158,24 +133,17 @@ def refit_bound(n, k):
     return k * ((n - 1).bit_length() - math.log2(k) + 2) - 1 if k else 0
 
 
-def round_down(value):
-    """Largest float32 strictly below a float64, as the boxes want it: outwards even where the value is exact."""
+def round_out(value, end):
+    """Return the next float32 strictly beyond a float64 on the side of an end: outwards even where it is exact."""
     f = np.float32(value)
-    return float(np.nextafter(f, np.float32(-np.inf)) if float(f) >= value else f)
-
-
-def round_up(value):
-    """Smallest float32 strictly above a float64."""
-    f = np.float32(value)
-    return float(np.nextafter(f, np.float32(np.inf)) if float(f) <= value else f)
+    return float(f if end * (float(f) - value) > 0 else np.nextafter(f, np.float32(end * np.inf)))
 
 
 def active_build(mesh, lod=None):
     """ACTIVE-BUILD(P): split the set of all primitives top-down, then take the state of one lod (default: finest).
 
-    Halves are equal to within one: node i of depth d covers the leaf positions (i n) >> d .. ((i+1) n) >> d. The axis
-    is the longest of the box of the segment's faces at the finest lod (ties: lowest axis), the order is by
-    lower + upper of each face's own box (ties: lowest face). Faces that are never active have leaves too.
+    Node i of depth d covers the leaf positions (i n) >> d .. ((i+1) n) >> d. The axis is the longest of the box of its
+    faces at the finest lod (ties: lowest), the order by lower + upper of a face's own box (ties: lowest face).
     """
     n = len(mesh.face_vertex)
     points = [[mesh.vertex_pos[v] for v in face] for face in mesh.face_vertex]
@@ -226,26 +194,22 @@ def rebuild(tree, lod):
 def active_mark(inserted, removed, deformed, tree):
     """ACTIVE-MARK(I, R, D, T): mark bottom-up what a refinement touches; returns the subtree Ts as a set of nodes.
 
-    Erratum (a). Algorithm 2 as printed climbs from a removed leaf x only while the sibling is active, and writes
-    nothing on the way: a leaf with an active sibling keeps its status and box, and so do its ancestors. At the first
-    inactive sibling it sets x, but not its parent, to inactive and returns from the whole operation (lines 6 and 10),
-    so that the rest of R and all of D and I are never marked. The text says what is meant: a node is inactive iff no
-    active primitive lies under it, and every box is the smallest. So a removed leaf becomes inactive, and with it each
-    ancestor whose other child is inactive too; from the first ancestor that keeps an active child upwards, boxes may
-    shrink, and the nodes are deformed. R goes before D and I, which revive what R had emptied.
+    Erratum (a). Algorithm 2 as printed climbs from a removed leaf only while the sibling is active and writes nothing
+    on the way; at the first inactive sibling it returns from the whole operation (lines 6 and 10), so that the rest of
+    R and all of D and I are never marked. The text says what is meant: a node is inactive iff no active primitive lies
+    under it, and every box is the smallest. So a removed leaf becomes inactive, and with it each ancestor whose other
+    child is inactive too; those above are deformed. R goes before D and I, which revive what R had emptied.
     """
     marked = set()
     for face in removed:
         x = tree.leaf[face]
-        x.deactivate()
-        marked.add(x)
-        while x.parent is not None:
-            x = x.parent
-            if x.left.status == INACTIVE and x.right.status == INACTIVE:
+        while x is not None:
+            if x.is_leaf or x.left.status == x.right.status == INACTIVE:
                 x.deactivate()
             else:
                 x.status = DEFORMED
             marked.add(x)
+            x = x.parent
     for face in deformed + inserted:
         x = tree.leaf[face]
         while x is not None:
@@ -258,14 +222,13 @@ def active_mark(inserted, removed, deformed, tree):
 def active_refit(tree, node):
     """ACTIVE-REFIT(x): the smallest box, status active, and the skip link.
 
-    A leaf's float32 box is about the model's centre and strictly encloses the float64 differences. Inside, minima and
-    maxima are exact, so the box does not depend on the order of the updates.
+    A leaf's float32 box is about the model's centre and strictly encloses the float64 differences.
     """
     if node.is_leaf:
         corners = [tree.mesh.vertex_pos[v] for v in tree.mesh.corners(node.index, tree.lod)]
         moved = [[p[k] - tree.centre[k] for k in range(3)] for p in corners]
-        lower = tuple(round_down(min(p[k] for p in moved)) for k in range(3))
-        upper = tuple(round_up(max(p[k] for p in moved)) for k in range(3))
+        lower = tuple(round_out(min(p[k] for p in moved), -1) for k in range(3))
+        upper = tuple(round_out(max(p[k] for p in moved), 1) for k in range(3))
         node.range, node.skip = (lower, upper), node
     else:
         children = [c for c in (node.left, node.right) if c.status == ACTIVE]
@@ -284,15 +247,10 @@ def active_walk(tree, node):
         active_refit(tree, node)
 
 
-def active_update(inserted, removed, deformed, tree):
-    """ACTIVE-UPDATE(I, R, D, T): mark, then walk from the root. The mesh already stands at its new lod (tree.lod)."""
-    marked = active_mark(inserted, removed, deformed, tree)
-    active_walk(tree, tree.root)
-    return Update(len(inserted) + len(removed) + len(deformed), len(marked))
-
-
 def set_lod(tree, lod):
-    """Refine or coarsen the mesh under a tree, and update the tree."""
+    """Refine or coarsen the mesh under a tree, then ACTIVE-UPDATE(I, R, D, T): mark, and walk from the root."""
     sets = tree.mesh.sets_between(tree.lod, lod)
     tree.lod = lod
-    return active_update(*sets, tree)
+    marked = active_mark(*sets, tree)
+    active_walk(tree, tree.root)
+    return Update(sum(map(len, sets)), len(marked))

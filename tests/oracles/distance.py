@@ -5,6 +5,8 @@ from fractions import Fraction
 import numpy as np
 import warp as wp
 
+from oracles.triangle import cross, dot, sub
+
 
 def lattice_points(corners, count):
     """Return a lattice of points of each triangle, `count` to an edge, corners included, float64 (k, 3)."""
@@ -14,12 +16,7 @@ def lattice_points(corners, count):
 
 
 def brute_distances(points, corners):
-    """Return the distance of every point to the nearest triangle, of its edges and its plane where the foot is inside.
-
-    Args:
-        points: Shape (p, 3).
-        corners: Shape (f, 3, 3).
-    """
+    """Return the distance of points (p, 3) to the nearest triangle (f, 3, 3): to its edges, or its plane inside."""
     least = np.full(len(points), np.inf)
     step = max(1, 500_000 // len(points))
     for start in range(0, len(corners), step):
@@ -66,8 +63,7 @@ def farthest_points(points, corners, count):
 def farthest_distance(triangles, corners):
     """Return the greatest distance of some triangles from others that a search by points finds.
 
-    Estimates choose the triangles with the farthest points, and these points; their errors make the answer less, never
-    more.
+    Estimates choose triangles with the farthest points, and these; their errors make the answer less, never more.
     """
     coarse = estimate_distances(lattice_points(triangles, 6), corners).reshape(len(triangles), -1).max(1)
     points = lattice_points(triangles[np.argsort(coarse)[-40:]], 100)
@@ -76,29 +72,14 @@ def farthest_distance(triangles, corners):
 
 def exact_distance_sq(point, corners):
     """Return the squared distance of a point of fractions to the nearest triangle, a Fraction."""
-
-    def dot(p, q):
-        return sum(x * y for x, y in zip(p, q))
-
-    def less(p, q):
-        return [x - y for x, y in zip(p, q)]
-
-    def cross(p, q):
-        return [p[(k + 1) % 3] * q[(k + 2) % 3] - p[(k + 2) % 3] * q[(k + 1) % 3] for k in range(3)]
-
-    least = None
-    for triangle in corners:
-        a, b, c = [[Fraction(x) for x in corner] for corner in triangle.tolist()]
-        found = []
-        for p, q in ((a, b), (b, c), (c, a)):
-            edge, to = less(q, p), less(point, p)
+    found = []
+    for a, b, c in ([[Fraction(x) for x in corner] for corner in triangle] for triangle in corners.tolist()):
+        edges = [(sub(q, p), sub(point, p)) for p, q in ((a, b), (b, c), (c, a))]
+        for edge, to in edges:
             along = min(max(dot(to, edge) / (dot(edge, edge) or 1), 0), 1)
             away = [x - along * y for x, y in zip(to, edge)]
             found.append(dot(away, away))
-        normal = cross(less(b, a), less(c, a))
-        if any(normal) and all(
-            dot(cross(less(q, p), less(point, p)), normal) >= 0 for p, q in ((a, b), (b, c), (c, a))
-        ):
-            found.append(dot(less(point, a), normal) ** 2 / dot(normal, normal))
-        least = min(found) if least is None else min(least, *found)
-    return least
+        normal = cross(sub(b, a), sub(c, a))
+        if any(normal) and all(dot(cross(edge, to), normal) >= 0 for edge, to in edges):
+            found.append(dot(sub(point, a), normal) ** 2 / dot(normal, normal))
+    return min(found)

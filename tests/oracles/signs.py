@@ -6,7 +6,6 @@ Points are (count, dim + 1, dim), for 3 and for 2 dimensions.
 from fractions import Fraction
 
 import numpy as np
-import warp as wp
 
 COUNT = 400
 TINY = 2.0**-290
@@ -20,16 +19,15 @@ def lattice_points(rng, dim):
     return rng.integers(-3, 4, (COUNT, dim + 1, dim)).astype(float)
 
 
-def random_points(rng, dim):
-    return rng.normal(size=(COUNT, dim + 1, dim))
-
-
-def coplanar_points(rng, dim):
+def coplanar_points(rng, dim, size=1.0):
     """The last point on the plane or line of the others, up to rounding and two units in the last place."""
-    points = random_points(rng, dim) + 2.0 ** rng.integers(-3, 20, (COUNT, 1, 1)) * rng.normal(size=(COUNT, 1, dim))
+    points = rng.normal(size=(COUNT, dim + 1, dim)) + 2.0 ** rng.integers(-3, 20, (COUNT, 1, 1)) * rng.normal(
+        size=(COUNT, 1, dim)
+    )
     weight = rng.choice([0.0, 0.25, 0.5, 1.0, -1.0, 0.3], (COUNT, dim - 1, 1))
     points[:, dim] = points[:, 0] + (weight * (points[:, 1:dim] - points[:, :1])).sum(1)
-    return points + rng.integers(-2, 3, points.shape) * np.spacing(np.abs(points))
+    points = size * (points + rng.integers(-2, 3, points.shape) * np.spacing(np.abs(points)))
+    return np.where(np.abs(points) < TINY, 0.0, points)
 
 
 def grid_points(rng, dim):
@@ -43,20 +41,15 @@ def mixed_points(rng, dim):
     return rng.choice(values, (COUNT, dim + 1, dim))
 
 
-def tiny_coplanar_points(rng, dim):
-    points = coplanar_points(rng, dim) * 2.0**-285
-    return np.where(np.abs(points) < TINY, 0.0, points)
-
-
 KINDS = {
-    "random": random_points,
+    "random": lambda rng, dim: rng.normal(size=(COUNT, dim + 1, dim)),
     "lattice": lattice_points,
     "coplanar": coplanar_points,
     "tiny lattice": lambda rng, dim: lattice_points(rng, dim) * TINY,
     "tiny grid": grid_points,
-    "tiny coplanar": tiny_coplanar_points,
+    "tiny coplanar": lambda rng, dim: coplanar_points(rng, dim, 2.0**-285),
     "mixed": mixed_points,
-    "large coplanar": lambda rng, dim: coplanar_points(rng, dim) * 2.0**150,
+    "large coplanar": lambda rng, dim: coplanar_points(rng, dim, 2.0**150),
     "large lattice": lambda rng, dim: lattice_points(rng, dim) * 2.0**150,
 }
 
@@ -87,12 +80,3 @@ def rounded_signs(points):
     u, v, w = u.transpose(1, 2, 0)
     x, y, z = v[1] * w[2] - v[2] * w[1], w[1] * u[2] - w[2] * u[1], u[1] * v[2] - u[2] * v[1]
     return np.sign((u[0] * x + v[0] * y) + w[0] * z)
-
-
-def find_signs(kernel, mode, points, device):
-    dtype = wp.vec3d if points.shape[2] == 3 else wp.vec2d
-    out = wp.zeros(len(points), dtype=wp.int32, device=device)
-    wp.launch(
-        kernel, dim=len(points), inputs=[int(mode), wp.array(points, dtype=dtype, device=device), out], device=device
-    )
-    return out.numpy()

@@ -10,8 +10,6 @@ from helpers.samples import plain, random_poses, sample
 
 from oracles import abtree, triangle
 
-# --- triangles -------------------------------------------------------------------------------------------------------
-
 FLAT, LINE = [(0, 0, 0), (4, 0, 0), (0, 4, 0)], [(0, 0, 0), (2, 2, 2), (1, 1, 1)]
 
 # Two triangles, and whether they meet.
@@ -41,7 +39,7 @@ def test_known_answers_in_every_vertex_order(case):
             assert triangle.triangles_intersect(a, b) is meets
 
 
-def adversarial_pairs():
+def test_either_triangle_clips_the_other_and_the_filter_rejects_only_what_is_apart():
     """Pairs on a tiny lattice, which share, touch and are flat; and pairs that touch, or nearly so, in a float."""
     rng = np.random.default_rng(1)
     a = rng.normal(size=(2000, 3, 3))
@@ -50,11 +48,7 @@ def adversarial_pairs():
     b = (weight[:, :, :, None] * a[:, None]).sum(2)
     b += rng.choice([0, 0, 0, 1], (2000, 3, 1)) * rng.normal(size=(2000, 3, 3))
     b = np.where(rng.random(b.shape) < 0.5, b, np.nextafter(b, rng.choice([-9.0, 9.0], b.shape)))
-    return np.concatenate([rng.integers(0, 3, (1000, 2, 3, 3)).astype(float), np.stack([a, b], 1)])
-
-
-def test_either_triangle_clips_the_other_and_the_filter_rejects_only_what_is_apart():
-    pairs = adversarial_pairs()
+    pairs = np.concatenate([rng.integers(0, 3, (1000, 2, 3, 3)).astype(float), np.stack([a, b], 1)])
     answers = np.array([triangle.triangles_intersect(a, b) for a, b in pairs])
     assert answers.tolist() == [triangle.triangles_intersect(b, a) for a, b in pairs]
     rejected = triangle.provably_apart(pairs[:, 0], pairs[:, 1])
@@ -70,9 +64,6 @@ def test_brute_force_equals_the_exact_test_of_every_pair():
     meets = triangle.pairs_intersect(ball.vertices, ball.faces, points, ring.faces, every)
     assert hits.tolist() == np.array(every)[meets].tolist()
     assert len(hits) > 20
-
-
-# --- the tree --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["one", "three", "soup"])

@@ -1,15 +1,12 @@
 """Exact triangle intersection for closed sets, from first principles, and brute force over all face pairs.
 
 Touching counts, coplanar overlap counts, and a triangle of zero area is the segment or point that it is. One triangle
-is clipped by the half-spaces of the other, in integers: a float64 is an integer times a power of two, so integers on a
-common exponent are exact.
+is clipped by the half-spaces of the other, in integers on a common exponent.
 """
 
 from fractions import Fraction
 
 import numpy as np
-
-# --- poses -----------------------------------------------------------------------------------------------------------
 
 
 def quaternion_matrix(q):
@@ -17,13 +14,9 @@ def quaternion_matrix(q):
     x, y, z, w = (np.float64(c) for c in q)
     norm = np.sqrt(((x * x + y * y) + z * z) + w * w)
     x, y, z, w = x / norm, y / norm, z / norm, w / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    first = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    second = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    return np.array([first, second, (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))])
 
 
 def pose_matrix(pose):
@@ -59,9 +52,6 @@ def into_frame_of_a(points_b, pose_a, pose_b):
     return transform(*relative_pose(*pose_matrix(pose_a), *pose_matrix(pose_b)), points_b)
 
 
-# --- exact test -------------------------------------------------------------------------------------------------------
-
-
 def integer_points(*arrays):
     """Each (n, 3) float64 array as a list of integer triples, all on one common power of two."""
     parts = [np.frexp(np.asarray(a, np.float64)) for a in arrays]
@@ -69,11 +59,8 @@ def integer_points(*arrays):
     lowest = min((int(e.min()) for e in exponents if e.size), default=0)
     result = []
     for mantissa, exponent in parts:
-        integer = (mantissa * 2.0**53).astype(np.int64).tolist()
-        shift = np.where(mantissa != 0, exponent - lowest, 0).tolist()
-        result.append(
-            [tuple(i << s for i, s in zip(row, srow, strict=True)) for row, srow in zip(integer, shift, strict=True)]
-        )
+        integer, shift = (mantissa * 2.0**53).astype(np.int64), np.where(mantissa != 0, exponent - lowest, 0)
+        result.append([tuple(map(int.__lshift__, *rows)) for rows in zip(integer.tolist(), shift.tolist())])
     return result
 
 
@@ -148,13 +135,8 @@ def pairs_intersect(points_a, faces_a, points_b, faces_b, pairs):
     """Exact answers for a list of (face of A, face of B), all in one frame; returns bool [k]."""
     ia, ib = integer_points(points_a, points_b)
     faces_a, faces_b = np.asarray(faces_a).tolist(), np.asarray(faces_b).tolist()
-    answers = np.zeros(len(pairs), bool)
-    for k, (i, j) in enumerate(pairs):
-        answers[k] = bool(_clip([ia[v] for v in faces_a[i]], [ib[v] for v in faces_b[j]]))
-    return answers
-
-
-# --- brute force -----------------------------------------------------------------------------------------------------
+    meets = [bool(_clip([ia[v] for v in faces_a[i]], [ib[v] for v in faces_b[j]])) for i, j in pairs]
+    return np.array(meets, bool)
 
 
 def box_pairs(a, b):
@@ -170,8 +152,8 @@ def box_pairs(a, b):
 def _strictly_beside(a, b):
     """Whether all of b lies strictly on one side of the plane of a, beyond rounding.
 
-    The determinant takes 8 roundings of 2^-53 (three differences, two products, three sums), so it is certain beyond
-    1.0e-15 times the sum of the absolute products; 4e-15 leaves room. The constant covers underflow below 1e100.
+    The determinant takes 8 roundings of 2^-53, so it is certain beyond 1.0e-15 times the sum of the absolute products;
+    4e-15 leaves room. The constant covers underflow below 1e100.
     """
     e, f = a[:, 1] - a[:, 0], a[:, 2] - a[:, 0]
     left, right = e[:, [1, 2, 0]] * f[:, [2, 0, 1]], e[:, [2, 0, 1]] * f[:, [1, 2, 0]]
@@ -197,8 +179,7 @@ def brute_force_faces(vertices_a, faces_a, vertices_b, faces_b, pose_a, pose_b):
     faces_a, faces_b = np.asarray(faces_a), np.asarray(faces_b)
     candidates = box_pairs(points_a[faces_a], points_b[faces_b])
     blocks = np.array_split(candidates, len(candidates) // 100_000 + 1)
-    uncertain = np.concatenate(
-        [p[~provably_apart(points_a[faces_a[p[:, 0]]], points_b[faces_b[p[:, 1]]])] for p in blocks]
-    )
+    apart = [provably_apart(points_a[faces_a[p[:, 0]]], points_b[faces_b[p[:, 1]]]) for p in blocks]
+    uncertain = candidates[~np.concatenate(apart)]
     hits = uncertain[pairs_intersect(points_a, faces_a, points_b, faces_b, uncertain)]
     return hits[np.lexsort((hits[:, 1], hits[:, 0]))].astype(np.int32)

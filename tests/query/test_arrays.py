@@ -5,7 +5,8 @@ import pytest
 import warp as wp
 from helpers.faults import describe
 from helpers.questions import to_matrix
-from helpers.samples import random_poses, sample
+from helpers.samples import STILL, random_poses, sample
+from helpers.scenes import add_objects
 from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
@@ -30,15 +31,14 @@ def on_gpu(make):
     return make_there
 
 
-def to_torch(values, device):
-    torch = pytest.importorskip("torch")
-    return torch.asarray(values, device="cuda" if device.is_cuda else "cpu")
-
-
 def to_jax(values, device):
     jax = pytest.importorskip("jax")
     jax.config.update("jax_enable_x64", True)
-    return jax.device_put(values, jax.devices("cuda" if device.is_cuda else "cpu")[0])
+    return jax.device_put(values, jax.devices(name_of(device))[0])
+
+
+def name_of(device):
+    return "cuda" if device.is_cuda else "cpu"
 
 
 def to_transforms(values, device):
@@ -54,7 +54,7 @@ FRAMEWORKS = {
     "transforms": to_transforms,
     "dlpack": lambda values, device: speaking(wp.array(values, device=device), "__dlpack__", "__dlpack_device__"),
     "interface": on_gpu(lambda values, device: speaking(wp.array(values, device=device), "__cuda_array_interface__")),
-    "torch": to_torch,
+    "torch": lambda values, device: pytest.importorskip("torch").asarray(values, device=name_of(device)),
     "cupy": on_gpu(lambda values, _: pytest.importorskip("cupy").asarray(values)),
     "jax": to_jax,
 }
@@ -70,10 +70,7 @@ PAIRS = np.array([(0, 1), (1, 2), (3, 1), (2, 0)])
 
 
 def make_scene(device):
-    scene = ab.Scene(device)
-    for pose in random_poses(np.random.default_rng(1), 4, 0.4):
-        scene.add(sample("torus"), pose)
-    return scene
+    return add_objects(device, ["torus"] * 4, seed=1, spread=0.4)
 
 
 def poses_of(shape, real, count=4):
@@ -97,8 +94,7 @@ def test_poses(device, framework, shape, real, monkeypatch):
         assert getattr(second.batch().objects.pool, name).numpy().tobytes() == expected.tobytes()
     model, many = sample("torus"), poses_of(shape, real, 500)
     scene = ab.Scene(device)
-    scene.add(model)
-    for pose in many:
+    for pose in (STILL, *many):
         scene.add(model, pose)
     expected = scene.intersect([(0, i + 1) for i in range(500)], output="faces")
     assert expected.any.any()
@@ -138,38 +134,34 @@ def test_what_lies_elsewhere_is_refused_or_copied(device, framework):
     before = scene.batch().objects.pool.position.numpy().copy()
     bad = poses.copy()
     bad[2, 3:] *= 1.5
-    for values, what in (
-        (bad, "pose 2 has a quaternion of norm 1.5"),
-        (np.where(np.arange(7) == 1, np.nan, poses), "pose 0 is not finite"),
-        (poses[:3], "3 given for 4 objects"),
-        (poses[:, :6], "neither"),
-        (np.diag([1, 1, -1, 1.0]) * np.ones((4, 1, 1)), "matrix 0 is not rigid"),
-        (np.eye(4) * np.array([1, 1, 1 + 1e-5])[[0, 1, 2, 0]][:, None, None], "matrix 2 is not rigid"),
+    torus, mirror = sample("torus"), np.diag([1, 1, -1, 1.0]) * np.ones((4, 1, 1))
+    stretched = np.eye(4) * np.array([1, 1, 1 + 1e-5])[[0, 1, 2, 0]][:, None, None]
+    for call, values, what in (
+        (scene.set_poses, bad, "pose 2 has a quaternion of norm 1.5"),
+        (scene.set_poses, np.where(np.arange(7) == 1, np.nan, poses), "pose 0 is not finite"),
+        (scene.set_poses, poses[:3], "3 given for 4 objects"),
+        (scene.set_poses, poses[:, :6], "neither"),
+        (scene.set_poses, mirror, "matrix 0 is not rigid"),
+        (scene.set_poses, stretched, "matrix 2 is not rigid"),
+        (scene.set_poses, np.ones((4, 7), bool), "poses: "),
+        (scene.set_lods, np.array([0, 1, 2, 10**6]), "object 3 asks"),
+        (scene.intersect, np.array([(0, 7)]), "has 4 objects"),
+        (lambda given: ab.sweep(torus, torus, given, device=device), bad, "pose 2 has a quaternion"),
     ):
         with pytest.raises(ValueError, match=what):
-            scene.set_poses(framework(values))
+            call(framework(values))
         np.testing.assert_array_equal(scene.batch().objects.pool.position.numpy(), before)
-    for call, what in (
-        (lambda: scene.set_lods(framework(np.array([0, 1, 2, 10**6]))), "object 3 asks"),
-        (lambda: scene.intersect(framework(np.array([(0, 7)]))), "has 4 objects"),
-        (lambda: ab.sweep(sample("torus"), sample("torus"), framework(bad), device=device), "pose 2 has a quaternion"),
-        (lambda: scene.set_poses(framework(np.ones((4, 7), bool))), "poses: "),
-    ):
-        with pytest.raises(ValueError, match=what):
-            call()
 
 
 def test_what_is_on_the_gpu_is_read_there(device):
     """Contiguous rows without a copy, Warp's transforms and matrices too; other types and devices are brought over."""
     target = wp.get_device(device)
     rows = wp.array(poses_of("quaternions", np.float64), device=device)
+    assert device_rows(wp.array(rows.numpy(), device="cpu"), target) is None
     if not target.is_cuda:
-        assert device_rows(rows, target) is None
         return
     matrices = wp.array(poses_of("matrices", np.float32), device=device)
-    transforms = wp.array(rows.numpy(), dtype=wp.transformd, device=device)
-    for array, width in ((rows, 7), (matrices, 16), (transforms, 7)):
+    for array, width in ((rows, 7), (matrices, 16), (wp.array(rows.numpy(), dtype=wp.transformd, device=device), 7)):
         assert device_rows(array, target).ptr == array.ptr and device_rows(array, target).shape == (4, width)
     across = wp.array(np.ascontiguousarray(rows.numpy().T), device=device).transpose()
     np.testing.assert_array_equal(device_rows(across, target).numpy(), rows.numpy())
-    assert device_rows(wp.array(rows.numpy(), device="cpu"), target) is None

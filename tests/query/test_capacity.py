@@ -51,9 +51,9 @@ def test_overflow_names_the_demand(crowd, kind):
         if name == "hits":
             np.testing.assert_array_equal(result.count, whole.count)
             assert len(result.faces) == room and (np.lexsort(result.faces.T[::-1]) == np.arange(room)).all()
-            assert {row.tobytes() for row in result.faces} <= {row.tobytes() for row in whole.faces}
+            assert {*map(bytes, result.faces)} <= {*map(bytes, whole.faces)}
         if kind == "contacts":
-            assert {row.tobytes() for row in result.contacts} <= {row.tobytes() for row in whole.contacts}
+            assert {*map(bytes, result.contacts)} <= {*map(bytes, whole.contacts)}
             rows = np.searchsorted(result.faces[:, 0], np.arange(len(whole.pairs) + 1))
             np.testing.assert_array_equal(query.start.numpy(), rows)
         grown = query.run()
@@ -74,46 +74,50 @@ def test_overflow_names_the_demand(crowd, kind):
     assert len(query.result().faces) == len(whole.faces)
 
 
-LARGEST = 2**31 - 1
-
-
-def test_the_error_names_the_bytes(device, monkeypatch):
-    """The largest buffers that may be asked for: so many entries of three integers, refused as a full device does."""
+@pytest.fixture
+def asked(device):
+    """A scene, a query about it, and a check that both are as they were."""
     scene = make_scene(device)
-    before = check_scene(None, scene)
-    query = ab.Query(scene, "faces", pairs=PAIRS)
+    before, query = check_scene(None, scene), ab.Query(scene, "faces", pairs=PAIRS)
     answers = describe(query.run())
+
+    def check():
+        check_scene(before, scene)
+        assert describe(query.run()) == answers
+
+    return scene, query, check
+
+
+def test_the_error_names_the_bytes(device, asked, monkeypatch):
+    """The largest buffers that may be asked for: so many entries of three integers, refused as a full device does."""
+    scene, query, check = asked
     allocator = wp.get_device(device).get_allocator()
-    allocate, asked = allocator.allocate, []
+    allocate, sizes = allocator.allocate, []
 
     def refuse_large(size):
-        asked.append(size)
+        sizes.append(size)
         return allocate(size if size < 2**33 else 2**62)
 
     monkeypatch.setattr(allocator, "allocate", refuse_large)
     for call in (
-        lambda: ab.Query(scene, "faces", pairs=PAIRS, capacity=LARGEST),
-        lambda: GpuQuery(scene, "faces", pairs=PAIRS, capacity=ab.Buffers(uncertain=LARGEST)),
-        lambda: query.resize(LARGEST),
+        lambda: ab.Query(scene, "faces", pairs=PAIRS, capacity=2**31 - 1),
+        lambda: GpuQuery(scene, "faces", pairs=PAIRS, capacity=ab.Buffers(uncertain=2**31 - 1)),
+        lambda: query.resize(2**31 - 1),
     ):
         with pytest.raises(RuntimeError, match=f"bytes on device '{device}'"):
             call()
-        assert asked[-1] == 12 * LARGEST
-        check_scene(before, scene)
-        assert describe(query.run()) == answers
+        assert sizes[-1] == 12 * (2**31 - 1)
+        check()
 
 
-def test_more_pairs_than_a_launch_holds(device, monkeypatch):
+def test_more_pairs_than_a_launch_holds(asked, monkeypatch):
     monkeypatch.setattr(request, "PAIRS_MAX", len(MORE_PAIRS))
-    scene = make_scene(device)
-    before = check_scene(None, scene)
-    query = ab.Query(scene, "faces", pairs=PAIRS)
-    answers = describe(query.run())
+    scene, query, check = asked
+    ab.Query(scene, pairs=MORE_PAIRS)  # as many as it holds
     with pytest.raises(ValueError, match="buffers: pairs 13 is outside"):
         ab.Query(scene, "any", capacity=ab.Buffers(pairs=13))
     many = np.concatenate([MORE_PAIRS, PAIRS])
     for call in (lambda: query.set_pairs(many), lambda: scene.intersect(many), lambda: ab.Query(scene, pairs=many)):
         with pytest.raises(ab.CapacityError, match="15 object pairs at a time"):
             call()
-        check_scene(before, scene)
-        assert describe(query.run()) == answers
+        check()

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import trimesh
+from helpers.bodies import box
 from helpers.contacts import check_summaries, exact_normal, lies_in_plane, unit
-from helpers.samples import STILL, contact_poses, sample, soup
+from helpers.samples import SHAPES, STILL, contact_poses, sample, soup
 from oracles.distance import brute_distances
 from oracles.triangle import cross, into_frame_of_a, quaternion_matrix, shared_polygon
 
@@ -33,15 +34,11 @@ def model_of(name):
     return sample(name)
 
 
-def two(device, name_a, name_b, pose_a=STILL, pose_b=STILL):
+def contacts_of(device, *placed, pairs=((0, 1),), **options):
+    """Return the contacts of a scene of (model, pose)."""
     scene = ab.Scene(device)
-    models = [model_of(name_a), model_of(name_b)]
-    for model, pose in zip(models, (pose_a, pose_b), strict=True):
+    for model, pose in placed:
         scene.add(model, pose)
-    return scene, models
-
-
-def contacts_of(scene, pairs=((0, 1),), **options):
     result = scene.intersect(np.array(pairs), output="contacts", **options)
     result.check()
     return result
@@ -68,10 +65,10 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_ends_and_normals_equal_exact_clipping(device, case):
     """Both ends are corners of the exact intersection, and as far apart as its farthest corners."""
-    name_a, name_b, pose = CASES[case]
-    pose = np.asarray(pose) / np.append(np.ones(3), np.full(4, np.linalg.norm(pose[3:])))
-    scene, models = two(device, name_a, name_b, pose_b=pose)
-    result = contacts_of(scene)
+    *names, pose = CASES[case]
+    models, pose = [model_of(name) for name in names], np.array(pose)
+    pose[3:] /= np.linalg.norm(pose[3:])
+    result = contacts_of(device, (models[0], STILL), (models[1], pose))
     rows = result.contacts
     assert len(rows) > 10
     check_fields(result)
@@ -118,17 +115,11 @@ def test_batches_in_the_world(device, names):
     """Random poses: fields, ends and normals in the world, mirrored pairs, repeated runs."""
     rng = np.random.default_rng(3)
     models = [sample(name) for name in names]
-    lods = [model.lod_max for model in models]
-    scene, poses = ab.Scene(device), []
-    for _ in range(6):
-        pair = contact_poses(rng, models[0], lods[0], models[1], lods[1])
-        for model, pose in zip(models, pair, strict=True):
-            scene.add(model, pose)
-            poses.append(pose)
-    poses.append(np.array([50.0, 0, 0, 0, 0, 0, 1]))
-    scene.add(models[0], poses[-1])
+    a, b = models
+    poses = [pose for _ in range(6) for pose in contact_poses(rng, a, a.lod_max, b, b.lod_max)]
+    placed = [*zip(models * 6, poses), (a, (50.0, 0, 0, 0, 0, 0, 1))]
     pairs = np.append(np.arange(12).reshape(-1, 2), [[0, 12]], 0)
-    result = contacts_of(scene, pairs)
+    result = contacts_of(device, *placed, pairs=pairs)
     assert result.count[:-1].sum() > 20 and result.count[-1] == 0
     check_fields(result)
     for row in result.contacts[rng.permutation(len(result.contacts))[:60]]:
@@ -140,10 +131,10 @@ def test_batches_in_the_world(device, names):
             normal = row["normal_b" if side else "normal_a"]
             if normal.any():
                 np.testing.assert_allclose(normal, unit(exact_normal(corners)), atol=1e-9)
-    again = contacts_of(scene, pairs)
+    again = contacts_of(device, *placed, pairs=pairs)
     assert again.contacts.tobytes() == result.contacts.tobytes()
     assert again.pair_contacts.tobytes() == result.pair_contacts.tobytes()
-    swapped = contacts_of(scene, pairs[:, ::-1])
+    swapped = contacts_of(device, *placed, pairs=pairs[:, ::-1])
     check_fields(swapped)
     turned = result.contacts[np.lexsort((*result.contacts["faces"].T, result.contacts["pair"]))]
     np.testing.assert_array_equal(swapped.contacts["faces"], turned["faces"][:, ::-1])
@@ -158,7 +149,7 @@ def test_batches_in_the_world(device, names):
 
 def test_contacts_need_no_pickle(device, tmp_path):
     """DESIGN: structured, `pair, faces, p0, p1, ...`; what is kept on disk comes back to the bit."""
-    result = contacts_of(two(device, "ball", "torus", pose_b=CASES["flat"][2])[0], [(1, 0)])
+    result = contacts_of(device, (sample("ball"), STILL), (sample("torus"), CASES["flat"][2]), pairs=[(1, 0)])
     assert len(result.contacts) > 10
     assert result.contacts.dtype.names == ("pair", "faces", *VECTORS, "coplanar")
     np.savez(tmp_path / "some.npz", contacts=result.contacts, pair_contacts=result.pair_contacts)
@@ -169,16 +160,11 @@ def test_contacts_need_no_pickle(device, tmp_path):
 
 
 def test_powers_of_two_scale_every_bit(device):
-    pose = np.array([0.3, 0.2, 0.1, 0.1, 0.2, 0.3, 0.9])
-    pose[3:] /= np.linalg.norm(pose[3:])
-    plain = None
+    plain, (soup_mesh, ball_mesh) = None, (SHAPES[name]() for name in ("soup", "ball"))
+    turn = np.array([0.1, 0.2, 0.3, 0.9]) / np.linalg.norm([0.1, 0.2, 0.3, 0.9])
     for k in (0, -60, 60):
-        scene = ab.Scene(device)
-        for name, at in (("soup", np.array(STILL)), ("ball", pose)):
-            vertices, faces, _ = sample(name).mesh_at(sample(name).lod_max)
-            model = ab.Model.from_arrays(np.ldexp(vertices, k), faces)
-            scene.add(model, np.append(np.ldexp(at[:3], k), at[3:]))
-        result = contacts_of(scene)
+        a, b = (ab.Model.from_arrays(np.ldexp(vertices, k), faces) for vertices, faces in (soup_mesh, ball_mesh))
+        result = contacts_of(device, (a, STILL), (b, [*np.ldexp([0.3, 0.2, 0.1], k), *turn]))
         plain = plain or result
         for rows, wanted in ((result.contacts, plain.contacts), (result.pair_contacts, plain.pair_contacts)):
             for name in rows.dtype.names:
@@ -193,13 +179,7 @@ KNOWN = {
     "a corner shared": (FLOOR, [(2, 0, 0), (4, 0, 1), (4, 0, -1)], [(2, 0, 0)] * 2, None, False),
     "opposite windings": (FLOOR, [(0, 0, 0), (0, 2, 0), (2, 0, 0)], [(2, 0, 0), (0, 2, 0)], (0, 0, 1), True),
     "a segment through": (FLOOR, [(0.5, 0.5, z) for z in (-1, 0, 1)], [(0.5, 0.5, 0)] * 2, (0, 0, 1), False),
-    "a segment in the plane": (
-        FLOOR,
-        [(x, 0.5, 0) for x in (-1, 1, 3)],
-        [(0, 0.5, 0), (1.5, 0.5, 0)],
-        (0, 0, 1),
-        False,
-    ),
+    "segment in the plane": (FLOOR, [(x, 0.5, 0) for x in (-1, 1, 3)], [(0, 0.5, 0), (1.5, 0.5, 0)], (0, 0, 1), False),
     # Faces without area have no normals; the contact's points from one centre to the other.
     "segments across": (ROD, [(0.5, y, 0) for y in (-1, 1, 3)], [(0.5, 0, 0)] * 2, (-0.5, 1, 0), False),
     "segments along": (ROD, [(1.5, 0, 0), (2, 0, 0), (4, 0, 0)], [(1.5, 0, 0), (2, 0, 0)], (1, 0, 0), False),
@@ -210,10 +190,8 @@ KNOWN = {
 def test_known_faces(device, case):
     one, other, ends, normal, coplanar = KNOWN[case]
     for a, b, sign in ((one, other, 1), (other, one, -1)):
-        scene = ab.Scene(device)
-        for corners in (a, b):
-            scene.add(ab.Model.from_arrays(np.array(corners, float), [[0, 1, 2]]))
-        result = contacts_of(scene)
+        faces = [ab.Model.from_arrays(np.array(corners, float), [[0, 1, 2]]) for corners in (a, b)]
+        result = contacts_of(device, (faces[0], STILL), (faces[1], STILL))
         check_fields(result)
         (contact,), (summed,) = result.contacts, result.pair_contacts
         got = sorted(map(tuple, (contact["p0"], contact["p1"])))
@@ -230,11 +208,8 @@ def test_known_faces(device, case):
 
 def test_boxes(device):
     """A unit box pressed 0.1 deep into the top of a wide one."""
-    wide, cube = trimesh.creation.box((4, 4, 1)), trimesh.creation.box()
-    scene = ab.Scene(device)
-    scene.add(ab.Model.from_arrays(wide.vertices, wide.faces))
-    scene.add(ab.Model.from_arrays(cube.vertices, cube.faces), (0.25, 0.5, 0.9, 0, 0, 0, 1))
-    result = contacts_of(scene, [(0, 1), (1, 0)])
+    placed = (box(4, 4, 1), STILL), (box(1, 1, 1), (0.25, 0.5, 0.9, 0, 0, 0, 1))
+    result = contacts_of(device, *placed, pairs=[(0, 1), (1, 0)])
     for p, sign in ((0, 1), (1, -1)):
         rows, summed = result.contacts[result.contacts["pair"] == p], result.pair_contacts[p]
         assert np.isclose(np.linalg.norm(rows["p1"] - rows["p0"], axis=1).sum(), 4.0)
@@ -245,21 +220,16 @@ def test_boxes(device):
 
 def test_depth_without_an_area(device):
     """A tip that touches: the overlap along the normal of the faces that touch, or of the boxes if that is less."""
-    wide, tip = trimesh.creation.box((4, 4, 1)), np.array([[0.25, 0.5, 0.5], [1, 0, 2], [1, 2, 1], [-2, 0, 2]])
-    tetrahedron = trimesh.Trimesh(tip, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], process=False)
-    models = [ab.Model.from_arrays(mesh.vertices, mesh.faces) for mesh in (wide, tetrahedron)]
-    scene = ab.Scene(device)
-    for model in models:
-        scene.add(model)
-    result = contacts_of(scene, [(0, 1), (1, 0)])
+    tip = np.array([[0.25, 0.5, 0.5], [1, 0, 2], [1, 2, 1], [-2, 0, 2]])
+    models = [box(4, 4, 1), ab.Model.from_arrays(tip, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])]
+    result = contacts_of(device, *((model, STILL) for model in models), pairs=[(0, 1), (1, 0)])
     rows = result.contacts[result.contacts["pair"] == 0]
     normal = result.pair_contacts["normal"][0]
     assert len(rows) > 2 and (rows["p0"] == tip[0]).all() and (rows["p1"] == tip[0]).all()
-    faces = (triangles(models[0], rows["faces"][:, 0]) @ normal).max() - (
-        triangles(models[1], rows["faces"][:, 1]) @ normal
-    ).min()
-    boxes = [np.array(np.meshgrid(*mesh.bounds.T)).reshape(3, -1).T @ normal for mesh in (wide, tetrahedron)]
-    wanted = min(faces, boxes[0].max() - boxes[1].min())
+    ends = [(-2, 2), (-2, 2), (-0.5, 0.5)], np.stack([tip.min(0), tip.max(0)], 1)
+    faces = [triangles(model, rows["faces"][:, k]) @ normal for k, model in enumerate(models)]
+    boxes = [np.array(np.meshgrid(*bounds)).reshape(3, -1).T @ normal for bounds in ends]
+    wanted = min(part[0].max() - part[1].min() for part in (faces, boxes))
     assert wanted > 0
     np.testing.assert_allclose(result.pair_contacts["depth"], [wanted] * 2, rtol=1e-6)
 
@@ -267,13 +237,9 @@ def test_depth_without_an_area(device):
 @pytest.mark.parametrize("overlap", [0.05, 1.0])
 def test_balls(device, overlap):
     """Two unit balls: a circle, the normal from one to the other, and a depth as far off as is said."""
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    model = ab.Model.from_arrays(ball.vertices, ball.faces)
-    scene, d = ab.Scene(device), 2 - overlap
-    axis = np.array([0.48, 0.6, 0.64])
-    scene.add(model, (1, 2, 3, 0, 0, 0, 1))
-    scene.add(model, (*((1, 2, 3) + d * axis), 0.3, 0, 0, np.sqrt(0.91)))
-    result = contacts_of(scene)
+    ball, d, axis = trimesh.creation.icosphere(subdivisions=4), 2 - overlap, np.array([0.48, 0.6, 0.64])
+    model, turned = ab.Model.from_arrays(ball.vertices, ball.faces), (0.3, 0, 0, np.sqrt(0.91))
+    result = contacts_of(device, (model, (1, 2, 3, 0, 0, 0, 1)), (model, (*((1, 2, 3) + d * axis), *turned)))
     radius = np.linalg.norm(np.cross(result.contacts["p0"] - [1, 2, 3], axis), axis=1)
     np.testing.assert_allclose(radius, np.sqrt(1 - d * d / 4), rtol=0.04)
     summed = result.pair_contacts[0]
@@ -284,10 +250,10 @@ def test_balls(device, overlap):
 
 def test_rounded_signs_give_whole_contacts(device):
     """Of faces that do not meet too, as rounded signs may report: a point between them."""
-    scene, models = two(device, "small ball", "small ball", pose_b=(1e-7, 0, 0, 0, 0, 0, 1))
-    result = contacts_of(scene, precision="float32")
+    ball = sample("small ball")
+    result = contacts_of(device, (ball, STILL), (ball, (1e-7, 0, 0, 0, 0, 0, 1)), precision="float32")
     check_fields(result)
     for row in result.contacts[:: len(result.contacts) // 100]:
         for k in range(2):
-            corners = triangles(models[k], row["faces"][k]) + [1e-7 * k, 0, 0]
+            corners = triangles(ball, row["faces"][k]) + [1e-7 * k, 0, 0]
             assert brute_distances(np.array([row["p0"], row["p1"]]), corners[None]).max() < 2e-7

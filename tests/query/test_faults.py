@@ -4,38 +4,27 @@ Out of memory, an operator goes on with what it had; interrupted, its next launc
 sentence; never another answer.
 """
 
-from functools import partial
-
 import numpy as np
 import pytest
 import warp as wp
-from helpers.faults import (
-    MORE_PAIRS,
-    PAIRS,
-    Interruption,
-    MemoryShortage,
-    add_objects,
-    check_buffer_lengths,
-    check_scene,
-    describe,
-    make_scene,
-)
-from helpers.questions import GpuQuery
+from helpers import faults
+from helpers.faults import MORE_PAIRS, PAIRS, add_objects, describe, make_scene
+from helpers.questions import GpuQuery, in_a_row
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
 
-REFUSED = "interrupted"
+REFUSALS = ("interrupted", "replaced", "nothing was launched", "make a new one")
 
 
 @pytest.fixture
 def memory(device, monkeypatch):
-    return MemoryShortage(device, monkeypatch)
+    return faults.MemoryShortage(device, monkeypatch)
 
 
 @pytest.fixture
 def interruption(device, monkeypatch):
-    return Interruption(device, monkeypatch)
+    return faults.Interruption(device, monkeypatch)
 
 
 QUERIES = {
@@ -64,10 +53,9 @@ def test_a_query_grows(device, memory, kind):
     few, many = describe(make()[1].run()), describe(grow(make()))
 
     def check(before, made):
-        check_buffer_lengths([made[1]])
-        if before is not None:
-            assert describe(made[1].run()) in (few, many)
-        return check_scene(before, made[0])
+        faults.check_buffer_lengths([made[1]])
+        assert before is None or describe(made[1].run()) in (few, many)
+        return faults.check_scene(before, made[0])
 
     count, result = memory.everywhere(make, grow, check)
     assert count >= 1 and describe(result) == many and result.any.any()
@@ -77,9 +65,7 @@ def test_the_broad_phase_grows(device, memory):
     """Among more objects in one place than it has room for pairs."""
 
     def make():
-        scene = ab.Scene(device)
-        for _ in range(20):
-            scene.add(sample("box"))
+        scene = in_a_row(device, "box", [0.0] * 20)
         scene.batch()
         return scene
 
@@ -134,14 +120,10 @@ def test_queries(device, interruption, kind, call):
     def check(before, query):
         if before is None:
             return query.run().count.tolist()
-        try:
+        with faults.refusing(*REFUSALS[:3], kind=(RuntimeError, ab.CapacityError)):
             assert query.result().count.tolist() == before
-        except (RuntimeError, ab.CapacityError) as error:
-            assert REFUSED in str(error) or "replaced" in str(error) or "nothing was launched" in str(error), error
-        try:
+        with faults.refusing(REFUSALS[3]):
             assert query.run().count.tolist() in (before, 2 * before)
-        except RuntimeError as error:
-            assert "make a new one" in str(error)
         return before
 
     steps, _ = interruption.everywhere(make, CALLS[call], check)
@@ -155,33 +137,32 @@ FRAMES = {
 }
 
 
+@pytest.mark.parametrize("replayed", [False, True])
 @pytest.mark.parametrize("kind", FRAMES)
-def test_frames(device, interruption, kind):
+def test_frames(device, interruption, kind, replayed):
     """The next launch, or the replay of a graph captured before, gives what it gives on a frame of its own."""
-    options = {"output": "count", "pairs": MORE_PAIRS, **FRAMES[kind]}
 
     def make():
-        frame = ab.Pipeline(add_objects(device), **options)
+        frame = ab.Pipeline(add_objects(device), **{"output": "count", "pairs": MORE_PAIRS, **FRAMES[kind]})
         graph = frame.capture()
         frame.lods.assign(np.array([20, 41, 9, 33], np.int32))
         return frame, graph
 
-    whole = make()[0]
+    whole, _ = make()
     whole.launch()
     expected = whole.result().count.tolist()
 
-    def check(before, made, launch):
-        if before is None:
-            return True
-        with pytest.raises(RuntimeError, match=REFUSED):
-            made[0].result()
-        launch(*made)
-        assert made[0].result().count.tolist() == expected
-        made[0].check()
+    def check(before, made):
+        if before is not None:
+            frame, graph = made
+            with pytest.raises(RuntimeError, match=REFUSALS[0]):
+                frame.result()
+            wp.capture_launch(graph) if replayed else frame.launch()
+            assert frame.result().count.tolist() == expected
+            frame.check()
+        return True
 
-    for launch in (lambda frame, _: frame.launch(), lambda _, graph: wp.capture_launch(graph)):
-        steps, _ = interruption.everywhere(make, lambda made: made[0].launch(), partial(check, launch=launch))
-        assert steps > 3
+    assert interruption.everywhere(make, lambda made: made[0].launch(), check)[0] > 3
 
 
 def test_a_capture(device, interruption):
@@ -191,7 +172,7 @@ def test_a_capture(device, interruption):
         wp.capture_launch(frame.capture())
         frame.check()
         now = frame.result().count.tolist()
-        assert before is None or now == before
+        assert before in (None, now)
         return now
 
     def make():
@@ -220,9 +201,8 @@ def test_bodies(device, interruption):
 
     def make():
         scene = ab.Scene(device)
-        scene.add(sample("box"), static=True)
-        for height in (0.9, 1.85):
-            scene.add(sample("box"), pose=(0.1, 0, height, 0, 0, 0, 1))
+        for height in (0, 0.9, 1.85):
+            scene.add(sample("box"), pose=(0.1 * (height > 0), 0, height, 0, 0, 0, 1), static=height == 0)
         bodies = ab.Dynamics(scene)
         bodies.step(1e-3)
         return bodies
@@ -232,12 +212,10 @@ def test_bodies(device, interruption):
     expected = whole.poses().tobytes()
 
     def check(before, bodies):
-        if before is None:
-            return True
-        try:
-            bodies.step(1e-3)
-            assert bodies.poses().tobytes() == expected
-        except RuntimeError as error:
-            assert "a step of the bodies was interrupted; make a new Dynamics" in str(error)
+        if before is not None:
+            with faults.refusing("a step of the bodies was interrupted; make a new Dynamics"):
+                bodies.step(1e-3)
+                assert bodies.poses().tobytes() == expected
+        return True
 
     assert interruption.everywhere(make, lambda bodies: bodies.step(1e-3), check)[0] > 10

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from conftest import slow
-from helpers.questions import pairs_of, random_case, scene_of, sort_rows
+from helpers.questions import ask, in_a_row, launch, pairs_of, random_case, scene_of, sort_rows
 from helpers.samples import REAL_MESHES, STILL, WARP_MESHES, contact_poses, random_poses, sample, true_faces
 from oracles.peers import fcl_faces, judge
 from oracles.triangle import into_frame_of_a
@@ -25,43 +25,26 @@ BUNDLED_PAIRS = [("warp:bunny", "warp:bear"), ("warp:rocks", "fcl-env")]
 BRUTE_FACES = 2500
 
 
-def ask(scene, pairs, output="faces"):
-    return scene.intersect(pairs, output=output)
-
-
-def check_cases(device, cases):
-    """Compare faces with brute force; any and count with faces; swapped pairs with plain ones."""
-    scene = scene_of(device, cases)
-    expected, pairs = [true_faces(*case) for case in cases], pairs_of(cases)
-    result = ask(scene, pairs)
-    rows = np.concatenate([np.insert(faces, 0, p, 1) for p, faces in enumerate(expected)])
+@pytest.mark.parametrize("names", [*SHAPE_PAIRS, *slow(*REAL_PAIRS, *BUNDLED_PAIRS)], ids="-".join)
+def test_faces_equal_brute_force(device, names):
+    """Also of swapped pairs; the three outputs agree, and results are typed, shaped and sorted as promised."""
+    rng, count = np.random.default_rng(1), 10 if names in SHAPE_PAIRS else 4
+    cases = [random_case(rng, names, BRUTE_FACES) for _ in range(count)]
+    scene, pairs = scene_of(device, cases), pairs_of(cases)
+    result = scene.intersect(pairs, "faces")
+    rows = np.concatenate([np.insert(true_faces(*case), 0, p, 1) for p, case in enumerate(cases)])
     np.testing.assert_array_equal(result.faces, rows)
-    check_agreement(scene, pairs, result)
-
-    np.testing.assert_array_equal(ask(scene, pairs[:, ::-1]).faces, sort_rows(rows[:, [0, 2, 1]]))
-    return expected
-
-
-def check_agreement(scene, pairs, result):
-    """The three outputs agree, and results are typed, shaped and sorted as promised."""
+    assert len(rows) > 0
+    np.testing.assert_array_equal(scene.intersect(pairs[:, ::-1], "faces").faces, sort_rows(rows[:, [0, 2, 1]]))
     np.testing.assert_array_equal(result.pairs, pairs)
     assert (result.any.dtype, result.count.dtype.kind, result.faces.dtype) == (bool, "i", np.int32)
     np.testing.assert_array_equal(result.count, np.bincount(result.faces[:, 0], minlength=len(pairs)))
     np.testing.assert_array_equal(result.any, result.count > 0)
-    assert (np.lexsort(result.faces.T[::-1]) == np.arange(len(result.faces))).all()
-    counts, alone = ask(scene, pairs, "count"), ask(scene, pairs, "any")
+    counts, alone = scene.intersect(pairs, "count"), scene.intersect(pairs, "any")
     np.testing.assert_array_equal(counts.count, result.count)
-    np.testing.assert_array_equal(counts.any, result.any)
-    np.testing.assert_array_equal(alone.any, result.any)
+    np.testing.assert_array_equal([counts.any, alone.any], [result.any] * 2)
     assert counts.faces is None and alone.faces is None and alone.count is None
     assert (alone.triangle_tests <= result.triangle_tests).all()
-
-
-@pytest.mark.parametrize("names", [*SHAPE_PAIRS, *slow(*REAL_PAIRS, *BUNDLED_PAIRS)], ids="-".join)
-def test_faces_equal_brute_force(device, names):
-    rng, count = np.random.default_rng(1), 10 if names in SHAPE_PAIRS else 4
-    cases = [random_case(rng, names, BRUTE_FACES) for _ in range(count)]
-    assert sum(map(len, check_cases(device, cases))) > 0
 
 
 @pytest.mark.parametrize("names", [*SHAPE_PAIRS[:3], *slow(*REAL_PAIRS, WARP_MESHES[:2])], ids="-".join)
@@ -70,7 +53,7 @@ def test_agrees_with_fcl(device, names):
     pytest.importorskip("fcl")
     rng, wrong = np.random.default_rng(3), 0
     cases = [random_case(rng, names, 10**6) for _ in range(3)]
-    result = ask(scene_of(device, cases), pairs_of(cases))
+    result = ask(device, cases)
     for p, (model_a, lod_a, pose_a, model_b, lod_b, pose_b) in enumerate(cases):
         (*mesh_a, ids_a), (*mesh_b, ids_b) = model_a.mesh_at(lod_a), model_b.mesh_at(lod_b)
         ours = result.faces[result.faces[:, 0] == p][:, 1:]
@@ -83,23 +66,18 @@ def test_agrees_with_fcl(device, names):
     assert len(result.faces) > 0
 
 
-# Where B's vertices lie in A's frame: to the bit, since every answer is defined on these coordinates.
-
-
 @wp.kernel
-def pose_point_kernel(
-    pair_poses: wp.array(dtype=PairPose), points: wp.array(dtype=wp.vec3d), moved_out: wp.array2d(dtype=wp.vec3d)
-):
+def pose_point_kernel(pair_poses: wp.array[PairPose], points: wp.array[wp.vec3d], moved_out: wp.array2d[wp.vec3d]):
     p, i = wp.tid()
     moved_out[p, i] = pose_point(pair_poses[p].rotation, pair_poses[p].translation, points[i])
 
 
 def test_relative_poses_equal_the_definition(device):
+    """Where B's vertices lie in A's frame, to the bit: every answer is defined on these coordinates."""
     rng = np.random.default_rng(10)
-    poses = np.concatenate([random_poses(rng, 20, 3.0), random_poses(rng, 20, 1e-3), random_poses(rng, 20, 1e7)])
+    poses = np.concatenate([random_poses(rng, 20, spread) for spread in (3.0, 1e-3, 1e7)])
     points = rng.normal(size=(50, 3)) * 2.0 ** rng.integers(-30, 5, (50, 3))
-    points[0] = 0
-    points[1] = 2.0**-291, -(2.0**-300), 2.0**-290
+    points[:2] = (0, 0, 0), (2.0**-291, -(2.0**-300), 2.0**-290)
     poses[:2] = STILL
     scene = ab.Scene(device)
     for pose in poses:
@@ -107,10 +85,8 @@ def test_relative_poses_equal_the_definition(device):
     pairs = np.concatenate([np.arange(60).reshape(-1, 2), rng.permutation(60).reshape(-1, 2)])
     query = ab.Query(scene, "any", pairs=pairs, precision="exact")
     query.launch()
-    moved = wp.zeros((60, 50), dtype=wp.vec3d, device=device)
-    inputs = [query.pair_poses, wp.array(points, dtype=wp.vec3d, device=device)]
-    wp.launch(pose_point_kernel, dim=(60, 50), inputs=inputs, outputs=[moved], device=device)
-    for (i, j), got in zip(pairs, moved.numpy(), strict=True):
+    moved = launch(pose_point_kernel, device, (60, 50), query.pair_poses, points)
+    for (i, j), got in zip(pairs, moved, strict=True):
         np.testing.assert_array_equal(got, into_frame_of_a(points, poses[min(i, j)], poses[max(i, j)]))
 
 
@@ -128,7 +104,7 @@ def rounded(name):
 def check_pair(device, model_a, pose_a, model_b, pose_b, lod):
     """Compare one pair at one LOD with brute force and return its faces."""
     case = (model_a, lod, pose_a, model_b, lod, pose_b)
-    faces = ask(scene_of(device, [case]), [(0, 1)]).faces[:, 1:]
+    faces = ask(device, [case]).faces[:, 1:]
     np.testing.assert_array_equal(faces, true_faces(*case))
     return faces
 
@@ -167,21 +143,15 @@ def test_touching_boxes(device, shift):
 @pytest.mark.parametrize("far", [1e6, 1e30, 1e39, 1e300, 1.7e308])
 def test_pairs_far_apart(device, far):
     """Beyond float32, even where the distance overflows float64, the answer is no and costs nothing."""
-    scene = ab.Scene(device)
-    ball = sample("small ball")
-    scene.add(ball)
-    for x in (far, -far):
-        for axis in range(3):
-            scene.add(ball, np.concatenate([np.roll([x, 0, 0], axis), STILL[3:]]))
-    scene.add(ball, (far, 0, 0, 0, 0, 0, 1))
-    count = scene.object_count
-    pairs = [(i, j) for i in range(count) for j in range(count) if i != j]
-    result = ask(scene, pairs)
-    meets = {(1, count - 1), (count - 1, 1)}
-    assert {pair for pair, any_hit in zip(pairs, result.any, strict=True) if any_hit} == meets
-    apart = [pair not in meets for pair in pairs]
+    scene = in_a_row(device, "small ball", (0, far, -far, far))
+    for place in ((0, far, 0), (0, 0, far), (0, -far, 0), (0, 0, -far)):
+        scene.add(sample("small ball"), (*place, 0, 0, 0, 1))
+    pairs = [(i, j) for i in range(8) for j in range(8) if i != j]
+    result = scene.intersect(pairs, "faces")
+    apart = np.array([{*pair} != {1, 3} for pair in pairs])
+    np.testing.assert_array_equal(result.any, ~apart)
     assert (result.node_tests[apart] <= 2).all() and (result.triangle_tests[apart] == 0).all()
-    assert (result.count[~np.array(apart)] >= ball.face_count).all()
+    assert (result.count[~apart] >= sample("small ball").face_count).all()
 
 
 @pytest.mark.parametrize("room", [STACK_LENGTH, 0])
@@ -191,15 +161,14 @@ def test_warps_give_the_same_answers(device, room, parts):
     """One warp a pair and several, with room on the stack or none, so that they go one item at a time."""
     rng = np.random.default_rng(8)
     scene = scene_of(device, [random_case(rng, ("torus", "soup"), BRUTE_FACES) for _ in range(12)])
-    for _ in range(2):  # coincident meshes
-        scene.add(sample("torus"), STILL, lod=sample("torus").lod_for(fraction=0.2))
-    for x in (0.0, 0.0, 0.03125):  # corners in common, faces in one plane wait for exact signs
-        scene.add(sample("grid"), (x, x / 2, 0, 0, 0, 0, 1), lod=sample("grid").lod_for(fraction=0.2))
+    # Coincident meshes; and corners in common, where faces in one plane wait for exact signs.
+    for name, x in (("torus", 0.0), ("torus", 0.0), ("grid", 0.0), ("grid", 0.0), ("grid", 0.03125)):
+        scene.add(sample(name), (x, x / 2, 0, 0, 0, 0, 1), lod=sample(name).lod_for(fraction=0.2))
     pairs = np.arange(24).reshape(-1, 2)
     pairs = np.concatenate([pairs, pairs[::-1, ::-1], [(0, 3), (2, 9), (24, 25), (26, 27), (26, 28), (28, 26)]])
     visits = {}
     for output in ("faces", "count", "any"):
-        plain = ask(scene, pairs, output)
+        plain = scene.intersect(pairs, output)
         with testing.regime(warps=True, warps_per_pair=parts, stack_length=room):
             query = ab.Query(scene, output, pairs=pairs, capacity=ab.Buffers(uncertain=2))
         result = query.run()
@@ -222,13 +191,13 @@ def test_coincident_meshes_go_to_float64_at_once(device):
     scene = ab.Scene(device)
     for placed in (model, model, copy.copy(model)):
         scene.add(placed, pose)
-    result = ask(scene, [(0, 1), (0, 2)])
+    result = scene.intersect([(0, 1), (0, 2)], "faces")
     first, second = (result.faces[result.faces[:, 0] == p, 1:] for p in range(2))
     np.testing.assert_array_equal(first, second)
     tested, left = result.triangle_tests, result.float64_tests
     assert left[0] == tested[0] == tested[1] > left[1]
     scene.set_lods([model.lod_max, *[model.lod_for(fraction=0.3)] * 2])
-    apart = ask(scene, [(0, 1), (0, 2)])  # no twins
+    apart = scene.intersect([(0, 1), (0, 2)], "faces")  # no twins
     assert (apart.float64_tests < apart.triangle_tests).all() and np.ptp(apart.float64_tests) == 0
 
 
@@ -240,12 +209,8 @@ def test_a_coarse_tree_costs_no_more_than_one_built_for_its_lod(device, name, fr
     lod = model.lod_for(fraction=fraction)
     static = ab.Model.from_arrays(*model.mesh_at(lod)[:2])
     rng = np.random.default_rng(9)
-    active, built = ab.Scene(device), ab.Scene(device)
-    for _ in range(20):
-        for pose in contact_poses(rng, model, lod, model, lod):
-            active.add(model, pose, lod=lod)
-            built.add(static, pose)
-    pairs = np.arange(40).reshape(-1, 2)
-    ours, theirs = ask(active, pairs, "count"), ask(built, pairs, "count")
+    poses = [contact_poses(rng, model, lod, model, lod) for _ in range(20)]
+    ours = ask(device, [(model, lod, pose_a, model, lod, pose_b) for pose_a, pose_b in poses], output="count")
+    theirs = ask(device, [(static, None, pose_a, static, None, pose_b) for pose_a, pose_b in poses], output="count")
     np.testing.assert_array_equal(ours.count, theirs.count)
     assert ours.node_tests.sum() <= 1.1 * theirs.node_tests.sum()

@@ -17,37 +17,29 @@ NAMES = ("box", "small ball", "crumbs", "soup", "torus", "three", "capsule", "on
 FACES = 60
 
 
-def dot(u, v):
-    return (u * v).sum(-1)
-
-
 def over(a, b):
     """a / b, and 0 where b is 0."""
     return np.divide(a, b, out=np.zeros(np.broadcast_shapes(np.shape(a), np.shape(b))), where=b > 0)
 
 
-def surface_distance(a, b):
-    """Return the distance of triangles (m, 3, 3) from others (n, 3, 3) that they do not intersect.
+def mesh_distance(model_a, lod_a, pose_a, model_b, lod_b, pose_b):
+    """Return the distance of two posed meshes that do not intersect.
 
     The least over all pairs of features: corner and face, and the lines of two edges where closest inside both.
     """
+    (vertices_a, faces_a, _), (vertices_b, faces_b, _) = model_a.mesh_at(lod_a), model_b.mesh_at(lod_b)
+    a, b = vertices_a[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b]
     least = min(brute_distances(a.reshape(-1, 3), b).min(), brute_distances(b.reshape(-1, 3), a).min())
     for i, j in itertools.product(range(3), repeat=2):
         p, q = a[:, None, i], b[None, :, j]
         e, f = a[:, None, (i + 1) % 3] - p, b[None, :, (j + 1) % 3] - q
-        cross = np.cross(e, f)
-        size = dot(cross, cross)
-        s, t = over(dot(np.cross(q - p, f), cross), size), over(dot(np.cross(q - p, e), cross), size)
+        across = np.cross(e, f)
+        size = (across**2).sum(-1)
+        s, t = (over((np.cross(q - p, edge) * across).sum(-1), size) for edge in (f, e))
         inside = (size > 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
-        least = min(least, np.abs(over(dot(q - p, cross), np.sqrt(size)))[inside].min(initial=np.inf))
+        gap = np.abs(over(((q - p) * across).sum(-1), np.sqrt(size)))
+        least = min(least, gap[inside].min(initial=np.inf))
     return least
-
-
-def mesh_distance(model_a, lod_a, pose_a, model_b, lod_b, pose_b):
-    """Distance of two posed meshes that do not intersect."""
-    vertices_a, faces_a, _ = model_a.mesh_at(lod_a)
-    vertices_b, faces_b, _ = model_b.mesh_at(lod_b)
-    return surface_distance(vertices_a[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b])
 
 
 def posed_pairs(rng, device, pairs, faces=FACES):
@@ -98,8 +90,8 @@ def test_single_faces_equal_brute_force(device, kind):
         elif kind == "parallel":
             b = a * rng.uniform(0.5, 2) + rng.normal(size=3)
         elif kind == "slivers":
-            a[2] = a[0] + rng.random() * (a[1] - a[0]) + 1e-6 * rng.normal(size=3)
-            b[2] = b[0] + rng.random() * (b[1] - b[0]) + 1e-6 * rng.normal(size=3)
+            for t in (a, b):
+                t[2] = t[0] + rng.random() * (t[1] - t[0]) + 1e-6 * rng.normal(size=3)
         elif kind == "segments and points":
             # Sums of halves stay collinear. Three equal corners weld, so a point is a very short segment.
             a, b = np.round(a * 64) / 64, np.round(b * 64) / 64
@@ -110,8 +102,8 @@ def test_single_faces_equal_brute_force(device, kind):
             a, b = np.round(a), np.round(b)
         if min(len(np.unique(a, axis=0)), len(np.unique(b, axis=0))) < 3:
             continue
-        models = [ab.Model.from_arrays(corners, [(0, 1, 2)]) for corners in (a, b)]
-        cases.append((models[0], 0, STILL, models[1], 0, STILL))
+        a, b = (ab.Model.from_arrays(corners, [(0, 1, 2)]) for corners in (a, b))
+        cases.append((a, 0, STILL, b, 0, STILL))
     scene = scene_of(device, cases)
     distances = distances_of(scene, cases)
     assert (distances > 0).sum() > 100
@@ -125,11 +117,11 @@ def test_coarse_proof_holds_for_the_original_meshes(device):
     cases, within = [], []
     for _ in range(300):
         a, b = [sample(name) for name in rng.choice(names, 2)]
-        lods = [int(model.lod_max * rng.random() ** 0.3) for model in (a, b)]
-        poses = contact_poses(rng, a, lods[0], b, lods[1])
-        poses[1][:3] += rng.normal(size=3) * rng.random()
-        cases.append((a, lods[0], poses[0], b, lods[1], poses[1]))
-        within.append(a.error_at(lods[0]) + b.error_at(lods[1]))
+        i, j = [int(model.lod_max * rng.random() ** 0.3) for model in (a, b)]
+        pose_a, pose_b = contact_poses(rng, a, i, b, j)
+        pose_b[:3] += rng.normal(size=3) * rng.random()
+        cases.append((a, i, pose_a, b, j, pose_b))
+        within.append(a.error_at(i) + b.error_at(j))
     coarse, pairs = scene_of(device, cases), pairs_of(cases)
     fine = scene_of(device, [(a, None, pose_a, b, None, pose_b) for a, _, pose_a, b, _, pose_b in cases])
     result, truth = coarse.intersect(pairs, within=within), fine.intersect(pairs)
@@ -142,12 +134,10 @@ def test_coarse_proof_holds_for_the_original_meshes(device):
 def test_scaling_by_a_power_of_two_changes_nothing(device, exponent):
     rng = np.random.default_rng(5)
     plain, cases = posed_pairs(rng, device, [("soup", "small ball")] * 20)
-    models = {}
-    for name in ("soup", "small ball"):
-        vertices, faces = SHAPES[name]()
-        models[sample(name)] = ab.Model.from_arrays(np.ldexp(vertices, exponent), faces, base_faces=4)
+    meshes = SHAPES["soup"](), SHAPES["small ball"]()
+    a, b = (ab.Model.from_arrays(np.ldexp(points, exponent), faces, base_faces=4) for points, faces in meshes)
     by = np.array([2.0**exponent] * 3 + [1] * 4)
-    scaled = scene_of(device, [(models[a], i, by * p, models[b], j, by * q) for a, i, p, b, j, q in cases])
+    scaled = scene_of(device, [(a, i, by * p, b, j, by * q) for _, i, p, _, j, q in cases])
     distances = distances_of(plain, cases)
     for factor in (0, 1 - 1e-13, 1 - 1e-15, 1, 1 + 1e-15, 1 + 1e-13, 2):
         one = plain.intersect(pairs_of(cases), within=factor * distances)
@@ -164,11 +154,10 @@ def test_far_from_the_origin(device, far):
     models = sample("torus"), ab.Model.from_arrays(vertices + shift[:3], faces, base_faces=4)
     cases = []
     for k in range(20):
-        sides = [(models[k % 2], random_lod(rng, models[k % 2], FACES)), (sample("soup"), 40)]
-        sides = sides if k % 4 < 2 else sides[::-1]
-        poses = contact_poses(rng, *sides[0], *sides[1])
-        poses[1][:3] += 3 * rng.normal(size=3)
-        cases.append((*sides[0], poses[0] + shift, *sides[1], poses[1] + shift))
+        a, b = [(models[k % 2], random_lod(rng, models[k % 2], FACES)), (sample("soup"), 40)][:: 1 if k % 4 < 2 else -1]
+        pose_a, pose_b = contact_poses(rng, *a, *b)
+        pose_b[:3] += 3 * rng.normal(size=3)
+        cases.append((*a, pose_a + shift, *b, pose_b + shift))
     scene = scene_of(device, cases)
     distances = distances_of(scene, cases)
     clear = distances > 0.01
@@ -216,15 +205,16 @@ def test_query_takes_other_pairs_and_distances(device):
     scene = in_a_row(device, "box", (0, 1.5, 4, 9))
     query = ab.Query(scene, "any", pairs=[(0, 1), (1, 2)], within=1.0)
     np.testing.assert_array_equal(query.run().apart, [False, True])
-    query.set_pairs([(0, 1), (0, 2), (2, 3)])
-    np.testing.assert_array_equal(query.run().apart, [False, True, True])
-    query.set_pairs([(0, 1), (0, 2), (2, 3)], within=[0.25, 3.5, 3.5])
-    np.testing.assert_array_equal(query.run().apart, [True, False, True])
-    query.set_pairs([(2, 3), (0, 1), (0, 2)])
-    np.testing.assert_array_equal(query.run().apart, [True, False, False])
+    for given, apart in (
+        (([(0, 1), (0, 2), (2, 3)],), [False, True, True]),
+        (([(0, 1), (0, 2), (2, 3)], [0.25, 3.5, 3.5]), [True, False, True]),
+        (([(2, 3), (0, 1), (0, 2)],), [True, False, False]),
+    ):
+        query.set_pairs(*given)
+        np.testing.assert_array_equal(query.run().apart, apart)
     with pytest.raises(ValueError, match="2 pairs"):
         query.set_pairs([(0, 1), (0, 2)])
-    np.testing.assert_array_equal(query.run().apart, [True, False, False])
+    np.testing.assert_array_equal(query.run().apart, apart)
     with pytest.raises(ValueError, match="without within"):
         ab.Query(scene, "any", pairs=[(0, 1)]).set_pairs([(0, 1)], within=1.0)
     assert scene.intersect(np.empty((0, 2), int), within=1.0).apart.shape == (0,)

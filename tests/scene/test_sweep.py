@@ -2,6 +2,7 @@
 
 import gc
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from types import SimpleNamespace
 
@@ -17,9 +18,10 @@ from warp_abtree.scene import sweep as pose_sweep
 
 
 @pytest.fixture(autouse=True)
-def nothing_kept():
+def kept():
+    """Sweeps that are kept, none before and after a test."""
     pose_sweep._kept.clear()
-    yield
+    yield pose_sweep._kept
     pose_sweep._kept.clear()
 
 
@@ -28,12 +30,13 @@ def small_chunks(monkeypatch):
     monkeypatch.setattr(pose_sweep, "CHUNKS", (7,))
 
 
-def ask_scene(device, models, poses, lods, **options):
+def ask_scene(device, models, poses, lod_a=None, **options):
+    """Return the faces of a scene with an object a pose."""
     scene = ab.Scene(device)
-    scene.add(models[0], STILL, lod=lods[0])
+    scene.add(models[0], STILL, lod=lod_a)
     for pose in poses:
-        scene.add(models[1], pose, lod=lods[1])
-    return scene.intersect([(0, i + 1) for i in range(len(poses))], **options)
+        scene.add(models[1], pose)
+    return scene.intersect([(0, i + 1) for i in range(len(poses))], output="faces", **options)
 
 
 def mixed_poses(seed=1):
@@ -45,40 +48,39 @@ def mixed_poses(seed=1):
 @pytest.mark.parametrize("names, precision", [(("torus", "soup"), "exact"), (("torus", "torus"), "float32")])
 def test_same_as_a_scene(device, names, precision, small_chunks):
     models, poses = [sample(name) for name in names], mixed_poses()
-    lods = [models[0].lod_for(fraction=0.3), None]
-    expected = ask_scene(device, models, poses, lods, output="faces", precision=precision)
+    options = {"lod_a": models[0].lod_for(fraction=0.3), "precision": precision}
+    expected = ask_scene(device, models, poses, **options)
     assert 3 < expected.any.sum() < 26
-    options = {"lod_a": lods[0], "precision": precision, "device": device}
     for _ in range(2):  # the second time from what is kept
         for output in ("any", "count", "faces"):
-            found = ab.sweep(*models, poses, output=output, **options)
+            found = ab.sweep(*models, poses, output=output, device=device, **options)
             np.testing.assert_array_equal(found, getattr(expected, output))
             assert found.dtype == getattr(expected, output).dtype
 
 
-def test_more_poses_than_before_and_fewer(device, monkeypatch):
+def test_more_poses_than_before_and_fewer(device, kept, monkeypatch):
     monkeypatch.setattr(pose_sweep, "CHUNKS", (2, 5, 20))
     models, poses = [sample("torus"), sample("soup")], mixed_poses()
-    expected = ask_scene(device, models, poses, [None, None], output="faces")
+    expected = ask_scene(device, models, poses)
     for count in (3, 26, 1, 17, 0, 26):
         for output in ("any", "faces"):
             found = ab.sweep(*models, poses[:count], output=output, device=device)
             whole = expected.any[:count] if output == "any" else expected.faces[expected.faces[:, 0] < count]
             np.testing.assert_array_equal(found, whole)
-    assert sorted(next(iter(pose_sweep._kept.values())).chunks) == [2, 5, 20]
+    assert sorted(next(iter(kept.values())).chunks) == [2, 5, 20]
 
 
 @pytest.mark.slow
-def test_lists_that_overflow_lose_nothing(device, monkeypatch, small_chunks):
+def test_lists_that_overflow_lose_nothing(device, kept, monkeypatch, small_chunks):
     """The CUDA regime, with room for one uncertain face pair; boxes lie flush."""
     box = sample("box")
     poses = np.tile(np.array(STILL), (20, 1))
     poses[:, 0] = np.arange(20) / 10
-    expected = ask_scene(device, [box, box], poses, [None, None], output="faces")
+    expected = ask_scene(device, [box, box], poses)
     assert expected.any[:11].all() and not expected.any[11:].any()
     monkeypatch.setattr(pose_sweep, "Query", partial(GpuQuery, capacity=ab.Buffers(uncertain=1)))
     np.testing.assert_array_equal(ab.sweep(box, box, poses, output="faces", device=device), expected.faces)
-    (posed,) = pose_sweep._kept.values()
+    (posed,) = kept.values()
     assert len(posed.chunks[7].chunk_query.query.hits.uncertain) > 1
 
 
@@ -107,7 +109,7 @@ def test_the_first_bad_pose_is_named(device, kind, small_chunks):
     assert len(ab.sweep(torus, torus, just, device=device)) == len(poses)
 
 
-def test_refused(device):
+def test_refused(device, kept):
     torus = sample("torus")
     asked = {"model_a": torus, "model_b": torus, "poses": [STILL, STILL], "device": device}
     for what, options in (
@@ -121,59 +123,54 @@ def test_refused(device):
     ):
         with pytest.raises(TypeError if what == "not a Model" else ValueError, match=what):
             ab.sweep(**{**asked, **options})
-    assert not pose_sweep._kept
-
-
-# --- what is kept ----------------------------------------------------------------------------------------------------
+    assert not kept
 
 
 def new_model(name="box"):
     return ab.Model.from_arrays(*SHAPES[name](), base_faces=4)
 
 
-def test_a_pair_of_models_is_set_up_once(device):
+def test_a_pair_of_models_is_set_up_once(device, kept):
     """Models, states and, for the same output, buffers."""
     a, b, poses = new_model(), new_model("torus"), mixed_poses()
     first = ab.sweep(a, b, poses, device=device)
-    (posed,) = pose_sweep._kept.values()
+    (posed,) = kept.values()
     (chunk,) = posed.chunks.values()
-    kept = chunk.chunk_query
+    query = chunk.chunk_query
     assert np.array_equal(ab.sweep(a, b, poses, device=device), first)
-    assert chunk.chunk_query is kept and [*pose_sweep._kept.values()] == [posed]
+    assert chunk.chunk_query is query and [*kept.values()] == [posed]
     ab.sweep(a, b, poses, output="count", device=device)
-    assert chunk.chunk_query is not kept and [*pose_sweep._kept.values()] == [posed], "of one output: memory is bounded"
+    assert chunk.chunk_query is not query and [*kept.values()] == [posed], "of one output: memory is bounded"
     for models, options in (((a, b), {"lod_a": 0}), ((a, b), {"lod_b": 3}), ((b, a), {})):
         ab.sweep(*models, poses, device=device, **options)
-    assert len(pose_sweep._kept) == 4
+    assert len(kept) == 4
 
 
-def test_what_is_kept_is_bounded_and_goes_with_its_models(device):
+def test_what_is_kept_is_bounded_and_goes_with_its_models(device, kept):
     poses = mixed_poses()[:2]
     models = [new_model() for _ in range(pose_sweep.KEPT_PAIRS + 2)]
     other = new_model("torus")
     for model in models:
         ab.sweep(model, other, poses, device=device)
-    assert len(pose_sweep._kept) == pose_sweep.KEPT_PAIRS
-    assert [key[0] for key in pose_sweep._kept] == [id(model) for model in models[2:]]
+    assert len(kept) == pose_sweep.KEPT_PAIRS
+    assert [key[0] for key in kept] == [id(model) for model in models[2:]]
     ab.sweep(models[2], other, poses, device=device)
-    assert [key[0] for key in pose_sweep._kept][-1] == id(models[2]), "the oldest is that asked longest ago"
+    assert [key[0] for key in kept][-1] == id(models[2]), "the oldest is that asked longest ago"
     del models[-1], model
     gc.collect()
-    assert len(pose_sweep._kept) == pose_sweep.KEPT_PAIRS - 1
+    assert len(kept) == pose_sweep.KEPT_PAIRS - 1
     del other
     gc.collect()
-    assert not pose_sweep._kept
+    assert not kept
 
 
-def test_long_lists_are_not_kept(device, monkeypatch):
+def test_long_lists_are_not_kept(device, kept, monkeypatch):
     a, poses = sample("torus"), np.tile(np.array(STILL), (3, 1))
-    monkeypatch.setattr(pose_sweep, "KEPT_ROWS", 2**17)
-    ab.sweep(a, a, poses, device=device)
-    (posed,) = pose_sweep._kept.values()
-    assert posed.chunks[1024].chunk_query is not None
-    monkeypatch.setattr(pose_sweep, "KEPT_ROWS", 100)
-    ab.sweep(a, a, poses, output="faces", device=device)
-    assert posed.chunks[1024].chunk_query is None
+    for rows in (2**17, 100):
+        monkeypatch.setattr(pose_sweep, "KEPT_ROWS", rows)
+        ab.sweep(a, a, poses, output="faces", device=device)
+        (posed,) = kept.values()
+        assert (posed.chunks[1024].chunk_query is None) == (rows == 100)
 
 
 def test_two_threads(device):
@@ -187,11 +184,8 @@ def test_two_threads(device):
         for _ in range(10):
             found[i].append(ab.sweep(*models, poses[i], output="count", device=device))
 
-    threads = [threading.Thread(target=ask, args=(i,)) for i in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(2) as threads:
+        list(threads.map(ask, range(2)))
     for answers, values in zip(found, expected, strict=True):
         assert len(answers) == 10 and all(np.array_equal(answer, values) for answer in answers)
     if stream is not None:  # where they do not, Warp may be left on the null stream, which cannot be captured

@@ -1,8 +1,8 @@
-"""Budget reports and step responses of rows made up by hand."""
+"""Budget reports of rows made up by hand."""
 
 import pytest
 
-from warp_abtree.simulate.budget_report import budget_report, step_response
+from warp_abtree.simulate.budget_report import budget_report
 from warp_abtree.simulate.frame import FrameRow
 
 
@@ -30,9 +30,3 @@ def test_reports_count_frames_within_a_budget():
     assert budget_report(rows, after=0.0)["within"] == 3 / 10
     assert budget_report(rows, budget_ms=20.0)["within"] == 7 / 8
     assert budget_report(rows, after=5.0) is None and budget_report(make_rows([1.0] * 9, None)) is None
-    assert step_response(rows, 0) == {"peak": 5.0, "frames": 2}
-    assert step_response(rows, 5) == {"peak": 4.0, "frames": 2}
-    assert step_response(rows, 8) == {"peak": 4.0, "frames": 1}
-    assert step_response(make_rows([30, 40]), 1) == {"peak": 4.0, "frames": None}
-    with pytest.raises(ValueError, match="frame 10"):
-        step_response(rows, 10)

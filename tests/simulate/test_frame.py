@@ -32,9 +32,6 @@ def make_motion():
     )
 
 
-# LODs.
-
-
 def test_sweep_goes_down_and_up_in_equal_ratios():
     sweep = LodSweep([(RING, np.array([0, 2]))], 1.0, 0.04, 4.0)
     assert [sweep.fraction(t) for t in (0, 1, 2, 3, 4)] == pytest.approx([1.0, 0.2, 0.04, 0.2, 1.0])
@@ -44,25 +41,13 @@ def test_sweep_goes_down_and_up_in_equal_ratios():
 
 
 def test_lod_requests():
-    for request, lod in (
-        ("finest", RING.lod_max),
-        ("coarsest", 0),
-        (17, 17),
-        ("17", 17),
-        (0.25, RING.lod_for(fraction=0.25)),
-        ("0.25", RING.lod_for(fraction=0.25)),
-        (1.0, RING.lod_max),
-        ("1", 1),
-        ("tol:1e30", RING.lod_for(tolerance=1e30)),
-        ("tol:0", RING.lod_for(tolerance=0)),
-    ):
-        assert resolve_lod(RING, request) == lod, request
+    top, quarter = RING.lod_max, RING.lod_for(fraction=0.25)
+    requests = "finest", "coarsest", 17, "17", 0.25, "0.25", 1.0, "1", "tol:1e30", "tol:0"
+    lods = [top, 0, 17, 17, quarter, quarter, top, 1, *(RING.lod_for(tolerance=x) for x in (1e30, 0))]
+    assert [resolve_lod(RING, request) for request in requests] == lods
     for request in ("", "fine", "tol:", "tol:x", "tol:-1", "tol:nan", "nan", 0.0, 1.5, -1, RING.lod_max + 1, "2.0"):
         with pytest.raises(ValueError):
             resolve_lod(RING, request)
-
-
-# Rows.
 
 
 def test_rows_are_what_a_fresh_scene_finds(device):
@@ -124,9 +109,6 @@ def test_history_is_recorded(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rows.csv", "rows.json"]
 
 
-# Clocks and controllers.
-
-
 def test_controllers_move_lods_from_the_coarsest(device):
     """A budget without bounds lets all of them climb to the finest."""
     for kind in (PaperController, PredictiveController):
@@ -177,14 +159,13 @@ def test_rows_tell_errors_and_turns():
     assert [row.oscillations for row in rows] == [0, 1, 2, 2, 2, 0]
 
 
-# Motions.
-
-
 class Pusher:
     """Moves the third object away whenever anything touches, and sets the scene's poses itself."""
 
-    def __init__(self, scene, log):
+    def __init__(self, scene, log, finds):
         self.scene, self.log, self.x = scene, log, 0.0
+        if finds:
+            self.find = self.find_one_pair
 
     def __len__(self):
         return 3
@@ -195,24 +176,20 @@ class Pusher:
         out[2, 0] += self.x
         self.scene.set_poses(out)
 
+    def find_one_pair(self, time_step):
+        self.log.append(("find", time_step))
+        return self.scene.intersect([[1, 2]], output="count")
+
     def answer(self, result, time_step):
         self.log.append(("answer", int(result.any.sum())))
         self.x += 10.0 * time_step * result.any.any()
 
 
-class Finder(Pusher):
-    """Finds the contacts of one pair alone."""
-
-    def find(self, time_step):
-        self.log.append(("find", time_step))
-        return self.scene.intersect([[1, 2]], output="count")
-
-
-@pytest.mark.parametrize("kind", [Pusher, Finder])
-def test_a_motion_is_told_what_was_found(device, kind):
+@pytest.mark.parametrize("finds", [False, True])
+def test_a_motion_is_told_what_was_found(device, finds):
     log, scene = [], make_scene(device)
-    rows = ab.Frame(scene, kind(scene, log), time_step=0.25, clock=WorkClock({"candidate": 1.0})).run(3)
-    finds = kind is Finder
+    clock = WorkClock({"candidate": 1.0})
+    rows = ab.Frame(scene, Pusher(scene, log, finds), time_step=0.25, clock=clock).run(3)
     assert [row.pairs for row in rows] == ([1] * 3 if finds else [3, 1, 1])
     assert [row.intersecting for row in rows] == ([1, 0, 0] if finds else [3, 1, 1])
     assert all((row.broad_ms == 0) == finds for row in rows)

@@ -23,14 +23,12 @@ ring = ab.Model.load(trimesh.creation.torus(0.5, 0.15, major_sections=64, minor_
 scene = ab.Scene(device=device)
 for i in range(3):
     scene.add(ring, (0.3 * i, 0, 0, 0, 0, 0, 1))
-top, motion = ring.lod_max, None
-if kind == "bodies":
-    motion = ab.Dynamics(scene).motion()
+top = ring.lod_max
+motion = ab.Dynamics(scene).motion() if kind == "bodies" else None
+steps = [(top, top - 1, 0), (top, top - 1, top - 1), (0, 1, 2), (top, top, top)]
+lods = lambda time: np.array(steps[min(round(60 * time), 3)])
 if kind == "budget":
     lods = ab.PredictiveController(scene, 1e6, ab.Camera.look_at((0, 0, 9), (0, 0, 0)))
-else:
-    steps = [(top, top - 1, 0), (top, top - 1, top - 1), (0, 1, 2), (top, top, top)]
-    lods = lambda time: np.array(steps[min(round(60 * time), 3)])
 frame = ab.Frame(scene, motion, lods)
 before = scene.lods.tolist(), scene.batch().objects.pool.position.numpy().tobytes()
 frame.warm_up()
@@ -72,7 +70,7 @@ def run_worlds(device, worlds, kind, moved):
     camera = Camera.look_at((0, 0, 3), (0, 0, 0), far=10.0)
     lods = PaperController(scene, 8.0, camera) if kind == "paper" else ToleranceController(scene, 0.01, camera)
     if moved == "bodies":
-        motion = ab.Dynamics(scene, restitution=0.4, gravity=(0, 0, -3), velocity=motion.velocity).motion()
+        motion = ab.Dynamics(scene, gravity=(0, 0, -3), velocity=motion.velocity).motion()
     ticks = np.cumsum(np.random.default_rng(3).uniform(0, 1.5e-3, 30 * (len(STAGES) + 1)))
     frame = ab.Frame(scene, motion, lods, clock=iter(ticks.tolist()).__next__, output="faces")
     found = {world: [] for world in worlds}

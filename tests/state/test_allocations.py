@@ -1,7 +1,4 @@
-"""Model only what a scene requires: nothing is allocated for outputs, stages, LODs or objects that nobody asks for.
-
-Every allocation of the device is booked, so what is held is counted where it is made, not where it is meant to be.
-"""
+"""Model only what a scene requires: nothing is allocated for outputs, stages, LODs or objects that nobody asks for."""
 
 import gc
 from functools import partial
@@ -11,6 +8,7 @@ import pytest
 import warp as wp
 from helpers.questions import GpuQuery
 from helpers.samples import random_poses, sample
+from helpers.scenes import add_objects
 
 import warp_abtree as ab
 from warp_abtree.scene import sweep as pose_sweep
@@ -53,13 +51,8 @@ def allocations(device, monkeypatch):
     return Allocations(device, monkeypatch)
 
 
-def make_scene(device, count=40, lods=(None,), models=("ball",)):
-    scene = ab.Scene(device)
-    for i, pose in enumerate(random_poses(np.random.default_rng(1), count, 3.0)):
-        model = sample(models[i % len(models)])
-        lod = lods[i % len(lods)]
-        scene.add(model, pose, lod=None if lod is None else model.lod_for(fraction=lod))
-    return scene
+def make_scene(device, count=40, fractions=(1.0,), names=("ball",)):
+    return add_objects(device, (names * count)[:count], seed=1, spread=3.0, fractions=fractions)
 
 
 def test_a_scene_that_is_not_asked_holds_nothing(device, allocations):
@@ -69,12 +62,12 @@ def test_a_scene_that_is_not_asked_holds_nothing(device, allocations):
     assert allocations.gained(lambda: make_scene(device))[0] == 0
 
 
-@pytest.mark.parametrize("lods", [(None,), (0.1, 0.3, 0.5, 1.0)])
-def test_states_are_those_in_use(device, allocations, lods):
+@pytest.mark.parametrize("fractions", [(1.0,), (0.1, 0.3, 0.5, 1.0)])
+def test_states_are_those_in_use(device, allocations, fractions):
     """One state a model and LOD that stands, whatever the number of objects; a coarse one needs no finer one."""
     one, _ = allocations.gained(make_scene(device, 1).batch)
     for models in (("ball",), ("ball", "torus")):
-        scene = make_scene(device, 80, lods, models)
+        scene = make_scene(device, 80, fractions, models)
         states, objects = scene.batch().states, scene.batch().objects
         used = sorted({(scene.object_model[i], lod) for i, lod in enumerate(scene.lods.tolist())})
         assert sorted((slot.model, slot.lod) for slot in states.slots) == used

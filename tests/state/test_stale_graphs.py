@@ -2,12 +2,13 @@
 
 import gc
 import weakref
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
 import warp as wp
-from helpers.samples import STILL, random_poses, sample
+from helpers.questions import in_a_row
+from helpers.samples import STILL, sample
+from helpers.scenes import add_objects
 
 import warp_abtree as ab
 
@@ -28,10 +29,7 @@ def operator(request):
 
 
 def make_scene(device, count=4):
-    scene = ab.Scene(device)
-    for pose in random_poses(np.random.default_rng(1), count, 0.3):
-        scene.add(sample("torus"), pose)
-    return scene
+    return add_objects(device, ["torus"] * count, seed=1, spread=0.3)
 
 
 def capture(device, operator, *arguments):
@@ -41,12 +39,6 @@ def capture(device, operator, *arguments):
 
 
 LEVELS = sample("torus").lod_max - 7 * np.arange(4)
-
-
-def count_at(device, lods):
-    fresh = make_scene(device)
-    fresh.set_lods(lods)
-    return fresh.intersect(PAIRS, output="count").count
 
 
 CHANGES = {
@@ -81,14 +73,13 @@ def test_a_replay_after_arrays_were_replaced_is_refused(device, operator, pairs,
         assert ([0, 1] in found.tolist()) == (change != "filtered pairs")
         return
     expected = scene.intersect(pairs, output="count").count.sum()
-    for launch, error in (
-        (query.launch, None),
-        (lambda: wp.capture_launch(graph), STALE),
-        (lambda: wp.capture_launch(capture(device, query)), None),
-    ):
-        launch()
-        with pytest.raises(RuntimeError, match=error) if error else nullcontext():
-            assert query.result().count.sum() == expected > 100
+    query.launch()
+    assert query.result().count.sum() == expected > 100
+    wp.capture_launch(graph)
+    with pytest.raises(RuntimeError, match=STALE):
+        query.result()
+    wp.capture_launch(capture(device, query))
+    assert query.result().count.sum() == expected
 
 
 @pytest.mark.parametrize("room", [True, False])
@@ -106,13 +97,14 @@ def test_changes_of_lods(device, kind, room):
         scene.set_lods(lods)
         wp.capture_launch(graph)
         try:
-            found = query.result().count
+            query.result()
         except RuntimeError:
             refused += 1
             graph = capture(device, query)
             wp.capture_launch(graph)
-            found = query.result().count
-        np.testing.assert_array_equal(found, count_at(device, lods))
+        fresh = make_scene(device)
+        fresh.set_lods(lods)
+        np.testing.assert_array_equal(query.result().count, fresh.intersect(PAIRS, output="count").count)
     assert refused == 0 if room else 1 <= refused <= 4
 
 
@@ -162,18 +154,16 @@ def test_a_graph_keeps_its_arrays(device):
 
 
 def test_results_without_a_launch(device, operator):
-    scene = make_scene(device)
-    query = operator(scene, pairs=PAIRS, capacity=20_000)
-    with pytest.raises(RuntimeError, match="nothing was launched"):
-        query.result()
-    query.launch()
-    query.result()
-    query.set_pairs(PAIRS[:2])
-    with pytest.raises(RuntimeError, match="nothing was launched"):
-        query.result()
-    query.launch()
-    query.resize(30_000)
-    with pytest.raises(RuntimeError, match="buffers were replaced"):
+    query = operator(make_scene(device), pairs=PAIRS, capacity=20_000)
+    for change, why in (
+        (lambda: None, "nothing was launched"),
+        (lambda: query.set_pairs(PAIRS[:2]), "nothing was launched"),
+        (lambda: query.resize(30_000), "buffers were replaced"),
+    ):
+        change()
+        with pytest.raises(RuntimeError, match=why):
+            query.result()
+        query.launch()
         query.result()
 
 
@@ -199,11 +189,10 @@ def test_poses_of_a_graph(device):
     scene = make_scene(device)
     poses = ab.PoseInput(scene)
     graph = capture(device, poses)
-    wp.capture_launch(graph)
-    poses.check()
-    scene.set_lods(LEVELS)  # which replaces nothing that poses lie in
-    wp.capture_launch(graph)
-    poses.check()
+    for change in (lambda: None, lambda: scene.set_lods(LEVELS)):  # which replaces nothing that poses lie in
+        change()
+        wp.capture_launch(graph)
+        poses.check()
     scene.add(sample("torus"))
     wp.capture_launch(graph)
     with pytest.raises(RuntimeError, match=f"poses since the last check are lost.*{STALE}"):
@@ -212,14 +201,13 @@ def test_poses_of_a_graph(device):
 
 def test_bodies_of_a_graph(device):
     """Contacts that outgrow their buffers in `step` end the graphs of `launch`."""
-    scene = make_scene(device, 3)
-    scene.set_poses(np.array([(3.0 * k, 0, 0, 0, 0, 0, 1) for k in range(3)]))
+    scene = in_a_row(device, "torus", (0, 3, 6))
     bodies = ab.Dynamics(scene, gravity=(0, 0, 0), capacity=ab.Buffers(8, pairs=1))
     bodies.step(1e-4)
     graph = capture(device, bodies, 1e-4)
     wp.capture_launch(graph)
     bodies.check()
-    scene.set_poses(np.array([(0.2 * k, 0, 0, 0, 0, 0, 1) for k in range(3)]))
+    scene.set_poses([(0.2 * k, 0, 0, 0, 0, 0, 1) for k in range(3)])
     bodies.step(1e-4)
     wp.capture_launch(graph)
     with pytest.raises(RuntimeError, match=STALE):

@@ -1,8 +1,6 @@
 """Applications of the library: scene files, pictures, the viewer and the command line."""
 
-from warp_abtree.app.pictures.plots import draw_controllers
-from warp_abtree.app.pictures.scenes import draw_objects
 from warp_abtree.app.toml.decode import SceneError
 from warp_abtree.app.toml.scene_file import SceneFile, load_scene
 
-__all__ = ["SceneError", "SceneFile", "draw_controllers", "draw_objects", "load_scene"]
+__all__ = ["SceneError", "SceneFile", "load_scene"]

@@ -1,24 +1,22 @@
 """Opens what `view` and `picture` are given on the command line."""
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from warp_abtree.app.cli.arguments import Parser, positive
-from warp_abtree.app.playback import MeshPlayback, Playback, RecordedPlayback, ScenePlayback
-from warp_abtree.app.recording import FORMAT_NAME, Recording
+from warp_abtree.app.cli.model_commands import load_model, lod_at
+from warp_abtree.app.playback import MeshPlayback, Playback, ScenePlayback
 from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.scene_file import load_scene
 from warp_abtree.model.model import Model
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.frame import resolve_lod
 
 OVERLAP = 0.25  # of the smaller extent: by so much a mesh without a pose reaches into the one before
 
 
 def open_playback(paths, device=None, progress=None, objects=None, poses=(), lod=None) -> Playback:
-    """Open one scene file (.toml) or recorded run (.npz), or meshes and built models (.npz).
+    """Open one scene file (.toml), or meshes and built models (.npz).
 
     Args:
         device, progress, objects: As for `load_scene`; objects for scene files alone.
@@ -27,19 +25,12 @@ def open_playback(paths, device=None, progress=None, objects=None, poses=(), lod
     """
     paths = [str(find_scene(path)) for path in paths]
     suffixes = [Path(path).suffix.lower() for path in paths]
-    recorded = len(paths) == 1 and suffixes[0] == ".npz" and _is_recording(paths[0])
-    if recorded or ".toml" in suffixes:
+    if ".toml" in suffixes:
         if len(paths) > 1:
             raise ValueError(f"{paths[suffixes.index('.toml')]}: a scene file is looked at alone")
         for name, value in (("--pose", len(poses)), ("--lod", lod is not None)):
             if value:
                 raise ValueError(f"{name}: for meshes; {paths[0]} says where its objects are and at which LODs")
-    if recorded:
-        if objects is not None:
-            raise ValueError("--objects: a recording has its own")
-        recording = Recording.open(paths[0])
-        return RecordedPlayback(recording, recording.load_scene(paths[0], device=device, progress=progress))
-    if ".toml" in suffixes:
         return ScenePlayback(load_scene(paths[0], device=device, progress=progress, objects=objects))
     if objects is not None:
         raise ValueError("--objects: for scene files")
@@ -53,13 +44,9 @@ def _open_meshes(paths, device, progress, poses, lod) -> MeshPlayback:
     known: dict[str, Model] = {}
     for path in paths:
         if path not in known:
-            built = Path(path).suffix.lower() == ".npz"
-            known[path] = Model.open(path) if built else Model.load(path, progress=progress)
+            known[path] = load_model(path, progress)
     models = [known[path] for path in paths]
-    try:
-        lods = [resolve_lod(model, "finest" if lod is None else lod) for model in models]
-    except ValueError as error:
-        raise ValueError(f"--lod: {error}") from None
+    lods = [lod_at("--lod", model, "finest" if lod is None else lod) for model in models]
     places = lay_out(models)
     if len(poses):
         places[1 : 1 + len(poses)] = poses
@@ -71,20 +58,12 @@ def _open_meshes(paths, device, progress, poses, lod) -> MeshPlayback:
 
 def add_playback_arguments(sub: Parser):
     """Add the arguments that name what is shown."""
-    about = "one scene file (.toml) or recorded run (.npz); or meshes and built models (.npz)"
+    about = "one scene file (.toml), or meshes and built models (.npz)"
     sub.add_file("source", nargs="+", metavar="SCENE_OR_MESHES", help=about)
     about = "pose of the second mesh, again for the third; without it each stands beside the one before, a bit inside"
     sub.add_pose(about, action="append", default=[])
     sub.add_argument("--lod", metavar="LOD", help="LOD of meshes, as for query (finest)")
     sub.add_argument("--objects", type=positive, metavar="N", help="about so many objects of a scene, as for run")
-
-
-def _is_recording(path) -> bool:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return str(file["format"]) == FORMAT_NAME
-    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile):
-        return False
 
 
 def lay_out(models) -> np.ndarray:

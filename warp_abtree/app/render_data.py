@@ -8,8 +8,6 @@ from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.query.result import Result
 from warp_abtree.simulate.frame import FrameRow
 
-NO_LINES = np.empty((0, 2, 3), np.float32)
-
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
@@ -29,18 +27,12 @@ class Settings:
 
     world: int = 0  # objects of world -1 are in every one
     intersecting: bool = True  # whether intersecting faces are coloured
-    contacts: bool = True
-    normals: bool = False  # of contacts
-    wireframe: bool = False
     by_lod: bool = False  # whether colours tell LODs in the place of models
-    level: int = -1  # of the boxes of trees, -1 for none
-    every_tree: bool = False  # whether the boxes are of all objects in the place of the picked one
-    picked: int | None = None  # index of an object
 
     @property
     def output(self) -> str:
         """The output that a query needs for it."""
-        return "contacts" if self.contacts or self.normals else "faces" if self.intersecting else "count"
+        return "faces" if self.intersecting else "count"
 
 
 @dataclass(eq=False)
@@ -51,13 +43,9 @@ class RenderData:
     keys: np.ndarray  # `mesh_keys` of every object
     colours: np.ndarray  # of every object, uint8 (n, 3)
     intersecting: dict  # intersecting faces by model, float32 (t, 3, 3)
-    segments: np.ndarray  # of contacts, float32 (k, 2, 3)
-    normals: np.ndarray  # of contacts, float32 (k, 2, 3)
-    boxes: np.ndarray  # edges of boxes of trees, float32 (k, 2, 3)
     shown: np.ndarray  # indices of the objects that are shown
     intersecting_count: int  # of faces, drawn or not
-    contact_count: int  # drawn or not
-    box_count: int  # drawn or not
+    pair_count: int  # of intersecting faces, drawn or not
     faces: int  # active faces of the shown objects together
     error_mean: float  # mean certified error of the shown objects [units]
 
@@ -77,12 +65,6 @@ def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Sett
     inside = np.zeros(scene.object_count, bool)
     inside[shown] = True
     intersecting = geometry.intersecting_faces(result, inside)
-    segments, normals = geometry.contact_lines(result, geometry.normal_length(cache, shown), inside)
-    boxes, box_count = NO_LINES, 0
-    if settings.level >= 0:
-        picked = [i for i in [settings.picked] if i is not None and inside[i]]
-        objects = shown if settings.every_tree else picked
-        boxes, box_count = geometry.tree_lines(scene, snapshot, objects, settings.level)
     keys = geometry.mesh_keys(scene, snapshot.lods)
     distinct, repeats = np.unique(keys[shown], return_counts=True)
     meshes = [(*geometry.split_key(key), n) for key, n in zip(distinct.tolist(), repeats.tolist())]
@@ -90,15 +72,11 @@ def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Sett
     return RenderData(
         poses=snapshot.poses,
         keys=keys,
-        colours=geometry.object_colours(scene, snapshot.lods, settings.picked, settings.by_lod),
+        colours=geometry.object_colours(scene, snapshot.lods, settings.by_lod),
         intersecting=geometry.intersecting_triangles(cache, snapshot, intersecting) if settings.intersecting else {},
-        segments=segments if settings.contacts else NO_LINES,
-        normals=normals if settings.normals else NO_LINES,
-        boxes=boxes,
         shown=shown,
         intersecting_count=len(intersecting),
-        contact_count=int(result.count[pairs].sum()) if result.count is not None else 0,
-        box_count=box_count,
+        pair_count=int(result.count[pairs].sum()) if result.count is not None else 0,
         faces=sum(cache.count(model, lod) * n for model, lod, n in meshes),
         error_mean=sum(scene.models[model].error_at(lod) * n for model, lod, n in meshes) / max(len(shown), 1),
     )

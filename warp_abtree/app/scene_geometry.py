@@ -1,4 +1,4 @@
-"""Geometry of a scene at one time, as arrays in the world: intersecting faces, contacts, boxes of trees, bounds.
+"""Geometry of a scene at one time, as arrays in the world: intersecting faces, bounds.
 
 The viewer sends these arrays to the browser, and pictures draw them.
 """
@@ -10,14 +10,8 @@ from warp_abtree.checks.quaternions import matrices_of
 from warp_abtree.scene.scene import Scene
 
 LIFT = 1.5e-3  # of a model's diagonal: offset of intersecting faces from the mesh, to both sides
-NORMAL = 0.1  # length of a normal, in diagonals of the median object shown
-LINES = 20_000  # contacts drawn at most, spread evenly over all
-BOXES = 4_000  # boxes of trees drawn at most
-PICKED = (0.95, 0.50, 0.20)
 COARSE, FINE = np.array((0.16, 0.24, 0.60)), np.array((1.0, 0.80, 0.20))
 CACHED_FACES = 4_000_000  # that a cache of meshes keeps
-# Corners of a box joined by its twelve edges; bit a of a corner's number says lower or upper along axis a.
-EDGES = np.array([(c, c | bit) for c in range(8) for bit in (1, 2, 4) if not c & bit])
 
 
 def place(poses, objects, points) -> np.ndarray:
@@ -76,8 +70,8 @@ def group_objects(keys, objects) -> dict[int, np.ndarray]:
     return dict(zip(found.tolist(), np.split(order, starts[1:]))) if len(order) else {}
 
 
-def object_colours(scene: Scene, lods, picked=None, by_lod=False) -> np.ndarray:
-    """Return the colour of every object, uint8 (n, 3): its model's, or its LOD's; the picked one stands out."""
+def object_colours(scene: Scene, lods, by_lod=False) -> np.ndarray:
+    """Return the colour of every object, uint8 (n, 3): its model's, or its LOD's."""
     model = np.array(scene.object_model)
     if by_lod:
         # The cube root spreads the coarse LODs, where most changes happen.
@@ -85,8 +79,6 @@ def object_colours(scene: Scene, lods, picked=None, by_lod=False) -> np.ndarray:
         colours = COARSE + part * (FINE - COARSE)
     else:
         colours = np.array([COLOURS[i % len(COLOURS)][0] for i in range(len(scene.models))])[model]
-    if picked is not None:
-        colours[picked] = PICKED
     return np.round(255 * colours).astype(np.uint8)
 
 
@@ -119,70 +111,6 @@ def intersecting_triangles(cache: MeshCache, snapshot, intersecting) -> dict[int
         corners = np.concatenate([corners + step, corners - step])
         found.setdefault(owner, []).append(corners.astype(np.float32))
     return {owner: np.concatenate(parts) for owner, parts in found.items()}
-
-
-def contact_lines(result, length, shown):
-    """Return segments of contacts of shown pairs and their normals in the world, float32 (k, 2, 3) both."""
-    contacts = result.contacts
-    if contacts is None or not len(contacts):
-        return np.empty((2, 0, 2, 3), np.float32)
-    contacts = contacts[shown[result.pairs].all(axis=1)[contacts["pair"]]]
-    if len(contacts) > LINES:
-        contacts = contacts[np.linspace(0, len(contacts) - 1, LINES).astype(int)]
-    p0, p1 = contacts["p0"], contacts["p1"]
-    middle = 0.5 * (p0 + p1)
-    segments = np.stack([p0, p1], axis=1)
-    normals = np.stack([middle, middle + length * contacts["normal"]], axis=1)
-    return segments.astype(np.float32), normals.astype(np.float32)
-
-
-def normal_length(cache: MeshCache, shown) -> float:
-    """Return how long normals are drawn [units]."""
-    return NORMAL * float(np.median(np.array(cache.diagonals)[np.array(cache.scene.object_model)[shown]]))
-
-
-# Trees.
-
-
-def tree_depth(scene: Scene, objects) -> int:
-    """Return the deepest level that the trees of objects have; the root is level 0."""
-    nodes = max(scene.models[scene.object_model[i]].face_count for i in objects)
-    return max(nodes - 1, 0).bit_length()
-
-
-def level_boxes(tree, level: int) -> np.ndarray:
-    """Return the boxes of the active nodes at a level of a `TreeState`, float64 (b, 2, 3), model frame."""
-    nodes = slice(min(1 << level, len(tree.status)), min(2 << level, len(tree.status)))
-    active = tree.status[nodes] != 0
-    return np.stack([tree.lower[nodes][active], tree.upper[nodes][active]], axis=1)
-
-
-def box_lines(boxes) -> np.ndarray:
-    """Return the edges of boxes (b, 2, 3), float64 (12 b, 2, 3)."""
-    corner = np.arange(8)
-    corners = np.stack([boxes[:, (corner >> axis) & 1, axis] for axis in range(3)], axis=-1)
-    return corners[:, EDGES].reshape(-1, 2, 3)
-
-
-def tree_lines(scene: Scene, snapshot, objects, level: int):
-    """Return the edges of the boxes of active nodes of some objects' trees in the world, and how many boxes there are.
-
-    Objects that share a model and a LOD share a tree. At most BOXES are drawn, those of the first objects.
-
-    Returns:
-        float32 (12 b, 2, 3), and the number of boxes with those that are not drawn.
-    """
-    trees, lines, count = {}, [], 0
-    for i in objects:
-        key = scene.object_model[i], int(snapshot.lods[i])
-        if key not in trees:
-            trees[key] = level_boxes(scene.tree_state(int(i)), level)
-        boxes = trees[key][: max(BOXES - count, 0)]
-        count += len(trees[key])
-        if len(boxes):
-            edges = box_lines(boxes)
-            lines.append(place(snapshot.poses, np.full(len(edges), i), edges))
-    return np.concatenate(lines or [np.empty((0, 2, 3))]).astype(np.float32), count
 
 
 def bounds(cache: MeshCache, snapshot, shown) -> tuple[np.ndarray, float]:

@@ -9,14 +9,15 @@ class Regime:
 
     Attributes:
         warps: Whether warps traverse object pairs; None: on CUDA they do, on the CPU threads.
-        warps_per_pair: Warps that share a single object pair; c pairs have 1 / sqrt(c) of that each.
+        warps_per_pair: Warps that share a single object pair; c pairs have 1 / sqrt(c) of that each, half for "any".
         stack_length: Items on a warp's stack before the rest goes depth-first; None is all there is room for.
         key_bits: Bits of a sort key; an object pair and two faces that take more are sorted in two passes.
         cpu_threads: Threads of a launch on the CPU; None is all that the process may use.
         plain_tests: Pairs of nodes that a thread of the CPU compares by boxes alone before it looks whether few of them
             hit, and makes slabs of subtrees where they do, which as many more tests have to pay for.
         full_refit: Fraction of its faces past which a state is refitted whole, by kind of device, as measured. A slice
-            repeats faces, so k is smaller still; on a GPU few nodes take as long as many.
+            repeats faces, so k is smaller still.
+        block_updates: Whether a block updates a tree state by itself where it can; False: all by level lists.
         relax_by_color: Whether contacts of rigid bodies are relaxed by color, a thread a pair; None: on CUDA they are,
             on the CPU one thread relaxes them all.
     """
@@ -27,7 +28,8 @@ class Regime:
     key_bits: int = 63
     cpu_threads: int | None = None
     plain_tests: int = 24576
-    full_refit: dict = field(default_factory=lambda: {"cpu": 0.5, "cuda": 0.01})
+    full_refit: dict = field(default_factory=lambda: {"cpu": 0.5, "cuda": 0.2})
+    block_updates: bool = True
     relax_by_color: bool | None = None
 
 

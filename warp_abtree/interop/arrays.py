@@ -50,15 +50,12 @@ class PoseInput:
         self._batch.check("pose input")
         check_device(self.device)
         with self._guard.launching(self):
-            self._launch(poses)
-
-    def _launch(self, poses):
-        rows = self.poses if poses is None else self._check(wrap_array(poses, "poses"))
-        if rows.dtype == wp.float32:
-            wp.utils.array_cast(rows, self.poses)
-            rows = self.poses
-        inputs = [QUATERNION_TOLERANCE, rows, self._batch.objects.pool, self._faults, self._guard.record()]
-        wp.launch(kernels.place_object_kernel, len(self.poses), inputs, device=self.device)
+            rows = self.poses if poses is None else self._check(wrap_array(poses, "poses"))
+            if rows.dtype == wp.float32:
+                wp.utils.array_cast(rows, self.poses)
+                rows = self.poses
+            inputs = [QUATERNION_TOLERANCE, rows, self._batch.objects.pool, self._faults, self._guard.record()]
+            wp.launch(kernels.place_object_kernel, len(self.poses), inputs, device=self.device)
 
     def _check(self, rows):
         if rows.shape != self.poses.shape or rows.dtype not in (wp.float32, wp.float64):

@@ -3,7 +3,21 @@
 import numpy as np
 
 
-class ContactData:
+class PairData:
+    """Two named objects and a face of each."""
+
+    __slots__ = ("_faces", "names")
+
+    def __init__(self, names, faces):
+        self.names = set(names)
+        self._faces = dict(zip(names, faces))
+
+    def index(self, name) -> int:
+        """Return the index of the named object's face in its mesh."""
+        return self._faces[name]
+
+
+class ContactData(PairData):
     """One contact, as trimesh.collision.ContactData.
 
     Attributes:
@@ -14,22 +28,15 @@ class ContactData:
         segment: End points of that segment, float64 (2, 3).
     """
 
-    __slots__ = ("_faces", "depth", "names", "normal", "point", "segment")
+    __slots__ = ("depth", "normal", "point", "segment")
 
     def __init__(self, names, faces, segment, normal, depth):
-        self.names = set(names)
-        self._faces = dict(zip(names, faces))
-        self.segment = segment
+        super().__init__(names, faces)
+        self.segment, self.normal, self.depth = segment, normal, depth
         self.point = 0.5 * (segment[0] + segment[1])
-        self.normal = normal
-        self.depth = depth
-
-    def index(self, name) -> int:
-        """Return the index of the named object's face in its mesh."""
-        return self._faces[name]
 
 
-class DistanceData:
+class DistanceData(PairData):
     """The nearest points of two objects, as trimesh.collision.DistanceData.
 
     Attributes:
@@ -37,17 +44,12 @@ class DistanceData:
         distance: Distance between them [world units]; 0 if they intersect.
     """
 
-    __slots__ = ("_faces", "_points", "distance", "names")
+    __slots__ = ("_points", "distance")
 
     def __init__(self, names, faces, points, distance):
-        self.names = set(names)
-        self._faces = dict(zip(names, faces))
+        super().__init__(names, faces)
         self._points = dict(zip(names, points))
         self.distance = distance
-
-    def index(self, name) -> int:
-        """Return the index of the named object's nearest face in its mesh."""
-        return self._faces[name]
 
     def point(self, name) -> np.ndarray:
         """Return the nearest point of the named object [world units], float64 (3,)."""

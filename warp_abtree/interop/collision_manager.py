@@ -13,8 +13,7 @@ from warp_abtree.interop.placed_shapes import PlacedShapes
 from warp_abtree.scene.poses import check_poses
 
 EXTERNAL = "__external"  # trimesh's name for a mesh that is not in the manager
-# Pairs tested first if one collision is enough.
-FIRST_PAIRS = 64
+FIRST_PAIRS = 64  # tested first if one collision is enough
 
 
 def _join(first, *rest):
@@ -26,7 +25,8 @@ def _join(first, *rest):
 class CollisionManager:
     """Named, posed meshes and their collisions: a drop-in replacement for trimesh.collision.CollisionManager.
 
-    Names, signatures and the shapes of results are trimesh's; convex meshes are solids, all others surfaces.
+    Names, signatures and the shapes of results are trimesh's: what is asked for beside an answer makes a tuple of it.
+    Convex meshes are solids, all others surfaces.
     Differences:
 
     * Answers are exact for the given poses (FCL rounds those of `add_object` to float32 and tests convex meshes
@@ -73,15 +73,9 @@ class CollisionManager:
             self._placed = PlacedShapes(self.device)
             self._slots = {name: self._placed.add(shape, matrix) for name, shape, matrix in kept}
 
-    def _external(self, mesh, transform):
-        return [(EXTERNAL, shape_of(mesh), self._matrix(transform, EXTERNAL))]
-
     @contextmanager
     def _pairs_with(self, guests):
-        """Add guests for the duration of one call.
-
-        Args:
-            guests: Name, `Shape` and matrix of each, or a manager that has them.
+        """Add guests for the duration of one call: name, `Shape` and matrix of each, or a manager that has them.
 
         Yields:
             Pairs of slots (own, guest), and a function of an index that returns the pair's names.
@@ -110,6 +104,9 @@ class CollisionManager:
         """Return the names of all objects and their slots."""
         return list(self._slots), np.array(list(self._slots.values()), np.int32)
 
+    def _external(self, mesh, transform):
+        return [(EXTERNAL, shape_of(mesh), self._matrix(transform, EXTERNAL))]
+
     @staticmethod
     def _matrix(transform, name):
         matrix = np.eye(4) if transform is None else to_numpy(transform, f"transform of {name!r}")
@@ -137,11 +134,7 @@ class CollisionManager:
         self._slots[name] = self._placed.add(shape, matrix)
 
     def remove_object(self, name):
-        """Remove an object.
-
-        Raises:
-            ValueError: No object has this name.
-        """
+        """Remove an object; raise ValueError if none has this name."""
         self._placed.remove(self._slot(name))
         del self._slots[name]
         self._release_slots()
@@ -157,10 +150,9 @@ class CollisionManager:
     # Collisions.
 
     def in_collision_single(self, mesh, transform=None, return_names=False, return_data=False):
-        """Return whether another mesh collides with any object, alone or first of a tuple. Waits for the device.
+        """Return whether another mesh, given as for `add_object`, collides with any object. Waits for the device.
 
         Args:
-            mesh, transform: As for `add_object`.
             return_names: Return the names of those that it collides with too, a set.
             return_data: Return the contacts too, a list of `ContactData`, in which the mesh is named "__external".
         """
@@ -168,7 +160,7 @@ class CollisionManager:
         return _join(any_hit, (return_names, {name for name, _ in hits}), (return_data, contacts))
 
     def in_collision_internal(self, return_names=False, return_data=False):
-        """Return whether any two objects collide, alone or first of a tuple. Waits for the device.
+        """Return whether any two objects collide. Waits for the device.
 
         Args:
             return_names: Return the pairs of names too, a set of tuples, each in alphabetical order.
@@ -186,10 +178,9 @@ class CollisionManager:
         return _join(any_hit, (return_names, {tuple(sorted(names)) for names in hits}), (return_data, contacts))
 
     def in_collision_other(self, other_manager, return_names=False, return_data=False):
-        """Return whether any object collides with one of another manager, alone or first of a tuple.
+        """Return whether any object collides with one of another manager, of any device. Waits for the device.
 
         Args:
-            other_manager: `CollisionManager`, of any device.
             return_names: Return the pairs of names too, a set of tuples (name here, name there).
             return_data: Return the contacts too, a list of `ContactData`.
 
@@ -202,12 +193,11 @@ class CollisionManager:
     # Distances.
 
     def min_distance_single(self, mesh, transform=None, return_name=False, return_data=False):
-        """Return the distance [world units] of another mesh from the nearest object. Waits for the device.
+        """Return the distance [world units] of another mesh, given as for `add_object`, from the nearest object.
 
-        0 if they collide, infinite without objects; alone or first of a tuple.
+        0 if they collide, infinite without objects. Waits for the device.
 
         Args:
-            mesh, transform: As for `add_object`.
             return_name: Return the nearest object's name too; None if there is none.
             return_data: Return a `DistanceData` too; None if there is none.
         """
@@ -218,7 +208,7 @@ class CollisionManager:
     def min_distance_internal(self, name=None, return_names=False, return_data=False):
         """Return the least distance [world units] of two objects, or of one from the others. Waits for the device.
 
-        0 if they collide, infinite without two objects; alone or first of a tuple.
+        0 if they collide, infinite without two objects.
 
         Args:
             name: One of the two objects; None for any.
@@ -231,19 +221,17 @@ class CollisionManager:
         names, own = self._own()
         i, j = np.triu_indices(len(own), 1)
         if name is not None:
-            slot = self._slot(name)
-            with_name = (own[i] == slot) | (own[j] == slot)
-            i, j = i[with_name], j[with_name]
+            asked = (np.stack([own[i], own[j]]) == self._slot(name)).any(0)
+            i, j = i[asked], j[asked]
         distance, pair, data = self._nearest(np.stack([own[i], own[j]], 1), lambda k: (names[i[k]], names[j[k]]))
         return _join(distance, (return_names, pair and tuple(sorted(pair))), (return_data, data))
 
     def min_distance_other(self, other_manager, return_names=False, return_data=False):
         """Return the least distance [world units] of an object from one of another manager. Waits for the device.
 
-        0 if they collide, infinite without two objects; alone or first of a tuple.
+        0 if they collide, infinite without two objects.
 
         Args:
-            other_manager: `CollisionManager`, of any device.
             return_names: Return the names too, a tuple (name here, name there); None if a manager is empty.
             return_data: Return a `DistanceData` too; None if a manager is empty.
 
@@ -308,8 +296,7 @@ class CollisionManager:
             return 0.0, names(k), DistanceData(names(k), faces, (contact.point, contact.point), 0.0)
         upper, likely = placed.upper_distance(pairs, gaps)
         kept = np.flatnonzero(gaps <= upper)
-        distance, k, face_a, face_b, point_a, point_b = find_nearest(
-            placed.shapes, placed.poses, pairs[kept], upper, int(np.searchsorted(kept, likely))
-        )
+        likely = int(np.searchsorted(kept, likely))
+        distance, k, faces, points = find_nearest(placed.shapes, placed.poses, pairs[kept], upper, likely)
         pair = names(int(kept[k]))
-        return distance, pair, DistanceData(pair, (face_a, face_b), (point_a, point_b), distance)
+        return distance, pair, DistanceData(pair, faces, points, distance)

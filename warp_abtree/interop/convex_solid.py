@@ -57,14 +57,9 @@ class Shape:
     def find_inside(self, pose, other, other_pose):
         """Find a component of another shape inside this solid; the two surfaces must not intersect.
 
-        A component is then inside or outside as a whole, so its probes decide.
-
-        Args:
-            pose, other_pose: Rigid (4, 4) matrices [world units].
-
-        Returns:
-            None, or the deepest probe of `other` [world units], the outer normal [world] of the nearest plane, the
-            depth below that plane, its face, and a face of `other` at the probe.
+        A component is then inside or outside as a whole, so its probes decide. Returns None, or the deepest probe of
+        `other` [world units], the outer normal [world] of the nearest plane, the depth below that plane, its face, and
+        a face of `other` at the probe.
         """
         if self.planes is None:
             return None
@@ -90,22 +85,22 @@ _SHAPES = weakref.WeakValueDictionary()
 
 def shape_of(mesh) -> Shape:
     """Return the shape of a mesh, by content, or of a model."""
-    key: tuple | None = ("model", id(mesh)) if isinstance(mesh, Model) else None
+    key: tuple = ("model", id(mesh))
     if isinstance(mesh, trimesh.Trimesh):
         key = (hash(mesh), len(mesh.vertices), len(mesh.faces))
-    shape = None if key is None else _SHAPES.get(key)
-    if shape is not None:
-        return shape
-    if isinstance(mesh, Model):
-        vertices, faces, _ = mesh.mesh_at(mesh.lod_max)
-        shape = Shape(mesh, is_convex(trimesh.Trimesh(vertices, faces, process=False)))
-    else:
-        source = load_mesh(mesh)
-        # Only the finest LOD is used, so there is nothing to collapse.
-        model = Model.load(source, base_faces=len(source.faces))
-        shape = Shape(model, isinstance(mesh, trimesh.Trimesh) and is_convex(mesh))
-    if key is not None:
-        _SHAPES[key] = shape
+    shape = _SHAPES.get(key)
+    if shape is None:
+        model, solid = mesh, mesh
+        if isinstance(mesh, Model):
+            vertices, faces, _ = mesh.mesh_at(mesh.lod_max)
+            solid = trimesh.Trimesh(vertices, faces, process=False)
+        else:
+            source = load_mesh(mesh)
+            # Only the finest LOD is used, so there is nothing to collapse.
+            model = Model.load(source, base_faces=len(source.faces))
+        shape = Shape(model, isinstance(solid, trimesh.Trimesh) and is_convex(solid))
+        if isinstance(solid, trimesh.Trimesh):
+            _SHAPES[key] = shape
     return shape
 
 

@@ -6,8 +6,7 @@ result is the least distance of all pairs of faces, to the rounding of coordinat
 
 import numpy as np
 
-# Node pairs expanded at a time, the nearest first.
-CHUNK = 2**12
+CHUNK = 2**12  # node pairs expanded at a time, the nearest first
 ROUNDING = 2.0**-44
 
 
@@ -64,7 +63,7 @@ class _Search:
 
     def walk_corners(self, pair):
         """Lower `bound` to the distance of two close corners, found by alternating nearest-corner searches."""
-        a, b = (self._corners(self.pairs[pair, k]) for k in (0, 1))
+        a, b = (self._place(slot, slice(self.shapes[slot].model.vertex_count)) for slot in self.pairs[pair])
         i, best = 0, np.inf
         while True:
             j = int(np.square(b - a[i]).sum(1).argmin())
@@ -75,10 +74,9 @@ class _Search:
             best = squares[i]
         self.bound = min(self.bound, float(np.sqrt(best)) * (1 + ROUNDING))
 
-    def _corners(self, slot):
-        model, pose = self.shapes[slot].model, self.poses[slot]
-        corners = model.progressive.vertex_pos[: model.vertex_count]
-        return corners @ pose[:3, :3].T + pose[:3, 3]
+    def _place(self, slot, vertices):
+        corners = self.shapes[slot].model.progressive.vertex_pos[vertices]
+        return corners @ self.poses[slot, :3, :3].T + self.poses[slot, :3, 3]
 
     def measure_boxes(self, pair, a, b):
         """Return lower bounds on the distances of boxes, and lower `bound` to the least of their upper bounds."""
@@ -95,24 +93,22 @@ class _Search:
         distance, point_a, point_b = triangle_distances(a, b)
         k = int(distance.argmin())
         if self.found is None or distance[k] < self.found[0]:
-            self.found = float(distance[k]), int(pair[k]), int(face_a[k]), int(face_b[k]), point_a[k], point_b[k]
+            self.found = float(distance[k]), int(pair[k]), (int(face_a[k]), int(face_b[k])), (point_a[k], point_b[k])
             self.bound = min(self.bound, self.found[0])
 
     def _posed(self, slot, face):
         corners = np.empty((len(face), 3, 3))
         for each in np.unique(slot):
-            own, pose = slot == each, self.poses[each]
-            progressive = self.shapes[each].model.progressive
-            corners[own] = progressive.vertex_pos[progressive.face_vertex[face[own]]] @ pose[:3, :3].T + pose[:3, 3]
+            own = slot == each
+            corners[own] = self._place(each, self.shapes[each].model.progressive.face_vertex[face[own]])
         return corners
 
     def children(self, pair, a, b):
         """Return the child pairs of node pairs: each child with faces of the larger node, and the other node."""
         down_a = (self.face[b] >= 0) | ((self.face[a] < 0) & (self.radius[a] >= self.radius[b]))
         first_a, first_b = self.start[:, pair]
-        rows = []
-        for k in (0, 1):
-            rows.append((pair, np.where(down_a, 2 * a - first_a + k, a), np.where(down_a, b, 2 * b - first_b + k)))
+        first_a, first_b = 2 * a - first_a, 2 * b - first_b
+        rows = [(pair, np.where(down_a, first_a + k, a), np.where(down_a, b, first_b + k)) for k in (0, 1)]
         pair, a, b = (np.concatenate(column) for column in zip(*rows))
         kept = (self.half[a] >= 0).all(1) & (self.half[b] >= 0).all(1)
         return pair[kept], a[kept], b[kept]
@@ -129,7 +125,7 @@ def find_nearest(shapes, poses, pairs, upper, likely):
         likely: Index of a pair that may be the nearest.
 
     Returns:
-        Distance, index of the pair, its two faces, and the two nearest points [world units].
+        Distance, index of the pair, its faces (2), and the nearest points (2) [world units].
     """
     search = _Search(shapes, poses, pairs, upper * (1 + ROUNDING))
     pair = np.arange(len(pairs))
@@ -169,7 +165,7 @@ def triangle_distances(a, b):
     point_a, point_b = np.zeros((2, len(a), 3))
 
     def offer(p, q, where):
-        length = np.where(where, np.einsum("ij,ij->i", q - p, q - p), np.inf)
+        length = np.where(where, _dot(q - p, q - p), np.inf)
         closer = length < best
         best[closer], point_a[closer], point_b[closer] = length[closer], p[closer], q[closer]
 
@@ -177,11 +173,11 @@ def triangle_distances(a, b):
         for j in range(3):
             p, q = _join_edges(a[:, i], a[:, (i + 1) % 3], b[:, j], b[:, (j + 1) % 3])
             offer(p, q, True)
-    for j in range(3):
-        foot, inside = _drop_on_face(b[:, j], a)
-        offer(foot, b[:, j], inside)
-        foot, inside = _drop_on_face(a[:, j], b)
-        offer(a[:, j], foot, inside)
+    for i in range(3):
+        foot, inside = _drop_on_face(b[:, i], a)
+        offer(foot, b[:, i], inside)
+        foot, inside = _drop_on_face(a[:, i], b)
+        offer(a[:, i], foot, inside)
     return np.sqrt(best), point_a, point_b
 
 

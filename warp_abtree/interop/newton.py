@@ -99,11 +99,7 @@ class NewtonContacts:
         return self.newton.Contacts(room, 0, device=self.device)
 
     def collide(self, state, contacts):
-        """Replace the contents of `contacts` by the contacts at a state's poses. Waits for the device.
-
-        Raises:
-            CapacityError: `contacts` has too little room; the message names the demand.
-        """
+        """Replace the contents of `contacts` by the contacts at a state's poses, see `check`. Waits for the device."""
         self._place(state.body_q)
         self.query.grow()
         if len(self._count) != len(self.query.pairs):
@@ -130,13 +126,10 @@ class NewtonContacts:
             raise CapacityError(f"{found} rigid contacts, newton.Contacts has room for {room}")
         self.query.result().check()
 
-    def _launch(self, kernel, dim, inputs):
-        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
-
     def _place(self, body_q):
         body_q = self._no_body if body_q is None else body_q
         inputs = [self._ids, body_q, self.model.shape_body, self.model.shape_transform, self.scene.batch().objects.pool]
-        self._launch(kernels.pose_object_kernel, len(self.shapes), inputs)
+        wp.launch(kernels.pose_object_kernel, len(self.shapes), inputs, device=self.device)
 
     def _write(self, body_q, contacts):
         contacts.clear()
@@ -146,9 +139,10 @@ class NewtonContacts:
             setattr(rigid, name, getattr(contacts, f"rigid_contact_{name}"))
         query, room = self.query, len(self._count)
         body_q = self._no_body if body_q is None else body_q
-        self._launch(kernels.count_point_kernel, room, [query.pair_count, query.manifolds, self._count])
+        inputs = [query.pair_count, query.manifolds, self._count]
+        wp.launch(kernels.count_point_kernel, room, inputs, device=self.device)
         with wp.ScopedDevice(self.device):
             wp.utils.array_scan(self._count, self._end, inclusive=True)
-        shapes = [self.model.shape_margin, self._ids, body_q, self.model.shape_body]
-        points = [query.pairs, query.manifolds, self._end, self._count, rigid]
-        self._launch(kernels.write_contact_kernel, room, [*shapes, *points])
+        inputs = [self.model.shape_margin, self._ids, body_q, self.model.shape_body]
+        inputs += [query.pairs, query.manifolds, self._end, self._count, rigid]
+        wp.launch(kernels.write_contact_kernel, room, inputs, device=self.device)

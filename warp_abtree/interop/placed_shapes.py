@@ -6,17 +6,12 @@ from warp_abtree.interop.collision_data import ContactData
 from warp_abtree.interop.convex_solid import Shape
 from warp_abtree.scene.scene import Scene
 
-# Slots without an object are kept for others of the same mesh: this many, or as many as there are objects.
-FREE_SLOTS = 16
-# Pairs whose corners are compared at a time.
-CHUNK = 2**16
+FREE_SLOTS = 16  # without an object, kept for others of the same mesh; or as many as there are objects
+CHUNK = 2**16  # pairs whose corners are compared at a time
 
 
 class PlacedShapes:
     """Posed shapes; the slot of a removed one is reused for the next of the same mesh: models stay on the device.
-
-    Args:
-        device: Warp device.
 
     Attributes:
         scene: `Scene` with one object per slot.
@@ -33,9 +28,8 @@ class PlacedShapes:
 
     def add(self, shape, matrix) -> int:
         """Place a shape and return its slot."""
-        free = self._free.get(shape)
-        if free:
-            slot = free.pop()
+        if self._free.get(shape):
+            slot = self._free[shape].pop()
         else:
             slot = self.scene.object_count
             if slot == len(self.poses):

@@ -49,18 +49,18 @@ def scene_from_trimesh(source, device=None, base_faces=10, progress=None):
     models: dict[str, list] = {}
     for node, geometry, mesh, pose, stretch in placed:
         known = models.setdefault(geometry, [])
-        match = next(
-            ((s, m) for s, m in known if np.abs(s - stretch).max() <= STRETCH_TOLERANCE * np.abs(s).max()), None
-        )
-        if match is None:
-            model = Model.load(load_mesh(_stretched(mesh, stretch), name=str(geometry)), base_faces, progress)
-            match = stretch, model
-            known.append(match)
-        if match[0] is not stretch and not (match[0] == np.eye(3)).all():
+        alike = (pair for pair in known if np.abs(pair[0] - stretch).max() <= STRETCH_TOLERANCE * np.abs(pair[0]).max())
+        own, model = next(alike, (stretch, None))
+        if model is None:
+            stretched, matrix = trimesh.Scene(), np.eye(4)
+            matrix[:3, :3] = stretch
+            stretched.add_geometry(mesh, transform=matrix)
+            model = Model.load(load_mesh(stretched, name=str(geometry)), base_faces, progress)
+            known.append((stretch, model))
+        if own is not stretch and not (own == np.eye(3)).all():
             # The pose takes up the small difference of the two stretches.
-            pose = pose.copy()
-            pose[:3, :3] = pose[:3, :3] @ stretch @ np.linalg.inv(match[0])
-        scene.add(match[1], pose)
+            pose[:3, :3] = pose[:3, :3] @ stretch @ np.linalg.inv(own)
+        scene.add(model, pose)
         names.append(node)
     return scene, names
 
@@ -79,15 +79,6 @@ def _split_transform(transform, node):
     sign = np.sign(np.linalg.det(left @ right))
     pose[:3, :3] = sign * left @ right
     return pose, sign * right.T @ np.diag(sizes) @ right
-
-
-def _stretched(mesh, stretch):
-    if (stretch == np.eye(3)).all():
-        return mesh
-    faces = np.asarray(mesh.faces)
-    # Reversed faces keep the outside of a mirrored surface.
-    faces = faces if np.linalg.det(stretch) > 0 else faces[:, ::-1]
-    return trimesh.Trimesh(np.asarray(mesh.vertices) @ stretch.T, faces, process=False)
 
 
 def scene_from_file(path, device=None, base_faces=10, progress=None):
@@ -138,11 +129,9 @@ def _read_usd(path) -> trimesh.Scene:
         if found is not None:
             faces = found[1] if source.GetOrientationAttr().Get(time) != "leftHanded" else found[1][:, ::-1]
             mesh = trimesh.Trimesh(found[0], faces, process=False)
-            key = mesh.vertices.tobytes(), mesh.faces.tobytes()
-            if key not in known:
-                known[key] = str(prim.GetPath())
-                scene.geometry[known[key]] = mesh
-            scene.graph.update(name, geometry=known[key], matrix=np.array(transform).T)
+            geometry = known.setdefault((mesh.vertices.tobytes(), mesh.faces.tobytes()), str(prim.GetPath()))
+            scene.geometry.setdefault(geometry, mesh)
+            scene.graph.update(name, geometry=geometry, matrix=np.array(transform).T)
 
     def visit(root, prefix, transform_of):
         prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies()))
@@ -160,11 +149,11 @@ def _read_usd(path) -> trimesh.Scene:
         for k, (index, way) in enumerate(zip(indices, ways)):
             prototype = stage.GetPrimAtPath(targets[index])
             root = places.GetLocalToWorldTransform(prototype).GetInverse()
-
-            def posed(prim, root=root, way=way):
-                return places.GetLocalToWorldTransform(prim) * root * way * base
-
-            visit(prototype, f"{prefix}[{k}]", posed)
+            visit(
+                prototype,
+                f"{prefix}[{k}]",
+                lambda prim, root=root, way=way: places.GetLocalToWorldTransform(prim) * root * way * base,
+            )
 
     visit(stage.GetPseudoRoot(), "", places.GetLocalToWorldTransform)
     return scene
@@ -191,42 +180,36 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
         raise ValueError(f"names: not {count} different strings")
     if result is not None and len(result.pairs) and int(result.pairs.max()) >= count:
         raise ValueError(f"result: asks object {int(result.pairs.max())}, the scene has {count}")
-    hit = _intersecting_faces(scene, result)
+    hit = {} if result is None else _intersecting_faces(result)
     objects = scene.batch().objects.pool
-    worlds = objects.world.numpy()
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = objects.rotation.numpy(), objects.position.numpy()
+    worlds, rotation, position = objects.world.numpy(), objects.rotation.numpy(), objects.position.numpy()
     made = trimesh.Scene()
     for i in range(count):
         if world is not None and worlds[i] not in (world, -1):
             continue
         model, lod = scene.models[scene.object_model[i]], int(scene.lods[i])
         vertices, faces, face_ids = model.mesh_at(lod)
+        geometry, colours = (
+            f"model {scene.object_model[i]} {model.name} at LOD {lod}",
+            np.tile(colour, (len(vertices), 1)),
+        )
         if i in hit:
             red = np.isin(face_ids, hit[i]) if hit[i] is not None else np.ones(len(faces), bool)
             # glTF has colours per vertex: faces of two colours must not share any.
             vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
-            colours = np.repeat(np.where(red[:, None], hit_colour, colour), 3, axis=0)
-            geometry = f"{names[i]} hit"
-        else:
-            colours = np.tile(colour, (len(vertices), 1))
-            geometry = f"model {scene.object_model[i]} {model.name} at LOD {lod}"
+            geometry, colours = f"{names[i]} hit", np.repeat(np.where(red[:, None], hit_colour, colour), 3, axis=0)
         if geometry not in made.geometry:
             colours = np.concatenate([colours, np.full((len(colours), 1), 255)], 1).astype(np.uint8)
-            mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
-            made.add_geometry(mesh, node_name=names[i], geom_name=geometry, transform=poses[i])
-        else:
-            made.graph.update(names[i], geometry=geometry, matrix=poses[i])
+            made.geometry[geometry] = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation[i], position[i]
+        made.graph.update(names[i], geometry=geometry, matrix=pose)
     return made
 
 
-def _intersecting_faces(scene, result):
+def _intersecting_faces(result):
     """Return the intersecting faces of each intersecting object, None for all of its faces."""
-    if result is None:
-        return {}
     if result.faces is None:
         return dict.fromkeys(result.pairs[result.any].ravel().tolist())
-    pair = result.faces[:, 0]
-    objects = np.concatenate([result.pairs[pair, 0], result.pairs[pair, 1]])
-    faces = np.concatenate([result.faces[:, 1], result.faces[:, 2]])
+    objects, faces = result.pairs[result.faces[:, 0]], result.faces[:, 1:]
     return {i: np.unique(faces[objects == i]) for i in np.unique(objects).tolist()}

@@ -1,6 +1,6 @@
 """Resumable batch jobs. Each shard is written atomically; rerunning a job skips finished shards.
 
-A job (`SweepJob`, `WorldsJob`) is split into shards. A pool of workers (`ThisProcess`, `RayPool`) computes them and
+A job (`SweepJob`) is split into shards. A pool of workers (`ThisProcess`, `RayPool`) computes them and
 `run_shards` writes them to a folder, the same bytes whatever the pool; `read_shards` reads a finished folder.
 """
 
@@ -8,6 +8,5 @@ from warp_abtree.jobs.ray_pool import RayPool
 from warp_abtree.jobs.run import ThisProcess, run_shards
 from warp_abtree.jobs.shard_folder import read_shards
 from warp_abtree.jobs.sweep_job import SweepJob
-from warp_abtree.jobs.worlds_job import WorldsJob
 
-__all__ = ["RayPool", "SweepJob", "ThisProcess", "WorldsJob", "read_shards", "run_shards"]
+__all__ = ["RayPool", "SweepJob", "ThisProcess", "read_shards", "run_shards"]

@@ -9,10 +9,8 @@ from collections import deque
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.regime import change_regime
 
-# Shards sent to a worker at a time: one running, one queued.
-AHEAD = 2
-# A run is given up when one shard, or the start of a worker, has ended so many workers.
-ATTEMPTS = 3
+AHEAD = 2  # shards sent to a worker at a time: one running, one queued
+ATTEMPTS = 3  # a run is given up when one shard, or the start of a worker, has ended so many workers
 
 
 def _import_ray():
@@ -78,14 +76,10 @@ class RayPool:
         self._own = not self.ray.is_initialized()
         if self._own:
             options = {"include_dashboard": False, "num_cpus": workers} if address is None else {}
+            options |= {"log_to_driver": False, "logging_level": "ERROR"}
             try:
                 with _sigterm_kept():
-                    self.ray.init(
-                        address="local" if address is None else address,
-                        log_to_driver=False,
-                        logging_level="ERROR",
-                        **options,
-                    )
+                    self.ray.init(address="local" if address is None else address, **options)
             except Exception as error:
                 raise ValueError(f"Ray at {address or 'this machine'}: {error}") from None
         found = self.ray.cluster_resources()
@@ -116,7 +110,8 @@ class RayPool:
             yield from running.results()
         finally:
             self.pids.clear()
-            running.kill_actors()
+            for actor in running.actors:
+                running.kill(actor)
 
 
 class _Run:
@@ -139,9 +134,8 @@ class _Run:
         on_gpus = self.pool.on_gpus
         share = {"num_gpus": 1, "num_cpus": 0} if on_gpus else {"num_cpus": 1}
         actor = self.ray.remote(_Actor).options(**share).remote(self.runner, "cuda:0" if on_gpus else "cpu")
-        ready = actor.ready.remote()
         self.actors.append(actor)
-        self.running[ready] = actor, None
+        self.running[actor.ready.remote()] = actor, None
 
     def send(self, actor):
         """Send the next shard to an actor."""
@@ -197,8 +191,3 @@ class _Run:
     def kill(self, actor):
         with contextlib.suppress(Exception):
             self.ray.kill(actor)
-
-    def kill_actors(self):
-        """Stop all actors."""
-        for actor in self.actors:
-            self.kill(actor)

@@ -75,7 +75,7 @@ def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:
     A folder must not be written to by two runs at once.
 
     Args:
-        job: `SweepJob`, or `WorldsJob`.
+        job: `SweepJob`.
         out: Folder; made if it does not exist.
         file: "npz", or "parquet", which needs pyarrow.
         pool: Workers: `RayPool`, or `ThisProcess` by default.

@@ -1,4 +1,4 @@
-"""The folder of a job: `job.json` with a hash of the job, and a file for each range of poses (or worlds).
+"""The folder of a job: `job.json` with a hash of the job, and a file for each range of poses.
 
 Beside its columns a shard has the hash of its job, its range, and a digest of all three, in arrays of the .npz file or
 in the metadata of the Parquet schema. Existing shards are read and checked, one column at a time.
@@ -223,8 +223,8 @@ def _row_fault(job, lengths, start, stop) -> str | None:
     """Return what is wrong with the lengths of a shard's columns, or None."""
     if len(lengths) != 1:
         return "columns of different lengths" if lengths else "no columns"
-    rows, expected = min(lengths), (stop - start) * job.get("frames", 1)
-    if job.get("output") in ("any", "count") and rows != expected:  # a row per pose, or per world and frame
+    rows, expected = min(lengths), stop - start
+    if job.get("output") in ("any", "count") and rows != expected:  # a row per pose
         return f"{rows} rows, not {expected}"
     return None
 
@@ -258,9 +258,8 @@ def _find_shards(path, job) -> dict[tuple[int, int], Path]:
     """
     held = {entry.name for entry in path.iterdir() if SHARD_NAME.match(entry.name)}
     names = {part: _shard_name(*part, job["file"]) for part in _ranges(job)}
-    other = sorted(held.difference(names.values()))
-    if other:
-        raise ValueError(f"{path / other[0]}: a shard of another job")
+    for other in sorted(held.difference(names.values())):
+        raise ValueError(f"{path / other}: a shard of another job")
     return {part: path / name for part, name in names.items() if name in held}
 
 

@@ -24,13 +24,9 @@ class _Rows:
     """Rows of numbers in memory, or in an .npy file that is read in parts."""
 
     def __init__(self, source, what, width):
-        self.what = what
-        self.path: Any = None  # of the file; None in memory
-        self.array = None
-        if isinstance(source, str | os.PathLike):
-            self.path = Path(source)
-        else:
-            self.array = to_numpy(source, what)
+        self.what, of_file = what, isinstance(source, str | os.PathLike)
+        self.path: Any = Path(source) if of_file else None
+        self.array = None if of_file else to_numpy(source, what)
         rows = self._open()
         if rows.dtype.kind not in "iuf":
             raise ValueError(f"{what}: type {rows.dtype} holds no real numbers")
@@ -110,14 +106,13 @@ class SweepJob:
         self.count = self.poses.count
         if self.lods is not None and self.lods.count != self.count:
             raise ValueError(f"lods: {self.lods.count} given for {self.count} poses")
-        known_lods = self.fixed if self.lods is None else self.lods.hash_checked(self._check_lods)
         self._known = {
             "kind": "sweep",
             "count": self.count,
             "shard": self.shard,
             "models": [model.digest for model in self.models],
             "poses": self.poses.hash_checked(lambda start, rows: check_poses(rows, first=start)),
-            "lods": known_lods,
+            "lods": self.fixed if self.lods is None else self.lods.hash_checked(self._check_lods),
             "output": output,
             "precision": precision,
         }
@@ -126,10 +121,8 @@ class SweepJob:
         top = np.array([model.lod_max for model in self.models])
         bad = np.flatnonzero(~((rows >= 0) & (rows <= top) & (rows == np.floor(rows))).all(1))
         if len(bad):
-            raise ValueError(
-                f"lods: those of pose {start + bad[0]} are {rows[bad[0]].tolist()}, "
-                f"not whole numbers from 0 to {top.tolist()}"
-            )
+            found = f"those of pose {start + bad[0]} are {rows[bad[0]].tolist()}"
+            raise ValueError(f"lods: {found}, not whole numbers from 0 to {top.tolist()}")
 
     def describe(self) -> dict:
         """Return everything that determines the results, for JSON."""

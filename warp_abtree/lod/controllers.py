@@ -24,7 +24,7 @@ from warp_abtree.lod.timing import COST_STAGES, CostFit
 from warp_abtree.lod.view import Camera, View
 from warp_abtree.query.result import Result
 from warp_abtree.state.ladder import Ladder
-from warp_abtree.state.lod_update import full_refit_fraction
+from warp_abtree.state.work_lists import full_refit_fraction
 
 TRIANGLE_WORK = 4.0
 """Cost of a test of two triangles in tests of two boxes, about."""

@@ -43,7 +43,7 @@ class Mesh:
 
 
 def load_mesh(source, name=None):
-    """Load a triangle mesh.
+    """Load a triangle mesh; return a Mesh.
 
     Args:
         source: One of: a path to anything that trimesh loads, gzipped (``.obj.gz``) or not; ``"warp:bunny"``,
@@ -51,9 +51,8 @@ def load_mesh(source, name=None):
             a trimesh.Scene, whose meshes are joined where its transforms put them.
         name: Name for people; by default the file's, without its extensions.
 
-    Returns:
-        A Mesh. Polygons of OBJ and USD are cut into fans from their first corner, or by clipping ears where that fan
-        would fold over; either way polygon by polygon in the source's order.
+    Polygons of OBJ and USD are cut into fans from their first corner, or by clipping ears where that fan would fold
+    over; either way polygon by polygon in the source's order.
 
     Raises:
         MeshError: The source cannot be read, or holds no mesh that can be used.
@@ -75,15 +74,12 @@ def load_mesh(source, name=None):
 
 
 def mesh_from_arrays(vertices, faces, name="arrays"):
-    """Make a mesh from arrays.
+    """Return the Mesh of arrays, where coordinates under 2^-290 are 0.
 
     Args:
         vertices: Positions [model units], real numbers, shape [v, 3].
         faces: Corners, integers (or floats with integral values), shape [n_f, 3].
         name: Name for people.
-
-    Returns:
-        A Mesh; coordinates under 2^-290 are 0.
 
     Raises:
         MeshError: Wrong shape or type, no faces, coordinates not finite or beyond 2^300, an index out of range, or an
@@ -93,17 +89,11 @@ def mesh_from_arrays(vertices, faces, name="arrays"):
 
 
 def describe_mesh(mesh):
-    """Return counts and sizes of a mesh, as a dictionary for JSON.
+    """Return counts and sizes of a mesh [model units], as a dictionary for JSON.
 
     Dropped faces are not counted. An area is zero if its float64 cross product is within the error bound of its
     computation. Faces with the same three corners in any order are duplicates; each one after the first counts. Faces
     that share a vertex are of one component. A mesh is closed if no edge belongs to one face only.
-
-    Args:
-        mesh: A Mesh.
-
-    Returns:
-        The dictionary; lengths in model units.
     """
     faces = np.delete(mesh.faces, mesh.dropped_faces, axis=0).astype(np.int64)
     vertex_count = len(mesh.vertices)
@@ -138,12 +128,10 @@ def describe_mesh(mesh):
 def _join_geometry(geometry, name, where=None):
     """Join the triangles of a trimesh object; points and paths are ignored."""
     where = name if where is None else where
+    placed = [(geometry, np.eye(4))]
     if isinstance(geometry, trimesh.Scene):
-        placed = [
-            (geometry.geometry[part], pose) for pose, part in map(geometry.graph.get, geometry.graph.nodes_geometry)
-        ]
-    else:
-        placed = [(geometry, np.eye(4))]
+        nodes = map(geometry.graph.get, geometry.graph.nodes_geometry)
+        placed = [(geometry.geometry[part], pose) for pose, part in nodes]
     if not placed:
         raise MeshError(f"{where}: no faces")
     vertices, faces, vertex_count = [], [], 0

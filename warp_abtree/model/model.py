@@ -107,11 +107,7 @@ class Model:
         return self.progressive.lod_max
 
     def check_lod(self, lod) -> int:
-        """Return a LOD as int.
-
-        Raises:
-            ValueError: It is no whole number from 0 to lod_max.
-        """
+        """Return a LOD as int; raise ValueError if it is no whole number from 0 to lod_max."""
         return whole_number(lod, f"model {self.name!r}: LOD", 0, self.lod_max)
 
     def mesh_at(self, lod):
@@ -154,11 +150,7 @@ class Model:
         return self.progressive.lod_for(fraction=fraction, tolerance=tolerance)
 
     def save(self, path):
-        """Write the model to an .npz file, atomically.
-
-        Raises:
-            OSError: The file cannot be written.
-        """
+        """Write the model to an .npz file, atomically; raise OSError if that cannot be."""
         arrays = self._arrays()
         digest = np.frombuffer(_hash_arrays(arrays), np.uint8)
         about: dict[str, Any] = {"format": np.array(FORMAT_NAME), "version": np.array(FORMAT_VERSION), "digest": digest}
@@ -245,19 +237,15 @@ def _assemble(path, arrays) -> Model:
     require(((parent == -1) | above).all(), "'vertex_parent' is no forest")
     require(split.shape == (n_f,) and split.min() >= 0 and split.max() <= m + 1, "'face_split' is out of range")
     slices = arrays["split_face"]
-    require(
-        len(start) == m + 1 and start[0] == 0 and (np.diff(start) >= 0).all() and start[-1] == len(slices),
-        "'split_start' does not fit 'split_face'",
-    )
+    rises = len(start) == m + 1 and start[0] == 0 and (np.diff(start) >= 0).all()
+    require(rises and start[-1] == len(slices), "'split_start' does not fit 'split_face'")
     require(len(slices) == 0 or (slices.min() >= 0 and slices.max() < n_f), "'split_face' is out of range")
     extent = np.ptp(pos[:n_v], axis=0).max()
     require(EXTENT_LIMITS[0] <= extent <= EXTENT_LIMITS[1], f"extent {extent:g} lies outside 2^-100 .. 2^100")
     require(np.ptp(pos, axis=0).max() <= 2.0**120, "'vertex_pos' has merged vertices beyond float32")
     require((np.bincount(parent[parent >= 0] - n_v, minlength=m) == 2).all(), "'vertex_parent' has a merge not of two")
-    require(
-        np.isfinite(error).all() and error[-1] == 0 and (np.diff(error) <= 0).all(),
-        "'lod_error' is not finite, falling and 0 at the end",
-    )
+    falls = np.isfinite(error).all() and error[-1] == 0 and (np.diff(error) <= 0).all()
+    require(falls, "'lod_error' is not finite, falling and 0 at the end")
     require((split <= m).any(), "no face is ever active")
     require(leaf_node.dtype == np.int32 and leaf_node.shape == (n_f,), "'leaf_node' has the wrong type or length")
     try:

@@ -34,13 +34,9 @@ def split_file_name(path: Path) -> tuple[str, str, bool]:
 
 
 def read_file(path: Path):
-    """Read a mesh file.
+    """Return vertices and triangles of an OBJ file, two arrays; of any other format a trimesh.Scene.
 
-    Returns:
-        Vertices and triangles of an OBJ file, two arrays; of any other format a trimesh.Scene.
-
-    Raises:
-        MeshError: The file is missing, damaged or of an unknown format.
+    Raises MeshError where the file is missing, damaged or of an unknown format.
     """
     if path.is_dir():
         raise MeshError(f"{path}: is a folder, not a mesh file")
@@ -175,7 +171,7 @@ def _clip_ears(points):
         (ax, ay), (bx, by), (cx, cy) = points[i], points[j], points[k]
         return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
 
-    points = [tuple(point) for point in points.tolist()]
+    points = list(map(tuple, points.tolist()))
     ring, triangles = list(range(len(points))), []
     while len(ring) > 3:
         candidates = list(zip(ring[-1:] + ring[:-1], ring, ring[1:] + ring[:1]))

@@ -16,6 +16,8 @@ from warp_abtree.kernels.progressive.quadric import Quadric
 MERGES, COVERS = 25_000, 200_000
 # Entries of the heap at first: for each edge, and beyond these.
 HEAP_PER_EDGE, HEAP_EXTRA = 2, 256
+# Slots of faces that cover triangles together: for each face, and beyond these. None left loosens bounds only.
+SLOTS_PER_FACE, SLOTS_EXTRA = 3, 4096
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
 
 # Error of a bound by rounding, in units of the frame (coordinates about 1/2, so 2^-54 each): reading the vertices of
@@ -97,8 +99,7 @@ class ProgressiveMesh:
     def mesh_at(self, lod):
         """Return the surface at a LOD: used vertices float64 [v, 3], faces int32 [f, 3], face ids int32 [f].
 
-        Faces are in the order of the original file, their ids are indices of original faces; at m the vertices are the
-        original ones in their order. Raises ValueError outside 0..m.
+        Faces are in the order of the original, and so are the vertices at m. Raises ValueError outside 0..m.
         """
         active = self.active_vertices(lod)
         face_ids = np.flatnonzero(self.face_split <= lod).astype(np.int32)
@@ -109,14 +110,8 @@ class ProgressiveMesh:
         return self.vertex_pos[used], faces.reshape(-1, 3).astype(np.int32), face_ids
 
     def lod_for(self, fraction=None, tolerance=None):
-        """Return the LOD for exactly one of two requests.
-
-        Args:
-            fraction: Fraction of `face_count` in (0, 1]; the LOD whose active count is nearest, the finer of equals.
-            tolerance: Largest error [model units], >= 0; the coarsest LOD whose `lod_error` is within it.
-
-        Raises ValueError for any other value, or unless exactly one is given.
-        """
+        """Return the LOD whose active count is nearest to a fraction of the faces, the finer of equals; or the coarsest
+        whose `lod_error` is within a tolerance. See `Model.lod_for`."""
         if (fraction is None) == (tolerance is None):
             raise ValueError("lod_for takes exactly one of fraction= and tolerance=")
         if tolerance is not None:
@@ -130,18 +125,16 @@ class ProgressiveMesh:
 
 
 def build_progressive(mesh, base_faces=10, progress=None):
-    """Collapse a mesh to a base of about `base_faces` faces and certify the error of every LOD on the way.
+    """Collapse a `Mesh` to a base of about `base_faces` faces and certify the error of every LOD on the way.
 
     The sequence for a larger base is a prefix of that for a smaller one, and does not depend on the mesh's scale by
     powers of two. It stops early only where every further merge would kill the last face.
 
     Args:
-        mesh: `Mesh`.
         base_faces: Stop when no more faces than this are left, >= 1.
         progress: Called as progress(stage, done, total) between launches; stages "collapse" and "LOD bounds".
 
-    Raises:
-        ValueError: base_faces is no whole number from 1, or the mesh has 2^29 vertices or 2^31 / 3 faces.
+    Raises ValueError where base_faces is no whole number from 1, or the mesh has 2^29 vertices or 2^31 / 3 faces.
 
     Source: Garland and Heckbert 1997 (collapse).
     """
@@ -195,8 +188,8 @@ def _filled(count, value):
     return wp.full(count, value, dtype=int, device="cpu")
 
 
-def _points(*shape):
-    return wp.zeros(shape, dtype=wp.vec3d, device="cpu")
+def _zeros(shape, dtype):
+    return wp.zeros(shape, dtype=dtype, device="cpu")
 
 
 def _launch(kernel, *inputs):
@@ -206,10 +199,8 @@ def _launch(kernel, *inputs):
 def _linked_rings(faces, face_array, node_capacity):
     """Return `vertex_forest.Rings` of the original mesh with room for `node_capacity` nodes."""
     rings = vertex_forest.Rings()
-    rings.head = _filled(node_capacity, -1)
-    rings.degree = _filled(node_capacity, 0)
-    rings.next = _filled(3 * len(faces), -1)
-    rings.corner_node = _filled(3 * len(faces), -1)
+    rings.head, rings.degree = _filled(node_capacity, -1), _filled(node_capacity, 0)
+    rings.next, rings.corner_node = _filled(3 * len(faces), -1), _filled(3 * len(faces), -1)
     _launch(vertex_forest.link_rings_kernel, len(faces), face_array, rings)
     return rings
 
@@ -221,15 +212,14 @@ def _collapse(pos, faces, base_faces, report):
     face_array = cpu_array(faces, int)
     surface = collapse.Surface()
     surface.pos = cpu_array(np.concatenate([pos, np.zeros_like(pos)]), wp.vec3d)
-    surface.quadric = wp.zeros(capacity, dtype=Quadric, device="cpu")
-    surface.parent = _filled(capacity, -1)
-    surface.stamp = _filled(capacity, -1)
+    surface.quadric = _zeros(capacity, Quadric)
+    surface.parent, surface.stamp = _filled(capacity, -1), _filled(capacity, -1)
     rings = _linked_rings(faces, face_array, capacity)
     _launch(collapse.weigh_faces_kernel, len(faces), face_array, cpu_array(boundary, wp.int8), surface)
     heap, size = Heap(), len(edges)
     room = HEAP_PER_EDGE * size + HEAP_EXTRA
     heap.pair = cpu_array(np.resize(edges, room), wp.int64)
-    heap.key = wp.zeros(room, dtype=wp.float64, device="cpu")
+    heap.key = _zeros(room, wp.float64)
     _launch(collapse.price_edges_kernel, size, heap.pair, surface, heap.key)
     start_live = int(_distinct(faces).sum())
     counter = cpu_array(np.array([size, 0, start_live, collapse.RUNNING], dtype=np.int32), int)
@@ -253,9 +243,8 @@ def _roomier_heap(surface, heap, counter):
     size, capacity = int(counter.numpy()[0]), len(heap.key)
     if 4 * size <= 3 * capacity < 4 * before:
         return heap
-    larger = Heap()
-    larger.key = wp.zeros(capacity + capacity // 2 + 64, dtype=wp.float64, device="cpu")
-    larger.pair = wp.zeros(capacity + capacity // 2 + 64, dtype=wp.int64, device="cpu")
+    larger, room = Heap(), capacity + capacity // 2 + 64
+    larger.key, larger.pair = _zeros(room, wp.float64), _zeros(room, wp.int64)
     wp.copy(larger.key, heap.key, count=size)
     wp.copy(larger.pair, heap.pair, count=size)
     return larger
@@ -266,11 +255,11 @@ def _splits(parent, faces, vertex_count):
     node_count = len(parent)
     merge_count = node_count - vertex_count
     face_array, parent_array = cpu_array(faces, int), cpu_array(parent, int)
-    size = wp.zeros(merge_count + 1, dtype=wp.int64, device="cpu")
-    face_split = wp.zeros(len(faces), dtype=int, device="cpu")
+    size = _zeros(merge_count + 1, wp.int64)
+    face_split = _zeros(len(faces), int)
     _launch(vertex_forest.count_events_kernel, vertex_count, node_count, face_array, parent_array, size, face_split)
     split_start = np.concatenate([[0], np.cumsum(size.numpy()[:merge_count])]).astype(np.int64)
-    split_face = wp.zeros(int(split_start[-1]), dtype=int, device="cpu")
+    split_face = _zeros(int(split_start[-1]), int)
     cursor = cpu_array(split_start.copy(), wp.int64)
     _launch(vertex_forest.fill_events_kernel, node_count, face_array, parent_array, cursor, split_face)
     return face_split.numpy(), split_start, split_face.numpy()
@@ -280,8 +269,8 @@ def make_scratch(candidates, faces, rows):
     """Return `polygon.Scratch` for so many candidate faces, covering faces and polygons on the stack."""
     scratch, corners = polygon.Scratch(), int(polygon.CORNERS)
     scratch.near, scratch.used = _filled(candidates, 0), _filled(faces, 0)
-    scratch.stack, scratch.stack_count = _points(rows, corners), _filled(rows, 0)
-    scratch.polygon, scratch.clipped = _points(corners), _points(corners)
+    scratch.stack, scratch.stack_count = _zeros((rows, corners), wp.vec3d), _filled(rows, 0)
+    scratch.polygon, scratch.clipped = _zeros(corners, wp.vec3d), _zeros(corners, wp.vec3d)
     return scratch
 
 
@@ -297,7 +286,7 @@ def _bound_errors(vertex_pos, parent, faces, report):
     replay = _replay((vertex_pos - centre) / scale, face_count)
     replay.rings = _linked_rings(faces, face_array, len(parent))
     _launch(hausdorff_bound.start_replay_kernel, face_count, face_array, replay)
-    bound_sq = wp.zeros(merge_count, dtype=wp.float64, device="cpu")
+    bound_sq = _zeros(merge_count, wp.float64)
     inputs = [len(parent) - merge_count, merge_count, COVERS, cpu_array(pair, int)]
     state = replay.counter.numpy()  # shares the memory
     while state[0] < merge_count:
@@ -315,11 +304,11 @@ def _replay(pos, face_count):
     replay.counter = _filled(6, 0)
     replay.scratch = make_scratch(face_count, triangle_cover.SLOTS, polygon.STACK)
     replay.pos = cpu_array(pos, wp.vec3d)
-    replay.triangle_pos, replay.face_pos = _points(face_count, 3), _points(face_count, 3)
-    replay.face_box = _points(face_count, 2)
+    replay.triangle_pos, replay.face_pos = _zeros((face_count, 3), wp.vec3d), _zeros((face_count, 3), wp.vec3d)
+    replay.face_box = _zeros((face_count, 2), wp.vec3d)
     for name in ("face_slot", "face_stamp", "triangle_stamp", "queue", "queue_face"):
         setattr(replay, name, _filled(face_count, -1))
-    pooled = 3 * face_count + 4096  # an empty pool loosens bounds only
+    pooled = SLOTS_PER_FACE * face_count + SLOTS_EXTRA
     for name in ("slot_face", "slot_triangle", "slot_sibling", "slot_next", "slot_last"):
         setattr(replay, name, _filled(face_count + pooled, -1))
     replay.free_slot = _filled(pooled, 0)

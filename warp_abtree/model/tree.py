@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-FACE_COUNT_MAX = 2**30
+from warp_abtree.model.mesh import FACE_LIMIT
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,7 @@ class Tree:
 
     @classmethod
     def from_leaves(cls, leaf_node: np.ndarray) -> "Tree":
-        """Make the tree that an indexed list describes.
-
-        Raises:
-            ValueError: The list does not give every face a leaf of its own.
-        """
+        """Make the tree that an indexed list describes; raise ValueError unless every face has a leaf of its own."""
         n = len(leaf_node)
         node_face = np.full(2 << find_depth(n), -1, np.int32)
         if not np.array_equal(np.sort(leaf_node), np.sort(leaf_nodes(n))):
@@ -75,12 +71,9 @@ def leaf_nodes(n: int) -> np.ndarray:
 
 
 def _partition(order, left, begin, middle):
-    """Move the marked entries of every segment before the others, keeping the order of each kind.
+    """Move the faces of every segment that go left before the others, keeping the order of each kind.
 
-    Args:
-        order: Face ids, segment after segment.
-        left: Whether each face goes left, per face id.
-        begin, middle: Where the segment of each position begins, and where its right half will.
+    begin and middle are where the segment of each position begins, and where its right half will.
     """
     goes_left = left[order]
     rank = np.cumsum(goes_left) - goes_left
@@ -114,23 +107,16 @@ def _sort_leaves(lower, upper, depth):
 
 
 def active_build(vertex_pos: np.ndarray, face_vertex: np.ndarray) -> Tree:
-    """Build the balanced tree over all faces top-down (ACTIVE-BUILD).
+    """Build the balanced tree over all faces, int32 (n, 3), top-down; raise ValueError for none or more than 2^30.
 
     Each segment splits at its median along the longest axis of its box, in the order of the faces' box centres, ties
     by face index; halves are equal to within one. The node at depth d and index i holds leaf positions (i n) >> d ..
     ((i+1) n) >> d.
 
-    Args:
-        vertex_pos: Original vertices [model units], float64 (v, 3).
-        face_vertex: Original faces, int32 (n, 3).
-
-    Raises:
-        ValueError: No face, or more than 2^30.
-
     Source: Liu et al. 2006, section 3.2.2, ACTIVE-BUILD.
     """
     n = len(face_vertex)
-    if not 0 < n <= FACE_COUNT_MAX:
+    if not 0 < n <= FACE_LIMIT:
         raise ValueError(f"an AB-Tree needs 1 to 2^30 faces, not {n}")
     corners = vertex_pos[face_vertex]
     leaf_face = _sort_leaves(corners.min(1), corners.max(1), find_depth(n))

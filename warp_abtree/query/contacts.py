@@ -46,9 +46,13 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.contact import contact, sort_hits, summary
+from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import CapacityError
 from warp_abtree.query.result import VECTORS, ContactResult, Result, contact_dtypes
+
+# Warps that a multiprocessor runs at a time, by their registers, of those that find deferred contacts.
+DEFERRED_WARPS = 8
 
 
 class ContactQuery(Query):
@@ -83,7 +87,8 @@ class ContactQuery(Query):
         contact_dtypes(contact_dtype)
         self.contact_dtype = contact_dtype
         self.contacts, self.pair_contacts = contact.Contacts(), summary.PairContacts()
-        self._sums = summary.ChunkSums()
+        self._sums, self._deferred = summary.ChunkSums(), contact.Deferred()
+        self._deferred.total = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "faces", pairs, capacity, precision, within)
 
     def resize(self, capacity: int):
@@ -101,6 +106,7 @@ class ContactQuery(Query):
         made = [(self.hits, "face", self._empty(capacity, wp.vec3i)), (self, "faces", self._empty(capacity, wp.vec3i))]
         made += [(self.contacts, name, self._empty(capacity, wp.vec3d)) for name in VECTORS]
         made.append((self.contacts, "coplanar", self._empty(capacity, wp.int32)))
+        made.append((self._deferred, "place", self._empty(capacity, wp.int32)))
         # The sort takes as much again as scratch.
         made.append((self, "_key", self._empty(2 * capacity, wp.int64)))
         made.append((self, "_order", self._empty(2 * capacity, wp.int32)))
@@ -146,8 +152,13 @@ class ContactQuery(Query):
         self._find()
         self._reduce()
 
-    def _launch_kernel(self, kernel, dim, inputs):
-        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+    def _launch_kernel(self, kernel, dim, inputs, block_dim=256):
+        wp.launch(kernel, dim=dim, inputs=inputs, block_dim=block_dim, device=self.device)
+
+    def _launch_warps(self, kernel, count, inputs):
+        """Launch a kernel with a warp for each of so many items, on the CPU a thread."""
+        lanes = WARP_SIZE if self.device.is_cuda else 1
+        self._launch_kernel(kernel, count * lanes, inputs, WARP_SIZE)
 
     def _passes(self):
         """Return the bits of (pair, face a, face b) that each pass of the sort looks at."""
@@ -166,20 +177,27 @@ class ContactQuery(Query):
             with wp.ScopedDevice(self.device):
                 wp.utils.radix_sort_pairs(self._key, self._order, capacity, end_bit=sum(widths))
         self._launch_kernel(sort_hits.place_row_kernel, capacity, [total, face, self._order, self.faces])
-        self._launch_kernel(sort_hits.start_pair_kernel, room + 1, [capacity, sum(widths[1:]), self._key, self.start])
+        inputs = [capacity, sum(widths[1:]), self._key, self.start, self._deferred.total]
+        self._launch_kernel(sort_hits.start_pair_kernel, room + 1, inputs)
 
     def _find(self):
         posed = [*self.batch.pools, self.pairs, self.pair_poses]
-        self._launch_kernel(contact.find_contact_kernel, self._places, [*posed, self.start, self.faces, self.contacts])
+        inputs = [*posed, self.start, self.faces, self._deferred, self.contacts]
+        self._launch_kernel(contact.find_contact_kernel, self._places, inputs, WARP_SIZE)
+        step = DEFERRED_WARPS * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
+        inputs = [step, *posed, self.faces, self._deferred, self.contacts]
+        self._launch_kernel(contact.find_deferred_kernel, step, inputs, WARP_SIZE)
 
     def _reduce(self):
         room, chunks = len(self.pairs), len(self._sums.span)
         pools = self.batch.pools
         start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
-        self._launch_kernel(summary.sum_length_kernel, chunks, [start, contacts, sums])
-        self._launch_kernel(summary.total_length_kernel, room, [start, sums])
-        self._launch_kernel(summary.sum_mean_kernel, chunks, [start, contacts, sums])
-        self._launch_kernel(summary.average_contact_kernel, room, [*pools, self.pairs, start, sums, means])
+        self._launch_warps(summary.sum_length_kernel, chunks, [start, contacts, sums])
+        self._launch_kernel(summary.total_length_kernel, room, [start, sums], WARP_SIZE)
+        self._launch_warps(summary.sum_mean_kernel, chunks, [start, contacts, sums])
+        self._launch_kernel(summary.average_contact_kernel, room, [*pools, self.pairs, start, sums, means], WARP_SIZE)
         posed = [*pools, self.pairs, self.pair_poses]
-        self._launch_kernel(summary.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
-        self._launch_kernel(summary.measure_depth_kernel, room, [*pools, self.pairs, start, contacts, sums, means])
+        self._launch_warps(summary.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
+        self._launch_kernel(
+            summary.measure_depth_kernel, room, [*pools, self.pairs, start, contacts, sums, means], WARP_SIZE
+        )

@@ -104,7 +104,8 @@ class Query(QueryBuffers):
     def _make_work(self):
         work, device = load_balance.Work(), self.device
         slots = load_balance.SLOT_COUNT if self.uses_warps() else 0
-        work.warps_per_pair = self._regime.warps_per_pair
+        # An early hit ends a pair, so that more warps ask in vain.
+        work.warps_per_pair = max(1, self._regime.warps_per_pair // (2 if self.output == "any" else 1))
         work.counter = wp.zeros(load_balance.COUNTER_COUNT, dtype=wp.int32, device=device)
         work.flag = wp.zeros(slots, dtype=wp.int32, device=device)
         work.owner = wp.empty(slots, dtype=wp.vec2i, device=device)
@@ -151,7 +152,9 @@ class Query(QueryBuffers):
         self.guard.record()
         inputs += [self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
-        wp.launch(relative_pose.relative_pose_kernel, dim=dim, inputs=inputs, device=self.device)
+        # A warp a block: few pairs lie on as many multiprocessors.
+        kernel = relative_pose.relative_pose_kernel
+        wp.launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
         if not self.uses_warps():
             cores = current_regime().cpu_threads or core_count()
@@ -160,8 +163,9 @@ class Query(QueryBuffers):
             inputs += [self._regime.plain_tests, self.slab_memory, hits, self.work]
             launch_on_cores(simd.thread_traversal(mode), room, inputs, self.device, cores, least)
             return
-        # More than there are pairs: idle warps wait for donations.
-        warps = max(room, int(4 * self._regime.warps_per_pair * math.sqrt(room)) + 1)
+        # More than there are units, where these are few: idle warps wait for donations.
+        units = int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1
+        warps = max(room, units)
         warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         wp.launch(
             dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),

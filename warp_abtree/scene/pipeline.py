@@ -61,7 +61,9 @@ class Pipeline:
     depends on nothing but how many states there are and how deep their trees (at most 31 levels):
 
     * 1 for poses;
-    * 6 for LODs, and 1 for each level on which all states together have more than 1,024 nodes; 1 with a ladder;
+    * 3 for LODs; 4 more where there are trees that no block of threads takes (on CUDA from 4,096 faces on, or as many
+      times more as there are more states than multiprocessors; from 65,536 on always), and then 1 for each level on
+      which their states together have more than 1,024 nodes; 1 with a ladder;
     * 2 for the broad phase, with a clearing and a rebuild of `wp.Bvh` between them; none for given pairs;
     * 2 for the narrow phase on the CPU (outside a graph one of them once a core), 4 on CUDA (3 without exact signs), 2
       more with `within`; for contacts those of `ContactQuery`;
@@ -73,8 +75,8 @@ class Pipeline:
     Tree states, and so memory, come in one of two ways:
 
     * One an object, or one a group of objects, updated in place by the AB-Tree's own update, a full refit where more
-      than half of the faces may change, on CUDA a hundredth: any LOD, some 90 to 140 bytes a face and state, a tenth of
-      that for worklists. They have room for all states to change at once.
+      than half of the faces may change, on CUDA a fifth: any LOD, some 80 to 130 bytes a face and state, up to a tenth
+      of that for worklists. They have room for all states to change at once.
     * With a ladder, one a model and level, made beforehand: an LOD change costs an index. The less memory where a model
       has more objects than levels.
 

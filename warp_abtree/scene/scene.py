@@ -297,12 +297,11 @@ class Scene:
         batch = self.batch()
         states, slot = batch.states, batch.states.slots[batch.objects.state[i]]
         model = self.models[slot.model]
-        nodes = slice(slot.node_start, slot.node_start + model.tree.node_count)
         lower, upper, skip = states.read_nodes(slot, model.tree.node_count)
         lower, upper = lower + model.centre, upper + model.centre
         return TreeState(
             slot.lod,
-            states.pool.node_status[nodes].numpy().copy(),
+            (skip >= 0).astype(np.int32),
             np.where(np.isinf(lower), lower, np.nextafter(lower, -np.inf)),
             np.where(np.isinf(upper), upper, np.nextafter(upper, np.inf)),
             skip,

@@ -6,27 +6,13 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from warp_abtree.checks.arguments import broadcast_rows, finite_array, first_line, to_numpy
+from warp_abtree.checks.arguments import broadcast_rows, finite_array, first_line
 from warp_abtree.checks.quaternions import quaternions_of
+from warp_abtree.kernels.arrays import ObjectPool
 from warp_abtree.kernels.dynamics import bodies as kernels
 from warp_abtree.model.model import Model
+from warp_abtree.scene.poses import check_poses, launch_place
 from warp_abtree.scene.scene import Scene
-
-SLOP = 1 / 512  # of the bounding radius
-SLEEP_SPEED = 0.01  # of the speed after a fall by half the bounding radius
-
-
-def object_values(values, count, what, low, high=np.inf, open_below=False):
-    """Return a number for each object, float64 (count,), from `low` (excluded if `open_below`) to `high`."""
-    values = broadcast_rows(to_numpy(values, what), what, (count,))
-    fits = np.isfinite(values) & (values > low if open_below else values >= low) & (values <= high)
-    if not fits.all():
-        i = int(np.argmin(fits))
-        raise ValueError(
-            f"{what}: {values[i]} of object {i} is not {'above' if open_below else 'at least'} {low}"
-            + (f" and at most {high}" if high < np.inf else " and finite")
-        )
-    return values
 
 
 def object_mask(chosen, count):
@@ -122,131 +108,86 @@ def _ranks(worlds):
     return ranks
 
 
+def _finite_rows(values, what, count):
+    """Return a vector for each of `count` objects, float64 (count, 3)."""
+    values = broadcast_rows(values, what, (count, 3))
+    if not np.isfinite(values).all():
+        raise ValueError(f"{what}: a number is not finite")
+    return values
+
+
 class RigidBodies:
     """State of the bodies of a scene; `Dynamics` documents the arguments.
 
     Attributes:
         bodies: Device arrays of all objects, `kernels.dynamics.bodies.Bodies`.
-        properties: `MassProperties` of each object's model, None unless rigid.
-        mass: (n,), inf unless rigid.
+        mass: Mass at density 1, (n,), inf unless rigid.
         rigid, kinematic: Which objects are rigid bodies, and which have prescribed motion, bool (n,).
+        targets: `ObjectPool` of the poses that kinematic objects have at the end of the next step.
     """
 
-    def __init__(self, scene: Scene, density, restitution, friction, gravity, kinematic, slop, sleep_speed):
-        self.scene, self.device = scene, scene.device
-        n = scene.object_count
-        self._objects = scene.batch().objects
+    def __init__(self, scene: Scene, gravity, kinematic, velocity, angular_velocity):
+        self.scene, self.device, n = scene, scene.device, scene.object_count
+        self._pool = pool = scene.batch().objects.pool
         self.gravity = finite_array(gravity, "gravity", (3,))
         self.kinematic = object_mask(kinematic, n)
-        self.rigid = ~self.kinematic & (self._objects.pool.is_static.numpy() == 0)
-        restitution = object_values(restitution, n, "restitution", 0.0, 1.0)
-        friction = object_values(friction, n, "friction", 0.0)
-        self._fill_bodies(object_values(density, n, "density", 0.0, open_below=True), slop, sleep_speed)
-        self._upload(restitution=restitution, friction=friction)
-        self.read_poses()
-
-    def _fill_bodies(self, density, slop, sleep_speed):
-        """Allocate the arrays of all bodies, and write what stays for good."""
-        scene, rigid, n = self.scene, self.rigid, self.scene.object_count
-        self.bodies = zeros_of(kernels.Bodies, n, 0, self.device)
-        models = sorted({scene.object_model[i] for i in np.flatnonzero(rigid)})
+        self.rigid = ~self.kinematic & (pool.is_static.numpy() == 0)
+        velocity = _finite_rows(velocity, "velocity", n)
+        angular_velocity = _finite_rows(angular_velocity, "angular_velocity", n)
+        models = sorted({scene.object_model[i] for i in np.flatnonzero(self.rigid)})
         found = {m: mass_properties(scene.models[m]) for m in models}
-        self.properties = [found[m] if r else None for m, r in zip(scene.object_model, rigid)]
-        own = [IMMOVABLE if found is None else found for found in self.properties]
-        self.mass = density * [found.volume for found in own]
-        self._moments = density[:, None] * [found.moments for found in own]
-        self._centre, self._axes = np.array([found.centre for found in own]), np.array([found.axes for found in own])
-        radius, rank = np.array([found.bounding_radius for found in own]), np.zeros(n, np.int64)
-        rank[rigid] = _ranks(self._objects.pool.world.numpy()[rigid])
-        if sleep_speed is None:
-            sleep_speed = SLEEP_SPEED * np.sqrt(np.linalg.norm(self.gravity) * np.where(rigid, radius, 0.0))
-        slop = np.where(rigid, SLOP * radius, np.inf) if slop is None else object_values(slop, n, "slop", 0.0)
-        self._upload(
-            rank=rank,
-            prescribed=self.kinematic,
-            inverse_mass=1 / self.mass,
-            inverse_moment=1 / self._moments,
-            centre=self._centre,
-            axes=self._axes,
-            bounding_radius=radius,
-            slop=slop,
-            sleep_speed=object_values(sleep_speed, n, "sleep_speed", 0.0),
-        )
-
-    def _upload(self, **values):
-        for name, array in values.items():
-            getattr(self.bodies, name).assign(array)
-
-    def read_poses(self):
-        """Take all poses from the scene, as after `Scene.set_poses`, and wake all bodies. Waits for the device."""
-        pool = self._objects.pool
-        rotation = pool.rotation.numpy()
-        self._upload(
-            position=pool.position.numpy() + np.einsum("nij,nj->ni", rotation, self._centre),
-            rotation=quaternions_of(rotation @ self._axes),
-        )
-        self.wake()
-
-    def wake(self):
-        """Wake all bodies."""
-        self._upload(motion_type=np.where(self.rigid, int(kernels.DYNAMIC), int(kernels.STATIC)))
-        self.bodies.rest_time.zero_()
-
-    def set_velocities(self, velocity, angular_velocity):
-        """Set the velocities of rigid bodies, and wake all bodies. Waits for the device.
-
-        Args:
-            velocity: Of the centres of mass [world units/s], (3,) or (n, 3).
-            angular_velocity: In the world frame [rad/s], (3,) or (n, 3).
-
-        Raises:
-            ValueError: Wrong shape, or a number that is not finite; nothing is changed.
-        """
-        shape = (len(self.mass), 3)
-        velocity = broadcast_rows(velocity, "velocity", shape)
-        angular_velocity = broadcast_rows(angular_velocity, "angular_velocity", shape)
-        for name, values in (("velocity", velocity), ("angular_velocity", angular_velocity)):
-            if not np.isfinite(values).all():
-                raise ValueError(f"{name}: a number is not finite")
-        rigid, frames = self.rigid[:, None], self._frames()
+        own = [found[m] if r else IMMOVABLE for m, r in zip(scene.object_model, self.rigid)]
+        self.mass, self._moments = np.array([one.volume for one in own]), np.array([one.moments for one in own])
+        self._axes, centre = np.array([one.axes for one in own]), np.array([one.centre for one in own])
+        rank = np.zeros(n, np.int64)
+        rank[self.rigid] = _ranks(pool.world.numpy()[self.rigid])
+        rotation, rigid, frames = pool.rotation.numpy(), self.rigid[:, None], self._frames()
         local = np.einsum("nji,nj->ni", frames, angular_velocity) * np.where(rigid, self._moments, 0.0)
-        self._upload(velocity=np.where(rigid, velocity, 0.0), momentum=np.einsum("nij,nj->ni", frames, local))
-        self.wake()
+        self.bodies = zeros_of(kernels.Bodies, n, 0, self.device)
+        for name, values in {
+            "motion_type": np.select([self.rigid, self.kinematic], [int(kernels.DYNAMIC), int(kernels.KINEMATIC)], 0),
+            "rank": rank,
+            "inverse_mass": 1 / self.mass,
+            "inverse_moment": 1 / self._moments,
+            "centre": centre,
+            "axes": self._axes,
+            "bounding_radius": np.array([one.bounding_radius for one in own]),
+            "position": pool.position.numpy() + np.einsum("nij,nj->ni", rotation, centre),
+            "rotation": quaternions_of(frames),
+            "velocity": np.where(rigid, velocity, 0.0),
+            "momentum": np.einsum("nij,nj->ni", frames, local),
+        }.items():
+            getattr(self.bodies, name).assign(values)
+        self.targets = ObjectPool()
+        self.targets.rotation, self.targets.position = wp.clone(pool.rotation), wp.clone(pool.position)
+
+    def clear_targets(self):
+        """Let kinematic objects stand where they are."""
+        wp.copy(self.targets.rotation, self._pool.rotation)
+        wp.copy(self.targets.position, self._pool.position)
+
+    def set_targets(self, targets):
+        """Set the poses of kinematic objects at the end of the next step; see `Dynamics.step`."""
+        targets = check_poses(targets, "targets")
+        if len(targets) != len(self.mass):
+            raise ValueError(f"targets: {len(targets)} given for {len(self.mass)} objects")
+        rows = wp.array(targets.reshape(len(targets), -1), dtype=wp.float64, device=self.device)
+        launch_place(rows, self.targets)
 
     def _frames(self):
         """Return the rotation matrices of the body frames, (n, 3, 3). Waits for the device."""
-        return self._objects.pool.rotation.numpy() @ self._axes
+        return self._pool.rotation.numpy() @ self._axes
 
     def poses(self) -> np.ndarray:
         """Return the pose of every object: x y z qx qy qz qw, float64 (n, 7). Waits for the device."""
-        pool = self._objects.pool
-        return np.concatenate([pool.position.numpy(), quaternions_of(pool.rotation.numpy())], axis=1)
+        return np.concatenate([self._pool.position.numpy(), quaternions_of(self._pool.rotation.numpy())], axis=1)
 
     def velocities(self):
         """Return the velocities of the centres of mass [world units/s] and angular velocities [rad/s], float64 (n, 3).
 
         0 for static objects, those of the last step for kinematic ones. Waits for the device.
         """
-        frames = self._frames()
-        local = np.einsum("nji,nj->ni", frames, self.bodies.momentum.numpy()) / self._moments
-        angular_velocity = self.bodies.angular_velocity.numpy() + np.einsum("nij,nj->ni", frames, local)
+        frames, momentum = self._frames(), self.bodies.momentum.numpy()
+        local = np.einsum("nji,nj->ni", frames, momentum) / self._moments
+        angular_velocity = np.where(self.kinematic[:, None], momentum, np.einsum("nij,nj->ni", frames, local))
         return self.bodies.velocity.numpy().copy(), angular_velocity
-
-    @property
-    def asleep(self) -> np.ndarray:
-        """Which bodies sleep, bool (n,). Waits for the device."""
-        return self.bodies.motion_type.numpy() == int(kernels.ASLEEP)
-
-    def energy(self) -> float:
-        """Return the kinetic and potential energy of all rigid bodies. Waits for the device."""
-        rigid, local = self.rigid, np.einsum("nji,nj->ni", self._frames(), self.bodies.momentum.numpy())
-        mass, velocity = self.mass[rigid], self.bodies.velocity.numpy()[rigid]
-        kinetic = 0.5 * (mass @ (velocity**2).sum(1) + (local[rigid] ** 2 / self._moments[rigid]).sum())
-        return float(kinetic - mass @ (self.bodies.position.numpy()[rigid] @ self.gravity))
-
-    def momentum(self):
-        """Return momentum and angular momentum about the origin of all bodies, (3,) each. Waits for the device."""
-        rigid = self.rigid
-        linear = self.mass[rigid, None] * self.bodies.velocity.numpy()[rigid]
-        angular = np.cross(self.bodies.position.numpy()[rigid], linear) + self.bodies.momentum.numpy()[rigid]
-        return linear.sum(0), angular.sum(0)

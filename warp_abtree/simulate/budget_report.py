@@ -1,4 +1,4 @@
-"""How well a run of frames held its time budget: `budget_report`, and `step_response` after a load step."""
+"""How well a run of frames held its time budget: `budget_report`."""
 
 import numpy as np
 
@@ -34,26 +34,3 @@ def budget_report(rows, budget_ms: float | None = None, after: float = 1.0) -> d
         "oscillations": float(oscillations / span) if span > 0 else 0.0,
         "error_mean": float(np.mean([row.error_mean for row in rows])),
     }
-
-
-def step_response(rows, frame: int, budget_ms: float | None = None) -> dict:
-    """Report how the budget was regained after the load rose at a frame.
-
-    Args:
-        rows: `FrameRow`s in their order.
-        frame: Number of the first frame under the higher load.
-        budget_ms: T [ms]; None takes the budget of the row at `frame`.
-
-    Returns:
-        A dict: peak, the greatest cost over T from that frame on; frames, the number of frames from it on before the
-        first within 1.1 T, None if there is none.
-
-    Raises:
-        ValueError: There is no such frame, or no budget.
-    """
-    rows = [row for row in rows if row.frame >= frame]
-    if not rows or (budget_ms or rows[0].budget_ms) is None:
-        raise ValueError(f"there is no frame {frame}, or no budget to compare with")
-    ratio = np.array([row.cost_ms for row in rows]) / (budget_ms or rows[0].budget_ms)
-    back = np.flatnonzero(ratio <= 1.1)
-    return {"peak": float(ratio.max()), "frames": int(back[0]) if len(back) else None}

@@ -26,7 +26,7 @@ from warp_abtree.query.result import Result
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.budget_report import budget_report
 from warp_abtree.simulate.motion import triangle_wave
-from warp_abtree.state.lod_update import full_refit_fraction
+from warp_abtree.state.work_lists import full_refit_fraction
 
 
 def resolve_lod(model: Model, request) -> int:
@@ -96,11 +96,8 @@ class FrameRow:
         nodes_refitted: Nodes of all updated trees.
         node_tests, triangle_tests: Pairs of boxes and of faces tested.
         budget_ms: T that a controller held [ms]; None without a budget.
-        select_ms: Selection of LODs [ms].
-        refine_ms: LOD change and refit [ms].
-        move_ms: Poses [ms].
-        broad_ms: Broad phase [ms].
-        query_ms: Narrow phase and results [ms]; the broad phase too where the motion finds contacts itself.
+        select_ms, refine_ms, move_ms: Selection of LODs; LOD change and refit; poses [ms].
+        broad_ms, query_ms: Broad phase; narrow phase and results, and all of it where the motion finds contacts [ms].
         answer_ms: Response of the motion [ms].
     """
 
@@ -155,20 +152,14 @@ def load_update_kernels(scene: Scene):
     These are a partial refit from a copied state, one in place, and a full refit. Very small models always have full
     refits.
     """
-    share = full_refit_fraction(scene.device)
-    chosen, step = None, 0
-    for model in sorted(scene.models, key=lambda model: model.face_count):
-        if not model.lod_max:
-            continue
-        spans = np.diff(model.progressive.split_start)
-        if chosen is None:
-            chosen = model
-        if spans.min() <= share * model.face_count:
-            chosen, step = model, int(spans.argmin())
-            break
-    if chosen is None:
+    share, copy = full_refit_fraction(scene.device), Scene(device=scene.device)
+    models = sorted((model for model in scene.models if model.lod_max), key=lambda model: model.face_count)
+    if not models:
         return
-    copy = Scene(device=scene.device)
+    spans = [np.diff(model.progressive.split_start) for model in models]
+    used = (i for i, model in enumerate(models) if spans[i].min() <= share * model.face_count)
+    place = next(used, 0)
+    chosen, step = models[place], int(spans[place].argmin())
     for _ in range(2):
         copy.add(chosen, lod=step)
     for lods in ((step, step + 1), (step + 1, step), (0, chosen.lod_max), (chosen.lod_max, chosen.lod_max)):

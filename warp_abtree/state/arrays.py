@@ -109,6 +109,7 @@ class StateArrays:
         self.torn = self._touched = False
         self.node_total = 0
         self.face_total = 0
+        self._uploaded = 0
         self.pool = StatePool()
         self._allocate_nodes(0)
         self._allocate_faces(0)
@@ -116,13 +117,12 @@ class StateArrays:
 
     def _allocate_nodes(self, count):
         old, kept = self.pool, self.node_total
-        status = wp.zeros(count, dtype=wp.int32, device=self.device)
+        mark = wp.zeros(count // 32 + 1, dtype=wp.uint32, device=self.device)
         box = wp.empty(2 * count, dtype=wp.vec4, device=self.device)
         if kept:
-            wp.copy(status, old.node_status, count=kept)
             wp.copy(box, old.node_box, count=2 * kept)
         self.generation.advance()
-        self.pool.node_status, self.pool.node_box = status, box
+        self.pool.node_mark, self.pool.node_box = mark, box
         wp.launch(clear_node_kernel, count - kept, [kept, self.pool], device=self.device)
         self.node_room = count
 
@@ -184,11 +184,12 @@ class StateArrays:
         return box[:, 0, :3], box[:, 1, :3], np.ascontiguousarray(box[:, 0, 3]).view(np.int32)
 
     def upload_slots(self):
-        """Bring model, LOD and starts of all states to the device, in place."""
-        for name in SLOT_COLUMNS:
+        """Bring model, LOD and starts of all states to the device, in place; of states known there the LOD alone."""
+        for name in SLOT_COLUMNS if len(self.slots) > self._uploaded else ("lod",):
             values = np.array([getattr(slot, name) for slot in self.slots], np.int32)
             source = wp.array(values, dtype=wp.int32, device="cpu", copy=False)
             wp.copy(getattr(self.pool, name), source, count=len(values))
+        self._uploaded = len(self.slots)
 
     def touch(self):
         """Say that from here on states in use change: what fails now leaves them torn."""
@@ -222,9 +223,9 @@ class StateArrays:
 
     def reset(self):
         """Forget all states; the pool keeps its room."""
-        self.slots, self.free = [], {}
+        self.slots, self.free, self._uploaded = [], {}, 0
         self.node_total = self.face_total = 0
-        self.pool.node_status.zero_()
+        self.pool.node_mark.zero_()
         wp.launch(clear_node_kernel, self.node_room, [0, self.pool], device=self.device)
 
 

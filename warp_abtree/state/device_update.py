@@ -7,8 +7,15 @@ from warp_abtree.kernels.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import work_lists
 from warp_abtree.state.arrays import ModelArrays, StateArrays
 from warp_abtree.state.batch import Batch
-from warp_abtree.state.lod_update import build_states, full_refit_fraction
-from warp_abtree.state.work_lists import WorkLists, active_update, block_limits, make_level_lists, refine_meshes
+from warp_abtree.state.lod_update import build_states
+from warp_abtree.state.work_lists import (
+    WorkLists,
+    active_update,
+    block_limits,
+    make_level_lists,
+    partial_limit,
+    refine_meshes,
+)
 
 # LODs wanted on the device that are out of range, and the lowest index that had one.
 NO_FAULTS = (0, 2**31 - 1)
@@ -34,9 +41,9 @@ class DeviceLodUpdate(WorkLists):
         owner = np.array([slot.model for slot in states.slots])
         bounds = [len(bound) for bound in models.split_bounds]
         longest = np.array([bound[-1] - bound[0] for bound in models.split_bounds])
-        partial_max = np.minimum(longest, np.floor(full_refit_fraction(device) * models.face_count).astype(np.int64))
         count = len(owner)
         block_max, block_whole = block_limits(models, count, device)
+        partial_max = np.minimum(longest, partial_limit(models, block_max, device))
         # What no block takes has room in the lists.
         entries = np.where(partial_max > block_max, partial_max, 0)[owner]
         faces = np.where(block_whole, 0, models.face_count)[owner]
@@ -60,8 +67,17 @@ class DeviceLodUpdate(WorkLists):
         self.splits.block_whole = upload(block_whole)
         plan = work_lists.UpdateLists()
         plan.partial_total, plan.full_total = room(1, wp.int64), room(1, wp.int64)
-        plan.block_count, plan.block_state, plan.block_slice = room(1), room(count), room(count, wp.vec2i)
-        for name in ("partial_state", "slice_start", "entry_end", "full_state", "face_end"):
+        plan.block_count = room(1)
+        for name in (
+            "block_state",
+            "block_start",
+            "block_length",
+            "partial_state",
+            "slice_start",
+            "entry_end",
+            "full_state",
+            "face_end",
+        ):
             setattr(plan, name, room(count))
         plan.changed_count, plan.marked_count = room(count), room(count)
         plan.whole_count = room(int(LEVEL_MAX))
@@ -70,10 +86,14 @@ class DeviceLodUpdate(WorkLists):
         make_level_lists(plan, marked_room, device)
         self.wanted = upload([slot.lod for slot in states.slots])
         self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=device)
-        super().__init__(plan, count, int(entries.sum()), int(faces.sum()), level_room, device)
+        blocks = count if (block_whole | (block_max > 0)).any() else 0
+        super().__init__(
+            plan, blocks, int(models.depth.max()), int(entries.sum()), int(faces.sum()), level_room, device
+        )
 
     def launch(self):
-        """Refine meshes and update trees. Launches only: six, and one for each level that has much to refit.
+        """Refine meshes and update trees. Launches only: three, and where there are trees that no block takes four more
+        and one for each level that has much to refit.
 
         Where it is interrupted, the next launch refits every state whole.
         """

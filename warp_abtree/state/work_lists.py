@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import block_update, mark, refine, refit
 from warp_abtree.kernels.update.work_lists import UpdateLists
@@ -16,10 +17,14 @@ from warp_abtree.kernels.update.work_lists import UpdateLists
 TOP_ROOM = 1024
 TOP_THREADS = 512
 # On a GPU: faces of a slice, or of a tree, that a block updates where there are fewer states than multiprocessors; with
-# more states, as many times more. Threads of a block, with few states and with many, and blocks of a launch, at most.
-BLOCK_SLICE, BLOCK_FACES = 4096, 4096
-FEW_THREADS, MANY_THREADS = 1024, 128
+# more states, as many times more. Threads of a block: of many states with trees of at most SMALL_DEPTH, with shallow
+# ones, and of others. And blocks of a launch, at most.
+BLOCK_SLICE, BLOCK_FACES = 1024, 4096
+SMALL_DEPTH = 10
+SMALL_THREADS, SHALLOW_THREADS, THREADS = 64, 128, 1024
 BLOCKS_MOST = 8192
+# Fraction of the longest slice of a partial update that level lists take.
+LISTED_FRACTION = 0.1
 # Threads that a GPU runs at a time, of each multiprocessor: more take turns over what they work off.
 THREADS_AT_ONCE = 2048
 
@@ -41,11 +46,29 @@ def block_limits(models, state_count: int, device):
         models: `ModelArrays`.
         state_count: States that may be updated at once.
     """
-    fits = models.depth <= block_update.BLOCK_DEPTH
+    fits = (models.depth <= block_update.BLOCK_DEPTH) & current_regime().block_updates
     if not device.is_cuda:
         return np.where(fits, models.split_start[-1], 0), fits
     times = max(1.0, state_count / device.sm_count)
     return np.where(fits, int(times * BLOCK_SLICE), 0), fits & (models.face_count <= times * BLOCK_FACES)
+
+
+def partial_limit(models, block_max, device):
+    """Return the longest slice of each model that a partial update takes; negative where all are refitted whole.
+
+    On a GPU level lists with little on each level take as long as with much, so few faces are worth it.
+
+    Args:
+        block_max: As `block_limits` returns it.
+    """
+    most = full_refit_fraction(device) * models.face_count
+    listed = LISTED_FRACTION * most if device.is_cuda else most
+    return np.floor(np.maximum(np.minimum(block_max, most), listed)).astype(np.int64)
+
+
+def full_refit_fraction(device) -> float:
+    """Return the fraction of its faces past which a state is refitted whole."""
+    return current_regime().full_refit["cuda" if device.is_cuda else "cpu"]
 
 
 @dataclass
@@ -55,12 +78,14 @@ class WorkLists:
     Attributes:
         plan: `UpdateLists` for kernels.
         block_room: States that a block updates each, at most.
+        depth: Of the deepest tree.
         entry_room, face_room: Faces in the slices of partial updates, and of states under full update, at most.
         level_room: Nodes to refit on each level, the root's first, at most; as many entries as there are levels.
     """
 
     plan: UpdateLists
     block_room: int
+    depth: int
     entry_room: int
     face_room: int
     level_room: list
@@ -75,11 +100,13 @@ class WorkLists:
         """Refine meshes and update trees of the states that a block takes each. One launch."""
         if not self.block_room:
             return
-        few = self.device.is_cuda and self.block_room <= self.device.sm_count
-        threads = (FEW_THREADS if few else MANY_THREADS) if self.device.is_cuda else 1
-        blocks = min(self.block_room, BLOCKS_MOST) if self.device.is_cuda else 1
+        blocks, threads, shallow = 1, 1, False
+        if self.device.is_cuda:
+            shallow = self.depth <= block_update.SHALLOW_DEPTH and self.block_room > self.device.sm_count
+            few_faces = SMALL_THREADS if self.depth <= SMALL_DEPTH else SHALLOW_THREADS
+            blocks, threads = min(self.block_room, BLOCKS_MOST), few_faces if shallow else THREADS
         inputs = [blocks, threads, models, self._scratch, states, self.plan]
-        kernel = block_update.update_state_kernel
+        kernel = block_update.state_update(shallow)
         wp.launch(kernel, (blocks, threads), inputs, block_dim=threads, device=self.device)
 
 

@@ -26,11 +26,7 @@ def paper_models(context, largest=True) -> list:
 
 
 def run(context):
-    """Yield one row a model. Vertices are those that faces use; build is collapse, certified error and tree, CPU time.
-
-    Raises:
-        RuntimeError: A model built again has another number of splits.
-    """
+    """Yield one row a model. Vertices are those that faces use; build is collapse, error bounds and tree, CPU time."""
     for (name, finest, base, _, base_faces), model in zip(PAPER_MODELS, paper_models(context), strict=True):
         vertices, faces, _ = model.mesh_at(model.lod_max)
         begin = time.process_time()

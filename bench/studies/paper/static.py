@@ -28,11 +28,7 @@ def run(context):
 
 
 def compare_static(context, model, lod, posed):
-    """Return the row of one LOD.
-
-    Raises:
-        RuntimeError: The trees find different face pairs.
-    """
+    """Return the row of one LOD, where both trees must find the same face pairs."""
     count = len(posed.pairs)
     posed.scene.set_lods([lod] * posed.scene.object_count)
     vertices, faces, face_ids = model.mesh_at(lod)

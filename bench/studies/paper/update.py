@@ -63,56 +63,51 @@ def time_move(context, scene, model, home, there):
 
 
 def by_model(rows):
-    """Yield (model, its rows of moves in the order of k)."""
-    for name in dict.fromkeys(row["model"] for row in rows):
-        yield name, sorted(pick(rows, model=name, case="move"), key=lambda row: (row["k"], row["splits"]))
+    """Return the rows of moves of each model, in the order of k."""
+    moves = sorted(pick(rows, case="move"), key=lambda row: (row["k"], row["splits"]))
+    return {name: pick(moves, model=name) for name in dict.fromkeys(row["model"] for row in rows)}
 
 
 def correlate(rows, one, other):
     return float(np.corrcoef([row[one] for row in rows], [row[other] for row in rows])[0, 1])
 
 
+def near_moves(moves):
+    """Return the moves up to k = n/2."""
+    return [row for row in moves if row["share"] <= CLOSE_TO_N]
+
+
 def fit_scale(moves) -> float:
     """Return the time a node of equation (1) [ms], fitted up to k = n/2."""
-    near = [row for row in moves if row["share"] <= CLOSE_TO_N]
-    bound, time = (np.array([row[key] for row in near], float) for key in ("bound", "refit_ms"))
+    bound, time = (np.array([row[key] for row in near_moves(moves)], float) for key in ("bound", "refit_ms"))
     return float(bound @ time / (bound @ bound))
 
 
 def fit_figure_6(rows):
     """Return a row a model: correlation with equation (1), its one scale, the greatest deviations, the crossover."""
     found = []
-    for name, moves in by_model(rows):
-        near = [row for row in moves if row["share"] <= CLOSE_TO_N]
+    for name, moves in by_model(rows).items():
+        near, used = near_moves(moves), [row["nodes"] / row["bound"] for row in moves]
         logs = np.log([row["refit_ms"] / row["full_ms"] for row in moves])
-        used = [row["nodes"] / row["bound"] for row in moves]
-        found.append(
-            {
-                "model": name,
-                "faces": moves[0]["faces"],
-                "k_min": moves[0]["k"],
-                "correlation": correlate(near, "bound", "refit_ms"),
-                "correlation_all": correlate(moves, "bound", "refit_ms"),
-                "correlation_nodes": correlate(near, "nodes", "refit_ms"),
-                "correlation_counted": correlate(near, "bound", "nodes"),
-                "ns_a_node": 1e6 * fit_scale(moves),
-                "nodes_of_bound_min": min(used),
-                "nodes_of_bound_max": max(used),
-                "crossover": crossover([row["share"] for row in moves], logs, 0.0),
-            }
-        )
+        row = {"model": name, "faces": moves[0]["faces"], "k_min": moves[0]["k"]}
+        row |= {"correlation": correlate(near, "bound", "refit_ms")}
+        row |= {"correlation_all": correlate(moves, "bound", "refit_ms")}
+        row |= {"correlation_nodes": correlate(near, "nodes", "refit_ms")}
+        row |= {"correlation_counted": correlate(near, "bound", "nodes"), "ns_a_node": 1e6 * fit_scale(moves)}
+        row |= {"nodes_of_bound_min": min(used), "nodes_of_bound_max": max(used)}
+        found.append(row | {"crossover": crossover([row["share"] for row in moves], logs, 0.0)})
     return found
 
 
 def fitted_moves(rows):
     """Return the rows of moves from the finest LOD, each with the time of equation (1), scaled once a model."""
-    found = [row | {"fitted_ms": fit_scale(moves) * row["bound"]} for _, moves in by_model(rows) for row in moves]
-    return pick(found, from_finest=True)
+    moves = [(fit_scale(moves), row) for moves in by_model(rows).values() for row in moves]
+    return pick([row | {"fitted_ms": scale * row["bound"]} for scale, row in moves], from_finest=True)
 
 
 def thin(rows):
     """Leave two rows of three away; those with the least and the greatest k stay."""
-    return [row for _, moves in by_model(rows) for row in moves[:-1:3] + moves[-1:]]
+    return [row for moves in by_model(rows).values() for row in moves[:-1:3] + moves[-1:]]
 
 
 def find_tenth(model) -> int:
@@ -153,15 +148,13 @@ def time_shares(context, model, lod, count, states):
     moved = context.time_graphs(dict(zip(("there", "back"), launches["update"], strict=True)))
     upload_lods(scene)
     scene.set_lods(there)
-    update = (moved["there"] + moved["back"]) / 2
+    about = {"model": model.name, "faces": model.face_count, "pairs": count, "states": states, "k": int(k.max())}
+    about |= {"k_share": k.max() / model.face_count, "update_ms": (moved["there"] + moved["back"]) / 2}
     for name, depth in CONFIGURATIONS:
         posed.place(depth)
-        row = {"model": model.name, "faces": model.face_count, "configuration": name, "pairs": count}
-        row |= {"states": states, "k": int(k.max()), "k_share": k.max() / model.face_count, "update_ms": update}
-        for output in ("faces", "any"):
-            query = ab.Query(scene, output, pairs=posed.pairs)
-            result = query.run()
-            row[f"{output}_ms"] = context.time_graphs({"query": query.launch})["query"]
-            if output == "faces":
-                row["hits"] = len(result.faces)
-        yield row | {"ratio": update / row["faces_ms"], "ratio_any": update / row["any_ms"]}
+        queries = {f"{output}_ms": ab.Query(scene, output, pairs=posed.pairs) for output in ("faces", "any")}
+        row = about | {"configuration": name, "hits": len(queries["faces_ms"].run().faces)}
+        queries["any_ms"].run()
+        for output, query in queries.items():
+            row |= context.time_graphs({output: query.launch})
+        yield row | {"ratio": row["update_ms"] / row["faces_ms"], "ratio_any": row["update_ms"] / row["any_ms"]}

@@ -1,14 +1,12 @@
 """Competitors: other ways to trade accuracy for speed, each a point of time against error beside our LODs.
 
-All answer yes or no for the same poses, and are taken along the same motions to where they first say yes. The truth is
-the exact answer on the finest meshes. A query is timed over all poses, apart to deep; python-fcl in a loop of its own
-calls on one core, its objects made before; ours as one batch, on the CPU on one core as well; Newton as one batch on
-the GPU. On a core, the CPU time of the thread counts. The surfaces of hulls are asked, too, which on a way in from
-outside is the same as asking the solids.
+All answer yes or no for the same poses, and are taken along the same motions to where they first say yes. A query is
+timed over all poses, apart to deep; python-fcl in a loop of its own calls on one core, its objects made before; ours as
+one batch, on the CPU on one core as well; Newton as one batch on the GPU. Hulls are asked as solids and as surfaces,
+which on a way in from outside is the same.
 """
 
 import time
-from functools import partial
 from importlib import metadata
 
 import numpy as np
@@ -16,34 +14,18 @@ import trimesh
 import warp as wp
 
 import warp_abtree as ab
-from warp_abtree.checks.quaternions import matrices_of
 
-from ...baselines.fcl import Fcl, make_convex, make_tree
+from ...baselines.fcl import Fcl
 from ...baselines.newton import Newton
+from ...shapes import pose_matrices
 from .workload import find_front, judge_answers, judge_contact, workloads
 
 FRACTIONS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
 QUICK_FRACTIONS = (0.02, 0.1, 0.5, 1)
 SDF_RESOLUTIONS = (32, 64, 128)
 NEWTON_POSES = 1024  # at a time: its time a pose hardly falls beyond, and a body is to be set up for each
-BASE_FACES = 10
-OURS, OURS_WITHIN, OURS_FCL = "our LODs", "our LODs, within both errors", "our LODs, python-fcl"
-SIMPLIFIED, HULL, NEWTON_SDF = "fast-simplification, python-fcl", "convex hull, python-fcl", "Newton, SDF"
-
-
-class FclPoses(Fcl):
-    """python-fcl over two shapes at any poses."""
-
-    def place(self, poses):
-        matrices = np.tile(np.eye(4), (len(poses), 1, 1))
-        if len(poses):
-            matrices[:, :3, :3], matrices[:, :3, 3] = matrices_of(poses[:, 3:]), poses[:, :3]
-        super().place(matrices)
-
-    def intersects(self, poses):
-        """Return whether A and B intersect at each pose, bool (n,)."""
-        self.place(poses)
-        return np.array(self.any(), bool)
+OURS, OURS_FCL = "our LODs", "our LODs, python-fcl"
+HULL, NEWTON_SDF = "convex hull, python-fcl", "Newton, SDF"
 
 
 class NewtonPoses(Newton):
@@ -63,11 +45,7 @@ class NewtonPoses(Newton):
         return rows
 
     def intersects(self, poses):
-        """Return whether it has a contact at each pose, bool (n,).
-
-        Raises:
-            RuntimeError: It lost contacts for lack of room.
-        """
+        """Return whether it has a contact at each pose, bool (n,)."""
         found = []
         for start in range(0, len(poses), self.room):
             part = poses[start : start + self.room]
@@ -75,24 +53,6 @@ class NewtonPoses(Newton):
             self.launch()
             found.append(self.result()[0][: len(part)])
         return np.concatenate(found)
-
-
-def simplify(library, vertices, faces, fraction):
-    """Return a mesh simplified by fast-simplification; its threshold is absolute, so it is brought to unit size.
-
-    Asked for fewer faces than our base meshes have, it may leave none.
-    """
-    if fraction == 1:
-        return vertices, faces
-    fraction, scale = max(fraction, BASE_FACES / len(faces)), np.ptp(vertices, axis=0).max()
-    points, kept = library.simplify(vertices / scale, faces.astype(np.int32), target_reduction=1 - fraction)
-    return points.astype(float) * scale, kept.astype(np.int32)
-
-
-def convex_hull(vertices, faces):
-    """Return the hull of a mesh, by trimesh (Qhull)."""
-    hull = trimesh.Trimesh(vertices, faces, process=False).convex_hull
-    return np.asarray(hull.vertices, float), np.asarray(hull.faces, np.int32)
 
 
 def measure(workload, method, setting, intersects, **more):
@@ -103,54 +63,47 @@ def measure(workload, method, setting, intersects, **more):
 
 
 def our_points(context, workload):
-    """Yield the points of our LODs, and of "not proved farther apart than both errors" at the same LODs."""
+    """Yield the points of our LODs."""
     poses = workload.timed_poses()
-    where = "GPU" if context.device.is_cuda else "CPU core"
     for value in context.size(FRACTIONS, QUICK_FRACTIONS):
-        lods, setting = workload.lods(fraction=value), f"{value:.3g} of the faces"
-        bound, about = workload.bound(lods), {"share": workload.fraction(lods), "where": where}
+        lods = workload.lods(fraction=value)
+        about = {"share": workload.fraction(lods), "where": "GPU" if context.device.is_cuda else "CPU core"}
         scene = workload.scene(lods)
-        found = [(None, measure(workload, OURS, setting, scene.intersects, **about))]
-        if bound > 0:
-            near = partial(scene.near, within=bound)
-            found.append((bound, measure(workload, OURS_WITHIN, setting, near, **about)))
+        row = measure(workload, OURS, f"{value:.3g} of the faces", scene.intersects, **about)
         scene.place(poses)
-        for within, row in found:
-            query = ab.Query(scene.scene, "any", pairs=scene.pairs[: len(poses)], within=within)
-            query.run()
-            yield row, query.launch if within is None else query.prove_apart
+        query = ab.Query(scene.scene, "any", pairs=scene.pairs[: len(poses)])
+        query.run()
+        yield row, query.launch
 
 
-def fcl_point(workload, method, setting, meshes, make=make_tree, **more):
+def fcl_point(workload, method, setting, meshes, convex=False, **more):
     """Return a point of python-fcl on other meshes of A and B."""
-    query = FclPoses(meshes[0], meshes[-1], (), make)
-    row = measure(workload, method, setting, query.intersects, where="CPU core", **more)
+    query = Fcl(meshes[0], meshes[-1], convex=convex)
+
+    def intersects(poses):
+        query.place(pose_matrices(poses))
+        return np.array(query.any(), bool)
+
+    row = measure(workload, method, setting, intersects, where="CPU core", **more)
     face_count = workload.a.face_count + workload.b.face_count
     row["share"] = (len(meshes[0][1]) + len(meshes[-1][1])) / face_count
-    query.place(workload.poses)
+    query.place(pose_matrices(workload.poses))
     return row, query.any
 
 
 def fcl_points(context, workload):
-    """Yield the points of python-fcl on meshes simplified by others and by us, on hulls and on decompositions."""
+    """Yield the points of python-fcl on our LODs and on convex hulls, made by trimesh (Qhull)."""
     if context.library("fcl") is None:
         return
     models = [workload.a] if workload.a is workload.b else [workload.a, workload.b]
-    library = context.library("fast_simplification")
-    whole = [model.mesh_at(model.lod_max)[:2] for model in models]
     for value in context.size(FRACTIONS, QUICK_FRACTIONS):
-        setting = f"{value:.3g} of the faces"
         ours = [model.mesh_at(model.lod_for(fraction=value))[:2] for model in models]
-        yield fcl_point(workload, OURS_FCL, setting, ours)
-        simplified = [] if library is None else [simplify(library, *mesh, value) for mesh in whole]
-        if simplified and all(len(mesh[1]) for mesh in simplified):
-            yield fcl_point(workload, SIMPLIFIED, setting, simplified)
-        elif simplified:
-            context.note(f"fast-simplification leaves no face of {workload.name} at {setting}.")
+        yield fcl_point(workload, OURS_FCL, f"{value:.3g} of the faces", ours)
     begin = time.perf_counter()
-    hulls = [convex_hull(*mesh) for mesh in whole]
+    whole = [trimesh.Trimesh(*model.mesh_at(model.lod_max)[:2], process=False) for model in models]
+    hulls = [(np.asarray(hull.vertices, float), hull.faces.astype(np.int32)) for hull in (w.convex_hull for w in whole)]
     made = {"build_s": time.perf_counter() - begin}
-    yield fcl_point(workload, HULL, "GJK", hulls, make_convex, **made)
+    yield fcl_point(workload, HULL, "GJK", hulls, convex=True, **made)
     yield fcl_point(workload, HULL, "BVHModel", hulls, **made)
 
 
@@ -184,8 +137,8 @@ def newton_points(context, workload):
 
 def run(context):
     """Yield one row a workload, method and setting."""
-    names = "python-fcl", "fast-simplification", "trimesh", "newton"
     versions = {package.name: package.version for package in metadata.distributions()}
+    names = "python-fcl", "trimesh", "newton"
     context.note(f"Versions: {', '.join(f'{name} {versions.get(name)}' for name in names)}.")
     for workload in workloads(context):
         found = []
@@ -208,6 +161,5 @@ def time_points(context, workload, found):
         count = len(workload.timed_poses() if on_gpu else workload.poses)
         for k, milliseconds in times.items():
             rows[k]["us"] = 1e3 * milliseconds / count
-    for row, front in zip(rows, find_front([r["us"] for r in rows], [r["contact_mean"] for r in rows]), strict=True):
-        row["front"] = bool(front)
-    return rows
+    fronts = find_front([row["us"] for row in rows], [row["contact_mean"] for row in rows])
+    return [row | {"front": front} for row, front in zip(rows, fronts, strict=True)]

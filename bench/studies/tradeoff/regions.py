@@ -16,21 +16,14 @@ TOLERANCE = 0.01  # of the size: a contact farther than this from the other regi
 
 @dataclass
 class Regions:
-    """The contact regions of many poses.
+    """The contact regions of many poses."""
 
-    Attributes:
-        ends: Segments, float64 (k, 2, 3) [sizes]; pose: theirs, int (k,).
-        sample, of: Samples, float64 (n, 3) [sizes], and their segments, int (n,).
-        weight: Length that a sample stands for, (n,) [sizes].
-        poses: Their number.
-    """
-
-    ends: np.ndarray
-    pose: np.ndarray
-    sample: np.ndarray
-    of: np.ndarray
-    weight: np.ndarray
-    poses: int
+    ends: np.ndarray  # segments, float64 (k, 2, 3) [sizes]
+    pose: np.ndarray  # of each segment, int (k,)
+    sample: np.ndarray  # float64 (n, 3) [sizes]
+    of: np.ndarray  # segment of each sample, int (n,)
+    weight: np.ndarray  # length that a sample stands for, (n,) [sizes]
+    poses: int  # their number
 
 
 def make_regions(contacts, poses, size):

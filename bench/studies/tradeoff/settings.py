@@ -22,14 +22,13 @@ COINCIDENT_FACES = 25_000  # larger meshes are not laid on themselves: a million
 COINCIDENT_ULPS = (0, 1, -3, 50)
 
 
-def make_query(scene, poses, output, capacity=0, **options):
-    """Return a query of placed poses that has room for what it finds."""
-    pairs = scene.pairs[: len(poses)]
+def make_query(scene, poses, output, **options):
+    """Return a query of placed poses, whose first run makes room for what it finds."""
     scene.place(poses)
-    if output == "contacts":
-        return ab.ContactQuery(scene.scene, pairs, capacity=max(1024, capacity), **options)
-    room = {"capacity": max(1024, capacity)} if output == "faces" else {}
-    return ab.Query(scene.scene, output, pairs, **room, **options)
+    pairs = scene.pairs[: len(poses)]
+    return (
+        ab.ContactQuery(scene.scene, pairs) if output == "contacts" else ab.Query(scene.scene, output, pairs, **options)
+    )
 
 
 def coincident_poses(size):
@@ -46,7 +45,7 @@ def precision_rows(context, workload, scenes):
         groups["coincident meshes"] = coincident_poses(workload.size)
     for value in PRECISION_FRACTIONS:
         for group, poses in groups.items():
-            queries = {p: make_query(scenes[value], poses, "faces", 64 * len(poses), precision=p) for p in PRECISIONS}
+            queries = {p: make_query(scenes[value], poses, "faces", precision=p) for p in PRECISIONS}
             found = {precision: query.run() for precision, query in queries.items()}  # grows where there is no room
             for result in found.values():
                 result.check()
@@ -66,20 +65,17 @@ def output_rows(context, workload, scenes):
     poses, finest = workload.timed_poses(), None
     for value in sorted(context.size(FRACTIONS, PRECISION_FRACTIONS), reverse=True):
         scene = scenes[value]
-        hits = int(scene.ask(workload.poses, "count").count.sum()) * (len(poses) // len(workload.poses))
-        queries = {output: make_query(scene, poses, output, hits) for output in OUTPUTS}
+        queries = {output: make_query(scene, poses, output) for output in OUTPUTS}
         found = {output: query.run() for output, query in queries.items()}
-        for result in found.values():
-            result.check()
-            if not np.array_equal(result.any, found["any"].any):
-                raise RuntimeError("outputs differ in which poses intersect")
+        if not all(np.array_equal(result.any, found["any"].any) for result in found.values()):
+            raise RuntimeError("outputs differ in which poses intersect")
         times = context.time_launches({output: query.launch for output, query in queries.items()})
         finest = finest or times
-        for output in OUTPUTS:
+        for output, result in found.items():
             row = {"case": "output", "workload": workload.name, "value": value, "setting": output}
             row |= {"us": 1e3 * times[output] / len(poses), "cost": times[output] / times["any"]}
-            row |= {"of_finest": times[output] / finest[output], "node_tests": float(found[output].node_tests.mean())}
-            yield row | {"triangle_tests": float(found[output].triangle_tests.mean())}
+            row |= {"of_finest": times[output] / finest[output], "node_tests": float(result.node_tests.mean())}
+            yield row | {"triangle_tests": float(result.triangle_tests.mean())}
 
 
 def margin_rows(context, workload, scenes):

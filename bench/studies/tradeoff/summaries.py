@@ -6,8 +6,9 @@ from ...tables import pick
 
 SUMMED = ("poses", "meet", "missed", "invented", "hits", "faces_missed", "faces_invented")
 LARGEST = ("early_max", "late_max", "contact_max", "region_hausdorff_max")
-RATIOS = ("us", "cost", "build_s", "of_finest")
-RATIOS += ("any_cost", "contacts_cost", "node_tests_cost", "contacts_node_tests_cost")
+RATIOS = ("us", "cost", "build_s", "of_finest", "any_cost", "contacts_cost")
+TESTS = ("node_tests", "contacts_node_tests")
+RATIOS += tuple(f"{name}_cost" for name in TESTS)
 SHOWN_OFFSETS = (0.01, 0.1, 0.5)  # fractions of the faces
 
 
@@ -55,26 +56,19 @@ def summarise(rows, names) -> list:
 
 
 def over_meshes(rows):
-    """Return one row a fraction of the faces: means over the meshes."""
+    """Return one row a fraction of the faces: means over the meshes, of normals over all poses."""
     found = []
+    finest = {row["workload"]: row for row in pick(rows, value=1)}
     for (value,), members in group(rows, "value").items():
-        costs = [dict(row) for row in members]
-        for row in costs:
-            finest = pick(rows, workload=row["workload"], value=1)[0]
-            for name in ("node_tests", "contacts_node_tests"):
-                row[f"{name}_cost"] = row[name] / finest[name]
+        costs = [row | {f"{name}_cost": row[name] / finest[row["workload"]][name] for name in TESTS} for row in members]
         row = aggregate(costs) | {"value": value, "level": "base" if value == 0 else f"{value:.3g}"}
         for name in ("normal", "normal_clear"):
-            row[f"{name}_mean"] = over_poses(members, f"{name}_mean", f"{name}_poses")
+            known = [member for member in members if member.get(f"{name}_poses")]
+            total = sum(member[f"{name}_poses"] for member in known)
+            weighted = sum(member[f"{name}_mean"] * member[f"{name}_poses"] for member in known)
+            row[f"{name}_mean"] = weighted / total if total else None
         found.append(row)
     return found
-
-
-def over_poses(rows, name, count):
-    """Return the mean of a column over all poses that its rows are means of, None of nothing."""
-    known = [row for row in rows if row.get(name) is not None and row.get(count)]
-    total = sum(row[count] for row in known)
-    return sum(row[name] * row[count] for row in known) / total if total else None
 
 
 def choose(rows):

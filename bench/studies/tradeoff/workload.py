@@ -41,7 +41,7 @@ class Workload:
 
     Attributes:
         size: The longest side of the larger model's box; errors are given as fractions of it.
-        low, high: Where each motion is first in contact, and last free.
+        low: Where each motion is first in contact.
         poses, offset: Poses (n, 7) of the first motions, from apart through touching to deep, and where they are from
             the first contact, in sizes; at 0 both sides of it.
         finest, truth: A scene of both at their finest LODs, and its answer at each pose.
@@ -57,10 +57,10 @@ class Workload:
         low, high = find_first_contact(self.finest.intersects, self.motions, self.steps)
         chosen = np.flatnonzero(~np.isnan(low))[:count]
         self.motions.away, self.motions.rotations = self.motions.away[chosen], self.motions.rotations[chosen]
-        self.low, self.high = low[chosen], high[chosen]
+        self.low = low[chosen]
         which = np.tile(np.arange(min(posed, len(chosen))), len(OFFSETS) + 2)
         along = [self.low[:posed] + offset * self.size for offset in OFFSETS]
-        along = np.concatenate([*along, self.low[:posed], self.high[:posed]])
+        along = np.concatenate([*along, self.low[:posed], high[chosen][:posed]])
         offset = np.repeat([*OFFSETS, 0.0, 0.0], len(which) // (len(OFFSETS) + 2))
         kept = along >= 0
         self.offset = offset[kept]
@@ -73,11 +73,8 @@ class Workload:
         return PoseScene(self.device, (self.a, self.b), lods, self.motions.far, room)
 
     def lods(self, fraction=None, tolerance=None):
-        """Return LODs of A and B: of a fraction of the faces (0 is the base), or whose errors sum to a tolerance.
-
-        Args:
-            tolerance: Of the size.
-        """
+        """Return LODs of A and B: of a fraction of the faces (0 is the base), or whose errors sum to a tolerance
+        [sizes]."""
         if fraction == 0:
             return 0, 0
         if fraction is not None:
@@ -118,21 +115,19 @@ def judge_answers(found, truth):
 def judge_contact(error):
     """Return columns of errors of the first contact [sizes]: mean and largest size, and the largest of either sign."""
     known = error[~np.isnan(error)]
-    row = {"never": int(np.isnan(error).sum())} | dict.fromkeys(
-        ("contact_mean", "contact_max", "early_max", "late_max")
-    )
-    if len(known):
-        row |= {"contact_mean": float(np.abs(known).mean()), "contact_max": float(np.abs(known).max())}
-        row |= {"early_max": float(max(0.0, known.max())), "late_max": float(max(0.0, -known.min()))}
-        row |= {"early": float((known > 0).mean()), "late": float((known < 0).mean())}
-    return row
+    columns = {
+        "contact_mean": lambda: np.abs(known).mean(),
+        "contact_max": lambda: np.abs(known).max(),
+        "early_max": lambda: max(0.0, known.max()),
+        "late_max": lambda: max(0.0, -known.min()),
+        "early": lambda: (known > 0).mean(),
+        "late": lambda: (known < 0).mean(),
+    }
+    row = {name: float(column()) if len(known) else None for name, column in columns.items()}
+    return {"never": int(np.isnan(error).sum())} | row
 
 
 def find_front(costs, errors):
     """Return which points no other one beats in one and equals in the other at least, bool (n,); None is infinite."""
-    points = np.array([(a, np.inf if b is None else b) for a, b in zip(costs, errors, strict=True)], float)
-    front = []
-    for cost, error in points:
-        better = (points[:, 0] <= cost) & (points[:, 1] <= error) & ((points[:, 0] < cost) | (points[:, 1] < error))
-        front.append(not better.any())
-    return front
+    points = [(cost, np.inf if error is None else error) for cost, error in zip(costs, errors, strict=True)]
+    return [not any(a <= cost and b <= error and (a, b) != (cost, error) for a, b in points) for cost, error in points]

@@ -1,4 +1,4 @@
-"""The command line: ``warp-abtree info|build|query|run|sweep|view|picture|bench|doctor``.
+"""The command line: ``warp-abtree info|build|query|run|sweep|view|picture|bench``.
 
 Exit status 0 when done, 2 with one line on stderr for bad input, 1 where work was lost or a device failed, 130 and 143
 when stopped by SIGINT and SIGTERM.
@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 
-from warp_abtree.app.cli import bench_command, doctor, model_commands, query_command, run_command, sweep_command
+from warp_abtree.app.cli import bench_command, model_commands, query_command, run_command, sweep_command
 from warp_abtree.app.cli.arguments import PROGRAM, STATUS, Parser, PrintCompletion, shield_numbers
 from warp_abtree.app.cli.progress import Progress, compile_notice, start_warp
 from warp_abtree.app.pictures import command as picture_command
@@ -23,8 +23,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog=PROGRAM,
         description="Mesh-mesh interference queries at any level of detail (LOD), in batches, on CUDA or the CPU.",
-        epilog=f"examples:\n  {PROGRAM} doctor\n  {PROGRAM} info cow.obj\n"
-        f"  {PROGRAM} run bunny_tori --picture bunny_tori.png\n\n{STATUS}",
+        epilog=f"examples:\n  {PROGRAM} info cow.obj\n  {PROGRAM} run bunny_tori --picture out.png\n\n{STATUS}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
@@ -60,7 +59,6 @@ def make_parser() -> argparse.ArgumentParser:
     ):
         command(name, function, module.SUMMARY, module.EXAMPLES, module.add_arguments)
     command("bench", None, bench_command.SUMMARY, bench_command.EXAMPLES)
-    command("doctor", doctor.doctor, doctor.SUMMARY, doctor.EXAMPLES)
     return parser
 
 

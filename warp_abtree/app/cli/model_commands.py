@@ -10,6 +10,7 @@ from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.model.mesh import describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model
 from warp_abtree.scene.scene import Scene
+from warp_abtree.simulate.frame import resolve_lod
 
 INFO_SUMMARY = "say what a mesh or a built model holds and what is odd about it"
 INFO_EXAMPLES = ("cow.obj", "cow.npz", "warp:bunny --json")
@@ -26,6 +27,14 @@ def is_model(source) -> bool:
 def load_model(source, progress) -> Model:
     """Open a built model, or build one of a mesh."""
     return Model.open(source) if is_model(source) else Model.load(source, progress=progress)
+
+
+def lod_at(option, model, request) -> int:
+    """Return the LOD that an option asks of a model; errors name the option."""
+    try:
+        return resolve_lod(model, request)
+    except ValueError as error:
+        raise ValueError(f"{option}: {error}") from None
 
 
 def active_count(model, lod) -> int:

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISIONS, Parser
-from warp_abtree.app.cli.model_commands import active_count, load_model
+from warp_abtree.app.cli.model_commands import active_count, load_model, lod_at
 from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.frame import resolve_lod
 
 SUMMARY = "intersect two meshes, A at the origin and B at a pose"
 EXAMPLES = (
@@ -79,12 +78,7 @@ def _make_scene(options, progress):
     models = [load_model(options.a, progress)]
     models.append(models[0] if options.b == options.a else load_model(options.b, progress))
     progress.close()
-    lods = []
-    for option, model, request in (("--lod-a", models[0], options.lod_a), ("--lod-b", models[1], options.lod_b)):
-        try:
-            lods.append(resolve_lod(model, request))
-        except ValueError as error:
-            raise ValueError(f"{option}: {error}") from None
+    lods = lod_at("--lod-a", models[0], options.lod_a), lod_at("--lod-b", models[1], options.lod_b)
     scene.add(models[0], lod=lods[0])
     try:
         scene.add(models[1], pose=options.pose, lod=lods[1])

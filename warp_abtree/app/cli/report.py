@@ -23,18 +23,11 @@ def plain(value):
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def print_json(value):
-    """Print a value as JSON."""
-    print(json.dumps(plain(value), indent=1, allow_nan=False))
-
-
 def print_result(result: dict, as_json: bool):
-    """Print the result of a command, for programs or for people."""
-    (print_json if as_json else print_report)(result)
-
-
-def print_report(result: dict):
-    """Print a result for people: a line for each value, a table for each list or dictionary of rows."""
+    """Print a result as JSON, or a line for each value and a table for each list or dictionary of rows."""
+    if as_json:
+        print(json.dumps(plain(result), indent=1, allow_nan=False))
+        return
     for key, value in result.items():
         heading = key.replace("_", " ")
         if isinstance(value, dict) and all(isinstance(row, dict) for row in value.values()):

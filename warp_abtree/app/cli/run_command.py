@@ -12,7 +12,6 @@ from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.app.pictures.plots import draw_run
 from warp_abtree.app.pictures.render import import_pyvista
 from warp_abtree.app.pictures.scenes import draw_scene
-from warp_abtree.app.recording import record_run
 from warp_abtree.app.toml.control import CONTROLLERS
 from warp_abtree.app.toml.folder import scene_names
 from warp_abtree.app.toml.scene_file import load_scene
@@ -21,7 +20,7 @@ SUMMARY = "run a scene frame by frame and time its stages"
 EXAMPLES = (
     "bunny_tori --picture bunny_tori.png",
     "scenes/herd.toml --frames 10 --device cpu --record herd.csv",
-    "rain --budget 8ms --controller paper --plot plots --record rain.npz",
+    "rain --budget 8ms --controller paper --plot plots",
 )
 PLOT_NAME = "frames.png"
 
@@ -35,7 +34,7 @@ def add_arguments(sub: Parser):
     sub.add_argument("--objects", type=positive, metavar="N", help="about so many objects, by other counts or worlds")
     sub.add_argument("--budget", type=milliseconds, metavar="TIME", help="time of a frame to hold, as 8ms or 0.008s")
     sub.add_argument("--controller", choices=CONTROLLERS, help="what chooses LODs (the scene's own, or predictive)")
-    about = "write a row a frame, .csv or .json; .npz holds all, for view and picture"
+    about = "write a row a frame, .csv or .json"
     sub.add_file("--record", type=Path, metavar="FILE", help=about)
     sub.add_file("--plot", type=Path, metavar="DIR", help="draw LODs, times and error over the frames there")
 
@@ -48,16 +47,16 @@ def run(options, progress):
     # A full collection of what was loaded takes longer than the budget of a frame.
     gc.collect()
     gc.freeze()
-    frame, recording = record_run(
-        loaded,
-        frames,
-        keep=bool(options.record and options.record.suffix.lower() == ".npz"),
-        progress=lambda done, total: progress("frames", done, total),
-        controller=options.controller,
-        budget_ms=options.budget,
-    )
+    bodies = loaded.make_bodies()
+    controller = loaded.control.asked(options.controller, options.budget).controller
+    frame = loaded.frame(controller=options.controller, budget_ms=options.budget, bodies=bodies)
+    lods = []
+    for done in range(frames):
+        frame.step()
+        lods.append(loaded.scene.lods)
+        progress("frames", done + 1, frames)
     progress.close()
-    written = [str(path) for path in _write(options, loaded, frame, recording)]
+    written = [str(path) for path in _write(options, loaded, frame, (controller, lods))]
     summary = {
         "title": loaded.title,
         "device": str(loaded.scene.device),
@@ -68,7 +67,7 @@ def run(options, progress):
             for name, model in loaded.models.items()
         },
         "worlds": len(np.unique(loaded.worlds[loaded.worlds >= 0])),
-        "controller": recording.settings.controller,
+        "controller": controller,
         "written": written,
         **frame.summary(),
     }
@@ -77,10 +76,8 @@ def run(options, progress):
 
 def _check(options):
     """Refuse options that cannot be met, before any work."""
-    if options.scene.lower().endswith(".npz"):
-        raise ValueError(f"{options.scene}: is no scene; view and picture show recordings")
     if options.record:
-        check_output(options.record, [".csv", ".json", ".npz"], inputs=[options.scene])
+        check_output(options.record, [".csv", ".json"], inputs=[options.scene])
     if options.picture:
         check_output(options.picture, [".png"])
         import_pyvista("--picture")
@@ -90,20 +87,18 @@ def _check(options):
             raise ValueError("--plot needs Matplotlib: pip install warp-abtree[pictures]")
 
 
-def _write(options, loaded, frame, recording) -> list[Path]:
-    """Write the files that the options name; return them."""
+def _write(options, loaded, frame, chosen) -> list[Path]:
+    """Write the files that the options name; return them. `chosen` is the controller and the LODs of each frame."""
+    controller, lods = chosen
     if options.record:
-        if options.record.suffix.lower() == ".npz":
-            recording.save(options.record)
-        else:
-            frame.record(options.record)
+        frame.record(options.record)
     if options.picture:
         poses = None if loaded.dynamics is None else frame.motion.dynamics.poses()
-        chosen = None if recording.settings.controller == "none" else loaded.scene.lods
-        draw_scene(loaded, options.picture, frame.history[-1].time, poses, chosen)
+        last = None if controller == "none" else loaded.scene.lods
+        draw_scene(loaded, options.picture, frame.history[-1].time, poses, last)
     if options.plot:
         options.plot.mkdir(exist_ok=True)
         top = np.array([model.lod_max for model in loaded.scene.models])[loaded.scene.object_model]
-        title = f"{loaded.title}: {recording.settings.controller} on {loaded.scene.device}"
-        draw_run(frame.history, recording.lods / np.maximum(top, 1), options.plot / PLOT_NAME, title)
+        title = f"{loaded.title}: {controller} on {loaded.scene.device}"
+        draw_run(frame.history, np.array(lods) / np.maximum(top, 1), options.plot / PLOT_NAME, title)
     return list(filter(None, (options.record, options.picture, options.plot and options.plot / PLOT_NAME)))

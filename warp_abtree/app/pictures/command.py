@@ -5,20 +5,18 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.app.cli.arguments import Parser, positive
-from warp_abtree.app.cli.report import check_output, print_json
+from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 from warp_abtree.app.pictures.render import import_pyvista
 from warp_abtree.app.pictures.scenes import SIZE, draw_snapshot
-from warp_abtree.app.playback import RecordedPlayback
 from warp_abtree.app.render_data import Settings, Snapshot, objects_of_world
-from warp_abtree.app.scene_geometry import tree_depth
 from warp_abtree.app.toml.objects import unit
 
-SUMMARY = "draw a scene, a recorded run or meshes to a PNG file"
+SUMMARY = "draw a scene or meshes to a PNG file"
 EXAMPLES = (
     "scenes/bunny_tori.toml --frame 30 --out tori.png",
-    "warp:bunny warp:bunny --lod 0.1 --contacts --out bunnies.png",
-    "cow.obj --lod tol:0.01 --tree 6 --eye 1 0.3 0.5 --out cow.png",
+    "warp:bunny warp:bunny --lod 0.1 --out bunnies.png",
+    "cow.obj --lod tol:0.01 --eye 1 0.3 0.5 --out cow.png",
 )
 
 
@@ -26,10 +24,7 @@ def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
     add_playback_arguments(sub)
     sub.add_file("--out", "-o", type=Path, required=True, metavar="PNG", help="file to write")
-    sub.add_argument("--frame", type=int, default=0, metavar="N", help="frame of a scene or recording to draw (0)")
-    sub.add_argument("--contacts", action="store_true", help="draw the segments in which faces meet")
-    sub.add_argument("--normals", action="store_true", help="draw the normals of contacts")
-    sub.add_argument("--tree", type=int, metavar="LEVEL", help="draw the boxes of the active nodes at a level of trees")
+    sub.add_argument("--frame", type=int, default=0, metavar="N", help="frame of a scene to draw (0)")
     for name, what in (("eye", "direction to the eye"), ("up", "direction upwards")):
         sub.add_argument(f"--{name}", nargs=3, type=float, metavar=("X", "Y", "Z"), help=f"{what} (the scene's own)")
     sub.add_argument("--world", type=int, metavar="W", help="world to draw (the scene's own)")
@@ -50,42 +45,24 @@ def picture(options, progress):
     objects = objects_of_world(playback.worlds, world)
     if not len(objects):
         raise ValueError(f"--world: no object is in world {world}")
-    deepest = tree_depth(playback.scene, objects)
-    if options.tree is not None and options.tree > deepest:
-        raise ValueError(f"--tree: the deepest tree ends at level {deepest}")
-    level = -1 if options.tree is None else options.tree
-    settings = Settings(world, contacts=options.contacts, normals=options.normals, level=level, every_tree=True)
+    settings = Settings(world)
     snapshot = go_to(playback, options.frame, settings.output, progress)
     progress.close()
     draw_snapshot(playback.scene, snapshot, objects, options.out, playback.title, (eye, up), settings, options.size)
-    if options.json:
-        print_json({"picture": str(options.out), "objects": len(objects), "frame": snapshot.number})
-    else:
-        print(f"wrote {options.out}")
+    print_result({"picture": str(options.out), "objects": len(objects), "frame": snapshot.number}, options.json)
 
 
 def _check(options):
     """Refuse options that are wrong by themselves, before any work."""
     check_output(options.out, [".png"], inputs=options.source)
-    for name in ("frame", "tree"):
-        value = getattr(options, name)
-        if value is not None and value < 0:
-            raise ValueError(f"--{name}: {value} is below 0")
+    if options.frame < 0:
+        raise ValueError(f"--frame: {options.frame} is below 0")
     if not 50 <= options.size <= 8000:
         raise ValueError(f"--size: {options.size} is outside 50 .. 8000")
 
 
 def go_to(playback, frame: int, output, progress=None) -> Snapshot:
-    """Return the snapshot of a frame; a scene runs the frames before it.
-
-    Raises:
-        ValueError: A recording that is not that long.
-    """
-    if isinstance(playback, RecordedPlayback):
-        if frame >= playback.length:
-            raise ValueError(f"--frame: the recording has {playback.length} frames, from 0")
-        playback.seek(frame)
-        return playback.query(output)
+    """Return the snapshot of a frame; a scene runs the frames before it."""
     if frame == 0:
         return playback.query(output)
     for done in range(frame + 1):

@@ -1,11 +1,11 @@
-"""Pictures of scenes: objects at their LODs and poses, intersecting faces coloured, contacts, boxes of trees."""
+"""Pictures of scenes: objects at their LODs and poses, intersecting faces coloured."""
 
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.pictures.render import Panel, draw
 from warp_abtree.app.render_data import RenderData, Settings, Snapshot, compose, objects_of_world
-from warp_abtree.app.styles import BOX_COLOUR, COLOURS, CONTACT_COLOUR, NORMAL_COLOUR
+from warp_abtree.app.styles import COLOURS
 from warp_abtree.scene.scene import Scene
 
 SIZE = 800  # pixels
@@ -29,15 +29,12 @@ def make_panel(cache: geometry.MeshCache, data: RenderData, title: str | None = 
         colours.append(np.tile(COLOURS[model % len(COLOURS)][1], (len(corners), 1)))
     count = len(data.shown)
     title = title or f"{count:,} object{'' if count == 1 else 's'}, {data.faces:,} faces"
-    title += f"\n{data.contact_count:,} intersecting face pairs"
-    if data.box_count:
-        title += f", {data.box_count:,} boxes"
-    lines = [(data.segments, CONTACT_COLOUR), (data.normals, NORMAL_COLOUR), (data.boxes, BOX_COLOUR)]
-    return Panel(title, np.concatenate(triangles), np.concatenate(colours), lines)
+    title += f"\n{data.pair_count:,} intersecting face pairs"
+    return Panel(title, np.concatenate(triangles), np.concatenate(colours))
 
 
-def make_legend(scene: Scene, panels: list[RenderData], level: int = -1) -> list:
-    """Return (colour, label) of the models, and of the kinds of lines that panels of one scene show."""
+def make_legend(scene: Scene, panels: list[RenderData]) -> list:
+    """Return (colour, label) of the models that panels of one scene show."""
     legend = []
     for model in dict.fromkeys(np.array(scene.object_model)[panels[0].shown].tolist()):
         plain, bright = COLOURS[model % len(COLOURS)]
@@ -45,45 +42,15 @@ def make_legend(scene: Scene, panels: list[RenderData], level: int = -1) -> list
         legend.append((plain, name))
         if any(model in data.intersecting for data in panels):
             legend.append((bright, f"{name}, intersecting"))
-    layers = [("segments", CONTACT_COLOUR, "contacts"), ("normals", NORMAL_COLOUR, "normals")]
-    layers.append(("boxes", BOX_COLOUR, f"active nodes at level {level}"))
-    return legend + [(colour, label) for name, colour, label in layers if any(len(getattr(d, name)) for d in panels)]
+    return legend
 
 
 def draw_snapshot(scene: Scene, snapshot: Snapshot, shown, path, title: str, view, settings: Settings, size: int):
     """Draw the shown objects of a snapshot to a PNG file; `view` is the directions to the eye and upwards."""
     cache = geometry.MeshCache(scene)
     data = compose(cache, snapshot, shown, settings)
-    (eye, up), legend = view, make_legend(scene, [data], settings.level)
+    (eye, up), legend = view, make_legend(scene, [data])
     draw([make_panel(cache, data)], path, title, legend, eye, up, size)
-
-
-def draw_objects(scene: Scene, poses, path, title="", objects=None, eye=(0.4, 0.35, 1.0), up=(0, 1, 0), **options):
-    """Draw objects of a scene at its LODs to a PNG file, intersecting faces coloured on both.
-
-    The scene's poses are those of the picture afterwards.
-
-    Args:
-        scene: `Scene`.
-        poses: Of every object, x y z and a quaternion x y z w, (n, 7).
-        path: File to write.
-        title: Above.
-        objects: Indices of those drawn; None for all. Intersections with others are not coloured.
-        eye, up: Directions to the eye and upwards in the world.
-        options: contacts, normals: whether they are drawn; level: of the boxes of trees; size: pixels along a side.
-
-    Raises:
-        ValueError: Bad poses, an object that is none, or pyvista is not installed.
-    """
-    size, level = options.pop("size", SIZE), options.pop("level", None)
-    settings = Settings(**{"contacts": False, **options}, level=-1 if level is None else level, every_tree=True)
-    objects = np.arange(scene.object_count) if objects is None else np.unique(objects)
-    if not len(objects) or objects[0] < 0 or objects[-1] >= scene.object_count:
-        raise ValueError(f"objects: from {scene.object_count} objects none is chosen, or one that does not exist")
-    scene.set_poses(poses)
-    result = scene.intersect(output=settings.output)
-    snapshot = Snapshot(0, 0.0, np.asarray(poses, np.float64), scene.lods, result, None)
-    draw_snapshot(scene, snapshot, objects, path, title, (eye, up), settings, size)
 
 
 def panel_lods(loaded) -> list[np.ndarray]:
@@ -127,7 +94,7 @@ def draw_scene(loaded, path, time: float, poses=None, lods=None):
         for chosen in panel_lods(loaded) if lods is None else [lods]:
             scene.set_lods(chosen)
             snapshot = Snapshot(0, time, poses, scene.lods, scene.intersect(output="faces"), None)
-            panels.append(compose(cache, snapshot, shown, Settings(contacts=False)))
+            panels.append(compose(cache, snapshot, shown, Settings()))
     finally:
         scene.set_lods(before)
     drawn = [make_panel(cache, data, _swept_title(scene, data, swept[0]) if swept else None) for data in panels]

@@ -40,7 +40,7 @@ def import_msgspec(path):
 
 
 def read_tables(path: Path, text: str | None = None):
-    """Return the text of a scene file, or `text` in its place, and its `SceneTable`, whose models are `ModelTable`s."""
+    """Return the `SceneTable` of a scene file, or of `text` in its place; its models are `ModelTable`s."""
     msgspec = import_msgspec(path)
     from warp_abtree.app.toml import tables
 
@@ -68,7 +68,7 @@ def read_tables(path: Path, text: str | None = None):
     models = {}
     for name, table in scene.models.items():
         models[name] = convert(table, tables.AnyShape if "shape" in table else tables.ModelTable, f"models.{name}")
-    return text, msgspec.structs.replace(scene, models=models)
+    return msgspec.structs.replace(scene, models=models)
 
 
 def _check_finite(path, key, value):

@@ -9,7 +9,6 @@ import numpy as np
 from warp_abtree.app.toml.decode import SceneError, fail
 
 OBJECT_LIMIT = 1_000_000  # of one entry of [[objects]]
-MATERIAL = ("density", "restitution", "friction")
 
 
 def unit(vector) -> np.ndarray:
@@ -27,7 +26,6 @@ class ObjectGroup:
     world: np.ndarray  # int (n,)
     motion: dict  # arguments of `Kinematic`
     kinematic: np.ndarray  # whether it moves as told among rigid bodies, bool (n,)
-    material: dict  # density, restitution and friction, (n,) each; NaN without [dynamics]
 
 
 def make_group(path, key: str, table, dynamics, rng) -> ObjectGroup:
@@ -58,21 +56,15 @@ def make_group(path, key: str, table, dynamics, rng) -> ObjectGroup:
         motion["shuttle"][:], motion["period"][:] = table.shuttle.by, table.shuttle.period
         motion["phase"][:] = table.shuttle.phase
     _scatter(table.random, motion, rng)
-    material = {}
-    for name in MATERIAL:
-        own = getattr(table, name)
-        value = np.nan if dynamics is None else getattr(dynamics, name) if own is None else own
-        material[name] = np.full(count, value)
     world = np.repeat(np.arange(table.world, table.world + table.worlds), len(offsets))
-    return ObjectGroup(key, table, world, motion, np.full(count, table.kinematic), material)
+    return ObjectGroup(key, table, world, motion, np.full(count, table.kinematic))
 
 
 def _check_dynamics(path, key, table, dynamics):
     """Refuse keys that rigid bodies alone have, or that they cannot have."""
     if dynamics is None:
-        given = [name for name in MATERIAL if getattr(table, name) is not None]
-        for name in [*(["kinematic"] if table.kinematic else []), *given]:
-            fail(path, f"{key}.{name}", "the scene has no [dynamics]")
+        if table.kinematic:
+            fail(path, f"{key}.kinematic", "the scene has no [dynamics]")
     elif not table.static and not table.kinematic and table.shuttle is not None:
         fail(path, f"{key}.shuttle", "a rigid body goes its own way; kinematic = true lets it shuttle")
 

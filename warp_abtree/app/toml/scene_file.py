@@ -14,7 +14,7 @@ from warp_abtree.app.toml.control import LodControl, make_control
 from warp_abtree.app.toml.decode import SceneError, fail, read_tables
 from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.models import build_model
-from warp_abtree.app.toml.objects import MATERIAL, make_groups
+from warp_abtree.app.toml.objects import make_groups
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame, LodSweep, resolve_lod
@@ -28,8 +28,6 @@ class SceneFile:
 
     path: Path
     title: str
-    text: str  # the file
-    objects: int | None  # the number of objects that was asked for, None for the file's own
     frames: int
     time_step: float  # between frames [s]
     models: dict  # `Model` by name
@@ -43,7 +41,6 @@ class SceneFile:
     control: LodControl  # of [lod]
     dynamics: Any  # `DynamicsTable`, None without [dynamics]
     kinematic: np.ndarray  # whether each object moves as told among rigid bodies, bool (n,)
-    body: dict  # density, restitution and friction of each object, (n,)
 
     def lods_at(self, time: float) -> np.ndarray:
         """Return the LOD of every object at a time [s] without a controller, int64 (n,)."""
@@ -62,9 +59,14 @@ class SceneFile:
             return None
         self.scene.set_poses(self.motion.poses(0.0))
         try:
-            angular_velocity = self.motion.axis * self.motion.rate[:, None]
-            moving = {"velocity": self.motion.velocity, "angular_velocity": angular_velocity}
-            return Dynamics(self.scene, kinematic=self.kinematic, **moving, **self.dynamics.options(), **self.body)
+            return Dynamics(
+                self.scene,
+                friction=self.dynamics.friction,
+                gravity=self.dynamics.gravity,
+                kinematic=self.kinematic,
+                velocity=self.motion.velocity,
+                angular_velocity=self.motion.axis * self.motion.rate[:, None],
+            )
         except ValueError as error:
             raise SceneError(f"{self.path}: objects: {error}") from None
 
@@ -116,7 +118,7 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
         raise ValueError(f"objects {objects!r} is not a whole number")
     objects = None if objects is None else whole_number(objects, "objects", 1, 2**31 - 1)
     path, scene = find_scene(path), Scene(device=device)
-    text, tables = read_tables(path, text)
+    tables = read_tables(path, text)
     if not tables.objects:
         fail(path, "the file", "no [[objects]]")
     control = make_control(path, tables.lod)
@@ -131,8 +133,6 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
     loaded = SceneFile(
         path=path,
         title=path.stem if tables.scene.title is None else tables.scene.title,
-        text=text,
-        objects=objects,
         frames=tables.scene.frames,
         time_step=tables.scene.time_step,
         models=models,
@@ -146,7 +146,6 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
         control=control,
         dynamics=tables.dynamics,
         kinematic=np.concatenate([group.kinematic for group in groups]),
-        body={name: np.concatenate([group.material[name] for group in groups]) for name in MATERIAL},
     )
     scene.set_lods(loaded.lods_at(0.0))
     scene.set_poses(motion.poses(0.0))

@@ -30,7 +30,6 @@ Fraction = Annotated[float, Meta(gt=0, le=1)]
 Count = Annotated[int, Meta(ge=1, le=2**31 - 1)]
 Cells = Annotated[int, Meta(ge=0, le=OBJECT_LIMIT)]
 Copies = Annotated[int, Meta(ge=1, le=OBJECT_LIMIT)]
-Restitution = Annotated[float, Meta(ge=0, le=1)]
 TerrainCells = Annotated[int, Meta(ge=1, le=4096)]
 Sections = Annotated[int, Meta(ge=3, le=10_000)]
 NonEmpty = Annotated[list[T], Meta(min_length=1)]
@@ -192,9 +191,6 @@ class ObjectTable(Table, kw_only=True):
     world: Annotated[int, Meta(ge=-1, le=2**30)] = 0  # objects of different worlds never meet; -1 is in every world
     static: bool = False  # static objects never meet each other
     kinematic: bool = False  # with [dynamics]: moves as told, and pushes
-    density: Positive | None = None  # with [dynamics]; these three are those of [dynamics] by default
-    restitution: Restitution | None = None
-    friction: NotNegative | None = None
     importance: Annotated[int, Meta(ge=1, le=3)] = 1  # 1 (most), 2 or 3, for the selection of LODs
     # A number with a decimal point is a fraction of the faces; a whole number, "finest", "coarsest" or "tol:0.01"; of a
     # list each in turn.
@@ -318,17 +314,8 @@ class CameraTable(Table):
 class DynamicsTable(Table):
     """[dynamics]: objects that are neither static nor kinematic are rigid bodies; velocity and turn start them."""
 
-    density: Positive = 1.0
-    restitution: Restitution = 0.0
     friction: NotNegative = 0.5
     gravity: Vector = (0.0, -9.81, 0.0)
-    iterations: Annotated[int, Meta(ge=1, le=10_000)] | None = None  # of the contact solver in a step
-    sleep_time: Positive | None = None  # at rest before bodies sleep
-
-    def options(self) -> dict:
-        """Return the arguments of `Dynamics` that the file gives."""
-        given = {name: getattr(self, name) for name in ("gravity", "iterations", "sleep_time")}
-        return {name: value for name, value in given.items() if value is not None}
 
 
 class PictureTable(Table):

@@ -1,4 +1,4 @@
-"""`warp-abtree view`: a page in the browser about a scene, a recorded run or meshes."""
+"""`warp-abtree view`: a page in the browser about a scene or meshes."""
 
 import contextlib
 import gc
@@ -6,20 +6,16 @@ import io
 import json
 import logging
 import socket
-from pathlib import Path
 
-from warp_abtree.app.cli.arguments import Parser, milliseconds, positive
-from warp_abtree.app.cli.report import check_output
+from warp_abtree.app.cli.arguments import Parser, milliseconds
 from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 
 PORT = 8080
-SUMMARY = "look at a scene, a recorded run or meshes in the browser"
+SUMMARY = "look at a scene or meshes in the browser"
 EXAMPLES = (
     "scenes/bunny_tori.toml",
     "warp:bunny warp:bunny --pose 0.3 0 0 0 0 0 1",
     "scenes/focus.toml --objects 500 --budget 20ms",
-    "rain.npz",
-    "scenes/bunny_tori.toml --record bunny_tori.html",
 )
 
 
@@ -29,8 +25,6 @@ def add_arguments(sub: Parser):
     sub.add_argument("--budget", type=milliseconds, metavar="TIME", help="time of a frame to hold, as 8ms or 0.008s")
     sub.add_argument("--host", default="127.0.0.1", help="address to serve at (127.0.0.1, this machine alone)")
     sub.add_argument("--port", type=int, metavar="P", help=f"port to serve at ({PORT}, or the next one that is free)")
-    sub.add_file("--record", type=Path, metavar="HTML", help="write a page that needs no server, and end")
-    sub.add_argument("--frames", type=positive, metavar="N", help="frames of --record (the scene's own number)")
 
 
 def import_viser():
@@ -80,22 +74,15 @@ def serve(host="127.0.0.1", port=0):
 
 
 def view(options, progress):
-    """Serve a page until Ctrl-C, or write one."""
+    """Serve a page until Ctrl-C."""
     from warp_abtree.app.viewer.page import Page
-    from warp_abtree.app.viewer.web_record import record_page
 
     import_viser()
-    if options.record:
-        check_output(options.record, [".html"], inputs=options.source)
-    elif options.frames:
-        raise ValueError("--frames: of --record; the page plays on")
     if options.port is not None or options.host != "127.0.0.1":
         check_port(options.host, 0 if options.port is None else options.port)
     named = {"objects": options.objects, "poses": options.pose, "lod": options.lod}
     playback = open_playback(options.source, options.device, progress, **named)
     if options.budget is not None:
-        if playback.length is not None:
-            raise ValueError("--budget: a recording holds its LODs")
         playback.choose(
             "scene" if playback.control.controller in ("predictive", "paper") else "predictive", options.budget
         )
@@ -103,12 +90,6 @@ def view(options, progress):
     gc.collect()
     gc.freeze()
     with serve(options.host, PORT if options.port is None else options.port) as server:
-        if options.record:
-            frames = playback.frames if options.frames is None else options.frames
-            record_page(server, playback, options.record, frames, progress=progress)
-            progress.close()
-            print(json.dumps({"page": str(options.record)}) if options.json else f"wrote {options.record}")
-            return
         if options.port and server.get_port() != options.port:
             raise ValueError(f"{options.host}:{options.port}: cannot be served at")
         page = Page(server, playback)

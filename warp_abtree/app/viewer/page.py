@@ -6,21 +6,18 @@ The server calls back in threads of its own; callbacks only put an event in a qu
 import math
 import queue
 import time
-from typing import Any
 
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.playback import HOLD, OWN
 from warp_abtree.app.render_data import Settings, compose, objects_of_world
+from warp_abtree.app.styles import STAGE_LABELS
 from warp_abtree.app.toml.objects import unit
-from warp_abtree.app.viewer import text as view_text
 from warp_abtree.app.viewer.viewer_scene import ViewerScene
-from warp_abtree.lod.view import Camera
 
 FRAME_SECONDS = 1 / 30  # between snapshots that are sent, at least
-TEXT_SECONDS = 0.2  # between changes of numbers and plots while it plays
-PLOTTED = 240  # frames
+TEXT_SECONDS = 0.2  # between changes of numbers while it plays
 BUDGETS = (0.5, 100.0)  # of the slider [ms]
 LIGHT = 0.6
 DISTANCE = 1.8  # of the first camera, in radii of what is shown
@@ -43,10 +40,10 @@ class Page:
         snapshots: How many were sent so far.
     """
 
-    def __init__(self, server, playback, clock=time.monotonic):
+    def __init__(self, server, playback):
         self.server, self.playback = server, playback
         self.cache = geometry.MeshCache(playback.scene)
-        self.viewer_scene = ViewerScene(server.scene, self.cache, lambda i: self._post(self._pick, i), clock)
+        self.viewer_scene = ViewerScene(server.scene, self.cache)
         self.settings = Settings(world=playback.view.world)
         self._eye, self._up = unit(playback.view.eye), unit(playback.view.up)
         if not len(self.shown):
@@ -54,17 +51,14 @@ class Page:
         self.playing, self.snapshots = False, 0
         self._events: queue.SimpleQueue = queue.SimpleQueue()
         self._closed = False
-        self._rows: list = []
         self._steps, self._dirty = 0, True
         self._text_time = self._snapshot_time = -math.inf
-        self._gizmo, self._plotted = None, False
         server.scene.set_up_direction(tuple(self._up))
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         server.gui.main_panel.dock_right()
         server.gui.set_panel_label(playback.title)
         self._light()
         self._build()
-        server.on_client_connect(self._watch)
         self.snapshot = playback.query(self.settings.output)
         self._place_camera()
 
@@ -80,39 +74,21 @@ class Page:
         with gui.add_folder("Time"):
             buttons = gui.add_button_group("run", ("play", "step", "restart"))
             buttons.on_click(lambda event: self._post(self._run_button, event.target.value))
-            self._frame_slider = None
-            if playback.length is not None and playback.length > 1:
-                self._frame_slider = gui.add_slider("frame", 0, playback.length - 1, 1, 0)
-                self._on_change(self._frame_slider, self._seek)
             self._state = gui.add_markdown("")
         with gui.add_folder("Level of detail"):
             names = [MODES[mode] for mode in playback.modes()]
             self._mode = gui.add_dropdown("chosen", names, initial_value=names[0])
             self._on_change(self._mode, lambda _: self._choose())
-            self._budget: Any = None  # a slider of viser
-            if len(names) > 2:
-                first = min(max(getattr(playback, "budget_ms", None) or 16.0, BUDGETS[0]), BUDGETS[1])
-                hint = "T: selection, refinement, broad phase and query of a frame"
-                self._budget = gui.add_slider("budget [ms]", *BUDGETS, 0.5, first, hint=hint)
-                self._on_change(self._budget, lambda _: self._choose())
-                self._for_page = gui.add_checkbox("for this page's camera", False, hint="near objects come first")
-                self._on_change(self._for_page, self._set_for_page)
+            first = min(max(playback.budget_ms or 16.0, BUDGETS[0]), BUDGETS[1])
+            hint = "T: selection, refinement, broad phase and query of a frame"
+            self._budget = gui.add_slider("budget [ms]", *BUDGETS, 0.5, first, hint=hint)
+            self._on_change(self._budget, lambda _: self._choose())
             self._all_lod = gui.add_slider(
                 "hold all at [%]", 0.0, 100.0, 0.5, 100.0, hint="of the finest LOD, for every object"
             )
             self._on_change(self._all_lod, self._hold_all)
-            release = gui.add_button("release all")
-            release.on_click(lambda _: self._post(self.playback.held.clear))
         with gui.add_folder("Show"):
             self._build_show(gui)
-        with gui.add_folder("Picked object"):
-            self._lod = gui.add_slider(
-                "hold it at [%]", 0.0, 100.0, 0.5, 100.0, disabled=True, hint="of its finest LOD"
-            )
-            self._on_change(self._lod, self._hold_picked)
-            self._numbers = gui.add_markdown(view_text.NOBODY)
-        with gui.add_folder("Frame times [ms]"):
-            self._plot = gui.add_uplot(**view_text.time_plot([], PLOTTED), height=220)
 
     def _build_show(self, gui):
         def box(label, name, hint=None):
@@ -120,16 +96,7 @@ class Page:
             self._on_change(handle, lambda value: setattr(self.settings, name, value))
 
         box("intersecting faces", "intersecting")
-        box("contacts", "contacts")
-        box("contact normals", "normals", "from the first object of a pair to the second")
-        box("wireframe", "wireframe")
         box("colours by LOD", "by_lod", "blue is coarse, yellow fine")
-        look = gui.add_button("look at all of it")
-        look.on_click(lambda event: self._post(self._look, event.client))
-        depth = geometry.tree_depth(self.playback.scene, range(self.playback.scene.object_count))
-        level = gui.add_slider("tree level", -1, depth, 1, -1, hint="boxes of the active nodes at a level; -1 is none")
-        self._on_change(level, lambda value: setattr(self.settings, "level", int(value)))
-        box("trees of all objects", "every_tree", "in the place of the picked one's")
         worlds = np.unique(self.playback.worlds)
         if len(worlds) > 1 and worlds.max() > 0:
             world = gui.add_number("world", self.settings.world, min=0, max=int(worlds.max()), step=1)
@@ -155,111 +122,33 @@ class Page:
             self.playing, self._steps = False, self._steps + 1
         else:
             self.playback.restart()
-            self._rows.clear()
-
-    def _seek(self, number):
-        self.playing = False
-        self.playback.seek(int(number))
 
     def _choose(self):
         """Choose LODs in the mode of the panel; the slider is the budget of the modes that hold one."""
         mode = next(mode for mode in self.playback.modes() if MODES[mode] == self._mode.value)
         self.playback.choose(mode, self._budget.value if mode in ("predictive", "paper") else None)
 
-    def _set_for_page(self, value):
-        self.playback.for_page = value
-        self._choose()
-
-    def _lod_of(self, i, percent):
-        return round(percent / 100 * self.playback.scene.models[self.playback.scene.object_model[i]].lod_max)
-
     def _hold_all(self, percent):
-        for i in range(self.playback.scene.object_count):
-            self.playback.held[i] = self._lod_of(i, percent)
-        self._show_held_lod()
+        scene = self.playback.scene
+        self.playback.hold([round(percent / 100 * scene.models[model].lod_max) for model in scene.object_model])
+        self._mode.value = MODES[HOLD]
 
-    def _hold_picked(self, percent):
-        if self.settings.picked is not None:
-            self.playback.held[self.settings.picked] = self._lod_of(self.settings.picked, percent)
-
-    def _pick(self, i):
-        """Pick an object; a click on the picked one leaves none."""
-        self.settings.picked = None if i == self.settings.picked else i
-        self._lod.disabled = self.settings.picked is None
-        self._show_held_lod()
-        self._show_gizmo()
-
-    def _show_held_lod(self):
-        i = self.settings.picked
-        if i is not None:
-            top = self.playback.scene.models[self.playback.scene.object_model[i]].lod_max
-            lod = self.playback.held.get(i, int(self.snapshot.lods[i]))
-            self._lod.value = round(200 * lod / max(top, 1)) / 2
-
-    def _show_gizmo(self):
-        """Give the picked object handles to move it by, where it may be moved."""
-        if self._gizmo is not None:
-            self._gizmo.remove()
-            self._gizmo = None
-        i = self.settings.picked
-        if i is None or not self.playback.can_move:
-            return
-        pose = self.snapshot.poses[i]
-        size = 0.35 * self.cache.diagonals[self.playback.scene.object_model[i]]
-        gizmo = self.server.scene.add_transform_controls(
-            "/gizmo", scale=size, position=pose[:3], wxyz=pose[[6, 3, 4, 5]], depth_test=False
-        )
-
-        @gizmo.on_update
-        def _(event):
-            wxyz = np.asarray(event.target.wxyz, np.float64)
-            self._post(self.playback.move, i, np.concatenate([event.target.position, wxyz[1:], wxyz[:1]]))
-
-        self._gizmo = gizmo
-
-    # Cameras.
+    # Light and camera.
 
     def _light(self):
-        """Put a soft light in the place of viser's own, which bleach colours beside its environment.
-
-        The environment stays as it is: a standalone page would make it anew whenever it begins again.
-        """
+        """Put a soft light in the place of viser's own, which bleach colours beside its environment."""
         scene = self.server.scene
         scene.configure_default_lights(False)
         direction = self._up - np.cross(self._up, self._eye) + 0.6 * self._eye
         scene.add_light_directional("/light", position=tuple(direction), intensity=LIGHT, cast_shadow=False)
 
-    def _overview(self):
-        """Return where a camera sees all that is shown: its position, what it looks at, and the radius of that."""
-        centre, radius = geometry.bounds(self.cache, self.snapshot, self.shown)
-        return centre + DISTANCE * radius * self._eye, centre, radius
-
     def _place_camera(self):
+        """Put the first camera where it sees all that is shown."""
         first = self.server.initial_camera
-        position, centre, radius = self._overview()
+        centre, radius = geometry.bounds(self.cache, self.snapshot, self.shown)
+        position = centre + DISTANCE * radius * self._eye
         first.position, first.look_at, first.up = tuple(position), tuple(centre), tuple(self._up)
         first.near, first.far = radius / 500, 200 * radius
-
-    def _look(self, client):
-        """Bring the camera of a page back to where it sees all."""
-        if client is not None:
-            client.camera.position, client.camera.look_at, _ = self._overview()
-
-    def _watch(self, client):
-        """Follow the camera of a page that opened."""
-
-        @client.camera.on_update
-        def _(camera):
-            # Before its first frame a camera has its eye at its target.
-            try:
-                size = camera.image_width, camera.image_height
-                options = {"up": camera.up_direction, "field_of_view": float(camera.fov), "size": size}
-                far = 4 * float(np.linalg.norm(camera.position - camera.look_at))
-                found = Camera.look_at(camera.position, camera.look_at, far=far, **options)
-            except ValueError:
-                return
-            if hasattr(self.playback, "page_camera"):
-                self.playback.page_camera = found
 
     # The loop.
 
@@ -271,7 +160,8 @@ class Page:
                 try:
                     self._act(self._events.get(timeout=0.1))
                 except queue.Empty:
-                    self._catch_up()
+                    if self.viewer_scene.waits:  # the browser was not ready for all of the last snapshot
+                        self._send()
                     continue
             while True:
                 try:
@@ -309,39 +199,35 @@ class Page:
             self.playing = False
             for client in self.server.get_clients().values():
                 client.add_notification("This frame failed", str(error), color="red")
-        if self.snapshot.row is not None:
-            self._rows.append(self.snapshot.row)
-            del self._rows[:-PLOTTED]
         self._steps, self._dirty = max(self._steps - 1, 0), False
-        data = self._data = compose(self.cache, self.snapshot, self.shown, self.settings)
+        self._data = compose(self.cache, self.snapshot, self.shown, self.settings)
         self._send()
         self.snapshots += 1
         now = time.monotonic()
         if not self.playing or now - self._text_time >= TEXT_SECONDS:
             self._text_time = now
-            self._show_text(data)
-        return data
-
-    def _catch_up(self):
-        """Show the last snapshot again where the browser was not ready for all of it."""
-        if self.viewer_scene.waits:
-            self._send()
+            self._show_text()
 
     def _send(self):
-        camera = self.playback.camera
         with self.server.atomic():
-            self.viewer_scene.show(self._data, self.settings, camera and camera(self.snapshot.time))
+            self.viewer_scene.show(self._data)
 
-    def _show_text(self, data):
-        self._state.content = view_text.state(self, data)
-        if self._frame_slider is not None:
-            self._frame_slider.value = self.snapshot.number
-        if self.settings.picked is not None and self.settings.picked not in self.playback.held:
-            self._show_held_lod()
-        self._numbers.content = view_text.numbers(self.playback, self.snapshot, self.cache, self.settings.picked)
-        if self._rows or self._plotted:
-            self._plotted = bool(self._rows)
-            plot = view_text.time_plot(self._rows, PLOTTED)
-            self._plot.data = plot["data"]
-            if self._plot.scales != plot["scales"]:
-                self._plot.scales = plot["scales"]
+    def _show_text(self):
+        """Show the numbers of the snapshot as a table."""
+        data, snapshot, playback = self._data, self.snapshot, self.playback
+        row, result = snapshot.row, snapshot.result
+        rows = [
+            ("state", "playing" if self.playing else "paused"),
+            ("time", f"{snapshot.time:.3f} s, frame {snapshot.number:,}"),
+            ("objects shown", f"{len(data.shown):,} of {playback.scene.object_count:,}"),
+            ("faces shown", f"{data.faces:,}"),
+            ("pairs that meet", f"{int(np.count_nonzero(result.any)):,} of {len(result.pairs):,} near"),
+            ("certified error, mean", f"{data.error_mean:.3g}"),
+            ("intersecting face pairs", f"{data.pair_count:,}"),
+            ("intersecting faces", f"{data.intersecting_count:,}"),
+        ]
+        if row is not None:
+            rows += [(label, f"{getattr(row, name):.1f} ms") for name, label in STAGE_LABELS.items()]
+            rows += [("select to query", f"{row.cost_ms:.1f} ms"), ("frame", f"{row.total_ms:.1f} ms")]
+            rows += [("budget", f"{row.budget_ms:g} ms")] if row.budget_ms is not None else []
+        self._state.content = "\n".join(["| | |", "|:--|--:|", *(f"| {key} | {value} |" for key, value in rows)])

@@ -1,29 +1,27 @@
 """The scene of the viewer in the browser: only what changed is sent."""
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
-from warp_abtree.app.render_data import RenderData, Settings
-from warp_abtree.app.styles import BOX_COLOUR, COLOURS, CONTACT_COLOUR, NORMAL_COLOUR, to_bytes
-from warp_abtree.checks.quaternions import quaternions_of
+from warp_abtree.app.render_data import RenderData
+from warp_abtree.app.styles import COLOURS, to_bytes
 
-CAMERA_COLOUR = (90, 90, 90)
 SINGLE_LIMIT = 24  # objects up to which each has its own mesh; with more, those of a model and LOD are instances of one
 READY_SECONDS = 0.25  # that a browser takes to draw instances of a new mesh
 HIDDEN_MESHES = 48  # kept by the browser, invisible, for when their LOD comes back
+PLAIN = {"flat_shading": True, "side": "double", "cast_shadow": False, "receive_shadow": False}
 
 
 @dataclass(eq=False)
 class _Node:
-    """A node of the browser's scene: its handle, the arrays sent last, its objects, and when it was added [s]."""
+    """A node of the browser's scene: its handle, the arrays sent last, and when it was added [s]."""
 
     handle: Any  # of viser
     sent: dict
-    objects: np.ndarray = field(default_factory=lambda: np.empty(0, int))
     since: float = 0.0
 
 
@@ -38,8 +36,8 @@ class ViewerScene:
         waits: Whether objects still show an earlier LOD, so that `show` should be called again soon.
     """
 
-    def __init__(self, api, cache, on_pick=None, clock=time.monotonic):
-        self.api, self.cache, self.on_pick, self.clock = api, cache, on_pick, clock
+    def __init__(self, api, cache, clock=time.monotonic):
+        self.api, self.cache, self.clock = api, cache, clock
         self.sent, self.waits = 0, False
         count = cache.scene.object_count
         self._single: dict[int, _Node] = {}
@@ -47,25 +45,15 @@ class ViewerScene:
         self._layers: dict[str, _Node] = {}
         # The key of the mesh that each object shows, and of the one that it waits for; -1 is none.
         self._now, self._next = np.full(count, -1, np.int64), np.full(count, -1, np.int64)
-        self._wireframe = False
 
-    def show(self, data: RenderData, settings: Settings, camera=None):
-        """Send what differs from what was sent before; `camera` is the scene's own `Camera`."""
-        if settings.wireframe != self._wireframe:
-            self._wireframe = settings.wireframe
-            for node in (*self._single.values(), *self._meshes.values()):
-                node.handle.wireframe = settings.wireframe
+    def show(self, data: RenderData):
+        """Send what differs from what was sent before."""
         few = len(data.shown) <= SINGLE_LIMIT
         self._show_single(data, data.shown if few else data.shown[:0])
         self._show_instances(data, data.shown[:0] if few else data.shown)
         for owner in range(len(self.cache.scene.models)):
             corners = data.intersecting.get(owner, ())
             self._show_triangles(f"/intersecting/{owner}", corners, COLOURS[owner % len(COLOURS)][1])
-        self._show_lines("/contacts", data.segments, CONTACT_COLOUR, 3.0)
-        self._show_lines("/normals", data.normals, NORMAL_COLOUR, 1.5)
-        self._show_lines("/tree", data.boxes, BOX_COLOUR, 1.0)
-        if camera is not None:
-            self._show_camera(camera)
 
     def _update(self, node: _Node, **arrays):
         """Assign the arrays that differ from those sent last."""
@@ -80,23 +68,10 @@ class ViewerScene:
         if node.sent.get("visible", True) != visible:
             node.handle.visible = node.sent["visible"] = visible
 
-    def _added(self, handle, arrays, objects) -> _Node:
-        """Keep what was just added, and let clicks on it pick."""
+    def _added(self, handle, arrays) -> _Node:
+        """Keep what was just added."""
         self.sent += sum(array.nbytes for array in arrays.values())
-        node = _Node(handle, dict(arrays), objects, self.clock())
-        if self.on_pick is not None:
-
-            @handle.on_click
-            def _(event):
-                index = event.instance_index or 0
-                if index < len(node.objects):
-                    self.on_pick(int(node.objects[index]))
-
-        return node
-
-    def _mesh_options(self):
-        plain = {"side": "double", "cast_shadow": False, "receive_shadow": False}
-        return {**plain, "wireframe": True} if self._wireframe else {**plain, "flat_shading": True}
+        return _Node(handle, dict(arrays), self.clock())
 
     def _mesh_arrays(self, key):
         vertices, faces, _ = self.cache.mesh(*geometry.split_key(key))
@@ -114,8 +89,8 @@ class ViewerScene:
             if node is None:
                 arrays = {**self._mesh_arrays(key), **place}
                 name = f"/objects/{i}"
-                handle = self.api.add_mesh_simple(name, **arrays, color=colour, **self._mesh_options())
-                node = self._single[i] = self._added(handle, arrays, np.array([i]))
+                handle = self.api.add_mesh_simple(name, **arrays, color=colour, **PLAIN)
+                node = self._single[i] = self._added(handle, arrays)
                 node.sent["key"], node.sent["color"] = key, colour
                 continue
             if node.sent["key"] != key:
@@ -148,7 +123,6 @@ class ViewerScene:
             elif key in groups:
                 self._update(node, **arrays)
                 self._visible(node, True)
-                node.objects = members
             self._meshes[key] = node  # the last used stand last
         hidden = [key for key in self._meshes if key not in groups and key not in coming]
         for key in hidden[: max(len(hidden) - HIDDEN_MESHES, 0)]:
@@ -179,42 +153,23 @@ class ViewerScene:
         arrays = {**self._mesh_arrays(key), **arrays}
         name = "/meshes/{}/{}".format(*geometry.split_key(key))
         options = {"lod": "off", "visible": visible}
-        handle = self.api.add_batched_meshes_simple(name, **arrays, **options, **self._mesh_options())
-        node = self._added(handle, arrays, members)
+        handle = self.api.add_batched_meshes_simple(name, **arrays, **options, **PLAIN)
+        node = self._added(handle, arrays)
         node.sent["visible"] = visible
         return node
 
-    # Layers over them.
-
-    def _show_layer(self, name, arrays, add, **options):
-        """Show arrays as a node that `add` makes at first; without arrays hide it."""
-        node = self._layers.get(name)
-        if node is None and arrays:
-            self._layers[name] = _Node(add(name, **arrays, **options), dict(arrays))
-            self.sent += sum(array.nbytes for array in arrays.values())
-        elif node is not None:
-            self._update(node, **arrays)
-            self._visible(node, bool(arrays))
-
     def _show_triangles(self, name, corners, colour):
-        arrays = {}
+        """Show triangles as a node of their own; without any hide it."""
+        node, arrays = self._layers.get(name), {}
         if len(corners):
             vertices = corners.reshape(-1, 3)
             arrays = {"vertices": vertices, "faces": np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)}
-        options = {"flat_shading": True, "side": "double", "cast_shadow": False, "receive_shadow": False}
-        self._show_layer(name, arrays, self.api.add_mesh_simple, color=to_bytes(colour), **options)
-
-    def _show_lines(self, name, lines, colour, width):
-        options = {"colors": to_bytes(colour), "thickness": width, "thickness_units": "screen"}
-        self._show_layer(name, {"points": lines} if len(lines) else {}, self.api.add_line_segments, **options)
-
-    def _show_camera(self, camera):
-        # viser's cameras look along z with y down; the rows of `view` are right, up and back.
-        wxyz = quaternions_of((camera.view.T * (1.0, -1.0, -1.0))[None])[0, [3, 0, 1, 2]]
-        options = {"fov": float(camera.field_of_view), "aspect": camera.size[0] / camera.size[1]}
-        options |= {"thickness": 1.5, "thickness_units": "screen", "color": CAMERA_COLOUR}
-        arrays = {"position": np.asarray(camera.eye, np.float64), "wxyz": wxyz}
-        self._show_layer("/camera", arrays, self.api.add_camera_frustum, scale=0.03 * camera.far, **options)
+        if node is None and arrays:
+            handle = self.api.add_mesh_simple(name, **arrays, color=to_bytes(colour), **PLAIN)
+            self._layers[name] = self._added(handle, arrays)
+        elif node is not None:
+            self._update(node, **arrays)
+            self._visible(node, bool(arrays))
 
 
 def _linear(colours) -> np.ndarray:
