@@ -9,14 +9,21 @@ import functools
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arithmetic.predicates import EXACT, FLOAT32
+from warp_abtree.kernels.arithmetic.predicates import EXACT
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal.face_pairs import OUTPUT_ANY, OUTPUT_FACES, WITHIN, Hits, report_hit, test_faces
+from warp_abtree.kernels.traversal.face_pairs import (
+    OUTPUT_ANY,
+    OUTPUT_FACES,
+    WITHIN,
+    Hits,
+    float32_bounds,
+    report_hit,
+    test_faces,
+)
 from warp_abtree.kernels.traversal.load_balance import Work, take_unit
 from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
 from warp_abtree.kernels.traversal.warp_stack import take_slots
-from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
@@ -224,16 +231,6 @@ def resolve_uncertain(
 
 
 @wp.func
-def shuffle_top(top: wp.int32, number: wp.int32, stack: wp.array(dtype=wp.int64)):
-    """Bring some item to the top of a stack: the next search for a hit begins elsewhere."""
-    if top > 1 and top <= STACK_TO_SHUFFLE:
-        at = wp.int32(wp.uint32(number) * wp.uint32(40503) >> wp.uint32(8)) % top
-        item = stack[at]
-        stack[at] = stack[top - 1]
-        stack[top - 1] = item
-
-
-@wp.func
 def write_counts(p: wp.int32, hit_count: wp.int64, tests: long_counts, hits: Hits):
     """Write what an object pair took: boxes, faces, those in float64 and those with exact signs."""
     hits.count[p] = hit_count
@@ -241,6 +238,116 @@ def write_counts(p: wp.int32, hit_count: wp.int64, tests: long_counts, hits: Hit
     hits.triangle_tests[p] = tests[1]
     hits.float64_tests[p] = tests[2]
     hits.exact_tests[p] = tests[3]
+
+
+@wp.struct
+class Descent:
+    """How a thread goes through an object pair, and how far it is."""
+
+    thread: wp.int32  # row of the memory for slabs
+    opened: wp.bool  # slabs were made before in this launch
+    at_once: wp.int32  # items taken from the stack
+    ready: wp.int32  # leaf pairs that are tested together
+    top: wp.int32  # items on the stack
+    deep: wp.int32  # items below the floors
+    floors: wp.vec2i  # levels of the subtrees that have slabs, NO_FLOOR for none
+    plain_tests: wp.int64  # node pair tests after which slabs may be made
+
+
+@wp.func
+def start_pair(output: wp.int32, plain_tests: wp.int64, before: Descent):
+    """Return the descent from the item on the stack."""
+    descent = before
+    descent.at_once = wp.where(output == OUTPUT_ANY, ITEMS_FOR_ANY, ITEMS_AT_ONCE)
+    descent.ready = wp.where(output == OUTPUT_ANY, FACES_FOR_ANY, FACES_READY)
+    descent.top = 1
+    descent.deep = 0
+    descent.floors = wp.vec2i(NO_FLOOR, NO_FLOOR)
+    descent.plain_tests = plain_tests
+    return descent
+
+
+@wp.func
+def advance(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    hit_count: wp.int64,
+    tested: wp.int64,
+    before: Descent,
+    stack: wp.array(dtype=wp.int64),
+    below: wp.array(dtype=wp.int64),
+    memory: wp.array2d(dtype=wp.float32),
+    faces: wp.array(dtype=wp.int64),
+):
+    """Descend until leaf pairs wait; return the descent then, the leaf pairs, and the node pair tests more.
+
+    Boxes decide until few of many node pair tests have led to hits; then slabs, below the floors.
+    """
+    descent = before
+    if descent.top > 0 and tested >= descent.plain_tests:
+        descent.plain_tests += tested
+        if hit_count * NODE_TESTS_A_HIT <= tested:
+            descent.floors = open_subtrees(models, states, pose, descent.thread, not descent.opened, memory)
+            descent.opened = True
+            descent.plain_tests = NEVER
+    plain = descent.floors[0] == NO_FLOOR
+    if not plain and descent.deep == 0:
+        moved = move_below(descent.floors, descent.top, stack, below)
+        descent.top = moved[0]
+        descent.deep = moved[1]
+    progress = three_numbers()
+    if descent.deep > 0:
+        progress = descend_subtrees(
+            models, states, pose, descent.thread, descent.ready, descent.deep, below, memory, faces
+        )
+        descent.deep = wp.int32(progress[0])
+    else:
+        most = wp.where(plain, descent.plain_tests - tested, wp.int64(1))
+        progress = descend(states, pose, descent.at_once, descent.ready, most, descent.top, stack, faces)
+        descent.top = wp.int32(progress[0])
+    return descent, wp.int32(progress[1]), progress[2]
+
+
+@wp.func
+def test_leaf_pairs(
+    mode: wp.int32,
+    output: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    waiting: wp.int32,
+    faces: wp.array(dtype=wp.int64),
+    uncertain: wp.array(dtype=wp.int64),
+):
+    """Test leaf pairs in all stages; return how many met, which stand in front of the list then, and what it took."""
+    if mode == WITHIN:
+        near, decided = resolve_faces(mode, output, models, states, pose, 0, waiting, faces, faces)
+        return near, long_counts(wp.int64(0), wp.int64(decided), wp.int64(0), wp.int64(0))
+    error, unit = float32_bounds(mode, pose)
+    filtered = simd_float32_filter(models, states, pose, error, unit, output == OUTPUT_ANY, waiting, faces, uncertain)
+    met, resolved, inexact = resolve_uncertain(
+        mode, output, models, states, pose, wp.int32(filtered[0]), wp.int32(filtered[1]), uncertain, faces
+    )
+    return met, long_counts(wp.int64(0), filtered[2], wp.int64(resolved), wp.int64(inexact))
+
+
+@wp.func
+def seek_elsewhere(met: wp.int32, number: wp.int64, before: Descent, stack: wp.array(dtype=wp.int64)):
+    """End a search that found a hit; else go on with some other item of the stack, and with more at a time."""
+    descent = before
+    if met > 0:
+        descent.top = 0
+        descent.deep = 0
+    descent.at_once = wp.min(2 * descent.at_once, ITEMS_AT_ONCE)
+    descent.ready = wp.min(2 * descent.ready, FACES_READY)
+    last = descent.top - 1
+    if last > 0 and last < STACK_TO_SHUFFLE:
+        at = wp.int32((number * wp.int64(40503) >> wp.int64(8)) % wp.int64(descent.top))
+        item = stack[at]
+        stack[at] = stack[last]
+        stack[last] = item
+    return descent
 
 
 @functools.cache
@@ -262,63 +369,30 @@ def thread_traversal(mode: int):
         """Take one object pair after the other and traverse it depth first; CPU only, a thread a core."""
         count = wp.min(pair_count[0], pair_poses.shape[0])
         stack = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
+        below = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
         faces = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
         uncertain = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
-        below = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
-        thread, opened = take_thread(work_inout.counter), wp.bool(False)
+        descent = Descent()
+        descent.thread = take_thread(work_inout.counter)
         p = take_unit(work_inout.counter)
         while p < count:
             pose = pair_poses[p]
-            at_once, ready = ITEMS_AT_ONCE, FACES_READY
-            if output == OUTPUT_ANY:
-                at_once, ready = ITEMS_FOR_ANY, FACES_FOR_ANY
             stack[0] = first_item(states, pose)
-            error, unit = wp.float32(pose.error), wp.float32(FLOAT32_UNIT)
-            if wp.static(mode == int(FLOAT32)):
-                error, unit = wp.float32(0.0), wp.float32(0.0)
-            top, hit_count = wp.int32(1), wp.int64(0)
-            tests = long_counts()
-            floors, most, deep = wp.vec2i(NO_FLOOR, NO_FLOOR), wp.int64(plain_tests), wp.int32(0)
-            if thread >= memory.shape[0] or wp.static(mode == int(WITHIN)) or pose.error == wp.inf:
-                most = NEVER
-            while top > 0 or deep > 0:
-                if top > 0 and tests[0] >= most:
-                    most = tests[0] + wp.int64(plain_tests)
-                    if hit_count * NODE_TESTS_A_HIT <= tests[0]:
-                        floors = open_subtrees(models, states, pose, thread, not opened, memory)
-                        opened, most = wp.bool(True), NEVER
-                waiting, compared = wp.int32(0), wp.int64(0)
-                if floors[0] != NO_FLOOR and deep == 0:
-                    moved = move_below(floors, top, stack, below)
-                    top, deep = moved[0], moved[1]
-                if deep > 0:
-                    inside = descend_subtrees(models, states, pose, thread, ready, deep, below, memory, faces)
-                    deep, waiting, compared = wp.int32(inside[0]), wp.int32(inside[1]), inside[2]
-                else:
-                    spare = wp.where(floors[0] == NO_FLOOR, most - tests[0], wp.int64(1))
-                    progress = descend(states, pose, at_once, ready, spare, top, stack, faces)
-                    top, waiting, compared = wp.int32(progress[0]), wp.int32(progress[1]), progress[2]
-                if wp.static(mode == int(WITHIN)):
-                    met, tested = resolve_faces(wp.static(mode), output, models, states, pose, 0, waiting, faces, faces)
-                    tests += long_counts(compared, wp.int64(tested), wp.int64(0), wp.int64(0))
-                else:
-                    filtered = simd_float32_filter(
-                        models, states, pose, error, unit, output == OUTPUT_ANY, waiting, faces, uncertain
-                    )
-                    met, left = wp.int32(filtered[0]), wp.int32(filtered[1])
-                    met, resolved, inexact = resolve_uncertain(
-                        wp.static(mode), output, models, states, pose, met, left, uncertain, faces
-                    )
-                    tests += long_counts(compared, filtered[2], wp.int64(resolved), wp.int64(inexact))
+            slabs = descent.thread < memory.shape[0] and wp.static(mode != int(WITHIN)) and pose.error < wp.inf
+            descent = start_pair(output, wp.where(slabs, wp.int64(plain_tests), NEVER), descent)
+            hit_count, tests = wp.int64(0), long_counts()
+            while descent.top > 0 or descent.deep > 0:
+                descent, waiting, compared = advance(
+                    models, states, pose, hit_count, tests[0], descent, stack, below, memory, faces
+                )
+                met, stages = test_leaf_pairs(wp.static(mode), output, models, states, pose, waiting, faces, uncertain)
+                tests += stages
+                tests[0] += compared
                 if met > 0:
                     hit_count += wp.int64(met)
                     report_hits(output, p, pose.swapped, met, faces, hits_inout)
-                    if output == OUTPUT_ANY:
-                        top = 0
-                        deep = 0
-                elif output == OUTPUT_ANY:
-                    at_once, ready = wp.min(2 * at_once, ITEMS_AT_ONCE), wp.min(2 * ready, FACES_READY)
-                    shuffle_top(top, wp.int32(tests[0]), stack)
+                if output == OUTPUT_ANY:
+                    descent = seek_elsewhere(met, tests[0], descent, stack)
             write_counts(p, hit_count, tests, hits_inout)
             p = take_unit(work_inout.counter)
 
