@@ -10,7 +10,7 @@ from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, r
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.buffers import QueryBuffers
-from warp_abtree.query.cpu_threads import core_count, launch_on_cores
+from warp_abtree.query.cpu_threads import RecordedLaunches, core_count, launch_on_cores
 from warp_abtree.query.request import LIST_MAX, OUTPUTS, PRECISIONS, check_capacity, check_request, check_within
 from warp_abtree.query.result import Result
 from warp_abtree.state.batch import Batch
@@ -93,6 +93,7 @@ class Query(QueryBuffers):
         self.hits = self._make_hits()
         self.near = None if within is None else self._make_hits()
         self.work = self._make_work()
+        self._recorded = RecordedLaunches()
         self._no_distance = wp.empty(0, dtype=wp.float64, device=self.device)
         self._within = within
         self._resize_uncertain((room.uncertain or UNCERTAIN_ROOM) if self.uses_warps() else 0)
@@ -154,14 +155,21 @@ class Query(QueryBuffers):
         dim = max(room, len(self.work.flag))
         # A warp a block: few pairs lie on as many multiprocessors.
         kernel = relative_pose.relative_pose_kernel
-        wp.launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
+        if self.device.is_cuda:
+            wp.launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
+        else:
+            self._recorded.launch(kernel, dim, inputs, self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
         if not self.uses_warps():
             cores = current_regime().cpu_threads or core_count()
             # A launch on a further core costs some 50 us: the work of many pairs apart, of less than one in contact.
             least = 32 if output == int(face_pairs.OUTPUT_ANY) else 1
             inputs += [self._regime.plain_tests, self.slab_memory, hits, self.work]
-            launch_on_cores(simd.thread_traversal(mode), room, inputs, self.device, cores, least)
+            kernel = simd.thread_traversal(mode)
+            if min(cores, room // least) > 1:
+                launch_on_cores(kernel, room, inputs, self.device, cores, least)
+            else:
+                self._recorded.launch(kernel, 1, inputs, self.device)
             return
         # More than there are units, where these are few: idle warps wait for donations.
         units = int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1

@@ -69,6 +69,7 @@ class Scene:
         self._batch: Batch | None = None
         self._broad_phase: BroadPhase | None = None
         self._queries: dict[tuple, Query] = {}
+        self._asked_pairs: dict[tuple, bytes] = {}  # of each query
 
     @property
     def object_count(self) -> int:
@@ -275,7 +276,8 @@ class Scene:
         # A query that fails, for lack of memory, is not kept: it gives its own back.
         query = self._queries.pop(asked, None)
         if query is not None:
-            query.set_pairs(pairs, within)
+            if within is not None or self._asked_pairs[asked] != pairs.tobytes():
+                query.set_pairs(pairs, within)
         elif with_contacts:
             query = ContactQuery(self, pairs=pairs, precision=precision, within=within)
         else:
@@ -283,6 +285,7 @@ class Scene:
         if isinstance(query, ContactQuery):
             query.contact_dtype = contact_dtype
         result = query.run()
+        self._asked_pairs[asked] = pairs.tobytes()  # before the query, so that an interruption loses that
         self._queries[asked] = query
         return result
 
