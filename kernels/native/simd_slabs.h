@@ -59,7 +59,6 @@ struct Slabs {
         const lanes above = x < least ? least : x, within = above > most ? most : above;
         return __builtin_convertvector(__builtin_convertvector(__builtin_elementwise_floor(within), words), half);
     }
-    // Twice the margin of boxes covers the rounding of a projection, see docs/exactness.md.
     static Record project(const Side& side, const void* near, int face) {
         lanes low = {}, high = {};
         for (int k = 0; k < 3; ++k) {

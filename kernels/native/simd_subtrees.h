@@ -42,14 +42,17 @@ wp::vec_t<2, wp::int32> open_subtrees(ModelPool models, StatePool states, PairPo
             middle += 0.5 * n[j] * (high + low);
             shift += n[j] * t[j];
         }
-        const double scale = d < 14 && size > 0.0 ? 65536.0 / size : 0.0;
+        // Three times the margin of boxes covers all rounding, see docs/exactness.md. A direction that tells nothing, since
+        // the margin is half of A's size or more, and numbers could overflow, has no slabs.
+        const double steps = 65536.0 / size, margin = 3.0 * steps * pose.margin;
+        const double scale = d < 14 && size > 0.0 && margin < 32768.0 ? steps : 0.0;
         for (int j = 0; j < 3; ++j) {
             kept.of_a[16 * j + d] = (float)(scale * n[j]);
             kept.of_b[16 * j + d] = (float)(-scale * ((n[0] * r[0][j] + n[1] * r[1][j]) + n[2] * r[2][j]));
         }
         kept.of_a[48 + d] = (float)(-scale * middle);
         kept.of_b[48 + d] = (float)(scale * (middle - shift));
-        kept.of_b[64 + d] = (float)(scale * 2.0 * pose.margin);
+        kept.of_b[64 + d] = scale > 0.0 ? (float)margin : 0.0f;
     }
     kept.header[1] = floors[0] = Slabs::find_floor(nodes + pose.node_a);
     kept.header[2] = floors[1] = Slabs::find_floor(nodes + pose.node_b);
