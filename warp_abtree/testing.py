@@ -64,7 +64,7 @@ def repeat_update(update: LodUpdate):
         if update.entry_room or update.face_room:
             for name in ("changed_count", "marked_count", "level_count"):
                 getattr(update.plan, name).zero_()
-        states.pool.lod = targets
+        wp.copy(states.pool.lod, targets)
         update.relaunch()
 
     return launch

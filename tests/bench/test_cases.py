@@ -8,7 +8,7 @@ import warp as wp
 
 from bench import __main__ as main
 from bench.baselines.newton import SDF_RESOLUTION
-from bench.cases import budget, build
+from bench.cases import budget, build, host
 from bench.tables import pick
 from warp_abtree import testing
 
@@ -70,6 +70,16 @@ def check_frame(rows):
 
 def check_precision(rows):
     assert rows[-1]["hits"] > 0 and rows[-1]["to_float64"] == 1
+
+
+def check_host(rows):
+    assert [(row["pairs"], row["output"]) for row in rows] == [
+        (count, name) for count in (1, 4) for name in host.OUTPUTS
+    ]
+    for row in rows:
+        records = {"contacts": 12 + 133, "faces": 12}.get(row["output"], 0) * (row["hits"] or 0)
+        of_pairs = {"any": 33, "contacts": 41 + 64}.get(row["output"], 41)
+        assert row["bytes"] == records + of_pairs * row["pairs"] and row["goal_ms"] >= row["launches_ms"] > 0
 
 
 def check_exact(rows):

@@ -1,5 +1,7 @@
 """Whole results, byte for byte: every device, and any number of threads, gives what one thread of the CPU gives."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import warp as wp
@@ -102,7 +104,7 @@ def count_item_kernel(count: int, taken: wp.array[int], seen: wp.array[int]):
 def test_threads_take_every_item_once_and_raise_what_fails():
     for threads, count in ((1, 17), (2, 1), (3, 1000), (7, 16), (2, 100)):
         seen, taken = (wp.zeros(length, dtype=int, device="cpu") for length in (count, 1))
-        launch_on_cores(count_item_kernel, count, [count, taken, seen], wp.get_device("cpu"), threads)
+        launch_on_cores(partial(wp.launch, count_item_kernel, 1, [count, taken, seen], device="cpu"), count, threads)
         assert (seen.numpy() == 1).all() and taken.numpy()[0] == count + min(threads, count)
     with pytest.raises(Exception, match="'seen'"):
-        launch_on_cores(count_item_kernel, 100, [100, taken, 3.5], wp.get_device("cpu"), 2)
+        launch_on_cores(partial(wp.launch, count_item_kernel, 1, [100, taken, 3.5], device="cpu"), 100, 2)

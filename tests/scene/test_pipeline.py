@@ -173,7 +173,7 @@ def test_the_start_is_the_scene(device):
 def test_launches_of_a_frame(device, monkeypatch, name, levels, update_path):
     """As many as the docstring states, however many objects there are and whatever they do."""
     launched, launch = [], wp.launch
-    monkeypatch.setattr(wp, "launch", lambda *args, **options: (launched.append(1), launch(*args, **options)))
+    monkeypatch.setattr(wp, "launch", lambda *args, **options: launched.append(1) or launch(*args, **options))
     narrow = 4 if wp.get_device(device).is_cuda else 2
     for count in (2, 40):
         scene = add_objects(device, [name] * count)

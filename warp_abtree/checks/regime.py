@@ -18,6 +18,7 @@ class Regime:
         full_refit: Fraction of its faces past which a state is refitted whole, by kind of device, as measured. A slice
             repeats faces, so k is smaller still.
         block_updates: Whether a block updates a tree state by itself where it can; False: all by level lists.
+        packs_results: Whether results are packed and sorted on the device before they are brought over; None: on CUDA.
         relax_by_color: Whether contacts of rigid bodies are relaxed by color, a thread a pair; None: on CUDA they are,
             on the CPU one thread relaxes them all.
     """
@@ -30,6 +31,7 @@ class Regime:
     plain_tests: int = 24576
     full_refit: dict = field(default_factory=lambda: {"cpu": 0.5, "cuda": 0.2})
     block_updates: bool = True
+    packs_results: bool | None = None
     relax_by_color: bool | None = None
 
 

@@ -73,7 +73,15 @@ class BroadPhase:
         Raises:
             CapacityError: 2^31 pairs or more.
         """
-        found = int(self.pair_count.numpy()[0])
+        return self.check_found(int(self.pair_count.numpy()[0]))
+
+    @staticmethod
+    def check_found(found: int) -> int:
+        """Return a number of pairs found.
+
+        Raises:
+            CapacityError: 2^31 pairs or more.
+        """
         if found < 0:
             raise CapacityError("the broad phase found 2^31 object pairs or more; use more worlds or fewer objects")
         return found

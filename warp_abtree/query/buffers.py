@@ -64,9 +64,12 @@ class QueryBuffers:
             raise ValueError("this query was made without within")
         if self.near is not None:
             within = check_within(self._within if within is None else within, len(pairs))
+        self.replace_pairs(pairs, within)
+
+    def replace_pairs(self, pairs: np.ndarray, within):
+        """Do what `set_pairs` does, with pairs and distances that are checked, None without."""
+        self._check_whole()
         # What may fail for lack of memory comes before anything that changes the query.
-        rows = wp.array(pairs, dtype=wp.vec2i, device=self.device)
-        distances = self._upload_within(within)
         made = []
         if len(pairs) > len(self.pairs):
             made = self._make_room(wp.empty(len(pairs), dtype=wp.vec2i, device=self.device))
@@ -75,11 +78,12 @@ class QueryBuffers:
                 self._replace(made)
             self.guard.forget()
             if len(pairs):
+                rows = wp.array(pairs, dtype=wp.vec2i, device="cpu", copy=False)
                 wp.copy(self.pairs, rows, count=len(pairs))
             self.pair_count.fill_(len(pairs))
             self._given = pairs
             self._within = within
-            self._fill_within(distances)
+            self._fill_within()
 
     @contextmanager
     def _changing(self):
@@ -134,19 +138,16 @@ class QueryBuffers:
         with self._changing():
             self._replace(made)
             if self.broad_phase is not None:
-                self._fill_within(None)
+                self._fill_within()
 
-    def _upload_within(self, within):
-        """Return distances of pairs on the device, None where there are none or one for all."""
-        if self.near is None or within.ndim == 0 or not len(within):
-            return None
-        return wp.array(within, dtype=wp.float64, device=self.device)
-
-    def _fill_within(self, distances):
-        if distances is not None:
-            wp.copy(self.within, distances, count=len(distances))
-        elif self.near is not None and self._within.ndim == 0:
+    def _fill_within(self):
+        if self.near is None:
+            return
+        if self._within.ndim == 0:
             self.within.fill_(float(self._within))
+        elif len(self._within):
+            distances = wp.array(self._within, dtype=wp.float64, device="cpu", copy=False)
+            wp.copy(self.within, distances, count=len(distances))
 
     def _resize_uncertain(self, capacity: int):
         inexact = capacity if self.precision == "exact" else 0

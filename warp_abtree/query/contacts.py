@@ -45,11 +45,13 @@ ends and signs; sums follow the order of the faces as named, so that its summary
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.contact import contact, sort_hits, summary
+from warp_abtree.kernels.contact import contact, pack, sort_hits, summary
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import CapacityError
-from warp_abtree.query.result import VECTORS, ContactResult, Result, contact_dtypes
+from warp_abtree.query.result import VECTORS, Found, contact_dtypes
+from warp_abtree.query.sorting import sort_on_device
+from warp_abtree.query.staging import first_rows
 
 # Warps that a multiprocessor runs at a time, by their registers, of those that find deferred contacts.
 DEFERRED_WARPS = 8
@@ -63,7 +65,7 @@ class ContactQuery(Query):
     Args:
         scene, pairs, precision, within: As for `Query`.
         capacity: `Buffers`, or the contacts that there is room for, below 2^30. Room that stays empty takes 180 bytes a
-            contact and time to sort all the same.
+            contact and, in `launch`, time to sort all the same; `run` looks at what was found.
         contact_dtype: Type of the real numbers in `result()`, float64 or float32; those beyond float32 become infinite.
 
     Attributes:
@@ -76,7 +78,6 @@ class ContactQuery(Query):
             missing in all of the above, on a GPU not the same in each launch.
     """
 
-    result_type: type[Result] = ContactResult
     faces: wp.array
     start: wp.array
     _key: wp.array
@@ -140,17 +141,21 @@ class ContactQuery(Query):
         """Return how many chunks there may be: `first_chunk` of the pair after the last, if all places are taken."""
         return places // int(summary.CHUNK) + pairs
 
-    def traverse(self):
-        """Run the narrow phase over the pairs in place and make the contacts. Launches only."""
-        super().traverse()
+    def finish(self, count: int | None = None):
+        """Make the contacts of the hits in place. Launches only."""
         if len(self.pairs):
-            self.find_contacts()
+            self.find_contacts(count)
 
-    def find_contacts(self):
-        """Sort the hits in place, whatever their order, make their contacts and sum them. Launches only."""
-        self._sort()
-        self._find()
-        self._reduce()
+    def find_contacts(self, count: int | None = None):
+        """Sort the hits in place, whatever their order, make their contacts and sum them. Launches only.
+
+        Args:
+            count: How many hits there are; None looks at all places.
+        """
+        count = self._places if count is None else min(count, self._places)
+        self._sort(count)
+        self._find(count)
+        self._reduce(count)
 
     def _launch_kernel(self, kernel, dim, inputs, block_dim=256):
         wp.launch(kernel, dim=dim, inputs=inputs, block_dim=block_dim, device=self.device)
@@ -160,36 +165,23 @@ class ContactQuery(Query):
         lanes = WARP_SIZE if self.device.is_cuda else 1
         self._launch_kernel(kernel, count * lanes, inputs, WARP_SIZE)
 
-    def _passes(self):
-        """Return the bits of (pair, face a, face b) that each pass of the sort looks at."""
-        pair = len(self.pairs).bit_length()
-        face = (int(self.batch.models.face_count.max()) - 1).bit_length()
-        if pair + 2 * face <= self._regime.key_bits:
-            return [(pair, face, face)]
-        return [(0, 0, face), (pair, face, 0)]
-
-    def _sort(self):
-        capacity, room = self._places, len(self.pairs)
-        total, face = self.hits.total, self.hits.face
-        for number, widths in enumerate(self._passes()):
-            inputs = [room, wp.vec3i(*widths), number == 0, total, face, self._order, self._key]
-            self._launch_kernel(sort_hits.make_key_kernel, capacity, inputs)
-            with wp.ScopedDevice(self.device):
-                wp.utils.radix_sort_pairs(self._key, self._order, capacity, end_bit=sum(widths))
-        self._launch_kernel(sort_hits.place_row_kernel, capacity, [total, face, self._order, self.faces])
-        inputs = [capacity, sum(widths[1:]), self._key, self.start, self._deferred.total]
+    def _sort(self, count: int):
+        passes, room = self._sort_passes(), len(self.pairs)
+        sort_on_device(self.hits, count, room, passes, self._order, self._key, self.faces)
+        inputs = [count, sum(passes[-1][1:]), self._key, self.start, self._deferred.total]
         self._launch_kernel(sort_hits.start_pair_kernel, room + 1, inputs)
 
-    def _find(self):
+    def _find(self, count: int):
         posed = [*self.batch.pools, self.pairs, self.pair_poses]
         inputs = [*posed, self.start, self.faces, self._deferred, self.contacts]
-        self._launch_kernel(contact.find_contact_kernel, self._places, inputs, WARP_SIZE)
+        self._launch_kernel(contact.find_contact_kernel, count, inputs, WARP_SIZE)
         step = DEFERRED_WARPS * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
         inputs = [step, *posed, self.faces, self._deferred, self.contacts]
         self._launch_kernel(contact.find_deferred_kernel, step, inputs, WARP_SIZE)
 
-    def _reduce(self):
-        room, chunks = len(self.pairs), len(self._sums.span)
+    def _reduce(self, count: int):
+        room = len(self.pairs)
+        chunks = self._chunk_count(count, room)
         pools = self.batch.pools
         start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
         self._launch_warps(summary.sum_length_kernel, chunks, [start, contacts, sums])
@@ -201,3 +193,60 @@ class ContactQuery(Query):
         self._launch_kernel(
             summary.measure_depth_kernel, room, [*pools, self.pairs, start, contacts, sums, means], WARP_SIZE
         )
+
+    def _read_rows(self, found: Found, count: int, device: bool):
+        if device:
+            self._copy_contacts(found, count)
+        elif self._packs():
+            self._transfer_contacts(found, count)
+        else:
+            self._share_contacts(found, count)
+
+    def _share_contacts(self, found: Found, count: int):
+        """Copy from arrays that are the host's memory."""
+        pairs = len(found.pairs)
+        face_type, pair_type = contact_dtypes(self.contact_dtype)
+        found.contacts, found.pair_contacts = np.zeros(count, face_type), np.zeros(pairs, pair_type)
+        found.faces = self.faces.numpy()[:count].reshape(-1, 3).copy()
+        found.pair_contacts["count"] = found.count
+        with np.errstate(over="ignore"):
+            for name in ("point", "normal", "depth"):
+                found.pair_contacts[name] = getattr(self.pair_contacts, name).numpy()[:pairs]
+            for name in (*VECTORS, "coplanar"):
+                found.contacts[name] = getattr(self.contacts, name).numpy()[:count]
+        found.contacts["pair"], found.contacts["faces"] = found.faces[:, 0], found.faces[:, 1:]
+
+    def _transfer_contacts(self, found: Found, count: int):
+        """Pack rows on the device, and bring them over."""
+        staging, pairs = self._staging, len(found.pairs)
+        real, (face_type, pair_type) = self._real(), contact_dtypes(self.contact_dtype)
+        memory = staging.row_pool.take(12 * count + pairs * pair_type.itemsize + count * face_type.itemsize)
+
+        def pack_pairs(first, some, target):
+            inputs = [first, self.hits.count, self.pair_contacts, target]
+            self._launch_kernel(pack.pair_packer(real), (some, pack.PAIR_NUMBERS), inputs)
+
+        def pack_contacts(first, some, target):
+            inputs = [first, self.faces, self.contacts, target]
+            self._launch_kernel(pack.contact_packer(real), (some, pack.CONTACT_NUMBERS), inputs)
+
+        found.faces, memory = staging.send_rows(memory, self.faces, count)
+        found.pair_contacts, memory = staging.send_records(memory, pair_type, pairs, pack_pairs)
+        found.contacts, _ = staging.send_records(memory, face_type, count, pack_contacts)
+        staging.wait()
+
+    def _copy_contacts(self, found: Found, count: int):
+        """Copy rows into arrays that stay on the device."""
+        real, pairs = self._real(), len(found.pairs)
+        vector = wp.vec3d if real is wp.float64 else wp.vec3
+        types = {"pair": wp.int32, "faces": wp.vec2i, **dict.fromkeys(VECTORS, vector), "coplanar": wp.bool}
+        found.contacts = {name: self._empty(count, dtype) for name, dtype in types.items()}
+        means = {"point": self._empty(pairs, vector), "normal": self._empty(pairs, vector)}
+        means["depth"] = self._empty(pairs, real)
+        self._launch_kernel(pack.contact_copier(real), count, [self.faces, self.contacts, *found.contacts.values()])
+        self._launch_kernel(pack.summary_copier(real), pairs, [self.pair_contacts, *means.values()])
+        found.pair_contacts = {"count": found.count, **means}
+        found.faces = wp.clone(first_rows(self.faces, count))
+
+    def _real(self):
+        return wp.float64 if np.dtype(self.contact_dtype) == np.float64 else wp.float32

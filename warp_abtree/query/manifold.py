@@ -22,12 +22,16 @@ Source of the area vector as a gradient: Allard et al. 2010, Volume Contact Cons
 section 3; that the boundary curve gives it is Stokes' theorem.
 """
 
+import numpy as np
 import warp as wp
 
 from warp_abtree.kernels import broad_phase
 from warp_abtree.kernels.contact import manifold, points
 from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.result import POINTS_MAX, ManifoldResult, Result
+from warp_abtree.query.result import Found, Result
+from warp_abtree.query.staging import first_rows
+
+POINTS_MAX = int(manifold.POINTS)
 
 
 class ManifoldQuery(ContactQuery):
@@ -44,7 +48,6 @@ class ManifoldQuery(ContactQuery):
             the greatest int64 behind the last pair.
     """
 
-    result_type: type[Result] = ManifoldResult
     growth = 2
     pair_key: wp.array
     _pair_order: wp.array
@@ -90,29 +93,41 @@ class ManifoldQuery(ContactQuery):
             wp.utils.radix_sort_pairs(self.pair_key, self._pair_order, room)
         self._launch_kernel(broad_phase.place_pair_kernel, room + 1, [self.pair_key, self.pair_count, self.pairs])
 
-    def find_contacts(self):
+    def find_contacts(self, count: int | None = None):
         """Sort the hits in place, make their contacts, and reduce them to points. Launches only."""
-        self._sort()
-        self._find()
-        capacity, room = self._places, len(self.pairs)
+        count = self._places if count is None else min(count, self._places)
+        self._sort(count)
+        self._find(count)
+        room = len(self.pairs)
         pools = self.batch.pools
         start, rows, curves = self.start, self.faces, self.curves
-        self._launch_kernel(manifold.begin_loop_kernel, capacity, [start, rows, curves, self._order, self._key])
-        self._sort_keys(capacity, 31 + room.bit_length())
-        self._launch_kernel(manifold.link_loop_kernel, capacity, [start, rows, self._order, self._key, curves])
-        self._launch_kernel(manifold.name_loop_kernel, capacity, [start, curves, self._order, self._key])
-        self._sort_keys(capacity, 31)
+        self._launch_kernel(manifold.begin_loop_kernel, count, [start, rows, curves, self._order, self._key])
+        self._sort_keys(count, 31 + room.bit_length())
+        self._launch_kernel(manifold.link_loop_kernel, count, [start, rows, self._order, self._key, curves])
+        self._launch_kernel(manifold.name_loop_kernel, count, [start, curves, self._order, self._key])
+        self._sort_keys(count, 31)
         inputs = [*pools, self.pairs, start, rows, self.contacts, self._order, curves]
-        self._launch_kernel(manifold.average_loop_kernel, capacity, inputs)
+        self._launch_kernel(manifold.average_loop_kernel, count, inputs)
         inputs = [*pools, self.pairs, self.pair_poses, start, rows, self.contacts, curves]
-        self._launch_kernel(manifold.find_candidate_kernel, capacity, inputs)
+        self._launch_kernel(manifold.find_candidate_kernel, count, inputs)
         self._launch_kernel(points.spread_point_kernel, room, [pools[2], self.pairs, start, curves, self.manifolds])
 
     def _sort_keys(self, count, bits):
         with wp.ScopedDevice(self.device):
             wp.utils.radix_sort_pairs(self._key, self._order, count, end_bit=bits)
 
-    def result(self, with_points: bool = True) -> ManifoldResult:
-        """Return the counts and, unless told otherwise, the contact points of the last launch on the host. Waits."""
-        pairs, demand = self._queried()
-        return ManifoldResult(self, pairs, demand, with_points)
+    def result(self, device: bool = False, with_points: bool = True) -> Result:
+        """Return the counts and, unless told otherwise, the contact points of the last launch, as `Query.result`."""
+        return self._read(device, with_points)
+
+    def _read_rows(self, found: Found, count: int, device: bool):
+        pairs, names = len(found.pairs), ("point", "normal", "depth")
+        arrays = {name: first_rows(getattr(self.manifolds, name), pairs) for name in ("count", *names)}
+        if device:
+            found.points = {name: wp.clone(array) for name, array in arrays.items()}
+            return
+        points = arrays["count"].numpy()
+        used = np.arange(POINTS_MAX) < points[:, None]
+        found.points = {"pair": np.repeat(np.arange(pairs), points)}
+        for name in names:
+            found.points[name] = arrays[name].numpy()[used]

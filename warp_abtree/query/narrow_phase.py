@@ -1,6 +1,7 @@
 """ACTIVE-INTERSECT for a batch: `Query`."""
 
 import math
+from functools import partial
 
 import warp as wp
 
@@ -9,10 +10,11 @@ from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, relative_pose, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
-from warp_abtree.query.buffers import QueryBuffers
-from warp_abtree.query.cpu_threads import RecordedLaunches, core_count, launch_on_cores
+from warp_abtree.query.commands import Commands
+from warp_abtree.query.cpu_threads import core_count, launch_on_cores
+from warp_abtree.query.readout import QueryReadout
 from warp_abtree.query.request import LIST_MAX, OUTPUTS, PRECISIONS, check_capacity, check_request, check_within
-from warp_abtree.query.result import Result
+from warp_abtree.query.result import Found, Result
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
 
@@ -32,7 +34,7 @@ def batch_of(source) -> Batch:
     return source if isinstance(source, Batch) else source.batch()
 
 
-class Query(QueryBuffers):
+class Query(QueryReadout):
     """Intersection of many object pairs as an operator: allocates once, launches many times.
 
     `launch()` only launches, so that a CUDA graph can capture it, the first launch too. Objects added to the scene ask
@@ -62,7 +64,6 @@ class Query(QueryBuffers):
         RuntimeError: A graph is being captured.
     """
 
-    result_type: type[Result] = Result
     growth = 1  # room that `run` makes, over the demand
 
     def __init__(self, scene, output="faces", pairs=None, capacity=None, precision="exact", within=None):
@@ -78,6 +79,7 @@ class Query(QueryBuffers):
         self.output, self.precision = output, precision
         self.device = batch.device
         self._torn = False
+        self._commands = Commands()
         self.guard = LaunchGuard(
             self.device, batch.states.generation, batch.filter_generation if pairs is None else None
         )
@@ -93,7 +95,6 @@ class Query(QueryBuffers):
         self.hits = self._make_hits()
         self.near = None if within is None else self._make_hits()
         self.work = self._make_work()
-        self._recorded = RecordedLaunches()
         self._no_distance = wp.empty(0, dtype=wp.float64, device=self.device)
         self._within = within
         self._resize_uncertain((room.uncertain or UNCERTAIN_ROOM) if self.uses_warps() else 0)
@@ -125,12 +126,20 @@ class Query(QueryBuffers):
         self._check_scene()
         with self.guard.launching(self):
             self._launch()
+            self.finish()
 
     def _launch(self):
         if self.broad_phase is not None:
             self.broad_phase.launch()
         self.prove_apart()
         self.traverse()
+
+    def finish(self, count: int | None = None):
+        """Make of the hits whatever else is asked. Launches only.
+
+        Args:
+            count: How many hits there are; None does what there is room for, as a graph must.
+        """
 
     def _check_scene(self):
         check_device(self.device)
@@ -144,44 +153,56 @@ class Query(QueryBuffers):
         room = len(self.pairs)
         if self.near is None or room == 0:
             return
-        self._launch_traversal(self.within, self.near, int(face_pairs.WITHIN), int(face_pairs.OUTPUT_ANY))
+        inputs = self.within, self.near, int(face_pairs.WITHIN), int(face_pairs.OUTPUT_ANY)
+        self._launch_search("within", partial(self._make_search, *inputs))
 
-    def _launch_traversal(self, within, hits, mode, output):
-        pools = self.batch.pools
-        room = len(self.pairs)
-        inputs = [output, *pools, self.pair_count, self.pairs, within]
-        self.guard.record()
-        inputs += [self.pair_poses, hits, self.work]
+    def _launch_search(self, name: str, make):
+        """Launch what `_make_search` makes: relative poses, the traversal, and passes over uncertain face pairs."""
+        # Also where all is captured: the kernels read the record.
+        given = self.guard.given()
+        if self.device.is_capturing:
+            make(wp.launch)
+            return
+        first, traversal, *passes = self._commands.find(name, given, make)
+        first.launch()
+        if self.uses_warps():
+            traversal.launch()
+        else:
+            cores = current_regime().cpu_threads or core_count()
+            launch_on_cores(traversal.launch, len(self.pairs), cores, self._least_pairs())
+        for command in passes:
+            command.launch()
+
+    def _least_pairs(self) -> int:
+        """Return the pairs that make a further core worth its while, which costs some 50 us.
+
+        Many of "any"; else about the root of the faces is the time that a pair in contact takes.
+        """
+        return 32 if self.output == "any" else max(1, int(50 / math.sqrt(self.batch.mean_faces)))
+
+    def _make_search(self, within, hits, mode, output, launch) -> list:
+        """Make the launches that bring relative poses and traverse all pairs, see `Commands.find`."""
+        pools, room = self.batch.pools, len(self.pairs)
+        inputs = [output, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
         # A warp a block: few pairs lie on as many multiprocessors.
         kernel = relative_pose.relative_pose_kernel
-        if self.device.is_cuda:
-            wp.launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
-        else:
-            self._recorded.launch(kernel, dim, inputs, self.device)
+        first = launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
         if not self.uses_warps():
-            cores = current_regime().cpu_threads or core_count()
-            # A launch on a further core costs some 50 us: the work of many pairs apart, of less than one in contact.
-            least = 32 if output == int(face_pairs.OUTPUT_ANY) else 1
             inputs += [self._regime.plain_tests, self.slab_memory, hits, self.work]
-            kernel = simd.thread_traversal(mode)
-            if min(cores, room // least) > 1:
-                launch_on_cores(kernel, room, inputs, self.device, cores, least)
-            else:
-                self._recorded.launch(kernel, 1, inputs, self.device)
-            return
+            return [first, launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device)]
         # More than there are units, where these are few: idle warps wait for donations.
-        units = int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1
-        warps = max(room, units)
+        warps = max(room, int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1)
         warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
-        wp.launch(
+        traversal = launch(
             dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
             inputs=[self._stack_length(), *inputs, hits, self.work],
             block_dim=WARP_SIZE,
             device=self.device,
         )
+        return [first, traversal]
 
     def _stack_length(self) -> int:
         length = self._regime.stack_length
@@ -191,47 +212,40 @@ class Query(QueryBuffers):
         """Run the narrow phase over the pairs in place. Launches only."""
         if not len(self.pairs):
             return
+        self._launch_search("pairs", self._make_traversal)
+
+    def _make_traversal(self, launch) -> list:
+        """Make the launches of the narrow phase."""
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
-        self._launch_traversal(self._no_distance, self.hits, mode, output)
+        made = self._make_search(self._no_distance, self.hits, mode, output, launch)
+        passes = []
         if len(self.hits.uncertain):
             first = uncertain_pairs.float64_filter_kernel if mode == EXACT else uncertain_pairs.resolve_rounded_kernel
             passes = [(first, FILTER_WARPS_A_PROCESSOR)]
             if mode == EXACT:
                 passes.append((uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR))
-            models, states, _ = self.batch.pools
-            for kernel, warps in passes:
-                threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
-                inputs = [threads, output, models, states, self.pair_poses, self.hits]
-                wp.launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
+        models, states, _ = self.batch.pools
+        for kernel, warps in passes:
+            threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
+            inputs = [threads, output, models, states, self.pair_poses, self.hits]
+            made.append(launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
+        return made
 
-    def result(self) -> Result:
-        """Return the results of the last launch on the host, sorted. Waits for the device.
+    def result(self, device: bool = False) -> Result:
+        """Return the results of the last launch, sorted. Waits for the device.
+
+        Args:
+            device: Whether the arrays stay on the device, as Warp arrays that no later launch changes.
 
         Raises:
             RuntimeError: There are none: nothing was launched, a launch was interrupted, or it was the replay of a
                 graph whose arrays were replaced.
         """
-        return self.result_type(self, *self._queried())
+        return self._read(device)
 
-    def _queried(self):
-        """Return the pairs of the last launch on the host, those there was room for, and how many there were.
-
-        Raises:
-            RuntimeError: As `result`.
-        """
-        check_device(self.device, "reading results")
-        self._check_whole()
-        if len(self.pairs):  # without room for pairs there are no launches
-            self.guard.check()
-        if self.broad_phase is None:
-            return self._given, len(self._given)
-        found = self.broad_phase.count_found()
-        return self.pairs.numpy()[: min(found, len(self.pairs))].reshape(-1, 2).copy(), found
-
-    def run(self) -> Result:
-        """Launch, grow buffers that were too small, and return the whole result. Waits for the device."""
-        self.grow()
-        result = self.result()
+    def run(self, device: bool = False) -> Result:
+        """Launch, grow buffers that were too small, and return the whole result, as `result`. Waits for the device."""
+        result = self._make_result(self._grow(partial(self._read_pairs, device)), device)
         result.check()
         return result
 
@@ -242,26 +256,41 @@ class Query(QueryBuffers):
             CapacityError: More pairs or hits than there can be room for.
             RuntimeError: As `launch`; or a graph is being captured.
         """
+        self._grow(lambda: Found(self._read_totals()))
+
+    def _grow(self, read) -> Found:
+        """Launch as `grow` and return what `read` finds of the last launch."""
         check_device(self.device, f"{type(self).__name__}.run (launch can)")
         self._check_scene()
         with self.guard.launching(self):
             self._launch()
-            if self.broad_phase is not None and self.broad_phase.count_found() > len(self.pairs):
-                room = self.growth * self.broad_phase.count_found()
-                self._take_pairs(wp.empty(room, dtype=wp.vec2i, device=self.device))
+            found = read()
+            if found.totals.pairs > len(self.pairs):
+                self._take_pairs(wp.empty(self.growth * found.totals.pairs, dtype=wp.vec2i, device=self.device))
                 self._launch()
-            self.grow_uncertain()
-            if self.output == "faces" and self._sum(self.hits.count) > len(self.hits.face):
-                self.resize(self.growth * self._sum(self.hits.count))
+                found = read()
+            found = self._grow_uncertain(read, found)
+            if found.totals.hits > len(self.hits.face):
+                self.resize(self.growth * found.totals.hits)
                 self.traverse()
+                found = read()
+            self.finish(found.totals.hits)
+        return found
 
     def grow_uncertain(self):
-        """Make room for the face pairs that wait, as far as there can be, and traverse again until all find it."""
-        # How many wait varies for `any`, where the first hit of a pair ends its traversal.
-        while 0 < len(self.hits.uncertain) < min(LIST_MAX, demand := self._sum(self.hits.float64_tests)):
-            self._resize_uncertain(min(2 * demand, LIST_MAX))
-            self.traverse()
+        """Make room for the face pairs that wait, as far as there can be, and launch again until all find it."""
 
-    @staticmethod
-    def _sum(counts) -> int:
-        return int(counts.numpy().sum())
+        def read():
+            return Found(self._read_totals())
+
+        first = read()
+        if self._grow_uncertain(read, first) is not first:
+            self.finish()
+
+    def _grow_uncertain(self, read, found: Found) -> Found:
+        # How many wait varies for `any`, where the first hit of a pair ends its traversal.
+        while 0 < len(self.hits.uncertain) < min(LIST_MAX, found.totals.uncertain):
+            self._resize_uncertain(min(2 * found.totals.uncertain, LIST_MAX))
+            self.traverse()
+            found = read()
+        return found

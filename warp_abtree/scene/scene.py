@@ -69,7 +69,6 @@ class Scene:
         self._batch: Batch | None = None
         self._broad_phase: BroadPhase | None = None
         self._queries: dict[tuple, Query] = {}
-        self._asked_pairs: dict[tuple, bytes] = {}  # of each query
 
     @property
     def object_count(self) -> int:
@@ -244,7 +243,9 @@ class Scene:
             self._broad_phase = BroadPhase(batch)
         return self._broad_phase.find()
 
-    def intersect(self, pairs=None, output="any", precision="exact", within=None, contact_dtype=np.float64) -> Result:
+    def intersect(
+        self, pairs=None, output="any", precision="exact", within=None, contact_dtype=np.float64, device: bool = False
+    ) -> Result:
         """Test object pairs for intersection, exactly as posed and at their LODs. Waits for the device.
 
         Touching counts. Columns of the result follow the order in which a pair names its objects.
@@ -261,6 +262,7 @@ class Scene:
                 With d = error_at(A) + error_at(B) it proves that the original meshes do not intersect. The broad phase
                 finds overlapping boxes only, whatever d is.
             contact_dtype: Type of the real numbers in contacts, float64 or float32.
+            device: Whether the result's arrays stay on the scene's device, see `Result`.
 
         Raises:
             ValueError: Bad pairs, a bad distance, an unknown option, or a scene without objects.
@@ -276,16 +278,14 @@ class Scene:
         # A query that fails, for lack of memory, is not kept: it gives its own back.
         query = self._queries.pop(asked, None)
         if query is not None:
-            if within is not None or self._asked_pairs[asked] != pairs.tobytes():
-                query.set_pairs(pairs, within)
+            query.replace_pairs(pairs, within)
         elif with_contacts:
             query = ContactQuery(self, pairs=pairs, precision=precision, within=within)
         else:
             query = Query(self, output, pairs=pairs, precision=precision, within=within)
         if isinstance(query, ContactQuery):
             query.contact_dtype = contact_dtype
-        result = query.run()
-        self._asked_pairs[asked] = pairs.tobytes()  # before the query, so that an interruption loses that
+        result = query.run(device)
         self._queries[asked] = query
         return result
 

@@ -226,7 +226,7 @@ class SteppedMotion:
         self.find(time_step)
 
     def find(self, time_step: float):
-        """Find the contacts of the step from here; return a `ManifoldResult` without points. Waits for the device."""
+        """Find the contacts of the step from here; return a `Result` without points. Waits for the device."""
         self.dynamics.find(None if self.prescribed is None else self.prescribed.poses(self._time + time_step))
         return self.dynamics.query.result(with_points=False)
 

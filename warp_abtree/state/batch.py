@@ -28,6 +28,7 @@ class Batch:
         device: Of the arrays.
         lods: LOD of each object as the host knows it, int (n,); -1 before `set_lods`.
         filter_generation: `Generation` of the excluded pairs.
+        mean_faces: About how many faces an object has at its LOD, as the host knows it.
     """
 
     def __init__(self, models: ModelArrays, states: StateArrays, objects: ObjectArrays, object_model, excluded=()):
@@ -37,6 +38,7 @@ class Batch:
         self.lods = np.full(len(self.object_model), -1, np.int64)
         self.excluded = np.asarray(excluded, np.int64)
         self.filter_generation = Generation(self.device)
+        self.mean_faces = float(models.face_count[self.object_model].mean()) if len(self.object_model) else 1.0
         self._retired = False
 
     @property
@@ -62,6 +64,9 @@ class Batch:
         with self.states.change():
             stats = set_object_lods(self.models, self.states, self.objects, self.object_model, lods)
             self.lods = np.array(lods)
+        # The base mesh has a few faces, and each operation adds about as many as any other.
+        share = (self.lods + 1) / (self.models.lod_max[self.object_model] + 1)
+        self.mean_faces = float((self.models.face_count[self.object_model] * share).mean())
         return stats
 
     def mend(self):

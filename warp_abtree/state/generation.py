@@ -77,10 +77,11 @@ def find_arrays(value) -> dict:
 
 
 def _holds_arrays(kind) -> bool:
-    """Return whether a class is the library's, or made from one, but for what outlives its operators."""
+    """Return whether a class is the library's, but for what outlives its operators and what no graph uses."""
     names = [f"{base.__module__}.{base.__name__}" for base in kind.__mro__]
     own = any(name.startswith("warp_abtree.") for name in names)
-    return own and not {"warp_abtree.scene.scene.Scene", "warp_abtree.model.model.Model"} & set(names)
+    others = {"scene.scene.Scene", "model.model.Model", "query.staging.Staging"}
+    return own and not {f"warp_abtree.{name}" for name in others} & set(names)
 
 
 class LaunchGuard:
@@ -102,7 +103,8 @@ class LaunchGuard:
         self._record = LaunchRecord()
         self._record.states_now, self._record.filter_now = states.now, self._filter.now
         self._record.buffers_now = self.buffers.now
-        self._record.launched = wp.array([NOT_LAUNCHED, 0], dtype=wp.int32, device=device)
+        self._record.launched = launched = wp.array([NOT_LAUNCHED, 0], dtype=wp.int32, device=device)
+        self._outcome = launched[:1]
         self._captured: dict = {}
         self._given: tuple = ()
 
@@ -113,10 +115,15 @@ class LaunchGuard:
 
     def record(self) -> LaunchRecord:
         """Return the record for a kernel about to be launched, with the generations as they are."""
+        self.given()
+        return self._record
+
+    def given(self) -> tuple:
+        """Bring the record up to date and return its generations: while they stand, so do all arrays of a launch."""
         given = self._states.given(), self._filter.given(), self.buffers.given()
         if given != self._given:
             self._record.states, self._record.filter, self._record.buffers = self._given = given
-        return self._record
+        return given
 
     def write_to(self, record: LaunchRecord):
         """Keep a record up to date that is part of another struct, in the place of the guard's own."""
@@ -137,19 +144,21 @@ class LaunchGuard:
 
     def __exit__(self, error, *_):
         if error is not None:
-            self.launched[:1].fill_(INTERRUPTED)
+            self._outcome.fill_(INTERRUPTED)
 
     def forget(self):
         """Let results count as none until the next launch."""
-        self.launched[:1].fill_(NOT_LAUNCHED)
+        self._outcome.fill_(NOT_LAUNCHED)
 
-    def check(self):
-        """Raise where the results are not of a whole launch on the arrays in use. Waits for the device.
+    def check(self, launched: int):
+        """Raise where the results are not of a whole launch on the arrays in use.
+
+        Args:
+            launched: First entry of the array of this name, as it was read.
 
         Raises:
             RuntimeError: Nothing was launched, or a launch was interrupted, or it was of a stale graph.
         """
-        launched = int(self.launched.numpy()[0])
         if launched == NOT_LAUNCHED:
             raise RuntimeError("there is no result: nothing was launched since this was made or given other pairs")
         if launched == INTERRUPTED:

@@ -1,0 +1,222 @@
+"""Results that are packed on the device and brought over, or stay there: the same bits, and later launches keep out."""
+
+import gc
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.faults import MORE_PAIRS, add_objects, describe
+from helpers.questions import GpuQuery, in_a_row
+
+import warp_abtree as ab
+from warp_abtree import testing
+from warp_abtree.query.result import COUNTERS
+from warp_abtree.query.staging import BLOCK_LEAST, LENT_MAX, PINNED_AT_ONCE, HostPool
+
+OUTPUTS = ["any", "count", "faces", "contacts", "contacts of float32"]
+NAMES = ("pairs", "any", "count", "faces", "contacts", "pair_contacts", "apart", *COUNTERS)
+
+
+@pytest.fixture(params=[True, False], ids=["packed", "as by default"])
+def packs(request):
+    """Pack results on every device, or where the library does."""
+    with testing.regime(packs_results=request.param or None):
+        yield
+
+
+def make_query(scene, output, pairs=MORE_PAIRS, **options):
+    if output.startswith("contacts"):
+        real = np.float32 if output.endswith("32") else np.float64
+        return ab.ContactQuery(scene, pairs, contact_dtype=real, **options)
+    return ab.Query(scene, output, pairs=pairs, **options)
+
+
+def as_host(value):
+    """Return a host array of what a result has on the device, contacts as records."""
+    if not isinstance(value, dict):
+        return None if value is None else value.numpy()
+    columns = {name: array.numpy() for name, array in value.items()}
+    records = np.zeros(len(columns["normal"]), [(name, x.dtype, x.shape[1:]) for name, x in columns.items()])
+    for name, column in columns.items():
+        records[name] = column
+    return records
+
+
+def check_same(kept, expected):
+    """Compare a result on the device with one on the host, to the bit."""
+    for name in NAMES:
+        found, wanted = as_host(getattr(kept, name)), getattr(expected, name)
+        assert (found is None) == (wanted is None), name
+        if wanted is not None:
+            assert found.dtype == wanted.dtype and found.shape == wanted.shape, name
+            assert found.tobytes() == wanted.tobytes(), name
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["given", "broad phase"])
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_every_way_of_reading_is_the_same(device, output, given):
+    scene = add_objects(device)
+    options = {"pairs": MORE_PAIRS if given else None, "within": 0.05}
+    if given:
+        options["within"] = np.linspace(0.0, 0.5, len(MORE_PAIRS))
+    with testing.regime(packs_results=False):
+        query = make_query(scene, output, **options)
+        expected = query.run()
+        assert expected.any.any()
+        check_same(query.run(device=True), expected)
+        check_same(query.result(device=True), expected)
+    with testing.regime(packs_results=True):
+        packed = make_query(scene, output, **options)
+        for found in (packed.run(), packed.result()):
+            assert describe(found) == describe(expected)
+            assert all(np.array_equal(getattr(found, name), getattr(expected, name)) for name in COUNTERS)
+            for name in NAMES:
+                wanted = getattr(expected, name)
+                assert wanted is None or getattr(found, name).dtype == wanted.dtype
+
+
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_a_scene_answers_on_its_device(device, output):
+    scene, output, *real = add_objects(device), *output.split(" of ")
+    options = {"contact_dtype": np.dtype(real[0])} if real else {}
+    expected = scene.intersect(MORE_PAIRS, output, **options)
+    kept = scene.intersect(MORE_PAIRS, output, device=True, **options)
+    kept.check()
+    check_same(kept, expected)
+    assert kept.any.device == kept.pairs.device == wp.get_device(device) and kept.any.dtype == wp.bool
+    assert kept.pairs.dtype == wp.vec2i and kept.node_tests.dtype == wp.int64
+
+
+@pytest.mark.parametrize("keeps", [False, True], ids=["host", "device"])
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_later_launches_change_no_result(device, packs, output, keeps):
+    scene = add_objects(device)
+    query = make_query(scene, output, within=0.1)
+
+    def read(result):
+        return [(as_host(getattr(result, n)) if keeps else getattr(result, n)) for n in NAMES]
+
+    def bits(result):
+        return [None if value is None else value.tobytes() for value in read(result)]
+
+    poses = np.tile([0, 0, 0, 0, 0, 0, 1.0], (4, 1))
+    results, before = [], []
+    for shift in (0.1, 0.2, 0.3, 0.4, 0.5):
+        poses[:, 0] = shift * np.arange(4)
+        scene.set_poses(poses)
+        results.append(query.run(device=keeps))
+        before.append(bits(results[-1]))
+    query.set_pairs(MORE_PAIRS[:1], within=0.1)
+    query.run()
+    assert [bits(result) for result in results] == before
+    assert len({tuple(part) for part in before}) == len(before), "each launch has found something else"
+
+
+def test_nothing_to_find(device, packs):
+    far = in_a_row(device, "box", (0, 5, 10))
+    for output in OUTPUTS:
+        for pairs in ([], [(0, 1), (1, 2)], None):
+            query = make_query(far, output, pairs=pairs)
+            expected, kept = query.run(), query.run(device=True)
+            check_same(kept, expected)
+            assert not expected.any.any() and len(expected.pairs) == (0 if pairs is None else len(pairs))
+            if output != "any":
+                assert expected.count.sum() == 0
+            if output not in ("any", "count"):
+                assert expected.faces.shape == (0, 3) and expected.faces.dtype == np.int32
+    assert scene_is_asked_nothing(far)
+
+
+def scene_is_asked_nothing(scene):
+    return all(len(scene.intersect([], output, device=True).any) == 0 for output in ("any", "faces", "contacts"))
+
+
+@pytest.mark.parametrize("keeps", [False, True], ids=["host", "device"])
+@pytest.mark.parametrize("output", ["faces", "contacts"])
+def test_overflow_is_told(device, packs, output, keeps):
+    """`launch` cannot grow: what there is room for is given, and `check` names the demand."""
+    scene = add_objects(device)
+    whole = scene.intersect(MORE_PAIRS, output)
+    query = make_query(scene, output, capacity=ab.Buffers(hits=5))
+    query.launch()
+    short = query.result(device=keeps)
+    assert len(short.faces) == 5
+    with pytest.raises(ab.CapacityError, match=rf"Buffers\(hits={len(whole.faces)}\)"):
+        short.check()
+    assert len(query.run(device=keeps).faces) == len(whole.faces)
+    found = make_query(scene, output, pairs=None, capacity=ab.Buffers(pairs=2))
+    found.launch()
+    short = found.result(device=keeps)
+    assert len(short.pairs) == 2
+    with pytest.raises(ab.CapacityError, match=rf"Buffers\(pairs={len(scene.broad_phase())}\)"):
+        short.check()
+
+
+def test_uncertain_face_pairs_are_counted_on_the_device(device, packs):
+    scene = add_objects(device)
+    whole = GpuQuery(scene, "faces", pairs=MORE_PAIRS).run()
+    demand = whole.float64_tests.sum()
+    query = GpuQuery(scene, "faces", pairs=MORE_PAIRS, capacity=ab.Buffers(uncertain=1))
+    query.launch()
+    for keeps in (False, True):
+        with pytest.raises(ab.CapacityError, match=rf"Buffers\(uncertain={demand}\)"):
+            query.result(device=keeps).check()
+    assert describe(query.run()) == describe(whole)
+
+
+@pytest.mark.parametrize("keeps", [False, True], ids=["host", "device"])
+def test_without_a_launch_there_is_no_result(device, packs, keeps):
+    query = ab.Query(add_objects(device), "faces", pairs=MORE_PAIRS)
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="nothing was launched"):
+            query.result(device=keeps)
+        assert query.run(device=keeps).any.shape == (len(MORE_PAIRS),)
+        query.set_pairs(MORE_PAIRS)
+
+
+@pytest.mark.parametrize("bits", [63, 20])
+def test_two_passes_sort_on_the_device(device, bits):
+    scene = add_objects(device)
+    expected = scene.intersect(MORE_PAIRS, "faces").faces
+    with testing.regime(key_bits=bits, packs_results=True):
+        np.testing.assert_array_equal(ab.Query(scene, "faces", pairs=MORE_PAIRS).run().faces, expected)
+
+
+def test_points_stay_on_the_device(device):
+    query = ab.ManifoldQuery(add_objects(device))
+    expected, kept = query.run().points, query.result(device=True).points
+    count = kept["count"].numpy()
+    assert count.sum() == len(expected["pair"]) > 0
+    for name in ("point", "normal", "depth"):
+        values = [kept[name].numpy()[p, :n] for p, n in enumerate(count)]
+        assert np.concatenate(values).tobytes() == expected[name].tobytes()
+    assert query.result(device=True, with_points=False).points is query.result(with_points=False).points is None
+
+
+def test_memory_is_lent_again_when_no_array_is_left():
+    pool = HostPool(wp.get_device("cpu"))
+    first, second = pool.take(100), pool.take(200)
+    view, places = first[8:16].view(np.int64), {first.ctypes.data, second.ctypes.data}
+    assert len(places) == LENT_MAX and pool.take(300).ctypes.data not in places, "too many are lent"
+    del first
+    gc.collect()
+    assert pool.take(100).ctypes.data not in places, "a view is left"
+    place = view.ctypes.data - 8
+    del view
+    again = pool.take(BLOCK_LEAST)
+    assert again.ctypes.data == place and again.flags.writeable
+    del again, second
+    large = [pool.take(PINNED_AT_ONCE + 1) for _ in range(2)]
+    assert large[0].base is None and large[1].base is not None, "what is read once is not page-locked"
+    assert pool.take(0).shape == (0,)
+
+
+def test_records_pass_in_parts(device, monkeypatch):
+    """More of them than there is memory to pack them in at a time."""
+    scene = add_objects(device)
+    expected = scene.intersect(MORE_PAIRS, "contacts")
+    monkeypatch.setattr("warp_abtree.query.staging.PACKED_AT_ONCE", 1000)
+    with testing.regime(packs_results=True):
+        query = ab.ContactQuery(scene, MORE_PAIRS)
+        assert describe(query.run()) == describe(expected)
+    assert len(expected.contacts) > 100

@@ -1,0 +1,161 @@
+"""Reading what a launch found: to the host in one transfer of each kind, or into arrays that stay on the device."""
+
+from contextlib import nullcontext
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import check_device
+from warp_abtree.checks.regime import Regime
+from warp_abtree.kernels import results as kernels
+from warp_abtree.query.buffers import QueryBuffers
+from warp_abtree.query.result import COUNTERS, Found, Result, Totals
+from warp_abtree.query.sorting import sort_on_device, sort_passes, sort_rows
+from warp_abtree.query.staging import Staging, first_rows, view_memory
+
+HEADER, COLUMNS = int(kernels.HEADER_WORDS), int(kernels.COUNT_COLUMNS)
+
+
+class QueryReadout(QueryBuffers):
+    """How a query reads what its launches found.
+
+    On a GPU kernels pack it into memory that one copy brings over: first a header of demands with whatever has an entry
+    a pair, then the rows, whose number is known by then. On the CPU the query's arrays are the host's memory already.
+    """
+
+    output: str
+    _regime: Regime
+    _made_staging: Staging | None = None
+
+    @property
+    def _staging(self) -> Staging:
+        if self._made_staging is None:
+            self._made_staging = Staging(self.device)
+        return self._made_staging
+
+    def _packs(self) -> bool:
+        packs = self._regime.packs_results
+        return self.device.is_cuda if packs is None else packs
+
+    def _read(self, device: bool, with_rows: bool = True) -> Result:
+        """Return the result of the last launch, on any stream, perhaps without what has an entry a hit."""
+        check_device(self.device, "reading results")
+        self._check_whole()
+        # The default stream waits for those that the query may have been launched on.
+        whole = wp.ScopedStream(self.device.null_stream, sync_exit=True) if self.device.is_cuda else nullcontext()
+        with whole:
+            return self._make_result(self._read_pairs(device), device, with_rows)
+
+    def _make_result(self, found: Found, device: bool, with_rows: bool = True) -> Result:
+        """Check that there was a launch, and read the rows that it found.
+
+        Raises:
+            RuntimeError: As `Query.result`.
+        """
+        if len(self.pairs):  # without room for pairs there are no launches
+            self.guard.check(found.totals.launched)
+        if self.output == "faces" and with_rows:
+            self._read_rows(found, min(found.totals.hits, len(self.hits.face)), device)
+        return Result(found, (len(self.pairs), len(self.hits.face), len(self.hits.uncertain)), self.output)
+
+    def _read_totals(self) -> Totals:
+        """Read what the last launch needed of each list. Waits for the device."""
+        if self._packs():
+            return self._totals(self._staging.fetch_words(self._pack_pairs(0), HEADER))
+        hits, total, uncertain = self.hits, 0, 0
+        found = len(self._given) if self.broad_phase is None else self.broad_phase.count_found()
+        if self.output == "faces":
+            total = int(hits.count.numpy().sum())
+        if len(hits.uncertain):
+            uncertain = int(hits.float64_tests.numpy().sum())
+        return Totals(int(self.guard.launched.numpy()[0]), found, total, uncertain)
+
+    def _totals(self, words) -> Totals:
+        """Return the demands in a header; those of lists that the query lacks are 0."""
+        launched, found, hits, uncertain = words[:HEADER].tolist()
+        found = len(self._given) if self.broad_phase is None else self.broad_phase.check_found(found)
+        return Totals(
+            launched, found, hits if self.output == "faces" else 0, uncertain if len(self.hits.uncertain) else 0
+        )
+
+    def _read_pairs(self, device: bool) -> Found:
+        """Read demands, and what there is an entry a pair of. Waits for the device."""
+        if not (self._packs() or device):
+            return self._copy_pairs()
+        n = len(self._given) if self.broad_phase is None else min(self._read_totals().pairs, len(self.pairs))
+        if device:
+            return self._keep_pairs(n)
+        words = self._staging.fetch_words(self._pack_pairs(n), self._block_length(n))
+        columns, end = words[HEADER : HEADER + COLUMNS * n].reshape(COLUMNS, n), HEADER + COLUMNS * n
+        if self.broad_phase is None:
+            pairs = self._given
+        else:
+            pairs, end = words[end : end + n].view(np.int32).reshape(n, 2), end + n
+        flags = words[end:].view(bool)
+        apart = None if self.near is None else flags[n : 2 * n]
+        return Found(self._totals(words), pairs, flags[:n], apart, columns[0], dict(zip(COUNTERS, columns[1:])))
+
+    def _copy_pairs(self) -> Found:
+        """Copy from arrays that are the host's memory, which the next launch writes."""
+        hits, totals = self.hits, self._read_totals()
+        n = min(totals.pairs, len(self.pairs))
+        pairs = self._given if self.broad_phase is None else self.pairs.numpy()[:n].reshape(-1, 2).copy()
+        apart = None if self.near is None else self.near.any_hit.numpy()[:n] == 0
+        tests = {name: getattr(hits, name).numpy()[:n].copy() for name in COUNTERS}
+        return Found(totals, pairs, hits.any_hit.numpy()[:n] != 0, apart, hits.count.numpy()[:n].copy(), tests)
+
+    def _keep_pairs(self, n: int) -> Found:
+        """Return arrays on the device, parts of a block of their own."""
+        block = wp.empty(self._block_length(n), dtype=wp.int64, device=self.device)
+        totals = self._totals(self._staging.fetch_words(self._pack_pairs(n, block), HEADER))
+
+        def part(at, dtype):
+            return view_memory(block.ptr + at, dtype, n, self.device, block)
+
+        column, words = 8 * n, [part(8 * HEADER + 8 * n * k, wp.int64) for k in range(COLUMNS)]
+        flags = 8 * HEADER + column * COLUMNS
+        if self.broad_phase is None:
+            pairs = wp.clone(first_rows(self.pairs, n))
+        else:
+            pairs, flags = part(flags, wp.vec2i), flags + column
+        apart = None if self.near is None else part(flags + n, wp.bool)
+        return Found(totals, pairs, part(flags, wp.bool), apart, words[0], dict(zip(COUNTERS, words[1:])))
+
+    def _block_length(self, n: int) -> int:
+        """Return the words of a block of n pairs."""
+        return HEADER + (COLUMNS + (self.broad_phase is not None)) * n + (2 * n + 7) // 8
+
+    def _pack_pairs(self, n: int, words=None) -> wp.array:
+        """Write a block of n pairs, to the staging memory by default, and return it. Launches only."""
+        staging = self._staging
+        if words is None:
+            words = staging.room("words", self._block_length(n), wp.int64)
+        words.zero_()
+        near = staging.no_flags if self.near is None else self.near.any_hit
+        pairs = staging.no_pairs if self.broad_phase is None else self.pairs
+        threads = max(1, -(-len(self.pairs) // kernels.BLOCK_DIM)) * kernels.BLOCK_DIM
+        inputs = [n, self.hits, near, self.pair_count, self.guard.launched, pairs, words]
+        wp.launch(kernels.pack_pair_kernel, threads, inputs, device=self.device, block_dim=kernels.BLOCK_DIM)
+        return words
+
+    def _read_rows(self, found: Found, count: int, device: bool):
+        """Read what there is an entry a hit of. Waits for the device, unless it stays there."""
+        if not (self._packs() or device):
+            found.faces = sort_rows(self.hits.face.numpy()[:count].reshape(-1, 3))
+        elif device:
+            found.faces = self._sort_hits(count, wp.empty(count, dtype=wp.vec3i, device=self.device))
+        else:
+            staging = self._staging
+            rows = self._sort_hits(count, staging.room("rows", count, wp.vec3i))
+            found.faces, _ = staging.send_rows(staging.row_pool.take(12 * count), rows, count)
+            staging.wait()
+
+    def _sort_hits(self, count: int, rows):
+        """Write the hits to rows in order, and return these. Launches only."""
+        order = self._staging.room("order", 2 * count, wp.int32)
+        key = self._staging.room("key", 2 * count, wp.int64)
+        sort_on_device(self.hits, count, len(self.pairs), self._sort_passes(), order, key, rows)
+        return rows
+
+    def _sort_passes(self) -> list:
+        return sort_passes(len(self.pairs), int(self.batch.models.face_count.max()), self._regime.key_bits)

@@ -1,0 +1,53 @@
+"""Hits in the order of `Result.faces`, sorted on the host or on the device."""
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels.contact import sort_hits
+
+# Rows whose sorting takes longer than packing each into one number, which sorts 20 times as fast.
+ROWS_TO_PACK = 1000
+
+
+def sort_rows(rows: np.ndarray) -> np.ndarray:
+    """Return rows of three int32 that are not negative, (k, 3), sorted by the first, the second and the third."""
+    packs = len(rows) >= ROWS_TO_PACK
+    widths = [int(column.max()).bit_length() for column in rows.T] if packs else []
+    if not packs or sum(widths) > 63:
+        return rows[np.lexsort((rows[:, 2], rows[:, 1], rows[:, 0]))]
+    key = rows[:, 0].astype(np.int64)
+    for column in (1, 2):
+        key <<= widths[column]
+        key |= rows[:, column]
+    key.sort()
+    found = np.empty_like(rows)
+    for column in (2, 1):
+        np.bitwise_and(key, (1 << widths[column]) - 1, out=found[:, column], casting="unsafe")
+        key >>= widths[column]
+    found[:, 0] = key
+    return found
+
+
+def sort_passes(pair_room: int, face_count: int, key_bits: int) -> list:
+    """Return the bits of (pair, face a, face b) that each pass of a device's sort looks at."""
+    pair, face = pair_room.bit_length(), (face_count - 1).bit_length()
+    if pair + 2 * face <= key_bits:
+        return [(pair, face, face)]
+    return [(0, 0, face), (pair, face, 0)]
+
+
+def sort_on_device(hits, count: int, pair_room: int, passes: list, order, key, rows):
+    """Write the first hits to `rows` in order. Launches only.
+
+    Args:
+        hits: `Hits` whose face pairs are sorted; those that it lacks count as a pair of their own, the last.
+        order, key: Scratch, device int32 and int64 (2 count,); the keys of the last pass stay.
+        rows: Device vec3i (count,).
+    """
+    device = hits.face.device
+    for number, widths in enumerate(passes):
+        inputs = [pair_room, wp.vec3i(*widths), number == 0, hits.total, hits.face, order, key]
+        wp.launch(sort_hits.make_key_kernel, count, inputs, device=device)
+        with wp.ScopedDevice(device):
+            wp.utils.radix_sort_pairs(key, order, count, end_bit=sum(widths))
+    wp.launch(sort_hits.place_row_kernel, count, [hits.total, hits.face, order, rows], device=device)
