@@ -1,6 +1,6 @@
 // Slabs of the nodes of a subtree, along directions that an object pair shares. A record has minima and negated maxima,
-// 16 lanes each, in steps that divide A's size along a direction into 2^16, rounded outwards, and at most +-32767. For B
-// the directions are negated, so that both are apart where the sum of two lanes is positive. The last two lanes of
+// 16 lanes each, in steps that divide A's size along a direction into 2^16, rounded outwards, and at most +-32767. For
+// B the directions are negated, so that both are apart where the sum of two lanes is positive. The last two lanes of
 // either are none: there lie `skip` with the minima and `face` with the maxima.
 #pragma once
 #include "builtin.h"
@@ -19,7 +19,7 @@ struct Slabs {
     };
     // What a thread keeps: a header, then of each object the roots of the subtrees in its slots, then records.
     struct Memory {
-        int* header;  // whose axes these are, levels of the subtrees' roots
+        int* header;                // whose axes these are, levels of the subtrees' roots
         float *axes, *of_a, *of_b;  // unit directions, then scaled: three rows and a shift
         int slots, *roots;
         Record* records;
@@ -28,7 +28,12 @@ struct Slabs {
         const unsigned long long start = (unsigned long long)(data + (wp::int64)words * thread);
         float* base = (float*)((start + 63) & ~63ull);
         const int slots = (words - 16 - SLAB_HEADER) / (2 + 32 * SUBTREE_RECORDS);
-        return Memory{(int*)base, base + 16, base + 64, base + 128, slots, (int*)base + SLAB_HEADER,
+        return Memory{(int*)base,
+                      base + 16,
+                      base + 64,
+                      base + 128,
+                      slots,
+                      (int*)base + SLAB_HEADER,
                       (Record*)(base + SLAB_HEADER + 2 * slots)};
     }
     // One of both objects.
@@ -36,7 +41,7 @@ struct Slabs {
         const Box* tree;
         const int* corners;  // four a face
         lanes axis[3], shift, margin;
-        int floor;  // level of the subtrees' roots
+        int floor;   // level of the subtrees' roots
         int* roots;  // of the subtrees in the slots, 0 for none
         Record* records;
     };
@@ -114,7 +119,8 @@ struct Slabs {
     }
     // A face's normal, of unit length, or 0.
     static void find_normal(const void* near, const int* corner, float* normal) {
-        const float *a = (const float*)near + 4 * (wp::int64)corner[0], *b = (const float*)near + 4 * (wp::int64)corner[1];
+        const float *a = (const float*)near + 4 * (wp::int64)corner[0],
+                    *b = (const float*)near + 4 * (wp::int64)corner[1];
         const float* c = (const float*)near + 4 * (wp::int64)corner[2];
         double u[3], v[3], n[3];
         for (int k = 0; k < 3; ++k) {

@@ -42,8 +42,8 @@ wp::vec_t<2, wp::int32> open_subtrees(ModelPool models, StatePool states, PairPo
             middle += 0.5 * n[j] * (high + low);
             shift += n[j] * t[j];
         }
-        // Three times the margin of boxes covers all rounding, see docs/exactness.md. A direction that tells nothing, since
-        // the margin is half of A's size or more, and numbers could overflow, has no slabs.
+        // Three times the margin of boxes covers all rounding, see docs/exactness.md. A direction that tells nothing,
+        // since the margin is half of A's size or more, and numbers could overflow, has no slabs.
         const double steps = 65536.0 / size, margin = 3.0 * steps * pose.margin;
         const double scale = d < 14 && size > 0.0 && margin < 32768.0 ? steps : 0.0;
         for (int j = 0; j < 3; ++j) {
@@ -103,11 +103,22 @@ wp::vec_t<3, wp::int64> descend_subtrees(ModelPool models, StatePool states, Pai
         const int* corners = (const int*)states.face_corner.data;
         const lanes *of_a = (const lanes*)kept.of_a, *of_b = (const lanes*)kept.of_b;
         const wp::int64 records_b = (wp::int64)SUBTREE_RECORDS * kept.slots;
-        const Slabs::Side sides[2] = {
-            {nodes + pose.node_a, corners + 4 * (wp::int64)pose.corner_a, {of_a[0], of_a[1], of_a[2]}, of_a[3], lanes{},
-             kept.header[1], kept.roots, kept.records},
-            {nodes + pose.node_b, corners + 4 * (wp::int64)pose.corner_b, {of_b[0], of_b[1], of_b[2]}, of_b[3], of_b[4],
-             kept.header[2], kept.roots + kept.slots, kept.records + records_b}};
+        const Slabs::Side sides[2] = {{nodes + pose.node_a,
+                                       corners + 4 * (wp::int64)pose.corner_a,
+                                       {of_a[0], of_a[1], of_a[2]},
+                                       of_a[3],
+                                       lanes{},
+                                       kept.header[1],
+                                       kept.roots,
+                                       kept.records},
+                                      {nodes + pose.node_b,
+                                       corners + 4 * (wp::int64)pose.corner_b,
+                                       {of_b[0], of_b[1], of_b[2]},
+                                       of_b[3],
+                                       of_b[4],
+                                       kept.header[2],
+                                       kept.roots + kept.slots,
+                                       kept.records + records_b}};
         const void* near = models.vertex_near.data;
         wp::int64* items = stack.data;
         wp::int64* found = faces.data;
@@ -161,10 +172,11 @@ wp::vec_t<3, wp::int64> descend_subtrees(ModelPool models, StatePool states, Pai
                     const Record gap = __builtin_elementwise_add_sat(a[k >> 1], b[k & 1]) > 0;
                     return __builtin_bit_cast(unsigned int, __builtin_convertvector(gap, flags)) & 0x3fff3fff;
                 };
-                const unsigned int mask = ((apart(0) == 0) | (apart(1) == 0) << 1 | (apart(2) == 0) << 2 |
-                                           (apart(3) == 0) << 3) &
-                                          taken[i].used;
-                const int *a0 = (const int*)a, *a1 = (const int*)(a + 1), *b0 = (const int*)b, *b1 = (const int*)(b + 1);
+                const unsigned int mask =
+                    ((apart(0) == 0) | (apart(1) == 0) << 1 | (apart(2) == 0) << 2 | (apart(3) == 0) << 3) &
+                    taken[i].used;
+                const int *a0 = (const int*)a, *a1 = (const int*)(a + 1), *b0 = (const int*)b,
+                          *b1 = (const int*)(b + 1);
                 const ints skip = {a0[7], a0[7], a1[7], a1[7], b0[7], b1[7], b0[7], b1[7]};
                 const ints face = {a0[15], a0[15], a1[15], a1[15], b0[15], b1[15], b0[15], b1[15]};
                 const ints other = __builtin_shufflevector(face, face, 4, 5, 6, 7, 0, 1, 2, 3);
