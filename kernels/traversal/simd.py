@@ -76,7 +76,7 @@ def descend(
     """
 
 
-@wp.func_native(native.body("simd_subtrees.h", "move_below"))
+@wp.func_native(native.body("simd_descend.h", "move_below"))
 def move_below(
     floors: wp.vec2i, top: wp.int32, stack: wp.array(dtype=wp.int64), below: wp.array(dtype=wp.int64)
 ) -> wp.vec2i:
