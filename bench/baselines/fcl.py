@@ -60,6 +60,12 @@ class Fcl:
     def faces(self):
         return self._collide(self.all)
 
+    def ask_one(self, pose, output):
+        """Return the answer at one pose."""
+        result = self.fcl.CollisionResult()
+        self.fcl.collide(self.a, self.b[pose], self.yes_no if output == "any" else self.all, result)
+        return result
+
     @staticmethod
     def face_pairs(answer):
         """Return the face numbers in one answer, (k, 2)."""

@@ -4,8 +4,8 @@
 #include "sizes.h"
 
 template <class StatePool, class PairPose>
-wp::vec_t<3, wp::int64> descend(StatePool states, PairPose pose, wp::int32 at_once, wp::int32 ready, wp::int32 top,
-                                wp::array_t<wp::int64> stack, wp::array_t<wp::int64> faces) {
+wp::vec_t<3, wp::int64> descend(StatePool states, PairPose pose, wp::int32 at_once, wp::int32 ready, wp::int64 most,
+                                wp::int32 top, wp::array_t<wp::int64> stack, wp::array_t<wp::int64> faces) {
     wp::vec_t<3, wp::int64> result;
 #if defined(__CUDA_ARCH__)
     __trap();  // warps have a traversal of their own
@@ -121,7 +121,7 @@ wp::vec_t<3, wp::int64> descend(StatePool states, PairPose pose, wp::int32 at_on
         }
 #endif
     };
-    while (end > 0 && waiting < ready) {
+    while (end > 0 && waiting < ready && compared < most) {
         const int room = (CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH - end) / 3, fits = room > 1 ? room : 1;
         const int wanted = at_once < fits ? at_once : fits, count = wanted < end ? wanted : end;
         end -= count;
@@ -136,4 +136,24 @@ wp::vec_t<3, wp::int64> descend(StatePool states, PairPose pose, wp::int32 at_on
     result[2] = compared;
 #endif
     return result;
+}
+
+wp::vec_t<2, wp::int32> move_below(wp::vec_t<2, wp::int32> floors, wp::int32 top, wp::array_t<wp::int64> stack,
+                                   wp::array_t<wp::int64> below) {
+#include "sizes.h"
+    // Whether a node, or both children of one, lie in a subtree whose root is on a level.
+    auto is_below = [](unsigned int half, int floor) {
+        return 31 - __builtin_clz(half & 0x7fffffff) - (int)(half >> 31) >= floor;
+    };
+    wp::int64* items = stack.data;
+    const int first = top > ITEMS_AT_ONCE ? top - ITEMS_AT_ONCE : 0;
+    int end = first, deep = 0;
+    for (int i = first; i < top; ++i) {
+        const wp::int64 item = items[i];
+        if (is_below((unsigned int)(item >> 32), floors[0]) && is_below((unsigned int)item, floors[1]))
+            below.data[deep++] = item;
+        else
+            items[end++] = item;
+    }
+    return wp::vec_t<2, wp::int32>(end, deep);
 }

@@ -32,6 +32,17 @@ constexpr int DEPTH_FIRST_LENGTH = 101;
 static_assert(DEPTH_FIRST_LENGTH == 3 * 31 + 8, "depth first always fits");
 static_assert(CPU_STACK_LENGTH >= DEPTH_FIRST_LENGTH + 4 * ITEMS_AT_ONCE, "so many at once fit at the start");
 
+// Subtrees of which the CPU keeps slabs: levels below the root and leaves; faces of which it takes normals.
+constexpr int SUBTREE_DEPTH = 7;
+constexpr int SUBTREE_LEAVES = 128;
+constexpr int SUBTREE_RECORDS = 256;
+constexpr int SLAB_SAMPLES = 64;
+constexpr int SLAB_HEADER = 256;
+constexpr int SUBTREES_AT_ONCE = 16;
+constexpr int NO_FLOOR = 64;
+static_assert(SUBTREE_LEAVES == 1 << SUBTREE_DEPTH, "of a binary tree");
+static_assert(SUBTREE_RECORDS == 2 * SUBTREE_LEAVES, "one a node, by its place in the subtree");
+
 // Straddling pairs that wait for their last two signs on the CPU, the last 16 of them written over.
 constexpr int STRADDLING_ROOM = 256;
 static_assert(STRADDLING_ROOM % 8 == 0, "corners are found 8 at a time");

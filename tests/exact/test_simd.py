@@ -244,7 +244,7 @@ def descend_kernel(
         stack[i] = root
     top = wp.int32(how[0])
     while top > 0:
-        progress = simd.descend(states, pose[0], how[1], how[2], top, stack, faces)
+        progress = simd.descend(states, pose[0], how[1], how[2], simd.NEVER, top, stack, faces)
         top = wp.int32(progress[0])
         counts[1] = counts[1] + progress[2]
         for i in range(wp.int32(progress[1])):

@@ -7,9 +7,11 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device
+from warp_abtree.checks.regime import Regime, current_regime
 from warp_abtree.kernels import poses
-from warp_abtree.kernels.traversal import face_pairs
+from warp_abtree.kernels.traversal import face_pairs, simd
 from warp_abtree.query.broad_phase import BroadPhase
+from warp_abtree.query.cpu_threads import core_count
 from warp_abtree.query.request import check_pair_room, check_within
 from warp_abtree.query.result import COUNTERS
 from warp_abtree.state.batch import Batch
@@ -32,7 +34,14 @@ class QueryBuffers:
     within: wp.array  # where asked
     _within: np.ndarray
     _given: np.ndarray  # pairs on the host
+    slab_memory: wp.array
+    _regime: Regime
     _torn: bool
+
+    def uses_warps(self) -> bool:
+        """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
+        warps = self._regime.warps
+        return self.device.is_cuda if warps is None else warps
 
     def _make_hits(self):
         hits = face_pairs.Hits()
@@ -97,6 +106,7 @@ class QueryBuffers:
     def _pair_arrays(self, room: int) -> list:
         """Return (owner, attribute, new array) of whatever has an entry a pair."""
         made = [(self, "pair_poses", wp.empty(room, dtype=poses.PairPose, device=self.device))]
+        made.append((self, "slab_memory", self._make_slab_memory(room)))
         for hits in (self.hits, self.near):
             if hits is not None:
                 made.append((hits, "any_hit", wp.zeros(room, dtype=wp.int32, device=self.device)))
@@ -105,6 +115,14 @@ class QueryBuffers:
         if self.near is not None:
             made.append((self, "within", wp.empty(room, dtype=wp.float64, device=self.device)))
         return made
+
+    def _make_slab_memory(self, room: int):
+        """Return what each thread of the CPU keeps slabs in; the system gives it only what it touches."""
+        if self.uses_warps():
+            return wp.empty((0, 0), dtype=wp.float32, device=self.device)
+        threads = min(room, current_regime().cpu_threads or core_count())
+        words = simd.slab_memory_words(int(self.batch.models.depth.max()))
+        return wp.empty((threads, words), dtype=wp.float32, device=self.device)
 
     def _make_room(self, pairs) -> list:
         """Return (owner, attribute, new array) of a device list of pairs, and of whatever belongs to a pair."""

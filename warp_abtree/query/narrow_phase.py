@@ -116,11 +116,6 @@ class Query(QueryReadout):
         self.guard.write_to(work.record)
         return work
 
-    def uses_warps(self) -> bool:
-        """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
-        warps = self._regime.warps
-        return self.device.is_cuda if warps is None else warps
-
     def launch(self):
         """Run broad phase (unless pairs were given) and narrow phase. Launches only.
 
@@ -193,8 +188,9 @@ class Query(QueryReadout):
         # A warp a block: few pairs lie on as many multiprocessors.
         kernel = relative_pose.relative_pose_kernel
         first = launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
-        inputs = [output, *pools[:2], self.pair_count, self.pair_poses, hits, self.work]
+        inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
         if not self.uses_warps():
+            inputs += [self._regime.plain_tests, self.slab_memory, hits, self.work]
             return [first, launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device)]
         # More than there are units, where these are few: idle warps wait for donations.
         warps = max(room, int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1)
@@ -202,7 +198,7 @@ class Query(QueryReadout):
         traversal = launch(
             dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
             dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
-            inputs=[self._stack_length(), *inputs],
+            inputs=[self._stack_length(), *inputs, hits, self.work],
             block_dim=WARP_SIZE,
             device=self.device,
         )

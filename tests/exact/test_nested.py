@@ -1,0 +1,161 @@
+"""Nested parts on the CPU: slabs of subtrees prune no pair that touches, and every answer stays the same."""
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.questions import pairs_of, scene_of
+from helpers.samples import STILL, random_poses, sample, true_faces
+
+import warp_abtree as ab
+from warp_abtree import testing
+from warp_abtree.kernels.arrays import ModelPool, StatePool
+from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
+from warp_abtree.kernels.traversal.simd import (
+    CPU_STACK_LENGTH,
+    WAITING_LENGTH,
+    descend_subtrees,
+    open_subtrees,
+    slab_memory_words,
+)
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+CPU = "cpu"
+AT_ONCE = 100  # leaf pairs that a test waits for
+
+
+def shells(rng, gap):
+    """Return two models of a rippled torus, the second farther inside by about a gap, which is random."""
+    model = sample("torus")
+    vertices, faces, _ = model.mesh_at(model.lod_max)
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inwards = np.zeros_like(vertices)
+    for k in range(3):
+        np.subtract.at(inwards, faces[:, k], normals)
+    inwards /= np.linalg.norm(inwards, axis=1, keepdims=True)
+    rippled = vertices + 0.02 * np.sin(9 * vertices[:, [1, 2, 0]])
+    inside = rippled + gap * rng.uniform(0.2, 1.8, (len(vertices), 1)) * inwards
+    return [ab.Model.from_arrays(points, faces) for points in (rippled, inside)]
+
+
+def nested_cases(rng, gap, count=2):
+    """Return cases (model, LOD, pose) twice: both shells under one random pose but for a small motion, at any LODs."""
+    outer, inner = shells(rng, gap)
+    cases = []
+    for k in range(count):
+        lods = [model.lod_max if k == 0 else model.lod_for(fraction=rng.uniform(0.3, 1)) for model in (outer, inner)]
+        pose = np.asarray(random_poses(rng, 1, 1.0)[0], float)
+        moved = pose.copy()
+        moved[:3] += gap / 4 * rng.normal(size=3)
+        cases.append((outer, lods[0], pose, inner, lods[1], moved))
+    return cases
+
+
+@pytest.mark.parametrize("gap", [0.001, 0.02, 0.06])
+def test_nested_parts_equal_brute_force(gap):
+    """Both outputs, the second LODs coarser; free, touching here and there, and crossing all over."""
+    cases = nested_cases(np.random.default_rng(5), gap)
+    truth = [true_faces(*case) for case in cases]
+    rows = np.concatenate([np.insert(faces, 0, p, 1) for p, faces in enumerate(truth)])
+    tests = {}
+    for plain_tests in (0, 1000, 10**9):
+        with testing.regime(plain_tests=plain_tests):
+            scene = scene_of(CPU, cases)
+            found = scene.intersect(pairs_of(cases), "faces")
+            np.testing.assert_array_equal(found.faces, rows)
+            np.testing.assert_array_equal(
+                scene.intersect(pairs_of(cases), "any").any, [len(faces) > 0 for faces in truth]
+            )
+            tests[plain_tests] = found.node_tests.sum(), found.triangle_tests.sum()
+    assert (1.3 * np.array(tests[0]) < tests[10**9]).all(), "slabs separate what boxes do not"
+
+
+def test_many_subtrees_share_little_memory():
+    """A tree of more subtrees than there is room for; the thread fills slots anew."""
+    rng = np.random.default_rng(2)
+    model = sample("torus")
+    vertices, faces, _ = model.mesh_at(model.lod_max)
+    for _ in range(2):
+        corners = vertices[faces]
+        middle = np.arange(len(faces))[:, None] + len(vertices)
+        vertices = np.concatenate([vertices, corners.mean(1) + 0.01 * rng.normal(size=(len(faces), 3))])
+        faces = np.concatenate([np.column_stack([faces[:, k], faces[:, (k + 1) % 3], middle]) for k in range(3)])
+    fine = ab.Model.from_arrays(vertices, faces)
+    scene = ab.Scene(CPU)
+    for pose in (STILL, (0.01, 0.02, 0, 0, 0, 0.01, 1)):
+        scene.add(fine, pose)
+    with testing.regime(plain_tests=10**9):
+        expected = ab.Query(scene, "faces", pairs=[(0, 1)]).run()
+    with testing.regime(plain_tests=0):
+        query = ab.Query(scene, "faces", pairs=[(0, 1)])
+        found = [query.run().faces]
+        assert query.slab_memory.shape[1] > slab_memory_words(0), "more subtrees than slots"
+        query.slab_memory = wp.empty((1, slab_memory_words(0)), dtype=wp.float32, device=CPU)
+        found.append(query.run().faces)
+    for faces in found:
+        np.testing.assert_array_equal(faces, expected.faces)
+
+
+@wp.kernel
+def list_leaf_pairs_kernel(
+    margin_factor: wp.float32,
+    models: ModelPool,
+    states: StatePool,
+    pair_poses: wp.array(dtype=PairPose),
+    memory: wp.array2d(dtype=wp.float32),
+    stack_inout: wp.array(dtype=wp.int64),
+    faces_inout: wp.array(dtype=wp.int64),
+    met_out: wp.array(dtype=wp.int32),
+):
+    """Note which faces of one number are a leaf pair that slabs do not separate, from the roots on."""
+    pose = pair_poses[0]
+    pose.margin = pose.margin * margin_factor
+    open_subtrees(models, states, pose, 0, True, memory)
+    stack_inout[0] = first_item(states, pose)
+    top = wp.int32(1)
+    while top > 0:
+        progress = descend_subtrees(models, states, pose, 0, AT_ONCE, top, stack_inout, memory, faces_inout)
+        top = wp.int32(progress[0])
+        for i in range(wp.int32(progress[1])):
+            if item_first(faces_inout[i]) == item_second(faces_inout[i]):
+                met_out[item_first(faces_inout[i])] = 1
+
+
+def touching_soups(rng, count, reach):
+    """Return a query of two soups whose faces of one number share a corner to the bit; the second's are far larger."""
+    corner = np.round(rng.uniform(-1, 1, (count, 1, 3)) * 2**10) / 2**10
+    small = np.concatenate([corner, corner + np.round(rng.uniform(-1, 1, (count, 2, 3)) * 2**10) / 2**12], 1)
+    large = np.concatenate([corner, np.round(reach * rng.uniform(-1, 1, (count, 2, 3)))], 1)
+    scene = ab.Scene(CPU)
+    turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # moves no number, so that corners are shared
+    for points, matrix in ((small, np.eye(3)), (large @ turn, turn)):
+        model = ab.Model.from_arrays(points.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
+        pose = np.eye(4)
+        pose[:3, :3] = matrix
+        scene.add(model, pose)
+    query = ab.Query(scene, "faces", pairs=[(0, 1)])
+    rows = query.run().faces[:, 1:]
+    assert (rows[rows[:, 0] == rows[:, 1], 0] == np.arange(count)).all()
+    return query
+
+
+def count_lost(query, count, margin_factor):
+    """Return how many of the pairs that share a corner slabs separate."""
+    memory = wp.empty((1, slab_memory_words(0)), dtype=wp.float32, device=CPU)
+    buffers = [wp.empty(length, dtype=wp.int64, device=CPU) for length in (CPU_STACK_LENGTH, WAITING_LENGTH)]
+    met = wp.zeros(count, dtype=wp.int32, device=CPU)
+    inputs = [margin_factor, *query.batch.pools[:2], query.pair_poses, memory, *buffers, met]
+    wp.launch(list_leaf_pairs_kernel, dim=1, inputs=inputs, device=CPU)
+    return int((met.numpy() == 0).sum())
+
+
+def test_margin_covers_rounding():
+    """Pairs that touch in a point survive beside coordinates that float32 rounds; without the margin some do not."""
+    rng, count, lost = np.random.default_rng(8), 120, 0
+    for reach in 10 ** rng.uniform(3, 6, 20):
+        query = touching_soups(rng, count, reach)
+        assert count_lost(query, count, 1.0) == 0
+        lost += count_lost(query, count, 0.0)
+    assert lost > 20
