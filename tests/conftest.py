@@ -11,6 +11,8 @@ from warp_abtree.state import work_lists
 
 # JAX would take three quarters of a GPU's memory for itself.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+# No test reads or writes the user's models; those of the cache name a folder of their own.
+os.environ["WARP_ABTREE_CACHE"] = "off"
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 

@@ -103,9 +103,11 @@ def test_files(path):
 
 
 def test_folders_hold_few_files():
+    room = {"kernels/native": 20}  # a file a function, or what several of them include
     folders = {path.parent for path in (*FILES, *NATIVE)}
     counts = {shown(folder): len([p for p in (*FILES, *NATIVE) if p.parent == folder]) for folder in folders}
-    assert {folder: count for folder, count in counts.items() if count > FOLDER_FILES + 1} == {}, "__init__.py apart"
+    full = {folder: count for folder, count in counts.items() if count > room.get(folder, FOLDER_FILES + 1)}
+    assert full == {}, "__init__.py apart"
 
 
 def test_files_of_tests_have_names_of_their_own():

@@ -82,6 +82,8 @@ def host_arrays(result):
 def compare(read, found, kept):
     """Raise where arrays read one by one, a result, and one on the device differ."""
     for name, expected in read.items():
+        if found.count is None and name in COUNTERS:
+            continue  # the tests of `any` end where a warp has found a hit
         there = getattr(kept, name)
         fields = [(there[field].numpy(), expected[field]) for field in there] if isinstance(there, dict) else []
         fields = fields or [(there.numpy(), expected)]

@@ -61,3 +61,17 @@ static_assert(MARK_START % 32 == 0 && 32 * MARK_WORDS == MARK_START + 3 * (1 << 
 constexpr int UNCERTAIN = 8;
 constexpr double COORDINATE_MIN = 0x1p-290;
 constexpr double BOUND_3D = 0x1.0000000000008p-50;
+
+// Certified errors: faces about a merge, distances of corners to them, corners of a polygon, polygons on the stack, faces
+// that cover a triangle, cuts of one, and triangles covered at once.
+constexpr int NEAR_ROOM = 64;
+constexpr int DISTANCE_ROOM = 8192;
+constexpr int POLYGON_CORNERS = 16;
+constexpr int POLYGON_STACK = 64;
+constexpr int COVER_SLOTS = 32;
+constexpr int COVER_CUTS = 64;
+constexpr int COVERS_AT_ONCE = 64;
+constexpr int SLOT_FACE = 0;
+constexpr int SLOT_SIBLING = 2;
+constexpr int SLOT_FIELDS = 8;
+static_assert(NEAR_ROOM % 8 == 0 && DISTANCE_ROOM >= 64 * NEAR_ROOM, "8 faces a vector, and room for cuts");

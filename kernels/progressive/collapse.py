@@ -290,11 +290,14 @@ def collapse_edges_kernel(
     rings_inout: Rings,
     heap_inout: Heap,
     counter_inout: wp.array(dtype=int),
+    # Out:
+    merge_pair_out: wp.array(dtype=wp.vec2i),
 ):
     """Merge the cheapest edge repeatedly (serial, dim=1); counter[STATUS] says why the launch ended.
 
     Invariants: an edge has one entry in the heap at most; an entry is stale iff one of its nodes has a parent; two
-    active nodes once joined by a face stay joined, as only a merge of one of them kills their faces.
+    active nodes once joined by a face stay joined, as only a merge of one of them kills their faces. `merge_pair_out`
+    gets the two nodes of each merge, the lower one first.
     """
     size = counter_inout[HEAP_SIZE]
     merges = counter_inout[MERGE_COUNT]
@@ -327,6 +330,7 @@ def collapse_edges_kernel(
                     else:
                         c = vertex_count + merges
                         commit_merge(surface_inout, rings_inout, a, b, c, q, place.pos)
+                        merge_pair_out[merges] = wp.vec2i(a, b)
                         size = push_ring(surface_inout, rings_inout, heap_inout, size, c)
                         merges += 1
                         live -= dying

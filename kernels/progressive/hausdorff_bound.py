@@ -8,12 +8,21 @@ other faces and by those around the merge.
 import warp as wp
 
 from warp_abtree.kernels.progressive.triangle_cover import (
+    COVERS_AT_ONCE,
     FLOOR,
+    SLOT_FACE,
+    SLOT_LAST,
+    SLOT_NEXT,
+    SLOT_SIBLING,
+    SLOT_STAMP,
+    SLOT_TRIANGLE,
     SLOTS,
+    Covers,
     Replay,
     add_near,
     add_ring,
     cover_distance_sq,
+    cover_ring,
     cover_triangle,
 )
 from warp_abtree.kernels.progressive.vertex_forest import (
@@ -23,7 +32,7 @@ from warp_abtree.kernels.progressive.vertex_forest import (
     third_vertices_live,
 )
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 # Entries of `Replay.counter`, kept between launches.
@@ -53,11 +62,11 @@ def set_face(replay: Replay, f: int):
 @wp.func
 def register_slot(replay: Replay, slot: int, f: int):
     first = replay.face_slot[f]
-    replay.slot_face[slot] = f
-    replay.slot_next[slot] = first
-    replay.slot_last[slot] = -1
+    replay.slot[slot, SLOT_FACE] = f
+    replay.slot[slot, SLOT_NEXT] = first
+    replay.slot[slot, SLOT_LAST] = -1
     if first >= 0:
-        replay.slot_last[first] = slot
+        replay.slot[first, SLOT_LAST] = slot
     replay.face_slot[f] = slot
 
 
@@ -66,19 +75,19 @@ def release_triangle(replay: Replay, t: int, face_count: int, free: int):
     """End every registration of triangle t; return how many pooled slots are free."""
     slot = t
     while slot >= 0:
-        before = replay.slot_last[slot]
-        after = replay.slot_next[slot]
+        before = replay.slot[slot, SLOT_LAST]
+        after = replay.slot[slot, SLOT_NEXT]
         if before >= 0:
-            replay.slot_next[before] = after
+            replay.slot[before, SLOT_NEXT] = after
         else:
-            replay.face_slot[replay.slot_face[slot]] = after
+            replay.face_slot[replay.slot[slot, SLOT_FACE]] = after
         if after >= 0:
-            replay.slot_last[after] = before
+            replay.slot[after, SLOT_LAST] = before
         if slot >= face_count:
             replay.free_slot[free] = slot
             free += 1
-        slot = replay.slot_sibling[slot]
-    replay.slot_sibling[t] = -1
+        slot = replay.slot[slot, SLOT_SIBLING]
+    replay.slot[t, SLOT_SIBLING] = -1
     return free
 
 
@@ -89,9 +98,9 @@ def register_triangle(replay: Replay, t: int, used: int, free: int):
     for k in range(1, used):
         free -= 1
         slot = replay.free_slot[free]
-        replay.slot_triangle[slot] = t
-        replay.slot_sibling[slot] = replay.slot_sibling[t]
-        replay.slot_sibling[t] = slot
+        replay.slot[slot, SLOT_TRIANGLE] = t
+        replay.slot[slot, SLOT_SIBLING] = replay.slot[t, SLOT_SIBLING]
+        replay.slot[t, SLOT_SIBLING] = slot
         register_slot(replay, slot, replay.scratch.used[k])
     return free
 
@@ -142,13 +151,13 @@ def queue_ring(replay: Replay, queued: int, node: int, stamp: int):
         if replay.rings.corner_node[3 * f] >= 0:
             slot = replay.face_slot[f]
             while slot >= 0:
-                t = replay.slot_triangle[slot]
-                if replay.triangle_stamp[t] != stamp:
-                    replay.triangle_stamp[t] = stamp
+                t = replay.slot[slot, SLOT_TRIANGLE]
+                if replay.slot[t, SLOT_STAMP] != stamp:
+                    replay.slot[t, SLOT_STAMP] = stamp
                     replay.queue[queued] = t
                     replay.queue_face[queued] = f
                     queued += 1
-                slot = replay.slot_next[slot]
+                slot = replay.slot[slot, SLOT_NEXT]
         k = replay.rings.next[k]
     return queued
 
@@ -184,7 +193,7 @@ def start_replay_kernel(
     """Register every original triangle with itself (serial, dim=1).
 
     Args:
-        replay_inout: `face_slot`, `slot_sibling` and the stamps must hold -1.
+        replay_inout: `face_slot`, `slot` and the stamps must hold -1.
     """
     live = int(0)
     for f in range(face_count):
@@ -192,7 +201,7 @@ def start_replay_kernel(
             replay_inout.triangle_pos[f, k] = replay_inout.pos[face_vertex[f, k]]
         if replay_inout.rings.corner_node[3 * f] >= 0:
             set_face(replay_inout, f)
-            replay_inout.slot_triangle[f] = f
+            replay_inout.slot[f, SLOT_TRIANGLE] = f
             register_slot(replay_inout, f, f)
             live += 1
     replay_inout.counter[LIVE_FACES] = live
@@ -219,10 +228,10 @@ def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: in
         replay.counter[STAMP] = own
         slot = t
         while slot >= 0:
-            f = replay.slot_face[slot]
+            f = replay.slot[slot, SLOT_FACE]
             if replay.rings.corner_node[3 * f] >= 0:
                 near_count = add_near(replay, near_count, shared, own, f)
-            slot = replay.slot_sibling[slot]
+            slot = replay.slot[slot, SLOT_SIBLING]
         if near_count == 0:
             f = search_all(replay, limit)
             for k in range(3):
@@ -237,7 +246,54 @@ def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: in
 
 
 @wp.func
-def replay_merge(replay: Replay, a: int, b: int, c: int, limit: wp.float64):
+def register_covers(replay: Replay, covers: Covers, begin: int, end: int, row: int):
+    """Register triangles with the faces that were found to cover them, for the first at `row`."""
+    face_count = replay.face_slot.shape[0]
+    free = replay.counter[FREE_SLOTS]
+    for i in range(begin, end):
+        t = covers.triangle[i]
+        free = release_triangle(replay, t, face_count, free)
+        used = covers.count[row + i - begin]
+        for k in range(used):
+            replay.scratch.used[k] = covers.face[row + i - begin, k]
+        free = register_triangle(replay, t, used, free)
+    replay.counter[FREE_SLOTS] = free
+
+
+@wp.func
+def cover_queue(
+    replay: Replay, covers: Covers, merge: wp.vec3i, queued: int, near_count: int, shared: int, limit: wp.float64
+):
+    """Cover every queued triangle again, 8 faces at a time where that does it; return the squared bound."""
+    i = int(0)
+    while i < queued:
+        end = i
+        if replay.counter[FREE_SLOTS] >= COVERS_AT_ONCE * SLOTS:
+            end = wp.min(i + COVERS_AT_ONCE, queued)
+            end = cover_ring(replay, covers, merge, 0, near_count, i, end, 0, limit, True)
+            if end > i:
+                limit = covers.limit[end - i - 1]
+            register_covers(replay, covers, i, end, 0)
+        if end < wp.min(i + COVERS_AT_ONCE, queued):
+            limit = cover_queued(replay, replay.queue[end], replay.queue_face[end], near_count, shared, limit)
+            end += 1
+        i = end
+    return limit
+
+
+@wp.func
+def move_faces(replay: Replay, a: int, b: int, c: int):
+    """Merge nodes a and b into c in the forest, and give the faces about c their corners."""
+    tail = absorb_ring(replay.rings, a, a, b, c, -1)
+    tail = absorb_ring(replay.rings, b, a, b, c, tail)
+    k = replay.rings.head[c]
+    while k >= 0:
+        set_face(replay, k // 3)
+        k = replay.rings.next[k]
+
+
+@wp.func
+def replay_merge(replay: Replay, covers: Covers, a: int, b: int, c: int, limit: wp.float64):
     """Merge nodes a and b into c and cover the triangles of their faces again; return the squared bound."""
     stamp = replay.counter[STAMP] + 1
     replay.counter[STAMP] = stamp
@@ -247,15 +303,9 @@ def replay_merge(replay: Replay, a: int, b: int, c: int, limit: wp.float64):
     near_count = int(0)
     if replay.rings.degree[a] + replay.rings.degree[b] == 2 * dying:
         near_count = third_rings(replay, a, b, stamp)
-    tail = absorb_ring(replay.rings, a, a, b, c, -1)
-    tail = absorb_ring(replay.rings, b, a, b, c, tail)
+    move_faces(replay, a, b, c)
     near_count = add_ring(replay, near_count, stamp, stamp, c)
-    k = replay.rings.head[c]
-    while k >= 0:
-        set_face(replay, k // 3)
-        k = replay.rings.next[k]
-    for i in range(queued):
-        limit = cover_queued(replay, replay.queue[i], replay.queue_face[i], near_count, stamp, limit)
+    limit = cover_queue(replay, covers, wp.vec3i(a, b, c), queued, near_count, stamp, limit)
     replay.counter[LIVE_FACES] = replay.counter[LIVE_FACES] - dying
     replay.counter[QUEUED] = queued
     return limit
@@ -269,6 +319,7 @@ def replay_merges_kernel(
     merge_pair: wp.array2d(dtype=int),
     # In and out:
     replay_inout: Replay,
+    covers_inout: Covers,
     # Out:
     bound_sq_out: wp.array(dtype=wp.float64),
 ):
@@ -294,7 +345,7 @@ def replay_merges_kernel(
             replay_inout.counter[INDEXED] = -1
             break
         c = vertex_count + j
-        limit = replay_merge(replay_inout, a, b, c, limit)
+        limit = replay_merge(replay_inout, covers_inout, a, b, c, limit)
         covers += replay_inout.counter[QUEUED] + 1
         bound_sq_out[j] = limit
         j += 1

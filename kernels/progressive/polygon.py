@@ -6,7 +6,7 @@ Source: Ericson, Real-Time Collision Detection, section 5.1.5 (closest point).
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 STACK = wp.constant(64)  # polygons on the stack
 CORNERS = wp.constant(16)  # of a polygon

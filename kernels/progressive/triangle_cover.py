@@ -6,6 +6,7 @@ upper bound. A partition along the prisms over the faces gives zero where the su
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.progressive.polygon import (
     CORNERS,
     STACK,
@@ -20,10 +21,20 @@ from warp_abtree.kernels.progressive.polygon import (
 )
 from warp_abtree.kernels.progressive.vertex_forest import Rings
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
+COVERS_AT_ONCE = wp.constant(native.constant("COVERS_AT_ONCE"))
 CUTS = wp.constant(64)  # cuts of a triangle at one merge, at most
 SLOTS = wp.constant(32)  # faces that cover a triangle, at most
+
+# Entries of a slot, which lie side by side in memory.
+SLOT_FACE = wp.constant(native.constant("SLOT_FACE"))  # the face that its triangle is registered with
+SLOT_TRIANGLE = wp.constant(1)
+SLOT_SIBLING = wp.constant(native.constant("SLOT_SIBLING"))  # next slot of the same triangle, or -1
+SLOT_NEXT = wp.constant(3)  # doubly linked list of each face's slots
+SLOT_LAST = wp.constant(4)  # the other direction
+SLOT_STAMP = wp.constant(5)  # last merge that queued the triangle; of a triangle's own slot
+SLOT_FIELDS = wp.constant(native.constant("SLOT_FIELDS"))
 
 # Coordinates are within 1/2 and rounded at 2^-53: smaller bounds in flat regions are noise, not worth a cut.
 FLOOR = wp.constant(wp.float64(2.0**-46))
@@ -38,8 +49,8 @@ SLACK_SQ = wp.constant(wp.float64(1.1))  # of the lower bound: a polygon within 
 class Replay:
     """The surface after each merge, and which faces cover which original triangles.
 
-    A slot registers one triangle with one face. Each face has a doubly linked list of its slots, each triangle a singly
-    linked one.
+    A slot registers one triangle with one face; slot t is triangle t's own. Each face has a doubly linked list of its
+    slots, each triangle a singly linked one.
     """
 
     counter: wp.array(dtype=int)  # [6], see `hausdorff_bound`
@@ -51,17 +62,48 @@ class Replay:
     face_box: wp.array2d(dtype=wp.vec3d)  # [face_count, 2], lower and upper corner of the box of each
     bvh: wp.uint64  # wp.Bvh over the boxes of bvh_face; 0 until a component vanishes
     bvh_face: wp.array(dtype=int)  # [any], faces that were active when the Bvh was built
-    slot_face: wp.array(dtype=int)  # [slot_count], face that the slot's triangle is registered with
-    slot_triangle: wp.array(dtype=int)  # [slot_count]; slot t is triangle t's own, those from face_count are pooled
-    slot_sibling: wp.array(dtype=int)  # [slot_count], next slot of the same triangle, or -1
-    slot_next: wp.array(dtype=int)  # [slot_count], doubly linked list of each face's slots
-    slot_last: wp.array(dtype=int)  # [slot_count], the other direction
+    slot: wp.array2d(dtype=int)  # [slot_count, SLOT_FIELDS]; those from face_count on are pooled
     free_slot: wp.array(dtype=int)  # [slot_count - face_count], stack of pooled slots not in use
     face_slot: wp.array(dtype=int)  # [face_count], first slot or -1
     face_stamp: wp.array(dtype=int)  # [face_count], last candidate set that held the face
-    triangle_stamp: wp.array(dtype=int)  # [face_count], last merge that queued the triangle
     queue: wp.array(dtype=int)  # [face_count], triangles to cover again
     queue_face: wp.array(dtype=int)  # [face_count], a face that covered each: the first to try
+
+
+@wp.struct
+class Covers:
+    """Triangles to cover, and the faces found for each; of one merge, or of all merges of a window."""
+
+    triangle: wp.array(dtype=int)  # [any], triangles in order
+    first: wp.array(dtype=int)  # [any], a face that covered each: the first to try
+    near: wp.array(dtype=int)  # [any], faces around a merge
+    count: wp.array(dtype=int)  # [rows], faces that cover each triangle
+    face: wp.array2d(dtype=int)  # [rows, any], these faces
+    limit: wp.array(dtype=wp.float64)  # [rows], squared running maximum after each triangle
+
+
+@wp.func_native(native.body("cover_ring.h", "cover_ring"))
+def cover_ring(
+    replay: Replay,
+    covers: Covers,
+    merge: wp.vec3i,
+    near_begin: wp.int32,
+    near_count: wp.int32,
+    begin: wp.int32,
+    end: wp.int32,
+    row: wp.int32,
+    limit: wp.float64,
+    raises: bool,
+) -> wp.int32:
+    """Cover triangles of a merge again, 8 faces at a time, number by number as `cover_triangle`.
+
+    Args:
+        merge: The two nodes of the merge and the one that it makes; the forest may be that before the merge or after.
+        begin, end: Triangles, at most COVERS_AT_ONCE; what is found for the first goes to `row`.
+        limit: Squared running maximum, which a triangle raises for those after it, if `raises`.
+
+    Returns where it stopped: `end`, or a triangle that only `cover_triangle` can cover, as other faces may be nearer.
+    """
 
 
 @wp.func

@@ -54,6 +54,23 @@ def test_build(files, capsys):
     assert sorted(path.name for path in files.glob("ball*")) == ["ball.npz", "ball.obj"]
 
 
+def test_build_of_many_files(files, capsys):
+    """A bad mesh costs a line and the status; the others are built."""
+    (files / "models").mkdir()
+    meshes = ["ball.obj", "junk.obj", "ring.ply", "missing.obj"]
+    assert cli.main(["build", *meshes, "models", "--json", "--base-faces", "40"]) == 2
+    shown = capsys.readouterr()
+    found = json.loads(shown.out)
+    assert [row["file"] for row in found["models"]] == ["models/ball.npz", "models/ring.npz"] and found["failed"] == 2
+    assert [line.split(":")[1].strip() for line in shown.err.splitlines()] == ["junk.obj", "missing.obj"]
+    assert sorted(path.name for path in (files / "models").iterdir()) == ["ball.npz", "ring.npz"]
+    for mesh in ("ball.obj", "ring.ply"):
+        built = ab.Model.load(mesh, base_faces=40)
+        assert ab.Model.open(f"models/{Path(mesh).stem}.npz").digest == built.digest
+    assert cli.main(["build", "ball.obj", "models"]) == 0
+    assert re.search(r"^models/ball.npz +[\d,]+ +320 ", capsys.readouterr().out, re.M)
+
+
 # query.
 
 

@@ -8,7 +8,7 @@ import pytest
 from helpers.samples import grid
 from oracles.distance import brute_distances, exact_distance_sq, lattice_points
 
-from warp_abtree.model import progressive as builder
+from warp_abtree.model import lod_bounds
 from warp_abtree.model.progressive import build_progressive
 
 
@@ -39,8 +39,8 @@ def test_covers_on_fewer_faces_than_they_want_are_measured_again(slots, monkeypa
     """Polygons that find no slot stand on a face that is used already, perhaps a far one, and the bound must say so."""
     mesh, looser = bumpy_sheet(10, 0.3, 1), 0
     plenty = build_progressive(mesh, base_faces=1)
-    monkeypatch.setattr(builder, "SLOTS_PER_FACE", 0)
-    monkeypatch.setattr(builder, "SLOTS_EXTRA", slots)
+    monkeypatch.setattr(lod_bounds, "SLOTS_PER_FACE", 0)
+    monkeypatch.setattr(lod_bounds, "SLOTS_EXTRA", slots)
     progressive = build_progressive(mesh, base_faces=1)
     points = lattice_points(plenty.vertex_pos[mesh.faces], 6)
     for lod in range(0, progressive.lod_max, 5):

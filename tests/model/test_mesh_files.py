@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from warp_abtree.model.mesh import MeshError, describe_mesh, load_mesh
+from warp_abtree.model.obj import parse_obj
 
 STL = b"solid\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
 
@@ -172,3 +173,30 @@ def test_source_errors(monkeypatch):
     ):
         with pytest.raises(MeshError, match=message):
             load_mesh(source)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "v 0 1 2.5\nvn 0 0 1\n# a\nv -1e-3 nan 1_0\nv 1 2 3\nf 1 2 3\n\nf 3 2 1",
+        "v 0 1 2\nv 0  1\nv 1 2 3 4\nf 1 2 3\n",
+        "v 0 1 2 \nv 1 1 1\nv 2 2 2\nf 1 2 3\nf 1 2 3 1\n",
+        "v 0 1 2\nv 1 1 1\nv 2 2 2\nf 1 2 -1\n",
+        "v 0 1 2\nf 1 1 99999999999999999999\n",
+        "v 0 1 2\nf 1/1 1/1 1/1\n",
+        "v 0 1 x\nf 1 1 1\n",
+        "v 0 1 2\nf 0 1 1\n",
+        "f 1 2 3\n",
+        "",
+    ],
+)
+def test_plain_files_are_read_as_any_others(text):
+    """A tab at the end of a file makes it no plain one."""
+
+    def read(data):
+        try:
+            return [array.tolist() for array in parse_obj(data, "here")]
+        except MeshError as error:
+            return str(error)
+
+    assert repr(read(text.encode())) == repr(read(text.encode() + b"\n\t\n"))

@@ -13,7 +13,7 @@ import pytest
 from helpers.scenes import add_objects
 
 import warp_abtree as ab
-from warp_abtree.query.cpu_threads import core_count
+from warp_abtree.checks.cpu_threads import core_count
 
 FORK = """
 import os, sys

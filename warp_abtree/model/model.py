@@ -9,7 +9,9 @@ import numpy as np
 
 from warp_abtree.checks.arguments import first_line, whole_number
 from warp_abtree.checks.atomic_write import atomic_write
+from warp_abtree.model.cache import LEAST_FACES, file_key, find_model, keep_model, mesh_key
 from warp_abtree.model.mesh import COORDINATE_MAX, COORDINATE_MIN, EXTENT_LIMITS, Mesh, load_mesh, mesh_from_arrays
+from warp_abtree.model.obj import split_file_name
 from warp_abtree.model.outward_error import OutwardError
 from warp_abtree.model.progressive import ProgressiveMesh, build_progressive
 from warp_abtree.model.tree import Tree, active_build
@@ -60,36 +62,55 @@ class Model:
         return f"Model({self.name!r}, {self.face_count:,} faces, LODs 0 .. {self.lod_max:,})"
 
     @classmethod
-    def load(cls, source, base_faces: int = 10, progress=None) -> "Model":
-        """Load a mesh and build its progressive mesh and AB-Tree.
+    def load(cls, source, base_faces: int = 10, progress=None, cache: bool = True) -> "Model":
+        """Load a mesh and build its progressive mesh and AB-Tree, or open the model that was built of it before.
+
+        Models of 1,000 faces and more are kept in $WARP_ABTREE_CACHE, by default ~/.cache/warp_abtree, at most 2 GiB of
+        them; "off" keeps none.
 
         Args:
             source: Path of anything trimesh reads (also gzipped), trimesh.Trimesh or Scene, "warp:bunny", "warp:bear",
                 "warp:rocks", or a `Mesh`. What `save` wrote is read by `open`.
             base_faces: Faces at which the collapse sequence stops.
             progress: Called as progress(stage, done, total) during long builds.
+            cache: Whether to look for the model in the cache, and to keep it there.
 
         Raises:
             MeshError: The mesh is missing, unreadable, empty or invalid.
             ValueError: base_faces is below 1.
         """
+        base_faces = whole_number(base_faces, "base_faces", 1, 2**62)
+        options = (FORMAT_VERSION, base_faces)
+        key = file_key(source, *options) if cache else None
+        model = find_model(key, cls.open)
+        if model is not None:
+            return cls(model.progressive, model.tree, split_file_name(Path(source))[0])
         mesh = source if isinstance(source, Mesh) else load_mesh(source)
-        progressive = build_progressive(mesh, base_faces=base_faces, progress=progress)
-        return cls(progressive, active_build(mesh.vertices, mesh.faces), mesh.name)
+        cache = cache and len(mesh.faces) >= max(LEAST_FACES, base_faces)
+        if cache and key is None:
+            key = mesh_key(mesh, *options)
+            model = find_model(key, cls.open)
+        if model is None:
+            trees = []
+            progressive = build_progressive(
+                mesh, base_faces, progress, then=lambda: trees.append(active_build(mesh.vertices, mesh.faces))
+            )
+            model = cls(progressive, trees[0], mesh.name)
+            if cache:
+                keep_model(key, _file_members(progressive, model.tree, mesh.name))
+        return model if model.name == mesh.name else cls(model.progressive, model.tree, mesh.name)
 
     @classmethod
-    def from_arrays(cls, vertices, faces, base_faces: int = 10, progress=None, name: str = "arrays") -> "Model":
+    def from_arrays(
+        cls, vertices, faces, base_faces: int = 10, progress=None, name: str = "arrays", cache: bool = True
+    ):
         """Build a model from vertices (v, 3) and faces (n, 3); see `load`."""
-        return cls.load(mesh_from_arrays(vertices, faces, name=name), base_faces, progress)
+        return cls.load(mesh_from_arrays(vertices, faces, name=name), base_faces, progress, cache)
 
     @cached_property
     def digest(self) -> str:
         """Hash of mesh, collapses and tree, hexadecimal; equal for equal models whatever their names."""
-        return _hash_arrays({name: value for name, value in self._arrays().items() if name != "name"}).hex()
-
-    def _arrays(self) -> dict[str, Any]:
-        arrays = {name: getattr(self.progressive, name) for name in _ARRAYS}
-        return arrays | {"leaf_node": self.tree.leaf_node, "name": np.array(self.name)}
+        return _hash_arrays(_model_arrays(self.progressive, self.tree)).hex()
 
     @property
     def face_count(self) -> int:
@@ -151,11 +172,8 @@ class Model:
 
     def save(self, path):
         """Write the model to an .npz file, atomically; raise OSError if that cannot be."""
-        arrays = self._arrays()
-        digest = np.frombuffer(_hash_arrays(arrays), np.uint8)
-        about: dict[str, Any] = {"format": np.array(FORMAT_NAME), "version": np.array(FORMAT_VERSION), "digest": digest}
         with atomic_write(path) as file:
-            np.savez_compressed(file, **about | arrays)
+            np.savez_compressed(file, **_file_members(self.progressive, self.tree, self.name))
 
     @classmethod
     def open(cls, path) -> "Model":
@@ -181,6 +199,17 @@ class Model:
         if not isinstance(digest, np.ndarray) or digest.tobytes() != _hash_arrays(arrays):
             raise ModelError(f"{path}: altered since it was saved")
         return model
+
+
+def _model_arrays(progressive: ProgressiveMesh, tree: Tree) -> dict[str, Any]:
+    return {name: getattr(progressive, name) for name in _ARRAYS} | {"leaf_node": tree.leaf_node}
+
+
+def _file_members(progressive: ProgressiveMesh, tree: Tree, name: str) -> dict[str, Any]:
+    """Return the arrays of a model file by name."""
+    arrays = _model_arrays(progressive, tree) | {"name": np.array(name)}
+    digest = np.frombuffer(_hash_arrays(arrays), np.uint8)
+    return {"format": np.array(FORMAT_NAME), "version": np.array(FORMAT_VERSION), "digest": digest} | arrays
 
 
 def _hash_arrays(arrays: dict) -> bytes:

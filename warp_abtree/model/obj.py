@@ -16,6 +16,8 @@ import warp as wp
 
 from warp_abtree.checks.arguments import first_line
 
+# How lines of plain OBJ files begin; in others, a `v` or `f` might stand behind a tab, say.
+PLAIN_STARTS = {b"", b"v ", b"f ", b"vn", b"vt", b"vp", b"# ", b"#", b"o ", b"g ", b"s ", b"us", b"mt"}
 WARP_ASSETS = ("bunny", "bear", "rocks")
 
 
@@ -66,8 +68,39 @@ def read_file(path: Path):
         raise MeshError(f"{path}: cannot be read as {kind}: {first_line(error)}") from None
 
 
+def _parse_plain_obj(data) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return vertices and triangles of an OBJ file where each `v` has three numbers and each `f` three plain indices.
+
+    None for any other file, and for one that has mistakes.
+    """
+    lines = data.splitlines()
+    if any(mark in data for mark in (b"\\", b"\t", b"\v", b"\f")) or not {line[:2] for line in lines} <= PLAIN_STARTS:
+        return None
+    points = _plain_triples([line[2:] for line in lines if line[:2] == b"v "], float)
+    corners = _plain_triples([line[2:] for line in lines if line[:2] == b"f "], int)
+    if points is None or corners is None or corners.min() <= 0:
+        return None
+    return points, corners - 1
+
+
+def _plain_triples(rows, number) -> np.ndarray | None:
+    """Return the numbers of rows that have three each with a blank between them, [n, 3]; None if one has not."""
+    if {row.count(b" ") for row in rows} != {2}:
+        return None
+    words = b" ".join(rows).split()
+    try:
+        # Two blanks make three words at most, so every row has three if there are as many in all.
+        kind = np.float64 if number is float else np.int64
+        return np.array(list(map(number, words)), kind).reshape(-1, 3) if len(words) == 3 * len(rows) else None
+    except (ValueError, OverflowError):
+        return None
+
+
 def parse_obj(data, where) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and triangles of an OBJ file; only `v` and `f` lines matter here."""
+    plain = _parse_plain_obj(data)
+    if plain is not None:
+        return plain
     vertices, corners, counts = [], [], []
     for number, line in enumerate(data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines(), start=1):
         fields = line.split()

@@ -2,7 +2,7 @@
 
 Rounding. A cut moves a corner of a polygon by at most sqrt(3) 2^-52 in a frame where coordinates are within 1/2; the
 parts then cover the polygon up to that distance, and after 192 nested cuts they cover the face up to 192 times that.
-Distances of corners are measured to points of original faces, both rounded. `progressive.ROUNDING` covers all of it.
+Distances of corners are measured to points of original faces, both rounded. `lod_bounds.ROUNDING` covers all of it.
 """
 
 from functools import cached_property
@@ -11,7 +11,8 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.progressive import outward_bound
-from warp_abtree.model.progressive import ROUNDING, cpu_array, find_frame, make_scratch
+from warp_abtree.model.cpu_arrays import cpu_array, find_frame, make_scratch
+from warp_abtree.model.lod_bounds import ROUNDING
 
 
 class OutwardError:

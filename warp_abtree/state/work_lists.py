@@ -21,7 +21,7 @@ TOP_THREADS = 512
 # ones, and of others. And blocks of a launch, at most.
 BLOCK_SLICE, BLOCK_FACES = 1024, 4096
 SMALL_DEPTH = 10
-SMALL_THREADS, SHALLOW_THREADS, THREADS = 64, 128, 1024
+SMALL_THREADS, SHALLOW_THREADS, THREADS = 64, 256, 1024
 BLOCKS_MOST = 8192
 # Fraction of the longest slice of a partial update that level lists take.
 LISTED_FRACTION = 0.1

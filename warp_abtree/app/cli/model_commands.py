@@ -1,21 +1,23 @@
 """`warp-abtree info` and `warp-abtree build`: what a mesh holds, and the model that is built of it."""
 
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.app.cli.arguments import MESHES, Parser, positive
+from warp_abtree.app.cli.arguments import MESHES, PROGRAM, Parser, positive
 from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.model.mesh import describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model
+from warp_abtree.model.obj import split_file_name
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import resolve_lod
 
 INFO_SUMMARY = "say what a mesh or a built model holds and what is odd about it"
 INFO_EXAMPLES = ("cow.obj", "cow.npz", "warp:bunny --json")
-BUILD_SUMMARY = "build a model from a mesh and save it"
-BUILD_EXAMPLES = ("cow.obj cow.npz --base-faces 100",)
+BUILD_SUMMARY = "build models from meshes and save them"
+BUILD_EXAMPLES = ("cow.obj cow.npz --base-faces 100", "*.obj models")
 LISTED_FRACTIONS = (0.5, 0.2, 0.1, 0.05, 0.01)  # of the faces, at which `build` prints the errors
 
 
@@ -65,20 +67,50 @@ def _describe_model(path) -> dict:
 
 def add_build_arguments(sub: Parser):
     """Add the arguments of `build`."""
-    sub.add_file("mesh", metavar="MESH", help=MESHES)
-    sub.add_file("out", metavar="OUT.npz", type=Path, help="file to write")
+    sub.add_file("mesh", metavar="MESH", nargs="+", help=f"{MESHES}; one after another")
+    sub.add_file("out", metavar="OUT", type=Path, help="file to write (.npz), or a folder for NAME.npz of each mesh")
     sub.add_argument("--base-faces", type=positive, default=10, metavar="N", help="faces of the coarsest LOD (10)")
 
 
 def build(options, progress):
-    """Build a model and save it."""
-    check_output(options.out, [".npz"])
+    """Build models and save them; a mesh that is bad costs a line on stderr, and the status in the end."""
+    several = len(options.mesh) > 1 or (options.out.is_dir() and options.out.suffix != ".npz")
+    files = [_model_file(options.out, mesh) for mesh in options.mesh] if several else [options.out]
+    for mesh, file in zip(options.mesh, files):
+        check_output(file, [".npz"])
+        if files.count(file) > 1:
+            raise ValueError(f"{file}: would be written for {mesh} and for another mesh")
     Scene(device=options.device)
+    if not several:
+        print_result(_build_file(options.mesh[0], options.out, options.base_faces, progress), options.json)
+        return 0
+    rows = []
+    for mesh, file in zip(options.mesh, files):
+        try:
+            rows.append(_build_file(mesh, file, options.base_faces, progress))
+        except (ValueError, OSError, MemoryError) as error:
+            progress.close()
+            print(f"{PROGRAM}: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
+    listed = ("file", "bytes", "faces", "vertices", "dropped_faces", "lods", "base_faces", "seconds")
+    shown = rows if options.json else [{key: row[key] for key in listed} for row in rows]
+    print_result({"models": shown, "failed": len(files) - len(rows)}, options.json)
+    return 2 if len(rows) < len(files) else 0
+
+
+def _model_file(folder, mesh) -> Path:
+    """Return where in a folder the model of a mesh is written."""
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: is no folder; several models are written to one")
+    return folder / f"{split_file_name(Path(mesh.removeprefix('warp:')))[0]}.npz"
+
+
+def _build_file(mesh, file, base_faces, progress) -> dict:
+    """Build a model, save it and say what it holds."""
     begin = time.perf_counter()
-    model = Model.load(options.mesh, base_faces=options.base_faces, progress=progress)
+    model = Model.load(mesh, base_faces=base_faces, progress=progress, cache=False)
     seconds = time.perf_counter() - begin
     progress.close()
-    model.save(options.out)
+    model.save(file)
     rows = []
     for fraction in LISTED_FRACTIONS:
         progress("outward bounds", len(rows), len(LISTED_FRACTIONS))
@@ -86,9 +118,9 @@ def build(options, progress):
         errors = {f"error_{side}": model.error_at(lod, side=side) for side in ("inward", "outward")}
         rows.append({"share": fraction, "lod": lod, "faces": active_count(model, lod), **errors})
     progress.close()
-    result = {
-        "file": str(options.out),
-        "bytes": options.out.stat().st_size,
+    return {
+        "file": str(file),
+        "bytes": file.stat().st_size,
         "faces": model.face_count,
         "vertices": model.vertex_count,
         "dropped_faces": len(model.dropped_faces),
@@ -98,4 +130,3 @@ def build(options, progress):
         "seconds": seconds,
         "errors": rows,
     }
-    print_result(result, options.json)

@@ -14,13 +14,14 @@ def core_count() -> int:
 
 
 @functools.cache
-def _workers(count: int):
+def workers(count: int):
+    """Return threads for work beside the calling one, the same for the same count."""
     return ThreadPoolExecutor(count, thread_name_prefix="warp_abtree")
 
 
 if hasattr(os, "register_at_fork"):
     # Threads do not come along into a forked child: it would wait for ever for those of its parent.
-    os.register_at_fork(after_in_child=_workers.cache_clear)
+    os.register_at_fork(after_in_child=workers.cache_clear)
 
 
 def launch_on_cores(launch, count, cores, least=1):
@@ -37,15 +38,15 @@ def launch_on_cores(launch, count, cores, least=1):
     deal = []
     try:
         for _ in range(1, cores):
-            deal.append(_workers(cores - 1).submit(launch))
+            deal.append(workers(cores - 1).submit(launch))
         launch()
     finally:
-        _wait_for(deal)
+        wait_for(deal)
     for job in deal:
         job.result()
 
 
-def _wait_for(jobs):
+def wait_for(jobs):
     """Wait until no thread touches the arrays of a launch any more, whatever interrupts that; raise it then."""
     interruption = None
     while not all(job.done() for job in jobs):

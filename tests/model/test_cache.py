@@ -1,0 +1,149 @@
+"""The cache of models: a mesh that comes again is opened, and nothing wrong with the folder is an error."""
+
+import os
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+
+import warp_abtree as ab
+from warp_abtree.model import cache
+from warp_abtree.model import model as model_module
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARP_ABTREE_CACHE", str(tmp_path / "models"))
+    return tmp_path / "models"
+
+
+@pytest.fixture
+def built(monkeypatch):
+    """Names of the meshes that were built, in order."""
+    names, build = [], model_module.build_progressive
+
+    def note(mesh, *options, **more):
+        names.append(mesh.name)
+        return build(mesh, *options, **more)
+
+    monkeypatch.setattr(model_module, "build_progressive", note)
+    return names
+
+
+@pytest.fixture
+def ball(tmp_path):
+    path = tmp_path / "ball.obj"
+    trimesh.creation.icosphere(3).export(path)  # 1,280 faces
+    return path
+
+
+def test_a_file_that_comes_again_is_opened(folder, built, ball):
+    first, second = ab.Model.load(ball), ab.Model.load(str(ball))
+    assert built == ["ball"] and len(list(folder.iterdir())) == 1
+    assert second.digest == first.digest and second.name == "ball" and second.error_at(7) == first.error_at(7)
+    shutil.copy(ball, ball.with_name("copy.obj"))
+    assert ab.Model.load(ball.with_name("copy.obj")).name == "copy" and built == ["ball"]
+
+
+def test_options_and_other_contents_build_anew(folder, built, ball):
+    ab.Model.load(ball)
+    assert ab.Model.load(ball, base_faces=100).progressive.active_count(0) > 50
+    trimesh.creation.icosphere(3, radius=2.0).export(ball)
+    assert np.ptp(ab.Model.load(ball).mesh_at(0)[0]) > 2.0
+    assert len(built) == 3 == len(list(folder.iterdir()))
+
+
+def test_arrays_and_meshes_are_found_by_what_they_hold(folder, built):
+    ball = trimesh.creation.icosphere(3)
+    models = [ab.Model.from_arrays(ball.vertices, ball.faces, name="a"), ab.Model.load(ball)]
+    assert len(built) == 1 and models[0].digest == models[1].digest
+    assert [model.name for model in models] == ["a", "trimesh"]
+
+
+def test_it_can_be_passed_by(folder, built, ball, monkeypatch):
+    ab.Model.load(ball, cache=False)
+    monkeypatch.setenv("WARP_ABTREE_CACHE", "off")
+    ab.Model.load(ball)
+    assert len(built) == 2 and not folder.exists()
+
+
+def test_small_models_are_not_kept(folder, built):
+    for _ in range(2):
+        ab.Model.load(trimesh.creation.box())
+    assert len(built) == 2 and not folder.exists()
+
+
+def test_where_the_folder_is(monkeypatch, tmp_path):
+    monkeypatch.setenv("WARP_ABTREE_CACHE", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache.cache_folder() == tmp_path / "warp_abtree"
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert cache.cache_folder() == tmp_path / "home" / ".cache" / "warp_abtree"
+    monkeypatch.setenv("WARP_ABTREE_CACHE", "~/models")
+    assert cache.cache_folder() == tmp_path / "home" / "models"
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:1000])
+
+
+def alter(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+
+
+def replace_by_another(path):
+    ball = trimesh.creation.icosphere(2)
+    ab.Model.load(ball).save(path.with_name("other.npz"))
+    os.replace(path.with_name("other.npz"), path)
+
+
+def swap_with_another_key(path):
+    """A whole file of the cache, under the name of another mesh."""
+    ab.Model.load(trimesh.creation.icosphere(3, radius=9.0))
+    (other,) = (file for file in path.parent.glob("*.npz") if file != path)
+    os.replace(other, path)
+
+
+@pytest.mark.parametrize("damage", [truncate, alter, replace_by_another, swap_with_another_key])
+def test_a_damaged_or_foreign_file_is_written_again(folder, built, ball, damage):
+    first = ab.Model.load(ball)
+    (path,) = folder.iterdir()
+    whole = path.stat().st_size
+    damage(path)
+    built.clear()
+    assert ab.Model.load(ball).digest == first.digest and built == ["ball"] and path.stat().st_size == whole
+    assert ab.Model.load(ball).digest == first.digest and built == ["ball"]
+
+
+def test_a_folder_that_cannot_be_written_is_no_error(folder, built, ball):
+    folder.write_text("a file")
+    assert ab.Model.load(ball).face_count == 1280 and folder.read_text() == "a file"
+
+
+def test_the_models_used_least_recently_go_first(folder, built, ball, monkeypatch):
+    paths = []
+    for k in range(3):
+        path = ball.with_name(f"ball{k}.obj")
+        trimesh.creation.icosphere(3, radius=2.0 + k).export(path)
+        ab.Model.load(path)
+        paths.append(path)
+        for i, file in enumerate(sorted(folder.iterdir(), key=lambda file: file.stat().st_mtime_ns)):
+            os.utime(file, (1000 + i, 1000 + i))
+    ab.Model.load(paths[0])  # used now
+    size = max(file.stat().st_size for file in folder.iterdir())
+    monkeypatch.setattr(cache, "SIZE_LIMIT", int(2.5 * size))
+    ab.Model.load(ball)
+    built.clear()
+    for path in (paths[0], ball):
+        ab.Model.load(path)
+    assert built == [] and len(list(folder.iterdir())) == 2
+
+
+def test_a_model_beyond_the_limit_is_not_kept(folder, built, ball, monkeypatch):
+    monkeypatch.setattr(cache, "SIZE_LIMIT", 1000)
+    ab.Model.load(ball)
+    assert not folder.exists()

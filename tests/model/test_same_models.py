@@ -1,0 +1,107 @@
+"""Models keep their bits: digests that were recorded once, by any number of threads, and on either path of the bounds.
+
+The meshes have coordinates of few bits, and a build adds, multiplies, divides and takes square roots alone: the digests
+are the same on every machine.
+"""
+
+import numpy as np
+import pytest
+from conftest import real_mesh_path
+
+import warp_abtree as ab
+from warp_abtree import testing
+from warp_abtree.kernels.progressive.triangle_cover import COVERS_AT_ONCE, SLOTS
+from warp_abtree.model import lod_bounds
+
+
+def height_field(side, height):
+    """A grid of side^2 squares whose heights are whole numbers over 64: the same bits on every machine."""
+    x, y = np.meshgrid(np.arange(side + 1), np.arange(side + 1), indexing="ij")
+    corner = x[:-1, :-1] * (side + 1) + y[:-1, :-1]
+    faces = np.concatenate(
+        [
+            np.stack([corner, corner + side + 1, corner + side + 2], -1).reshape(-1, 3),
+            np.stack([corner, corner + side + 2, corner + 1], -1).reshape(-1, 3),
+        ]
+    )
+    return np.stack([x, y, height(x, y) / 64], -1).reshape(-1, 3), faces
+
+
+def waves(side):
+    """Hills of cubic profile and some roughness."""
+    return height_field(
+        side, lambda x, y: (x % 16) * (16 - x % 16) * 2 + (y % 24) * (24 - y % 24) + (x * x * 7 + y * 13) % 5
+    )
+
+
+def bent_tube(around, along):
+    """A closed tube of square section with rough sides."""
+    i, j = np.meshgrid(np.arange(around), np.arange(along), indexing="ij")
+    quarter, step = i * 4 // around, i * 4 % around
+    x = np.choose(quarter, [step, around + 0 * step, around - step, 0 * step])
+    y = np.choose(quarter, [0 * step, step, around + 0 * step, around - step])
+    z = 16 * j + (i * i + 3 * j * j) % 7
+    next_i, next_j = (i + 1) % around, j[:, :-1] + 1
+    a, b = i * along + j, next_i * along + j
+    a, b, c, d = a[:, :-1], b[:, :-1], (next_i * along)[:, :-1] + next_j, (i * along)[:, :-1] + next_j
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    return np.stack([x * 16 + j * j % 11, y * 16, z], -1).reshape(-1, 3) / 64, faces
+
+
+def crowd(count):
+    """Tetrahedra of many sizes, some of them apart, and a fan of many faces about one vertex."""
+    corner = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    face = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    k = np.arange(count)
+    place = np.stack([k * 37 % 61, k * 53 % 67, k * 29 % 71], -1) / 8
+    vertices = (corner[None] * (1 + k % 5)[:, None, None] / 4 + place[:, None]).reshape(-1, 3)
+    rim = np.arange(96)
+    round_ = np.stack([rim * 8 % 96, np.abs(rim - 48), rim % 3], -1) / 16
+    hub = 4 * count + 96
+    fan = np.stack([np.full(96, hub), 4 * count + rim, 4 * count + (rim + 1) % 96], -1)
+    return np.concatenate([vertices, round_, [[3.0, 1.0, 2.0]]]), np.concatenate(
+        [(face[None] + 4 * k[:, None, None]).reshape(-1, 3), fan]
+    )
+
+
+MESHES = {
+    "waves": lambda: waves(48),
+    "flat": lambda: height_field(24, lambda x, y: 0 * x),
+    "tube": lambda: bent_tube(32, 40),
+    "crowd": lambda: crowd(60),
+}
+DIGESTS = {
+    "waves": "c502b59ae511681a602724b4d81bbb12f9324ee36195a41573484d711de48495",
+    "flat": "01fb648983cb8f63f9f962b2aa8e6330114f738e8146cd108bf529e4089134c0",
+    "tube": "f0b36ad2490031a08dfd7d3d6a359e0147fdb5663068d1166a359cece3ac7a59",
+    "crowd": "bb5a67bf343dd561d4f6aef485a85e48555b6c6c08216269054ac6a6ad4746b3",
+    "cow": "2244ef0de14da370",
+    "fandisk": "3be06187dd46905d",
+    "homer": "3efc9392b8d6e3d0",
+    "stanford-bunny": "0a4506ca28903db5",
+}
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("name", MESHES)
+def test_a_model_keeps_its_digest(name, threads, monkeypatch):
+    monkeypatch.setattr(lod_bounds, "LEAST_FACES", 1)  # four cores and more work in windows
+    with testing.regime(cpu_threads=threads):
+        assert ab.Model.from_arrays(*MESHES[name](), base_faces=4).digest == DIGESTS[name]
+
+
+@pytest.mark.parametrize("mesh", [waves(16), bent_tube(16, 12), crowd(30)], ids=["waves", "tube", "crowd"])
+def test_covers_of_one_face_at_a_time_give_the_same(mesh, monkeypatch):
+    """Where slots may run out, triangles are covered face by face: the same arithmetic without vectors."""
+    first = ab.Model.from_arrays(*mesh, base_faces=4)
+    monkeypatch.setattr(lod_bounds, "SLOTS_PER_FACE", 0)
+    monkeypatch.setattr(lod_bounds, "SLOTS_EXTRA", int(COVERS_AT_ONCE * SLOTS) - 1)
+    assert ab.Model.from_arrays(*mesh, base_faces=4).digest == first.digest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cow", "fandisk", "homer", "stanford-bunny"])
+@pytest.mark.parametrize("threads", [2, 5])
+def test_a_real_model_keeps_its_digest(name, threads):
+    with testing.regime(cpu_threads=threads):
+        assert ab.Model.load(real_mesh_path(name)).digest.startswith(DIGESTS[name])

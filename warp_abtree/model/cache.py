@@ -1,0 +1,112 @@
+"""Models that were built before, kept in a folder: a mesh that comes again is opened instead of built.
+
+The folder is $WARP_ABTREE_CACHE if that is set, and none if it is "off"; else $XDG_CACHE_HOME/warp_abtree, else
+~/.cache/warp_abtree. It may be deleted at any time. Nothing that goes wrong with it is an error: the model is built.
+"""
+
+import contextlib
+import hashlib
+import os
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from warp_abtree.checks.atomic_write import atomic_write, sweep_up
+from warp_abtree.checks.version import __version__
+from warp_abtree.model.obj import split_file_name
+
+VARIABLE = "WARP_ABTREE_CACHE"
+SIZE_LIMIT = 2 << 30  # bytes in the folder; the models that were used least recently go
+LEAST_FACES = 1_000  # smaller models are built as fast as opened
+SELF_CONTAINED = {"obj", "ply", "stl", "off", "glb"}  # other formats may refer to further files
+
+
+def cache_folder() -> Path | None:
+    """Return the folder of the cache, None if it is off or nowhere."""
+    named = os.environ.get(VARIABLE, "")
+    if named:
+        return None if named.lower() == "off" else Path(named).expanduser()
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    if os.path.isabs(base):
+        return Path(base) / "warp_abtree"
+    try:
+        return Path.home() / ".cache" / "warp_abtree"
+    except RuntimeError:  # no home
+        return None
+
+
+def file_key(source, *options) -> str | None:
+    """Return the key of a model built of a mesh file; None if the file's bytes alone do not decide it."""
+    if not isinstance(source, str | os.PathLike):
+        return None
+    path = Path(source)
+    kind = split_file_name(path)[1:]
+    if kind[0] not in SELF_CONTAINED:
+        return None
+    try:
+        return _key([path.read_bytes()], kind, None if kind[0] == "obj" else trimesh.__version__, *options)
+    except OSError:
+        return None
+
+
+def mesh_key(mesh, *options) -> str:
+    """Return the key of a model built of a `Mesh`."""
+    return _key([mesh.vertices.tobytes(), mesh.faces.tobytes()], len(mesh.vertices), *options)
+
+
+def _key(parts, *options) -> str:
+    found = hashlib.blake2b(repr((__version__, *options)).encode(), digest_size=20)
+    for part in parts:
+        found.update(hashlib.blake2b(part).digest())
+    return found.hexdigest()
+
+
+def find_model(key, open_model):
+    """Return what `open_model` makes of the file of a key, None if there is none that is whole."""
+    path = _path(key)
+    if path is None:
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if str(file["key"]) != key:
+                return None
+        model = open_model(path)
+    except Exception:  # NumPy's readers raise whatever goes wrong inside them
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)  # used now
+    return model
+
+
+def keep_model(key, arrays):
+    """Write the arrays of a model to the file of a key, and make room for it."""
+    path = _path(key)
+    if path is None or sum(value.nbytes for value in arrays.values()) > SIZE_LIMIT:
+        return
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        sweep_up(path.parent)
+        with atomic_write(path) as file:
+            np.savez(file, key=np.array(key), **arrays)  # compressing takes longer than building
+        _make_room(path)
+
+
+def _path(key) -> Path | None:
+    folder = cache_folder()
+    return None if folder is None or key is None else folder / f"{key}.npz"
+
+
+def _make_room(newest):
+    """Remove the models that were used least recently, but not the newest, until the rest is within the limit."""
+    files = []
+    for path in newest.parent.glob("*.npz"):
+        with contextlib.suppress(OSError):
+            about = path.stat()
+            files.append((path != newest, -about.st_mtime_ns, about.st_size, path))
+    total = 0
+    for other, _, size, path in sorted(files):
+        total += size
+        if total > SIZE_LIMIT and other:
+            with contextlib.suppress(OSError):
+                path.unlink()

@@ -1,0 +1,136 @@
+"""The collapse sequence of a mesh: run in launches of so many merges, which another thread may follow.
+
+Source: Garland and Heckbert 1997.
+"""
+
+import threading
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels.progressive import collapse
+from warp_abtree.kernels.progressive.heap import Heap
+from warp_abtree.kernels.progressive.quadric import Quadric
+from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings
+
+# Merges per launch.
+MERGES = 25_000
+# Entries of the heap at first: for each edge, and beyond these.
+HEAP_PER_EDGE, HEAP_EXTRA = 2, 256
+
+
+class Collapse:
+    """The collapse of a mesh.
+
+    Attributes:
+        frame: Centre and scale of normalised positions [model units].
+        pos: Positions of all nodes, normalised, float64 [2 n_v, 3]; those of the merges that `follow` returned stand.
+        pair: The two nodes of each merge, the lower one first, int32 [n_v, 2].
+        goal: Faces to be removed.
+    """
+
+    def __init__(self, vertices, faces, base_faces):
+        self.frame = centre, scale = find_frame(vertices)
+        pos = (vertices - centre) / scale
+        self.vertex_count, self.base_faces = len(pos), base_faces
+        edges, boundary = _edges(faces)
+        face_array = cpu_array(faces, int)
+        self._surface = surface = collapse.Surface()
+        self.pos = np.concatenate([pos, np.zeros_like(pos)])
+        surface.pos = wp.array(self.pos, dtype=wp.vec3d, device="cpu", copy=False)
+        surface.quadric = wp.zeros(2 * len(pos), dtype=Quadric, device="cpu")
+        surface.parent = filled(2 * len(pos), -1)
+        surface.stamp = filled(2 * len(pos), -1)
+        self._merge_pair = filled((len(pos), 2), 0, wp.vec2i)
+        self.pair = self._merge_pair.numpy()  # shares the memory
+        self._rings = linked_rings(faces, face_array, 2 * len(pos))
+        launch(collapse.weigh_faces_kernel, len(faces), face_array, cpu_array(boundary, wp.int8), surface)
+        self._heap = _new_heap(np.resize(edges, HEAP_PER_EDGE * len(edges) + HEAP_EXTRA))
+        launch(collapse.price_edges_kernel, len(edges), self._heap.pair, surface, self._heap.key)
+        self._start_live = int(are_distinct(faces).sum())
+        state = np.array([len(edges), 0, self._start_live, collapse.RUNNING], dtype=np.int32)
+        self._counter = cpu_array(state, int)
+        launch(collapse.compact_heap_kernel, surface, self._heap, self._counter)
+        self._state = self._counter.numpy()  # shares the memory
+        self.goal = max(self._start_live - base_faces, 1)
+        self._merges, self._removed, self._ended, self._stopped = 0, 0, False, False
+        self._moved = threading.Condition()
+
+    def run(self):
+        """Collapse to the base mesh, or until `stop`; return whether the base mesh was reached."""
+        for _ in self.steps():
+            pass
+        return self._state[3] == int(collapse.FINISHED)
+
+    def steps(self):
+        """Do the same, and yield how many faces are removed after each launch."""
+        try:
+            while self._state[3] != int(collapse.FINISHED) and not self._stopped:
+                if self._state[3] == int(collapse.HEAP_FULL):
+                    self._make_room()
+                limits = [self.vertex_count, self.base_faces, MERGES, len(self._heap.key)]
+                changed = [self._surface, self._rings, self._heap, self._counter, self._merge_pair]
+                launch(collapse.collapse_edges_kernel, *limits, *changed)
+                self._publish(ended=False)
+                yield self._removed
+        finally:
+            self._publish(ended=True)
+
+    def _publish(self, ended):
+        with self._moved:
+            self._merges, self._ended = int(self._state[1]), ended
+            self._removed = min(self._start_live - int(self._state[2]), self.goal)
+            self._moved.notify_all()
+
+    def follow(self, merges):
+        """Wait until there are more merges than so many, or the end; return how many, faces removed, if it ended."""
+        with self._moved:
+            self._moved.wait_for(lambda: self._ended or self._merges > merges)
+            return self._merges, self._removed, self._ended
+
+    def stop(self):
+        """Let `run` end after the launch under way."""
+        self._stopped = True
+
+    def parents(self):
+        """Return vertex_parent, int32 [n_v+m]."""
+        return self._surface.parent.numpy()[: self.vertex_count + self._merges].copy()
+
+    def _make_room(self):
+        """Drop stale entries; take a larger heap if more than three quarters or the next merge's edges do not fit."""
+        heap, before = self._heap, int(self._state[0])
+        launch(collapse.compact_heap_kernel, self._surface, heap, self._counter)
+        size, capacity = int(self._state[0]), len(heap.key)
+        if 4 * size <= 3 * capacity < 4 * before:
+            return
+        self._heap = _new_heap(np.zeros(capacity + capacity // 2 + 64, np.int64))
+        wp.copy(self._heap.key, heap.key, count=size)
+        wp.copy(self._heap.pair, heap.pair, count=size)
+
+
+def _new_heap(pairs):
+    heap = Heap()
+    heap.pair = cpu_array(pairs, wp.int64)
+    heap.key = wp.zeros(len(pairs), dtype=wp.float64, device="cpu")
+    return heap
+
+
+def are_distinct(faces):
+    """Return which faces have three distinct corners."""
+    return (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+
+
+def _edges(faces):
+    """Return the packed edges of the faces with three corners, ascending, and which corners start a boundary edge."""
+    valid = are_distinct(faces)
+    start, end = faces.astype(np.int64), np.roll(faces, -1, axis=1).astype(np.int64)
+    pair = (np.minimum(start, end) << 32) | (np.maximum(start, end) << 2)
+    slot = np.flatnonzero(np.repeat(valid, 3))
+    pair = pair.reshape(-1)[slot]
+    order = np.argsort(pair)
+    pair = pair[order]
+    first = np.flatnonzero(np.concatenate([[True], pair[1:] != pair[:-1]]))
+    single = np.diff(np.append(first, len(pair))) == 1
+    boundary = np.zeros(faces.size, dtype=np.int8)
+    boundary[slot[order[first[single]]]] = 1
+    return pair[first], boundary.reshape(faces.shape)
