@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 
 FOLDER = Path(__file__).parent / "native"
-INCLUDE = re.compile(r'^ *#include "([\w.]+)"\n', re.M)
+INCLUDE = re.compile(r'^ *#include "([\w./]+)"\n', re.M)
 FUNCTION = re.compile(r"^[^\s#/][^\n]*? (\w+)\(([^()]*)\) \{\n(.*?)^\}", re.M | re.S)
 TEMPLATE = re.compile(r"<[^<>]*>")
 

@@ -82,7 +82,7 @@ class Covers:
     limit: wp.array(dtype=wp.float64)  # [rows], squared running maximum after each triangle
 
 
-@wp.func_native(native.body("cover_ring.h", "cover_ring"))
+@wp.func_native(native.body("covers/cover_ring.h", "cover_ring"))
 def cover_ring(
     replay: Replay,
     covers: Covers,

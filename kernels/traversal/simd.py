@@ -52,12 +52,12 @@ long_counts = wp.types.vector(length=4, dtype=wp.int64)
 three_numbers = wp.types.vector(length=3, dtype=wp.int64)
 
 
-@wp.func_native(native.body("simd_subtrees.h", "take_thread"))
+@wp.func_native(native.body("simd/subtrees.h", "take_thread"))
 def take_thread(counter: wp.array(dtype=wp.int32)) -> wp.int32:
     """Return the number of a thread that no other thread of a launch has."""
 
 
-@wp.func_native(native.body("simd_descend.h", "descend"))
+@wp.func_native(native.body("simd/descend.h", "descend"))
 def descend(
     states: StatePool,
     pose: PairPose,
@@ -76,7 +76,7 @@ def descend(
     """
 
 
-@wp.func_native(native.body("simd_descend.h", "move_below"))
+@wp.func_native(native.body("simd/descend.h", "move_below"))
 def move_below(
     floors: wp.vec2i, top: wp.int32, stack: wp.array(dtype=wp.int64), below: wp.array(dtype=wp.int64)
 ) -> wp.vec2i:
@@ -86,7 +86,7 @@ def move_below(
     """
 
 
-@wp.func_native(native.body("simd_subtrees.h", "open_subtrees"))
+@wp.func_native(native.body("simd/subtrees.h", "open_subtrees"))
 def open_subtrees(
     models: ModelPool,
     states: StatePool,
@@ -98,7 +98,7 @@ def open_subtrees(
     """Choose the directions of slabs for an object pair; return its floors, see `move_below`."""
 
 
-@wp.func_native(native.body("simd_subtrees.h", "descend_subtrees"))
+@wp.func_native(native.body("simd/subtrees.h", "descend_subtrees"))
 def descend_subtrees(
     models: ModelPool,
     states: StatePool,
@@ -116,7 +116,7 @@ def descend_subtrees(
     """
 
 
-@wp.func_native(native.body("simd_float32_filter.h", "simd_float32_filter"))
+@wp.func_native(native.body("simd/float32_filter.h", "simd_float32_filter"))
 def simd_float32_filter(
     models: ModelPool,
     states: StatePool,
@@ -136,7 +136,7 @@ def simd_float32_filter(
     """
 
 
-@wp.func_native(native.body("simd_float64_filter.h", "simd_float64_filter"))
+@wp.func_native(native.body("simd/float64_filter.h", "simd_float64_filter"))
 def simd_float64_filter(
     models: ModelPool,
     states: StatePool,

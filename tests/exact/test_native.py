@@ -85,7 +85,7 @@ def test_ptx_of_the_traversal_is_not_contracted(tmp_path, case):
     assert set(find_contraction(text)) <= asked
 
 
-FILES = sorted(path.name for path in native.FOLDER.iterdir())
+FILES = sorted(path.relative_to(native.FOLDER).as_posix() for path in native.FOLDER.rglob("*.*h"))
 
 
 def test_every_function_has_one_stub_of_its_name_and_parameters():

@@ -7,11 +7,11 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device
-from warp_abtree.checks.cpu_threads import core_count
 from warp_abtree.checks.regime import Regime, current_regime
 from warp_abtree.kernels import poses
 from warp_abtree.kernels.traversal import face_pairs, simd
 from warp_abtree.query.broad_phase import BroadPhase
+from warp_abtree.checks.cpu_threads import core_count
 from warp_abtree.query.request import check_pair_room, check_within
 from warp_abtree.query.result import COUNTERS
 from warp_abtree.state.batch import Batch

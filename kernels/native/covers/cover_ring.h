@@ -1,7 +1,7 @@
 // Cover original triangles with the faces about a merge: what `cover_queued` does one face at a time, 8 at a time.
 #pragma once
 #include "builtin.h"
-#include "polygon_cuts.h"
+#include "covers/polygon_cuts.h"
 
 template <class Replay, class Covers>
 wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge, wp::int32 near_begin,
@@ -10,7 +10,7 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
 #if defined(__CUDA_ARCH__)
     __trap();  // models are built on the host
 #else
-#include "polygon_cuts.h"
+#include "covers/polygon_cuts.h"
     typedef FaceLanes::lanes lanes;
     if (near_count > NEAR_ROOM)
         return begin;

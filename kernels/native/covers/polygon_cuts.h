@@ -1,7 +1,7 @@
 // Convex polygons on a stack, cut by planes; new corners are measured at once.
 #pragma once
 #include "builtin.h"
-#include "near_faces.h"
+#include "covers/near_faces.h"
 
 struct PolygonCuts {
     NearFaces near;

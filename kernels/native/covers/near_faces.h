@@ -1,7 +1,7 @@
 // The faces about a merge as groups of 8, and their distances to the corners of polygons.
 #pragma once
 #include "builtin.h"
-#include "face_lanes.h"
+#include "covers/face_lanes.h"
 #include "sizes.h"
 
 // A corner of a polygon, and where its distances to the faces stand.

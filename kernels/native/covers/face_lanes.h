@@ -1,7 +1,7 @@
 // 8 faces in lanes of float64: the distance of a point to each of them, and the planes of the prism over each.
 #pragma once
 #include "builtin.h"
-#include "simd_float64.h"
+#include "simd/float64.h"
 
 struct FaceLanes {
     typedef Float64::lanes lanes;

@@ -2,7 +2,7 @@
 #pragma once
 #include "builtin.h"
 #include "sizes.h"
-#include "simd_float64.h"
+#include "simd/float64.h"
 
 template <class ModelPool, class StatePool, class PairPose>
 wp::vec_t<3, wp::int64> simd_float64_filter(ModelPool models, StatePool states, PairPose pose, bool first_ends,
@@ -15,7 +15,7 @@ wp::vec_t<3, wp::int64> simd_float64_filter(ModelPool models, StatePool states, 
     {
 #pragma clang fp contract(off)
 #include "sizes.h"
-#include "simd_float64.h"
+#include "simd/float64.h"
         typedef Float64 F;
         typedef F::lanes lanes;
         typedef F::bits bits;

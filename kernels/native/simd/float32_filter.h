@@ -1,7 +1,7 @@
 // The float32 filter of the CPU: 16 face pairs at a time, as `float32_filter_triangles` one by one.
 #pragma once
 #include "builtin.h"
-#include "simd_float32.h"
+#include "simd/float32.h"
 
 template <class ModelPool, class StatePool, class PairPose>
 wp::vec_t<3, wp::int64> simd_float32_filter(ModelPool models, StatePool states, PairPose pose, wp::float32 error,
@@ -13,7 +13,7 @@ wp::vec_t<3, wp::int64> simd_float32_filter(ModelPool models, StatePool states, 
 #else
     {
 #pragma clang fp contract(off)
-#include "simd_float32.h"
+#include "simd/float32.h"
         typedef Float32 F;
         typedef F::lanes lanes;
         typedef F::bits bits;

@@ -1,7 +1,7 @@
 // The dual-tree traversal of the CPU inside subtrees, by slabs: as `descend`, four pairs of nodes at a time.
 #pragma once
 #include "builtin.h"
-#include "simd_slabs.h"
+#include "simd/slabs.h"
 
 wp::int32 take_thread(wp::array_t<wp::int32> counter) {
 #if defined(__CUDA_ARCH__)
@@ -18,7 +18,7 @@ wp::vec_t<2, wp::int32> open_subtrees(ModelPool models, StatePool states, PairPo
 #if defined(__CUDA_ARCH__)
     __trap();  // warps have a traversal of their own
 #else
-#include "simd_slabs.h"
+#include "simd/slabs.h"
     const Slabs::Memory kept = Slabs::find_memory(memory.data, memory.shape[1], thread);
     const Slabs::Box* nodes = (const Slabs::Box*)states.node_box.data;
     if (first || kept.header[0] != pose.node_a + 1) {
@@ -69,7 +69,7 @@ wp::vec_t<3, wp::int64> descend_subtrees(ModelPool models, StatePool states, Pai
     __trap();  // warps have a traversal of their own
 #else
     {
-#include "simd_slabs.h"
+#include "simd/slabs.h"
         typedef Slabs::lanes lanes;
         typedef Slabs::Record Record;
         typedef int ints __attribute__((vector_size(32)));
