@@ -78,7 +78,8 @@ struct Slabs {
                                        5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25,
                                        26, 27, 28, 29, 30, 31);
     }
-    static void fill(const Side& side, const void* near, unsigned int root, Record* records) {
+    // Kept out of the traversal: inlined, it takes registers from the loops that every object pair runs through.
+    __attribute__((noinline)) static void fill(const Side& side, const void* near, unsigned int root, Record* records) {
         unsigned int nodes[2 * SUBTREE_LEAVES];
         int count = 1;
         nodes[0] = root;
@@ -134,7 +135,8 @@ struct Slabs {
             normal[k] = size > 0.0 ? (float)(n[k] / size) : 0.0f;
     }
     // The axes, and normals of the faces of A from which those of other faces differ least.
-    static void choose_axes(const Box* tree, const void* corners, const void* near, float* axes) {
+    __attribute__((noinline)) static void choose_axes(const Box* tree, const void* corners, const void* near,
+                                                      float* axes) {
         constexpr int GROUPS = SLAB_SAMPLES / 16;
         float normal[3][SLAB_SAMPLES];
         lanes angle[SLAB_SAMPLES][GROUPS];  // sines
