@@ -49,6 +49,7 @@ def time_outputs(device, model, count, distance, repeats):
             query = ab.ContactQuery(scene, pairs, capacity)
         else:
             query = ab.Query(scene, output, pairs=pairs, capacity=capacity)
+        query.grow()
         compare(unpacked(query, pairs), found, scene.intersect(pairs, output, device=True))
         runs = make_runs({"launches": query.launch}, device)
         runs["intersect"] = time_call(Keeper(lambda output=output: scene.intersect(pairs, output)), device)

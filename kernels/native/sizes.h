@@ -62,8 +62,8 @@ constexpr int UNCERTAIN = 8;
 constexpr double COORDINATE_MIN = 0x1p-290;
 constexpr double BOUND_3D = 0x1.0000000000008p-50;
 
-// Certified errors: faces about a merge, distances of corners to them, corners of a polygon, polygons on the stack, faces
-// that cover a triangle, cuts of one, and triangles covered at once.
+// Certified errors: faces about a merge, distances of corners to them, corners of a polygon, polygons on the stack,
+// faces that cover a triangle, cuts of one, and triangles covered at once.
 constexpr int NEAR_ROOM = 64;
 constexpr int DISTANCE_ROOM = 8192;
 constexpr int POLYGON_CORNERS = 16;

@@ -46,8 +46,8 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
                 if (least > limit)
                     return false;  // another face may be nearer
                 const double enough = 1.1 * least > limit ? 1.1 * least : limit;
-                final = bound <= enough || split >= COVER_CUTS || top + 4 >= POLYGON_STACK ||
-                        p.count + 4 > POLYGON_CORNERS;
+                final =
+                    bound <= enough || split >= COVER_CUTS || top + 4 >= POLYGON_STACK || p.count + 4 > POLYGON_CORNERS;
             }
             if (final) {
                 int at = 0;

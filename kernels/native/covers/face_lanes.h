@@ -53,8 +53,7 @@ struct FaceLanes {
     static lanes edge_distance_sq(const Point& p, const Point& start, const Point& along, lanes t, const lanes& size) {
         const lanes zero = {}, one = zero + 1.0;
         t = size > 0.0 ? lower(higher(t / size, zero), one) : zero;
-        const Point to =
-            Float64::minus(p, Point{start.x + along.x * t, start.y + along.y * t, start.z + along.z * t});
+        const Point to = Float64::minus(p, Point{start.x + along.x * t, start.y + along.y * t, start.z + along.z * t});
         return dot(to, to);
     }
     // As `triangle_distance_sq`.
@@ -66,14 +65,14 @@ struct FaceLanes {
         const bits at_a = (d1 <= 0.0) & (d2 <= 0.0), at_b = (d3 >= 0.0) & (d4 <= d3), at_c = (d6 >= 0.0) & (d5 <= d6);
         const bits inside = (va > 0.0) & (vb > 0.0) & (vc > 0.0) & (total > thin);
         const lanes v = vb / total, w = vc / total;
-        const Point over = Float64::minus(p, Point{a.x + ab.x * v + ac.x * w, a.y + ab.y * v + ac.y * w,
-                                                   a.z + ab.z * v + ac.z * w});
+        const Point over =
+            Float64::minus(p, Point{a.x + ab.x * v + ac.x * w, a.y + ab.y * v + ac.y * w, a.z + ab.z * v + ac.z * w});
         lanes found = dot(over, over);
         if (Float64::to_mask(at_a | at_b | at_c | inside) != 255) {
             const Point ca = Float64::minus(a, c);
-            const lanes edges = lower(edge_distance_sq(p, a, ab, d1, ab_sq),
-                                      lower(edge_distance_sq(p, b, bc, dot(bp, bc), bc_sq),
-                                            edge_distance_sq(p, c, ca, dot(cp, ca), ac_sq)));
+            const lanes edges = lower(
+                edge_distance_sq(p, a, ab, d1, ab_sq),
+                lower(edge_distance_sq(p, b, bc, dot(bp, bc), bc_sq), edge_distance_sq(p, c, ca, dot(cp, ca), ac_sq)));
             found = inside ? found : edges;
         }
         found = at_c ? dot(cp, cp) : found;

@@ -62,9 +62,7 @@ struct NearFaces {
         const lanes place_in = {0, 1, 2, 3, 4, 5, 6, 7};
         return place_in < double(count - 8 * g) ? found : lanes{} + __builtin_inf();
     }
-    static int lane_of(const lanes& found, double value) {
-        return __builtin_ctz(Float64::to_mask(found == value));
-    }
+    static int lane_of(const lanes& found, double value) { return __builtin_ctz(Float64::to_mask(found == value)); }
     // As `point_nearest_face`.
     int nearest(const double* row, double& least) const {
         int best = -1;
