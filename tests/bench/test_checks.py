@@ -8,6 +8,7 @@ from bench.cases import query, scale, sweep, update
 from bench.meshes import knot_model
 from bench.shapes import pair_poses, random_poses, scene_of_objects, scene_of_pairs
 from bench.verify import count_differences
+from warp_abtree import testing
 from warp_abtree.state import lod_update, work_lists
 
 pytestmark = pytest.mark.slow
@@ -82,6 +83,11 @@ def test_worlds_alone_notice_a_lost_hit(device):
 
 def test_an_update_that_forgets_nodes_is_noticed(device, monkeypatch):
     model = knot_model(300)
+    with testing.regime(block_updates=False):
+        run_forgetting(device, monkeypatch, model)
+
+
+def run_forgetting(device, monkeypatch, model):
     scene = ab.Scene(device)
     scene.add(model)
     move = scene, [model.lod_max - 5], [model.lod_max], model.face_count

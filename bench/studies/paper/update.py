@@ -23,9 +23,9 @@ CONFIGURATIONS = (("touching", 0.001), ("light", 0.03), ("deep", 0.2))
 def run_figure_6(context):
     """Yield one row a model and k.
 
-    A model goes from its finest level of detail to a coarser one; k faces change. Marking and refit are timed alone, as
-    the paper's figure 6 has them, as captured launches (one core on the CPU), beside a refit of the whole tree. Nodes
-    are counted by the marking itself.
+    A model goes from its finest level of detail to a coarser one; k faces change. For figure 6 updates are repeated at
+    a LOD that is reached, where refinement finds nothing to do, as captured launches (one core on the CPU), beside those
+    of the whole tree. Nodes are counted by the marking itself.
     """
     for model in paper_models(context):
         context.progress(model.name)
@@ -52,8 +52,8 @@ def time_move(context, scene, model, home, there):
     # In turn, at the same LOD: a refit repeated alone is one that the processor knows by heart.
     times = context.time_graphs({"refit": part, "full": whole})
     scene.set_lods([home])
-    forth, back = launches["update"]
-    moved = context.time_graphs({"there": forth, "between": whole, "back": back, "after": whole})
+    (forth, back), (between, after) = launches["update"], launches["full"]
+    moved = context.time_graphs({"there": forth, "between": between, "back": back, "after": after})
     upload_lods(scene)
     row = {"case": "move", "from_finest": home == model.lod_max, "model": model.name, "faces": model.face_count}
     row |= {"splits": home - there, "k": int(k[0]), "share": k[0] / model.face_count, "entries": entries}
