@@ -24,8 +24,8 @@ def run_figure_6(context):
     """Yield one row a model and k.
 
     A model goes from its finest level of detail to a coarser one; k faces change. For figure 6 updates are repeated at
-    a LOD that is reached, where refinement finds nothing to do, as captured launches (one core on the CPU), beside those
-    of the whole tree. Nodes are counted by the marking itself.
+    the LOD that they reach, where refinement finds nothing to do, as captured launches (one core on the CPU), beside
+    those of the whole tree. Nodes are counted by the marking itself.
     """
     for model in paper_models(context):
         context.progress(model.name)
