@@ -136,7 +136,12 @@ def test_the_models_used_least_recently_go_first(folder, built, ball, monkeypatc
     ab.Model.load(paths[0])  # used now
     size = max(file.stat().st_size for file in folder.iterdir())
     monkeypatch.setattr(cache, "SIZE_LIMIT", int(2.5 * size))
+    stranger = folder / "mine.npz"
+    stranger.write_bytes(bytes(3 * size))
+    os.utime(stranger, (1, 1))
     ab.Model.load(ball)
+    assert stranger.stat().st_size == 3 * size, "other files of the folder stay, and count for nothing"
+    stranger.unlink()
     built.clear()
     for path in (paths[0], ball):
         ab.Model.load(path)

@@ -18,6 +18,7 @@ from warp_abtree.model.obj import split_file_name
 
 VARIABLE = "WARP_ABTREE_CACHE"
 SIZE_LIMIT = 2 << 30  # bytes in the folder; the models that were used least recently go
+KEY_DIGITS = 40
 LEAST_FACES = 1_000  # smaller models are built as fast as opened
 SELF_CONTAINED = {"obj", "ply", "stl", "off", "glb"}  # other formats may refer to further files
 
@@ -56,7 +57,7 @@ def mesh_key(mesh, *options) -> str:
 
 
 def _key(parts, *options) -> str:
-    found = hashlib.blake2b(repr((__version__, *options)).encode(), digest_size=20)
+    found = hashlib.blake2b(repr((__version__, *options)).encode(), digest_size=KEY_DIGITS // 2)
     for part in parts:
         found.update(hashlib.blake2b(part).digest())
     return found.hexdigest()
@@ -100,7 +101,8 @@ def _path(key) -> Path | None:
 def _make_room(newest):
     """Remove the models that were used least recently, but not the newest, until the rest is within the limit."""
     files = []
-    for path in newest.parent.glob("*.npz"):
+    # By the shape of their keys: a folder that the user names may hold other files.
+    for path in newest.parent.glob("[0-9a-f]" * KEY_DIGITS + ".npz"):
         with contextlib.suppress(OSError):
             about = path.stat()
             files.append((path != newest, -about.st_mtime_ns, about.st_size, path))
