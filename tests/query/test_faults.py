@@ -13,6 +13,7 @@ from helpers.questions import GpuQuery, in_a_row
 from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 REFUSALS = ("interrupted", "replaced", "nothing was launched", "make a new one")
 
@@ -163,6 +164,32 @@ def test_frames(device, interruption, kind, replayed):
         return True
 
     assert interruption.everywhere(make, lambda made: made[0].launch(), check)[0] > 3
+
+
+def test_no_mark_is_left(device, interruption):
+    """After an interrupted update by level lists and a whole one, a partial update leaves the bits of any other."""
+
+    def make():
+        with testing.regime(block_updates=False, full_refit={"cpu": 1e6, "cuda": 1e6}):
+            frame = ab.Pipeline(add_objects(device), "count", pairs=MORE_PAIRS)
+        for lod in (40, 39):
+            frame.launch()
+            frame.lods.fill_(lod)
+        return frame
+
+    def move_on(frame):
+        for lod in (39, 40):
+            frame.lods.fill_(lod)
+            frame.launch()
+        return frame.batch.states.pool.node_box.numpy().tobytes()
+
+    expected = move_on(make())
+
+    def check(before, frame):
+        assert before is None or move_on(frame) == expected
+        return True
+
+    assert interruption.everywhere(make, lambda frame: frame.launch(), check)[0] > 6
 
 
 def test_a_capture(device, interruption):

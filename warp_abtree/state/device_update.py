@@ -101,6 +101,8 @@ class DeviceLodUpdate(WorkLists):
             self._launch()
         except BaseException:
             self.states.pool.lod.fill_(int(work_lists.UNKNOWN))
+            # A whole refit clears no mark, and walks would stop at one that is left.
+            self.states.pool.node_mark.zero_()
             raise
 
     def _launch(self):
