@@ -14,7 +14,7 @@ from warp_abtree.kernels.progressive.hausdorff_bound import (
     NEXT_MERGE,
     STAMP,
     cover_queue,
-    move_faces,
+    merge_rings,
     register_covers,
 )
 from warp_abtree.kernels.progressive.triangle_cover import (
@@ -26,7 +26,6 @@ from warp_abtree.kernels.progressive.triangle_cover import (
     SLOTS,
     Covers,
     Replay,
-    add_ring,
     cover_ring,
 )
 from warp_abtree.kernels.progressive.vertex_forest import count_dying, third_corner
@@ -187,7 +186,9 @@ def cover_window_kernel(
 
 
 @wp.func
-def register_merge(replay: Replay, window: Window, covers: Covers, w: int, stamp: int, limit: wp.float64):
+def register_merge(
+    replay: Replay, window: Window, covers: Covers, w: int, near_count: int, stamp: int, limit: wp.float64
+):
     """Register the triangles of a merge of the window; the squared bound after it, and whether the window goes on."""
     before = limit
     begin = window.start[w]
@@ -202,9 +203,7 @@ def register_merge(replay: Replay, window: Window, covers: Covers, w: int, stamp
         for k in range(i, end):
             replay.queue[k - i] = window.covers.triangle[k]
             replay.queue_face[k - i] = window.covers.first[k]
-        merge = window.merge[w]
-        near_count = add_ring(replay, 0, stamp, stamp, merge[2])
-        limit = cover_queue(replay, covers, merge, end - i, near_count, stamp, limit)
+        limit = cover_queue(replay, covers, window.merge[w], end - i, near_count, stamp, limit)
     return limit, i == end and limit == before
 
 
@@ -228,8 +227,8 @@ def register_window_kernel(
         stamp = replay_inout.counter[STAMP] + 1
         replay_inout.counter[STAMP] = stamp
         dying = count_dying(replay_inout.rings, merge[0], merge[1])
-        move_faces(replay_inout, merge[0], merge[1], merge[2])
-        limit, holds = register_merge(replay_inout, window, covers_inout, w, stamp, limit)
+        near_count = merge_rings(replay_inout, merge, 0)
+        limit, holds = register_merge(replay_inout, window, covers_inout, w, near_count, stamp, limit)
         replay_inout.counter[LIVE_FACES] = replay_inout.counter[LIVE_FACES] - dying
         bound_sq_inout[j + w] = limit
         w += 1

@@ -5,7 +5,7 @@ import warp as wp
 
 from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.kernels.progressive import hausdorff_bound, merge_window, polygon, triangle_cover
-from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, points
+from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, unwritten
 
 # Cores and faces from which on windows gain: gathering them takes half as long again as going on merge by merge.
 LEAST_CORES, LEAST_FACES = 4, 20_000
@@ -103,13 +103,13 @@ def _new_replay(pos, face_count):
     replay.counter = filled(6, 0)
     replay.scratch = make_scratch(face_count, triangle_cover.SLOTS, polygon.STACK)
     replay.pos = wp.array(pos, dtype=wp.vec3d, device="cpu", copy=False)
-    replay.triangle_pos, replay.face_pos = points(face_count, 3), points(face_count, 3)
-    replay.face_box = points(face_count, 2)
-    for name in ("face_slot", "face_stamp", "queue", "queue_face"):
-        setattr(replay, name, filled(face_count, -1))
+    for name, corners in (("triangle_pos", 3), ("face_pos", 3), ("face_box", 2)):
+        setattr(replay, name, unwritten((face_count, corners), wp.vec3d))
+    replay.queue, replay.queue_face = unwritten(face_count), unwritten(face_count)
+    replay.face_slot, replay.face_stamp = filled(face_count, -1), filled(face_count, -1)
     pooled = SLOTS_PER_FACE * face_count + SLOTS_EXTRA
-    replay.slot = filled((face_count + pooled, triangle_cover.SLOT_FIELDS), -1)
-    replay.free_slot = filled(pooled, 0)
+    replay.slot = unwritten((face_count + pooled, triangle_cover.SLOT_FIELDS))
+    replay.free_slot = unwritten(pooled)
     replay.bvh_face = filled(1, 0)
     return replay
 
@@ -142,8 +142,9 @@ def _new_window(replay):
 
 def _index(replay):
     """Return a wp.Bvh over the active faces, for triangles whose connected component vanishes."""
-    active = np.flatnonzero(replay.rings.corner_node.numpy()[::3] >= 0).astype(np.int32)
-    corners = replay.face_pos.numpy()[active]
+    node = replay.rings.corner_node.numpy().reshape(-1, 3)
+    active = np.flatnonzero(node[:, 0] >= 0).astype(np.int32)
+    corners = replay.pos.numpy()[node[active]]
     lower, upper = corners.min(axis=1).astype(np.float32), corners.max(axis=1).astype(np.float32)
     replay.bvh_face = cpu_array(active, int)
     return wp.Bvh(cpu_array(lower, wp.vec3), cpu_array(upper, wp.vec3))
