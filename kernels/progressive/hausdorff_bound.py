@@ -342,8 +342,7 @@ def replay_merges_kernel(
             replay_inout.counter[INDEXED] = -1
             break
         c = vertex_count + j
-        if j + 1 < merge_count:
-            fetch_merge(replay_inout, merge_pair[j + 1, 0], merge_pair[j + 1, 1])
+        fetch_merge(replay_inout, merge_pair, merge_count, j)
         limit = replay_merge(replay_inout, covers_inout, a, b, c, limit)
         covers += replay_inout.counter[QUEUED] + 1
         bound_sq_out[j] = limit

@@ -107,8 +107,8 @@ def cover_ring(
 
 
 @wp.func_native(native.body("covers/fetch_merge.h", "fetch_merge"))
-def fetch_merge(replay: Replay, a: wp.int32, b: wp.int32):
-    """Bring what a merge of two nodes will read into the caches of this core."""
+def fetch_merge(replay: Replay, merge_pair: wp.array2d(dtype=int), merge_count: wp.int32, j: wp.int32):
+    """Bring what the merges after merge j will read into the caches of this core."""
 
 
 @wp.func

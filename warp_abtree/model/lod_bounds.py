@@ -75,7 +75,7 @@ class LodBounds:
         covered = 0
         while covered < COVERS and self.done < self._known:
             launch(merge_window.gather_window_kernel, *inputs)
-            merges, triangles, blocks, _ = state.tolist()
+            merges, triangles, blocks = state[:3].tolist()
             if merges == 0:
                 self._advance_alone(self.done + 1)
                 continue
@@ -127,7 +127,7 @@ def _new_window(replay):
     merges, face_count = int(merge_window.MERGE_ROOM), len(replay.face_slot)
     rows = face_count + int(merge_window.TRIANGLE_ROOM)
     blocks = merges + rows // int(triangle_cover.COVERS_AT_ONCE) + 1
-    window.counter = filled(4, 0)
+    window.counter = filled(5, 0)
     window.merge = filled((merges, 3), 0, wp.vec3i)
     window.start, window.near_start = filled(merges + 1, 0), filled(merges + 1, 0)
     window.block_merge, window.block_start = filled(blocks, 0), filled(blocks, 0)
