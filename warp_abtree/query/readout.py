@@ -13,6 +13,7 @@ from warp_abtree.query.result import COUNTERS, Found, Result, Totals
 from warp_abtree.query.sorting import sort_on_device, sort_passes, sort_rows
 from warp_abtree.query.staging import Staging, first_rows, view_memory
 
+FLOAT64_ROW = 1 + COUNTERS.index("float64_tests")
 HEADER, COLUMNS = int(kernels.HEADER_WORDS), int(kernels.COUNT_COLUMNS)
 
 
@@ -62,13 +63,16 @@ class QueryReadout(QueryBuffers):
         """Read what the last launch needed of each list. Waits for the device."""
         if self._packs():
             return self._totals(self._staging.fetch_words(self._pack_pairs(0), HEADER))
-        hits, total, uncertain = self.hits, 0, 0
-        found = len(self._given) if self.broad_phase is None else self.broad_phase.count_found()
+        views, total, uncertain = self._views, 0, 0
+        if self.broad_phase is None:
+            found = len(self._given)
+        else:
+            found = self.broad_phase.check_found(int(views.pair_count[0]))
         if self.output == "faces":
-            total = int(hits.count.numpy().sum())
-        if len(hits.uncertain):
-            uncertain = int(hits.float64_tests.numpy().sum())
-        return Totals(int(self.guard.launched.numpy()[0]), found, total, uncertain)
+            total = int(views.counts[0].sum())
+        if len(self.hits.uncertain):
+            uncertain = int(views.counts[FLOAT64_ROW].sum())
+        return Totals(self.guard.outcome(), found, total, uncertain)
 
     def _totals(self, words) -> Totals:
         """Return the demands in a header; those of lists that the query lacks are 0."""
@@ -97,12 +101,12 @@ class QueryReadout(QueryBuffers):
 
     def _copy_pairs(self) -> Found:
         """Copy from arrays that are the host's memory, which the next launch writes."""
-        hits, totals = self.hits, self._read_totals()
+        views, totals = self._views, self._read_totals()
         n = min(totals.pairs, len(self.pairs))
-        pairs = self._given if self.broad_phase is None else self.pairs.numpy()[:n].reshape(-1, 2).copy()
-        apart = None if self.near is None else self.near.any_hit.numpy()[:n] == 0
-        tests = {name: getattr(hits, name).numpy()[:n].copy() for name in COUNTERS}
-        return Found(totals, pairs, hits.any_hit.numpy()[:n] != 0, apart, hits.count.numpy()[:n].copy(), tests)
+        pairs = self._given if self.broad_phase is None else views.pairs[:n].copy()
+        apart = None if views.near_hit is None else views.near_hit[:n] == 0
+        count, *tests = views.counts[:, :n].copy()
+        return Found(totals, pairs, views.any_hit[:n] != 0, apart, count, dict(zip(COUNTERS, tests)))
 
     def _keep_pairs(self, n: int) -> Found:
         """Return arrays on the device, parts of a block of their own."""
@@ -141,7 +145,7 @@ class QueryReadout(QueryBuffers):
     def _read_rows(self, found: Found, count: int, device: bool):
         """Read what there is an entry a hit of. Waits for the device, unless it stays there."""
         if not (self._packs() or device):
-            found.faces = sort_rows(self.hits.face.numpy()[:count].reshape(-1, 3))
+            found.faces = sort_rows(self._views.faces[:count])
         elif device:
             found.faces = self._sort_hits(count, wp.empty(count, dtype=wp.vec3i, device=self.device))
         else:
