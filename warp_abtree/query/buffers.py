@@ -27,7 +27,8 @@ class HostViews:
         self.any_hit = query.hits.any_hit.numpy()
         self.near_hit = None if query.near is None else query.near.any_hit.numpy()
         self.counts = query.counts.numpy()
-        self.faces = query.hits.face.numpy().reshape(-1, 3)
+        # The pairs of a query in the making come before room for hits.
+        self.faces: Any = None if query.hits.face is None else query.hits.face.numpy().reshape(-1, 3)
 
 
 class QueryBuffers:
@@ -91,13 +92,22 @@ class QueryBuffers:
             if made:
                 self._replace(made)
             self.guard.forget()
-            if len(pairs):
-                rows = wp.array(pairs, dtype=wp.vec2i, device="cpu", copy=False)
-                wp.copy(self.pairs, rows, count=len(pairs))
-            self.pair_count.fill_(len(pairs))
+            if self.device.is_cpu:
+                self._views.pairs[: len(pairs)] = pairs
+                self._views.pair_count[0] = len(pairs)
+            else:
+                if len(pairs):
+                    rows = wp.array(pairs, dtype=wp.vec2i, device="cpu", copy=False)
+                    wp.copy(self.pairs, rows, count=len(pairs))
+                self.pair_count.fill_(len(pairs))
             self._given = pairs
             self._within = within
             self._fill_within()
+
+    def is_asked(self, pairs: np.ndarray, within) -> bool:
+        """Return whether pairs and distances, checked, None without, are those in place."""
+        same = len(pairs) == len(self._given) and pairs.tobytes() == self._given.tobytes()
+        return same and (within is None or np.array_equal(within, self._within))
 
     @contextmanager
     def _changing(self):
