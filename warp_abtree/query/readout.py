@@ -15,6 +15,7 @@ from warp_abtree.query.result import COUNTERS, Found, Result, Totals
 from warp_abtree.query.sorting import make_sort, sort_on_device, sort_passes, sort_rows
 from warp_abtree.query.staging import Staging, first_rows, view_memory
 
+# Rows that are expected come in steps.
 ROWS_STEP = 1024
 FLOAT64_ROW = 1 + COUNTERS.index("float64_tests")
 HEADER, COLUMNS = int(kernels.HEADER_WORDS), int(kernels.COUNT_COLUMNS)
