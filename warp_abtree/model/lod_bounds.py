@@ -8,7 +8,7 @@ from warp_abtree.kernels.progressive import hausdorff_bound, merge_window, polyg
 from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, unwritten
 
 # Cores and faces from which on windows gain: gathering them takes half as long again as going on merge by merge.
-LEAST_CORES, LEAST_FACES = 4, 20_000
+LEAST_CORES, LEAST_FACES = 2, 20_000
 # Triangles covered per launch, about.
 COVERS = 200_000
 # Pooled slots for each face, and beyond these; an empty pool loosens bounds only.
