@@ -136,7 +136,7 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     if 2 * len(vertices) >= NODE_LIMIT or 3 * len(faces) >= 2**31:
         raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
     report = progress if progress is not None else lambda stage, done, total: None
-    collapse, bounds = Collapse(vertices, faces, int(base_faces)), LodBounds(vertices, faces)
+    collapse = Collapse(vertices, faces, int(base_faces))
 
     def finish():
         parent = collapse.parents()
@@ -148,11 +148,13 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     if threads == 1:
         for removed in collapse.steps():
             report("collapse", removed, collapse.goal)
+        bounds = LodBounds(vertices, faces)
         merged = _follow(collapse, bounds, lambda: 1, report)
         forest = finish()
     else:
         running = workers(1).submit(lambda: finish() if collapse.run() else None)
         try:
+            bounds = LodBounds(vertices, faces)
             merged = _follow(collapse, bounds, lambda: threads if running.done() else threads - 1, report)
         finally:
             collapse.stop()
