@@ -77,3 +77,9 @@ constexpr int SLOT_SIBLING = 2;
 constexpr int SLOT_NEXT = 3;
 constexpr int SLOT_FIELDS = 8;
 static_assert(NEAR_ROOM % 8 == 0 && DISTANCE_ROOM >= 64 * NEAR_ROOM, "8 faces a vector, and room for cuts");
+
+// Counters that threads share while they cover triangles, each in a cache line of its own.
+constexpr int BLOCKS_ADDED = 16;
+constexpr int BLOCKS_TAKEN = 32;
+constexpr int WINDOWS_ENDED = 48;
+constexpr int THREADS = 64;

@@ -65,23 +65,16 @@ class LodBounds:
         """Bound merges window by window."""
         if self._window is None:
             self._window = _new_window(self._replay)
-        window, bounds = self._window, self._bound_sq
-        inputs = [self._vertex_count, self._known, self._pair, self._replay, window]
-        state = window.counter.numpy()  # shares the memory
+        counter = self._window.counter.numpy()  # shares the memory
+        counter[[int(merge_window.ENDED), int(merge_window.THREADS)]] = 0
+        inputs = [self._vertex_count, self._known, COVERS, self._pair, self._replay, self._window, self._covers]
 
-        def cover():
-            launch(merge_window.cover_window_kernel, self._replay, bounds, window)
+        def work():
+            launch(merge_window.work_windows_kernel, *inputs, self._bound_sq)
 
-        covered = 0
-        while covered < COVERS and self.done < self._known:
-            launch(merge_window.gather_window_kernel, *inputs)
-            merges, triangles, blocks = state[:3].tolist()
-            if merges == 0:
-                self._advance_alone(self.done + 1)
-                continue
-            launch_on_cores(cover, blocks, cores, 4)
-            launch(merge_window.register_window_kernel, window, self._replay, self._covers, bounds)
-            covered += triangles
+        launch_on_cores(work, cores, cores)
+        if counter[merge_window.MERGES] == 0 and self.done < self._known:
+            self._advance_alone(self.done + 1)
 
     def _advance_alone(self, merges):
         """Bound merges one after the other, at most up to a number of them."""
@@ -127,15 +120,17 @@ def _new_window(replay):
     merges, face_count = int(merge_window.MERGE_ROOM), len(replay.face_slot)
     rows = face_count + int(merge_window.TRIANGLE_ROOM)
     blocks = merges + rows // int(triangle_cover.COVERS_AT_ONCE) + 1
-    window.counter = filled(5, 0)
+    window.counter = filled(int(merge_window.COUNTERS), 0)
     window.merge = filled((merges, 3), 0, wp.vec3i)
     window.start, window.near_start = filled(merges + 1, 0), filled(merges + 1, 0)
-    window.block_merge, window.block_start = filled(blocks, 0), filled(blocks, 0)
+    window.first_block = filled(merges + 1, 0)
+    for name in ("block_merge", "block_start", "block_done"):
+        setattr(window, name, unwritten(blocks))
     window.face_mark = filled(face_count, -1)
-    covers.triangle, covers.first, covers.count = filled(rows, 0), filled(rows, 0), filled(rows, 0)
-    covers.near = filled((merges + 1) * int(merge_window.NEAR_MOST), 0)
-    covers.face = filled((rows, merge_window.COLUMNS), 0)
-    covers.limit = wp.zeros(rows, dtype=wp.float64, device="cpu")
+    covers.triangle, covers.first, covers.count = unwritten(rows), unwritten(rows), unwritten(rows)
+    covers.near = unwritten((merges + 1) * int(merge_window.NEAR_MOST))
+    covers.face = unwritten((rows, int(merge_window.COLUMNS)))
+    window.limit, covers.limit = (wp.empty(n, dtype=wp.float64, device="cpu") for n in (1, rows))
     window.covers = covers
     return window
 
