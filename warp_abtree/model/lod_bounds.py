@@ -25,6 +25,7 @@ class LodBounds:
 
     Attributes:
         done: Merges that are bounded.
+        replay: The surface after them, and which faces cover which original triangles.
     """
 
     def __init__(self, vertices, faces):
@@ -33,13 +34,13 @@ class LodBounds:
         face_array = cpu_array(faces, int)
         self._pos = np.zeros((2 * len(vertices), 3))
         self._pos[: len(vertices)] = (vertices - self._centre) / self._scale
-        self._replay = _new_replay(self._pos, face_count)
-        self._replay.rings = linked_rings(faces, face_array, 2 * len(vertices))
-        launch(hausdorff_bound.start_replay_kernel, face_count, face_array, self._replay)
-        self._covers = _new_covers(self._replay)
+        self.replay = _new_replay(self._pos, face_count)
+        self.replay.rings = linked_rings(faces, face_array, 2 * len(vertices))
+        launch(hausdorff_bound.start_replay_kernel, face_count, face_array, self.replay)
+        self._covers = _new_covers(self.replay)
         self._pair = filled((len(vertices), 2), 0)
         self._bound_sq = wp.zeros(len(vertices), dtype=wp.float64, device="cpu")
-        self._state = self._replay.counter.numpy()  # shares the memory
+        self._state = self.replay.counter.numpy()  # shares the memory
         self._known, self._window = 0, None
 
     @property
@@ -56,7 +57,7 @@ class LodBounds:
 
     def advance(self, cores=1):
         """Bound some of the merges that are known, on so many cores."""
-        if cores >= LEAST_CORES and len(self._replay.face_slot) >= LEAST_FACES:
+        if cores >= LEAST_CORES and len(self.replay.face_slot) >= LEAST_FACES:
             self._advance_together(cores)
         else:
             self._advance_alone(self._known)
@@ -64,10 +65,10 @@ class LodBounds:
     def _advance_together(self, cores):
         """Bound merges window by window."""
         if self._window is None:
-            self._window = _new_window(self._replay)
+            self._window = _new_window(self.replay)
         counter = self._window.counter.numpy()  # shares the memory
         counter[[int(merge_window.ENDED), int(merge_window.THREADS)]] = 0
-        inputs = [self._vertex_count, self._known, COVERS, self._pair, self._replay, self._window, self._covers]
+        inputs = [self._vertex_count, self._known, COVERS, self._pair, self.replay, self._window, self._covers]
 
         def work():
             launch(merge_window.work_windows_kernel, *inputs, self._bound_sq)
@@ -78,11 +79,11 @@ class LodBounds:
 
     def _advance_alone(self, merges):
         """Bound merges one after the other, at most up to a number of them."""
-        inputs = [self._vertex_count, merges, COVERS, self._pair, self._replay, self._covers, self._bound_sq]
+        inputs = [self._vertex_count, merges, COVERS, self._pair, self.replay, self._covers, self._bound_sq]
         launch(hausdorff_bound.replay_merges_kernel, *inputs)
         if self._state[5] < 0:
-            bvh = _index(self._replay)
-            self._replay.bvh, self._state[5] = bvh.id, self._state[1]
+            bvh = _index(self.replay)
+            self.replay.bvh, self._state[5] = bvh.id, self._state[1]
             self._bvh = bvh  # lives as long as it is asked
 
     def errors(self):
