@@ -72,7 +72,9 @@ constexpr int COVER_SLOTS = 32;
 constexpr int COVER_CUTS = 64;
 constexpr int COVERS_AT_ONCE = 64;
 constexpr int SLOT_FACE = 0;
+constexpr int SLOT_TRIANGLE = 1;
 constexpr int SLOT_SIBLING = 2;
+constexpr int SLOT_NEXT = 3;
 constexpr int SLOT_FIELDS = 8;
 static_assert(NEAR_ROOM % 8 == 0 && DISTANCE_ROOM >= 64 * NEAR_ROOM, "8 faces a vector, and room for cuts");
 
