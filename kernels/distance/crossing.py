@@ -1,10 +1,8 @@
 """A pair of faces that intersect, of object pairs that do: the first of the trees, children in order, a point of both.
 
-Which pair is first does not depend on how many a warp looks at together, nor on the bounds of boxes: nodes and faces lie
-on one stack in their order, a hit drops what comes after it, and the search goes on with what comes before.
+Which pair is first does not depend on how many a warp looks at together, nor on the bounds of boxes: nodes and faces
+lie on one stack in their order, a hit drops what comes after it, and the search goes on with what comes before.
 """
-
-import functools
 
 import warp as wp
 

@@ -4,16 +4,20 @@ Boxes are scaled by a power of two that brings the larger model, or the distance
 unit size, so that float32 holds squares of distances. `margin` is that of `PairPose`, which widens boxes along an axis
 by what their coordinates may err by.
 
-D is the least distance of A's vertices to x' (docs/exactness.md), d that of the surfaces in the world. With reaches A
-and B of the vertices, T of the translation, S = A + B + T, and skews s_a and s_b of the rotations:
+D is the least distance of A's vertices to x' (docs/exactness.md) that is computed, d that of the surfaces in the world.
+With u = 2^-53, reaches A and B of the vertices, T of the translation, S = A + B + T, and skews s_a and s_b of the
+rotations, for world points p and q of the surfaces and w = a - Ra^T (Rb b + tb - ta):
 
-1. `pad_distance` proves d > x of D > (1 + 2 (s_a + s_b) + 2^-45) x + 6 s_a A + 2^-45 S.
-2. The other way, for world points p and q and w = a - Ra^T (Rb b + tb - ta),
-   p - q = Ra w + Ra (Ra^T Ra - 1) a - (Ra Ra^T - 1) (p - q). The matrices in brackets have norms of at most 3 s_a, so
-   |p - q| <= (1 + 5 s_a) |w| + 6 s_a A, and x' stands for Ra^T (Rb b + tb - ta) with the error in 1.
-3. L of `triangle_pair` is at most 2 S.
+1. p - q = Ra w + Ra (Ra^T Ra - 1) a - (Ra Ra^T - 1) (p - q). The brackets have norms of at most 3 s_a, and Ra and Rb
+   lengthen by at most 1 + 1.5 s_a and 1 + 1.5 s_b, so |p - q| <= (1 + 5 s_a) |w| + 6 s_a A; and the other way, from
+   w = Ra^T (p - q) - (Ra^T Ra - 1) a, |w| <= (1 + 1.5 s_a) |p - q| + 6 s_a A.
+2. x' stands for Ra^T (Rb b + tb - ta) with an error of 24 u (B + T). A matrix made of a quaternion errs by 24 u, which
+   moves p and q by 42 u (A + B), and the skew's own rounding counts 21 u A: 90 u S in all.
+3. L of `triangle_pair` is at most 2 S. By its steps, a pair of faces errs by 40 u L and by what sqrt(D^2 + (128 u L)^2)
+   exceeds D: together 96 u S where D > 2^-19 S, else at most 2 PAIR_ROUNDING S.
 
-So |D - d| <= 5 (s_a + s_b) d + 6 s_a A + 3 2^-45 S with the D that is computed: `stretch` and `slack`.
+So d <= D (1 + 5 (s_a + s_b) + 2^-45) + 6 s_a A + 2^-45 S, and D is under the same of d, or S counts 2^-44 more where
+D is small: `stretch` and `slack_of`.
 """
 
 import warp as wp
@@ -40,6 +44,8 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 NO_FACES = wp.constant(wp.int64(2**63 - 1))
 # Of a bound of boxes, a sum of six squares in float32, and of its comparison.
 BOUND_ROUNDING = wp.constant(wp.float64(2.0**-19))
+# Distances over so many times a `pair_slack`, which is 2^-44 S, are not small.
+SMALL_DISTANCE = wp.constant(wp.float64(2.0**25))
 SCALE_MAX = wp.constant(wp.float64(2.0**100))
 
 
@@ -52,13 +58,13 @@ class Frame:
     scale: wp.float32  # power of two that boxes are scaled by
     margin: wp.float32  # that posed boxes are widened by, scaled
     limit_scale: wp.float64  # brings twice a distance in A's frame to that of scaled boxes, and more
-    pair_slack: wp.float64  # that a pair of faces errs by [model units]
+    pair_slack: wp.float64  # that a pair of faces errs by at most [model units]
     stretch: wp.float64  # D <= d stretch + slack, and d <= D stretch + slack
-    slack: wp.float64  # the other part [world units]
+    slack: wp.float64  # the other part, of distances that are not small; see `slack_of`
 
 
 @wp.struct
-class Dial:
+class Tolerances:
     """When a pair of faces is near enough."""
 
     tolerance: wp.float64  # width of the bracket [world units]
@@ -120,19 +126,25 @@ def make_frame(models: ModelPool, states: StatePool, objects: ObjectPool, pose: 
     frame.limit_scale = two * scale * (one + BOUND_ROUNDING + wp.float64(4.0) * skew)
     frame.pair_slack = two * PAIR_ROUNDING * sizes
     frame.stretch = one + wp.float64(5.0) * (skew_a + skew_b) + POSE_ROUNDING
-    frame.slack = wp.float64(6.0) * skew_a * (reach_a + largest(centre_a)) + (two * PAIR_ROUNDING + POSE_ROUNDING) * sizes
+    frame.slack = wp.float64(6.0) * skew_a * (reach_a + largest(centre_a)) + POSE_ROUNDING * sizes
     return frame
 
 
 @wp.func
-def cut_of(frame: Frame, dial: Dial, distance: wp.float64):
+def slack_of(frame: Frame, distance: wp.float64):
+    """Return what a distance errs by, beside a part of itself."""
+    return wp.where(distance > SMALL_DISTANCE * frame.pair_slack, frame.slack, frame.slack + frame.pair_slack)
+
+
+@wp.func
+def cut_of(frame: Frame, tolerances: Tolerances, distance: wp.float64):
     """Return the distance in A's frame under which faces matter, where there are some at a distance.
 
     The bracket is as narrow as is asked then; where rounding alone makes it wider, faces that are any nearer matter.
     """
-    four = wp.float64(4.0)
-    asked = wp.max(dial.tolerance, dial.relative * distance)
-    spare = asked - four * (frame.slack + (frame.stretch - wp.float64(1.0)) * distance)
+    asked = wp.max(tolerances.tolerance, tolerances.relative * distance)
+    wide = (frame.slack + frame.pair_slack) + (frame.stretch - wp.float64(1.0)) * distance
+    spare = asked - wp.float64(4.0) * wide
     return wp.where(spare > wp.float64(0.0), distance - spare, distance)
 
 
@@ -181,7 +193,7 @@ def start_distance_kernel(
     found_inout.frame[p] = frame
     bound = found_inout.beyond[p]
     if bound < DISTANCE_MAX:
-        bound = bound * frame.stretch + frame.slack
+        bound = bound * frame.stretch + (frame.slack + frame.pair_slack)
     else:
         bound = wp.float64(wp.inf)
     faces = found_inout.faces[p]

@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
-from warp_abtree.kernels.distance.frame import NO_FACES, Dial, Found, cut_of, load_triangles
+from warp_abtree.kernels.distance.frame import NO_FACES, Found, Tolerances, cut_of, load_triangles, slack_of
 from warp_abtree.kernels.distance.triangle_pair import feature_weights, nearest_features
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import PairPose, pose_point
@@ -64,7 +64,7 @@ def blend_corners(models: ModelPool, corner: wp.vec4i, weights: wp.vec3d):
 
 @wp.kernel
 def report_distance_kernel(
-    dial: Dial,
+    tolerances: Tolerances,
     models: ModelPool,
     states: StatePool,
     objects: ObjectPool,
@@ -86,7 +86,6 @@ def report_distance_kernel(
         return
     pose = pair_poses[p]
     if found.faces[p] == NO_FACES:
-        # Twice a subnormal number is another one, also where it is multiplied.
         beyond = wp.min(found.beyond[p], DISTANCE_MAX)
         distances_out.distance[p] = wp.float64(wp.inf)
         distances_out.bracket[p] = wp.vec2d(beyond, wp.float64(wp.inf))
@@ -94,9 +93,10 @@ def report_distance_kernel(
         return
     frame = found.frame[p]
     d = found.distance[p]
-    lower = wp.max((cut_of(frame, dial, d) - frame.slack) / frame.stretch, zero)
+    cut = cut_of(frame, tolerances, d)
+    lower = wp.max((cut - slack_of(frame, cut)) / frame.stretch, zero)
     distances_out.distance[p] = wp.max(d, LEAST_DISTANCE)
-    distances_out.bracket[p] = wp.vec2d(lower, wp.max(d * frame.stretch + frame.slack, LEAST_DISTANCE))
+    distances_out.bracket[p] = wp.vec2d(lower, wp.max(d * frame.stretch + slack_of(frame, d), LEAST_DISTANCE))
     face_a, face_b = item_first(found.faces[p]), item_second(found.faces[p])
     near = nearest_features(load_triangles(models, states, pose, face_a, face_b))
     weights_a, weights_b = feature_weights(near)

@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.distance.frame import NO_FACES, Dial, Found, Frame, Nearest, load_triangles
+from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame, Nearest, Tolerances, load_triangles
 from warp_abtree.kernels.distance.node_pair import bound_children, limit_of
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.generation import STALE
@@ -99,7 +99,13 @@ def measure_faces(
 
 @wp.func
 def search_pair(
-    models: ModelPool, states: StatePool, pose: PairPose, frame: Frame, dial: Dial, room: wp.int32, start: Nearest
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    frame: Frame,
+    tolerances: Tolerances,
+    room: wp.int32,
+    start: Nearest,
 ):
     """Return the nearest faces of an object pair, and what this lane compared: boxes and faces."""
     nearest = start
@@ -108,7 +114,7 @@ def search_pair(
         write_item(items, 0, first_item(states, pose))
         write_bound(items, 0, wp.float32(0.0))
     warp_sync()
-    limit = limit_of(frame, dial, nearest)
+    limit = limit_of(frame, tolerances, nearest)
     end, waiting = wp.int32(1), wp.int32(0)
     tests = wp.vec2i()
     while end > 0 or waiting > 0:
@@ -132,7 +138,7 @@ def search_pair(
             popped = wp.min(waiting, warp_size())
             waiting -= popped
             nearest, measured = measure_faces(items, waiting, popped, limit, models, states, pose, nearest)
-            limit = limit_of(frame, dial, nearest)
+            limit = limit_of(frame, tolerances, nearest)
             tests[1] += measured
     return nearest, tests
 
@@ -140,7 +146,7 @@ def search_pair(
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
 def search_warp_kernel(
     room: wp.int32,
-    dial: Dial,
+    tolerances: Tolerances,
     models: ModelPool,
     states: StatePool,
     pair_count: wp.array(dtype=wp.int32),
@@ -158,7 +164,7 @@ def search_warp_kernel(
     start.distance = found_inout.distance[p]
     start.faces = found_inout.faces[p]
     pose = pair_poses[p]
-    nearest, tests = search_pair(models, states, pose, found_inout.frame[p], dial, room, start)
+    nearest, tests = search_pair(models, states, pose, found_inout.frame[p], tolerances, room, start)
     if warp_lane() == 0:
         found_inout.distance[p] = nearest.distance
         found_inout.faces[p] = nearest.faces

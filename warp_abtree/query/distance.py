@@ -33,7 +33,6 @@ from warp_abtree.query.request import check_within
 from warp_abtree.query.result import DISTANCES, Found, Result
 from warp_abtree.query.staging import first_rows
 
-
 COUNTER_COUNT = 4
 
 
@@ -44,12 +43,12 @@ def check_beyond(beyond, pair_count=None) -> np.ndarray:
     return check_within(beyond, pair_count, "beyond")
 
 
-def make_dial(tolerance, relative):
+def make_tolerances(tolerance, relative):
     """Return the tolerances of a search for a kernel."""
-    dial = frame.Dial()
-    dial.tolerance = check_tolerance(tolerance, "tolerance", math.inf)
-    dial.relative = check_tolerance(relative, "relative", 1.0)
-    return dial
+    tolerances = frame.Tolerances()
+    tolerances.tolerance = check_tolerance(tolerance, "tolerance", math.inf)
+    tolerances.relative = check_tolerance(relative, "relative", 1.0)
+    return tolerances
 
 
 def check_tolerance(tolerance, name: str, most: float) -> float:
@@ -86,7 +85,7 @@ class DistanceQuery(Query):
     """
 
     def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None):
-        self._dial = make_dial(tolerance, relative)
+        self._tolerances = make_tolerances(tolerance, relative)
         self._asked = check_beyond(beyond, None if pairs is None else len(to_numpy(pairs, "pairs")))
         self.distances, self._found = report.Distances(), frame.Found()
         self._counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
@@ -112,7 +111,7 @@ class DistanceQuery(Query):
         Raises:
             ValueError: One that is negative, infinite or no number.
         """
-        self._dial = make_dial(tolerance, relative)
+        self._tolerances = make_tolerances(tolerance, relative)
         self._commands = Commands()
 
     def _fill_within(self):
@@ -163,9 +162,9 @@ class DistanceQuery(Query):
         reports = [*posed, found, hits, self.distances]
         return [
             launch(frame.start_distance_kernel, inputs=[*posed, found, self._counter], **threads),
-            launch(search.search_warp_kernel, inputs=[length, self._dial, *shared, found, hits], **warps),
+            launch(search.search_warp_kernel, inputs=[length, self._tolerances, *shared, found, hits], **warps),
             launch(crossing.search_crossing_kernel, inputs=[length, *shared, hits, found], **warps),
-            launch(report.report_distance_kernel, inputs=[self._dial, *reports], **threads),
+            launch(report.report_distance_kernel, inputs=[self._tolerances, *reports], **threads),
             launch(crossing.report_crossing_kernel, inputs=reports, **threads),
         ]
 

@@ -281,20 +281,18 @@ class Scene:
         """
         check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)
-        dial = {"tolerance": tolerance, "relative": relative, "beyond": beyond}
-        dial = {name: value for name, value in dial.items() if value is not None}
+        options = {"tolerance": tolerance, "relative": relative, "beyond": beyond}
+        options = {name: value for name, value in options.items() if value is not None}
         if output == "distance":
             refuse_options(output, {"precision": precision != "exact", "within": within is not None})
-            return self._find_distances(pairs, dial, device)
-        refuse_options(output, dial)
+            return self._find_distances(pairs, options, device)
+        refuse_options(output, options)
         with_contacts = output == "contacts"
         check_request("faces" if with_contacts else output, precision)
         pairs = self.broad_phase() if pairs is None else check_pairs(pairs, self.object_count)
         if within is not None:
             within = check_within(within, len(pairs))
-        asked = (output, precision, within is not None)
-        # A query that fails, for lack of memory, is not kept: it gives its own back.
-        query = self._queries.pop(asked, None)
+        query = self._queries.pop((output, precision, within is not None), None)
         if query is not None:
             query.replace_pairs(pairs, within)
         elif with_contacts:
@@ -303,22 +301,24 @@ class Scene:
             query = Query(self, output, pairs=pairs, precision=precision, within=within)
         if isinstance(query, ContactQuery):
             query.contact_dtype = contact_dtype
+        return self._run((output, precision, within is not None), query, device)
+
+    def _run(self, key: tuple, query: Query, device: bool) -> Result:
+        """Run a query and keep it for the next time; one that fails, for lack of memory, gives its own back."""
         result = query.run(device)
-        self._queries[asked] = query
+        self._queries[key] = query
         return result
 
-    def _find_distances(self, pairs, dial: dict, device: bool) -> Result:
+    def _find_distances(self, pairs, options: dict, device: bool) -> Result:
         pairs = self.broad_phase() if pairs is None else check_pairs(pairs, self.object_count)
-        beyond = check_beyond(dial.pop("beyond", None), len(pairs))
+        beyond = check_beyond(options.pop("beyond", None), len(pairs))
         query = self._queries.pop(("distance",), None)
         if isinstance(query, DistanceQuery):
-            query.set_tolerance(**dial)
+            query.set_tolerance(**options)
             query.replace_pairs(pairs, beyond)
         else:
-            query = DistanceQuery(self, pairs=pairs, beyond=beyond, **dial)
-        result = query.run(device)
-        self._queries[("distance",)] = query
-        return result
+            query = DistanceQuery(self, pairs=pairs, beyond=beyond, **options)
+        return self._run(("distance",), query, device)
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.
