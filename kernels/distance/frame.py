@@ -28,6 +28,7 @@ from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import (
     ROUNDING_32,
     ROUNDING_64,
+    UNIT_32,
     PairPose,
     measure_rotation,
     pose_point,
@@ -57,7 +58,10 @@ class Frame:
     back: wp.vec3  # the same, of A to B
     scale: wp.float32  # power of two that boxes are scaled by
     margin: wp.float32  # that posed boxes are widened by, scaled
-    limit_scale: wp.float64  # brings twice a distance in A's frame to that of scaled boxes, and more
+    grow: wp.float32  # a little over 1: bounds of boxes may be so much too large
+    error: wp.float32  # that float32 errs by in the distance of two faces, beside a part of their size, scaled
+    least: wp.float32  # that pairs of faces err by in float64, scaled
+    scale64: wp.float64  # the same power of two, where float32 has none
     pair_slack: wp.float64  # that a pair of faces errs by at most [model units]
     stretch: wp.float64  # D <= d stretch + slack, and d <= D stretch + slack
     slack: wp.float64  # the other part, of distances that are not small; see `slack_of`
@@ -109,8 +113,9 @@ def make_frame(models: ModelPool, states: StatePool, objects: ObjectPool, pose: 
     two = wp.float64(2.0)
     size = largest(t) + largest(centre_a)
     far = largest(shift)
-    margin = ROUNDING_64 * (size + two * (largest(centre_b) + reach_b) + reach_a)
-    margin = margin + wp.float64(4.0) * skew * (reach_b + far) + ROUNDING_32 * (reach_a + reach_b + far)
+    margin64 = ROUNDING_64 * (size + two * (largest(centre_b) + reach_b) + reach_a)
+    margin64 = margin64 + wp.float64(4.0) * skew * (reach_b + far)
+    margin = margin64 + ROUNDING_32 * (reach_a + reach_b + far)
     most = wp.max(wp.max(reach_a, reach_b), far)
     power = wp.cast(wp.cast(most, wp.int64) & EXPONENT_BITS, wp.float64)
     scale = wp.min(wp.float64(1.0) / power, SCALE_MAX)
@@ -123,8 +128,12 @@ def make_frame(models: ModelPool, states: StatePool, objects: ObjectPool, pose: 
     frame.back = wp.vec3(back * scale)
     frame.scale = wp.float32(scale)
     frame.margin = wp.float32(margin * scale)
-    frame.limit_scale = two * scale * (one + BOUND_ROUNDING + wp.float64(4.0) * skew)
+    frame.scale64 = scale
     frame.pair_slack = two * PAIR_ROUNDING * sizes
+    frame.grow = wp.float32(one + two * BOUND_ROUNDING + wp.float64(4.0) * skew)
+    frame.least = wp.float32(two * frame.pair_slack * scale)
+    off = UNIT_32 * (reach_a + wp.float64(7.2) * reach_b + wp.float64(4.0) * far) + margin64
+    frame.error = wp.float32((wp.float64(1.75) * off + two * frame.pair_slack) * scale)
     frame.stretch = one + wp.float64(5.0) * (skew_a + skew_b) + POSE_ROUNDING
     frame.slack = wp.float64(6.0) * skew_a * (reach_a + largest(centre_a)) + POSE_ROUNDING * sizes
     return frame
@@ -137,14 +146,19 @@ def slack_of(frame: Frame, distance: wp.float64):
 
 
 @wp.func
+def width_of(frame: Frame, distance: wp.float64):
+    """Return what a bracket at a distance is at least as wide as, as `cut_of` takes it."""
+    return wp.float64(4.0) * ((frame.slack + frame.pair_slack) + (frame.stretch - wp.float64(1.0)) * distance)
+
+
+@wp.func
 def cut_of(frame: Frame, tolerances: Tolerances, distance: wp.float64):
     """Return the distance in A's frame under which faces matter, where there are some at a distance.
 
     The bracket is as narrow as is asked then; where rounding alone makes it wider, faces that are any nearer matter.
     """
     asked = wp.max(tolerances.tolerance, tolerances.relative * distance)
-    wide = (frame.slack + frame.pair_slack) + (frame.stretch - wp.float64(1.0)) * distance
-    spare = asked - wp.float64(4.0) * wide
+    spare = asked - width_of(frame, distance)
     return wp.where(spare > wp.float64(0.0), distance - spare, distance)
 
 
@@ -184,6 +198,7 @@ def start_distance_kernel(
     """Prepare an object pair a thread, with the last launch's faces as the first bound where both are active."""
     p = wp.tid()
     if p == 0:
+        counter_out[1] = 0
         counter_out[3] = 0
     if p >= pair_count[0] or found_inout.launched[0] == STALE:
         return

@@ -51,8 +51,8 @@ def limit_of(frame: Frame, tolerances: Tolerances, nearest: Nearest):
     cut = cut_of(frame, tolerances, nearest.distance)
     if cut < wp.float64(0.0):
         return wp.float32(-1.0)
-    # 2^-19 of `limit_scale` has room for the roundings here too.
-    x = wp.float32((cut + frame.pair_slack) * frame.limit_scale)
+    # `grow` has room for the roundings here too.
+    x = wp.float32(wp.float64(2.0) * (cut + frame.pair_slack) * frame.scale64) * frame.grow
     return x * x
 
 

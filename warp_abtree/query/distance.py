@@ -25,7 +25,9 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy
-from warp_abtree.kernels.distance import crossing, frame, report, search
+from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
+from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.narrow_phase import Query
@@ -34,6 +36,8 @@ from warp_abtree.query.result import DISTANCES, Found, Result
 from warp_abtree.query.staging import first_rows
 
 COUNTER_COUNT = 4
+# Pairs that make a further core worth its while, which costs some 50 us.
+PAIRS_A_CORE = 2
 
 
 def check_beyond(beyond, pair_count=None) -> np.ndarray:
@@ -84,6 +88,8 @@ class DistanceQuery(Query):
         RuntimeError: A graph is being captured.
     """
 
+    _memory: wp.array
+
     def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None):
         self._tolerances = make_tolerances(tolerance, relative)
         self._asked = check_beyond(beyond, None if pairs is None else len(to_numpy(pairs, "pairs")))
@@ -122,6 +128,10 @@ class DistanceQuery(Query):
             rows = wp.array(beyond, dtype=wp.float64, device="cpu", copy=False)
             wp.copy(self._found.beyond, rows, count=len(rows))
 
+    @staticmethod
+    def _cores() -> int:
+        return current_regime().cpu_threads or core_count()
+
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
         for owner, name, dtype in (
@@ -134,6 +144,8 @@ class DistanceQuery(Query):
             (self.distances, "faces", wp.vec2i),
         ):
             made.append((owner, name, wp.empty(room, dtype=dtype, device=self.device)))
+        words = 0 if self.uses_warps() else min(room, self._cores()) * search_simd.NEAREST_WORDS
+        made.append((self, "_memory", wp.empty(words, dtype=wp.float32, device=self.device)))
         no_faces = int(frame.NO_FACES)
         return [*made, (self._found, "faces", wp.full(room, no_faces, dtype=wp.int64, device=self.device))]
 
@@ -147,7 +159,13 @@ class DistanceQuery(Query):
         if self.device.is_capturing:
             self._make_distances(wp.launch)
             return
-        for command in self._commands.find("distances", self.guard.given(), self._make_distances):
+        first, search, *reports = self._commands.find("distances", self.guard.given(), self._make_distances)
+        first.launch()
+        if self.uses_warps():
+            search.launch()
+        else:
+            launch_on_cores(search.launch, room, self._cores(), PAIRS_A_CORE)
+        for command in reports:
             command.launch()
 
     def _make_distances(self, launch) -> list:
@@ -160,9 +178,15 @@ class DistanceQuery(Query):
         warps = {"dim": room * lanes, "block_dim": WARP_SIZE, "device": device}
         threads = {"dim": room, "block_dim": WARP_SIZE, "device": device}
         reports = [*posed, found, hits, self.distances]
+        if self.uses_warps():
+            inputs = [length, self._tolerances, *shared, found, hits]
+            searching = launch(search.search_warp_kernel, inputs=inputs, **warps)
+        else:
+            inputs = [self._tolerances, *shared, self._counter, found, hits, self._memory]
+            searching = launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device)
         return [
             launch(frame.start_distance_kernel, inputs=[*posed, found, self._counter], **threads),
-            launch(search.search_warp_kernel, inputs=[length, self._tolerances, *shared, found, hits], **warps),
+            searching,
             launch(crossing.search_crossing_kernel, inputs=[length, *shared, hits, found], **warps),
             launch(report.report_distance_kernel, inputs=[self._tolerances, *reports], **threads),
             launch(crossing.report_crossing_kernel, inputs=reports, **threads),
