@@ -11,7 +11,10 @@ struct NearBoxes {
     typedef int ints __attribute__((vector_size(32)));
     typedef wp::int64 longs __attribute__((vector_size(32)));
     typedef float four __attribute__((vector_size(16)));
+    typedef int fours __attribute__((vector_size(16)));
     typedef bool flags __attribute__((ext_vector_type(8)));
+    typedef wp::int64 loose_longs __attribute__((vector_size(32), aligned(8)));
+    typedef float loose_four __attribute__((vector_size(16), aligned(4)));
     struct Taken {
         const char *a, *b;
         unsigned int used;
@@ -109,5 +112,27 @@ struct NearBoxes {
         tested.used = taken.used;
         tested.leaves = 15 & ~__builtin_bit_cast(unsigned char, __builtin_convertvector(inner, flags));
         return tested;
+    }
+    static unsigned int up_to(const four& x, float most) {
+        const fours which = x <= most;
+        const flags both = __builtin_convertvector(__builtin_shufflevector(which, which, 0, 1, 2, 3, 0, 1, 2, 3), flags);
+        return __builtin_bit_cast(unsigned char, both) & 15;
+    }
+    // Put what a mask names on a list, of which four places are written over.
+    static void append_items(wp::int64* list, const longs& x, unsigned int which) {
+#if defined(__AVX512VL__)
+        *(loose_longs*)list = __builtin_ia32_compressdi256_mask(x, longs{}, which);
+#else
+        for (int k = 0, n = 0; k < 4; n += which >> k++ & 1)
+            list[n] = x[k];
+#endif
+    }
+    static void append_bounds(float* list, const four& x, unsigned int which) {
+#if defined(__AVX512VL__)
+        *(loose_four*)list = __builtin_ia32_compresssf128_mask(x, four{}, which);
+#else
+        for (int k = 0, n = 0; k < 4; n += which >> k++ & 1)
+            list[n] = x[k];
+#endif
     }
 };

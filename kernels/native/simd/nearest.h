@@ -34,6 +34,8 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     const NearBoxes boxes = NearBoxes::make(r, frame.back, frame.translation, frame.margin, frame.scale,
                                             states.node_box.data, pose.node_a, pose.node_b);
     const float INF = __builtin_inff();
+    // Apart from the memory that lists are written to.
+    int top = h.top, later = h.later, waiting = h.waiting, node_tests = h.node_tests;
     // Bounds over `limit` are dropped; those over `soon` wait for later, when a nearer pair may have been found.
     float cut = 0.0f, limit = 0.0f, soon = 0.0f;
     auto set_limits = [&]() {
@@ -47,8 +49,8 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
         soon = h.level < 2 && h.upper < INF ? to_bound(PART[h.level] * cut) : limit;
     };
     auto measure = [&](int count) {
-        h.waiting -= count;
-        wp::int64* items = m.face + h.waiting;
+        waiting -= count;
+        wp::int64* items = m.face + waiting;
         const N::Corners corners = N::load(models.vertex_near.data, states.face_corner.data, pose.corner_a,
                                            pose.corner_b, r, frame.translation, frame.scale, items, count);
         F::lanes size, error;
@@ -78,75 +80,77 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     };
     set_limits();
     while (h.open_count <= OPEN_LENGTH - 16) {
-        while (h.top > 0 && h.waiting < 16) {
-            const int room = (CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH - h.top) / 3, fits = room > 1 ? room : 1;
+        while (top > 0 && waiting < 16) {
+            const int room = (CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH - top) / 3, fits = room > 1 ? room : 1;
             const int most = h.upper < INF ? NEAREST_AT_ONCE : 1, wanted = fits < most ? fits : most;
             NearBoxes::Taken taken[NEAREST_AT_ONCE];
             int count = 0;
-            while (h.top > 0 && count < wanted) {
-                --h.top;
-                const float bound = m.bound[h.top];
-                if (bound > limit)
-                    continue;
-                if (bound > soon && h.later < LATER_LENGTH) {
-                    m.later[h.later] = m.item[h.top];
-                    m.later_bound[h.later++] = bound;
-                } else
-                    taken[count++] = boxes.take(m.item[h.top]);
+            while (top > 0 && count < wanted) {
+                --top;
+                if (m.bound[top] <= limit)
+                    taken[count++] = boxes.take(m.item[top]);
             }
+            const bool has_room = later <= LATER_LENGTH - 4 * NEAREST_AT_ONCE - 4;
+            const float now = has_room ? soon : limit;
             for (int i = 0; i < count; ++i) {
                 const NearBoxes::Tested tested = boxes.test(taken[i]);
-                h.node_tests += __builtin_popcount(tested.used);
-                int nearest = h.top;
-                for (int k = 0; k < 4; ++k) {
-                    const bool used = (tested.used >> k & 1) && tested.bound[k] <= limit;
-                    const bool leaf = used && (tested.leaves >> k & 1), node = used && !leaf;
-                    m.item[h.top] = m.face[h.waiting] = tested.item[k];
-                    m.bound[h.top] = tested.bound[k];
-                    nearest = node && tested.bound[k] < m.bound[nearest] ? h.top : nearest;
-                    h.top += node;
-                    h.waiting += leaf;
-                }
+                node_tests += __builtin_popcount(tested.used);
+                const unsigned int near = tested.used & NearBoxes::up_to(tested.bound, limit);
+                const unsigned int nodes = near & ~tested.leaves, first = nodes & NearBoxes::up_to(tested.bound, now);
+                NearBoxes::append_items(m.item + top, tested.item, first);
+                NearBoxes::append_bounds(m.bound + top, tested.bound, first);
+                NearBoxes::append_items(m.later + later, tested.item, nodes & ~first);
+                NearBoxes::append_bounds(m.later_bound + later, tested.bound, nodes & ~first);
+                NearBoxes::append_items(m.face + waiting, tested.item, near & tested.leaves);
+                const int end = top + __builtin_popcount(first);
+                later += __builtin_popcount(nodes & ~first);
+                waiting += __builtin_popcount(near & tested.leaves);
                 // The nearest comes last, so that it is taken first.
-                if (nearest < h.top) {
-                    const wp::int64 item = m.item[nearest];
-                    const float bound = m.bound[nearest];
-                    m.item[nearest] = m.item[h.top - 1];
-                    m.bound[nearest] = m.bound[h.top - 1];
-                    m.item[h.top - 1] = item;
-                    m.bound[h.top - 1] = bound;
-                }
+                for (int k = top; h.upper == INF && k < end - 1; ++k)
+                    if (m.bound[k] < m.bound[end - 1]) {
+                        const wp::int64 item = m.item[k];
+                        const float bound = m.bound[k];
+                        m.item[k] = m.item[end - 1];
+                        m.bound[k] = m.bound[end - 1];
+                        m.item[end - 1] = item;
+                        m.bound[end - 1] = bound;
+                    }
+                top = end;
             }
-            if (h.upper == INF && h.waiting > 0)
+            if (h.upper == INF && waiting > 0)
                 break;
         }
-        if (h.waiting > 0) {
-            measure(h.waiting < 16 ? h.waiting : 16);
+        if (waiting > 0) {
+            measure(waiting < 16 ? waiting : 16);
             if (h.open_count > OPEN_LENGTH - 16)
                 keep_open();
-        } else if (h.later > 0) {
+        } else if (later > 0) {
             // What waited for later, of which much is too far by now; on the stack as much as leaves it room.
             h.level = h.level < 2 ? h.level + 1 : 2;
             set_limits();
             int kept = 0;
-            for (int i = 0; i < h.later; ++i) {
+            for (int i = 0; i < later; ++i) {
                 const float bound = m.later_bound[i];
                 const wp::int64 item = m.later[i];
-                if (bound <= soon && h.top < CPU_STACK_LENGTH / 2) {
-                    m.item[h.top] = item;
-                    m.bound[h.top++] = bound;
+                if (bound <= soon && top < CPU_STACK_LENGTH / 2) {
+                    m.item[top] = item;
+                    m.bound[top++] = bound;
                 } else if (bound <= limit) {
                     m.later[kept] = item;
                     m.later_bound[kept++] = bound;
                 }
             }
-            h.later = kept;
-        } else if (h.top == 0) {
+            later = kept;
+        } else if (top == 0) {
             keep_open();
-            return wp::vec_t<3, wp::int32>(1, h.node_tests, h.face_tests);
+            return wp::vec_t<3, wp::int32>(1, node_tests, h.face_tests);
         }
     }
-    return wp::vec_t<3, wp::int32>(0, h.node_tests, h.face_tests);
+    h.top = top;
+    h.later = later;
+    h.waiting = waiting;
+    h.node_tests = node_tests;
+    return wp::vec_t<3, wp::int32>(0, node_tests, h.face_tests);
 #endif
 }
 
