@@ -21,7 +21,7 @@ import warp_abtree as ab
 from . import tables
 
 CASES = (
-    *("assembly", "baselines", "budget", "build", "coarse", "exact", "frame"),
+    *("assembly", "baselines", "budget", "build", "coarse", "distance", "exact", "frame"),
     *("host", "precision", "query", "scale", "sweep", "update"),
 )
 STUDIES = ("paper", "tradeoff")

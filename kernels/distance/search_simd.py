@@ -37,9 +37,7 @@ ROUNDING_DOWN = wp.constant(wp.float32(1.0 - 2.0**-20))
 
 
 @wp.func_native(native.body("simd/nearest.h", "open_search"))
-def open_search(
-    upper: wp.float32, first: wp.int64, thread: wp.int32, memory: wp.array(dtype=wp.float32)
-): ...
+def open_search(upper: wp.float32, first: wp.int64, thread: wp.int32, memory: wp.array(dtype=wp.float32)): ...
 
 
 @wp.func_native(native.body("simd/nearest.h", "search_nearest"))

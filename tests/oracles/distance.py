@@ -92,12 +92,16 @@ def over(a, b):
 
 
 def mesh_distance(model_a, lod_a, pose_a, model_b, lod_b, pose_b):
-    """Return the distance of two posed meshes that do not intersect.
+    """Return the distance of two posed meshes that do not intersect, in A's frame."""
+    (vertices_a, faces_a, _), (vertices_b, faces_b, _) = model_a.mesh_at(lod_a), model_b.mesh_at(lod_b)
+    return surface_distance(vertices_a[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b])
+
+
+def surface_distance(a, b):
+    """Return the distance of the faces a from the faces b, corners (f, 3, 3) each, that do not intersect.
 
     The least over all pairs of features: corner and face, and the lines of two edges where closest inside both.
     """
-    (vertices_a, faces_a, _), (vertices_b, faces_b, _) = model_a.mesh_at(lod_a), model_b.mesh_at(lod_b)
-    a, b = vertices_a[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b]
     least = min(brute_distances(a.reshape(-1, 3), b).min(), brute_distances(b.reshape(-1, 3), a).min())
     for i, j in itertools.product(range(3), repeat=2):
         p, q = a[:, None, i], b[None, :, j]

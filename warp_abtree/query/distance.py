@@ -31,7 +31,7 @@ from warp_abtree.kernels.distance import crossing, frame, report, search, search
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.narrow_phase import Query
-from warp_abtree.query.request import check_within
+from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import DISTANCES, Found, Result
 from warp_abtree.query.staging import first_rows
 
@@ -65,6 +65,25 @@ def check_tolerance(tolerance, name: str, most: float) -> float:
     if value.shape != () or value.dtype.kind not in "iuf" or not 0 <= value < most:
         raise ValueError(f"{name}: {tolerance!r} is no number of 0 or more, below {most}")
     return float(value)
+
+
+def check_asked(output, precision, options):
+    """Check what is asked of a sweep.
+
+    Raises:
+        TypeError: An option with another name than tolerance, relative and beyond.
+        ValueError: A bad option, output or precision, or one that means nothing beside another.
+    """
+    unknown = set(options) - {"tolerance", "relative", "beyond"}
+    if unknown:
+        raise TypeError(f"sweep has no option {sorted(unknown)[0]!r}")
+    if output == "distance":
+        refuse_options(output, {"precision": precision != "exact"})
+        make_tolerances(options.get("tolerance", 0.0), options.get("relative", 0.0))
+        check_beyond(options.get("beyond"))
+    else:
+        refuse_options(output, options)
+        check_request(output, precision)
 
 
 class DistanceQuery(Query):
@@ -119,6 +138,10 @@ class DistanceQuery(Query):
         """
         self._tolerances = make_tolerances(tolerance, relative)
         self._commands = Commands()
+
+    def forget(self):
+        """Let the next launch start anew, and not from the faces that the last one found. Launches only."""
+        self._found.faces.fill_(int(frame.NO_FACES))
 
     def _fill_within(self):
         beyond = self._asked if self._within is None else self._within
