@@ -7,10 +7,10 @@ The folder is $WARP_ABTREE_CACHE if that is set, and none if it is "off"; else $
 import contextlib
 import hashlib
 import os
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from warp_abtree.checks.atomic_write import atomic_write, sweep_up
 from warp_abtree.checks.version import __version__
@@ -19,6 +19,7 @@ from warp_abtree.model.obj import split_file_name
 VARIABLE = "WARP_ABTREE_CACHE"
 SIZE_LIMIT = 2 << 30  # bytes in the folder; the models that were used least recently go
 KEY_DIGITS = 40
+BUILDER = 2  # grows with each change of what is built of the same mesh
 LEAST_FACES = 1_000  # smaller models are built as fast as opened
 SELF_CONTAINED = {"obj", "ply", "stl", "off", "glb"}  # other formats may refer to further files
 
@@ -46,7 +47,7 @@ def file_key(source, *options) -> str | None:
     if kind[0] not in SELF_CONTAINED:
         return None
     try:
-        return _key([path.read_bytes()], kind, None if kind[0] == "obj" else trimesh.__version__, *options)
+        return _key([path.read_bytes()], kind, None if kind[0] == "obj" else version("trimesh"), *options)
     except OSError:
         return None
 
@@ -57,7 +58,7 @@ def mesh_key(mesh, *options) -> str:
 
 
 def _key(parts, *options) -> str:
-    found = hashlib.blake2b(repr((__version__, *options)).encode(), digest_size=KEY_DIGITS // 2)
+    found = hashlib.blake2b(repr((__version__, BUILDER, *options)).encode(), digest_size=KEY_DIGITS // 2)
     for part in parts:
         found.update(hashlib.blake2b(part).digest())
     return found.hexdigest()

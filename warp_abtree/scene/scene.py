@@ -294,7 +294,8 @@ class Scene:
             within = check_within(within, len(pairs))
         query = self._queries.pop((output, precision, within is not None), None)
         if query is not None:
-            query.replace_pairs(pairs, within)
+            if not query.is_asked(pairs, within):
+                query.replace_pairs(pairs, within)
         elif with_contacts:
             query = ContactQuery(self, pairs=pairs, precision=precision, within=within)
         else:
