@@ -22,7 +22,7 @@ from . import tables
 
 CASES = (
     *("assembly", "baselines", "budget", "build", "coarse", "distance", "exact", "frame"),
-    *("host", "precision", "query", "scale", "sweep", "update"),
+    *("host", "query", "scale", "sweep", "update"),
 )
 STUDIES = ("paper", "tradeoff")
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml

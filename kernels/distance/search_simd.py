@@ -37,7 +37,7 @@ ROUNDING_DOWN = wp.constant(wp.float32(1.0 - 2.0**-20))
 
 
 @wp.func_native(native.body("simd/nearest.h", "open_search"))
-def open_search(upper: wp.float32, first: wp.int64, thread: wp.int32, memory: wp.array(dtype=wp.float32)): ...
+def open_search(upper: wp.float32, first: wp.int64, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)): ...
 
 
 @wp.func_native(native.body("simd/nearest.h", "search_nearest"))
@@ -48,7 +48,7 @@ def search_nearest(
     frame: Frame,
     spare: wp.vec4,
     thread: wp.int32,
-    memory: wp.array(dtype=wp.float32),
+    memory: wp.array2d(dtype=wp.float32),
 ) -> wp.vec3i:
     """Search until the end, or until many pairs of faces wait for float64.
 
@@ -57,7 +57,9 @@ def search_nearest(
 
 
 @wp.func_native(native.body("simd/nearest.h", "take_nearest"))
-def take_nearest(upper: wp.float32, cut: wp.float32, thread: wp.int32, memory: wp.array(dtype=wp.float32)) -> wp.int64:
+def take_nearest(
+    upper: wp.float32, cut: wp.float32, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)
+) -> wp.int64:
     """Return the faces that wait and seem nearest, -1 if none may be as near as the cut.
 
     Args:
@@ -93,7 +95,7 @@ def decide_open(
     tolerances: Tolerances,
     thread: wp.int32,
     before: Nearest,
-    memory: wp.array(dtype=wp.float32),
+    memory: wp.array2d(dtype=wp.float32),
 ):
     """Measure in float64 what waits, the nearest first, as far as it matters; return the nearest."""
     nearest = before
@@ -123,13 +125,15 @@ def search_thread_kernel(
     counter: wp.array(dtype=wp.int32),
     found_inout: Found,
     hits_inout: Hits,
-    memory_out: wp.array(dtype=wp.float32),
+    memory_out: wp.array2d(dtype=wp.float32),
 ):
     """Take one object pair after the other that does not intersect, and search it; CPU only, a thread a core."""
     if found_inout.launched[0] == STALE:
         return
     count = wp.min(pair_count[0], pair_poses.shape[0])
     thread = take_thread(counter)
+    if thread >= memory_out.shape[0]:
+        return
     p = take_unit(counter)
     while p < count:
         if hits_inout.any_hit[p] == 0:

@@ -151,9 +151,11 @@ class DistanceQuery(Query):
             rows = wp.array(beyond, dtype=wp.float64, device="cpu", copy=False)
             wp.copy(self._found.beyond, rows, count=len(rows))
 
-    @staticmethod
-    def _cores() -> int:
-        return current_regime().cpu_threads or core_count()
+    def _slow_kernels(self, with_distances: bool) -> list:
+        warps = [search.search_warp_kernel, crossing.search_crossing_kernel]
+        kernels = warps if self.uses_warps() else [search_simd.search_thread_kernel, warps[1]]
+        kernels += [crossing.report_crossing_kernel, report.report_distance_kernel, frame.start_distance_kernel]
+        return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._slow_kernels(with_distances)]
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
@@ -167,8 +169,10 @@ class DistanceQuery(Query):
             (self.distances, "faces", wp.vec2i),
         ):
             made.append((owner, name, wp.empty(room, dtype=dtype, device=self.device)))
-        words = 0 if self.uses_warps() else min(room, self._cores()) * search_simd.NEAREST_WORDS
-        made.append((self, "_memory", wp.empty(words, dtype=wp.float32, device=self.device)))
+        threads = 0 if self.uses_warps() else min(room, current_regime().cpu_threads or core_count())
+        made.append(
+            (self, "_memory", wp.empty((threads, search_simd.NEAREST_WORDS), dtype=wp.float32, device=self.device))
+        )
         no_faces = int(frame.NO_FACES)
         return [*made, (self._found, "faces", wp.full(room, no_faces, dtype=wp.int64, device=self.device))]
 
@@ -187,7 +191,7 @@ class DistanceQuery(Query):
         if self.uses_warps():
             search.launch()
         else:
-            launch_on_cores(search.launch, room, self._cores(), PAIRS_A_CORE)
+            launch_on_cores(search.launch, room, current_regime().cpu_threads, PAIRS_A_CORE)
         for command in reports:
             command.launch()
 
