@@ -179,11 +179,14 @@ def save_impulses_kernel(
     objects: ObjectPool,
     manifolds: Manifolds,
     constraints: Constraints,
+    bodies: Bodies,
     # out
     warm_start_out: WarmStart,
 ):
     """Save the impulses of one pair a thread for the next step, with points relative to the first object."""
     p = wp.tid()
+    if bodies.is_whole[0] == 0:
+        return
     warm_start_out.key[p] = key[p]
     warm_start_out.count[p] = manifolds.count[p]
     a = pairs[p][0]

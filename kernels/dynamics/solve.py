@@ -126,6 +126,8 @@ def relax_kernel(
     Args:
         color, order: Colors in ascending order, and the pairs that have them.
     """
+    if bodies_inout.is_whole[0] == 0:
+        return
     room = order.shape[0] // 2
     stage = relaxation.stage
     start = wp.lower_bound(color, 0, room, relaxation.first_color)

@@ -118,20 +118,33 @@ class Dynamics(RigidBodies):
     def find(self, targets=None):
         """Do the first half of `step`: find the contacts where the bodies stand, without moving them."""
         self._check_whole()
+        self.aim(targets)
+        self.fit()
+
+    def aim(self, targets=None):
+        """Set where kinematic objects are at the end of the coming step; None leaves them where they are."""
         if targets is not None:
             self.set_targets(targets)
         elif self.kinematic.any():
             self.clear_targets()
+
+    def fit(self):
+        """Find the contacts with room for all of them. Waits for the device."""
         self.query.grow()
         self._grow()
 
     def answer(self, dt: float):
-        """Do the second half of `step`: impulses, and motion. Launches only."""
+        """Do the second half of `step`: impulses, and motion. Launches only.
+
+        Where contacts or pairs outran the capacity nothing moves.
+        """
         self._check_whole()
         n, room, query, bodies = len(self.mass), self._room, self.query, self.bodies
         fast = 2.0 * float(np.linalg.norm(self.gravity)) * dt
         posed = [query.pairs, self._pool, query.manifolds]
         with self._changing():
+            found = [query.guard.launched, query.pair_count, len(query.pairs), query.hits]
+            self._launch(body_kernels.judge_contacts_kernel, 1, [*found, bodies])
             inputs = [dt, wp.vec3d(*(dt * self.gravity)), self.targets, self._pool, bodies]
             self._launch(body_kernels.begin_step_kernel, n, inputs)
             inputs = [dt, fast, *posed, self._warm_start, bodies, self._sorted_pair, self.constraints]
@@ -140,14 +153,14 @@ class Dynamics(RigidBodies):
             self._relax(solve.WARM_START, 1, fast)
             self._relax(solve.VELOCITY, ITERATIONS, fast)
             self._relax(solve.POSITION, ITERATIONS, fast)
-            inputs = [query.pair_key, *posed, self.constraints, self._warm_start]
+            inputs = [query.broad_phase.key, *posed, self.constraints, bodies, self._warm_start]
             self._launch(constraint_kernels.save_impulses_kernel, room, inputs)
             self._launch(body_kernels.integrate_kernel, n, [dt, self.targets, bodies, self._pool])
 
     def launch(self, dt: float):
         """Move all bodies by one step. Launches only: after a `step`, a CUDA graph can capture it, with this dt.
 
-        Contacts and pairs beyond the capacity are lost; `check` raises then.
+        Where contacts or pairs outrun the capacity nothing moves; `check` raises then.
         """
         self._check_whole()
         with self.query.guard.launching(self):
@@ -210,26 +223,18 @@ class SteppedMotion:
 
     def __init__(self, dynamics: Dynamics, prescribed=None):
         self.dynamics, self.prescribed = dynamics, prescribed
-        self._time = 0.0
 
     def __len__(self) -> int:
         return len(self.dynamics.mass)
 
-    def poses(self, time: float, out=None) -> None:
-        """Take the time [s]; the poses are in the scene already."""
-        self._time = time
-
-    def warm_up(self, time_step: float):
+    def warm_up(self, time: float):
         """Load all kernels of a step, and grow to the contacts where the bodies stand; nothing moves."""
         for module in (body_kernels, constraint_kernels, graph_coloring, solve):
             wp.load_module(module, self.dynamics.device)
-        self.find(time_step)
+        self.aim(time)
+        self.dynamics.fit()
 
-    def find(self, time_step: float):
-        """Find the contacts of the step from here; return a `Result` without points. Waits for the device."""
-        self.dynamics.find(None if self.prescribed is None else self.prescribed.poses(self._time + time_step))
-        return self.dynamics.query.result(with_points=False)
-
-    def answer(self, result, time_step: float):
-        """Move on by a step."""
-        self.dynamics.answer(time_step)
+    def aim(self, time: float):
+        """Set where kinematic objects are at a time [s], the end of the coming step."""
+        if self.dynamics.kinematic.any():
+            self.dynamics.aim(None if self.prescribed is None else self.prescribed.poses(time))
