@@ -166,7 +166,7 @@ class Frame:
         """Return the stages of the frame, made anew where scene, controller or output are others."""
         controller = self.lods if isinstance(self.lods, Controller) else None
         if self._stages is None or not self._stages.serves(self.scene, controller, self.output):
-            self._graph = None
+            self._graph, self._open, self._is_short = None, None, False
             dynamics = None if self._stepped is None else self._stepped.dynamics
             moves = self.motion is not None
             self._stages = FrameStages(self.scene, controller, dynamics, self.output, self.time_step, moves)
@@ -176,10 +176,11 @@ class Frame:
         return self._stages
 
     def _advance(self):
-        """Run the next frame and append its row; first finish one that was interrupted while its graph ran."""
+        """Run the next frame and append its row; only finish it where it was interrupted while its graph ran."""
         stages = self._ready()
         if self._open is not None and (self._is_short or stages.read()[words.FRAMES] != self._seen):
             self._finish(stages, *self._open)
+            return
         self._open, self._is_short = None, False
         time = len(self.history) * self.time_step
         self._timer.begin()
