@@ -29,6 +29,7 @@ from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.budget_report import budget_report
 from warp_abtree.simulate.frame_row import FrameRow, LodTable
 from warp_abtree.simulate.frame_stages import FrameStages
+from warp_abtree.simulate.motion import Kinematic
 from warp_abtree.simulate.rigid_bodies import SteppedMotion
 from warp_abtree.state.work_lists import full_refit_fraction
 
@@ -121,6 +122,8 @@ class Frame:
         # runs, and whether its buffers were too small.
         self._seen, self._is_short = 0, False
         self._open: tuple | None = None
+        # A time and a motion, and its poses then.
+        self._ahead: tuple = (None, None)
         self._direction = np.zeros(scene.object_count, np.int8)
         self._lods = scene.batch().lods
         self._measure_lods()
@@ -210,12 +213,20 @@ class Frame:
 
     def _place(self, stages, time) -> bool:
         """Bring the poses of a time to the device; return whether there are any that the motion has not set itself."""
-        poses = self.motion.poses(time, out=self._poses) if hasattr(self.motion, "poses") else None
+        known, rows = self._ahead
+        if known != (time, self.motion) and hasattr(self.motion, "poses"):
+            rows = self._find_rows(stages, time)
+        self._ahead = None, None
         if self._stepped is not None:
             self._stepped.aim(time + self.time_step)
-        if poses is not None:
-            stages.take_poses(poses)
-        return poses is not None
+        if rows is not None:
+            stages.take_rows(rows)
+        return rows is not None
+
+    def _find_rows(self, stages, time):
+        """Return the poses of a time, (n, 7), or None if the motion has set those of the scene."""
+        poses = self.motion.poses(time, out=self._poses)
+        return None if poses is None else stages.check_rows(poses)
 
     def _replay(self, stages, time, changes):
         """Run a frame as a graph, captured anew where arrays were replaced since."""
@@ -237,6 +248,9 @@ class Frame:
         wp.capture_launch(self._graph)
         if not timer.uses_events:
             timer.mark("query_ms")
+        if isinstance(self.motion, Kinematic):  # that of the next frame, while the device works on this one
+            following = (len(self.history) + 1) * self.time_step
+            self._ahead = (following, self.motion), self._find_rows(stages, following)
 
     def _finish(self, stages, time, changes):
         """Answer a frame that was launched, and append its row. Waits for the device."""

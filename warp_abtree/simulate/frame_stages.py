@@ -115,8 +115,8 @@ class FrameStages:
         """Return what stands for all arrays that launches are given: while it does, a graph of them holds."""
         return self.query.guard.given()
 
-    def take_poses(self, poses):
-        """Bring poses of all objects to the device, (n, 7), for the next launch.
+    def check_rows(self, poses) -> np.ndarray:
+        """Return poses of all objects, (n, 7).
 
         Raises:
             ValueError: Bad poses, or another number of them.
@@ -124,6 +124,10 @@ class FrameStages:
         rows = check_poses(poses)
         if rows.shape != self._rows.shape:
             raise ValueError(f"motion: poses of shape {rows.shape}, not {self._rows.shape}")
+        return rows
+
+    def take_rows(self, rows):
+        """Bring checked poses to the device for the next launch."""
         np.copyto(self._host_rows.numpy(), rows.ravel())
         if self.device.is_cuda:
             wp.copy(self._rows, self._host_rows)
@@ -148,7 +152,7 @@ class FrameStages:
 
         Args:
             mark: As for `launch_selection`.
-            places: Whether `take_poses` has brought poses.
+            places: Whether `take_rows` has brought poses.
         """
         if places:
             launch_place(self._rows, self.batch.objects.pool)
