@@ -71,14 +71,14 @@ MESHES = {
     "crowd": lambda: crowd(60),
 }
 DIGESTS = {
-    "waves": "c502b59ae511681a602724b4d81bbb12f9324ee36195a41573484d711de48495",
+    "waves": "1c52f25c98c57e2ca8c36a15f84a2025b93f0169463be62182e7ed8cca5cd265",
     "flat": "01fb648983cb8f63f9f962b2aa8e6330114f738e8146cd108bf529e4089134c0",
-    "tube": "f0b36ad2490031a08dfd7d3d6a359e0147fdb5663068d1166a359cece3ac7a59",
-    "crowd": "bb5a67bf343dd561d4f6aef485a85e48555b6c6c08216269054ac6a6ad4746b3",
-    "cow": "2244ef0de14da370",
-    "fandisk": "3be06187dd46905d",
-    "homer": "3efc9392b8d6e3d0",
-    "stanford-bunny": "0a4506ca28903db5",
+    "tube": "1c0e377ae33f95396c85cafbabac544040ad8599542afdeacd397a723258b5b9",
+    "crowd": "e3c3c4aabe7a8e5b3be3829dbea292f12eb72424d3cf3a7745ceb010a8147280",
+    "cow": "256eef31a0614cb1",
+    "fandisk": "52315ff5f2f51de1",
+    "homer": "ff5db907db0ed8c2",
+    "stanford-bunny": "1b7f88d4b6470ec2",
 }
 
 

@@ -142,8 +142,9 @@ def round_out(value, end):
 def active_build(mesh, lod=None):
     """ACTIVE-BUILD(P): split the set of all primitives top-down, then take the state of one lod (default: finest).
 
-    Node i of depth d covers the leaf positions (i n) >> d .. ((i+1) n) >> d. The axis is the longest of the box of its
-    faces at the finest lod (ties: lowest), the order by lower + upper of a face's own box (ties: lowest face).
+    Node i of depth d covers the leaf positions (i n) >> d .. ((i+1) n) >> d. The axis is that of the least sum of
+    extents of both halves' boxes at the finest lod, or for fewer than 10 faces the longest of their box (ties: lowest).
+    The paper takes the longest everywhere. The order is by lower + upper of a face's own box (ties: lowest face).
     """
     n = len(mesh.face_vertex)
     points = [[mesh.vertex_pos[v] for v in face] for face in mesh.face_vertex]
@@ -151,18 +152,26 @@ def active_build(mesh, lod=None):
     upper = [[max(p[k] for p in face) for k in range(3)] for face in points]
     tree = ABTree(mesh, mesh.lod_max, leaf=[None] * n, centre=mesh.centre())
 
+    def sort_faces(faces, axis):
+        return sorted(faces, key=lambda f: (lower[f][axis] + upper[f][axis], f))
+
+    def extents(faces):
+        return [max(upper[f][k] for f in faces) - min(lower[f][k] for f in faces) for k in range(3)]
+
     def subdivide(faces, number, parent):
         node = Node(number, parent)
         if len(faces) == 1:
             node.index = faces[0]
             tree.leaf[node.index] = node
             return node
-        extent = [max(upper[f][k] for f in faces) - min(lower[f][k] for f in faces) for k in range(3)]
-        axis = extent.index(max(extent))
-        ordered = sorted(faces, key=lambda f: (lower[f][axis] + upper[f][axis], f))
         depth = number.bit_length() - 1
         i = number - (1 << depth)
         half = ((2 * i + 1) * n >> depth + 1) - (i * n >> depth)
+        orders = [sort_faces(faces, axis) for axis in range(3)]
+        costs = [sum(extents(order[:half])) + sum(extents(order[half:])) for order in orders]
+        if len(faces) < 10:
+            costs = [-extent for extent in extents(faces)]
+        ordered = orders[costs.index(min(costs))]
         node.left = subdivide(ordered[:half], 2 * number, node)
         node.right = subdivide(ordered[half:], 2 * number + 1, node)
         return node

@@ -95,8 +95,20 @@ def test_tree_follows_a_random_walk_of_lods(name):
         assert all(child.status == abtree.ACTIVE for child in opened)
 
 
-def test_split_is_the_median_on_the_longest_axis():
+def strips(ys, length):
+    """Faces one unit wide along y, so long along x."""
+    position = [p for y in ys for p in ((0, y, 0), (length, y, 0), (0, y + 1, 0))]
+    faces = np.arange(3 * len(ys)).reshape(-1, 3).tolist()
+    return abtree.Progressive([-1] * len(position), position, faces, [0] * len(ys), [0], [])
+
+
+def test_few_faces_split_on_the_longest_axis():
     """Four faces along y, the two middle ones with equal keys: the lower index goes left."""
-    position = [p for y in (9, 4, 4, 0) for p in ((0, y, 0), (1, y, 0), (0, y + 1, 0))]
-    mesh = abtree.Progressive([-1] * 12, position, np.arange(12).reshape(4, 3).tolist(), [0] * 4, [0], [])
-    assert [leaf.number for leaf in abtree.active_build(mesh).leaf] == [7, 5, 6, 4]
+    assert [leaf.number for leaf in abtree.active_build(strips((9, 4, 4, 0), 1)).leaf] == [7, 5, 6, 4]
+
+
+@pytest.mark.parametrize(("count", "first"), [(9, {0, 1, 2, 3}), (10, {1, 3, 5, 7, 9})])
+def test_many_faces_split_where_the_halves_are_smallest(count, first):
+    """Long strips, by index from both ends of y: split along x, their longest axis, both halves have all of y."""
+    tree = abtree.active_build(strips([-i if i % 2 else i for i in range(count)], 20))
+    assert {i for i, leaf in enumerate(tree.leaf) if bin(leaf.number)[3] == "0"} == first

@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 from helpers.faults import MORE_PAIRS, add_objects, describe
 from helpers.questions import GpuQuery, in_a_row
+from helpers.samples import random_poses
 
 import warp_abtree as ab
 from warp_abtree import testing
@@ -178,6 +179,22 @@ def test_without_a_launch_there_is_no_result(device, packs, keeps):
             query.result(device=keeps)
         assert query.run(device=keeps).any.shape == (len(MORE_PAIRS),)
         query.set_pairs(MORE_PAIRS)
+
+
+def test_hits_that_vary_are_read_whole(device, packs, monkeypatch):
+    """Read along with the counts where the last result makes so many likely, else after these."""
+    monkeypatch.setattr("warp_abtree.query.readout.ROWS_STEP", 4)
+    scene = add_objects(device)
+    poses, seen = random_poses(np.random.default_rng(1), 4, 0.4), []
+    query = ab.Query(scene, "faces", pairs=MORE_PAIRS)
+    for spread in (0.5, 1.0, 0.97, 0.5, 99.0, 99.0, 0.52, 1.0):
+        scene.set_poses(poses * np.repeat([spread, 1.0], [3, 4]))
+        fresh = ab.Query(scene, "faces", pairs=MORE_PAIRS).run()
+        assert describe(query.run()) == describe(query.result()) == describe(fresh)
+        seen.append(len(fresh.faces))
+    assert 0 in seen and len(set(seen)) > 4, "they have not varied"
+    query.set_pairs(MORE_PAIRS[:2])
+    assert describe(query.run()) == describe(scene.intersect(MORE_PAIRS[:2], "faces"))
 
 
 @pytest.mark.parametrize("bits", [63, 20])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.questions import sort_rows, to_matrix
+from helpers.questions import in_a_row, sort_rows, to_matrix
 from helpers.samples import STILL, random_poses, raw_state, sample, true_faces
 from helpers.scenes import TURN, add_objects, everything, pair_scene
 from oracles.triangle import pose_matrix
@@ -220,6 +220,17 @@ def test_contacts_beyond_any_memory(device):
 def test_missing_devices_are_named(name):
     with pytest.raises(ValueError, match=r"no device .* cpu"):
         ab.Scene(name)
+
+
+def test_a_result_is_its_owners(device):
+    """Whoever writes into one changes no later answer, also where the same pairs are asked again."""
+    scene = in_a_row(device, "box", (0, 0.5, 5))
+    for pairs in ([(0, 1), (0, 2)], [(1, 2), (1, 2)], [(1, 2), (1, 2)], [(0, 2), (0, 1)], [(0, 1)]):
+        result = scene.intersect(pairs)
+        assert result.pairs.tolist() == [list(pair) for pair in pairs]
+        assert result.any.tolist() == [pair == (0, 1) for pair in pairs]
+        result.pairs[:] = 1, 2
+        result.any[:] = True
 
 
 def test_an_empty_scene(device):

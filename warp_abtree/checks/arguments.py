@@ -91,13 +91,15 @@ def to_numpy(values, what: str) -> np.ndarray:
         ValueError: It is no array of numbers.
     """
     try:
-        if isinstance(values, wp.array):
+        if isinstance(values, list | tuple | np.ndarray):
+            pass
+        elif isinstance(values, wp.array):
             values = values.numpy()
         elif is_device_array(values):
             values = wrap_array(values, what).numpy()
         elif hasattr(values, "numpy"):
             values = (values.detach() if getattr(values, "requires_grad", False) else values).numpy()
-        elif hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray):
+        elif hasattr(values, "__dlpack__"):
             values = np.from_dlpack(values)
         array = np.asarray(values)
     except (ValueError, TypeError, BufferError, RuntimeError) as error:

@@ -19,6 +19,7 @@ from warp_abtree.model.obj import split_file_name
 VARIABLE = "WARP_ABTREE_CACHE"
 SIZE_LIMIT = 2 << 30  # bytes in the folder; the models that were used least recently go
 KEY_DIGITS = 40
+BUILDER = 2  # grows with each change of what is built of the same mesh
 LEAST_FACES = 1_000  # smaller models are built as fast as opened
 SELF_CONTAINED = {"obj", "ply", "stl", "off", "glb"}  # other formats may refer to further files
 
@@ -57,7 +58,7 @@ def mesh_key(mesh, *options) -> str:
 
 
 def _key(parts, *options) -> str:
-    found = hashlib.blake2b(repr((__version__, *options)).encode(), digest_size=KEY_DIGITS // 2)
+    found = hashlib.blake2b(repr((__version__, BUILDER, *options)).encode(), digest_size=KEY_DIGITS // 2)
     for part in parts:
         found.update(hashlib.blake2b(part).digest())
     return found.hexdigest()

@@ -18,6 +18,19 @@ from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
 
 
+class HostViews:
+    """NumPy's views of a query's arrays, where these are the host's memory."""
+
+    def __init__(self, query):
+        self.pairs = query.pairs.numpy().reshape(-1, 2)
+        self.pair_count = query.pair_count.numpy()
+        self.any_hit = query.hits.any_hit.numpy()
+        self.near_hit = None if query.near is None else query.near.any_hit.numpy()
+        self.counts = query.counts.numpy()
+        # The pairs of a query in the making come before room for hits.
+        self.faces: Any = None if query.hits.face is None else query.hits.face.numpy().reshape(-1, 3)
+
+
 class QueryBuffers:
     """Device lists of an operator about object pairs; see `Query` for the attributes that users read."""
 
@@ -31,12 +44,14 @@ class QueryBuffers:
     pairs: wp.array
     pair_count: wp.array
     pair_poses: wp.array
+    counts: wp.array  # rows: hits.count, then COUNTERS
     within: wp.array  # where asked
     _within: np.ndarray
     _given: np.ndarray  # pairs on the host
     slab_memory: wp.array
     _regime: Regime
     _torn: bool
+    _made_views: HostViews | None = None
 
     def uses_warps(self) -> bool:
         """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
@@ -77,13 +92,22 @@ class QueryBuffers:
             if made:
                 self._replace(made)
             self.guard.forget()
-            if len(pairs):
-                rows = wp.array(pairs, dtype=wp.vec2i, device="cpu", copy=False)
-                wp.copy(self.pairs, rows, count=len(pairs))
-            self.pair_count.fill_(len(pairs))
+            if self.device.is_cpu:
+                self._views.pairs[: len(pairs)] = pairs
+                self._views.pair_count[0] = len(pairs)
+            else:
+                if len(pairs):
+                    rows = wp.array(pairs, dtype=wp.vec2i, device="cpu", copy=False)
+                    wp.copy(self.pairs, rows, count=len(pairs))
+                self.pair_count.fill_(len(pairs))
             self._given = pairs
             self._within = within
             self._fill_within()
+
+    def is_asked(self, pairs: np.ndarray, within) -> bool:
+        """Return whether pairs and distances, checked, None without, are those in place."""
+        same = len(pairs) == len(self._given) and pairs.tobytes() == self._given.tobytes()
+        return same and (within is None or np.array_equal(within, self._within))
 
     @contextmanager
     def _changing(self):
@@ -100,8 +124,15 @@ class QueryBuffers:
         """Put new arrays, (owner, attribute, array), in the place of old ones."""
         self.guard.buffers.advance()
         with self._changing():
+            self._made_views = None
             for owner, name, array in made:
                 setattr(owner, name, array)
+
+    @property
+    def _views(self) -> HostViews:
+        if self._made_views is None:
+            self._made_views = HostViews(self)
+        return self._made_views
 
     def _pair_arrays(self, room: int) -> list:
         """Return (owner, attribute, new array) of whatever has an entry a pair."""
@@ -110,8 +141,10 @@ class QueryBuffers:
         for hits in (self.hits, self.near):
             if hits is not None:
                 made.append((hits, "any_hit", wp.zeros(room, dtype=wp.int32, device=self.device)))
-                for name in ("count", *COUNTERS):
-                    made.append((hits, name, wp.zeros(room, dtype=wp.int64, device=self.device)))
+                counts = wp.zeros((1 + len(COUNTERS), max(1, room)), dtype=wp.int64, device=self.device)
+                made += [(hits, name, counts[k]) for k, name in enumerate(("count", *COUNTERS))]
+                if hits is self.hits:
+                    made.append((self, "counts", counts))
         if self.near is not None:
             made.append((self, "within", wp.empty(room, dtype=wp.float64, device=self.device)))
         return made

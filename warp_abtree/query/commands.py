@@ -20,6 +20,13 @@ class Commands:
         """
         before, commands = self._made.get(name, (None, []))
         if before != given:
-            commands = make(partial(wp.launch, record_cmd=True))
+            # Warp records nothing for a launch of no thread.
+            commands = [command for command in make(partial(wp.launch, record_cmd=True)) if command is not None]
             self._made[name] = given, commands
         return commands
+
+    def find_callables(self, name, given: tuple, device, make) -> list:
+        """Return what `find` does as callables, which launch as `wp.launch` does while a graph is captured."""
+        if device.is_capturing:
+            return make(partial(partial, wp.launch))
+        return [command.launch for command in self.find(name, given, make)]

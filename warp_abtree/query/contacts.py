@@ -50,7 +50,6 @@ from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import CapacityError
 from warp_abtree.query.result import VECTORS, Found, contact_dtypes
-from warp_abtree.query.sorting import sort_on_device
 from warp_abtree.query.staging import first_rows
 
 # Warps that a multiprocessor runs at a time, by their registers, of those that find deferred contacts.
@@ -168,7 +167,14 @@ class ContactQuery(Query):
         self._reduce(count)
 
     def _launch_kernel(self, kernel, dim, inputs, block_dim=256):
-        wp.launch(kernel, dim=dim, inputs=inputs, block_dim=block_dim, device=self.device)
+        """Launch a kernel of which only dim differs while the query's arrays stand."""
+        self._repeat((), kernel, dim, inputs, block_dim)
+
+    def _launch_once(self, kernel, dim, inputs):
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+
+    def _send_expected_rows(self, n: int) -> None:
+        """Bring nothing: rows come of launches that follow."""
 
     def _launch_warps(self, kernel, count, inputs):
         """Launch a kernel with a warp for each of so many items, on the CPU a thread."""
@@ -176,10 +182,10 @@ class ContactQuery(Query):
         self._launch_kernel(kernel, count * lanes, inputs, WARP_SIZE)
 
     def _sort(self, count: int):
+        self._sort_into(count, self._order, self._key, self.faces)
         passes, room = self._sort_passes(), len(self.pairs)
-        sort_on_device(self.hits, count, room, passes, self._order, self._key, self.faces)
         inputs = [count, sum(passes[-1][1:]), self._key, self.start, self._deferred.total]
-        self._launch_kernel(sort_hits.start_pair_kernel, room + 1, inputs)
+        self._repeat((count,), sort_hits.start_pair_kernel, room + 1, inputs)
 
     def _find(self, count: int):
         posed = [*self.batch.pools, self.pairs, self.pair_poses]
@@ -234,11 +240,11 @@ class ContactQuery(Query):
 
         def pack_pairs(first, some, target):
             inputs = [first, self.hits.count, self.pair_contacts, target]
-            self._launch_kernel(pack.pair_packer(real), (some, pack.PAIR_NUMBERS), inputs)
+            self._launch_once(pack.pair_packer(real), (some, pack.PAIR_NUMBERS), inputs)
 
         def pack_contacts(first, some, target):
             inputs = [first, self.faces, self.contacts, target]
-            self._launch_kernel(pack.contact_packer(real), (some, pack.CONTACT_NUMBERS), inputs)
+            self._launch_once(pack.contact_packer(real), (some, pack.CONTACT_NUMBERS), inputs)
 
         found.faces, memory = staging.send_rows(memory, self.faces, count)
         found.pair_contacts, memory = staging.send_records(memory, pair_type, pairs, pack_pairs)
@@ -253,8 +259,8 @@ class ContactQuery(Query):
         found.contacts = {name: self._empty(count, dtype) for name, dtype in types.items()}
         means = {"point": self._empty(pairs, vector), "normal": self._empty(pairs, vector)}
         means["depth"] = self._empty(pairs, real)
-        self._launch_kernel(pack.contact_copier(real), count, [self.faces, self.contacts, *found.contacts.values()])
-        self._launch_kernel(pack.summary_copier(real), pairs, [self.pair_contacts, *means.values()])
+        self._launch_once(pack.contact_copier(real), count, [self.faces, self.contacts, *found.contacts.values()])
+        self._launch_once(pack.summary_copier(real), pairs, [self.pair_contacts, *means.values()])
         found.pair_contacts = {"count": found.count, **means}
         found.faces = wp.clone(first_rows(self.faces, count))
 

@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device
-from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
+from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, relative_pose, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
@@ -177,7 +177,7 @@ class Query(QueryReadout):
         if self.uses_warps():
             traversal.launch()
         else:
-            cores = current_regime().cpu_threads or core_count()
+            cores = current_regime().cpu_threads
             launch_on_cores(traversal.launch, len(self.pairs), cores, self._least_pairs())
         for command in passes:
             command.launch()

@@ -1,6 +1,7 @@
 """Reading what a launch found: to the host in one transfer of each kind, or into arrays that stay on the device."""
 
 from contextlib import nullcontext
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -9,10 +10,14 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.regime import Regime
 from warp_abtree.kernels import results as kernels
 from warp_abtree.query.buffers import QueryBuffers
+from warp_abtree.query.commands import Commands
 from warp_abtree.query.result import COUNTERS, Found, Result, Totals
-from warp_abtree.query.sorting import sort_on_device, sort_passes, sort_rows
+from warp_abtree.query.sorting import make_sort, sort_on_device, sort_passes, sort_rows
 from warp_abtree.query.staging import Staging, first_rows, view_memory
 
+# Rows that are expected come in steps.
+ROWS_STEP = 1024
+FLOAT64_ROW = 1 + COUNTERS.index("float64_tests")
 HEADER, COLUMNS = int(kernels.HEADER_WORDS), int(kernels.COUNT_COLUMNS)
 
 
@@ -25,7 +30,9 @@ class QueryReadout(QueryBuffers):
 
     output: str
     _regime: Regime
+    _commands: Commands
     _made_staging: Staging | None = None
+    _last_read = 0, 0  # pairs of the last result, and its hits
 
     @property
     def _staging(self) -> Staging:
@@ -62,13 +69,16 @@ class QueryReadout(QueryBuffers):
         """Read what the last launch needed of each list. Waits for the device."""
         if self._packs():
             return self._totals(self._staging.fetch_words(self._pack_pairs(0), HEADER))
-        hits, total, uncertain = self.hits, 0, 0
-        found = len(self._given) if self.broad_phase is None else self.broad_phase.count_found()
+        views, total, uncertain = self._views, 0, 0
+        if self.broad_phase is None:
+            found = len(self._given)
+        else:
+            found = self.broad_phase.check_found(int(views.pair_count[0]))
         if self.output == "faces":
-            total = int(hits.count.numpy().sum())
-        if len(hits.uncertain):
-            uncertain = int(hits.float64_tests.numpy().sum())
-        return Totals(int(self.guard.launched.numpy()[0]), found, total, uncertain)
+            total = int(views.counts[0].sum())
+        if len(self.hits.uncertain):
+            uncertain = int(views.counts[FLOAT64_ROW].sum())
+        return Totals(self.guard.outcome(), found, total, uncertain)
 
     def _totals(self, words) -> Totals:
         """Return the demands in a header; those of lists that the query lacks are 0."""
@@ -85,24 +95,41 @@ class QueryReadout(QueryBuffers):
         n = len(self._given) if self.broad_phase is None else min(self._read_totals().pairs, len(self.pairs))
         if device:
             return self._keep_pairs(n)
-        words = self._staging.fetch_words(self._pack_pairs(n), self._block_length(n))
+        words = self._staging.send_words(self._pack_pairs(n), self._block_length(n))
+        rows = self._send_expected_rows(n)
+        self._staging.wait()
         columns, end = words[HEADER : HEADER + COLUMNS * n].reshape(COLUMNS, n), HEADER + COLUMNS * n
         if self.broad_phase is None:
-            pairs = self._given
+            pairs = self._given.copy()
         else:
             pairs, end = words[end : end + n].view(np.int32).reshape(n, 2), end + n
         flags = words[end:].view(bool)
         apart = None if self.near is None else flags[n : 2 * n]
-        return Found(self._totals(words), pairs, flags[:n], apart, columns[0], dict(zip(COUNTERS, columns[1:])))
+        found = Found(self._totals(words), pairs, flags[:n], apart, columns[0], dict(zip(COUNTERS, columns[1:])))
+        self._last_read = n, found.totals.hits
+        if rows is not None and found.totals.hits <= len(rows):
+            found.faces = rows[: found.totals.hits]
+        return found
+
+    def _send_expected_rows(self, n: int) -> np.ndarray | None:
+        """Bring as many hits over as the last result of so many pairs makes likely, sorted. Does not wait.
+
+        So the device sorts while the host still launches, and a loop over poses waits once a call.
+        """
+        pairs, hits = self._last_read
+        if self.output != "faces" or pairs != n or hits == 0:
+            return None
+        # A little more, in steps, so that hits that vary find room and launches stay the same.
+        return self._send_sorted_hits(min(-(-hits * 17 // 16 // ROWS_STEP) * ROWS_STEP, len(self.hits.face)))
 
     def _copy_pairs(self) -> Found:
         """Copy from arrays that are the host's memory, which the next launch writes."""
-        hits, totals = self.hits, self._read_totals()
+        views, totals = self._views, self._read_totals()
         n = min(totals.pairs, len(self.pairs))
-        pairs = self._given if self.broad_phase is None else self.pairs.numpy()[:n].reshape(-1, 2).copy()
-        apart = None if self.near is None else self.near.any_hit.numpy()[:n] == 0
-        tests = {name: getattr(hits, name).numpy()[:n].copy() for name in COUNTERS}
-        return Found(totals, pairs, hits.any_hit.numpy()[:n] != 0, apart, hits.count.numpy()[:n].copy(), tests)
+        pairs = (self._given if self.broad_phase is None else views.pairs[:n]).copy()
+        apart = None if views.near_hit is None else views.near_hit[:n] == 0
+        count, *tests = views.counts[:, :n].copy()
+        return Found(totals, pairs, views.any_hit[:n] != 0, apart, count, dict(zip(COUNTERS, tests)))
 
     def _keep_pairs(self, n: int) -> Found:
         """Return arrays on the device, parts of a block of their own."""
@@ -135,27 +162,53 @@ class QueryReadout(QueryBuffers):
         pairs = staging.no_pairs if self.broad_phase is None else self.pairs
         threads = max(1, -(-len(self.pairs) // kernels.BLOCK_DIM)) * kernels.BLOCK_DIM
         inputs = [n, self.hits, near, self.pair_count, self.guard.launched, pairs, words]
-        wp.launch(kernels.pack_pair_kernel, threads, inputs, device=self.device, block_dim=kernels.BLOCK_DIM)
+
+        self._repeat((n, words.ptr), kernels.pack_pair_kernel, threads, inputs, kernels.BLOCK_DIM)
         return words
+
+    def _repeat(self, given: tuple, kernel, dim, inputs, block_dim=256):
+        """Launch a kernel, recorded until the query's arrays are replaced, or whatever else is given changes."""
+
+        def make(launch):
+            return [launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_dim)]
+
+        given = *self.guard.given(), dim, *given
+        for launch in self._commands.find_callables(kernel.key, given, self.device, make):
+            launch()
 
     def _read_rows(self, found: Found, count: int, device: bool):
         """Read what there is an entry a hit of. Waits for the device, unless it stays there."""
+        if found.faces is not None:
+            return
         if not (self._packs() or device):
-            found.faces = sort_rows(self.hits.face.numpy()[:count].reshape(-1, 3))
+            found.faces = sort_rows(self._views.faces[:count])
         elif device:
             found.faces = self._sort_hits(count, wp.empty(count, dtype=wp.vec3i, device=self.device))
         else:
-            staging = self._staging
-            rows = self._sort_hits(count, staging.room("rows", count, wp.vec3i))
-            found.faces, _ = staging.send_rows(staging.row_pool.take(12 * count), rows, count)
-            staging.wait()
+            found.faces = self._send_sorted_hits(count)
+            self._staging.wait()
+
+    def _send_sorted_hits(self, count: int) -> np.ndarray:
+        """Bring hits over in order. Does not wait."""
+        staging = self._staging
+        rows = self._sort_hits(count, staging.room("rows", count, wp.vec3i))
+        return staging.send_rows(staging.row_pool.take(12 * count), rows, count)[0]
 
     def _sort_hits(self, count: int, rows):
         """Write the hits to rows in order, and return these. Launches only."""
         order = self._staging.room("order", 2 * count, wp.int32)
         key = self._staging.room("key", 2 * count, wp.int64)
-        sort_on_device(self.hits, count, len(self.pairs), self._sort_passes(), order, key, rows)
+        self._sort_into(count, order, key, rows)
         return rows
+
+    def _sort_into(self, count: int, order, key, rows):
+        """Write the first hits to rows in order, with such scratch. Launches only."""
+        if count == 0:
+            return
+        passes = self._sort_passes()
+        make = partial(make_sort, self.hits, count, len(self.pairs), passes, order, key, rows)
+        given = *self.guard.given(), count, order.ptr, key.ptr, rows.ptr
+        sort_on_device(self._commands.find_callables("sort", given, self.device, make), count, passes, order, key)
 
     def _sort_passes(self) -> list:
         return sort_passes(len(self.pairs), int(self.batch.models.face_count.max()), self._regime.key_bits)

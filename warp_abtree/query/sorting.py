@@ -36,18 +36,27 @@ def sort_passes(pair_room: int, face_count: int, key_bits: int) -> list:
     return [(0, 0, face), (pair, face, 0)]
 
 
-def sort_on_device(hits, count: int, pair_room: int, passes: list, order, key, rows):
-    """Write the first hits to `rows` in order. Launches only.
+def make_sort(hits, count: int, pair_room: int, passes: list, order, key, rows, launch) -> list:
+    """Return what `launch` makes of the kernels that sort the first hits: one a pass, and the last.
 
     Args:
         hits: `Hits` whose face pairs are sorted; those that it lacks count as a pair of their own, the last.
         order, key: Scratch, device int32 and int64 (2 count,); the keys of the last pass stay.
-        rows: Device vec3i (count,).
+        rows: Device vec3i (count,), for the hits in order.
+        launch: Takes what `wp.launch` does.
     """
-    device = hits.face.device
+    made = []
     for number, widths in enumerate(passes):
         inputs = [pair_room, wp.vec3i(*widths), number == 0, hits.total, hits.face, order, key]
-        wp.launch(sort_hits.make_key_kernel, count, inputs, device=device)
-        with wp.ScopedDevice(device):
+        made.append(launch(sort_hits.make_key_kernel, count, inputs, device=hits.face.device))
+    inputs = [hits.total, hits.face, order, rows]
+    return [*made, launch(sort_hits.place_row_kernel, count, inputs, device=hits.face.device)]
+
+
+def sort_on_device(launches: list, count: int, passes: list, order, key):
+    """Sort hits by the launches of `make_sort`, each a callable. Launches only."""
+    for launch, widths in zip(launches, passes):
+        launch()
+        with wp.ScopedDevice(key.device):
             wp.utils.radix_sort_pairs(key, order, count, end_bit=sum(widths))
-    wp.launch(sort_hits.place_row_kernel, count, [hits.total, hits.face, order, rows], device=device)
+    launches[-1]()

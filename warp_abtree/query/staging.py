@@ -35,16 +35,41 @@ def _host_memory() -> int:
         return 2**33
 
 
+class _Block:
+    """Host memory with views of it that are made once."""
+
+    def __init__(self, size: int, pinned: bool):
+        self.words = wp.empty((size + 7) // 8, dtype=wp.int64, device="cpu", pinned=pinned)
+        self._views = {wp.int64: self.words}
+
+    def __len__(self):
+        return 8 * len(self.words)
+
+    def view(self, dtype) -> wp.array:
+        """Return as many entries of a type as there is room for."""
+        if dtype not in self._views:
+            count = len(self) // wp.types.type_size_in_bytes(dtype)
+            self._views[dtype] = view_memory(self.words.ptr, dtype, count, owner=self.words)
+        return self._views[dtype]
+
+
 class _Lease:
     """Part of a block as NumPy's array interface; when no array is on it any more, the block goes back."""
 
-    def __init__(self, pool: "HostPool", block: wp.array, size: int):
-        self._pool, self._block = pool, block
-        data = (block.ptr, False)
+    def __init__(self, pool: "HostPool", block: _Block, size: int):
+        self._pool, self.block = pool, block
+        data = (block.words.ptr, False)
         self.__array_interface__ = {"shape": (size,), "typestr": "|u1", "data": data, "version": 3}
 
     def __del__(self):
-        self._pool.take_back(self._block)
+        self._pool.take_back(self.block)
+
+
+def _start_of(memory: np.ndarray, dtype, count: int) -> wp.array:
+    """Return a Warp array on the start of host memory, as `HostPool` lends it or a part of that."""
+    if isinstance(memory.base, _Lease):
+        return memory.base.block.view(dtype)
+    return view_memory(memory.ctypes.data, dtype, count)
 
 
 class HostPool:
@@ -56,7 +81,7 @@ class HostPool:
 
     def __init__(self, device):
         self._pinned = device.is_cuda
-        self._free: list[wp.array] = []
+        self._free: list[_Block] = []
         self._made = 0  # blocks, lent ones among them
         self._block_most = min(PINNED_MAX, int(PINNED_FRACTION * _host_memory())) // LENT_MAX
         self._is_used_again = False
@@ -65,7 +90,7 @@ class HostPool:
         """Return memory, uint8 (size,): of a block, or of its own where more than two are in use or too large."""
         if size == 0:
             return np.empty(0, np.uint8)
-        fitting = [block for block in self._free if 8 * len(block) >= size]
+        fitting = [block for block in self._free if len(block) >= size]
         if fitting:
             block = min(fitting, key=len)
             self._free.remove(block)
@@ -79,12 +104,11 @@ class HostPool:
             self._free.pop()
             self._made -= 1
         # A quarter more than is asked, so that results that differ a little find room.
-        room = max(BLOCK_LEAST, min(size + size // 4, self._block_most))
-        block = wp.empty((room + 7) // 8, dtype=wp.int64, device="cpu", pinned=self._pinned)
+        block = _Block(max(BLOCK_LEAST, min(size + size // 4, self._block_most)), self._pinned)
         self._made += 1
         return np.asarray(_Lease(self, block, size))
 
-    def take_back(self, block: wp.array):
+    def take_back(self, block: _Block):
         """Let a block be lent again; from any thread."""
         self._free.append(block)
 
@@ -111,18 +135,23 @@ class Staging:
             setattr(self, name, array)
         return array
 
+    def send_words(self, words: wp.array, count: int) -> np.ndarray:
+        """Bring words over, int64 (count,). Does not wait."""
+        memory = self.pair_pool.take(8 * count)
+        wp.copy(_start_of(memory, wp.int64, count), words, count=count)
+        return memory.view(np.int64)
+
     def fetch_words(self, words: wp.array, count: int) -> np.ndarray:
         """Bring words over, int64 (count,). Waits for the device."""
-        memory = self.pair_pool.take(8 * count)
-        wp.copy(view_memory(memory.ctypes.data, wp.int64, count), words, count=count)
+        memory = self.send_words(words, count)
         self.wait()
-        return memory.view(np.int64)
+        return memory
 
     def send_rows(self, memory: np.ndarray, rows: wp.array, count: int):
         """Bring rows over as they are, to the start of host memory; returns what is behind them. Does not wait."""
         size = 12 * count
         if count:
-            wp.copy(view_memory(memory.ctypes.data, wp.vec3i, count), rows, count=count)
+            wp.copy(_start_of(memory, wp.vec3i, count), rows, count=count)
         return memory[:size].view(np.int32).reshape(-1, 3), memory[size:]
 
     def send_records(self, memory: np.ndarray, dtype: np.dtype, count: int, pack):

@@ -278,7 +278,8 @@ class Scene:
         # A query that fails, for lack of memory, is not kept: it gives its own back.
         query = self._queries.pop(asked, None)
         if query is not None:
-            query.replace_pairs(pairs, within)
+            if not query.is_asked(pairs, within):
+                query.replace_pairs(pairs, within)
         elif with_contacts:
             query = ContactQuery(self, pairs=pairs, precision=precision, within=within)
         else:

@@ -160,7 +160,8 @@ def check_pairs(pairs, object_count: int) -> np.ndarray:
         return np.empty((0, 2), np.int32)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.dtype.kind not in "iu":
         raise ValueError(f"pairs: shape {pairs.shape} and type {pairs.dtype}, not whole numbers of shape (p, 2)")
-    if pairs.min() < 0 or pairs.max() >= object_count:
+    # Of the same bits without a sign, a negative number is greater than any index.
+    if pairs.astype(np.int64).view(np.uint64).max() >= object_count:
         bad = np.flatnonzero(((pairs < 0) | (pairs >= object_count)).any(1))
         raise ValueError(
             f"pairs: pair {bad[0]} is {tuple(pairs[bad[0]].tolist())}, the scene has {object_count} objects"
@@ -169,7 +170,7 @@ def check_pairs(pairs, object_count: int) -> np.ndarray:
     if same.any():
         first = int(same.argmax())
         raise ValueError(f"pairs: pair {first} pairs object {pairs[first, 0]} with itself")
-    return pairs.astype(np.int32)
+    return pairs.astype(np.int32, order="C")
 
 
 def exclusion_keys(pairs: np.ndarray) -> np.ndarray:

@@ -105,6 +105,7 @@ class LaunchGuard:
         self._record.buffers_now = self.buffers.now
         self._record.launched = launched = wp.array([NOT_LAUNCHED, 0], dtype=wp.int32, device=device)
         self._outcome = launched[:1]
+        self._view = launched.numpy() if device.is_cpu else None
         self._captured: dict = {}
         self._given: tuple = ()
 
@@ -144,11 +145,21 @@ class LaunchGuard:
 
     def __exit__(self, error, *_):
         if error is not None:
-            self._outcome.fill_(INTERRUPTED)
+            self._note(INTERRUPTED)
 
     def forget(self):
         """Let results count as none until the next launch."""
-        self._outcome.fill_(NOT_LAUNCHED)
+        self._note(NOT_LAUNCHED)
+
+    def _note(self, outcome: int):
+        if self._view is None:
+            self._outcome.fill_(outcome)
+        else:
+            self._view[0] = outcome
+
+    def outcome(self) -> int:
+        """Return the first entry of `launched`. Waits for the device."""
+        return int((self.launched.numpy() if self._view is None else self._view)[0])
 
     def check(self, launched: int):
         """Raise where the results are not of a whole launch on the arrays in use.
