@@ -23,6 +23,7 @@ from warp_abtree.simulate.body_state import RigidBodies, zeros_of
 
 COLOR_COUNT = int(graph_coloring.COLOR_COUNT)
 ITERATIONS = 16  # rounds of relaxation over all contacts in a step
+RELAX_THREADS = 32  # of a block: few pairs lie on as many multiprocessors
 
 
 class Dynamics(RigidBodies):
@@ -66,6 +67,8 @@ class Dynamics(RigidBodies):
         by_color = current_regime().relax_by_color
         self._by_color = not self.device.is_cpu if by_color is None else by_color
         self.query = ManifoldQuery(scene, None, capacity)
+        # No body is in two pairs of a color.
+        self._color_room = max(1, int(np.count_nonzero(self.rigid)))
         self._warm_start = constraint_kernels.WarmStart()
         self._room, self._interrupted = -1, False
         self._grow()
@@ -179,8 +182,8 @@ class Dynamics(RigidBodies):
         """Return what a `Frame` takes as motion: steps of this, with kinematic objects on a prescribed path."""
         return SteppedMotion(self, prescribed)
 
-    def _launch(self, kernel, dim, inputs):
-        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+    def _launch(self, kernel, dim, inputs, block_dim=256):
+        wp.launch(kernel, dim=dim, inputs=inputs, block_dim=block_dim, device=self.device)
 
     def _color_pairs(self):
         """Color the pairs in contact, and sort all pairs by color."""
@@ -207,9 +210,9 @@ class Dynamics(RigidBodies):
             each.backward = turn % 2 if stage == solve.VELOCITY else 0
             for color in reversed(colors) if each.backward else colors:
                 # The pairs without a color of their own are relaxed one after another.
-                each.threads = self._room if color < COLOR_COUNT else 1
+                each.threads = self._color_room if color < COLOR_COUNT else 1
                 each.first_color = each.last_color = color
-                self._launch(solve.relax_kernel, each.threads, inputs)
+                self._launch(solve.relax_kernel, each.threads, inputs, RELAX_THREADS)
 
 
 class SteppedMotion:
