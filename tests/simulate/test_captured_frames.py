@@ -200,6 +200,19 @@ def test_bodies_whose_contacts_outrun_a_captured_frame_lose_none(device):
     assert len(rooms) > 1, "room has grown in the middle"
 
 
+def test_a_camera_that_ends_serves_all_its_frames(device):
+    """It is asked for the next frame while one runs."""
+    scene, motion = crowd(device)
+    cameras = {frame / 8: camera_at(frame / 8) for frame in range(5)}
+    with testing.regime(captures_frames=True):
+        frame = ab.Frame(scene, motion, ToleranceController(scene, 0.01, cameras.__getitem__), "any", 1 / 8)
+    assert len(frame.run(5)) == 5
+    with pytest.raises(KeyError):
+        frame.step()
+    cameras[5 / 8] = camera_at(5 / 8)
+    assert len(frame.run(1)) == 6
+
+
 @pytest.mark.parametrize("place", ["before", "after"])
 def test_a_frame_whose_graph_is_interrupted_is_neither_lost_nor_run_twice(device, monkeypatch, place):
     """Of rigid bodies, which remember, and a controller that climbs with every frame."""

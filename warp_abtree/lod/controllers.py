@@ -82,6 +82,7 @@ class Controller:
             raise TypeError(f"camera is a {type(camera).__name__}, neither a Camera nor a function of time")
         self.scene, self.camera, self.ladder, self.device = scene, camera, ladder, scene.device
         self.view, self.pool = View(scene, window), lod_pool(ladder, scene)
+        self._ahead: tuple = (math.nan, None)  # a time, and the camera then
         self.lods = self._zeros(scene.object_count, wp.int32)
 
     def next_lods(self, feedback: Feedback) -> wp.array:
@@ -104,9 +105,15 @@ class Controller:
             RuntimeError: As `next_lods`.
         """
         self.view.check()
+        if self._ahead[0] != feedback.time:
+            self.look_ahead(feedback.time)
         if self.camera is not None:
-            self.view.look(self.camera if isinstance(self.camera, Camera) else self.camera(feedback.time))
+            self.view.look(self._ahead[1])
         self._update(feedback)
+
+    def look_ahead(self, time: float):
+        """Find the camera of the next `prepare`, as while the device works on a frame."""
+        self._ahead = time, self.camera(time) if callable(self.camera) else self.camera
 
     def launch(self):
         """Measure the view as the camera and the objects stand, and select the LODs of a frame. Launches only."""

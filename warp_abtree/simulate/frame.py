@@ -10,6 +10,7 @@ import csv
 import json
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -248,8 +249,12 @@ class Frame:
         wp.capture_launch(self._graph)
         if not timer.uses_events:
             timer.mark("query_ms")
-        if isinstance(self.motion, Kinematic):  # that of the next frame, while the device works on this one
-            following = (len(self.history) + 1) * self.time_step
+        # The host's part of the next frame, while the device works on this one.
+        following = (len(self.history) + 1) * self.time_step
+        if isinstance(self.lods, Controller):
+            with suppress(Exception):  # a camera that there is none of raises when its frame comes
+                self.lods.look_ahead(following)
+        if isinstance(self.motion, Kinematic):
             self._ahead = (following, self.motion), self._find_rows(stages, following)
 
     def _finish(self, stages, time, changes):
