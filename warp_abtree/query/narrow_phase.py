@@ -258,21 +258,24 @@ class Query(QueryReadout):
         result.check()
         return result
 
-    def grow(self):
+    def grow(self, between=None):
         """Launch, and again with more room until nothing is lost. Waits for the device.
+
+        Args:
+            between: As for `launch`, which calls it once.
 
         Raises:
             CapacityError: More pairs or hits than there can be room for.
             RuntimeError: As `launch`; or a graph is being captured.
         """
-        self._grow(lambda: Found(self._read_totals()))
+        self._grow(lambda: Found(self._read_totals()), between)
 
-    def _grow(self, read) -> Found:
+    def _grow(self, read, between=None) -> Found:
         """Launch as `grow` and return what `read` finds of the last launch."""
         check_device(self.device, f"{type(self).__name__}.run (launch can)")
         self._check_scene()
         with self.guard.launching(self):
-            self._launch()
+            self._launch(between)
             found = read()
             if found.totals.pairs > len(self.pairs):
                 self._take_pairs(wp.empty(self.growth * found.totals.pairs, dtype=wp.vec2i, device=self.device))

@@ -264,7 +264,7 @@ class Frame:
             timer.mark("answer_ms")
         if self._is_short or not stages.is_whole(stages.read()):
             self._is_short = True
-            stages.fit()
+            stages.find()
             stages.respond(timer.mark)
             self._is_short = False
         if answers:

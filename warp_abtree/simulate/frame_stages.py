@@ -109,7 +109,7 @@ class FrameStages:
         """Load the kernels that no other operator has loaded, and make room for what is found; nothing moves."""
         for module in (words, level_kernels, work_lists):
             wp.load_module(module, self.device)
-        self.fit()
+        self.find()
 
     def arrays(self) -> tuple:
         """Return what stands for all arrays that launches are given: while it does, a graph of them holds."""
@@ -157,14 +157,9 @@ class FrameStages:
         if places:
             launch_place(self._rows, self.batch.objects.pool)
         mark("move_ms", lambda: {"posed": self.scene.object_count if self.moves else 0})
-        self.query.launch(between=lambda: mark("broad_ms", lambda: {"candidate": self.query.broad_phase.count_found()}))
-        self._summarise()
-        while not self.device.is_capturing and not self.is_whole(self.read()):
-            self.fit()
-            self._summarise()
-        mark("query_ms", self._count_tests)
-        if self.dynamics is not None:
-            self.dynamics.answer(self.time_step)
+        find = self.query.launch if self.device.is_capturing else self.find
+        find(lambda: mark("broad_ms", lambda: {"candidate": self.query.broad_phase.count_found()}))
+        self.respond(mark)
 
     def _marked(self):
         plan = None if self._levels is None else self._levels.plan
@@ -210,15 +205,19 @@ class FrameStages:
             and (not len(hits.uncertain) or summary[words.UNCERTAIN] <= len(hits.uncertain))
         )
 
-    def fit(self):
-        """Query again with room for all that is found. Waits for the device."""
+    def find(self, between=None):
+        """Query with room for all that is found. Waits for the device.
+
+        Args:
+            between: Called between broad and narrow phase.
+        """
         if self.dynamics is None:
-            self.query.grow()
+            self.query.grow(between)
         else:
-            self.dynamics.fit()
+            self.dynamics.find_contacts(between)
 
     def respond(self, mark: Callable):
-        """Do what a frame could not do before `fit`."""
+        """Summarise what the query has found, and let rigid bodies respond to it. Launches only."""
         self._summarise()
         mark("query_ms", self._count_tests)
         if self.dynamics is not None:

@@ -122,7 +122,7 @@ class Dynamics(RigidBodies):
         """Do the first half of `step`: find the contacts where the bodies stand, without moving them."""
         self._check_whole()
         self.aim(targets)
-        self.fit()
+        self.find_contacts()
 
     def aim(self, targets=None):
         """Set where kinematic objects are at the end of the coming step; None leaves them where they are."""
@@ -131,9 +131,9 @@ class Dynamics(RigidBodies):
         elif self.kinematic.any():
             self.clear_targets()
 
-    def fit(self):
-        """Find the contacts with room for all of them. Waits for the device."""
-        self.query.grow()
+    def find_contacts(self, between=None):
+        """Find the contacts, with room for all of them; see `Query.grow`. Waits for the device."""
+        self.query.grow(between)
         self._grow()
 
     def answer(self, dt: float):
@@ -235,7 +235,7 @@ class SteppedMotion:
         for module in (body_kernels, constraint_kernels, graph_coloring, solve):
             wp.load_module(module, self.dynamics.device)
         self.aim(time)
-        self.dynamics.fit()
+        self.dynamics.find_contacts()
 
     def aim(self, time: float):
         """Set where kinematic objects are at a time [s], the end of the coming step."""
