@@ -68,7 +68,9 @@ def make_frame(device, kind, output, captured):
 
 def describe(frame, state, result):
     row = {name: value for name, value in frame.history[-1].as_dict().items() if name not in TIMES}
-    names = "pairs", "any", "count", "faces", "node_tests", "triangle_tests"
+    names = ["pairs", "any", "count", "faces", "node_tests", "triangle_tests"]
+    if frame.output == "any":  # warps that share a pair leave it at the first hit of any of them
+        names, row = names[:2], row | {"node_tests": 0, "triangle_tests": 0}
     found = [None if getattr(result, name) is None else getattr(result, name).tolist() for name in names]
     return row, found, [array.tobytes() for array in state()]
 

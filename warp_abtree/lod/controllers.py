@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import finite_array, positive, whole_number
+from warp_abtree.checks.upload import Upload
 from warp_abtree.kernels.lod import paper, prediction, tolerance
 from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.lod.selection import lod_pool
@@ -269,9 +270,15 @@ class PredictiveController(Controller):
         self.position_max = int(prediction.DITHER) * (self.pool.tolerance_count - 1) + loosened
         falls = [step for step in FALLS if step > -self.position_max]
         self.changes = [*CLIMBS, 0, *falls, -self.position_max, 0]
+        self._rates = Upload(5, self.device)
+        self._rates.send([math.nan] * 5)
         self.prediction = self._make_prediction()
         self.rate, count = self.prediction.rate, len(self.lods)
         self.tests, self.choice = self._zeros(count, wp.int64), self._zeros(5)
+        # Where the host reads the choice when a launch is over.
+        self._chosen = self.choice
+        if self.device.is_cuda:
+            self._chosen = wp.zeros(5, dtype=wp.float64, device="cpu", pinned=True)
         self.scale, self.offset = self._zeros(2, wp.int32), self._zeros(count, wp.int32)
         self.level = self._zeros(count, wp.int32)
         self._query, self._refine, self._rest = CostFit(), CostFit(), CostFit()
@@ -281,7 +288,7 @@ class PredictiveController(Controller):
         candidates, levels = len(self.changes), self.ladder.lod.size
         made = prediction.Prediction()
         made.change = wp.array(np.array(self.changes, np.int32), dtype=wp.int32, device=self.device)
-        made.rate = wp.full(5, math.nan, dtype=wp.float64, device=self.device)
+        made.rate = self._rates.array
         made.power_up, made.power_down = self._zeros(levels), self._zeros(levels)
         made.work, made.nodes = self._zeros(candidates, wp.int64), self._zeros(candidates, wp.int64)
         return made
@@ -289,8 +296,14 @@ class PredictiveController(Controller):
     @property
     def predicted_ms(self) -> float:
         """Predicted cost of the next frame [ms], NaN before the second. Waits for the device."""
-        choice = self.choice.numpy()
+        choice = self._read_choice()
         return float(choice[1] + choice[2])
+
+    def _read_choice(self) -> np.ndarray:
+        """Return what the last launch chose. Waits for the device."""
+        if self.device.is_cuda:
+            wp.synchronize_stream(wp.get_stream(self.device))
+        return self._chosen.numpy()
 
     def _update(self, feedback):
         if feedback.tests is None:
@@ -305,11 +318,11 @@ class PredictiveController(Controller):
         # Conservative both ways: a climb costs more than fitted, a fall saves less.
         up, down = self._exponent + 0.2, max(self._exponent - 0.2, 0.1)
         grown = math.exp(self._drift)
-        self.rate.assign(np.array([fixed, per_work * grown, per_node, up, down]))
+        self._rates.send((fixed, per_work * grown, per_node, up, down))
 
     def _fit_exponent(self, total):
         """Fit to the tests counted, against those predicted: the exponent if LODs changed, the drift if not."""
-        _, _, _, predicted, before = self.choice.numpy()
+        _, _, _, predicted, before = self._read_choice().tolist()
         if not (predicted > 0 and before > 0 and total > 0):
             self._drift *= 0.8
             return
@@ -337,3 +350,5 @@ class PredictiveController(Controller):
         self._launch(prediction.choose_position_kernel, 1, *limits, predicted, self.scale, self.choice)
         place = self.scale, self.offset, self.choice, self.level, self.lods
         self._launch(prediction.set_level_kernel, count, candidates - 1, pool, *place)
+        if self.device.is_cuda:
+            wp.copy(self._chosen, self.choice)

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import finite_array, positive, whole_number
+from warp_abtree.checks.upload import Upload
 from warp_abtree.kernels.lod import view as kernels
 
 
@@ -100,13 +101,14 @@ class View:
         self._arrays.window = self.window
         self._arrays.object_model = wp.array(np.array(scene.object_model, np.int32), dtype=wp.int32, device=self.device)
         self._arrays.centre = self.batch.models.pool.centre
-        self._arrays.camera, self._arrays.frame = zeros(15), zeros(1, wp.int32)
+        self._camera = Upload(15, self.device)
+        self._arrays.camera, self._arrays.frame = self._camera.array, zeros(1, wp.int32)
         self._arrays.screen, self._arrays.path = zeros(count, wp.vec3d), zeros(self.window * count)
         self._arrays.distance, self._arrays.motion, self._arrays.focus = self.distance, self.motion, self.focus
 
     def look(self, camera: Camera):
         """Set the camera from the next launch on; a captured graph reads it at every launch."""
-        self._arrays.camera.assign(camera.packed())
+        self._camera.send(camera.packed())
 
     def check(self):
         """Raise RuntimeError if the scene's objects changed since the operator was made."""

@@ -247,8 +247,7 @@ class Frame:
             timer.replay(self._marks)
         self._open = time, changes
         wp.capture_launch(self._graph)
-        if not timer.uses_events:
-            timer.mark("query_ms")
+        timer.mark("answer_ms" if timer.uses_events else "query_ms")
         # The host's part of the next frame, while the device works on this one.
         following = (len(self.history) + 1) * self.time_step
         if isinstance(self.lods, Controller):
@@ -260,7 +259,7 @@ class Frame:
     def _finish(self, stages, time, changes):
         """Answer a frame that was launched, and append its row. Waits for the device."""
         timer, answers = self._timer, hasattr(self.motion, "answer")
-        if not answers:
+        if not answers and timer.marks()[-1] != "answer_ms":
             timer.mark("answer_ms")
         if self._is_short or not stages.is_whole(stages.read()):
             self._is_short = True

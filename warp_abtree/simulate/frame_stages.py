@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.upload import Upload
 from warp_abtree.kernels.lod import frame_summary as words
 from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.kernels.update import levels as level_kernels
@@ -58,10 +59,12 @@ class FrameStages:
         if controller is not None:
             self._levels = self._make_levels(controller)
             self.table = LodTable(scene.models, self._levels.level_model, self._levels.level_lod)
-        self._rows, self._host_rows = self._mirrored(7 * scene.object_count, wp.float64)
-        self._rows = self._rows.reshape((-1, 7))
+        self._upload = Upload(7 * scene.object_count, self.device)
+        self._rows = self._upload.array.reshape((-1, 7))
         length = HEAD + (0 if self.table is None else len(self.table.lod))
-        self._summary, self._host_summary = self._mirrored(length, wp.int64)
+        self._summary = self._host_summary = self._zeros(length, wp.int64)
+        if self.device.is_cuda:
+            self._host_summary = wp.zeros(length, dtype=wp.int64, device="cpu", pinned=True)
         self._frames = self._zeros(1, wp.int64)
         self._no_changes, self._nothing = self._zeros(2, wp.int32), self._zeros(0, wp.int32)
         tests = None if controller is None else controller.tests
@@ -83,13 +86,6 @@ class FrameStages:
 
     def _zeros(self, length, dtype):
         return wp.zeros(length, dtype=dtype, device=self.device)
-
-    def _mirrored(self, length, dtype):
-        """Return an array on the device and one of the host that a transfer needs not wait for, the same on the CPU."""
-        array = self._zeros(length, dtype)
-        if self.device.is_cpu:
-            return array, array
-        return array, wp.zeros(length, dtype=dtype, device="cpu", pinned=True)
 
     def serves(self, scene, controller, output) -> bool:
         """Return whether these stages are still those of a frame."""
@@ -128,9 +124,7 @@ class FrameStages:
 
     def take_rows(self, rows):
         """Bring checked poses to the device for the next launch."""
-        np.copyto(self._host_rows.numpy(), rows.ravel())
-        if self.device.is_cuda:
-            wp.copy(self._rows, self._host_rows)
+        self._upload.send(rows.ravel())
 
     def launch_selection(self, mark: Callable):
         """Select LODs and bring objects to them, if there is a controller. Launches only.
