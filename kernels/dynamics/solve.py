@@ -8,6 +8,8 @@ import warp as wp
 from warp_abtree.kernels.contact.manifold import Manifolds
 from warp_abtree.kernels.dynamics.bodies import DYNAMIC, Bodies
 from warp_abtree.kernels.dynamics.constraints import Constraints, point_velocity
+from warp_abtree.kernels.dynamics.graph_coloring import COLOR_COUNT
+from warp_abtree.kernels.update.refit import block_sync
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -25,8 +27,8 @@ class Relaxation:
     backward: wp.int32  # 1 if the first round goes from the last pair to the first
     first_color: wp.int32  # first color of the range
     last_color: wp.int32  # last color of the range
-    rounds: wp.int32  # rounds over the range; more than 1 needs a single thread
-    threads: wp.int32  # threads of the launch
+    rounds: wp.int32  # rounds over the range
+    threads: wp.int32  # threads of the launch; one block where there are several colors or rounds
     friction: wp.float64  # coefficient of Coulomb's law
     fast: wp.float64  # separation speed of points whose position is not corrected [world units/s]; 0 without gravity
 
@@ -226,10 +228,10 @@ def relax_kernel(
     constraints_inout: Constraints,
     bodies_inout: Bodies,
 ):
-    """Relax the pairs of a range of colors, color by color; the threads of the launch share them.
+    """Relax the pairs of a range of colors, color by color; the threads of the launch share those of a color.
 
-    A single thread may take several colors and rounds. Velocity rounds alternate in direction, so that impulses travel
-    through a stack both ways; all other stages go forward.
+    Velocity rounds alternate in direction, so that impulses travel through a stack both ways; all other stages go
+    forward. One thread relaxes the pairs without a color of their own.
 
     Args:
         color, order: Colors in ascending order, and the pairs that have them.
@@ -238,15 +240,21 @@ def relax_kernel(
         return
     room = order.shape[0] // 2
     stage = relaxation.stage
-    start = wp.lower_bound(color, 0, room, relaxation.first_color)
-    end = wp.lower_bound(color, 0, room, relaxation.last_color + 1)
-    for round in range(relaxation.rounds):
-        backward = wp.where(stage == VELOCITY, (relaxation.backward + round) % 2, 0)
-        for turn in range(wp.tid(), end - start, relaxation.threads):
-            p = order[wp.where(backward != 0, end - 1 - turn, start + turn)]
-            if stage == WARM_START:
-                apply_warm_start(p, pairs[p], manifolds, constraints_inout, bodies_inout)
-            elif stage == VELOCITY:
-                relax_velocities(relaxation, p, pairs[p], backward, manifolds, constraints_inout, bodies_inout)
-            else:
-                relax_positions(relaxation, p, pairs[p], manifolds, constraints_inout, bodies_inout)
+    colors = relaxation.last_color - relaxation.first_color + 1
+    for step in range(relaxation.rounds * colors):
+        backward = wp.where(stage == VELOCITY, (relaxation.backward + step / colors) % 2, 0)
+        c = relaxation.first_color + point_of_turn(step % colors, colors, backward)
+        start = wp.lower_bound(color, 0, room, c)
+        end = wp.lower_bound(color, 0, room, c + 1)
+        threads = wp.where(c == COLOR_COUNT, 1, relaxation.threads)
+        if wp.tid() < threads:
+            for turn in range(wp.tid(), end - start, threads):
+                p = order[wp.where(backward != 0, end - 1 - turn, start + turn)]
+                if stage == WARM_START:
+                    apply_warm_start(p, pairs[p], manifolds, constraints_inout, bodies_inout)
+                elif stage == VELOCITY:
+                    relax_velocities(relaxation, p, pairs[p], backward, manifolds, constraints_inout, bodies_inout)
+                else:
+                    relax_positions(relaxation, p, pairs[p], manifolds, constraints_inout, bodies_inout)
+        if colors > 1:
+            block_sync()

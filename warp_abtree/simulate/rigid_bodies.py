@@ -23,7 +23,9 @@ from warp_abtree.simulate.body_state import RigidBodies, zeros_of
 
 COLOR_COUNT = int(graph_coloring.COLOR_COUNT)
 ITERATIONS = 16  # rounds of relaxation over all contacts in a step
-RELAX_THREADS = 32  # of a block: few pairs lie on as many multiprocessors
+LAST_COLORS = 11  # first of the last colors, which one block relaxes
+# Threads of a block: few pairs of a color lie on as many multiprocessors, and the last colors on one.
+RELAX_THREADS, TAIL_THREADS = 32, 256
 
 
 class Dynamics(RigidBodies):
@@ -69,6 +71,8 @@ class Dynamics(RigidBodies):
         self.query = ManifoldQuery(scene, None, capacity)
         # No body is in two pairs of a color.
         self._color_room = max(1, int(np.count_nonzero(self.rigid)))
+        # On the CPU threads run one after another.
+        self._tail_threads = TAIL_THREADS if self.device.is_cuda else 1
         self._warm_start = constraint_kernels.WarmStart()
         self._room, self._interrupted = -1, False
         self._grow()
@@ -196,23 +200,31 @@ class Dynamics(RigidBodies):
             wp.utils.radix_sort_pairs(self._sorted_color, self._sorted_pair, room, end_bit=7)
 
     def _relax(self, stage, rounds, fast):
-        """Relax all pairs: by one thread in one launch, or a launch for each color of each round."""
-        each, colors = solve.Relaxation(), range(COLOR_COUNT + 1)
+        """Relax all pairs: by one thread in one launch, or a launch for each of the first colors of each round.
+
+        The last colors have few pairs: a block relaxes them, with those of the next round where it goes backward.
+        """
+        each = solve.Relaxation()
         each.stage, each.friction, each.fast = int(stage), self.friction, fast
-        arrays = [self._sorted_pair, self._sorted_color, self.query.pairs, self.query.manifolds]
-        inputs = [each, *arrays, self.constraints, self.bodies]
         if not self._by_color:
-            each.last_color, each.rounds, each.threads = COLOR_COUNT, rounds, 1
-            self._launch(solve.relax_kernel, 1, inputs)
+            self._relax_colors(each, range(COLOR_COUNT + 1), rounds, 1)
             return
-        each.rounds = 1
+        head, tail = range(LAST_COLORS), range(LAST_COLORS, COLOR_COUNT + 1)
+        alternates = stage == solve.VELOCITY
         for turn in range(rounds):
-            each.backward = turn % 2 if stage == solve.VELOCITY else 0
-            for color in reversed(colors) if each.backward else colors:
-                # The pairs without a color of their own are relaxed one after another.
-                each.threads = self._color_room if color < COLOR_COUNT else 1
-                each.first_color = each.last_color = color
-                self._launch(solve.relax_kernel, each.threads, inputs, RELAX_THREADS)
+            each.backward = turn % 2 if alternates else 0
+            for color in [] if each.backward else head:
+                self._relax_colors(each, [color], 1, self._color_room)
+            if not each.backward:
+                self._relax_colors(each, tail, min(2, rounds - turn) if alternates else 1, self._tail_threads)
+            for color in reversed(head) if each.backward else []:
+                self._relax_colors(each, [color], 1, self._color_room)
+
+    def _relax_colors(self, each, colors, rounds, threads):
+        each.first_color, each.last_color, each.rounds, each.threads = colors[0], colors[-1], rounds, threads
+        arrays = [self._sorted_pair, self._sorted_color, self.query.pairs, self.query.manifolds]
+        block = RELAX_THREADS if len(colors) == 1 else TAIL_THREADS
+        self._launch(solve.relax_kernel, threads, [each, *arrays, self.constraints, self.bodies], block)
 
 
 class SteppedMotion:
