@@ -35,7 +35,7 @@ STAGES = ("float32_stage_ns", "float64_stage_ns", "exact_stage_ns", "float32_ns"
 
 def run(device, count=None, processes=2, quick=False):
     """Yield one row a kind of pair: pairs asked, fraction that intersect (meet), disagreements of any stage with the
-    truth, fractions left to float64 and to expansions, error rate of float32 alone, time a pair [ns].
+    truth, fractions left to float64 and to exact signs, error rate of float32 alone, time a pair [ns].
 
     Raises:
         RuntimeError: An answer was wrong, or the tests' oracle is not at hand.

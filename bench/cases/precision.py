@@ -14,7 +14,7 @@ QUICK = {"faces": 300, "pairs": 3, "coincident": 1, "repeats": 1}
 
 
 def run(device, quick=False):
-    """Yield one row a scene: hits, fractions of face pairs that reach float64 and expansions, face pairs that float32
+    """Yield one row a scene: hits, fractions of face pairs that reach float64 and exact signs, face pairs that float32
     misses and invents, and times of a launch [ms]."""
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL

@@ -72,6 +72,13 @@ constexpr int COVER_SLOTS = 32;
 constexpr int COVER_CUTS = 64;
 constexpr int COVERS_AT_ONCE = 64;
 constexpr int SLOT_FACE = 0;
+constexpr int SLOT_TRIANGLE = 1;
 constexpr int SLOT_SIBLING = 2;
+constexpr int SLOT_NEXT = 3;
 constexpr int SLOT_FIELDS = 8;
 static_assert(NEAR_ROOM % 8 == 0 && DISTANCE_ROOM >= 64 * NEAR_ROOM, "8 faces a vector, and room for cuts");
+
+// Expansions in 3D: 6 products of three differences, each of two components, and each product of three of four. So many
+// lanes of a warp have room for one in shared memory.
+constexpr int EXPANSION_LENGTH = 192;
+constexpr int EXPANSION_LANES = 16;

@@ -29,7 +29,7 @@ class Regime:
     stack_length: int | None = None
     key_bits: int = 63
     cpu_threads: int | None = None
-    plain_tests: int = 24576
+    plain_tests: int = 6144
     full_refit: dict = field(default_factory=lambda: {"cpu": 0.5, "cuda": 0.2})
     block_updates: bool = True
     packs_results: bool | None = None

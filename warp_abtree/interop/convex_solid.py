@@ -4,7 +4,6 @@ import weakref
 from functools import cached_property
 
 import numpy as np
-import trimesh
 
 from warp_abtree.interop.nearest import NodeBoxes
 from warp_abtree.model.mesh import component_labels, load_mesh
@@ -85,6 +84,8 @@ _SHAPES = weakref.WeakValueDictionary()
 
 def shape_of(mesh) -> Shape:
     """Return the shape of a mesh, by content, or of a model."""
+    import trimesh
+
     key: tuple = ("model", id(mesh))
     if isinstance(mesh, trimesh.Trimesh):
         key = (hash(mesh), len(mesh.vertices), len(mesh.faces))
@@ -106,6 +107,8 @@ def shape_of(mesh) -> Shape:
 
 def is_convex(mesh) -> bool:
     """Return `mesh.is_convex` of trimesh, without the graph package that trimesh needs for it."""
+    import trimesh
+
     if not mesh.is_watertight:
         return False
     faces = np.asarray(mesh.faces)

@@ -155,7 +155,9 @@ class QueryBuffers:
             return wp.empty((0, 0), dtype=wp.float32, device=self.device)
         threads = min(room, current_regime().cpu_threads or core_count())
         words = simd.slab_memory_words(int(self.batch.models.depth.max()))
-        return wp.empty((threads, words), dtype=wp.float32, device=self.device)
+        memory = wp.empty((threads, words), dtype=wp.float32, device=self.device)
+        memory.numpy()[:, : simd.SLAB_ZEROS] = 0.0
+        return memory
 
     def _make_room(self, pairs) -> list:
         """Return (owner, attribute, new array) of a device list of pairs, and of whatever belongs to a pair."""

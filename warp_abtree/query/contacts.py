@@ -101,6 +101,10 @@ class ContactQuery(Query):
         self._deferred.total = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "faces", pairs, capacity, precision, within, sort_pairs)
 
+    def _slow_kernels(self, with_distances: bool) -> list:
+        kernels = [contact.find_contact_kernel, summary.sum_loop_kernel]
+        return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._slow_kernels(with_distances)]
+
     def resize(self, capacity: int):
         """Make room for a number of contacts.
 

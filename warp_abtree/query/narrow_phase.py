@@ -8,6 +8,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.cpu_threads import launch_on_cores
+from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, relative_pose, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
@@ -74,14 +75,14 @@ class Query(QueryReadout):
         check_request(output, precision)
         check_device(scene.device, f"making a {type(self).__name__}")
         room = check_capacity(capacity)
-        self.batch = batch = batch_of(scene)
+        self._regime = current_regime()
+        self.output, self.precision, self.device = output, precision, scene.device
+        with loading(self.device, self._slow_kernels(within is not None)):
+            self.batch = batch = batch_of(scene)
         if pairs is not None:
             pairs = batch.check_pairs(pairs)
         if within is not None:
             within = check_within(within, None if pairs is None else len(pairs))
-        self._regime = current_regime()
-        self.output, self.precision = output, precision
-        self.device = batch.device
         self._torn = False
         self._commands = Commands()
         self.guard = LaunchGuard(
@@ -227,18 +228,32 @@ class Query(QueryReadout):
         """Make the launches of the narrow phase."""
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
         made = self._make_search(self._no_distance, self.hits, mode, output, launch)
-        passes = []
-        if len(self.hits.uncertain):
-            first = uncertain_pairs.float64_filter_kernel if mode == EXACT else uncertain_pairs.resolve_rounded_kernel
-            passes = [(first, FILTER_WARPS_A_PROCESSOR)]
-            if mode == EXACT:
-                passes.append((uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR))
         models, states, _ = self.batch.pools
-        for kernel, warps in passes:
+        for kernel, warps in self._passes() if len(self.hits.uncertain) else ():
             threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
             inputs = [threads, output, models, states, self.pair_poses, self.hits]
             made.append(launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
         return made
+
+    def _passes(self) -> list:
+        """Return the kernels that decide uncertain face pairs, and their warps on a multiprocessor."""
+        if int(PRECISIONS[self.precision]) != EXACT:
+            return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR)]
+        return [
+            (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR),
+            (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR),
+        ]
+
+    def _slow_kernels(self, with_distances: bool) -> list:
+        """Return the kernels that take longest to compile, with block sizes, the longest first."""
+        within = int(face_pairs.WITHIN)
+        modes = [int(PRECISIONS[self.precision]), *([within] if with_distances else [])]
+        if self.uses_warps():
+            kernels = [dual_tree.warp_traversal(mode, mode == within or self.output == "any") for mode in modes]
+            kernels += reversed([kernel for kernel, _ in self._passes()])
+        else:
+            kernels = [simd.thread_traversal(mode) for mode in modes]
+        return [(kernel, WARP_SIZE) for kernel in (*kernels, relative_pose.relative_pose_kernel)]
 
     def result(self, device: bool = False) -> Result:
         """Return the results of the last launch, sorted. Waits for the device.
