@@ -8,11 +8,19 @@ seldom: triangles are covered for its value before the window. Where it rises, a
 to a face about a later merge, the window ends, and the merges after it are gathered again.
 """
 
-import functools
-
 import warp as wp
 
-from warp_abtree.kernels import native
+from warp_abtree.kernels.progressive.block_queue import (
+    BLOCKS_ADDED,
+    ENDED,
+    THREADS,
+    count_up,
+    pause,
+    read_flag,
+    take_block,
+    withdraw_blocks,
+    write_flag,
+)
 from warp_abtree.kernels.progressive.hausdorff_bound import (
     FREE_SLOTS,
     LIVE_FACES,
@@ -45,25 +53,21 @@ MERGES = wp.constant(0)
 TRIANGLES = wp.constant(1)
 FIRST_STAMP = wp.constant(2)  # stamp of its first merge
 FIRST_BLOCK = wp.constant(3)  # number of its first block
-BLOCKS_ADDED = wp.constant(native.constant("BLOCKS_ADDED"))
-BLOCKS_TAKEN = wp.constant(native.constant("BLOCKS_TAKEN"))
-ENDED = wp.constant(native.constant("WINDOWS_ENDED"))
-THREADS = wp.constant(native.constant("THREADS"))  # that have come
-COUNTERS = THREADS + 1
+# Those of `block_queue` follow.
 
 MERGE_ROOM = wp.constant(512)
 TRIANGLE_ROOM = wp.constant(1 << 16)  # a merge is added while there are fewer
 NEAR_MOST = wp.constant(64)  # faces about a merge, at most; of others, one thread takes care
 COLUMNS = wp.constant(8)  # faces that cover a triangle, at most; likewise
 CONFLICT = wp.constant(-1)
-PATIENCE = wp.constant(1 << 16)  # pauses until a thread without work gives up
+PAUSES = wp.constant(1 << 16)  # until a thread without work gives up
 
 
 @wp.struct
 class Window:
     """Merges that do not meet, in order."""
 
-    counter: wp.array(dtype=int)  # [COUNTERS]
+    counter: wp.array(dtype=int)  # [COUNTER_COUNT], see above
     merge: wp.array(dtype=wp.vec3i)  # [MERGE_ROOM], its two nodes and the one that it makes
     start: wp.array(dtype=int)  # [MERGE_ROOM + 1], first triangle of each merge
     near_start: wp.array(dtype=int)  # [MERGE_ROOM + 1], first face about each merge
@@ -74,39 +78,6 @@ class Window:
     face_mark: wp.array(dtype=int)  # [face_count], last merge that had the face in its rings
     limit: wp.array(dtype=wp.float64)  # [1], squared running maximum before the window
     covers: Covers  # of all merges
-
-
-block_code = functools.partial(native.body, "covers/blocks.h")
-
-
-@wp.func_native(block_code("take_block"))
-def take_block(counter: wp.array(dtype=int)) -> wp.int32:
-    """Return the number of a block that no other thread has, the lowest first; -1 where there is none now."""
-
-
-@wp.func_native(block_code("withdraw_blocks"))
-def withdraw_blocks(counter: wp.array(dtype=int)) -> wp.int32:
-    """Take all blocks that are left, and return the number of the first; nobody adds any meanwhile."""
-
-
-@wp.func_native(block_code("write_flag"))
-def write_flag(flag: wp.array(dtype=int), i: wp.int32, value: wp.int32):
-    """Write an entry that other threads read; they see all that was written before."""
-
-
-@wp.func_native(block_code("read_flag"))
-def read_flag(flag: wp.array(dtype=int), i: wp.int32) -> wp.int32:
-    """Read an entry that another thread writes."""
-
-
-@wp.func_native(block_code("count_up"))
-def count_up(flag: wp.array(dtype=int), i: wp.int32) -> wp.int32:
-    """Raise an entry by one and return what it was."""
-
-
-@wp.func_native(block_code("pause"))
-def pause():
-    """Wait for a moment."""
 
 
 @wp.func
@@ -317,15 +288,15 @@ def register_window(replay: Replay, window: Window, covers: Covers, bound_sq: wp
 @wp.func
 def help_windows(replay: Replay, window: Window):
     """Cover blocks until there are no more windows, or none for a while."""
-    patience = int(PATIENCE)
-    while patience > 0 and read_flag(window.counter, ENDED) == 0:
+    left = int(PAUSES)
+    while left > 0 and read_flag(window.counter, ENDED) == 0:
         number = take_block(window.counter)
         if number >= 0:
             cover_block(replay, window, number)
-            patience = int(PATIENCE)
+            left = int(PAUSES)
         else:
             pause()
-            patience -= 1
+            left -= 1
 
 
 @wp.kernel

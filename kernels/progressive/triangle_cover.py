@@ -124,7 +124,7 @@ def place_face(replay: Replay, f: int):
     replay.face_box[f, 1] = wp.max(a, wp.max(b, c))
 
 
-@wp.func
+@wp.func(inline=False)
 def cover_distance_sq(replay: Replay, count: int, f: int, enough: wp.float64):
     """Return the largest squared distance of the current polygon to active face f, or any value above `enough`.
 
@@ -182,7 +182,7 @@ def add_near(replay: Replay, near_count: int, shared: int, own: int, f: int):
     return near_count + 1
 
 
-@wp.func
+@wp.func(inline=False)
 def add_ring(replay: Replay, near_count: int, shared: int, own: int, node: int):
     """Make every live face at a node a candidate; return the new count."""
     k = replay.rings.head[node]
@@ -193,7 +193,7 @@ def add_ring(replay: Replay, near_count: int, shared: int, own: int, node: int):
     return near_count
 
 
-@wp.func
+@wp.func(inline=False)
 def approach_point(replay: Replay, near_count: int, shared: int, own: int, p: wp.vec3d, limit: wp.float64):
     """Walk over the active surface towards p, from the nearest candidate until within `limit` or at a local minimum.
 

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.cpu_threads import launch_on_cores
-from warp_abtree.kernels.progressive import hausdorff_bound, merge_window, polygon, triangle_cover
+from warp_abtree.kernels.progressive import block_queue, hausdorff_bound, merge_window, polygon, triangle_cover
 from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, unwritten
 
 # Cores and faces from which on windows gain: gathering them takes half as long again as going on merge by merge.
@@ -67,7 +67,7 @@ class LodBounds:
         if self._window is None:
             self._window = _new_window(self.replay)
         counter = self._window.counter.numpy()  # shares the memory
-        counter[[int(merge_window.ENDED), int(merge_window.THREADS)]] = 0
+        counter[[int(block_queue.ENDED), int(block_queue.THREADS)]] = 0
         inputs = [self._vertex_count, self._known, COVERS, self._pair, self.replay, self._window, self._covers]
 
         def work():
@@ -121,7 +121,7 @@ def _new_window(replay):
     merges, face_count = int(merge_window.MERGE_ROOM), len(replay.face_slot)
     rows = face_count + int(merge_window.TRIANGLE_ROOM)
     blocks = merges + rows // int(triangle_cover.COVERS_AT_ONCE) + 1
-    window.counter = filled(int(merge_window.COUNTERS), 0)
+    window.counter = filled(block_queue.COUNTER_COUNT, 0)
     window.merge = filled((merges, 3), 0, wp.vec3i)
     window.start, window.near_start = filled(merges + 1, 0), filled(merges + 1, 0)
     window.first_block = filled(merges + 1, 0)

@@ -62,7 +62,8 @@ struct NearFaces {
         for (int g = from; g < groups; ++g)
             group[g].load(place[g]);
     }
-    void measure(const Corner& p, double* row) const {
+    // Not inlined, as `PolygonCuts::cut`: both have many callers, and compiling takes long.
+    __attribute__((noinline)) void measure(const Corner& p, double* row) const {
         const FaceLanes::Point q = FaceLanes::spread(p.x, p.y, p.z);
         for (int g = 0; g < groups; ++g)
             *(lanes*)(row + 8 * g) = group[g].distance_sq(q);
