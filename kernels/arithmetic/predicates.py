@@ -1,5 +1,5 @@
 """Orientation signs: a float64 determinant with a proven error bound; where it leaves the sign open, the same in double
-words, then in wrapping integers, and at last expansions.
+words, then in wrapping integers, and at last in integers as long as it takes.
 
 With e = 2^-53 the determinants below err by at most (8 + 128 e) e P in 3D and (3 + 16 e) e P in 2D, P the same sum with
 every product and difference of products replaced by the sum of magnitudes, computed in the same arithmetic. Coordinates
@@ -11,7 +11,8 @@ from typing import Any
 import warp as wp
 
 from warp_abtree.kernels.arithmetic.double_word import BOUND_DOUBLE, double_orient2d, double_orient3d
-from warp_abtree.kernels.arithmetic.expansion import exact_orient2d, exact_orient3d, fuse_multiply
+from warp_abtree.kernels.arithmetic.exact import exact_orient2d, exact_orient3d
+from warp_abtree.kernels.arithmetic.expansion import fuse_multiply
 from warp_abtree.kernels.arithmetic.int128 import integer_orient2d, integer_orient3d
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_abtree.kernels.arithmetic.expansion import EXPANSION_LANES
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.traversal.uncertain_pairs import items_at_once
@@ -173,7 +174,7 @@ def find_deferred_kernel(
     contacts_out: Contacts,
 ):
     """Compute deferred contacts by exact signs: few at a time in each warp of so many threads."""
-    at_once = items_at_once(deferred.total[0], step)
+    at_once = wp.min(items_at_once(deferred.total[0], step), EXPANSION_LANES)
     k = at_once * (wp.tid() / warp_size()) + warp_lane()
     while warp_lane() < at_once and k < deferred.total[0]:
         i = deferred.place[k]

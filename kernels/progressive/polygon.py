@@ -69,7 +69,7 @@ def triangle_distance_sq(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     return wp.min(segment_distance_sq(p, a, b), wp.min(segment_distance_sq(p, b, c), segment_distance_sq(p, c, a)))
 
 
-@wp.func
+@wp.func(inline=False)
 def face_distance_sq(face_pos: wp.array2d(dtype=wp.vec3d), f: int, p: wp.vec3d):
     return triangle_distance_sq(p, face_pos[f, 0], face_pos[f, 1], face_pos[f, 2])
 
@@ -127,7 +127,7 @@ def store_polygon(scratch: Scratch, row: int, count: int):
     scratch.stack_count[row] = count
 
 
-@wp.func
+@wp.func(inline=False)
 def cut_polygon(scratch: Scratch, count: int, row: int, normal: wp.vec3d, origin: wp.vec3d, margin: wp.float64):
     """Cut the current polygon by a plane: keep the side of the normal, write the rest to a row of the stack.
 

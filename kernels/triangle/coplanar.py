@@ -7,7 +7,7 @@ from warp_abtree.kernels.arithmetic.predicates import drop_axis, orient2d, orien
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
-@wp.func
+@wp.func(inline=False)
 def separates_line(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, inner: wp.vec2d, p: wp.vec2d, q: wp.vec2d, r: wp.vec2d):
     """Return whether p, q and r all lie strictly on the side of line ab that `inner` is not on."""
     side = orient2d(mode, a, b, inner)
@@ -40,7 +40,7 @@ def overlap_coplanar(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: w
     return True
 
 
-@wp.func
+@wp.func(inline=False)
 def widest_axis(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     """Return the axis along which a triangle projects to about the largest area, -1 where all three are collinear."""
     axis = wp.int32(-1)
@@ -137,7 +137,7 @@ def intersect_segments(mode: wp.int32, p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b:
     return meet
 
 
-@wp.func
+@wp.func(inline=False)
 def intersect_degenerate(
     mode: wp.int32,
     axis_a: wp.int32,

@@ -63,7 +63,7 @@ def is_one_sided(s0: wp.int32, s1: wp.int32, s2: wp.int32):
     return wp.abs(s0 + s1 + s2) == 3
 
 
-@wp.func
+@wp.func(inline=False)
 def intersect_special(
     mode: wp.int32, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d
 ):

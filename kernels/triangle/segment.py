@@ -7,13 +7,7 @@ on, and the rounding of its coordinates. Nothing here depends on the order in wh
 
 import warp as wp
 
-from warp_abtree.kernels.arithmetic.expansion import (
-    LENGTH_2D,
-    LENGTH_3D,
-    expand_orient2d,
-    expand_orient3d,
-    sum_expansion,
-)
+from warp_abtree.kernels.arithmetic.expansion import expand_area, expand_volume
 from warp_abtree.kernels.arithmetic.predicates import (
     BOUND_2D,
     BOUND_3D,
@@ -33,22 +27,6 @@ RELATIVE_ERROR = wp.constant(wp.float64(2.0**-42))
 # Corners in, and edges across, the other triangle.
 POINT_ROOM = wp.constant(15)
 NEAREST_STEPS = wp.constant(32)
-
-
-@wp.func(inline=False)
-def expand_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return det(a - d, b - d, c - d) by expansions."""
-    sum = wp.zeros(shape=(LENGTH_3D,), dtype=wp.float64)
-    length = expand_orient3d(sum, a, b, c, d)
-    return sum_expansion(sum, length)
-
-
-@wp.func(inline=False)
-def expand_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
-    """Return det(a - c, b - c) by expansions."""
-    sum = wp.zeros(shape=(LENGTH_2D,), dtype=wp.float64)
-    length = expand_orient2d(sum, a, b, c)
-    return sum_expansion(sum, length)
 
 
 @wp.func
@@ -191,7 +169,7 @@ def holds_point(axis: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, p: wp.vec
     return (ab >= 0 and bc >= 0 and ca >= 0) or (ab <= 0 and bc <= 0 and ca <= 0)
 
 
-@wp.func
+@wp.func(inline=False)
 def overlap_ends(axis: wp.int32, corner: wp.array(dtype=wp.vec3d)):
     """Return the number of points and the two that are farthest apart of the overlap of two sets in one plane.
 
@@ -235,7 +213,7 @@ def overlap_ends(axis: wp.int32, corner: wp.array(dtype=wp.vec3d)):
     return count, point[first], point[last]
 
 
-@wp.func
+@wp.func(inline=False)
 def pierce_triangle(axis: wp.int32, low: wp.vec3d, high: wp.vec3d, base: wp.int32, corner: wp.array(dtype=wp.vec3d)):
     """Return the number of points and the ends of the overlap of a segment (or point) and the triangle at base."""
     value_low = signed_volume(corner[base], corner[base + 1], corner[base + 2], low)
@@ -312,7 +290,7 @@ def nearest_on_triangle(base: wp.int32, corner: wp.array(dtype=wp.vec3d), p: wp.
     return best
 
 
-@wp.func
+@wp.func(inline=False)
 def nearest_middle(scale: wp.float64, corner: wp.array(dtype=wp.vec3d)):
     """Return a point between two triangles that are nearly nearest to each other there, by alternating projection."""
     near = wp.zeros(shape=(6,), dtype=wp.vec3d)

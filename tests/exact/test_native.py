@@ -123,7 +123,7 @@ def compile_alone(text, folder):
 
 def test_included_files_are_part_of_the_text():
     """Warp hashes the text, so that a change of any file compiles anew."""
-    assert "struct WideInteger" in native.body("int128.h", "integer_orient3d")
+    assert "struct WideInteger" in native.body("exact/int128.h", "integer_orient3d")
     assert not any("#include" in body for file in FILES for _, body in native.functions(file).values())
 
 

@@ -1,4 +1,4 @@
-"""Expansions, and signs of all stages, against fractions."""
+"""Exact determinants, and signs of all stages, against fractions."""
 
 from fractions import Fraction
 
@@ -9,7 +9,8 @@ from helpers.questions import launch
 from oracles.signs import COUNT, KINDS, random_floats, rounded_signs, true_signs, true_terms
 
 from warp_abtree.kernels.arithmetic.double_word import double_orient2d, double_orient3d
-from warp_abtree.kernels.arithmetic.expansion import exact_orient2d, exact_orient3d, two_product, two_sum
+from warp_abtree.kernels.arithmetic.exact import exact_orient2d, exact_orient3d, exact_volume
+from warp_abtree.kernels.arithmetic.expansion import EXPANSION_LANES, expand_area, expand_volume, two_product, two_sum
 from warp_abtree.kernels.arithmetic.int128 import integer_orient2d, integer_orient3d
 from warp_abtree.kernels.arithmetic.predicates import UNCERTAIN, orient2d, orient3d, orient_edges
 from warp_abtree.kernels.triangle import float32_filter
@@ -56,7 +57,7 @@ def test_sums_and_products_lose_nothing(device, kind):
     assert [Fraction(h) + Fraction(t) for h, t in zip(high.tolist(), low.tolist())] == exact
 
 
-STAGES = ("filter", "float32", "exact", "expansion", "integer", "double")  # the first three by their modes
+STAGES = ("filter", "float32", "exact", "long", "integer", "double")  # the first three by their modes
 
 
 @wp.kernel
@@ -129,7 +130,7 @@ def test_signs(device, form, kind):
     assert len(np.unique(truth)) >= 2
     sure = check_filter(found, truth)
     if form != "edges":
-        np.testing.assert_array_equal(found["expansion"], truth)
+        np.testing.assert_array_equal(found["long"], truth)
     if kind == "random":
         assert sure.all() and (found["float32"] == truth).mean() > 0.99
     elif kind in ROUNDED_WRONG:
@@ -143,6 +144,46 @@ def test_signs(device, form, kind):
             off = abs(Fraction(value) - sum(terms))
             # The high word alone is returned.
             assert off <= Fraction(2) ** -53 * abs(Fraction(value)) + 20 * Fraction(2) ** -106 * sum(map(abs, terms))
+
+
+def spread_points(rng, dim):
+    """The first row is a large power of two times a sum of the others, less the last point, which rounds nothing."""
+    last = rng.integers(-9, 10, (COUNT, 1, dim)).astype(float)
+    rows = rng.integers(-9, 10, (COUNT, dim - 1, dim)).astype(float)
+    first = (rng.integers(-9, 10, (COUNT, dim - 1, 1)) * rows).sum(1, keepdims=True)
+    return np.concatenate([first * 2.0 ** rng.integers(60, 200, (COUNT, 1, 1)), rows + last, last], 1)
+
+
+@wp.kernel
+def volume_kernel(points: wp.array2d[wp.vec3d], out: wp.array2d[wp.float64]):
+    """A determinant rounded once, and as expansions have it in 3D and, of its first coordinates, in 2D."""
+    i = wp.tid()
+    a, b, c, d = points[i, 0], points[i, 1], points[i, 2], points[i, 3]
+    out[i, 0] = exact_volume(a, b, c, d)
+    out[i, 1] = expand_volume(a, b, c, d)
+    out[i, 2] = expand_area(wp.vec2d(a[0], a[1]), wp.vec2d(b[0], b[1]), wp.vec2d(d[0], d[1]))
+
+
+def tied_points(rng, dim):
+    """Determinants with few bits, about half a unit in the last place of others: many are ties, or next to one."""
+    rows = np.eye(3)[None] * rng.choice([1.0, -1.0], (COUNT, 1, 1))
+    rows[:, 0, 0] = 2.0**53 - rng.integers(0, 3, COUNT)
+    rows[:, 0, 1], rows[:, 1, 0] = rng.choice([0.25, 0.5, 1.0, 1.5], COUNT), rng.choice([-1.0, 1.0, 3.0], COUNT)
+    rows[:, 0, 2], rows[:, 2, 0] = 2.0 ** -rng.integers(0, 70, COUNT), rng.choice([0.0, 1.0, -1.0], COUNT)
+    return np.concatenate([rows, np.zeros((COUNT, 1, 3))], 1)
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "spread", "tied"])
+def test_determinants_are_rounded_once_or_a_few_times(device, kind):
+    """Once to nearest, ties to even, as Python rounds fractions; expansions with a few roundings more."""
+    points = {**KINDS, "spread": spread_points, "tied": tied_points}[kind](np.random.default_rng([8, 3]), 3)
+    found = launch(volume_kernel, device, len(points), points, columns=3, block_dim=int(EXPANSION_LANES))
+    values = [sum(true_terms(rows)) for rows in points.tolist()]
+    np.testing.assert_array_equal(found[:, 0], [float(x) for x in values])
+    assert not np.signbit(found[found[:, 0] == 0, 0]).any() and len(np.unique(found[:, 0])) > 5
+    areas = [sum(true_terms(rows)) for rows in points[:, [0, 1, 3], :2].tolist()]
+    for expanded, exact in ((found[:, 1], values), (found[:, 2], areas)):
+        assert all(abs(Fraction(x) - y) <= abs(y) / 2**51 for x, y in zip(expanded.tolist(), exact))
 
 
 @pytest.mark.parametrize("across", [False, True])
@@ -177,14 +218,6 @@ def unit_of(rows):
         for row in rows
     ]
     return sum(map(min, powers)) if all(powers) else None
-
-
-def spread_points(rng, dim):
-    """The first row is a large power of two times a sum of the others, less the last point, which rounds nothing."""
-    last = rng.integers(-9, 10, (COUNT, 1, dim)).astype(float)
-    rows = rng.integers(-9, 10, (COUNT, dim - 1, dim)).astype(float)
-    first = (rng.integers(-9, 10, (COUNT, dim - 1, 1)) * rows).sum(1, keepdims=True)
-    return np.concatenate([first * 2.0 ** rng.integers(60, 200, (COUNT, 1, 1)), rows + last, last], 1)
 
 
 @pytest.mark.parametrize("share", [1, 4])

@@ -21,7 +21,7 @@ def GpuQuery(*arguments, **options):
         return ab.Query(*arguments, **options)
 
 
-def launch(kernel, device, shape, *inputs, columns=0):
+def launch(kernel, device, shape, *inputs, columns=0, block_dim=256):
     """Launch a kernel with a thread for each entry of a shape; return its last argument, so many columns for each.
 
     Arrays of NumPy, and lists, become Warp's, of the types that the kernel names.
@@ -32,7 +32,7 @@ def launch(kernel, device, shape, *inputs, columns=0):
             wp.array(value, dtype=kind.dtype, device=device) if isinstance(value, (list, np.ndarray)) else value
         )
     out = wp.zeros((shape, columns) if columns else shape, dtype=types[-1].dtype, device=device)
-    wp.launch(kernel, shape, [*given, out], device=device)
+    wp.launch(kernel, shape, [*given, out], device=device, block_dim=block_dim)
     return out.numpy()
 
 

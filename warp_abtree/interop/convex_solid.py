@@ -1,12 +1,9 @@
 """A model's original mesh on the host: its box, extreme corners, and the planes of a convex solid."""
 
 import weakref
-from functools import cached_property
 
 import numpy as np
-import trimesh
 
-from warp_abtree.interop.nearest import NodeBoxes
 from warp_abtree.model.mesh import component_labels, load_mesh
 from warp_abtree.model.model import Model
 
@@ -49,11 +46,6 @@ class Shape:
             normals = normals[wide] / length[wide, None]
             self.planes = normals, np.einsum("ij,ij->i", normals, a[wide]), face_ids[wide]
 
-    @cached_property
-    def node_boxes(self) -> NodeBoxes:
-        """Boxes of the tree at the finest LOD."""
-        return NodeBoxes(self.model)
-
     def find_inside(self, pose, other, other_pose):
         """Find a component of another shape inside this solid; the two surfaces must not intersect.
 
@@ -85,6 +77,8 @@ _SHAPES = weakref.WeakValueDictionary()
 
 def shape_of(mesh) -> Shape:
     """Return the shape of a mesh, by content, or of a model."""
+    import trimesh
+
     key: tuple = ("model", id(mesh))
     if isinstance(mesh, trimesh.Trimesh):
         key = (hash(mesh), len(mesh.vertices), len(mesh.faces))
@@ -106,6 +100,8 @@ def shape_of(mesh) -> Shape:
 
 def is_convex(mesh) -> bool:
     """Return `mesh.is_convex` of trimesh, without the graph package that trimesh needs for it."""
+    import trimesh
+
     if not mesh.is_watertight:
         return False
     faces = np.asarray(mesh.faces)

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.model.mesh import MeshError, load_mesh
@@ -35,6 +34,8 @@ def scene_from_trimesh(source, device=None, base_faces=10, progress=None):
         TypeError: source is no trimesh.Scene.
         MeshError: A mesh cannot be used, a node's transform is singular or not affine, or there is no mesh.
     """
+    import trimesh
+
     if not isinstance(source, trimesh.Scene):
         raise TypeError(f"source is a {type(source).__name__}, not a trimesh.Scene")
     placed = []
@@ -95,6 +96,8 @@ def scene_from_file(path, device=None, base_faces=10, progress=None):
     Raises:
         MeshError: The file is missing or cannot be read, or as for `scene_from_trimesh`.
     """
+    import trimesh
+
     path = Path(path)
     if not path.is_file():
         raise MeshError(f"{path}: no such file")
@@ -110,7 +113,9 @@ def scene_from_file(path, device=None, base_faces=10, progress=None):
         raise MeshError(f"{path}: {error}") from None
 
 
-def _read_usd(path) -> trimesh.Scene:
+def _read_usd(path):
+    import trimesh
+
     try:
         from pxr import Tf, Usd, UsdGeom
     except ImportError:
@@ -174,6 +179,8 @@ def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 
     Raises:
         ValueError: names are not n different strings, or the result names objects that the scene does not have.
     """
+    import trimesh
+
     count = scene.object_count
     names = [f"object {i}" for i in range(count)] if names is None else list(names)
     if len(names) != count or len(set(names)) != count or not all(isinstance(name, str) for name in names):

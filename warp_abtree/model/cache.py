@@ -7,10 +7,10 @@ The folder is $WARP_ABTREE_CACHE if that is set, and none if it is "off"; else $
 import contextlib
 import hashlib
 import os
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from warp_abtree.checks.atomic_write import atomic_write, sweep_up
 from warp_abtree.checks.version import __version__
@@ -47,7 +47,7 @@ def file_key(source, *options) -> str | None:
     if kind[0] not in SELF_CONTAINED:
         return None
     try:
-        return _key([path.read_bytes()], kind, None if kind[0] == "obj" else trimesh.__version__, *options)
+        return _key([path.read_bytes()], kind, None if kind[0] == "obj" else version("trimesh"), *options)
     except OSError:
         return None
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.model.obj import MeshError, read_file, read_warp_asset, split_file_name
@@ -57,9 +56,11 @@ def load_mesh(source, name=None):
     Raises:
         MeshError: The source cannot be read, or holds no mesh that can be used.
     """
-    if isinstance(source, trimesh.parent.Geometry):
-        return _join_geometry(source, "trimesh" if name is None else name)
     if not isinstance(source, str | os.PathLike):
+        import trimesh  # takes as long as the rest of the library
+
+        if isinstance(source, trimesh.parent.Geometry):
+            return _join_geometry(source, "trimesh" if name is None else name)
         raise MeshError(f"cannot load a mesh from {type(source).__name__}; give a path, a trimesh.Trimesh or arrays")
     if isinstance(source, str) and source.startswith("warp:"):
         asset = source[len("warp:") :]
@@ -67,7 +68,7 @@ def load_mesh(source, name=None):
     path = Path(source)
     found = read_file(path)
     name = split_file_name(path)[0] if name is None else name
-    if isinstance(found, trimesh.Scene):
+    if not isinstance(found, tuple):
         return _join_geometry(found, name, where=str(path))
     vertices, faces = found
     return _weld_mesh(vertices, faces, name, where=str(path))
@@ -127,6 +128,8 @@ def describe_mesh(mesh):
 
 def _join_geometry(geometry, name, where=None):
     """Join the triangles of a trimesh object; points and paths are ignored."""
+    import trimesh
+
     where = name if where is None else where
     placed = [(geometry, np.eye(4))]
     if isinstance(geometry, trimesh.Scene):

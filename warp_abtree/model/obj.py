@@ -11,7 +11,6 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-import trimesh
 import warp as wp
 
 from warp_abtree.checks.arguments import first_line
@@ -55,6 +54,8 @@ def read_file(path: Path):
         raise MeshError(f"{path}: not a mesh file; a built model is read by Model.open")
     if kind == "obj":
         return parse_obj(data, str(path))
+    import trimesh
+
     known = trimesh.available_formats()
     if kind not in known:
         raise MeshError(f"{path}: unknown extension '{kind}'; known here: {' '.join(sorted(known))}")

@@ -9,13 +9,17 @@ import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.cpu_threads import core_count, wait_for, workers
+from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.progressive import vertex_forest
+from warp_abtree.kernels import active_build
+from warp_abtree.kernels.progressive import hausdorff_bound, vertex_forest
 from warp_abtree.model.collapse import Collapse
 from warp_abtree.model.cpu_arrays import cpu_array, launch
 from warp_abtree.model.lod_bounds import LodBounds
 
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
+# Compiled while the first merges are made.
+SLOW_KERNELS = [(hausdorff_bound.replay_merges_kernel, 1), (active_build.split_segment_kernel, 1)]
 
 
 @dataclass(frozen=True)
@@ -136,7 +140,8 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     if 2 * len(vertices) >= NODE_LIMIT or 3 * len(faces) >= 2**31:
         raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
     report = progress if progress is not None else lambda stage, done, total: None
-    collapse, bounds = Collapse(vertices, faces, int(base_faces)), LodBounds(vertices, faces)
+    with loading(wp.get_device("cpu"), SLOW_KERNELS):
+        collapse = Collapse(vertices, faces, int(base_faces))
 
     def finish():
         parent = collapse.parents()
@@ -148,11 +153,13 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     if threads == 1:
         for removed in collapse.steps():
             report("collapse", removed, collapse.goal)
+        bounds = LodBounds(vertices, faces)
         merged = _follow(collapse, bounds, lambda: 1, report)
         forest = finish()
     else:
         running = workers(1).submit(lambda: finish() if collapse.run() else None)
         try:
+            bounds = LodBounds(vertices, faces)
             merged = _follow(collapse, bounds, lambda: threads if running.done() else threads - 1, report)
         finally:
             collapse.stop()

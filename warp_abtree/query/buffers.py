@@ -163,9 +163,7 @@ class QueryBuffers:
         """Return (owner, attribute, new array) of a device list of pairs, and of whatever belongs to a pair."""
         check_pair_room(len(pairs))
         made = [*self._pair_arrays(len(pairs)), (self, "pairs", pairs)]
-        if self.broad_phase is not None:
-            made.append((self.broad_phase, "pairs", pairs))
-        return made
+        return made if self.broad_phase is None else made + self.broad_phase.make_room(pairs)
 
     def _take_pairs(self, pairs):
         """Take a device list of pairs and make room for whatever belongs to a pair: all of it, or nothing changes."""

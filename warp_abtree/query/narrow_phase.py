@@ -2,11 +2,13 @@
 
 import math
 from functools import partial
+from typing import Any
 
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.cpu_threads import launch_on_cores
+from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, relative_pose, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
@@ -52,6 +54,7 @@ class Query(QueryReadout):
         within: Distances [world units], one for all pairs or (p,) beside given pairs: tell also which pairs are farther
             apart. The proof covers all rounding: pairs beyond by less than about 1e-13 of their size stay unproved, by
             less than 6 s where a rotation is off orthonormal by s, and all for distances from 2^1000 on.
+        sort_pairs: Whether pairs of the broad phase are sorted by their objects.
 
     Attributes:
         batch: `Batch` that is queried.
@@ -66,27 +69,29 @@ class Query(QueryReadout):
 
     growth = 1  # room that `run` makes, over the demand
 
-    def __init__(self, scene, output="faces", pairs=None, capacity=None, precision="exact", within=None):
+    def __init__(
+        self, scene, output="faces", pairs=None, capacity=None, precision="exact", within=None, sort_pairs=False
+    ):
         check_request(output, precision)
         check_device(scene.device, f"making a {type(self).__name__}")
         room = check_capacity(capacity)
-        self.batch = batch = batch_of(scene)
+        self._regime = current_regime()
+        self.output, self.precision, self.device = output, precision, scene.device
+        with loading(self.device, self._slow_kernels(within is not None)):
+            self.batch = batch = batch_of(scene)
         if pairs is not None:
             pairs = batch.check_pairs(pairs)
         if within is not None:
             within = check_within(within, None if pairs is None else len(pairs))
-        self._regime = current_regime()
-        self.output, self.precision = output, precision
-        self.device = batch.device
         self._torn = False
         self._commands = Commands()
         self.guard = LaunchGuard(
             self.device, batch.states.generation, batch.filter_generation if pairs is None else None
         )
-        self.broad_phase = None
+        self.broad_phase: Any = None
         if pairs is None:
             self._excluded_count = len(batch.excluded)
-            self.broad_phase = BroadPhase(batch, room.pairs)
+            self.broad_phase = BroadPhase(batch, room.pairs, sort_pairs)
             self.broad_phase.guard = self.guard
             self.pairs, self.pair_count = self.broad_phase.pairs, self.broad_phase.pair_count
         else:
@@ -116,8 +121,11 @@ class Query(QueryReadout):
         self.guard.write_to(work.record)
         return work
 
-    def launch(self):
+    def launch(self, between=None):
         """Run broad phase (unless pairs were given) and narrow phase. Launches only.
+
+        Args:
+            between: Called between the two, as to time them.
 
         Raises:
             RuntimeError: The scene's objects changed since the query was made, or its filter where the broad phase
@@ -125,12 +133,14 @@ class Query(QueryReadout):
         """
         self._check_scene()
         with self.guard.launching(self):
-            self._launch()
+            self._launch(between)
             self.finish()
 
-    def _launch(self):
+    def _launch(self, between=None):
         if self.broad_phase is not None:
             self.broad_phase.launch()
+        if between is not None:
+            between()
         self.prove_apart()
         self.traverse()
 
@@ -218,18 +228,32 @@ class Query(QueryReadout):
         """Make the launches of the narrow phase."""
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
         made = self._make_search(self._no_distance, self.hits, mode, output, launch)
-        passes = []
-        if len(self.hits.uncertain):
-            first = uncertain_pairs.float64_filter_kernel if mode == EXACT else uncertain_pairs.resolve_rounded_kernel
-            passes = [(first, FILTER_WARPS_A_PROCESSOR)]
-            if mode == EXACT:
-                passes.append((uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR))
         models, states, _ = self.batch.pools
-        for kernel, warps in passes:
+        for kernel, warps in self._passes() if len(self.hits.uncertain) else ():
             threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
             inputs = [threads, output, models, states, self.pair_poses, self.hits]
             made.append(launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
         return made
+
+    def _passes(self) -> list:
+        """Return the kernels that decide uncertain face pairs, and their warps on a multiprocessor."""
+        if int(PRECISIONS[self.precision]) != EXACT:
+            return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR)]
+        return [
+            (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR),
+            (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR),
+        ]
+
+    def _slow_kernels(self, with_distances: bool) -> list:
+        """Return the kernels that take longest to compile, with block sizes, the longest first."""
+        within = int(face_pairs.WITHIN)
+        modes = [int(PRECISIONS[self.precision]), *([within] if with_distances else [])]
+        if self.uses_warps():
+            kernels = [dual_tree.warp_traversal(mode, mode == within or self.output == "any") for mode in modes]
+            kernels += reversed([kernel for kernel, _ in self._passes()])
+        else:
+            kernels = [simd.thread_traversal(mode) for mode in modes]
+        return [(kernel, WARP_SIZE) for kernel in (*kernels, relative_pose.relative_pose_kernel)]
 
     def result(self, device: bool = False) -> Result:
         """Return the results of the last launch, sorted. Waits for the device.
@@ -249,21 +273,24 @@ class Query(QueryReadout):
         result.check()
         return result
 
-    def grow(self):
+    def grow(self, between=None):
         """Launch, and again with more room until nothing is lost. Waits for the device.
+
+        Args:
+            between: As for `launch`, which calls it once.
 
         Raises:
             CapacityError: More pairs or hits than there can be room for.
             RuntimeError: As `launch`; or a graph is being captured.
         """
-        self._grow(lambda: Found(self._read_totals()))
+        self._grow(lambda: Found(self._read_totals()), between)
 
-    def _grow(self, read) -> Found:
+    def _grow(self, read, between=None) -> Found:
         """Launch as `grow` and return what `read` finds of the last launch."""
         check_device(self.device, f"{type(self).__name__}.run (launch can)")
         self._check_scene()
         with self.guard.launching(self):
-            self._launch()
+            self._launch(between)
             found = read()
             if found.totals.pairs > len(self.pairs):
                 self._take_pairs(wp.empty(self.growth * found.totals.pairs, dtype=wp.vec2i, device=self.device))

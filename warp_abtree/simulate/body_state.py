@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 import warp as wp
 
 from warp_abtree.checks.arguments import broadcast_rows, finite_array, first_line
@@ -68,6 +67,8 @@ def mass_properties(model: Model) -> MassProperties:
     Raises:
         ValueError: The mesh is flat, or its convex hull is needed and scipy or networkx is missing.
     """
+    import trimesh
+
     vertices, faces, _ = model.mesh_at(model.lod_max)
     middle = 0.5 * (vertices.min(0) + vertices.max(0))
     size = np.ptp(vertices, axis=0).max()

@@ -13,6 +13,16 @@ struct Corner {
 struct Polygon {
     int count;
     Corner corner[POLYGON_CORNERS];
+
+    Polygon() : count(0) {}
+    Polygon(const Polygon& other) { *this = other; }
+    // The corners in use alone.
+    Polygon& operator=(const Polygon& other) {
+        count = other.count;
+        for (int i = 0; i < count; ++i)
+            corner[i] = other.corner[i];
+        return *this;
+    }
 };
 
 struct NearFaces {
@@ -52,7 +62,8 @@ struct NearFaces {
         for (int g = from; g < groups; ++g)
             group[g].load(place[g]);
     }
-    void measure(const Corner& p, double* row) const {
+    // Not inlined, as `PolygonCuts::cut`: both have many callers, and compiling takes long.
+    __attribute__((noinline)) void measure(const Corner& p, double* row) const {
         const FaceLanes::Point q = FaceLanes::spread(p.x, p.y, p.z);
         for (int g = 0; g < groups; ++g)
             *(lanes*)(row + 8 * g) = group[g].distance_sq(q);

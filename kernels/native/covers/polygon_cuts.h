@@ -19,7 +19,8 @@ struct PolygonCuts {
         }
     }
     // As `cut_polygon`; false where there is no room for distances.
-    bool cut(Polygon& p, Polygon& rest, const double (&normal)[3], const double (&origin)[3], double margin) {
+    __attribute__((noinline)) bool cut(Polygon& p, Polygon& rest, const double (&normal)[3], const double (&origin)[3],
+                                       double margin) {
         double height[POLYGON_CORNERS];
         int above = 0, below = 0;
         for (int i = 0; i < p.count; ++i) {
