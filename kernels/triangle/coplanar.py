@@ -58,7 +58,7 @@ def widest_axis(mode: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     return axis
 
 
-@wp.func(inline=False)
+@wp.func
 def intersect_coplanar(
     mode: wp.int32, axis: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d
 ):
