@@ -77,7 +77,7 @@ def run_controller(loaded, controller, output, frames, options):
 
 def steady_costs(frame):
     """Return T' of all frames after the first second [ms]."""
-    return np.array([row.cost_ms for row in frame.history if row.time >= 1.0])
+    return np.array([row.total_ms for row in frame.history if row.time >= 1.0])
 
 
 def describe_hold(frame, budget):
@@ -101,7 +101,7 @@ def draw_runs(name, runs, budget, folder):
         {
             "controller": controller,
             "frame": i,
-            "cost": row.cost_ms / budget,
+            "cost": row.total_ms / budget,
             "faces": row.faces,
             "error": row.error_mean,
         }

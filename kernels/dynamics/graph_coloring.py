@@ -10,7 +10,7 @@ from warp_abtree.kernels.dynamics.bodies import DYNAMIC, Bodies
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-COLOR_COUNT = wp.constant(16)
+COLOR_COUNT = wp.constant(24)
 """Number of colors. Pairs without one have the color COLOR_COUNT; those left over are relaxed one after another."""
 
 INACTIVE = wp.constant(127)

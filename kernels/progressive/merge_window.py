@@ -2,8 +2,8 @@
 
 A window holds the next merges whose rings share no face and whose triangles are not the same. None of them changes what
 another reads, so their triangles are covered on the surface before all of them, in any order. The running maximum rises
-seldom: triangles are covered for its value before the window. Where it rises, and where a triangle has to be covered
-alone, the window ends, and the merges after it are gathered again.
+seldom: triangles are covered for its value before the window. Where it rises, and where a triangle covered alone moves
+to a face about a later merge, the window ends, and the merges after it are gathered again.
 """
 
 import warp as wp
@@ -14,31 +14,34 @@ from warp_abtree.kernels.progressive.hausdorff_bound import (
     NEXT_MERGE,
     STAMP,
     cover_queue,
-    move_faces,
+    merge_rings,
     register_covers,
 )
 from warp_abtree.kernels.progressive.triangle_cover import (
     COVERS_AT_ONCE,
     FLOOR,
+    SLOT_FACE,
     SLOT_NEXT,
+    SLOT_SIBLING,
     SLOT_STAMP,
     SLOT_TRIANGLE,
     SLOTS,
     Covers,
     Replay,
-    add_ring,
     cover_ring,
+    fetch_merge,
 )
 from warp_abtree.kernels.progressive.vertex_forest import count_dying, third_corner
 from warp_abtree.kernels.traversal.load_balance import take_unit
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-# Entries of `Window.counter`; `take_unit` counts the last one up.
+# Entries of `Window.counter`; `take_unit` counts TAKEN up.
 MERGES = wp.constant(0)
 TRIANGLES = wp.constant(1)
 BLOCKS = wp.constant(2)
 TAKEN = wp.constant(3)
+FIRST_STAMP = wp.constant(4)  # stamp of its first merge
 
 MERGE_ROOM = wp.constant(512)
 TRIANGLE_ROOM = wp.constant(1 << 16)  # a merge is added while there are fewer
@@ -51,7 +54,7 @@ CONFLICT = wp.constant(-1)
 class Window:
     """Merges that do not meet, in order."""
 
-    counter: wp.array(dtype=int)  # [4]
+    counter: wp.array(dtype=int)  # [5]
     merge: wp.array(dtype=wp.vec3i)  # [MERGE_ROOM], its two nodes and the one that it makes
     start: wp.array(dtype=int)  # [MERGE_ROOM + 1], first triangle of each merge
     near_start: wp.array(dtype=int)  # [MERGE_ROOM + 1], first face about each merge
@@ -134,6 +137,7 @@ def gather_window_kernel(
     gathering = bool(True)
     while gathering and j < merge_count and merges < MERGE_ROOM and span[0] < TRIANGLE_ROOM:
         merge = wp.vec3i(merge_pair[j, 0], merge_pair[j, 1], vertex_count + j)
+        fetch_merge(replay_inout, merge_pair, merge_count, j)
         added = gather_merge(replay_inout, window_inout, merge, first_new, span)
         gathering = added[0] >= 0
         stamp += 1
@@ -157,6 +161,7 @@ def gather_window_kernel(
     window_inout.counter[TRIANGLES] = span[0]
     window_inout.counter[BLOCKS] = blocks
     window_inout.counter[TAKEN] = 0
+    window_inout.counter[FIRST_STAMP] = span[2]
 
 
 @wp.kernel
@@ -187,7 +192,22 @@ def cover_window_kernel(
 
 
 @wp.func
-def register_merge(replay: Replay, window: Window, covers: Covers, w: int, stamp: int, limit: wp.float64):
+def meets_later(replay: Replay, window: Window, w: int, begin: int, end: int):
+    """Tell whether triangles of a merge are now registered with faces about a later merge of the window."""
+    last = window.counter[FIRST_STAMP] + w
+    for i in range(begin, end):
+        slot = window.covers.triangle[i]
+        while slot >= 0:
+            if window.face_mark[replay.slot[slot, SLOT_FACE]] > last:
+                return True
+            slot = replay.slot[slot, SLOT_SIBLING]
+    return False
+
+
+@wp.func
+def register_merge(
+    replay: Replay, window: Window, covers: Covers, w: int, near_count: int, stamp: int, limit: wp.float64
+):
     """Register the triangles of a merge of the window; the squared bound after it, and whether the window goes on."""
     before = limit
     begin = window.start[w]
@@ -197,15 +217,17 @@ def register_merge(replay: Replay, window: Window, covers: Covers, w: int, stamp
         limit = window.covers.limit[i]
         i += 1
     register_covers(replay, window.covers, begin, i, begin)
+    holds = limit == before
     if i < end:
         # The rest of this merge, as if there were no window.
         for k in range(i, end):
             replay.queue[k - i] = window.covers.triangle[k]
             replay.queue_face[k - i] = window.covers.first[k]
-        merge = window.merge[w]
-        near_count = add_ring(replay, 0, stamp, stamp, merge[2])
-        limit = cover_queue(replay, covers, merge, end - i, near_count, stamp, limit)
-    return limit, i == end and limit == before
+        limit = cover_queue(replay, covers, window.merge[w], end - i, near_count, stamp, limit)
+        holds = limit == before and not meets_later(replay, window, w, i, end)
+        # Slots as for all merges that were gathered.
+        holds = holds and replay.counter[FREE_SLOTS] >= COLUMNS * (window.counter[TRIANGLES] - end) + SLOTS
+    return limit, holds
 
 
 @wp.kernel
@@ -228,8 +250,8 @@ def register_window_kernel(
         stamp = replay_inout.counter[STAMP] + 1
         replay_inout.counter[STAMP] = stamp
         dying = count_dying(replay_inout.rings, merge[0], merge[1])
-        move_faces(replay_inout, merge[0], merge[1], merge[2])
-        limit, holds = register_merge(replay_inout, window, covers_inout, w, stamp, limit)
+        near_count = merge_rings(replay_inout, merge, 0)
+        limit, holds = register_merge(replay_inout, window, covers_inout, w, near_count, stamp, limit)
         replay_inout.counter[LIVE_FACES] = replay_inout.counter[LIVE_FACES] - dying
         bound_sq_inout[j + w] = limit
         w += 1

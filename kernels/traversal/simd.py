@@ -33,6 +33,8 @@ CPU_STACK_LENGTH = native.constant("CPU_STACK_LENGTH")
 DEPTH_FIRST_LENGTH = native.constant("DEPTH_FIRST_LENGTH")
 SUBTREES_KEPT = 512
 SUBTREE_DEPTH, SUBTREE_RECORDS = native.constant("SUBTREE_DEPTH"), native.constant("SUBTREE_RECORDS")
+# Zeros in front of a thread's memory say that it holds nothing.
+SLAB_ZEROS = 32
 SLAB_HEADER = native.constant("SLAB_HEADER")
 NO_FLOOR = native.constant("NO_FLOOR")
 # Slabs are made where so many pairs of nodes were compared for a hit, or more.
@@ -92,10 +94,12 @@ def open_subtrees(
     states: StatePool,
     pose: PairPose,
     thread: wp.int32,
-    first: bool,
     memory: wp.array2d(dtype=wp.float32),
 ) -> wp.vec2i:
-    """Choose the directions of slabs for an object pair; return its floors, see `move_below`."""
+    """Choose the directions of slabs for an object pair; return its floors, see `move_below`.
+
+    Directions and slabs of A stay for the next pair with it, in this launch or a later one.
+    """
 
 
 @wp.func_native(native.body("simd/subtrees.h", "descend_subtrees"))
@@ -245,7 +249,6 @@ class Descent:
     """How a thread goes through an object pair, and how far it is."""
 
     thread: wp.int32  # row of the memory for slabs
-    opened: wp.bool  # slabs were made before in this launch
     at_once: wp.int32  # items taken from the stack
     ready: wp.int32  # leaf pairs that are tested together
     top: wp.int32  # items on the stack
@@ -288,8 +291,7 @@ def advance(
     if descent.top > 0 and tested >= descent.plain_tests:
         descent.plain_tests += tested
         if hit_count * NODE_TESTS_A_HIT <= tested:
-            descent.floors = open_subtrees(models, states, pose, descent.thread, not descent.opened, memory)
-            descent.opened = True
+            descent.floors = open_subtrees(models, states, pose, descent.thread, memory)
             descent.plain_tests = NEVER
     plain = descent.floors[0] == NO_FLOOR
     if not plain and descent.deep == 0:

@@ -10,6 +10,7 @@ import warp_abtree as ab
 from warp_abtree import testing
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal import simd
 from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
 from warp_abtree.kernels.traversal.simd import (
     CPU_STACK_LENGTH,
@@ -72,7 +73,7 @@ def test_nested_parts_equal_brute_force(gap):
     assert (1.3 * np.array(tests[0]) < tests[10**9]).all(), "slabs separate what boxes do not"
 
 
-def test_many_subtrees_share_little_memory():
+def test_many_subtrees_share_little_memory(monkeypatch):
     """A tree of more subtrees than there is room for; the thread fills slots anew."""
     rng = np.random.default_rng(2)
     model = sample("torus")
@@ -92,10 +93,43 @@ def test_many_subtrees_share_little_memory():
         query = ab.Query(scene, "faces", pairs=[(0, 1)])
         found = [query.run().faces]
         assert query.slab_memory.shape[1] > slab_memory_words(0), "more subtrees than slots"
-        query.slab_memory = wp.empty((1, slab_memory_words(0)), dtype=wp.float32, device=CPU)
+        monkeypatch.setattr(simd, "slab_memory_words", lambda depth: slab_memory_words(0))
+        query = ab.Query(scene, "faces", pairs=[(0, 1)])
+        assert query.slab_memory.shape[1] == slab_memory_words(0)
         found.append(query.run().faces)
     for faces in found:
         np.testing.assert_array_equal(faces, expected.faces)
+
+
+def test_slabs_that_stay_are_those_of_the_lod():
+    """A query keeps slabs from launch to launch: poses, LODs and states that change places between do not mix."""
+    cases = nested_cases(np.random.default_rng(6), 0.02)
+    scene, pairs = scene_of(CPU, cases), pairs_of(cases)
+    tops = scene.lods
+    with testing.regime(plain_tests=0):
+        kept = ab.Query(scene, "faces", pairs=pairs)
+    for fractions in ([1, 1, 1, 1], [1, 1, 1, 1], [0.5, 1, 0.5, 1], [1, 1, 0.5, 1], [0.7, 0.6, 1, 0.9], [1, 1, 1, 1]):
+        scene.set_lods((tops * fractions).astype(int))
+        scene.set_poses(np.concatenate([[case[2], case[5]] for case in cases]) + [0.001 * sum(fractions), *6 * [0]])
+        with testing.regime(plain_tests=10**9):
+            expected = ab.Query(scene, "faces", pairs=pairs).run().faces
+        np.testing.assert_array_equal(kept.run().faces, expected)
+        assert len(expected) > 0
+
+
+def test_slabs_that_stay_fit_an_object_of_any_size():
+    """A far larger object leaves directions no meaning, those of the smaller one's slabs too."""
+    model, scene = sample("torus"), ab.Scene(CPU)
+    near = scene.add(model), scene.add(model, (0.01, 0.02, 0, 0, 0, 0, 1))
+    wide = 2.0**24 * np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0], [-1, -1, 1], [1, -1, 1], [0, 1, 1]])
+    walls = ab.Model.from_arrays(wide, [[0, 1, 2], [3, 4, 5]])
+    pairs = [near, *((near[0], scene.add(walls, (0, 0, z, 0, 0, 0, 1))) for z in np.linspace(-0.3, 0.3, 7))]
+    found = []
+    for plain_tests in (0, 10**9):
+        with testing.regime(plain_tests=plain_tests, cpu_threads=1):
+            found.append(ab.Query(scene, "faces", pairs=pairs).run())
+    assert (found[1].count[1:] > 0).sum() > 3
+    np.testing.assert_array_equal(found[0].faces, found[1].faces)
 
 
 @wp.kernel
@@ -112,7 +146,7 @@ def list_leaf_pairs_kernel(
     """Note which faces of one number are a leaf pair that slabs do not separate, from the roots on."""
     pose = pair_poses[0]
     pose.margin = pose.margin * margin_factor
-    open_subtrees(models, states, pose, 0, True, memory)
+    open_subtrees(models, states, pose, 0, memory)
     stack_inout[0] = first_item(states, pose)
     top = wp.int32(1)
     while top > 0:
@@ -143,7 +177,7 @@ def touching_soups(rng, count, reach):
 
 def count_lost(query, count, margin_factor):
     """Return how many of the pairs that share a corner slabs separate."""
-    memory = wp.empty((1, slab_memory_words(0)), dtype=wp.float32, device=CPU)
+    memory = wp.zeros((1, slab_memory_words(0)), dtype=wp.float32, device=CPU)
     buffers = [wp.empty(length, dtype=wp.int64, device=CPU) for length in (CPU_STACK_LENGTH, WAITING_LENGTH)]
     met = wp.zeros(count, dtype=wp.int32, device=CPU)
     inputs = [margin_factor, *query.batch.pools[:2], query.pair_poses, memory, *buffers, met]

@@ -5,10 +5,10 @@ import warp as wp
 
 from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.kernels.progressive import hausdorff_bound, merge_window, polygon, triangle_cover
-from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, points
+from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, unwritten
 
 # Cores and faces from which on windows gain: gathering them takes half as long again as going on merge by merge.
-LEAST_CORES, LEAST_FACES = 4, 20_000
+LEAST_CORES, LEAST_FACES = 2, 20_000
 # Triangles covered per launch, about.
 COVERS = 200_000
 # Pooled slots for each face, and beyond these; an empty pool loosens bounds only.
@@ -75,7 +75,7 @@ class LodBounds:
         covered = 0
         while covered < COVERS and self.done < self._known:
             launch(merge_window.gather_window_kernel, *inputs)
-            merges, triangles, blocks, _ = state.tolist()
+            merges, triangles, blocks = state[:3].tolist()
             if merges == 0:
                 self._advance_alone(self.done + 1)
                 continue
@@ -103,13 +103,13 @@ def _new_replay(pos, face_count):
     replay.counter = filled(6, 0)
     replay.scratch = make_scratch(face_count, triangle_cover.SLOTS, polygon.STACK)
     replay.pos = wp.array(pos, dtype=wp.vec3d, device="cpu", copy=False)
-    replay.triangle_pos, replay.face_pos = points(face_count, 3), points(face_count, 3)
-    replay.face_box = points(face_count, 2)
-    for name in ("face_slot", "face_stamp", "queue", "queue_face"):
-        setattr(replay, name, filled(face_count, -1))
+    for name, corners in (("triangle_pos", 3), ("face_pos", 3), ("face_box", 2)):
+        setattr(replay, name, unwritten((face_count, corners), wp.vec3d))
+    replay.queue, replay.queue_face = unwritten(face_count), unwritten(face_count)
+    replay.face_slot, replay.face_stamp = filled(face_count, -1), filled(face_count, -1)
     pooled = SLOTS_PER_FACE * face_count + SLOTS_EXTRA
-    replay.slot = filled((face_count + pooled, triangle_cover.SLOT_FIELDS), -1)
-    replay.free_slot = filled(pooled, 0)
+    replay.slot = unwritten((face_count + pooled, triangle_cover.SLOT_FIELDS))
+    replay.free_slot = unwritten(pooled)
     replay.bvh_face = filled(1, 0)
     return replay
 
@@ -127,7 +127,7 @@ def _new_window(replay):
     merges, face_count = int(merge_window.MERGE_ROOM), len(replay.face_slot)
     rows = face_count + int(merge_window.TRIANGLE_ROOM)
     blocks = merges + rows // int(triangle_cover.COVERS_AT_ONCE) + 1
-    window.counter = filled(4, 0)
+    window.counter = filled(5, 0)
     window.merge = filled((merges, 3), 0, wp.vec3i)
     window.start, window.near_start = filled(merges + 1, 0), filled(merges + 1, 0)
     window.block_merge, window.block_start = filled(blocks, 0), filled(blocks, 0)
@@ -142,8 +142,9 @@ def _new_window(replay):
 
 def _index(replay):
     """Return a wp.Bvh over the active faces, for triangles whose connected component vanishes."""
-    active = np.flatnonzero(replay.rings.corner_node.numpy()[::3] >= 0).astype(np.int32)
-    corners = replay.face_pos.numpy()[active]
+    node = replay.rings.corner_node.numpy().reshape(-1, 3)
+    active = np.flatnonzero(node[:, 0] >= 0).astype(np.int32)
+    corners = replay.pos.numpy()[node[active]]
     lower, upper = corners.min(axis=1).astype(np.float32), corners.max(axis=1).astype(np.float32)
     replay.bvh_face = cpu_array(active, int)
     return wp.Bvh(cpu_array(lower, wp.vec3), cpu_array(upper, wp.vec3))

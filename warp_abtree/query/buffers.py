@@ -155,15 +155,15 @@ class QueryBuffers:
             return wp.empty((0, 0), dtype=wp.float32, device=self.device)
         threads = min(room, current_regime().cpu_threads or core_count())
         words = simd.slab_memory_words(int(self.batch.models.depth.max()))
-        return wp.empty((threads, words), dtype=wp.float32, device=self.device)
+        memory = wp.empty((threads, words), dtype=wp.float32, device=self.device)
+        memory.numpy()[:, : simd.SLAB_ZEROS] = 0.0
+        return memory
 
     def _make_room(self, pairs) -> list:
         """Return (owner, attribute, new array) of a device list of pairs, and of whatever belongs to a pair."""
         check_pair_room(len(pairs))
         made = [*self._pair_arrays(len(pairs)), (self, "pairs", pairs)]
-        if self.broad_phase is not None:
-            made.append((self.broad_phase, "pairs", pairs))
-        return made
+        return made if self.broad_phase is None else made + self.broad_phase.make_room(pairs)
 
     def _take_pairs(self, pairs):
         """Take a device list of pairs and make room for whatever belongs to a pair: all of it, or nothing changes."""

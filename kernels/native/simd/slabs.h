@@ -19,7 +19,8 @@ struct Slabs {
     };
     // What a thread keeps: a header, then of each object the roots of the subtrees in its slots, then records.
     struct Memory {
-        int* header;                // whose axes these are, levels of the subtrees' roots
+        int* whose;                 // node + 1, model and LOD of the A whose axes and subtrees these are, 0 for none
+        int* floors;                // levels of the subtrees' roots
         float *axes, *of_a, *of_b;  // unit directions, then scaled: three rows and a shift
         int slots, *roots;
         Record* records;
@@ -29,6 +30,7 @@ struct Slabs {
         float* base = (float*)((start + 63) & ~63ull);
         const int slots = (words - 16 - SLAB_HEADER) / (2 + 32 * SUBTREE_RECORDS);
         return Memory{(int*)base,
+                      (int*)base + 3,
                       base + 16,
                       base + 64,
                       base + 128,
