@@ -21,8 +21,8 @@ import warp_abtree as ab
 from . import tables
 
 CASES = (
-    *("assembly", "baselines", "budget", "build", "coarse", "exact", "frame"),
-    *("host", "precision", "query", "scale", "sweep", "update"),
+    *("assembly", "baselines", "budget", "build", "coarse", "distance", "exact", "frame"),
+    *("host", "query", "scale", "sweep", "update"),
 )
 STUDIES = ("paper", "tradeoff")
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml

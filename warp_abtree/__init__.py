@@ -11,6 +11,7 @@ from warp_abtree.lod.view import Camera
 from warp_abtree.model.mesh import MeshError
 from warp_abtree.model.model import Model, ModelError
 from warp_abtree.query.contacts import ContactQuery
+from warp_abtree.query.distance import DistanceQuery
 from warp_abtree.query.manifold import ManifoldQuery
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import Buffers, CapacityError
@@ -31,6 +32,7 @@ __all__ = [
     "CapacityError",
     "CollisionManager",
     "ContactQuery",
+    "DistanceQuery",
     "Dynamics",
     "Feedback",
     "Frame",

@@ -60,6 +60,13 @@ class Fcl:
     def faces(self):
         return self._collide(self.all)
 
+    def distances(self):
+        """Return the distance at each pose, negative or 0 where A and B intersect."""
+        request, answers = self.fcl.DistanceRequest(), []
+        for b in self.b:
+            answers.append(self.fcl.distance(self.a, b, request, self.fcl.DistanceResult()))
+        return np.array(answers)
+
     def ask_one(self, pose, output):
         """Return the answer at one pose."""
         result = self.fcl.CollisionResult()

@@ -1,4 +1,7 @@
-"""Triangle pairs, random and adversarial, against integer arithmetic: disagreements, fractions, error rates, times."""
+"""Triangle pairs, random and adversarial, against integer arithmetic: disagreements, fractions, error rates, times.
+
+Then whole meshes: what "float32" saves and gets wrong, all face pairs of one batch, in turn with "exact".
+"""
 
 import functools
 import itertools
@@ -9,6 +12,7 @@ import time
 import numpy as np
 import warp as wp
 
+import warp_abtree as ab
 from warp_abtree.testing import (
     EXACT,
     FILTER,
@@ -19,10 +23,15 @@ from warp_abtree.testing import (
     float32_filter_triangles,
 )
 
+from ..shapes import knot, pair_poses, scene_of_pairs
+from ..timing import ratio_of, summarise, time_in_turn
 from ..triangle_pairs import ADVERSARIAL, make_chunk
-from ..verify import load_oracle
+from ..verify import count_differences, load_oracle
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+PRECISIONS = ("exact", "float32")
+FULL = {"faces": 5000, "pairs": 256, "coincident": 16, "repeats": 11}
+QUICK = {"faces": 300, "pairs": 3, "coincident": 1, "repeats": 1}
 COUNT, QUICK_COUNT = 100_000, 110
 CHUNK = 20_000
 # Every so many adversarial pairs, one is asked in all orders; the others in one order each, in turn.
@@ -35,7 +44,8 @@ STAGES = ("float32_stage_ns", "float64_stage_ns", "exact_stage_ns", "float32_ns"
 
 def run(device, count=None, processes=2, quick=False):
     """Yield one row a kind of pair: pairs asked, fraction that intersect (meet), disagreements of any stage with the
-    truth, fractions left to float64 and to exact signs, error rate of float32 alone, time a pair [ns].
+    truth, fractions left to float64 and to exact signs, error rate of float32 alone, time a pair [ns]; then one a
+    scene of meshes.
 
     Raises:
         RuntimeError: An answer was wrong, or the tests' oracle is not at hand.
@@ -56,6 +66,29 @@ def run(device, count=None, processes=2, quick=False):
             yield describe_tally(device, kind, tally)
     if wrong:
         raise RuntimeError("exact signs gave a wrong answer")
+    yield from measure_meshes(device, QUICK if quick else FULL)
+
+
+def measure_meshes(device, sizes):
+    """Yield one row a scene: hits, fractions of face pairs that reach float64 and expansions, face pairs that float32
+    misses and invents, and times of a launch [ms]."""
+    model = ab.Model.from_arrays(*knot(sizes["faces"]), name="knot")
+    scenes = {f"knots, centres {distance} apart": pair_poses(sizes["pairs"], distance) for distance in (0.9, 0.2)}
+    scenes["coincident knots, any rotation"] = pair_poses(sizes["coincident"], 0.0)
+    scenes["coincident knots, any rotation"][1::2] = scenes["coincident knots, any rotation"][::2]
+    for name, poses in scenes.items():
+        scene, pairs = scene_of_pairs(device, model, poses)
+        queries = {p: ab.Query(scene, output="faces", pairs=pairs, precision=p) for p in PRECISIONS}
+        found = {precision: query.run() for precision, query in queries.items()}
+        times = time_in_turn({p: query.launch for p, query in queries.items()}, device, sizes["repeats"])
+        exact = found["exact"]
+        tests = exact.triangle_tests.sum()
+        row = {"device": device.name, "scene": name, "hits": len(exact.faces), "triangle_tests": int(tests)}
+        row["to_float64"] = float(f"{exact.float64_tests.sum() / tests:.3g}")
+        row["to_exact"] = float(f"{exact.exact_tests.sum() / tests:.3g}")
+        row["float32_missed"], row["float32_invented"] = count_differences(found["float32"].faces, exact.faces)
+        row |= summarise(times)
+        yield row | {"exact_to_float32": ratio_of(times["exact"], times["float32"])}
 
 
 def list_jobs(count):

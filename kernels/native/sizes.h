@@ -43,6 +43,17 @@ constexpr int NO_FLOOR = 64;
 static_assert(SUBTREE_LEAVES == 1 << SUBTREE_DEPTH, "of a binary tree");
 static_assert(SUBTREE_RECORDS == 2 * SUBTREE_LEAVES, "one a node, by its place in the subtree");
 
+// A search for the nearest faces on the CPU: node pairs that wait for later, faces for float64, faces for float32, node
+// pairs taken at once, and words of a thread.
+constexpr int LATER_LENGTH = 4096;
+constexpr int OPEN_LENGTH = 256;
+constexpr int NEAREST_FACES = 64;
+constexpr int NEAREST_AT_ONCE = 8;
+constexpr int NEAREST_WORDS = 16272;
+constexpr float FACES_ERROR = 0x1p-16f;
+static_assert(NEAREST_FACES >= 15 + 4 * NEAREST_AT_ONCE + 16, "loads go beyond");
+static_assert(NEAREST_WORDS == 16 + 3 * (CPU_STACK_LENGTH + LATER_LENGTH + OPEN_LENGTH) + 2 * NEAREST_FACES, "no gap");
+
 // Straddling pairs that wait for their last two signs on the CPU, the last 16 of them written over.
 constexpr int STRADDLING_ROOM = 256;
 static_assert(STRADDLING_ROOM % 8 == 0, "corners are found 8 at a time");

@@ -92,6 +92,11 @@ def test_query_against_the_library(files, capsys):
     bound = ball.error_at(found["lods"][0]) + ring.error_at(900)
     assert found["bound"] == (pytest.approx(bound) if np.isfinite(bound) else None)
 
+    apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "distance")
+    lower, upper = apart["bracket"]
+    assert 0 < lower <= apart["distance"] <= upper and not apart["intersects"]
+    between = np.linalg.norm(np.subtract(*apart["points"]))
+    assert between == pytest.approx(apart["distance"], rel=1e-12) and len(apart["point_faces"]) == 2
     apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "contacts")
     nowhere = [None, None, None]
     assert apart["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere, "depth": 0}

@@ -68,10 +68,6 @@ def check_frame(rows):
     assert [row["ladder"] for row in rows] == [False, True] and rows[0]["hits"] == rows[1]["hits"] > 0
 
 
-def check_precision(rows):
-    assert rows[-1]["hits"] > 0 and rows[-1]["to_float64"] == 1
-
-
 def check_host(rows):
     assert [(row["pairs"], row["output"]) for row in rows] == [
         (count, name) for count in (1, 4) for name in host.OUTPUTS
@@ -83,6 +79,8 @@ def check_host(rows):
 
 
 def check_exact(rows):
+    *rows, _, _, coincident = rows
+    assert coincident["hits"] > 0 and coincident["to_float64"] == 1
     assert len(rows) == 12 and all(row["disagreements"] == 0 for row in rows)
     assert sum(row["pairs"] for row in rows) > 110 and any(row["float32_errors"] > 0 for row in rows)
 
@@ -92,6 +90,12 @@ def check_baselines(rows):
     for row in rows:
         assert row["faces_missed"] == row["faces_invented"] == row["ours_wrong"] == 0
         assert row["meet"] == 3 and row["ours_any_per_s"] > 0 and row["faces_ratio"] > 0
+
+
+def check_distance(rows):
+    (row,) = rows
+    assert row["poses"] == 3 > row["meet"] and row["median_gap"] > 0 and 0 < row["face_tests"] < row["node_tests"]
+    assert row["again_ms"] > 0 and row.get("fcl_differs", 0) < 1e-12
 
 
 def check_build(rows):

@@ -8,10 +8,11 @@ import weakref
 import numpy as np
 import pytest
 import trimesh
+from oracles.distance import surface_distance
 from oracles.triangle import brute_force_faces
 
 import warp_abtree as ab
-from warp_abtree.interop import collision_manager, convex_solid, nearest
+from warp_abtree.interop import collision_manager, convex_solid
 
 pytest.importorskip("fcl")
 from trimesh.collision import CollisionManager as TrimeshManager
@@ -182,10 +183,8 @@ def test_a_component_inside_a_solid(device):
 # Distances.
 
 
-@pytest.mark.parametrize("chunk", [128, nearest.CHUNK])
 @pytest.mark.slow
-def test_distances_on_random_scenes(device, monkeypatch, chunk):
-    monkeypatch.setattr(nearest, "CHUNK", chunk)
+def test_distances_on_random_scenes(device):
     rng = np.random.default_rng(4)
     apart = 0
     for spread in (2.5, 4.0, 8.0):
@@ -223,32 +222,8 @@ def test_nearest_points(device):
     posed = {}
     for name, mesh in SHAPES.items():
         posed[name] = trimesh.transform_points(mesh.vertices, placed[name])[mesh.faces]
-    least = math.inf
-    for a, b in itertools.combinations(posed.values(), 2):
-        i, j = (part.ravel() for part in np.indices((len(a), len(b))))
-        least = min(least, nearest.triangle_distances(a[i], b[j])[0].min())
+    least = min(surface_distance(a, b) for a, b in itertools.combinations(posed.values(), 2))
     assert distance == pytest.approx(least, rel=1e-12)
-
-
-def test_triangle_distances_against_a_search():
-    """Nearest points by alternate projection in the plane of barycentric coordinates, from many starts."""
-    rng = np.random.default_rng(6)
-    a, b = rng.uniform(-1, 1, size=(2, 200, 3, 3))
-    b[:, :, 0] += 2.1
-    a[0, 2], b[1] = a[0, 1], b[1, 0]  # a segment, a point
-    found, p, q = nearest.triangle_distances(a, b)
-    assert np.allclose(np.linalg.norm(p - q, axis=1), found)
-    x, y = a.mean(1), b.mean(1)
-    for _ in range(3000):
-        x = trimesh.triangles.closest_point(a, y)
-        y = trimesh.triangles.closest_point(b, x)
-    searched = np.linalg.norm(x - y, axis=1)
-    proper = np.arange(200) > 1
-    assert (found[proper] <= searched[proper] + 1e-12).all()
-    assert np.allclose(found[proper], searched[proper], atol=1e-3)
-    for points, of in ((p, a), (q, b)):
-        on = trimesh.triangles.closest_point(of[proper], points[proper])
-        assert np.abs(on - points[proper]).max() < 1e-12
 
 
 @pytest.mark.parametrize("gap", [3.0, 2.0**-40])

@@ -1,11 +1,12 @@
 """Distances of points to a surface, apart from the kernels: by brute force in float64, and in fractions."""
 
+import itertools
 from fractions import Fraction
 
 import numpy as np
 import warp as wp
 
-from oracles.triangle import cross, dot, sub
+from oracles.triangle import cross, dot, into_frame_of_a, sub
 
 
 def lattice_points(corners, count):
@@ -83,3 +84,32 @@ def exact_distance_sq(point, corners):
         if any(normal) and all(dot(cross(edge, to), normal) >= 0 for edge, to in edges):
             found.append(dot(sub(point, a), normal) ** 2 / dot(normal, normal))
     return min(found)
+
+
+def over(a, b):
+    """a / b, and 0 where b is 0."""
+    return np.divide(a, b, out=np.zeros(np.broadcast_shapes(np.shape(a), np.shape(b))), where=b > 0)
+
+
+def mesh_distance(model_a, lod_a, pose_a, model_b, lod_b, pose_b):
+    """Return the distance of two posed meshes that do not intersect, in A's frame."""
+    (vertices_a, faces_a, _), (vertices_b, faces_b, _) = model_a.mesh_at(lod_a), model_b.mesh_at(lod_b)
+    return surface_distance(vertices_a[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b])
+
+
+def surface_distance(a, b):
+    """Return the distance of the faces a from the faces b, corners (f, 3, 3) each, that do not intersect.
+
+    The least over all pairs of features: corner and face, and the lines of two edges where closest inside both.
+    """
+    least = min(brute_distances(a.reshape(-1, 3), b).min(), brute_distances(b.reshape(-1, 3), a).min())
+    for i, j in itertools.product(range(3), repeat=2):
+        p, q = a[:, None, i], b[None, :, j]
+        e, f = a[:, None, (i + 1) % 3] - p, b[None, :, (j + 1) % 3] - q
+        across = np.cross(e, f)
+        size = (across**2).sum(-1)
+        s, t = (over((np.cross(q - p, edge) * across).sum(-1), size) for edge in (f, e))
+        inside = (size > 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+        gap = np.abs(over(((q - p) * across).sum(-1), np.sqrt(size)))
+        least = min(least, gap[inside].min(initial=np.inf))
+    return least

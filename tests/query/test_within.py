@@ -7,39 +7,13 @@ import pytest
 import warp as wp
 from helpers.questions import in_a_row, pairs_of, random_case, random_lod, scene_of
 from helpers.samples import SHAPES, STILL, contact_poses, sample
-from oracles.distance import brute_distances
-from oracles.triangle import into_frame_of_a
+from oracles.distance import mesh_distance
 
 import warp_abtree as ab
 from warp_abtree import testing
 
 NAMES = ("box", "small ball", "crumbs", "soup", "torus", "three", "capsule", "one")
 FACES = 60
-
-
-def over(a, b):
-    """a / b, and 0 where b is 0."""
-    return np.divide(a, b, out=np.zeros(np.broadcast_shapes(np.shape(a), np.shape(b))), where=b > 0)
-
-
-def mesh_distance(model_a, lod_a, pose_a, model_b, lod_b, pose_b):
-    """Return the distance of two posed meshes that do not intersect.
-
-    The least over all pairs of features: corner and face, and the lines of two edges where closest inside both.
-    """
-    (vertices_a, faces_a, _), (vertices_b, faces_b, _) = model_a.mesh_at(lod_a), model_b.mesh_at(lod_b)
-    a, b = vertices_a[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b]
-    least = min(brute_distances(a.reshape(-1, 3), b).min(), brute_distances(b.reshape(-1, 3), a).min())
-    for i, j in itertools.product(range(3), repeat=2):
-        p, q = a[:, None, i], b[None, :, j]
-        e, f = a[:, None, (i + 1) % 3] - p, b[None, :, (j + 1) % 3] - q
-        across = np.cross(e, f)
-        size = (across**2).sum(-1)
-        s, t = (over((np.cross(q - p, edge) * across).sum(-1), size) for edge in (f, e))
-        inside = (size > 0) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
-        gap = np.abs(over(((q - p) * across).sum(-1), np.sqrt(size)))
-        least = min(least, gap[inside].min(initial=np.inf))
-    return least
 
 
 def posed_pairs(rng, device, pairs, faces=FACES):

@@ -8,7 +8,6 @@ import numpy as np
 from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.interop.collision_data import ContactData, DistanceData
 from warp_abtree.interop.convex_solid import shape_of
-from warp_abtree.interop.nearest import find_nearest
 from warp_abtree.interop.placed_shapes import PlacedShapes
 from warp_abtree.scene.poses import check_poses
 
@@ -287,16 +286,24 @@ class CollisionManager:
         placed = self._placed
         placed.upload()
         gaps = placed.gaps(pairs)
-        overlapping = np.flatnonzero(gaps == 0)
-        _, _, contacts = self._collide(pairs[overlapping], [(k, -1 - k) for k in overlapping.tolist()], True)
-        if contacts:
-            contact = contacts[0]
-            k = max(contact.names)
-            faces = contact.index(k), contact.index(-1 - k)
-            return 0.0, names(k), DistanceData(names(k), faces, (contact.point, contact.point), 0.0)
-        upper, likely = placed.upper_distance(pairs, gaps)
-        kept = np.flatnonzero(gaps <= upper)
-        likely = int(np.searchsorted(kept, likely))
-        distance, k, faces, points = find_nearest(placed.shapes, placed.poses, pairs[kept], upper, likely)
-        pair = names(int(kept[k]))
-        return distance, pair, DistanceData(pair, faces, points, distance)
+        _, likely = placed.upper_distance(pairs, gaps)
+        k, result = likely, placed.scene.intersect(pairs[[likely]], "distance")
+        distance, row = float(result.distance[0]), 0
+        # Of the others, what is proved farther than that is not searched to its end.
+        others = np.flatnonzero(gaps <= distance)
+        others = others[others != likely]
+        if distance > 0 and len(others):
+            beyond = distance if distance < math.inf else None
+            rest = placed.scene.intersect(pairs[others], "distance", beyond=beyond)
+            if rest.distance.min() < distance:
+                result, row = rest, int(rest.distance.argmin())
+                k, distance = int(others[row]), float(rest.distance[row])
+        if distance > 0 and self._convex_solids:
+            overlapping = np.flatnonzero(gaps == 0)
+            for i in overlapping[placed.may_contain(pairs[overlapping])].tolist():
+                inside = placed.find_contained(pairs[i], (0, 1))
+                if inside is not None:
+                    faces = inside.index(0), inside.index(1)
+                    return 0.0, names(i), DistanceData(names(i), faces, (inside.point, inside.point), 0.0)
+        faces, points = result.point_faces[row].tolist(), result.points[row]
+        return distance, names(k), DistanceData(names(k), faces, points, distance)

@@ -1,11 +1,9 @@
 """A model's original mesh on the host: its box, extreme corners, and the planes of a convex solid."""
 
 import weakref
-from functools import cached_property
 
 import numpy as np
 
-from warp_abtree.interop.nearest import NodeBoxes
 from warp_abtree.model.mesh import component_labels, load_mesh
 from warp_abtree.model.model import Model
 
@@ -47,11 +45,6 @@ class Shape:
             wide = length > 0
             normals = normals[wide] / length[wide, None]
             self.planes = normals, np.einsum("ij,ij->i", normals, a[wide]), face_ids[wide]
-
-    @cached_property
-    def node_boxes(self) -> NodeBoxes:
-        """Boxes of the tree at the finest LOD."""
-        return NodeBoxes(self.model)
 
     def find_inside(self, pose, other, other_pose):
         """Find a component of another shape inside this solid; the two surfaces must not intersect.

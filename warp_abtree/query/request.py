@@ -63,30 +63,38 @@ def check_request(output: str, precision: str):
     """Check what is asked of a query.
 
     Raises:
-        ValueError: An unknown output or precision, or contacts, which another operator finds.
+        ValueError: An unknown output or precision, or an output that another operator finds.
     """
-    if output not in (*OUTPUTS, "contacts"):
-        raise ValueError(f"output {output!r} is none of 'any', 'count', 'faces', 'contacts'")
+    if output not in (*OUTPUTS, "contacts", "distance"):
+        raise ValueError(f"output {output!r} is none of 'any', 'count', 'faces', 'contacts', 'distance'")
     if precision not in tuple(PRECISIONS):
         raise ValueError(f"precision {precision!r} is neither 'exact' nor 'float32'")
-    if output == "contacts":
-        raise ValueError("output 'contacts' is found by ab.ContactQuery, or Scene.intersect")
+    others = {"contacts": "ContactQuery", "distance": "DistanceQuery"}
+    if output in others:
+        raise ValueError(f"output {output!r} is found by ab.{others[output]}, or Scene.intersect")
 
 
-def check_within(within, pair_count=None) -> np.ndarray:
-    """Return distances [world units] as float64, () or (p,).
+def refuse_options(output: str, given: dict):
+    """Raise ValueError for options, by name, that are given though they mean nothing for an output."""
+    for name, is_given in given.items():
+        if is_given is not False:
+            raise ValueError(f"{name} means nothing for output {output!r}")
+
+
+def check_within(within, pair_count=None, name="within") -> np.ndarray:
+    """Return distances [world units] as float64, () or (p,); errors have their name.
 
     Raises:
         ValueError: Another shape (for pairs of the broad phase any but a scalar), a distance that is negative, infinite
             or no number.
     """
-    within = to_numpy(within, "within").astype(np.float64)
+    within = to_numpy(within, name).astype(np.float64)
     if within.shape != () and within.shape != (pair_count,):
         known = "pairs of the broad phase: one distance for all" if pair_count is None else f"{pair_count} pairs"
-        raise ValueError(f"within: shape {within.shape} given for {known}")
+        raise ValueError(f"{name}: shape {within.shape} given for {known}")
     bad = np.flatnonzero(~(np.isfinite(within) & (within >= 0)))
     if len(bad):
-        raise ValueError(f"within: {within.flat[bad[0]]} of pair {bad[0]} is no finite distance of 0 or more")
+        raise ValueError(f"{name}: {within.flat[bad[0]]} of pair {bad[0]} is no finite distance of 0 or more")
     return within
 
 

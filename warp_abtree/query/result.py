@@ -9,6 +9,8 @@ import numpy as np
 from warp_abtree.query.request import CapacityError
 
 COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
+# What a `DistanceQuery` has beside points.
+DISTANCES = ("distance", "bracket", "point_faces")
 # Vectors of a contact.
 VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
 
@@ -59,6 +61,9 @@ class Found:
     contacts: Any = None
     pair_contacts: Any = None
     points: Any = None
+    distance: Any = None
+    bracket: Any = None
+    point_faces: Any = None
 
 
 class Result:
@@ -68,8 +73,9 @@ class Result:
     tests among them, from a GPU into page-locked memory that is used again when no array of the result is left.
 
     On the device types are those that give the same NumPy array by `numpy()`: bool for any and apart, int64 for count
-    and tests, vec2i for pairs and vec3i for faces. Contacts and summaries are dictionaries of one array a field, points
-    one of count, point, normal and depth as `ManifoldQuery.manifolds`.
+    and tests, vec2i for pairs and point_faces, vec3i for faces, vec2d and matrices of 2 rows for bracket and points of
+    distances. Contacts and summaries are dictionaries of one array a field, points of manifolds one of count, point,
+    normal and depth as `ManifoldQuery.manifolds`.
 
     Attributes:
         pairs: Object pairs queried, int32 (p, 2).
@@ -81,7 +87,11 @@ class Result:
             output is "contacts".
         apart: Whether each pair is proved farther apart than `within`, bool (p,); None without within.
         points: Contact points of a `ManifoldQuery`: a dictionary of pair, place in `pairs`, int (k,); point and normal,
-            float64 (k, 3), and depth, (k,), as `ManifoldQuery.manifolds`; None from other queries.
+            float64 (k, 3), and depth, (k,), as `ManifoldQuery.manifolds`. Of a `DistanceQuery` the nearest point of
+            each object [world units], float64 (p, 2, 3). None from other queries.
+        distance, bracket, point_faces: Least distance of each pair [world units], float64 (p,), proven lower and upper
+            bound of it, (p, 2), and the faces that the nearest points lie on, int32 (p, 2), see
+            `warp_abtree.query.distance`; None unless output is "distance".
         node_tests, triangle_tests, float64_tests, exact_tests: Work done for each pair, int64 (p,): pairs of boxes,
             pairs of faces, those of them that float32 left uncertain, and of these those that took exact arithmetic.
 
@@ -99,13 +109,16 @@ class Result:
     contacts: Any
     pair_contacts: Any
     points: Any
+    distance: Any
+    bracket: Any
+    point_faces: Any
     node_tests: Any
     triangle_tests: Any
     float64_tests: Any
     exact_tests: Any
 
     def __init__(self, found: Found, room: tuple, output: str):
-        for name in ("pairs", "any", "apart", "faces", "contacts", "pair_contacts", "points"):
+        for name in ("pairs", "any", "apart", "faces", "contacts", "pair_contacts", "points", *DISTANCES):
             setattr(self, name, getattr(found, name))
         self.count: Any = found.count if output != "any" else None
         for name in COUNTERS:

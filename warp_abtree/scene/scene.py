@@ -9,8 +9,9 @@ from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
 from warp_abtree.model.model import Model
 from warp_abtree.query.broad_phase import EVERY_WORLD, BroadPhase
 from warp_abtree.query.contacts import ContactQuery
+from warp_abtree.query.distance import DistanceQuery, check_beyond
 from warp_abtree.query.narrow_phase import Query
-from warp_abtree.query.request import check_request, check_within
+from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import Result, contact_dtypes
 from warp_abtree.scene.poses import check_poses, device_rows, launch_place, place_rows
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
@@ -244,7 +245,16 @@ class Scene:
         return self._broad_phase.find()
 
     def intersect(
-        self, pairs=None, output="any", precision="exact", within=None, contact_dtype=np.float64, device: bool = False
+        self,
+        pairs=None,
+        output="any",
+        precision="exact",
+        within=None,
+        contact_dtype=np.float64,
+        device: bool = False,
+        tolerance=None,
+        relative=None,
+        beyond=None,
     ) -> Result:
         """Test object pairs for intersection, exactly as posed and at their LODs. Waits for the device.
 
@@ -254,7 +264,8 @@ class Scene:
             pairs: (p, 2) object indices, asked whatever their worlds, also where both are static or filtered out of the
                 broad phase; None asks the broad phase.
             output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
-                an object pair's summary of them, stands in `warp_abtree.query.contacts`.
+                an object pair's summary of them, stands in `warp_abtree.query.contacts`. Or "distance": how far apart
+                the surfaces are, and where they are nearest, see `warp_abtree.query.distance`.
             precision: "exact": the answer is exact for A's vertices and the posed ones of B, A the object with the
                 smaller index. "float32" takes the signs of rounded determinants.
             within: Distance d >= 0 [world units], or (p,) of them: `result.apart` tells the pairs whose posed surfaces,
@@ -263,20 +274,25 @@ class Scene:
                 finds overlapping boxes only, whatever d is.
             contact_dtype: Type of the real numbers in contacts, float64 or float32.
             device: Whether the result's arrays stay on the scene's device, see `Result`.
+            tolerance, relative, beyond: When the search of a distance ends, see `DistanceQuery`; for "distance" alone.
 
         Raises:
             ValueError: Bad pairs, a bad distance, an unknown option, or a scene without objects.
         """
         check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)
+        options = {"tolerance": tolerance, "relative": relative, "beyond": beyond}
+        options = {name: value for name, value in options.items() if value is not None}
+        if output == "distance":
+            refuse_options(output, {"precision": precision != "exact", "within": within is not None})
+            return self._find_distances(pairs, options, device)
+        refuse_options(output, options)
         with_contacts = output == "contacts"
         check_request("faces" if with_contacts else output, precision)
         pairs = self.broad_phase() if pairs is None else check_pairs(pairs, self.object_count)
         if within is not None:
             within = check_within(within, len(pairs))
-        asked = (output, precision, within is not None)
-        # A query that fails, for lack of memory, is not kept: it gives its own back.
-        query = self._queries.pop(asked, None)
+        query = self._queries.pop((output, precision, within is not None), None)
         if query is not None:
             if not query.is_asked(pairs, within):
                 query.replace_pairs(pairs, within)
@@ -286,9 +302,24 @@ class Scene:
             query = Query(self, output, pairs=pairs, precision=precision, within=within)
         if isinstance(query, ContactQuery):
             query.contact_dtype = contact_dtype
+        return self._run((output, precision, within is not None), query, device)
+
+    def _run(self, key: tuple, query: Query, device: bool) -> Result:
+        """Run a query and keep it for the next time; one that fails, for lack of memory, gives its own back."""
         result = query.run(device)
-        self._queries[asked] = query
+        self._queries[key] = query
         return result
+
+    def _find_distances(self, pairs, options: dict, device: bool) -> Result:
+        pairs = self.broad_phase() if pairs is None else check_pairs(pairs, self.object_count)
+        beyond = check_beyond(options.pop("beyond", None), len(pairs))
+        query = self._queries.pop(("distance",), None)
+        if isinstance(query, DistanceQuery):
+            query.set_tolerance(**options)
+            query.replace_pairs(pairs, beyond)
+        else:
+            query = DistanceQuery(self, pairs=pairs, beyond=beyond, **options)
+        return self._run(("distance",), query, device)
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.

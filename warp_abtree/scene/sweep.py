@@ -14,8 +14,8 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.sweep import NONE_REFUSED, pose_placer, report_chunk_kernel
+from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond
 from warp_abtree.query.narrow_phase import Query
-from warp_abtree.query.request import check_request
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE, check_poses, device_rows
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.arrays import ObjectArrays
@@ -30,6 +30,9 @@ KEPT_ROWS = 2**20
 SCALARS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 # By the numbers of a row: quaternions, and matrices.
 TOLERANCE = {7: QUATERNION_TOLERANCE, 16: RIGID_TOLERANCE}
+DISTANCE_ROWS = np.dtype(
+    [("distance", np.float64), ("bracket", np.float64, 2), ("points", np.float64, (2, 3)), ("faces", np.int32, 2)]
+)
 ANSWERS = {"any": np.dtype(bool), "count": np.dtype(np.int64)}
 
 _kept: dict[tuple, "_PosedModels"] = {}
@@ -164,7 +167,10 @@ class _ChunkQuery:
         self.device, self.room, self.objects = chunk.batch.device, chunk.room, chunk.batch.objects
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
-        self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision)
+        if self.output == "distance":
+            self.query: Query = DistanceQuery(chunk.batch, self.pairs)
+        else:
+            self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision)
         self.count = self.room
         self._slots: dict = {}
         self.copies = _find_copy_stream(self.device.alias) if self.device.is_cuda else None
@@ -173,7 +179,7 @@ class _ChunkQuery:
         """Return the slots of poses of one type, made at the first use."""
         kind = poses.scalar, poses.width
         if kind not in self._slots:
-            count = 1 if self.output == "faces" else 2
+            count = 2 if self.output in ANSWERS else 1
             made = [_Slot(self.device, self.room, self.output, *kind) for _ in range(count)]
             if self.device.is_cuda:
                 # Another stream may touch what was allocated on this one only once it is there.
@@ -276,6 +282,26 @@ class _ChunkQuery:
             parts.append(found)
         return np.concatenate(parts)
 
+    def find_distances(self, poses, tolerances, beyond):
+        """Return the rows of "distance" of all poses."""
+        found, slot = np.empty(len(poses), DISTANCE_ROWS), self._find_slots(poses)[0]
+        assert isinstance(self.query, DistanceQuery)
+        self.query.set_tolerance(**tolerances)
+        for start in range(0, len(poses), self.room):
+            count = min(self.room, len(poses) - start)
+            self._load(slot, poses, start, count)
+            self.query.set_pairs(self.pairs[:count], beyond)
+            self.count = count
+            self._place(slot)
+            result = self.query.run()
+            refused = int(slot.report.numpy()[0])
+            if refused != NONE_REFUSED:
+                _refuse(poses, start + refused)
+            rows = found[start : start + count]
+            rows["distance"], rows["bracket"] = result.distance, result.bracket
+            rows["points"], rows["faces"] = result.points, result.point_faces
+        return found
+
     def is_small(self):
         return len(self.query.hits.face) + len(self.query.hits.uncertain) <= KEPT_ROWS
 
@@ -287,7 +313,17 @@ def _keep(key, posed):
         _kept.pop(old, None)
 
 
-def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precision="exact", device=None):
+def sweep(
+    model_a,
+    model_b,
+    poses,
+    lod_a=None,
+    lod_b=None,
+    output="any",
+    precision="exact",
+    device=None,
+    **options,
+):
     """Test one pair of models at many poses of B in A's frame. Waits for the device, once a chunk of 65,536 poses.
 
     Poses are checked on the device; on CUDA transfers overlap with launches, except for "faces". The arrays of the last
@@ -301,32 +337,36 @@ def sweep(model_a, model_b, poses, lod_a=None, lod_b=None, output="any", precisi
             matrices, taken as they are; float32 or float64, of any framework. What lies on the GPU that asks is read
             where it is, Warp's transforms and matrices (p,) too.
         lod_a, lod_b: LODs; None is the finest.
-        output: "any", "count" or "faces".
+        output: "any", "count", "faces" or "distance".
         precision: As `Scene.intersect`, exact for A's vertices and the posed ones of B.
         device: Warp device; None for Warp's default.
+        options: tolerance, relative and beyond, each one number, as `DistanceQuery` takes them; for "distance" alone.
 
     Returns:
         For "any" bool (p,), for "count" the intersecting face pairs of each pose, int64 (p,), for "faces" rows (pose,
-        face of A, face of B), int32 (k, 3), sorted.
+        face of A, face of B), int32 (k, 3), sorted. For "distance" a structured array (p,) of distance, bracket (2,),
+        points (2, 3) [A's frame] and faces (2,), see `warp_abtree.query.distance`.
 
     Raises:
-        TypeError: model_a or model_b is no Model.
+        TypeError: model_a or model_b is no Model; an option has another name.
         ValueError: Bad poses, the first of which is named, a LOD out of range, an unknown option or device.
         RuntimeError: A graph is being captured.
     """
-    check_request(output, precision)
+    check_asked(output, precision, options)
     pair = Scene(device)
     check_device(pair.device, "ab.sweep")
     with device_lock(pair.device):
-        return _sweep(pair, (model_a, model_b), poses, (lod_a, lod_b), output, precision)
+        return _sweep(pair, (model_a, model_b), poses, (lod_a, lod_b), (output, precision), options)
 
 
-def _sweep(pair, models, poses, lods, output, precision):
+def _sweep(pair, models, poses, lods, asked, options):
+    output, precision = asked
     poses = _take_poses(poses, pair.device)
     for model, lod in zip(models, lods):
         pair.add(model, lod=lod)
     if len(poses) == 0:
-        return np.empty((0, 3), np.int32) if output == "faces" else np.empty(0, ANSWERS[output])
+        empty = {"faces": np.empty((0, 3), np.int32), "distance": np.empty(0, DISTANCE_ROWS)}
+        return empty[output] if output in empty else np.empty(0, ANSWERS[output])
     key = (*map(id, models), *pair.lods.tolist(), pair.device.alias)
     # Taken out while in use: a call from another thread has its own, and one that fails leaves nothing behind.
     posed = _kept.pop(key, None)
@@ -335,7 +375,11 @@ def _sweep(pair, models, poses, lods, output, precision):
         posed = _PosedModels(pair, owners)
     chunk = posed.find_chunk(len(poses))
     query = chunk.find_query(output, precision)
-    answers = query.find_faces(poses) if output == "faces" else query.find_answers(poses)
+    if output == "distance":
+        tolerances = {name: value for name, value in options.items() if name != "beyond"}
+        answers = query.find_distances(poses, tolerances, check_beyond(options.get("beyond")))
+    else:
+        answers = query.find_faces(poses) if output == "faces" else query.find_answers(poses)
     chunk.trim()
     _keep(key, posed)
     return answers

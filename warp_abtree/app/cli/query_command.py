@@ -17,8 +17,9 @@ EXAMPLES = (
     "cow.obj warp:bunny --pose 0.2 0 0 0 0 0 1",
     "cow.npz cow.npz --pose -0.5 0 0 0 0 0 1 --lod-a 0.25 --lod-b tol:0.01 --output faces --json",
     "cow.npz cow.npz --pose 0.2 0 0 0 0 0 1 --output contacts --record contacts.csv",
+    "cow.npz cow.npz --pose 2 0 0 0 0 0 1 --output distance --json",
 )
-OUTPUTS = ("any", "count", "faces", "contacts")
+OUTPUTS = ("any", "count", "faces", "contacts", "distance")
 
 
 def add_arguments(sub: Parser):
@@ -40,11 +41,15 @@ def query(options, progress):
     """Intersect two meshes at a pose and two LODs."""
     if options.record:
         check_output(options.record, [".csv", ".npz"], inputs=(options.a, options.b))
-        if options.record.suffix.lower() == ".csv" and options.output in ("any", "count"):
+        if options.record.suffix.lower() == ".csv" and options.output not in ("faces", "contacts"):
             raise ValueError(f"{options.record}: a row is a face pair; ask --output faces or contacts, or write .npz")
     scene, models = _make_scene(options, progress)
     pair = np.array([[0, 1]])
-    asked = {"output": options.output, "precision": options.precision}
+    asked = {"output": options.output}
+    if options.output != "distance":
+        asked["precision"] = options.precision
+    elif options.precision != "exact":
+        raise ValueError("--precision means nothing for --output distance")
     scene.intersect(pair, **asked)  # loads the kernels, so that the time below is the query's
     begin = time.perf_counter()
     found = scene.intersect(pair, **asked)
@@ -64,6 +69,8 @@ def query(options, progress):
     }
     if found.faces is not None:
         result["faces"] = found.faces[:, 1:]
+    if found.distance is not None:
+        result |= {name: getattr(found, name)[0] for name in ("distance", "bracket", "points", "point_faces")}
     if found.contacts is not None:
         result |= {"contacts": _flat_contacts(found.contacts), "pair_contacts": _named(found.pair_contacts[0])}
     if options.record:
@@ -104,7 +111,7 @@ def record_found(found, path: Path):
     if there is one; the summary over an object pair has no place there.
     """
     if path.suffix.lower() == ".npz":
-        names = ("any", "count", "faces", "contacts", "pair_contacts")
+        names = ("any", "count", "faces", "contacts", "pair_contacts", "distance", "bracket", "points", "point_faces")
         arrays = {name: getattr(found, name) for name in names if getattr(found, name) is not None}
         with atomic_write(path) as file:
             np.savez(file, **arrays)

@@ -1,0 +1,113 @@
+"""Least distances: real meshes at gaps, a nut free on its bolt, and knots at random poses; python-fcl beside them.
+
+Gaps are fractions of the mesh's size, poses otherwise random. Times are of a pose: of all poses at once, where each
+search starts anew (fresh) or from the faces of the launch before (again), and of one pair alone, launched to the
+result on the host. On the CPU all on one core, beside python-fcl, whose answers must be ours but for rounding.
+"""
+
+import time
+
+import numpy as np
+import warp as wp
+
+import warp_abtree as ab
+
+from ..baselines.fcl import Fcl
+from ..meshes import ModelFolder, knot_model, mesh_file
+from ..shapes import longest_side, pose_matrices, random_poses, scene_of_poses
+from ..timing import medians, no_garbage_collection, one_core, time_in_turn
+from .assembly import place_nut
+
+FULL = {"poses": 32, "counts": (1, 1024, 65536), "knot": 5000, "repeats": 7}
+CPU = FULL | {"counts": (1, 1024)}
+QUICK = {"poses": 3, "counts": (3,), "knot": 300, "repeats": 1}
+GAPS = 0.3, 0.01  # of the size, first and last
+IDENTITY = (0, 0, 0, 0, 0, 0, 1)
+MESHES = ("cow", "rocker-arm", "stanford-bunny")
+NUT = ("factory-bolt-m20", "factory-nut-m20")
+STEPS = 25  # of the bisection that places a pose at a gap
+
+
+def run(device, quick=False):
+    """Yield a row a workload: times [ms] and what the searches took; of baselines, where they are at hand."""
+    device = wp.get_device(device)
+    sizes = QUICK if quick else CPU if device.is_cpu else FULL
+    folder = ModelFolder(None)
+    for name in MESHES if mesh_file(MESHES[0]) else ():
+        model = folder.load([name])
+        yield measure(name, [model, model], place_at_gaps(model, sizes["poses"]), device, sizes["repeats"])
+    if all(map(mesh_file, NUT)):
+        models = [folder.load([name]) for name in NUT]
+        matrices = place_nut(models, sizes["poses"])["free"]
+        yield measure("nut on bolt, free", models, matrices, device, sizes["repeats"])
+    knots = knot_model(sizes["knot"])
+    for count in sizes["counts"]:
+        matrices = pose_matrices(random_poses(longest_side(knots), count))
+        yield measure(f"knot, {count} poses", [knots, knots], matrices, device, sizes["repeats"])
+
+
+def place_at_gaps(model, count):
+    """Return random poses of B, moved away from A until as far apart as gaps that lie evenly in their logarithm."""
+    size, rng = longest_side(model), np.random.default_rng(0)
+    matrices = pose_matrices(random_poses(0.0, count))
+    away = rng.normal(size=(count, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    vertices = model.mesh_at(model.lod_max)[0]
+    middle = (vertices.max(0) + vertices.min(0)) / 2
+    start = middle - np.einsum("nij,j->ni", matrices[:, :3, :3], middle)
+    low, high, gaps = np.zeros(count), np.full(count, 3 * size), size * np.geomspace(*GAPS, count)
+    for _ in range(STEPS):
+        far = (low + high) / 2
+        matrices[:, :3, 3] = start + far[:, None] * away
+        wide = ab.sweep(model, model, matrices, output="distance", device="cpu")["distance"] > gaps
+        low, high = np.where(wide, low, far), np.where(wide, far, high)
+    matrices[:, :3, 3] = start + high[:, None] * away
+    return matrices
+
+
+def measure(name, models, matrices, device, repeats):
+    """Return the row of one workload.
+
+    Raises:
+        RuntimeError: A baseline's distance is another, by more than float64's rounding of the sizes.
+    """
+    scene, pairs = scene_of_poses(device, *models, [IDENTITY] * len(matrices))
+    scene.set_poses(np.concatenate([np.eye(4)[None], matrices]))
+    query, fresh = ab.DistanceQuery(scene, pairs), ab.DistanceQuery(scene, pairs)
+    one = ab.DistanceQuery(scene, pairs[len(pairs) // 2 :][:1])
+    found = fresh.run()
+    query.run()
+    row = {"device": device.name, "workload": name, "faces": " x ".join(str(model.face_count) for model in models)}
+    row |= {"poses": len(pairs), "meet": int(found.any.sum()), "median_gap": float(np.median(found.distance))}
+    row |= {"node_tests": round(found.node_tests.mean(), 1), "face_tests": round(found.triangle_tests.mean(), 1)}
+
+    def launch_fresh():
+        fresh.forget()
+        fresh.launch()
+
+    launches = {"fresh": launch_fresh, "again": query.launch, "one": lambda: (one.forget(), one.launch())}
+    with one_core():
+        if device.is_cpu:
+            try:
+                launches["fcl"] = make_fcl(models, matrices, found, row)
+            except ImportError as error:
+                row["fcl_skipped"] = str(error)
+        with no_garbage_collection():
+            times = medians(time_in_turn(launches, device, repeats, time.thread_time))
+    per = {key: time if key == "one" else time / len(pairs) for key, time in times.items()}
+    row |= {f"{key}_ms": float(f"{value:.4g}") for key, value in per.items()}
+    row |= {f"fcl_{key}_ratio": round(per["fcl"] / per[key], 2) for key in ("fresh", "again", "one") if "fcl" in per}
+    return row
+
+
+def make_fcl(models, matrices, found, row):
+    """Return python-fcl's answer as a launch, after comparing it with ours."""
+    meshes = [model.mesh_at(model.lod_max)[:2] for model in models]
+    fcl = Fcl(*meshes, matrices)
+    apart = ~found.any
+    error = np.abs(fcl.distances() - found.distance)[apart].max(initial=0.0)
+    size = max(longest_side(model) for model in models)
+    if error > 1e-12 * size:
+        raise RuntimeError(f"python-fcl's distances differ by {error / size} of the size")
+    row["fcl_differs"] = float(f"{error / size:.2g}")
+    return fcl.distances

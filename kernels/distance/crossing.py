@@ -1,0 +1,121 @@
+"""A pair of faces that intersect, of object pairs that do: the first of the trees, children in order, a point of both.
+
+Which pair is first does not depend on how many a warp looks at together, nor on the bounds of boxes: nodes and faces
+lie on one stack in their order, a hit drops what comes after it, and the search goes on with what comes before.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.arithmetic.predicates import EXACT
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.contact.contact import load_corners
+from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame
+from warp_abtree.kernels.distance.node_pair import DROPPED, FACES, NODES, bound_children
+from warp_abtree.kernels.distance.report import Distances, write_nearest
+from warp_abtree.kernels.distance.search import (
+    DEPTH_FIRST_ROOM,
+    nearest_stack,
+    read_bound,
+    warp_min_item,
+    write_bound,
+)
+from warp_abtree.kernels.generation import STALE
+from warp_abtree.kernels.poses import PairPose, pose_point
+from warp_abtree.kernels.traversal.face_pairs import Hits, test_faces
+from warp_abtree.kernels.traversal.node_pair import first_item, four_items, item_first, item_second
+from warp_abtree.kernels.traversal.warp_stack import read_item, warp_lane, warp_size, warp_sync, write_item
+from warp_abtree.kernels.triangle.segment import intersect_faces
+
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
+
+
+@wp.func_native(native.body("nearest_stack.cuh", "push_in_order"))
+def push_in_order(items: wp.uint64, end: wp.int32, kinds: wp.vec4i, children: four_items) -> wp.int32:
+    """Append what is not dropped to the stack, the first child of the first lane last; return the new end."""
+
+
+@wp.func
+def search_crossing(models: ModelPool, states: StatePool, pose: PairPose, frame: Frame, room: wp.int32):
+    """Return the first faces of an object pair that intersect, NO_FACES where none do."""
+    items = nearest_stack()
+    if warp_lane() == 0:
+        write_item(items, 0, first_item(states, pose))
+        write_bound(items, 0, wp.float32(NODES))
+    warp_sync()
+    found = NO_FACES
+    end = wp.int32(1)
+    while end > 0:
+        popped = wp.max(1, (room - DEPTH_FIRST_ROOM - end) >> 2)
+        popped = wp.min(popped, wp.min(warp_size(), end))
+        # The first of the stack's top to the first lane.
+        at = end - 1 - wp.min(warp_lane(), popped - 1)
+        end -= popped
+        item = read_item(items, at)
+        kind = wp.where(warp_lane() < popped, wp.int32(read_bound(items, at)), DROPPED)
+        warp_sync()
+        crosses = False
+        if kind == FACES:
+            crosses = test_faces(EXACT, models, states, pose, item_first(item), item_second(item)) == 1
+        first = wp.int32(warp_min_item(wp.where(crosses, wp.int64(warp_lane()), wp.int64(popped))))
+        if first < popped:
+            end = 0
+            found = warp_min_item(wp.where(first == warp_lane(), item, NO_FACES))
+        live = wp.where(kind == NODES and warp_lane() < first, -1, 0)
+        if kind != NODES:
+            item = first_item(states, pose)
+        children, kinds, _bounds, _tests = bound_children(states, pose, frame, wp.float32(0.0), item, live)
+        end = push_in_order(items, end, kinds, children)
+        warp_sync()
+    return found
+
+
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+def search_crossing_kernel(
+    room: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pair_count: wp.array(dtype=wp.int32),
+    pair_poses: wp.array(dtype=PairPose),
+    hits: Hits,
+    found_inout: Found,
+):
+    """Find the first crossing faces of the object pairs that intersect, a warp a pair."""
+    p = wp.tid() / warp_size()
+    if p >= pair_count[0] or found_inout.launched[0] == STALE:
+        return
+    if hits.any_hit[p] == 0:
+        return
+    faces = search_crossing(models, states, pair_poses[p], found_inout.frame[p], room)
+    if warp_lane() == 0:
+        found_inout.faces[p] = faces
+
+
+@wp.kernel
+def report_crossing_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    found: Found,
+    hits: Hits,
+    distances_out: Distances,
+):
+    """Report the faces of an object pair that intersects, and the middle of what they share, a thread a pair."""
+    p = wp.tid()
+    if p >= pair_count[0] or found.launched[0] == STALE:
+        return
+    if hits.any_hit[p] == 0 or found.faces[p] == NO_FACES:
+        return
+    pose = pair_poses[p]
+    face_a, face_b = item_first(found.faces[p]), item_second(found.faces[p])
+    corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
+    load_corners(models, states, pose, face_a, face_b, corner)
+    p0, p1, _ = intersect_faces(pose.scale, corner)
+    a = wp.min(pairs[p][0], pairs[p][1])
+    middle = wp.float64(0.5) * (p0 + p1)
+    point = pose_point(objects.rotation[a], objects.position[a], middle)
+    write_nearest(p, pose.swapped, face_a, face_b, point, point, distances_out)

@@ -1,0 +1,223 @@
+"""What an object pair's search of distances starts from: boxes at unit size, errors to allow for, and a first bound.
+
+Boxes are scaled by a power of two that brings the larger model, or the distance between the models' centres, to about
+unit size, so that float32 holds squares of distances. `margin` is that of `PairPose`, which widens boxes along an axis
+by what their coordinates may err by.
+
+D is the least distance of A's vertices to x' (docs/exactness.md) that is computed, d that of the surfaces in the world.
+With u = 2^-53, reaches A and B of the vertices, T of the translation, S = A + B + T, and skews s_a and s_b of the
+rotations, for world points p and q of the surfaces and w = a - Ra^T (Rb b + tb - ta):
+
+1. p - q = Ra w + Ra (Ra^T Ra - 1) a - (Ra Ra^T - 1) (p - q). The brackets have norms of at most 3 s_a, and Ra and Rb
+   lengthen by at most 1 + 1.5 s_a and 1 + 1.5 s_b, so |p - q| <= (1 + 5 s_a) |w| + 6 s_a A; and the other way, from
+   w = Ra^T (p - q) - (Ra^T Ra - 1) a, |w| <= (1 + 1.5 s_a) |p - q| + 6 s_a A.
+2. x' stands for Ra^T (Rb b + tb - ta) with an error of 24 u (B + T). A matrix made of a quaternion errs by 24 u, which
+   moves p and q by 42 u (A + B), and the skew's own rounding counts 21 u A: 90 u S in all.
+3. L of `triangle_pair` is at most 2 S. By its steps, a pair of faces errs by 40 u L and by what sqrt(D^2 + (128 u L)^2)
+   exceeds D: together 96 u S where D > 2^-19 S, else at most 2 PAIR_ROUNDING S.
+
+So d <= D (1 + 5 (s_a + s_b) + 2^-45) + 6 s_a A + 2^-45 S, and D is under the same of d, or S counts 2^-44 more where
+D is small: `stretch` and `slack_of`.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.distance.triangle_pair import PAIR_ROUNDING, scale_triangles, triangle_distance
+from warp_abtree.kernels.generation import STALE
+from warp_abtree.kernels.poses import (
+    ROUNDING_32,
+    ROUNDING_64,
+    UNIT_32,
+    PairPose,
+    measure_rotation,
+    pose_point,
+    reach_box,
+    sum_products,
+)
+from warp_abtree.kernels.traversal.node_pair import pack_item
+from warp_abtree.kernels.traversal.nodes import load_node
+from warp_abtree.kernels.triangle.distance import DISTANCE_MAX, EXPONENT_BITS, POSE_ROUNDING, largest, skew_of
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+# Sorts behind all face pairs.
+NO_FACES = wp.constant(wp.int64(2**63 - 1))
+# Of a bound of boxes, a sum of six squares in float32, and of its comparison.
+BOUND_ROUNDING = wp.constant(wp.float64(2.0**-19))
+# Distances over so many times a `pair_slack`, which is 2^-44 S, are not small.
+SMALL_DISTANCE = wp.constant(wp.float64(2.0**25))
+SCALE_MAX = wp.constant(wp.float64(2.0**100))
+
+
+@wp.struct
+class Frame:
+    """How an object pair's boxes are compared, and what its distances err by."""
+
+    translation: wp.vec3  # between the models' centres, of B to A, scaled
+    back: wp.vec3  # the same, of A to B
+    scale: wp.float32  # power of two that boxes are scaled by
+    margin: wp.float32  # that posed boxes are widened by, scaled
+    grow: wp.float32  # a little over 1: bounds of boxes may be so much too large
+    error: wp.float32  # that float32 errs by in the distance of two faces, beside a part of their size, scaled
+    least: wp.float32  # that pairs of faces err by in float64, scaled
+    scale64: wp.float64  # the same power of two, where float32 has none
+    pair_slack: wp.float64  # that a pair of faces errs by at most [model units]
+    stretch: wp.float64  # D <= d stretch + slack, and d <= D stretch + slack
+    slack: wp.float64  # the other part, of distances that are not small; see `slack_of`
+
+
+@wp.struct
+class Tolerances:
+    """When a pair of faces is near enough."""
+
+    tolerance: wp.float64  # width of the bracket [world units]
+    relative: wp.float64  # width of the bracket, relative to its upper end
+
+
+@wp.struct
+class Nearest:
+    """The nearest pair of faces found so far."""
+
+    distance: wp.float64  # in A's frame, or what it is asked to be under
+    faces: wp.int64  # (face of A, face of B) as an item of `node_pair`, NO_FACES for none
+
+
+@wp.struct
+class Found:
+    """What the search of each object pair has found."""
+
+    distance: wp.array(dtype=wp.float64)  # in A's frame, shape [pair]
+    faces: wp.array(dtype=wp.int64)  # see `Nearest`, shape [pair]; what lies there starts the next search
+    frame: wp.array(dtype=Frame)  # shape [pair]
+    beyond: wp.array(dtype=wp.float64)  # distance to end at [world units], infinite for none, shape [pair]
+    launched: wp.array(dtype=wp.int32)  # STALE where nothing is to be done, see `generation.LaunchRecord`
+
+
+@wp.func
+def make_frame(models: ModelPool, states: StatePool, objects: ObjectPool, pose: PairPose, a: wp.int32, b: wp.int32):
+    """Return the `Frame` of objects a < b."""
+    state_a, state_b = objects.state[a], objects.state[b]
+    centre_a, centre_b = models.centre[states.model[state_a]], models.centre[states.model[state_b]]
+    root_a = load_node(states, states.node_start[state_a] + 1)
+    root_b = load_node(states, states.node_start[state_b] + 1)
+    reach_a = reach_box(root_a.lower, root_a.upper)
+    reach_b = reach_box(root_b.lower, root_b.upper)
+    r, t = pose.rotation, pose.translation
+    shift, back = wp.vec3d(), wp.vec3d()
+    for i in range(3):
+        shift[i] = (sum_products(r[i, 0], centre_b[0], r[i, 1], centre_b[1], r[i, 2], centre_b[2]) + t[i]) - centre_a[i]
+    for i in range(3):
+        back[i] = -sum_products(r[0, i], shift[0], r[1, i], shift[1], r[2, i], shift[2])
+    skew, _ = measure_rotation(r)
+    two = wp.float64(2.0)
+    size = largest(t) + largest(centre_a)
+    far = largest(shift)
+    margin64 = ROUNDING_64 * (size + two * (largest(centre_b) + reach_b) + reach_a)
+    margin64 = margin64 + wp.float64(4.0) * skew * (reach_b + far)
+    margin = margin64 + ROUNDING_32 * (reach_a + reach_b + far)
+    most = wp.max(wp.max(reach_a, reach_b), far)
+    power = wp.cast(wp.cast(most, wp.int64) & EXPONENT_BITS, wp.float64)
+    scale = wp.min(wp.float64(1.0) / power, SCALE_MAX)
+    one = wp.float64(1.0)
+    skew_a, skew_b = skew_of(objects.rotation[a]), skew_of(objects.rotation[b])
+    sizes = (reach_a + largest(centre_a)) + (reach_b + largest(centre_b))
+    sizes = sizes + largest(objects.position[b] - objects.position[a])
+    frame = Frame()
+    frame.translation = wp.vec3(shift * scale)
+    frame.back = wp.vec3(back * scale)
+    frame.scale = wp.float32(scale)
+    frame.margin = wp.float32(margin * scale)
+    frame.scale64 = scale
+    frame.pair_slack = two * PAIR_ROUNDING * sizes
+    frame.grow = wp.float32(one + two * BOUND_ROUNDING + wp.float64(4.0) * skew)
+    frame.least = wp.float32(two * frame.pair_slack * scale)
+    off = UNIT_32 * (reach_a + wp.float64(7.2) * reach_b + wp.float64(4.0) * far) + margin64
+    frame.error = wp.float32((wp.float64(1.75) * off + two * frame.pair_slack) * scale)
+    frame.stretch = one + wp.float64(5.0) * (skew_a + skew_b) + POSE_ROUNDING
+    frame.slack = wp.float64(6.0) * skew_a * (reach_a + largest(centre_a)) + POSE_ROUNDING * sizes
+    return frame
+
+
+@wp.func
+def slack_of(frame: Frame, distance: wp.float64):
+    """Return what a distance errs by, beside a part of itself."""
+    return wp.where(distance > SMALL_DISTANCE * frame.pair_slack, frame.slack, frame.slack + frame.pair_slack)
+
+
+@wp.func
+def width_of(frame: Frame, distance: wp.float64):
+    """Return what a bracket at a distance is at least as wide as, as `cut_of` takes it."""
+    return wp.float64(4.0) * ((frame.slack + frame.pair_slack) + (frame.stretch - wp.float64(1.0)) * distance)
+
+
+@wp.func
+def cut_of(frame: Frame, tolerances: Tolerances, distance: wp.float64):
+    """Return the distance in A's frame under which faces matter, where there are some at a distance.
+
+    The bracket is as narrow as is asked then; where rounding alone makes it wider, faces that are any nearer matter.
+    """
+    asked = wp.max(tolerances.tolerance, tolerances.relative * distance)
+    spare = asked - width_of(frame, distance)
+    return wp.where(spare > wp.float64(0.0), distance - spare, distance)
+
+
+@wp.func
+def load_triangles(models: ModelPool, states: StatePool, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
+    """Return the corners of a face of A and of one of B, in A's frame."""
+    a = states.face_corner[pose.corner_a + face_a]
+    b = states.face_corner[pose.corner_b + face_b]
+    return scale_triangles(
+        load_vertex(models.vertex_pos, a[0]),
+        load_vertex(models.vertex_pos, a[1]),
+        load_vertex(models.vertex_pos, a[2]),
+        pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[0])),
+        pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[1])),
+        pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[2])),
+    )
+
+
+@wp.func
+def is_active(models: ModelPool, states: StatePool, state: wp.int32, face: wp.int32):
+    if face < 0 or face >= models.face_count[states.model[state]]:
+        return False
+    return states.face_corner[states.face_start[state] + face][0] >= 0
+
+
+@wp.kernel
+def start_distance_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    found_inout: Found,
+    counter_out: wp.array(dtype=wp.int32),
+):
+    """Prepare an object pair a thread, with the last launch's faces as the first bound where both are active."""
+    p = wp.tid()
+    if p == 0:
+        counter_out[1] = 0
+        counter_out[3] = 0
+    if p >= pair_count[0] or found_inout.launched[0] == STALE:
+        return
+    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
+    pose = pair_poses[p]
+    frame = make_frame(models, states, objects, pose, a, b)
+    found_inout.frame[p] = frame
+    bound = found_inout.beyond[p]
+    if bound < DISTANCE_MAX:
+        bound = bound * frame.stretch + (frame.slack + frame.pair_slack)
+    else:
+        bound = wp.float64(wp.inf)
+    faces = found_inout.faces[p]
+    kept = NO_FACES
+    face_a, face_b = wp.int32(faces >> wp.int64(32)), wp.int32(faces & wp.int64(0x7FFFFFFF))
+    if is_active(models, states, objects.state[a], face_a) and is_active(models, states, objects.state[b], face_b):
+        d = triangle_distance(load_triangles(models, states, pose, face_a, face_b))
+        if d <= bound:
+            bound = d
+            kept = pack_item(face_a, face_b)
+    found_inout.distance[p] = bound
+    found_inout.faces[p] = kept

@@ -1,0 +1,112 @@
+"""Bounds of the distances of posed boxes, and the step of the search: a node pair, up to four pairs of children.
+
+Items are those of `traversal.node_pair`. Boxes are compared along the axes of both frames, as in `traversal.boxes`: in
+each frame the six gaps between a box and the other's image bound the distance, and the larger bound counts. Bounds are
+squares of twice the distance, scaled (`frame.Frame`).
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import StatePool
+from warp_abtree.kernels.distance.frame import Frame, Nearest, Tolerances, cut_of
+from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.boxes import PosedBox, pose_box
+from warp_abtree.kernels.traversal.node_pair import (
+    INDEX_MASK,
+    children_of,
+    four_items,
+    item_first,
+    item_second,
+    pack_item,
+)
+from warp_abtree.kernels.traversal.nodes import Node, load_constant_node
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+# What a pair of children is: dropped, to go on with, or two faces.
+DROPPED, NODES, FACES = wp.constant(0), wp.constant(1), wp.constant(2)
+
+
+@wp.func
+def square_gap(x: wp.vec3, reach: wp.vec3):
+    """Return the squared length of what |x| exceeds a reach by."""
+    zero = wp.float32(0.0)
+    a = wp.max(wp.abs(x[0]) - reach[0], zero)
+    b = wp.max(wp.abs(x[1]) - reach[1], zero)
+    c = wp.max(wp.abs(x[2]) - reach[2], zero)
+    return (a * a + b * b) + c * c
+
+
+@wp.func
+def bound_boxes(a: PosedBox, b: PosedBox):
+    """Return a lower bound of the squared distance of two boxes, see this module."""
+    return wp.max(
+        square_gap(a.sum - b.posed_sum, a.size + b.posed_size), square_gap(a.posed_sum - b.sum, a.posed_size + b.size)
+    )
+
+
+@wp.func
+def limit_of(frame: Frame, tolerances: Tolerances, nearest: Nearest):
+    """Return the bound over which nothing matters any more: negative where all is known."""
+    cut = cut_of(frame, tolerances, nearest.distance)
+    if cut < wp.float64(0.0):
+        return wp.float32(-1.0)
+    # `grow` has room for the roundings here too.
+    x = wp.float32(wp.float64(2.0) * (cut + frame.pair_slack) * frame.scale64) * frame.grow
+    return x * x
+
+
+@wp.func
+def item_of(a: Node, b: Node):
+    """Return the item that two nodes leave: their faces, where both are leaves.
+
+    Else the next step goes down both, or only the one that is more than twice as large as the other, or no leaf.
+    """
+    leaves = (a.face | b.face) >= 0
+    span_a, span_b = wp.cast(a.face, wp.float32), wp.cast(b.face, wp.float32)
+    x = wp.where(leaves, a.face, wp.where(span_a + span_a <= span_b, children_of(a.skip), a.skip))
+    y = wp.where(leaves, b.face, wp.where(span_b + span_b <= span_a, children_of(b.skip), b.skip))
+    return pack_item(x, y)
+
+
+@wp.func
+def kind_of(used: wp.int32, a: Node, b: Node, bound: wp.float32, limit: wp.float32):
+    kind = wp.where((a.face | b.face) >= 0, FACES, NODES)
+    return wp.where(used < 0 and bound <= limit, kind, DROPPED)
+
+
+@wp.func
+def bound_children(states: StatePool, pose: PairPose, frame: Frame, limit: wp.float32, item: wp.int64, live: wp.int32):
+    """Compare what an item names; return the items that follow, what each is, their bounds, and how many were compared.
+
+    live is -1, or 0 where nothing is asked of the item, which still names nodes.
+    """
+    x = item_first(item)
+    y = item_second(item)
+    at_a = pose.node_a + (x & INDEX_MASK)
+    at_b = pose.node_b + (y & INDEX_MASK)
+    a0 = load_constant_node(states, at_a)
+    a1 = load_constant_node(states, at_a + wp.where(x < 0, 1, 0))
+    b0 = load_constant_node(states, at_b)
+    b1 = load_constant_node(states, at_b + wp.where(y < 0, 1, 0))
+    home = wp.transpose(pose.rotation32)
+    s = frame.scale
+    box_a0 = pose_box(a0.lower * s, a0.upper * s, home, frame.back, frame.margin)
+    box_a1 = pose_box(a1.lower * s, a1.upper * s, home, frame.back, frame.margin)
+    box_b0 = pose_box(b0.lower * s, b0.upper * s, pose.rotation32, frame.translation, frame.margin)
+    box_b1 = pose_box(b1.lower * s, b1.upper * s, pose.rotation32, frame.translation, frame.margin)
+    bounds = wp.vec4(
+        bound_boxes(box_a0, box_b0),
+        bound_boxes(box_a0, box_b1),
+        bound_boxes(box_a1, box_b0),
+        bound_boxes(box_a1, box_b1),
+    )
+    kinds = wp.vec4i(
+        kind_of(live, a0, b0, bounds[0], limit),
+        kind_of(y & live, a0, b1, bounds[1], limit),
+        kind_of(x & live, a1, b0, bounds[2], limit),
+        kind_of(x & y & live, a1, b1, bounds[3], limit),
+    )
+    items = four_items(item_of(a0, b0), item_of(a0, b1), item_of(a1, b0), item_of(a1, b1))
+    tests = -((live >> 31) + ((y & live) >> 31) + ((x & live) >> 31) + ((x & y & live) >> 31))
+    return items, kinds, bounds, tests

@@ -1,0 +1,108 @@
+"""What is reported of an object pair: its distance, the bracket around it, and the nearest points in the world."""
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.distance.frame import NO_FACES, Found, Tolerances, cut_of, load_triangles, slack_of
+from warp_abtree.kernels.distance.triangle_pair import feature_weights, nearest_features
+from warp_abtree.kernels.generation import STALE
+from warp_abtree.kernels.poses import PairPose, pose_point
+from warp_abtree.kernels.traversal.face_pairs import Hits
+from warp_abtree.kernels.traversal.node_pair import item_first, item_second
+from warp_abtree.kernels.triangle.distance import DISTANCE_MAX
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+# Of surfaces that do not intersect though their distance rounds to 0.
+LEAST_DISTANCE = wp.constant(wp.float64(2.0**-1022))
+
+two_points = wp.types.matrix(shape=(2, 3), dtype=wp.float64)
+
+
+@wp.func_native(native.body("numbers.cuh", "no_vector"))
+def no_vector() -> wp.vec3d:
+    """Return a vector of NumPy's NaN."""
+
+
+@wp.struct
+class Distances:
+    """Answers, a row an object pair, its objects in the order in which the pair names them."""
+
+    distance: wp.array(dtype=wp.float64)  # 0 where they intersect, infinite where proved beyond [world units]
+    bracket: wp.array(dtype=wp.vec2d)  # proven lower and upper bound [world units]
+    points: wp.array(dtype=two_points)  # nearest point of each, NaN where proved beyond [world units]
+    faces: wp.array(dtype=wp.vec2i)  # the faces that they lie on, -1 where proved beyond
+
+
+@wp.func
+def write_nearest(
+    p: wp.int32,
+    swapped: wp.int32,
+    face_a: wp.int32,
+    face_b: wp.int32,
+    point_a: wp.vec3d,
+    point_b: wp.vec3d,
+    distances: Distances,
+):
+    """Write points and faces in the order in which a pair names its objects."""
+    if swapped != 0:
+        distances.points[p] = wp.matrix_from_rows(point_b, point_a)
+        distances.faces[p] = wp.vec2i(face_b, face_a)
+    else:
+        distances.points[p] = wp.matrix_from_rows(point_a, point_b)
+        distances.faces[p] = wp.vec2i(face_a, face_b)
+
+
+@wp.func
+def blend_corners(models: ModelPool, corner: wp.vec4i, weights: wp.vec3d):
+    """Return a point of a face, by the weights of its corners."""
+    x = weights[0] * load_vertex(models.vertex_pos, corner[0])
+    x = x + weights[1] * load_vertex(models.vertex_pos, corner[1])
+    return x + weights[2] * load_vertex(models.vertex_pos, corner[2])
+
+
+@wp.kernel
+def report_distance_kernel(
+    tolerances: Tolerances,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    found: Found,
+    hits: Hits,
+    distances_out: Distances,
+):
+    """Report an object pair a thread; of those that intersect, what does not depend on where."""
+    p = wp.tid()
+    if p >= pair_count[0] or found.launched[0] == STALE:
+        return
+    zero = wp.float64(0.0)
+    if hits.any_hit[p] != 0:
+        distances_out.distance[p] = zero
+        distances_out.bracket[p] = wp.vec2d(zero, zero)
+        return
+    pose = pair_poses[p]
+    if found.faces[p] == NO_FACES:
+        beyond = wp.min(found.beyond[p], DISTANCE_MAX)
+        distances_out.distance[p] = wp.float64(wp.inf)
+        distances_out.bracket[p] = wp.vec2d(beyond, wp.float64(wp.inf))
+        write_nearest(p, 0, -1, -1, no_vector(), no_vector(), distances_out)
+        return
+    frame = found.frame[p]
+    d = found.distance[p]
+    cut = cut_of(frame, tolerances, d)
+    lower = wp.max((cut - slack_of(frame, cut)) / frame.stretch, zero)
+    distances_out.distance[p] = wp.max(d, LEAST_DISTANCE)
+    distances_out.bracket[p] = wp.vec2d(lower, wp.max(d * frame.stretch + slack_of(frame, d), LEAST_DISTANCE))
+    face_a, face_b = item_first(found.faces[p]), item_second(found.faces[p])
+    near = nearest_features(load_triangles(models, states, pose, face_a, face_b))
+    weights_a, weights_b = feature_weights(near)
+    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
+    point_a = blend_corners(models, states.face_corner[pose.corner_a + face_a], weights_a)
+    point_b = blend_corners(models, states.face_corner[pose.corner_b + face_b], weights_b)
+    point_a = pose_point(objects.rotation[a], objects.position[a], point_a)
+    point_b = pose_point(objects.rotation[b], objects.position[b], point_b)
+    write_nearest(p, pose.swapped, face_a, face_b, point_a, point_b, distances_out)

@@ -1,0 +1,155 @@
+"""The search of the CPU: threads that take one object pair after the other, in vector instructions.
+
+Node pairs go depth first, but those that are far for what has been found wait until something nearer may be: few are
+looked at then that a search from the answer would not. Faces are measured in float32, 16 at a time, within an error
+that is proven as in `triangle_pair` with u = 2^-24 and for the coordinates as in docs/exactness.md; float64 decides
+between those that may be the nearest. It is the same answer that warps give on CUDA.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.arrays import ModelPool, StatePool
+from warp_abtree.kernels.distance.frame import (
+    NO_FACES,
+    Found,
+    Frame,
+    Nearest,
+    Tolerances,
+    cut_of,
+    load_triangles,
+    width_of,
+)
+from warp_abtree.kernels.distance.triangle_pair import triangle_distance
+from warp_abtree.kernels.generation import STALE
+from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.face_pairs import Hits
+from warp_abtree.kernels.traversal.load_balance import take_unit
+from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
+from warp_abtree.kernels.traversal.simd import take_thread
+
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
+
+NEAREST_WORDS = native.constant("NEAREST_WORDS")
+ROUNDING_UP = wp.constant(wp.float32(1.0 + 2.0**-20))
+ROUNDING_DOWN = wp.constant(wp.float32(1.0 - 2.0**-20))
+
+
+@wp.func_native(native.body("simd/nearest.h", "open_search"))
+def open_search(upper: wp.float32, first: wp.int64, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)): ...
+
+
+@wp.func_native(native.body("simd/nearest.h", "search_nearest"))
+def search_nearest(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    frame: Frame,
+    spare: wp.vec4,
+    thread: wp.int32,
+    memory: wp.array2d(dtype=wp.float32),
+) -> wp.vec3i:
+    """Search until the end, or until many pairs of faces wait for float64.
+
+    Returns 1 at the end, and how many pairs of boxes were compared since the start, and pairs of faces.
+    """
+
+
+@wp.func_native(native.body("simd/nearest.h", "take_nearest"))
+def take_nearest(
+    upper: wp.float32, cut: wp.float32, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)
+) -> wp.int64:
+    """Return the faces that wait and seem nearest, -1 if none may be as near as the cut.
+
+    Args:
+        upper: Scaled distance that the nearest faces are not beyond.
+    """
+
+
+@wp.func
+def scaled_up(distance: wp.float64, frame: Frame):
+    """Return a distance in the scale of the boxes, not less than any pair of faces at it has in float64."""
+    return wp.float32(distance * frame.scale64) * ROUNDING_UP + frame.least
+
+
+@wp.func
+def spare_of(tolerances: Tolerances, frame: Frame):
+    """Return tolerances for float32: scaled, relative, and widths of a bracket to be taken off, scaled and relative."""
+    width = width_of(frame, wp.float64(0.0))
+    part = wp.float64(4.0) * (frame.stretch - wp.float64(1.0))
+    return wp.vec4(
+        wp.float32((tolerances.tolerance - width) * frame.scale64) * ROUNDING_DOWN,
+        wp.float32(tolerances.relative) * ROUNDING_DOWN,
+        wp.float32(width * frame.scale64) * ROUNDING_UP,
+        wp.float32(part) * ROUNDING_UP,
+    )
+
+
+@wp.func
+def decide_open(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    frame: Frame,
+    tolerances: Tolerances,
+    thread: wp.int32,
+    before: Nearest,
+    memory: wp.array2d(dtype=wp.float32),
+):
+    """Measure in float64 what waits, the nearest first, as far as it matters; return the nearest."""
+    nearest = before
+    searching = bool(True)
+    while searching:
+        upper = scaled_up(nearest.distance, frame)
+        cut = upper
+        if nearest.faces != NO_FACES:
+            cut = scaled_up(cut_of(frame, tolerances, nearest.distance), frame)
+        item = take_nearest(upper, cut, thread, memory)
+        searching = item >= wp.int64(0)
+        if searching:
+            d = triangle_distance(load_triangles(models, states, pose, item_first(item), item_second(item)))
+            if d < nearest.distance or (d == nearest.distance and item < nearest.faces):
+                nearest.distance = d
+                nearest.faces = item
+    return nearest
+
+
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+def search_thread_kernel(
+    tolerances: Tolerances,
+    models: ModelPool,
+    states: StatePool,
+    pair_count: wp.array(dtype=wp.int32),
+    pair_poses: wp.array(dtype=PairPose),
+    counter: wp.array(dtype=wp.int32),
+    found_inout: Found,
+    hits_inout: Hits,
+    memory_out: wp.array2d(dtype=wp.float32),
+):
+    """Take one object pair after the other that does not intersect, and search it; CPU only, a thread a core."""
+    if found_inout.launched[0] == STALE:
+        return
+    count = wp.min(pair_count[0], pair_poses.shape[0])
+    thread = take_thread(counter)
+    if thread >= memory_out.shape[0]:
+        return
+    p = take_unit(counter)
+    while p < count:
+        if hits_inout.any_hit[p] == 0:
+            pose = pair_poses[p]
+            frame = found_inout.frame[p]
+            nearest = Nearest()
+            nearest.distance = found_inout.distance[p]
+            nearest.faces = found_inout.faces[p]
+            spare = spare_of(tolerances, frame)
+            open_search(scaled_up(nearest.distance, frame), first_item(states, pose), thread, memory_out)
+            state = wp.vec3i()
+            while state[0] == 0:
+                state = search_nearest(models, states, pose, frame, spare, thread, memory_out)
+                nearest = decide_open(models, states, pose, frame, tolerances, thread, nearest, memory_out)
+            hits_inout.node_tests[p] += wp.int64(state[1])
+            hits_inout.triangle_tests[p] += wp.int64(state[2])
+            found_inout.distance[p] = nearest.distance
+            found_inout.faces[p] = nearest.faces
+        p = take_unit(counter)

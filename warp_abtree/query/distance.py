@@ -1,0 +1,227 @@
+"""How far apart two surfaces are, and where: `DistanceQuery`.
+
+The distance of an object pair is the least distance of a point of one surface, at its LOD, from a point of the other.
+It is 0 if and only if the surfaces intersect, which the exact test decides. For each pair, in the order in which it
+names its objects:
+
+* distance [world units]: of a pair of points, one of each surface; with the default tolerance the least there is but
+  for rounding. 0 where the surfaces intersect, infinite where they are proved farther apart than `beyond`.
+* bracket [world units]: lower and upper bound between which the least distance lies, proven for the poses as real
+  numbers and all rounding (`warp_abtree.kernels.distance.frame`): the bounds are within about 1e-13 of the sizes of
+  models and poses from `distance`, or within what the tolerance asks if that is more. (0, 0) where the surfaces
+  intersect, (`beyond`, infinite) where they are proved farther apart.
+* points [world units]: the nearest points. Where the surfaces intersect, one point of both, twice: the middle of what
+  two faces share, as accurate as a contact (`warp_abtree.query.contacts`).
+* point_faces: the faces that they lie on. Of equally near face pairs the one with the lowest face of the object with
+  the smaller index, then of the other; where the surfaces intersect, some pair that does.
+
+With the default tolerance, all of this is the same, bit for bit, on CPU and CUDA, whatever the search has started from.
+With a tolerance points, faces and distance may also depend on what the last launch found.
+"""
+
+import math
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import check_device, to_numpy
+from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
+from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd
+from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
+from warp_abtree.query.commands import Commands
+from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.request import check_request, check_within, refuse_options
+from warp_abtree.query.result import DISTANCES, Found, Result
+from warp_abtree.query.staging import first_rows
+
+COUNTER_COUNT = 4
+# Pairs that make a further core worth its while, which costs some 50 us.
+PAIRS_A_CORE = 2
+
+
+def check_beyond(beyond, pair_count=None) -> np.ndarray:
+    """Return distances that end a search, as `check_within`; infinite for None."""
+    if beyond is None or (isinstance(beyond, np.ndarray) and beyond.shape == () and beyond == np.inf):
+        return np.array(np.inf)
+    return check_within(beyond, pair_count, "beyond")
+
+
+def make_tolerances(tolerance, relative):
+    """Return the tolerances of a search for a kernel."""
+    tolerances = frame.Tolerances()
+    tolerances.tolerance = check_tolerance(tolerance, "tolerance", math.inf)
+    tolerances.relative = check_tolerance(relative, "relative", 1.0)
+    return tolerances
+
+
+def check_tolerance(tolerance, name: str, most: float) -> float:
+    """Return a tolerance.
+
+    Raises:
+        ValueError: No number from 0 up to below the most.
+    """
+    value = to_numpy(tolerance, name)
+    if value.shape != () or value.dtype.kind not in "iuf" or not 0 <= value < most:
+        raise ValueError(f"{name}: {tolerance!r} is no number of 0 or more, below {most}")
+    return float(value)
+
+
+def check_asked(output, precision, options):
+    """Check what is asked of a sweep.
+
+    Raises:
+        TypeError: An option with another name than tolerance, relative and beyond.
+        ValueError: A bad option, output or precision, or one that means nothing beside another.
+    """
+    unknown = set(options) - {"tolerance", "relative", "beyond"}
+    if unknown:
+        raise TypeError(f"sweep has no option {sorted(unknown)[0]!r}")
+    if output == "distance":
+        refuse_options(output, {"precision": precision != "exact"})
+        make_tolerances(options.get("tolerance", 0.0), options.get("relative", 0.0))
+        check_beyond(options.get("beyond"))
+    else:
+        refuse_options(output, options)
+        check_request(output, precision)
+
+
+class DistanceQuery(Query):
+    """Least distances of many object pairs as an operator: allocates once, launches many times.
+
+    As `Query` otherwise. The faces that a launch finds are where the next one starts, so that objects which move little
+    from launch to launch take less time. What each answer is stands in `warp_abtree.query.distance`.
+
+    Args:
+        scene, pairs, capacity: As for `Query`. The broad phase finds overlapping boxes only.
+        tolerance: Width of the bracket that ends the search of a pair [world units].
+        relative: The same as a fraction of the distance, below 1; the wider one counts.
+        beyond: Distance [world units] that ends the search of a pair which is proved farther apart: one for all pairs,
+            or (p,) beside given pairs; None for none.
+
+    Attributes:
+        distances: The last launch's answers, device arrays (pair capacity,) of `kernels.distance.report.Distances`.
+
+    Raises:
+        ValueError: As `Query`; a tolerance or distance that is negative, infinite or no number.
+        RuntimeError: A graph is being captured.
+    """
+
+    _memory: wp.array
+
+    def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None):
+        self._tolerances = make_tolerances(tolerance, relative)
+        self._asked = check_beyond(beyond, None if pairs is None else len(to_numpy(pairs, "pairs")))
+        self.distances, self._found = report.Distances(), frame.Found()
+        self._counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
+        super().__init__(scene, "any", pairs, capacity)
+
+    def set_pairs(self, pairs, beyond=None):
+        """Query other pairs from now on, in the room there is if they fit; beyond None keeps the distances.
+
+        Raises:
+            ValueError: Bad pairs or distances, or a query that runs the broad phase.
+        """
+        if self.broad_phase is not None:
+            raise ValueError("this query takes its pairs from the broad phase")
+        check_device(self.device, "giving a query other pairs")
+        pairs = self.batch.check_pairs(pairs)
+        if beyond is None:
+            beyond = self._asked if self._within is None else self._within
+        self.replace_pairs(pairs, check_beyond(beyond, len(pairs)))
+
+    def set_tolerance(self, tolerance=0.0, relative=0.0):
+        """Take other tolerances from the next launch on; a captured graph keeps its own.
+
+        Raises:
+            ValueError: One that is negative, infinite or no number.
+        """
+        self._tolerances = make_tolerances(tolerance, relative)
+        self._commands = Commands()
+
+    def forget(self):
+        """Let the next launch start anew, and not from the faces that the last one found. Launches only."""
+        self._found.faces.fill_(int(frame.NO_FACES))
+
+    def _fill_within(self):
+        beyond = self._asked if self._within is None else self._within
+        if beyond.ndim == 0:
+            self._found.beyond.fill_(float(beyond))
+        elif len(beyond):
+            rows = wp.array(beyond, dtype=wp.float64, device="cpu", copy=False)
+            wp.copy(self._found.beyond, rows, count=len(rows))
+
+    def _slow_kernels(self, with_distances: bool) -> list:
+        warps = [search.search_warp_kernel, crossing.search_crossing_kernel]
+        kernels = warps if self.uses_warps() else [search_simd.search_thread_kernel, warps[1]]
+        kernels += [crossing.report_crossing_kernel, report.report_distance_kernel, frame.start_distance_kernel]
+        return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._slow_kernels(with_distances)]
+
+    def _pair_arrays(self, room: int) -> list:
+        made = super()._pair_arrays(room)
+        for owner, name, dtype in (
+            (self._found, "distance", wp.float64),
+            (self._found, "frame", frame.Frame),
+            (self._found, "beyond", wp.float64),
+            (self.distances, "distance", wp.float64),
+            (self.distances, "bracket", wp.vec2d),
+            (self.distances, "points", report.two_points),
+            (self.distances, "faces", wp.vec2i),
+        ):
+            made.append((owner, name, wp.empty(room, dtype=dtype, device=self.device)))
+        threads = 0 if self.uses_warps() else min(room, current_regime().cpu_threads or core_count())
+        made.append(
+            (self, "_memory", wp.empty((threads, search_simd.NEAREST_WORDS), dtype=wp.float32, device=self.device))
+        )
+        no_faces = int(frame.NO_FACES)
+        return [*made, (self._found, "faces", wp.full(room, no_faces, dtype=wp.int64, device=self.device))]
+
+    def traverse(self):
+        """Decide which pairs in place intersect, and find the distances of the others. Launches only."""
+        super().traverse()
+        room = len(self.pairs)
+        if not room:
+            return
+        self._found.launched = self.guard.launched
+        if self.device.is_capturing:
+            self._make_distances(wp.launch)
+            return
+        first, search, *reports = self._commands.find("distances", self.guard.given(), self._make_distances)
+        first.launch()
+        if self.uses_warps():
+            search.launch()
+        else:
+            launch_on_cores(search.launch, room, current_regime().cpu_threads, PAIRS_A_CORE)
+        for command in reports:
+            command.launch()
+
+    def _make_distances(self, launch) -> list:
+        """Make the launches that follow the exact test, see `Commands.find`."""
+        models, states, objects = self.batch.pools
+        room, lanes, device = len(self.pairs), WARP_SIZE if self.device.is_cuda else 1, self.device
+        posed = [models, states, objects, self.pair_count, self.pairs, self.pair_poses]
+        shared = [models, states, self.pair_count, self.pair_poses]
+        hits, found, length = self.hits, self._found, self._stack_length()
+        warps = {"dim": room * lanes, "block_dim": WARP_SIZE, "device": device}
+        threads = {"dim": room, "block_dim": WARP_SIZE, "device": device}
+        reports = [*posed, found, hits, self.distances]
+        if self.uses_warps():
+            inputs = [length, self._tolerances, *shared, found, hits]
+            searching = launch(search.search_warp_kernel, inputs=inputs, **warps)
+        else:
+            inputs = [self._tolerances, *shared, self._counter, found, hits, self._memory]
+            searching = launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device)
+        return [
+            launch(frame.start_distance_kernel, inputs=[*posed, found, self._counter], **threads),
+            searching,
+            launch(crossing.search_crossing_kernel, inputs=[length, *shared, hits, found], **warps),
+            launch(report.report_distance_kernel, inputs=[self._tolerances, *reports], **threads),
+            launch(crossing.report_crossing_kernel, inputs=reports, **threads),
+        ]
+
+    def _make_result(self, found: Found, device: bool, with_rows: bool = True) -> Result:
+        n, answers = len(found.pairs), self.distances
+        for name in (*DISTANCES, "points"):
+            rows = first_rows(getattr(answers, "faces" if name == "point_faces" else name), n)
+            setattr(found, name, wp.clone(rows) if device else rows.numpy().copy())
+        return super()._make_result(found, device, with_rows)
