@@ -81,27 +81,32 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     set_limits();
     while (h.open_count <= OPEN_LENGTH - 16) {
         while (top > 0 && waiting < 16) {
-            const int room = (CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH - top) / 3, fits = room > 1 ? room : 1;
+            const int room = (CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH - 16 - top) / 3, fits = room > 1 ? room : 1;
             const int most = h.upper < INF ? NEAREST_AT_ONCE : 1, wanted = fits < most ? fits : most;
-            NearBoxes::Taken taken[NEAREST_AT_ONCE];
+            NearBoxes::Taken taken[NEAREST_AT_ONCE / 4][4];
             int count = 0;
             while (top > 0 && count < wanted) {
                 --top;
-                if (m.bound[top] <= limit)
-                    taken[count++] = boxes.take(m.item[top]);
+                if (m.bound[top] <= limit) {
+                    taken[count >> 2][count & 3] = boxes.take(m.item[top]);
+                    ++count;
+                }
             }
-            const bool has_room = later <= LATER_LENGTH - 4 * NEAREST_AT_ONCE - 4;
-            const float now = has_room ? soon : limit;
-            for (int i = 0; i < count; ++i) {
+            for (int i = count; i & 3; ++i) {
+                taken[i >> 2][i & 3] = taken[0][0];
+                taken[i >> 2][i & 3].used = 0;
+            }
+            const float now = later <= LATER_LENGTH - 4 * NEAREST_AT_ONCE - 16 ? soon : limit;
+            for (int i = 0; 4 * i < count; ++i) {
                 const NearBoxes::Tested tested = boxes.test(taken[i]);
                 node_tests += __builtin_popcount(tested.used);
-                const unsigned int near = tested.used & NearBoxes::up_to(tested.bound, limit);
-                const unsigned int nodes = near & ~tested.leaves, first = nodes & NearBoxes::up_to(tested.bound, now);
-                NearBoxes::append_items(m.item + top, tested.item, first);
+                const unsigned int near = tested.used & NearBoxes::to_mask(tested.bound <= limit);
+                const unsigned int nodes = near & ~tested.leaves, first = nodes & NearBoxes::to_mask(tested.bound <= now);
+                NearBoxes::append_items(m.item + top, tested, first);
                 NearBoxes::append_bounds(m.bound + top, tested.bound, first);
-                NearBoxes::append_items(m.later + later, tested.item, nodes & ~first);
+                NearBoxes::append_items(m.later + later, tested, nodes & ~first);
                 NearBoxes::append_bounds(m.later_bound + later, tested.bound, nodes & ~first);
-                NearBoxes::append_items(m.face + waiting, tested.item, near & tested.leaves);
+                NearBoxes::append_items(m.face + waiting, tested, near & tested.leaves);
                 const int end = top + __builtin_popcount(first);
                 later += __builtin_popcount(nodes & ~first);
                 waiting += __builtin_popcount(near & tested.leaves);
