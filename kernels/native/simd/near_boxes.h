@@ -22,8 +22,10 @@ struct NearBoxes {
         unsigned int used, leaves;
     };
     lanes axes[3][3], sizes[3][3], shift[3];
-    float scale, wide;
+    float scale, wide, margin;
     const char *tree_a, *tree_b;
+    wp::int64 slabs;   // where the slab of a node lies, from the node; 0 for none
+    lanes way[3], far;  // direction from A for A's nodes, to A for B's, in their own frames; and -t . n of B's
 
     static NearBoxes make(const wp::float32 (&r)[3][3], const wp::vec_t<3, float>& back,
                           const wp::vec_t<3, float>& there, float margin, float scale, const void* trees, int a, int b) {
@@ -37,6 +39,8 @@ struct NearBoxes {
             s.shift[i] = join(2 * back[i], 2 * there[i]);
         }
         s.wide = 2 * margin;
+        s.margin = 12 * margin;
+        s.slabs = 0;
         s.scale = scale;
         s.tree_a = (const char*)trees + 32 * (wp::int64)a;
         s.tree_b = (const char*)trees + 32 * (wp::int64)b;
@@ -53,6 +57,31 @@ struct NearBoxes {
         __builtin_prefetch(taken.b);
         return taken;
     }
+    // Take a unit vector of A's frame as the direction along which slabs are compared.
+    void look(const float* n) {
+        float back[3];
+        for (int i = 0; i < 3; ++i)
+            back[i] = axes[0][i][15] * n[0] + axes[1][i][15] * n[1] + axes[2][i][15] * n[2];
+        const float t = shift[0][15] * n[0] + shift[1][15] * n[1] + shift[2][15] * n[2];
+        for (int i = 0; i < 3; ++i) {
+            const float a = n[i], b = -back[i];
+            way[i] = lanes{a, a, a, a, a, a, a, a, b, b, b, b, b, b, b, b};
+        }
+        far = lanes{0, 0, 0, 0, 0, 0, 0, 0, t, t, t, t, t, t, t, t};
+    }
+    // Upper bounds of twice the coordinate along the direction, of each node's box and slab.
+    lanes tops(const Taken (&taken)[4], const lanes (&sum)[3], const lanes (&size)[3]) const {
+        lanes slab[8];
+        turn(taken, slabs, slab);
+        const lanes along = way[0] * slab[0] + way[1] * slab[1] + way[2] * slab[2];
+        lanes top = along * (along > 0.0f ? slab[4] : slab[3]) * (2.0f * scale), plain = {};
+        for (int i = 0; i < 3; ++i) {
+            const lanes rest = way[i] - along * slab[i];
+            top += rest * sum[i] + __builtin_elementwise_abs(rest) * size[i];
+            plain += way[i] * sum[i] + __builtin_elementwise_abs(way[i]) * size[i];
+        }
+        return (top < plain ? top : plain) - far;
+    }
     static lanes square(const lanes& x, const lanes& reach) {
         const lanes over = __builtin_elementwise_abs(x) - reach, gap = over > 0.0f ? over : lanes{};
         return gap * gap;
@@ -61,11 +90,11 @@ struct NearBoxes {
         return (unsigned int)__builtin_bit_cast(unsigned short, __builtin_convertvector(which, flags));
     }
     // A node's eight numbers, of A's nodes in order, then of B's.
-    static void turn(const Taken (&taken)[4], lanes (&field)[8]) {
+    static void turn(const Taken (&taken)[4], wp::int64 offset, lanes (&field)[8]) {
         lanes row[8], half[8], part[8];
         for (int i = 0; i < 4; ++i) {
-            row[i] = *(const loose*)taken[i].a;
-            row[4 + i] = *(const loose*)taken[i].b;
+            row[i] = *(const loose*)(taken[i].a + offset);
+            row[4 + i] = *(const loose*)(taken[i].b + offset);
         }
         // Numbers k of the siblings of two items side by side, then of four.
         for (int i = 0; i < 4; ++i) {
@@ -99,7 +128,7 @@ struct NearBoxes {
     }
     Tested test(const Taken (&taken)[4]) const {
         lanes field[8], sum[3], size[3], bound = {}, other = {};
-        turn(taken, field);
+        turn(taken, 0, field);
         for (int i = 0; i < 3; ++i) {
             const lanes low = field[i] * scale, high = field[4 + i] * scale;
             sum[i] = high + low;
@@ -116,6 +145,11 @@ struct NearBoxes {
         }
         Tested tested;
         tested.bound = bound > other ? bound : other;
+        if (slabs != 0) {
+            const lanes top = tops(taken, sum, size), gap = -(of_a(top) + of_b(top)) - margin;
+            const lanes apart = gap > 0.0f ? gap * gap : lanes{};
+            tested.bound = tested.bound > apart ? tested.bound : apart;
+        }
         // What follows, as in `item_of`.
         const bits face_a = (bits)of_a(field[7]), face_b = (bits)of_b(field[7]);
         const bits skip_a = (bits)of_a(field[3]), skip_b = (bits)of_b(field[3]);

@@ -5,19 +5,23 @@
 #include "simd/near_faces32.h"
 #include "simd/nearest_memory.h"
 
-void open_search(wp::float32 upper, wp::int64 first, wp::int32 thread, wp::array_t<wp::float32> memory) {
+void open_search(wp::float32 upper, wp::int64 first, wp::vec_t<3, wp::float32> way, wp::int32 thread,
+                 wp::array_t<wp::float32> memory) {
 #include "simd/nearest_memory.h"
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
     h = NearestMemory::Header{};
     h.upper = upper;
     h.top = 1;
+    for (int k = 0; k < 3; ++k)
+        h.way[k] = way[k];
     m.item[0] = first;
     m.bound[0] = 0.0f;
 }
 
-template <class ModelPool, class StatePool, class PairPose, class Frame>
+template <class ModelPool, class StatePool, class PairPose, class Frame, class Slabs>
 wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairPose pose, Frame frame, wp::vec_t<4, wp::float32> spare,
+                                       Slabs slabs, bool with_slabs,
                                        wp::int32 thread, wp::array_t<wp::float32> memory) {
 #if defined(__CUDA_ARCH__)
     __trap();  // warps have a search of their own
@@ -31,8 +35,12 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
     const auto& r = pose.rotation32.data;
-    const NearBoxes boxes = NearBoxes::make(r, frame.back, frame.translation, frame.margin, frame.scale,
+    NearBoxes boxes = NearBoxes::make(r, frame.back, frame.translation, frame.margin, frame.scale,
                                             states.node_box.data, pose.node_a, pose.node_b);
+    if (with_slabs) {
+        boxes.slabs = (const char*)slabs.record.data - (const char*)states.node_box.data;
+        boxes.look(h.way);
+    }
     const float INF = __builtin_inff();
     // Apart from the memory that lists are written to.
     int top = h.top, later = h.later, waiting = h.waiting, node_tests = h.node_tests;
@@ -54,12 +62,24 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
         const N::Corners corners = N::load(models.vertex_near.data, states.face_corner.data, pose.corner_a,
                                            pose.corner_b, r, frame.translation, frame.scale, items, count);
         F::lanes size, error;
-        const F::lanes square = N::measure(corners, size);
-        error = size * FACES_ERROR + frame.error;
-        const F::lanes d = __builtin_elementwise_sqrt(square), over = d + error, under = d - error;
+        const N::Nearest nearest = N::measure(corners, size);
+        const F::lanes d = __builtin_elementwise_sqrt(nearest.square);
+        // What exceeds 48 u L matters where the distance is small.
+        error = size * (d > size * 0x1p-10f ? F::lanes{} + 48 * 0x1p-24f : F::lanes{} + 256 * 0x1p-24f) + frame.error;
+        const F::lanes over = d + error, under = d - error;
         float low[16];
+        int best = -1;
         for (int i = 0; i < count; ++i)
-            h.upper = over[i] < h.upper ? over[i] : h.upper;
+            if (over[i] < h.upper) {
+                h.upper = over[i];
+                best = i;
+            }
+        if (best >= 0 && with_slabs && d[best] > 0.0f) {
+            const float way[3] = {nearest.v.x[best] / d[best], nearest.v.y[best] / d[best], nearest.v.z[best] / d[best]};
+            boxes.look(way);
+            for (int k = 0; k < 3; ++k)
+                h.way[k] = way[k];
+        }
         __builtin_memcpy(low, &under, sizeof(low));
         set_limits();
         for (int i = 0; i < count; ++i)
