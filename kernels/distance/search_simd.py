@@ -153,9 +153,7 @@ def search_thread_kernel(
             open_search(scaled_up(nearest.distance, frame), first_item(states, pose), frame.way, thread, memory_out)
             state = wp.vec3i()
             while state[0] == 0:
-                state = search_nearest(
-                    models, states, pose, frame, spare, slabs, with_slabs, thread, memory_out
-                )
+                state = search_nearest(models, states, pose, frame, spare, slabs, with_slabs, thread, memory_out)
                 nearest = decide_open(models, states, pose, frame, tolerances, thread, nearest, memory_out)
             hits_inout.node_tests[p] += wp.int64(state[1])
             hits_inout.triangle_tests[p] += wp.int64(state[2])

@@ -39,7 +39,7 @@ COUNTER_COUNT = 4
 # Place of the search among the launches, from their end.
 SEARCH = -4
 # Pairs that make a further core worth its while, which costs some 50 us.
-PAIRS_A_CORE = 2
+PAIRS_A_CORE = 4
 
 
 def check_beyond(beyond, pair_count=None) -> np.ndarray:
@@ -140,8 +140,10 @@ class DistanceQuery(Query):
         Raises:
             ValueError: One that is negative, infinite or no number.
         """
-        self._tolerances = make_tolerances(tolerance, relative)
-        self._commands = Commands()
+        asked = make_tolerances(tolerance, relative)
+        if (asked.tolerance, asked.relative) != (self._tolerances.tolerance, self._tolerances.relative):
+            self._tolerances = asked
+            self._commands = Commands()
 
     def forget(self):
         """Let the next launch start anew, and not from the faces that the last one found. Launches only."""

@@ -39,7 +39,7 @@ struct NearBoxes {
             s.shift[i] = join(2 * back[i], 2 * there[i]);
         }
         s.wide = 2 * margin;
-        s.margin = 12 * margin;
+        s.margin = 16 * margin;  // docs/exactness.md
         s.slabs = 0;
         s.scale = scale;
         s.tree_a = (const char*)trees + 32 * (wp::int64)a;
