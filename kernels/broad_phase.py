@@ -99,7 +99,9 @@ def find_pair_kernel(
     pair_count_inout: wp.array(dtype=wp.int32),
     pairs_out: wp.array(dtype=wp.vec2i),
 ):
-    """Find the partners of each object: larger indices in its own world, and everything that is in every world.
+    """Find the partners of each object: in its own world larger indices and what is static, and all in every world.
+
+    What is static finds none in its world: it may be large, and one thread would meet all others.
 
     Args:
         shared_group: Group of the objects that are in every world, -1 if there is none.
@@ -107,13 +109,14 @@ def find_pair_kernel(
         excluded: Sorted keys i * 2^32 + j, i < j.
     """
     i = wp.tid()
-    # The root of a missing group would be -1, which means the whole tree; an object's own group always exists.
-    root = wp.bvh_get_group_root(bvh, group[i])
-    query = wp.bvh_query_aabb(bvh, lower[i], upper[i], root)
     j = wp.int32(0)
-    while wp.bvh_query_next(query, j):
-        if j > i:
-            append_pair(i, j, objects, excluded, pair_count_inout, pairs_out)
+    if objects.is_static[i] == 0:
+        # The root of a missing group would be -1, which means the whole tree; an object's own group always exists.
+        root = wp.bvh_get_group_root(bvh, group[i])
+        query = wp.bvh_query_aabb(bvh, lower[i], upper[i], root)
+        while wp.bvh_query_next(query, j):
+            if j > i or objects.is_static[j] != 0:
+                append_pair(i, j, objects, excluded, pair_count_inout, pairs_out)
     if shared_group >= 0 and group[i] != shared_group:
         root = wp.bvh_get_group_root(bvh, shared_group)
         query = wp.bvh_query_aabb(bvh, lower[i], upper[i], root)

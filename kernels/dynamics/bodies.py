@@ -6,6 +6,7 @@ A body frame has its origin at the centre of mass and its axes along the princip
 import warp as wp
 
 from warp_abtree.kernels.arrays import ObjectPool
+from warp_abtree.kernels.traversal.face_pairs import Hits
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -39,6 +40,7 @@ class Bodies:
     pseudo_velocity: wp.array(dtype=wp.vec3d)  # of the position correction [world units/s]
     pseudo_momentum: wp.array(dtype=wp.vec3d)  # its angular momentum
     bid: wp.array(dtype=wp.int64)  # highest bid of the graph coloring
+    is_whole: wp.array(dtype=wp.int32)  # entry 0: whether all contacts are known, 0 or 1; else bodies keep their state
 
 
 @wp.func
@@ -68,6 +70,23 @@ def integrate_rotation(q: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d
 
 
 @wp.kernel
+def judge_contacts_kernel(
+    launched: wp.array(dtype=wp.int32),
+    pair_count: wp.array(dtype=wp.int32),
+    pair_room: wp.int32,
+    hits: Hits,
+    # out
+    bodies_out: Bodies,
+):
+    """Find whether a query has found all contacts in the room that it had; one thread."""
+    whole = launched[0] >= 0 and wp.uint32(pair_count[0]) <= wp.uint32(pair_room)
+    whole = whole and wp.uint32(hits.total[0]) <= wp.uint32(hits.face.shape[0])
+    if hits.uncertain.shape[0] > 0:
+        whole = whole and wp.uint32(hits.uncertain_total[0]) <= wp.uint32(hits.uncertain.shape[0])
+    bodies_out.is_whole[0] = wp.where(whole, 1, 0)
+
+
+@wp.kernel
 def begin_step_kernel(
     dt: wp.float64,
     velocity_change: wp.vec3d,
@@ -78,6 +97,8 @@ def begin_step_kernel(
 ):
     """Initialise a step: gravity changes velocities; kinematic objects get those that take them to their targets."""
     i = wp.tid()
+    if bodies_inout.is_whole[0] == 0:
+        return
     bodies_inout.pseudo_velocity[i] = wp.vec3d()
     bodies_inout.pseudo_momentum[i] = wp.vec3d()
     bodies_inout.bid[i] = wp.int64(0)
@@ -105,6 +126,8 @@ def integrate_kernel(
 ):
     """Move each body by its velocity and its position correction, and pose its object."""
     i = wp.tid()
+    if bodies_inout.is_whole[0] == 0:
+        return
     if bodies_inout.motion_type[i] == KINEMATIC:
         objects_inout.rotation[i] = targets.rotation[i]
         objects_inout.position[i] = targets.position[i]

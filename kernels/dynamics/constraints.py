@@ -70,16 +70,18 @@ def make_point(manifolds: Manifolds, pair: wp.vec2i, p: wp.int32, k: wp.int32):
 
 
 @wp.func
-def relative_velocity(
-    velocity: wp.array(dtype=wp.vec3d),
-    momentum: wp.array(dtype=wp.vec3d),
-    constraints: Constraints,
-    bodies: Bodies,
-    c: Point,
-):
-    """Return the velocity, or pseudo-velocity, of the second object relative to the first at a point."""
-    at_a = velocity[c.a] + wp.cross(bodies.inverse_inertia[c.a] * momentum[c.a], constraints.arm_a[c.pair, c.column])
-    at_b = velocity[c.b] + wp.cross(bodies.inverse_inertia[c.b] * momentum[c.b], constraints.arm_b[c.pair, c.column])
+def point_velocity(inverse_inertia: wp.mat33d, velocity: wp.vec3d, momentum: wp.vec3d, arm: wp.vec3d):
+    """Return the velocity of a body at the end of an arm from its centre of mass."""
+    return velocity + wp.cross(inverse_inertia * momentum, arm)
+
+
+@wp.func
+def relative_velocity(constraints: Constraints, bodies: Bodies, c: Point):
+    """Return the velocity of the second object relative to the first at a point."""
+    arm_a = constraints.arm_a[c.pair, c.column]
+    arm_b = constraints.arm_b[c.pair, c.column]
+    at_a = point_velocity(bodies.inverse_inertia[c.a], bodies.velocity[c.a], bodies.momentum[c.a], arm_a)
+    at_b = point_velocity(bodies.inverse_inertia[c.b], bodies.velocity[c.b], bodies.momentum[c.b], arm_b)
     return at_b - at_a
 
 
@@ -160,7 +162,7 @@ def prepare_constraints_kernel(
         constraints_out.impulse[p, k] = wp.float64(0.0)
         constraints_out.friction_impulse[p, k] = wp.vec3d()
         constraints_out.pseudo_impulse[p, k] = wp.float64(0.0)
-        velocity = relative_velocity(bodies.velocity, bodies.momentum, constraints_out, bodies, c)
+        velocity = relative_velocity(constraints_out, bodies, c)
         if known and wp.abs(wp.dot(c.normal, velocity)) <= fast:
             local = wp.transpose(objects.rotation[a]) * (x - objects.position[a])
             match = find_match(warm_start, row, MATCH_RADIUS * radius, local, used)
@@ -179,11 +181,14 @@ def save_impulses_kernel(
     objects: ObjectPool,
     manifolds: Manifolds,
     constraints: Constraints,
+    bodies: Bodies,
     # out
     warm_start_out: WarmStart,
 ):
     """Save the impulses of one pair a thread for the next step, with points relative to the first object."""
     p = wp.tid()
+    if bodies.is_whole[0] == 0:
+        return
     warm_start_out.key[p] = key[p]
     warm_start_out.count[p] = manifolds.count[p]
     a = pairs[p][0]

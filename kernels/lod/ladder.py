@@ -1,6 +1,8 @@
-"""LOD ladders and objects of a scene, as selection kernels read them."""
+"""LOD ladders and objects of a scene, as selection kernels read them, and sums over all threads of a launch."""
 
 import warp as wp
+
+from warp_abtree.kernels import native
 
 
 @wp.struct
@@ -18,6 +20,16 @@ class LodPool:
     faces: wp.array(dtype=wp.int32)  # [level] active faces
     entry: wp.array(dtype=wp.int32)  # [level] where the LOD starts in its model's split_face
     face_count: wp.array(dtype=wp.int32)  # [model] faces of the finest LOD
+    refits: wp.array(dtype=wp.int32)  # [model] 1 if a change of LOD refits a tree, 0 if each level has a tree state
     tolerance_level: wp.array(dtype=wp.int32)  # [model * tolerance_count + tolerance] coarsest level within it
     level_count: wp.int32  # levels of each ladder
     tolerance_count: wp.int32  # tolerances of the scale
+
+
+WARP = 32
+"""Threads of a launch that adds lanes are a multiple of it."""
+
+
+@wp.func_native(native.body("warp_vote.cuh", "add_lanes"))
+def add_lanes(totals: wp.array(dtype=wp.int64), i: wp.int32, x: wp.int64):
+    """Add to a total what each lane of a warp brings; all lanes call it together, with the same i."""

@@ -2,18 +2,18 @@
 
 The tolerance scale has a tolerance for every DITHER positions, 0 the coarsest. A candidate is a change of the position;
 candidates are ordered from the finest to the coarsest, `stay` (no change) among them, and the last, `held`, leaves
-every object at its level whatever the view. Every kernel is linear in the number of objects.
+every object at its level whatever the view. Sums are of whole numbers, so that they have no order.
 """
 
 import warp as wp
 
-from warp_abtree.kernels.lod.ladder import LodPool
+from warp_abtree.kernels.lod.ladder import LodPool, add_lanes
 from warp_abtree.kernels.lod.tolerance import loosening
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-CHUNKS = wp.constant(256)
-"""Threads that share the objects of one candidate: sums have one order on every device."""
+WORK_MOST = wp.constant(wp.float64(2.0**40))
+"""Tests of one object, at most: sums of up to 2^22 objects are exact, so that they have no order."""
 
 DITHER = wp.constant(4)
 """Positions a tolerance: objects of one level move to the next in so many groups."""
@@ -26,11 +26,10 @@ GOLDEN = wp.constant(wp.uint32(2654435761))
 
 RATE_FIXED = wp.constant(0)
 RATE_WORK = wp.constant(1)
-RATE_CHANGE = wp.constant(2)
-RATE_NODE = wp.constant(3)
-RATE_UP = wp.constant(4)
-RATE_DOWN = wp.constant(5)
-"""Entries of `Prediction.rate`: ms of a frame, a unit of work, a change of any LOD, a node refitted; two exponents."""
+RATE_NODE = wp.constant(2)
+RATE_UP = wp.constant(3)
+RATE_DOWN = wp.constant(4)
+"""Entries of `Prediction.rate`: ms of a frame, a unit of work, a node refitted; two exponents."""
 
 
 @wp.struct
@@ -38,15 +37,11 @@ class Prediction:
     """What each candidate would cost."""
 
     change: wp.array(dtype=wp.int32)  # [candidate] change of the position
-    rate: wp.array(dtype=wp.float64)  # [6] see the RATE constants
+    rate: wp.array(dtype=wp.float64)  # [5] see the RATE constants
     power_up: wp.array(dtype=wp.float64)  # [level] faces to the exponent with which tests grow
     power_down: wp.array(dtype=wp.float64)  # [level] faces to the exponent with which tests fall
-    chunk_work: wp.array(dtype=wp.float64)  # [candidate * CHUNKS + chunk] tests
-    chunk_moved: wp.array(dtype=wp.int32)  # [candidate * CHUNKS + chunk] objects that change level
-    used: wp.array(dtype=wp.int32)  # [(candidate * models + model) * level_count + level] 1 if an object stands there
-    work: wp.array(dtype=wp.float64)  # [candidate] tests
-    moved: wp.array(dtype=wp.int32)  # [candidate] objects that change level
-    nodes: wp.array(dtype=wp.float64)  # [candidate] nodes refitted
+    work: wp.array(dtype=wp.int64)  # [candidate] tests of all objects, each pair's counted for both of its objects
+    nodes: wp.array(dtype=wp.int64)  # [candidate] nodes refitted
 
 
 @wp.func
@@ -58,86 +53,30 @@ def level_at(lods: LodPool, i: wp.int32, position: wp.int32, offset: wp.int32):
 
 
 @wp.kernel
-def update_offset_kernel(
-    loosest: wp.float64, lods: LodPool, focus: wp.array(dtype=wp.float64), offset_inout: wp.array(dtype=wp.int32)
+def begin_prediction_kernel(
+    loosest: wp.float64,
+    lods: LodPool,
+    focus: wp.array(dtype=wp.float64),
+    prediction_inout: Prediction,
+    offset_inout: wp.array(dtype=wp.int32),
 ):
-    """Convert the loosening of an object to positions, rounded down.
+    """Convert the loosening of each object to positions, rounded down; raise the faces of each level to both exponents.
 
     Hysteresis: the offset follows only beyond a tolerance, so that an object between two levels does not flicker.
     """
     i = wp.tid()
-    octaves = wp.log2(loosening(focus[i], lods.importance[i], loosest))
-    offset = wp.int32(wp.floor(octaves * wp.float64(POSITIONS_PER_OCTAVE)))
-    if offset < offset_inout[i] or offset > offset_inout[i] + DITHER:
-        offset_inout[i] = offset
-
-
-@wp.kernel
-def raise_faces_kernel(lods: LodPool, prediction: Prediction):
-    """Raise the faces of every level to the two exponents."""
-    k = wp.tid()
-    faces = wp.float64(wp.max(lods.faces[k], 1))
-    prediction.power_up[k] = wp.pow(faces, prediction.rate[RATE_UP])
-    prediction.power_down[k] = wp.pow(faces, prediction.rate[RATE_DOWN])
-
-
-@wp.kernel
-def predict_work_kernel(
-    # static
-    model_count: wp.int32,
-    lods: LodPool,
-    # state
-    scale: wp.array(dtype=wp.int32),
-    offset: wp.array(dtype=wp.int32),
-    level: wp.array(dtype=wp.int32),
-    work: wp.array(dtype=wp.float64),
-    # out
-    prediction: Prediction,
-):
-    """Predict the tests of every object for every candidate; one thread a candidate and chunk of the objects.
-
-    Args:
-        level: Of each object now. work: Tests of the last frame, each pair's shared by its two objects.
-    """
-    k, chunk = wp.tid()
-    n = lods.object_model.shape[0]
-    held = prediction.change.shape[0] - 1
-    total = wp.float64(0.0)
-    moved = wp.int32(0)
-    i = chunk
-    while i < n:
-        model = lods.object_model[i]
-        now = level[i]
-        then = now
-        if k < held:
-            then = level_at(lods, i, scale[0] + prediction.change[k], offset[i])
-        prediction.used[(k * model_count + model) * lods.level_count + then] = 1
-        a = model * lods.level_count + now
-        b = model * lods.level_count + then
-        share = work[i]
-        if then != now:
-            moved += 1
-            if lods.faces[b] > lods.faces[a]:
-                share = share * prediction.power_up[b] / prediction.power_up[a]
-            else:
-                share = share * prediction.power_down[b] / prediction.power_down[a]
-        total += share
-        i += CHUNKS
-    prediction.chunk_work[k * CHUNKS + chunk] = total
-    prediction.chunk_moved[k * CHUNKS + chunk] = moved
-
-
-@wp.kernel
-def sum_chunk_kernel(prediction: Prediction):
-    """Sum the chunks of one candidate, in order."""
-    k = wp.tid()
-    work = wp.float64(0.0)
-    moved = wp.int32(0)
-    for chunk in range(CHUNKS):
-        work += prediction.chunk_work[k * CHUNKS + chunk]
-        moved += prediction.chunk_moved[k * CHUNKS + chunk]
-    prediction.work[k] = work
-    prediction.moved[k] = moved
+    if i < prediction_inout.work.shape[0]:
+        prediction_inout.work[i] = wp.int64(0)
+        prediction_inout.nodes[i] = wp.int64(0)
+    if i < prediction_inout.power_up.shape[0]:
+        faces = wp.float64(wp.max(lods.faces[i], 1))
+        prediction_inout.power_up[i] = wp.pow(faces, prediction_inout.rate[RATE_UP])
+        prediction_inout.power_down[i] = wp.pow(faces, prediction_inout.rate[RATE_DOWN])
+    if i < offset_inout.shape[0]:
+        octaves = wp.log2(loosening(focus[i], lods.importance[i], loosest))
+        offset = wp.int32(wp.floor(octaves * wp.float64(POSITIONS_PER_OCTAVE)))
+        if offset < offset_inout[i] or offset > offset_inout[i] + DITHER:
+            offset_inout[i] = offset
 
 
 @wp.func
@@ -154,41 +93,71 @@ def predict_nodes(entries: wp.int32, faces: wp.int32, full_share: wp.float64):
 
 
 @wp.kernel
-def predict_refit_kernel(model_count: wp.int32, full_share: wp.float64, lods: LodPool, prediction: Prediction):
-    """Predict the nodes of one model that a candidate refits.
+def predict_kernel(
+    # static
+    chunks: wp.int32,
+    full_share: wp.float64,
+    lods: LodPool,
+    # state
+    scale: wp.array(dtype=wp.int32),
+    offset: wp.array(dtype=wp.int32),
+    level: wp.array(dtype=wp.int32),
+    tests: wp.array(dtype=wp.int64),
+    # out
+    prediction: Prediction,
+):
+    """Predict the tests and refits of every object for every candidate; one thread a candidate and chunk of objects.
 
-    A level without a tree state is reached from the nearest level with one.
+    Args:
+        chunks: Chunks that share the objects, a multiple of WARP.
+        level: Of each object now. tests: Of each object in the last frame.
     """
-    k, model = wp.tid()
+    k, chunk = wp.tid()
+    n = lods.object_model.shape[0]
     held = prediction.change.shape[0] - 1
-    first = model * lods.level_count
-    wanted = (k * model_count + model) * lods.level_count
-    present = (held * model_count + model) * lods.level_count
-    total = wp.float64(0.0)
-    for r in range(lods.level_count):
-        if prediction.used[wanted + r] == 0 or prediction.used[present + r] != 0:
-            continue
-        nearest = wp.int32(2147483647)
-        for s in range(lods.level_count):
-            if prediction.used[present + s] != 0:
-                nearest = wp.min(nearest, wp.abs(lods.entry[first + r] - lods.entry[first + s]))
-        total += predict_nodes(nearest, lods.face_count[model], full_share)
-    wp.atomic_add(prediction.nodes, k, wp.floor(total))
+    position = scale[0] + prediction.change[k]
+    total = wp.int64(0)
+    nodes = wp.int64(0)
+    i = chunk
+    while i < n:
+        model = lods.object_model[i]
+        a = model * lods.level_count + level[i]
+        b = a
+        if k < held:
+            b = model * lods.level_count + level_at(lods, i, position, offset[i])
+        found = tests[i]
+        if a != b and found > wp.int64(0):
+            share = wp.float64(found)
+            if lods.faces[b] > lods.faces[a]:
+                share = share * prediction.power_up[b] / prediction.power_up[a]
+            else:
+                share = share * prediction.power_down[b] / prediction.power_down[a]
+            found = wp.int64(wp.min(share, WORK_MOST) + wp.float64(0.5))
+        total += found
+        if a != b and lods.refits[model] != 0 and lods.entry[a] != lods.entry[b]:
+            entries = wp.abs(lods.entry[b] - lods.entry[a])
+            nodes += wp.int64(predict_nodes(entries, lods.face_count[model], full_share))
+        i += chunks
+    add_lanes(prediction.work, k, total)
+    add_lanes(prediction.nodes, k, nodes)
+
+
+@wp.func
+def work_of(prediction: Prediction, k: wp.int32):
+    """Return the tests of a candidate, each pair's once."""
+    return wp.float64(prediction.work[k]) * wp.float64(0.5)
 
 
 @wp.func
 def steady_cost(prediction: Prediction, k: wp.int32):
     """Return the time that a candidate takes in every frame [ms]."""
-    return prediction.rate[RATE_FIXED] + prediction.rate[RATE_WORK] * prediction.work[k]
+    return prediction.rate[RATE_FIXED] + prediction.rate[RATE_WORK] * work_of(prediction, k)
 
 
 @wp.func
 def transition_cost(prediction: Prediction, k: wp.int32):
     """Return the time that a candidate takes in its first frame alone [ms]."""
-    cost = prediction.rate[RATE_NODE] * prediction.nodes[k]
-    if prediction.moved[k] > 0:
-        cost += prediction.rate[RATE_CHANGE]
-    return cost
+    return prediction.rate[RATE_NODE] * wp.float64(prediction.nodes[k])
 
 
 @wp.func
@@ -264,8 +233,8 @@ def choose_position_kernel(
     choice_out[0] = wp.float64(chosen)
     choice_out[1] = steady_cost(prediction, chosen)
     choice_out[2] = transition_cost(prediction, chosen)
-    choice_out[3] = prediction.work[chosen]
-    choice_out[4] = prediction.work[held]
+    choice_out[3] = work_of(prediction, chosen)
+    choice_out[4] = work_of(prediction, held)
 
 
 @wp.kernel

@@ -105,3 +105,15 @@ inline CUDA_CALLABLE void count_flags(wp::array_t<wp::int64> totals, wp::int32 i
         totals.data[i] += 1;
 #endif
 }
+
+inline CUDA_CALLABLE void add_lanes(wp::array_t<wp::int64> totals, wp::int32 i, wp::int64 x) {
+#if defined(__CUDA_ARCH__)
+    long long sum = x;
+    for (int step = 16; step > 0; step >>= 1)
+        sum += __shfl_down_sync(0xffffffffu, sum, step);
+    if ((threadIdx.x & 31) == 0 && sum != 0)
+        atomicAdd((unsigned long long*)totals.data + i, (unsigned long long)sum);
+#else
+    totals.data[i] += x;
+#endif
+}

@@ -5,6 +5,7 @@ Source: Garland and Heckbert, "Surface simplification using quadric error metric
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.progressive.heap import (
     Heap,
     heap_drop_top,
@@ -73,6 +74,11 @@ class Placement:
 
     pos: wp.vec3d  # normalised
     cost: wp.float64  # quadric error there
+
+
+@wp.func_native(native.body("fetch_edges.h", "fetch_edges"))
+def fetch_edges(surface: Surface, rings: Rings, heap: Heap, size: wp.int32):
+    """Bring what the next merges will read into the caches of this core."""
 
 
 @wp.func
@@ -317,6 +323,7 @@ def collapse_edges_kernel(
                 status = int(HEAP_FULL)
             else:
                 size = heap_drop_top(heap_inout, size)
+                fetch_edges(surface_inout, rings_inout, heap_inout, size)
                 dying = count_dying(rings_inout, a, b)
                 # never merge away the last faces of the model
                 if dying < live:

@@ -24,6 +24,8 @@ from warp_abtree.kernels.progressive.triangle_cover import (
     cover_distance_sq,
     cover_ring,
     cover_triangle,
+    fetch_merge,
+    place_face,
 )
 from warp_abtree.kernels.progressive.vertex_forest import (
     absorb_ring,
@@ -44,19 +46,6 @@ QUEUED = wp.constant(4)  # triangles covered again at the last merge
 INDEXED = wp.constant(5)  # active faces when the Bvh was built; 0: not yet; -1: the next merge needs a new one
 
 SEARCH_REACH = wp.constant(wp.float64(2.0**-10))
-
-
-@wp.func
-def set_face(replay: Replay, f: int):
-    """Take an active face's corners from the forest."""
-    a = replay.pos[replay.rings.corner_node[3 * f]]
-    b = replay.pos[replay.rings.corner_node[3 * f + 1]]
-    c = replay.pos[replay.rings.corner_node[3 * f + 2]]
-    replay.face_pos[f, 0] = a
-    replay.face_pos[f, 1] = b
-    replay.face_pos[f, 2] = c
-    replay.face_box[f, 0] = wp.min(a, wp.min(b, c))
-    replay.face_box[f, 1] = wp.max(a, wp.max(b, c))
 
 
 @wp.func
@@ -124,6 +113,7 @@ def search_all(replay: Replay, limit: wp.float64):
         while bound > limit and wp.bvh_query_next(query, i):
             f = replay.bvh_face[i]
             if replay.rings.corner_node[3 * f] >= 0:
+                place_face(replay, f)
                 distance = cover_distance_sq(replay, 3, f, bound)
                 if distance < bound:
                     best = f
@@ -193,15 +183,16 @@ def start_replay_kernel(
     """Register every original triangle with itself (serial, dim=1).
 
     Args:
-        replay_inout: `face_slot`, `slot` and the stamps must hold -1.
+        replay_inout: `face_slot` and `face_stamp` must hold -1.
     """
     live = int(0)
     for f in range(face_count):
         for k in range(3):
             replay_inout.triangle_pos[f, k] = replay_inout.pos[face_vertex[f, k]]
         if replay_inout.rings.corner_node[3 * f] >= 0:
-            set_face(replay_inout, f)
             replay_inout.slot[f, SLOT_TRIANGLE] = f
+            replay_inout.slot[f, SLOT_SIBLING] = -1
+            replay_inout.slot[f, SLOT_STAMP] = -1
             register_slot(replay_inout, f, f)
             live += 1
     replay_inout.counter[LIVE_FACES] = live
@@ -211,7 +202,7 @@ def start_replay_kernel(
     replay_inout.counter[FREE_SLOTS] = pooled
 
 
-@wp.func
+@wp.func(inline=False)
 def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: int, limit: wp.float64):
     """Cover triangle t again, with faces around the merge and its other faces; return its squared bound."""
     for k in range(3):
@@ -221,11 +212,15 @@ def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: in
     replay.scratch.used[0] = first
     used = int(0)
     if replay.rings.corner_node[3 * first] >= 0:
+        place_face(replay, first)
         if cover_distance_sq(replay, 3, first, limit) <= limit:
             used = int(1)
     if used == 0:
         own = replay.counter[STAMP] + 1
         replay.counter[STAMP] = own
+        for i in range(near_count):
+            place_face(replay, replay.scratch.near[i])
+            replay.face_stamp[replay.scratch.near[i]] = shared
         slot = t
         while slot >= 0:
             f = replay.slot[slot, SLOT_FACE]
@@ -282,14 +277,16 @@ def cover_queue(
 
 
 @wp.func
-def move_faces(replay: Replay, a: int, b: int, c: int):
-    """Merge nodes a and b into c in the forest, and give the faces about c their corners."""
-    tail = absorb_ring(replay.rings, a, a, b, c, -1)
-    tail = absorb_ring(replay.rings, b, a, b, c, tail)
-    k = replay.rings.head[c]
+def merge_rings(replay: Replay, merge: wp.vec3i, near_count: int):
+    """Merge two nodes in the forest, and make the faces about the node that they make candidates; their new count."""
+    tail = absorb_ring(replay.rings, merge[0], merge[0], merge[1], merge[2], -1)
+    tail = absorb_ring(replay.rings, merge[1], merge[0], merge[1], merge[2], tail)
+    k = replay.rings.head[merge[2]]
     while k >= 0:
-        set_face(replay, k // 3)
+        replay.scratch.near[near_count] = k // 3
+        near_count += 1
         k = replay.rings.next[k]
+    return near_count
 
 
 @wp.func
@@ -303,9 +300,9 @@ def replay_merge(replay: Replay, covers: Covers, a: int, b: int, c: int, limit: 
     near_count = int(0)
     if replay.rings.degree[a] + replay.rings.degree[b] == 2 * dying:
         near_count = third_rings(replay, a, b, stamp)
-    move_faces(replay, a, b, c)
-    near_count = add_ring(replay, near_count, stamp, stamp, c)
-    limit = cover_queue(replay, covers, wp.vec3i(a, b, c), queued, near_count, stamp, limit)
+    merge = wp.vec3i(a, b, c)
+    near_count = merge_rings(replay, merge, near_count)
+    limit = cover_queue(replay, covers, merge, queued, near_count, stamp, limit)
     replay.counter[LIVE_FACES] = replay.counter[LIVE_FACES] - dying
     replay.counter[QUEUED] = queued
     return limit
@@ -345,6 +342,7 @@ def replay_merges_kernel(
             replay_inout.counter[INDEXED] = -1
             break
         c = vertex_count + j
+        fetch_merge(replay_inout, merge_pair, merge_count, j)
         limit = replay_merge(replay_inout, covers_inout, a, b, c, limit)
         covers += replay_inout.counter[QUEUED] + 1
         bound_sq_out[j] = limit

@@ -10,6 +10,8 @@ The order (key, edge) is total, so the merge sequence depends neither on the hea
 
 import warp as wp
 
+from warp_abtree.kernels import native
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -53,12 +55,18 @@ def heap_before(key_a: wp.float64, pair_a: wp.int64, key_b: wp.float64, pair_b: 
     return key_a < key_b or (key_a == key_b and pair_a < pair_b)
 
 
+@wp.func_native(native.body("fetch_edges.h", "fetch_entries"))
+def fetch_entries(heap: Heap, child: wp.int32):
+    """Bring the children of four entries into the caches of this core."""
+
+
 @wp.func
 def sift_down(heap: Heap, size: int, start: int, key: wp.float64, pair: wp.int64):
     """Put (key, pair) into the hole at `start`, whose subtrees are heaps."""
     hole = start
     child = 4 * hole + 1
     while child < size:
+        fetch_entries(heap, child)
         best = child
         best_key = heap.key[child]
         best_pair = heap.pair[child]

@@ -29,9 +29,9 @@ SLOTS = wp.constant(32)  # faces that cover a triangle, at most
 
 # Entries of a slot, which lie side by side in memory.
 SLOT_FACE = wp.constant(native.constant("SLOT_FACE"))  # the face that its triangle is registered with
-SLOT_TRIANGLE = wp.constant(1)
+SLOT_TRIANGLE = wp.constant(native.constant("SLOT_TRIANGLE"))
 SLOT_SIBLING = wp.constant(native.constant("SLOT_SIBLING"))  # next slot of the same triangle, or -1
-SLOT_NEXT = wp.constant(3)  # doubly linked list of each face's slots
+SLOT_NEXT = wp.constant(native.constant("SLOT_NEXT"))  # doubly linked list of each face's slots
 SLOT_LAST = wp.constant(4)  # the other direction
 SLOT_STAMP = wp.constant(5)  # last merge that queued the triangle; of a triangle's own slot
 SLOT_FIELDS = wp.constant(native.constant("SLOT_FIELDS"))
@@ -58,8 +58,8 @@ class Replay:
     scratch: Scratch  # of the current triangle
     pos: wp.array(dtype=wp.vec3d)  # [node_count], normalised
     triangle_pos: wp.array2d(dtype=wp.vec3d)  # [face_count, 3], original triangles
-    face_pos: wp.array2d(dtype=wp.vec3d)  # [face_count, 3], current corners of active faces
-    face_box: wp.array2d(dtype=wp.vec3d)  # [face_count, 2], lower and upper corner of the box of each
+    face_pos: wp.array2d(dtype=wp.vec3d)  # [face_count, 3], corners of candidates
+    face_box: wp.array2d(dtype=wp.vec3d)  # [face_count, 2], lower and upper corner of the box of each candidate
     bvh: wp.uint64  # wp.Bvh over the boxes of bvh_face; 0 until a component vanishes
     bvh_face: wp.array(dtype=int)  # [any], faces that were active when the Bvh was built
     slot: wp.array2d(dtype=int)  # [slot_count, SLOT_FIELDS]; those from face_count on are pooled
@@ -104,6 +104,24 @@ def cover_ring(
 
     Returns where it stopped: `end`, or a triangle that only `cover_triangle` can cover, as other faces may be nearer.
     """
+
+
+@wp.func_native(native.body("covers/fetch_merge.h", "fetch_merge"))
+def fetch_merge(replay: Replay, merge_pair: wp.array2d(dtype=int), merge_count: wp.int32, j: wp.int32):
+    """Bring what the merges after merge j will read into the caches of this core."""
+
+
+@wp.func
+def place_face(replay: Replay, f: int):
+    """Take an active face's corners from the forest: of candidates of one face at a time alone."""
+    a = replay.pos[replay.rings.corner_node[3 * f]]
+    b = replay.pos[replay.rings.corner_node[3 * f + 1]]
+    c = replay.pos[replay.rings.corner_node[3 * f + 2]]
+    replay.face_pos[f, 0] = a
+    replay.face_pos[f, 1] = b
+    replay.face_pos[f, 2] = c
+    replay.face_box[f, 0] = wp.min(a, wp.min(b, c))
+    replay.face_box[f, 1] = wp.max(a, wp.max(b, c))
 
 
 @wp.func(inline=False)
@@ -158,6 +176,7 @@ def add_near(replay: Replay, near_count: int, shared: int, own: int, f: int):
     """Make face f a candidate unless it is one: `own` stamps those of this triangle, `shared` those of the merge."""
     if replay.face_stamp[f] == shared or replay.face_stamp[f] == own:
         return near_count
+    place_face(replay, f)
     replay.face_stamp[f] = own
     replay.scratch.near[near_count] = f
     return near_count + 1

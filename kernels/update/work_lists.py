@@ -6,7 +6,7 @@ are none left.
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import LEVEL_MAX, ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.arrays import LEVEL_MAX, ModelPool, StatePool
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -176,27 +176,3 @@ def plan_update_kernel(
         list_block(plan_inout, s, begin, length)
     else:
         list_partial(plan_inout, s, begin, length)
-
-
-@wp.kernel
-def pick_state_kernel(
-    states: StatePool,
-    lod_start: wp.array(dtype=wp.int32),
-    wanted: wp.array(dtype=wp.int32),
-    objects_inout: ObjectPool,
-    faults_inout: wp.array(dtype=wp.int32),
-):
-    """Point each object at the coarsest state of its model that is not coarser than the wanted LOD.
-
-    Args:
-        lod_start: Where the states of each model begin, by rising LOD, shape [model + 1].
-        wanted: LOD of each object; one out of range is a fault and served by the nearer end.
-        faults_inout: As `note_fault`, by object.
-    """
-    i = wp.tid()
-    model = states.model[objects_inout.state[i]]
-    # The last one where all are coarser.
-    slot = wp.lower_bound(states.lod, lod_start[model], lod_start[model + 1], wanted[i])
-    if wanted[i] < 0 or wanted[i] > states.lod[slot]:
-        note_fault(faults_inout, i)
-    objects_inout.state[i] = slot

@@ -206,7 +206,7 @@ def test_controllers_of_a_file(tmp_path):
 def test_near_objects_refine(tmp_path, device):
     """With counted work in the place of time: at one budget, errors rise with the distance from the camera."""
     loaded = load_ours("focus", device, [("size = [10, 5, 0]", "size = [2, 2, 0]")], objects=80)
-    finest = loaded.frame(controller="none", clock=WorkClock(RATES)).run(1)[0].cost_ms
+    finest = loaded.frame(controller="none", clock=WorkClock(RATES)).run(1)[0].total_ms
     frame = loaded.frame(budget_ms=finest / 3, clock=WorkClock(RATES))
     frame.run(90)
     time = frame.history[-1].time

@@ -58,8 +58,8 @@ def g_printed(cases, i, importance):
 
 
 def stages(cost):
-    """Return stages that cost so much; movement is not among them."""
-    return {"select_ms": 0.25, "refine_ms": 0.5, "move_ms": 100.0, "broad_ms": 0.25, "query_ms": cost - 1.0}
+    """Return stages that cost so much together."""
+    return {"select_ms": 0.25, "refine_ms": 0.125, "move_ms": 0.125, "query_ms": cost - 1.0, "answer_ms": 0.5}
 
 
 def run_paper(scene, costs, start=0.0, focus=None, **options):
@@ -203,8 +203,8 @@ def test_selection_runs_in_a_captured_graph(device, kind):
             captured.cost.fill_(cost)
         if kind is PredictiveController:
             for controller in (plain, captured):
-                controller.rate.assign([1.0, [1e-4, 1.0][frame == 4], 0.0, 0.0, 1.0, 0.5])
-                controller.work.fill_(10.0)
+                controller.rate.assign([1.0, [1e-4, 1.0][frame == 4], 0.0, 1.0, 0.5])
+                controller.tests.fill_(10)
         lods = plain.next_lods(Feedback(frame, stages(cost))).numpy().copy()
         wp.capture_launch(capture.graph)
         assert np.array_equal(captured.lods.numpy(), lods), frame

@@ -3,15 +3,15 @@
 import pytest
 
 from warp_abtree.simulate.budget_report import budget_report
-from warp_abtree.simulate.frame import FrameRow
+from warp_abtree.simulate.frame_row import FrameRow
 
 
 def make_rows(costs, budget=10.0, step=0.5):
     rows = []
     for i, cost in enumerate(costs):
-        values = dict.fromkeys(FrameRow.names()[:-2], 0)
+        values = dict.fromkeys(FrameRow.names()[:-1], 0)
         values |= {"frame": i, "time": i * step, "objects": 4, "oscillations": i % 2, "error_mean": float(i)}
-        rows.append(FrameRow(**{**values, "budget_ms": budget, "query_ms": cost, "move_ms": 99.0}))
+        rows.append(FrameRow(**{**values, "budget_ms": budget, "query_ms": cost - 1.5, "answer_ms": 1.5}))
     return rows
 
 

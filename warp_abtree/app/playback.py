@@ -3,15 +3,15 @@
 A playback owns its scene: one thread steps, queries and changes it.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import warp as wp
 
 from warp_abtree.app.render_data import Snapshot
 from warp_abtree.app.toml.control import CONTROLLERS, LodControl
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.frame import Frame, LodSweep
+from warp_abtree.simulate.frame import Frame
+from warp_abtree.simulate.lod_request import LodSweep
 
 SWEEP_PERIOD = 8.0  # seconds from the finest LOD of a mesh to its base and back
 OWN, HOLD = "scene", "hold"  # LODs as the scene chooses them, and as they are
@@ -23,26 +23,6 @@ class MeshView(NamedTuple):
     eye: tuple[float, float, float] = (0.4, 0.35, 1.0)
     up: tuple[float, float, float] = (0.0, 1.0, 0.0)
     world: int = 0
-
-
-class _Chooser:
-    """Chooses LODs for a `Frame`: by a controller or a function of time, or not at all."""
-
-    def __init__(self, playback):
-        self.playback = playback
-        self.inner: Any = None
-
-    @property
-    def budget_ms(self):
-        return getattr(self.inner, "budget_ms", None)
-
-    def next_lods(self, feedback):
-        playback, inner = self.playback, self.inner
-        if hasattr(inner, "next_lods"):
-            playback.chosen = inner.next_lods(feedback).numpy().copy()
-        elif inner is not None:
-            playback.chosen = np.array(inner(feedback.time), np.int32)
-        return wp.array(playback.chosen, dtype=wp.int32, device="cpu")
 
 
 class Playback:
@@ -59,7 +39,6 @@ class Playback:
         self.scene, self.title, self.worlds = scene, title, np.asarray(worlds)
         self.time_step, self.view = time_step, view
         self.camera, self.control = camera, control or LodControl()
-        self._chooser = _Chooser(self)
         self._mode, self._budget = OWN, None
         self.restart()
 
@@ -76,7 +55,6 @@ class Playback:
         self._frame, self._bodies, self._own = self._begin()
         self.number, self.chosen, self._first = 0, self.scene.lods, self.scene.lods
         self._poses = self._poses_now()
-        self._frame.lods = self._chooser
         self.choose(self._mode, self._budget)
 
     @property
@@ -107,7 +85,8 @@ class Playback:
         else:
             name = self.control.controller if mode == OWN else mode
             inner = self.control.asked(name, budget_ms).make(self.scene, self.camera)
-        self._chooser.inner, self._mode, self._budget = inner, mode, budget_ms
+        self._frame.lods = (lambda _: self.chosen) if inner is None else inner
+        self._mode, self._budget = mode, budget_ms
 
     def hold(self, lods):
         """Hold LODs of all objects, (n,), until others are chosen."""
@@ -117,7 +96,7 @@ class Playback:
     @property
     def budget_ms(self) -> float | None:
         """T that is held [ms], or None."""
-        return self._chooser.budget_ms
+        return getattr(self._frame.lods, "budget_ms", None)
 
     def query(self, output) -> Snapshot:
         """Query the scene as it is, after LODs, poses or the output changed. Waits for the device."""
@@ -137,7 +116,7 @@ class Playback:
         """
         self._frame.output = output
         result = self._frame.step()
-        row = self._frame.history[-1]
+        self.chosen, row = self.scene.lods, self._frame.history[-1]
         self.number = row.frame
         self._poses = self._poses_now()
         if self._bodies is not None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.query.result import Result
-from warp_abtree.simulate.frame import FrameRow
+from warp_abtree.simulate.frame_row import FrameRow
 
 
 @dataclass(frozen=True, eq=False)

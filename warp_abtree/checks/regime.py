@@ -21,6 +21,7 @@ class Regime:
         packs_results: Whether results are packed and sorted on the device before they are brought over; None: on CUDA.
         relax_by_color: Whether contacts of rigid bodies are relaxed by color, a thread a pair; None: on CUDA they are,
             on the CPU one thread relaxes them all.
+        captures_frames: Whether frames without a clock of their own are replays of a graph; None: on CUDA they are.
     """
 
     warps: bool | None = None
@@ -33,6 +34,7 @@ class Regime:
     block_updates: bool = True
     packs_results: bool | None = None
     relax_by_color: bool | None = None
+    captures_frames: bool | None = None
 
 
 _current = Regime()

@@ -1,8 +1,8 @@
 """Controllers of LODs: each frame they take the feedback of the last one and select the LODs of the next.
 
-All have one method, `next_lods(feedback)`, and one attribute, `budget_ms` (None without a budget). They never read a
-clock: times are part of the feedback, so that runs repeat on counted work. They allocate once; `launch` only launches,
-so that a graph can capture it.
+Before a frame `prepare(feedback)` writes a few numbers to the device; `launch()`, which only launches, so that a graph
+can capture it, selects the LODs of all objects there. `budget_ms` is T, None without a budget. Controllers never read a
+clock: times are part of the feedback, so that runs repeat on counted work. They allocate once.
 
 Source: Liu et al. 2006, section 4, and figure 4. Errata, kept here: g2 is printed with the absolute frame number and
 would explode; figure 4 counts from the start of the last climb, so that a descent mirrors it. In Case 2 the change is
@@ -18,16 +18,17 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import finite_array, positive, whole_number
+from warp_abtree.checks.upload import Upload
 from warp_abtree.kernels.lod import paper, prediction, tolerance
+from warp_abtree.kernels.lod.ladder import WARP
 from warp_abtree.lod.selection import lod_pool
-from warp_abtree.lod.timing import COST_STAGES, CostFit
+from warp_abtree.lod.timing import CostFit
 from warp_abtree.lod.view import Camera, View
-from warp_abtree.query.result import Result
 from warp_abtree.state.ladder import Ladder
 from warp_abtree.state.work_lists import full_refit_fraction
 
-TRIANGLE_WORK = 4.0
-"""Cost of a test of two triangles in tests of two boxes, about."""
+# Threads that share the objects of a candidate, at most.
+CHUNKS_MOST = 8192
 
 # Changes of the position on the tolerance scale that are candidates, finest first, in steps of 2^(1/16).
 CLIMBS = (8, 4, 2, 1)
@@ -40,23 +41,21 @@ class Feedback:
 
     Attributes:
         time: Time of the next frame [s].
-        stage_ms: Stages of the last frame by name [ms]; empty before the first. The sum of `select_ms`, `refine_ms`,
-            `broad_ms` and `query_ms` is T.
+        stage_ms: Stages of the last frame by name [ms], whose sum is T'; empty before the first.
         nodes_refitted: Nodes that the last frame refitted.
-        lods_changed: Whether it changed any LOD.
-        result: Result of its query, with the tests of every pair; None before the first.
+        tests: Tests of its query, in tests of two boxes; None before the first. Those of each object a frame brings to
+            `PredictiveController.tests` itself.
     """
 
     time: float
     stage_ms: dict = field(default_factory=dict)
     nodes_refitted: int = 0
-    lods_changed: bool = False
-    result: Result | None = None
+    tests: float | None = None
 
     @property
     def cost_ms(self) -> float:
-        """T', the time of interference detection in the last frame [ms]; NaN before the first."""
-        return sum(self.stage_ms[name] for name in COST_STAGES) if self.stage_ms else math.nan
+        """T', the time of the last frame [ms]; NaN before the first."""
+        return sum(self.stage_ms.values()) if self.stage_ms else math.nan
 
 
 class Controller:
@@ -72,15 +71,19 @@ class Controller:
         budget_ms: T [ms], None without a budget.
         view: `View` of the scene.
         lods: LODs last selected, int32 (n,) on the device.
+        tests: Tests of the last frame that each object took part in, for whoever runs frames to write; None where the
+            controller reads none.
     """
 
     budget_ms: float | None = None
+    tests: wp.array | None = None
 
     def __init__(self, scene, camera: Camera | Callable[[float], Camera] | None, window: int, ladder: Ladder):
         if not (camera is None or isinstance(camera, Camera) or callable(camera)):
             raise TypeError(f"camera is a {type(camera).__name__}, neither a Camera nor a function of time")
         self.scene, self.camera, self.ladder, self.device = scene, camera, ladder, scene.device
         self.view, self.pool = View(scene, window), lod_pool(ladder, scene)
+        self._ahead: tuple = (math.nan, None)  # a time, and the camera then
         self.lods = self._zeros(scene.object_count, wp.int32)
 
     def next_lods(self, feedback: Feedback) -> wp.array:
@@ -92,16 +95,34 @@ class Controller:
         Raises:
             RuntimeError: The scene's objects changed since the controller was made.
         """
-        self.view.check()
-        if self.camera is not None:
-            self.view.look(self.camera if isinstance(self.camera, Camera) else self.camera(feedback.time))
-            self.view.launch()
-        self._update(feedback)
+        self.prepare(feedback)
         self.launch()
         return self.lods
 
+    def prepare(self, feedback: Feedback):
+        """Bring to the device what `launch` reads of the feedback and the camera; a captured graph reads it too.
+
+        Raises:
+            RuntimeError: As `next_lods`.
+        """
+        self.view.check()
+        if self._ahead[0] != feedback.time:
+            self.look_ahead(feedback.time)
+        if self.camera is not None:
+            self.view.look(self._ahead[1])
+        self._update(feedback)
+
+    def look_ahead(self, time: float):
+        """Find the camera of the next `prepare`, as while the device works on a frame."""
+        self._ahead = time, self.camera(time) if callable(self.camera) else self.camera
+
     def launch(self):
-        """Select the LODs of a frame as `view` stands. Launches only."""
+        """Measure the view as the camera and the objects stand, and select the LODs of a frame. Launches only."""
+        if self.camera is not None:
+            self.view.launch()
+        self._select()
+
+    def _select(self):
         raise NotImplementedError
 
     def _update(self, feedback):
@@ -145,8 +166,7 @@ class PaperController(Controller):
     def _update(self, feedback):
         self.cost.fill_(feedback.cost_ms)
 
-    def launch(self):
-        """Select the LODs of a frame as `view` stands. Launches only."""
+    def _select(self):
         self._launch(paper.advance_case_kernel, 1, self.budget_ms, self.threshold, self.cost, self._case)
         inputs = self.pool, self.view.focus, self._case, self.level, self.lods
         self._launch(paper.advance_level_kernel, len(self.lods), *inputs)
@@ -179,8 +199,7 @@ class ToleranceController(Controller):
         super().__init__(scene, camera, window, Ladder(scene.models, steps, spacing))
         self.tolerance = wp.full(1, value, dtype=wp.float64, device=self.device)
 
-    def launch(self):
-        """Select the LODs of a frame as `view` stands. Launches only."""
+    def _select(self):
         inputs = self.loosest, self.pool, self.view.focus, self.tolerance, self.lods
         self._launch(tolerance.select_tolerance_kernel, len(self.lods), *inputs)
 
@@ -201,8 +220,8 @@ class PredictiveController(Controller):
 
     The common tolerance is a position on a scale in steps of 2^(1/16). Each frame takes some finer and coarser
     positions as candidates. It predicts their tests from the last frame's tests of every object and the faces it would
-    have (tests grow as a power of the faces, with a fitted exponent), and the nodes refitted from the levels without a
-    tree state yet; with the recent rates of this machine it takes the finest position that keeps the budget
+    have (tests grow as a power of the faces, with a fitted exponent), and the nodes refitted, of models whose levels do
+    not all have tree states; with the recent rates of this machine it takes the finest position that keeps the budget
     (`choose_position_kernel`).
 
     Args:
@@ -215,8 +234,8 @@ class PredictiveController(Controller):
         loosest: Most that a tolerance is loosened.
 
     Attributes:
-        rate: See the RATE constants of `kernels.lod.prediction`, float64 (6,) on the device; NaN at first: no change.
-        work: Tests of each object in the last frame, float64 (n,) on the device.
+        rate: See the RATE constants of `kernels.lod.prediction`, float64 (5,) on the device; NaN at first: no change.
+        tests: int64 (n,) on the device.
         choice: See `choose_position_kernel`, float64 (5,) on the device.
         scale: Position, and frames that a change has been held, int32 (2,) on the device.
         offset: Positions by which each object is loosened, int32 (n,) on the device.
@@ -251,9 +270,15 @@ class PredictiveController(Controller):
         self.position_max = int(prediction.DITHER) * (self.pool.tolerance_count - 1) + loosened
         falls = [step for step in FALLS if step > -self.position_max]
         self.changes = [*CLIMBS, 0, *falls, -self.position_max, 0]
+        self._rates = Upload(5, self.device)
+        self._rates.send([math.nan] * 5)
         self.prediction = self._make_prediction()
         self.rate, count = self.prediction.rate, len(self.lods)
-        self.work, self.choice = self._zeros(count), self._zeros(5)
+        self.tests, self.choice = self._zeros(count, wp.int64), self._zeros(5)
+        # Where the host reads the choice when a launch is over.
+        self._chosen = self.choice
+        if self.device.is_cuda:
+            self._chosen = wp.zeros(5, dtype=wp.float64, device="cpu", pinned=True)
         self.scale, self.offset = self._zeros(2, wp.int32), self._zeros(count, wp.int32)
         self.level = self._zeros(count, wp.int32)
         self._query, self._refine, self._rest = CostFit(), CostFit(), CostFit()
@@ -263,48 +288,41 @@ class PredictiveController(Controller):
         candidates, levels = len(self.changes), self.ladder.lod.size
         made = prediction.Prediction()
         made.change = wp.array(np.array(self.changes, np.int32), dtype=wp.int32, device=self.device)
-        made.rate = wp.full(6, math.nan, dtype=wp.float64, device=self.device)
+        made.rate = self._rates.array
         made.power_up, made.power_down = self._zeros(levels), self._zeros(levels)
-        chunks = candidates * int(prediction.CHUNKS)
-        made.chunk_work, made.chunk_moved = self._zeros(chunks), self._zeros(chunks, wp.int32)
-        made.used = self._zeros(candidates * levels, wp.int32)
-        made.work, made.moved = self._zeros(candidates), self._zeros(candidates, wp.int32)
-        made.nodes = self._zeros(candidates)
+        made.work, made.nodes = self._zeros(candidates, wp.int64), self._zeros(candidates, wp.int64)
         return made
 
     @property
     def predicted_ms(self) -> float:
         """Predicted cost of the next frame [ms], NaN before the second. Waits for the device."""
-        choice = self.choice.numpy()
+        choice = self._read_choice()
         return float(choice[1] + choice[2])
 
+    def _read_choice(self) -> np.ndarray:
+        """Return what the last launch chose. Waits for the device."""
+        if self.device.is_cuda:
+            wp.synchronize_stream(wp.get_stream(self.device))
+        return self._chosen.numpy()
+
     def _update(self, feedback):
-        if feedback.result is None:
+        if feedback.tests is None:
             return
-        stages, result, count = feedback.stage_ms, feedback.result, self.scene.object_count
-        tests = result.node_tests + TRIANGLE_WORK * result.triangle_tests
-        work = np.zeros(count)
-        if len(result.pairs):
-            first, second = (np.bincount(result.pairs[:, side], tests, count) for side in (0, 1))
-            work = 0.5 * (first + second)
-        total = float(tests.sum())
-        self._fit_exponent(total)
-        self._query.add(total, stages["query_ms"])
-        self._rest.add(0.0, stages["select_ms"] + stages["broad_ms"])
-        if feedback.lods_changed:
-            self._refine.add(float(feedback.nodes_refitted), stages["refine_ms"])
-        per_work, fixed = self._query.line()
-        per_node, change = (0.0 if math.isnan(rate) else rate for rate in self._refine.line())
-        fixed += self._rest.line()[1]
+        stages = feedback.stage_ms
+        self._fit_exponent(feedback.tests)
+        self._query.add(feedback.tests, stages["query_ms"])
+        self._refine.add(float(feedback.nodes_refitted), stages["refine_ms"])
+        self._rest.add(0.0, feedback.cost_ms - stages["query_ms"] - stages["refine_ms"])
+        (per_work, fixed), (per_node, change) = self._query.line(), self._refine.line()
+        fixed += change + self._rest.line()[1]
         # Conservative both ways: a climb costs more than fitted, a fall saves less.
         up, down = self._exponent + 0.2, max(self._exponent - 0.2, 0.1)
         grown = math.exp(self._drift)
-        self.rate.assign(np.array([fixed, per_work * grown, change, per_node, up, down]))
-        self.work.assign(work)
+        self._rates.send((fixed, per_work * grown, per_node, up, down))
 
     def _fit_exponent(self, total):
         """Fit to the tests counted, against those predicted: the exponent if LODs changed, the drift if not."""
-        _, _, _, predicted, before = self.choice.numpy()
+        _, _, _, predicted, before = self._read_choice().tolist()
         if not (predicted > 0 and before > 0 and total > 0):
             self._drift *= 0.8
             return
@@ -317,20 +335,20 @@ class PredictiveController(Controller):
         self._drift += 0.2 * (min(max(found, -0.2), 0.2) - self._drift)
         self._drift = max(self._drift, 0.0)
 
-    def launch(self):
-        """Predict, choose and select the LODs of a frame as `view` stands. Launches only."""
+    def _select(self):
         predicted, pool, count = self.prediction, self.pool, len(self.lods)
-        candidates, models = len(self.changes), len(self.ladder.models)
-        predicted.used.zero_()
-        predicted.nodes.zero_()
-        self._launch(prediction.update_offset_kernel, count, self.loosest, pool, self.view.focus, self.offset)
-        self._launch(prediction.raise_faces_kernel, len(predicted.power_up), pool, predicted)
-        inputs = models, pool, self.scale, self.offset, self.level, self.work, predicted
-        self._launch(prediction.predict_work_kernel, (candidates, int(prediction.CHUNKS)), *inputs)
+        candidates = len(self.changes)
+        dim = max(count, candidates, len(predicted.power_up))
+        inputs = self.loosest, pool, self.view.focus, predicted, self.offset
+        self._launch(prediction.begin_prediction_kernel, dim, *inputs)
+        # On the CPU one thread works anyway.
+        chunks = min(CHUNKS_MOST, -(-count // WARP) * WARP) if self.device.is_cuda else WARP
         share = full_refit_fraction(self.device)
-        self._launch(prediction.predict_refit_kernel, (candidates, models), models, share, pool, predicted)
-        self._launch(prediction.sum_chunk_kernel, candidates, predicted)
+        now = self.scale, self.offset, self.level, self.tests
+        self._launch(prediction.predict_kernel, (candidates, chunks), chunks, share, pool, *now, predicted)
         limits = self.budget_ms, self.aim, self.low, self.hold_frames, self.position_max, len(CLIMBS)
         self._launch(prediction.choose_position_kernel, 1, *limits, predicted, self.scale, self.choice)
         place = self.scale, self.offset, self.choice, self.level, self.lods
         self._launch(prediction.set_level_kernel, count, candidates - 1, pool, *place)
+        if self.device.is_cuda:
+            wp.copy(self._chosen, self.choice)

@@ -7,6 +7,7 @@ import warp as wp
 
 from warp_abtree.kernels.lod import prediction
 from warp_abtree.kernels.lod.ladder import LodPool
+from warp_abtree.state.device_update import shares_levels
 from warp_abtree.state.ladder import Ladder
 
 TOLERANCES_PER_OCTAVE = int(prediction.POSITIONS_PER_OCTAVE) // int(prediction.DITHER)
@@ -24,6 +25,7 @@ def lod_pool(ladder: Ladder, scene) -> LodPool:
     tolerances = tolerance_scale(ladder)
     levels = np.stack([(error > tolerances[:, None]).sum(1) for error in ladder.error])
     levels[:, 0] = 0
+    shared = shares_levels(scene.object_model, ladder.levels())
     pool = LodPool()
     for name, values in (
         ("object_model", scene.object_model),
@@ -33,6 +35,7 @@ def lod_pool(ladder: Ladder, scene) -> LodPool:
         ("faces", ladder.faces),
         ("entry", ladder.entry),
         ("face_count", [model.face_count for model in ladder.models]),
+        ("refits", ~shared),
         ("tolerance_level", levels),
     ):
         dtype, real = (wp.float64, np.float64) if name == "error" else (wp.int32, np.int32)

@@ -10,9 +10,7 @@ import warp as wp
 from warp_abtree.checks.arguments import to_numpy
 
 STAGES = ("select_ms", "refine_ms", "move_ms", "broad_ms", "query_ms", "answer_ms")
-COST_STAGES = ("select_ms", "refine_ms", "broad_ms", "query_ms")
-"""Stages of T = TR + TB + TQ + TLOD (paper, section 4.2): selection, refinement with refitting, queries with their
-broad phase; movement is not among them."""
+"""Stages of a frame in their order. T is a budget for all of them: for the frame that users see."""
 
 RATES = {
     "selected": 2e-7,
@@ -61,12 +59,19 @@ class WorkClock:
         self.seconds += sum(self.rates[name] * count for name, count in work.items())
 
 
+# Marks of a frame, at most.
+MARKS_MOST = 16
+
+
 class Timer:
     """Times the stages of one frame after another [whole ns].
 
+    On CUDA and without a clock of its own it records events, which a graph may do too: what it marks there while a
+    graph is captured, a replay marks again.
+
     Args:
         device: Where the work runs.
-        clock: Seconds, read len(STAGES) + 1 times a frame; None is the host's clock, on CUDA events.
+        clock: Seconds, read when a frame begins and at every mark; None is the host's clock, on CUDA events.
 
     Attributes:
         counts_work: Whether the clock takes the counted work of each stage.
@@ -76,35 +81,57 @@ class Timer:
         self.device = device
         self.counts_work = hasattr(clock, "charge")
         self.clock: Any = perf_counter if clock is None else clock
-        self._events = None
-        if clock is None and device.is_cuda:
-            self._events = [wp.Event(device, enable_timing=True) for _ in range(len(STAGES) + 1)]
-        self._marks = []
+        self.uses_events = clock is None and device.is_cuda
+        made = MARKS_MOST if self.uses_events else 0
+        self._events = [wp.Event(device, enable_timing=True) for _ in range(made)]
+        self._stages: list[str] = []
+        self._readings: list[int] = []
 
     def begin(self):
         """Begin a frame."""
-        self._marks = []
-        self.mark()
+        self._stages, self._readings = [], []
+        self._read()
 
-    def mark(self, **work):
-        """End a stage; a clock without events is read when the device has finished. (synchronization point)"""
-        if self._events is not None:
-            wp.get_stream(self.device).record_event(self._events[len(self._marks)])
-            self._marks.append(None)
+    def mark(self, stage: str, count=dict):
+        """End a part of a stage, which may have several. (synchronization point without events)
+
+        Args:
+            count: Returns the counted work of that part by name; called for a clock that takes it.
+        """
+        if self.device.is_capturing and not self.uses_events:
             return
-        wp.synchronize_device(self.device)
+        self._stages.append(stage)
         if self.counts_work:
-            self.clock.charge(**work)
-        self._marks.append(round(1e9 * self.clock()))
+            self.clock.charge(**count())
+        self._read()
+
+    def marks(self) -> list[str]:
+        """Return the stages marked in this frame so far."""
+        return list(self._stages)
+
+    def replay(self, marks: list[str]):
+        """Take it that a graph marks these stages as it did when it was captured."""
+        if self.uses_events:
+            self._stages += marks
+
+    def _read(self):
+        if not self.uses_events:
+            wp.synchronize_device(self.device)
+            self._readings.append(round(1e9 * self.clock()))
+            return
+        wp.get_stream(self.device).record_event(self._events[len(self._stages)])
 
     def stage_ms(self) -> dict:
         """Return the stages of the frame [ms], exact to the nanosecond. (synchronization point on CUDA)"""
-        if self._events is not None:
-            pairs = zip(self._events, self._events[1:])
+        if self.uses_events:
+            pairs = zip(self._events, self._events[1 : len(self._stages) + 1])
             spans = [round(1e6 * wp.get_event_elapsed_time(begin, end)) for begin, end in pairs]
         else:
-            spans = np.diff(self._marks).tolist()
-        return {stage: span / 1e6 for stage, span in zip(STAGES, spans, strict=True)}
+            spans = np.diff(self._readings).tolist()
+        total = dict.fromkeys(STAGES, 0)
+        for stage, span in zip(self._stages, spans, strict=True):
+            total[stage] += span
+        return {stage: span / 1e6 for stage, span in total.items()}
 
 
 class CostFit:

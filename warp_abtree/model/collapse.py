@@ -11,7 +11,7 @@ import warp as wp
 from warp_abtree.kernels.progressive import collapse
 from warp_abtree.kernels.progressive.heap import Heap
 from warp_abtree.kernels.progressive.quadric import Quadric
-from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings
+from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, unwritten
 
 # Merges per launch.
 MERGES = 25_000
@@ -31,30 +31,33 @@ class Collapse:
 
     def __init__(self, vertices, faces, base_faces):
         self.frame = centre, scale = find_frame(vertices)
-        pos = (vertices - centre) / scale
-        self.vertex_count, self.base_faces = len(pos), base_faces
+        self.vertex_count, self.base_faces, self._faces = len(vertices), base_faces, faces
+        self.pos = np.empty((2 * len(vertices), 3))
+        np.divide(vertices - centre, scale, out=self.pos[: len(vertices)])
+        self._merge_pair = unwritten((len(vertices), 2), wp.vec2i)
+        self.pair = self._merge_pair.numpy()  # shares the memory
+        self._start_live = int(are_distinct(faces).sum())
+        self.goal = max(self._start_live - base_faces, 1)
+        self._state = np.zeros(4, np.int32)
+        self._merges, self._removed, self._ended, self._stopped = 0, 0, False, False
+        self._moved = threading.Condition()
+
+    def _prepare(self):
+        """Weigh the faces, and make a heap of all edges."""
+        faces, nodes = self._faces, len(self.pos)
         edges, boundary = _edges(faces)
         face_array = cpu_array(faces, int)
         self._surface = surface = collapse.Surface()
-        self.pos = np.concatenate([pos, np.zeros_like(pos)])
         surface.pos = wp.array(self.pos, dtype=wp.vec3d, device="cpu", copy=False)
-        surface.quadric = wp.zeros(2 * len(pos), dtype=Quadric, device="cpu")
-        surface.parent = filled(2 * len(pos), -1)
-        surface.stamp = filled(2 * len(pos), -1)
-        self._merge_pair = filled((len(pos), 2), 0, wp.vec2i)
-        self.pair = self._merge_pair.numpy()  # shares the memory
-        self._rings = linked_rings(faces, face_array, 2 * len(pos))
+        surface.quadric = wp.zeros(nodes, dtype=Quadric, device="cpu")
+        surface.parent, surface.stamp = filled(nodes, -1), filled(nodes, -1)
+        self._rings = linked_rings(faces, face_array, nodes)
         launch(collapse.weigh_faces_kernel, len(faces), face_array, cpu_array(boundary, wp.int8), surface)
         self._heap = _new_heap(np.resize(edges, HEAP_PER_EDGE * len(edges) + HEAP_EXTRA))
         launch(collapse.price_edges_kernel, len(edges), self._heap.pair, surface, self._heap.key)
-        self._start_live = int(are_distinct(faces).sum())
-        state = np.array([len(edges), 0, self._start_live, collapse.RUNNING], dtype=np.int32)
-        self._counter = cpu_array(state, int)
+        self._counter = cpu_array([len(edges), 0, self._start_live, collapse.RUNNING], int)
         launch(collapse.compact_heap_kernel, surface, self._heap, self._counter)
         self._state = self._counter.numpy()  # shares the memory
-        self.goal = max(self._start_live - base_faces, 1)
-        self._merges, self._removed, self._ended, self._stopped = 0, 0, False, False
-        self._moved = threading.Condition()
 
     def run(self):
         """Collapse to the base mesh, or until `stop`; return whether the base mesh was reached."""
@@ -65,6 +68,7 @@ class Collapse:
     def steps(self):
         """Do the same, and yield how many faces are removed after each launch."""
         try:
+            self._prepare()
             while self._state[3] != int(collapse.FINISHED) and not self._stopped:
                 if self._state[3] == int(collapse.HEAP_FULL):
                     self._make_room()

@@ -13,13 +13,13 @@ def cpu_array(values, dtype):
 
 def filled(shape, value, dtype=int):
     """Return an array on the CPU, in memory of NumPy's: that lies on huge pages where the system has them."""
-    memory = np.full(shape, value, np.float64 if dtype is wp.vec3d else np.int32)
+    return wp.array(np.full(shape, value, np.int32), dtype=dtype, device="cpu", copy=False)
+
+
+def unwritten(shape, dtype=int):
+    """Return an array on the CPU with no values yet; what is never written takes no memory."""
+    memory = np.empty((*shape, 3), np.float64) if dtype is wp.vec3d else np.empty(shape, np.int32)
     return wp.array(memory, dtype=dtype, device="cpu", copy=False)
-
-
-def points(*shape):
-    """Return an array of points at the origin."""
-    return filled((*shape, 3), 0.0, wp.vec3d)
 
 
 def launch(kernel, *inputs):
@@ -49,7 +49,7 @@ def linked_rings(faces, face_array, node_capacity):
 def make_scratch(candidates, faces, rows):
     """Return `polygon.Scratch` for so many candidate faces, covering faces and polygons on the stack."""
     scratch, corners = polygon.Scratch(), int(polygon.CORNERS)
-    scratch.near, scratch.used = filled(candidates, 0), filled(faces, 0)
-    scratch.stack, scratch.stack_count = points(rows, corners), filled(rows, 0)
-    scratch.polygon, scratch.clipped = points(corners), points(corners)
+    scratch.near, scratch.used = unwritten(candidates), unwritten(faces)
+    scratch.stack, scratch.stack_count = unwritten((rows, corners), wp.vec3d), unwritten(rows)
+    scratch.polygon, scratch.clipped = unwritten((corners,), wp.vec3d), unwritten((corners,), wp.vec3d)
     return scratch

@@ -142,7 +142,6 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     report = progress if progress is not None else lambda stage, done, total: None
     with loading(wp.get_device("cpu"), SLOW_KERNELS):
         collapse = Collapse(vertices, faces, int(base_faces))
-    bounds = LodBounds(vertices, faces)
 
     def finish():
         parent = collapse.parents()
@@ -154,11 +153,13 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     if threads == 1:
         for removed in collapse.steps():
             report("collapse", removed, collapse.goal)
+        bounds = LodBounds(vertices, faces)
         merged = _follow(collapse, bounds, lambda: 1, report)
         forest = finish()
     else:
         running = workers(1).submit(lambda: finish() if collapse.run() else None)
         try:
+            bounds = LodBounds(vertices, faces)
             merged = _follow(collapse, bounds, lambda: threads if running.done() else threads - 1, report)
         finally:
             collapse.stop()

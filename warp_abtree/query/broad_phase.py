@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device
-from warp_abtree.kernels.broad_phase import find_pair_kernel, pose_box_kernel
+from warp_abtree.kernels.broad_phase import find_pair_kernel, make_pair_key_kernel, place_pair_kernel, pose_box_kernel
 from warp_abtree.query.request import CapacityError
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
@@ -17,15 +17,23 @@ class BroadPhase:
 
     Args:
         capacity: Pairs that there is room for at first.
+        sorts: Whether a launch sorts the pairs by their objects, so that nothing depends on the order in which it
+            found them.
 
     Attributes:
-        pairs: (i, j), i < j, in no order, device vec2i (capacity,).
+        pairs: (i, j), i < j, device vec2i (capacity,).
+        key: i * 2^32 + j of each pair where they are sorted, device int64 (2 capacity,); the greatest int64 behind the
+            last pair.
         pair_count: Pairs found, device int32 (1,); keeps counting past the capacity.
         guard: `LaunchGuard` of what launches it; a query takes its own.
     """
 
-    def __init__(self, batch: Batch, capacity=None):
-        self.batch = batch
+    pairs: wp.array
+    key: wp.array
+    order: wp.array
+
+    def __init__(self, batch: Batch, capacity=None, sorts=False):
+        self.batch, self.sorts = batch, sorts
         self.device = device = batch.device
         check_device(device, "making a broad phase")
         count = batch.object_count
@@ -46,10 +54,18 @@ class BroadPhase:
 
     def resize(self, capacity: int):
         """Make room for a number of pairs."""
-        self.pairs = wp.empty(capacity, dtype=wp.vec2i, device=self.device)
+        for owner, name, array in self.make_room(wp.empty(capacity, dtype=wp.vec2i, device=self.device)):
+            setattr(owner, name, array)
+
+    def make_room(self, pairs: wp.array) -> list:
+        """Return (owner, attribute, new array) of a list of pairs and of what sorts them."""
+        # The sort takes as much again as scratch.
+        names = {"key": wp.int64, "order": wp.int32} if self.sorts else {}
+        sorting = {name: wp.empty(2 * len(pairs), dtype=dtype, device=self.device) for name, dtype in names.items()}
+        return [(self, name, array) for name, array in {"pairs": pairs, **sorting}.items()]
 
     def launch(self):
-        """Box, rebuild and query. Launches only, so that a graph can capture it."""
+        """Box, rebuild, query, and sort if asked. Launches only, so that a graph can capture it."""
         self._launch_boxes()
         self.bvh.rebuild()
         self.pair_count.zero_()
@@ -62,6 +78,18 @@ class BroadPhase:
             ],
             device=self.device,
         )
+
+        if self.sorts:
+            self._sort()
+
+    def _sort(self):
+        room = len(self.pairs)
+        inputs = [self.pair_count, self.pairs, self.order, self.key]
+        wp.launch(make_pair_key_kernel, room, inputs, device=self.device)
+        with wp.ScopedDevice(self.device):
+            wp.utils.radix_sort_pairs(self.key, self.order, room)
+        inputs = [self.key, self.pair_count, self.pairs]
+        wp.launch(place_pair_kernel, room + 1, inputs, device=self.device)
 
     def _launch_boxes(self):
         inputs = [*self.batch.pools, self.guard.record(), self.lower, self.upper]

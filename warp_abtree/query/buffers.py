@@ -10,7 +10,7 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.cpu_threads import core_count
 from warp_abtree.checks.regime import Regime, current_regime
 from warp_abtree.kernels import poses
-from warp_abtree.kernels.traversal import face_pairs, simd
+from warp_abtree.kernels.traversal import descent, face_pairs
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.request import check_pair_room, check_within
 from warp_abtree.query.result import COUNTERS
@@ -154,18 +154,16 @@ class QueryBuffers:
         if self.uses_warps():
             return wp.empty((0, 0), dtype=wp.float32, device=self.device)
         threads = min(room, current_regime().cpu_threads or core_count())
-        words = simd.slab_memory_words(int(self.batch.models.depth.max()))
+        words = descent.slab_memory_words(int(self.batch.models.depth.max()))
         memory = wp.empty((threads, words), dtype=wp.float32, device=self.device)
-        memory.numpy()[:, : simd.SLAB_ZEROS] = 0.0
+        memory.numpy()[:, : descent.SLAB_ZEROS] = 0.0
         return memory
 
     def _make_room(self, pairs) -> list:
         """Return (owner, attribute, new array) of a device list of pairs, and of whatever belongs to a pair."""
         check_pair_room(len(pairs))
         made = [*self._pair_arrays(len(pairs)), (self, "pairs", pairs)]
-        if self.broad_phase is not None:
-            made.append((self.broad_phase, "pairs", pairs))
-        return made
+        return made if self.broad_phase is None else made + self.broad_phase.make_room(pairs)
 
     def _take_pairs(self, pairs):
         """Take a device list of pairs and make room for whatever belongs to a pair: all of it, or nothing changes."""

@@ -66,6 +66,7 @@ class ContactQuery(Query):
         capacity: `Buffers`, or the contacts that there is room for, below 2^30. Room that stays empty takes 180 bytes a
             contact and, in `launch`, time to sort all the same; `run` looks at what was found.
         contact_dtype: Type of the real numbers in `result()`, float64 or float32; those beyond float32 become infinite.
+        sort_pairs: As for `Query`.
 
     Attributes:
         faces: The last launch's `Result.faces`, device vec3i (capacity,), sorted.
@@ -83,13 +84,22 @@ class ContactQuery(Query):
     _order: wp.array
     _places = 0
 
-    def __init__(self, scene, pairs=None, capacity=None, precision="exact", within=None, contact_dtype=np.float64):
+    def __init__(
+        self,
+        scene,
+        pairs=None,
+        capacity=None,
+        precision="exact",
+        within=None,
+        contact_dtype=np.float64,
+        sort_pairs=False,
+    ):
         contact_dtypes(contact_dtype)
         self.contact_dtype = contact_dtype
         self.contacts, self.pair_contacts = contact.Contacts(), summary.PairContacts()
         self._sums, self._deferred = summary.ChunkSums(), contact.Deferred()
         self._deferred.total = wp.zeros(1, dtype=wp.int32, device=scene.device)
-        super().__init__(scene, "faces", pairs, capacity, precision, within)
+        super().__init__(scene, "faces", pairs, capacity, precision, within, sort_pairs)
 
     def _slow_kernels(self, with_distances: bool) -> list:
         kernels = [contact.find_contact_kernel, summary.sum_loop_kernel]

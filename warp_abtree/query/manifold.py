@@ -25,7 +25,6 @@ section 3; that the boundary curve gives it is Stokes' theorem.
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels import broad_phase
 from warp_abtree.kernels.contact import manifold, points
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.result import Found, Result
@@ -44,24 +43,20 @@ class ManifoldQuery(ContactQuery):
 
     Attributes:
         manifolds: Points of each pair, device arrays (pair capacity, POINTS) of `kernels.manifold.Manifolds`, float64.
-        pair_key: first object * 2^32 + second object of each pair of the broad phase, device int64 (2 pair capacity,);
-            the greatest int64 behind the last pair.
     """
 
     growth = 2
-    pair_key: wp.array
-    _pair_order: wp.array
 
     def __init__(self, scene, pairs=None, capacity=None, precision="exact"):
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
-        super().__init__(scene, pairs, capacity, precision)
+        super().__init__(scene, pairs, capacity, precision, sort_pairs=True)
 
     def _place_arrays(self, capacity: int) -> list:
         made = super()._place_arrays(capacity)
         made += [(self.curves, name, self._empty(capacity, wp.int32)) for name in ("parent", "loop")]
         made += [(self.curves, name, self._empty(capacity, wp.vec3d)) for name in ("loop_normal", "normal")]
         made.append((self.curves, "point", self._empty((capacity, 2), wp.vec3d)))
-        made.append((self.curves, "depth", self._empty((capacity, 2), wp.float64)))
+        made += [(self.curves, name, self._empty((capacity, 2), wp.float64)) for name in ("depth", "nearest")]
         return made
 
     def _pair_arrays(self, room: int) -> list:
@@ -70,28 +65,7 @@ class ManifoldQuery(ContactQuery):
         made.append((self.manifolds, "count", wp.zeros(room, dtype=wp.int32, device=self.device)))
         for name, dtype in (("point", wp.vec3d), ("normal", wp.vec3d), ("depth", wp.float64)):
             made.append((self.manifolds, name, self._empty(points, dtype)))
-        # The sort takes as much again as scratch.
-        made.append((self, "pair_key", self._empty(2 * room, wp.int64)))
-        made.append((self, "_pair_order", self._empty(2 * room, wp.int32)))
         return made
-
-    def _launch(self):
-        if self.broad_phase is not None:
-            self.broad_phase.launch()
-            self._sort_pairs()
-        self.traverse()
-
-    def make_pair_keys(self, order, keys):
-        """Write the place and the key of each pair of the broad phase; pairs of the last key are left out."""
-        inputs = [self.pair_count, self.pairs, order, keys]
-        wp.launch(broad_phase.make_pair_key_kernel, len(self.pairs), inputs, device=self.device)
-
-    def _sort_pairs(self):
-        room = len(self.pairs)
-        self.make_pair_keys(self._pair_order, self.pair_key)
-        with wp.ScopedDevice(self.device):
-            wp.utils.radix_sort_pairs(self.pair_key, self._pair_order, room)
-        self._launch_kernel(broad_phase.place_pair_kernel, room + 1, [self.pair_key, self.pair_count, self.pairs])
 
     def find_contacts(self, count: int | None = None):
         """Sort the hits in place, make their contacts, and reduce them to points. Launches only."""
@@ -110,7 +84,7 @@ class ManifoldQuery(ContactQuery):
         self._launch_kernel(manifold.average_loop_kernel, count, inputs)
         inputs = [*pools, self.pairs, self.pair_poses, start, rows, self.contacts, curves]
         self._launch_kernel(manifold.find_candidate_kernel, count, inputs)
-        self._launch_kernel(points.spread_point_kernel, room, [pools[2], self.pairs, start, curves, self.manifolds])
+        self._launch_warps(points.spread_point_kernel, room, [pools[2], self.pairs, start, curves, self.manifolds])
 
     def _sort_keys(self, count, bits):
         with wp.ScopedDevice(self.device):

@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from typing import Any
 
 import warp as wp
 
@@ -53,6 +54,7 @@ class Query(QueryReadout):
         within: Distances [world units], one for all pairs or (p,) beside given pairs: tell also which pairs are farther
             apart. The proof covers all rounding: pairs beyond by less than about 1e-13 of their size stay unproved, by
             less than 6 s where a rotation is off orthonormal by s, and all for distances from 2^1000 on.
+        sort_pairs: Whether pairs of the broad phase are sorted by their objects.
 
     Attributes:
         batch: `Batch` that is queried.
@@ -67,7 +69,9 @@ class Query(QueryReadout):
 
     growth = 1  # room that `run` makes, over the demand
 
-    def __init__(self, scene, output="faces", pairs=None, capacity=None, precision="exact", within=None):
+    def __init__(
+        self, scene, output="faces", pairs=None, capacity=None, precision="exact", within=None, sort_pairs=False
+    ):
         check_request(output, precision)
         check_device(scene.device, f"making a {type(self).__name__}")
         room = check_capacity(capacity)
@@ -84,10 +88,10 @@ class Query(QueryReadout):
         self.guard = LaunchGuard(
             self.device, batch.states.generation, batch.filter_generation if pairs is None else None
         )
-        self.broad_phase = None
+        self.broad_phase: Any = None
         if pairs is None:
             self._excluded_count = len(batch.excluded)
-            self.broad_phase = BroadPhase(batch, room.pairs)
+            self.broad_phase = BroadPhase(batch, room.pairs, sort_pairs)
             self.broad_phase.guard = self.guard
             self.pairs, self.pair_count = self.broad_phase.pairs, self.broad_phase.pair_count
         else:
@@ -117,8 +121,11 @@ class Query(QueryReadout):
         self.guard.write_to(work.record)
         return work
 
-    def launch(self):
+    def launch(self, between=None):
         """Run broad phase (unless pairs were given) and narrow phase. Launches only.
+
+        Args:
+            between: Called between the two, as to time them.
 
         Raises:
             RuntimeError: The scene's objects changed since the query was made, or its filter where the broad phase
@@ -126,12 +133,14 @@ class Query(QueryReadout):
         """
         self._check_scene()
         with self.guard.launching(self):
-            self._launch()
+            self._launch(between)
             self.finish()
 
-    def _launch(self):
+    def _launch(self, between=None):
         if self.broad_phase is not None:
             self.broad_phase.launch()
+        if between is not None:
+            between()
         self.prove_apart()
         self.traverse()
 
@@ -264,21 +273,24 @@ class Query(QueryReadout):
         result.check()
         return result
 
-    def grow(self):
+    def grow(self, between=None):
         """Launch, and again with more room until nothing is lost. Waits for the device.
+
+        Args:
+            between: As for `launch`, which calls it once.
 
         Raises:
             CapacityError: More pairs or hits than there can be room for.
             RuntimeError: As `launch`; or a graph is being captured.
         """
-        self._grow(lambda: Found(self._read_totals()))
+        self._grow(lambda: Found(self._read_totals()), between)
 
-    def _grow(self, read) -> Found:
+    def _grow(self, read, between=None) -> Found:
         """Launch as `grow` and return what `read` finds of the last launch."""
         check_device(self.device, f"{type(self).__name__}.run (launch can)")
         self._check_scene()
         with self.guard.launching(self):
-            self._launch()
+            self._launch(between)
             found = read()
             if found.totals.pairs > len(self.pairs):
                 self._take_pairs(wp.empty(self.growth * found.totals.pairs, dtype=wp.vec2i, device=self.device))

@@ -15,7 +15,6 @@ from warp_abtree.query.result import Result
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE
 from warp_abtree.state.device_update import NO_FAULTS, DeviceLodUpdate, LevelStates
 from warp_abtree.state.generation import STALE_GRAPH
-from warp_abtree.state.lod_update import build_states
 
 
 def check_groups(groups, object_model) -> np.ndarray:
@@ -112,7 +111,7 @@ class Pipeline:
         else:
             self._update = self._make_ladder(scene.lods, ladder, scene.models)
         self.lods = self._update.wanted
-        plan = getattr(self._update, "plan", None)
+        plan = self._update.plan
         self.changed_count = None if plan is None else plan.changed_count
         self.marked_count = None if plan is None else plan.marked_count
         self.poses = wp.empty((batch.object_count, 7), dtype=wp.float64, device=self.device)
@@ -131,8 +130,7 @@ class Pipeline:
         batch, object_model = self.batch, self.batch.object_model
         group = np.arange(len(lods)) if groups is None else check_groups(groups, object_model)
         first = np.unique(group, return_index=True)[1]
-        ids = build_states(batch.models, batch.states, object_model[first].tolist(), lods[first])
-        batch.objects.set_states(np.array(ids)[group])
+        batch.replace_states(list(zip(object_model[first].tolist(), lods[first].tolist())), group)
         return DeviceLodUpdate(batch.models, batch.states)
 
     def _make_ladder(self, lods, ladder, models):

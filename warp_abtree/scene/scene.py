@@ -330,6 +330,7 @@ class Scene:
         check_device(self.device, "Scene.tree_state")
         i = whole_number(i, "object", 0, self.object_count - 1)
         batch = self.batch()
+        batch.catch_up()
         states, slot = batch.states, batch.states.slots[batch.objects.state[i]]
         model = self.models[slot.model]
         lower, upper, skip = states.read_nodes(slot, model.tree.node_count)

@@ -20,7 +20,7 @@ def budget_report(rows, budget_ms: float | None = None, after: float = 1.0) -> d
     rows = [row for row in rows if row.time >= after and (budget_ms or row.budget_ms) is not None]
     if not rows:
         return None
-    ratio = np.array([row.cost_ms / (budget_ms or row.budget_ms) for row in rows])
+    ratio = np.array([row.total_ms / (budget_ms or row.budget_ms) for row in rows])
     # Where the runs of frames over the limit begin and end.
     edges = np.flatnonzero(np.diff(np.concatenate([[0], ratio > 1.1, [0]]).astype(int)))
     span = (rows[-1].time - rows[0].time) * len(rows) / max(len(rows) - 1, 1)

@@ -1,6 +1,7 @@
 """The frame loop: select LODs, refine, move, find candidate pairs, intersect them, respond; each stage timed.
 
-LODs come from a function of time, or from a controller (`warp_abtree.lod.controllers`) that holds a budget.
+LODs come from a controller (`warp_abtree.lod.controllers`), or from a function of time. Everything but that function,
+and a motion in Python, runs on the device: on a GPU as one graph, after which the host reads a few numbers.
 
 Source: Liu et al. 2006, Algorithm 4.
 """
@@ -9,7 +10,8 @@ import csv
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,132 +20,19 @@ import warp as wp
 
 from warp_abtree.checks.arguments import positive
 from warp_abtree.checks.atomic_write import atomic_write
-from warp_abtree.lod.controllers import Feedback
-from warp_abtree.lod.timing import COST_STAGES, STAGES, Timer
-from warp_abtree.model.model import Model
+from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.lod import frame_summary as words
+from warp_abtree.lod.controllers import Controller, Feedback
+from warp_abtree.lod.timing import STAGES, Timer
 from warp_abtree.query.request import check_request
 from warp_abtree.query.result import Result
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.budget_report import budget_report
-from warp_abtree.simulate.motion import triangle_wave
+from warp_abtree.simulate.frame_row import FrameRow, LodTable
+from warp_abtree.simulate.frame_stages import FrameStages
+from warp_abtree.simulate.motion import Kinematic
+from warp_abtree.simulate.rigid_bodies import SteppedMotion
 from warp_abtree.state.work_lists import full_refit_fraction
-
-
-def resolve_lod(model: Model, request) -> int:
-    """Return the LOD that a request means for a model.
-
-    Args:
-        request: A float is a fraction of the faces in (0, 1], an int a LOD; "finest", "coarsest", or "tol:X", the
-            coarsest LOD whose certified error is within X [model units]. A number as text with a dot is a float.
-
-    Raises:
-        ValueError: None of these, or out of range.
-    """
-    if request in ("finest", "coarsest"):
-        return model.lod_max if request == "finest" else 0
-    if isinstance(request, str):
-        number = request.removeprefix("tol:")
-        for kind in (float,) if number != request else (int, float):
-            try:
-                value = kind(number)
-            except ValueError:
-                continue
-            return model.lod_for(tolerance=value) if number != request else resolve_lod(model, value)
-        raise ValueError(f"LOD {request!r} is none of a fraction of the faces, a whole number, finest, coarsest, tol:X")
-    return model.lod_for(fraction=request) if isinstance(request, float) else model.check_lod(request)
-
-
-@dataclass(frozen=True)
-class LodSweep:
-    """LODs of some objects that go from one fraction of the faces to another and back, in equal ratios.
-
-    Attributes:
-        objects: Object indices by model, a list of (`Model`, int array).
-        start, turn: Fractions of the faces at the start, and half a period later.
-        period: Time there and back [s].
-    """
-
-    objects: list
-    start: float
-    turn: float
-    period: float
-
-    def fraction(self, time: float) -> float:
-        """Return the fraction of the faces at a time [s]."""
-        return self.start * (self.turn / self.start) ** float(triangle_wave(time / self.period))
-
-    def apply(self, fraction: float, lods: np.ndarray):
-        """Write the LODs of a fraction of the faces into the LODs of all objects, int (n,)."""
-        for model, indices in self.objects:
-            lods[indices] = model.lod_for(fraction=fraction)
-
-
-@dataclass(frozen=True)
-class FrameRow:
-    """What one frame did.
-
-    Attributes:
-        frame, time: Number from 0, and time in the scene [s].
-        objects, states: Objects, and the distinct (model, LOD) among them, which share a tree state.
-        pairs: Candidate pairs of the broad phase.
-        intersecting: Pairs that intersect.
-        hits: Intersecting face pairs; None where only "any" was asked.
-        lod_min, lod_max: Least and greatest LOD of any object.
-        faces: Active faces of all objects together.
-        error_mean, error_max: Mean and greatest `Model.error_at` of the objects at their LODs, one-sided [world units].
-        lods_changed: Objects whose LOD this frame changed.
-        oscillations: Those of them whose previous change had the opposite direction.
-        nodes_refitted: Nodes of all updated trees.
-        node_tests, triangle_tests: Pairs of boxes and of faces tested.
-        budget_ms: T that a controller held [ms]; None without a budget.
-        select_ms, refine_ms, move_ms: Selection of LODs; LOD change and refit; poses [ms].
-        broad_ms, query_ms: Broad phase; narrow phase and results, and all of it where the motion finds contacts [ms].
-        answer_ms: Response of the motion [ms].
-    """
-
-    frame: int
-    time: float
-    objects: int
-    states: int
-    pairs: int
-    intersecting: int
-    hits: int | None
-    lod_min: int
-    lod_max: int
-    faces: int
-    error_mean: float
-    error_max: float
-    lods_changed: int
-    oscillations: int
-    nodes_refitted: int
-    node_tests: int
-    triangle_tests: int
-    budget_ms: float | None
-    select_ms: float
-    refine_ms: float
-    move_ms: float
-    broad_ms: float
-    query_ms: float
-    answer_ms: float
-
-    @property
-    def total_ms(self) -> float:
-        """All stages together [ms]."""
-        return sum(getattr(self, stage) for stage in STAGES)
-
-    @property
-    def cost_ms(self) -> float:
-        """The stages that a budget is for, T = TR + TB + TQ + TLOD of the paper: all but movement [ms]."""
-        return sum(getattr(self, stage) for stage in COST_STAGES)
-
-    def as_dict(self) -> dict:
-        """Return the row as plain values, total_ms and cost_ms among them."""
-        return {**asdict(self), "total_ms": self.total_ms, "cost_ms": self.cost_ms}
-
-    @classmethod
-    def names(cls) -> list[str]:
-        """Return the names of `as_dict` in their order."""
-        return [*(field.name for field in fields(cls)), "total_ms", "cost_ms"]
 
 
 def load_update_kernels(scene: Scene):
@@ -169,20 +58,22 @@ def load_update_kernels(scene: Scene):
 class Frame:
     """Runs a scene frame by frame and keeps a `FrameRow` on each.
 
+    On a GPU, and without a clock of its own, a frame is the replay of one graph, captured at the second frame and
+    again after a buffer grew: a frame that finds more than its buffers hold is finished with larger ones, at the cost
+    of its time.
+
     A motion has a length, the number of objects, and these methods, called in this order in every frame:
 
     - `poses(time, out)` returns the poses at a time [s], float64 (n, 7), in `out` or an array of its own, or None if
       it has set the poses of the scene itself
-    - `find(time_step)`, optional, returns a `Result` in place of the frame's own broad phase and query
     - `answer(result, time_step)`, optional, takes the result, and moves on by the time to the next frame [s]
-
-    and optionally `warm_up(time_step)`, which loads the kernels of these and moves nothing.
 
     Args:
         scene: `Scene` with all its objects.
-        motion: `Kinematic`, or anything with the methods above; None leaves the objects where they are.
-        lods: A controller of `warp_abtree.lod.controllers`, or anything with its `next_lods` and `budget_ms`; or a
-            function from time [s] to the LOD of every object, int (n,); None leaves them.
+        motion: `Kinematic`, or anything with the methods above; `Dynamics.motion()` for rigid bodies; None leaves the
+            objects where they are.
+        lods: A controller of `warp_abtree.lod.controllers`, which serves objects from states of its ladder's levels
+            (`LevelStates`); or a function from time [s] to the LOD of every object, int (n,); None leaves them.
         output: Output of the query: "any", "count", "faces" or "contacts".
         time_step: Time between frames [s], above 0.
         clock: Returns seconds; read between stages when the device has finished. A clock with a method `charge` is
@@ -207,7 +98,7 @@ class Frame:
     ):
         if motion is not None and len(motion) != scene.object_count:
             raise ValueError(f"the motion is of {len(motion)} objects, the scene has {scene.object_count}")
-        if not (lods is None or callable(lods) or hasattr(lods, "next_lods")):
+        if not (lods is None or callable(lods) or isinstance(lods, Controller)):
             raise ValueError(f"lods: a {type(lods).__name__} is neither a controller nor a function of time")
         if not (clock is None or callable(clock)):
             raise ValueError(f"clock: a {type(clock).__name__} cannot be called")
@@ -219,63 +110,189 @@ class Frame:
         self.time_step = positive(time_step, "time_step")
         self.history: list[FrameRow] = []
         self._timer = Timer(scene.device, clock)
+        captures = current_regime().captures_frames
+        self._captures = clock is None and (scene.device.is_cuda if captures is None else captures)
         self._feedback = Feedback(0.0)
         self._poses = np.empty((scene.object_count, 7))
-        self._model = np.array(scene.object_model)
+        self._stages: Any = None
+        self._graph: Any = None
+        # What the graph was captured with, and the marks that it makes.
+        self._given: tuple = ()
+        self._marks: list[str] = []
+        # Frames that the device has counted; time and LOD changes of a frame that is not recorded yet while its graph
+        # runs, and whether its buffers were too small.
+        self._seen, self._is_short = 0, False
+        self._open: tuple | None = None
+        # A time and a motion, and its poses then.
+        self._ahead: tuple = (None, None)
         self._direction = np.zeros(scene.object_count, np.int8)
-        scene.batch()
+        self._lods = scene.batch().lods
         self._measure_lods()
+
+    @property
+    def _stepped(self) -> SteppedMotion | None:
+        return self.motion if isinstance(self.motion, SteppedMotion) else None
 
     def warm_up(self):
         """Run every stage once and keep no row, so that no row times the loading of kernels.
 
-        Nothing moves, and LODs stay as they are: changes of them are launched on copies. Waits for the device.
+        Nothing moves, and LODs stay as they are, but that those off a controller's ladder go to its next finer level:
+        changes of them are launched on copies. Waits for the device.
         """
+        stages = self._ready()
+        if isinstance(self.lods, Controller):
+            self.lods.next_lods(self._feedback)
         if self.lods is not None:
-            self._select(0.0)
             load_update_kernels(self.scene)
-        if hasattr(self.motion, "warm_up"):
-            self.motion.warm_up(self.time_step)
-        if not hasattr(self.motion, "find"):
-            self.scene.intersect(self.scene.broad_phase(), output=self.output)
+        if self._stepped is not None:
+            self._stepped.warm_up(self.time_step)
+        stages.warm_up()
         wp.synchronize_device(self.scene.device)
 
     def step(self) -> Result:
         """Run the next frame, append its row, and return what the query found. Waits for the device."""
-        number, scene, timer = len(self.history), self.scene, self._timer
-        time = number * self.time_step
-        timer.begin()
-        wanted = None if self.lods is None else self._select(time)
-        timer.mark(selected=0 if wanted is None else scene.object_count)
-        stats = None if wanted is None or np.array_equal(wanted, scene.lods) else scene.set_lods(wanted)
-        refitted = _sum(stats.nodes_refitted) if stats is not None and timer.counts_work else 0
-        timer.mark(lod_change=int(stats is not None), node_refitted=refitted)
-        if self.motion is not None:
-            poses = self.motion.poses(time, out=self._poses)
-            if poses is not None:
-                scene.set_poses(poses)
-        timer.mark(posed=0 if self.motion is None else scene.object_count)
-        finds = hasattr(self.motion, "find")
-        pairs = None if finds else scene.broad_phase()
-        timer.mark(candidate=0 if pairs is None else len(pairs))
-        result = self.motion.find(self.time_step) if finds else scene.intersect(pairs, output=self.output)
-        node_tests, triangle_tests = _sum(result.node_tests), _sum(result.triangle_tests)
-        timer.mark(query=1, node_test=node_tests, triangle_test=triangle_tests)
-        if hasattr(self.motion, "answer"):
-            self.motion.answer(result, self.time_step)
-        timer.mark()
-        stage_ms = timer.stage_ms()
-        refitted = 0 if stats is None else _sum(stats.nodes_refitted)
-        changed, oscillations = (0, 0) if stats is None else self._measure_lods()
-        self._feedback = Feedback(time, stage_ms, refitted, stats is not None, result)
+        self._advance()
+        return self._result()
+
+    def run(self, frames: int, progress=None) -> list[FrameRow]:
+        """Run a number of frames and return the whole history; progress(done, total) is called after each."""
+        for done in range(1, frames + 1):
+            self._advance()
+            if progress is not None:
+                progress(done, frames)
+        return self.history
+
+    def _result(self):
+        query = self._stages.query
+        return query.result() if self._stepped is None else query.result(with_points=False)
+
+    def _ready(self) -> FrameStages:
+        """Return the stages of the frame, made anew where scene, controller or output are others."""
+        controller = self.lods if isinstance(self.lods, Controller) else None
+        if self._stages is None or not self._stages.serves(self.scene, controller, self.output):
+            self._graph, self._open, self._is_short = None, None, False
+            dynamics = None if self._stepped is None else self._stepped.dynamics
+            moves = self.motion is not None
+            self._stages = FrameStages(self.scene, controller, dynamics, self.output, self.time_step, moves)
+            self._seen = 0
+            self._lods = self.scene.batch().lods
+            self._measure_lods()
+        return self._stages
+
+    def _advance(self):
+        """Run the next frame and append its row; only finish it where it was interrupted while its graph ran."""
+        stages = self._ready()
+        if self._open is not None and (self._is_short or stages.read()[words.FRAMES] != self._seen):
+            self._finish(stages, *self._open)
+            return
+        self._open, self._is_short = None, False
+        time = len(self.history) * self.time_step
+        self._timer.begin()
+        if isinstance(self.lods, Controller):
+            self.lods.prepare(replace(self._feedback, time=time))
+            changes = None
+        else:
+            changes = self._choose(time)
+            stages = self._ready()
+        if self._captures and self.history:
+            self._replay(stages, time, changes)
+        else:
+            stages.launch_selection(self._timer.mark)
+            stages.launch_query(self._timer.mark, self._place(stages, time))
+        self._finish(stages, time, changes)
+
+    def _choose(self, time):
+        """Bring objects to the LODs of a function of time; return the `LodUpdate`, None where nothing changes."""
+        wanted = None if self.lods is None else np.asarray(self.lods(time))
+        self._timer.mark("select_ms", lambda: {"selected": 0 if wanted is None else self.scene.object_count})
+        changes = None
+        if wanted is not None and not np.array_equal(wanted, self.scene.lods):
+            changes = self.scene.set_lods(wanted)
+        work = {"lod_change": int(changes is not None)}
+        self._timer.mark("refine_ms", lambda: work | {"node_refitted": _refitted(changes)})
+        return changes
+
+    def _place(self, stages, time) -> bool:
+        """Bring the poses of a time to the device; return whether there are any that the motion has not set itself."""
+        known, rows = self._ahead
+        if known != (time, self.motion) and hasattr(self.motion, "poses"):
+            rows = self._find_rows(stages, time)
+        self._ahead = None, None
+        if self._stepped is not None:
+            self._stepped.aim(time + self.time_step)
+        if rows is not None:
+            stages.take_rows(rows)
+        return rows is not None
+
+    def _find_rows(self, stages, time):
+        """Return the poses of a time, (n, 7), or None if the motion has set those of the scene."""
+        poses = self.motion.poses(time, out=self._poses)
+        return None if poses is None else stages.check_rows(poses)
+
+    def _replay(self, stages, time, changes):
+        """Run a frame as a graph, captured anew where arrays were replaced since."""
+        timer = self._timer
+        if isinstance(self.lods, Controller):
+            timer.mark("select_ms")
+        places = self._place(stages, time)
+        timer.mark("move_ms")
+        given = (*stages.arrays(), places)
+        if self._graph is None or given != self._given:
+            before = len(timer.marks())
+            with wp.ScopedCapture(self.scene.device) as capture:
+                stages.launch_selection(timer.mark)
+                stages.launch_query(timer.mark, places)
+            self._graph, self._given, self._marks = capture.graph, given, timer.marks()[before:]
+        else:
+            timer.replay(self._marks)
+        self._open = time, changes
+        wp.capture_launch(self._graph)
+        timer.mark("answer_ms" if timer.uses_events else "query_ms")
+        # The host's part of the next frame, while the device works on this one.
+        following = (len(self.history) + 1) * self.time_step
+        if isinstance(self.lods, Controller):
+            with suppress(Exception):  # a camera that there is none of raises when its frame comes
+                self.lods.look_ahead(following)
+        if isinstance(self.motion, Kinematic):
+            self._ahead = (following, self.motion), self._find_rows(stages, following)
+
+    def _finish(self, stages, time, changes):
+        """Answer a frame that was launched, and append its row. Waits for the device."""
+        timer, answers = self._timer, hasattr(self.motion, "answer")
+        if not answers and timer.marks()[-1] != "answer_ms":
+            timer.mark("answer_ms")
+        if self._is_short or not stages.is_whole(stages.read()):
+            self._is_short = True
+            stages.find()
+            stages.respond(timer.mark)
+            self._is_short = False
+        if answers:
+            self.motion.answer(self._result(), self.time_step)
+        if answers or timer.marks()[-1] != "answer_ms":
+            timer.mark("answer_ms")
+        self._record(stages, time, changes, stages.read())
+        self._open = None
+
+    def _record(self, stages, time, changes, summary):
+        """Append the row of a frame, and keep what the next selection is told."""
+        stage_ms, node_tests = self._timer.stage_ms(), int(summary[words.NODE_TESTS])
+        triangle_tests, refitted = int(summary[words.TRIANGLE_TESTS]), int(summary[words.REFITTED])
+        changed, oscillations = int(summary[words.CHANGED]), int(summary[words.TURNED])
+        if changes is not None:
+            refitted, (changed, oscillations) = _refitted(changes), self._measure_lods()
+        elif changed:
+            self._lod_columns = stages.table.columns(summary[words.HEAD :])
+        tests = node_tests + int(words.TRIANGLE_WORK) * triangle_tests
+        self._feedback = Feedback(time, stage_ms, refitted, float(tests))
+        self._seen = int(summary[words.FRAMES])
         self.history.append(
             FrameRow(
-                frame=number,
+                frame=len(self.history),
                 time=time,
-                objects=scene.object_count,
-                pairs=len(result.pairs),
-                intersecting=int(np.count_nonzero(result.any)),
-                hits=None if result.count is None else _sum(result.count),
+                objects=self.scene.object_count,
+                pairs=int(summary[words.PAIRS]),
+                intersecting=int(summary[words.INTERSECTING]),
+                hits=None if stages.query.output == "any" else int(summary[words.HITS]),
                 lods_changed=changed,
                 oscillations=oscillations,
                 nodes_refitted=refitted,
@@ -286,15 +303,6 @@ class Frame:
                 **stage_ms,
             )
         )
-        return result
-
-    def run(self, frames: int, progress=None) -> list[FrameRow]:
-        """Run a number of frames and return the whole history; progress(done, total) is called after each."""
-        for done in range(1, frames + 1):
-            self.step()
-            if progress is not None:
-                progress(done, frames)
-        return self.history
 
     def summary(self, after: float = 1.0) -> dict:
         """Return mean, min and max of the counts, the range of LODs, and mean, p95 and total of stages [ms].
@@ -313,7 +321,7 @@ class Frame:
         for name in (*counts, "error_mean", "error_max"):
             values = np.array([math.nan if row[name] is None else row[name] for row in rows], np.float64)
             found[name] = {"mean": float(values.mean()), "min": float(values.min()), "max": float(values.max())}
-        for name in (*STAGES, "total_ms", "cost_ms"):
+        for name in (*STAGES, "total_ms"):
             values = np.array([row[name] for row in rows])
             p95 = float(np.percentile(values, 95))
             found["stages"][name] = {"mean": float(values.mean()), "p95": p95, "total": float(values.sum())}
@@ -338,34 +346,18 @@ class Frame:
                 writer.writeheader()
                 writer.writerows(rows)
 
-    def _select(self, time):
-        """Return the LODs that are wanted at a time, on the host. (synchronization point)"""
-        if hasattr(self.lods, "next_lods"):
-            return self.lods.next_lods(replace(self._feedback, time=time)).numpy()
-        return np.asarray(self.lods(time))
-
     def _measure_lods(self):
         """Measure the LODs as they stand; return how many changed, and how many of these reversed their direction."""
         scene, lods = self.scene, self.scene.lods.astype(np.int64)
-        direction = np.sign(lods - getattr(self, "_lods", lods)).astype(np.int8)
+        direction = np.sign(lods - self._lods).astype(np.int8)
         changed = int(np.count_nonzero(direction))
         oscillations = int(np.count_nonzero(direction * self._direction < 0))
         self._direction = np.where(direction == 0, self._direction, direction)
         self._lods = lods
-        keys, repeats = np.unique((self._model.astype(np.int64) << 32) + lods, return_counts=True)
-        states = [(scene.models[key >> 32], key & (2**32 - 1)) for key in keys.tolist()]
-        errors = np.array([model.error_at(lod) for model, lod in states])
-        faces = np.array([model.progressive.active_count(lod) for model, lod in states])
-        self._lod_columns: dict[str, Any] = {
-            "states": len(keys),
-            "lod_min": int(lods.min()),
-            "lod_max": int(lods.max()),
-            "faces": int(faces @ repeats),
-            "error_mean": float(sum((errors * repeats).tolist()) / len(lods)),
-            "error_max": float(errors.max()),
-        }
+        keys, repeats = np.unique((np.array(scene.object_model, np.int64) << 32) + lods, return_counts=True)
+        self._lod_columns = LodTable(scene.models, keys >> 32, keys & (2**32 - 1)).columns(repeats)
         return changed, oscillations
 
 
-def _sum(counts) -> int:
-    return int(np.sum(counts, dtype=np.int64))
+def _refitted(changes) -> int:
+    return 0 if changes is None else int(np.sum(changes.nodes_refitted, dtype=np.int64))

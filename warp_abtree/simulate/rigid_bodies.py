@@ -23,6 +23,10 @@ from warp_abtree.simulate.body_state import RigidBodies, zeros_of
 
 COLOR_COUNT = int(graph_coloring.COLOR_COUNT)
 ITERATIONS = 16  # rounds of relaxation over all contacts in a step
+COLOR_ROUNDS = 2  # of the graph coloring, each color; one makes almost twice as many colors
+LAST_COLORS = 8  # first of the last colors, which one block relaxes
+# Threads of a block: few pairs of a color lie on as many multiprocessors, and the last colors on one.
+RELAX_THREADS, TAIL_THREADS = 32, 256
 
 
 class Dynamics(RigidBodies):
@@ -66,6 +70,10 @@ class Dynamics(RigidBodies):
         by_color = current_regime().relax_by_color
         self._by_color = not self.device.is_cpu if by_color is None else by_color
         self.query = ManifoldQuery(scene, None, capacity)
+        # No body is in two pairs of a color.
+        self._color_room = max(1, int(np.count_nonzero(self.rigid)))
+        # On the CPU threads run one after another, and a color more costs nothing.
+        self._tail_threads, self._color_rounds = (TAIL_THREADS, COLOR_ROUNDS) if self.device.is_cuda else (1, 1)
         self._warm_start = constraint_kernels.WarmStart()
         self._room, self._interrupted = -1, False
         self._grow()
@@ -118,20 +126,33 @@ class Dynamics(RigidBodies):
     def find(self, targets=None):
         """Do the first half of `step`: find the contacts where the bodies stand, without moving them."""
         self._check_whole()
+        self.aim(targets)
+        self.find_contacts()
+
+    def aim(self, targets=None):
+        """Set where kinematic objects are at the end of the coming step; None leaves them where they are."""
         if targets is not None:
             self.set_targets(targets)
         elif self.kinematic.any():
             self.clear_targets()
-        self.query.grow()
+
+    def find_contacts(self, between=None):
+        """Find the contacts, with room for all of them; see `Query.grow`. Waits for the device."""
+        self.query.grow(between)
         self._grow()
 
     def answer(self, dt: float):
-        """Do the second half of `step`: impulses, and motion. Launches only."""
+        """Do the second half of `step`: impulses, and motion. Launches only.
+
+        Where contacts or pairs outran the capacity nothing moves.
+        """
         self._check_whole()
         n, room, query, bodies = len(self.mass), self._room, self.query, self.bodies
         fast = 2.0 * float(np.linalg.norm(self.gravity)) * dt
         posed = [query.pairs, self._pool, query.manifolds]
         with self._changing():
+            found = [query.guard.launched, query.pair_count, len(query.pairs), query.hits]
+            self._launch(body_kernels.judge_contacts_kernel, 1, [*found, bodies])
             inputs = [dt, wp.vec3d(*(dt * self.gravity)), self.targets, self._pool, bodies]
             self._launch(body_kernels.begin_step_kernel, n, inputs)
             inputs = [dt, fast, *posed, self._warm_start, bodies, self._sorted_pair, self.constraints]
@@ -140,14 +161,14 @@ class Dynamics(RigidBodies):
             self._relax(solve.WARM_START, 1, fast)
             self._relax(solve.VELOCITY, ITERATIONS, fast)
             self._relax(solve.POSITION, ITERATIONS, fast)
-            inputs = [query.pair_key, *posed, self.constraints, self._warm_start]
+            inputs = [query.broad_phase.key, *posed, self.constraints, bodies, self._warm_start]
             self._launch(constraint_kernels.save_impulses_kernel, room, inputs)
             self._launch(body_kernels.integrate_kernel, n, [dt, self.targets, bodies, self._pool])
 
     def launch(self, dt: float):
         """Move all bodies by one step. Launches only: after a `step`, a CUDA graph can capture it, with this dt.
 
-        Contacts and pairs beyond the capacity are lost; `check` raises then.
+        Where contacts or pairs outrun the capacity nothing moves; `check` raises then.
         """
         self._check_whole()
         with self.query.guard.launching(self):
@@ -166,37 +187,46 @@ class Dynamics(RigidBodies):
         """Return what a `Frame` takes as motion: steps of this, with kinematic objects on a prescribed path."""
         return SteppedMotion(self, prescribed)
 
-    def _launch(self, kernel, dim, inputs):
-        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+    def _launch(self, kernel, dim, inputs, block_dim=256):
+        wp.launch(kernel, dim=dim, inputs=inputs, block_dim=block_dim, device=self.device)
 
     def _color_pairs(self):
         """Color the pairs in contact, and sort all pairs by color."""
-        room, color = self._room, self.constraints.color
-        for c in range(COLOR_COUNT):
-            self._launch(graph_coloring.bid_kernel, room, [c, self.query.pairs, color, self.bodies])
-            self._launch(graph_coloring.assign_color_kernel, room, [c, self.query.pairs, self.bodies, color])
+        room, found = self._room, [self.query.pairs, self.constraints.color, self.bodies]
+        rounds, color = self._color_rounds, self.constraints.color
+        for turn in range(COLOR_COUNT * rounds):
+            self._launch(graph_coloring.bid_kernel, room, [turn, rounds, *found])
+            self._launch(graph_coloring.assign_color_kernel, room, [turn, rounds, *found])
         wp.copy(self._sorted_color, color, count=room)
         with wp.ScopedDevice(self.device):
             wp.utils.radix_sort_pairs(self._sorted_color, self._sorted_pair, room, end_bit=7)
 
     def _relax(self, stage, rounds, fast):
-        """Relax all pairs: by one thread in one launch, or a launch for each color of each round."""
-        each, colors = solve.Relaxation(), range(COLOR_COUNT + 1)
+        """Relax all pairs: by one thread in one launch, or a launch for each of the first colors of each round.
+
+        The last colors have few pairs: a block relaxes them, with those of the next round where it goes backward.
+        """
+        each = solve.Relaxation()
         each.stage, each.friction, each.fast = int(stage), self.friction, fast
-        arrays = [self._sorted_pair, self._sorted_color, self.query.pairs, self.query.manifolds]
-        inputs = [each, *arrays, self.constraints, self.bodies]
         if not self._by_color:
-            each.last_color, each.rounds, each.threads = COLOR_COUNT, rounds, 1
-            self._launch(solve.relax_kernel, 1, inputs)
+            self._relax_colors(each, range(COLOR_COUNT + 1), rounds, 1)
             return
-        each.rounds = 1
+        head, tail = range(LAST_COLORS), range(LAST_COLORS, COLOR_COUNT + 1)
+        alternates = stage == solve.VELOCITY
         for turn in range(rounds):
-            each.backward = turn % 2 if stage == solve.VELOCITY else 0
-            for color in reversed(colors) if each.backward else colors:
-                # The pairs without a color of their own are relaxed one after another.
-                each.threads = self._room if color < COLOR_COUNT else 1
-                each.first_color = each.last_color = color
-                self._launch(solve.relax_kernel, each.threads, inputs)
+            each.backward = turn % 2 if alternates else 0
+            for color in [] if each.backward else head:
+                self._relax_colors(each, [color], 1, self._color_room)
+            if not each.backward:
+                self._relax_colors(each, tail, min(2, rounds - turn) if alternates else 1, self._tail_threads)
+            for color in reversed(head) if each.backward else []:
+                self._relax_colors(each, [color], 1, self._color_room)
+
+    def _relax_colors(self, each, colors, rounds, threads):
+        each.first_color, each.last_color, each.rounds, each.threads = colors[0], colors[-1], rounds, threads
+        arrays = [self._sorted_pair, self._sorted_color, self.query.pairs, self.query.manifolds]
+        block = RELAX_THREADS if len(colors) == 1 else TAIL_THREADS
+        self._launch(solve.relax_kernel, threads, [each, *arrays, self.constraints, self.bodies], block)
 
 
 class SteppedMotion:
@@ -210,26 +240,18 @@ class SteppedMotion:
 
     def __init__(self, dynamics: Dynamics, prescribed=None):
         self.dynamics, self.prescribed = dynamics, prescribed
-        self._time = 0.0
 
     def __len__(self) -> int:
         return len(self.dynamics.mass)
 
-    def poses(self, time: float, out=None) -> None:
-        """Take the time [s]; the poses are in the scene already."""
-        self._time = time
-
-    def warm_up(self, time_step: float):
+    def warm_up(self, time: float):
         """Load all kernels of a step, and grow to the contacts where the bodies stand; nothing moves."""
         for module in (body_kernels, constraint_kernels, graph_coloring, solve):
             wp.load_module(module, self.dynamics.device)
-        self.find(time_step)
+        self.aim(time)
+        self.dynamics.find_contacts()
 
-    def find(self, time_step: float):
-        """Find the contacts of the step from here; return a `Result` without points. Waits for the device."""
-        self.dynamics.find(None if self.prescribed is None else self.prescribed.poses(self._time + time_step))
-        return self.dynamics.query.result(with_points=False)
-
-    def answer(self, result, time_step: float):
-        """Move on by a step."""
-        self.dynamics.answer(time_step)
+    def aim(self, time: float):
+        """Set where kinematic objects are at a time [s], the end of the coming step."""
+        if self.dynamics.kinematic.any():
+            self.dynamics.aim(None if self.prescribed is None else self.prescribed.poses(time))

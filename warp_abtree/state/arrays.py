@@ -178,6 +178,12 @@ class StateArrays:
             self.face_total += int(self.models.face_count[model])
         return ids
 
+    def free_others(self, used):
+        """Let all states be taken again but those of some ids."""
+        self.free = {}
+        for state in sorted(set(range(len(self.slots))) - set(np.asarray(used).tolist())):
+            self.free.setdefault(self.slots[state].model, []).append(state)
+
     def read_nodes(self, slot, count):
         """Return lower and upper bounds, float32 (count, 3), and skip ids of a slot's nodes. Waits for the device."""
         box = self.pool.node_box[2 * slot.node_start : 2 * (slot.node_start + count)].numpy().reshape(count, 2, 4)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.generation import Generation
-from warp_abtree.state.lod_update import LodUpdate, set_object_lods
+from warp_abtree.state.lod_update import LodUpdate, replace_states, set_object_lods
 
 
 class Batch:
@@ -26,7 +28,6 @@ class Batch:
     Attributes:
         models, states, objects, object_model, excluded: As given.
         device: Of the arrays.
-        lods: LOD of each object as the host knows it, int (n,); -1 before `set_lods`.
         filter_generation: `Generation` of the excluded pairs.
         mean_faces: About how many faces an object has at its LOD, as the host knows it.
     """
@@ -35,11 +36,35 @@ class Batch:
         self.device = states.device
         self.models, self.states, self.objects = models, states, objects
         self.object_model = np.asarray(object_model)
-        self.lods = np.full(len(self.object_model), -1, np.int64)
+        self._lods = np.full(len(self.object_model), -1, np.int64)
+        self._followed: Any = None
         self.excluded = np.asarray(excluded, np.int64)
         self.filter_generation = Generation(self.device)
         self.mean_faces = float(models.face_count[self.object_model].mean()) if len(self.object_model) else 1.0
         self._retired = False
+
+    @property
+    def lods(self) -> np.ndarray:
+        """LOD of each object, int (n,); -1 before `set_lods`. Waits for the device while it chooses LODs."""
+        self.catch_up()
+        return self._lods
+
+    def follow(self, followed):
+        """Take it that `LevelStates` on the device points objects at states from now on."""
+        self._followed = followed
+
+    def follows(self, followed) -> bool:
+        """Return whether what chooses LODs on the device is still this."""
+        return self._followed is followed
+
+    def catch_up(self):
+        """Bring to the host where objects stand, if that is chosen on the device. Waits for it then."""
+        if self._followed is None:
+            return
+        lods, states = self._followed.read()
+        self._lods, self.objects.state = lods, states.astype(np.int32)
+        for state, lod in zip(states.tolist(), lods.tolist()):
+            self.states.slots[state].lod = lod
 
     @property
     def object_count(self) -> int:
@@ -61,19 +86,41 @@ class Batch:
 
     def set_lods(self, lods) -> LodUpdate:
         """Bring every object to an LOD, int (n,) within its model's range: wholly, or not at all."""
+        self._lead()
         with self.states.change():
             stats = set_object_lods(self.models, self.states, self.objects, self.object_model, lods)
-            self.lods = np.array(lods)
+            self._lods = np.array(lods)
         # The base mesh has a few faces, and each operation adds about as many as any other.
-        share = (self.lods + 1) / (self.models.lod_max[self.object_model] + 1)
+        share = (self._lods + 1) / (self.models.lod_max[self.object_model] + 1)
         self.mean_faces = float((self.models.face_count[self.object_model] * share).mean())
         return stats
+
+    def replace_states(self, wanted: list, serving) -> np.ndarray:
+        """Serve objects from states of their own: wholly, or not at all; see `lod_update.replace_states`."""
+        self._lead()
+        with self.states.change():
+            ids = replace_states(self.models, self.states, self.objects, wanted, serving)
+            self._lods = np.array([lod for _, lod in wanted], np.int64)[serving]
+        return ids
+
+    def tear(self):
+        """Say that an interruption has left tree states that no LOD explains."""
+        self.states.generation.suspend()
+        self.states.torn = True
+
+    def _lead(self):
+        """Choose LODs on the host again."""
+        if self._followed is not None:
+            self.catch_up()
+            self._followed = None
+            self.states.free_others(self.objects.state)
 
     def mend(self):
         """Make tree states anew that an interrupted change of LODs has left torn."""
         if not self.states.torn:
             return
         check_device(self.device, "making tree states anew")
+        self._lead()
         self.states.reset()
         self.objects.state = np.full(self.object_count, -1, np.int32)
         set_object_lods(self.models, self.states, self.objects, self.object_model, self.lods)

@@ -4,10 +4,10 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.arrays import LEVEL_MAX
+from warp_abtree.kernels.update import levels as level_kernels
 from warp_abtree.kernels.update import work_lists
 from warp_abtree.state.arrays import ModelArrays, StateArrays
 from warp_abtree.state.batch import Batch
-from warp_abtree.state.lod_update import build_states
 from warp_abtree.state.work_lists import (
     WorkLists,
     active_update,
@@ -29,16 +29,17 @@ class DeviceLodUpdate(WorkLists):
 
     Args:
         models, states: A pool that grows no more.
+        moving: Ids of the states that may be brought to other LODs; None is all.
 
     Attributes:
         wanted: LOD of each state, device int32 (s,), to be written before a launch.
         faults: LODs wanted out of range (the nearer end is taken) and the lowest state that had one, device int32 (2,).
     """
 
-    def __init__(self, models: ModelArrays, states: StateArrays):
+    def __init__(self, models: ModelArrays, states: StateArrays, moving=None):
         self.models, self.states = models, states
         device = states.device
-        owner = np.array([slot.model for slot in states.slots])
+        owner = np.array([slot.model for slot in states.slots])[slice(None) if moving is None else moving]
         bounds = [len(bound) for bound in models.split_bounds]
         longest = np.array([bound[-1] - bound[0] for bound in models.split_bounds])
         count = len(owner)
@@ -79,7 +80,7 @@ class DeviceLodUpdate(WorkLists):
             "face_end",
         ):
             setattr(plan, name, room(count))
-        plan.changed_count, plan.marked_count = room(count), room(count)
+        plan.changed_count, plan.marked_count = room(len(states.slots)), room(len(states.slots))
         plan.whole_count = room(int(LEVEL_MAX))
         plan.whole_start = upload(np.cumsum(whole_room) - whole_room)
         plan.whole_state = room(int(whole_room.sum()))
@@ -115,36 +116,96 @@ class DeviceLodUpdate(WorkLists):
         active_update(self.models.pool, self.states.pool, self)
 
 
-class LevelStates:
-    """Serve LODs that stand on the device from states made beforehand, one a level: no tree is ever updated.
+def shares_levels(object_model, levels) -> np.ndarray:
+    """Return of each model whether its objects share tree states, one a level: where there are fewer levels than them.
 
     Args:
-        batch: Without states.
-        levels: LODs of each model that states are made for, rising.
+        object_model: Model of each object, int (n,).
+        levels: LODs of each model, a list of arrays.
+    """
+    lengths = np.array([len(part) for part in levels])
+    return np.bincount(object_model, minlength=len(lengths)) > lengths
+
+
+class LevelStates:
+    """Serve LODs that stand on the device: objects stand at levels of LOD ladders, and change them on the device.
+
+    A model's levels have a tree state each, made beforehand, so that a change of LOD costs an index; or each of its
+    objects has a state of its own, updated in place. Takes over the states of a batch; the host's side of it follows by
+    `read` (`Batch.follow`).
+
+    Args:
+        batch: Whose objects are served.
+        levels: LODs that objects of each model may stand at, rising.
         lods: LOD that each object starts at, int (n,).
+        shared: Models whose levels have states, bool (models,); None is all.
 
     Attributes:
         wanted: LOD of each object, device int32 (n,), to be written before a launch; the coarsest level that is not
             coarser serves it.
         faults: LODs wanted below 0 or beyond the last level (the nearer end is taken) and the lowest object that had
             one, device int32 (2,).
+        levels: `kernels.update.levels.Levels`.
+        level_model, level_lod: Model and LOD of each level, int arrays.
+        plan: `UpdateLists` of states that are updated; None where there are none.
 
     Raises:
         ValueError: The pool would pass 2^30 nodes.
     """
 
-    def __init__(self, batch: Batch, levels, lods):
+    def __init__(self, batch: Batch, levels, lods, shared=None):
         self.batch, self.device = batch, batch.device
+        model, shared = batch.object_model, np.full(len(levels), True) if shared is None else shared
         starts = np.concatenate([[0], np.cumsum([len(part) for part in levels])])
-        state_model = np.repeat(np.arange(len(levels)), np.diff(starts))
-        build_states(batch.models, batch.states, state_model, np.concatenate(levels))
-        batch.objects.set_states(starts[batch.object_model])
-        self._level_start = wp.array(starts, dtype=wp.int32, device=self.device)
-        self.wanted = wp.array(np.asarray(lods), dtype=wp.int32, device=self.device)
+        self.level_model, self.level_lod = np.repeat(np.arange(len(levels)), np.diff(starts)), np.concatenate(levels)
+        keys = (self.level_model << 32) + self.level_lod
+        placed = np.minimum(np.searchsorted(keys, (model << 32) + np.asarray(lods)), starts[model + 1] - 1)
+        beforehand, own = np.flatnonzero(shared[self.level_model]), np.flatnonzero(~shared[model])
+        # States of levels first, then those of objects.
+        made = np.full(len(keys), -1)
+        made[beforehand] = np.arange(len(beforehand))
+        serving = made[placed]
+        serving[own] = len(beforehand) + np.arange(len(own))
+        state_level = np.concatenate([beforehand, placed[own]])
+        wanted = zip(self.level_model[state_level].tolist(), self.level_lod[state_level].tolist())
+        ids = batch.replace_states(list(wanted), serving)
+        self._level_state = np.where(made >= 0, ids[made], -1)
+        self._update, self.plan = None, None
+        if len(own):
+            self._update = DeviceLodUpdate(batch.models, batch.states, ids[len(beforehand) :])
+            self.plan = self._update.plan
+        self.levels = self._upload(starts, placed)
+        self.wanted = self._int32(self.level_lod[placed])
         self.faults = wp.array(NO_FAULTS, dtype=wp.int32, device=self.device)
 
+    def _int32(self, values):
+        return wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=self.device)
+
+    def _upload(self, starts, placed):
+        made = level_kernels.Levels()
+        made.object_model, made.start = self._int32(self.batch.object_model), self._int32(starts)
+        made.lod, made.state = self._int32(self.level_lod), self._int32(self._level_state)
+        made.level, made.direction = self._int32(placed), self._int32(0 * placed)
+        made.count = self._int32(np.bincount(placed, minlength=len(self.level_lod)))
+        made.state_lod = self._int32([]) if self._update is None else self._update.wanted
+        made.changed = self._int32([0, 0])
+        return made
+
     def launch(self):
-        """Point objects at other states. One launch."""
-        _, states, objects = self.batch.pools
-        inputs = [states, self._level_start, self.wanted, objects, self.faults]
-        wp.launch(work_lists.pick_state_kernel, len(self.wanted), inputs, device=self.device)
+        """Bring objects to their levels: one launch, and those of `DeviceLodUpdate` where states are updated."""
+        try:
+            self.levels.changed.zero_()
+            inputs = [self.wanted, self.levels, self.batch.objects.pool, self.faults]
+            wp.launch(level_kernels.place_level_kernel, len(self.wanted), inputs, device=self.device)
+            if self._update is not None:
+                self._update.launch()
+        except BaseException:
+            if self.batch.follows(self):
+                self.batch.tear()
+            raise
+
+    def read(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return LOD and tree state of every object as the last launch has left them. Waits for the device."""
+        level = self.levels.level.numpy()
+        state = self._level_state[level]
+        return self.level_lod[level], np.where(state >= 0, state, self.batch.objects.state)

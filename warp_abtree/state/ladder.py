@@ -38,6 +38,10 @@ class Ladder:
         self.faces = np.array([progressive.active_count(lods) for progressive, lods in rows], np.int32)
         self.entry = np.array([progressive.split_start[lods] for progressive, lods in rows], np.int32)
 
+    def levels(self) -> list:
+        """Return the distinct LODs of each model, rising int arrays."""
+        return [np.unique(lods) for lods in self.lod]
+
     def _levels(self, model, spacing):
         fraction = np.arange(self.steps + 1) / self.steps
         if spacing == "operations":

@@ -204,14 +204,27 @@ class LodUpdate(WorkLists):
         active_update(self.models.pool, self.states.pool, self)
 
 
-def build_states(models: ModelArrays, states: StateArrays, state_model, lods) -> list:
-    """Make a state for each model and LOD of two lists, of its own each, and return their ids.
+def replace_states(
+    models: ModelArrays, states: StateArrays, objects: ObjectArrays, wanted: list, serving: np.ndarray
+) -> np.ndarray:
+    """Make states of their own, point objects at them, and free all others; return their ids, int32.
+
+    All that it needs is allocated before the first state in use changes (`StateArrays.change`).
+
+    Args:
+        wanted: Model and LOD of each state.
+        serving: Entry of that list that serves each object, int (n,).
 
     Raises:
         ValueError: The pool would pass 2^30 nodes.
     """
-    ids = states.reserve(state_model)
-    LodUpdate(models, states, [(state, int(lod), -1) for state, lod in zip(ids, lods, strict=True)]).launch()
+    ids = np.array(states.reserve([model for model, _ in wanted]), np.int32)
+    moves = [(state, lod, -1) for state, (_, lod) in zip(ids.tolist(), wanted, strict=True)]
+    update, chosen = LodUpdate(models, states, moves), ids[serving]
+    staged = objects.stage_states(chosen, states.generation)
+    update.launch()
+    states.free_others(ids)
+    objects.set_states(chosen, staged)
     return ids
 
 

@@ -60,13 +60,13 @@ def trace_budget(context):
     loaded = load_scene(SCENE, device=context.device, objects=objects)
     finest = loaded.frame(controller="none", clock=WorkClock())
     finest.run(frames // 2)
-    budget = float(np.median([row.cost_ms for row in finest.history if row.time >= AFTER / 2])) / BREACH
+    budget = float(np.median([row.total_ms for row in finest.history if row.time >= AFTER / 2])) / BREACH
     for controller in CONTROLLERS:
         context.progress(f"{controller} controller")
         frame = loaded.frame(controller=controller, budget_ms=budget, clock=WorkClock())
         frame.run(frames)
         for row in frame.history[::2]:
-            cost = {"cost": row.cost_ms / budget, "faces": row.faces}
+            cost = {"cost": row.total_ms / budget, "faces": row.faces}
             yield {"case": "trace", "controller": controller, "time": row.time} | cost
         judged = budget_report(frame.history, budget, after=AFTER)
         about = {"case": "budget", "controller": controller, "objects": loaded.scene.object_count}

@@ -97,6 +97,21 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
         }
         *(lanes*)(first_bound + (i - begin)) = has_first ? found : lanes{} + __builtin_inf();
     }
+    // Bring what the rest of these triangles are registered with into the cache, one step of all lists at a time.
+    int list[COVERS_AT_ONCE], lists = 0;
+    for (int i = begin; i < end; ++i)
+        if (first_bound[i - begin] > limit)
+            list[lists++] = covers.triangle.data[i];
+    while (lists > 0) {
+        int kept = 0;
+        for (int k = 0; k < lists; ++k) {
+            __builtin_prefetch(near.node_of + 3 * slot_at(list[k])[SLOT_FACE]);
+            const int sibling = slot_at(list[k])[SLOT_SIBLING];
+            if (sibling >= 0)
+                list[kept++] = sibling;
+        }
+        lists = kept;
+    }
     for (int i = begin; i < end; ++i, ++row) {
         const int t = covers.triangle.data[i];
         int* found = covers.face.data + columns * (wp::int64)row;

@@ -13,6 +13,16 @@ struct Corner {
 struct Polygon {
     int count;
     Corner corner[POLYGON_CORNERS];
+
+    Polygon() : count(0) {}
+    Polygon(const Polygon& other) { *this = other; }
+    // The corners in use alone.
+    Polygon& operator=(const Polygon& other) {
+        count = other.count;
+        for (int i = 0; i < count; ++i)
+            corner[i] = other.corner[i];
+        return *this;
+    }
 };
 
 struct NearFaces {

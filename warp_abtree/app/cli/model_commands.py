@@ -12,7 +12,7 @@ from warp_abtree.model.mesh import describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model
 from warp_abtree.model.obj import split_file_name
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.frame import resolve_lod
+from warp_abtree.simulate.lod_request import resolve_lod
 
 INFO_SUMMARY = "say what a mesh or a built model holds and what is odd about it"
 INFO_EXAMPLES = ("cow.obj", "cow.npz", "warp:bunny --json")

@@ -51,10 +51,13 @@ def run(options, progress):
     controller = loaded.control.asked(options.controller, options.budget).controller
     frame = loaded.frame(controller=options.controller, budget_ms=options.budget, bodies=bodies)
     lods = []
-    for done in range(frames):
-        frame.step()
-        lods.append(loaded.scene.lods)
-        progress("frames", done + 1, frames)
+
+    def after_frame(done, total):
+        if options.plot:
+            lods.append(loaded.scene.lods)
+        progress("frames", done, total)
+
+    frame.run(frames, after_frame)
     progress.close()
     written = [str(path) for path in _write(options, loaded, frame, (controller, lods))]
     summary = {

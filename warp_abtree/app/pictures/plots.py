@@ -6,7 +6,7 @@ import numpy as np
 
 from warp_abtree.app.pictures.render import BACKGROUND, write_png
 from warp_abtree.app.styles import STAGE_LABELS
-from warp_abtree.simulate.frame import FrameRow
+from warp_abtree.simulate.frame_row import FrameRow
 
 
 def _make_figure(size, title):

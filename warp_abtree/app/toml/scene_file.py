@@ -17,7 +17,8 @@ from warp_abtree.app.toml.models import build_model
 from warp_abtree.app.toml.objects import make_groups
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.frame import Frame, LodSweep, resolve_lod
+from warp_abtree.simulate.frame import Frame
+from warp_abtree.simulate.lod_request import LodSweep, resolve_lod
 from warp_abtree.simulate.motion import Kinematic
 from warp_abtree.simulate.rigid_bodies import Dynamics
 

@@ -1,0 +1,99 @@
+"""What one frame did: `FrameRow`, and what its LODs amount to."""
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from warp_abtree.lod.timing import STAGES
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """What one frame did.
+
+    Attributes:
+        frame, time: Number from 0, and time in the scene [s].
+        objects, states: Objects, and the distinct (model, LOD) among them, which share a tree state.
+        pairs: Candidate pairs of the broad phase.
+        intersecting: Pairs that intersect.
+        hits: Intersecting face pairs; None where only "any" was asked.
+        lod_min, lod_max: Least and greatest LOD of any object.
+        faces: Active faces of all objects together.
+        error_mean, error_max: Mean and greatest `Model.error_at` of the objects at their LODs, one-sided [world units].
+        lods_changed: Objects whose LOD this frame changed.
+        oscillations: Those of them whose previous change had the opposite direction.
+        nodes_refitted: Nodes of all updated trees; none where a controller finds a tree state for each level.
+        node_tests, triangle_tests: Pairs of boxes and of faces tested.
+        budget_ms: T that a controller held [ms]; None without a budget.
+        select_ms, refine_ms, move_ms: Selection of LODs; LOD change and refit; poses [ms].
+        broad_ms, query_ms: Broad phase; narrow phase, and all of it where the motion finds contacts [ms].
+        answer_ms: Response of the motion [ms].
+    """
+
+    frame: int
+    time: float
+    objects: int
+    states: int
+    pairs: int
+    intersecting: int
+    hits: int | None
+    lod_min: int
+    lod_max: int
+    faces: int
+    error_mean: float
+    error_max: float
+    lods_changed: int
+    oscillations: int
+    nodes_refitted: int
+    node_tests: int
+    triangle_tests: int
+    budget_ms: float | None
+    select_ms: float
+    refine_ms: float
+    move_ms: float
+    broad_ms: float
+    query_ms: float
+    answer_ms: float
+
+    @property
+    def total_ms(self) -> float:
+        """All stages together, which a budget is for [ms]."""
+        return sum(getattr(self, stage) for stage in STAGES)
+
+    def as_dict(self) -> dict:
+        """Return the row as plain values, total_ms among them."""
+        return {**asdict(self), "total_ms": self.total_ms}
+
+    @classmethod
+    def names(cls) -> list[str]:
+        """Return the names of `as_dict` in their order."""
+        return [*(field.name for field in fields(cls)), "total_ms"]
+
+
+class LodTable:
+    """Columns of a `FrameRow` about LODs.
+
+    Args:
+        models: `Model`s.
+        level_model, level_lod: Model and LOD of each level at which objects may stand, in this order, int arrays.
+    """
+
+    def __init__(self, models, level_model, level_lod):
+        self.lod = np.asarray(level_lod)
+        levels = [(models[model], lod) for model, lod in zip(np.asarray(level_model).tolist(), self.lod.tolist())]
+        self.error = np.array([model.error_at(lod) for model, lod in levels])
+        self.faces = np.array([model.progressive.active_count(lod) for model, lod in levels])
+
+    def columns(self, count) -> dict[str, Any]:
+        """Return the columns for a number of objects at each level, int array."""
+        used = np.flatnonzero(count)
+        repeats, error = count[used], self.error[used]
+        return {
+            "states": len(used),
+            "lod_min": int(self.lod[used].min()),
+            "lod_max": int(self.lod[used].max()),
+            "faces": int(self.faces[used] @ repeats),
+            "error_mean": float(sum((error * repeats).tolist()) / int(repeats.sum())),
+            "error_max": float(error.max()),
+        }
