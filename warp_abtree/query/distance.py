@@ -36,8 +36,8 @@ from warp_abtree.query.result import DISTANCES, Found, Result
 from warp_abtree.query.staging import first_rows
 
 COUNTER_COUNT = 4
-# Place of the search among the launches, from their end.
-SEARCH = -4
+# Places among the launches, from their end: of the search, and of what is about pairs that intersect.
+SEARCH, CROSSINGS = -4, (-3, -1)
 # Pairs that make a further core worth its while, which costs some 50 us.
 PAIRS_A_CORE = 4
 
@@ -119,6 +119,7 @@ class DistanceQuery(Query):
         self._slabs.made = wp.empty(0, dtype=wp.vec4i, device=scene.device)
         self._counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity)
+        self._found.launched = self.guard.launched
 
     def set_pairs(self, pairs, beyond=None):
         """Query other pairs from now on, in the room there is if they fit; beyond None keeps the distances.
@@ -191,15 +192,16 @@ class DistanceQuery(Query):
         if not self.uses_warps():
             self._fit_slabs()
         super().traverse()
-        self._found.launched = self.guard.launched
         if self.device.is_capturing:
             self._make_distances(wp.launch)
             return
         commands = self._commands.find("distances", self.guard.given(), self._make_distances)
-        for command in commands:
-            if command is commands[SEARCH] and not self.uses_warps():
+        # On the CPU what is launched is done.
+        meeting = self.device.is_cuda or bool(self.hits.any_hit.numpy().any())
+        for place, command in enumerate(commands, -len(commands)):
+            if place == SEARCH and not self.uses_warps():
                 launch_on_cores(command.launch, room, current_regime().cpu_threads, PAIRS_A_CORE)
-            else:
+            elif meeting or place not in CROSSINGS:
                 command.launch()
 
     def _fit_slabs(self):
@@ -241,6 +243,7 @@ class DistanceQuery(Query):
     def _make_result(self, found: Found, device: bool, with_rows: bool = True) -> Result:
         n, answers = len(found.pairs), self.distances
         for name in (*DISTANCES, "points"):
-            rows = first_rows(getattr(answers, "faces" if name == "point_faces" else name), n)
+            rows = getattr(answers, "faces" if name == "point_faces" else name)
+            rows = rows if len(rows) == n else first_rows(rows, n)
             setattr(found, name, wp.clone(rows) if device else rows.numpy().copy())
         return super()._make_result(found, device, with_rows)

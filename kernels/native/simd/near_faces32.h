@@ -3,7 +3,7 @@
 #include "builtin.h"
 #include "simd/float32.h"
 
-struct NearFaces {
+struct NearestFaces {
     typedef Float32 F;
     typedef F::lanes lanes;
     typedef F::bits bits;

@@ -30,7 +30,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
 #include "simd/near_boxes.h"
 #include "simd/near_faces32.h"
 #include "simd/nearest_memory.h"
-    typedef NearFaces N;
+    typedef NearestFaces N;
     typedef N::F F;
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
