@@ -12,6 +12,17 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.arithmetic.predicates import EXACT
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.descent import (
+    CPU_STACK_LENGTH,
+    NEVER,
+    WAITING_LENGTH,
+    Descent,
+    advance,
+    count_repeats,
+    seek_elsewhere,
+    start_pair,
+    three_numbers,
+)
 from warp_abtree.kernels.traversal.face_pairs import (
     OUTPUT_ANY,
     OUTPUT_FACES,
@@ -28,96 +39,12 @@ from warp_abtree.kernels.traversal.warp_stack import take_slots
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
-ITEMS_AT_ONCE = native.constant("ITEMS_AT_ONCE")
-CPU_STACK_LENGTH = native.constant("CPU_STACK_LENGTH")
-DEPTH_FIRST_LENGTH = native.constant("DEPTH_FIRST_LENGTH")
-SUBTREES_KEPT = 512
-SUBTREE_DEPTH, SUBTREE_RECORDS = native.constant("SUBTREE_DEPTH"), native.constant("SUBTREE_RECORDS")
-# Zeros in front of a thread's memory say that it holds nothing.
-SLAB_ZEROS = 32
-SLAB_HEADER = native.constant("SLAB_HEADER")
-NO_FLOOR = native.constant("NO_FLOOR")
-# Slabs are made where so many pairs of nodes were compared for a hit, or more.
-NODE_TESTS_A_HIT = wp.constant(wp.int64(256))
-NEVER = wp.constant(wp.int64(2**62))
-
-# A thread tests so many face pairs at a time, so that its processor finds its way through either loop. For `any`, which
-# an early hit ends, few at first, and twice as many after each search without one, so that what an end wastes is at
-# most a part of what was needed.
-FACES_READY, FACES_FOR_ANY = wp.constant(128), wp.constant(4)
-ITEMS_FOR_ANY = wp.constant(8)
-# So many items leave room to go on depth first from any of them.
-STACK_TO_SHUFFLE = wp.constant(CPU_STACK_LENGTH // 2)
-WAITING_LENGTH = int(FACES_READY) + 4 * ITEMS_AT_ONCE + 16  # 16 are written at a time
-
 long_counts = wp.types.vector(length=4, dtype=wp.int64)
-three_numbers = wp.types.vector(length=3, dtype=wp.int64)
 
 
 @wp.func_native(native.body("simd/subtrees.h", "take_thread"))
 def take_thread(counter: wp.array(dtype=wp.int32)) -> wp.int32:
     """Return the number of a thread that no other thread of a launch has."""
-
-
-@wp.func_native(native.body("simd/descend.h", "descend"))
-def descend(
-    states: StatePool,
-    pose: PairPose,
-    at_once: wp.int32,
-    ready: wp.int32,
-    most: wp.int64,
-    top: wp.int32,
-    stack: wp.array(dtype=wp.int64),
-    faces: wp.array(dtype=wp.int64),
-) -> three_numbers:
-    """Test items from the top of a stack until there are none, or so many leaf pairs wait as are asked for.
-
-    The same as `compare_node_pair`, four pairs of boxes at a time. Ends also once so many pairs of boxes were compared.
-
-    Returns the items left on the stack, the leaf pairs that wait, and the pairs of boxes compared.
-    """
-
-
-@wp.func_native(native.body("simd/descend.h", "move_below"))
-def move_below(
-    floors: wp.vec2i, top: wp.int32, stack: wp.array(dtype=wp.int64), below: wp.array(dtype=wp.int64)
-) -> wp.vec2i:
-    """Move items near the top of a stack to a list if both nodes lie in subtrees whose roots are on floors.
-
-    Returns the items left on the stack, and those on the list, at most ITEMS_AT_ONCE.
-    """
-
-
-@wp.func_native(native.body("simd/subtrees.h", "open_subtrees"))
-def open_subtrees(
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    thread: wp.int32,
-    memory: wp.array2d(dtype=wp.float32),
-) -> wp.vec2i:
-    """Choose the directions of slabs for an object pair; return its floors, see `move_below`.
-
-    Directions and slabs of A stay for the next pair with it, in this launch or a later one.
-    """
-
-
-@wp.func_native(native.body("simd/subtrees.h", "descend_subtrees"))
-def descend_subtrees(
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    thread: wp.int32,
-    ready: wp.int32,
-    top: wp.int32,
-    stack: wp.array(dtype=wp.int64),
-    memory: wp.array2d(dtype=wp.float32),
-    faces: wp.array(dtype=wp.int64),
-) -> three_numbers:
-    """Test items below the floors until there are none, or so many leaf pairs wait as are asked for.
-
-    Returns the items left on the stack, the leaf pairs that wait, and the pairs of nodes compared.
-    """
 
 
 @wp.func_native(native.body("simd/float32_filter.h", "simd_float32_filter"))
@@ -160,12 +87,6 @@ def simd_float64_filter(
     """
 
 
-def slab_memory_words(depth: int) -> int:
-    """Return the length of a thread's memory for slabs, for trees of a depth at most."""
-    slots = max(16, min(SUBTREES_KEPT, 2 ** max(0, depth - SUBTREE_DEPTH)))
-    return 16 + SLAB_HEADER + slots * (2 + 32 * SUBTREE_RECORDS)
-
-
 @wp.func
 def report_hits(
     output: wp.int32, pair: wp.int32, swapped: wp.int32, count: wp.int32, faces: wp.array(dtype=wp.int64), hits: Hits
@@ -206,7 +127,7 @@ def resolve_faces(
     return met, tested
 
 
-@wp.func
+@wp.func(inline=False)
 def resolve_uncertain(
     mode: wp.int32,
     output: wp.int32,
@@ -220,13 +141,13 @@ def resolve_uncertain(
 ):
     """Decide uncertain face pairs, as `resolve_faces`: for EXACT in float64, then what is inexact there.
 
+    Not inlined: compiling takes less long, and most calls of its caller have none.
+
     Returns how many have met then, how many were decided, and how many of these took exact signs.
     """
     if mode != EXACT:
         met, tested = resolve_faces(mode, output, models, states, pose, met, count, uncertain, met_inout)
         return met, tested, 0
-    if count == 0 or (output == OUTPUT_ANY and met > 0):
-        return met, 0, 0
     counts = simd_float64_filter(models, states, pose, output == OUTPUT_ANY, met, count, uncertain, met_inout)
     met, inexact = resolve_faces(
         mode, output, models, states, pose, wp.int32(counts[0]), wp.int32(counts[1]), uncertain, met_inout
@@ -242,73 +163,6 @@ def write_counts(p: wp.int32, hit_count: wp.int64, tests: long_counts, hits: Hit
     hits.triangle_tests[p] = tests[1]
     hits.float64_tests[p] = tests[2]
     hits.exact_tests[p] = tests[3]
-
-
-@wp.struct
-class Descent:
-    """How a thread goes through an object pair, and how far it is."""
-
-    thread: wp.int32  # row of the memory for slabs
-    at_once: wp.int32  # items taken from the stack
-    ready: wp.int32  # leaf pairs that are tested together
-    top: wp.int32  # items on the stack
-    deep: wp.int32  # items below the floors
-    floors: wp.vec2i  # levels of the subtrees that have slabs, NO_FLOOR for none
-    plain_tests: wp.int64  # node pair tests after which slabs may be made
-
-
-@wp.func
-def start_pair(output: wp.int32, plain_tests: wp.int64, before: Descent):
-    """Return the descent from the item on the stack."""
-    descent = before
-    descent.at_once = wp.where(output == OUTPUT_ANY, ITEMS_FOR_ANY, ITEMS_AT_ONCE)
-    descent.ready = wp.where(output == OUTPUT_ANY, FACES_FOR_ANY, FACES_READY)
-    descent.top = 1
-    descent.deep = 0
-    descent.floors = wp.vec2i(NO_FLOOR, NO_FLOOR)
-    descent.plain_tests = plain_tests
-    return descent
-
-
-@wp.func
-def advance(
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    hit_count: wp.int64,
-    tested: wp.int64,
-    before: Descent,
-    stack: wp.array(dtype=wp.int64),
-    below: wp.array(dtype=wp.int64),
-    memory: wp.array2d(dtype=wp.float32),
-    faces: wp.array(dtype=wp.int64),
-):
-    """Descend until leaf pairs wait; return the descent then, the leaf pairs, and the node pair tests more.
-
-    Boxes decide until few of many node pair tests have led to hits; then slabs, below the floors.
-    """
-    descent = before
-    if descent.top > 0 and tested >= descent.plain_tests:
-        descent.plain_tests += tested
-        if hit_count * NODE_TESTS_A_HIT <= tested:
-            descent.floors = open_subtrees(models, states, pose, descent.thread, memory)
-            descent.plain_tests = NEVER
-    plain = descent.floors[0] == NO_FLOOR
-    if not plain and descent.deep == 0:
-        moved = move_below(descent.floors, descent.top, stack, below)
-        descent.top = moved[0]
-        descent.deep = moved[1]
-    progress = three_numbers()
-    if descent.deep > 0:
-        progress = descend_subtrees(
-            models, states, pose, descent.thread, descent.ready, descent.deep, below, memory, faces
-        )
-        descent.deep = wp.int32(progress[0])
-    else:
-        most = wp.where(plain, descent.plain_tests - tested, wp.int64(1))
-        progress = descend(states, pose, descent.at_once, descent.ready, most, descent.top, stack, faces)
-        descent.top = wp.int32(progress[0])
-    return descent, wp.int32(progress[1]), progress[2]
 
 
 @wp.func
@@ -328,28 +182,11 @@ def test_leaf_pairs(
         return near, long_counts(wp.int64(0), wp.int64(decided), wp.int64(0), wp.int64(0))
     error, unit = float32_bounds(mode, pose)
     filtered = simd_float32_filter(models, states, pose, error, unit, output == OUTPUT_ANY, waiting, faces, uncertain)
-    met, resolved, inexact = resolve_uncertain(
-        mode, output, models, states, pose, wp.int32(filtered[0]), wp.int32(filtered[1]), uncertain, faces
-    )
+    met, count = wp.int32(filtered[0]), wp.int32(filtered[1])
+    resolved, inexact = wp.int32(0), wp.int32(0)
+    if count > 0 and not (output == OUTPUT_ANY and met > 0):
+        met, resolved, inexact = resolve_uncertain(mode, output, models, states, pose, met, count, uncertain, faces)
     return met, long_counts(wp.int64(0), filtered[2], wp.int64(resolved), wp.int64(inexact))
-
-
-@wp.func
-def seek_elsewhere(met: wp.int32, number: wp.int64, before: Descent, stack: wp.array(dtype=wp.int64)):
-    """End a search that found a hit; else go on with some other item of the stack, and with more at a time."""
-    descent = before
-    if met > 0:
-        descent.top = 0
-        descent.deep = 0
-    descent.at_once = wp.min(2 * descent.at_once, ITEMS_AT_ONCE)
-    descent.ready = wp.min(2 * descent.ready, FACES_READY)
-    last = descent.top - 1
-    if last > 0 and last < STACK_TO_SHUFFLE:
-        at = wp.int32((number * wp.int64(40503) >> wp.int64(8)) % wp.int64(descent.top))
-        item = stack[at]
-        stack[at] = stack[last]
-        stack[last] = item
-    return descent
 
 
 @functools.cache
@@ -381,7 +218,9 @@ def thread_traversal(mode: int):
             pose = pair_poses[p]
             stack[0] = first_item(states, pose)
             slabs = descent.thread < memory.shape[0] and wp.static(mode != int(WITHIN)) and pose.error < wp.inf
-            descent = start_pair(output, wp.where(slabs, wp.int64(plain_tests), NEVER), descent)
+            descent = start_pair(
+                output, wp.where(slabs, wp.int64(plain_tests), NEVER), count_repeats(p, pair_poses), descent
+            )
             hit_count, tests = wp.int64(0), long_counts()
             while descent.top > 0 or descent.deep > 0:
                 descent, waiting, compared = advance(

@@ -8,6 +8,7 @@ from helpers.questions import QUARTERS, ask, coarse, sort_rows, to_matrix
 from helpers.samples import SHAPES, STILL, contact_poses, random_poses, sample, true_faces
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 LATTICE_NAMES = ("torus", "crumbs", "lattice soup")
 
@@ -168,17 +169,23 @@ def test_batches_buffers_and_precisions_do_not_matter(device):
         scene.add(sample(name))
     scene.add(sample("grid"), (0.3, 0.1, 0, 0, 0, 0, 1))  # in one plane with the other
     pairs = np.array([(i, j) for i in range(10) for j in range(10) if i != j])
-    whole = scene.intersect(pairs, output="faces")
+    # Slabs of an object serve several pairs in a row, so that tests depend on these; boxes alone do not.
+    with testing.regime(plain_tests=10**9):
+        whole = ab.Query(scene, pairs=pairs).run()
     assert whole.float64_tests.sum() > whole.exact_tests.sum() > 100
     for trial in range(6):
         order = rng.permutation(len(pairs))
         capacities = rng.integers(1, 2 * whole.float64_tests.sum(), 2)
         scene.intersect(pairs[order], output="faces", precision="float32")
-        query = ab.Query(scene, pairs=pairs[order], capacity=ab.Buffers(capacities[0], uncertain=capacities[1]))
+        by_boxes = trial < 4
+        with testing.regime(plain_tests=10**9 if by_boxes else 3):
+            query = ab.Query(scene, pairs=pairs[order], capacity=ab.Buffers(capacities[0], uncertain=capacities[1]))
         if trial % 2:
             query.run()
         result = query.run()
-        np.testing.assert_array_equal(work_of(result), work_of(whole)[order])
+        np.testing.assert_array_equal(result.count, whole.count[order])
+        if by_boxes or query.uses_warps():
+            np.testing.assert_array_equal(work_of(result), work_of(whole)[order])
         faces = result.faces.copy()
         faces[:, 0] = order[faces[:, 0]]
         np.testing.assert_array_equal(sort_rows(faces), whole.faces)

@@ -10,15 +10,15 @@ import warp_abtree as ab
 from warp_abtree import testing
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal import simd
-from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
-from warp_abtree.kernels.traversal.simd import (
+from warp_abtree.kernels.traversal import descent
+from warp_abtree.kernels.traversal.descent import (
     CPU_STACK_LENGTH,
     WAITING_LENGTH,
     descend_subtrees,
     open_subtrees,
     slab_memory_words,
 )
+from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -93,7 +93,7 @@ def test_many_subtrees_share_little_memory(monkeypatch):
         query = ab.Query(scene, "faces", pairs=[(0, 1)])
         found = [query.run().faces]
         assert query.slab_memory.shape[1] > slab_memory_words(0), "more subtrees than slots"
-        monkeypatch.setattr(simd, "slab_memory_words", lambda depth: slab_memory_words(0))
+        monkeypatch.setattr(descent, "slab_memory_words", lambda depth: slab_memory_words(0))
         query = ab.Query(scene, "faces", pairs=[(0, 1)])
         assert query.slab_memory.shape[1] == slab_memory_words(0)
         found.append(query.run().faces)
@@ -115,6 +115,25 @@ def test_slabs_that_stay_are_those_of_the_lod():
             expected = ab.Query(scene, "faces", pairs=pairs).run().faces
         np.testing.assert_array_equal(kept.run().faces, expected)
         assert len(expected) > 0
+
+
+def test_slabs_serve_several_pairs_in_a_row():
+    """Where hits are too frequent for a pair alone: from the second pair of an object on, in every launch alike."""
+    rng = np.random.default_rng(7)
+    scene, model = ab.Scene(CPU), sample("torus")
+    scene.add(model)
+    pairs = [(0, scene.add(model, pose)) for pose in random_poses(rng, 8, 0.5)]
+    found = {}
+    for plain_tests, threads in ((10**9, 1), (10**4, 1), (10**4, 2)):
+        with testing.regime(plain_tests=plain_tests, cpu_threads=threads):
+            query = ab.Query(scene, "faces", pairs=pairs)
+            found[plain_tests, threads] = query.run(), query.run()
+    (plain, _), (one, again), (two, _) = found.values()
+    assert (plain.count > 10).all() and (24 * plain.count < plain.node_tests).sum() > 4
+    for result in (one, again, two):
+        np.testing.assert_array_equal(result.faces, plain.faces)
+        np.testing.assert_array_equal(result.node_tests, one.node_tests)
+    assert one.node_tests[0] == plain.node_tests[0] and (one.node_tests < plain.node_tests).sum() > 4
 
 
 def test_slabs_that_stay_fit_an_object_of_any_size():

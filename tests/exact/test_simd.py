@@ -11,16 +11,11 @@ from helpers.samples import STILL, contact_poses, sample
 from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal import face_pairs, simd
+from warp_abtree.kernels.traversal import descent, face_pairs
+from warp_abtree.kernels.traversal.descent import CPU_STACK_LENGTH, ITEMS_AT_ONCE, WAITING_LENGTH
 from warp_abtree.kernels.traversal.face_pairs import face_plane_signs, intersect_straddling_faces
 from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
-from warp_abtree.kernels.traversal.simd import (
-    CPU_STACK_LENGTH,
-    ITEMS_AT_ONCE,
-    WAITING_LENGTH,
-    simd_float32_filter,
-    simd_float64_filter,
-)
+from warp_abtree.kernels.traversal.simd import simd_float32_filter, simd_float64_filter
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, SEPARATED
 
 pytestmark = pytest.mark.slow
@@ -244,7 +239,7 @@ def descend_kernel(
         stack[i] = root
     top = wp.int32(how[0])
     while top > 0:
-        progress = simd.descend(states, pose[0], how[1], how[2], simd.NEVER, top, stack, faces)
+        progress = descent.descend(states, pose[0], how[1], how[2], descent.NEVER, top, stack, faces)
         top = wp.int32(progress[0])
         counts[1] = counts[1] + progress[2]
         for i in range(wp.int32(progress[1])):
@@ -262,7 +257,7 @@ def test_descends_as_node_pair_tests_do(names):
         cases.append((a, lods[0], pose_a, b, lods[1], pose_b))
     most = WAITING_LENGTH - 4 * ITEMS_AT_ONCE - 4
     ways = [(1, taken, ready) for taken in (1, 2, 7, ITEMS_AT_ONCE) for ready in (1, most)]
-    full = CPU_STACK_LENGTH - simd.DEPTH_FIRST_LENGTH, ITEMS_AT_ONCE, 100  # worked off one item at a time
+    full = CPU_STACK_LENGTH - descent.DEPTH_FIRST_LENGTH, ITEMS_AT_ONCE, 100  # worked off one item at a time
     for case in cases:
         query, plain = GpuQuery(scene_of(CPU, [case]), "faces", pairs=[(0, 1)]), None  # which takes items one by one
         result = query.run()

@@ -12,7 +12,7 @@ from helpers.scenes import add_objects
 
 import warp_abtree as ab
 from warp_abtree.checks.cpu_threads import core_count
-from warp_abtree.kernels.traversal import simd
+from warp_abtree.kernels.traversal import descent
 from warp_abtree.scene import sweep as pose_sweep
 
 CHUNK = 1024  # poses of a sweep at a time
@@ -149,7 +149,7 @@ def test_a_sweep_needs_no_more_for_more_poses(device, allocations, monkeypatch):
     one, _ = allocations.gained(lambda: ab.sweep(ball, ball, poses[:CHUNK], device=device))
     twenty, _ = allocations.gained(lambda: ab.sweep(ball, ball, poses, device=device))
     # Lists between stages and slots of the load balance; on the CPU what each thread keeps slabs in.
-    slabs = 4 * core_count() * simd.slab_memory_words(ball.tree.depth)
+    slabs = 4 * core_count() * descent.slab_memory_words(ball.tree.depth)
     rows = 24 * 65536 + 2**22 if wp.get_device(device).is_cuda else slabs
     assert 0 < one < whole + 512 * CHUNK + rows + SLACK
     assert abs(twenty) <= SLACK

@@ -10,7 +10,7 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.cpu_threads import core_count
 from warp_abtree.checks.regime import Regime, current_regime
 from warp_abtree.kernels import poses
-from warp_abtree.kernels.traversal import face_pairs, simd
+from warp_abtree.kernels.traversal import descent, face_pairs
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.request import check_pair_room, check_within
 from warp_abtree.query.result import COUNTERS
@@ -154,9 +154,9 @@ class QueryBuffers:
         if self.uses_warps():
             return wp.empty((0, 0), dtype=wp.float32, device=self.device)
         threads = min(room, current_regime().cpu_threads or core_count())
-        words = simd.slab_memory_words(int(self.batch.models.depth.max()))
+        words = descent.slab_memory_words(int(self.batch.models.depth.max()))
         memory = wp.empty((threads, words), dtype=wp.float32, device=self.device)
-        memory.numpy()[:, : simd.SLAB_ZEROS] = 0.0
+        memory.numpy()[:, : descent.SLAB_ZEROS] = 0.0
         return memory
 
     def _make_room(self, pairs) -> list:

@@ -12,64 +12,6 @@ wp::int32 take_thread(wp::array_t<wp::int32> counter) {
 }
 
 template <class ModelPool, class StatePool, class PairPose>
-wp::vec_t<2, wp::int32> open_subtrees(ModelPool models, StatePool states, PairPose pose, wp::int32 thread,
-                                      wp::array_t<wp::float32> memory) {
-    wp::vec_t<2, wp::int32> floors;
-#if defined(__CUDA_ARCH__)
-    __trap();  // warps have a traversal of their own
-#else
-#include "simd/slabs.h"
-    const Slabs::Memory kept = Slabs::find_memory(memory.data, memory.shape[1], thread);
-    const Slabs::Box* nodes = (const Slabs::Box*)states.node_box.data;
-    // What stands there is that of a model at an LOD, from whichever launch.
-    int state = 0;
-    while (states.node_start.data[state] != pose.node_a)
-        ++state;
-    const int whose[3] = {pose.node_a + 1, states.model.data[state], states.lod.data[state]};
-    if (kept.whose[0] != whose[0] || kept.whose[1] != whose[1] || kept.whose[2] != whose[2]) {
-        Slabs::choose_axes(nodes + pose.node_a, states.face_corner.data + pose.corner_a, models.vertex_near.data,
-                           kept.axes);
-        for (int i = 0; i < 3; ++i)
-            kept.whose[i] = whose[i];
-        for (int i = 0; i < kept.slots; ++i)
-            kept.roots[i] = 0;
-    }
-    for (int i = 0; i < kept.slots; ++i)
-        kept.roots[kept.slots + i] = 0;
-    const auto& r = pose.rotation.data;
-    const auto& t = pose.translation32;
-    const Slabs::Box& whole = nodes[pose.node_a + 1];
-    for (int d = 0; d < 16; ++d) {
-        const double n[3] = {kept.axes[d], kept.axes[16 + d], kept.axes[32 + d]};
-        double size = 0.0, middle = 0.0, shift = 0.0, reach = 0.0;
-        for (int j = 0; j < 3; ++j) {
-            const double low = whole.lower[j], high = whole.upper[j];
-            size += __builtin_elementwise_abs(n[j]) * (high - low);
-            middle += 0.5 * n[j] * (high + low);
-            shift += n[j] * t[j];
-            reach = __builtin_elementwise_max(reach, high - low);
-        }
-        // Slabs of A depend on A alone, which keeps them for other pairs. Where A is flat, numbers could overflow.
-        const double steps = d < 14 && size * 0x1p20 > reach ? 65536.0 / size : 0.0;
-        // Three times the margin of boxes covers all rounding, see docs/exactness.md. A direction that tells nothing,
-        // since the margin is half of A's size or more, has slabs of B that reach everywhere.
-        const double margin = 3.0 * steps * pose.margin;
-        const double scale = margin < 32768.0 ? steps : 0.0;
-        for (int j = 0; j < 3; ++j) {
-            kept.of_a[16 * j + d] = (float)(steps * n[j]);
-            kept.of_b[16 * j + d] = (float)(-scale * ((n[0] * r[0][j] + n[1] * r[1][j]) + n[2] * r[2][j]));
-        }
-        kept.of_a[48 + d] = (float)(-steps * middle);
-        kept.of_b[48 + d] = (float)(scale * (middle - shift));
-        kept.of_b[64 + d] = scale > 0.0 ? (float)margin : 65536.0f;
-    }
-    kept.floors[0] = floors[0] = Slabs::find_floor(nodes + pose.node_a);
-    kept.floors[1] = floors[1] = Slabs::find_floor(nodes + pose.node_b);
-#endif
-    return floors;
-}
-
-template <class ModelPool, class StatePool, class PairPose>
 wp::vec_t<3, wp::int64> descend_subtrees(ModelPool models, StatePool states, PairPose pose, wp::int32 thread,
                                          wp::int32 ready, wp::int32 top, wp::array_t<wp::int64> stack,
                                          wp::array_t<wp::float32> memory, wp::array_t<wp::int64> faces) {
