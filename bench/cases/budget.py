@@ -2,21 +2,28 @@
 
 T is measured first: the median frame at the finest LODs, after the first second, over BREACH. On the CPU one core, and
 the CPU time of its thread, so that what else the machine does is left out.
+
+Then what control costs: a budget that the finest LODs keep makes the controller stay there, so that its frames have all
+of its cost and none of its gain; and selection of many LODs alone.
 """
 
 import contextlib
 import gc
+import importlib.util
 import time
 from pathlib import Path
 
 import numpy as np
+import trimesh
 import warp as wp
 
+import warp_abtree as ab
 from warp_abtree.app import load_scene
+from warp_abtree.lod.timing import STAGES
 from warp_abtree.simulate.budget_report import budget_report
 
 from .. import tables
-from ..timing import one_core
+from ..timing import medians, one_core, time_in_turn
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 NAMES = ("rain", "focus")
@@ -25,14 +32,22 @@ OBJECTS = {"cpu": {"rain": 300, "focus": 300}, "cuda": {"rain": 4000, "focus": 1
 OUTPUT = {"cpu": "count", "cuda": "contacts"}
 FRAMES, QUICK_FRAMES, QUICK_OBJECTS = 240, 75, 40
 BREACH = 3.5  # how often the finest LODs take the budget
+# What control costs: scenes, how many of their objects, and budgets in frames of the finest LODs.
+CONTROLLED = ("focus", "herd", "rain", "worlds")
+CONTROLLED_OBJECTS = {"cpu": 200, "cuda": None}
+BUDGETS = (2.0, 0.5)
+SELECTED = (1_500, 100_000)  # objects whose LODs are selected
 CONTROLLERS = ("none", "coarsest", "predictive", "paper", "tolerance")
 
 
 def run(device, quick=False, plots=None):
-    """Yield one row a scene and controller, over all frames after the first second.
+    """Yield one row a scene and controller, over all frames after the first second; then what control costs.
 
     budget_ms is T; for what is judged see `budget_report`. "none" has the finest LODs, "coarsest" the coarsest: no
     budget below can be held. plots is a folder for a figure a scene, None draws nothing.
+
+    Of rows with a ratio finest_ms is the median frame at the finest LODs, half of its runs before and half after those
+    under control; total_ms that under the controller, with the medians of its stages.
     """
     device = wp.get_device(device)
     kind = "cuda" if device.is_cuda else "cpu"
@@ -53,6 +68,14 @@ def run(device, quick=False, plots=None):
                 runs[controller] = frame.history
             if plots is not None:
                 draw_runs(name, runs, budget, plots)
+    frames = QUICK_FRAMES // 10 if quick else FRAMES
+    for name in CONTROLLED:
+        if name == "herd" and importlib.util.find_spec("pxr") is None:
+            continue  # its meshes need usd-core
+        objects = QUICK_OBJECTS if quick else CONTROLLED_OBJECTS[kind]
+        yield from compare(load_scene(SCENES / f"{name}.toml", device, objects=objects), name, frames)
+    for count in SELECTED[: 1 if quick else 2]:
+        yield from time_selection(device, count)
 
 
 def collect():
@@ -110,3 +133,52 @@ def draw_runs(name, runs, budget, folder):
     ]
     (figure,) = tables.pick(tables.read_layout("cases/figures.toml")["figure"], case="budget")
     print(tables.draw([figure | {"file": f"budget-{name}.svg"}], rows, folder), flush=True)
+
+
+def compare(loaded, name, frames):
+    """Yield a row a budget of one scene."""
+    finest = run_frames(loaded, frames, None)
+    for part in BUDGETS:
+        budget = part * float(np.median([row.total_ms for row in finest]))
+        controlled = run_frames(loaded, frames, budget)
+        finest += run_frames(loaded, frames, None)
+        stand, total = (float(np.median([row.total_ms for row in rows])) for rows in (finest, controlled))
+        stages = {stage: round(float(np.median([getattr(row, stage) for row in controlled])), 4) for stage in STAGES}
+        row = {"scene": name, "device": loaded.scene.device.name, "objects": loaded.scene.object_count}
+        row |= {"budget": part, "finest_ms": round(stand, 4), "total_ms": round(total, 4)}
+        yield row | stages | {"error_mean": controlled[-1].error_mean, "ratio": round(total / stand, 3)}
+
+
+def run_frames(loaded, frames, budget):
+    """Run a scene from its start, at its finest LODs or under a budget [ms]; return the second half of its rows."""
+    scene = loaded.scene
+    scene.set_lods([scene.models[model].lod_max for model in scene.object_model])
+    bodies = loaded.make_bodies()
+    motion = loaded.motion if bodies is None else bodies.motion(loaded.motion)
+    lods = None if budget is None else ab.PredictiveController(scene, budget, loaded.camera)
+    frame = ab.Frame(scene, motion, lods, time_step=loaded.time_step)
+    frame.warm_up()
+    collect()
+    return frame.run(frames)[frames // 2 :]
+
+
+def time_selection(device, count):
+    """Yield a row a controller that selects LODs of so many objects."""
+    sections = (48, 44, 40)
+    models = [ab.Model.load(trimesh.creation.torus(0.5, 0.2, major_sections=n, minor_sections=24)) for n in sections]
+    scene, places = ab.Scene(device), np.random.default_rng(0).uniform(-20, 20, (count, 3))
+    for i, place in enumerate(places):
+        scene.add(models[i % 3], pose=(*place, 0, 0, 0, 1), importance=1 + i % 3)
+    camera = ab.Camera.look_at((0, 0, 30), (0, 0, 0))
+    made = {
+        "predictive": ab.PredictiveController(scene, 10.0, camera),
+        "paper": ab.PaperController(scene, 10.0, camera),
+        "tolerance": ab.ToleranceController(scene, 0.01, camera),
+    }
+    for controller in made.values():
+        controller.prepare(ab.Feedback(0.0))
+    made["predictive"].tests.fill_(1000)
+    made["predictive"].rate.assign([1.0, 1e-7, 1e-6, 1.0, 0.5])
+    times = medians(time_in_turn({name: controller.launch for name, controller in made.items()}, device))
+    for name, taken in times.items():
+        yield {"controller": name, "device": device.name, "objects": count, "select_ms": round(taken, 4)}

@@ -36,6 +36,7 @@ class Curves:
     point: wp.array2d(dtype=wp.vec3d)  # the deepest candidate and one far from it [world units], shape [contact, 2]
     depth: wp.array2d(dtype=wp.float64)  # [world units], -1 where there is none, shape [contact, 2]
     normal: wp.array(dtype=wp.vec3d)  # of both candidates, shape [contact]
+    nearest: wp.array2d(dtype=wp.float64)  # squared distance from the points chosen, shape [contact, 2]
 
 
 @wp.struct
@@ -50,9 +51,16 @@ class Manifolds:
 
 @wp.func
 def find_root(parent: wp.array(dtype=wp.int32), i: wp.int32):
+    """Return the root of a set, and halve the way to it: threads that link neighbours at once make long ways."""
     root = i
-    while parent[root] != root:
-        root = parent[root]
+    up = parent[root]
+    while up != root:
+        top = parent[up]
+        if top != up:
+            # Nothing but such a step changes the entry of a member, so that it stays one towards the root.
+            parent[root] = top
+        root = up
+        up = top
     return root
 
 

@@ -4,6 +4,7 @@ import warp as wp
 
 from warp_abtree.kernels.arrays import ObjectPool
 from warp_abtree.kernels.contact.manifold import POINTS, Curves, Manifolds
+from warp_abtree.kernels.traversal.warp_stack import warp_lane, warp_max, warp_size
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -15,19 +16,29 @@ FAVOUR = wp.constant(wp.float64(2.0**-5))
 DEEPER = wp.constant(wp.float64(0.9))
 
 
+CANDIDATES = wp.constant(2)  # of each contact, numbered on from contact to contact
+
+
+@wp.func
+def best_of_warp(value: wp.float64, candidate: wp.int32):
+    """Return the greatest value of all lanes and the candidate that has it, the first of several."""
+    greatest = warp_max(value)
+    return wp.int32(-warp_max(wp.where(value == greatest, -wp.float64(candidate), -wp.float64(wp.inf)))), greatest
+
+
 @wp.func
 def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
-    """Return the deepest candidate of a pair, contact and number, and its depth, -1 where there is none."""
+    """Return the deepest candidate of a pair and its depth, -1 where there is none."""
     deepest = wp.float64(-1.0)
-    best = wp.vec2i(first, 0)
-    i = first
+    best = CANDIDATES * first
+    i = first + warp_lane()
     while i < end:
-        for k in range(2):
+        for k in range(CANDIDATES):
             if curves.depth[i, k] > deepest:
                 deepest = curves.depth[i, k]
-                best = wp.vec2i(i, k)
-        i += 1
-    return best, deepest
+                best = CANDIDATES * i + k
+        i += warp_size()
+    return best_of_warp(deepest, best)
 
 
 @wp.func
@@ -35,78 +46,89 @@ def find_outermost(first: wp.int32, end: wp.int32, least: wp.float64, along: wp.
     """Return the candidate that reaches farthest along a direction, of those of a least depth."""
     origin = curves.point[first, 0]
     farthest = -wp.float64(wp.inf)
-    best = wp.vec2i(first, 0)
-    i = first
+    best = CANDIDATES * first
+    i = first + warp_lane()
     while i < end:
-        for k in range(2):
+        for k in range(CANDIDATES):
             reach = wp.dot(along, curves.point[i, k] - origin)
             if curves.depth[i, k] >= least and reach > farthest:
                 farthest = reach
-                best = wp.vec2i(i, k)
-        i += 1
+                best = CANDIDATES * i + k
+        i += warp_size()
+    best, farthest = best_of_warp(farthest, best)
     return best
 
 
 @wp.func
 def distance_squared(
-    point: wp.vec3d, normal: wp.vec3d, size: wp.float64, p: wp.int32, count: wp.int32, manifolds: Manifolds
+    x: wp.vec3d,
+    normal: wp.vec3d,
+    size: wp.float64,
+    end: wp.int32,
+    point: wp.array(dtype=wp.vec3d),
+    normals: wp.array(dtype=wp.vec3d),
 ):
-    """Return how far a candidate lies from the nearest segment between points chosen, normals counted in sizes."""
+    """Return how far a candidate lies from the nearest segment that ends at a chosen point, normals counted in sizes.
+
+    Args:
+        end: That point. Segments begin at those before it and at itself.
+    """
     nearest = wp.float64(wp.inf)
-    j = wp.int32(0)
-    while j < count:
-        x = manifolds.point[p, j]
-        m = manifolds.normal[p, j]
-        r = point - x
-        u = size * (normal - m)
-        other = j
-        while other < count:
-            s = manifolds.point[p, other] - x
-            v = size * (manifolds.normal[p, other] - m)
-            along = wp.dot(r, s) + wp.dot(u, v)
-            length = wp.dot(s, s) + wp.dot(v, v)
-            t = wp.float64(0.0)
-            if length > wp.float64(0.0):
-                t = wp.clamp(along / length, wp.float64(0.0), wp.float64(1.0))
-            d = r - t * s
-            e = u - t * v
-            nearest = wp.min(nearest, wp.dot(d, d) + wp.dot(e, e))
-            other += 1
-        j += 1
+    for j in range(end + 1):
+        r = x - point[j]
+        u = size * (normal - normals[j])
+        s = point[end] - point[j]
+        v = size * (normals[end] - normals[j])
+        along = wp.dot(r, s) + wp.dot(u, v)
+        length = wp.dot(s, s) + wp.dot(v, v)
+        t = wp.float64(0.0)
+        if length > wp.float64(0.0):
+            t = wp.clamp(along / length, wp.float64(0.0), wp.float64(1.0))
+        d = r - t * s
+        e = u - t * v
+        nearest = wp.min(nearest, wp.dot(d, d) + wp.dot(e, e))
     return nearest
 
 
 @wp.func
 def find_farthest(
-    first: wp.int32,
-    end: wp.int32,
+    ends: wp.vec2i,
     least: wp.float64,
     size: wp.float64,
     along: wp.vec3d,
-    p: wp.int32,
     count: wp.int32,
+    point: wp.array(dtype=wp.vec3d),
+    normals: wp.array(dtype=wp.vec3d),
     curves: Curves,
-    manifolds: Manifolds,
 ):
     """Return the candidate of a least depth that is farthest from the points chosen, and how far, squared.
 
     Those on one side are favoured a little, so that noise does not choose between two that are as far.
+
+    Args:
+        ends: First contact of the pair, and the one behind its last.
+        count: Points chosen. From the second on a candidate keeps its distance from those before.
     """
     farthest = wp.float64(-1.0)
-    best = wp.vec2i(first, 0)
-    i = first
-    while i < end:
-        for k in range(2):
+    best = CANDIDATES * ends[0]
+    i = ends[0] + warp_lane()
+    while i < ends[1]:
+        for k in range(CANDIDATES):
             if curves.depth[i, k] >= least:
                 x = curves.point[i, k]
-                d = distance_squared(x, curves.normal[i], size, p, count, manifolds)
+                d = distance_squared(x, curves.normal[i], size, count - 1, point, normals)
+                if count == 2:
+                    d = wp.min(d, distance_squared(x, curves.normal[i], size, 0, point, normals))
+                if count > 2:
+                    d = wp.min(d, curves.nearest[i, k])
+                curves.nearest[i, k] = d
                 if size > wp.float64(0.0):
-                    d = d * (wp.float64(1.0) + FAVOUR * wp.dot(along, x - manifolds.point[p, 0]) / size)
+                    d = d * (wp.float64(1.0) + FAVOUR * wp.dot(along, x - point[0]) / size)
                 if d > farthest:
                     farthest = d
-                    best = wp.vec2i(i, k)
-        i += 1
-    return best, farthest
+                    best = CANDIDATES * i + k
+        i += warp_size()
+    return best_of_warp(farthest, best)
 
 
 @wp.kernel
@@ -114,39 +136,47 @@ def spread_point_kernel(
     objects: ObjectPool,
     pairs: wp.array(dtype=wp.vec2i),
     start: wp.array(dtype=wp.int32),
-    curves: Curves,
+    curves_inout: Curves,
     manifolds_out: Manifolds,
 ):
-    """Choose the points of one pair a thread: an outermost one, those farthest from those before, the deepest.
+    """Choose the points of one pair a warp: an outermost one, those farthest from those before, the deepest.
 
     Distance counts places, and normals in sizes of the pair's contact. Where no face of the pair looks along its
-    contact's normal, the middles of the contacts serve, with depth 0.
+    contact's normal, the middles of the contacts serve, with depth 0. All lanes know the points chosen.
     """
-    p = wp.tid()
+    p = wp.tid() / warp_size()
     first = start[p]
     end = start[p + 1]
-    manifolds_out.count[p] = 0
     if first >= end:
+        manifolds_out.count[p] = 0
         return
     zero = wp.float64(0.0)
     along = objects.rotation[wp.min(pairs[p][0], pairs[p][1])] * wp.vec3d(
         wp.float64(0.6134), wp.float64(0.5327), wp.float64(0.5831)
     )
-    deepest_at, deepest = find_deepest(first, end, curves)
-    best = find_outermost(first, end, wp.float64(0.5) * deepest, along, curves)
+    deepest_at, deepest = find_deepest(first, end, curves_inout)
+    best = find_outermost(first, end, wp.float64(0.5) * deepest, along, curves_inout)
+    point = wp.zeros(shape=(POINTS,), dtype=wp.vec3d)
+    normals = wp.zeros(shape=(POINTS,), dtype=wp.vec3d)
     count = wp.int32(0)
     size = zero
     least = zero
     deep = zero
     searching = bool(True)
     while searching:
-        depth = wp.max(curves.depth[best[0], best[1]], zero)
-        manifolds_out.point[p, count] = curves.point[best[0], best[1]]
-        manifolds_out.normal[p, count] = curves.normal[best[0]]
-        manifolds_out.depth[p, count] = depth
+        i = best / CANDIDATES
+        depth = wp.max(curves_inout.depth[i, best % CANDIDATES], zero)
+        point[count] = curves_inout.point[i, best % CANDIDATES]
+        normals[count] = curves_inout.normal[i]
+        if warp_lane() == 0:
+            manifolds_out.point[p, count] = point[count]
+            manifolds_out.normal[p, count] = normals[count]
+            manifolds_out.depth[p, count] = depth
         deep = wp.max(deep, depth)
         count += 1
-        best, farthest = find_farthest(first, end, wp.min(deepest, zero), size, along, p, count, curves, manifolds_out)
+        ends = wp.vec2i(first, end)
+        floor = wp.min(deepest, zero)
+        best, farthest = find_farthest(ends, floor, size, along, count, point, normals, curves_inout)
         if count == 1:
             size = wp.sqrt(wp.max(farthest, zero))
             least = NEAREST_POINT * farthest
@@ -154,4 +184,5 @@ def spread_point_kernel(
             best = deepest_at
             searching = DEEPER * deepest > deep
         searching = searching and count < POINTS
-    manifolds_out.count[p] = count
+    if warp_lane() == 0:
+        manifolds_out.count[p] = count

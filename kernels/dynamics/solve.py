@@ -105,6 +105,32 @@ def store_motion(
         momentum_out[i] = momentum
 
 
+@wp.struct
+class Contact:
+    """A contact point while the velocities of its pair are relaxed."""
+
+    normal: wp.vec3d  # from the first to the second object
+    arm_a: wp.vec3d  # from the centre of mass of the first body
+    arm_b: wp.vec3d  # from that of the second
+    mass: wp.float64  # effective mass along the normal
+    tangent_mass: wp.mat33d  # effective mass across it, world frame
+    impulse: wp.float64  # accumulated, along the normal
+    friction_impulse: wp.vec3d  # accumulated, across it
+
+
+@wp.func
+def load_contact(manifolds: Manifolds, constraints: Constraints, p: wp.int32, k: wp.int32):
+    c = Contact()
+    c.normal = manifolds.normal[p, k]
+    c.arm_a = constraints.arm_a[p, k]
+    c.arm_b = constraints.arm_b[p, k]
+    c.mass = constraints.mass[p, k]
+    c.tangent_mass = constraints.tangent_mass[p, k]
+    c.impulse = constraints.impulse[p, k]
+    c.friction_impulse = constraints.friction_impulse[p, k]
+    return c
+
+
 @wp.func
 def relax_velocities(
     relaxation: Relaxation,
@@ -117,7 +143,7 @@ def relax_velocities(
 ):
     """Relax the points of a pair: the tangential velocity within the friction cone, then the normal velocity.
 
-    The motion of both objects stays in registers meanwhile.
+    The motion of both objects stays in registers meanwhile, and each point is loaded while the one before is relaxed.
     """
     a = load_side(bodies, pair[0])
     b = load_side(bodies, pair[1])
@@ -126,37 +152,60 @@ def relax_velocities(
     momentum_a = bodies.momentum[pair[0]]
     momentum_b = bodies.momentum[pair[1]]
     count = manifolds.count[p]
+    following = load_contact(manifolds, constraints, p, point_of_turn(0, count, backward))
     for i in range(count):
         k = point_of_turn(i, count, backward)
-        normal = manifolds.normal[p, k]
-        arm_a = constraints.arm_a[p, k]
-        arm_b = constraints.arm_b[p, k]
-        before = constraints.impulse[p, k]
-        old = constraints.friction_impulse[p, k]
-        mass = constraints.mass[p, k]
-        at_a = point_velocity(a.inverse_inertia, velocity_a, momentum_a, arm_a)
-        at_b = point_velocity(b.inverse_inertia, velocity_b, momentum_b, arm_b)
-        new = old - constraints.tangent_mass[p, k] * (at_b - at_a)
+        c = following
+        following = load_contact(manifolds, constraints, p, point_of_turn(wp.min(i + 1, count - 1), count, backward))
+        at_a = point_velocity(a.inverse_inertia, velocity_a, momentum_a, c.arm_a)
+        at_b = point_velocity(b.inverse_inertia, velocity_b, momentum_b, c.arm_b)
+        new = c.friction_impulse - c.tangent_mass * (at_b - at_a)
         length = wp.length(new)
-        if length > relaxation.friction * before:
-            new = new * (relaxation.friction * before / length)
+        if length > relaxation.friction * c.impulse:
+            new = new * (relaxation.friction * c.impulse / length)
         constraints.friction_impulse[p, k] = new
-        impulse = new - old
+        impulse = new - c.friction_impulse
         velocity_a = push_velocity(a, velocity_a, -impulse)
-        momentum_a = push_momentum(a, momentum_a, arm_a, -impulse)
+        momentum_a = push_momentum(a, momentum_a, c.arm_a, -impulse)
         velocity_b = push_velocity(b, velocity_b, impulse)
-        momentum_b = push_momentum(b, momentum_b, arm_b, impulse)
-        at_a = point_velocity(a.inverse_inertia, velocity_a, momentum_a, arm_a)
-        at_b = point_velocity(b.inverse_inertia, velocity_b, momentum_b, arm_b)
-        after = wp.max(before - mass * wp.dot(normal, at_b - at_a), wp.float64(0.0))
+        momentum_b = push_momentum(b, momentum_b, c.arm_b, impulse)
+        at_a = point_velocity(a.inverse_inertia, velocity_a, momentum_a, c.arm_a)
+        at_b = point_velocity(b.inverse_inertia, velocity_b, momentum_b, c.arm_b)
+        after = wp.max(c.impulse - c.mass * wp.dot(c.normal, at_b - at_a), wp.float64(0.0))
         constraints.impulse[p, k] = after
-        impulse = (after - before) * normal
+        impulse = (after - c.impulse) * c.normal
         velocity_a = push_velocity(a, velocity_a, -impulse)
-        momentum_a = push_momentum(a, momentum_a, arm_a, -impulse)
+        momentum_a = push_momentum(a, momentum_a, c.arm_a, -impulse)
         velocity_b = push_velocity(b, velocity_b, impulse)
-        momentum_b = push_momentum(b, momentum_b, arm_b, impulse)
+        momentum_b = push_momentum(b, momentum_b, c.arm_b, impulse)
     store_motion(a, pair[0], velocity_a, momentum_a, bodies.velocity, bodies.momentum)
     store_motion(b, pair[1], velocity_b, momentum_b, bodies.velocity, bodies.momentum)
+
+
+@wp.struct
+class Overlap:
+    """A contact point while the positions of its pair are corrected."""
+
+    normal: wp.vec3d  # from the first to the second object
+    arm_a: wp.vec3d  # from the centre of mass of the first body
+    arm_b: wp.vec3d  # from that of the second
+    mass: wp.float64  # effective mass along the normal
+    bias: wp.float64  # separation speed aimed for [world units/s]
+    impulse: wp.float64  # accumulated, along the normal
+    pseudo_impulse: wp.float64  # accumulated, of the correction
+
+
+@wp.func
+def load_overlap(manifolds: Manifolds, constraints: Constraints, p: wp.int32, k: wp.int32):
+    c = Overlap()
+    c.normal = manifolds.normal[p, k]
+    c.arm_a = constraints.arm_a[p, k]
+    c.arm_b = constraints.arm_b[p, k]
+    c.mass = constraints.mass[p, k]
+    c.bias = constraints.bias[p, k]
+    c.impulse = constraints.impulse[p, k]
+    c.pseudo_impulse = constraints.pseudo_impulse[p, k]
+    return c
 
 
 @wp.func
@@ -188,30 +237,28 @@ def relax_positions(
     pseudo_b = bodies.pseudo_velocity[pair[1]]
     angular_a = bodies.pseudo_momentum[pair[0]]
     angular_b = bodies.pseudo_momentum[pair[1]]
-    for k in range(manifolds.count[p]):
-        normal = manifolds.normal[p, k]
-        arm_a = constraints.arm_a[p, k]
-        arm_b = constraints.arm_b[p, k]
-        at_a = point_velocity(a.inverse_inertia, velocity_a, momentum_a, arm_a)
-        at_b = point_velocity(b.inverse_inertia, velocity_b, momentum_b, arm_b)
-        speed = wp.dot(normal, at_b - at_a)
+    count = manifolds.count[p]
+    following = load_overlap(manifolds, constraints, p, 0)
+    for k in range(count):
+        c = following
+        following = load_overlap(manifolds, constraints, p, wp.min(k + 1, count - 1))
+        at_a = point_velocity(a.inverse_inertia, velocity_a, momentum_a, c.arm_a)
+        at_b = point_velocity(b.inverse_inertia, velocity_b, momentum_b, c.arm_b)
+        speed = wp.dot(c.normal, at_b - at_a)
         if not (fast > zero and speed >= fast):
-            before = constraints.pseudo_impulse[p, k]
-            mass = constraints.mass[p, k]
-            bias = constraints.bias[p, k]
-            at_a = point_velocity(a.inverse_inertia, pseudo_a, angular_a, arm_a)
-            at_b = point_velocity(b.inverse_inertia, pseudo_b, angular_b, arm_b)
-            separation = wp.dot(normal, at_b - at_a) + wp.max(speed, zero)
-            after = before - mass * (separation - bias)
+            at_a = point_velocity(a.inverse_inertia, pseudo_a, angular_a, c.arm_a)
+            at_b = point_velocity(b.inverse_inertia, pseudo_b, angular_b, c.arm_b)
+            separation = wp.dot(c.normal, at_b - at_a) + wp.max(speed, zero)
+            after = c.pseudo_impulse - c.mass * (separation - c.bias)
             # Resting contacts sink to the slop, where rounding does not break them; other points are never pulled.
-            if fast == zero or constraints.impulse[p, k] <= zero:
-                after = wp.max(before - mass * (separation - wp.max(bias, zero)), zero)
+            if fast == zero or c.impulse <= zero:
+                after = wp.max(c.pseudo_impulse - c.mass * (separation - wp.max(c.bias, zero)), zero)
             constraints.pseudo_impulse[p, k] = after
-            impulse = (after - before) * normal
+            impulse = (after - c.pseudo_impulse) * c.normal
             pseudo_a = push_velocity(a, pseudo_a, -impulse)
-            angular_a = push_momentum(a, angular_a, arm_a, -impulse)
+            angular_a = push_momentum(a, angular_a, c.arm_a, -impulse)
             pseudo_b = push_velocity(b, pseudo_b, impulse)
-            angular_b = push_momentum(b, angular_b, arm_b, impulse)
+            angular_b = push_momentum(b, angular_b, c.arm_b, impulse)
     store_motion(a, pair[0], pseudo_a, angular_a, bodies.pseudo_velocity, bodies.pseudo_momentum)
     store_motion(b, pair[1], pseudo_b, angular_b, bodies.pseudo_velocity, bodies.pseudo_momentum)
 

@@ -202,7 +202,7 @@ def start_replay_kernel(
     replay_inout.counter[FREE_SLOTS] = pooled
 
 
-@wp.func
+@wp.func(inline=False)
 def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: int, limit: wp.float64):
     """Cover triangle t again, with faces around the merge and its other faces; return its squared bound."""
     for k in range(3):

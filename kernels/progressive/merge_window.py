@@ -1,13 +1,26 @@
 """Certified errors by several threads: merges that do not meet are covered at the same time, and registered in order.
 
 A window holds the next merges whose rings share no face and whose triangles are not the same. None of them changes what
-another reads, so their triangles are covered on the surface before all of them, in any order. The running maximum rises
+another reads, so their triangles are covered on the surface before all of them, in any order. One thread leads: it
+gathers merges, and registers them in order as soon as their triangles are covered. The others cover blocks of triangles
+from the moment they are gathered. The running maximum rises
 seldom: triangles are covered for its value before the window. Where it rises, and where a triangle covered alone moves
 to a face about a later merge, the window ends, and the merges after it are gathered again.
 """
 
 import warp as wp
 
+from warp_abtree.kernels.progressive.block_queue import (
+    BLOCKS_ADDED,
+    ENDED,
+    THREADS,
+    count_up,
+    pause,
+    read_flag,
+    take_block,
+    withdraw_blocks,
+    write_flag,
+)
 from warp_abtree.kernels.progressive.hausdorff_bound import (
     FREE_SLOTS,
     LIVE_FACES,
@@ -32,35 +45,38 @@ from warp_abtree.kernels.progressive.triangle_cover import (
     fetch_merge,
 )
 from warp_abtree.kernels.progressive.vertex_forest import count_dying, third_corner
-from warp_abtree.kernels.traversal.load_balance import take_unit
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-# Entries of `Window.counter`; `take_unit` counts TAKEN up.
+# Entries of `Window.counter`. The first belong to the thread that leads.
 MERGES = wp.constant(0)
 TRIANGLES = wp.constant(1)
-BLOCKS = wp.constant(2)
-TAKEN = wp.constant(3)
-FIRST_STAMP = wp.constant(4)  # stamp of its first merge
+FIRST_STAMP = wp.constant(2)  # stamp of its first merge
+FIRST_BLOCK = wp.constant(3)  # number of its first block
+# Those of `block_queue` follow.
 
 MERGE_ROOM = wp.constant(512)
 TRIANGLE_ROOM = wp.constant(1 << 16)  # a merge is added while there are fewer
 NEAR_MOST = wp.constant(64)  # faces about a merge, at most; of others, one thread takes care
 COLUMNS = wp.constant(8)  # faces that cover a triangle, at most; likewise
 CONFLICT = wp.constant(-1)
+PAUSES = wp.constant(1 << 16)  # until a thread without work gives up
 
 
 @wp.struct
 class Window:
     """Merges that do not meet, in order."""
 
-    counter: wp.array(dtype=int)  # [5]
+    counter: wp.array(dtype=int)  # [COUNTER_COUNT], see above
     merge: wp.array(dtype=wp.vec3i)  # [MERGE_ROOM], its two nodes and the one that it makes
     start: wp.array(dtype=int)  # [MERGE_ROOM + 1], first triangle of each merge
     near_start: wp.array(dtype=int)  # [MERGE_ROOM + 1], first face about each merge
+    first_block: wp.array(dtype=int)  # [MERGE_ROOM + 1], first block of each merge, from that of the window on
     block_merge: wp.array(dtype=int)  # [any], merge of each block of triangles
     block_start: wp.array(dtype=int)  # [any], its first triangle
+    block_done: wp.array(dtype=int)  # [any], whether it is covered
     face_mark: wp.array(dtype=int)  # [face_count], last merge that had the face in its rings
+    limit: wp.array(dtype=wp.float64)  # [1], squared running maximum before the window
     covers: Covers  # of all merges
 
 
@@ -118,77 +134,83 @@ def gather_merge(replay: Replay, window: Window, merge: wp.vec3i, first_new: int
     return added
 
 
-@wp.kernel
-def gather_window_kernel(
-    vertex_count: int,
-    merge_count: int,
-    merge_pair: wp.array2d(dtype=int),
-    # In and out:
-    replay_inout: Replay,
-    window_inout: Window,
+@wp.func
+def add_merge(window: Window, merge: wp.vec3i, span: wp.vec4i, added: wp.vec4i):
+    """Hand out the triangles of a merge that was gathered, in blocks."""
+    w = window.counter[MERGES]
+    first = window.counter[FIRST_BLOCK]
+    block = window.first_block[w]
+    window.merge[w] = merge
+    window.start[w + 1] = added[0]
+    window.near_start[w + 1] = added[1]
+    i = span[0]
+    while i < added[0]:
+        window.block_merge[block] = w
+        window.block_start[block] = i
+        window.block_done[block] = 0
+        block += 1
+        i += COVERS_AT_ONCE
+    window.first_block[w + 1] = block
+    window.counter[MERGES] = w + 1
+    window.counter[TRIANGLES] = added[0]
+    write_flag(window.counter, BLOCKS_ADDED, first + block)
+
+
+@wp.func
+def gather_window(
+    vertex_count: int, merge_count: int, merge_pair: wp.array2d(dtype=int), replay: Replay, window: Window
 ):
-    """Gather the next merges until one meets an earlier one (serial, dim=1)."""
-    j = replay_inout.counter[NEXT_MERGE]
+    """Gather the next merges until one meets an earlier one; other threads cover their triangles meanwhile."""
+    j = replay.counter[NEXT_MERGE]
     first_new = vertex_count + j
-    stamp = replay_inout.counter[STAMP] + 1
+    stamp = replay.counter[STAMP] + 1
+    window.counter[MERGES] = 0
+    window.counter[TRIANGLES] = 0
+    window.counter[FIRST_STAMP] = stamp
+    window.counter[FIRST_BLOCK] = window.counter[BLOCKS_ADDED]
+    window.start[0] = 0
+    window.near_start[0] = 0
+    window.first_block[0] = 0
     span = wp.vec4i(0, 0, stamp, stamp)
-    merges = int(0)
-    blocks = int(0)
     gathering = bool(True)
-    while gathering and j < merge_count and merges < MERGE_ROOM and span[0] < TRIANGLE_ROOM:
+    while gathering and j < merge_count and window.counter[MERGES] < MERGE_ROOM and span[0] < TRIANGLE_ROOM:
         merge = wp.vec3i(merge_pair[j, 0], merge_pair[j, 1], vertex_count + j)
-        fetch_merge(replay_inout, merge_pair, merge_count, j)
-        added = gather_merge(replay_inout, window_inout, merge, first_new, span)
+        fetch_merge(replay, merge_pair, merge_count, j)
+        added = gather_merge(replay, window, merge, first_new, span)
         gathering = added[0] >= 0
         stamp += 1
         if gathering:
-            window_inout.merge[merges] = merge
-            window_inout.start[merges] = span[0]
-            window_inout.near_start[merges] = span[1]
-            i = span[0]
-            while i < added[0]:
-                window_inout.block_merge[blocks] = merges
-                window_inout.block_start[blocks] = i
-                blocks += 1
-                i += COVERS_AT_ONCE
+            add_merge(window, merge, span, added)
             span = wp.vec4i(added[0], added[1], added[2], stamp)
-            merges += 1
-            window_inout.start[merges] = span[0]
-            window_inout.near_start[merges] = span[1]
             j += 1
-    replay_inout.counter[STAMP] = stamp
-    window_inout.counter[MERGES] = merges
-    window_inout.counter[TRIANGLES] = span[0]
-    window_inout.counter[BLOCKS] = blocks
-    window_inout.counter[TAKEN] = 0
-    window_inout.counter[FIRST_STAMP] = span[2]
+    replay.counter[STAMP] = stamp
 
 
-@wp.kernel
-def cover_window_kernel(
-    replay: Replay,
-    bound_sq: wp.array(dtype=wp.float64),
-    # Out:
-    window_out: Window,
-):
-    """Take one block of triangles after the other; CPU only, a thread a core. Those not covered get a count of 0."""
-    limit = FLOOR * FLOOR
-    j = replay.counter[NEXT_MERGE]
-    if j > 0:
-        limit = bound_sq[j - 1]
-    u = take_unit(window_out.counter)
-    while u < window_out.counter[BLOCKS]:
-        w = window_out.block_merge[u]
-        i = window_out.block_start[u]
-        end = wp.min(i + COVERS_AT_ONCE, window_out.start[w + 1])
-        near = window_out.near_start[w]
-        near_count = window_out.near_start[w + 1] - near
-        while i < end:
-            i = cover_ring(replay, window_out.covers, window_out.merge[w], near, near_count, i, end, i, limit, False)
-            if i < end:
-                window_out.covers.count[i] = 0
-                i += 1
-        u = take_unit(window_out.counter)
+@wp.func
+def cover_block(replay: Replay, window: Window, number: int):
+    """Cover a block of triangles, on any thread. Those not covered get a count of 0."""
+    block = number - window.counter[FIRST_BLOCK]
+    w = window.block_merge[block]
+    i = window.block_start[block]
+    end = wp.min(i + COVERS_AT_ONCE, window.start[w + 1])
+    near = window.near_start[w]
+    near_count = window.near_start[w + 1] - near
+    limit = window.limit[0]
+    while i < end:
+        i = cover_ring(replay, window.covers, window.merge[w], near, near_count, i, end, i, limit, False)
+        if i < end:
+            window.covers.count[i] = 0
+            i += 1
+    write_flag(window.block_done, block, 1)
+
+
+@wp.func
+def is_covered(window: Window, begin: int, end: int):
+    """Tell whether blocks of the window are covered."""
+    for block in range(begin, end):
+        if read_flag(window.block_done, block) == 0:
+            return False
+    return True
 
 
 @wp.func
@@ -230,29 +252,83 @@ def register_merge(
     return limit, holds
 
 
-@wp.kernel
-def register_window_kernel(
-    window: Window,
-    # In and out:
-    replay_inout: Replay,
-    covers_inout: Covers,
-    bound_sq_inout: wp.array(dtype=wp.float64),
-):
-    """Apply the merges of a window in order and register their triangles, as far as what was found holds (dim=1)."""
-    limit = FLOOR * FLOOR
-    j = replay_inout.counter[NEXT_MERGE]
-    if j > 0:
-        limit = bound_sq_inout[j - 1]
+@wp.func
+def register_window(replay: Replay, window: Window, covers: Covers, bound_sq: wp.array(dtype=wp.float64)):
+    """Apply the merges of a window in order and register their triangles, as far as what was found holds.
+
+    Blocks that no other thread has are covered on the way.
+    """
+    limit = window.limit[0]
+    j = replay.counter[NEXT_MERGE]
     w = int(0)
     holds = bool(True)
     while holds and w < window.counter[MERGES]:
-        merge = window.merge[w]
-        stamp = replay_inout.counter[STAMP] + 1
-        replay_inout.counter[STAMP] = stamp
-        dying = count_dying(replay_inout.rings, merge[0], merge[1])
-        near_count = merge_rings(replay_inout, merge, 0)
-        limit, holds = register_merge(replay_inout, window, covers_inout, w, near_count, stamp, limit)
-        replay_inout.counter[LIVE_FACES] = replay_inout.counter[LIVE_FACES] - dying
-        bound_sq_inout[j + w] = limit
-        w += 1
-    replay_inout.counter[NEXT_MERGE] = j + w
+        if is_covered(window, window.first_block[w], window.first_block[w + 1]):
+            merge = window.merge[w]
+            stamp = replay.counter[STAMP] + 1
+            replay.counter[STAMP] = stamp
+            dying = count_dying(replay.rings, merge[0], merge[1])
+            near_count = merge_rings(replay, merge, 0)
+            limit, holds = register_merge(replay, window, covers, w, near_count, stamp, limit)
+            replay.counter[LIVE_FACES] = replay.counter[LIVE_FACES] - dying
+            bound_sq[j + w] = limit
+            w += 1
+        else:
+            number = take_block(window.counter)
+            if number >= 0:
+                cover_block(replay, window, number)
+            else:
+                pause()
+    replay.counter[NEXT_MERGE] = j + w
+    taken = withdraw_blocks(window.counter) - window.counter[FIRST_BLOCK]
+    while not is_covered(window, 0, taken):
+        pause()
+
+
+@wp.func
+def help_windows(replay: Replay, window: Window):
+    """Cover blocks until there are no more windows, or none for a while."""
+    left = int(PAUSES)
+    while left > 0 and read_flag(window.counter, ENDED) == 0:
+        number = take_block(window.counter)
+        if number >= 0:
+            cover_block(replay, window, number)
+            left = int(PAUSES)
+        else:
+            pause()
+            left -= 1
+
+
+@wp.kernel
+def work_windows_kernel(
+    vertex_count: int,
+    merge_count: int,
+    cover_budget: int,
+    merge_pair: wp.array2d(dtype=int),
+    # In and out:
+    replay_inout: Replay,
+    window_inout: Window,
+    covers_inout: Covers,
+    bound_sq_inout: wp.array(dtype=wp.float64),
+):
+    """Bound merges window by window until `cover_budget` triangles are covered, or the next merge can be in no window.
+
+    Launched once a thread of the CPU, dim=1: the one that comes first leads, the others cover blocks for it. The last
+    window has no merges where it ended for want of one.
+    """
+    if count_up(window_inout.counter, THREADS) > 0:
+        help_windows(replay_inout, window_inout)
+        return
+    covered = int(0)
+    gathered = bool(True)
+    while gathered and covered < cover_budget and replay_inout.counter[NEXT_MERGE] < merge_count:
+        j = replay_inout.counter[NEXT_MERGE]
+        window_inout.limit[0] = FLOOR * FLOOR
+        if j > 0:
+            window_inout.limit[0] = bound_sq_inout[j - 1]
+        gather_window(vertex_count, merge_count, merge_pair, replay_inout, window_inout)
+        gathered = window_inout.counter[MERGES] > 0
+        if gathered:
+            register_window(replay_inout, window_inout, covers_inout, bound_sq_inout)
+            covered += window_inout.counter[TRIANGLES]
+    write_flag(window_inout.counter, ENDED, 1)

@@ -127,7 +127,7 @@ def resolve_faces(
     return met, tested
 
 
-@wp.func
+@wp.func(inline=False)
 def resolve_uncertain(
     mode: wp.int32,
     output: wp.int32,
@@ -141,13 +141,13 @@ def resolve_uncertain(
 ):
     """Decide uncertain face pairs, as `resolve_faces`: for EXACT in float64, then what is inexact there.
 
+    Not inlined: compiling takes less long, and most calls of its caller have none.
+
     Returns how many have met then, how many were decided, and how many of these took exact signs.
     """
     if mode != EXACT:
         met, tested = resolve_faces(mode, output, models, states, pose, met, count, uncertain, met_inout)
         return met, tested, 0
-    if count == 0 or (output == OUTPUT_ANY and met > 0):
-        return met, 0, 0
     counts = simd_float64_filter(models, states, pose, output == OUTPUT_ANY, met, count, uncertain, met_inout)
     met, inexact = resolve_faces(
         mode, output, models, states, pose, wp.int32(counts[0]), wp.int32(counts[1]), uncertain, met_inout
@@ -182,9 +182,10 @@ def test_leaf_pairs(
         return near, long_counts(wp.int64(0), wp.int64(decided), wp.int64(0), wp.int64(0))
     error, unit = float32_bounds(mode, pose)
     filtered = simd_float32_filter(models, states, pose, error, unit, output == OUTPUT_ANY, waiting, faces, uncertain)
-    met, resolved, inexact = resolve_uncertain(
-        mode, output, models, states, pose, wp.int32(filtered[0]), wp.int32(filtered[1]), uncertain, faces
-    )
+    met, count = wp.int32(filtered[0]), wp.int32(filtered[1])
+    resolved, inexact = wp.int32(0), wp.int32(0)
+    if count > 0 and not (output == OUTPUT_ANY and met > 0):
+        met, resolved, inexact = resolve_uncertain(mode, output, models, states, pose, met, count, uncertain, faces)
     return met, long_counts(wp.int64(0), filtered[2], wp.int64(resolved), wp.int64(inexact))
 
 

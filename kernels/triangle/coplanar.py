@@ -17,7 +17,7 @@ def separates_line(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, inner: wp.vec2d, p:
     return orient2d(mode, a, b, q) == sp and orient2d(mode, a, b, r) == sp
 
 
-@wp.func
+@wp.func(inline=False)
 def overlap_coplanar(mode: wp.int32, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d, q: wp.vec2d, r: wp.vec2d):
     """Return whether no edge line separates two closed plane triangles.
 
@@ -83,7 +83,7 @@ def is_before(a: wp.vec3d, b: wp.vec3d):
     return a[2] < b[2]
 
 
-@wp.func
+@wp.func(inline=False)
 def find_ends(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     """Return the ends of the segment that three collinear points span."""
     low = a
@@ -99,7 +99,7 @@ def find_ends(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     return low, high
 
 
-@wp.func
+@wp.func(inline=False)
 def intersect_segment_triangle(
     mode: wp.int32, axis: wp.int32, p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d
 ):

@@ -17,6 +17,7 @@ from warp_abtree.kernels.arithmetic.predicates import (
     orient3d,
     plain_sign,
 )
+from warp_abtree.kernels.traversal.warp_stack import lowest_bit
 from warp_abtree.kernels.triangle.coplanar import find_ends, widest_axis
 from warp_abtree.kernels.triangle.intersect import find_alone, is_one_sided
 
@@ -24,9 +25,11 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Determinants whose relative error may exceed this are summed as expansions.
 RELATIVE_ERROR = wp.constant(wp.float64(2.0**-42))
-# Corners in, and edges across, the other triangle.
+# Extreme points that an overlap may have: corners of either triangle in the other, then edges across one another.
 POINT_ROOM = wp.constant(15)
 NEAREST_STEPS = wp.constant(32)
+
+ratios = wp.types.vector(length=9, dtype=wp.float64)  # where each edge of A crosses each of B, along that of A
 
 
 @wp.func
@@ -169,20 +172,28 @@ def holds_point(axis: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, p: wp.vec
     return (ab >= 0 and bc >= 0 and ca >= 0) or (ab <= 0 and bc <= 0 and ca <= 0)
 
 
+@wp.func
+def overlap_point(k: wp.int32, ratio: ratios, corner: wp.array(dtype=wp.vec3d)):
+    """Return an extreme point of an overlap, by its place among those that there may be; any beyond the last."""
+    if k < 6:
+        return corner[k]
+    i = (k - 6) // 3 % 3
+    return corner[i] + (corner[(i + 1) % 3] - corner[i]) * ratio[wp.min(k - 6, 8)]
+
+
 @wp.func(inline=False)
 def overlap_ends(axis: wp.int32, corner: wp.array(dtype=wp.vec3d)):
     """Return the number of points and the two that are farthest apart of the overlap of two sets in one plane.
 
     Extreme points of the overlap are corners of one set in the other, and proper crossings of two edges.
     """
-    point = wp.zeros(shape=(POINT_ROOM,), dtype=wp.vec3d)
-    count = wp.int32(0)
+    ratio = ratios()
+    found = wp.int32(0)  # a bit each
     k = wp.int32(0)
     while k < 6:
         other = wp.where(k < 3, 3, 0)
         if holds_point(axis, corner[other], corner[other + 1], corner[other + 2], corner[k]):
-            point[count] = corner[k]
-            count += 1
+            found |= 1 << k
         k += 1
     k = wp.int32(0)
     while k < 9:
@@ -196,21 +207,27 @@ def overlap_ends(axis: wp.int32, corner: wp.array(dtype=wp.vec3d)):
             value_a = signed_area(p2, q2, a2)
             value_b = signed_area(p2, q2, b2)
             if plain_sign(value_a) * plain_sign(value_b) < 0:
-                point[count] = cross_edge(a, b, value_a, value_b)
-                count += 1
+                ratio[k] = value_a / (value_a - value_b)
+                found |= 1 << (6 + k)
         k += 1
-    first = wp.int32(0)
-    last = wp.int32(0)
+    count = wp.bit_count(found)
+    low = overlap_point(lowest_bit(found | (1 << POINT_ROOM)), ratio, corner)
+    high = low
     most = wp.float64(0.0)
     k = wp.int32(0)
-    while k < count * count:
-        length = measure_length(point[k % count] - point[k // count])
-        if length > most:
-            most = length
-            first = k // count
-            last = k % count
+    while k < POINT_ROOM * POINT_ROOM:
+        i = k // POINT_ROOM
+        j = k % POINT_ROOM
+        if (found >> i) & (found >> j) & 1 != 0:
+            start = overlap_point(i, ratio, corner)
+            end = overlap_point(j, ratio, corner)
+            length = measure_length(end - start)
+            if length > most:
+                most = length
+                low = start
+                high = end
         k += 1
-    return count, point[first], point[last]
+    return count, low, high
 
 
 @wp.func(inline=False)
@@ -268,17 +285,17 @@ def nearest_on_segment(a: wp.vec3d, b: wp.vec3d, p: wp.vec3d):
 
 
 @wp.func
-def nearest_on_triangle(base: wp.int32, corner: wp.array(dtype=wp.vec3d), p: wp.vec3d):
-    """Return the point of a closed triangle, segment or point nearest to p."""
+def nearest_on_triangle(scale: wp.float64, base: wp.int32, corner: wp.array(dtype=wp.vec3d), p: wp.vec3d):
+    """Return the point of a closed triangle, segment or point nearest to p, all scaled."""
     zero = wp.float64(0.0)
-    a = corner[base]
-    n = wp.cross(corner[base + 1] - a, corner[base + 2] - a)
-    best = nearest_on_segment(a, corner[base + 1], p)
+    a = corner[base] * scale
+    n = wp.cross(corner[base + 1] * scale - a, corner[base + 2] * scale - a)
+    best = nearest_on_segment(a, corner[base + 1] * scale, p)
     inside = bool(True)
     k = wp.int32(0)
     while k < 3:
-        u = corner[base + k]
-        v = corner[base + (k + 1) % 3]
+        u = corner[base + k] * scale
+        v = corner[base + (k + 1) % 3] * scale
         q = nearest_on_segment(u, v, p)
         if wp.dot(q - p, q - p) < wp.dot(best - p, best - p):
             best = q
@@ -293,17 +310,12 @@ def nearest_on_triangle(base: wp.int32, corner: wp.array(dtype=wp.vec3d), p: wp.
 @wp.func(inline=False)
 def nearest_middle(scale: wp.float64, corner: wp.array(dtype=wp.vec3d)):
     """Return a point between two triangles that are nearly nearest to each other there, by alternating projection."""
-    near = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    k = wp.int32(0)
-    while k < 6:
-        near[k] = corner[k] * scale
-        k += 1
-    q = (near[3] + near[4] + near[5]) / wp.float64(3.0)
+    q = (corner[3] * scale + corner[4] * scale + corner[5] * scale) / wp.float64(3.0)
     p = q
     k = wp.int32(0)
     while k < NEAREST_STEPS:
-        p = nearest_on_triangle(0, near, q)
-        q = nearest_on_triangle(3, near, p)
+        p = nearest_on_triangle(scale, 0, corner, q)
+        q = nearest_on_triangle(scale, 3, corner, p)
         k += 1
     return (p + q) * (wp.float64(0.5) / scale)
 

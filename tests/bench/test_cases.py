@@ -118,8 +118,13 @@ def check_coarse(rows):
 
 def check_budget(rows):
     expected = [(scene, name) for scene in ("rain", "focus") for name in budget.CONTROLLERS]
-    assert [(row["scene"], row["controller"]) for row in rows] == expected
-    for row in rows:
+    held, controlled = ([row for row in rows if name in row] for name in ("judged", "ratio"))
+    assert [(row["scene"], row["controller"]) for row in held] == expected
+    assert {row["scene"] for row in controlled} >= {"focus", "rain", "worlds"}
+    for row in controlled:
+        assert row["ratio"] == pytest.approx(row["total_ms"] / row["finest_ms"], rel=0.01) and row["select_ms"] > 0
+    assert [row["controller"] for row in rows if row not in held + controlled] == ["predictive", "paper", "tolerance"]
+    for row in held:
         assert row["judged"] == 3 and 0 <= row["within"] <= row["within_110_percent"] <= 1 and row["budget_ms"] > 0
         assert (row["error_max"] == 0) == (row["controller"] == "none") and row["cost_ms"] <= row["cost_p95_ms"]
         if row["controller"] == "none":

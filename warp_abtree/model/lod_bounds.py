@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.cpu_threads import launch_on_cores
-from warp_abtree.kernels.progressive import hausdorff_bound, merge_window, polygon, triangle_cover
+from warp_abtree.kernels.progressive import block_queue, hausdorff_bound, merge_window, polygon, triangle_cover
 from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, unwritten
 
 # Cores and faces from which on windows gain: gathering them takes half as long again as going on merge by merge.
@@ -25,6 +25,7 @@ class LodBounds:
 
     Attributes:
         done: Merges that are bounded.
+        replay: The surface after them, and which faces cover which original triangles.
     """
 
     def __init__(self, vertices, faces):
@@ -33,13 +34,13 @@ class LodBounds:
         face_array = cpu_array(faces, int)
         self._pos = np.zeros((2 * len(vertices), 3))
         self._pos[: len(vertices)] = (vertices - self._centre) / self._scale
-        self._replay = _new_replay(self._pos, face_count)
-        self._replay.rings = linked_rings(faces, face_array, 2 * len(vertices))
-        launch(hausdorff_bound.start_replay_kernel, face_count, face_array, self._replay)
-        self._covers = _new_covers(self._replay)
+        self.replay = _new_replay(self._pos, face_count)
+        self.replay.rings = linked_rings(faces, face_array, 2 * len(vertices))
+        launch(hausdorff_bound.start_replay_kernel, face_count, face_array, self.replay)
+        self._covers = _new_covers(self.replay)
         self._pair = filled((len(vertices), 2), 0)
         self._bound_sq = wp.zeros(len(vertices), dtype=wp.float64, device="cpu")
-        self._state = self._replay.counter.numpy()  # shares the memory
+        self._state = self.replay.counter.numpy()  # shares the memory
         self._known, self._window = 0, None
 
     @property
@@ -56,7 +57,7 @@ class LodBounds:
 
     def advance(self, cores=1):
         """Bound some of the merges that are known, on so many cores."""
-        if cores >= LEAST_CORES and len(self._replay.face_slot) >= LEAST_FACES:
+        if cores >= LEAST_CORES and len(self.replay.face_slot) >= LEAST_FACES:
             self._advance_together(cores)
         else:
             self._advance_alone(self._known)
@@ -64,32 +65,25 @@ class LodBounds:
     def _advance_together(self, cores):
         """Bound merges window by window."""
         if self._window is None:
-            self._window = _new_window(self._replay)
-        window, bounds = self._window, self._bound_sq
-        inputs = [self._vertex_count, self._known, self._pair, self._replay, window]
-        state = window.counter.numpy()  # shares the memory
+            self._window = _new_window(self.replay)
+        counter = self._window.counter.numpy()  # shares the memory
+        counter[[int(block_queue.ENDED), int(block_queue.THREADS)]] = 0
+        inputs = [self._vertex_count, self._known, COVERS, self._pair, self.replay, self._window, self._covers]
 
-        def cover():
-            launch(merge_window.cover_window_kernel, self._replay, bounds, window)
+        def work():
+            launch(merge_window.work_windows_kernel, *inputs, self._bound_sq)
 
-        covered = 0
-        while covered < COVERS and self.done < self._known:
-            launch(merge_window.gather_window_kernel, *inputs)
-            merges, triangles, blocks = state[:3].tolist()
-            if merges == 0:
-                self._advance_alone(self.done + 1)
-                continue
-            launch_on_cores(cover, blocks, cores, 4)
-            launch(merge_window.register_window_kernel, window, self._replay, self._covers, bounds)
-            covered += triangles
+        launch_on_cores(work, cores, cores)
+        if counter[merge_window.MERGES] == 0 and self.done < self._known:
+            self._advance_alone(self.done + 1)
 
     def _advance_alone(self, merges):
         """Bound merges one after the other, at most up to a number of them."""
-        inputs = [self._vertex_count, merges, COVERS, self._pair, self._replay, self._covers, self._bound_sq]
+        inputs = [self._vertex_count, merges, COVERS, self._pair, self.replay, self._covers, self._bound_sq]
         launch(hausdorff_bound.replay_merges_kernel, *inputs)
         if self._state[5] < 0:
-            bvh = _index(self._replay)
-            self._replay.bvh, self._state[5] = bvh.id, self._state[1]
+            bvh = _index(self.replay)
+            self.replay.bvh, self._state[5] = bvh.id, self._state[1]
             self._bvh = bvh  # lives as long as it is asked
 
     def errors(self):
@@ -127,15 +121,17 @@ def _new_window(replay):
     merges, face_count = int(merge_window.MERGE_ROOM), len(replay.face_slot)
     rows = face_count + int(merge_window.TRIANGLE_ROOM)
     blocks = merges + rows // int(triangle_cover.COVERS_AT_ONCE) + 1
-    window.counter = filled(5, 0)
+    window.counter = filled(block_queue.COUNTER_COUNT, 0)
     window.merge = filled((merges, 3), 0, wp.vec3i)
     window.start, window.near_start = filled(merges + 1, 0), filled(merges + 1, 0)
-    window.block_merge, window.block_start = filled(blocks, 0), filled(blocks, 0)
+    window.first_block = filled(merges + 1, 0)
+    for name in ("block_merge", "block_start", "block_done"):
+        setattr(window, name, unwritten(blocks))
     window.face_mark = filled(face_count, -1)
-    covers.triangle, covers.first, covers.count = filled(rows, 0), filled(rows, 0), filled(rows, 0)
-    covers.near = filled((merges + 1) * int(merge_window.NEAR_MOST), 0)
-    covers.face = filled((rows, merge_window.COLUMNS), 0)
-    covers.limit = wp.zeros(rows, dtype=wp.float64, device="cpu")
+    covers.triangle, covers.first, covers.count = unwritten(rows), unwritten(rows), unwritten(rows)
+    covers.near = unwritten((merges + 1) * int(merge_window.NEAR_MOST))
+    covers.face = unwritten((rows, int(merge_window.COLUMNS)))
+    window.limit, covers.limit = (wp.empty(n, dtype=wp.float64, device="cpu") for n in (1, rows))
     window.covers = covers
     return window
 

@@ -56,7 +56,7 @@ class ManifoldQuery(ContactQuery):
         made += [(self.curves, name, self._empty(capacity, wp.int32)) for name in ("parent", "loop")]
         made += [(self.curves, name, self._empty(capacity, wp.vec3d)) for name in ("loop_normal", "normal")]
         made.append((self.curves, "point", self._empty((capacity, 2), wp.vec3d)))
-        made.append((self.curves, "depth", self._empty((capacity, 2), wp.float64)))
+        made += [(self.curves, name, self._empty((capacity, 2), wp.float64)) for name in ("depth", "nearest")]
         return made
 
     def _pair_arrays(self, room: int) -> list:
@@ -84,7 +84,7 @@ class ManifoldQuery(ContactQuery):
         self._launch_kernel(manifold.average_loop_kernel, count, inputs)
         inputs = [*pools, self.pairs, self.pair_poses, start, rows, self.contacts, curves]
         self._launch_kernel(manifold.find_candidate_kernel, count, inputs)
-        self._launch_kernel(points.spread_point_kernel, room, [pools[2], self.pairs, start, curves, self.manifolds])
+        self._launch_warps(points.spread_point_kernel, room, [pools[2], self.pairs, start, curves, self.manifolds])
 
     def _sort_keys(self, count, bits):
         with wp.ScopedDevice(self.device):

@@ -23,7 +23,8 @@ from warp_abtree.simulate.body_state import RigidBodies, zeros_of
 
 COLOR_COUNT = int(graph_coloring.COLOR_COUNT)
 ITERATIONS = 16  # rounds of relaxation over all contacts in a step
-LAST_COLORS = 11  # first of the last colors, which one block relaxes
+COLOR_ROUNDS = 2  # of the graph coloring, each color; one makes almost twice as many colors
+LAST_COLORS = 8  # first of the last colors, which one block relaxes
 # Threads of a block: few pairs of a color lie on as many multiprocessors, and the last colors on one.
 RELAX_THREADS, TAIL_THREADS = 32, 256
 
@@ -71,8 +72,8 @@ class Dynamics(RigidBodies):
         self.query = ManifoldQuery(scene, None, capacity)
         # No body is in two pairs of a color.
         self._color_room = max(1, int(np.count_nonzero(self.rigid)))
-        # On the CPU threads run one after another.
-        self._tail_threads = TAIL_THREADS if self.device.is_cuda else 1
+        # On the CPU threads run one after another, and a color more costs nothing.
+        self._tail_threads, self._color_rounds = (TAIL_THREADS, COLOR_ROUNDS) if self.device.is_cuda else (1, 1)
         self._warm_start = constraint_kernels.WarmStart()
         self._room, self._interrupted = -1, False
         self._grow()
@@ -191,10 +192,11 @@ class Dynamics(RigidBodies):
 
     def _color_pairs(self):
         """Color the pairs in contact, and sort all pairs by color."""
-        room, color = self._room, self.constraints.color
-        for c in range(COLOR_COUNT):
-            self._launch(graph_coloring.bid_kernel, room, [c, self.query.pairs, color, self.bodies])
-            self._launch(graph_coloring.assign_color_kernel, room, [c, self.query.pairs, self.bodies, color])
+        room, found = self._room, [self.query.pairs, self.constraints.color, self.bodies]
+        rounds, color = self._color_rounds, self.constraints.color
+        for turn in range(COLOR_COUNT * rounds):
+            self._launch(graph_coloring.bid_kernel, room, [turn, rounds, *found])
+            self._launch(graph_coloring.assign_color_kernel, room, [turn, rounds, *found])
         wp.copy(self._sorted_color, color, count=room)
         with wp.ScopedDevice(self.device):
             wp.utils.radix_sort_pairs(self._sorted_color, self._sorted_pair, room, end_bit=7)

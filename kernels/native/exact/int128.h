@@ -17,8 +17,10 @@ inline CUDA_CALLABLE wp::int32 integer_orient3d(wp::vec_t<3, wp::float64> a, wp:
     const double last[3] = {d[0], d[1], d[2]};
     Wide x[3][3];
     int units = 0;
+#pragma unroll  // no array then
     for (int i = 0; i < 3; ++i) {
         int unit = 1 << 20;
+#pragma unroll
         for (int j = 0; j < 3; ++j) {
             if (Wide::exponent_of(row[i][j]) == 2047 || Wide::exponent_of(last[j]) == 2047)
                 return UNCERTAIN;
@@ -26,6 +28,7 @@ inline CUDA_CALLABLE wp::int32 integer_orient3d(wp::vec_t<3, wp::float64> a, wp:
         }
         if (unit == 1 << 20)
             return 0;  // a row of zeros
+#pragma unroll
         for (int j = 0; j < 3; ++j)
             x[i][j] = Wide::add(Wide::count_units(row[i][j], unit), Wide::negate(Wide::count_units(last[j], unit)));
         units += unit;
