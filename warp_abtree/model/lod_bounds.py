@@ -30,7 +30,9 @@ class LodBounds:
 
     def __init__(self, vertices, faces):
         self._vertex_count, face_count = len(vertices), len(faces)
-        self._centre, self._scale = find_frame(vertices[np.unique(faces)])
+        used = np.zeros(len(vertices), dtype=bool)
+        used[faces] = True
+        self._centre, self._scale = find_frame(vertices[used])
         face_array = cpu_array(faces, int)
         self._pos = np.zeros((2 * len(vertices), 3))
         self._pos[: len(vertices)] = (vertices - self._centre) / self._scale
