@@ -23,7 +23,12 @@ D is small: `stretch` and `slack_of`.
 import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
-from warp_abtree.kernels.distance.triangle_pair import PAIR_ROUNDING, scale_triangles, triangle_distance
+from warp_abtree.kernels.distance.triangle_pair import (
+    PAIR_ROUNDING,
+    between_features,
+    nearest_features,
+    scale_triangles,
+)
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import (
     ROUNDING_32,
@@ -56,6 +61,7 @@ class Frame:
 
     translation: wp.vec3  # between the models' centres, of B to A, scaled
     back: wp.vec3  # the same, of A to B
+    way: wp.vec3  # unit, in A's frame, about the direction in which the surfaces are nearest
     scale: wp.float32  # power of two that boxes are scaled by
     margin: wp.float32  # that posed boxes are widened by, scaled
     grow: wp.float32  # a little over 1: bounds of boxes may be so much too large
@@ -126,6 +132,7 @@ def make_frame(models: ModelPool, states: StatePool, objects: ObjectPool, pose: 
     frame = Frame()
     frame.translation = wp.vec3(shift * scale)
     frame.back = wp.vec3(back * scale)
+    frame.way = wp.normalize(frame.translation)
     frame.scale = wp.float32(scale)
     frame.margin = wp.float32(margin * scale)
     frame.scale64 = scale
@@ -205,7 +212,6 @@ def start_distance_kernel(
     a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
     pose = pair_poses[p]
     frame = make_frame(models, states, objects, pose, a, b)
-    found_inout.frame[p] = frame
     bound = found_inout.beyond[p]
     if bound < DISTANCE_MAX:
         bound = bound * frame.stretch + (frame.slack + frame.pair_slack)
@@ -215,9 +221,13 @@ def start_distance_kernel(
     kept = NO_FACES
     face_a, face_b = wp.int32(faces >> wp.int64(32)), wp.int32(faces & wp.int64(0x7FFFFFFF))
     if is_active(models, states, objects.state[a], face_a) and is_active(models, states, objects.state[b], face_b):
-        d = triangle_distance(load_triangles(models, states, pose, face_a, face_b))
+        triangles = load_triangles(models, states, pose, face_a, face_b)
+        near = nearest_features(triangles)
+        d = wp.sqrt(near.square) * triangles.size
         if d <= bound:
             bound = d
             kept = pack_item(face_a, face_b)
+            frame.way = wp.vec3(wp.normalize(between_features(triangles, near)))
+    found_inout.frame[p] = frame
     found_inout.distance[p] = bound
     found_inout.faces[p] = kept

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.contact.summary import no_vector
 from warp_abtree.kernels.distance.frame import NO_FACES, Found, Tolerances, cut_of, load_triangles, slack_of
 from warp_abtree.kernels.distance.triangle_pair import feature_weights, nearest_features
 from warp_abtree.kernels.generation import STALE
@@ -18,11 +18,6 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 LEAST_DISTANCE = wp.constant(wp.float64(2.0**-1022))
 
 two_points = wp.types.matrix(shape=(2, 3), dtype=wp.float64)
-
-
-@wp.func_native(native.body("numbers.cuh", "no_vector"))
-def no_vector() -> wp.vec3d:
-    """Return a vector of NumPy's NaN."""
 
 
 @wp.struct

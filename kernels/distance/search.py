@@ -34,6 +34,8 @@ wp.set_module_options(MODULE_OPTIONS)
 # As in `traversal.dual_tree`.
 DEPTH_FIRST_ROOM = wp.constant(128)
 
+FIRST_TOLERANCE = wp.constant(wp.float64(0.25))
+
 stack_code = functools.partial(native.body, "nearest_stack.cuh")
 
 
@@ -160,11 +162,20 @@ def search_warp_kernel(
         return
     if hits_inout.any_hit[p] != 0:
         return
-    start = Nearest()
-    start.distance = found_inout.distance[p]
-    start.faces = found_inout.faces[p]
+    nearest = Nearest()
+    nearest.distance = found_inout.distance[p]
+    nearest.faces = found_inout.faces[p]
     pose = pair_poses[p]
-    nearest, tests = search_pair(models, states, pose, found_inout.frame[p], tolerances, room, start)
+    # Without faces to start from, what is found within a wide tolerance is: far fewer are looked at in vain.
+    turn = wp.where(nearest.faces == NO_FACES, 0, 1)
+    tests = wp.vec2i()
+    while turn < 2:
+        asked = tolerances
+        if turn == 0:
+            asked.relative = wp.max(tolerances.relative, FIRST_TOLERANCE)
+        nearest, more = search_pair(models, states, pose, found_inout.frame[p], asked, room, nearest)
+        tests += more
+        turn += 1
     if warp_lane() == 0:
         found_inout.distance[p] = nearest.distance
         found_inout.faces[p] = nearest.faces

@@ -20,6 +20,7 @@ from warp_abtree.kernels.distance.frame import (
     load_triangles,
     width_of,
 )
+from warp_abtree.kernels.distance.slabs import Slabs, has_slabs
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import PairPose
@@ -37,7 +38,9 @@ ROUNDING_DOWN = wp.constant(wp.float32(1.0 - 2.0**-20))
 
 
 @wp.func_native(native.body("simd/nearest.h", "open_search"))
-def open_search(upper: wp.float32, first: wp.int64, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)): ...
+def open_search(
+    upper: wp.float32, first: wp.int64, way: wp.vec3, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)
+): ...
 
 
 @wp.func_native(native.body("simd/nearest.h", "search_nearest"))
@@ -47,6 +50,8 @@ def search_nearest(
     pose: PairPose,
     frame: Frame,
     spare: wp.vec4,
+    slabs: Slabs,
+    with_slabs: bool,
     thread: wp.int32,
     memory: wp.array2d(dtype=wp.float32),
 ) -> wp.vec3i:
@@ -123,6 +128,7 @@ def search_thread_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pair_poses: wp.array(dtype=PairPose),
     counter: wp.array(dtype=wp.int32),
+    slabs: Slabs,
     found_inout: Found,
     hits_inout: Hits,
     memory_out: wp.array2d(dtype=wp.float32),
@@ -142,11 +148,12 @@ def search_thread_kernel(
             nearest = Nearest()
             nearest.distance = found_inout.distance[p]
             nearest.faces = found_inout.faces[p]
+            with_slabs = has_slabs(slabs, p)
             spare = spare_of(tolerances, frame)
-            open_search(scaled_up(nearest.distance, frame), first_item(states, pose), thread, memory_out)
+            open_search(scaled_up(nearest.distance, frame), first_item(states, pose), frame.way, thread, memory_out)
             state = wp.vec3i()
             while state[0] == 0:
-                state = search_nearest(models, states, pose, frame, spare, thread, memory_out)
+                state = search_nearest(models, states, pose, frame, spare, slabs, with_slabs, thread, memory_out)
                 nearest = decide_open(models, states, pose, frame, tolerances, thread, nearest, memory_out)
             hits_inout.node_tests[p] += wp.int64(state[1])
             hits_inout.triangle_tests[p] += wp.int64(state[2])

@@ -199,3 +199,10 @@ def feature_weights(near: Features):
     if near.kind < CORNERS_OF_A:
         return inside, edge_weights(near.kind - CORNERS_OF_B, wp.float64(0.0))
     return edge_weights(near.kind - CORNERS_OF_A, wp.float64(0.0)), inside
+
+
+@wp.func
+def between_features(t: Triangles, near: Features):
+    """Return the vector from the nearest point of A to that of B, scaled."""
+    a, b = feature_weights(near)
+    return (b[0] * t.b0 + b[1] * t.b1 + b[2] * t.b2) - (a[1] * t.a1 + a[2] * t.a2)

@@ -47,11 +47,10 @@ static_assert(SUBTREE_RECORDS == 2 * SUBTREE_LEAVES, "one a node, by its place i
 // pairs taken at once, and words of a thread.
 constexpr int LATER_LENGTH = 4096;
 constexpr int OPEN_LENGTH = 256;
-constexpr int NEAREST_FACES = 64;
+constexpr int NEAREST_FACES = 128;
 constexpr int NEAREST_AT_ONCE = 8;
-constexpr int NEAREST_WORDS = 16272;
-constexpr float FACES_ERROR = 0x1p-16f;
-static_assert(NEAREST_FACES >= 15 + 4 * NEAREST_AT_ONCE + 16, "loads go beyond");
+constexpr int NEAREST_WORDS = 16400;
+static_assert(NEAREST_FACES >= 15 + 4 * NEAREST_AT_ONCE + 16 && NEAREST_AT_ONCE % 4 == 0, "loads go beyond");
 static_assert(NEAREST_WORDS == 16 + 3 * (CPU_STACK_LENGTH + LATER_LENGTH + OPEN_LENGTH) + 2 * NEAREST_FACES, "no gap");
 
 // Straddling pairs that wait for their last two signs on the CPU, the last 16 of them written over.

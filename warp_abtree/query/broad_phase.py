@@ -82,7 +82,8 @@ class BroadPhase:
         inputs = [self.pair_count, self.pairs, self.order, self.key]
         wp.launch(make_pair_key_kernel, room, inputs, device=self.device)
         with wp.ScopedDevice(self.device):
-            wp.utils.radix_sort_pairs(self.key, self.order, room)
+            # The key behind all others has only ones among these bits.
+            wp.utils.radix_sort_pairs(self.key, self.order, room, end_bit=32 + len(self.lower).bit_length())
         inputs = [self.key, self.pair_count, self.pairs]
         wp.launch(place_pair_kernel, room + 1, inputs, device=self.device)
 

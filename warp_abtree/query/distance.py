@@ -27,7 +27,7 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd
+from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd, slabs
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.narrow_phase import Query
@@ -36,8 +36,10 @@ from warp_abtree.query.result import DISTANCES, Found, Result
 from warp_abtree.query.staging import first_rows
 
 COUNTER_COUNT = 4
+# Places among the launches, from their end: of the search, and of what is about pairs that intersect.
+SEARCH, CROSSINGS = -4, (-3, -1)
 # Pairs that make a further core worth its while, which costs some 50 us.
-PAIRS_A_CORE = 2
+PAIRS_A_CORE = 4
 
 
 def check_beyond(beyond, pair_count=None) -> np.ndarray:
@@ -112,9 +114,12 @@ class DistanceQuery(Query):
     def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None):
         self._tolerances = make_tolerances(tolerance, relative)
         self._asked = check_beyond(beyond, None if pairs is None else len(to_numpy(pairs, "pairs")))
-        self.distances, self._found = report.Distances(), frame.Found()
+        self.distances, self._found, self._slabs = report.Distances(), frame.Found(), slabs.Slabs()
+        self._slabs.record = wp.empty(0, dtype=wp.vec4, device=scene.device)
+        self._slabs.made = wp.empty(0, dtype=wp.vec4i, device=scene.device)
         self._counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity)
+        self._found.launched = self.guard.launched
 
     def set_pairs(self, pairs, beyond=None):
         """Query other pairs from now on, in the room there is if they fit; beyond None keeps the distances.
@@ -136,8 +141,10 @@ class DistanceQuery(Query):
         Raises:
             ValueError: One that is negative, infinite or no number.
         """
-        self._tolerances = make_tolerances(tolerance, relative)
-        self._commands = Commands()
+        asked = make_tolerances(tolerance, relative)
+        if (asked.tolerance, asked.relative) != (self._tolerances.tolerance, self._tolerances.relative):
+            self._tolerances = asked
+            self._commands = Commands()
 
     def forget(self):
         """Let the next launch start anew, and not from the faces that the last one found. Launches only."""
@@ -170,6 +177,7 @@ class DistanceQuery(Query):
         ):
             made.append((owner, name, wp.empty(room, dtype=dtype, device=self.device)))
         threads = 0 if self.uses_warps() else min(room, current_regime().cpu_threads or core_count())
+        made.append((self._slabs, "states", wp.empty(room, dtype=wp.vec2i, device=self.device)))
         made.append(
             (self, "_memory", wp.empty((threads, search_simd.NEAREST_WORDS), dtype=wp.float32, device=self.device))
         )
@@ -178,22 +186,33 @@ class DistanceQuery(Query):
 
     def traverse(self):
         """Decide which pairs in place intersect, and find the distances of the others. Launches only."""
-        super().traverse()
         room = len(self.pairs)
         if not room:
             return
-        self._found.launched = self.guard.launched
+        if not self.uses_warps():
+            self._fit_slabs()
+        super().traverse()
         if self.device.is_capturing:
             self._make_distances(wp.launch)
             return
-        first, search, *reports = self._commands.find("distances", self.guard.given(), self._make_distances)
-        first.launch()
-        if self.uses_warps():
-            search.launch()
-        else:
-            launch_on_cores(search.launch, room, current_regime().cpu_threads, PAIRS_A_CORE)
-        for command in reports:
-            command.launch()
+        commands = self._commands.find("distances", self.guard.given(), self._make_distances)
+        # On the CPU what is launched is done.
+        meeting = self.device.is_cuda or bool(self.hits.any_hit.numpy().any())
+        for place, command in enumerate(commands, -len(commands)):
+            if place == SEARCH and not self.uses_warps():
+                launch_on_cores(command.launch, room, current_regime().cpu_threads, PAIRS_A_CORE)
+            elif meeting or place not in CROSSINGS:
+                command.launch()
+
+    def _fit_slabs(self):
+        """Make room for the slabs of all tree states that there are now."""
+        pool = self.batch.states.pool
+        if len(self._slabs.record) == len(pool.node_box) and len(self._slabs.made) == len(pool.lod):
+            return
+        check_device(self.device, "a first launch after tree states were added")
+        made = wp.zeros(len(pool.lod), dtype=wp.vec4i, device=self.device)
+        record = wp.empty(len(pool.node_box), dtype=wp.vec4, device=self.device)
+        self._replace([(self._slabs, "record", record), (self._slabs, "made", made)])
 
     def _make_distances(self, launch) -> list:
         """Make the launches that follow the exact test, see `Commands.find`."""
@@ -205,15 +224,17 @@ class DistanceQuery(Query):
         warps = {"dim": room * lanes, "block_dim": WARP_SIZE, "device": device}
         threads = {"dim": room, "block_dim": WARP_SIZE, "device": device}
         reports = [*posed, found, hits, self.distances]
+        made = [launch(frame.start_distance_kernel, inputs=[*posed, found, self._counter], **threads)]
         if self.uses_warps():
             inputs = [length, self._tolerances, *shared, found, hits]
-            searching = launch(search.search_warp_kernel, inputs=inputs, **warps)
+            made.append(launch(search.search_warp_kernel, inputs=inputs, **warps))
         else:
-            inputs = [self._tolerances, *shared, self._counter, found, hits, self._memory]
-            searching = launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device)
+            inputs = [models, states, objects, self.pair_count, self.pairs, found, self._slabs]
+            made.append(launch(slabs.refresh_slab_kernel, inputs=inputs, dim=room, device=device))
+            inputs = [self._tolerances, *shared, self._counter, self._slabs, found, hits, self._memory]
+            made.append(launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device))
         return [
-            launch(frame.start_distance_kernel, inputs=[*posed, found, self._counter], **threads),
-            searching,
+            *made,
             launch(crossing.search_crossing_kernel, inputs=[length, *shared, hits, found], **warps),
             launch(report.report_distance_kernel, inputs=[self._tolerances, *reports], **threads),
             launch(crossing.report_crossing_kernel, inputs=reports, **threads),
@@ -222,6 +243,7 @@ class DistanceQuery(Query):
     def _make_result(self, found: Found, device: bool, with_rows: bool = True) -> Result:
         n, answers = len(found.pairs), self.distances
         for name in (*DISTANCES, "points"):
-            rows = first_rows(getattr(answers, "faces" if name == "point_faces" else name), n)
+            rows = getattr(answers, "faces" if name == "point_faces" else name)
+            rows = rows if len(rows) == n else first_rows(rows, n)
             setattr(found, name, wp.clone(rows) if device else rows.numpy().copy())
         return super()._make_result(found, device, with_rows)

@@ -1,47 +1,46 @@
-// Bounds of the distances of four pairs of boxes at a time, as `bound_children` one by one.
+// Bounds of the distances of 16 pairs of boxes at a time, those of four items: as `bound_children` one by one.
 #pragma once
 #include "builtin.h"
 
 struct NearBoxes {
-    // Groups of four numbers: x, y, z and one that is not in use.
-    typedef float groups __attribute__((vector_size(64)));
+    // Two siblings of one tree as they lie in memory; or a number each of A's eight nodes, then of B's.
+    typedef float lanes __attribute__((vector_size(64)));
     typedef float loose __attribute__((vector_size(64), aligned(16)));
     typedef int bits __attribute__((vector_size(64)));
-    typedef float eight __attribute__((vector_size(32)));
-    typedef int ints __attribute__((vector_size(32)));
-    typedef wp::int64 longs __attribute__((vector_size(32)));
-    typedef float four __attribute__((vector_size(16)));
-    typedef int fours __attribute__((vector_size(16)));
-    typedef bool flags __attribute__((ext_vector_type(8)));
-    typedef wp::int64 loose_longs __attribute__((vector_size(32), aligned(8)));
-    typedef float loose_four __attribute__((vector_size(16), aligned(4)));
+    typedef wp::int64 longs __attribute__((vector_size(64)));
+    typedef wp::int64 loose_longs __attribute__((vector_size(64), aligned(8)));
+    typedef float loose_lanes __attribute__((vector_size(64), aligned(4)));
+    typedef bool flags __attribute__((ext_vector_type(16)));
     struct Taken {
         const char *a, *b;
         unsigned int used;
     };
-    // Up to four pairs of children: bounds, items that follow, and which are nodes and which faces, a bit each.
+    // 16 pairs of children: bounds, items that follow, and which are in use and which are faces, a bit each.
     struct Tested {
-        four bound;
-        longs item;
+        lanes bound;
+        longs low, high;
         unsigned int used, leaves;
     };
-    groups axes[3], sizes[3], shift, wide;
-    float scale;
+    lanes axes[3][3], sizes[3][3], shift[3];
+    float scale, wide, margin;
     const char *tree_a, *tree_b;
+    wp::int64 slabs;   // where the slab of a node lies, from the node; 0 for none
+    lanes way[3], far;  // direction from A for A's nodes, to A for B's, in their own frames; and -t . n of B's
 
-    static NearBoxes make(const wp::float32 (&r)[3][3], const wp::vec_t<3, float>& back, const wp::vec_t<3, float>& there,
-                          float margin, float scale, const void* trees, int a, int b) {
+    static NearBoxes make(const wp::float32 (&r)[3][3], const wp::vec_t<3, float>& back,
+                          const wp::vec_t<3, float>& there, float margin, float scale, const void* trees, int a, int b) {
         NearBoxes s;
-        // For both children of A, then for both children of B.
-        for (int k = 0; k < 3; ++k) {
-            s.axes[k] = groups{r[k][0], r[k][1], r[k][2], 0.0f, r[k][0], r[k][1], r[k][2], 0.0f,
-                               r[0][k], r[1][k], r[2][k], 0.0f, r[0][k], r[1][k], r[2][k], 0.0f};
-            s.sizes[k] = __builtin_elementwise_abs(s.axes[k]);
+        auto join = [](float a, float b) { return lanes{a, a, a, a, a, a, a, a, b, b, b, b, b, b, b, b}; };
+        for (int i = 0; i < 3; ++i) {
+            for (int k = 0; k < 3; ++k) {
+                s.axes[i][k] = join(r[k][i], r[i][k]);
+                s.sizes[i][k] = __builtin_elementwise_abs(s.axes[i][k]);
+            }
+            s.shift[i] = join(2 * back[i], 2 * there[i]);
         }
-        const float h[3] = {back[0] * 2, back[1] * 2, back[2] * 2};
-        const float f[3] = {there[0] * 2, there[1] * 2, there[2] * 2};
-        s.shift = groups{h[0], h[1], h[2], 0.0f, h[0], h[1], h[2], 0.0f, f[0], f[1], f[2], 0.0f, f[0], f[1], f[2], 0.0f};
-        s.wide = groups{} + 2 * margin;
+        s.wide = 2 * margin;
+        s.margin = 16 * margin;  // docs/exactness.md
+        s.slabs = 0;
         s.scale = scale;
         s.tree_a = (const char*)trees + 32 * (wp::int64)a;
         s.tree_b = (const char*)trees + 32 * (wp::int64)b;
@@ -58,81 +57,133 @@ struct NearBoxes {
         __builtin_prefetch(taken.b);
         return taken;
     }
-    static groups of_a(const groups& v) {
-        return __builtin_shufflevector(v, v, 0, 1, 2, 3, 0, 1, 2, 3, 4, 5, 6, 7, 4, 5, 6, 7);
+    // Take a unit vector of A's frame as the direction along which slabs are compared.
+    void look(const float* n) {
+        float back[3];
+        for (int i = 0; i < 3; ++i)
+            back[i] = axes[0][i][15] * n[0] + axes[1][i][15] * n[1] + axes[2][i][15] * n[2];
+        const float t = shift[0][15] * n[0] + shift[1][15] * n[1] + shift[2][15] * n[2];
+        for (int i = 0; i < 3; ++i) {
+            const float a = n[i], b = -back[i];
+            way[i] = lanes{a, a, a, a, a, a, a, a, b, b, b, b, b, b, b, b};
+        }
+        far = lanes{0, 0, 0, 0, 0, 0, 0, 0, t, t, t, t, t, t, t, t};
     }
-    static groups of_b(const groups& v) {
-        return __builtin_shufflevector(v, v, 8, 9, 10, 11, 12, 13, 14, 15, 8, 9, 10, 11, 12, 13, 14, 15);
+    // Upper bounds of twice the coordinate along the direction, of each node's box and slab.
+    lanes tops(const Taken (&taken)[4], const lanes (&sum)[3], const lanes (&size)[3]) const {
+        lanes slab[8];
+        turn(taken, slabs, slab);
+        const lanes along = way[0] * slab[0] + way[1] * slab[1] + way[2] * slab[2];
+        lanes top = along * (along > 0.0f ? slab[4] : slab[3]) * (2.0f * scale), plain = {};
+        for (int i = 0; i < 3; ++i) {
+            const lanes rest = way[i] - along * slab[i];
+            top += rest * sum[i] + __builtin_elementwise_abs(rest) * size[i];
+            plain += way[i] * sum[i] + __builtin_elementwise_abs(way[i]) * size[i];
+        }
+        return (top < plain ? top : plain) - far;
     }
-    static groups spread_x(const groups& v) {
-        return __builtin_shufflevector(v, v, 0, 0, 0, 0, 4, 4, 4, 4, 8, 8, 8, 8, 12, 12, 12, 12);
+    static lanes square(const lanes& x, const lanes& reach) {
+        const lanes over = __builtin_elementwise_abs(x) - reach, gap = over > 0.0f ? over : lanes{};
+        return gap * gap;
     }
-    static groups spread_y(const groups& v) {
-        return __builtin_shufflevector(v, v, 1, 1, 1, 1, 5, 5, 5, 5, 9, 9, 9, 9, 13, 13, 13, 13);
+    static unsigned int to_mask(const bits& which) {
+        return (unsigned int)__builtin_bit_cast(unsigned short, __builtin_convertvector(which, flags));
     }
-    static groups spread_z(const groups& v) {
-        return __builtin_shufflevector(v, v, 2, 2, 2, 2, 6, 6, 6, 6, 10, 10, 10, 10, 14, 14, 14, 14);
+    // A node's eight numbers, of A's nodes in order, then of B's.
+    static void turn(const Taken (&taken)[4], wp::int64 offset, lanes (&field)[8]) {
+        lanes row[8], half[8], part[8];
+        for (int i = 0; i < 4; ++i) {
+            row[i] = *(const loose*)(taken[i].a + offset);
+            row[4 + i] = *(const loose*)(taken[i].b + offset);
+        }
+        // Numbers k of the siblings of two items side by side, then of four.
+        for (int i = 0; i < 4; ++i) {
+            const lanes &a = row[2 * i], &b = row[2 * i + 1];
+            half[2 * i] =
+                __builtin_shufflevector(a, b, 0, 8, 16, 24, 1, 9, 17, 25, 2, 10, 18, 26, 3, 11, 19, 27);
+            half[2 * i + 1] =
+                __builtin_shufflevector(a, b, 4, 12, 20, 28, 5, 13, 21, 29, 6, 14, 22, 30, 7, 15, 23, 31);
+        }
+        for (int i = 0; i < 2; ++i)
+            for (int k = 0; k < 2; ++k) {
+                const lanes &a = half[4 * i + k], &b = half[4 * i + 2 + k];
+                part[4 * i + 2 * k] =
+                    __builtin_shufflevector(a, b, 0, 1, 2, 3, 16, 17, 18, 19, 4, 5, 6, 7, 20, 21, 22, 23);
+                part[4 * i + 2 * k + 1] =
+                    __builtin_shufflevector(a, b, 8, 9, 10, 11, 24, 25, 26, 27, 12, 13, 14, 15, 28, 29, 30, 31);
+            }
+        for (int k = 0; k < 4; ++k) {
+            const lanes &a = part[k], &b = part[4 + k];
+            field[2 * k] =
+                __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23);
+            field[2 * k + 1] =
+                __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
+        }
     }
-    // Squares of what |x| exceeds a reach by, summed in each group.
-    static groups square_gap(const groups& x, const groups& reach) {
-        const groups over = __builtin_elementwise_abs(x) - reach, gap = over > 0.0f ? over : groups{};
-        const groups square = gap * gap;
-        const groups two = square + __builtin_shufflevector(square, square, 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12,
-                                                            15, 14);
-        return two + __builtin_shufflevector(two, two, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13);
+    static lanes of_a(const lanes& v) {
+        return __builtin_shufflevector(v, v, 0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
     }
-    Tested test(const Taken& taken) const {
-        const groups none = {};
-        const groups a = *(const loose*)taken.a, b = *(const loose*)taken.b;
-        groups low = __builtin_shufflevector(a, b, 0, 1, 2, 3, 8, 9, 10, 11, 16, 17, 18, 19, 24, 25, 26, 27);
-        groups high = __builtin_shufflevector(a, b, 4, 5, 6, 7, 12, 13, 14, 15, 20, 21, 22, 23, 28, 29, 30, 31);
-        low = __builtin_shufflevector(low, none, 0, 1, 2, 16, 4, 5, 6, 16, 8, 9, 10, 16, 12, 13, 14, 16) * scale;
-        high = __builtin_shufflevector(high, none, 0, 1, 2, 16, 4, 5, 6, 16, 8, 9, 10, 16, 12, 13, 14, 16) * scale;
-        const groups sum = high + low, size = high - low;
-        groups sum_there = __builtin_elementwise_fma(axes[2], spread_z(sum), shift);
-        sum_there = __builtin_elementwise_fma(axes[1], spread_y(sum), sum_there);
-        sum_there = __builtin_elementwise_fma(axes[0], spread_x(sum), sum_there);
-        groups size_there = __builtin_elementwise_fma(sizes[2], spread_z(size), wide);
-        size_there = __builtin_elementwise_fma(sizes[1], spread_y(size), size_there);
-        size_there = __builtin_elementwise_fma(sizes[0], spread_x(size), size_there);
-        const groups one = square_gap(of_a(sum) - of_b(sum_there), of_a(size) + of_b(size_there));
-        const groups other = square_gap(of_a(sum_there) - of_b(sum), of_a(size_there) + of_b(size));
-        const groups more = one > other ? one : other;
+    static lanes of_b(const lanes& v) {
+        return __builtin_shufflevector(v, v, 8, 9, 8, 9, 10, 11, 10, 11, 12, 13, 12, 13, 14, 15, 14, 15);
+    }
+    Tested test(const Taken (&taken)[4]) const {
+        lanes field[8], sum[3], size[3], bound = {}, other = {};
+        turn(taken, 0, field);
+        for (int i = 0; i < 3; ++i) {
+            const lanes low = field[i] * scale, high = field[4 + i] * scale;
+            sum[i] = high + low;
+            size[i] = high - low;
+        }
+        for (int i = 0; i < 3; ++i) {
+            lanes sum_there = shift[i], size_there = lanes{} + wide;
+            for (int k = 2; k >= 0; --k) {
+                sum_there = __builtin_elementwise_fma(axes[i][k], sum[k], sum_there);
+                size_there = __builtin_elementwise_fma(sizes[i][k], size[k], size_there);
+            }
+            bound += square(of_a(sum[i]) - of_b(sum_there), of_a(size[i]) + of_b(size_there));
+            other += square(of_a(sum_there) - of_b(sum[i]), of_a(size_there) + of_b(size[i]));
+        }
         Tested tested;
-        tested.bound = __builtin_shufflevector(more, more, 0, 4, 8, 12);
-        // What follows, as in `item_of`: of A for the four pairs, then of B.
-        const bits whole_a = (bits)a, whole_b = (bits)b;
-        const ints skip = __builtin_shufflevector(whole_a, whole_b, 3, 3, 11, 11, 19, 27, 19, 27);
-        const ints face = __builtin_shufflevector(whole_a, whole_b, 7, 7, 15, 15, 23, 31, 23, 31);
-        const ints across = __builtin_shufflevector(face, face, 4, 5, 6, 7, 0, 1, 2, 3);
-        const eight span = (eight)face, other_span = (eight)across;
-        const ints inner = (face | across) < 0, down = (face < 0) & (span + span <= other_span);
-        const ints next = inner ? (down ? (skip + skip) | (1 << 31) : skip) : face;
-        tested.item = (longs)__builtin_shufflevector(next, next, 4, 0, 5, 1, 6, 2, 7, 3);
-        tested.used = taken.used;
-        tested.leaves = 15 & ~__builtin_bit_cast(unsigned char, __builtin_convertvector(inner, flags));
+        tested.bound = bound > other ? bound : other;
+        if (slabs != 0) {
+            const lanes top = tops(taken, sum, size), gap = -(of_a(top) + of_b(top)) - margin;
+            const lanes apart = gap > 0.0f ? gap * gap : lanes{};
+            tested.bound = tested.bound > apart ? tested.bound : apart;
+        }
+        // What follows, as in `item_of`.
+        const bits face_a = (bits)of_a(field[7]), face_b = (bits)of_b(field[7]);
+        const bits skip_a = (bits)of_a(field[3]), skip_b = (bits)of_b(field[3]);
+        const lanes span_a = (lanes)face_a, span_b = (lanes)face_b;
+        const bits inner = (face_a | face_b) < 0;
+        const bits down_a = span_a + span_a <= span_b, down_b = span_b + span_b <= span_a;
+        const bits x = inner ? (down_a ? (skip_a + skip_a) | (1 << 31) : skip_a) : face_a;
+        const bits y = inner ? (down_b ? (skip_b + skip_b) | (1 << 31) : skip_b) : face_b;
+        tested.low = (longs)__builtin_shufflevector(y, x, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+        tested.high =
+            (longs)__builtin_shufflevector(y, x, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+        tested.used = taken[0].used | taken[1].used << 4 | taken[2].used << 8 | taken[3].used << 12;
+        tested.leaves = 0xffff & ~to_mask(inner);
         return tested;
     }
-    static unsigned int up_to(const four& x, float most) {
-        const fours which = x <= most;
-        const flags both = __builtin_convertvector(__builtin_shufflevector(which, which, 0, 1, 2, 3, 0, 1, 2, 3), flags);
-        return __builtin_bit_cast(unsigned char, both) & 15;
-    }
-    // Put what a mask names on a list, of which four places are written over.
-    static void append_items(wp::int64* list, const longs& x, unsigned int which) {
+    // Put what a mask names on a list, of which 16 places are written over.
+    static void append_items(wp::int64* list, const Tested& tested, unsigned int which) {
 #if defined(__AVX512VL__)
-        *(loose_longs*)list = __builtin_ia32_compressdi256_mask(x, longs{}, which);
+        *(loose_longs*)list = __builtin_ia32_compressdi512_mask(tested.low, longs{}, which & 255);
+        *(loose_longs*)(list + __builtin_popcount(which & 255)) =
+            __builtin_ia32_compressdi512_mask(tested.high, longs{}, which >> 8);
 #else
-        for (int k = 0, n = 0; k < 4; n += which >> k++ & 1)
-            list[n] = x[k];
+        for (int n = 0; which != 0; which &= which - 1) {
+            const int k = __builtin_ctz(which);
+            list[n++] = k < 8 ? tested.low[k] : tested.high[k - 8];
+        }
 #endif
     }
-    static void append_bounds(float* list, const four& x, unsigned int which) {
+    static void append_bounds(float* list, const lanes& x, unsigned int which) {
 #if defined(__AVX512VL__)
-        *(loose_four*)list = __builtin_ia32_compresssf128_mask(x, four{}, which);
+        *(loose_lanes*)list = __builtin_ia32_compresssf512_mask(x, lanes{}, which);
 #else
-        for (int k = 0, n = 0; k < 4; n += which >> k++ & 1)
-            list[n] = x[k];
+        for (int n = 0; which != 0; which &= which - 1)
+            list[n++] = x[__builtin_ctz(which)];
 #endif
     }
 };

@@ -3,7 +3,7 @@
 #include "builtin.h"
 #include "simd/float32.h"
 
-struct NearFaces {
+struct NearestFaces {
     typedef Float32 F;
     typedef F::lanes lanes;
     typedef F::bits bits;
@@ -63,28 +63,40 @@ struct NearFaces {
         }
         return c;
     }
-    static lanes between_edges(const Point& r, const Point& e, const Point& f, const lanes& inverse_e,
+    // Squared distances, and vectors from A's points to B's.
+    struct Nearest {
+        lanes square;
+        Point v;
+    };
+    static Point between_edges(const Point& r, const Point& e, const Point& f, const lanes& inverse_e,
                                const lanes& inverse_f) {
         const Point n = F::cross(e, f);
         lanes s = clamp(F::dot(F::cross(r, f), n) * invert(F::dot(n, n)));
         const lanes t = clamp((F::dot(e, f) * s - F::dot(r, f)) * inverse_f);
         s = clamp(F::dot(add(r, t, f), e) * inverse_e);
-        const Point v = add(add(r, t, f), -s, e);
-        return F::dot(v, v);
+        return add(add(r, t, f), -s, e);
     }
-    static lanes over_face(const Point& w, const Point& e1, const Point& e2, const Point& n, const lanes& inverse) {
+    static Point over_face(const Point& w, const Point& e1, const Point& e2, const Point& n, const lanes& inverse) {
         const Point level = add(w, -F::dot(w, n) * inverse, n);
         const lanes x = F::dot(cross_exactly(level, e2), n) * inverse;
         const lanes y = F::dot(cross_exactly(e1, level), n) * inverse;
         const Point v = add(add(w, -x, e1), -y, e2);
         const bits inside = (inverse > 0.0f) & (x >= 0.0f) & (y >= 0.0f) & (x + y <= 1.0f);
-        return inside ? F::dot(v, v) : lanes{} + __builtin_inff();
+        const lanes far = lanes{} + 0x1p60f;
+        return Point{inside ? v.x : far, inside ? v.y : far, inside ? v.z : far};
     }
-    // Squared distances, and the largest coordinate of what joins corners.
-    static lanes measure(const Corners& c, lanes& size) {
+    static void offer(Nearest& nearest, const Point& v) {
+        const lanes square = F::dot(v, v);
+        const bits closer = square < nearest.square;
+        nearest.square = closer ? square : nearest.square;
+        nearest.v = F::choose(closer, v, nearest.v);
+    }
+    // Where pairs are nearest, and the largest coordinate of what joins corners.
+    static Nearest measure(const Corners& c, lanes& size) {
         const Point e[3] = {F::minus(c.a[1], c.a[0]), F::minus(c.a[2], c.a[1]), F::minus(c.a[0], c.a[2])};
         const Point f[3] = {F::minus(c.b[1], c.b[0]), F::minus(c.b[2], c.b[1]), F::minus(c.b[0], c.b[2])};
-        lanes inverse_e[3], inverse_f[3], square = lanes{} + __builtin_inff();
+        lanes inverse_e[3], inverse_f[3];
+        Nearest nearest = {lanes{} + __builtin_inff(), Point{}};
         for (int k = 0; k < 3; ++k) {
             inverse_e[k] = invert(F::dot(e[k], e[k]));
             inverse_f[k] = invert(F::dot(f[k], f[k]));
@@ -94,16 +106,17 @@ struct NearFaces {
             for (int j = 0; j < 3; ++j) {
                 const Point r = F::minus(c.b[j], c.a[i]);
                 size = most(size, largest(r));
-                square = least(square, between_edges(r, e[i], f[j], inverse_e[i], inverse_f[j]));
+                offer(nearest, between_edges(r, e[i], f[j], inverse_e[i], inverse_f[j]));
             }
         const Point back_a = F::minus(c.a[2], c.a[0]), back_b = F::minus(c.b[2], c.b[0]);
         const Point n = cross_exactly(e[0], back_a), m = cross_exactly(f[0], back_b);
         const lanes inverse_n = invert(F::dot(n, n)), inverse_m = invert(F::dot(m, m));
         for (int k = 0; k < 3; ++k) {
-            square = least(square, over_face(F::minus(c.b[k], c.a[0]), e[0], back_a, n, inverse_n));
-            square = least(square, over_face(F::minus(c.a[k], c.b[0]), f[0], back_b, m, inverse_m));
+            offer(nearest, over_face(F::minus(c.b[k], c.a[0]), e[0], back_a, n, inverse_n));
+            const Point v = over_face(F::minus(c.a[k], c.b[0]), f[0], back_b, m, inverse_m);
+            offer(nearest, Point{-v.x, -v.y, -v.z});
         }
         size = most(most(size, largest(e[0])), most(largest(back_a), most(largest(f[0]), largest(back_b))));
-        return square;
+        return nearest;
     }
 };

@@ -5,19 +5,23 @@
 #include "simd/near_faces32.h"
 #include "simd/nearest_memory.h"
 
-void open_search(wp::float32 upper, wp::int64 first, wp::int32 thread, wp::array_t<wp::float32> memory) {
+void open_search(wp::float32 upper, wp::int64 first, wp::vec_t<3, wp::float32> way, wp::int32 thread,
+                 wp::array_t<wp::float32> memory) {
 #include "simd/nearest_memory.h"
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
     h = NearestMemory::Header{};
     h.upper = upper;
     h.top = 1;
+    for (int k = 0; k < 3; ++k)
+        h.way[k] = way[k];
     m.item[0] = first;
     m.bound[0] = 0.0f;
 }
 
-template <class ModelPool, class StatePool, class PairPose, class Frame>
+template <class ModelPool, class StatePool, class PairPose, class Frame, class Slabs>
 wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairPose pose, Frame frame, wp::vec_t<4, wp::float32> spare,
+                                       Slabs slabs, bool with_slabs,
                                        wp::int32 thread, wp::array_t<wp::float32> memory) {
 #if defined(__CUDA_ARCH__)
     __trap();  // warps have a search of their own
@@ -26,13 +30,17 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
 #include "simd/near_boxes.h"
 #include "simd/near_faces32.h"
 #include "simd/nearest_memory.h"
-    typedef NearFaces N;
+    typedef NearestFaces N;
     typedef N::F F;
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
     const auto& r = pose.rotation32.data;
-    const NearBoxes boxes = NearBoxes::make(r, frame.back, frame.translation, frame.margin, frame.scale,
+    NearBoxes boxes = NearBoxes::make(r, frame.back, frame.translation, frame.margin, frame.scale,
                                             states.node_box.data, pose.node_a, pose.node_b);
+    if (with_slabs) {
+        boxes.slabs = (const char*)slabs.record.data - (const char*)states.node_box.data;
+        boxes.look(h.way);
+    }
     const float INF = __builtin_inff();
     // Apart from the memory that lists are written to.
     int top = h.top, later = h.later, waiting = h.waiting, node_tests = h.node_tests;
@@ -54,12 +62,24 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
         const N::Corners corners = N::load(models.vertex_near.data, states.face_corner.data, pose.corner_a,
                                            pose.corner_b, r, frame.translation, frame.scale, items, count);
         F::lanes size, error;
-        const F::lanes square = N::measure(corners, size);
-        error = size * FACES_ERROR + frame.error;
-        const F::lanes d = __builtin_elementwise_sqrt(square), over = d + error, under = d - error;
+        const N::Nearest nearest = N::measure(corners, size);
+        const F::lanes d = __builtin_elementwise_sqrt(nearest.square);
+        // What exceeds 48 u L matters where the distance is small.
+        error = size * (d > size * 0x1p-10f ? F::lanes{} + 48 * 0x1p-24f : F::lanes{} + 256 * 0x1p-24f) + frame.error;
+        const F::lanes over = d + error, under = d - error;
         float low[16];
+        int best = -1;
         for (int i = 0; i < count; ++i)
-            h.upper = over[i] < h.upper ? over[i] : h.upper;
+            if (over[i] < h.upper) {
+                h.upper = over[i];
+                best = i;
+            }
+        if (best >= 0 && with_slabs && d[best] > 0.0f) {
+            const float way[3] = {nearest.v.x[best] / d[best], nearest.v.y[best] / d[best], nearest.v.z[best] / d[best]};
+            boxes.look(way);
+            for (int k = 0; k < 3; ++k)
+                h.way[k] = way[k];
+        }
         __builtin_memcpy(low, &under, sizeof(low));
         set_limits();
         for (int i = 0; i < count; ++i)
@@ -81,27 +101,32 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     set_limits();
     while (h.open_count <= OPEN_LENGTH - 16) {
         while (top > 0 && waiting < 16) {
-            const int room = (CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH - top) / 3, fits = room > 1 ? room : 1;
+            const int room = (CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH - 16 - top) / 3, fits = room > 1 ? room : 1;
             const int most = h.upper < INF ? NEAREST_AT_ONCE : 1, wanted = fits < most ? fits : most;
-            NearBoxes::Taken taken[NEAREST_AT_ONCE];
+            NearBoxes::Taken taken[NEAREST_AT_ONCE / 4][4];
             int count = 0;
             while (top > 0 && count < wanted) {
                 --top;
-                if (m.bound[top] <= limit)
-                    taken[count++] = boxes.take(m.item[top]);
+                if (m.bound[top] <= limit) {
+                    taken[count >> 2][count & 3] = boxes.take(m.item[top]);
+                    ++count;
+                }
             }
-            const bool has_room = later <= LATER_LENGTH - 4 * NEAREST_AT_ONCE - 4;
-            const float now = has_room ? soon : limit;
-            for (int i = 0; i < count; ++i) {
+            for (int i = count; i & 3; ++i) {
+                taken[i >> 2][i & 3] = taken[0][0];
+                taken[i >> 2][i & 3].used = 0;
+            }
+            const float now = later <= LATER_LENGTH - 4 * NEAREST_AT_ONCE - 16 ? soon : limit;
+            for (int i = 0; 4 * i < count; ++i) {
                 const NearBoxes::Tested tested = boxes.test(taken[i]);
                 node_tests += __builtin_popcount(tested.used);
-                const unsigned int near = tested.used & NearBoxes::up_to(tested.bound, limit);
-                const unsigned int nodes = near & ~tested.leaves, first = nodes & NearBoxes::up_to(tested.bound, now);
-                NearBoxes::append_items(m.item + top, tested.item, first);
+                const unsigned int near = tested.used & NearBoxes::to_mask(tested.bound <= limit);
+                const unsigned int nodes = near & ~tested.leaves, first = nodes & NearBoxes::to_mask(tested.bound <= now);
+                NearBoxes::append_items(m.item + top, tested, first);
                 NearBoxes::append_bounds(m.bound + top, tested.bound, first);
-                NearBoxes::append_items(m.later + later, tested.item, nodes & ~first);
+                NearBoxes::append_items(m.later + later, tested, nodes & ~first);
                 NearBoxes::append_bounds(m.later_bound + later, tested.bound, nodes & ~first);
-                NearBoxes::append_items(m.face + waiting, tested.item, near & tested.leaves);
+                NearBoxes::append_items(m.face + waiting, tested, near & tested.leaves);
                 const int end = top + __builtin_popcount(first);
                 later += __builtin_popcount(nodes & ~first);
                 waiting += __builtin_popcount(near & tested.leaves);

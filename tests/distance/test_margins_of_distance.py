@@ -1,0 +1,95 @@
+"""No bound is too large: faces that are nearer by a part in 10^8 than very many others are found, slabs or not."""
+
+import numpy as np
+import pytest
+from helpers.questions import pairs_of, random_lod, scene_of
+from helpers.samples import grid, random_poses, random_quaternions, sample
+from oracles.distance import surface_distance
+from oracles.triangle import into_frame_of_a, quaternion_matrix
+
+import warp_abtree as ab
+from warp_abtree import testing
+
+STILL = (0, 0, 0, 0, 0, 0, 1)
+ANSWERS = ("distance", "bracket", "points", "point_faces")
+
+
+def to_bytes(result):
+    return [getattr(result, name).tobytes() for name in ANSWERS]
+
+
+def sheets(rng, roughness, far, bend):
+    """Return two sheets over one another, their corners up or down by a little, in frames of their own, and poses."""
+    vertices, faces = grid(9)
+    vertices = vertices / 9 - [0.5, 0.5, 0.0]
+    below, above = vertices + roughness * rng.normal(size=(2, *vertices.shape)) * [0, 0, 1]
+    below, above = (v - [0, 0, side * bend] * (v[:, :2] ** 2).sum(1)[:, None] for v, side in ((below, 1), (above, -1)))
+    above[:, 2] += 0.25
+    models, poses = [], []
+    for points in (below, above):
+        turn, shift = random_quaternions(rng, 1)[0], far * rng.normal(size=3)
+        models.append(ab.Model.from_arrays(points @ quaternion_matrix(turn) + shift, faces, base_faces=200))
+        position = -quaternion_matrix(turn) @ shift
+        poses.append(np.concatenate([position, turn]))
+    return models, poses
+
+
+def anchored_sheets(rng, roughness, far):
+    """Return two flat sheets, each with a face far behind it, so that centres lie far from them, and poses."""
+    vertices, faces = grid(9)
+    models, poses = [], []
+    for side, height in ((-1, 0.0), (1, 0.25)):
+        points = vertices / 9 + roughness * rng.normal(size=vertices.shape) * [0, 0, 1]
+        behind = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]) + [0, 0, side * far * rng.uniform(0.5, 1)]
+        corners = np.concatenate([points, behind])
+        count = len(points)
+        models.append(ab.Model.from_arrays(corners, [*faces, [count, count + 1, count + 2]], base_faces=200))
+        poses.append(np.array([*(0.1 * rng.normal(size=2)), height, 0, 0, 0, 1]))
+    return models, poses
+
+
+@pytest.mark.parametrize("roughness", [1e-6, 1e-8, 1e-10])
+@pytest.mark.parametrize("far", [0.0, 100.0])
+@pytest.mark.parametrize("bend", [0.0, 0.3])
+def test_nearly_equally_near_faces(device, roughness, far, bend):
+    rng = np.random.default_rng(1)
+    check_sheets(device, [sheets(rng, roughness, far, bend) for _ in range(6)], 1 + far)
+
+
+@pytest.mark.parametrize("roughness", [1e-6, 1e-8])
+@pytest.mark.parametrize("far", [3.0, 100.0])
+def test_nearly_equally_near_faces_of_large_objects(device, roughness, far):
+    rng = np.random.default_rng(3)
+    check_sheets(device, [anchored_sheets(rng, roughness, far) for _ in range(20)], 1 + far)
+
+
+def check_sheets(device, sheets, size):
+    """Compare with brute force, without slabs, with slabs from the start, and from the answer."""
+    cases = [(a, None, pose_a, b, None, pose_b) for (a, b), (pose_a, pose_b) in sheets]
+    query = ab.DistanceQuery(scene_of(device, cases), pairs_of(cases))
+    first = query.run()
+    for (a, _, pose_a, b, _, pose_b), found in zip(cases, first.distance, strict=True):
+        (vertices_a, faces_a, _), (vertices_b, faces_b, _) = a.mesh_at(a.lod_max), b.mesh_at(b.lod_max)
+        truth = surface_distance(vertices_a[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b])
+        assert found == pytest.approx(truth, rel=1e-13, abs=1e-15 * size)
+    for turn in range(20):
+        query.launch()
+        assert to_bytes(query.result()) == to_bytes(first)
+        if turn > 16:
+            query.forget()
+
+
+def test_slabs_follow_levels_of_detail(device):
+    """Very many pairs of few states: slabs are made in the first launch, and anew when LODs move."""
+    rng = np.random.default_rng(2)
+    models = sample("torus"), sample("capsule")
+    poses = random_poses(rng, 40, 2.0)
+    scene = scene_of(device, [(models[0], None, STILL, models[1], None, pose) for pose in poses])
+    pairs = np.arange(80).reshape(-1, 2)
+    query = ab.DistanceQuery(scene, pairs)
+    for _ in range(5):
+        found = query.run()
+        with testing.regime(warps=True):
+            assert to_bytes(ab.DistanceQuery(scene, pairs).run()) == to_bytes(found)
+        lods = [random_lod(rng, model, 1000) for model in models]
+        scene.set_lods(np.tile(lods, 40))
