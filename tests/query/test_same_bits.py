@@ -72,7 +72,8 @@ def test_any_device(device, ask):
 
 @pytest.mark.slow
 def test_any_number_of_threads():
-    query, found = ab.Query(make_scene("cpu"), "faces", pairs=PAIRS, within=0.05), []
+    with testing.regime(cpu_threads=5):
+        query, found = ab.Query(make_scene("cpu"), "faces", pairs=PAIRS, within=0.05), []
     for threads in (1, *(2, 3, 5) * 8):
         with testing.regime(cpu_threads=threads):
             result = query.run()
