@@ -205,11 +205,11 @@ class DistanceQuery(Query):
                 command.launch()
 
     def _fit_slabs(self):
-        """Make room for the slabs of all tree states that there are now."""
+        """Make room for the slabs of all tree states that there are now; a graph goes on without."""
         pool = self.batch.states.pool
-        if len(self._slabs.record) == len(pool.node_box) and len(self._slabs.made) == len(pool.lod):
+        fits = len(self._slabs.record) == len(pool.node_box) and len(self._slabs.made) == len(pool.lod)
+        if fits or self.device.is_capturing:
             return
-        check_device(self.device, "a first launch after tree states were added")
         made = wp.zeros(len(pool.lod), dtype=wp.vec4i, device=self.device)
         record = wp.empty(len(pool.node_box), dtype=wp.vec4, device=self.device)
         self._replace([(self._slabs, "record", record), (self._slabs, "made", made)])
