@@ -1,7 +1,7 @@
 """Slabs of nodes on the CPU: how far the faces below a node reach along their mean normal, both ways.
 
 A box has corners that no face has. Along the direction in which two surfaces are nearest, faces that look that way
-reach no farther than their slab, so a node's box and slab together bound it closely (`simd/near_boxes.h`). A slab is
+reach no farther than their slab, so a node's box and slab together bound it closely (`nearest/boxes.h`). A slab is
 made of a state at a LOD once so many pairs have asked for it that it pays.
 
 A slab is two entries of 16 bytes a node, as `nodes.Node` has:
