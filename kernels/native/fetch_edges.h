@@ -35,7 +35,8 @@ void fetch_edges(Surface surface, Rings rings, Heap heap, wp::int32 size) {
 }
 
 // Of the children of the four entries from `child` on, before it is known whose are needed.
-template <class Heap> void fetch_entries(Heap heap, wp::int32 child) {
+template <class Heap>
+void fetch_entries(Heap heap, wp::int32 child) {
 #if !defined(__CUDA_ARCH__)
     const wp::int64 first = 4 * (wp::int64)child + 1;
     for (int i = 0; i < 16; i += 8) {

@@ -60,7 +60,7 @@ TRIANGLE_ROOM = wp.constant(1 << 16)  # a merge is added while there are fewer
 NEAR_MOST = wp.constant(64)  # faces about a merge, at most; of others, one thread takes care
 COLUMNS = wp.constant(8)  # faces that cover a triangle, at most; likewise
 CONFLICT = wp.constant(-1)
-PAUSES = wp.constant(1 << 16)  # until a thread without work gives up
+PAUSES = wp.constant(1 << 17)  # until a thread without work gives up
 
 
 @wp.struct

@@ -70,7 +70,7 @@ def move_below(
 
 
 @wp.func_native(native.body("simd/open_subtrees.h", "slab_cost"))
-def slab_cost(states: StatePool, pose: PairPose, repeats: wp.int32) -> wp.int64:
+def slab_cost(models: ModelPool, states: StatePool, pose: PairPose, repeats: wp.int32) -> wp.int64:
     """Return about how many node pair tests the slabs of an object pair take, for an A of one pair before it or two."""
 
 
@@ -156,13 +156,15 @@ def start_pair(output: wp.int32, plain_tests: wp.int64, repeats: wp.int32, befor
 
 
 @wp.func
-def wants_slabs(states: StatePool, pose: PairPose, hit_count: wp.int64, tested: wp.int64, before: Descent):
+def wants_slabs(
+    models: ModelPool, states: StatePool, pose: PairPose, hit_count: wp.int64, tested: wp.int64, before: Descent
+):
     """Return whether slabs are to be made, and the descent with the next time to look."""
     descent = before
     if tested >= descent.plain_tests and hit_count * NODE_TESTS_A_HIT <= tested:
         return True, descent
     if descent.cost < wp.int64(0):
-        descent.cost = slab_cost(states, pose, descent.repeats)
+        descent.cost = slab_cost(models, states, pose, descent.repeats)
     if tested >= descent.cost and hit_count * NODE_TESTS_A_DENSE_HIT <= tested:
         return True, descent
     descent.looks = tested * wp.int64(2)
@@ -192,7 +194,7 @@ def advance(
     """
     descent = before
     if descent.top > 0 and tested >= descent.looks:
-        wanted, descent = wants_slabs(states, pose, hit_count, tested, descent)
+        wanted, descent = wants_slabs(models, states, pose, hit_count, tested, descent)
         if wanted:
             descent.floors = open_subtrees(models, states, pose, descent.thread, memory)
             descent.looks = NEVER

@@ -74,7 +74,7 @@ def files(tmp_path, monkeypatch):
 SLOW = [
     (BUILD, "np.savez_compressed", block, TERMINATE, 143, []),
     ("run scene.toml --record new.csv", "frame.csv.DictWriter", None, TERMINATE, 143, []),
-    ("run scene.toml --record new.json", "ab.Frame.step", ignore, INTERRUPT, 130, []),
+    ("run scene.toml --record new.json", "ab.Frame.run", ignore, INTERRUPT, 130, []),
     (QUERY, "np.savez", block, INTERRUPT, 130, []),
     (SWEEP, "np.savez", ignore, TERMINATE, 143, ["answers", "answers/job.json"]),
     (VIEW, "_", ignore, INTERRUPT, 0, []),  # an interrupt is how people end it

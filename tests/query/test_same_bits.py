@@ -71,8 +71,10 @@ def test_any_device(device, ask):
 
 
 @pytest.mark.slow
-def test_any_number_of_threads():
-    query, found = ab.Query(make_scene("cpu"), "faces", pairs=PAIRS, within=0.05), []
+@pytest.mark.parametrize("with_slabs", [False, True])
+def test_any_number_of_threads(with_slabs):
+    with testing.regime(cpu_threads=5, plain_tests=0 if with_slabs else 10**9):
+        query, found = ab.Query(make_scene("cpu"), "faces", pairs=PAIRS, within=0.05), []
     for threads in (1, *(2, 3, 5) * 8):
         with testing.regime(cpu_threads=threads):
             result = query.run()

@@ -24,7 +24,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=workers.cache_clear)
 
 
-def launch_on_cores(launch, count, cores=None, least=1):
+def launch_on_cores(launch, count, cores, least=1):
     """Launch a kernel on several threads of the CPU, which share a number of items; waits for them.
 
     Each thread of the kernel takes one item after the other until there are none. It writes what belongs to its item
@@ -32,11 +32,9 @@ def launch_on_cores(launch, count, cores=None, least=1):
 
     Args:
         launch: Launches a kernel that is loaded, one thread of it.
-        cores: How many threads at most; None is `core_count`.
         least: Items that make a further core worth its while.
     """
-    most = max(1, count // least)
-    cores = 1 if most == 1 else min(most, cores or core_count())
+    cores = max(1, min(cores, count // least))
     deal = []
     try:
         for _ in range(1, cores):

@@ -98,7 +98,11 @@ class PlacedShapes:
     def may_contain(self, pairs):
         """Return which pairs may have a component of one inside the other: a solid's box contains a corner of it."""
         nested = np.zeros(len(pairs), bool)
+        if not len(pairs):
+            return nested
         solid = np.array([shape.planes is not None for shape in self.shapes])
+        if not solid.any():
+            return nested
         middle, half = self._model_boxes()
         several = np.array([len(shape.probes) > 6 for shape in self.shapes])
         # A connected shape that is inside has its first corner inside; the components of others are tested later.

@@ -124,8 +124,9 @@ class Timer:
     def stage_ms(self) -> dict:
         """Return the stages of the frame [ms], exact to the nanosecond. (synchronization point on CUDA)"""
         if self.uses_events:
+            wp.synchronize_event(self._events[len(self._stages)])
             pairs = zip(self._events, self._events[1 : len(self._stages) + 1])
-            spans = [round(1e6 * wp.get_event_elapsed_time(begin, end)) for begin, end in pairs]
+            spans = [round(1e6 * wp.get_event_elapsed_time(*pair, synchronize=False)) for pair in pairs]
         else:
             spans = np.diff(self._readings).tolist()
         total = dict.fromkeys(STAGES, 0)
@@ -144,7 +145,7 @@ class CostFit:
     FORGET = 0.9  # factor on the weight of an observation at each new one
 
     def __init__(self):
-        self.sums = np.zeros(5)
+        self.sums = [0.0] * 5  # of weights, work, time, work squared, work times time
 
     def add(self, work: float, time: float):
         """Add an observation."""
@@ -152,11 +153,12 @@ class CostFit:
         expected = slope * work + intercept
         if self.sums[0] > 2 and expected > 0:
             time = min(max(time, 0.5 * expected), 2.0 * expected)
-        self.sums = self.FORGET * self.sums + [1.0, work, time, work * work, work * time]
+        new = 1.0, work, time, work * work, work * time
+        self.sums = [self.FORGET * old + added for old, added in zip(self.sums, new)]
 
     def line(self) -> tuple[float, float]:
         """Return slope and intercept, NaN before the first observation."""
-        weight, x, y, xx, xy = self.sums.tolist()
+        weight, x, y, xx, xy = self.sums
         if weight == 0:
             return math.nan, math.nan
         x, y, xx, xy = x / weight, y / weight, xx / weight, xy / weight

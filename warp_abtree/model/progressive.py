@@ -12,14 +12,20 @@ from warp_abtree.checks.cpu_threads import core_count, wait_for, workers
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels import active_build
+from warp_abtree.kernels.progressive import collapse as collapse_kernels
 from warp_abtree.kernels.progressive import hausdorff_bound, vertex_forest
 from warp_abtree.model.collapse import Collapse
 from warp_abtree.model.cpu_arrays import cpu_array, launch
 from warp_abtree.model.lod_bounds import LodBounds
 
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
-# Compiled while the first merges are made.
-SLOW_KERNELS = [(hausdorff_bound.replay_merges_kernel, 1), (active_build.split_segment_kernel, 1)]
+# Of all modules of a build, those first that take longest to compile; each is launched as a block of one thread.
+KERNELS = [
+    (hausdorff_bound.replay_merges_kernel, 1),
+    (collapse_kernels.collapse_edges_kernel, 1),
+    (active_build.split_segment_kernel, 1),
+    (vertex_forest.fill_events_kernel, 1),
+]
 
 
 @dataclass(frozen=True)
@@ -140,7 +146,7 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     if 2 * len(vertices) >= NODE_LIMIT or 3 * len(faces) >= 2**31:
         raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
     report = progress if progress is not None else lambda stage, done, total: None
-    with loading(wp.get_device("cpu"), SLOW_KERNELS):
+    with loading(wp.get_device("cpu"), KERNELS):
         collapse = Collapse(vertices, faces, int(base_faces))
 
     def finish():

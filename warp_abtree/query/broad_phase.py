@@ -5,6 +5,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.kernels.broad_phase import find_pair_kernel, make_pair_key_kernel, place_pair_kernel, pose_box_kernel
+from warp_abtree.query.commands import Commands
 from warp_abtree.query.request import CapacityError
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
@@ -48,7 +49,8 @@ class BroadPhase:
         self.pair_count = wp.zeros(1, dtype=wp.int32, device=device)
         self.guard = LaunchGuard(device, batch.states.generation, batch.filter_generation)
         self.resize(capacity or max(64, 4 * count))
-        self._launch_boxes()
+        self._commands = Commands()
+        self._make_boxes(wp.launch)
         # Made here, since no graph can capture it.
         self.bvh = wp.Bvh(self.lower, self.upper, groups=self.group)
 
@@ -66,19 +68,12 @@ class BroadPhase:
 
     def launch(self):
         """Box, rebuild, query, and sort if asked. Launches only, so that a graph can capture it."""
-        self._launch_boxes()
+        given = *self.guard.given(), self.pairs.ptr
+        launch_boxes, launch_find = self._commands.find_callables("pairs", given, self.device, self._make_launches)
+        launch_boxes()
         self.bvh.rebuild()
         self.pair_count.zero_()
-        wp.launch(
-            find_pair_kernel,
-            dim=len(self.lower),
-            inputs=[
-                *(self.shared_group, self.bvh.id, self.lower, self.upper, self.group, self.excluded),
-                *(self.batch.objects.pool, self.pair_count, self.pairs),
-            ],
-            device=self.device,
-        )
-
+        launch_find()
         if self.sorts:
             self._sort()
 
@@ -87,13 +82,23 @@ class BroadPhase:
         inputs = [self.pair_count, self.pairs, self.order, self.key]
         wp.launch(make_pair_key_kernel, room, inputs, device=self.device)
         with wp.ScopedDevice(self.device):
-            wp.utils.radix_sort_pairs(self.key, self.order, room)
+            # The key behind all others has only ones among these bits.
+            wp.utils.radix_sort_pairs(self.key, self.order, room, end_bit=32 + len(self.lower).bit_length())
         inputs = [self.key, self.pair_count, self.pairs]
         wp.launch(place_pair_kernel, room + 1, inputs, device=self.device)
 
-    def _launch_boxes(self):
+    def _make_launches(self, launch) -> list:
+        """Return what boxes the objects, and what finds pairs."""
+        inputs = [
+            *(self.shared_group, self.bvh.id, self.lower, self.upper, self.group, self.excluded),
+            *(self.batch.objects.pool, self.pair_count, self.pairs),
+        ]
+        find = launch(find_pair_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
+        return [self._make_boxes(launch), find]
+
+    def _make_boxes(self, launch):
         inputs = [*self.batch.pools, self.guard.record(), self.lower, self.upper]
-        wp.launch(pose_box_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
+        return launch(pose_box_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
 
     def count_found(self) -> int:
         """Return how many pairs the last launch found. Waits for the device.

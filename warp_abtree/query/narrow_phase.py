@@ -178,7 +178,9 @@ class Query(QueryReadout):
         if self.uses_warps():
             traversal.launch()
         else:
-            cores = current_regime().cpu_threads
+            # Each has memory for slabs: tests do not depend on which thread takes a pair.
+            rooms = len(self.slab_memory)
+            cores = min(current_regime().cpu_threads or rooms, rooms)
             launch_on_cores(traversal.launch, len(self.pairs), cores, self._least_pairs())
         for command in passes:
             command.launch()

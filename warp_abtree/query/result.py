@@ -93,7 +93,8 @@ class Result:
             bound of it, (p, 2), and the faces that the nearest points lie on, int32 (p, 2), see
             `warp_abtree.query.distance`; None unless output is "distance".
         node_tests, triangle_tests, float64_tests, exact_tests: Work done for each pair, int64 (p,): pairs of boxes,
-            pairs of faces, those of them that float32 left uncertain, and of these those that took exact arithmetic.
+            pairs of faces, those of them that float32 left uncertain, and of these those that took exact arithmetic. On
+            the CPU a pair may take fewer of them after others of the same first object.
 
     Args:
         found: What was read.

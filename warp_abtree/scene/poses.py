@@ -103,6 +103,35 @@ def place_rows(rows, pool):
     wp.synchronize_stream(wp.get_stream(rows.device))
 
 
+class HostPoses:
+    """Checked poses of the host on their way to the objects of a pool: memory and launches are made once.
+
+    Args:
+        pool: `ObjectPool` whose arrays stay.
+    """
+
+    def __init__(self, pool, device):
+        self._pool, self._device = pool, device
+        self._made: dict = {}  # rows, their view on the host, and the launch, by numbers a pose
+
+    def place(self, poses: np.ndarray):
+        """Set all objects from poses float64, (n, 7) or (n, 4, 4). One launch: all of them move, or none."""
+        given = poses.reshape(len(poses), -1)
+        width = given.shape[1]
+        if width not in self._made:
+            rows = wp.empty(given.shape, dtype=wp.float64, device=self._device)
+            view = rows.numpy() if self._device.is_cpu else None
+            kernel = place_poses.pose_setter(wp.float64, width)
+            command = wp.launch(kernel, len(rows), [rows, self._pool], device=self._device, record_cmd=True)
+            self._made[width] = rows, view, command
+        rows, view, command = self._made[width]
+        if view is None:
+            wp.copy(rows, wp.array(given, dtype=wp.float64, device="cpu"))
+        else:
+            view[:] = given
+        command.launch()
+
+
 def launch_place(rows, pool):
     """Set the objects of a pool from sound rows of 7 or 16 numbers. One launch: all objects move, or none."""
     wp.launch(place_poses.pose_setter(rows.dtype, rows.shape[1]), len(rows), [rows, pool], device=rows.device)

@@ -13,7 +13,7 @@ from warp_abtree.query.distance import DistanceQuery, check_beyond
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import Result, contact_dtypes
-from warp_abtree.scene.poses import check_poses, device_rows, launch_place, place_rows
+from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, launch_place, place_rows
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.batch import Batch, check_pairs, exclusion_keys
 from warp_abtree.state.lod_update import LodUpdate
@@ -69,6 +69,7 @@ class Scene:
         self._excluded = np.empty(0, np.int64)
         self._batch: Batch | None = None
         self._broad_phase: BroadPhase | None = None
+        self._host_poses: HostPoses | None = None
         self._queries: dict[tuple, Query] = {}
 
     @property
@@ -133,7 +134,7 @@ class Scene:
         self._batch.retire()
         self._added_pose, self._lod = list(matrices), self._batch.lods.tolist()
         self._queries.clear()
-        self._broad_phase = None
+        self._broad_phase = self._host_poses = None
         self._batch = None
 
     def batch(self) -> Batch:
@@ -193,8 +194,10 @@ class Scene:
         pool = self.batch().objects.pool
         if rows is not None:
             place_rows(rows, pool)
-        else:
-            launch_place(wp.array(poses.reshape(given, -1), dtype=wp.float64, device=self.device), pool)
+            return
+        if self._host_poses is None:
+            self._host_poses = HostPoses(pool, self.device)
+        self._host_poses.place(poses)
 
     def set_lods(self, lods) -> LodUpdate:
         """Bring every object to a LOD: meshes are refined and trees updated in one batch, states are shared.

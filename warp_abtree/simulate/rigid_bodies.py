@@ -246,8 +246,11 @@ class SteppedMotion:
 
     def warm_up(self, time: float):
         """Load all kernels of a step, and grow to the contacts where the bodies stand; nothing moves."""
+        device = self.dynamics.device
         for module in (body_kernels, constraint_kernels, graph_coloring, solve):
-            wp.load_module(module, self.dynamics.device)
+            wp.load_module(module, device)
+        if device.is_cuda:  # where a module is compiled for each size of blocks
+            wp.load_module(solve, device, block_dim=RELAX_THREADS)
         self.aim(time)
         self.dynamics.find_contacts()
 

@@ -4,20 +4,24 @@
 #include "simd/slab_axes.h"
 #include "simd/slabs.h"
 
-template <class StatePool, class PairPose>
-wp::int64 slab_cost(StatePool states, PairPose pose, wp::int32 repeats) {
+template <class ModelPool, class StatePool, class PairPose>
+wp::int64 slab_cost(ModelPool models, StatePool states, PairPose pose, wp::int32 repeats) {
     wp::int64 cost = 0;
 #if defined(__CUDA_ARCH__)
     __trap();  // warps have a traversal of their own
 #else
 #include "simd/slabs.h"
-    const Slabs::Box* nodes = (const Slabs::Box*)states.node_box.data;
-    const wp::int64 leaves_a = Slabs::count_leaves(nodes + pose.node_a);
-    const wp::int64 leaves_b = Slabs::count_leaves(nodes + pose.node_b);
-    // Slabs of more than 2^14 leaves do not stay in a cache.
-    cost = leaves_b < 16384 ? leaves_b : leaves_b * (leaves_b >> 14);
+    // About how many faces an object has at its LOD: each vertex split adds as many as any other.
+    auto faces_of = [&](int place) {
+        const Slabs::Content x =
+            Slabs::content_of(states.node_start.data, states.model.data, states.lod.data, place);
+        return (wp::int64)models.face_count.data[x.model] * (x.lod + 1) / (models.lod_max.data[x.model] + 1);
+    };
+    const wp::int64 faces_a = faces_of(pose.node_a), faces_b = faces_of(pose.node_b);
+    // Slabs of more than 2^14 faces do not stay in a cache.
+    cost = faces_b < 16384 ? faces_b : faces_b * (faces_b >> 14);
     if (repeats < 2)
-        cost += leaves_a / 2;
+        cost += faces_a / 2;
 #endif
     return cost;
 }

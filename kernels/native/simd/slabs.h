@@ -67,15 +67,11 @@ struct Slabs {
     }
     // The first level at which subtrees are small enough: all leaves lie on two levels.
     static int find_floor(const Box* tree) {
-        const int floor = 64 - __builtin_clzll(count_leaves(tree)) - SUBTREE_DEPTH;
-        return floor > 0 ? floor : 0;
-    }
-    // About how many leaves a tree has, at least half of them.
-    static wp::int64 count_leaves(const Box* tree) {
         int node = tree[1].skip;
         while (tree[node].face < 0)
             node = tree[2 * node].skip;
-        return 1ll << level_of(node);
+        const int floor = level_of(node) + 1 - SUBTREE_DEPTH;
+        return floor > 0 ? floor : 0;
     }
     // Rounded outwards: NaN does not occur.
     static half round_down(const lanes& x) {
