@@ -200,7 +200,9 @@ class DistanceQuery(Query):
         meeting = self.device.is_cuda or bool(self.hits.any_hit.numpy().any())
         for place, command in enumerate(commands, -len(commands)):
             if place == SEARCH and not self.uses_warps():
-                launch_on_cores(command.launch, room, current_regime().cpu_threads, PAIRS_A_CORE)
+                rooms = len(self._memory)
+                cores = min(current_regime().cpu_threads or rooms, rooms)
+                launch_on_cores(command.launch, room, cores, PAIRS_A_CORE)
             elif meeting or place not in CROSSINGS:
                 command.launch()
 
