@@ -34,10 +34,11 @@ def run(device, quick=False):
     device = wp.get_device(device)
     sizes = QUICK if quick else CPU if device.is_cpu else FULL
     folder = ModelFolder(None)
-    for name in MESHES if mesh_file(MESHES[0]) else ():
+    at_hand = [name for name in MESHES if mesh_file(name)]
+    for name in at_hand[:1] if quick else at_hand:
         model = folder.load([name])
         yield measure(name, [model, model], place_at_gaps(model, sizes["poses"]), device, sizes["repeats"])
-    if all(map(mesh_file, NUT)):
+    if all(map(mesh_file, NUT)) and not quick:
         models = [folder.load([name]) for name in NUT]
         matrices = place_nut(models, sizes["poses"])["free"]
         yield measure("nut on bolt, free", models, matrices, device, sizes["repeats"])
