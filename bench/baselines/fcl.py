@@ -60,10 +60,10 @@ class Fcl:
     def faces(self):
         return self._collide(self.all)
 
-    def distances(self):
-        """Return the distance at each pose, negative or 0 where A and B intersect."""
+    def distances(self, poses=slice(None)):
+        """Return the distance at each of some poses, negative or 0 where A and B intersect."""
         request, answers = self.fcl.DistanceRequest(), []
-        for b in self.b:
+        for b in self.b[poses]:
             answers.append(self.fcl.distance(self.a, b, request, self.fcl.DistanceResult()))
         return np.array(answers)
 

@@ -37,13 +37,13 @@ ROUNDING_UP = wp.constant(wp.float32(1.0 + 2.0**-20))
 ROUNDING_DOWN = wp.constant(wp.float32(1.0 - 2.0**-20))
 
 
-@wp.func_native(native.body("simd/nearest.h", "open_search"))
+@wp.func_native(native.body("nearest/lists.h", "open_search"))
 def open_search(
     upper: wp.float32, first: wp.int64, way: wp.vec3, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)
 ): ...
 
 
-@wp.func_native(native.body("simd/nearest.h", "search_nearest"))
+@wp.func_native(native.body("nearest/search.h", "search_nearest"))
 def search_nearest(
     models: ModelPool,
     states: StatePool,
@@ -61,7 +61,7 @@ def search_nearest(
     """
 
 
-@wp.func_native(native.body("simd/nearest.h", "take_nearest"))
+@wp.func_native(native.body("nearest/lists.h", "take_nearest"))
 def take_nearest(
     upper: wp.float32, cut: wp.float32, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)
 ) -> wp.int64:

@@ -1,7 +1,7 @@
 """Slabs of nodes on the CPU: how far the faces below a node reach along their mean normal, both ways.
 
 A box has corners that no face has. Along the direction in which two surfaces are nearest, faces that look that way
-reach no farther than their slab, so a node's box and slab together bound it closely (`simd/near_boxes.h`). A slab is
+reach no farther than their slab, so a node's box and slab together bound it closely (`nearest/boxes.h`). A slab is
 made of a state at a LOD once so many pairs have asked for it that it pays.
 
 A slab is two entries of 16 bytes a node, as `nodes.Node` has:
@@ -141,12 +141,17 @@ def make_slabs(models: ModelPool, states: StatePool, slabs: Slabs, state: wp.int
 def has_slabs(slabs: Slabs, p: wp.int32):
     """Return whether there are slabs of both objects of a pair."""
     own = slabs.states[p]
+    if wp.max(own[0], own[1]) >= slabs.made.shape[0]:
+        return False
     return slabs.made[own[0]][3] >= USES_MIN and slabs.made[own[1]][3] >= USES_MIN
 
 
 @wp.func
 def ask_slabs(models: ModelPool, states: StatePool, slabs: Slabs, state: wp.int32):
-    """Count a pair that asks for the slabs of a state, and make them if they pay."""
+    """Count a pair that asks for the slabs of a state, and make them if they pay and there is room."""
+    end = states.node_start[state] + (wp.int32(2) << models.depth[states.model[state]])
+    if state >= slabs.made.shape[0] or 2 * end > slabs.record.shape[0]:
+        return
     key = wp.vec3i(states.lod[state], states.model[state], states.node_start[state])
     made = slabs.made[state]
     uses = wp.where(made[0] == key[0] and made[1] == key[1] and made[2] == key[2], made[3], 0)

@@ -223,6 +223,7 @@ CALLS = {
     "tree_state": lambda scene, *_: scene.tree_state(0),
     "Query": lambda scene, *_: ab.Query(scene, "count"),
     "ContactQuery": lambda scene, *_: ab.ContactQuery(scene, capacity=1000),
+    "DistanceQuery": lambda scene, *_: ab.DistanceQuery(scene),
     "Pipeline": lambda scene, *_: ab.Pipeline(scene),
     "PoseInput": lambda scene, *_: ab.PoseInput(scene),
     "sweep": lambda scene, *_: ab.sweep(sample("torus"), sample("torus"), [STILL], device=scene.device),

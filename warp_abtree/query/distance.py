@@ -200,16 +200,18 @@ class DistanceQuery(Query):
         meeting = self.device.is_cuda or bool(self.hits.any_hit.numpy().any())
         for place, command in enumerate(commands, -len(commands)):
             if place == SEARCH and not self.uses_warps():
-                launch_on_cores(command.launch, room, current_regime().cpu_threads, PAIRS_A_CORE)
+                rooms = len(self._memory)
+                cores = min(current_regime().cpu_threads or rooms, rooms)
+                launch_on_cores(command.launch, room, cores, PAIRS_A_CORE)
             elif meeting or place not in CROSSINGS:
                 command.launch()
 
     def _fit_slabs(self):
-        """Make room for the slabs of all tree states that there are now."""
+        """Make room for the slabs of all tree states that there are now; a graph goes on without."""
         pool = self.batch.states.pool
-        if len(self._slabs.record) == len(pool.node_box) and len(self._slabs.made) == len(pool.lod):
+        fits = len(self._slabs.record) == len(pool.node_box) and len(self._slabs.made) == len(pool.lod)
+        if fits or self.device.is_capturing:
             return
-        check_device(self.device, "a first launch after tree states were added")
         made = wp.zeros(len(pool.lod), dtype=wp.vec4i, device=self.device)
         record = wp.empty(len(pool.node_box), dtype=wp.vec4, device=self.device)
         self._replace([(self._slabs, "record", record), (self._slabs, "made", made)])

@@ -1,42 +1,28 @@
 // The search for the nearest faces on the CPU: node pairs in vector instructions, faces in float32 with bounds.
 #pragma once
 #include "builtin.h"
-#include "simd/near_boxes.h"
-#include "simd/near_faces32.h"
-#include "simd/nearest_memory.h"
-
-void open_search(wp::float32 upper, wp::int64 first, wp::vec_t<3, wp::float32> way, wp::int32 thread,
-                 wp::array_t<wp::float32> memory) {
-#include "simd/nearest_memory.h"
-    const NearestMemory m = NearestMemory::find(memory.data, thread);
-    NearestMemory::Header& h = *m.header;
-    h = NearestMemory::Header{};
-    h.upper = upper;
-    h.top = 1;
-    for (int k = 0; k < 3; ++k)
-        h.way[k] = way[k];
-    m.item[0] = first;
-    m.bound[0] = 0.0f;
-}
+#include "nearest/boxes.h"
+#include "nearest/faces32.h"
+#include "nearest/memory.h"
 
 template <class ModelPool, class StatePool, class PairPose, class Frame, class Slabs>
-wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairPose pose, Frame frame, wp::vec_t<4, wp::float32> spare,
-                                       Slabs slabs, bool with_slabs,
-                                       wp::int32 thread, wp::array_t<wp::float32> memory) {
+wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairPose pose, Frame frame,
+                                       wp::vec_t<4, wp::float32> spare, Slabs slabs, bool with_slabs, wp::int32 thread,
+                                       wp::array_t<wp::float32> memory) {
 #if defined(__CUDA_ARCH__)
     __trap();  // warps have a search of their own
     return wp::vec_t<3, wp::int32>();
 #else
-#include "simd/near_boxes.h"
-#include "simd/near_faces32.h"
-#include "simd/nearest_memory.h"
+#include "nearest/boxes.h"
+#include "nearest/faces32.h"
+#include "nearest/memory.h"
     typedef NearestFaces N;
     typedef N::F F;
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
     const auto& r = pose.rotation32.data;
-    NearBoxes boxes = NearBoxes::make(r, frame.back, frame.translation, frame.margin, frame.scale,
-                                            states.node_box.data, pose.node_a, pose.node_b);
+    NearBoxes boxes = NearBoxes::make(r, frame.back, frame.translation, frame.margin, frame.scale, states.node_box.data,
+                                      pose.node_a, pose.node_b);
     if (with_slabs) {
         boxes.slabs = (const char*)slabs.record.data - (const char*)states.node_box.data;
         boxes.look(h.way);
@@ -75,7 +61,8 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
                 best = i;
             }
         if (best >= 0 && with_slabs && d[best] > 0.0f) {
-            const float way[3] = {nearest.v.x[best] / d[best], nearest.v.y[best] / d[best], nearest.v.z[best] / d[best]};
+            const float way[3] = {nearest.v.x[best] / d[best], nearest.v.y[best] / d[best],
+                                  nearest.v.z[best] / d[best]};
             boxes.look(way);
             for (int k = 0; k < 3; ++k)
                 h.way[k] = way[k];
@@ -121,7 +108,8 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
                 const NearBoxes::Tested tested = boxes.test(taken[i]);
                 node_tests += __builtin_popcount(tested.used);
                 const unsigned int near = tested.used & NearBoxes::to_mask(tested.bound <= limit);
-                const unsigned int nodes = near & ~tested.leaves, first = nodes & NearBoxes::to_mask(tested.bound <= now);
+                const unsigned int nodes = near & ~tested.leaves,
+                                   first = nodes & NearBoxes::to_mask(tested.bound <= now);
                 NearBoxes::append_items(m.item + top, tested, first);
                 NearBoxes::append_bounds(m.bound + top, tested.bound, first);
                 NearBoxes::append_items(m.later + later, tested, nodes & ~first);
@@ -177,24 +165,4 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     h.node_tests = node_tests;
     return wp::vec_t<3, wp::int32>(0, node_tests, h.face_tests);
 #endif
-}
-
-wp::int64 take_nearest(wp::float32 upper, wp::float32 cut, wp::int32 thread, wp::array_t<wp::float32> memory) {
-#include "simd/nearest_memory.h"
-    const NearestMemory m = NearestMemory::find(memory.data, thread);
-    NearestMemory::Header& h = *m.header;
-    h.upper = upper < h.upper ? upper : h.upper;
-    if (h.open_count == 0)
-        return -1;
-    int best = 0;
-    for (int i = 1; i < h.open_count; ++i)
-        best = m.open_bound[i] < m.open_bound[best] ? i : best;
-    if (m.open_bound[best] > (cut < h.upper ? cut : h.upper)) {
-        h.open_count = 0;
-        return -1;
-    }
-    const wp::int64 item = m.open[best];
-    m.open[best] = m.open[--h.open_count];
-    m.open_bound[best] = m.open_bound[h.open_count];
-    return item;
 }

@@ -37,8 +37,7 @@ struct NearestFaces {
         const bits low = (bits)(lane < count ? (longs) * (const loose*)items : some);
         const bits high = (bits)(lane + 8 < count ? (longs) * (const loose*)(items + 8) : some);
         alignas(64) F::sixteen face[2], corner[6];
-        const bits of_a =
-            __builtin_shufflevector(low, high, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+        const bits of_a = __builtin_shufflevector(low, high, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
         const bits of_b = __builtin_shufflevector(low, high, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
         *(counts*)face[0] = 2 * (counts)(start_a + of_a);
         *(counts*)face[1] = 2 * (counts)(start_b + of_b);

@@ -24,11 +24,12 @@ struct NearBoxes {
     lanes axes[3][3], sizes[3][3], shift[3];
     float scale, wide, margin;
     const char *tree_a, *tree_b;
-    wp::int64 slabs;   // where the slab of a node lies, from the node; 0 for none
+    wp::int64 slabs;    // where the slab of a node lies, from the node; 0 for none
     lanes way[3], far;  // direction from A for A's nodes, to A for B's, in their own frames; and -t . n of B's
 
     static NearBoxes make(const wp::float32 (&r)[3][3], const wp::vec_t<3, float>& back,
-                          const wp::vec_t<3, float>& there, float margin, float scale, const void* trees, int a, int b) {
+                          const wp::vec_t<3, float>& there, float margin, float scale, const void* trees, int a,
+                          int b) {
         NearBoxes s;
         auto join = [](float a, float b) { return lanes{a, a, a, a, a, a, a, a, b, b, b, b, b, b, b, b}; };
         for (int i = 0; i < 3; ++i) {
@@ -99,10 +100,8 @@ struct NearBoxes {
         // Numbers k of the siblings of two items side by side, then of four.
         for (int i = 0; i < 4; ++i) {
             const lanes &a = row[2 * i], &b = row[2 * i + 1];
-            half[2 * i] =
-                __builtin_shufflevector(a, b, 0, 8, 16, 24, 1, 9, 17, 25, 2, 10, 18, 26, 3, 11, 19, 27);
-            half[2 * i + 1] =
-                __builtin_shufflevector(a, b, 4, 12, 20, 28, 5, 13, 21, 29, 6, 14, 22, 30, 7, 15, 23, 31);
+            half[2 * i] = __builtin_shufflevector(a, b, 0, 8, 16, 24, 1, 9, 17, 25, 2, 10, 18, 26, 3, 11, 19, 27);
+            half[2 * i + 1] = __builtin_shufflevector(a, b, 4, 12, 20, 28, 5, 13, 21, 29, 6, 14, 22, 30, 7, 15, 23, 31);
         }
         for (int i = 0; i < 2; ++i)
             for (int k = 0; k < 2; ++k) {
@@ -114,8 +113,7 @@ struct NearBoxes {
             }
         for (int k = 0; k < 4; ++k) {
             const lanes &a = part[k], &b = part[4 + k];
-            field[2 * k] =
-                __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23);
+            field[2 * k] = __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7, 16, 17, 18, 19, 20, 21, 22, 23);
             field[2 * k + 1] =
                 __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
         }

@@ -1,0 +1,78 @@
+"""Real meshes at very many poses, beside python-fcl: distances, brackets, and zeros where the exact test says so."""
+
+import numpy as np
+import pytest
+from helpers.questions import pairs_of, scene_of
+from helpers.samples import random_poses, sample
+from oracles.triangle import quaternion_matrix
+
+import warp_abtree as ab
+
+fcl = pytest.importorskip("fcl")
+
+STILL = (0, 0, 0, 0, 0, 0, 1)
+PAIRS = (("cow", "rocker-arm"), ("fandisk", "cow"), ("stanford-bunny", "fandisk"), ("fcl-env", "fcl-rob"))
+POSES = 500
+
+
+def fcl_tree(model):
+    vertices, faces, _ = model.mesh_at(model.lod_max)
+    tree = fcl.BVHModel()
+    tree.beginModel(len(vertices), len(faces))
+    tree.addSubModel(vertices, faces)
+    tree.endModel()
+    return tree
+
+
+def place_about(a, b, poses):
+    """Return poses whose positions are those of B's centre about A's."""
+    poses = poses.copy()
+    poses[:, :3] += a.centre - np.array([quaternion_matrix(q) @ b.centre for q in poses[:, 3:]])
+    return poses
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("names", PAIRS, ids="-".join)
+def test_equals_fcl(device, names):
+    rng = np.random.default_rng(1)
+    a, b = map(sample, names)
+    poses = place_about(a, b, random_poses(rng, POSES, 1.5))
+    scene = scene_of(device, [(a, None, STILL, b, None, pose) for pose in poses])
+    pairs = np.arange(2 * POSES).reshape(-1, 2)
+    query = ab.DistanceQuery(scene, pairs)
+    result = query.run()
+    np.testing.assert_array_equal(result.distance == 0, scene.intersect(pairs).any)
+    trees = fcl_tree(a), fcl_tree(b)
+    still = fcl.CollisionObject(trees[0], fcl.Transform())
+    truth = []
+    for pose in poses:
+        other = fcl.CollisionObject(trees[1], fcl.Transform(quaternion_matrix(pose[3:]), pose[:3]))
+        truth.append(max(0.0, fcl.distance(still, other, fcl.DistanceRequest(), fcl.DistanceResult())))
+    truth, apart = np.array(truth), ~result.any
+    assert 20 < apart.sum() and result.any.any()
+    # FCL's own rounding is about that of the brackets.
+    np.testing.assert_allclose(result.distance[apart], truth[apart], rtol=1e-12, atol=1e-14)
+    lower, upper = result.bracket.T
+    assert (lower <= truth * (1 + 1e-13)).all() and (truth * (1 - 1e-13) <= upper)[apart].all()
+    assert (upper - lower)[apart].max() < 1e-12
+    # From the start again, with slabs, and from the answer.
+    for forgets in (True, False):
+        if forgets:
+            query.forget()
+        again = query.run()
+        for name in ("distance", "bracket", "points", "point_faces"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(result, name))
+
+
+@pytest.mark.slow
+def test_coarse_levels_are_answered_as_meshes_of_their_own(device):
+    rng = np.random.default_rng(2)
+    model = sample("stanford-bunny")
+    lods = [model.lod_for(fraction=f) for f in (0.1, 0.01)]
+    poses = place_about(model, model, random_poses(rng, 60, 1.5))
+    cases = [(model, lods[0], STILL, model, lods[1], pose) for pose in poses]
+    meshes = [ab.Model.from_arrays(*model.mesh_at(lod)[:2], base_faces=10**6) for lod in lods]
+    others = [(meshes[0], None, STILL, meshes[1], None, pose) for pose in poses]
+    one, other = (scene_of(device, some).intersect(pairs_of(some), "distance") for some in (cases, others))
+    np.testing.assert_array_equal(one.any, other.any)
+    np.testing.assert_allclose(one.distance, other.distance, rtol=1e-13, atol=1e-15)
