@@ -13,8 +13,7 @@ wp::int64 slab_cost(ModelPool models, StatePool states, PairPose pose, wp::int32
 #include "simd/slabs.h"
     // About how many faces an object has at its LOD: each vertex split adds as many as any other.
     auto faces_of = [&](int place) {
-        const Slabs::Content x =
-            Slabs::content_of(states.node_start.data, states.model.data, states.lod.data, place);
+        const Slabs::Content x = Slabs::content_of(states.node_start.data, states.model.data, states.lod.data, place);
         return (wp::int64)models.face_count.data[x.model] * (x.lod + 1) / (models.lod_max.data[x.model] + 1);
     };
     const wp::int64 faces_a = faces_of(pose.node_a), faces_b = faces_of(pose.node_b);
@@ -36,11 +35,10 @@ wp::vec_t<2, wp::int32> open_subtrees(ModelPool models, StatePool states, PairPo
 #include "simd/slab_axes.h"
     const Slabs::Memory kept = Slabs::find_memory(memory.data, memory.shape[1], thread);
     const Slabs::Box* nodes = (const Slabs::Box*)states.node_box.data;
-    const Slabs::Content a =
-        Slabs::content_of(states.node_start.data, states.model.data, states.lod.data, pose.node_a);
+    const Slabs::Content a = Slabs::content_of(states.node_start.data, states.model.data, states.lod.data, pose.node_a);
     if (!(*kept.whose == a)) {
         SlabAxes::choose_axes(nodes + pose.node_a, states.face_corner.data + pose.corner_a, models.vertex_near.data,
-                           kept.axes);
+                              kept.axes);
         *kept.whose = a;
         for (int i = 0; i < kept.slots; ++i)
             kept.roots[i] = 0;
