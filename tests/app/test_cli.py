@@ -97,6 +97,10 @@ def test_query_against_the_library(files, capsys):
     assert 0 < lower <= apart["distance"] <= upper and not apart["intersects"]
     between = np.linalg.norm(np.subtract(*apart["points"]))
     assert between == pytest.approx(apart["distance"], rel=1e-12) and len(apart["point_faces"]) == 2
+    shown, _ = run(
+        capsys, "query", "ball.obj", "ring.ply", "--pose", *map(str, (9, 0, 0, 0, 0, 0, 1)), "--output", "distance"
+    )
+    assert f"distance                {apart['distance']:.6g}\n" in shown and "\npoints:\n" in shown
     apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "contacts")
     nowhere = [None, None, None]
     assert apart["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere, "depth": 0}

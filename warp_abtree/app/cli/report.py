@@ -32,7 +32,7 @@ def print_result(result: dict, as_json: bool):
         heading = key.replace("_", " ")
         if isinstance(value, dict) and all(isinstance(row, dict) for row in value.values()):
             value = [{heading: name} | row for name, row in value.items()]
-        rows = len(value) if isinstance(value, list | np.ndarray) else 0
+        rows = len(value) if isinstance(value, list) or (isinstance(value, np.ndarray) and value.ndim > 1) else 0
         if rows and (isinstance(value, np.ndarray) or isinstance(value[0], dict)):
             print(f"\n{heading}:")
             table = [list(row.values()) if isinstance(row, dict) else row for row in value[:LISTED]]
