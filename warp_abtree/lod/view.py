@@ -11,11 +11,6 @@ from warp_abtree.checks.upload import Upload
 from warp_abtree.kernels.lod import view as kernels
 
 
-def _cross(a, b):
-    """Return the cross product of two vectors, in a tenth of NumPy's time: a camera is made every frame."""
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
-
-
 @dataclass(frozen=True, eq=False)
 class Camera:
     """Position and projection of the viewer.
@@ -41,7 +36,7 @@ class Camera:
     def __post_init__(self):
         object.__setattr__(self, "eye", finite_array(self.eye, "eye", (3,)))
         view = finite_array(self.view, "view", (3, 3))
-        if not np.abs(view @ view.T - np.eye(3)).max() <= 1e-6 or not view[0] @ _cross(view[1], view[2]) > 0:
+        if not np.abs(view @ view.T - np.eye(3)).max() <= 1e-6 or not np.linalg.det(view) > 0:
             raise ValueError("view: the rows are no rotation")
         object.__setattr__(self, "view", view)
         if not positive(self.field_of_view, "field_of_view") < math.pi:
@@ -58,12 +53,12 @@ class Camera:
             ValueError: `target` is `eye`, or `up` points along the view.
         """
         back = finite_array(eye, "eye", (3,)) - finite_array(target, "target", (3,))
-        right = _cross(finite_array(up, "up", (3,)), back)
+        right = np.cross(finite_array(up, "up", (3,)), back)
         length = np.linalg.norm(back), np.linalg.norm(right)
         if not length[0] > 0 or not length[1] > 1e-9 * length[0] * np.linalg.norm(up):
             raise ValueError("the camera looks at its own eye, or along up")
         back, right = back / length[0], right / length[1]
-        return cls(eye, np.stack([right, _cross(back, right), back]), **options)
+        return cls(eye, np.stack([right, np.cross(back, right), back]), **options)
 
     def packed(self) -> np.ndarray:
         """Return what kernels read: eye, rows, focal length and diagonal W [pixels], D; float64 (15,)."""

@@ -319,7 +319,8 @@ class Scene:
         query = self._queries.pop(("distance",), None)
         if isinstance(query, DistanceQuery):
             query.set_tolerance(**options)
-            query.replace_pairs(pairs, beyond)
+            if not query.is_asked(pairs, beyond):
+                query.replace_pairs(pairs, beyond)
         else:
             query = DistanceQuery(self, pairs=pairs, beyond=beyond, **options)
         return self._run(("distance",), query, device)
