@@ -204,7 +204,7 @@ def test_calls_that_repeat_follow_what_changes(device, output):
     pairs, tolerance = np.array(MORE_PAIRS), 0.0
     for step in range(24):
         if step % 8 == 5:
-            scene.set_poses(random_poses(rng, 4, 0.4))
+            scene.set_poses(random_poses(rng, 4, 2.0 if output == "distance" else 0.4))
         if step % 8 == 6:
             scene.set_lods(rng.integers(0, scene.batch().models.lod_max[scene.object_model] + 1))
         if step % 8 == 7:
