@@ -50,6 +50,7 @@ CONTROLLERS = {
     "tolerance": lambda scene: ToleranceController(scene, 0.003, camera_at),
     "coarse ladder": lambda scene: ToleranceController(scene, 0.01, camera_at, steps=5),
     "paper": lambda scene: PaperController(scene, 1e9, camera_at),
+    "predictive": lambda scene: PredictiveController(scene, 1e9, camera_at),
 }
 
 
