@@ -275,7 +275,7 @@ class PredictiveController(Controller):
         hold_frames=30,
         loosest=64.0,
     ):
-        self.budget_ms = positive(budget_ms, "budget_ms")
+        self.budget_ms: float = positive(budget_ms, "budget_ms")
         self.aim, self.low = positive(aim, "aim"), positive(low, "low")
         if not self.low <= self.aim <= 1:
             raise ValueError(f"low {low!r} and aim {aim!r} do not rise to at most 1")
