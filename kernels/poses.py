@@ -21,6 +21,9 @@ UNIT_32 = wp.constant(wp.float64(2.0**-24))
 REACH_MIN = wp.constant(wp.float64(2.0**-100))
 REACH_MAX = wp.constant(wp.float64(2.0**100))
 ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
+# Small nodes have 2^SMALL_DEPTH faces at most, as they lie on the last levels of a tree.
+SMALL_DEPTH = wp.constant(3)
+NO_NODE = wp.constant(2**31 - 1)
 
 
 @wp.struct
@@ -44,6 +47,9 @@ class PairPose:
     node_b: wp.int32  # where B's tree lies in the pool
     corner_a: wp.int32  # where A's face corners lie in the pool
     corner_b: wp.int32  # where B's face corners lie in the pool
+    slab: wp.vec2i  # where slabs of A's nodes lie in the models' pool, and of B's
+    floor_a: wp.int32  # A's nodes from this one on are small and have slabs; none has where B has none
+    floor_b: wp.int32  # B's nodes from this one on
 
 
 @wp.func
@@ -105,6 +111,18 @@ def unit_scale(reach: wp.float64):
 
 
 @wp.func
+def has_slabs(models: ModelPool, states: StatePool, state: wp.int32):
+    """Return whether there are slabs of a state's small nodes: of original faces, so at the finest LOD."""
+    return models.node_slab.shape[0] > 0 and states.lod[state] == models.lod_max[states.model[state]]
+
+
+@wp.func
+def first_small_node(depth: wp.int32):
+    """Return the first node of a tree of a depth that has few faces."""
+    return 1 << wp.max(depth - SMALL_DEPTH, 0)
+
+
+@wp.func
 def pair_pose(
     whole: bool, models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32, within: wp.float64
 ):
@@ -149,6 +167,12 @@ def pair_pose(
     pose.error = wp.float32(pose.scale * wp.float64(2.02) * (off32 + margin64))
     if wp.max(reach_a, reach_b) < REACH_MIN or wp.max(reach_a, reach_b) > REACH_MAX:
         pose.error = wp.inf
+    pose.slab = wp.vec2i(models.node_start[states.model[state_a]], models.node_start[states.model[state_b]])
+    pose.floor_a = NO_NODE
+    pose.floor_b = NO_NODE
+    if has_slabs(models, states, state_a) and has_slabs(models, states, state_b):
+        pose.floor_a = first_small_node(models.depth[states.model[state_a]])
+        pose.floor_b = first_small_node(models.depth[states.model[state_b]])
     same = states.model[state_a] == states.model[state_b] and states.lod[state_a] == states.lod[state_b]
     if whole and same and far + wp.float64(3.0) * rotation_size * reach_b <= off32:
         # Coincident meshes: no vertex is farther from its twin than float32 can tell.

@@ -3,19 +3,26 @@
 
 constexpr int WARP_SIZE = 32;
 
-// A warp's items in shared memory: node pairs, then leaf pairs, then straddling pairs and their signs.
+// A warp's items in shared memory: node pairs, then leaf pairs and from the other end pairs of small nodes that wait
+// for slabs, then straddling pairs and their signs.
 constexpr int STACK_LENGTH = 512;
-constexpr int LEAF_PAIR_LENGTH = 160;
+constexpr int LEAF_PAIR_LENGTH = 192;
 constexpr int STRADDLING_LENGTH = 64;
-constexpr int STRADDLING_START = 672;
-constexpr int SIGNS_START = 736;
-constexpr int ITEM_BYTES = 8;
+constexpr int STRADDLING_START = 704;
+constexpr int SIGNS_START = 768;
 static_assert((STACK_LENGTH & (STACK_LENGTH - 1)) == 0, "the stack is a ring");
-static_assert(LEAF_PAIR_LENGTH >= (WARP_SIZE - 1) + 4 * WARP_SIZE, "fewer than a warp wait, a test emits 4 a lane");
+static_assert(LEAF_PAIR_LENGTH >= 2 * (WARP_SIZE - 1) + 4 * WARP_SIZE, "fewer than a warp wait, a test emits 4 a lane");
 static_assert(STRADDLING_LENGTH >= (WARP_SIZE - 1) + WARP_SIZE, "fewer than a warp wait, a test adds 1 a lane");
 static_assert(STRADDLING_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
 static_assert(SIGNS_START == STRADDLING_START + STRADDLING_LENGTH, "signs lie behind the straddling pairs");
-static_assert((STACK_LENGTH + LEAF_PAIR_LENGTH) * ITEM_BYTES < 1 << 16, "`push_children` packs two byte offsets");
+// `push_children` packs three places into a word, from these bits on; that on the stack, the last, goes round.
+constexpr int SMALL_PAIR_BIT = 0;
+constexpr int LEAF_PAIR_BIT = 10;
+constexpr int STACK_BIT = 23;
+constexpr int NO_BIT = 32;
+constexpr int PLACE_MASK = 1023;
+static_assert(STRADDLING_START <= PLACE_MASK && PLACE_MASK < 1 << LEAF_PAIR_BIT, "places fit");
+static_assert(STACK_LENGTH == 1 << (32 - STACK_BIT), "the stack is a ring in the word, too");
 
 // Slots of the queue in which idle warps wait, each with room for so many items: one a lane.
 constexpr int SLOT_COUNT = 8192;

@@ -55,10 +55,16 @@ inline CUDA_CALLABLE void write_item(wp::uint64 items, wp::int32 i, wp::int64 it
 #endif
 }
 
-inline CUDA_CALLABLE wp::int64 push_children(wp::uint64 items, wp::int32 end, wp::int32 leaf_end,
-                                             wp::vec_t<4, wp::int32> emitted, wp::vec_t<4, wp::int64> children) {
+inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp::vec_t<3, wp::int32> ends,
+                                                           wp::vec_t<4, wp::int32> lists,
+                                                           wp::vec_t<4, wp::int64> children) {
 #include "sizes.h"
+    const int end = ends[0], small_end = ends[1], leaf_end = ends[2];
 #if defined(__CUDA_ARCH__)
+    unsigned int emitted[4];
+#pragma unroll
+    for (int k = 0; k < 4; ++k)
+        asm("shl.b32 %0, 1, %1;" : "=r"(emitted[k]) : "r"(lists[k]));  // 0 for NO_BIT
     const unsigned int mine = (emitted[0] + emitted[1]) + (emitted[2] + emitted[3]);
     unsigned int sum = mine;
 // What came from a lane is added, nothing where there is none.
@@ -70,29 +76,66 @@ inline CUDA_CALLABLE wp::int64 push_children(wp::uint64 items, wp::int32 end, wp
             : "+r"(sum)
             : "r"(step));
     const unsigned int total = __shfl_sync(0xffffffffu, sum, 31);
-    // Bytes from the start: on the stack in the low half, among the leaf pairs in the high half.
-    unsigned int place = ((end & (STACK_LENGTH - 1)) | (STACK_LENGTH + leaf_end) << 16) * 8 + (sum - mine) * 8;
+    // Of small pairs, which are listed downwards, that from the other end.
+    unsigned int place = ((unsigned int)end << STACK_BIT | (STACK_LENGTH + leaf_end) << LEAF_PAIR_BIT |
+                          (PLACE_MASK - (STRADDLING_START - 1) + small_end)) +
+                         (sum - mine);
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
-        const unsigned int at = emitted[k] > 1 ? place >> 16 : place & (8 * STACK_LENGTH - 1);
+        unsigned int at;
+        asm("shr.u32 %0, %1, %2;" : "=r"(at) : "r"(place), "r"(lists[k]));
+        at = (at & PLACE_MASK) ^ (lists[k] == SMALL_PAIR_BIT ? PLACE_MASK : 0);
         asm volatile(
             "{ .reg .pred used; setp.ne.u32 used, %0, 0; @used st.shared.v2.b32 [%1], {%2, %3}; }" ::"r"(emitted[k]),
-            "r"((unsigned int)items + at), "r"((int)children[k]), "r"((int)(children[k] >> 32))
+            "r"((unsigned int)items + 8 * at), "r"((int)children[k]), "r"((int)(children[k] >> 32))
             : "memory");
-        place += 8 * emitted[k];
+        place += emitted[k];
     }
+    const int more_items = total >> STACK_BIT, more_leaves = (total >> LEAF_PAIR_BIT) & PLACE_MASK;
+    const int more_small = total & PLACE_MASK;
 #else
-    long long* stack = (long long*)items;
-    int total = 0;
+    long long* list = (long long*)items;
+    int more_items = 0, more_small = 0, more_leaves = 0;
     for (int k = 0; k < 4; ++k) {
-        if (emitted[k] > 1)
-            stack[STACK_LENGTH + leaf_end + (total >> 16)] = children[k];
-        else if (emitted[k] == 1)
-            stack[(end + total) & (STACK_LENGTH - 1)] = children[k];
-        total += emitted[k];
+        if (lists[k] == STACK_BIT)
+            list[(end + more_items++) & (STACK_LENGTH - 1)] = children[k];
+        else if (lists[k] == SMALL_PAIR_BIT)
+            list[STRADDLING_START - 1 - (small_end + more_small++)] = children[k];
+        else if (lists[k] == LEAF_PAIR_BIT)
+            list[STACK_LENGTH + leaf_end + more_leaves++] = children[k];
     }
 #endif
-    return ((long long)(leaf_end + (total >> 16)) << 32) | (unsigned int)(end + (total & 0xffff));
+    return wp::vec_t<3, wp::int32>(end + more_items, small_end + more_small, leaf_end + more_leaves);
+}
+
+inline CUDA_CALLABLE wp::int64 read_small_pair(wp::uint64 items, wp::int32 i) {
+#include "sizes.h"
+#if defined(__CUDA_ARCH__)
+    long long item;
+    asm volatile("ld.shared.b64 %0, [%1];"
+                 : "=l"(item)
+                 : "r"((unsigned int)items + 8 * (STRADDLING_START - 1 - i))
+                 : "memory");
+    return item;
+#else
+    return ((const long long*)items)[STRADDLING_START - 1 - i];
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 push_items(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item) {
+#include "sizes.h"
+#if defined(__CUDA_ARCH__)
+    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    const unsigned int at = (end + __popc(votes & ((1u << threadIdx.x) - 1u))) & (STACK_LENGTH - 1);
+    asm volatile("{ .reg .pred used; setp.ne.s32 used, %0, 0; @used st.shared.b64 [%1], %2; }" ::"r"((int)flag),
+                 "r"((unsigned int)items + 8 * at), "l"(item)
+                 : "memory");
+    return end + __popc(votes);
+#else
+    if (flag)
+        ((long long*)items)[end & (STACK_LENGTH - 1)] = item;
+    return end + flag;
+#endif
 }
 
 inline CUDA_CALLABLE wp::int32 hold_uniform(wp::int32 x) {

@@ -27,13 +27,16 @@ from warp_abtree.kernels.traversal.load_balance import (
     take_unit,
     units_per_pair,
 )
-from warp_abtree.kernels.traversal.node_pair import compare_node_pair, first_item, item_first, item_second
+from warp_abtree.kernels.traversal.node_pair import compare_node_pair, first_item
+from warp_abtree.kernels.traversal.small_slabs import small_nodes_overlap
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
     add_warp_sum,
     hold_uniform,
     push_children,
+    push_items,
     read_item,
+    read_small_pair,
     warp_any,
     warp_lane,
     warp_size,
@@ -79,6 +82,7 @@ class WarpItems:
     items: wp.uint64  # `warp_stack`
     head: wp.int32  # where node pairs start, the oldest first; STACK_MASK takes it into the ring
     end: wp.int32  # where they end
+    small: wp.int32  # pairs of small nodes that wait for slabs
     waiting: wp.int32  # leaf pairs
 
 
@@ -87,8 +91,7 @@ def expand_items(
     items: wp.uint64,
     first: wp.int32,
     popped: wp.int32,
-    end: wp.int32,
-    waiting: wp.int32,
+    ends: wp.vec3i,
     states: StatePool,
     pose: PairPose,
 ):
@@ -99,10 +102,30 @@ def expand_items(
     lane = warp_lane()
     item = read_item(items, (first + wp.min(lane, popped - 1)) & STACK_MASK)
     warp_sync()
-    children, emitted, tests = compare_node_pair(states, pose, item, wp.where(lane < popped, -1, 0))
-    ends = push_children(items, end, waiting, emitted, children)
+    children, lists, tests = compare_node_pair(states, pose, item, wp.where(lane < popped, -1, 0))
+    found = push_children(items, ends, lists, children)
     warp_sync()
-    return item_second(ends), item_first(ends), tests
+    return found, tests
+
+
+@wp.func
+def separate_small_pairs(
+    items: wp.uint64,
+    first: wp.int32,
+    popped: wp.int32,
+    end: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    slab: wp.vec2i,
+):
+    """Put the small pairs on the stack that slabs do not separate, one a lane; return its new end."""
+    lane = warp_lane()
+    item = read_small_pair(items, first + wp.min(lane, popped - 1))
+    overlap = small_nodes_overlap(models, states, pose, slab, item)
+    end = push_items(items, end, overlap and lane < popped, item)
+    warp_sync()
+    return end
 
 
 @wp.func
@@ -127,25 +150,25 @@ def divide_items(items: wp.uint64, head: wp.int32, end: wp.int32, part: wp.int32
 def start_items(items: wp.uint64, part: wp.int32, parts: wp.int32, states: StatePool, pose: PairPose):
     """Start a pair: expand the roots breadth first, the same in every warp at work on it, and keep a part.
 
-    Returns where the part starts and ends, the leaf pairs that wait, and the pairs of boxes compared: these two are
-    the first warp's.
+    Returns where the part starts, its end with those of the small pairs and the leaf pairs that wait, and the pairs of
+    boxes compared: all but the part are the first warp's.
     """
     if warp_lane() == 0:
         write_item(items, 0, first_item(states, pose))
     warp_sync()
-    head, end = wp.int32(0), wp.int32(1)
-    waiting, compared = wp.int32(0), wp.int32(0)
+    head, compared = wp.int32(0), wp.int32(0)
+    ends = wp.vec3i(1, 0, 0)
     wanted = wp.min(parts * ITEMS_PER_WARP, ITEMS_TO_DIVIDE)
-    while parts > 1 and end > head and end - head < wanted and waiting < warp_size():
+    while parts > 1 and ends[0] > head and ends[0] - head < wanted and ends[1] < warp_size() and ends[2] < warp_size():
         first = head
-        head += wp.min(warp_size(), end - head)
-        end, waiting, more = expand_items(items, first, head - first, end, waiting, states, pose)
+        head += wp.min(warp_size(), ends[0] - head)
+        ends, more = expand_items(items, first, head - first, ends, states, pose)
         compared += more
+    end = divide_items(items, head, ends[0], part, parts)
     if part > 0:
-        waiting = 0
+        ends = wp.vec3i()
         compared = 0
-    end = divide_items(items, head, end, part, parts)
-    return head, end, waiting, compared
+    return head, wp.vec3i(end, ends[1], ends[2]), compared
 
 
 @wp.func
@@ -187,7 +210,7 @@ def traverse_items(
     pair: wp.int32,
     models: ModelPool,
     states: StatePool,
-    pose: PairPose,
+    pair_poses: wp.array(dtype=PairPose),
     # state
     own: WarpItems,
     # out
@@ -196,32 +219,46 @@ def traverse_items(
 ):
     """Traverse what is on the stack and is not given away; return pairs of boxes compared, and face pair tests."""
     items, for_any = own.items, pace.for_any
-    head, end, waiting = wp.int32(own.head), wp.int32(own.end), wp.int32(own.waiting)
+    pose = pair_poses[pair]
+    head, end, small, waiting = wp.int32(own.head), wp.int32(own.end), wp.int32(own.small), wp.int32(own.waiting)
     node_tests, turn = wp.int32(0), wp.int32(0)
     tested, hit_count, uncertain_count = wp.int32(0), wp.int32(0), wp.int32(0)
     straddling = wp.int32(0)
     ready = wp.where(for_any, wp.min(LEAF_PAIRS_FOR_ANY, warp_size()), warp_size())
     ready_straddling = wp.where(for_any, 1, warp_size())
-    while end > head or waiting > 0 or straddling > 0:
+    while end > head or small > 0 or waiting > 0 or straddling > 0:
         found = False
         tickets, visits = wp.int64(0), wp.int32(0)
         turn += 1
         if (turn & pace.balance_mask) == 0:
             tickets = load_tickets(work.counter)
-        while visits < pace.tests_max and end > head and waiting < ready:
+        ready_small = wp.int32(ready)
+        while visits < pace.tests_max and end > head and small < ready_small and waiting < ready:
             # One at a time, depth first, needs little room; more where there is.
-            popped = wp.max(1, (pace.stack_room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
-            popped = wp.min(popped, wp.min(warp_size(), end - head))
-            end -= popped
-            end, waiting, compared = expand_items(items, end, popped, end, waiting, states, pose)
+            room = (pace.stack_room - DEPTH_FIRST_ROOM - (end - head) - small) >> 2
+            if room < 1:
+                # What waits for slabs comes back to the stack.
+                ready_small = 1
+            popped = wp.min(wp.max(1, room), wp.min(warp_size(), end - head))
+            ends, compared = expand_items(
+                items, end - popped, popped, wp.vec3i(end - popped, small, waiting), states, pose
+            )
+            end = ends[0]
+            small = ends[1]
+            waiting = ends[2]
             node_tests += compared
             visits += 1
-        if waiting >= ready or (end == head and waiting > 0):
+        if small >= ready_small or (end == head and small > 0):
+            popped = wp.min(small, warp_size())
+            small -= popped
+            end = separate_small_pairs(items, small, popped, end, models, states, pose, pair_poses[pair].slab)
+            node_tests += wp.where(warp_lane() < popped, 1, 0)
+        if waiting >= ready or (end == head and small == 0 and waiting > 0):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
             straddling = separate_leaf_pairs(mode, items, waiting, popped, straddling, models, states, pose)
             tested += popped
-        if straddling >= ready_straddling or (end == head and waiting == 0 and straddling > 0):
+        if straddling >= ready_straddling or (end == head and small == 0 and waiting == 0 and straddling > 0):
             popped = wp.min(straddling, warp_size())
             straddling -= popped
             found, uncertain = test_straddling(
@@ -235,6 +272,7 @@ def traverse_items(
         if for_any:
             if warp_any(found or hits.any_hit[pair] != 0):
                 end = head
+                small = 0
                 waiting = 0
                 straddling = 0
     return node_tests, wp.vec3i(hit_count, wp.where(warp_lane() == 0, tested, 0), uncertain_count)
@@ -282,17 +320,18 @@ def warp_traversal(mode: int, for_any: bool):
                     return
                 p = work_inout.owner[slot][0]
             pose = pair_poses[p]
-            head, end, waiting, started = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
+            head, ends, started = wp.int32(0), wp.vec3i(), wp.int32(0)
             if slot >= 0:
-                end = receive_items(own.items, slot, work_inout)
+                ends[0] = receive_items(own.items, slot, work_inout)
             else:
-                head, end, waiting, started = start_items(own.items, unit % parts, parts, states, pose)
+                head, ends, started = start_items(own.items, unit % parts, parts, states, pose)
             own.head = head
-            own.end = end
-            own.waiting = waiting
+            own.end = ends[0]
+            own.small = ends[1]
+            own.waiting = ends[2]
             asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
             node_tests, tests = traverse_items(
-                asked, wp.static(mode), pace, p, models, states, pose, own, hits_inout, work_inout
+                asked, wp.static(mode), pace, p, models, states, pair_poses, own, hits_inout, work_inout
             )
             add_warp_sum(hits_inout.node_tests, p, node_tests + started)
             add_warp_sum(hits_inout.count, p, tests[0])

@@ -38,7 +38,8 @@ def warp_sync(): ...
 def warp_stack() -> wp.uint64:
     """Return where this warp's items lie, an address in shared memory on CUDA.
 
-    Its stack, its leaf pairs, those that straddle each other's planes, and the signs of these, half an item each.
+    Its stack, its leaf pairs and small pairs, those that straddle each other's planes, and the signs of these, half an
+    item each.
     """
 
 
@@ -51,13 +52,20 @@ def write_item(items: wp.uint64, i: wp.int32, item: wp.int64): ...
 
 
 @wp.func_native(stack_code("push_children"))
-def push_children(
-    items: wp.uint64, end: wp.int32, leaf_end: wp.int32, emitted: wp.vec4i, children: four_items
-) -> wp.int64:
-    """Append the children that emit an item to the stack, those that emit a leaf pair to the leaf pairs.
+def push_children(items: wp.uint64, ends: wp.vec3i, lists: wp.vec4i, children: four_items) -> wp.vec3i:
+    """Append children to the lists that they are for: the stack, the small pairs, the leaf pairs, or none.
 
-    Returns both ends as an item, that of the leaf pairs first.
+    Returns the new ends of these.
     """
+
+
+@wp.func_native(stack_code("read_small_pair"))
+def read_small_pair(items: wp.uint64, i: wp.int32) -> wp.int64: ...
+
+
+@wp.func_native(stack_code("push_items"))
+def push_items(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64) -> wp.int32:
+    """Append the items whose flag is set to the stack; return its new end."""
 
 
 @wp.func_native(stack_code("hold_uniform"))
