@@ -15,14 +15,12 @@ static_assert(LEAF_PAIR_LENGTH >= 2 * (WARP_SIZE - 1) + 4 * WARP_SIZE, "fewer th
 static_assert(STRADDLING_LENGTH >= (WARP_SIZE - 1) + WARP_SIZE, "fewer than a warp wait, a test adds 1 a lane");
 static_assert(STRADDLING_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
 static_assert(SIGNS_START == STRADDLING_START + STRADDLING_LENGTH, "signs lie behind the straddling pairs");
-// `push_children` packs three places into a word, from these bits on; that on the stack, the last, goes round.
-constexpr int SMALL_PAIR_BIT = 0;
+// `push_children` counts small pairs, leaf pairs and node pairs of a warp in one word, from these bits on.
 constexpr int LEAF_PAIR_BIT = 10;
-constexpr int STACK_BIT = 23;
-constexpr int NO_BIT = 32;
+constexpr int STACK_BIT = 20;
 constexpr int PLACE_MASK = 1023;
-static_assert(STRADDLING_START <= PLACE_MASK && PLACE_MASK < 1 << LEAF_PAIR_BIT, "places fit");
-static_assert(STACK_LENGTH == 1 << (32 - STACK_BIT), "the stack is a ring in the word, too");
+static_assert(STRADDLING_START <= PLACE_MASK && PLACE_MASK < 1 << LEAF_PAIR_BIT, "places have room");
+static_assert(4 * WARP_SIZE <= PLACE_MASK && 2 * LEAF_PAIR_BIT == STACK_BIT, "counts have room");
 
 // Slots of the queue in which idle warps wait, each with room for so many items: one a lane.
 constexpr int SLOT_COUNT = 8192;

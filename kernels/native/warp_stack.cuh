@@ -56,16 +56,13 @@ inline CUDA_CALLABLE void write_item(wp::uint64 items, wp::int32 i, wp::int64 it
 }
 
 inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp::vec_t<3, wp::int32> ends,
-                                                           wp::vec_t<4, wp::int32> lists,
+                                                           wp::vec_t<4, wp::int32> emitted, bool small,
                                                            wp::vec_t<4, wp::int64> children) {
 #include "sizes.h"
     const int end = ends[0], small_end = ends[1], leaf_end = ends[2];
 #if defined(__CUDA_ARCH__)
-    unsigned int emitted[4];
-#pragma unroll
-    for (int k = 0; k < 4; ++k)
-        asm("shl.b32 %0, 1, %1;" : "=r"(emitted[k]) : "r"(lists[k]));  // 0 for NO_BIT
-    const unsigned int mine = (emitted[0] + emitted[1]) + (emitted[2] + emitted[3]);
+    const unsigned int own = (emitted[0] + emitted[1]) + (emitted[2] + emitted[3]);
+    const unsigned int mine = (own >> 16 << LEAF_PAIR_BIT) + ((own & 0xffff) << (small ? 0 : STACK_BIT));
     unsigned int sum = mine;
 // What came from a lane is added, nothing where there is none.
 #pragma unroll
@@ -75,21 +72,22 @@ inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp:
             " shfl.sync.up.b32 other|from, %0, %1, 0, 0xffffffff; @from add.u32 %0, %0, other; }"
             : "+r"(sum)
             : "r"(step));
-    const unsigned int total = __shfl_sync(0xffffffffu, sum, 31);
-    // Of small pairs, which are listed downwards, that from the other end.
-    unsigned int place = ((unsigned int)end << STACK_BIT | (STACK_LENGTH + leaf_end) << LEAF_PAIR_BIT |
-                          (PLACE_MASK - (STRADDLING_START - 1) + small_end)) +
-                         (sum - mine);
+    const unsigned int total = __shfl_sync(0xffffffffu, sum, 31), before = sum - mine;
+    // Bytes from the start, of leaf pairs in the high half; of small pairs, which are listed downwards, the bytes to
+    // PLACE_MASK.
+    const unsigned int leaf_place = STACK_LENGTH + leaf_end + ((before >> LEAF_PAIR_BIT) & PLACE_MASK);
+    const unsigned int small_place = PLACE_MASK + 1 - STRADDLING_START + small_end + (before & PLACE_MASK);
+    const unsigned int stack_place = (end & (STACK_LENGTH - 1)) + (before >> STACK_BIT);
+    unsigned int place = 8 * (leaf_place << 16 | (small ? small_place : stack_place));
+    const unsigned int mask = 8 * (small ? PLACE_MASK : STACK_LENGTH - 1), turn = small ? 8 * PLACE_MASK : 0;
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
-        unsigned int at;
-        asm("shr.u32 %0, %1, %2;" : "=r"(at) : "r"(place), "r"(lists[k]));
-        at = (at & PLACE_MASK) ^ (lists[k] == SMALL_PAIR_BIT ? PLACE_MASK : 0);
+        const unsigned int at = emitted[k] > 1 ? place >> 16 : (place & mask) ^ turn;
         asm volatile(
             "{ .reg .pred used; setp.ne.u32 used, %0, 0; @used st.shared.v2.b32 [%1], {%2, %3}; }" ::"r"(emitted[k]),
-            "r"((unsigned int)items + 8 * at), "r"((int)children[k]), "r"((int)(children[k] >> 32))
+            "r"((unsigned int)items + at), "r"((int)children[k]), "r"((int)(children[k] >> 32))
             : "memory");
-        place += emitted[k];
+        place += 8 * emitted[k];
     }
     const int more_items = total >> STACK_BIT, more_leaves = (total >> LEAF_PAIR_BIT) & PLACE_MASK;
     const int more_small = total & PLACE_MASK;
@@ -97,12 +95,12 @@ inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp:
     long long* list = (long long*)items;
     int more_items = 0, more_small = 0, more_leaves = 0;
     for (int k = 0; k < 4; ++k) {
-        if (lists[k] == STACK_BIT)
-            list[(end + more_items++) & (STACK_LENGTH - 1)] = children[k];
-        else if (lists[k] == SMALL_PAIR_BIT)
-            list[STRADDLING_START - 1 - (small_end + more_small++)] = children[k];
-        else if (lists[k] == LEAF_PAIR_BIT)
+        if (emitted[k] > 1)
             list[STACK_LENGTH + leaf_end + more_leaves++] = children[k];
+        else if (emitted[k] == 1 && small)
+            list[STRADDLING_START - 1 - (small_end + more_small++)] = children[k];
+        else if (emitted[k] == 1)
+            list[(end + more_items++) & (STACK_LENGTH - 1)] = children[k];
     }
 #endif
     return wp::vec_t<3, wp::int32>(end + more_items, small_end + more_small, leaf_end + more_leaves);

@@ -27,7 +27,7 @@ from warp_abtree.kernels.traversal.load_balance import (
     take_unit,
     units_per_pair,
 )
-from warp_abtree.kernels.traversal.node_pair import compare_node_pair, first_item
+from warp_abtree.kernels.traversal.node_pair import are_small, compare_node_pair, first_item
 from warp_abtree.kernels.traversal.small_slabs import small_nodes_overlap
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
@@ -102,8 +102,8 @@ def expand_items(
     lane = warp_lane()
     item = read_item(items, (first + wp.min(lane, popped - 1)) & STACK_MASK)
     warp_sync()
-    children, lists, tests = compare_node_pair(states, pose, item, wp.where(lane < popped, -1, 0))
-    found = push_children(items, ends, lists, children)
+    children, emitted, tests = compare_node_pair(states, pose, item, wp.where(lane < popped, -1, 0))
+    found = push_children(items, ends, emitted, are_small(pose, item), children)
     warp_sync()
     return found, tests
 

@@ -22,10 +22,8 @@ from warp_abtree.kernels.traversal.nodes import Node, load_constant_node, load_n
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 INDEX_MASK = wp.constant(2**31 - 1)
-# The lists of a warp that overlapping children go to, by the bits where `push_children` counts them.
-TO_STACK, TO_SMALL_PAIRS, TO_LEAF_PAIRS, TO_NONE = (
-    native.constant(name) for name in ("STACK_BIT", "SMALL_PAIR_BIT", "LEAF_PAIR_BIT", "NO_BIT")
-)
+# What a test emits is counted in one word: leaf pairs << 16 | items.
+EMIT_ITEM, EMIT_LEAVES = wp.constant(1), wp.constant(1 << 16)
 
 four_items = wp.types.vector(length=4, dtype=wp.int64)
 
@@ -62,31 +60,28 @@ class Child:
     skip: wp.int32  # half an item that compares this node alone
     down: wp.int32  # half an item that compares its children; not for a leaf
     face: wp.int32  # face number of a leaf, negative at an inner node
-    above: wp.int32  # negative where the node is not small
 
 
 @wp.func
-def make_child(box: PosedBox, node: Node, floor: wp.int32):
+def make_child(box: PosedBox, node: Node):
     child = Child()
     child.box = box
     child.span = wp.cast(node.face, wp.float32)
     child.skip = node.skip
     child.down = children_of(node.skip)
     child.face = node.face
-    child.above = node.skip - floor
     return child
 
 
 @wp.func
 def child_of_a(pose: PairPose, node: Node):
     back = wp.transpose(pose.rotation32)
-    return make_child(pose_box(node.lower, node.upper, back, pose.back32, pose.margin), node, pose.floor_a)
+    return make_child(pose_box(node.lower, node.upper, back, pose.back32, pose.margin), node)
 
 
 @wp.func
 def child_of_b(pose: PairPose, node: Node):
-    box = pose_box(node.lower, node.upper, pose.rotation32, pose.translation32, pose.margin)
-    return make_child(box, node, pose.floor_b)
+    return make_child(pose_box(node.lower, node.upper, pose.rotation32, pose.translation32, pose.margin), node)
 
 
 @wp.func
@@ -104,11 +99,10 @@ def next_item(a: Child, b: Child):
 
 
 @wp.func
-def list_of_pair(used: wp.int32, a: Child, b: Child):
-    """Return the list that two children go to if they overlap and `used` is negative, else TO_NONE."""
-    inner = wp.where((a.above | b.above) >= 0, TO_SMALL_PAIRS, TO_STACK)
-    to = wp.where((a.face | b.face) >= 0, TO_LEAF_PAIRS, inner)
-    return wp.where(boxes_overlap(a.box, b.box), wp.where(used < 0, to, TO_NONE), TO_NONE)
+def emit_of_pair(used: wp.int32, a: Child, b: Child):
+    """Return what two children add to the count of what is emitted if they overlap and `used` is negative."""
+    emitted = wp.where((a.face | b.face) >= 0, EMIT_LEAVES, EMIT_ITEM)
+    return wp.where(boxes_overlap(a.box, b.box), wp.where(used < 0, emitted, 0), 0)
 
 
 @wp.func
@@ -120,8 +114,16 @@ def count_used(used: wp.vec4i):
 
 
 @wp.func
+def are_small(pose: PairPose, item: wp.int64):
+    """Return whether the nodes that an item names are small, and so are all below: they lie on the same levels."""
+    above_a = (item_first(item) & INDEX_MASK) - pose.floor_a
+    above_b = (item_second(item) & INDEX_MASK) - pose.floor_b
+    return (above_a | above_b) >= 0
+
+
+@wp.func
 def compare_node_pair(states: StatePool, pose: PairPose, item: wp.int64, live: wp.int32):
-    """Compare what an item names; return the items that follow, the list of each, and the pairs of boxes compared.
+    """Compare what an item names; return the items that follow, what each emits, and the pairs of boxes compared.
 
     live is -1, or 0 where nothing is asked of the item, which still names nodes. No branches: the lanes of a warp stay
     together, and all loads are under way at once. A node that is compared alone is its own sibling.
@@ -141,11 +143,11 @@ def compare_node_pair(states: StatePool, pose: PairPose, item: wp.int64, live: w
     b0 = child_of_b(pose, node_b0)
     b1 = child_of_b(pose, node_b1)
     used = wp.vec4i(live, y & live, x & live, x & y & live)
-    lists = wp.vec4i(
-        list_of_pair(used[0], a0, b0),
-        list_of_pair(used[1], a0, b1),
-        list_of_pair(used[2], a1, b0),
-        list_of_pair(used[3], a1, b1),
+    emitted = wp.vec4i(
+        emit_of_pair(used[0], a0, b0),
+        emit_of_pair(used[1], a0, b1),
+        emit_of_pair(used[2], a1, b0),
+        emit_of_pair(used[3], a1, b1),
     )
     items = four_items(next_item(a0, b0), next_item(a0, b1), next_item(a1, b0), next_item(a1, b1))
-    return items, lists, count_used(used)
+    return items, emitted, count_used(used)

@@ -52,10 +52,13 @@ def write_item(items: wp.uint64, i: wp.int32, item: wp.int64): ...
 
 
 @wp.func_native(stack_code("push_children"))
-def push_children(items: wp.uint64, ends: wp.vec3i, lists: wp.vec4i, children: four_items) -> wp.vec3i:
-    """Append children to the lists that they are for: the stack, the small pairs, the leaf pairs, or none.
+def push_children(
+    items: wp.uint64, ends: wp.vec3i, emitted: wp.vec4i, small: bool, children: four_items
+) -> wp.vec3i:
+    """Append the children that emit a leaf pair to the leaf pairs, those that emit an item to the stack or, if small,
+    to the small pairs.
 
-    Returns the new ends of these.
+    Returns the new ends of the stack, the small pairs and the leaf pairs.
     """
 
 
