@@ -7,6 +7,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
 from warp_abtree.model.model import Model
+from warp_abtree.model.winding import refuse_open
 from warp_abtree.query.broad_phase import EVERY_WORLD, BroadPhase
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.distance import DistanceQuery, check_beyond
@@ -64,6 +65,7 @@ class Scene:
         self.object_importance: list[int] = []
         self._world: list[int] = []
         self.object_static: list[bool] = []
+        self.object_solid: list[bool] = []
         self._added_pose: list[np.ndarray] = []
         self._lod: list[int] = []
         self._excluded = np.empty(0, np.int64)
@@ -82,7 +84,7 @@ class Scene:
         """LOD of each object, int32 (n,)."""
         return np.array(self._lod if self._batch is None else self._batch.lods, np.int32)
 
-    def add(self, model, pose=(0, 0, 0, 0, 0, 0, 1), world=0, lod=None, importance=1, static=False) -> int:
+    def add(self, model, pose=(0, 0, 0, 0, 0, 0, 1), world=0, lod=None, importance=1, static=False, solid=False) -> int:
         """Add an object and return its index.
 
         Args:
@@ -92,9 +94,12 @@ class Scene:
             lod: LOD to stand at; None is the finest.
             importance: Application context beta of the LOD selection, 1, 2 or 3 (paper, section 4.2).
             static: Whether the broad phase never pairs it with another static object, a bool.
+            solid: Whether what lies inside it intersects it, a bool; of a closed model, at every LOD, see
+                `warp_abtree.state.solids`.
 
         Raises:
             TypeError: model is no Model.
+            MeshError: A solid whose mesh is not closed; the message names edges.
             ValueError: Anything else is out of range; nothing is added.
             RuntimeError: A graph is being captured.
         """
@@ -103,18 +108,21 @@ class Scene:
         checked = check_poses(to_numpy(pose, "pose")[None], "pose")[0]
         world = whole_number(world, "world", EVERY_WORLD, 2**31 - 1)
         importance = whole_number(importance, "importance", 1, 3)
-        if not isinstance(static, bool | np.bool_):
-            raise ValueError(f"static {static!r} is neither True nor False")
+        for name, value in (("static", static), ("solid", solid)):
+            if not isinstance(value, bool | np.bool_):
+                raise ValueError(f"{name} {value!r} is neither True nor False")
+        if solid:
+            refuse_open(model.winding, model.name)
         lod = model.lod_max if lod is None else model.check_lod(lod)
         known = next((i for i, other in enumerate(self.models) if other is model), len(self.models))
         self._retire()
         count = self.object_count
         columns: list[list] = [self._world, self.object_static, self._added_pose, self._lod]
-        columns += [self.object_importance, self.object_model]
+        columns += [self.object_importance, self.object_solid, self.object_model]
         try:
             if known == len(self.models):
                 self.models.append(model)
-            for column, value in zip(columns, (world, bool(static), checked, lod, importance, known)):
+            for column, value in zip(columns, (world, bool(static), checked, lod, importance, bool(solid), known)):
                 column.append(value)
         except BaseException:
             for column in columns:
@@ -149,7 +157,7 @@ class Scene:
             models = ModelArrays(self.models, self.device)
             states = StateArrays(models, self.device)
             objects = ObjectArrays(self._world, self.object_static, self.device)
-            batch = Batch(models, states, objects, self.object_model, self._excluded)
+            batch = Batch(models, states, objects, self.object_model, self._excluded, self.object_solid)
             batch.set_lods(np.array(self._lod))
             self._place_added(objects.pool)
             self._batch = batch

@@ -16,6 +16,7 @@ from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.models import build_model
 from warp_abtree.app.toml.objects import make_groups
 from warp_abtree.checks.arguments import whole_number
+from warp_abtree.model.obj import MeshError
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame
 from warp_abtree.simulate.lod_request import LodSweep, resolve_lod
@@ -188,7 +189,10 @@ def _add_objects(path, scene, groups, models):
                 lod = resolve_lod(models[name], lods[i % len(lods)])
             except ValueError as error:
                 fail(path, f"{group.key}.lod", error)
-            scene.add(models[name], poses[i], int(group.world[i]), lod, table.importance, table.static)
+            try:
+                scene.add(models[name], poses[i], int(group.world[i]), lod, table.importance, table.static, table.solid)
+            except MeshError as error:
+                fail(path, f"{group.key}.solid", error)
             owners.append((table.name, name))
     return owners
 

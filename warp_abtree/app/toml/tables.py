@@ -69,6 +69,7 @@ class ModelTable(Table):
     centre: bool = False  # moves the middle of the box to the model's origin
     faces: Count | None = None  # brings the mesh to so many, or one less: by Loop subdivision and edge collapses
     base_faces: Count = 10  # faces of the coarsest LOD
+    orient: bool = False  # turns faces that disagree with their neighbours or face inwards
 
     def __post_init__(self):
         if self.mesh is None and self.__struct_config__.tag is None:
@@ -191,6 +192,7 @@ class ObjectTable(Table, kw_only=True):
     world: Annotated[int, Meta(ge=-1, le=2**30)] = 0  # objects of different worlds never meet; -1 is in every world
     static: bool = False  # static objects never meet each other
     kinematic: bool = False  # with [dynamics]: moves as told, and pushes
+    solid: bool = False  # what lies inside it intersects it; of a closed model
     importance: Annotated[int, Meta(ge=1, le=3)] = 1  # 1 (most), 2 or 3, for the selection of LODs
     # A number with a decimal point is a fraction of the faces; a whole number, "finest", "coarsest" or "tol:0.01"; of a
     # list each in turn.
