@@ -4,7 +4,7 @@ import random
 
 import numpy as np
 
-from oracles.triangle import brute_force_faces, cross, dot, integer_points, into_frame_of_a, sub
+from oracles.triangle import brute_force_faces, clip, cross, dot, integer_points, into_frame_of_a, sub
 
 
 def parity(point, triangles):
@@ -21,15 +21,15 @@ def parity(point, triangles):
         crossings = 0
         for k in range(0, len(corners), 3):
             a, b, c = corners[k : k + 3]
+            volume = dot(a, cross(b, c))
+            if volume == 0:
+                # A line in general position passes the plane of the face, or its line, in the point alone.
+                assert not clip((a, b, c), [(0, 0, 0)] * 3), "the point lies on the surface"
+                continue
             sides = [dot(direction, cross(u, v)) for u, v in ((a, b), (b, c), (c, a))]
-            if not any(cross(sub(b, a), sub(c, a))):
-                continue  # a face of no area, which a line in general position misses
             if 0 in sides:
                 break
-            if min(sides) > 0 or max(sides) < 0:
-                ahead = dot(a, cross(b, c)) * sides[0]
-                assert ahead != 0, "the point lies on the surface"
-                crossings += ahead > 0
+            crossings += (min(sides) > 0 or max(sides) < 0) and volume * sides[0] > 0
         else:
             return crossings % 2 == 1
 
