@@ -21,8 +21,8 @@ UNIT_32 = wp.constant(wp.float64(2.0**-24))
 REACH_MIN = wp.constant(wp.float64(2.0**-100))
 REACH_MAX = wp.constant(wp.float64(2.0**100))
 ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
-# Small nodes have 2^SMALL_DEPTH faces at most, as they lie on the last levels of a tree.
-SMALL_DEPTH = wp.constant(3)
+# Nodes so few levels above the leaves have slabs: of 8 faces at most.
+SLAB_DEPTH = wp.constant(3)
 NO_NODE = wp.constant(2**31 - 1)
 
 
@@ -48,8 +48,7 @@ class PairPose:
     corner_a: wp.int32  # where A's face corners lie in the pool
     corner_b: wp.int32  # where B's face corners lie in the pool
     slab: wp.vec2i  # where slabs of A's nodes lie in the models' pool, and of B's
-    floor_a: wp.int32  # A's nodes from this one on are small and have slabs; none has where B has none
-    floor_b: wp.int32  # B's nodes from this one on
+    floor: wp.vec2i  # nodes of A, and of B, from these on have slabs; none where either model has none
 
 
 @wp.func
@@ -112,14 +111,18 @@ def unit_scale(reach: wp.float64):
 
 @wp.func
 def has_slabs(models: ModelPool, states: StatePool, state: wp.int32):
-    """Return whether there are slabs of a state's small nodes: of original faces, so at the finest LOD."""
+    """Return whether there are slabs of a state's nodes: they are of original faces."""
     return models.node_slab.shape[0] > 0 and states.lod[state] == models.lod_max[states.model[state]]
 
 
 @wp.func
-def first_small_node(depth: wp.int32):
-    """Return the first node of a tree of a depth that has few faces."""
-    return 1 << wp.max(depth - SMALL_DEPTH, 0)
+def slab_floors(models: ModelPool, states: StatePool, a: wp.int32, b: wp.int32):
+    """Return the first node of each of two states that has a slab."""
+    if has_slabs(models, states, a) and has_slabs(models, states, b):
+        depth_a = models.depth[states.model[a]]
+        depth_b = models.depth[states.model[b]]
+        return wp.vec2i(1 << wp.max(depth_a - SLAB_DEPTH, 0), 1 << wp.max(depth_b - SLAB_DEPTH, 0))
+    return wp.vec2i(NO_NODE, NO_NODE)
 
 
 @wp.func
@@ -168,11 +171,7 @@ def pair_pose(
     if wp.max(reach_a, reach_b) < REACH_MIN or wp.max(reach_a, reach_b) > REACH_MAX:
         pose.error = wp.inf
     pose.slab = wp.vec2i(models.node_start[states.model[state_a]], models.node_start[states.model[state_b]])
-    pose.floor_a = NO_NODE
-    pose.floor_b = NO_NODE
-    if has_slabs(models, states, state_a) and has_slabs(models, states, state_b):
-        pose.floor_a = first_small_node(models.depth[states.model[state_a]])
-        pose.floor_b = first_small_node(models.depth[states.model[state_b]])
+    pose.floor = slab_floors(models, states, state_a, state_b)
     same = states.model[state_a] == states.model[state_b] and states.lod[state_a] == states.lod[state_b]
     if whole and same and far + wp.float64(3.0) * rotation_size * reach_b <= off32:
         # Coincident meshes: no vertex is farther from its twin than float32 can tell.

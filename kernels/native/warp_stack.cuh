@@ -22,11 +22,11 @@ inline CUDA_CALLABLE wp::int32 warp_lane() {
 inline CUDA_CALLABLE wp::uint64 warp_stack() {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
-    __shared__ long long items[SIGNS_START + STRADDLING_LENGTH / 2];
+    __shared__ long long items[SLAB_PAIR_START + SLAB_PAIR_LENGTH];
     // Through another lane, so that the address is held and not computed again at every use.
     return __shfl_sync(0xffffffffu, (unsigned int)__cvta_generic_to_shared(items), 0);
 #else
-    static long long items[SIGNS_START + STRADDLING_LENGTH / 2];
+    static long long items[SLAB_PAIR_START + SLAB_PAIR_LENGTH];
     return (wp::uint64)items;
 #endif
 }
@@ -56,13 +56,16 @@ inline CUDA_CALLABLE void write_item(wp::uint64 items, wp::int32 i, wp::int64 it
 }
 
 inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp::vec_t<3, wp::int32> ends,
-                                                           wp::vec_t<4, wp::int32> emitted, bool small,
+                                                           wp::vec_t<4, wp::int32> lists,
                                                            wp::vec_t<4, wp::int64> children) {
 #include "sizes.h"
-    const int end = ends[0], small_end = ends[1], leaf_end = ends[2];
+    const int end = ends[0], slab_end = ends[1], leaf_end = ends[2];
 #if defined(__CUDA_ARCH__)
-    const unsigned int own = (emitted[0] + emitted[1]) + (emitted[2] + emitted[3]);
-    const unsigned int mine = (own >> 16 << LEAF_PAIR_BIT) + ((own & 0xffff) << (small ? 0 : STACK_BIT));
+    unsigned int emitted[4];
+#pragma unroll
+    for (int k = 0; k < 4; ++k)
+        asm("shl.b32 %0, %1, %2;" : "=r"(emitted[k]) : "r"(ITEM_BYTES), "r"(lists[k]));  // 0 for NO_LIST
+    const unsigned int mine = (emitted[0] + emitted[1]) + (emitted[2] + emitted[3]);
     unsigned int sum = mine;
 // What came from a lane is added, nothing where there is none.
 #pragma unroll
@@ -72,52 +75,37 @@ inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp:
             " shfl.sync.up.b32 other|from, %0, %1, 0, 0xffffffff; @from add.u32 %0, %0, other; }"
             : "+r"(sum)
             : "r"(step));
-    const unsigned int total = __shfl_sync(0xffffffffu, sum, 31), before = sum - mine;
-    // Bytes from the start, of leaf pairs in the high half; of small pairs, which are listed downwards, the bytes to
-    // PLACE_MASK.
-    const unsigned int leaf_place = STACK_LENGTH + leaf_end + ((before >> LEAF_PAIR_BIT) & PLACE_MASK);
-    const unsigned int small_place = PLACE_MASK + 1 - STRADDLING_START + small_end + (before & PLACE_MASK);
-    const unsigned int stack_place = (end & (STACK_LENGTH - 1)) + (before >> STACK_BIT);
-    unsigned int place = 8 * (leaf_place << 16 | (small ? small_place : stack_place));
-    const unsigned int mask = 8 * (small ? PLACE_MASK : STACK_LENGTH - 1), turn = small ? 8 * PLACE_MASK : 0;
+    const unsigned int total = __shfl_sync(0xffffffffu, sum, 31);
+    unsigned int place = (ITEM_BYTES * (unsigned int)end << STACK_LIST |
+                          ITEM_BYTES * (STACK_LENGTH + leaf_end) << LEAF_PAIR_LIST |
+                          ITEM_BYTES * (SLAB_PAIR_START + slab_end) << SLAB_PAIR_LIST) +
+                         (sum - mine);
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
-        const unsigned int at = emitted[k] > 1 ? place >> 16 : (place & mask) ^ turn;
+        unsigned int at;
+        asm("shr.u32 %0, %1, %2;" : "=r"(at) : "r"(place), "r"(lists[k]));
         asm volatile(
             "{ .reg .pred used; setp.ne.u32 used, %0, 0; @used st.shared.v2.b32 [%1], {%2, %3}; }" ::"r"(emitted[k]),
-            "r"((unsigned int)items + at), "r"((int)children[k]), "r"((int)(children[k] >> 32))
+            "r"((unsigned int)items + (at & PLACE_MASK)), "r"((int)children[k]), "r"((int)(children[k] >> 32))
             : "memory");
-        place += 8 * emitted[k];
+        place += emitted[k];
     }
-    const int more_items = total >> STACK_BIT, more_leaves = (total >> LEAF_PAIR_BIT) & PLACE_MASK;
-    const int more_small = total & PLACE_MASK;
+    const int more_items = (total >> STACK_LIST) / ITEM_BYTES;
+    const int more_slab = ((total >> SLAB_PAIR_LIST) & PLACE_MASK) / ITEM_BYTES;
+    const int more_leaves = ((total >> LEAF_PAIR_LIST) & PLACE_MASK) / ITEM_BYTES;
 #else
     long long* list = (long long*)items;
-    int more_items = 0, more_small = 0, more_leaves = 0;
+    int more_items = 0, more_slab = 0, more_leaves = 0;
     for (int k = 0; k < 4; ++k) {
-        if (emitted[k] > 1)
-            list[STACK_LENGTH + leaf_end + more_leaves++] = children[k];
-        else if (emitted[k] == 1 && small)
-            list[STRADDLING_START - 1 - (small_end + more_small++)] = children[k];
-        else if (emitted[k] == 1)
+        if (lists[k] == STACK_LIST)
             list[(end + more_items++) & (STACK_LENGTH - 1)] = children[k];
+        else if (lists[k] == SLAB_PAIR_LIST)
+            list[SLAB_PAIR_START + slab_end + more_slab++] = children[k];
+        else if (lists[k] == LEAF_PAIR_LIST)
+            list[STACK_LENGTH + leaf_end + more_leaves++] = children[k];
     }
 #endif
-    return wp::vec_t<3, wp::int32>(end + more_items, small_end + more_small, leaf_end + more_leaves);
-}
-
-inline CUDA_CALLABLE wp::int64 read_small_pair(wp::uint64 items, wp::int32 i) {
-#include "sizes.h"
-#if defined(__CUDA_ARCH__)
-    long long item;
-    asm volatile("ld.shared.b64 %0, [%1];"
-                 : "=l"(item)
-                 : "r"((unsigned int)items + 8 * (STRADDLING_START - 1 - i))
-                 : "memory");
-    return item;
-#else
-    return ((const long long*)items)[STRADDLING_START - 1 - i];
-#endif
+    return wp::vec_t<3, wp::int32>(end + more_items, slab_end + more_slab, leaf_end + more_leaves);
 }
 
 inline CUDA_CALLABLE wp::int32 push_items(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item) {

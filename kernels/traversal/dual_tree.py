@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.slabs.overlap import slabs_overlap
 from warp_abtree.kernels.traversal.face_pairs import OUTPUT_ANY, Hits
 from warp_abtree.kernels.traversal.leaf_pairs import separate_leaf_pairs, test_straddling
 from warp_abtree.kernels.traversal.load_balance import (
@@ -27,16 +28,16 @@ from warp_abtree.kernels.traversal.load_balance import (
     take_unit,
     units_per_pair,
 )
-from warp_abtree.kernels.traversal.node_pair import are_small, compare_node_pair, first_item
-from warp_abtree.kernels.traversal.small_slabs import small_nodes_overlap
+from warp_abtree.kernels.traversal.node_pair import compare_node_pair, first_item
 from warp_abtree.kernels.traversal.warp_stack import (
+    SLAB_PAIR_LENGTH,
+    SLAB_PAIR_START,
     STACK_LENGTH,
     add_warp_sum,
     hold_uniform,
     push_children,
     push_items,
     read_item,
-    read_small_pair,
     warp_any,
     warp_lane,
     warp_size,
@@ -81,9 +82,7 @@ class WarpItems:
 
     items: wp.uint64  # `warp_stack`
     head: wp.int32  # where node pairs start, the oldest first; STACK_MASK takes it into the ring
-    end: wp.int32  # where they end
-    small: wp.int32  # pairs of small nodes that wait for slabs
-    waiting: wp.int32  # leaf pairs
+    ends: wp.vec3i  # where they end; slab pairs; leaf pairs
 
 
 @wp.func
@@ -102,14 +101,14 @@ def expand_items(
     lane = warp_lane()
     item = read_item(items, (first + wp.min(lane, popped - 1)) & STACK_MASK)
     warp_sync()
-    children, emitted, tests = compare_node_pair(states, pose, item, wp.where(lane < popped, -1, 0))
-    found = push_children(items, ends, emitted, are_small(pose, item), children)
+    children, lists, tests = compare_node_pair(states, pose, item, wp.where(lane < popped, -1, 0))
+    found = push_children(items, ends, lists, children)
     warp_sync()
     return found, tests
 
 
 @wp.func
-def separate_small_pairs(
+def separate_slab_pairs(
     items: wp.uint64,
     first: wp.int32,
     popped: wp.int32,
@@ -119,10 +118,10 @@ def separate_small_pairs(
     pose: PairPose,
     slab: wp.vec2i,
 ):
-    """Put the small pairs on the stack that slabs do not separate, one a lane; return its new end."""
+    """Put the slab pairs on the stack that slabs do not separate, one a lane; return its new end."""
     lane = warp_lane()
-    item = read_small_pair(items, first + wp.min(lane, popped - 1))
-    overlap = small_nodes_overlap(models, states, pose, slab, item)
+    item = read_item(items, SLAB_PAIR_START + first + wp.min(lane, popped - 1))
+    overlap = slabs_overlap(models, states, pose, slab, item)
     end = push_items(items, end, overlap and lane < popped, item)
     warp_sync()
     return end
@@ -150,7 +149,7 @@ def divide_items(items: wp.uint64, head: wp.int32, end: wp.int32, part: wp.int32
 def start_items(items: wp.uint64, part: wp.int32, parts: wp.int32, states: StatePool, pose: PairPose):
     """Start a pair: expand the roots breadth first, the same in every warp at work on it, and keep a part.
 
-    Returns where the part starts, its end with those of the small pairs and the leaf pairs that wait, and the pairs of
+    Returns where the part starts, its end with those of the slab pairs and the leaf pairs that wait, and the pairs of
     boxes compared: all but the part are the first warp's.
     """
     if warp_lane() == 0:
@@ -161,7 +160,7 @@ def start_items(items: wp.uint64, part: wp.int32, parts: wp.int32, states: State
     wanted = wp.min(parts * ITEMS_PER_WARP, ITEMS_TO_DIVIDE)
     while parts > 1 and ends[0] > head and ends[0] - head < wanted and ends[1] < warp_size() and ends[2] < warp_size():
         first = head
-        head += wp.min(warp_size(), ends[0] - head)
+        head += wp.min(wp.min(warp_size(), (SLAB_PAIR_LENGTH - ends[1]) >> 2), ends[0] - head)
         ends, more = expand_items(items, first, head - first, ends, states, pose)
         compared += more
     end = divide_items(items, head, ends[0], part, parts)
@@ -202,6 +201,38 @@ def donate_items(items: wp.uint64, pair: wp.int32, head: wp.int32, end: wp.int32
 
 
 @wp.func
+def descend(
+    items: wp.uint64,
+    pace: Pace,
+    ready: wp.int32,
+    head: wp.int32,
+    ends: wp.vec3i,
+    states: StatePool,
+    pose: PairPose,
+):
+    """Test node pairs for a turn, or until enough slab pairs or leaf pairs wait.
+
+    Returns the new ends, how many slab pairs are enough, and the pairs of boxes compared.
+    """
+    end, slab_pairs, waiting = wp.int32(ends[0]), wp.int32(ends[1]), wp.int32(ends[2])
+    ready_slab = wp.int32(ready)
+    visits, node_tests = wp.int32(0), wp.int32(0)
+    while visits < pace.tests_max and end > head and slab_pairs < ready_slab and waiting < ready:
+        # One at a time, depth first, needs little room; more where there is. Slab pairs come back to the stack.
+        room = wp.min(pace.stack_room - DEPTH_FIRST_ROOM - (end - head), SLAB_PAIR_LENGTH) - slab_pairs
+        ready_slab = wp.min(ready, wp.max(1, room - 3))
+        popped = wp.min(wp.max(1, room >> 2), wp.min(warp_size(), end - head))
+        end -= popped
+        found, compared = expand_items(items, end, popped, wp.vec3i(end, slab_pairs, waiting), states, pose)
+        end = found[0]
+        slab_pairs = found[1]
+        waiting = found[2]
+        node_tests += compared
+        visits += 1
+    return wp.vec3i(end, slab_pairs, waiting), ready_slab, node_tests
+
+
+@wp.func
 def traverse_items(
     # static
     output: wp.int32,
@@ -220,45 +251,39 @@ def traverse_items(
     """Traverse what is on the stack and is not given away; return pairs of boxes compared, and face pair tests."""
     items, for_any = own.items, pace.for_any
     pose = pair_poses[pair]
-    head, end, small, waiting = wp.int32(own.head), wp.int32(own.end), wp.int32(own.small), wp.int32(own.waiting)
+    head, end, slab_pairs, waiting = (
+        wp.int32(own.head),
+        wp.int32(own.ends[0]),
+        wp.int32(own.ends[1]),
+        wp.int32(own.ends[2]),
+    )
     node_tests, turn = wp.int32(0), wp.int32(0)
     tested, hit_count, uncertain_count = wp.int32(0), wp.int32(0), wp.int32(0)
     straddling = wp.int32(0)
     ready = wp.where(for_any, wp.min(LEAF_PAIRS_FOR_ANY, warp_size()), warp_size())
     ready_straddling = wp.where(for_any, 1, warp_size())
-    while end > head or small > 0 or waiting > 0 or straddling > 0:
+    while end > head or slab_pairs > 0 or waiting > 0 or straddling > 0:
         found = False
-        tickets, visits = wp.int64(0), wp.int32(0)
+        tickets = wp.int64(0)
         turn += 1
         if (turn & pace.balance_mask) == 0:
             tickets = load_tickets(work.counter)
-        ready_small = wp.int32(ready)
-        while visits < pace.tests_max and end > head and small < ready_small and waiting < ready:
-            # One at a time, depth first, needs little room; more where there is.
-            room = (pace.stack_room - DEPTH_FIRST_ROOM - (end - head) - small) >> 2
-            if room < 1:
-                # What waits for slabs comes back to the stack.
-                ready_small = 1
-            popped = wp.min(wp.max(1, room), wp.min(warp_size(), end - head))
-            ends, compared = expand_items(
-                items, end - popped, popped, wp.vec3i(end - popped, small, waiting), states, pose
-            )
-            end = ends[0]
-            small = ends[1]
-            waiting = ends[2]
-            node_tests += compared
-            visits += 1
-        if small >= ready_small or (end == head and small > 0):
-            popped = wp.min(small, warp_size())
-            small -= popped
-            end = separate_small_pairs(items, small, popped, end, models, states, pose, pair_poses[pair].slab)
+        ends, ready_slab, compared = descend(items, pace, ready, head, wp.vec3i(end, slab_pairs, waiting), states, pose)
+        end = ends[0]
+        slab_pairs = ends[1]
+        waiting = ends[2]
+        node_tests += compared
+        if slab_pairs >= ready_slab or (end == head and slab_pairs > 0):
+            popped = wp.min(slab_pairs, warp_size())
+            slab_pairs -= popped
+            end = separate_slab_pairs(items, slab_pairs, popped, end, models, states, pose, pair_poses[pair].slab)
             node_tests += wp.where(warp_lane() < popped, 1, 0)
-        if waiting >= ready or (end == head and small == 0 and waiting > 0):
+        if waiting >= ready or (end == head and slab_pairs == 0 and waiting > 0):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
             straddling = separate_leaf_pairs(mode, items, waiting, popped, straddling, models, states, pose)
             tested += popped
-        if straddling >= ready_straddling or (end == head and small == 0 and waiting == 0 and straddling > 0):
+        if straddling >= ready_straddling or (end == head and slab_pairs == 0 and waiting == 0 and straddling > 0):
             popped = wp.min(straddling, warp_size())
             straddling -= popped
             found, uncertain = test_straddling(
@@ -272,7 +297,7 @@ def traverse_items(
         if for_any:
             if warp_any(found or hits.any_hit[pair] != 0):
                 end = head
-                small = 0
+                slab_pairs = 0
                 waiting = 0
                 straddling = 0
     return node_tests, wp.vec3i(hit_count, wp.where(warp_lane() == 0, tested, 0), uncertain_count)
@@ -326,9 +351,7 @@ def warp_traversal(mode: int, for_any: bool):
             else:
                 head, ends, started = start_items(own.items, unit % parts, parts, states, pose)
             own.head = head
-            own.end = ends[0]
-            own.small = ends[1]
-            own.waiting = ends[2]
+            own.ends = ends
             asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
             node_tests, tests = traverse_items(
                 asked, wp.static(mode), pace, p, models, states, pair_poses, own, hits_inout, work_inout

@@ -15,6 +15,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 WARP_SIZE = native.constant("WARP_SIZE")
 STACK_LENGTH = native.constant("STACK_LENGTH")  # node pairs
 STRADDLING_START = native.constant("STRADDLING_START")
+SLAB_PAIR_START, SLAB_PAIR_LENGTH = native.constant("SLAB_PAIR_START"), native.constant("SLAB_PAIR_LENGTH")
 
 six_numbers = wp.types.vector(length=6, dtype=wp.float64)
 
@@ -38,8 +39,8 @@ def warp_sync(): ...
 def warp_stack() -> wp.uint64:
     """Return where this warp's items lie, an address in shared memory on CUDA.
 
-    Its stack, its leaf pairs and small pairs, those that straddle each other's planes, and the signs of these, half an
-    item each.
+    Its stack, its leaf pairs, those that straddle each other's planes, the signs of these, half an item each, and its
+    slab pairs.
     """
 
 
@@ -52,18 +53,11 @@ def write_item(items: wp.uint64, i: wp.int32, item: wp.int64): ...
 
 
 @wp.func_native(stack_code("push_children"))
-def push_children(
-    items: wp.uint64, ends: wp.vec3i, emitted: wp.vec4i, small: bool, children: four_items
-) -> wp.vec3i:
-    """Append the children that emit a leaf pair to the leaf pairs, those that emit an item to the stack or, if small,
-    to the small pairs.
+def push_children(items: wp.uint64, ends: wp.vec3i, lists: wp.vec4i, children: four_items) -> wp.vec3i:
+    """Append children to the lists that they are for, if any, see `node_pair`.
 
-    Returns the new ends of the stack, the small pairs and the leaf pairs.
+    Returns the new ends of the stack, the slab pairs and the leaf pairs.
     """
-
-
-@wp.func_native(stack_code("read_small_pair"))
-def read_small_pair(items: wp.uint64, i: wp.int32) -> wp.int64: ...
 
 
 @wp.func_native(stack_code("push_items"))

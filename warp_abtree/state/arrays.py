@@ -7,9 +7,9 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.poses import SMALL_DEPTH
+from warp_abtree.kernels.poses import SLAB_DEPTH
+from warp_abtree.kernels.slabs.make_slabs import make_slab_kernel
 from warp_abtree.kernels.traversal.nodes import clear_node_kernel
-from warp_abtree.kernels.traversal.small_slabs import make_small_slab_kernel
 from warp_abtree.state.generation import Generation
 
 # Columns of `StatePool` that mirror the host's slots.
@@ -82,14 +82,14 @@ class ModelArrays:
         self.pool, self.device = pool, device
 
     def make_slabs(self):
-        """Make slabs of all small nodes, for warps, unless there are any. Launches only."""
+        """Make slabs of nodes of few faces, for warps, unless there are any. Launches only."""
         if len(self.pool.node_slab):
             return
         slabs = wp.empty(int(self.node_start[-1]), dtype=wp.vec4, device=self.device)
         for model, depth in enumerate(self.depth):
-            first = 1 << max(0, int(depth) - int(SMALL_DEPTH))
+            first = 1 << max(0, int(depth) - int(SLAB_DEPTH))
             inputs = [model, first, self.pool, slabs]
-            wp.launch(make_small_slab_kernel, int(self.node_count[model]) - first, inputs, device=self.device)
+            wp.launch(make_slab_kernel, int(self.node_count[model]) - first, inputs, device=self.device)
         self.pool.node_slab = slabs
 
 
