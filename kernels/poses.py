@@ -116,13 +116,20 @@ def has_slabs(models: ModelPool, states: StatePool, state: wp.int32):
 
 
 @wp.func
-def slab_floors(models: ModelPool, states: StatePool, a: wp.int32, b: wp.int32):
-    """Return the first node of each of two states that has a slab."""
+def locate_trees(models: ModelPool, states: StatePool, a: wp.int32, b: wp.int32):
+    """Return a `PairPose` that says where two states lie."""
+    pose = PairPose()
+    pose.node_a = states.node_start[a]
+    pose.node_b = states.node_start[b]
+    pose.corner_a = states.face_start[a]
+    pose.corner_b = states.face_start[b]
+    model_a, model_b = states.model[a], states.model[b]
+    pose.slab = wp.vec2i(models.node_start[model_a], models.node_start[model_b])
+    pose.floor = wp.vec2i(NO_NODE, NO_NODE)
     if has_slabs(models, states, a) and has_slabs(models, states, b):
-        depth_a = models.depth[states.model[a]]
-        depth_b = models.depth[states.model[b]]
-        return wp.vec2i(1 << wp.max(depth_a - SLAB_DEPTH, 0), 1 << wp.max(depth_b - SLAB_DEPTH, 0))
-    return wp.vec2i(NO_NODE, NO_NODE)
+        pose.floor[0] = 1 << wp.max(models.depth[model_a] - SLAB_DEPTH, 0)
+        pose.floor[1] = 1 << wp.max(models.depth[model_b] - SLAB_DEPTH, 0)
+    return pose
 
 
 @wp.func
@@ -157,21 +164,15 @@ def pair_pose(
     # Of a coordinate in `float32_filter_triangles`; docs/exactness.md has the terms, which need `near` below.
     off32 = UNIT_32 * (wp.float64(2.0) * reach_a + wp.float64(13.0) * reach_b + wp.float64(3.0) * far)
 
-    pose = PairPose()
+    pose = locate_trees(models, states, state_a, state_b)
     pose.rotation = r
     pose.translation = t
     pose.within = within
-    pose.node_a = states.node_start[state_a]
-    pose.node_b = states.node_start[state_b]
-    pose.corner_a = states.face_start[state_a]
-    pose.corner_b = states.face_start[state_b]
     pose.rotation32 = wp.mat33(r)
     pose.scale = unit_scale(wp.max(reach_a, reach_b))
     pose.error = wp.float32(pose.scale * wp.float64(2.02) * (off32 + margin64))
     if wp.max(reach_a, reach_b) < REACH_MIN or wp.max(reach_a, reach_b) > REACH_MAX:
         pose.error = wp.inf
-    pose.slab = wp.vec2i(models.node_start[states.model[state_a]], models.node_start[states.model[state_b]])
-    pose.floor = slab_floors(models, states, state_a, state_b)
     same = states.model[state_a] == states.model[state_b] and states.lod[state_a] == states.lod[state_b]
     if whole and same and far + wp.float64(3.0) * rotation_size * reach_b <= off32:
         # Coincident meshes: no vertex is farther from its twin than float32 can tell.

@@ -66,7 +66,7 @@ def measure_faces(models: ModelPool, model: wp.int32, node: wp.int32, level: wp.
 
 
 @wp.func
-def pack_slab(extent: Extent):
+def record_of(extent: Extent):
     n = wp.vec3i(
         wp.int32(extent.direction[0]) + DIRECTION_LENGTH,
         wp.int32(extent.direction[1]) + DIRECTION_LENGTH,
@@ -111,4 +111,4 @@ def make_slab_kernel(model: wp.int32, first: wp.int32, models: ModelPool, slab_o
             extent = measure_faces(models, model, node, level, whole_direction(normal))
             if extent.high - extent.low < best.high - best.low:
                 best = extent
-    slab_out[start + node] = pack_slab(best)
+    slab_out[start + node] = record_of(best)

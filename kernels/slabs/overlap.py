@@ -95,7 +95,7 @@ def overlaps_along(
 
 
 @wp.func
-def slabs_overlap(models: ModelPool, states: StatePool, pose: PairPose, slab: wp.vec2i, item: wp.int64):
+def slabs_overlap(models: ModelPool, states: StatePool, pose: PairPose, item: wp.int64):
     """Return False only where the slabs of the two nodes that an item goes down from separate them."""
     x = item_first(item)
     y = item_second(item)
@@ -104,8 +104,8 @@ def slabs_overlap(models: ModelPool, states: StatePool, pose: PairPose, slab: wp
     y = wp.where(y < 0, (y & INDEX_MASK) >> 1, y)
     node_a = load_constant_node(states, pose.node_a + x)
     node_b = load_constant_node(states, pose.node_b + y)
-    a = load_slab(models, slab[0] + x)
-    b = load_slab(models, slab[1] + y)
+    a = load_slab(models, pose.slab[0] + x)
+    b = load_slab(models, pose.slab[1] + y)
     zero = wp.vec3()
     a_there = map_point(wp.transpose(pose.rotation32), zero, a.direction)
     b_there = map_point(pose.rotation32, zero, b.direction)

@@ -116,12 +116,11 @@ def separate_slab_pairs(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    slab: wp.vec2i,
 ):
     """Put the slab pairs on the stack that slabs do not separate, one a lane; return its new end."""
     lane = warp_lane()
     item = read_item(items, SLAB_PAIR_START + first + wp.min(lane, popped - 1))
-    overlap = slabs_overlap(models, states, pose, slab, item)
+    overlap = slabs_overlap(models, states, pose, item)
     end = push_items(items, end, overlap and lane < popped, item)
     warp_sync()
     return end
@@ -207,12 +206,13 @@ def descend(
     ready: wp.int32,
     head: wp.int32,
     ends: wp.vec3i,
+    models: ModelPool,
     states: StatePool,
     pose: PairPose,
 ):
-    """Test node pairs for a turn, or until enough slab pairs or leaf pairs wait.
+    """Test node pairs for a turn, or until enough slab pairs or leaf pairs wait, and then a warp of slab pairs.
 
-    Returns the new ends, how many slab pairs are enough, and the pairs of boxes compared.
+    Returns the new ends and the pairs of nodes compared.
     """
     end, slab_pairs, waiting = wp.int32(ends[0]), wp.int32(ends[1]), wp.int32(ends[2])
     ready_slab = wp.int32(ready)
@@ -229,7 +229,12 @@ def descend(
         waiting = found[2]
         node_tests += compared
         visits += 1
-    return wp.vec3i(end, slab_pairs, waiting), ready_slab, node_tests
+    if slab_pairs >= ready_slab or (end == head and slab_pairs > 0):
+        popped = wp.min(slab_pairs, warp_size())
+        slab_pairs -= popped
+        end = separate_slab_pairs(items, slab_pairs, popped, end, models, states, pose)
+        node_tests += wp.where(warp_lane() < popped, 1, 0)
+    return wp.vec3i(end, slab_pairs, waiting), node_tests
 
 
 @wp.func
@@ -241,7 +246,7 @@ def traverse_items(
     pair: wp.int32,
     models: ModelPool,
     states: StatePool,
-    pair_poses: wp.array(dtype=PairPose),
+    pose: PairPose,
     # state
     own: WarpItems,
     # out
@@ -250,40 +255,29 @@ def traverse_items(
 ):
     """Traverse what is on the stack and is not given away; return pairs of boxes compared, and face pair tests."""
     items, for_any = own.items, pace.for_any
-    pose = pair_poses[pair]
-    head, end, slab_pairs, waiting = (
-        wp.int32(own.head),
-        wp.int32(own.ends[0]),
-        wp.int32(own.ends[1]),
-        wp.int32(own.ends[2]),
-    )
+    head, ends = wp.int32(own.head), own.ends + wp.vec3i()
     node_tests, turn = wp.int32(0), wp.int32(0)
     tested, hit_count, uncertain_count = wp.int32(0), wp.int32(0), wp.int32(0)
     straddling = wp.int32(0)
     ready = wp.where(for_any, wp.min(LEAF_PAIRS_FOR_ANY, warp_size()), warp_size())
     ready_straddling = wp.where(for_any, 1, warp_size())
-    while end > head or slab_pairs > 0 or waiting > 0 or straddling > 0:
+    while ends[0] > head or ends[1] > 0 or ends[2] > 0 or straddling > 0:
         found = False
         tickets = wp.int64(0)
         turn += 1
         if (turn & pace.balance_mask) == 0:
             tickets = load_tickets(work.counter)
-        ends, ready_slab, compared = descend(items, pace, ready, head, wp.vec3i(end, slab_pairs, waiting), states, pose)
-        end = ends[0]
-        slab_pairs = ends[1]
-        waiting = ends[2]
+        ends, compared = descend(items, pace, ready, head, ends, models, states, pose)
         node_tests += compared
-        if slab_pairs >= ready_slab or (end == head and slab_pairs > 0):
-            popped = wp.min(slab_pairs, warp_size())
-            slab_pairs -= popped
-            end = separate_slab_pairs(items, slab_pairs, popped, end, models, states, pose, pair_poses[pair].slab)
-            node_tests += wp.where(warp_lane() < popped, 1, 0)
-        if waiting >= ready or (end == head and slab_pairs == 0 and waiting > 0):
+        waiting = ends[2]
+        empty = ends[0] == head and ends[1] == 0
+        if waiting >= ready or (empty and waiting > 0):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
+            ends[2] = waiting
             straddling = separate_leaf_pairs(mode, items, waiting, popped, straddling, models, states, pose)
             tested += popped
-        if straddling >= ready_straddling or (end == head and slab_pairs == 0 and waiting == 0 and straddling > 0):
+        if straddling >= ready_straddling or (empty and waiting == 0 and straddling > 0):
             popped = wp.min(straddling, warp_size())
             straddling -= popped
             found, uncertain = test_straddling(
@@ -292,13 +286,11 @@ def traverse_items(
             hit_count += wp.where(found, 1, 0)
             uncertain_count += wp.where(uncertain, 1, 0)
         idle = count_idle(tickets)
-        if idle > 0 and end - head >= 2 * DONATION_LEAST:
-            head = donate_items(items, pair, head, end, idle, work)
+        if idle > 0 and ends[0] - head >= 2 * DONATION_LEAST:
+            head = donate_items(items, pair, head, ends[0], idle, work)
         if for_any:
             if warp_any(found or hits.any_hit[pair] != 0):
-                end = head
-                slab_pairs = 0
-                waiting = 0
+                ends = wp.vec3i(head, 0, 0)
                 straddling = 0
     return node_tests, wp.vec3i(hit_count, wp.where(warp_lane() == 0, tested, 0), uncertain_count)
 
@@ -354,7 +346,7 @@ def warp_traversal(mode: int, for_any: bool):
             own.ends = ends
             asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
             node_tests, tests = traverse_items(
-                asked, wp.static(mode), pace, p, models, states, pair_poses, own, hits_inout, work_inout
+                asked, wp.static(mode), pace, p, models, states, pose, own, hits_inout, work_inout
             )
             add_warp_sum(hits_inout.node_tests, p, node_tests + started)
             add_warp_sum(hits_inout.count, p, tests[0])

@@ -52,7 +52,7 @@ def read_item(items: wp.uint64, i: wp.int32) -> wp.int64: ...
 def write_item(items: wp.uint64, i: wp.int32, item: wp.int64): ...
 
 
-@wp.func_native(stack_code("push_children"))
+@wp.func_native(native.body("push_children.cuh", "push_children"))
 def push_children(items: wp.uint64, ends: wp.vec3i, lists: wp.vec4i, children: four_items) -> wp.vec3i:
     """Append children to the lists that they are for, if any, see `node_pair`.
 
