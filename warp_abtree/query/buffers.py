@@ -12,7 +12,7 @@ from warp_abtree.checks.regime import Regime, current_regime
 from warp_abtree.kernels import poses
 from warp_abtree.kernels.traversal import descent, face_pairs
 from warp_abtree.query.broad_phase import BroadPhase
-from warp_abtree.query.request import check_pair_room, check_within
+from warp_abtree.query.request import check_gap, check_pair_room, check_within
 from warp_abtree.query.result import COUNTERS
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
@@ -47,6 +47,7 @@ class QueryBuffers:
     counts: wp.array  # rows: hits.count, then COUNTERS
     within: wp.array  # where asked
     _within: np.ndarray
+    _gap: np.ndarray | None = None  # beside given pairs; of the broad phase's pairs that of each object
     _given: np.ndarray  # pairs on the host
     slab_memory: wp.array
     _regime: Regime
@@ -58,14 +59,14 @@ class QueryBuffers:
         warps = self._regime.warps
         return self.device.is_cuda if warps is None else warps
 
-    def _make_hits(self):
+    def _make_hits(self, with_gap=False):
         hits = face_pairs.Hits()
-        for name in ("total", "uncertain_total", "inexact_total"):
+        for name in ("total", "uncertain_total", "inexact_total", *(["apart_total"] if with_gap else [])):
             setattr(hits, name, wp.zeros(1, dtype=wp.int32, device=self.device))
         return hits
 
-    def set_pairs(self, pairs, within=None):
-        """Query other pairs from now on, in the room there is if they fit; within None keeps the distances.
+    def set_pairs(self, pairs, within=None, gap=None):
+        """Query other pairs from now on, in the room there is if they fit; within and gap None keep the distances.
 
         Raises:
             ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
@@ -79,9 +80,13 @@ class QueryBuffers:
             raise ValueError("this query was made without within")
         if self.near is not None:
             within = check_within(self._within if within is None else within, len(pairs))
-        self.replace_pairs(pairs, within)
+        if gap is not None and self._gap is None:
+            raise ValueError("this query was made without gap")
+        if self._gap is not None:
+            gap = check_gap(self._gap if gap is None else gap, len(pairs), 0)
+        self.replace_pairs(pairs, within, gap)
 
-    def replace_pairs(self, pairs: np.ndarray, within):
+    def replace_pairs(self, pairs: np.ndarray, within, gap=None):
         """Do what `set_pairs` does, with pairs and distances that are checked, None without."""
         self._check_whole()
         # What may fail for lack of memory comes before anything that changes the query.
@@ -101,13 +106,15 @@ class QueryBuffers:
                     wp.copy(self.pairs, rows, count=len(pairs))
                 self.pair_count.fill_(len(pairs))
             self._given = pairs
-            self._within = within
+            self._within, self._gap = within, gap
             self._fill_within()
+            self._fill_gap()
 
-    def is_asked(self, pairs: np.ndarray, within) -> bool:
+    def is_asked(self, pairs: np.ndarray, within, gap=None) -> bool:
         """Return whether pairs and distances, checked, None without, are those in place."""
         same = len(pairs) == len(self._given) and pairs.tobytes() == self._given.tobytes()
-        return same and (within is None or np.array_equal(within, self._within))
+        same = same and (within is None or np.array_equal(within, self._within))
+        return same and (gap is None or np.array_equal(gap, self._gap))
 
     @contextmanager
     def _changing(self):
@@ -147,6 +154,8 @@ class QueryBuffers:
                     made.append((self, "counts", counts))
         if self.near is not None:
             made.append((self, "within", wp.empty(room, dtype=wp.float64, device=self.device)))
+        if self._gap is not None:
+            made.append((self.hits, "gap", wp.empty(max(1, room), dtype=wp.float64, device=self.device)))
         return made
 
     def _make_slab_memory(self, room: int):
@@ -173,6 +182,13 @@ class QueryBuffers:
             if self.broad_phase is not None:
                 self._fill_within()
 
+    def _fill_gap(self):
+        """Write the gaps of given pairs to the device."""
+        if self._gap is not None and self._gap.ndim == 0:
+            self.hits.gap.fill_(float(self._gap))
+        elif self._gap is not None and len(self._gap):
+            wp.copy(self.hits.gap, wp.array(self._gap, dtype=wp.float64, device="cpu"), count=len(self._gap))
+
     def _fill_within(self):
         if self.near is None:
             return
@@ -185,6 +201,8 @@ class QueryBuffers:
     def _resize_uncertain(self, capacity: int):
         inexact = capacity if self.precision == "exact" else 0
         made = [("uncertain", capacity), ("inexact", inexact)]
+        if self._gap is not None:
+            made.append(("apart", capacity))
         self._replace([(self.hits, name, wp.empty(room, dtype=wp.vec3i, device=self.device)) for name, room in made])
 
     def resize(self, capacity: int):

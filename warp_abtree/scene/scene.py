@@ -239,13 +239,16 @@ class Scene:
 
         Worlds never mix (-1 is in every one), two static objects never pair, filtered pairs stay out.
         """
+        return self._broad_pairs(0.0)
+
+    def _broad_pairs(self, within: float) -> np.ndarray:
         check_device(self.device, "Scene.broad_phase")
         if self.object_count < 2:
             return np.empty((0, 2), np.int32)
         batch = self.batch()
         if self._broad_phase is None:
             self._broad_phase = BroadPhase(batch)
-        return self._broad_phase.find()
+        return self._broad_phase.find(within)
 
     def intersect(
         self,
@@ -258,6 +261,7 @@ class Scene:
         tolerance=None,
         relative=None,
         beyond=None,
+        gap=None,
     ) -> Result:
         """Test object pairs for intersection, exactly as posed and at their LODs. Waits for the device.
 
@@ -265,7 +269,8 @@ class Scene:
 
         Args:
             pairs: (p, 2) object indices, asked whatever their worlds, also where both are static or filtered out of the
-                broad phase; None asks the broad phase.
+                broad phase; None asks the broad phase for the pairs whose boxes overlap, or are no farther apart than
+                within, gap or beyond if that is one distance.
             output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
                 an object pair's summary of them, stands in `warp_abtree.query.contacts`. Or "distance": how far apart
                 the surfaces are, and where they are nearest, see `warp_abtree.query.distance`.
@@ -273,11 +278,12 @@ class Scene:
                 smaller index. "float32" takes the signs of rounded determinants.
             within: Distance d >= 0 [world units], or (p,) of them: `result.apart` tells the pairs whose posed surfaces,
                 at their LODs, are proved farther apart than d; never true where they are not, whatever the rounding.
-                With d = error_at(A) + error_at(B) it proves that the original meshes do not intersect. The broad phase
-                finds overlapping boxes only, whatever d is.
+                With d = error_at(A) + error_at(B) it proves that the original meshes do not intersect.
             contact_dtype: Type of the real numbers in contacts, float64 or float32.
             device: Whether the result's arrays stay on the scene's device, see `Result`.
             tolerance, relative, beyond: When the search of a distance ends, see `DistanceQuery`; for "distance" alone.
+            gap: Distance [world units], or (p,) of them; for "contacts" alone: faces nearer than that have contacts
+                too, and all have a separation.
 
         Raises:
             ValueError: Bad pairs, a bad distance, an unknown option, or a scene without objects.
@@ -286,26 +292,42 @@ class Scene:
         contact_dtypes(contact_dtype)
         options = {"tolerance": tolerance, "relative": relative, "beyond": beyond}
         options = {name: value for name, value in options.items() if value is not None}
+        if output != "contacts":
+            refuse_options(output, {"gap": gap is not None})
         if output == "distance":
             refuse_options(output, {"precision": precision != "exact", "within": within is not None})
             return self._find_distances(pairs, options, device)
         refuse_options(output, options)
         with_contacts = output == "contacts"
         check_request("faces" if with_contacts else output, precision)
-        pairs = self.broad_phase() if pairs is None else check_pairs(pairs, self.object_count)
+        pairs = self._find_pairs(pairs, check_within, within=within, gap=gap)
         if within is not None:
             within = check_within(within, len(pairs))
-        query = self._queries.pop((output, precision, within is not None), None)
+        if gap is not None:
+            gap = check_within(gap, len(pairs), "gap")
+        key = (output, precision, within is not None, gap is not None)
+        query = self._queries.pop(key, None)
         if query is not None:
-            if not query.is_asked(pairs, within):
-                query.replace_pairs(pairs, within)
+            if not query.is_asked(pairs, within, gap):
+                query.replace_pairs(pairs, within, gap)
         elif with_contacts:
-            query = ContactQuery(self, pairs=pairs, precision=precision, within=within)
+            query = ContactQuery(self, pairs=pairs, precision=precision, within=within, gap=gap)
         else:
             query = Query(self, output, pairs=pairs, precision=precision, within=within)
         if isinstance(query, ContactQuery):
             query.contact_dtype = contact_dtype
-        return self._run((output, precision, within is not None), query, device)
+        return self._run(key, query, device)
+
+    def _find_pairs(self, pairs, check, **distances) -> np.ndarray:
+        """Return given pairs, or those of the broad phase within the largest distance that is one for all pairs.
+
+        Args:
+            check: What checks a distance that is one for all, given it and its name.
+        """
+        if pairs is not None:
+            return check_pairs(pairs, self.object_count)
+        single = [check(d, name=name) for name, d in distances.items() if d is not None and np.ndim(d) == 0]
+        return self._broad_pairs(max((float(d) for d in single if np.isfinite(d)), default=0.0))
 
     def _run(self, key: tuple, query: Query, device: bool) -> Result:
         """Run a query and keep it for the next time; one that fails, for lack of memory, gives its own back."""
@@ -314,8 +336,9 @@ class Scene:
         return result
 
     def _find_distances(self, pairs, options: dict, device: bool) -> Result:
-        pairs = self.broad_phase() if pairs is None else check_pairs(pairs, self.object_count)
-        beyond = check_beyond(options.pop("beyond", None), len(pairs))
+        beyond = options.pop("beyond", None)
+        pairs = self._find_pairs(pairs, lambda d, name: check_beyond(d), beyond=beyond)
+        beyond = check_beyond(beyond, len(pairs))
         query = self._queries.pop(("distance",), None)
         if isinstance(query, DistanceQuery):
             query.set_tolerance(**options)
