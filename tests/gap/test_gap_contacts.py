@@ -234,6 +234,21 @@ def test_known_faces(device, case):
                 np.testing.assert_allclose(row["normal"], turned / np.linalg.norm(turned), atol=1e-6)
 
 
+@pytest.mark.parametrize("turn", [(0, 0, 0, 1), (0.5, 0.5, 0.5, 0.5), (0, 0.6, 0, 0.8)])
+def test_a_gap_reaches_as_far_as_it_says(device, regime, turn):
+    """Sheets over one another at a distance that a little less does not reach, and a little more does."""
+    scene = ab.Scene(device)
+    up = quaternion_matrix(turn) @ [0, 0, 0.3]
+    for place in ((0, 0, 0), up):
+        scene.add(sample("grid"), (*place, *turn))
+    assert len(scene.intersect([(0, 1)], output="contacts", gap=0.3 * (1 - 1e-12)).contacts) == 0
+    found = scene.intersect([(0, 1)], output="contacts", gap=0.3 * (1 + 1e-12)).contacts
+    # Each face and the six around it, and those that share a corner, are 0.3 apart.
+    faces, ids = corners_of(sample("grid"), sample("grid").lod_max)
+    shared = (faces[:, None, :, None] == faces[None, :, None]).all(4).any((2, 3))
+    assert len(found) == shared.sum()
+
+
 def test_nearest_faces_have_the_distance_of_the_surfaces(device):
     cases, _ = cases_of(6, 12, 100)
     for case in cases:
