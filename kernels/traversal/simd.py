@@ -55,9 +55,7 @@ def simd_float32_filter(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    error: wp.float32,
-    unit: wp.float32,
-    gap: wp.float32,
+    bounds: wp.vec3,
     first_ends: bool,
     waiting: wp.int32,
     faces: wp.array(dtype=wp.int64),
@@ -68,6 +66,9 @@ def simd_float32_filter(
 
     The same as `float32_filter_triangles`. With a gap, 0 or more [scaled], also lists those that are apart, but for
     those that `gap_signs` calls separated; below 0 there is no such list.
+
+    Args:
+        bounds: (error, unit, gap), the first two of `float32_bounds`.
 
     Returns how many met, which stand in front of the list then, how many are uncertain, how many were tested, and how
     many are listed as apart.
@@ -189,7 +190,7 @@ def test_leaf_pairs(
         return near, long_counts(wp.int64(0), wp.int64(decided), wp.int64(0), wp.int64(0))
     error, unit = float32_bounds(mode, pose)
     filtered = simd_float32_filter(
-        models, states, pose, error, unit, -1.0, output == OUTPUT_ANY, waiting, faces, uncertain, uncertain
+        models, states, pose, wp.vec3(error, unit, -1.0), output == OUTPUT_ANY, waiting, faces, uncertain, uncertain
     )
     met, count = wp.int32(filtered[0]), wp.int32(filtered[1])
     resolved, inexact = wp.int32(0), wp.int32(0)
@@ -210,8 +211,8 @@ def test_gap_pairs(
 ):
     """Test leaf pairs as `test_leaf_pairs` and list those that are apart; return how many, after how many met."""
     error, unit = float32_bounds(EXACT, pose)
-    gap = scaled_gap(pose)
-    filtered = simd_float32_filter(models, states, pose, error, unit, gap, False, waiting, faces, uncertain, apart)
+    bounds = wp.vec3(error, unit, scaled_gap(pose))
+    filtered = simd_float32_filter(models, states, pose, bounds, False, waiting, faces, uncertain, apart)
     count = wp.int32(filtered[1])
     met, clear = part_uncertain(
         models, states, pose, wp.int32(filtered[0]), count, uncertain, wp.int32(filtered[3]), faces, apart

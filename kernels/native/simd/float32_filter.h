@@ -5,8 +5,8 @@
 #include "simd/float32.h"
 
 template <class ModelPool, class StatePool, class PairPose>
-wp::vec_t<4, wp::int64> simd_float32_filter(ModelPool models, StatePool states, PairPose pose, wp::float32 error,
-                                            wp::float32 unit, wp::float32 gap, bool first_ends, wp::int32 waiting,
+wp::vec_t<4, wp::int64> simd_float32_filter(ModelPool models, StatePool states, PairPose pose,
+                                            wp::vec_t<3, wp::float32> bounds, bool first_ends, wp::int32 waiting,
                                             wp::array_t<wp::int64> faces, wp::array_t<wp::int64> uncertain,
                                             wp::array_t<wp::int64> apart) {
     wp::vec_t<4, wp::int64> result;
@@ -25,7 +25,7 @@ wp::vec_t<4, wp::int64> simd_float32_filter(ModelPool models, StatePool states, 
         typedef wp::int64 longs __attribute__((vector_size(64)));
         const auto& r = pose.rotation32.data;
         const auto& t = pose.translation32;
-        const float scale = (float)pose.scale;
+        const float error = bounds[0], unit = bounds[1], gap = bounds[2], scale = (float)pose.scale;
         const void* near = models.vertex_near.data;
         const void* corners = states.face_corner.data;
         wp::int64* list = faces.data;
