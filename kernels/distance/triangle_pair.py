@@ -30,7 +30,7 @@ longer than 4 L.
 import warp as wp
 
 from warp_abtree.kernels.arithmetic.expansion import fuse_multiply
-from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, clamp_unit, corners_type, divide, largest
+from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, clamp_unit, divide, largest
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -14,7 +14,7 @@ from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.face_pairs import NEAR_BIT, Hits, report_hit, test_faces
 from warp_abtree.kernels.traversal.node_pair import item_first, item_second
-from warp_abtree.kernels.traversal.warp_stack import count_flags, reserve_slot, take_slots, warp_lane, warp_size
+from warp_abtree.kernels.traversal.warp_stack import count_flags, reserve_slot, take_slots, warp_lane
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -8,6 +8,7 @@ import itertools
 import math
 
 import numpy as np
+
 from oracles.triangle import box_pairs, triangles_intersect
 from oracles.triangle_distance import cross, dot, minus, to_integers, triangle_distance
 

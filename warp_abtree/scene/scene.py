@@ -7,13 +7,12 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
 from warp_abtree.model.model import Model
-from warp_abtree.query.broad_phase import EVERY_WORLD, BroadPhase
-from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.distance import DistanceQuery, check_beyond
-from warp_abtree.query.narrow_phase import Query
-from warp_abtree.query.request import check_request, check_within, refuse_options
+from warp_abtree.query.broad_phase import BroadPhase
+from warp_abtree.query.request import refuse_options
 from warp_abtree.query.result import Result, contact_dtypes
-from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, launch_place, place_rows
+from warp_abtree.scene.kept_queries import KeptQueries
+from warp_abtree.scene.objects import ALL_BITS, ObjectList, check_columns, check_lods, check_models
+from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, place_rows
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.batch import Batch, check_pairs, exclusion_keys
 from warp_abtree.state.lod_update import LodUpdate
@@ -59,30 +58,54 @@ class Scene:
             present = ", ".join(d.alias for d in wp.get_devices())
             raise ValueError(f"no device {device!r} on this machine; there is {present} ({error})") from None
         check_device(self.device)
-        self.models: list[Model] = []
-        self.object_model: list[int] = []
-        self.object_importance: list[int] = []
-        self._world: list[int] = []
-        self.object_static: list[bool] = []
-        self._added_pose: list[np.ndarray] = []
-        self._lod: list[int] = []
+        self._objects = ObjectList()
         self._excluded = np.empty(0, np.int64)
         self._batch: Batch | None = None
         self._broad_phase: BroadPhase | None = None
         self._host_poses: HostPoses | None = None
-        self._queries: dict[tuple, Query] = {}
+        self._queries = KeptQueries(self, self._find_pairs)
 
     @property
     def object_count(self) -> int:
         """Objects added so far."""
-        return len(self.object_model)
+        return len(self._objects)
+
+    @property
+    def models(self) -> list[Model]:
+        """Models of the objects, each once."""
+        return self._objects.models
+
+    @property
+    def object_model(self) -> list[int]:
+        """Index into `models` of each object."""
+        return self._objects.model
+
+    @property
+    def object_importance(self) -> list[int]:
+        """Importance of each object."""
+        return self._objects.importance
+
+    @property
+    def worlds(self) -> np.ndarray:
+        """World of each object, int32 (n,)."""
+        return np.array(self._objects.world, np.int32)
 
     @property
     def lods(self) -> np.ndarray:
         """LOD of each object, int32 (n,)."""
-        return np.array(self._lod if self._batch is None else self._batch.lods, np.int32)
+        return np.array(self._objects.lod if self._batch is None else self._batch.lods, np.int32)
 
-    def add(self, model, pose=(0, 0, 0, 0, 0, 0, 1), world=0, lod=None, importance=1, static=False) -> int:
+    def add(
+        self,
+        model,
+        pose=(0, 0, 0, 0, 0, 0, 1),
+        world=0,
+        lod=None,
+        importance=1,
+        static=False,
+        collision_group=1,
+        collision_mask=ALL_BITS,
+    ) -> int:
         """Add an object and return its index.
 
         Args:
@@ -92,35 +115,50 @@ class Scene:
             lod: LOD to stand at; None is the finest.
             importance: Application context beta of the LOD selection, 1, 2 or 3 (paper, section 4.2).
             static: Whether the broad phase never pairs it with another static object, a bool.
+            collision_group, collision_mask: Bits, from 0 to 2^32 - 1. The broad phase pairs objects a and b only where
+                group_a & mask_b and group_b & mask_a both hold a bit.
 
         Raises:
             TypeError: model is no Model.
             ValueError: Anything else is out of range; nothing is added.
             RuntimeError: A graph is being captured.
         """
-        if not isinstance(model, Model):
-            raise TypeError(f"model is a {type(model).__name__}, not a Model")
-        checked = check_poses(to_numpy(pose, "pose")[None], "pose")[0]
-        world = whole_number(world, "world", EVERY_WORLD, 2**31 - 1)
-        importance = whole_number(importance, "importance", 1, 3)
-        if not isinstance(static, bool | np.bool_):
-            raise ValueError(f"static {static!r} is neither True nor False")
-        lod = model.lod_max if lod is None else model.check_lod(lod)
-        known = next((i for i, other in enumerate(self.models) if other is model), len(self.models))
+        models = check_models(model, 1)
+        poses = check_poses(to_numpy(pose, "pose")[None], "pose")
+        columns = check_columns(models, world, importance, static, collision_group, collision_mask)
+        return int(self._extend(models, poses, lod, columns)[0])
+
+    def add_many(
+        self,
+        models,
+        poses,
+        worlds=0,
+        lods=None,
+        importances=1,
+        statics=False,
+        collision_groups=1,
+        collision_masks=ALL_BITS,
+    ) -> np.ndarray:
+        """Add an object for each pose and return their indices, int (n,): all of them, or none.
+
+        Args:
+            models: `Model` of all, or a list of n.
+            poses: (n, 7) or (n, 4, 4), of any framework, see `add`.
+            worlds, lods, importances, statics, collision_groups, collision_masks: As for `add`, one for all or (n,).
+
+        Raises:
+            TypeError, ValueError, RuntimeError: As `add`; or not n were given.
+        """
+        poses = check_poses(poses)
+        models = check_models(models, len(poses))
+        columns = check_columns(models, worlds, importances, statics, collision_groups, collision_masks)
+        return self._extend(models, poses, lods, columns)
+
+    def _extend(self, models, poses, lods, columns) -> np.ndarray:
+        lods = check_lods(lods, models)
         self._retire()
-        count = self.object_count
-        columns: list[list] = [self._world, self.object_static, self._added_pose, self._lod]
-        columns += [self.object_importance, self.object_model]
-        try:
-            if known == len(self.models):
-                self.models.append(model)
-            for column, value in zip(columns, (world, bool(static), checked, lod, importance, known)):
-                column.append(value)
-        except BaseException:
-            for column in columns:
-                del column[count:]
-            raise
-        return count
+        self._objects.extend(models, {"lod": lods, "pose": list(poses), **columns})
+        return np.arange(self.object_count - len(models), self.object_count)
 
     def _retire(self):
         """Take the device's poses back before the arrays are made anew. Waits for the device."""
@@ -132,7 +170,7 @@ class Scene:
         matrices[:, :3, :3] = objects.pool.rotation.numpy()
         matrices[:, :3, 3] = objects.pool.position.numpy()
         self._batch.retire()
-        self._added_pose, self._lod = list(matrices), self._batch.lods.tolist()
+        self._objects.pose, self._objects.lod = list(matrices), self._batch.lods.tolist()
         self._queries.clear()
         self._broad_phase = self._host_poses = None
         self._batch = None
@@ -143,34 +181,19 @@ class Scene:
         Tree states that an interrupted change of LODs has left torn are made anew.
         """
         if self._batch is None:
-            if not self.object_model:
+            if not self.object_count:
                 raise ValueError("the scene has no object")
             check_device(self.device, "making a scene's arrays")
             models = ModelArrays(self.models, self.device)
             states = StateArrays(models, self.device)
-            objects = ObjectArrays(self._world, self.object_static, self.device)
-            batch = Batch(models, states, objects, self.object_model, self._excluded)
-            batch.set_lods(np.array(self._lod))
-            self._place_added(objects.pool)
+            told = self._objects
+            objects = ObjectArrays(told.world, told.static, self.device, told.collision_bits())
+            batch = Batch(models, states, objects, told.model, self._excluded)
+            batch.set_lods(np.array(told.lod))
+            told.set_poses(objects.pool, self.device)
             self._batch = batch
         self._batch.mend()
         return self._batch
-
-    def _place_added(self, pool):
-        """Set poses of both kinds: the device turns quaternions into matrices, matrices are taken as they are."""
-        poses = self._added_pose
-        matrix = np.array([pose.ndim == 2 for pose in poses])
-        rows = np.zeros((len(poses), 7))
-        rows[:, 6] = 1.0
-        for i in np.flatnonzero(~matrix):
-            rows[i] = poses[i]
-        launch_place(wp.array(rows, dtype=wp.float64, device=self.device), pool)
-        if matrix.any():
-            rotation, position = pool.rotation.numpy(), pool.position.numpy()
-            stacked = np.array([poses[i] for i in np.flatnonzero(matrix)])
-            rotation[matrix], position[matrix] = stacked[:, :3, :3], stacked[:, :3, 3]
-            pool.rotation.assign(rotation)
-            pool.position.assign(position)
 
     def set_poses(self, poses):
         """Set the pose of every object.
@@ -225,9 +248,16 @@ class Scene:
     def filter(self, pairs):
         """Exclude object pairs from every later broad phase.
 
+        Args:
+            pairs: (..., 2) object indices. A filter that repeats, as of neighbouring links of many arms, is one call:
+                `links = scene.add_many(...).reshape(arms, -1)`, then `scene.filter(links[:, [(0, 1), (1, 2)]])`.
+
         Raises:
             ValueError: Wrong shape, an index that is no object, an object paired with itself.
         """
+        pairs = to_numpy(pairs, "pairs")
+        if pairs.ndim > 2 and pairs.shape[-1] == 2:
+            pairs = pairs.reshape(-1, 2)
         excluded = np.union1d(self._excluded, exclusion_keys(check_pairs(pairs, self.object_count)))
         if self._batch is not None:
             self._batch.exclude(excluded)
@@ -237,9 +267,14 @@ class Scene:
     def broad_phase(self) -> np.ndarray:
         """Return the object pairs whose posed root boxes overlap, int32 (p, 2), sorted, i < j. Waits for the device.
 
-        Worlds never mix (-1 is in every one), two static objects never pair, filtered pairs stay out.
+        Worlds never mix (-1 is in every one), two static objects never pair, nor do objects whose collision groups and
+        masks forbid it; filtered pairs stay out.
         """
         return self._broad_pairs(0.0)
+
+    def _find_pairs(self, pairs, within: float) -> np.ndarray:
+        """Return given pairs, checked, or those of the broad phase up to a distance."""
+        return self._broad_pairs(within) if pairs is None else check_pairs(pairs, self.object_count)
 
     def _broad_pairs(self, within: float) -> np.ndarray:
         check_device(self.device, "Scene.broad_phase")
@@ -268,9 +303,9 @@ class Scene:
         Touching counts. Columns of the result follow the order in which a pair names its objects.
 
         Args:
-            pairs: (p, 2) object indices, asked whatever their worlds, also where both are static or filtered out of the
-                broad phase; None asks the broad phase for the pairs whose boxes overlap, or are no farther apart than
-                within, gap or beyond if that is one distance.
+            pairs: (p, 2) object indices, asked whatever their worlds, groups and masks, also where both are static or
+                filtered out of the broad phase; None asks the broad phase for the pairs whose boxes overlap, or are no
+                farther apart than within, gap or beyond if that is one distance.
             output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
                 an object pair's summary of them, stands in `warp_abtree.query.contacts`. Or "distance": how far apart
                 the surfaces are, and where they are nearest, see `warp_abtree.query.distance`.
@@ -290,63 +325,12 @@ class Scene:
         """
         check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)
-        options = {"tolerance": tolerance, "relative": relative, "beyond": beyond}
+        options = {"within": within, "tolerance": tolerance, "relative": relative, "beyond": beyond, "gap": gap}
         options = {name: value for name, value in options.items() if value is not None}
-        if output != "contacts":
-            refuse_options(output, {"gap": gap is not None})
         if output == "distance":
-            refuse_options(output, {"precision": precision != "exact", "within": within is not None})
-            return self._find_distances(pairs, options, device)
-        refuse_options(output, options)
-        with_contacts = output == "contacts"
-        check_request("faces" if with_contacts else output, precision)
-        pairs = self._find_pairs(pairs, check_within, within=within, gap=gap)
-        if within is not None:
-            within = check_within(within, len(pairs))
-        if gap is not None:
-            gap = check_within(gap, len(pairs), "gap")
-        key = (output, precision, within is not None, gap is not None)
-        query = self._queries.pop(key, None)
-        if query is not None:
-            if not query.is_asked(pairs, within, gap):
-                query.replace_pairs(pairs, within, gap)
-        elif with_contacts:
-            query = ContactQuery(self, pairs=pairs, precision=precision, within=within, gap=gap)
-        else:
-            query = Query(self, output, pairs=pairs, precision=precision, within=within)
-        if isinstance(query, ContactQuery):
-            query.contact_dtype = contact_dtype
-        return self._run(key, query, device)
-
-    def _find_pairs(self, pairs, check, **distances) -> np.ndarray:
-        """Return given pairs, or those of the broad phase within the largest distance that is one for all pairs.
-
-        Args:
-            check: What checks a distance that is one for all, given it and its name.
-        """
-        if pairs is not None:
-            return check_pairs(pairs, self.object_count)
-        single = [check(d, name=name) for name, d in distances.items() if d is not None and np.ndim(d) == 0]
-        return self._broad_pairs(max((float(d) for d in single if np.isfinite(d)), default=0.0))
-
-    def _run(self, key: tuple, query: Query, device: bool) -> Result:
-        """Run a query and keep it for the next time; one that fails, for lack of memory, gives its own back."""
-        result = query.run(device)
-        self._queries[key] = query
-        return result
-
-    def _find_distances(self, pairs, options: dict, device: bool) -> Result:
-        beyond = options.pop("beyond", None)
-        pairs = self._find_pairs(pairs, lambda d, name: check_beyond(d), beyond=beyond)
-        beyond = check_beyond(beyond, len(pairs))
-        query = self._queries.pop(("distance",), None)
-        if isinstance(query, DistanceQuery):
-            query.set_tolerance(**options)
-            if not query.is_asked(pairs, beyond):
-                query.replace_pairs(pairs, beyond)
-        else:
-            query = DistanceQuery(self, pairs=pairs, beyond=beyond, **options)
-        return self._run(("distance",), query, device)
+            refuse_options(output, {"precision": precision != "exact"})
+            return self._queries.find_distances(pairs, options, device)
+        return self._queries.find_hits(pairs, output, precision, contact_dtype, options, device)
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.
