@@ -5,7 +5,8 @@ The block of n pairs, in words of 8 bytes:
     [ header 5 | count n | node tests n | triangle tests n | float64 tests n | exact tests n | pairs n | flags ]
 
 The header holds what became of the launch, object pairs found, face pairs found, uncertain face pairs, and those that
-are listed as apart for a gap. Pairs stand there only where they are asked. The flags are bytes: n whether a pair intersects, n whether it is apart.
+are listed as apart for a gap. Pairs stand there only where they are asked. The flags are bytes: n whether a pair
+intersects, n whether it is apart.
 """
 
 import warp as wp

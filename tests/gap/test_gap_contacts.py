@@ -1,4 +1,4 @@
-"""Contacts with a gap: the face pairs, separations, points and normals against integers, and what a gap leaves alone."""
+"""Contacts with a gap: face pairs, separations, points and normals against integers, and what a gap leaves alone."""
 
 import itertools
 
@@ -246,7 +246,7 @@ def test_a_gap_reaches_as_far_as_it_says(device, regime, turn):
     assert len(scene.intersect([(0, 1)], output="contacts", gap=0.3 * (1 - 1e-12)).contacts) == 0
     found = scene.intersect([(0, 1)], output="contacts", gap=0.3 * (1 + 1e-12)).contacts
     # Each face and the six around it, and those that share a corner, are 0.3 apart.
-    faces, ids = corners_of(sample("grid"), sample("grid").lod_max)
+    faces, _ = corners_of(sample("grid"), sample("grid").lod_max)
     shared = (faces[:, None, :, None] == faces[None, :, None]).all(4).any((2, 3))
     assert len(found) == shared.sum()
 
@@ -325,7 +325,7 @@ def test_capture_and_room(device, regime):
     assert describe(query.result()) == expected
     tight = ab.ContactQuery(scene, pairs, capacity=ab.Buffers(hits=3, uncertain=5), gap=gaps)
     tight.launch()
-    with pytest.raises(ab.CapacityError, match="room for [35]"):
+    with pytest.raises(ab.CapacityError, match=r"room for [35]"):
         tight.result().check()
     assert describe(tight.run()) == expected
     if query.uses_warps():

@@ -47,7 +47,7 @@ class QueryBuffers:
     counts: wp.array  # rows: hits.count, then COUNTERS
     within: wp.array  # where asked
     _within: np.ndarray
-    _gap: np.ndarray | None = None  # beside given pairs; of the broad phase's pairs that of each object
+    _gap: Any = None  # beside given pairs; of the broad phase's pairs that of each object
     _given: np.ndarray  # pairs on the host
     slab_memory: wp.array
     _regime: Regime
@@ -65,12 +65,15 @@ class QueryBuffers:
             setattr(hits, name, wp.zeros(1, dtype=wp.int32, device=self.device))
         return hits
 
-    def set_pairs(self, pairs, within=None, gap=None):
-        """Query other pairs from now on, in the room there is if they fit; within and gap None keep the distances.
+    def set_pairs(self, pairs, within=None):
+        """Query other pairs from now on, in the room there is if they fit; within None keeps the distances.
 
         Raises:
             ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
         """
+        self._set_pairs(pairs, within, None)
+
+    def _set_pairs(self, pairs, within, gap):
         if self.broad_phase is not None:
             raise ValueError("this query takes its pairs from the broad phase")
         check_device(self.device, "giving a query other pairs")

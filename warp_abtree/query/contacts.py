@@ -13,6 +13,25 @@ posed to the world by that object's pose. A face pair's contact, in the order in
   neither face has an area, the direction from one model's centre to the other's, or the x axis.
 * coplanar: whether the faces have area and lie in one plane, exactly.
 
+With `gap=d` face pairs that do not intersect, but are nearer than d, have contacts too, in the same order as the rest,
+and every contact has a separation: the widest gap that any direction leaves between the two closed triangles, the
+greatest of min n.b - max n.a over unit vectors n, a of the one and b of the other [world units].
+
+* Faces that do not intersect: their distance, above 0, computed as `warp_abtree.query.distance` does. p0 and p1 are the
+  nearest points, p0 on the first object's face: of a corner over a face the corner and its foot, of two edges where
+  their common normal meets them, of parallel faces, edges or a shared plane one pair of equally near points. normal is
+  the direction from p0 to p1: the face's normal under a corner, across both edges, else along neither. Where they are
+  nearer than 2^-30 of the faces' size it is told by normal_a and normal_b, as for faces that cross. coplanar is False.
+* Faces that cross: minus the length of the shortest motion of one of them after which they only touch, along a normal
+  of either face or across an edge of each; all else is as without a gap, to the bit. It is off by 2^-26 of the faces'
+  size at most, and by rounding alone unless edges are nearly parallel.
+* Faces that touch, or overlap in one plane: nothing parts them, and nothing has to. They intersect: their separation is
+  -2^-126, the least in magnitude, which stands for 0, so that the sign says whether two faces intersect, exactly.
+
+Which faces are nearer than d is decided by the computed distance, in the frame of the lower object, alone: the proofs
+by which boxes and planes are passed over have room for its error. Summaries are those of the faces that intersect,
+wherever sums below say contacts; `Result.count` counts all contacts, `Result.any` says whether a pair intersects.
+
 An end is a corner, or lies on an edge, off its exact place by at most 2^-40 of the edge's length and the rounding of
 coordinates in both frames. Where the lower object's rotation is a matrix R that is off orthonormal by s, the largest
 entry of |R^T R - I|, ends lie on the higher object's posed mesh only to within 3 s of their distance from the lower
@@ -21,7 +40,7 @@ object's position. Pairs that a coarser precision reports although they are apar
 An object pair's summary is made of sums over its contacts in the order of `Result.faces`, in float64. Each sum adds the
 contacts of each chunk of 32, the last chunk perhaps shorter, from left to right, then the chunks from left to right:
 
-* count: contacts, as `Result.count`.
+* count: contacts, as `Result.count`, with a gap those of faces that are apart too.
 * point: mean of the segments' midpoints, weighted by length; unweighted where all lengths vanish. It need not lie on
   either surface.
 * normal: mean of the normals, weighted as the points, at unit length. A mean shorter than 2^-20, as of curves that run
@@ -106,6 +125,14 @@ class ContactQuery(Query):
         self._sums, self._deferred = summary.ChunkSums(), contact.Deferred()
         self._deferred.total = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "faces", pairs, capacity, precision, within, sort_pairs)
+
+    def set_pairs(self, pairs, within=None, gap=None):
+        """Query other pairs from now on, in the room there is if they fit; within and gap None keep the distances.
+
+        Raises:
+            ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
+        """
+        self._set_pairs(pairs, within, gap)
 
     def _slow_kernels(self, with_distances: bool) -> list:
         kernels = [contact.find_contact_kernel, summary.sum_loop_kernel]

@@ -33,7 +33,7 @@ def contact_dtypes(dtype=np.float64, with_gap=False):
 @cache
 def _record_types(real, with_gap):
     indices = [("pair", np.int32), ("faces", np.int32, (2,))]
-    vectors = [(name, real, (3,)) for name in VECTORS]
+    vectors: list = [(name, real, (3,)) for name in VECTORS]
     if with_gap:
         vectors.append(("separation", real))
     means = [("point", real, (3,)), ("normal", real, (3,)), ("depth", real)]
