@@ -46,6 +46,7 @@ class QueryBuffers:
     pair_poses: wp.array
     counts: wp.array  # rows: hits.count, then COUNTERS
     within: wp.array  # where asked
+    contained: wp.array  # face of what is inside, where there are solids
     _within: np.ndarray
     _gap: Any = None  # beside given pairs; of the broad phase's pairs that of each object
     _given: np.ndarray  # pairs on the host
@@ -159,6 +160,8 @@ class QueryBuffers:
             made.append((self, "within", wp.empty(room, dtype=wp.float64, device=self.device)))
         if self._gap is not None:
             made.append((self.hits, "gap", wp.empty(max(1, room), dtype=wp.float64, device=self.device)))
+        if self.batch.solids is not None:
+            made.append((self, "contained", wp.empty(room, dtype=wp.int32, device=self.device)))
         return made
 
     def _make_slab_memory(self, room: int):
