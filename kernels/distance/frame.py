@@ -40,6 +40,7 @@ from warp_abtree.kernels.poses import (
     reach_box,
     sum_products,
 )
+from warp_abtree.kernels.traversal.load_balance import NO_UNIT, Work
 from warp_abtree.kernels.traversal.node_pair import pack_item
 from warp_abtree.kernels.traversal.nodes import load_node
 from warp_abtree.kernels.triangle.distance import DISTANCE_MAX, EXPONENT_BITS, POSE_ROUNDING, largest, skew_of
@@ -200,14 +201,22 @@ def start_distance_kernel(
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
     found_inout: Found,
-    counter_out: wp.array(dtype=wp.int32),
+    work_out: Work,
 ):
-    """Prepare an object pair a thread, with the last launch's faces as the first bound where both are active."""
+    """Prepare an object pair a thread, with the last launch's faces as the first bound where both are active.
+
+    A unit of work is an object pair; a stale launch is left none.
+    """
     p = wp.tid()
+    if p < work_out.flag.shape[0]:
+        work_out.flag[p] = 0
     if p == 0:
-        counter_out[1] = 0
-        counter_out[3] = 0
-    if p >= pair_count[0] or found_inout.launched[0] == STALE:
+        stale = found_inout.launched[0] == STALE
+        work_out.counter[0] = 0
+        work_out.counter[1] = 0
+        work_out.counter[2] = wp.where(stale, 0, wp.min(pair_count[0], pairs.shape[0]))
+        work_out.counter[3] = wp.where(stale, NO_UNIT, 0)
+    if p >= wp.min(pair_count[0], pairs.shape[0]) or found_inout.launched[0] == STALE:
         return
     a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
     pose = pair_poses[p]

@@ -8,7 +8,7 @@ squares of twice the distance, scaled (`frame.Frame`).
 import warp as wp
 
 from warp_abtree.kernels.arrays import StatePool
-from warp_abtree.kernels.distance.frame import Frame, Nearest, Tolerances, cut_of
+from warp_abtree.kernels.distance.frame import NO_FACES, Frame, Nearest, Tolerances, cut_of
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.boxes import PosedBox, pose_box
 from warp_abtree.kernels.traversal.node_pair import (
@@ -48,7 +48,9 @@ def bound_boxes(a: PosedBox, b: PosedBox):
 @wp.func
 def limit_of(frame: Frame, tolerances: Tolerances, nearest: Nearest):
     """Return the bound over which nothing matters any more: negative where all is known."""
-    cut = cut_of(frame, tolerances, nearest.distance)
+    cut = nearest.distance
+    if nearest.faces != NO_FACES:
+        cut = cut_of(frame, tolerances, cut)
     if cut < wp.float64(0.0):
         return wp.float32(-1.0)
     # `grow` has room for the roundings here too.

@@ -1,8 +1,8 @@
-"""The search of two trees for their nearest faces, a warp an object pair: depth first, the nearest children first.
+"""The search of two trees for their nearest faces: depth first, the nearest children first, by warps that share work.
 
-Node pairs are dropped where their boxes are farther apart than the nearest pair of faces found so far; never where a
-pair of faces below may be as near, so that the nearest distance, and of equally near faces the lowest pair, are found
-whatever the order. With a tolerance other faces are found in another order, within it.
+Node pairs are dropped where their boxes are farther apart than the nearest pair of faces that any warp has found so
+far; never where a pair of faces below may be as near, so that the nearest distance, and of equally near faces the lowest
+pair, are found whatever the order and whoever looks. With a tolerance other faces are found in another order, within it.
 """
 
 import functools
@@ -16,7 +16,16 @@ from warp_abtree.kernels.distance.node_pair import bound_children, limit_of
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.dual_tree import DEPTH_FIRST_ROOM, STACK_MASK, donate_items, receive_items
 from warp_abtree.kernels.traversal.face_pairs import Hits
+from warp_abtree.kernels.traversal.load_balance import (
+    Work,
+    await_donation,
+    count_idle,
+    end_unit,
+    load_tickets,
+    take_unit,
+)
 from warp_abtree.kernels.traversal.node_pair import first_item, four_items, item_first, item_second
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
@@ -31,8 +40,8 @@ from warp_abtree.kernels.traversal.warp_stack import (
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
-# As in `traversal.dual_tree`.
-DEPTH_FIRST_ROOM = wp.constant(128)
+# Fewer items than the traversal gives away: far more lies below one.
+DONATION_LEAST = wp.constant(4)
 
 FIRST_TOLERANCE = wp.constant(wp.float64(0.25))
 
@@ -62,12 +71,46 @@ def push_nearest(
     """
 
 
+@wp.func_native(stack_code("load_distance"))
+def load_distance(distance: wp.array(dtype=wp.float64), i: wp.int32) -> wp.float64:
+    """Return an entry that other warps write, past the first-level cache; the same in all lanes."""
+
+
+@wp.func_native(stack_code("load_faces"))
+def load_faces(faces: wp.array(dtype=wp.int64), i: wp.int32) -> wp.int64: ...
+
+
+@wp.func_native(stack_code("offer_nearest"))
+def offer_nearest(
+    distance: wp.array(dtype=wp.float64), faces: wp.array(dtype=wp.int64), i: wp.int32, d: wp.float64, item: wp.int64
+):
+    """Put in faces that are nearer than those there, or as near and lower."""
+
+
 @wp.func_native(stack_code("warp_min"))
 def warp_min(x: wp.float64) -> wp.float64: ...
 
 
 @wp.func_native(stack_code("warp_min_item"))
 def warp_min_item(x: wp.int64) -> wp.int64: ...
+
+
+@wp.struct
+class Turn:
+    """How warps look for the nearest faces."""
+
+    tolerances: Tolerances  # when they are near enough
+    room: wp.int32  # items that the stack takes, STACK_LENGTH at most
+    shared: wp.bool  # whether warps that are idle get some
+
+
+@wp.func
+def load_nearest(found: Found, pair: wp.int32):
+    """Return the nearest faces that any warp has found; while one puts others in, perhaps no faces that there are."""
+    nearest = Nearest()
+    nearest.distance = load_distance(found.distance, pair)
+    nearest.faces = load_faces(found.faces, pair)
+    return nearest
 
 
 @wp.func
@@ -79,10 +122,8 @@ def measure_faces(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    before: Nearest,
 ):
     """Measure the face pairs first to first + popped, one a lane; return the nearest, and how many this lane took."""
-    nearest = before
     at = STACK_LENGTH + first + wp.min(warp_lane(), popped - 1)
     item = read_item(items, at)
     live = warp_lane() < popped and read_bound(items, at) <= limit
@@ -90,64 +131,100 @@ def measure_faces(
     d = wp.float64(wp.inf)
     if live:
         d = triangle_distance(load_triangles(models, states, pose, item_first(item), item_second(item)))
-    least = warp_min(d)
-    if least <= nearest.distance:
-        lowest = warp_min_item(wp.where(d == least, item, NO_FACES))
-        if least < nearest.distance or lowest < nearest.faces:
-            nearest.distance = least
-            nearest.faces = lowest
+    nearest = Nearest()
+    nearest.distance = warp_min(d)
+    nearest.faces = warp_min_item(wp.where(d == nearest.distance, item, NO_FACES))
     return nearest, wp.where(live, 1, 0)
 
 
 @wp.func
-def search_pair(
+def expand_nearest(
+    items: wp.uint64,
+    first: wp.int32,
+    popped: wp.int32,
+    waiting: wp.int32,
+    limit: wp.float32,
+    states: StatePool,
+    pose: PairPose,
+    frame: Frame,
+):
+    """Compare what items first to first + popped name, one a lane; return both ends, see `push_nearest`, and tests."""
+    at = (first + wp.min(warp_lane(), popped - 1)) & STACK_MASK
+    item = read_item(items, at)
+    live = wp.where(warp_lane() < popped and read_bound(items, at) <= limit, -1, 0)
+    warp_sync()
+    children, kinds, bounds, compared = bound_children(states, pose, frame, limit, item, live)
+    ends = push_nearest(items, first, waiting, kinds, children, bounds)
+    warp_sync()
+    return ends, compared
+
+
+@wp.func
+def search_items(
+    # static
+    turn: Turn,
+    pair: wp.int32,
+    count: wp.int32,
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
     frame: Frame,
-    tolerances: Tolerances,
-    room: wp.int32,
-    start: Nearest,
+    # state
+    found: Found,
+    work: Work,
 ):
-    """Return the nearest faces of an object pair, and what this lane compared: boxes and faces."""
-    nearest = start
+    """Search so many items on the stack that are not given away; return what this lane compared: boxes and faces."""
     items = nearest_stack()
-    if warp_lane() == 0:
-        write_item(items, 0, first_item(states, pose))
-        write_bound(items, 0, wp.float32(0.0))
-    warp_sync()
-    limit = limit_of(frame, tolerances, nearest)
-    end, waiting = wp.int32(1), wp.int32(0)
+    head, end, waiting = wp.int32(0), wp.int32(count), wp.int32(0)
     tests = wp.vec2i()
-    while end > 0 or waiting > 0:
-        if end > 0 and waiting < warp_size():
+    while end > head or waiting > 0:
+        tickets = wp.int64(0)
+        if turn.shared:
+            tickets = load_tickets(work.counter)
+        nearest = load_nearest(found, pair)
+        limit = limit_of(frame, turn.tolerances, nearest)
+        if end > head and waiting < warp_size():
             # One at a time, depth first, needs little room; more where there is.
-            popped = wp.max(1, (room - DEPTH_FIRST_ROOM - end) >> 2)
-            popped = wp.min(popped, wp.min(warp_size(), end))
+            popped = wp.max(1, (turn.room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
+            popped = wp.min(popped, wp.min(warp_size(), end - head))
             end -= popped
-            at = end + wp.min(warp_lane(), popped - 1)
-            item = read_item(items, at)
-            live = wp.where(warp_lane() < popped and read_bound(items, at) <= limit, -1, 0)
-            warp_sync()
-            children, kinds, bounds, compared = bound_children(states, pose, frame, limit, item, live)
-            ends = push_nearest(items, end, waiting, kinds, children, bounds)
-            warp_sync()
+            ends, compared = expand_nearest(items, end, popped, waiting, limit, states, pose, frame)
             end = item_second(ends)
             waiting = item_first(ends)
             tests[0] += compared
         # The first face pairs are measured at once: until then, nothing is dropped.
-        if waiting >= warp_size() or (waiting > 0 and (end == 0 or nearest.faces == NO_FACES)):
+        if waiting >= warp_size() or (waiting > 0 and (end == head or nearest.faces == NO_FACES)):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
-            nearest, measured = measure_faces(items, waiting, popped, limit, models, states, pose, nearest)
-            limit = limit_of(frame, tolerances, nearest)
+            faces, measured = measure_faces(items, waiting, popped, limit, models, states, pose)
+            if faces.distance <= nearest.distance and faces.faces != NO_FACES:
+                offer_nearest(found.distance, found.faces, pair, faces.distance, faces.faces)
             tests[1] += measured
-    return nearest, tests
+        idle = count_idle(tickets)
+        if idle > 0 and end - head >= 2 * DONATION_LEAST:
+            head = donate_items(DONATION_LEAST, pair, idle, items, head, end, work)
+    return tests
+
+
+@wp.func
+def start_items(slot: wp.int32, states: StatePool, pose: PairPose, work: Work):
+    """Put both roots on the empty stack, or what lies in a slot, 0 or more; return how many items."""
+    items = nearest_stack()
+    size = wp.int32(1)
+    if slot >= 0:
+        size = receive_items(items, slot, work)
+    elif warp_lane() == 0:
+        write_item(items, 0, first_item(states, pose))
+    if warp_lane() < size:
+        write_bound(items, warp_lane(), wp.float32(0.0))
+    warp_sync()
+    return size
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
 def search_warp_kernel(
     room: wp.int32,
+    rough_least: wp.int32,
     tolerances: Tolerances,
     models: ModelPool,
     states: StatePool,
@@ -155,29 +232,41 @@ def search_warp_kernel(
     pair_poses: wp.array(dtype=PairPose),
     found_inout: Found,
     hits_inout: Hits,
+    work_inout: Work,
 ):
-    """Search the object pairs that do not intersect, a warp a pair."""
-    p = wp.tid() / warp_size()
-    if p >= pair_count[0] or found_inout.launched[0] == STALE:
-        return
-    if hits_inout.any_hit[p] != 0:
-        return
-    nearest = Nearest()
-    nearest.distance = found_inout.distance[p]
-    nearest.faces = found_inout.faces[p]
-    pose = pair_poses[p]
-    # Without faces to start from, what is found within a wide tolerance is: far fewer are looked at in vain.
-    turn = wp.where(nearest.faces == NO_FACES, 0, 1)
-    tests = wp.vec2i()
-    while turn < 2:
-        asked = tolerances
-        if turn == 0:
-            asked.relative = wp.max(tolerances.relative, FIRST_TOLERANCE)
-        nearest, more = search_pair(models, states, pose, found_inout.frame[p], asked, room, nearest)
-        tests += more
-        turn += 1
-    if warp_lane() == 0:
-        found_inout.distance[p] = nearest.distance
-        found_inout.faces[p] = nearest.faces
-    add_warp_sum(hits_inout.node_tests, p, tests[0])
-    add_warp_sum(hits_inout.triangle_tests, p, tests[1])
+    """Search the object pairs that do not intersect: units of work, a pair each, and donated items.
+
+    Args:
+        rough_least: Object pairs from which on each is searched roughly first.
+    """
+    count = wp.min(pair_count[0], pair_poses.shape[0])
+    turn = Turn()
+    turn.room = room
+    while True:
+        p = take_unit(work_inout.counter)
+        slot = wp.int32(-1)
+        if p >= count:
+            slot = await_donation(work_inout.counter, work_inout.flag)
+            if slot < 0:
+                return
+            p = work_inout.owner[slot][0]
+        if hits_inout.any_hit[p] == 0:
+            pose = pair_poses[p]
+            frame = found_inout.frame[p]
+            tests = wp.vec2i()
+            rough = slot < 0 and count >= rough_least and load_faces(found_inout.faces, p) == NO_FACES
+            searching = bool(True)
+            while searching:
+                # What is found within a wide tolerance is a start: far fewer are looked at in vain.
+                asked = tolerances
+                if rough:
+                    asked.relative = wp.max(tolerances.relative, FIRST_TOLERANCE)
+                turn.shared = not rough
+                turn.tolerances = asked
+                size = start_items(slot, states, pose, work_inout)
+                tests += search_items(turn, p, size, models, states, pose, frame, found_inout, work_inout)
+                searching = rough
+                rough = False
+            add_warp_sum(hits_inout.node_tests, p, tests[0])
+            add_warp_sum(hits_inout.triangle_tests, p, tests[1])
+        end_unit(work_inout.counter, work_inout.flag)

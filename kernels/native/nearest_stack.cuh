@@ -1,4 +1,5 @@
-// A warp's lists of a search for the nearest faces: node pairs and face pairs, each with a bound of its distance.
+// A warp's lists of a search for the nearest faces: a ring of node pairs, and face pairs, each with a bound of its
+// distance; and the nearest faces that all warps at work on an object pair have found.
 #pragma once
 #include "builtin.h"
 #include "sizes.h"
@@ -64,7 +65,8 @@ inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp:
         const unsigned int below = (1u << threadIdx.x) - 1u;
         const unsigned int nodes = __ballot_sync(0xffffffffu, kinds[k] == 1);
         const unsigned int faces = __ballot_sync(0xffffffffu, kinds[k] == 2);
-        const int at = kinds[k] == 1 ? end + __popc(nodes & below) : STACK_LENGTH + leaf_end + __popc(faces & below);
+        const int place = (end + __popc(nodes & below)) & (STACK_LENGTH - 1);
+        const int at = kinds[k] == 1 ? place : STACK_LENGTH + leaf_end + __popc(faces & below);
         if (kinds[k] != 0) {
             asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"(children[k]) : "memory");
             asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * STRADDLING_START + 4 * at),
@@ -75,13 +77,59 @@ inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp:
         leaf_end += __popc(faces);
 #else
         if (kinds[k] != 0) {
-            const int at = kinds[k] == 1 ? end++ : STACK_LENGTH + leaf_end++;
+            const int at = kinds[k] == 1 ? end++ & (STACK_LENGTH - 1) : STACK_LENGTH + leaf_end++;
             ((long long*)items)[at] = children[k];
             ((float*)((long long*)items + STRADDLING_START))[at] = bounds[k];
         }
 #endif
     }
     return ((long long)leaf_end << 32) | (unsigned int)end;
+}
+
+inline CUDA_CALLABLE wp::float64 load_distance(wp::array_t<wp::float64> distance, wp::int32 i) {
+#if defined(__CUDA_ARCH__)
+    // Lanes that were not together read at different times; what follows needs the same number in all.
+    return __shfl_sync(0xffffffffu, *(const volatile double*)(distance.data + i), 0);
+#else
+    return distance.data[i];
+#endif
+}
+
+inline CUDA_CALLABLE wp::int64 load_faces(wp::array_t<wp::int64> faces, wp::int32 i) {
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(0xffffffffu, *(const volatile long long*)(faces.data + i), 0);
+#else
+    return faces.data[i];
+#endif
+}
+
+inline CUDA_CALLABLE void offer_nearest(wp::array_t<wp::float64> distance, wp::array_t<wp::int64> faces, wp::int32 i,
+                                        wp::float64 d, wp::int64 item) {
+#if defined(__CUDA_ARCH__)
+    if (threadIdx.x == 0) {
+        // Who takes the faces, and leaves -1, has the pair for itself.
+        unsigned long long* place = (unsigned long long*)(faces.data + i);
+        unsigned long long held = atomicExch(place, ~0ull);
+        while (held == ~0ull) {
+            __nanosleep(20);
+            held = atomicExch(place, ~0ull);
+        }
+        __threadfence();
+        volatile double* least = (volatile double*)(distance.data + i);
+        if (d < *least || (d == *least && item < (long long)held)) {
+            *least = d;
+            held = (unsigned long long)item;
+        }
+        __threadfence();
+        atomicExch(place, held);
+    }
+    __syncwarp();
+#else
+    if (d < distance.data[i] || (d == distance.data[i] && item < faces.data[i])) {
+        distance.data[i] = d;
+        faces.data[i] = item;
+    }
+#endif
 }
 
 inline CUDA_CALLABLE wp::float64 warp_min(wp::float64 x) {
