@@ -1,8 +1,9 @@
 """The search of two trees for their nearest faces: depth first, the nearest children first, by warps that share work.
 
 Node pairs are dropped where their boxes are farther apart than the nearest pair of faces that any warp has found so
-far; never where a pair of faces below may be as near, so that the nearest distance, and of equally near faces the lowest
-pair, are found whatever the order and whoever looks. With a tolerance other faces are found in another order, within it.
+far; never where a pair of faces below may be as near, so that the nearest distance, and of equally near faces the
+lowest pair, are found whatever the order and whoever looks. With a tolerance other faces are found in another order,
+within it.
 """
 
 import functools
@@ -14,7 +15,6 @@ from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame, Nearest, Tolerances, load_triangles
 from warp_abtree.kernels.distance.node_pair import bound_children, limit_of
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
-from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.dual_tree import DEPTH_FIRST_ROOM, STACK_MASK, donate_items, receive_items
 from warp_abtree.kernels.traversal.face_pairs import Hits

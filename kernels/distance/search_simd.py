@@ -39,8 +39,14 @@ ROUNDING_DOWN = wp.constant(wp.float32(1.0 - 2.0**-20))
 
 @wp.func_native(native.body("nearest/lists.h", "open_search"))
 def open_search(
-    upper: wp.float32, first: wp.int64, way: wp.vec3, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)
-): ...
+    upper: wp.float32,
+    found: bool,
+    first: wp.int64,
+    way: wp.vec3,
+    thread: wp.int32,
+    memory: wp.array2d(dtype=wp.float32),
+):
+    """Start with a distance, whether there are faces at it, both roots and the direction to look along."""
 
 
 @wp.func_native(native.body("nearest/search.h", "search_nearest"))
@@ -150,7 +156,8 @@ def search_thread_kernel(
             nearest.faces = found_inout.faces[p]
             with_slabs = has_slabs(slabs, p)
             spare = spare_of(tolerances, frame)
-            open_search(scaled_up(nearest.distance, frame), first_item(states, pose), frame.way, thread, memory_out)
+            upper, started = scaled_up(nearest.distance, frame), nearest.faces != NO_FACES
+            open_search(upper, started, first_item(states, pose), frame.way, thread, memory_out)
             state = wp.vec3i()
             while state[0] == 0:
                 state = search_nearest(models, states, pose, frame, spare, slabs, with_slabs, thread, memory_out)

@@ -163,7 +163,7 @@ def receive_items(items: wp.uint64, slot: wp.int32, work: Work):
 def donate_items(
     least: wp.int32, pair: wp.int32, idle: wp.int32, items: wp.uint64, head: wp.int32, end: wp.int32, work: Work
 ):
-    """Serve idle warps with the oldest items, so many each at least, which have most below them; return the new head."""
+    """Serve idle warps with the oldest items, so many each at least: most lies below them. Return the new head."""
     wanted = wp.min(idle, DONATIONS_AT_ONCE)
     size = wp.min(wp.max((end - head) / (wanted + 1), least), SLOT_ITEMS)
     lane = warp_lane()

@@ -183,6 +183,20 @@ def test_beyond_ends_a_pair_that_is_farther(device):
             np.testing.assert_array_equal(getattr(found, name)[~ended], getattr(exact, name)[~ended])
 
 
+@pytest.mark.parametrize("tolerances", [{"tolerance": 0.3}, {"relative": 0.5}])
+def test_beyond_beside_a_tolerance(device, tolerances):
+    """What is nearer than `beyond` is found, within the tolerance, and nothing nearer is proved beyond."""
+    rng = np.random.default_rng(15)
+    cases = make_cases(rng, [("torus", "ball"), ("soup", "capsule")] * 25)
+    scene, pairs = scene_of(device, cases), pairs_of(cases)
+    exact = scene.intersect(pairs, "distance")
+    for beyond in (exact.distance * (1 + 1e-9) + 1e-9, 1.1 * exact.distance + 1e-6, 0.99 * exact.distance):
+        found = ab.DistanceQuery(scene, pairs, beyond=beyond, **tolerances).run()
+        np.testing.assert_array_equal(np.isinf(found.distance), exact.distance > beyond)
+        lower, upper = found.bracket.T
+        assert (lower <= exact.bracket[:, 1]).all() and (exact.bracket[:, 0] <= upper).all()
+
+
 def test_what_a_search_starts_from_changes_nothing(device):
     """Faces of other poses, of other LODs, some inactive now, and of other pairs."""
     rng = np.random.default_rng(9)

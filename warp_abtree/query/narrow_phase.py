@@ -214,7 +214,7 @@ class Query(QueryReadout):
         return [first, traversal]
 
     def _warp_count(self) -> int:
-        """Return the warps of a launch: more than there are units, where these are few, so that some wait for donations."""
+        """Return the warps of a launch: more than units, where these are few, so that some wait for donations."""
         if not self.device.is_cuda:
             return 1
         room = len(self.pairs)

@@ -26,6 +26,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     if (with_slabs) {
         boxes.slabs = (const char*)slabs.record.data - (const char*)states.node_box.data;
         boxes.look(h.way);
+        boxes.normals = h.face_tests >= NORMALS_LEAST;
     }
     const float INF = __builtin_inff();
     // Apart from the memory that lists are written to.
@@ -34,7 +35,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     float cut = 0.0f, limit = 0.0f, soon = 0.0f;
     auto set_limits = [&]() {
         constexpr float PART[] = {0.6f, 0.85f, 1.0f};
-        cut = NearestMemory::cut_of(h.upper, spare);
+        cut = h.found ? NearestMemory::cut_of(h.upper, spare) : h.upper;
         auto to_bound = [&](float x) {
             const float y = 2.0f * (x * frame.grow + frame.least);
             return x < 0.0f ? -1.0f : y * y;
@@ -58,6 +59,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
         for (int i = 0; i < count; ++i)
             if (over[i] < h.upper) {
                 h.upper = over[i];
+                h.found = true;
                 best = i;
             }
         if (best >= 0 && with_slabs && d[best] > 0.0f) {
@@ -75,6 +77,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
                 m.open_bound[h.open_count++] = low[i];
             }
         h.face_tests += count;
+        boxes.normals = h.face_tests >= NORMALS_LEAST;
     };
     auto keep_open = [&]() {
         int kept = 0;
