@@ -59,7 +59,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
         for (int i = 0; i < count; ++i)
             if (over[i] < h.upper) {
                 h.upper = over[i];
-                h.found = true;
+                h.found = 1;
                 best = i;
             }
         if (best >= 0 && with_slabs && d[best] > 0.0f) {
