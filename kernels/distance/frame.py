@@ -53,6 +53,8 @@ NO_FACES = wp.constant(wp.int64(2**63 - 1))
 BOUND_ROUNDING = wp.constant(wp.float64(2.0**-19))
 # Distances over so many times a `pair_slack`, which is 2^-44 S, are not small.
 SMALL_DISTANCE = wp.constant(wp.float64(2.0**25))
+ROUNDING_UP = wp.constant(wp.float32(1.0 + 2.0**-20))
+ROUNDING_DOWN = wp.constant(wp.float32(1.0 - 2.0**-20))
 SCALE_MAX = wp.constant(wp.float64(2.0**100))
 
 
@@ -98,6 +100,7 @@ class Found:
     faces: wp.array(dtype=wp.int64)  # see `Nearest`, shape [pair]; what lies there starts the next search
     frame: wp.array(dtype=Frame)  # shape [pair]
     beyond: wp.array(dtype=wp.float64)  # distance to end at [world units], infinite for none, shape [pair]
+    upper: wp.array(dtype=wp.float32)  # what no nearest faces are beyond, scaled, shape [pair]; of warps alone
     launched: wp.array(dtype=wp.int32)  # STALE where nothing is to be done, see `generation.LaunchRecord`
 
 
@@ -171,6 +174,25 @@ def cut_of(frame: Frame, tolerances: Tolerances, distance: wp.float64):
 
 
 @wp.func
+def scaled_up(distance: wp.float64, frame: Frame):
+    """Return a distance in the scale of the boxes, not less than any pair of faces at it has in float64."""
+    return wp.float32(distance * frame.scale64) * ROUNDING_UP + frame.least
+
+
+@wp.func
+def spare_of(tolerances: Tolerances, frame: Frame):
+    """Return tolerances for float32: scaled, relative, and widths of a bracket to be taken off, scaled and relative."""
+    width = width_of(frame, wp.float64(0.0))
+    part = wp.float64(4.0) * (frame.stretch - wp.float64(1.0))
+    return wp.vec4(
+        wp.float32((tolerances.tolerance - width) * frame.scale64) * ROUNDING_DOWN,
+        wp.float32(tolerances.relative) * ROUNDING_DOWN,
+        wp.float32(width * frame.scale64) * ROUNDING_UP,
+        wp.float32(part) * ROUNDING_UP,
+    )
+
+
+@wp.func
 def load_triangles(models: ModelPool, states: StatePool, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
     """Return the corners of a face of A and of one of B, in A's frame."""
     a = states.face_corner[pose.corner_a + face_a]
@@ -240,3 +262,5 @@ def start_distance_kernel(
     found_inout.frame[p] = frame
     found_inout.distance[p] = bound
     found_inout.faces[p] = kept
+    if p < found_inout.upper.shape[0]:
+        found_inout.upper[p] = scaled_up(bound, frame)

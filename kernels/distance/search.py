@@ -12,12 +12,13 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame, Nearest, Tolerances, load_triangles
+from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame, Tolerances, load_triangles, scaled_up, spare_of
 from warp_abtree.kernels.distance.node_pair import bound_children, limit_of
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.boxes import map_point
 from warp_abtree.kernels.traversal.dual_tree import DEPTH_FIRST_ROOM, STACK_MASK, donate_items, receive_items
-from warp_abtree.kernels.traversal.face_pairs import Hits
+from warp_abtree.kernels.traversal.face_pairs import Hits, load_corner_ids, load_near
 from warp_abtree.kernels.traversal.load_balance import (
     Work,
     await_donation,
@@ -31,6 +32,7 @@ from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
     add_warp_sum,
     read_item,
+    warp_any,
     warp_lane,
     warp_size,
     warp_sync,
@@ -43,14 +45,23 @@ wp.set_module_options(MODULE_OPTIONS)
 # Fewer items than the traversal gives away: far more lies below one.
 DONATION_LEAST = wp.constant(4)
 
+OPEN_START = native.constant("NEAREST_OPEN_START")
+OPEN_LENGTH = native.constant("NEAREST_OPEN_LENGTH")
+
 FIRST_TOLERANCE = wp.constant(wp.float64(0.25))
 
 stack_code = functools.partial(native.body, "nearest_stack.cuh")
+faces_code = functools.partial(native.body, "nearest_faces.cuh")
+
+three_points = wp.types.matrix(shape=(3, 3), dtype=wp.float32)
 
 
 @wp.func_native(stack_code("nearest_stack"))
 def nearest_stack() -> wp.uint64:
-    """Return where this warp's lists lie, an address in shared memory on CUDA: node pairs, face pairs, their bounds."""
+    """Return where this warp's lists lie, an address in shared memory on CUDA, and behind them a bound for each entry.
+
+    Node pairs, face pairs for float32, and face pairs for float64.
+    """
 
 
 @wp.func_native(stack_code("read_bound"))
@@ -71,27 +82,54 @@ def push_nearest(
     """
 
 
-@wp.func_native(stack_code("load_distance"))
-def load_distance(distance: wp.array(dtype=wp.float64), i: wp.int32) -> wp.float64:
+@wp.func_native(stack_code("push_open"))
+def push_open(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, bound: wp.float32) -> wp.int32:
+    """Append the face pairs whose flag is set to those for float64; return the new end."""
+
+
+@wp.func_native(faces_code("bound_faces"))
+def bound_faces(own: wp.float32, a: three_points, b: three_points) -> wp.vec2:
+    """Return a lower and an upper bound of the distance of two triangles, their corners in rows.
+
+    Args:
+        own: What errors of the coordinates add.
+    """
+
+
+@wp.func_native(faces_code("load_upper"))
+def load_upper(upper: wp.array(dtype=wp.float32), i: wp.int32) -> wp.float32:
     """Return an entry that other warps write, past the first-level cache; the same in all lanes."""
 
 
-@wp.func_native(stack_code("load_faces"))
+@wp.func_native(faces_code("lower_upper"))
+def lower_upper(upper: wp.array(dtype=wp.float32), i: wp.int32, x: wp.float32):
+    """Put in a number, 0 or more, if it is lower."""
+
+
+@wp.func_native(faces_code("load_distance"))
+def load_distance(distance: wp.array(dtype=wp.float64), i: wp.int32) -> wp.float64: ...
+
+
+@wp.func_native(faces_code("load_faces"))
 def load_faces(faces: wp.array(dtype=wp.int64), i: wp.int32) -> wp.int64: ...
 
 
-@wp.func_native(stack_code("offer_nearest"))
+@wp.func_native(faces_code("offer_nearest"))
 def offer_nearest(
     distance: wp.array(dtype=wp.float64), faces: wp.array(dtype=wp.int64), i: wp.int32, d: wp.float64, item: wp.int64
 ):
     """Put in faces that are nearer than those there, or as near and lower."""
 
 
-@wp.func_native(stack_code("warp_min"))
+@wp.func_native(faces_code("warp_min"))
 def warp_min(x: wp.float64) -> wp.float64: ...
 
 
-@wp.func_native(stack_code("warp_min_item"))
+@wp.func_native(faces_code("warp_min32"))
+def warp_min32(x: wp.float32) -> wp.float32: ...
+
+
+@wp.func_native(faces_code("warp_min_item"))
 def warp_min_item(x: wp.int64) -> wp.int64: ...
 
 
@@ -101,40 +139,79 @@ class Turn:
 
     tolerances: Tolerances  # when they are near enough
     room: wp.int32  # items that the stack takes, STACK_LENGTH at most
-    shared: wp.bool  # whether warps that are idle get some
+    shared: wp.bool  # whether warps that are idle get some, and faces are measured in float64
 
 
 @wp.func
-def load_nearest(found: Found, pair: wp.int32):
-    """Return the nearest faces that any warp has found; while one puts others in, perhaps no faces that there are."""
-    nearest = Nearest()
-    nearest.distance = load_distance(found.distance, pair)
-    nearest.faces = load_faces(found.faces, pair)
-    return nearest
+def load_points(models: ModelPool, states: StatePool, pose: PairPose, frame: Frame, face_a: wp.int32, face_b: wp.int32):
+    """Return the corners of a face of A and of one of B in rows, in A's frame, scaled."""
+    a, b = load_corner_ids(states, pose.corner_a + face_a), load_corner_ids(states, pose.corner_b + face_b)
+    of_a, of_b = three_points(), three_points()
+    for k in range(3):
+        of_a[k] = load_near(models, a[k]) * frame.scale
+        of_b[k] = map_point(pose.rotation32, frame.translation, load_near(models, b[k]) * frame.scale)
+    return of_a, of_b
 
 
 @wp.func
-def measure_faces(
+def bound_waiting(
     items: wp.uint64,
     first: wp.int32,
     popped: wp.int32,
+    opened: wp.int32,
     limit: wp.float32,
+    upper: wp.float32,
+    pair: wp.int32,
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
+    frame: Frame,
+    found: Found,
 ):
-    """Measure the face pairs first to first + popped, one a lane; return the nearest, and how many this lane took."""
+    """Measure face pairs in float32, one a lane; keep those that may be nearest, and return how many there are."""
     at = STACK_LENGTH + first + wp.min(warp_lane(), popped - 1)
     item = read_item(items, at)
     live = warp_lane() < popped and read_bound(items, at) <= limit
     warp_sync()
-    d = wp.float64(wp.inf)
+    between = wp.vec2(wp.inf, wp.inf)
     if live:
-        d = triangle_distance(load_triangles(models, states, pose, item_first(item), item_second(item)))
-    nearest = Nearest()
-    nearest.distance = warp_min(d)
-    nearest.faces = warp_min_item(wp.where(d == nearest.distance, item, NO_FACES))
-    return nearest, wp.where(live, 1, 0)
+        a, b = load_points(models, states, pose, frame, item_first(item), item_second(item))
+        between = bound_faces(frame.error, a, b)
+    least = warp_min32(between[1])
+    if least < upper:
+        lower_upper(found.upper, pair, least)
+    opened = push_open(items, opened, live and between[0] <= wp.min(least, upper), item, between[0])
+    warp_sync()
+    return opened, wp.where(live, 1, 0)
+
+
+@wp.func
+def decide_open(
+    items: wp.uint64,
+    first: wp.int32,
+    popped: wp.int32,
+    upper: wp.float32,
+    pair: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    frame: Frame,
+    found: Found,
+):
+    """Measure in float64 what face pairs may still be nearest, one a lane."""
+    at = OPEN_START + first + wp.min(warp_lane(), popped - 1)
+    item = read_item(items, at)
+    live = warp_lane() < popped and read_bound(items, at) <= upper
+    warp_sync()
+    if warp_any(live):
+        d = wp.float64(wp.inf)
+        if live:
+            d = triangle_distance(load_triangles(models, states, pose, item_first(item), item_second(item)))
+        least = warp_min(d)
+        lowest = warp_min_item(wp.where(d == least, item, NO_FACES))
+        if least <= load_distance(found.distance, pair):
+            offer_nearest(found.distance, found.faces, pair, least, lowest)
+            lower_upper(found.upper, pair, scaled_up(least, frame))
 
 
 @wp.func
@@ -175,14 +252,18 @@ def search_items(
 ):
     """Search so many items on the stack that are not given away; return what this lane compared: boxes and faces."""
     items = nearest_stack()
-    head, end, waiting = wp.int32(0), wp.int32(count), wp.int32(0)
+    head, end, waiting, opened = wp.int32(0), wp.int32(count), wp.int32(0), wp.int32(0)
     tests = wp.vec2i()
-    while end > head or waiting > 0:
+    held = load_faces(found.faces, pair) != NO_FACES
+    beyond = scaled_up(load_distance(found.distance, pair), frame)
+    spare = spare_of(turn.tolerances, frame)
+    while end > head or waiting > 0 or opened > 0:
         tickets = wp.int64(0)
         if turn.shared:
             tickets = load_tickets(work.counter)
-        nearest = load_nearest(found, pair)
-        limit = limit_of(frame, turn.tolerances, nearest)
+        upper = load_upper(found.upper, pair)
+        held = held or upper < beyond
+        limit = limit_of(frame, spare, upper, held)
         if end > head and waiting < warp_size():
             # One at a time, depth first, needs little room; more where there is.
             popped = wp.max(1, (turn.room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
@@ -193,13 +274,19 @@ def search_items(
             waiting = item_first(ends)
             tests[0] += compared
         # The first face pairs are measured at once: until then, nothing is dropped.
-        if waiting >= warp_size() or (waiting > 0 and (end == head or nearest.faces == NO_FACES)):
+        if waiting >= warp_size() or (waiting > 0 and (end == head or not held)):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
-            faces, measured = measure_faces(items, waiting, popped, limit, models, states, pose)
-            if faces.distance <= nearest.distance and faces.faces != NO_FACES:
-                offer_nearest(found.distance, found.faces, pair, faces.distance, faces.faces)
+            opened, measured = bound_waiting(
+                items, waiting, popped, opened, limit, upper, pair, models, states, pose, frame, found
+            )
             tests[1] += measured
+        if opened > OPEN_LENGTH - warp_size() or (opened > 0 and end == head and waiting == 0):
+            popped = wp.min(opened, warp_size())
+            opened -= popped
+            if turn.shared:
+                upper = load_upper(found.upper, pair)
+                decide_open(items, opened, popped, upper, pair, models, states, pose, frame, found)
         idle = count_idle(tickets)
         if idle > 0 and end - head >= 2 * DONATION_LEAST:
             head = donate_items(DONATION_LEAST, pair, idle, items, head, end, work)

@@ -1,5 +1,5 @@
-// A warp's lists of a search for the nearest faces: a ring of node pairs, and face pairs, each with a bound of its
-// distance; and the nearest faces that all warps at work on an object pair have found.
+// A warp's lists of a search for the nearest faces: a ring of node pairs, face pairs to be measured in float32 and those
+// to be measured in float64, each with a bound of its distance.
 #pragma once
 #include "builtin.h"
 #include "sizes.h"
@@ -7,10 +7,10 @@
 inline CUDA_CALLABLE wp::uint64 nearest_stack() {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
-    __shared__ long long items[STRADDLING_START + STRADDLING_START / 2];
+    __shared__ long long items[NEAREST_LENGTH + NEAREST_LENGTH / 2];
     return __cvta_generic_to_shared(items);
 #else
-    static long long items[STRADDLING_START + STRADDLING_START / 2];
+    static long long items[NEAREST_LENGTH + NEAREST_LENGTH / 2];
     return (wp::uint64)items;
 #endif
 }
@@ -21,21 +21,21 @@ inline CUDA_CALLABLE wp::float32 read_bound(wp::uint64 items, wp::int32 i) {
     float bound;
     asm volatile("ld.shared.f32 %0, [%1];"
                  : "=f"(bound)
-                 : "r"((unsigned int)items + 8 * STRADDLING_START + 4 * i)
+                 : "r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * i)
                  : "memory");
     return bound;
 #else
-    return ((const float*)((const long long*)items + STRADDLING_START))[i];
+    return ((const float*)((const long long*)items + NEAREST_LENGTH))[i];
 #endif
 }
 
 inline CUDA_CALLABLE void write_bound(wp::uint64 items, wp::int32 i, wp::float32 bound) {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
-    asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * STRADDLING_START + 4 * i), "f"(bound)
+    asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * i), "f"(bound)
                  : "memory");
 #else
-    ((float*)((long long*)items + STRADDLING_START))[i] = bound;
+    ((float*)((long long*)items + NEAREST_LENGTH))[i] = bound;
 #endif
 }
 
@@ -69,7 +69,7 @@ inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp:
         const int at = kinds[k] == 1 ? place : STACK_LENGTH + leaf_end + __popc(faces & below);
         if (kinds[k] != 0) {
             asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"(children[k]) : "memory");
-            asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * STRADDLING_START + 4 * at),
+            asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * at),
                          "f"(bounds[k])
                          : "memory");
         }
@@ -79,73 +79,11 @@ inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp:
         if (kinds[k] != 0) {
             const int at = kinds[k] == 1 ? end++ & (STACK_LENGTH - 1) : STACK_LENGTH + leaf_end++;
             ((long long*)items)[at] = children[k];
-            ((float*)((long long*)items + STRADDLING_START))[at] = bounds[k];
+            ((float*)((long long*)items + NEAREST_LENGTH))[at] = bounds[k];
         }
 #endif
     }
     return ((long long)leaf_end << 32) | (unsigned int)end;
-}
-
-inline CUDA_CALLABLE wp::float64 load_distance(wp::array_t<wp::float64> distance, wp::int32 i) {
-#if defined(__CUDA_ARCH__)
-    // Lanes that were not together read at different times; what follows needs the same number in all.
-    return __shfl_sync(0xffffffffu, *(const volatile double*)(distance.data + i), 0);
-#else
-    return distance.data[i];
-#endif
-}
-
-inline CUDA_CALLABLE wp::int64 load_faces(wp::array_t<wp::int64> faces, wp::int32 i) {
-#if defined(__CUDA_ARCH__)
-    return __shfl_sync(0xffffffffu, *(const volatile long long*)(faces.data + i), 0);
-#else
-    return faces.data[i];
-#endif
-}
-
-inline CUDA_CALLABLE void offer_nearest(wp::array_t<wp::float64> distance, wp::array_t<wp::int64> faces, wp::int32 i,
-                                        wp::float64 d, wp::int64 item) {
-#if defined(__CUDA_ARCH__)
-    if (threadIdx.x == 0) {
-        // Who takes the faces, and leaves -1, has the pair for itself.
-        unsigned long long* place = (unsigned long long*)(faces.data + i);
-        unsigned long long held = atomicExch(place, ~0ull);
-        while (held == ~0ull) {
-            __nanosleep(20);
-            held = atomicExch(place, ~0ull);
-        }
-        __threadfence();
-        volatile double* least = (volatile double*)(distance.data + i);
-        if (d < *least || (d == *least && item < (long long)held)) {
-            *least = d;
-            held = (unsigned long long)item;
-        }
-        __threadfence();
-        atomicExch(place, held);
-    }
-    __syncwarp();
-#else
-    if (d < distance.data[i] || (d == distance.data[i] && item < faces.data[i])) {
-        distance.data[i] = d;
-        faces.data[i] = item;
-    }
-#endif
-}
-
-inline CUDA_CALLABLE wp::float64 warp_min(wp::float64 x) {
-#if defined(__CUDA_ARCH__)
-    for (int step = 16; step > 0; step >>= 1)
-        x = wp::min(x, __shfl_xor_sync(0xffffffffu, x, step));
-#endif
-    return x;
-}
-
-inline CUDA_CALLABLE wp::int64 warp_min_item(wp::int64 x) {
-#if defined(__CUDA_ARCH__)
-    for (int step = 16; step > 0; step >>= 1)
-        x = wp::min(x, (wp::int64)__shfl_xor_sync(0xffffffffu, (long long)x, step));
-#endif
-    return x;
 }
 
 inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp::vec_t<4, wp::int32> kinds,
@@ -165,7 +103,7 @@ inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp
         if (kinds[k] != 0) {
             --at;
             asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"(children[k]) : "memory");
-            asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * STRADDLING_START + 4 * at),
+            asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * at),
                          "f"((float)kinds[k])
                          : "memory");
         }
@@ -176,8 +114,29 @@ inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp
         if (kinds[k] != 0) {
             --at;
             ((long long*)items)[at] = children[k];
-            ((float*)((long long*)items + STRADDLING_START))[at] = (float)kinds[k];
+            ((float*)((long long*)items + NEAREST_LENGTH))[at] = (float)kinds[k];
         }
     return end + mine;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 push_open(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item,
+                                         wp::float32 bound) {
+#include "sizes.h"
+#if defined(__CUDA_ARCH__)
+    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    const int at = NEAREST_OPEN_START + end + __popc(votes & ((1u << threadIdx.x) - 1u));
+    if (flag) {
+        asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"((long long)item) : "memory");
+        asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * at), "f"(bound)
+                     : "memory");
+    }
+    return end + __popc(votes);
+#else
+    if (flag) {
+        ((long long*)items)[NEAREST_OPEN_START + end] = item;
+        ((float*)((long long*)items + NEAREST_LENGTH))[NEAREST_OPEN_START + end] = bound;
+    }
+    return end + flag;
 #endif
 }

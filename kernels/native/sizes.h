@@ -17,6 +17,13 @@ static_assert(STRADDLING_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie on
 static_assert(SIGNS_START == STRADDLING_START + STRADDLING_LENGTH, "signs lie behind the straddling pairs");
 static_assert((STACK_LENGTH + LEAF_PAIR_LENGTH) * ITEM_BYTES < 1 << 16, "`push_children` packs two byte offsets");
 
+// Of a search for the nearest faces: node pairs, face pairs for float32, and behind them those for float64.
+constexpr int NEAREST_OPEN_START = 672;
+constexpr int NEAREST_OPEN_LENGTH = 64;
+constexpr int NEAREST_LENGTH = 736;
+static_assert(NEAREST_OPEN_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
+static_assert(NEAREST_LENGTH == NEAREST_OPEN_START + NEAREST_OPEN_LENGTH, "lists lie one behind the other");
+
 // Slots of the queue in which idle warps wait, each with room for so many items: one a lane.
 constexpr int SLOT_COUNT = 8192;
 constexpr int SLOT_ITEMS = 32;

@@ -176,6 +176,8 @@ class DistanceQuery(Query):
             (self.distances, "faces", wp.vec2i),
         ):
             made.append((owner, name, wp.empty(room, dtype=dtype, device=self.device)))
+        uppers = room if self.uses_warps() else 0
+        made.append((self._found, "upper", wp.empty(uppers, dtype=wp.float32, device=self.device)))
         threads = 0 if self.uses_warps() else min(room, current_regime().cpu_threads or core_count())
         made.append((self._slabs, "states", wp.empty(room, dtype=wp.vec2i, device=self.device)))
         made.append(
