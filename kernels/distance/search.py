@@ -134,17 +134,21 @@ def warp_min_item(x: wp.int64) -> wp.int64: ...
 
 
 @wp.struct
-class Turn:
-    """How warps look for the nearest faces."""
+class Search:
+    """An object pair, and how a warp looks for its nearest faces."""
 
+    pair: wp.int32  # its number
+    pose: PairPose  # of B in A's frame
+    frame: Frame  # how boxes are compared
     tolerances: Tolerances  # when they are near enough
     room: wp.int32  # items that the stack takes, STACK_LENGTH at most
     shared: wp.bool  # whether warps that are idle get some, and faces are measured in float64
 
 
 @wp.func
-def load_points(models: ModelPool, states: StatePool, pose: PairPose, frame: Frame, face_a: wp.int32, face_b: wp.int32):
+def load_points(models: ModelPool, states: StatePool, search: Search, face_a: wp.int32, face_b: wp.int32):
     """Return the corners of a face of A and of one of B in rows, in A's frame, scaled."""
+    pose, frame = search.pose, search.frame
     a, b = load_corner_ids(states, pose.corner_a + face_a), load_corner_ids(states, pose.corner_b + face_b)
     of_a, of_b = three_points(), three_points()
     for k in range(3):
@@ -161,11 +165,9 @@ def bound_waiting(
     opened: wp.int32,
     limit: wp.float32,
     upper: wp.float32,
-    pair: wp.int32,
+    search: Search,
     models: ModelPool,
     states: StatePool,
-    pose: PairPose,
-    frame: Frame,
     found: Found,
 ):
     """Measure face pairs in float32, one a lane; keep those that may be nearest, and return how many there are."""
@@ -175,11 +177,11 @@ def bound_waiting(
     warp_sync()
     between = wp.vec2(wp.inf, wp.inf)
     if live:
-        a, b = load_points(models, states, pose, frame, item_first(item), item_second(item))
-        between = bound_faces(frame.error, a, b)
+        a, b = load_points(models, states, search, item_first(item), item_second(item))
+        between = bound_faces(search.frame.error, a, b)
     least = warp_min32(between[1])
     if least < upper:
-        lower_upper(found.upper, pair, least)
+        lower_upper(found.upper, search.pair, least)
     opened = push_open(items, opened, live and between[0] <= wp.min(least, upper), item, between[0])
     warp_sync()
     return opened, wp.where(live, 1, 0)
@@ -191,11 +193,9 @@ def decide_open(
     first: wp.int32,
     popped: wp.int32,
     upper: wp.float32,
-    pair: wp.int32,
+    search: Search,
     models: ModelPool,
     states: StatePool,
-    pose: PairPose,
-    frame: Frame,
     found: Found,
 ):
     """Measure in float64 what face pairs may still be nearest, one a lane."""
@@ -206,12 +206,12 @@ def decide_open(
     if warp_any(live):
         d = wp.float64(wp.inf)
         if live:
-            d = triangle_distance(load_triangles(models, states, pose, item_first(item), item_second(item)))
+            d = triangle_distance(load_triangles(models, states, search.pose, item_first(item), item_second(item)))
         least = warp_min(d)
         lowest = warp_min_item(wp.where(d == least, item, NO_FACES))
-        if least <= load_distance(found.distance, pair):
-            offer_nearest(found.distance, found.faces, pair, least, lowest)
-            lower_upper(found.upper, pair, scaled_up(least, frame))
+        if least <= load_distance(found.distance, search.pair):
+            offer_nearest(found.distance, found.faces, search.pair, least, lowest)
+            lower_upper(found.upper, search.pair, scaled_up(least, search.frame))
 
 
 @wp.func
@@ -222,15 +222,14 @@ def expand_nearest(
     waiting: wp.int32,
     limit: wp.float32,
     states: StatePool,
-    pose: PairPose,
-    frame: Frame,
+    search: Search,
 ):
     """Compare what items first to first + popped name, one a lane; return both ends, see `push_nearest`, and tests."""
     at = (first + wp.min(warp_lane(), popped - 1)) & STACK_MASK
     item = read_item(items, at)
     live = wp.where(warp_lane() < popped and read_bound(items, at) <= limit, -1, 0)
     warp_sync()
-    children, kinds, bounds, compared = bound_children(states, pose, frame, limit, item, live)
+    children, kinds, bounds, compared = bound_children(states, search.pose, search.frame, limit, item, live)
     ends = push_nearest(items, first, waiting, kinds, children, bounds)
     warp_sync()
     return ends, compared
@@ -239,37 +238,34 @@ def expand_nearest(
 @wp.func
 def search_items(
     # static
-    turn: Turn,
-    pair: wp.int32,
+    search: Search,
     count: wp.int32,
     models: ModelPool,
     states: StatePool,
-    pose: PairPose,
-    frame: Frame,
     # state
     found: Found,
     work: Work,
 ):
     """Search so many items on the stack that are not given away; return what this lane compared: boxes and faces."""
-    items = nearest_stack()
+    items, pair, frame = nearest_stack(), search.pair, search.frame
     head, end, waiting, opened = wp.int32(0), wp.int32(count), wp.int32(0), wp.int32(0)
     tests = wp.vec2i()
     held = load_faces(found.faces, pair) != NO_FACES
     beyond = scaled_up(load_distance(found.distance, pair), frame)
-    spare = spare_of(turn.tolerances, frame)
+    spare = spare_of(search.tolerances, frame)
     while end > head or waiting > 0 or opened > 0:
         tickets = wp.int64(0)
-        if turn.shared:
+        if search.shared:
             tickets = load_tickets(work.counter)
         upper = load_upper(found.upper, pair)
         held = held or upper < beyond
         limit = limit_of(frame, spare, upper, held)
         if end > head and waiting < warp_size():
             # One at a time, depth first, needs little room; more where there is.
-            popped = wp.max(1, (turn.room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
+            popped = wp.max(1, (search.room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
             popped = wp.min(popped, wp.min(warp_size(), end - head))
             end -= popped
-            ends, compared = expand_nearest(items, end, popped, waiting, limit, states, pose, frame)
+            ends, compared = expand_nearest(items, end, popped, waiting, limit, states, search)
             end = item_second(ends)
             waiting = item_first(ends)
             tests[0] += compared
@@ -278,15 +274,15 @@ def search_items(
             popped = wp.min(waiting, warp_size())
             waiting -= popped
             opened, measured = bound_waiting(
-                items, waiting, popped, opened, limit, upper, pair, models, states, pose, frame, found
+                items, waiting, popped, opened, limit, upper, search, models, states, found
             )
             tests[1] += measured
         if opened > OPEN_LENGTH - warp_size() or (opened > 0 and end == head and waiting == 0):
             popped = wp.min(opened, warp_size())
             opened -= popped
-            if turn.shared:
+            if search.shared:
                 upper = load_upper(found.upper, pair)
-                decide_open(items, opened, popped, upper, pair, models, states, pose, frame, found)
+                decide_open(items, opened, popped, upper, search, models, states, found)
         idle = count_idle(tickets)
         if idle > 0 and end - head >= 2 * DONATION_LEAST:
             head = donate_items(DONATION_LEAST, pair, idle, items, head, end, work)
@@ -327,8 +323,8 @@ def search_warp_kernel(
         rough_least: Object pairs from which on each is searched roughly first.
     """
     count = wp.min(pair_count[0], pair_poses.shape[0])
-    turn = Turn()
-    turn.room = room
+    search = Search()
+    search.room = room
     while True:
         p = take_unit(work_inout.counter)
         slot = wp.int32(-1)
@@ -338,8 +334,9 @@ def search_warp_kernel(
                 return
             p = work_inout.owner[slot][0]
         if hits_inout.any_hit[p] == 0:
-            pose = pair_poses[p]
-            frame = found_inout.frame[p]
+            search.pair = p
+            search.pose = pair_poses[p]
+            search.frame = found_inout.frame[p]
             tests = wp.vec2i()
             rough = slot < 0 and count >= rough_least and load_faces(found_inout.faces, p) == NO_FACES
             searching = bool(True)
@@ -348,10 +345,10 @@ def search_warp_kernel(
                 asked = tolerances
                 if rough:
                     asked.relative = wp.max(tolerances.relative, FIRST_TOLERANCE)
-                turn.shared = not rough
-                turn.tolerances = asked
-                size = start_items(slot, states, pose, work_inout)
-                tests += search_items(turn, p, size, models, states, pose, frame, found_inout, work_inout)
+                search.shared = not rough
+                search.tolerances = asked
+                size = start_items(slot, states, search.pose, work_inout)
+                tests += search_items(search, size, models, states, found_inout, work_inout)
                 searching = rough
                 rough = False
             add_warp_sum(hits_inout.node_tests, p, tests[0])
