@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.distance import DistanceQuery, check_beyond
 from warp_abtree.query.narrow_phase import Query
@@ -71,7 +72,8 @@ class KeptQueries:
     @staticmethod
     def _one_for_all(distance, name: str) -> float:
         """Return a distance that is one for all pairs, checked; 0 where each pair has its own."""
-        return float(check_within(distance, name=name)) if np.ndim(distance) == 0 else 0.0
+        distance = to_numpy(distance, name)
+        return float(check_within(distance, name=name)) if distance.ndim == 0 else 0.0
 
     def _run(self, key: tuple, query: Query, device: bool) -> Result:
         """Run a query and keep it for the next time; one that fails, for lack of memory, gives its own back."""
