@@ -120,6 +120,49 @@ def test_a_signal_stops_a_command(files, words, place, before, number, status, l
     assert all(path.read_text() == "old" for path in files.glob("new.*"))
 
 
+def run_process(words, code="import runpy; runpy.run_module('warp_abtree', run_name='__main__')", **variables):
+    """Run a command in a process of its own; return its status and what it says."""
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words.split()],
+        env={**os.environ, "PYTHONPATH": path, **variables},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+STOP_AT_WARP = """
+import sys
+
+class Stop:
+    def find_spec(self, name, *_):
+        if name == "warp":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Stop())
+from warp_abtree.__main__ import main
+sys.exit(main())
+"""
+
+
+def test_the_version_needs_no_warp():
+    assert run_process("--version", STOP_AT_WARP) == (0, f"warp-abtree {ab.__version__}\n", "")
+
+
+def test_an_interrupt_during_imports_is_one_line():
+    assert run_process("info ball.obj", STOP_AT_WARP) == (130, "", "warp-abtree: interrupted\n")
+
+
+def test_a_kernel_cache_that_cannot_be_written_names_its_variable(files):
+    status, _, errors = run_process("info ball.obj --device cpu", WARP_CACHE_PATH=str(files / "ball.obj" / "cache"))
+    assert status == 2 and errors.count("\n") == 1 and "ball.obj/cache" in errors
+    assert errors.endswith("(Warp's kernel cache; WARP_CACHE_PATH names a folder that can be written)\n")
+    status, _, errors = run_process("info gone.obj --device cpu")
+    assert status == 2 and "WARP_CACHE_PATH" not in errors
+
+
 def test_a_caller_keeps_its_signals(files, capsys, monkeypatch):
     """Of a command that is called, and of a program's that runs in another thread than the main one."""
     before = [signal.getsignal(number) for number in BOTH]
