@@ -1,5 +1,6 @@
 """The process of a command: progress on stderr, and SIGINT and SIGTERM, which leave no half-written file."""
 
+import csv
 import io
 import json
 import os
@@ -34,7 +35,6 @@ import sys, time
 import numpy as np
 import warp_abtree as ab
 from warp_abtree.app.cli import main as cli
-from warp_abtree.simulate import frame
 
 def hang(file=None, *_, **__):
     if hasattr(file, "write"):
@@ -73,7 +73,7 @@ def files(tmp_path, monkeypatch):
 
 SLOW = [
     (BUILD, "np.savez_compressed", block, TERMINATE, 143, []),
-    ("run scene.toml --record new.csv", "frame.csv.DictWriter", None, TERMINATE, 143, []),
+    ("run scene.toml --record new.csv", "ab.Frame.run", None, TERMINATE, 143, []),
     ("run scene.toml --record new.json", "ab.Frame.run", ignore, INTERRUPT, 130, []),
     (QUERY, "np.savez", block, INTERRUPT, 130, []),
     (SWEEP, "np.savez", ignore, TERMINATE, 143, ["answers", "answers/job.json"]),
@@ -131,6 +131,33 @@ def run_process(words, code="import runpy; runpy.run_module('warp_abtree', run_n
         timeout=60,
     )
     return done.returncode, done.stdout, done.stderr
+
+
+STOP_IN_FRAME = """
+import os, signal, sys
+import warp_abtree as ab
+from warp_abtree.app.cli import main as cli
+
+advance = ab.Frame._advance
+
+def stop(frame):
+    if len(frame.history) == 3:
+        os.kill(os.getpid(), signal.SIGINT)
+    advance(frame)
+
+ab.Frame._advance = stop
+sys.exit(cli.main())
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("name", ["rows.csv", "rows.json"])
+def test_an_interrupted_run_keeps_its_rows(files, name):
+    status, _, errors = run_process(f"run scene.toml --record {name} --device cpu", STOP_IN_FRAME)
+    assert (status, errors) == (130, "warp-abtree: interrupted\n")
+    text = Path(name).read_text()
+    rows = json.loads(text) if name.endswith("json") else list(csv.DictReader(io.StringIO(text)))
+    assert [int(row["frame"]) for row in rows] == [0, 1, 2]
 
 
 STOP_AT_WARP = """
