@@ -89,7 +89,7 @@ def scene_from_file(path, device=None, base_faces=10, progress=None):
         path: GLB, glTF or another format of trimesh; USD (extra `usd`), at the stage's first time, in the file's units
             and axes. Objects of USD are its visible meshes and basic shapes, including instances and those of point
             instancers. Cubes and planes are exact; spheres (5,120 faces), cylinders, cones and capsules (64 sections)
-            lie within 0.0015 of their radius inside. A warning names what is left out: invisible prims, and geometry of
+            lie within 0.002 of their radius inside. A warning names what is left out: invisible prims, and geometry of
             other kinds.
         device, base_faces, progress: As for `scene_from_trimesh`.
 

@@ -7,7 +7,7 @@ import numpy as np
 from warp_abtree.model.mesh import MeshError
 from warp_abtree.model.obj import read_usd_mesh
 
-# Round shapes: 64 sections around, spheres of 5,120 faces. All lie within 0.0015 of the radius inside.
+# Round shapes: 64 sections around, spheres of 5,120 faces. All lie within 0.002 of the radius inside.
 SECTIONS, SUBDIVISIONS = 64, 4
 # Prims that a warning names.
 NAMED = 4
