@@ -15,6 +15,18 @@ names its objects:
 * point_faces: the faces that they lie on. Of equally near face pairs the one with the lowest face of the object with
   the smaller index, then of the other; where the surfaces intersect, some pair that does.
 
+With `signed`, a pair of which one object lies inside the other, a solid (`Scene.add`), by some of its points has a
+negative distance. The depth of a point is its distance from the other's surface; looked at are corners of faces,
+middles of edges and centroids of faces, of both objects if both are solids. The greatest depth is that of the pair:
+
+* distance is minus the depth; bracket holds it as above.
+* points are the point inside and the point of the other surface that is nearest to it, in the order of the pair, and
+  point_faces the faces that they lie on. From the point inside to the other is its way out.
+
+Whatever the number of faces that have gone under, no shorter motion frees the objects: depth is a lower bound of the
+penetration depth, the length of the shortest motion that does, and that length for a body pressed into a flat floor or
+a peg that is too thick for its hole. Where solids cross and none of these points is inside, distance is 0.
+
 With the default tolerance, all of this is the same, bit for bit, on CPU and CUDA, whatever the search has started from.
 With a tolerance points, faces and distance may also depend on what the last launch found.
 """
@@ -29,6 +41,7 @@ from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd, slabs
 from warp_abtree.kernels.solid.containment import report_contained_kernel
+from warp_abtree.kernels.solid.depth import find_depth_kernel
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.narrow_phase import Query
@@ -70,20 +83,28 @@ def check_tolerance(tolerance, name: str, most: float) -> float:
     return float(value)
 
 
+def check_signed(signed) -> bool:
+    """Return whether distances are signed; raise ValueError for what is no bool."""
+    if not isinstance(signed, bool | np.bool_):
+        raise ValueError(f"signed {signed!r} is neither True nor False")
+    return bool(signed)
+
+
 def check_asked(output, precision, options):
     """Check what is asked of a sweep.
 
     Raises:
-        TypeError: An option with another name than tolerance, relative and beyond.
+        TypeError: An option with another name than tolerance, relative, beyond and signed.
         ValueError: A bad option, output or precision, or one that means nothing beside another.
     """
-    unknown = set(options) - {"tolerance", "relative", "beyond"}
+    unknown = set(options) - {"tolerance", "relative", "beyond", "signed"}
     if unknown:
         raise TypeError(f"sweep has no option {sorted(unknown)[0]!r}")
     if output == "distance":
         refuse_options(output, {"precision": precision != "exact"})
         make_tolerances(options.get("tolerance", 0.0), options.get("relative", 0.0))
         check_beyond(options.get("beyond"))
+        check_signed(options.get("signed", False))
     else:
         refuse_options(output, options)
         check_request(output, precision)
@@ -101,6 +122,7 @@ class DistanceQuery(Query):
         relative: The same as a fraction of the distance, below 1; the wider one counts.
         beyond: Distance [world units] that ends the search of a pair which is proved farther apart: one for all pairs,
             or (p,) beside given pairs; None for none.
+        signed: Whether pairs of which one is a solid that holds corners of the other have their depth, negative.
 
     Attributes:
         distances: The last launch's answers, device arrays (pair capacity,) of `kernels.distance.report.Distances`.
@@ -112,7 +134,8 @@ class DistanceQuery(Query):
 
     _memory: wp.array
 
-    def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None):
+    def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None, signed=False):
+        self._signed = check_signed(signed)
         self._tolerances = make_tolerances(tolerance, relative)
         self._asked = check_beyond(beyond, None if pairs is None else len(to_numpy(pairs, "pairs")))
         self.distances, self._found, self._slabs = report.Distances(), frame.Found(), slabs.Slabs()
@@ -216,7 +239,14 @@ class DistanceQuery(Query):
             return []
         posed = [*self.batch.pools, self.pair_count, self.pairs, self.pair_poses]
         inputs = [*posed, self.guard.launched, self.hits, self.contained, self.distances]
-        return [launch(report_contained_kernel, dim=len(self.pairs), inputs=inputs, device=self.device)]
+        made = [launch(report_contained_kernel, dim=len(self.pairs), inputs=inputs, device=self.device)]
+        if self._signed:
+            models, states, *posed = posed
+            inputs = [self._stack_length(), models, states, self.batch.solids.pool, *posed]
+            inputs += [self.guard.launched, self.hits, self.distances]
+            dim = len(self.pairs) * (WARP_SIZE if self.device.is_cuda else 1)
+            made.append(launch(find_depth_kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
+        return made
 
     def _fit_slabs(self):
         """Make room for the slabs of all tree states that there are now; a graph goes on without."""

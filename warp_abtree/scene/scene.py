@@ -9,7 +9,7 @@ from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
 from warp_abtree.model.model import Model
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.distance import DistanceQuery, check_beyond
+from warp_abtree.query.distance import DistanceQuery, check_beyond, check_signed
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import Result, contact_dtypes
@@ -302,6 +302,7 @@ class Scene:
         tolerance=None,
         relative=None,
         beyond=None,
+        signed=None,
     ) -> Result:
         """Test object pairs for intersection, exactly as posed and at their LODs. Waits for the device.
 
@@ -322,13 +323,14 @@ class Scene:
             contact_dtype: Type of the real numbers in contacts, float64 or float32.
             device: Whether the result's arrays stay on the scene's device, see `Result`.
             tolerance, relative, beyond: When the search of a distance ends, see `DistanceQuery`; for "distance" alone.
+            signed: Whether distances are negative where solids are deep in one another; for "distance" alone.
 
         Raises:
             ValueError: Bad pairs, a bad distance, an unknown option, or a scene without objects.
         """
         check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)
-        options = {"tolerance": tolerance, "relative": relative, "beyond": beyond}
+        options = {"tolerance": tolerance, "relative": relative, "beyond": beyond, "signed": signed}
         options = {name: value for name, value in options.items() if value is not None}
         if output == "distance":
             refuse_options(output, {"precision": precision != "exact", "within": within is not None})
@@ -360,14 +362,16 @@ class Scene:
     def _find_distances(self, pairs, options: dict, device: bool) -> Result:
         pairs = self.broad_phase() if pairs is None else check_pairs(pairs, self.object_count)
         beyond = check_beyond(options.pop("beyond", None), len(pairs))
-        query = self._queries.pop(("distance",), None)
+        signed = check_signed(options.pop("signed", False))
+        key = ("distance", signed)
+        query = self._queries.pop(key, None)
         if isinstance(query, DistanceQuery):
             query.set_tolerance(**options)
             if not query.is_asked(pairs, beyond):
                 query.replace_pairs(pairs, beyond)
         else:
-            query = DistanceQuery(self, pairs=pairs, beyond=beyond, **options)
-        return self._run(("distance",), query, device)
+            query = DistanceQuery(self, pairs=pairs, beyond=beyond, signed=signed, **options)
+        return self._run(key, query, device)
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.

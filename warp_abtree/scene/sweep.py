@@ -119,9 +119,8 @@ class _Chunk:
         self.batch = Batch(pair.models, pair.states, objects, np.repeat(pair.object_model, [1, room]), solid=solid)
         self.chunk_query: _ChunkQuery | None = None
 
-    def find_query(self, output, precision):
-        """Return the chunk's query if it is of this output and precision, else another."""
-        key = (output, precision)
+    def find_query(self, *key):
+        """Return the chunk's query if it is of this output, precision and sign, else another."""
         if self.chunk_query is None or self.chunk_query.key != key:
             self.chunk_query = None  # its memory first
             self.chunk_query = _ChunkQuery(self, key)
@@ -164,12 +163,12 @@ class _ChunkQuery:
 
     def __init__(self, chunk: _Chunk, key):
         self.key = key
-        self.output, precision = key
+        self.output, precision, signed = key
         self.device, self.room, self.objects = chunk.batch.device, chunk.room, chunk.batch.objects
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
         if self.output == "distance":
-            self.query: Query = DistanceQuery(chunk.batch, self.pairs)
+            self.query: Query = DistanceQuery(chunk.batch, self.pairs, signed=signed)
         else:
             self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision)
         self.count = self.room
@@ -344,7 +343,8 @@ def sweep(
         device: Warp device; None for Warp's default.
         solid: Whether both are solids (`Scene.add`), or a bool for each; what "any" and "distance" answer for one
             inside the other stands in `warp_abtree.state.solids`, "count" and "faces" are of surfaces.
-        options: tolerance, relative and beyond, each one number, as `DistanceQuery` takes them; for "distance" alone.
+        options: tolerance, relative, beyond, each one number, and signed, as `DistanceQuery` takes them; for "distance"
+            alone.
 
     Returns:
         For "any" bool (p,), for "count" the intersecting face pairs of each pose, int64 (p,), for "faces" rows (pose,
@@ -380,7 +380,7 @@ def _sweep(pair, poses, asked, options):
         owners = [weakref.ref(model, lambda _: _kept.pop(key, None)) for model in models]
         posed = _PosedModels(pair, owners)
     chunk = posed.find_chunk(len(poses))
-    query = chunk.find_query(output, precision)
+    query = chunk.find_query(output, precision, bool(options.pop("signed", False)))
     if output == "distance":
         tolerances = {name: value for name, value in options.items() if name != "beyond"}
         answers = query.find_distances(poses, tolerances, check_beyond(options.get("beyond")))
