@@ -77,12 +77,14 @@ class QueryReadout(QueryBuffers):
         if self.output == "faces":
             total = int(views.counts[0].sum())
         if len(self.hits.uncertain):
-            uncertain = int(views.counts[FLOAT64_ROW].sum())
+            apart = 0 if self._gap is None else int(self.hits.apart_total.numpy().view(np.uint32)[0])
+            uncertain = max(apart, int(views.counts[FLOAT64_ROW].sum()))
         return Totals(self.guard.outcome(), found, total, uncertain)
 
     def _totals(self, words) -> Totals:
         """Return the demands in a header; those of lists that the query lacks are 0."""
-        launched, found, hits, uncertain = words[:HEADER].tolist()
+        launched, found, hits, uncertain, apart = words[:HEADER].tolist()
+        uncertain = max(uncertain, apart)
         found = len(self._given) if self.broad_phase is None else self.broad_phase.check_found(found)
         return Totals(
             launched, found, hits if self.output == "faces" else 0, uncertain if len(self.hits.uncertain) else 0
