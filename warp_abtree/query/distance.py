@@ -49,7 +49,7 @@ def check_beyond(beyond, pair_count=None) -> np.ndarray:
     return check_within(beyond, pair_count, "beyond")
 
 
-def make_tolerances(tolerance, relative):
+def make_tolerances(tolerance=0.0, relative=0.0):
     """Return the tolerances of a search for a kernel."""
     tolerances = frame.Tolerances()
     tolerances.tolerance = check_tolerance(tolerance, "tolerance", math.inf)
@@ -69,23 +69,45 @@ def check_tolerance(tolerance, name: str, most: float) -> float:
     return float(value)
 
 
+def check_originals(originals) -> bool:
+    """Return whether originals are asked about.
+
+    Raises:
+        ValueError: It is neither True nor False.
+    """
+    if not isinstance(originals, bool | np.bool_):
+        raise ValueError(f"originals {originals!r} is neither True nor False")
+    return bool(originals)
+
+
 def check_asked(output, precision, options):
     """Check what is asked of a sweep.
 
     Raises:
-        TypeError: An option with another name than tolerance, relative and beyond.
+        TypeError: An option with another name than tolerance, relative, beyond and originals.
         ValueError: A bad option, output or precision, or one that means nothing beside another.
     """
-    unknown = set(options) - {"tolerance", "relative", "beyond"}
+    unknown = set(options) - {"tolerance", "relative", "beyond", "originals"}
     if unknown:
         raise TypeError(f"sweep has no option {sorted(unknown)[0]!r}")
     if output == "distance":
         refuse_options(output, {"precision": precision != "exact"})
         make_tolerances(options.get("tolerance", 0.0), options.get("relative", 0.0))
         check_beyond(options.get("beyond"))
+        check_originals(options.get("originals", False))
     else:
         refuse_options(output, options)
         check_request(output, precision)
+
+
+def prepare_query(query, batch, pairs: np.ndarray, beyond: np.ndarray, tolerances: dict):
+    """Return a `DistanceQuery` for what is asked, checked: the one of before if there is one, else another."""
+    if query is None:
+        return DistanceQuery(batch, pairs=pairs, beyond=beyond, **tolerances)
+    query.set_tolerance(**tolerances)
+    if not query.is_asked(pairs, beyond):
+        query.replace_pairs(pairs, beyond)
+    return query
 
 
 class DistanceQuery(Query):
@@ -149,6 +171,13 @@ class DistanceQuery(Query):
     def forget(self):
         """Let the next launch start anew, and not from the faces that the last one found. Launches only."""
         self._found.faces.fill_(int(frame.NO_FACES))
+
+    def start_from(self, faces: np.ndarray):
+        """Let the next launch start from a face of each object of the pairs in place, int32 (p, 2); -1 for none."""
+        order = self._given[:, 0] > self._given[:, 1]
+        faces = np.where(order[:, None], faces[:, ::-1], faces).astype(np.int64)
+        items = np.where(faces.min(1) < 0, int(frame.NO_FACES), (faces[:, 0] << 32) | faces[:, 1])
+        wp.copy(self._found.faces, wp.array(items, dtype=wp.int64, device="cpu", copy=False), count=len(items))
 
     def _fill_within(self):
         beyond = self._asked if self._within is None else self._within

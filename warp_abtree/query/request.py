@@ -74,6 +74,11 @@ def check_request(output: str, precision: str):
         raise ValueError(f"output {output!r} is found by ab.{others[output]}, or Scene.intersect")
 
 
+def given_options(**options) -> dict:
+    """Return the options that are not None."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
 def refuse_options(output: str, given: dict):
     """Raise ValueError for options, by name, that are given though they mean nothing for an output."""
     for name, is_given in given.items():

@@ -9,10 +9,11 @@ from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
 from warp_abtree.model.model import Model
 from warp_abtree.query.broad_phase import EVERY_WORLD, BroadPhase
 from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.distance import DistanceQuery, check_beyond
+from warp_abtree.query.distance import check_beyond, check_originals, make_tolerances, prepare_query
 from warp_abtree.query.narrow_phase import Query
-from warp_abtree.query.request import check_request, check_within, refuse_options
+from warp_abtree.query.request import check_request, check_within, given_options, refuse_options
 from warp_abtree.query.result import Result, contact_dtypes
+from warp_abtree.scene.originals import OriginalDistances
 from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, launch_place, place_rows
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.batch import Batch, check_pairs, exclusion_keys
@@ -71,6 +72,7 @@ class Scene:
         self._broad_phase: BroadPhase | None = None
         self._host_poses: HostPoses | None = None
         self._queries: dict[tuple, Query] = {}
+        self._originals: OriginalDistances | None = None
 
     @property
     def object_count(self) -> int:
@@ -134,7 +136,7 @@ class Scene:
         self._batch.retire()
         self._added_pose, self._lod = list(matrices), self._batch.lods.tolist()
         self._queries.clear()
-        self._broad_phase = self._host_poses = None
+        self._broad_phase = self._host_poses = self._originals = None
         self._batch = None
 
     def batch(self) -> Batch:
@@ -258,6 +260,7 @@ class Scene:
         tolerance=None,
         relative=None,
         beyond=None,
+        originals: bool = False,
     ) -> Result:
         """Test object pairs for intersection, exactly as posed and at their LODs. Waits for the device.
 
@@ -277,15 +280,15 @@ class Scene:
                 finds overlapping boxes only, whatever d is.
             contact_dtype: Type of the real numbers in contacts, float64 or float32.
             device: Whether the result's arrays stay on the scene's device, see `Result`.
-            tolerance, relative, beyond: When the search of a distance ends, see `DistanceQuery`; for "distance" alone.
+            tolerance, relative, beyond: When the search of a "distance" ends, see `DistanceQuery`.
+            originals: Whether it is that of the original meshes, whatever the LODs, see `warp_abtree.query.distance`.
 
         Raises:
             ValueError: Bad pairs, a bad distance, an unknown option, or a scene without objects.
         """
         check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)
-        options = {"tolerance": tolerance, "relative": relative, "beyond": beyond}
-        options = {name: value for name, value in options.items() if value is not None}
+        options = given_options(tolerance=tolerance, relative=relative, beyond=beyond, originals=originals or None)
         if output == "distance":
             refuse_options(output, {"precision": precision != "exact", "within": within is not None})
             return self._find_distances(pairs, options, device)
@@ -316,14 +319,14 @@ class Scene:
     def _find_distances(self, pairs, options: dict, device: bool) -> Result:
         pairs = self.broad_phase() if pairs is None else check_pairs(pairs, self.object_count)
         beyond = check_beyond(options.pop("beyond", None), len(pairs))
+        if check_originals(options.pop("originals", False)):
+            make_tolerances(**options)
+            batch = self.batch()
+            if self._originals is None:
+                self._originals = OriginalDistances(batch)
+            return self._originals.run(pairs, beyond, **options, device=device)
         query = self._queries.pop(("distance",), None)
-        if isinstance(query, DistanceQuery):
-            query.set_tolerance(**options)
-            if not query.is_asked(pairs, beyond):
-                query.replace_pairs(pairs, beyond)
-        else:
-            query = DistanceQuery(self, pairs=pairs, beyond=beyond, **options)
-        return self._run(("distance",), query, device)
+        return self._run(("distance",), prepare_query(query, self, pairs, beyond, options), device)
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.

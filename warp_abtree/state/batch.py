@@ -84,6 +84,28 @@ class Batch:
         wp.copy(objects.pool.position, placed.position)
         return Batch(self.models, StateArrays(self.models, self.device), objects, self.object_model, self.excluded)
 
+    def at_finest(self) -> Batch:
+        """Return a batch of the same objects at their finest LODs, which follows their poses; see `add_finest`."""
+        placed = self.objects.pool
+        objects = ObjectArrays(placed.world.numpy(), placed.is_static.numpy(), self.device)
+        objects.pool.rotation, objects.pool.position = placed.rotation, placed.position
+        batch = Batch(self.models, StateArrays(self.models, self.device), objects, self.object_model, self.excluded)
+        batch._lods = self.models.lod_max[self.object_model]
+        return batch
+
+    def add_finest(self, models):
+        """Make tree states of some more models of `at_finest`, and point their objects at them."""
+        states, serving = self.states, self.objects.state.copy()
+        with states.change():
+            ids = states.reserve(models)
+            moves = [(state, int(self.models.lod_max[model]), -1) for state, model in zip(ids, models, strict=True)]
+            update = LodUpdate(self.models, states, moves)
+            for state, model in zip(ids, models, strict=True):
+                serving[self.object_model == model] = state
+            staged = self.objects.stage_states(serving, states.generation)
+            update.launch()
+            self.objects.set_states(serving, staged)
+
     def set_lods(self, lods) -> LodUpdate:
         """Bring every object to an LOD, int (n,) within its model's range: wholly, or not at all."""
         self._lead()
