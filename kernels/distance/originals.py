@@ -172,7 +172,7 @@ def bound_originals_kernel(
     bracket = distances_inout.bracket[p]
     bracket[0] = wp.max(bracket[0] - errors[p] * frame.stretch * SUM_ROUNDING, wp.float64(0.0))
     faces = distances_inout.faces[p]
-    if faces[0] >= 0:
+    if faces[0] >= 0 and faces[1] >= 0:
         face_a, face_b = wp.where(swapped, faces[1], faces[0]), wp.where(swapped, faces[0], faces[1])
         witness = distances_inout.points[p][wp.where(swapped, 0, 1)]
         target = wp.transpose(objects.rotation[a]) * (witness - objects.position[a])

@@ -244,6 +244,26 @@ def test_frames_off_orthonormal(device):
         assert (lower <= truth + 1e-14).all() and (truth <= upper + 1e-14).all()
 
 
+def test_solids(device):
+    """What is inside a solid intersects it, also beside pairs that LODs decide."""
+    cow, ball = sample("cow"), sample("ball")
+    scene = ab.Scene(device)
+    scene.add(ball, lod=ball.lod_for(fraction=0.3), solid=True)
+    small = ab.Model.from_arrays(ball.mesh_at(ball.lod_max)[0] / 9, ball.mesh_at(ball.lod_max)[1])
+    scene.add(small, lod=small.lod_for(fraction=0.3))
+    scene.add(cow, (30, 0, 0, 0, 0, 0, 1), lod=cow.lod_for(fraction=0.3))
+    scene.add(ball, (60, 0, 0, 0, 0, 0, 1))
+    scene.add(small, (60, 0, 0, 0, 0, 0, 1))
+    pairs = [(0, 1), (1, 2), (3, 4)]
+    found = scene.intersect(pairs, "distance", originals=True, relative=0.3)
+    np.testing.assert_array_equal(found.any, [True, False, False])
+    assert found.distance[0] == 0 < found.distance[2] < found.distance[1]
+    scene.set_lods([model.lod_max for model in (ball, small, cow, ball, small)])
+    lower, upper = found.bracket.T
+    truth = scene.intersect(pairs, "distance").distance
+    assert (lower <= truth).all() and (truth <= upper).all()
+
+
 def test_bad_input(device):
     scene = scene_of(device, random_cases(np.random.default_rng(9), 1))
     pairs = [(0, 1)]

@@ -88,7 +88,10 @@ class OriginalDistances:
         model = self.batch.object_model[pairs]
         asked = np.maximum(tolerances["tolerance"], tolerances["relative"] * self.batch.models.size[model].sum(1))
         asked = np.maximum(asked, np.where(np.isfinite(beyond), beyond, 0.0))
-        return ~self._made[model].all(1) & (errors <= HOPE * asked)
+        # Errors of surfaces say nothing of what lies inside a solid.
+        solids = self.batch.solids
+        hopeless = self._made[model].all(1) | (False if solids is None else solids.is_solid[pairs].any(1))
+        return ~hopeless & (errors <= HOPE * asked)
 
     def _ask_lods(self, pairs, beyond, tolerances) -> DistanceQuery:
         """Return a query of pairs at their LODs."""
@@ -98,8 +101,9 @@ class OriginalDistances:
 
     def _ask_originals(self, pairs, beyond, tolerances) -> DistanceQuery:
         """Return a query of pairs at their finest LODs, after making the tree states that it lacks."""
-        query, finest, made = self._at_finest, self.finest or self.batch.at_finest(), self._made
+        query, finest, made = self._at_finest, self.finest, self._made
         self._at_finest, self.finest, self._made = None, None, np.zeros_like(made)
+        finest = finest or self.batch.with_own_states(follows_poses=True)
         missing = np.setdiff1d(self.batch.object_model[pairs], np.flatnonzero(made))
         if len(missing):
             finest.add_finest(missing.tolist())
