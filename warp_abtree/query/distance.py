@@ -63,7 +63,7 @@ def check_beyond(beyond, pair_count=None) -> np.ndarray:
     return check_within(beyond, pair_count, "beyond")
 
 
-def make_tolerances(tolerance, relative):
+def make_tolerances(tolerance=0.0, relative=0.0):
     """Return the tolerances of a search for a kernel."""
     tolerances = frame.Tolerances()
     tolerances.tolerance = check_tolerance(tolerance, "tolerance", math.inf)
@@ -83,31 +83,53 @@ def check_tolerance(tolerance, name: str, most: float) -> float:
     return float(value)
 
 
-def check_signed(signed) -> bool:
-    """Return whether distances are signed; raise ValueError for what is no bool."""
-    if not isinstance(signed, bool | np.bool_):
-        raise ValueError(f"signed {signed!r} is neither True nor False")
-    return bool(signed)
+def check_flag(value, name: str) -> bool:
+    """Return a bool, such as signed or originals; raise ValueError for what is none."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} {value!r} is neither True nor False")
+    return bool(value)
+
+
+def check_flags(options: dict) -> tuple[bool, bool]:
+    """Return whether distances are signed, and whether of originals.
+
+    Raises:
+        ValueError: One that is no bool, or both are asked: depths are those of LODs.
+    """
+    signed, originals = (check_flag(options.get(name, False), name) for name in ("signed", "originals"))
+    if signed and originals:
+        raise ValueError("signed means nothing beside originals; ask at the finest LODs")
+    return signed, originals
 
 
 def check_asked(output, precision, options):
     """Check what is asked of a sweep.
 
     Raises:
-        TypeError: An option with another name than tolerance, relative, beyond and signed.
+        TypeError: An option with another name than tolerance, relative, beyond, signed and originals.
         ValueError: A bad option, output or precision, or one that means nothing beside another.
     """
-    unknown = set(options) - {"tolerance", "relative", "beyond", "signed"}
+    unknown = set(options) - {"tolerance", "relative", "beyond", "signed", "originals"}
     if unknown:
         raise TypeError(f"sweep has no option {sorted(unknown)[0]!r}")
     if output == "distance":
         refuse_options(output, {"precision": precision != "exact"})
         make_tolerances(options.get("tolerance", 0.0), options.get("relative", 0.0))
         check_beyond(options.get("beyond"))
-        check_signed(options.get("signed", False))
+        check_flags(options)
     else:
         refuse_options(output, options)
         check_request(output, precision)
+
+
+def prepare_query(query, batch, pairs: np.ndarray, beyond: np.ndarray, tolerances: dict, signed: bool = False):
+    """Return a `DistanceQuery` for what is asked, checked: the one of before if there is one, else another."""
+    if query is None:
+        return DistanceQuery(batch, pairs=pairs, beyond=beyond, signed=signed, **tolerances)
+    query.set_tolerance(**tolerances)
+    if not query.is_asked(pairs, beyond):
+        query.replace_pairs(pairs, beyond)
+    return query
 
 
 class DistanceQuery(Query):
@@ -135,7 +157,7 @@ class DistanceQuery(Query):
     _memory: wp.array
 
     def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None, signed=False):
-        self._signed = check_signed(signed)
+        self._signed = check_flag(signed, "signed")
         self._tolerances = make_tolerances(tolerance, relative)
         self._asked = check_beyond(beyond, None if pairs is None else len(to_numpy(pairs, "pairs")))
         self.distances, self._found, self._slabs = report.Distances(), frame.Found(), slabs.Slabs()
@@ -173,6 +195,13 @@ class DistanceQuery(Query):
     def forget(self):
         """Let the next launch start anew, and not from the faces that the last one found. Launches only."""
         self._found.faces.fill_(int(frame.NO_FACES))
+
+    def start_from(self, faces: np.ndarray):
+        """Let the next launch start from a face of each object of the pairs in place, int32 (p, 2); -1 for none."""
+        order = self._given[:, 0] > self._given[:, 1]
+        faces = np.where(order[:, None], faces[:, ::-1], faces).astype(np.int64)
+        items = np.where(faces.min(1) < 0, int(frame.NO_FACES), (faces[:, 0] << 32) | faces[:, 1])
+        wp.copy(self._found.faces, wp.array(items, dtype=wp.int64, device="cpu", copy=False), count=len(items))
 
     def _fill_within(self):
         beyond = self._asked if self._within is None else self._within

@@ -12,7 +12,7 @@ OUTPUTS = {"any": face_pairs.OUTPUT_ANY, "count": face_pairs.OUTPUT_COUNT, "face
 PRECISIONS = {"exact": predicates.EXACT, "float32": predicates.FLOAT32}
 
 # What one output alone takes, beside distances that most do.
-OPTIONS = {"within", "tolerance", "relative", "beyond", "signed", "gap"}
+OPTIONS = {"within", "tolerance", "relative", "beyond", "signed", "originals", "gap"}
 
 # A launch of 32 threads a pair stays within 2^31.
 PAIRS_MAX = 2**26
@@ -79,11 +79,11 @@ def check_request(output: str, precision: str):
 
 
 def given_options(caller: str, **options) -> dict:
-    """Return the options that are not None; raise TypeError for one that none of the outputs has."""
+    """Return the options that are neither None nor False; raise TypeError for one that none of the outputs has."""
     unknown = set(options) - OPTIONS
     if unknown:
         raise TypeError(f"{caller} has no option {sorted(unknown)[0]!r}")
-    return {name: value for name, value in options.items() if value is not None}
+    return {name: value for name, value in options.items() if value is not None and value is not False}
 
 
 def refuse_options(output: str, given: dict):

@@ -325,9 +325,10 @@ class Scene:
             contact_dtype: Type of the real numbers in contacts, float64 or float32.
             device: Whether the result's arrays stay on the scene's device, see `Result`.
             options: What one output alone takes, None as if not given. Of "distance": tolerance, relative and beyond,
-                when the search ends, and signed, whether depths of solids are negative distances, see `DistanceQuery`.
-                Of "contacts": gap, a distance [world units] or (p,) of them: faces nearer than that have contacts too,
-                and all have a separation.
+                when the search ends, and signed, whether depths of solids are negative distances, see `DistanceQuery`;
+                originals, whether it is that of the original meshes, whatever the LODs, see
+                `warp_abtree.query.distance`. Of "contacts": gap, a distance [world units] or (p,) of them: faces nearer
+                than that have contacts too, and all have a separation.
 
         Raises:
             TypeError: An option with another name.
