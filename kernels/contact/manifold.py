@@ -346,7 +346,8 @@ def find_candidate_kernel(
     Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least.
 
     Args:
-        gap: How far outside the second point may be [world units], shape [pair]; [0] for not at all.
+        gap: How far outside the second point may be, of faces that look at one another [world units], shape [pair]; [0]
+            for not at all.
     """
     i = wp.tid()
     if i >= start[start.shape[0] - 1] or not have_crossed(contacts, i):
@@ -363,7 +364,7 @@ def find_candidate_kernel(
     first = 3 * swapped
     zero = wp.float64(0.0)
     least = zero
-    if gap.shape[0] > 0:
+    if gap.shape[0] > 0 and -wp.dot(normal_a, normal_b) >= LIKENESS:
         least = -gap[p]
     n = back * curves_inout.loop_normal[curves_inout.loop[i]]
     loop = n

@@ -24,6 +24,16 @@ NEARER = wp.constant(wp.float64(0.998))
 
 
 @wp.struct
+class Rows:
+    """Contacts of all pairs in two orders."""
+
+    start: wp.array(dtype=wp.int32)  # where those of each pair start, shape [pair + 1]
+    faces: wp.array(dtype=wp.vec3i)  # pair and faces, in the order of the first object's faces, shape [contact]
+    order: wp.array(dtype=wp.int32)  # contacts in the order of the second object's faces, shape [contact]
+    key: wp.array(dtype=wp.int64)  # pair and face of each in that order, shape [contact]
+
+
+@wp.struct
 class NearRow:
     """A contact of faces that are apart, in A's frame and the order of the pair."""
 
@@ -31,6 +41,16 @@ class NearRow:
     second: wp.vec3d  # of the second's
     square: wp.float64  # of their distance, under which another face is nearer
     swapped: wp.int32  # 1 where the pair names B first
+
+
+@wp.func
+def make_row(pose: PairPose, back: wp.mat33d, position: wp.vec3d, p0: wp.vec3d, p1: wp.vec3d):
+    row = NearRow()
+    row.first = back * (p0 - position) * pose.scale
+    row.second = back * (p1 - position) * pose.scale
+    row.square = NEARER * wp.dot(row.second - row.first, row.second - row.first)
+    row.swapped = pose.swapped
+    return row
 
 
 @wp.func
@@ -58,28 +78,26 @@ def are_surfaces_nearest(
     pose: PairPose,
     row: NearRow,
     i: wp.int32,
-    faces: wp.array(dtype=wp.vec3i),
-    order: wp.array(dtype=wp.int32),
-    key: wp.array(dtype=wp.int64),
-    count: wp.int32,
+    rows: Rows,
     corner: wp.array(dtype=wp.vec3d),
 ):
     """Return whether no face in contact with either face of contact i is nearer to its points than they are."""
-    own = faces[i]
+    own = rows.faces[i]
+    count = rows.start[rows.start.shape[0] - 1]
     j = i - 1
-    while j >= 0 and faces[j][0] == own[0] and faces[j][1] == own[1]:
-        if is_nearer(models, states, pose, row, faces[j], False, corner):
+    while j >= 0 and rows.faces[j][0] == own[0] and rows.faces[j][1] == own[1]:
+        if is_nearer(models, states, pose, row, rows.faces[j], False, corner):
             return False
         j -= 1
     j = i + 1
-    while j < count and faces[j][0] == own[0] and faces[j][1] == own[1]:
-        if is_nearer(models, states, pose, row, faces[j], False, corner):
+    while j < count and rows.faces[j][0] == own[0] and rows.faces[j][1] == own[1]:
+        if is_nearer(models, states, pose, row, rows.faces[j], False, corner):
             return False
         j += 1
     wanted = (wp.int64(own[0]) << wp.int64(31)) | wp.int64(own[2])
-    j = wp.lower_bound(key, 0, count, wanted)
-    while j < count and key[j] == wanted:
-        if is_nearer(models, states, pose, row, faces[order[j]], True, corner):
+    j = wp.lower_bound(rows.key, 0, count, wanted)
+    while j < count and rows.key[j] == wanted:
+        if is_nearer(models, states, pose, row, rows.faces[rows.order[j]], True, corner):
             return False
         j += 1
     return True
@@ -93,10 +111,7 @@ def find_near_candidate_kernel(
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
     gap: wp.array(dtype=wp.float64),
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    order: wp.array(dtype=wp.int32),
-    key: wp.array(dtype=wp.int64),
+    rows: Rows,
     contacts: Contacts,
     curves_inout: Curves,
 ):
@@ -107,19 +122,18 @@ def find_near_candidate_kernel(
 
     Args:
         gap: Under which face pairs are near [world units], shape [pair].
-        order, key: Contacts in the order of the second object's faces, and keys of pair and face.
     """
     i = wp.tid()
-    count = start[start.shape[0] - 1]
-    if i >= count or have_crossed(contacts, i):
+    if i >= rows.start[rows.start.shape[0] - 1] or have_crossed(contacts, i):
         return
-    p = faces[i][0]
+    own = rows.faces[i]
+    p = own[0]
     pose = pair_poses[p]
     a = wp.min(pairs[p][0], pairs[p][1])
     rotation, position = objects.rotation[a], objects.position[a]
     back = wp.transpose(rotation)
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(models, states, pose, faces[i][1 + pose.swapped], faces[i][2 - pose.swapped], corner)
+    load_corners(models, states, pose, own[1 + pose.swapped], own[2 - pose.swapped], corner)
     normal_a, normal_b = back * contacts.normal_a[i], back * contacts.normal_b[i]
     first = 3 * pose.swapped
     n = back * contacts.normal[i]
@@ -132,11 +146,7 @@ def find_near_candidate_kernel(
             n, depth, point, other, second = -normal_b, d, x, e, y
         elif depth > NO_DEPTH:
             n = normal_a
-    row = NearRow()
-    row.first = back * (contacts.p0[i] - position) * pose.scale
-    row.second = back * (contacts.p1[i] - position) * pose.scale
-    row.square = NEARER * wp.dot(row.second - row.first, row.second - row.first)
-    row.swapped = pose.swapped
+    row = make_row(pose, back, position, contacts.p0[i], contacts.p1[i])
     nearest = bool(True)
     if not (wp.abs(wp.abs(depth) - contacts.separation[i]) <= ALIKE * contacts.separation[i]):
         n = back * contacts.normal[i]
@@ -144,7 +154,7 @@ def find_near_candidate_kernel(
         point = (row.first + row.second) * (wp.float64(0.5) / pose.scale)
         nearest = wp.dot(n, normal_a) > wp.float64(0.0) and wp.dot(n, normal_b) < wp.float64(0.0)
     if nearest and (depth > wp.float64(0.0) or other != other):
-        nearest = are_surfaces_nearest(models, states, pose, row, i, faces, order, key, count, corner)
+        nearest = are_surfaces_nearest(models, states, pose, row, i, rows, corner)
     if not nearest:
         depth, other = NO_POINT, NO_POINT
     write_candidates(i, rotation, position, n, wp.vec2d(depth, other), point, second, contacts, curves_inout)

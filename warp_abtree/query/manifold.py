@@ -93,7 +93,9 @@ class ManifoldQuery(ContactQuery):
         self._sort_keys(count, 31 + room.bit_length())
         self._launch_kernel(manifold.link_loop_kernel, count, [start, rows, contacts, self._order, self._key, curves])
         if self._gap is not None:
-            inputs = [*posed, gap, start, rows, self._order, self._key, contacts, curves]
+            both = near_points.Rows()
+            both.start, both.faces, both.order, both.key = start, rows, self._order, self._key
+            inputs = [*posed, gap, both, contacts, curves]
             self._launch_kernel(near_points.find_near_candidate_kernel, count, inputs, WARP_SIZE)
         self._launch_kernel(manifold.name_loop_kernel, count, [start, contacts, curves, self._order, self._key])
         self._sort_keys(count, 31)
