@@ -240,17 +240,22 @@ class Query(QueryReadout):
         if not self.uses_warps():
             inputs += [self._regime.plain_tests, self.slab_memory, hits, self.work]
             return [first, launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device)]
-        # More than there are units, where these are few: idle warps wait for donations.
-        warps = max(room, int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1)
-        warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         traversal = launch(
             dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
-            dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
+            dim=self._warp_count() * (WARP_SIZE if self.device.is_cuda else 1),
             inputs=[self._stack_length(), *inputs, hits, self.work],
             block_dim=WARP_SIZE,
             device=self.device,
         )
         return [first, traversal]
+
+    def _warp_count(self) -> int:
+        """Return the warps of a launch: more than units, where these are few, so that some wait for donations."""
+        if not self.device.is_cuda:
+            return 1
+        room = len(self.pairs)
+        warps = max(room, int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1)
+        return min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count)
 
     def _stack_length(self) -> int:
         length = self._regime.stack_length
