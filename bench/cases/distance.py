@@ -2,7 +2,8 @@
 
 Gaps are fractions of the mesh's size, poses otherwise random. Times are of a pose: of all poses at once, where each
 search starts anew (fresh) or from the faces of the launch before (again), and of one pair alone, launched to the
-result on the host. On the CPU all on one core, beside python-fcl, whose answers must be ours but for rounding.
+result on the host. On the CPU all on one core, beside python-fcl, whose answers must be ours but for rounding. Then
+distances of originals while objects stand at coarse LODs, and their brackets at many configurations (`originals`).
 """
 
 import time
@@ -12,25 +13,35 @@ import warp as wp
 
 import warp_abtree as ab
 
+from .. import originals
 from ..baselines.fcl import Fcl
 from ..meshes import ModelFolder, knot_model, mesh_file
 from ..shapes import longest_side, pose_matrices, random_poses, scene_of_poses
 from ..timing import medians, no_garbage_collection, one_core, time_in_turn
 from .assembly import place_nut
 
-FULL = {"poses": 32, "counts": (1, 1024, 65536), "knot": 5000, "repeats": 7}
+FULL = {"poses": 32, "counts": (1, 1024, 65536), "knot": 5000, "repeats": 7, "refined": 256}
 CPU = FULL | {"counts": (1, 1024)}
-QUICK = {"poses": 3, "counts": (3,), "knot": 300, "repeats": 1}
+QUICK = {"poses": 3, "counts": (3,), "knot": 300, "repeats": 1, "refined": 4}
+CONFIGURATIONS, QUICK_CONFIGURATIONS = 100_000, 60
 GAPS = 0.3, 0.01  # of the size, first and last
 IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 MESHES = ("cow", "rocker-arm", "stanford-bunny")
+REFINED = ("rocker-arm", "stanford-bunny")
 NUT = ("factory-bolt-m20", "factory-nut-m20")
 LAUNCHES_BEFORE = 20  # of the pair alone, as in a loop that goes on: slabs are made of what is asked often
 STEPS = 25  # of the bisection that places a pose at a gap
 
 
-def run(device, quick=False):
-    """Yield a row a workload: times [ms] and what the searches took; of baselines, where they are at hand."""
+def run(device, count=None, quick=False):
+    """Yield a row a workload: times [ms] and what the searches took; of baselines, where they are at hand.
+
+    Args:
+        count: Configurations whose brackets of originals are checked.
+
+    Raises:
+        RuntimeError: A distance or a bracket was wrong.
+    """
     device = wp.get_device(device)
     sizes = QUICK if quick else CPU if device.is_cpu else FULL
     folder = ModelFolder(None)
@@ -43,9 +54,14 @@ def run(device, quick=False):
         matrices = place_nut(models, sizes["poses"])["free"]
         yield measure("nut on bolt, free", models, matrices, device, sizes["repeats"])
     knots = knot_model(sizes["knot"])
-    for count in sizes["counts"]:
-        matrices = pose_matrices(random_poses(longest_side(knots), count))
-        yield measure(f"knot, {count} poses", [knots, knots], matrices, device, sizes["repeats"])
+    for number in sizes["counts"]:
+        matrices = pose_matrices(random_poses(longest_side(knots), number))
+        yield measure(f"knot, {number} poses", [knots, knots], matrices, device, sizes["repeats"])
+    for name in [name for name in REFINED if name in at_hand][: 1 if quick else None]:
+        model = folder.load([name])
+        matrices = place_at_gaps(model, sizes["refined"])
+        yield from originals.time_refining(name, model, matrices, device, sizes["repeats"])
+    yield from originals.verify(device, count or (QUICK_CONFIGURATIONS if quick else CONFIGURATIONS))
 
 
 def place_at_gaps(model, count):
