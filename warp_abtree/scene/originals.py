@@ -12,6 +12,8 @@ from warp_abtree.state.batch import Batch
 # Of what is asked: what certified errors may be, together, for a pair to be asked at its LODs, and what goes to the
 # search there; the rest goes to the faces of the originals that stand near the witnesses.
 HOPE, SEARCHED = 0.5, 0.5
+# Distance, in sizes, at which a fraction of it is such a length: how far a pair is apart is not known yet.
+FAR = 0.1
 # Ends a search at LODs, relative, where only distances beyond which nothing matters can decide.
 ROUGH = 0.5
 # Over what rotations that scenes take may lengthen an error by.
@@ -86,7 +88,8 @@ class OriginalDistances:
     def _may_decide(self, pairs, errors, beyond, tolerances) -> np.ndarray:
         """Return which pairs are asked at their LODs: errors are within what is asked, originals not at hand."""
         model = self.batch.object_model[pairs]
-        asked = np.maximum(tolerances["tolerance"], tolerances["relative"] * self.batch.models.size[model].sum(1))
+        size = self.batch.models.size[model].sum(1)
+        asked = np.maximum(tolerances["tolerance"], tolerances["relative"] * FAR * size)
         asked = np.maximum(asked, np.where(np.isfinite(beyond), beyond, 0.0))
         # Errors of surfaces say nothing of what lies inside a solid.
         solids = self.batch.solids

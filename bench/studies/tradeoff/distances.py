@@ -14,6 +14,7 @@ import warp_abtree as ab
 
 from ...baselines.fcl import Fcl
 from ...shapes import pose_matrices
+from ..motions import POSES_AT_A_TIME
 from .workload import workloads
 
 GAPS = (0.3, 0.1, 0.03, 0.01)  # of the size, from the first contact
@@ -26,39 +27,43 @@ OURS, OURS_FCL, TOLERANCE = "our LODs", "our LODs, python-fcl", "tolerance at th
 
 
 class Distances:
-    """A workload's poses apart, and queries about them at LODs."""
+    """A workload's poses apart, on CUDA several times over, and queries about them at LODs.
+
+    Attributes:
+        poses, truth: All poses, and their distances at the finest LODs.
+        once: How many of the first are not repeated.
+    """
 
     def __init__(self, context, workload):
         self.context, self.workload = context, workload
         posed = min(context.size(24, 6), len(workload.low))
         which = np.tile(np.arange(posed), len(GAPS))
         along = workload.low[which] + np.repeat(GAPS, posed) * workload.size
-        self.poses = workload.motions.poses(along, which)
+        poses, self.once = workload.motions.poses(along, which), len(which)
+        self.poses = np.tile(poses, (-(-POSES_AT_A_TIME // self.once) if context.device.is_cuda else 1, 1))
+        self._scenes = {}
         self.truth = self.ask((workload.a.lod_max, workload.b.lod_max)).run().distance
 
     def ask(self, lods, which=slice(None), **options):
         """Return a query of some poses at LODs."""
-        poses = self.poses[which]
-        scene = self.workload.scene(lods)
-        scene.place(poses)
-        return ab.DistanceQuery(scene.scene, scene.pairs[: len(poses)], **options)
+        if lods not in self._scenes:
+            self._scenes[lods] = self.workload.scene(lods, len(self.poses))
+            self._scenes[lods].place(self.poses)
+        scene = self._scenes[lods]
+        return ab.DistanceQuery(scene.scene, scene.pairs[: len(self.poses)][which], **options)
 
     def lods(self, fraction):
         """Return LODs of a fraction of the faces, 1 for the finest."""
         return self.workload.lods(fraction=fraction)
 
-    def time(self, queries: dict, on_core=False) -> dict:
-        """Return the time of a pose [us] of each query, or callable, in turn; each search starts anew."""
-
-        def anew(query):
-            return query if callable(query) else lambda: (query.forget(), query.launch())
-
-        times = self.context.time_launches({name: anew(query) for name, query in queries.items()}, on_core=on_core)
-        return {name: 1e3 * time / len(self.poses) for name, time in times.items()}
+    def time(self, queries: dict) -> dict:
+        """Return the time of a pose [us] of each query, in turn; each search starts anew."""
+        anew = {name: lambda query=query: (query.forget(), query.launch()) for name, query in queries.items()}
+        return {name: 1e3 * time / len(self.poses) for name, time in self.context.time_launches(anew).items()}
 
     def row(self, method, setting, found, proved, share, on_core):
         """Return a row of distances, time aside."""
-        error = np.abs(found - self.truth) / self.workload.size
+        error = np.abs(found - self.truth[: len(found)]) / self.workload.size
         row = {"case": "distance", "workload": self.workload.name, "method": method, "setting": setting}
         row |= {"where": "CPU core" if on_core else "GPU", "share": share, "proved": float(proved / self.workload.size)}
         return row | {"distance_mean": float(error.mean()), "distance_max": float(error.max())}
@@ -91,7 +96,7 @@ def measure_fcl(distances) -> dict:
     context, workload, rows, queries = distances.context, distances.workload, {}, {}
     if context.library("fcl") is None:
         return rows
-    matrices = pose_matrices(distances.poses)
+    matrices = pose_matrices(distances.poses[: distances.once])
     for value in context.size(FRACTIONS, QUICK_FRACTIONS):
         lods, setting = distances.lods(value), f"{value:.3g} of the faces"
         meshes = [model.mesh_at(lod)[:2] for model, lod in zip((workload.a, workload.b), lods, strict=True)]
@@ -100,8 +105,8 @@ def measure_fcl(distances) -> dict:
         shared = workload.bound(lods), workload.fraction(lods)
         rows[OURS_FCL, setting] = distances.row(OURS_FCL, setting, found, *shared, True)
         queries[OURS_FCL, setting] = fcl.distances
-    for key, us in distances.time(queries, on_core=True).items():
-        rows[key]["us"] = us
+    for key, time in context.time_launches(queries, on_core=True).items():
+        rows[key]["us"] = 1e3 * time / distances.once
     return rows
 
 
