@@ -9,21 +9,36 @@ import time
 from functools import partial
 
 import numpy as np
+import warp as wp
 
 import warp_abtree as ab
 
 from .meshes import ModelFolder, mesh_file
-from .shapes import longest_side, pose_matrices, random_poses, scene_of_poses
+from .shapes import longest_side, place_at_gaps, pose_matrices, random_poses, scene_of_poses
 from .timing import medians, no_garbage_collection, one_core, time_call, time_rounds
 
 MESHES = ("cow", "fandisk", "homer", "rocker-arm", "stanford-bunny", "woody")
 ROBOT = ("fcl-env", "fcl-rob")
+REFINED = ("rocker-arm", "stanford-bunny")
 IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 GROUP = 100  # configurations of two LODs
 REACH = 0.2, 2.5  # distances of centres, in sizes
 ASKED = ({"tolerance": 10.0}, {"tolerance": 0.1}, {"relative": 0.5}, {"relative": 0.1}, {"beyond": 0.3})
 TIMED = ({"relative": 0.05}, {"relative": 0.2}, {"tolerance": 0.03}, {"beyond": 0.1, "relative": 0.1})
 FRACTIONS = 0.1, 0.01
+
+
+def run(device, count=None, quick=False):
+    """Yield the rows of times, then those of brackets at a number of configurations.
+
+    Raises:
+        RuntimeError: A bracket does not hold the distance.
+    """
+    device, folder = wp.get_device(device), ModelFolder(None)
+    for name in [name for name in REFINED if mesh_file(name)][: 1 if quick else None]:
+        model = folder.load([name])
+        yield from time_refining(name, model, place_at_gaps(model, 4 if quick else 256), device, 1 if quick else 7)
+    yield from verify(device, count or (60 if quick else 100_000))
 
 
 def pairs_at_hand(folder) -> dict:

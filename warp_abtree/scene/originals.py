@@ -75,15 +75,24 @@ class OriginalDistances:
                 rows[name][rest] += getattr(result, name)
         return self._make_result(pairs, rows, device)
 
+    def reach(self) -> float:
+        """Return how much nearer than their LODs two originals may be at most [world units]."""
+        return 2 * STRETCH * float(self._errors()[0].max())
+
     def _measure(self, pairs) -> tuple[np.ndarray, np.ndarray]:
         """Return the certified errors of pairs, added up [model units], and which stand at their finest LODs."""
+        errors, whole = self._errors()
+        return errors[pairs].sum(1), whole[pairs].all(1)
+
+    def _errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the certified error of each object at its LOD [model units], and which stand at their finest LODs."""
         self.batch.catch_up()
         states, model = self.batch.states, self.batch.object_model
         lods = np.array([slot.lod for slot in states.slots])[self.batch.objects.state]
         errors = np.zeros(len(model))
         for k, error in enumerate(self.batch.models.lod_error):
             errors[model == k] = error[lods[model == k]]
-        return errors[pairs].sum(1), (lods == self.batch.models.lod_max[model])[pairs].all(1)
+        return errors, lods == self.batch.models.lod_max[model]
 
     def _may_decide(self, pairs, errors, beyond, tolerances) -> np.ndarray:
         """Return which pairs are asked at their LODs: errors are within what is asked, originals not at hand."""
