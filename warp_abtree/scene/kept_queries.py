@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.distance import check_beyond, check_originals, make_tolerances, prepare_query
+from warp_abtree.query.distance import check_beyond, check_flags, check_tolerances, prepare_query
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import Result
@@ -22,18 +23,17 @@ class KeptQueries:
 
     Attributes:
         kept: The queries, by what they answer.
-        originals: That of distances of originals.
     """
 
     def __init__(self, scene, find_pairs: Callable[[Any, float], np.ndarray]):
         self._scene, self._find_pairs = scene, find_pairs
         self.kept: dict[tuple, Query] = {}
-        self.originals: OriginalDistances | None = None
+        self._originals: OriginalDistances | None = None
 
     def clear(self):
         """Forget all queries."""
         self.kept.clear()
-        self.originals = None
+        self._originals = None
 
     def find_hits(self, pairs, output, precision, contact_dtype, options: dict, device: bool) -> Result:
         """Answer any output but "distance"; options are those that are given, `Scene.intersect` has them."""
@@ -60,24 +60,27 @@ class KeptQueries:
     def find_distances(self, pairs, options: dict, device: bool) -> Result:
         """Answer "distance"; options as for `find_hits`."""
         refuse_options("distance", {name: True for name in options if name in ("within", "gap")})
-        beyond, of_originals = options.pop("beyond", None), check_originals(options.pop("originals", False))
-        make_tolerances(**options)
+        signed, of_originals = check_flags(options)
+        tolerances = {name: value for name, value in options.items() if name in ("tolerance", "relative")}
+        check_tolerances(**tolerances)
+        beyond = options.get("beyond")
         reach = 0.0 if beyond is None else self._one_for_all(beyond, "beyond")
-        if not of_originals:
-            pairs = self._find_pairs(pairs, reach)
-            query = self.kept.pop(("distance",), None)
-            query = prepare_query(query, self._scene, pairs, check_beyond(beyond, len(pairs)), options)
-            return self._run(("distance",), query, device)
-        if self.originals is None:
-            self.originals = OriginalDistances(self._scene.batch())
-        # Originals may reach out of the boxes of their LODs by their errors.
-        pairs = self._find_pairs(pairs, reach + (0.0 if pairs is not None else self.originals.reach()))
-        return self.originals.run(pairs, check_beyond(beyond, len(pairs)), **options, device=device)
+        if of_originals:
+            if self._originals is None:
+                self._originals = OriginalDistances(self._scene.batch())
+            # Originals may lie out of the boxes of their LODs.
+            pairs = self._find_pairs(pairs, reach + (self._originals.reach() if pairs is None else 0.0))
+            return self._originals.run(pairs, check_beyond(beyond, len(pairs)), **tolerances, device=device)
+        pairs = self._find_pairs(pairs, reach)
+        beyond = check_beyond(beyond, len(pairs))
+        query = prepare_query(self.kept.pop(("distance", signed), None), self._scene, pairs, beyond, tolerances, signed)
+        return self._run(("distance", signed), query, device)
 
     @staticmethod
     def _one_for_all(distance, name: str) -> float:
         """Return a distance that is one for all pairs, checked; 0 where each pair has its own."""
-        return float(check_within(distance, name=name)) if np.ndim(distance) == 0 else 0.0
+        distance = to_numpy(distance, name)
+        return float(check_within(distance, name=name)) if distance.ndim == 0 else 0.0
 
     def _run(self, key: tuple, query: Query, device: bool) -> Result:
         """Run a query and keep it for the next time; one that fails, for lack of memory, gives its own back."""

@@ -324,18 +324,19 @@ class Scene:
                 With d = error_at(A) + error_at(B) it proves that the original meshes do not intersect.
             contact_dtype: Type of the real numbers in contacts, float64 or float32.
             device: Whether the result's arrays stay on the scene's device, see `Result`.
-            options: For "distance" tolerance, relative and beyond, when its search ends, see `DistanceQuery`; and
-                originals=True for the distances of the original meshes, whatever LODs their objects stand at. For
-                "contacts" gap, a distance [world units] or (p,) of them: faces nearer than that have contacts too, and
-                all have a separation.
+            options: What one output alone takes, None as if not given. Of "distance": tolerance, relative and beyond,
+                when the search ends, and signed, whether depths of solids are negative distances, see `DistanceQuery`;
+                originals, whether it is that of the original meshes, whatever the LODs, see
+                `warp_abtree.query.distance`. Of "contacts": gap, a distance [world units] or (p,) of them: faces nearer
+                than that have contacts too, and all have a separation.
 
         Raises:
-            TypeError: An option has another name.
+            TypeError: An option with another name.
             ValueError: Bad pairs, a bad distance, an unknown option, or a scene without objects.
         """
         check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)
-        options = given_options(options | {"within": within})
+        options = given_options("intersect", within=within, **options)
         if output == "distance":
             refuse_options(output, {"precision": precision != "exact"})
             return self._queries.find_distances(pairs, options, device)
