@@ -182,6 +182,7 @@ def test_lost_work_is_status_1(files, capsys, monkeypatch):
     ("words", "parts"),
     [
         *((f"{name} --help", (f"examples:\n  warp-abtree {name}", "--device")) for name in COMMANDS),
+        ("bench --help", ("[--json] NAME\n", "benchmark or study")),
         ("--help", ("exit status:\n  0 ", "examples:")),
         ("--version", (f"warp-abtree {ab.__version__}\n",)),
         ("--print-completion bash", ("--lod-a", "sweep", "compgen")),
