@@ -24,6 +24,8 @@ ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
 # Nodes so few levels above the leaves have slabs: of 8 faces at most.
 SLAB_DEPTH = wp.constant(3)
 NO_NODE = wp.constant(2**31 - 1)
+# Slabs separate little where boxes are hardly wider along their directions: by so many 64ths of the sum of widths.
+SLAB_GAIN_UNIT, SLAB_GAIN_LEAST = wp.constant(64), wp.constant(16)
 
 
 @wp.struct
@@ -111,8 +113,12 @@ def unit_scale(reach: wp.float64):
 
 @wp.func
 def has_slabs(models: ModelPool, states: StatePool, state: wp.int32):
-    """Return whether there are slabs of a state's nodes: they are of original faces."""
-    return models.node_slab.shape[0] > 0 and states.lod[state] == models.lod_max[states.model[state]]
+    """Return whether there are slabs of a state's nodes: of original faces, and where they gain."""
+    model = states.model[state]
+    if models.node_slab.shape[0] == 0 or states.lod[state] < models.lod_max[model]:
+        return False
+    gain = models.slab_gain[model]
+    return gain[0] > SLAB_GAIN_LEAST * gain[1]
 
 
 @wp.func

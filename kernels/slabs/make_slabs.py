@@ -3,6 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, load_vertex
+from warp_abtree.kernels.poses import SLAB_GAIN_UNIT
 from warp_abtree.kernels.slabs.overlap import DIRECTION_LENGTH
 from warp_abtree.kernels.traversal.boxes import round_up
 
@@ -79,8 +80,37 @@ def record_of(extent: Extent):
     return wp.vec4(wp.cast(n[0] | (n[1] << 16), wp.float32), wp.cast(n[2], wp.float32), sum, size)
 
 
+@wp.func
+def measure_box(models: ModelPool, model: wp.int32, node: wp.int32, level: wp.int32):
+    """Return the widths of the box of the faces below a node."""
+    widths = wp.vec3d()
+    for k in range(3):
+        axis = wp.vec3d()
+        axis[k] = wp.float64(1.0)
+        extent = measure_faces(models, model, node, level, axis)
+        widths[k] = extent.high - extent.low
+    return widths
+
+
+@wp.func
+def gain_of(widths: wp.vec3d, slab: Extent):
+    """Return by how much a box is wider than a slab, along the slab's direction, see `poses.SLAB_GAIN_UNIT`."""
+    n = slab.direction
+    whole = (wp.abs(n[0]) * widths[0] + wp.abs(n[1]) * widths[1]) + wp.abs(n[2]) * widths[2]
+    most = wp.float64(DIRECTION_LENGTH) * ((widths[0] + widths[1]) + widths[2])
+    if not most > wp.float64(0.0):
+        return wp.int32(0)
+    return wp.int32(wp.float64(SLAB_GAIN_UNIT) * (whole - (slab.high - slab.low)) / most)
+
+
 @wp.kernel
-def make_slab_kernel(model: wp.int32, first: wp.int32, models: ModelPool, slab_out: wp.array(dtype=wp.vec4)):
+def make_slab_kernel(
+    model: wp.int32,
+    first: wp.int32,
+    models: ModelPool,
+    slab_out: wp.array(dtype=wp.vec4),
+    gain_out: wp.array(dtype=wp.vec2i),
+):
     """Make the slab of each node of few faces, along its faces' mean normal or that of a face.
 
     Args:
@@ -112,3 +142,6 @@ def make_slab_kernel(model: wp.int32, first: wp.int32, models: ModelPool, slab_o
             if extent.high - extent.low < best.high - best.low:
                 best = extent
     slab_out[start + node] = record_of(best)
+    if count > 1:
+        gain = gain_of(measure_box(models, model, node, level), best)
+        wp.atomic_add(gain_out, model, wp.vec2i(gain, 1))

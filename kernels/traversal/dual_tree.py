@@ -9,7 +9,7 @@ import functools
 import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.poses import NO_NODE, PairPose
 from warp_abtree.kernels.slabs.overlap import slabs_overlap
 from warp_abtree.kernels.traversal.face_pairs import OUTPUT_ANY, Hits
 from warp_abtree.kernels.traversal.leaf_pairs import separate_leaf_pairs, test_straddling
@@ -57,8 +57,11 @@ STACK_MASK = wp.constant(STACK_LENGTH - 1)
 # Warps on one pair divide its work when there are about so many items for each, or as many as the stack takes then.
 ITEMS_PER_WARP = wp.constant(8)
 ITEMS_TO_DIVIDE = wp.constant(STACK_LENGTH // 2)
-# An early hit ends a pair for `any`, so few leaf pairs wait.
+# An early hit ends a pair for `any`, so few leaf pairs wait at first, and slabs wait for this turn.
 LEAF_PAIRS_FOR_ANY = wp.constant(8)
+SLAB_TURN = wp.constant(16)
+# Where warps share a pair of so few nodes above those of slabs that each has little to do, slabs would but delay it.
+SLAB_NODES = wp.constant(8)
 # A warp with work for two looks at every second turn whether others are idle, at every one where pairs are few: a turn
 # is so many visits, or fewer until a warp of leaf pairs waits, and their tests.
 DONATION_LEAST = wp.constant(16)
@@ -91,6 +94,7 @@ def expand_items(
     first: wp.int32,
     popped: wp.int32,
     ends: wp.vec3i,
+    floor: wp.vec2i,
     states: StatePool,
     pose: PairPose,
 ):
@@ -101,7 +105,7 @@ def expand_items(
     lane = warp_lane()
     item = read_item(items, (first + wp.min(lane, popped - 1)) & STACK_MASK)
     warp_sync()
-    children, lists, tests = compare_node_pair(states, pose, item, wp.where(lane < popped, -1, 0))
+    children, lists, tests = compare_node_pair(states, pose, floor, item, wp.where(lane < popped, -1, 0))
     found = push_children(items, ends, lists, children)
     warp_sync()
     return found, tests
@@ -160,7 +164,7 @@ def start_items(items: wp.uint64, part: wp.int32, parts: wp.int32, states: State
     while parts > 1 and ends[0] > head and ends[0] - head < wanted and ends[1] < warp_size() and ends[2] < warp_size():
         first = head
         head += wp.min(wp.min(warp_size(), (SLAB_PAIR_LENGTH - ends[1]) >> 2), ends[0] - head)
-        ends, more = expand_items(items, first, head - first, ends, states, pose)
+        ends, more = expand_items(items, first, head - first, ends, pose.floor, states, pose)
         compared += more
     end = divide_items(items, head, ends[0], part, parts)
     if part > 0:
@@ -202,12 +206,20 @@ def donate_items(
 
 
 @wp.func
+def slab_floor(pose: PairPose, parts: wp.int32):
+    """Return the nodes of A and B from which on slabs are compared, where so many warps share a pair."""
+    small = wp.max(pose.floor[0], pose.floor[1]) <= SLAB_NODES * parts
+    return wp.where(small, wp.vec2i(NO_NODE, NO_NODE), pose.floor)
+
+
+@wp.func
 def descend(
     items: wp.uint64,
     pace: Pace,
     ready: wp.int32,
     head: wp.int32,
     ends: wp.vec3i,
+    floor: wp.vec2i,
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
@@ -225,7 +237,7 @@ def descend(
         ready_slab = wp.min(ready, wp.max(1, room - 3))
         popped = wp.min(wp.max(1, room >> 2), wp.min(warp_size(), end - head))
         end -= popped
-        found, compared = expand_items(items, end, popped, wp.vec3i(end, slab_pairs, waiting), states, pose)
+        found, compared = expand_items(items, end, popped, wp.vec3i(end, slab_pairs, waiting), floor, states, pose)
         end = found[0]
         slab_pairs = found[1]
         waiting = found[2]
@@ -261,15 +273,19 @@ def traverse_items(
     node_tests, turn = wp.int32(0), wp.int32(0)
     tested, hit_count, uncertain_count = wp.int32(0), wp.int32(0), wp.int32(0)
     straddling = wp.int32(0)
-    ready = wp.where(for_any, wp.min(LEAF_PAIRS_FOR_ANY, warp_size()), warp_size())
-    ready_straddling = wp.where(for_any, 1, warp_size())
+    ready, ready_straddling = warp_size(), warp_size()
+    floor = wp.where(for_any, wp.vec2i(NO_NODE, NO_NODE), pose.floor)
     while ends[0] > head or ends[1] > 0 or ends[2] > 0 or straddling > 0:
-        found = False
-        tickets = wp.int64(0)
+        found, tickets = False, wp.int64(0)
         turn += 1
         if (turn & pace.balance_mask) == 0:
             tickets = load_tickets(work.counter)
-        ends, compared = descend(items, pace, ready, head, ends, models, states, pose)
+        if for_any:
+            # The longer a search without a hit takes, the more waits, so that few lanes idle.
+            ready = wp.min(LEAF_PAIRS_FOR_ANY + turn, warp_size())
+            ready_straddling = wp.min(1 + (turn >> 2), warp_size())
+            floor = wp.where(turn < SLAB_TURN, floor, pose.floor)
+        ends, compared = descend(items, pace, ready, head, ends, floor, models, states, pose)
         node_tests += compared
         waiting = ends[2]
         empty = ends[0] == head and ends[1] == 0
@@ -331,14 +347,14 @@ def warp_traversal(mode: int, for_any: bool):
         own.items = warp_stack()
         while True:
             unit = take_unit(work_inout.counter)
-            p = unit / parts
-            slot = wp.int32(-1)
+            p, slot = unit / parts, wp.int32(-1)
             if unit >= count * parts:
                 slot = await_donation(work_inout.counter, work_inout.flag)
                 if slot < 0:
                     return
                 p = work_inout.owner[slot][0]
             pose = pair_poses[p]
+            pose.floor = slab_floor(pose, parts)
             head, ends, started = wp.int32(0), wp.vec3i(), wp.int32(0)
             if slot >= 0:
                 ends[0] = receive_items(own.items, slot, work_inout)

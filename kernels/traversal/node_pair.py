@@ -115,19 +115,24 @@ def count_used(used: wp.vec4i):
 
 
 @wp.func
-def have_slabs(pose: PairPose, item: wp.int64):
+def have_slabs(floor: wp.vec2i, item: wp.int64):
     """Return whether the nodes that an item names have slabs, as all below them."""
-    above_a = (item_first(item) & INDEX_MASK) - pose.floor[0]
-    above_b = (item_second(item) & INDEX_MASK) - pose.floor[1]
+    above_a = (item_first(item) & INDEX_MASK) - floor[0]
+    above_b = (item_second(item) & INDEX_MASK) - floor[1]
     return (above_a | above_b) >= 0
 
 
 @wp.func
-def compare_node_pair(states: StatePool, pose: PairPose, item: wp.int64, live: wp.int32):
+def compare_node_pair(states: StatePool, pose: PairPose, floor: wp.vec2i, item: wp.int64, live: wp.int32):
     """Compare what an item names; return the items that follow, their lists, and the pairs of boxes compared.
 
-    live is -1, or 0 where nothing is asked of the item, which still names nodes. No branches: the lanes of a warp stay
-    together, and all loads are under way at once. A node that is compared alone is its own sibling.
+    No branches: the lanes of a warp stay together, and all loads are under way at once. A node compared alone is its
+    own sibling.
+
+    Args:
+        floor: `PairPose.floor`, or NO_NODE.
+        live: -1, or 0 where nothing is asked of the item, which still names nodes.
+
     """
     x = item_first(item)
     y = item_second(item)
@@ -144,7 +149,7 @@ def compare_node_pair(states: StatePool, pose: PairPose, item: wp.int64, live: w
     b0 = child_of_b(pose, node_b0)
     b1 = child_of_b(pose, node_b1)
     used = wp.vec4i(live, y & live, x & live, x & y & live)
-    inner = wp.where(have_slabs(pose, item), TO_SLAB_PAIRS, TO_STACK)
+    inner = wp.where(have_slabs(floor, item), TO_SLAB_PAIRS, TO_STACK)
     lists = wp.vec4i(
         list_of_pair(used[0], inner, a0, b0),
         list_of_pair(used[1], inner, a0, b1),

@@ -83,6 +83,7 @@ class ModelArrays:
         pool.lod_max = _upload(self.lod_max.astype(np.int32), wp.int32, device)
         pool.centre = _upload(np.array([model.centre for model in models]), wp.vec3d, device)
         pool.node_slab = wp.empty(0, dtype=wp.vec4, device=device)
+        pool.slab_gain = wp.zeros(len(models), dtype=wp.vec2i, device=device)
         self.pool, self.device = pool, device
 
     def make_slabs(self):
@@ -92,7 +93,7 @@ class ModelArrays:
         slabs = wp.empty(int(self.node_start[-1]), dtype=wp.vec4, device=self.device)
         for model, depth in enumerate(self.depth):
             first = 1 << max(0, int(depth) - int(SLAB_DEPTH))
-            inputs = [model, first, self.pool, slabs]
+            inputs = [model, first, self.pool, slabs, self.pool.slab_gain]
             wp.launch(make_slab_kernel, int(self.node_count[model]) - first, inputs, device=self.device)
         self.pool.node_slab = slabs
 
