@@ -36,7 +36,7 @@ def import_viser():
     try:
         import viser
     except ImportError as error:
-        raise ValueError(f"view needs viser: pip install warp-abtree[view] ({error})") from None
+        raise ValueError(f"view needs viser: pip install viser ({error})") from None
     # A browser that goes away in the middle of a message is no news.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     return viser
