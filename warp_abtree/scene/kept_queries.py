@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 
 from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.distance import DistanceQuery, check_beyond
+from warp_abtree.query.distance import check_beyond, check_flags, make_tolerances, prepare_query
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import Result
+from warp_abtree.scene.originals import OriginalDistances
 
 
 class KeptQueries:
@@ -26,10 +27,12 @@ class KeptQueries:
     def __init__(self, scene, find_pairs: Callable[[Any, float], np.ndarray]):
         self._scene, self._find_pairs = scene, find_pairs
         self.kept: dict[tuple, Query] = {}
+        self._originals: OriginalDistances | None = None
 
     def clear(self):
         """Forget all queries."""
         self.kept.clear()
+        self._originals = None
 
     def find_hits(self, pairs, output, precision, contact_dtype, options: dict, device: bool) -> Result:
         """Answer any output but "distance"; options are those that are given, `Scene.intersect` has them."""
@@ -59,14 +62,16 @@ class KeptQueries:
         beyond = options.pop("beyond", None)
         pairs = self._find_pairs(pairs, 0.0 if beyond is None else self._one_for_all(beyond, "beyond"))
         beyond = check_beyond(beyond, len(pairs))
-        query = self.kept.pop(("distance",), None)
-        if isinstance(query, DistanceQuery):
-            query.set_tolerance(**options)
-            if not query.is_asked(pairs, beyond):
-                query.replace_pairs(pairs, beyond)
-        else:
-            query = DistanceQuery(self._scene, pairs=pairs, beyond=beyond, **options)
-        return self._run(("distance",), query, device)
+        signed, of_originals = check_flags(options)
+        tolerances = {name: value for name, value in options.items() if name in ("tolerance", "relative")}
+        make_tolerances(**tolerances)
+        if of_originals:
+            batch = self._scene.batch()
+            if self._originals is None:
+                self._originals = OriginalDistances(batch)
+            return self._originals.run(pairs, beyond, **tolerances, device=device)
+        query = prepare_query(self.kept.pop(("distance", signed), None), self._scene, pairs, beyond, tolerances, signed)
+        return self._run(("distance", signed), query, device)
 
     @staticmethod
     def _one_for_all(distance, name: str) -> float:

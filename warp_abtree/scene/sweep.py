@@ -14,8 +14,9 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.sweep import NONE_REFUSED, pose_placer, report_chunk_kernel
-from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond
+from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond, check_flags
 from warp_abtree.query.narrow_phase import Query
+from warp_abtree.scene.originals import OriginalDistances
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE, check_poses, device_rows
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.arrays import ObjectArrays
@@ -119,9 +120,8 @@ class _Chunk:
         self.batch = Batch(pair.models, pair.states, objects, np.repeat(pair.object_model, [1, room]), solid=solid)
         self.chunk_query: _ChunkQuery | None = None
 
-    def find_query(self, output, precision):
-        """Return the chunk's query if it is of this output and precision, else another."""
-        key = (output, precision)
+    def find_query(self, *key):
+        """Return the chunk's query if it is of this output and precision, signed or of originals, else another."""
         if self.chunk_query is None or self.chunk_query.key != key:
             self.chunk_query = None  # its memory first
             self.chunk_query = _ChunkQuery(self, key)
@@ -164,12 +164,13 @@ class _ChunkQuery:
 
     def __init__(self, chunk: _Chunk, key):
         self.key = key
-        self.output, precision = key
+        self.output, precision, (signed, of_originals) = key
         self.device, self.room, self.objects = chunk.batch.device, chunk.room, chunk.batch.objects
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
+        self.originals = OriginalDistances(chunk.batch) if of_originals else None
         if self.output == "distance":
-            self.query: Query = DistanceQuery(chunk.batch, self.pairs)
+            self.query: Query = DistanceQuery(chunk.batch, self.pairs, signed=signed)
         else:
             self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision)
         self.count = self.room
@@ -291,10 +292,13 @@ class _ChunkQuery:
         for start in range(0, len(poses), self.room):
             count = min(self.room, len(poses) - start)
             self._load(slot, poses, start, count)
-            self.query.set_pairs(self.pairs[:count], beyond)
             self.count = count
             self._place(slot)
-            result = self.query.run()
+            if self.originals is None:
+                self.query.set_pairs(self.pairs[:count], beyond)
+                result = self.query.run()
+            else:
+                result = self.originals.run(self.pairs[:count], beyond, **tolerances)
             refused = int(slot.report.numpy()[0])
             if refused != NONE_REFUSED:
                 _refuse(poses, start + refused)
@@ -344,7 +348,8 @@ def sweep(
         device: Warp device; None for Warp's default.
         solid: Whether both are solids (`Scene.add`), or a bool for each; what "any" and "distance" answer for one
             inside the other stands in `warp_abtree.state.solids`, "count" and "faces" are of surfaces.
-        options: tolerance, relative and beyond, each one number, as `DistanceQuery` takes them; for "distance" alone.
+        options: tolerance, relative, beyond, each one number, and signed, as `DistanceQuery` takes them, and originals,
+            as `Scene.intersect` does; for "distance" alone.
 
     Returns:
         For "any" bool (p,), for "count" the intersecting face pairs of each pose, int64 (p,), for "faces" rows (pose,
@@ -380,9 +385,9 @@ def _sweep(pair, poses, asked, options):
         owners = [weakref.ref(model, lambda _: _kept.pop(key, None)) for model in models]
         posed = _PosedModels(pair, owners)
     chunk = posed.find_chunk(len(poses))
-    query = chunk.find_query(output, precision)
+    query = chunk.find_query(output, precision, check_flags(options))
     if output == "distance":
-        tolerances = {name: value for name, value in options.items() if name != "beyond"}
+        tolerances = {name: value for name, value in options.items() if name in ("tolerance", "relative")}
         answers = query.find_distances(poses, tolerances, check_beyond(options.get("beyond")))
     else:
         answers = query.find_faces(poses) if output == "faces" else query.find_answers(poses)
