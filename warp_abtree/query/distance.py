@@ -53,6 +53,7 @@ from warp_abtree.query.staging import first_rows
 SEARCH, CROSSINGS = -4, (-3, -1)
 # Pairs that make a further core worth its while, which costs some 50 us.
 PAIRS_A_CORE = 4
+FIELDS = {"point_faces": "faces"}  # of `report.Distances`, where a result's name is another
 # Pairs from which on warps search each roughly first; fewer leave some idle, and those share the search.
 ROUGH_LEAST = 1024
 
@@ -64,12 +65,9 @@ def check_beyond(beyond, pair_count=None) -> np.ndarray:
     return check_within(beyond, pair_count, "beyond")
 
 
-def make_tolerances(tolerance=0.0, relative=0.0):
-    """Return the tolerances of a search for a kernel."""
-    tolerances = frame.Tolerances()
-    tolerances.tolerance = check_tolerance(tolerance, "tolerance", math.inf)
-    tolerances.relative = check_tolerance(relative, "relative", 1.0)
-    return tolerances
+def check_tolerances(tolerance=0.0, relative=0.0) -> tuple[float, float]:
+    """Return the tolerances of a search."""
+    return check_tolerance(tolerance, "tolerance", math.inf), check_tolerance(relative, "relative", 1.0)
 
 
 def check_tolerance(tolerance, name: str, most: float) -> float:
@@ -115,7 +113,7 @@ def check_asked(output, precision, options):
         raise TypeError(f"sweep has no option {sorted(unknown)[0]!r}")
     if output == "distance":
         refuse_options(output, {"precision": precision != "exact", "within": "within" in options})
-        make_tolerances(options.get("tolerance", 0.0), options.get("relative", 0.0))
+        check_tolerances(options.get("tolerance", 0.0), options.get("relative", 0.0))
         check_beyond(options.get("beyond"))
         check_flags(options)
     else:
@@ -162,7 +160,10 @@ class DistanceQuery(Query):
 
     def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None, signed=False):
         self._signed = check_flag(signed, "signed")
-        self._tolerances = make_tolerances(tolerance, relative)
+        self._asked_tolerances = check_tolerances(tolerance, relative)
+        self._tolerances = frame.Tolerances()
+        self._tolerances.tolerance, self._tolerances.relative = self._asked_tolerances
+        self._answer_views: tuple[int, dict] = (-1, {})
         self._asked = check_beyond(beyond, None if pairs is None else len(to_numpy(pairs, "pairs")))
         self.distances, self._found, self._slabs = report.Distances(), frame.Found(), slabs.Slabs()
         self._slabs.record = wp.empty(0, dtype=wp.vec4, device=scene.device)
@@ -190,9 +191,9 @@ class DistanceQuery(Query):
         Raises:
             ValueError: One that is negative, infinite or no number.
         """
-        asked = make_tolerances(tolerance, relative)
-        if (asked.tolerance, asked.relative) != (self._tolerances.tolerance, self._tolerances.relative):
-            self._tolerances = asked
+        asked = check_tolerances(tolerance, relative)
+        if asked != self._asked_tolerances:
+            self._asked_tolerances = self._tolerances.tolerance, self._tolerances.relative = asked
             self._commands = Commands()
 
     def forget(self):
@@ -256,7 +257,7 @@ class DistanceQuery(Query):
             return
         commands = self._commands.find("distances", self.guard.given(), self._make_distances)
         # On the CPU what is launched is done.
-        meeting = self.device.is_cuda or bool(self.hits.any_hit.numpy().any())
+        meeting = self.device.is_cuda or bool(self._views.any_hit.any())
         for place, command in enumerate(commands, -len(commands)):
             if place == SEARCH and not self.uses_warps():
                 rooms = len(self._memory)
@@ -322,8 +323,21 @@ class DistanceQuery(Query):
 
     def _make_result(self, found: Found, device: bool, with_rows: bool = True) -> Result:
         n, answers = len(found.pairs), self.distances
+        views = self._find_views() if self.device.is_cpu and not device else {}
         for name in (*DISTANCES, "points"):
-            rows = getattr(answers, "faces" if name == "point_faces" else name)
+            if name in views:
+                setattr(found, name, views[name][:n].copy())
+                continue
+            rows = getattr(answers, FIELDS.get(name, name))
             rows = rows if len(rows) == n else first_rows(rows, n)
             setattr(found, name, wp.clone(rows) if device else rows.numpy().copy())
         return super()._make_result(found, device, with_rows)
+
+    def _find_views(self) -> dict:
+        """Return NumPy's views of the answers, where these are the host's memory."""
+        made, views = self._answer_views
+        if made != self.guard.buffers.number:
+            fields = {name: getattr(self.distances, FIELDS.get(name, name)) for name in (*DISTANCES, "points")}
+            views = {name: rows.numpy() for name, rows in fields.items()}
+            self._answer_views = self.guard.buffers.number, views
+        return views

@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.distance import check_beyond, check_flags, make_tolerances, prepare_query
+from warp_abtree.query.distance import check_beyond, check_flags, check_tolerances, prepare_query
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import Result
@@ -64,7 +65,7 @@ class KeptQueries:
         beyond = check_beyond(beyond, len(pairs))
         signed, of_originals = check_flags(options)
         tolerances = {name: value for name, value in options.items() if name in ("tolerance", "relative")}
-        make_tolerances(**tolerances)
+        check_tolerances(**tolerances)
         if of_originals:
             batch = self._scene.batch()
             if self._originals is None:
@@ -76,7 +77,8 @@ class KeptQueries:
     @staticmethod
     def _one_for_all(distance, name: str) -> float:
         """Return a distance that is one for all pairs, checked; 0 where each pair has its own."""
-        return float(check_within(distance, name=name)) if np.ndim(distance) == 0 else 0.0
+        distance = to_numpy(distance, name)
+        return float(check_within(distance, name=name)) if distance.ndim == 0 else 0.0
 
     def _run(self, key: tuple, query: Query, device: bool) -> Result:
         """Run a query and keep it for the next time; one that fails, for lack of memory, gives its own back."""
