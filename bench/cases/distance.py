@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree import testing
 
 from .. import gap_contacts, originals
 from ..baselines.fcl import Fcl
@@ -88,7 +89,7 @@ def measure(name, models, matrices, device, repeats):
         fresh.launch()
 
     launches = {"fresh": launch_fresh, "again": query.launch, "one": lambda: (one.forget(), one.launch())}
-    with one_core():
+    with one_core(), testing.regime(cpu_threads=1):
         if device.is_cpu:
             try:
                 fcl = make_fcl(models, matrices, found, row)
