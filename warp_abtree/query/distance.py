@@ -117,20 +117,23 @@ def check_asked(output, precision, options):
     """Check what is asked of a sweep.
 
     Raises:
-        TypeError: An option with another name than tolerance, relative, beyond, signed and originals.
+        TypeError: An option with another name than tolerance, relative, beyond, signed, originals and within.
         ValueError: A bad option, output or precision, or one that means nothing beside another.
     """
-    unknown = set(options) - {"tolerance", "relative", "beyond", "signed", "originals"}
+    unknown = set(options) - {"tolerance", "relative", "beyond", "signed", "originals", "within"}
     if unknown:
         raise TypeError(f"sweep has no option {sorted(unknown)[0]!r}")
     if output == "distance":
-        refuse_options(output, {"precision": precision != "exact"})
+        refuse_options(output, {"precision": precision != "exact", "within": "within" in options})
         check_tolerances(options.get("tolerance", 0.0), options.get("relative", 0.0))
         check_beyond(options.get("beyond"))
         check_flags(options)
     else:
-        refuse_options(output, options)
+        taken = ("within",) if output != "faces" else ()
+        refuse_options(output, {name: value for name, value in options.items() if name not in taken})
         check_request(output, precision)
+        if options.get("within") is not None:
+            check_within(options["within"], known="a sweep: one distance for all")
 
 
 def prepare_query(query, batch, pairs: np.ndarray, beyond: np.ndarray, tolerances: dict, signed: bool = False):
