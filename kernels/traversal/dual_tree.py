@@ -57,9 +57,9 @@ STACK_MASK = wp.constant(STACK_LENGTH - 1)
 # Warps on one pair divide its work when there are about so many items for each, or as many as the stack takes then.
 ITEMS_PER_WARP = wp.constant(8)
 ITEMS_TO_DIVIDE = wp.constant(STACK_LENGTH // 2)
-# An early hit ends a pair for `any`, so few leaf pairs wait at first, and slabs wait for this turn.
+# An early hit ends a pair for `any`, so few leaf pairs wait, and none for slabs, until so many turns have had no hit.
 LEAF_PAIRS_FOR_ANY = wp.constant(8)
-SLAB_TURN = wp.constant(16)
+LONG_SEARCH = wp.constant(16)
 # Where warps share a pair of so few nodes above those of slabs that each has little to do, slabs would but delay it.
 SLAB_NODES = wp.constant(8)
 # A warp with work for two looks at every second turn whether others are idle, at every one where pairs are few: a turn
@@ -273,18 +273,17 @@ def traverse_items(
     node_tests, turn = wp.int32(0), wp.int32(0)
     tested, hit_count, uncertain_count = wp.int32(0), wp.int32(0), wp.int32(0)
     straddling = wp.int32(0)
-    ready, ready_straddling = warp_size(), warp_size()
+    ready = wp.where(for_any, wp.min(LEAF_PAIRS_FOR_ANY, warp_size()), warp_size())
+    ready_straddling = wp.where(for_any, 1, warp_size())
     floor = wp.where(for_any, wp.vec2i(NO_NODE, NO_NODE), pose.floor)
     while ends[0] > head or ends[1] > 0 or ends[2] > 0 or straddling > 0:
         found, tickets = False, wp.int64(0)
         turn += 1
         if (turn & pace.balance_mask) == 0:
             tickets = load_tickets(work.counter)
-        if for_any:
-            # The longer a search without a hit takes, the more waits, so that few lanes idle.
-            ready = wp.min(LEAF_PAIRS_FOR_ANY + turn, warp_size())
-            ready_straddling = wp.min(1 + (turn >> 2), warp_size())
-            floor = wp.where(turn < SLAB_TURN, floor, pose.floor)
+        if turn == LONG_SEARCH and for_any:
+            ready = warp_size()
+            floor = pose.floor
         ends, compared = descend(items, pace, ready, head, ends, floor, models, states, pose)
         node_tests += compared
         waiting = ends[2]

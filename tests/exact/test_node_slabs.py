@@ -61,7 +61,7 @@ def test_nested_parts_equal_brute_force(device, gap):
     rows = np.concatenate([np.insert(true_faces(*case), 0, p, 1) for p, case in enumerate(cases)])
     tests = []
     for slabs in (False, True):
-        with testing.regime(slabs=slabs):
+        with testing.regime(slabs=slabs, warps_per_pair=1):
             scene = scene_of(device, cases)
             found = GpuQuery(scene, "faces", pairs=pairs_of(cases)).run()
             np.testing.assert_array_equal(found.faces, rows)
