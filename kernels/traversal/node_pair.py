@@ -107,14 +107,6 @@ def list_of_pair(used: wp.int32, inner: wp.int32, a: Child, b: Child):
 
 
 @wp.func
-def count_used(used: wp.vec4i):
-    tests = wp.int32(0)
-    for k in range(4):
-        tests -= used[k] >> 31
-    return tests
-
-
-@wp.func
 def have_slabs(floor: wp.vec2i, item: wp.int64):
     """Return whether the nodes that an item names have slabs, as all below them."""
     above_a = (item_first(item) & INDEX_MASK) - floor[0]
@@ -157,4 +149,5 @@ def compare_node_pair(states: StatePool, pose: PairPose, floor: wp.vec2i, item: 
         list_of_pair(used[3], inner, a1, b1),
     )
     items = four_items(next_item(a0, b0), next_item(a0, b1), next_item(a1, b0), next_item(a1, b1))
-    return items, lists, count_used(used)
+    # Of one node or two of A times one or two of B.
+    return items, lists, live & ((1 + two_a) << two_b)
