@@ -14,6 +14,10 @@ inline CUDA_CALLABLE wp::uint64 nearest_stack() {
 #endif
 }
 
+inline CUDA_CALLABLE wp::uint64 thread_lists(wp::array_t<wp::int64> memory, wp::int32 thread) {
+    return (wp::uint64)(memory.data + (wp::int64)thread * memory.shape[1]);
+}
+
 inline CUDA_CALLABLE wp::float32 read_bound(wp::uint64 items, wp::int32 i) {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)

@@ -13,6 +13,7 @@ from warp_abtree.query.distance import DistanceQuery, check_beyond
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import Result, contact_dtypes
+from warp_abtree.scene.first_contact import FirstContactQuery
 from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, launch_place, place_rows
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.batch import Batch, check_pairs, exclusion_keys
@@ -324,6 +325,37 @@ class Scene:
         else:
             query = DistanceQuery(self, pairs=pairs, beyond=beyond, **options)
         return self._run(("distance",), query, device)
+
+    def first_contact(self, pairs, end_poses, tolerance=1e-6, device: bool = False) -> Result:
+        """Find when object pairs first touch on the way from their poses to end poses. Waits for the device.
+
+        In unit time each object's frame moves straight at constant speed, and turns the shortest way at constant
+        angular velocity; poses in the scene stay as they are.
+
+        Args:
+            pairs: (p, 2) object indices, as for `intersect`.
+            end_poses: Of all objects, as for `set_poses`.
+            tolerance: What a time may be early by, as a part of the motion, from 2^-40 up.
+            device: As for `intersect`.
+
+        Returns:
+            `Result` with time, clear and undecided; what they are stands in `warp_abtree.scene.first_contact`.
+
+        Raises:
+            ValueError: Bad pairs, poses or tolerance, a scene without objects; an object of a pair that turns by half a
+                revolution, within 1e-6 rad, which has no shortest way.
+        """
+        check_device(self.device, "Scene.first_contact (FirstContactQuery.launch can)")
+        pairs = check_pairs(pairs, self.object_count)
+        query = self._queries.pop(("first contact",), None)
+        if isinstance(query, FirstContactQuery):
+            query.set_tolerance(tolerance)
+            query.set_end_poses(end_poses)
+            if not query.is_asked(pairs, None):
+                query.replace_pairs(pairs, None)
+        else:
+            query = FirstContactQuery(self, end_poses, pairs=pairs, tolerance=tolerance)
+        return self._run(("first contact",), query, device)
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.
