@@ -95,9 +95,7 @@ def safe_step(motion: Motion, n: wp.vec3d, base: corners_type, m: Moment, mover:
 
 
 @wp.func
-def is_clear(
-    motion: Motion, left: wp.float64, base: corners_type, m: Moment, mover: corners_type, at: corners_type
-):
+def is_clear(motion: Motion, left: wp.float64, base: corners_type, m: Moment, mover: corners_type, at: corners_type):
     """Return whether the plane of one face proves two apart for all that is left of the time."""
     n = wp.normalize(wp.cross(base[1] - base[0], base[2] - base[0]))
     n = wp.where(wp.dot(n, at[0] - base[0]) < wp.float64(0.0), -n, n)

@@ -110,9 +110,7 @@ def step_boxes(a: MovingBox, b: MovingBox, motion: Motion):
     first = step_along(
         b.at.posed_sum - a.at.sum, b.at.posed_size + a.at.size, b.speed, b.spread, motion.bend_b, wp.vec2()
     )
-    return step_along(
-        a.at.posed_sum - b.at.sum, a.at.posed_size + b.at.size, a.speed, a.spread, motion.bend_a, first
-    )
+    return step_along(a.at.posed_sum - b.at.sum, a.at.posed_size + b.at.size, a.speed, a.spread, motion.bend_a, first)
 
 
 @wp.func

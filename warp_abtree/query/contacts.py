@@ -177,8 +177,9 @@ class ContactQuery(Query):
     def _launch_once(self, kernel, dim, inputs):
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
 
-    def _send_expected_rows(self, n: int) -> None:
-        """Bring nothing: rows come of launches that follow."""
+    def _expected_hits(self, n: int) -> int:
+        """Return none: rows come of launches that follow."""
+        return 0
 
     def _launch_warps(self, kernel, count, inputs):
         """Launch a kernel with a warp for each of so many items, on the CPU a thread."""

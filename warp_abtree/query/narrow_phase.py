@@ -271,7 +271,8 @@ class Query(QueryReadout):
 
     def run(self, device: bool = False) -> Result:
         """Launch, grow buffers that were too small, and return the whole result, as `result`. Waits for the device."""
-        result = self._make_result(self._grow(partial(self._read_pairs, device)), device)
+        first = partial(self._launch_and_bring, self._launch) if self._repeats_calls(device) else None
+        result = self._make_result(self._grow(partial(self._read_pairs, device), first=first), device)
         result.check()
         return result
 
@@ -287,13 +288,14 @@ class Query(QueryReadout):
         """
         self._grow(lambda: Found(self._read_totals()), between)
 
-    def _grow(self, read, between=None) -> Found:
-        """Launch as `grow` and return what `read` finds of the last launch."""
+    def _grow(self, read, between=None, first=None) -> Found:
+        """Launch as `grow` and return what `read` finds of the last launch; `first` does both the first time."""
         check_device(self.device, f"{type(self).__name__}.run (launch can)")
         self._check_scene()
         with self.guard.launching(self):
-            self._launch(between)
-            found = read()
+            if first is None:
+                self._launch(between)
+            found = read() if first is None else first()
             if found.totals.pairs > len(self.pairs):
                 self._take_pairs(wp.empty(self.growth * found.totals.pairs, dtype=wp.vec2i, device=self.device))
                 self._launch()

@@ -79,7 +79,8 @@ class Batch:
     def with_own_states(self) -> Batch:
         """Return a batch of the same models and objects, posed alike, that has no tree state yet."""
         placed = self.objects.pool
-        objects = ObjectArrays(placed.world.numpy(), placed.is_static.numpy(), self.device)
+        bits = self.objects.collision_bits.numpy()
+        objects = ObjectArrays(placed.world.numpy(), placed.is_static.numpy(), self.device, bits)
         wp.copy(objects.pool.rotation, placed.rotation)
         wp.copy(objects.pool.position, placed.position)
         return Batch(self.models, StateArrays(self.models, self.device), objects, self.object_model, self.excluded)
