@@ -1,7 +1,7 @@
 """Until when a node pair stays apart, and the step of the search: a node pair, up to four pairs of children.
 
-Items are those of `traversal.node_pair`, each with a time up to which its boxes are proved apart. At that time boxes are
-compared along the axes of both frames, as in `traversal.boxes`; along each the gap g, the least speed s at which it
+Items are those of `traversal.node_pair`, each with a time up to which its boxes are proved apart. At that time boxes
+are compared along the axes of both frames, as in `traversal.boxes`; along each the gap g, the least speed s at which it
 grows and the bound M of accelerations (`path`) give a time to which it stays open, and the latest counts. All numbers
 but times are twice what they say, and scaled.
 

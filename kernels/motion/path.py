@@ -4,8 +4,8 @@ An object's anchor, a point of its model frame, moves on a straight line at cons
 it at constant angular velocity: x_world(t) = R E(t) (x - anchor) + start + t travel, E(t) the turn by t angle about an
 axis of the model frame, t from 0 to 1. The anchor is the frame's origin, or for screws a point of the screw's axis.
 
-With R0 = Ra^T Rb and d(t) = d0 + t d1 the way from A's anchor to B's in A's first frame, and w the angular velocities in
-the model frames, B's point b lies in A's frame at R b + x, where it moves with K b + v:
+With R0 = Ra^T Rb and d(t) = d0 + t d1 the way from A's anchor to B's in A's first frame, and w the angular velocities
+in the model frames, B's point b lies in A's frame at R b + x, where it moves with K b + v:
 
     R = Ea^T R0 Eb               x = anchor_a + Ea^T d - R anchor_b
     K = R [wb] - [wa] R          v = Ea^T d1 - wa x (Ea^T d) - K anchor_b
@@ -38,6 +38,8 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 # That bounds of accelerations grow by: their own rounding, and rotations that are not quite orthonormal.
 GROW = wp.constant(wp.float64(1.0 + 2.0**-16))
 SCALE_MAX = wp.constant(wp.float64(2.0**100))
+# Sine of half a turn below which a screw's axis is too far away: the frame's origin moves straight then.
+SCREW_LEAST = wp.constant(wp.float64(2.0**-20))
 # What has no acceleration is given one, so that nothing is divided by 0.
 BEND_LEAST = wp.constant(wp.float64(2.0**-80))
 
@@ -155,7 +157,7 @@ def bend_of(
 
     Returns the factor of a point's distance from its own axis, the rest, and the whole for the farthest point.
     """
-    far, reach, most = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    far, most = wp.float64(0.0), wp.float64(0.0)
     d = wp.max(wp.length(d0), wp.length(d0 + d1))
     for k in range(8):
         p = corner_of(lower, upper, k)
@@ -243,12 +245,21 @@ def bound_motion(before: Motion, states: StatePool, pose: PairPose):
 
 
 @wp.kernel
-def prepare_path_kernel(objects: ObjectPool, ends: ObjectPool, paths_out: Paths):
-    """Prepare an object's path a thread, from its pose to that of `ends`."""
+def prepare_path_kernel(screw: bool, objects: ObjectPool, ends: ObjectPool, paths_out: Paths):
+    """Prepare an object's path a thread, from its pose to that of `ends`, as a screw if asked."""
     i = wp.tid()
-    axis, angle = shortest_turn(wp.transpose(objects.rotation[i]) * ends.rotation[i])
+    r = objects.rotation[i]
+    axis, angle, half = shortest_turn(wp.transpose(r) * ends.rotation[i])
+    travel = ends.position[i] - objects.position[i]
+    anchor = wp.vec3d()
+    if screw and half[0] > SCREW_LEAST and angle > wp.float64(0.0):
+        k = r * axis
+        along = wp.dot(travel, k) * k
+        side = travel - along
+        anchor = wp.float64(0.5) * (side + (half[1] / half[0]) * wp.cross(k, side))
+        travel = along
     paths_out.axis[i] = axis
     paths_out.angle[i] = angle
-    paths_out.anchor[i] = wp.vec3d()
-    paths_out.start[i] = objects.position[i]
-    paths_out.travel[i] = ends.position[i] - objects.position[i]
+    paths_out.anchor[i] = wp.transpose(r) * anchor
+    paths_out.start[i] = objects.position[i] + anchor
+    paths_out.travel[i] = travel

@@ -98,16 +98,20 @@ def quaternion_of(m: wp.mat33d):
 
 @wp.func
 def shortest_turn(m: wp.mat33d):
-    """Return the axis of a rotation matrix and its angle in [0, pi], -1 where half a revolution has no shortest way."""
+    """Return the axis of a rotation matrix, its angle in [0, pi], and sine and cosine of half of that.
+
+    The angle is -1 where half a revolution has no shortest way.
+    """
     q = quaternion_of(m)
     v = wp.vec3d(q[0], q[1], q[2])
     s = wp.sqrt((v[0] * v[0] + v[1] * v[1]) + v[2] * v[2])
-    if s == wp.float64(0.0):
-        return wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0)), wp.float64(0.0)
+    zero = wp.float64(0.0)
+    if s == zero:
+        return wp.vec3d(zero, zero, wp.float64(1.0)), zero, wp.vec2d(zero, wp.float64(1.0))
     angle = wp.float64(-1.0)
     if q[3] >= REAL_LEAST:
         angle = angle_of(s, q[3])
-    return v / s, angle
+    return v / s, angle, wp.vec2d(s, q[3])
 
 
 @wp.func

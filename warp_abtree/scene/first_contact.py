@@ -1,7 +1,8 @@
 """When moving objects first touch: `FirstContactQuery`.
 
 In unit time each object goes from its pose in the scene to an end pose: its frame's origin on a straight line at
-constant speed, turning at constant angular velocity, the shortest way. For each object pair:
+constant speed, turning at constant angular velocity, the shortest way; or on a screw, along whose axis the object moves
+as it turns about it, at constant speed; straight where it turns by less than 2^-19 rad. For each object pair:
 
 * time, from 0 to 1: the surfaces, at their LODs, are proved apart at all earlier times, for the motion as real numbers
   and all rounding (`warp_abtree.kernels.motion.path`). 1 where they are for all of the motion. 0 where the exact test
@@ -59,6 +60,7 @@ class FirstContactQuery(Query):
         end_poses: As for `set_end_poses`.
         pairs, capacity: As for `Query`.
         tolerance: What a time may be early by, as a part of the motion, from 2^-40 up.
+        screw: Whether objects move on screws.
 
     Attributes:
         ends: End poses, which each launch reads: device arrays rotation and position of `kernels.arrays.ObjectPool`.
@@ -71,7 +73,8 @@ class FirstContactQuery(Query):
 
     _memory: wp.array
 
-    def __init__(self, scene, end_poses, pairs=None, capacity=None, tolerance=1e-6):
+    def __init__(self, scene, end_poses, pairs=None, capacity=None, tolerance=1e-6, screw=False):
+        self.screw = bool(screw)
         self.tolerance = check_tolerance(tolerance)
         self.contacts, self.ends, self._paths = start.Contacts(), ObjectPool(), path.Paths()
         self._counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
@@ -106,13 +109,13 @@ class FirstContactQuery(Query):
         else:
             place_rows(rows, self.ends)
 
-    def set_tolerance(self, tolerance):
-        """Take another tolerance from the next launch on; a captured graph keeps its own.
+    def set_options(self, tolerance=1e-6, screw=False):
+        """Take another tolerance and path from the next launch on; a captured graph keeps its own.
 
         Raises:
-            ValueError: One out of range.
+            ValueError: A tolerance out of range.
         """
-        self.tolerance = check_tolerance(tolerance)
+        self.tolerance, self.screw = check_tolerance(tolerance), bool(screw)
 
     def _slow_kernels(self, with_distances: bool) -> list:
         kernel = search.search_warp_kernel if self.uses_warps() else search.search_thread_kernel
@@ -136,7 +139,7 @@ class FirstContactQuery(Query):
         if self.device.is_capturing:
             self._make_contacts(wp.launch)
             return
-        given = *self.guard.given(), self.tolerance
+        given = *self.guard.given(), self.tolerance, self.screw
         *first, last = self._commands.find("first contacts", given, self._make_contacts)
         for command in first:
             command.launch()
@@ -152,7 +155,7 @@ class FirstContactQuery(Query):
         models, states, objects = self.batch.pools
         room, device = len(self.pairs), self.device
         launch = partial(launch, device=device)
-        inputs = [objects, self.ends, self._paths]
+        inputs = [self.screw, objects, self.ends, self._paths]
         paths = launch(path.prepare_path_kernel, dim=self.batch.object_count, inputs=inputs)
         inputs = [models, states, objects, self._paths, self.pair_count, self.pairs, self.pair_poses]
         inputs += [self.hits, self.contacts, self._counter]
@@ -180,7 +183,7 @@ class FirstContactQuery(Query):
         if len(half):
             pairs = found.pairs.numpy() if device else found.pairs
             raise ValueError(
-                f"end_poses: of objects {pairs[half[0]].tolist()} one turns by half a revolution, which has no shortest "
-                "way; split its motion in two"
+                f"end_poses: one of objects {pairs[half[0]].tolist()} turns by half a revolution, which has no "
+                "shortest way; split its motion in two"
             )
         return result

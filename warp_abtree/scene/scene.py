@@ -337,7 +337,7 @@ class Scene:
             query = DistanceQuery(self, pairs=pairs, beyond=beyond, **options)
         return self._run(("distance",), query, device)
 
-    def first_contact(self, pairs, end_poses, tolerance=1e-6, device: bool = False) -> Result:
+    def first_contact(self, pairs, end_poses, tolerance=1e-6, screw=False, device: bool = False) -> Result:
         """Find when object pairs first touch on the way from their poses to end poses. Waits for the device.
 
         In unit time each object's frame moves straight at constant speed, and turns the shortest way at constant
@@ -347,6 +347,7 @@ class Scene:
             pairs: (p, 2) object indices, as for `intersect`.
             end_poses: Of all objects, as for `set_poses`.
             tolerance: What a time may be early by, as a part of the motion, from 2^-40 up.
+            screw: Whether objects move on screws instead.
             device: As for `intersect`.
 
         Returns:
@@ -360,12 +361,12 @@ class Scene:
         pairs = check_pairs(pairs, self.object_count)
         query = self._queries.pop(("first contact",), None)
         if isinstance(query, FirstContactQuery):
-            query.set_tolerance(tolerance)
+            query.set_options(tolerance, screw)
             query.set_end_poses(end_poses)
             if not query.is_asked(pairs, None):
                 query.replace_pairs(pairs, None)
         else:
-            query = FirstContactQuery(self, end_poses, pairs=pairs, tolerance=tolerance)
+            query = FirstContactQuery(self, end_poses, pairs=pairs, tolerance=tolerance, screw=screw)
         return self._run(("first contact",), query, device)
 
     def tree_state(self, i) -> TreeState:
