@@ -7,6 +7,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import to_numpy, whole_number
 from warp_abtree.model.model import Model
+from warp_abtree.model.winding import refuse_open
 from warp_abtree.query.broad_phase import EVERY_WORLD
 from warp_abtree.scene.poses import launch_place
 
@@ -23,6 +24,7 @@ class ObjectList:
     lod: list[int] = field(default_factory=list)
     importance: list[int] = field(default_factory=list)
     static: list[bool] = field(default_factory=list)
+    solid: list[bool] = field(default_factory=list)
     group: list[int] = field(default_factory=list)
     mask: list[int] = field(default_factory=list)
     pose: list[np.ndarray] = field(default_factory=list)  # (7,) or (4, 4)
@@ -135,17 +137,26 @@ def check_flags(values, what: str, count: int) -> list[bool]:
     return flags.tolist()
 
 
-def check_columns(models, worlds, importances, statics, groups, masks) -> dict[str, list]:
+def check_columns(models, worlds, importances, flags, bits) -> dict[str, list]:
     """Return the columns of `ObjectList` for objects of these models.
 
+    Args:
+        flags: Static and solid ones.
+        bits: Collision groups, and masks.
+
     Raises:
+        MeshError: A solid whose mesh is not closed.
         ValueError: Another number of them, or one out of range.
     """
-    count = len(models)
-    return {
+    count, (statics, solids), (groups, masks) = len(models), flags, bits
+    columns: dict[str, list] = {
         "world": check_numbers(worlds, "world", EVERY_WORLD, 2**31 - 1, count),
         "importance": check_numbers(importances, "importance", 1, 3, count),
         "static": check_flags(statics, "static", count),
+        "solid": check_flags(solids, "solid", count),
         "group": check_numbers(groups, "collision_group", 0, ALL_BITS, count),
         "mask": check_numbers(masks, "collision_mask", 0, ALL_BITS, count),
     }
+    for model in {id(model): model for model, solid in zip(models, columns["solid"]) if solid}.values():
+        refuse_open(model.winding, model.name)
+    return columns

@@ -67,6 +67,11 @@ class Scene:
         return self._objects.importance
 
     @property
+    def object_solid(self) -> list[bool]:
+        """Whether each object is a solid."""
+        return self._objects.solid
+
+    @property
     def worlds(self) -> np.ndarray:
         """World of each object, int32 (n,)."""
         return np.array(self._objects.world, np.int32)
@@ -86,6 +91,7 @@ class Scene:
         static=False,
         collision_group=1,
         collision_mask=ALL_BITS,
+        solid=False,
     ) -> int:
         """Add an object and return its index.
 
@@ -96,17 +102,20 @@ class Scene:
             lod: LOD to stand at; None is the finest.
             importance: Application context beta of the LOD selection, 1, 2 or 3 (paper, section 4.2).
             static: Whether the broad phase never pairs it with another static object, a bool.
+            solid: Whether what lies inside it intersects it, a bool; of a closed model, at every LOD, see
+                `warp_abtree.state.solids`.
             collision_group, collision_mask: Bits, from 0 to 2^32 - 1. The broad phase pairs objects a and b only where
                 group_a & mask_b and group_b & mask_a both hold a bit.
 
         Raises:
             TypeError: model is no Model.
+            MeshError: A solid whose mesh is not closed; the message names edges.
             ValueError: Anything else is out of range; nothing is added.
             RuntimeError: A graph is being captured.
         """
         models = check_models(model, 1)
         poses = check_poses(to_numpy(pose, "pose")[None], "pose")
-        columns = check_columns(models, world, importance, static, collision_group, collision_mask)
+        columns = check_columns(models, world, importance, (static, solid), (collision_group, collision_mask))
         return int(self._extend(models, poses, lod, columns)[0])
 
     def add_many(
@@ -119,20 +128,22 @@ class Scene:
         statics=False,
         collision_groups=1,
         collision_masks=ALL_BITS,
+        solids=False,
     ) -> np.ndarray:
         """Add an object for each pose and return their indices, int (n,): all of them, or none.
 
         Args:
             models: `Model` of all, or a list of n.
             poses: (n, 7) or (n, 4, 4), of any framework, see `add`.
-            worlds, lods, importances, statics, collision_groups, collision_masks: As for `add`, one for all or (n,).
+            worlds, lods, importances, statics, solids, collision_groups, collision_masks: As for `add`, one for all or
+                (n,).
 
         Raises:
             TypeError, ValueError, RuntimeError: As `add`; or not n were given.
         """
         poses = check_poses(poses)
         models = check_models(models, len(poses))
-        columns = check_columns(models, worlds, importances, statics, collision_groups, collision_masks)
+        columns = check_columns(models, worlds, importances, (statics, solids), (collision_groups, collision_masks))
         return self._extend(models, poses, lods, columns)
 
     def _extend(self, models, poses, lods, columns) -> np.ndarray:
@@ -169,7 +180,7 @@ class Scene:
             states = StateArrays(models, self.device)
             told = self._objects
             objects = ObjectArrays(told.world, told.static, self.device, told.collision_bits())
-            batch = Batch(models, states, objects, told.model, self._excluded)
+            batch = Batch(models, states, objects, told.model, self._excluded, told.solid)
             batch.set_lods(np.array(told.lod))
             told.set_poses(objects.pool, self.device)
             self._batch = batch

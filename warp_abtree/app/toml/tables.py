@@ -71,6 +71,7 @@ class ModelTable(Table):
     centre: bool = False  # moves the middle of the box to the model's origin
     faces: Count | None = None  # brings the mesh to so many, or one less: by Loop subdivision and edge collapses
     base_faces: Count = 10  # faces of the coarsest LOD
+    orient: bool = False  # turns faces that disagree with their neighbours or face inwards
 
     def __post_init__(self):
         if self.mesh is None and self.__struct_config__.tag is None:
@@ -192,6 +193,7 @@ class ObjectTable(Table, kw_only=True):
     rotation: RotationTable | None = None
     world: Annotated[int, Meta(ge=-1, le=2**30)] = 0  # objects of different worlds never meet; -1 is in every world
     static: bool = False  # static objects never meet each other
+    solid: bool = False  # what lies inside it intersects it; of a closed model
     kinematic: bool = False  # with [dynamics]: moves as told, and pushes
     # Bits: objects a and b may meet where group a & mask b and group b & mask a are not 0.
     collision_group: Bits = 1
