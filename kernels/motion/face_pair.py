@@ -5,7 +5,8 @@ base's frame. ANY n proves what `path` says; the best joins the nearest points. 
 
 * clear, at a time after the best so far;
 * at t, where the next step is shorter than the tolerance and the faces intersect at t + tolerance, of which float64 is
-  certain; or where no gap is left along n but rounding: they are as near as coordinates err (`Motion.slack`);
+  certain; or where no step is left along n, nor along any axis of the separating axis theorem: gaps there are no more
+  than what coordinates err by (`Motion.slack`);
 * undecided, at t, after `STEPS_MAX` steps.
 
 Gaps and speeds err by `slack` and `speed_slack`, which also cover the dot products' roundings, 8 u of the sizes. The
@@ -15,7 +16,14 @@ root's is covered by `EARLIER`, 2^-40 of the step.
 import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, StatePool, load_vertex
-from warp_abtree.kernels.distance.triangle_pair import between_features, nearest_features, scale_triangles
+from warp_abtree.kernels.distance.triangle_pair import (
+    CORNERS_OF_A,
+    CORNERS_OF_B,
+    between_features,
+    cross_exactly,
+    nearest_features,
+    scale_triangles,
+)
 from warp_abtree.kernels.motion.path import Moment, Motion, across, place_motion, reverse_moment
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.triangle.distance import corners_type
@@ -23,7 +31,7 @@ from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-STEPS_MAX = wp.constant(256)
+STEPS_MAX, AXIS_COUNT = wp.constant(256), wp.constant(17)
 EARLIER = wp.constant(wp.float64(1.0 - 2.0**-40))
 TIME_ROUNDING = wp.constant(wp.float64(2.0**-50))
 TIME_DOWN = wp.constant(wp.float64(1.0 - 2.0**-50))
@@ -64,6 +72,79 @@ def map_corners(r: wp.mat33d, shift: wp.vec3d, corners: corners_type) -> corners
 
 
 @wp.func
+def edge_of(m: corners_type, k: wp.int32):
+    """Return the start and the direction of edge k."""
+    start = wp.where(k == 0, m[0], wp.where(k == 1, m[1], m[2]))
+    return start, wp.where(k == 0, m[1], wp.where(k == 1, m[2], m[0])) - start
+
+
+@wp.func
+def level(v: wp.vec3d, e: wp.vec3d):
+    """Return v without what it has along e."""
+    square = wp.dot(e, e)
+    return v - wp.where(square > wp.float64(0.0), wp.dot(v, e) / square, wp.float64(0.0)) * e
+
+
+@wp.func
+def separating_direction(base: corners_type, at: corners_type):
+    """Return the unit vector along which faces are nearest, from the base's to the mover's.
+
+    Where they are near, what joins the nearest points is short and its direction rounded; the normal of the features
+    that they lie inside is not.
+    """
+    t = scale_triangles(base[0], base[1], base[2], at[0], at[1], at[2])
+    near = nearest_features(t)
+    v = between_features(t, near)
+    zero, one = wp.float64(0.0), wp.float64(1.0)
+    n, way, e, f = v, v, v, v
+    a = wp.matrix_from_rows(wp.vec3d(), t.a1, t.a2)
+    b = wp.matrix_from_rows(t.b0, t.b1, t.b2)
+    crosses = bool(True)
+    if near.kind < CORNERS_OF_B:
+        p, along_a = edge_of(a, near.kind / 3)
+        q, along_b = edge_of(b, near.kind % 3)
+        inside_a, inside_b = near.x > zero and near.x < one, near.y > zero and near.y < one
+        n = wp.where(inside_a, level(v, along_a), wp.where(inside_b, level(v, along_b), v))
+        crosses = inside_a and inside_b
+        way, e, f = q - p, along_a, along_b
+    elif near.kind < CORNERS_OF_A:
+        way, _ = edge_of(b, near.kind - CORNERS_OF_B)
+        _, e = edge_of(a, 0)
+        _, f = edge_of(a, 1)
+    else:
+        corner, _ = edge_of(a, near.kind - CORNERS_OF_A)
+        start, e = edge_of(b, 0)
+        _, f = edge_of(b, 1)
+        way = start - corner
+    normal = cross_exactly(e, f)
+    # Its direction errs by rounding over the height of what e and f span, that of v by rounding over the distance.
+    if crosses and wp.dot(normal, normal) > near.square * wp.max(wp.dot(e, e), wp.dot(f, f)):
+        n = wp.where(wp.dot(normal, way) < zero, -normal, normal)
+    return wp.normalize(n)
+
+
+@wp.func
+def axis_of(base: corners_type, at: corners_type, k: wp.int32):
+    """Return the k-th unit vector of the separating axis theorem.
+
+    Cross products of two edges; then for either face what is level and square to an edge, and the normal.
+    """
+    if k < 9:
+        _, e = edge_of(base, k / 3)
+        _, f = edge_of(at, k % 3)
+        return wp.normalize(cross_exactly(e, f))
+    face = wp.where(k < 13, base, at)
+    _, e = edge_of(face, 0)
+    _, f = edge_of(face, 1)
+    n = wp.normalize(cross_exactly(e, f))
+    i = (k - 9) & 3
+    if i < 3:
+        _, edge = edge_of(face, i)
+        n = wp.normalize(cross_exactly(n, edge))
+    return n
+
+
+@wp.func
 def step_along(gap: wp.float64, rate: wp.float64, bend: wp.float64):
     """Return how long a gap stays open, as `node_pair.step_of`; infinite where it does for ever."""
     zero, two = wp.float64(0.0), wp.float64(2.0)
@@ -91,6 +172,24 @@ def safe_step(motion: Motion, n: wp.vec3d, base: corners_type, m: Moment, mover:
         rate = wp.dot(n, m.spin * mover[k] + m.speed) - motion.speed_slack
         bend = motion.bend_size * across(axis, mover[k] - anchor) + motion.bend_rest
         step = wp.min(step, step_along(wp.dot(n, at[k]) - top, rate, bend))
+    return step
+
+
+@wp.func
+def longest_step(
+    motion: Motion, tried: wp.float64, base: corners_type, m: Moment, mover: corners_type, at: corners_type
+):
+    """Return the longest step along any axis, and the one tried before.
+
+    What joins points that are very near errs in its direction, so that long edges seem to reach across it.
+    """
+    step = tried
+    k = wp.int32(0)
+    while k < AXIS_COUNT:
+        n = axis_of(base, at, k)
+        step = wp.max(step, safe_step(motion, n, base, m, mover, at))
+        step = wp.max(step, safe_step(motion, -n, base, m, mover, at))
+        k += 1
     return step
 
 
@@ -129,23 +228,25 @@ def advance_faces(
         if is_clear(motion, (best - t) + TIME_ROUNDING, base, m, mover, at):
             contact.end = CLEAR
             return contact
-        triangles = scale_triangles(base[0], base[1], base[2], at[0], at[1], at[2])
-        n = wp.normalize(between_features(triangles, nearest_features(triangles)))
+        n = separating_direction(base, at)
         step = safe_step(motion, n, base, m, mover, at) * EARLIER
         contact.time = t
         contact.end = UNDECIDED
-        if step == wp.float64(0.0):
+        then = (t + step) * TIME_DOWN
+        if then <= t:
+            step = longest_step(motion, step, base, m, mover, at) * EARLIER
+            then = (t + step) * TIME_DOWN
+        if then <= t:
             contact.end = TOUCHES
             return contact
         if step < tolerance:
             if meet_at(motion, wp.min(t + tolerance, wp.float64(1.0)), base, mover):
                 contact.end = TOUCHES
                 return contact
-        then = (t + step) * TIME_DOWN
         if then > best:
             contact.end = CLEAR
             return contact
-        t = wp.max(t, then)
+        t = then
     return contact
 
 

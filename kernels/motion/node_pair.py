@@ -91,7 +91,7 @@ def step_of(gap: wp.float32, rate: wp.float32, bend: wp.float32):
 
 
 @wp.func
-def step_along(
+def longest_step(
     between: wp.vec3, reach: wp.vec3, speed: wp.vec3, spread: wp.vec3, bend: wp.float32, best: wp.vec2
 ) -> wp.vec2:
     """Return the longest step and the widest gap along three axes, and of what was found before."""
@@ -107,10 +107,10 @@ def step_along(
 @wp.func
 def step_boxes(a: MovingBox, b: MovingBox, motion: Motion):
     """Return how long two boxes stay apart, 0 if they may not be, and the widest gap between them."""
-    first = step_along(
+    first = longest_step(
         b.at.posed_sum - a.at.sum, b.at.posed_size + a.at.size, b.speed, b.spread, motion.bend_b, wp.vec2()
     )
-    return step_along(a.at.posed_sum - b.at.sum, a.at.posed_size + b.at.size, a.speed, a.spread, motion.bend_a, first)
+    return longest_step(a.at.posed_sum - b.at.sum, a.at.posed_size + b.at.size, a.speed, a.spread, motion.bend_a, first)
 
 
 @wp.func
@@ -124,19 +124,18 @@ def go_on(
     used: wp.int32,
     a: Node,
     b: Node,
-    box_a: MovingBox,
-    box_b: MovingBox,
-    step: wp.vec2,
+    scale: wp.float32,
+    gap: wp.float32,
     t: wp.float32,
     then: wp.float32,
     best: wp.float64,
 ):
-    """Return what two nodes apart from t to a later time leave, what it is.
+    """Return what two nodes apart from t to a later time leave, and what it is.
 
     Themselves again where they are far apart at t and there is a later time, else as `item_of`.
     """
-    size = wp.max(wp.max(box_a.at.size), wp.max(box_b.at.size))
-    again = step[1] > AGAIN * size and then > t
+    size = wp.max(wp.max(a.upper - a.lower), wp.max(b.upper - b.lower)) * scale
+    again = gap > AGAIN * size and then > t
     kind = wp.where((a.face | b.face) >= 0 and not again, FACES, NODES)
     kind = wp.where(used < 0 and wp.float64(then) <= best, kind, DROPPED)
     return wp.where(again, pack_item(a.skip, b.skip), item_of(a, b)), kind
@@ -173,9 +172,10 @@ def advance_children(
     s00, s01 = step_boxes(box_a0, box_b0, motion), step_boxes(box_a0, box_b1, motion)
     s10, s11 = step_boxes(box_a1, box_b0, motion), step_boxes(box_a1, box_b1, motion)
     times = wp.vec4(later(t, s00[0]), later(t, s01[0]), later(t, s10[0]), later(t, s11[0]))
-    i00, k00 = go_on(live, a0, b0, box_a0, box_b0, s00, t, times[0], best)
-    i01, k01 = go_on(y & live, a0, b1, box_a0, box_b1, s01, t, times[1], best)
-    i10, k10 = go_on(x & live, a1, b0, box_a1, box_b0, s10, t, times[2], best)
-    i11, k11 = go_on(x & y & live, a1, b1, box_a1, box_b1, s11, t, times[3], best)
+    scale = wp.float32(motion.scale)
+    i00, k00 = go_on(live, a0, b0, scale, s00[1], t, times[0], best)
+    i01, k01 = go_on(y & live, a0, b1, scale, s01[1], t, times[1], best)
+    i10, k10 = go_on(x & live, a1, b0, scale, s10[1], t, times[2], best)
+    i11, k11 = go_on(x & y & live, a1, b1, scale, s11[1], t, times[3], best)
     tests = -((live >> 31) + ((y & live) >> 31) + ((x & live) >> 31) + ((x & y & live) >> 31))
     return four_items(i00, i01, i10, i11), wp.vec4i(k00, k01, k10, k11), times, tests

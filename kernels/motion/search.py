@@ -5,6 +5,9 @@ dropped if that is after the best time so far. So the earliest time is found wha
 takes an object pair on CUDA; a thread of the CPU takes one after the other.
 """
 
+from functools import cache
+from typing import Any
+
 import warp as wp
 
 from warp_abtree.kernels import native
@@ -18,9 +21,8 @@ from warp_abtree.kernels.distance.search import (
     write_bound,
 )
 from warp_abtree.kernels.generation import STALE
-from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED, Contact, advance_pair
-from warp_abtree.kernels.motion.node_pair import advance_children, box_motion
-from warp_abtree.kernels.motion.path import Motion, place_motion
+from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED, Contact
+from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
 from warp_abtree.kernels.motion.start import OPEN, Contacts
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.face_pairs import Hits
@@ -60,7 +62,7 @@ def meet_faces(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    motion: Motion,
+    motion: Any,
     before: Contact,
 ):
     """Advance the face pairs first to first + popped, one a lane; return the earliest, and how many this lane took."""
@@ -70,9 +72,8 @@ def meet_faces(
     warp_sync()
     own = Contact()
     if live:
-        own = advance_pair(
-            tolerance, models, states, pose, motion, item_first(item), item_second(item), start, before.time
-        )
+        faces = wp.vec2i(item_first(item), item_second(item))
+        own = advance_faces(tolerance, models, states, pose, motion, faces, start, before.time)
     time = wp.where(own.end == CLEAR, wp.float64(wp.inf), own.time)
     best = before
     earliest = warp_min(time)
@@ -92,7 +93,7 @@ def search_contact(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    motion: Motion,
+    motion: Any,
     start: wp.float64,
 ):
     """Return the first contact of an object pair that is apart until a start, and what this lane compared."""
@@ -115,8 +116,7 @@ def search_contact(
             item, t = read_item(items, at), read_bound(items, at)
             live = wp.where(warp_lane() < popped and wp.float64(t) <= best.time, -1, 0)
             warp_sync()
-            boxes = box_motion(motion, place_motion(motion, wp.float64(t)))
-            children, kinds, times, compared = advance_children(states, pose, motion, boxes, t, best.time, item, live)
+            children, kinds, times, compared = advance_nodes(states, pose, motion, t, best.time, item, live)
             ends = push_nearest(items, end, waiting, kinds, children, times)
             warp_sync()
             end = item_second(ends)
@@ -131,61 +131,73 @@ def search_contact(
     return best, tests
 
 
-@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
-def search_warp_kernel(
-    room: wp.int32,
-    tolerance: wp.float64,
-    models: ModelPool,
-    states: StatePool,
-    pair_count: wp.array(dtype=wp.int32),
-    pair_poses: wp.array(dtype=PairPose),
-    hits_inout: Hits,
-    contacts_inout: Contacts,
-):
-    """Search the object pairs that do not intersect at first, a warp a pair."""
-    p = wp.tid() / warp_size()
-    if p >= pair_count[0] or contacts_inout.launched[0] == STALE:
-        return
-    if contacts_inout.end[p] != OPEN:
-        return
-    items = nearest_stack()
-    start, motion = contacts_inout.time[p], contacts_inout.motion[p]
-    contact, tests = search_contact(items, room, tolerance, models, states, pair_poses[p], motion, start)
-    if warp_lane() == 0:
-        contacts_inout.time[p] = contact.time
-        contacts_inout.end[p] = contact.end
-    add_warp_sum(hits_inout.node_tests, p, tests[0])
-    add_warp_sum(hits_inout.triangle_tests, p, tests[1])
+@cache
+def warp_search(kind):
+    """Return the kernel of warps for motions of a kind: `path.Motion` or `linear.LinearMotion`."""
 
-
-@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
-def search_thread_kernel(
-    room: wp.int32,
-    tolerance: wp.float64,
-    models: ModelPool,
-    states: StatePool,
-    pair_count: wp.array(dtype=wp.int32),
-    pair_poses: wp.array(dtype=PairPose),
-    counter: wp.array(dtype=wp.int32),
-    hits_inout: Hits,
-    contacts_inout: Contacts,
-    memory_out: wp.array2d(dtype=wp.int64),
-):
-    """Take one object pair after the other that does not intersect at first, and search it; CPU only."""
-    if contacts_inout.launched[0] == STALE:
-        return
-    count = wp.min(pair_count[0], pair_poses.shape[0])
-    thread = take_thread(counter)
-    if thread >= memory_out.shape[0]:
-        return
-    items = thread_lists(memory_out, thread)
-    p = take_unit(counter)
-    while p < count:
-        if contacts_inout.end[p] == OPEN:
-            start, motion = contacts_inout.time[p], contacts_inout.motion[p]
-            contact, tests = search_contact(items, room, tolerance, models, states, pair_poses[p], motion, start)
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    def search_warp_kernel(
+        room: wp.int32,
+        tolerance: wp.float64,
+        models: ModelPool,
+        states: StatePool,
+        pair_count: wp.array(dtype=wp.int32),
+        pair_poses: wp.array(dtype=PairPose),
+        motion: wp.array(dtype=kind),
+        hits_inout: Hits,
+        contacts_inout: Contacts,
+    ):
+        """Search the object pairs that are open, a warp a pair."""
+        p = wp.tid() / warp_size()
+        if p >= pair_count[0] or contacts_inout.launched[0] == STALE:
+            return
+        if contacts_inout.end[p] != OPEN:
+            return
+        items, start = nearest_stack(), contacts_inout.time[p]
+        contact, tests = search_contact(items, room, tolerance, models, states, pair_poses[p], motion[p], start)
+        if warp_lane() == 0:
             contacts_inout.time[p] = contact.time
             contacts_inout.end[p] = contact.end
-            hits_inout.node_tests[p] += wp.int64(tests[0])
-            hits_inout.triangle_tests[p] += wp.int64(tests[1])
-        p = take_unit(counter)
+        add_warp_sum(hits_inout.node_tests, p, tests[0])
+        add_warp_sum(hits_inout.triangle_tests, p, tests[1])
+
+    return search_warp_kernel
+
+
+@cache
+def thread_search(kind):
+    """Return the kernel of the CPU's threads for motions of a kind."""
+
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    def search_thread_kernel(
+        room: wp.int32,
+        tolerance: wp.float64,
+        models: ModelPool,
+        states: StatePool,
+        pair_count: wp.array(dtype=wp.int32),
+        pair_poses: wp.array(dtype=PairPose),
+        motion: wp.array(dtype=kind),
+        hits_inout: Hits,
+        contacts_inout: Contacts,
+        memory_out: wp.array2d(dtype=wp.int64),
+    ):
+        """Take one object pair after the other that is open, and search it; CPU only."""
+        if contacts_inout.launched[0] == STALE:
+            return
+        count = wp.min(pair_count[0], pair_poses.shape[0])
+        thread = take_thread(contacts_inout.counter)
+        if thread >= memory_out.shape[0]:
+            return
+        items = thread_lists(memory_out, thread)
+        p = take_unit(contacts_inout.counter)
+        while p < count:
+            if contacts_inout.end[p] == OPEN:
+                pose, start = pair_poses[p], contacts_inout.time[p]
+                contact, tests = search_contact(items, room, tolerance, models, states, pose, motion[p], start)
+                contacts_inout.time[p] = contact.time
+                contacts_inout.end[p] = contact.end
+                hits_inout.node_tests[p] += wp.int64(tests[0])
+                hits_inout.triangle_tests[p] += wp.int64(tests[1])
+            p = take_unit(contacts_inout.counter)
+
+    return search_thread_kernel

@@ -5,32 +5,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import warp as wp
-from helpers.questions import pairs_of, random_lod, scene_of
+from helpers.motions import ANSWERS, STILL, find, random_motions, to_bytes
+from helpers.questions import pairs_of, scene_of
 from helpers.samples import random_poses, random_quaternions, sample
-from oracles.motion import apart_until, pose_between, translation_contact
+from oracles.motion import apart_until, pose_between, rigid_soups, translation_contact
 
 import warp_abtree as ab
 from warp_abtree import testing
-
-NAMES = ("box", "small ball", "crumbs", "soup", "torus", "three", "capsule", "one", "lattice soup", "twins")
-ANSWERS = ("time", "clear", "undecided")
-STILL = np.array([0, 0, 0, 0, 0, 0, 1.0])
-FACES = 60
-
-
-def to_bytes(result):
-    return [np.asarray(getattr(result, name)).tobytes() for name in ANSWERS]
-
-
-def random_motions(rng, count, names=NAMES, faces=FACES, spread=2.0):
-    """Return cases at their starts, apart as a rule, and end poses (2 count, 7)."""
-    cases, ends = [], []
-    for _ in range(count):
-        models = [sample(name) for name in rng.choice(names, 2)]
-        starts, ends_now = (random_poses(rng, 2, spread) for _ in range(2))
-        cases.append([x for m, pose in zip(models, starts) for x in (m, random_lod(rng, m, faces), pose)])
-        ends.append(ends_now)
-    return cases, np.concatenate(ends)
 
 
 def starts_of(cases):
@@ -41,10 +22,6 @@ def poses_at(cases, ends, times):
     """Return the poses of all objects, each pair's at its own time."""
     times = np.repeat(np.broadcast_to(times, len(cases)), 2)
     return np.array([pose_between(*row) for row in zip(starts_of(cases), ends, times)])
-
-
-def find(device, cases, ends, **options):
-    return scene_of(device, cases).first_contact(pairs_of(cases), ends, **options)
 
 
 def meets(scene, cases, ends, times):
@@ -81,7 +58,7 @@ def test_agrees_with_steps_of_the_distance(device):
         if time == 0:
             continue
         meshes = [model.mesh_at(lod)[:2] for model, lod in (case[:2], case[3:5])]
-        assert apart_until(meshes, (case[2], case[5]), path, 1e-3) <= time + 1e-6
+        assert apart_until(*rigid_soups(meshes, (case[2], case[5]), path), 1e-3) <= time + 1e-6
 
 
 def random_soup(rng, count, size):

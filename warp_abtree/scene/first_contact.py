@@ -2,7 +2,8 @@
 
 In unit time each object goes from its pose in the scene to an end pose: its frame's origin on a straight line at
 constant speed, turning at constant angular velocity, the shortest way; or on a screw, along whose axis the object moves
-as it turns about it, at constant speed; straight where it turns by less than 2^-19 rad. For each object pair:
+as it turns about it, at constant speed; straight where it turns by less than 2^-19 rad. Or each vertex on a straight
+line, at constant speed, from one posed mesh to the other. For each object pair:
 
 * time, from 0 to 1: the surfaces, at their LODs, are proved apart at all earlier times, for the motion as real numbers
   and all rounding (`warp_abtree.kernels.motion.path`). 1 where they are for all of the motion. 0 where the exact test
@@ -26,6 +27,7 @@ from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import ObjectPool
 from warp_abtree.kernels.motion import face_pair, path, search, start
+from warp_abtree.kernels.motion import linear as straight
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.result import Found, Result
@@ -50,6 +52,12 @@ def check_tolerance(tolerance) -> float:
     return float(value)
 
 
+def check_path(screw, linear):
+    """Raise ValueError for two paths at a time."""
+    if screw and linear:
+        raise ValueError("screw and linear: objects move on one kind of path")
+
+
 class FirstContactQuery(Query):
     """Times of first contact of many object pairs as an operator: allocates once, launches many times.
 
@@ -61,6 +69,7 @@ class FirstContactQuery(Query):
         pairs, capacity: As for `Query`.
         tolerance: What a time may be early by, as a part of the motion, from 2^-40 up.
         screw: Whether objects move on screws.
+        linear: Whether vertices move straight instead, from one posed mesh to the other; whatever the turn.
 
     Attributes:
         ends: End poses, which each launch reads: device arrays rotation and position of `kernels.arrays.ObjectPool`.
@@ -72,21 +81,23 @@ class FirstContactQuery(Query):
     """
 
     _memory: wp.array
+    _motion: wp.array
 
-    def __init__(self, scene, end_poses, pairs=None, capacity=None, tolerance=1e-6, screw=False):
-        self.screw = bool(screw)
-        self.tolerance = check_tolerance(tolerance)
-        self.contacts, self.ends, self._paths = start.Contacts(), ObjectPool(), path.Paths()
-        self._counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
+    def __init__(self, scene, end_poses, pairs=None, capacity=None, tolerance=1e-6, screw=False, linear=False):
+        check_path(screw, linear)
+        self._kind = straight.LinearMotion if linear else path.Motion
+        self.tolerance, self.screw = check_tolerance(tolerance), bool(screw)
+        self.contacts, self.ends, self._ways = start.Contacts(), ObjectPool(), start.Ways()
+        self.contacts.counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity)
         self.contacts.launched = self.guard.launched
-        count = self.batch.object_count
-        for name, dtype in (("axis", wp.vec3d), ("angle", wp.float64), ("anchor", wp.vec3d)):
-            setattr(self._paths, name, wp.zeros(count, dtype=dtype, device=self.device))
-        for name in ("start", "travel"):
-            setattr(self._paths, name, wp.zeros(count, dtype=wp.vec3d, device=self.device))
+        paths = path.Paths()
+        for name in ("axis", "angle", "anchor", "start", "travel"):
+            dtype = wp.float64 if name == "angle" else wp.vec3d
+            setattr(paths, name, wp.zeros(self.batch.object_count, dtype=dtype, device=self.device))
         self.ends.rotation = wp.clone(self.batch.objects.pool.rotation)
         self.ends.position = wp.clone(self.batch.objects.pool.position)
+        self._ways.paths, self._ways.ends = paths, self.ends
         self._host_ends = HostPoses(self.ends, self.device)
         self.set_end_poses(end_poses)
 
@@ -110,7 +121,7 @@ class FirstContactQuery(Query):
             place_rows(rows, self.ends)
 
     def set_options(self, tolerance=1e-6, screw=False):
-        """Take another tolerance and path from the next launch on; a captured graph keeps its own.
+        """Take another tolerance, and screws or not, from the next launch on; a captured graph keeps its own.
 
         Raises:
             ValueError: A tolerance out of range.
@@ -118,14 +129,15 @@ class FirstContactQuery(Query):
         self.tolerance, self.screw = check_tolerance(tolerance), bool(screw)
 
     def _slow_kernels(self, with_distances: bool) -> list:
-        kernel = search.search_warp_kernel if self.uses_warps() else search.search_thread_kernel
-        kernels = [kernel, start.start_contact_kernel, path.prepare_path_kernel]
+        make = search.warp_search if self.uses_warps() else search.thread_search
+        kernels = [make(self._kind), start.contact_starter(self._kind), path.prepare_path_kernel]
         return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._slow_kernels(with_distances)]
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
-        for name, dtype in (("time", wp.float64), ("end", wp.int32), ("motion", path.Motion)):
-            made.append((self.contacts, name, wp.empty(room, dtype=dtype, device=self.device)))
+        made.append((self.contacts, "time", wp.empty(room, dtype=wp.float64, device=self.device)))
+        made.append((self.contacts, "end", wp.empty(room, dtype=wp.int32, device=self.device)))
+        made.append((self, "_motion", wp.empty(room, dtype=self._kind, device=self.device)))
         threads = 0 if self.uses_warps() else min(room, current_regime().cpu_threads or core_count())
         memory = wp.empty((threads, search.LIST_WORDS), dtype=wp.int64, device=self.device)
         return [*made, (self, "_memory", memory)]
@@ -155,17 +167,18 @@ class FirstContactQuery(Query):
         models, states, objects = self.batch.pools
         room, device = len(self.pairs), self.device
         launch = partial(launch, device=device)
-        inputs = [self.screw, objects, self.ends, self._paths]
+        inputs = [self.screw, objects, self.ends, self._ways.paths]
         paths = launch(path.prepare_path_kernel, dim=self.batch.object_count, inputs=inputs)
-        inputs = [models, states, objects, self._paths, self.pair_count, self.pairs, self.pair_poses]
-        inputs += [self.hits, self.contacts, self._counter]
-        begin = launch(start.start_contact_kernel, dim=room, inputs=inputs, block_dim=WARP_SIZE)
-        inputs = [self._stack_length(), self.tolerance, models, states, self.pair_count, self.pair_poses]
+        inputs = [models, states, objects, self._ways, self.pair_count, self.pairs, self.pair_poses]
+        inputs += [self.hits, self.contacts, self._motion]
+        begin = launch(start.contact_starter(self._kind), dim=room, inputs=inputs, block_dim=WARP_SIZE)
+        inputs = [self._stack_length(), self.tolerance, models, states, self.pair_count, self.pair_poses, self._motion]
         if self.uses_warps():
             dim, inputs = room * (WARP_SIZE if device.is_cuda else 1), [*inputs, self.hits, self.contacts]
-            return [paths, begin, launch(search.search_warp_kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE)]
-        inputs += [self._counter, self.hits, self.contacts, self._memory]
-        return [paths, begin, launch(search.search_thread_kernel, dim=1, inputs=inputs)]
+            kernel = search.warp_search(self._kind)
+            return [paths, begin, launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE)]
+        inputs += [self.hits, self.contacts, self._memory]
+        return [paths, begin, launch(search.thread_search(self._kind), dim=1, inputs=inputs)]
 
     def _make_result(self, found: Found, device: bool, with_rows: bool = True) -> Result:
         n = len(found.pairs)

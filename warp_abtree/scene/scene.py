@@ -11,7 +11,7 @@ from warp_abtree.query.distance import DistanceQuery, check_beyond
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import Result, contact_dtypes
-from warp_abtree.scene.first_contact import FirstContactQuery
+from warp_abtree.scene.first_contact import FirstContactQuery, check_path
 from warp_abtree.scene.objects import ALL_BITS, ObjectList, check_columns, check_lods, check_models
 from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, place_rows
 from warp_abtree.scene.tree_state import TreeState, read_tree_state
@@ -348,7 +348,9 @@ class Scene:
             query = DistanceQuery(self, pairs=pairs, beyond=beyond, **options)
         return self._run(("distance",), query, device)
 
-    def first_contact(self, pairs, end_poses, tolerance=1e-6, screw=False, device: bool = False) -> Result:
+    def first_contact(
+        self, pairs, end_poses, tolerance=1e-6, screw=False, linear=False, device: bool = False
+    ) -> Result:
         """Find when object pairs first touch on the way from their poses to end poses. Waits for the device.
 
         In unit time each object's frame moves straight at constant speed, and turns the shortest way at constant
@@ -359,6 +361,7 @@ class Scene:
             end_poses: Of all objects, as for `set_poses`.
             tolerance: What a time may be early by, as a part of the motion, from 2^-40 up.
             screw: Whether objects move on screws instead.
+            linear: Whether vertices move straight instead, from one posed mesh to the other.
             device: As for `intersect`.
 
         Returns:
@@ -370,15 +373,17 @@ class Scene:
         """
         check_device(self.device, "Scene.first_contact (FirstContactQuery.launch can)")
         pairs = check_pairs(pairs, self.object_count)
-        query = self._queries.pop(("first contact",), None)
+        key = ("first contact", bool(linear))
+        query = self._queries.pop(key, None)
         if isinstance(query, FirstContactQuery):
+            check_path(screw, linear)
             query.set_options(tolerance, screw)
             query.set_end_poses(end_poses)
             if not query.is_asked(pairs, None):
                 query.replace_pairs(pairs, None)
         else:
-            query = FirstContactQuery(self, end_poses, pairs=pairs, tolerance=tolerance, screw=screw)
-        return self._run(("first contact",), query, device)
+            query = FirstContactQuery(self, end_poses, pairs=pairs, tolerance=tolerance, screw=screw, linear=linear)
+        return self._run(key, query, device)
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.
