@@ -3,6 +3,8 @@
 Gaps are fractions of the mesh's size, poses otherwise random. Times are of a pose: of all poses at once, where each
 search starts anew (fresh) or from the faces of the launch before (again), and of one pair alone, launched to the
 result on the host. On the CPU all on one core, beside python-fcl, whose answers must be ours but for rounding.
+
+The part `gap` is contacts with a gap: `bench.gap_contacts`.
 """
 
 import time
@@ -12,6 +14,7 @@ import warp as wp
 
 import warp_abtree as ab
 
+from .. import gap_contacts
 from ..baselines.fcl import Fcl
 from ..meshes import ModelFolder, knot_model, mesh_file
 from ..shapes import longest_side, pose_matrices, random_poses, scene_of_poses
@@ -21,6 +24,7 @@ from .assembly import place_nut
 FULL = {"poses": 32, "counts": (1, 1024, 65536), "knot": 5000, "repeats": 7}
 CPU = FULL | {"counts": (1, 1024)}
 QUICK = {"poses": 3, "counts": (3,), "knot": 300, "repeats": 1}
+PARTS = ("nearest", "gap")
 GAPS = 0.3, 0.01  # of the size, first and last
 IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 MESHES = ("cow", "rocker-arm", "stanford-bunny")
@@ -29,9 +33,16 @@ LAUNCHES_BEFORE = 20  # of the pair alone, as in a loop that goes on: slabs are 
 STEPS = 25  # of the bisection that places a pose at a gap
 
 
-def run(device, quick=False):
+def run(device, quick=False, only=PARTS):
     """Yield a row a workload: times [ms] and what the searches took; of baselines, where they are at hand."""
-    device = wp.get_device(device)
+    if "nearest" in only:
+        yield from measure_all(wp.get_device(device), quick)
+    if "gap" in only:
+        yield from gap_contacts.run(device, quick)
+
+
+def measure_all(device, quick):
+    """Yield the rows of distances."""
     sizes = QUICK if quick else CPU if device.is_cpu else FULL
     folder = ModelFolder(None)
     at_hand = [name for name in MESHES if mesh_file(name)]

@@ -83,6 +83,8 @@ def judge_contacts_kernel(
     whole = whole and wp.uint32(hits.total[0]) <= wp.uint32(hits.face.shape[0])
     if hits.uncertain.shape[0] > 0:
         whole = whole and wp.uint32(hits.uncertain_total[0]) <= wp.uint32(hits.uncertain.shape[0])
+    if hits.apart.shape[0] > 0:
+        whole = whole and wp.uint32(hits.apart_total[0]) <= wp.uint32(hits.apart.shape[0])
     bodies_out.is_whole[0] = wp.where(whole, 1, 0)
 
 

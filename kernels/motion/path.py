@@ -244,10 +244,20 @@ def bound_motion(before: Motion, states: StatePool, pose: PairPose):
     return motion
 
 
-@wp.kernel
-def prepare_path_kernel(screw: bool, objects: ObjectPool, ends: ObjectPool, paths_out: Paths):
-    """Prepare an object's path a thread, from its pose to that of `ends`, as a screw if asked."""
-    i = wp.tid()
+@wp.struct
+class Path:
+    """One object's way, see `Paths`."""
+
+    axis: wp.vec3d  # of its turn, unit, model frame
+    angle: wp.float64  # of its turn, 0 to pi; -1 where there is no shortest turn
+    anchor: wp.vec3d  # the point that moves straight [model units]
+    start: wp.vec3d  # where that is at first [world units]
+    travel: wp.vec3d  # its way [world units]
+
+
+@wp.func
+def make_path(screw: bool, objects: ObjectPool, ends: ObjectPool, i: wp.int32) -> Path:
+    """Return an object's path from its pose to that of `ends`, as a screw if asked."""
     r = objects.rotation[i]
     axis, angle, half = shortest_turn(wp.transpose(r) * ends.rotation[i])
     travel = ends.position[i] - objects.position[i]
@@ -258,8 +268,22 @@ def prepare_path_kernel(screw: bool, objects: ObjectPool, ends: ObjectPool, path
         side = travel - along
         anchor = wp.float64(0.5) * (side + (half[1] / half[0]) * wp.cross(k, side))
         travel = along
-    paths_out.axis[i] = axis
-    paths_out.angle[i] = angle
-    paths_out.anchor[i] = wp.transpose(r) * anchor
-    paths_out.start[i] = objects.position[i] + anchor
-    paths_out.travel[i] = travel
+    path = Path()
+    path.axis = axis
+    path.angle = angle
+    path.anchor = wp.transpose(r) * anchor
+    path.start = objects.position[i] + anchor
+    path.travel = travel
+    return path
+
+
+@wp.kernel
+def prepare_path_kernel(screw: bool, objects: ObjectPool, ends: ObjectPool, paths_out: Paths):
+    """Prepare an object's path a thread."""
+    i = wp.tid()
+    path = make_path(screw, objects, ends, i)
+    paths_out.axis[i] = path.axis
+    paths_out.angle[i] = path.angle
+    paths_out.anchor[i] = path.anchor
+    paths_out.start[i] = path.start
+    paths_out.travel[i] = path.travel

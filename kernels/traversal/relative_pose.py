@@ -49,6 +49,8 @@ def relative_pose_kernel(
         hits_out.total[0] = 0
         hits_out.uncertain_total[0] = 0
         hits_out.inexact_total[0] = 0
+        if hits_out.gap.shape[0] > 0:
+            hits_out.apart_total[0] = 0
     hits_out.any_hit[p] = 0
     hits_out.count[p] = wp.int64(0)
     hits_out.node_tests[p] = wp.int64(0)

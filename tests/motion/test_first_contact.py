@@ -201,6 +201,21 @@ def test_common_motions_are_clear(device):
     np.testing.assert_array_equal(result.clear[~near], ~met[~near])
 
 
+@pytest.mark.parametrize("path", [{}, {"screw": True}, {"linear": True}], ids=["straight", "screw", "linear"])
+def test_the_broad_phase_finds_all_that_touch(device, path):
+    rng = np.random.default_rng(11)
+    scene, count = ab.Scene(device), 40
+    starts, ends = (random_poses(rng, count, 12.0) for _ in range(2))
+    for i, pose in enumerate(starts):
+        scene.add(sample("capsule"), pose, world=i % 2, lod=sample("capsule").lod_for(fraction=0.1))
+    found = scene.first_contact(None, ends, **path)
+    assert 0 < (~found.clear).sum() < len(found.pairs) < count * (count - 2) / 4
+    every = np.array([(i, j) for i in range(count) for j in range(i + 2, count, 2)])
+    whole = scene.first_contact(every, ends, **path)
+    times = [dict(zip(map(tuple, r.pairs[~r.clear].tolist()), r.time[~r.clear].tolist())) for r in (found, whole)]
+    assert times[0] == times[1]
+
+
 def test_captured_graphs(device):
     rng = np.random.default_rng(10)
     cases, ends = random_motions(rng, 20)

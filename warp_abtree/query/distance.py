@@ -36,11 +36,12 @@ from warp_abtree.query.request import check_request, check_within, refuse_option
 from warp_abtree.query.result import DISTANCES, Found, Result
 from warp_abtree.query.staging import first_rows
 
-COUNTER_COUNT = 4
 # Places among the launches, from their end: of the search, and of what is about pairs that intersect.
 SEARCH, CROSSINGS = -4, (-3, -1)
 # Pairs that make a further core worth its while, which costs some 50 us.
 PAIRS_A_CORE = 4
+# Pairs from which on warps search each roughly first; fewer leave some idle, and those share the search.
+ROUGH_LEAST = 1024
 
 
 def check_beyond(beyond, pair_count=None) -> np.ndarray:
@@ -118,7 +119,6 @@ class DistanceQuery(Query):
         self.distances, self._found, self._slabs = report.Distances(), frame.Found(), slabs.Slabs()
         self._slabs.record = wp.empty(0, dtype=wp.vec4, device=scene.device)
         self._slabs.made = wp.empty(0, dtype=wp.vec4i, device=scene.device)
-        self._counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity)
         self._found.launched = self.guard.launched
 
@@ -177,6 +177,8 @@ class DistanceQuery(Query):
             (self.distances, "faces", wp.vec2i),
         ):
             made.append((owner, name, wp.empty(room, dtype=dtype, device=self.device)))
+        uppers = room if self.uses_warps() else 0
+        made.append((self._found, "upper", wp.empty(uppers, dtype=wp.float32, device=self.device)))
         threads = 0 if self.uses_warps() else min(room, current_regime().cpu_threads or core_count())
         made.append((self._slabs, "states", wp.empty(room, dtype=wp.vec2i, device=self.device)))
         made.append(
@@ -238,14 +240,16 @@ class DistanceQuery(Query):
         warps = {"dim": room * lanes, "block_dim": WARP_SIZE, "device": device}
         threads = {"dim": room, "block_dim": WARP_SIZE, "device": device}
         reports = [*posed, found, hits, self.distances]
-        made = [launch(frame.start_distance_kernel, inputs=[*posed, found, self._counter], **threads)]
+        start = {**threads, "dim": max(room, len(self.work.flag))}
+        made = [launch(frame.start_distance_kernel, inputs=[*posed, found, self.work], **start)]
         if self.uses_warps():
-            inputs = [length, self._tolerances, *shared, found, hits]
-            made.append(launch(search.search_warp_kernel, inputs=inputs, **warps))
+            inputs = [length, ROUGH_LEAST, self._tolerances, *shared, found, hits, self.work]
+            searching = {**warps, "dim": self._warp_count() * lanes}
+            made.append(launch(search.search_warp_kernel, inputs=inputs, **searching))
         else:
             inputs = [models, states, objects, self.pair_count, self.pairs, found, self._slabs]
             made.append(launch(slabs.refresh_slab_kernel, inputs=inputs, dim=room, device=device))
-            inputs = [self._tolerances, *shared, self._counter, self._slabs, found, hits, self._memory]
+            inputs = [self._tolerances, *shared, self.work.counter, self._slabs, found, hits, self._memory]
             made.append(launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device))
         return [
             *made,

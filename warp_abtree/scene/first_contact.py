@@ -26,9 +26,10 @@ from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import ObjectPool
-from warp_abtree.kernels.motion import face_pair, path, search, start
+from warp_abtree.kernels.motion import face_pair, path, search, start, swept_boxes
 from warp_abtree.kernels.motion import linear as straight
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
+from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.result import Found, Result
 from warp_abtree.query.staging import first_rows
@@ -58,6 +59,22 @@ def check_path(screw, linear):
         raise ValueError("screw and linear: objects move on one kind of path")
 
 
+class SweptBroadPhase(BroadPhase):
+    """Broad phase of objects on their whole way, for a `FirstContactQuery`."""
+
+    def __init__(self, query, capacity, sorts):
+        self._query = query
+        super().__init__(query.batch, capacity, sorts)
+
+    def _options(self) -> tuple:
+        return (self._query.screw,)
+
+    def _make_boxes(self, launch):
+        query = self._query
+        inputs = [query.linear, query.screw, *self.batch.pools, query.ends, self.guard.record(), self.lower, self.upper]
+        return launch(swept_boxes.sweep_box_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
+
+
 class FirstContactQuery(Query):
     """Times of first contact of many object pairs as an operator: allocates once, launches many times.
 
@@ -66,7 +83,7 @@ class FirstContactQuery(Query):
     Args:
         scene: As for `Query`: its poses at the time of each launch are where motions start.
         end_poses: As for `set_end_poses`.
-        pairs, capacity: As for `Query`.
+        pairs, capacity: As for `Query`; the broad phase finds objects whose boxes overlap somewhere on their way.
         tolerance: What a time may be early by, as a part of the motion, from 2^-40 up.
         screw: Whether objects move on screws.
         linear: Whether vertices move straight instead, from one posed mesh to the other; whatever the turn.
@@ -86,7 +103,7 @@ class FirstContactQuery(Query):
     def __init__(self, scene, end_poses, pairs=None, capacity=None, tolerance=1e-6, screw=False, linear=False):
         check_path(screw, linear)
         self._kind = straight.LinearMotion if linear else path.Motion
-        self.tolerance, self.screw = check_tolerance(tolerance), bool(screw)
+        self.tolerance, self.screw, self.linear = check_tolerance(tolerance), bool(screw), bool(linear)
         self.contacts, self.ends, self._ways = start.Contacts(), ObjectPool(), start.Ways()
         self.contacts.counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity)
@@ -95,11 +112,20 @@ class FirstContactQuery(Query):
         for name in ("axis", "angle", "anchor", "start", "travel"):
             dtype = wp.float64 if name == "angle" else wp.vec3d
             setattr(paths, name, wp.zeros(self.batch.object_count, dtype=dtype, device=self.device))
-        self.ends.rotation = wp.clone(self.batch.objects.pool.rotation)
-        self.ends.position = wp.clone(self.batch.objects.pool.position)
+        self._make_ends()
         self._ways.paths, self._ways.ends = paths, self.ends
         self._host_ends = HostPoses(self.ends, self.device)
         self.set_end_poses(end_poses)
+
+    def _make_ends(self):
+        """Make room for end poses, at first those of the scene; once."""
+        if self.ends.rotation is None:
+            self.ends.rotation = wp.clone(self.batch.objects.pool.rotation)
+            self.ends.position = wp.clone(self.batch.objects.pool.position)
+
+    def _make_broad_phase(self, capacity, sorts: bool) -> BroadPhase:
+        self._make_ends()
+        return SweptBroadPhase(self, capacity, sorts)
 
     def set_end_poses(self, end_poses):
         """Set where each object's motion ends, from the next launch on.
