@@ -8,7 +8,7 @@ import warp as wp
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.distance.node_pair import DROPPED
 from warp_abtree.kernels.generation import STALE
-from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES
+from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED
 from warp_abtree.kernels.motion.kinds import advance_nodes, has_way, make_motion
 from warp_abtree.kernels.motion.path import Paths
 from warp_abtree.kernels.poses import PairPose
@@ -92,6 +92,10 @@ def contact_starter(kind):
             contacts_inout.end[p] = HALF_TURN
             return
         motion = make_motion(motion, ways.paths, ways.ends, models, states, objects, pair_poses[p], pair)
+        if not (motion.slack < wp.float64(wp.inf)):
+            # Beyond float64, or no numbers: nothing could be proved.
+            contacts_inout.end[p] = UNDECIDED
+            return
         t, clear, tests = advance_roots(states, pair_poses[p], motion)
         hits_inout.node_tests[p] += wp.int64(tests)
         contacts_inout.time[p] = wp.where(clear, wp.float64(1.0), wp.float64(t))

@@ -256,3 +256,31 @@ def test_bad_input(device):
         scene.first_contact([(0, 2)], ends)
     assert scene.first_contact([(0, 1)], np.array([STILL, [3, 0, 0, 0, 0, 1, 1e-5]])).clear.all()
     assert len(scene.first_contact(np.empty((0, 2), int), ends).time) == 0
+
+
+@pytest.mark.parametrize("path", [{}, {"screw": True}, {"linear": True}], ids=["straight", "screw", "linear"])
+def test_sweeps(device, path):
+    """Motions of B in the frame of a resting A, in chunks, as matrices too, and bad ones."""
+    rng = np.random.default_rng(12)
+    a, b = sample("torus"), sample("capsule")
+    starts, ends = (random_poses(rng, 1500, 3.0) for _ in range(2))
+    options = {"output": "first_contact", "tolerance": 1e-3, "lod_a": a.lod_for(fraction=0.1), "device": device, **path}
+    rows = ab.sweep(a, b, starts, end_poses=ends, **options)
+    scene = ab.Scene(device)
+    scene.add(a, lod=options["lod_a"])
+    for pose in starts[:100]:
+        scene.add(b, pose)
+    pairs = np.stack([np.zeros(100, int), np.arange(1, 101)], 1)
+    result = scene.first_contact(pairs, [STILL, *ends[:100]], tolerance=1e-3, **path)
+    for name in ANSWERS:
+        np.testing.assert_array_equal(rows[name][:100], getattr(result, name))
+    for bad, error, message in (
+        ({"end_poses": ends[:3]}, ValueError, "3 given for 1500"),
+        ({"end_poses": np.where(np.arange(1500)[:, None] == 7, np.nan, ends)}, ValueError, "end_poses: pose 7"),
+        ({}, TypeError, "end_poses"),
+        ({"end_poses": ends, "beyond": 1.0}, TypeError, "beyond"),
+        ({"end_poses": ends, "tolerance": 2}, ValueError, "tolerance"),
+    ):
+        with pytest.raises(error, match=message):
+            ab.sweep(a, b, starts, **{**options, **bad})
+    assert len(ab.sweep(a, b, np.empty((0, 7)), end_poses=np.empty((0, 7)), **options)) == 0

@@ -31,6 +31,7 @@ from warp_abtree.kernels.motion import linear as straight
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.request import refuse_options
 from warp_abtree.query.result import Found, Result
 from warp_abtree.query.staging import first_rows
 from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, place_rows
@@ -59,6 +60,23 @@ def check_path(screw, linear):
         raise ValueError("screw and linear: objects move on one kind of path")
 
 
+def check_asked_contacts(output, precision, options):
+    """Check what is asked of a sweep of motions.
+
+    Raises:
+        TypeError: An option with another name, or no end poses.
+        ValueError: A bad option or precision.
+    """
+    unknown = set(options) - {"end_poses", "tolerance", "screw", "linear"}
+    if unknown:
+        raise TypeError(f"sweep has no option {sorted(unknown)[0]!r} for output {output!r}")
+    if "end_poses" not in options:
+        raise TypeError(f"sweep needs end_poses for output {output!r}")
+    refuse_options(output, {"precision": precision != "exact"})
+    check_tolerance(options.get("tolerance", 1e-6))
+    check_path(options.get("screw"), options.get("linear"))
+
+
 class SweptBroadPhase(BroadPhase):
     """Broad phase of objects on their whole way, for a `FirstContactQuery`."""
 
@@ -82,7 +100,7 @@ class FirstContactQuery(Query):
 
     Args:
         scene: As for `Query`: its poses at the time of each launch are where motions start.
-        end_poses: As for `set_end_poses`.
+        end_poses: As for `set_end_poses`; None for those of the scene as it stands, until others are set.
         pairs, capacity: As for `Query`; the broad phase finds objects whose boxes overlap somewhere on their way.
         tolerance: What a time may be early by, as a part of the motion, from 2^-40 up.
         screw: Whether objects move on screws.
@@ -115,7 +133,8 @@ class FirstContactQuery(Query):
         self._make_ends()
         self._ways.paths, self._ways.ends = paths, self.ends
         self._host_ends = HostPoses(self.ends, self.device)
-        self.set_end_poses(end_poses)
+        if end_poses is not None:
+            self.set_end_poses(end_poses)
 
     def _make_ends(self):
         """Make room for end poses, at first those of the scene; once."""

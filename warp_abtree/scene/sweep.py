@@ -11,12 +11,15 @@ from collections import deque
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device, to_numpy
+from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.sweep import NONE_REFUSED, pose_placer, report_chunk_kernel
-from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond
+from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond, check_flags
 from warp_abtree.query.narrow_phase import Query
-from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE, check_poses, device_rows
+from warp_abtree.scene.first_contact import FirstContactQuery, check_asked_contacts
+from warp_abtree.scene.originals import OriginalDistances
+from warp_abtree.scene.pose_rows import DeviceRows, refuse_row, take_rows
+from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
@@ -27,67 +30,17 @@ CHUNKS = (1024, 8192, 65536)
 KEPT_PAIRS = 4
 KEPT_ROWS = 2**20
 
-SCALARS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 # By the numbers of a row: quaternions, and matrices.
 TOLERANCE = {7: QUATERNION_TOLERANCE, 16: RIGID_TOLERANCE}
 DISTANCE_ROWS = np.dtype(
     [("distance", np.float64), ("bracket", np.float64, 2), ("points", np.float64, (2, 3)), ("faces", np.int32, 2)]
 )
+CONTACT_ROWS = np.dtype([("time", np.float64), ("clear", bool), ("undecided", bool)])
+# Outputs whose answers are rows.
+ROWS = {"distance": DISTANCE_ROWS, "first_contact": CONTACT_ROWS}
 ANSWERS = {"any": np.dtype(bool), "count": np.dtype(np.int64)}
 
 _kept: dict[tuple, "_PosedModels"] = {}
-
-
-class _HostPoses:
-    """Poses in the memory of the host, rows of 7 or 16 numbers."""
-
-    def __init__(self, rows):
-        self.rows = rows
-        self.scalar, self.width = SCALARS[rows.dtype], rows.shape[1]
-
-    def __len__(self):
-        return len(self.rows)
-
-    def row(self, i):
-        return self.rows[i]
-
-
-class _DevicePoses:
-    """Poses in the memory of the device that asks, rows of 7 or 16 numbers."""
-
-    def __init__(self, rows):
-        self.scalar, (self.count, self.width) = rows.dtype, rows.shape
-        self.flat = rows.flatten()
-
-    def __len__(self):
-        return self.count
-
-    def row(self, i):
-        return self.flat[self.width * i : self.width * (i + 1)].numpy()
-
-
-def _take_poses(poses, device):
-    """Return poses where they are, or on the host.
-
-    Raises:
-        ValueError: No numbers, or another shape than (p, 7) and (p, 4, 4).
-    """
-    rows = device_rows(poses, device)
-    if rows is not None:
-        return _DevicePoses(rows)
-    rows = to_numpy(poses, "poses")
-    if rows.shape == (0,):
-        rows = np.empty((0, 7))
-    if not (rows.ndim == 2 and rows.shape[1] == 7) and not (rows.ndim == 3 and rows.shape[1:] == (4, 4)):
-        raise ValueError(f"poses: shape {rows.shape} is neither (p, 7) nor (p, 4, 4)")
-    rows = rows.reshape(len(rows), 7 if rows.ndim == 2 else 16)
-    return _HostPoses(rows if rows.dtype in SCALARS else rows.astype(np.float64))
-
-
-def _refuse(poses, i):
-    row = np.asarray(poses.row(i), np.float64)
-    check_poses(row[None] if poses.width == 7 else row.reshape(1, 4, 4), first=i)
-    raise ValueError(f"poses: pose {i} is no pose")  # by rounding, where the host finds it just within
 
 
 class _PosedModels:
@@ -119,9 +72,8 @@ class _Chunk:
         self.batch = Batch(pair.models, pair.states, objects, np.repeat(pair.object_model, [1, room]), solid=solid)
         self.chunk_query: _ChunkQuery | None = None
 
-    def find_query(self, output, precision):
-        """Return the chunk's query if it is of this output and precision, else another."""
-        key = (output, precision)
+    def find_query(self, *key):
+        """Return the chunk's query if it is of this output and precision, signed or of originals, else another."""
         if self.chunk_query is None or self.chunk_query.key != key:
             self.chunk_query = None  # its memory first
             self.chunk_query = _ChunkQuery(self, key)
@@ -164,12 +116,15 @@ class _ChunkQuery:
 
     def __init__(self, chunk: _Chunk, key):
         self.key = key
-        self.output, precision = key
+        self.output, precision, (signed, of_originals) = key
         self.device, self.room, self.objects = chunk.batch.device, chunk.room, chunk.batch.objects
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
+        self.originals = OriginalDistances(chunk.batch) if of_originals else None
         if self.output == "distance":
-            self.query: Query = DistanceQuery(chunk.batch, self.pairs)
+            self.query: Query = DistanceQuery(chunk.batch, self.pairs, signed=signed)
+        elif self.output == "first_contact":
+            self.query = FirstContactQuery(chunk.batch, None, self.pairs, linear=precision == "linear")
         else:
             self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision)
         self.count = self.room
@@ -191,7 +146,7 @@ class _ChunkQuery:
     def _load(self, slot, poses, start, count):
         """Bring poses into a slot whose last chunk is over."""
         width = slot.width
-        if isinstance(poses, _DevicePoses):
+        if isinstance(poses, DeviceRows):
             wp.copy(slot.poses_flat, poses.flat, src_offset=width * start, count=width * count)
             return
         np.copyto(slot.poses_host.numpy().reshape(-1, width)[:count], poses.rows[start : start + count])
@@ -200,10 +155,11 @@ class _ChunkQuery:
             self.copies.record_event(slot.loaded)
             wp.get_stream(self.device).wait_event(slot.loaded)
 
-    def _place(self, slot):
+    def _place(self, slot, objects=None):
         slot.report.fill_(NONE_REFUSED)
         kernel = pose_placer(slot.poses.dtype, slot.width)
-        inputs = [wp.float64(TOLERANCE[slot.width]), slot.poses, self.objects.pool, slot.report]
+        objects = self.objects.pool if objects is None else objects
+        inputs = [wp.float64(TOLERANCE[slot.width]), slot.poses, objects, slot.report]
         wp.launch(kernel, self.count, inputs, device=self.device)
 
     def _launch(self, slot):
@@ -233,7 +189,7 @@ class _ChunkQuery:
             wp.synchronize_event(slot.done)
         refused, uncertain = slot.report_host.numpy().tolist()
         if refused != NONE_REFUSED:
-            _refuse(poses, start + refused)
+            refuse_row(poses, start + refused)
         if uncertain % 2**32 > slot.uncertain_room:  # which may have grown since
             return getattr(self._run_grown(slot, count), self.output)
         return slot.answer_host.numpy()[:count]
@@ -278,7 +234,7 @@ class _ChunkQuery:
             found = self._run_grown(slot, count).faces
             refused = int(slot.report.numpy()[0])
             if refused != NONE_REFUSED:
-                _refuse(poses, start + refused)
+                refuse_row(poses, start + refused)
             found[:, 0] += start
             parts.append(found)
         return np.concatenate(parts)
@@ -291,16 +247,39 @@ class _ChunkQuery:
         for start in range(0, len(poses), self.room):
             count = min(self.room, len(poses) - start)
             self._load(slot, poses, start, count)
-            self.query.set_pairs(self.pairs[:count], beyond)
             self.count = count
             self._place(slot)
-            result = self.query.run()
+            if self.originals is None:
+                self.query.set_pairs(self.pairs[:count], beyond)
+                result = self.query.run()
+            else:
+                result = self.originals.run(self.pairs[:count], beyond, **tolerances)
             refused = int(slot.report.numpy()[0])
             if refused != NONE_REFUSED:
-                _refuse(poses, start + refused)
+                refuse_row(poses, start + refused)
             rows = found[start : start + count]
             rows["distance"], rows["bracket"] = result.distance, result.bracket
             rows["points"], rows["faces"] = result.points, result.point_faces
+        return found
+
+    def find_first_contacts(self, poses, ends, options):
+        """Return the rows of "first_contact" of all motions, from poses to ends."""
+        found = np.empty(len(poses), CONTACT_ROWS)
+        assert isinstance(self.query, FirstContactQuery)
+        self.query.set_options(**options)
+        for start in range(0, len(poses), self.room):
+            self.count = count = min(self.room, len(poses) - start)
+            self.query.set_pairs(self.pairs[:count])
+            for rows, objects, what in ((poses, None, "poses"), (ends, self.query.ends, "end_poses")):
+                slot = self._find_slots(rows)[0]
+                self._load(slot, rows, start, count)
+                self._place(slot, objects)
+                refused = int(slot.report.numpy()[0])
+                if refused != NONE_REFUSED:
+                    refuse_row(rows, start + refused, what)
+            result = self.query.run()
+            for name in ("time", "clear", "undecided"):
+                found[name][start : start + count] = getattr(result, name)
         return found
 
     def is_small(self):
@@ -339,28 +318,34 @@ def sweep(
             matrices, taken as they are; float32 or float64, of any framework. What lies on the GPU that asks is read
             where it is, Warp's transforms and matrices (p,) too.
         lod_a, lod_b: LODs; None is the finest.
-        output: "any", "count", "faces" or "distance".
+        output: "any", "count", "faces", "distance" or "first_contact", of B's motions from poses to end_poses.
         precision: As `Scene.intersect`, exact for A's vertices and the posed ones of B.
         device: Warp device; None for Warp's default.
         solid: Whether both are solids (`Scene.add`), or a bool for each; what "any" and "distance" answer for one
             inside the other stands in `warp_abtree.state.solids`, "count" and "faces" are of surfaces.
-        options: tolerance, relative and beyond, each one number, as `DistanceQuery` takes them; for "distance" alone.
+        options: tolerance, relative, beyond, each one number, and signed, as `DistanceQuery` takes them, and originals,
+            as `Scene.intersect` does; for "distance" alone.
 
     Returns:
         For "any" bool (p,), for "count" the intersecting face pairs of each pose, int64 (p,), for "faces" rows (pose,
         face of A, face of B), int32 (k, 3), sorted. For "distance" a structured array (p,) of distance, bracket (2,),
-        points (2, 3) [A's frame] and faces (2,), see `warp_abtree.query.distance`.
+        points (2, 3) [A's frame] and faces (2,), see `warp_abtree.query.distance`. For "first_contact" one of time,
+        clear and undecided, see `warp_abtree.scene.first_contact`.
 
     Raises:
         TypeError: model_a or model_b is no Model; an option has another name.
         ValueError: Bad poses, the first of which is named, a LOD out of range, an unknown option or device.
         RuntimeError: A graph is being captured.
     """
-    check_asked(output, precision, options)
+    (check_asked_contacts if output == "first_contact" else check_asked)(output, precision, options)
     pair = Scene(device)
     check_device(pair.device, "ab.sweep")
     with device_lock(pair.device):
-        poses = _take_poses(poses, pair.device)
+        poses = take_rows(poses, pair.device)
+        if output == "first_contact":
+            options["end_poses"] = ends = take_rows(options["end_poses"], pair.device, "end_poses")
+            if len(ends) != len(poses):
+                raise ValueError(f"end_poses: {len(ends)} given for {len(poses)} poses")
         solids = solid if isinstance(solid, tuple | list) and len(solid) == 2 else (solid, solid)
         for model, lod, is_solid in zip((model_a, model_b), (lod_a, lod_b), solids):
             pair.add(model, lod=lod, solid=is_solid)
@@ -369,9 +354,10 @@ def sweep(
 
 def _sweep(pair, poses, asked, options):
     output, precision = asked
+    if output == "first_contact":
+        precision = "linear" if options.pop("linear", False) else "rigid"
     if len(poses) == 0:
-        empty = {"faces": np.empty((0, 3), np.int32), "distance": np.empty(0, DISTANCE_ROWS)}
-        return empty[output] if output in empty else np.empty(0, ANSWERS[output])
+        return np.empty((0, 3), np.int32) if output == "faces" else np.empty(0, (ROWS | ANSWERS)[output])
     models = [pair.models[i] for i in pair.object_model]
     key = (*map(id, models), *pair.lods.tolist(), *pair.object_solid, pair.device.alias)
     # Taken out while in use: a call from another thread has its own, and one that fails leaves nothing behind.
@@ -380,10 +366,12 @@ def _sweep(pair, poses, asked, options):
         owners = [weakref.ref(model, lambda _: _kept.pop(key, None)) for model in models]
         posed = _PosedModels(pair, owners)
     chunk = posed.find_chunk(len(poses))
-    query = chunk.find_query(output, precision)
+    query = chunk.find_query(output, precision, check_flags(options))
     if output == "distance":
-        tolerances = {name: value for name, value in options.items() if name != "beyond"}
+        tolerances = {name: value for name, value in options.items() if name in ("tolerance", "relative")}
         answers = query.find_distances(poses, tolerances, check_beyond(options.get("beyond")))
+    elif output == "first_contact":
+        answers = query.find_first_contacts(poses, options.pop("end_poses"), options)
     else:
         answers = query.find_faces(poses) if output == "faces" else query.find_answers(poses)
     chunk.trim()

@@ -1,7 +1,7 @@
 // The filter of face pairs that are apart, on the CPU: 16 at a time in float32, those that may be nearer than a gap.
 #pragma once
 #include "builtin.h"
-#include "nearest/faces32.h"
+#include "nearest/corners32.h"
 
 template <class ModelPool, class StatePool, class PairPose>
 wp::int32 simd_near_filter(ModelPool models, StatePool states, PairPose pose, wp::int32 waiting,
@@ -10,7 +10,7 @@ wp::int32 simd_near_filter(ModelPool models, StatePool states, PairPose pose, wp
     __trap();  // a lane measures a pair
     return 0;
 #else
-#include "nearest/faces32.h"
+#include "nearest/corners32.h"
     typedef NearestFaces N;
     typedef N::F F;
     wp::int64* list = faces.data;
@@ -25,8 +25,8 @@ wp::int32 simd_near_filter(ModelPool models, StatePool states, PairPose pose, wp
     for (int done = 0; done < waiting; done += 16) {
         const int count = waiting - done < 16 ? waiting - done : 16;
         const N::Corners corners =
-            N::load(models.vertex_near.data, states.face_corner.data, pose.corner_a, pose.corner_b,
-                    pose.rotation32.data, there, scale, list + done, count);
+            NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a, pose.corner_b,
+                                 pose.rotation32.data, there, scale, list + done, count);
         F::lanes size;
         const F::lanes d = __builtin_elementwise_sqrt(N::measure(corners, size).square);
         // As `search_nearest`, where differences of corners err by `error` along an axis.
