@@ -25,7 +25,7 @@ from . import tables
 
 CASES = (
     *("assembly", "baselines", "budget", "build", "coarse", "distance", "exact", "frame"),
-    *("host", "query", "scale", "sweep", "update"),
+    *("host", "motion", "query", "scale", "sweep", "update"),
 )
 STUDIES = {"paper": "study", "tradeoff": "study", "nightly": "nightly"}  # and the modules that run them
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml

@@ -3,6 +3,8 @@
 u = 2^-53. Sine and cosine are Taylor sums on [0, pi/4], which end below 2^-56, and doubled angles: within 8 u.
 """
 
+import math
+
 import warp as wp
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -12,29 +14,21 @@ REAL_LEAST = wp.constant(wp.float64(2.0**-21))
 NEWTON_STEPS = wp.constant(4)
 
 
+# Factors of the sums, the last first. A literal inside a kernel would be a float32.
+SINES = wp.constant(wp.types.vector(8, wp.float64)(*[(-1) ** k / math.factorial(2 * k + 1) for k in range(8, 0, -1)]))
+COSINES = wp.constant(wp.types.vector(8, wp.float64)(*[(-1) ** k / math.factorial(2 * k) for k in range(8, 0, -1)]))
+QUARTER_TURN = wp.constant(wp.float64(math.pi / 2))
+
+
 @wp.func
 def sin_cos_quarter(x: wp.float64):
     """Return sine and cosine of an angle in [0, pi/4]."""
     z = x * x
-    s = wp.float64(1.0 / 355687428096000.0)
-    s = wp.float64(-1.0 / 1307674368000.0) + z * s
-    s = wp.float64(1.0 / 6227020800.0) + z * s
-    s = wp.float64(-1.0 / 39916800.0) + z * s
-    s = wp.float64(1.0 / 362880.0) + z * s
-    s = wp.float64(-1.0 / 5040.0) + z * s
-    s = wp.float64(1.0 / 120.0) + z * s
-    s = wp.float64(-1.0 / 6.0) + z * s
-    s = x + x * (z * s)
-    c = wp.float64(1.0 / 20922789888000.0)
-    c = wp.float64(-1.0 / 87178291200.0) + z * c
-    c = wp.float64(1.0 / 479001600.0) + z * c
-    c = wp.float64(-1.0 / 3628800.0) + z * c
-    c = wp.float64(1.0 / 40320.0) + z * c
-    c = wp.float64(-1.0 / 720.0) + z * c
-    c = wp.float64(1.0 / 24.0) + z * c
-    c = wp.float64(-0.5) + z * c
-    c = wp.float64(1.0) + z * c
-    return s, c
+    s, c = SINES[0], COSINES[0]
+    for k in range(1, 8):
+        s = SINES[k] + z * s
+        c = COSINES[k] + z * c
+    return x + x * (z * s), wp.float64(1.0) + z * c
 
 
 @wp.func
@@ -70,7 +64,7 @@ def angle_of(s: wp.float64, c: wp.float64):
     r = least / most
     x = r / (wp.float64(1.0) + wp.float64(0.28) * r * r)
     if s > c:
-        x = wp.float64(1.5707963267948966) - x
+        x = QUARTER_TURN - x
     i = wp.int32(0)
     while i < NEWTON_STEPS:
         sx, cx = sin_cos_half(wp.float64(2.0) * x)

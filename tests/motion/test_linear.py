@@ -1,11 +1,7 @@
 """First contacts where vertices move straight: whole meshes, and public queries with ground truth."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
-from helpers.ccd import read_queries
 from helpers.motions import STILL, find, random_motions, to_bytes
 from helpers.samples import sample
 from oracles.distance import surface_distance
@@ -13,9 +9,9 @@ from oracles.motion import apart_until, straight_soups
 from oracles.triangle import box_pairs, pairs_intersect
 
 import warp_abtree as ab
+from bench.ccd_queries import FOLDER, read_queries
 from warp_abtree import testing
 
-FOLDER = Path(os.environ.get("ABTREE_CCD", Path(__file__).resolve().parents[2].parent / "shared" / "ccd"))
 TOLERANCE = 1e-6
 
 

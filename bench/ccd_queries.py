@@ -1,12 +1,19 @@
-"""Queries of continuous collision detection with ground truth, as ../shared/ccd has them; see its README."""
+"""Queries of continuous collision detection with ground truth in rational numbers: Sample-Queries of Tight-Inclusion.
+
+Files NAME.vertex-face|edge-edge.N.csv.gz, in the folder that the environment variable ABTREE_CCD names, else in
+../shared/ccd beside the checkout. Eight rows a query, four points at first and at last: numerator and denominator of x,
+y and z, then 1 if they touch at some time while points move straight.
+"""
 
 import csv
 import gzip
+import os
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 
+FOLDER = Path(os.environ.get("ABTREE_CCD", Path(__file__).resolve().parents[2] / "shared" / "ccd"))
 # Which rows at either time are the corners of A's face and of B's, a vertex or an edge as a face without area.
 CORNERS = {"vertex-face": (0, 0, 0, 1, 2, 3), "edge-edge": (0, 1, 1, 2, 3, 3)}
 
