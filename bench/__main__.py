@@ -28,6 +28,8 @@ CASES = (
     *("host", "motion", "query", "scale", "sweep", "update"),
 )
 STUDIES = {"paper": "study", "tradeoff": "study", "nightly": "nightly"}  # and the modules that run them
+MODULES = {name: f"bench.cases.{name}" for name in CASES} | {"motion": "bench.motions.case"}
+MODULES |= {name: f"bench.studies.{module}" for name, module in STUDIES.items()}
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml
 # A case, and a study, takes the options that its function `run` has as arguments.
 OPTIONS = {
@@ -35,7 +37,7 @@ OPTIONS = {
     "largest": {"type": int, "metavar": "FACES", "help": "leave larger meshes out"},
     "models": {"metavar": "DIR", "help": "keep the models there"},
     "plots": {"metavar": "DIR", "help": "draw figures there"},
-    "count": {"type": int, "help": "random pairs; a tenth as many adversarial ones"},
+    "count": {"type": int, "help": "random pairs, and a tenth as many adversarial ones; or configurations"},
     "out": {"required": True, "metavar": "DIR", "help": "where to write JSON, tables and figures"},
     "only": {"nargs": "+", "metavar": "PART", "help": "run these parts, or cases, alone; others are kept from before"},
     "processes": {"type": int, "help": "processes that run the oracle"},
@@ -53,8 +55,8 @@ def main(argv=None):
     argv = list(sys.argv[1:] if argv is None else argv)
     name = argv[0] if argv else None
     case = None
-    if name in (*CASES, *STUDIES):
-        case = importlib.import_module(f"bench.studies.{STUDIES[name]}" if name in STUDIES else f"bench.cases.{name}")
+    if name in MODULES:
+        case = importlib.import_module(MODULES[name])
     taken = set(inspect.signature(case.run).parameters) if case else set()
     parser = Parser(prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=[*STUDIES, *CASES])

@@ -200,10 +200,10 @@ def test_help_has_examples(capsys, words, parts):
 @pytest.mark.parametrize(
     ("module", "words", "message"),
     [
-        ("shtab", "--print-completion bash", "--print-completion needs shtab: pip install warp-abtree[app]"),
-        ("msgspec", "run rain", "rain.toml: scene files need msgspec: pip install warp-abtree[app]"),
-        ("viser", "view ball.obj", "view needs viser: pip install warp-abtree[view]"),
-        ("matplotlib", "run rain --plot .", "--plot needs Matplotlib: pip install warp-abtree[pictures]"),
+        ("shtab", "--print-completion bash", "--print-completion needs shtab: pip install shtab"),
+        ("msgspec", "run rain", "rain.toml: scene files need msgspec: pip install msgspec"),
+        ("viser", "view ball.obj", "view needs viser: pip install viser"),
+        ("matplotlib", "run rain --plot .", "--plot needs Matplotlib: pip install matplotlib"),
         ("pyvista", "run rain --picture out.png", "--picture needs pyvista and Matplotlib: pip install"),
         ("pyvista", "picture ball.obj --out out.png", "picture needs pyvista and Matplotlib: pip install"),
     ],

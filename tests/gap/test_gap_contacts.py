@@ -276,13 +276,23 @@ def test_the_broad_phase_is_wider(device):
     result = ab.ContactQuery(scene, gap=0.015).run()
     assert result.pairs.tolist() == [[0, 1]]
     np.testing.assert_allclose(result.contacts["separation"].min(), 0.01, rtol=1e-12)
-    own = wp.array([0.004, 0.008, 0.011], dtype=wp.float64, device=device)
+    rows = np.zeros((3, 4))
+    rows[:, 3] = 0.004, 0.008, 0.011
+    own = wp.array(rows, dtype=wp.vec4d, device=device)
     query = ab.ContactQuery(scene, gap=own)
     assert query.run().pairs.tolist() == [[0, 1]]
     assert (query.result().contacts["separation"] < 0.012).all() and len(query.result().contacts)
-    own.assign(np.array([0.0, 0.011, 0.011]))
+    rows[:, 3] = 0.0, 0.011, 0.011
+    own.assign(rows)
     query.launch()
     assert sorted(map(tuple, query.result().pairs.tolist())) == [(0, 1), (1, 2)]
+    # Two that move together come no nearer.
+    rows[:] = [(0.0, 0.9, 0.0, 0.0), (0.0, 0.9, 0.0, 0.0), (-0.025, 0.9, 0.0, 0.0)]
+    own.assign(rows)
+    query.run()
+    assert np.unique(query.result().contacts["pair"]).tolist() == [
+        p for p, pair in enumerate(query.result().pairs.tolist()) if pair == [1, 2]
+    ]
     assert ab.ContactQuery(scene, gap=np.array([0.0, 0.011, 0.011])).run().contacts["separation"].max() < 0.022
 
 

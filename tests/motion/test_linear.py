@@ -9,7 +9,7 @@ from oracles.motion import apart_until, straight_soups
 from oracles.triangle import box_pairs, pairs_intersect
 
 import warp_abtree as ab
-from bench.ccd_queries import FOLDER, read_queries
+from bench.motions.ccd_queries import FOLDER, read_queries
 from warp_abtree import testing
 
 TOLERANCE = 1e-6

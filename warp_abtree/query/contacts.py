@@ -89,9 +89,10 @@ class ContactQuery(Query):
         contact_dtype: Type of the real numbers in `result()`, float64 or float32; those beyond float32 become infinite.
         sort_pairs: As for `Query`.
         gap: Distance [world units]: faces nearer than that have contacts too. One for all pairs, (p,) beside given
-            pairs; where the broad phase makes the pairs also (n,), one for each object, which add up for a pair: as a
-            Warp array, float64 on the query's device, it is read by each launch. It needs precision "exact", and takes
-            12 bytes more a contact. None for none.
+            pairs; where the broad phase makes the pairs also (n,), one for each object, which add up for a pair. Or a
+            Warp array of vec4d (n,) on the query's device, which each launch reads: x, y, z the motion that an object
+            is about to make, w its own part; a pair's gap is both parts and the length of the relative motion. It needs
+            precision "exact", and takes 12 bytes more a contact. None for none.
 
     Attributes:
         faces: The last launch's `Result.faces`, device vec3i (capacity,), sorted.

@@ -18,9 +18,9 @@ from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond,
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.scene.first_contact import FirstContactQuery, check_asked_contacts
 from warp_abtree.scene.originals import OriginalDistances
-from warp_abtree.scene.pose_rows import DeviceRows, refuse_row, take_rows
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
+from warp_abtree.scene.sweep_poses import DeviceRows, refuse_row, take_rows
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
 
@@ -36,8 +36,6 @@ DISTANCE_ROWS = np.dtype(
     [("distance", np.float64), ("bracket", np.float64, 2), ("points", np.float64, (2, 3)), ("faces", np.int32, 2)]
 )
 CONTACT_ROWS = np.dtype([("time", np.float64), ("clear", bool), ("undecided", bool)])
-# Outputs whose answers are rows.
-ROWS = {"distance": DISTANCE_ROWS, "first_contact": CONTACT_ROWS}
 ANSWERS = {"any": np.dtype(bool), "count": np.dtype(np.int64)}
 
 _kept: dict[tuple, "_PosedModels"] = {}
@@ -73,7 +71,7 @@ class _Chunk:
         self.chunk_query: _ChunkQuery | None = None
 
     def find_query(self, *key):
-        """Return the chunk's query if it is of this output and precision, signed or of originals, else another."""
+        """Return the chunk's query if it is of this output and precision, and of the same options, else another."""
         if self.chunk_query is None or self.chunk_query.key != key:
             self.chunk_query = None  # its memory first
             self.chunk_query = _ChunkQuery(self, key)
@@ -116,7 +114,7 @@ class _ChunkQuery:
 
     def __init__(self, chunk: _Chunk, key):
         self.key = key
-        self.output, precision, (signed, of_originals) = key
+        self.output, precision, (signed, of_originals), proves = key
         self.device, self.room, self.objects = chunk.batch.device, chunk.room, chunk.batch.objects
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
@@ -126,7 +124,8 @@ class _ChunkQuery:
         elif self.output == "first_contact":
             self.query = FirstContactQuery(chunk.batch, None, self.pairs, linear=precision == "linear")
         else:
-            self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision)
+            within = 0.0 if proves else None
+            self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision, within=within)
         self.count = self.room
         self._slots: dict = {}
         self.copies = _find_copy_stream(self.device.alias) if self.device.is_cuda else None
@@ -225,51 +224,59 @@ class _ChunkQuery:
             raise
         return answers
 
-    def find_faces(self, poses):
-        """Return the rows of "faces" of all poses."""
-        parts, slot = [], self._find_slots(poses)[0]
+    def _ask(self, poses, run):
+        """Yield the poses of each chunk, a slice, and what `run` finds of the chunk's first so many pairs."""
+        slot = self._find_slots(poses)[0]
         for start in range(0, len(poses), self.room):
-            count = min(self.room, len(poses) - start)
+            self.count = count = min(self.room, len(poses) - start)
             self._load(slot, poses, start, count)
-            found = self._run_grown(slot, count).faces
+            self._place(slot)
+            result = run(self.pairs[:count])
             refused = int(slot.report.numpy()[0])
             if refused != NONE_REFUSED:
                 refuse_row(poses, start + refused)
-            found[:, 0] += start
-            parts.append(found)
+            yield slice(start, start + count), result
+
+    def _run(self, pairs, within=None):
+        self.query.set_pairs(pairs, within)
+        return self.query.run()
+
+    def find_faces(self, poses):
+        """Return the rows of "faces" of all poses."""
+        parts = []
+        for part, result in self._ask(poses, self._run):
+            result.faces[:, 0] += part.start
+            parts.append(result.faces)
         return np.concatenate(parts)
+
+    def find_apart(self, poses, within):
+        """Return the rows of "any" or "count" of all poses, and which are proved farther apart."""
+        found = np.empty(len(poses), apart_rows(self.output))
+        for part, result in self._ask(poses, functools.partial(self._run, within=within)):
+            found[self.output][part], found["apart"][part] = getattr(result, self.output), result.apart
+        return found
 
     def find_distances(self, poses, tolerances, beyond):
         """Return the rows of "distance" of all poses."""
-        found, slot = np.empty(len(poses), DISTANCE_ROWS), self._find_slots(poses)[0]
         assert isinstance(self.query, DistanceQuery)
         self.query.set_tolerance(**tolerances)
-        for start in range(0, len(poses), self.room):
-            count = min(self.room, len(poses) - start)
-            self._load(slot, poses, start, count)
-            self.count = count
-            self._place(slot)
-            if self.originals is None:
-                self.query.set_pairs(self.pairs[:count], beyond)
-                result = self.query.run()
-            else:
-                result = self.originals.run(self.pairs[:count], beyond, **tolerances)
-            refused = int(slot.report.numpy()[0])
-            if refused != NONE_REFUSED:
-                refuse_row(poses, start + refused)
-            rows = found[start : start + count]
+        run = functools.partial(self._run, within=beyond)
+        if self.originals is not None:
+            run = functools.partial(self.originals.run, beyond=beyond, **tolerances)
+        found = np.empty(len(poses), DISTANCE_ROWS)
+        for part, result in self._ask(poses, run):
+            rows = found[part]
             rows["distance"], rows["bracket"] = result.distance, result.bracket
             rows["points"], rows["faces"] = result.points, result.point_faces
         return found
 
     def find_first_contacts(self, poses, ends, options):
         """Return the rows of "first_contact" of all motions, from poses to ends."""
-        found = np.empty(len(poses), CONTACT_ROWS)
         assert isinstance(self.query, FirstContactQuery)
         self.query.set_options(**options)
+        found = np.empty(len(poses), CONTACT_ROWS)
         for start in range(0, len(poses), self.room):
             self.count = count = min(self.room, len(poses) - start)
-            self.query.set_pairs(self.pairs[:count])
             for rows, objects, what in ((poses, None, "poses"), (ends, self.query.ends, "end_poses")):
                 slot = self._find_slots(rows)[0]
                 self._load(slot, rows, start, count)
@@ -277,13 +284,18 @@ class _ChunkQuery:
                 refused = int(slot.report.numpy()[0])
                 if refused != NONE_REFUSED:
                     refuse_row(rows, start + refused, what)
-            result = self.query.run()
+            result = self._run(self.pairs[:count])
             for name in ("time", "clear", "undecided"):
                 found[name][start : start + count] = getattr(result, name)
         return found
 
     def is_small(self):
         return len(self.query.hits.face) + len(self.query.hits.uncertain) <= KEPT_ROWS
+
+
+def apart_rows(output) -> np.dtype:
+    """Return the type of the answers of a sweep with `within`."""
+    return np.dtype([(output, ANSWERS[output]), ("apart", np.dtype(bool))])
 
 
 def _keep(key, posed):
@@ -324,11 +336,14 @@ def sweep(
         solid: Whether both are solids (`Scene.add`), or a bool for each; what "any" and "distance" answer for one
             inside the other stands in `warp_abtree.state.solids`, "count" and "faces" are of surfaces.
         options: tolerance, relative, beyond, each one number, and signed, as `DistanceQuery` takes them, and originals,
-            as `Scene.intersect` does; for "distance" alone.
+            as `Scene.intersect` does; for "distance" alone. within, one distance as `Scene.intersect` takes it; for
+            "any" and "count" alone. end_poses, as poses, and tolerance, screw and linear, as `FirstContactQuery` takes
+            them; for "first_contact" alone.
 
     Returns:
         For "any" bool (p,), for "count" the intersecting face pairs of each pose, int64 (p,), for "faces" rows (pose,
-        face of A, face of B), int32 (k, 3), sorted. For "distance" a structured array (p,) of distance, bracket (2,),
+        face of A, face of B), int32 (k, 3), sorted; with within, a structured array (p,) of any or count, and apart,
+        whether the surfaces are proved farther apart. For "distance" a structured array (p,) of distance, bracket (2,),
         points (2, 3) [A's frame] and faces (2,), see `warp_abtree.query.distance`. For "first_contact" one of time,
         clear and undecided, see `warp_abtree.scene.first_contact`.
 
@@ -354,10 +369,14 @@ def sweep(
 
 def _sweep(pair, poses, asked, options):
     output, precision = asked
+    within = options.get("within")
     if output == "first_contact":
         precision = "linear" if options.pop("linear", False) else "rigid"
     if len(poses) == 0:
-        return np.empty((0, 3), np.int32) if output == "faces" else np.empty(0, (ROWS | ANSWERS)[output])
+        empty = {"faces": np.empty((0, 3), np.int32), "distance": np.empty(0, DISTANCE_ROWS)}
+        empty["first_contact"] = np.empty(0, CONTACT_ROWS)
+        kind = ANSWERS.get(output) if within is None else apart_rows(output)
+        return empty[output] if output in empty else np.empty(0, kind)
     models = [pair.models[i] for i in pair.object_model]
     key = (*map(id, models), *pair.lods.tolist(), *pair.object_solid, pair.device.alias)
     # Taken out while in use: a call from another thread has its own, and one that fails leaves nothing behind.
@@ -366,12 +385,14 @@ def _sweep(pair, poses, asked, options):
         owners = [weakref.ref(model, lambda _: _kept.pop(key, None)) for model in models]
         posed = _PosedModels(pair, owners)
     chunk = posed.find_chunk(len(poses))
-    query = chunk.find_query(output, precision, check_flags(options))
+    query = chunk.find_query(output, precision, check_flags(options), within is not None)
     if output == "distance":
         tolerances = {name: value for name, value in options.items() if name in ("tolerance", "relative")}
         answers = query.find_distances(poses, tolerances, check_beyond(options.get("beyond")))
     elif output == "first_contact":
         answers = query.find_first_contacts(poses, options.pop("end_poses"), options)
+    elif within is not None:
+        answers = query.find_apart(poses, within)
     else:
         answers = query.find_faces(poses) if output == "faces" else query.find_answers(poses)
     chunk.trim()

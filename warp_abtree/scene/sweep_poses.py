@@ -1,4 +1,4 @@
-"""Very many poses where a caller has them: in the memory of the host, or of the device that asks."""
+"""Poses of a sweep, where they lie: in the memory of the host, or of the device that asks."""
 
 import numpy as np
 import warp as wp
@@ -20,6 +20,7 @@ class HostRows:
         return len(self.rows)
 
     def row(self, i):
+        """Return a row on the host."""
         return self.rows[i]
 
 
@@ -34,6 +35,7 @@ class DeviceRows:
         return self.count
 
     def row(self, i):
+        """Return a row on the host."""
         return self.flat[self.width * i : self.width * (i + 1)].numpy()
 
 
@@ -56,7 +58,7 @@ def take_rows(poses, device, what="poses"):
 
 
 def refuse_row(poses, i, what="poses"):
-    """Raise ValueError for a row that the device refused."""
+    """Raise ValueError about row i, which is no pose."""
     row = np.asarray(poses.row(i), np.float64)
     check_poses(row[None] if poses.width == 7 else row.reshape(1, 4, 4), what, first=i)
     raise ValueError(f"{what}: pose {i} is no pose")  # by rounding, where the host finds it just within

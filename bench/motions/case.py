@@ -1,6 +1,6 @@
 """First contacts: public queries, random motions checked, and times against python-fcl's continuous collision.
 
-* queries: contacts missed and reported beyond the truth of `bench.ccd_queries`, where its files are at hand.
+* queries: contacts missed and reported beyond the truth of `ccd_queries`, where its files are at hand.
 * checked: random motions of two meshes; late and missed by exact tests at many times, early by one after the tolerance.
 * times [ms] of a motion, by tolerance and LOD: meshes that pass each other (across), from far away, in a planner's
   short steps; and a nut that turns on its bolt, which moves on a screw. On the CPU all on one core.
@@ -15,11 +15,11 @@ import warp_abtree as ab
 from warp_abtree import testing
 
 from ..baselines.fcl import Fcl
-from ..ccd_queries import FOLDER, read_queries
+from ..cases.assembly import PITCH, place_nut, turned
 from ..meshes import ModelFolder, knot_model, mesh_file
 from ..shapes import longest_side, pose_matrices, random_directions, scene_of_poses
 from ..timing import medians, no_garbage_collection, one_core, time_in_turn
-from .assembly import PITCH, place_nut, turned
+from .ccd_queries import FOLDER, read_queries
 
 FULL = {"count": 65536, "checked": 1_000_000, "samples": 32, "repeats": 5, "turn": 163.0, "fcl": 0}
 CPU = FULL | {"count": 256, "checked": 20_000, "fcl": 8}
