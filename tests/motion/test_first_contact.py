@@ -284,3 +284,29 @@ def test_sweeps(device, path):
         with pytest.raises(error, match=message):
             ab.sweep(a, b, starts, **{**options, **bad})
     assert len(ab.sweep(a, b, np.empty((0, 7)), end_poses=np.empty((0, 7)), **options)) == 0
+
+
+def test_margins_cover_the_rounding_of_boxes(device):
+    """Flat faces meet head on, soon: nothing but margins keeps the boxes from being late."""
+    rng = np.random.default_rng(13)
+    cube = sample("box").mesh_at(sample("box").lod_max)
+    cases, ends, truths = [], [], []
+    for _ in range(400):
+        axis, models, boxes = rng.integers(3), [], []
+        for _ in range(2):
+            low, size = rng.normal(size=3), rng.uniform(0.5, 1.5, 3)
+            corners = low + (cube[0] - cube[0].min(0)) / np.ptp(cube[0], axis=0) * size
+            models.append(ab.Model.from_arrays(corners, cube[1], base_faces=len(cube[1])))
+            boxes.append((corners.min(0), corners.max(0)))
+        pose = STILL.copy()
+        pose[:3] = boxes[0][0] - boxes[1][0]
+        pose[axis] = boxes[0][1][axis] - boxes[1][0][axis] + 10 ** rng.uniform(-5, -2)
+        end = pose.copy()
+        end[axis] -= rng.uniform(0.2, 0.4)
+        near = Fraction(boxes[0][1][axis]) - Fraction(boxes[1][0][axis])
+        truths.append((Fraction(pose[axis]) - near) / (Fraction(pose[axis]) - Fraction(end[axis])))
+        cases.append([models[0], models[0].lod_max, STILL, models[1], models[1].lod_max, pose])
+        ends += [STILL, end]
+    result = find(device, cases, np.array(ends))
+    late = [float(Fraction(time) - truth) for time, truth in zip(result.time.tolist(), truths)]
+    assert -1e-6 <= min(late) and max(late) <= 0 and not result.undecided.any()
