@@ -50,8 +50,8 @@ contacts of each chunk of 32, the last chunk perhaps shorter, from left to right
   quotient, at most the overlap of the two root boxes along the normal, which it is too where the area does not shrink.
   Without an area (points, shared planes) it is the overlap along the normal of the faces that touch. For a box pressed
   straight into a larger one it is exact up to the rounding of the root boxes, float32 and outwards: 3e-7 for boxes of 4
-  units, so that boxes that only touch have that travel. At most (2 r + d) / 2 d times the truth for balls of radius r at
-  distance d, less where the root boxes cap it; half of it for the tip of a cone. It is no depth, and no bound
+  units, so that boxes that only touch have that travel. At most (2 r + d) / 2 d times the truth for balls of radius r
+  at distance d, less where the root boxes cap it; half of it for the tip of a cone. It is no depth, and no bound
   on one: where a curve runs over the edge of an object the mean normal leans over, and travel can be several times too
   large; for separate regions of contact, such as a peg in its hole, and for open surfaces it is merely a length. Depths
   of solids are measured by `signed` distances (`warp_abtree.query.distance`).
