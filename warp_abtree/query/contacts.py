@@ -126,7 +126,7 @@ class ContactQuery(Query):
         self.contacts, self.pair_contacts = contact.Contacts(), summary.PairContacts()
         self._sums, self._deferred = summary.ChunkSums(), contact.Deferred()
         for model in () if isinstance(scene, Batch) else scene.models:
-            model.warn_of_winding("the normals and depths of its contacts depend on the winding", stacklevel=4)
+            model.warn_of_winding("the normals and depths of its contacts depend on the winding", stacklevel=5)
         self._deferred.total = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "faces", pairs, capacity, precision, within, sort_pairs)
 

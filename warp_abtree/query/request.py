@@ -11,6 +11,9 @@ from warp_abtree.kernels.traversal import face_pairs
 OUTPUTS = {"any": face_pairs.OUTPUT_ANY, "count": face_pairs.OUTPUT_COUNT, "faces": face_pairs.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float32": predicates.FLOAT32}
 
+# What one output alone takes, beside distances that most do.
+OPTIONS = {"within", "tolerance", "relative", "beyond", "signed", "originals", "gap"}
+
 # A launch of 32 threads a pair stays within 2^31.
 PAIRS_MAX = 2**26
 # Entries that an int32 numbers.
@@ -73,6 +76,14 @@ def check_request(output: str, precision: str):
     others = {"contacts": "ContactQuery", "distance": "DistanceQuery"}
     if output in others:
         raise ValueError(f"output {output!r} is found by ab.{others[output]}, or Scene.intersect")
+
+
+def given_options(caller: str, **options) -> dict:
+    """Return the options that are neither None nor False; raise TypeError for one that none of the outputs has."""
+    unknown = set(options) - OPTIONS
+    if unknown:
+        raise TypeError(f"{caller} has no option {sorted(unknown)[0]!r}")
+    return {name: value for name, value in options.items() if value is not None and value is not False}
 
 
 def refuse_options(output: str, given: dict):

@@ -8,7 +8,7 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
 from warp_abtree.model.model import Model
 from warp_abtree.query.broad_phase import BroadPhase
-from warp_abtree.query.request import refuse_options
+from warp_abtree.query.request import given_options, refuse_options
 from warp_abtree.query.result import Result, contact_dtypes
 from warp_abtree.scene.kept_queries import KeptQueries
 from warp_abtree.scene.objects import ALL_BITS, ObjectList, check_columns, check_lods, check_models
@@ -304,10 +304,7 @@ class Scene:
         within=None,
         contact_dtype=np.float64,
         device: bool = False,
-        tolerance=None,
-        relative=None,
-        beyond=None,
-        gap=None,
+        **options,
     ) -> Result:
         """Test object pairs for intersection, exactly as posed and at their LODs. Waits for the device.
 
@@ -327,17 +324,19 @@ class Scene:
                 With d = error_at(A) + error_at(B) it proves that the original meshes do not intersect.
             contact_dtype: Type of the real numbers in contacts, float64 or float32.
             device: Whether the result's arrays stay on the scene's device, see `Result`.
-            tolerance, relative, beyond: When the search of a distance ends, see `DistanceQuery`; for "distance" alone.
-            gap: Distance [world units], or (p,) of them; for "contacts" alone: faces nearer than that have contacts
-                too, and all have a separation.
+            options: What one output alone takes, None as if not given. Of "distance": tolerance, relative and beyond,
+                when the search ends, and signed, whether depths of solids are negative distances, see `DistanceQuery`;
+                originals, whether it is that of the original meshes, whatever the LODs, see
+                `warp_abtree.query.distance`. Of "contacts": gap, a distance [world units] or (p,) of them: faces nearer
+                than that have contacts too, and all have a separation.
 
         Raises:
+            TypeError: An option with another name.
             ValueError: Bad pairs, a bad distance, an unknown option, or a scene without objects.
         """
         check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)
-        options = {"within": within, "tolerance": tolerance, "relative": relative, "beyond": beyond, "gap": gap}
-        options = {name: value for name, value in options.items() if value is not None}
+        options = given_options("intersect", within=within, **options)
         if output == "distance":
             refuse_options(output, {"precision": precision != "exact"})
             return self._queries.find_distances(pairs, options, device)
