@@ -12,6 +12,8 @@ shapes of which one is no mesh are passed to a pipeline of Newton's, whose conta
 found. Tested with Newton 1.8 (extra `newton`), which calls its contacts experimental.
 """
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -26,25 +28,27 @@ OTHERS_MAX = 2**16
 FIELDS = ("shape0", "shape1", "point0", "point1", "offset0", "offset1", "normal", "margin0", "margin1")
 
 
-def _pairs_between(rows, others):
+def pairs_between(rows, others):
     """Return all pairs of two lists of objects, (k, 2)."""
     return np.stack(np.meshgrid(rows, others, indexing="ij"), 2).reshape(-1, 2)
 
 
-def _same_body_pairs(body):
+def same_body_pairs(body):
     """Return the pairs of objects of one body."""
     order = np.argsort(body, kind="stable")
     order = order[body[order] >= 0]
     parts = np.split(order, np.flatnonzero(np.diff(body[order])) + 1)
-    return [_pairs_between(part, part) for part in parts if len(part) > 1]
+    return [pairs_between(part, part) for part in parts if len(part) > 1]
 
 
-def _group_pairs(group, world):
+def group_pairs(group, world):
     """Return the pairs of objects that may share a world, of groups that do not collide.
 
     Positive groups collide with themselves and negative ones, negative ones with all but themselves, 0 with none.
     """
     found = []
+    if len(np.unique(group)) == 1 and group[0] > 0:
+        return found
     for place in np.unique(world):
         here = np.flatnonzero((world == place) | (world < 0))
         names = np.unique(group[here]).tolist()
@@ -52,7 +56,7 @@ def _group_pairs(group, world):
             for high in names[k:]:
                 collide = low != 0 and high != 0 and (low == high if low > 0 else low != high)
                 if not collide:
-                    found.append(_pairs_between(here[group[here] == low], here[group[here] == high]))
+                    found.append(pairs_between(here[group[here] == low], here[group[here] == high]))
     return found
 
 
@@ -62,7 +66,7 @@ def _excluded_pairs(model, shapes):
     object_of[shapes] = np.arange(len(shapes))
     listed = np.array(sorted(model.shape_collision_filter_pairs), np.int64).reshape(-1, 2)
     group, world = (values.numpy()[shapes] for values in (model.shape_collision_group, model.shape_world))
-    found = [object_of[listed], *_same_body_pairs(model.shape_body.numpy()[shapes]), *_group_pairs(group, world)]
+    found = [object_of[listed], *same_body_pairs(model.shape_body.numpy()[shapes]), *group_pairs(group, world)]
     pairs = np.sort(np.concatenate(found), axis=1)
     return np.unique(pairs[(pairs[:, 0] >= 0) & (pairs[:, 0] < pairs[:, 1])], axis=0)
 
@@ -114,7 +118,7 @@ class NewtonContacts:
         self.scene.add_many(self._find_models(found, models or {}), still, worlds=world, statics=static)
         self.scene.filter(_excluded_pairs(model, self.shapes))
         self._pairs_of_others = _other_pairs(model, is_mesh | ~collide)
-        self.others = None
+        self.others: Any = None
         reach = np.zeros((len(found), 4))
         reach[:, 3] = (model.shape_margin.numpy() + model.shape_gap.numpy())[found]
         if not (np.isfinite(reach).all() and (reach >= 0).all()):
@@ -123,8 +127,8 @@ class NewtonContacts:
         self._ids = wp.array(self.shapes, dtype=wp.int32, device=self.device)
         self._no_body = wp.empty(0, dtype=wp.transform, device=self.device)
         self._place(model.body_q)
-        reach = wp.array(reach, dtype=wp.vec4d, device=self.device)
-        self.query = ManifoldQuery(self.scene, None, capacity, gap=reach)
+        own = wp.array(reach, dtype=wp.vec4d, device=self.device)
+        self.query = ManifoldQuery(self.scene, None, capacity, gap=own)
         self._first = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._grow()
 
