@@ -1,7 +1,6 @@
 // Corners of 16 pairs of faces at a time, for `NearestFaces`.
 #pragma once
 #include "builtin.h"
-#include "simd/float32.h"
 #include "nearest/faces32.h"
 
 struct NearestCorners {

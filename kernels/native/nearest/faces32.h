@@ -1,7 +1,7 @@
-// Distances of pairs of faces in float32, within an error that is known: as `nearest_features`; of 16 pairs at a time
-// with the `Float32` of simd/float32.h, of one with that of nearest/float32.h.
+// Distances of pairs of faces in float32, within an error that is known: as `nearest_features`.
 #pragma once
 #include "builtin.h"
+#include "simd/float32.h"
 
 struct NearestFaces {
     typedef Float32 F;
