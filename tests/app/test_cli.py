@@ -108,7 +108,7 @@ def test_query_against_the_library(files, capsys):
     assert answer(capsys, *asked, "--beyond", 2, "--tolerance", 0.1)["bracket"] == [2, None]
     apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "contacts")
     nowhere = [None, None, None]
-    assert apart["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere, "depth": 0}
+    assert apart["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere, "travel": 0}
     assert apart["count"] == 0 and apart["faces"] == apart["contacts"] == []
     shown, _ = run(capsys, "query", "ball.obj", "ring.ply", "--output", "contacts", "--device", "cpu")
     assert "intersects              yes\n" in shown and len(re.findall(r"^\d+ +\d+$", shown, re.M)) == report.LISTED
@@ -200,10 +200,10 @@ def test_help_has_examples(capsys, words, parts):
 @pytest.mark.parametrize(
     ("module", "words", "message"),
     [
-        ("shtab", "--print-completion bash", "--print-completion needs shtab: pip install warp-abtree[app]"),
-        ("msgspec", "run rain", "rain.toml: scene files need msgspec: pip install warp-abtree[app]"),
-        ("viser", "view ball.obj", "view needs viser: pip install warp-abtree[view]"),
-        ("matplotlib", "run rain --plot .", "--plot needs Matplotlib: pip install warp-abtree[pictures]"),
+        ("shtab", "--print-completion bash", "--print-completion needs shtab: pip install shtab"),
+        ("msgspec", "run rain", "rain.toml: scene files need msgspec: pip install msgspec"),
+        ("viser", "view ball.obj", "view needs viser: pip install viser"),
+        ("matplotlib", "run rain --plot .", "--plot needs Matplotlib: pip install matplotlib"),
         ("pyvista", "run rain --picture out.png", "--picture needs pyvista and Matplotlib: pip install"),
         ("pyvista", "picture ball.obj --out out.png", "picture needs pyvista and Matplotlib: pip install"),
     ],

@@ -175,7 +175,7 @@ def test_source_errors(monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     for source, message in (
         ("warp:cow", "warp:bunny, warp:bear, warp:rocks"),
-        ("warp:bunny", r"pip install warp-abtree\[usd\]"),
+        ("warp:bunny", r"pip install usd-core"),
         (3, "cannot load a mesh from int"),
         (trimesh.PointCloud(np.eye(3)), r"no faces .*PointCloud"),
         (trimesh.Scene(), "no faces"),

@@ -149,7 +149,7 @@ def read_warp_asset(source, asset) -> tuple[np.ndarray, np.ndarray]:
     try:
         from pxr import Usd, UsdGeom
     except ImportError:
-        raise MeshError(f"{source}: reading it needs usd-core: pip install warp-abtree[usd]") from None
+        raise MeshError(f"{source}: reading it needs usd-core: pip install usd-core") from None
     path = Path(wp.__file__).parent / "examples" / "assets" / f"{asset}.usd"
     if not path.is_file():
         raise MeshError(f"{source}: {path} is missing from this installation of Warp")

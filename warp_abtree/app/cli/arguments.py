@@ -76,6 +76,6 @@ class PrintCompletion(argparse.Action):
         try:
             import shtab
         except ImportError:
-            raise ValueError(f"{option_string} needs shtab: pip install warp-abtree[app]") from None
+            raise ValueError(f"{option_string} needs shtab: pip install shtab") from None
         print(shtab.complete(parser, values))
         parser.exit()

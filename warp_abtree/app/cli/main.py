@@ -26,7 +26,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog=PROGRAM,
         description="Mesh-mesh interference queries at any level of detail (LOD), in batches, on CUDA or the CPU.",
-        epilog=f"examples:\n  {PROGRAM} info cow.obj\n  {PROGRAM} run bunny_tori --picture out.png\n\n{STATUS}",
+        epilog=f"examples:\n  {PROGRAM} info warp:bunny\n  {PROGRAM} run bunny_tori --picture out.png\n\n{STATUS}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")

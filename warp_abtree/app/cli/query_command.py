@@ -14,11 +14,11 @@ from warp_abtree.scene.scene import Scene
 
 SUMMARY = "intersect two meshes, A at the origin and B at a pose"
 EXAMPLES = (
-    "cow.obj warp:bunny --pose 0.2 0 0 0 0 0 1",
-    "cow.npz cow.npz --pose -0.5 0 0 0 0 0 1 --lod-a 0.25 --lod-b tol:0.01 --output faces --json",
-    "cow.npz cow.npz --pose 0.2 0 0 0 0 0 1 --output contacts --record contacts.csv",
-    "cow.npz cow.npz --pose 2 0 0 0 0 0 1 --output distance --json",
-    "cow.npz cow.npz --pose 2 0 0 0 0 0 1 --lod-a 0.1 --lod-b 0.1 --output distance --relative 0.05 --originals",
+    "warp:bear warp:bunny --pose 0.2 0 0 0 0 0 1",
+    "bunny.npz bunny.npz --pose -0.5 0 0 0 0 0 1 --lod-a 0.25 --lod-b tol:0.01 --output faces --json",
+    "bunny.npz bunny.npz --pose 0.2 0 0 0 0 0 1 --output contacts --record contacts.csv",
+    "bunny.npz bunny.npz --pose 2 0 0 0 0 0 1 --output distance --json",
+    "bunny.npz bunny.npz --pose 2 0 0 0 0 0 1 --lod-a 0.1 --lod-b 0.1 --output distance --relative 0.05 --originals",
 )
 OUTPUTS = ("any", "count", "faces", "contacts", "distance")
 DISTANCE_OPTIONS = ("tolerance", "relative", "beyond", "originals")

@@ -94,7 +94,7 @@ def _check(options):
     if options.plot:
         check_output(options.plot / PLOT_NAME, [".png"], make=True)
         if importlib.util.find_spec("matplotlib") is None:
-            raise ValueError("--plot needs Matplotlib: pip install warp-abtree[pictures]")
+            raise ValueError("--plot needs Matplotlib: pip install matplotlib")
 
 
 def _write(options, loaded, frame, chosen) -> list[Path]:
