@@ -24,8 +24,8 @@ struct NearBoxes : SlabBounds {
     lanes sizes[3][3];
     float wide;
     const char *tree_a, *tree_b;
-    wp::int64 slabs;    // where the slab of a node lies, from the node; 0 for none
-    bool normals;       // whether slabs are compared along the nodes' own normals
+    wp::int64 slabs;  // where the slab of a node lies, from the node; 0 for none
+    bool normals;     // whether slabs are compared along the nodes' own normals
 
     static NearBoxes make(const wp::float32 (&r)[3][3], const wp::vec_t<3, float>& back,
                           const wp::vec_t<3, float>& there, float margin, float scale, const void* trees, int a,

@@ -42,7 +42,8 @@ struct SlabBounds {
     static lanes square(const lanes& gap) { return gap > 0.0f ? gap * gap : lanes{}; }
 
     // Along the direction from A to B by boxes and slabs, across it by the balls about boxes.
-    lanes bound_way(const lanes (&slab)[8], const lanes (&sum)[3], const lanes (&size)[3], const lanes (&apart)[3]) const {
+    lanes bound_way(const lanes (&slab)[8], const lanes (&sum)[3], const lanes (&size)[3],
+                    const lanes (&apart)[3]) const {
         const lanes normal[3] = {slab[0], slab[1], slab[2]};
         const lanes along = way[0] * slab[0] + way[1] * slab[1] + way[2] * slab[2];
         const lanes top = tops(way, along, normal, slab[3], slab[4], sum, size) - far;
@@ -81,7 +82,8 @@ struct SlabBounds {
                 step += apart[i] * (k == 0 ? of_first[i] : -of_second[i]);
             }
             const lanes sign = step > 0.0f ? lanes{} + 1.0f : lanes{} - 1.0f;
-            const lanes own_low = k == 0 ? of_a(slab[3]) : of_b(slab[3]), own_high = k == 0 ? of_a(slab[4]) : of_b(slab[4]);
+            const lanes own_low = k == 0 ? of_a(slab[3]) : of_b(slab[3]),
+                        own_high = k == 0 ? of_a(slab[4]) : of_b(slab[4]);
             const lanes low = k == 0 ? of_b(slab[3]) : of_a(slab[3]), high = k == 0 ? of_b(slab[4]) : of_a(slab[4]);
             lanes shifted = {};
             for (int i = 0; i < 3; ++i) {
