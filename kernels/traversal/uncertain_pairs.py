@@ -15,6 +15,7 @@ from warp_abtree.kernels.traversal.face_pairs import (
     Hits,
     list_apart,
     load_corner_ids,
+    load_face_pair,
     report_hit,
     test_faces,
 )
@@ -124,14 +125,8 @@ def item_plane_signs(models: ModelPool, states: StatePool, pose: PairPose, item:
     """Return what `filter_planes` says of a face pair."""
     a = load_corner_ids(states, pose.corner_a + item[1])
     b = load_corner_ids(states, pose.corner_b + item[2])
-    return filter_planes(
-        load_vertex(models.vertex_pos, a[0]),
-        load_vertex(models.vertex_pos, a[1]),
-        load_vertex(models.vertex_pos, a[2]),
-        pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[0])),
-        pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[1])),
-        pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[2])),
-    )
+    a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
+    return filter_planes(a0, a1, a2, b0, b1, b2)
 
 
 @wp.func
