@@ -11,6 +11,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Some ten float64 roundings; this is 32 of them.
 ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
+REACH_ROUNDING = wp.constant(wp.float64(1.0 + 2.0**-48))
 
 
 @wp.func
@@ -31,7 +32,7 @@ def pose_box_kernel(
     objects: ObjectPool,
     record: LaunchRecord,
     wide: wp.float64,
-    reach: wp.array(dtype=wp.float64),
+    reach: wp.array(dtype=wp.vec4d),
     lower_out: wp.array(dtype=wp.vec3),
     upper_out: wp.array(dtype=wp.vec3),
 ):
@@ -39,7 +40,8 @@ def pose_box_kernel(
 
     Args:
         wide: By how much boxes are wider on all sides [world units].
-        reach: The same of each object, where that is more, shape [object]; [0] for none.
+        reach: The same of each object, its motion and what comes beside it, where that is more, shape [object]; [0]
+            for none.
     """
     i = wp.tid()
     state = objects.state[i]
@@ -56,7 +58,9 @@ def pose_box_kernel(
     skew = wp.float64(3.0) * measure_skew(rotation)
     more = wide
     if reach.shape[0] > 0:
-        more = wp.max(more, reach[i])
+        motion = wp.vec3d(reach[i][0], reach[i][1], reach[i][2])
+        # A little more than half of what `add_reach_kernel` makes of two.
+        more = wp.max(more, (reach[i][3] + wp.length(motion)) * REACH_ROUNDING)
     skew = skew * (wp.length(middle) + wp.length(half) + more) + more
     for k in range(3):
         terms = wp.vec3d(rotation[k, 0] * middle[0], rotation[k, 1] * middle[1], rotation[k, 2] * middle[2])

@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.arrays import ObjectPool
-from warp_abtree.kernels.contact.manifold import POINTS, Curves, Manifolds
+from warp_abtree.kernels.contact.manifold import NO_DEPTH, POINTS, Curves, Manifolds
 from warp_abtree.kernels.traversal.warp_stack import warp_lane, warp_max, warp_size
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -12,6 +12,8 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 NEAREST_POINT = wp.constant(wp.float64(2.0**-9))
 # By which part of its distance a point is favoured at the far end of the spread.
 FAVOUR = wp.constant(wp.float64(2.0**-5))
+# Part of the gap within which points are as good as the deepest.
+FIRST_PART = wp.constant(wp.float64(0.125))
 # The deepest point is among those chosen if this part of its depth is more than theirs.
 DEEPER = wp.constant(wp.float64(0.9))
 
@@ -28,8 +30,8 @@ def best_of_warp(value: wp.float64, candidate: wp.int32):
 
 @wp.func
 def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
-    """Return the deepest candidate of a pair and its depth, -1 where there is none."""
-    deepest = wp.float64(-1.0)
+    """Return the deepest candidate of a pair and its depth, NO_DEPTH where there is none."""
+    deepest = NO_DEPTH
     best = CANDIDATES * first
     i = first + warp_lane()
     while i < end:
@@ -43,7 +45,7 @@ def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
 
 @wp.func
 def find_outermost(first: wp.int32, end: wp.int32, least: wp.float64, along: wp.vec3d, curves: Curves):
-    """Return the candidate that reaches farthest along a direction, of those of a least depth."""
+    """Return the candidate that reaches farthest along a direction, of those of a least depth, and how far."""
     origin = curves.point[first, 0]
     farthest = -wp.float64(wp.inf)
     best = CANDIDATES * first
@@ -55,8 +57,7 @@ def find_outermost(first: wp.int32, end: wp.int32, least: wp.float64, along: wp.
                 farthest = reach
                 best = CANDIDATES * i + k
         i += warp_size()
-    best, farthest = best_of_warp(farthest, best)
-    return best
+    return best_of_warp(farthest, best)
 
 
 @wp.func
@@ -93,7 +94,7 @@ def distance_squared(
 @wp.func
 def find_farthest(
     ends: wp.vec2i,
-    least: wp.float64,
+    least: wp.vec2d,
     size: wp.float64,
     along: wp.vec3d,
     count: wp.int32,
@@ -107,6 +108,7 @@ def find_farthest(
 
     Args:
         ends: First contact of the pair, and the one behind its last.
+        least: Least depths of candidates that there are, and of those that are looked at.
         count: Points chosen. From the second on a candidate keeps its distance from those before.
     """
     farthest = wp.float64(-1.0)
@@ -114,7 +116,7 @@ def find_farthest(
     i = ends[0] + warp_lane()
     while i < ends[1]:
         for k in range(CANDIDATES):
-            if curves.depth[i, k] >= least:
+            if curves.depth[i, k] >= least[0]:
                 x = curves.point[i, k]
                 d = distance_squared(x, curves.normal[i], size, count - 1, point, normals)
                 if count == 2:
@@ -124,25 +126,56 @@ def find_farthest(
                 curves.nearest[i, k] = d
                 if size > wp.float64(0.0):
                     d = d * (wp.float64(1.0) + FAVOUR * wp.dot(along, x - point[0]) / size)
-                if d > farthest:
+                if d > farthest and curves.depth[i, k] >= least[1]:
                     farthest = d
                     best = CANDIDATES * i + k
         i += warp_size()
     return best_of_warp(farthest, best)
 
 
+@wp.func
+def write_in_order(
+    p: wp.int32,
+    count: wp.int32,
+    along: wp.vec3d,
+    point: wp.array(dtype=wp.vec3d),
+    normals: wp.array(dtype=wp.vec3d),
+    depth: wp.array(dtype=wp.float64),
+    manifolds: Manifolds,
+):
+    """Write the points of a pair in the order in which they lie along a direction of its lower object.
+
+    So points that stay keep their order from step to step, whichever was found first, and whatever face they are on.
+    """
+    k = warp_lane()
+    while k < count:
+        place = wp.int32(0)
+        for j in range(count):
+            ahead = wp.dot(along, point[k] - point[j])
+            if ahead > wp.float64(0.0) or (ahead == wp.float64(0.0) and j < k):
+                place += 1
+        manifolds.point[p, place] = point[k]
+        manifolds.normal[p, place] = normals[k]
+        manifolds.depth[p, place] = depth[k]
+        k += warp_size()
+    if warp_lane() == 0:
+        manifolds.count[p] = count
+
+
 @wp.kernel
 def spread_point_kernel(
     objects: ObjectPool,
     pairs: wp.array(dtype=wp.vec2i),
+    gap: wp.array(dtype=wp.float64),
     start: wp.array(dtype=wp.int32),
     curves_inout: Curves,
     manifolds_out: Manifolds,
 ):
     """Choose the points of one pair a warp: an outermost one, those farthest from those before, the deepest.
 
-    Distance counts places, and normals in sizes of the pair's contact. Where no face of the pair looks along its
-    contact's normal, the middles of the contacts serve, with depth 0. All lanes know the points chosen.
+    Distance counts places, and normals in sizes of the pair's contact; depth counts from the gap on. Where no face of
+    the pair looks along its contact's normal, the middles of the contacts serve, with depth 0. All lanes know the
+    points chosen.
     """
     p = wp.tid() / warp_size()
     first = start[p]
@@ -151,38 +184,50 @@ def spread_point_kernel(
         manifolds_out.count[p] = 0
         return
     zero = wp.float64(0.0)
+    shell = zero
+    if gap.shape[0] > 0:
+        shell = gap[p]
     along = objects.rotation[wp.min(pairs[p][0], pairs[p][1])] * wp.vec3d(
         wp.float64(0.6134), wp.float64(0.5327), wp.float64(0.5831)
     )
     deepest_at, deepest = find_deepest(first, end, curves_inout)
-    best = find_outermost(first, end, wp.float64(0.5) * deepest, along, curves_inout)
+    half = wp.float64(0.5) * (deepest + shell) - shell
+    best, reach = find_outermost(first, end, half, along, curves_inout)
+    if reach == -wp.float64(wp.inf):
+        manifolds_out.count[p] = 0
+        return
+    # Those about as deep as the deepest first, then what may be within the gap.
+    lowest = wp.where(deepest == NO_DEPTH, NO_DEPTH, -shell)
+    least_depth = wp.vec2d(lowest, wp.where(shell > zero, wp.max(deepest - FIRST_PART * shell, lowest), lowest))
     point = wp.zeros(shape=(POINTS,), dtype=wp.vec3d)
     normals = wp.zeros(shape=(POINTS,), dtype=wp.vec3d)
+    depth = wp.zeros(shape=(POINTS,), dtype=wp.float64)
     count = wp.int32(0)
     size = zero
     least = zero
-    deep = zero
+    deep = -shell
     searching = bool(True)
     while searching:
         i = best / CANDIDATES
-        depth = wp.max(curves_inout.depth[i, best % CANDIDATES], zero)
+        found = curves_inout.depth[i, best % CANDIDATES]
         point[count] = curves_inout.point[i, best % CANDIDATES]
         normals[count] = curves_inout.normal[i]
-        if warp_lane() == 0:
-            manifolds_out.point[p, count] = point[count]
-            manifolds_out.normal[p, count] = normals[count]
-            manifolds_out.depth[p, count] = depth
-        deep = wp.max(deep, depth)
+        depth[count] = wp.where(found == NO_DEPTH, zero, found)
+        deep = wp.max(deep, depth[count])
         count += 1
         ends = wp.vec2i(first, end)
-        floor = wp.min(deepest, zero)
-        best, farthest = find_farthest(ends, floor, size, along, count, point, normals, curves_inout)
+        best, farthest = find_farthest(ends, least_depth, size, along, count, point, normals, curves_inout)
         if count == 1:
             size = wp.sqrt(wp.max(farthest, zero))
             least = NEAREST_POINT * farthest
+        if farthest <= least and least_depth[1] > lowest:
+            least_depth[1] = lowest
+            best, farthest = find_farthest(ends, least_depth, size, along, count, point, normals, curves_inout)
+            if count == 1:
+                size = wp.sqrt(wp.max(farthest, zero))
+                least = NEAREST_POINT * farthest
         if farthest <= least or count == POINTS - 1:
             best = deepest_at
-            searching = DEEPER * deepest > deep
+            searching = DEEPER * (deepest + shell) > deep + shell
         searching = searching and count < POINTS
-    if warp_lane() == 0:
-        manifolds_out.count[p] = count
+    write_in_order(p, count, along, point, normals, depth, manifolds_out)

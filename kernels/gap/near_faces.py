@@ -108,10 +108,12 @@ def find_near_kernel(
 def add_reach_kernel(
     pair_count: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
-    reach: wp.array(dtype=wp.float64),
+    reach: wp.array(dtype=wp.vec4d),
     gap_out: wp.array(dtype=wp.float64),
 ):
-    """Add the reaches of both objects of a pair to its gap, one a thread."""
+    """Find the gap of one pair a thread, of the motion and the reach of both objects."""
     p = wp.tid()
     if p < pair_count[0]:
-        gap_out[p] = reach[pairs[p][0]] + reach[pairs[p][1]]
+        a, b = reach[pairs[p][0]], reach[pairs[p][1]]
+        motion = wp.vec3d(a[0] - b[0], a[1] - b[1], a[2] - b[2])
+        gap_out[p] = (a[3] + b[3]) + wp.length(motion)

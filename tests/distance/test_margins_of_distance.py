@@ -18,10 +18,10 @@ def to_bytes(result):
     return [getattr(result, name).tobytes() for name in ANSWERS]
 
 
-def sheets(rng, roughness, far, bend):
+def sheets(rng, roughness, far, bend, side=9):
     """Return two sheets over one another, their corners up or down by a little, in frames of their own, and poses."""
-    vertices, faces = grid(9)
-    vertices = vertices / 9 - [0.5, 0.5, 0.0]
+    vertices, faces = grid(side)
+    vertices = vertices / side - [0.5, 0.5, 0.0]
     below, above = vertices + roughness * rng.normal(size=(2, *vertices.shape)) * [0, 0, 1]
     below, above = (v - [0, 0, side * bend] * (v[:, :2] ** 2).sum(1)[:, None] for v, side in ((below, 1), (above, -1)))
     above[:, 2] += 0.25
@@ -77,6 +77,27 @@ def check_sheets(device, sheets, size):
         assert to_bytes(query.result()) == to_bytes(first)
         if turn > 16:
             query.forget()
+
+
+@pytest.mark.parametrize("far", [0.0, 100.0])
+@pytest.mark.parametrize("roughness", [1e-7, 1e-9])
+def test_very_many_nearly_equally_near_faces(device, roughness, far):
+    """So many that slabs are compared along the nodes' own normals, on the CPU; warps have no slabs."""
+    rng = np.random.default_rng(4)
+    cases = []
+    for bend in (0.0, 0.1, 0.02):
+        (a, b), (pose_a, pose_b) = sheets(rng, roughness, far, bend, side=32)
+        cases.append((a, None, pose_a, b, None, pose_b))
+    scene, pairs = scene_of(device, cases), pairs_of(cases)
+    with testing.regime(warps=True):
+        expected = ab.DistanceQuery(scene, pairs).run()
+    query = ab.DistanceQuery(scene, pairs)
+    for _ in range(17):
+        query.launch()
+    query.forget()
+    found = query.run()
+    assert to_bytes(found) == to_bytes(expected)
+    assert (found.triangle_tests > 6000).any()
 
 
 def test_slabs_follow_levels_of_detail(device):

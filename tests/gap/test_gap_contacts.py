@@ -145,12 +145,12 @@ def test_without_more_faces_nothing_changes(device, regime):
             np.testing.assert_array_equal(crossing[name], plain.contacts[name])
         assert (len(result.contacts) > len(crossing)) == (gap > 0)
         np.testing.assert_array_equal(result.any, plain.any)
-        for name in ("point", "normal", "depth"):
+        for name in ("point", "normal", "travel"):
             found, wanted = result.pair_contacts[name], plain.pair_contacts[name]
             close = np.isclose(found, wanted, rtol=1e-9, atol=1e-9, equal_nan=True)
             # Where the area of a curve is lost in rounding, as of faces that are there twice, so is its sign.
             assert np.array_equal(found, wanted, equal_nan=True) if gap == 0 else close.mean() > 0.9
-            assert close.all() or name == "depth"
+            assert close.all() or name == "travel"
     for p in np.flatnonzero(plain.any)[:5]:
         point, _, _ = summary(plain.contacts[plain.contacts["pair"] == p])
         np.testing.assert_allclose(result.pair_contacts["point"][p], point, atol=1e-9)
@@ -276,13 +276,23 @@ def test_the_broad_phase_is_wider(device):
     result = ab.ContactQuery(scene, gap=0.015).run()
     assert result.pairs.tolist() == [[0, 1]]
     np.testing.assert_allclose(result.contacts["separation"].min(), 0.01, rtol=1e-12)
-    own = wp.array([0.004, 0.008, 0.011], dtype=wp.float64, device=device)
+    rows = np.zeros((3, 4))
+    rows[:, 3] = 0.004, 0.008, 0.011
+    own = wp.array(rows, dtype=wp.vec4d, device=device)
     query = ab.ContactQuery(scene, gap=own)
     assert query.run().pairs.tolist() == [[0, 1]]
     assert (query.result().contacts["separation"] < 0.012).all() and len(query.result().contacts)
-    own.assign(np.array([0.0, 0.011, 0.011]))
+    rows[:, 3] = 0.0, 0.011, 0.011
+    own.assign(rows)
     query.launch()
     assert sorted(map(tuple, query.result().pairs.tolist())) == [(0, 1), (1, 2)]
+    # Two that move together come no nearer.
+    rows[:] = [(0.0, 0.9, 0.0, 0.0), (0.0, 0.9, 0.0, 0.0), (-0.025, 0.9, 0.0, 0.0)]
+    own.assign(rows)
+    query.run()
+    assert np.unique(query.result().contacts["pair"]).tolist() == [
+        p for p, pair in enumerate(query.result().pairs.tolist()) if pair == [1, 2]
+    ]
     assert ab.ContactQuery(scene, gap=np.array([0.0, 0.011, 0.011])).run().contacts["separation"].max() < 0.022
 
 

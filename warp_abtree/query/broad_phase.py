@@ -23,8 +23,8 @@ class BroadPhase:
         capacity: Pairs that there is room for at first.
         sorts: Whether a launch sorts the pairs by their objects, so that nothing depends on the order in which it
             found them.
-        reach: By how much each object's box is wider on all sides [world units], device float64 (n,), read by each
-            launch; None for not at all.
+        reach: By how much each object's box is wider on all sides [world units]: the length of x, y, z and w, device
+            vec4d (n,), read by each launch; None for not at all.
 
     Attributes:
         pairs: (i, j), i < j, device vec2i (capacity,).
@@ -42,7 +42,7 @@ class BroadPhase:
     def __init__(self, batch: Batch, capacity=None, sorts=False, reach: wp.array | None = None):
         self.batch, self.sorts, self.wide = batch, sorts, 0.0
         self.device = device = batch.device
-        self._reach = wp.empty(0, dtype=wp.float64, device=device) if reach is None else reach
+        self._reach = wp.empty(0, dtype=wp.vec4d, device=device) if reach is None else reach
         check_device(device, "making a broad phase")
         count = batch.object_count
         worlds = batch.objects.pool.world.numpy()

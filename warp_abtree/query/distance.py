@@ -29,6 +29,18 @@ a peg that is too thick for its hole. Where solids cross and none of these point
 
 With the default tolerance, all of this is the same, bit for bit, on CPU and CUDA, whatever the search has started from.
 With a tolerance points, faces and distance may also depend on what the last launch found.
+
+With `originals=True` (`Scene.intersect`, `sweep`) all of this, `any` too, is of the original meshes, whatever the LODs
+of their objects; with the default tolerance it is what the finest LODs answer, bit for bit. A pair is asked at its LODs
+first where that may decide it (`warp_abtree.kernels.distance.originals`):
+
+* Originals are no nearer than the surfaces at LODs less both `Model.error_at(lod)`: the bracket's lower end. Only the
+  inward error counts, how far an original lies from its LOD.
+* They are no farther apart than any two of their faces: a pair that stands near the nearest points at the LODs gives
+  the upper end, the distance and the points. Where LODs intersect, or may, nothing is decided.
+* Pairs whose bracket is wider than asked go to the finest LODs, with these faces as the start. Tree states of their
+  models are made there and stay; where they are at hand, pairs are asked there at once, which takes no longer. Pairs
+  with a solid always are: errors of surfaces say nothing of what is inside.
 """
 
 import math

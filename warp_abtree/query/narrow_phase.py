@@ -80,7 +80,7 @@ class Query(QueryReadout):
 
     growth = 1  # room that `run` makes, over the demand
     _asked_gap: Any = None  # of operators that take one
-    _reach: wp.array | None = None  # half the gap of each object, where the broad phase makes pairs
+    _reach: wp.array | None = None  # part of each object in the gap, where the broad phase makes pairs
 
     def __init__(
         self, scene, output="faces", pairs=None, capacity=None, precision="exact", within=None, sort_pairs=False
@@ -130,13 +130,14 @@ class Query(QueryReadout):
             return
         if self.precision != "exact":
             raise ValueError(f"gap: needs precision 'exact', not {self.precision!r}")
-        if pair_count is None and isinstance(gap, wp.array) and gap.shape == (count,) and gap.dtype is wp.float64:
+        if pair_count is None and isinstance(gap, wp.array) and gap.shape == (count,) and gap.dtype is wp.vec4d:
             self._gap, self._reach = np.zeros(count), gap
             return
         self._gap = check_gap(gap, pair_count, count)
         if pair_count is None:
-            halves = np.full(count, 0.5 * self._gap) if self._gap.ndim == 0 else self._gap
-            self._reach = wp.array(halves, dtype=wp.float64, device=self.device)
+            rows = np.zeros((count, 4))
+            rows[:, 3] = 0.5 * self._gap if self._gap.ndim == 0 else self._gap
+            self._reach = wp.array(rows, dtype=wp.vec4d, device=self.device)
 
     def _make_work(self):
         work, device = load_balance.Work(), self.device

@@ -60,17 +60,19 @@ class KeptQueries:
     def find_distances(self, pairs, options: dict, device: bool) -> Result:
         """Answer "distance"; options as for `find_hits`."""
         refuse_options("distance", {name: True for name in options if name in ("within", "gap")})
-        beyond = options.pop("beyond", None)
-        pairs = self._find_pairs(pairs, 0.0 if beyond is None else self._one_for_all(beyond, "beyond"))
-        beyond = check_beyond(beyond, len(pairs))
         signed, of_originals = check_flags(options)
         tolerances = {name: value for name, value in options.items() if name in ("tolerance", "relative")}
         check_tolerances(**tolerances)
+        beyond = options.get("beyond")
+        reach = 0.0 if beyond is None else self._one_for_all(beyond, "beyond")
         if of_originals:
-            batch = self._scene.batch()
             if self._originals is None:
-                self._originals = OriginalDistances(batch)
-            return self._originals.run(pairs, beyond, **tolerances, device=device)
+                self._originals = OriginalDistances(self._scene.batch())
+            # Originals may lie out of the boxes of their LODs.
+            pairs = self._find_pairs(pairs, reach + (self._originals.reach() if pairs is None else 0.0))
+            return self._originals.run(pairs, check_beyond(beyond, len(pairs)), **tolerances, device=device)
+        pairs = self._find_pairs(pairs, reach)
+        beyond = check_beyond(beyond, len(pairs))
         query = prepare_query(self.kept.pop(("distance", signed), None), self._scene, pairs, beyond, tolerances, signed)
         return self._run(("distance", signed), query, device)
 

@@ -12,6 +12,8 @@ from warp_abtree.state.batch import Batch
 # Of what is asked: what certified errors may be, together, for a pair to be asked at its LODs, and what goes to the
 # search there; the rest goes to the faces of the originals that stand near the witnesses.
 HOPE, SEARCHED = 0.5, 0.5
+# Distance, in sizes, at which a fraction of it is such a length: how far a pair is apart is not known yet.
+FAR = 0.1
 # Ends a search at LODs, relative, where only distances beyond which nothing matters can decide.
 ROUGH = 0.5
 # Over what rotations that scenes take may lengthen an error by.
@@ -73,20 +75,30 @@ class OriginalDistances:
                 rows[name][rest] += getattr(result, name)
         return self._make_result(pairs, rows, device)
 
+    def reach(self) -> float:
+        """Return how much nearer than their LODs two originals may be at most [world units]."""
+        return 2 * STRETCH * float(self._errors()[0].max())
+
     def _measure(self, pairs) -> tuple[np.ndarray, np.ndarray]:
         """Return the certified errors of pairs, added up [model units], and which stand at their finest LODs."""
+        errors, whole = self._errors()
+        return errors[pairs].sum(1), whole[pairs].all(1)
+
+    def _errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the certified error of each object at its LOD [model units], and which stand at their finest LODs."""
         self.batch.catch_up()
         states, model = self.batch.states, self.batch.object_model
         lods = np.array([slot.lod for slot in states.slots])[self.batch.objects.state]
         errors = np.zeros(len(model))
         for k, error in enumerate(self.batch.models.lod_error):
             errors[model == k] = error[lods[model == k]]
-        return errors[pairs].sum(1), (lods == self.batch.models.lod_max[model])[pairs].all(1)
+        return errors, lods == self.batch.models.lod_max[model]
 
     def _may_decide(self, pairs, errors, beyond, tolerances) -> np.ndarray:
         """Return which pairs are asked at their LODs: errors are within what is asked, originals not at hand."""
         model = self.batch.object_model[pairs]
-        asked = np.maximum(tolerances["tolerance"], tolerances["relative"] * self.batch.models.size[model].sum(1))
+        size = self.batch.models.size[model].sum(1)
+        asked = np.maximum(tolerances["tolerance"], tolerances["relative"] * FAR * size)
         asked = np.maximum(asked, np.where(np.isfinite(beyond), beyond, 0.0))
         # Errors of surfaces say nothing of what lies inside a solid.
         solids = self.batch.solids

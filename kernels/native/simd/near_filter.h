@@ -29,10 +29,8 @@ wp::int32 simd_near_filter(ModelPool models, StatePool states, PairPose pose, wp
                                  pose.rotation32.data, there, scale, list + done, count);
         F::lanes size;
         const F::lanes d = __builtin_elementwise_sqrt(N::measure(corners, size).square);
-        // As `search_nearest`, where differences of corners err by `error` along an axis.
-        const F::lanes error =
-            size * (d > size * 0x1p-10f ? F::lanes{} + 48 * 0x1p-24f : F::lanes{} + 256 * 0x1p-24f) + 2.0f * pose.error;
-        const F::lanes under = d - error;
+        // Differences of corners err by `error` along an axis.
+        const F::lanes under = d - N::error_of(d, size, 2.0f * pose.error);
         for (int i = 0; i < count; ++i) {
             list[kept] = list[done + i];
             kept += !(under[i] > gap * (1.0f + 0x1p-20f));
