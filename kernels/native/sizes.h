@@ -7,15 +7,31 @@ constexpr int WARP_SIZE = 32;
 constexpr int STACK_LENGTH = 512;
 constexpr int LEAF_PAIR_LENGTH = 160;
 constexpr int STRADDLING_LENGTH = 64;
+constexpr int INEXACT_LENGTH = 96;
 constexpr int STRADDLING_START = 672;
 constexpr int SIGNS_START = 736;
 constexpr int ITEM_BYTES = 8;
 static_assert((STACK_LENGTH & (STACK_LENGTH - 1)) == 0, "the stack is a ring");
 static_assert(LEAF_PAIR_LENGTH >= (WARP_SIZE - 1) + 4 * WARP_SIZE, "fewer than a warp wait, a test emits 4 a lane");
 static_assert(STRADDLING_LENGTH >= (WARP_SIZE - 1) + WARP_SIZE, "fewer than a warp wait, a test adds 1 a lane");
+static_assert(INEXACT_LENGTH >= (WARP_SIZE - 1) + 2 * WARP_SIZE, "fewer than a warp wait, two tests add 1 a lane each");
 static_assert(STRADDLING_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
 static_assert(SIGNS_START == STRADDLING_START + STRADDLING_LENGTH, "signs lie behind the straddling pairs");
 static_assert((STACK_LENGTH + LEAF_PAIR_LENGTH) * ITEM_BYTES < 1 << 16, "`push_children` packs two byte offsets");
+
+// Two small trees where a warp's stack lies otherwise: leaves of each, their nodes or faces, and inner nodes before boxes
+// of A's leaves take their place. In words of 4 bytes, quarters of a box 4 words.
+constexpr int SMALL_LEAVES = 64;
+constexpr int SMALL_INNER = 128;
+constexpr int SMALL_A = 768;
+constexpr int SMALL_B = 832;
+static_assert(SMALL_A == 12 * SMALL_LEAVES && SMALL_A >= SMALL_INNER, "three quarters a box, or inner nodes");
+static_assert(SMALL_B == SMALL_A + SMALL_LEAVES && 4 * (SMALL_B + SMALL_LEAVES) <= STACK_LENGTH * ITEM_BYTES, "room");
+
+// Lanes that share a relative pose, and numbers that they keep: R, t, the shift between centres, and that shift back.
+constexpr int POSE_LANES = 16;
+constexpr int POSE_ENTRIES = 18;
+static_assert(POSE_LANES >= 12 && WARP_SIZE % POSE_LANES == 0, "a lane an entry of R and t, poses side by side");
 
 // Slots of the queue in which idle warps wait, each with room for so many items: one a lane.
 constexpr int SLOT_COUNT = 8192;

@@ -8,6 +8,7 @@ import functools
 
 import warp as wp
 
+from warp_abtree.kernels.arithmetic.predicates import EXACT
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.face_pairs import OUTPUT_ANY, Hits
@@ -27,6 +28,7 @@ from warp_abtree.kernels.traversal.load_balance import (
     take_unit,
     units_per_pair,
 )
+from warp_abtree.kernels.traversal.small_trees import SmallLists, gather_leaves, is_small, test_small_trees
 from warp_abtree.kernels.traversal.node_pair import compare_node_pair, first_item, item_first, item_second
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
@@ -282,19 +284,41 @@ def warp_traversal(mode: int, for_any: bool):
                     return
                 p = work_inout.owner[slot][0]
             pose = pair_poses[p]
-            head, end, waiting, started = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
-            if slot >= 0:
-                end = receive_items(own.items, slot, work_inout)
-            else:
-                head, end, waiting, started = start_items(own.items, unit % parts, parts, states, pose)
-            own.head = head
-            own.end = end
-            own.waiting = waiting
             asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
-            node_tests, tests = traverse_items(
-                asked, wp.static(mode), pace, p, models, states, pose, own, hits_inout, work_inout
-            )
-            add_warp_sum(hits_inout.node_tests, p, node_tests + started)
+            part = unit - p * parts
+            node_tests, tests = wp.int32(0), wp.vec3i()
+            lists = SmallLists()
+            if wp.static(mode == int(EXACT)):
+                if slot < 0 and is_small(pose, work_inout.small_faces):
+                    lists = gather_leaves(own.items, states, pose)
+            if lists.fits:
+                node_tests, tests = test_small_trees(
+                    asked,
+                    wp.static(mode),
+                    wp.static(for_any),
+                    wp.vec3i(p, part, parts),
+                    models,
+                    states,
+                    pose,
+                    own.items,
+                    lists,
+                    hits_inout,
+                )
+            else:
+                head, end, waiting, started = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
+                if slot >= 0:
+                    end = receive_items(own.items, slot, work_inout)
+                else:
+                    head, end, waiting, started = start_items(own.items, part, parts, states, pose)
+                    started += wp.where(part == 0, lists.tests, 0)
+                own.head = head
+                own.end = end
+                own.waiting = waiting
+                node_tests, tests = traverse_items(
+                    asked, wp.static(mode), pace, p, models, states, pose, own, hits_inout, work_inout
+                )
+                node_tests += started
+            add_warp_sum(hits_inout.node_tests, p, node_tests)
             add_warp_sum(hits_inout.count, p, tests[0])
             add_warp_sum(hits_inout.triangle_tests, p, tests[1])
             add_warp_sum(hits_inout.float64_tests, p, tests[2])

@@ -42,8 +42,6 @@ class Hits:
     exact_tests: wp.array(dtype=wp.int64)  # those that are inexact in float64 and took exact signs, shape [pair]
     uncertain: wp.array(dtype=wp.vec3i)  # (pair, face of the lower object, face of the higher), shape [capacity]
     uncertain_total: wp.array(dtype=wp.int32)  # numbers `uncertain`
-    inexact: wp.array(dtype=wp.vec3i)  # as `uncertain`, of the same shape where there is an exact stage
-    inexact_total: wp.array(dtype=wp.int32)  # numbers `inexact`
 
 
 @wp.func_native(native.body("numbers.cuh", "load_corner"))

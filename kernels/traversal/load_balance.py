@@ -45,6 +45,7 @@ class Work:
     owner: wp.array(dtype=wp.vec2i)  # (object pair, number of items), shape [slot]
     item: wp.array(dtype=wp.int64)  # node pairs (`node_pair`), shape [slot * SLOT_ITEMS]
     warps_per_pair: wp.int32  # units of a single pair; c pairs have 1 / sqrt(c) of that each
+    small_faces: wp.int32  # two trees of so many faces at most are compared at once (`small_trees`)
     record: LaunchRecord  # what the launch was given; here, since another argument takes time in every launch
 
 

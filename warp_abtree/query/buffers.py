@@ -60,7 +60,7 @@ class QueryBuffers:
 
     def _make_hits(self):
         hits = face_pairs.Hits()
-        for name in ("total", "uncertain_total", "inexact_total"):
+        for name in ("total", "uncertain_total"):
             setattr(hits, name, wp.zeros(1, dtype=wp.int32, device=self.device))
         return hits
 
@@ -183,9 +183,7 @@ class QueryBuffers:
             wp.copy(self.within, distances, count=len(distances))
 
     def _resize_uncertain(self, capacity: int):
-        inexact = capacity if self.precision == "exact" else 0
-        made = [("uncertain", capacity), ("inexact", inexact)]
-        self._replace([(self.hits, name, wp.empty(room, dtype=wp.vec3i, device=self.device)) for name, room in made])
+        self._replace([(self.hits, "uncertain", wp.empty(capacity, dtype=wp.vec3i, device=self.device))])
 
     def resize(self, capacity: int):
         """Make room for a number of intersecting face pairs."""

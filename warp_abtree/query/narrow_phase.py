@@ -22,9 +22,8 @@ from warp_abtree.state.generation import LaunchGuard
 
 # Face pairs that the float32 stage leaves uncertain: about one in a hundred. The list grows as needed.
 UNCERTAIN_ROOM = 65536
-# Warps that one multiprocessor runs at a time by their registers: of the traversal, of float64, of exact signs.
+# Warps that one multiprocessor runs at a time by their registers.
 WARPS_A_PROCESSOR = 16
-FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
 # So that each finds a slot for all that it gives away at once.
 WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
@@ -117,6 +116,7 @@ class Query(QueryReadout):
         work.flag = wp.zeros(slots, dtype=wp.int32, device=device)
         work.owner = wp.empty(slots, dtype=wp.vec2i, device=device)
         work.item = wp.empty(slots * load_balance.SLOT_ITEMS, dtype=wp.int64, device=device)
+        work.small_faces = self._regime.small_faces
         work.record = self.guard.record()
         self.guard.write_to(work.record)
         return work
@@ -231,20 +231,16 @@ class Query(QueryReadout):
         output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
         made = self._make_search(self._no_distance, self.hits, mode, output, launch)
         models, states, _ = self.batch.pools
-        for kernel, warps in self._passes() if len(self.hits.uncertain) else ():
-            threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
+        if len(self.hits.uncertain):
+            threads = WARPS_A_PROCESSOR * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
             inputs = [threads, output, models, states, self.pair_poses, self.hits]
-            made.append(launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
+            made.append(launch(self._pass(), dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
         return made
 
-    def _passes(self) -> list:
-        """Return the kernels that decide uncertain face pairs, and their warps on a multiprocessor."""
-        if int(PRECISIONS[self.precision]) != EXACT:
-            return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR)]
-        return [
-            (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR),
-            (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR),
-        ]
+    def _pass(self):
+        """Return the kernel that decides uncertain face pairs."""
+        exact = int(PRECISIONS[self.precision]) == EXACT
+        return uncertain_pairs.resolve_exact_kernel if exact else uncertain_pairs.resolve_rounded_kernel
 
     def _slow_kernels(self, with_distances: bool) -> list:
         """Return the kernels that take longest to compile, with block sizes, the longest first."""
@@ -252,7 +248,7 @@ class Query(QueryReadout):
         modes = [int(PRECISIONS[self.precision]), *([within] if with_distances else [])]
         if self.uses_warps():
             kernels = [dual_tree.warp_traversal(mode, mode == within or self.output == "any") for mode in modes]
-            kernels += reversed([kernel for kernel, _ in self._passes()])
+            kernels.insert(0, self._pass())
         else:
             kernels = [simd.thread_traversal(mode) for mode in modes]
         return [(kernel, WARP_SIZE) for kernel in (*kernels, relative_pose.relative_pose_kernel)]

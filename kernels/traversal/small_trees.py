@@ -1,0 +1,294 @@
+"""Two small trees at once: the leaves of each that overlap the other's root, all against all, by tight boxes.
+
+A descent of two trees of a few dozen leaves waits for itself at every level. Here a warp gathers the leaves of both
+trees level by level, and then compares all of them, a leaf of A at a time with one of B a lane: each has a box in the
+frame of either object, its own and the one about its posed corners. These overlap for less than half of the leaf pairs
+that a descent finds. Several units of one object pair take every so many-th leaf of A.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.arrays import ModelPool, StatePool
+from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.boxes import PosedBox, boxes_overlap, map_point, pose_box
+from warp_abtree.kernels.traversal.face_pairs import Hits, load_corner_ids, load_near
+from warp_abtree.kernels.traversal.leaf_pairs import separate_leaf_pairs, test_straddling
+from warp_abtree.kernels.traversal.node_pair import INDEX_MASK
+from warp_abtree.kernels.traversal.nodes import Node, load_constant_node
+from warp_abtree.kernels.traversal.warp_stack import warp_any, warp_lane, warp_size, warp_sync
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+SMALL_LEAVES, SMALL_INNER = native.constant("SMALL_LEAVES"), native.constant("SMALL_INNER")
+SMALL_A, SMALL_B = native.constant("SMALL_A"), native.constant("SMALL_B")
+# An early hit ends a pair for `any`, so few leaf pairs wait.
+LEAF_PAIRS_FOR_ANY = wp.constant(8)
+SIDE_B = wp.constant(-(2**31))  # the bit of an inner node of B
+
+@wp.func_native(native.body("small_trees.cuh", "rank_flag"))
+def rank_flag(flag: bool) -> wp.int32:
+    """Return how many lanes have set their flag, and in the low half how many before this one."""
+
+
+@wp.func_native(native.body("small_trees.cuh", "read_number"))
+def read_number(items: wp.uint64, i: wp.int32) -> wp.int32: ...
+
+
+@wp.func_native(native.body("small_trees.cuh", "write_number"))
+def write_number(items: wp.uint64, i: wp.int32, flag: bool, x: wp.int32): ...
+
+
+@wp.func_native(native.body("small_trees.cuh", "read_quarter"))
+def read_quarter(items: wp.uint64, i: wp.int32) -> wp.vec4: ...
+
+
+@wp.func_native(native.body("small_trees.cuh", "write_quarter"))
+def write_quarter(items: wp.uint64, i: wp.int32, x: wp.vec4): ...
+
+
+@wp.func_native(native.body("small_trees.cuh", "spans_overlap"))
+def spans_overlap(a: wp.vec3, b: wp.vec3, c: wp.vec3, d: wp.vec3) -> bool:
+    """Return whether the boxes from a to b and from c to d overlap, without branches."""
+
+
+@wp.func_native(native.body("small_trees.cuh", "push_leaf_pair"))
+def push_leaf_pair(items: wp.uint64, end: wp.int32, flag: bool, face_a: wp.int32, face_b: wp.int32) -> wp.int32:
+    """Append the leaf pairs whose flag is set; return the new end."""
+
+
+@wp.struct
+class SmallLists:
+    """How many leaves of two trees a warp has gathered, and what that took."""
+
+    leaves_a: wp.int32  # leaves of A that overlap B's root
+    leaves_b: wp.int32  # leaves of B that overlap A's root
+    fits: bool  # there was room for all of them
+    tests: wp.int32  # pairs of boxes that this lane has compared
+
+
+@wp.struct
+class LeafBox:
+    """A leaf's box in its own frame, and the box of its corners in the other object's."""
+
+    lower: wp.vec3
+    upper: wp.vec3
+    posed_lower: wp.vec3
+    posed_upper: wp.vec3
+    face: wp.int32  # face number
+
+
+@wp.func
+def is_small(pose: PairPose, faces_max: wp.int32):
+    """Return whether to try both trees at once: few faces, of sizes that float32 takes, and no coincident meshes."""
+    return wp.max(pose.faces_a, pose.faces_b) <= faces_max and pose.error < wp.inf
+
+
+@wp.func
+def pose_root(lower: wp.vec3, upper: wp.vec3, pose: PairPose, of_b: bool):
+    """Return a box of A or of B with its image in the other frame."""
+    rotation = pose.rotation32
+    shift = pose.translation32
+    if not of_b:
+        rotation = wp.transpose(rotation)
+        shift = pose.back32
+    return pose_box(lower, upper, rotation, shift, pose.margin)
+
+
+@wp.func
+def select_box(first: bool, a: PosedBox, b: PosedBox):
+    box = PosedBox()
+    box.sum = wp.where(first, a.sum, b.sum)
+    box.size = wp.where(first, a.size, b.size)
+    box.posed_sum = wp.where(first, a.posed_sum, b.posed_sum)
+    box.posed_size = wp.where(first, a.posed_size, b.posed_size)
+    return box
+
+
+@wp.func
+def append_node(items: wp.uint64, first: wp.int32, room: wp.int32, end: wp.int32, keep: bool, entry: wp.int32):
+    """Append the entries that are to be kept to a list, as far as there is room; return its new end."""
+    rank = rank_flag(keep)
+    at = end + (rank & 0xFFFF)
+    write_number(items, first + at, keep and at < room, entry)
+    return end + (rank >> 16)
+
+
+@wp.func
+def append_nodes(items: wp.uint64, ends: wp.vec3i, keep: bool, of_b: bool, node: Node):
+    """Append nodes to the leaves of A, those of B or the inner nodes; return the new ends of these lists."""
+    leaf = node.face >= 0
+    entry = wp.where(of_b, node.skip | SIDE_B, node.skip)
+    return wp.vec3i(
+        append_node(items, SMALL_A, SMALL_LEAVES, ends[0], keep and leaf and not of_b, node.skip),
+        append_node(items, SMALL_B, SMALL_LEAVES, ends[1], keep and leaf and of_b, node.skip),
+        append_node(items, 0, SMALL_INNER, ends[2], keep and not leaf, entry),
+    )
+
+
+@wp.func
+def gather_leaves(items: wp.uint64, states: StatePool, pose: PairPose):
+    """List the leaves of each tree that overlap the other's root, level by level, as far as there is room."""
+    lists = SmallLists()
+    node_a = load_constant_node(states, pose.node_a + 1)
+    node_b = load_constant_node(states, pose.node_b + 1)
+    root_a = pose_root(node_a.lower, node_a.upper, pose, False)
+    root_b = pose_root(node_b.lower, node_b.upper, pose, True)
+    first = warp_lane() == 0
+    lists.tests = wp.where(first, 1, 0)
+    lists.fits = True
+    if not boxes_overlap(root_a, root_b):
+        return lists
+    ends = append_nodes(items, wp.vec3i(0, 0, 0), first, False, node_a)
+    ends = append_nodes(items, ends, first, True, node_b)
+    head = wp.int32(0)
+    while head < ends[2] and lists.fits:
+        warp_sync()
+        popped = wp.min(warp_size(), ends[2] - head)
+        live = warp_lane() < popped
+        entry = read_number(items, head + wp.min(warp_lane(), popped - 1))
+        of_b = entry < 0
+        other = select_box(of_b, root_a, root_b)
+        at = wp.where(of_b, pose.node_b, pose.node_a) + 2 * (entry & INDEX_MASK)
+        head += popped
+        for k in range(2):
+            child = load_constant_node(states, at + k)
+            keep = live and boxes_overlap(pose_root(child.lower, child.upper, pose, of_b), other)
+            lists.tests += wp.where(live, 1, 0)
+            ends = append_nodes(items, ends, keep, of_b, child)
+        lists.fits = ends[2] <= SMALL_INNER and wp.max(ends[0], ends[1]) <= SMALL_LEAVES
+    warp_sync()
+    lists.leaves_a = ends[0]
+    lists.leaves_b = ends[1]
+    return lists
+
+
+@wp.func
+def box_leaf(models: ModelPool, states: StatePool, pose: PairPose, node: wp.int32, of_b: bool):
+    """Return the boxes of a leaf in both frames."""
+    leaf = LeafBox()
+    record = load_constant_node(states, wp.where(of_b, pose.node_b, pose.node_a) + node)
+    leaf.lower = record.lower
+    leaf.upper = record.upper
+    leaf.face = record.face
+    corners = load_corner_ids(states, wp.where(of_b, pose.corner_b, pose.corner_a) + record.face)
+    rotation = pose.rotation32
+    shift = pose.translation32
+    if not of_b:
+        rotation = wp.transpose(rotation)
+        shift = pose.back32
+    p = map_point(rotation, shift, load_near(models, corners[0]))
+    q = map_point(rotation, shift, load_near(models, corners[1]))
+    r = map_point(rotation, shift, load_near(models, corners[2]))
+    # Corners are rounded where boxes are not; docs/exactness.md has the terms.
+    margin = wp.vec3(pose.margin + pose.margin)
+    leaf.posed_lower = wp.min(p, wp.min(q, r)) - margin
+    leaf.posed_upper = wp.max(p, wp.max(q, r)) + margin
+    return leaf
+
+
+@wp.func
+def keep_boxes(
+    items: wp.uint64, part: wp.int32, parts: wp.int32, leaves: wp.int32, models: ModelPool, states: StatePool, pose: PairPose
+):
+    """Put the boxes of every so many-th leaf of A in place, with their faces; return how many there are."""
+    rows = (leaves - part + parts - 1) / parts
+    first = wp.int32(0)
+    while first < rows:
+        row = first + warp_lane()
+        leaf = box_leaf(models, states, pose, read_number(items, SMALL_A + part + parts * wp.min(row, rows - 1)), False)
+        warp_sync()
+        if row < rows:
+            write_quarter(items, 3 * row, wp.vec4(leaf.lower[0], leaf.lower[1], leaf.lower[2], leaf.upper[0]))
+            write_quarter(
+                items, 3 * row + 1, wp.vec4(leaf.upper[1], leaf.upper[2], leaf.posed_lower[0], leaf.posed_lower[1])
+            )
+            write_quarter(
+                items,
+                3 * row + 2,
+                wp.vec4(leaf.posed_lower[2], leaf.posed_upper[0], leaf.posed_upper[1], leaf.posed_upper[2]),
+            )
+        write_number(items, SMALL_A + row, row < rows, leaf.face)
+        warp_sync()
+        first += warp_size()
+    return rows
+
+
+@wp.func
+def compare_leaf(items: wp.uint64, row: wp.int32, live: bool, waiting: wp.int32, b: LeafBox):
+    """Compare the boxes of a leaf of A with one of B a lane, and append the leaf pairs that overlap."""
+    x = read_quarter(items, 3 * row)
+    y = read_quarter(items, 3 * row + 1)
+    z = read_quarter(items, 3 * row + 2)
+    own = spans_overlap(
+        wp.vec3(x[0], x[1], x[2]), wp.vec3(x[3], y[0], y[1]), b.posed_lower, b.posed_upper
+    )
+    posed = spans_overlap(wp.vec3(y[2], y[3], z[0]), wp.vec3(z[1], z[2], z[3]), b.lower, b.upper)
+    return push_leaf_pair(items, waiting, live and own and posed, read_number(items, SMALL_A + row), b.face)
+
+
+@wp.func
+def test_small_trees(
+    # static
+    output: wp.int32,
+    mode: wp.int32,
+    for_any: bool,
+    unit: wp.vec3i,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    items: wp.uint64,
+    lists: SmallLists,
+    # out
+    hits: Hits,
+):
+    """Compare what was gathered and test the leaf pairs; return as `traverse_items`.
+
+    Args:
+        for_any: One hit ends a pair.
+        unit: Object pair, part and parts.
+    """
+    pair = unit[0]
+    ready = wp.where(for_any, wp.min(LEAF_PAIRS_FOR_ANY, warp_size()), warp_size())
+    ready_straddling = wp.where(for_any, 1, warp_size())
+    rows = keep_boxes(items, unit[1], unit[2], lists.leaves_a, models, states, pose)
+    node_tests = wp.where(unit[1] == 0, lists.tests, 0)
+    hit_count, uncertain_count, tested = wp.int32(0), wp.int32(0), wp.int32(0)
+    waiting, straddling = wp.int32(0), wp.int32(0)
+    row, column = wp.int32(0), wp.int32(0)
+    b = LeafBox()
+    more = rows > 0 and lists.leaves_b > 0
+    while more or waiting > 0 or straddling > 0:
+        found = False
+        while more and waiting < ready:
+            live = column + warp_lane() < lists.leaves_b
+            if row == 0:
+                at = wp.min(column + warp_lane(), lists.leaves_b - 1)
+                b = box_leaf(models, states, pose, read_number(items, SMALL_B + at), True)
+            waiting = compare_leaf(items, row, live, waiting, b)
+            node_tests += wp.where(live, 1, 0)
+            row += 1
+            if row == rows:
+                row = 0
+                column += warp_size()
+                more = column < lists.leaves_b
+        warp_sync()
+        if waiting >= ready or (not more and waiting > 0):
+            popped = wp.min(waiting, warp_size())
+            waiting -= popped
+            straddling = separate_leaf_pairs(mode, items, waiting, popped, straddling, models, states, pose)
+            tested += popped
+        if straddling >= ready_straddling or (not more and waiting == 0 and straddling > 0):
+            popped = wp.min(straddling, warp_size())
+            straddling -= popped
+            found, uncertain = test_straddling(
+                output, mode, items, straddling, popped, pair, models, states, pose, hits
+            )
+            hit_count += wp.where(found, 1, 0)
+            uncertain_count += wp.where(uncertain, 1, 0)
+        if for_any:
+            if warp_any(found or hits.any_hit[pair] != 0):
+                more = False
+                waiting = 0
+                straddling = 0
+    return node_tests, wp.vec3i(hit_count, wp.where(warp_lane() == 0, tested, 0), uncertain_count)
