@@ -44,31 +44,8 @@ class PairPose:
     node_b: wp.int32  # where B's tree lies in the pool
     corner_a: wp.int32  # where A's face corners lie in the pool
     corner_b: wp.int32  # where B's face corners lie in the pool
-    faces_a: wp.int32  # about how many faces A has at its LOD: right for a closed manifold
-    faces_b: wp.int32  # about how many faces B has at its LOD
-
-
-@wp.struct
-class PairTrees:
-    """What two objects of a pair have by their tree states alone."""
-
-    state_a: wp.int32  # tree state of A
-    state_b: wp.int32  # tree state of B
-    centre_a: wp.vec3d  # of A's model [model units]
-    centre_b: wp.vec3d  # of B's model [model units]
-    reach_a: wp.float64  # largest coordinate of A's root box about the centre, in magnitude
-    reach_b: wp.float64  # the same of B
-
-
-@wp.struct
-class RelativePose:
-    """The pose of B in A's frame in float64, and how far its rotation is off."""
-
-    rotation: wp.mat33d  # B's model frame to A's
-    translation: wp.vec3d  # B's model frame to A's
-    shift: wp.vec3d  # the same between the models' centres
-    back: wp.vec3d  # the transpose of the rotation times the shift
-    skew: wp.float64  # the largest entry of R^T R - 1, in magnitude
+    faces_a: wp.int32  # about how many faces A has at its LOD, no more than at the finest
+    faces_b: wp.int32  # the same of B
 
 
 @wp.func
@@ -101,11 +78,6 @@ def relative_pose(objects: ObjectPool, a: wp.int32, b: wp.int32):
     return r, t
 
 
-@wp.func_native("return y > x ? y : x;")
-def larger(x: wp.float64, y: wp.float64) -> wp.float64:
-    """Return the larger of a number and what may be none: fewer steps than `wp.max`."""
-
-
 @wp.func
 def reach_box(lower: wp.vec3, upper: wp.vec3):
     """Return the largest coordinate of a box, in magnitude."""
@@ -114,26 +86,17 @@ def reach_box(lower: wp.vec3, upper: wp.vec3):
 
 
 @wp.func
-def measure_skew(r: wp.mat33d):
-    """Return how far R^T R is off the identity, the largest entry; its entries are the same on both sides."""
+def measure_rotation(r: wp.mat33d):
+    """Return how far R^T R and R are off the identity, the largest entries."""
     skew = wp.float64(0.0)
-    for i in range(3):
-        for j in range(i, 3):
-            one = wp.where(i == j, wp.float64(1.0), wp.float64(0.0))
-            gram = sum_products(r[0, i], r[0, j], r[1, i], r[1, j], r[2, i], r[2, j])
-            skew = larger(skew, wp.abs(gram - one))
-    return skew
-
-
-@wp.func
-def measure_turn(r: wp.mat33d):
-    """Return how far R is off the identity, the largest entry."""
     size = wp.float64(0.0)
     for i in range(3):
         for j in range(3):
             one = wp.where(i == j, wp.float64(1.0), wp.float64(0.0))
-            size = larger(size, wp.abs(r[i, j] - one))
-    return size
+            gram = sum_products(r[0, i], r[0, j], r[1, i], r[1, j], r[2, i], r[2, j])
+            skew = wp.max(skew, wp.abs(gram - one))
+            size = wp.max(size, wp.abs(r[i, j] - one))
+    return skew, size
 
 
 @wp.func
@@ -145,44 +108,9 @@ def unit_scale(reach: wp.float64):
 
 @wp.func
 def active_faces(models: ModelPool, states: StatePool, state: wp.int32):
-    """Return about how many faces a state has: every vertex split of a closed manifold adds two."""
+    """Return about how many faces a state has: a vertex split of a closed manifold adds two."""
     model = states.model[state]
     return models.face_count[model] - 2 * (models.lod_max[model] - states.lod[state])
-
-
-@wp.func
-def pair_trees(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32):
-    trees = PairTrees()
-    trees.state_a = objects.state[a]
-    trees.state_b = objects.state[b]
-    trees.centre_a = models.centre[states.model[trees.state_a]]
-    trees.centre_b = models.centre[states.model[trees.state_b]]
-    root_a = load_node(states, states.node_start[trees.state_a] + 1)
-    root_b = load_node(states, states.node_start[trees.state_b] + 1)
-    trees.reach_a = reach_box(root_a.lower, root_a.upper)
-    trees.reach_b = reach_box(root_b.lower, root_b.upper)
-    return trees
-
-
-@wp.func
-def shift_centre(r0: wp.float64, r1: wp.float64, r2: wp.float64, c: wp.vec3d, t: wp.float64, to: wp.float64):
-    """Return a coordinate of B's centre c about A's: its row of R, and its entries of t and of A's centre."""
-    return (sum_products(r0, c[0], r1, c[1], r2, c[2]) + t) - to
-
-
-@wp.func
-def measure_pose(objects: ObjectPool, trees: PairTrees, a: wp.int32, b: wp.int32):
-    """Return the `RelativePose` of a pair; `shared_pose` does the same by several lanes."""
-    r, t = relative_pose(objects, a, b)
-    pose = RelativePose()
-    pose.rotation = r
-    pose.translation = t
-    for i in range(3):
-        pose.shift[i] = shift_centre(r[i, 0], r[i, 1], r[i, 2], trees.centre_b, t[i], trees.centre_a[i])
-    for i in range(3):
-        pose.back[i] = sum_products(r[0, i], pose.shift[0], r[1, i], pose.shift[1], r[2, i], pose.shift[2])
-    pose.skew = measure_skew(r)
-    return pose
 
 
 @wp.func
@@ -193,29 +121,24 @@ def pair_pose(
 
     `whole` says that all faces are asked for, not one hit, which float32 may find first.
     """
-    trees = pair_trees(models, states, objects, a, b)
-    return pose_trees(whole, models, states, trees, measure_pose(objects, trees, a, b), within)
-
-
-@wp.func
-def pose_trees(
-    whole: bool,
-    models: ModelPool,
-    states: StatePool,
-    trees: PairTrees,
-    relative: RelativePose,
-    within: wp.float64,
-):
-    """Return the `PairPose` of what is known of a pair."""
-    reach_a, reach_b = trees.reach_a, trees.reach_b
-    reach = larger(reach_a, reach_b)
-    shift, skew = relative.shift, relative.skew
+    r, t = relative_pose(objects, a, b)
+    state_a = objects.state[a]
+    state_b = objects.state[b]
+    centre_a = models.centre[states.model[state_a]]
+    centre_b = models.centre[states.model[state_b]]
+    root_a = load_node(states, states.node_start[state_a] + 1)
+    root_b = load_node(states, states.node_start[state_b] + 1)
+    reach_a = reach_box(root_a.lower, root_a.upper)
+    reach_b = reach_box(root_b.lower, root_b.upper)
+    shift = wp.vec3d()
     size = wp.float64(0.0)
     far = wp.float64(0.0)
     for i in range(3):
-        far = larger(far, wp.abs(shift[i]))
-        size = larger(size, wp.abs(relative.translation[i]) + wp.abs(trees.centre_a[i]))
-    reach_c = larger(larger(wp.abs(trees.centre_b[0]), wp.abs(trees.centre_b[1])), wp.abs(trees.centre_b[2]))
+        shift[i] = (sum_products(r[i, 0], centre_b[0], r[i, 1], centre_b[1], r[i, 2], centre_b[2]) + t[i]) - centre_a[i]
+        far = wp.max(far, wp.abs(shift[i]))
+        size = wp.max(size, wp.abs(t[i]) + wp.abs(centre_a[i]))
+    skew, rotation_size = measure_rotation(r)
+    reach_c = wp.max(wp.max(wp.abs(centre_b[0]), wp.abs(centre_b[1])), wp.abs(centre_b[2]))
     margin64 = ROUNDING_64 * (size + wp.float64(2.0) * (reach_c + reach_b) + reach_a)
     margin64 = margin64 + wp.float64(4.0) * skew * (reach_b + far)
     margin32 = ROUNDING_32 * (reach_a + reach_b + far)
@@ -223,26 +146,24 @@ def pose_trees(
     off32 = UNIT_32 * (wp.float64(2.0) * reach_a + wp.float64(13.0) * reach_b + wp.float64(3.0) * far)
 
     pose = PairPose()
-    pose.rotation = relative.rotation
-    pose.translation = relative.translation
+    pose.rotation = r
+    pose.translation = t
     pose.within = within
-    pose.node_a = states.node_start[trees.state_a]
-    pose.node_b = states.node_start[trees.state_b]
-    pose.corner_a = states.face_start[trees.state_a]
-    pose.corner_b = states.face_start[trees.state_b]
-    pose.faces_a = active_faces(models, states, trees.state_a)
-    pose.faces_b = active_faces(models, states, trees.state_b)
-    pose.rotation32 = wp.mat33(relative.rotation)
-    pose.scale = unit_scale(reach)
+    pose.node_a = states.node_start[state_a]
+    pose.node_b = states.node_start[state_b]
+    pose.corner_a = states.face_start[state_a]
+    pose.corner_b = states.face_start[state_b]
+    pose.faces_a = active_faces(models, states, state_a)
+    pose.faces_b = active_faces(models, states, state_b)
+    pose.rotation32 = wp.mat33(r)
+    pose.scale = unit_scale(wp.max(reach_a, reach_b))
     pose.error = wp.float32(pose.scale * wp.float64(2.02) * (off32 + margin64))
-    if reach < REACH_MIN or reach > REACH_MAX:
+    if wp.max(reach_a, reach_b) < REACH_MIN or wp.max(reach_a, reach_b) > REACH_MAX:
         pose.error = wp.inf
-    same = states.model[trees.state_a] == states.model[trees.state_b]
-    same = same and states.lod[trees.state_a] == states.lod[trees.state_b]
-    if whole and same and far <= off32:
-        if far + wp.float64(3.0) * measure_turn(relative.rotation) * reach_b <= off32:
-            # Coincident meshes: no vertex is farther from its twin than float32 can tell.
-            pose.error = wp.inf
+    same = states.model[state_a] == states.model[state_b] and states.lod[state_a] == states.lod[state_b]
+    if whole and same and far + wp.float64(3.0) * rotation_size * reach_b <= off32:
+        # Coincident meshes: no vertex is farther from its twin than float32 can tell.
+        pose.error = wp.inf
     # A margin that no box passes, for pairs that are apart for certain and perhaps beyond float32, or even float64: a
     # distance that overflowed gives infinity or NaN.
     pose.margin = -wp.inf
@@ -251,7 +172,8 @@ def pose_trees(
     near = wp.abs(shift[0]) <= wide and wp.abs(shift[1]) <= wide and wp.abs(shift[2]) <= wide
     if near and limit < wp.float64(wp.inf):
         pose.translation32 = wp.vec3(shift)
-        pose.back32 = -wp.vec3(relative.back)
+        for i in range(3):
+            pose.back32[i] = -wp.float32(sum_products(r[0, i], shift[0], r[1, i], shift[1], r[2, i], shift[2]))
         pose.margin = wp.float32(margin64 + margin32 + within * (wp.float64(1.0) + skew + ROUNDING_32))
     return pose
 

@@ -35,7 +35,7 @@ from warp_abtree.kernels.poses import (
     ROUNDING_64,
     UNIT_32,
     PairPose,
-    measure_skew,
+    measure_rotation,
     pose_point,
     reach_box,
     sum_products,
@@ -115,7 +115,7 @@ def make_frame(models: ModelPool, states: StatePool, objects: ObjectPool, pose: 
         shift[i] = (sum_products(r[i, 0], centre_b[0], r[i, 1], centre_b[1], r[i, 2], centre_b[2]) + t[i]) - centre_a[i]
     for i in range(3):
         back[i] = -sum_products(r[0, i], shift[0], r[1, i], shift[1], r[2, i], shift[2])
-    skew = measure_skew(r)
+    skew, _ = measure_rotation(r)
     two = wp.float64(2.0)
     size = largest(t) + largest(centre_a)
     far = largest(shift)

@@ -28,12 +28,9 @@ constexpr int SMALL_B = 832;
 static_assert(SMALL_A == 12 * SMALL_LEAVES && SMALL_A >= SMALL_INNER, "three quarters a box, or inner nodes");
 static_assert(SMALL_B == SMALL_A + SMALL_LEAVES && 4 * (SMALL_B + SMALL_LEAVES) <= STACK_LENGTH * ITEM_BYTES, "room");
 
-// Lanes that share a relative pose, and numbers that they keep: R, t, the shift between centres, and that shift back.
-constexpr int POSE_LANES = 16;
-constexpr int POSE_ENTRIES = 18;
-static_assert(POSE_LANES >= 12 && WARP_SIZE % POSE_LANES == 0, "a lane an entry of R and t, poses side by side");
-
 // Slots of the queue in which idle warps wait, each with room for so many items: one a lane.
+// More than there are units of any launch: as the number of units taken, it leaves none.
+constexpr int NO_UNIT = 1073741824;
 constexpr int SLOT_COUNT = 8192;
 constexpr int SLOT_ITEMS = 32;
 static_assert((SLOT_COUNT & (SLOT_COUNT - 1)) == 0, "a ticket's low bits are its slot");

@@ -21,15 +21,16 @@ from warp_abtree.kernels.traversal.load_balance import (
     await_donation,
     claim_slot,
     count_idle,
-    end_unit,
     fill_slot,
+    first_unit,
     free_slot,
     load_tickets,
+    start_items,
     take_unit,
     units_per_pair,
 )
+from warp_abtree.kernels.traversal.node_pair import compare_node_pair, item_first, item_second
 from warp_abtree.kernels.traversal.small_trees import SmallLists, gather_leaves, is_small, test_small_trees
-from warp_abtree.kernels.traversal.node_pair import compare_node_pair, first_item, item_first, item_second
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
     add_warp_sum,
@@ -52,9 +53,6 @@ wp.set_module_options(MODULE_OPTIONS)
 DEPTH_FIRST_ROOM = wp.constant(128)
 
 STACK_MASK = wp.constant(STACK_LENGTH - 1)
-# Warps on one pair divide its work when there are about so many items for each, or as many as the stack takes then.
-ITEMS_PER_WARP = wp.constant(8)
-ITEMS_TO_DIVIDE = wp.constant(STACK_LENGTH // 2)
 # An early hit ends a pair for `any`, so few leaf pairs wait.
 LEAF_PAIRS_FOR_ANY = wp.constant(8)
 # A warp with work for two looks at every second turn whether others are idle, at every one where pairs are few: a turn
@@ -76,12 +74,10 @@ class Pace:
 
 @wp.struct
 class WarpItems:
-    """What a warp has in shared memory: a ring of node pairs, and leaf pairs."""
+    """What a warp has in shared memory: node pairs, in a ring, the oldest first."""
 
     items: wp.uint64  # `warp_stack`
-    head: wp.int32  # where node pairs start, the oldest first; STACK_MASK takes it into the ring
-    end: wp.int32  # where they end
-    waiting: wp.int32  # leaf pairs
+    end: wp.int32  # node pairs
 
 
 @wp.func
@@ -105,49 +101,6 @@ def expand_items(
     ends = push_children(items, end, waiting, emitted, children)
     warp_sync()
     return item_second(ends), item_first(ends), tests
-
-
-@wp.func
-def divide_items(items: wp.uint64, head: wp.int32, end: wp.int32, part: wp.int32, parts: wp.int32):
-    """Keep every so many-th item from head on, for one of several warps that hold the same; return the new end."""
-    kept = (end - head - part + parts - 1) / parts
-    done = wp.int32(0)
-    while done < kept:
-        item = wp.int64(0)
-        i = done + warp_lane()
-        if i < kept:
-            item = read_item(items, (head + part + parts * i) & STACK_MASK)
-        warp_sync()
-        if i < kept:
-            write_item(items, (head + i) & STACK_MASK, item)
-        warp_sync()
-        done += warp_size()
-    return head + kept
-
-
-@wp.func
-def start_items(items: wp.uint64, part: wp.int32, parts: wp.int32, states: StatePool, pose: PairPose):
-    """Start a pair: expand the roots breadth first, the same in every warp at work on it, and keep a part.
-
-    Returns where the part starts and ends, the leaf pairs that wait, and the pairs of boxes compared: these two are
-    the first warp's.
-    """
-    if warp_lane() == 0:
-        write_item(items, 0, first_item(states, pose))
-    warp_sync()
-    head, end = wp.int32(0), wp.int32(1)
-    waiting, compared = wp.int32(0), wp.int32(0)
-    wanted = wp.min(parts * ITEMS_PER_WARP, ITEMS_TO_DIVIDE)
-    while parts > 1 and end > head and end - head < wanted and waiting < warp_size():
-        first = head
-        head += wp.min(warp_size(), end - head)
-        end, waiting, more = expand_items(items, first, head - first, end, waiting, states, pose)
-        compared += more
-    if part > 0:
-        waiting = 0
-        compared = 0
-    end = divide_items(items, head, end, part, parts)
-    return head, end, waiting, compared
 
 
 @wp.func
@@ -198,7 +151,7 @@ def traverse_items(
 ):
     """Traverse what is on the stack and is not given away; return pairs of boxes compared, and face pair tests."""
     items, for_any = own.items, pace.for_any
-    head, end, waiting = wp.int32(own.head), wp.int32(own.end), wp.int32(own.waiting)
+    head, end, waiting = wp.int32(0), wp.int32(own.end), wp.int32(0)
     node_tests, turn = wp.int32(0), wp.int32(0)
     tested, hit_count, uncertain_count = wp.int32(0), wp.int32(0), wp.int32(0)
     straddling = wp.int32(0)
@@ -274,14 +227,17 @@ def warp_traversal(mode: int, for_any: bool):
             pace.tests_max = hold_uniform(wp.where(parts >= MANY_PARTS, 1, TESTS_A_TURN))
         own = WarpItems()
         own.items = warp_stack()
+        units = count * parts
+        unit = first_unit(work_inout.counter)
+        ended = wp.int32(0)
         while True:
-            unit = take_unit(work_inout.counter)
             p = unit / parts
             slot = wp.int32(-1)
-            if unit >= count * parts:
-                slot = await_donation(work_inout.counter, work_inout.flag)
+            if unit >= units:
+                slot = await_donation(work_inout.counter, work_inout.flag, ended)
                 if slot < 0:
                     return
+                ended = 0
                 p = work_inout.owner[slot][0]
             pose = pair_poses[p]
             asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
@@ -305,23 +261,22 @@ def warp_traversal(mode: int, for_any: bool):
                     hits_inout,
                 )
             else:
-                head, end, waiting, started = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
                 if slot >= 0:
-                    end = receive_items(own.items, slot, work_inout)
+                    own.end = receive_items(own.items, slot, work_inout)
                 else:
-                    head, end, waiting, started = start_items(own.items, part, parts, states, pose)
-                    started += wp.where(part == 0, lists.tests, 0)
-                own.head = head
-                own.end = end
-                own.waiting = waiting
+                    own.end = start_items(own.items, part, parts, pose)
                 node_tests, tests = traverse_items(
                     asked, wp.static(mode), pace, p, models, states, pose, own, hits_inout, work_inout
                 )
-                node_tests += started
+                node_tests += wp.where(part == 0, lists.tests, 0)
             add_warp_sum(hits_inout.node_tests, p, node_tests)
             add_warp_sum(hits_inout.count, p, tests[0])
             add_warp_sum(hits_inout.triangle_tests, p, tests[1])
             add_warp_sum(hits_inout.float64_tests, p, tests[2])
-            end_unit(work_inout.counter, work_inout.flag)
+            ended += 1
+            if unit < units:
+                unit = wp.int32(units)
+                if units > work_inout.warps:
+                    unit = take_unit(work_inout.counter)
 
     return traverse_warp_kernel

@@ -26,6 +26,7 @@ SMALL_A, SMALL_B = native.constant("SMALL_A"), native.constant("SMALL_B")
 LEAF_PAIRS_FOR_ANY = wp.constant(8)
 SIDE_B = wp.constant(-(2**31))  # the bit of an inner node of B
 
+
 @wp.func_native(native.body("small_trees.cuh", "rank_flag"))
 def rank_flag(flag: bool) -> wp.int32:
     """Return how many lanes have set their flag, and in the low half how many before this one."""
@@ -189,7 +190,13 @@ def box_leaf(models: ModelPool, states: StatePool, pose: PairPose, node: wp.int3
 
 @wp.func
 def keep_boxes(
-    items: wp.uint64, part: wp.int32, parts: wp.int32, leaves: wp.int32, models: ModelPool, states: StatePool, pose: PairPose
+    items: wp.uint64,
+    part: wp.int32,
+    parts: wp.int32,
+    leaves: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
 ):
     """Put the boxes of every so many-th leaf of A in place, with their faces; return how many there are."""
     rows = (leaves - part + parts - 1) / parts
@@ -220,9 +227,7 @@ def compare_leaf(items: wp.uint64, row: wp.int32, live: bool, waiting: wp.int32,
     x = read_quarter(items, 3 * row)
     y = read_quarter(items, 3 * row + 1)
     z = read_quarter(items, 3 * row + 2)
-    own = spans_overlap(
-        wp.vec3(x[0], x[1], x[2]), wp.vec3(x[3], y[0], y[1]), b.posed_lower, b.posed_upper
-    )
+    own = spans_overlap(wp.vec3(x[0], x[1], x[2]), wp.vec3(x[3], y[0], y[1]), b.posed_lower, b.posed_upper)
     posed = spans_overlap(wp.vec3(y[2], y[3], z[0]), wp.vec3(z[1], z[2], z[3]), b.lower, b.upper)
     return push_leaf_pair(items, waiting, live and own and posed, read_number(items, SMALL_A + row), b.face)
 

@@ -78,7 +78,7 @@ def read_signs(items: wp.uint64, i: wp.int32) -> wp.int32:
 
 @wp.func_native(stack_code("signed_pairs"))
 def signed_pairs() -> wp.uint64:
-    """Return where this warp holds face pairs with their signs, then inexact ones: an address in shared memory on CUDA."""
+    """Return where this warp holds face pairs with their signs, then inexact ones; in shared memory on CUDA."""
 
 
 @wp.func_native(stack_code("push_signed_pair"))

@@ -195,21 +195,22 @@ class Query(QueryReadout):
     def _make_search(self, within, hits, mode, output, launch) -> list:
         """Make the launches that bring relative poses and traverse all pairs, see `Commands.find`."""
         pools, room = self.batch.pools, len(self.pairs)
+        # More than there are units, where these are few: idle warps wait for donations.
+        warps = max(room, int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1)
+        warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
+        self.work.warps = warps if self.uses_warps() else 0
         inputs = [output, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
         # A warp a block: few pairs lie on as many multiprocessors.
-        kernel = relative_pose.relative_pose_kernel
+        kernel = relative_pose.relative_poses(mode == int(face_pairs.WITHIN))
         first = launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
         if not self.uses_warps():
             inputs += [self._regime.plain_tests, self.slab_memory, hits, self.work]
             return [first, launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device)]
-        # More than there are units, where these are few: idle warps wait for donations.
-        warps = max(room, int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1)
-        warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
         traversal = launch(
             dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
-            dim=warps * (WARP_SIZE if self.device.is_cuda else 1),
+            dim=self.work.warps * (WARP_SIZE if self.device.is_cuda else 1),
             inputs=[self._stack_length(), *inputs, hits, self.work],
             block_dim=WARP_SIZE,
             device=self.device,
@@ -251,7 +252,8 @@ class Query(QueryReadout):
             kernels.insert(0, self._pass())
         else:
             kernels = [simd.thread_traversal(mode) for mode in modes]
-        return [(kernel, WARP_SIZE) for kernel in (*kernels, relative_pose.relative_pose_kernel)]
+        kernels += [relative_pose.relative_poses(mode == within) for mode in modes]
+        return [(kernel, WARP_SIZE) for kernel in kernels]
 
     def result(self, device: bool = False) -> Result:
         """Return the results of the last launch, sorted. Waits for the device.
