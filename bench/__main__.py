@@ -1,6 +1,9 @@
 """python -m bench CASE [--device D] [--json FILE] [...]: one of the cases below, its rows printed as they come.
 
-python -m bench paper|tradeoff --out DIR [...]: a study. `python -m bench NAME --help` lists the options of a name.
+python -m bench paper|tradeoff --out DIR [...]: a study.
+python -m bench nightly --out DIR [...]: what became slower since the command ran before.
+
+`python -m bench NAME --help` lists the options of a name.
 """
 
 import argparse
@@ -24,7 +27,7 @@ CASES = (
     *("assembly", "baselines", "budget", "build", "coarse", "distance", "exact", "frame"),
     *("host", "query", "scale", "sweep", "update"),
 )
-STUDIES = ("paper", "tradeoff")
+STUDIES = {"paper": "study", "tradeoff": "study", "nightly": "nightly"}  # and the modules that run them
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml
 # A case, and a study, takes the options that its function `run` has as arguments.
 OPTIONS = {
@@ -34,7 +37,7 @@ OPTIONS = {
     "plots": {"metavar": "DIR", "help": "draw figures there"},
     "count": {"type": int, "help": "random pairs; a tenth as many adversarial ones"},
     "out": {"required": True, "metavar": "DIR", "help": "where to write JSON, tables and figures"},
-    "only": {"nargs": "+", "metavar": "PART", "help": "run these parts alone; others are kept from before"},
+    "only": {"nargs": "+", "metavar": "PART", "help": "run these parts, or cases, alone; others are kept from before"},
     "processes": {"type": int, "help": "processes that run the oracle"},
 }
 
@@ -51,7 +54,7 @@ def main(argv=None):
     name = argv[0] if argv else None
     case = None
     if name in (*CASES, *STUDIES):
-        case = importlib.import_module("bench.studies.study" if name in STUDIES else f"bench.cases.{name}")
+        case = importlib.import_module(f"bench.studies.{STUDIES[name]}" if name in STUDIES else f"bench.cases.{name}")
     taken = set(inspect.signature(case.run).parameters) if case else set()
     parser = Parser(prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=[*STUDIES, *CASES])

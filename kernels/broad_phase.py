@@ -69,12 +69,21 @@ def append_pair(
     j: wp.int32,
     objects: ObjectPool,
     excluded: wp.array(dtype=wp.int64),
+    collision_bits: wp.array(dtype=wp.vec2ui),
     pair_count: wp.array(dtype=wp.int32),
     pairs: wp.array(dtype=wp.vec2i),
 ):
-    """Append (min, max) unless both are static or the user excluded it; the count goes on past the capacity."""
+    """Append (min, max) unless both are static, their bits forbid it, or the user excluded it.
+
+    The count goes on past the capacity.
+    """
     if objects.is_static[i] != 0 and objects.is_static[j] != 0:
         return
+    if collision_bits.shape[0] > 0:
+        a = collision_bits[i]
+        b = collision_bits[j]
+        if (a[0] & b[1]) == wp.uint32(0) or (b[0] & a[1]) == wp.uint32(0):
+            return
     low = wp.min(i, j)
     high = wp.max(i, j)
     if excluded.shape[0] > 0:
@@ -95,6 +104,7 @@ def find_pair_kernel(
     upper: wp.array(dtype=wp.vec3),
     group: wp.array(dtype=wp.int32),
     excluded: wp.array(dtype=wp.int64),
+    collision_bits: wp.array(dtype=wp.vec2ui),
     objects: ObjectPool,
     pair_count_inout: wp.array(dtype=wp.int32),
     pairs_out: wp.array(dtype=wp.vec2i),
@@ -107,6 +117,7 @@ def find_pair_kernel(
         shared_group: Group of the objects that are in every world, -1 if there is none.
         group: Group of each object; worlds are renumbered from 0.
         excluded: Sorted keys i * 2^32 + j, i < j.
+        collision_bits: Collision group and mask of each object; empty where they keep no pair apart.
     """
     i = wp.tid()
     j = wp.int32(0)
@@ -116,12 +127,12 @@ def find_pair_kernel(
         query = wp.bvh_query_aabb(bvh, lower[i], upper[i], root)
         while wp.bvh_query_next(query, j):
             if j > i or objects.is_static[j] != 0:
-                append_pair(i, j, objects, excluded, pair_count_inout, pairs_out)
+                append_pair(i, j, objects, excluded, collision_bits, pair_count_inout, pairs_out)
     if shared_group >= 0 and group[i] != shared_group:
         root = wp.bvh_get_group_root(bvh, shared_group)
         query = wp.bvh_query_aabb(bvh, lower[i], upper[i], root)
         while wp.bvh_query_next(query, j):
-            append_pair(i, j, objects, excluded, pair_count_inout, pairs_out)
+            append_pair(i, j, objects, excluded, collision_bits, pair_count_inout, pairs_out)
 
 
 @wp.func

@@ -94,12 +94,16 @@ def find_study(name):
     return importlib.import_module(f"{__package__}.{name}")
 
 
+def describe_device(device) -> str:
+    """Return the name of a GPU, or the processor and its cores."""
+    return device.name if device.is_cuda else f"{platform.processor()}, {os.cpu_count()} cores"
+
+
 def run_part(run, context, command) -> dict:
     """Run a part; return its rows, notes and the circumstances."""
     begin = time.perf_counter()
     rows = [{key: tables.plain(value) for key, value in row.items()} for row in run(context)]
-    device = context.device.name if context.device.is_cuda else f"{platform.processor()}, {os.cpu_count()} cores"
-    about = {"device": device, "quick": context.quick, **describe_run(), "command": command}
+    about = {"device": describe_device(context.device), "quick": context.quick, **describe_run(), "command": command}
     about["seconds"] = tables.plain(time.perf_counter() - begin)
     return {"run": about, "notes": context.notes, "rows": rows}
 

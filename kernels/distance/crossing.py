@@ -85,7 +85,7 @@ def search_crossing_kernel(
     p = wp.tid() / warp_size()
     if p >= pair_count[0] or found_inout.launched[0] == STALE:
         return
-    if hits.any_hit[p] == 0:
+    if hits.any_hit[p] != 1:
         return
     faces = search_crossing(models, states, pair_poses[p], found_inout.frame[p], room)
     if warp_lane() == 0:
@@ -108,7 +108,7 @@ def report_crossing_kernel(
     p = wp.tid()
     if p >= pair_count[0] or found.launched[0] == STALE:
         return
-    if hits.any_hit[p] == 0 or found.faces[p] == NO_FACES:
+    if hits.any_hit[p] != 1 or found.faces[p] == NO_FACES:
         return
     pose = pair_poses[p]
     face_a, face_b = item_first(found.faces[p]), item_second(found.faces[p])

@@ -16,7 +16,6 @@ from warp_abtree.kernels.distance.frame import (
     Frame,
     Nearest,
     Tolerances,
-    cut_of,
     load_triangles,
     width_of,
 )
@@ -39,7 +38,12 @@ ROUNDING_DOWN = wp.constant(wp.float32(1.0 - 2.0**-20))
 
 @wp.func_native(native.body("nearest/lists.h", "open_search"))
 def open_search(
-    upper: wp.float32, first: wp.int64, way: wp.vec3, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)
+    upper: wp.float32,
+    found: bool,
+    first: wp.int64,
+    way: wp.vec3,
+    thread: wp.int32,
+    memory: wp.array2d(dtype=wp.float32),
 ): ...
 
 
@@ -62,10 +66,8 @@ def search_nearest(
 
 
 @wp.func_native(native.body("nearest/lists.h", "take_nearest"))
-def take_nearest(
-    upper: wp.float32, cut: wp.float32, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)
-) -> wp.int64:
-    """Return the faces that wait and seem nearest, -1 if none may be as near as the cut.
+def take_nearest(upper: wp.float32, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)) -> wp.int64:
+    """Return the faces that wait and seem nearest, -1 if none may be the nearest.
 
     Args:
         upper: Scaled distance that the nearest faces are not beyond.
@@ -97,7 +99,6 @@ def decide_open(
     states: StatePool,
     pose: PairPose,
     frame: Frame,
-    tolerances: Tolerances,
     thread: wp.int32,
     before: Nearest,
     memory: wp.array2d(dtype=wp.float32),
@@ -106,11 +107,7 @@ def decide_open(
     nearest = before
     searching = bool(True)
     while searching:
-        upper = scaled_up(nearest.distance, frame)
-        cut = upper
-        if nearest.faces != NO_FACES:
-            cut = scaled_up(cut_of(frame, tolerances, nearest.distance), frame)
-        item = take_nearest(upper, cut, thread, memory)
+        item = take_nearest(scaled_up(nearest.distance, frame), thread, memory)
         searching = item >= wp.int64(0)
         if searching:
             d = triangle_distance(load_triangles(models, states, pose, item_first(item), item_second(item)))
@@ -150,11 +147,12 @@ def search_thread_kernel(
             nearest.faces = found_inout.faces[p]
             with_slabs = has_slabs(slabs, p)
             spare = spare_of(tolerances, frame)
-            open_search(scaled_up(nearest.distance, frame), first_item(states, pose), frame.way, thread, memory_out)
+            upper, found = scaled_up(nearest.distance, frame), nearest.faces != NO_FACES
+            open_search(upper, found, first_item(states, pose), frame.way, thread, memory_out)
             state = wp.vec3i()
             while state[0] == 0:
                 state = search_nearest(models, states, pose, frame, spare, slabs, with_slabs, thread, memory_out)
-                nearest = decide_open(models, states, pose, frame, tolerances, thread, nearest, memory_out)
+                nearest = decide_open(models, states, pose, frame, thread, nearest, memory_out)
             hits_inout.node_tests[p] += wp.int64(state[1])
             hits_inout.triangle_tests[p] += wp.int64(state[2])
             found_inout.distance[p] = nearest.distance

@@ -206,7 +206,7 @@ def choose_position_kernel(
 
     Args:
         scale_inout: Position, and frames that a transition has been held.
-        choice_out: Candidate, its steady and transition cost [ms], its work, the work of `held`.
+        choice_out: Candidate, its steady and transition cost [ms], its work, the work of `held`, the position.
     """
     held = prediction.change.shape[0] - 1
     chosen = stay
@@ -235,6 +235,7 @@ def choose_position_kernel(
     choice_out[2] = transition_cost(prediction, chosen)
     choice_out[3] = work_of(prediction, chosen)
     choice_out[4] = work_of(prediction, held)
+    choice_out[5] = wp.float64(scale_inout[0])
 
 
 @wp.kernel

@@ -32,7 +32,7 @@ WITHIN = wp.constant(-1)
 class Hits:
     """Results of a batch of pairs. Lists are full where their total is beyond their shape, which is then the demand."""
 
-    any_hit: wp.array(dtype=wp.int32)  # whether it intersects, 0 or 1, shape [pair]
+    any_hit: wp.array(dtype=wp.int32)  # 0, 1 where the surfaces meet, more where a solid holds the other, shape [pair]
     count: wp.array(dtype=wp.int64)  # face pairs that intersect, shape [pair]
     face: wp.array(dtype=wp.vec3i)  # (pair, face of its first object, face of its second), shape [capacity]
     total: wp.array(dtype=wp.int32)  # numbers `face` and may wrap: the demand is the sum of `count`

@@ -4,10 +4,12 @@ import csv
 import io
 import json
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib.image
 import numpy as np
+import PIL.Image
 import pytest
 import trimesh
 from helpers.viewer import BODIES, SCENE, write_scene
@@ -144,6 +146,31 @@ def test_picture_of_a_frame(picture):
     assert first.shape != last.shape or not np.array_equal(first, last)
     picture("scene.toml --world 2 --eye 0 0 1 --out world.png")
     assert count("world.png", COLOURS[0][0]) < count("first.png", COLOURS[0][0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["webp", "gif"])
+def test_an_animation_shows_each_frame(picture, kind):
+    shown = picture(f"scene.toml --frame 1 --frames 3 --json --out moves.{kind}")
+    assert json.loads(shown) == {"picture": f"moves.{kind}", "objects": 2, "frames": 3}
+    with PIL.Image.open(f"moves.{kind}") as image:
+        assert image.format == kind.upper() and image.n_frames == 3
+        frames = []
+        for number in range(3):
+            image.seek(number)
+            frames.append(np.array(image.convert("RGB"), np.int16))
+    assert all(np.abs(one - other).max() > 50 for one, other in pairwise(frames))
+
+
+def test_an_animation_needs_frames_and_a_name_of_its_kind(picture, capsys):
+    for words, said in (
+        ("--frames 5 --out a.png", "a.png: the name must end in .webp or .gif"),
+        ("--out a.webp", "a.webp: the name must end in .png"),
+        ("--frames 1 --out a.webp", "--frames: 1, every 1, is less than two"),
+        ("--frames 4 --every 4 --out a.gif", "--frames: 4, every 4, is less than two"),
+    ):
+        (line,) = run(capsys, "picture", "ball.obj", *words.split(), status=2)[1]
+        assert said in line and not list(Path().glob("a.*"))
 
 
 def test_frames_go_as_far_as_they_are_asked(tmp_path, device):

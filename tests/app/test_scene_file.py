@@ -83,6 +83,13 @@ def test_copies(tmp_path):
     assert loaded.scene.lods.tolist() == lods * 2
 
 
+def test_collision_groups_and_masks(tmp_path):
+    """Balls of two teams, all in one place: a team meets the other alone, and what watches meets nothing."""
+    teams = "count = 2\ncollision_group = {}\ncollision_mask = {}\n[[objects]]\nmodel = 'ball'\n"
+    text = ONE + teams.format("0b01", "0b10") + teams.format("0b10", "0b01") + "collision_mask = 0\n"
+    assert load(tmp_path, text).scene.broad_phase().tolist() == [[0, 2], [0, 3], [1, 2], [1, 3]]
+
+
 def test_random_is_seeded_and_bounded(tmp_path):
     text = ONE + (
         "count = 50\nshuttle = { by = [1, 0, 0], period = 2 }\n"
@@ -193,6 +200,8 @@ KEY = "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\ntarget = [0, 0, 0]\n"
         (ONE + 'lod = "fine"\n', "objects[0].lod: LOD 'fine'"),
         (ONE + "lod = true\n", "objects[0].lod: expected a whole number or a number or a string or a list, got true"),
         (ONE + "world = -1\nworlds = 2\n", "objects[0].worlds"),
+        (ONE + "collision_group = 4294967296\n", "objects[0].collision_group"),
+        (ONE + "collision_mask = -1\n", "objects[0].collision_mask"),
         (ONE + "count = 1000\nworlds = 100000\n", "objects[0].worlds: more than"),
         (ONE + "grid = { size = [1000, 1000, 1000], spacing = [1, 1, 1] }\n", "objects[0].grid.size: more than"),
         (ONE + "count = 2\ngrid = { size = [1, 1, 1], spacing = [1, 1, 1] }\n", "give count or grid"),

@@ -25,6 +25,7 @@ def everything(scene):
     states, objects = scene.batch().states, scene.batch().objects
     held = [scene.object_count, scene.lods, objects.state, scene.batch().excluded, len(states.slots)]
     pool = objects.pool
+    held += [objects.collision_bits.numpy(), scene.worlds, scene.object_importance, scene.object_model]
     held += [array.numpy() for array in (pool.rotation, pool.position, pool.world, pool.is_static, pool.state)]
     held += [value for i in range(scene.object_count) for value in raw_state(scene, i).values()]
     return [np.asarray(value).tobytes() for value in held]

@@ -98,7 +98,7 @@ def _half_spaces(triangle):
     yield from ((sign, p) for wall in walls for sign in (wall, sub(ZERO, wall)))
 
 
-def _clip(a, b):
+def clip(a, b):
     """Corners of the intersection of two closed triangles of exact numbers, by clipping B with every half-space of A.
 
     A corner (x, y, z, w), w > 0, is the point (x, y, z) / w, so that nothing is divided.
@@ -122,20 +122,20 @@ def _clip(a, b):
 
 def triangles_intersect(a, b):
     """Whether two closed triangles of float64 coordinates, (3, 3) each, meet; exact."""
-    return bool(_clip(*integer_points(a, b)))
+    return bool(clip(*integer_points(a, b)))
 
 
 def shared_polygon(a, b):
     """Corners of the intersection of two closed triangles, float64 (n, 3), each rounded once."""
     a, b = ([tuple(map(Fraction, p)) for p in np.asarray(t, np.float64).tolist()] for t in (a, b))
-    return np.array([[float(x / w) for x in point] for *point, w in _clip(a, b)])
+    return np.array([[float(x / w) for x in point] for *point, w in clip(a, b)])
 
 
 def pairs_intersect(points_a, faces_a, points_b, faces_b, pairs):
     """Exact answers for a list of (face of A, face of B), all in one frame; returns bool [k]."""
     ia, ib = integer_points(points_a, points_b)
     faces_a, faces_b = np.asarray(faces_a).tolist(), np.asarray(faces_b).tolist()
-    meets = [bool(_clip([ia[v] for v in faces_a[i]], [ib[v] for v in faces_b[j]])) for i, j in pairs]
+    meets = [bool(clip([ia[v] for v in faces_a[i]], [ib[v] for v in faces_b[j]])) for i, j in pairs]
     return np.array(meets, bool)
 
 

@@ -35,7 +35,7 @@ def overlaps(lower, upper, slack):
     return ((lower[:, None] <= upper) & (upper[:, None] >= lower)).all(2)
 
 
-def check_pairs(scene, poses, worlds, statics, excluded=()):
+def check_pairs(scene, poses, worlds, statics, excluded=(), bits=None):
     """Compare with brute force: all pairs that overlap, and none that float32 can tell apart. Returns the pairs."""
     pairs = scene.broad_phase()
     assert pairs.dtype == np.int32 and pairs.ndim == 2 and pairs.shape[1] == 2
@@ -43,6 +43,9 @@ def check_pairs(scene, poses, worlds, statics, excluded=()):
     worlds, statics = np.array(worlds), np.array(statics)
     may = (worlds[:, None] == worlds) | (worlds[:, None] == -1) | (worlds == -1)
     may &= ~(statics[:, None] & statics)
+    for i, (group, mask) in enumerate([] if bits is None else bits):
+        for j, (other_group, other_mask) in enumerate(bits):
+            may[i, j] &= (group & other_mask) != 0 and (other_group & mask) != 0
     for i, j in excluded:
         may[i, j] = may[j, i] = False
     may, found = np.triu(may, 1), np.zeros_like(may)
@@ -53,12 +56,14 @@ def check_pairs(scene, poses, worlds, statics, excluded=()):
     return pairs
 
 
-def make_scene(device, names, poses, worlds=None, statics=None, lods=None):
+def make_scene(device, names, poses, worlds=None, statics=None, lods=None, bits=None):
     """Return a scene of samples, all in world 0, none of them static, at their finest unless told."""
     scene = ab.Scene(device)
     for i, model in enumerate(map(sample, names)):
         world, static = (0 if worlds is None else int(worlds[i])), statics is not None and bool(statics[i])
-        scene.add(model, poses[i], world=world, static=static, lod=lods and round(lods[i] * model.lod_max))
+        group, mask = (1, 2**32 - 1) if bits is None else bits[i]
+        lod = lods and round(lods[i] * model.lod_max)
+        scene.add(model, poses[i], world, lod, static=static, collision_group=group, collision_mask=mask)
     return scene
 
 
@@ -70,6 +75,7 @@ objects = st.lists(
         st.sampled_from([-1, 0, 0, 0, 1, 7, 2**31 - 1]),
         st.booleans(),
         st.sampled_from([0.0, 0.3, 1.0]),
+        st.sampled_from([(1, 2**32 - 1)] * 3 + [(2, 1), (0, 3), (3, 0), (2**31, 2**32 - 1), (5, 2**31 + 4)]),
     ),
     min_size=2,
     max_size=25,
@@ -80,15 +86,18 @@ objects = st.lists(
 @given(objects, st.lists(st.tuples(st.integers(0, 24), st.integers(0, 24)), max_size=8))
 def test_random_scenes_equal_brute_force(device, things, excluded):
     """Positions on a lattice, so that boxes often touch."""
-    names, positions, quaternions, worlds, statics, lods = zip(*things, strict=True)
+    names, positions, quaternions, worlds, statics, lods, bits = zip(*things, strict=True)
     quaternions = np.array(quaternions) / np.linalg.norm(quaternions, axis=1, keepdims=True)
     poses = np.concatenate([0.5 * np.array(positions), quaternions], 1)
-    scene = make_scene(device, names, poses, worlds, statics, lods)
-    check_pairs(scene, poses, worlds, statics)
+    scene = make_scene(device, names, poses, worlds, statics, lods, bits)
+    check_pairs(scene, poses, worlds, statics, bits=bits)
     excluded = [(i, j) for i, j in excluded if i != j and max(i, j) < len(things)]
     for i, j in excluded:
         scene.filter([(i, j)])
-    check_pairs(scene, poses, worlds, statics, excluded)
+    pairs = check_pairs(scene, poses, worlds, statics, excluded, bits)
+    pipeline = ab.Pipeline(scene, output="any", capacity=ab.Buffers(pairs=400))
+    pipeline.launch()
+    np.testing.assert_array_equal(sort_rows(pipeline.result().pairs), pairs, "the pipeline's own objects")
 
 
 @pytest.mark.parametrize("far", [0.0, 3e7])
@@ -159,6 +168,19 @@ def test_filter_adds_up_and_outlives_changes(device):
     np.testing.assert_array_equal(scene.broad_phase(), [(0, 2), (0, 4), (1, 2), (1, 3), (1, 4), (2, 4), (3, 4)])
     assert scene.intersect([(0, 1)]).any.all(), "a pair that is asked for is tested all the same"
     assert len(scene.intersect().pairs) == 7
+
+
+def test_a_filter_that_repeats_per_world_is_one_call(device):
+    """Three links in each of five worlds and a post in all: neighbouring links are left out, as pair by pair."""
+    scene, poses = ab.Scene(device), np.tile(STILL, (15, 1))
+    worlds = np.repeat(np.arange(5), 3)
+    links = scene.add_many(sample("box"), poses, worlds).reshape(5, 3)
+    post = scene.add(sample("box"), world=-1, static=True)
+    scene.filter(links[:, [(0, 1), (1, 2)]])
+    expected = [(a, b) for a, _, c in links.tolist() for b in (c, post)] + [(b, post) for b in links[:, 1].tolist()]
+    expected += [(c, post) for c in links[:, 2].tolist()]
+    np.testing.assert_array_equal(scene.broad_phase(), sorted(expected))
+    assert scene.worlds.tolist() == [*worlds.tolist(), -1]
 
 
 def test_distances_beyond_float32(device):

@@ -197,6 +197,34 @@ def test_hits_that_vary_are_read_whole(device, packs, monkeypatch):
     assert describe(query.run()) == describe(scene.intersect(MORE_PAIRS[:2], "faces"))
 
 
+@pytest.mark.parametrize("output", [*OUTPUTS, "distance"])
+def test_calls_that_repeat_follow_what_changes(device, output):
+    """On a GPU they are a graph after a few: poses, LODs, pairs, distances and rooms for hits still count."""
+    scene, rng, seen = add_objects(device), np.random.default_rng(4), set()
+    pairs, tolerance = np.array(MORE_PAIRS), 0.0
+    for step in range(24):
+        if step % 8 == 5:
+            scene.set_poses(random_poses(rng, 4, 2.0 if output == "distance" else 0.4))
+        if step % 8 == 6:
+            scene.set_lods(rng.integers(0, scene.batch().models.lod_max[scene.object_model] + 1))
+        if step % 8 == 7:
+            pairs = np.roll(pairs, 1, axis=0) if step > 8 else pairs[:-1]
+            tolerance = 0.1
+        if output == "distance":
+            found = scene.intersect(pairs, output, tolerance=tolerance)
+            fresh = ab.DistanceQuery(scene, pairs, tolerance=tolerance).run()
+            np.testing.assert_array_equal(found.any, fresh.any)
+            assert (found.bracket[:, 0] <= fresh.bracket[:, 1]).all() and (found.any == (found.distance == 0)).all()
+            assert (np.diff(found.bracket, axis=1) <= max(tolerance, 1e-9)).all()
+            seen.add(found.distance.tobytes())
+        else:
+            within = np.linspace(0.0, 0.1 * step, len(pairs))
+            found = scene.intersect(pairs, output.split()[0], within=within)
+            assert describe(found) == describe(make_query(scene, output.split()[0], pairs, within=within).run())
+            seen.add(tuple(describe(found)))
+    assert len(seen) > 3, "nothing has changed"
+
+
 @pytest.mark.parametrize("bits", [63, 20])
 def test_two_passes_sort_on_the_device(device, bits):
     scene = add_objects(device)

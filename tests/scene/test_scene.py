@@ -60,6 +60,40 @@ def test_add_keeps_poses_and_lods(device):
     np.testing.assert_equal([raw_state(scene, i) for i in range(3)], states)
 
 
+@pytest.mark.parametrize("matrices", [False, True])
+def test_many_objects_are_added_as_one_by_one(device, matrices):
+    """To the bit; also onto a scene whose poses and LODs have changed since its objects were added."""
+    rng, scenes = np.random.default_rng(6), [pair_scene(device), pair_scene(device)]
+    poses = random_poses(rng, 12, 2.0)
+    if matrices:
+        poses = np.array([to_matrix(*pose_matrix(pose)) for pose in poses])
+    models = [sample(name) for name in rng.choice(["box", "torus", "three"], 12)]
+    lods = [int(rng.integers(0, model.lod_max + 1)) for model in models]
+    worlds, importances, statics = rng.integers(-1, 3, 12), rng.integers(1, 4, 12), rng.random(12) < 0.5
+    bits = rng.integers(0, 2**32, (2, 12), dtype=np.uint32)
+    for scene in scenes:
+        scene.set_lods([3, 2, 1])
+        scene.set_poses(random_poses(np.random.default_rng(7), 3, 2.0))
+    added = scenes[0].add_many(models, poses, worlds, lods, importances, statics, *bits)
+    assert added.tolist() == list(range(3, 15))
+    rows = zip(models, poses, worlds, lods, importances, statics, *bits, strict=True)
+    assert [scenes[1].add(*row) for row in rows] == added.tolist()
+    assert everything(scenes[0]) == everything(scenes[1])
+    np.testing.assert_array_equal(scenes[0].broad_phase(), scenes[1].broad_phase())
+    assert scenes[0].lods.tolist() == [3, 2, 1, *lods] and scenes[0].worlds[3:].tolist() == worlds.tolist()
+
+
+def test_one_value_serves_all_objects_that_are_added(device):
+    scene = ab.Scene(device)
+    assert scene.add_many(sample("box"), np.empty((0, 7))).shape == (0,)
+    scene.add_many(sample("box"), [STILL] * 4, worlds=2, lods=3, importances=2, statics=True)
+    assert scene.worlds.tolist() == [2] * 4 and scene.lods.tolist() == [3] * 4 and len(scene.models) == 1
+    assert scene.object_importance == [2] * 4 and len(scene.broad_phase()) == 0
+    with pytest.raises(TypeError):
+        scene.add_many([sample("torus"), "torus"], [STILL] * 2)
+    assert scene.models == [sample("box")] and scene.object_count == 4
+
+
 def test_a_query_follows_poses_and_lods(device):
     """Launched again after every change; its answers are those of a scene made so from the start."""
     rng, hits, pairs = np.random.default_rng(4), 0, [[0, 1], [2, 0], [3, 1], [2, 3]]
@@ -127,6 +161,30 @@ OBJECTS = [
     (dict(lod=1.5), "LOD", "1.5"),
     (dict(lod=True), "LOD", "True"),
     (dict(static=1), "static"),
+    (dict(collision_group=-1), "collision_group", "-1"),
+    (dict(collision_group=2**32), "collision_group", str(2**32)),
+    (dict(collision_mask=0.5), "collision_mask", "0.5"),
+]
+# What `add_many` refuses of three objects.
+MANY = [
+    (dict(models=[sample("box"), "box.obj", sample("box")]), "model", "str"),
+    (dict(models=None), "model", "NoneType"),
+    (dict(models=[sample("box")] * 2), "2", "3"),
+    (dict(poses=STILL), "poses", "(7,)"),
+    (dict(poses=[STILL, STILL, (0, 0, 0, 0, 0, 0, 2)]), "pose 2", "quaternion"),
+    (dict(worlds=[0, -2, 0]), "worlds[1]", "-2"),
+    (dict(worlds=[0, 1]), "worlds", "(2,)"),
+    (dict(worlds=[[0, 1], [2]]), "worlds"),
+    (dict(worlds=[0, NAN, 0]), "worlds[1]", "nan"),
+    (dict(worlds=[0, True, 0.5]), "worlds[2]", "0.5"),
+    (dict(lods=[1, 2, BOX_TOP + 1]), "LOD", str(BOX_TOP + 1), "box"),
+    (dict(lods=[1, 2]), "lods", "(2,)"),
+    (dict(lods=-1), "LOD", "-1"),
+    (dict(importances=[1, 2, 4]), "importances[2]", "4"),
+    (dict(statics=[0, 1, 0]), "static"),
+    (dict(statics=[True]), "statics", "(1,)"),
+    (dict(collision_groups=[1, 2**32, 1]), "collision_groups[1]"),
+    (dict(collision_masks=["all"] * 3), "collision_masks"),
 ]
 LODS = [
     ([1, 2], "(2,)", "3"),
@@ -166,6 +224,9 @@ def refused_calls():
     yield "too many poses", lambda scene: scene.set_poses(np.tile(STILL, (4, 1))), ["poses", "4", "3"]
     for options, *words in OBJECTS:
         yield f"add {options}", lambda scene, o=options: scene.add(**{"model": box, **o}), words
+    for options, *words in MANY:
+        three = {"models": box, "poses": [STILL] * 3, **options}
+        yield f"add_many {words}", lambda scene, three=three: scene.add_many(**three), words
     for lods, *words in LODS:
         yield f"set_lods {lods}", lambda scene, lods=lods: scene.set_lods(lods), ["lods", *words]
     for pairs, *words in PAIRS:

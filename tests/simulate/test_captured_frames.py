@@ -11,11 +11,12 @@ from helpers.faults import Interruption
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.lod.controllers import PaperController, PredictiveController, ToleranceController
+from warp_abtree.lod.controllers import Feedback, PaperController, PredictiveController, ToleranceController
 from warp_abtree.lod.timing import STAGES
 from warp_abtree.lod.view import Camera
 
 TIMES = {*STAGES, "total_ms"}
+NO_TIME = Feedback(0.0, {"query_ms": 0.0})
 
 
 def camera_at(time):
@@ -50,6 +51,7 @@ CONTROLLERS = {
     "tolerance": lambda scene: ToleranceController(scene, 0.003, camera_at),
     "coarse ladder": lambda scene: ToleranceController(scene, 0.01, camera_at, steps=5),
     "paper": lambda scene: PaperController(scene, 1e9, camera_at),
+    "predictive": lambda scene: PredictiveController(scene, 1e9, camera_at, steps=5, loosest=2.0),
 }
 
 
@@ -85,8 +87,11 @@ def test_captured_frames_are_launched_ones(device, kind, output):
         assert captured == launched
         seen.append(captured[0]["intersecting"])
         lods.add(captured[2][2])
+    assert kind != "predictive" or all(
+        frame.lods.rests(Feedback(0.0)) < frame.lods.rests(NO_TIME) for frame, _ in frames
+    )
     assert max(seen) > 5 and (len(lods) > 1) == (
-        kind in ("function", "paper") or (kind != "finest" and output != "bodies")
+        kind in ("function", "paper", "predictive") or (kind != "finest" and output != "bodies")
     )
 
 

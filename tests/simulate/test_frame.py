@@ -125,6 +125,30 @@ def test_controllers_move_lods_from_the_coarsest(device):
         assert summary["budget"]["frames"] == 20 and frame.summary(after=0.0)["budget"]["frames"] == 80
 
 
+def test_selection_rests_while_the_finest_lods_fit(device):
+    """It is left out then, and is back in the frame after one that was too long, or after LODs were set."""
+    scene = make_scene(device)
+    clock = WorkClock({"node_test": 1e-7, "triangle_test": 2e-7})
+    frame = ab.Frame(scene, make_motion(), PredictiveController(scene, 1e6), clock=clock)
+    frame.warm_up()
+    selects = np.array([row.select_ms > 0 for row in frame.run(80)])
+    rests = int(np.flatnonzero(selects).max()) + 1
+    assert selects[:rests].all() and 2 < rests < 60
+    scene.set_lods([0, 0, 0])
+    rows = frame.run(100)[80:]
+    assert rows[0].select_ms > 0 and rows[0].lods_changed == 3 and rows[-1].select_ms == 0 and rows[-1].error_max == 0
+    frame.lods = controller = PredictiveController(scene, 1.2 * max(row.total_ms for row in rows))
+    frame.run(60)
+    assert frame.history[-1].select_ms == 0 and frame.history[-1].error_max == 0
+    for rate in ("node_test", "triangle_test"):
+        clock.rates[rate] *= 10
+    times = np.array(
+        [(row.select_ms > 0, row.total_ms > controller.aim * controller.budget_ms) for row in frame.run(20)]
+    )
+    assert times[240, 1] and (times[240:-1, 1] <= times[241:, 0]).all()
+    assert frame.history[-1].error_max > 0
+
+
 def test_work_is_counted_not_timed(device):
     rates = dict.fromkeys(WorkClock().rates, 0.0)
     for name, stage, count in (

@@ -4,8 +4,9 @@ import weakref
 
 import numpy as np
 
-from warp_abtree.model.mesh import component_labels, load_mesh
+from warp_abtree.model.mesh import load_mesh
 from warp_abtree.model.model import Model
+from warp_abtree.model.winding import component_labels
 
 
 class Shape:

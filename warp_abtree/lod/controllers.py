@@ -99,8 +99,18 @@ class Controller:
         self.launch()
         return self.lods
 
-    def prepare(self, feedback: Feedback):
+    def rests(self, feedback: Feedback) -> bool:
+        """Return whether a selection is known to leave all LODs as the last one did, which may be left out then.
+
+        Waits for the device.
+        """
+        return False
+
+    def prepare(self, feedback: Feedback, rests: bool = False):
         """Bring to the device what `launch` reads of the feedback and the camera; a captured graph reads it too.
+
+        Args:
+            rests: Whether the selection is left out.
 
         Raises:
             RuntimeError: As `next_lods`.
@@ -110,17 +120,23 @@ class Controller:
             self.look_ahead(feedback.time)
         if self.camera is not None:
             self.view.look(self._ahead[1])
-        self._update(feedback)
+        if not rests:
+            self._update(feedback)
 
     def look_ahead(self, time: float):
         """Find the camera of the next `prepare`, as while the device works on a frame."""
         self._ahead = time, self.camera(time) if callable(self.camera) else self.camera
 
-    def launch(self):
-        """Measure the view as the camera and the objects stand, and select the LODs of a frame. Launches only."""
+    def launch(self, rests: bool = False):
+        """Measure the view as the camera and the objects stand, and select the LODs of a frame. Launches only.
+
+        Args:
+            rests: Whether the selection is left out.
+        """
         if self.camera is not None:
             self.view.launch()
-        self._select()
+        if not rests:
+            self._select()
 
     def _select(self):
         raise NotImplementedError
@@ -236,7 +252,7 @@ class PredictiveController(Controller):
     Attributes:
         rate: See the RATE constants of `kernels.lod.prediction`, float64 (5,) on the device; NaN at first: no change.
         tests: int64 (n,) on the device.
-        choice: See `choose_position_kernel`, float64 (5,) on the device.
+        choice: See `choose_position_kernel`, float64 (6,) on the device.
         scale: Position, and frames that a change has been held, int32 (2,) on the device.
         offset: Positions by which each object is loosened, int32 (n,) on the device.
         changes: Change of the position of each candidate; the last leaves every object at its level.
@@ -259,7 +275,7 @@ class PredictiveController(Controller):
         hold_frames=30,
         loosest=64.0,
     ):
-        self.budget_ms = positive(budget_ms, "budget_ms")
+        self.budget_ms: float = positive(budget_ms, "budget_ms")
         self.aim, self.low = positive(aim, "aim"), positive(low, "low")
         if not self.low <= self.aim <= 1:
             raise ValueError(f"low {low!r} and aim {aim!r} do not rise to at most 1")
@@ -274,11 +290,11 @@ class PredictiveController(Controller):
         self._rates.send([math.nan] * 5)
         self.prediction = self._make_prediction()
         self.rate, count = self.prediction.rate, len(self.lods)
-        self.tests, self.choice = self._zeros(count, wp.int64), self._zeros(5)
+        self.tests, self.choice = self._zeros(count, wp.int64), self._zeros(6)
         # Where the host reads the choice when a launch is over.
         self._chosen = self.choice
         if self.device.is_cuda:
-            self._chosen = wp.zeros(5, dtype=wp.float64, device="cpu", pinned=True)
+            self._chosen = wp.zeros(6, dtype=wp.float64, device="cpu", pinned=True)
         self.scale, self.offset = self._zeros(2, wp.int32), self._zeros(count, wp.int32)
         self.level = self._zeros(count, wp.int32)
         self._query, self._refine, self._rest = CostFit(), CostFit(), CostFit()
@@ -298,6 +314,10 @@ class PredictiveController(Controller):
         """Predicted cost of the next frame [ms], NaN before the second. Waits for the device."""
         choice = self._read_choice()
         return float(choice[1] + choice[2])
+
+    def rests(self, feedback: Feedback) -> bool:
+        """Return whether every object is at the finest LOD for good: the last frame was within `aim` of the budget."""
+        return bool(self._read_choice()[5] == self.position_max and feedback.cost_ms <= self.aim * self.budget_ms)
 
     def _read_choice(self) -> np.ndarray:
         """Return what the last launch chose. Waits for the device."""
@@ -322,7 +342,7 @@ class PredictiveController(Controller):
 
     def _fit_exponent(self, total):
         """Fit to the tests counted, against those predicted: the exponent if LODs changed, the drift if not."""
-        _, _, _, predicted, before = self._read_choice().tolist()
+        predicted, before = self._read_choice()[3:5].tolist()
         if not (predicted > 0 and before > 0 and total > 0):
             self._drift *= 0.8
             return

@@ -4,13 +4,14 @@ A face keeps the index that it has in the source, at every later step.
 """
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.model.obj import MeshError, read_file, read_warp_asset, split_file_name
+from warp_abtree.model.winding import component_labels, find_winding
 
 FACE_LIMIT = 2**30  # int32 forest ids count up to two nodes a vertex, and heap indices up to two a face
 EXTENT_LIMITS = (2.0**-100, 2.0**100)  # boxes are float32
@@ -94,7 +95,9 @@ def describe_mesh(mesh):
 
     Dropped faces are not counted. An area is zero if its float64 cross product is within the error bound of its
     computation. Faces with the same three corners in any order are duplicates; each one after the first counts. Faces
-    that share a vertex are of one component. A mesh is closed if no edge belongs to one face only.
+    that share a vertex are of one component. A mesh is closed if every edge belongs to an even number of faces. Its
+    winding is mixed where two faces run along an edge the same way, inside out where parts are, see
+    `warp_abtree.model.winding`, else consistent, and outwards if the mesh is closed too.
     """
     faces = np.delete(mesh.faces, mesh.dropped_faces, axis=0).astype(np.int64)
     vertex_count = len(mesh.vertices)
@@ -102,7 +105,8 @@ def describe_mesh(mesh):
     edges = np.concatenate([corners[:, [0, 1]], corners[:, [0, 2]], corners[:, [1, 2]]])
     _, edge_faces = np.unique(edges[:, 0] * vertex_count + edges[:, 1], return_counts=True)
     lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    open_edges = int(np.count_nonzero(edge_faces == 1))
+    winding = find_winding(mesh.vertices, mesh.faces, mesh.dropped_faces)
+    right = "outwards" if winding.is_closed else "consistent"
     return {
         "name": mesh.name,
         "faces": len(mesh.faces),
@@ -113,14 +117,25 @@ def describe_mesh(mesh):
         "dropped_faces": len(mesh.dropped_faces),
         "zero_area_faces": int(np.count_nonzero(_zero_area(mesh.vertices, faces))),
         "duplicate_faces": len(corners) - len(np.unique(corners, axis=0)),
-        "open_edges": open_edges,
+        "open_edges": int(np.count_nonzero(edge_faces == 1)),
         "nonmanifold_edges": int(np.count_nonzero(edge_faces > 2)),
         "components": len(np.unique(component_labels(faces, vertex_count)[np.unique(faces)])),
-        "closed": open_edges == 0,
+        "closed": winding.is_closed,
+        "winding": "mixed" if winding.mixed_edges else "inside out" if len(winding.inside_out) else right,
+        "mixed_edges": winding.mixed_edges,
+        "inside_out_faces": len(winding.inside_out),
         "extents": (upper - lower).tolist(),
         "bounds": [lower.tolist(), upper.tolist()],
         "diagonal": float(np.linalg.norm(upper - lower)),
     }
+
+
+def orient_mesh(mesh):
+    """Return a Mesh with its faces turned as `Winding.oriented` says; faces keep their indices, dropped ones too."""
+    winding = find_winding(mesh.vertices, mesh.faces, mesh.dropped_faces)
+    faces = mesh.faces.copy()
+    faces[winding.face_ids] = winding.oriented()
+    return replace(mesh, faces=faces)
 
 
 # Validation and welding.
@@ -267,23 +282,3 @@ def _zero_area(vertices, faces):
     for p, q in ((y1 * z2, z1 * y2), (z1 * x2, x1 * z2), (x1 * y2, y1 * x2)):
         zero &= np.abs(p - q) <= 2.0**-50 * (np.abs(p) + np.abs(q))
     return zero
-
-
-def component_labels(faces, vertex_count):
-    """Return the lowest vertex that each vertex is joined to through faces, int (v,)."""
-    label = np.arange(vertex_count)
-    pending = faces
-    while len(pending):
-        corner_label = label[pending]
-        lowest = corner_label.min(axis=1)
-        for column in corner_label.T:
-            np.minimum.at(label, column, lowest)
-        # Invariant: label[v] <= v, so jumping ends, at roots.
-        while True:
-            jumped = label[label]
-            if np.array_equal(jumped, label):
-                break
-            label = jumped
-        corner_label = label[pending]
-        pending = pending[(corner_label != corner_label[:, :1]).any(axis=1)]
-    return label

@@ -1,6 +1,7 @@
 """Model: a mesh with its progressive mesh and its AB-Tree, saved and opened as .npz."""
 
 import hashlib
+import warnings
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,20 @@ import numpy as np
 from warp_abtree.checks.arguments import first_line, whole_number
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.model.cache import LEAST_FACES, file_key, find_model, keep_model, mesh_key
-from warp_abtree.model.mesh import COORDINATE_MAX, COORDINATE_MIN, EXTENT_LIMITS, Mesh, load_mesh, mesh_from_arrays
+from warp_abtree.model.mesh import (
+    COORDINATE_MAX,
+    COORDINATE_MIN,
+    EXTENT_LIMITS,
+    Mesh,
+    load_mesh,
+    mesh_from_arrays,
+    orient_mesh,
+)
 from warp_abtree.model.obj import split_file_name
 from warp_abtree.model.outward_error import OutwardError
 from warp_abtree.model.progressive import ProgressiveMesh, build_progressive
 from warp_abtree.model.tree import Tree, active_build
+from warp_abtree.model.winding import Winding, find_winding
 
 FORMAT_NAME = "warp_abtree model"
 FORMAT_VERSION = 2
@@ -57,12 +67,13 @@ class Model:
         original = progressive.vertex_pos[: progressive.vertex_count]
         self.centre = 0.5 * original.min(0) + 0.5 * original.max(0)
         self._outward = OutwardError(progressive, tree)
+        self._warned = False
 
     def __repr__(self):
         return f"Model({self.name!r}, {self.face_count:,} faces, LODs 0 .. {self.lod_max:,})"
 
     @classmethod
-    def load(cls, source, base_faces: int = 10, progress=None, cache: bool = True) -> "Model":
+    def load(cls, source, base_faces: int = 10, progress=None, cache: bool = True, orient: bool = False) -> "Model":
         """Load a mesh and build its progressive mesh and AB-Tree, or open the model that was built of it before.
 
         Models of 1,000 faces and more are kept in $WARP_ABTREE_CACHE, by default ~/.cache/warp_abtree, at most 2 GiB of
@@ -74,18 +85,21 @@ class Model:
             base_faces: Faces at which the collapse sequence stops.
             progress: Called as progress(stage, done, total) during long builds.
             cache: Whether to look for the model in the cache, and to keep it there.
+            orient: Whether to turn faces so that neighbours agree about the outside, and closed parts that are inside
+                out; face ids stay, and so does what has one side only.
 
         Raises:
             MeshError: The mesh is missing, unreadable, empty or invalid.
             ValueError: base_faces is below 1.
         """
         base_faces = whole_number(base_faces, "base_faces", 1, 2**62)
-        options = (FORMAT_VERSION, base_faces)
+        options = (FORMAT_VERSION, base_faces, "oriented") if orient else (FORMAT_VERSION, base_faces)
         key = file_key(source, *options) if cache else None
         model = find_model(key, cls.open)
         if model is not None:
             return cls(model.progressive, model.tree, split_file_name(Path(source))[0])
         mesh = source if isinstance(source, Mesh) else load_mesh(source)
+        mesh = orient_mesh(mesh) if orient else mesh
         cache = cache and len(mesh.faces) >= max(LEAST_FACES, base_faces)
         if cache and key is None:
             key = mesh_key(mesh, *options)
@@ -102,10 +116,31 @@ class Model:
 
     @classmethod
     def from_arrays(
-        cls, vertices, faces, base_faces: int = 10, progress=None, name: str = "arrays", cache: bool = True
+        cls,
+        vertices,
+        faces,
+        base_faces: int = 10,
+        progress=None,
+        name: str = "arrays",
+        cache: bool = True,
+        orient: bool = False,
     ):
         """Build a model from vertices (v, 3) and faces (n, 3); see `load`."""
-        return cls.load(mesh_from_arrays(vertices, faces, name=name), base_faces, progress, cache)
+        return cls.load(mesh_from_arrays(vertices, faces, name=name), base_faces, progress, cache, orient)
+
+    @cached_property
+    def winding(self) -> Winding:
+        """How the original faces are wound, and whether they have an inside: `warp_abtree.model.winding.Winding`."""
+        vertices = self.progressive.vertex_pos[: self.vertex_count]
+        return find_winding(vertices, self.progressive.face_vertex, self.dropped_faces)
+
+    def warn_of_winding(self, why: str, stacklevel: int = 3):
+        """Warn where the winding is wrong, once a model, and say what depends on it."""
+        fault = self.winding.fault()
+        if fault is not None and not self._warned:
+            self._warned = True
+            mend = "Model.load(orient=True) turns the faces"
+            warnings.warn(f"model {self.name!r}: {fault}; {why}; {mend}", RuntimeWarning, stacklevel=stacklevel)
 
     @cached_property
     def digest(self) -> str:

@@ -1,4 +1,7 @@
-"""Candidate object pairs from posed root boxes; worlds never mix, static objects never pair with static ones."""
+"""Candidate object pairs from posed root boxes.
+
+Worlds never mix, static objects never pair with static ones, and collision groups and masks must allow a pair.
+"""
 
 import numpy as np
 import warp as wp
@@ -46,6 +49,7 @@ class BroadPhase:
         self.upper = wp.zeros(count, dtype=wp.vec3, device=device)
         self.group = wp.array(group.astype(np.int32), dtype=wp.int32, device=device)
         self.excluded = wp.array(batch.excluded, dtype=wp.int64, device=device)
+        self.collision_bits = batch.objects.collision_bits
         self.pair_count = wp.zeros(1, dtype=wp.int32, device=device)
         self.guard = LaunchGuard(device, batch.states.generation, batch.filter_generation)
         self.resize(capacity or max(64, 4 * count))
@@ -91,7 +95,7 @@ class BroadPhase:
         """Return what boxes the objects, and what finds pairs."""
         inputs = [
             *(self.shared_group, self.bvh.id, self.lower, self.upper, self.group, self.excluded),
-            *(self.batch.objects.pool, self.pair_count, self.pairs),
+            *(self.collision_bits, self.batch.objects.pool, self.pair_count, self.pairs),
         ]
         find = launch(find_pair_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
         return [self._make_boxes(launch), find]

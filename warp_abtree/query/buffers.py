@@ -46,6 +46,7 @@ class QueryBuffers:
     pair_poses: wp.array
     counts: wp.array  # rows: hits.count, then COUNTERS
     within: wp.array  # where asked
+    contained: wp.array  # face of what is inside, where there are solids
     _within: np.ndarray
     _given: np.ndarray  # pairs on the host
     slab_memory: wp.array
@@ -147,6 +148,8 @@ class QueryBuffers:
                     made.append((self, "counts", counts))
         if self.near is not None:
             made.append((self, "within", wp.empty(room, dtype=wp.float64, device=self.device)))
+        if self.batch.solids is not None:
+            made.append((self, "contained", wp.empty(room, dtype=wp.int32, device=self.device)))
         return made
 
     def _make_slab_memory(self, room: int):

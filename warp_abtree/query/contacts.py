@@ -51,6 +51,7 @@ from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import CapacityError
 from warp_abtree.query.result import VECTORS, Found, contact_dtypes
 from warp_abtree.query.staging import first_rows
+from warp_abtree.state.batch import Batch
 
 # Warps that a multiprocessor runs at a time, by their registers, of those that find deferred contacts.
 DEFERRED_WARPS = 8
@@ -98,6 +99,8 @@ class ContactQuery(Query):
         self.contact_dtype = contact_dtype
         self.contacts, self.pair_contacts = contact.Contacts(), summary.PairContacts()
         self._sums, self._deferred = summary.ChunkSums(), contact.Deferred()
+        for model in () if isinstance(scene, Batch) else scene.models:
+            model.warn_of_winding("the normals and depths of its contacts depend on the winding", stacklevel=4)
         self._deferred.total = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "faces", pairs, capacity, precision, within, sort_pairs)
 
@@ -177,8 +180,9 @@ class ContactQuery(Query):
     def _launch_once(self, kernel, dim, inputs):
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
 
-    def _send_expected_rows(self, n: int) -> None:
-        """Bring nothing: rows come of launches that follow."""
+    def _expected_hits(self, n: int) -> int:
+        """Return none: rows come of launches that follow."""
+        return 0
 
     def _launch_warps(self, kernel, count, inputs):
         """Launch a kernel with a warp for each of so many items, on the CPU a thread."""

@@ -28,6 +28,7 @@ from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd, slabs
+from warp_abtree.kernels.solid.containment import report_contained_kernel
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.narrow_phase import Query
@@ -194,6 +195,7 @@ class DistanceQuery(Query):
         super().traverse()
         if self.device.is_capturing:
             self._make_distances(wp.launch)
+            self._make_inside(wp.launch)
             return
         commands = self._commands.find("distances", self.guard.given(), self._make_distances)
         # On the CPU what is launched is done.
@@ -205,6 +207,16 @@ class DistanceQuery(Query):
                 launch_on_cores(command.launch, room, cores, PAIRS_A_CORE)
             elif meeting or place not in CROSSINGS:
                 command.launch()
+        for command in self._commands.find("inside", self.guard.given(), self._make_inside):
+            command.launch()
+
+    def _make_inside(self, launch) -> list:
+        """Make the launch that reports pairs of which one is inside the other, where there are solids."""
+        if self.batch.solids is None:
+            return []
+        posed = [*self.batch.pools, self.pair_count, self.pairs, self.pair_poses]
+        inputs = [*posed, self.guard.launched, self.hits, self.contained, self.distances]
+        return [launch(report_contained_kernel, dim=len(self.pairs), inputs=inputs, device=self.device)]
 
     def _fit_slabs(self):
         """Make room for the slabs of all tree states that there are now; a graph goes on without."""

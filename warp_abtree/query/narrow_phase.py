@@ -10,6 +10,7 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.solid.containment import find_contained_kernel
 from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, relative_pose, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
@@ -226,6 +227,27 @@ class Query(QueryReadout):
         if not len(self.pairs):
             return
         self._launch_search("pairs", self._make_traversal)
+        self._find_contained()
+
+    def _find_contained(self):
+        """Find what is inside solids, of the pairs whose surfaces do not meet. Launches only."""
+        if self.batch.solids is None:
+            return
+        self.batch.solids.fit()
+        if self.device.is_capturing:
+            self._make_contained(wp.launch)
+            return
+        for command in self._commands.find("contained", self.guard.given(), self._make_contained):
+            command.launch()
+
+    def _make_contained(self, launch) -> list:
+        solids: Any = self.batch.solids
+        launched = self.guard.launched
+        near = wp.empty(0, dtype=wp.int32, device=self.device) if self.near is None else self.near.any_hit
+        posed = [*self.batch.pools, self.pair_count, self.pairs, self.pair_poses]
+        inputs = [*posed, solids.pool, launched, self.hits, near, self.contained]
+        dim = {"dim": len(self.pairs), "block_dim": WARP_SIZE, "device": self.device}
+        return [solids.prepare(launch, launched), launch(find_contained_kernel, inputs=inputs, **dim)]
 
     def _make_traversal(self, launch) -> list:
         """Make the launches of the narrow phase."""
@@ -269,7 +291,8 @@ class Query(QueryReadout):
 
     def run(self, device: bool = False) -> Result:
         """Launch, grow buffers that were too small, and return the whole result, as `result`. Waits for the device."""
-        result = self._make_result(self._grow(partial(self._read_pairs, device)), device)
+        first = partial(self._launch_and_bring, self._launch) if self._repeats_calls(device) else None
+        result = self._make_result(self._grow(partial(self._read_pairs, device), first=first), device)
         result.check()
         return result
 
@@ -285,13 +308,14 @@ class Query(QueryReadout):
         """
         self._grow(lambda: Found(self._read_totals()), between)
 
-    def _grow(self, read, between=None) -> Found:
-        """Launch as `grow` and return what `read` finds of the last launch."""
+    def _grow(self, read, between=None, first=None) -> Found:
+        """Launch as `grow` and return what `read` finds of the last launch; `first` does both the first time."""
         check_device(self.device, f"{type(self).__name__}.run (launch can)")
         self._check_scene()
         with self.guard.launching(self):
-            self._launch(between)
-            found = read()
+            if first is None:
+                self._launch(between)
+            found = read() if first is None else first()
             if found.totals.pairs > len(self.pairs):
                 self._take_pairs(wp.empty(self.growth * found.totals.pairs, dtype=wp.vec2i, device=self.device))
                 self._launch()

@@ -95,9 +95,59 @@ class QueryReadout(QueryBuffers):
         n = len(self._given) if self.broad_phase is None else min(self._read_totals().pairs, len(self.pairs))
         if device:
             return self._keep_pairs(n)
-        words = self._staging.send_words(self._pack_pairs(n), self._block_length(n))
-        rows = self._send_expected_rows(n)
-        self._staging.wait()
+        expected = self._expected_hits(n)
+        self._pack(n, expected)
+        return self._bring(n, expected)
+
+    def _repeats_calls(self, device: bool) -> bool:
+        """Return whether what `run` launches can be the same at every call."""
+        return self.device.is_cuda and self._packs() and not device and self.broad_phase is None
+
+    def _launch_and_bring(self, launch) -> Found:
+        """Launch, pack and sort, by a graph where a call repeats the one before, and read. Waits for the device."""
+        n = len(self._given)
+        expected = self._expected_hits(n)
+        self._make_staging_room(n, expected)
+
+        def launch_all():
+            launch()
+            self._pack(n, expected)
+
+        given = *self.guard.given(), n, expected, *self._staging.addresses()
+        self._commands.repeat_call(given, self.device, launch_all)
+        return self._bring(n, expected)
+
+    def _expected_hits(self, n: int) -> int:
+        """Return as many hits as the last result of so many pairs makes likely.
+
+        So the device sorts them while the host still launches, and a loop over poses waits once a call.
+        """
+        pairs, hits = self._last_read
+        if self.output != "faces" or pairs != n or hits == 0:
+            return 0
+        # A little more, in steps, so that hits that vary find room and launches stay the same.
+        return min(-(-hits * 17 // 16 // ROWS_STEP) * ROWS_STEP, len(self.hits.face))
+
+    def _make_staging_room(self, n: int, hits: int):
+        """Allocate what `_pack` writes to."""
+        staging = self._staging
+        staging.room("words", self._block_length(n), wp.int64)
+        if hits:
+            self._sort_room(hits)
+
+    def _pack(self, n: int, hits: int):
+        """Pack what there is an entry a pair of, and sort the first hits, into the staging memory. Launches only."""
+        self._pack_pairs(n)
+        if hits:
+            self._sort_hits(hits, self._sort_room(hits))
+
+    def _bring(self, n: int, expected: int) -> Found:
+        """Bring over what was packed. Waits for the device."""
+        staging, rows = self._staging, None
+        words = staging.send_words(staging.words, self._block_length(n))
+        if expected:
+            rows = self._send_sorted_hits(expected)
+        staging.wait()
         columns, end = words[HEADER : HEADER + COLUMNS * n].reshape(COLUMNS, n), HEADER + COLUMNS * n
         if self.broad_phase is None:
             pairs = self._given.copy()
@@ -110,17 +160,6 @@ class QueryReadout(QueryBuffers):
         if rows is not None and found.totals.hits <= len(rows):
             found.faces = rows[: found.totals.hits]
         return found
-
-    def _send_expected_rows(self, n: int) -> np.ndarray | None:
-        """Bring as many hits over as the last result of so many pairs makes likely, sorted. Does not wait.
-
-        So the device sorts while the host still launches, and a loop over poses waits once a call.
-        """
-        pairs, hits = self._last_read
-        if self.output != "faces" or pairs != n or hits == 0:
-            return None
-        # A little more, in steps, so that hits that vary find room and launches stay the same.
-        return self._send_sorted_hits(min(-(-hits * 17 // 16 // ROWS_STEP) * ROWS_STEP, len(self.hits.face)))
 
     def _copy_pairs(self) -> Found:
         """Copy from arrays that are the host's memory, which the next launch writes."""
@@ -185,14 +224,20 @@ class QueryReadout(QueryBuffers):
         elif device:
             found.faces = self._sort_hits(count, wp.empty(count, dtype=wp.vec3i, device=self.device))
         else:
+            self._sort_hits(count, self._sort_room(count))
             found.faces = self._send_sorted_hits(count)
             self._staging.wait()
 
     def _send_sorted_hits(self, count: int) -> np.ndarray:
-        """Bring hits over in order. Does not wait."""
+        """Bring hits over that were sorted into the staging memory. Does not wait."""
         staging = self._staging
-        rows = self._sort_hits(count, staging.room("rows", count, wp.vec3i))
-        return staging.send_rows(staging.row_pool.take(12 * count), rows, count)[0]
+        return staging.send_rows(staging.row_pool.take(12 * count), staging.rows, count)[0]
+
+    def _sort_room(self, count: int) -> wp.array:
+        """Return the staging memory that hits are sorted into, with room for so many, after that of the sort."""
+        self._staging.room("order", 2 * count, wp.int32)
+        self._staging.room("key", 2 * count, wp.int64)
+        return self._staging.room("rows", count, wp.vec3i)
 
     def _sort_hits(self, count: int, rows):
         """Write the hits to rows in order, and return these. Launches only."""

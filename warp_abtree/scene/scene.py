@@ -7,13 +7,14 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
 from warp_abtree.model.model import Model
-from warp_abtree.query.broad_phase import EVERY_WORLD, BroadPhase
+from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.distance import DistanceQuery, check_beyond
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import Result, contact_dtypes
-from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, launch_place, place_rows
+from warp_abtree.scene.objects import ALL_BITS, ObjectList, check_columns, check_lods, check_models
+from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, place_rows
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.batch import Batch, check_pairs, exclusion_keys
 from warp_abtree.state.lod_update import LodUpdate
@@ -59,13 +60,7 @@ class Scene:
             present = ", ".join(d.alias for d in wp.get_devices())
             raise ValueError(f"no device {device!r} on this machine; there is {present} ({error})") from None
         check_device(self.device)
-        self.models: list[Model] = []
-        self.object_model: list[int] = []
-        self.object_importance: list[int] = []
-        self._world: list[int] = []
-        self.object_static: list[bool] = []
-        self._added_pose: list[np.ndarray] = []
-        self._lod: list[int] = []
+        self._objects = ObjectList()
         self._excluded = np.empty(0, np.int64)
         self._batch: Batch | None = None
         self._broad_phase: BroadPhase | None = None
@@ -75,14 +70,50 @@ class Scene:
     @property
     def object_count(self) -> int:
         """Objects added so far."""
-        return len(self.object_model)
+        return len(self._objects)
+
+    @property
+    def models(self) -> list[Model]:
+        """Models of the objects, each once."""
+        return self._objects.models
+
+    @property
+    def object_model(self) -> list[int]:
+        """Index into `models` of each object."""
+        return self._objects.model
+
+    @property
+    def object_importance(self) -> list[int]:
+        """Importance of each object."""
+        return self._objects.importance
+
+    @property
+    def object_solid(self) -> list[bool]:
+        """Whether each object is a solid."""
+        return self._objects.solid
+
+    @property
+    def worlds(self) -> np.ndarray:
+        """World of each object, int32 (n,)."""
+        return np.array(self._objects.world, np.int32)
 
     @property
     def lods(self) -> np.ndarray:
         """LOD of each object, int32 (n,)."""
-        return np.array(self._lod if self._batch is None else self._batch.lods, np.int32)
+        return np.array(self._objects.lod if self._batch is None else self._batch.lods, np.int32)
 
-    def add(self, model, pose=(0, 0, 0, 0, 0, 0, 1), world=0, lod=None, importance=1, static=False) -> int:
+    def add(
+        self,
+        model,
+        pose=(0, 0, 0, 0, 0, 0, 1),
+        world=0,
+        lod=None,
+        importance=1,
+        static=False,
+        collision_group=1,
+        collision_mask=ALL_BITS,
+        solid=False,
+    ) -> int:
         """Add an object and return its index.
 
         Args:
@@ -92,35 +123,55 @@ class Scene:
             lod: LOD to stand at; None is the finest.
             importance: Application context beta of the LOD selection, 1, 2 or 3 (paper, section 4.2).
             static: Whether the broad phase never pairs it with another static object, a bool.
+            solid: Whether what lies inside it intersects it, a bool; of a closed model, at every LOD, see
+                `warp_abtree.state.solids`.
+            collision_group, collision_mask: Bits, from 0 to 2^32 - 1. The broad phase pairs objects a and b only where
+                group_a & mask_b and group_b & mask_a both hold a bit.
 
         Raises:
             TypeError: model is no Model.
+            MeshError: A solid whose mesh is not closed; the message names edges.
             ValueError: Anything else is out of range; nothing is added.
             RuntimeError: A graph is being captured.
         """
-        if not isinstance(model, Model):
-            raise TypeError(f"model is a {type(model).__name__}, not a Model")
-        checked = check_poses(to_numpy(pose, "pose")[None], "pose")[0]
-        world = whole_number(world, "world", EVERY_WORLD, 2**31 - 1)
-        importance = whole_number(importance, "importance", 1, 3)
-        if not isinstance(static, bool | np.bool_):
-            raise ValueError(f"static {static!r} is neither True nor False")
-        lod = model.lod_max if lod is None else model.check_lod(lod)
-        known = next((i for i, other in enumerate(self.models) if other is model), len(self.models))
+        models = check_models(model, 1)
+        poses = check_poses(to_numpy(pose, "pose")[None], "pose")
+        columns = check_columns(models, world, importance, (static, solid), (collision_group, collision_mask))
+        return int(self._extend(models, poses, lod, columns)[0])
+
+    def add_many(
+        self,
+        models,
+        poses,
+        worlds=0,
+        lods=None,
+        importances=1,
+        statics=False,
+        collision_groups=1,
+        collision_masks=ALL_BITS,
+        solids=False,
+    ) -> np.ndarray:
+        """Add an object for each pose and return their indices, int (n,): all of them, or none.
+
+        Args:
+            models: `Model` of all, or a list of n.
+            poses: (n, 7) or (n, 4, 4), of any framework, see `add`.
+            worlds, lods, importances, statics, solids, collision_groups, collision_masks: As for `add`, one for all or
+                (n,).
+
+        Raises:
+            TypeError, ValueError, RuntimeError: As `add`; or not n were given.
+        """
+        poses = check_poses(poses)
+        models = check_models(models, len(poses))
+        columns = check_columns(models, worlds, importances, (statics, solids), (collision_groups, collision_masks))
+        return self._extend(models, poses, lods, columns)
+
+    def _extend(self, models, poses, lods, columns) -> np.ndarray:
+        lods = check_lods(lods, models)
         self._retire()
-        count = self.object_count
-        columns: list[list] = [self._world, self.object_static, self._added_pose, self._lod]
-        columns += [self.object_importance, self.object_model]
-        try:
-            if known == len(self.models):
-                self.models.append(model)
-            for column, value in zip(columns, (world, bool(static), checked, lod, importance, known)):
-                column.append(value)
-        except BaseException:
-            for column in columns:
-                del column[count:]
-            raise
-        return count
+        self._objects.extend(models, {"lod": lods, "pose": list(poses), **columns})
+        return np.arange(self.object_count - len(models), self.object_count)
 
     def _retire(self):
         """Take the device's poses back before the arrays are made anew. Waits for the device."""
@@ -132,7 +183,7 @@ class Scene:
         matrices[:, :3, :3] = objects.pool.rotation.numpy()
         matrices[:, :3, 3] = objects.pool.position.numpy()
         self._batch.retire()
-        self._added_pose, self._lod = list(matrices), self._batch.lods.tolist()
+        self._objects.pose, self._objects.lod = list(matrices), self._batch.lods.tolist()
         self._queries.clear()
         self._broad_phase = self._host_poses = None
         self._batch = None
@@ -143,34 +194,19 @@ class Scene:
         Tree states that an interrupted change of LODs has left torn are made anew.
         """
         if self._batch is None:
-            if not self.object_model:
+            if not self.object_count:
                 raise ValueError("the scene has no object")
             check_device(self.device, "making a scene's arrays")
             models = ModelArrays(self.models, self.device)
             states = StateArrays(models, self.device)
-            objects = ObjectArrays(self._world, self.object_static, self.device)
-            batch = Batch(models, states, objects, self.object_model, self._excluded)
-            batch.set_lods(np.array(self._lod))
-            self._place_added(objects.pool)
+            told = self._objects
+            objects = ObjectArrays(told.world, told.static, self.device, told.collision_bits())
+            batch = Batch(models, states, objects, told.model, self._excluded, told.solid)
+            batch.set_lods(np.array(told.lod))
+            told.set_poses(objects.pool, self.device)
             self._batch = batch
         self._batch.mend()
         return self._batch
-
-    def _place_added(self, pool):
-        """Set poses of both kinds: the device turns quaternions into matrices, matrices are taken as they are."""
-        poses = self._added_pose
-        matrix = np.array([pose.ndim == 2 for pose in poses])
-        rows = np.zeros((len(poses), 7))
-        rows[:, 6] = 1.0
-        for i in np.flatnonzero(~matrix):
-            rows[i] = poses[i]
-        launch_place(wp.array(rows, dtype=wp.float64, device=self.device), pool)
-        if matrix.any():
-            rotation, position = pool.rotation.numpy(), pool.position.numpy()
-            stacked = np.array([poses[i] for i in np.flatnonzero(matrix)])
-            rotation[matrix], position[matrix] = stacked[:, :3, :3], stacked[:, :3, 3]
-            pool.rotation.assign(rotation)
-            pool.position.assign(position)
 
     def set_poses(self, poses):
         """Set the pose of every object.
@@ -225,9 +261,16 @@ class Scene:
     def filter(self, pairs):
         """Exclude object pairs from every later broad phase.
 
+        Args:
+            pairs: (..., 2) object indices. A filter that repeats, as of neighbouring links of many arms, is one call:
+                `links = scene.add_many(...).reshape(arms, -1)`, then `scene.filter(links[:, [(0, 1), (1, 2)]])`.
+
         Raises:
             ValueError: Wrong shape, an index that is no object, an object paired with itself.
         """
+        pairs = to_numpy(pairs, "pairs")
+        if pairs.ndim > 2 and pairs.shape[-1] == 2:
+            pairs = pairs.reshape(-1, 2)
         excluded = np.union1d(self._excluded, exclusion_keys(check_pairs(pairs, self.object_count)))
         if self._batch is not None:
             self._batch.exclude(excluded)
@@ -237,7 +280,8 @@ class Scene:
     def broad_phase(self) -> np.ndarray:
         """Return the object pairs whose posed root boxes overlap, int32 (p, 2), sorted, i < j. Waits for the device.
 
-        Worlds never mix (-1 is in every one), two static objects never pair, filtered pairs stay out.
+        Worlds never mix (-1 is in every one), two static objects never pair, nor do objects whose collision groups and
+        masks forbid it; filtered pairs stay out.
         """
         check_device(self.device, "Scene.broad_phase")
         if self.object_count < 2:
@@ -264,8 +308,8 @@ class Scene:
         Touching counts. Columns of the result follow the order in which a pair names its objects.
 
         Args:
-            pairs: (p, 2) object indices, asked whatever their worlds, also where both are static or filtered out of the
-                broad phase; None asks the broad phase.
+            pairs: (p, 2) object indices, asked whatever their worlds, groups and masks, also where both are static or
+                filtered out of the broad phase; None asks the broad phase.
             output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
                 an object pair's summary of them, stands in `warp_abtree.query.contacts`. Or "distance": how far apart
                 the surfaces are, and where they are nearest, see `warp_abtree.query.distance`.

@@ -115,7 +115,8 @@ class _Chunk:
         objects = ObjectArrays(np.zeros(room + 1), np.zeros(room + 1), posed.device)
         objects.set_states(np.repeat(pair.objects.state, [1, room]))
         objects.pool.rotation[:1].assign(np.eye(3)[None])
-        self.batch = Batch(pair.models, pair.states, objects, np.repeat(pair.object_model, [1, room]))
+        solid = () if pair.solids is None else np.repeat(pair.solids.is_solid, [1, room])
+        self.batch = Batch(pair.models, pair.states, objects, np.repeat(pair.object_model, [1, room]), solid=solid)
         self.chunk_query: _ChunkQuery | None = None
 
     def find_query(self, output, precision):
@@ -322,6 +323,7 @@ def sweep(
     output="any",
     precision="exact",
     device=None,
+    solid=False,
     **options,
 ):
     """Test one pair of models at many poses of B in A's frame. Waits for the device, once a chunk of 65,536 poses.
@@ -340,6 +342,8 @@ def sweep(
         output: "any", "count", "faces" or "distance".
         precision: As `Scene.intersect`, exact for A's vertices and the posed ones of B.
         device: Warp device; None for Warp's default.
+        solid: Whether both are solids (`Scene.add`), or a bool for each; what "any" and "distance" answer for one
+            inside the other stands in `warp_abtree.state.solids`, "count" and "faces" are of surfaces.
         options: tolerance, relative and beyond, each one number, as `DistanceQuery` takes them; for "distance" alone.
 
     Returns:
@@ -356,18 +360,20 @@ def sweep(
     pair = Scene(device)
     check_device(pair.device, "ab.sweep")
     with device_lock(pair.device):
-        return _sweep(pair, (model_a, model_b), poses, (lod_a, lod_b), (output, precision), options)
+        poses = _take_poses(poses, pair.device)
+        solids = solid if isinstance(solid, tuple | list) and len(solid) == 2 else (solid, solid)
+        for model, lod, is_solid in zip((model_a, model_b), (lod_a, lod_b), solids):
+            pair.add(model, lod=lod, solid=is_solid)
+        return _sweep(pair, poses, (output, precision), options)
 
 
-def _sweep(pair, models, poses, lods, asked, options):
+def _sweep(pair, poses, asked, options):
     output, precision = asked
-    poses = _take_poses(poses, pair.device)
-    for model, lod in zip(models, lods):
-        pair.add(model, lod=lod)
     if len(poses) == 0:
         empty = {"faces": np.empty((0, 3), np.int32), "distance": np.empty(0, DISTANCE_ROWS)}
         return empty[output] if output in empty else np.empty(0, ANSWERS[output])
-    key = (*map(id, models), *pair.lods.tolist(), pair.device.alias)
+    models = [pair.models[i] for i in pair.object_model]
+    key = (*map(id, models), *pair.lods.tolist(), *pair.object_solid, pair.device.alias)
     # Taken out while in use: a call from another thread has its own, and one that fails leaves nothing behind.
     posed = _kept.pop(key, None)
     if posed is None:

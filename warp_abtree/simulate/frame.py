@@ -115,10 +115,9 @@ class Frame:
         self._feedback = Feedback(0.0)
         self._poses = np.empty((scene.object_count, 7))
         self._stages: Any = None
-        self._graph: Any = None
-        # What the graph was captured with, and the marks that it makes.
+        # Graphs and the marks that they make, by what is in them, all captured with the same arrays.
+        self._graphs: dict[tuple, tuple] = {}
         self._given: tuple = ()
-        self._marks: list[str] = []
         # Frames that the device has counted; time and LOD changes of a frame that is not recorded yet while its graph
         # runs, and whether its buffers were too small.
         self._seen, self._is_short = 0, False
@@ -170,7 +169,8 @@ class Frame:
         """Return the stages of the frame, made anew where scene, controller or output are others."""
         controller = self.lods if isinstance(self.lods, Controller) else None
         if self._stages is None or not self._stages.serves(self.scene, controller, self.output):
-            self._graph, self._open, self._is_short = None, None, False
+            self._open, self._is_short = None, False
+            self._graphs.clear()
             dynamics = None if self._stepped is None else self._stepped.dynamics
             moves = self.motion is not None
             self._stages = FrameStages(self.scene, controller, dynamics, self.output, self.time_step, moves)
@@ -186,20 +186,27 @@ class Frame:
             self._finish(stages, *self._open)
             return
         self._open, self._is_short = None, False
-        time = len(self.history) * self.time_step
+        time, rests = len(self.history) * self.time_step, self._rests()
         self._timer.begin()
         if isinstance(self.lods, Controller):
-            self.lods.prepare(replace(self._feedback, time=time))
+            self.lods.prepare(replace(self._feedback, time=time), rests)
             changes = None
         else:
             changes = self._choose(time)
             stages = self._ready()
         if self._captures and self.history:
-            self._replay(stages, time, changes)
+            self._replay(stages, time, changes, rests)
         else:
-            stages.launch_selection(self._timer.mark)
+            stages.launch_selection(self._timer.mark, rests)
             stages.launch_query(self._timer.mark, self._place(stages, time))
         self._finish(stages, time, changes)
+
+    def _rests(self) -> bool:
+        """Return whether the controller's LODs are known to stay, after a frame in which they did."""
+        if not (isinstance(self.lods, Controller) and self.history and self._seen):
+            return False
+        last = self.history[-1]
+        return not (last.lods_changed or last.nodes_refitted) and self.lods.rests(self._feedback)
 
     def _choose(self, time):
         """Bring objects to the LODs of a function of time; return the `LodUpdate`, None where nothing changes."""
@@ -229,24 +236,28 @@ class Frame:
         poses = self.motion.poses(time, out=self._poses)
         return None if poses is None else stages.check_rows(poses)
 
-    def _replay(self, stages, time, changes):
+    def _replay(self, stages, time, changes, rests):
         """Run a frame as a graph, captured anew where arrays were replaced since."""
         timer = self._timer
         if isinstance(self.lods, Controller):
             timer.mark("select_ms")
         places = self._place(stages, time)
         timer.mark("move_ms")
-        given = (*stages.arrays(), places)
-        if self._graph is None or given != self._given:
+        if stages.arrays() != self._given:
+            self._graphs.clear()
+            self._given = stages.arrays()
+        if (places, rests) in self._graphs:
+            graph, marks = self._graphs[places, rests]
+            timer.replay(marks)
+        else:
             before = len(timer.marks())
             with wp.ScopedCapture(self.scene.device) as capture:
-                stages.launch_selection(timer.mark)
+                stages.launch_selection(timer.mark, rests)
                 stages.launch_query(timer.mark, places)
-            self._graph, self._given, self._marks = capture.graph, given, timer.marks()[before:]
-        else:
-            timer.replay(self._marks)
+            graph = capture.graph
+            self._graphs[places, rests] = graph, timer.marks()[before:]
         self._open = time, changes
-        wp.capture_launch(self._graph)
+        wp.capture_launch(graph)
         timer.mark("answer_ms" if timer.uses_events else "query_ms")
         # The host's part of the next frame, while the device works on this one.
         following = (len(self.history) + 1) * self.time_step

@@ -126,16 +126,19 @@ class FrameStages:
         """Bring checked poses to the device for the next launch."""
         self._upload.send(rows.ravel())
 
-    def launch_selection(self, mark: Callable):
+    def launch_selection(self, mark: Callable, rests: bool = False):
         """Select LODs and bring objects to them, if there is a controller. Launches only.
 
         Args:
             mark: Called as mark(stage, count) when the launches of a stage are over; count() returns its counted work.
+            rests: Whether all LODs are known to stay, after a frame in which they did.
         """
         if self.controller is None:
             return
-        self.controller.launch()
-        mark("select_ms", lambda: {"selected": self.scene.object_count})
+        self.controller.launch(rests)
+        mark("select_ms", lambda: {"selected": 0 if rests else self.scene.object_count})
+        if rests:
+            return
         self._levels.launch()
         mark("refine_ms", lambda: {"node_refitted": int(self._marked().numpy().sum())})
 

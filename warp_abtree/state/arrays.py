@@ -242,9 +242,10 @@ class ObjectArrays:
         pool: `ObjectPool` for kernels.
         state: State of each object, NumPy int32 (n,), the host's copy of pool.state.
         generation: Of the arrays; retired where the scene makes others.
+        collision_bits: Collision group and mask of each object, device vec2ui; empty where they keep no pair apart.
     """
 
-    def __init__(self, worlds, statics, device):
+    def __init__(self, worlds, statics, device, collision_bits=()):
         count = len(worlds)
         self.device = device
         self.state = np.full(count, -1, np.int32)
@@ -254,6 +255,8 @@ class ObjectArrays:
         self.pool.is_static = _upload(np.asarray(statics, np.int32), wp.int32, device)
         self.pool.rotation = wp.zeros(count, dtype=wp.mat33d, device=device)
         self.pool.position = wp.zeros(count, dtype=wp.vec3d, device=device)
+        bits = np.asarray(collision_bits, np.uint32).reshape(-1, 2)
+        self.collision_bits = wp.array(bits, dtype=wp.vec2ui, device=device)
         self.generation = Generation(device)
         self._pointed = 0
 

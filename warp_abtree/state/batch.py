@@ -11,6 +11,7 @@ from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.generation import Generation
 from warp_abtree.state.lod_update import LodUpdate, replace_states, set_object_lods
+from warp_abtree.state.solids import SolidArrays
 
 
 class Batch:
@@ -24,15 +25,19 @@ class Batch:
         objects: Arrays of the same device.
         object_model: Model of each object, int (n,).
         excluded: Keys of pairs that the broad phase leaves out, see `exclusion_keys`.
+        solid: Whether each object is a solid, (n,); empty for none.
 
     Attributes:
         models, states, objects, object_model, excluded: As given.
+        solids: `SolidArrays`, None where no object is a solid.
         device: Of the arrays.
         filter_generation: `Generation` of the excluded pairs.
         mean_faces: About how many faces an object has at its LOD, as the host knows it.
     """
 
-    def __init__(self, models: ModelArrays, states: StateArrays, objects: ObjectArrays, object_model, excluded=()):
+    def __init__(
+        self, models: ModelArrays, states: StateArrays, objects: ObjectArrays, object_model, excluded=(), solid=()
+    ):
         self.device = states.device
         self.models, self.states, self.objects = models, states, objects
         self.object_model = np.asarray(object_model)
@@ -41,6 +46,7 @@ class Batch:
         self.excluded = np.asarray(excluded, np.int64)
         self.filter_generation = Generation(self.device)
         self.mean_faces = float(models.face_count[self.object_model].mean()) if len(self.object_model) else 1.0
+        self.solids = SolidArrays(models, states, solid) if np.any(solid) else None
         self._retired = False
 
     @property
@@ -79,10 +85,13 @@ class Batch:
     def with_own_states(self) -> Batch:
         """Return a batch of the same models and objects, posed alike, that has no tree state yet."""
         placed = self.objects.pool
-        objects = ObjectArrays(placed.world.numpy(), placed.is_static.numpy(), self.device)
+        bits = self.objects.collision_bits.numpy()
+        objects = ObjectArrays(placed.world.numpy(), placed.is_static.numpy(), self.device, bits)
         wp.copy(objects.pool.rotation, placed.rotation)
         wp.copy(objects.pool.position, placed.position)
-        return Batch(self.models, StateArrays(self.models, self.device), objects, self.object_model, self.excluded)
+        states = StateArrays(self.models, self.device)
+        solid = () if self.solids is None else self.solids.is_solid
+        return Batch(self.models, states, objects, self.object_model, self.excluded, solid)
 
     def set_lods(self, lods) -> LodUpdate:
         """Bring every object to an LOD, int (n,) within its model's range: wholly, or not at all."""
@@ -90,6 +99,7 @@ class Batch:
         with self.states.change():
             stats = set_object_lods(self.models, self.states, self.objects, self.object_model, lods)
             self._lods = np.array(lods)
+        self._fit_solids()
         # The base mesh has a few faces, and each operation adds about as many as any other.
         share = (self._lods + 1) / (self.models.lod_max[self.object_model] + 1)
         self.mean_faces = float((self.models.face_count[self.object_model] * share).mean())
@@ -101,7 +111,12 @@ class Batch:
         with self.states.change():
             ids = replace_states(self.models, self.states, self.objects, wanted, serving)
             self._lods = np.array([lod for _, lod in wanted], np.int64)[serving]
+        self._fit_solids()
         return ids
+
+    def _fit_solids(self):
+        if self.solids is not None:
+            self.solids.fit()
 
     def tear(self):
         """Say that an interruption has left tree states that no LOD explains."""
@@ -122,8 +137,11 @@ class Batch:
         check_device(self.device, "making tree states anew")
         self._lead()
         self.states.reset()
+        if self.solids is not None:
+            self.solids.forget()
         self.objects.state = np.full(self.object_count, -1, np.int32)
         set_object_lods(self.models, self.states, self.objects, self.object_model, self.lods)
+        self._fit_solids()
         self.states.generation.resume()
         self.states.torn = False
 

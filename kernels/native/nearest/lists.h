@@ -3,13 +3,14 @@
 #include "builtin.h"
 #include "nearest/memory.h"
 
-void open_search(wp::float32 upper, wp::int64 first, wp::vec_t<3, wp::float32> way, wp::int32 thread,
+void open_search(wp::float32 upper, bool found, wp::int64 first, wp::vec_t<3, wp::float32> way, wp::int32 thread,
                  wp::array_t<wp::float32> memory) {
 #include "nearest/memory.h"
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
     h = NearestMemory::Header{};
     h.upper = upper;
+    h.found = found;
     h.top = 1;
     for (int k = 0; k < 3; ++k)
         h.way[k] = way[k];
@@ -17,7 +18,7 @@ void open_search(wp::float32 upper, wp::int64 first, wp::vec_t<3, wp::float32> w
     m.bound[0] = 0.0f;
 }
 
-wp::int64 take_nearest(wp::float32 upper, wp::float32 cut, wp::int32 thread, wp::array_t<wp::float32> memory) {
+wp::int64 take_nearest(wp::float32 upper, wp::int32 thread, wp::array_t<wp::float32> memory) {
 #include "nearest/memory.h"
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
@@ -27,7 +28,8 @@ wp::int64 take_nearest(wp::float32 upper, wp::float32 cut, wp::int32 thread, wp:
     int best = 0;
     for (int i = 1; i < h.open_count; ++i)
         best = m.open_bound[i] < m.open_bound[best] ? i : best;
-    if (m.open_bound[best] > (cut < h.upper ? cut : h.upper)) {
+    // Not under a tolerance: node pairs were dropped for faces that wait here.
+    if (m.open_bound[best] > h.upper) {
         h.open_count = 0;
         return -1;
     }

@@ -34,7 +34,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     float cut = 0.0f, limit = 0.0f, soon = 0.0f;
     auto set_limits = [&]() {
         constexpr float PART[] = {0.6f, 0.85f, 1.0f};
-        cut = NearestMemory::cut_of(h.upper, spare);
+        cut = h.found ? NearestMemory::cut_of(h.upper, spare) : h.upper;
         auto to_bound = [&](float x) {
             const float y = 2.0f * (x * frame.grow + frame.least);
             return x < 0.0f ? -1.0f : y * y;
@@ -58,6 +58,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
         for (int i = 0; i < count; ++i)
             if (over[i] < h.upper) {
                 h.upper = over[i];
+                h.found = 1;
                 best = i;
             }
         if (best >= 0 && with_slabs && d[best] > 0.0f) {

@@ -70,6 +70,7 @@ def add_build_arguments(sub: Parser):
     sub.add_file("mesh", metavar="MESH", nargs="+", help=f"{MESHES}; one after another")
     sub.add_file("out", metavar="OUT", type=Path, help="file to write (.npz), or a folder for NAME.npz of each mesh")
     sub.add_argument("--base-faces", type=positive, default=10, metavar="N", help="faces of the coarsest LOD (10)")
+    sub.add_argument("--orient", action="store_true", help="turn faces that disagree with neighbours or face inwards")
 
 
 def build(options, progress):
@@ -82,12 +83,12 @@ def build(options, progress):
             raise ValueError(f"{file}: would be written for {mesh} and for another mesh")
     Scene(device=options.device)
     if not several:
-        print_result(_build_file(options.mesh[0], options.out, options.base_faces, progress), options.json)
+        print_result(_build_file(options.mesh[0], options.out, options, progress), options.json)
         return 0
     rows = []
     for mesh, file in zip(options.mesh, files):
         try:
-            rows.append(_build_file(mesh, file, options.base_faces, progress))
+            rows.append(_build_file(mesh, file, options, progress))
         except (ValueError, OSError, MemoryError) as error:
             progress.close()
             print(f"{PROGRAM}: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
@@ -104,10 +105,10 @@ def _model_file(folder, mesh) -> Path:
     return folder / f"{split_file_name(Path(mesh.removeprefix('warp:')))[0]}.npz"
 
 
-def _build_file(mesh, file, base_faces, progress) -> dict:
+def _build_file(mesh, file, options, progress) -> dict:
     """Build a model, save it and say what it holds."""
     begin = time.perf_counter()
-    model = Model.load(mesh, base_faces=base_faces, progress=progress, cache=False)
+    model = Model.load(mesh, options.base_faces, progress, cache=False, orient=options.orient)
     seconds = time.perf_counter() - begin
     progress.close()
     model.save(file)

@@ -1,4 +1,4 @@
-"""`warp-abtree picture`: one PNG file of what `warp-abtree view` shows, without a browser."""
+"""`warp-abtree picture`: a file of what `warp-abtree view` shows, still or moving, without a browser."""
 
 from pathlib import Path
 
@@ -8,14 +8,15 @@ from warp_abtree.app.cli.arguments import Parser, positive
 from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 from warp_abtree.app.pictures.render import import_pyvista
-from warp_abtree.app.pictures.scenes import SIZE, draw_snapshot
+from warp_abtree.app.pictures.scenes import SIZE, draw_frames, draw_snapshot
 from warp_abtree.app.render_data import Settings, Snapshot, objects_of_world
 from warp_abtree.app.toml.objects import unit
 
-SUMMARY = "draw a scene or meshes to a PNG file"
+SUMMARY = "draw a scene or meshes to a PNG file, or a scene's frames to a WebP or GIF file"
 EXAMPLES = (
     "scenes/bunny_tori.toml --frame 30 --out tori.png",
     "warp:bunny warp:bunny --lod 0.1 --out bunnies.png",
+    "scenes/bunny_tori.toml --frames 60 --every 2 --out tori.webp",
     "cow.obj --lod tol:0.01 --eye 1 0.3 0.5 --out cow.png",
 )
 
@@ -23,8 +24,10 @@ EXAMPLES = (
 def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
     add_playback_arguments(sub)
-    sub.add_file("--out", "-o", type=Path, required=True, metavar="PNG", help="file to write")
+    sub.add_file("--out", "-o", type=Path, required=True, metavar="FILE", help="PNG, or WebP or GIF, to write")
     sub.add_argument("--frame", type=int, default=0, metavar="N", help="frame of a scene to draw (0)")
+    sub.add_argument("--frames", type=int, metavar="N", help="draw so many frames of a scene from there on")
+    sub.add_argument("--every", type=positive, default=1, metavar="K", help="of these, draw each K-th (1)")
     for name, what in (("eye", "direction to the eye"), ("up", "direction upwards")):
         sub.add_argument(f"--{name}", nargs=3, type=float, metavar=("X", "Y", "Z"), help=f"{what} (the scene's own)")
     sub.add_argument("--world", type=int, metavar="W", help="world to draw (the scene's own)")
@@ -46,19 +49,38 @@ def picture(options, progress):
     if not len(objects):
         raise ValueError(f"--world: no object is in world {world}")
     settings = Settings(world)
-    snapshot = go_to(playback, options.frame, settings.output, progress)
+    if options.frames is None:
+        snapshot = go_to(playback, options.frame, settings.output, progress)
+        progress.close()
+        draw_snapshot(playback.scene, snapshot, objects, options.out, playback.title, (eye, up), settings, options.size)
+        print_result({"picture": str(options.out), "objects": len(objects), "frame": snapshot.number}, options.json)
+        return
+    frames = range(options.frame, options.frame + options.frames, options.every)
+    snapshots = run_frames(playback, frames, settings.output, progress)
+    draw_frames(playback.scene, snapshots, objects, options.out, playback.title, (eye, up), settings, options.size)
     progress.close()
-    draw_snapshot(playback.scene, snapshot, objects, options.out, playback.title, (eye, up), settings, options.size)
-    print_result({"picture": str(options.out), "objects": len(objects), "frame": snapshot.number}, options.json)
+    print_result({"picture": str(options.out), "objects": len(objects), "frames": len(frames)}, options.json)
 
 
 def _check(options):
     """Refuse options that are wrong by themselves, before any work."""
-    check_output(options.out, [".png"], inputs=options.source)
+    check_output(options.out, [".png"] if options.frames is None else [".webp", ".gif"], inputs=options.source)
     if options.frame < 0:
         raise ValueError(f"--frame: {options.frame} is below 0")
+    if options.frames is not None and options.frames <= options.every:
+        raise ValueError(f"--frames: {options.frames}, every {options.every}, is less than two to draw")
     if not 50 <= options.size <= 8000:
         raise ValueError(f"--size: {options.size} is outside 50 .. 8000")
+
+
+def run_frames(playback, frames: range, output, progress=None):
+    """Yield the snapshots of frames, and run those between."""
+    for number in range(frames[-1] + 1):
+        snapshot = playback.step(output if number in frames else "count")
+        if progress is not None:
+            progress("frames", number + 1, frames[-1] + 1)
+        if number in frames:
+            yield snapshot
 
 
 def go_to(playback, frame: int, output, progress=None) -> Snapshot:

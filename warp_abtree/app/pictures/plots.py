@@ -50,4 +50,5 @@ def draw_run(rows: list[FrameRow], fractions, path, title: str):
     for axes in (lods, times, errors):
         axes.grid(True, alpha=0.3)
         axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
-    write_png(figure.canvas, path)
+    figure.canvas.draw()
+    write_png(np.asarray(figure.canvas.buffer_rgba())[:, :, :3].copy(), path)

@@ -1,4 +1,4 @@
-"""Images of triangles and lines by pyvista (VTK), off-screen, and figures of them side by side by Matplotlib."""
+"""Images of triangles and lines by pyvista (VTK), off-screen, and figures of them, still or moving, by Matplotlib."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import os
 import sys
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -92,6 +93,12 @@ def render(panel: Panel, camera: Camera, size: int) -> np.ndarray:
         plotter.close()
 
 
+def camera_of(panels: list[Panel], eye, up) -> Camera:
+    """Return a camera that sees all that panels show; eye and up are directions in the world."""
+    drawn = [part for panel in panels for part in (panel.triangles, *(ends for ends, _ in panel.lines))]
+    return camera_around(np.concatenate([np.reshape(part, (-1, 3)) for part in drawn]), eye, up)
+
+
 def draw(panels: list[Panel], path, title: str, legend, eye, up, size: int = 620):
     """Write panels side by side, seen by one camera, to a PNG file.
 
@@ -101,16 +108,20 @@ def draw(panels: list[Panel], path, title: str, legend, eye, up, size: int = 620
         size: Pixels along a panel's side.
     """
     import_pyvista("a picture")
+    camera = camera_of(panels, eye, up)
+    images = crop([render(panel, camera, size) for panel in panels])
+    write_png(lay_out(images, [panel.title for panel in panels], title, legend), path)
+
+
+def lay_out(images: list, titles: list[str], title: str, legend) -> np.ndarray:
+    """Return images of one size side by side, with titles and a legend, uint8 (rows, columns, 3)."""
     import matplotlib.patches
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    drawn = [part for panel in panels for part in (panel.triangles, *(ends for ends, _ in panel.lines))]
-    camera = camera_around(np.concatenate([np.reshape(part, (-1, 3)) for part in drawn]), eye, up)
-    images = _crop([render(panel, camera, size) for panel in panels])
     rows, columns = images[0].shape[:2]
     gap, head, panel_head = 16, 44, 50
-    width = len(panels) * columns + (len(panels) + 1) * gap
+    width = len(images) * columns + (len(images) + 1) * gap
     # Pairs of entries, plain and intersecting, stay side by side.
     across = max(1, min(len(legend) // 2, width // (2 * LEGEND_WIDTH)))
     foot = 40 + 20 * (-(-len(legend) // (2 * across)) - 1)
@@ -120,13 +131,13 @@ def draw(panels: list[Panel], path, title: str, legend, eye, up, size: int = 620
     canvas = FigureCanvasAgg(figure)
     middle: dict = {"ha": "center", "va": "center"}
     figure.text(0.5, 1 - 0.5 * head / height, title, **middle, fontsize=15, fontweight="bold", color="0.15")
-    for i, (panel, image) in enumerate(zip(panels, images)):
+    for i, (text, image) in enumerate(zip(titles, images)):
         left = gap + i * (columns + gap)
         axes = figure.add_axes((left / width, foot / height, columns / width, rows / height))
         axes.imshow(image, interpolation="nearest", aspect="auto")
         axes.set_axis_off()
         x, y = (left + 0.5 * columns) / width, 1 - (head + 0.5 * panel_head) / height
-        figure.text(x, y, panel.title, **middle, fontsize=10.5, color="0.25", linespacing=1.35)
+        figure.text(x, y, text, **middle, fontsize=10.5, color="0.25", linespacing=1.35)
     # The legend fills columns first.
     lines = [legend[i : i + 2 * across] for i in range(0, len(legend), 2 * across)]
     entries = [line[i] for i in range(2 * across) for line in lines if i < len(line)]
@@ -134,21 +145,34 @@ def draw(panels: list[Panel], path, title: str, legend, eye, up, size: int = 620
     figure.legend(
         handles=handles, loc="lower center", ncols=2 * across, frameon=False, fontsize=10.5, borderaxespad=0.6
     )
-    write_png(canvas, path)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 
 
-def write_png(canvas, path):
-    """Write a canvas of Matplotlib as a PNG of 256 colours, less than half the size; the file appears whole or not."""
+def write_png(image: np.ndarray, path):
+    """Write an image as a PNG of 256 colours, less than half the size; the file appears whole or not."""
     import PIL.Image
 
-    canvas.draw()
-    image = PIL.Image.fromarray(np.asarray(canvas.buffer_rgba())[:, :, :3].copy())
-    image = image.quantize(256, PIL.Image.Quantize.MEDIANCUT, kmeans=1, dither=PIL.Image.Dither.NONE)
+    picture = PIL.Image.fromarray(image)
+    picture = picture.quantize(256, PIL.Image.Quantize.MEDIANCUT, kmeans=1, dither=PIL.Image.Dither.NONE)
     with atomic_write(path) as file:
-        image.save(file, format="PNG", optimize=True)
+        picture.save(file, format="PNG", optimize=True)
 
 
-def _crop(images):
+def write_animation(images: list, path, milliseconds: int):
+    """Write images as an animation that repeats, WebP or GIF by the name; the file appears whole or not."""
+    import PIL.Image
+
+    first, *others = (PIL.Image.fromarray(image) for image in images)
+    kind = Path(path).suffix[1:].lower()
+    options: dict = {"quality": 70, "method": 6} if kind == "webp" else {"optimize": True}
+    with atomic_write(path) as file:
+        first.save(
+            file, format=kind.upper(), save_all=True, append_images=others, duration=milliseconds, loop=0, **options
+        )
+
+
+def crop(images: list) -> list:
     """Cut the empty margin that all images share, and leave a little."""
     drawn = np.any([(image < 250).any(axis=2) for image in images], axis=0)
     if not drawn.any():

@@ -1,9 +1,11 @@
 """Pictures of scenes: objects at their LODs and poses, intersecting faces coloured."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
-from warp_abtree.app.pictures.render import Panel, draw
+from warp_abtree.app.pictures.render import Panel, camera_of, crop, draw, lay_out, render, write_animation
 from warp_abtree.app.render_data import RenderData, Settings, Snapshot, compose, objects_of_world
 from warp_abtree.app.styles import COLOURS
 from warp_abtree.scene.scene import Scene
@@ -51,6 +53,25 @@ def draw_snapshot(scene: Scene, snapshot: Snapshot, shown, path, title: str, vie
     data = compose(cache, snapshot, shown, settings)
     (eye, up), legend = view, make_legend(scene, [data])
     draw([make_panel(cache, data)], path, title, legend, eye, up, size)
+
+
+def draw_frames(scene: Scene, snapshots, shown, path, title: str, view, settings: Settings, size: int):
+    """Draw the shown objects of snapshots, in equal steps of time, to a WebP or GIF file, seen by one camera.
+
+    Args:
+        snapshots: Yields two or more.
+        view: Directions to the eye and upwards.
+    """
+    cache, panels, seen, times = geometry.MeshCache(scene), [], [], []
+    for snapshot in snapshots:
+        data = compose(cache, snapshot, shown, settings)
+        panels.append(make_panel(cache, data))
+        seen.append(replace(data, colours=data.colours[:0], poses=data.poses[:0]))
+        times.append(snapshot.time)
+    camera, legend = camera_of(panels, *view), make_legend(scene, seen)
+    images = crop([render(panel, camera, size) for panel in panels])
+    drawn = [lay_out([image], [panel.title], title, legend) for image, panel in zip(images, panels)]
+    write_animation(drawn, path, round(1000 * (times[-1] - times[0]) / (len(times) - 1)))
 
 
 def panel_lods(loaded) -> list[np.ndarray]:

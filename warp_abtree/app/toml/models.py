@@ -30,7 +30,7 @@ def build_model(path: Path, name: str, table, progress=None) -> Model:
                 mesh = mesh_from_arrays(vertices * factor, mesh.faces, name=mesh.name)
         if table.faces is not None:
             mesh = _bring_to(mesh, table.faces, progress)
-        return Model.load(mesh, base_faces=table.base_faces, progress=progress)
+        return Model.load(mesh, table.base_faces, progress, orient=table.orient)
     except ValueError as error:
         fail(path, f"models.{name}", error)
 

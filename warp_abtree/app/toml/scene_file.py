@@ -16,6 +16,7 @@ from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.models import build_model
 from warp_abtree.app.toml.objects import make_groups
 from warp_abtree.checks.arguments import whole_number
+from warp_abtree.model.obj import MeshError
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame
 from warp_abtree.simulate.lod_request import LodSweep, resolve_lod
@@ -182,14 +183,26 @@ def _add_objects(path, scene, groups, models):
         table = group.table
         poses = np.concatenate([group.motion["position"], group.motion["rotation"]], axis=1)
         names, lods = as_list(table.model), as_list(table.lod)
-        for i in range(len(group.world)):
-            name = names[i % len(names)]
-            try:
-                lod = resolve_lod(models[name], lods[i % len(lods)])
-            except ValueError as error:
-                fail(path, f"{group.key}.lod", error)
-            scene.add(models[name], poses[i], int(group.world[i]), lod, table.importance, table.static)
-            owners.append((table.name, name))
+        turns = [(i % len(names), i % len(lods)) for i in range(len(group.world))]
+        try:
+            found = {(k, at): resolve_lod(models[names[k]], lods[at]) for k, at in dict.fromkeys(turns)}
+        except ValueError as error:
+            fail(path, f"{group.key}.lod", error)
+        try:
+            scene.add_many(
+                [models[names[k]] for k, _ in turns],
+                poses,
+                group.world,
+                [found[turn] for turn in turns],
+                table.importance,
+                table.static,
+                table.collision_group,
+                table.collision_mask,
+                table.solid,
+            )
+        except MeshError as error:
+            fail(path, f"{group.key}.solid", error)
+        owners += [(table.name, names[k]) for k, _ in turns]
     return owners
 
 

@@ -22,12 +22,14 @@ from msgspec.structs import replace
 
 from warp_abtree.app.toml.objects import OBJECT_LIMIT, unit
 from warp_abtree.lod.view import Camera
+from warp_abtree.scene.objects import ALL_BITS
 
 T = TypeVar("T")
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
 Fraction = Annotated[float, Meta(gt=0, le=1)]
 Count = Annotated[int, Meta(ge=1, le=2**31 - 1)]
+Bits = Annotated[int, Meta(ge=0, le=ALL_BITS)]
 Cells = Annotated[int, Meta(ge=0, le=OBJECT_LIMIT)]
 Copies = Annotated[int, Meta(ge=1, le=OBJECT_LIMIT)]
 TerrainCells = Annotated[int, Meta(ge=1, le=4096)]
@@ -69,6 +71,7 @@ class ModelTable(Table):
     centre: bool = False  # moves the middle of the box to the model's origin
     faces: Count | None = None  # brings the mesh to so many, or one less: by Loop subdivision and edge collapses
     base_faces: Count = 10  # faces of the coarsest LOD
+    orient: bool = False  # turns faces that disagree with their neighbours or face inwards
 
     def __post_init__(self):
         if self.mesh is None and self.__struct_config__.tag is None:
@@ -190,7 +193,11 @@ class ObjectTable(Table, kw_only=True):
     rotation: RotationTable | None = None
     world: Annotated[int, Meta(ge=-1, le=2**30)] = 0  # objects of different worlds never meet; -1 is in every world
     static: bool = False  # static objects never meet each other
+    solid: bool = False  # what lies inside it intersects it; of a closed model
     kinematic: bool = False  # with [dynamics]: moves as told, and pushes
+    # Bits: objects a and b may meet where group a & mask b and group b & mask a are not 0.
+    collision_group: Bits = 1
+    collision_mask: Bits = ALL_BITS
     importance: Annotated[int, Meta(ge=1, le=3)] = 1  # 1 (most), 2 or 3, for the selection of LODs
     # A number with a decimal point is a fraction of the faces; a whole number, "finest", "coarsest" or "tol:0.01"; of a
     # list each in turn.

@@ -1,0 +1,151 @@
+"""`python -m bench nightly --out DIR`: times of the cases day by day, and what became slower than before.
+
+Each case runs a few times. DIR/history.jsonl takes one line a case: device, versions, and for each series (a row's key
+and a column of times) the time of every run. DIR/CASE.svg draws them. A series became slower where its median is above
+those of the lines before by more than its times vary, within a run of this command or from one to the next.
+"""
+
+import importlib
+import json
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+import warp_abtree as ab
+
+from .. import tables
+from ..__main__ import describe_run
+from .study import StudyError, describe_device
+
+# What tells the rows of a case apart, whatever is measured.
+KEYS = {
+    "query": ("faces", "pairs", "distance"),
+    "coarse": ("pairs", "distance", "fraction"),
+    "update": ("case", "splits", "faces", "states"),
+    "frame": ("objects", "ladder"),
+    "host": ("pairs", "distance", "output"),
+    "sweep": ("model", "case", "poses"),
+    "distance": ("workload",),
+}
+OTHERS = ("peer", "fcl", "bvh", "unpacked", "goal")  # columns that are no time of the library
+RUNS, BEFORE = 3, 7  # runs of a case; lines that a new one is compared with
+LEAST = 0.05  # fraction below which no change is named: times of one process differ by as much from another's
+
+
+def run(device, out, only=None, quick=False, command=None):
+    """Run the cases, append their lines, draw the history; say what became slower.
+
+    Args:
+        only: Names of cases; None runs all.
+
+    Raises:
+        StudyError: An unknown case or device, or a folder or history that cannot be used.
+    """
+    wp.config.log_level = wp.LOG_WARNING
+    unknown = sorted(set(only or ()) - set(KEYS))
+    if unknown:
+        raise StudyError(f"--only: {unknown[0]} is none of {', '.join(KEYS)}")
+    folder = Path(out)
+    try:
+        ab.Scene(device)
+        folder.mkdir(parents=True, exist_ok=True)
+    except (ValueError, OSError) as error:
+        raise StudyError(str(error)) from error
+    lines = read_history(folder / "history.jsonl")
+    about = describe_run() | {"device": describe_device(wp.get_device(device)), "quick": quick, "command": command}
+    for name in only or KEYS:
+        print(f"  {name}", file=sys.stderr, flush=True)
+        line = {"case": name, **about, "series": measure(name, device, quick)}
+        before = same_kind(lines, line)
+        lines.append(line)
+        append_line(folder / "history.jsonl", line)
+        for series, was, now, noise in find_slower(before, line["series"]):
+            print(f"slower: {name}: {series}: {was:.4g} -> {now:.4g} ms, {now / was:.2f} times; noise {noise:.2f}")
+        print(f"{name}: {len(line['series'])} series, {len(before)} lines before", flush=True)
+        print(tables.draw([layout(name)], history_rows([*before, line]), folder), flush=True)
+
+
+def measure(name, device, quick) -> dict:
+    """Return the times [ms] of every series of a case, one a run."""
+    case, series = importlib.import_module(f"bench.cases.{name}"), {}
+    for _ in range(RUNS):
+        for row in case.run(device, quick=quick):
+            key = " ".join(f"{column}={row[column]}" for column in KEYS[name] if column in row)
+            for column, value in row.items():
+                if not column.endswith("_ms") or column.endswith("_p95_ms") or column.startswith(OTHERS):
+                    continue
+                if isinstance(value, int | float):
+                    series.setdefault(f"{key} {column.removesuffix('_ms')}", []).append(tables.plain(value))
+    return series
+
+
+def read_history(path) -> list:
+    """Return the lines of a history, none where there is no file.
+
+    Raises:
+        StudyError: A line is not what this command writes.
+    """
+    if not path.exists():
+        return []
+    lines = []
+    for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        try:
+            line = json.loads(text)
+            line["case"], line["device"], line["quick"], line["series"].items()
+        except (ValueError, KeyError, TypeError, AttributeError):
+            raise StudyError(f"{path}: line {number} is none of this command's; move the file away") from None
+        lines.append(line)
+    return lines
+
+
+def append_line(path, line):
+    """Append a line in one write."""
+    with open(path, "a", encoding="utf-8") as file:
+        file.write(json.dumps(line) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def same_kind(lines, line) -> list:
+    """Return the last lines of the same case, device and size."""
+    kind = ("case", "device", "quick")
+    return tables.pick(lines, **{name: line[name] for name in kind})[-BEFORE:]
+
+
+def find_slower(before, series) -> list:
+    """Return (series, median before, median now, noise) of what became slower by more than its own noise [ms].
+
+    The noise is the most that runs of one line, or the medians of the lines before, differ by: a ratio. So it takes two
+    lines before.
+    """
+    found = []
+    for name, times in series.items():
+        known = [line["series"][name] for line in before if name in line["series"]]
+        if len(known) < 2:
+            continue
+        medians = [float(np.median(values)) for values in known]
+        noise = max([max(values) / min(values) for values in (*known, times, medians)])
+        was, now = float(np.median(medians)), float(np.median(times))
+        if now > was * max(noise, 1 + LEAST):
+            found.append((name, was, now, noise))
+    return found
+
+
+def history_rows(lines) -> list:
+    """Return a row a line and series: its median over that of the first line that has it."""
+    first, rows = {}, []
+    for number, line in enumerate(lines):
+        for name, times in line["series"].items():
+            median = float(np.median(times))
+            rows.append({"line": number, "series": name, "relative": median / first.setdefault(name, median)})
+    return rows
+
+
+def layout(name) -> dict:
+    """Return the figure of a case, see `tables.draw`."""
+    panel = {"x": "line", "xscale": "linear", "by": "series", "legend": False, "y": {"relative": ""}}
+    panel |= {"xlabel": "run of the command", "ylabel": "time over that of the first run", "title": name}
+    return {"file": f"{name}.svg", "panels": [panel]}

@@ -1,0 +1,1 @@
+"""Solids: the parts of a surface, which points lie inside a closed one, and how deep."""

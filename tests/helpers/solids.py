@@ -1,0 +1,66 @@
+"""Closed meshes with awkward corners: surfaces of voxels, and what lies between them."""
+
+import numpy as np
+
+import warp_abtree as ab
+
+# The two triangles of a unit square's sides, by corners of the cube in binary, outwards.
+SQUARES = {
+    (-1, 0, 0): (4, 6, 2, 0),
+    (1, 0, 0): (3, 7, 5, 1),
+    (0, -1, 0): (1, 5, 4, 0),
+    (0, 1, 0): (6, 7, 3, 2),
+    (0, 0, -1): (2, 3, 1, 0),
+    (0, 0, 1): (5, 7, 6, 4),
+}
+
+
+def voxel_mesh(cells, rng=None):
+    """Return the surface of cells, int (k, 3), with integer corners: vertices and faces, wound outwards.
+
+    Faces come in random order with random diagonals where `rng` is given.
+    """
+    cells = {tuple(cell) for cell in np.asarray(cells).tolist()}
+    corners, faces = {}, []
+    for cell in sorted(cells):
+        for side, square in SQUARES.items():
+            if tuple(np.add(cell, side).tolist()) in cells:
+                continue
+            points = [tuple(np.add(cell, (k & 1, k >> 1 & 1, k >> 2)).tolist()) for k in square]
+            a, b, c, d = (corners.setdefault(point, len(corners)) for point in points)
+            cut = rng is not None and rng.random() < 0.5
+            faces += [(b, c, d), (b, d, a)] if cut else [(a, b, c), (a, c, d)]
+    faces = np.array(faces)
+    return np.array(list(corners), float), faces if rng is None else faces[rng.permutation(len(faces))]
+
+
+def shell(size, wall=1):
+    """Return the cells of a hollow cube."""
+    grid = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    return grid[((grid < wall) | (grid >= size - wall)).any(1)]
+
+
+def lattice_rotation(rng):
+    """Return one of the 24 rotations of a cube, (3, 3)."""
+    while True:
+        matrix = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)[:, None]
+        if np.linalg.det(matrix) > 0:
+            return matrix
+
+
+def lattice_pose(rng, reach, scale=1.0):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = lattice_rotation(rng), rng.integers(-reach, reach + 1, 3) * scale
+    return pose
+
+
+def model_of(mesh, name="voxels"):
+    return ab.Model.from_arrays(*mesh, base_faces=4, name=name)
+
+
+def ask(device, placed, pairs=((0, 1),), output="any", **options):
+    """Return the result for objects given as (model, pose, whether it is a solid)."""
+    scene = ab.Scene(device)
+    for model, pose, solid in placed:
+        scene.add(model, pose, solid=solid)
+    return scene.intersect(np.array(pairs), output, **options)

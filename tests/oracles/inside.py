@@ -1,0 +1,59 @@
+"""Whether a point lies inside a closed surface, in integers: along a line in general position, found by trying."""
+
+import random
+
+import numpy as np
+
+from oracles.triangle import brute_force_faces, clip, cross, dot, integer_points, into_frame_of_a, sub
+
+
+def parity(point, triangles):
+    """Return whether a point off a surface is inside it; triangles float64 (n, 3, 3).
+
+    Signs of three determinants with a direction say whether a line through the point passes a triangle, one more on
+    which side of the point. A direction for which any of the three is 0 is not in general position: another is tried.
+    """
+    flat, origin = integer_points(np.reshape(triangles, (-1, 3)), np.reshape(point, (1, 3)))
+    corners = [sub(p, origin[0]) for p in flat]
+    rng = random.Random(0)
+    while True:
+        direction = tuple(rng.randint(-(10**6), 10**6) for _ in range(3))
+        crossings = 0
+        for k in range(0, len(corners), 3):
+            a, b, c = corners[k : k + 3]
+            volume = dot(a, cross(b, c))
+            if volume == 0:
+                # A line in general position passes the plane of the face, or its line, in the point alone.
+                assert not clip((a, b, c), [(0, 0, 0)] * 3), "the point lies on the surface"
+                continue
+            sides = [dot(direction, cross(u, v)) for u, v in ((a, b), (b, c), (c, a))]
+            if 0 in sides:
+                break
+            crossings += (min(sides) > 0 or max(sides) < 0) and volume * sides[0] > 0
+        else:
+            return crossings % 2 == 1
+
+
+def components(faces):
+    """Return lists of rows of faces that share vertices."""
+    groups = []
+    for row, face in enumerate(np.asarray(faces).tolist()):
+        touched = [group for group in groups if group[0] & set(face)]
+        vertices = set(face).union(*(group[0] for group in touched))
+        rows = [row, *(r for group in touched for r in group[1])]
+        groups = [group for group in groups if group not in touched] + [(vertices, rows)]
+    return [rows for _, rows in groups]
+
+
+def solids_intersect(mesh_a, mesh_b, pose_a, pose_b, solid_a, solid_b):
+    """Return (whether surfaces meet, whether a solid holds a component of the other).
+
+    Args:
+        mesh_a, mesh_b: Vertices (v, 3) and faces (n, 3) of the object with the smaller index, and of the other.
+    """
+    (vertices_a, faces_a), (vertices_b, faces_b) = mesh_a, mesh_b
+    if len(brute_force_faces(vertices_a, faces_a, vertices_b, faces_b, pose_a, pose_b)):
+        return True, False
+    a, b = np.asarray(vertices_a, np.float64)[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b]
+    held = solid_b and any(parity(a[rows[-1], 1], b) for rows in components(faces_a))
+    return False, held or bool(solid_a and any(parity(b[rows[-1], 1], a) for rows in components(faces_b)))

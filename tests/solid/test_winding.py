@@ -1,0 +1,218 @@
+"""Winding: open edges, neighbours that disagree and parts that are inside out, against loops; and what mends them."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.solids import model_of, shell, voxel_mesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import warp_abtree as ab
+from warp_abtree.app import SceneError, load_scene
+from warp_abtree.app.cli.main import main
+from warp_abtree.model.mesh import describe_mesh, mesh_from_arrays, orient_mesh
+from warp_abtree.model.winding import find_winding
+
+TORUS = trimesh.creation.torus(1, 0.3, major_sections=12, minor_sections=8)
+
+
+def winding_of(vertices, faces):
+    mesh = mesh_from_arrays(vertices, faces)
+    return find_winding(mesh.vertices, mesh.faces, mesh.dropped_faces)
+
+
+def turned(faces, chosen):
+    return np.where(np.asarray(chosen)[:, None], faces[:, ::-1], faces)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(*[st.integers(0, 5)] * 3), min_size=1, max_size=20), st.integers(2, 6))
+def test_edges_are_counted_as_by_hand(faces, vertex_count):
+    vertices = np.random.default_rng(0).normal(size=(6, 3))
+    faces = np.array(faces)
+    if not any(len(set(face)) == 3 for face in faces.tolist()):
+        return
+    mesh = mesh_from_arrays(vertices, faces)
+    runs = {}
+    for f, (a, b, c) in enumerate(mesh.faces.tolist()):
+        if len({a, b, c}) == 3:
+            for u, v in ((a, b), (b, c), (c, a)):
+                runs.setdefault((min(u, v), max(u, v)), []).append((f, u < v))
+    winding = find_winding(mesh.vertices, mesh.faces, mesh.dropped_faces)
+    odd = {edge: min(f for f, _ in of) for edge, of in runs.items() if len(of) % 2}
+    assert dict(zip(map(tuple, winding.odd_edges.tolist()), winding.odd_faces.tolist())) == odd
+    assert winding.mixed_edges == sum(len(of) == 2 and of[0][1] == of[1][1] for of in runs.values())
+    assert describe_mesh(mesh)["closed"] == winding.is_closed == (not odd)
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0**-90, 2.0**90])
+def test_closed_meshes_that_are_inside_out_are_found(scale):
+    for mesh in (TORUS, trimesh.creation.box(), trimesh.creation.icosphere(2)):
+        vertices = mesh.vertices * scale
+        assert winding_of(vertices, mesh.faces).fault() is None
+        assert winding_of(vertices, mesh.faces[:, ::-1]).fault() == "it is inside out"
+    # A volume that vanishes has no sign, however it rounds: two sides of one sheet.
+    flat = (trimesh.creation.icosphere(1).vertices * [1, 1, 0] + [0.1, 0.2, 0.3]) * scale
+    assert winding_of(flat, trimesh.creation.icosphere(1).faces).fault() is None
+
+
+def test_volumes_that_nearly_vanish_have_the_exact_sign():
+    """A slab of one unit in the last place, far from the origin, at an angle."""
+    box = trimesh.creation.box()
+    for direction in (1, -1):
+        vertices = box.vertices.copy()
+        vertices[:, 2] = 1.0
+        top = box.vertices[:, 2] > 0
+        vertices[top, 2] = np.nextafter(1.0, 2.0 if direction > 0 else 0.0)
+        assert (winding_of(vertices, box.faces).fault() is None) == (direction > 0)
+
+
+def test_walls_of_cavities_may_face_inwards():
+    vertices, faces = voxel_mesh(shell(3))  # a cube within a cube, which faces inwards
+    winding = winding_of(vertices, faces)
+    assert winding.fault() is None and len(np.unique(winding.part)) == 2
+    # Inside out as a whole, the outer wall is wrong, and the inner one an island of its own.
+    outer = winding.part == winding.part[np.argmax((vertices[faces] == 0).all(1).any(1))]
+    found = winding_of(vertices, turned(faces, outer))
+    assert np.array_equal(found.inside_out, np.flatnonzero(outer))
+    assert f"{outer.sum()} faces" in found.fault()
+    # Two bodies side by side are each for themselves, also where they share an edge.
+    for other in ((5, 0, 0), (1, 1, 0)):
+        vertices, faces = voxel_mesh([(0, 0, 0), other])
+        second = (vertices[faces][..., :2] >= np.minimum(other[:2], 1)).all((1, 2)) & (vertices[faces].max((1, 2)) > 1)
+        found = winding_of(vertices, turned(faces, second))
+        assert np.array_equal(found.inside_out, np.flatnonzero(second))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_mending_restores_what_was_turned(seed):
+    rng = np.random.default_rng(seed)
+    cells = rng.integers(0, 4, (12, 3))
+    for vertices, faces in ((TORUS.vertices, TORUS.faces), voxel_mesh(cells, rng), voxel_mesh(shell(4), rng)):
+        for chosen in (rng.random(len(faces)) < 0.4, np.full(len(faces), True)):
+            mended = orient_mesh(mesh_from_arrays(vertices, turned(faces, chosen)))
+            sorted_faces = np.sort(mended.faces, axis=1)
+            assert np.array_equal(sorted_faces, np.sort(mesh_from_arrays(vertices, faces).faces, axis=1)), "same ids"
+            winding = find_winding(mended.vertices, mended.faces)
+            assert winding.fault() is None
+            before = winding_of(vertices, faces)
+            same = (np.roll(mended.faces, 0) == before.faces).all(1)
+            for shift in (1, 2):
+                same |= (np.roll(mended.faces, shift, axis=1) == before.faces).all(1)
+            for part in np.unique(before.part):
+                # A wall within another may face either way.
+                assert same[before.part == part].all() or not same[before.part == part].any()
+
+
+def test_open_and_one_sided_parts():
+    """An open sheet goes with the majority; a Moebius strip stays as it is."""
+    grid = trimesh.creation.box().subdivide()
+    keep = grid.triangles_center[:, 2] < 0.4
+    chosen = np.zeros(keep.sum(), bool)
+    chosen[:5] = True
+    mended = orient_mesh(mesh_from_arrays(grid.vertices, turned(grid.faces[keep], chosen)))
+    assert winding_of(mended.vertices, mended.faces).mixed_edges == 0
+    middle = mended.vertices[mended.faces]
+    normals = np.cross(middle[:, 1] - middle[:, 0], middle[:, 2] - middle[:, 0])
+    assert (np.einsum("ij,ij->i", normals, middle.mean(1)) > 0).all()
+    n = 9
+    angle = 2 * np.pi * np.arange(n) / n
+    along, up = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1), np.array([0, 0, 1.0])
+    across = np.cos(angle / 2)[:, None] * up + np.sin(angle / 2)[:, None] * along
+    strip = np.concatenate([along + 0.3 * across, along - 0.3 * across])
+    rows = []
+    for i in range(n):
+        j, k = (i + 1, n + i + 1) if i + 1 < n else (n, 0)
+        rows += [(i, n + i, j), (j, n + i, k)]
+    mesh = mesh_from_arrays(strip, rows)
+    assert winding_of(strip, rows).mixed_edges > 0
+    np.testing.assert_array_equal(orient_mesh(mesh).faces, mesh.faces)
+
+
+def test_every_lod_of_a_closed_mesh_is_closed():
+    """Merges map edges to edges, so an even number of faces stays at each, folds and coincident faces among them."""
+    rng = np.random.default_rng(1)
+    meshes = [TORUS, trimesh.creation.icosphere(2)]
+    models = [ab.Model.from_arrays(mesh.vertices, mesh.faces, base_faces=1) for mesh in meshes]
+    models += [model_of(voxel_mesh(rng.integers(0, 4, (14, 3)), rng)) for _ in range(4)]
+    folded = 0
+    for model in models:
+        assert model.winding.is_closed
+        for lod in range(model.lod_max + 1):
+            vertices, faces, _ = model.mesh_at(lod)
+            assert find_winding(vertices, faces).is_closed, (model, lod)
+            folded += len(faces) - len(np.unique(np.sort(faces, axis=1), axis=0))
+    assert folded > 0, "some of them are folded"
+
+
+def test_open_solids_are_refused_by_their_edges(device):
+    torn = ab.Model.from_arrays(TORUS.vertices, TORUS.faces[1:], name="torn")
+    scene = ab.Scene(device)
+    with pytest.raises(
+        ab.MeshError, match=r"'torn' is no solid.*3 edges belong to an odd number of faces: \("
+    ) as found:
+        scene.add(torn, solid=True)
+    corner = ", ".join(f"{x:.6g}" for x in TORUS.vertices[TORUS.faces[0][0]])
+    assert f"({corner})" in str(found.value) and scene.object_count == 0
+    with pytest.raises(ValueError, match="solid 1 is neither"):
+        scene.add(torn, solid=1)
+    with pytest.raises(ab.MeshError, match="torn"):
+        ab.sweep(torn, torn, np.eye(4)[None], solid=True, device=device)
+    # Three sheets that share an edge leave none open, and still have no inside.
+    fin = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [-1, 1, 0], [-1, -1, 0.0]])
+    fins = ab.Model.from_arrays(fin, [[0, 1, 2], [0, 1, 3], [0, 1, 4]])
+    assert len(fins.winding.odd_edges) == 7
+    assert scene.add(ab.Model.load(TORUS), solid=True) == 0
+
+
+def test_wrong_winding_warns_once_where_it_matters(device):
+    inverted = ab.Model.from_arrays(TORUS.vertices, TORUS.faces[:, ::-1], name="inverted")
+    scene = ab.Scene(device)
+    for _ in range(2):
+        scene.add(inverted, solid=True)
+    scene.intersect(np.array([(0, 1)]), "faces")  # does not depend on it
+    with pytest.warns(RuntimeWarning, match="'inverted': it is inside out; .*normals.*orient=True"):
+        scene.intersect(np.array([(0, 1)]), "contacts")
+    scene.add(inverted)
+    scene.intersect(np.array([(0, 1)]), "contacts")
+    other = ab.Model.from_arrays(TORUS.vertices, turned(TORUS.faces, np.arange(len(TORUS.faces)) < 9), name="mixed")
+    scene = ab.Scene(device)
+    scene.add(other)
+    with pytest.warns(RuntimeWarning, match="'mixed': neighbouring faces disagree .* mass"):
+        ab.Dynamics(scene)
+
+
+def test_orient_in_models_files_and_commands(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WARP_ABTREE_CACHE", str(tmp_path / "cache"))
+    ball = trimesh.creation.icosphere(3)
+    ball.faces = ball.faces[:, ::-1]
+    ball.export("ball.obj")
+    for _ in range(2):  # built, and opened from the cache
+        assert ab.Model.load("ball.obj").winding.fault() is not None
+        assert ab.Model.load("ball.obj", orient=True).winding.fault() is None
+    assert ab.Model.from_arrays(ball.vertices, ball.faces, orient=True).winding.fault() is None
+    main(["info", "ball.obj"])
+    assert "inside out" in capsys.readouterr().out
+    main(["build", "ball.obj", "ball.npz", "--orient", "--json"])
+    capsys.readouterr()
+    main(["info", "ball.npz", "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert (found["closed"], found["winding"], found["mixed_edges"], found["inside_out_faces"]) == (
+        True,
+        "outwards",
+        0,
+        0,
+    )
+    (tmp_path / "a.toml").write_text(
+        '[models.b]\nmesh = "ball.obj"\norient = true\n[[objects]]\nmodel = "b"\nsolid = true\n', encoding="utf-8"
+    )
+    loaded = load_scene(tmp_path / "a.toml", device="cpu")
+    assert loaded.scene.object_solid == [True] and loaded.models["b"].winding.fault() is None
+    trimesh.Trimesh(ball.vertices, ball.faces[1:]).export("torn.obj")
+    text = '[models.t]\nmesh = "torn.obj"\n[[objects]]\nmodel = "t"\nsolid = true\n'
+    (tmp_path / "b.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(SceneError, match=r"objects\[0\].solid: .* is no solid.*edges belong"):
+        load_scene(tmp_path / "b.toml", device="cpu")

@@ -1,0 +1,162 @@
+"""Objects as a scene was told of them: checked, and kept on the host until the device's arrays are made."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import to_numpy, whole_number
+from warp_abtree.model.model import Model
+from warp_abtree.model.winding import refuse_open
+from warp_abtree.query.broad_phase import EVERY_WORLD
+from warp_abtree.scene.poses import launch_place
+
+ALL_BITS = 2**32 - 1
+
+
+@dataclass
+class ObjectList:
+    """The objects of a scene: `models` without repeats, and lists with an entry an object."""
+
+    models: list[Model] = field(default_factory=list)
+    model: list[int] = field(default_factory=list)  # index into models
+    world: list[int] = field(default_factory=list)
+    lod: list[int] = field(default_factory=list)
+    importance: list[int] = field(default_factory=list)
+    static: list[bool] = field(default_factory=list)
+    solid: list[bool] = field(default_factory=list)
+    group: list[int] = field(default_factory=list)
+    mask: list[int] = field(default_factory=list)
+    pose: list[np.ndarray] = field(default_factory=list)  # (7,) or (4, 4)
+    place: dict[int, int] = field(default_factory=dict)  # index into models, by identity
+
+    def __len__(self):
+        return len(self.model)
+
+    def extend(self, models: list[Model], columns: dict[str, list]):
+        """Append objects, wholly or not at all: their models, and the other columns by name."""
+        count, known = len(self.model), len(self.models)
+        try:
+            for model in models:
+                if id(model) not in self.place:
+                    self.models.append(model)
+                    self.place[id(model)] = len(self.models) - 1
+            for name, values in columns.items():
+                getattr(self, name).extend(values)
+            self.model.extend([self.place[id(model)] for model in models])
+        except BaseException:
+            for name in (*columns, "model"):
+                del getattr(self, name)[count:]
+            del self.models[known:]
+            self.place = {id(model): i for i, model in enumerate(self.models)}
+            raise
+
+    def collision_bits(self) -> np.ndarray:
+        """Return collision group and mask of each object, uint32 (n, 2); (0, 2) where they keep no pair apart."""
+        bits = np.array([self.group, self.mask], np.uint32).T
+        return bits if (bits != (1, ALL_BITS)).any() else bits[:0]
+
+    def set_poses(self, pool, device):
+        """Set the objects of a pool: the device turns quaternions into matrices, matrices are taken as they are."""
+        matrix = np.array([pose.ndim == 2 for pose in self.pose])
+        rows = np.zeros((len(self), 7))
+        rows[:, 6] = 1.0
+        if not matrix.all():
+            rows[~matrix] = [pose for pose in self.pose if pose.ndim == 1]
+        launch_place(wp.array(rows, dtype=wp.float64, device=device), pool)
+        if matrix.any():
+            rotation, position = pool.rotation.numpy(), pool.position.numpy()
+            stacked = np.array([pose for pose in self.pose if pose.ndim == 2])
+            rotation[matrix], position[matrix] = stacked[:, :3, :3], stacked[:, :3, 3]
+            pool.rotation.assign(rotation)
+            pool.position.assign(position)
+
+
+def check_models(models, count: int) -> list[Model]:
+    """Return the model of each of a number of objects: one for all of them, or a list.
+
+    Raises:
+        TypeError: One is no Model.
+        ValueError: Another number of them.
+    """
+    listed = [models] * count if isinstance(models, Model) or not isinstance(models, list | tuple) else list(models)
+    for model in listed:
+        if not isinstance(model, Model):
+            raise TypeError(f"model is a {type(model).__name__}, not a Model")
+    if len(listed) != count:
+        raise ValueError(f"models: {len(listed)} given for {count} poses")
+    return listed
+
+
+def check_lods(lods, models: list[Model]) -> list[int]:
+    """Return the LOD of each object, the finest of its model for None.
+
+    Raises:
+        ValueError: Another number of them, or one out of range.
+    """
+    if lods is None or _is_one(lods):
+        return [model.lod_max if lods is None else model.check_lod(lods) for model in models]
+    lods = check_numbers(lods, "lod", 0, 2**31 - 1, len(models))
+    return [model.check_lod(lod) for model, lod in zip(models, lods)]
+
+
+def _is_one(values) -> bool:
+    return len(getattr(values, "shape", (1,) if isinstance(values, list | tuple) else ())) == 0
+
+
+def check_numbers(values, what: str, low: int, high: int, count: int) -> list[int]:
+    """Return whole numbers from low to high: one for all objects, or (count,).
+
+    Raises:
+        ValueError: Another shape, or one that is none.
+    """
+    if _is_one(values):
+        return [whole_number(values, what, low, high)] * count
+    numbers = to_numpy(values, f"{what}s")
+    if numbers.shape != (count,):
+        raise ValueError(f"{what}s: shape {numbers.shape} given for {count} objects")
+    bad = np.flatnonzero(~((numbers >= low) & (numbers <= high) & (numbers == np.floor(numbers))))
+    if len(bad):
+        whole_number(numbers[bad[0]].item(), f"{what}s[{bad[0]}]", low, high)
+    return numbers.astype(np.int64).tolist()
+
+
+def check_flags(values, what: str, count: int) -> list[bool]:
+    """Return bools: one for all objects, or (count,).
+
+    Raises:
+        ValueError: Another shape or type.
+    """
+    if isinstance(values, bool | np.bool_):
+        return [bool(values)] * count
+    flags = np.asarray(values)
+    if flags.ndim == 0 or flags.dtype != bool:
+        raise ValueError(f"{what} {values!r} is neither True nor False")
+    if flags.shape != (count,):
+        raise ValueError(f"{what}s: shape {flags.shape} given for {count} objects")
+    return flags.tolist()
+
+
+def check_columns(models, worlds, importances, flags, bits) -> dict[str, list]:
+    """Return the columns of `ObjectList` for objects of these models.
+
+    Args:
+        flags: Static and solid ones.
+        bits: Collision groups, and masks.
+
+    Raises:
+        MeshError: A solid whose mesh is not closed.
+        ValueError: Another number of them, or one out of range.
+    """
+    count, (statics, solids), (groups, masks) = len(models), flags, bits
+    columns: dict[str, list] = {
+        "world": check_numbers(worlds, "world", EVERY_WORLD, 2**31 - 1, count),
+        "importance": check_numbers(importances, "importance", 1, 3, count),
+        "static": check_flags(statics, "static", count),
+        "solid": check_flags(solids, "solid", count),
+        "group": check_numbers(groups, "collision_group", 0, ALL_BITS, count),
+        "mask": check_numbers(masks, "collision_mask", 0, ALL_BITS, count),
+    }
+    for model in {id(model): model for model, solid in zip(models, columns["solid"]) if solid}.values():
+        refuse_open(model.winding, model.name)
+    return columns

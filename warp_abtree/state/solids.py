@@ -1,0 +1,90 @@
+"""Solids: objects that hold what lies inside them.
+
+A closed mesh (`warp_abtree.model.winding`) divides space into inside and outside, at every LOD and however it is wound.
+An object pair with a solid intersects if the surfaces meet, or if a component of one surface lies inside the other
+object, a solid. Surfaces that do not meet leave each component wholly inside or outside, so this is decided exactly, on
+the numbers of `docs/exactness.md`, by the parity of the crossings of a ray (`warp_abtree.kernels.solid.parity`); at
+the LODs of the objects, it says nothing of the originals. Of an object pair that intersects in this way alone
+
+* any is True, count is 0, and it has no faces and no contacts: these are of surfaces;
+* apart is False, whatever `within` is;
+* distance and bracket are 0, both points are a corner of the component that is inside, and point_faces names its face,
+  beside -1 for the solid.
+
+A cavity is outside: what lies in it intersects nothing. So is what two overlapping parts of one mesh share.
+"""
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels.solid.components import Solids, find_component_kernel
+from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
+from warp_abtree.state.arrays import ModelArrays, StateArrays
+
+SLOT_ARRAYS = {"shift": wp.int32, "first": wp.int32, "count": wp.int32, "made": wp.vec3i}
+PLACE_ARRAYS = ("parent", "lowest", "face")
+
+
+class SolidArrays:
+    """Which objects of a batch are solids, and the components of its tree states.
+
+    Args:
+        models, states: Arrays of the batch.
+        is_solid: Whether each object is a solid, (n,).
+
+    Attributes:
+        pool: `Solids` for kernels.
+        is_solid: As given.
+    """
+
+    def __init__(self, models: ModelArrays, states: StateArrays, is_solid):
+        self.models, self.states = models, states
+        self.device = states.device
+        self.is_solid = np.asarray(is_solid, bool)
+        self.pool = Solids()
+        self.pool.is_solid = wp.array(self.is_solid.astype(np.int32), dtype=wp.int32, device=self.device)
+        self._slot_models: list[int] = []
+        self._allocate(0, 0)
+        self.fit()
+
+    def _allocate(self, slots: int, places: int):
+        self.states.generation.advance()
+        for name, dtype in SLOT_ARRAYS.items():
+            setattr(self.pool, name, wp.zeros(slots, dtype=dtype, device=self.device))
+        for name in PLACE_ARRAYS:
+            setattr(self.pool, name, wp.empty(places, dtype=wp.int32, device=self.device))
+
+    def fit(self):
+        """Make room for the components of all tree states that there are now."""
+        slots = [slot.model for slot in self.states.slots]
+        if slots == self._slot_models or self.device.is_capturing:
+            return
+        lengths = np.diff(self.models.vertex_start)[slots]
+        first = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+        if first[-1] >= 2**31:
+            raise ValueError(
+                f"the tree states of solids would hold {first[-1]} vertices, more than 2^31; use fewer LODs"
+            )
+        room, places = len(self.pool.first), len(self.pool.parent)
+        if len(self.states.pool.lod) > room or first[-1] > places:
+            grown = max(int(first[-1]), min(2 * places, 2**31 - 1))
+            self._allocate(len(self.states.pool.lod), grown if first[-1] > places else places)
+        made = np.full((len(self.pool.first), 3), -1, np.int32)
+        starts = np.full((2, len(made)), -1, np.int32)
+        starts[0, : len(slots)], starts[1, : len(slots)] = first[:-1], first[:-1] - self.models.vertex_start[slots]
+        self.pool.made.assign(made)
+        self.pool.first.assign(starts[0])
+        self.pool.shift.assign(starts[1])
+        self._slot_models = slots
+
+    def forget(self):
+        """Make room anew: tree states are others than they were."""
+        self._slot_models = [-1]
+
+    def prepare(self, launch, launched):
+        """Make the launch that finds the components of states which have changed; `launched` as of `LaunchRecord`."""
+        lanes = WARP_SIZE if self.device.is_cuda else 1
+        inputs = [self.models.pool, self.states.pool, launched, self.pool]
+        # With room for states to come, which a captured graph finds too.
+        dim = len(self.pool.first) * lanes
+        return launch(find_component_kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
