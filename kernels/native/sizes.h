@@ -19,13 +19,16 @@ static_assert(STRADDLING_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie on
 static_assert(SIGNS_START == STRADDLING_START + STRADDLING_LENGTH, "signs lie behind the straddling pairs");
 static_assert((STACK_LENGTH + LEAF_PAIR_LENGTH) * ITEM_BYTES < 1 << 16, "`push_children` packs two byte offsets");
 
-// Two small trees where a warp's stack lies otherwise: leaves of each, their nodes or faces, and inner nodes before boxes
-// of A's leaves take their place. In words of 4 bytes, quarters of a box 4 words.
-constexpr int SMALL_LEAVES = 64;
-constexpr int SMALL_INNER = 128;
-constexpr int SMALL_A = 768;
-constexpr int SMALL_B = 832;
-static_assert(SMALL_A == 12 * SMALL_LEAVES && SMALL_A >= SMALL_INNER, "three quarters a box, or inner nodes");
+// Two small trees where a warp's stack lies otherwise: leaves of each, and inner nodes before boxes of A's leaves take
+// their place. In words of 4 bytes, a box three quarters of 4 words.
+constexpr int SMALL_LEAVES = 96;
+constexpr int SMALL_INNER = 192;
+constexpr int SMALL_ROWS = 64;
+constexpr int SMALL_FACES = 768;
+constexpr int SMALL_A = 832;
+constexpr int SMALL_B = 928;
+static_assert(SMALL_INNER >= 2 * SMALL_LEAVES && SMALL_FACES >= SMALL_INNER, "both trees' inner nodes have room");
+static_assert(SMALL_FACES == 12 * SMALL_ROWS && SMALL_A == SMALL_FACES + SMALL_ROWS, "boxes, then their faces");
 static_assert(SMALL_B == SMALL_A + SMALL_LEAVES && 4 * (SMALL_B + SMALL_LEAVES) <= STACK_LENGTH * ITEM_BYTES, "room");
 
 // Slots of the queue in which idle warps wait, each with room for so many items: one a lane.

@@ -47,14 +47,15 @@ inline CUDA_CALLABLE wp::vec_t<4, wp::float32> read_quarter(wp::uint64 items, wp
 #endif
 }
 
-inline CUDA_CALLABLE void write_quarter(wp::uint64 items, wp::int32 i, wp::vec_t<4, wp::float32> x) {
+inline CUDA_CALLABLE void write_quarter(wp::uint64 items, wp::int32 i, bool flag, wp::vec_t<4, wp::float32> x) {
 #if defined(__CUDA_ARCH__)
-    asm volatile("st.shared.v4.f32 [%0], {%1, %2, %3, %4};" ::"r"((unsigned int)items + 16 * i), "f"(x[0]), "f"(x[1]),
-                 "f"(x[2]), "f"(x[3])
-                 : "memory");
+    asm volatile(
+        "{ .reg .pred used; setp.ne.s32 used, %0, 0; @used st.shared.v4.f32 [%1], {%2, %3, %4, %5}; }" ::"r"((int)flag),
+        "r"((unsigned int)items + 16 * i), "f"(x[0]), "f"(x[1]), "f"(x[2]), "f"(x[3])
+        : "memory");
 #else
     float* p = (float*)items + 4 * i;
-    for (int k = 0; k < 4; ++k)
+    for (int k = 0; flag && k < 4; ++k)
         p[k] = x[k];
 #endif
 }

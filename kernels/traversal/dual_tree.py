@@ -268,7 +268,6 @@ def warp_traversal(mode: int, for_any: bool):
                 node_tests, tests = traverse_items(
                     asked, wp.static(mode), pace, p, models, states, pose, own, hits_inout, work_inout
                 )
-                node_tests += wp.where(part == 0, lists.tests, 0)
             add_warp_sum(hits_inout.node_tests, p, node_tests)
             add_warp_sum(hits_inout.count, p, tests[0])
             add_warp_sum(hits_inout.triangle_tests, p, tests[1])

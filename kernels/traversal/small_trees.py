@@ -11,7 +11,7 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal.boxes import PosedBox, boxes_overlap, map_point, pose_box
+from warp_abtree.kernels.traversal.boxes import map_point
 from warp_abtree.kernels.traversal.face_pairs import Hits, load_corner_ids, load_near
 from warp_abtree.kernels.traversal.leaf_pairs import separate_leaf_pairs, test_straddling
 from warp_abtree.kernels.traversal.node_pair import INDEX_MASK
@@ -21,6 +21,7 @@ from warp_abtree.kernels.traversal.warp_stack import warp_any, warp_lane, warp_s
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 SMALL_LEAVES, SMALL_INNER = native.constant("SMALL_LEAVES"), native.constant("SMALL_INNER")
+SMALL_ROWS, SMALL_FACES = native.constant("SMALL_ROWS"), native.constant("SMALL_FACES")
 SMALL_A, SMALL_B = native.constant("SMALL_A"), native.constant("SMALL_B")
 # An early hit ends a pair for `any`, so few leaf pairs wait.
 LEAF_PAIRS_FOR_ANY = wp.constant(8)
@@ -45,7 +46,7 @@ def read_quarter(items: wp.uint64, i: wp.int32) -> wp.vec4: ...
 
 
 @wp.func_native(native.body("small_trees.cuh", "write_quarter"))
-def write_quarter(items: wp.uint64, i: wp.int32, x: wp.vec4): ...
+def write_quarter(items: wp.uint64, i: wp.int32, flag: bool, x: wp.vec4): ...
 
 
 @wp.func_native(native.body("small_trees.cuh", "spans_overlap"))
@@ -60,22 +61,21 @@ def push_leaf_pair(items: wp.uint64, end: wp.int32, flag: bool, face_a: wp.int32
 
 @wp.struct
 class SmallLists:
-    """How many leaves of two trees a warp has gathered, and what that took."""
+    """The leaves of two trees that a warp has gathered."""
 
-    leaves_a: wp.int32  # leaves of A that overlap B's root
-    leaves_b: wp.int32  # leaves of B that overlap A's root
+    leaves_a: wp.int32  # of A
+    leaves_b: wp.int32  # of B
     fits: bool  # there was room for all of them
-    tests: wp.int32  # pairs of boxes that this lane has compared
 
 
 @wp.struct
 class LeafBox:
     """A leaf's box in its own frame, and the box of its corners in the other object's."""
 
-    lower: wp.vec3
-    upper: wp.vec3
-    posed_lower: wp.vec3
-    posed_upper: wp.vec3
+    lower: wp.vec3  # least corner
+    upper: wp.vec3  # greatest corner
+    posed_lower: wp.vec3  # least corner in the other frame
+    posed_upper: wp.vec3  # greatest corner in the other frame
     face: wp.int32  # face number
 
 
@@ -83,27 +83,6 @@ class LeafBox:
 def is_small(pose: PairPose, faces_max: wp.int32):
     """Return whether to try both trees at once: few faces, of sizes that float32 takes, and no coincident meshes."""
     return wp.max(pose.faces_a, pose.faces_b) <= faces_max and pose.error < wp.inf
-
-
-@wp.func
-def pose_root(lower: wp.vec3, upper: wp.vec3, pose: PairPose, of_b: bool):
-    """Return a box of A or of B with its image in the other frame."""
-    rotation = pose.rotation32
-    shift = pose.translation32
-    if not of_b:
-        rotation = wp.transpose(rotation)
-        shift = pose.back32
-    return pose_box(lower, upper, rotation, shift, pose.margin)
-
-
-@wp.func
-def select_box(first: bool, a: PosedBox, b: PosedBox):
-    box = PosedBox()
-    box.sum = wp.where(first, a.sum, b.sum)
-    box.size = wp.where(first, a.size, b.size)
-    box.posed_sum = wp.where(first, a.posed_sum, b.posed_sum)
-    box.posed_size = wp.where(first, a.posed_size, b.posed_size)
-    return box
 
 
 @wp.func
@@ -116,32 +95,27 @@ def append_node(items: wp.uint64, first: wp.int32, room: wp.int32, end: wp.int32
 
 
 @wp.func
-def append_nodes(items: wp.uint64, ends: wp.vec3i, keep: bool, of_b: bool, node: Node):
+def append_nodes(items: wp.uint64, ends: wp.vec3i, live: bool, of_b: bool, node: Node):
     """Append nodes to the leaves of A, those of B or the inner nodes; return the new ends of these lists."""
     leaf = node.face >= 0
     entry = wp.where(of_b, node.skip | SIDE_B, node.skip)
     return wp.vec3i(
-        append_node(items, SMALL_A, SMALL_LEAVES, ends[0], keep and leaf and not of_b, node.skip),
-        append_node(items, SMALL_B, SMALL_LEAVES, ends[1], keep and leaf and of_b, node.skip),
-        append_node(items, 0, SMALL_INNER, ends[2], keep and not leaf, entry),
+        append_node(items, SMALL_A, SMALL_LEAVES, ends[0], live and leaf and not of_b, node.skip),
+        append_node(items, SMALL_B, SMALL_LEAVES, ends[1], live and leaf and of_b, node.skip),
+        append_node(items, 0, SMALL_INNER, ends[2], live and not leaf, entry),
     )
 
 
 @wp.func
 def gather_leaves(items: wp.uint64, states: StatePool, pose: PairPose):
-    """List the leaves of each tree that overlap the other's root, level by level, as far as there is room."""
+    """List the leaves of both trees, level by level, as far as there is room; none of pairs that are far apart."""
     lists = SmallLists()
-    node_a = load_constant_node(states, pose.node_a + 1)
-    node_b = load_constant_node(states, pose.node_b + 1)
-    root_a = pose_root(node_a.lower, node_a.upper, pose, False)
-    root_b = pose_root(node_b.lower, node_b.upper, pose, True)
-    first = warp_lane() == 0
-    lists.tests = wp.where(first, 1, 0)
     lists.fits = True
-    if not boxes_overlap(root_a, root_b):
+    if pose.margin < 0.0:
         return lists
-    ends = append_nodes(items, wp.vec3i(0, 0, 0), first, False, node_a)
-    ends = append_nodes(items, ends, first, True, node_b)
+    first = warp_lane() == 0
+    ends = append_nodes(items, wp.vec3i(0, 0, 0), first, False, load_constant_node(states, pose.node_a + 1))
+    ends = append_nodes(items, ends, first, True, load_constant_node(states, pose.node_b + 1))
     head = wp.int32(0)
     while head < ends[2] and lists.fits:
         warp_sync()
@@ -149,14 +123,10 @@ def gather_leaves(items: wp.uint64, states: StatePool, pose: PairPose):
         live = warp_lane() < popped
         entry = read_number(items, head + wp.min(warp_lane(), popped - 1))
         of_b = entry < 0
-        other = select_box(of_b, root_a, root_b)
         at = wp.where(of_b, pose.node_b, pose.node_a) + 2 * (entry & INDEX_MASK)
         head += popped
-        for k in range(2):
-            child = load_constant_node(states, at + k)
-            keep = live and boxes_overlap(pose_root(child.lower, child.upper, pose, of_b), other)
-            lists.tests += wp.where(live, 1, 0)
-            ends = append_nodes(items, ends, keep, of_b, child)
+        ends = append_nodes(items, ends, live, of_b, load_constant_node(states, at))
+        ends = append_nodes(items, ends, live, of_b, load_constant_node(states, at + 1))
         lists.fits = ends[2] <= SMALL_INNER and wp.max(ends[0], ends[1]) <= SMALL_LEAVES
     warp_sync()
     lists.leaves_a = ends[0]
@@ -182,42 +152,41 @@ def box_leaf(models: ModelPool, states: StatePool, pose: PairPose, node: wp.int3
     q = map_point(rotation, shift, load_near(models, corners[1]))
     r = map_point(rotation, shift, load_near(models, corners[2]))
     # Corners are rounded where boxes are not; docs/exactness.md has the terms.
-    margin = wp.vec3(pose.margin + pose.margin)
-    leaf.posed_lower = wp.min(p, wp.min(q, r)) - margin
-    leaf.posed_upper = wp.max(p, wp.max(q, r)) + margin
+    margin = pose.margin + pose.margin
+    leaf.posed_lower = wp.min(p, wp.min(q, r)) - wp.vec3(margin, margin, margin)
+    leaf.posed_upper = wp.max(p, wp.max(q, r)) + wp.vec3(margin, margin, margin)
     return leaf
 
 
 @wp.func
-def keep_boxes(
+def keep_rows(
     items: wp.uint64,
-    part: wp.int32,
-    parts: wp.int32,
-    leaves: wp.int32,
+    unit: wp.vec3i,
+    first: wp.int32,
+    lists: SmallLists,
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
 ):
-    """Put the boxes of every so many-th leaf of A in place, with their faces; return how many there are."""
-    rows = (leaves - part + parts - 1) / parts
-    first = wp.int32(0)
-    while first < rows:
-        row = first + warp_lane()
-        leaf = box_leaf(models, states, pose, read_number(items, SMALL_A + part + parts * wp.min(row, rows - 1)), False)
-        warp_sync()
-        if row < rows:
-            write_quarter(items, 3 * row, wp.vec4(leaf.lower[0], leaf.lower[1], leaf.lower[2], leaf.upper[0]))
-            write_quarter(
-                items, 3 * row + 1, wp.vec4(leaf.upper[1], leaf.upper[2], leaf.posed_lower[0], leaf.posed_lower[1])
-            )
-            write_quarter(
-                items,
-                3 * row + 2,
-                wp.vec4(leaf.posed_lower[2], leaf.posed_upper[0], leaf.posed_upper[1], leaf.posed_upper[2]),
-            )
-        write_number(items, SMALL_A + row, row < rows, leaf.face)
-        warp_sync()
-        first += warp_size()
+    """Put the boxes of this unit's next leaves of A in place, but for those beyond B's root; return how many."""
+    root = load_constant_node(states, pose.node_b + 1)
+    rows = wp.int32(0)
+    done = wp.int32(0)
+    while done < SMALL_ROWS and first + unit[2] * done < lists.leaves_a:
+        at = first + unit[2] * (done + warp_lane())
+        live = at < lists.leaves_a
+        leaf = box_leaf(models, states, pose, read_number(items, SMALL_A + wp.min(at, lists.leaves_a - 1)), False)
+        keep = live and spans_overlap(leaf.posed_lower, leaf.posed_upper, root.lower, root.upper)
+        rank = rank_flag(keep)
+        row = rows + (rank & 0xFFFF)
+        lower, upper, near, far = leaf.lower, leaf.upper, leaf.posed_lower, leaf.posed_upper
+        write_quarter(items, 3 * row, keep, wp.vec4(lower[0], lower[1], lower[2], upper[0]))
+        write_quarter(items, 3 * row + 1, keep, wp.vec4(upper[1], upper[2], near[0], near[1]))
+        write_quarter(items, 3 * row + 2, keep, wp.vec4(near[2], far[0], far[1], far[2]))
+        write_number(items, SMALL_FACES + row, keep, leaf.face)
+        rows += rank >> 16
+        done += warp_size()
+    warp_sync()
     return rows
 
 
@@ -229,7 +198,40 @@ def compare_leaf(items: wp.uint64, row: wp.int32, live: bool, waiting: wp.int32,
     z = read_quarter(items, 3 * row + 2)
     own = spans_overlap(wp.vec3(x[0], x[1], x[2]), wp.vec3(x[3], y[0], y[1]), b.posed_lower, b.posed_upper)
     posed = spans_overlap(wp.vec3(y[2], y[3], z[0]), wp.vec3(z[1], z[2], z[3]), b.lower, b.upper)
-    return push_leaf_pair(items, waiting, live and own and posed, read_number(items, SMALL_A + row), b.face)
+    return push_leaf_pair(items, waiting, live and own and posed, read_number(items, SMALL_FACES + row), b.face)
+
+
+@wp.struct
+class Place:
+    """Where a warp is among all pairs of leaves."""
+
+    next: wp.int32  # the next leaf of A that has no row
+    rows: wp.int32  # leaves of A in place
+    row: wp.int32  # the next of them
+    column: wp.int32  # the leaf of B of the first lane
+    more: bool  # there are pairs left
+
+
+@wp.func
+def advance(
+    items: wp.uint64, unit: wp.vec3i, at: Place, lists: SmallLists, models: ModelPool, states: StatePool, pose: PairPose
+):
+    """Return the next place whose row is there: of the next leaves of B after the last row, then of the next rows."""
+    place = Place()
+    place.next = at.next
+    place.rows = at.rows
+    place.row = at.row + 1
+    place.column = at.column
+    place.more = at.more
+    if place.row >= place.rows:
+        place.row = 0
+        place.column += warp_size()
+    while place.more and (place.rows == 0 or place.column >= lists.leaves_b):
+        place.more = place.next < lists.leaves_a and lists.leaves_b > 0
+        place.rows = keep_rows(items, unit, place.next, lists, models, states, pose)
+        place.next += unit[2] * SMALL_ROWS
+        place.column = 0
+    return place
 
 
 @wp.func
@@ -242,12 +244,13 @@ def test_small_trees(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
+    # state
     items: wp.uint64,
     lists: SmallLists,
     # out
     hits: Hits,
 ):
-    """Compare what was gathered and test the leaf pairs; return as `traverse_items`.
+    """Compare the leaves that were gathered and test the leaf pairs; return as `traverse_items`.
 
     Args:
         for_any: One hit ends a pair.
@@ -256,34 +259,30 @@ def test_small_trees(
     pair = unit[0]
     ready = wp.where(for_any, wp.min(LEAF_PAIRS_FOR_ANY, warp_size()), warp_size())
     ready_straddling = wp.where(for_any, 1, warp_size())
-    rows = keep_boxes(items, unit[1], unit[2], lists.leaves_a, models, states, pose)
-    node_tests = wp.where(unit[1] == 0, lists.tests, 0)
-    hit_count, uncertain_count, tested = wp.int32(0), wp.int32(0), wp.int32(0)
+    node_tests, hit_count, uncertain_count, tested = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
     waiting, straddling = wp.int32(0), wp.int32(0)
-    row, column = wp.int32(0), wp.int32(0)
     b = LeafBox()
-    more = rows > 0 and lists.leaves_b > 0
-    while more or waiting > 0 or straddling > 0:
+    place = Place()
+    place.next = unit[1]
+    place.more = True
+    place = advance(items, unit, place, lists, models, states, pose)
+    while place.more or waiting > 0 or straddling > 0:
         found = False
-        while more and waiting < ready:
-            live = column + warp_lane() < lists.leaves_b
-            if row == 0:
-                at = wp.min(column + warp_lane(), lists.leaves_b - 1)
-                b = box_leaf(models, states, pose, read_number(items, SMALL_B + at), True)
-            waiting = compare_leaf(items, row, live, waiting, b)
-            node_tests += wp.where(live, 1, 0)
-            row += 1
-            if row == rows:
-                row = 0
-                column += warp_size()
-                more = column < lists.leaves_b
+        while place.more and waiting < ready:
+            column = place.column + warp_lane()
+            if place.row == 0:
+                node = read_number(items, SMALL_B + wp.min(column, lists.leaves_b - 1))
+                b = box_leaf(models, states, pose, node, True)
+            waiting = compare_leaf(items, place.row, column < lists.leaves_b, waiting, b)
+            node_tests += wp.where(column < lists.leaves_b, 1, 0)
+            place = advance(items, unit, place, lists, models, states, pose)
         warp_sync()
-        if waiting >= ready or (not more and waiting > 0):
+        if waiting >= ready or (not place.more and waiting > 0):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
             straddling = separate_leaf_pairs(mode, items, waiting, popped, straddling, models, states, pose)
             tested += popped
-        if straddling >= ready_straddling or (not more and waiting == 0 and straddling > 0):
+        if straddling >= ready_straddling or (not place.more and waiting == 0 and straddling > 0):
             popped = wp.min(straddling, warp_size())
             straddling -= popped
             found, uncertain = test_straddling(
@@ -293,7 +292,7 @@ def test_small_trees(
             uncertain_count += wp.where(uncertain, 1, 0)
         if for_any:
             if warp_any(found or hits.any_hit[pair] != 0):
-                more = False
+                place.more = False
                 waiting = 0
                 straddling = 0
     return node_tests, wp.vec3i(hit_count, wp.where(warp_lane() == 0, tested, 0), uncertain_count)
