@@ -25,8 +25,9 @@ from warp_abtree.kernels.traversal.load_balance import (
     first_unit,
     free_slot,
     load_tickets,
+    next_unit,
+    parts_at_once,
     start_items,
-    take_unit,
     units_per_pair,
 )
 from warp_abtree.kernels.traversal.node_pair import compare_node_pair, item_first, item_second
@@ -195,6 +196,33 @@ def traverse_items(
     return node_tests, wp.vec3i(hit_count, wp.where(warp_lane() == 0, tested, 0), uncertain_count)
 
 
+@wp.func
+def set_pace(stack_room: wp.int32, parts: wp.int32, for_any: bool):
+    pace = Pace()
+    pace.stack_room = stack_room
+    pace.for_any = for_any
+    pace.balance_mask = hold_uniform(wp.where(parts >= MANY_PARTS, wp.where(for_any, 3, 0), 1))
+    # Where many warps look for one hit of a pair, each asks at every visit whether there is one.
+    pace.tests_max = hold_uniform(wp.where(for_any and parts >= MANY_PARTS, 1, TESTS_A_TURN))
+    return pace
+
+
+@wp.func
+def open_stack():
+    own = WarpItems()
+    own.items = warp_stack()
+    return own
+
+
+@wp.func
+def count_tests(hits: Hits, pair: wp.int32, node_tests: wp.int32, tests: wp.vec3i):
+    """Count what the lanes have tested: pairs of boxes, and what `traverse_items` returns of face pairs."""
+    add_warp_sum(hits.node_tests, pair, node_tests)
+    add_warp_sum(hits.count, pair, tests[0])
+    add_warp_sum(hits.triangle_tests, pair, tests[1])
+    add_warp_sum(hits.float64_tests, pair, tests[2])
+
+
 @functools.cache
 def warp_traversal(mode: int, for_any: bool):
     """Return the kernel that has warps share the object pairs: EXACT, FLOAT32 or WITHIN.
@@ -217,16 +245,9 @@ def warp_traversal(mode: int, for_any: bool):
         """Traverse units of work, each a part of one object pair, and donated items, until there are none."""
         count = wp.min(pair_count[0], pair_poses.shape[0])
         parts = units_per_pair(work_inout.warps_per_pair, count)
-        pace = Pace()
-        pace.stack_room = stack_room
-        pace.for_any = wp.static(for_any)
-        pace.tests_max = TESTS_A_TURN
-        pace.balance_mask = hold_uniform(wp.where(parts >= MANY_PARTS, wp.static(3 if for_any else 0), 1))
-        if wp.static(for_any):
-            # Where many warps look for one hit of a pair, each asks at every visit whether there is one.
-            pace.tests_max = hold_uniform(wp.where(parts >= MANY_PARTS, 1, TESTS_A_TURN))
-        own = WarpItems()
-        own.items = warp_stack()
+        pace = set_pace(stack_room, parts, wp.static(for_any))
+        asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
+        own = open_stack()
         units = count * parts
         unit = first_unit(work_inout.counter)
         ended = wp.int32(0)
@@ -240,42 +261,27 @@ def warp_traversal(mode: int, for_any: bool):
                 ended = 0
                 p = work_inout.owner[slot][0]
             pose = pair_poses[p]
-            asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
-            part = unit - p * parts
             node_tests, tests = wp.int32(0), wp.vec3i()
             lists = SmallLists()
+            task = wp.vec3i(p, unit - p * parts, parts)
             if wp.static(mode == int(EXACT)):
                 if slot < 0 and is_small(pose, work_inout.small_faces):
-                    lists = gather_leaves(own.items, states, pose)
+                    task[2] = parts_at_once(parts, count, work_inout.warps)
+                    lists = gather_leaves(task, own.items, states, pose)
             if lists.fits:
                 node_tests, tests = test_small_trees(
-                    asked,
-                    wp.static(mode),
-                    wp.static(for_any),
-                    wp.vec3i(p, part, parts),
-                    models,
-                    states,
-                    pose,
-                    own.items,
-                    lists,
-                    hits_inout,
+                    asked, pace.for_any, task, lists, models, states, pose, own.items, hits_inout
                 )
             else:
                 if slot >= 0:
                     own.end = receive_items(own.items, slot, work_inout)
                 else:
-                    own.end = start_items(own.items, part, parts, pose)
+                    own.end = start_items(own.items, task[1], task[2], pose)
                 node_tests, tests = traverse_items(
                     asked, wp.static(mode), pace, p, models, states, pose, own, hits_inout, work_inout
                 )
-            add_warp_sum(hits_inout.node_tests, p, node_tests)
-            add_warp_sum(hits_inout.count, p, tests[0])
-            add_warp_sum(hits_inout.triangle_tests, p, tests[1])
-            add_warp_sum(hits_inout.float64_tests, p, tests[2])
+            count_tests(hits_inout, p, node_tests, tests)
             ended += 1
-            if unit < units:
-                unit = wp.int32(units)
-                if units > work_inout.warps:
-                    unit = take_unit(work_inout.counter)
+            unit = next_unit(unit, units, work_inout)
 
     return traverse_warp_kernel

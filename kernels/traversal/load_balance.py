@@ -107,6 +107,22 @@ def units_per_pair(warps_per_pair: wp.int32, count: wp.int32):
 
 
 @wp.func
+def next_unit(unit: wp.int32, units: wp.int32, work: Work):
+    """Return the unit that follows one, `units` or more where there is none or the warp has had none."""
+    if unit < units:
+        unit = wp.int32(units)
+        if units > work.warps:
+            unit = take_unit(work.counter)
+    return unit
+
+
+@wp.func
+def parts_at_once(parts: wp.int32, count: wp.int32, warps: wp.int32):
+    """Return by how many units a pair is divided that each starts with as much work as the whole pair."""
+    return wp.clamp(warps / wp.max(count, 1), 1, parts)
+
+
+@wp.func
 def start_level(level: wp.int32, faces: wp.int32):
     """Return the level of a tree to start from: so deep that two faces or more lie below a node, on average."""
     while level > 0 and (2 << level) > faces:
@@ -122,11 +138,13 @@ def level_pair(level: wp.int32, i: wp.int32):
 
 @wp.func
 def start_items(items: wp.uint64, part: wp.int32, parts: wp.int32, pose: PairPose):
-    """Put this unit's part of a pair's first items on the stack, one a lane at most; return how many there are.
+    """Put this unit's part of a pair's first items on the stack; return how many there are.
 
     All pairs of siblings of a level, compared at once: from the roots down, level by level, a warp would wait as often.
     """
-    level = 3 + wp.where(parts > 2, 1, 0) + wp.where(parts > 8, 1, 0) + wp.where(parts > 32, 1, 0)
+    # As measured: about 32 a unit, one a lane.
+    level = 3 + wp.where(parts >= 2, 1, 0) + wp.where(parts >= 8, 1, 0)
+    level += wp.where(parts >= 32, 1, 0) + wp.where(parts >= 64, 1, 0)
     level = wp.where(pose.margin < 0.0, 0, level)
     level_a = start_level(level, pose.faces_a)
     level_b = start_level(level, pose.faces_b)

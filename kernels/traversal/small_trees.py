@@ -9,6 +9,7 @@ that a descent finds. Several units of one object pair take every so many-th lea
 import warp as wp
 
 from warp_abtree.kernels import native
+from warp_abtree.kernels.arithmetic.predicates import EXACT
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.boxes import map_point
@@ -107,11 +108,14 @@ def append_nodes(items: wp.uint64, ends: wp.vec3i, live: bool, of_b: bool, node:
 
 
 @wp.func
-def gather_leaves(items: wp.uint64, states: StatePool, pose: PairPose):
-    """List the leaves of both trees, level by level, as far as there is room; none of pairs that are far apart."""
+def gather_leaves(task: wp.vec3i, items: wp.uint64, states: StatePool, pose: PairPose):
+    """List the leaves of both trees, level by level, as far as there is room.
+
+    None where pairs are far apart, or where a part of that number has nothing to do.
+    """
     lists = SmallLists()
     lists.fits = True
-    if pose.margin < 0.0:
+    if pose.margin < 0.0 or task[1] >= task[2]:
         return lists
     first = warp_lane() == 0
     ends = append_nodes(items, wp.vec3i(0, 0, 0), first, False, load_constant_node(states, pose.node_a + 1))
@@ -161,19 +165,19 @@ def box_leaf(models: ModelPool, states: StatePool, pose: PairPose, node: wp.int3
 @wp.func
 def keep_rows(
     items: wp.uint64,
-    unit: wp.vec3i,
+    task: wp.vec3i,
     first: wp.int32,
     lists: SmallLists,
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
 ):
-    """Put the boxes of this unit's next leaves of A in place, but for those beyond B's root; return how many."""
+    """Put the boxes of this part's next leaves of A in place, but for those beyond B's root; return how many."""
     root = load_constant_node(states, pose.node_b + 1)
     rows = wp.int32(0)
     done = wp.int32(0)
-    while done < SMALL_ROWS and first + unit[2] * done < lists.leaves_a:
-        at = first + unit[2] * (done + warp_lane())
+    while done < SMALL_ROWS and first + task[2] * done < lists.leaves_a:
+        at = first + task[2] * (done + warp_lane())
         live = at < lists.leaves_a
         leaf = box_leaf(models, states, pose, read_number(items, SMALL_A + wp.min(at, lists.leaves_a - 1)), False)
         keep = live and spans_overlap(leaf.posed_lower, leaf.posed_upper, root.lower, root.upper)
@@ -214,7 +218,7 @@ class Place:
 
 @wp.func
 def advance(
-    items: wp.uint64, unit: wp.vec3i, at: Place, lists: SmallLists, models: ModelPool, states: StatePool, pose: PairPose
+    items: wp.uint64, task: wp.vec3i, at: Place, lists: SmallLists, models: ModelPool, states: StatePool, pose: PairPose
 ):
     """Return the next place whose row is there: of the next leaves of B after the last row, then of the next rows."""
     place = Place()
@@ -228,8 +232,8 @@ def advance(
         place.column += warp_size()
     while place.more and (place.rows == 0 or place.column >= lists.leaves_b):
         place.more = place.next < lists.leaves_a and lists.leaves_b > 0
-        place.rows = keep_rows(items, unit, place.next, lists, models, states, pose)
-        place.next += unit[2] * SMALL_ROWS
+        place.rows = keep_rows(items, task, place.next, lists, models, states, pose)
+        place.next += task[2] * SMALL_ROWS
         place.column = 0
     return place
 
@@ -238,34 +242,32 @@ def advance(
 def test_small_trees(
     # static
     output: wp.int32,
-    mode: wp.int32,
     for_any: bool,
-    unit: wp.vec3i,
+    task: wp.vec3i,
+    lists: SmallLists,
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
     # state
     items: wp.uint64,
-    lists: SmallLists,
     # out
     hits: Hits,
 ):
-    """Compare the leaves that were gathered and test the leaf pairs; return as `traverse_items`.
+    """Compare the leaves that were gathered and test the leaf pairs in float32; return as `traverse_items`.
 
     Args:
         for_any: One hit ends a pair.
-        unit: Object pair, part and parts.
+        task: Object pair, part and parts.
     """
-    pair = unit[0]
     ready = wp.where(for_any, wp.min(LEAF_PAIRS_FOR_ANY, warp_size()), warp_size())
     ready_straddling = wp.where(for_any, 1, warp_size())
     node_tests, hit_count, uncertain_count, tested = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
     waiting, straddling = wp.int32(0), wp.int32(0)
     b = LeafBox()
     place = Place()
-    place.next = unit[1]
+    place.next = task[1]
     place.more = True
-    place = advance(items, unit, place, lists, models, states, pose)
+    place = advance(items, task, place, lists, models, states, pose)
     while place.more or waiting > 0 or straddling > 0:
         found = False
         while place.more and waiting < ready:
@@ -275,23 +277,23 @@ def test_small_trees(
                 b = box_leaf(models, states, pose, node, True)
             waiting = compare_leaf(items, place.row, column < lists.leaves_b, waiting, b)
             node_tests += wp.where(column < lists.leaves_b, 1, 0)
-            place = advance(items, unit, place, lists, models, states, pose)
+            place = advance(items, task, place, lists, models, states, pose)
         warp_sync()
         if waiting >= ready or (not place.more and waiting > 0):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
-            straddling = separate_leaf_pairs(mode, items, waiting, popped, straddling, models, states, pose)
+            straddling = separate_leaf_pairs(EXACT, items, waiting, popped, straddling, models, states, pose)
             tested += popped
         if straddling >= ready_straddling or (not place.more and waiting == 0 and straddling > 0):
             popped = wp.min(straddling, warp_size())
             straddling -= popped
             found, uncertain = test_straddling(
-                output, mode, items, straddling, popped, pair, models, states, pose, hits
+                output, EXACT, items, straddling, popped, task[0], models, states, pose, hits
             )
             hit_count += wp.where(found, 1, 0)
             uncertain_count += wp.where(uncertain, 1, 0)
         if for_any:
-            if warp_any(found or hits.any_hit[pair] != 0):
+            if warp_any(found or hits.any_hit[task[0]] != 0):
                 place.more = False
                 waiting = 0
                 straddling = 0

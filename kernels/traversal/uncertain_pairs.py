@@ -183,7 +183,7 @@ def resolve_inexact(
     resolve_item(EXACT, output, models, states, pair_poses, lane < popped, item, hits)
 
 
-@wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=128)
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=96)
 def resolve_exact_kernel(
     threads: wp.int32,
     output: wp.int32,

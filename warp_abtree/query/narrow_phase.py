@@ -10,8 +10,9 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels import relative_pose
 from warp_abtree.kernels.solid.containment import find_contained_kernel
-from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, relative_pose, simd, uncertain_pairs
+from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.commands import Commands
@@ -23,8 +24,8 @@ from warp_abtree.state.generation import LaunchGuard
 
 # Face pairs that the float32 stage leaves uncertain: about one in a hundred. The list grows as needed.
 UNCERTAIN_ROOM = 65536
-# Warps that one multiprocessor runs at a time by their registers.
-WARPS_A_PROCESSOR = 16
+# Warps that one multiprocessor runs at a time by their registers: of the traversal, of the pass over uncertain pairs.
+WARPS_A_PROCESSOR, FILTER_WARPS_A_PROCESSOR = 16, 20
 # So that each finds a slot for all that it gives away at once.
 WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
@@ -255,7 +256,7 @@ class Query(QueryReadout):
         made = self._make_search(self._no_distance, self.hits, mode, output, launch)
         models, states, _ = self.batch.pools
         if len(self.hits.uncertain):
-            threads = WARPS_A_PROCESSOR * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
+            threads = FILTER_WARPS_A_PROCESSOR * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
             inputs = [threads, output, models, states, self.pair_poses, self.hits]
             made.append(launch(self._pass(), dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
         return made

@@ -15,6 +15,29 @@ MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
 
+@wp.func
+def clear_work(count: wp.int32, work: Work):
+    """Set out the units of so many pairs; none for a stale launch, whose tree states may be half changed in bounds."""
+    stale = record_launch(work.record)
+    work.counter[0] = 0
+    work.counter[1] = 0
+    work.counter[2] = wp.where(stale, 0, count * units_per_pair(work.warps_per_pair, count))
+    work.counter[3] = wp.where(stale, NO_UNIT, work.warps)
+
+
+@wp.func
+def clear_hits(p: wp.int32, hits: Hits):
+    if p == 0:
+        hits.total[0] = 0
+        hits.uncertain_total[0] = 0
+    hits.any_hit[p] = 0
+    hits.count[p] = wp.int64(0)
+    hits.node_tests[p] = wp.int64(0)
+    hits.triangle_tests[p] = wp.int64(0)
+    hits.float64_tests[p] = wp.int64(0)
+    hits.exact_tests[p] = wp.int64(0)
+
+
 @functools.cache
 def relative_poses(with_distances: bool):
     """Return the kernel that starts a traversal: for pairs that meet, or that are nearer than distances."""
@@ -34,8 +57,6 @@ def relative_poses(with_distances: bool):
     ):
         """Compute the pose of B in A's frame once a pair, A the smaller index, and clear what the traversal counts.
 
-        A stale launch is left no work: tree states may be half changed, though in bounds.
-
         Args:
             within: Distances [world units] that boxes are to be widened by, shape [pair]; [0] for intersection.
         """
@@ -45,22 +66,10 @@ def relative_poses(with_distances: bool):
             work_out.flag[p] = 0
         # By the last thread, which has no pose to wait for unless there are very many.
         if p == wp.max(pairs.shape[0], work_out.flag.shape[0]) - 1:
-            stale = record_launch(work_out.record)
-            work_out.counter[0] = 0
-            work_out.counter[1] = 0
-            work_out.counter[2] = wp.where(stale, 0, count * units_per_pair(work_out.warps_per_pair, count))
-            work_out.counter[3] = wp.where(stale, NO_UNIT, work_out.warps)
+            clear_work(count, work_out)
         if p >= pairs.shape[0]:
             return
-        if p == 0:
-            hits_out.total[0] = 0
-            hits_out.uncertain_total[0] = 0
-        hits_out.any_hit[p] = 0
-        hits_out.count[p] = wp.int64(0)
-        hits_out.node_tests[p] = wp.int64(0)
-        hits_out.triangle_tests[p] = wp.int64(0)
-        hits_out.float64_tests[p] = wp.int64(0)
-        hits_out.exact_tests[p] = wp.int64(0)
+        clear_hits(p, hits_out)
         if p >= count:
             return
         a = wp.min(pairs[p][0], pairs[p][1])
