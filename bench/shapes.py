@@ -93,3 +93,22 @@ def scene_of_poses(device, model_a, model_b, poses):
     for pose in poses:
         scene.add(model_b, pose)
     return scene, np.stack([np.zeros(len(poses), np.int32), np.arange(1, len(poses) + 1, dtype=np.int32)], 1)
+
+
+def place_at_gaps(model, count):
+    """Return matrices of B, rotations random, 0.3 to 0.01 of the size away from A, evenly in the logarithm."""
+    size, rng = longest_side(model), np.random.default_rng(0)
+    matrices = pose_matrices(random_poses(0.0, count))
+    away = rng.normal(size=(count, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    vertices = model.mesh_at(model.lod_max)[0]
+    middle = (vertices.max(0) + vertices.min(0)) / 2
+    start = middle - np.einsum("nij,j->ni", matrices[:, :3, :3], middle)
+    low, high, gaps = np.zeros(count), np.full(count, 3 * size), size * np.geomspace(0.3, 0.01, count)
+    for _ in range(25):
+        far = (low + high) / 2
+        matrices[:, :3, 3] = start + far[:, None] * away
+        wide = ab.sweep(model, model, matrices, output="distance", device="cpu")["distance"] > gaps
+        low, high = np.where(wide, low, far), np.where(wide, far, high)
+    matrices[:, :3, 3] = start + high[:, None] * away
+    return matrices

@@ -7,6 +7,7 @@ and studies.
 import importlib
 import json
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,6 @@ import numpy as np
 from warp_abtree.checks.atomic_write import atomic_write
 
 from .timing import fit_slope, upper_half
-
-try:
-    import tomllib
-except ModuleNotFoundError:  # Python 3.10
-    import tomli as tomllib
 
 HERE = Path(__file__).parent
 SHOWN_RUN = ("device", "date", "command", "seconds", "warp", "warp_abtree", "numpy", "python")

@@ -9,6 +9,8 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+from warp_abtree.testing import regime
+
 WARM_UP = 2  # rounds before the first that counts
 
 
@@ -127,16 +129,20 @@ def upper_half(values):
 
 @contextlib.contextmanager
 def one_core():
-    """Hold this thread, and those it starts, on one core; yield its number, None where the system has no such call."""
-    if not hasattr(os, "sched_setaffinity"):
-        yield None
-        return
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(allowed)})
-    try:
-        yield max(allowed)
-    finally:
-        os.sched_setaffinity(0, allowed)
+    """Hold this thread, and launches, on one core; yield its number, None where the system has no such call.
+
+    Launches of operators made before too, which else share their work with threads that go on elsewhere.
+    """
+    with regime(cpu_threads=1):
+        if not hasattr(os, "sched_setaffinity"):
+            yield None
+            return
+        allowed = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, {max(allowed)})
+        try:
+            yield max(allowed)
+        finally:
+            os.sched_setaffinity(0, allowed)
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Some ten float64 roundings; this is 32 of them.
 ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
+REACH_ROUNDING = wp.constant(wp.float64(1.0 + 2.0**-48))
 
 
 @wp.func
@@ -30,10 +31,18 @@ def pose_box_kernel(
     states: StatePool,
     objects: ObjectPool,
     record: LaunchRecord,
+    wide: wp.float64,
+    reach: wp.array(dtype=wp.vec4d),
     lower_out: wp.array(dtype=wp.vec3),
     upper_out: wp.array(dtype=wp.vec3),
 ):
-    """Box the posed root box of each object in the world, rounded outwards; a stale launch boxes points apart."""
+    """Box the posed root box of each object in the world, rounded outwards; a stale launch boxes points apart.
+
+    Args:
+        wide: By how much boxes are wider on all sides [world units].
+        reach: The same of each object, its motion and what comes beside it, where that is more, shape [object]; [0]
+            for none.
+    """
     i = wp.tid()
     state = objects.state[i]
     root = load_node(states, states.node_start[state] + 1)
@@ -46,15 +55,21 @@ def pose_box_kernel(
     box_lower = wp.vec3()
     box_upper = wp.vec3()
     # B is taken to A's frame by the transpose: where that is no inverse, A stands off by (R R^T - I) of its points.
-    skew = wp.float64(3.0) * measure_skew(rotation) * (wp.length(middle) + wp.length(half))
+    skew = wp.float64(3.0) * measure_skew(rotation)
+    more = wide
+    if reach.shape[0] > 0:
+        motion = wp.vec3d(reach[i][0], reach[i][1], reach[i][2])
+        # A little more than half of what `add_reach_kernel` makes of two.
+        more = wp.max(more, (reach[i][3] + wp.length(motion)) * REACH_ROUNDING)
+    skew = skew * (wp.length(middle) + wp.length(half) + more) + more
     for k in range(3):
         terms = wp.vec3d(rotation[k, 0] * middle[0], rotation[k, 1] * middle[1], rotation[k, 2] * middle[2])
         centre = terms[0] + terms[1] + terms[2] + position[k]
-        reach = wp.abs(rotation[k, 0]) * half[0] + wp.abs(rotation[k, 1]) * half[1] + wp.abs(rotation[k, 2]) * half[2]
-        size = wp.abs(terms[0]) + wp.abs(terms[1]) + wp.abs(terms[2]) + wp.abs(position[k]) + reach
-        reach = reach + ROUNDING_64 * size + skew
-        box_lower[k] = round_down(centre - reach)
-        box_upper[k] = round_up(centre + reach)
+        side = wp.abs(rotation[k, 0]) * half[0] + wp.abs(rotation[k, 1]) * half[1] + wp.abs(rotation[k, 2]) * half[2]
+        size = wp.abs(terms[0]) + wp.abs(terms[1]) + wp.abs(terms[2]) + wp.abs(position[k]) + side + more
+        side = side + ROUNDING_64 * size + skew
+        box_lower[k] = round_down(centre - side)
+        box_upper[k] = round_up(centre + side)
     # At last, so that no load waits for it.
     if is_stale(record):
         box_lower = wp.vec3(wp.float32(i), 0.0, 0.0)

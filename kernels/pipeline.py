@@ -6,6 +6,8 @@ from warp_abtree.kernels.arrays import ObjectPool
 from warp_abtree.kernels.generation import LaunchRecord, record_launch
 from warp_abtree.kernels.place_poses import is_quaternion_pose, read_position, read_quaternion
 from warp_abtree.kernels.poses import rotate_quaternion
+from warp_abtree.kernels.results import count_apart
+from warp_abtree.kernels.traversal.face_pairs import Hits
 from warp_abtree.kernels.update.work_lists import note_fault
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -44,8 +46,7 @@ def place_object_kernel(
 @wp.kernel
 def tally_demand_kernel(
     pair_count: wp.array(dtype=wp.int32),
-    hit_total: wp.array(dtype=wp.int32),
-    uncertain_total: wp.array(dtype=wp.int32),
+    hits: Hits,
     launched: wp.array(dtype=wp.int32),
     demand_inout: wp.array(dtype=wp.int64),
 ):
@@ -55,6 +56,8 @@ def tally_demand_kernel(
     Counts past 2^31 are kept, since one thread a pair or hit takes an int32 past its sign bit, not around.
     """
     demand_inout[0] = wp.max(demand_inout[0], wp.int64(wp.uint32(pair_count[0])))
-    demand_inout[1] = wp.max(demand_inout[1], wp.int64(wp.uint32(hit_total[0])))
-    demand_inout[2] = wp.max(demand_inout[2], wp.int64(wp.uint32(uncertain_total[0])))
+    demand_inout[1] = wp.max(demand_inout[1], wp.int64(wp.uint32(hits.total[0])))
+    demand_inout[2] = wp.max(demand_inout[2], wp.int64(wp.uint32(hits.uncertain_total[0])))
+    if hits.apart.shape[0] > 0:
+        demand_inout[2] = wp.max(demand_inout[2], count_apart(hits))
     demand_inout[3] = wp.max(demand_inout[3], wp.int64(launched[1]))

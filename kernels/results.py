@@ -2,10 +2,11 @@
 
 The block of n pairs, in words of 8 bytes:
 
-    [ header 4 | count n | node tests n | triangle tests n | float64 tests n | exact tests n | pairs n | flags ]
+    [ header 5 | count n | node tests n | triangle tests n | float64 tests n | exact tests n | pairs n | flags ]
 
-The header holds what became of the launch, object pairs found, intersecting face pairs, uncertain face pairs. Pairs
-stand there only where they are asked. The flags are bytes: n whether a pair intersects, n whether it is apart.
+The header holds what became of the launch, object pairs found, face pairs found, uncertain face pairs, and those that
+are listed as apart for a gap. Pairs stand there only where they are asked. The flags are bytes: n whether a pair
+intersects, n whether it is apart.
 """
 
 import warp as wp
@@ -15,7 +16,7 @@ from warp_abtree.kernels.traversal.face_pairs import Hits
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-HEADER_WORDS = wp.constant(4)
+HEADER_WORDS = wp.constant(5)
 COUNT_COLUMNS = wp.constant(5)
 BLOCK_DIM = 256
 
@@ -23,6 +24,15 @@ BLOCK_DIM = 256
 @wp.func_native(native.body("numbers.cuh", "store_flag"))
 def store_flag(words: wp.array(dtype=wp.int64), at: wp.int64, flag: wp.int32):
     """Write a byte of 0 or 1 at a place counted in bytes."""
+
+
+@wp.func
+def count_apart(hits: Hits):
+    """Return how many face pairs are listed as apart; a count past 2^31 goes past the sign bit, not around."""
+    count = wp.int64(0)
+    if hits.gap.shape[0] > 0:
+        count = wp.int64(wp.uint32(hits.apart_total[0]))
+    return count
 
 
 @wp.kernel
@@ -53,6 +63,7 @@ def pack_pair_kernel(
     if i == 0:
         words_inout[0] = wp.int64(launched[0])
         words_inout[1] = wp.int64(pair_count[0])
+        words_inout[4] = count_apart(hits)
     if i < n:
         words_inout[HEADER_WORDS + i] = hit_count
         words_inout[HEADER_WORDS + n + i] = hits.node_tests[i]

@@ -260,7 +260,7 @@ def banned_faults(tree):
 
 
 def public_names():
-    for node in parse(ROOT / "warp_abtree" / "__init__.py").body:
+    for node in parse(ROOT / "warp_abtree" / "names.py").body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
             return ast.literal_eval(node.value)
     return []

@@ -129,6 +129,103 @@ def test_commands_parse(page):
             assert not word.startswith("scenes/") or (ROOT / word).is_file()
 
 
+# Commands that are not run here, and why.
+NOT_RUN = {"view": "serves until it is stopped; tests/app/test_view_page.py", "bench": "a study; tests/bench"}
+
+
+def run_words(words):
+    """Run a command of a page at small cost, on the CPU; return why it was not run, or None."""
+    if words[0] in NOT_RUN:
+        return NOT_RUN[words[0]]
+    devices = words[words.index("--device") + 1].split(",") if "--device" in words else ["cpu"]
+    if not set(devices) <= {device.alias for device in wp.get_devices()}:
+        return f"needs {', '.join(devices)}"
+    modules = {"picture": "pyvista", "--plot": "matplotlib", "parquet": "pyarrow", "warp:": "pxr"}
+    if "--picture" in words and missing(["pyvista"]):
+        at = words.index("--picture")
+        words = words[:at] + words[at + 2 :]  # the run itself needs none
+    absent = missing([module for part, module in modules.items() if any(part in word for word in words)])
+    if absent:
+        return f"needs {', '.join(absent)}"
+    if "--frames" in words:
+        words[words.index("--frames") + 1] = "2"
+    elif words[0] == "run":
+        words = [*words, "--frames", "2"]
+    if words[0] == "sweep" and "--ray" not in words and ("--workers" in words or not missing(["ray"])):
+        return "starts a cluster of Ray; tests/jobs/test_ray_pool.py"
+    if "--device" not in words:
+        words = [*words, "--device", "cpu"]
+    with contextlib.redirect_stdout(io.StringIO()) as shown:
+        status = cli.main(words)
+    assert status == 0 and shown.getvalue(), words
+    return None
+
+
+def run_page(page, folder):
+    """Run a page's commands in a folder, after the Python and the files before them; return why some were not run.
+
+    What installs packages, over the network, is left to .ci/run.
+    """
+    skipped, space = [], {}
+    for needs, kind, block in BLOCK.findall(page.read_text(encoding="utf-8")):
+        if kind == "toml" and (name := re.match(r"# (\w+\.toml)\n", block)):
+            (folder / name[1]).write_text(block)
+        elif kind == "python" and ".save(" in block and not missing(needs.split(", ") if needs else []):
+            exec(block, space)
+        elif kind == "sh":
+            parts = [part.split("#")[0].split() for line in block.splitlines() for part in line.split("&&")]
+            for words in parts:
+                if words and words[0].removeprefix(".venv/bin/") == "warp-abtree":
+                    skipped.append(run_words(words[1:]))
+    return skipped
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=() if page.name == "README.md" else pytest.mark.slow, id=name_of(page))
+        for page in PAGES
+        if any(commands_of(page))
+    ],
+)
+def test_commands_run_as_they_stand(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
+    reasons = run_page(page, tmp_path)
+    assert reasons
+    if None not in reasons:
+        pytest.skip("; ".join(dict.fromkeys(reasons)))
+
+
+@pytest.mark.slow
+def test_examples_of_help_run(tmp_path, monkeypatch, capsys):
+    """In the order of the commands' own needs, `build` first, in a folder that has poses."""
+    pytest.importorskip("pxr")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
+    np.save("poses.npy", np.eye(7)[[6] * 3])
+    run = []
+    for name in "build info query run sweep picture".split():
+        with pytest.raises(SystemExit):
+            cli.main([name, "--help"])
+        for line in re.findall(rf"^  warp-abtree ({name} .*)$", capsys.readouterr().out, re.M):
+            run.append(run_words(line.split()))
+    assert run.count(None) >= 10
+
+
+def test_hints_name_packages_that_there_are():
+    """What a message tells to install is required by an extra under that name."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    known = {re.match(r"[\w-]+", name)[0] for name in re.findall(r'"([\w-]+[^"]*)"', text)}
+    hints = {}
+    for path in [*(ROOT / "warp_abtree").rglob("*.py"), *(ROOT / "scenes").glob("*.py")]:
+        for words in re.findall(r"pip install ([\w\[\]. -]+)", path.read_text(encoding="utf-8")):
+            hints.setdefault(words.strip(), path.name)
+    assert len(hints) > 5
+    wrong = {hint: name for hint, name in hints.items() if not set(hint.split()) <= known | {"torch"}}
+    assert not wrong, "the project is on no package index"
+
+
 def test_benchmarks_exist():
     named = {name for page in PAGES for name in re.findall(r"python -m bench (\w+)", page.read_text(encoding="utf-8"))}
     assert len(named) > 10 and named <= {*bench.CASES, *bench.STUDIES}

@@ -49,6 +49,14 @@ def sources(folder, suffixes):
     return {path.relative_to(ROOT).as_posix() for path in (ROOT / folder).rglob("*") if path.suffix in suffixes}
 
 
+def test_every_folder_of_modules_is_listed():
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    listed = re.findall(r'"([\w.]+)"', re.search(r"^packages = \[(.*?)\]", text, re.M | re.S)[1])
+    folders = {path.parent.relative_to(ROOT) for path in (ROOT / "warp_abtree").rglob("*.py")}
+    folders |= {Path("warp_abtree") / path.parent.relative_to(ROOT) for path in (ROOT / "kernels").rglob("*.py")}
+    assert sorted(listed) == sorted({".".join(folder.parts) for folder in folders} | {"warp_abtree.scenes"})
+
+
 @pytest.mark.slow
 def test_wheel_holds_the_package(wheel):
     _, file = wheel

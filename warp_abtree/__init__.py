@@ -1,59 +1,22 @@
 """Batched mesh-mesh interference queries at any level of detail, on NVIDIA Warp."""
 
-from warp_abtree.checks.arguments import wrap_array
-from warp_abtree.checks.version import __version__ as __version__
-from warp_abtree.interop.arrays import PoseInput
-from warp_abtree.interop.collision_manager import CollisionManager
-from warp_abtree.interop.newton import NewtonContacts
-from warp_abtree.interop.scenes import scene_from_file, scene_from_trimesh, to_trimesh
-from warp_abtree.lod.controllers import Feedback, PaperController, PredictiveController, ToleranceController
-from warp_abtree.lod.view import Camera
-from warp_abtree.model.mesh import MeshError
-from warp_abtree.model.model import Model, ModelError
-from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.distance import DistanceQuery
-from warp_abtree.query.manifold import ManifoldQuery
-from warp_abtree.query.narrow_phase import Query
-from warp_abtree.query.request import Buffers, CapacityError
-from warp_abtree.query.result import Result
-from warp_abtree.scene.pipeline import Pipeline
-from warp_abtree.scene.scene import Scene
-from warp_abtree.scene.sweep import sweep
-from warp_abtree.simulate.frame import Frame
-from warp_abtree.simulate.motion import Kinematic
-from warp_abtree.simulate.rigid_bodies import Dynamics
-from warp_abtree.state.batch import Batch
-from warp_abtree.state.ladder import Ladder
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Batch",
-    "Buffers",
-    "Camera",
-    "CapacityError",
-    "CollisionManager",
-    "ContactQuery",
-    "DistanceQuery",
-    "Dynamics",
-    "Feedback",
-    "Frame",
-    "Kinematic",
-    "Ladder",
-    "ManifoldQuery",
-    "MeshError",
-    "Model",
-    "ModelError",
-    "NewtonContacts",
-    "PaperController",
-    "Pipeline",
-    "PoseInput",
-    "PredictiveController",
-    "Query",
-    "Result",
-    "Scene",
-    "ToleranceController",
-    "scene_from_file",
-    "scene_from_trimesh",
-    "sweep",
-    "to_trimesh",
-    "wrap_array",
-]
+from warp_abtree.checks.version import __version__ as __version__
+
+if TYPE_CHECKING:
+    from warp_abtree.names import *  # noqa: F403
+else:
+
+    def __getattr__(name):
+        """Import Warp and the library when the first of `warp_abtree.names` is asked for."""
+        if name == "__all__" or not name.startswith("_"):
+            import warp_abtree.names as public
+
+            globals().update({known: getattr(public, known) for known in ("__all__", *public.__all__)})
+            if name in globals():
+                return globals()[name]
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+    def __dir__():
+        return [*globals(), *__getattr__("__all__")]

@@ -3,6 +3,9 @@
 Gaps are fractions of the mesh's size, poses otherwise random. Times are of a pose: of all poses at once, where each
 search starts anew (fresh) or from the faces of the launch before (again), and of one pair alone, launched to the
 result on the host. On the CPU all on one core, beside python-fcl, whose answers must be ours but for rounding.
+
+The part `gap` is contacts with a gap: `bench.gap_contacts`. The part `originals` is distances of originals while
+objects stand at coarse LODs: `bench.originals`.
 """
 
 import time
@@ -11,27 +14,41 @@ import numpy as np
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree import testing
 
+from .. import gap_contacts, originals
 from ..baselines.fcl import Fcl
 from ..meshes import ModelFolder, knot_model, mesh_file
-from ..shapes import longest_side, pose_matrices, random_poses, scene_of_poses
+from ..shapes import longest_side, place_at_gaps, pose_matrices, random_poses, scene_of_poses
 from ..timing import medians, no_garbage_collection, one_core, time_in_turn
 from .assembly import place_nut
 
 FULL = {"poses": 32, "counts": (1, 1024, 65536), "knot": 5000, "repeats": 7}
 CPU = FULL | {"counts": (1, 1024)}
 QUICK = {"poses": 3, "counts": (3,), "knot": 300, "repeats": 1}
-GAPS = 0.3, 0.01  # of the size, first and last
+PARTS = ("nearest", "gap", "originals")
 IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 MESHES = ("cow", "rocker-arm", "stanford-bunny")
 NUT = ("factory-bolt-m20", "factory-nut-m20")
 LAUNCHES_BEFORE = 20  # of the pair alone, as in a loop that goes on: slabs are made of what is asked often
-STEPS = 25  # of the bisection that places a pose at a gap
 
 
-def run(device, quick=False):
-    """Yield a row a workload: times [ms] and what the searches took; of baselines, where they are at hand."""
-    device = wp.get_device(device)
+def run(device, count=None, quick=False, only=PARTS):
+    """Yield a row a workload: times [ms] and what the searches took; of baselines, where they are at hand.
+
+    Args:
+        count: Configurations whose brackets of originals are checked.
+    """
+    if "nearest" in only:
+        yield from measure_all(wp.get_device(device), quick)
+    if "gap" in only:
+        yield from gap_contacts.run(device, quick)
+    if "originals" in only:
+        yield from originals.run(device, count, quick)
+
+
+def measure_all(device, quick):
+    """Yield the rows of distances."""
     sizes = QUICK if quick else CPU if device.is_cpu else FULL
     folder = ModelFolder(None)
     at_hand = [name for name in MESHES if mesh_file(name)]
@@ -46,25 +63,6 @@ def run(device, quick=False):
     for count in sizes["counts"]:
         matrices = pose_matrices(random_poses(longest_side(knots), count))
         yield measure(f"knot, {count} poses", [knots, knots], matrices, device, sizes["repeats"])
-
-
-def place_at_gaps(model, count):
-    """Return random poses of B, moved away from A until as far apart as gaps that lie evenly in their logarithm."""
-    size, rng = longest_side(model), np.random.default_rng(0)
-    matrices = pose_matrices(random_poses(0.0, count))
-    away = rng.normal(size=(count, 3))
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    vertices = model.mesh_at(model.lod_max)[0]
-    middle = (vertices.max(0) + vertices.min(0)) / 2
-    start = middle - np.einsum("nij,j->ni", matrices[:, :3, :3], middle)
-    low, high, gaps = np.zeros(count), np.full(count, 3 * size), size * np.geomspace(*GAPS, count)
-    for _ in range(STEPS):
-        far = (low + high) / 2
-        matrices[:, :3, 3] = start + far[:, None] * away
-        wide = ab.sweep(model, model, matrices, output="distance", device="cpu")["distance"] > gaps
-        low, high = np.where(wide, low, far), np.where(wide, far, high)
-    matrices[:, :3, 3] = start + high[:, None] * away
-    return matrices
 
 
 def measure(name, models, matrices, device, repeats):
@@ -91,7 +89,7 @@ def measure(name, models, matrices, device, repeats):
         fresh.launch()
 
     launches = {"fresh": launch_fresh, "again": query.launch, "one": lambda: (one.forget(), one.launch())}
-    with one_core():
+    with one_core(), testing.regime(cpu_threads=1):
         if device.is_cpu:
             try:
                 fcl = make_fcl(models, matrices, found, row)

@@ -26,6 +26,7 @@ class Contacts:
     normal_b: wp.array(dtype=wp.vec3d)  # unit normal of the second object's face
     normal: wp.array(dtype=wp.vec3d)  # unit normal of the contact, from the first object to the second
     coplanar: wp.array(dtype=wp.int32)  # 0 or 1
+    separation: wp.array(dtype=wp.float64)  # [world units], negative where the faces intersect; [0] without a gap
 
 
 @wp.func
@@ -84,6 +85,23 @@ def contact_objects(pairs: wp.array(dtype=wp.vec2i), pair_poses: wp.array(dtype=
 
 
 @wp.func
+def have_crossed(contacts: Contacts, i: wp.int32):
+    """Return whether a contact's faces intersect; with a gap they may be apart."""
+    if contacts.separation.shape[0] == 0:
+        return True
+    return contacts.separation[i] < wp.float64(0.0)
+
+
+@wp.func
+def blend_normals(normal_a: wp.vec3d, normal_b: wp.vec3d):
+    """Return the direction from A to B that the normals of two faces tell, 0 where neither has an area."""
+    normal = normal_a - normal_b
+    if wp.dot(normal, normal) <= SHORTEST_NORMAL * SHORTEST_NORMAL:
+        normal = normal_a
+    return unit_vector(normal)
+
+
+@wp.func
 def write_contact(
     # static
     models: ModelPool,
@@ -105,10 +123,7 @@ def write_contact(
     end1 = pose_point(rotation, objects.position[own.a], p1)
     normal_a = unit_vector(rotation * face_normal_a)
     normal_b = unit_vector(rotation * face_normal_b)
-    normal = normal_a - normal_b
-    if wp.dot(normal, normal) <= SHORTEST_NORMAL * SHORTEST_NORMAL:
-        normal = normal_a
-    normal = unit_vector(normal)
+    normal = blend_normals(normal_a, normal_b)
     if wp.dot(normal, normal) == wp.float64(0.0):
         normal = pair_direction(models, states, objects, own.a, own.b)
     back = own.swapped != 0
@@ -137,7 +152,7 @@ def find_contact_kernel(
         start: Where the face pairs of each object pair start, shape [pair + 1]; after the last pair, where all end.
     """
     i = wp.tid()
-    if i >= start[start.shape[0] - 1]:
+    if i >= start[start.shape[0] - 1] or not have_crossed(contacts_out, i):
         return
     p = faces[i][0]
     own = contact_objects(pairs, pair_poses, p)

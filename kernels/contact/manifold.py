@@ -1,12 +1,13 @@
 """Contact loops of an object pair, their normals, and candidate points: depths behind faces along those normals.
 
 A loop is a set of contacts that faces link: two contacts of a pair that share a face of either object are of one loop.
+Faces that are apart, nearer than a gap, are of no loop; their candidates have a negative depth.
 """
 
 import warp as wp
 
 from warp_abtree.kernels.arrays import LAST_KEY, ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.contact.contact import Contacts, load_corners, pair_direction
+from warp_abtree.kernels.contact.contact import Contacts, have_crossed, load_corners, pair_direction
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
@@ -24,6 +25,8 @@ LEAST_LOOP_AREA = wp.constant(wp.float64(2.0**-20))
 # By which part of a face's size its column is wider, so that walls that stand on its rim are inside.
 COLUMN_SLACK = wp.constant(wp.float64(2.0**-36))
 CORNERS = wp.constant(8)
+# Depths of candidates that there are not: the middle of the contact serves where all are so, or not even that.
+NO_DEPTH, NO_POINT = wp.constant(wp.float64(-wp.inf)), wp.constant(wp.float64(wp.nan))
 
 
 @wp.struct
@@ -34,7 +37,7 @@ class Curves:
     loop: wp.array(dtype=wp.int32)  # first contact of its loop, shape [contact]
     loop_normal: wp.array(dtype=wp.vec3d)  # at the first contact of each loop, shape [contact]
     point: wp.array2d(dtype=wp.vec3d)  # the deepest candidate and one far from it [world units], shape [contact, 2]
-    depth: wp.array2d(dtype=wp.float64)  # [world units], -1 where there is none, shape [contact, 2]
+    depth: wp.array2d(dtype=wp.float64)  # [world units], or NO_DEPTH or NO_POINT, shape [contact, 2]
     normal: wp.array(dtype=wp.vec3d)  # of both candidates, shape [contact]
     nearest: wp.array2d(dtype=wp.float64)  # squared distance from the points chosen, shape [contact, 2]
 
@@ -46,7 +49,7 @@ class Manifolds:
     count: wp.array(dtype=wp.int32)  # points of it, shape [pair]
     point: wp.array2d(dtype=wp.vec3d)  # [world units], shape [pair, POINTS]
     normal: wp.array2d(dtype=wp.vec3d)  # unit, from the pair's first object to its second, shape [pair, POINTS]
-    depth: wp.array2d(dtype=wp.float64)  # [world units] along the normal, shape [pair, POINTS]
+    depth: wp.array2d(dtype=wp.float64)  # [world units] along the normal, negative if apart, shape [pair, POINTS]
 
 
 @wp.func
@@ -95,31 +98,43 @@ def begin_loop_kernel(
     order_out[i] = i
     key_out[i] = LAST_KEY
     if i < start[start.shape[0] - 1]:
-        key_out[i] = (wp.int64(faces[i][0]) << wp.int64(31)) | wp.int64(faces[i][2])
         curves_out.parent[i] = i
+        key_out[i] = (wp.int64(faces[i][0]) << wp.int64(31)) | wp.int64(faces[i][2])
 
 
 @wp.kernel
 def link_loop_kernel(
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
     order: wp.array(dtype=wp.int32),
     key: wp.array(dtype=wp.int64),
     curves_inout: Curves,
 ):
     """Unite neighbours that share a face, in the order of the first object's faces and in that of the second's."""
     i = wp.tid()
-    if i + 1 >= start[start.shape[0] - 1]:
+    last = start[start.shape[0] - 1]
+    if i + 1 >= last:
         return
-    if faces[i][0] == faces[i + 1][0] and faces[i][1] == faces[i + 1][1]:
-        unite_roots(curves_inout.parent, i, i + 1)
-    if key[i] == key[i + 1]:
-        unite_roots(curves_inout.parent, order[i], order[i + 1])
+    j = i + 1
+    if have_crossed(contacts, i):
+        # The next one that intersects, of the same face.
+        while j + 1 < last and faces[j][1] == faces[i][1] and not have_crossed(contacts, j):
+            j += 1
+        if faces[i][0] == faces[j][0] and faces[i][1] == faces[j][1] and have_crossed(contacts, j):
+            unite_roots(curves_inout.parent, i, j)
+    j = i + 1
+    if have_crossed(contacts, order[i]):
+        while j + 1 < last and key[j] == key[i] and not have_crossed(contacts, order[j]):
+            j += 1
+        if key[i] == key[j] and have_crossed(contacts, order[j]):
+            unite_roots(curves_inout.parent, order[i], order[j])
 
 
 @wp.kernel
 def name_loop_kernel(
     start: wp.array(dtype=wp.int32),
+    contacts: Contacts,
     curves_inout: Curves,
     order_out: wp.array(dtype=wp.int32),
     key_out: wp.array(dtype=wp.int64),
@@ -131,7 +146,8 @@ def name_loop_kernel(
     if i < start[start.shape[0] - 1]:
         root = find_root(curves_inout.parent, i)
         curves_inout.loop[i] = root
-        key_out[i] = wp.int64(root)
+        if have_crossed(contacts, i):
+            key_out[i] = wp.int64(root)
 
 
 @wp.kernel
@@ -153,7 +169,7 @@ def average_loop_kernel(
     """
     k = wp.tid()
     last = start[start.shape[0] - 1]
-    if k >= last or curves_inout.loop[order[k]] != order[k]:
+    if k >= last or curves_inout.loop[order[k]] != order[k] or not have_crossed(contacts, order[k]):
         return
     root = order[k]
     origin = contacts.p0[root]
@@ -235,14 +251,20 @@ def clip_column(
 
 @wp.func
 def measure_column(
-    corner: wp.array(dtype=wp.vec3d), n: wp.vec3d, normal_a: wp.vec3d, normal_b: wp.vec3d, first: wp.int32
+    corner: wp.array(dtype=wp.vec3d),
+    n: wp.vec3d,
+    normal_a: wp.vec3d,
+    normal_b: wp.vec3d,
+    first: wp.int32,
+    least: wp.float64,
 ):
-    """Return how deep one face lies behind the other along n, where, and a second such point far from it; -1 for none.
+    """Return how deep one face lies behind the other along n, where, and a second such point far from it, or NO_DEPTH.
 
     Args:
+        least: Depth from which on there are points: 0, or minus the gap.
         corner: Corners of the pair's first object at places first .. first + 2, of its second at the others.
     """
-    none = wp.float64(-1.0)
+    none = NO_DEPTH
     facing_a = wp.dot(n, normal_a)
     facing_b = -wp.dot(n, normal_b)
     face = first
@@ -264,7 +286,7 @@ def measure_column(
     i = wp.int32(0)
     while i < count:
         depth = wp.dot(corner[face] - polygon[i], plane) / facing
-        if depth > deepest and depth >= wp.float64(0.0):
+        if depth > deepest and depth >= least:
             deepest = depth
             point = polygon[i]
         i += 1
@@ -275,12 +297,35 @@ def measure_column(
     while i < count:
         depth = wp.dot(corner[face] - polygon[i], plane) / facing
         away = wp.dot(polygon[i] - point, polygon[i] - point)
-        if away > most and depth >= wp.float64(0.5) * deepest:
+        if away > most and depth - least >= wp.float64(0.5) * (deepest - least):
             most = away
             other = depth
             second = polygon[i]
         i += 1
     return deepest, point, other, second
+
+
+@wp.func
+def write_candidates(
+    i: wp.int32,
+    rotation: wp.mat33d,
+    position: wp.vec3d,
+    n: wp.vec3d,
+    depths: wp.vec2d,
+    point: wp.vec3d,
+    second: wp.vec3d,
+    contacts: Contacts,
+    curves: Curves,
+):
+    """Write both candidates of a contact, posed to the world; where there is none its middle and an end."""
+    curves.depth[i, 0] = depths[0]
+    curves.depth[i, 1] = depths[1]
+    curves.normal[i] = rotation * n
+    curves.point[i, 0] = pose_point(rotation, position, point)
+    curves.point[i, 1] = pose_point(rotation, position, second)
+    if depths[0] == NO_DEPTH:
+        curves.point[i, 1] = contacts.p1[i]
+        curves.point[i, 0] = wp.float64(0.5) * (contacts.p0[i] + contacts.p1[i])
 
 
 @wp.kernel
@@ -290,46 +335,48 @@ def find_candidate_kernel(
     objects: ObjectPool,
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
+    gap: wp.array(dtype=wp.float64),
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
     curves_inout: Curves,
 ):
-    """Find the normal and two candidate points of one contact a thread.
+    """Find the normal and two candidate points of one contact a thread, of faces that intersect.
 
     Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least.
+
+    Args:
+        gap: How far outside the second point may be, of faces that look at one another [world units], shape [pair]; [0]
+            for not at all.
     """
     i = wp.tid()
-    if i >= start[start.shape[0] - 1]:
+    if i >= start[start.shape[0] - 1] or not have_crossed(contacts, i):
         return
     p = faces[i][0]
     swapped = pair_poses[p].swapped
     a = wp.min(pairs[p][0], pairs[p][1])
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
     load_corners(models, states, pair_poses[p], faces[i][1 + swapped], faces[i][2 - swapped], corner)
-    back = wp.transpose(objects.rotation[a])
+    rotation, position = objects.rotation[a], objects.position[a]
+    back = wp.transpose(rotation)
     normal_a = back * contacts.normal_a[i]
     normal_b = back * contacts.normal_b[i]
-    loop = back * curves_inout.loop_normal[curves_inout.loop[i]]
     first = 3 * swapped
-    n = loop
-    depth, point, other, second = measure_column(corner, n, normal_a, normal_b, first)
+    zero = wp.float64(0.0)
+    least = zero
+    if gap.shape[0] > 0 and -wp.dot(normal_a, normal_b) >= LIKENESS:
+        least = -gap[p]
+    n = back * curves_inout.loop_normal[curves_inout.loop[i]]
+    loop = n
+    depth, point, other, second = measure_column(corner, n, normal_a, normal_b, first, least)
     for k in range(2):
         m = wp.where(k == 0, normal_a, -normal_b)
         if wp.dot(m, loop) > LIKENESS:
-            d, x, e, y = measure_column(corner, m, normal_a, normal_b, first)
-            if d >= wp.float64(0.0) and (depth < wp.float64(0.0) or d <= depth):
+            d, x, e, y = measure_column(corner, m, normal_a, normal_b, first, least)
+            if d >= zero and (depth < zero or d <= depth):
                 n = m
                 depth = d
                 point = x
                 other = e
                 second = y
-    curves_inout.depth[i, 0] = depth
-    curves_inout.depth[i, 1] = other
-    rotation = objects.rotation[a]
-    curves_inout.normal[i] = rotation * n
-    curves_inout.point[i, 0] = pose_point(rotation, objects.position[a], point)
-    curves_inout.point[i, 1] = pose_point(rotation, objects.position[a], second)
-    if depth < wp.float64(0.0):
-        curves_inout.point[i, 1] = contacts.p1[i]
-        curves_inout.point[i, 0] = wp.float64(0.5) * (contacts.p0[i] + contacts.p1[i])
+    write_candidates(i, rotation, position, n, wp.vec2d(depth, other), point, second, contacts, curves_inout)

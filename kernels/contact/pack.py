@@ -2,7 +2,8 @@
 
 A record has no padding, so that its numbers lie at any byte; one thread writes one number, neighbours side by side:
 
-    [ pair 4 | faces 2 x 4 | p0, p1, normal_a, normal_b, normal 5 x 3 x 4 or 8 | coplanar 1 ] bytes of a contact
+    [ pair 4 | faces 2 x 4 | p0, p1, normal_a, normal_b, normal 5 x 3 x 4 or 8 | coplanar 1 ] bytes of a contact; with
+    a gap its separation, 4 or 8 bytes, stands before the flag
     [ count 8 | point, normal 2 x 3 x 4 or 8 | depth 4 or 8 ] bytes of a summary
 """
 
@@ -17,7 +18,7 @@ from warp_abtree.kernels.contact.summary import PairContacts
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
-# Numbers of a record: three indices, five vectors, a flag; a count, two vectors, a depth.
+# Numbers of a record: three indices, five vectors, a flag, one more with a gap; a count, two vectors, a depth.
 CONTACT_NUMBERS, PAIR_NUMBERS = 19, 8
 
 
@@ -58,7 +59,9 @@ def keep_number(x: wp.float64):
 
 @wp.func
 def load_component(contacts: Contacts, i: wp.int32, k: wp.int32):
-    """Return one of the 15 numbers of a contact's vectors."""
+    """Return one of the 15 numbers of a contact's vectors, then its separation."""
+    if k == 15:
+        return contacts.separation[i]
     c = k % 3
     vector = k // 3
     if vector == 0:
@@ -73,9 +76,10 @@ def load_component(contacts: Contacts, i: wp.int32, k: wp.int32):
 
 
 @functools.cache
-def contact_packer(real: type):
+def contact_packer(real: type, with_gap: bool):
     """Return the kernel that writes records of contacts, their real numbers float32 or float64."""
     size = wp.types.type_size_in_bytes(real)
+    numbers = 16 if with_gap else 15
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def pack_contact_kernel(
@@ -86,15 +90,15 @@ def contact_packer(real: type):
     ):
         """Write one number a thread, of the contacts from the first one on; threads are [contact, number]."""
         i, k = wp.tid()
-        at = i * wp.static(13 + 15 * size)
+        at = i * wp.static(13 + numbers * size)
         if k < 3:
             store_bits(records_out, at + 4 * k, 4, wp.int64(faces[first + i][k]))
-        elif k < 18:
+        elif k < wp.static(3 + numbers):
             x = load_component(contacts, first + i, k - 3)
             bits = wp.static(float64_bits if size == 8 else float32_bits)(x)
             store_bits(records_out, at + 12 + wp.static(size) * (k - 3), wp.static(size), bits)
         else:
-            records_out[at + wp.static(12 + 15 * size)] = wp.uint8(contacts.coplanar[first + i])
+            records_out[at + wp.static(12 + numbers * size)] = wp.uint8(contacts.coplanar[first + i])
 
     return pack_contact_kernel
 
@@ -160,6 +164,19 @@ def contact_copier(real: type):
         coplanar_out[i] = contacts.coplanar[i] != 0
 
     return copy_contact_kernel
+
+
+@functools.cache
+def number_copier(real: type):
+    """Return the kernel that copies float64 numbers into an array of another type."""
+
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    def copy_number_kernel(numbers: wp.array(dtype=wp.float64), numbers_out: wp.array(dtype=real)):
+        """Copy one number a thread."""
+        i = wp.tid()
+        numbers_out[i] = wp.static(keep_number if real is wp.float64 else round_to_float32)(numbers[i])
+
+    return copy_number_kernel
 
 
 @functools.cache

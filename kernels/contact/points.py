@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.arrays import ObjectPool
-from warp_abtree.kernels.contact.manifold import POINTS, Curves, Manifolds
+from warp_abtree.kernels.contact.manifold import NO_DEPTH, POINTS, Curves, Manifolds
 from warp_abtree.kernels.traversal.warp_stack import warp_lane, warp_max, warp_size
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -28,8 +28,8 @@ def best_of_warp(value: wp.float64, candidate: wp.int32):
 
 @wp.func
 def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
-    """Return the deepest candidate of a pair and its depth, -1 where there is none."""
-    deepest = wp.float64(-1.0)
+    """Return the deepest candidate of a pair and its depth, NO_DEPTH where there is none."""
+    deepest = NO_DEPTH
     best = CANDIDATES * first
     i = first + warp_lane()
     while i < end:
@@ -43,7 +43,7 @@ def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
 
 @wp.func
 def find_outermost(first: wp.int32, end: wp.int32, least: wp.float64, along: wp.vec3d, curves: Curves):
-    """Return the candidate that reaches farthest along a direction, of those of a least depth."""
+    """Return the candidate that reaches farthest along a direction, of those of a least depth, and how far."""
     origin = curves.point[first, 0]
     farthest = -wp.float64(wp.inf)
     best = CANDIDATES * first
@@ -55,8 +55,7 @@ def find_outermost(first: wp.int32, end: wp.int32, least: wp.float64, along: wp.
                 farthest = reach
                 best = CANDIDATES * i + k
         i += warp_size()
-    best, farthest = best_of_warp(farthest, best)
-    return best
+    return best_of_warp(farthest, best)
 
 
 @wp.func
@@ -131,18 +130,49 @@ def find_farthest(
     return best_of_warp(farthest, best)
 
 
+@wp.func
+def write_in_order(
+    p: wp.int32,
+    count: wp.int32,
+    along: wp.vec3d,
+    point: wp.array(dtype=wp.vec3d),
+    normals: wp.array(dtype=wp.vec3d),
+    depth: wp.array(dtype=wp.float64),
+    manifolds: Manifolds,
+):
+    """Write the points of a pair in the order in which they lie along a direction of its lower object.
+
+    So points that stay keep their order from step to step, whichever was found first, and whatever face they are on.
+    """
+    k = warp_lane()
+    while k < count:
+        place = wp.int32(0)
+        for j in range(count):
+            ahead = wp.dot(along, point[k] - point[j])
+            if ahead > wp.float64(0.0) or (ahead == wp.float64(0.0) and j < k):
+                place += 1
+        manifolds.point[p, place] = point[k]
+        manifolds.normal[p, place] = normals[k]
+        manifolds.depth[p, place] = depth[k]
+        k += warp_size()
+    if warp_lane() == 0:
+        manifolds.count[p] = count
+
+
 @wp.kernel
 def spread_point_kernel(
     objects: ObjectPool,
     pairs: wp.array(dtype=wp.vec2i),
+    gap: wp.array(dtype=wp.float64),
     start: wp.array(dtype=wp.int32),
     curves_inout: Curves,
     manifolds_out: Manifolds,
 ):
     """Choose the points of one pair a warp: an outermost one, those farthest from those before, the deepest.
 
-    Distance counts places, and normals in sizes of the pair's contact. Where no face of the pair looks along its
-    contact's normal, the middles of the contacts serve, with depth 0. All lanes know the points chosen.
+    Distance counts places, and normals in sizes of the pair's contact; depth counts from the gap on. Where no face of
+    the pair looks along its contact's normal, the middles of the contacts serve, with depth 0. All lanes know the
+    points chosen.
     """
     p = wp.tid() / warp_size()
     first = start[p]
@@ -151,38 +181,42 @@ def spread_point_kernel(
         manifolds_out.count[p] = 0
         return
     zero = wp.float64(0.0)
+    shell = zero
+    if gap.shape[0] > 0:
+        shell = gap[p]
     along = objects.rotation[wp.min(pairs[p][0], pairs[p][1])] * wp.vec3d(
         wp.float64(0.6134), wp.float64(0.5327), wp.float64(0.5831)
     )
     deepest_at, deepest = find_deepest(first, end, curves_inout)
-    best = find_outermost(first, end, wp.float64(0.5) * deepest, along, curves_inout)
+    half = wp.float64(0.5) * (deepest + shell) - shell
+    best, reach = find_outermost(first, end, half, along, curves_inout)
+    if reach == -wp.float64(wp.inf):
+        manifolds_out.count[p] = 0
+        return
+    floor = wp.where(deepest == NO_DEPTH, NO_DEPTH, -shell)
     point = wp.zeros(shape=(POINTS,), dtype=wp.vec3d)
     normals = wp.zeros(shape=(POINTS,), dtype=wp.vec3d)
+    depth = wp.zeros(shape=(POINTS,), dtype=wp.float64)
     count = wp.int32(0)
     size = zero
     least = zero
-    deep = zero
+    deep = -shell
     searching = bool(True)
     while searching:
         i = best / CANDIDATES
-        depth = wp.max(curves_inout.depth[i, best % CANDIDATES], zero)
+        found = curves_inout.depth[i, best % CANDIDATES]
         point[count] = curves_inout.point[i, best % CANDIDATES]
         normals[count] = curves_inout.normal[i]
-        if warp_lane() == 0:
-            manifolds_out.point[p, count] = point[count]
-            manifolds_out.normal[p, count] = normals[count]
-            manifolds_out.depth[p, count] = depth
-        deep = wp.max(deep, depth)
+        depth[count] = wp.where(found == NO_DEPTH, zero, found)
+        deep = wp.max(deep, depth[count])
         count += 1
         ends = wp.vec2i(first, end)
-        floor = wp.min(deepest, zero)
         best, farthest = find_farthest(ends, floor, size, along, count, point, normals, curves_inout)
         if count == 1:
             size = wp.sqrt(wp.max(farthest, zero))
             least = NEAREST_POINT * farthest
         if farthest <= least or count == POINTS - 1:
             best = deepest_at
-            searching = DEEPER * deepest > deep
+            searching = DEEPER * (deepest + shell) > deep + shell
         searching = searching and count < POINTS
-    if warp_lane() == 0:
-        manifolds_out.count[p] = count
+    write_in_order(p, count, along, point, normals, depth, manifolds_out)

@@ -5,6 +5,8 @@ All of it has the size of the buffer of hits, so that a CUDA graph can hold it; 
 
 import warp as wp
 
+from warp_abtree.kernels.traversal.face_pairs import PAIR_MASK
+
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
@@ -39,6 +41,7 @@ def make_key_kernel(
     row = wp.vec3i(room, 0, 0)
     if at < count_rows(total[0], face.shape[0]):
         row = face[at]
+        row[0] = row[0] & PAIR_MASK
     key = wp.int64(0)
     for k in range(3):
         if widths[k] > 0:

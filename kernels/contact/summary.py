@@ -2,14 +2,20 @@
 
 A chunk is CHUNK contacts of one pair, the pair's last one shorter. One warp a chunk sums its contacts in their order
 (on the CPU a thread), then one thread a pair its chunks in theirs, so that no bit depends on the device or on the order
-in which threads run.
+in which threads run. With a gap contacts of faces that are apart count nothing.
 """
 
 import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
-from warp_abtree.kernels.contact.contact import SHORTEST_NORMAL, Contacts, contact_objects, pair_direction
+from warp_abtree.kernels.contact.contact import (
+    SHORTEST_NORMAL,
+    Contacts,
+    contact_objects,
+    have_crossed,
+    pair_direction,
+)
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.traversal.nodes import load_node
 from warp_abtree.kernels.traversal.warp_stack import add_in_order, six_numbers, warp_lane, warp_max, warp_size
@@ -43,7 +49,9 @@ class ChunkSums:
     change: wp.array(dtype=wp.float64)  # how fast the area changes, shape [chunk]
     front: wp.array(dtype=wp.float64)  # how far the first object's faces reach along the normal, shape [chunk]
     back: wp.array(dtype=wp.float64)  # how far the second's reach against it, shape [chunk]
+    crossed: wp.array(dtype=wp.float64)  # contacts whose faces intersect, shape [chunk]; [0] without a gap
     total: wp.array(dtype=wp.float64)  # length of all contacts, or 0, shape [pair]
+    number: wp.array(dtype=wp.float64)  # of contacts whose faces intersect, shape [pair]; [0] without a gap
     middle: wp.array(dtype=wp.vec3d)  # mean point from the first end, shape [pair]
 
 
@@ -85,12 +93,16 @@ def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_
     while first < span[2]:
         k = wp.min(first + warp_lane(), span[2] - 1)
         count = wp.min(span[2] - first, warp_size())
-        length[0] = measure_length(contacts.p1[k] - contacts.p0[k])
+        crossed = wp.where(have_crossed(contacts, k), wp.float64(1.0), wp.float64(0.0))
+        length[0] = crossed * measure_length(contacts.p1[k] - contacts.p0[k])
+        length[1] = crossed
         sums = add_in_order(sums, length, count)
         first += warp_size()
     if warp_lane() == 0:
         sums_out.span[c] = span
         sums_out.length[c] = sums[0]
+        if sums_out.crossed.shape[0] > 0:
+            sums_out.crossed[c] = sums[1]
 
 
 @wp.kernel
@@ -98,12 +110,26 @@ def total_length_kernel(start: wp.array(dtype=wp.int32), sums_inout: ChunkSums):
     """Sum the lengths of one object pair's chunks a thread."""
     p = wp.tid()
     total = wp.float64(0.0)
+    number = wp.float64(0.0)
     c = first_chunk(p, start)
     end = end_chunk(p, start)
     while c < end:
         total += sums_inout.length[c]
+        if sums_inout.crossed.shape[0] > 0:
+            number += sums_inout.crossed[c]
         c += 1
     sums_inout.total[p] = total
+    if sums_inout.crossed.shape[0] > 0:
+        sums_inout.number[p] = number
+
+
+@wp.func
+def count_crossed(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
+    """Return how many contacts of a pair are of faces that intersect."""
+    number = wp.float64(start[p + 1] - start[p])
+    if sums.number.shape[0] > 0:
+        number = sums.number[p]
+    return number
 
 
 @wp.kernel
@@ -125,9 +151,11 @@ def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_in
     while first < span[2]:
         k = wp.min(first + warp_lane(), span[2] - 1)
         count = wp.min(span[2] - first, warp_size())
-        weight = wp.float64(1.0) / wp.float64(start[p + 1] - start[p])
+        weight = wp.float64(1.0) / count_crossed(p, start, sums_inout)
         if total != wp.float64(0.0):
             weight = measure_length(contacts.p1[k] - contacts.p0[k]) / total
+        if not have_crossed(contacts, k):
+            weight = wp.float64(0.0)
         middle = weight * (half * (contacts.p0[k] - origin) + half * (contacts.p1[k] - origin))
         normal = weight * contacts.normal[k]
         both = six_numbers(middle[0], middle[1], middle[2], normal[0], normal[1], normal[2])
@@ -159,7 +187,7 @@ def average_contact_kernel(
     n = no_vector()
     c = first_chunk(p, start)
     end = end_chunk(p, start)
-    if c < end:
+    if count_crossed(p, start, sums_inout) > wp.float64(0.0):
         n = wp.vec3d()
         while c < end:
             point += sums_inout.point[c]
@@ -240,13 +268,14 @@ def sum_loop_kernel(
             reach_a = wp.dot(n, pose_point(objects.rotation[own.a], objects.position[own.a], corner_a) - origin)
             reach_b = wp.dot(n, pose_point(objects.rotation[own.a], objects.position[own.a], corner_b) - origin)
             # The normal goes from the object that the pair names first.
-            front = wp.max(front, wp.where(own.swapped == 0, reach_a, reach_b))
-            back = wp.max(back, -wp.where(own.swapped == 0, reach_b, reach_a))
+            if have_crossed(contacts, k):
+                front = wp.max(front, wp.where(own.swapped == 0, reach_a, reach_b))
+                back = wp.max(back, -wp.where(own.swapped == 0, reach_b, reach_a))
         # About the mean point, since for an open curve the area depends on where it is measured from.
         r = contacts.p0[k] - origin - sums_inout.middle[p]
         s = contacts.p1[k] - contacts.p0[k]
         parts = six_numbers()
-        if contacts.coplanar[k] == 0:
+        if contacts.coplanar[k] == 0 and have_crossed(contacts, k):
             parts[0] = wp.float64(0.5) * wp.dot(n, wp.cross(r, s))
             parts[1] = loop_change(s, contacts.normal_a[k], contacts.normal_b[k], n)
         sums = add_in_order(sums, parts, count)
@@ -292,7 +321,7 @@ def measure_depth_kernel(
     """Estimate the depth of one object pair a thread, and pose its mean point; docstring of warp_abtree/contact.py."""
     p = wp.tid()
     first = start[p]
-    if first == start[p + 1]:
+    if count_crossed(p, start, sums) == wp.float64(0.0):
         pair_contacts_inout.point[p] = no_vector()
         pair_contacts_inout.depth[p] = wp.float64(0.0)
         return

@@ -14,7 +14,6 @@ from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame
 from warp_abtree.kernels.distance.node_pair import DROPPED, FACES, NODES, bound_children
 from warp_abtree.kernels.distance.report import Distances, write_nearest
 from warp_abtree.kernels.distance.search import (
-    DEPTH_FIRST_ROOM,
     nearest_stack,
     read_bound,
     warp_min_item,
@@ -22,6 +21,7 @@ from warp_abtree.kernels.distance.search import (
 )
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import PairPose, pose_point
+from warp_abtree.kernels.traversal.dual_tree import DEPTH_FIRST_ROOM
 from warp_abtree.kernels.traversal.face_pairs import Hits, test_faces
 from warp_abtree.kernels.traversal.node_pair import first_item, four_items, item_first, item_second
 from warp_abtree.kernels.traversal.warp_stack import read_item, warp_lane, warp_size, warp_sync, write_item

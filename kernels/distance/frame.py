@@ -40,6 +40,7 @@ from warp_abtree.kernels.poses import (
     reach_box,
     sum_products,
 )
+from warp_abtree.kernels.traversal.load_balance import NO_UNIT, Work
 from warp_abtree.kernels.traversal.node_pair import pack_item
 from warp_abtree.kernels.traversal.nodes import load_node
 from warp_abtree.kernels.triangle.distance import DISTANCE_MAX, EXPONENT_BITS, POSE_ROUNDING, largest, skew_of
@@ -52,6 +53,8 @@ NO_FACES = wp.constant(wp.int64(2**63 - 1))
 BOUND_ROUNDING = wp.constant(wp.float64(2.0**-19))
 # Distances over so many times a `pair_slack`, which is 2^-44 S, are not small.
 SMALL_DISTANCE = wp.constant(wp.float64(2.0**25))
+ROUNDING_UP = wp.constant(wp.float32(1.0 + 2.0**-20))
+ROUNDING_DOWN = wp.constant(wp.float32(1.0 - 2.0**-20))
 SCALE_MAX = wp.constant(wp.float64(2.0**100))
 
 
@@ -97,6 +100,7 @@ class Found:
     faces: wp.array(dtype=wp.int64)  # see `Nearest`, shape [pair]; what lies there starts the next search
     frame: wp.array(dtype=Frame)  # shape [pair]
     beyond: wp.array(dtype=wp.float64)  # distance to end at [world units], infinite for none, shape [pair]
+    upper: wp.array(dtype=wp.float32)  # what no nearest faces are beyond, scaled, shape [pair]; of warps alone
     launched: wp.array(dtype=wp.int32)  # STALE where nothing is to be done, see `generation.LaunchRecord`
 
 
@@ -170,6 +174,25 @@ def cut_of(frame: Frame, tolerances: Tolerances, distance: wp.float64):
 
 
 @wp.func
+def scaled_up(distance: wp.float64, frame: Frame):
+    """Return a distance in the scale of the boxes, not less than any pair of faces at it has in float64."""
+    return wp.float32(distance * frame.scale64) * ROUNDING_UP + frame.least
+
+
+@wp.func
+def spare_of(tolerances: Tolerances, frame: Frame):
+    """Return tolerances for float32: scaled, relative, and widths of a bracket to be taken off, scaled and relative."""
+    width = width_of(frame, wp.float64(0.0))
+    part = wp.float64(4.0) * (frame.stretch - wp.float64(1.0))
+    return wp.vec4(
+        wp.float32((tolerances.tolerance - width) * frame.scale64) * ROUNDING_DOWN,
+        wp.float32(tolerances.relative) * ROUNDING_DOWN,
+        wp.float32(width * frame.scale64) * ROUNDING_UP,
+        wp.float32(part) * ROUNDING_UP,
+    )
+
+
+@wp.func
 def load_triangles(models: ModelPool, states: StatePool, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
     """Return the corners of a face of A and of one of B, in A's frame."""
     a = states.face_corner[pose.corner_a + face_a]
@@ -200,14 +223,22 @@ def start_distance_kernel(
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
     found_inout: Found,
-    counter_out: wp.array(dtype=wp.int32),
+    work_out: Work,
 ):
-    """Prepare an object pair a thread, with the last launch's faces as the first bound where both are active."""
+    """Prepare an object pair a thread, with the last launch's faces as the first bound where both are active.
+
+    A unit of work is an object pair; a stale launch is left none.
+    """
     p = wp.tid()
+    if p < work_out.flag.shape[0]:
+        work_out.flag[p] = 0
     if p == 0:
-        counter_out[1] = 0
-        counter_out[3] = 0
-    if p >= pair_count[0] or found_inout.launched[0] == STALE:
+        stale = found_inout.launched[0] == STALE
+        work_out.counter[0] = 0
+        work_out.counter[1] = 0
+        work_out.counter[2] = wp.where(stale, 0, wp.min(pair_count[0], pairs.shape[0]))
+        work_out.counter[3] = wp.where(stale, NO_UNIT, 0)
+    if p >= wp.min(pair_count[0], pairs.shape[0]) or found_inout.launched[0] == STALE:
         return
     a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
     pose = pair_poses[p]
@@ -231,3 +262,5 @@ def start_distance_kernel(
     found_inout.frame[p] = frame
     found_inout.distance[p] = bound
     found_inout.faces[p] = kept
+    if p < found_inout.upper.shape[0]:
+        found_inout.upper[p] = scaled_up(bound, frame)

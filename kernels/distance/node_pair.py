@@ -8,7 +8,7 @@ squares of twice the distance, scaled (`frame.Frame`).
 import warp as wp
 
 from warp_abtree.kernels.arrays import StatePool
-from warp_abtree.kernels.distance.frame import Frame, Nearest, Tolerances, cut_of
+from warp_abtree.kernels.distance.frame import Frame
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.boxes import PosedBox, pose_box
 from warp_abtree.kernels.traversal.node_pair import (
@@ -46,13 +46,21 @@ def bound_boxes(a: PosedBox, b: PosedBox):
 
 
 @wp.func
-def limit_of(frame: Frame, tolerances: Tolerances, nearest: Nearest):
-    """Return the bound over which nothing matters any more: negative where all is known."""
-    cut = cut_of(frame, tolerances, nearest.distance)
-    if cut < wp.float64(0.0):
+def limit_of(frame: Frame, spare: wp.vec4, upper: wp.float32, held: wp.bool):
+    """Return the bound over which nothing matters any more: negative where all is known.
+
+    Args:
+        spare: See `frame.spare_of`; counts where there are faces at most as far as upper.
+        upper: Scaled distance that the nearest faces are not beyond.
+        held: Whether there are such faces.
+    """
+    cut = upper
+    if held:
+        part = wp.max(spare[1] * upper - spare[2], spare[0])
+        cut = upper - wp.max(part - spare[3] * upper, 0.0)
+    if cut < 0.0:
         return wp.float32(-1.0)
-    # `grow` has room for the roundings here too.
-    x = wp.float32(wp.float64(2.0) * (cut + frame.pair_slack) * frame.scale64) * frame.grow
+    x = 2.0 * (cut * frame.grow + frame.least)
     return x * x
 
 

@@ -1,8 +1,9 @@
-"""The search of two trees for their nearest faces, a warp an object pair: depth first, the nearest children first.
+"""The search of two trees for their nearest faces: depth first, the nearest children first, by warps that share work.
 
-Node pairs are dropped where their boxes are farther apart than the nearest pair of faces found so far; never where a
-pair of faces below may be as near, so that the nearest distance, and of equally near faces the lowest pair, are found
-whatever the order. With a tolerance other faces are found in another order, within it.
+Node pairs are dropped where their boxes are farther apart than the nearest pair of faces that any warp has found so
+far; never where a pair of faces below may be as near, so that the nearest distance, and of equally near faces the
+lowest pair, are found whatever the order and whoever looks. With a tolerance other faces are found in another order,
+within it.
 """
 
 import functools
@@ -11,17 +12,26 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame, Nearest, Tolerances, load_triangles
+from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame, Tolerances, load_triangles, scaled_up, spare_of
 from warp_abtree.kernels.distance.node_pair import bound_children, limit_of
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
-from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal.face_pairs import Hits
+from warp_abtree.kernels.traversal.boxes import map_point
+from warp_abtree.kernels.traversal.dual_tree import DEPTH_FIRST_ROOM, STACK_MASK, donate_items, receive_items
+from warp_abtree.kernels.traversal.face_pairs import Hits, load_corner_ids, load_near
+from warp_abtree.kernels.traversal.load_balance import (
+    Work,
+    await_donation,
+    count_idle,
+    load_tickets,
+    take_unit,
+)
 from warp_abtree.kernels.traversal.node_pair import first_item, four_items, item_first, item_second
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
     add_warp_sum,
     read_item,
+    warp_any,
     warp_lane,
     warp_size,
     warp_sync,
@@ -31,17 +41,26 @@ from warp_abtree.kernels.traversal.warp_stack import (
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
-# As in `traversal.dual_tree`.
-DEPTH_FIRST_ROOM = wp.constant(128)
+# Fewer items than the traversal gives away: far more lies below one.
+DONATION_LEAST = wp.constant(4)
+
+OPEN_START = native.constant("NEAREST_OPEN_START")
+OPEN_LENGTH = native.constant("NEAREST_OPEN_LENGTH")
 
 FIRST_TOLERANCE = wp.constant(wp.float64(0.25))
 
 stack_code = functools.partial(native.body, "nearest_stack.cuh")
+faces_code = functools.partial(native.body, "nearest_faces.cuh")
+
+three_points = wp.types.matrix(shape=(3, 3), dtype=wp.float32)
 
 
 @wp.func_native(stack_code("nearest_stack"))
 def nearest_stack() -> wp.uint64:
-    """Return where this warp's lists lie, an address in shared memory on CUDA: node pairs, face pairs, their bounds."""
+    """Return where this warp's lists lie, an address in shared memory on CUDA, and behind them a bound for each entry.
+
+    Node pairs, face pairs for float32, and face pairs for float64.
+    """
 
 
 @wp.func_native(stack_code("read_bound"))
@@ -62,92 +81,232 @@ def push_nearest(
     """
 
 
-@wp.func_native(stack_code("warp_min"))
+@wp.func_native(stack_code("push_open"))
+def push_open(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, bound: wp.float32) -> wp.int32:
+    """Append the face pairs whose flag is set to those for float64; return the new end."""
+
+
+@wp.func_native(faces_code("bound_faces"))
+def bound_faces(own: wp.float32, a: three_points, b: three_points) -> wp.vec2:
+    """Return a lower and an upper bound of the distance of two triangles, their corners in rows.
+
+    Args:
+        own: What errors of the coordinates add.
+    """
+
+
+@wp.func_native(faces_code("load_upper"))
+def load_upper(upper: wp.array(dtype=wp.float32), i: wp.int32) -> wp.float32:
+    """Return an entry that other warps write, past the first-level cache; the same in all lanes."""
+
+
+@wp.func_native(faces_code("lower_upper"))
+def lower_upper(upper: wp.array(dtype=wp.float32), i: wp.int32, x: wp.float32):
+    """Put in a number, 0 or more, if it is lower."""
+
+
+@wp.func_native(faces_code("load_distance"))
+def load_distance(distance: wp.array(dtype=wp.float64), i: wp.int32) -> wp.float64: ...
+
+
+@wp.func_native(faces_code("load_faces"))
+def load_faces(faces: wp.array(dtype=wp.int64), i: wp.int32) -> wp.int64: ...
+
+
+@wp.func_native(faces_code("offer_nearest"))
+def offer_nearest(
+    distance: wp.array(dtype=wp.float64), faces: wp.array(dtype=wp.int64), i: wp.int32, d: wp.float64, item: wp.int64
+):
+    """Put in faces that are nearer than those there, or as near and lower."""
+
+
+@wp.func_native(faces_code("warp_min"))
 def warp_min(x: wp.float64) -> wp.float64: ...
 
 
-@wp.func_native(stack_code("warp_min_item"))
+@wp.func_native(faces_code("warp_min32"))
+def warp_min32(x: wp.float32) -> wp.float32: ...
+
+
+@wp.func_native(faces_code("warp_min_item"))
 def warp_min_item(x: wp.int64) -> wp.int64: ...
 
 
+@wp.struct
+class Search:
+    """An object pair, and how a warp looks for its nearest faces."""
+
+    pair: wp.int32  # its number
+    pose: PairPose  # of B in A's frame
+    frame: Frame  # how boxes are compared
+    tolerances: Tolerances  # when they are near enough
+    room: wp.int32  # items that the stack takes, STACK_LENGTH at most
+    shared: wp.bool  # whether warps that are idle get some, and faces are measured in float64
+
+
 @wp.func
-def measure_faces(
+def load_points(models: ModelPool, states: StatePool, search: Search, face_a: wp.int32, face_b: wp.int32):
+    """Return the corners of a face of A and of one of B in rows, in A's frame, scaled."""
+    pose, frame = search.pose, search.frame
+    a, b = load_corner_ids(states, pose.corner_a + face_a), load_corner_ids(states, pose.corner_b + face_b)
+    of_a, of_b = three_points(), three_points()
+    for k in range(3):
+        of_a[k] = load_near(models, a[k]) * frame.scale
+        of_b[k] = map_point(pose.rotation32, frame.translation, load_near(models, b[k]) * frame.scale)
+    return of_a, of_b
+
+
+@wp.func
+def bound_waiting(
     items: wp.uint64,
     first: wp.int32,
     popped: wp.int32,
+    opened: wp.int32,
     limit: wp.float32,
+    upper: wp.float32,
+    search: Search,
     models: ModelPool,
     states: StatePool,
-    pose: PairPose,
-    before: Nearest,
+    found: Found,
 ):
-    """Measure the face pairs first to first + popped, one a lane; return the nearest, and how many this lane took."""
-    nearest = before
+    """Measure face pairs in float32, one a lane; keep those that may be nearest, and return how many there are."""
     at = STACK_LENGTH + first + wp.min(warp_lane(), popped - 1)
     item = read_item(items, at)
     live = warp_lane() < popped and read_bound(items, at) <= limit
     warp_sync()
-    d = wp.float64(wp.inf)
+    between = wp.vec2(wp.inf, wp.inf)
     if live:
-        d = triangle_distance(load_triangles(models, states, pose, item_first(item), item_second(item)))
-    least = warp_min(d)
-    if least <= nearest.distance:
-        lowest = warp_min_item(wp.where(d == least, item, NO_FACES))
-        if least < nearest.distance or lowest < nearest.faces:
-            nearest.distance = least
-            nearest.faces = lowest
-    return nearest, wp.where(live, 1, 0)
+        a, b = load_points(models, states, search, item_first(item), item_second(item))
+        between = bound_faces(search.frame.error, a, b)
+    least = warp_min32(between[1])
+    if least < upper:
+        lower_upper(found.upper, search.pair, least)
+    opened = push_open(items, opened, live and between[0] <= wp.min(least, upper), item, between[0])
+    warp_sync()
+    return opened, wp.where(live, 1, 0)
 
 
 @wp.func
-def search_pair(
+def decide_open(
+    items: wp.uint64,
+    first: wp.int32,
+    popped: wp.int32,
+    upper: wp.float32,
+    search: Search,
     models: ModelPool,
     states: StatePool,
-    pose: PairPose,
-    frame: Frame,
-    tolerances: Tolerances,
-    room: wp.int32,
-    start: Nearest,
+    found: Found,
 ):
-    """Return the nearest faces of an object pair, and what this lane compared: boxes and faces."""
-    nearest = start
-    items = nearest_stack()
-    if warp_lane() == 0:
-        write_item(items, 0, first_item(states, pose))
-        write_bound(items, 0, wp.float32(0.0))
+    """Measure in float64 what face pairs may still be nearest, one a lane."""
+    at = OPEN_START + first + wp.min(warp_lane(), popped - 1)
+    item = read_item(items, at)
+    live = warp_lane() < popped and read_bound(items, at) <= upper
     warp_sync()
-    limit = limit_of(frame, tolerances, nearest)
-    end, waiting = wp.int32(1), wp.int32(0)
+    if warp_any(live):
+        d = wp.float64(wp.inf)
+        if live:
+            d = triangle_distance(load_triangles(models, states, search.pose, item_first(item), item_second(item)))
+        least = warp_min(d)
+        lowest = warp_min_item(wp.where(d == least, item, NO_FACES))
+        if least <= load_distance(found.distance, search.pair):
+            offer_nearest(found.distance, found.faces, search.pair, least, lowest)
+            lower_upper(found.upper, search.pair, scaled_up(least, search.frame))
+
+
+@wp.func
+def expand_nearest(
+    items: wp.uint64,
+    first: wp.int32,
+    popped: wp.int32,
+    waiting: wp.int32,
+    limit: wp.float32,
+    states: StatePool,
+    search: Search,
+):
+    """Compare what items first to first + popped name, one a lane; return both ends, see `push_nearest`, and tests."""
+    at = (first + wp.min(warp_lane(), popped - 1)) & STACK_MASK
+    item = read_item(items, at)
+    live = wp.where(warp_lane() < popped and read_bound(items, at) <= limit, -1, 0)
+    warp_sync()
+    children, kinds, bounds, compared = bound_children(states, search.pose, search.frame, limit, item, live)
+    ends = push_nearest(items, first, waiting, kinds, children, bounds)
+    warp_sync()
+    return ends, compared
+
+
+@wp.func
+def search_items(
+    # static
+    search: Search,
+    count: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    # state
+    found: Found,
+    work: Work,
+):
+    """Search so many items on the stack that are not given away; return what this lane compared: boxes and faces."""
+    items, pair, frame = nearest_stack(), search.pair, search.frame
+    head, end, waiting, opened = wp.int32(0), wp.int32(count), wp.int32(0), wp.int32(0)
     tests = wp.vec2i()
-    while end > 0 or waiting > 0:
-        if end > 0 and waiting < warp_size():
+    held = load_faces(found.faces, pair) != NO_FACES
+    beyond = scaled_up(load_distance(found.distance, pair), frame)
+    spare = spare_of(search.tolerances, frame)
+    while end > head or waiting > 0 or opened > 0:
+        tickets = wp.int64(0)
+        if search.shared:
+            tickets = load_tickets(work.counter)
+        upper = load_upper(found.upper, pair)
+        held = held or upper < beyond
+        limit = limit_of(frame, spare, upper, held)
+        if end > head and waiting < warp_size():
             # One at a time, depth first, needs little room; more where there is.
-            popped = wp.max(1, (room - DEPTH_FIRST_ROOM - end) >> 2)
-            popped = wp.min(popped, wp.min(warp_size(), end))
+            popped = wp.max(1, (search.room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
+            popped = wp.min(popped, wp.min(warp_size(), end - head))
             end -= popped
-            at = end + wp.min(warp_lane(), popped - 1)
-            item = read_item(items, at)
-            live = wp.where(warp_lane() < popped and read_bound(items, at) <= limit, -1, 0)
-            warp_sync()
-            children, kinds, bounds, compared = bound_children(states, pose, frame, limit, item, live)
-            ends = push_nearest(items, end, waiting, kinds, children, bounds)
-            warp_sync()
+            ends, compared = expand_nearest(items, end, popped, waiting, limit, states, search)
             end = item_second(ends)
             waiting = item_first(ends)
             tests[0] += compared
         # The first face pairs are measured at once: until then, nothing is dropped.
-        if waiting >= warp_size() or (waiting > 0 and (end == 0 or nearest.faces == NO_FACES)):
+        if waiting >= warp_size() or (waiting > 0 and (end == head or not held)):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
-            nearest, measured = measure_faces(items, waiting, popped, limit, models, states, pose, nearest)
-            limit = limit_of(frame, tolerances, nearest)
+            opened, measured = bound_waiting(
+                items, waiting, popped, opened, limit, upper, search, models, states, found
+            )
             tests[1] += measured
-    return nearest, tests
+        if opened > OPEN_LENGTH - warp_size() or (opened > 0 and end == head and waiting == 0):
+            popped = wp.min(opened, warp_size())
+            opened -= popped
+            if search.shared:
+                upper = load_upper(found.upper, pair)
+                decide_open(items, opened, popped, upper, search, models, states, found)
+        idle = count_idle(tickets)
+        if idle > 0 and end - head >= 2 * DONATION_LEAST:
+            head = donate_items(DONATION_LEAST, pair, idle, items, head, end, work)
+    return tests
+
+
+@wp.func
+def start_items(slot: wp.int32, states: StatePool, pose: PairPose, work: Work):
+    """Put both roots on the empty stack, or what lies in a slot, 0 or more; return how many items."""
+    items = nearest_stack()
+    size = wp.int32(1)
+    if slot >= 0:
+        size = receive_items(items, slot, work)
+    elif warp_lane() == 0:
+        write_item(items, 0, first_item(states, pose))
+    if warp_lane() < size:
+        write_bound(items, warp_lane(), wp.float32(0.0))
+    warp_sync()
+    return size
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
 def search_warp_kernel(
     room: wp.int32,
+    rough_least: wp.int32,
     tolerances: Tolerances,
     models: ModelPool,
     states: StatePool,
@@ -155,29 +314,47 @@ def search_warp_kernel(
     pair_poses: wp.array(dtype=PairPose),
     found_inout: Found,
     hits_inout: Hits,
+    work_inout: Work,
 ):
-    """Search the object pairs that do not intersect, a warp a pair."""
-    p = wp.tid() / warp_size()
-    if p >= pair_count[0] or found_inout.launched[0] == STALE:
-        return
-    if hits_inout.any_hit[p] != 0:
-        return
-    nearest = Nearest()
-    nearest.distance = found_inout.distance[p]
-    nearest.faces = found_inout.faces[p]
-    pose = pair_poses[p]
-    # Without faces to start from, what is found within a wide tolerance is: far fewer are looked at in vain.
-    turn = wp.where(nearest.faces == NO_FACES, 0, 1)
-    tests = wp.vec2i()
-    while turn < 2:
-        asked = tolerances
-        if turn == 0:
-            asked.relative = wp.max(tolerances.relative, FIRST_TOLERANCE)
-        nearest, more = search_pair(models, states, pose, found_inout.frame[p], asked, room, nearest)
-        tests += more
-        turn += 1
-    if warp_lane() == 0:
-        found_inout.distance[p] = nearest.distance
-        found_inout.faces[p] = nearest.faces
-    add_warp_sum(hits_inout.node_tests, p, tests[0])
-    add_warp_sum(hits_inout.triangle_tests, p, tests[1])
+    """Search the object pairs that do not intersect: units of work, a pair each, and donated items.
+
+    Args:
+        rough_least: Object pairs from which on each is searched roughly first.
+    """
+    count = wp.min(pair_count[0], pair_poses.shape[0])
+    search = Search()
+    search.room = room
+    p = take_unit(work_inout.counter)
+    ended = wp.int32(0)
+    while True:
+        slot = wp.int32(-1)
+        if p >= count:
+            slot = await_donation(work_inout.counter, work_inout.flag, ended)
+            if slot < 0:
+                return
+            ended = 0
+            p = work_inout.owner[slot][0]
+        if hits_inout.any_hit[p] == 0:
+            search.pair = p
+            search.pose = pair_poses[p]
+            search.frame = found_inout.frame[p]
+            tests = wp.vec2i()
+            rough = slot < 0 and count >= rough_least and load_faces(found_inout.faces, p) == NO_FACES
+            searching = bool(True)
+            while searching:
+                # What is found within a wide tolerance is a start: far fewer are looked at in vain.
+                asked = tolerances
+                if rough:
+                    asked.relative = wp.max(tolerances.relative, FIRST_TOLERANCE)
+                search.shared = not rough
+                search.tolerances = asked
+                size = start_items(slot, states, search.pose, work_inout)
+                tests += search_items(search, size, models, states, found_inout, work_inout)
+                searching = rough
+                rough = False
+            add_warp_sum(hits_inout.node_tests, p, tests[0])
+            add_warp_sum(hits_inout.triangle_tests, p, tests[1])
+        ended += 1
+        p = count
+        if slot < 0:
+            p = take_unit(work_inout.counter)

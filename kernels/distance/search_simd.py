@@ -17,7 +17,8 @@ from warp_abtree.kernels.distance.frame import (
     Nearest,
     Tolerances,
     load_triangles,
-    width_of,
+    scaled_up,
+    spare_of,
 )
 from warp_abtree.kernels.distance.slabs import Slabs, has_slabs
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
@@ -32,8 +33,6 @@ MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
 NEAREST_WORDS = native.constant("NEAREST_WORDS")
-ROUNDING_UP = wp.constant(wp.float32(1.0 + 2.0**-20))
-ROUNDING_DOWN = wp.constant(wp.float32(1.0 - 2.0**-20))
 
 
 @wp.func_native(native.body("nearest/lists.h", "open_search"))
@@ -72,25 +71,6 @@ def take_nearest(upper: wp.float32, thread: wp.int32, memory: wp.array2d(dtype=w
     Args:
         upper: Scaled distance that the nearest faces are not beyond.
     """
-
-
-@wp.func
-def scaled_up(distance: wp.float64, frame: Frame):
-    """Return a distance in the scale of the boxes, not less than any pair of faces at it has in float64."""
-    return wp.float32(distance * frame.scale64) * ROUNDING_UP + frame.least
-
-
-@wp.func
-def spare_of(tolerances: Tolerances, frame: Frame):
-    """Return tolerances for float32: scaled, relative, and widths of a bracket to be taken off, scaled and relative."""
-    width = width_of(frame, wp.float64(0.0))
-    part = wp.float64(4.0) * (frame.stretch - wp.float64(1.0))
-    return wp.vec4(
-        wp.float32((tolerances.tolerance - width) * frame.scale64) * ROUNDING_DOWN,
-        wp.float32(tolerances.relative) * ROUNDING_DOWN,
-        wp.float32(width * frame.scale64) * ROUNDING_UP,
-        wp.float32(part) * ROUNDING_UP,
-    )
 
 
 @wp.func

@@ -17,6 +17,9 @@ DYNAMIC = wp.constant(2)
 
 HALF = wp.constant(wp.float64(0.5))
 
+REACH_LEAST, REACH_MAX = wp.constant(wp.float64(2.0**-8)), wp.constant(wp.float64(0.25))
+"""How far ahead of a body contacts are looked for, beside its motion in a step, and motion at most, in its radii."""
+
 
 @wp.struct
 class Bodies:
@@ -35,6 +38,7 @@ class Bodies:
     rotation: wp.array(dtype=wp.quatd)  # of the body frame, x y z w
     velocity: wp.array(dtype=wp.vec3d)  # of the centre of mass [world units/s]
     momentum: wp.array(dtype=wp.vec3d)  # angular momentum, world frame; of kinematic objects angular velocity [rad/s]
+    reach: wp.array(dtype=wp.vec4d)  # motion in a step, and reach beside it, for contacts ahead [world units]
     # of one step
     inverse_inertia: wp.array(dtype=wp.mat33d)  # world frame; of kinematic objects the identity
     pseudo_velocity: wp.array(dtype=wp.vec3d)  # of the position correction [world units/s]
@@ -83,6 +87,8 @@ def judge_contacts_kernel(
     whole = whole and wp.uint32(hits.total[0]) <= wp.uint32(hits.face.shape[0])
     if hits.uncertain.shape[0] > 0:
         whole = whole and wp.uint32(hits.uncertain_total[0]) <= wp.uint32(hits.uncertain.shape[0])
+    if hits.apart.shape[0] > 0:
+        whole = whole and wp.uint32(hits.apart_total[0]) <= wp.uint32(hits.apart.shape[0])
     bodies_out.is_whole[0] = wp.where(whole, 1, 0)
 
 
@@ -116,6 +122,19 @@ def begin_step_kernel(
         bodies_inout.inverse_inertia[i] = wp.identity(n=3, dtype=wp.float64)
 
 
+@wp.func
+def reach_of(bodies: Bodies, i: wp.int32, dt: wp.float64):
+    """Return how an object's centre moves in a step, and how far its surface may beside that, and a little more."""
+    motion = dt * bodies.velocity[i]
+    if bodies.motion_type[i] != DYNAMIC:
+        return wp.vec4d(motion[0], motion[1], motion[2], wp.float64(0.0))
+    radius = bodies.bounding_radius[i]
+    most = REACH_MAX * radius
+    motion = motion * wp.min(most / wp.max(wp.length(motion), most), wp.float64(1.0))
+    turn = dt * wp.length(bodies.inverse_inertia[i] * bodies.momentum[i]) * radius
+    return wp.vec4d(motion[0], motion[1], motion[2], wp.min(turn, most) + REACH_LEAST * radius)
+
+
 @wp.kernel
 def integrate_kernel(
     dt: wp.float64,
@@ -128,6 +147,7 @@ def integrate_kernel(
     i = wp.tid()
     if bodies_inout.is_whole[0] == 0:
         return
+    bodies_inout.reach[i] = reach_of(bodies_inout, i, dt)
     if bodies_inout.motion_type[i] == KINEMATIC:
         objects_inout.rotation[i] = targets.rotation[i]
         objects_inout.position[i] = targets.position[i]

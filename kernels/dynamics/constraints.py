@@ -29,6 +29,7 @@ class Constraints:
     mass: wp.array2d(dtype=wp.float64)  # effective mass along the normal
     tangent_mass: wp.array2d(dtype=wp.mat33d)  # effective mass across the normal, world frame
     bias: wp.array2d(dtype=wp.float64)  # separation speed that the position correction aims for [world units/s]
+    approach: wp.array2d(dtype=wp.float64)  # speed at which points that are apart meet after the step [world units/s]
     impulse: wp.array2d(dtype=wp.float64)  # accumulated, along the normal
     friction_impulse: wp.array2d(dtype=wp.vec3d)  # accumulated, across the normal, world frame
     pseudo_impulse: wp.array2d(dtype=wp.float64)  # accumulated, of the position correction
@@ -158,7 +159,9 @@ def prepare_constraints_kernel(
         constraints_out.arm_a[p, k] = x - bodies.position[a]
         constraints_out.arm_b[p, k] = x - bodies.position[b]
         set_effective_mass(bodies, constraints_out, c)
-        constraints_out.bias[p, k] = BAUMGARTE * (manifolds.depth[p, k] - SLOP * radius) / dt
+        depth = wp.max(manifolds.depth[p, k], wp.float64(0.0))
+        constraints_out.bias[p, k] = BAUMGARTE * (depth - SLOP * radius) / dt
+        constraints_out.approach[p, k] = (depth - manifolds.depth[p, k]) / dt
         constraints_out.impulse[p, k] = wp.float64(0.0)
         constraints_out.friction_impulse[p, k] = wp.vec3d()
         constraints_out.pseudo_impulse[p, k] = wp.float64(0.0)

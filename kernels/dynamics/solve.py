@@ -114,6 +114,7 @@ class Contact:
     arm_b: wp.vec3d  # from that of the second
     mass: wp.float64  # effective mass along the normal
     tangent_mass: wp.mat33d  # effective mass across it, world frame
+    approach: wp.float64  # speed at which its points may approach [world units/s]
     impulse: wp.float64  # accumulated, along the normal
     friction_impulse: wp.vec3d  # accumulated, across it
 
@@ -126,6 +127,7 @@ def load_contact(manifolds: Manifolds, constraints: Constraints, p: wp.int32, k:
     c.arm_b = constraints.arm_b[p, k]
     c.mass = constraints.mass[p, k]
     c.tangent_mass = constraints.tangent_mass[p, k]
+    c.approach = constraints.approach[p, k]
     c.impulse = constraints.impulse[p, k]
     c.friction_impulse = constraints.friction_impulse[p, k]
     return c
@@ -171,7 +173,7 @@ def relax_velocities(
         momentum_b = push_momentum(b, momentum_b, c.arm_b, impulse)
         at_a = point_velocity(a.inverse_inertia, velocity_a, momentum_a, c.arm_a)
         at_b = point_velocity(b.inverse_inertia, velocity_b, momentum_b, c.arm_b)
-        after = wp.max(c.impulse - c.mass * wp.dot(c.normal, at_b - at_a), wp.float64(0.0))
+        after = wp.max(c.impulse - c.mass * (wp.dot(c.normal, at_b - at_a) + c.approach), wp.float64(0.0))
         constraints.impulse[p, k] = after
         impulse = (after - c.impulse) * c.normal
         velocity_a = push_velocity(a, velocity_a, -impulse)
@@ -191,6 +193,7 @@ class Overlap:
     arm_b: wp.vec3d  # from that of the second
     mass: wp.float64  # effective mass along the normal
     bias: wp.float64  # separation speed aimed for [world units/s]
+    approach: wp.float64  # speed at which its points may approach [world units/s]
     impulse: wp.float64  # accumulated, along the normal
     pseudo_impulse: wp.float64  # accumulated, of the correction
 
@@ -203,6 +206,7 @@ def load_overlap(manifolds: Manifolds, constraints: Constraints, p: wp.int32, k:
     c.arm_b = constraints.arm_b[p, k]
     c.mass = constraints.mass[p, k]
     c.bias = constraints.bias[p, k]
+    c.approach = constraints.approach[p, k]
     c.impulse = constraints.impulse[p, k]
     c.pseudo_impulse = constraints.pseudo_impulse[p, k]
     return c
@@ -252,7 +256,8 @@ def relax_positions(
             after = c.pseudo_impulse - c.mass * (separation - c.bias)
             # Resting contacts sink to the slop, where rounding does not break them; other points are never pulled.
             if fast == zero or c.impulse <= zero:
-                after = wp.max(c.pseudo_impulse - c.mass * (separation - wp.max(c.bias, zero)), zero)
+                wanted = wp.max(c.bias, zero) - c.approach
+                after = wp.max(c.pseudo_impulse - c.mass * (separation - wanted), zero)
             constraints.pseudo_impulse[p, k] = after
             impulse = (after - c.pseudo_impulse) * c.normal
             pseudo_a = push_velocity(a, pseudo_a, -impulse)

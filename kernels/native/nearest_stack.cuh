@@ -1,4 +1,5 @@
-// A warp's lists of a search for the nearest faces: node pairs and face pairs, each with a bound of its distance.
+// A warp's lists of a search for the nearest faces: a ring of node pairs, face pairs to be measured in float32 and those
+// to be measured in float64, each with a bound of its distance.
 #pragma once
 #include "builtin.h"
 #include "sizes.h"
@@ -6,10 +7,10 @@
 inline CUDA_CALLABLE wp::uint64 nearest_stack() {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
-    __shared__ long long items[STRADDLING_START + STRADDLING_START / 2];
+    __shared__ long long items[NEAREST_LENGTH + NEAREST_LENGTH / 2];
     return __cvta_generic_to_shared(items);
 #else
-    static long long items[STRADDLING_START + STRADDLING_START / 2];
+    static long long items[NEAREST_LENGTH + NEAREST_LENGTH / 2];
     return (wp::uint64)items;
 #endif
 }
@@ -20,21 +21,21 @@ inline CUDA_CALLABLE wp::float32 read_bound(wp::uint64 items, wp::int32 i) {
     float bound;
     asm volatile("ld.shared.f32 %0, [%1];"
                  : "=f"(bound)
-                 : "r"((unsigned int)items + 8 * STRADDLING_START + 4 * i)
+                 : "r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * i)
                  : "memory");
     return bound;
 #else
-    return ((const float*)((const long long*)items + STRADDLING_START))[i];
+    return ((const float*)((const long long*)items + NEAREST_LENGTH))[i];
 #endif
 }
 
 inline CUDA_CALLABLE void write_bound(wp::uint64 items, wp::int32 i, wp::float32 bound) {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
-    asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * STRADDLING_START + 4 * i), "f"(bound)
+    asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * i), "f"(bound)
                  : "memory");
 #else
-    ((float*)((long long*)items + STRADDLING_START))[i] = bound;
+    ((float*)((long long*)items + NEAREST_LENGTH))[i] = bound;
 #endif
 }
 
@@ -64,10 +65,11 @@ inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp:
         const unsigned int below = (1u << threadIdx.x) - 1u;
         const unsigned int nodes = __ballot_sync(0xffffffffu, kinds[k] == 1);
         const unsigned int faces = __ballot_sync(0xffffffffu, kinds[k] == 2);
-        const int at = kinds[k] == 1 ? end + __popc(nodes & below) : STACK_LENGTH + leaf_end + __popc(faces & below);
+        const int place = (end + __popc(nodes & below)) & (STACK_LENGTH - 1);
+        const int at = kinds[k] == 1 ? place : STACK_LENGTH + leaf_end + __popc(faces & below);
         if (kinds[k] != 0) {
             asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"(children[k]) : "memory");
-            asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * STRADDLING_START + 4 * at),
+            asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * at),
                          "f"(bounds[k])
                          : "memory");
         }
@@ -75,29 +77,13 @@ inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp:
         leaf_end += __popc(faces);
 #else
         if (kinds[k] != 0) {
-            const int at = kinds[k] == 1 ? end++ : STACK_LENGTH + leaf_end++;
+            const int at = kinds[k] == 1 ? end++ & (STACK_LENGTH - 1) : STACK_LENGTH + leaf_end++;
             ((long long*)items)[at] = children[k];
-            ((float*)((long long*)items + STRADDLING_START))[at] = bounds[k];
+            ((float*)((long long*)items + NEAREST_LENGTH))[at] = bounds[k];
         }
 #endif
     }
     return ((long long)leaf_end << 32) | (unsigned int)end;
-}
-
-inline CUDA_CALLABLE wp::float64 warp_min(wp::float64 x) {
-#if defined(__CUDA_ARCH__)
-    for (int step = 16; step > 0; step >>= 1)
-        x = wp::min(x, __shfl_xor_sync(0xffffffffu, x, step));
-#endif
-    return x;
-}
-
-inline CUDA_CALLABLE wp::int64 warp_min_item(wp::int64 x) {
-#if defined(__CUDA_ARCH__)
-    for (int step = 16; step > 0; step >>= 1)
-        x = wp::min(x, (wp::int64)__shfl_xor_sync(0xffffffffu, (long long)x, step));
-#endif
-    return x;
 }
 
 inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp::vec_t<4, wp::int32> kinds,
@@ -117,7 +103,7 @@ inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp
         if (kinds[k] != 0) {
             --at;
             asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"(children[k]) : "memory");
-            asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * STRADDLING_START + 4 * at),
+            asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * at),
                          "f"((float)kinds[k])
                          : "memory");
         }
@@ -128,8 +114,29 @@ inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp
         if (kinds[k] != 0) {
             --at;
             ((long long*)items)[at] = children[k];
-            ((float*)((long long*)items + STRADDLING_START))[at] = (float)kinds[k];
+            ((float*)((long long*)items + NEAREST_LENGTH))[at] = (float)kinds[k];
         }
     return end + mine;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 push_open(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item,
+                                         wp::float32 bound) {
+#include "sizes.h"
+#if defined(__CUDA_ARCH__)
+    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    const int at = NEAREST_OPEN_START + end + __popc(votes & ((1u << threadIdx.x) - 1u));
+    if (flag) {
+        asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"((long long)item) : "memory");
+        asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * at), "f"(bound)
+                     : "memory");
+    }
+    return end + __popc(votes);
+#else
+    if (flag) {
+        ((long long*)items)[NEAREST_OPEN_START + end] = item;
+        ((float*)((long long*)items + NEAREST_LENGTH))[NEAREST_OPEN_START + end] = bound;
+    }
+    return end + flag;
 #endif
 }

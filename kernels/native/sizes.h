@@ -31,6 +31,13 @@ static_assert(SMALL_INNER >= 2 * SMALL_LEAVES && SMALL_FACES >= SMALL_INNER, "bo
 static_assert(SMALL_FACES == 12 * SMALL_ROWS && SMALL_A == SMALL_FACES + SMALL_ROWS, "boxes, then their faces");
 static_assert(SMALL_B == SMALL_A + SMALL_LEAVES && 4 * (SMALL_B + SMALL_LEAVES) <= STACK_LENGTH * ITEM_BYTES, "room");
 
+// Of a search for the nearest faces: node pairs, face pairs for float32, and behind them those for float64.
+constexpr int NEAREST_OPEN_START = 672;
+constexpr int NEAREST_OPEN_LENGTH = 64;
+constexpr int NEAREST_LENGTH = 736;
+static_assert(NEAREST_OPEN_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
+static_assert(NEAREST_LENGTH == NEAREST_OPEN_START + NEAREST_OPEN_LENGTH, "lists lie one behind the other");
+
 // Slots of the queue in which idle warps wait, each with room for so many items: one a lane.
 // More than there are units of any launch: as the number of units taken, it leaves none.
 constexpr int NO_UNIT = 1073741824;
@@ -60,11 +67,12 @@ static_assert(SUBTREE_LEAVES == 1 << SUBTREE_DEPTH, "of a binary tree");
 static_assert(SUBTREE_RECORDS == 2 * SUBTREE_LEAVES, "one a node, by its place in the subtree");
 
 // A search for the nearest faces on the CPU: node pairs that wait for later, faces for float64, faces for float32, node
-// pairs taken at once, and words of a thread.
+// pairs taken at once, faces measured from which on slabs are compared along the nodes' normals, and words of a thread.
 constexpr int LATER_LENGTH = 4096;
 constexpr int OPEN_LENGTH = 256;
 constexpr int NEAREST_FACES = 128;
 constexpr int NEAREST_AT_ONCE = 8;
+constexpr int NORMALS_LEAST = 4096;
 constexpr int NEAREST_WORDS = 16400;
 static_assert(NEAREST_FACES >= 15 + 4 * NEAREST_AT_ONCE + 16 && NEAREST_AT_ONCE % 4 == 0, "loads go beyond");
 static_assert(NEAREST_WORDS == 16 + 3 * (CPU_STACK_LENGTH + LATER_LENGTH + OPEN_LENGTH) + 2 * NEAREST_FACES, "no gap");

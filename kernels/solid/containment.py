@@ -41,7 +41,7 @@ def find_inside(
     centre: wp.vec3d,
 ):
     """Return the lowest face that stands for a component inside the solid A, or B, of the other's state; or NO_FACE."""
-    lowest = NO_FACE
+    lowest = wp.int32(NO_FACE)
     i = wp.int32(0)
     while i < solids.count[state]:
         face = solids.face[solids.first[state] + i]

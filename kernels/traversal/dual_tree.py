@@ -116,10 +116,12 @@ def receive_items(items: wp.uint64, slot: wp.int32, work: Work):
 
 
 @wp.func
-def donate_items(items: wp.uint64, pair: wp.int32, head: wp.int32, end: wp.int32, idle: wp.int32, work: Work):
-    """Serve idle warps with the oldest items, which have most below them; return the new head."""
+def donate_items(
+    least: wp.int32, pair: wp.int32, idle: wp.int32, items: wp.uint64, head: wp.int32, end: wp.int32, work: Work
+):
+    """Serve idle warps with the oldest items, so many each at least: most lies below them. Return the new head."""
     wanted = wp.min(idle, DONATIONS_AT_ONCE)
-    size = wp.min(wp.max((end - head) / (wanted + 1), DONATION_LEAST), SLOT_ITEMS)
+    size = wp.min(wp.max((end - head) / (wanted + 1), least), SLOT_ITEMS)
     lane = warp_lane()
     while wanted > 0 and end - head >= 2 * size:
         ticket = claim_slot(work.counter, work.flag)
@@ -187,7 +189,7 @@ def traverse_items(
             uncertain_count += wp.where(uncertain, 1, 0)
         idle = count_idle(tickets)
         if idle > 0 and end - head >= 2 * DONATION_LEAST:
-            head = donate_items(items, pair, head, end, idle, work)
+            head = donate_items(DONATION_LEAST, pair, idle, items, head, end, work)
         if for_any:
             if warp_any(found or hits.any_hit[pair] != 0):
                 end = head

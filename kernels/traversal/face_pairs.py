@@ -12,6 +12,8 @@ from warp_abtree.kernels.triangle.distance import triangles_near
 from warp_abtree.kernels.triangle.float32_filter import (
     FLOAT32_UNIT,
     are_uncertain,
+    gap_signs,
+    have_one_side,
     intersect_straddling,
     plane_signs,
     rotate_corners,
@@ -26,6 +28,14 @@ OUTPUT_FACES = wp.constant(2)
 
 # In place of a precision: faces count as met unless proved farther apart than a distance.
 WITHIN = wp.constant(-1)
+# EXACT, and face pairs that are apart by less than a gap are listed too.
+GAP = wp.constant(-2)
+
+# On the pair of a face pair in `Hits.face`: it is apart.
+NEAR_BIT = wp.constant(1 << 30)
+PAIR_MASK = wp.constant((1 << 30) - 1)
+# In float32 a gap is no larger, so that its products with lengths are finite; and rounded up.
+GAP_MAX, GAP_ROUNDING_32 = wp.constant(2.0**60), wp.constant(1.0 + 2.0**-20)
 
 
 @wp.struct
@@ -42,6 +52,9 @@ class Hits:
     exact_tests: wp.array(dtype=wp.int64)  # those that are inexact in float64 and took exact signs, shape [pair]
     uncertain: wp.array(dtype=wp.vec3i)  # (pair, face of the lower object, face of the higher), shape [capacity]
     uncertain_total: wp.array(dtype=wp.int32)  # numbers `uncertain`
+    gap: wp.array(dtype=wp.float64)  # under which face pairs are near [world units], shape [pair]; [0] for no gap
+    apart: wp.array(dtype=wp.vec3i)  # as `uncertain`: pairs that are apart and may be near, shape [capacity]
+    apart_total: wp.array(dtype=wp.int32)  # numbers `apart`
 
 
 @wp.func_native(native.body("numbers.cuh", "load_corner"))
@@ -76,6 +89,12 @@ def float32_bounds(mode: wp.int32, pose: PairPose):
 
 
 @wp.func
+def scaled_gap(pose: PairPose):
+    """Return the distance that boxes are widened by at the scale of float32, not too small."""
+    return wp.min(wp.float32(pose.within * pose.scale) * GAP_ROUNDING_32, GAP_MAX)
+
+
+@wp.func
 def face_plane_signs(
     mode: wp.int32,
     models: ModelPool,
@@ -90,16 +109,11 @@ def face_plane_signs(
     a = load_corner_ids(states, pose.corner_a + face_a)
     b = load_corner_ids(states, pose.corner_b + face_b)
     error, unit = float32_bounds(mode, pose)
-    return plane_signs(
-        error,
-        unit,
-        near_of_a(models, pose, a[0]),
-        near_of_a(models, pose, a[1]),
-        near_of_a(models, pose, a[2]),
-        near_of_b(models, pose, b[0]),
-        near_of_b(models, pose, b[1]),
-        near_of_b(models, pose, b[2]),
-    )
+    a0, a1, a2 = near_of_a(models, pose, a[0]), near_of_a(models, pose, a[1]), near_of_a(models, pose, a[2])
+    b0, b1, b2 = near_of_b(models, pose, b[0]), near_of_b(models, pose, b[1]), near_of_b(models, pose, b[2])
+    if mode == GAP:
+        return gap_signs(error, unit, scaled_gap(pose), a0, a1, a2, b0, b1, b2)
+    return plane_signs(error, unit, a0, a1, a2, b0, b1, b2)
 
 
 @wp.func
@@ -114,6 +128,8 @@ def intersect_straddling_faces(
 ):
     """Test straddling faces in float32, with the signs of `face_plane_signs`; return 1, 0 or UNCERTAIN."""
     error, unit = float32_bounds(mode, pose)
+    if mode == GAP and have_one_side(signs):
+        return 0
     if are_uncertain(unit, signs):
         return UNCERTAIN
     a = load_corner_ids(states, pose.corner_a + face_a)
@@ -179,6 +195,13 @@ def defer_uncertain(slot: wp.int32, pair: wp.int32, face_a: wp.int32, face_b: wp
     """Put a face pair on the list of uncertain ones, if there is room."""
     if slot >= 0 and slot < hits.uncertain.shape[0]:
         hits.uncertain[slot] = wp.vec3i(pair, face_a, face_b)
+
+
+@wp.func
+def list_apart(slot: wp.int32, pair: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+    """Put a face pair on the list of those that are apart, if there is room."""
+    if slot >= 0 and slot < hits.apart.shape[0]:
+        hits.apart[slot] = wp.vec3i(pair, face_a, face_b)
 
 
 @wp.func

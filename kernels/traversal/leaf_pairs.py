@@ -10,10 +10,12 @@ from warp_abtree.kernels.arithmetic.predicates import UNCERTAIN
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.face_pairs import (
+    GAP,
     OUTPUT_FACES,
     Hits,
     defer_uncertain,
     face_plane_signs,
+    list_apart,
     report_hit,
     try_straddling_faces,
 )
@@ -67,12 +69,20 @@ def test_straddling(
     pose: PairPose,
     hits: Hits,
 ):
-    """Test straddling pairs, one a lane; return whether this lane's meets, and whether it is uncertain."""
+    """Test straddling pairs, one a lane; return whether this lane's meets, and whether it is uncertain.
+
+    With a gap pairs straddle that no plane parts by more than that, and those that are apart are listed.
+    """
     lane = warp_lane()
     at = first + wp.min(lane, popped - 1)
     item = read_item(items, STRADDLING_START + at)
     signs = read_signs(items, at)
     meet = try_straddling_faces(mode, models, states, pose, item_first(item), item_second(item), signs)
+    if mode == GAP:
+        apart = meet == 0 and lane < popped
+        slot = reserve_slot(hits.apart_total, apart)
+        if apart:
+            list_apart(slot, pair, item_first(item), item_second(item), hits)
     meet = wp.where(lane < popped, meet, 0)
     warp_sync()
     found = meet == 1

@@ -11,6 +11,7 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arithmetic.predicates import EXACT
 from warp_abtree.kernels.arrays import ModelPool, StatePool
+from warp_abtree.kernels.gap.near_faces import part_uncertain, report_near
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.descent import (
     CPU_STACK_LENGTH,
@@ -24,12 +25,14 @@ from warp_abtree.kernels.traversal.descent import (
     three_numbers,
 )
 from warp_abtree.kernels.traversal.face_pairs import (
+    GAP,
     OUTPUT_ANY,
     OUTPUT_FACES,
     WITHIN,
     Hits,
     float32_bounds,
     report_hit,
+    scaled_gap,
     test_faces,
 )
 from warp_abtree.kernels.traversal.load_balance import Work, take_unit
@@ -52,18 +55,23 @@ def simd_float32_filter(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    error: wp.float32,
-    unit: wp.float32,
+    bounds: wp.vec3,
     first_ends: bool,
     waiting: wp.int32,
     faces: wp.array(dtype=wp.int64),
     uncertain: wp.array(dtype=wp.int64),
-) -> three_numbers:
+    apart: wp.array(dtype=wp.int64),
+) -> long_counts:
     """Test face pairs in float32, 16 at a time, perhaps until the first that meet. Lists have room for 16 more.
 
-    The same as `float32_filter_triangles`.
+    The same as `float32_filter_triangles`. With a gap, 0 or more [scaled], also lists those that are apart, but for
+    those that `gap_signs` calls separated; below 0 there is no such list.
 
-    Returns how many met, which stand in front of the list then, how many are uncertain, and how many were tested.
+    Args:
+        bounds: (error, unit, gap), the first two of `float32_bounds`.
+
+    Returns how many met, which stand in front of the list then, how many are uncertain, how many were tested, and how
+    many are listed as apart.
     """
 
 
@@ -181,7 +189,9 @@ def test_leaf_pairs(
         near, decided = resolve_faces(mode, output, models, states, pose, 0, waiting, faces, faces)
         return near, long_counts(wp.int64(0), wp.int64(decided), wp.int64(0), wp.int64(0))
     error, unit = float32_bounds(mode, pose)
-    filtered = simd_float32_filter(models, states, pose, error, unit, output == OUTPUT_ANY, waiting, faces, uncertain)
+    filtered = simd_float32_filter(
+        models, states, pose, wp.vec3(error, unit, -1.0), output == OUTPUT_ANY, waiting, faces, uncertain, uncertain
+    )
     met, count = wp.int32(filtered[0]), wp.int32(filtered[1])
     resolved, inexact = wp.int32(0), wp.int32(0)
     if count > 0 and not (output == OUTPUT_ANY and met > 0):
@@ -189,9 +199,30 @@ def test_leaf_pairs(
     return met, long_counts(wp.int64(0), filtered[2], wp.int64(resolved), wp.int64(inexact))
 
 
+@wp.func
+def test_gap_pairs(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    waiting: wp.int32,
+    faces: wp.array(dtype=wp.int64),
+    uncertain: wp.array(dtype=wp.int64),
+    apart: wp.array(dtype=wp.int64),
+):
+    """Test leaf pairs as `test_leaf_pairs` and list those that are apart; return how many, after how many met."""
+    error, unit = float32_bounds(EXACT, pose)
+    bounds = wp.vec3(error, unit, scaled_gap(pose))
+    filtered = simd_float32_filter(models, states, pose, bounds, False, waiting, faces, uncertain, apart)
+    count = wp.int32(filtered[1])
+    met, clear = part_uncertain(
+        models, states, pose, wp.int32(filtered[0]), count, uncertain, wp.int32(filtered[3]), faces, apart
+    )
+    return met, clear, long_counts(wp.int64(0), filtered[2], wp.int64(count), wp.int64(count))
+
+
 @functools.cache
 def thread_traversal(mode: int):
-    """Return the kernel whose threads share the object pairs, at a precision or WITHIN."""
+    """Return the kernel whose threads share the object pairs, at a precision, WITHIN or GAP."""
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def traverse_thread_kernel(
@@ -211,6 +242,7 @@ def thread_traversal(mode: int):
         below = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
         faces = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
         uncertain = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
+        apart = wp.zeros(shape=wp.static(WAITING_LENGTH if mode == int(GAP) else 1), dtype=wp.int64)
         descent = Descent()
         descent.thread = take_thread(work_inout.counter)
         p = take_unit(work_inout.counter)
@@ -221,12 +253,19 @@ def thread_traversal(mode: int):
             descent = start_pair(
                 output, wp.where(slabs, wp.int64(plain_tests), NEVER), count_repeats(p, pair_poses), descent
             )
-            hit_count, tests = wp.int64(0), long_counts()
+            hit_count, near_count, tests = wp.int64(0), wp.int64(0), long_counts()
             while descent.top > 0 or descent.deep > 0:
                 descent, waiting, compared = advance(
                     models, states, pose, hit_count, tests[0], descent, stack, below, memory, faces
                 )
-                met, stages = test_leaf_pairs(wp.static(mode), output, models, states, pose, waiting, faces, uncertain)
+                met, clear, stages = wp.int32(0), wp.int32(0), long_counts()
+                if wp.static(mode == int(GAP)):
+                    met, clear, stages = test_gap_pairs(models, states, pose, waiting, faces, uncertain, apart)
+                    near_count += wp.int64(report_near(models, states, pose, p, clear, apart, hits_inout))
+                else:
+                    met, stages = test_leaf_pairs(
+                        wp.static(mode), output, models, states, pose, waiting, faces, uncertain
+                    )
                 tests += stages
                 tests[0] += compared
                 if met > 0:
@@ -234,7 +273,7 @@ def thread_traversal(mode: int):
                     report_hits(output, p, pose.swapped, met, faces, hits_inout)
                 if output == OUTPUT_ANY:
                     descent = seek_elsewhere(met, tests[0], descent, stack)
-            write_counts(p, hit_count, tests, hits_inout)
+            write_counts(p, hit_count + near_count, tests, hits_inout)
             p = take_unit(work_inout.counter)
 
     return traverse_thread_kernel

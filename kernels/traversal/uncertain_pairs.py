@@ -13,6 +13,7 @@ from warp_abtree.kernels.traversal.face_pairs import (
     OUTPUT_ANY,
     OUTPUT_FACES,
     Hits,
+    list_apart,
     load_corner_ids,
     report_hit,
     test_faces,
@@ -49,6 +50,15 @@ def report_item(output: wp.int32, pair_poses: wp.array(dtype=PairPose), item: wp
 
 
 @wp.func
+def list_apart_item(item: wp.vec3i, apart: bool, hits: Hits):
+    """Put a face pair on the list of those that are apart where a gap is asked. For all threads of a warp."""
+    if hits.gap.shape[0] > 0:
+        slot = reserve_slot(hits.apart_total, apart)
+        if apart:
+            list_apart(slot, item[0], item[1], item[2], hits)
+
+
+@wp.func
 def resolve_item(
     mode: wp.int32,
     output: wp.int32,
@@ -65,6 +75,7 @@ def resolve_item(
     if waits and not (output == OUTPUT_ANY and hits.any_hit[p] != 0):
         meet = test_faces(mode, models, states, pair_poses[p], item[1], item[2])
     report_item(output, pair_poses, item, meet == 1, hits)
+    list_apart_item(item, waits and meet == 0, hits)
 
 
 @wp.func
@@ -158,6 +169,7 @@ def resolve_straddling(
     meet = wp.int32(1)
     if waiting[3] != SHARED_CORNER:
         meet = intersect_straddling_item(models, states, pair_poses[p], item, waiting[3])
+    list_apart_item(item, lane < popped and meet == 0, hits)
     meet = wp.where(lane < popped, meet, 0)
     warp_sync()
     report_item(output, pair_poses, item, meet == 1, hits)
@@ -210,6 +222,7 @@ def resolve_exact_kernel(
             waits = lane < wp.min(at_once, end - first)
             if waits and not (output == OUTPUT_ANY and hits_inout.any_hit[item[0]] != 0):
                 signs = item_plane_signs(models, states, pair_poses[item[0]], item)
+            list_apart_item(item, waits and signs == SEPARATED, hits_inout)
             straddling = push_signed_pair(list, straddling, signs >= 0, item, signs)
             inexact = defer_inexact(list, inexact, hits_inout, signs == UNDECIDED, item)
             warp_sync()

@@ -28,6 +28,8 @@ from warp_abtree.kernels.triangle.intersect import rotate_first
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 FLOAT32_UNIT = wp.constant(9.0 * 2.0**-24)
+# For the rounding of `gap_signs`; sums of magnitudes over the least have squares.
+WIDE, SQUARE_MIN = wp.constant(1.0 + 2.0**-18), wp.constant(2.0**-50)
 
 SEPARATED = wp.constant(-1)
 SIGNS_OF_A, SIGNS_OF_B, POSITIVE = wp.constant(0xFC0), wp.constant(0x3F), wp.constant(0xAAA)
@@ -113,6 +115,49 @@ def plane_signs(
     of_b, bound_b = heights_over_plane(error, unit, a1 - a0, a2 - a0, -w, a0 - b1, a0 - b2)
     signs = add_signs(add_signs(0, of_a, bound_a), of_b, bound_b)
     return wp.where((one_sided(of_a, bound_a) | one_sided(of_b, bound_b)) < 0, SEPARATED, signs)
+
+
+@wp.func
+def length_bound(error: wp.float32, unit: wp.float32, u: wp.vec3, v: wp.vec3):
+    """Return a length that the cross product of two differences of corners does not exceed; docs/exactness.md."""
+    normal = cross32(u, v)
+    p = sum_sizes(u) + 2.0 * error
+    q = sum_sizes(v) + 2.0 * error
+    # Squares may underflow.
+    most = sum_sizes(normal)
+    length = wp.where(most > SQUARE_MIN, wp.sqrt(dot32(normal, normal)), most)
+    return length + 2.0 * (error * (p + q) + unit * (p * q))
+
+
+@wp.func
+def gap_signs(
+    error: wp.float32,
+    unit: wp.float32,
+    gap: wp.float32,
+    a0: wp.vec3,
+    a1: wp.vec3,
+    a2: wp.vec3,
+    b0: wp.vec3,
+    b1: wp.vec3,
+    b2: wp.vec3,
+):
+    """Return what `plane_signs` does, SEPARATED only where more than a gap lies between a triangle and a plane."""
+    w = b0 - a0
+    of_a, bound_a = heights_over_plane(error, unit, b1 - b0, b2 - b0, w, b0 - a1, b0 - a2)
+    of_b, bound_b = heights_over_plane(error, unit, a1 - a0, a2 - a0, -w, a0 - b1, a0 - b2)
+    signs = add_signs(add_signs(0, of_a, bound_a), of_b, bound_b)
+    wide_a = (bound_a + gap * length_bound(error, unit, b1 - b0, b2 - b0)) * WIDE
+    wide_b = (bound_b + gap * length_bound(error, unit, a1 - a0, a2 - a0)) * WIDE
+    return wp.where((one_sided(of_a, wide_a) | one_sided(of_b, wide_b)) < 0, SEPARATED, signs)
+
+
+@wp.func
+def have_one_side(signs: wp.int32):
+    """Return whether the signs say that one triangle lies on one side of the other's plane."""
+    over, under = signs & POSITIVE, (signs << 1) & POSITIVE
+    one_of_a = (over & SIGNS_OF_A) == (POSITIVE & SIGNS_OF_A) or (under & SIGNS_OF_A) == (POSITIVE & SIGNS_OF_A)
+    one_of_b = (over & SIGNS_OF_B) == (POSITIVE & SIGNS_OF_B) or (under & SIGNS_OF_B) == (POSITIVE & SIGNS_OF_B)
+    return one_of_a or one_of_b
 
 
 @wp.func

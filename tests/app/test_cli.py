@@ -101,6 +101,11 @@ def test_query_against_the_library(files, capsys):
         capsys, "query", "ball.obj", "ring.ply", "--pose", *map(str, (9, 0, 0, 0, 0, 0, 1)), "--output", "distance"
     )
     assert f"distance                {apart['distance']:.6g}\n" in shown and "\npoints:\n" in shown
+    asked = ["ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--lod-a", 0.2, "--output", "distance"]
+    of_originals = answer(capsys, *asked, "--originals", "--relative", 0.3)
+    assert of_originals["bracket"][0] <= apart["distance"] <= of_originals["bracket"][1]
+    assert answer(capsys, *asked, "--originals")["distance"] == apart["distance"]
+    assert answer(capsys, *asked, "--beyond", 2, "--tolerance", 0.1)["bracket"] == [2, None]
     apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "contacts")
     nowhere = [None, None, None]
     assert apart["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere, "depth": 0}
@@ -177,6 +182,7 @@ def test_lost_work_is_status_1(files, capsys, monkeypatch):
     ("words", "parts"),
     [
         *((f"{name} --help", (f"examples:\n  warp-abtree {name}", "--device")) for name in COMMANDS),
+        ("bench --help", ("[--json] NAME\n", "benchmark or study")),
         ("--help", ("exit status:\n  0 ", "examples:")),
         ("--version", (f"warp-abtree {ab.__version__}\n",)),
         ("--print-completion bash", ("--lod-a", "sweep", "compgen")),
@@ -194,10 +200,10 @@ def test_help_has_examples(capsys, words, parts):
 @pytest.mark.parametrize(
     ("module", "words", "message"),
     [
-        ("shtab", "--print-completion bash", "--print-completion needs shtab: pip install warp-abtree[app]"),
-        ("msgspec", "run rain", "rain.toml: scene files need msgspec: pip install warp-abtree[app]"),
-        ("viser", "view ball.obj", "view needs viser: pip install warp-abtree[view]"),
-        ("matplotlib", "run rain --plot .", "--plot needs Matplotlib: pip install warp-abtree[pictures]"),
+        ("shtab", "--print-completion bash", "--print-completion needs shtab: pip install shtab"),
+        ("msgspec", "run rain", "rain.toml: scene files need msgspec: pip install msgspec"),
+        ("viser", "view ball.obj", "view needs viser: pip install viser"),
+        ("matplotlib", "run rain --plot .", "--plot needs Matplotlib: pip install matplotlib"),
         ("pyvista", "run rain --picture out.png", "--picture needs pyvista and Matplotlib: pip install"),
         ("pyvista", "picture ball.obj --out out.png", "picture needs pyvista and Matplotlib: pip install"),
     ],

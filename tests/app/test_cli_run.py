@@ -53,6 +53,17 @@ def test_run_under_a_budget(scene):
     assert found["stages"]["total_ms"]["total"] == pytest.approx(parts)
 
 
+def test_an_impossible_budget_is_called_so(scene):
+    """One that no level of detail can hold; not one that is easy."""
+    shown, errors = scene("--frames 8 --budget 0.001ms")
+    (said,) = errors
+    assert re.fullmatch(r"warp-abtree: a budget of 0.001 ms is impossible here: .* frames take [\d.]+ ms", said)
+    assert re.search(r"^coarsest ms +[\d.]+$", shown, re.M)
+    found = json.loads(scene("--frames 8 --budget 0.001ms --json")[0])
+    assert found["coarsest_ms"] > found["budget_ms"] == 0.001
+    assert not scene("--frames 8 --budget 10s")[1]
+
+
 @pytest.mark.slow
 def test_plot(scene):
     shown, _ = scene("--frames 6 --budget 20ms --plot plots")

@@ -122,7 +122,6 @@ SHARD = "shard-000000000000-000000000001"
         (lambda path: write_json(path, {"study": "x", "parts": {}}), "study.json"),
         (MODEL.save, "model.npz"),
         (lambda path: run_frame()[0].record(path), "rows.csv"),
-        (lambda path: run_frame()[0].record(path), "rows.json"),
         (lambda path: record_found(run_frame()[1], path), "found.csv"),
         (lambda path: record_found(run_frame()[1], path), "found.npz"),
         (lambda path: write_png(np.zeros((9, 9, 3), np.uint8), path), "picture.png"),

@@ -1,5 +1,6 @@
 """The process of a command: progress on stderr, and SIGINT and SIGTERM, which leave no half-written file."""
 
+import csv
 import io
 import json
 import os
@@ -34,7 +35,6 @@ import sys, time
 import numpy as np
 import warp_abtree as ab
 from warp_abtree.app.cli import main as cli
-from warp_abtree.simulate import frame
 
 def hang(file=None, *_, **__):
     if hasattr(file, "write"):
@@ -73,7 +73,7 @@ def files(tmp_path, monkeypatch):
 
 SLOW = [
     (BUILD, "np.savez_compressed", block, TERMINATE, 143, []),
-    ("run scene.toml --record new.csv", "frame.csv.DictWriter", None, TERMINATE, 143, []),
+    ("run scene.toml --record new.csv", "ab.Frame.run", None, TERMINATE, 143, []),
     ("run scene.toml --record new.json", "ab.Frame.run", ignore, INTERRUPT, 130, []),
     (QUERY, "np.savez", block, INTERRUPT, 130, []),
     (SWEEP, "np.savez", ignore, TERMINATE, 143, ["answers", "answers/job.json"]),
@@ -118,6 +118,76 @@ def test_a_signal_stops_a_command(files, words, place, before, number, status, l
     assert (process.returncode, shown) == (status, "")
     assert sorted(str(path.relative_to(files)) for path in set(files.rglob("*")) - known) == left
     assert all(path.read_text() == "old" for path in files.glob("new.*"))
+
+
+def run_process(words, code="import runpy; runpy.run_module('warp_abtree', run_name='__main__')", **variables):
+    """Run a command in a process of its own; return its status and what it says."""
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words.split()],
+        env={**os.environ, "PYTHONPATH": path, **variables},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+STOP_IN_FRAME = """
+import os, signal, sys
+import warp_abtree as ab
+from warp_abtree.app.cli import main as cli
+
+advance = ab.Frame._advance
+
+def stop(frame):
+    if len(frame.history) == 3:
+        os.kill(os.getpid(), signal.SIGINT)
+    advance(frame)
+
+ab.Frame._advance = stop
+sys.exit(cli.main())
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("name", ["rows.csv", "rows.json"])
+def test_an_interrupted_run_keeps_its_rows(files, name):
+    status, _, errors = run_process(f"run scene.toml --record {name} --device cpu", STOP_IN_FRAME)
+    assert (status, errors) == (130, "warp-abtree: interrupted\n")
+    text = Path(name).read_text()
+    rows = json.loads(text) if name.endswith("json") else list(csv.DictReader(io.StringIO(text)))
+    assert [int(row["frame"]) for row in rows] == [0, 1, 2]
+
+
+STOP_AT_WARP = """
+import sys
+
+class Stop:
+    def find_spec(self, name, *_):
+        if name == "warp":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Stop())
+from warp_abtree.__main__ import main
+sys.exit(main())
+"""
+
+
+def test_the_version_needs_no_warp():
+    assert run_process("--version", STOP_AT_WARP) == (0, f"warp-abtree {ab.__version__}\n", "")
+
+
+def test_an_interrupt_during_imports_is_one_line():
+    assert run_process("info ball.obj", STOP_AT_WARP) == (130, "", "warp-abtree: interrupted\n")
+
+
+def test_a_kernel_cache_that_cannot_be_written_names_its_variable(files):
+    status, _, errors = run_process("info ball.obj --device cpu", WARP_CACHE_PATH=str(files / "ball.obj" / "cache"))
+    assert status == 2 and errors.count("\n") == 1 and "ball.obj/cache" in errors
+    assert errors.endswith("(Warp's kernel cache; WARP_CACHE_PATH names a folder that can be written)\n")
+    status, _, errors = run_process("info gone.obj --device cpu")
+    assert status == 2 and "WARP_CACHE_PATH" not in errors
 
 
 def test_a_caller_keeps_its_signals(files, capsys, monkeypatch):

@@ -1,6 +1,7 @@
 """The viewer's page on its server, without a browser and in a headless Chromium (playwright, extra dev)."""
 
 import io
+import re
 import shutil
 import socket
 import threading
@@ -9,10 +10,13 @@ import time
 import numpy as np
 import PIL.Image
 import pytest
-from helpers.viewer import make_playback, run_command, write_scene
+from helpers.viewer import make_models, make_playback, run_command, write_scene
+
+import warp_abtree as ab
 
 pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 
+from warp_abtree.app import view
 from warp_abtree.app.viewer.command import serve
 from warp_abtree.app.viewer.page import Page
 
@@ -76,6 +80,39 @@ def test_what_people_do_reaches_the_scene(page):
     assert page.playback.budget_ms == 7.0
     act(page, page._run_button, "step", seconds=0.3)
     assert page.snapshot.row.budget_ms == 7.0 and "| budget | 7 ms |" in page._state.content
+
+
+def test_a_scene_made_in_python_is_shown(device, capsys):
+    """At its poses and LODs, which it has at the end, too."""
+    scene = ab.Scene(device)
+    (ball, ring), half = make_models(), 0.5**0.5
+    poses = np.array([(0, 0, 0, 0, 0, 0, 1), (0.6, 0.1, 0, half, 0, 0, half), (9, 0, 0, 0, 0, 0, 1)])
+    scene.add_many([ball, ring, ball], poses, worlds=[0, 0, 2], lods=[9, ring.lod_max, 3])
+    shown = []
+
+    def act(page, seconds):
+        shown.append(page.snapshot)
+        page._hold_all(0.0)
+        page.advance()
+        shown.append(page.snapshot)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Page, "run", act)
+        view(scene, "my scene", port=0, seconds=0.1)
+    assert re.fullmatch(r"my scene: http://localhost:\d+ \(Ctrl-C ends\)\n", capsys.readouterr().out.split("Module")[0])
+    assert np.allclose(shown[0].poses, poses) and shown[0].lods.tolist() == [9, ring.lod_max, 3]
+    assert shown[0].result.pairs.tolist() == [[0, 1]] and shown[0].result.any.all()
+    assert shown[1].lods.tolist() == [0, 0, 0] and scene.lods.tolist() == [9, ring.lod_max, 3]
+    assert np.allclose(scene.batch().objects.pool.position.numpy(), poses[:, :3])
+
+
+def test_what_view_refuses(device):
+    with pytest.raises(TypeError, match="not a Scene"):
+        view(make_models()[0])
+    with pytest.raises(ValueError, match="no object"):
+        view(ab.Scene(device))
+    with pytest.raises(ValueError, match="port"):
+        view(ab.Scene(device), port=-1)
 
 
 def test_a_port_that_is_taken(tmp_path, capsys):

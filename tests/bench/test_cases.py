@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 from bench import __main__ as main
+from bench import gap_contacts
 from bench.baselines.newton import SDF_RESOLUTION
 from bench.cases import budget, build, host
 from bench.tables import pick
@@ -93,6 +94,15 @@ def check_baselines(rows):
 
 
 def check_distance(rows):
+    gaps = [row for row in rows if "gap" in row]
+    rows = [row for row in rows if "gap" not in row]
+    assert [row["gap"] for row in gaps] == list(gap_contacts.GAPS)
+    assert gaps[0]["more"] == 1 < gaps[-1]["more"] and all(row["ratio"] > 0 for row in gaps)
+    checked = [row for row in rows if row["workload"].startswith("brackets")]
+    refined = [row for row in rows if row["workload"].startswith("originals")]
+    assert sum(row["configurations"] for row in checked) >= 60 and all(row["violations"] == 0 for row in checked)
+    assert all(min(row[f"{name}_ms"] for name in ("finest", "moved", "originals", "first")) > 0 for row in refined)
+    rows = rows[: len(rows) - len(checked) - len(refined)]
     assert rows[-1]["workload"] == "knot, 3 poses"
     for row in rows:
         assert row["poses"] == 3 > row["meet"] and row["median_gap"] > 0 and 0 < row["face_tests"] < row["node_tests"]

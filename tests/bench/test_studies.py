@@ -12,7 +12,7 @@ from bench import tables
 from bench.shapes import knot
 from bench.studies import study
 from bench.studies.paper import meshes, static, update
-from bench.studies.tradeoff import competitors, lods, settings
+from bench.studies.tradeoff import competitors, distances, lods, settings
 from bench.tables import pick
 
 pytestmark = pytest.mark.slow
@@ -78,7 +78,23 @@ def check_tradeoff(parts, model):
         assert [row[name] for row in ours] == pytest.approx([row[name] for row in theirs], abs=1e-6)
     for row in pick(rows, method=competitors.HULL):
         assert row["missed"] == 0 and row["late_max"] < 1e-6 and row["contact_mean"] > 1e-3
+    check_distances(parts["distances"])
     assert any(row["front"] for row in rows) and not all(row["front"] for row in rows)
+
+
+def check_distances(rows):
+    ours, theirs, ended = (
+        pick(rows, method=name) for name in (distances.OURS, distances.OURS_FCL, distances.TOLERANCE)
+    )
+    assert len(ours) == len(theirs) == 3 == len(ended)
+    for name in ("distance_mean", "distance_max"):
+        assert [row[name] for row in ours] == pytest.approx([row[name] for row in theirs], abs=1e-9)
+    proved = [row["proved"] for row in ours]
+    assert proved == sorted(proved, reverse=True) and proved[-1] == 0 == ours[-1]["distance_max"]
+    assert all(0 < row["proved"] for row in ended) and all(row["us"] > 0 for row in (*ours, *theirs, *ended))
+    refined = pick(rows, case="refine")
+    assert len(refined) == len(distances.REFINED) * len(distances.ASKED)
+    assert all(0 <= row["decided"] <= 1 and row["refine_cost"] > 0 for row in refined)
 
 
 def check_settings(rows):

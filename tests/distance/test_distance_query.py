@@ -233,28 +233,6 @@ def flattened(corners, level):
     return np.concatenate([kept, kept[-1:].repeat(3 - len(kept), 0)])
 
 
-def test_tolerances_whatever_the_search_starts_from(device):
-    """Brackets hold where it starts from faces far from the nearest, and a pair within `beyond` is never beyond."""
-    rng = np.random.default_rng(15)
-    models, count = (sample("torus"), sample("cow")), 150
-    poses = random_poses(rng, count, 2.5)
-    scene = scene_of(device, [(models[0], None, (0, 0, 0, 0, 0, 0, 1), models[1], None, pose) for pose in poses])
-    pairs = np.arange(2 * count).reshape(-1, 2)
-    still = np.tile([0.0, 0, 0, 0, 0, 0, 1], (count, 1))
-    truth = scene.intersect(pairs, "distance").distance
-    assert (truth > 0).sum() > count / 2
-    for options in ({"relative": 0.9}, {"relative": 0.5}, {"tolerance": 0.5}):
-        query = ab.DistanceQuery(scene, pairs, **options)
-        for _ in range(6):
-            order = rng.permutation(count)
-            scene.set_poses(np.stack([still, poses[order]], 1).reshape(-1, 7))
-            found, d = query.run(), truth[order]
-            assert (found.bracket[:, 0] <= d * (1 + 1e-13)).all() and (d <= found.bracket[:, 1] * (1 + 1e-13)).all()
-        for part in (0.99, 1.01):
-            found = ab.DistanceQuery(scene, pairs, beyond=d * part, **options).run()
-            np.testing.assert_array_equal(np.isinf(found.distance), (d > 0) & (part < 1))
-
-
 def test_captured_graphs(device):
     query, _ = small_query(device)
     expected = to_bytes(query.result())
@@ -336,7 +314,7 @@ def test_sweeps(device):
     for options, error in (
         ({"beyond": -1}, ValueError),
         ({"tolerance": np.nan}, ValueError),
-        ({"within": 1}, TypeError),
+        ({"within": 1}, ValueError),
     ):
         with pytest.raises(error, match=next(iter(options))):
             ab.sweep(a, b, poses, **asked, **options)

@@ -18,10 +18,10 @@ def to_bytes(result):
     return [getattr(result, name).tobytes() for name in ANSWERS]
 
 
-def sheets(rng, roughness, far, bend):
+def sheets(rng, roughness, far, bend, side=9):
     """Return two sheets over one another, their corners up or down by a little, in frames of their own, and poses."""
-    vertices, faces = grid(9)
-    vertices = vertices / 9 - [0.5, 0.5, 0.0]
+    vertices, faces = grid(side)
+    vertices = vertices / side - [0.5, 0.5, 0.0]
     below, above = vertices + roughness * rng.normal(size=(2, *vertices.shape)) * [0, 0, 1]
     below, above = (v - [0, 0, side * bend] * (v[:, :2] ** 2).sum(1)[:, None] for v, side in ((below, 1), (above, -1)))
     above[:, 2] += 0.25
@@ -79,6 +79,27 @@ def check_sheets(device, sheets, size):
             query.forget()
 
 
+@pytest.mark.parametrize("far", [0.0, 100.0])
+@pytest.mark.parametrize("roughness", [1e-7, 1e-9])
+def test_very_many_nearly_equally_near_faces(device, roughness, far):
+    """So many that slabs are compared along the nodes' own normals, on the CPU; warps have no slabs."""
+    rng = np.random.default_rng(4)
+    cases = []
+    for bend in (0.0, 0.1, 0.02):
+        (a, b), (pose_a, pose_b) = sheets(rng, roughness, far, bend, side=32)
+        cases.append((a, None, pose_a, b, None, pose_b))
+    scene, pairs = scene_of(device, cases), pairs_of(cases)
+    with testing.regime(warps=True):
+        expected = ab.DistanceQuery(scene, pairs).run()
+    query = ab.DistanceQuery(scene, pairs)
+    for _ in range(17):
+        query.launch()
+    query.forget()
+    found = query.run()
+    assert to_bytes(found) == to_bytes(expected)
+    assert (found.triangle_tests > 6000).any()
+
+
 def test_slabs_follow_levels_of_detail(device):
     """Very many pairs of few states: slabs are made in the first launch, and anew when LODs move."""
     rng = np.random.default_rng(2)
@@ -93,3 +114,25 @@ def test_slabs_follow_levels_of_detail(device):
             assert to_bytes(ab.DistanceQuery(scene, pairs).run()) == to_bytes(found)
         lods = [random_lod(rng, model, 1000) for model in models]
         scene.set_lods(np.tile(lods, 40))
+
+
+def test_tolerances_whatever_the_search_starts_from(device):
+    """Brackets hold where it starts from faces far from the nearest, and a pair within `beyond` is never beyond."""
+    rng = np.random.default_rng(15)
+    models, count = (sample("torus"), sample("cow")), 150
+    poses = random_poses(rng, count, 2.5)
+    scene = scene_of(device, [(models[0], None, STILL, models[1], None, pose) for pose in poses])
+    pairs = np.arange(2 * count).reshape(-1, 2)
+    still = np.tile([0.0, 0, 0, 0, 0, 0, 1], (count, 1))
+    truth = scene.intersect(pairs, "distance").distance
+    assert (truth > 0).sum() > count / 2
+    for options in ({"relative": 0.9}, {"relative": 0.5}, {"tolerance": 0.5}):
+        query = ab.DistanceQuery(scene, pairs, **options)
+        for _ in range(6):
+            order = rng.permutation(count)
+            scene.set_poses(np.stack([still, poses[order]], 1).reshape(-1, 7))
+            found, d = query.run(), truth[order]
+            assert (found.bracket[:, 0] <= d * (1 + 1e-13)).all() and (d <= found.bracket[:, 1] * (1 + 1e-13)).all()
+        for part in (0.99, 1.01):
+            found = ab.DistanceQuery(scene, pairs, beyond=d * part, **options).run()
+            np.testing.assert_array_equal(np.isinf(found.distance), (d > 0) & (part < 1))

@@ -76,7 +76,9 @@ def float32_one_kernel(mode: int, posed: Posed, items: Items, meet_out: wp.array
 @wp.kernel
 def float32_all_kernel(first_ends: bool, unit: float, posed: Posed, faces_inout: Items, left_out: Items, count: Items):
     models, states, pose, waiting = posed.models, posed.states, posed.pose, faces_inout.shape[0] - OVER
-    counts = simd_float32_filter(models, states, pose, pose.error, unit, first_ends, waiting, faces_inout, left_out)
+    counts = simd_float32_filter(
+        models, states, pose, wp.vec3(pose.error, unit, -1.0), first_ends, waiting, faces_inout, left_out, left_out
+    )
     for i in range(3):
         count[i] = counts[i]
 

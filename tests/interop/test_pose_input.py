@@ -43,9 +43,28 @@ def assert_same(scene, query, poses, launch=True):
     assert wanted.count.sum() > 0
 
 
+@pytest.mark.parametrize("real", [np.float32, np.float64])
+def test_bad_rows_leave_their_objects_and_the_poses_of_the_input(scene, real):
+    """Its next launch without poses is of what its owner wrote there, not of rows that were refused."""
+    poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
+    before = poses.poses.numpy().copy()
+    rows = poses_of(1).astype(real)
+    rows[2, 0], rows[4, 3:] = np.nan, 0.51
+    poses.launch(rows if scene.device.is_cpu else wp.array(rows, device=scene.device))
+    with pytest.raises(ValueError, match=r"2 rows .* object that had one is 2"):
+        poses.check()
+    kept = rows.astype(np.float64)
+    kept[[2, 4]] = before[[2, 4]]
+    assert_same(scene, query, kept)
+    assert np.array_equal(poses.poses.numpy(), before)
+    poses.launch()
+    poses.check()
+    assert_same(scene, query, before)
+
+
 def test_poses_from_warp(scene):
     poses, query = ab.PoseInput(scene), ab.Query(scene, "count")
-    found = poses.poses.numpy()
+    found = poses.poses.numpy().copy()
     assert np.allclose(found[:, 0], 0.3 * np.arange(6)) and np.allclose(found[:, 1:], [0, 0, 0, 0, 0, 1])
     rows = poses_of(1)
     poses.launch(wp.array(rows, dtype=wp.float64, device=scene.device))
@@ -54,6 +73,7 @@ def test_poses_from_warp(scene):
     single = rows.astype(np.float32)
     poses.launch(wp.array(single, dtype=wp.float32, device=scene.device))
     assert_same(scene, query, single)
+    assert np.array_equal(poses.poses.numpy(), found), "float32 is widened elsewhere"
     poses.poses.assign(poses_of(2))
     poses.launch()
     assert_same(scene, query, poses_of(2))

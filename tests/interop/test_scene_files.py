@@ -151,6 +151,113 @@ def test_usd_in(tmp_path, suffix):
         assert ((found.mean(1) - found.mean((0, 1))) * normal).sum(1).min() > 0, f"{name} is inside out"
 
 
+def off_sphere(points, radius, half=0.0):
+    """Return how far points lie outside a sphere, or a capsule along z of this half length."""
+    middle = np.stack([0 * points[:, 0], 0 * points[:, 0], np.clip(points[:, 2], -half, half)], 1)
+    return np.linalg.norm(points - middle, axis=1) - radius
+
+
+def off_cylinder(points, radius, half):
+    return np.maximum(np.linalg.norm(points[:, :2], axis=1) - radius, np.abs(points[:, 2]) - half)
+
+
+def off_cone(points, radius, half):
+    """The cone's apex is at +half; its slope takes the radius to 0 there."""
+    wide = np.linalg.norm(points[:, :2], axis=1) - radius * (half - points[:, 2]) / (2 * half)
+    return np.maximum(wide * 2 * half / math.hypot(radius, 2 * half), np.abs(points[:, 2]) - half)
+
+
+# Attributes of a prim, its volume, and how far a point lies outside of it.
+USD_SHAPES = {
+    "Cube": ({"size": 3.0}, 27.0, lambda p: np.abs(p).max(1) - 1.5),
+    "Sphere": ({"radius": 2.0}, 32 / 3 * math.pi, lambda p: off_sphere(p, 2.0)),
+    "Cylinder": ({"radius": 0.5, "height": 3.0}, 0.75 * math.pi, lambda p: off_cylinder(p, 0.5, 1.5)),
+    "Cone": ({"radius": 1.0, "height": 3.0}, math.pi, lambda p: off_cone(p, 1.0, 1.5)),
+    "Capsule": ({"radius": 1.0, "height": 2.0}, 10 / 3 * math.pi, lambda p: off_sphere(p, 1.0, 1.0)),
+}
+# Coordinates of a point in the frame in which the axis is z.
+AXES = {"X": [1, 2, 0], "Y": [2, 0, 1], "Z": [0, 1, 2]}
+
+
+@pytest.mark.parametrize("kind", USD_SHAPES)
+def test_usd_shapes_are_read_as_meshes(tmp_path, kind):
+    """Of every axis, closed, faces outwards, on the shape's surface or inside by 0.002 of the radius at most."""
+    pytest.importorskip("pxr")
+    from pxr import Gf, Usd, UsdGeom
+
+    stage, (values, volume, outside) = Usd.Stage.CreateNew(str(tmp_path / "shapes.usda")), USD_SHAPES[kind]
+    axes = AXES if "height" in values else "Z"
+    for axis in axes:
+        shape = getattr(UsdGeom, kind).Define(stage, f"/{axis}")
+        for name, value in {**values, **({"axis": axis} if len(axes) == 3 else {})}.items():
+            shape.GetPrim().GetAttribute(name).Set(value)
+        UsdGeom.Xformable(shape).AddTranslateOp().Set(Gf.Vec3d(5, 6, 7))
+    stage.GetRootLayer().Save()
+    scene, names = ab.scene_from_file(tmp_path / "shapes.usda", device="cpu")
+    assert sorted(names) == sorted(f"/{axis}" for axis in axes)
+    for i, name in enumerate(names):
+        points = (posed_triangles(scene, i) - [5, 6, 7])[..., AXES[name[1]]]
+        mesh = trimesh.Trimesh(*trimesh.triangles.to_kwargs(points).values(), process=True)
+        assert mesh.is_watertight and volume > mesh.volume * (1 - 1e-6) > 0.99 * volume
+        assert np.abs(outside(points.reshape(-1, 3))).max() < 1e-5, "corners lie on the surface"
+        inside = -outside(np.concatenate([points.mean(1), (points + np.roll(points, 1, 1)).reshape(-1, 3) / 2]))
+        curved = inside if kind != "Cube" else inside[:0]
+        assert inside.min() > -1e-5 and curved.max(initial=0) < 0.002 * values.get("radius", 0) + 1e-5
+
+
+def test_usd_planes(tmp_path):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.CreateNew(str(tmp_path / "planes.usda"))
+    sizes = {"X": (0, 3, 2), "Y": (2, 0, 3), "Z": (2, 3, 0)}
+    for axis in sizes:
+        plane = UsdGeom.Plane.Define(stage, f"/{axis}")
+        plane.GetAxisAttr().Set(axis), plane.GetWidthAttr().Set(2.0), plane.GetLengthAttr().Set(3.0)
+    stage.GetRootLayer().Save()
+    scene, names = ab.scene_from_file(tmp_path / "planes.usda", device="cpu")
+    for i, name in enumerate(names):
+        found = posed_triangles(scene, i)
+        assert np.ptp(found.reshape(-1, 3), axis=0).tolist() == list(sizes[name[1]]) and len(found) == 2
+        assert np.allclose(trimesh.triangles.normals(found)[0], np.eye(3)["XYZ".index(name[1])])
+        assert trimesh.triangles.area(found).sum() == pytest.approx(6.0)
+
+
+def test_what_usd_hides_is_left_out_and_named(tmp_path):
+    """Invisible prims with all under them, hidden and inactive instances, and geometry of other kinds."""
+    pytest.importorskip("pxr")
+    from pxr import Gf, Usd, UsdGeom
+
+    path = tmp_path / "hidden.usda"
+    write_usd(path)
+    stage = Usd.Stage.Open(str(path))
+    UsdGeom.Imageable(stage.GetPrimAtPath("/root/turned")).MakeInvisible()
+    UsdGeom.Imageable(stage.GetPrimAtPath("/copy1")).MakeInvisible()
+    UsdGeom.Xform.Define(stage, "/lights").MakeInvisible()
+    many = UsdGeom.PointInstancer.Get(stage, "/many")
+    many.CreateProtoIndicesAttr([0] * 4)
+    many.CreatePositionsAttr([Gf.Vec3f(0, 0, z) for z in (5, 1, 6, 2)])
+    many.CreateIdsAttr([10, 11, 12, 13])
+    many.CreateInvisibleIdsAttr([10])
+    many.DeactivateId(12)
+    UsdGeom.Points.Define(stage, "/root/dust")
+    UsdGeom.Camera.Define(stage, "/root/eye")
+    stage.GetRootLayer().Save()
+    with pytest.warns(UserWarning) as caught:
+        scene, names = ab.scene_from_file(path, device="cpu")
+    (said,) = [str(warning.message) for warning in caught]
+    assert said.startswith(f"{path}: left out ") and caught[0].filename == __file__
+    for part in ("/root/turned (invisible)", "/copy1 (invisible)", "/root/dust (Points)"):
+        assert part in said
+    assert "lights" not in said and "eye" not in said
+    gone = {"/root/turned", "/copy1/mesh", "/many[0]/many/prototype"}
+    shown = {"/many[3]/many/prototype", "/root/quad"}
+    assert sorted(names) == sorted({*USD_PRIMS} - gone | shown)
+    for k in (1, 3):
+        place = posed_triangles(scene, names.index(f"/many[{k}]/many/prototype")).reshape(-1, 3)
+        assert np.allclose((place.min(0) + place.max(0)) / 2, [100, 7, {1: 1, 3: 2}[k]] + BOX.bounds.mean(0))
+
+
 def red_faces(mesh):
     colours = np.asarray(mesh.visual.vertex_colors)[mesh.faces][..., :3]
     red = (colours == RED).all((1, 2))

@@ -47,7 +47,7 @@ def test_an_interrupted_run_continues(tmp_path, pool):
     job = job_of(count=400, shard=10)
     with pytest.raises(KeyboardInterrupt):
         run_shards(job, tmp_path / "ray", pool=pool, progress=stop_after(7))
-    assert check_against_one_process(job, tmp_path, pool)["found"] == 7
+    assert check_against_one_process(job, tmp_path, pool)["kept"] == 7
 
 
 class FailingJob(ColumnJob):

@@ -20,7 +20,7 @@ def test_several_devices_of_one_process_write_the_same(device, tmp_path, output)
     assert contents(tmp_path / "three") == contents(tmp_path / "one")
     with pytest.raises(KeyboardInterrupt):
         run(job, tmp_path / "four", device=[device] * 4, progress=stop_after(6))
-    assert run(job, tmp_path / "four", device=[device] * 2)["found"] == 6
+    assert run(job, tmp_path / "four", device=[device] * 2)["kept"] == 6
     assert contents(tmp_path / "four") == contents(tmp_path / "one")
     with pytest.raises(ValueError, match="an empty list"):
         ThisProcess([])
@@ -66,10 +66,10 @@ def test_an_interrupted_job_continues(tmp_path, monkeypatch):
     (out / "shard-000000000099-000000000100.npz.77.partial").write_bytes(b"half")
     computed = []
     monkeypatch.setattr(again, "task", lambda *part: computed.append(part) or job.task(*part))
-    assert run(again, out)["found"] == 4
+    assert run(again, out)["kept"] == 4
     assert computed == [(start, min(start + 9, 100)) for start in range(36, 100, 9)]
     assert contents(out) == contents(tmp_path / "whole")
-    assert run(again, out)["found"] == 12
+    assert run(again, out)["kept"] == 12
 
 
 def test_a_folder_is_of_one_job(tmp_path):

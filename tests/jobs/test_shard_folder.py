@@ -75,7 +75,7 @@ def test_a_damaged_shard_is_detected_and_computed_again(tmp_path, monkeypatch, f
     computed, told = [], []
     monkeypatch.setattr(job, "task", lambda *part, plain=job.task: computed.append(part) or plain(*part))
     done = run(job, out, file, progress=lambda *call: told.append(call))
-    assert computed == [(20, 40)] and (done["shards"], done["found"], done["damaged"]) == (3, 2, 1)
+    assert computed == [(20, 40)] and (done["shards"], done["kept"], done["damaged"]) == (3, 2, 1)
     assert told == [*(("check", k, 3) for k in (1, 2, 3)), ("shards", 2, 3), ("shards", 3, 3)]
     assert contents(out) == whole
     assert run(job, out, file)["damaged"] == 0
@@ -129,7 +129,7 @@ def test_a_shard_of_another_job_is_refused(tmp_path, file, place):
     held = path.read_bytes()
     refuse(job, out, "a shard of another job", str(path), file=file, readers=place == 0)
     path.unlink()
-    assert (run(job, out, file)["damaged"], run(job, out, file)["found"]) == (1, 3)
+    assert (run(job, out, file)["damaged"], run(job, out, file)["kept"]) == (1, 3)
     path.write_bytes(held)
     refuse(job, out, "a shard of another job", str(path), file=file)
 
@@ -153,7 +153,7 @@ def test_shards_of_every_output_and_file_hold_the_same(tmp_path, output):
         run(job, tmp_path / file, file)
         rows = [len(next(iter(columns.values()))) for _, _, columns in read_shards(tmp_path / file)]
         assert rows == [20, 20, 10] if output in ("any", "count") else rows[1] == 0 < min(rows[0], rows[2])
-        assert run(job, tmp_path / file, file)["found"] == 3
+        assert run(job, tmp_path / file, file)["kept"] == 3
         found[file] = read(tmp_path / file)
         assert not set(shard_folder.STAMP) & set(found[file])
     table = found.get("parquet", {})
@@ -195,7 +195,7 @@ def test_one_column_is_in_memory_while_all_are_checked(tmp_path):
     run(job, out)
     tracemalloc.start()
     try:
-        assert run(job, out)["found"] == 4
+        assert run(job, out)["kept"] == 4
         checked = tracemalloc.get_traced_memory()[1]
         tracemalloc.reset_peak()
         for _, _, columns in read_shards(out):

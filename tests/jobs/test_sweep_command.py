@@ -30,7 +30,7 @@ def sweep(tmp_path, monkeypatch, capsys):
 def test_answers_are_those_of_the_calls(sweep, tmp_path):
     first, second = pair()
     asked = "a.npz b.npz poses.npy --out out --shard 30 --output count"
-    assert sweep(asked)[0]["shards"] == 4 and sweep(asked)[0]["found"] == 4
+    assert sweep(asked)[0]["shards"] == 4 and sweep(asked)[0]["kept"] == 4
     expected = ab.sweep(first, second, poses_of(), output="count", device="cpu")
     np.testing.assert_array_equal(read(tmp_path / "out")["count"], expected)
     sweep("a.npz b.npz poses.npy --out lods --lods lods.npy")
@@ -41,13 +41,29 @@ def test_answers_are_those_of_the_calls(sweep, tmp_path):
     np.testing.assert_array_equal(read(tmp_path / "half")["any"], expected)
 
 
-def test_found_shards_are_counted(sweep, tmp_path):
+def test_shards_that_stay_are_counted(sweep, tmp_path):
     words = "a.npz b.npz poses.npy --out out --shard 40"
     for place, text, counts in ((0, None, (3, 0, 0)), (0, b"PK", (3, 2, 1)), (2, b"", (3, 2, 1))):
         if text is not None:
             shard_at(tmp_path / "out", place).write_bytes(text)
         found = sweep(words)[0]
-        assert (found["shards"], found["found"], found["damaged"]) == counts
+        assert (found["shards"], found["kept"], found["damaged"]) == counts
+
+
+@pytest.mark.parametrize("output", ["any", "count", "faces", "contacts"])
+@pytest.mark.parametrize("file", ["npz", "parquet"])
+def test_intersecting_poses_are_counted(sweep, tmp_path, output, file):
+    """Those of shards that were there already, too, and of damaged ones once."""
+    if file == "parquet":
+        pytest.importorskip("pyarrow")
+    words = f"a.npz b.npz poses.npy --out out --shard 40 --output {output} --file {file}"
+    expected = int(ab.sweep(*pair(), poses_of(), device="cpu").sum())
+    assert 0 < expected < 100
+    for damage in (False, False, True):
+        if damage:
+            shard_at(tmp_path / "out", 1).write_bytes(b"PK")
+        found = sweep(words)[0]
+        assert (found["count"], found["intersecting"], found["unit"]) == (100, expected, "pose")
 
 
 def test_without_ray_one_line_says_so(sweep, tmp_path, monkeypatch):

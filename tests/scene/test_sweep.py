@@ -58,6 +58,28 @@ def test_same_as_a_scene(device, names, precision, small_chunks):
             assert found.dtype == getattr(expected, output).dtype
 
 
+@pytest.mark.parametrize("kind", ["host", "device"])
+def test_poses_proved_apart(device, kind, small_chunks):
+    """As of a scene, for distances in turn; never where the surfaces are nearer, as the search of distances says."""
+    models, poses = [sample("torus"), sample("soup")], mixed_poses()
+    asked = wp.array(poses, dtype=wp.float64, device=device) if kind == "device" else poses
+    pairs = [(0, i + 1) for i in range(len(poses))]
+    distance = ab.sweep(*models, poses, output="distance", device=device)["distance"]
+    for within in (0.5, 0.0, 2.0, 0.5):
+        expected = ask_scene(device, models, poses, within=within)
+        for output in ("any", "count"):
+            found = ab.sweep(*models, asked, output=output, device=device, within=within)
+            assert found.dtype.names == (output, "apart")
+            np.testing.assert_array_equal(found[output], getattr(expected, output))
+            np.testing.assert_array_equal(found["apart"], expected.apart)
+            assert not (found["apart"] & (distance <= within)).any()
+            assert (found["apart"] | (distance < within + 1e-6)).all() and 0 < found["apart"].sum() < len(pairs)
+    assert ab.sweep(*models, poses[:0], within=1.0, device=device).dtype.names == ("any", "apart")
+    np.testing.assert_array_equal(ab.sweep(*models, poses, device=device), expected.any)
+    with pytest.raises(ValueError, match="pose 16 is not finite"):
+        ab.sweep(*models, np.where(np.arange(26)[:, None] == 16, np.nan, poses), within=1.0, device=device)
+
+
 def test_more_poses_than_before_and_fewer(device, kept, monkeypatch):
     monkeypatch.setattr(pose_sweep, "CHUNKS", (2, 5, 20))
     models, poses = [sample("torus"), sample("soup")], mixed_poses()
@@ -117,6 +139,10 @@ def test_refused(device, kept):
         ("matrix 2 is not rigid", {"poses": np.eye(4) * [[[1.0]], [[1.0]], [[2.0]]]}),
         ("LOD", {"lod_b": 10**6}),
         ("ContactQuery", {"output": "contacts"}),
+        ("within means nothing", {"output": "faces", "within": 1.0}),
+        ("within means nothing", {"output": "distance", "within": 1.0}),
+        ("within: -1.0 ", {"within": -1}),
+        ("one distance for all", {"within": [1.0, 2.0]}),
         ("precision 'half'", {"precision": "half"}),
         ("no device", {"device": "cuda:99"}),
         ("not a Model", {"model_b": "torus"}),

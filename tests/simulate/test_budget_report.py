@@ -1,8 +1,10 @@
 """Budget reports of rows made up by hand."""
 
+from dataclasses import replace
+
 import pytest
 
-from warp_abtree.simulate.budget_report import budget_report
+from warp_abtree.simulate.budget_report import budget_report, cost_at_coarsest
 from warp_abtree.simulate.frame_row import FrameRow
 
 
@@ -30,3 +32,13 @@ def test_reports_count_frames_within_a_budget():
     assert budget_report(rows, after=0.0)["within"] == 3 / 10
     assert budget_report(rows, budget_ms=20.0)["within"] == 7 / 8
     assert budget_report(rows, after=5.0) is None and budget_report(make_rows([1.0] * 9, None)) is None
+
+
+def at_lods(costs, lods):
+    return [replace(row, lod_max=lod) for row, lod in zip(make_rows(costs), lods, strict=True)]
+
+
+def test_a_budget_below_the_cost_of_the_coarsest_lods_is_impossible():
+    assert cost_at_coarsest(at_lods([99, 12, 14, 13, 9], [0, 0, 0, 0, 7])) == 13
+    assert cost_at_coarsest(at_lods([99, 12, 14, 9], [0, 0, 5, 7])) is None, "it climbs from there"
+    assert cost_at_coarsest(at_lods([99], [0])) is None and cost_at_coarsest([]) is None

@@ -109,6 +109,52 @@ def test_history_is_recorded(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rows.csv", "rows.json"]
 
 
+@pytest.mark.parametrize("name", ["rows.csv", "rows.json"])
+def test_rows_are_written_as_they_come(tmp_path, name):
+    """The file is whole after each, and takes the place of another with the first; rows before `record` count too."""
+
+    def read():
+        text = path.read_text()
+        rows = json.loads(text) if name == "rows.json" else list(csv.DictReader(text.splitlines()))
+        return [int(row["frame"]) for row in rows]
+
+    path, late = tmp_path / name, tmp_path / f"late-{name}"
+    path.write_text("old")
+    frame = ab.Frame(make_scene(), make_motion())
+    frame.record(path)
+    assert path.read_text() == "old"
+    for count in (1, 2, 3):
+        frame.step()
+        assert read() == list(range(count))
+    frame.record(late)
+    assert late.read_bytes() == path.read_bytes()
+    frame.run(2, progress=lambda done, total: read() == list(range(3 + done)) or pytest.fail("not written"))
+    assert late.read_bytes() == path.read_bytes() and read() == list(range(5))
+
+
+@pytest.mark.parametrize("name", ["rows.csv", "rows.json"])
+@pytest.mark.parametrize("room", [0, 1, 100])
+def test_a_full_disk_keeps_the_rows_before(tmp_path, name, room):
+    """The row that does not fit is raised, and written when there is room again."""
+    resource = pytest.importorskip("resource")
+    path, frame = tmp_path / name, ab.Frame(make_scene(), make_motion())
+    frame.record(path)
+    frame.run(2)
+    before = path.read_bytes()
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + room, limit[1]))
+        with pytest.raises(OSError):
+            frame.run(3)
+        assert path.read_bytes() == before and len(frame.history) == 3
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    frame.step()
+    text = path.read_text()
+    rows = json.loads(text) if name == "rows.json" else list(csv.DictReader(text.splitlines()))
+    assert [int(row["frame"]) for row in rows] == [0, 1, 2, 3]
+
+
 def test_controllers_move_lods_from_the_coarsest(device):
     """A budget without bounds lets all of them climb to the finest."""
     for kind in (PaperController, PredictiveController):

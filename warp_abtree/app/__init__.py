@@ -2,5 +2,6 @@
 
 from warp_abtree.app.toml.decode import SceneError
 from warp_abtree.app.toml.scene_file import SceneFile, load_scene
+from warp_abtree.app.viewer.still import view
 
-__all__ = ["SceneError", "SceneFile", "load_scene"]
+__all__ = ["SceneError", "SceneFile", "load_scene", "view"]

@@ -1,4 +1,4 @@
-"""What `view` and `picture` show: a scene file that runs, or meshes; one snapshot after another.
+"""What `view` and `picture` show: a scene that runs or stands, or meshes; one snapshot after another.
 
 A playback owns its scene: one thread steps, queries and changes it.
 """
@@ -9,6 +9,7 @@ import numpy as np
 
 from warp_abtree.app.render_data import Snapshot
 from warp_abtree.app.toml.control import CONTROLLERS, LodControl
+from warp_abtree.interop.arrays import PoseInput
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame
 from warp_abtree.simulate.lod_request import LodSweep
@@ -173,6 +174,24 @@ class MeshPlayback(Playback):
 
     def _poses_now(self):
         return self._start
+
+
+class StillPlayback(Playback):
+    """A scene that stands at its poses; LODs begin where they are."""
+
+    def __init__(self, scene: Scene, title: str):
+        self._poses_held = PoseInput(scene).poses.numpy().copy()
+        self._lods_held = scene.lods
+        super().__init__(scene, title, scene.worlds, 1 / 30, MeshView())
+
+    def _begin(self):
+        self.scene.set_lods(self._lods_held)
+        frame = Frame(self.scene, time_step=self.time_step)
+        frame.warm_up()
+        return frame, None, None
+
+    def _poses_now(self):
+        return self._poses_held
 
 
 def _fraction_at(model, lod) -> float:

@@ -32,6 +32,7 @@ class PoseInput:
         self._guard = LaunchGuard(self.device, self._batch.objects.generation)
         count = scene.object_count
         self.poses = wp.empty((count, 7), dtype=wp.float64, device=self.device)
+        self._widened = wp.empty_like(self.poses)
         self._faults = wp.array(NO_FAULTS, dtype=wp.int32, device=self.device)
         wp.launch(kernels.read_pose_kernel, count, [self._batch.objects.pool, self.poses], device=self.device)
 
@@ -39,9 +40,9 @@ class PoseInput:
         """Place every object. Launches only.
 
         Args:
-            poses: (n, 7) array of any framework on the scene's device, float64 (read in place) or float32 (copied to
-                `poses` on the device); None reads `poses`. A graph keeps the address of the capture: capture
-                `launch()`, and write to `poses`.
+            poses: (n, 7) array of any framework on the scene's device, float64 (read in place) or float32 (widened on
+                the device); None reads `poses`, which only its owner writes. A graph keeps the address of the capture:
+                capture `launch()`, and write to `poses`.
 
         Raises:
             ValueError: Another shape, type or device; nothing is changed.
@@ -52,8 +53,8 @@ class PoseInput:
         with self._guard.launching(self):
             rows = self.poses if poses is None else self._check(wrap_array(poses, "poses"))
             if rows.dtype == wp.float32:
-                wp.utils.array_cast(rows, self.poses)
-                rows = self.poses
+                wp.utils.array_cast(rows, self._widened)
+                rows = self._widened
             inputs = [QUATERNION_TOLERANCE, rows, self._batch.objects.pool, self._faults, self._guard.record()]
             wp.launch(kernels.place_object_kernel, len(self.poses), inputs, device=self.device)
 

@@ -22,10 +22,12 @@ class ContactData(PairData):
 
     Attributes:
         names: Names of the two objects, a set.
-        point: Midpoint of the segment in which the two faces intersect [world units], float64 (3,).
+        point: Midpoint of the segment [world units], float64 (3,).
         normal: Unit normal from the first object of the pair to the second, float64 (3,).
-        depth: Estimated penetration depth of the pair (see `warp_abtree.query.contacts`) [world units].
-        segment: End points of that segment, float64 (2, 3).
+        depth: How far the deepest point of one object inside the other, a solid, is from the surface; of surfaces, how
+            deep the two faces are in one another [world units].
+        segment: End points of the segment in which the two faces intersect; where one object is wholly inside the
+            other, that deepest point and the surface's nearest one [world units], float64 (2, 3).
     """
 
     __slots__ = ("depth", "normal", "point", "segment")

@@ -7,8 +7,7 @@ import numpy as np
 
 from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.interop.collision_data import ContactData, DistanceData
-from warp_abtree.interop.convex_solid import shape_of
-from warp_abtree.interop.placed_shapes import PlacedShapes
+from warp_abtree.interop.placed_shapes import PlacedShapes, shape_of
 from warp_abtree.scene.poses import check_poses
 
 EXTERNAL = "__external"  # trimesh's name for a mesh that is not in the manager
@@ -25,16 +24,19 @@ class CollisionManager:
     """Named, posed meshes and their collisions: a drop-in replacement for trimesh.collision.CollisionManager.
 
     Names, signatures and the shapes of results are trimesh's: what is asked for beside an answer makes a tuple of it.
-    Convex meshes are solids, all others surfaces.
+    Closed meshes are solids, all others surfaces.
     Differences:
 
     * Answers are exact for the given poses (FCL rounds those of `add_object` to float32 and tests convex meshes
-      iteratively). Touching is a collision. Containment of a surface in a convex mesh is decided in float64.
-    * A contact is a pair of intersecting faces with their indices, also of convex meshes. Its depth is an estimate for
-      the pair of objects. A component inside a convex mesh gives one contact: the deepest of its extreme corners, the
-      distance to the plane of the nearest face, and that face.
-    * Distances are never negative: 0 if objects intersect, infinite if there are none. They are exact to the rounding
-      of coordinates, for convex meshes too.
+      iteratively). Touching is a collision. What lies inside any closed mesh collides with it, not only inside a convex
+      one.
+    * A contact is a pair of intersecting faces with their indices, also of convex meshes. Its depth is that of the pair
+      of objects if one is a solid that holds points of the other: how far the deepest of these is from the surface
+      (`warp_abtree.query.distance`); else how deep the two faces are in one another. An object wholly inside a solid
+      gives one contact, whose segment joins that deepest point and the surface.
+    * Distances are negative where solids are deep in one another, by that depth, a lower bound of the penetration
+      depth; 0 where surfaces merely intersect, infinite if there are no objects. They are exact to the rounding of
+      coordinates, for convex meshes too.
     * Transforms must be rigid within 1e-6; an object of the same name is replaced; `add_object` returns nothing.
 
     Cost: meshes are prepared once for all managers, by content. The first call after `add_object` of a mesh without a
@@ -44,16 +46,16 @@ class CollisionManager:
 
     Args:
         device: Warp device, such as "cpu" or "cuda:0"; None for Warp's default.
-        convex_solids: False makes convex meshes surfaces too: nothing collides inside them.
+        solids: False makes closed meshes surfaces too: nothing collides inside them, and no distance is negative.
 
     Raises:
         ValueError: No such device on this machine.
     """
 
-    def __init__(self, device=None, convex_solids=True):
-        self._convex_solids = bool(convex_solids)
+    def __init__(self, device=None, solids=True):
+        self._solids = bool(solids)
         self._slots: dict = {}
-        self._placed = PlacedShapes(device)
+        self._placed = PlacedShapes(device, self._solids)
 
     @property
     def device(self):
@@ -69,7 +71,7 @@ class CollisionManager:
         """Make the scene again without free slots if there are too many of these."""
         if self._placed.has_too_many_free(len(self._slots)):
             kept = self.placed_objects()
-            self._placed = PlacedShapes(self.device)
+            self._placed = PlacedShapes(self.device, self._solids)
             self._slots = {name: self._placed.add(shape, matrix) for name, shape, matrix in kept}
 
     @contextmanager
@@ -194,7 +196,7 @@ class CollisionManager:
     def min_distance_single(self, mesh, transform=None, return_name=False, return_data=False):
         """Return the distance [world units] of another mesh, given as for `add_object`, from the nearest object.
 
-        0 if they collide, infinite without objects. Waits for the device.
+        0 or less if they collide, infinite without objects. Waits for the device.
 
         Args:
             return_name: Return the nearest object's name too; None if there is none.
@@ -207,7 +209,7 @@ class CollisionManager:
     def min_distance_internal(self, name=None, return_names=False, return_data=False):
         """Return the least distance [world units] of two objects, or of one from the others. Waits for the device.
 
-        0 if they collide, infinite without two objects.
+        0 or less if they collide, infinite without two objects.
 
         Args:
             name: One of the two objects; None for any.
@@ -228,7 +230,7 @@ class CollisionManager:
     def min_distance_other(self, other_manager, return_names=False, return_data=False):
         """Return the least distance [world units] of an object from one of another manager. Waits for the device.
 
-        0 if they collide, infinite without two objects.
+        0 or less if they collide, infinite without two objects.
 
         Args:
             return_names: Return the names too, a tuple (name here, name there); None if a manager is empty.
@@ -262,22 +264,30 @@ class CollisionManager:
         if not len(pairs):
             return False, [], []
         self._placed.upload()
-        result = self._placed.scene.intersect(pairs, output="contacts" if return_data else "any")
-        inside = {}
-        if self._convex_solids:
-            apart = np.flatnonzero(~result.any)
-            nested = apart[self._placed.may_contain(pairs[apart])].tolist()
-            inside = {k: self._placed.find_contained(pairs[k], names[k]) for k in nested}
-        hit = [k for k in range(len(pairs)) if result.any[k] or inside.get(k) is not None]
-        contacts = []
-        if return_data:
-            rows = result.contacts
-            segments = np.stack([rows["p0"], rows["p1"]], 1)
-            depths = result.pair_contacts["depth"][rows["pair"]].tolist()
-            for k, *of in zip(rows["pair"].tolist(), rows["faces"].tolist(), segments, rows["normal"], depths):
-                contacts.append(ContactData(names[k], *of))
-            contacts += [inside[k] for k in hit if not result.any[k]]
-        return bool(hit), [names[k] for k in hit], contacts
+        scene = self._placed.scene
+        if not return_data:
+            hit = np.flatnonzero(scene.intersect(pairs, output="any").any)
+            return bool(len(hit)), [names[k] for k in hit.tolist()], []
+        result = scene.intersect(pairs, output="contacts", gap=0.0)
+        hit = np.flatnonzero(result.any)
+        deep = scene.intersect(pairs[hit], "distance", signed=True)
+        depth = np.zeros(len(pairs))
+        depth[hit] = -deep.distance
+        rows = result.contacts
+        own = depth[rows["pair"]]
+        depths = np.where(own > 0, own, np.maximum(-rows["separation"], 0)).tolist()
+        segments = np.stack([rows["p0"], rows["p1"]], 1)
+        contacts = [
+            ContactData(names[k], *of)
+            for k, *of in zip(rows["pair"].tolist(), rows["faces"].tolist(), segments, rows["normal"], depths)
+        ]
+        for row in np.flatnonzero(result.count[hit] == 0).tolist():
+            points, deepest = deep.points[row], -deep.distance[row]
+            # Whichever of the two is inside, it is the way out of the second object.
+            normal = (points[0] - points[1]) / deepest
+            faces = deep.point_faces[row].tolist()
+            contacts.append(ContactData(names[hit[row]], faces, points, normal, float(deepest)))
+        return bool(len(hit)), [names[k] for k in hit.tolist()], contacts
 
     def _nearest(self, pairs, names):
         """Return the least distance of pairs, the names of the nearest pair, and a `DistanceData`."""
@@ -298,12 +308,10 @@ class CollisionManager:
             if rest.distance.min() < distance:
                 result, row = rest, int(rest.distance.argmin())
                 k, distance = int(others[row]), float(rest.distance[row])
-        if distance > 0 and self._convex_solids:
+        if distance == 0 and self._solids:
             overlapping = np.flatnonzero(gaps == 0)
-            for i in overlapping[placed.may_contain(pairs[overlapping])].tolist():
-                inside = placed.find_contained(pairs[i], (0, 1))
-                if inside is not None:
-                    faces = inside.index(0), inside.index(1)
-                    return 0.0, names(i), DistanceData(names(i), faces, (inside.point, inside.point), 0.0)
+            result = placed.scene.intersect(pairs[overlapping], "distance", signed=True)
+            row = int(result.distance.argmin())
+            k, distance = int(overlapping[row]), float(result.distance[row])
         faces, points = result.point_faces[row].tolist(), result.points[row]
         return distance, names(k), DistanceData(names(k), faces, points, distance)

@@ -1,17 +1,66 @@
-"""Posed shapes in one scene whose slots are reused, and bounds on their distances by their boxes."""
+"""Shapes of meshes, posed in one scene whose slots are reused, and bounds on their distances by their boxes."""
+
+import weakref
 
 import numpy as np
 
-from warp_abtree.interop.collision_data import ContactData
-from warp_abtree.interop.convex_solid import Shape
+from warp_abtree.model.mesh import load_mesh
+from warp_abtree.model.model import Model
 from warp_abtree.scene.scene import Scene
 
 FREE_SLOTS = 16  # without an object, kept for others of the same mesh; or as many as there are objects
 CHUNK = 2**16  # pairs whose corners are compared at a time
 
 
+class Shape:
+    """A model and its original mesh on the host, float64, model frame.
+
+    Attributes:
+        model: `Model`.
+        is_closed: Whether it may be a solid.
+        middle, half: Centre and half extents of its box, (3,) each.
+        corners: Extreme corners along each axis in both directions, (6, 3).
+    """
+
+    def __init__(self, model):
+        self.model = model
+        self.is_closed = model.winding.is_closed
+        vertices = model.winding.vertices[np.unique(model.winding.faces)]
+        lower, upper = vertices.min(0), vertices.max(0)
+        self.middle, self.half = lower / 2 + upper / 2, upper / 2 - lower / 2
+        self.corners = vertices[np.concatenate([vertices.argmin(0), vertices.argmax(0)])]
+
+
+# Shapes of equal meshes are shared by all managers while any of them uses one.
+_SHAPES: weakref.WeakValueDictionary = weakref.WeakValueDictionary()
+
+
+def shape_of(mesh) -> Shape:
+    """Return the shape of a mesh, by content, or of a model."""
+    import trimesh
+
+    key: tuple = ("model", id(mesh))
+    if isinstance(mesh, trimesh.Trimesh):
+        key = (hash(mesh), len(mesh.vertices), len(mesh.faces))
+    shape = _SHAPES.get(key)
+    if shape is None:
+        model = mesh
+        if not isinstance(mesh, Model):
+            source = load_mesh(mesh)
+            # Only the finest LOD is used, so there is nothing to collapse.
+            model = Model.load(source, base_faces=len(source.faces))
+        shape = Shape(model)
+        if isinstance(mesh, trimesh.Trimesh | Model):
+            _SHAPES[key] = shape
+    return shape
+
+
 class PlacedShapes:
     """Posed shapes; the slot of a removed one is reused for the next of the same mesh: models stay on the device.
+
+    Args:
+        device: Warp device.
+        solids: Whether closed shapes are solids.
 
     Attributes:
         scene: `Scene` with one object per slot.
@@ -19,8 +68,8 @@ class PlacedShapes:
         poses: Matrices of the slots [world units], float64 (at least as many as slots, 4, 4).
     """
 
-    def __init__(self, device):
-        self.scene = Scene(device)
+    def __init__(self, device, solids: bool):
+        self.scene, self._solids = Scene(device), solids
         self.shapes: list[Shape] = []
         self.poses = np.tile(np.eye(4), (8, 1, 1))
         self._free: dict[Shape, list[int]] = {}
@@ -36,7 +85,7 @@ class PlacedShapes:
                 self.poses = np.concatenate([self.poses, np.tile(np.eye(4), (slot, 1, 1))])
             # First, so that an interruption leaves no object without a shape.
             self.shapes[slot:] = [shape]
-            self.scene.add(shape.model, matrix)
+            self.scene.add(shape.model, matrix, solid=self._solids and shape.is_closed)
         self.move(slot, matrix)
         return slot
 
@@ -84,7 +133,7 @@ class PlacedShapes:
 
     def upper_distance(self, pairs, gaps):
         """Return an upper bound on the least distance of all pairs, that of two corners, and the index of its pair."""
-        corners = np.array([s.probes[:6] @ p[:3, :3].T + p[:3, 3] for s, p in zip(self.shapes, self.poses)])
+        corners = np.array([s.corners @ p[:3, :3].T + p[:3, 3] for s, p in zip(self.shapes, self.poses)])
         upper, likely = np.inf, 0
         for start in range(0, len(pairs), CHUNK):
             part = start + np.flatnonzero(gaps[start : start + CHUNK] <= upper)
@@ -94,34 +143,3 @@ class PlacedShapes:
                 if apart.min() < upper:
                     upper, likely = float(apart.min()), int(part[apart.argmin()])
         return upper, likely
-
-    def may_contain(self, pairs):
-        """Return which pairs may have a component of one inside the other: a solid's box contains a corner of it."""
-        nested = np.zeros(len(pairs), bool)
-        if not len(pairs):
-            return nested
-        solid = np.array([shape.planes is not None for shape in self.shapes])
-        if not solid.any():
-            return nested
-        middle, half = self._model_boxes()
-        several = np.array([len(shape.probes) > 6 for shape in self.shapes])
-        # A connected shape that is inside has its first corner inside; the components of others are tested later.
-        corner = np.array([shape.probes[0] for shape in self.shapes])
-        for outer, inner in (pairs.T, pairs.T[::-1]):
-            pose, posed = self.poses[outer], self.poses[inner]
-            world = np.einsum("nij,nj->ni", posed[:, :3, :3], corner[inner]) + posed[:, :3, 3] - pose[:, :3, 3]
-            local = np.einsum("nij,ni->nj", pose[:, :3, :3], world)
-            held = (np.abs(local - middle[outer]) <= half[outer] * (1 + 1e-9)).all(1)
-            nested |= solid[outer] & (held | several[inner])
-        return nested
-
-    def find_contained(self, pair, names):
-        """Return a `ContactData` if a component of one object is inside the other; surfaces must not intersect."""
-        for outer, inner in (pair, pair[::-1]):
-            found = self.shapes[outer].find_inside(self.poses[outer], self.shapes[inner], self.poses[inner])
-            if found is not None:
-                point, normal, depth, *faces = found
-                if outer != pair[0]:
-                    faces, normal = faces[::-1], -normal
-                return ContactData(names, faces, np.stack([point, point]), normal, depth)
-        return None

@@ -79,12 +79,12 @@ def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:
         out: Folder; made if it does not exist.
         file: "npz", or "parquet", which needs pyarrow.
         pool: Workers: `RayPool`, or `ThisProcess` by default.
-        progress: Called as progress("shards", done, total) after each shard, found ones included; before that as
+        progress: Called as progress("shards", done, total) after each shard, kept ones included; before that as
             progress("check", done, total) after each existing shard that is checked.
 
     Returns:
-        A dict: shards, found (existing and intact), damaged (existing and computed again), count, workers, and lost
-        (workers that ended before their work).
+        A dict: count (of poses), intersecting (how many of them do), shards, kept (existing and intact), damaged
+        (existing and computed again), workers, and lost (workers that ended before their work).
 
     Raises:
         ValueError: The folder holds another job, a shard of another or something else; bad options. Nothing is written.
@@ -96,8 +96,8 @@ def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:
     report = progress or (lambda stage, done, total: None)
     total, left = len(folder.left), folder.left
     folder.open(report)
-    found = total - len(left)
-    report("shards", found, total)
+    kept = total - len(left)
+    report("shards", kept, total)
     for start, stop, columns in pool.run(job, list(left)) if left else ():
         if (start, stop) not in left:
             raise RuntimeError(f"shard {start} to {stop} was answered twice")
@@ -107,5 +107,6 @@ def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:
     if left:
         raise RuntimeError(f"{len(left)} of {total} shards were not answered")
     sweep_up(folder.path)
-    about = {"shards": total, "found": found, "damaged": len(folder.damaged), "count": job.count}
+    about = {"count": job.count, "intersecting": folder.intersecting}
+    about |= {"shards": total, "kept": kept, "damaged": len(folder.damaged)}
     return {**about, "workers": pool.workers, "lost": pool.lost}

@@ -9,6 +9,7 @@ import json
 import re
 import zipfile
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ class ShardFolder:
     Attributes:
         left: Ranges still to be computed, in order, as keys.
         damaged: Ranges whose file is damaged; they are in `left` too.
+        intersecting: Poses that intersect, in the shards that were checked or written.
     """
 
     def __init__(self, out, job, file):
@@ -46,6 +48,7 @@ class ShardFolder:
         self.manifest = {"format": FORMAT_NAME, "version": FORMAT_VERSION, "hash": _hash_job(known), "job": known}
         self.left = dict.fromkeys(_ranges(known))
         self.damaged: list = []
+        self.intersecting = 0
 
     def open(self, progress):
         """Make the folder, or check the shards that it holds of this job.
@@ -75,7 +78,8 @@ class ShardFolder:
         shards = _find_shards(self.path, held["job"])
         for done, (part, path) in enumerate(shards.items(), start=1):
             try:
-                _read_shard(path, held, *part, keep=False)
+                counts = _read_shard(path, held, *part, read=partial(_count_poses, held["job"]))
+                self.intersecting += sum(counts.values())
                 del self.left[part]
             except DamagedShard:
                 self.damaged.append(part)
@@ -89,6 +93,7 @@ class ShardFolder:
             OSError: The file cannot be written.
         """
         job = self.manifest["job"]
+        intersecting = sum(_count_poses(job, name, values) for name, values in columns.items())
         if job["file"] == "parquet":
             columns = dict(_flat(columns if self.unit in columns else {self.unit: np.arange(start, stop), **columns}))
         fault = _row_fault(job, {len(values) for values in columns.values()}, start, stop)
@@ -107,6 +112,7 @@ class ShardFolder:
                 pyarrow, parquet = _import_parquet()
                 table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})
                 parquet.write_table(table.replace_schema_metadata(stamp), file)
+        self.intersecting += intersecting
 
 
 def read_shards(out) -> Iterator[tuple[int, int, dict]]:
@@ -138,28 +144,27 @@ def read_shards(out) -> Iterator[tuple[int, int, dict]]:
 # Shards.
 
 
-def _read_shard(path, manifest, start, stop, keep=True) -> dict:
-    """Check a shard and return its columns, none if not `keep`.
+def _read_shard(path, manifest, start, stop, read=lambda name, values: values) -> dict:
+    """Check a shard and return its columns, or what `read` makes of each.
 
     Raises:
         DamagedShard: It is not what was written for this range.
         ValueError: It is of another job.
         OSError: It cannot be opened.
     """
-    read = _read_npz if manifest["job"]["file"] == "npz" else _read_parquet
-    if read is _read_parquet:
+    open_columns = _read_npz if manifest["job"]["file"] == "npz" else _read_parquet
+    if open_columns is _read_parquet:
         _import_parquet()
     stamp, columns, rows, digest = {}, {}, set(), hashlib.sha256()
     with open(path, "rb") as file:
         try:
-            for name, values in read(file):
+            for name, values in open_columns(file):
                 if name in STAMP:
                     stamp[name] = str(values)
                     continue
                 _add_column(digest, name, values)
                 rows.add(len(values))
-                if keep:
-                    columns[name] = values
+                columns[name] = read(name, values)
                 del values  # frees it before the next is read
         except MemoryError:
             raise
@@ -227,6 +232,13 @@ def _row_fault(job, lengths, start, stop) -> str | None:
     if job.get("output") in ("any", "count") and rows != expected:  # a row per pose
         return f"{rows} rows, not {expected}"
     return None
+
+
+def _count_poses(job, name, values) -> int:
+    """Return how many poses intersect by a column: yes or no, a number, or the pose of each row, in order."""
+    if job["output"] in ("any", "count"):
+        return int(np.count_nonzero(values)) if name == job["output"] else 0
+    return int(np.count_nonzero(values[1:] != values[:-1])) + bool(len(values)) if name == "pose" else 0
 
 
 def _flat(columns):

@@ -4,6 +4,7 @@ OBJ is read here because trimesh groups its faces by material and moves quads; e
 whose face order is kept (for polygons in PLY and OFF: triangles first, then quads, then the rest).
 """
 
+import codecs
 import gzip
 import io
 import warnings
@@ -99,6 +100,7 @@ def _plain_triples(rows, number) -> np.ndarray | None:
 
 def parse_obj(data, where) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and triangles of an OBJ file; only `v` and `f` lines matter here."""
+    data = data.removeprefix(codecs.BOM_UTF8)
     plain = _parse_plain_obj(data)
     if plain is not None:
         return plain
@@ -147,7 +149,7 @@ def read_warp_asset(source, asset) -> tuple[np.ndarray, np.ndarray]:
     try:
         from pxr import Usd, UsdGeom
     except ImportError:
-        raise MeshError(f"{source}: reading it needs usd-core: pip install warp-abtree[usd]") from None
+        raise MeshError(f"{source}: reading it needs usd-core: pip install usd-core") from None
     path = Path(wp.__file__).parent / "examples" / "assets" / f"{asset}.usd"
     if not path.is_file():
         raise MeshError(f"{source}: {path} is missing from this installation of Warp")

@@ -23,6 +23,8 @@ class BroadPhase:
         capacity: Pairs that there is room for at first.
         sorts: Whether a launch sorts the pairs by their objects, so that nothing depends on the order in which it
             found them.
+        reach: By how much each object's box is wider on all sides [world units]: the length of x, y, z and w, device
+            vec4d (n,), read by each launch; None for not at all.
 
     Attributes:
         pairs: (i, j), i < j, device vec2i (capacity,).
@@ -30,15 +32,17 @@ class BroadPhase:
             last pair.
         pair_count: Pairs found, device int32 (1,); keeps counting past the capacity.
         guard: `LaunchGuard` of what launches it; a query takes its own.
+        wide: By how much all boxes are wider at least [world units].
     """
 
     pairs: wp.array
     key: wp.array
     order: wp.array
 
-    def __init__(self, batch: Batch, capacity=None, sorts=False):
-        self.batch, self.sorts = batch, sorts
+    def __init__(self, batch: Batch, capacity=None, sorts=False, reach: wp.array | None = None):
+        self.batch, self.sorts, self.wide = batch, sorts, 0.0
         self.device = device = batch.device
+        self._reach = wp.empty(0, dtype=wp.vec4d, device=device) if reach is None else reach
         check_device(device, "making a broad phase")
         count = batch.object_count
         worlds = batch.objects.pool.world.numpy()
@@ -72,7 +76,7 @@ class BroadPhase:
 
     def launch(self):
         """Box, rebuild, query, and sort if asked. Launches only, so that a graph can capture it."""
-        given = *self.guard.given(), self.pairs.ptr
+        given = *self.guard.given(), self.pairs.ptr, self.wide
         launch_boxes, launch_find = self._commands.find_callables("pairs", given, self.device, self._make_launches)
         launch_boxes()
         self.bvh.rebuild()
@@ -101,7 +105,7 @@ class BroadPhase:
         return [self._make_boxes(launch), find]
 
     def _make_boxes(self, launch):
-        inputs = [*self.batch.pools, self.guard.record(), self.lower, self.upper]
+        inputs = [*self.batch.pools, self.guard.record(), self.wide, self._reach, self.lower, self.upper]
         return launch(pose_box_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
 
     def count_found(self) -> int:
@@ -123,8 +127,13 @@ class BroadPhase:
             raise CapacityError("the broad phase found 2^31 object pairs or more; use more worlds or fewer objects")
         return found
 
-    def find(self) -> np.ndarray:
-        """Return all pairs, int32 (p, 2), sorted, i < j. Waits for the device; buffers grow as needed."""
+    def find(self, within=0.0) -> np.ndarray:
+        """Return all pairs, int32 (p, 2), sorted, i < j. Waits for the device; buffers grow as needed.
+
+        Args:
+            within: Distance [world units] up to which objects count as a pair.
+        """
+        self.wide = 0.5 * within
         self.launch()
         found = self.count_found()
         if found > len(self.pairs):

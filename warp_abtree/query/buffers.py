@@ -12,7 +12,7 @@ from warp_abtree.checks.regime import Regime, current_regime
 from warp_abtree.kernels import poses
 from warp_abtree.kernels.traversal import descent, face_pairs
 from warp_abtree.query.broad_phase import BroadPhase
-from warp_abtree.query.request import check_pair_room, check_within
+from warp_abtree.query.request import check_gap, check_pair_room, check_within
 from warp_abtree.query.result import COUNTERS
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
@@ -48,6 +48,7 @@ class QueryBuffers:
     within: wp.array  # where asked
     contained: wp.array  # face of what is inside, where there are solids
     _within: np.ndarray
+    _gap: Any = None  # beside given pairs; of the broad phase's pairs that of each object
     _given: np.ndarray  # pairs on the host
     slab_memory: wp.array
     _regime: Regime
@@ -59,9 +60,9 @@ class QueryBuffers:
         warps = self._regime.warps
         return self.device.is_cuda if warps is None else warps
 
-    def _make_hits(self):
+    def _make_hits(self, with_gap=False):
         hits = face_pairs.Hits()
-        for name in ("total", "uncertain_total"):
+        for name in ("total", "uncertain_total", *(["apart_total"] if with_gap else [])):
             setattr(hits, name, wp.zeros(1, dtype=wp.int32, device=self.device))
         return hits
 
@@ -71,6 +72,9 @@ class QueryBuffers:
         Raises:
             ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
         """
+        self._set_pairs(pairs, within, None)
+
+    def _set_pairs(self, pairs, within, gap):
         if self.broad_phase is not None:
             raise ValueError("this query takes its pairs from the broad phase")
         check_device(self.device, "giving a query other pairs")
@@ -80,9 +84,13 @@ class QueryBuffers:
             raise ValueError("this query was made without within")
         if self.near is not None:
             within = check_within(self._within if within is None else within, len(pairs))
-        self.replace_pairs(pairs, within)
+        if gap is not None and self._gap is None:
+            raise ValueError("this query was made without gap")
+        if self._gap is not None:
+            gap = check_gap(self._gap if gap is None else gap, len(pairs), 0)
+        self.replace_pairs(pairs, within, gap)
 
-    def replace_pairs(self, pairs: np.ndarray, within):
+    def replace_pairs(self, pairs: np.ndarray, within, gap=None):
         """Do what `set_pairs` does, with pairs and distances that are checked, None without."""
         self._check_whole()
         # What may fail for lack of memory comes before anything that changes the query.
@@ -102,13 +110,15 @@ class QueryBuffers:
                     wp.copy(self.pairs, rows, count=len(pairs))
                 self.pair_count.fill_(len(pairs))
             self._given = pairs
-            self._within = within
+            self._within, self._gap = within, gap
             self._fill_within()
+            self._fill_gap()
 
-    def is_asked(self, pairs: np.ndarray, within) -> bool:
+    def is_asked(self, pairs: np.ndarray, within, gap=None) -> bool:
         """Return whether pairs and distances, checked, None without, are those in place."""
         same = len(pairs) == len(self._given) and pairs.tobytes() == self._given.tobytes()
-        return same and (within is None or np.array_equal(within, self._within))
+        same = same and (within is None or np.array_equal(within, self._within))
+        return same and (gap is None or np.array_equal(gap, self._gap))
 
     @contextmanager
     def _changing(self):
@@ -148,6 +158,8 @@ class QueryBuffers:
                     made.append((self, "counts", counts))
         if self.near is not None:
             made.append((self, "within", wp.empty(room, dtype=wp.float64, device=self.device)))
+        if self._gap is not None:
+            made.append((self.hits, "gap", wp.empty(max(1, room), dtype=wp.float64, device=self.device)))
         if self.batch.solids is not None:
             made.append((self, "contained", wp.empty(room, dtype=wp.int32, device=self.device)))
         return made
@@ -176,6 +188,13 @@ class QueryBuffers:
             if self.broad_phase is not None:
                 self._fill_within()
 
+    def _fill_gap(self):
+        """Write the gaps of given pairs to the device."""
+        if self._gap is not None and self._gap.ndim == 0:
+            self.hits.gap.fill_(float(self._gap))
+        elif self._gap is not None and len(self._gap):
+            wp.copy(self.hits.gap, wp.array(self._gap, dtype=wp.float64, device="cpu"), count=len(self._gap))
+
     def _fill_within(self):
         if self.near is None:
             return
@@ -186,7 +205,8 @@ class QueryBuffers:
             wp.copy(self.within, distances, count=len(distances))
 
     def _resize_uncertain(self, capacity: int):
-        self._replace([(self.hits, "uncertain", wp.empty(capacity, dtype=wp.vec3i, device=self.device))])
+        made = ["uncertain"] if self._gap is None else ["uncertain", "apart"]
+        self._replace([(self.hits, name, wp.empty(capacity, dtype=wp.vec3i, device=self.device)) for name in made])
 
     def resize(self, capacity: int):
         """Make room for a number of intersecting face pairs."""

@@ -13,6 +13,25 @@ posed to the world by that object's pose. A face pair's contact, in the order in
   neither face has an area, the direction from one model's centre to the other's, or the x axis.
 * coplanar: whether the faces have area and lie in one plane, exactly.
 
+With `gap=d` face pairs that do not intersect, but are nearer than d, have contacts too, in the same order as the rest,
+and every contact has a separation: the widest gap that any direction leaves between the two closed triangles, the
+greatest of min n.b - max n.a over unit vectors n, a of the one and b of the other [world units].
+
+* Faces that do not intersect: their distance, above 0, computed as `warp_abtree.query.distance` does. p0 and p1 are the
+  nearest points, p0 on the first object's face: of a corner over a face the corner and its foot, of two edges where
+  their common normal meets them, of parallel faces, edges or a shared plane one pair of equally near points. normal is
+  the direction from p0 to p1: the face's normal under a corner, across both edges, else along neither. Where they are
+  nearer than 2^-30 of the faces' size it is told by normal_a and normal_b, as for faces that cross. coplanar is False.
+* Faces that cross: minus the length of the shortest motion of one of them after which they only touch, along a normal
+  of either face or across an edge of each; all else is as without a gap, to the bit. It is off by 2^-26 of the faces'
+  size at most, and by rounding alone unless edges are nearly parallel.
+* Faces that touch, or overlap in one plane: nothing parts them, and nothing has to. They intersect: their separation is
+  -2^-126, the least in magnitude, which stands for 0, so that the sign says whether two faces intersect, exactly.
+
+Which faces are nearer than d is decided by the computed distance, in the frame of the lower object, alone: the proofs
+by which boxes and planes are passed over have room for its error. Summaries are those of the faces that intersect,
+wherever sums below say contacts; `Result.count` counts all contacts, `Result.any` says whether a pair intersects.
+
 An end is a corner, or lies on an edge, off its exact place by at most 2^-40 of the edge's length and the rounding of
 coordinates in both frames. Where the lower object's rotation is a matrix R that is off orthonormal by s, the largest
 entry of |R^T R - I|, ends lie on the higher object's posed mesh only to within 3 s of their distance from the lower
@@ -21,7 +40,7 @@ object's position. Pairs that a coarser precision reports although they are apar
 An object pair's summary is made of sums over its contacts in the order of `Result.faces`, in float64. Each sum adds the
 contacts of each chunk of 32, the last chunk perhaps shorter, from left to right, then the chunks from left to right:
 
-* count: contacts, as `Result.count`.
+* count: contacts, as `Result.count`, with a gap those of faces that are apart too.
 * point: mean of the segments' midpoints, weighted by length; unweighted where all lengths vanish. It need not lie on
   either surface.
 * normal: mean of the normals, weighted as the points, at unit length. A mean shorter than 2^-20, as of curves that run
@@ -46,6 +65,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.contact import contact, pack, sort_hits, summary
+from warp_abtree.kernels.gap import separation
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import CapacityError
@@ -68,6 +88,11 @@ class ContactQuery(Query):
             contact and, in `launch`, time to sort all the same; `run` looks at what was found.
         contact_dtype: Type of the real numbers in `result()`, float64 or float32; those beyond float32 become infinite.
         sort_pairs: As for `Query`.
+        gap: Distance [world units]: faces nearer than that have contacts too. One for all pairs, (p,) beside given
+            pairs; where the broad phase makes the pairs also (n,), one for each object, which add up for a pair. Or a
+            Warp array of vec4d (n,) on the query's device, which each launch reads: x, y, z the motion that an object
+            is about to make, w its own part; a pair's gap is both parts and the length of the relative motion. It needs
+            precision "exact", and takes 12 bytes more a contact. None for none.
 
     Attributes:
         faces: The last launch's `Result.faces`, device vec3i (capacity,), sorted.
@@ -94,15 +119,24 @@ class ContactQuery(Query):
         within=None,
         contact_dtype=np.float64,
         sort_pairs=False,
+        gap=None,
     ):
         contact_dtypes(contact_dtype)
-        self.contact_dtype = contact_dtype
+        self.contact_dtype, self._asked_gap = contact_dtype, gap
         self.contacts, self.pair_contacts = contact.Contacts(), summary.PairContacts()
         self._sums, self._deferred = summary.ChunkSums(), contact.Deferred()
         for model in () if isinstance(scene, Batch) else scene.models:
-            model.warn_of_winding("the normals and depths of its contacts depend on the winding", stacklevel=4)
+            model.warn_of_winding("the normals and depths of its contacts depend on the winding", stacklevel=5)
         self._deferred.total = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "faces", pairs, capacity, precision, within, sort_pairs)
+
+    def set_pairs(self, pairs, within=None, gap=None):
+        """Query other pairs from now on, in the room there is if they fit; within and gap None keep the distances.
+
+        Raises:
+            ValueError: Bad pairs or distances, a query that runs the broad phase, or distances for one made without.
+        """
+        self._set_pairs(pairs, within, gap)
 
     def _slow_kernels(self, with_distances: bool) -> list:
         kernels = [contact.find_contact_kernel, summary.sum_loop_kernel]
@@ -123,6 +157,8 @@ class ContactQuery(Query):
         made = [(self.hits, "face", self._empty(capacity, wp.vec3i)), (self, "faces", self._empty(capacity, wp.vec3i))]
         made += [(self.contacts, name, self._empty(capacity, wp.vec3d)) for name in VECTORS]
         made.append((self.contacts, "coplanar", self._empty(capacity, wp.int32)))
+        if self._gap is not None:
+            made.append((self.contacts, "separation", self._empty(capacity, wp.float64)))
         made.append((self._deferred, "place", self._empty(capacity, wp.int32)))
         # The sort takes as much again as scratch.
         made.append((self, "_key", self._empty(2 * capacity, wp.int64)))
@@ -138,6 +174,7 @@ class ContactQuery(Query):
             (self.pair_contacts, "depth", wp.float64),
             (self._sums, "total", wp.float64),
             (self._sums, "middle", wp.vec3d),
+            *([] if self._gap is None else [(self._sums, "number", wp.float64)]),
         ):
             made.append((owner, name, self._empty(room, dtype)))
         return made + self._chunk_arrays(self._chunk_count(self._places, room))
@@ -146,7 +183,7 @@ class ContactQuery(Query):
         """Return (owner, attribute, new array) of whatever has an entry a chunk."""
         made = [(self._sums, "span", self._empty(count, wp.vec3i))]
         made += [(self._sums, name, self._empty(count, wp.vec3d)) for name in ("point", "normal")]
-        names = ("length", "area", "change", "front", "back")
+        names = ("length", "area", "change", "front", "back", *(["crossed"] if self._gap is not None else []))
         return made + [(self._sums, name, self._empty(count, wp.float64)) for name in names]
 
     def _empty(self, count, dtype):
@@ -197,6 +234,10 @@ class ContactQuery(Query):
 
     def _find(self, count: int):
         posed = [*self.batch.pools, self.pairs, self.pair_poses]
+        if self._gap is not None:
+            marks = [self.start, self.faces, self.contacts]
+            self._launch_kernel(separation.mark_near_kernel, count, marks)
+            self._launch_kernel(separation.find_separation_kernel, count, [*posed, *marks], WARP_SIZE)
         inputs = [*posed, self.start, self.faces, self._deferred, self.contacts]
         self._launch_kernel(contact.find_contact_kernel, count, inputs, WARP_SIZE)
         step = DEFERRED_WARPS * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
@@ -229,21 +270,21 @@ class ContactQuery(Query):
     def _share_contacts(self, found: Found, count: int):
         """Copy from arrays that are the host's memory."""
         pairs = len(found.pairs)
-        face_type, pair_type = contact_dtypes(self.contact_dtype)
+        face_type, pair_type = self._dtypes()
         found.contacts, found.pair_contacts = np.zeros(count, face_type), np.zeros(pairs, pair_type)
         found.faces = self.faces.numpy()[:count].reshape(-1, 3).copy()
         found.pair_contacts["count"] = found.count
         with np.errstate(over="ignore"):
             for name in ("point", "normal", "depth"):
                 found.pair_contacts[name] = getattr(self.pair_contacts, name).numpy()[:pairs]
-            for name in (*VECTORS, "coplanar"):
+            for name in face_type.names[2:]:
                 found.contacts[name] = getattr(self.contacts, name).numpy()[:count]
         found.contacts["pair"], found.contacts["faces"] = found.faces[:, 0], found.faces[:, 1:]
 
     def _transfer_contacts(self, found: Found, count: int):
         """Pack rows on the device, and bring them over."""
         staging, pairs = self._staging, len(found.pairs)
-        real, (face_type, pair_type) = self._real(), contact_dtypes(self.contact_dtype)
+        real, (face_type, pair_type), with_gap = self._real(), self._dtypes(), self._gap is not None
         memory = staging.row_pool.take(12 * count + pairs * pair_type.itemsize + count * face_type.itemsize)
 
         def pack_pairs(first, some, target):
@@ -252,7 +293,8 @@ class ContactQuery(Query):
 
         def pack_contacts(first, some, target):
             inputs = [first, self.faces, self.contacts, target]
-            self._launch_once(pack.contact_packer(real), (some, pack.CONTACT_NUMBERS), inputs)
+            numbers = pack.CONTACT_NUMBERS + with_gap
+            self._launch_once(pack.contact_packer(real, with_gap), (some, numbers), inputs)
 
         found.faces, memory = staging.send_rows(memory, self.faces, count)
         found.pair_contacts, memory = staging.send_records(memory, pair_type, pairs, pack_pairs)
@@ -268,9 +310,15 @@ class ContactQuery(Query):
         means = {"point": self._empty(pairs, vector), "normal": self._empty(pairs, vector)}
         means["depth"] = self._empty(pairs, real)
         self._launch_once(pack.contact_copier(real), count, [self.faces, self.contacts, *found.contacts.values()])
+        if self._gap is not None:
+            separation = found.contacts["separation"] = self._empty(count, real)
+            self._launch_once(pack.number_copier(real), count, [self.contacts.separation, separation])
         self._launch_once(pack.summary_copier(real), pairs, [self.pair_contacts, *means.values()])
         found.pair_contacts = {"count": found.count, **means}
         found.faces = wp.clone(first_rows(self.faces, count))
+
+    def _dtypes(self):
+        return contact_dtypes(self.contact_dtype, self._gap is not None)
 
     def _real(self):
         return wp.float64 if np.dtype(self.contact_dtype) == np.float64 else wp.float32

@@ -15,8 +15,32 @@ names its objects:
 * point_faces: the faces that they lie on. Of equally near face pairs the one with the lowest face of the object with
   the smaller index, then of the other; where the surfaces intersect, some pair that does.
 
+With `signed`, a pair of which one object lies inside the other, a solid (`Scene.add`), by some of its points has a
+negative distance. The depth of a point is its distance from the other's surface; looked at are corners of faces,
+middles of edges and centroids of faces, of both objects if both are solids. The greatest depth is that of the pair:
+
+* distance is minus the depth; bracket holds it as above.
+* points are the point inside and the point of the other surface that is nearest to it, in the order of the pair, and
+  point_faces the faces that they lie on. From the point inside to the other is its way out.
+
+Whatever the number of faces that have gone under, no shorter motion frees the objects: depth is a lower bound of the
+penetration depth, the length of the shortest motion that does, and that length for a body pressed into a flat floor or
+a peg that is too thick for its hole. Where solids cross and none of these points is inside, distance is 0.
+
 With the default tolerance, all of this is the same, bit for bit, on CPU and CUDA, whatever the search has started from.
 With a tolerance points, faces and distance may also depend on what the last launch found.
+
+With `originals=True` (`Scene.intersect`, `sweep`) all of this, `any` too, is of the original meshes, whatever the LODs
+of their objects; with the default tolerance it is what the finest LODs answer, bit for bit. A pair is asked at its LODs
+first where that may decide it (`warp_abtree.kernels.distance.originals`):
+
+* Originals are no nearer than the surfaces at LODs less both `Model.error_at(lod)`: the bracket's lower end. Only the
+  inward error counts, how far an original lies from its LOD.
+* They are no farther apart than any two of their faces: a pair that stands near the nearest points at the LODs gives
+  the upper end, the distance and the points. Where LODs intersect, or may, nothing is decided.
+* Pairs whose bracket is wider than asked go to the finest LODs, with these faces as the start. Tree states of their
+  models are made there and stay; where they are at hand, pairs are asked there at once, which takes no longer. Pairs
+  with a solid always are: errors of surfaces say nothing of what is inside.
 """
 
 import math
@@ -29,6 +53,7 @@ from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd, slabs
 from warp_abtree.kernels.solid.containment import report_contained_kernel
+from warp_abtree.kernels.solid.depth import find_depth_kernel
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.narrow_phase import Query
@@ -36,11 +61,13 @@ from warp_abtree.query.request import check_request, check_within, refuse_option
 from warp_abtree.query.result import DISTANCES, Found, Result
 from warp_abtree.query.staging import first_rows
 
-COUNTER_COUNT = 4
 # Places among the launches, from their end: of the search, and of what is about pairs that intersect.
 SEARCH, CROSSINGS = -4, (-3, -1)
 # Pairs that make a further core worth its while, which costs some 50 us.
 PAIRS_A_CORE = 4
+FIELDS = {"point_faces": "faces"}  # of `report.Distances`, where a result's name is another
+# Pairs from which on warps search each roughly first; fewer leave some idle, and those share the search.
+ROUGH_LEAST = 1024
 
 
 def check_beyond(beyond, pair_count=None) -> np.ndarray:
@@ -50,12 +77,9 @@ def check_beyond(beyond, pair_count=None) -> np.ndarray:
     return check_within(beyond, pair_count, "beyond")
 
 
-def make_tolerances(tolerance, relative):
-    """Return the tolerances of a search for a kernel."""
-    tolerances = frame.Tolerances()
-    tolerances.tolerance = check_tolerance(tolerance, "tolerance", math.inf)
-    tolerances.relative = check_tolerance(relative, "relative", 1.0)
-    return tolerances
+def check_tolerances(tolerance=0.0, relative=0.0) -> tuple[float, float]:
+    """Return the tolerances of a search."""
+    return check_tolerance(tolerance, "tolerance", math.inf), check_tolerance(relative, "relative", 1.0)
 
 
 def check_tolerance(tolerance, name: str, most: float) -> float:
@@ -70,23 +94,56 @@ def check_tolerance(tolerance, name: str, most: float) -> float:
     return float(value)
 
 
+def check_flag(value, name: str) -> bool:
+    """Return a bool, such as signed or originals; raise ValueError for what is none."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} {value!r} is neither True nor False")
+    return bool(value)
+
+
+def check_flags(options: dict) -> tuple[bool, bool]:
+    """Return whether distances are signed, and whether of originals.
+
+    Raises:
+        ValueError: One that is no bool, or both are asked: depths are those of LODs.
+    """
+    signed, originals = (check_flag(options.get(name, False), name) for name in ("signed", "originals"))
+    if signed and originals:
+        raise ValueError("signed means nothing beside originals; ask at the finest LODs")
+    return signed, originals
+
+
 def check_asked(output, precision, options):
     """Check what is asked of a sweep.
 
     Raises:
-        TypeError: An option with another name than tolerance, relative and beyond.
+        TypeError: An option with another name than tolerance, relative, beyond, signed, originals and within.
         ValueError: A bad option, output or precision, or one that means nothing beside another.
     """
-    unknown = set(options) - {"tolerance", "relative", "beyond"}
+    unknown = set(options) - {"tolerance", "relative", "beyond", "signed", "originals", "within"}
     if unknown:
         raise TypeError(f"sweep has no option {sorted(unknown)[0]!r}")
     if output == "distance":
-        refuse_options(output, {"precision": precision != "exact"})
-        make_tolerances(options.get("tolerance", 0.0), options.get("relative", 0.0))
+        refuse_options(output, {"precision": precision != "exact", "within": "within" in options})
+        check_tolerances(options.get("tolerance", 0.0), options.get("relative", 0.0))
         check_beyond(options.get("beyond"))
+        check_flags(options)
     else:
-        refuse_options(output, options)
+        taken = ("within",) if output != "faces" else ()
+        refuse_options(output, {name: value for name, value in options.items() if name not in taken})
         check_request(output, precision)
+        if options.get("within") is not None:
+            check_within(options["within"], known="a sweep: one distance for all")
+
+
+def prepare_query(query, batch, pairs: np.ndarray, beyond: np.ndarray, tolerances: dict, signed: bool = False):
+    """Return a `DistanceQuery` for what is asked, checked: the one of before if there is one, else another."""
+    if query is None:
+        return DistanceQuery(batch, pairs=pairs, beyond=beyond, signed=signed, **tolerances)
+    query.set_tolerance(**tolerances)
+    if not query.is_asked(pairs, beyond):
+        query.replace_pairs(pairs, beyond)
+    return query
 
 
 class DistanceQuery(Query):
@@ -101,6 +158,7 @@ class DistanceQuery(Query):
         relative: The same as a fraction of the distance, below 1; the wider one counts.
         beyond: Distance [world units] that ends the search of a pair which is proved farther apart: one for all pairs,
             or (p,) beside given pairs; None for none.
+        signed: Whether pairs of which one is a solid that holds corners of the other have their depth, negative.
 
     Attributes:
         distances: The last launch's answers, device arrays (pair capacity,) of `kernels.distance.report.Distances`.
@@ -112,13 +170,16 @@ class DistanceQuery(Query):
 
     _memory: wp.array
 
-    def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None):
-        self._tolerances = make_tolerances(tolerance, relative)
+    def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None, signed=False):
+        self._signed = check_flag(signed, "signed")
+        self._asked_tolerances = check_tolerances(tolerance, relative)
+        self._tolerances = frame.Tolerances()
+        self._tolerances.tolerance, self._tolerances.relative = self._asked_tolerances
+        self._answer_views: tuple[int, dict] = (-1, {})
         self._asked = check_beyond(beyond, None if pairs is None else len(to_numpy(pairs, "pairs")))
         self.distances, self._found, self._slabs = report.Distances(), frame.Found(), slabs.Slabs()
         self._slabs.record = wp.empty(0, dtype=wp.vec4, device=scene.device)
         self._slabs.made = wp.empty(0, dtype=wp.vec4i, device=scene.device)
-        self._counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity)
         self._found.launched = self.guard.launched
 
@@ -142,14 +203,21 @@ class DistanceQuery(Query):
         Raises:
             ValueError: One that is negative, infinite or no number.
         """
-        asked = make_tolerances(tolerance, relative)
-        if (asked.tolerance, asked.relative) != (self._tolerances.tolerance, self._tolerances.relative):
-            self._tolerances = asked
+        asked = check_tolerances(tolerance, relative)
+        if asked != self._asked_tolerances:
+            self._asked_tolerances = self._tolerances.tolerance, self._tolerances.relative = asked
             self._commands = Commands()
 
     def forget(self):
         """Let the next launch start anew, and not from the faces that the last one found. Launches only."""
         self._found.faces.fill_(int(frame.NO_FACES))
+
+    def start_from(self, faces: np.ndarray):
+        """Let the next launch start from a face of each object of the pairs in place, int32 (p, 2); -1 for none."""
+        order = self._given[:, 0] > self._given[:, 1]
+        faces = np.where(order[:, None], faces[:, ::-1], faces).astype(np.int64)
+        items = np.where(faces.min(1) < 0, int(frame.NO_FACES), (faces[:, 0] << 32) | faces[:, 1])
+        wp.copy(self._found.faces, wp.array(items, dtype=wp.int64, device="cpu", copy=False), count=len(items))
 
     def _fill_within(self):
         beyond = self._asked if self._within is None else self._within
@@ -177,6 +245,8 @@ class DistanceQuery(Query):
             (self.distances, "faces", wp.vec2i),
         ):
             made.append((owner, name, wp.empty(room, dtype=dtype, device=self.device)))
+        uppers = room if self.uses_warps() else 0
+        made.append((self._found, "upper", wp.empty(uppers, dtype=wp.float32, device=self.device)))
         threads = 0 if self.uses_warps() else min(room, current_regime().cpu_threads or core_count())
         made.append((self._slabs, "states", wp.empty(room, dtype=wp.vec2i, device=self.device)))
         made.append(
@@ -199,7 +269,7 @@ class DistanceQuery(Query):
             return
         commands = self._commands.find("distances", self.guard.given(), self._make_distances)
         # On the CPU what is launched is done.
-        meeting = self.device.is_cuda or bool(self.hits.any_hit.numpy().any())
+        meeting = self.device.is_cuda or bool(self._views.any_hit.any())
         for place, command in enumerate(commands, -len(commands)):
             if place == SEARCH and not self.uses_warps():
                 rooms = len(self._memory)
@@ -216,7 +286,14 @@ class DistanceQuery(Query):
             return []
         posed = [*self.batch.pools, self.pair_count, self.pairs, self.pair_poses]
         inputs = [*posed, self.guard.launched, self.hits, self.contained, self.distances]
-        return [launch(report_contained_kernel, dim=len(self.pairs), inputs=inputs, device=self.device)]
+        made = [launch(report_contained_kernel, dim=len(self.pairs), inputs=inputs, device=self.device)]
+        if self._signed:
+            models, states, *posed = posed
+            inputs = [self._stack_length(), models, states, self.batch.solids.pool, *posed]
+            inputs += [self.guard.launched, self.hits, self.distances]
+            dim = len(self.pairs) * (WARP_SIZE if self.device.is_cuda else 1)
+            made.append(launch(find_depth_kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
+        return made
 
     def _fit_slabs(self):
         """Make room for the slabs of all tree states that there are now; a graph goes on without."""
@@ -238,14 +315,16 @@ class DistanceQuery(Query):
         warps = {"dim": room * lanes, "block_dim": WARP_SIZE, "device": device}
         threads = {"dim": room, "block_dim": WARP_SIZE, "device": device}
         reports = [*posed, found, hits, self.distances]
-        made = [launch(frame.start_distance_kernel, inputs=[*posed, found, self._counter], **threads)]
+        start = {**threads, "dim": max(room, len(self.work.flag))}
+        made = [launch(frame.start_distance_kernel, inputs=[*posed, found, self.work], **start)]
         if self.uses_warps():
-            inputs = [length, self._tolerances, *shared, found, hits]
-            made.append(launch(search.search_warp_kernel, inputs=inputs, **warps))
+            inputs = [length, ROUGH_LEAST, self._tolerances, *shared, found, hits, self.work]
+            searching = {**warps, "dim": self._warp_count() * lanes}
+            made.append(launch(search.search_warp_kernel, inputs=inputs, **searching))
         else:
             inputs = [models, states, objects, self.pair_count, self.pairs, found, self._slabs]
             made.append(launch(slabs.refresh_slab_kernel, inputs=inputs, dim=room, device=device))
-            inputs = [self._tolerances, *shared, self._counter, self._slabs, found, hits, self._memory]
+            inputs = [self._tolerances, *shared, self.work.counter, self._slabs, found, hits, self._memory]
             made.append(launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device))
         return [
             *made,
@@ -256,8 +335,21 @@ class DistanceQuery(Query):
 
     def _make_result(self, found: Found, device: bool, with_rows: bool = True) -> Result:
         n, answers = len(found.pairs), self.distances
+        views = self._find_views() if self.device.is_cpu and not device else {}
         for name in (*DISTANCES, "points"):
-            rows = getattr(answers, "faces" if name == "point_faces" else name)
+            if name in views:
+                setattr(found, name, views[name][:n].copy())
+                continue
+            rows = getattr(answers, FIELDS.get(name, name))
             rows = rows if len(rows) == n else first_rows(rows, n)
             setattr(found, name, wp.clone(rows) if device else rows.numpy().copy())
         return super()._make_result(found, device, with_rows)
+
+    def _find_views(self) -> dict:
+        """Return NumPy's views of the answers, where these are the host's memory."""
+        made, views = self._answer_views
+        if made != self.guard.buffers.number:
+            fields = {name: getattr(self.distances, FIELDS.get(name, name)) for name in (*DISTANCES, "points")}
+            views = {name: rows.numpy() for name, rows in fields.items()}
+            self._answer_views = self.guard.buffers.number, views
+        return views

@@ -10,7 +10,16 @@ Meshes meet in curves, and a curve alone has no depth. Here is what is made of i
   normal, at the deepest place. Where the normal of either face is within 60 degrees of the loop's and makes that
   depth no larger, it takes the place of the loop's: so a box in a corner is pushed by floor and wall, each its own way.
 * Of all candidates of the pair an outermost one is taken, then those farthest, in place and in normal, from the
-  segments between those before, and the deepest, up to `POINTS` of them.
+  segments between those before, and the deepest, up to `POINTS` of them, in the order in which they lie along a fixed
+  direction of the lower object: points that stay keep their order from launch to launch.
+
+With `gap=d` faces that are apart but nearer than d have candidates too, with minus a separation as depth. Where two
+faces look at one another within 60 degrees it is measured along the normal that leaves the wider gap: the nearest point
+of the one face's part within the column of the other, and one far from it. Where their distance is in another
+direction, as across two edges, it is their nearest points. A face behind the other's plane is inside, as deep as it is
+far: so what lies up to d inside is not forgotten once it no longer crosses. Across edges and inside, points count only
+if no other face of either object is nearer to them: so a box that slides over a floor of many faces is not stopped by
+the edges between them. Depths count from the gap on for what is half as deep as what.
 
 Normals come from the winding of the faces, outwards. Only surfaces that cross have contacts: an object that lies whole
 inside another has none. Depth is exact while every vertex inside has a face that crosses; once a whole ring of faces
@@ -26,6 +35,8 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.contact import manifold, points
+from warp_abtree.kernels.gap import near_points
+from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.result import Found, Result
 from warp_abtree.query.staging import first_rows
@@ -39,7 +50,7 @@ class ManifoldQuery(ContactQuery):
     Pairs of the broad phase are sorted by their objects, so that nothing depends on the order in which it found them.
 
     Args:
-        scene, pairs, capacity, precision: As for `ContactQuery`.
+        scene, pairs, capacity, precision, gap: As for `ContactQuery`.
 
     Attributes:
         manifolds: Points of each pair, device arrays (pair capacity, POINTS) of `kernels.manifold.Manifolds`, float64.
@@ -47,9 +58,10 @@ class ManifoldQuery(ContactQuery):
 
     growth = 2
 
-    def __init__(self, scene, pairs=None, capacity=None, precision="exact"):
+    def __init__(self, scene, pairs=None, capacity=None, precision="exact", gap=None):
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
-        super().__init__(scene, pairs, capacity, precision, sort_pairs=True)
+        super().__init__(scene, pairs, capacity, precision, sort_pairs=True, gap=gap)
+        self._no_gap = wp.empty(0, dtype=wp.float64, device=self.device)
 
     def _place_arrays(self, capacity: int) -> list:
         made = super()._place_arrays(capacity)
@@ -74,17 +86,24 @@ class ManifoldQuery(ContactQuery):
         self._find(count)
         room = len(self.pairs)
         pools = self.batch.pools
-        start, rows, curves = self.start, self.faces, self.curves
+        start, rows, curves, contacts = self.start, self.faces, self.curves, self.contacts
+        gap = self._no_gap if self._gap is None else self.hits.gap
+        posed = [*pools, self.pairs, self.pair_poses]
         self._launch_kernel(manifold.begin_loop_kernel, count, [start, rows, curves, self._order, self._key])
         self._sort_keys(count, 31 + room.bit_length())
-        self._launch_kernel(manifold.link_loop_kernel, count, [start, rows, self._order, self._key, curves])
-        self._launch_kernel(manifold.name_loop_kernel, count, [start, curves, self._order, self._key])
+        self._launch_kernel(manifold.link_loop_kernel, count, [start, rows, contacts, self._order, self._key, curves])
+        if self._gap is not None:
+            both = near_points.Rows()
+            both.start, both.faces, both.order, both.key = start, rows, self._order, self._key
+            inputs = [*posed, gap, both, contacts, curves]
+            self._launch_kernel(near_points.find_near_candidate_kernel, count, inputs, WARP_SIZE)
+        self._launch_kernel(manifold.name_loop_kernel, count, [start, contacts, curves, self._order, self._key])
         self._sort_keys(count, 31)
-        inputs = [*pools, self.pairs, start, rows, self.contacts, self._order, curves]
+        inputs = [*pools, self.pairs, start, rows, contacts, self._order, curves]
         self._launch_kernel(manifold.average_loop_kernel, count, inputs)
-        inputs = [*pools, self.pairs, self.pair_poses, start, rows, self.contacts, curves]
+        inputs = [*posed, gap, start, rows, contacts, curves]
         self._launch_kernel(manifold.find_candidate_kernel, count, inputs)
-        self._launch_warps(points.spread_point_kernel, room, [pools[2], self.pairs, start, curves, self.manifolds])
+        self._launch_warps(points.spread_point_kernel, room, [pools[2], self.pairs, gap, start, curves, self.manifolds])
 
     def _sort_keys(self, count, bits):
         with wp.ScopedDevice(self.device):

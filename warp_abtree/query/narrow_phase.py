@@ -4,6 +4,7 @@ import math
 from functools import partial
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device
@@ -11,13 +12,22 @@ from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels import relative_pose
+from warp_abtree.kernels.gap import near_faces
 from warp_abtree.kernels.solid.containment import find_contained_kernel
 from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.readout import QueryReadout
-from warp_abtree.query.request import LIST_MAX, OUTPUTS, PRECISIONS, check_capacity, check_request, check_within
+from warp_abtree.query.request import (
+    LIST_MAX,
+    OUTPUTS,
+    PRECISIONS,
+    check_capacity,
+    check_gap,
+    check_request,
+    check_within,
+)
 from warp_abtree.query.result import Found, Result
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
@@ -26,6 +36,7 @@ from warp_abtree.state.generation import LaunchGuard
 UNCERTAIN_ROOM = 65536
 # Warps that one multiprocessor runs at a time by their registers: of the traversal, of the pass over uncertain pairs.
 WARPS_A_PROCESSOR, FILTER_WARPS_A_PROCESSOR = 16, 20
+NEAR_WARPS_A_PROCESSOR = 12
 # So that each finds a slot for all that it gives away at once.
 WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
@@ -69,6 +80,8 @@ class Query(QueryReadout):
     """
 
     growth = 1  # room that `run` makes, over the demand
+    _asked_gap: Any = None  # of operators that take one
+    _reach: wp.array | None = None  # part of each object in the gap, where the broad phase makes pairs
 
     def __init__(
         self, scene, output="faces", pairs=None, capacity=None, precision="exact", within=None, sort_pairs=False
@@ -84,6 +97,7 @@ class Query(QueryReadout):
             pairs = batch.check_pairs(pairs)
         if within is not None:
             within = check_within(within, None if pairs is None else len(pairs))
+        self._take_gap(None if pairs is None else len(pairs))
         self._torn = False
         self._commands = Commands()
         self.guard = LaunchGuard(
@@ -92,13 +106,14 @@ class Query(QueryReadout):
         self.broad_phase: Any = None
         if pairs is None:
             self._excluded_count = len(batch.excluded)
-            self.broad_phase = BroadPhase(batch, room.pairs, sort_pairs)
+            self.broad_phase = BroadPhase(batch, room.pairs, sort_pairs, self._reach)
             self.broad_phase.guard = self.guard
+            self.broad_phase.wide = 0.0 if within is None else 0.5 * float(within)
             self.pairs, self.pair_count = self.broad_phase.pairs, self.broad_phase.pair_count
         else:
             self.pair_count = wp.zeros(1, dtype=wp.int32, device=self.device)
             self.pairs = wp.empty(room.pairs or 0, dtype=wp.vec2i, device=self.device)
-        self.hits = self._make_hits()
+        self.hits = self._make_hits(self._gap is not None)
         self.near = None if within is None else self._make_hits()
         self.work = self._make_work()
         self._no_distance = wp.empty(0, dtype=wp.float64, device=self.device)
@@ -108,6 +123,22 @@ class Query(QueryReadout):
         if pairs is not None:
             self.set_pairs(pairs)
         self.resize((room.hits or max(1024, 16 * len(self.pairs))) if output == "faces" else 0)
+
+    def _take_gap(self, pair_count: int | None):
+        """Check the gap that is asked, if any; what the broad phase reads of it goes to the device."""
+        gap, count = self._asked_gap, self.batch.object_count
+        if gap is None:
+            return
+        if self.precision != "exact":
+            raise ValueError(f"gap: needs precision 'exact', not {self.precision!r}")
+        if pair_count is None and isinstance(gap, wp.array) and gap.shape == (count,) and gap.dtype is wp.vec4d:
+            self._gap, self._reach = np.zeros(count), gap
+            return
+        self._gap = check_gap(gap, pair_count, count)
+        if pair_count is None:
+            rows = np.zeros((count, 4))
+            rows[:, 3] = 0.5 * self._gap if self._gap.ndim == 0 else self._gap
+            self._reach = wp.array(rows, dtype=wp.vec4d, device=self.device)
 
     def _make_work(self):
         work, device = load_balance.Work(), self.device
@@ -141,10 +172,16 @@ class Query(QueryReadout):
     def _launch(self, between=None):
         if self.broad_phase is not None:
             self.broad_phase.launch()
+            self._add_reaches()
         if between is not None:
             between()
         self.prove_apart()
         self.traverse()
+
+    def _add_reaches(self):
+        if self._reach is not None and len(self.pairs):
+            inputs = [self.pair_count, self.pairs, self._reach, self.hits.gap]
+            self._repeat((), near_faces.add_reach_kernel, len(self.pairs), inputs)
 
     def finish(self, count: int | None = None):
         """Make of the hits whatever else is asked. Launches only.
@@ -197,14 +234,11 @@ class Query(QueryReadout):
     def _make_search(self, within, hits, mode, output, launch) -> list:
         """Make the launches that bring relative poses and traverse all pairs, see `Commands.find`."""
         pools, room = self.batch.pools, len(self.pairs)
-        # More than there are units, where these are few: idle warps wait for donations.
-        warps = max(room, int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1)
-        warps = min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count) if self.device.is_cuda else 1
-        self.work.warps = warps if self.uses_warps() else 0
+        self.work.warps = self._warp_count() if self.uses_warps() else 0
         inputs = [output, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
         # A warp a block: few pairs lie on as many multiprocessors.
-        kernel = relative_pose.relative_poses(mode == int(face_pairs.WITHIN))
+        kernel = relative_pose.relative_poses(len(within) > 0)
         first = launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
         if not self.uses_warps():
@@ -212,12 +246,20 @@ class Query(QueryReadout):
             return [first, launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device)]
         traversal = launch(
             dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
-            dim=self.work.warps * (WARP_SIZE if self.device.is_cuda else 1),
+            dim=self._warp_count() * (WARP_SIZE if self.device.is_cuda else 1),
             inputs=[self._stack_length(), *inputs, hits, self.work],
             block_dim=WARP_SIZE,
             device=self.device,
         )
         return [first, traversal]
+
+    def _warp_count(self) -> int:
+        """Return the warps of a launch: more than units, where these are few, so that some wait for donations."""
+        if not self.device.is_cuda:
+            return 1
+        room = len(self.pairs)
+        warps = max(room, int(self.work.warps_per_pair * max(4.0, math.sqrt(room))) + 1)
+        return min(warps, WARPS_MAX, WARPS_A_PROCESSOR * self.device.sm_count)
 
     def _stack_length(self) -> int:
         length = self._regime.stack_length
@@ -252,30 +294,41 @@ class Query(QueryReadout):
 
     def _make_traversal(self, launch) -> list:
         """Make the launches of the narrow phase."""
-        output, mode = int(OUTPUTS[self.output]), int(PRECISIONS[self.precision])
-        made = self._make_search(self._no_distance, self.hits, mode, output, launch)
+        output, mode, within = int(OUTPUTS[self.output]), self._mode(), self._no_distance
+        if self._gap is not None:
+            within = self.hits.gap
+        made = self._make_search(within, self.hits, mode, output, launch)
         models, states, _ = self.batch.pools
-        if len(self.hits.uncertain):
-            threads = FILTER_WARPS_A_PROCESSOR * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
-            inputs = [threads, output, models, states, self.pair_poses, self.hits]
-            made.append(launch(self._pass(), dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
+        for kernel, warps in self._passes() if len(self.hits.uncertain) else ():
+            threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
+            given = [] if kernel is near_faces.find_near_kernel else [output]
+            inputs = [threads, *given, models, states, self.pair_poses, self.hits]
+            made.append(launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
         return made
 
-    def _pass(self):
-        """Return the kernel that decides uncertain face pairs."""
-        exact = int(PRECISIONS[self.precision]) == EXACT
-        return uncertain_pairs.resolve_exact_kernel if exact else uncertain_pairs.resolve_rounded_kernel
+    def _mode(self) -> int:
+        return int(PRECISIONS[self.precision] if self._asked_gap is None else face_pairs.GAP)
+
+    def _passes(self) -> list:
+        """Return the kernels that decide what the traversal lists, and their warps on a multiprocessor."""
+        if int(PRECISIONS[self.precision]) != EXACT:
+            return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR)]
+        return [
+            (uncertain_pairs.resolve_exact_kernel, FILTER_WARPS_A_PROCESSOR),
+            *([] if self._asked_gap is None else [(near_faces.find_near_kernel, NEAR_WARPS_A_PROCESSOR)]),
+        ]
 
     def _slow_kernels(self, with_distances: bool) -> list:
         """Return the kernels that take longest to compile, with block sizes, the longest first."""
         within = int(face_pairs.WITHIN)
-        modes = [int(PRECISIONS[self.precision]), *([within] if with_distances else [])]
+        modes = [self._mode(), *([within] if with_distances else [])]
         if self.uses_warps():
             kernels = [dual_tree.warp_traversal(mode, mode == within or self.output == "any") for mode in modes]
-            kernels.insert(0, self._pass())
+            kernels = [*[kernel for kernel, _ in self._passes()], *kernels]
         else:
             kernels = [simd.thread_traversal(mode) for mode in modes]
-        kernels += [relative_pose.relative_poses(mode == within) for mode in modes]
+        distant = (within, int(face_pairs.GAP))
+        kernels += [relative_pose.relative_poses(mode in distant) for mode in modes]
         return [(kernel, WARP_SIZE) for kernel in kernels]
 
     def result(self, device: bool = False) -> Result:

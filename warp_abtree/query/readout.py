@@ -77,12 +77,14 @@ class QueryReadout(QueryBuffers):
         if self.output == "faces":
             total = int(views.counts[0].sum())
         if len(self.hits.uncertain):
-            uncertain = int(views.counts[FLOAT64_ROW].sum())
+            apart = 0 if self._gap is None else int(self.hits.apart_total.numpy().view(np.uint32)[0])
+            uncertain = max(apart, int(views.counts[FLOAT64_ROW].sum()))
         return Totals(self.guard.outcome(), found, total, uncertain)
 
     def _totals(self, words) -> Totals:
         """Return the demands in a header; those of lists that the query lacks are 0."""
-        launched, found, hits, uncertain = words[:HEADER].tolist()
+        launched, found, hits, uncertain, apart = words[:HEADER].tolist()
+        uncertain = max(uncertain, apart)
         found = len(self._given) if self.broad_phase is None else self.broad_phase.check_found(found)
         return Totals(
             launched, found, hits if self.output == "faces" else 0, uncertain if len(self.hits.uncertain) else 0
@@ -95,8 +97,9 @@ class QueryReadout(QueryBuffers):
         n = len(self._given) if self.broad_phase is None else min(self._read_totals().pairs, len(self.pairs))
         if device:
             return self._keep_pairs(n)
+        self._pack_pairs(n)
         expected = self._expected_hits(n)
-        self._pack(n, expected)
+        self._sort_hits(expected, self._sort_room(expected))
         return self._bring(n, expected)
 
     def _repeats_calls(self, device: bool) -> bool:
@@ -104,17 +107,18 @@ class QueryReadout(QueryBuffers):
         return self.device.is_cuda and self._packs() and not device and self.broad_phase is None
 
     def _launch_and_bring(self, launch) -> Found:
-        """Launch, pack and sort, by a graph where a call repeats the one before, and read. Waits for the device."""
+        """Launch and pack, by a graph where a call repeats the one before, and read. Waits for the device."""
         n = len(self._given)
-        expected = self._expected_hits(n)
-        self._make_staging_room(n, expected)
+        words = self._staging.room("words", self._block_length(n), wp.int64)
 
         def launch_all():
             launch()
-            self._pack(n, expected)
+            self._pack_pairs(n)
 
-        given = *self.guard.given(), n, expected, *self._staging.addresses()
-        self._commands.repeat_call(given, self.device, launch_all)
+        self._commands.repeat_call((*self.guard.given(), n, words.ptr), self.device, launch_all)
+        # Not in the graph: Warp's sort fails without an exception there once memory has run out.
+        expected = self._expected_hits(n)
+        self._sort_hits(expected, self._sort_room(expected))
         return self._bring(n, expected)
 
     def _expected_hits(self, n: int) -> int:
@@ -127,19 +131,6 @@ class QueryReadout(QueryBuffers):
             return 0
         # A little more, in steps, so that hits that vary find room and launches stay the same.
         return min(-(-hits * 17 // 16 // ROWS_STEP) * ROWS_STEP, len(self.hits.face))
-
-    def _make_staging_room(self, n: int, hits: int):
-        """Allocate what `_pack` writes to."""
-        staging = self._staging
-        staging.room("words", self._block_length(n), wp.int64)
-        if hits:
-            self._sort_room(hits)
-
-    def _pack(self, n: int, hits: int):
-        """Pack what there is an entry a pair of, and sort the first hits, into the staging memory. Launches only."""
-        self._pack_pairs(n)
-        if hits:
-            self._sort_hits(hits, self._sort_room(hits))
 
     def _bring(self, n: int, expected: int) -> Found:
         """Bring over what was packed. Waits for the device."""
@@ -234,13 +225,11 @@ class QueryReadout(QueryBuffers):
         return staging.send_rows(staging.row_pool.take(12 * count), staging.rows, count)[0]
 
     def _sort_room(self, count: int) -> wp.array:
-        """Return the staging memory that hits are sorted into, with room for so many, after that of the sort."""
-        self._staging.room("order", 2 * count, wp.int32)
-        self._staging.room("key", 2 * count, wp.int64)
+        """Return the staging memory that so many hits are sorted into."""
         return self._staging.room("rows", count, wp.vec3i)
 
     def _sort_hits(self, count: int, rows):
-        """Write the hits to rows in order, and return these. Launches only."""
+        """Write the first hits to rows in order, and return these. Launches only."""
         order = self._staging.room("order", 2 * count, wp.int32)
         key = self._staging.room("key", 2 * count, wp.int64)
         self._sort_into(count, order, key, rows)

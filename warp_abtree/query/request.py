@@ -11,6 +11,9 @@ from warp_abtree.kernels.traversal import face_pairs
 OUTPUTS = {"any": face_pairs.OUTPUT_ANY, "count": face_pairs.OUTPUT_COUNT, "faces": face_pairs.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float32": predicates.FLOAT32}
 
+# What one output alone takes, beside distances that most do.
+OPTIONS = {"within", "tolerance", "relative", "beyond", "signed", "originals", "gap"}
+
 # A launch of 32 threads a pair stays within 2^31.
 PAIRS_MAX = 2**26
 # Entries that an int32 numbers.
@@ -28,7 +31,8 @@ class Buffers:
     Attributes:
         hits: Intersecting face pairs, where they are listed.
         pairs: Object pairs; by default those given, or a guess for the broad phase.
-        uncertain: Face pairs between float32 and the later stages; not needed on the CPU.
+        uncertain: Face pairs between float32 and the later stages, and with a gap as many that are apart; not needed on
+            the CPU.
 
     Raises:
         ValueError: A number that is out of range.
@@ -74,6 +78,14 @@ def check_request(output: str, precision: str):
         raise ValueError(f"output {output!r} is found by ab.{others[output]}, or Scene.intersect")
 
 
+def given_options(caller: str, **options) -> dict:
+    """Return the options that are neither None nor False; raise TypeError for one that none of the outputs has."""
+    unknown = set(options) - OPTIONS
+    if unknown:
+        raise TypeError(f"{caller} has no option {sorted(unknown)[0]!r}")
+    return {name: value for name, value in options.items() if value is not None and value is not False}
+
+
 def refuse_options(output: str, given: dict):
     """Raise ValueError for options, by name, that are given though they mean nothing for an output."""
     for name, is_given in given.items():
@@ -81,7 +93,19 @@ def refuse_options(output: str, given: dict):
             raise ValueError(f"{name} means nothing for output {output!r}")
 
 
-def check_within(within, pair_count=None, name="within") -> np.ndarray:
+def check_gap(gap, pair_count, object_count: int) -> np.ndarray:
+    """Return gaps [world units] as float64: () or (p,) beside given pairs, () or (n,) for the broad phase.
+
+    Raises:
+        ValueError: As `check_within`.
+    """
+    if pair_count is not None:
+        return check_within(gap, pair_count, "gap")
+    known = f"pairs of the broad phase: one for all, or one for each of {object_count} objects"
+    return check_within(gap, object_count, "gap", known)
+
+
+def check_within(within, pair_count=None, name="within", known=None) -> np.ndarray:
     """Return distances [world units] as float64, () or (p,); errors have their name.
 
     Raises:
@@ -90,11 +114,13 @@ def check_within(within, pair_count=None, name="within") -> np.ndarray:
     """
     within = to_numpy(within, name).astype(np.float64)
     if within.shape != () and within.shape != (pair_count,):
-        known = "pairs of the broad phase: one distance for all" if pair_count is None else f"{pair_count} pairs"
+        if known is None:
+            known = "pairs of the broad phase: one distance for all" if pair_count is None else f"{pair_count} pairs"
         raise ValueError(f"{name}: shape {within.shape} given for {known}")
     bad = np.flatnonzero(~(np.isfinite(within) & (within >= 0)))
     if len(bad):
-        raise ValueError(f"{name}: {within.flat[bad[0]]} of pair {bad[0]} is no finite distance of 0 or more")
+        whose = "" if within.shape == () else f" of {'pair' if known is None else 'object'} {bad[0]}"
+        raise ValueError(f"{name}: {within.flat[bad[0]]}{whose} is no finite distance of 0 or more")
     return within
 
 

@@ -15,7 +15,7 @@ DISTANCES = ("distance", "bracket", "point_faces")
 VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
 
 
-def contact_dtypes(dtype=np.float64):
+def contact_dtypes(dtype=np.float64, with_gap=False):
     """Return the types of `Result.contacts` and `Result.pair_contacts`, real numbers of a type inside.
 
     Raises:
@@ -27,13 +27,15 @@ def contact_dtypes(dtype=np.float64):
         real = None
     if real not in (np.float32, np.float64):
         raise ValueError(f"contact_dtype {dtype!r} is neither float32 nor float64")
-    return _record_types(real)
+    return _record_types(real, with_gap)
 
 
 @cache
-def _record_types(real):
+def _record_types(real, with_gap):
     indices = [("pair", np.int32), ("faces", np.int32, (2,))]
-    vectors = [(name, real, (3,)) for name in VECTORS]
+    vectors: list = [(name, real, (3,)) for name in VECTORS]
+    if with_gap:
+        vectors.append(("separation", real))
     means = [("point", real, (3,)), ("normal", real, (3,)), ("depth", real)]
     return np.dtype([*indices, *vectors, ("coplanar", bool)]), np.dtype([("count", np.int64), *means])
 
@@ -80,7 +82,7 @@ class Result:
     Attributes:
         pairs: Object pairs queried, int32 (p, 2).
         any: Whether each pair intersects, bool (p,).
-        count: Intersecting face pairs of each, int64 (p,); None for output "any".
+        count: Intersecting face pairs of each, with a gap those nearer than that too, int64 (p,); None for "any".
         faces: (pair, face of the pair's first object, face of its second), int32 (k, 3), sorted; None unless output
             is "faces" or "contacts".
         contacts, pair_contacts: Structured arrays (k,) and (p,), see `warp_abtree.query.contacts`; None unless

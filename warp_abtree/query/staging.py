@@ -135,10 +135,6 @@ class Staging:
             setattr(self, name, array)
         return array
 
-    def addresses(self) -> tuple:
-        """Return where the device memory lies that grows."""
-        return tuple(array.ptr for array in (self.words, self.rows, self.order, self.key))
-
     def send_words(self, words: wp.array, count: int) -> np.ndarray:
         """Bring words over, int64 (count,). Does not wait."""
         memory = self.pair_pool.take(8 * count)

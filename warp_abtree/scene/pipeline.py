@@ -164,7 +164,7 @@ class Pipeline:
             self._set_objects()
             self.query.launch()
             hits, launched = self.query.hits, self.query.guard.launched
-            inputs = [self.query.pair_count, hits.total, hits.uncertain_total, launched, self._demand]
+            inputs = [self.query.pair_count, hits, launched, self._demand]
             wp.launch(kernels.tally_demand_kernel, 1, inputs, device=self.device)
 
     def _set_objects(self):

@@ -8,11 +8,9 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
 from warp_abtree.model.model import Model
 from warp_abtree.query.broad_phase import BroadPhase
-from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.distance import DistanceQuery, check_beyond
-from warp_abtree.query.narrow_phase import Query
-from warp_abtree.query.request import check_request, check_within, refuse_options
+from warp_abtree.query.request import given_options, refuse_options
 from warp_abtree.query.result import Result, contact_dtypes
+from warp_abtree.scene.kept_queries import KeptQueries
 from warp_abtree.scene.objects import ALL_BITS, ObjectList, check_columns, check_lods, check_models
 from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, place_rows
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
@@ -65,7 +63,7 @@ class Scene:
         self._batch: Batch | None = None
         self._broad_phase: BroadPhase | None = None
         self._host_poses: HostPoses | None = None
-        self._queries: dict[tuple, Query] = {}
+        self._queries = KeptQueries(self, self._find_pairs)
 
     @property
     def object_count(self) -> int:
@@ -283,13 +281,20 @@ class Scene:
         Worlds never mix (-1 is in every one), two static objects never pair, nor do objects whose collision groups and
         masks forbid it; filtered pairs stay out.
         """
+        return self._broad_pairs(0.0)
+
+    def _find_pairs(self, pairs, within: float) -> np.ndarray:
+        """Return given pairs, checked, or those of the broad phase up to a distance."""
+        return self._broad_pairs(within) if pairs is None else check_pairs(pairs, self.object_count)
+
+    def _broad_pairs(self, within: float) -> np.ndarray:
         check_device(self.device, "Scene.broad_phase")
         if self.object_count < 2:
             return np.empty((0, 2), np.int32)
         batch = self.batch()
         if self._broad_phase is None:
             self._broad_phase = BroadPhase(batch)
-        return self._broad_phase.find()
+        return self._broad_phase.find(within)
 
     def intersect(
         self,
@@ -299,9 +304,7 @@ class Scene:
         within=None,
         contact_dtype=np.float64,
         device: bool = False,
-        tolerance=None,
-        relative=None,
-        beyond=None,
+        **options,
     ) -> Result:
         """Test object pairs for intersection, exactly as posed and at their LODs. Waits for the device.
 
@@ -309,7 +312,8 @@ class Scene:
 
         Args:
             pairs: (p, 2) object indices, asked whatever their worlds, groups and masks, also where both are static or
-                filtered out of the broad phase; None asks the broad phase.
+                filtered out of the broad phase; None asks the broad phase for the pairs whose boxes overlap, or are no
+                farther apart than within, gap or beyond if that is one distance.
             output: "any", "count", "faces" or "contacts": each answers those before it too; what a contact is, and
                 an object pair's summary of them, stands in `warp_abtree.query.contacts`. Or "distance": how far apart
                 the surfaces are, and where they are nearest, see `warp_abtree.query.distance`.
@@ -317,57 +321,26 @@ class Scene:
                 smaller index. "float32" takes the signs of rounded determinants.
             within: Distance d >= 0 [world units], or (p,) of them: `result.apart` tells the pairs whose posed surfaces,
                 at their LODs, are proved farther apart than d; never true where they are not, whatever the rounding.
-                With d = error_at(A) + error_at(B) it proves that the original meshes do not intersect. The broad phase
-                finds overlapping boxes only, whatever d is.
+                With d = error_at(A) + error_at(B) it proves that the original meshes do not intersect.
             contact_dtype: Type of the real numbers in contacts, float64 or float32.
             device: Whether the result's arrays stay on the scene's device, see `Result`.
-            tolerance, relative, beyond: When the search of a distance ends, see `DistanceQuery`; for "distance" alone.
+            options: What one output alone takes, None as if not given. Of "distance": tolerance, relative and beyond,
+                when the search ends, and signed, whether depths of solids are negative distances, see `DistanceQuery`;
+                originals, whether it is that of the original meshes, whatever the LODs, see
+                `warp_abtree.query.distance`. Of "contacts": gap, a distance [world units] or (p,) of them: faces nearer
+                than that have contacts too, and all have a separation.
 
         Raises:
+            TypeError: An option with another name.
             ValueError: Bad pairs, a bad distance, an unknown option, or a scene without objects.
         """
         check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)
-        options = {"tolerance": tolerance, "relative": relative, "beyond": beyond}
-        options = {name: value for name, value in options.items() if value is not None}
+        options = given_options("intersect", within=within, **options)
         if output == "distance":
-            refuse_options(output, {"precision": precision != "exact", "within": within is not None})
-            return self._find_distances(pairs, options, device)
-        refuse_options(output, options)
-        with_contacts = output == "contacts"
-        check_request("faces" if with_contacts else output, precision)
-        pairs = self.broad_phase() if pairs is None else check_pairs(pairs, self.object_count)
-        if within is not None:
-            within = check_within(within, len(pairs))
-        query = self._queries.pop((output, precision, within is not None), None)
-        if query is not None:
-            if not query.is_asked(pairs, within):
-                query.replace_pairs(pairs, within)
-        elif with_contacts:
-            query = ContactQuery(self, pairs=pairs, precision=precision, within=within)
-        else:
-            query = Query(self, output, pairs=pairs, precision=precision, within=within)
-        if isinstance(query, ContactQuery):
-            query.contact_dtype = contact_dtype
-        return self._run((output, precision, within is not None), query, device)
-
-    def _run(self, key: tuple, query: Query, device: bool) -> Result:
-        """Run a query and keep it for the next time; one that fails, for lack of memory, gives its own back."""
-        result = query.run(device)
-        self._queries[key] = query
-        return result
-
-    def _find_distances(self, pairs, options: dict, device: bool) -> Result:
-        pairs = self.broad_phase() if pairs is None else check_pairs(pairs, self.object_count)
-        beyond = check_beyond(options.pop("beyond", None), len(pairs))
-        query = self._queries.pop(("distance",), None)
-        if isinstance(query, DistanceQuery):
-            query.set_tolerance(**options)
-            if not query.is_asked(pairs, beyond):
-                query.replace_pairs(pairs, beyond)
-        else:
-            query = DistanceQuery(self, pairs=pairs, beyond=beyond, **options)
-        return self._run(("distance",), query, device)
+            refuse_options(output, {"precision": precision != "exact"})
+            return self._queries.find_distances(pairs, options, device)
+        return self._queries.find_hits(pairs, output, precision, contact_dtype, options, device)
 
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.

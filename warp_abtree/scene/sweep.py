@@ -11,13 +11,15 @@ from collections import deque
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device, to_numpy
+from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.sweep import NONE_REFUSED, pose_placer, report_chunk_kernel
-from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond
+from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond, check_flags
 from warp_abtree.query.narrow_phase import Query
-from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE, check_poses, device_rows
+from warp_abtree.scene.originals import OriginalDistances
+from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
+from warp_abtree.scene.sweep_poses import DeviceRows, refuse_row, take_rows
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
 
@@ -27,7 +29,6 @@ CHUNKS = (1024, 8192, 65536)
 KEPT_PAIRS = 4
 KEPT_ROWS = 2**20
 
-SCALARS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
 # By the numbers of a row: quaternions, and matrices.
 TOLERANCE = {7: QUATERNION_TOLERANCE, 16: RIGID_TOLERANCE}
 DISTANCE_ROWS = np.dtype(
@@ -36,58 +37,6 @@ DISTANCE_ROWS = np.dtype(
 ANSWERS = {"any": np.dtype(bool), "count": np.dtype(np.int64)}
 
 _kept: dict[tuple, "_PosedModels"] = {}
-
-
-class _HostPoses:
-    """Poses in the memory of the host, rows of 7 or 16 numbers."""
-
-    def __init__(self, rows):
-        self.rows = rows
-        self.scalar, self.width = SCALARS[rows.dtype], rows.shape[1]
-
-    def __len__(self):
-        return len(self.rows)
-
-    def row(self, i):
-        return self.rows[i]
-
-
-class _DevicePoses:
-    """Poses in the memory of the device that asks, rows of 7 or 16 numbers."""
-
-    def __init__(self, rows):
-        self.scalar, (self.count, self.width) = rows.dtype, rows.shape
-        self.flat = rows.flatten()
-
-    def __len__(self):
-        return self.count
-
-    def row(self, i):
-        return self.flat[self.width * i : self.width * (i + 1)].numpy()
-
-
-def _take_poses(poses, device):
-    """Return poses where they are, or on the host.
-
-    Raises:
-        ValueError: No numbers, or another shape than (p, 7) and (p, 4, 4).
-    """
-    rows = device_rows(poses, device)
-    if rows is not None:
-        return _DevicePoses(rows)
-    rows = to_numpy(poses, "poses")
-    if rows.shape == (0,):
-        rows = np.empty((0, 7))
-    if not (rows.ndim == 2 and rows.shape[1] == 7) and not (rows.ndim == 3 and rows.shape[1:] == (4, 4)):
-        raise ValueError(f"poses: shape {rows.shape} is neither (p, 7) nor (p, 4, 4)")
-    rows = rows.reshape(len(rows), 7 if rows.ndim == 2 else 16)
-    return _HostPoses(rows if rows.dtype in SCALARS else rows.astype(np.float64))
-
-
-def _refuse(poses, i):
-    row = np.asarray(poses.row(i), np.float64)
-    check_poses(row[None] if poses.width == 7 else row.reshape(1, 4, 4), first=i)
-    raise ValueError(f"poses: pose {i} is no pose")  # by rounding, where the host finds it just within
 
 
 class _PosedModels:
@@ -119,9 +68,8 @@ class _Chunk:
         self.batch = Batch(pair.models, pair.states, objects, np.repeat(pair.object_model, [1, room]), solid=solid)
         self.chunk_query: _ChunkQuery | None = None
 
-    def find_query(self, output, precision):
-        """Return the chunk's query if it is of this output and precision, else another."""
-        key = (output, precision)
+    def find_query(self, *key):
+        """Return the chunk's query if it is of this output and precision, and of the same options, else another."""
         if self.chunk_query is None or self.chunk_query.key != key:
             self.chunk_query = None  # its memory first
             self.chunk_query = _ChunkQuery(self, key)
@@ -164,14 +112,16 @@ class _ChunkQuery:
 
     def __init__(self, chunk: _Chunk, key):
         self.key = key
-        self.output, precision = key
+        self.output, precision, (signed, of_originals), proves = key
         self.device, self.room, self.objects = chunk.batch.device, chunk.room, chunk.batch.objects
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
+        self.originals = OriginalDistances(chunk.batch) if of_originals else None
         if self.output == "distance":
-            self.query: Query = DistanceQuery(chunk.batch, self.pairs)
+            self.query: Query = DistanceQuery(chunk.batch, self.pairs, signed=signed)
         else:
-            self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision)
+            within = 0.0 if proves else None
+            self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision, within=within)
         self.count = self.room
         self._slots: dict = {}
         self.copies = _find_copy_stream(self.device.alias) if self.device.is_cuda else None
@@ -191,7 +141,7 @@ class _ChunkQuery:
     def _load(self, slot, poses, start, count):
         """Bring poses into a slot whose last chunk is over."""
         width = slot.width
-        if isinstance(poses, _DevicePoses):
+        if isinstance(poses, DeviceRows):
             wp.copy(slot.poses_flat, poses.flat, src_offset=width * start, count=width * count)
             return
         np.copyto(slot.poses_host.numpy().reshape(-1, width)[:count], poses.rows[start : start + count])
@@ -233,7 +183,7 @@ class _ChunkQuery:
             wp.synchronize_event(slot.done)
         refused, uncertain = slot.report_host.numpy().tolist()
         if refused != NONE_REFUSED:
-            _refuse(poses, start + refused)
+            refuse_row(poses, start + refused)
         if uncertain % 2**32 > slot.uncertain_room:  # which may have grown since
             return getattr(self._run_grown(slot, count), self.output)
         return slot.answer_host.numpy()[:count]
@@ -269,42 +219,59 @@ class _ChunkQuery:
             raise
         return answers
 
-    def find_faces(self, poses):
-        """Return the rows of "faces" of all poses."""
-        parts, slot = [], self._find_slots(poses)[0]
+    def _ask(self, poses, run):
+        """Yield the poses of each chunk, a slice, and what `run` finds of the chunk's first so many pairs."""
+        slot = self._find_slots(poses)[0]
         for start in range(0, len(poses), self.room):
-            count = min(self.room, len(poses) - start)
+            self.count = count = min(self.room, len(poses) - start)
             self._load(slot, poses, start, count)
-            found = self._run_grown(slot, count).faces
+            self._place(slot)
+            result = run(self.pairs[:count])
             refused = int(slot.report.numpy()[0])
             if refused != NONE_REFUSED:
-                _refuse(poses, start + refused)
-            found[:, 0] += start
-            parts.append(found)
+                refuse_row(poses, start + refused)
+            yield slice(start, start + count), result
+
+    def _run(self, pairs, within=None):
+        self.query.set_pairs(pairs, within)
+        return self.query.run()
+
+    def find_faces(self, poses):
+        """Return the rows of "faces" of all poses."""
+        parts = []
+        for part, result in self._ask(poses, self._run):
+            result.faces[:, 0] += part.start
+            parts.append(result.faces)
         return np.concatenate(parts)
+
+    def find_apart(self, poses, within):
+        """Return the rows of "any" or "count" of all poses, and which are proved farther apart."""
+        found = np.empty(len(poses), apart_rows(self.output))
+        for part, result in self._ask(poses, functools.partial(self._run, within=within)):
+            found[self.output][part], found["apart"][part] = getattr(result, self.output), result.apart
+        return found
 
     def find_distances(self, poses, tolerances, beyond):
         """Return the rows of "distance" of all poses."""
-        found, slot = np.empty(len(poses), DISTANCE_ROWS), self._find_slots(poses)[0]
         assert isinstance(self.query, DistanceQuery)
         self.query.set_tolerance(**tolerances)
-        for start in range(0, len(poses), self.room):
-            count = min(self.room, len(poses) - start)
-            self._load(slot, poses, start, count)
-            self.query.set_pairs(self.pairs[:count], beyond)
-            self.count = count
-            self._place(slot)
-            result = self.query.run()
-            refused = int(slot.report.numpy()[0])
-            if refused != NONE_REFUSED:
-                _refuse(poses, start + refused)
-            rows = found[start : start + count]
+        run = functools.partial(self._run, within=beyond)
+        if self.originals is not None:
+            run = functools.partial(self.originals.run, beyond=beyond, **tolerances)
+        found = np.empty(len(poses), DISTANCE_ROWS)
+        for part, result in self._ask(poses, run):
+            rows = found[part]
             rows["distance"], rows["bracket"] = result.distance, result.bracket
             rows["points"], rows["faces"] = result.points, result.point_faces
         return found
 
     def is_small(self):
         return len(self.query.hits.face) + len(self.query.hits.uncertain) <= KEPT_ROWS
+
+
+def apart_rows(output) -> np.dtype:
+    """Return the type of the answers of a sweep with `within`."""
+    return np.dtype([(output, ANSWERS[output]), ("apart", np.dtype(bool))])
 
 
 def _keep(key, posed):
@@ -344,11 +311,14 @@ def sweep(
         device: Warp device; None for Warp's default.
         solid: Whether both are solids (`Scene.add`), or a bool for each; what "any" and "distance" answer for one
             inside the other stands in `warp_abtree.state.solids`, "count" and "faces" are of surfaces.
-        options: tolerance, relative and beyond, each one number, as `DistanceQuery` takes them; for "distance" alone.
+        options: tolerance, relative, beyond, each one number, and signed, as `DistanceQuery` takes them, and originals,
+            as `Scene.intersect` does; for "distance" alone. within, one distance as `Scene.intersect` takes it; for
+            "any" and "count" alone.
 
     Returns:
         For "any" bool (p,), for "count" the intersecting face pairs of each pose, int64 (p,), for "faces" rows (pose,
-        face of A, face of B), int32 (k, 3), sorted. For "distance" a structured array (p,) of distance, bracket (2,),
+        face of A, face of B), int32 (k, 3), sorted; with within, a structured array (p,) of any or count, and apart,
+        whether the surfaces are proved farther apart. For "distance" a structured array (p,) of distance, bracket (2,),
         points (2, 3) [A's frame] and faces (2,), see `warp_abtree.query.distance`.
 
     Raises:
@@ -360,7 +330,7 @@ def sweep(
     pair = Scene(device)
     check_device(pair.device, "ab.sweep")
     with device_lock(pair.device):
-        poses = _take_poses(poses, pair.device)
+        poses = take_rows(poses, pair.device)
         solids = solid if isinstance(solid, tuple | list) and len(solid) == 2 else (solid, solid)
         for model, lod, is_solid in zip((model_a, model_b), (lod_a, lod_b), solids):
             pair.add(model, lod=lod, solid=is_solid)
@@ -369,9 +339,11 @@ def sweep(
 
 def _sweep(pair, poses, asked, options):
     output, precision = asked
+    within = options.get("within")
     if len(poses) == 0:
         empty = {"faces": np.empty((0, 3), np.int32), "distance": np.empty(0, DISTANCE_ROWS)}
-        return empty[output] if output in empty else np.empty(0, ANSWERS[output])
+        kind = ANSWERS.get(output) if within is None else apart_rows(output)
+        return empty[output] if output in empty else np.empty(0, kind)
     models = [pair.models[i] for i in pair.object_model]
     key = (*map(id, models), *pair.lods.tolist(), *pair.object_solid, pair.device.alias)
     # Taken out while in use: a call from another thread has its own, and one that fails leaves nothing behind.
@@ -380,10 +352,12 @@ def _sweep(pair, poses, asked, options):
         owners = [weakref.ref(model, lambda _: _kept.pop(key, None)) for model in models]
         posed = _PosedModels(pair, owners)
     chunk = posed.find_chunk(len(poses))
-    query = chunk.find_query(output, precision)
+    query = chunk.find_query(output, precision, check_flags(options), within is not None)
     if output == "distance":
-        tolerances = {name: value for name, value in options.items() if name != "beyond"}
+        tolerances = {name: value for name, value in options.items() if name in ("tolerance", "relative")}
         answers = query.find_distances(poses, tolerances, check_beyond(options.get("beyond")))
+    elif within is not None:
+        answers = query.find_apart(poses, within)
     else:
         answers = query.find_faces(poses) if output == "faces" else query.find_answers(poses)
     chunk.trim()

@@ -13,6 +13,9 @@ from warp_abtree.model.model import Model
 from warp_abtree.scene.poses import check_poses, launch_place
 from warp_abtree.scene.scene import Scene
 
+FIRST_STEP = 1 / 60
+"""Length of a step [s] before the first one is known."""
+
 
 def object_mask(chosen, count):
     """Return which objects are chosen by indices or by a mask, bool (count,)."""
@@ -160,10 +163,20 @@ class RigidBodies:
             "rotation": quaternions_of(frames),
             "velocity": np.where(rigid, velocity, 0.0),
             "momentum": np.einsum("nij,nj->ni", frames, local),
+            "reach": self._first_reach(velocity, angular_velocity, [one.bounding_radius for one in own]),
         }.items():
             getattr(self.bodies, name).assign(values)
         self.targets = ObjectPool()
         self.targets.rotation, self.targets.position = wp.clone(pool.rotation), wp.clone(pool.position)
+
+    def _first_reach(self, velocity, angular_velocity, radii):
+        """Return how far ahead contacts of the first step are looked for, as if it took FIRST_STEP, (n, 4)."""
+        radius = np.where(self.rigid, radii, 0.0)
+        turn, most = FIRST_STEP * np.linalg.norm(angular_velocity, axis=1) * radius, float(kernels.REACH_MAX) * radius
+        motion = FIRST_STEP * np.where(self.rigid[:, None], velocity, 0.0)
+        length = np.maximum(np.linalg.norm(motion, axis=1), 1e-300)
+        reach = np.minimum(turn, most) + float(kernels.REACH_LEAST) * radius
+        return np.column_stack([motion * np.minimum(most / length, 1.0)[:, None], reach])
 
     def clear_targets(self):
         """Let kinematic objects stand where they are."""

@@ -1,4 +1,4 @@
-"""How well a run of frames held its time budget: `budget_report`."""
+"""How well a run of frames held its time budget: `budget_report`, and whether one could: `cost_at_coarsest`."""
 
 import numpy as np
 
@@ -34,3 +34,12 @@ def budget_report(rows, budget_ms: float | None = None, after: float = 1.0) -> d
         "oscillations": float(oscillations / span) if span > 0 else 0.0,
         "error_mean": float(np.mean([row.error_mean for row in rows])),
     }
+
+
+def cost_at_coarsest(rows) -> float | None:
+    """Return the median cost of frames with every object at LOD 0 [ms], None unless they are half of all or more.
+
+    The first frame is left out. No controller can hold a budget below it.
+    """
+    costs = [row.total_ms for row in rows[1:] if row.lod_max == 0]
+    return float(np.median(costs)) if costs and 2 * len(costs) >= len(rows) - 1 else None

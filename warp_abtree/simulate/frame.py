@@ -6,20 +6,16 @@ and a motion in Python, runs on the device: on a GPU as one graph, after which t
 Source: Liu et al. 2006, Algorithm 4.
 """
 
-import csv
-import json
 import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import positive
-from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.lod import frame_summary as words
 from warp_abtree.lod.controllers import Controller, Feedback
@@ -27,7 +23,8 @@ from warp_abtree.lod.timing import STAGES, Timer
 from warp_abtree.query.request import check_request
 from warp_abtree.query.result import Result
 from warp_abtree.scene.scene import Scene
-from warp_abtree.simulate.budget_report import budget_report
+from warp_abtree.simulate.budget_report import budget_report, cost_at_coarsest
+from warp_abtree.simulate.frame_file import FrameFile
 from warp_abtree.simulate.frame_row import FrameRow, LodTable
 from warp_abtree.simulate.frame_stages import FrameStages
 from warp_abtree.simulate.motion import Kinematic
@@ -109,6 +106,7 @@ class Frame:
         self.output = output
         self.time_step = positive(time_step, "time_step")
         self.history: list[FrameRow] = []
+        self._files: list[FrameFile] = []
         self._timer = Timer(scene.device, clock)
         captures = current_regime().captures_frames
         self._captures = clock is None and (scene.device.is_cuda if captures is None else captures)
@@ -151,12 +149,14 @@ class Frame:
     def step(self) -> Result:
         """Run the next frame, append its row, and return what the query found. Waits for the device."""
         self._advance()
+        self._write_rows()
         return self._result()
 
     def run(self, frames: int, progress=None) -> list[FrameRow]:
         """Run a number of frames and return the whole history; progress(done, total) is called after each."""
         for done in range(1, frames + 1):
             self._advance()
+            self._write_rows()
             if progress is not None:
                 progress(done, frames)
         return self.history
@@ -319,7 +319,8 @@ class Frame:
         """Return mean, min and max of the counts, the range of LODs, and mean, p95 and total of stages [ms].
 
         Args:
-            after: `budget`, the result of `budget_report`, leaves out frames before this time [s].
+            after: `budget`, the result of `budget_report`, leaves out frames before this time [s]. A budget below
+                `coarsest_ms` (`cost_at_coarsest`) is impossible.
 
         Raises:
             ValueError: No frame has run.
@@ -339,23 +340,24 @@ class Frame:
         found["lod_min"] = min(row["lod_min"] for row in rows)
         found["lod_max"] = max(row["lod_max"] for row in rows)
         found["budget_ms"] = rows[-1]["budget_ms"]
+        found["coarsest_ms"] = None if found["budget_ms"] is None else cost_at_coarsest(self.history)
         found["budget"] = budget_report(self.history, after=after)
         return found
 
     def record(self, path):
-        """Write the history to a .json file, or as CSV to any other, atomically.
+        """Write the history to a .json file, or as CSV to any other, and every further row as it comes.
+
+        The file replaces what stood there with the first row, and can be read after each, whatever ends the run.
 
         Raises:
-            OSError: The file cannot be written.
+            OSError: The file cannot be written; `step` and `run` raise it too, when the frame is over.
         """
-        rows = [row.as_dict() for row in self.history]
-        with atomic_write(path, "w", newline="", encoding="utf-8") as file:
-            if Path(path).suffix.lower() == ".json":
-                json.dump(rows, file, indent=1)
-            else:
-                writer = csv.DictWriter(file, FrameRow.names())
-                writer.writeheader()
-                writer.writerows(rows)
+        self._files.append(FrameFile(path))
+        self._write_rows()
+
+    def _write_rows(self):
+        for file in self._files:
+            file.append(self.history)
 
     def _measure_lods(self):
         """Measure the LODs as they stand; return how many changed, and how many of these reversed their direction."""

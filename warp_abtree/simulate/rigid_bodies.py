@@ -1,8 +1,9 @@
 """Rigid bodies that respond to the contacts of their meshes: `Dynamics`.
 
-One step: contacts where the bodies stand (`ManifoldQuery`); gravity; contact impulses by projected Gauss-Seidel with
-warm starting and Coulomb friction; position correction by split impulses; semi-implicit Euler with a symplectic
-rotation. All in float64; docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
+One step: contacts where the bodies stand, and as far ahead as they move (`ManifoldQuery` with a gap); gravity; contact
+impulses by projected Gauss-Seidel with warm starting and Coulomb friction; position correction by split impulses;
+semi-implicit Euler with a symplectic rotation. All in float64; docs/dynamics.md has each part, what is conserved and
+repeated, figures, and limits.
 """
 
 from contextlib import contextmanager
@@ -69,7 +70,7 @@ class Dynamics(RigidBodies):
             raise ValueError(f"friction {friction!r} is below 0")
         by_color = current_regime().relax_by_color
         self._by_color = not self.device.is_cpu if by_color is None else by_color
-        self.query = ManifoldQuery(scene, None, capacity)
+        self.query = ManifoldQuery(scene, None, capacity, gap=self.bodies.reach)
         # No body is in two pairs of a color.
         self._color_room = max(1, int(np.count_nonzero(self.rigid)))
         # On the CPU threads run one after another, and a color more costs nothing.

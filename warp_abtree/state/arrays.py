@@ -26,6 +26,8 @@ class ModelArrays:
         pool: `ModelPool` for kernels.
         vertex_start, face_start, split_start, node_count, face_count, depth: NumPy, one entry a model.
         split_bounds: split_start of each model, offset into the pool's split_face.
+        lod_error: Of each model, as `ProgressiveMesh` has it.
+        size: Longest side of each model's box [model units].
     """
 
     def __init__(self, models, device):
@@ -45,6 +47,8 @@ class ModelArrays:
         self.node_count = np.array([model.tree.node_count for model in models], np.int64)
         self.depth = np.array([model.tree.depth for model in models], np.int64)
         self.lod_max = np.array([f.lod_max for f in forests], np.int64)
+        self.lod_error = [f.lod_error for f in forests]
+        self.size = np.array([np.ptp(f.vertex_pos[: f.vertex_count], axis=0).max() for f in forests])
         self.split_bounds = [
             f.split_start.astype(np.int64) + s for f, s in zip(forests, self.split_start[:-1], strict=True)
         ]

@@ -82,16 +82,33 @@ class Batch:
         """`ModelPool`, `StatePool` and `ObjectPool` for kernels."""
         return [self.models.pool, self.states.pool, self.objects.pool]
 
-    def with_own_states(self) -> Batch:
-        """Return a batch of the same models and objects, posed alike, that has no tree state yet."""
+    def with_own_states(self, follows_poses: bool = False) -> Batch:
+        """Return a batch of the same models and objects, posed alike now or always, that has no tree state yet."""
         placed = self.objects.pool
         bits = self.objects.collision_bits.numpy()
         objects = ObjectArrays(placed.world.numpy(), placed.is_static.numpy(), self.device, bits)
-        wp.copy(objects.pool.rotation, placed.rotation)
-        wp.copy(objects.pool.position, placed.position)
+        if follows_poses:
+            objects.pool.rotation, objects.pool.position = placed.rotation, placed.position
+        else:
+            wp.copy(objects.pool.rotation, placed.rotation)
+            wp.copy(objects.pool.position, placed.position)
         states = StateArrays(self.models, self.device)
         solid = () if self.solids is None else self.solids.is_solid
         return Batch(self.models, states, objects, self.object_model, self.excluded, solid)
+
+    def add_finest(self, models):
+        """Make a tree state of some more models at its finest LOD each, and point their objects at it."""
+        states, serving = self.states, self.objects.state.copy()
+        with states.change():
+            ids = states.reserve(models)
+            moves = [(state, int(self.models.lod_max[model]), -1) for state, model in zip(ids, models, strict=True)]
+            update = LodUpdate(self.models, states, moves)
+            for state, model in zip(ids, models, strict=True):
+                serving[self.object_model == model] = state
+            staged = self.objects.stage_states(serving, states.generation)
+            update.launch()
+            self.objects.set_states(serving, staged)
+        self._fit_solids()
 
     def set_lods(self, lods) -> LodUpdate:
         """Bring every object to an LOD, int (n,) within its model's range: wholly, or not at all."""

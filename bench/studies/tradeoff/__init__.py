@@ -2,9 +2,9 @@
 
 from functools import partial
 
-from . import competitors, lods, settings, summaries
+from . import competitors, distances, lods, settings, summaries
 
-PARTS = {"lods": lods.run, "settings": settings.run, "competitors": competitors.run}
+PARTS = {"lods": lods.run, "settings": settings.run, "competitors": competitors.run, "distances": distances.run}
 SUMMARIES = {
     "over_meshes": summaries.over_meshes,
     "choose": summaries.choose,
@@ -13,4 +13,6 @@ SUMMARIES = {
     "outputs": partial(summaries.summarise, names=("value", "setting")),
     "margins": partial(summaries.summarise, names=("value", "factor")),
     "over_workloads": summaries.over_workloads,
+    "distances": partial(summaries.summarise, names=("method", "setting", "where")),
+    "refined": partial(summaries.summarise, names=("value", "asked")),
 }

@@ -25,6 +25,7 @@ struct NearBoxes {
     float scale, wide, margin;
     const char *tree_a, *tree_b;
     wp::int64 slabs;    // where the slab of a node lies, from the node; 0 for none
+    bool normals;       // whether slabs are compared along the nodes' own normals
     lanes way[3], far;  // direction from A for A's nodes, to A for B's, in their own frames; and -t . n of B's
 
     static NearBoxes make(const wp::float32 (&r)[3][3], const wp::vec_t<3, float>& back,
@@ -42,6 +43,7 @@ struct NearBoxes {
         s.wide = 2 * margin;
         s.margin = 16 * margin;  // docs/exactness.md
         s.slabs = 0;
+        s.normals = false;
         s.scale = scale;
         s.tree_a = (const char*)trees + 32 * (wp::int64)a;
         s.tree_b = (const char*)trees + 32 * (wp::int64)b;
@@ -69,19 +71,6 @@ struct NearBoxes {
             way[i] = lanes{a, a, a, a, a, a, a, a, b, b, b, b, b, b, b, b};
         }
         far = lanes{0, 0, 0, 0, 0, 0, 0, 0, t, t, t, t, t, t, t, t};
-    }
-    // Upper bounds of twice the coordinate along the direction, of each node's box and slab.
-    lanes tops(const Taken (&taken)[4], const lanes (&sum)[3], const lanes (&size)[3]) const {
-        lanes slab[8];
-        turn(taken, slabs, slab);
-        const lanes along = way[0] * slab[0] + way[1] * slab[1] + way[2] * slab[2];
-        lanes top = along * (along > 0.0f ? slab[4] : slab[3]) * (2.0f * scale), plain = {};
-        for (int i = 0; i < 3; ++i) {
-            const lanes rest = way[i] - along * slab[i];
-            top += rest * sum[i] + __builtin_elementwise_abs(rest) * size[i];
-            plain += way[i] * sum[i] + __builtin_elementwise_abs(way[i]) * size[i];
-        }
-        return (top < plain ? top : plain) - far;
     }
     static lanes square(const lanes& x, const lanes& reach) {
         const lanes over = __builtin_elementwise_abs(x) - reach, gap = over > 0.0f ? over : lanes{};
@@ -124,8 +113,9 @@ struct NearBoxes {
     static lanes of_b(const lanes& v) {
         return __builtin_shufflevector(v, v, 8, 9, 8, 9, 10, 11, 10, 11, 12, 13, 12, 13, 14, 15, 14, 15);
     }
+#include "nearest/slab_bounds.h"
     Tested test(const Taken (&taken)[4]) const {
-        lanes field[8], sum[3], size[3], bound = {}, other = {};
+        lanes field[8], sum[3], size[3], apart[3], bound = {}, other = {};
         turn(taken, 0, field);
         for (int i = 0; i < 3; ++i) {
             const lanes low = field[i] * scale, high = field[4 + i] * scale;
@@ -138,15 +128,17 @@ struct NearBoxes {
                 sum_there = __builtin_elementwise_fma(axes[i][k], sum[k], sum_there);
                 size_there = __builtin_elementwise_fma(sizes[i][k], size[k], size_there);
             }
-            bound += square(of_a(sum[i]) - of_b(sum_there), of_a(size[i]) + of_b(size_there));
+            apart[i] = of_a(sum[i]) - of_b(sum_there);
+            bound += square(apart[i], of_a(size[i]) + of_b(size_there));
             other += square(of_a(sum_there) - of_b(sum[i]), of_a(size_there) + of_b(size[i]));
         }
         Tested tested;
         tested.bound = bound > other ? bound : other;
         if (slabs != 0) {
-            const lanes top = tops(taken, sum, size), gap = -(of_a(top) + of_b(top)) - margin;
-            const lanes apart = gap > 0.0f ? gap * gap : lanes{};
-            tested.bound = tested.bound > apart ? tested.bound : apart;
+            lanes slab[8];
+            turn(taken, slabs, slab);
+            const lanes more = normals ? bound_normals(slab, sum, size, apart) : bound_way(slab, sum, size, apart);
+            tested.bound = tested.bound > more ? tested.bound : more;
         }
         // What follows, as in `item_of`.
         const bits face_a = (bits)of_a(field[7]), face_b = (bits)of_b(field[7]);

@@ -1,73 +1,38 @@
-// Distances of 16 pairs of faces at a time in float32, within an error that is known: as `nearest_features` one by one.
+// Distances of pairs of faces in float32, within an error that is known: as `nearest_features`; of 16 pairs at a time
+// with the `Float32` of simd/float32.h, of one with that of nearest/float32.h.
 #pragma once
 #include "builtin.h"
-#include "simd/float32.h"
 
 struct NearestFaces {
     typedef Float32 F;
     typedef F::lanes lanes;
     typedef F::bits bits;
     typedef F::Point Point;
-    typedef unsigned int counts __attribute__((vector_size(64)));
-    typedef wp::int64 longs __attribute__((vector_size(64)));
-    typedef int loose __attribute__((vector_size(64), aligned(4)));
     struct Corners {
         Point a[3], b[3];
     };
-    static lanes most(const lanes& a, const lanes& b) { return a > b ? a : b; }
-    static lanes least(const lanes& a, const lanes& b) { return a < b ? a : b; }
-    static lanes clamp(const lanes& x) { return least(most(x, lanes{}), lanes{} + 1.0f); }
-    static lanes invert(const lanes& x) { return x > 0x1p-126f ? 1.0f / x : lanes{}; }
-    static Point add(const Point& p, const lanes& s, const Point& v) {
+    static CUDA_CALLABLE lanes most(const lanes& a, const lanes& b) { return a > b ? a : b; }
+    static CUDA_CALLABLE lanes least(const lanes& a, const lanes& b) { return a < b ? a : b; }
+    static CUDA_CALLABLE lanes clamp(const lanes& x) { return least(most(x, lanes{}), lanes{} + 1.0f); }
+    static CUDA_CALLABLE lanes invert(const lanes& x) { return x > 0x1p-126f ? 1.0f / x : lanes{}; }
+    static CUDA_CALLABLE Point add(const Point& p, const lanes& s, const Point& v) {
         return Point{F::fuse(s, v.x, p.x), F::fuse(s, v.y, p.y), F::fuse(s, v.z, p.z)};
     }
-    static lanes minor(const lanes& a, const lanes& b, const lanes& c, const lanes& d) {
+    static CUDA_CALLABLE lanes minor(const lanes& a, const lanes& b, const lanes& c, const lanes& d) {
         const lanes w = c * d;
         return F::fuse(a, b, -w) - F::fuse(c, d, -w);
     }
-    static Point cross_exactly(const Point& u, const Point& v) {
+    static CUDA_CALLABLE Point cross_exactly(const Point& u, const Point& v) {
         return Point{minor(u.y, v.z, u.z, v.y), minor(u.z, v.x, u.x, v.z), minor(u.x, v.y, u.y, v.x)};
     }
-    static lanes largest(const Point& p) { return most(most(F::absolute(p.x), F::absolute(p.y)), F::absolute(p.z)); }
+    static CUDA_CALLABLE lanes largest(const Point& p) { return most(most(F::absolute(p.x), F::absolute(p.y)), F::absolute(p.z)); }
 
-    // The corners of up to 16 pairs of faces in A's frame, scaled; the first pair in the place of those that lack.
-    static Corners load(const void* near, const void* ids, int start_a, int start_b, const wp::float32 (&r)[3][3],
-                        const wp::vec_t<3, float>& there, float scale, const wp::int64* items, int count) {
-        const longs lane = {0, 1, 2, 3, 4, 5, 6, 7}, some = longs{} + items[0];
-        const bits low = (bits)(lane < count ? (longs) * (const loose*)items : some);
-        const bits high = (bits)(lane + 8 < count ? (longs) * (const loose*)(items + 8) : some);
-        alignas(64) F::sixteen face[2], corner[6];
-        const bits of_a = __builtin_shufflevector(low, high, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
-        const bits of_b = __builtin_shufflevector(low, high, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
-        *(counts*)face[0] = 2 * (counts)(start_a + of_a);
-        *(counts*)face[1] = 2 * (counts)(start_b + of_b);
-        for (int i = 0; i < 2; ++i) {
-            const Point c = F::gather(ids, face[i]);
-            *(counts*)corner[3 * i] = 2 * (counts)c.x;
-            *(counts*)corner[3 * i + 1] = 2 * (counts)c.y;
-            *(counts*)corner[3 * i + 2] = 2 * (counts)c.z;
-        }
-        Corners c;
-        for (int k = 0; k < 3; ++k) {
-            const Point p = F::gather(near, corner[k]);
-            const Point q = F::gather(near, corner[3 + k]);
-            c.a[k] = Point{p.x * scale, p.y * scale, p.z * scale};
-            lanes x[3];
-            for (int i = 0; i < 3; ++i) {
-                x[i] = F::fuse(F::every(r[i][2]), q.z * scale, F::every(there[i]));
-                x[i] = F::fuse(F::every(r[i][1]), q.y * scale, x[i]);
-                x[i] = F::fuse(F::every(r[i][0]), q.x * scale, x[i]);
-            }
-            c.b[k] = Point{x[0], x[1], x[2]};
-        }
-        return c;
-    }
     // Squared distances, and vectors from A's points to B's.
     struct Nearest {
         lanes square;
         Point v;
     };
-    static Point between_edges(const Point& r, const Point& e, const Point& f, const lanes& inverse_e,
+    static CUDA_CALLABLE Point between_edges(const Point& r, const Point& e, const Point& f, const lanes& inverse_e,
                                const lanes& inverse_f) {
         const Point n = F::cross(e, f);
         lanes s = clamp(F::dot(F::cross(r, f), n) * invert(F::dot(n, n)));
@@ -75,7 +40,7 @@ struct NearestFaces {
         s = clamp(F::dot(add(r, t, f), e) * inverse_e);
         return add(add(r, t, f), -s, e);
     }
-    static Point over_face(const Point& w, const Point& e1, const Point& e2, const Point& n, const lanes& inverse) {
+    static CUDA_CALLABLE Point over_face(const Point& w, const Point& e1, const Point& e2, const Point& n, const lanes& inverse) {
         const Point level = add(w, -F::dot(w, n) * inverse, n);
         const lanes x = F::dot(cross_exactly(level, e2), n) * inverse;
         const lanes y = F::dot(cross_exactly(e1, level), n) * inverse;
@@ -84,18 +49,18 @@ struct NearestFaces {
         const lanes far = lanes{} + 0x1p60f;
         return Point{inside ? v.x : far, inside ? v.y : far, inside ? v.z : far};
     }
-    static void offer(Nearest& nearest, const Point& v) {
+    static CUDA_CALLABLE void offer(Nearest& nearest, const Point& v) {
         const lanes square = F::dot(v, v);
         const bits closer = square < nearest.square;
         nearest.square = closer ? square : nearest.square;
         nearest.v = F::choose(closer, v, nearest.v);
     }
     // Where pairs are nearest, and the largest coordinate of what joins corners.
-    static Nearest measure(const Corners& c, lanes& size) {
+    static CUDA_CALLABLE Nearest measure(const Corners& c, lanes& size) {
         const Point e[3] = {F::minus(c.a[1], c.a[0]), F::minus(c.a[2], c.a[1]), F::minus(c.a[0], c.a[2])};
         const Point f[3] = {F::minus(c.b[1], c.b[0]), F::minus(c.b[2], c.b[1]), F::minus(c.b[0], c.b[2])};
         lanes inverse_e[3], inverse_f[3];
-        Nearest nearest = {lanes{} + __builtin_inff(), Point{}};
+        Nearest nearest = {lanes{} + 0x1.fffffep127f, Point{}};
         for (int k = 0; k < 3; ++k) {
             inverse_e[k] = invert(F::dot(e[k], e[k]));
             inverse_f[k] = invert(F::dot(f[k], f[k]));
@@ -117,5 +82,9 @@ struct NearestFaces {
         }
         size = most(most(size, largest(e[0])), most(largest(back_a), most(largest(f[0]), largest(back_b))));
         return nearest;
+    }
+    // What distances err by: over 48 u L where they are small. `own` is what coordinates make of it.
+    static CUDA_CALLABLE lanes error_of(const lanes& d, const lanes& size, float own) {
+        return size * (d > size * 0x1p-10f ? lanes{} + 48 * 0x1p-24f : lanes{} + 256 * 0x1p-24f) + own;
     }
 };

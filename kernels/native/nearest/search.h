@@ -2,7 +2,7 @@
 #pragma once
 #include "builtin.h"
 #include "nearest/boxes.h"
-#include "nearest/faces32.h"
+#include "nearest/corners32.h"
 #include "nearest/memory.h"
 
 template <class ModelPool, class StatePool, class PairPose, class Frame, class Slabs>
@@ -14,7 +14,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     return wp::vec_t<3, wp::int32>();
 #else
 #include "nearest/boxes.h"
-#include "nearest/faces32.h"
+#include "nearest/corners32.h"
 #include "nearest/memory.h"
     typedef NearestFaces N;
     typedef N::F F;
@@ -26,6 +26,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     if (with_slabs) {
         boxes.slabs = (const char*)slabs.record.data - (const char*)states.node_box.data;
         boxes.look(h.way);
+        boxes.normals = h.face_tests >= NORMALS_LEAST;
     }
     const float INF = __builtin_inff();
     // Apart from the memory that lists are written to.
@@ -45,14 +46,12 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     auto measure = [&](int count) {
         waiting -= count;
         wp::int64* items = m.face + waiting;
-        const N::Corners corners = N::load(models.vertex_near.data, states.face_corner.data, pose.corner_a,
+        const N::Corners corners = NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a,
                                            pose.corner_b, r, frame.translation, frame.scale, items, count);
-        F::lanes size, error;
+        F::lanes size;
         const N::Nearest nearest = N::measure(corners, size);
         const F::lanes d = __builtin_elementwise_sqrt(nearest.square);
-        // What exceeds 48 u L matters where the distance is small.
-        error = size * (d > size * 0x1p-10f ? F::lanes{} + 48 * 0x1p-24f : F::lanes{} + 256 * 0x1p-24f) + frame.error;
-        const F::lanes over = d + error, under = d - error;
+        const F::lanes error = N::error_of(d, size, frame.error), over = d + error, under = d - error;
         float low[16];
         int best = -1;
         for (int i = 0; i < count; ++i)
@@ -76,6 +75,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
                 m.open_bound[h.open_count++] = low[i];
             }
         h.face_tests += count;
+        boxes.normals = h.face_tests >= NORMALS_LEAST;
     };
     auto keep_open = [&]() {
         int kept = 0;

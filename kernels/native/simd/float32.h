@@ -12,10 +12,10 @@ struct Float32 {
     struct Point {
         lanes x, y, z;
     };
-    // Of three signs those that are 1 and those that are -1, a bit each; where they lie on one side, and where one is
-    // UNCERTAIN or all are 0.
+    // Of three signs those that are 1 and those that are -1, a bit each; where they lie on one side, where they lie
+    // there farther than a gap, and where one is UNCERTAIN or all are 0.
     struct Sides {
-        unsigned int above[3], below[3], one_sided, uncertain;
+        unsigned int above[3], below[3], one_sided, far, uncertain;
     };
     struct Side {
         unsigned int above, uncertain;
@@ -68,7 +68,14 @@ struct Float32 {
         const lanes high_01 = high(row[0], row[1]), high_23 = high(row[2], row[3]);
         return Point{first(low_01, low_23), second(low_01, low_23), first(high_01, high_23)};
     }
-    static Sides sides_of_plane(float error, float unit, const Point& a, const Point& b, const Point& c,
+    // As `length_bound`.
+    static lanes length_bound(float error, float unit, const Point& u, const Point& v, const Point& normal) {
+        const lanes p = sum_sizes(u) + 2.0f * error, q = sum_sizes(v) + 2.0f * error, most = sum_sizes(normal);
+        const lanes length = __builtin_elementwise_sqrt(dot(normal, normal));
+        return (most > 0x1p-50f ? length : most) + 2.0f * (error * (p + q) + unit * (p * q));
+    }
+    // Without a gap, below 0, what is far is on one side.
+    static Sides sides_of_plane(float error, float unit, float gap, const Point& a, const Point& b, const Point& c,
                                 const Point (&d)[3]) {
         const Point u = minus(b, a), v = minus(c, a);
         const Point w[3] = {minus(a, d[0]), minus(a, d[1]), minus(a, d[2])};
@@ -78,13 +85,20 @@ struct Float32 {
         const lanes bound = bound_error(error, unit, sum_sizes(u), sum_sizes(v), size[0] > more ? size[0] : more);
         Sides s;
         unsigned int none[3];
+        lanes value[3];
         for (int i = 0; i < 3; ++i) {
-            const lanes value = dot(w[i], normal);
-            s.above[i] = to_mask(value > bound);
-            s.below[i] = to_mask(value < -bound);
+            value[i] = dot(w[i], normal);
+            s.above[i] = to_mask(value[i] > bound);
+            s.below[i] = to_mask(value[i] < -bound);
             none[i] = ~(s.above[i] | s.below[i]);
         }
         s.one_sided = (s.above[0] & s.above[1] & s.above[2]) | (s.below[0] & s.below[1] & s.below[2]);
+        s.far = s.one_sided;
+        if (gap >= 0.0f) {
+            const lanes wide = (bound + gap * length_bound(error, unit, u, v, normal)) * (1.0f + 0x1p-18f);
+            s.far = to_mask((value[0] > wide) & (value[1] > wide) & (value[2] > wide)) |
+                    to_mask((value[0] < -wide) & (value[1] < -wide) & (value[2] < -wide));
+        }
         s.uncertain = (none[0] | none[1] | none[2]) & (~to_mask(bound == 0.0f) | (none[0] & none[1] & none[2]));
         return s;
     }

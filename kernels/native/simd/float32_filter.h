@@ -1,13 +1,15 @@
-// The float32 filter of the CPU: 16 face pairs at a time, as `float32_filter_triangles` one by one.
+// The float32 filter of the CPU: 16 face pairs at a time, as `float32_filter_triangles` one by one. With a gap, 0 or more, it
+// also lists those that are apart, but not by more than the gap along the normal of a plane.
 #pragma once
 #include "builtin.h"
 #include "simd/float32.h"
 
 template <class ModelPool, class StatePool, class PairPose>
-wp::vec_t<3, wp::int64> simd_float32_filter(ModelPool models, StatePool states, PairPose pose, wp::float32 error,
-                                            wp::float32 unit, bool first_ends, wp::int32 waiting,
-                                            wp::array_t<wp::int64> faces, wp::array_t<wp::int64> uncertain) {
-    wp::vec_t<3, wp::int64> result;
+wp::vec_t<4, wp::int64> simd_float32_filter(ModelPool models, StatePool states, PairPose pose,
+                                            wp::vec_t<3, wp::float32> bounds, bool first_ends, wp::int32 waiting,
+                                            wp::array_t<wp::int64> faces, wp::array_t<wp::int64> uncertain,
+                                            wp::array_t<wp::int64> apart) {
+    wp::vec_t<4, wp::int64> result;
 #if defined(__CUDA_ARCH__)
     __trap();  // a lane tests a pair
 #else
@@ -23,11 +25,12 @@ wp::vec_t<3, wp::int64> simd_float32_filter(ModelPool models, StatePool states, 
         typedef wp::int64 longs __attribute__((vector_size(64)));
         const auto& r = pose.rotation32.data;
         const auto& t = pose.translation32;
-        const float scale = (float)pose.scale;
+        const float error = bounds[0], unit = bounds[1], gap = bounds[2], scale = (float)pose.scale;
         const void* near = models.vertex_near.data;
         const void* corners = states.face_corner.data;
         wp::int64* list = faces.data;
         wp::int64* rest = uncertain.data;
+        wp::int64* beside = apart.data;
         auto near_a = [&](const F::sixteen& corner) {
             const Point p = F::gather(near, corner);
             return Point{p.x * scale, p.y * scale, p.z * scale};
@@ -41,7 +44,7 @@ wp::vec_t<3, wp::int64> simd_float32_filter(ModelPool models, StatePool states, 
             }
             return Point{x[0] * scale, x[1] * scale, x[2] * scale};
         };
-        int met = 0, open = 0, done = 0;
+        int met = 0, open = 0, done = 0, near_count = 0;
         if (error == __builtin_inff()) {
             for (; open < waiting; ++open)
                 rest[open] = list[open];
@@ -81,9 +84,16 @@ wp::vec_t<3, wp::int64> simd_float32_filter(ModelPool models, StatePool states, 
             done += count;
             const Point a[3] = {near_a(corner[0]), near_a(corner[1]), near_a(corner[2])};
             const Point b[3] = {near_b(corner[3]), near_b(corner[4]), near_b(corner[5])};
-            const F::Sides sides_a = F::sides_of_plane(error, unit, b[0], b[1], b[2], a);
-            const F::Sides sides_b = F::sides_of_plane(error, unit, a[0], a[1], a[2], b);
-            const unsigned int left = ~(sides_a.one_sided | sides_b.one_sided) & ((1u << count) - 1);
+            const F::Sides sides_a = F::sides_of_plane(error, unit, gap, b[0], b[1], b[2], a);
+            const F::Sides sides_b = F::sides_of_plane(error, unit, gap, a[0], a[1], a[2], b);
+            const unsigned int one_sided = sides_a.one_sided | sides_b.one_sided, all = (1u << count) - 1;
+            const unsigned int left = ~one_sided & all;
+            auto keep_near = [&](unsigned int which) {
+                append(beside + near_count, which);
+                near_count += __builtin_popcount(which);
+            };
+            if (gap >= 0.0f)
+                keep_near(all & one_sided & ~(sides_a.far | sides_b.far));
             const unsigned int planes_open = sides_a.uncertain | sides_b.uncertain;
             // For coincident or nearly coincident meshes, usually every pair is uncertain here.
             if ((left & ~planes_open) == 0) {
@@ -99,9 +109,11 @@ wp::vec_t<3, wp::int64> simd_float32_filter(ModelPool models, StatePool states, 
                 F::side_of_plane(error, unit, p1, F::choose(back_b, r1, q1), p2, F::choose(back_a, r2, q2));
             const F::Side e =
                 F::side_of_plane(error, unit, p1, F::choose(back_b, q1, r1), F::choose(back_a, q2, r2), p2);
-            const unsigned int apart = s.above | e.above;
-            const unsigned int opens = left & (planes_open | (~apart & (s.uncertain | e.uncertain)));
-            const unsigned int meet = left & ~opens & ~apart;
+            const unsigned int clear = s.above | e.above;
+            const unsigned int opens = left & (planes_open | (~clear & (s.uncertain | e.uncertain)));
+            const unsigned int meet = left & ~opens & ~clear;
+            if (gap >= 0.0f)
+                keep_near(left & ~opens & clear);
             if (opens != 0) {
                 append(rest + open, opens);
                 open += __builtin_popcount(opens);
@@ -113,6 +125,7 @@ wp::vec_t<3, wp::int64> simd_float32_filter(ModelPool models, StatePool states, 
         result[0] = met;
         result[1] = open;
         result[2] = done;
+        result[3] = near_count;
     }
 #endif
     return result;

@@ -62,7 +62,8 @@ wp::vec_t<2, wp::int32> open_subtrees(ModelPool models, StatePool states, PairPo
         const double steps = d < 14 && size * 0x1p20 > reach ? 65536.0 / size : 0.0;
         // Three times the margin of boxes covers all rounding, see docs/exactness.md. A direction that tells nothing,
         // since the margin is half of A's size or more, has slabs of B that reach everywhere.
-        const double margin = 3.0 * steps * pose.margin;
+        // Of a margin for distances, what is not for rounding counts once.
+        const double margin = steps * (3.0 * pose.margin - 1.99 * pose.within);
         const double scale = margin < 32768.0 ? steps : 0.0;
         for (int j = 0; j < 3; ++j) {
             kept.of_a[16 * j + d] = (float)(steps * n[j]);

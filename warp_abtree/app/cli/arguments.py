@@ -56,14 +56,16 @@ def positive(text) -> int:
 
 
 def milliseconds(text) -> float:
-    """Return a time above 0 in milliseconds."""
-    match = re.fullmatch(r"\s*([\d.eE+-]+)\s*(ms|s)?\s*", text)
+    """Return a time above 0, in ms or s, in milliseconds."""
+    match = re.fullmatch(r"\s*([\d.eE+-]+)\s*(ms|s|)\s*", text)
     try:
         value = 0.0 if match is None else float(match[1]) * (1e3 if match[2] == "s" else 1.0)
     except ValueError:
-        value = 0.0
+        match, value = None, 0.0
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text.strip()!r} is no time above 0, as 8ms or 0.008s")
+    if match is not None and not match[2]:
+        raise argparse.ArgumentTypeError(f"{text.strip()!r} has no unit; give {match[1]}ms or {match[1]}s")
     return value
 
 
@@ -74,6 +76,6 @@ class PrintCompletion(argparse.Action):
         try:
             import shtab
         except ImportError:
-            raise ValueError(f"{option_string} needs shtab: pip install warp-abtree[app]") from None
+            raise ValueError(f"{option_string} needs shtab: pip install shtab") from None
         print(shtab.complete(parser, values))
         parser.exit()

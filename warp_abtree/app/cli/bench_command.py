@@ -8,6 +8,11 @@ SUMMARY = "run a benchmark or a study of a checkout (see python -m bench --help 
 EXAMPLES = ("paper --out found --quick", "tradeoff --out found --device cuda:0", "query --device cpu --json query.json")
 
 
+def add_arguments(sub):
+    """Add the arguments of the command to its parser, which only shows them."""
+    sub.add_argument("name", metavar="NAME", help="benchmark or study; python -m bench --help lists them")
+
+
 def bench(arguments, folder=None) -> int:
     """Run `python -m bench` of a checkout, by default the one of this package, and return its exit status."""
     folder = Path(__file__).resolve().parents[3] if folder is None else Path(folder)

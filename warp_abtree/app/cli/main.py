@@ -9,6 +9,9 @@ import os
 import signal
 import sys
 import threading
+from pathlib import Path
+
+import warp as wp
 
 from warp_abtree.app.cli import bench_command, model_commands, query_command, run_command, sweep_command
 from warp_abtree.app.cli.arguments import PROGRAM, STATUS, Parser, PrintCompletion, shield_numbers
@@ -23,7 +26,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog=PROGRAM,
         description="Mesh-mesh interference queries at any level of detail (LOD), in batches, on CUDA or the CPU.",
-        epilog=f"examples:\n  {PROGRAM} info cow.obj\n  {PROGRAM} run bunny_tori --picture out.png\n\n{STATUS}",
+        epilog=f"examples:\n  {PROGRAM} info warp:bunny\n  {PROGRAM} run bunny_tori --picture out.png\n\n{STATUS}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
@@ -58,7 +61,7 @@ def make_parser() -> argparse.ArgumentParser:
         ("sweep", sweep_command, sweep_command.sweep),
     ):
         command(name, function, module.SUMMARY, module.EXAMPLES, module.add_arguments)
-    command("bench", None, bench_command.SUMMARY, bench_command.EXAMPLES)
+    command("bench", None, bench_command.SUMMARY, bench_command.EXAMPLES, bench_command.add_arguments)
     return parser
 
 
@@ -122,9 +125,15 @@ def main(argv=None) -> int:
 
 def _fail(progress, error, status):
     progress.close()
-    print(f"{PROGRAM}: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
+    print(f"{PROGRAM}: {' '.join(str(error).split()) or type(error).__name__}{_cache_hint(error)}", file=sys.stderr)
     return status
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def _cache_hint(error) -> str:
+    """Return what to do about a kernel cache that cannot be written, or nothing."""
+    if not isinstance(error, OSError) or error.filename is None or not wp.config.kernel_cache_dir:
+        return ""
+    cache, path = Path(wp.config.kernel_cache_dir), Path(os.fsdecode(error.filename))
+    if cache not in (path, *path.parents) and (cache.exists() or path not in cache.parents):
+        return ""
+    return " (Warp's kernel cache; WARP_CACHE_PATH names a folder that can be written)"

@@ -15,9 +15,9 @@ from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.lod_request import resolve_lod
 
 INFO_SUMMARY = "say what a mesh or a built model holds and what is odd about it"
-INFO_EXAMPLES = ("cow.obj", "cow.npz", "warp:bunny --json")
+INFO_EXAMPLES = ("warp:bunny --json", "bunny.npz")
 BUILD_SUMMARY = "build models from meshes and save them"
-BUILD_EXAMPLES = ("cow.obj cow.npz --base-faces 100", "*.obj models")
+BUILD_EXAMPLES = ("warp:bunny bunny.npz --base-faces 100", "warp:bear warp:rocks .")
 LISTED_FRACTIONS = (0.5, 0.2, 0.1, 0.05, 0.01)  # of the faces, at which `build` prints the errors
 
 

@@ -14,12 +14,14 @@ from warp_abtree.scene.scene import Scene
 
 SUMMARY = "intersect two meshes, A at the origin and B at a pose"
 EXAMPLES = (
-    "cow.obj warp:bunny --pose 0.2 0 0 0 0 0 1",
-    "cow.npz cow.npz --pose -0.5 0 0 0 0 0 1 --lod-a 0.25 --lod-b tol:0.01 --output faces --json",
-    "cow.npz cow.npz --pose 0.2 0 0 0 0 0 1 --output contacts --record contacts.csv",
-    "cow.npz cow.npz --pose 2 0 0 0 0 0 1 --output distance --json",
+    "warp:bear warp:bunny --pose 0.2 0 0 0 0 0 1",
+    "bunny.npz bunny.npz --pose -0.5 0 0 0 0 0 1 --lod-a 0.25 --lod-b tol:0.01 --output faces --json",
+    "bunny.npz bunny.npz --pose 0.2 0 0 0 0 0 1 --output contacts --record contacts.csv",
+    "bunny.npz bunny.npz --pose 2 0 0 0 0 0 1 --output distance --json",
+    "bunny.npz bunny.npz --pose 2 0 0 0 0 0 1 --lod-a 0.1 --lod-b 0.1 --output distance --relative 0.05 --originals",
 )
 OUTPUTS = ("any", "count", "faces", "contacts", "distance")
+DISTANCE_OPTIONS = ("tolerance", "relative", "beyond", "originals")
 
 
 def add_arguments(sub: Parser):
@@ -33,6 +35,12 @@ def add_arguments(sub: Parser):
     sub.add_argument("--output", choices=OUTPUTS, default="count", help="what to ask (count)")
     about = "signs of determinants: exact, or of the rounded ones (exact)"
     sub.add_argument("--precision", choices=PRECISIONS, default="exact", help=about)
+    about = "width of the bracket that ends the search of a distance (0)"
+    sub.add_argument("--tolerance", type=float, metavar="X", help=about)
+    sub.add_argument("--relative", type=float, metavar="X", help="the same as a fraction of the distance (0)")
+    sub.add_argument("--beyond", type=float, metavar="X", help="distance that is far enough (none)")
+    about = "the distance of the original meshes, at whatever LODs A and B stand"
+    sub.add_argument("--originals", action="store_true", default=None, help=about)
     about = "write face pairs and contacts as .csv, or the whole result as .npz"
     sub.add_file("--record", type=Path, metavar="FILE", help=about)
 
@@ -45,11 +53,7 @@ def query(options, progress):
             raise ValueError(f"{options.record}: a row is a face pair; ask --output faces or contacts, or write .npz")
     scene, models = _make_scene(options, progress)
     pair = np.array([[0, 1]])
-    asked = {"output": options.output}
-    if options.output != "distance":
-        asked["precision"] = options.precision
-    elif options.precision != "exact":
-        raise ValueError("--precision means nothing for --output distance")
+    asked = {"output": options.output, **_list_options(options)}
     scene.intersect(pair, **asked)  # loads the kernels, so that the time below is the query's
     begin = time.perf_counter()
     found = scene.intersect(pair, **asked)
@@ -77,6 +81,18 @@ def query(options, progress):
         record_found(found, options.record)
         result["written"] = [str(options.record)]
     print_result(result, options.json)
+
+
+def _list_options(options) -> dict:
+    """Return the options of an output; raise ValueError for one of another."""
+    of_distance = {name: getattr(options, name) for name in DISTANCE_OPTIONS if getattr(options, name) is not None}
+    if options.output == "distance":
+        if options.precision != "exact":
+            raise ValueError("--precision means nothing for --output distance")
+        return of_distance
+    for name in of_distance:
+        raise ValueError(f"--{name} means nothing for --output {options.output}")
+    return {"precision": options.precision}
 
 
 def _make_scene(options, progress):

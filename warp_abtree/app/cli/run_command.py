@@ -2,11 +2,12 @@
 
 import gc
 import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.app.cli.arguments import Parser, milliseconds, positive
+from warp_abtree.app.cli.arguments import PROGRAM, Parser, milliseconds, positive
 from warp_abtree.app.cli.model_commands import active_count
 from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.app.pictures.plots import draw_run
@@ -34,7 +35,7 @@ def add_arguments(sub: Parser):
     sub.add_argument("--objects", type=positive, metavar="N", help="about so many objects, by other counts or worlds")
     sub.add_argument("--budget", type=milliseconds, metavar="TIME", help="time of a frame to hold, as 8ms or 0.008s")
     sub.add_argument("--controller", choices=CONTROLLERS, help="what chooses LODs (the scene's own, or predictive)")
-    about = "write a row a frame, .csv or .json"
+    about = "write a row a frame as it ends, .csv or .json"
     sub.add_file("--record", type=Path, metavar="FILE", help=about)
     sub.add_file("--plot", type=Path, metavar="DIR", help="draw LODs, times and error over the frames there")
 
@@ -51,6 +52,8 @@ def run(options, progress):
     controller = loaded.control.asked(options.controller, options.budget).controller
     frame = loaded.frame(controller=options.controller, budget_ms=options.budget, bodies=bodies)
     lods = []
+    if options.record:
+        frame.record(options.record)
 
     def after_frame(done, total):
         if options.plot:
@@ -75,6 +78,10 @@ def run(options, progress):
         **frame.summary(),
     }
     print_result(summary, options.json)
+    budget, least = summary["budget_ms"], summary["coarsest_ms"]
+    if budget is not None and least is not None and least > budget:
+        about = f"a budget of {budget:g} ms is impossible here: with every object at its coarsest LOD frames take"
+        print(f"{PROGRAM}: {about} {least:.3g} ms", file=sys.stderr)
 
 
 def _check(options):
@@ -87,14 +94,12 @@ def _check(options):
     if options.plot:
         check_output(options.plot / PLOT_NAME, [".png"], make=True)
         if importlib.util.find_spec("matplotlib") is None:
-            raise ValueError("--plot needs Matplotlib: pip install warp-abtree[pictures]")
+            raise ValueError("--plot needs Matplotlib: pip install matplotlib")
 
 
 def _write(options, loaded, frame, chosen) -> list[Path]:
     """Write the files that the options name; return them. `chosen` is the controller and the LODs of each frame."""
     controller, lods = chosen
-    if options.record:
-        frame.record(options.record)
     if options.picture:
         poses = None if loaded.dynamics is None else frame.motion.dynamics.poses()
         last = None if controller == "none" else loaded.scene.lods

@@ -15,8 +15,8 @@ from warp_abtree.jobs import RayPool, SweepJob, ThisProcess, run_shards
 
 SUMMARY = "ask a pair of models at millions of poses, into shards"
 EXAMPLES = (
-    "cow.npz cow.npz poses.npy --out answers",
-    "cow.npz tool.npz poses.npy --output contacts --file parquet --workers 2 --out contacts",
+    "bunny.npz bunny.npz poses.npy --out answers",
+    "bunny.npz warp:bear poses.npy --output contacts --file parquet --workers 2 --out contacts",
 )
 
 

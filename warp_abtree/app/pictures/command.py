@@ -17,7 +17,7 @@ EXAMPLES = (
     "scenes/bunny_tori.toml --frame 30 --out tori.png",
     "warp:bunny warp:bunny --lod 0.1 --out bunnies.png",
     "scenes/bunny_tori.toml --frames 60 --every 2 --out tori.webp",
-    "cow.obj --lod tol:0.01 --eye 1 0.3 0.5 --out cow.png",
+    "bunny.npz --lod tol:0.01 --eye 1 0.3 0.5 --out bunny.png",
 )
 
 

@@ -45,7 +45,7 @@ def import_pyvista(what: str):
         import pyvista
         from vtkmodules.vtkCommonCore import vtkLogger
     except ImportError:
-        raise ValueError(f"{what} needs pyvista and Matplotlib: pip install warp-abtree[pictures]") from None
+        raise ValueError(f"{what} needs pyvista and Matplotlib: pip install pyvista matplotlib") from None
     # VTK ends the process where it finds none of these.
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         if not (ctypes.util.find_library("EGL") or ctypes.util.find_library("OSMesa")):

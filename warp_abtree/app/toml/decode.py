@@ -35,7 +35,7 @@ def import_msgspec(path):
     try:
         import msgspec
     except ImportError:
-        raise SceneError(f"{path}: scene files need msgspec: pip install warp-abtree[app]") from None
+        raise SceneError(f"{path}: scene files need msgspec: pip install msgspec") from None
     return msgspec
 
 
@@ -47,8 +47,6 @@ def read_tables(path: Path, text: str | None = None):
     try:
         text = path.read_bytes().decode() if text is None else text
         tree = msgspec.toml.decode(text)
-    except ImportError:
-        raise SceneError(f"{path}: scene files need tomli on Python 3.10: pip install warp-abtree[app]") from None
     except FileNotFoundError as error:
         known = ", ".join(scene_names())
         raise SceneError(f"{path}: {error.strerror}; scenes that come with the package: {known}") from None

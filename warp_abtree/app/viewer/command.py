@@ -9,8 +9,9 @@ import socket
 
 from warp_abtree.app.cli.arguments import Parser, milliseconds
 from warp_abtree.app.open_playback import add_playback_arguments, open_playback
+from warp_abtree.app.playback import Playback
 
-PORT = 8080
+HOST, PORT = "127.0.0.1", 8080
 SUMMARY = "look at a scene or meshes in the browser"
 EXAMPLES = (
     "scenes/bunny_tori.toml",
@@ -23,7 +24,7 @@ def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
     add_playback_arguments(sub)
     sub.add_argument("--budget", type=milliseconds, metavar="TIME", help="time of a frame to hold, as 8ms or 0.008s")
-    sub.add_argument("--host", default="127.0.0.1", help="address to serve at (127.0.0.1, this machine alone)")
+    sub.add_argument("--host", default=HOST, help="address to serve at (127.0.0.1, this machine alone)")
     sub.add_argument("--port", type=int, metavar="P", help=f"port to serve at ({PORT}, or the next one that is free)")
 
 
@@ -36,7 +37,7 @@ def import_viser():
     try:
         import viser
     except ImportError as error:
-        raise ValueError(f"view needs viser: pip install warp-abtree[view] ({error})") from None
+        raise ValueError(f"view needs viser: pip install viser ({error})") from None
     # A browser that goes away in the middle of a message is no news.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     return viser
@@ -75,10 +76,8 @@ def serve(host="127.0.0.1", port=0):
 
 def view(options, progress):
     """Serve a page until Ctrl-C."""
-    from warp_abtree.app.viewer.page import Page
-
     import_viser()
-    if options.port is not None or options.host != "127.0.0.1":
+    if options.port is not None or options.host != HOST:
         check_port(options.host, 0 if options.port is None else options.port)
     named = {"objects": options.objects, "poses": options.pose, "lod": options.lod}
     playback = open_playback(options.source, options.device, progress, **named)
@@ -89,13 +88,24 @@ def view(options, progress):
     progress.close()
     gc.collect()
     gc.freeze()
-    with serve(options.host, PORT if options.port is None else options.port) as server:
-        if options.port and server.get_port() != options.port:
-            raise ValueError(f"{options.host}:{options.port}: cannot be served at")
+    show(playback, options.host, options.port, options.json)
+
+
+def show(playback: Playback, host=HOST, port=None, as_json=False, seconds=None):
+    """Serve a page about a playback until Ctrl-C, or for a time [s]; print its address.
+
+    Raises:
+        ValueError: The address cannot be served at.
+    """
+    from warp_abtree.app.viewer.page import Page
+
+    with serve(host, PORT if port is None else port) as server:
+        if port and server.get_port() != port:
+            raise ValueError(f"{host}:{port}: cannot be served at")
         page = Page(server, playback)
-        shown = "localhost" if options.host in ("127.0.0.1", "0.0.0.0") else options.host
+        shown = "localhost" if host in (HOST, "0.0.0.0") else host
         address = f"http://{shown}:{server.get_port()}"
         found = {"address": address, "title": playback.title, "objects": playback.scene.object_count}
         with contextlib.suppress(KeyboardInterrupt):  # from when the address is told
-            print(json.dumps(found) if options.json else f"{playback.title}: {address} (Ctrl-C ends)", flush=True)
-            page.run()
+            print(json.dumps(found) if as_json else f"{playback.title}: {address} (Ctrl-C ends)", flush=True)
+            page.run(seconds)

@@ -1,0 +1,1 @@
+"""Face pairs that are apart by less than a gap."""

@@ -1,0 +1,108 @@
+// Faces of a search by warps: their distance in float32, and what all warps at work on an object pair have found.
+#pragma once
+#include "builtin.h"
+
+template <class Corners>
+inline CUDA_CALLABLE wp::vec_t<2, wp::float32> bound_faces(wp::float32 own, Corners a, Corners b) {
+#include "nearest/float32.h"
+#include "nearest/faces32.h"
+    NearestFaces::Corners c;
+    for (int k = 0; k < 3; ++k) {
+        c.a[k] = Float32::Point{a.data[k][0], a.data[k][1], a.data[k][2]};
+        c.b[k] = Float32::Point{b.data[k][0], b.data[k][1], b.data[k][2]};
+    }
+    float size;
+    const float d = sqrtf(NearestFaces::measure(c, size).square), error = NearestFaces::error_of(d, size, own);
+    return wp::vec_t<2, wp::float32>(d - error, d + error);
+}
+
+inline CUDA_CALLABLE wp::float32 load_upper(wp::array_t<wp::float32> upper, wp::int32 i) {
+#if defined(__CUDA_ARCH__)
+    // Lanes that were not together read at different times; what follows needs the same number in all.
+    return __shfl_sync(0xffffffffu, *(const volatile float*)(upper.data + i), 0);
+#else
+    return upper.data[i];
+#endif
+}
+
+inline CUDA_CALLABLE void lower_upper(wp::array_t<wp::float32> upper, wp::int32 i, wp::float32 x) {
+#if defined(__CUDA_ARCH__)
+    // Numbers of 0 and more are in the order of their bits.
+    if (threadIdx.x == 0)
+        atomicMin((int*)(upper.data + i), __float_as_int(x));
+    __syncwarp();
+#else
+    upper.data[i] = x < upper.data[i] ? x : upper.data[i];
+#endif
+}
+
+inline CUDA_CALLABLE wp::float64 load_distance(wp::array_t<wp::float64> distance, wp::int32 i) {
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(0xffffffffu, *(const volatile double*)(distance.data + i), 0);
+#else
+    return distance.data[i];
+#endif
+}
+
+inline CUDA_CALLABLE wp::int64 load_faces(wp::array_t<wp::int64> faces, wp::int32 i) {
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(0xffffffffu, *(const volatile long long*)(faces.data + i), 0);
+#else
+    return faces.data[i];
+#endif
+}
+
+inline CUDA_CALLABLE void offer_nearest(wp::array_t<wp::float64> distance, wp::array_t<wp::int64> faces, wp::int32 i,
+                                        wp::float64 d, wp::int64 item) {
+#if defined(__CUDA_ARCH__)
+    if (threadIdx.x == 0) {
+        // Who takes the faces, and leaves -1, has the pair for itself.
+        unsigned long long* place = (unsigned long long*)(faces.data + i);
+        unsigned long long held = atomicExch(place, ~0ull);
+        while (held == ~0ull) {
+            __nanosleep(20);
+            held = atomicExch(place, ~0ull);
+        }
+        __threadfence();
+        volatile double* least = (volatile double*)(distance.data + i);
+        if (d < *least || (d == *least && item < (long long)held)) {
+            *least = d;
+            held = (unsigned long long)item;
+        }
+        __threadfence();
+        atomicExch(place, held);
+    }
+    __syncwarp();
+#else
+    if (d < distance.data[i] || (d == distance.data[i] && item < faces.data[i])) {
+        distance.data[i] = d;
+        faces.data[i] = item;
+    }
+#endif
+}
+
+inline CUDA_CALLABLE wp::float64 warp_min(wp::float64 x) {
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step >>= 1)
+        x = wp::min(x, __shfl_xor_sync(0xffffffffu, x, step));
+#endif
+    return x;
+}
+
+inline CUDA_CALLABLE wp::int64 warp_min_item(wp::int64 x) {
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step >>= 1)
+        x = wp::min(x, (wp::int64)__shfl_xor_sync(0xffffffffu, (long long)x, step));
+#endif
+    return x;
+}
+
+inline CUDA_CALLABLE wp::float32 warp_min32(wp::float32 x) {
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step >>= 1) {
+        const float other = __shfl_xor_sync(0xffffffffu, x, step);
+        x = other < x ? other : x;
+    }
+#endif
+    return x;
+}

@@ -1,0 +1,323 @@
+"""How deep an object pair is: the greatest depth of samples of one surface inside the other object, a solid.
+
+Samples of a face are its corners, the middles of its edges and its centroid. The depth of a point inside is its
+distance from the surface. A motion that is shorter leaves it inside, so the greatest depth is a lower bound of any
+motion that frees the two. Nodes of the tree whose samples are looked at are dropped where, by the distance of their
+middle from the surface, nothing below can be inside, or deeper than what is known; never where it may be as deep, so
+that the deepest sample, the lowest of several, is found in any order.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.distance.frame import Frame, make_frame, slack_of
+from warp_abtree.kernels.distance.node_pair import FACES, NODES
+from warp_abtree.kernels.distance.report import Distances, blend_corners, write_nearest
+from warp_abtree.kernels.distance.search import (
+    DEPTH_FIRST_ROOM,
+    nearest_stack,
+    push_nearest,
+    read_bound,
+    warp_min_item,
+    write_bound,
+)
+from warp_abtree.kernels.generation import STALE
+from warp_abtree.kernels.poses import PairPose, pose_point
+from warp_abtree.kernels.solid.components import Solids
+from warp_abtree.kernels.solid.nearest_face import (
+    Whose,
+    into_frame,
+    make_whose,
+    nearest_face,
+    point_features,
+    point_weights,
+    square_outside,
+)
+from warp_abtree.kernels.solid.parity import face_corners, is_inside
+from warp_abtree.kernels.traversal.boxes import round_up
+from warp_abtree.kernels.traversal.face_pairs import Hits
+from warp_abtree.kernels.traversal.node_pair import four_items, item_first, item_second
+from warp_abtree.kernels.traversal.nodes import Node, load_node
+from warp_abtree.kernels.traversal.warp_stack import (
+    STACK_LENGTH,
+    read_item,
+    warp_lane,
+    warp_max,
+    warp_size,
+    warp_sync,
+    write_item,
+)
+
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
+
+# Points of a face that are looked at.
+SAMPLES = wp.constant(7)
+NO_SAMPLE = wp.constant(wp.int64(2**63 - 1))
+# Before all samples: of what is known already, equally deep ones are no better.
+KNOWN = wp.constant(wp.int64(-1))
+HALF = wp.constant(wp.float64(0.5))
+
+
+@wp.struct
+class Deepest:
+    """The deepest sample found so far."""
+
+    depth: wp.float64  # [model units], 0 for none
+    item: wp.int64  # see `pack_deepest`
+
+
+@wp.func
+def pack_deepest(face: wp.int32, sample: wp.int32, nearest: wp.int32):
+    """Return the item of a sample and the face that is nearest; the lowest of several that are equally deep counts:
+
+    63 62                        33 32    30 29                         0
+    [0|       face of the sample    | sample |      face that is nearest   ]
+    """
+    return (wp.int64(face) << wp.int64(33)) | (wp.int64(sample) << wp.int64(30)) | wp.int64(nearest)
+
+
+@wp.func
+def sample_weights(sample: wp.int32):
+    """Return the weights of a face's corners at a sample: corners, middles of the edges behind them, the centroid."""
+    w = wp.vec3d()
+    if sample == SAMPLES - 1:
+        third = wp.float64(1.0) / wp.float64(3.0)
+        return wp.vec3d(third, third, third)
+    k = sample % 3
+    w[k] = wp.where(sample < 3, wp.float64(1.0), HALF)
+    if sample >= 3:
+        w[(k + 1) % 3] = HALF
+    return w
+
+
+@wp.func
+def bound_depth(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    inner: Whose,
+    outer: Whose,
+    node: Node,
+    known: wp.float64,
+):
+    """Return an upper bound of the depth of what is below a node; negative only where that is less than what is known.
+
+    With the node's middle at a distance d from the surface, and points within r of it, an inside point is no deeper
+    than d + r, and no deeper than r - d where the middle is outside: the surface lies between them.
+    """
+    none = -wp.float64(1.0)
+    if node.skip < 0:
+        return none
+    lower, upper = wp.vec3d(node.lower), wp.vec3d(node.upper)
+    middle = HALF * (lower + upper) + inner.centre
+    if inner.of_b:
+        middle = pose_point(pose.rotation, pose.translation, middle)
+    reach = wp.length(HALF * (upper - lower)) * outer.grow + outer.margin
+    # What is inside lies within the root's box, and no deeper than its nearest side.
+    root = load_node(states, outer.node + 1)
+    x = into_frame(pose, outer, middle)
+    if square_outside(root, x) > reach * reach:
+        return none
+    for i in range(3):
+        side = wp.min(x[i] - wp.float64(root.lower[i]), wp.float64(root.upper[i]) - x[i])
+        if side + reach < known:
+            return none
+    distance, _face = nearest_face(models, states, pose, outer, middle, wp.float64(wp.inf), known - reach)
+    if distance + reach < known:
+        return none
+    if reach - distance < known or distance > reach:
+        centre = wp.where(inner.of_b, outer.centre, inner.centre)
+        if not is_inside(models, states, pose, outer.of_b, centre, middle):
+            return none
+    return distance + reach
+
+
+@wp.func
+def measure_samples(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    inner: Whose,
+    outer: Whose,
+    face: wp.int32,
+    known: Deepest,
+):
+    """Return the deepest of what is known and the samples of a face that are inside the outer object."""
+    best = known
+    a, b, c = face_corners(models, states, pose, inner.of_b, face)
+    centre = wp.where(inner.of_b, outer.centre, inner.centre)
+    root = load_node(states, outer.node + 1)
+    k = wp.int32(0)
+    while k < SAMPLES:
+        w = sample_weights(k)
+        point = (w[0] * a + w[1] * b) + w[2] * c
+        if square_outside(root, into_frame(pose, outer, point)) <= outer.margin * outer.margin:
+            distance, nearest = nearest_face(models, states, pose, outer, point, wp.float64(wp.inf), best.depth)
+            if distance >= best.depth and distance > wp.float64(0.0):
+                item = pack_deepest(face, k, nearest)
+                if distance > best.depth or item < best.item:
+                    if is_inside(models, states, pose, outer.of_b, centre, point):
+                        best.depth = distance
+                        best.item = item
+        k += 1
+    return best
+
+
+@wp.func
+def agree(best: Deepest):
+    """Return the deepest of what all lanes have found, the lowest of several."""
+    found = Deepest()
+    found.depth = warp_max(best.depth)
+    found.item = warp_min_item(wp.where(best.depth == found.depth, best.item, NO_SAMPLE))
+    return found
+
+
+@wp.func
+def find_deepest(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    inner: Whose,
+    outer: Whose,
+    room: wp.int32,
+    known: Deepest,
+):
+    """Return the deepest of what is known and all samples of one object inside the other, the same in all lanes.
+
+    The children that may be deepest come first; faces wait until there is one for each lane.
+    """
+    best = known
+    items = nearest_stack()
+    root = load_node(states, inner.node + 1)
+    # A single face waits at once.
+    waiting = wp.where(root.face >= 0, 1, 0)
+    end = 1 - waiting
+    if warp_lane() == 0:
+        at = STACK_LENGTH * waiting
+        write_item(items, at, wp.int64(wp.where(root.face >= 0, root.face, root.skip)))
+        write_bound(items, at, -wp.float32(wp.inf))
+    warp_sync()
+    while end > 0 or waiting > 0:
+        if end > 0 and waiting < warp_size():
+            popped = wp.max(1, (room - DEPTH_FIRST_ROOM - end) >> 1)
+            popped = wp.min(popped, wp.min(warp_size(), end))
+            end -= popped
+            at = end + wp.min(warp_lane(), popped - 1)
+            node = wp.int32(read_item(items, at))
+            live = warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth
+            warp_sync()
+            children, kinds, bounds = four_items(), wp.vec4i(), wp.vec4()
+            for k in range(2):
+                child = load_node(states, inner.node + wp.where(live, 2 * node + k, 1))
+                if live:
+                    bound = bound_depth(models, states, pose, inner, outer, child, best.depth)
+                    if bound >= wp.float64(0.0):
+                        kinds[k] = wp.where(child.face >= 0, FACES, NODES)
+                        children[k] = wp.int64(wp.where(child.face >= 0, child.face, child.skip))
+                        bounds[k] = -round_up(bound)
+            ends = push_nearest(items, end, waiting, kinds, children, bounds)
+            warp_sync()
+            end = item_second(ends)
+            waiting = item_first(ends)
+        if waiting >= warp_size() or (waiting > 0 and end == 0):
+            popped = wp.min(waiting, warp_size())
+            waiting -= popped
+            at = STACK_LENGTH + waiting + wp.min(warp_lane(), popped - 1)
+            face = wp.int32(read_item(items, at))
+            if warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth:
+                best = measure_samples(models, states, pose, inner, outer, face, best)
+            warp_sync()
+            best = agree(best)
+    return best
+
+
+@wp.func
+def report_deepest(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pose: PairPose,
+    frame: Frame,
+    pair: wp.vec2i,
+    of_b: bool,
+    best: Deepest,
+    p: wp.int32,
+    distances: Distances,
+):
+    """Write the deepest sample of a pair, the point of the other's surface that is nearest, and their faces."""
+    face = wp.int32(best.item >> wp.int64(33))
+    weights = sample_weights(wp.int32((best.item >> wp.int64(30)) & wp.int64(7)))
+    nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
+    a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
+    inner, outer = wp.where(of_b, b, a), wp.where(of_b, a, b)
+    u, v, w = face_corners(models, states, pose, of_b, face)
+    point = (weights[0] * u + weights[1] * v) + weights[2] * w
+    u, v, w = face_corners(models, states, pose, not of_b, nearest)
+    near, _size = point_features(u, v, w, point)
+    ids = states.face_corner[states.face_start[objects.state[outer]] + nearest]
+    foot = blend_corners(models, ids, point_weights(near))
+    foot = pose_point(objects.rotation[outer], objects.position[outer], foot)
+    ids = states.face_corner[states.face_start[objects.state[inner]] + face]
+    sample = blend_corners(models, ids, weights)
+    sample = pose_point(objects.rotation[inner], objects.position[inner], sample)
+    d = best.depth
+    slack = slack_of(frame, d)
+    least = wp.max((d - slack) / frame.stretch, wp.float64(0.0))
+    distances.distance[p] = -d
+    distances.bracket[p] = wp.vec2d(-(d * frame.stretch + slack), -least)
+    if of_b:
+        write_nearest(p, pose.swapped, nearest, face, foot, sample, distances)
+    else:
+        write_nearest(p, pose.swapped, face, nearest, sample, foot, distances)
+
+
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+def find_depth_kernel(
+    # static
+    room: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    solids: Solids,
+    # state
+    objects: ObjectPool,
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    launched: wp.array(dtype=wp.int32),
+    hits: Hits,
+    # out
+    distances_inout: Distances,
+):
+    """Find the depth of the object pairs that intersect and have samples of one in the other, a solid; a warp a pair.
+
+    Others keep the rows that they have.
+    """
+    p = wp.tid() / warp_size()
+    if p >= pair_count[0] or p >= pairs.shape[0] or launched[0] == STALE:
+        return
+    if hits.any_hit[p] == 0:
+        return
+    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
+    if solids.is_solid[a] == 0 and solids.is_solid[b] == 0:
+        return
+    pose = pair_poses[p]
+    frame = make_frame(models, states, objects, pose, a, b)
+    first = make_whose(models, states, pose, frame, False, objects.state[a])
+    second = make_whose(models, states, pose, frame, True, objects.state[b])
+    best = Deepest()
+    best.item = NO_SAMPLE
+    of_b = bool(False)
+    if solids.is_solid[b] != 0:
+        best = find_deepest(models, states, pose, first, second, room, best)
+    if solids.is_solid[a] != 0:
+        other = Deepest()
+        other.depth = best.depth
+        other.item = KNOWN
+        other = find_deepest(models, states, pose, second, first, room, other)
+        if other.item != KNOWN:
+            best.depth = other.depth
+            best.item = other.item
+            of_b = bool(True)
+    if best.depth > wp.float64(0.0) and warp_lane() == 0:
+        report_deepest(models, states, objects, pose, frame, pairs[p], of_b, best, p, distances_inout)

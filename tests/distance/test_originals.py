@@ -1,0 +1,297 @@
+"""Distances of originals: certified brackets from coarse LODs, refined where these leave undecided what is asked."""
+
+import numpy as np
+import pytest
+from helpers.questions import coarse, pairs_of, random_lod, scene_of
+from helpers.samples import grid, random_poses, sample
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from oracles.distance import brute_distances, mesh_distance
+from oracles.triangle import quaternion_matrix
+
+import warp_abtree as ab
+from warp_abtree.scene import originals
+from warp_abtree.scene.originals import OriginalDistances
+
+ROWS = ("any", "distance", "bracket", "points", "point_faces")
+SAMPLES = ("torus", "ball", "capsule", "soup", "cow")
+CLOSE = 1 + 1e-12
+
+
+def random_cases(rng, count, names=SAMPLES, spread=2.5):
+    """Return cases of samples at random LODs and poses, from crossing to far apart."""
+    cases = []
+    for _ in range(count):
+        a, b = (sample(rng.choice(names)) for _ in range(2))
+        pose_a, pose_b = random_poses(rng, 2, spread)
+        cases.append((a, random_lod(rng, a, 2000), pose_a, b, random_lod(rng, b, 2000), pose_b))
+    return cases
+
+
+def finest(cases):
+    return [(a, a.lod_max, pose_a, b, b.lod_max, pose_b) for a, _, pose_a, b, _, pose_b in cases]
+
+
+def check(result, truth, tolerance=0.0, relative=0.0, beyond=np.inf):
+    """Hold a result to the distances of the originals, and to the options that it was asked with."""
+    lower, upper = result.bracket.T
+    far = np.isinf(result.distance)
+    np.testing.assert_array_equal(result.any, truth == 0)
+    np.testing.assert_array_equal(result.distance == 0, truth == 0)
+    assert (lower <= truth * CLOSE).all() and (truth <= upper * CLOSE).all()
+    np.testing.assert_array_equal(far, truth > beyond)
+    assert (lower[far] == np.broadcast_to(beyond, len(truth))[far]).all() and np.isinf(upper[far]).all()
+    assert (result.point_faces[far] == -1).all() and np.isnan(result.points[far]).all()
+    near = ~far
+    width = np.maximum(tolerance, relative * result.distance[near])
+    assert (upper[near] - lower[near] <= width * CLOSE + 1e-11).all()
+    assert (lower[near] <= result.distance[near]).all() and (result.distance[near] <= upper[near]).all()
+    between = np.linalg.norm(result.points[:, 0] - result.points[:, 1], axis=1)[near]
+    np.testing.assert_allclose(between, result.distance[near], rtol=1e-9, atol=1e-13)
+
+
+def check_points(cases, result):
+    """Nearest points lie on the original faces that are named."""
+    for case, points, faces in zip(cases, result.points, result.point_faces, strict=True):
+        for model, _, pose, point, face in ((*case[:3], points[0], faces[0]), (*case[3:], points[1], faces[1])):
+            if face >= 0:
+                vertices, corners, ids = model.mesh_at(model.lod_max)
+                posed = vertices[corners[ids == face]] @ quaternion_matrix(pose[3:]).T + pose[:3]
+                assert brute_distances(point[None], posed)[0] < 1e-12 * (1 + np.abs(posed).max())
+
+
+OPTIONS = st.fixed_dictionaries(
+    {},
+    optional={
+        "tolerance": st.sampled_from((1e-3, 0.1, 0.5, 100.0)),
+        "relative": st.sampled_from((0.01, 0.1, 0.5, 0.9)),
+        "beyond": st.sampled_from((0.0, 0.05, 0.5, 2.0)),
+    },
+)
+
+
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32 - 1), options=OPTIONS, swapped=st.booleans())
+def test_brackets_hold_the_originals(device, seed, options, swapped):
+    """Whatever the LODs, poses and options; a second time, with tree states of the originals at hand, too."""
+    cases = random_cases(np.random.default_rng(seed), 8)
+    pairs = pairs_of(cases)[:, ::-1] if swapped else pairs_of(cases)
+    truth = scene_of(device, finest(cases)).intersect(pairs, "distance").distance
+    scene = scene_of(device, cases)
+    for _ in range(2):
+        result = scene.intersect(pairs, "distance", originals=True, **options)
+        check(result, truth, **options)
+        if not swapped:
+            check_points(cases, result)
+
+
+def test_brackets_hold_brute_force(device):
+    """Beside distances over all pairs of features of the original meshes."""
+    rng = np.random.default_rng(1)
+    models = [ab.Model.from_arrays(*coarse(name, 300)) for name in ("torus", "ball", "cow")]
+    small = []
+    for _ in range(30):
+        a, b = rng.choice(models, 2)
+        pose_a, pose_b = random_poses(rng, 2, 3.0)
+        small.append((a, a.lod_for(fraction=0.3), pose_a, b, b.lod_for(fraction=0.6), pose_b))
+    result = scene_of(device, small).intersect(pairs_of(small), "distance", originals=True, tolerance=50.0)
+    apart = np.flatnonzero(~result.any)
+    assert len(apart) > 15
+    truth = np.array([mesh_distance(*finest(small)[i]) for i in apart])
+    lower, upper = result.bracket[apart].T
+    assert (lower <= truth * CLOSE).all() and (truth <= upper * CLOSE).all()
+    assert (upper - lower > 1e-6).any(), "some stand as the LODs decide them"
+
+
+def test_errors_count_to_the_last(device, monkeypatch):
+    """A spike that its LOD lacks reaches out by 0.98 of the certified error, towards a plate."""
+    vertices, faces = grid(8)
+    vertices[40, 2] = 1.6
+    spike = ab.Model.from_arrays((vertices - [4, 4, 0]) / 8, faces, base_faces=2)
+    plate = ab.Model.from_arrays(grid(1)[0] - [0.5, 0.5, 0], grid(1)[1], base_faces=2)
+    cases = [(spike, 0, (0, 0, 0, 0, 0, 0, 1), plate, 0, (0, 0, 1, 0, 0, 0, 1))]
+    error = spike.error_at(0)
+    assert 0.98 * error < scene_of(device, cases).intersect([(0, 1)], "distance").distance[0] - 0.8 < error
+    for beyond, distance in ((0.801, 0.8), (0.79, np.inf), (0.8 - 0.02 * error, np.inf)):
+        asked = {"beyond": beyond, "relative": 0.5, "originals": True}
+        found = scene_of(device, cases).intersect([(0, 1)], "distance", **asked)
+        assert found.distance[0] == pytest.approx(distance)
+    monkeypatch.setattr(originals, "SEARCHED", 1e-6)
+    asked = OriginalDistances(scene_of(device, cases).batch())
+    lower, upper = asked.run(np.array([[0, 1]]), np.array(np.inf), tolerance=2.5 * error).bracket[0]
+    assert asked.finest is None and 0.8 - 0.02 * error < lower <= 0.8 <= upper
+
+
+def test_without_tolerance_the_answer_is_that_of_the_finest(device):
+    cases = random_cases(np.random.default_rng(2), 20)
+    expected = scene_of(device, finest(cases)).intersect(pairs_of(cases), "distance")
+    scene = scene_of(device, cases)
+    for _ in range(2):
+        result = scene.intersect(pairs_of(cases), "distance", originals=True)
+        for name in ROWS:
+            np.testing.assert_array_equal(getattr(result, name), getattr(expected, name))
+    at_finest = scene_of(device, finest(cases)).intersect(pairs_of(cases), "distance", originals=True)
+    for name in ROWS:
+        np.testing.assert_array_equal(getattr(at_finest, name), getattr(expected, name))
+
+
+def test_only_models_of_undecided_pairs_are_refined(device):
+    """Far pairs are decided at their LODs; the pair that is not takes tree states of its own models alone."""
+    names = ("torus", "ball", "capsule", "cow")
+    models = [sample(name) for name in names]
+    places = [(0, 0, 0), (9, 0, 0), (0, 9, 0), (0, 11.5, 0)]
+    scene = ab.Scene(device)
+    for model, place in zip(models, places):
+        scene.add(model, (*place, 0, 0, 0, 1), lod=model.lod_for(fraction=0.3))
+    asked = OriginalDistances(scene.batch())
+    pairs, no_end = np.array([[0, 1], [0, 2], [1, 2], [2, 3]]), np.array(np.inf)
+    poses = [(*place, 0, 0, 0, 1) for place in places]
+    cases = [(models[i], None, poses[i], models[j], None, poses[j]) for i, j in pairs]
+    truth = scene_of(device, cases).intersect(pairs_of(cases), "distance").distance
+    check(asked.run(pairs[:3], no_end, tolerance=1.0), truth[:3], tolerance=1.0)
+    assert asked.finest is None
+    errors = [model.error_at(lod) for model, lod in zip(models, scene.lods)]
+    tolerance = 2.5 * (errors[0] + errors[1])
+    check(asked.run(pairs, no_end, tolerance=tolerance), truth, tolerance=tolerance)
+    made = {slot.model for slot in asked.finest.states.slots} if asked.finest else set()
+    assert made <= {2, 3}
+    check(asked.run(pairs[2:], no_end), truth[2:])
+    assert {slot.model for slot in asked.finest.states.slots} == {1, 2, 3}
+    check(asked.run(pairs, no_end), truth)
+
+
+def test_poses_lods_and_objects_change(device):
+    rng = np.random.default_rng(4)
+    cases = random_cases(rng, 6)
+    scene, reference = scene_of(device, cases), scene_of(device, finest(cases))
+    options = {"relative": 0.3}
+    for turn in range(4):
+        result = scene.intersect(pairs_of(cases), "distance", originals=True, **options)
+        check(result, reference.intersect(pairs_of(cases), "distance").distance, **options)
+        poses = random_poses(rng, 12, 2.5 + turn)
+        scene.set_poses(poses)
+        reference.set_poses(poses)
+        scene.set_lods([random_lod(rng, scene.models[m], 2000) for m in scene.object_model])
+    more = sample("box")
+    for one in (scene, reference):
+        one.add(more, (1.0, 2.0, 7.0, 0, 0, 0, 1))
+    pairs = np.array([[0, 12], [12, 5], [2, 3]])
+    result = scene.intersect(pairs, "distance", originals=True, **options)
+    check(result, reference.intersect(pairs, "distance").distance, **options)
+
+
+def test_distances_of_their_own_for_each_pair(device):
+    """`beyond` of each pair, and the broad phase's pairs."""
+    cases = random_cases(np.random.default_rng(5), 12)
+    truth = scene_of(device, finest(cases)).intersect(pairs_of(cases), "distance").distance
+    beyond = truth * np.where(np.arange(12) % 2, 0.8, 1.2)
+    scene = scene_of(device, cases)
+    options = {"beyond": beyond, "relative": 0.5}
+    check(scene.intersect(pairs_of(cases), "distance", originals=True, **options), truth, **options)
+    found = scene.intersect(output="distance", originals=True)
+    assert set(map(tuple, scene.broad_phase().tolist())) <= set(map(tuple, found.pairs.tolist()))
+
+
+def test_results_on_the_device(device):
+    cases = random_cases(np.random.default_rng(6), 10)
+    options = {"originals": True, "relative": 0.4}
+    for count in (10, 0):
+        pairs = pairs_of(cases)[:count]
+        kept = scene_of(device, cases).intersect(pairs, "distance", device=True, **options)
+        host = scene_of(device, cases).intersect(pairs, "distance", **options)
+        for name in ("pairs", *ROWS, "node_tests"):
+            np.testing.assert_array_equal(getattr(kept, name).numpy(), getattr(host, name))
+            assert getattr(kept, name).device == scene_of(device, cases).device
+        host.check()
+
+
+def test_sweeps(device):
+    rng = np.random.default_rng(7)
+    a, b = sample("cow"), sample("torus")
+    poses = random_poses(rng, 300, 3.0)
+    truth = ab.sweep(a, b, poses, output="distance", device=device)
+    asked = {"output": "distance", "device": device, "originals": True}
+    lods = {"lod_a": a.lod_for(fraction=0.2), "lod_b": b.lod_for(fraction=0.2)}
+    for _ in range(2):
+        for options in ({}, {"relative": 0.3}, {"tolerance": 0.2}, {"beyond": 0.7, "relative": 0.5}):
+            found = ab.sweep(a, b, poses, **asked, **lods, **options)
+            lower, upper = found["bracket"].T
+            assert (lower <= truth["distance"] * CLOSE).all() and (truth["distance"] <= upper * CLOSE).all()
+            np.testing.assert_array_equal(found["distance"] == 0, truth["distance"] == 0)
+            np.testing.assert_array_equal(
+                np.isinf(found["distance"]), truth["distance"] > options.get("beyond", np.inf)
+            )
+            if not options:
+                np.testing.assert_array_equal(found, truth)
+
+
+def test_frames_off_orthonormal(device):
+    """Rotations off by nearly what scenes refuse: brackets hold the posed originals."""
+    rng = np.random.default_rng(8)
+    model = sample("torus")
+    scene, posed = ab.Scene(device), ab.Scene(device)
+    vertices, faces, _ = model.mesh_at(model.lod_max)
+    for i in range(20):
+        matrix = np.eye(4)
+        matrix[:3, :3] = quaternion_matrix(random_poses(rng, 1, 1)[0, 3:]) + rng.uniform(-2e-7, 2e-7, (3, 3))
+        matrix[:3, 3] = (3.0 * i, 0, 0)
+        scene.add(model, matrix, lod=model.lod_for(fraction=0.3))
+        posed.add(ab.Model.from_arrays(vertices @ matrix[:3, :3].T + matrix[:3, 3], faces))
+    pairs = np.stack([np.arange(19), np.arange(1, 20)], 1)
+    truth = posed.intersect(pairs, "distance").distance
+    for options in ({"tolerance": 5.0}, {}):
+        lower, upper = scene.intersect(pairs, "distance", originals=True, **options).bracket.T
+        assert (lower <= truth + 1e-14).all() and (truth <= upper + 1e-14).all()
+
+
+def test_solids(device):
+    """What is inside a solid intersects it, also beside pairs that LODs decide."""
+    cow, ball = sample("cow"), sample("ball")
+    scene = ab.Scene(device)
+    scene.add(ball, lod=ball.lod_for(fraction=0.3), solid=True)
+    small = ab.Model.from_arrays(ball.mesh_at(ball.lod_max)[0] / 9, ball.mesh_at(ball.lod_max)[1])
+    scene.add(small, lod=small.lod_for(fraction=0.3))
+    scene.add(cow, (30, 0, 0, 0, 0, 0, 1), lod=cow.lod_for(fraction=0.3))
+    scene.add(ball, (60, 0, 0, 0, 0, 0, 1))
+    scene.add(small, (60, 0, 0, 0, 0, 0, 1))
+    pairs = [(0, 1), (1, 2), (3, 4)]
+    found = scene.intersect(pairs, "distance", originals=True, relative=0.3)
+    np.testing.assert_array_equal(found.any, [True, False, False])
+    assert found.distance[0] == 0 < found.distance[2] < found.distance[1]
+    scene.set_lods([model.lod_max for model in (ball, small, cow, ball, small)])
+    lower, upper = found.bracket.T
+    truth = scene.intersect(pairs, "distance").distance
+    assert (lower <= truth).all() and (truth <= upper).all()
+
+
+def test_bad_input(device):
+    scene = scene_of(device, random_cases(np.random.default_rng(9), 1))
+    pairs = [(0, 1)]
+    for options in ({"tolerance": -1}, {"relative": 1.0}, {"beyond": np.nan}, {"originals": 1}, {"originals": "yes"}):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            scene.intersect(pairs, "distance", **{"originals": True, **options})
+    with pytest.raises(ValueError, match="originals means nothing for output 'any'"):
+        scene.intersect(pairs, originals=True)
+    with pytest.raises(ValueError, match="within means nothing"):
+        scene.intersect(pairs, "distance", originals=True, within=1.0)
+    with pytest.raises(ValueError, match="pairs object 0 with itself"):
+        scene.intersect([(0, 0)], "distance", originals=True)
+    model = scene.models[0]
+    with pytest.raises(ValueError, match="originals"):
+        ab.sweep(model, model, [(0, 0, 0, 0, 0, 0, 1)], output="distance", device=device, originals="no")
+    with pytest.raises(ValueError, match="originals means nothing"):
+        ab.sweep(model, model, [(0, 0, 0, 0, 0, 0, 1)], device=device, originals=True)
+
+
+def test_the_broad_phase_finds_what_lods_leave_out(device):
+    """Boxes of LODs that are apart, of originals that are not."""
+    vertices, faces = grid(8)
+    vertices[40, 2] = 1.6
+    spike = ab.Model.from_arrays((vertices - [4, 4, 0]) / 8, faces, base_faces=2)
+    scene = ab.Scene(device)
+    for z in (0.0, 0.15):
+        scene.add(spike, (0, 0, z, 0, 0, 0, 1), lod=0)
+    assert len(scene.broad_phase()) == 0
+    found = scene.intersect(output="distance", originals=True)
+    np.testing.assert_array_equal(found.pairs, [[0, 1]])
+    assert 0 < found.distance[0] < 0.15 and found.bracket[0, 1] < 0.15

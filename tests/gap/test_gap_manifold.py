@@ -1,0 +1,134 @@
+"""Contact points with a gap: boxes in closed form, floors of many faces, and an order that steps do not change."""
+
+import itertools
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.bodies import about, box, model_of
+from helpers.samples import STILL, random_poses, sample
+from oracles.triangle import quaternion_matrix
+
+import warp_abtree as ab
+from warp_abtree import testing
+
+UP = [0, 0, 1.0]
+
+
+def ask(device, *placed, **options):
+    """Return the query of (model, pose) in a scene, and what it finds."""
+    scene = ab.Scene(device)
+    for model, pose in placed:
+        scene.add(model, pose=pose)
+    query = ab.ManifoldQuery(scene, **options)
+    return query, query.run()
+
+
+@pytest.mark.parametrize("splits", [(0, 0), (3, 0), (2, 2)])
+@pytest.mark.parametrize("height", [-0.01, 0.0, 0.01])
+def test_a_box_over_a_floor_has_its_four_corners(device, splits, height):
+    floor, cube = box(4, 4, 1, splits=splits[0]), box(1, 0.8, 0.6, splits=splits[1])
+    turned = about(UP, 0.3)
+    placed = (floor, (0, 0, -0.5, 0, 0, 0, 1)), (cube, (0.1, 0.2, 0.3 + height, *turned))
+    points = ask(device, *placed, gap=0.03)[1].points
+    np.testing.assert_allclose(points["normal"], [UP] * len(points["normal"]), atol=1e-9)
+    np.testing.assert_allclose(points["depth"], -height, atol=1e-12)
+    r = quaternion_matrix(turned)
+    for x, y in itertools.product((-0.5, 0.5), (-0.4, 0.4)):
+        corner = r @ [x, y, -0.3] + [0.1, 0.2, 0.3 + height]
+        away = np.linalg.norm(points["point"] - corner, axis=1)
+        assert away.min() < (0.02 if splits == (0, 0) else 0.2)
+
+
+@pytest.mark.parametrize("splits", [0, 3])
+def test_a_tilted_box_has_points_inside_and_outside(device, splits):
+    """An edge is in the floor, the one across from it apart: depths are minus the heights of corners."""
+    floor, cube, tilt = box(4, 4, 1, splits=splits), box(1, 1, 1), 0.03
+    pose = (0.01, 0.02, 0.5, *about((0, 1, 0), tilt))
+    points = ask(device, (floor, (0, 0, -0.5, 0, 0, 0, 1)), (cube, pose), gap=0.05)[1].points
+    r = quaternion_matrix(pose[3:])
+    for x, y in itertools.product((-0.5, 0.5), repeat=2):
+        corner = r @ [x, y, -0.5] + pose[:3]
+        near = np.linalg.norm(points["point"] - corner, axis=1) < (0.05 if splits == 0 else 0.3)
+        assert near.any() and np.abs(points["depth"][near] + corner[2]).min() < (1.5e-3 if splits == 0 else 0.01)
+    assert points["depth"].max() == pytest.approx(-(r @ [0.5, 0.5, -0.5] + pose[:3])[2], rel=0.01)
+    assert points["depth"].min() < -0.01
+    assert (points["normal"] @ UP > 0.99).all()
+
+
+def test_edges_and_corners_that_are_apart(device):
+    bar, half = box(4, 0.5, 0.5), np.sqrt(0.125)
+    on_edge = about((1, 0, 0), np.pi / 4)
+    across = np.eye(4)
+    across[:3, :3] = quaternion_matrix(about(UP, np.pi / 2)) @ quaternion_matrix(on_edge)
+    across[2, 3] = 2 * half + 0.02
+    points = ask(device, (bar, (0, 0, 0, *on_edge)), (bar, across), gap=0.03)[1].points
+    assert points["depth"].max() == pytest.approx(-0.02, abs=1e-12)
+    np.testing.assert_allclose(points["normal"], [UP] * len(points["normal"]), atol=1e-9)
+    assert np.abs(points["point"][:, :2]).max() < 0.05
+    corner = about((1, -1, 0), np.arctan(np.sqrt(2)))
+    points = ask(device, (box(4, 4, 1), STILL), (box(1, 1, 1), (0, 0, 0.5 + np.sqrt(0.75) + 0.01, *corner)), gap=0.02)[
+        1
+    ]
+    assert points.points["depth"].max() == pytest.approx(-0.01, abs=1e-9)
+    np.testing.assert_allclose(points.points["normal"], [UP] * len(points.points["normal"]), atol=1e-9)
+
+
+@pytest.mark.parametrize("height", [-0.002, 0.001, 0.01])
+def test_faces_ahead_on_a_floor_do_not_stop_what_slides(device, height):
+    """Wherever the box is on a floor of many faces, deep in it or above, all points push upwards."""
+    rng, floor, cube = np.random.default_rng(0), box(4, 4, 1, splits=4), box(0.7, 0.6, 0.5, splits=1)
+    for _ in range(25):
+        pose = (*rng.uniform(-1, 1, 2), 0.25 + height, *about(UP, rng.uniform(0, 3)))
+        points = ask(device, (floor, (0, 0, -0.5, 0, 0, 0, 1)), (cube, pose), gap=0.06)[1].points
+        assert len(points["normal"]) >= 4
+        np.testing.assert_allclose(points["normal"], [UP] * len(points["normal"]), atol=0.05)
+
+
+def test_the_deepest_point_is_kept(device):
+    """Of balls that are apart it is as far as the distance says."""
+    rng, ball = np.random.default_rng(1), sample("small ball")
+    for pose in random_poses(rng, 12, 0.5):
+        pose[:3] *= 2.03 / np.linalg.norm(pose[:3])
+        query, result = ask(device, (ball, STILL), (ball, pose), pairs=[(0, 1)], gap=0.1)
+        distance = query.batch and ab.DistanceQuery(query.batch, [(0, 1)]).run().distance[0]
+        depth = result.points["depth"]
+        assert 0 < len(depth) <= 8 and not result.any[0]
+        assert distance * (1 - 1e-12) <= -depth.max() <= 0.1 * 0.1 + 0.9 * distance + 1e-12
+        assert (depth > -0.1).all()
+
+
+def test_points_keep_their_order_while_a_box_slides(device):
+    """Points that stay, as a box slides over the edges of a floor, come in the same order as before."""
+    floor, cube = box(4, 4, 1, splits=4), box(0.7, 0.6, 0.5)
+    scene = ab.Scene(device)
+    scene.add(floor, (0, 0, -0.5, 0, 0, 0, 1))
+    scene.add(cube)
+    query, before, kept = ab.ManifoldQuery(scene, gap=0.02), None, 0
+    for step in range(120):
+        turned = about((0.002, 0.001, 1), 0.4 + 0.002 * step)
+        place = np.array([-0.6 + 0.01 * step, 0.3 - 0.004 * step, 0.2495])
+        scene.set_poses([(0, 0, -0.5, 0, 0, 0, 1), (*place, *turned)])
+        query.run()
+        count = query.manifolds.count.numpy()[0]
+        points = (query.manifolds.point.numpy()[0, :count] - place) @ quaternion_matrix(turned)
+        if before is not None:
+            away = np.linalg.norm(points[:, None] - before, axis=2)
+            stay = away.min(1) < 0.004
+            assert (np.diff(away.argmin(1)[stay]) >= 0).all()
+            kept += stay.sum() / len(points)
+        before = points
+    assert kept > 40
+
+
+@pytest.mark.parametrize("gap", [None, 0.05])
+def test_same_bits_on_every_path(device, gap):
+    rng, found = np.random.default_rng(2), []
+    torus = model_of(trimesh.creation.torus(0.5, 0.2, 24, 12))
+    placed = [(torus, pose) for pose in random_poses(rng, 9, 0.9)]
+    for where, warps in (("cpu", False), (device, True), (device, None)):
+        with testing.regime(warps=warps):
+            points = ask(where, *placed, gap=gap)[1].points
+        found.append([points[name].tobytes() for name in ("pair", "point", "normal", "depth")])
+    assert found[0] == found[1] == found[2]
+    assert (points["depth"] < 0).any() == (gap is not None) and (points["depth"] > 0).any()

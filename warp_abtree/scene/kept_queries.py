@@ -1,0 +1,89 @@
+"""Queries that `Scene.intersect` makes, one of each kind, and keeps for the next time."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from warp_abtree.checks.arguments import to_numpy
+from warp_abtree.query.contacts import ContactQuery
+from warp_abtree.query.distance import check_beyond, check_flags, check_tolerances, prepare_query
+from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.request import check_request, check_within, refuse_options
+from warp_abtree.query.result import Result
+from warp_abtree.scene.originals import OriginalDistances
+
+
+class KeptQueries:
+    """Queries of a scene, by what they are asked.
+
+    Args:
+        scene: `Scene` that they are about.
+        find_pairs: Returns given pairs, checked, or where None those of the broad phase up to a distance.
+
+    Attributes:
+        kept: The queries, by what they answer.
+    """
+
+    def __init__(self, scene, find_pairs: Callable[[Any, float], np.ndarray]):
+        self._scene, self._find_pairs = scene, find_pairs
+        self.kept: dict[tuple, Query] = {}
+        self._originals: OriginalDistances | None = None
+
+    def clear(self):
+        """Forget all queries."""
+        self.kept.clear()
+        self._originals = None
+
+    def find_hits(self, pairs, output, precision, contact_dtype, options: dict, device: bool) -> Result:
+        """Answer any output but "distance"; options are those that are given, `Scene.intersect` has them."""
+        with_contacts, taken = output == "contacts", ("within", "gap") if output == "contacts" else ("within",)
+        refuse_options(output, {name: True for name in options if name not in taken})
+        check_request("faces" if with_contacts else output, precision)
+        reach = max((self._one_for_all(options[name], name) for name in options), default=0.0)
+        pairs = self._find_pairs(pairs, reach)
+        given = {name: check_within(value, len(pairs), name) for name, value in options.items()}
+        within, gap = given.get("within"), given.get("gap")
+        key = output, precision, *sorted(given)
+        query = self.kept.pop(key, None)
+        if query is not None:
+            if not query.is_asked(pairs, within, gap):
+                query.replace_pairs(pairs, within, gap)
+        elif with_contacts:
+            query = ContactQuery(self._scene, pairs=pairs, precision=precision, within=within, gap=gap)
+        else:
+            query = Query(self._scene, output, pairs=pairs, precision=precision, within=within)
+        if isinstance(query, ContactQuery):
+            query.contact_dtype = contact_dtype
+        return self._run(key, query, device)
+
+    def find_distances(self, pairs, options: dict, device: bool) -> Result:
+        """Answer "distance"; options as for `find_hits`."""
+        refuse_options("distance", {name: True for name in options if name in ("within", "gap")})
+        signed, of_originals = check_flags(options)
+        tolerances = {name: value for name, value in options.items() if name in ("tolerance", "relative")}
+        check_tolerances(**tolerances)
+        beyond = options.get("beyond")
+        reach = 0.0 if beyond is None else self._one_for_all(beyond, "beyond")
+        if of_originals:
+            if self._originals is None:
+                self._originals = OriginalDistances(self._scene.batch())
+            # Originals may lie out of the boxes of their LODs.
+            pairs = self._find_pairs(pairs, reach + (self._originals.reach() if pairs is None else 0.0))
+            return self._originals.run(pairs, check_beyond(beyond, len(pairs)), **tolerances, device=device)
+        pairs = self._find_pairs(pairs, reach)
+        beyond = check_beyond(beyond, len(pairs))
+        query = prepare_query(self.kept.pop(("distance", signed), None), self._scene, pairs, beyond, tolerances, signed)
+        return self._run(("distance", signed), query, device)
+
+    @staticmethod
+    def _one_for_all(distance, name: str) -> float:
+        """Return a distance that is one for all pairs, checked; 0 where each pair has its own."""
+        distance = to_numpy(distance, name)
+        return float(check_within(distance, name=name)) if distance.ndim == 0 else 0.0
+
+    def _run(self, key: tuple, query: Query, device: bool) -> Result:
+        """Run a query and keep it for the next time; one that fails, for lack of memory, gives its own back."""
+        result = query.run(device)
+        self.kept[key] = query
+        return result

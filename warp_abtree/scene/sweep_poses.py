@@ -1,0 +1,64 @@
+"""Poses of a sweep, where they lie: in the memory of the host, or of the device that asks."""
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import to_numpy
+from warp_abtree.scene.poses import check_poses, device_rows
+
+SCALARS = {np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64}
+
+
+class HostRows:
+    """Poses in the memory of the host, rows of 7 or 16 numbers."""
+
+    def __init__(self, rows):
+        self.rows = rows
+        self.scalar, self.width = SCALARS[rows.dtype], rows.shape[1]
+
+    def __len__(self):
+        return len(self.rows)
+
+    def row(self, i):
+        """Return a row on the host."""
+        return self.rows[i]
+
+
+class DeviceRows:
+    """Poses in the memory of the device that asks, rows of 7 or 16 numbers."""
+
+    def __init__(self, rows):
+        self.scalar, (self.count, self.width) = rows.dtype, rows.shape
+        self.flat = rows.flatten()
+
+    def __len__(self):
+        return self.count
+
+    def row(self, i):
+        """Return a row on the host."""
+        return self.flat[self.width * i : self.width * (i + 1)].numpy()
+
+
+def take_rows(poses, device):
+    """Return poses where they are, or on the host.
+
+    Raises:
+        ValueError: No numbers, or another shape than (p, 7) and (p, 4, 4).
+    """
+    rows = device_rows(poses, device)
+    if rows is not None:
+        return DeviceRows(rows)
+    rows = to_numpy(poses, "poses")
+    if rows.shape == (0,):
+        rows = np.empty((0, 7))
+    if not (rows.ndim == 2 and rows.shape[1] == 7) and not (rows.ndim == 3 and rows.shape[1:] == (4, 4)):
+        raise ValueError(f"poses: shape {rows.shape} is neither (p, 7) nor (p, 4, 4)")
+    rows = rows.reshape(len(rows), 7 if rows.ndim == 2 else 16)
+    return HostRows(rows if rows.dtype in SCALARS else rows.astype(np.float64))
+
+
+def refuse_row(poses, i):
+    """Raise ValueError about row i, which is no pose."""
+    row = np.asarray(poses.row(i), np.float64)
+    check_poses(row[None] if poses.width == 7 else row.reshape(1, 4, 4), first=i)
+    raise ValueError(f"poses: pose {i} is no pose")  # by rounding, where the host finds it just within

@@ -1,0 +1,66 @@
+"""Rows of frames in a file, written as they come."""
+
+import csv
+import io
+import json
+from pathlib import Path
+
+from warp_abtree.checks.atomic_write import atomic_write
+from warp_abtree.simulate.frame_row import FrameRow
+
+
+class FrameFile:
+    """A list of rows as .json, or CSV by any other name, that can be read after each row, whatever ends the run.
+
+    What stood there is replaced with the first rows, in one step. A row for which the disk has no room is taken back.
+    """
+
+    def __init__(self, path):
+        self.path = Path(path)
+        self._written, self._end = 0, 0  # rows, and bytes without the tail
+        self._opening, self._comma, self._tail = (b"[\n", b",\n", b"\n]\n") if self._is_json() else (b"", b"", b"")
+
+    def _is_json(self):
+        return self.path.suffix.lower() == ".json"
+
+    def append(self, history: list[FrameRow]):
+        """Write the rows of a history that are not in the file yet.
+
+        Raises:
+            OSError: They cannot be written; the file holds those before.
+        """
+        rows = [row.as_dict() for row in history[self._written :]]
+        if not rows:
+            return
+        first = not self._written
+        data = (self._opening if first else self._comma) + self._encode(rows, first)
+        if first:
+            with atomic_write(self.path) as file:
+                file.write(data + self._tail)
+        else:
+            self._write_at_end(data + self._tail)
+        self._written, self._end = len(history), self._end + len(data)
+
+    def _encode(self, rows, with_names) -> bytes:
+        if self._is_json():
+            return self._comma.join(json.dumps(row).encode() for row in rows)
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, FrameRow.names())
+        if with_names:
+            writer.writeheader()
+        writer.writerows(rows)
+        return text.getvalue().encode()
+
+    def _write_at_end(self, data):
+        with open(self.path, "r+b", buffering=0) as file:
+            try:
+                file.seek(self._end)
+                left = memoryview(data)
+                while left:
+                    left = left[file.write(left) :]
+            except BaseException:
+                # Over bytes that it held before, so that there is room.
+                file.seek(self._end)
+                file.write(self._tail)
+                file.truncate(self._end + len(self._tail))
+                raise
