@@ -250,9 +250,7 @@ def warp_traversal(mode: int, for_any: bool):
         pace = set_pace(stack_room, parts, wp.static(for_any))
         asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
         own = open_stack()
-        units = count * parts
-        unit = first_unit(work_inout.counter)
-        ended = wp.int32(0)
+        unit, units, ended = first_unit(work_inout.counter), count * parts, wp.int32(0)
         while True:
             p = unit / parts
             slot = wp.int32(-1)

@@ -34,9 +34,9 @@ from warp_abtree.state.generation import LaunchGuard
 
 # Face pairs that the float32 stage leaves uncertain: about one in a hundred. The list grows as needed.
 UNCERTAIN_ROOM = 65536
-# Warps that one multiprocessor runs at a time by their registers: of the traversal, of the pass over uncertain pairs.
-WARPS_A_PROCESSOR, FILTER_WARPS_A_PROCESSOR = 16, 20
-NEAR_WARPS_A_PROCESSOR = 12
+# Warps that one multiprocessor runs at a time by their registers: of the traversal, of uncertain pairs, of near ones.
+WARPS_A_PROCESSOR = 16
+FILTER_WARPS_A_PROCESSOR, NEAR_WARPS_A_PROCESSOR = 20, 12
 # So that each finds a slot for all that it gives away at once.
 WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
@@ -324,11 +324,10 @@ class Query(QueryReadout):
         modes = [self._mode(), *([within] if with_distances else [])]
         if self.uses_warps():
             kernels = [dual_tree.warp_traversal(mode, mode == within or self.output == "any") for mode in modes]
-            kernels = [*[kernel for kernel, _ in self._passes()], *kernels]
+            kernels += [kernel for kernel, _ in self._passes()]
         else:
             kernels = [simd.thread_traversal(mode) for mode in modes]
-        distant = (within, int(face_pairs.GAP))
-        kernels += [relative_pose.relative_poses(mode in distant) for mode in modes]
+        kernels += [relative_pose.relative_poses(mode in (within, int(face_pairs.GAP))) for mode in modes]
         return [(kernel, WARP_SIZE) for kernel in kernels]
 
     def result(self, device: bool = False) -> Result:
