@@ -25,6 +25,7 @@ from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.solid.components import Solids
 from warp_abtree.kernels.solid.nearest_face import (
+    NO_NEAREST,
     Whose,
     into_frame,
     make_whose,
@@ -36,7 +37,7 @@ from warp_abtree.kernels.solid.nearest_face import (
 from warp_abtree.kernels.solid.parity import face_corners, is_inside
 from warp_abtree.kernels.traversal.boxes import round_up
 from warp_abtree.kernels.traversal.face_pairs import Hits
-from warp_abtree.kernels.traversal.node_pair import four_items, item_first, item_second
+from warp_abtree.kernels.traversal.node_pair import four_items, item_first, item_second, pack_item
 from warp_abtree.kernels.traversal.nodes import Node, load_node
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
@@ -99,16 +100,17 @@ def bound_depth(
     inner: Whose,
     outer: Whose,
     node: Node,
+    hint: wp.int32,
     known: wp.float64,
 ):
-    """Return an upper bound of the depth of what is below a node; negative only where that is less than what is known.
+    """Return an upper bound of the depth below a node, negative only where it is less than what is known, and a face.
 
     With the node's middle at a distance d from the surface, and points within r of it, an inside point is no deeper
     than d + r, and no deeper than r - d where the middle is outside: the surface lies between them.
     """
     none = -wp.float64(1.0)
     if node.skip < 0:
-        return none
+        return none, hint
     lower, upper = wp.vec3d(node.lower), wp.vec3d(node.upper)
     middle = HALF * (lower + upper) + inner.centre
     if inner.of_b:
@@ -118,19 +120,19 @@ def bound_depth(
     root = load_node(states, outer.node + 1)
     x = into_frame(pose, outer, middle)
     if square_outside(root, x) > reach * reach:
-        return none
+        return none, hint
     for i in range(3):
         side = wp.min(x[i] - wp.float64(root.lower[i]), wp.float64(root.upper[i]) - x[i])
         if side + reach < known:
-            return none
-    distance, _face = nearest_face(models, states, pose, outer, middle, wp.float64(wp.inf), known - reach)
+            return none, hint
+    distance, near = nearest_face(models, states, pose, outer, middle, hint, known - reach)
     if distance + reach < known:
-        return none
+        return none, near
     if reach - distance < known or distance > reach:
         centre = wp.where(inner.of_b, outer.centre, inner.centre)
         if not is_inside(models, states, pose, outer.of_b, centre, middle):
-            return none
-    return distance + reach
+            return none, near
+    return distance + reach, near
 
 
 @wp.func
@@ -141,6 +143,7 @@ def measure_samples(
     inner: Whose,
     outer: Whose,
     face: wp.int32,
+    hint: wp.int32,
     known: Deepest,
 ):
     """Return the deepest of what is known and the samples of a face that are inside the outer object."""
@@ -148,14 +151,15 @@ def measure_samples(
     a, b, c = face_corners(models, states, pose, inner.of_b, face)
     centre = wp.where(inner.of_b, outer.centre, inner.centre)
     root = load_node(states, outer.node + 1)
+    near = wp.int32(hint)
     k = wp.int32(0)
     while k < SAMPLES:
         w = sample_weights(k)
         point = (w[0] * a + w[1] * b) + w[2] * c
         if square_outside(root, into_frame(pose, outer, point)) <= outer.margin * outer.margin:
-            distance, nearest = nearest_face(models, states, pose, outer, point, wp.float64(wp.inf), best.depth)
+            distance, near = nearest_face(models, states, pose, outer, point, near, best.depth)
             if distance >= best.depth and distance > wp.float64(0.0):
-                item = pack_deepest(face, k, nearest)
+                item = pack_deepest(face, k, near)
                 if distance > best.depth or item < best.item:
                     if is_inside(models, states, pose, outer.of_b, centre, point):
                         best.depth = distance
@@ -185,7 +189,8 @@ def find_deepest(
 ):
     """Return the deepest of what is known and all samples of one object inside the other, the same in all lanes.
 
-    The children that may be deepest come first; faces wait until there is one for each lane.
+    The children that may be deepest come first; faces wait until there is one for each lane. An item names a node or a
+    face, and the outer face that was nearest above it, where the next search starts.
     """
     best = known
     items = nearest_stack()
@@ -195,7 +200,7 @@ def find_deepest(
     end = 1 - waiting
     if warp_lane() == 0:
         at = STACK_LENGTH * waiting
-        write_item(items, at, wp.int64(wp.where(root.face >= 0, root.face, root.skip)))
+        write_item(items, at, pack_item(wp.where(root.face >= 0, root.face, root.skip), NO_NEAREST))
         write_bound(items, at, -wp.float32(wp.inf))
     warp_sync()
     while end > 0 or waiting > 0:
@@ -204,17 +209,18 @@ def find_deepest(
             popped = wp.min(popped, wp.min(warp_size(), end))
             end -= popped
             at = end + wp.min(warp_lane(), popped - 1)
-            node = wp.int32(read_item(items, at))
+            item = read_item(items, at)
+            node = item_first(item)
             live = warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth
             warp_sync()
             children, kinds, bounds = four_items(), wp.vec4i(), wp.vec4()
             for k in range(2):
                 child = load_node(states, inner.node + wp.where(live, 2 * node + k, 1))
                 if live:
-                    bound = bound_depth(models, states, pose, inner, outer, child, best.depth)
+                    bound, near = bound_depth(models, states, pose, inner, outer, child, item_second(item), best.depth)
                     if bound >= wp.float64(0.0):
                         kinds[k] = wp.where(child.face >= 0, FACES, NODES)
-                        children[k] = wp.int64(wp.where(child.face >= 0, child.face, child.skip))
+                        children[k] = pack_item(wp.where(child.face >= 0, child.face, child.skip), near)
                         bounds[k] = -round_up(bound)
             ends = push_nearest(items, end, waiting, kinds, children, bounds)
             warp_sync()
@@ -224,9 +230,9 @@ def find_deepest(
             popped = wp.min(waiting, warp_size())
             waiting -= popped
             at = STACK_LENGTH + waiting + wp.min(warp_lane(), popped - 1)
-            face = wp.int32(read_item(items, at))
+            item = read_item(items, at)
             if warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth:
-                best = measure_samples(models, states, pose, inner, outer, face, best)
+                best = measure_samples(models, states, pose, inner, outer, item_first(item), item_second(item), best)
             warp_sync()
             best = agree(best)
     return best

@@ -110,25 +110,37 @@ def point_weights(near: Features):
 
 
 @wp.func
+def point_distance(models: ModelPool, states: StatePool, pose: PairPose, whose: Whose, face: wp.int32, point: wp.vec3d):
+    """Return the distance of a point in A's frame from an active face of an object."""
+    a, b, c = face_corners(models, states, pose, whose.of_b, face)
+    near, size = point_features(a, b, c, point)
+    return wp.sqrt(near.square) * size
+
+
+@wp.func
 def nearest_face(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
     whose: Whose,
     point: wp.vec3d,
-    most: wp.float64,
+    hint: wp.int32,
     enough: wp.float64,
 ):
     """Return the least distance of a point from the faces of an object, and the lowest face that has it.
 
     Args:
         point: In A's frame.
-        most: Faces farther than that do not matter; where no other is found, the distance is infinite.
+        hint: A face that may be near, or NO_NEAREST.
         enough: The search ends with the first face that is nearer.
     """
     x = into_frame(pose, whose, point)
-    least, face = wp.float64(wp.inf), wp.int32(NO_NEAREST)
-    limit = (most + whose.margin) * whose.grow
+    least, face = wp.float64(wp.inf), wp.int32(hint)
+    if hint != NO_NEAREST:
+        least = point_distance(models, states, pose, whose, hint, point)
+        if least < enough:
+            return least, face
+    limit = (least + whose.margin) * whose.grow
     limit = limit * limit
     stack = wp.zeros(shape=(STACK_ROOM,), dtype=wp.int32)
     bound = wp.zeros(shape=(STACK_ROOM,), dtype=wp.float64)
@@ -152,10 +164,8 @@ def nearest_face(
             bound[end + 1] = wp.min(d0, d1)
             end += 2
         elif live:
-            a, b, c = face_corners(models, states, pose, whose.of_b, node.face)
-            near, size = point_features(a, b, c, point)
-            d = wp.sqrt(near.square) * size
-            if d <= most and (d < least or (d == least and node.face < face)):
+            d = point_distance(models, states, pose, whose, node.face, point)
+            if d < least or (d == least and node.face < face):
                 face = node.face
                 if d < least:
                     least = d
