@@ -88,6 +88,7 @@ def count_point_kernel(pair_count: wp.array(dtype=wp.int32), manifolds: Manifold
 
 @wp.kernel
 def write_contact_kernel(
+    first: wp.array(dtype=wp.int32),
     margin: wp.array(dtype=wp.float32),
     shapes: wp.array(dtype=wp.int32),
     body_q: wp.array(dtype=wp.transform),
@@ -98,27 +99,26 @@ def write_contact_kernel(
     count: wp.array(dtype=wp.int32),
     contacts_out: RigidContacts,
 ):
-    """Write the points of one pair a thread, half the depth on either side of the point.
-
-    Points are drawn in by the margins of their shapes, which Newton adds, so that it finds the depth of the meshes.
+    """Write the points of one pair a thread, on the surfaces of the meshes: half the depth on either side.
 
     Args:
+        first: Contacts that are there already, which stay, shape [1].
         margin: Surface margin of each shape [m].
         end: Sum of the counts of points up to and with each pair.
     """
     p = wp.tid()
     if p == pairs.shape[0] - 1:
-        contacts_out.count[0] = end[p]
+        contacts_out.count[0] = first[0] + end[p]
     shape0 = shapes[pairs[p][0]]
     shape1 = shapes[pairs[p][1]]
     k = wp.int32(0)
     while k < count[p]:
-        at = end[p] - count[p] + k
+        at = first[0] + end[p] - count[p] + k
         if at < contacts_out.shape0.shape[0]:
             n = manifolds.normal[p, k]
             half = wp.float64(0.5) * manifolds.depth[p, k]
-            x0 = manifolds.point[p, k] + n * (half - wp.float64(margin[shape0]))
-            x1 = manifolds.point[p, k] - n * (half - wp.float64(margin[shape1]))
+            x0 = manifolds.point[p, k] + n * half
+            x1 = manifolds.point[p, k] - n * half
             normal = wp.vec3(n)
             contacts_out.shape0[at] = shape0
             contacts_out.shape1[at] = shape1

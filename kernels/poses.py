@@ -51,6 +51,8 @@ class PairPose:
     corner_b: wp.int32  # where B's face corners lie in the pool
     slab: wp.vec2i  # where slabs of A's nodes lie in the models' pool, and of B's
     floor: wp.vec2i  # nodes of A, and of B, from these on have slabs; none where either model has none
+    faces_a: wp.int32  # about how many faces A has at its LOD, no more than at the finest
+    faces_b: wp.int32  # the same of B
 
 
 @wp.func
@@ -122,17 +124,26 @@ def has_slabs(models: ModelPool, states: StatePool, state: wp.int32):
 
 
 @wp.func
-def locate_trees(models: ModelPool, states: StatePool, a: wp.int32, b: wp.int32):
-    """Return a `PairPose` that says where two states lie."""
+def active_faces(models: ModelPool, states: StatePool, state: wp.int32):
+    """Return about how many faces a state has: a vertex split of a closed manifold adds two."""
+    model = states.model[state]
+    return models.face_count[model] - 2 * (models.lod_max[model] - states.lod[state])
+
+
+@wp.func
+def place_trees(models: ModelPool, states: StatePool, state_a: wp.int32, state_b: wp.int32):
+    """Return a `PairPose` that says where the trees lie, and no more."""
     pose = PairPose()
-    pose.node_a = states.node_start[a]
-    pose.node_b = states.node_start[b]
-    pose.corner_a = states.face_start[a]
-    pose.corner_b = states.face_start[b]
-    model_a, model_b = states.model[a], states.model[b]
+    pose.node_a = states.node_start[state_a]
+    pose.node_b = states.node_start[state_b]
+    pose.corner_a = states.face_start[state_a]
+    pose.corner_b = states.face_start[state_b]
+    pose.faces_a = active_faces(models, states, state_a)
+    pose.faces_b = active_faces(models, states, state_b)
+    model_a, model_b = states.model[state_a], states.model[state_b]
     pose.slab = wp.vec2i(models.node_start[model_a], models.node_start[model_b])
     pose.floor = wp.vec2i(NO_NODE, NO_NODE)
-    if has_slabs(models, states, a) and has_slabs(models, states, b):
+    if has_slabs(models, states, state_a) and has_slabs(models, states, state_b):
         pose.floor[0] = 1 << wp.max(models.depth[model_a] - SLAB_DEPTH, 0)
         pose.floor[1] = 1 << wp.max(models.depth[model_b] - SLAB_DEPTH, 0)
     return pose
@@ -170,7 +181,7 @@ def pair_pose(
     # Of a coordinate in `float32_filter_triangles`; docs/exactness.md has the terms, which need `near` below.
     off32 = UNIT_32 * (wp.float64(2.0) * reach_a + wp.float64(13.0) * reach_b + wp.float64(3.0) * far)
 
-    pose = locate_trees(models, states, state_a, state_b)
+    pose = place_trees(models, states, state_a, state_b)
     pose.rotation = r
     pose.translation = t
     pose.within = within

@@ -123,9 +123,9 @@ def assemble(query, count, rows):
     real = np.float64
     vectors = [(name, real, (3,)) for name in VECTORS]
     contacts = np.zeros(rows, [("pair", np.int32), ("faces", np.int32, (2,)), *vectors, ("coplanar", bool)])
-    means = np.zeros(len(count), [("count", np.int64), ("point", real, (3,)), ("normal", real, (3,)), ("depth", real)])
+    means = np.zeros(len(count), [("count", np.int64), ("point", real, (3,)), ("normal", real, (3,)), ("travel", real)])
     means["count"] = count
-    for name in ("point", "normal", "depth"):
+    for name in ("point", "normal", "travel"):
         means[name] = getattr(query.pair_contacts, name)[: len(count)].numpy()
     faces = np.empty((0, 3), np.int32)
     if rows:

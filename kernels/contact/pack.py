@@ -4,7 +4,7 @@ A record has no padding, so that its numbers lie at any byte; one thread writes 
 
     [ pair 4 | faces 2 x 4 | p0, p1, normal_a, normal_b, normal 5 x 3 x 4 or 8 | coplanar 1 ] bytes of a contact; with
     a gap its separation, 4 or 8 bytes, stands before the flag
-    [ count 8 | point, normal 2 x 3 x 4 or 8 | depth 4 or 8 ] bytes of a summary
+    [ count 8 | point, normal 2 x 3 x 4 or 8 | travel 4 or 8 ] bytes of a summary
 """
 
 import functools
@@ -18,7 +18,7 @@ from warp_abtree.kernels.contact.summary import PairContacts
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
-# Numbers of a record: three indices, five vectors, a flag, one more with a gap; a count, two vectors, a depth.
+# Numbers of a record: three indices, five vectors, a flag, one more with a gap; a count, two vectors, a travel.
 CONTACT_NUMBERS, PAIR_NUMBERS = 19, 8
 
 
@@ -122,7 +122,7 @@ def pair_packer(real: type):
         if k == 0:
             store_bits(records_out, at, 8, count[p])
             return
-        x = means.depth[p]
+        x = means.travel[p]
         if k < 4:
             x = means.point[p][k - 1]
         elif k < 7:
@@ -190,12 +190,12 @@ def summary_copier(real: type):
         means: PairContacts,
         point_out: wp.array(dtype=vector),
         normal_out: wp.array(dtype=vector),
-        depth_out: wp.array(dtype=real),
+        travel_out: wp.array(dtype=real),
     ):
         """Copy the summary of one object pair a thread."""
         p = wp.tid()
         point_out[p] = wp.static(convert)(means.point[p])
         normal_out[p] = wp.static(convert)(means.normal[p])
-        depth_out[p] = wp.static(narrow)(means.depth[p])
+        travel_out[p] = wp.static(narrow)(means.travel[p])
 
     return copy_summary_kernel

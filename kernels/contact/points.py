@@ -12,6 +12,8 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 NEAREST_POINT = wp.constant(wp.float64(2.0**-9))
 # By which part of its distance a point is favoured at the far end of the spread.
 FAVOUR = wp.constant(wp.float64(2.0**-5))
+# Part of the gap within which points are as good as the deepest.
+FIRST_PART = wp.constant(wp.float64(0.125))
 # The deepest point is among those chosen if this part of its depth is more than theirs.
 DEEPER = wp.constant(wp.float64(0.9))
 
@@ -92,7 +94,7 @@ def distance_squared(
 @wp.func
 def find_farthest(
     ends: wp.vec2i,
-    least: wp.float64,
+    least: wp.vec2d,
     size: wp.float64,
     along: wp.vec3d,
     count: wp.int32,
@@ -106,6 +108,7 @@ def find_farthest(
 
     Args:
         ends: First contact of the pair, and the one behind its last.
+        least: Least depths of candidates that there are, and of those that are looked at.
         count: Points chosen. From the second on a candidate keeps its distance from those before.
     """
     farthest = wp.float64(-1.0)
@@ -113,7 +116,7 @@ def find_farthest(
     i = ends[0] + warp_lane()
     while i < ends[1]:
         for k in range(CANDIDATES):
-            if curves.depth[i, k] >= least:
+            if curves.depth[i, k] >= least[0]:
                 x = curves.point[i, k]
                 d = distance_squared(x, curves.normal[i], size, count - 1, point, normals)
                 if count == 2:
@@ -123,7 +126,7 @@ def find_farthest(
                 curves.nearest[i, k] = d
                 if size > wp.float64(0.0):
                     d = d * (wp.float64(1.0) + FAVOUR * wp.dot(along, x - point[0]) / size)
-                if d > farthest:
+                if d > farthest and curves.depth[i, k] >= least[1]:
                     farthest = d
                     best = CANDIDATES * i + k
         i += warp_size()
@@ -193,7 +196,9 @@ def spread_point_kernel(
     if reach == -wp.float64(wp.inf):
         manifolds_out.count[p] = 0
         return
-    floor = wp.where(deepest == NO_DEPTH, NO_DEPTH, -shell)
+    # Those about as deep as the deepest first, then what may be within the gap.
+    lowest = wp.where(deepest == NO_DEPTH, NO_DEPTH, -shell)
+    least_depth = wp.vec2d(lowest, wp.where(shell > zero, wp.max(deepest - FIRST_PART * shell, lowest), lowest))
     point = wp.zeros(shape=(POINTS,), dtype=wp.vec3d)
     normals = wp.zeros(shape=(POINTS,), dtype=wp.vec3d)
     depth = wp.zeros(shape=(POINTS,), dtype=wp.float64)
@@ -211,10 +216,16 @@ def spread_point_kernel(
         deep = wp.max(deep, depth[count])
         count += 1
         ends = wp.vec2i(first, end)
-        best, farthest = find_farthest(ends, floor, size, along, count, point, normals, curves_inout)
+        best, farthest = find_farthest(ends, least_depth, size, along, count, point, normals, curves_inout)
         if count == 1:
             size = wp.sqrt(wp.max(farthest, zero))
             least = NEAREST_POINT * farthest
+        if farthest <= least and least_depth[1] > lowest:
+            least_depth[1] = lowest
+            best, farthest = find_farthest(ends, least_depth, size, along, count, point, normals, curves_inout)
+            if count == 1:
+                size = wp.sqrt(wp.max(farthest, zero))
+                least = NEAREST_POINT * farthest
         if farthest <= least or count == POINTS - 1:
             best = deepest_at
             searching = DEEPER * (deepest + shell) > deep + shell

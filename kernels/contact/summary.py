@@ -34,7 +34,7 @@ class PairContacts:
 
     point: wp.array(dtype=wp.vec3d)  # mean point [world units]
     normal: wp.array(dtype=wp.vec3d)  # unit mean normal
-    depth: wp.array(dtype=wp.float64)  # [world units]
+    travel: wp.array(dtype=wp.float64)  # [world units]
 
 
 @wp.struct
@@ -242,7 +242,7 @@ def sum_loop_kernel(
     pair_contacts: PairContacts,
     sums_inout: ChunkSums,
 ):
-    """Sum what the depth needs of one chunk a warp: area within the contact curve, its change, extents of faces."""
+    """Sum what the travel needs of one chunk a warp: area within the contact curve, its change, extents of faces."""
     c = wp.tid() / warp_size()
     span = sums_inout.span[c]
     if span[1] >= span[2]:
@@ -308,7 +308,7 @@ def sum_loop(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
 
 
 @wp.kernel
-def measure_depth_kernel(
+def measure_travel_kernel(
     models: ModelPool,
     states: StatePool,
     objects: ObjectPool,
@@ -318,21 +318,21 @@ def measure_depth_kernel(
     sums: ChunkSums,
     pair_contacts_inout: PairContacts,
 ):
-    """Estimate the depth of one object pair a thread, and pose its mean point; docstring of warp_abtree/contact.py."""
+    """Estimate the travel of one object pair a thread, and pose its mean point; docstring of warp_abtree/contact.py."""
     p = wp.tid()
     first = start[p]
     if count_crossed(p, start, sums) == wp.float64(0.0):
         pair_contacts_inout.point[p] = no_vector()
-        pair_contacts_inout.depth[p] = wp.float64(0.0)
+        pair_contacts_inout.travel[p] = wp.float64(0.0)
         return
     origin = contacts.p0[first]
     n = pair_contacts_inout.normal[p]
     area, change, overlap = sum_loop(p, start, sums)
-    depth = box_support(models, states, objects, pairs[p][0], n, origin)
-    depth += box_support(models, states, objects, pairs[p][1], -n, origin)
+    travel = box_support(models, states, objects, pairs[p][0], n, origin)
+    travel += box_support(models, states, objects, pairs[p][1], -n, origin)
     if area == wp.float64(0.0):
-        depth = wp.min(depth, overlap)
+        travel = wp.min(travel, overlap)
     elif area * change < wp.float64(0.0):
-        depth = wp.min(depth, -area / change)
+        travel = wp.min(travel, -area / change)
     pair_contacts_inout.point[p] = origin + sums.middle[p]
-    pair_contacts_inout.depth[p] = wp.max(depth, wp.float64(0.0))
+    pair_contacts_inout.travel[p] = wp.max(travel, wp.float64(0.0))

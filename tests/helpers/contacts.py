@@ -80,12 +80,12 @@ def check_summaries(result):
         rows = result.contacts[result.contacts["pair"] == p]
         assert len(rows) == result.count[p]
         if not len(rows):
-            assert np.isnan(got["point"]).all() and np.isnan(got["normal"]).all() and got["depth"] == 0
+            assert np.isnan(got["point"]).all() and np.isnan(got["normal"]).all() and got["travel"] == 0
             continue
         point, normal, depth = summary(rows)
         assert got["point"].tobytes() == point.tobytes()
         assert normal is None or got["normal"].tobytes() == normal.tobytes()
         assert abs(np.linalg.norm(got["normal"]) - 1) < 1e-15
-        assert 0 <= got["depth"] and (depth is None or got["depth"] <= depth)
-        curves += got["depth"] == depth
+        assert 0 <= got["travel"] and (depth is None or got["travel"] <= depth)
+        curves += got["travel"] == depth
     return curves

@@ -6,6 +6,7 @@ import trimesh
 import warp as wp
 
 import warp_abtree as ab
+from warp_abtree.interop import newton as adapter
 
 newton = pytest.importorskip("newton")
 # Newton's first steps compile its own kernels, which takes most of the time of this file.
@@ -62,11 +63,13 @@ def test_a_cube_on_a_floor_has_its_corners(device):
     np.testing.assert_allclose(normals, np.tile([0, 0, 1], (4, 1)), atol=1e-6)
     for side in (0, 1):
         assert set(getattr(contacts, f"rigid_contact_shape{side}").numpy()[:4]) == {side}
-    np.testing.assert_allclose((second - first) @ [0, 0, 1], -0.01, atol=1e-6)
+    # The floor's margin thickens it, as in Newton.
+    np.testing.assert_allclose((second - first) @ [0, 0, 1], -0.03, atol=1e-6)
     r = matrix([0, 0, 0, *placed((0, 0, 0), *turn)[3:]])[:3, :3]
     corners = np.array([r @ [x, y, 0] + [0.3, 0.2, 0] for x in (-0.5, 0.5) for y in (-0.4, 0.4)])
     for corner in corners:
         assert np.abs(0.5 * (first + second) - corner)[:, :2].max(1).min() < 1e-6
+    assert (contacts.rigid_contact_count.numpy() == 4).all()
     assert np.unique(contacts.rigid_contact_margin0.numpy()[:4]) == pytest.approx(0.02)
 
 
@@ -103,8 +106,68 @@ def test_room_and_wrong_models(device):
     builder.add_shape_mesh(builder.add_body(xform=placed((0, 0, 0.49))), mesh=mesh_of(CUBE))
     model = builder.finalize(device=device)
     found = ab.NewtonContacts(model)
-    with pytest.raises(ab.CapacityError, match="4 rigid contacts"):
+    with pytest.raises(ab.CapacityError, match=r"\d rigid contacts"):
         found.collide(model.state(), found.contacts(2))
+
+
+@pytest.mark.parametrize("gap, margin, count", [(0.03, 0.0, 4), (0.02, 0.0, 0), (0.02, 0.01, 4)])
+def test_gaps_and_margins_are_those_of_newton(device, gap, margin, count):
+    """A cube 0.05 above a floor: contacts where margins and gaps of both reach that far, with what margins leave."""
+    config = newton.ModelBuilder.ShapeConfig(gap=gap, margin=margin)
+    builder = newton.ModelBuilder()
+    builder.add_shape_mesh(-1, xform=placed((0, 0, -0.5)), mesh=mesh_of(FLOOR), cfg=config)
+    builder.add_shape_mesh(builder.add_body(xform=placed((0, 0, 0.55))), mesh=mesh_of(CUBE), cfg=config)
+    model = builder.finalize(device=device)
+    state, found = model.state(), ab.NewtonContacts(model)
+    contacts = found.contacts()
+    found.collide(state, contacts)
+    (first, second), normals = world_points(model, state, contacts)
+    assert len(normals) == count
+    np.testing.assert_allclose((second - first) @ [0, 0, 1], 0.05 - 2 * margin, atol=1e-6)
+    np.testing.assert_allclose(normals, np.tile([0, 0, 1], (count, 1)), atol=1e-6)
+
+
+def test_shapes_that_are_no_meshes_are_newtons(device):
+    """Two mesh cubes, one on the other, and a sphere stand on Newton's ground plane."""
+    config = newton.ModelBuilder.ShapeConfig(gap=0.01)
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    for z in (0.5, 1.5):
+        builder.add_shape_mesh(builder.add_body(xform=placed((0, 0, z))), mesh=mesh_of(CUBE), cfg=config)
+    builder.add_shape_sphere(builder.add_body(xform=placed((3, 0, 0.3))), radius=0.3, cfg=config)
+    model = builder.finalize(device=device)
+    found = ab.NewtonContacts(model)
+    solver, contacts, control = newton.solvers.SolverXPBD(model), found.contacts(), model.control()
+    state, after = model.state(), model.state()
+    for _ in range(60):
+        state.clear_forces()
+        found.collide(state, contacts)
+        solver.step(state, after, control, contacts, 1 / 240)
+        state, after = after, state
+    count = int(contacts.rigid_contact_count.numpy()[0])
+    pairs = {
+        tuple(pair)
+        for pair in np.stack([getattr(contacts, f"rigid_contact_shape{k}").numpy() for k in (0, 1)], 1)[:count]
+    }
+    assert {tuple(sorted(pair)) for pair in pairs} == {(0, 1), (1, 2), (0, 3)}
+    np.testing.assert_allclose(state.body_q.numpy()[:, 2], [0.5, 1.5, 0.3], atol=0.01)
+
+
+def test_excluded_pairs_of_many_shapes():
+    """By body, group, world and list, as pair by pair; and not all pairs of many worlds are looked at."""
+    rng = np.random.default_rng(0)
+    body, group = rng.integers(-1, 6, 40), rng.choice([-2, -1, 0, 1, 2], 40)
+    world = rng.integers(-1, 3, 40)
+    found = [*adapter.same_body_pairs(body), *adapter.group_pairs(group, world)]
+    found = {tuple(sorted(pair)) for pair in np.concatenate(found).tolist() if pair[0] != pair[1]}
+    for i in range(40):
+        for j in range(i + 1, 40):
+            low, high = sorted((group[i], group[j]))
+            apart = low == 0 or high == 0 or not (low == high if low > 0 else low != high)
+            together = world[i] == world[j] or min(world[i], world[j]) < 0
+            assert ((i, j) in found) == (bool(apart and together) or bool(body[i] == body[j] >= 0))
+    world = np.repeat(np.arange(5000), 2)
+    assert adapter.group_pairs(np.ones(10_000, int), world) == []
 
 
 def test_a_ring_falls_over_a_peg_in_newton(device):

@@ -88,17 +88,17 @@ def test_any_batch(device):
 def check_device_arrays(query, result):
     """What lies on the device is what the host was given; starts cover the rows of each pair."""
     start, k = query.start.numpy(), len(result.faces)
-    assert len(start) == len(query.pairs) + 1 == len(query.pair_contacts.depth) + 1
+    assert len(start) == len(query.pairs) + 1 == len(query.pair_contacts.travel) + 1
     rows = result.faces[:, 0]
     np.testing.assert_array_equal(start, np.searchsorted(rows, np.arange(len(start))))
     np.testing.assert_array_equal(query.faces.numpy()[:k], result.faces)
     for name in result.contacts.dtype.names[2:]:
         np.testing.assert_array_equal(getattr(query.contacts, name).numpy()[:k], result.contacts[name])
-    for name in ("point", "normal", "depth"):
+    for name in ("point", "normal", "travel"):
         found = getattr(query.pair_contacts, name).numpy()
         np.testing.assert_array_equal(found[: len(result.pairs)], result.pair_contacts[name])
         beyond = found[len(result.pairs) :]
-        assert (beyond == 0).all() if name == "depth" else np.isnan(beyond).all()
+        assert (beyond == 0).all() if name == "travel" else np.isnan(beyond).all()
 
 
 def test_pairs_of_the_broad_phase(device):

@@ -279,3 +279,37 @@ def test_an_interrupted_change_of_lods_is_made_good(device):
     again = scene.intersect(pairs, "count")
     np.testing.assert_array_equal(before.any, again.any)
     np.testing.assert_array_equal(before.count, again.count)
+
+
+@pytest.mark.parametrize("name", ["cow", "rocker-arm"])
+def test_real_meshes_against_winding_numbers(device, name, real_mesh_path):
+    """Small probes anywhere in the box of a mesh, at its finest LOD and a coarse one, in turned poses."""
+    mesh, rng = ab.Model.load(real_mesh_path(name)), np.random.default_rng(2)
+    vertices = mesh.mesh_at(mesh.lod_max)[0]
+    lower, upper = vertices.min(0), vertices.max(0)
+    probe = ab.Model.load(trimesh.creation.icosphere(0, 0.004 * np.ptp(vertices, axis=0).max()), base_faces=20)
+    poses = random_poses(rng, 250, 1.0)
+    poses[:, :3] = rng.uniform(lower, upper, (len(poses), 3))
+    for lod in (mesh.lod_max, mesh.lod_for(fraction=0.05)):
+        faces = mesh.mesh_at(lod)[0][mesh.mesh_at(lod)[1]]
+        plain = ab.sweep(mesh, probe, poses, lod_a=lod, device=device)
+        found = ab.sweep(mesh, probe, poses, lod_a=lod, device=device, solid=(True, False))
+        signed = ab.sweep(
+            mesh, probe, poses, lod_a=lod, device=device, solid=(True, False), output="distance", signed=True
+        )
+        # The sum of the solid angles of all faces, 4 pi inside; odd multiples count.
+        angle = np.array([solid_angle(faces - pose[:3]) for pose in poses])
+        held = np.round(angle / (4 * np.pi)).astype(int) % 2 == 1
+        np.testing.assert_array_equal(found[~plain], held[~plain])
+        assert (found | ~plain).all() and 20 < held[~plain].sum() < (~plain).sum()
+        np.testing.assert_array_equal(signed["distance"] <= 0, found)
+        assert (signed["distance"][held & ~plain] < 0).all()
+
+
+def solid_angle(triangles):
+    """Solid angle of triangles seen from the origin. Source: van Oosterom and Strackee 1983."""
+    a, b, c = (triangles[:, k] for k in range(3))
+    x, y, z = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+    rest = x * y * z + np.einsum("ij,ij->i", a, b) * z + np.einsum("ij,ij->i", b, c) * x
+    return 2 * np.arctan2(volume, rest + np.einsum("ij,ij->i", c, a) * y).sum()

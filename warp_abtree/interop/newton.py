@@ -1,14 +1,18 @@
-"""Contacts for Newton's solvers: `NewtonContacts` fills a `newton.Contacts` from intersecting meshes.
+"""Contacts for Newton's solvers: `NewtonContacts` fills a `newton.Contacts` from meshes that are near or intersect.
 
-Replace `model.collide(state, contacts)` by `collide` here: the poses of bodies are copied to a scene's objects,
-`ManifoldQuery` finds the contact points, and these are written in Newton's conventions: shapes, points and offsets in
-body frames, normals from the first shape to the second, margins. Everything stays on the device, in the order of pairs,
-and is deterministic.
+Its `collide` stands in the place of that of a `newton.CollisionPipeline`: the poses of bodies are copied to a scene's
+objects, `ManifoldQuery` finds the contact points, and these are written in Newton's conventions: shapes, points and
+offsets in body frames, normals from the first shape to the second. Everything stays on the device, in the order of
+pairs, and is deterministic.
 
-Only intersecting meshes have contacts, so Newton's `gap` is ignored: there are no contacts ahead of touch. Depths and
-normals are those of `warp_abtree.query.manifold`. Soft contacts are not changed. Tested with Newton 1.8 (extra
-`newton`), which calls its contacts experimental.
+As Newton has it, two shapes have contacts where their distance is under the sum of both margins and both gaps
+(`ShapeConfig`), and rest with both margins between them. Newton's own gap of 0.1 m a shape makes very many contacts of
+fine meshes: give one that bodies move in a step. Depths and normals are those of `warp_abtree.query.manifold`. Pairs of
+shapes of which one is no mesh are passed to a pipeline of Newton's, whose contacts come first. Soft contacts are not
+found. Tested with Newton 1.8 (extra `newton`), which calls its contacts experimental.
 """
+
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -19,29 +23,67 @@ from warp_abtree.query.manifold import POINTS_MAX, ManifoldQuery
 from warp_abtree.query.request import CapacityError
 from warp_abtree.scene.scene import Scene
 
+# Pairs of other shapes that there is room for by default.
+OTHERS_MAX = 2**16
 FIELDS = ("shape0", "shape1", "point0", "point1", "offset0", "offset1", "normal", "margin0", "margin1")
+
+
+def pairs_between(rows, others):
+    """Return all pairs of two lists of objects, (k, 2)."""
+    return np.stack(np.meshgrid(rows, others, indexing="ij"), 2).reshape(-1, 2)
+
+
+def same_body_pairs(body):
+    """Return the pairs of objects of one body."""
+    order = np.argsort(body, kind="stable")
+    order = order[body[order] >= 0]
+    parts = np.split(order, np.flatnonzero(np.diff(body[order])) + 1)
+    return [pairs_between(part, part) for part in parts if len(part) > 1]
+
+
+def group_pairs(group, world):
+    """Return the pairs of objects that may share a world, of groups that do not collide.
+
+    Positive groups collide with themselves and negative ones, negative ones with all but themselves, 0 with none.
+    """
+    found = []
+    if len(np.unique(group)) == 1 and group[0] > 0:
+        return found
+    for place in np.unique(world):
+        here = np.flatnonzero((world == place) | (world < 0))
+        names = np.unique(group[here]).tolist()
+        for k, low in enumerate(names):
+            for high in names[k:]:
+                collide = low != 0 and high != 0 and (low == high if low > 0 else low != high)
+                if not collide:
+                    found.append(pairs_between(here[group[here] == low], here[group[here] == high]))
+    return found
 
 
 def _excluded_pairs(model, shapes):
     """Return the object pairs that Newton never tests: filtered, of one body, or of groups that do not collide."""
-    i, j = np.triu_indices(len(shapes), 1)
-    a, b = shapes[i], shapes[j]
-    body = model.shape_body.numpy()
-    group = model.shape_collision_group.numpy()
-    low, high = np.minimum(group[a], group[b]), np.maximum(group[a], group[b])
-    # Positive groups collide with themselves and negative ones, negative ones with all but themselves, 0 with none.
-    collide = (low != 0) & (high != 0) & np.where(low > 0, low == high, low != high)
-    filtered = {tuple(sorted(pair)) for pair in model.shape_collision_filter_pairs}
-    listed = np.array([tuple(sorted(pair)) in filtered for pair in zip(a.tolist(), b.tolist())], bool)
-    excluded = ~collide | listed | ((body[a] == body[b]) & (body[a] >= 0))
-    return np.stack([i, j], axis=1)[excluded]
+    object_of = np.full(int(model.shape_count), -1)
+    object_of[shapes] = np.arange(len(shapes))
+    listed = np.array(sorted(model.shape_collision_filter_pairs), np.int64).reshape(-1, 2)
+    group, world = (values.numpy()[shapes] for values in (model.shape_collision_group, model.shape_world))
+    found = [object_of[listed], *same_body_pairs(model.shape_body.numpy()[shapes]), *group_pairs(group, world)]
+    pairs = np.sort(np.concatenate(found), axis=1)
+    return np.unique(pairs[(pairs[:, 0] >= 0) & (pairs[:, 0] < pairs[:, 1])], axis=0)
+
+
+def _other_pairs(model, is_mesh):
+    """Return the pairs of shapes that collide and are not both meshes, (k, 2); none where all shapes are meshes."""
+    if is_mesh.all():
+        return np.empty((0, 2), np.int32)
+    pairs = model.shape_contact_pairs.numpy().reshape(-1, 2)
+    return pairs[~is_mesh[pairs].all(1)]
 
 
 class NewtonContacts:
     """Contacts of Newton's mesh shapes: allocates once, collides many times.
 
     Args:
-        model: `newton.Model`. Shapes that are no meshes are ignored, with their contacts.
+        model: `newton.Model`.
         models: `Model` by shape index, to replace the shape's mesh, for example by one built before; in the shape's
             frame, scaled. Shapes of one mesh and scale share a model.
         capacity: As for `ManifoldQuery`; `collide` makes more room, `launch` does not.
@@ -50,6 +92,7 @@ class NewtonContacts:
         scene: `Scene` of the shapes, at their finest LODs; `scene.set_lods` changes these.
         shapes: Newton's shape of each object, int32 (n,).
         query: `ManifoldQuery`.
+        others: `newton.CollisionPipeline` of the pairs of which one is no mesh; None without, or before the first use.
 
     Raises:
         ImportError: Newton is not installed.
@@ -64,29 +107,42 @@ class NewtonContacts:
         self.device = model.device
         kind, flags = model.shape_type.numpy(), model.shape_flags.numpy()
         collide = (flags & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0
-        found = np.flatnonzero((kind == int(newton.GeoType.MESH)) & collide)
+        is_mesh = (kind == int(newton.GeoType.MESH)) & collide
+        found = np.flatnonzero(is_mesh)
         if len(found) < 2:
             raise ValueError(f"the model has {len(found)} shapes that are meshes and collide, not two")
         self.shapes = found.astype(np.int32)
         self.scene = Scene(str(self.device))
-        scale, body, world = model.shape_scale.numpy(), model.shape_body.numpy(), model.shape_world.numpy()
-        known = {}
-        for shape in found.tolist():
-            source = model.shape_source[shape]
-            own = None if models is None else models.get(shape)
-            if own is None:
-                key = (id(source), tuple(scale[shape].tolist()))
-                if key not in known:
-                    vertices = np.asarray(source.vertices, np.float64) * scale[shape]
-                    known[key] = Model.from_arrays(vertices, np.asarray(source.indices).reshape(-1, 3))
-                own = known[key]
-            self.scene.add(own, world=int(world[shape]), static=bool(body[shape] < 0))
+        still = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(found), 1))
+        static, world = model.shape_body.numpy()[found] < 0, model.shape_world.numpy()[found]
+        self.scene.add_many(self._find_models(found, models or {}), still, worlds=world, statics=static)
         self.scene.filter(_excluded_pairs(model, self.shapes))
+        self._pairs_of_others = _other_pairs(model, is_mesh | ~collide)
+        self.others: Any = None
+        reach = np.zeros((len(found), 4))
+        reach[:, 3] = (model.shape_margin.numpy() + model.shape_gap.numpy())[found]
+        if not (np.isfinite(reach).all() and (reach >= 0).all()):
+            bad = found[np.flatnonzero(~(np.isfinite(reach[:, 3]) & (reach[:, 3] >= 0)))[0]]
+            raise ValueError(f"gap: margin and gap of shape {bad} make no finite distance of 0 or more")
         self._ids = wp.array(self.shapes, dtype=wp.int32, device=self.device)
         self._no_body = wp.empty(0, dtype=wp.transform, device=self.device)
         self._place(model.body_q)
-        self.query = ManifoldQuery(self.scene, None, capacity)
+        own = wp.array(reach, dtype=wp.vec4d, device=self.device)
+        self.query = ManifoldQuery(self.scene, None, capacity, gap=own)
+        self._first = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._grow()
+
+    def _find_models(self, shapes, given):
+        """Return the model of each shape; shapes of one mesh and scale share theirs."""
+        known, scale, models = {}, self.model.shape_scale.numpy(), []
+        for shape in shapes.tolist():
+            source = self.model.shape_source[shape]
+            key = (id(source), tuple(scale[shape].tolist()))
+            if given.get(shape) is None and key not in known:
+                vertices = np.asarray(source.vertices, np.float64) * scale[shape]
+                known[key] = Model.from_arrays(vertices, np.asarray(source.indices).reshape(-1, 3))
+            models.append(known[key] if given.get(shape) is None else given[shape])
+        return models
 
     def _grow(self):
         room = len(self.query.pairs)
@@ -95,24 +151,38 @@ class NewtonContacts:
 
     def contacts(self, rigid_contact_max=None):
         """Return an empty `newton.Contacts` for rigid contacts; by default with room for 8 of each pair."""
-        room = POINTS_MAX * len(self.query.pairs) if rigid_contact_max is None else rigid_contact_max
-        return self.newton.Contacts(room, 0, device=self.device)
+        room = POINTS_MAX * (len(self.query.pairs) + min(len(self._pairs_of_others), OTHERS_MAX))
+        room = room if rigid_contact_max is None else rigid_contact_max
+        if not len(self._pairs_of_others):
+            return self.newton.Contacts(room, 0, device=self.device)
+        self._make_others(room)
+        return self.others.contacts()
+
+    def _make_others(self, room):
+        """Make the pipeline of pairs of which one is no mesh, for contacts of some size."""
+        pairs = wp.array(self._pairs_of_others, dtype=wp.vec2i, device=self.device)
+        self.others = self.newton.CollisionPipeline(
+            self.model, broad_phase="explicit", shape_pairs_filtered=pairs, rigid_contact_max=room
+        )
 
     def collide(self, state, contacts):
         """Replace the contents of `contacts` by the contacts at a state's poses, see `check`. Waits for the device."""
+        room = len(contacts.rigid_contact_shape0)
+        if len(self._pairs_of_others) and (self.others is None or self.others.rigid_contact_max != room):
+            self._make_others(room)
         self._place(state.body_q)
         self.query.grow()
         if len(self._count) != len(self.query.pairs):
             self._grow()
-        self._write(state.body_q, contacts)
+        self._write(state, contacts)
         self.check(contacts)
 
     def launch(self, state, contacts):
-        """Do the same within the present capacity. Launches only, so that a CUDA graph can capture it."""
+        """Do the same within the present capacity. Launches only, after a `collide`, so that a graph can capture it."""
         with self.query.guard.launching(self):
             self._place(state.body_q)
             self.query.launch()
-            self._write(state.body_q, contacts)
+            self._write(state, contacts)
 
     def check(self, contacts):
         """Raise an error if the last contacts did not fit. Waits for the device.
@@ -131,8 +201,13 @@ class NewtonContacts:
         inputs = [self._ids, body_q, self.model.shape_body, self.model.shape_transform, self.scene.batch().objects.pool]
         wp.launch(kernels.pose_object_kernel, len(self.shapes), inputs, device=self.device)
 
-    def _write(self, body_q, contacts):
-        contacts.clear()
+    def _write(self, state, contacts):
+        if self.others is None:
+            contacts.clear()
+        else:
+            self.others.collide(state, contacts)
+        body_q = state.body_q
+        wp.copy(self._first, contacts.rigid_contact_count, count=1)
         rigid = kernels.RigidContacts()
         rigid.count = contacts.rigid_contact_count
         for name in FIELDS:
@@ -143,6 +218,6 @@ class NewtonContacts:
         wp.launch(kernels.count_point_kernel, room, inputs, device=self.device)
         with wp.ScopedDevice(self.device):
             wp.utils.array_scan(self._count, self._end, inclusive=True)
-        inputs = [self.model.shape_margin, self._ids, body_q, self.model.shape_body]
+        inputs = [self._first, self.model.shape_margin, self._ids, body_q, self.model.shape_body]
         inputs += [query.pairs, query.manifolds, self._end, self._count, rigid]
         wp.launch(kernels.write_contact_kernel, room, inputs, device=self.device)

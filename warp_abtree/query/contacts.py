@@ -45,18 +45,18 @@ contacts of each chunk of 32, the last chunk perhaps shorter, from left to right
   either surface.
 * normal: mean of the normals, weighted as the points, at unit length. A mean shorter than 2^-20, as of curves that run
   around an object, gives way to the direction between the models' centres.
-* depth: an estimate of how far the second object would have to move along the normal to come free. The contact curve
-  encloses an area, seen along the normal; its faces say how fast that area shrinks with such a motion; depth is their
+* travel: an estimate of how far the second object would have to move along the normal to come free. The contact curve
+  encloses an area, seen along the normal; its faces say how fast that area shrinks with such a motion; travel is their
   quotient, at most the overlap of the two root boxes along the normal, which it is too where the area does not shrink.
   Without an area (points, shared planes) it is the overlap along the normal of the faces that touch. For a box pressed
   straight into a larger one it is exact up to the rounding of the root boxes, float32 and outwards: 3e-7 for boxes of 4
-  units, so that boxes that only touch have that depth. At most (2 r + d) / 2 d times the truth for balls of radius r at
-  distance d, less where the root boxes cap it; half of it for the tip of a cone. It is not the penetration depth (the
-  smallest motion in any direction), and no bound on it: where a curve runs over the edge of an object the mean normal
-  leans over, and depth can be several times too large; for separate regions of contact and for open surfaces it is
-  merely a length.
+  units, so that boxes that only touch have that travel. At most (2 r + d) / 2 d times the truth for balls of radius r
+  at distance d, less where the root boxes cap it; half of it for the tip of a cone. It is no depth, and no bound
+  on one: where a curve runs over the edge of an object the mean normal leans over, and travel can be several times too
+  large; for separate regions of contact, such as a peg in its hole, and for open surfaces it is merely a length. Depths
+  of solids are measured by `signed` distances (`warp_abtree.query.distance`).
 
-A pair without contacts has depth 0 and NaN as point and normal, of the bits 0x7ff8000000000000. The results are the
+A pair without contacts has travel 0 and NaN as point and normal, of the bits 0x7ff8000000000000. The results are the
 same, bit for bit, on CPU and CUDA. For a pair named the other way the contacts differ in nothing but order, exchanged
 ends and signs; sums follow the order of the faces as named, so that its summary may differ in the last bits too.
 """
@@ -126,7 +126,7 @@ class ContactQuery(Query):
         self.contacts, self.pair_contacts = contact.Contacts(), summary.PairContacts()
         self._sums, self._deferred = summary.ChunkSums(), contact.Deferred()
         for model in () if isinstance(scene, Batch) else scene.models:
-            model.warn_of_winding("the normals and depths of its contacts depend on the winding", stacklevel=5)
+            model.warn_of_winding("the normals of its contacts depend on the winding", stacklevel=5)
         self._deferred.total = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "faces", pairs, capacity, precision, within, sort_pairs)
 
@@ -171,7 +171,7 @@ class ContactQuery(Query):
         for owner, name, dtype in (
             (self.pair_contacts, "point", wp.vec3d),
             (self.pair_contacts, "normal", wp.vec3d),
-            (self.pair_contacts, "depth", wp.float64),
+            (self.pair_contacts, "travel", wp.float64),
             (self._sums, "total", wp.float64),
             (self._sums, "middle", wp.vec3d),
             *([] if self._gap is None else [(self._sums, "number", wp.float64)]),
@@ -256,7 +256,7 @@ class ContactQuery(Query):
         posed = [*pools, self.pairs, self.pair_poses]
         self._launch_warps(summary.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
         self._launch_kernel(
-            summary.measure_depth_kernel, room, [*pools, self.pairs, start, contacts, sums, means], WARP_SIZE
+            summary.measure_travel_kernel, room, [*pools, self.pairs, start, contacts, sums, means], WARP_SIZE
         )
 
     def _read_rows(self, found: Found, count: int, device: bool):
@@ -275,7 +275,7 @@ class ContactQuery(Query):
         found.faces = self.faces.numpy()[:count].reshape(-1, 3).copy()
         found.pair_contacts["count"] = found.count
         with np.errstate(over="ignore"):
-            for name in ("point", "normal", "depth"):
+            for name in ("point", "normal", "travel"):
                 found.pair_contacts[name] = getattr(self.pair_contacts, name).numpy()[:pairs]
             for name in face_type.names[2:]:
                 found.contacts[name] = getattr(self.contacts, name).numpy()[:count]
@@ -308,7 +308,7 @@ class ContactQuery(Query):
         types = {"pair": wp.int32, "faces": wp.vec2i, **dict.fromkeys(VECTORS, vector), "coplanar": wp.bool}
         found.contacts = {name: self._empty(count, dtype) for name, dtype in types.items()}
         means = {"point": self._empty(pairs, vector), "normal": self._empty(pairs, vector)}
-        means["depth"] = self._empty(pairs, real)
+        means["travel"] = self._empty(pairs, real)
         self._launch_once(pack.contact_copier(real), count, [self.faces, self.contacts, *found.contacts.values()])
         if self._gap is not None:
             separation = found.contacts["separation"] = self._empty(count, real)
