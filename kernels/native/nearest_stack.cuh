@@ -1,5 +1,5 @@
-// A warp's lists of a search for the nearest faces: a ring of node pairs, face pairs to be measured in float32 and those
-// to be measured in float64, each with a bound of its distance.
+// A warp's lists of a search for the nearest faces: a ring of node pairs, face pairs to be measured in float32 and
+// those to be measured in float64, each with a bound of its distance.
 #pragma once
 #include "builtin.h"
 #include "sizes.h"

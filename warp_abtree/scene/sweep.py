@@ -118,9 +118,11 @@ class _ChunkQuery:
         self.device, self.room, self.objects = chunk.batch.device, chunk.room, chunk.batch.objects
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
-        self.originals = OriginalDistances(chunk.batch) if of_originals else None
+        self.originals: OriginalDistances | None = None
         if self.output == "distance":
-            self.query: Query = DistanceQuery(chunk.batch, self.pairs, signed=signed)
+            self.query: Query = (distances := DistanceQuery(chunk.batch, self.pairs, signed=signed))
+            if of_originals:
+                self.originals = OriginalDistances(chunk.batch, distances)
         elif self.output == "first_contact":
             self.query = FirstContactQuery(chunk.batch, None, self.pairs, linear=precision == "linear")
         else:
@@ -321,8 +323,9 @@ def sweep(
 
     Poses are checked on the device; on CUDA transfers overlap with launches, except for "faces". The arrays of the last
     four pairs of models, LODs and devices stay on the device for the next call as long as both models live: models and
-    tree states, some 190 bytes a face, and 0.5 KB for each of at most 74,752 poses in chunks of three sizes. Whatever
-    the number of poses, a call needs no more memory besides its answer. Calls of several threads take turns on a GPU.
+    tree states, some 190 bytes a face, and 0.5 KB for each of at most 74,752 poses in chunks of three sizes; for
+    distances of originals tree states at the finest LODs, too. Whatever the number of poses, a call needs no more
+    memory besides its answer. Calls of several threads take turns on a GPU.
 
     Args:
         model_a, model_b: `Model`; may be the same.
