@@ -13,7 +13,7 @@ NEAREST_POINT = wp.constant(wp.float64(2.0**-9))
 # By which part of its distance a point is favoured at the far end of the spread.
 FAVOUR = wp.constant(wp.float64(2.0**-5))
 # Part of the spread by which points may be less deep than the deepest, and apart, to be chosen before others.
-FIRST_PART = wp.constant(wp.float64(2.0**-6))
+FIRST_PART = wp.constant(wp.float64(2.0**-5))
 # The deepest point is among those chosen if this part of its depth is more than theirs.
 DEEPER = wp.constant(wp.float64(0.9))
 
