@@ -44,6 +44,8 @@ class PairPose:
     node_b: wp.int32  # where B's tree lies in the pool
     corner_a: wp.int32  # where A's face corners lie in the pool
     corner_b: wp.int32  # where B's face corners lie in the pool
+    faces_a: wp.int32  # about how many faces A has at its LOD, no more than at the finest
+    faces_b: wp.int32  # the same of B
 
 
 @wp.func
@@ -105,6 +107,26 @@ def unit_scale(reach: wp.float64):
 
 
 @wp.func
+def active_faces(models: ModelPool, states: StatePool, state: wp.int32):
+    """Return about how many faces a state has: a vertex split of a closed manifold adds two."""
+    model = states.model[state]
+    return models.face_count[model] - 2 * (models.lod_max[model] - states.lod[state])
+
+
+@wp.func
+def place_trees(models: ModelPool, states: StatePool, state_a: wp.int32, state_b: wp.int32):
+    """Return a `PairPose` that says where the trees lie, and no more."""
+    pose = PairPose()
+    pose.node_a = states.node_start[state_a]
+    pose.node_b = states.node_start[state_b]
+    pose.corner_a = states.face_start[state_a]
+    pose.corner_b = states.face_start[state_b]
+    pose.faces_a = active_faces(models, states, state_a)
+    pose.faces_b = active_faces(models, states, state_b)
+    return pose
+
+
+@wp.func
 def pair_pose(
     whole: bool, models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32, within: wp.float64
 ):
@@ -136,14 +158,10 @@ def pair_pose(
     # Of a coordinate in `float32_filter_triangles`; docs/exactness.md has the terms, which need `near` below.
     off32 = UNIT_32 * (wp.float64(2.0) * reach_a + wp.float64(13.0) * reach_b + wp.float64(3.0) * far)
 
-    pose = PairPose()
+    pose = place_trees(models, states, state_a, state_b)
     pose.rotation = r
     pose.translation = t
     pose.within = within
-    pose.node_a = states.node_start[state_a]
-    pose.node_b = states.node_start[state_b]
-    pose.corner_a = states.face_start[state_a]
-    pose.corner_b = states.face_start[state_b]
     pose.rotation32 = wp.mat33(r)
     pose.scale = unit_scale(wp.max(reach_a, reach_b))
     pose.error = wp.float32(pose.scale * wp.float64(2.02) * (off32 + margin64))

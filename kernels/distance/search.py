@@ -23,7 +23,6 @@ from warp_abtree.kernels.traversal.load_balance import (
     Work,
     await_donation,
     count_idle,
-    end_unit,
     load_tickets,
     take_unit,
 )
@@ -325,13 +324,15 @@ def search_warp_kernel(
     count = wp.min(pair_count[0], pair_poses.shape[0])
     search = Search()
     search.room = room
+    p = take_unit(work_inout.counter)
+    ended = wp.int32(0)
     while True:
-        p = take_unit(work_inout.counter)
         slot = wp.int32(-1)
         if p >= count:
-            slot = await_donation(work_inout.counter, work_inout.flag)
+            slot = await_donation(work_inout.counter, work_inout.flag, ended)
             if slot < 0:
                 return
+            ended = 0
             p = work_inout.owner[slot][0]
         if hits_inout.any_hit[p] == 0:
             search.pair = p
@@ -353,4 +354,7 @@ def search_warp_kernel(
                 rough = False
             add_warp_sum(hits_inout.node_tests, p, tests[0])
             add_warp_sum(hits_inout.triangle_tests, p, tests[1])
-        end_unit(work_inout.counter, work_inout.flag)
+        ended += 1
+        p = count
+        if slot < 0:
+            p = take_unit(work_inout.counter)

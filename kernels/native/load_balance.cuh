@@ -3,6 +3,16 @@
 #include "builtin.h"
 #include "sizes.h"
 
+inline CUDA_CALLABLE wp::int32 first_unit(wp::array_t<wp::int32> counter) {
+#include "sizes.h"
+#if defined(__CUDA_ARCH__)
+    const int taken = *(const volatile int*)(counter.data + 3);
+    return __shfl_sync(0xffffffffu, taken >= NO_UNIT ? NO_UNIT : (int)blockIdx.x, 0);
+#else
+    return counter.data[3] >= NO_UNIT ? NO_UNIT : 0;
+#endif
+}
+
 inline CUDA_CALLABLE wp::int32 take_unit(wp::array_t<wp::int32> counter) {
 #if defined(__CUDA_ARCH__)
     int unit = 0;
@@ -33,16 +43,20 @@ inline CUDA_CALLABLE wp::int32 count_idle(wp::int64 tickets) {
 #endif
 }
 
-inline CUDA_CALLABLE wp::int32 await_donation(wp::array_t<wp::int32> counter, wp::array_t<wp::int32> flag) {
+inline CUDA_CALLABLE wp::int32 await_donation(wp::array_t<wp::int32> counter, wp::array_t<wp::int32> flag,
+                                              wp::int32 ended) {
 #if defined(__CUDA_ARCH__)
 #include "sizes.h"
-    int slot = -1;
+    int slot = -1, left = 1;
     if (threadIdx.x == 0) {
-        int ticket = atomicAdd(counter.data + 1, 1);
+        __threadfence();  // a slot that this warp has freed, before the last one fills it with -1
+        // Both under way at once.
+        const int ticket = atomicAdd(counter.data + 1, 1);
+        left = ended > 0 ? atomicSub(counter.data + 2, ended) - ended : *(const volatile int*)(counter.data + 2);
         const volatile int* mine = (const volatile int*)(flag.data + (ticket & (SLOT_COUNT - 1)));
         __threadfence();
         // The warp that ends the last unit terminates those that have tickets by then.
-        if (*(const volatile int*)(counter.data + 2) != 0) {
+        if (left != 0) {
             int got = *mine;
             while (got != ticket + 1 && got != -1) {
                 __nanosleep(100);
@@ -54,8 +68,12 @@ inline CUDA_CALLABLE wp::int32 await_donation(wp::array_t<wp::int32> counter, wp
         __threadfence();
     }
     __syncwarp();
+    if (ended > 0 && __shfl_sync(0xffffffffu, left, 0) == 0)
+        for (int i = threadIdx.x; i < SLOT_COUNT / 4; i += 32)
+            ((int4*)flag.data)[i] = make_int4(-1, -1, -1, -1);
     return __shfl_sync(0xffffffffu, slot, 0);
 #else
+    counter.data[2] -= ended;
     return -1;
 #endif
 }
@@ -95,24 +113,5 @@ inline CUDA_CALLABLE void fill_slot(wp::array_t<wp::int32> flag, wp::int32 ticke
     __syncwarp();
     if (threadIdx.x == 0)
         *(volatile int*)(flag.data + (ticket & (SLOT_COUNT - 1))) = ticket + 1;
-#endif
-}
-
-inline CUDA_CALLABLE void end_unit(wp::array_t<wp::int32> counter, wp::array_t<wp::int32> flag) {
-#if defined(__CUDA_ARCH__)
-#include "sizes.h"
-    int left = 1;
-    if (threadIdx.x == 0) {
-        __threadfence();  // a slot that this warp has freed, before the last one fills it with -1
-        left = atomicSub(counter.data + 2, 1) - 1;
-        __threadfence();
-    }
-    __syncwarp();
-    if (__shfl_sync(0xffffffffu, left, 0) != 0)
-        return;
-    for (int i = threadIdx.x; i < SLOT_COUNT / 4; i += 32)
-        ((int4*)flag.data)[i] = make_int4(-1, -1, -1, -1);
-#else
-    counter.data[2] -= 1;
 #endif
 }

@@ -7,15 +7,29 @@ constexpr int WARP_SIZE = 32;
 constexpr int STACK_LENGTH = 512;
 constexpr int LEAF_PAIR_LENGTH = 160;
 constexpr int STRADDLING_LENGTH = 64;
+constexpr int INEXACT_LENGTH = 96;
 constexpr int STRADDLING_START = 672;
 constexpr int SIGNS_START = 736;
 constexpr int ITEM_BYTES = 8;
 static_assert((STACK_LENGTH & (STACK_LENGTH - 1)) == 0, "the stack is a ring");
 static_assert(LEAF_PAIR_LENGTH >= (WARP_SIZE - 1) + 4 * WARP_SIZE, "fewer than a warp wait, a test emits 4 a lane");
 static_assert(STRADDLING_LENGTH >= (WARP_SIZE - 1) + WARP_SIZE, "fewer than a warp wait, a test adds 1 a lane");
+static_assert(INEXACT_LENGTH >= (WARP_SIZE - 1) + 2 * WARP_SIZE, "fewer than a warp wait, two tests add 1 a lane each");
 static_assert(STRADDLING_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
 static_assert(SIGNS_START == STRADDLING_START + STRADDLING_LENGTH, "signs lie behind the straddling pairs");
 static_assert((STACK_LENGTH + LEAF_PAIR_LENGTH) * ITEM_BYTES < 1 << 16, "`push_children` packs two byte offsets");
+
+// Two small trees where a warp's stack lies otherwise: leaves of each, and inner nodes before boxes of A's leaves take
+// their place. In words of 4 bytes, a box three quarters of 4 words.
+constexpr int SMALL_LEAVES = 96;
+constexpr int SMALL_INNER = 192;
+constexpr int SMALL_ROWS = 64;
+constexpr int SMALL_FACES = 768;
+constexpr int SMALL_A = 832;
+constexpr int SMALL_B = 928;
+static_assert(SMALL_INNER >= 2 * SMALL_LEAVES && SMALL_FACES >= SMALL_INNER, "both trees' inner nodes have room");
+static_assert(SMALL_FACES == 12 * SMALL_ROWS && SMALL_A == SMALL_FACES + SMALL_ROWS, "boxes, then their faces");
+static_assert(SMALL_B == SMALL_A + SMALL_LEAVES && 4 * (SMALL_B + SMALL_LEAVES) <= STACK_LENGTH * ITEM_BYTES, "room");
 
 // Of a search for the nearest faces: node pairs, face pairs for float32, and behind them those for float64.
 constexpr int NEAREST_OPEN_START = 672;
@@ -25,6 +39,8 @@ static_assert(NEAREST_OPEN_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie 
 static_assert(NEAREST_LENGTH == NEAREST_OPEN_START + NEAREST_OPEN_LENGTH, "lists lie one behind the other");
 
 // Slots of the queue in which idle warps wait, each with room for so many items: one a lane.
+// More than there are units of any launch: as the number of units taken, it leaves none.
+constexpr int NO_UNIT = 1073741824;
 constexpr int SLOT_COUNT = 8192;
 constexpr int SLOT_ITEMS = 32;
 static_assert((SLOT_COUNT & (SLOT_COUNT - 1)) == 0, "a ticket's low bits are its slot");

@@ -8,6 +8,7 @@ import functools
 
 import warp as wp
 
+from warp_abtree.kernels.arithmetic.predicates import EXACT
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.face_pairs import OUTPUT_ANY, Hits
@@ -20,14 +21,17 @@ from warp_abtree.kernels.traversal.load_balance import (
     await_donation,
     claim_slot,
     count_idle,
-    end_unit,
     fill_slot,
+    first_unit,
     free_slot,
     load_tickets,
-    take_unit,
+    next_unit,
+    parts_at_once,
+    start_items,
     units_per_pair,
 )
-from warp_abtree.kernels.traversal.node_pair import compare_node_pair, first_item, item_first, item_second
+from warp_abtree.kernels.traversal.node_pair import compare_node_pair, item_first, item_second
+from warp_abtree.kernels.traversal.small_trees import SmallLists, gather_leaves, is_small, test_small_trees
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
     add_warp_sum,
@@ -50,9 +54,6 @@ wp.set_module_options(MODULE_OPTIONS)
 DEPTH_FIRST_ROOM = wp.constant(128)
 
 STACK_MASK = wp.constant(STACK_LENGTH - 1)
-# Warps on one pair divide its work when there are about so many items for each, or as many as the stack takes then.
-ITEMS_PER_WARP = wp.constant(8)
-ITEMS_TO_DIVIDE = wp.constant(STACK_LENGTH // 2)
 # An early hit ends a pair for `any`, so few leaf pairs wait.
 LEAF_PAIRS_FOR_ANY = wp.constant(8)
 # A warp with work for two looks at every second turn whether others are idle, at every one where pairs are few: a turn
@@ -74,12 +75,10 @@ class Pace:
 
 @wp.struct
 class WarpItems:
-    """What a warp has in shared memory: a ring of node pairs, and leaf pairs."""
+    """What a warp has in shared memory: node pairs, in a ring, the oldest first."""
 
     items: wp.uint64  # `warp_stack`
-    head: wp.int32  # where node pairs start, the oldest first; STACK_MASK takes it into the ring
-    end: wp.int32  # where they end
-    waiting: wp.int32  # leaf pairs
+    end: wp.int32  # node pairs
 
 
 @wp.func
@@ -103,49 +102,6 @@ def expand_items(
     ends = push_children(items, end, waiting, emitted, children)
     warp_sync()
     return item_second(ends), item_first(ends), tests
-
-
-@wp.func
-def divide_items(items: wp.uint64, head: wp.int32, end: wp.int32, part: wp.int32, parts: wp.int32):
-    """Keep every so many-th item from head on, for one of several warps that hold the same; return the new end."""
-    kept = (end - head - part + parts - 1) / parts
-    done = wp.int32(0)
-    while done < kept:
-        item = wp.int64(0)
-        i = done + warp_lane()
-        if i < kept:
-            item = read_item(items, (head + part + parts * i) & STACK_MASK)
-        warp_sync()
-        if i < kept:
-            write_item(items, (head + i) & STACK_MASK, item)
-        warp_sync()
-        done += warp_size()
-    return head + kept
-
-
-@wp.func
-def start_items(items: wp.uint64, part: wp.int32, parts: wp.int32, states: StatePool, pose: PairPose):
-    """Start a pair: expand the roots breadth first, the same in every warp at work on it, and keep a part.
-
-    Returns where the part starts and ends, the leaf pairs that wait, and the pairs of boxes compared: these two are
-    the first warp's.
-    """
-    if warp_lane() == 0:
-        write_item(items, 0, first_item(states, pose))
-    warp_sync()
-    head, end = wp.int32(0), wp.int32(1)
-    waiting, compared = wp.int32(0), wp.int32(0)
-    wanted = wp.min(parts * ITEMS_PER_WARP, ITEMS_TO_DIVIDE)
-    while parts > 1 and end > head and end - head < wanted and waiting < warp_size():
-        first = head
-        head += wp.min(warp_size(), end - head)
-        end, waiting, more = expand_items(items, first, head - first, end, waiting, states, pose)
-        compared += more
-    if part > 0:
-        waiting = 0
-        compared = 0
-    end = divide_items(items, head, end, part, parts)
-    return head, end, waiting, compared
 
 
 @wp.func
@@ -198,7 +154,7 @@ def traverse_items(
 ):
     """Traverse what is on the stack and is not given away; return pairs of boxes compared, and face pair tests."""
     items, for_any = own.items, pace.for_any
-    head, end, waiting = wp.int32(own.head), wp.int32(own.end), wp.int32(own.waiting)
+    head, end, waiting = wp.int32(0), wp.int32(own.end), wp.int32(0)
     node_tests, turn = wp.int32(0), wp.int32(0)
     tested, hit_count, uncertain_count = wp.int32(0), wp.int32(0), wp.int32(0)
     straddling = wp.int32(0)
@@ -242,6 +198,33 @@ def traverse_items(
     return node_tests, wp.vec3i(hit_count, wp.where(warp_lane() == 0, tested, 0), uncertain_count)
 
 
+@wp.func
+def set_pace(stack_room: wp.int32, parts: wp.int32, for_any: bool):
+    pace = Pace()
+    pace.stack_room = stack_room
+    pace.for_any = for_any
+    pace.balance_mask = hold_uniform(wp.where(parts >= MANY_PARTS, wp.where(for_any, 3, 0), 1))
+    # Where many warps look for one hit of a pair, each asks at every visit whether there is one.
+    pace.tests_max = hold_uniform(wp.where(for_any and parts >= MANY_PARTS, 1, TESTS_A_TURN))
+    return pace
+
+
+@wp.func
+def open_stack():
+    own = WarpItems()
+    own.items = warp_stack()
+    return own
+
+
+@wp.func
+def count_tests(hits: Hits, pair: wp.int32, node_tests: wp.int32, tests: wp.vec3i):
+    """Count what the lanes have tested: pairs of boxes, and what `traverse_items` returns of face pairs."""
+    add_warp_sum(hits.node_tests, pair, node_tests)
+    add_warp_sum(hits.count, pair, tests[0])
+    add_warp_sum(hits.triangle_tests, pair, tests[1])
+    add_warp_sum(hits.float64_tests, pair, tests[2])
+
+
 @functools.cache
 def warp_traversal(mode: int, for_any: bool):
     """Return the kernel that has warps share the object pairs: EXACT, FLOAT32 or WITHIN.
@@ -264,42 +247,41 @@ def warp_traversal(mode: int, for_any: bool):
         """Traverse units of work, each a part of one object pair, and donated items, until there are none."""
         count = wp.min(pair_count[0], pair_poses.shape[0])
         parts = units_per_pair(work_inout.warps_per_pair, count)
-        pace = Pace()
-        pace.stack_room = stack_room
-        pace.for_any = wp.static(for_any)
-        pace.tests_max = TESTS_A_TURN
-        pace.balance_mask = hold_uniform(wp.where(parts >= MANY_PARTS, wp.static(3 if for_any else 0), 1))
-        if wp.static(for_any):
-            # Where many warps look for one hit of a pair, each asks at every visit whether there is one.
-            pace.tests_max = hold_uniform(wp.where(parts >= MANY_PARTS, 1, TESTS_A_TURN))
-        own = WarpItems()
-        own.items = warp_stack()
+        pace = set_pace(stack_room, parts, wp.static(for_any))
+        asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
+        own = open_stack()
+        unit, units, ended = first_unit(work_inout.counter), count * parts, wp.int32(0)
         while True:
-            unit = take_unit(work_inout.counter)
             p = unit / parts
             slot = wp.int32(-1)
-            if unit >= count * parts:
-                slot = await_donation(work_inout.counter, work_inout.flag)
+            if unit >= units:
+                slot = await_donation(work_inout.counter, work_inout.flag, ended)
                 if slot < 0:
                     return
+                ended = 0
                 p = work_inout.owner[slot][0]
             pose = pair_poses[p]
-            head, end, waiting, started = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
-            if slot >= 0:
-                end = receive_items(own.items, slot, work_inout)
+            node_tests, tests = wp.int32(0), wp.vec3i()
+            lists = SmallLists()
+            task = wp.vec3i(p, unit - p * parts, parts)
+            if wp.static(mode == int(EXACT)):
+                if slot < 0 and is_small(pose, work_inout.small_faces):
+                    task[2] = parts_at_once(parts, count, work_inout.warps)
+                    lists = gather_leaves(task, own.items, states, pose)
+            if lists.fits:
+                node_tests, tests = test_small_trees(
+                    asked, pace.for_any, task, lists, models, states, pose, own.items, hits_inout
+                )
             else:
-                head, end, waiting, started = start_items(own.items, unit % parts, parts, states, pose)
-            own.head = head
-            own.end = end
-            own.waiting = waiting
-            asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
-            node_tests, tests = traverse_items(
-                asked, wp.static(mode), pace, p, models, states, pose, own, hits_inout, work_inout
-            )
-            add_warp_sum(hits_inout.node_tests, p, node_tests + started)
-            add_warp_sum(hits_inout.count, p, tests[0])
-            add_warp_sum(hits_inout.triangle_tests, p, tests[1])
-            add_warp_sum(hits_inout.float64_tests, p, tests[2])
-            end_unit(work_inout.counter, work_inout.flag)
+                if slot >= 0:
+                    own.end = receive_items(own.items, slot, work_inout)
+                else:
+                    own.end = start_items(own.items, task[1], task[2], pose)
+                node_tests, tests = traverse_items(
+                    asked, wp.static(mode), pace, p, models, states, pose, own, hits_inout, work_inout
+                )
+            count_tests(hits_inout, p, node_tests, tests)
+            ended += 1
+            unit = next_unit(unit, units, work_inout)
 
     return traverse_warp_kernel

@@ -1,6 +1,7 @@
 """Dynamic load balancing between warps: idle warps wait in a queue; busy warps donate the oldest items of their stack.
 
-Units of work are numbered. A warp takes the next one until there are no more, then a ticket, and waits at the slot of
+Units of work are numbered. A warp starts with that of its own number, takes the next one until there are no more, then
+a ticket, and waits at the slot of
 that number. A busy warp compares the tickets taken with those served, and serves the next few with the oldest items of
 its stack. The warp that ends the last unit or donation terminates all that wait.
 
@@ -23,6 +24,9 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.generation import LaunchRecord
+from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.node_pair import pack_item
+from warp_abtree.kernels.traversal.warp_stack import warp_lane, warp_size, warp_sync, write_item
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -32,8 +36,9 @@ SLOT_ITEMS = native.constant("SLOT_ITEMS")
 DONATIONS_AT_ONCE = wp.constant(3)
 COUNTER_COUNT = 4
 
-# More than there are units of any launch: as the number of units taken, it leaves none.
-NO_UNIT = wp.constant(2**30)
+NO_UNIT = native.constant("NO_UNIT")
+# The bit of half an item that names two siblings.
+SIBLINGS = wp.constant(-(2**31))
 
 
 @wp.struct
@@ -44,11 +49,18 @@ class Work:
     flag: wp.array(dtype=wp.int32)  # 0 free, the ticket + 1 that it is full for, -1 when all is done, shape [slot]
     owner: wp.array(dtype=wp.vec2i)  # (object pair, number of items), shape [slot]
     item: wp.array(dtype=wp.int64)  # node pairs (`node_pair`), shape [slot * SLOT_ITEMS]
+    warps: wp.int32  # of the launch; each starts with the unit of its own number
     warps_per_pair: wp.int32  # units of a single pair; c pairs have 1 / sqrt(c) of that each
+    small_faces: wp.int32  # two trees of so many faces at most are compared at once (`small_trees`)
     record: LaunchRecord  # what the launch was given; here, since another argument takes time in every launch
 
 
 balance_code = functools.partial(native.body, "load_balance.cuh")
+
+
+@wp.func_native(balance_code("first_unit"))
+def first_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
+    """Return the unit that this warp starts with, NO_UNIT or more where there is no work."""
 
 
 @wp.func_native(balance_code("take_unit"))
@@ -67,8 +79,11 @@ def count_idle(tickets: wp.int64) -> wp.int32:
 
 
 @wp.func_native(balance_code("await_donation"))
-def await_donation(counter: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32)) -> wp.int32:
-    """Wait for a donation; return its slot, or -1 when all work is done."""
+def await_donation(counter: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32), ended: wp.int32) -> wp.int32:
+    """End so many units and donations, and wait for a donation; return its slot, or -1 when all work is done.
+
+    Who ends the last one terminates all warps that wait.
+    """
 
 
 @wp.func_native(balance_code("free_slot"))
@@ -85,12 +100,64 @@ def fill_slot(flag: wp.array(dtype=wp.int32), ticket: wp.int32):
     """Hand over what this warp has put into the slot of a ticket."""
 
 
-@wp.func_native(balance_code("end_unit"))
-def end_unit(counter: wp.array(dtype=wp.int32), flag: wp.array(dtype=wp.int32)):
-    """End a unit or a donation; the last one terminates all warps that wait."""
-
-
 @wp.func
 def units_per_pair(warps_per_pair: wp.int32, count: wp.int32):
     """Return how many units an object pair is at first; more of them cost more, since each starts at the roots."""
     return wp.max(1, wp.int32(wp.float32(warps_per_pair) / wp.sqrt(wp.float32(wp.max(count, 1)))))
+
+
+@wp.func
+def next_unit(unit: wp.int32, units: wp.int32, work: Work):
+    """Return the unit that follows one, `units` or more where there is none or the warp has had none."""
+    if unit < units:
+        unit = wp.int32(units)
+        if units > work.warps:
+            unit = take_unit(work.counter)
+    return unit
+
+
+@wp.func
+def parts_at_once(parts: wp.int32, count: wp.int32, warps: wp.int32):
+    """Return by how many units a pair is divided that each starts with as much work as the whole pair."""
+    return wp.clamp(warps / wp.max(count, 1), 1, parts)
+
+
+@wp.func
+def start_level(level: wp.int32, faces: wp.int32):
+    """Return the level of a tree to start from: so deep that two faces or more lie below a node, on average."""
+    while level > 0 and (2 << level) > faces:
+        level -= 1
+    return level
+
+
+@wp.func
+def level_pair(level: wp.int32, i: wp.int32):
+    """Return half an item: two siblings of a level, or the root."""
+    return wp.where(level > 0, ((1 << level) + 2 * i) | SIBLINGS, 1)
+
+
+@wp.func
+def start_items(items: wp.uint64, part: wp.int32, parts: wp.int32, pose: PairPose):
+    """Put this unit's part of a pair's first items on the stack; return how many there are.
+
+    All pairs of siblings of a level, compared at once: from the roots down, level by level, a warp would wait as often.
+    """
+    # As measured: about 32 a unit, one a lane.
+    level = 3 + wp.where(parts >= 2, 1, 0) + wp.where(parts >= 8, 1, 0)
+    level += wp.where(parts >= 32, 1, 0) + wp.where(parts >= 64, 1, 0)
+    level = wp.where(pose.margin < 0.0, 0, level)
+    level_a = start_level(level, pose.faces_a)
+    level_b = start_level(level, pose.faces_b)
+    shift = wp.max(level_b - 1, 0)
+    total = 1 << (wp.max(level_a - 1, 0) + shift)
+    count = wp.max(0, (total - part + parts - 1) / parts)
+    k = warp_lane()
+    while k < count:
+        i = part + parts * k
+        x = i >> shift
+        # Each part gets pairs from all over both trees.
+        y = (i + x) & ((1 << shift) - 1)
+        write_item(items, k, pack_item(level_pair(level_a, x), level_pair(level_b, y)))
+        k += warp_size()
+    warp_sync()
+    return count

@@ -11,6 +11,7 @@ class Regime:
         warps: Whether warps traverse object pairs; None: on CUDA they do, on the CPU threads.
         warps_per_pair: Warps that share a single object pair; c pairs have 1 / sqrt(c) of that each, half for "any".
         stack_length: Items on a warp's stack before the rest goes depth-first; None is all there is room for.
+        small_faces: Faces up to which warps compare two trees at once, not level by level.
         key_bits: Bits of a sort key; an object pair and two faces that take more are sorted in two passes.
         cpu_threads: Threads of a launch on the CPU; None is all that the process may use.
         plain_tests: Pairs of nodes that a thread of the CPU compares by boxes alone before it looks whether few of them
@@ -27,6 +28,7 @@ class Regime:
     warps: bool | None = None
     warps_per_pair: int = 128
     stack_length: int | None = None
+    small_faces: int = 96
     key_bits: int = 63
     cpu_threads: int | None = None
     plain_tests: int = 6144

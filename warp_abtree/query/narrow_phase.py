@@ -11,9 +11,10 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels import relative_pose
 from warp_abtree.kernels.gap import near_faces
 from warp_abtree.kernels.solid.containment import find_contained_kernel
-from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, relative_pose, simd, uncertain_pairs
+from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.commands import Commands
@@ -33,9 +34,9 @@ from warp_abtree.state.generation import LaunchGuard
 
 # Face pairs that the float32 stage leaves uncertain: about one in a hundred. The list grows as needed.
 UNCERTAIN_ROOM = 65536
-# Warps that one multiprocessor runs at a time by their registers: of the traversal, of float64, of exact signs.
+# Warps that one multiprocessor runs at a time by their registers: of the traversal, of uncertain pairs, of near ones.
 WARPS_A_PROCESSOR = 16
-FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
+FILTER_WARPS_A_PROCESSOR, NEAR_WARPS_A_PROCESSOR = 20, 12
 # So that each finds a slot for all that it gives away at once.
 WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
@@ -105,7 +106,7 @@ class Query(QueryReadout):
         self.broad_phase: Any = None
         if pairs is None:
             self._excluded_count = len(batch.excluded)
-            self.broad_phase = BroadPhase(batch, room.pairs, sort_pairs, self._reach)
+            self.broad_phase = self._make_broad_phase(room.pairs, sort_pairs)
             self.broad_phase.guard = self.guard
             self.broad_phase.wide = 0.0 if within is None else 0.5 * float(within)
             self.pairs, self.pair_count = self.broad_phase.pairs, self.broad_phase.pair_count
@@ -139,6 +140,9 @@ class Query(QueryReadout):
             rows[:, 3] = 0.5 * self._gap if self._gap.ndim == 0 else self._gap
             self._reach = wp.array(rows, dtype=wp.vec4d, device=self.device)
 
+    def _make_broad_phase(self, capacity, sorts: bool) -> BroadPhase:
+        return BroadPhase(self.batch, capacity, sorts, self._reach)
+
     def _make_work(self):
         work, device = load_balance.Work(), self.device
         slots = load_balance.SLOT_COUNT if self.uses_warps() else 0
@@ -148,6 +152,7 @@ class Query(QueryReadout):
         work.flag = wp.zeros(slots, dtype=wp.int32, device=device)
         work.owner = wp.empty(slots, dtype=wp.vec2i, device=device)
         work.item = wp.empty(slots * load_balance.SLOT_ITEMS, dtype=wp.int64, device=device)
+        work.small_faces = self._regime.small_faces
         work.record = self.guard.record()
         self.guard.write_to(work.record)
         return work
@@ -232,10 +237,11 @@ class Query(QueryReadout):
     def _make_search(self, within, hits, mode, output, launch) -> list:
         """Make the launches that bring relative poses and traverse all pairs, see `Commands.find`."""
         pools, room = self.batch.pools, len(self.pairs)
+        self.work.warps = self._warp_count() if self.uses_warps() else 0
         inputs = [output, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
         dim = max(room, len(self.work.flag))
         # A warp a block: few pairs lie on as many multiprocessors.
-        kernel = relative_pose.relative_pose_kernel
+        kernel = relative_pose.relative_poses(len(within) > 0)
         first = launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
         if not self.uses_warps():
@@ -311,9 +317,8 @@ class Query(QueryReadout):
         if int(PRECISIONS[self.precision]) != EXACT:
             return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR)]
         return [
-            (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR),
-            (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR),
-            *([] if self._asked_gap is None else [(near_faces.find_near_kernel, EXACT_WARPS_A_PROCESSOR)]),
+            (uncertain_pairs.resolve_exact_kernel, FILTER_WARPS_A_PROCESSOR),
+            *([] if self._asked_gap is None else [(near_faces.find_near_kernel, NEAR_WARPS_A_PROCESSOR)]),
         ]
 
     def _slow_kernels(self, with_distances: bool) -> list:
@@ -322,10 +327,11 @@ class Query(QueryReadout):
         modes = [self._mode(), *([within] if with_distances else [])]
         if self.uses_warps():
             kernels = [dual_tree.warp_traversal(mode, mode == within or self.output == "any") for mode in modes]
-            kernels += reversed([kernel for kernel, _ in self._passes()])
+            kernels += [kernel for kernel, _ in self._passes()]
         else:
             kernels = [simd.thread_traversal(mode) for mode in modes]
-        return [(kernel, WARP_SIZE) for kernel in (*kernels, relative_pose.relative_pose_kernel)]
+        kernels += [relative_pose.relative_poses(mode in (within, int(face_pairs.GAP))) for mode in modes]
+        return [(kernel, WARP_SIZE) for kernel in kernels]
 
     def result(self, device: bool = False) -> Result:
         """Return the results of the last launch, sorted. Waits for the device.
