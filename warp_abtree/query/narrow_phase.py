@@ -43,11 +43,6 @@ WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 EXACT = int(PRECISIONS["exact"])
 
 
-def batch_of(source) -> Batch:
-    """Return a `Batch`, or that of a scene."""
-    return source if isinstance(source, Batch) else source.batch()
-
-
 class Query(QueryReadout):
     """Intersection of many object pairs as an operator: allocates once, launches many times.
 
@@ -92,7 +87,7 @@ class Query(QueryReadout):
         self._regime = current_regime()
         self.output, self.precision, self.device = output, precision, scene.device
         with loading(self.device, self._slow_kernels(within is not None)):
-            self.batch = batch = batch_of(scene)
+            self.batch = batch = scene if isinstance(scene, Batch) else scene.batch()
         if pairs is not None:
             pairs = batch.check_pairs(pairs)
         if within is not None:

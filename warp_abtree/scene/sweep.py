@@ -20,7 +20,7 @@ from warp_abtree.scene.first_contact import FirstContactQuery, check_asked_conta
 from warp_abtree.scene.originals import OriginalDistances
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
-from warp_abtree.scene.sweep_poses import DeviceRows, refuse_row, take_rows
+from warp_abtree.scene.sweep_poses import DeviceRows, refuse_row, take_ends, take_rows
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
 
@@ -361,9 +361,7 @@ def sweep(
     with device_lock(pair.device):
         poses = take_rows(poses, pair.device)
         if output == "first_contact":
-            options["end_poses"] = ends = take_rows(options["end_poses"], pair.device, "end_poses")
-            if len(ends) != len(poses):
-                raise ValueError(f"end_poses: {len(ends)} given for {len(poses)} poses")
+            options["end_poses"] = take_ends(options["end_poses"], len(poses), pair.device)
         solids = solid if isinstance(solid, tuple | list) and len(solid) == 2 else (solid, solid)
         for model, lod, is_solid in zip((model_a, model_b), (lod_a, lod_b), solids):
             pair.add(model, lod=lod, solid=is_solid)
@@ -376,10 +374,9 @@ def _sweep(pair, poses, asked, options):
     if output == "first_contact":
         precision = "linear" if options.pop("linear", False) else "rigid"
     if len(poses) == 0:
-        empty = {"faces": np.empty((0, 3), np.int32), "distance": np.empty(0, DISTANCE_ROWS)}
-        empty["first_contact"] = np.empty(0, CONTACT_ROWS)
-        kind = ANSWERS.get(output) if within is None else apart_rows(output)
-        return empty[output] if output in empty else np.empty(0, kind)
+        kinds = {**ANSWERS, "distance": DISTANCE_ROWS, "first_contact": CONTACT_ROWS}
+        kind = kinds.get(output) if within is None else apart_rows(output)
+        return np.empty((0, 3), np.int32) if output == "faces" else np.empty(0, kind)
     models = [pair.models[i] for i in pair.object_model]
     key = (*map(id, models), *pair.lods.tolist(), *pair.object_solid, pair.device.alias)
     # Taken out while in use: a call from another thread has its own, and one that fails leaves nothing behind.

@@ -62,3 +62,15 @@ def refuse_row(poses, i, what="poses"):
     row = np.asarray(poses.row(i), np.float64)
     check_poses(row[None] if poses.width == 7 else row.reshape(1, 4, 4), what, first=i)
     raise ValueError(f"{what}: pose {i} is no pose")  # by rounding, where the host finds it just within
+
+
+def take_ends(ends, count: int, device):
+    """Return where motions end as `take_rows` does.
+
+    Raises:
+        ValueError: As `take_rows`; or not as many as there are poses.
+    """
+    rows = take_rows(ends, device, "end_poses")
+    if len(rows) != count:
+        raise ValueError(f"end_poses: {len(rows)} given for {count} poses")
+    return rows
