@@ -25,9 +25,11 @@ from . import tables
 
 CASES = (
     *("assembly", "baselines", "budget", "build", "coarse", "distance", "exact", "frame"),
-    *("host", "query", "scale", "sweep", "update"),
+    *("host", "motion", "query", "scale", "sweep", "update"),
 )
 STUDIES = {"paper": "study", "tradeoff": "study", "nightly": "nightly"}  # and the modules that run them
+MODULES = {name: f"bench.cases.{name}" for name in CASES} | {"motion": "bench.motions.case"}
+MODULES |= {name: f"bench.studies.{module}" for name, module in STUDIES.items()}
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml
 # A case, and a study, takes the options that its function `run` has as arguments.
 OPTIONS = {
@@ -53,8 +55,8 @@ def main(argv=None):
     argv = list(sys.argv[1:] if argv is None else argv)
     name = argv[0] if argv else None
     case = None
-    if name in (*CASES, *STUDIES):
-        case = importlib.import_module(f"bench.studies.{STUDIES[name]}" if name in STUDIES else f"bench.cases.{name}")
+    if name in MODULES:
+        case = importlib.import_module(MODULES[name])
     taken = set(inspect.signature(case.run).parameters) if case else set()
     parser = Parser(prog="python -m bench", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=[*STUDIES, *CASES])

@@ -15,6 +15,7 @@ from warp_abtree.query.manifold import ManifoldQuery
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import Buffers, CapacityError
 from warp_abtree.query.result import Result
+from warp_abtree.scene.first_contact import FirstContactQuery
 from warp_abtree.scene.pipeline import Pipeline
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep import sweep
@@ -34,6 +35,7 @@ __all__ = [
     "DistanceQuery",
     "Dynamics",
     "Feedback",
+    "FirstContactQuery",
     "Frame",
     "Kinematic",
     "Ladder",

@@ -10,6 +10,8 @@ import warp as wp
 
 from warp_abtree.checks.regime import Regime, change_regime, current_regime, restore_regime
 from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
+from warp_abtree.kernels.motion.face_pair import CLEAR, UNDECIDED, Contact
+from warp_abtree.kernels.motion.linear import advance_corners_kernel
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, float32_filter_triangles
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
 from warp_abtree.state.lod_update import LodUpdate
@@ -22,6 +24,7 @@ __all__ = [
     "FLOAT32_UNIT",
     "UNCERTAIN",
     "Regime",
+    "advance_corners",
     "current_regime",
     "decide_triangles",
     "float32_filter_triangles",
@@ -87,3 +90,18 @@ def state_lods(scene) -> list:
 def upload_lods(scene):
     """Write the host's LODs of the states to the device, after repeated launches."""
     scene.batch().states.upload_slots()
+
+
+def advance_corners(starts, ends, tolerance=1e-6, device="cpu"):
+    """Return when pairs of faces first touch whose corners move straight: times, clear and undecided, each (p,).
+
+    Args:
+        starts, ends: Corners of A's face and of B's at first and at last, float64 (p, 6, 3).
+    """
+    contacts = wp.empty(len(starts), dtype=Contact, device=device)
+    given = [wp.array(corners, dtype=wp.vec3d, device=device) for corners in (starts, ends)]
+    # Each coordinate on the way errs by 4 u, so do dot products: 28 u of the largest in all.
+    inputs = [wp.float64(tolerance), wp.float64(2.0**-48), *given, contacts]
+    wp.launch(advance_corners_kernel, len(starts), inputs, device=device)
+    found = contacts.numpy()
+    return found["time"], found["end"] == int(CLEAR), found["end"] == int(UNDECIDED)

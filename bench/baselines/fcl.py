@@ -67,6 +67,20 @@ class Fcl:
             answers.append(self.fcl.distance(self.a, b, request, self.fcl.DistanceResult()))
         return np.array(answers)
 
+    def first_contacts(self, ends, tolerance=1e-4):
+        """Return when A, at rest, and B first touch on B's way to each of some matrices (n, 4, 4), 1 if never.
+
+        By conservative advancement, the origin on a straight line, constant angular velocity.
+        """
+        fcl, still, answers = self.fcl, self.fcl.Transform(), []
+        for b, end in zip(self.b, ends, strict=True):
+            request = fcl.ContinuousCollisionRequest(toc_err=tolerance, ccd_motion_type=1, ccd_solver_type=1)
+            result = fcl.ContinuousCollisionResult()
+            answers.append(
+                fcl.continuousCollide(self.a, still, b, fcl.Transform(end[:3, :3], end[:3, 3]), request, result)
+            )
+        return np.array(answers)
+
     def ask_one(self, pose, output):
         """Return the answer at one pose."""
         result = self.fcl.CollisionResult()

@@ -22,7 +22,7 @@ D is small: `stretch` and `slack_of`.
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.distance.triangle_pair import (
     PAIR_ROUNDING,
     between_features,
@@ -36,10 +36,10 @@ from warp_abtree.kernels.poses import (
     UNIT_32,
     PairPose,
     measure_rotation,
-    pose_point,
     reach_box,
     sum_products,
 )
+from warp_abtree.kernels.traversal.face_pairs import load_face_pair
 from warp_abtree.kernels.traversal.load_balance import NO_UNIT, Work
 from warp_abtree.kernels.traversal.node_pair import pack_item
 from warp_abtree.kernels.traversal.nodes import load_node
@@ -197,14 +197,8 @@ def load_triangles(models: ModelPool, states: StatePool, pose: PairPose, face_a:
     """Return the corners of a face of A and of one of B, in A's frame."""
     a = states.face_corner[pose.corner_a + face_a]
     b = states.face_corner[pose.corner_b + face_b]
-    return scale_triangles(
-        load_vertex(models.vertex_pos, a[0]),
-        load_vertex(models.vertex_pos, a[1]),
-        load_vertex(models.vertex_pos, a[2]),
-        pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[0])),
-        pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[1])),
-        pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[2])),
-    )
+    a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
+    return scale_triangles(a0, a1, a2, b0, b1, b2)
 
 
 @wp.func

@@ -1,19 +1,21 @@
 // Faces of a search by warps: their distance in float32, and what all warps at work on an object pair have found.
 #pragma once
 #include "builtin.h"
+#include "nearest/faces32.h"
 
 template <class Corners>
 inline CUDA_CALLABLE wp::vec_t<2, wp::float32> bound_faces(wp::float32 own, Corners a, Corners b) {
-#include "nearest/float32.h"
 #include "nearest/faces32.h"
-    NearestFaces::Corners c;
+    typedef NearestFaces N;
+    N::Corners c;
+    const N::lanes zero = {};
     for (int k = 0; k < 3; ++k) {
-        c.a[k] = Float32::Point{a.data[k][0], a.data[k][1], a.data[k][2]};
-        c.b[k] = Float32::Point{b.data[k][0], b.data[k][1], b.data[k][2]};
+        c.a[k] = N::Point{zero + a.data[k][0], zero + a.data[k][1], zero + a.data[k][2]};
+        c.b[k] = N::Point{zero + b.data[k][0], zero + b.data[k][1], zero + b.data[k][2]};
     }
-    float size;
-    const float d = sqrtf(NearestFaces::measure(c, size).square), error = NearestFaces::error_of(d, size, own);
-    return wp::vec_t<2, wp::float32>(d - error, d + error);
+    N::lanes size;
+    const N::lanes d = N::F::root(N::measure(c, size).square), error = N::error_of(d, size, own);
+    return wp::vec_t<2, wp::float32>(N::F::first(d - error), N::F::first(d + error));
 }
 
 inline CUDA_CALLABLE wp::float32 load_upper(wp::array_t<wp::float32> upper, wp::int32 i) {

@@ -1,5 +1,5 @@
-// A warp's lists of a search for the nearest faces: a ring of node pairs, face pairs to be measured in float32 and those
-// to be measured in float64, each with a bound of its distance.
+// A warp's lists of a search for the nearest faces: a ring of node pairs, face pairs to be measured in float32 and
+// those to be measured in float64, each with a bound of its distance.
 #pragma once
 #include "builtin.h"
 #include "sizes.h"
@@ -13,6 +13,10 @@ inline CUDA_CALLABLE wp::uint64 nearest_stack() {
     static long long items[NEAREST_LENGTH + NEAREST_LENGTH / 2];
     return (wp::uint64)items;
 #endif
+}
+
+inline CUDA_CALLABLE wp::uint64 thread_lists(wp::array_t<wp::int64> memory, wp::int32 thread) {
+    return (wp::uint64)(memory.data + (wp::int64)thread * memory.shape[1]);
 }
 
 inline CUDA_CALLABLE wp::float32 read_bound(wp::uint64 items, wp::int32 i) {

@@ -150,6 +150,16 @@ def intersect_straddling_faces(
 
 
 @wp.func
+def load_face_pair(models: ModelPool, pose: PairPose, a: wp.vec4i, b: wp.vec4i):
+    """Return the corners of a face of A and of one of B, of their vertices, in A's frame."""
+    a0, a1 = load_vertex(models.vertex_pos, a[0]), load_vertex(models.vertex_pos, a[1])
+    b0, b1 = load_vertex(models.vertex_pos, b[0]), load_vertex(models.vertex_pos, b[1])
+    a2, b2 = load_vertex(models.vertex_pos, a[2]), load_vertex(models.vertex_pos, b[2])
+    r, t = pose.rotation, pose.translation
+    return a0, a1, a2, pose_point(r, t, b0), pose_point(r, t, b1), pose_point(r, t, b2)
+
+
+@wp.func
 def test_faces(
     mode: wp.int32,
     models: ModelPool,
@@ -161,12 +171,7 @@ def test_faces(
     """Test one active face of A against one of B in float64, in A's frame; return 1, 0 or UNCERTAIN."""
     a = states.face_corner[pose.corner_a + face_a]
     b = states.face_corner[pose.corner_b + face_b]
-    a0 = load_vertex(models.vertex_pos, a[0])
-    a1 = load_vertex(models.vertex_pos, a[1])
-    a2 = load_vertex(models.vertex_pos, a[2])
-    b0 = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[0]))
-    b1 = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[1]))
-    b2 = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[2]))
+    a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
     if mode == WITHIN:
         return triangles_near(pose.within, a0, a1, a2, b0, b1, b2)
     if mode == FLOAT32:

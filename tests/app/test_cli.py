@@ -101,6 +101,9 @@ def test_query_against_the_library(files, capsys):
         capsys, "query", "ball.obj", "ring.ply", "--pose", *map(str, (9, 0, 0, 0, 0, 0, 1)), "--output", "distance"
     )
     assert f"distance                {apart['distance']:.6g}\n" in shown and "\npoints:\n" in shown
+    asked = ["ball.obj", "ball.obj", "--pose", 1.5, 0, 0, 0, 0, 0, 1, "--solid", "--output", "distance", "--signed"]
+    deep = answer(capsys, *asked)
+    assert deep["intersects"] and -0.51 < deep["distance"] < -0.45
     asked = ["ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--lod-a", 0.2, "--output", "distance"]
     of_originals = answer(capsys, *asked, "--originals", "--relative", 0.3)
     assert of_originals["bracket"][0] <= apart["distance"] <= of_originals["bracket"][1]

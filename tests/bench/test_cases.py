@@ -109,6 +109,14 @@ def check_distance(rows):
         assert row["again_ms"] > 0 and row.get("fcl_differs", 0) < 1e-12
 
 
+def check_motion(rows):
+    queries, checked, *times = rows
+    assert "skipped" in queries or queries["missed"] == 0 < queries["contacts"]
+    assert checked["late"] == checked["missed"] == checked["early"] == 0 < checked["clear"] < checked["asked"]
+    assert len(times) == 15 and all(row["ms"] > 0 and row["undecided"] == 0 for row in times)
+    assert all(row.get("fcl_late", 0) == 0 for row in times)
+
+
 def check_build(rows):
     *rows, slopes = rows
     assert [row["faces"] for row in rows] == [168, 576] and slopes["build_ms_slope"] is not None

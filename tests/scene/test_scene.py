@@ -8,6 +8,7 @@ from helpers.scenes import TURN, add_objects, everything, pair_scene
 from oracles.triangle import pose_matrix
 
 import warp_abtree as ab
+from warp_abtree.scene import scene as scene_module
 
 
 def placed(scene):
@@ -81,6 +82,21 @@ def test_many_objects_are_added_as_one_by_one(device, matrices):
     assert everything(scenes[0]) == everything(scenes[1])
     np.testing.assert_array_equal(scenes[0].broad_phase(), scenes[1].broad_phase())
     assert scenes[0].lods.tolist() == [3, 2, 1, *lods] and scenes[0].worlds[3:].tolist() == worlds.tolist()
+
+
+def test_an_interrupt_while_objects_are_added_leaves_no_trace(device, monkeypatch):
+    def stop(lods, models):
+        yield 3
+        raise KeyboardInterrupt
+
+    scene = pair_scene(device)
+    before, models = everything(scene), [sample("torus"), sample("three")]
+    with monkeypatch.context() as patch:
+        patch.setattr(scene_module, "check_lods", stop)
+        with pytest.raises(KeyboardInterrupt):
+            scene.add_many(models, [STILL] * 2)
+    assert everything(scene) == before and len(scene.models) == 2
+    assert scene.add_many(models, [STILL] * 2).tolist() == [3, 4] and scene.object_model == [0, 1, 0, 2, 3]
 
 
 def test_one_value_serves_all_objects_that_are_added(device):

@@ -243,6 +243,33 @@ class CollisionManager:
             distance, pair, data = self._nearest(pairs, names)
         return _join(distance, (return_names, pair), (return_data, data))
 
+    def first_contact_internal(self, transforms, tolerance=1e-6, return_names=False):
+        """Return when two objects first collide as some move, from 0 to 1 and never late; 1 if none do. Waits.
+
+        What FCL's continuousCollide is for two objects. Objects move as in `Scene.first_contact`, and stay in place.
+
+        Args:
+            transforms: Where objects end in unit time, by name: rigid (4, 4) [world units]; others rest.
+            tolerance: What the time may be early by.
+            return_names: Return the two names too, a tuple in alphabetical order; None if none collide.
+
+        Raises:
+            ValueError: No object has a name, a transform is not rigid within 1e-6, or turns by half a revolution.
+        """
+        names, own = self._own()
+        ends = self._placed.poses[: self._placed.scene.object_count].copy()
+        for name, transform in transforms.items():
+            ends[self._slot(name)] = self._matrix(transform, name)
+        _, at_first = self.in_collision_internal(return_names=True)
+        time, pair = (0.0, min(at_first)) if at_first else (1.0, None)
+        if not at_first and len(own) > 1:
+            i, j = np.triu_indices(len(own), 1)
+            found = self._placed.scene.first_contact(np.stack([own[i], own[j]], 1), ends, tolerance)
+            k = int(found.time.argmin())
+            if not found.clear[k]:
+                time, pair = float(found.time[k]), tuple(sorted((names[i[k]], names[j[k]])))
+        return _join(time, (return_names, pair))
+
     # Computation.
 
     def _collide_with(self, guests, return_names, return_data):

@@ -76,7 +76,7 @@ class BroadPhase:
 
     def launch(self):
         """Box, rebuild, query, and sort if asked. Launches only, so that a graph can capture it."""
-        given = *self.guard.given(), self.pairs.ptr, self.wide
+        given = *self.guard.given(), self.pairs.ptr, self._options()
         launch_boxes, launch_find = self._commands.find_callables("pairs", given, self.device, self._make_launches)
         launch_boxes()
         self.bvh.rebuild()
@@ -84,6 +84,10 @@ class BroadPhase:
         launch_find()
         if self.sorts:
             self._sort()
+
+    def _options(self) -> tuple:
+        """Return the numbers that boxes depend on, by which launches are recorded anew."""
+        return (self.wide,)
 
     def _sort(self):
         room = len(self.pairs)

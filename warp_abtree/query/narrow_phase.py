@@ -43,11 +43,6 @@ WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 EXACT = int(PRECISIONS["exact"])
 
 
-def batch_of(source) -> Batch:
-    """Return a `Batch`, or that of a scene."""
-    return source if isinstance(source, Batch) else source.batch()
-
-
 class Query(QueryReadout):
     """Intersection of many object pairs as an operator: allocates once, launches many times.
 
@@ -92,7 +87,7 @@ class Query(QueryReadout):
         self._regime = current_regime()
         self.output, self.precision, self.device = output, precision, scene.device
         with loading(self.device, self._slow_kernels(within is not None)):
-            self.batch = batch = batch_of(scene)
+            self.batch = batch = scene if isinstance(scene, Batch) else scene.batch()
         if pairs is not None:
             pairs = batch.check_pairs(pairs)
         if within is not None:
@@ -106,7 +101,7 @@ class Query(QueryReadout):
         self.broad_phase: Any = None
         if pairs is None:
             self._excluded_count = len(batch.excluded)
-            self.broad_phase = BroadPhase(batch, room.pairs, sort_pairs, self._reach)
+            self.broad_phase = self._make_broad_phase(room.pairs, sort_pairs)
             self.broad_phase.guard = self.guard
             self.broad_phase.wide = 0.0 if within is None else 0.5 * float(within)
             self.pairs, self.pair_count = self.broad_phase.pairs, self.broad_phase.pair_count
@@ -139,6 +134,9 @@ class Query(QueryReadout):
             rows = np.zeros((count, 4))
             rows[:, 3] = 0.5 * self._gap if self._gap.ndim == 0 else self._gap
             self._reach = wp.array(rows, dtype=wp.vec4d, device=self.device)
+
+    def _make_broad_phase(self, capacity, sorts: bool) -> BroadPhase:
+        return BroadPhase(self.batch, capacity, sorts, self._reach)
 
     def _make_work(self):
         work, device = load_balance.Work(), self.device

@@ -11,6 +11,8 @@ from warp_abtree.query.request import CapacityError
 COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 # What a `DistanceQuery` has beside points.
 DISTANCES = ("distance", "bracket", "point_faces")
+# What a `FirstContactQuery` has.
+TIMES = ("time", "clear", "undecided")
 # Vectors of a contact.
 VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
 
@@ -66,6 +68,9 @@ class Found:
     distance: Any = None
     bracket: Any = None
     point_faces: Any = None
+    time: Any = None
+    clear: Any = None
+    undecided: Any = None
 
 
 class Result:
@@ -94,6 +99,9 @@ class Result:
         distance, bracket, point_faces: Least distance of each pair [world units], float64 (p,), proven lower and upper
             bound of it, (p, 2), and the faces that the nearest points lie on, int32 (p, 2), see
             `warp_abtree.query.distance`; None unless output is "distance".
+        time, clear, undecided: Time of first contact of each pair, float64 (p,) in [0, 1], never late and 1 where it is
+            proved clear of contact, bool (p,); where undecided, bool (p,), contact may be as much later as there is
+            time. See `warp_abtree.scene.first_contact`; None from other queries.
         node_tests, triangle_tests, float64_tests, exact_tests: Work done for each pair, int64 (p,): pairs of boxes,
             pairs of faces, those of them that float32 left uncertain, and of these those that took exact arithmetic. On
             the CPU a pair may take fewer of them after others of the same first object.
@@ -115,13 +123,16 @@ class Result:
     distance: Any
     bracket: Any
     point_faces: Any
+    time: Any
+    clear: Any
+    undecided: Any
     node_tests: Any
     triangle_tests: Any
     float64_tests: Any
     exact_tests: Any
 
     def __init__(self, found: Found, room: tuple, output: str):
-        for name in ("pairs", "any", "apart", "faces", "contacts", "pair_contacts", "points", *DISTANCES):
+        for name in ("pairs", "any", "apart", "faces", "contacts", "pair_contacts", "points", *DISTANCES, *TIMES):
             setattr(self, name, getattr(found, name))
         self.count: Any = found.count if output != "any" else None
         for name in COUNTERS:

@@ -11,6 +11,7 @@ from warp_abtree.query.distance import check_beyond, check_flags, check_toleranc
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import Result
+from warp_abtree.scene.first_contact import FirstContactQuery, check_path
 from warp_abtree.scene.originals import OriginalDistances
 
 
@@ -75,6 +76,20 @@ class KeptQueries:
         beyond = check_beyond(beyond, len(pairs))
         query = prepare_query(self.kept.pop(("distance", signed), None), self._scene, pairs, beyond, tolerances, signed)
         return self._run(("distance", signed), query, device)
+
+    def find_first_contacts(self, pairs, end_poses, tolerance, screw, linear, device: bool) -> Result:
+        """Answer `Scene.first_contact`; pairs are checked."""
+        check_path(screw, linear)
+        key = "first contact", bool(linear), pairs is None
+        query = self.kept.pop(key, None)
+        if isinstance(query, FirstContactQuery):
+            query.set_options(tolerance, screw)
+            query.set_end_poses(end_poses)
+            if pairs is not None and not query.is_asked(pairs, None):
+                query.replace_pairs(pairs, None)
+        else:
+            query = FirstContactQuery(self._scene, end_poses, pairs, tolerance=tolerance, screw=screw, linear=linear)
+        return self._run(key, query, device)
 
     @staticmethod
     def _one_for_all(distance, name: str) -> float:

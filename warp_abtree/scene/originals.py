@@ -31,15 +31,15 @@ class OriginalDistances:
 
     Args:
         batch: `Batch` whose objects are asked about, as posed.
+        at_lods: `DistanceQuery` of that batch, to be used from now on; None makes one when needed.
 
     Attributes:
         finest: Batch of the objects at their finest LODs, with tree states of those models that needed them; None
             before any did.
     """
 
-    def __init__(self, batch: Batch):
-        self.batch = batch
-        self._at_lods: DistanceQuery | None = None
+    def __init__(self, batch: Batch, at_lods: DistanceQuery | None = None):
+        self.batch, self._at_lods = batch, at_lods
         self._at_finest: DistanceQuery | None = None
         self.finest: Batch | None = None
         self._made = np.zeros(len(batch.models.lod_max), bool)
@@ -126,11 +126,13 @@ class OriginalDistances:
 
     def _bound(self, pairs, errors, whole, beyond, tolerances) -> tuple[dict, np.ndarray]:
         """Ask pairs at their LODs; return rows that hold for their originals, and which of them are decided."""
-        asked = {name: SEARCHED * value for name, value in tolerances.items()}
-        # Much over the errors it would leave open whether surfaces intersect at all.
-        asked["tolerance"] = min(asked["tolerance"], float(errors.max()))
-        if not any(asked.values()) and not whole.any():
-            asked["relative"] = ROUGH
+        asked = tolerances
+        if not whole.all():
+            # Much over the errors it would leave open whether surfaces intersect at all.
+            tolerance = min(SEARCHED * tolerances["tolerance"], float(errors.max()))
+            asked = {"tolerance": tolerance, "relative": SEARCHED * tolerances["relative"]}
+            if not any(asked.values()) and not whole.any():
+                asked["relative"] = ROUGH
         padded = beyond + STRETCH * errors if np.isfinite(beyond).all() else beyond
         query, n = self._ask_lods(pairs, padded, asked), len(pairs)
         found = query.run()

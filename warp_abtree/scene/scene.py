@@ -1,7 +1,5 @@
 """Scene: posed objects at levels of detail, and every question that one can ask of them."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import warp as wp
 
@@ -13,30 +11,10 @@ from warp_abtree.query.result import Result, contact_dtypes
 from warp_abtree.scene.kept_queries import KeptQueries
 from warp_abtree.scene.objects import ALL_BITS, ObjectList, check_columns, check_lods, check_models
 from warp_abtree.scene.poses import HostPoses, check_poses, device_rows, place_rows
+from warp_abtree.scene.tree_state import TreeState, read_tree_state
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.batch import Batch, check_pairs, exclusion_keys
 from warp_abtree.state.lod_update import LodUpdate
-
-
-@dataclass(frozen=True)
-class TreeState:
-    """The AB-Tree of one object at its LOD, on the host.
-
-    Attributes:
-        lod: Where it stands.
-        status: 0 inactive, 1 active, per heap node (the root is 1), int32.
-        lower, upper: Boxes [model units], model frame, float64 (nodes, 3), rounded outwards; (+inf, -inf) where
-            inactive.
-        skip: The node that a traversal visits in place of each, -1 where inactive, int32.
-        face_node: Leaf of each face, int32 (n_f,).
-    """
-
-    lod: int
-    status: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    skip: np.ndarray
-    face_node: np.ndarray
 
 
 class Scene:
@@ -342,6 +320,34 @@ class Scene:
             return self._queries.find_distances(pairs, options, device)
         return self._queries.find_hits(pairs, output, precision, contact_dtype, options, device)
 
+    def first_contact(
+        self, pairs, end_poses, tolerance=1e-6, screw=False, linear=False, device: bool = False
+    ) -> Result:
+        """Find when object pairs first touch on the way from their poses to end poses. Waits for the device.
+
+        In unit time each object's frame moves straight at constant speed, and turns the shortest way at constant
+        angular velocity; poses in the scene stay as they are.
+
+        Args:
+            pairs: As for `intersect`; None asks the broad phase for boxes that overlap on their way.
+            end_poses: Of all objects, as for `set_poses`.
+            tolerance: What a time may be early by, as a part of the motion, from 2^-40 up.
+            screw: Whether objects move on screws instead.
+            linear: Whether vertices move straight instead, from one posed mesh to the other.
+            device: As for `intersect`.
+
+        Returns:
+            `Result` with time, clear and undecided; what they are stands in `warp_abtree.scene.first_contact`.
+
+        Raises:
+            ValueError: Bad pairs, poses or tolerance, a scene without objects; an object of a pair that turns by half a
+                revolution, within 1e-6 rad, which has no shortest way.
+        """
+        check_device(self.device, "Scene.first_contact (FirstContactQuery.launch can)")
+        if pairs is not None:
+            pairs = check_pairs(pairs, self.object_count)
+        return self._queries.find_first_contacts(pairs, end_poses, tolerance, screw, linear, device)
+
     def tree_state(self, i) -> TreeState:
         """Return the AB-Tree of an object at its LOD. Waits for the device.
 
@@ -350,17 +356,4 @@ class Scene:
         """
         check_device(self.device, "Scene.tree_state")
         i = whole_number(i, "object", 0, self.object_count - 1)
-        batch = self.batch()
-        batch.catch_up()
-        states, slot = batch.states, batch.states.slots[batch.objects.state[i]]
-        model = self.models[slot.model]
-        lower, upper, skip = states.read_nodes(slot, model.tree.node_count)
-        lower, upper = lower + model.centre, upper + model.centre
-        return TreeState(
-            slot.lod,
-            (skip >= 0).astype(np.int32),
-            np.where(np.isinf(lower), lower, np.nextafter(lower, -np.inf)),
-            np.where(np.isinf(upper), upper, np.nextafter(upper, np.inf)),
-            skip,
-            model.tree.leaf_node.copy(),
-        )
+        return read_tree_state(self.batch(), self.models, i)

@@ -16,10 +16,11 @@ from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.sweep import NONE_REFUSED, pose_placer, report_chunk_kernel
 from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond, check_flags
 from warp_abtree.query.narrow_phase import Query
+from warp_abtree.scene.first_contact import FirstContactQuery, check_asked_contacts
 from warp_abtree.scene.originals import OriginalDistances
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
-from warp_abtree.scene.sweep_poses import DeviceRows, refuse_row, take_rows
+from warp_abtree.scene.sweep_poses import DeviceRows, refuse_row, take_ends, take_rows
 from warp_abtree.state.arrays import ObjectArrays
 from warp_abtree.state.batch import Batch
 
@@ -34,6 +35,7 @@ TOLERANCE = {7: QUATERNION_TOLERANCE, 16: RIGID_TOLERANCE}
 DISTANCE_ROWS = np.dtype(
     [("distance", np.float64), ("bracket", np.float64, 2), ("points", np.float64, (2, 3)), ("faces", np.int32, 2)]
 )
+CONTACT_ROWS = np.dtype([("time", np.float64), ("clear", bool), ("undecided", bool)])
 ANSWERS = {"any": np.dtype(bool), "count": np.dtype(np.int64)}
 
 _kept: dict[tuple, "_PosedModels"] = {}
@@ -116,9 +118,13 @@ class _ChunkQuery:
         self.device, self.room, self.objects = chunk.batch.device, chunk.room, chunk.batch.objects
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
-        self.originals = OriginalDistances(chunk.batch) if of_originals else None
+        self.originals: OriginalDistances | None = None
         if self.output == "distance":
-            self.query: Query = DistanceQuery(chunk.batch, self.pairs, signed=signed)
+            self.query: Query = (distances := DistanceQuery(chunk.batch, self.pairs, signed=signed))
+            if of_originals:
+                self.originals = OriginalDistances(chunk.batch, distances)
+        elif self.output == "first_contact":
+            self.query = FirstContactQuery(chunk.batch, None, self.pairs, linear=precision == "linear")
         else:
             within = 0.0 if proves else None
             self.query = Query(chunk.batch, self.output, pairs=self.pairs, precision=precision, within=within)
@@ -150,10 +156,11 @@ class _ChunkQuery:
             self.copies.record_event(slot.loaded)
             wp.get_stream(self.device).wait_event(slot.loaded)
 
-    def _place(self, slot):
+    def _place(self, slot, objects=None):
         slot.report.fill_(NONE_REFUSED)
         kernel = pose_placer(slot.poses.dtype, slot.width)
-        inputs = [wp.float64(TOLERANCE[slot.width]), slot.poses, self.objects.pool, slot.report]
+        objects = self.objects.pool if objects is None else objects
+        inputs = [wp.float64(TOLERANCE[slot.width]), slot.poses, objects, slot.report]
         wp.launch(kernel, self.count, inputs, device=self.device)
 
     def _launch(self, slot):
@@ -265,6 +272,25 @@ class _ChunkQuery:
             rows["points"], rows["faces"] = result.points, result.point_faces
         return found
 
+    def find_first_contacts(self, poses, ends, options):
+        """Return the rows of "first_contact" of all motions, from poses to ends."""
+        assert isinstance(self.query, FirstContactQuery)
+        self.query.set_options(**options)
+        found = np.empty(len(poses), CONTACT_ROWS)
+        for start in range(0, len(poses), self.room):
+            self.count = count = min(self.room, len(poses) - start)
+            for rows, objects, what in ((poses, None, "poses"), (ends, self.query.ends, "end_poses")):
+                slot = self._find_slots(rows)[0]
+                self._load(slot, rows, start, count)
+                self._place(slot, objects)
+                refused = int(slot.report.numpy()[0])
+                if refused != NONE_REFUSED:
+                    refuse_row(rows, start + refused, what)
+            result = self._run(self.pairs[:count])
+            for name in ("time", "clear", "undecided"):
+                found[name][start : start + count] = getattr(result, name)
+        return found
+
     def is_small(self):
         return len(self.query.hits.face) + len(self.query.hits.uncertain) <= KEPT_ROWS
 
@@ -297,8 +323,9 @@ def sweep(
 
     Poses are checked on the device; on CUDA transfers overlap with launches, except for "faces". The arrays of the last
     four pairs of models, LODs and devices stay on the device for the next call as long as both models live: models and
-    tree states, some 190 bytes a face, and 0.5 KB for each of at most 74,752 poses in chunks of three sizes. Whatever
-    the number of poses, a call needs no more memory besides its answer. Calls of several threads take turns on a GPU.
+    tree states, some 190 bytes a face, and 0.5 KB for each of at most 74,752 poses in chunks of three sizes; for
+    distances of originals tree states at the finest LODs, too. Whatever the number of poses, a call needs no more
+    memory besides its answer. Calls of several threads take turns on a GPU.
 
     Args:
         model_a, model_b: `Model`; may be the same.
@@ -306,31 +333,35 @@ def sweep(
             matrices, taken as they are; float32 or float64, of any framework. What lies on the GPU that asks is read
             where it is, Warp's transforms and matrices (p,) too.
         lod_a, lod_b: LODs; None is the finest.
-        output: "any", "count", "faces" or "distance".
+        output: "any", "count", "faces", "distance" or "first_contact", of B's motions from poses to end_poses.
         precision: As `Scene.intersect`, exact for A's vertices and the posed ones of B.
         device: Warp device; None for Warp's default.
         solid: Whether both are solids (`Scene.add`), or a bool for each; what "any" and "distance" answer for one
             inside the other stands in `warp_abtree.state.solids`, "count" and "faces" are of surfaces.
         options: tolerance, relative, beyond, each one number, and signed, as `DistanceQuery` takes them, and originals,
             as `Scene.intersect` does; for "distance" alone. within, one distance as `Scene.intersect` takes it; for
-            "any" and "count" alone.
+            "any" and "count" alone. end_poses, as poses, and tolerance, screw and linear, as `FirstContactQuery` takes
+            them; for "first_contact" alone.
 
     Returns:
         For "any" bool (p,), for "count" the intersecting face pairs of each pose, int64 (p,), for "faces" rows (pose,
         face of A, face of B), int32 (k, 3), sorted; with within, a structured array (p,) of any or count, and apart,
         whether the surfaces are proved farther apart. For "distance" a structured array (p,) of distance, bracket (2,),
-        points (2, 3) [A's frame] and faces (2,), see `warp_abtree.query.distance`.
+        points (2, 3) [A's frame] and faces (2,), see `warp_abtree.query.distance`. For "first_contact" one of time,
+        clear and undecided, see `warp_abtree.scene.first_contact`.
 
     Raises:
         TypeError: model_a or model_b is no Model; an option has another name.
         ValueError: Bad poses, the first of which is named, a LOD out of range, an unknown option or device.
         RuntimeError: A graph is being captured.
     """
-    check_asked(output, precision, options)
+    (check_asked_contacts if output == "first_contact" else check_asked)(output, precision, options)
     pair = Scene(device)
     check_device(pair.device, "ab.sweep")
     with device_lock(pair.device):
         poses = take_rows(poses, pair.device)
+        if output == "first_contact":
+            options["end_poses"] = take_ends(options["end_poses"], len(poses), pair.device)
         solids = solid if isinstance(solid, tuple | list) and len(solid) == 2 else (solid, solid)
         for model, lod, is_solid in zip((model_a, model_b), (lod_a, lod_b), solids):
             pair.add(model, lod=lod, solid=is_solid)
@@ -340,10 +371,12 @@ def sweep(
 def _sweep(pair, poses, asked, options):
     output, precision = asked
     within = options.get("within")
+    if output == "first_contact":
+        precision = "linear" if options.pop("linear", False) else "rigid"
     if len(poses) == 0:
-        empty = {"faces": np.empty((0, 3), np.int32), "distance": np.empty(0, DISTANCE_ROWS)}
-        kind = ANSWERS.get(output) if within is None else apart_rows(output)
-        return empty[output] if output in empty else np.empty(0, kind)
+        kinds = {**ANSWERS, "distance": DISTANCE_ROWS, "first_contact": CONTACT_ROWS}
+        kind = kinds.get(output) if within is None else apart_rows(output)
+        return np.empty((0, 3), np.int32) if output == "faces" else np.empty(0, kind)
     models = [pair.models[i] for i in pair.object_model]
     key = (*map(id, models), *pair.lods.tolist(), *pair.object_solid, pair.device.alias)
     # Taken out while in use: a call from another thread has its own, and one that fails leaves nothing behind.
@@ -356,6 +389,8 @@ def _sweep(pair, poses, asked, options):
     if output == "distance":
         tolerances = {name: value for name, value in options.items() if name in ("tolerance", "relative")}
         answers = query.find_distances(poses, tolerances, check_beyond(options.get("beyond")))
+    elif output == "first_contact":
+        answers = query.find_first_contacts(poses, options.pop("end_poses"), options)
     elif within is not None:
         answers = query.find_apart(poses, within)
     else:

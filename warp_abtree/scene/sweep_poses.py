@@ -39,26 +39,38 @@ class DeviceRows:
         return self.flat[self.width * i : self.width * (i + 1)].numpy()
 
 
-def take_rows(poses, device):
+def take_rows(poses, device, what="poses"):
     """Return poses where they are, or on the host.
 
     Raises:
         ValueError: No numbers, or another shape than (p, 7) and (p, 4, 4).
     """
-    rows = device_rows(poses, device)
+    rows = device_rows(poses, device, what)
     if rows is not None:
         return DeviceRows(rows)
-    rows = to_numpy(poses, "poses")
+    rows = to_numpy(poses, what)
     if rows.shape == (0,):
         rows = np.empty((0, 7))
     if not (rows.ndim == 2 and rows.shape[1] == 7) and not (rows.ndim == 3 and rows.shape[1:] == (4, 4)):
-        raise ValueError(f"poses: shape {rows.shape} is neither (p, 7) nor (p, 4, 4)")
+        raise ValueError(f"{what}: shape {rows.shape} is neither (p, 7) nor (p, 4, 4)")
     rows = rows.reshape(len(rows), 7 if rows.ndim == 2 else 16)
     return HostRows(rows if rows.dtype in SCALARS else rows.astype(np.float64))
 
 
-def refuse_row(poses, i):
+def refuse_row(poses, i, what="poses"):
     """Raise ValueError about row i, which is no pose."""
     row = np.asarray(poses.row(i), np.float64)
-    check_poses(row[None] if poses.width == 7 else row.reshape(1, 4, 4), first=i)
-    raise ValueError(f"poses: pose {i} is no pose")  # by rounding, where the host finds it just within
+    check_poses(row[None] if poses.width == 7 else row.reshape(1, 4, 4), what, first=i)
+    raise ValueError(f"{what}: pose {i} is no pose")  # by rounding, where the host finds it just within
+
+
+def take_ends(ends, count: int, device):
+    """Return where motions end as `take_rows` does.
+
+    Raises:
+        ValueError: As `take_rows`; or not as many as there are poses.
+    """
+    rows = take_rows(ends, device, "end_poses")
+    if len(rows) != count:
+        raise ValueError(f"end_poses: {len(rows)} given for {count} poses")
+    return rows

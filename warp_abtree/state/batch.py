@@ -132,8 +132,12 @@ class Batch:
         return ids
 
     def _fit_solids(self):
-        if self.solids is not None:
+        if self.solids is None:
+            return
+        try:
             self.solids.fit()
+        except RuntimeError:  # the LODs have changed all the same: the next launch tries again, and raises
+            self.solids.forget()
 
     def tear(self):
         """Say that an interruption has left tree states that no LOD explains."""

@@ -17,6 +17,7 @@ A cavity is outside: what lies in it intersects nothing. So is what two overlapp
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.arguments import check_device
 from warp_abtree.kernels.solid.components import Solids, find_component_kernel
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.state.arrays import ModelArrays, StateArrays
@@ -48,17 +49,22 @@ class SolidArrays:
         self.fit()
 
     def _allocate(self, slots: int, places: int):
+        made = {name: wp.zeros(slots, dtype=dtype, device=self.device) for name, dtype in SLOT_ARRAYS.items()}
+        made |= {name: wp.empty(places, dtype=wp.int32, device=self.device) for name in PLACE_ARRAYS}
         self.states.generation.advance()
-        for name, dtype in SLOT_ARRAYS.items():
-            setattr(self.pool, name, wp.zeros(slots, dtype=dtype, device=self.device))
-        for name in PLACE_ARRAYS:
-            setattr(self.pool, name, wp.empty(places, dtype=wp.int32, device=self.device))
+        for name, array in made.items():
+            setattr(self.pool, name, array)
 
     def fit(self):
-        """Make room for the components of all tree states that there are now."""
+        """Make room for the components of all tree states that there are now.
+
+        Raises:
+            RuntimeError: It takes room, and a graph is being captured; or the device is out of memory.
+        """
         slots = [slot.model for slot in self.states.slots]
-        if slots == self._slot_models or self.device.is_capturing:
+        if slots == self._slot_models:
             return
+        check_device(self.device, "making room for the components of solids")
         lengths = np.diff(self.models.vertex_start)[slots]
         first = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
         if first[-1] >= 2**31:

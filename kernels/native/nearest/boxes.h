@@ -1,10 +1,10 @@
 // Bounds of the distances of 16 pairs of boxes at a time, those of four items: as `bound_children` one by one.
 #pragma once
 #include "builtin.h"
+#include "nearest/slab_bounds.h"
 
-struct NearBoxes {
-    // Two siblings of one tree as they lie in memory; or a number each of A's eight nodes, then of B's.
-    typedef float lanes __attribute__((vector_size(64)));
+struct NearBoxes : SlabBounds {
+    // Lanes are two siblings of one tree as they lie in memory; or a number each of A's eight nodes, then of B's.
     typedef float loose __attribute__((vector_size(64), aligned(16)));
     typedef int bits __attribute__((vector_size(64)));
     typedef wp::int64 longs __attribute__((vector_size(64)));
@@ -21,12 +21,11 @@ struct NearBoxes {
         longs low, high;
         unsigned int used, leaves;
     };
-    lanes axes[3][3], sizes[3][3], shift[3];
-    float scale, wide, margin;
+    lanes sizes[3][3];
+    float wide;
     const char *tree_a, *tree_b;
-    wp::int64 slabs;    // where the slab of a node lies, from the node; 0 for none
-    bool normals;       // whether slabs are compared along the nodes' own normals
-    lanes way[3], far;  // direction from A for A's nodes, to A for B's, in their own frames; and -t . n of B's
+    wp::int64 slabs;  // where the slab of a node lies, from the node; 0 for none
+    bool normals;     // whether slabs are compared along the nodes' own normals
 
     static NearBoxes make(const wp::float32 (&r)[3][3], const wp::vec_t<3, float>& back,
                           const wp::vec_t<3, float>& there, float margin, float scale, const void* trees, int a,
@@ -60,19 +59,7 @@ struct NearBoxes {
         __builtin_prefetch(taken.b);
         return taken;
     }
-    // Take a unit vector of A's frame as the direction along which slabs are compared.
-    void look(const float* n) {
-        float back[3];
-        for (int i = 0; i < 3; ++i)
-            back[i] = axes[0][i][15] * n[0] + axes[1][i][15] * n[1] + axes[2][i][15] * n[2];
-        const float t = shift[0][15] * n[0] + shift[1][15] * n[1] + shift[2][15] * n[2];
-        for (int i = 0; i < 3; ++i) {
-            const float a = n[i], b = -back[i];
-            way[i] = lanes{a, a, a, a, a, a, a, a, b, b, b, b, b, b, b, b};
-        }
-        far = lanes{0, 0, 0, 0, 0, 0, 0, 0, t, t, t, t, t, t, t, t};
-    }
-    static lanes square(const lanes& x, const lanes& reach) {
+    static lanes square_gap(const lanes& x, const lanes& reach) {
         const lanes over = __builtin_elementwise_abs(x) - reach, gap = over > 0.0f ? over : lanes{};
         return gap * gap;
     }
@@ -107,13 +94,6 @@ struct NearBoxes {
                 __builtin_shufflevector(a, b, 8, 9, 10, 11, 12, 13, 14, 15, 24, 25, 26, 27, 28, 29, 30, 31);
         }
     }
-    static lanes of_a(const lanes& v) {
-        return __builtin_shufflevector(v, v, 0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
-    }
-    static lanes of_b(const lanes& v) {
-        return __builtin_shufflevector(v, v, 8, 9, 8, 9, 10, 11, 10, 11, 12, 13, 12, 13, 14, 15, 14, 15);
-    }
-#include "nearest/slab_bounds.h"
     Tested test(const Taken (&taken)[4]) const {
         lanes field[8], sum[3], size[3], apart[3], bound = {}, other = {};
         turn(taken, 0, field);
@@ -129,8 +109,8 @@ struct NearBoxes {
                 size_there = __builtin_elementwise_fma(sizes[i][k], size[k], size_there);
             }
             apart[i] = of_a(sum[i]) - of_b(sum_there);
-            bound += square(apart[i], of_a(size[i]) + of_b(size_there));
-            other += square(of_a(sum_there) - of_b(sum[i]), of_a(size_there) + of_b(size[i]));
+            bound += square_gap(apart[i], of_a(size[i]) + of_b(size_there));
+            other += square_gap(of_a(sum_there) - of_b(sum[i]), of_a(size_there) + of_b(size[i]));
         }
         Tested tested;
         tested.bound = bound > other ? bound : other;

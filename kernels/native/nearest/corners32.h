@@ -1,7 +1,6 @@
 // Corners of 16 pairs of faces at a time, for `NearestFaces`.
 #pragma once
 #include "builtin.h"
-#include "simd/float32.h"
 #include "nearest/faces32.h"
 
 struct NearestCorners {
@@ -15,7 +14,7 @@ struct NearestCorners {
     typedef int loose __attribute__((vector_size(64), aligned(4)));
     // The corners of up to 16 pairs of faces in A's frame, scaled; the first pair in the place of those that lack.
     static N::Corners load(const void* near, const void* ids, int start_a, int start_b, const wp::float32 (&r)[3][3],
-                        const wp::vec_t<3, float>& there, float scale, const wp::int64* items, int count) {
+                           const wp::vec_t<3, float>& there, float scale, const wp::int64* items, int count) {
         const longs lane = {0, 1, 2, 3, 4, 5, 6, 7}, some = longs{} + items[0];
         const bits low = (bits)(lane < count ? (longs) * (const loose*)items : some);
         const bits high = (bits)(lane + 8 < count ? (longs) * (const loose*)(items + 8) : some);

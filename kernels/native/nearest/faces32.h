@@ -1,7 +1,7 @@
-// Distances of pairs of faces in float32, within an error that is known: as `nearest_features`; of 16 pairs at a time
-// with the `Float32` of simd/float32.h, of one with that of nearest/float32.h.
+// Distances of pairs of faces in float32, within an error that is known: as `nearest_features`.
 #pragma once
 #include "builtin.h"
+#include "simd/float32.h"
 
 struct NearestFaces {
     typedef Float32 F;
@@ -25,7 +25,9 @@ struct NearestFaces {
     static CUDA_CALLABLE Point cross_exactly(const Point& u, const Point& v) {
         return Point{minor(u.y, v.z, u.z, v.y), minor(u.z, v.x, u.x, v.z), minor(u.x, v.y, u.y, v.x)};
     }
-    static CUDA_CALLABLE lanes largest(const Point& p) { return most(most(F::absolute(p.x), F::absolute(p.y)), F::absolute(p.z)); }
+    static CUDA_CALLABLE lanes largest(const Point& p) {
+        return most(most(F::absolute(p.x), F::absolute(p.y)), F::absolute(p.z));
+    }
 
     // Squared distances, and vectors from A's points to B's.
     struct Nearest {
@@ -33,14 +35,15 @@ struct NearestFaces {
         Point v;
     };
     static CUDA_CALLABLE Point between_edges(const Point& r, const Point& e, const Point& f, const lanes& inverse_e,
-                               const lanes& inverse_f) {
+                                             const lanes& inverse_f) {
         const Point n = F::cross(e, f);
         lanes s = clamp(F::dot(F::cross(r, f), n) * invert(F::dot(n, n)));
         const lanes t = clamp((F::dot(e, f) * s - F::dot(r, f)) * inverse_f);
         s = clamp(F::dot(add(r, t, f), e) * inverse_e);
         return add(add(r, t, f), -s, e);
     }
-    static CUDA_CALLABLE Point over_face(const Point& w, const Point& e1, const Point& e2, const Point& n, const lanes& inverse) {
+    static CUDA_CALLABLE Point over_face(const Point& w, const Point& e1, const Point& e2, const Point& n,
+                                         const lanes& inverse) {
         const Point level = add(w, -F::dot(w, n) * inverse, n);
         const lanes x = F::dot(cross_exactly(level, e2), n) * inverse;
         const lanes y = F::dot(cross_exactly(e1, level), n) * inverse;

@@ -47,7 +47,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
         waiting -= count;
         wp::int64* items = m.face + waiting;
         const N::Corners corners = NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a,
-                                           pose.corner_b, r, frame.translation, frame.scale, items, count);
+                                                        pose.corner_b, r, frame.translation, frame.scale, items, count);
         F::lanes size;
         const N::Nearest nearest = N::measure(corners, size);
         const F::lanes d = __builtin_elementwise_sqrt(nearest.square);

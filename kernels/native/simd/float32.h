@@ -1,7 +1,26 @@
-// 16 lanes of float32: numbers, masks and points, one of each of 16 face pairs.
+// Numbers, masks and points in float32: of 16 face pairs on the CPU, of one in each lane of a GPU.
 #pragma once
 #include "builtin.h"
 
+#if defined(__CUDA_ARCH__)
+struct Float32 {
+    typedef float lanes;
+    typedef bool bits;
+    struct Point {
+        float x, y, z;
+    };
+    static CUDA_CALLABLE float absolute(float v) { return v < 0.0f ? -v : v; }
+    static CUDA_CALLABLE float fuse(float a, float b, float c) { return fmaf(a, b, c); }
+    static CUDA_CALLABLE Point minus(const Point& a, const Point& b) { return Point{a.x - b.x, a.y - b.y, a.z - b.z}; }
+    static CUDA_CALLABLE Point cross(const Point& u, const Point& v) {
+        return Point{fuse(u.y, v.z, -(u.z * v.y)), fuse(u.z, v.x, -(u.x * v.z)), fuse(u.x, v.y, -(u.y * v.x))};
+    }
+    static CUDA_CALLABLE float dot(const Point& u, const Point& v) { return fuse(u.x, v.x, fuse(u.y, v.y, u.z * v.z)); }
+    static CUDA_CALLABLE float root(float v) { return sqrtf(v); }
+    static CUDA_CALLABLE float first(float v) { return v; }
+    static CUDA_CALLABLE Point choose(bool which, const Point& a, const Point& b) { return which ? a : b; }
+};
+#else
 struct Float32 {
     typedef float lanes __attribute__((vector_size(64)));
     typedef int bits __attribute__((vector_size(64)));
@@ -22,6 +41,8 @@ struct Float32 {
     };
 
     static lanes every(float v) { return lanes{v, v, v, v, v, v, v, v, v, v, v, v, v, v, v, v}; }
+    static lanes root(const lanes& v) { return __builtin_elementwise_sqrt(v); }
+    static float first(const lanes& v) { return v[0]; }
     static lanes absolute(const lanes& v) { return __builtin_elementwise_abs(v); }
     static lanes fuse(const lanes& a, const lanes& b, const lanes& c) { return __builtin_elementwise_fma(a, b, c); }
     static lanes sum_sizes(const Point& v) { return (absolute(v.x) + absolute(v.y)) + absolute(v.z); }
@@ -126,3 +147,4 @@ struct Float32 {
         last = choose(first, c[2], choose(second, c[0], c[1]));
     }
 };
+#endif

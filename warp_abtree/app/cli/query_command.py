@@ -10,6 +10,7 @@ from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISIONS, Parser
 from warp_abtree.app.cli.model_commands import active_count, load_model, lod_at
 from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.checks.atomic_write import atomic_write
+from warp_abtree.model.obj import MeshError
 from warp_abtree.scene.scene import Scene
 
 SUMMARY = "intersect two meshes, A at the origin and B at a pose"
@@ -21,7 +22,7 @@ EXAMPLES = (
     "bunny.npz bunny.npz --pose 2 0 0 0 0 0 1 --lod-a 0.1 --lod-b 0.1 --output distance --relative 0.05 --originals",
 )
 OUTPUTS = ("any", "count", "faces", "contacts", "distance")
-DISTANCE_OPTIONS = ("tolerance", "relative", "beyond", "originals")
+DISTANCE_OPTIONS = ("tolerance", "relative", "beyond", "originals", "signed")
 
 
 def add_arguments(sub: Parser):
@@ -41,6 +42,9 @@ def add_arguments(sub: Parser):
     sub.add_argument("--beyond", type=float, metavar="X", help="distance that is far enough (none)")
     about = "the distance of the original meshes, at whatever LODs A and B stand"
     sub.add_argument("--originals", action="store_true", default=None, help=about)
+    about = "negative distances, as deep as the deepest point of one solid in the other"
+    sub.add_argument("--signed", action="store_true", default=None, help=about)
+    sub.add_argument("--solid", action="store_true", help="what lies inside A or B, closed meshes, intersects it")
     about = "write face pairs and contacts as .csv, or the whole result as .npz"
     sub.add_file("--record", type=Path, metavar="FILE", help=about)
 
@@ -102,9 +106,11 @@ def _make_scene(options, progress):
     models.append(models[0] if options.b == options.a else load_model(options.b, progress))
     progress.close()
     lods = lod_at("--lod-a", models[0], options.lod_a), lod_at("--lod-b", models[1], options.lod_b)
-    scene.add(models[0], lod=lods[0])
+    scene.add(models[0], lod=lods[0], solid=options.solid)
     try:
-        scene.add(models[1], pose=options.pose, lod=lods[1])
+        scene.add(models[1], pose=options.pose, lod=lods[1], solid=options.solid)
+    except MeshError:
+        raise
     except ValueError as error:
         raise ValueError(f"--{error}") from None
     return scene, models

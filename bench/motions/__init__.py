@@ -1,0 +1,1 @@
+"""First contacts: public queries with ground truth, and the case `motion`."""

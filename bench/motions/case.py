@@ -1,0 +1,144 @@
+"""First contacts: public queries, random motions checked, and times against python-fcl's continuous collision.
+
+* queries: contacts missed and reported beyond the truth of `ccd_queries`, where its files are at hand.
+* checked: random motions of two meshes; late and missed by exact tests at many times, early by one after the tolerance.
+* times [ms] of a motion, by tolerance and LOD: meshes that pass each other (across), from far away, in a planner's
+  short steps; and a nut that turns on its bolt, which moves on a screw. On the CPU all on one core.
+"""
+
+import time
+
+import numpy as np
+import warp as wp
+
+import warp_abtree as ab
+from warp_abtree import testing
+
+from ..baselines.fcl import Fcl
+from ..cases.assembly import PITCH, place_nut, turned
+from ..meshes import ModelFolder, knot_model, mesh_file
+from ..shapes import longest_side, pose_matrices, random_directions, scene_of_poses
+from ..timing import medians, no_garbage_collection, one_core, time_in_turn
+from .ccd_queries import FOLDER, read_queries
+
+FULL = {"count": 65536, "checked": 1_000_000, "samples": 32, "repeats": 5, "turn": 163.0, "fcl": 0}
+CPU = FULL | {"count": 256, "checked": 20_000, "fcl": 8}
+QUICK = {"count": 3, "checked": 20, "samples": 4, "repeats": 1, "turn": 0.01, "fcl": 1}
+TOLERANCES, FRACTIONS = (1e-6, 1e-4, 1e-2), (1.0, 0.1, 0.01)
+IDENTITY = (0, 0, 0, 0, 0, 0, 1)
+NUT = ("factory-bolt-m20", "factory-nut-m20")
+
+
+def run(device, count=None, quick=False):
+    """Yield the rows; count is that of the checked motions."""
+    device = wp.get_device(device)
+    sizes = dict(QUICK if quick else CPU if device.is_cpu else FULL)
+    sizes["checked"] = count or sizes["checked"]
+    yield check_queries(device)
+    folder = ModelFolder(None)
+    at_hand = mesh_file("cow") and not quick
+    name, model = ("cow", folder.load(["cow"])) if at_hand else ("knot", knot_model(300))
+    yield check_motions(name, model, device, sizes)
+    ways = {"across": (1.2, 1.2), "from far": (4.0, 4.0), "steps": (1.2, None)}
+    for way, (first, last) in ways.items():
+        poses = random_motions(model, sizes["count"], first, last)
+        for fraction, tolerance in [(1.0, t) for t in TOLERANCES] + [(f, TOLERANCES[0]) for f in FRACTIONS[1:]]:
+            whole = fraction == 1.0 and tolerance == TOLERANCES[0]
+            yield measure(f"{name}, {way}", [model, model], poses, fraction, tolerance, device, sizes, whole)
+    if all(map(mesh_file, NUT)) and not quick:
+        models = [folder.load([part]) for part in NUT]
+        first = place_nut(models, 1)["free"]
+        angle = np.deg2rad(sizes["turn"])
+        last = turned(angle, z=first[0, 2, 3] + PITCH * angle / (2 * np.pi))[None]
+        yield measure(f"nut, {sizes['turn']:g} degrees", models, (first, last), 1.0, TOLERANCES[0], device, sizes, True)
+
+
+def random_motions(model, count, first, last, seed=0):
+    """Return poses (count, 7) of B at both ends, its origin so many sizes from A's; steps of a tenth for None."""
+    rng, size = np.random.default_rng(seed), longest_side(model)
+    turn = rng.normal(size=(2, count, 4))
+    ends = size * random_directions(rng, 2, count, 3) * np.array([first, last or first])[:, None, None]
+    if last is None:
+        ends[1] = ends[0] + 0.1 * size * random_directions(rng, count, 3)
+        turn[1] = turn[0] + 0.1 * np.linalg.norm(turn[0], axis=1, keepdims=True) * random_directions(rng, count, 4)
+    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
+    return tuple(np.concatenate(rows, 1) for rows in zip(ends, turn))
+
+
+def check_queries(device):
+    """Return how public queries are answered."""
+    row = {
+        "device": device.name,
+        "case": "queries",
+        "asked": 0,
+        "contacts": 0,
+        "missed": 0,
+        "beyond": 0,
+        "undecided": 0,
+    }
+    for path in sorted(FOLDER.glob("*.csv.gz")):
+        starts, ends, truth = read_queries(path)
+        _, clear, undecided = testing.advance_corners(starts, ends, TOLERANCES[0], device)
+        row["asked"] += len(truth)
+        row["contacts"] += int(truth.sum())
+        row["missed"] += int((truth & clear).sum())
+        row["beyond"] += int((~truth & ~clear).sum())
+        row["undecided"] += int(undecided.sum())
+    return row if row["asked"] else {"case": "queries", "skipped": "no files: set ABTREE_CCD to their folder"}
+
+
+def between(first, last, times):
+    """Return poses (n, 7) at times (n,), each of its own motion: the origin straight, the shortest turn."""
+    turns = first[:, 3:], last[:, 3:] * np.sign((first[:, 3:] * last[:, 3:]).sum(1))[:, None]
+    cosine = (turns[0] * turns[1]).sum(1)
+    angle = np.arctan2(np.linalg.norm(turns[1] - cosine[:, None] * turns[0], axis=1), cosine)[:, None]
+    t = times[:, None]
+    turn = (np.sin((1 - t) * angle) * turns[0] + np.sin(t * angle) * turns[1]) / np.sin(angle)
+    return np.concatenate([(1 - t) * first[:, :3] + t * last[:, :3], turn], 1)
+
+
+def check_motions(name, model, device, sizes):
+    """Return how many of random motions are late, missed, or early by more than the tolerance, by exact tests."""
+    first, last = random_motions(model, sizes["checked"], 1.0, 1.0, seed=1)
+    rows = ab.sweep(model, model, first, end_poses=last, output="first_contact", device=device)
+    late = missed = 0
+    for part in np.linspace(0, 1, sizes["samples"]):
+        hit = ab.sweep(model, model, between(first, last, part * rows["time"]), device=device)
+        late += int((hit & ~rows["clear"] & (rows["time"] > 0)).sum())
+        missed += int((hit & rows["clear"]).sum())
+    touching = ~rows["clear"] & ~rows["undecided"] & (rows["time"] > 0)
+    later = np.minimum(rows["time"] + TOLERANCES[0], 1)
+    meets = ab.sweep(model, model, between(first, last, later), device=device)
+    row = {"device": device.name, "case": f"checked, {name}", "asked": len(rows), "clear": int(rows["clear"].sum())}
+    row |= {"at_start": int((rows["time"] == 0).sum()), "undecided": int(rows["undecided"].sum())}
+    return row | {"late": late, "missed": missed, "early": int((touching & ~meets).sum())}
+
+
+def measure(name, models, poses, fraction, tolerance, device, sizes, with_fcl):
+    """Return times of a motion [ms], of all at once."""
+    first, last = (rows if rows.ndim == 3 else pose_matrices(rows) for rows in poses)
+    scene, pairs = scene_of_poses(device, *models, [IDENTITY] * len(first))
+    scene.set_poses(np.concatenate([np.eye(4)[None], first]))
+    scene.set_lods([models[0].lod_for(fraction=fraction)] + [models[1].lod_for(fraction=fraction)] * len(first))
+    query = ab.FirstContactQuery(scene, np.concatenate([np.eye(4)[None], last]), pairs, tolerance=tolerance)
+    found = query.run()
+    row = {"device": device.name, "case": name, "motions": len(pairs), "fraction": fraction, "tolerance": tolerance}
+    row |= {"clear": int(found.clear.sum()), "at_start": int((found.time == 0).sum())}
+    row |= {"undecided": int(found.undecided.sum()), "node_tests": round(float(found.node_tests.mean()), 1)}
+    row |= {"face_tests": round(float(found.triangle_tests.mean()), 1)}
+    with one_core(), no_garbage_collection():
+        times = medians(time_in_turn({"ours": query.launch}, device, sizes["repeats"], time.thread_time))
+        row["ms"] = float(f"{times['ours'] / len(pairs):.4g}")
+        if with_fcl and device.is_cpu:
+            try:
+                some = slice(0, sizes["fcl"])
+                fcl = Fcl(*[model.mesh_at(model.lod_max)[:2] for model in models], first[some])
+                start = time.thread_time()
+                answers = fcl.first_contacts(last[some])
+                row["fcl_ms"] = float(f"{1e3 * (time.thread_time() - start) / len(answers):.4g}")
+                row["fcl_late"] = int((answers > found.time[some] + 1e-3).sum())
+                row["fcl_early"] = int((answers < found.time[some] - 1e-3).sum())
+                row["fcl_ratio"] = round(row["fcl_ms"] / row["ms"], 2)
+            except ImportError as error:
+                row["fcl_skipped"] = str(error)
+    return row

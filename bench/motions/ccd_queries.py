@@ -1,0 +1,37 @@
+"""Queries of continuous collision detection with ground truth in rational numbers: Sample-Queries of Tight-Inclusion.
+
+Files NAME.vertex-face|edge-edge.N.csv.gz, in the folder that the environment variable ABTREE_CCD names, else in
+../shared/ccd beside the checkout. Eight rows a query, four points at first and at last: numerator and denominator of x,
+y and z, then 1 if they touch at some time while points move straight.
+"""
+
+import csv
+import gzip
+import os
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+FOLDER = Path(os.environ.get("ABTREE_CCD", Path(__file__).resolve().parents[3] / "shared" / "ccd"))
+# Which rows at either time are the corners of A's face and of B's, a vertex or an edge as a face without area.
+CORNERS = {"vertex-face": (0, 0, 0, 1, 2, 3), "edge-edge": (0, 1, 1, 2, 3, 3)}
+
+
+def read_queries(path: Path):
+    """Return corners at first and at last, float64 (p, 6, 3), and whether they touch, bool (p,).
+
+    Raises:
+        ValueError: A coordinate that float64 does not hold.
+    """
+    with gzip.open(path, "rt") as file:
+        rows = [[int(x) for x in row] for row in csv.reader(file)]
+    points = []
+    for row in rows:
+        exact = [Fraction(row[2 * k], row[2 * k + 1]) for k in range(3)]
+        points.append([float(x) for x in exact])
+        if any(Fraction(x) != y for x, y in zip(points[-1], exact)):
+            raise ValueError(f"{path}: {row} is beyond float64")
+    at = np.array(points).reshape(-1, 2, 4, 3)
+    corners = CORNERS[path.name.split(".")[1]]
+    return at[:, 0, corners], at[:, 1, corners], np.array([row[6] for row in rows[::8]]) != 0

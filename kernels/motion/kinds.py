@@ -1,0 +1,117 @@
+"""The steps of the search for either kind of motion, by the type of the motion that they are given."""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.motion.face_pair import advance_pair
+from warp_abtree.kernels.motion.linear import (
+    LinearMotion,
+    advance_linear_children,
+    advance_linear_pair,
+    bound_linear_motion,
+    start_linear_motion,
+)
+from warp_abtree.kernels.motion.node_pair import advance_children, box_motion
+from warp_abtree.kernels.motion.path import Motion, Paths, bound_motion, place_motion, start_motion
+from warp_abtree.kernels.poses import PairPose
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.func
+def make_motion(
+    kind: Motion,
+    paths: Paths,
+    ends: ObjectPool,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pose: PairPose,
+    pair: wp.vec2i,
+):
+    """Return the motion of objects a < b of the kind that is named."""
+    return bound_motion(start_motion(paths, models, states, objects, pair), states, pose)
+
+
+@wp.func
+def make_motion(  # noqa: F811 - Warp takes the one for the type
+    kind: LinearMotion,
+    paths: Paths,
+    ends: ObjectPool,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pose: PairPose,
+    pair: wp.vec2i,
+):
+    return bound_linear_motion(start_linear_motion(ends, models, states, objects, pair), states, pose)
+
+
+@wp.func
+def has_way(kind: Motion, paths: Paths, pair: wp.vec2i):
+    """Return whether neither object turns by half a revolution, where that matters."""
+    return paths.angle[pair[0]] >= wp.float64(0.0) and paths.angle[pair[1]] >= wp.float64(0.0)
+
+
+@wp.func
+def has_way(kind: LinearMotion, paths: Paths, pair: wp.vec2i):  # noqa: F811
+    return True
+
+
+@wp.func
+def advance_nodes(
+    states: StatePool,
+    pose: PairPose,
+    motion: Motion,
+    t: wp.float32,
+    best: wp.float64,
+    item: wp.int64,
+    live: wp.int32,
+):
+    """Compare what an item names from t on, see `node_pair.advance_children`."""
+    boxes = box_motion(motion, place_motion(motion, wp.float64(t)))
+    items, kinds, times, tests = advance_children(states, pose, motion, boxes, t, best, item, live)
+    return items, kinds, times, tests
+
+
+@wp.func
+def advance_nodes(  # noqa: F811
+    states: StatePool,
+    pose: PairPose,
+    motion: LinearMotion,
+    t: wp.float32,
+    best: wp.float64,
+    item: wp.int64,
+    live: wp.int32,
+):
+    items, kinds, times, tests = advance_linear_children(states, pose, motion, t, best, item, live)
+    return items, kinds, times, tests
+
+
+@wp.func
+def advance_faces(
+    tolerance: wp.float64,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    motion: Motion,
+    faces: wp.vec2i,
+    start: wp.float64,
+    best: wp.float64,
+):
+    """Return the `Contact` of a face of A and one of B."""
+    return advance_pair(tolerance, models, states, pose, motion, faces[0], faces[1], start, best)
+
+
+@wp.func
+def advance_faces(  # noqa: F811
+    tolerance: wp.float64,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    motion: LinearMotion,
+    faces: wp.vec2i,
+    start: wp.float64,
+    best: wp.float64,
+):
+    return advance_linear_pair(tolerance, models, states, pose, motion, faces[0], faces[1], start, best)

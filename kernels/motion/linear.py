@@ -1,0 +1,307 @@
+"""Motions whose vertices move straight, from a posed mesh to the same mesh posed elsewhere: nothing bends.
+
+In A's first frame A's point a lies at a + t (way_a a + shift_a), and B's point b at R0 b + x0 + t (way_b b + shift_b):
+affine in both, so an image of a box at a time, and one of the speeds of its points, are boxes as in `traversal.boxes`.
+They are compared along the axes of A's first frame and the columns of R0, which rest. A gap g between corners that
+grows at a rate s stays open until g + s h = 0; of faces it is taken for each of nine pairs of corners. Roundings as in
+`path`; in float32 both boxes have an image now, each as wide as the margin there says.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.motion.face_pair import (
+    AXIS_COUNT,
+    CLEAR,
+    EARLIER,
+    STEPS_MAX,
+    TIME_DOWN,
+    TOUCHES,
+    UNDECIDED,
+    Contact,
+    axis_of,
+    load_corners,
+    map_corners,
+    separating_direction,
+    step_along,
+)
+from warp_abtree.kernels.motion.node_pair import go_on, later, longest_step
+from warp_abtree.kernels.motion.path import BEND_LEAST, SCALE_MAX
+from warp_abtree.kernels.poses import ROUNDING_32, PairPose, reach_box
+from warp_abtree.kernels.traversal.boxes import pose_box
+from warp_abtree.kernels.traversal.node_pair import INDEX_MASK, four_items, item_first, item_second
+from warp_abtree.kernels.traversal.nodes import Node, load_constant_node, load_node
+from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, corners_type, largest
+from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.struct
+class LinearMotion:
+    """How the points of A and B move in A's first frame, and what is bounded over all of it."""
+
+    first: wp.mat33d  # R0
+    offset: wp.vec3d  # x0
+    way_a: wp.mat33d  # what the way of A's points has of their coordinates
+    shift_a: wp.vec3d  # and what not
+    way_b: wp.mat33d  # of B's points
+    shift_b: wp.vec3d  # and what not
+    centre_a: wp.vec3d  # of A's model
+    centre_b: wp.vec3d  # of B's model
+    slack: wp.float64  # that gaps between faces err by [model units]
+    scale: wp.float64  # power of two that boxes are scaled by
+    margin: wp.float32  # that boxes are widened by, scaled
+    speed_margin: wp.float32  # that their speeds are, scaled
+
+
+@wp.struct
+class Image:
+    """Boxes, or speeds of their points, along three axes: matrix x + shift, of A without one."""
+
+    a: wp.mat33  # of A's boxes about its centre
+    b: wp.mat33  # of B's
+    shift: wp.vec3  # of B's centre from A's
+
+
+@wp.struct
+class Seen:
+    """A box along three axes, and its speed."""
+
+    sum: wp.vec3  # twice its centre
+    size: wp.vec3  # its width
+    speed: wp.vec3  # twice that of its centre
+    spread: wp.vec3  # twice what speeds of its points differ from that
+
+
+@wp.func
+def start_linear_motion(
+    ends: ObjectPool, models: ModelPool, states: StatePool, objects: ObjectPool, pair: wp.vec2i
+) -> LinearMotion:
+    """Return the motion of objects a < b, but for its bounds."""
+    a, b = pair[0], pair[1]
+    home = wp.transpose(objects.rotation[a])
+    motion = LinearMotion()
+    motion.first = home * objects.rotation[b]
+    motion.offset = home * (objects.position[b] - objects.position[a])
+    motion.way_a = home * ends.rotation[a] - home * objects.rotation[a]
+    motion.shift_a = home * (ends.position[a] - objects.position[a])
+    motion.way_b = home * ends.rotation[b] - motion.first
+    motion.shift_b = home * (ends.position[b] - objects.position[b])
+    motion.centre_a = models.centre[states.model[objects.state[a]]]
+    motion.centre_b = models.centre[states.model[objects.state[b]]]
+    return motion
+
+
+@wp.func
+def bound_linear_motion(before: LinearMotion, states: StatePool, pose: PairPose) -> LinearMotion:
+    """Return a motion with its bounds."""
+    motion = before
+    root_a = load_node(states, pose.node_a + 1)
+    root_b = load_node(states, pose.node_b + 1)
+    reach_a, reach_b = reach_box(root_a.lower, root_a.upper), reach_box(root_b.lower, root_b.upper)
+    two = wp.float64(2.0)
+    away = largest(motion.centre_a) + largest(motion.centre_b)
+    travel = largest(motion.shift_a) + largest(motion.shift_b)
+    sizes = ((reach_a + reach_b) + away) + (largest(motion.offset) + travel)
+    motion.slack = two * POSE_ROUNDING * sizes
+    far = two * (largest(motion.offset) + travel) + two * away
+    most = wp.max(wp.max(reach_a, reach_b), far)
+    power = wp.cast(wp.cast(most, wp.int64) & EXPONENT_BITS, wp.float64)
+    motion.scale = wp.min(wp.float64(1.0) / power, SCALE_MAX)
+    margin = motion.slack + two * ROUNDING_32 * ((reach_a + reach_b) + far)
+    motion.margin = wp.float32(margin * motion.scale)
+    # Ways differ from no matrix by more than 2 in any entry: speeds err by what coordinates do, twice.
+    motion.speed_margin = wp.float32(two * margin * motion.scale)
+    return motion
+
+
+@wp.func
+def see(node: Node, motion: LinearMotion, at: wp.mat33, shift: wp.vec3, way: wp.mat33, speed: wp.vec3) -> Seen:
+    s = wp.float32(motion.scale)
+    lower, upper = node.lower * s, node.upper * s
+    placed = pose_box(lower, upper, at, shift, motion.margin)
+    moved = pose_box(lower, upper, way, speed, motion.speed_margin)
+    seen = Seen()
+    seen.sum = placed.posed_sum
+    seen.size = placed.posed_size
+    seen.speed = moved.posed_sum
+    seen.spread = moved.posed_size
+    return seen
+
+
+@wp.func
+def compare(a: Seen, b: Seen, before: wp.vec2) -> wp.vec2:
+    """Return the longest step and the widest gap along three axes, and of what was found before."""
+    bend = wp.float32(BEND_LEAST)
+    return longest_step(b.sum - a.sum, a.size + b.size, b.speed - a.speed, a.spread + b.spread, bend, before)
+
+
+@wp.func
+def image_of(a: wp.mat33d, b: wp.mat33d, shift: wp.vec3d, scale: wp.float64) -> Image:
+    image = Image()
+    image.a = wp.mat33(a)
+    image.b = wp.mat33(b)
+    image.shift = wp.vec3(shift * scale)
+    return image
+
+
+@wp.func
+def steps_along(
+    motion: LinearMotion, at: Image, way: Image, a0: Node, a1: Node, b0: Node, b1: Node, s: wp.vec4, g: wp.vec4
+):
+    """Return the longest steps and widest gaps of four pairs of boxes along three axes, and of those before."""
+    o = wp.vec3()
+    x0, x1 = see(a0, motion, at.a, o, way.a, o), see(a1, motion, at.a, o, way.a, o)
+    y0, y1 = see(b0, motion, at.b, at.shift, way.b, way.shift), see(b1, motion, at.b, at.shift, way.b, way.shift)
+    p00, p01 = compare(x0, y0, wp.vec2(s[0], g[0])), compare(x0, y1, wp.vec2(s[1], g[1]))
+    p10, p11 = compare(x1, y0, wp.vec2(s[2], g[2])), compare(x1, y1, wp.vec2(s[3], g[3]))
+    return wp.vec4(p00[0], p01[0], p10[0], p11[0]), wp.vec4(p00[1], p01[1], p10[1], p11[1])
+
+
+@wp.func
+def advance_linear_children(
+    states: StatePool,
+    pose: PairPose,
+    motion: LinearMotion,
+    t: wp.float32,
+    best: wp.float64,
+    item: wp.int64,
+    live: wp.int32,
+):
+    """Compare what an item names from t on, as `node_pair.advance_children`."""
+    x, y = item_first(item), item_second(item)
+    at_a, at_b = pose.node_a + (x & INDEX_MASK), pose.node_b + (y & INDEX_MASK)
+    a0 = load_constant_node(states, at_a)
+    a1 = load_constant_node(states, at_a + wp.where(x < 0, 1, 0))
+    b0 = load_constant_node(states, at_b)
+    b1 = load_constant_node(states, at_b + wp.where(y < 0, 1, 0))
+    time = wp.float64(t)
+    p = wp.identity(n=3, dtype=wp.float64) + time * motion.way_a
+    q = motion.first + time * motion.way_b
+    speed = (motion.way_b * motion.centre_b + motion.shift_b) - (motion.way_a * motion.centre_a + motion.shift_a)
+    shift = ((motion.first * motion.centre_b + motion.offset) - motion.centre_a) + time * speed
+    back = wp.transpose(motion.first)
+    s, g = steps_along(
+        motion,
+        image_of(p, q, shift, motion.scale),
+        image_of(motion.way_a, motion.way_b, speed, motion.scale),
+        a0, a1, b0, b1, wp.vec4(), wp.vec4(),
+    )  # fmt: skip
+    s, g = steps_along(
+        motion,
+        image_of(back * p, back * q, back * shift, motion.scale),
+        image_of(back * motion.way_a, back * motion.way_b, back * speed, motion.scale),
+        a0, a1, b0, b1, s, g,
+    )  # fmt: skip
+    times = wp.vec4(later(t, s[0]), later(t, s[1]), later(t, s[2]), later(t, s[3]))
+    scale = wp.float32(motion.scale)
+    i00, k00 = go_on(live, a0, b0, scale, g[0], t, times[0], best)
+    i01, k01 = go_on(y & live, a0, b1, scale, g[1], t, times[1], best)
+    i10, k10 = go_on(x & live, a1, b0, scale, g[2], t, times[2], best)
+    i11, k11 = go_on(x & y & live, a1, b1, scale, g[3], t, times[3], best)
+    tests = -((live >> 31) + ((y & live) >> 31) + ((x & live) >> 31) + ((x & y & live) >> 31))
+    return four_items(i00, i01, i10, i11), wp.vec4i(k00, k01, k10, k11), times, tests
+
+
+@wp.func
+def straight_step(
+    slack: wp.float64, n: wp.vec3d, a: corners_type, b: corners_type, way_a: corners_type, way_b: corners_type
+):
+    """Return how long corners stay apart for certain along a unit vector n, from A's to B's; ways err by slack."""
+    step = wp.float64(wp.inf)
+    for j in range(3):
+        place, speed = wp.dot(n, a[j]) + slack, wp.dot(n, way_a[j]) + slack
+        for k in range(3):
+            step = wp.min(step, step_along(wp.dot(n, b[k]) - place, wp.dot(n, way_b[k]) - speed, wp.float64(0.0)))
+    return step
+
+
+@wp.func
+def advance_straight(
+    tolerance: wp.float64,
+    slack: wp.float64,
+    a: corners_type,
+    b: corners_type,
+    way_a: corners_type,
+    way_b: corners_type,
+    start: wp.float64,
+    best: wp.float64,
+):
+    """Return when two faces whose corners move straight first touch, as `face_pair.advance_faces`."""
+    contact = Contact()
+    t, steps = wp.float64(start), wp.int32(0)
+    while steps < STEPS_MAX:
+        steps += 1
+        x, y = a + t * way_a, b + t * way_b
+        n = separating_direction(x, y)
+        step = straight_step(slack, n, x, y, way_a, way_b) * EARLIER
+        contact.time = t
+        contact.end = UNDECIDED
+        then = (t + step) * TIME_DOWN
+        if then <= t:
+            k = wp.int32(0)
+            while k < AXIS_COUNT:
+                n = axis_of(x, y, k)
+                step = wp.max(step, straight_step(slack, n, x, y, way_a, way_b) * EARLIER)
+                step = wp.max(step, straight_step(slack, -n, x, y, way_a, way_b) * EARLIER)
+                k += 1
+            then = (t + step) * TIME_DOWN
+        if then <= t:
+            contact.end = TOUCHES
+            return contact
+        if step < tolerance:
+            soon = wp.min(t + tolerance, wp.float64(1.0))
+            p, q = a + soon * way_a, b + soon * way_b
+            if float64_filter_triangles(p[0], p[1], p[2], q[0], q[1], q[2]) == 1:
+                contact.end = TOUCHES
+                return contact
+        if then > best:
+            contact.end = CLEAR
+            return contact
+        t = then
+    return contact
+
+
+@wp.func
+def advance_linear_pair(
+    tolerance: wp.float64,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    motion: LinearMotion,
+    face_a: wp.int32,
+    face_b: wp.int32,
+    start: wp.float64,
+    best: wp.float64,
+):
+    """Return the `Contact` of a face of A and one of B."""
+    a = load_corners(models, states, pose.corner_a + face_a)
+    b = load_corners(models, states, pose.corner_b + face_b)
+    way_a = map_corners(motion.way_a, motion.shift_a, a)
+    way_b = map_corners(motion.way_b, motion.shift_b, b)
+    b = map_corners(motion.first, motion.offset, b)
+    return advance_straight(tolerance, motion.slack, a, b, way_a, way_b, start, best)
+
+
+@wp.kernel
+def advance_corners_kernel(
+    tolerance: wp.float64,
+    rounding: wp.float64,
+    starts: wp.array2d(dtype=wp.vec3d),
+    ends: wp.array2d(dtype=wp.vec3d),
+    contact_out: wp.array(dtype=Contact),
+):
+    """Find when two faces first touch whose corners, A's and then B's, move straight, a pair a thread."""
+    i = wp.tid()
+    a = wp.matrix_from_rows(starts[i, 0], starts[i, 1], starts[i, 2])
+    b = wp.matrix_from_rows(starts[i, 3], starts[i, 4], starts[i, 5])
+    c = wp.matrix_from_rows(ends[i, 0], ends[i, 1], ends[i, 2])
+    d = wp.matrix_from_rows(ends[i, 3], ends[i, 4], ends[i, 5])
+    size = wp.float64(0.0)
+    for k in range(6):
+        size = wp.max(size, wp.max(largest(starts[i, k]), largest(ends[i, k])))
+    contact = advance_straight(tolerance, rounding * size, a, b, c - a, d - b, wp.float64(0.0), wp.float64(1.0))
+    if contact.end == CLEAR:
+        contact.time = wp.float64(1.0)
+    contact_out[i] = contact

@@ -1,0 +1,181 @@
+"""Until when a node pair stays apart, and the step of the search: a node pair, up to four pairs of children.
+
+Items are those of `traversal.node_pair`, each with a time up to which its boxes are proved apart. At that time boxes
+are compared along the axes of both frames, as in `traversal.boxes`; along each the gap g, the least speed s at which it
+grows and the bound M of accelerations (`path`) give a time to which it stays open, and the latest counts. All numbers
+but times are twice what they say, and scaled.
+
+An axis of A's frame is fixed there, and B's points move: their speeds along it are those of a box whose coordinates are
+K b + v, as their coordinates are R b + x. So one function poses boxes and speeds, and float32 errs in speeds as it does
+in coordinates, by 9 u of the sizes added up; twice that is allowed for. The root is a sum, products and quotients of
+numbers that are not negative, so it errs by 8 u of itself, and `LATER` takes off 16 u.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.arrays import StatePool
+from warp_abtree.kernels.distance.node_pair import DROPPED, FACES, NODES, item_of
+from warp_abtree.kernels.motion.path import Moment, Motion
+from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.boxes import PosedBox, pose_box
+from warp_abtree.kernels.traversal.node_pair import INDEX_MASK, four_items, item_first, item_second, pack_item
+from warp_abtree.kernels.traversal.nodes import Node, load_constant_node
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+LATER, SUM_DOWN = wp.constant(wp.float32(1.0 - 2.0**-20)), wp.constant(wp.float32(1.0 - 2.0**-22))
+# Boxes farther apart than so much of the larger one are compared again at the later time; else their children are.
+AGAIN = wp.constant(wp.float32(0.5))
+
+
+@wp.struct
+class BoxMotion:
+    """A `Moment` for boxes: float32, about the models' centres, scaled."""
+
+    rotation: wp.mat33  # of B in A's frame
+    shift: wp.vec3  # of B to A
+    back: wp.vec3  # of A to B
+    spin: wp.mat33  # speeds of B's points in A's frame; the transpose of A's in B's
+    speed: wp.vec3  # the same, of B's centre
+    back_speed: wp.vec3  # of A's centre
+
+
+@wp.struct
+class MovingBox:
+    """A box in its own frame, in the other's, and how fast its points move there."""
+
+    at: PosedBox  # in both frames
+    speed: wp.vec3  # twice that of its centre, other frame
+    spread: wp.vec3  # twice what speeds of its points differ from that
+
+
+@wp.func
+def box_motion(motion: Motion, m: Moment):
+    """Return a moment for boxes."""
+    r, k = m.rotation, m.spin
+    shift = (r * motion.centre_b + m.shift) - motion.centre_a
+    speed = k * motion.centre_b + m.speed
+    back = wp.transpose(r)
+    boxes = BoxMotion()
+    boxes.rotation = wp.mat33(r)
+    boxes.spin = wp.mat33(k)
+    boxes.shift = wp.vec3(shift * motion.scale)
+    boxes.back = wp.vec3(-(back * shift) * motion.scale)
+    boxes.speed = wp.vec3(speed * motion.scale)
+    boxes.back_speed = wp.vec3(-(wp.transpose(k) * shift + back * speed) * motion.scale)
+    return boxes
+
+
+@wp.func
+def move_box(
+    node: Node, motion: Motion, rotation: wp.mat33, shift: wp.vec3, spin: wp.mat33, speed: wp.vec3
+) -> MovingBox:
+    s = wp.float32(motion.scale)
+    lower, upper = node.lower * s, node.upper * s
+    moved = pose_box(lower, upper, spin, speed, motion.speed_margin)
+    box = MovingBox()
+    box.at = pose_box(lower, upper, rotation, shift, motion.margin)
+    box.speed = moved.posed_sum
+    box.spread = moved.posed_size
+    return box
+
+
+@wp.func
+def step_of(gap: wp.float32, rate: wp.float32, bend: wp.float32):
+    """Return how long a gap stays open that grows at a rate, less bend / 2 times the time squared; 0 if it is none."""
+    root = wp.sqrt(rate * rate + wp.float32(2.0) * bend * gap)
+    closing = wp.float32(2.0) * gap / (root - wp.min(rate, wp.float32(0.0)))
+    growing = (rate + root) / bend
+    step = wp.where(rate > wp.float32(0.0), growing, closing)
+    return wp.where(gap > wp.float32(0.0), step, wp.float32(0.0))
+
+
+@wp.func
+def longest_step(
+    between: wp.vec3, reach: wp.vec3, speed: wp.vec3, spread: wp.vec3, bend: wp.float32, best: wp.vec2
+) -> wp.vec2:
+    """Return the longest step and the widest gap along three axes, and of what was found before."""
+    step, widest = best[0], best[1]
+    for i in range(3):
+        gap = wp.abs(between[i]) - reach[i]
+        rate = wp.where(between[i] > wp.float32(0.0), speed[i], -speed[i]) - spread[i]
+        step = wp.max(step, step_of(gap, rate, bend))
+        widest = wp.max(widest, gap)
+    return wp.vec2(step, widest)
+
+
+@wp.func
+def step_boxes(a: MovingBox, b: MovingBox, motion: Motion):
+    """Return how long two boxes stay apart, 0 if they may not be, and the widest gap between them."""
+    first = longest_step(
+        b.at.posed_sum - a.at.sum, b.at.posed_size + a.at.size, b.speed, b.spread, motion.bend_b, wp.vec2()
+    )
+    return longest_step(a.at.posed_sum - b.at.sum, a.at.posed_size + b.at.size, a.speed, a.spread, motion.bend_a, first)
+
+
+@wp.func
+def later(t: wp.float32, step: wp.float32):
+    """Return the time that a step leads to, rounded down; t where the step is lost to rounding."""
+    return wp.max(t, (t + step * LATER) * SUM_DOWN)
+
+
+@wp.func
+def go_on(
+    used: wp.int32,
+    a: Node,
+    b: Node,
+    scale: wp.float32,
+    gap: wp.float32,
+    t: wp.float32,
+    then: wp.float32,
+    best: wp.float64,
+):
+    """Return what two nodes apart from t to a later time leave, and what it is.
+
+    Themselves again where they are far apart at t and there is a later time, else as `item_of`.
+    """
+    size = wp.max(wp.max(a.upper - a.lower), wp.max(b.upper - b.lower)) * scale
+    again = gap > AGAIN * size and then > t
+    kind = wp.where((a.face | b.face) >= 0 and not again, FACES, NODES)
+    kind = wp.where(used < 0 and wp.float64(then) <= best, kind, DROPPED)
+    return wp.where(again, pack_item(a.skip, b.skip), item_of(a, b)), kind
+
+
+@wp.func
+def advance_children(
+    states: StatePool,
+    pose: PairPose,
+    motion: Motion,
+    boxes: BoxMotion,
+    t: wp.float32,
+    best: wp.float64,
+    item: wp.int64,
+    live: wp.int32,
+):
+    """Compare what an item names from t on; return the items that follow, what each is, their times, and how many.
+
+    live is -1, or 0 where nothing is asked of the item, which still names nodes. Times after `best` are dropped.
+    """
+    x = item_first(item)
+    y = item_second(item)
+    at_a = pose.node_a + (x & INDEX_MASK)
+    at_b = pose.node_b + (y & INDEX_MASK)
+    a0 = load_constant_node(states, at_a)
+    a1 = load_constant_node(states, at_a + wp.where(x < 0, 1, 0))
+    b0 = load_constant_node(states, at_b)
+    b1 = load_constant_node(states, at_b + wp.where(y < 0, 1, 0))
+    home, spin = wp.transpose(boxes.rotation), wp.transpose(boxes.spin)
+    box_a0 = move_box(a0, motion, home, boxes.back, spin, boxes.back_speed)
+    box_a1 = move_box(a1, motion, home, boxes.back, spin, boxes.back_speed)
+    box_b0 = move_box(b0, motion, boxes.rotation, boxes.shift, boxes.spin, boxes.speed)
+    box_b1 = move_box(b1, motion, boxes.rotation, boxes.shift, boxes.spin, boxes.speed)
+    s00, s01 = step_boxes(box_a0, box_b0, motion), step_boxes(box_a0, box_b1, motion)
+    s10, s11 = step_boxes(box_a1, box_b0, motion), step_boxes(box_a1, box_b1, motion)
+    times = wp.vec4(later(t, s00[0]), later(t, s01[0]), later(t, s10[0]), later(t, s11[0]))
+    scale = wp.float32(motion.scale)
+    i00, k00 = go_on(live, a0, b0, scale, s00[1], t, times[0], best)
+    i01, k01 = go_on(y & live, a0, b1, scale, s01[1], t, times[1], best)
+    i10, k10 = go_on(x & live, a1, b0, scale, s10[1], t, times[2], best)
+    i11, k11 = go_on(x & y & live, a1, b1, scale, s11[1], t, times[3], best)
+    tests = -((live >> 31) + ((y & live) >> 31) + ((x & live) >> 31) + ((x & y & live) >> 31))
+    return four_items(i00, i01, i10, i11), wp.vec4i(k00, k01, k10, k11), times, tests

@@ -1,0 +1,312 @@
+"""First contacts: never late and hardly early, against dense sampling, other proofs, and fractions."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.motions import ANSWERS, STILL, find, random_motions, to_bytes
+from helpers.questions import pairs_of, scene_of
+from helpers.samples import random_poses, random_quaternions, sample
+from oracles.motion import apart_until, pose_between, rigid_soups, translation_contact
+
+import warp_abtree as ab
+from warp_abtree import testing
+
+
+def starts_of(cases):
+    return np.array([pose for case in cases for pose in (case[2], case[5])])
+
+
+def poses_at(cases, ends, times):
+    """Return the poses of all objects, each pair's at its own time."""
+    times = np.repeat(np.broadcast_to(times, len(cases)), 2)
+    return np.array([pose_between(*row) for row in zip(starts_of(cases), ends, times)])
+
+
+def meets(scene, cases, ends, times):
+    """Return which pairs intersect at times, exactly for the poses there."""
+    scene.set_poses(poses_at(cases, ends, times))
+    return scene.intersect(pairs_of(cases)).any
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-3])
+def test_never_late_and_early_by_the_tolerance(device, tolerance):
+    rng = np.random.default_rng(1)
+    cases, ends = random_motions(rng, 160)
+    scene = scene_of(device, cases)
+    result = scene.first_contact(pairs_of(cases), ends, tolerance=tolerance)
+    time = result.time
+    assert not result.undecided.any()
+    np.testing.assert_array_equal(meets(scene, cases, ends, 0.0), (time == 0))
+    assert 5 < (time == 0).sum() < 100 and 20 < result.clear.sum() < 120
+    np.testing.assert_array_equal(time[result.clear], 1.0)
+    touching = ~result.clear & (time > 0)
+    assert touching.sum() > 20
+    # Nothing meets before, up to the time itself; all that is decided does after the tolerance.
+    for part in (*np.linspace(0.02, 0.98, 25), 1 - 1e-3, 1 - 1e-6, 1.0):
+        assert not meets(scene, cases, ends, part * time)[time > 0].any()
+    np.testing.assert_array_equal(meets(scene, cases, ends, np.minimum(time + tolerance, 1))[touching], True)
+
+
+def test_agrees_with_steps_of_the_distance(device):
+    """A bound of all speeds over brute-force distances proves nothing that the answer does not say too."""
+    rng = np.random.default_rng(2)
+    cases, ends = random_motions(rng, 12, ("box", "three", "one", "crumbs"), 20)
+    result = find(device, cases, ends)
+    for case, path, time in zip(cases, ends.reshape(-1, 2, 7), result.time, strict=True):
+        if time == 0:
+            continue
+        meshes = [model.mesh_at(lod)[:2] for model, lod in (case[:2], case[3:5])]
+        assert apart_until(*rigid_soups(meshes, (case[2], case[5]), path), 1e-3) <= time + 1e-6
+
+
+def random_soup(rng, count, size):
+    """Return corners of faces on a grid of 2^-10, in general position."""
+    return np.round(rng.normal(size=(count, 1, 3)) * 300 + rng.normal(size=(count, 3, 3)) * size) / 1024
+
+
+@pytest.mark.parametrize("far", [1, 2**14])
+def test_translations_against_fractions(device, far):
+    """Small soups that pass each other near the middle of their way, which is long or not."""
+    rng = np.random.default_rng(3)
+    cases, ends, truths = [], [], []
+    while len(cases) < 60:
+        a, b = (random_soup(rng, 4, 300) for _ in range(2))
+        way, off = (np.round(1024 * rng.normal(size=3)) / 1024 for _ in range(2))
+        start, end = off - far * way, off + 2 * far * way
+        still, pose = STILL, np.concatenate([start, STILL[3:]])
+        models = [ab.Model.from_arrays(s.reshape(-1, 3), np.arange(12).reshape(-1, 3), base_faces=4) for s in (a, b)]
+        cases.append([models[0], models[0].lod_max, still, models[1], models[1].lod_max, pose])
+        ends += [still, np.concatenate([end, STILL[3:]])]
+        truths.append(translation_contact(a, b + start, end - start))
+    result, tolerance = find(device, cases, np.array(ends)), Fraction(1e-6)
+    met = scene_of(device, cases).intersect(pairs_of(cases)).any
+    assert sum(truth is not None for truth in truths) > 20 and not result.undecided.any()
+    for truth, hit, time, clear in zip(truths, met, result.time.tolist(), result.clear, strict=True):
+        if hit:
+            assert time == 0
+        else:
+            assert clear == (truth is None)
+            assert truth is None or truth - tolerance <= Fraction(time) <= truth
+
+
+@pytest.mark.parametrize("name", ["three", "torus"])
+def test_thin_obstacles_are_not_passed(device, name):
+    """A bullet through a sheet, however fast and far."""
+    rng = np.random.default_rng(4)
+    sheet = ab.Model.from_arrays(
+        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]], [[0, 1, 2], [0, 2, 3]], base_faces=2
+    )
+    bullet = sample(name)
+    scene, ends, far = ab.Scene(device), [], 2.0 ** rng.integers(2, 12, 30)
+    scene.add(sheet)
+    for way in far:
+        scene.add(bullet, (*rng.uniform(-0.1, 0.1, 2), -way, *random_quaternions(rng, 1)[0]))
+        ends.append([*rng.uniform(-0.1, 0.1, 2), 3 * way, *random_quaternions(rng, 1)[0]])
+    pairs = np.stack([np.zeros(30, int), np.arange(1, 31)], 1)
+    result = scene.first_contact(pairs, [STILL, *ends])
+    assert not result.clear.any() and not result.undecided.any()
+    reach = np.linalg.norm(bullet.mesh_at(bullet.lod_max)[0], axis=1).max()
+    assert ((far - reach) / (4 * far) - 1e-6 <= result.time).all() and (result.time <= 0.25 + reach / far).all()
+
+
+def test_order_of_objects_and_of_pairs_changes_nothing(device):
+    rng = np.random.default_rng(5)
+    cases, ends = random_motions(rng, 40)
+    scene, pairs = scene_of(device, cases), pairs_of(cases)
+    first = scene.first_contact(pairs, ends)
+    assert to_bytes(scene.first_contact(pairs[:, ::-1], ends)) == to_bytes(first)
+    order = rng.permutation(40)
+    mixed = scene.first_contact(pairs[order], ends)
+    for name in ANSWERS:
+        np.testing.assert_array_equal(getattr(mixed, name), getattr(first, name)[order])
+
+
+def test_regimes_agree(device):
+    rng = np.random.default_rng(6)
+    cases, ends = random_motions(rng, 40, faces=500)
+    first = to_bytes(find(device, cases, ends))
+    for warps, length in ((True, None), (True, 129), (None, 200)):
+        with testing.regime(warps=warps, stack_length=length, cpu_threads=1 if length else 2):
+            assert to_bytes(find(device, cases, ends)) == first
+
+
+@pytest.mark.parametrize("exponent", [-40, 40])
+def test_scaling_by_a_power_of_two_changes_nothing(device, exponent):
+    rng = np.random.default_rng(7)
+    cases, ends = random_motions(rng, 24)
+    first = find(device, cases, ends)
+    factor, scaled = 2.0**exponent, []
+    for model_a, lod_a, pose_a, model_b, lod_b, pose_b in cases:
+        case = []
+        for model, lod, pose in ((model_a, lod_a, pose_a), (model_b, lod_b, pose_b)):
+            vertices, faces, _ = model.mesh_at(lod)
+            larger = ab.Model.from_arrays(vertices * factor, faces, base_faces=len(faces))
+            case += [larger, larger.lod_max, pose * [*[factor] * 3, 1, 1, 1, 1]]
+        scaled.append(case)
+    again = find(device, scaled, ends * [*[factor] * 3, 1, 1, 1, 1])
+    np.testing.assert_array_equal(again.clear, first.clear)
+    np.testing.assert_allclose(again.time, first.time, rtol=0, atol=1e-6)
+
+
+def test_screws_end_where_they_should_and_keep_their_distance_from_the_axis(device):
+    """A ball on a screw about z, beside a post there: touches if and only if it is as near as that."""
+    post, ball = sample("one"), sample("small ball")
+    reach = np.linalg.norm(ball.mesh_at(ball.lod_max)[0], axis=1).max()
+    scene, ends = ab.Scene(device), [STILL]
+    vertices = post.mesh_at(post.lod_max)[0]
+    middle = vertices.mean(0)
+    scene.add(post, (*-middle, 0, 0, 0, 1))
+    radius = np.linalg.norm(vertices - middle, axis=1).max() + 1.05 * reach
+    half = np.deg2rad(80)
+    scene.add(ball, (radius, 0, -0.1, 0, 0, 0, 1))
+    ends = [
+        [*-middle, 0, 0, 0, 1],
+        [radius * np.cos(2 * half), radius * np.sin(2 * half), 0.1, 0, 0, np.sin(half), np.cos(half)],
+    ]
+    straight, screw = (scene.first_contact([(0, 1)], ends, screw=screw) for screw in (False, True))
+    assert screw.clear.all() and not straight.clear.any() and not straight.undecided.any()
+
+
+def test_resting_and_parting_objects_are_clear(device):
+    rng = np.random.default_rng(8)
+    cases, _ = random_motions(rng, 30)
+    scene, starts = scene_of(device, cases), starts_of(cases)
+    met = scene.intersect(pairs_of(cases)).any
+    rest = scene.first_contact(pairs_of(cases), starts)
+    np.testing.assert_array_equal(rest.clear, ~met)
+    np.testing.assert_array_equal(rest.time, np.where(met, 0, 1))
+
+
+def test_common_motions_are_clear(device):
+    """Objects that move as one body, turning about a point far from both, keep their distance."""
+    rng = np.random.default_rng(9)
+    cases, _ = random_motions(rng, 20)
+    whole = random_poses(rng, 20, 5.0)
+    scene = scene_of(device, cases)
+    met = scene.intersect(pairs_of(cases)).any
+
+    def matrices(poses):
+        turns = np.array([wp.quat_to_matrix(wp.quat(*q)) for q in poses[:, 3:]]).reshape(-1, 3, 3)
+        made = np.tile(np.eye(4), (len(poses), 1, 1))
+        made[:, :3, :3], made[:, :3, 3] = turns, poses[:, :3]
+        return made
+
+    starts = matrices(starts_of(cases))
+    scene.set_poses(starts)
+    ends = np.repeat(matrices(whole), 2, 0) @ starts
+    result = scene.first_contact(pairs_of(cases), ends, screw=True)
+    near = scene.intersect(pairs_of(cases), "distance").distance < 1e-3
+    np.testing.assert_array_equal(result.clear[~near], ~met[~near])
+
+
+@pytest.mark.parametrize("path", [{}, {"screw": True}, {"linear": True}], ids=["straight", "screw", "linear"])
+def test_the_broad_phase_finds_all_that_touch(device, path):
+    rng = np.random.default_rng(11)
+    scene, count = ab.Scene(device), 40
+    starts, ends = (random_poses(rng, count, 12.0) for _ in range(2))
+    for i, pose in enumerate(starts):
+        scene.add(sample("capsule"), pose, world=i % 2, lod=sample("capsule").lod_for(fraction=0.1))
+    found = scene.first_contact(None, ends, **path)
+    assert 0 < (~found.clear).sum() < len(found.pairs) < count * (count - 2) / 4
+    every = np.array([(i, j) for i in range(count) for j in range(i + 2, count, 2)])
+    whole = scene.first_contact(every, ends, **path)
+    times = [dict(zip(map(tuple, r.pairs[~r.clear].tolist()), r.time[~r.clear].tolist())) for r in (found, whole)]
+    assert times[0] == times[1]
+
+
+def test_captured_graphs(device):
+    rng = np.random.default_rng(10)
+    cases, ends = random_motions(rng, 20)
+    scene, pairs = scene_of(device, cases), pairs_of(cases)
+    query = ab.FirstContactQuery(scene, ends, pairs)
+    first = query.run()
+    with wp.ScopedCapture(query.device) as capture:
+        query.launch()
+    query.set_end_poses(starts_of(cases))
+    wp.capture_launch(capture.graph)
+    assert query.result().clear[first.time > 0].all()
+    query.set_end_poses(ends)
+    wp.capture_launch(capture.graph)
+    assert to_bytes(query.result()) == to_bytes(first)
+    on_device = query.result(device=True)
+    assert [getattr(on_device, name).numpy().tobytes() for name in ANSWERS] == to_bytes(first)
+
+
+def test_bad_input(device):
+    scene = ab.Scene(device)
+    for x in (0, 3):
+        scene.add(sample("box"), (x, 0, 0, 0, 0, 0, 1))
+    ends = np.array([STILL, STILL])
+    for tolerance in (0, 1, -1, np.nan, "a", 2.0**-41, [1e-6]):
+        with pytest.raises(ValueError, match="tolerance"):
+            scene.first_contact([(0, 1)], ends, tolerance=tolerance)
+    for bad, message in (
+        (ends[:1], "1 given for 2"),
+        (ends[0], "shape"),
+        (ends * np.nan, "not finite"),
+        (ends * 2, "norm"),
+        (np.array([STILL, [0, 0, 0, 0, 0, 1, 0]]), "half a revolution"),
+        (np.array([STILL, [0, 0, 0, 0, 1, 0, 1e-8]]), "half a revolution"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            scene.first_contact([(0, 1)], bad)
+    with pytest.raises(ValueError):
+        scene.first_contact([(0, 2)], ends)
+    assert scene.first_contact([(0, 1)], np.array([STILL, [3, 0, 0, 0, 0, 1, 1e-5]])).clear.all()
+    assert len(scene.first_contact(np.empty((0, 2), int), ends).time) == 0
+
+
+@pytest.mark.parametrize("path", [{}, {"screw": True}, {"linear": True}], ids=["straight", "screw", "linear"])
+def test_sweeps(device, path):
+    """Motions of B in the frame of a resting A, in chunks, as matrices too, and bad ones."""
+    rng = np.random.default_rng(12)
+    a, b = sample("torus"), sample("capsule")
+    starts, ends = (random_poses(rng, 1500, 3.0) for _ in range(2))
+    options = {"output": "first_contact", "tolerance": 1e-3, "lod_a": a.lod_for(fraction=0.1), "device": device, **path}
+    rows = ab.sweep(a, b, starts, end_poses=ends, **options)
+    scene = ab.Scene(device)
+    scene.add(a, lod=options["lod_a"])
+    for pose in starts[:100]:
+        scene.add(b, pose)
+    pairs = np.stack([np.zeros(100, int), np.arange(1, 101)], 1)
+    result = scene.first_contact(pairs, [STILL, *ends[:100]], tolerance=1e-3, **path)
+    for name in ANSWERS:
+        np.testing.assert_array_equal(rows[name][:100], getattr(result, name))
+    for bad, error, message in (
+        ({"end_poses": ends[:3]}, ValueError, "3 given for 1500"),
+        ({"end_poses": np.where(np.arange(1500)[:, None] == 7, np.nan, ends)}, ValueError, "end_poses: pose 7"),
+        ({}, TypeError, "end_poses"),
+        ({"end_poses": ends, "beyond": 1.0}, TypeError, "beyond"),
+        ({"end_poses": ends, "tolerance": 2}, ValueError, "tolerance"),
+    ):
+        with pytest.raises(error, match=message):
+            ab.sweep(a, b, starts, **{**options, **bad})
+    assert len(ab.sweep(a, b, np.empty((0, 7)), end_poses=np.empty((0, 7)), **options)) == 0
+
+
+def test_margins_cover_the_rounding_of_boxes(device):
+    """Flat faces meet head on, soon: nothing but margins keeps the boxes from being late."""
+    rng = np.random.default_rng(13)
+    cube = sample("box").mesh_at(sample("box").lod_max)
+    cases, ends, truths = [], [], []
+    for _ in range(400):
+        axis, models, boxes = rng.integers(3), [], []
+        for _ in range(2):
+            low, size = rng.normal(size=3), rng.uniform(0.5, 1.5, 3)
+            corners = low + (cube[0] - cube[0].min(0)) / np.ptp(cube[0], axis=0) * size
+            models.append(ab.Model.from_arrays(corners, cube[1], base_faces=len(cube[1])))
+            boxes.append((corners.min(0), corners.max(0)))
+        pose = STILL.copy()
+        pose[:3] = boxes[0][0] - boxes[1][0]
+        pose[axis] = boxes[0][1][axis] - boxes[1][0][axis] + 10 ** rng.uniform(-5, -2)
+        end = pose.copy()
+        end[axis] -= rng.uniform(0.2, 0.4)
+        near = Fraction(boxes[0][1][axis]) - Fraction(boxes[1][0][axis])
+        truths.append((Fraction(pose[axis]) - near) / (Fraction(pose[axis]) - Fraction(end[axis])))
+        cases.append([models[0], models[0].lod_max, STILL, models[1], models[1].lod_max, pose])
+        ends += [STILL, end]
+    result = find(device, cases, np.array(ends))
+    late = [float(Fraction(time) - truth) for time, truth in zip(result.time.tolist(), truths)]
+    assert -1e-6 <= min(late) and max(late) <= 0 and not result.undecided.any()

@@ -1,0 +1,83 @@
+"""First contacts where vertices move straight: whole meshes, and public queries with ground truth."""
+
+import numpy as np
+import pytest
+from helpers.motions import STILL, find, random_motions, to_bytes
+from helpers.samples import sample
+from oracles.distance import surface_distance
+from oracles.motion import apart_until, straight_soups
+from oracles.triangle import box_pairs, pairs_intersect
+
+import warp_abtree as ab
+from bench.motions.ccd_queries import FOLDER, read_queries
+from warp_abtree import testing
+
+TOLERANCE = 1e-6
+
+
+def soups_intersect(a, b):
+    """Return whether corners (f, 3, 3) have a point in common, in integers."""
+    pairs = box_pairs(a, b)
+    corners = [np.arange(3 * len(soup)).reshape(-1, 3) for soup in (a, b)]
+    return pairs_intersect(a.reshape(-1, 3), corners[0], b.reshape(-1, 3), corners[1], pairs).any()
+
+
+def test_never_late_and_early_by_the_tolerance(device):
+    rng = np.random.default_rng(1)
+    cases, ends = random_motions(rng, 40, ("box", "small ball", "torus", "soup"), 40, 1.5)
+    result = find(device, cases, ends, linear=True)
+    assert not result.undecided.any() and 10 < result.clear.sum() < 35 and (result.time == 0).sum() < 10
+    for case, path, time, clear in zip(cases, ends.reshape(-1, 2, 7), result.time, result.clear, strict=True):
+        meshes = [model.mesh_at(lod)[:2] for model, lod in (case[:2], case[3:5])]
+        place, speed = straight_soups(meshes, (case[2], case[5]), path)
+        if time > 0:
+            assert apart_until(place, speed, 1e-3) <= time + TOLERANCE
+            for part in (0.0, 0.3, 0.6, 0.8, 0.9, 0.97, 0.999, 1.0):
+                assert not soups_intersect(*place(part * time))
+        if not clear:
+            assert soups_intersect(*place(min(time + TOLERANCE, 1.0) if time > 0 else 0.0))
+
+
+def test_regimes_agree(device):
+    rng = np.random.default_rng(2)
+    cases, ends = random_motions(rng, 30, faces=500)
+    first = to_bytes(find(device, cases, ends, linear=True))
+    with testing.regime(warps=True):
+        assert to_bytes(find(device, cases, ends, linear=True)) == first
+
+
+def test_without_turns_it_is_the_rigid_motion(device):
+    rng = np.random.default_rng(3)
+    cases, ends = random_motions(rng, 30)
+    for case, path in zip(cases, ends.reshape(-1, 2, 7)):
+        path[:, 3:] = case[2][3:], case[5][3:]
+    rigid, straight = (find(device, cases, ends, linear=linear) for linear in (False, True))
+    np.testing.assert_array_equal(rigid.clear, straight.clear)
+    np.testing.assert_allclose(rigid.time, straight.time, rtol=0, atol=TOLERANCE)
+
+
+def test_half_revolutions_have_straight_ways(device):
+    scene = ab.Scene(device)
+    scene.add(sample("box"))
+    scene.add(sample("box"), (8, 0, 0, 0, 0, 0, 1))
+    ends = [STILL, [8, 0, 0, 0, 0, 1, 0]]
+    assert scene.first_contact([(0, 1)], ends, linear=True).clear.all()
+    with pytest.raises(ValueError, match="one kind of path"):
+        scene.first_contact([(0, 1)], ends, linear=True, screw=True)
+
+
+def test_public_queries_miss_no_contact(device):
+    """Ground truth in rational numbers; what is found beyond it meets, or nearly so, but for rounding."""
+    files = sorted(FOLDER.glob("*.csv.gz"))
+    if not files:
+        pytest.skip("queries of continuous collision detection are not at hand; ABTREE_CCD names their folder")
+    for path in files:
+        starts, ends, truth = read_queries(path)
+        time, clear, undecided = testing.advance_corners(starts, ends, TOLERANCE, device)
+        assert not clear[truth].any()
+        for i in np.flatnonzero(~truth & ~clear & ~undecided):
+            way = ends[i] - starts[i]
+            at, soon = (starts[i] + t * way for t in (time[i], min(time[i] + TOLERANCE, 1.0)))
+            size = np.abs([starts[i], ends[i]]).max()
+            if not soups_intersect(soon[:3][None], soon[3:][None]):
+                assert surface_distance(at[None, :3], at[None, 3:]) <= 2.0**-45 * size
