@@ -88,6 +88,8 @@ class Query(QueryReadout):
         self.output, self.precision, self.device = output, precision, scene.device
         with loading(self.device, self._slow_kernels(within is not None)):
             self.batch = batch = scene if isinstance(scene, Batch) else scene.batch()
+            if self.uses_warps() and self._regime.slabs:
+                batch.models.make_slabs()
         if pairs is not None:
             pairs = batch.check_pairs(pairs)
         if within is not None:
