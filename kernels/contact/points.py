@@ -12,8 +12,8 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 NEAREST_POINT = wp.constant(wp.float64(2.0**-9))
 # By which part of its distance a point is favoured at the far end of the spread.
 FAVOUR = wp.constant(wp.float64(2.0**-5))
-# Part of the gap within which points are as good as the deepest.
-FIRST_PART = wp.constant(wp.float64(0.125))
+# Part of the spread by which points may be less deep than the deepest, and apart, to be chosen before others.
+FIRST_PART = wp.constant(wp.float64(2.0**-5))
 # The deepest point is among those chosen if this part of its depth is more than theirs.
 DEEPER = wp.constant(wp.float64(0.9))
 
@@ -91,11 +91,21 @@ def distance_squared(
     return nearest
 
 
+@wp.struct
+class Choice:
+    """How the points of a pair are chosen."""
+
+    lowest: wp.float64  # least depth of candidates
+    floor: wp.float64  # least depth of those looked at now
+    first_floor: wp.float64  # of those looked at first, but for a part of the spread
+    size: wp.float64  # spread of the candidates, 0 before it is known
+    least: wp.float64  # squared distance from the chosen points that is none
+
+
 @wp.func
 def find_farthest(
     ends: wp.vec2i,
-    least: wp.vec2d,
-    size: wp.float64,
+    choice: Choice,
     along: wp.vec3d,
     count: wp.int32,
     point: wp.array(dtype=wp.vec3d),
@@ -108,7 +118,6 @@ def find_farthest(
 
     Args:
         ends: First contact of the pair, and the one behind its last.
-        least: Least depths of candidates that there are, and of those that are looked at.
         count: Points chosen. From the second on a candidate keeps its distance from those before.
     """
     farthest = wp.float64(-1.0)
@@ -116,21 +125,49 @@ def find_farthest(
     i = ends[0] + warp_lane()
     while i < ends[1]:
         for k in range(CANDIDATES):
-            if curves.depth[i, k] >= least[0]:
+            if curves.depth[i, k] >= choice.lowest:
                 x = curves.point[i, k]
-                d = distance_squared(x, curves.normal[i], size, count - 1, point, normals)
+                d = distance_squared(x, curves.normal[i], choice.size, count - 1, point, normals)
                 if count == 2:
-                    d = wp.min(d, distance_squared(x, curves.normal[i], size, 0, point, normals))
+                    d = wp.min(d, distance_squared(x, curves.normal[i], choice.size, 0, point, normals))
                 if count > 2:
                     d = wp.min(d, curves.nearest[i, k])
                 curves.nearest[i, k] = d
-                if size > wp.float64(0.0):
-                    d = d * (wp.float64(1.0) + FAVOUR * wp.dot(along, x - point[0]) / size)
-                if d > farthest and curves.depth[i, k] >= least[1]:
+                if choice.size > wp.float64(0.0):
+                    d = d * (wp.float64(1.0) + FAVOUR * wp.dot(along, x - point[0]) / choice.size)
+                if d > farthest and curves.depth[i, k] >= choice.floor:
                     farthest = d
                     best = CANDIDATES * i + k
         i += warp_size()
     return best_of_warp(farthest, best)
+
+
+@wp.func
+def find_next(
+    ends: wp.vec2i,
+    before: Choice,
+    along: wp.vec3d,
+    count: wp.int32,
+    point: wp.array(dtype=wp.vec3d),
+    normals: wp.array(dtype=wp.vec3d),
+    curves: Curves,
+):
+    """Return the next candidate, how far it is, squared, and the choice after it.
+
+    Those that touch, or nearly so for their spread, come before what is farther apart within the gap.
+    """
+    choice = before
+    best, farthest = find_farthest(ends, choice, along, count, point, normals, curves)
+    if count == 1:
+        choice.size = wp.sqrt(wp.max(farthest, wp.float64(0.0)))
+        choice.least = NEAREST_POINT * farthest
+        choice.floor = wp.max(choice.first_floor - FIRST_PART * choice.size, choice.lowest)
+        if choice.floor > choice.lowest:
+            best, farthest = find_farthest(ends, choice, along, count, point, normals, curves)
+    if farthest <= choice.least and choice.floor > choice.lowest:
+        choice.floor = choice.lowest
+        best, farthest = find_farthest(ends, choice, along, count, point, normals, curves)
+    return best, farthest, choice
 
 
 @wp.func
@@ -196,15 +233,14 @@ def spread_point_kernel(
     if reach == -wp.float64(wp.inf):
         manifolds_out.count[p] = 0
         return
-    # Those about as deep as the deepest first, then what may be within the gap.
-    lowest = wp.where(deepest == NO_DEPTH, NO_DEPTH, -shell)
-    least_depth = wp.vec2d(lowest, wp.where(shell > zero, wp.max(deepest - FIRST_PART * shell, lowest), lowest))
+    choice = Choice()
+    choice.lowest = wp.where(deepest == NO_DEPTH, NO_DEPTH, -shell)
+    choice.floor = choice.lowest
+    choice.first_floor = wp.where(shell > zero, wp.min(deepest, zero), choice.lowest)
     point = wp.zeros(shape=(POINTS,), dtype=wp.vec3d)
     normals = wp.zeros(shape=(POINTS,), dtype=wp.vec3d)
     depth = wp.zeros(shape=(POINTS,), dtype=wp.float64)
     count = wp.int32(0)
-    size = zero
-    least = zero
     deep = -shell
     searching = bool(True)
     while searching:
@@ -215,18 +251,8 @@ def spread_point_kernel(
         depth[count] = wp.where(found == NO_DEPTH, zero, found)
         deep = wp.max(deep, depth[count])
         count += 1
-        ends = wp.vec2i(first, end)
-        best, farthest = find_farthest(ends, least_depth, size, along, count, point, normals, curves_inout)
-        if count == 1:
-            size = wp.sqrt(wp.max(farthest, zero))
-            least = NEAREST_POINT * farthest
-        if farthest <= least and least_depth[1] > lowest:
-            least_depth[1] = lowest
-            best, farthest = find_farthest(ends, least_depth, size, along, count, point, normals, curves_inout)
-            if count == 1:
-                size = wp.sqrt(wp.max(farthest, zero))
-                least = NEAREST_POINT * farthest
-        if farthest <= least or count == POINTS - 1:
+        best, farthest, choice = find_next(wp.vec2i(first, end), choice, along, count, point, normals, curves_inout)
+        if farthest <= choice.least or count == POINTS - 1:
             best = deepest_at
             searching = DEEPER * (deepest + shell) > deep + shell
         searching = searching and count < POINTS

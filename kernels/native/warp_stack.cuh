@@ -117,10 +117,10 @@ inline CUDA_CALLABLE wp::int32 read_signs(wp::uint64 items, wp::int32 i) {
 inline CUDA_CALLABLE wp::uint64 signed_pairs() {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
-    __shared__ int4 items[STRADDLING_LENGTH + INEXACT_LENGTH];
+    __shared__ int4 items[STRADDLING_LENGTH];
     return __cvta_generic_to_shared(items);
 #else
-    static int items[(STRADDLING_LENGTH + INEXACT_LENGTH) * 4];
+    static int items[STRADDLING_LENGTH * 4];
     return (wp::uint64)items;
 #endif
 }

@@ -16,7 +16,6 @@ WARP_SIZE = native.constant("WARP_SIZE")
 STACK_LENGTH = native.constant("STACK_LENGTH")  # node pairs
 STRADDLING_START = native.constant("STRADDLING_START")
 SLAB_PAIR_START, SLAB_PAIR_LENGTH = native.constant("SLAB_PAIR_START"), native.constant("SLAB_PAIR_LENGTH")
-STRADDLING_LENGTH = native.constant("STRADDLING_LENGTH")
 
 six_numbers = wp.types.vector(length=6, dtype=wp.float64)
 
@@ -83,7 +82,7 @@ def read_signs(items: wp.uint64, i: wp.int32) -> wp.int32:
 
 @wp.func_native(stack_code("signed_pairs"))
 def signed_pairs() -> wp.uint64:
-    """Return where this warp holds face pairs with their signs, then inexact ones; in shared memory on CUDA."""
+    """Return where this warp holds face pairs with their signs, an address in shared memory on CUDA."""
 
 
 @wp.func_native(stack_code("push_signed_pair"))
