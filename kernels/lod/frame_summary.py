@@ -3,18 +3,18 @@
 import warp as wp
 
 from warp_abtree.kernels.lod.ladder import add_lanes
+from warp_abtree.kernels.results import count_apart
 from warp_abtree.kernels.traversal.face_pairs import Hits
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-FRAMES, LAUNCHED, PAIRS, HITS, UNCERTAIN, INTERSECTING, NODE_TESTS, TRIANGLE_TESTS, REFITTED, CHANGED, TURNED = range(
-    11
-)
+FRAMES, LAUNCHED, PAIRS, HITS, UNCERTAIN, APART, INTERSECTING, NODE_TESTS, TRIANGLE_TESTS = range(9)
+REFITTED, CHANGED, TURNED = 9, 10, 11
 """Words of a summary: frames so far, what became of the query's launch (`LaunchRecord`), object pairs, face pairs that
-intersect and that are uncertain, pairs that intersect, pairs of boxes and of faces tested, nodes refitted, objects
-whose level changed, and those that turned back."""
+intersect, that are uncertain, and that are apart by less than a gap perhaps, pairs that intersect, pairs of boxes and of
+faces tested, nodes refitted, objects whose level changed, and those that turned back."""
 
-HEAD = wp.constant(11)
+HEAD = wp.constant(12)
 """Words before those that count the objects at each level."""
 
 TRIANGLE_WORK = wp.constant(wp.int64(4))
@@ -77,5 +77,6 @@ def summarise_frame_kernel(
         summary_out[wp.static(FRAMES)] = frames_inout[0]
         summary_out[wp.static(LAUNCHED)] = wp.int64(launched[0])
         summary_out[wp.static(PAIRS)] = wp.int64(pair_count[0])
+        summary_out[wp.static(APART)] = count_apart(hits)
         summary_out[wp.static(CHANGED)] = wp.int64(changed[0])
         summary_out[wp.static(TURNED)] = wp.int64(changed[1])

@@ -53,7 +53,7 @@ def check_scale(rows):
     assert [row["pairs"] for row in pairs] == [1, 4, 16]
     assert [(row["faces"], row["pairs"]) for row in meshes] == [(168, 1), (168, 3), (576, 1), (576, 3)]
     grown = 2**20 * (meshes[2]["arrays_mib"] - meshes[0]["arrays_mib"]) / (576 - 168)
-    assert 180 < grown < 300, "bytes a face, of the model and its state"
+    assert 180 < grown < 340, "bytes a face, of the model and its state, on a GPU with slabs of nodes"
     assert [(row["worlds"], row["objects"]) for row in worlds] == [(1, 4), (8, 32)]
     assert all(row["pairs"] <= 6 * row["worlds"] for row in worlds) and worlds[1]["hits"] > worlds[0]["hits"]
     slopes = [row for row in rows if row["sweep"].endswith("slope")]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from helpers.questions import coarse, pairs_of, random_lod, scene_of
 from helpers.samples import grid, random_poses, sample
 from hypothesis import HealthCheck, given, settings
@@ -196,12 +197,14 @@ def test_distances_of_their_own_for_each_pair(device):
 
 def test_results_on_the_device(device):
     cases = random_cases(np.random.default_rng(6), 10)
-    options = {"originals": True, "relative": 0.4}
+    on_cpu = wp.get_device(device).is_cpu
+    # Within a tolerance warps answer what they find first.
+    options = {"originals": True, "relative": 0.4 if on_cpu else 0.0}
     for count in (10, 0):
         pairs = pairs_of(cases)[:count]
         kept = scene_of(device, cases).intersect(pairs, "distance", device=True, **options)
         host = scene_of(device, cases).intersect(pairs, "distance", **options)
-        for name in ("pairs", *ROWS, "node_tests"):
+        for name in ("pairs", *ROWS, *(["node_tests"] if on_cpu else [])):
             np.testing.assert_array_equal(getattr(kept, name).numpy(), getattr(host, name))
             assert getattr(kept, name).device == scene_of(device, cases).device
         host.check()

@@ -76,7 +76,7 @@ def check_buffer_lengths(queries):
         rooms += [] if query.broad_phase is None else [query.broad_phase.pairs]
         if isinstance(query, ab.ContactQuery):
             means, sums, contacts = query.pair_contacts, query._sums, query.contacts
-            rooms += [means.point, means.normal, means.depth, sums.total, sums.middle, query.start[1:]]
+            rooms += [means.point, means.normal, means.travel, sums.total, sums.middle, query.start[1:]]
             places = [query.hits.face, query.faces, *(getattr(contacts, name) for name in (*VECTORS, "coplanar"))]
             assert len({len(array) for array in (*places, query._key[::2], query._order[::2])}) == 1
             chunks = [sums.point, sums.normal, sums.length, sums.area, sums.change, sums.front, sums.back, sums.span]

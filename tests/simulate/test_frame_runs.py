@@ -81,7 +81,8 @@ def run_worlds(device, worlds, kind, moved):
             kept = np.isin(result.pairs, mine).all(1)
             pairs = np.searchsorted(mine, result.pairs[kept]).tolist()
             seen = [scene.lods[mine].tolist(), pairs, result.count[kept].tolist()]
-            seen.append(result.node_tests[kept].tolist())
+            if scene.device.is_cpu:  # warps start a pair deeper the more of them share it
+                seen.append(result.node_tests[kept].tolist())
             if result.faces is not None:
                 seen.append(result.faces[kept[result.faces[:, 0]], 1:].tolist())
             found[world].append(seen)

@@ -199,7 +199,7 @@ class FrameStages:
             summary[words.LAUNCHED] >= 0
             and 0 <= summary[words.PAIRS] <= room
             and (not listed or summary[words.HITS] <= len(hits.face))
-            and (not len(hits.uncertain) or summary[words.UNCERTAIN] <= len(hits.uncertain))
+            and (not len(hits.uncertain) or max(summary[[words.UNCERTAIN, words.APART]]) <= len(hits.uncertain))
         )
 
     def find(self, between=None):
