@@ -11,8 +11,8 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 FRAMES, LAUNCHED, PAIRS, HITS, UNCERTAIN, APART, INTERSECTING, NODE_TESTS, TRIANGLE_TESTS = range(9)
 REFITTED, CHANGED, TURNED = 9, 10, 11
 """Words of a summary: frames so far, what became of the query's launch (`LaunchRecord`), object pairs, face pairs that
-intersect, that are uncertain, and that are apart by less than a gap perhaps, pairs that intersect, pairs of boxes and of
-faces tested, nodes refitted, objects whose level changed, and those that turned back."""
+intersect, that are uncertain, and that may be within a gap, pairs that intersect, pairs of boxes and of faces tested,
+nodes refitted, objects whose level changed, and those that turned back."""
 
 HEAD = wp.constant(12)
 """Words before those that count the objects at each level."""
