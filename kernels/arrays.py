@@ -28,6 +28,8 @@ class ModelPool:
     split_face: wp.array(dtype=wp.int32)  # faces that each vertex split inserts or deforms, slice by slice
     leaf_node: wp.array(dtype=wp.int32)  # node of each face, the indexed list of the paper, shape [face]
     node_face: wp.array(dtype=wp.int32)  # face of a leaf, -1 at an inner node, -1 without a node, shape [node]
+    node_slab: wp.array(dtype=wp.vec4)  # `slabs.overlap.Slab` of nodes of few faces, shape [node], or [0]
+    slab_gain: wp.array(dtype=wp.vec2i)  # sum of `slabs.make_slabs.gain_of`, and its terms, shape [model]
     face_start: wp.array(dtype=wp.int32)  # where its faces begin, shape [model]
     face_count: wp.array(dtype=wp.int32)  # shape [model]
     depth: wp.array(dtype=wp.int32)  # of its tree, shape [model]

@@ -21,6 +21,11 @@ UNIT_32 = wp.constant(wp.float64(2.0**-24))
 REACH_MIN = wp.constant(wp.float64(2.0**-100))
 REACH_MAX = wp.constant(wp.float64(2.0**100))
 ROUNDING_64 = wp.constant(wp.float64(2.0**-48))
+# Nodes so few levels above the leaves have slabs: of 8 faces at most.
+SLAB_DEPTH = wp.constant(3)
+NO_NODE = wp.constant(2**31 - 1)
+# Slabs separate little where boxes are hardly wider along their directions: by so many 64ths of the sum of widths.
+SLAB_GAIN_UNIT, SLAB_GAIN_LEAST = wp.constant(64), wp.constant(16)
 
 
 @wp.struct
@@ -44,6 +49,8 @@ class PairPose:
     node_b: wp.int32  # where B's tree lies in the pool
     corner_a: wp.int32  # where A's face corners lie in the pool
     corner_b: wp.int32  # where B's face corners lie in the pool
+    slab: wp.vec2i  # where slabs of A's nodes lie in the models' pool, and of B's
+    floor: wp.vec2i  # nodes of A, and of B, from these on have slabs; none where either model has none
     faces_a: wp.int32  # about how many faces A has at its LOD, no more than at the finest
     faces_b: wp.int32  # the same of B
 
@@ -107,6 +114,16 @@ def unit_scale(reach: wp.float64):
 
 
 @wp.func
+def has_slabs(models: ModelPool, states: StatePool, state: wp.int32):
+    """Return whether there are slabs of a state's nodes: of original faces, and where they gain."""
+    model = states.model[state]
+    if models.node_slab.shape[0] == 0 or states.lod[state] < models.lod_max[model]:
+        return False
+    gain = models.slab_gain[model]
+    return gain[0] > SLAB_GAIN_LEAST * gain[1]
+
+
+@wp.func
 def active_faces(models: ModelPool, states: StatePool, state: wp.int32):
     """Return about how many faces a state has: a vertex split of a closed manifold adds two."""
     model = states.model[state]
@@ -123,6 +140,12 @@ def place_trees(models: ModelPool, states: StatePool, state_a: wp.int32, state_b
     pose.corner_b = states.face_start[state_b]
     pose.faces_a = active_faces(models, states, state_a)
     pose.faces_b = active_faces(models, states, state_b)
+    model_a, model_b = states.model[state_a], states.model[state_b]
+    pose.slab = wp.vec2i(models.node_start[model_a], models.node_start[model_b])
+    pose.floor = wp.vec2i(NO_NODE, NO_NODE)
+    if has_slabs(models, states, state_a) and has_slabs(models, states, state_b):
+        pose.floor[0] = 1 << wp.max(models.depth[model_a] - SLAB_DEPTH, 0)
+        pose.floor[1] = 1 << wp.max(models.depth[model_b] - SLAB_DEPTH, 0)
     return pose
 
 

@@ -30,6 +30,7 @@ def clear_hits(p: wp.int32, hits: Hits):
     if p == 0:
         hits.total[0] = 0
         hits.uncertain_total[0] = 0
+        hits.inexact_total[0] = 0
         if hits.gap.shape[0] > 0:
             hits.apart_total[0] = 0
     hits.any_hit[p] = 0

@@ -3,21 +3,35 @@
 
 constexpr int WARP_SIZE = 32;
 
-// A warp's items in shared memory: node pairs, then leaf pairs, then straddling pairs and their signs.
+// A warp's items in shared memory: node pairs, then leaf pairs, then straddling pairs and their signs, then slab
+// pairs: node pairs that wait for slabs.
+// With what Warp and the driver add, 16 warps fit into 132 KiB of a multiprocessor.
 constexpr int STACK_LENGTH = 512;
 constexpr int LEAF_PAIR_LENGTH = 160;
 constexpr int STRADDLING_LENGTH = 64;
-constexpr int INEXACT_LENGTH = 96;
 constexpr int STRADDLING_START = 672;
 constexpr int SIGNS_START = 736;
-constexpr int ITEM_BYTES = 8;
+constexpr int SLAB_PAIR_LENGTH = 144;
+constexpr int SLAB_PAIR_START = 768;
 static_assert((STACK_LENGTH & (STACK_LENGTH - 1)) == 0, "the stack is a ring");
 static_assert(LEAF_PAIR_LENGTH >= (WARP_SIZE - 1) + 4 * WARP_SIZE, "fewer than a warp wait, a test emits 4 a lane");
 static_assert(STRADDLING_LENGTH >= (WARP_SIZE - 1) + WARP_SIZE, "fewer than a warp wait, a test adds 1 a lane");
-static_assert(INEXACT_LENGTH >= (WARP_SIZE - 1) + 2 * WARP_SIZE, "fewer than a warp wait, two tests add 1 a lane each");
 static_assert(STRADDLING_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
 static_assert(SIGNS_START == STRADDLING_START + STRADDLING_LENGTH, "signs lie behind the straddling pairs");
-static_assert((STACK_LENGTH + LEAF_PAIR_LENGTH) * ITEM_BYTES < 1 << 16, "`push_children` packs two byte offsets");
+static_assert(SLAB_PAIR_START == SIGNS_START + STRADDLING_LENGTH / 2, "two signs an entry");
+static_assert(SLAB_PAIR_LENGTH >= WARP_SIZE + 4, "fewer than a warp wait, a test emits 4");
+// Lists are named by the shifts at which `push_children` packs three places [bytes] into a word. The last, on the stack,
+// goes round.
+constexpr int SLAB_PAIR_LIST = 0;
+constexpr int LEAF_PAIR_LIST = 10;
+constexpr int STACK_LIST = 20;
+constexpr int NO_LIST = 32;
+constexpr int ITEM_BYTES = 8;
+constexpr int PLACE_MASK = 8184;
+static_assert(PLACE_MASK == ITEM_BYTES * ((1 << LEAF_PAIR_LIST) - 1), "the bits of a place, whole items");
+static_assert(ITEM_BYTES * (SLAB_PAIR_START + SLAB_PAIR_LENGTH) <= PLACE_MASK, "places fit");
+static_assert(STACK_LIST == 2 * LEAF_PAIR_LIST, "places do not overlap");
+static_assert((unsigned int)(ITEM_BYTES * STACK_LENGTH) << STACK_LIST == 0, "the stack is a ring in the word, too");
 
 // Two small trees where a warp's stack lies otherwise: leaves of each, and inner nodes before boxes of A's leaves take
 // their place. In words of 4 bytes, a box three quarters of 4 words.

@@ -22,11 +22,11 @@ inline CUDA_CALLABLE wp::int32 warp_lane() {
 inline CUDA_CALLABLE wp::uint64 warp_stack() {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
-    __shared__ long long items[SIGNS_START + STRADDLING_LENGTH / 2];
+    __shared__ long long items[SLAB_PAIR_START + SLAB_PAIR_LENGTH];
     // Through another lane, so that the address is held and not computed again at every use.
     return __shfl_sync(0xffffffffu, (unsigned int)__cvta_generic_to_shared(items), 0);
 #else
-    static long long items[SIGNS_START + STRADDLING_LENGTH / 2];
+    static long long items[SLAB_PAIR_START + SLAB_PAIR_LENGTH];
     return (wp::uint64)items;
 #endif
 }
@@ -55,44 +55,20 @@ inline CUDA_CALLABLE void write_item(wp::uint64 items, wp::int32 i, wp::int64 it
 #endif
 }
 
-inline CUDA_CALLABLE wp::int64 push_children(wp::uint64 items, wp::int32 end, wp::int32 leaf_end,
-                                             wp::vec_t<4, wp::int32> emitted, wp::vec_t<4, wp::int64> children) {
+inline CUDA_CALLABLE wp::int32 push_items(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item) {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
-    const unsigned int mine = (emitted[0] + emitted[1]) + (emitted[2] + emitted[3]);
-    unsigned int sum = mine;
-// What came from a lane is added, nothing where there is none.
-#pragma unroll
-    for (int step = 1; step < 32; step <<= 1)
-        asm volatile(
-            "{ .reg .pred from; .reg .b32 other;"
-            " shfl.sync.up.b32 other|from, %0, %1, 0, 0xffffffff; @from add.u32 %0, %0, other; }"
-            : "+r"(sum)
-            : "r"(step));
-    const unsigned int total = __shfl_sync(0xffffffffu, sum, 31);
-    // Bytes from the start: on the stack in the low half, among the leaf pairs in the high half.
-    unsigned int place = ((end & (STACK_LENGTH - 1)) | (STACK_LENGTH + leaf_end) << 16) * 8 + (sum - mine) * 8;
-#pragma unroll
-    for (int k = 0; k < 4; ++k) {
-        const unsigned int at = emitted[k] > 1 ? place >> 16 : place & (8 * STACK_LENGTH - 1);
-        asm volatile(
-            "{ .reg .pred used; setp.ne.u32 used, %0, 0; @used st.shared.v2.b32 [%1], {%2, %3}; }" ::"r"(emitted[k]),
-            "r"((unsigned int)items + at), "r"((int)children[k]), "r"((int)(children[k] >> 32))
-            : "memory");
-        place += 8 * emitted[k];
-    }
+    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    const unsigned int at = (end + __popc(votes & ((1u << threadIdx.x) - 1u))) & (STACK_LENGTH - 1);
+    asm volatile("{ .reg .pred used; setp.ne.s32 used, %0, 0; @used st.shared.b64 [%1], %2; }" ::"r"((int)flag),
+                 "r"((unsigned int)items + 8 * at), "l"(item)
+                 : "memory");
+    return end + __popc(votes);
 #else
-    long long* stack = (long long*)items;
-    int total = 0;
-    for (int k = 0; k < 4; ++k) {
-        if (emitted[k] > 1)
-            stack[STACK_LENGTH + leaf_end + (total >> 16)] = children[k];
-        else if (emitted[k] == 1)
-            stack[(end + total) & (STACK_LENGTH - 1)] = children[k];
-        total += emitted[k];
-    }
+    if (flag)
+        ((long long*)items)[end & (STACK_LENGTH - 1)] = item;
+    return end + flag;
 #endif
-    return ((long long)(leaf_end + (total >> 16)) << 32) | (unsigned int)(end + (total & 0xffff));
 }
 
 inline CUDA_CALLABLE wp::int32 hold_uniform(wp::int32 x) {
@@ -141,10 +117,10 @@ inline CUDA_CALLABLE wp::int32 read_signs(wp::uint64 items, wp::int32 i) {
 inline CUDA_CALLABLE wp::uint64 signed_pairs() {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
-    __shared__ int4 items[STRADDLING_LENGTH + INEXACT_LENGTH];
+    __shared__ int4 items[STRADDLING_LENGTH];
     return __cvta_generic_to_shared(items);
 #else
-    static int items[(STRADDLING_LENGTH + INEXACT_LENGTH) * 4];
+    static int items[STRADDLING_LENGTH * 4];
     return (wp::uint64)items;
 #endif
 }

@@ -10,7 +10,8 @@ import warp as wp
 
 from warp_abtree.kernels.arithmetic.predicates import EXACT
 from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.poses import NO_NODE, PairPose
+from warp_abtree.kernels.slabs.overlap import slabs_overlap
 from warp_abtree.kernels.traversal.face_pairs import OUTPUT_ANY, Hits
 from warp_abtree.kernels.traversal.leaf_pairs import separate_leaf_pairs, test_straddling
 from warp_abtree.kernels.traversal.load_balance import (
@@ -30,13 +31,16 @@ from warp_abtree.kernels.traversal.load_balance import (
     start_items,
     units_per_pair,
 )
-from warp_abtree.kernels.traversal.node_pair import compare_node_pair, item_first, item_second
+from warp_abtree.kernels.traversal.node_pair import compare_node_pair
 from warp_abtree.kernels.traversal.small_trees import SmallLists, gather_leaves, is_small, test_small_trees
 from warp_abtree.kernels.traversal.warp_stack import (
+    SLAB_PAIR_LENGTH,
+    SLAB_PAIR_START,
     STACK_LENGTH,
     add_warp_sum,
     hold_uniform,
     push_children,
+    push_items,
     read_item,
     warp_any,
     warp_lane,
@@ -54,8 +58,11 @@ wp.set_module_options(MODULE_OPTIONS)
 DEPTH_FIRST_ROOM = wp.constant(128)
 
 STACK_MASK = wp.constant(STACK_LENGTH - 1)
-# An early hit ends a pair for `any`, so few leaf pairs wait.
+# An early hit ends a pair for `any`, so few leaf pairs wait, and none for slabs, until so many turns have had no hit.
 LEAF_PAIRS_FOR_ANY = wp.constant(8)
+LONG_SEARCH = wp.constant(16)
+# Where warps share a pair of so few nodes above those of slabs that each has little to do, slabs would but delay it.
+SLAB_NODES = wp.constant(8)
 # A warp with work for two looks at every second turn whether others are idle, at every one where pairs are few: a turn
 # is so many visits, or fewer until a warp of leaf pairs waits, and their tests.
 DONATION_LEAST = wp.constant(16)
@@ -86,8 +93,8 @@ def expand_items(
     items: wp.uint64,
     first: wp.int32,
     popped: wp.int32,
-    end: wp.int32,
-    waiting: wp.int32,
+    ends: wp.vec3i,
+    floor: wp.vec2i,
     states: StatePool,
     pose: PairPose,
 ):
@@ -98,10 +105,29 @@ def expand_items(
     lane = warp_lane()
     item = read_item(items, (first + wp.min(lane, popped - 1)) & STACK_MASK)
     warp_sync()
-    children, emitted, tests = compare_node_pair(states, pose, item, wp.where(lane < popped, -1, 0))
-    ends = push_children(items, end, waiting, emitted, children)
+    children, lists, tests = compare_node_pair(states, pose, floor, item, wp.where(lane < popped, -1, 0))
+    found = push_children(items, ends, lists, children)
     warp_sync()
-    return item_second(ends), item_first(ends), tests
+    return found, tests
+
+
+@wp.func
+def separate_slab_pairs(
+    items: wp.uint64,
+    first: wp.int32,
+    popped: wp.int32,
+    end: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+):
+    """Put the slab pairs on the stack that slabs do not separate, one a lane; return its new end."""
+    lane = warp_lane()
+    item = read_item(items, SLAB_PAIR_START + first + wp.min(lane, popped - 1))
+    overlap = slabs_overlap(models, states, pose, item)
+    end = push_items(items, end, overlap and lane < popped, item)
+    warp_sync()
+    return end
 
 
 @wp.func
@@ -137,6 +163,52 @@ def donate_items(
 
 
 @wp.func
+def slab_floor(pose: PairPose, parts: wp.int32):
+    """Return the nodes of A and B from which on slabs are compared, where so many warps share a pair."""
+    small = wp.max(pose.floor[0], pose.floor[1]) <= SLAB_NODES * parts
+    return wp.where(small, wp.vec2i(NO_NODE, NO_NODE), pose.floor)
+
+
+@wp.func
+def descend(
+    items: wp.uint64,
+    pace: Pace,
+    ready: wp.int32,
+    head: wp.int32,
+    ends: wp.vec3i,
+    floor: wp.vec2i,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+):
+    """Test node pairs for a turn, or until enough slab pairs or leaf pairs wait, and then a warp of slab pairs.
+
+    Returns the new ends and the pairs of nodes compared.
+    """
+    end, slab_pairs, waiting = wp.int32(ends[0]), wp.int32(ends[1]), wp.int32(ends[2])
+    ready_slab = wp.int32(ready)
+    visits, node_tests = wp.int32(0), wp.int32(0)
+    while visits < pace.tests_max and end > head and slab_pairs < ready_slab and waiting < ready:
+        # One at a time, depth first, needs little room; more where there is. Slab pairs come back to the stack.
+        room = wp.min(pace.stack_room - DEPTH_FIRST_ROOM - (end - head), SLAB_PAIR_LENGTH) - slab_pairs
+        ready_slab = wp.min(ready, wp.max(1, room - 3))
+        popped = wp.min(wp.max(1, room >> 2), wp.min(warp_size(), end - head))
+        end -= popped
+        found, compared = expand_items(items, end, popped, wp.vec3i(end, slab_pairs, waiting), floor, states, pose)
+        end = found[0]
+        slab_pairs = found[1]
+        waiting = found[2]
+        node_tests += compared
+        visits += 1
+    if slab_pairs >= ready_slab or (end == head and slab_pairs > 0):
+        popped = wp.min(slab_pairs, warp_size())
+        slab_pairs -= popped
+        end = separate_slab_pairs(items, slab_pairs, popped, end, models, states, pose)
+        node_tests += wp.where(warp_lane() < popped, 1, 0)
+    return wp.vec3i(end, slab_pairs, waiting), node_tests
+
+
+@wp.func
 def traverse_items(
     # static
     output: wp.int32,
@@ -154,32 +226,32 @@ def traverse_items(
 ):
     """Traverse what is on the stack and is not given away; return pairs of boxes compared, and face pair tests."""
     items, for_any = own.items, pace.for_any
-    head, end, waiting = wp.int32(0), wp.int32(own.end), wp.int32(0)
+    head, ends = wp.int32(0), wp.vec3i(own.end, 0, 0)
     node_tests, turn = wp.int32(0), wp.int32(0)
     tested, hit_count, uncertain_count = wp.int32(0), wp.int32(0), wp.int32(0)
     straddling = wp.int32(0)
     ready = wp.where(for_any, wp.min(LEAF_PAIRS_FOR_ANY, warp_size()), warp_size())
     ready_straddling = wp.where(for_any, 1, warp_size())
-    while end > head or waiting > 0 or straddling > 0:
-        found = False
-        tickets, visits = wp.int64(0), wp.int32(0)
+    floor = wp.where(for_any, wp.vec2i(NO_NODE, NO_NODE), pose.floor)
+    while ends[0] > head or ends[1] > 0 or ends[2] > 0 or straddling > 0:
+        found, tickets = False, wp.int64(0)
         turn += 1
         if (turn & pace.balance_mask) == 0:
             tickets = load_tickets(work.counter)
-        while visits < pace.tests_max and end > head and waiting < ready:
-            # One at a time, depth first, needs little room; more where there is.
-            popped = wp.max(1, (pace.stack_room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
-            popped = wp.min(popped, wp.min(warp_size(), end - head))
-            end -= popped
-            end, waiting, compared = expand_items(items, end, popped, end, waiting, states, pose)
-            node_tests += compared
-            visits += 1
-        if waiting >= ready or (end == head and waiting > 0):
+        if turn == LONG_SEARCH and for_any:
+            ready = warp_size()
+            floor = pose.floor
+        ends, compared = descend(items, pace, ready, head, ends, floor, models, states, pose)
+        node_tests += compared
+        waiting = ends[2]
+        empty = ends[0] == head and ends[1] == 0
+        if waiting >= ready or (empty and waiting > 0):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
+            ends[2] = waiting
             straddling = separate_leaf_pairs(mode, items, waiting, popped, straddling, models, states, pose)
             tested += popped
-        if straddling >= ready_straddling or (end == head and waiting == 0 and straddling > 0):
+        if straddling >= ready_straddling or (empty and waiting == 0 and straddling > 0):
             popped = wp.min(straddling, warp_size())
             straddling -= popped
             found, uncertain = test_straddling(
@@ -188,12 +260,11 @@ def traverse_items(
             hit_count += wp.where(found, 1, 0)
             uncertain_count += wp.where(uncertain, 1, 0)
         idle = count_idle(tickets)
-        if idle > 0 and end - head >= 2 * DONATION_LEAST:
-            head = donate_items(DONATION_LEAST, pair, idle, items, head, end, work)
+        if idle > 0 and ends[0] - head >= 2 * DONATION_LEAST:
+            head = donate_items(DONATION_LEAST, pair, idle, items, head, ends[0], work)
         if for_any:
             if warp_any(found or hits.any_hit[pair] != 0):
-                end = head
-                waiting = 0
+                ends = wp.vec3i(head, 0, 0)
                 straddling = 0
     return node_tests, wp.vec3i(hit_count, wp.where(warp_lane() == 0, tested, 0), uncertain_count)
 
@@ -261,6 +332,7 @@ def warp_traversal(mode: int, for_any: bool):
                 ended = 0
                 p = work_inout.owner[slot][0]
             pose = pair_poses[p]
+            pose.floor = slab_floor(pose, parts)
             node_tests, tests = wp.int32(0), wp.vec3i()
             lists = SmallLists()
             task = wp.vec3i(p, unit - p * parts, parts)

@@ -52,6 +52,8 @@ class Hits:
     exact_tests: wp.array(dtype=wp.int64)  # those that are inexact in float64 and took exact signs, shape [pair]
     uncertain: wp.array(dtype=wp.vec3i)  # (pair, face of the lower object, face of the higher), shape [capacity]
     uncertain_total: wp.array(dtype=wp.int32)  # numbers `uncertain`
+    inexact: wp.array(dtype=wp.vec3i)  # as `uncertain`, of the same shape where there is an exact stage
+    inexact_total: wp.array(dtype=wp.int32)  # numbers `inexact`
     gap: wp.array(dtype=wp.float64)  # under which face pairs are near [world units], shape [pair]; [0] for no gap
     apart: wp.array(dtype=wp.vec3i)  # as `uncertain`: pairs that are apart and may be near, shape [capacity]
     apart_total: wp.array(dtype=wp.int32)  # numbers `apart`

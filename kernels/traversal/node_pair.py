@@ -22,8 +22,9 @@ from warp_abtree.kernels.traversal.nodes import Node, load_constant_node, load_n
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 INDEX_MASK = wp.constant(2**31 - 1)
-# What a test emits is counted in one word: leaf pairs << 16 | items.
-EMIT_ITEM, EMIT_LEAVES = wp.constant(1), wp.constant(1 << 16)
+# The lists of a warp that overlapping children are for, see `push_children`.
+TO_STACK, TO_LEAF_PAIRS = native.constant("STACK_LIST"), native.constant("LEAF_PAIR_LIST")
+TO_SLAB_PAIRS, TO_NONE = native.constant("SLAB_PAIR_LIST"), native.constant("NO_LIST")
 
 four_items = wp.types.vector(length=4, dtype=wp.int64)
 
@@ -99,26 +100,31 @@ def next_item(a: Child, b: Child):
 
 
 @wp.func
-def emit_of_pair(used: wp.int32, a: Child, b: Child):
-    """Return what two children add to the count of what is emitted if they overlap and `used` is negative."""
-    emitted = wp.where((a.face | b.face) >= 0, EMIT_LEAVES, EMIT_ITEM)
-    return wp.where(boxes_overlap(a.box, b.box), wp.where(used < 0, emitted, 0), 0)
+def list_of_pair(used: wp.int32, inner: wp.int32, a: Child, b: Child):
+    """Return the list that two children are for, TO_NONE unless they overlap and `used` is negative."""
+    to = wp.where((a.face | b.face) >= 0, TO_LEAF_PAIRS, inner)
+    return wp.where(boxes_overlap(a.box, b.box), wp.where(used < 0, to, TO_NONE), TO_NONE)
 
 
 @wp.func
-def count_used(used: wp.vec4i):
-    tests = wp.int32(0)
-    for k in range(4):
-        tests -= used[k] >> 31
-    return tests
+def have_slabs(floor: wp.vec2i, item: wp.int64):
+    """Return whether the nodes that an item names have slabs, as all below them."""
+    above_a = (item_first(item) & INDEX_MASK) - floor[0]
+    above_b = (item_second(item) & INDEX_MASK) - floor[1]
+    return (above_a | above_b) >= 0
 
 
 @wp.func
-def compare_node_pair(states: StatePool, pose: PairPose, item: wp.int64, live: wp.int32):
-    """Compare what an item names; return the items that follow, what each emits, and the pairs of boxes compared.
+def compare_node_pair(states: StatePool, pose: PairPose, floor: wp.vec2i, item: wp.int64, live: wp.int32):
+    """Compare what an item names; return the items that follow, their lists, and the pairs of boxes compared.
 
-    live is -1, or 0 where nothing is asked of the item, which still names nodes. No branches: the lanes of a warp stay
-    together, and all loads are under way at once. A node that is compared alone is its own sibling.
+    No branches: the lanes of a warp stay together, and all loads are under way at once. A node compared alone is its
+    own sibling.
+
+    Args:
+        floor: `PairPose.floor`, or NO_NODE.
+        live: -1, or 0 where nothing is asked of the item, which still names nodes.
+
     """
     x = item_first(item)
     y = item_second(item)
@@ -135,11 +141,13 @@ def compare_node_pair(states: StatePool, pose: PairPose, item: wp.int64, live: w
     b0 = child_of_b(pose, node_b0)
     b1 = child_of_b(pose, node_b1)
     used = wp.vec4i(live, y & live, x & live, x & y & live)
-    emitted = wp.vec4i(
-        emit_of_pair(used[0], a0, b0),
-        emit_of_pair(used[1], a0, b1),
-        emit_of_pair(used[2], a1, b0),
-        emit_of_pair(used[3], a1, b1),
+    inner = wp.where(have_slabs(floor, item), TO_SLAB_PAIRS, TO_STACK)
+    lists = wp.vec4i(
+        list_of_pair(used[0], inner, a0, b0),
+        list_of_pair(used[1], inner, a0, b1),
+        list_of_pair(used[2], inner, a1, b0),
+        list_of_pair(used[3], inner, a1, b1),
     )
     items = four_items(next_item(a0, b0), next_item(a0, b1), next_item(a1, b0), next_item(a1, b1))
-    return items, emitted, count_used(used)
+    # Of one node or two of A times one or two of B.
+    return items, lists, live & ((1 + two_a) << two_b)

@@ -1,7 +1,7 @@
-"""The pass over uncertain face pairs: float64 for all of them, exact signs for the few that are inexact there.
+"""The passes over uncertain face pairs: float64 for all of them, exact signs for the few that are inexact there.
 
-Each warp keeps lists of what waits for its next stage, so that its threads do much the same. A block is a warp:
-neighbours on a list are of the same few object pairs, and count for them together.
+Each pass works off a list of its own, so that the threads of a warp do much the same. A block is a warp: neighbours on
+a list are of the same few object pairs, and count for them together.
 """
 
 import warp as wp
@@ -20,7 +20,6 @@ from warp_abtree.kernels.traversal.face_pairs import (
     test_faces,
 )
 from warp_abtree.kernels.traversal.warp_stack import (
-    STRADDLING_LENGTH,
     count_flags,
     push_signed_pair,
     read_signed_pair,
@@ -90,10 +89,12 @@ def items_at_once(count: wp.int32, threads: wp.int32):
 
 
 @wp.func
-def defer_inexact(list: wp.uint64, waiting: wp.int32, hits: Hits, inexact: bool, item: wp.vec3i):
-    """Put a face pair on this warp's list of inexact ones; return how many wait. For all threads of a warp."""
+def defer_inexact(hits: Hits, inexact: bool, item: wp.vec3i):
+    """Put a face pair on the list that `resolve_inexact_kernel` works off. For all threads of a warp."""
     count_flags(hits.exact_tests, item[0], inexact)
-    return push_signed_pair(list, STRADDLING_LENGTH + waiting, inexact, item, 0) - STRADDLING_LENGTH
+    slot = reserve_slot(hits.inexact_total, inexact)
+    if inexact:
+        hits.inexact[slot] = item
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=80)
@@ -150,13 +151,12 @@ def resolve_straddling(
     list: wp.uint64,
     first: wp.int32,
     popped: wp.int32,
-    inexact: wp.int32,
     models: ModelPool,
     states: StatePool,
     pair_poses: wp.array(dtype=PairPose),
     hits: Hits,
 ):
-    """Decide straddling pairs, one a lane, and report those that meet; return how many inexact ones wait then."""
+    """Decide straddling pairs, one a lane, and report those that meet."""
     lane = warp_lane()
     waiting = read_signed_pair(list, first + wp.min(lane, popped - 1))
     item = wp.vec3i(waiting[0], waiting[1], waiting[2])
@@ -168,30 +168,11 @@ def resolve_straddling(
     meet = wp.where(lane < popped, meet, 0)
     warp_sync()
     report_item(output, pair_poses, item, meet == 1, hits)
-    return defer_inexact(list, inexact, hits, meet == UNCERTAIN, item)
-
-
-@wp.func
-def resolve_inexact(
-    output: wp.int32,
-    list: wp.uint64,
-    first: wp.int32,
-    popped: wp.int32,
-    models: ModelPool,
-    states: StatePool,
-    pair_poses: wp.array(dtype=PairPose),
-    hits: Hits,
-):
-    """Decide inexact pairs by exact signs, one a lane, and report those that meet."""
-    lane = warp_lane()
-    waiting = read_signed_pair(list, STRADDLING_LENGTH + first + wp.min(lane, popped - 1))
-    warp_sync()
-    item = wp.vec3i(waiting[0], waiting[1], waiting[2])
-    resolve_item(EXACT, output, models, states, pair_poses, lane < popped, item, hits)
+    defer_inexact(hits, meet == UNCERTAIN, item)
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=96)
-def resolve_exact_kernel(
+def float64_filter_kernel(
     threads: wp.int32,
     output: wp.int32,
     models: ModelPool,
@@ -199,18 +180,17 @@ def resolve_exact_kernel(
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
-    """Decide the uncertain face pairs, every so many-th a thread: in float64, by exact signs where that is inexact.
+    """Decide the uncertain face pairs, every so many-th a thread, and list those that are inexact in float64.
 
-    Planes first: they separate most pairs. Straddling pairs take edges, and inexact ones exact signs, when a warp of
-    them waits.
+    Planes first: they separate most pairs, and only straddling pairs take edges, when a warp of them waits.
     """
     lane = warp_lane()
     list = signed_pairs()
     end = wp.min(hits_inout.uncertain_total[0], hits_inout.uncertain.shape[0])
     at_once = items_at_once(end, threads)
     first = at_once * (wp.tid() / warp_size())
-    straddling, inexact = wp.int32(0), wp.int32(0)
-    while first < end or straddling > 0 or inexact > 0:
+    straddling = wp.int32(0)
+    while first < end or straddling > 0:
         if first < end:
             item = hits_inout.uncertain[first + wp.min(lane, end - 1 - first)]
             signs = wp.int32(SEPARATED)
@@ -219,17 +199,33 @@ def resolve_exact_kernel(
                 signs = item_plane_signs(models, states, pair_poses[item[0]], item)
             list_apart_item(item, waits and signs == SEPARATED, hits_inout)
             straddling = push_signed_pair(list, straddling, signs >= 0, item, signs)
-            inexact = defer_inexact(list, inexact, hits_inout, signs == UNDECIDED, item)
+            defer_inexact(hits_inout, signs == UNDECIDED, item)
             warp_sync()
             first += wp.min(at_once * (threads / warp_size()), end - first)
         if straddling >= warp_size() or (first >= end and straddling > 0):
             popped = wp.min(straddling, warp_size())
             straddling -= popped
-            inexact = resolve_straddling(
-                output, list, straddling, popped, inexact, models, states, pair_poses, hits_inout
-            )
-            warp_sync()
-        if inexact >= warp_size() or (first >= end and straddling == 0 and inexact > 0):
-            popped = wp.min(inexact, warp_size())
-            inexact -= popped
-            resolve_inexact(output, list, inexact, popped, models, states, pair_poses, hits_inout)
+            resolve_straddling(output, list, straddling, popped, models, states, pair_poses, hits_inout)
+
+
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=168)
+def resolve_inexact_kernel(
+    threads: wp.int32,
+    output: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pair_poses: wp.array(dtype=PairPose),
+    hits_inout: Hits,
+):
+    """Decide the inexact face pairs by exact signs: every so many-th a thread."""
+    lane = warp_lane()
+    end = hits_inout.inexact_total[0]
+    at_once = items_at_once(end, threads)
+    first = at_once * (wp.tid() / warp_size())
+    while first < end:
+        waits = lane < wp.min(at_once, end - first)
+        item = wp.vec3i()
+        if waits:
+            item = hits_inout.inexact[first + lane]
+        resolve_item(EXACT, output, models, states, pair_poses, waits, item, hits_inout)
+        first += wp.min(at_once * (threads / warp_size()), end - first)

@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 WARP_SIZE = native.constant("WARP_SIZE")
 STACK_LENGTH = native.constant("STACK_LENGTH")  # node pairs
 STRADDLING_START = native.constant("STRADDLING_START")
-STRADDLING_LENGTH = native.constant("STRADDLING_LENGTH")
+SLAB_PAIR_START, SLAB_PAIR_LENGTH = native.constant("SLAB_PAIR_START"), native.constant("SLAB_PAIR_LENGTH")
 
 six_numbers = wp.types.vector(length=6, dtype=wp.float64)
 
@@ -39,7 +39,8 @@ def warp_sync(): ...
 def warp_stack() -> wp.uint64:
     """Return where this warp's items lie, an address in shared memory on CUDA.
 
-    Its stack, its leaf pairs, those that straddle each other's planes, and the signs of these, half an item each.
+    Its stack, its leaf pairs, those that straddle each other's planes, the signs of these, half an item each, and its
+    slab pairs.
     """
 
 
@@ -51,14 +52,17 @@ def read_item(items: wp.uint64, i: wp.int32) -> wp.int64: ...
 def write_item(items: wp.uint64, i: wp.int32, item: wp.int64): ...
 
 
-@wp.func_native(stack_code("push_children"))
-def push_children(
-    items: wp.uint64, end: wp.int32, leaf_end: wp.int32, emitted: wp.vec4i, children: four_items
-) -> wp.int64:
-    """Append the children that emit an item to the stack, those that emit a leaf pair to the leaf pairs.
+@wp.func_native(native.body("push_children.cuh", "push_children"))
+def push_children(items: wp.uint64, ends: wp.vec3i, lists: wp.vec4i, children: four_items) -> wp.vec3i:
+    """Append children to the lists that they are for, if any, see `node_pair`.
 
-    Returns both ends as an item, that of the leaf pairs first.
+    Returns the new ends of the stack, the slab pairs and the leaf pairs.
     """
+
+
+@wp.func_native(stack_code("push_items"))
+def push_items(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64) -> wp.int32:
+    """Append the items whose flag is set to the stack; return its new end."""
 
 
 @wp.func_native(stack_code("hold_uniform"))
@@ -78,7 +82,7 @@ def read_signs(items: wp.uint64, i: wp.int32) -> wp.int32:
 
 @wp.func_native(stack_code("signed_pairs"))
 def signed_pairs() -> wp.uint64:
-    """Return where this warp holds face pairs with their signs, then inexact ones; in shared memory on CUDA."""
+    """Return where this warp holds face pairs with their signs, an address in shared memory on CUDA."""
 
 
 @wp.func_native(stack_code("push_signed_pair"))

@@ -19,7 +19,7 @@ from warp_abtree.kernels.poses import COORDINATE_MIN
 from warp_abtree.kernels.traversal import dual_tree, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.face_pairs import WITHIN
 
-PASSES = ("resolve_rounded", "resolve_exact")
+PASSES = ("resolve_rounded", "float64_filter", "resolve_inexact")
 # Approximate on purpose, or without arithmetic.
 OTHERS = re.compile(r"\.(progressive|lod|arrays|native)\b")
 
@@ -70,7 +70,7 @@ def test_ptx_is_not_contracted(tmp_path, fuse_fp):
 TRAVERSAL = {
     "all": (lambda: dual_tree.warp_traversal(int(EXACT), False), "f32", {"fma.rn.f32"}),
     "any": (lambda: dual_tree.warp_traversal(int(EXACT), True), "f32", {"fma.rn.f32"}),
-    "filter": (lambda: uncertain_pairs.resolve_exact_kernel, "f64", {"fma.rn.f64"}),
+    "filter": (lambda: uncertain_pairs.float64_filter_kernel, "f64", {"fma.rn.f64"}),
     "rounded": (lambda: uncertain_pairs.resolve_rounded_kernel, "f64", set()),
 }
 

@@ -172,7 +172,7 @@ def test_warps_give_the_same_answers(device, room, parts, small):
     for output in ("faces", "count", "any"):
         with testing.regime(plain_tests=10**9, small_faces=0):  # slabs of the CPU save tests, small trees do on CUDA
             plain = ab.Query(scene, output, pairs=pairs).run()
-        with testing.regime(warps=True, warps_per_pair=parts, stack_length=room, small_faces=small):
+        with testing.regime(warps=True, warps_per_pair=parts, stack_length=room, small_faces=small, slabs=False):
             query = ab.Query(scene, output, pairs=pairs, capacity=ab.Buffers(uncertain=2))
         result = query.run()
         visits[output] = result.node_tests.sum()

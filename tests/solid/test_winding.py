@@ -14,6 +14,7 @@ from warp_abtree.app import SceneError, load_scene
 from warp_abtree.app.cli.main import main
 from warp_abtree.model.mesh import describe_mesh, mesh_from_arrays, orient_mesh
 from warp_abtree.model.winding import find_winding
+from warp_abtree.simulate.body_state import mass_properties
 
 TORUS = trimesh.creation.torus(1, 0.3, major_sections=12, minor_sections=8)
 
@@ -216,3 +217,11 @@ def test_orient_in_models_files_and_commands(tmp_path, capsys, monkeypatch):
     (tmp_path / "b.toml").write_text(text, encoding="utf-8")
     with pytest.raises(SceneError, match=r"objects\[0\].solid: .* is no solid.*edges belong"):
         load_scene(tmp_path / "b.toml", device="cpu")
+
+
+def test_the_mass_of_a_mended_body_is_its_own():
+    inverted = ab.Model.from_arrays(TORUS.vertices, TORUS.faces[:, ::-1], name="inverted")
+    with pytest.warns(RuntimeWarning, match="mass"):
+        assert mass_properties(inverted).volume > 1.2 * TORUS.volume  # of the hull
+    mended = ab.Model.from_arrays(TORUS.vertices, TORUS.faces[:, ::-1], orient=True)
+    assert mass_properties(mended).volume == pytest.approx(TORUS.volume)

@@ -16,6 +16,7 @@ class Regime:
         cpu_threads: Threads of a launch on the CPU; None is all that the process may use.
         plain_tests: Pairs of nodes that a thread of the CPU compares by boxes alone before it looks whether few of them
             hit, and makes slabs of subtrees where they do, which as many more tests have to pay for.
+        slabs: Whether warps compare slabs of nodes of few faces, too.
         full_refit: Fraction of its faces past which a state is refitted whole, by kind of device, as measured. A slice
             repeats faces, so k is smaller still.
         block_updates: Whether a block updates a tree state by itself where it can; False: all by level lists.
@@ -32,6 +33,7 @@ class Regime:
     key_bits: int = 63
     cpu_threads: int | None = None
     plain_tests: int = 6144
+    slabs: bool = True
     full_refit: dict = field(default_factory=lambda: {"cpu": 0.5, "cuda": 0.2})
     block_updates: bool = True
     packs_results: bool | None = None

@@ -62,7 +62,7 @@ class QueryBuffers:
 
     def _make_hits(self, with_gap=False):
         hits = face_pairs.Hits()
-        for name in ("total", "uncertain_total", *(["apart_total"] if with_gap else [])):
+        for name in ("total", "uncertain_total", "inexact_total", *(["apart_total"] if with_gap else [])):
             setattr(hits, name, wp.zeros(1, dtype=wp.int32, device=self.device))
         return hits
 
@@ -205,8 +205,11 @@ class QueryBuffers:
             wp.copy(self.within, distances, count=len(distances))
 
     def _resize_uncertain(self, capacity: int):
-        made = ["uncertain"] if self._gap is None else ["uncertain", "apart"]
-        self._replace([(self.hits, name, wp.empty(capacity, dtype=wp.vec3i, device=self.device)) for name in made])
+        inexact = capacity if self.precision == "exact" else 0
+        made = [("uncertain", capacity), ("inexact", inexact)]
+        if self._gap is not None:
+            made.append(("apart", capacity))
+        self._replace([(self.hits, name, wp.empty(room, dtype=wp.vec3i, device=self.device)) for name, room in made])
 
     def resize(self, capacity: int):
         """Make room for a number of intersecting face pairs."""

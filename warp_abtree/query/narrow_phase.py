@@ -34,9 +34,9 @@ from warp_abtree.state.generation import LaunchGuard
 
 # Face pairs that the float32 stage leaves uncertain: about one in a hundred. The list grows as needed.
 UNCERTAIN_ROOM = 65536
-# Warps that one multiprocessor runs at a time by their registers: of the traversal, of uncertain pairs, of near ones.
+# Warps that one multiprocessor runs at a time by their registers: of the traversal, of float64, of exact signs.
 WARPS_A_PROCESSOR = 16
-FILTER_WARPS_A_PROCESSOR, NEAR_WARPS_A_PROCESSOR = 20, 12
+FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
 # So that each finds a slot for all that it gives away at once.
 WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
@@ -88,6 +88,8 @@ class Query(QueryReadout):
         self.output, self.precision, self.device = output, precision, scene.device
         with loading(self.device, self._slow_kernels(within is not None)):
             self.batch = batch = scene if isinstance(scene, Batch) else scene.batch()
+            if self.uses_warps() and self._regime.slabs:
+                batch.models.make_slabs()
         if pairs is not None:
             pairs = batch.check_pairs(pairs)
         if within is not None:
@@ -312,8 +314,9 @@ class Query(QueryReadout):
         if int(PRECISIONS[self.precision]) != EXACT:
             return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR)]
         return [
-            (uncertain_pairs.resolve_exact_kernel, FILTER_WARPS_A_PROCESSOR),
-            *([] if self._asked_gap is None else [(near_faces.find_near_kernel, NEAR_WARPS_A_PROCESSOR)]),
+            (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR),
+            (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR),
+            *([] if self._asked_gap is None else [(near_faces.find_near_kernel, EXACT_WARPS_A_PROCESSOR)]),
         ]
 
     def _slow_kernels(self, with_distances: bool) -> list:
@@ -322,7 +325,7 @@ class Query(QueryReadout):
         modes = [self._mode(), *([within] if with_distances else [])]
         if self.uses_warps():
             kernels = [dual_tree.warp_traversal(mode, mode == within or self.output == "any") for mode in modes]
-            kernels += [kernel for kernel, _ in self._passes()]
+            kernels += reversed([kernel for kernel, _ in self._passes()])
         else:
             kernels = [simd.thread_traversal(mode) for mode in modes]
         kernels += [relative_pose.relative_poses(mode in (within, int(face_pairs.GAP))) for mode in modes]

@@ -7,6 +7,8 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.poses import SLAB_DEPTH
+from warp_abtree.kernels.slabs.make_slabs import make_slab_kernel
 from warp_abtree.kernels.traversal.nodes import clear_node_kernel
 from warp_abtree.state.generation import Generation
 
@@ -24,6 +26,7 @@ class ModelArrays:
 
     Attributes:
         pool: `ModelPool` for kernels.
+        device: As given.
         vertex_start, face_start, split_start, node_count, face_count, depth: NumPy, one entry a model.
         split_bounds: split_start of each model, offset into the pool's split_face.
         lod_error: Of each model, as `ProgressiveMesh` has it.
@@ -79,7 +82,20 @@ class ModelArrays:
         pool.finest_limit = _upload(np.array(finest, np.int32), wp.int32, device)
         pool.lod_max = _upload(self.lod_max.astype(np.int32), wp.int32, device)
         pool.centre = _upload(np.array([model.centre for model in models]), wp.vec3d, device)
-        self.pool = pool
+        pool.node_slab = wp.empty(0, dtype=wp.vec4, device=device)
+        pool.slab_gain = wp.zeros(len(models), dtype=wp.vec2i, device=device)
+        self.pool, self.device = pool, device
+
+    def make_slabs(self):
+        """Make slabs of nodes of few faces, for warps, unless there are any. Launches only."""
+        if len(self.pool.node_slab):
+            return
+        slabs = wp.empty(int(self.node_start[-1]), dtype=wp.vec4, device=self.device)
+        for model, depth in enumerate(self.depth):
+            first = 1 << max(0, int(depth) - int(SLAB_DEPTH))
+            inputs = [model, first, self.pool, slabs, self.pool.slab_gain]
+            wp.launch(make_slab_kernel, int(self.node_count[model]) - first, inputs, device=self.device)
+        self.pool.node_slab = slabs
 
 
 @dataclass

@@ -1,0 +1,1 @@
+"""Slabs of nodes: how far faces reach along the direction in which they are thinnest."""

@@ -1,0 +1,131 @@
+"""Slabs of nodes of few faces, which warps compare: they hold their faces, and prune no pair that touches."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.nested import nested_cases
+from helpers.questions import GpuQuery, pairs_of, scene_of, to_matrix
+from helpers.samples import random_quaternions, sample, true_faces
+from oracles.triangle import into_frame_of_a, quaternion_matrix
+
+import warp_abtree as ab
+from warp_abtree import testing
+from warp_abtree.kernels.arrays import ModelPool, StatePool
+from warp_abtree.kernels.poses import SLAB_DEPTH, PairPose
+from warp_abtree.kernels.slabs.overlap import DIRECTION_LENGTH, slabs_overlap
+from warp_abtree.kernels.traversal.node_pair import pack_item
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+def read_slabs(device, model):
+    """Return directions, sums and sizes of a model's nodes that have slabs, and the first of these nodes."""
+    scene = ab.Scene(device)
+    for _ in range(2):
+        scene.add(model)
+    query = GpuQuery(scene, "any", pairs=[(0, 1)])
+    records = query.batch.models.pool.node_slab.numpy()
+    low, high = records[:, 0].view(np.int32), records[:, 1].view(np.int32)
+    directions = np.stack([low & 0xFFFF, (low >> 16) & 0xFFFF, high], 1) - int(DIRECTION_LENGTH)
+    return directions, records[:, 2], records[:, 3], 1 << max(0, model.tree.depth - int(SLAB_DEPTH))
+
+
+@pytest.mark.parametrize("name", ["torus", "soup", "crumbs", "box"])
+def test_slabs_hold_their_faces(device, name):
+    """Of every node the exact extent along its direction, in fractions; and nodes of one face are as thin as it is."""
+    model = sample(name)
+    directions, sums, sizes, first = read_slabs(device, model)
+    leaf_node = model.tree.leaf_node
+    corner = (model.progressive.vertex_pos - model.centre)[model.progressive.face_vertex]
+    reach = np.abs(corner).max()
+    used = np.flatnonzero(model.tree.node_face[leaf_node] >= 0)[:200]
+    for face in used:
+        node = int(leaf_node[face])
+        while node >= first:
+            n = directions[node]
+            assert abs(np.linalg.norm(n) / int(DIRECTION_LENGTH) - 1) < 1e-3
+            for p in corner[face]:
+                along = sum(2 * Fraction(float(x)) * int(k) for x, k in zip(p, n))
+                rounding = Fraction(float(reach)) * 2**-34  # of float64, which the margin covers
+                assert abs(along - Fraction(float(sums[node]))) <= Fraction(float(sizes[node])) + rounding
+            node >>= 1
+    assert np.median(sizes[leaf_node[used]]) < 1e-3 * int(DIRECTION_LENGTH) * reach
+
+
+@pytest.mark.parametrize("gap", [0.001, 0.02, 0.06])
+def test_nested_parts_equal_brute_force(device, gap):
+    """Both outputs, the second LODs coarser and without slabs; free, touching here and there, and crossing all over."""
+    cases = nested_cases(np.random.default_rng(5), gap)
+    rows = np.concatenate([np.insert(true_faces(*case), 0, p, 1) for p, case in enumerate(cases)])
+    tests = []
+    for slabs in (False, True):
+        with testing.regime(slabs=slabs, warps_per_pair=1):
+            scene = scene_of(device, cases)
+            found = GpuQuery(scene, "faces", pairs=pairs_of(cases)).run()
+            np.testing.assert_array_equal(found.faces, rows)
+            met = GpuQuery(scene, "any", pairs=pairs_of(cases)).run().any
+            np.testing.assert_array_equal(met, np.isin(range(len(cases)), rows[:, 0]))
+            tests.append((found.node_tests, found.triangle_tests))
+    (nodes, faces), (fewer_nodes, fewer_faces) = tests
+    assert nodes[1] == fewer_nodes[1] and faces[1] == fewer_faces[1], "no slabs at coarse LODs"
+    assert 1.03 * fewer_faces[0] < faces[0], "slabs separate what boxes do not"
+
+
+@wp.kernel
+def compare_slabs_kernel(
+    margin_factor: wp.float32,
+    models: ModelPool,
+    states: StatePool,
+    pair_poses: wp.array(dtype=PairPose),
+    nodes: wp.array(dtype=wp.vec2i),
+    overlap_out: wp.array(dtype=wp.int32),
+):
+    """Note which nodes slabs do not separate."""
+    i = wp.tid()
+    pose = pair_poses[0]
+    pose.margin = pose.margin * margin_factor
+    item = pack_item(nodes[i][0], nodes[i][1])
+    overlap_out[i] = wp.where(slabs_overlap(models, states, pose, item), 1, 0)
+
+
+def touching_soups(device, rng, count, reach_a, reach_b):
+    """Return a query of two soups, and their trees: faces of one number lie in about one plane and share a corner."""
+    first = rng.uniform(-1, 1, (count, 1, 3))
+    turn = quaternion_matrix(random_quaternions(rng, 1)[0])
+    pose, faces = to_matrix(turn, rng.normal(size=3)), np.arange(3 * count).reshape(-1, 3)
+    meet = into_frame_of_a(first.reshape(-1, 3), np.eye(4), pose).reshape(-1, 1, 3)
+    plane, along = rng.normal(size=(count, 2, 3)), rng.uniform(-1, 1, (2, count, 2, 2))
+    a = np.concatenate([meet, meet + reach_a * (along[0] @ plane)], 1)
+    b = np.concatenate([first, first + reach_b * (along[1] @ plane @ turn)], 1)
+    models = [ab.Model.from_arrays(points.reshape(-1, 3), faces) for points in (a, b)]
+    scene = ab.Scene(device)
+    for model, placed in zip(models, (np.eye(4), pose)):
+        scene.add(model, placed)
+    query = GpuQuery(scene, "faces", pairs=[(0, 1)])
+    rows = query.run().faces[:, 1:]
+    assert (rows[rows[:, 0] == rows[:, 1], 0] == np.arange(count)).all()
+    return query, [model.tree for model in models]
+
+
+def count_lost(query, trees, levels, margin_factor):
+    """Return how many nodes so far above faces that meet slabs separate."""
+    leaves = np.stack([tree.leaf_node for tree in trees], 1)
+    nodes = wp.array(leaves >> levels, dtype=wp.vec2i, device=query.device)
+    overlap = wp.zeros(len(nodes), dtype=wp.int32, device=query.device)
+    inputs = [margin_factor, *query.batch.pools[:2], query.pair_poses, nodes, overlap]
+    wp.launch(compare_slabs_kernel, dim=len(nodes), inputs=inputs, device=query.device)
+    return int((overlap.numpy() == 0).sum())
+
+
+@pytest.mark.parametrize("reach_a, reach_b", [(1e-3, 1e3), (1e3, 1e-3), (1e-3, 1e-3)])
+def test_margin_covers_rounding(device, reach_a, reach_b):
+    """Faces that touch in a point survive, as do the nodes above; without the margin some do not."""
+    rng, lost = np.random.default_rng(8), 0
+    for _ in range(10):
+        query, trees = touching_soups(device, rng, 128, reach_a, reach_b)
+        for levels in range(3):
+            assert count_lost(query, trees, levels, 1.0) == 0
+        lost += count_lost(query, trees, 0, 0.0)
+    assert lost > 100
