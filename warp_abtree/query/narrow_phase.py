@@ -364,8 +364,7 @@ class Query(QueryReadout):
         def read():
             return Found(self._read_totals())
 
-        first = read()
-        if self._grow_uncertain(read, first) is not first:
+        if self._grow_uncertain(read, first := read()) is not first:
             self.finish()
 
     def _grow_uncertain(self, read, found: Found) -> Found:
