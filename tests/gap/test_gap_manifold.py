@@ -98,8 +98,9 @@ def test_the_deepest_point_is_kept(device):
         assert (depth > -0.1).all()
 
 
-def test_points_keep_their_order_while_a_box_slides(device):
-    """Points that stay, as a box slides over the edges of a floor, come in the same order as before."""
+@pytest.mark.parametrize("rocks", [False, True])
+def test_points_keep_their_order_while_a_box_slides(device, rocks):
+    """Points that stay, as a box slides over the edges of a floor or rocks on it, come in the same order as before."""
     floor, cube = box(4, 4, 1, splits=4), box(0.7, 0.6, 0.5)
     scene = ab.Scene(device)
     scene.add(floor, (0, 0, -0.5, 0, 0, 0, 1))
@@ -108,6 +109,8 @@ def test_points_keep_their_order_while_a_box_slides(device):
     for step in range(120):
         turned = about((0.002, 0.001, 1), 0.4 + 0.002 * step)
         place = np.array([-0.6 + 0.01 * step, 0.3 - 0.004 * step, 0.2495])
+        if rocks:
+            turned, place = about((np.sin(step), np.cos(2 * step), 0), 0.004), np.array([0.02, 0.03, 0.25])
         scene.set_poses([(0, 0, -0.5, 0, 0, 0, 1), (*place, *turned)])
         query.run()
         count = query.manifolds.count.numpy()[0]

@@ -78,8 +78,13 @@ def check_buffer_lengths(queries):
             means, sums, contacts = query.pair_contacts, query._sums, query.contacts
             rooms += [means.point, means.normal, means.travel, sums.total, sums.middle, query.start[1:]]
             places = [query.hits.face, query.faces, *(getattr(contacts, name) for name in (*VECTORS, "coplanar"))]
+            with_gap = query._gap is not None
+            if with_gap:
+                rooms += [query.hits.gap, sums.number]
+                places.append(contacts.separation)
             assert len({len(array) for array in (*places, query._key[::2], query._order[::2])}) == 1
             chunks = [sums.point, sums.normal, sums.length, sums.area, sums.change, sums.front, sums.back, sums.span]
+            chunks += [sums.crossed] if with_gap else []
             assert {len(array) for array in chunks} == {len(query.hits.face) // int(CHUNK) + len(query.pairs)}
         assert len({len(room) for room in rooms}) == 1
 

@@ -32,6 +32,7 @@ QUERIES = {
     "within": lambda scene, **options: ab.Query(scene, "count", within=0.01, **options),
     "as on CUDA": lambda scene, **options: GpuQuery(scene, capacity=ab.Buffers(uncertain=1, hits=1), **options),
     "contacts": lambda scene, **options: ab.ContactQuery(scene, capacity=1, **options),
+    "near": lambda scene, **options: ab.ContactQuery(scene, capacity=1, gap=0.02, **options),
     "found": lambda scene, **_: ab.ContactQuery(scene, capacity=ab.Buffers(pairs=1, hits=1)),
 }
 

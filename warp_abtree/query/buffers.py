@@ -49,6 +49,8 @@ class QueryBuffers:
     contained: wp.array  # face of what is inside, where there are solids
     _within: np.ndarray
     _gap: Any = None  # beside given pairs; of the broad phase's pairs that of each object
+    _asked_gap: Any = None  # of operators that take one
+    _reach: wp.array | None = None  # part of each object in the gap, where the broad phase makes pairs
     _given: np.ndarray  # pairs on the host
     slab_memory: wp.array
     _regime: Regime
@@ -59,6 +61,25 @@ class QueryBuffers:
         """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
         warps = self._regime.warps
         return self.device.is_cuda if warps is None else warps
+
+    def _take_gap(self, pair_count: int | None):
+        """Check the gap that is asked, if any; what the broad phase reads of it goes to the device."""
+        gap, count = self._asked_gap, self.batch.object_count
+        if gap is None:
+            return
+        if self.precision != "exact":
+            raise ValueError(f"gap: needs precision 'exact', not {self.precision!r}")
+        if pair_count is None and isinstance(gap, wp.array) and gap.shape == (count,) and gap.dtype is wp.vec4d:
+            self._gap, self._reach = np.zeros(count), gap
+            return
+        self._gap = check_gap(gap, pair_count, count)
+        if pair_count is None:
+            rows = np.zeros((count, 4))
+            rows[:, 3] = 0.5 * self._gap if self._gap.ndim == 0 else self._gap
+            self._reach = wp.array(rows, dtype=wp.vec4d, device=self.device)
+
+    def _make_broad_phase(self, capacity, sorts: bool) -> BroadPhase:
+        return BroadPhase(self.batch, capacity, sorts, self._reach)
 
     def _make_hits(self, with_gap=False):
         hits = face_pairs.Hits()

@@ -21,11 +21,11 @@ far: so what lies up to d inside is not forgotten once it no longer crosses. Acr
 if no other face of either object is nearer to them: so a box that slides over a floor of many faces is not stopped by
 the edges between them. Depths count from the gap on for what is half as deep as what.
 
-Normals come from the winding of the faces, outwards. Only surfaces that cross have contacts: an object that lies whole
-inside another has none. Depth is exact while every vertex inside has a face that crosses; once a whole ring of faces
-is inside it is that ring's, too little, and rings that go under in one step are forgotten: fine meshes come to rest
-several times as deep as they are told to (docs/dynamics.md has figures). Of two thin things that are through each other
-the way out is as likely forwards as back.
+Normals come from the winding of the faces, outwards. Without a gap only surfaces that cross have contacts: an object
+that lies whole inside another has none. Depth is exact while every vertex inside has a face that crosses; once a whole
+ring of faces is inside it is that ring's, too little, and rings that go under in one step are forgotten: fine meshes
+come to rest several times as deep as they are told to (docs/dynamics.md has figures). Of two thin things that are
+through each other the way out is as likely forwards as back.
 
 Source of the area vector as a gradient: Allard et al. 2010, Volume Contact Constraints at Arbitrary Resolution,
 section 3; that the boundary curve gives it is Stokes' theorem.

@@ -4,7 +4,6 @@ import math
 from functools import partial
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device
@@ -16,7 +15,6 @@ from warp_abtree.kernels.gap import near_faces
 from warp_abtree.kernels.solid.containment import find_contained_kernel
 from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
-from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.readout import QueryReadout
 from warp_abtree.query.request import (
@@ -24,7 +22,6 @@ from warp_abtree.query.request import (
     OUTPUTS,
     PRECISIONS,
     check_capacity,
-    check_gap,
     check_request,
     check_within,
 )
@@ -75,8 +72,6 @@ class Query(QueryReadout):
     """
 
     growth = 1  # room that `run` makes, over the demand
-    _asked_gap: Any = None  # of operators that take one
-    _reach: wp.array | None = None  # part of each object in the gap, where the broad phase makes pairs
 
     def __init__(
         self, scene, output="faces", pairs=None, capacity=None, precision="exact", within=None, sort_pairs=False
@@ -120,25 +115,6 @@ class Query(QueryReadout):
         if pairs is not None:
             self.set_pairs(pairs)
         self.resize((room.hits or max(1024, 16 * len(self.pairs))) if output == "faces" else 0)
-
-    def _take_gap(self, pair_count: int | None):
-        """Check the gap that is asked, if any; what the broad phase reads of it goes to the device."""
-        gap, count = self._asked_gap, self.batch.object_count
-        if gap is None:
-            return
-        if self.precision != "exact":
-            raise ValueError(f"gap: needs precision 'exact', not {self.precision!r}")
-        if pair_count is None and isinstance(gap, wp.array) and gap.shape == (count,) and gap.dtype is wp.vec4d:
-            self._gap, self._reach = np.zeros(count), gap
-            return
-        self._gap = check_gap(gap, pair_count, count)
-        if pair_count is None:
-            rows = np.zeros((count, 4))
-            rows[:, 3] = 0.5 * self._gap if self._gap.ndim == 0 else self._gap
-            self._reach = wp.array(rows, dtype=wp.vec4d, device=self.device)
-
-    def _make_broad_phase(self, capacity, sorts: bool) -> BroadPhase:
-        return BroadPhase(self.batch, capacity, sorts, self._reach)
 
     def _make_work(self):
         work, device = load_balance.Work(), self.device
