@@ -24,10 +24,10 @@ inline CUDA_CALLABLE wp::vec_t<3, wp::int32> push_children(wp::uint64 items, wp:
             : "+r"(sum)
             : "r"(step));
     const unsigned int total = __shfl_sync(0xffffffffu, sum, 31);
-    unsigned int place = (ITEM_BYTES * (unsigned int)end << STACK_LIST |
-                          ITEM_BYTES * (STACK_LENGTH + leaf_end) << LEAF_PAIR_LIST |
-                          ITEM_BYTES * (SLAB_PAIR_START + slab_end) << SLAB_PAIR_LIST) +
-                         (sum - mine);
+    unsigned int place =
+        (ITEM_BYTES * (unsigned int)end << STACK_LIST | ITEM_BYTES * (STACK_LENGTH + leaf_end) << LEAF_PAIR_LIST |
+         ITEM_BYTES * (SLAB_PAIR_START + slab_end) << SLAB_PAIR_LIST) +
+        (sum - mine);
 #pragma unroll
     for (int k = 0; k < 4; ++k) {
         unsigned int at;

@@ -20,8 +20,8 @@ static_assert(STRADDLING_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie on
 static_assert(SIGNS_START == STRADDLING_START + STRADDLING_LENGTH, "signs lie behind the straddling pairs");
 static_assert(SLAB_PAIR_START == SIGNS_START + STRADDLING_LENGTH / 2, "two signs an entry");
 static_assert(SLAB_PAIR_LENGTH >= WARP_SIZE + 4, "fewer than a warp wait, a test emits 4");
-// Lists are named by the shifts at which `push_children` packs three places [bytes] into a word. The last, on the stack,
-// goes round.
+// Lists are named by the shifts at which `push_children` packs three places [bytes] into a word. The last, on the
+// stack, goes round.
 constexpr int SLAB_PAIR_LIST = 0;
 constexpr int LEAF_PAIR_LIST = 10;
 constexpr int STACK_LIST = 20;

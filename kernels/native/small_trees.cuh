@@ -71,10 +71,10 @@ inline CUDA_CALLABLE wp::int32 push_leaf_pair(wp::uint64 items, wp::int32 end, b
 #if defined(__CUDA_ARCH__)
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
     const unsigned int at = STACK_LENGTH + end + __popc(votes & ((1u << threadIdx.x) - 1u));
-    asm volatile("{ .reg .pred used; setp.ne.s32 used, %0, 0; @used st.shared.v2.b32 [%1], {%2, %3}; }" ::"r"(
-                     (int)flag),
-                 "r"((unsigned int)items + 8 * at), "r"(face_b), "r"(face_a)
-                 : "memory");
+    asm volatile(
+        "{ .reg .pred used; setp.ne.s32 used, %0, 0; @used st.shared.v2.b32 [%1], {%2, %3}; }" ::"r"((int)flag),
+        "r"((unsigned int)items + 8 * at), "r"(face_b), "r"(face_a)
+        : "memory");
     return end + __popc(votes);
 #else
     if (flag)
