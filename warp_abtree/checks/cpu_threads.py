@@ -2,6 +2,7 @@
 
 import functools
 import os
+import threading
 from concurrent.futures import ThreadPoolExecutor, wait
 
 
@@ -24,6 +25,47 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=workers.cache_clear)
 
 
+class _Share:
+    """A launch on further threads: none begins after `close`, which waits for those that have.
+
+    So a thread that an interruption has kept from being noted does not work on arrays that others go on to use.
+    """
+
+    def __init__(self, launch):
+        self._launch, self._is_open, self._running = launch, True, 0
+        self._changed = threading.Condition()
+        self.error: BaseException | None = None
+
+    def run(self):
+        """Launch, unless this is closed; for a thread."""
+        with self._changed:
+            if not self._is_open:
+                return
+            self._running += 1
+        try:
+            self._launch()
+        except BaseException as error:
+            self.error = error
+        finally:
+            with self._changed:
+                self._running -= 1
+                self._changed.notify_all()
+
+    def close(self):
+        """Wait until no thread touches the arrays of the launch any more, whatever interrupts that; raise it then."""
+        interruption = None
+        while self._is_open or self._running:
+            try:
+                with self._changed:
+                    self._is_open = False
+                    while self._running:
+                        self._changed.wait()
+            except BaseException as error:
+                interruption = error
+        if interruption is not None:
+            raise interruption
+
+
 def launch_on_cores(launch, count, cores, least=1):
     """Launch a kernel on several threads of the CPU, which share a number of items; waits for them.
 
@@ -35,19 +77,25 @@ def launch_on_cores(launch, count, cores, least=1):
         least: Items that make a further core worth its while.
     """
     cores = max(1, min(cores, count // least))
-    deal = []
+    if cores == 1:
+        launch()
+        return
+    share = _Share(launch)
     try:
         for _ in range(1, cores):
-            deal.append(workers(cores - 1).submit(launch))
+            workers(cores - 1).submit(share.run)
         launch()
     finally:
-        wait_for(deal)
-    for job in deal:
-        job.result()
+        try:
+            share.close()
+        finally:  # where an interruption came before it had begun
+            share.close()
+    if share.error is not None:
+        raise share.error
 
 
 def wait_for(jobs):
-    """Wait until no thread touches the arrays of a launch any more, whatever interrupts that; raise it then."""
+    """Wait until no thread touches the arrays of jobs any more, whatever interrupts that; raise it then."""
     interruption = None
     while not all(job.done() for job in jobs):
         try:
