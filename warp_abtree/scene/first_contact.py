@@ -30,6 +30,7 @@ from warp_abtree.kernels.motion import face_pair, path, search, start, swept_box
 from warp_abtree.kernels.motion import linear as straight
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
+from warp_abtree.query.commands import Commands
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import refuse_options
 from warp_abtree.query.result import Found, Result
@@ -171,7 +172,10 @@ class FirstContactQuery(Query):
         Raises:
             ValueError: A tolerance out of range.
         """
-        self.tolerance, self.screw = check_tolerance(tolerance), bool(screw)
+        asked = check_tolerance(tolerance), bool(screw)
+        if asked != (self.tolerance, self.screw):
+            self.tolerance, self.screw = asked
+            self._commands = Commands()
 
     def _slow_kernels(self, with_distances: bool) -> list:
         make = search.warp_search if self.uses_warps() else search.thread_search
@@ -196,8 +200,7 @@ class FirstContactQuery(Query):
         if self.device.is_capturing:
             self._make_contacts(wp.launch)
             return
-        given = *self.guard.given(), self.tolerance, self.screw
-        *first, last = self._commands.find("first contacts", given, self._make_contacts)
+        *first, last = self._commands.find("first contacts", self.guard.given(), self._make_contacts)
         for command in first:
             command.launch()
         if self.uses_warps():
