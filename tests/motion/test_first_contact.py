@@ -216,6 +216,21 @@ def test_the_broad_phase_finds_all_that_touch(device, path):
     assert times[0] == times[1]
 
 
+def test_calls_that_repeat_take_other_options(device):
+    """On a GPU they are a graph after a few; tolerance, screws and end poses still count."""
+    cases, ends = random_motions(np.random.default_rng(9), 40)
+    scene, pairs, seen = scene_of(device, cases), pairs_of(cases), set()
+    others = np.roll(ends.reshape(-1, 2, 7), 1, axis=0).reshape(-1, 7)
+    for options in ({}, {"tolerance": 1e-2}, {"screw": True}):
+        for k in range(7):
+            asked = ends if k < 5 else others
+            found = scene.first_contact(pairs, asked, **options)
+            fresh = ab.FirstContactQuery(scene, asked, pairs, **options).run()
+            assert to_bytes(found) == to_bytes(fresh)
+            seen.add(found.time.tobytes())
+    assert len(seen) == 6, "options change nothing"
+
+
 def test_captured_graphs(device):
     rng = np.random.default_rng(10)
     cases, ends = random_motions(rng, 20)
