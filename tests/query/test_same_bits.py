@@ -107,6 +107,7 @@ def test_threads_take_every_item_once_and_raise_what_fails():
     for threads, count in ((1, 17), (2, 1), (3, 1000), (7, 16), (2, 100)):
         seen, taken = (wp.zeros(length, dtype=int, device="cpu") for length in (count, 1))
         launch_on_cores(partial(wp.launch, count_item_kernel, 1, [count, taken, seen], device="cpu"), count, threads)
-        assert (seen.numpy() == 1).all() and taken.numpy()[0] == count + min(threads, count)
+        # Each thread that began before the items were gone has found that none is left.
+        assert (seen.numpy() == 1).all() and 1 <= taken.numpy()[0] - count <= min(threads, count)
     with pytest.raises(Exception, match="'seen'"):
         launch_on_cores(partial(wp.launch, count_item_kernel, 1, [100, taken, 3.5], device="cpu"), 100, 2)

@@ -153,6 +153,17 @@ def positive(value, what: str) -> float:
     return number
 
 
+def flag(value, what: str) -> bool:
+    """Return a bool as such.
+
+    Raises:
+        ValueError: It is none.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{what} {value!r} is neither True nor False")
+    return bool(value)
+
+
 def broadcast_rows(values, what: str, shape: tuple) -> np.ndarray:
     """Return a copy of numbers as float64, broadcast to a shape: one row, or number, serves all objects.
 

@@ -48,7 +48,7 @@ import math
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device, to_numpy
+from warp_abtree.checks.arguments import check_device, flag, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd, slabs
@@ -94,20 +94,13 @@ def check_tolerance(tolerance, name: str, most: float) -> float:
     return float(value)
 
 
-def check_flag(value, name: str) -> bool:
-    """Return a bool, such as signed or originals; raise ValueError for what is none."""
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} {value!r} is neither True nor False")
-    return bool(value)
-
-
 def check_flags(options: dict) -> tuple[bool, bool]:
     """Return whether distances are signed, and whether of originals.
 
     Raises:
         ValueError: One that is no bool, or both are asked: depths are those of LODs.
     """
-    signed, originals = (check_flag(options.get(name, False), name) for name in ("signed", "originals"))
+    signed, originals = (flag(options.get(name, False), name) for name in ("signed", "originals"))
     if signed and originals:
         raise ValueError("signed means nothing beside originals; ask at the finest LODs")
     return signed, originals
@@ -171,7 +164,7 @@ class DistanceQuery(Query):
     _memory: wp.array
 
     def __init__(self, scene, pairs=None, capacity=None, tolerance=0.0, relative=0.0, beyond=None, signed=False):
-        self._signed = check_flag(signed, "signed")
+        self._signed = flag(signed, "signed")
         self._asked_tolerances = check_tolerances(tolerance, relative)
         self._tolerances = frame.Tolerances()
         self._tolerances.tolerance, self._tolerances.relative = self._asked_tolerances

@@ -17,14 +17,7 @@ from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, s
 from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.readout import QueryReadout
-from warp_abtree.query.request import (
-    LIST_MAX,
-    OUTPUTS,
-    PRECISIONS,
-    check_capacity,
-    check_request,
-    check_within,
-)
+from warp_abtree.query.request import LIST_MAX, OUTPUTS, PRECISIONS, check_capacity, check_request, check_within
 from warp_abtree.query.result import Found, Result
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard

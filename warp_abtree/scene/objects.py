@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import to_numpy, whole_number
+from warp_abtree.checks.arguments import flag, to_numpy, whole_number
 from warp_abtree.model.model import Model
 from warp_abtree.model.winding import refuse_open
 from warp_abtree.query.broad_phase import EVERY_WORLD
@@ -127,11 +127,9 @@ def check_flags(values, what: str, count: int) -> list[bool]:
     Raises:
         ValueError: Another shape or type.
     """
-    if isinstance(values, bool | np.bool_):
-        return [bool(values)] * count
     flags = np.asarray(values)
     if flags.ndim == 0 or flags.dtype != bool:
-        raise ValueError(f"{what} {values!r} is neither True nor False")
+        return [flag(values, what)] * count
     if flags.shape != (count,):
         raise ValueError(f"{what}s: shape {flags.shape} given for {count} objects")
     return flags.tolist()

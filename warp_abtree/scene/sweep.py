@@ -319,7 +319,7 @@ def sweep(
     solid=False,
     **options,
 ):
-    """Test one pair of models at many poses of B in A's frame. Waits for the device, once a chunk of 65,536 poses.
+    """Test one pair of models at many poses of B in A's frame. Waits for the device, 1 to 3 times a chunk of 65,536.
 
     Poses are checked on the device; on CUDA transfers overlap with launches, except for "faces". The arrays of the last
     four pairs of models, LODs and devices stay on the device for the next call as long as both models live: models and
