@@ -57,6 +57,7 @@ SAMPLES = wp.constant(7)
 NO_SAMPLE = wp.constant(wp.int64(2**63 - 1))
 # Before all samples: of what is known already, equally deep ones are no better.
 KNOWN = wp.constant(wp.int64(-1))
+AVOIDED_MAX = wp.constant(3)
 HALF = wp.constant(wp.float64(0.5))
 
 
@@ -66,6 +67,31 @@ class Deepest:
 
     depth: wp.float64  # [model units], 0 for none
     item: wp.int64  # see `pack_deepest`
+    of_b: bool  # whether it is of B, inside A
+
+
+@wp.struct
+class Avoided:
+    """Points near which no samples count."""
+
+    count: wp.int32  # how many
+    radius: wp.float64  # what is near [model units]
+    first: wp.vec3d  # in A's frame
+    second: wp.vec3d  # the same
+    third: wp.vec3d  # the same
+
+
+@wp.func
+def is_avoided(avoided: Avoided, point: wp.vec3d, reach: wp.float64):
+    """Return whether all that lies within a reach of a point is near to one of the points avoided."""
+    near = bool(False)
+    if avoided.count > 0:
+        near = wp.length(point - avoided.first) + reach < avoided.radius
+    if avoided.count > 1:
+        near = near or wp.length(point - avoided.second) + reach < avoided.radius
+    if avoided.count > 2:
+        near = near or wp.length(point - avoided.third) + reach < avoided.radius
+    return near
 
 
 @wp.func
@@ -102,6 +128,7 @@ def bound_depth(
     node: Node,
     hint: wp.int32,
     known: wp.float64,
+    avoided: Avoided,
 ):
     """Return an upper bound of the depth below a node, negative only where it is less than what is known, and a face.
 
@@ -116,6 +143,8 @@ def bound_depth(
     if inner.of_b:
         middle = pose_point(pose.rotation, pose.translation, middle)
     reach = wp.length(HALF * (upper - lower)) * outer.grow + outer.margin
+    if is_avoided(avoided, middle, reach):
+        return none, hint
     # What is inside lies within the root's box, and no deeper than its nearest side.
     root = load_node(states, outer.node + 1)
     x = into_frame(pose, outer, middle)
@@ -145,6 +174,7 @@ def measure_samples(
     face: wp.int32,
     hint: wp.int32,
     known: Deepest,
+    avoided: Avoided,
 ):
     """Return the deepest of what is known and the samples of a face that are inside the outer object."""
     best = known
@@ -156,7 +186,8 @@ def measure_samples(
     while k < SAMPLES:
         w = sample_weights(k)
         point = (w[0] * a + w[1] * b) + w[2] * c
-        if square_outside(root, into_frame(pose, outer, point)) <= outer.margin * outer.margin:
+        met = square_outside(root, into_frame(pose, outer, point)) <= outer.margin * outer.margin
+        if met and not is_avoided(avoided, point, wp.float64(0.0)):
             distance, near = nearest_face(models, states, pose, outer, point, near, best.depth)
             if distance >= best.depth and distance > wp.float64(0.0):
                 item = pack_deepest(face, k, near)
@@ -186,6 +217,7 @@ def find_deepest(
     outer: Whose,
     room: wp.int32,
     known: Deepest,
+    avoided: Avoided,
 ):
     """Return the deepest of what is known and all samples of one object inside the other, the same in all lanes.
 
@@ -217,7 +249,9 @@ def find_deepest(
             for k in range(2):
                 child = load_node(states, inner.node + wp.where(live, 2 * node + k, 1))
                 if live:
-                    bound, near = bound_depth(models, states, pose, inner, outer, child, item_second(item), best.depth)
+                    bound, near = bound_depth(
+                        models, states, pose, inner, outer, child, item_second(item), best.depth, avoided
+                    )
                     if bound >= wp.float64(0.0):
                         kinds[k] = wp.where(child.face >= 0, FACES, NODES)
                         children[k] = pack_item(wp.where(child.face >= 0, child.face, child.skip), near)
@@ -232,10 +266,60 @@ def find_deepest(
             at = STACK_LENGTH + waiting + wp.min(warp_lane(), popped - 1)
             item = read_item(items, at)
             if warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth:
-                best = measure_samples(models, states, pose, inner, outer, item_first(item), item_second(item), best)
+                face, near = item_first(item), item_second(item)
+                best = measure_samples(models, states, pose, inner, outer, face, near, best, avoided)
             warp_sync()
             best = agree(best)
     return best
+
+
+@wp.func
+def deepest_of_both(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    solids: Solids,
+    first: Whose,
+    second: Whose,
+    pair: wp.vec2i,
+    room: wp.int32,
+    known: Deepest,
+    avoided: Avoided,
+):
+    """Return the deepest of what is known and all samples of either object inside the other, where that is a solid."""
+    best = known
+    if solids.is_solid[wp.max(pair[0], pair[1])] != 0:
+        best = find_deepest(models, states, pose, first, second, room, known, avoided)
+    if solids.is_solid[wp.min(pair[0], pair[1])] != 0:
+        other = Deepest()
+        other.depth = best.depth
+        other.item = KNOWN
+        other = find_deepest(models, states, pose, second, first, room, other, avoided)
+        if other.item != KNOWN:
+            best = other
+            best.of_b = True
+    return best
+
+
+@wp.func
+def deepest_points(models: ModelPool, states: StatePool, objects: ObjectPool, pose: PairPose, pair: wp.vec2i, best: Deepest):
+    """Return the deepest sample of a pair and the point of the other's surface that is nearest: in A's frame, posed."""
+    face = wp.int32(best.item >> wp.int64(33))
+    weights = sample_weights(wp.int32((best.item >> wp.int64(30)) & wp.int64(7)))
+    nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
+    a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
+    inner, outer = wp.where(best.of_b, b, a), wp.where(best.of_b, a, b)
+    u, v, w = face_corners(models, states, pose, best.of_b, face)
+    point = (weights[0] * u + weights[1] * v) + weights[2] * w
+    u, v, w = face_corners(models, states, pose, not best.of_b, nearest)
+    near, _size = point_features(u, v, w, point)
+    ids = states.face_corner[states.face_start[objects.state[outer]] + nearest]
+    foot = blend_corners(models, ids, point_weights(near))
+    foot = pose_point(objects.rotation[outer], objects.position[outer], foot)
+    ids = states.face_corner[states.face_start[objects.state[inner]] + face]
+    sample = blend_corners(models, ids, weights)
+    sample = pose_point(objects.rotation[inner], objects.position[inner], sample)
+    return point, sample, foot
 
 
 @wp.func
@@ -246,33 +330,20 @@ def report_deepest(
     pose: PairPose,
     frame: Frame,
     pair: wp.vec2i,
-    of_b: bool,
     best: Deepest,
     p: wp.int32,
     distances: Distances,
 ):
     """Write the deepest sample of a pair, the point of the other's surface that is nearest, and their faces."""
+    _point, sample, foot = deepest_points(models, states, objects, pose, pair, best)
     face = wp.int32(best.item >> wp.int64(33))
-    weights = sample_weights(wp.int32((best.item >> wp.int64(30)) & wp.int64(7)))
     nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
-    a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
-    inner, outer = wp.where(of_b, b, a), wp.where(of_b, a, b)
-    u, v, w = face_corners(models, states, pose, of_b, face)
-    point = (weights[0] * u + weights[1] * v) + weights[2] * w
-    u, v, w = face_corners(models, states, pose, not of_b, nearest)
-    near, _size = point_features(u, v, w, point)
-    ids = states.face_corner[states.face_start[objects.state[outer]] + nearest]
-    foot = blend_corners(models, ids, point_weights(near))
-    foot = pose_point(objects.rotation[outer], objects.position[outer], foot)
-    ids = states.face_corner[states.face_start[objects.state[inner]] + face]
-    sample = blend_corners(models, ids, weights)
-    sample = pose_point(objects.rotation[inner], objects.position[inner], sample)
     d = best.depth
     slack = slack_of(frame, d)
     least = wp.max((d - slack) / frame.stretch, wp.float64(0.0))
     distances.distance[p] = -d
     distances.bracket[p] = wp.vec2d(-(d * frame.stretch + slack), -least)
-    if of_b:
+    if best.of_b:
         write_nearest(p, pose.swapped, nearest, face, foot, sample, distances)
     else:
         write_nearest(p, pose.swapped, face, nearest, sample, foot, distances)
@@ -312,18 +383,7 @@ def find_depth_kernel(
     first = make_whose(models, states, pose, frame, False, objects.state[a])
     second = make_whose(models, states, pose, frame, True, objects.state[b])
     best = Deepest()
-    best.item = NO_SAMPLE
-    of_b = bool(False)
-    if solids.is_solid[b] != 0:
-        best = find_deepest(models, states, pose, first, second, room, best)
-    if solids.is_solid[a] != 0:
-        other = Deepest()
-        other.depth = best.depth
-        other.item = KNOWN
-        other = find_deepest(models, states, pose, second, first, room, other)
-        if other.item != KNOWN:
-            best.depth = other.depth
-            best.item = other.item
-            of_b = bool(True)
-    if best.depth > wp.float64(0.0) and warp_lane() == 0:
-        report_deepest(models, states, objects, pose, frame, pairs[p], of_b, best, p, distances_inout)
+    best.item = KNOWN
+    best = deepest_of_both(models, states, pose, solids, first, second, pairs[p], room, best, Avoided())
+    if best.item != KNOWN and warp_lane() == 0:
+        report_deepest(models, states, objects, pose, frame, pairs[p], best, p, distances_inout)

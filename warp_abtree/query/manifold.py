@@ -36,6 +36,7 @@ import warp as wp
 
 from warp_abtree.kernels.contact import manifold, points
 from warp_abtree.kernels.gap import near_points
+from warp_abtree.kernels.solid import inside_points
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.result import Found, Result
@@ -104,6 +105,15 @@ class ManifoldQuery(ContactQuery):
         inputs = [*posed, gap, start, rows, contacts, curves]
         self._launch_kernel(manifold.find_candidate_kernel, count, inputs)
         self._launch_warps(points.spread_point_kernel, room, [pools[2], self.pairs, gap, start, curves, self.manifolds])
+        self._add_inside_points()
+
+    def _add_inside_points(self):
+        """Add points of what is inside, where there are solids. Launches only."""
+        if self.batch.solids is not None:
+            models, states, *posed = [*self.batch.pools, self.pair_count, self.pairs, self.pair_poses]
+            inputs = [self._stack_length(), models, states, self.batch.solids.pool, *posed]
+            inputs += [self.guard.launched, self.hits, self.manifolds]
+            self._launch_warps(inside_points.add_inside_point_kernel, len(self.pairs), inputs)
 
     def _sort_keys(self, count, bits):
         with wp.ScopedDevice(self.device):
