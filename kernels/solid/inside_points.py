@@ -13,10 +13,13 @@ from warp_abtree.kernels.contact.manifold import POINTS, Manifolds
 from warp_abtree.kernels.contact.points import order_direction
 from warp_abtree.kernels.distance.frame import make_frame
 from warp_abtree.kernels.generation import STALE
-from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.solid.components import Solids
-from warp_abtree.kernels.solid.depth import AVOIDED_MAX, KNOWN, MODULE_OPTIONS, Avoided, Deepest, deepest_of_both, deepest_points
-from warp_abtree.kernels.solid.nearest_face import Whose, make_whose
+from warp_abtree.kernels.solid.containment import FIRST_INSIDE, SECOND_INSIDE
+from warp_abtree.kernels.solid.depth import MODULE_OPTIONS, deepest_of_both, deepest_points
+from warp_abtree.kernels.solid.nearest_face import NO_NEAREST, Whose, make_whose, nearest_face
+from warp_abtree.kernels.solid.parity import is_inside
+from warp_abtree.kernels.solid.samples import AVOIDED_MAX, HALF, KNOWN, Deepest, Sampling, way_out
 from warp_abtree.kernels.traversal.face_pairs import Hits
 from warp_abtree.kernels.traversal.nodes import load_node
 from warp_abtree.kernels.traversal.warp_stack import warp_lane, warp_size
@@ -24,10 +27,9 @@ from warp_abtree.kernels.triangle.segment import unit_vector
 
 wp.set_module_options(MODULE_OPTIONS)
 
-# By which part a sample must be deeper than the points of its pair.
-DEEPER = wp.constant(wp.float64(1.0 + 2.0**-8))
-# Part of the smaller object's size under which a depth is none: its direction would be that of rounding.
-LEAST_DEPTH = wp.constant(wp.float64(2.0**-20))
+# Part of the smaller object's size by which a sample must be deeper than all points of its pair; and under which the
+# points of a pair that has some tell that nothing is deep.
+DEEPER = wp.constant(wp.float64(2.0**-12))
 # Part of that size by which samples lie apart, and of the first one's depth that others have at least.
 APART, LESS = wp.constant(wp.float64(0.25)), wp.constant(wp.float64(0.5))
 
@@ -46,6 +48,29 @@ def known_depth(manifolds: Manifolds, p: wp.int32):
     for k in range(manifolds.count[p]):
         deepest = wp.max(deepest, manifolds.depth[p, k])
     return deepest
+
+
+@wp.func
+def way_of_points(manifolds: Manifolds, p: wp.int32):
+    """Return the sum of the normals of the points of a pair."""
+    way = wp.vec3d()
+    for k in range(manifolds.count[p]):
+        way += manifolds.normal[p, k]
+    return way
+
+
+@wp.func
+def way_of_middle(models: ModelPool, states: StatePool, pose: PairPose, inner: Whose, outer: Whose):
+    """Return the way out of the middle of the inner object's box, in A's frame."""
+    root = load_node(states, inner.node + 1)
+    middle = HALF * (wp.vec3d(root.lower) + wp.vec3d(root.upper)) + inner.centre
+    if inner.of_b:
+        middle = pose_point(pose.rotation, pose.translation, middle)
+    _, face = nearest_face(models, states, pose, outer, middle, NO_NEAREST, wp.float64(0.0))
+    way = way_out(models, states, pose, outer, face, middle)
+    if not is_inside(models, states, pose, outer.of_b, wp.where(inner.of_b, outer.centre, inner.centre), middle):
+        way = -way
+    return way
 
 
 @wp.func
@@ -110,17 +135,28 @@ def add_inside_point_kernel(
     first = make_whose(models, states, pose, frame, False, objects.state[a])
     second = make_whose(models, states, pose, frame, True, objects.state[b])
     size = wp.min(size_of(states, first), size_of(states, second))
-    deep = wp.max(DEEPER * known_depth(manifolds_inout, p), LEAST_DEPTH * size)
+    deep = known_depth(manifolds_inout, p)
+    if manifolds_inout.count[p] > 0 and deep < DEEPER * size:
+        return
+    deep += DEEPER * size
     least = wp.float64(deep)
-    avoided = Avoided()
-    avoided.radius = APART * size
+    sampling = Sampling()
+    sampling.samples = 3
+    sampling.radius = APART * size
+    if hits.any_hit[p] == FIRST_INSIDE:
+        sampling.way = -way_of_middle(models, states, pose, first, second)
+    elif hits.any_hit[p] == SECOND_INSIDE:
+        sampling.way = way_of_middle(models, states, pose, second, first)
+    else:
+        turned = wp.transpose(objects.rotation[a]) * way_of_points(manifolds_inout, p)
+        sampling.way = wp.where(pose.swapped != 0, -turned, turned)
     along = order_direction(objects.rotation[a])
     searching = bool(True)
     while searching:
         best = Deepest()
         best.item = KNOWN
         best.depth = least
-        best = deepest_of_both(models, states, pose, solids, first, second, pairs[p], room, best, avoided)
+        best = deepest_of_both(models, states, pose, solids, first, second, pairs[p], room, best, sampling)
         searching = best.item != KNOWN
         if searching:
             point, sample, foot = deepest_points(models, states, objects, pose, pairs[p], best)
@@ -130,12 +166,12 @@ def add_inside_point_kernel(
                 if manifolds_inout.count[p] == POINTS:
                     remove_nearest(p, sample, deep, manifolds_inout)
                 insert_point(p, along, sample, normal, best.depth, manifolds_inout)
-            if avoided.count == 0:
-                avoided.first = point
+            if sampling.count == 0:
+                sampling.first = point
                 least = wp.max(deep, LESS * best.depth)
-            elif avoided.count == 1:
-                avoided.second = point
+            elif sampling.count == 1:
+                sampling.second = point
             else:
-                avoided.third = point
-            avoided.count += 1
-            searching = avoided.count <= AVOIDED_MAX
+                sampling.third = point
+            sampling.count += 1
+            searching = sampling.count <= AVOIDED_MAX
