@@ -159,17 +159,15 @@ def find_deepest(
             for k in range(2):
                 child = load_node(states, inner.node + wp.where(live, 2 * node + k, 1))
                 if live:
-                    bound, near = bound_depth(
-                        models, states, pose, inner, outer, child, item_second(item), best.depth, sampling
-                    )
+                    near = item_second(item)
+                    bound, near = bound_depth(models, states, pose, inner, outer, child, near, best.depth, sampling)
                     if bound >= wp.float64(0.0):
                         kinds[k] = wp.where(child.face >= 0, FACES, NODES)
                         children[k] = pack_item(wp.where(child.face >= 0, child.face, child.skip), near)
                         bounds[k] = -round_up(bound)
             ends = push_nearest(items, end, waiting, kinds, children, bounds)
             warp_sync()
-            end = item_second(ends)
-            waiting = item_first(ends)
+            waiting, end = item_first(ends), item_second(ends)
         if waiting >= warp_size() or (waiting > 0 and end == 0):
             popped = wp.min(waiting, warp_size())
             waiting -= popped

@@ -74,6 +74,43 @@ def way_of_middle(models: ModelPool, states: StatePool, pose: PairPose, inner: W
 
 
 @wp.func
+def way_of_second(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    first: Whose,
+    second: Whose,
+    which: wp.int32,
+    normals: wp.vec3d,
+):
+    """Return the way on which B comes free, in A's frame.
+
+    Args:
+        which: What of the pair is inside, `Hits.any_hit`.
+        normals: Sum of the normals of its points, in the order of the pair.
+    """
+    if which == FIRST_INSIDE:
+        return -way_of_middle(models, states, pose, first, second)
+    if which == SECOND_INSIDE:
+        return way_of_middle(models, states, pose, second, first)
+    return wp.where(pose.swapped != 0, -normals, normals)
+
+
+@wp.func
+def avoid_point(before: Sampling, point: wp.vec3d):
+    """Return a sampling that avoids one more point."""
+    sampling = before
+    if before.count == 0:
+        sampling.first = point
+    elif before.count == 1:
+        sampling.second = point
+    else:
+        sampling.third = point
+    sampling.count += 1
+    return sampling
+
+
+@wp.func
 def remove_nearest(p: wp.int32, x: wp.vec3d, limit: wp.float64, manifolds: Manifolds):
     """Remove the point of a full pair that is nearest to x, of those less deep than a limit."""
     count = manifolds.count[p]
@@ -143,13 +180,8 @@ def add_inside_point_kernel(
     sampling = Sampling()
     sampling.samples = 3
     sampling.radius = APART * size
-    if hits.any_hit[p] == FIRST_INSIDE:
-        sampling.way = -way_of_middle(models, states, pose, first, second)
-    elif hits.any_hit[p] == SECOND_INSIDE:
-        sampling.way = way_of_middle(models, states, pose, second, first)
-    else:
-        turned = wp.transpose(objects.rotation[a]) * way_of_points(manifolds_inout, p)
-        sampling.way = wp.where(pose.swapped != 0, -turned, turned)
+    normals = wp.transpose(objects.rotation[a]) * way_of_points(manifolds_inout, p)
+    sampling.way = way_of_second(models, states, pose, first, second, hits.any_hit[p], normals)
     along = order_direction(objects.rotation[a])
     searching = bool(True)
     while searching:
@@ -167,11 +199,6 @@ def add_inside_point_kernel(
                     remove_nearest(p, sample, deep, manifolds_inout)
                 insert_point(p, along, sample, normal, best.depth, manifolds_inout)
             if sampling.count == 0:
-                sampling.first = point
                 least = wp.max(deep, LESS * best.depth)
-            elif sampling.count == 1:
-                sampling.second = point
-            else:
-                sampling.third = point
-            sampling.count += 1
+            sampling = avoid_point(sampling, point)
             searching = sampling.count <= AVOIDED_MAX

@@ -30,8 +30,8 @@ another has no points. Solids (`Scene.add`) have more. Of an object pair that in
   from one another and at least half as deep as the first, and take the places of the nearest others if there are 8.
 * They are looked for where they are needed: only corners that are deeper than all other points of the pair by 1/4096 of
   that size count, and pairs whose points are all less deep than that are passed over.
-* Their ways out are within 90 degrees of the sum of the other points' normals; of what lies inside whole, of the way out
-  of the middle of its box. So they do not hold an object from both sides.
+* Their ways out are within 90 degrees of the sum of the other points' normals; of what lies inside whole, of the way
+  out of the middle of its box. So they do not hold an object from both sides.
 
 Of two thin surfaces that are through each other the way out is as likely forwards as back.
 
