@@ -25,7 +25,7 @@ from . import tables
 
 CASES = (
     *("assembly", "baselines", "budget", "build", "coarse", "distance", "exact", "frame"),
-    *("host", "motion", "query", "scale", "sweep", "update"),
+    *("host", "motion", "query", "robot", "scale", "sweep", "update"),
 )
 STUDIES = {"paper": "study", "tradeoff": "study", "nightly": "nightly"}  # and the modules that run them
 MODULES = {name: f"bench.cases.{name}" for name in CASES} | {"motion": "bench.motions.case"}
