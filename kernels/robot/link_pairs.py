@@ -115,6 +115,14 @@ def append_pair(
             distances[slot] = distance
 
 
+@wp.func
+def boxes_meet(lower: wp.vec3, upper: wp.vec3, low: wp.vec3, high: wp.vec3):
+    meet = bool(True)
+    for k in range(3):
+        meet = meet and lower[k] <= high[k] and low[k] <= upper[k]
+    return meet
+
+
 @wp.kernel
 def find_link_pair_kernel(
     # static
@@ -166,15 +174,7 @@ def find_link_pair_kernel(
                     append_pair(first, j, reach, pair_count_inout, pairs_out, distances_out)
         else:
             j = base + second
-            low, high = lower[j], upper[j]
-            if (
-                least[0] <= high[0]
-                and low[0] <= most[0]
-                and least[1] <= high[1]
-                and low[1] <= most[1]
-                and least[2] <= high[2]
-                and low[2] <= most[2]
-            ):
+            if boxes_meet(least, most, lower[j], upper[j]):
                 if wide > reach:
                     chunk_inout.near[i] = wp.uint8(1)
                 append_pair(first, j, reach, pair_count_inout, pairs_out, distances_out)

@@ -1,16 +1,18 @@
 """`RobotQuery`: a chunk of configurations as an operator; and edges, halved until each stretch is decided."""
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
 from warp_abtree.interop.robot.link_query import LinkDistances, LinkHits
 from warp_abtree.interop.robot.surroundings import RobotBatch
 from warp_abtree.query.request import CapacityError
+from warp_abtree.scene.sweep import CONTACT_ROWS
 
 NEAREST_ROWS = np.dtype(
     [("distance", np.float64), ("points", np.float64, (2, 3)), ("faces", np.int32, 2), ("pair", np.int32, 2)]
 )
-CONTACT_ROWS = np.dtype([("time", np.float64), ("clear", bool), ("undecided", bool)])
 PAIRS_GUESS = 4  # of a configuration and stage
 # Edges whose stretches are halved at a time.
 EDGES_AT_ONCE = 1024
@@ -36,10 +38,12 @@ class RobotQuery:
         self._robots = made = RobotBatch(around, robot.models, room, robot.collision_bits, robot.device)
         asked = robot.asked(made, room)
         self._around, self._models = made.count, len(robot.models)
+        self._links: Any
+        capacity = max(1, PAIRS_GUESS * room)
         if output == "distance":
-            self._links = LinkDistances(made.batch, asked, PAIRS_GUESS * room)
+            self._links = LinkDistances(made.batch, asked, capacity)
         else:
-            self._links = LinkHits(made.batch, asked, PAIRS_GUESS * room, output == "within")
+            self._links = LinkHits(made.batch, asked, capacity, output == "within")
         self.nearest = self._links.nearest
         pairs = self._links.links
         self.configurations, self._chunk = pairs.configurations, pairs.chunk
@@ -64,7 +68,9 @@ class RobotQuery:
 
         Raises:
             CapacityError: A buffer overflowed; a graph is to be captured again.
+            RuntimeError: There was no whole launch, see `Query.result`.
         """
+        self._links.guard.check(self._links.guard.outcome())
         pairs, uncertain = self._links.demand.numpy().tolist()
         if self._links.make_room_for(pairs, uncertain):
             raise CapacityError(f"{pairs} pairs of objects, {uncertain} uncertain ones of faces; launch again")

@@ -1,6 +1,7 @@
 """Queries about the parts of a robot at a chunk of configurations, among themselves and with what surrounds them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,6 +13,7 @@ from warp_abtree.query.distance import DistanceQuery
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import Buffers
 from warp_abtree.state.batch import Batch
+from warp_abtree.state.generation import LaunchGuard
 
 MODES = {"any": int(link_pairs.ANY), "within": int(link_pairs.WITHIN), "distance": int(link_pairs.DISTANCE)}
 
@@ -50,7 +52,7 @@ class LinkPairs:
     """
 
     check_found = staticmethod(BroadPhase.check_found)
-    guard: object
+    guard: LaunchGuard
     wide = 0.0
     pairs: wp.array
 
@@ -121,7 +123,7 @@ class StagedQuery(Query):
 
     def _prepare(self, batch: Batch, asked: Asked, mode: str):
         self.asked, self.asked_mode = asked, MODES[mode]
-        self.nearest: answers.Nearest | None = None
+        self.nearest: Any = None  # `answers.Nearest`, where distances are asked
         self.demand = wp.zeros(2, dtype=wp.int32, device=batch.device)
 
     def _make_broad_phase(self, capacity, sorts):
@@ -207,7 +209,7 @@ class LinkDistances(DistanceQuery, StagedQuery):
         return self._found.beyond
 
     def _launch(self, between=None):
-        nearest = self.nearest
+        nearest: Any = self.nearest
         self.links.chunk.best.fill_(self.most)
         nearest.distance.fill_(np.inf)
         nearest.points.fill_(np.nan)
@@ -216,7 +218,8 @@ class LinkDistances(DistanceQuery, StagedQuery):
         super()._launch(between)
 
     def _note(self):
-        links, asked, nearest = self.links, self.asked, self.nearest
+        links, asked = self.links, self.asked
+        nearest: Any = self.nearest
         nearest.winner.fill_(int(answers.NO_PAIR))
         given = [asked.around, asked.part_count, self.pair_count, self.pairs]
         for kernel, inputs in (

@@ -9,6 +9,7 @@ from warp_abtree.checks.arguments import first_line
 from warp_abtree.interop.robot.description import Description, Frame, Part, RobotError, join_meshes, unit_axis
 from warp_abtree.interop.robot.urdf import INSTALL
 
+KINDS = {"hinge": "revolute", "slide": "prismatic"}
 VISUAL_GROUPS = 3  # MuJoCo shows geoms of the groups below
 
 
@@ -31,7 +32,7 @@ def read_mjcf(path: Path, geometry: str) -> Description:
     for b, name in enumerate(names):
         if model.body_mocapid[b] >= 0:
             raise RobotError(f"{path}: body {name!r} is moved by motion capture, not by joints")
-        description.links[name] = _add_body(model, b, description, names, values, path)
+        description.links[name] = _add_body(mujoco, model, b, description, names, values, path)
     for b in range(model.nbody):
         _add_parts(mujoco, model, b, description, geometry, f"{path}: body {names[b]!r}")
     for signature in model.exclude_signature.tolist():
@@ -44,11 +45,11 @@ def _joint_values(mujoco, model, path) -> list[tuple[str, float, float]]:
     names = [model.joint(j).name or f"joint {j}" for j in range(model.njnt)]
     values, leads = [(name, 1.0, 0.0) for name in names], {}
     for j, name in enumerate(names):
-        if model.jnt_type[j] not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
-            kind = mujoco.mjtJoint(model.jnt_type[j]).name[len("mjJNT_") :].lower()
+        kind = mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()
+        if kind not in KINDS:
             raise RobotError(f"{path}: joint {name!r} is {kind}; hinge and slide ones are supported")
     for e in range(model.neq):
-        if model.eq_type[e] != mujoco.mjtEq.mjEQ_JOINT or not model.eq_active0[e]:
+        if int(model.eq_type[e]) != int(mujoco.mjtEq.mjEQ_JOINT) or not model.eq_active0[e]:
             continue
         j, k, factors = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e, :5]
         if factors[2:].any():
@@ -83,7 +84,7 @@ def _pose(position, quaternion) -> np.ndarray:
     return matrix
 
 
-def _add_body(model, b, description, names, values, path) -> int:
+def _add_body(mujoco, model, b, description, names, values, path) -> int:
     """Add the frames of a body, one for each joint and one more where a joint stands off its origin."""
     parent = -1 if b == 0 else description.links[names[model.body_parentid[b]]]
     origin = np.eye(4) if b == 0 else _pose(model.body_pos[b], model.body_quat[b])
@@ -94,7 +95,7 @@ def _add_body(model, b, description, names, values, path) -> int:
         anchor = model.jnt_pos[j]
         joint, scale, offset = values[j]
         start = float(model.qpos0[model.jnt_qposadr[j]])
-        kind = "revolute" if model.jnt_type[j] == 3 else "prismatic"
+        kind = KINDS[mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()]
         axis = unit_axis(model.jnt_axis[j], f"{path}: joint {j}")
         frame = Frame(parent, origin, kind, axis, joint or None, scale, offset - start)
         description.frames.append(frame)
@@ -132,26 +133,25 @@ def _shape(mujoco, model, g, where):
     """Return vertices and faces of a geom, in its own frame."""
     import trimesh
 
-    kinds, kind, size = mujoco.mjtGeom, model.geom_type[g], model.geom_size[g]
-    if kind == kinds.mjGEOM_MESH:
+    kind, size = mujoco.mjtGeom(int(model.geom_type[g])).name[len("mjGEOM_") :].lower(), model.geom_size[g]
+    if kind == "mesh":
         m = int(model.geom_dataid[g])
         vertex, face = int(model.mesh_vertadr[m]), int(model.mesh_faceadr[m])
         vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[m]].astype(np.float64)
         return vertices, model.mesh_face[face : face + model.mesh_facenum[m]]
-    if kind == kinds.mjGEOM_BOX:
+    if kind == "box":
         made = trimesh.creation.box(2 * size)
-    elif kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
+    elif kind in ("sphere", "ellipsoid"):
         made = trimesh.creation.icosphere(subdivisions=3)
-        made.apply_scale(size[0] if kind == kinds.mjGEOM_SPHERE else size)
-    elif kind == kinds.mjGEOM_CYLINDER:
+        made.apply_scale(size[0] if kind == "sphere" else size)
+    elif kind == "cylinder":
         made = trimesh.creation.cylinder(size[0], 2 * size[1])
-    elif kind == kinds.mjGEOM_CAPSULE:
+    elif kind == "capsule":
         made = trimesh.creation.capsule(radius=size[0], height=2 * size[1])
         made.apply_translation(-made.bounds.mean(0))
     else:
-        name = mujoco.mjtGeom(int(kind)).name[len("mjGEOM_") :].lower()
         raise RobotError(
-            f"{where}: geom {model.geom(g).name or g!r} is a {name}, which has no mesh; what surrounds the robot is "
+            f"{where}: geom {model.geom(g).name or g!r} is a {kind}, which has no mesh; what surrounds the robot is "
             "given to Robot.check"
         )
     return np.asarray(made.vertices), np.asarray(made.faces)

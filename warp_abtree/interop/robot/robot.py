@@ -194,13 +194,14 @@ class Robot:
             TypeError, ValueError: As `check`.
         """
         check_device(self.device, "Robot.check_edges")
-        rows = [self._take(given, limits, what).numpy() for given, what in ((starts, "starts"), (ends, "ends"))]
-        if len(rows[0]) != len(rows[1]):
-            raise ValueError(f"ends: {len(rows[1])} given for {len(rows[0])} starts")
+        first, last = (self._take(given, limits, what).numpy() for given, what in ((starts, "starts"), (ends, "ends")))
+        if len(first) != len(last):
+            raise ValueError(f"ends: {len(last)} given for {len(first)} starts")
         tolerance = to_numpy(tolerance, "tolerance")
         if tolerance.shape != () or not 2.0**-30 <= tolerance < 1:
             raise ValueError(f"tolerance: {tolerance} is no number of 2^-30 or more, below 1")
-        return check_edges(self._find_query(world, "within", STRETCHES * len(rows[0])), *rows, float(tolerance))
+        query = self._find_query(world, "within", STRETCHES * len(first))
+        return check_edges(query, first, last, float(tolerance))
 
     def query(self, world=None, output="any", room=4096) -> RobotQuery:
         """Return an operator for a fixed number of configurations, which a CUDA graph can capture: `RobotQuery`."""

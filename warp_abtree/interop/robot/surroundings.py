@@ -85,8 +85,13 @@ class RobotBatch:
         return self._batch is around.batch() and np.array_equal(self._lods, around.lods)
 
     def take_poses(self):
-        """Copy the poses of what surrounds the robot. Launches only."""
+        """Copy the poses of what surrounds the robot. Launches only.
+
+        Raises:
+            RuntimeError: Objects were added to its scene since.
+        """
         if self._batch is not None:
+            self._batch.check("robot query")
             source, target = self._batch.objects.pool, self.batch.objects.pool
             wp.copy(target.rotation, source.rotation, count=self.count)
             wp.copy(target.position, source.position, count=self.count)

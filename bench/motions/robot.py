@@ -14,7 +14,6 @@ import trimesh
 import warp as wp
 
 import warp_abtree as ab
-
 from warp_abtree.model.mesh import load_mesh
 
 from ..meshes import mesh_file
