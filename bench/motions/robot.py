@@ -193,7 +193,21 @@ def run(device, quick=False):
         row["configurations_s"] = round(1e3 * count / row["ours_ms"])
         row["fcl_configurations_s"] = round(1e3 * len(some) / row["fcl_ms"])
         yield row
-        part = configurations[: max(1, count // 8)]
-        times = time_rounds({"ours": time_call(lambda: robot.check(part, around, "distance"), device)}, 1)
-        row = about | {"output": "distance", "configurations": len(part)} | summarise(times)
-        yield row | {"configurations_s": round(1e3 * len(part) / row["ours_ms"])}
+        part = configurations[: max(2, count // 8)]
+        for beyond in (None, 0.05):
+            ask = time_call(lambda beyond=beyond: robot.check(part, around, "distance", beyond), device)
+            times = time_rounds({"ours": ask}, 1)
+            row = about | {"output": "distance", "beyond": beyond, "configurations": len(part)} | summarise(times)
+            yield row | {"configurations_s": round(1e3 * len(part) / row["ours_ms"])}
+        yield about | run_edges(device, robot, around, configurations[~found])
+
+
+def run_edges(device, robot, around, free):
+    """Return the columns of edges between configurations that are free, a twentieth of the way to another."""
+    starts = free[: len(free) // 2]
+    ends = starts + 0.05 * (free[len(free) // 2 :][: len(starts)] - starts)
+    rows = robot.check_edges(starts, ends, around)
+    times = time_rounds({"ours": time_call(lambda: robot.check_edges(starts, ends, around), device)}, 1)
+    row = {"output": "edges", "configurations": len(starts), "clear": round(float(rows["clear"].mean()), 4)}
+    row |= {"undecided": round(float(rows["undecided"].mean()), 4)} | summarise(times)
+    return row | {"edges_s": round(1e3 * len(starts) / row["ours_ms"])}
