@@ -26,7 +26,7 @@ FRAME_ROUNDING = wp.constant(wp.float64(2.0**-47))
 # Nothing of a size that models may have is farther away.
 FARTHEST = wp.constant(wp.float64(2.0**120))
 # Of a part's size: whose boxes are nearer than so large a reach are taken as near.
-HOPELESS = wp.constant(wp.float64(0.25))
+HOPELESS = wp.constant(wp.float64(0.4))
 # Of the values of joints.
 VALUE_ROUNDING = wp.constant(wp.float64(2.0**-48))
 

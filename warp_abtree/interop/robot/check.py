@@ -13,7 +13,7 @@ from warp_abtree.scene.sweep import CONTACT_ROWS
 NEAREST_ROWS = np.dtype(
     [("distance", np.float64), ("points", np.float64, (2, 3)), ("faces", np.int32, 2), ("pair", np.int32, 2)]
 )
-PAIRS_GUESS = 4  # of a configuration and stage
+PAIRS_GUESS = 2  # of a configuration and stage
 # Edges whose stretches are halved at a time.
 EDGES_AT_ONCE = 1024
 # Stretches of an edge that are looked at at a time, and how short they may be: what takes more is undecided.
