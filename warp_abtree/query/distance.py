@@ -74,7 +74,7 @@ ROUGH_LEAST = 1024
 
 def check_beyond(beyond, pair_count=None) -> np.ndarray:
     """Return distances that end a search, as `check_within`; `NOT_BEYOND` for None."""
-    if beyond is None or beyond is NOT_BEYOND:
+    if beyond is None or (isinstance(beyond, np.ndarray) and beyond.shape == () and beyond == np.inf):
         return NOT_BEYOND
     return check_within(beyond, pair_count, "beyond")
 
