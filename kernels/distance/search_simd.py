@@ -106,7 +106,7 @@ class Asked:
     pair_count: wp.array(dtype=wp.int32)  # shape (1,)
     pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]
     pair_poses: wp.array(dtype=PairPose)  # shape [pair]
-    tolerances: Tolerances
+    tolerances: Tolerances  # when they are near enough
 
 
 @wp.func
@@ -176,7 +176,5 @@ def search_thread_kernel(
         start_pair(p, models, states, objects, pairs, poses, found_inout)
         if hits_inout.any_hit[p] == 0:
             search_pair(p, asked, models, states, slabs, thread, found_inout, hits_inout, memory_out)
-        report_pair(
-            p, asked.tolerances, models, states, objects, pairs, poses, found_inout, hits_inout, distances_out
-        )
+        report_pair(p, asked.tolerances, models, states, objects, pairs, poses, found_inout, hits_inout, distances_out)
         p = take_unit(counter)
