@@ -106,6 +106,14 @@ def test_links_lead_somewhere(page):
             assert (page.parent / target.split("#")[0]).exists(), target
 
 
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_files_that_are_named_exist(page):
+    """Of the checkout; `warp_abtree/scenes` and kernels stand there in what is installed."""
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:bench|docs|kernels|scenes|tests|warp_abtree)/[\w./]+)`", text):
+        assert (ROOT / name).exists() or name in ("warp_abtree/kernels", "warp_abtree/scenes"), name
+
+
 def test_blocks_are_found_and_told_apart():
     found = BLOCK.findall("x\n<!-- needs: torch, cuda -->\n```python\na\n```\n\n```sh\nb\n```\n```python\nc\n```\n")
     assert found == [("torch, cuda", "python", "a\n"), ("", "sh", "b\n"), ("", "python", "c\n")]
