@@ -35,7 +35,7 @@ def test_a_box_that_falls_stops_at_the_surface(device, speed, turn):
     assert np.abs(dynamics.velocities()[0]).max() < 0.05
 
 
-@pytest.mark.parametrize("model, most", [(FINE_TORUS, 2.0), (FINE_BALL, 4.0)])
+@pytest.mark.parametrize("model, most", [(FINE_TORUS, 1.5), (FINE_BALL, 2.0)])
 def test_fine_meshes_rest_a_few_slops_deep_at_60_steps_a_second(device, model, most):
     low = model.mesh_at(model.lod_max)[0][:, 2].min()
     dynamics = on_ground(device, (model, (0, 0, 0.3 - low, *about((0, 0, 1), 0.3))))
