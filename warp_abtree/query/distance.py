@@ -91,7 +91,7 @@ def check_tolerance(tolerance, name: str, most: float) -> float:
         ValueError: No number from 0 up to below the most.
     """
     # Plain numbers, as most are, in a tenth of the time.
-    value = tolerance if type(tolerance) in (int, float) else to_numpy(tolerance, name)
+    value = tolerance if type(tolerance) is float else to_numpy(tolerance, name)
     if np.ndim(value) or not 0 <= value < most:
         raise ValueError(f"{name}: {tolerance!r} is no number of 0 or more, below {most}")
     return float(value)
