@@ -86,8 +86,8 @@ def render(panel: Panel, camera: Camera, size: int) -> np.ndarray:
                 lines = pyvista.line_segments_from_points(points + LINE_LIFT * (camera.eye - points))
                 plotter.add_mesh(lines, color=colour, line_width=LINE_WIDTH, lighting=False)
         if panel.labels:
-            points, texts = zip(*panel.labels)
-            lifted = np.array(points) + LINE_LIFT * (camera.eye - points)
+            places = np.array([point for point, _ in panel.labels])
+            lifted, texts = places + LINE_LIFT * (camera.eye - places), [text for _, text in panel.labels]
             box = {"shape_color": BACKGROUND, "shape_opacity": 0.8, "margin": 3}
             plotter.add_point_labels(lifted, texts, font_size=16, show_points=False, always_visible=True, **box)
         view = plotter.camera
