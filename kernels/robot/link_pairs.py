@@ -20,9 +20,10 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 ANY, WITHIN, DISTANCE = wp.constant(0), wp.constant(1), wp.constant(2)
 
-# Of a reach, and of poses: some twenty roundings of each frame that a part hangs on, which add up along the way.
-REACH_ROUNDING = wp.constant(wp.float64(1.0 + 2.0**-40))
-FRAME_ROUNDING = wp.constant(wp.float64(2.0**-47))
+# Of a reach, where fixed transforms are rigid within 1e-12; and of poses: a frame turns what hangs on it by some 50 u
+# too much, u = 2^-53, and these add up along the way.
+REACH_ROUNDING = wp.constant(wp.float64(1.0 + 2.0**-30))
+FRAME_ROUNDING = wp.constant(wp.float64(2.0**-45))
 # Nothing of a size that models may have is farther away.
 FARTHEST = wp.constant(wp.float64(2.0**120))
 # Of a part's size: whose boxes are nearer than so large a reach are taken as near.

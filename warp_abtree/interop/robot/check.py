@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_abtree.interop.robot.link_query import LinkDistances, LinkHits
+from warp_abtree.interop.robot.link_query import Asked, LinkDistances, LinkHits
 from warp_abtree.interop.robot.surroundings import RobotBatch
+from warp_abtree.kernels.robot.link_pairs import Parts
 from warp_abtree.query.request import CapacityError
 from warp_abtree.scene.sweep import CONTACT_ROWS
 
@@ -18,6 +19,36 @@ PAIRS_GUESS = 2  # of a configuration and stage
 EDGES_AT_ONCE = 1024
 # Stretches of an edge that are looked at at a time, and how short they may be: what takes more is undecided.
 STRETCHES_MAX, WIDTH_LEAST = 1024, 2.0**-30
+
+
+def ask_about(robot, robots: RobotBatch, room: int) -> Asked:
+    """Return what a chunk's query is about, with parts asked from the outermost inwards."""
+    description, device = robot.description, robot.device
+    frame = [description.links[robot.link_names[k]] for k in robot.model_link]
+    paths = [description.path(f) for f in frame]
+    order = sorted(range(len(frame)), key=lambda k: -len(paths[k]))
+    entries, stages = [], []
+    for k in order:
+        first = len(entries)
+        if robots.count and robot.model_link[k] not in robot.mounted:
+            entries.append((k, -1, -1))
+        for i, j in robot.pairs[robot.pairs[:, 1] == k].tolist():
+            entries.append((j, i, max(set(paths[i]) & set(paths[j]), default=-1)))
+        if len(entries) > first:
+            stages.append((first, len(entries)))
+    parts = Parts()
+    columns = np.array(entries, np.int32).reshape(-1, 3).T
+    parts.first, parts.second, parts.shared = (wp.array(c.copy(), dtype=wp.int32, device=device) for c in columns)
+    parts.meets = wp.array(robots.meets.astype(np.uint8), dtype=wp.uint8, device=device)
+    parts.frame = wp.array(np.array(frame, np.int32), device=device)
+    parts.depth = wp.array(np.array([len(path) for path in paths], np.int32), device=device)
+    middles = np.array([model.centre for model in robot.models])
+    parts.middle = wp.array(middles, dtype=wp.vec3d, device=device)
+    vertices = [model.progressive.vertex_pos[: model.progressive.vertex_count] for model in robot.models]
+    radii = [np.sqrt(((v - m) ** 2).sum(1).max()) * (1 + 2.0**-40) for v, m in zip(vertices, middles)]
+    parts.radius = wp.array(np.array(radii), dtype=wp.float64, device=device)
+    sizes = len(robot.joint_names), len(description.frames), len(frame)
+    return Asked(description.make_chain(device), parts, stages, robots.count, room, *sizes)
 
 
 class RobotQuery:
@@ -35,8 +66,8 @@ class RobotQuery:
 
     def __init__(self, robot, around, output: str, room: int):
         self.device, self.output, self.room = robot.device, output, room
-        self._robots = made = RobotBatch(around, robot.models, room, robot.collision_bits, robot.device)
-        asked = robot.asked(made, room)
+        self._robots = made = RobotBatch(around, robot.models, room, robot.device)
+        asked = ask_about(robot, made, room)
         self._around, self._models = made.count, len(robot.models)
         self._links: Any
         capacity = max(1, PAIRS_GUESS * room)

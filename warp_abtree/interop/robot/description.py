@@ -153,7 +153,7 @@ def check_rigid(matrix, what: str) -> np.ndarray:
     """
     matrix = np.eye(4) if matrix is None else np.asarray(matrix, np.float64)
     rotation = matrix[:3, :3]
-    fine = np.isfinite(matrix).all() and np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-9
+    fine = np.isfinite(matrix).all() and np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-12
     if not fine or np.linalg.det(rotation) < 0:
         raise RobotError(f"{what}: its transform is not rigid")
     return matrix

@@ -18,13 +18,11 @@ from warp_abtree.checks.arguments import (
     wrap_array,
 )
 from warp_abtree.interop.robot.check import RobotQuery, check_edges
-from warp_abtree.interop.robot.description import ALL_BITS, Description, RobotError
-from warp_abtree.interop.robot.link_query import Asked
+from warp_abtree.interop.robot.description import Description, RobotError
 from warp_abtree.interop.robot.mjcf import read_mjcf
-from warp_abtree.interop.robot.surroundings import RobotBatch, make_surroundings
+from warp_abtree.interop.robot.surroundings import make_surroundings
 from warp_abtree.interop.robot.urdf import read_disabled_pairs, read_urdf
 from warp_abtree.kernels.robot import forward
-from warp_abtree.kernels.robot.link_pairs import Parts
 from warp_abtree.model.model import Model
 from warp_abtree.query.distance import check_beyond
 from warp_abtree.scene.scene import Scene
@@ -47,10 +45,11 @@ class Robot:
         models: `Model` of each part: the mesh of a link, in the link's frame.
         model_link: Index into `link_names` of each model, int (m,).
         pairs: Pairs of models that are tested against one another, int (p, 2).
+        mounted: Indices into `link_names` of the links that are not tested against what surrounds the robot.
+        description: What the file says, `warp_abtree.interop.robot.description.Description`.
     """
 
-    def __init__(self, description: Description, device=None, mounted=(), collision_bits=(1, ALL_BITS)):
-        self.collision_bits = collision_bits
+    def __init__(self, description: Description, device=None, mounted=()):
         self.device = Scene(device).device
         self.description = description
         self.joint_names, self.link_names = tuple(description.joints), tuple(description.links)
@@ -65,7 +64,7 @@ class Robot:
         unknown = set(mounted) - set(self.link_names)
         if unknown:
             raise ValueError(f"mounted: the robot has no link {sorted(unknown)[0]!r}")
-        self._mounted = [self.link_names.index(name) for name in mounted]
+        self.mounted = [self.link_names.index(name) for name in mounted]
         self._chain = description.make_chain(self.device)
         self._links = wp.array(np.array(list(description.links.values()), np.int32), device=self.device)
         self._kept: dict[tuple, RobotQuery] = {}
@@ -260,32 +259,3 @@ class Robot:
         for old in list(self._kept)[:-KEPT]:
             del self._kept[old]
         return query
-
-    def asked(self, robots: RobotBatch, room: int) -> Asked:
-        """Return what a chunk's query is about, with parts asked from the outermost inwards."""
-        description, device = self.description, self.device
-        frame = [description.links[self.link_names[k]] for k in self.model_link]
-        paths = [description.path(f) for f in frame]
-        order = sorted(range(len(frame)), key=lambda k: -len(paths[k]))
-        entries, stages = [], []
-        for k in order:
-            first = len(entries)
-            if robots.count and self.model_link[k] not in self._mounted:
-                entries.append((k, -1, -1))
-            for i, j in self.pairs[self.pairs[:, 1] == k].tolist():
-                entries.append((j, i, max(set(paths[i]) & set(paths[j]), default=-1)))
-            if len(entries) > first:
-                stages.append((first, len(entries)))
-        parts = Parts()
-        columns = np.array(entries, np.int32).reshape(-1, 3).T
-        parts.first, parts.second, parts.shared = (wp.array(c.copy(), dtype=wp.int32, device=device) for c in columns)
-        parts.meets = wp.array(robots.meets.astype(np.uint8), dtype=wp.uint8, device=device)
-        parts.frame = wp.array(np.array(frame, np.int32), device=device)
-        parts.depth = wp.array(np.array([len(path) for path in paths], np.int32), device=device)
-        middles = np.array([model.centre for model in self.models])
-        parts.middle = wp.array(middles, dtype=wp.vec3d, device=device)
-        vertices = [model.progressive.vertex_pos[: model.progressive.vertex_count] for model in self.models]
-        radii = [np.sqrt(((v - m) ** 2).sum(1).max()) * (1 + 2.0**-40) for v, m in zip(vertices, middles)]
-        parts.radius = wp.array(np.array(radii), dtype=wp.float64, device=device)
-        sizes = len(self.joint_names), len(description.frames), len(frame)
-        return Asked(self._chain, parts, stages, robots.count, room, *sizes)

@@ -50,15 +50,15 @@ class RobotBatch:
         around: `Scene`, or None.
         models: Of the parts.
         room: Robots.
-        bits: Collision group and mask of the robot, see `Scene.add`.
 
     Attributes:
         batch: `Batch`; objects of the surroundings come first.
         count: Objects of the surroundings.
-        meets: Whether the bits of each of these let it meet the robot, bool (count,).
+        meets: Whether the bits of each of these let it meet the robot, whose group is 1, with every bit in its mask,
+            bool (count,).
     """
 
-    def __init__(self, around: Scene | None, models: list[Model], room: int, bits: tuple[int, int], device):
+    def __init__(self, around: Scene | None, models: list[Model], room: int, device):
         posed = Scene(device)
         self.count, solid = 0, np.zeros(0, bool)
         self._around, self._batch, self._lods = around, None, np.zeros(0)
@@ -68,7 +68,7 @@ class RobotBatch:
             posed.add_many([around.models[m] for m in around.object_model], [STILL] * self.count, lods=self._lods)
             solid = np.array(around.object_solid)
             group, mask = self._batch.objects.collision_bits.numpy().reshape(-1, 2).T
-            self.meets = ((group & bits[1]) != 0) & ((mask & bits[0]) != 0) if len(group) else np.ones(self.count, bool)
+            self.meets = (group != 0) & ((mask & 1) != 0) if len(group) else np.ones(self.count, bool)
         posed.add_many(models, [STILL] * len(models))
         once = posed.batch()
         chosen = np.concatenate([np.arange(self.count), np.tile(np.arange(self.count, once.object_count), room)])
