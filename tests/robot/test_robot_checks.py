@@ -1,5 +1,7 @@
 """Robots at many configurations against FCL, a scene of posed links, and dense samples of edges."""
 
+from dataclasses import replace
+
 import fcl
 import numpy as np
 import pytest
@@ -63,19 +65,16 @@ def test_forward_kinematics_is_a_product_of_matrices(arm):
     np.testing.assert_allclose(arm.forward(large, limits=False).numpy(), turned, atol=1e-13)
 
 
-def test_pairs_leave_neighbours_and_excluded_links_out(arm):
+def test_pairs_leave_neighbours_and_excluded_links_out(device):
+    description = described_arm()
+    # A mesh of the flange too, which is rigidly fixed to the forearm.
+    description.parts.append(replace(description.parts[2], link=3))
+    arm = ab.Robot(description, device)
     names = [arm.link_names[k] for k in arm.model_link]
     pairs = {frozenset((names[i], names[j])) for i, j in arm.pairs}
-    # The fingers and the flap hang on the forearm, the flange is part of it.
-    left_out = [
-        ("base", "upper"),
-        ("upper", "fore"),
-        ("fore", "left"),
-        ("fore", "right"),
-        ("fore", "flap"),
-        ("base", "fore"),
-    ]
-    assert len(pairs) == 15 - len(left_out) and not pairs & set(map(frozenset, left_out))
+    around = [(link, other) for link in ("fore", "flange") for other in ("upper", "left", "right", "flap")]
+    left_out = {*map(frozenset, around), *map(frozenset, [("base", "upper"), ("fore", "flange"), ("base", "fore")])}
+    assert not pairs & left_out and len(pairs) == len(arm.pairs) == 21 - len(left_out)
 
 
 def test_answers_are_those_of_fcl(arm):
