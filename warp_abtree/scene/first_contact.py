@@ -193,10 +193,14 @@ class FirstContactQuery(Query):
 
     def traverse(self):
         """Decide which pairs in place intersect at first, and find when the others do. Launches only."""
+        super().traverse()
+        self.search()
+
+    def search(self):
+        """Find when the pairs in place do that are not marked as intersecting in `hits.any_hit`. Launches only."""
         room = len(self.pairs)
         if not room:
             return
-        super().traverse()
         if self.device.is_capturing:
             self._make_contacts(wp.launch)
             return
