@@ -2,19 +2,21 @@
 
 Each object has a goal, where the step would take it, and an end of its way there, at first the goal. A round searches
 the first contacts of all pairs on these ways, and cuts the ways of both objects of a pair at its time, less a little.
-The next round searches the pairs of which an object's way was cut, since it now stands where the other may still come.
-What the last round does not prove clear, end included, holds its whole world where it was. So at the end a path leads
-from each object's pose to its new one, on which no two surfaces meet that were apart.
+The next round searches the pairs of which an object's way was cut, since it now stands where the other may still come:
+that one is cut at the time of contact, then to the same part of its motion, on which both were clear. Meanwhile
+surfaces count as thicker, where they are not so near yet, since what slides along at no distance is hard to prove
+apart. What the last round does not prove clear, end included, holds its whole world where it was. So at the end a path
+leads from each object's pose to its new one, on which no two surfaces meet that were apart.
 """
 
 import warp as wp
 
 from warp_abtree.kernels.arrays import ObjectPool
-from warp_abtree.kernels.dynamics.bodies import DYNAMIC, STATIC, Bodies
+from warp_abtree.kernels.dynamics.bodies import DYNAMIC, STATIC, Bodies, rotation_by
 from warp_abtree.kernels.dynamics.constraints import SLOP
 from warp_abtree.kernels.motion.face_pair import CLEAR, UNDECIDED
-from warp_abtree.kernels.motion.path import make_path
-from warp_abtree.kernels.motion.start import Contacts
+from warp_abtree.kernels.motion.path import Motion, make_path
+from warp_abtree.kernels.motion.start import OPEN, Contacts
 from warp_abtree.kernels.motion.turn import shortest_turn, turn_matrix
 from warp_abtree.kernels.traversal.face_pairs import Hits
 
@@ -23,10 +25,14 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 TOUCHING, UNDECIDED_PAIRS, HELD = wp.constant(0), wp.constant(1), wp.constant(2)
 """Entries of `Ways.counter`."""
 
-CUT, HOLD, CERTIFY = wp.constant(0), wp.constant(1), wp.constant(2)
-"""What a round does with pairs that are not clear: cut at the time of contact, at the start, or hold the world."""
+CUT, MATCH, HOLD, CERTIFY = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+"""What a round does with pairs that are not clear: cut ways at the time of contact, cut the longer part to the shorter,
+cut both at the start, or hold the world."""
 
-ZERO, ONE, HALF = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0)), wp.constant(wp.float64(0.5))
+NEAR, NEARER = wp.constant(wp.float64(0.25)), wp.constant(wp.float64(1.0 / 32.0))
+EXEMPT, LAST_LEVEL = wp.constant(-1), wp.constant(2)
+
+ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 
 
 @wp.struct
@@ -39,11 +45,30 @@ class Ways:
     goals: ObjectPool  # poses that the step aims for: rotation and position
     ends: ObjectPool  # poses that it ends at
     part: wp.array(dtype=wp.float64)  # of its motion that an object makes, 0 to 1, shape [object]
+    is_stuck: wp.array(dtype=wp.int32)  # whether the last motion was cut to next to nothing, 0 or 1, shape [object]
     cut: wp.array(dtype=wp.float64)  # part of its way that the round leaves, shape [object]
     is_changed: wp.array(dtype=wp.int32)  # whether the last round has cut its way, 0 or 1, shape [object]
     is_held: wp.array(dtype=wp.int32)  # of each world, 0 or 1, shape [object]
-    is_exempt: wp.array(dtype=wp.int32)  # whether the ways of a pair do not matter, 0 or 1, shape [pair]
+    level: wp.array(dtype=wp.int32)  # of a pair's `margin_of`; EXEMPT where ways do not matter, shape [pair]
+    is_again: wp.array(dtype=wp.int32)  # whether a pair is searched again at another level, 0 or 1, shape [pair]
     counter: wp.array(dtype=wp.int32)  # touching and undecided pairs, and pairs that held a world, shape [3]
+
+
+@wp.kernel
+def free_stuck_kernel(dt: wp.float64, objects: ObjectPool, bodies_inout: Bodies, ways_inout: Ways):
+    """Let a body that was stuck in the last step move by its position correction alone, out of contact."""
+    i = wp.tid()
+    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] != DYNAMIC or ways_inout.is_stuck[i] == 0:
+        return
+    axes, centre = bodies_inout.axes[i], bodies_inout.centre[i]
+    turn = rotation_by(dt * (bodies_inout.inverse_inertia[i] * bodies_inout.pseudo_momentum[i]))
+    q = wp.normalize(turn * wp.quat_from_matrix(objects.rotation[i] * axes))
+    position = objects.position[i] + objects.rotation[i] * centre + dt * bodies_inout.pseudo_velocity[i]
+    bodies_inout.rotation[i] = q
+    bodies_inout.position[i] = position
+    rotation = wp.quat_to_matrix(q) * wp.transpose(axes)
+    ways_inout.goals.rotation[i] = rotation
+    ways_inout.goals.position[i] = position - rotation * centre
 
 
 @wp.kernel
@@ -81,7 +106,8 @@ def exempt_pair_kernel(
         return
     moves = bodies.motion_type[pairs[p][0]] == DYNAMIC or bodies.motion_type[pairs[p][1]] == DYNAMIC
     touches = hits.any_hit[p] != 0
-    ways_inout.is_exempt[p] = wp.where(touches or not moves, 1, 0)
+    ways_inout.level[p] = wp.where(touches or not moves, EXEMPT, 0)
+    ways_inout.is_again[p] = 0
     if touches and moves:
         wp.atomic_add(ways_inout.counter, TOUCHING, 1)
 
@@ -95,8 +121,33 @@ def choose_pair_kernel(
     if p >= pair_count[0]:
         return
     a, b = pairs[p][0], pairs[p][1]
-    changed = ways.is_changed[a] + ways.is_changed[b] > 0 and ways.part[a] + ways.part[b] > ZERO
-    hits_inout.any_hit[p] = wp.where(changed and ways.is_exempt[p] == 0, 0, 1)
+    changed = ways.is_changed[a] + ways.is_changed[b] + ways.is_again[p] > 0 and ways.part[a] + ways.part[b] > ZERO
+    hits_inout.any_hit[p] = wp.where(changed and ways.level[p] != EXEMPT, 0, 1)
+
+
+@wp.func
+def slop_of(bodies: Bodies, pair: wp.vec2i):
+    return SLOP * wp.min(bodies.bounding_radius[pair[0]], bodies.bounding_radius[pair[1]])
+
+
+@wp.kernel
+def widen_motion_kernel(
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    contacts: Contacts,
+    bodies: Bodies,
+    ways: Ways,
+    motion_inout: wp.array(dtype=Motion),
+):
+    """Let the surfaces of a pair a thread count as in contact when near: by a quarter of a slop, or 1/32 of that."""
+    p = wp.tid()
+    if p >= pair_count[0] or contacts.end[p] != OPEN or ways.level[p] >= LAST_LEVEL:
+        return
+    margin = slop_of(bodies, pairs[p]) * wp.where(ways.level[p] == 0, NEAR, NEAR * NEARER)
+    motion = motion_inout[p]
+    motion.slack = motion.slack + margin
+    motion.margin = motion.margin + wp.float32(margin * motion.scale)
+    motion_inout[p] = motion
 
 
 @wp.func
@@ -122,9 +173,16 @@ def cut_way_kernel(
 ):
     """Cut the ways of both objects of a pair a thread that is not proved clear, or hold their worlds."""
     p = wp.tid()
-    if p >= pair_count[0] or hits.any_hit[p] != 0 or contacts.end[p] == CLEAR:
+    if p >= pair_count[0] or hits.any_hit[p] != 0:
+        return
+    ways_inout.is_again[p] = 0
+    if contacts.end[p] == CLEAR:
         return
     a, b = pairs[p][0], pairs[p][1]
+    if mode <= MATCH and contacts.time[p] == ZERO and ways_inout.level[p] < LAST_LEVEL:
+        ways_inout.level[p] += 1
+        ways_inout.is_again[p] = 1
+        return
     if contacts.end[p] == UNDECIDED:
         wp.atomic_add(ways_inout.counter, UNDECIDED_PAIRS, 1)
     if mode == CERTIFY:
@@ -133,15 +191,25 @@ def cut_way_kernel(
             if bodies.motion_type[pairs[p][k]] != STATIC:
                 wp.atomic_max(ways_inout.is_held, ways_inout.world[pairs[p][k]], 1)
         return
-    part = ZERO
+    if mode == HOLD:
+        wp.atomic_min(ways_inout.cut, a, ZERO)
+        wp.atomic_min(ways_inout.cut, b, ZERO)
+        return
+    # A quarter of a slop before the contact, where contacts ahead find it.
+    length = way_length(objects, ways_inout, bodies, a) + way_length(objects, ways_inout, bodies, b)
+    back = NEAR * slop_of(bodies, pairs[p])
+    part = wp.max(contacts.time[p] - back / wp.max(length, back), ZERO)
+    part_a, part_b = ways_inout.part[a], ways_inout.part[b]
+    less, more = wp.min(part_a, part_b), wp.max(part_a, part_b)
+    static = bodies.motion_type[a] == STATIC or bodies.motion_type[b] == STATIC
+    if static or less == more:
+        wp.atomic_min(ways_inout.cut, a, part)
+        wp.atomic_min(ways_inout.cut, b, part)
+        return
+    shorter = less / more
     if mode == CUT:
-        # A quarter of a slop before the contact, where contacts ahead find it; at least half the way to it.
-        time = contacts.time[p]
-        length = way_length(objects, ways_inout, bodies, a) + way_length(objects, ways_inout, bodies, b)
-        back = wp.float64(0.25) * SLOP * wp.min(bodies.bounding_radius[a], bodies.bounding_radius[b])
-        part = wp.max(HALF * time, time - back / wp.max(length, back))
-    for k in range(2):
-        wp.atomic_min(ways_inout.cut, pairs[p][k], part)
+        shorter = wp.max(shorter, part)
+    wp.atomic_min(ways_inout.cut, wp.where(part_a == more, a, b), shorter)
 
 
 @wp.kernel
@@ -188,24 +256,30 @@ def end_way_kernel(
 ):
     """Pose an object where its way ends, unless not all pairs were found.
 
-    Gravity acts on a body for the part of the step that it moves, and a turn that is cut short adds no energy.
+    Gravity acts on a body for the part of the step that it moves, and a turn that is cut short adds no energy. A body
+    that is stuck stops, and moves by its position correction alone in the next step: else it would ask for the same
+    motion for ever.
     """
     i = wp.tid()
     if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] == STATIC:
         return
-    whole = launched[0] >= 0 and wp.uint32(pair_count[0]) <= wp.uint32(ways.is_exempt.shape[0])
+    whole = launched[0] >= 0 and wp.uint32(pair_count[0]) <= wp.uint32(ways.level.shape[0])
     if hits.uncertain.shape[0] > 0:
         whole = whole and wp.uint32(hits.uncertain_total[0]) <= wp.uint32(hits.uncertain.shape[0])
     if not whole:
         return
     part = ways.part[i]
+    near = NEAR * SLOP * bodies_inout.bounding_radius[i]
+    stuck = part < ONE and way_length(objects_inout, ways, bodies_inout, i) < near
     if ways.is_held[ways.world[i]] != 0:
         part = ZERO
     else:
         objects_inout.rotation[i] = ways.ends.rotation[i]
         objects_inout.position[i] = ways.ends.position[i]
     ways.part[i] = part
-    if bodies_inout.motion_type[i] != DYNAMIC or part == ONE:
+    was_stuck = ways.is_stuck[i] != 0
+    ways.is_stuck[i] = wp.where(stuck, 1, 0)
+    if bodies_inout.motion_type[i] != DYNAMIC or (part == ONE and not was_stuck):
         return
     rotation = objects_inout.rotation[i]
     bodies_inout.position[i] = objects_inout.position[i] + rotation * bodies_inout.centre[i]
@@ -214,8 +288,9 @@ def end_way_kernel(
     before = spin_energy(bodies_inout.rotation[i], momentum, inverse)
     after = spin_energy(q, momentum, inverse)
     bodies_inout.rotation[i] = q
-    if after > before:
-        bodies_inout.momentum[i] = wp.sqrt(before / after) * momentum
+    keep = wp.where(stuck, ZERO, ONE)
+    bodies_inout.momentum[i] = (keep * wp.where(after > before, wp.sqrt(before / after), ONE)) * momentum
     down = wp.normalize(velocity_change)
     speed = wp.max(wp.dot(bodies_inout.velocity[i], down), ZERO)
-    bodies_inout.velocity[i] -= wp.min((ONE - part) * wp.length(velocity_change), speed) * down
+    taken = wp.min(wp.where(was_stuck, ONE, ONE - part) * wp.length(velocity_change), speed)
+    bodies_inout.velocity[i] = keep * (bodies_inout.velocity[i] - taken * down)

@@ -9,8 +9,10 @@ from warp_abtree.scene.first_contact import FirstContactQuery
 from warp_abtree.scene.scene import Scene
 
 TOLERANCE = 2.0**-24  # of times, as a part of a step's motion
+INTEGERS = [(name, wp.int32) for name in ("is_changed", "is_held", "is_stuck")]
+MODES = kernels.CUT, kernels.MATCH, kernels.HOLD, kernels.CERTIFY
 # What each round does with the pairs that it does not prove clear.
-ROUNDS = (*4 * [int(kernels.CUT)], *4 * [int(kernels.HOLD)], int(kernels.CERTIFY))
+ROUNDS = [int(mode) for mode, times in zip(MODES, (5, 4, 3, 1)) for _ in range(times)]
 
 
 class CertifiedWays(FirstContactQuery):
@@ -36,7 +38,7 @@ class CertifiedWays(FirstContactQuery):
         super().__init__(scene, None, None, capacity, TOLERANCE)
         state, shared = self._state, self.broad_phase.shared_group
         state.goals, state.ends = self.goals, self.ends
-        for name, dtype in (("part", wp.float64), ("cut", wp.float64), ("is_changed", wp.int32), ("is_held", wp.int32)):
+        for name, dtype in (("part", wp.float64), ("cut", wp.float64), *INTEGERS):
             setattr(state, name, wp.zeros(n, dtype=dtype, device=self.device))
         state.counter = wp.zeros(3, dtype=wp.int32, device=self.device)
         # What moves in every world holds all of them together.
@@ -47,7 +49,8 @@ class CertifiedWays(FirstContactQuery):
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
-        return [*made, (self._state, "is_exempt", wp.zeros(room, dtype=wp.int32, device=self.device))]
+        names = "level", "is_again"
+        return [*made, *((self._state, name, wp.zeros(room, dtype=wp.int32, device=self.device)) for name in names)]
 
     def _launch(self, between=None):
         self._begin()
@@ -68,10 +71,18 @@ class CertifiedWays(FirstContactQuery):
         self._run(kernels.exempt_pair_kernel, room, [*found, self.hits, self._bodies, state])
         for mode in ROUNDS:
             self._run(kernels.choose_pair_kernel, room, [*found, state, self.hits])
-            self.search()
+            self.begin_motions()
+            if mode <= kernels.MATCH:
+                inputs = [*found, self.contacts, self._bodies, state, self._motion]
+                self._run(kernels.widen_motion_kernel, room, inputs)
+            self.follow_motions()
             inputs = [mode, *found, self._pool, self.hits, self.contacts, self._bodies, state]
             self._run(kernels.cut_way_kernel, room, inputs)
             self._run(kernels.apply_cut_kernel, n, [self._pool, self._bodies, state])
+
+    def free_stuck(self, dt: float):
+        """Set other goals for bodies that were stuck in the last step. Launches only."""
+        self._run(kernels.free_stuck_kernel, len(self.part), [dt, self._pool, self._bodies, self._state])
 
     def end(self, velocity_change):
         """Pose objects where their ways end, unless there was no room for all pairs. Launches only.

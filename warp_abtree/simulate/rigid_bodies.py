@@ -178,6 +178,7 @@ class Dynamics(RigidBodies):
             posed = self._pool if self.certified is None else self.certified.goals
             self._launch(body_kernels.integrate_kernel, n, [dt, self.targets, bodies, posed])
             if self.certified is not None:
+                self.certified.free_stuck(dt)
                 self.certified.launch()
                 self.certified.end(dt * self.gravity)
 
