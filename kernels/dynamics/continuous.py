@@ -30,6 +30,9 @@ CUT, MATCH, HOLD, CERTIFY = wp.constant(0), wp.constant(1), wp.constant(2), wp.c
 cut both at the start, or hold the world."""
 
 NEAR, NEARER = wp.constant(wp.float64(0.25)), wp.constant(wp.float64(1.0 / 32.0))
+FREE, STUCK, ON_TRIAL, STUCK_AGAIN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+"""Whether a body's last motion was cut to next to nothing, and what came of it; the odd ones move out of contact."""
+
 EXEMPT, LAST_LEVEL = wp.constant(-1), wp.constant(2)
 
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
@@ -45,7 +48,7 @@ class Ways:
     goals: ObjectPool  # poses that the step aims for: rotation and position
     ends: ObjectPool  # poses that it ends at
     part: wp.array(dtype=wp.float64)  # of its motion that an object makes, 0 to 1, shape [object]
-    is_stuck: wp.array(dtype=wp.int32)  # whether the last motion was cut to next to nothing, 0 or 1, shape [object]
+    stuck: wp.array(dtype=wp.int32)  # FREE, STUCK, ON_TRIAL or STUCK_AGAIN, shape [object]
     cut: wp.array(dtype=wp.float64)  # part of its way that the round leaves, shape [object]
     is_changed: wp.array(dtype=wp.int32)  # whether the last round has cut its way, 0 or 1, shape [object]
     is_held: wp.array(dtype=wp.int32)  # of each world, 0 or 1, shape [object]
@@ -58,7 +61,7 @@ class Ways:
 def free_stuck_kernel(dt: wp.float64, objects: ObjectPool, bodies_inout: Bodies, ways_inout: Ways):
     """Let a body that was stuck in the last step move by its position correction alone, out of contact."""
     i = wp.tid()
-    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] != DYNAMIC or ways_inout.is_stuck[i] == 0:
+    if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] != DYNAMIC or (ways_inout.stuck[i] & 1) == 0:
         return
     axes, centre = bodies_inout.axes[i], bodies_inout.centre[i]
     turn = rotation_by(dt * (bodies_inout.inverse_inertia[i] * bodies_inout.pseudo_momentum[i]))
@@ -257,8 +260,8 @@ def end_way_kernel(
     """Pose an object where its way ends, unless not all pairs were found.
 
     Gravity acts on a body for the part of the step that it moves, and a turn that is cut short adds no energy. A body
-    that is stuck stops, and moves by its position correction alone in the next step: else it would ask for the same
-    motion for ever.
+    that is stuck stops turning, and moves by its position correction alone in the next step: else it would ask for the
+    same motion for ever. Stuck again it stops.
     """
     i = wp.tid()
     if bodies_inout.is_whole[0] == 0 or bodies_inout.motion_type[i] == STATIC:
@@ -277,8 +280,12 @@ def end_way_kernel(
         objects_inout.rotation[i] = ways.ends.rotation[i]
         objects_inout.position[i] = ways.ends.position[i]
     ways.part[i] = part
-    was_stuck = ways.is_stuck[i] != 0
-    ways.is_stuck[i] = wp.where(stuck, 1, 0)
+    before_stuck = ways.stuck[i]
+    was_stuck = (before_stuck & 1) != 0
+    now = wp.where(before_stuck == STUCK, ON_TRIAL, FREE)
+    if stuck:
+        now = wp.where(before_stuck == FREE, STUCK, STUCK_AGAIN)
+    ways.stuck[i] = now
     if bodies_inout.motion_type[i] != DYNAMIC or (part == ONE and not was_stuck):
         return
     rotation = objects_inout.rotation[i]
@@ -288,9 +295,9 @@ def end_way_kernel(
     before = spin_energy(bodies_inout.rotation[i], momentum, inverse)
     after = spin_energy(q, momentum, inverse)
     bodies_inout.rotation[i] = q
-    keep = wp.where(stuck, ZERO, ONE)
-    bodies_inout.momentum[i] = (keep * wp.where(after > before, wp.sqrt(before / after), ONE)) * momentum
+    scale = wp.where(after > before, wp.sqrt(before / after), ONE)
+    bodies_inout.momentum[i] = wp.where(stuck, ZERO, scale) * momentum
     down = wp.normalize(velocity_change)
     speed = wp.max(wp.dot(bodies_inout.velocity[i], down), ZERO)
     taken = wp.min(wp.where(was_stuck, ONE, ONE - part) * wp.length(velocity_change), speed)
-    bodies_inout.velocity[i] = keep * (bodies_inout.velocity[i] - taken * down)
+    bodies_inout.velocity[i] = wp.where(now == STUCK_AGAIN, ZERO, ONE) * (bodies_inout.velocity[i] - taken * down)

@@ -9,7 +9,7 @@ from warp_abtree.scene.first_contact import FirstContactQuery
 from warp_abtree.scene.scene import Scene
 
 TOLERANCE = 2.0**-24  # of times, as a part of a step's motion
-INTEGERS = [(name, wp.int32) for name in ("is_changed", "is_held", "is_stuck")]
+INTEGERS = [(name, wp.int32) for name in ("is_changed", "is_held", "stuck")]
 MODES = kernels.CUT, kernels.MATCH, kernels.HOLD, kernels.CERTIFY
 # What each round does with the pairs that it does not prove clear.
 ROUNDS = [int(mode) for mode, times in zip(MODES, (5, 4, 3, 1)) for _ in range(times)]
