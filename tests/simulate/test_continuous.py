@@ -23,10 +23,10 @@ def surfaces_meet(dynamics):
 
 def energy(dynamics, g=9.81):
     """Kinetic energy, and potential energy under gravity along -z."""
-    velocity, angular = dynamics.velocities()
-    rigid, z = dynamics.rigid, dynamics.bodies.position.numpy()[:, 2]
-    spin = np.einsum("ni,ni->n", angular, dynamics.bodies.momentum.numpy())[rigid].sum()
-    return 0.5 * spin + (dynamics.mass * (0.5 * (velocity**2).sum(1) + g * z))[rigid].sum()
+    rigid = dynamics.rigid
+    velocity, angular = (rows[rigid] for rows in dynamics.velocities())
+    z, momentum = dynamics.bodies.position.numpy()[rigid, 2], dynamics.bodies.momentum.numpy()[rigid]
+    return 0.5 * (angular * momentum).sum() + (dynamics.mass[rigid] * (0.5 * (velocity**2).sum(1) + g * z)).sum()
 
 
 @pytest.mark.parametrize("speed", [3.0, 30.0, 300.0, 1000.0])

@@ -79,6 +79,14 @@ class CertifiedWays(FirstContactQuery):
             inputs = [mode, *found, self._pool, self.hits, self.contacts, self._bodies, state]
             self._run(kernels.cut_way_kernel, room, inputs)
             self._run(kernels.apply_cut_kernel, n, [self._pool, self._bodies, state])
+            if self._is_settled():
+                break
+
+    def _is_settled(self) -> bool:
+        """Return whether further rounds would find nothing, where that can be told without a wait."""
+        if not self.device.is_cpu or self.device.is_capturing:
+            return False
+        return not (self._state.is_changed.numpy().any() or self._state.is_again.numpy().any())
 
     def free_stuck(self, dt: float):
         """Set other goals for bodies that were stuck in the last step. Launches only."""
