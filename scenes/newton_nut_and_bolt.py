@@ -63,8 +63,8 @@ def make_nut(sections, turns):
 
 def find_height(bolt, nut, pitch, height):
     """Return the middle of the widest range of heights, from a given one on, at which a nut is free on its bolt."""
-    poses = np.tile(np.eye(4), (101, 1, 1))
-    poses[:, 2, 3] = height + np.linspace(0, pitch, 101)
+    poses = np.tile(np.eye(4), (501, 1, 1))
+    poses[:, 2, 3] = height + np.linspace(0, pitch, 501)
     free = np.flatnonzero(~ab.sweep(bolt, nut, poses, output="any"))
     if not len(free):
         raise ValueError(f"the nut crosses the bolt at every height from {height} to {height + pitch}")

@@ -177,7 +177,8 @@ def test_points_are_as_many_as_asked_for(device, most):
     normals = points["normal"]
     assert most - 1 <= len(normals) <= most  # the last place is the deepest's, if it is deeper
     seen = (normals @ np.asarray(ball.vertices).T).max(0).min()  # cosine of the emptiest cap
-    assert seen > {8: 0.3, 24: 0.8}[most]
+    # Farthest-first is at worst twice as wide as the best; and 24 do what no 8 can, 48 degrees.
+    assert seen > {8: -0.11, 24: 0.67}[most]
     assert (1 - normals @ normals.T + 2 * np.eye(len(normals))).min() > 0.02
 
 
