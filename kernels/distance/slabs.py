@@ -180,7 +180,7 @@ def refresh_slab_kernel(
     p = wp.tid()
     if p < counter_out.shape[0]:
         counter_out[p] = 0
-    if p >= pair_count[0] or found.launched[0] == STALE:
+    if p >= wp.min(pair_count[0], pairs.shape[0]) or found.launched[0] == STALE:
         return
     own = wp.vec2i(objects.state[pairs[p][0]], objects.state[pairs[p][1]])
     slabs_inout.states[p] = own
