@@ -9,7 +9,7 @@ the nearest other points where there is no room.
 import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.contact.manifold import POINTS, Manifolds
+from warp_abtree.kernels.contact.manifold import Manifolds
 from warp_abtree.kernels.contact.points import order_direction
 from warp_abtree.kernels.distance.frame import make_frame
 from warp_abtree.kernels.generation import STALE
@@ -125,7 +125,7 @@ def remove_nearest(p: wp.int32, x: wp.vec3d, limit: wp.float64, manifolds: Manif
         manifolds.point[p, k - 1] = manifolds.point[p, k]
         manifolds.normal[p, k - 1] = manifolds.normal[p, k]
         manifolds.depth[p, k - 1] = manifolds.depth[p, k]
-    manifolds.count[p] = wp.min(count, POINTS - 1)
+    manifolds.count[p] = wp.min(count, manifolds.point.shape[1] - 1)
 
 
 @wp.func
@@ -178,6 +178,7 @@ def add_inside_point_kernel(
     deep += DEEPER * size
     least = wp.float64(deep)
     sampling = Sampling()
+    most = manifolds_inout.point.shape[1]
     sampling.samples = 3
     sampling.radius = APART * size
     normals = wp.transpose(objects.rotation[a]) * way_of_points(manifolds_inout, p)
@@ -195,10 +196,10 @@ def add_inside_point_kernel(
             if warp_lane() == 0:
                 # The way out of what is inside, of the higher object, or of the lower one turned.
                 normal = unit_vector(wp.where(best.of_b != (pose.swapped != 0), foot - sample, sample - foot))
-                if manifolds_inout.count[p] == POINTS:
+                if manifolds_inout.count[p] == most:
                     remove_nearest(p, sample, deep, manifolds_inout)
                 insert_point(p, along, sample, normal, best.depth, manifolds_inout)
             if sampling.count == 0:
                 least = wp.max(deep, LESS * best.depth)
             sampling = avoid_point(sampling, point)
-            searching = sampling.count <= AVOIDED_MAX
+            searching = sampling.count <= AVOIDED_MAX and sampling.count < most
