@@ -13,7 +13,9 @@ from warp_abtree.kernels.motion.linear import (
 )
 from warp_abtree.kernels.motion.node_pair import advance_children, box_motion
 from warp_abtree.kernels.motion.path import Motion, Paths, bound_motion, place_motion, start_motion
+from warp_abtree.kernels.motion.screw import parent_of, slides_apart
 from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.node_pair import item_first, item_second
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -60,6 +62,7 @@ def has_way(kind: LinearMotion, paths: Paths, pair: wp.vec2i):  # noqa: F811
 
 @wp.func
 def advance_nodes(
+    models: ModelPool,
     states: StatePool,
     pose: PairPose,
     motion: Motion,
@@ -69,13 +72,18 @@ def advance_nodes(
     live: wp.int32,
 ):
     """Compare what an item names from t on, see `node_pair.advance_children`."""
+    used = live
+    x, y = parent_of(item_first(item)), parent_of(item_second(item))
+    if live < 0 and x >= pose.floor[0] and y >= pose.floor[1]:
+        used = wp.where(slides_apart(models, states, pose, motion, wp.float64(t), x, y), 0, live)
     boxes = box_motion(motion, place_motion(motion, wp.float64(t)))
-    items, kinds, times, tests = advance_children(states, pose, motion, boxes, t, best, item, live)
+    items, kinds, times, tests = advance_children(states, pose, motion, boxes, t, best, item, used)
     return items, kinds, times, tests
 
 
 @wp.func
 def advance_nodes(  # noqa: F811
+    models: ModelPool,
     states: StatePool,
     pose: PairPose,
     motion: LinearMotion,

@@ -116,7 +116,7 @@ def search_contact(
             item, t = read_item(items, at), read_bound(items, at)
             live = wp.where(warp_lane() < popped and wp.float64(t) <= best.time, -1, 0)
             warp_sync()
-            children, kinds, times, compared = advance_nodes(states, pose, motion, t, best.time, item, live)
+            children, kinds, times, compared = advance_nodes(models, states, pose, motion, t, best.time, item, live)
             ends = push_nearest(items, end, waiting, kinds, children, times)
             warp_sync()
             end = item_second(ends)
