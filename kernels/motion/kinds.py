@@ -62,7 +62,6 @@ def has_way(kind: LinearMotion, paths: Paths, pair: wp.vec2i):  # noqa: F811
 
 @wp.func
 def advance_nodes(
-    models: ModelPool,
     states: StatePool,
     pose: PairPose,
     motion: Motion,
@@ -72,18 +71,13 @@ def advance_nodes(
     live: wp.int32,
 ):
     """Compare what an item names from t on, see `node_pair.advance_children`."""
-    used = live
-    x, y = parent_of(item_first(item)), parent_of(item_second(item))
-    if live < 0 and x >= pose.floor[0] and y >= pose.floor[1]:
-        used = wp.where(slides_apart(models, states, pose, motion, wp.float64(t), x, y), 0, live)
     boxes = box_motion(motion, place_motion(motion, wp.float64(t)))
-    items, kinds, times, tests = advance_children(states, pose, motion, boxes, t, best, item, used)
+    items, kinds, times, tests = advance_children(states, pose, motion, boxes, t, best, item, live)
     return items, kinds, times, tests
 
 
 @wp.func
 def advance_nodes(  # noqa: F811
-    models: ModelPool,
     states: StatePool,
     pose: PairPose,
     motion: LinearMotion,
@@ -94,6 +88,22 @@ def advance_nodes(  # noqa: F811
 ):
     items, kinds, times, tests = advance_linear_children(states, pose, motion, t, best, item, live)
     return items, kinds, times, tests
+
+
+@wp.func
+def slides_past(models: ModelPool, states: StatePool, pose: PairPose, motion: Motion, t: wp.float32, item: wp.int64):
+    """Return whether the nodes that an item goes down from stay apart from t on, see `screw`."""
+    x, y = parent_of(item_first(item)), parent_of(item_second(item))
+    if x < pose.floor[0] or y < pose.floor[1]:
+        return False
+    return slides_apart(models, states, pose, motion, wp.float64(t), x, y)
+
+
+@wp.func
+def slides_past(  # noqa: F811
+    models: ModelPool, states: StatePool, pose: PairPose, motion: LinearMotion, t: wp.float32, item: wp.int64
+):
+    return False
 
 
 @wp.func

@@ -22,12 +22,12 @@ from warp_abtree.kernels.distance.search import (
 )
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED, Contact
-from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
+from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, slides_past
 from warp_abtree.kernels.motion.start import OPEN, Contacts
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.face_pairs import Hits
 from warp_abtree.kernels.traversal.load_balance import take_unit
-from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
+from warp_abtree.kernels.traversal.node_pair import first_item, four_items, item_first, item_second
 from warp_abtree.kernels.traversal.simd import take_thread
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
@@ -115,8 +115,12 @@ def search_contact(
             at = end + wp.min(warp_lane(), popped - 1)
             item, t = read_item(items, at), read_bound(items, at)
             live = wp.where(warp_lane() < popped and wp.float64(t) <= best.time, -1, 0)
+            if live < 0 and slides_past(models, states, pose, motion, t, item):
+                live = 0
             warp_sync()
-            children, kinds, times, compared = advance_nodes(models, states, pose, motion, t, best.time, item, live)
+            children, kinds, times, compared = four_items(), wp.vec4i(), wp.vec4(), wp.int32(0)
+            if warp_any(live < 0):
+                children, kinds, times, compared = advance_nodes(states, pose, motion, t, best.time, item, live)
             ends = push_nearest(items, end, waiting, kinds, children, times)
             warp_sync()
             end = item_second(ends)

@@ -42,13 +42,13 @@ class Ways:
 
 
 @wp.func
-def advance_roots(models: ModelPool, states: StatePool, pose: PairPose, motion: Any):
+def advance_roots(states: StatePool, pose: PairPose, motion: Any):
     """Return a time until which two roots stay apart, as the search finds it, and whether that is all the way."""
     t = wp.float32(0.0)
     item = first_item(states, pose)
     tests = wp.int32(0)
     while tests < ROOT_STEPS:
-        items, kinds, times, _ = advance_nodes(models, states, pose, motion, t, wp.float64(1.0), item, -1)
+        items, kinds, times, _ = advance_nodes(states, pose, motion, t, wp.float64(1.0), item, -1)
         tests += 1
         if kinds[0] == DROPPED:
             return t, True, tests
@@ -96,7 +96,7 @@ def contact_starter(kind):
             # Beyond float64, or no numbers: nothing could be proved.
             contacts_inout.end[p] = UNDECIDED
             return
-        t, clear, tests = advance_roots(models, states, pair_poses[p], motion)
+        t, clear, tests = advance_roots(states, pair_poses[p], motion)
         hits_inout.node_tests[p] += wp.int64(tests)
         contacts_inout.time[p] = wp.where(clear, wp.float64(1.0), wp.float64(t))
         contacts_inout.end[p] = wp.where(clear, CLEAR, OPEN)
