@@ -1,8 +1,8 @@
 """Whether two nodes of few faces stay apart while one object slides past the other along a screw, as a nut on its bolt.
 
 One object turns, by w a unit time, and moves by v along the axis u of its turn, seen from the other, the base. With
-k = v / w and cylinder coordinates r, a, z about that axis, r and z - k a of a point that moves do not change. So neither
-does f = p r + q (z - k a), whatever p and q: nodes on which f differs do not meet, however long the motion.
+k = v / w and cylinder coordinates r, a, z about that axis, r and z - k a of a point that moves do not change. So
+neither does f = p r + q (z - k a), whatever p and q: nodes on which f differs do not meet, however long the motion.
 
 1. Nodes lie in balls about the centres of their boxes. Centres at radii over twice those of the balls: two balls meet
    only at times at which their angles differ by at most c = 1.1 (b0 / r0 + b1 / r1), since asin x <= 1.1 x there. As no
@@ -139,7 +139,9 @@ def turn_between(s: wp.float64, c: wp.float64):
 
 
 @wp.func
-def part_on_screw(base: Ring, mover: Ring, home: wp.mat33d, turn: wp.float64, rise: wp.float64, t: wp.float64, off: wp.float64):
+def part_on_screw(
+    base: Ring, mover: Ring, home: wp.mat33d, turn: wp.float64, rise: wp.float64, t: wp.float64, off: wp.float64
+):
     """Return whether two nodes stay apart from t on, while the mover turns about the axis and rises along it.
 
     Args:

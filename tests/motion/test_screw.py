@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
 
-COUNT, TIMES = 240, 121
+COUNT, TIMES = 160, 41
 
 
 def random_patch(rng):
@@ -21,20 +21,20 @@ def random_patch(rng):
     return ab.Model.from_arrays(points, [[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]], base_faces=4)
 
 
+def pose_on_screw(whole, turn, offset):
+    """Return a pose turned about the z axis of a frame, and moved in it."""
+    frame = Rotation.from_quat(whole[3:])
+    return np.concatenate([frame.apply(offset) + whole[:3], (frame * Rotation.from_euler("z", turn)).as_quat()])
+
+
 def sliding_motions(rng, drift):
     """Return cases of patches, one of which turns by up to 170 degrees about z and moves along it, and end poses."""
     cases, ends = [], []
     for k in range(COUNT):
         models, whole = [random_patch(rng) for _ in range(2)], random_poses(rng, 1, 1.0)[0]
-        turn, rise, met = np.deg2rad(rng.uniform(5, 170)), rng.normal(scale=0.3), rng.uniform(-0.1, 1.1)
-        frame = Rotation.from_quat(whole[3:])
-
-        def pose_of(part, across=0.0):
-            place = frame.apply([across * drift, 0, (part - met) * rise]) + whole[:3]
-            return np.concatenate([place, (frame * Rotation.from_euler("z", (part - met) * turn)).as_quat()])
-
-        rest, moves = (whole, whole), (pose_of(0), pose_of(1, 1.0))
-        first, second = (rest, moves) if k % 2 else (moves, rest)
+        turn, rise, met = np.deg2rad(rng.uniform(5, 170)), rng.normal(), rng.uniform(-0.1, 1.1)
+        moves = [pose_on_screw(whole, (t - met) * turn, [t * drift, 0, (t - met) * rise]) for t in (0, 1)]
+        first, second = ((whole, whole), moves) if k % 2 else (moves, (whole, whole))
         cases.append([models[0], models[0].lod_max, first[0], models[1], models[1].lod_max, second[0]])
         ends += [first[1], second[1]]
     return cases, np.array(ends)
@@ -45,7 +45,7 @@ def check(device, drift, seed):
     result = find(device, cases, ends)
     scene, pairs = scene_of(device, cases), pairs_of(cases)
     starts = np.array([pose for case in cases for pose in (case[2], case[5])])
-    assert not result.undecided.any() and 40 < result.clear.sum() < COUNT - 40
+    assert not result.undecided.any() and 30 < result.clear.sum() < COUNT - 30
     for part in np.linspace(0, 1, TIMES):
         times = np.repeat(part * result.time, 2)
         scene.set_poses(np.array([pose_between(*row) for row in zip(starts, ends, times)]))
@@ -55,8 +55,8 @@ def check(device, drift, seed):
 
 def test_patches_on_a_screw_are_never_late(device):
     result = check(device, 0.0, 1)
-    # Half of what is clear needs no face: it is dropped for all of the motion.
-    assert (result.triangle_tests[result.clear] == 0).mean() > 0.5
+    # Much of what is clear needs no face: it is dropped for all of the motion.
+    assert (result.triangle_tests[result.clear] == 0).mean() > 0.3
 
 
 def test_patches_that_drift_across_the_axis_are_never_late(device):
