@@ -25,10 +25,11 @@ from . import tables
 
 CASES = (
     *("assembly", "baselines", "budget", "build", "coarse", "distance", "exact", "frame"),
-    *("host", "motion", "query", "scale", "sweep", "update"),
+    *("host", "motion", "query", "robot", "scale", "sweep", "update"),
 )
 STUDIES = {"paper": "study", "tradeoff": "study", "nightly": "nightly"}  # and the modules that run them
 MODULES = {name: f"bench.cases.{name}" for name in CASES} | {"motion": "bench.motions.case"}
+MODULES["robot"] = "bench.motions.robot"
 MODULES |= {name: f"bench.studies.{module}" for name, module in STUDIES.items()}
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml
 # A case, and a study, takes the options that its function `run` has as arguments.

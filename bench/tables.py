@@ -198,12 +198,24 @@ def draw_panel(axes, panel, lines):
         style = {"color": COLOURS[colour % len(COLOURS)], "linestyle": DASHES[turn % len(DASHES)]}
         style["marker"] = MARKERS[max(turn, colour) % len(MARKERS)] if panel.get("markers", True) else ""
         axes.plot(x, y, label=label, **style)
+    if panel.get("xscale", "log") == "log":
+        label_ticks(axes.xaxis, [x for points in lines.values() for x, _ in points])
     axes.set(title=panel.get("title", ""), xlabel=panel["xlabel"], ylabel=panel["ylabel"])
     if "least" in panel:  # no error is negative
         axes.set_ylim(bottom=-0.3 * panel["least"])
     axes.grid(True, alpha=0.3)
     if panel.get("legend", True):
-        axes.legend(fontsize=8, framealpha=0.9)
+        axes.legend(fontsize=8, framealpha=0.6)
+
+
+def label_ticks(axis, values):
+    """Label a logarithmic axis so that no two labels overlap, whatever it spans."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    axis.set_minor_formatter(NullFormatter())
+    if max(values) < 100 * min(values):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter("{x:g}")
 
 
 def main(files) -> int:

@@ -1,5 +1,6 @@
-"""python docs/figures.py: draw the pictures of concepts.md anew, from the library itself."""
+"""python docs/figures.py: draw the pictures of concepts.md and of the guides anew, from the library itself."""
 
+import runpy
 from pathlib import Path
 
 import matplotlib
@@ -11,10 +12,14 @@ from matplotlib.lines import Line2D
 import warp_abtree as ab
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.pictures.render import Panel, draw
+from warp_abtree.app.pictures.scenes import make_panel
+from warp_abtree.app.render_data import Settings, Snapshot, compose
 from warp_abtree.app.styles import COLOURS
 
 FOLDER = Path(__file__).parent
+SAMPLES = FOLDER.parent / "scenes"
 INK, PALE, BLUE, RED = "#33373d", "#d5d8dc", "#3b76c4", "#d4472f"
+RED_LINE = (0.83, 0.1, 0.1)
 
 # The same file each time it is drawn.
 matplotlib.rcParams.update({"svg.hashsalt": "warp_abtree", "font.size": 9, "svg.fonttype": "none"})
@@ -181,10 +186,99 @@ def draw_traversal():
     draw(panels, FOLDER / "concept_traversal.png", title, legend, eye, up, 380)
 
 
+# The guides: what their samples compute.
+
+
+def panel_of(scene, title, poses, lods=None, objects=None, query=True):
+    """Return a picture of a scene's objects (all), intersecting faces coloured if a query is made."""
+    lods = scene.lods if lods is None else np.asarray(lods, np.int32)
+    objects = np.arange(scene.object_count) if objects is None else np.asarray(objects)
+    scene.set_poses(poses)
+    scene.set_lods(lods)
+    pairs = scene.broad_phase() if query else np.empty((0, 2), np.int32)
+    cache, found = geometry.MeshCache(scene), scene.intersect(pairs, output="faces")
+    snapshot = Snapshot(0, 0.0, np.asarray(poses, np.float64), lods, found, None)
+    panel = make_panel(cache, compose(cache, snapshot, objects, Settings(intersecting=query)))
+    panel.title = title
+    return panel
+
+
+def run_sample(name):
+    """Run a sample of scenes/; return what its names stand for."""
+    return runpy.run_path(str(SAMPLES / f"{name}.py"))
+
+
+def draw_which_pairs():
+    sample = run_sample("01_which_pairs")
+    half = 0.5**0.5
+    poses = [(0, 0, 0, 0, 0, 0, 1), (1.0, 0, 0, half, 0, 0, half), (0, 0, 0, 0, 0, 0, 1)]
+    panel = panel_of(sample["scene"], "", poses)
+    legend = [(COLOURS[0][0], "rings"), (COLOURS[1][0], "pipe")]
+    legend += [(COLOURS[k][1], "faces that intersect") for k in (0, 1)]
+    counts = sample["result"].count.tolist()
+    title = f"Three pairs: {counts[0]}, {counts[1]} and {counts[2]} face pairs intersect"
+    draw([panel], FOLDER / "sample_which_pairs.png", title, legend, (0.6, -1, 0.5), (0, 0, 1), 560)
+
+
+def draw_how_far():
+    sample = run_sample("02_how_far")
+    where = [(0, 0, 0), (0.1, 0, 0), (2.2, 0, 0.4), (0, -1.2, 0.55)]
+    panel = panel_of(sample["scene"], "", [(*point, 0, 0, 0, 1) for point in where])
+    points = sample["result"].points
+    panel.lines = [(points, RED_LINE)]
+    distances = ", ".join(f"{distance:.2f}" for distance in sample["result"].distance)
+    legend = [(COLOURS[0][0], "ring"), (COLOURS[1][0], "balls"), (RED_LINE, "from nearest point to nearest point")]
+    title = f"Signed distances {distances}"
+    draw([panel], FOLDER / "sample_how_far.png", title, legend, (0.5, -0.9, 0.9), (0, 0, 1), 560)
+
+
+def draw_when():
+    sample = run_sample("03_when")
+    starts, ends, time = sample["starts"], sample["ends"], sample["result"].time
+    panels = []
+    for part, title in ((0.0, "time 0"), (time[1], f"time {time[1]:.3f}: contact"), (1.0, "time 1")):
+        poses = np.array(starts)
+        poses[1, :3] += part * (ends - starts)[1, :3]
+        poses[2, :3] += min(part, time[1]) * (ends - starts)[2, :3]
+        panels.append(panel_of(sample["scene"], title, poses, query=False))
+    legend = [(COLOURS[0][0], "ring"), (COLOURS[1][0], "balls; one stops where it touches, one is through")]
+    draw(panels, FOLDER / "sample_when.png", "First contacts", legend, (0.5, -1, 0.45), (0, 0, 1), 330)
+
+
+def draw_which_lod():
+    sample = run_sample("04_which_lod")
+    model, half = sample["model"], 0.5**0.5
+    poses = [(0, 0, 0, 0, 0, 0, 1), (0.5, 0, 0, half, 0, 0, half)]
+    panels = []
+    for lod, result in zip(sample["lods"], sample["results"]):
+        faces, error = len(model.mesh_at(lod)[1]), model.error_at(lod)
+        title = f"LOD {lod:,}: {faces:,} faces\nerror {error:.2g}, {result.count[0]} face pairs"
+        panels.append(panel_of(sample["scene"], title, poses, [lod, lod]))
+    legend = [(COLOURS[0][0], "rings"), (COLOURS[0][1], "faces that intersect")]
+    draw(panels, FOLDER / "sample_which_lod.png", "One query at four LODs", legend, (0.4, -1, 0.7), (0, 0, 1), 300)
+
+
+def draw_simulator():
+    sample = run_sample("05_in_a_simulator")
+    scene, rings = sample["scene"], sample["rings"]
+    panels = []
+    for world in range(3):
+        objects = [0, *range(1 + world * rings, 1 + (world + 1) * rings)]
+        panels.append(panel_of(scene, f"world {world}", sample["poses"], objects=objects, query=False))
+    title = f"After 150 steps, three of {sample['worlds']} worlds"
+    legend = [(COLOURS[0][0], "peg and plate, in every world"), (COLOURS[1][0], "rings")]
+    draw(panels, FOLDER / "sample_in_a_simulator.png", title, legend, (0.5, -1, 0.5), (0, 0, 1), 330)
+
+
 def main():
     draw_lods()
     draw_trees()
     draw_traversal()
+    draw_which_pairs()
+    draw_how_far()
+    draw_when()
+    draw_which_lod()
+    draw_simulator()
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ BLOCK = re.compile(r"(?:<!-- needs: ([\w, ]+) -->\n)?^```(\w+)\n(.*?)^```", re.S
 # What a page does at full size, at one that tests can bear.
 SMALLER = {
     "docs/howto_lod.md": (("objects=60", "objects=12"), ("range(120)", "range(66)")),
-    "docs/howto_planning.md": (("100_000", "3_000"),),
+    "docs/howto_pairs.md": (("100_000", "3_000"),),
 }
 
 
@@ -104,6 +104,14 @@ def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)\s]+)\)", text):
         if not target.startswith(("http", "#")):
             assert (page.parent / target.split("#")[0]).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_files_that_are_named_exist(page):
+    """Of the checkout; `warp_abtree/scenes` and kernels stand there in what is installed."""
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:bench|docs|kernels|scenes|tests|warp_abtree)/[\w./]+)`", text):
+        assert (ROOT / name).exists() or name in ("warp_abtree/kernels", "warp_abtree/scenes"), name
 
 
 def test_blocks_are_found_and_told_apart():
@@ -229,6 +237,35 @@ def test_hints_name_packages_that_there_are():
 def test_benchmarks_exist():
     named = {name for page in PAGES for name in re.findall(r"python -m bench (\w+)", page.read_text(encoding="utf-8"))}
     assert len(named) > 10 and named <= {*bench.CASES, *bench.STUDIES}
+
+
+SAMPLES = sorted((ROOT / "scenes").glob("[0-9]*.py"))
+
+
+@pytest.mark.parametrize("path", SAMPLES, ids=lambda path: path.stem)
+def test_samples_run_and_stand_in_their_pages(path):
+    """A sample is short, prints, and is the first block of the page that it names, which shows its picture."""
+    text = path.read_text(encoding="utf-8")
+    lines, (page,) = text.splitlines(), re.findall(r"docs/\w+\.md", text)
+    assert len(lines) <= 40 and f"python scenes/{path.name}" in lines[0]
+    assert blocks_of(ROOT / page, "python")[0] == ([], text.split("\n\n", 1)[1])
+    picture = f"sample_{path.stem.split('_', 1)[1]}.png"
+    assert f"]({picture})" in (ROOT / page).read_text(encoding="utf-8")
+    assert (ROOT / "docs" / picture).stat().st_size < 150_000
+    shown = io.StringIO()
+    with contextlib.redirect_stdout(shown):
+        runpy.run_path(str(path))
+    assert shown.getvalue()
+
+
+def test_samples_are_numbered_in_the_order_of_the_site():
+    names = [re.search(r"docs/(\w+\.md)", path.read_text(encoding="utf-8"))[1] for path in SAMPLES]
+    site = re.findall(r"- (howto_\w+\.md)", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+    assert len(names) >= 5 and [name for name in site if name in names] == names
+
+
+def test_readme_fits_a_screen_or_two():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 90
 
 
 def test_readme_has_one_line_for_the_run_and_one_for_the_tests():

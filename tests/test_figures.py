@@ -1,4 +1,4 @@
-"""The pictures of docs/concepts.md: the script draws them, and the numbers in those of the repository still hold."""
+"""The pictures of concepts and guides: the script draws them, and the numbers in those of the repository still hold."""
 
 import importlib.util
 import re
@@ -31,10 +31,12 @@ def drawn(tmp_path_factory):
     return figures.FOLDER, titles
 
 
-def test_all_pictures_of_the_page_are_drawn(drawn):
-    named = re.findall(r"\((concept_[\w.]+)\)", (DOCS / "concepts.md").read_text(encoding="utf-8"))
-    assert sorted(named) == sorted(path.name for path in drawn[0].iterdir()) and len(named) == 3
-    assert sorted(named) == sorted(path.name for path in DOCS.glob("concept_*") if path.suffix in (".png", ".svg"))
+def test_all_pictures_of_the_pages_are_drawn(drawn):
+    pages = "".join(path.read_text(encoding="utf-8") for path in DOCS.glob("*.md"))
+    named = re.findall(r"\(((?:concept|sample)_[\w.]+)\)", pages)
+    assert sorted(named) == sorted(path.name for path in drawn[0].iterdir()) and len(named) >= 8
+    kept = [path.name for path in DOCS.iterdir() if path.name.startswith(("concept_", "sample_"))]
+    assert sorted(named) == sorted(kept)
 
 
 def test_a_vector_picture_says_what_the_library_finds(drawn):
@@ -50,3 +52,11 @@ def test_what_pictures_show(drawn):
     assert int(re.search(r"to (\d+) intersecting", title)[1]) > 50 and pairs == sorted(pairs)
     _, *lods = drawn[1]["concept_lods.png"]
     assert "the original" in lods[0] and [("error at most" in lod) for lod in lods] == [False, True, True, True]
+
+
+def test_pictures_of_the_guides_show_what_samples_found(drawn):
+    (title, *_), lods = drawn[1]["sample_which_pairs.png"], drawn[1]["sample_which_lod.png"]
+    free, also, found = map(int, re.findall(r"\d+", title.split(":")[1]))
+    assert free == also == 0 and found > 50
+    assert len(lods) == 5 and all("face pairs" in lod for lod in lods[1:])
+    assert "-0." in drawn[1]["sample_how_far.png"][0], "one ball is inside"

@@ -4,6 +4,7 @@ from warp_abtree.checks.arguments import wrap_array
 from warp_abtree.interop.arrays import PoseInput
 from warp_abtree.interop.collision_manager import CollisionManager
 from warp_abtree.interop.newton import NewtonContacts
+from warp_abtree.interop.robot.robot import Robot
 from warp_abtree.interop.scenes import scene_from_file, scene_from_trimesh, to_trimesh
 from warp_abtree.lod.controllers import Feedback, PaperController, PredictiveController, ToleranceController
 from warp_abtree.lod.view import Camera
@@ -50,6 +51,7 @@ __all__ = [
     "PredictiveController",
     "Query",
     "Result",
+    "Robot",
     "Scene",
     "ToleranceController",
     "scene_from_file",

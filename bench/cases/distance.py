@@ -1,8 +1,9 @@
 """Least distances: real meshes at gaps, a nut free on its bolt, and knots at random poses; python-fcl beside them.
 
 Gaps are fractions of the mesh's size, poses otherwise random. Times are of a pose: of all poses at once, where each
-search starts anew (fresh) or from the faces of the launch before (again), and of one pair alone, launched to the
-result on the host. On the CPU all on one core, beside python-fcl, whose answers must be ours but for rounding.
+search starts anew (fresh) or from the faces of the launch before (again), and of one pair alone, searched anew, by
+launches from Python (one) and as a captured graph (one_graph, on the CPU; on CUDA all are). On the CPU all on one core,
+beside python-fcl, whose answers must be ours but for rounding.
 
 The part `gap` is contacts with a gap: `bench.gap_contacts`. The part `originals` is distances of originals while
 objects stand at coarse LODs: `bench.originals`.
@@ -20,7 +21,7 @@ from .. import gap_contacts, originals
 from ..baselines.fcl import Fcl
 from ..meshes import ModelFolder, knot_model, mesh_file
 from ..shapes import longest_side, place_at_gaps, pose_matrices, random_poses, scene_of_poses
-from ..timing import medians, no_garbage_collection, one_core, time_in_turn
+from ..timing import make_replay, medians, no_garbage_collection, one_core, time_in_turn
 from .assembly import place_nut
 
 FULL = {"poses": 32, "counts": (1, 1024, 65536), "knot": 5000, "repeats": 7}
@@ -88,8 +89,16 @@ def measure(name, models, matrices, device, repeats):
         fresh.forget()
         fresh.launch()
 
-    launches = {"fresh": launch_fresh, "again": query.launch, "one": lambda: (one.forget(), one.launch())}
+    def launch_one():
+        one.forget()
+        one.launch()
+
     with one_core(), testing.regime(cpu_threads=1):
+        # Either comes after a whole batch: what it needs is as far from the core.
+        launches = {"fresh": launch_fresh}
+        if device.is_cpu:
+            launches["one_graph"] = make_replay(launch_one, device, captured=True)
+        launches |= {"again": query.launch, "one": launch_one}
         if device.is_cpu:
             try:
                 fcl = make_fcl(models, matrices, found, row)
@@ -98,9 +107,9 @@ def measure(name, models, matrices, device, repeats):
                 row["fcl_skipped"] = str(error)
         with no_garbage_collection():
             times = medians(time_in_turn(launches, device, repeats, time.thread_time))
-    per = {key: time if key.endswith("one") else time / len(pairs) for key, time in times.items()}
+    per = {key: time if "one" in key else time / len(pairs) for key, time in times.items()}
     row |= {f"{key}_ms": float(f"{value:.4g}") for key, value in per.items()}
-    for key, base in (("fresh", "fcl"), ("again", "fcl"), ("one", "fcl_one")):
+    for key, base in (("fresh", "fcl"), ("again", "fcl"), ("one", "fcl_one"), ("one_graph", "fcl_one")):
         if base in per:
             row[f"{key}_fcl_ratio"] = round(per[base] / per[key], 2)
     return row

@@ -208,6 +208,43 @@ def is_active(models: ModelPool, states: StatePool, state: wp.int32, face: wp.in
     return states.face_corner[states.face_start[state] + face][0] >= 0
 
 
+@wp.func
+def start_pair(
+    p: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    found: Found,
+):
+    """Prepare an object pair, with the last launch's faces as the first bound where both are active."""
+    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
+    pose = pair_poses[p]
+    frame = make_frame(models, states, objects, pose, a, b)
+    bound = found.beyond[p]
+    if bound < DISTANCE_MAX:
+        bound = bound * frame.stretch + (frame.slack + frame.pair_slack)
+    else:
+        bound = wp.float64(wp.inf)
+    faces = found.faces[p]
+    kept = NO_FACES
+    face_a, face_b = wp.int32(faces >> wp.int64(32)), wp.int32(faces & wp.int64(0x7FFFFFFF))
+    if is_active(models, states, objects.state[a], face_a) and is_active(models, states, objects.state[b], face_b):
+        triangles = load_triangles(models, states, pose, face_a, face_b)
+        near = nearest_features(triangles)
+        d = wp.sqrt(near.square) * triangles.size
+        if d <= bound:
+            bound = d
+            kept = pack_item(face_a, face_b)
+            frame.way = wp.vec3(wp.normalize(between_features(triangles, near)))
+    found.frame[p] = frame
+    found.distance[p] = bound
+    found.faces[p] = kept
+    if p < found.upper.shape[0]:
+        found.upper[p] = scaled_up(bound, frame)
+
+
 @wp.kernel
 def start_distance_kernel(
     models: ModelPool,
@@ -219,7 +256,7 @@ def start_distance_kernel(
     found_inout: Found,
     work_out: Work,
 ):
-    """Prepare an object pair a thread, with the last launch's faces as the first bound where both are active.
+    """Prepare an object pair a thread, see `start_pair`.
 
     A unit of work is an object pair; a stale launch is left none.
     """
@@ -234,27 +271,4 @@ def start_distance_kernel(
         work_out.counter[3] = wp.where(stale, NO_UNIT, 0)
     if p >= wp.min(pair_count[0], pairs.shape[0]) or found_inout.launched[0] == STALE:
         return
-    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
-    pose = pair_poses[p]
-    frame = make_frame(models, states, objects, pose, a, b)
-    bound = found_inout.beyond[p]
-    if bound < DISTANCE_MAX:
-        bound = bound * frame.stretch + (frame.slack + frame.pair_slack)
-    else:
-        bound = wp.float64(wp.inf)
-    faces = found_inout.faces[p]
-    kept = NO_FACES
-    face_a, face_b = wp.int32(faces >> wp.int64(32)), wp.int32(faces & wp.int64(0x7FFFFFFF))
-    if is_active(models, states, objects.state[a], face_a) and is_active(models, states, objects.state[b], face_b):
-        triangles = load_triangles(models, states, pose, face_a, face_b)
-        near = nearest_features(triangles)
-        d = wp.sqrt(near.square) * triangles.size
-        if d <= bound:
-            bound = d
-            kept = pack_item(face_a, face_b)
-            frame.way = wp.vec3(wp.normalize(between_features(triangles, near)))
-    found_inout.frame[p] = frame
-    found_inout.distance[p] = bound
-    found_inout.faces[p] = kept
-    if p < found_inout.upper.shape[0]:
-        found_inout.upper[p] = scaled_up(bound, frame)
+    start_pair(p, models, states, objects, pairs, pair_poses, found_inout)

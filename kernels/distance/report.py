@@ -57,6 +57,49 @@ def blend_corners(models: ModelPool, corner: wp.vec4i, weights: wp.vec3d):
     return x + weights[2] * load_vertex(models.vertex_pos, corner[2])
 
 
+@wp.func
+def report_pair(
+    p: wp.int32,
+    tolerances: Tolerances,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    found: Found,
+    hits: Hits,
+    distances: Distances,
+):
+    """Report an object pair; of those that intersect, what does not depend on where."""
+    zero = wp.float64(0.0)
+    if hits.any_hit[p] != 0:
+        distances.distance[p] = zero
+        distances.bracket[p] = wp.vec2d(zero, zero)
+        return
+    pose = pair_poses[p]
+    if found.faces[p] == NO_FACES:
+        beyond = wp.min(found.beyond[p], DISTANCE_MAX)
+        distances.distance[p] = wp.float64(wp.inf)
+        distances.bracket[p] = wp.vec2d(beyond, wp.float64(wp.inf))
+        write_nearest(p, 0, -1, -1, no_vector(), no_vector(), distances)
+        return
+    frame = found.frame[p]
+    d = found.distance[p]
+    cut = cut_of(frame, tolerances, d)
+    lower = wp.max((cut - slack_of(frame, cut)) / frame.stretch, zero)
+    distances.distance[p] = wp.max(d, LEAST_DISTANCE)
+    distances.bracket[p] = wp.vec2d(lower, wp.max(d * frame.stretch + slack_of(frame, d), LEAST_DISTANCE))
+    face_a, face_b = item_first(found.faces[p]), item_second(found.faces[p])
+    near = nearest_features(load_triangles(models, states, pose, face_a, face_b))
+    weights_a, weights_b = feature_weights(near)
+    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
+    point_a = blend_corners(models, states.face_corner[pose.corner_a + face_a], weights_a)
+    point_b = blend_corners(models, states.face_corner[pose.corner_b + face_b], weights_b)
+    point_a = pose_point(objects.rotation[a], objects.position[a], point_a)
+    point_b = pose_point(objects.rotation[b], objects.position[b], point_b)
+    write_nearest(p, pose.swapped, face_a, face_b, point_a, point_b, distances)
+
+
 @wp.kernel
 def report_distance_kernel(
     tolerances: Tolerances,
@@ -70,34 +113,8 @@ def report_distance_kernel(
     hits: Hits,
     distances_out: Distances,
 ):
-    """Report an object pair a thread; of those that intersect, what does not depend on where."""
+    """Report an object pair a thread, see `report_pair`."""
     p = wp.tid()
     if p >= pair_count[0] or found.launched[0] == STALE:
         return
-    zero = wp.float64(0.0)
-    if hits.any_hit[p] != 0:
-        distances_out.distance[p] = zero
-        distances_out.bracket[p] = wp.vec2d(zero, zero)
-        return
-    pose = pair_poses[p]
-    if found.faces[p] == NO_FACES:
-        beyond = wp.min(found.beyond[p], DISTANCE_MAX)
-        distances_out.distance[p] = wp.float64(wp.inf)
-        distances_out.bracket[p] = wp.vec2d(beyond, wp.float64(wp.inf))
-        write_nearest(p, 0, -1, -1, no_vector(), no_vector(), distances_out)
-        return
-    frame = found.frame[p]
-    d = found.distance[p]
-    cut = cut_of(frame, tolerances, d)
-    lower = wp.max((cut - slack_of(frame, cut)) / frame.stretch, zero)
-    distances_out.distance[p] = wp.max(d, LEAST_DISTANCE)
-    distances_out.bracket[p] = wp.vec2d(lower, wp.max(d * frame.stretch + slack_of(frame, d), LEAST_DISTANCE))
-    face_a, face_b = item_first(found.faces[p]), item_second(found.faces[p])
-    near = nearest_features(load_triangles(models, states, pose, face_a, face_b))
-    weights_a, weights_b = feature_weights(near)
-    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
-    point_a = blend_corners(models, states.face_corner[pose.corner_a + face_a], weights_a)
-    point_b = blend_corners(models, states.face_corner[pose.corner_b + face_b], weights_b)
-    point_a = pose_point(objects.rotation[a], objects.position[a], point_a)
-    point_b = pose_point(objects.rotation[b], objects.position[b], point_b)
-    write_nearest(p, pose.swapped, face_a, face_b, point_a, point_b, distances_out)
+    report_pair(p, tolerances, models, states, objects, pairs, pair_poses, found, hits, distances_out)

@@ -9,7 +9,7 @@ between those that may be the nearest. It is the same answer that warps give on 
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arrays import ModelPool, StatePool
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.distance.frame import (
     NO_FACES,
     Found,
@@ -19,7 +19,9 @@ from warp_abtree.kernels.distance.frame import (
     load_triangles,
     scaled_up,
     spare_of,
+    start_pair,
 )
+from warp_abtree.kernels.distance.report import Distances, report_pair
 from warp_abtree.kernels.distance.slabs import Slabs, has_slabs
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.generation import STALE
@@ -97,44 +99,82 @@ def decide_open(
     return nearest
 
 
-@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
-def search_thread_kernel(
-    tolerances: Tolerances,
+@wp.struct
+class Asked:
+    """The object pairs of a launch, and how near their distances are to be."""
+
+    pair_count: wp.array(dtype=wp.int32)  # shape (1,)
+    pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]
+    pair_poses: wp.array(dtype=PairPose)  # shape [pair]
+    tolerances: Tolerances  # when they are near enough
+
+
+@wp.func
+def search_pair(
+    p: wp.int32,
+    asked: Asked,
     models: ModelPool,
     states: StatePool,
-    pair_count: wp.array(dtype=wp.int32),
-    pair_poses: wp.array(dtype=PairPose),
+    slabs: Slabs,
+    thread: wp.int32,
+    found: Found,
+    hits: Hits,
+    memory: wp.array2d(dtype=wp.float32),
+):
+    """Find the nearest faces of an object pair that does not intersect."""
+    pose = asked.pair_poses[p]
+    frame = found.frame[p]
+    nearest = Nearest()
+    nearest.distance = found.distance[p]
+    nearest.faces = found.faces[p]
+    with_slabs = has_slabs(slabs, p)
+    spare = spare_of(asked.tolerances, frame)
+    open_search(
+        scaled_up(nearest.distance, frame),
+        nearest.faces != NO_FACES,
+        first_item(states, pose),
+        frame.way,
+        thread,
+        memory,
+    )
+    state = wp.vec3i()
+    while state[0] == 0:
+        state = search_nearest(models, states, pose, frame, spare, slabs, with_slabs, thread, memory)
+        nearest = decide_open(models, states, pose, frame, thread, nearest, memory)
+    hits.node_tests[p] += wp.int64(state[1])
+    hits.triangle_tests[p] += wp.int64(state[2])
+    found.distance[p] = nearest.distance
+    found.faces[p] = nearest.faces
+
+
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+def search_thread_kernel(
+    asked: Asked,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
     counter: wp.array(dtype=wp.int32),
     slabs: Slabs,
     found_inout: Found,
     hits_inout: Hits,
+    distances_out: Distances,
     memory_out: wp.array2d(dtype=wp.float32),
 ):
-    """Take one object pair after the other that does not intersect, and search it; CPU only, a thread a core."""
+    """Take one object pair after the other, search those that do not intersect, and report; CPU only, a thread a core.
+
+    One launch for all, since a launch takes the host as long as a seventh of a search.
+    """
     if found_inout.launched[0] == STALE:
         return
-    count = wp.min(pair_count[0], pair_poses.shape[0])
+    pairs, poses = asked.pairs, asked.pair_poses
+    count = wp.min(asked.pair_count[0], poses.shape[0])
     thread = take_thread(counter)
     if thread >= memory_out.shape[0]:
         return
     p = take_unit(counter)
     while p < count:
+        start_pair(p, models, states, objects, pairs, poses, found_inout)
         if hits_inout.any_hit[p] == 0:
-            pose = pair_poses[p]
-            frame = found_inout.frame[p]
-            nearest = Nearest()
-            nearest.distance = found_inout.distance[p]
-            nearest.faces = found_inout.faces[p]
-            with_slabs = has_slabs(slabs, p)
-            spare = spare_of(tolerances, frame)
-            upper, found = scaled_up(nearest.distance, frame), nearest.faces != NO_FACES
-            open_search(upper, found, first_item(states, pose), frame.way, thread, memory_out)
-            state = wp.vec3i()
-            while state[0] == 0:
-                state = search_nearest(models, states, pose, frame, spare, slabs, with_slabs, thread, memory_out)
-                nearest = decide_open(models, states, pose, frame, thread, nearest, memory_out)
-            hits_inout.node_tests[p] += wp.int64(state[1])
-            hits_inout.triangle_tests[p] += wp.int64(state[2])
-            found_inout.distance[p] = nearest.distance
-            found_inout.faces[p] = nearest.faces
+            search_pair(p, asked, models, states, slabs, thread, found_inout, hits_inout, memory_out)
+        report_pair(p, asked.tolerances, models, states, objects, pairs, poses, found_inout, hits_inout, distances_out)
         p = take_unit(counter)

@@ -171,10 +171,16 @@ def refresh_slab_kernel(
     pairs: wp.array(dtype=wp.vec2i),
     found: Found,
     slabs_inout: Slabs,
+    counter_out: wp.array(dtype=wp.int32),
 ):
-    """Count what pairs ask for, and make the slabs that pay; CPU only, one thread after the other."""
+    """Count what pairs ask for, and make the slabs that pay; CPU only, one thread after the other.
+
+    Counters of the search start at 0.
+    """
     p = wp.tid()
-    if p >= pair_count[0] or found.launched[0] == STALE:
+    if p < counter_out.shape[0]:
+        counter_out[p] = 0
+    if p >= wp.min(pair_count[0], pairs.shape[0]) or found.launched[0] == STALE:
         return
     own = wp.vec2i(objects.state[pairs[p][0]], objects.state[pairs[p][1]])
     slabs_inout.states[p] = own

@@ -150,14 +150,19 @@ def check_budget(rows):
             assert row["cost_ms"] == pytest.approx(3.5 * row["budget_ms"], abs=0.01)
 
 
+def check_robot(rows):
+    assert [row["output"] for row in rows] == ["any", "distance", "distance", "edges"]
+    assert rows[0]["differ_from_fcl"] == 0 and 0 < rows[0]["meet"] < 1 and rows[-1]["clear"] > 0
+
+
 @pytest.mark.parametrize("name", main.CASES)
 def test_case(name, device, tmp_path, monkeypatch, capsys):
     """Every number is finite, no time or size is negative, and each case's own facts hold."""
     monkeypatch.delenv("ABTREE_MESHES", raising=False)
     monkeypatch.setattr(budget, "QUICK_FRAMES", 63)
     monkeypatch.setattr(budget, "QUICK_OBJECTS", 12)
-    if name == "baselines":
-        pytest.importorskip("fcl")
+    for library in {"baselines": ["fcl"], "robot": ["fcl", "yourdfpy"]}.get(name, []):
+        pytest.importorskip(library)
     file, more = tmp_path / "rows.json", ["--plots", str(tmp_path)] if name in PLOTS else []
     more += ["--processes", "1"] if name == "exact" else []
     assert main.main([name, "--device", device, "--quick", "--json", str(file), *more]) == 0

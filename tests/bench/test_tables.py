@@ -1,6 +1,7 @@
 """Rows as JSON, Markdown and figures; models kept; docs that repeat their data."""
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -35,6 +36,17 @@ def test_figures(tmp_path, monkeypatch):
     assert "ours: slope 1.00" in drawn and "object pairs" in drawn and "faces a mesh" not in drawn
     tables.draw(figures, rows, tmp_path)
     assert (tmp_path / "scale_time.svg").read_text() == drawn, "the same rows, the same file"
+
+
+def test_labels_of_a_logarithmic_axis_do_not_overlap(tmp_path):
+    """As of the times of one mesh, which span a decade or two; labels within it are few and plain."""
+    pytest.importorskip("matplotlib")
+    panel = {"x": "us", "xlabel": "time", "ylabel": "error", "y": {"error": "mean"}}
+    for most, shown in ((90.0, {"10", "20", "50", "100"}), (9000.0, set())):
+        rows = [{"us": us, "error": 1.0} for us in (9.0, most)]
+        tables.draw([{"file": "axis.svg", "panels": [panel]}], rows, tmp_path)
+        words = re.findall(r"<text[^>]*>([^<]*)</text>", (tmp_path / "axis.svg").read_text())
+        assert {word for word in words if word.isdigit()} == shown
 
 
 @pytest.mark.parametrize("file", sorted(DATA.glob("*.json")), ids=lambda path: path.name)

@@ -12,11 +12,13 @@ import warp_abtree as ab
 COUNT, TIMES = 160, 41
 
 
-def random_patch(rng):
-    """Return the model of a flat patch of 4 faces about a point at radius 1 of the z axis, tilted, wide or small."""
+def random_patch(rng, pitch):
+    """Return the model of a flat patch of 4 faces at radius 1 of the z axis, tilted, wide or small; often on a screw."""
     width = rng.choice([0.05, 0.35], 2) * rng.uniform(0.5, 1, 2)
     u, v = (np.stack(np.meshgrid([-1, 0, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 2) * width).T
     tilt = Rotation.from_rotvec([0, rng.uniform(-1, 1), rng.uniform(-0.3, 0.3)])
+    if rng.random() < 0.5:
+        tilt = Rotation.from_rotvec([np.arctan(pitch), 0, 0]) * Rotation.from_rotvec([0, rng.uniform(0.8, 1.7), 0])
     points = tilt.apply(np.stack([0 * u, u, v], 1)) + [rng.uniform(0.95, 1.05), 0, rng.uniform(-0.05, 0.05)]
     return ab.Model.from_arrays(points, [[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]], base_faces=4)
 
@@ -31,8 +33,8 @@ def sliding_motions(rng, drift):
     """Return cases of patches, one of which turns by up to 170 degrees about z and moves along it, and end poses."""
     cases, ends = [], []
     for k in range(COUNT):
-        models, whole = [random_patch(rng) for _ in range(2)], random_poses(rng, 1, 1.0)[0]
         turn, rise, met = np.deg2rad(rng.uniform(5, 170)), rng.normal(), rng.uniform(-0.1, 1.1)
+        models, whole = [random_patch(rng, rise / turn) for _ in range(2)], random_poses(rng, 1, 1.0)[0]
         moves = [pose_on_screw(whole, (t - met) * turn, [t * drift, 0, (t - met) * rise]) for t in (0, 1)]
         first, second = ((whole, whole), moves) if k % 2 else (moves, (whole, whole))
         cases.append([models[0], models[0].lod_max, first[0], models[1], models[1].lod_max, second[0]])

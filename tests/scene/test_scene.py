@@ -134,6 +134,18 @@ def test_a_query_follows_poses_and_lods(device):
     assert hits > 100
 
 
+def test_what_is_printed_says_what_is_held(device):
+    """A user's first `print` of a scene and of a result, and a path in the place of a model."""
+    scene, model = ab.Scene(device), sample("box")
+    for _ in range(2):
+        scene.add(model)
+    assert repr(scene) == f"Scene('{device}', objects=2, models=1)"
+    assert repr(scene.intersect(output="faces")) == "Result(pairs=1, any, faces, count)"
+    assert repr(scene.intersect(device=True)) == "Result(pairs=1, any)"
+    with pytest.raises(TypeError, match="model is a str, not a Model: "):
+        scene.add("part.obj")
+
+
 def test_names_of_a_model_may_repeat(device):
     """Models count by identity: two models of one name are two models."""
     vertices, faces, _ = sample("box").mesh_at(sample("box").lod_max)

@@ -92,7 +92,7 @@ class SweepJob:
     def __init__(self, model_a, model_b, poses, lods=None, output="any", precision="exact", shard=SHARD):
         for model in (model_a, model_b):
             if not isinstance(model, Model):
-                raise TypeError(f"model is a {type(model).__name__}, not a Model")
+                raise TypeError(f"model is a {type(model).__name__}, not a Model: Model.load makes one")
         check_request("faces" if output == "contacts" else output, precision)
         self.models = (model_a, model_b)
         self.output, self.precision = output, precision

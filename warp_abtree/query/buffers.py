@@ -138,7 +138,7 @@ class QueryBuffers:
     def is_asked(self, pairs: np.ndarray, within, gap=None) -> bool:
         """Return whether pairs and distances, checked, None without, are those in place."""
         same = len(pairs) == len(self._given) and pairs.tobytes() == self._given.tobytes()
-        same = same and (within is None or np.array_equal(within, self._within))
+        same = same and (within is None or within is self._within or np.array_equal(within, self._within))
         return same and (gap is None or np.array_equal(gap, self._gap))
 
     @contextmanager

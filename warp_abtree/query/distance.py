@@ -61,19 +61,21 @@ from warp_abtree.query.request import check_request, check_within, refuse_option
 from warp_abtree.query.result import DISTANCES, Found, Result
 from warp_abtree.query.staging import first_rows
 
-# Places among the launches, from their end: of the search, and of what is about pairs that intersect.
-SEARCH, CROSSINGS = -4, (-3, -1)
+# Places among the launches, from their end: of the CPU's search, and of what is about pairs that intersect.
+SEARCH, CROSSINGS = -3, (-2, -1)
 # Pairs that make a further core worth its while, which costs some 50 us.
 PAIRS_A_CORE = 4
+NOT_BEYOND = np.array(np.inf)  # one for all, so that it is known again at once
+NOT_BEYOND.flags.writeable = False
 FIELDS = {"point_faces": "faces"}  # of `report.Distances`, where a result's name is another
 # Pairs from which on warps search each roughly first; fewer leave some idle, and those share the search.
 ROUGH_LEAST = 1024
 
 
 def check_beyond(beyond, pair_count=None) -> np.ndarray:
-    """Return distances that end a search, as `check_within`; infinite for None."""
+    """Return distances that end a search, as `check_within`; `NOT_BEYOND` for None."""
     if beyond is None or (isinstance(beyond, np.ndarray) and beyond.shape == () and beyond == np.inf):
-        return np.array(np.inf)
+        return NOT_BEYOND
     return check_within(beyond, pair_count, "beyond")
 
 
@@ -88,8 +90,9 @@ def check_tolerance(tolerance, name: str, most: float) -> float:
     Raises:
         ValueError: No number from 0 up to below the most.
     """
-    value = to_numpy(tolerance, name)
-    if value.shape != () or value.dtype.kind not in "iuf" or not 0 <= value < most:
+    # Plain numbers, as most are, in a tenth of the time.
+    value = tolerance if type(tolerance) is float else to_numpy(tolerance, name)
+    if np.ndim(value) or not 0 <= value < most:
         raise ValueError(f"{name}: {tolerance!r} is no number of 0 or more, below {most}")
     return float(value)
 
@@ -221,9 +224,10 @@ class DistanceQuery(Query):
             wp.copy(self._found.beyond, rows, count=len(rows))
 
     def _slow_kernels(self, with_distances: bool) -> list:
-        warps = [search.search_warp_kernel, crossing.search_crossing_kernel]
-        kernels = warps if self.uses_warps() else [search_simd.search_thread_kernel, warps[1]]
-        kernels += [crossing.report_crossing_kernel, report.report_distance_kernel, frame.start_distance_kernel]
+        kernels = [search_simd.search_thread_kernel]
+        if self.uses_warps():
+            kernels = [search.search_warp_kernel, report.report_distance_kernel, frame.start_distance_kernel]
+        kernels += [crossing.search_crossing_kernel, crossing.report_crossing_kernel]
         return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._slow_kernels(with_distances)]
 
     def _pair_arrays(self, room: int) -> list:
@@ -308,22 +312,28 @@ class DistanceQuery(Query):
         warps = {"dim": room * lanes, "block_dim": WARP_SIZE, "device": device}
         threads = {"dim": room, "block_dim": WARP_SIZE, "device": device}
         reports = [*posed, found, hits, self.distances]
-        start = {**threads, "dim": max(room, len(self.work.flag))}
-        made = [launch(frame.start_distance_kernel, inputs=[*posed, found, self.work], **start)]
-        if self.uses_warps():
-            inputs = [length, ROUGH_LEAST, self._tolerances, *shared, found, hits, self.work]
-            searching = {**warps, "dim": self._warp_count() * lanes}
-            made.append(launch(search.search_warp_kernel, inputs=inputs, **searching))
-        else:
-            inputs = [models, states, objects, self.pair_count, self.pairs, found, self._slabs]
-            made.append(launch(slabs.refresh_slab_kernel, inputs=inputs, dim=room, device=device))
-            inputs = [self._tolerances, *shared, self.work.counter, self._slabs, found, hits, self._memory]
-            made.append(launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device))
-        return [
-            *made,
+        crossings = [
             launch(crossing.search_crossing_kernel, inputs=[length, *shared, hits, found], **warps),
-            launch(report.report_distance_kernel, inputs=[self._tolerances, *reports], **threads),
             launch(crossing.report_crossing_kernel, inputs=reports, **threads),
+        ]
+        if not self.uses_warps():
+            counter = self.work.counter
+            inputs = [models, states, objects, self.pair_count, self.pairs, found, self._slabs, counter]
+            refresh = launch(slabs.refresh_slab_kernel, inputs=inputs, dim=max(room, len(counter)), device=device)
+            asked = search_simd.Asked()
+            asked.pair_count, asked.pairs, asked.pair_poses = self.pair_count, self.pairs, self.pair_poses
+            asked.tolerances = self._tolerances
+            inputs = [asked, models, states, objects, counter, self._slabs, found, hits]
+            inputs += [self.distances, self._memory]
+            return [refresh, launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device), *crossings]
+        start = {**threads, "dim": max(room, len(self.work.flag))}
+        inputs = [length, ROUGH_LEAST, self._tolerances, *shared, found, hits, self.work]
+        searching = {**warps, "dim": self._warp_count() * lanes}
+        return [
+            launch(frame.start_distance_kernel, inputs=[*posed, found, self.work], **start),
+            launch(search.search_warp_kernel, inputs=inputs, **searching),
+            launch(report.report_distance_kernel, inputs=[self._tolerances, *reports], **threads),
+            *crossings,
         ]
 
     def _make_result(self, found: Found, device: bool, with_rows: bool = True) -> Result:

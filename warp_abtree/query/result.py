@@ -13,6 +13,8 @@ COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
 DISTANCES = ("distance", "bracket", "point_faces")
 # What a `FirstContactQuery` has.
 TIMES = ("time", "clear", "undecided")
+# What a result may have for its pairs; None where it was not asked for.
+ANSWERS = ("pairs", "any", "apart", "faces", "contacts", "pair_contacts", "points", *DISTANCES, *TIMES)
 # Vectors of a contact.
 VECTORS = ("p0", "p1", "normal_a", "normal_b", "normal")
 
@@ -132,12 +134,16 @@ class Result:
     exact_tests: Any
 
     def __init__(self, found: Found, room: tuple, output: str):
-        for name in ("pairs", "any", "apart", "faces", "contacts", "pair_contacts", "points", *DISTANCES, *TIMES):
+        for name in ANSWERS:
             setattr(self, name, getattr(found, name))
         self.count: Any = found.count if output != "any" else None
         for name in COUNTERS:
             setattr(self, name, found.tests[name])
         self._totals, self._room = found.totals, room
+
+    def __repr__(self):
+        held = [name for name in (*ANSWERS[1:], "count") if getattr(self, name) is not None]
+        return f"Result(pairs={len(self.pairs)}, {', '.join(held)})"
 
     def check(self):
         """Raise where anything was lost.

@@ -82,7 +82,7 @@ def check_models(models, count: int) -> list[Model]:
     listed = [models] * count if isinstance(models, Model) or not isinstance(models, list | tuple) else list(models)
     for model in listed:
         if not isinstance(model, Model):
-            raise TypeError(f"model is a {type(model).__name__}, not a Model")
+            raise TypeError(f"model is a {type(model).__name__}, not a Model: Model.load makes one")
     if len(listed) != count:
         raise ValueError(f"models: {len(listed)} given for {count} poses")
     return listed

@@ -43,6 +43,9 @@ class Scene:
         self._host_poses: HostPoses | None = None
         self._queries = KeptQueries(self, self._find_pairs)
 
+    def __repr__(self):
+        return f"Scene({self.device.alias!r}, objects={self.object_count}, models={len(self.models)})"
+
     @property
     def object_count(self) -> int:
         """Objects added so far."""

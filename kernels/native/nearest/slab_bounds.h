@@ -31,13 +31,21 @@ struct SlabBounds {
     // Upper bounds of twice the coordinate of each node along a direction of its own frame, by its box and by its slab.
     lanes tops(const lanes (&w)[3], const lanes& along, const lanes (&normal)[3], const lanes& low, const lanes& high,
                const lanes (&sum)[3], const lanes (&size)[3]) const {
-        lanes top = along * (along > 0.0f ? high : low) * (2.0f * scale), plain = {};
+        // Terms in several sums, short chains: it is latency that takes the time.
+        const lanes wide = 2.0f * scale * (along > 0.0f ? high : low);
+        lanes rest[3], rest_size[3], w_size[3];
         for (int i = 0; i < 3; ++i) {
-            const lanes rest = w[i] - along * normal[i];
-            top += rest * sum[i] + __builtin_elementwise_abs(rest) * size[i];
-            plain += w[i] * sum[i] + __builtin_elementwise_abs(w[i]) * size[i];
+            rest[i] = fuse(-along, normal[i], w[i]);
+            rest_size[i] = __builtin_elementwise_abs(rest[i]);
+            w_size[i] = __builtin_elementwise_abs(w[i]);
         }
+        const lanes top = fuse(along, wide, dot(rest, sum)) + dot(rest_size, size);
+        const lanes plain = dot(w, sum) + dot(w_size, size);
         return top < plain ? top : plain;
+    }
+    static lanes fuse(const lanes& a, const lanes& b, const lanes& c) { return __builtin_elementwise_fma(a, b, c); }
+    static lanes dot(const lanes (&a)[3], const lanes (&b)[3]) {
+        return fuse(a[2], b[2], fuse(a[1], b[1], a[0] * b[0]));
     }
     static lanes square(const lanes& gap) { return gap > 0.0f ? gap * gap : lanes{}; }
 
@@ -64,13 +72,12 @@ struct SlabBounds {
                         const lanes (&apart)[3]) const {
         lanes there[3], towards = {}, along = {};
         for (int i = 0; i < 3; ++i)
-            there[i] = axes[i][0] * slab[0] + axes[i][1] * slab[1] + axes[i][2] * slab[2];
+            there[i] = fuse(axes[i][2], slab[2], fuse(axes[i][1], slab[1], axes[i][0] * slab[0]));
         // Both in A's frame.
         const lanes of_first[3] = {of_a(slab[0]), of_a(slab[1]), of_a(slab[2])};
         const lanes of_second[3] = {of_b(there[0]), of_b(there[1]), of_b(there[2])};
         lanes bound = {};
-        for (int i = 0; i < 3; ++i)
-            along += of_first[i] * of_second[i];
+        along = dot(of_first, of_second);
         for (int k = 0; k < 2; ++k) {
             // The other's reach along a node's normal, which is turned away from the other.
             lanes w[3], normal[3], middle[3], half[3], step = {};
@@ -79,7 +86,7 @@ struct SlabBounds {
                 normal[i] = k == 0 ? of_b(slab[i]) : of_a(slab[i]);
                 middle[i] = k == 0 ? of_b(sum[i]) : of_a(sum[i]);
                 half[i] = k == 0 ? of_b(size[i]) : of_a(size[i]);
-                step += apart[i] * (k == 0 ? of_first[i] : -of_second[i]);
+                step = fuse(apart[i], k == 0 ? of_first[i] : -of_second[i], step);
             }
             const lanes sign = step > 0.0f ? lanes{} + 1.0f : lanes{} - 1.0f;
             const lanes own_low = k == 0 ? of_a(slab[3]) : of_b(slab[3]),
@@ -88,11 +95,11 @@ struct SlabBounds {
             lanes shifted = {};
             for (int i = 0; i < 3; ++i) {
                 w[i] = sign * w[i];
-                shifted += sign * (k == 0 ? of_a(slab[i]) * shift[i][15] : of_b(slab[i]) * shift[i][0]);
+                shifted = fuse(k == 0 ? of_first[i] : of_b(slab[i]), lanes{} + shift[i][k == 0 ? 15 : 0], shifted);
             }
             const lanes top = tops(w, sign * along, normal, low, high, middle, half);
             const lanes own = (sign > 0.0f ? own_low : -own_high) * (2.0f * scale);
-            const lanes gap = square(own - top - shifted - margin);
+            const lanes gap = square(own - top - sign * shifted - margin);
             bound = bound > gap ? bound : gap;
         }
         return bound;

@@ -1,0 +1,181 @@
+"""The pairs of a robot's parts, and of parts and what surrounds them, that may meet or come near: by boxes.
+
+A configuration is asked part by part, and no more once it is decided. Edges of a planner ask how far the points of a
+part are from where they stand at the middle of a stretch of the edge. To get from there to any other configuration of
+the stretch, let the joints turn one by one, the outermost first: the joints that a joint hangs on still stand as in the
+middle, and so does its axis. A turn by an angle moves a point by no more than the angle times its distance from the
+axis, which is that of the part in the middle and what outer joints have moved the point by:
+
+    reach = 0;  from the part inwards:  reach += angle (distance of the part's farthest point + reach)
+
+The joints that both parts of a pair hang on move them as one and do not count.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.robot.forward import PRISMATIC, REVOLUTE, Chain, Frames
+from warp_abtree.kernels.traversal.boxes import round_down, round_up
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+ANY, WITHIN, DISTANCE = wp.constant(0), wp.constant(1), wp.constant(2)
+
+# Of a reach, where fixed transforms are rigid within 1e-12; and of poses: a frame turns what hangs on it by some 50 u
+# too much, u = 2^-53, and these add up along the way.
+REACH_ROUNDING = wp.constant(wp.float64(1.0 + 2.0**-30))
+FRAME_ROUNDING = wp.constant(wp.float64(2.0**-45))
+# Nothing of a size that models may have is farther away.
+FARTHEST = wp.constant(wp.float64(2.0**120))
+# Of a part's size: whose boxes are nearer than so large a reach are taken as near.
+HOPELESS = wp.constant(wp.float64(0.4))
+# Of the values of joints.
+VALUE_ROUNDING = wp.constant(wp.float64(2.0**-48))
+
+
+@wp.struct
+class Parts:
+    """Parts of a robot, and which of them are tested against one another or their surroundings."""
+
+    frame: wp.array(dtype=wp.int32)  # that it moves with, shape [part]
+    depth: wp.array(dtype=wp.int32)  # frames that it hangs on, shape [part]
+    middle: wp.array(dtype=wp.vec3d)  # of a sphere around its vertices, in its frame [robot units], shape [part]
+    radius: wp.array(dtype=wp.float64)  # of the sphere [robot units], shape [part]
+    first: wp.array(dtype=wp.int32)  # part, shape [entry]
+    second: wp.array(dtype=wp.int32)  # other part, -1 for the surroundings, shape [entry]
+    shared: wp.array(dtype=wp.int32)  # last frame that both parts hang on, -1 for none, shape [entry]
+    meets: wp.array(dtype=wp.uint8)  # whether an object of the surroundings may meet the robot, shape [object]
+
+
+@wp.struct
+class Chunk:
+    """Configurations that are asked at a time, and what is known of them."""
+
+    count: wp.array(dtype=wp.int32)  # of configurations, shape [1]
+    half: wp.array2d(dtype=wp.float64)  # what joint values may differ by, shape [configuration, column]; of WITHIN
+    size: wp.array2d(dtype=wp.float64)  # greatest magnitude of joint values, shape [configuration, column]; of WITHIN
+    hit: wp.array(dtype=wp.uint8)  # whether it is decided that parts intersect, shape [configuration]
+    near: wp.array(dtype=wp.uint8)  # whether some are not proved farther apart, shape [configuration]; of WITHIN
+    best: wp.array(dtype=wp.float64)  # least distance so far [robot units], shape [configuration]; of DISTANCE
+
+
+@wp.func
+def part_reach(chain: Chain, frames: Frames, parts: Parts, chunk: Chunk, i: wp.int32, part: wp.int32, shared: wp.int32):
+    """Return how far any point of a part may be from where it stands, seen from a frame that it hangs on."""
+    f = parts.frame[part]
+    radius = parts.radius[part]
+    point = frames.rotation[i, f] * parts.middle[part] + frames.position[i, f]
+    reach = wp.float64(0.0)
+    size = wp.length(point) + radius
+    while f > shared:
+        size = wp.max(size, wp.length(frames.position[i, f]))
+        kind = chain.kind[f]
+        column = chain.column[f]
+        if column >= 0:
+            scale = wp.abs(chain.scale[f])
+            rounding = (scale * chunk.size[i, column] + wp.abs(chain.offset[f])) + wp.float64(1.0)
+            value = scale * chunk.half[i, column] + VALUE_ROUNDING * rounding
+            if kind == REVOLUTE:
+                axis = frames.rotation[i, f] * chain.axis[f]
+                far = wp.length(wp.cross(axis, point - frames.position[i, f])) + radius
+                reach += value * (far + reach)
+            elif kind == PRISMATIC:
+                reach += value
+        f = chain.parent[f]
+    depth = wp.float64(parts.depth[part])
+    return reach * REACH_ROUNDING + FRAME_ROUNDING * (depth * depth) * size
+
+
+@wp.func
+def pair_reach(mode: wp.int32, chain: Chain, frames: Frames, parts: Parts, chunk: Chunk, i: wp.int32, entry: wp.int32):
+    """Return up to what distance the parts of an entry matter at a configuration [robot units]."""
+    if mode == ANY:
+        return wp.float64(0.0)
+    if mode == DISTANCE:
+        return chunk.best[i]
+    shared, second = parts.shared[entry], parts.second[entry]
+    reach = part_reach(chain, frames, parts, chunk, i, parts.first[entry], shared)
+    if second >= 0:
+        reach += part_reach(chain, frames, parts, chunk, i, second, shared)
+    return reach
+
+
+@wp.func
+def append_pair(
+    first: wp.int32,
+    second: wp.int32,
+    distance: wp.float64,
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    distances: wp.array(dtype=wp.float64),
+):
+    """Append a pair of objects; the count goes on past the capacity."""
+    slot = wp.atomic_add(pair_count, 0, 1)
+    if slot >= 0 and slot < pairs.shape[0]:
+        pairs[slot] = wp.vec2i(first, second)
+        if slot < distances.shape[0]:
+            distances[slot] = distance
+
+
+@wp.func
+def boxes_meet(lower: wp.vec3, upper: wp.vec3, low: wp.vec3, high: wp.vec3):
+    meet = bool(True)
+    for k in range(3):
+        meet = meet and lower[k] <= high[k] and low[k] <= upper[k]
+    return meet
+
+
+@wp.kernel
+def find_link_pair_kernel(
+    # static
+    mode: wp.int32,
+    stage: wp.vec2i,
+    around: wp.int32,
+    bvh: wp.uint64,
+    chain: Chain,
+    parts: Parts,
+    # state
+    frames: Frames,
+    lower: wp.array(dtype=wp.vec3),
+    upper: wp.array(dtype=wp.vec3),
+    chunk_inout: Chunk,
+    pair_count_inout: wp.array(dtype=wp.int32),
+    pairs_out: wp.array(dtype=wp.vec2i),
+    distances_out: wp.array(dtype=wp.float64),
+):
+    """Find the pairs of a stage whose boxes are near enough, a configuration a thread that is not decided yet.
+
+    Args:
+        stage: First entry of `Parts`, and the one behind the last.
+        around: Objects of the surroundings, which come before those of parts.
+        bvh: Of their boxes.
+        distances_out: Up to what distance each pair matters [robot units]; [0] where that is 0.
+    """
+    i = wp.tid()
+    if i >= chunk_inout.count[0] or chunk_inout.hit[i] != wp.uint8(0):
+        return
+    base = around + i * parts.frame.shape[0]
+    j = wp.int32(0)
+    for entry in range(stage[0], stage[1]):
+        first, second = base + parts.first[entry], parts.second[entry]
+        reach = pair_reach(mode, chain, frames, parts, chunk_inout, i, entry)
+        wide = wp.float64(reach)
+        if mode == WITHIN and reach > HOPELESS * parts.radius[parts.first[entry]]:
+            reach = wp.float64(0.0)
+        least, most = lower[first], upper[first]
+        if mode != ANY:
+            for k in range(3):
+                least[k] = round_down(wp.max(wp.float64(least[k]) - wide, -FARTHEST))
+                most[k] = round_up(wp.min(wp.float64(most[k]) + wide, FARTHEST))
+        if second < 0:
+            query = wp.bvh_query_aabb(bvh, least, most)
+            while wp.bvh_query_next(query, j):
+                if parts.meets[j] != wp.uint8(0):
+                    if wide > reach:
+                        chunk_inout.near[i] = wp.uint8(1)
+                    append_pair(first, j, reach, pair_count_inout, pairs_out, distances_out)
+        else:
+            j = base + second
+            if boxes_meet(least, most, lower[j], upper[j]):
+                if wide > reach:
+                    chunk_inout.near[i] = wp.uint8(1)
+                append_pair(first, j, reach, pair_count_inout, pairs_out, distances_out)

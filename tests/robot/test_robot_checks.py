@@ -1,0 +1,275 @@
+"""Robots at many configurations against FCL, a scene of posed links, and dense samples of edges."""
+
+from dataclasses import replace
+
+import fcl
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from helpers.robots import described_arm, pose_frames, random_configurations
+
+import warp_abtree as ab
+from warp_abtree.interop.robot import check, robot
+
+STILL = (0, 0, 0, 0, 0, 0, 1)
+RING = ab.Model.load(trimesh.creation.torus(0.45, 0.12, 32, 12))
+ROOF = ab.Model.load(trimesh.creation.box((1.5, 0.1, 0.02)))
+AROUND = [(RING, (0, 0, 0.75, 0, 0, 0, 1)), (ROOF, (0, 0.3, 1.1, 0, 0, 0.6, 0.8))]
+
+
+@pytest.fixture
+def arm(device):
+    return ab.Robot(described_arm(), device, mounted=["base"])
+
+
+def fcl_object(model, matrix=None):
+    vertices, faces = model.mesh_at(model.lod_max)[:2]
+    tree = fcl.BVHModel()
+    tree.beginModel(len(vertices), len(faces))
+    tree.addSubModel(vertices, faces)
+    tree.endModel()
+    return fcl.CollisionObject(
+        tree, fcl.Transform() if matrix is None else fcl.Transform(matrix[:3, :3], matrix[:3, 3])
+    )
+
+
+class AskFcl:
+    """Whether any pair intersects at a configuration, and the least distance, link by link."""
+
+    def __init__(self, arm):
+        self.arm, others = arm, []
+        self.parts = [fcl_object(model) for model in arm.models]
+        for model, pose in AROUND:
+            matrix = trimesh.transformations.quaternion_matrix(np.roll(pose[3:], 1))
+            matrix[:3, 3] = pose[:3]
+            others.append(fcl_object(model, matrix))
+        self.pairs = [(part, other) for k, part in enumerate(self.parts) if k != 0 for other in others]
+        self.pairs += [(self.parts[i], self.parts[j]) for i, j in arm.pairs]
+
+    def __call__(self, row):
+        for part, matrix in zip(self.parts, pose_frames(self.arm.description, row)[self.arm.model_link]):
+            part.setTransform(fcl.Transform(matrix[:3, :3], matrix[:3, 3]))
+        hit = any(fcl.collide(a, b) for a, b in self.pairs)
+        request, result = fcl.DistanceRequest(), fcl.DistanceResult
+        return hit, 0.0 if hit else min(fcl.distance(a, b, request, result()) for a, b in self.pairs)
+
+
+def test_forward_kinematics_is_a_product_of_matrices(arm):
+    rows = random_configurations(300)
+    rows[:5, 0] = np.array([0.0, -1, 1, 2, -2]) * np.pi / 4
+    expected = np.array([pose_frames(arm.description, row) for row in rows])
+    np.testing.assert_allclose(arm.forward(rows).numpy(), expected, atol=1e-13)
+    large = np.array([[1e6, 0, 0, 0], [-1048575.3, 0, 0, 0]])
+    turned = np.array([pose_frames(arm.description, row) for row in large])
+    np.testing.assert_allclose(arm.forward(large, limits=False).numpy(), turned, atol=1e-13)
+
+
+def test_pairs_leave_neighbours_and_excluded_links_out(device):
+    description = described_arm()
+    # A mesh of the flange too, which is rigidly fixed to the forearm.
+    description.parts.append(replace(description.parts[2], link=3))
+    arm = ab.Robot(description, device)
+    names = [arm.link_names[k] for k in arm.model_link]
+    pairs = {frozenset((names[i], names[j])) for i, j in arm.pairs}
+    around = [(link, other) for link in ("fore", "flange") for other in ("upper", "left", "right", "flap")]
+    left_out = {*map(frozenset, around), *map(frozenset, [("base", "upper"), ("fore", "flange"), ("base", "fore")])}
+    assert not pairs & left_out and len(pairs) == len(arm.pairs) == 21 - len(left_out)
+
+
+def test_answers_are_those_of_fcl(arm):
+    rows = random_configurations(300, seed=1)
+    ask_fcl = AskFcl(arm)
+    hit, far = np.array([ask_fcl(row) for row in rows]).T
+    assert 60 < hit.sum() < 240
+    np.testing.assert_array_equal(arm.check(rows, AROUND), hit != 0)
+    found = arm.check(rows, AROUND, output="distance")
+    np.testing.assert_array_equal(found["distance"] == 0, hit != 0)
+    np.testing.assert_allclose(found["distance"], far, atol=1e-6)
+    assert len({tuple(pair) for pair in found["pair"].tolist()}) > 5
+    between = np.linalg.norm(found["points"][:, 0] - found["points"][:, 1], axis=1)
+    np.testing.assert_allclose(between, found["distance"], atol=1e-12)
+
+
+def test_beyond_ends_the_search(arm):
+    rows = random_configurations(100, seed=2)
+    whole, part = (arm.check(rows, AROUND, output="distance", beyond=d) for d in (None, 0.05))
+    near = whole["distance"] <= 0.05
+    assert 5 < near.sum() < 95
+    for name in ("distance", "points", "faces", "pair"):
+        np.testing.assert_array_equal(part[name][near], whole[name][near])
+    assert np.isinf(part["distance"][~near]).all() and (part["pair"][~near] == -1).all()
+
+
+def test_surroundings_are_a_scene_with_bits_lods_and_solids(arm, device):
+    scene = ab.Scene(device)
+    shell = ab.Model.load(trimesh.creation.icosphere(subdivisions=2, radius=0.3))
+    scene.add(RING, AROUND[0][1], lod=RING.lod_for(fraction=0.2))
+    scene.add(shell, (0.4, 0.2, 0.7, 0, 0, 0, 1), solid=True)
+    scene.add(ROOF, AROUND[1][1], collision_group=2, collision_mask=2)
+    rows = random_configurations(60, seed=3)
+
+    def expected():
+        one = ab.Scene(device)
+        one.add_many(arm.models, np.tile(STILL, (len(arm.models), 1)))
+        one.add(RING, STILL, lod=scene.lods[0])
+        one.add(shell, STILL, solid=True)
+        moving = [k for k in range(len(arm.models)) if arm.link_names[arm.model_link[k]] != "base"]
+        pairs = [*arm.pairs.tolist(), *[(k, len(arm.models) + w) for k in moving for w in (0, 1)]]
+        hits = []
+        placed = scene.batch().objects.pool
+        for row in rows:
+            matrices = np.tile(np.eye(4), (len(arm.models) + 2, 1, 1))
+            matrices[:-2] = pose_frames(arm.description, row)[arm.model_link]
+            matrices[-2:, :3, :3], matrices[-2:, :3, 3] = placed.rotation.numpy()[:2], placed.position.numpy()[:2]
+            one.set_poses(matrices)
+            hits.append(one.intersect(pairs).any.any())
+        return np.array(hits)
+
+    first = arm.check(rows, scene)
+    np.testing.assert_array_equal(first, expected())
+    assert not np.array_equal(first, arm.check(rows, [(RING, AROUND[0][1]), (shell, (0.4, 0.2, 0.7, 0, 0, 0, 1))]))
+    scene.set_poses(np.array([[0.2, 0, 0.6, 0, 0, 0, 1], [-0.3, 0, 0.9, 0, 0, 0, 1], AROUND[1][1]]))
+    second = arm.check(rows, scene)
+    np.testing.assert_array_equal(second, expected())
+    assert not np.array_equal(first, second)
+    scene.set_lods([RING.lod_max, shell.lod_max, ROOF.lod_max])
+    np.testing.assert_array_equal(arm.check(rows, scene), expected())
+
+
+def test_chunks_and_small_buffers_change_nothing(arm, monkeypatch):
+    rows = random_configurations(50, seed=4)
+    whole = [arm.check(rows, AROUND, output=output) for output in ("any", "distance")]
+    monkeypatch.setattr(robot, "CHUNKS", {"cpu": (7,), "cuda": (7,)})
+    monkeypatch.setattr(check, "PAIRS_GUESS", 0)
+    for output, expected in zip(("any", "distance"), whole):
+        np.testing.assert_array_equal(arm.check(rows, AROUND, output=output), expected)
+
+
+def test_a_robot_alone_is_asked_about_itself(arm):
+    rows = random_configurations(50, seed=5)
+    alone = arm.check(rows)
+    assert 0 < alone.sum() < 50 and (arm.check(rows, AROUND) >= alone).all()
+    at = rows[np.flatnonzero(alone)[0]]
+    arm.exclude_meeting(at)
+    assert not arm.check(at[None])[0]
+
+
+def test_a_query_is_captured_and_says_when_room_was_short(arm, device, monkeypatch):
+    rows = random_configurations(20, seed=6)
+    expected = arm.check(rows, AROUND)
+    query = arm.query(AROUND, room=20)
+    with pytest.raises(RuntimeError, match="nothing was launched"):
+        query.check()
+    query.launch()
+    query.check()
+    with wp.ScopedCapture(device) as capture:
+        query.launch()
+    query.configurations.assign(rows)
+    wp.capture_launch(capture.graph)
+    query.check()
+    np.testing.assert_array_equal(query.hit.numpy() != 0, expected)
+    monkeypatch.setattr(check, "PAIRS_GUESS", 0)
+    short = arm.query(AROUND, output="distance", room=20)
+    short.configurations.assign(rows)
+    short.launch()
+    with pytest.raises(ab.CapacityError, match="launch again"):
+        short.check()
+    short.launch()
+    short.check()
+    np.testing.assert_array_equal(short.nearest.distance.numpy() == 0, expected)
+
+
+def edges(count, seed, part=0.15):
+    """Return short edges within limits."""
+    starts, others = random_configurations(count, seed=seed), random_configurations(count, seed=seed + 1)
+    return starts, starts + part * (others - starts)
+
+
+def test_edges_are_never_late(arm):
+    starts, ends = edges(40, 7)
+    times = np.linspace(0, 1, 801)
+    sampled = np.array([arm.check(a + times[:, None] * (b - a), AROUND) for a, b in zip(starts, ends)])
+    met = sampled.any(1)
+    first = np.where(met, times[sampled.argmax(1)], np.inf)
+    rows = arm.check_edges(starts, ends, AROUND, tolerance=1e-3)
+    assert 10 < met.sum() < 36 and not rows["undecided"].any()
+    assert (rows["time"] <= np.minimum(first, 1.0)).all()
+    assert not (rows["clear"] & met).any() and rows["clear"].sum() > 5
+    moving = first > 0
+    # No earlier than the tolerance before what a sample may have missed.
+    early = np.minimum(first, 1.0) - rows["time"]
+    assert (early[moving & met] <= 1e-3 + times[1]).all()
+    assert (rows["time"][~moving] == 0).all() and (rows["time"][rows["clear"]] == 1).all()
+
+
+def test_an_edge_passes_through_nothing_thin(device):
+    arm = ab.Robot(described_arm(), device, mounted=["base"])
+    # A blade of no thickness in the way of the bent arm, which turns three times and stands free at most samples.
+    blade = [ab.Model.from_arrays([[0.3, 0, 0.2], [2, 0, 0.2], [2, 0, 3], [0.3, 0, 3]], [[0, 1, 2], [0, 2, 3]])]
+    ends = np.array([[-9.0, 1.4, 0.05, 0], [9.0, 1.4, 0.05, 0]])
+    sampled = arm.check(np.linspace(*ends, 60), blade)
+    assert not sampled[0] and sampled.mean() < 0.3
+    rows = arm.check_edges(ends[:1], ends[1:], blade, tolerance=1e-5)
+    assert not rows["clear"][0] and not rows["undecided"][0]
+    # Within the tolerance of the time there is contact, and before it none at as many more configurations.
+    time = rows["time"][0]
+    at, before = (
+        ends[0] + np.linspace(*span, 500)[:, None] * (ends[1] - ends[0]) for span in ((time, time + 1e-5), (0, time))
+    )
+    assert arm.check(at, blade).any() and not arm.check(before, blade).any()
+
+
+def test_edges_that_slide_are_undecided(arm, monkeypatch):
+    monkeypatch.setattr(check, "STRETCHES_MAX", 64)
+    # The ring turns in its own plane, so near a plate that no stretch is proved free.
+    plate = [(ab.Model.load(trimesh.creation.box((3, 3, 0.02))), (0, 0, 0.36 - 0.01 - 1e-7, 0, 0, 0, 1))]
+    ends = np.array([[0.0, 0, 0.05, 0], [3.0, 0, 0.05, 0]])
+    assert not arm.check(ends, plate).any()
+    row = arm.check_edges(ends[:1], ends[1:], plate)[0]
+    assert row["undecided"] and not row["clear"] and row["time"] == 0
+
+
+@pytest.mark.parametrize(
+    "bad, message",
+    [
+        (np.zeros((3, 3)), r"shape \(3, 3\), not \(c, 4\)"),
+        (np.zeros(4), r"shape \(4,\)"),
+        ([[0, 0, 0, 0], [0, np.nan, 0, 0]], "configuration 1 has nan for joint 'bend'"),
+        ([[0, 0, 0, 0], [0, 3, 0, 0]], "configuration 1 has 3 for joint 'bend', outside -2.8 .. 2.8"),
+        ("x", "configurations"),
+    ],
+)
+def test_bad_configurations_are_refused(arm, bad, message):
+    for call in (arm.check, arm.forward):
+        with pytest.raises(ValueError, match=message):
+            call(bad)
+
+
+def test_bad_options_are_refused(arm, device):
+    rows = np.zeros((1, 4))
+    other = ab.Scene(device)
+    other.add(RING, world=0)
+    other.add(RING, world=1)
+    for call, error, message in (
+        (lambda: arm.check(rows, output="faces"), ValueError, "neither 'any' nor 'distance'"),
+        (lambda: arm.check(rows, beyond=1.0), ValueError, "beyond means nothing"),
+        (lambda: arm.check(rows, [(RING, (0, 0, 0, 0, 0, 0, 2))]), ValueError, "world: pose 0"),
+        (lambda: arm.check(rows, ["ring"]), TypeError, "world: entry 0"),
+        (lambda: arm.check(rows, 3), TypeError, "world: a int"),
+        (lambda: arm.check(rows, other), ValueError, "several worlds"),
+        (lambda: arm.check_edges(rows, rows[:0]), ValueError, "ends: 0 given for 1"),
+        (lambda: arm.check_edges(rows, rows, tolerance=0), ValueError, "tolerance"),
+        (lambda: ab.Robot(described_arm(), device, mounted=["foot"]), ValueError, "no link 'foot'"),
+    ):
+        with pytest.raises(error, match=message):
+            call()
+    assert arm.check(np.empty((0, 4))).shape == (0,) and len(arm.check_edges(rows[:0], rows[:0])) == 0
+    assert arm.check(rows + [0, 3, 0, 0], limits=False).shape == (1,)
+
+
+def test_a_robot_needs_a_mesh(device):
+    empty = described_arm()
+    empty.parts = []
+    with pytest.raises(ValueError, match="no link with a mesh"):
+        ab.Robot(empty, device)

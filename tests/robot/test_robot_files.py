@@ -1,0 +1,164 @@
+"""Robots of URDF and MJCF files: kinematics as yourdfpy and MuJoCo have it, pairs, meshes, and refused files."""
+
+import sys
+
+import numpy as np
+import pytest
+from helpers.robots import MJCF, URDF, random_configurations, write_arm
+
+import warp_abtree as ab
+
+SRDF = '<robot name="arm"><disable_collisions link1="{}" link2="fore" reason="Never"/></robot>'
+
+
+@pytest.fixture
+def urdf(tmp_path):
+    pytest.importorskip("yourdfpy")
+    return write_arm(tmp_path, URDF, "arm.urdf")
+
+
+@pytest.fixture
+def mjcf(tmp_path):
+    pytest.importorskip("mujoco")
+    return write_arm(tmp_path, MJCF, "arm.xml")
+
+
+def asked_pairs(robot):
+    """Return the pairs of names of links that are tested."""
+    names = [robot.link_names[k] for k in robot.model_link]
+    return {frozenset((names[i], names[j])) for i, j in robot.pairs}
+
+
+def pairs_of(*names):
+    return {frozenset(pair.split()) for pair in names}
+
+
+def test_urdf_poses_are_those_of_yourdfpy(urdf, device):
+    import yourdfpy
+
+    arm = ab.Robot.load(urdf, device=device)
+    assert arm.joint_names == ("turn", "bend", "grip")
+    np.testing.assert_array_equal(arm.limits, [[-np.inf, np.inf], [-2.8, 2.8], [0, 0.1]])
+    other = yourdfpy.URDF.load(str(urdf), load_meshes=False)
+    rows = random_configurations(100, arm.limits)
+    for row, poses in zip(rows, arm.forward(rows).numpy()):
+        other.update_cfg(dict(zip(arm.joint_names, row)))
+        expected = [other.get_transform(name) for name in arm.link_names]
+        np.testing.assert_allclose(poses, expected, atol=1e-14)
+
+
+def test_mjcf_poses_are_those_of_mujoco(mjcf, device):
+    import mujoco
+
+    arm = ab.Robot.load(mjcf, device=device)
+    assert arm.joint_names == ("turn", "lean", "bend", "grip")
+    model = mujoco.MjModel.from_xml_path(str(mjcf))
+    data = mujoco.MjData(model)
+    rows = random_configurations(100, arm.limits)
+    for row, poses in zip(rows, arm.forward(rows).numpy()):
+        data.qpos[:] = [*row, -0.04 - row[3]]
+        mujoco.mj_kinematics(model, data)
+        for name, pose in zip(arm.link_names, poses):
+            body = data.body(name)
+            np.testing.assert_allclose(pose[:3, :3], body.xmat.reshape(3, 3), atol=1e-14)
+            np.testing.assert_allclose(pose[:3, 3], body.xpos, atol=1e-14)
+
+
+def test_urdf_meshes_pairs_and_srdf(urdf, tmp_path):
+    arm = ab.Robot.load(urdf, device="cpu")
+    upper = arm.models[1].mesh_at(arm.models[1].lod_max)[0]
+    assert arm.models[1].face_count == 24  # a box, and a box in a file that is scaled and moved
+    np.testing.assert_allclose([upper.min(0), upper.max(0)], [[-0.05, -0.04, 0.05], [0.05, 0.15, 0.55]], atol=1e-12)
+    # The flange is rigidly joined to the forearm, so that fingers are neighbours of this.
+    fingers = pairs_of("base left", "base right", "upper left", "upper right", "left right")
+    assert asked_pairs(arm) == fingers | pairs_of("base fore")
+    assert [arm.link_names[k] for k in ab.Robot.load(urdf, "visual", device="cpu").model_link] == ["upper"]
+    (tmp_path / "arm.srdf").write_text(SRDF.format("base"), encoding="utf-8")
+    assert asked_pairs(ab.Robot.load(urdf, device="cpu", srdf=tmp_path / "arm.srdf")) == fingers
+    neutral = ab.Robot.load(urdf, device="cpu", neutral=[0, 0, 0.0])
+    assert asked_pairs(neutral) == asked_pairs(arm) - pairs_of("left right")
+
+
+def test_mjcf_meshes_and_pairs(mjcf):
+    arm = ab.Robot.load(mjcf, device="cpu")
+    upper = arm.models[1].mesh_at(arm.models[1].lod_max)[0]
+    np.testing.assert_allclose([upper.min(0), upper.max(0)], [[-0.05, -0.04, 0.05], [0.05, 0.15, 0.55]], atol=1e-7)
+    # The left finger has a part of other bits, which meets nothing.
+    names = [arm.link_names[k] for k in arm.model_link]
+    assert names == ["base", "upper", "fore", "left", "left", "right"] and not (arm.pairs == 4).any()
+    assert asked_pairs(arm) == pairs_of("base left", "base right", "upper left", "upper right", "left right")
+    visual = ab.Robot.load(mjcf, "visual", device="cpu")
+    assert visual.models[1].face_count > arm.models[1].face_count
+
+
+def test_files_answer_as_scenes_of_their_links(urdf, device):
+    arm = ab.Robot.load(urdf, device=device)
+    rows = random_configurations(60, arm.limits, seed=2)
+    scene = ab.Scene(device)
+    scene.add_many(arm.models, np.tile(np.eye(4), (len(arm.models), 1, 1)))
+    expected = []
+    for poses in arm.forward(rows).numpy():
+        scene.set_poses(poses[arm.model_link])
+        expected.append(scene.intersect(arm.pairs).any.any())
+    assert 3 < sum(expected) < 57
+    np.testing.assert_array_equal(arm.check(rows), expected)
+
+
+@pytest.mark.parametrize(
+    "before, after, message",
+    [
+        ('type="continuous"', 'type="floating"', "joint 'turn' is floating"),
+        ("package://arm/part.stl", "lost.stl", "link 'upper': no mesh file lost.stl"),
+        ('<mimic joint="grip"', '<mimic joint="gone"', "joint 'follow' mimics 'gone'"),
+        ('<child link="fore"/>', '<child link="hand"/>', "joint 'bend': no link 'hand'"),
+        ('<child link="left"/>', '<child link="fore"/>', "another joint moves link 'fore'"),
+        ('xyz="0 0 2"', 'xyz="0 0 0"', "is no axis"),
+        ('<robot name="arm">', "arm", "not read as URDF"),
+    ],
+)
+def test_bad_urdf_is_refused(urdf, before, after, message):
+    assert before in URDF
+    urdf.write_text(URDF.replace(before, after), encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        ab.Robot.load(urdf, device="cpu")
+
+
+@pytest.mark.parametrize(
+    "before, after, message",
+    [
+        ('axis="0 1 0.2" range="-2.8 2.8"', 'type="ball"', "joint 'bend' is ball"),
+        ('<body name="base">', '<body name="base"><freejoint name="loose"/>', "joint 'loose' is free"),
+        ('type="cylinder" size="0.1 0.1"', 'name="ground" type="plane" size="1 1 1"', "geom 'ground' is a plane"),
+        ('polycoef="-0.04 -1 0 0 0"', 'polycoef="0 -1 1 0 0"', "follows another by a curve"),
+        ('file="part.stl"', 'file="lost.stl"', "lost.stl"),
+    ],
+)
+def test_bad_mjcf_is_refused(mjcf, before, after, message):
+    assert before in MJCF
+    mjcf.write_text(MJCF.replace(before, after), encoding="utf-8")
+    with pytest.raises(ValueError, match=message):
+        ab.Robot.load(mjcf, device="cpu")
+
+
+def test_bad_paths_and_options_are_refused(urdf, tmp_path):
+    (tmp_path / "arm.srdf").write_text(SRDF.format("elbow"), encoding="utf-8")
+    for arguments, message in (
+        ({"path": tmp_path / "none.urdf"}, "none.urdf: no such file"),
+        ({"path": tmp_path / "part.stl"}, "a robot is a .urdf or .xml file"),
+        ({"path": urdf, "geometry": "both"}, "geometry 'both'"),
+        ({"path": urdf, "srdf": tmp_path / "no.srdf"}, "no.srdf: no such file"),
+        ({"path": urdf, "srdf": tmp_path / "arm.srdf"}, "names 'elbow'"),
+        ({"path": urdf, "neutral": [0, 0]}, r"shape \(1, 2\)"),
+        ({"path": urdf, "device": "cuda:9"}, "no device 'cuda:9'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ab.Robot.load(**arguments)
+
+
+@pytest.mark.parametrize("name, library", [("arm.urdf", "yourdfpy"), ("arm.xml", "mujoco")])
+def test_without_the_extra_there_is_one_line(name, library, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(
+        ImportError, match=r"^an? \w+ file needs the extra `robot`: pip install 'warp-abtree\[robot\]'$"
+    ):
+        ab.Robot.load(write_arm(tmp_path, URDF, name))

@@ -1,0 +1,1 @@
+"""Robots of URDF and MJCF files, checked at many configurations."""

@@ -1,0 +1,195 @@
+"""`RobotQuery`: a chunk of configurations as an operator; and edges, halved until each stretch is decided."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.interop.robot.link_query import Asked, LinkDistances, LinkHits
+from warp_abtree.interop.robot.surroundings import RobotBatch
+from warp_abtree.kernels.robot.link_pairs import Parts
+from warp_abtree.query.request import CapacityError
+from warp_abtree.scene.sweep import CONTACT_ROWS
+
+NEAREST_ROWS = np.dtype(
+    [("distance", np.float64), ("points", np.float64, (2, 3)), ("faces", np.int32, 2), ("pair", np.int32, 2)]
+)
+PAIRS_GUESS = 2  # of a configuration and stage
+# Edges whose stretches are halved at a time.
+EDGES_AT_ONCE = 1024
+# Stretches of an edge that are looked at at a time, and how short they may be: what takes more is undecided.
+STRETCHES_MAX, WIDTH_LEAST = 1024, 2.0**-30
+
+
+def ask_about(robot, robots: RobotBatch, room: int) -> Asked:
+    """Return what a chunk's query is about, with parts asked from the outermost inwards."""
+    description, device = robot.description, robot.device
+    frame = [description.links[robot.link_names[k]] for k in robot.model_link]
+    paths = [description.path(f) for f in frame]
+    order = sorted(range(len(frame)), key=lambda k: -len(paths[k]))
+    entries, stages = [], []
+    for k in order:
+        first = len(entries)
+        if robots.count and robot.model_link[k] not in robot.mounted:
+            entries.append((k, -1, -1))
+        for i, j in robot.pairs[robot.pairs[:, 1] == k].tolist():
+            entries.append((j, i, max(set(paths[i]) & set(paths[j]), default=-1)))
+        if len(entries) > first:
+            stages.append((first, len(entries)))
+    parts = Parts()
+    columns = np.array(entries, np.int32).reshape(-1, 3).T
+    parts.first, parts.second, parts.shared = (wp.array(c.copy(), dtype=wp.int32, device=device) for c in columns)
+    parts.meets = wp.array(robots.meets.astype(np.uint8), dtype=wp.uint8, device=device)
+    parts.frame = wp.array(np.array(frame, np.int32), device=device)
+    parts.depth = wp.array(np.array([len(path) for path in paths], np.int32), device=device)
+    middles = np.array([model.centre for model in robot.models])
+    parts.middle = wp.array(middles, dtype=wp.vec3d, device=device)
+    vertices = [model.progressive.vertex_pos[: model.progressive.vertex_count] for model in robot.models]
+    radii = [np.sqrt(((v - m) ** 2).sum(1).max()) * (1 + 2.0**-40) for v, m in zip(vertices, middles)]
+    parts.radius = wp.array(np.array(radii), dtype=wp.float64, device=device)
+    sizes = len(robot.joint_names), len(description.frames), len(frame)
+    return Asked(description.make_chain(device), parts, stages, robots.count, room, *sizes)
+
+
+class RobotQuery:
+    """A fixed number of configurations as an operator: allocates once, launches many times.
+
+    `launch()` only launches, so that a CUDA graph can capture it; `configurations` and the poses of what surrounds the
+    robot, as of the last `take_poses`, are read by each launch. Configurations are taken as they are: those that are
+    not finite meet nothing.
+
+    Attributes:
+        configurations: Device float64 (room, n).
+        hit: Whether parts of each intersect, device uint8 (room,).
+        nearest: Of output "distance", device arrays of `kernels.robot.answers.Nearest`, else None.
+    """
+
+    def __init__(self, robot, around, output: str, room: int):
+        self.device, self.output, self.room = robot.device, output, room
+        self._robots = made = RobotBatch(around, robot.models, room, robot.device)
+        asked = ask_about(robot, made, room)
+        self._around, self._models = made.count, len(robot.models)
+        self._links: Any
+        capacity = max(1, PAIRS_GUESS * room)
+        if output == "distance":
+            self._links = LinkDistances(made.batch, asked, capacity)
+        else:
+            self._links = LinkHits(made.batch, asked, capacity, output == "within")
+        self.nearest = self._links.nearest
+        pairs = self._links.links
+        self.configurations, self._chunk = pairs.configurations, pairs.chunk
+        self.hit = self._chunk.hit
+        self._chunk.count.fill_(room)
+        self.take_poses()
+
+    def is_of(self, around) -> bool:
+        """Return whether what surrounds the robot has the objects and LODs of before."""
+        return self._robots.is_of(around)
+
+    def take_poses(self):
+        """Read where what surrounds the robot is now. Launches only."""
+        self._robots.take_poses()
+
+    def launch(self):
+        """Ask all configurations. Launches only."""
+        self._links.launch()
+
+    def check(self):
+        """Raise where the last launch lost anything, after making room for the next. Waits for the device.
+
+        Raises:
+            CapacityError: A buffer overflowed; a graph is to be captured again.
+            RuntimeError: There was no whole launch, see `Query.result`.
+        """
+        self._links.guard.check(self._links.guard.outcome())
+        pairs, uncertain = self._links.demand.numpy().tolist()
+        if self._links.make_room_for(pairs, uncertain):
+            raise CapacityError(f"{pairs} pairs of objects, {uncertain} uncertain ones of faces; launch again")
+
+    def ask(self, rows: wp.array, beyond: float = np.inf) -> np.ndarray:
+        """Return the answers of configurations, device rows (c, n), see `Robot.check`. Waits for the device."""
+        self.take_poses()
+        answers = np.empty(len(rows), bool if self.output == "any" else NEAREST_ROWS)
+        for start in range(0, len(rows), self.room):
+            count = min(self.room, len(rows) - start)
+            if self.output == "distance":
+                self._links.most = beyond
+            self._run(rows[start : start + count])
+            part = answers[start : start + count]
+            if self.output == "any":
+                part[:] = self.hit[:count].numpy() != 0
+                continue
+            for name in ("distance", "points", "faces", "pair"):
+                part[name] = getattr(self.nearest, name)[:count].numpy()
+            self._number(part["pair"])
+        return answers
+
+    def _run(self, rows):
+        self._links.links.active = count = len(rows)
+        self._chunk.count.fill_(count)
+        wp.copy(self.configurations, rows, count=rows.size)
+        self._links.run_stages()
+
+    def _number(self, pairs: np.ndarray):
+        """Number pairs of objects as models of the robot, and what surrounds it after these."""
+        part = (pairs - self._around) % self._models
+        pairs[:] = np.where(pairs < 0, -1, np.where(pairs < self._around, pairs + self._models, part))
+
+    def ask_spread(self, middles, halves, sizes) -> tuple[np.ndarray, np.ndarray]:
+        """Return which configurations meet, and which are not proved apart for all that joint values may differ by.
+
+        Args:
+            middles, halves, sizes: Configurations, what values may differ by, and their greatest magnitude, (c, n).
+        """
+        hit, near = np.empty(len(middles), bool), np.empty(len(middles), bool)
+        for start in range(0, len(middles), self.room):
+            part = slice(start, start + self.room)
+            for target, values in ((self._chunk.half, halves[part]), (self._chunk.size, sizes[part])):
+                wp.copy(target, wp.array(values, dtype=wp.float64, device=self.device), count=values.size)
+            self._run(wp.array(middles[part], dtype=wp.float64, device=self.device))
+            count = len(middles[part])
+            hit[part], near[part] = self.hit[:count].numpy() != 0, self._chunk.near[:count].numpy() != 0
+        return hit, near
+
+
+def check_edges(query: RobotQuery, starts, ends, tolerance: float) -> np.ndarray:
+    """Return the rows of `Robot.check_edges`. Waits for the device, about twice a halving."""
+    query.take_poses()
+    rows = np.empty(len(starts), CONTACT_ROWS)
+    for first in range(0, len(starts), EDGES_AT_ONCE):
+        part = slice(first, first + EDGES_AT_ONCE)
+        rows[part] = _halve(query, starts[part], ends[part], tolerance)
+    return rows
+
+
+def _halve(query: RobotQuery, starts, ends, tolerance) -> np.ndarray:
+    """Halve the stretches of edges until each is proved free, or the first contact is known within the tolerance.
+
+    A stretch k of a level is from k / 2^level to (k + 1) / 2^level, which float64 holds exactly.
+    """
+    count, rows = len(starts), np.zeros(len(starts), CONTACT_ROWS)
+    sizes, motion = np.maximum(np.abs(starts), np.abs(ends)), ends - starts
+    # Ends first: stretches are looked at in their middles alone. `met` is a time at which parts intersect.
+    still = np.zeros_like(motion)
+    met = np.where(query.ask_spread(ends, still, sizes)[0], 1.0, np.inf)
+    met[query.ask_spread(starts, still, sizes)[0]] = 0.0
+    edge, place, width = np.flatnonzero(met > 0.0), np.zeros(np.count_nonzero(met > 0.0)), 1.0
+    first = np.minimum(met, 1.0)  # start of the first stretch that is not proved free
+    while len(edge):
+        middle = (place + 0.5) * width
+        half = 0.5 * width * np.abs(motion[edge]) * (1 + 2.0**-50)
+        hit, near = query.ask_spread(starts[edge] + middle[:, None] * motion[edge], half, sizes[edge])
+        np.minimum.at(met, edge[hit], middle[hit])
+        is_open = (hit | near) & (place * width < met[edge])
+        edge, place = edge[is_open], place[is_open]
+        first = np.minimum(met, 1.0)
+        np.minimum.at(first, edge, place * width)
+        open_count = np.bincount(edge, minlength=count)
+        rows["undecided"] |= (open_count > STRETCHES_MAX) | ((open_count > 0) & (width <= WIDTH_LEAST))
+        done = rows["undecided"] | (met - first <= tolerance)
+        rows["undecided"] &= ~(met - first <= tolerance)
+        edge, place = edge[~done[edge]], place[~done[edge]]
+        edge, place, width = np.repeat(edge, 2), (2 * place[:, None] + [0.0, 1.0]).ravel(), 0.5 * width
+    rows["time"] = first
+    rows["clear"] = ~rows["undecided"] & np.isinf(met)
+    return rows

@@ -1,0 +1,171 @@
+"""What a robot's file says, whatever its format: frames and their joints, links, parts, and pairs never tested."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.kernels.robot import forward
+from warp_abtree.model.mesh import Mesh
+
+KINDS = {"fixed": int(forward.FIXED), "revolute": int(forward.REVOLUTE), "prismatic": int(forward.PRISMATIC)}
+ALL_BITS = 2**32 - 1
+
+
+class RobotError(ValueError):
+    """A robot's file that is missing, unreadable, or holds what is not supported; the message names what and where."""
+
+
+@dataclass
+class Frame:
+    """A frame: its parent's, moved by a fixed transform, then by a joint.
+
+    Attributes:
+        parent: Index of an earlier frame, -1 for none.
+        origin: Fixed transform, float64 (4, 4), rigid [robot units].
+        kind: "fixed", "revolute" or "prismatic".
+        axis: Of the joint, unit, (3,).
+        joint: Name of the joint whose value moves it, None where it is fixed.
+        scale, offset: Value of this joint = scale * that of `joint` + offset.
+    """
+
+    parent: int
+    origin: np.ndarray
+    kind: str = "fixed"
+    axis: tuple = (0.0, 0.0, 1.0)
+    joint: str | None = None
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass
+class Part:
+    """Mesh of a link, in the link's frame, and the bits of MJCF that say which others it meets."""
+
+    link: int
+    mesh: Mesh
+    group: int = 1
+    mask: int = ALL_BITS
+
+
+@dataclass
+class Description:
+    """A robot as its file describes it.
+
+    Attributes:
+        frames: Parents first.
+        joints: Limits (lower, upper) by the name of each joint that a configuration sets, in order [rad or robot
+            units].
+        links: Index of the frame of each link, by its name.
+        parts: Meshes of links; a link has none, one, or several whose bits differ.
+        excluded: Pairs of names of links that the file says are never tested.
+    """
+
+    frames: list[Frame] = field(default_factory=list)
+    joints: dict[str, tuple[float, float]] = field(default_factory=dict)
+    links: dict[str, int] = field(default_factory=dict)
+    parts: list[Part] = field(default_factory=list)
+    excluded: set[frozenset] = field(default_factory=set)
+
+    def bodies(self) -> np.ndarray:
+        """Return the rigid body of each frame, int (frames,): the frame from which on no joint moves it."""
+        body = np.arange(len(self.frames))
+        for f, frame in enumerate(self.frames):
+            if frame.kind == "fixed":
+                body[f] = body[frame.parent] if frame.parent >= 0 else -1
+        return body
+
+    def path(self, f: int) -> list[int]:
+        """Return a frame and those that it hangs on, up to a root."""
+        found = []
+        while f >= 0:
+            found.append(f)
+            f = self.frames[f].parent
+        return found
+
+    def allowed_pairs(self) -> list[tuple[int, int]]:
+        """Return the pairs of parts that are tested: neither rigidly joined nor of links that a joint joins.
+
+        Links without a joint between them are one body; what the file excludes, or its bits forbid, is not tested.
+        """
+        body, names = self.bodies(), list(self.links)
+        frames = [self.links[names[part.link]] for part in self.parts]
+
+        with_links = {-1, *(body[f] for f in self.links.values())}
+
+        def holder(b):  # body that a body's joint hangs on; joints in a row, without links between them, are one
+            parent = self.frames[b].parent
+            while parent >= 0 and body[parent] not in with_links:
+                parent = self.frames[body[parent]].parent
+            return body[parent] if parent >= 0 else -1
+
+        found = []
+        for i, a in enumerate(self.parts):
+            for j in range(i):
+                b = self.parts[j]
+                x, y = body[frames[i]], body[frames[j]]
+                near = x == y or (x >= 0 and holder(x) == y) or (y >= 0 and holder(y) == x)
+                told = frozenset((names[a.link], names[b.link])) in self.excluded
+                if not near and not told and (a.group & b.mask or b.group & a.mask):
+                    found.append((j, i))
+        return found
+
+    def make_chain(self, device) -> forward.Chain:
+        """Return the frames as device arrays."""
+        chain, columns = forward.Chain(), {name: k for k, name in enumerate(self.joints)}
+        frames, origins = self.frames, np.array([frame.origin for frame in self.frames])
+
+        def upload(values, dtype):
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        chain.parent = upload(np.array([frame.parent for frame in frames], np.int32), wp.int32)
+        chain.kind = upload(np.array([KINDS[frame.kind] for frame in frames], np.int32), wp.int32)
+        moved = [-1 if frame.joint is None else columns[frame.joint] for frame in frames]
+        chain.column = upload(np.array(moved, np.int32), wp.int32)
+        chain.scale = upload(np.array([frame.scale for frame in frames]), wp.float64)
+        chain.offset = upload(np.array([frame.offset for frame in frames]), wp.float64)
+        chain.axis = upload(np.array([frame.axis for frame in frames], np.float64), wp.vec3d)
+        chain.rotation = upload(origins[:, :3, :3], wp.mat33d)
+        chain.position = upload(origins[:, :3, 3], wp.vec3d)
+        limits = np.array(list(self.joints.values()), np.float64).reshape(-1, 2)
+        chain.lower, chain.upper = upload(limits[:, 0], wp.float64), upload(limits[:, 1], wp.float64)
+        return chain
+
+
+def unit_axis(axis, what: str) -> tuple:
+    """Return an axis of unit length.
+
+    Raises:
+        RobotError: It has no length, or is not finite.
+    """
+    axis = np.asarray(axis, np.float64)
+    size = np.linalg.norm(axis)
+    if axis.shape != (3,) or not (np.isfinite(size) and size > 1e-12):
+        raise RobotError(f"{what}: {axis.tolist()} is no axis")
+    return tuple(axis / size)
+
+
+def check_rigid(matrix, what: str) -> np.ndarray:
+    """Return a transform as float64 (4, 4), identity for None.
+
+    Raises:
+        RobotError: It is not rigid.
+    """
+    matrix = np.eye(4) if matrix is None else np.asarray(matrix, np.float64)
+    rotation = matrix[:3, :3]
+    fine = np.isfinite(matrix).all() and np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-12
+    if not fine or np.linalg.det(rotation) < 0:
+        raise RobotError(f"{what}: its transform is not rigid")
+    return matrix
+
+
+def join_meshes(placed, name: str) -> Mesh:
+    """Return meshes (vertices, faces, transform) as one, in the frame that they are placed in."""
+    from warp_abtree.model.mesh import mesh_from_arrays
+
+    vertices, faces, count = [], [], 0
+    for corners, triangles, transform in placed:
+        vertices.append(corners @ transform[:3, :3].T + transform[:3, 3])
+        faces.append(np.asarray(triangles) + count)
+        count += len(corners)
+    return mesh_from_arrays(np.concatenate(vertices), np.concatenate(faces), name=name)

@@ -1,0 +1,157 @@
+"""Robots of MJCF files, read and compiled by MuJoCo (extra `robot`)."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from warp_abtree.checks.arguments import first_line
+from warp_abtree.interop.robot.description import Description, Frame, Part, RobotError, join_meshes, unit_axis
+from warp_abtree.interop.robot.urdf import INSTALL
+
+KINDS = {"hinge": "revolute", "slide": "prismatic"}
+VISUAL_GROUPS = 3  # MuJoCo shows geoms of the groups below
+
+
+def read_mjcf(path: Path, geometry: str) -> Description:
+    """Read a robot from an MJCF file; see `Robot.load`."""
+    try:
+        import mujoco
+    except ImportError:
+        raise ImportError(f"an MJCF file {INSTALL}") from None
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except Exception as error:
+        raise RobotError(f"{path}: not read as MJCF ({first_line(error)})") from None
+    description, names = Description(), [model.body(b).name or f"body {b}" for b in range(model.nbody)]
+    values = _joint_values(mujoco, model, path)
+    for j in range(model.njnt):
+        if values[j] == (model.joint(j).name or f"joint {j}", 1.0, 0.0):
+            low, high = model.jnt_range[j].tolist()
+            description.joints[values[j][0]] = (low, high) if model.jnt_limited[j] else (-math.inf, math.inf)
+    for b, name in enumerate(names):
+        if model.body_mocapid[b] >= 0:
+            raise RobotError(f"{path}: body {name!r} is moved by motion capture, not by joints")
+        description.links[name] = _add_body(mujoco, model, b, description, names, values, path)
+    for b in range(model.nbody):
+        _add_parts(mujoco, model, b, description, geometry, f"{path}: body {names[b]!r}")
+    for signature in model.exclude_signature.tolist():
+        description.excluded.add(frozenset((names[signature >> 16], names[signature & 0xFFFF])))
+    return description
+
+
+def _joint_values(mujoco, model, path) -> list[tuple[str, float, float]]:
+    """Return for each joint that which a configuration sets, and scale and offset of what this one makes of it."""
+    names = [model.joint(j).name or f"joint {j}" for j in range(model.njnt)]
+    values, leads = [(name, 1.0, 0.0) for name in names], {}
+    for j, name in enumerate(names):
+        kind = mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()
+        if kind not in KINDS:
+            raise RobotError(f"{path}: joint {name!r} is {kind}; hinge and slide ones are supported")
+    for e in range(model.neq):
+        if int(model.eq_type[e]) != int(mujoco.mjtEq.mjEQ_JOINT) or not model.eq_active0[e]:
+            continue
+        j, k, factors = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e, :5]
+        if factors[2:].any():
+            raise RobotError(f"{path}: joint {names[j]!r} follows another by a curve; linear ones are supported")
+        # y - y0 = a + b (x - x0)
+        scale = float(factors[1]) if k >= 0 else 0.0
+        start = model.qpos0[model.jnt_qposadr[k]] if k >= 0 else 0.0
+        offset = float(model.qpos0[model.jnt_qposadr[j]] + factors[0] - scale * start)
+        leads[j] = (k, scale, offset)
+    for j in leads:
+        scale, offset, at, seen = 1.0, 0.0, j, set()
+        while at in leads and at not in seen:
+            seen.add(at)
+            k, by, more = leads[at]
+            scale, offset, at = scale * by, offset + scale * more, k
+        if at in seen:
+            raise RobotError(f"{path}: joint {names[j]!r} follows itself")
+        values[j] = (names[at] if at >= 0 else "", scale, offset)
+    return values
+
+
+def _pose(position, quaternion) -> np.ndarray:
+    """Return the transform of a position and a quaternion w x y z."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = position
+    return matrix
+
+
+def _add_body(mujoco, model, b, description, names, values, path) -> int:
+    """Add the frames of a body, one for each joint and one more where a joint stands off its origin."""
+    parent = -1 if b == 0 else description.links[names[model.body_parentid[b]]]
+    origin = np.eye(4) if b == 0 else _pose(model.body_pos[b], model.body_quat[b])
+    anchor = np.zeros(3)
+    first = int(model.body_jntadr[b])
+    for j in range(first, first + int(model.body_jntnum[b])):
+        origin = origin @ _shift(model.jnt_pos[j] - anchor)
+        anchor = model.jnt_pos[j]
+        joint, scale, offset = values[j]
+        start = float(model.qpos0[model.jnt_qposadr[j]])
+        kind = KINDS[mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()]
+        axis = unit_axis(model.jnt_axis[j], f"{path}: joint {j}")
+        frame = Frame(parent, origin, kind, axis, joint or None, scale, offset - start)
+        description.frames.append(frame)
+        parent, origin = len(description.frames) - 1, np.eye(4)
+    if anchor.any() or not model.body_jntnum[b]:
+        description.frames.append(Frame(parent, origin @ _shift(-anchor)))
+    return len(description.frames) - 1
+
+
+def _shift(by) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, 3] = by
+    return matrix
+
+
+def _add_parts(mujoco, model, b, description, geometry, where):
+    """Add the meshes of a body, one for all geoms of the same bits."""
+    placed: dict[tuple[int, int], list] = {}
+    for g in range(int(model.body_geomadr[b]), int(model.body_geomadr[b]) + int(model.body_geomnum[b])):
+        bits = int(model.geom_contype[g]), int(model.geom_conaffinity[g])
+        if geometry == "collision" and bits == (0, 0):
+            continue
+        if geometry == "visual":
+            if model.geom_group[g] >= VISUAL_GROUPS:
+                continue
+            bits = 1, 1
+        vertices, faces = _shape(mujoco, model, g, where)
+        placed.setdefault(bits, []).append((vertices, faces, _pose(model.geom_pos[g], model.geom_quat[g])))
+    for (group, mask), shapes in placed.items():
+        name = model.body(b).name or f"body {b}"
+        description.parts.append(Part(b, join_meshes(shapes, name), group, mask))
+
+
+def _shape(mujoco, model, g, where):
+    """Return vertices and faces of a geom, in its own frame."""
+    import trimesh
+
+    kind, size = mujoco.mjtGeom(int(model.geom_type[g])).name[len("mjGEOM_") :].lower(), model.geom_size[g]
+    if kind == "mesh":
+        m = int(model.geom_dataid[g])
+        vertex, face = int(model.mesh_vertadr[m]), int(model.mesh_faceadr[m])
+        vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[m]].astype(np.float64)
+        return vertices, model.mesh_face[face : face + model.mesh_facenum[m]]
+    if kind == "box":
+        made = trimesh.creation.box(2 * size)
+    elif kind in ("sphere", "ellipsoid"):
+        made = trimesh.creation.icosphere(subdivisions=3)
+        made.apply_scale(size[0] if kind == "sphere" else size)
+    elif kind == "cylinder":
+        made = trimesh.creation.cylinder(size[0], 2 * size[1])
+    elif kind == "capsule":
+        made = trimesh.creation.capsule(radius=size[0], height=2 * size[1])
+        made.apply_translation(-made.bounds.mean(0))
+    else:
+        raise RobotError(
+            f"{where}: geom {model.geom(g).name or g!r} is a {kind}, which has no mesh; what surrounds the robot is "
+            "given to Robot.check"
+        )
+    return np.asarray(made.vertices), np.asarray(made.faces)

@@ -1,0 +1,97 @@
+"""What surrounds a robot: the objects of a scene, or models; and the batch of them and of a chunk's robots."""
+
+import numpy as np
+import warp as wp
+
+from warp_abtree.checks.arguments import to_numpy
+from warp_abtree.model.model import Model
+from warp_abtree.scene.poses import check_poses
+from warp_abtree.scene.scene import Scene
+from warp_abtree.state.arrays import ObjectArrays
+from warp_abtree.state.batch import Batch
+
+STILL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def make_surroundings(world, device) -> tuple[Scene | None, tuple]:
+    """Return what surrounds a robot as a scene of a device, None where there is nothing, and what tells it from others.
+
+    Args:
+        world: `Scene`, `Model`, a list of models and pairs (model, pose), or None.
+
+    Raises:
+        TypeError: It is none of these.
+        ValueError: A scene of another device or of several worlds, a bad pose.
+    """
+    if isinstance(world, Scene):
+        if world.device != device:
+            raise ValueError(f"world: a scene on {world.device}, the robot is on {device}")
+        if len(set(world.worlds.tolist()) - {-1}) > 1:
+            raise ValueError("world: a scene of several worlds; a robot is in one")
+        return (world, (id(world),)) if world.object_count else (None, ())
+    listed = [] if world is None else [world] if isinstance(world, Model) else world
+    if not isinstance(listed, list | tuple):
+        raise TypeError(f"world: a {type(world).__name__} is neither a Scene nor models with poses")
+    scene, placed = Scene(device), []
+    for k, entry in enumerate(listed):
+        model, pose = (entry, STILL) if isinstance(entry, Model) else entry if len(entry) == 2 else (None, STILL)
+        if not isinstance(model, Model):
+            raise TypeError(f"world: entry {k} is neither a Model nor a model with a pose")
+        placed.append((model, check_poses(to_numpy(pose, "pose")[None], f"world: pose {k}")[0]))
+    for model, pose in placed:
+        scene.add(model, pose)
+    return (scene if placed else None), tuple((id(model), pose.tobytes()) for model, pose in placed)
+
+
+class RobotBatch:
+    """The batch of what surrounds a robot, at its LODs, and of the parts of a number of robots.
+
+    Args:
+        around: `Scene`, or None.
+        models: Of the parts.
+        room: Robots.
+
+    Attributes:
+        batch: `Batch`; objects of the surroundings come first.
+        count: Objects of the surroundings.
+        meets: Whether the bits of each of these let it meet the robot, whose group is 1, with every bit in its mask,
+            bool (count,).
+    """
+
+    def __init__(self, around: Scene | None, models: list[Model], room: int, device):
+        posed = Scene(device)
+        self.count, solid = 0, np.zeros(0, bool)
+        self._around, self._batch, self._lods = around, None, np.zeros(0)
+        self.meets = np.zeros(0, bool)
+        if around is not None:
+            self.count, self._batch, self._lods = around.object_count, around.batch(), around.lods
+            posed.add_many([around.models[m] for m in around.object_model], [STILL] * self.count, lods=self._lods)
+            solid = np.array(around.object_solid)
+            group, mask = self._batch.objects.collision_bits.numpy().reshape(-1, 2).T
+            self.meets = (group != 0) & ((mask & 1) != 0) if len(group) else np.ones(self.count, bool)
+        posed.add_many(models, [STILL] * len(models))
+        once = posed.batch()
+        chosen = np.concatenate([np.arange(self.count), np.tile(np.arange(self.count, once.object_count), room)])
+        none = np.zeros(len(chosen))
+        objects = ObjectArrays(none, none, device)
+        objects.set_states(once.objects.state[chosen])
+        solids = np.concatenate([solid, np.zeros(len(chosen) - self.count, bool)]) if solid.any() else ()
+        self.batch = Batch(once.models, once.states, objects, once.object_model[chosen], solid=solids)
+
+    def is_of(self, around: Scene | None) -> bool:
+        """Return whether the surroundings still have the same objects at the same LODs."""
+        if around is None or self._around is not around:
+            return True  # of models that were given again
+        return self._batch is around.batch() and np.array_equal(self._lods, around.lods)
+
+    def take_poses(self):
+        """Copy the poses of what surrounds the robot. Launches only.
+
+        Raises:
+            RuntimeError: Objects were added to its scene since.
+        """
+        if self._batch is not None:
+            self._batch.check("robot query")
+            source, target = self._batch.objects.pool, self.batch.objects.pool
+            wp.copy(target.rotation, source.rotation, count=self.count)
+            wp.copy(target.position, source.position, count=self.count)

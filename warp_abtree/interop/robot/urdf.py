@@ -1,0 +1,158 @@
+"""Robots of URDF files, read by yourdfpy (extra `robot`), and pairs that an SRDF file excludes."""
+
+import math
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from warp_abtree.checks.arguments import first_line
+from warp_abtree.interop.robot.description import (
+    Description,
+    Frame,
+    Part,
+    RobotError,
+    check_rigid,
+    join_meshes,
+    unit_axis,
+)
+from warp_abtree.model.mesh import MeshError, load_mesh
+
+KINDS = {"fixed": "fixed", "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+INSTALL = "needs the extra `robot`: pip install 'warp-abtree[robot]'"
+
+
+def read_urdf(path: Path, geometry: str) -> Description:
+    """Read a robot from a URDF file; see `Robot.load`."""
+    try:
+        import yourdfpy
+    except ImportError:
+        raise ImportError(f"a URDF file {INSTALL}") from None
+    try:
+        robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+    except Exception as error:
+        raise RobotError(f"{path}: not read as URDF ({first_line(error)})") from None
+    description, joints = Description(), {joint.child: joint for joint in robot.joints}
+    names = [link.name for link in robot.links]
+    for joint in robot.joints:
+        _check_joint(joint, joints, names, path)
+    for joint in robot.joints:  # in the file's order, as configurations are
+        if joint.type != "fixed" and joint.mimic is None:
+            description.joints[joint.name] = _limits(joint)
+    values = {joint.name: _value_of(joint, robot.joints, path) for joint in robot.joints if joint.type != "fixed"}
+    for name in names:
+        _add_link(name, description, joints, values, path, ())
+
+    def find_file(name):
+        return yourdfpy.urdf.filename_handler_magic(name, dir=str(path.parent))
+
+    # By name: frames come parents first, links as they stand in the file.
+    description.links = {name: description.links[name] for name in names}
+    for k, link in enumerate(robot.links):
+        shapes = link.collisions if geometry == "collision" else link.visuals
+        where = f"{path}: link {link.name!r}"
+        placed = [
+            (*_load_shape(shape.geometry, where, find_file), check_rigid(shape.origin, where)) for shape in shapes
+        ]
+        if placed:
+            description.parts.append(Part(k, join_meshes(placed, link.name)))
+    return description
+
+
+def _check_joint(joint, joints, names, path):
+    where = f"{path}: joint {joint.name!r}"
+    if joint.type not in KINDS:
+        raise RobotError(f"{where} is {joint.type}; fixed, revolute, continuous and prismatic ones are supported")
+    for end in (joint.parent, joint.child):
+        if end not in names:
+            raise RobotError(f"{where}: no link {end!r}")
+    if joints[joint.child] is not joint:
+        raise RobotError(f"{where}: another joint moves link {joint.child!r}, too")
+
+
+def _limits(joint) -> tuple[float, float]:
+    if joint.type == "continuous" or joint.limit is None or joint.limit.lower is None or joint.limit.upper is None:
+        return -math.inf, math.inf
+    return float(joint.limit.lower), float(joint.limit.upper)
+
+
+def _value_of(joint, joints, path) -> tuple[str, float, float]:
+    """Return the joint that a configuration sets, and scale and offset of what this one makes of it."""
+    scale, offset, seen = 1.0, 0.0, {joint.name}
+    named = {other.name: other for other in joints}
+    while joint.mimic is not None:
+        source = joint.mimic.joint
+        if source not in named or source in seen or named[source].type == "fixed":
+            raise RobotError(f"{path}: joint {joint.name!r} mimics {source!r}, which is none that moves by itself")
+        by = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
+        offset += scale * (0.0 if joint.mimic.offset is None else float(joint.mimic.offset))
+        scale *= by
+        joint = named[source]
+        seen.add(source)
+    return joint.name, scale, offset
+
+
+def _add_link(name, description, joints, values, path, below):
+    """Add the frame of a link, after those that it hangs on."""
+    if name in description.links:
+        return
+    if name in below:
+        raise RobotError(f"{path}: link {name!r} hangs on itself")
+    joint = joints.get(name)
+    if joint is None:
+        frame = Frame(-1, np.eye(4))
+    else:
+        _add_link(joint.parent, description, joints, values, path, (*below, name))
+        origin = check_rigid(joint.origin, f"{path}: joint {joint.name!r}")
+        frame = Frame(description.links[joint.parent], origin, KINDS[joint.type])
+        if joint.type != "fixed":
+            frame.joint, frame.scale, frame.offset = values[joint.name]
+            axis = (1.0, 0.0, 0.0) if joint.axis is None else joint.axis
+            frame.axis = unit_axis(axis, f"{path}: joint {joint.name!r}")
+    description.links[name] = len(description.frames)
+    description.frames.append(frame)
+
+
+def _load_shape(geometry, where, find_file):
+    """Return vertices and faces of a shape."""
+    import trimesh
+
+    if geometry.mesh is not None:
+        file = find_file(geometry.mesh.filename)
+        if not Path(file).is_file():
+            raise RobotError(f"{where}: no mesh file {geometry.mesh.filename}")
+        try:
+            mesh = load_mesh(file)
+        except MeshError as error:
+            raise RobotError(f"{where}: {first_line(error)}") from None
+        scale = 1.0 if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale, np.float64)
+        return mesh.vertices * scale, np.delete(mesh.faces, mesh.dropped_faces, axis=0)
+    if geometry.box is not None:
+        made = trimesh.creation.box(geometry.box.size)
+    elif geometry.cylinder is not None:
+        made = trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length)
+    elif geometry.sphere is not None:
+        made = trimesh.creation.icosphere(subdivisions=3, radius=geometry.sphere.radius)
+    else:
+        raise RobotError(f"{where}: a shape that is neither mesh, box, cylinder nor sphere")
+    return np.asarray(made.vertices), np.asarray(made.faces)
+
+
+def read_disabled_pairs(path: Path, links: set[str]) -> set[frozenset]:
+    """Return the pairs of links whose collisions an SRDF file disables.
+
+    Raises:
+        RobotError: It is unreadable, or names a link that the robot has not.
+    """
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError as error:
+        raise RobotError(f"{path}: not read as SRDF ({first_line(error)})") from None
+    pairs = set()
+    for entry in root.iter("disable_collisions"):
+        names = entry.get("link1"), entry.get("link2")
+        for name in names:
+            if name not in links:
+                raise RobotError(f"{path}: disable_collisions names {name!r}, which is no link of the robot")
+        pairs.add(frozenset(names))
+    return pairs
