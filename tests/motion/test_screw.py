@@ -9,17 +9,17 @@ from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
 
-COUNT, TIMES = 160, 41
+COUNT, TIMES = 240, 41
 
 
 def random_patch(rng, pitch):
-    """Return the model of a flat patch of 4 faces at radius 1 of the z axis, tilted, wide or small; often on a screw."""
+    """Return the model of a flat patch of 4 faces some 1 from the z axis, tilted, wide or small; some along a screw."""
     width = rng.choice([0.05, 0.35], 2) * rng.uniform(0.5, 1, 2)
     u, v = (np.stack(np.meshgrid([-1, 0, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 2) * width).T
     tilt = Rotation.from_rotvec([0, rng.uniform(-1, 1), rng.uniform(-0.3, 0.3)])
     if rng.random() < 0.5:
         tilt = Rotation.from_rotvec([np.arctan(pitch), 0, 0]) * Rotation.from_rotvec([0, rng.uniform(0.8, 1.7), 0])
-    points = tilt.apply(np.stack([0 * u, u, v], 1)) + [rng.uniform(0.95, 1.05), 0, rng.uniform(-0.05, 0.05)]
+    points = tilt.apply(np.stack([0 * u, u, v], 1)) + [rng.uniform(0.95, 1.05), 0, rng.uniform(-0.05, 0.05) * rng.choice([0.1, 1])]
     return ab.Model.from_arrays(points, [[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]], base_faces=4)
 
 
