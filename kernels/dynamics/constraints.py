@@ -127,6 +127,7 @@ def prepare_constraints_kernel(
     # static
     dt: wp.float64,
     fast: wp.float64,
+    shell: wp.float64,
     # state
     pairs: wp.array(dtype=wp.vec2i),
     objects: ObjectPool,
@@ -137,7 +138,11 @@ def prepare_constraints_kernel(
     order_out: wp.array(dtype=wp.int32),
     constraints_out: Constraints,
 ):
-    """Set up the constraints of one pair a thread; points no faster than `fast` are matched with the step before."""
+    """Set up the constraints of one pair a thread; points no faster than `fast` are matched with the step before.
+
+    Args:
+        shell: By how much points count as deeper than they are, as a fraction of the bounding radius.
+    """
     p = wp.tid()
     order_out[p] = p
     constraints_out.color[p] = INACTIVE
@@ -159,9 +164,10 @@ def prepare_constraints_kernel(
         constraints_out.arm_a[p, k] = x - bodies.position[a]
         constraints_out.arm_b[p, k] = x - bodies.position[b]
         set_effective_mass(bodies, constraints_out, c)
-        depth = wp.max(manifolds.depth[p, k], wp.float64(0.0))
+        whole = manifolds.depth[p, k] + shell * radius
+        depth = wp.max(whole, wp.float64(0.0))
         constraints_out.bias[p, k] = BAUMGARTE * (depth - SLOP * radius) / dt
-        constraints_out.approach[p, k] = (depth - manifolds.depth[p, k]) / dt
+        constraints_out.approach[p, k] = (depth - whole) / dt
         constraints_out.impulse[p, k] = wp.float64(0.0)
         constraints_out.friction_impulse[p, k] = wp.vec3d()
         constraints_out.pseudo_impulse[p, k] = wp.float64(0.0)

@@ -215,6 +215,7 @@ KEY = "[[camera.keys]]\ntime = 0\neye = [0, 0, 1]\ntarget = [0, 0, 0]\n"
         (ONE + "kinematic = true\n", "objects[0].kinematic: the scene has no [dynamics]"),
         (ONE + "density = 2\n[dynamics]\n", "objects[0].density: unknown key"),
         (ONE + "[dynamics]\nrestitution = 0.5\n", "dynamics.restitution: unknown key"),
+        (ONE + "static = true\n[dynamics]\ncontinuous = true\n", "dynamics.continuous: no object is a rigid body"),
         (ONE + "static = true\nkinematic = true\n[dynamics]\n", "objects[0].kinematic: a static object"),
         (ONE + "shuttle = { by = [1, 0, 0], period = 1 }\n[dynamics]\n", "objects[0].shuttle: a rigid body"),
         (ONE + "[dynamics]\n[picture]\ntime = 1\n", "picture.time: rigid bodies"),

@@ -258,6 +258,21 @@ def test_rain(device):
     assert height.min() > -0.6 and np.median(height) < 2.5
 
 
+def test_hammered_nuts_stay_on_their_thread(device):
+    """The rings arrive in the third step; where a nut is off the thread's helix it has passed through."""
+    loaded = load_ours("nut_and_bolt", device, [("worlds = 8", "worlds = 1")])
+    frame = loaded.frame()
+    dynamics, nut = frame.motion.dynamics, 1
+    assert len(dynamics.mass) == 5 and not loaded.scene.intersect(loaded.scene.broad_phase(), output="any").any.any()
+    start = dynamics.poses()[nut]
+    for _ in range(8):
+        frame.step()
+        assert dynamics.certified.pair_totals()["touching"] == 0
+    pose = dynamics.poses()[nut]
+    assert abs(pose[2] - start[2]) < 0.03 and abs(pose[5]) < 0.05 and np.abs(pose[:2]).max() < 0.03
+    assert dynamics.poses()[2:, 2].min() > pose[2] + 0.3, "and no ring has passed the nut"
+
+
 @pytest.mark.parametrize(
     ("name", "objects", "frames", "each", "size"),
     [("bunny_tori", None, 3, 6, 1), ("herd", None, 1, 200, 16), ("worlds", 16, 1, 16, 8)],

@@ -194,40 +194,51 @@ class FirstContactQuery(Query):
 
     def traverse(self):
         """Decide which pairs in place intersect at first, and find when the others do. Launches only."""
-        room = len(self.pairs)
-        if not room:
-            return
         super().traverse()
-        if self.device.is_capturing:
-            self._make_contacts(wp.launch)
-            return
-        *first, last = self._commands.find("first contacts", self.guard.given(), self._make_contacts)
-        for command in first:
-            command.launch()
-        if self.uses_warps():
-            last.launch()
+        self.search()
+
+    def search(self):
+        """Find when the pairs in place do that are not marked as intersecting in `hits.any_hit`. Launches only."""
+        if len(self.pairs):
+            self.begin_motions()
+            self.follow_motions()
+
+    def begin_motions(self):
+        """Do the first half of `search`: make each pair's motion. Launches only."""
+        for launch in self._find_launches("motions", self._make_motions):
+            launch()
+
+    def follow_motions(self):
+        """Do the second half of `search`: follow motions to the first contacts. Launches only."""
+        (launch,) = self._find_launches("first contacts", self._make_contacts)
+        if self.device.is_capturing or self.uses_warps():
+            launch()
         else:
             rooms = len(self._memory)
             cores = min(current_regime().cpu_threads or rooms, rooms)
-            launch_on_cores(last.launch, room, cores, PAIRS_A_CORE)
+            launch_on_cores(launch, len(self.pairs), cores, PAIRS_A_CORE)
 
-    def _make_contacts(self, launch) -> list:
-        """Make the launches that follow the exact test, see `Commands.find`."""
+    def _find_launches(self, name, make) -> list:
+        return self._commands.find_callables(name, self.guard.given(), self.device, make)
+
+    def _make_motions(self, launch) -> list:
         models, states, objects = self.batch.pools
-        room, device = len(self.pairs), self.device
-        launch = partial(launch, device=device)
+        room, launch = len(self.pairs), partial(launch, device=self.device)
         inputs = [self.screw, objects, self.ends, self._ways.paths]
         paths = launch(path.prepare_path_kernel, dim=self.batch.object_count, inputs=inputs)
         inputs = [models, states, objects, self._ways, self.pair_count, self.pairs, self.pair_poses]
         inputs += [self.hits, self.contacts, self._motion]
-        begin = launch(start.contact_starter(self._kind), dim=room, inputs=inputs, block_dim=WARP_SIZE)
+        return [paths, launch(start.contact_starter(self._kind), dim=room, inputs=inputs, block_dim=WARP_SIZE)]
+
+    def _make_contacts(self, launch) -> list:
+        models, states, _ = self.batch.pools
+        room, launch = len(self.pairs), partial(launch, device=self.device)
         inputs = [self._stack_length(), self.tolerance, models, states, self.pair_count, self.pair_poses, self._motion]
         if self.uses_warps():
-            dim, inputs = room * (WARP_SIZE if device.is_cuda else 1), [*inputs, self.hits, self.contacts]
-            kernel = search.warp_search(self._kind)
-            return [paths, begin, launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE)]
+            dim, inputs = room * (WARP_SIZE if self.device.is_cuda else 1), [*inputs, self.hits, self.contacts]
+            return [launch(search.warp_search(self._kind), dim=dim, inputs=inputs, block_dim=WARP_SIZE)]
         inputs += [self.hits, self.contacts, self._memory]
-        return [paths, begin, launch(search.thread_search(self._kind), dim=1, inputs=inputs)]
+        return [launch(search.thread_search(self._kind), dim=1, inputs=inputs)]
 
     def _make_result(self, found: Found, device: bool, with_rows: bool = True) -> Result:
         n = len(found.pairs)

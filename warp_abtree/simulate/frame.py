@@ -277,6 +277,7 @@ class Frame:
             stages.find()
             stages.respond(timer.mark)
             self._is_short = False
+        stages.finish_bodies()
         if answers:
             self.motion.answer(self._result(), self.time_step)
         if answers or timer.marks()[-1] != "answer_ms":

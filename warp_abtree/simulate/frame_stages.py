@@ -109,7 +109,8 @@ class FrameStages:
 
     def arrays(self) -> tuple:
         """Return what stands for all arrays that launches are given: while it does, a graph of them holds."""
-        return self.query.guard.given()
+        certified = None if self.dynamics is None else self.dynamics.certified
+        return *self.query.guard.given(), *(() if certified is None else certified.guard.given())
 
     def check_rows(self, poses) -> np.ndarray:
         """Return poses of all objects, (n, 7).
@@ -212,6 +213,11 @@ class FrameStages:
             self.query.grow(between)
         else:
             self.dynamics.find_contacts(between)
+
+    def finish_bodies(self):
+        """Finish a step of rigid bodies that lacked room, see `Dynamics.finish`."""
+        if self.dynamics is not None:
+            self.dynamics.finish(self.time_step)
 
     def respond(self, mark: Callable):
         """Summarise what the query has found, and let rigid bodies respond to it. Launches only."""

@@ -2,8 +2,8 @@
 
 One step: contacts where the bodies stand, and as far ahead as they move (`ManifoldQuery` with a gap); gravity; contact
 impulses by projected Gauss-Seidel with warm starting and Coulomb friction; position correction by split impulses;
-semi-implicit Euler with a symplectic rotation. All in float64; docs/dynamics.md has each part, what is conserved and
-repeated, figures, and limits.
+semi-implicit Euler with a symplectic rotation; with `continuous`, motions cut where surfaces would meet. All in
+float64; docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
 """
 
 from contextlib import contextmanager
@@ -11,18 +11,20 @@ from contextlib import contextmanager
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import finite_array, positive
+from warp_abtree.checks.arguments import finite_array, flag, positive
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import LAST_KEY
 from warp_abtree.kernels.dynamics import bodies as body_kernels
 from warp_abtree.kernels.dynamics import constraints as constraint_kernels
 from warp_abtree.kernels.dynamics import graph_coloring, solve
 from warp_abtree.query.manifold import POINTS_MAX, ManifoldQuery
-from warp_abtree.query.request import Buffers
+from warp_abtree.query.request import Buffers, check_capacity
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.body_state import RigidBodies, zeros_of
+from warp_abtree.simulate.continuous import CertifiedWays
 
 COLOR_COUNT = int(graph_coloring.COLOR_COUNT)
+SHELL = float(body_kernels.REACH_LEAST)  # with continuous bodies rest one slop apart, for one deep
 ITERATIONS = 16  # rounds of relaxation over all contacts in a step
 COLOR_ROUNDS = 2  # of the graph coloring, each color; one makes almost twice as many colors
 LAST_COLORS = 8  # first of the last colors, which one block relaxes
@@ -44,9 +46,12 @@ class Dynamics(RigidBodies):
         velocity: Initial velocity of the centres of mass [world units/s], (3,) or (n, 3).
         angular_velocity: Initial angular velocity in the world frame [rad/s], (3,) or (n, 3).
         capacity: `Buffers`, or the initial capacity for contacts; `step` grows it, `launch` does not.
+        continuous: Whether surfaces that are apart are proved to stay apart: bodies stop, for the rest of a step, short
+            of where they would meet, and rest a little apart. Kinematic objects stop too.
 
     Attributes:
         bodies, mass, rigid, kinematic: As `RigidBodies`.
+        certified: With `continuous`, `CertifiedWays`, what the last step made of each motion; else None.
         query: The `ManifoldQuery` of the last step: its pairs, contacts and contact points.
         constraints: Their impulses and colors, `kernels.dynamics.constraints.Constraints`.
 
@@ -63,6 +68,7 @@ class Dynamics(RigidBodies):
         velocity=(0.0, 0.0, 0.0),
         angular_velocity=(0.0, 0.0, 0.0),
         capacity: Buffers | int | None = None,
+        continuous: bool = False,
     ):
         super().__init__(scene, gravity, kinematic, velocity, angular_velocity)
         self.friction = float(finite_array(friction, "friction", ()))
@@ -71,6 +77,9 @@ class Dynamics(RigidBodies):
         by_color = current_regime().relax_by_color
         self._by_color = not self.device.is_cpu if by_color is None else by_color
         self.query = ManifoldQuery(scene, None, capacity, gap=self.bodies.reach)
+        self.certified = None
+        if flag(continuous, "continuous"):
+            self.certified = CertifiedWays(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))
         # No body is in two pairs of a color.
         self._color_room = max(1, int(np.count_nonzero(self.rigid)))
         # On the CPU threads run one after another, and a color more costs nothing.
@@ -123,6 +132,7 @@ class Dynamics(RigidBodies):
         dt = positive(dt, "dt")
         self.find(targets)
         self.answer(dt)
+        self.finish(dt)
 
     def find(self, targets=None):
         """Do the first half of `step`: find the contacts where the bodies stand, without moving them."""
@@ -156,7 +166,8 @@ class Dynamics(RigidBodies):
             self._launch(body_kernels.judge_contacts_kernel, 1, [*found, bodies])
             inputs = [dt, wp.vec3d(*(dt * self.gravity)), self.targets, self._pool, bodies]
             self._launch(body_kernels.begin_step_kernel, n, inputs)
-            inputs = [dt, fast, *posed, self._warm_start, bodies, self._sorted_pair, self.constraints]
+            shell = 0.0 if self.certified is None else SHELL
+            inputs = [dt, fast, shell, *posed, self._warm_start, bodies, self._sorted_pair, self.constraints]
             self._launch(constraint_kernels.prepare_constraints_kernel, room, inputs)
             self._color_pairs()
             self._relax(solve.WARM_START, 1, fast)
@@ -164,7 +175,19 @@ class Dynamics(RigidBodies):
             self._relax(solve.POSITION, ITERATIONS, fast)
             inputs = [query.broad_phase.key, *posed, self.constraints, bodies, self._warm_start]
             self._launch(constraint_kernels.save_impulses_kernel, room, inputs)
-            self._launch(body_kernels.integrate_kernel, n, [dt, self.targets, bodies, self._pool])
+            posed = self._pool if self.certified is None else self.certified.goals
+            self._launch(body_kernels.integrate_kernel, n, [dt, self.targets, bodies, posed])
+            if self.certified is not None:
+                self.certified.free_stuck(dt)
+                self.certified.launch()
+                self.certified.end(dt * self.gravity)
+
+    def finish(self, dt: float):
+        """Finish an `answer` whose motions had more pairs than room for them. Waits for the device if `continuous`."""
+        if self.certified is not None and not self.certified.is_whole():
+            with self._changing():
+                self.certified.grow()
+                self.certified.end(dt * self.gravity)
 
     def launch(self, dt: float):
         """Move all bodies by one step. Launches only: after a `step`, a CUDA graph can capture it, with this dt.
@@ -183,6 +206,8 @@ class Dynamics(RigidBodies):
             CapacityError: Names the demand.
         """
         self.query.result(with_points=False).check()
+        if self.certified is not None:
+            self.certified.check()
 
     def motion(self, prescribed=None) -> "SteppedMotion":
         """Return what a `Frame` takes as motion: steps of this, with kinematic objects on a prescribed path."""
@@ -254,6 +279,8 @@ class SteppedMotion:
             wp.load_module(solve, device, block_dim=RELAX_THREADS)
         self.aim(time)
         self.dynamics.find_contacts()
+        if self.dynamics.certified is not None:
+            self.dynamics.certified.grow()
 
     def aim(self, time: float):
         """Set where kinematic objects are at a time [s], the end of the coming step."""

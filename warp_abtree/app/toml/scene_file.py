@@ -68,6 +68,7 @@ class SceneFile:
                 kinematic=self.kinematic,
                 velocity=self.motion.velocity,
                 angular_velocity=self.motion.axis * self.motion.rate[:, None],
+                continuous=self.dynamics.continuous,
             )
         except ValueError as error:
             raise SceneError(f"{self.path}: objects: {error}") from None
@@ -126,6 +127,9 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
     control = make_control(path, tables.lod)
     groups = make_groups(path, tables.objects, tables.dynamics, tables.scene.seed, objects)
     _check_names(path, tables)
+    if tables.dynamics is not None and tables.dynamics.continuous:
+        if all(table.static or table.kinematic for table in tables.objects):
+            fail(path, "dynamics.continuous", "no object is a rigid body, which it would stop")
     try:
         motion = Kinematic(**{key: np.concatenate([group.motion[key] for group in groups]) for key in groups[0].motion})
     except ValueError as error:  # a sum of finite numbers that is not

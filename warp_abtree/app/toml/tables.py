@@ -323,6 +323,7 @@ class DynamicsTable(Table):
 
     friction: NotNegative = 0.5
     gravity: Vector = (0.0, -9.81, 0.0)
+    continuous: bool = False  # surfaces that are apart stay apart, however fast; of rigid bodies alone
 
 
 class PictureTable(Table):

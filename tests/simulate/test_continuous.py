@@ -1,0 +1,163 @@
+"""With `continuous` surfaces that are apart stay apart, however fast bodies are."""
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from helpers.bodies import BRICK, TORUS, about, bits, box, make, model_of, on_ground
+
+import warp_abtree as ab
+from warp_abtree.query.request import Buffers, CapacityError
+
+SHEET = box(0.4, 0.4, 0.001)
+BULLET = model_of(trimesh.creation.icosphere(1, 0.005))
+ROD = box(0.3, 0.02, 0.03)
+FREE = {"gravity": (0, 0, 0)}
+
+
+def surfaces_meet(dynamics):
+    """Ask the exact test, of all pairs of the broad phase, which the steps do not."""
+    scene = dynamics.scene
+    return scene.intersect(scene.broad_phase(), output="any").any.any()
+
+
+def energy(dynamics, g=9.81):
+    """Kinetic energy, and potential energy under gravity along -z."""
+    rigid = dynamics.rigid
+    velocity, angular = (rows[rigid] for rows in dynamics.velocities())
+    z, momentum = dynamics.bodies.position.numpy()[rigid, 2], dynamics.bodies.momentum.numpy()[rigid]
+    return 0.5 * (angular * momentum).sum() + (dynamics.mass[rigid] * (0.5 * (velocity**2).sum(1) + g * z)).sum()
+
+
+@pytest.mark.parametrize("speed", [3.0, 30.0, 300.0, 1000.0])
+@pytest.mark.parametrize("stands", [True, False])
+def test_a_bullet_is_stopped_by_a_sheet_of_1_mm_at_60_steps_a_second(device, speed, stands):
+    def shoot(continuous):
+        placed = (SHEET, (0, 0, 0, 0, 0, 0, 1), stands), (BULLET, (0.03, 0.02, 0.3, 0, 0, 0, 1))
+        velocity = [(0, 0, 0), (0, 0, -speed)]
+        dynamics = make(device, *placed, velocity=velocity, continuous=continuous, **FREE)
+        start = energy(dynamics, 0)
+        for _ in range(int(np.ceil(0.35 / speed * 60)) + 3):
+            dynamics.step(1 / 60)
+            assert energy(dynamics, 0) < (1 + 1e-9) * start
+        return dynamics
+
+    dynamics = shoot(True)
+    sheet, bullet = dynamics.poses()
+    normal = trimesh.transformations.quaternion_matrix([sheet[6], *sheet[3:6]])[:3, 2]
+    assert normal @ (bullet - sheet)[:3] > 0.004 and not surfaces_meet(dynamics)
+    if stands and speed > 3:
+        assert shoot(False).poses()[1, 2] < -0.004
+
+
+def test_no_random_throw_passes_a_thin_sheet(device):
+    """Spinning rods at up to 1,000 units a second, from near and far: none is ever on the other side."""
+    rng, scene, count = np.random.default_rng(5), ab.Scene(device), 40
+    turns = rng.normal(size=(count, 4))
+    velocity, spin = [], []
+    for world in range(count):
+        scene.add(SHEET, static=True, world=world)
+        turn = turns[world] / np.linalg.norm(turns[world])
+        place = np.array([*rng.uniform(-0.05, 0.05, 2), 0.17 + rng.exponential(0.3)])
+        scene.add(ROD, pose=(*place, *turn), world=world)
+        aim = np.array([*rng.uniform(-0.1, 0.1, 2), 0]) - place
+        speed = 10 ** rng.uniform(0, 3)
+        velocity += [(0, 0, 0), aim / np.linalg.norm(aim) * speed]
+        spin += [(0, 0, 0), rng.normal(size=3) * 10 ** rng.uniform(-1, 2)]
+    dynamics = ab.Dynamics(scene, velocity=velocity, angular_velocity=spin, continuous=True, **FREE)
+    corners = ROD.mesh_at(ROD.lod_max)[0]
+    side, hits = np.ones(count, bool), np.zeros(count, bool)
+    for _ in range(24):
+        dynamics.step(1 / 60)
+        rotation, place = dynamics.scene.batch().objects.pool.rotation, dynamics.scene.batch().objects.pool.position
+        world = np.einsum("nij,vj->nvi", rotation.numpy()[1::2], corners) + place.numpy()[1::2, None]
+        over = np.abs(world[..., :2]).max((1, 2)) < 0.2
+        hits |= dynamics.certified.part.numpy()[1::2] < 1
+        side &= ~over | (world[..., 2].min(1) > 0.0005)
+        assert not surfaces_meet(dynamics)
+    assert side.all() and hits.sum() > count // 2
+
+
+def test_a_heap_falls_and_comes_to_rest_without_more_energy(device):
+    rng, placed = np.random.default_rng(3), []
+    for k in range(8):
+        turn = rng.normal(size=4)
+        place = (1.2 * (k % 2), 1.2 * (k // 2 % 2), 1 + 1.3 * (k // 4))
+        placed.append(([TORUS, BRICK][k % 2], (*place, *(turn / np.linalg.norm(turn)))))
+    dynamics = on_ground(device, *placed, velocity=(0, 0, -15.0), continuous=True)
+    start = before = energy(dynamics)
+    for _ in range(150):
+        dynamics.step(1 / 60)
+        after = energy(dynamics)
+        assert after < before + 1e-5 * start
+        before = after
+    assert dynamics.certified.pair_totals()["touching"] == 0 and not surfaces_meet(dynamics)
+    assert dynamics.poses()[1:, 2].min() > 0.1 and before < 0.3 * start
+    assert np.abs(dynamics.velocities()[0]).max() < 0.5
+
+
+def test_a_body_rests_one_slop_above_the_floor(device):
+    dynamics = on_ground(device, (box(0.8, 0.6, 0.4), (0, 0, 0.5, *about((0, 0, 1), 0.3))), continuous=True)
+    for _ in range(60):
+        dynamics.step(1 / 60)
+    slop = dynamics.bodies.bounding_radius.numpy()[1] / 512
+    assert 0.2 + 0.5 * slop < dynamics.poses()[1, 2] < 0.2 + 1.5 * slop
+    assert dynamics.certified.part.numpy()[1] == 1
+
+
+def test_bodies_that_overlap_at_first_are_not_stopped(device):
+    """Where surfaces intersect already nothing is promised, and nothing freezes."""
+    placed = (SHEET, (0, 0, 0, 0, 0, 0, 1), True), (BULLET, (0, 0, 0.001, 0, 0, 0, 1))
+    dynamics = make(device, *placed, velocity=(0, 0, 1.0), continuous=True, **FREE)
+    dynamics.step(1 / 60)
+    assert dynamics.certified.pair_totals()["touching"] == 1
+    assert dynamics.poses()[1, 2] > 0.01
+
+
+def test_a_kinematic_object_stops_too_and_catches_up(device):
+    """It presses a brick on the floor, and is late for its target until it turns back."""
+    dynamics = on_ground(
+        device, (BRICK, (0, 0, 0.3, 0, 0, 0, 1)), (BRICK, (0, 0, 1.0, 0, 0, 0, 1)), kinematic=[2], continuous=True
+    )
+    for z in (0.9, 0.6, 0.4):
+        dynamics.step(1 / 60, [[0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 1], [0, 0, z, 0, 0, 0, 1]])
+    assert 0.75 < dynamics.poses()[2, 2] < 0.82 and not surfaces_meet(dynamics)
+    dynamics.step(1 / 60, [[0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, 1], [0, 0, 1.5, 0, 0, 0, 1]])
+    assert dynamics.poses()[2, 2] == 1.5
+
+
+def test_steps_repeat_to_the_bit_and_in_a_captured_graph(device):
+    def thrown(**options):
+        placed = (TORUS, (0.1, 0, 0.6, *about((1, 0, 0), 0.5))), (BRICK, (0, 0.2, 1.5, *about((0, 1, 0), 0.3)))
+        return on_ground(device, *placed, velocity=(0, 0, -20.0), continuous=True, **options)
+
+    first, second = thrown(), thrown()
+    for _ in range(12):
+        first.step(1 / 60)
+    if wp.get_device(device).is_cuda:
+        second.step(1 / 60)
+        with wp.ScopedCapture(device) as capture:
+            second.launch(1 / 60)
+        for _ in range(11):
+            wp.capture_launch(capture.graph)
+    else:
+        for _ in range(12):
+            second.launch(1 / 60)
+    second.certified.result().check()
+    np.testing.assert_array_equal(bits(first), bits(second))
+
+
+def test_a_step_without_room_for_pairs_moves_nothing_and_says_so(device):
+    models = [(BRICK, (1.1 * k, 0, 0, 0, 0, 0, 1)) for k in range(4)]
+    options = {"velocity": [(30.0 * (1.5 - k), 0, 0) for k in range(4)], "continuous": True, **FREE}
+    dynamics = make(device, *models, capacity=Buffers(pairs=1), **options)
+    dynamics.certified.resize(0)
+    before = dynamics.poses()
+    dynamics.query.grow()
+    dynamics._grow()
+    dynamics.launch(1 / 60)
+    np.testing.assert_array_equal(dynamics.poses(), before)
+    with pytest.raises(CapacityError, match="Buffers\\(pairs="):
+        dynamics.check()
+    dynamics.finish(1 / 60)
+    assert not np.array_equal(dynamics.poses(), before) and not surfaces_meet(dynamics)
