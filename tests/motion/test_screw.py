@@ -19,7 +19,11 @@ def random_patch(rng, pitch):
     tilt = Rotation.from_rotvec([0, rng.uniform(-1, 1), rng.uniform(-0.3, 0.3)])
     if rng.random() < 0.5:
         tilt = Rotation.from_rotvec([np.arctan(pitch), 0, 0]) * Rotation.from_rotvec([0, rng.uniform(0.8, 1.7), 0])
-    points = tilt.apply(np.stack([0 * u, u, v], 1)) + [rng.uniform(0.95, 1.05), 0, rng.uniform(-0.05, 0.05) * rng.choice([0.1, 1])]
+    points = tilt.apply(np.stack([0 * u, u, v], 1)) + [
+        rng.uniform(0.95, 1.05),
+        0,
+        rng.uniform(-0.05, 0.05) * rng.choice([0.1, 1]),
+    ]
     return ab.Model.from_arrays(points, [[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]], base_faces=4)
 
 
