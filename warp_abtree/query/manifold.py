@@ -10,8 +10,8 @@ Meshes meet in curves, and a curve alone has no depth. Here is what is made of i
   normal, at the deepest place. Where the normal of either face is within 60 degrees of the loop's and makes that
   depth no larger, it takes the place of the loop's: so a box in a corner is pushed by floor and wall, each its own way.
 * Of all candidates of the pair an outermost one is taken, then those farthest, in place and in normal, from the
-  segments between those before, and the deepest, up to `POINTS` of them, in the order in which they lie along a fixed
-  direction of the lower object: points that stay keep their order from launch to launch.
+  segments between those before, and the deepest, up to 8 of them or as many as asked for, in the order in which they
+  lie along a fixed direction of the lower object: points that stay keep their order from launch to launch.
 
 With `gap=d` faces that are apart but nearer than d have candidates too, with minus a separation as depth. Where two
 faces look at one another within 60 degrees it is measured along the normal that leaves the wider gap: the nearest point
@@ -34,7 +34,9 @@ section 3; that the boundary curve gives it is Stokes' theorem.
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.contact import manifold, points
+from warp_abtree.checks.arguments import whole_number
+from warp_abtree.kernels.contact import manifold
+from warp_abtree.kernels.contact import points as point_kernels
 from warp_abtree.kernels.gap import near_points
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.contacts import ContactQuery
@@ -51,14 +53,17 @@ class ManifoldQuery(ContactQuery):
 
     Args:
         scene, pairs, capacity, precision, gap: As for `ContactQuery`.
+        points: Most points of a pair, 1 to 64. Those beyond the eighth lie farthest from any before them.
 
     Attributes:
-        manifolds: Points of each pair, device arrays (pair capacity, POINTS) of `kernels.manifold.Manifolds`, float64.
+        manifolds: Points of each pair, device arrays (pair capacity, points) of `kernels.manifold.Manifolds`, float64.
+        point_max: Most points of a pair.
     """
 
     growth = 2
 
-    def __init__(self, scene, pairs=None, capacity=None, precision="exact", gap=None):
+    def __init__(self, scene, pairs=None, capacity=None, precision="exact", gap=None, points=POINTS_MAX):
+        self.point_max = whole_number(points, "points", 1, 64)
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
         super().__init__(scene, pairs, capacity, precision, sort_pairs=True, gap=gap)
         self._no_gap = wp.empty(0, dtype=wp.float64, device=self.device)
@@ -73,7 +78,7 @@ class ManifoldQuery(ContactQuery):
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
-        points = (room, POINTS_MAX)
+        points = (room, self.point_max)
         made.append((self.manifolds, "count", wp.zeros(room, dtype=wp.int32, device=self.device)))
         for name, dtype in (("point", wp.vec3d), ("normal", wp.vec3d), ("depth", wp.float64)):
             made.append((self.manifolds, name, self._empty(points, dtype)))
@@ -103,7 +108,8 @@ class ManifoldQuery(ContactQuery):
         self._launch_kernel(manifold.average_loop_kernel, count, inputs)
         inputs = [*posed, gap, start, rows, contacts, curves]
         self._launch_kernel(manifold.find_candidate_kernel, count, inputs)
-        self._launch_warps(points.spread_point_kernel, room, [pools[2], self.pairs, gap, start, curves, self.manifolds])
+        spread = point_kernels.point_spreader(self.point_max)
+        self._launch_warps(spread, room, [pools[2], self.pairs, gap, start, curves, self.manifolds])
 
     def _sort_keys(self, count, bits):
         with wp.ScopedDevice(self.device):
@@ -120,7 +126,7 @@ class ManifoldQuery(ContactQuery):
             found.points = {name: wp.clone(array) for name, array in arrays.items()}
             return
         points = arrays["count"].numpy()
-        used = np.arange(POINTS_MAX) < points[:, None]
+        used = np.arange(self.point_max) < points[:, None]
         found.points = {"pair": np.repeat(np.arange(pairs), points)}
         for name in names:
             found.points[name] = arrays[name].numpy()[used]
