@@ -34,6 +34,8 @@ HALF, DIRECTION_UNIT = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(2.0*
 # Of slower turns the pitch would be long.
 TURN_LEAST = wp.constant(wp.float64(2.0**-10))
 ASIN_SLOPE, TURN_ROUNDING = wp.constant(wp.float64(1.1)), wp.constant(wp.float64(2.0**-44))
+# Scaled: where more is across the axis, few nodes are found apart.
+DRIFT_MAX = wp.constant(wp.float64(2.0**-5))
 PI = wp.constant(wp.float64(math.pi))
 
 
@@ -177,14 +179,24 @@ def part_on_screw(
 
 
 @wp.func
-def slides_apart(
-    models: ModelPool, states: StatePool, pose: PairPose, motion: Motion, t: wp.float64, x: wp.int32, y: wp.int32
-):
-    """Return whether nodes x of A and y of B stay apart from t on for sure, since one object moves on a screw."""
-    a_turns = motion.angle_a > wp.float64(0.0)
+def is_screw(motion: Motion):
+    """Return whether one object alone turns, and moves little across the axis of its turn."""
     turn = wp.max(motion.angle_a, motion.angle_b)
     if wp.min(motion.angle_a, motion.angle_b) != wp.float64(0.0) or turn < TURN_LEAST:
         return False
+    axis = motion.first * motion.axis_b
+    if motion.angle_a > wp.float64(0.0):
+        axis = motion.axis_a
+    return wp.length(motion.d1 - wp.dot(motion.d1, axis) * axis) * motion.scale < DRIFT_MAX
+
+
+@wp.func
+def slides_apart(
+    models: ModelPool, states: StatePool, pose: PairPose, motion: Motion, t: wp.float64, x: wp.int32, y: wp.int32
+):
+    """Return whether nodes x of A and y of B stay apart from t on for sure; one object moves nearly on a screw."""
+    a_turns = motion.angle_a > wp.float64(0.0)
+    turn = wp.max(motion.angle_a, motion.angle_b)
     back = wp.transpose(motion.first)
     axis_a = wp.where(a_turns, motion.axis_a, motion.first * motion.axis_b)
     axis_b = wp.where(a_turns, back * motion.axis_a, motion.axis_b)

@@ -22,7 +22,7 @@ from warp_abtree.kernels.distance.search import (
 )
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED, Contact
-from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, slides_past
+from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, slide_floor, slides_past
 from warp_abtree.kernels.motion.start import OPEN, Contacts
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.face_pairs import Hits
@@ -106,7 +106,7 @@ def search_contact(
         write_bound(items, 0, wp.float32(start))
     warp_sync()
     end, waiting = wp.int32(1), wp.int32(0)
-    tests = wp.vec2i()
+    tests, floor = wp.vec2i(), slide_floor(pose, motions[p])
     while end > 0 or waiting > 0:
         if end > 0 and waiting < warp_size():
             # One at a time, depth first, needs little room; more where there is.
@@ -116,7 +116,7 @@ def search_contact(
             at = end + wp.min(warp_lane(), popped - 1)
             item, t = read_item(items, at), read_bound(items, at)
             live = wp.where(warp_lane() < popped and wp.float64(t) <= best.time, -1, 0)
-            if live < 0 and slides_past(models, states, pose, motions[p], t, item):
+            if live < 0 and slides_past(floor, models, states, pose, motions[p], t, item):
                 live = 0
             warp_sync()
             children, kinds, times, compared = four_items(), wp.vec4i(), wp.vec4(), wp.int32(0)
