@@ -16,7 +16,7 @@ NEAREST_POINT = wp.constant(wp.float64(2.0**-9))
 # By which part of its distance a point is favoured at the far end of the spread.
 FAVOUR = wp.constant(wp.float64(2.0**-5))
 # Part of the spread by which points may be less deep than the deepest, and apart, to be chosen before others.
-FIRST_PART = wp.constant(wp.float64(2.0**-5))
+FIRST_PART = wp.constant(wp.float64(2.0**-9))
 # The deepest point is among those chosen if this part of its depth is more than theirs.
 DEEPER = wp.constant(wp.float64(0.9))
 
@@ -177,6 +177,12 @@ def find_next(
 
 
 @wp.func
+def order_direction(rotation: wp.mat33d):
+    """Return the direction along which the points of a pair are in order, of its lower object's rotation."""
+    return rotation * wp.vec3d(wp.float64(0.6134), wp.float64(0.5327), wp.float64(0.5831))
+
+
+@wp.func
 def write_in_order(
     p: wp.int32,
     count: wp.int32,
@@ -244,9 +250,7 @@ def point_spreader(most: int):
         shell = zero
         if gap.shape[0] > 0:
             shell = gap[p]
-        along = objects.rotation[wp.min(pairs[p][0], pairs[p][1])] * wp.vec3d(
-            wp.float64(0.6134), wp.float64(0.5327), wp.float64(0.5831)
-        )
+        along = order_direction(objects.rotation[wp.min(pairs[p][0], pairs[p][1])])
         deepest_at, deepest = find_deepest(first, end, curves_inout)
         half = wp.float64(0.5) * (deepest + shell) - shell
         best, reach = find_outermost(first, end, half, along, curves_inout)

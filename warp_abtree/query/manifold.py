@@ -21,11 +21,20 @@ far: so what lies up to d inside is not forgotten once it no longer crosses. Acr
 if no other face of either object is nearer to them: so a box that slides over a floor of many faces is not stopped by
 the edges between them. Depths count from the gap on for what is half as deep as what.
 
-Normals come from the winding of the faces, outwards. Without a gap only surfaces that cross have contacts: an object
-that lies whole inside another has none. Depth is exact while every vertex inside has a face that crosses; once a whole
-ring of faces is inside it is that ring's, too little, and rings that go under in one step are forgotten: fine meshes
-come to rest several times as deep as they are told to (docs/dynamics.md has figures). Of two thin things that are
-through each other the way out is as likely forwards as back.
+Normals come from the winding of the faces, outwards. Depth is exact while every vertex inside has a face that crosses;
+once a whole ring of faces is inside it is that ring's, too little, and without a gap an object that lies whole inside
+another has no points. Solids (`Scene.add`) have more. Of an object pair that intersects, of which one is a solid:
+
+* Corners of one object inside the other, a solid, have as depth their distance from its surface, and the way there as
+  normal. Up to four become points, the deepest first, a quarter of the smaller object's size (the diagonal of its box)
+  from one another and at least half as deep as the first, and take the places of the nearest others if there is no
+  room.
+* They are looked for where they are needed: only corners that are deeper than all other points of the pair by 1/4096 of
+  that size count, and pairs whose points are all less deep than that are passed over.
+* Their ways out are within 90 degrees of the sum of the other points' normals; of what lies inside whole, of the way
+  out of the middle of its box. So they do not hold an object from both sides.
+
+Of two thin surfaces that are through each other the way out is as likely forwards as back.
 
 Source of the area vector as a gradient: Allard et al. 2010, Volume Contact Constraints at Arbitrary Resolution,
 section 3; that the boundary curve gives it is Stokes' theorem.
@@ -38,6 +47,7 @@ from warp_abtree.checks.arguments import whole_number
 from warp_abtree.kernels.contact import manifold
 from warp_abtree.kernels.contact import points as point_kernels
 from warp_abtree.kernels.gap import near_points
+from warp_abtree.kernels.solid import inside_points
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.result import Found, Result
@@ -110,6 +120,15 @@ class ManifoldQuery(ContactQuery):
         self._launch_kernel(manifold.find_candidate_kernel, count, inputs)
         spread = point_kernels.point_spreader(self.point_max)
         self._launch_warps(spread, room, [pools[2], self.pairs, gap, start, curves, self.manifolds])
+        self._add_inside_points()
+
+    def _add_inside_points(self):
+        """Add points of what is inside, where there are solids. Launches only."""
+        if self.batch.solids is not None:
+            models, states, *posed = [*self.batch.pools, self.pair_count, self.pairs, self.pair_poses]
+            inputs = [self._stack_length(), models, states, self.batch.solids.pool, *posed]
+            inputs += [self.guard.launched, self.hits, self.manifolds]
+            self._launch_warps(inside_points.add_inside_point_kernel, len(self.pairs), inputs)
 
     def _sort_keys(self, count, bits):
         with wp.ScopedDevice(self.device):
