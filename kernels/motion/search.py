@@ -22,12 +22,12 @@ from warp_abtree.kernels.distance.search import (
 )
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED, Contact
-from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
+from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, slide_floor, slides_past
 from warp_abtree.kernels.motion.start import OPEN, Contacts
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.face_pairs import Hits
 from warp_abtree.kernels.traversal.load_balance import take_unit
-from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
+from warp_abtree.kernels.traversal.node_pair import first_item, four_items, item_first, item_second
 from warp_abtree.kernels.traversal.simd import take_thread
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
@@ -93,7 +93,8 @@ def search_contact(
     models: ModelPool,
     states: StatePool,
     pose: PairPose,
-    motion: Any,
+    motions: Any,
+    p: wp.int32,
     start: wp.float64,
 ):
     """Return the first contact of an object pair that is apart until a start, and what this lane compared."""
@@ -105,7 +106,7 @@ def search_contact(
         write_bound(items, 0, wp.float32(start))
     warp_sync()
     end, waiting = wp.int32(1), wp.int32(0)
-    tests = wp.vec2i()
+    tests, floor = wp.vec2i(), slide_floor(pose, motions[p])
     while end > 0 or waiting > 0:
         if end > 0 and waiting < warp_size():
             # One at a time, depth first, needs little room; more where there is.
@@ -115,8 +116,12 @@ def search_contact(
             at = end + wp.min(warp_lane(), popped - 1)
             item, t = read_item(items, at), read_bound(items, at)
             live = wp.where(warp_lane() < popped and wp.float64(t) <= best.time, -1, 0)
+            if live < 0 and slides_past(floor, models, states, pose, motions[p], t, item):
+                live = 0
             warp_sync()
-            children, kinds, times, compared = advance_nodes(states, pose, motion, t, best.time, item, live)
+            children, kinds, times, compared = four_items(), wp.vec4i(), wp.vec4(), wp.int32(0)
+            if warp_any(live < 0):
+                children, kinds, times, compared = advance_nodes(states, pose, motions[p], t, best.time, item, live)
             ends = push_nearest(items, end, waiting, kinds, children, times)
             warp_sync()
             end = item_second(ends)
@@ -126,7 +131,7 @@ def search_contact(
         if waiting >= warp_size() or (waiting > 0 and (end == 0 or best.end == CLEAR)):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
-            best, advanced = meet_faces(items, waiting, popped, tolerance, models, states, pose, motion, best)
+            best, advanced = meet_faces(items, waiting, popped, tolerance, models, states, pose, motions[p], best)
             tests[1] += advanced
     return best, tests
 
@@ -154,7 +159,7 @@ def warp_search(kind):
         if contacts_inout.end[p] != OPEN:
             return
         items, start = nearest_stack(), contacts_inout.time[p]
-        contact, tests = search_contact(items, room, tolerance, models, states, pair_poses[p], motion[p], start)
+        contact, tests = search_contact(items, room, tolerance, models, states, pair_poses[p], motion, p, start)
         if warp_lane() == 0:
             contacts_inout.time[p] = contact.time
             contacts_inout.end[p] = contact.end
@@ -193,7 +198,7 @@ def thread_search(kind):
         while p < count:
             if contacts_inout.end[p] == OPEN:
                 pose, start = pair_poses[p], contacts_inout.time[p]
-                contact, tests = search_contact(items, room, tolerance, models, states, pose, motion[p], start)
+                contact, tests = search_contact(items, room, tolerance, models, states, pose, motion, p, start)
                 contacts_inout.time[p] = contact.time
                 contacts_inout.end[p] = contact.end
                 hits_inout.node_tests[p] += wp.int64(tests[0])

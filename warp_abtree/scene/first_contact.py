@@ -126,6 +126,7 @@ class FirstContactQuery(Query):
         self.contacts, self.ends, self._ways = start.Contacts(), ObjectPool(), start.Ways()
         self.contacts.counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity)
+        self.batch.models.make_slabs()
         self.contacts.launched = self.guard.launched
         paths = path.Paths()
         for name in ("axis", "angle", "anchor", "start", "travel"):
