@@ -99,7 +99,7 @@ def write_contact_kernel(
     count: wp.array(dtype=wp.int32),
     contacts_out: RigidContacts,
 ):
-    """Write the points of one pair a thread, on the surfaces of the meshes: half the depth on either side.
+    """Write the points of one pair a thread: half the depth on either side of where the manifold has them.
 
     Args:
         first: Contacts that are there already, which stay, shape [1].

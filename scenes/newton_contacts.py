@@ -1,6 +1,7 @@
 """Newton moves rings that fall over a peg; their contacts are found here, between the meshes themselves.
 
-Newton's own pipeline threads the rings too, by fields of distances made beforehand. Needs the extra `newton`:
+Newton 1.8's own pipeline threads the rings too, by edges against a BVH, or by fields of distances made beforehand on
+CUDA. Needs the extra `newton`:
 
     python scenes/newton_contacts.py [--device cpu] [--rings 6] [--seconds 3]
 """

@@ -156,7 +156,7 @@ def run_words(words):
     if absent:
         return f"needs {', '.join(absent)}"
     if "--frames" in words:
-        words[words.index("--frames") + 1] = "2"
+        words[words.index("--frames") + 1] = "3"
     elif words[0] == "run":
         words = [*words, "--frames", "2"]
     if words[0] == "sweep" and "--ray" not in words and ("--workers" in words or not missing(["ray"])):

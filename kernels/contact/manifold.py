@@ -14,7 +14,7 @@ from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 POINTS = wp.constant(8)
-"""Points that stand for a pair."""
+"""Points that stand for a pair, unless told otherwise."""
 
 # A face seen at a smaller cosine along a direction says nothing about depth in that direction.
 FACING = wp.constant(wp.float64(0.1))
@@ -47,9 +47,9 @@ class Manifolds:
     """Points that stand for each pair, world frame."""
 
     count: wp.array(dtype=wp.int32)  # points of it, shape [pair]
-    point: wp.array2d(dtype=wp.vec3d)  # [world units], shape [pair, POINTS]
-    normal: wp.array2d(dtype=wp.vec3d)  # unit, from the pair's first object to its second, shape [pair, POINTS]
-    depth: wp.array2d(dtype=wp.float64)  # [world units] along the normal, negative if apart, shape [pair, POINTS]
+    point: wp.array2d(dtype=wp.vec3d)  # [world units], shape [pair, points]
+    normal: wp.array2d(dtype=wp.vec3d)  # unit, from the pair's first object to its second, shape [pair, points]
+    depth: wp.array2d(dtype=wp.float64)  # [world units] along the normal, negative if apart, shape [pair, points]
 
 
 @wp.func

@@ -1,19 +1,22 @@
 """The few points that stand for an object pair, chosen of the candidates of its contacts."""
 
+import functools
+
 import warp as wp
 
 from warp_abtree.kernels.arrays import ObjectPool
 from warp_abtree.kernels.contact.manifold import NO_DEPTH, POINTS, Curves, Manifolds
 from warp_abtree.kernels.traversal.warp_stack import warp_lane, warp_max, warp_size
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
 
 # Squared part of the spread within which a point adds nothing to others.
 NEAREST_POINT = wp.constant(wp.float64(2.0**-9))
 # By which part of its distance a point is favoured at the far end of the spread.
 FAVOUR = wp.constant(wp.float64(2.0**-5))
 # Part of the spread by which points may be less deep than the deepest, and apart, to be chosen before others.
-FIRST_PART = wp.constant(wp.float64(2.0**-5))
+FIRST_PART = wp.constant(wp.float64(2.0**-9))
 # The deepest point is among those chosen if this part of its depth is more than theirs.
 DEEPER = wp.constant(wp.float64(0.9))
 
@@ -72,10 +75,12 @@ def distance_squared(
     """Return how far a candidate lies from the nearest segment that ends at a chosen point, normals counted in sizes.
 
     Args:
-        end: That point. Segments begin at those before it and at itself.
+        end: That point. Segments begin at those before it and at itself; from `POINTS` on at itself alone, so that
+            many points cost no more than their number.
     """
     nearest = wp.float64(wp.inf)
-    for j in range(end + 1):
+    j = wp.where(end < POINTS, 0, end)
+    while j <= end:
         r = x - point[j]
         u = size * (normal - normals[j])
         s = point[end] - point[j]
@@ -88,6 +93,7 @@ def distance_squared(
         d = r - t * s
         e = u - t * v
         nearest = wp.min(nearest, wp.dot(d, d) + wp.dot(e, e))
+        j += 1
     return nearest
 
 
@@ -171,6 +177,12 @@ def find_next(
 
 
 @wp.func
+def order_direction(rotation: wp.mat33d):
+    """Return the direction along which the points of a pair are in order, of its lower object's rotation."""
+    return rotation * wp.vec3d(wp.float64(0.6134), wp.float64(0.5327), wp.float64(0.5831))
+
+
+@wp.func
 def write_in_order(
     p: wp.int32,
     count: wp.int32,
@@ -199,61 +211,72 @@ def write_in_order(
         manifolds.count[p] = count
 
 
-@wp.kernel
-def spread_point_kernel(
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    gap: wp.array(dtype=wp.float64),
-    start: wp.array(dtype=wp.int32),
-    curves_inout: Curves,
-    manifolds_out: Manifolds,
-):
-    """Choose the points of one pair a warp: an outermost one, those farthest from those before, the deepest.
-
-    Distance counts places, and normals in sizes of the pair's contact; depth counts from the gap on. Where no face of
-    the pair looks along its contact's normal, the middles of the contacts serve, with depth 0. All lanes know the
-    points chosen.
-    """
-    p = wp.tid() / warp_size()
-    first = start[p]
-    end = start[p + 1]
-    if first >= end:
-        manifolds_out.count[p] = 0
-        return
-    zero = wp.float64(0.0)
-    shell = zero
-    if gap.shape[0] > 0:
-        shell = gap[p]
-    along = objects.rotation[wp.min(pairs[p][0], pairs[p][1])] * wp.vec3d(
-        wp.float64(0.6134), wp.float64(0.5327), wp.float64(0.5831)
-    )
-    deepest_at, deepest = find_deepest(first, end, curves_inout)
-    half = wp.float64(0.5) * (deepest + shell) - shell
-    best, reach = find_outermost(first, end, half, along, curves_inout)
-    if reach == -wp.float64(wp.inf):
-        manifolds_out.count[p] = 0
-        return
+@wp.func
+def begin_choice(deepest: wp.float64, shell: wp.float64):
+    """Return how the points of a pair are chosen whose deepest candidate and gap are known."""
     choice = Choice()
     choice.lowest = wp.where(deepest == NO_DEPTH, NO_DEPTH, -shell)
     choice.floor = choice.lowest
-    choice.first_floor = wp.where(shell > zero, wp.min(deepest, zero), choice.lowest)
-    point = wp.zeros(shape=(POINTS,), dtype=wp.vec3d)
-    normals = wp.zeros(shape=(POINTS,), dtype=wp.vec3d)
-    depth = wp.zeros(shape=(POINTS,), dtype=wp.float64)
-    count = wp.int32(0)
-    deep = -shell
-    searching = bool(True)
-    while searching:
-        i = best / CANDIDATES
-        found = curves_inout.depth[i, best % CANDIDATES]
-        point[count] = curves_inout.point[i, best % CANDIDATES]
-        normals[count] = curves_inout.normal[i]
-        depth[count] = wp.where(found == NO_DEPTH, zero, found)
-        deep = wp.max(deep, depth[count])
-        count += 1
-        best, farthest, choice = find_next(wp.vec2i(first, end), choice, along, count, point, normals, curves_inout)
-        if farthest <= choice.least or count == POINTS - 1:
-            best = deepest_at
-            searching = DEEPER * (deepest + shell) > deep + shell
-        searching = searching and count < POINTS
-    write_in_order(p, count, along, point, normals, depth, manifolds_out)
+    choice.first_floor = wp.where(shell > wp.float64(0.0), wp.min(deepest, wp.float64(0.0)), choice.lowest)
+    return choice
+
+
+@functools.cache
+def point_spreader(most: int):
+    """Return the kernel that chooses the points of each pair, so many at most."""
+
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    def spread_point_kernel(
+        objects: ObjectPool,
+        pairs: wp.array(dtype=wp.vec2i),
+        gap: wp.array(dtype=wp.float64),
+        start: wp.array(dtype=wp.int32),
+        curves_inout: Curves,
+        manifolds_out: Manifolds,
+    ):
+        """Choose the points of one pair a warp: an outermost one, those farthest from those before, the deepest.
+
+        Distance counts places, and normals in sizes of the pair's contact; depth counts from the gap on. Where no face
+        of the pair looks along its contact's normal, the middles of the contacts serve, with depth 0. All lanes know
+        the points chosen.
+        """
+        p = wp.tid() / warp_size()
+        first = start[p]
+        end = start[p + 1]
+        if first >= end:
+            manifolds_out.count[p] = 0
+            return
+        zero = wp.float64(0.0)
+        shell = zero
+        if gap.shape[0] > 0:
+            shell = gap[p]
+        along = order_direction(objects.rotation[wp.min(pairs[p][0], pairs[p][1])])
+        deepest_at, deepest = find_deepest(first, end, curves_inout)
+        half = wp.float64(0.5) * (deepest + shell) - shell
+        best, reach = find_outermost(first, end, half, along, curves_inout)
+        if reach == -wp.float64(wp.inf):
+            manifolds_out.count[p] = 0
+            return
+        choice = begin_choice(deepest, shell)
+        point = wp.zeros(shape=(wp.static(most),), dtype=wp.vec3d)
+        normals = wp.zeros(shape=(wp.static(most),), dtype=wp.vec3d)
+        depth = wp.zeros(shape=(wp.static(most),), dtype=wp.float64)
+        count = wp.int32(0)
+        deep = -shell
+        searching = bool(True)
+        while searching:
+            i = best / CANDIDATES
+            found = curves_inout.depth[i, best % CANDIDATES]
+            point[count] = curves_inout.point[i, best % CANDIDATES]
+            normals[count] = curves_inout.normal[i]
+            depth[count] = wp.where(found == NO_DEPTH, zero, found)
+            deep = wp.max(deep, depth[count])
+            count += 1
+            best, farthest, choice = find_next(wp.vec2i(first, end), choice, along, count, point, normals, curves_inout)
+            if farthest <= choice.least or count == wp.static(most - 1):
+                best = deepest_at
+                searching = DEEPER * (deepest + shell) > deep + shell
+            searching = searching and count < wp.static(most)
+        write_in_order(p, count, along, point, normals, depth, manifolds_out)
+
+    return spread_point_kernel

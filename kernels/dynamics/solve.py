@@ -194,7 +194,6 @@ class Overlap:
     mass: wp.float64  # effective mass along the normal
     bias: wp.float64  # separation speed aimed for [world units/s]
     approach: wp.float64  # speed at which its points may approach [world units/s]
-    impulse: wp.float64  # accumulated, along the normal
     pseudo_impulse: wp.float64  # accumulated, of the correction
 
 
@@ -207,7 +206,6 @@ def load_overlap(manifolds: Manifolds, constraints: Constraints, p: wp.int32, k:
     c.mass = constraints.mass[p, k]
     c.bias = constraints.bias[p, k]
     c.approach = constraints.approach[p, k]
-    c.impulse = constraints.impulse[p, k]
     c.pseudo_impulse = constraints.pseudo_impulse[p, k]
     return c
 
@@ -253,11 +251,8 @@ def relax_positions(
             at_a = point_velocity(a.inverse_inertia, pseudo_a, angular_a, c.arm_a)
             at_b = point_velocity(b.inverse_inertia, pseudo_b, angular_b, c.arm_b)
             separation = wp.dot(c.normal, at_b - at_a) + wp.max(speed, zero)
-            after = c.pseudo_impulse - c.mass * (separation - c.bias)
-            # Resting contacts sink to the slop, where rounding does not break them; other points are never pulled.
-            if fast == zero or c.impulse <= zero:
-                wanted = wp.max(c.bias, zero) - c.approach
-                after = wp.max(c.pseudo_impulse - c.mass * (separation - wanted), zero)
+            wanted = wp.max(c.bias, zero) - c.approach
+            after = wp.max(c.pseudo_impulse - c.mass * (separation - wanted), zero)
             constraints.pseudo_impulse[p, k] = after
             impulse = (after - c.pseudo_impulse) * c.normal
             pseudo_a = push_velocity(a, pseudo_a, -impulse)

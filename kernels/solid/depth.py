@@ -1,10 +1,9 @@
 """How deep an object pair is: the greatest depth of samples of one surface inside the other object, a solid.
 
-Samples of a face are its corners, the middles of its edges and its centroid. The depth of a point inside is its
-distance from the surface. A motion that is shorter leaves it inside, so the greatest depth is a lower bound of any
-motion that frees the two. Nodes of the tree whose samples are looked at are dropped where, by the distance of their
-middle from the surface, nothing below can be inside, or deeper than what is known; never where it may be as deep, so
-that the deepest sample, the lowest of several, is found in any order.
+A motion shorter than the depth of a sample (`solid.samples`) leaves it inside, so the greatest depth is a lower bound
+of any motion that frees the two. Nodes of the tree whose samples are looked at are dropped where, by the distance of
+their middle from the surface, nothing below can be inside, or deeper than what is known; never where it may be as deep,
+so that the deepest sample, the lowest of several, is found in any order.
 """
 
 import warp as wp
@@ -35,6 +34,17 @@ from warp_abtree.kernels.solid.nearest_face import (
     square_outside,
 )
 from warp_abtree.kernels.solid.parity import face_corners, is_inside
+from warp_abtree.kernels.solid.samples import (
+    HALF,
+    KNOWN,
+    NO_SAMPLE,
+    SAMPLES,
+    Deepest,
+    Sampling,
+    is_avoided,
+    measure_samples,
+    sample_weights,
+)
 from warp_abtree.kernels.traversal.boxes import round_up
 from warp_abtree.kernels.traversal.face_pairs import Hits
 from warp_abtree.kernels.traversal.node_pair import four_items, item_first, item_second, pack_item
@@ -52,45 +62,6 @@ from warp_abtree.kernels.traversal.warp_stack import (
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
-# Points of a face that are looked at.
-SAMPLES = wp.constant(7)
-NO_SAMPLE = wp.constant(wp.int64(2**63 - 1))
-# Before all samples: of what is known already, equally deep ones are no better.
-KNOWN = wp.constant(wp.int64(-1))
-HALF = wp.constant(wp.float64(0.5))
-
-
-@wp.struct
-class Deepest:
-    """The deepest sample found so far."""
-
-    depth: wp.float64  # [model units], 0 for none
-    item: wp.int64  # see `pack_deepest`
-
-
-@wp.func
-def pack_deepest(face: wp.int32, sample: wp.int32, nearest: wp.int32):
-    """Return the item of a sample and the face that is nearest; the lowest of several that are equally deep counts:
-
-    63 62                        33 32    30 29                         0
-    [0|       face of the sample    | sample |      face that is nearest   ]
-    """
-    return (wp.int64(face) << wp.int64(33)) | (wp.int64(sample) << wp.int64(30)) | wp.int64(nearest)
-
-
-@wp.func
-def sample_weights(sample: wp.int32):
-    """Return the weights of a face's corners at a sample: corners, middles of the edges behind them, the centroid."""
-    w = wp.vec3d()
-    if sample == SAMPLES - 1:
-        third = wp.float64(1.0) / wp.float64(3.0)
-        return wp.vec3d(third, third, third)
-    k = sample % 3
-    w[k] = wp.where(sample < 3, wp.float64(1.0), HALF)
-    if sample >= 3:
-        w[(k + 1) % 3] = HALF
-    return w
-
 
 @wp.func
 def bound_depth(
@@ -102,6 +73,7 @@ def bound_depth(
     node: Node,
     hint: wp.int32,
     known: wp.float64,
+    sampling: Sampling,
 ):
     """Return an upper bound of the depth below a node, negative only where it is less than what is known, and a face.
 
@@ -116,6 +88,8 @@ def bound_depth(
     if inner.of_b:
         middle = pose_point(pose.rotation, pose.translation, middle)
     reach = wp.length(HALF * (upper - lower)) * outer.grow + outer.margin
+    if is_avoided(sampling, middle, reach):
+        return none, hint
     # What is inside lies within the root's box, and no deeper than its nearest side.
     root = load_node(states, outer.node + 1)
     x = into_frame(pose, outer, middle)
@@ -136,39 +110,6 @@ def bound_depth(
 
 
 @wp.func
-def measure_samples(
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    inner: Whose,
-    outer: Whose,
-    face: wp.int32,
-    hint: wp.int32,
-    known: Deepest,
-):
-    """Return the deepest of what is known and the samples of a face that are inside the outer object."""
-    best = known
-    a, b, c = face_corners(models, states, pose, inner.of_b, face)
-    centre = wp.where(inner.of_b, outer.centre, inner.centre)
-    root = load_node(states, outer.node + 1)
-    near = wp.int32(hint)
-    k = wp.int32(0)
-    while k < SAMPLES:
-        w = sample_weights(k)
-        point = (w[0] * a + w[1] * b) + w[2] * c
-        if square_outside(root, into_frame(pose, outer, point)) <= outer.margin * outer.margin:
-            distance, near = nearest_face(models, states, pose, outer, point, near, best.depth)
-            if distance >= best.depth and distance > wp.float64(0.0):
-                item = pack_deepest(face, k, near)
-                if distance > best.depth or item < best.item:
-                    if is_inside(models, states, pose, outer.of_b, centre, point):
-                        best.depth = distance
-                        best.item = item
-        k += 1
-    return best
-
-
-@wp.func
 def agree(best: Deepest):
     """Return the deepest of what all lanes have found, the lowest of several."""
     found = Deepest()
@@ -186,6 +127,7 @@ def find_deepest(
     outer: Whose,
     room: wp.int32,
     known: Deepest,
+    sampling: Sampling,
 ):
     """Return the deepest of what is known and all samples of one object inside the other, the same in all lanes.
 
@@ -217,25 +159,77 @@ def find_deepest(
             for k in range(2):
                 child = load_node(states, inner.node + wp.where(live, 2 * node + k, 1))
                 if live:
-                    bound, near = bound_depth(models, states, pose, inner, outer, child, item_second(item), best.depth)
+                    near = item_second(item)
+                    bound, near = bound_depth(models, states, pose, inner, outer, child, near, best.depth, sampling)
                     if bound >= wp.float64(0.0):
                         kinds[k] = wp.where(child.face >= 0, FACES, NODES)
                         children[k] = pack_item(wp.where(child.face >= 0, child.face, child.skip), near)
                         bounds[k] = -round_up(bound)
             ends = push_nearest(items, end, waiting, kinds, children, bounds)
             warp_sync()
-            end = item_second(ends)
-            waiting = item_first(ends)
+            waiting, end = item_first(ends), item_second(ends)
         if waiting >= warp_size() or (waiting > 0 and end == 0):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
             at = STACK_LENGTH + waiting + wp.min(warp_lane(), popped - 1)
             item = read_item(items, at)
             if warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth:
-                best = measure_samples(models, states, pose, inner, outer, item_first(item), item_second(item), best)
+                face, near = item_first(item), item_second(item)
+                best = measure_samples(models, states, pose, inner, outer, face, near, best, sampling)
             warp_sync()
             best = agree(best)
     return best
+
+
+@wp.func
+def deepest_of_both(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    solids: Solids,
+    first: Whose,
+    second: Whose,
+    pair: wp.vec2i,
+    room: wp.int32,
+    known: Deepest,
+    sampling: Sampling,
+):
+    """Return the deepest of what is known and all samples of either object inside the other, where that is a solid."""
+    best = known
+    if solids.is_solid[wp.max(pair[0], pair[1])] != 0:
+        best = find_deepest(models, states, pose, first, second, room, known, sampling)
+    if solids.is_solid[wp.min(pair[0], pair[1])] != 0:
+        other = Deepest()
+        other.depth = best.depth
+        other.item = KNOWN
+        other = find_deepest(models, states, pose, second, first, room, other, sampling)
+        if other.item != KNOWN:
+            best = other
+            best.of_b = True
+    return best
+
+
+@wp.func
+def deepest_points(
+    models: ModelPool, states: StatePool, objects: ObjectPool, pose: PairPose, pair: wp.vec2i, best: Deepest
+):
+    """Return the deepest sample of a pair and the point of the other's surface that is nearest: in A's frame, posed."""
+    face = wp.int32(best.item >> wp.int64(33))
+    weights = sample_weights(wp.int32((best.item >> wp.int64(30)) & wp.int64(7)))
+    nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
+    a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
+    inner, outer = wp.where(best.of_b, b, a), wp.where(best.of_b, a, b)
+    u, v, w = face_corners(models, states, pose, best.of_b, face)
+    point = (weights[0] * u + weights[1] * v) + weights[2] * w
+    u, v, w = face_corners(models, states, pose, not best.of_b, nearest)
+    near, _size = point_features(u, v, w, point)
+    ids = states.face_corner[states.face_start[objects.state[outer]] + nearest]
+    foot = blend_corners(models, ids, point_weights(near))
+    foot = pose_point(objects.rotation[outer], objects.position[outer], foot)
+    ids = states.face_corner[states.face_start[objects.state[inner]] + face]
+    sample = blend_corners(models, ids, weights)
+    sample = pose_point(objects.rotation[inner], objects.position[inner], sample)
+    return point, sample, foot
 
 
 @wp.func
@@ -246,33 +240,20 @@ def report_deepest(
     pose: PairPose,
     frame: Frame,
     pair: wp.vec2i,
-    of_b: bool,
     best: Deepest,
     p: wp.int32,
     distances: Distances,
 ):
     """Write the deepest sample of a pair, the point of the other's surface that is nearest, and their faces."""
+    _point, sample, foot = deepest_points(models, states, objects, pose, pair, best)
     face = wp.int32(best.item >> wp.int64(33))
-    weights = sample_weights(wp.int32((best.item >> wp.int64(30)) & wp.int64(7)))
     nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
-    a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
-    inner, outer = wp.where(of_b, b, a), wp.where(of_b, a, b)
-    u, v, w = face_corners(models, states, pose, of_b, face)
-    point = (weights[0] * u + weights[1] * v) + weights[2] * w
-    u, v, w = face_corners(models, states, pose, not of_b, nearest)
-    near, _size = point_features(u, v, w, point)
-    ids = states.face_corner[states.face_start[objects.state[outer]] + nearest]
-    foot = blend_corners(models, ids, point_weights(near))
-    foot = pose_point(objects.rotation[outer], objects.position[outer], foot)
-    ids = states.face_corner[states.face_start[objects.state[inner]] + face]
-    sample = blend_corners(models, ids, weights)
-    sample = pose_point(objects.rotation[inner], objects.position[inner], sample)
     d = best.depth
     slack = slack_of(frame, d)
     least = wp.max((d - slack) / frame.stretch, wp.float64(0.0))
     distances.distance[p] = -d
     distances.bracket[p] = wp.vec2d(-(d * frame.stretch + slack), -least)
-    if of_b:
+    if best.of_b:
         write_nearest(p, pose.swapped, nearest, face, foot, sample, distances)
     else:
         write_nearest(p, pose.swapped, face, nearest, sample, foot, distances)
@@ -312,18 +293,9 @@ def find_depth_kernel(
     first = make_whose(models, states, pose, frame, False, objects.state[a])
     second = make_whose(models, states, pose, frame, True, objects.state[b])
     best = Deepest()
-    best.item = NO_SAMPLE
-    of_b = bool(False)
-    if solids.is_solid[b] != 0:
-        best = find_deepest(models, states, pose, first, second, room, best)
-    if solids.is_solid[a] != 0:
-        other = Deepest()
-        other.depth = best.depth
-        other.item = KNOWN
-        other = find_deepest(models, states, pose, second, first, room, other)
-        if other.item != KNOWN:
-            best.depth = other.depth
-            best.item = other.item
-            of_b = bool(True)
-    if best.depth > wp.float64(0.0) and warp_lane() == 0:
-        report_deepest(models, states, objects, pose, frame, pairs[p], of_b, best, p, distances_inout)
+    best.item = KNOWN
+    sampling = Sampling()
+    sampling.samples = SAMPLES
+    best = deepest_of_both(models, states, pose, solids, first, second, pairs[p], room, best, sampling)
+    if best.item != KNOWN and warp_lane() == 0:
+        report_deepest(models, states, objects, pose, frame, pairs[p], best, p, distances_inout)

@@ -91,6 +91,8 @@ def test_query_against_the_library(files, capsys):
     assert found["lods"] == scene.lods.tolist()
     bound = ball.error_at(found["lods"][0]) + ring.error_at(900)
     assert found["bound"] == (pytest.approx(bound) if np.isfinite(bound) else None)
+    extents = [np.ptp(model.mesh_at(model.lod_max)[0], axis=0) for model in scene.models]
+    assert found["diagonals"] == pytest.approx([(extent @ extent) ** 0.5 for extent in extents])
 
     apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "distance")
     lower, upper = apart["bracket"]

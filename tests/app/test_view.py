@@ -187,6 +187,41 @@ def test_settings_reach_the_viewer_scene(playback):
     assert sorted(show.show()[1]) == [(f"/objects/{i}", "color") for i in range(3)]
 
 
+def test_distances_are_drawn_between_nearest_points(playback):
+    """Of pairs that are apart, as segments and numbers, at the places of the moment."""
+    show = Show(playback)
+    assert not len(show.show()[0].nearest) and "/distances" not in show.api.handles
+    show.settings.distances = True
+    for x in (6.0, 7.0):
+        data, _ = show.show(moved={2: x})
+        found = playback.scene.intersect(np.array([[0, 1], [0, 2], [1, 2]]), output="distance")
+        apart = found.distance > 0
+        assert apart.tolist() == [False, True, True]
+        np.testing.assert_array_equal(data.distance, found.distance[apart])
+        line = show.api.handles["/distances"]
+        np.testing.assert_array_equal(line.points, found.points[apart].astype(np.float32))
+        least = data.distance.argmin()
+        label = show.api.handles["/distance/0"]
+        assert float(label.text) == pytest.approx(data.distance[least], rel=1e-3)
+        np.testing.assert_allclose(label.position, data.nearest[least].mean(axis=0))
+    panel = scenes.make_panel(show.cache, data)
+    assert len(panel.lines[0][0]) == len(panel.labels) == 2
+    show.show(moved={2: 0.6})
+    assert not show.api.handles["/distance/1"].visible
+    show.settings.distances = False
+    show.show()
+    assert not show.api.handles["/distances"].visible and not show.api.handles["/distance/0"].visible
+
+
+def test_many_objects_have_distances_where_boxes_overlap(playback, monkeypatch):
+    scene, shown = playback.scene, np.arange(3)
+    result = playback.query("count").result
+    all_pairs, _ = geometry.nearest_points(scene, shown, result)
+    monkeypatch.setattr(geometry, "FEW_OBJECTS", 2)
+    near, _ = geometry.nearest_points(scene, shown, result)
+    assert len(near) < len(all_pairs) and len(near) == (scene.intersect(result.pairs, "distance").distance > 0).sum()
+
+
 def test_objects_of_a_model_and_lod_are_instances_of_one_mesh(playback, monkeypatch):
     monkeypatch.setattr(stages, "SINGLE_LIMIT", 0)
     show = Show(playback)

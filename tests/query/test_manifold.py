@@ -164,3 +164,25 @@ def test_room_grows_and_changes_nothing(device):
     for name, values in ample.points.items():
         for points in (tight.points, query.result().points):
             assert np.array_equal(values, points[name]), name
+
+
+@pytest.mark.parametrize("most", [8, 24])
+def test_points_are_as_many_as_asked_for(device, most):
+    """A ball in a cavity is near all around: more points leave smaller caps of directions without one, none twice."""
+    ball, cavity = trimesh.creation.icosphere(2, 1.0), trimesh.creation.icosphere(2, 1.01)
+    cavity.invert()
+    shell = ab.Model.from_arrays(cavity.vertices, cavity.faces)
+    with pytest.warns(RuntimeWarning, match="inside out"):
+        points = ask(device, (model_of(ball), STILL), (shell, STILL), gap=0.02, points=most)[1].points
+    normals = points["normal"]
+    assert most - 1 <= len(normals) <= most  # the last place is the deepest's, if it is deeper
+    seen = (normals @ np.asarray(ball.vertices).T).max(0).min()  # cosine of the emptiest cap
+    # Farthest-first is at worst twice as wide as the best; and 24 do what no 8 can, 48 degrees.
+    assert seen > {8: -0.11, 24: 0.67}[most]
+    assert (1 - normals @ normals.T + 2 * np.eye(len(normals))).min() > 0.02
+
+
+def test_numbers_of_points_that_are_none_are_refused(device):
+    for points in (0, 65, 2.5, "8"):
+        with pytest.raises(ValueError, match="points"):
+            ab.ManifoldQuery(ab.Scene(device), points=points)

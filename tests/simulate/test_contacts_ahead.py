@@ -30,18 +30,18 @@ def test_a_box_that_falls_stops_at_the_surface(device, speed, turn):
     for _ in range(90):
         dynamics.step(1 / 60)
         worst = max(worst, depth_in_floor(dynamics, BOX))
-    assert 0.5 < depth_in_floor(dynamics, BOX) < 2
+    assert -0.1 < depth_in_floor(dynamics, BOX) < 2
     assert worst < (4 if turn == 0 else 30)
     assert np.abs(dynamics.velocities()[0]).max() < 0.05
 
 
-@pytest.mark.parametrize("model, most", [(FINE_TORUS, 2.0), (FINE_BALL, 4.0)])
+@pytest.mark.parametrize("model, most", [(FINE_TORUS, 1.5), (FINE_BALL, 2.0)])
 def test_fine_meshes_rest_a_few_slops_deep_at_60_steps_a_second(device, model, most):
     low = model.mesh_at(model.lod_max)[0][:, 2].min()
     dynamics = on_ground(device, (model, (0, 0, 0.3 - low, *about((0, 0, 1), 0.3))))
     for _ in range(90):
         dynamics.step(1 / 60)
-    assert 0.5 < depth_in_floor(dynamics, model) < most
+    assert -0.1 < depth_in_floor(dynamics, model) < most
 
 
 def test_bodies_that_fly_together_have_no_contacts(device):

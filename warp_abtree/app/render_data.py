@@ -8,6 +8,8 @@ from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.query.result import Result
 from warp_abtree.simulate.frame_row import FrameRow
 
+LABELS = 32  # distances that are told in numbers, at most
+
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
@@ -28,6 +30,7 @@ class Settings:
     world: int = 0  # objects of world -1 are in every one
     intersecting: bool = True  # whether intersecting faces are coloured
     by_lod: bool = False  # whether colours tell LODs in the place of models
+    distances: bool = False  # whether distances are drawn between objects that do not meet
 
     @property
     def output(self) -> str:
@@ -48,6 +51,13 @@ class RenderData:
     pair_count: int  # of intersecting faces, drawn or not
     faces: int  # active faces of the shown objects together
     error_mean: float  # mean certified error of the shown objects [units]
+    nearest: np.ndarray  # nearest points of object pairs that are apart, float64 (k, 2, 3)
+    distance: np.ndarray  # between them, float64 (k,)
+
+    def labels(self) -> list:
+        """Return (point, text) of the least distances, at the middles of their segments."""
+        told = np.argsort(self.distance, kind="stable")[:LABELS]
+        return [(self.nearest[i].mean(axis=0), f"{self.distance[i]:.4g}") for i in told]
 
 
 def objects_of_world(worlds, world: int) -> np.ndarray:
@@ -69,6 +79,7 @@ def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Sett
     distinct, repeats = np.unique(keys[shown], return_counts=True)
     meshes = [(*geometry.split_key(key), n) for key, n in zip(distinct.tolist(), repeats.tolist())]
     pairs = inside[result.pairs].all(axis=1) if len(result.pairs) else np.zeros(0, bool)
+    nearest, distance = geometry.nearest_points(scene, shown, result) if settings.distances else geometry.NO_NEAREST
     return RenderData(
         poses=snapshot.poses,
         keys=keys,
@@ -79,4 +90,6 @@ def compose(cache: geometry.MeshCache, snapshot: Snapshot, shown, settings: Sett
         pair_count=int(result.count[pairs].sum()) if result.count is not None else 0,
         faces=sum(cache.count(model, lod) * n for model, lod, n in meshes),
         error_mean=sum(scene.models[model].error_at(lod) * n for model, lod, n in meshes) / max(len(shown), 1),
+        nearest=nearest,
+        distance=distance,
     )

@@ -11,6 +11,8 @@ from warp_abtree.scene.scene import Scene
 
 LIFT = 1.5e-3  # of a model's diagonal: offset of intersecting faces from the mesh, to both sides
 COARSE, FINE = np.array((0.16, 0.24, 0.60)), np.array((1.0, 0.80, 0.20))
+FEW_OBJECTS = 12  # all pairs of which have distances drawn
+NO_NEAREST = np.empty((0, 2, 3)), np.empty(0)
 CACHED_FACES = 4_000_000  # that a cache of meshes keeps
 
 
@@ -111,6 +113,22 @@ def intersecting_triangles(cache: MeshCache, snapshot, intersecting) -> dict[int
         corners = np.concatenate([corners + step, corners - step])
         found.setdefault(owner, []).append(corners.astype(np.float32))
     return {owner: np.concatenate(parts) for owner, parts in found.items()}
+
+
+def nearest_points(scene: Scene, shown, result) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nearest points of shown object pairs that are apart, (k, 2, 3), and their distances, (k,).
+
+    Of a few objects these are all pairs, of more those whose boxes overlap, which the result has. Waits for the device.
+    """
+    if len(shown) <= FEW_OBJECTS:
+        pairs = shown[np.stack(np.triu_indices(len(shown), 1), 1)]
+    else:
+        pairs = result.pairs[np.isin(result.pairs, shown).all(axis=1)]
+    if not len(pairs):
+        return NO_NEAREST
+    found = scene.intersect(pairs, output="distance")
+    apart = found.distance > 0
+    return found.points[apart], found.distance[apart]
 
 
 def bounds(cache: MeshCache, snapshot, shown) -> tuple[np.ndarray, float]:

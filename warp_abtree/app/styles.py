@@ -7,6 +7,8 @@ COLOURS = (
     ((0.84, 0.50, 0.37), (0.97, 0.22, 0.60)),
     ((0.56, 0.48, 0.74), (0.20, 0.88, 0.94)),
 )
+# Segments between the nearest points of two objects.
+NEAREST_COLOUR = (0.85, 0.10, 0.10)
 # The stages of a frame; a budget is for the first four.
 STAGE_LABELS = {
     "select_ms": "select LODs",

@@ -7,9 +7,9 @@ pairs, and is deterministic.
 
 As Newton has it, two shapes have contacts where their distance is under the sum of both margins and both gaps
 (`ShapeConfig`), and rest with both margins between them. Newton's own gap of 0.1 m a shape makes very many contacts of
-fine meshes: give one that bodies move in a step. Depths and normals are those of `warp_abtree.query.manifold`. Pairs of
-shapes of which one is no mesh are passed to a pipeline of Newton's, whose contacts come first. Soft contacts are not
-found. Tested with Newton 1.8 (extra `newton`), which calls its contacts experimental.
+fine meshes: give one that bodies move in a step. Gaps are read once. Depths and normals are those of
+`warp_abtree.query.manifold`. Pairs of shapes of which one is no mesh, and particles, are passed to a pipeline of
+Newton's, whose contacts come first. Tested with Newton 1.8 (extra `newton`), which calls its contacts experimental.
 """
 
 from typing import Any
@@ -60,23 +60,42 @@ def group_pairs(group, world):
     return found
 
 
+def _filtered_pairs(model):
+    """Return the pairs of shapes that a model filters, (k, 2)."""
+    return np.array(sorted(model.shape_collision_filter_pairs), np.int64).reshape(-1, 2)
+
+
 def _excluded_pairs(model, shapes):
     """Return the object pairs that Newton never tests: filtered, of one body, or of groups that do not collide."""
     object_of = np.full(int(model.shape_count), -1)
     object_of[shapes] = np.arange(len(shapes))
-    listed = np.array(sorted(model.shape_collision_filter_pairs), np.int64).reshape(-1, 2)
     group, world = (values.numpy()[shapes] for values in (model.shape_collision_group, model.shape_world))
-    found = [object_of[listed], *same_body_pairs(model.shape_body.numpy()[shapes]), *group_pairs(group, world)]
-    pairs = np.sort(np.concatenate(found), axis=1)
+    bodies = same_body_pairs(model.shape_body.numpy()[shapes])
+    pairs = np.concatenate([object_of[_filtered_pairs(model)], *bodies, *group_pairs(group, world)])
+    pairs = np.sort(pairs, axis=1)
     return np.unique(pairs[(pairs[:, 0] >= 0) & (pairs[:, 0] < pairs[:, 1])], axis=0)
 
 
-def _other_pairs(model, is_mesh):
-    """Return the pairs of shapes that collide and are not both meshes, (k, 2); none where all shapes are meshes."""
-    if is_mesh.all():
-        return np.empty((0, 2), np.int32)
-    pairs = model.shape_contact_pairs.numpy().reshape(-1, 2)
-    return pairs[~is_mesh[pairs].all(1)]
+def _other_pairs(model, is_mesh, collide):
+    """Return the pairs of shapes that collide and are not both meshes, (k, 2), sorted; k is linear in the meshes.
+
+    Newton's own list of pairs has all pairs of meshes too.
+    """
+    names = ("shape_body", "shape_collision_group", "shape_world")
+    body, group, world = (np.asarray(getattr(model, name).numpy(), np.int64) for name in names)
+    collide = collide & (group != 0)
+    found = [np.empty((0, 2), np.int64)]
+    for place in np.unique(world[collide & ~is_mesh]):
+        rows = np.flatnonzero(collide & ~is_mesh & (world == place))
+        here = collide if place < 0 else collide & ((world == place) | (world < 0))
+        found.append(pairs_between(rows, np.flatnonzero(here)))
+    pairs = np.sort(np.concatenate(found), axis=1)
+    first, second = group[pairs].T
+    meet = np.where(first > 0, (first == second) | (second < 0), first != second)
+    low, high = np.maximum(body[pairs], -1).T
+    keys = np.unique(pairs[meet & (low != high)] @ [int(model.shape_count), 1])
+    keys = np.setdiff1d(keys, np.sort(_filtered_pairs(model), axis=1) @ [int(model.shape_count), 1])
+    return np.stack(np.divmod(keys, int(model.shape_count)), 1).astype(np.int32)
 
 
 class NewtonContacts:
@@ -87,19 +106,21 @@ class NewtonContacts:
         models: `Model` by shape index, to replace the shape's mesh, for example by one built before; in the shape's
             frame, scaled. Shapes of one mesh and scale share a model.
         capacity: As for `ManifoldQuery`; `collide` makes more room, `launch` does not.
+        points: Most points of a pair, as for `ManifoldQuery`: 8 hold up what rests, nested parts such as a nut on its
+            bolt want 32.
 
     Attributes:
         scene: `Scene` of the shapes, at their finest LODs; `scene.set_lods` changes these.
         shapes: Newton's shape of each object, int32 (n,).
         query: `ManifoldQuery`.
-        others: `newton.CollisionPipeline` of the pairs of which one is no mesh; None without, or before the first use.
+        others: `newton.CollisionPipeline` of pairs of which one is no mesh, and particles; None without, or before use.
 
     Raises:
         ImportError: Newton is not installed.
-        ValueError: Fewer than two mesh shapes.
+        ValueError: Fewer than two mesh shapes; or a mesh whose surface moves (`enable_surface_velocity`).
     """
 
-    def __init__(self, model, models=None, capacity=None):
+    def __init__(self, model, models=None, capacity=None, points=POINTS_MAX):
         import newton
 
         self.newton = newton
@@ -117,7 +138,8 @@ class NewtonContacts:
         static, world = model.shape_body.numpy()[found] < 0, model.shape_world.numpy()[found]
         self.scene.add_many(self._find_models(found, models or {}), still, worlds=world, statics=static)
         self.scene.filter(_excluded_pairs(model, self.shapes))
-        self._pairs_of_others = _other_pairs(model, is_mesh | ~collide)
+        self._pairs_of_others = _other_pairs(model, is_mesh, collide)
+        self._has_others = len(self._pairs_of_others) > 0 or model.particle_count > 0
         self.others: Any = None
         reach = np.zeros((len(found), 4))
         reach[:, 3] = (model.shape_margin.numpy() + model.shape_gap.numpy())[found]
@@ -128,7 +150,7 @@ class NewtonContacts:
         self._no_body = wp.empty(0, dtype=wp.transform, device=self.device)
         self._place(model.body_q)
         own = wp.array(reach, dtype=wp.vec4d, device=self.device)
-        self.query = ManifoldQuery(self.scene, None, capacity, gap=own)
+        self.query = ManifoldQuery(self.scene, None, capacity, gap=own, points=points)
         self._first = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._grow()
 
@@ -137,6 +159,8 @@ class NewtonContacts:
         known, scale, models = {}, self.model.shape_scale.numpy(), []
         for shape in shapes.tolist():
             source = self.model.shape_source[shape]
+            if getattr(source, "enable_surface_velocity", False):
+                raise ValueError(f"the surface of shape {shape} moves (enable_surface_velocity): not supported")
             key = (id(source), tuple(scale[shape].tolist()))
             if given.get(shape) is None and key not in known:
                 vertices = np.asarray(source.vertices, np.float64) * scale[shape]
@@ -150,26 +174,41 @@ class NewtonContacts:
         self._end = wp.zeros(room, dtype=wp.int32, device=self.device)
 
     def contacts(self, rigid_contact_max=None):
-        """Return an empty `newton.Contacts` for rigid contacts; by default with room for 8 of each pair."""
-        room = POINTS_MAX * (len(self.query.pairs) + min(len(self._pairs_of_others), OTHERS_MAX))
+        """Return an empty `newton.Contacts`; by default with room for all points of each pair."""
+        room = self.query.point_max * len(self.query.pairs)
+        room += POINTS_MAX * min(len(self._pairs_of_others), OTHERS_MAX)
         room = room if rigid_contact_max is None else rigid_contact_max
-        if not len(self._pairs_of_others):
+        if not self._has_others:
             return self.newton.Contacts(room, 0, device=self.device)
         self._make_others(room)
         return self.others.contacts()
 
     def _make_others(self, room):
-        """Make the pipeline of pairs of which one is no mesh, for contacts of some size."""
+        """Make the pipeline of what is not two meshes, for contacts of some size."""
         pairs = wp.array(self._pairs_of_others, dtype=wp.vec2i, device=self.device)
         self.others = self.newton.CollisionPipeline(
-            self.model, broad_phase="explicit", shape_pairs_filtered=pairs, rigid_contact_max=room
+            self.model,
+            broad_phase="explicit",
+            shape_pairs_filtered=pairs,
+            rigid_contact_max=room,
+            deterministic=self.device.is_cuda,  # the CPU has one order anyway
+        )
+
+    def _fits(self, contacts):
+        return not self._has_others or (
+            self.others is not None and self.others.rigid_contact_max == len(contacts.rigid_contact_shape0)
         )
 
     def collide(self, state, contacts):
-        """Replace the contents of `contacts` by the contacts at a state's poses, see `check`. Waits for the device."""
-        room = len(contacts.rigid_contact_shape0)
-        if len(self._pairs_of_others) and (self.others is None or self.others.rigid_contact_max != room):
-            self._make_others(room)
+        """Replace the contents of `contacts` by the contacts at a state's poses, see `check`.
+
+        Waits for the device. While a graph is captured it does no more than `launch`.
+        """
+        if self.device.is_capturing:
+            self.launch(state, contacts)
+            return
+        if not self._fits(contacts):
+            self._make_others(len(contacts.rigid_contact_shape0))
         self._place(state.body_q)
         self.query.grow()
         if len(self._count) != len(self.query.pairs):
@@ -178,7 +217,13 @@ class NewtonContacts:
         self.check(contacts)
 
     def launch(self, state, contacts):
-        """Do the same within the present capacity. Launches only, after a `collide`, so that a graph can capture it."""
+        """Do the same within the present capacity. Launches only, after a `collide`, so that a graph can capture it.
+
+        Raises:
+            ValueError: `contacts` have another size than those of `collide`, where Newton's own pipeline is needed.
+        """
+        if not self._fits(contacts):
+            raise ValueError("contacts have another size than those of the last collide()")
         with self.query.guard.launching(self):
             self._place(state.body_q)
             self.query.launch()

@@ -10,8 +10,8 @@ Meshes meet in curves, and a curve alone has no depth. Here is what is made of i
   normal, at the deepest place. Where the normal of either face is within 60 degrees of the loop's and makes that
   depth no larger, it takes the place of the loop's: so a box in a corner is pushed by floor and wall, each its own way.
 * Of all candidates of the pair an outermost one is taken, then those farthest, in place and in normal, from the
-  segments between those before, and the deepest, up to `POINTS` of them, in the order in which they lie along a fixed
-  direction of the lower object: points that stay keep their order from launch to launch.
+  segments between those before, and the deepest, up to 8 of them or as many as asked for, in the order in which they
+  lie along a fixed direction of the lower object: points that stay keep their order from launch to launch.
 
 With `gap=d` faces that are apart but nearer than d have candidates too, with minus a separation as depth. Where two
 faces look at one another within 60 degrees it is measured along the normal that leaves the wider gap: the nearest point
@@ -21,11 +21,20 @@ far: so what lies up to d inside is not forgotten once it no longer crosses. Acr
 if no other face of either object is nearer to them: so a box that slides over a floor of many faces is not stopped by
 the edges between them. Depths count from the gap on for what is half as deep as what.
 
-Normals come from the winding of the faces, outwards. Without a gap only surfaces that cross have contacts: an object
-that lies whole inside another has none. Depth is exact while every vertex inside has a face that crosses; once a whole
-ring of faces is inside it is that ring's, too little, and rings that go under in one step are forgotten: fine meshes
-come to rest several times as deep as they are told to (docs/dynamics.md has figures). Of two thin things that are
-through each other the way out is as likely forwards as back.
+Normals come from the winding of the faces, outwards. Depth is exact while every vertex inside has a face that crosses;
+once a whole ring of faces is inside it is that ring's, too little, and without a gap an object that lies whole inside
+another has no points. Solids (`Scene.add`) have more. Of an object pair that intersects, of which one is a solid:
+
+* Corners of one object inside the other, a solid, have as depth their distance from its surface, and the way there as
+  normal. Up to four become points, the deepest first, a quarter of the smaller object's size (the diagonal of its box)
+  from one another and at least half as deep as the first, and take the places of the nearest others if there is no
+  room.
+* They are looked for where they are needed: only corners that are deeper than all other points of the pair by 1/4096 of
+  that size count, and pairs whose points are all less deep than that are passed over.
+* Their ways out are within 90 degrees of the sum of the other points' normals; of what lies inside whole, of the way
+  out of the middle of its box. So they do not hold an object from both sides.
+
+Of two thin surfaces that are through each other the way out is as likely forwards as back.
 
 Source of the area vector as a gradient: Allard et al. 2010, Volume Contact Constraints at Arbitrary Resolution,
 section 3; that the boundary curve gives it is Stokes' theorem.
@@ -34,8 +43,11 @@ section 3; that the boundary curve gives it is Stokes' theorem.
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.contact import manifold, points
+from warp_abtree.checks.arguments import whole_number
+from warp_abtree.kernels.contact import manifold
+from warp_abtree.kernels.contact import points as point_kernels
 from warp_abtree.kernels.gap import near_points
+from warp_abtree.kernels.solid import inside_points
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.result import Found, Result
@@ -51,14 +63,17 @@ class ManifoldQuery(ContactQuery):
 
     Args:
         scene, pairs, capacity, precision, gap: As for `ContactQuery`.
+        points: Most points of a pair, 1 to 64. Those beyond the eighth lie farthest from any before them.
 
     Attributes:
-        manifolds: Points of each pair, device arrays (pair capacity, POINTS) of `kernels.manifold.Manifolds`, float64.
+        manifolds: Points of each pair, device arrays (pair capacity, points) of `kernels.manifold.Manifolds`, float64.
+        point_max: Most points of a pair.
     """
 
     growth = 2
 
-    def __init__(self, scene, pairs=None, capacity=None, precision="exact", gap=None):
+    def __init__(self, scene, pairs=None, capacity=None, precision="exact", gap=None, points=POINTS_MAX):
+        self.point_max = whole_number(points, "points", 1, 64)
         self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
         super().__init__(scene, pairs, capacity, precision, sort_pairs=True, gap=gap)
         self._no_gap = wp.empty(0, dtype=wp.float64, device=self.device)
@@ -73,7 +88,7 @@ class ManifoldQuery(ContactQuery):
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
-        points = (room, POINTS_MAX)
+        points = (room, self.point_max)
         made.append((self.manifolds, "count", wp.zeros(room, dtype=wp.int32, device=self.device)))
         for name, dtype in (("point", wp.vec3d), ("normal", wp.vec3d), ("depth", wp.float64)):
             made.append((self.manifolds, name, self._empty(points, dtype)))
@@ -103,7 +118,17 @@ class ManifoldQuery(ContactQuery):
         self._launch_kernel(manifold.average_loop_kernel, count, inputs)
         inputs = [*posed, gap, start, rows, contacts, curves]
         self._launch_kernel(manifold.find_candidate_kernel, count, inputs)
-        self._launch_warps(points.spread_point_kernel, room, [pools[2], self.pairs, gap, start, curves, self.manifolds])
+        spread = point_kernels.point_spreader(self.point_max)
+        self._launch_warps(spread, room, [pools[2], self.pairs, gap, start, curves, self.manifolds])
+        self._add_inside_points()
+
+    def _add_inside_points(self):
+        """Add points of what is inside, where there are solids. Launches only."""
+        if self.batch.solids is not None:
+            models, states, *posed = [*self.batch.pools, self.pair_count, self.pairs, self.pair_poses]
+            inputs = [self._stack_length(), models, states, self.batch.solids.pool, *posed]
+            inputs += [self.guard.launched, self.hits, self.manifolds]
+            self._launch_warps(inside_points.add_inside_point_kernel, len(self.pairs), inputs)
 
     def _sort_keys(self, count, bits):
         with wp.ScopedDevice(self.device):
@@ -120,7 +145,7 @@ class ManifoldQuery(ContactQuery):
             found.points = {name: wp.clone(array) for name, array in arrays.items()}
             return
         points = arrays["count"].numpy()
-        used = np.arange(POINTS_MAX) < points[:, None]
+        used = np.arange(self.point_max) < points[:, None]
         found.points = {"pair": np.repeat(np.arange(pairs), points)}
         for name in names:
             found.points[name] = arrays[name].numpy()[used]

@@ -68,6 +68,7 @@ def query(options, progress):
         "count": None if found.count is None else int(found.count[0]),
         "bound": sum(model.error_at(lod) for model, lod in zip(models, lods)),
         "lods": lods,
+        "diagonals": [_diagonal(model) for model in models],
         "active_faces": [active_count(model, lod) for model, lod in zip(models, lods)],
         "node_tests": int(found.node_tests[0]),
         "triangle_tests": int(found.triangle_tests[0]),
@@ -114,6 +115,11 @@ def _make_scene(options, progress):
     except ValueError as error:
         raise ValueError(f"--{error}") from None
     return scene, models
+
+
+def _diagonal(model) -> float:
+    """Return the diagonal of the original's box, which tells meshes of different units apart [model units]."""
+    return float(np.linalg.norm(np.ptp(model.mesh_at(model.lod_max)[0], axis=0)))
 
 
 def _flat_contacts(contacts) -> list[dict]:

@@ -17,6 +17,7 @@ EXAMPLES = (
     "scenes/bunny_tori.toml --frame 30 --out tori.png",
     "warp:bunny warp:bunny --lod 0.1 --out bunnies.png",
     "scenes/bunny_tori.toml --frames 60 --every 2 --out tori.webp",
+    "warp:bunny warp:bunny --pose 2 0 0 0 0 0 1 --distances --out distance.png",
     "bunny.npz --lod tol:0.01 --eye 1 0.3 0.5 --out bunny.png",
 )
 
@@ -30,6 +31,8 @@ def add_arguments(sub: Parser):
     sub.add_argument("--every", type=positive, default=1, metavar="K", help="of these, draw each K-th (1)")
     for name, what in (("eye", "direction to the eye"), ("up", "direction upwards")):
         sub.add_argument(f"--{name}", nargs=3, type=float, metavar=("X", "Y", "Z"), help=f"{what} (the scene's own)")
+    about = "draw distances between objects: of few all, of more those whose boxes overlap"
+    sub.add_argument("--distances", action="store_true", help=about)
     sub.add_argument("--world", type=int, metavar="W", help="world to draw (the scene's own)")
     sub.add_argument("--size", type=positive, default=SIZE, metavar="PX", help=f"pixels along a side ({SIZE})")
 
@@ -48,7 +51,7 @@ def picture(options, progress):
     objects = objects_of_world(playback.worlds, world)
     if not len(objects):
         raise ValueError(f"--world: no object is in world {world}")
-    settings = Settings(world)
+    settings = Settings(world, distances=options.distances)
     if options.frames is None:
         snapshot = go_to(playback, options.frame, settings.output, progress)
         progress.close()

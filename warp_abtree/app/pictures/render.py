@@ -32,6 +32,7 @@ class Panel:
     triangles: np.ndarray  # corners in the world [units], float64 (t, 3, 3)
     colours: np.ndarray  # of each triangle, float64 (t, 3), 0 to 1
     lines: list = field(default_factory=list)  # (ends in the world (k, 2, 3), colour) of each kind of line
+    labels: list = field(default_factory=list)  # (point in the world, text) of each
 
 
 def import_pyvista(what: str):
@@ -84,6 +85,11 @@ def render(panel: Panel, camera: Camera, size: int) -> np.ndarray:
                 points = np.asarray(ends, np.float64).reshape(-1, 3)
                 lines = pyvista.line_segments_from_points(points + LINE_LIFT * (camera.eye - points))
                 plotter.add_mesh(lines, color=colour, line_width=LINE_WIDTH, lighting=False)
+        if panel.labels:
+            places = np.array([point for point, _ in panel.labels])
+            lifted, texts = places + LINE_LIFT * (camera.eye - places), [text for _, text in panel.labels]
+            box = {"shape_color": BACKGROUND, "shape_opacity": 0.8, "margin": 3}
+            plotter.add_point_labels(lifted, texts, font_size=16, show_points=False, always_visible=True, **box)
         view = plotter.camera
         view.position, view.focal_point, view.up = camera.eye, camera.eye - camera.view[2], camera.view[1]
         view.view_angle = math.degrees(camera.field_of_view)

@@ -7,7 +7,7 @@ import numpy as np
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.pictures.render import Panel, camera_of, crop, draw, lay_out, render, write_animation
 from warp_abtree.app.render_data import RenderData, Settings, Snapshot, compose, objects_of_world
-from warp_abtree.app.styles import COLOURS
+from warp_abtree.app.styles import COLOURS, NEAREST_COLOUR
 from warp_abtree.scene.scene import Scene
 
 SIZE = 800  # pixels
@@ -32,7 +32,8 @@ def make_panel(cache: geometry.MeshCache, data: RenderData, title: str | None = 
     count = len(data.shown)
     title = title or f"{count:,} object{'' if count == 1 else 's'}, {data.faces:,} faces"
     title += f"\n{data.pair_count:,} intersecting face pairs"
-    return Panel(title, np.concatenate(triangles), np.concatenate(colours))
+    lines = [(data.nearest, NEAREST_COLOUR)] if len(data.nearest) else []
+    return Panel(title, np.concatenate(triangles), np.concatenate(colours), lines, data.labels())
 
 
 def make_legend(scene: Scene, panels: list[RenderData]) -> list:

@@ -97,6 +97,7 @@ class Page:
 
         box("intersecting faces", "intersecting")
         box("colours by LOD", "by_lod", "blue is coarse, yellow fine")
+        box("distances", "distances", "of few objects all, of many those whose boxes overlap")
         worlds = np.unique(self.playback.worlds)
         if len(worlds) > 1 and worlds.max() > 0:
             world = gui.add_number("world", self.settings.world, min=0, max=int(worlds.max()), step=1)
@@ -226,6 +227,8 @@ class Page:
             ("intersecting face pairs", f"{data.pair_count:,}"),
             ("intersecting faces", f"{data.intersecting_count:,}"),
         ]
+        if len(data.distance):
+            rows.append(("least distance", f"{data.distance.min():.6g}"))
         if row is not None:
             rows += [(label, f"{getattr(row, name):.1f} ms") for name, label in STAGE_LABELS.items()]
             rows.append(("frame", f"{row.total_ms:.1f} ms"))

@@ -8,10 +8,11 @@ import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
 from warp_abtree.app.render_data import RenderData
-from warp_abtree.app.styles import COLOURS, to_bytes
+from warp_abtree.app.styles import COLOURS, NEAREST_COLOUR, to_bytes
 
 SINGLE_LIMIT = 24  # objects up to which each has its own mesh; with more, those of a model and LOD are instances of one
 READY_SECONDS = 0.25  # that a browser takes to draw instances of a new mesh
+LINE = {"thickness": 2.5, "thickness_units": "screen"}
 HIDDEN_MESHES = 48  # kept by the browser, invisible, for when their LOD comes back
 PLAIN = {"flat_shading": True, "side": "double", "cast_shadow": False, "receive_shadow": False}
 
@@ -43,6 +44,7 @@ class ViewerScene:
         self._single: dict[int, _Node] = {}
         self._meshes: dict[int, _Node] = {}
         self._layers: dict[str, _Node] = {}
+        self._labels: list[_Node] = []
         # The key of the mesh that each object shows, and of the one that it waits for; -1 is none.
         self._now, self._next = np.full(count, -1, np.int64), np.full(count, -1, np.int64)
 
@@ -54,6 +56,7 @@ class ViewerScene:
         for owner in range(len(self.cache.scene.models)):
             corners = data.intersecting.get(owner, ())
             self._show_triangles(f"/intersecting/{owner}", corners, COLOURS[owner % len(COLOURS)][1])
+        self._show_distances(data)
 
     def _update(self, node: _Node, **arrays):
         """Assign the arrays that differ from those sent last."""
@@ -170,6 +173,42 @@ class ViewerScene:
         elif node is not None:
             self._update(node, **arrays)
             self._visible(node, bool(arrays))
+
+    def _show_distances(self, data):
+        """Show the segments between nearest points, and the least distances in numbers at their middles."""
+        node, count = self._layers.get("/distances"), len(data.distance)
+        if node is None and count:
+            colour = np.array(to_bytes(NEAREST_COLOUR), np.uint8)
+            arrays = {"points": data.nearest.astype(np.float32), "colors": np.tile(colour, (count, 2, 1))}
+            handle = self.api.add_line_segments("/distances", **arrays, **LINE)
+            self._layers["/distances"] = self._added(handle, arrays)
+        elif node is not None:
+            if count and count != len(node.sent["points"]):
+                # Points and colours go together.
+                node.handle.remove()
+                del self._layers["/distances"]
+                self._show_distances(data)
+                return
+            self._update(node, **({"points": data.nearest.astype(np.float32)} if count else {}))
+            self._visible(node, count > 0)
+        self._show_labels(data)
+
+    def _show_labels(self, data):
+        told = data.labels()
+        for k, (point, text) in enumerate(told):
+            place = {"position": point}
+            if k == len(self._labels):
+                handle = self.api.add_label(f"/distance/{k}", text=text, anchor="center-center", **place)
+                self._labels.append(self._added(handle, place))
+                self._labels[k].sent["text"] = text
+                continue
+            node = self._labels[k]
+            if node.sent["text"] != text:
+                node.handle.text = node.sent["text"] = text
+            self._update(node, **place)
+            self._visible(node, True)
+        for node in self._labels[len(told) :]:
+            self._visible(node, False)
 
 
 def _linear(colours) -> np.ndarray:

@@ -1,0 +1,211 @@
+"""What `NewtonContacts` takes over from Newton's models: pairs, materials, particles, worlds; captures and order."""
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+import warp_abtree as ab
+
+newton = pytest.importorskip("newton")
+
+
+def mesh_of(shape):
+    return newton.Mesh(np.asarray(shape.vertices, np.float32), np.asarray(shape.faces).ravel())
+
+
+def lifted(z, x=0.0):
+    return wp.transform((x, 0.0, z), wp.quat_identity())
+
+
+CUBE, FLOOR = mesh_of(trimesh.creation.box((1, 1, 1))), mesh_of(trimesh.creation.box((8, 8, 1)))
+RING = mesh_of(trimesh.creation.torus(0.8, 0.25, 24, 12))
+NEAR = newton.ModelBuilder.ShapeConfig(gap=0.01)
+
+
+def pairs_of(contacts):
+    count = int(contacts.rigid_contact_count.numpy()[0])
+    shapes = [getattr(contacts, f"rigid_contact_shape{k}").numpy()[:count] for k in (0, 1)]
+    return {tuple(sorted(pair)) for pair in np.stack(shapes, 1).tolist()}
+
+
+def test_pairs_are_those_of_newton(device):
+    """Of bodies, groups, worlds, filters, joints and flags; pairs of meshes are ours, and no other."""
+    rng = np.random.default_rng(1)
+    builder, shapes = newton.ModelBuilder(), []
+    for _ in range(3):
+        world, last = newton.ModelBuilder(), None
+        for _ in range(5):
+            body = -1 if rng.random() < 0.2 else world.add_link(xform=lifted(0.0))
+            for _ in range(rng.integers(1, 3)):
+                config = newton.ModelBuilder.ShapeConfig(collision_group=int(rng.choice([-2, -1, 0, 1, 2])))
+                config.has_shape_collision = bool(rng.random() < 0.9)
+                add = world.add_shape_mesh if rng.random() < 0.6 else world.add_shape_sphere
+                add(body, **({"mesh": CUBE} if add == world.add_shape_mesh else {"radius": 0.5}), cfg=config)
+            if body >= 0:
+                joint = world.add_joint_free(body) if last is None else world.add_joint_fixed(last, body)
+                shapes.append(joint)
+                last = body
+        world.add_articulation(list(range(world.joint_count)))
+        for _ in range(4):
+            a, b = rng.choice(world.shape_count, 2, replace=False).tolist()
+            world.add_shape_collision_filter_pair(a, b)
+        builder.add_world(world)
+    builder.add_ground_plane()
+    builder.add_shape_mesh(-1, mesh=FLOOR)
+    model = builder.finalize(device=device)
+    found = ab.NewtonContacts(model)
+    found.contacts()
+    ours = {tuple(sorted(pair)) for pair in found.shapes[found.scene.broad_phase()].tolist()}
+    others = {tuple(pair) for pair in found.others.shape_pairs_filtered.numpy().tolist()}
+    expected = {tuple(sorted(pair)) for pair in model.shape_contact_pairs.numpy().tolist()}
+    assert len(expected) > 50 and len(ours) > 10 and len(others) > 10
+    assert not ours & others
+    assert ours | others == expected
+
+
+def test_other_pairs_of_one_plane_are_as_many_as_bodies():
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    for _ in range(300):
+        builder.add_shape_mesh(builder.add_body(), mesh=CUBE)
+    found = ab.NewtonContacts(builder.finalize(device="cpu"))
+    found.contacts(100)
+    assert found.others.shape_pairs_filtered.numpy().tolist() == [[0, k] for k in range(1, 301)]
+
+
+@pytest.mark.parametrize("mu, slides", [(0.2, True), (0.8, False)])
+def test_friction_is_that_of_the_shapes(device, mu, slides):
+    """A cube on a slope of 0.4 rad, whose tangent is 0.42."""
+    slope = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), 0.4)
+    config = newton.ModelBuilder.ShapeConfig(gap=0.01, mu=mu)
+    builder = newton.ModelBuilder()
+    builder.add_shape_mesh(
+        -1, xform=wp.transform(wp.quat_rotate(slope, wp.vec3(0, 0, -0.5)), slope), mesh=FLOOR, cfg=config
+    )
+    body = builder.add_body(xform=wp.transform(wp.quat_rotate(slope, wp.vec3(0, 0, 0.5)), slope))
+    builder.add_shape_mesh(body, mesh=CUBE, cfg=config)
+    model = builder.finalize(device=device)
+    found = ab.NewtonContacts(model)
+    solver, contacts, control = newton.solvers.SolverXPBD(model, iterations=8), found.contacts(), model.control()
+    state, after = model.state(), model.state()
+    begin = state.body_q.numpy()[0, :3].copy()
+    for _ in range(120):
+        state.clear_forces()
+        found.collide(state, contacts)
+        solver.step(state, after, control, contacts, 1 / 240)
+        state, after = after, state
+    way = np.linalg.norm(state.body_q.numpy()[0, :3] - begin)
+    # By friction alone it would slide 9.81 (sin - mu cos) t^2 / 2 = 0.25 m.
+    assert 0.15 < way < 0.35 if slides else way < 0.03
+
+
+@pytest.mark.slow  # Newton compiles much for it
+def test_particles_are_newtons(device):
+    builder = newton.ModelBuilder()
+    builder.add_shape_mesh(-1, xform=lifted(-0.5), mesh=FLOOR, cfg=NEAR)
+    builder.add_shape_mesh(builder.add_body(xform=lifted(0.5)), mesh=CUBE, cfg=NEAR)
+    builder.add_particle((3.0, 0.0, 0.05), (0.0, 0.0, 0.0), 1.0, radius=0.1)
+    model = builder.finalize(device=device)
+    found = ab.NewtonContacts(model)
+    contacts = found.contacts()
+    found.collide(model.state(), contacts)
+    assert contacts.soft_contact_count.numpy()[0] == 1
+    assert pairs_of(contacts) == {(0, 1)} and contacts.rigid_contact_count.numpy()[0] == 4
+
+
+def test_worlds_have_meshes_of_their_own(device):
+    """The same shape is a cube in one world and a ring in the next: their contacts are at other heights."""
+    builder = newton.ModelBuilder()
+    for mesh, half in ((CUBE, 0.5), (RING, 0.25)):
+        world = newton.ModelBuilder()
+        world.add_shape_mesh(-1, xform=lifted(-0.5), mesh=FLOOR, cfg=NEAR)
+        world.add_shape_mesh(world.add_body(xform=lifted(half + 0.005)), mesh=mesh, cfg=NEAR)
+        builder.add_world(world)
+    model = builder.finalize(device=device)
+    found = ab.NewtonContacts(model)
+    contacts = found.contacts()
+    found.collide(model.state(), contacts)
+    assert pairs_of(contacts) == {(0, 1), (2, 3)}
+    count = int(contacts.rigid_contact_count.numpy()[0])
+    second = contacts.rigid_contact_shape1.numpy()[:count]
+    heights = contacts.rigid_contact_point1.numpy()[:count, 2]
+    np.testing.assert_allclose(heights[second == 1], -0.5, atol=0.004)
+    np.testing.assert_allclose(heights[second == 3], -0.25, atol=0.004)
+    radii = np.linalg.norm(contacts.rigid_contact_point1.numpy()[:count, :2], axis=1)
+    np.testing.assert_allclose(radii[second == 3], 0.8, atol=0.02)
+
+
+def ring_model(device, count):
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    builder.add_shape_mesh(-1, xform=lifted(0.5), mesh=FLOOR, cfg=NEAR)
+    for k in range(count):
+        builder.add_shape_mesh(builder.add_body(xform=lifted(1.255 + 0.505 * k)), mesh=RING, cfg=NEAR)
+    builder.add_shape_sphere(builder.add_body(xform=lifted(0.295, 6.0)), radius=0.3, cfg=NEAR)
+    return builder.finalize(device=device)
+
+
+def rows_of(contacts):
+    count = int(contacts.rigid_contact_count.numpy()[0])
+    names = ("shape0", "shape1", "point0", "point1", "offset0", "normal", "margin0")
+    return [getattr(contacts, f"rigid_contact_{name}").numpy()[:count].copy() for name in names]
+
+
+def test_contacts_keep_their_order_as_bodies_move(device):
+    """Row by row the same pair and nearly the same point, so that what a solver keeps of a row still fits."""
+    model = ring_model(device, 3)
+    found, state = ab.NewtonContacts(model), model.state()
+    contacts = found.contacts()
+    found.collide(state, contacts)
+    before = rows_of(contacts)
+    poses = state.body_q.numpy().copy()
+    for _ in range(4):
+        poses[:, :3] += np.float32(1e-4)
+        state.body_q.assign(poses)
+        found.collide(state, contacts)
+        rows = rows_of(contacts)
+        assert rows[0].tolist() == before[0].tolist() and rows[1].tolist() == before[1].tolist()
+        np.testing.assert_allclose(rows[3], before[3], atol=0.01)
+        again = rows_of(contacts)
+        found.collide(state, contacts)
+        for one, two in zip(again, rows_of(contacts)):
+            np.testing.assert_array_equal(one, two)
+
+
+def test_collide_in_a_capture_launches_only(device):
+    """A graph of collide and a solver's step has the bits of doing so step by step."""
+    model = ring_model(device, 2)
+    ends = []
+    for captured in (False, True):
+        found, state, after = ab.NewtonContacts(model), model.state(), model.state()
+        solver, control, contacts = newton.solvers.SolverXPBD(model), model.control(), found.contacts()
+
+        def step(found=found, solver=solver, state=state, after=after, control=control, contacts=contacts):
+            found.collide(state, contacts)
+            state.clear_forces()
+            solver.step(state, after, control, contacts, 1 / 240)
+            state.assign(after)
+
+        step()
+        if captured:
+            with wp.ScopedCapture(device) as capture:
+                step()
+        for _ in range(20):
+            wp.capture_launch(capture.graph) if captured else step()
+        found.check(contacts)
+        ends.append(state.body_q.numpy().copy())
+    assert np.abs(ends[0][:, 2] - model.body_q.numpy()[:, 2]).max() > 1e-4
+    np.testing.assert_array_equal(*ends)
+    with pytest.raises(ValueError, match="another size"):
+        found.launch(state, newton.Contacts(7, 0, device=device))
+
+
+def test_a_surface_that_moves_is_refused(device):
+    mesh = mesh_of(trimesh.creation.box((1, 1, 1)))
+    mesh.enable_surface_velocity = True
+    builder = newton.ModelBuilder()
+    builder.add_shape_mesh(-1, mesh=FLOOR)
+    builder.add_shape_mesh(builder.add_body(), mesh=mesh)
+    with pytest.raises(ValueError, match="surface of shape 1 moves"):
+        ab.NewtonContacts(builder.finalize(device=device))
