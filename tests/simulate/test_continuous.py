@@ -96,12 +96,12 @@ def test_a_heap_falls_and_comes_to_rest_without_more_energy(device):
     assert np.abs(dynamics.velocities()[0]).max() < 0.5
 
 
-def test_a_body_rests_one_slop_above_the_floor(device):
+def test_a_body_rests_about_a_slop_above_the_floor(device):
     dynamics = on_ground(device, (box(0.8, 0.6, 0.4), (0, 0, 0.5, *about((0, 0, 1), 0.3))), continuous=True)
     for _ in range(60):
         dynamics.step(1 / 60)
     slop = dynamics.bodies.bounding_radius.numpy()[1] / 512
-    assert 0.2 + 0.5 * slop < dynamics.poses()[1, 2] < 0.2 + 1.5 * slop
+    assert 0.2 + 0.4 * slop < dynamics.poses()[1, 2] < 0.2 + 1.6 * slop
     assert dynamics.certified.part.numpy()[1] == 1
 
 

@@ -198,7 +198,8 @@ def test_a_stack_of_five_stands_for_ten_seconds(device, splits):
     moved = dynamics.poses()[1:] - start
     slop = mass_properties(cube).bounding_radius / 512
     assert np.abs(moved[:, :2]).max() < 0.006 and np.abs(moved[:, 3:6]).max() < 0.01
-    np.testing.assert_allclose(moved[:, 2], -slop * np.arange(1, 6), atol=2 * slop)
+    sunk = np.diff(-moved[:, 2], prepend=0)  # of each cube into what is below
+    assert sunk.min() > -0.05 * slop and sunk.max() < slop
     assert np.abs(dynamics.velocities()[0]).max() < 1e-3
 
 
