@@ -2,8 +2,7 @@
 
 Node pairs are dropped where their boxes are farther apart than the nearest pair of faces that any warp has found so
 far; never where a pair of faces below may be as near, so that the nearest distance, and of equally near faces the
-lowest pair, are found whatever the order and whoever looks. With a tolerance other faces are found in another order,
-within it.
+lowest pair, are found whatever the order. With a tolerance other faces are found in another order, within it.
 """
 
 import functools

@@ -3,7 +3,7 @@
 Each object has a goal, where the step would take it, and an end of its way there, at first the goal. A round searches
 the first contacts of all pairs on these ways, and cuts the ways of both objects of a pair at its time, less a little.
 The next round searches the pairs of which an object's way was cut, since it now stands where the other may still come:
-that one is cut at the time of contact, then to the same part of its motion, on which both were clear. Meanwhile
+that one is cut at the time of contact, then to the same fraction of its motion, on which both were clear. Meanwhile
 surfaces count as thicker, where they are not so near yet, since what slides along at no distance is hard to prove
 apart. What the last round does not prove clear, end included, holds its whole world where it was. So at the end a path
 leads from each object's pose to its new one, on which no two surfaces meet that were apart.
@@ -26,8 +26,8 @@ TOUCHING, UNDECIDED_PAIRS, HELD = wp.constant(0), wp.constant(1), wp.constant(2)
 """Entries of `Ways.counter`."""
 
 CUT, MATCH, HOLD, CERTIFY = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
-"""What a round does with pairs that are not clear: cut ways at the time of contact, cut the longer part to the shorter,
-cut both at the start, or hold the world."""
+"""What a round does with pairs that are not clear: cut ways at the time of contact, cut the larger fraction to the
+smaller, cut both at the start, or hold the world."""
 
 NEAR, NEARER = wp.constant(wp.float64(0.25)), wp.constant(wp.float64(1.0 / 32.0))
 FREE, STUCK, ON_TRIAL, STUCK_AGAIN = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
@@ -47,9 +47,9 @@ class Ways:
     # state
     goals: ObjectPool  # poses that the step aims for: rotation and position
     ends: ObjectPool  # poses that it ends at
-    part: wp.array(dtype=wp.float64)  # of its motion that an object makes, 0 to 1, shape [object]
+    fraction: wp.array(dtype=wp.float64)  # of its motion that an object makes, 0 to 1, shape [object]
     stuck: wp.array(dtype=wp.int32)  # FREE, STUCK, ON_TRIAL or STUCK_AGAIN, shape [object]
-    cut: wp.array(dtype=wp.float64)  # part of its way that the round leaves, shape [object]
+    cut: wp.array(dtype=wp.float64)  # fraction of its way that the round leaves, shape [object]
     is_changed: wp.array(dtype=wp.int32)  # whether the last round has cut its way, 0 or 1, shape [object]
     is_held: wp.array(dtype=wp.int32)  # of each world, 0 or 1, shape [object]
     level: wp.array(dtype=wp.int32)  # of a pair's `margin_of`; EXEMPT where ways do not matter, shape [pair]
@@ -81,7 +81,7 @@ def begin_way_kernel(objects: ObjectPool, bodies: Bodies, ways_inout: Ways):
     if i == 0:
         for k in range(3):
             ways_inout.counter[k] = 0
-    ways_inout.part[i] = wp.where(bodies.motion_type[i] == STATIC, ZERO, ONE)
+    ways_inout.fraction[i] = wp.where(bodies.motion_type[i] == STATIC, ZERO, ONE)
     ways_inout.cut[i] = ONE
     ways_inout.is_changed[i] = 1
     ways_inout.is_held[i] = 0
@@ -124,7 +124,9 @@ def choose_pair_kernel(
     if p >= pair_count[0]:
         return
     a, b = pairs[p][0], pairs[p][1]
-    changed = ways.is_changed[a] + ways.is_changed[b] + ways.is_again[p] > 0 and ways.part[a] + ways.part[b] > ZERO
+    changed = (
+        ways.is_changed[a] + ways.is_changed[b] + ways.is_again[p] > 0 and ways.fraction[a] + ways.fraction[b] > ZERO
+    )
     hits_inout.any_hit[p] = wp.where(changed and ways.level[p] != EXEMPT, 0, 1)
 
 
@@ -201,43 +203,43 @@ def cut_way_kernel(
     # A quarter of a slop before the contact, where contacts ahead find it.
     length = way_length(objects, ways_inout, bodies, a) + way_length(objects, ways_inout, bodies, b)
     back = NEAR * slop_of(bodies, pairs[p])
-    part = wp.max(contacts.time[p] - back / wp.max(length, back), ZERO)
-    part_a, part_b = ways_inout.part[a], ways_inout.part[b]
-    less, more = wp.min(part_a, part_b), wp.max(part_a, part_b)
+    fraction = wp.max(contacts.time[p] - back / wp.max(length, back), ZERO)
+    fraction_a, fraction_b = ways_inout.fraction[a], ways_inout.fraction[b]
+    less, more = wp.min(fraction_a, fraction_b), wp.max(fraction_a, fraction_b)
     static = bodies.motion_type[a] == STATIC or bodies.motion_type[b] == STATIC
     if static or less == more:
-        wp.atomic_min(ways_inout.cut, a, part)
-        wp.atomic_min(ways_inout.cut, b, part)
+        wp.atomic_min(ways_inout.cut, a, fraction)
+        wp.atomic_min(ways_inout.cut, b, fraction)
         return
     shorter = less / more
     if mode == CUT:
-        shorter = wp.max(shorter, part)
-    wp.atomic_min(ways_inout.cut, wp.where(part_a == more, a, b), shorter)
+        shorter = wp.max(shorter, fraction)
+    wp.atomic_min(ways_inout.cut, wp.where(fraction_a == more, a, b), shorter)
 
 
 @wp.kernel
 def apply_cut_kernel(objects: ObjectPool, bodies: Bodies, ways_inout: Ways):
     """End an object's way where the round has cut it."""
     i = wp.tid()
-    part = ways_inout.cut[i]
+    fraction = ways_inout.cut[i]
     ways_inout.cut[i] = ONE
-    changed = part < ONE and ways_inout.part[i] > ZERO
+    changed = fraction < ONE and ways_inout.fraction[i] > ZERO
     ways_inout.is_changed[i] = wp.where(changed, 1, 0)
     if not changed:
         return
-    ways_inout.part[i] = part * ways_inout.part[i]
-    if part == ZERO:
+    ways_inout.fraction[i] = fraction * ways_inout.fraction[i]
+    if fraction == ZERO:
         ways_inout.ends.rotation[i] = objects.rotation[i]
         ways_inout.ends.position[i] = objects.position[i]
         return
     path = make_path(False, objects, ways_inout.ends, i)
-    rotation = objects.rotation[i] * turn_matrix(path.axis, part * path.angle)
+    rotation = objects.rotation[i] * turn_matrix(path.axis, fraction * path.angle)
     if bodies.motion_type[i] == DYNAMIC:
         # By way of a quaternion, so that it stays a rotation, cut after cut.
         axes = bodies.axes[i]
         rotation = wp.quat_to_matrix(wp.normalize(wp.quat_from_matrix(rotation * axes))) * wp.transpose(axes)
     ways_inout.ends.rotation[i] = rotation
-    ways_inout.ends.position[i] = objects.position[i] + part * path.travel
+    ways_inout.ends.position[i] = objects.position[i] + fraction * path.travel
 
 
 @wp.func
@@ -259,8 +261,8 @@ def end_way_kernel(
 ):
     """Pose an object where its way ends, unless not all pairs were found.
 
-    Gravity acts on a body for the part of the step that it moves, and a turn that is cut short adds no energy. A body
-    that is stuck stops turning, and moves by its position correction alone in the next step: else it would ask for the
+    Gravity acts on a body for the fraction of the step that it moves, and a turn that is cut short adds no energy. What
+    is stuck stops turning, and moves by its position correction alone in the next step: else it would ask for the
     same motion for ever. Stuck again it stops.
     """
     i = wp.tid()
@@ -271,22 +273,22 @@ def end_way_kernel(
         whole = whole and wp.uint32(hits.uncertain_total[0]) <= wp.uint32(hits.uncertain.shape[0])
     if not whole:
         return
-    part = ways.part[i]
+    fraction = ways.fraction[i]
     near = NEAR * SLOP * bodies_inout.bounding_radius[i]
-    stuck = part < ONE and way_length(objects_inout, ways, bodies_inout, i) < near
+    stuck = fraction < ONE and way_length(objects_inout, ways, bodies_inout, i) < near
     if ways.is_held[ways.world[i]] != 0:
-        part = ZERO
+        fraction = ZERO
     else:
         objects_inout.rotation[i] = ways.ends.rotation[i]
         objects_inout.position[i] = ways.ends.position[i]
-    ways.part[i] = part
+    ways.fraction[i] = fraction
     before_stuck = ways.stuck[i]
     was_stuck = (before_stuck & 1) != 0
     now = wp.where(before_stuck == STUCK, ON_TRIAL, FREE)
     if stuck:
         now = wp.where(before_stuck == FREE, STUCK, STUCK_AGAIN)
     ways.stuck[i] = now
-    if bodies_inout.motion_type[i] != DYNAMIC or (part == ONE and not was_stuck):
+    if bodies_inout.motion_type[i] != DYNAMIC or (fraction == ONE and not was_stuck):
         return
     rotation = objects_inout.rotation[i]
     bodies_inout.position[i] = objects_inout.position[i] + rotation * bodies_inout.centre[i]
@@ -299,5 +301,5 @@ def end_way_kernel(
     bodies_inout.momentum[i] = wp.where(stuck, ZERO, scale) * momentum
     down = wp.normalize(velocity_change)
     speed = wp.max(wp.dot(bodies_inout.velocity[i], down), ZERO)
-    taken = wp.min(wp.where(was_stuck, ONE, ONE - part) * wp.length(velocity_change), speed)
+    taken = wp.min(wp.where(was_stuck, ONE, ONE - fraction) * wp.length(velocity_change), speed)
     bodies_inout.velocity[i] = wp.where(now == STUCK_AGAIN, ZERO, ONE) * (bodies_inout.velocity[i] - taken * down)

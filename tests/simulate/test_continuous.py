@@ -72,7 +72,7 @@ def test_no_random_throw_passes_a_thin_sheet(device):
         rotation, place = dynamics.scene.batch().objects.pool.rotation, dynamics.scene.batch().objects.pool.position
         world = np.einsum("nij,vj->nvi", rotation.numpy()[1::2], corners) + place.numpy()[1::2, None]
         over = np.abs(world[..., :2]).max((1, 2)) < 0.2
-        hits |= dynamics.certified.part.numpy()[1::2] < 1
+        hits |= dynamics.certified.fraction.numpy()[1::2] < 1
         side &= ~over | (world[..., 2].min(1) > 0.0005)
         assert not surfaces_meet(dynamics)
     assert side.all() and hits.sum() > count // 2
@@ -102,7 +102,7 @@ def test_a_body_rests_about_a_slop_above_the_floor(device):
         dynamics.step(1 / 60)
     slop = dynamics.bodies.bounding_radius.numpy()[1] / 512
     assert 0.2 + 0.4 * slop < dynamics.poses()[1, 2] < 0.2 + 1.6 * slop
-    assert dynamics.certified.part.numpy()[1] == 1
+    assert dynamics.certified.fraction.numpy()[1] == 1
 
 
 def test_bodies_that_overlap_at_first_are_not_stopped(device):

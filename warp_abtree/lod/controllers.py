@@ -71,7 +71,7 @@ class Controller:
         budget_ms: T [ms], None without a budget.
         view: `View` of the scene.
         lods: LODs last selected, int32 (n,) on the device.
-        tests: Tests of the last frame that each object took part in, for whoever runs frames to write; None where the
+        tests: Tests of the last frame that each object took part in, written by what runs frames; None where the
             controller reads none.
     """
 

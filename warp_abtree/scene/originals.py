@@ -125,7 +125,7 @@ class OriginalDistances:
         return query
 
     def _bound(self, pairs, errors, whole, beyond, tolerances) -> tuple[dict, np.ndarray]:
-        """Ask pairs at their LODs; return rows that hold for their originals, and which of them are decided."""
+        """Query pairs at their LODs; return rows that hold for their originals, and which of them are decided."""
         asked = tolerances
         if not whole.all():
             # Much over the errors it would leave open whether surfaces intersect at all.

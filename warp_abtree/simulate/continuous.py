@@ -8,7 +8,7 @@ from warp_abtree.query.request import Buffers
 from warp_abtree.scene.first_contact import FirstContactQuery
 from warp_abtree.scene.scene import Scene
 
-TOLERANCE = 2.0**-24  # of times, as a part of a step's motion
+TOLERANCE = 2.0**-24  # of times, as a fraction of a step's motion
 INTEGERS = [(name, wp.int32) for name in ("is_changed", "is_held", "stuck")]
 MODES = kernels.CUT, kernels.MATCH, kernels.HOLD, kernels.CERTIFY
 # What each round does with the pairs that it does not prove clear.
@@ -27,7 +27,7 @@ class CertifiedWays(FirstContactQuery):
 
     Attributes:
         goals: Poses that a step aims for, device arrays rotation and position of `kernels.arrays.ObjectPool`.
-        part: How much of its motion each object made in the last step, device float64 (n,), 0 to 1.
+        fraction: How much of its motion each object made in the last step, device float64 (n,), 0 to 1.
     """
 
     def __init__(self, scene: Scene, bodies, capacity: Buffers):
@@ -38,14 +38,14 @@ class CertifiedWays(FirstContactQuery):
         super().__init__(scene, None, None, capacity, TOLERANCE)
         state, shared = self._state, self.broad_phase.shared_group
         state.goals, state.ends = self.goals, self.ends
-        for name, dtype in (("part", wp.float64), ("cut", wp.float64), *INTEGERS):
+        for name, dtype in (("fraction", wp.float64), ("cut", wp.float64), *INTEGERS):
             setattr(state, name, wp.zeros(n, dtype=dtype, device=self.device))
         state.counter = wp.zeros(3, dtype=wp.int32, device=self.device)
         # What moves in every world holds all of them together.
         world = self.broad_phase.group
         moves = bodies.motion_type.numpy() != int(kernels.STATIC)
         state.world = wp.zeros_like(world) if (moves & (world.numpy() == shared)).any() else world
-        self.part = state.part
+        self.fraction = state.fraction
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
@@ -60,11 +60,11 @@ class CertifiedWays(FirstContactQuery):
         wp.launch(kernel, dim, inputs, device=self.device)
 
     def _begin(self):
-        self._run(kernels.begin_way_kernel, len(self.part), [self._pool, self._bodies, self._state])
+        self._run(kernels.begin_way_kernel, len(self.fraction), [self._pool, self._bodies, self._state])
 
     def traverse(self):
         """Cut the ways of objects in rounds, from goals on. Launches only."""
-        room, n, state = len(self.pairs), len(self.part), self._state
+        room, n, state = len(self.pairs), len(self.fraction), self._state
         self._begin()
         super(FirstContactQuery, self).traverse()
         found = [self.pair_count, self.pairs]
@@ -90,7 +90,7 @@ class CertifiedWays(FirstContactQuery):
 
     def free_stuck(self, dt: float):
         """Set other goals for bodies that were stuck in the last step. Launches only."""
-        self._run(kernels.free_stuck_kernel, len(self.part), [dt, self._pool, self._bodies, self._state])
+        self._run(kernels.free_stuck_kernel, len(self.fraction), [dt, self._pool, self._bodies, self._state])
 
     def end(self, velocity_change):
         """Pose objects where their ways end, unless there was no room for all pairs. Launches only.
@@ -99,7 +99,7 @@ class CertifiedWays(FirstContactQuery):
             velocity_change: What gravity changes velocities by in a step [world units/s].
         """
         inputs = [wp.vec3d(*velocity_change), self.guard.launched, self.pair_count, self.hits, self._state]
-        self._run(kernels.end_way_kernel, len(self.part), [*inputs, self._bodies, self._pool])
+        self._run(kernels.end_way_kernel, len(self.fraction), [*inputs, self._bodies, self._pool])
 
     def is_whole(self) -> bool:
         """Return whether there was room for all pairs. Waits for the device."""

@@ -91,7 +91,7 @@ class RobotQuery:
         self._robots.take_poses()
 
     def launch(self):
-        """Ask all configurations. Launches only."""
+        """Check all configurations. Launches only."""
         self._links.launch()
 
     def check(self):

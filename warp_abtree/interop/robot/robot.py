@@ -143,7 +143,7 @@ class Robot:
         return poses
 
     def check(self, configurations, world=None, output="any", beyond=None, limits=True):
-        """Ask of each configuration whether parts intersect, each other or the world, or how far they are apart.
+        """Check whether parts intersect, each other or the world, at each configuration, or how far they are apart.
 
         Exactly, as `Scene.intersect`, for link poses as `forward` computes them. Waits for the device, once a chunk of
         4,096 configurations on the CPU, of 65,536 on a GPU; device arrays are kept for the next call.
@@ -175,7 +175,7 @@ class Robot:
         return self._find_query(world, output, len(rows)).ask(rows, far)
 
     def check_edges(self, starts, ends, world=None, tolerance=1e-3, limits=True) -> np.ndarray:
-        """Ask of edges of a planner when parts first touch: all joints move evenly from start to end, in unit time.
+        """Find when parts first touch on edges of a planner: all joints move evenly from start to end, in unit time.
 
         Stretches of an edge are proved free as wholes, with bounds on how far joints move each part from where it
         stands in the middle (`warp_abtree.kernels.robot.link_pairs`); others are halved. Waits for the device.
