@@ -23,6 +23,7 @@ from .ccd_queries import FOLDER, read_queries
 
 FULL = {"count": 65536, "checked": 1_000_000, "samples": 32, "repeats": 5, "turn": 163.0, "fcl": 0}
 CPU = FULL | {"count": 256, "checked": 20_000, "fcl": 8}
+HALF_REVOLUTION = 2.0**-16  # real part of a turn, under which there is none
 QUICK = {"count": 3, "checked": 20, "samples": 4, "repeats": 1, "turn": 0.01, "fcl": 1}
 TOLERANCES, FRACTIONS = (1e-6, 1e-4, 1e-2), (1.0, 0.1, 0.01)
 IDENTITY = (0, 0, 0, 0, 0, 0, 1)
@@ -62,6 +63,9 @@ def random_motions(model, count, first, last, seed=0):
         ends[1] = ends[0] + 0.1 * size * random_directions(rng, count, 3)
         turn[1] = turn[0] + 0.1 * np.linalg.norm(turn[0], axis=1, keepdims=True) * random_directions(rng, count, 4)
     turn /= np.linalg.norm(turn, axis=2, keepdims=True)
+    # Half a revolution has no shortest way: of a million some come near it, and do not turn.
+    half = np.abs((turn[0] * turn[1]).sum(1)) < HALF_REVOLUTION
+    turn[1, half] = turn[0, half]
     return tuple(np.concatenate(rows, 1) for rows in zip(ends, turn))
 
 
@@ -93,7 +97,9 @@ def between(first, last, times):
     cosine = (turns[0] * turns[1]).sum(1)
     angle = np.arctan2(np.linalg.norm(turns[1] - cosine[:, None] * turns[0], axis=1), cosine)[:, None]
     t = times[:, None]
-    turn = (np.sin((1 - t) * angle) * turns[0] + np.sin(t * angle) * turns[1]) / np.sin(angle)
+    with np.errstate(invalid="ignore"):
+        turn = (np.sin((1 - t) * angle) * turns[0] + np.sin(t * angle) * turns[1]) / np.sin(angle)
+    turn = np.where(angle > 0, turn, turns[0])
     return np.concatenate([(1 - t) * first[:, :3] + t * last[:, :3], turn], 1)
 
 
