@@ -114,6 +114,11 @@ def test_files_answer_as_scenes_of_their_links(urdf, device):
         ('<child link="left"/>', '<child link="fore"/>', "another joint moves link 'fore'"),
         ('xyz="0 0 2"', 'xyz="0 0 0"', "is no axis"),
         ('<robot name="arm">', "arm", "not read as URDF"),
+        ('lower="-2.8"', 'lower="2.9"', "joint 'bend': limits 2.9 .. 2.8 leave no value"),
+        ('lower="-2.8"', 'lower="nan"', "joint 'bend': limits nan .. 2.8 leave no value"),
+        ('size="0.08 0.08 0.5"', 'size="0.08 0.5"', "link 'upper': sizes .* are not 3"),
+        ('radius="0.1" length', 'radius="-0.1" length', "link 'base': sizes .* are not 2"),
+        ('radius="0.03"', 'radius="nan"', "link 'left': sizes .* are not 1"),
     ],
 )
 def test_bad_urdf_is_refused(urdf, before, after, message):

@@ -38,7 +38,7 @@ def read_urdf(path: Path, geometry: str) -> Description:
         _check_joint(joint, joints, names, path)
     for joint in robot.joints:  # in the file's order, as configurations are
         if joint.type != "fixed" and joint.mimic is None:
-            description.joints[joint.name] = _limits(joint)
+            description.joints[joint.name] = _limits(joint, path)
     values = {joint.name: _value_of(joint, robot.joints, path) for joint in robot.joints if joint.type != "fixed"}
     for name in names:
         _add_link(name, description, joints, values, path, ())
@@ -70,10 +70,13 @@ def _check_joint(joint, joints, names, path):
         raise RobotError(f"{where}: another joint moves link {joint.child!r}, too")
 
 
-def _limits(joint) -> tuple[float, float]:
+def _limits(joint, path) -> tuple[float, float]:
     if joint.type == "continuous" or joint.limit is None or joint.limit.lower is None or joint.limit.upper is None:
         return -math.inf, math.inf
-    return float(joint.limit.lower), float(joint.limit.upper)
+    low, high = float(joint.limit.lower), float(joint.limit.upper)
+    if not low <= high:
+        raise RobotError(f"{path}: joint {joint.name!r}: limits {low:g} .. {high:g} leave no value")
+    return low, high
 
 
 def _value_of(joint, joints, path) -> tuple[str, float, float]:
@@ -128,14 +131,23 @@ def _load_shape(geometry, where, find_file):
         scale = 1.0 if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale, np.float64)
         return mesh.vertices * scale, np.delete(mesh.faces, mesh.dropped_faces, axis=0)
     if geometry.box is not None:
-        made = trimesh.creation.box(geometry.box.size)
+        made = trimesh.creation.box(_sizes(geometry.box.size, 3, where))
     elif geometry.cylinder is not None:
-        made = trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length)
+        made = trimesh.creation.cylinder(*_sizes([geometry.cylinder.radius, geometry.cylinder.length], 2, where))
     elif geometry.sphere is not None:
-        made = trimesh.creation.icosphere(subdivisions=3, radius=geometry.sphere.radius)
+        (radius,) = _sizes([geometry.sphere.radius], 1, where)
+        made = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     else:
         raise RobotError(f"{where}: a shape that is neither mesh, box, cylinder nor sphere")
     return np.asarray(made.vertices), np.asarray(made.faces)
+
+
+def _sizes(given, count, where) -> np.ndarray:
+    """Return the sizes of a box, cylinder or sphere, checked."""
+    sizes = np.array(given, np.float64)
+    if sizes.shape != (count,) or not np.isfinite(sizes).all() or (sizes < 0).any():
+        raise RobotError(f"{where}: sizes {sizes.tolist()} of a shape are not {count} finite numbers of at least 0")
+    return sizes
 
 
 def read_disabled_pairs(path: Path, links: set[str]) -> set[frozenset]:
