@@ -209,15 +209,10 @@ def pair_pose(
 
 
 @wp.func
-def rotate_quaternion(q: wp.vec4d):
-    """Return the rotation matrix of a quaternion x y z w after normalising it."""
+def unit_quaternion_matrix(x: wp.float64, y: wp.float64, z: wp.float64, w: wp.float64):
+    """Return the rotation matrix of a unit quaternion."""
     two = wp.float64(2.0)
     one = wp.float64(1.0)
-    norm = wp.sqrt(((q[0] * q[0] + q[1] * q[1]) + q[2] * q[2]) + q[3] * q[3])
-    x = q[0] / norm
-    y = q[1] / norm
-    z = q[2] / norm
-    w = q[3] / norm
     return wp.mat33d(
         one - two * (y * y + z * z),
         two * (x * y - z * w),
@@ -229,3 +224,10 @@ def rotate_quaternion(q: wp.vec4d):
         two * (y * z + x * w),
         one - two * (x * x + y * y),
     )
+
+
+@wp.func
+def rotate_quaternion(q: wp.vec4d):
+    """Return the rotation matrix of a quaternion x y z w after normalising it."""
+    norm = wp.sqrt(((q[0] * q[0] + q[1] * q[1]) + q[2] * q[2]) + q[3] * q[3])
+    return unit_quaternion_matrix(q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)

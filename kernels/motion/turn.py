@@ -7,6 +7,8 @@ import math
 
 import warp as wp
 
+from warp_abtree.kernels.poses import unit_quaternion_matrix
+
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Turns by more than half a revolution less about 1e-6 rad have no shortest way: a quaternion's least real part.
@@ -42,19 +44,7 @@ def sin_cos_half(angle: wp.float64):
 def turn_matrix(axis: wp.vec3d, angle: wp.float64):
     """Return the rotation by an angle in [0, pi] about a unit axis."""
     s, w = sin_cos_half(angle)
-    one, two = wp.float64(1.0), wp.float64(2.0)
-    x, y, z = axis[0] * s, axis[1] * s, axis[2] * s
-    return wp.mat33d(
-        one - two * (y * y + z * z),
-        two * (x * y - z * w),
-        two * (x * z + y * w),
-        two * (x * y + z * w),
-        one - two * (x * x + z * z),
-        two * (y * z - x * w),
-        two * (x * z - y * w),
-        two * (y * z + x * w),
-        one - two * (x * x + y * y),
-    )
+    return unit_quaternion_matrix(axis[0] * s, axis[1] * s, axis[2] * s, w)
 
 
 @wp.func

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from warp_abtree.kernels.broad_phase import pair_key
 from warp_abtree.kernels.distance.report import Distances, two_points
 from warp_abtree.kernels.robot.link_pairs import Chunk
 from warp_abtree.kernels.traversal.face_pairs import Hits
@@ -99,8 +100,7 @@ def find_winner_kernel(
     i = configuration_of(pairs[p], around, part_count)
     distance = distances.distance[p]
     if distance == chunk.best[i] and distance < nearest_inout.distance[i]:
-        key = (wp.int64(pairs[p][0]) << wp.int64(32)) | wp.int64(pairs[p][1])
-        wp.atomic_min(nearest_inout.winner, i, key)
+        wp.atomic_min(nearest_inout.winner, i, pair_key(pairs[p]))
 
 
 @wp.kernel
@@ -118,7 +118,7 @@ def write_nearest_kernel(
     if p >= wp.min(pair_count[0], pairs.shape[0]):
         return
     i = configuration_of(pairs[p], around, part_count)
-    if nearest_inout.winner[i] == ((wp.int64(pairs[p][0]) << wp.int64(32)) | wp.int64(pairs[p][1])):
+    if nearest_inout.winner[i] == pair_key(pairs[p]):
         nearest_inout.distance[i] = distances.distance[p]
         nearest_inout.points[i] = distances.points[p]
         nearest_inout.faces[i] = distances.faces[p]

@@ -261,6 +261,7 @@ def test_bad_options_are_refused(arm, device):
         (lambda: arm.check_edges(rows, rows[:0]), ValueError, "ends: 0 given for 1"),
         (lambda: arm.check_edges(rows, rows, tolerance=0), ValueError, "tolerance"),
         (lambda: ab.Robot(described_arm(), device, mounted=["foot"]), ValueError, "no link 'foot'"),
+        (lambda: ab.Robot(described_arm(), device, mounted="base"), TypeError, "'base' is a name"),
     ):
         with pytest.raises(error, match=message):
             call()

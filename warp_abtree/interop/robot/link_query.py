@@ -168,21 +168,14 @@ class LinkHits(StagedQuery):
 
     def __init__(self, batch: Batch, asked: Asked, capacity: int, proves: bool):
         self._prepare(batch, asked, "within" if proves else "any")
+        self._no_near = wp.empty(0, dtype=wp.int32, device=batch.device)
         super().__init__(batch, "any", capacity=Buffers(pairs=capacity), within=0.0 if proves else None)
 
     def _note(self):
-        near = wp.empty(0, dtype=wp.int32, device=self.device) if self.near is None else self.near.any_hit
+        near = self._no_near if self.near is None else self.near.any_hit
         links, asked = self.links, self.asked
-        inputs = [
-            asked.around,
-            asked.part_count,
-            self.pair_count,
-            self.pairs,
-            self.hits,
-            near,
-            links.chunk,
-            self.demand,
-        ]
+        inputs = [asked.around, asked.part_count, self.pair_count, self.pairs, self.hits, near, links.chunk]
+        inputs.append(self.demand)
         wp.launch(answers.note_hit_kernel, len(self.pairs), inputs, device=self.device)
 
 

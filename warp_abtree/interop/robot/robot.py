@@ -61,6 +61,8 @@ class Robot:
         self.models = [Model.load(mesh, base_faces=len(mesh.faces)) for mesh in meshes]
         self.model_link = np.array([part.link for part in description.parts])
         self.pairs = np.array(description.allowed_pairs(), np.int64).reshape(-1, 2)
+        if isinstance(mounted, str):
+            raise TypeError(f"mounted: {mounted!r} is a name, not a list of names of links")
         unknown = set(mounted) - set(self.link_names)
         if unknown:
             raise ValueError(f"mounted: the robot has no link {sorted(unknown)[0]!r}")
@@ -111,7 +113,7 @@ class Robot:
         return f"Robot({len(self.joint_names)} joints, {len(self.models)} models, {faces:,} faces)"
 
     def exclude_meeting(self, configuration):
-        """Test models no more that intersect at a configuration, (n,), as neighbours do whose meshes overlap."""
+        """Test models no more that intersect at a configuration, (n,), as neighbours may. Waits for the device."""
         poses = self.forward(np.asarray(configuration, np.float64)[None]).numpy()[0]
         scene = Scene(self.device)
         scene.add_many(self.models, poses[self.model_link])
@@ -121,6 +123,8 @@ class Robot:
 
     def forward(self, configurations, limits=True) -> wp.array:
         """Return the poses of all links, device mat44d (c, links), in the frame of the root.
+
+        Waits for the device once, for what is refused.
 
         Args:
             configurations: (c, n) of any framework; float64 on the robot's GPU is read where it lies.
