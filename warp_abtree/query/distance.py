@@ -61,8 +61,8 @@ from warp_abtree.query.request import check_request, check_within, refuse_option
 from warp_abtree.query.result import DISTANCES, Found, Result
 from warp_abtree.query.staging import first_rows
 
-# Places among the launches, from their end: of the CPU's search, and of what is about pairs that intersect.
-SEARCH, CROSSINGS = -3, (-2, -1)
+# Place of the CPU's search among its launches.
+SEARCH = 1
 # Pairs that make a further core worth its while, which costs some 50 us.
 PAIRS_A_CORE = 4
 NOT_BEYOND = np.array(np.inf)  # one for all, so that it is known again at once
@@ -261,21 +261,36 @@ class DistanceQuery(Query):
             self._fit_slabs()
         super().traverse()
         if self.device.is_capturing:
-            self._make_distances(wp.launch)
-            self._make_inside(wp.launch)
+            for make in (self._make_distances, self._make_crossings, self._make_inside):
+                make(wp.launch)
             return
-        commands = self._commands.find("distances", self.guard.given(), self._make_distances)
-        # On the CPU what is launched is done.
-        meeting = self.device.is_cuda or bool(self._views.any_hit.any())
-        for place, command in enumerate(commands, -len(commands)):
+        given = self.guard.given()
+        for place, command in enumerate(self._commands.find("distances", given, self._make_distances)):
             if place == SEARCH and not self.uses_warps():
                 rooms = len(self._memory)
                 cores = min(current_regime().cpu_threads or rooms, rooms)
                 launch_on_cores(command.launch, room, cores, PAIRS_A_CORE)
-            elif meeting or place not in CROSSINGS:
+            else:
                 command.launch()
-        for command in self._commands.find("inside", self.guard.given(), self._make_inside):
+        # On the CPU what is launched is done.
+        if self.device.is_cuda or self._views.any_hit.any():
+            for command in self._commands.find("crossings", given, self._make_crossings):
+                command.launch()
+        for command in self._commands.find("inside", given, self._make_inside):
             command.launch()
+
+    def _make_crossings(self, launch) -> list:
+        """Make the launches that find points of pairs that intersect, see `Commands.find`."""
+        room, device = len(self.pairs), self.device
+        models, states, objects = self.batch.pools
+        inputs = [self._stack_length(), models, states, self.pair_count, self.pair_poses, self.hits, self._found]
+        dim = room * (WARP_SIZE if device.is_cuda else 1)
+        kernel = crossing.search_crossing_kernel
+        search = launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=device)
+        posed = [models, states, objects, self.pair_count, self.pairs, self.pair_poses]
+        inputs = [*posed, self._found, self.hits, self.distances]
+        kernel = crossing.report_crossing_kernel
+        return [search, launch(kernel, dim=room, inputs=inputs, block_dim=WARP_SIZE, device=device)]
 
     def _make_inside(self, launch) -> list:
         """Make the launch that reports pairs of which one is inside the other, where there are solids."""
@@ -303,19 +318,14 @@ class DistanceQuery(Query):
         self._replace([(self._slabs, "record", record), (self._slabs, "made", made)])
 
     def _make_distances(self, launch) -> list:
-        """Make the launches that follow the exact test, see `Commands.find`."""
+        """Make the launches that find distances, after the exact test, see `Commands.find`."""
         models, states, objects = self.batch.pools
         room, lanes, device = len(self.pairs), WARP_SIZE if self.device.is_cuda else 1, self.device
         posed = [models, states, objects, self.pair_count, self.pairs, self.pair_poses]
         shared = [models, states, self.pair_count, self.pair_poses]
         hits, found, length = self.hits, self._found, self._stack_length()
-        warps = {"dim": room * lanes, "block_dim": WARP_SIZE, "device": device}
         threads = {"dim": room, "block_dim": WARP_SIZE, "device": device}
         reports = [*posed, found, hits, self.distances]
-        crossings = [
-            launch(crossing.search_crossing_kernel, inputs=[length, *shared, hits, found], **warps),
-            launch(crossing.report_crossing_kernel, inputs=reports, **threads),
-        ]
         if not self.uses_warps():
             counter = self.work.counter
             inputs = [models, states, objects, self.pair_count, self.pairs, found, self._slabs, counter]
@@ -325,15 +335,14 @@ class DistanceQuery(Query):
             asked.tolerances = self._tolerances
             inputs = [asked, models, states, objects, counter, self._slabs, found, hits]
             inputs += [self.distances, self._memory]
-            return [refresh, launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device), *crossings]
+            return [refresh, launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device)]
         start = {**threads, "dim": max(room, len(self.work.flag))}
         inputs = [length, ROUGH_LEAST, self._tolerances, *shared, found, hits, self.work]
-        searching = {**warps, "dim": self._warp_count() * lanes}
+        searching = {"dim": self._warp_count() * lanes, "block_dim": WARP_SIZE, "device": device}
         return [
             launch(frame.start_distance_kernel, inputs=[*posed, found, self.work], **start),
             launch(search.search_warp_kernel, inputs=inputs, **searching),
             launch(report.report_distance_kernel, inputs=[self._tolerances, *reports], **threads),
-            *crossings,
         ]
 
     def _make_result(self, found: Found, device: bool, with_rows: bool = True) -> Result:

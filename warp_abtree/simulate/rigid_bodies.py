@@ -1,6 +1,6 @@
 """Rigid bodies that respond to the contacts of their meshes: `Dynamics`.
 
-One step: contacts where the bodies stand, and as far ahead as they move (`ManifoldQuery` with a gap); gravity; contact
+One step: contacts where the bodies stand, and where they first meet as far ahead as they move (`AheadQuery`); gravity; contact
 impulses by projected Gauss-Seidel with warm starting and Coulomb friction; position correction by split impulses;
 semi-implicit Euler with a symplectic rotation; with `continuous`, motions cut where surfaces would meet. All in
 float64; docs/dynamics.md has each part, what is conserved and repeated, figures, and limits.
@@ -17,10 +17,11 @@ from warp_abtree.kernels.arrays import LAST_KEY
 from warp_abtree.kernels.dynamics import bodies as body_kernels
 from warp_abtree.kernels.dynamics import constraints as constraint_kernels
 from warp_abtree.kernels.dynamics import graph_coloring, solve
-from warp_abtree.query.manifold import POINTS_MAX, ManifoldQuery
+from warp_abtree.query.manifold import POINTS_MAX
 from warp_abtree.query.request import Buffers, check_capacity
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.body_state import RigidBodies, zeros_of
+from warp_abtree.simulate.contacts_ahead import AheadQuery
 from warp_abtree.simulate.continuous import CertifiedWays
 
 COLOR_COUNT = int(graph_coloring.COLOR_COUNT)
@@ -52,7 +53,7 @@ class Dynamics(RigidBodies):
     Attributes:
         bodies, mass, rigid, kinematic: As `RigidBodies`.
         certified: With `continuous`, `CertifiedWays`, what the last step made of each motion; else None.
-        query: The `ManifoldQuery` of the last step: its pairs, contacts and contact points.
+        query: The `AheadQuery` of the last step: its pairs, contacts and contact points.
         constraints: Their impulses and colors, `kernels.dynamics.constraints.Constraints`.
 
     Raises:
@@ -76,7 +77,7 @@ class Dynamics(RigidBodies):
             raise ValueError(f"friction {friction!r} is below 0")
         by_color = current_regime().relax_by_color
         self._by_color = not self.device.is_cpu if by_color is None else by_color
-        self.query = ManifoldQuery(scene, None, capacity, gap=self.bodies.reach)
+        self.query = AheadQuery(scene, self.bodies, capacity)
         self.certified = None
         if flag(continuous, "continuous"):
             self.certified = CertifiedWays(scene, self.bodies, Buffers(pairs=check_capacity(capacity).pairs))
