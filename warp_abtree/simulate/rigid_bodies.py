@@ -26,7 +26,7 @@ from warp_abtree.simulate.continuous import CertifiedWays
 
 COLOR_COUNT = int(graph_coloring.COLOR_COUNT)
 SHELL = 0.75 * float(body_kernels.REACH_LEAST)  # with continuous bodies rest half a slop apart or more, in reach
-ITERATIONS = 16  # rounds of relaxation over all contacts in a step
+ITERATIONS = 32  # rounds of relaxation over all contacts in a step
 COLOR_ROUNDS = 2  # of the graph coloring, each color; one makes almost twice as many colors
 LAST_COLORS = 8  # first of the last colors, which one block relaxes
 # Threads of a block: few pairs of a color lie on as many multiprocessors, and the last colors on one.
