@@ -21,7 +21,7 @@ HALF_ROOT = wp.constant(wp.float64(1.7725))
 class Chosen:
     """Pairs whose distances are wanted, in any order."""
 
-    count: wp.array(dtype=wp.int32)
+    count: wp.array(dtype=wp.int32)  # how many, shape [1]
     pairs: wp.array(dtype=wp.vec2i)  # their objects, shape [chosen]
     place: wp.array(dtype=wp.int32)  # index of each among all pairs, shape [chosen]
     beyond: wp.array(dtype=wp.float64)  # their gaps, how far a distance is searched [world units], shape [chosen]

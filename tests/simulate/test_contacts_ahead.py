@@ -6,6 +6,7 @@ import trimesh
 from helpers.bodies import about, make, model_of, on_ground
 from oracles.triangle import quaternion_matrix
 
+import warp_abtree as ab
 from warp_abtree.simulate.body_state import mass_properties
 
 BOX = model_of(trimesh.creation.box((0.8, 0.6, 0.4)))
@@ -61,3 +62,22 @@ def test_a_body_that_passes_by_is_not_touched(device):
         dynamics.step(1 / 60)
     np.testing.assert_allclose(dynamics.velocities()[0][1], [6.0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(dynamics.poses()[1, :3], [1.0, 0, 0.205], atol=1e-12)
+
+
+def test_only_faces_about_the_nearest_are_contacts_ahead(device):
+    """Of a fine ball that falls fast: as far as its distance from the floor and half a face."""
+    height, speed = 0.6, 9.0
+    dynamics = on_ground(device, (FINE_BALL, (0, 0, height, 0, 0, 0, 1)), velocity=(0, 0, -speed))
+    dynamics.find()
+    query = dynamics.query
+    distance = ab.DistanceQuery(dynamics.scene, [(0, 1)]).run().bracket[0, 1]
+    radius = dynamics.bodies.bounding_radius.numpy()[1]
+    faces = len(FINE_BALL.mesh_at(FINE_BALL.lod_max)[1])
+    gap = query.hits.gap.numpy()[0]
+    np.testing.assert_allclose(gap, distance + radius * np.sqrt(np.pi / faces), rtol=1e-4)
+    reach = np.linalg.norm(dynamics.bodies.reach.numpy()[1][:3])
+    assert gap < reach
+    near = ab.ContactQuery(dynamics.scene, [(0, 1)], gap=[gap]).run()
+    assert query.hits.count.numpy()[0] == near.count[0] > 0
+    far = ab.ContactQuery(dynamics.scene, [(0, 1)], gap=[reach]).run()
+    assert far.count[0] > 1.5 * near.count[0]
