@@ -261,8 +261,8 @@ class DistanceQuery(Query):
             self._fit_slabs()
         super().traverse()
         if self.device.is_capturing:
-            self._make_distances(wp.launch)
-            self._make_inside(wp.launch)
+            self._launch_all("distances", self._make_distances)
+            self._launch_all("inside", self._make_inside)
             return
         commands = self._commands.find("distances", self.guard.given(), self._make_distances)
         # On the CPU what is launched is done.
@@ -274,8 +274,7 @@ class DistanceQuery(Query):
                 launch_on_cores(command.launch, room, cores, PAIRS_A_CORE)
             elif meeting or place not in CROSSINGS:
                 command.launch()
-        for command in self._commands.find("inside", self.guard.given(), self._make_inside):
-            command.launch()
+        self._launch_all("inside", self._make_inside)
 
     def _make_inside(self, launch) -> list:
         """Make the launch that reports pairs of which one is inside the other, where there are solids."""
