@@ -11,7 +11,16 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame, Tolerances, load_triangles, scaled_up, spare_of
+from warp_abtree.kernels.distance.frame import (
+    NO_FACES,
+    ROUNDING_DOWN,
+    Found,
+    Frame,
+    Tolerances,
+    load_triangles,
+    scaled_up,
+    spare_of,
+)
 from warp_abtree.kernels.distance.node_pair import bound_children, limit_of
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.poses import PairPose
@@ -140,7 +149,8 @@ class Search:
     frame: Frame  # how boxes are compared
     tolerances: Tolerances  # when they are near enough
     room: wp.int32  # items that the stack takes, STACK_LENGTH at most
-    shared: wp.bool  # whether warps that are idle get some, and faces are measured in float64
+    shared: wp.bool  # whether warps that are idle get some
+    measures: wp.bool  # whether faces are measured in float64
 
 
 @wp.func
@@ -249,7 +259,8 @@ def search_items(
     head, end, waiting, opened = wp.int32(0), wp.int32(count), wp.int32(0), wp.int32(0)
     tests = wp.vec2i()
     held = load_faces(found.faces, pair) != NO_FACES
-    beyond = scaled_up(load_distance(found.distance, pair), frame)
+    # Bounds under it are of faces that are as near as is asked.
+    beyond = wp.float32(load_distance(found.distance, pair) * frame.scale64) * ROUNDING_DOWN
     spare = spare_of(search.tolerances, frame)
     while end > head or waiting > 0 or opened > 0:
         tickets = wp.int64(0)
@@ -278,7 +289,7 @@ def search_items(
         if opened > OPEN_LENGTH - warp_size() or (opened > 0 and end == head and waiting == 0):
             popped = wp.min(opened, warp_size())
             opened -= popped
-            if search.shared:
+            if search.measures:
                 upper = load_upper(found.upper, pair)
                 decide_open(items, opened, popped, upper, search, models, states, found)
         idle = count_idle(tickets)
@@ -339,6 +350,8 @@ def search_warp_kernel(
             search.frame = found_inout.frame[p]
             tests = wp.vec2i()
             rough = slot < 0 and count >= rough_least and load_faces(found_inout.faces, p) == NO_FACES
+            # Within a tolerance what bounds the distance may not be found again: it is measured at once.
+            within = tolerances.tolerance > wp.float64(0.0) or tolerances.relative > wp.float64(0.0)
             searching = bool(True)
             while searching:
                 # What is found within a wide tolerance is a start: far fewer are looked at in vain.
@@ -346,6 +359,7 @@ def search_warp_kernel(
                 if rough:
                     asked.relative = wp.max(tolerances.relative, FIRST_TOLERANCE)
                 search.shared = not rough
+                search.measures = within or not rough
                 search.tolerances = asked
                 size = start_items(slot, states, search.pose, work_inout)
                 tests += search_items(search, size, models, states, found_inout, work_inout)

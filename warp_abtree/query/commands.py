@@ -24,7 +24,7 @@ class Commands:
 
         Args:
             given: What the launches depend on: generations of the arrays, and numbers.
-            make: Returns a list of launches, made by a function that takes what `wp.launch` does.
+            make: Returns a list of launches, in their order, made by a function that takes what `wp.launch` does.
         """
         before, commands = self._made.get(name, (None, []))
         if before != given:

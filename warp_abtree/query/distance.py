@@ -261,8 +261,9 @@ class DistanceQuery(Query):
             self._fit_slabs()
         super().traverse()
         if self.device.is_capturing:
-            for make in (self._make_distances, self._make_crossings, self._make_inside):
-                make(wp.launch)
+            self._launch_all("distances", self._make_distances)
+            self._launch_all("crossings", self._make_crossings)
+            self._launch_all("inside", self._make_inside)
             return
         given = self.guard.given()
         for place, command in enumerate(self._commands.find("distances", given, self._make_distances)):
@@ -274,10 +275,8 @@ class DistanceQuery(Query):
                 command.launch()
         # On the CPU what is launched is done.
         if self.device.is_cuda or self._views.any_hit.any():
-            for command in self._commands.find("crossings", given, self._make_crossings):
-                command.launch()
-        for command in self._commands.find("inside", given, self._make_inside):
-            command.launch()
+            self._launch_all("crossings", self._make_crossings)
+        self._launch_all("inside", self._make_inside)
 
     def _make_crossings(self, launch) -> list:
         """Make the launches that find points of pairs that intersect, see `Commands.find`."""

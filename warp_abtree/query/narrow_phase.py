@@ -176,12 +176,10 @@ class Query(QueryReadout):
 
     def _launch_search(self, name: str, make):
         """Launch what `_make_search` makes: relative poses, the traversal, and passes over uncertain face pairs."""
-        # Also where all is captured: the kernels read the record.
-        given = self.guard.given()
         if self.device.is_capturing:
-            make(wp.launch)
+            self._launch_all(name, make)
             return
-        first, traversal, *passes = self._commands.find(name, given, make)
+        first, traversal, *passes = self._commands.find(name, self.guard.given(), make)
         first.launch()
         if self.uses_warps():
             traversal.launch()
@@ -246,11 +244,13 @@ class Query(QueryReadout):
         if self.batch.solids is None:
             return
         self.batch.solids.fit()
-        if self.device.is_capturing:
-            self._make_contained(wp.launch)
-            return
-        for command in self._commands.find("contained", self.guard.given(), self._make_contained):
-            command.launch()
+        self._launch_all("contained", self._make_contained)
+
+    def _launch_all(self, name: str, make):
+        """Launch what `make` lists, in this order, see `Commands.find`; into a graph, too."""
+        # The generations are brought up to date first: kernels read the record.
+        for launch in self._commands.find_callables(name, self.guard.given(), self.device, make):
+            launch()
 
     def _make_contained(self, launch) -> list:
         solids: Any = self.batch.solids

@@ -16,6 +16,7 @@ FRACTIONS = (1e-5, 1e-4, 3e-4, 0.001, 0.003, 0.006, 0.01, 0.02, 0.03, 0.05, 0.07
 QUICK_FRACTIONS = (1e-5, 0.003, 0.03, 0.1, 0.3, 1.0)
 CLOSE_TO_N = 0.5  # "except for the cases when k is very close to n"
 TENTH = 0.1  # k of all faces, at most
+BATCH_FACES = 10_000  # of a model of which a GPU has a thousand states
 # Name, and how far B is pushed into A as a fraction of A's longest side.
 CONFIGURATIONS = (("touching", 0.001), ("light", 0.03), ("deep", 0.2))
 
@@ -126,13 +127,16 @@ def run_share(context):
 
     Pairs of one model in random rotations: just touching, pushed into each other by 3 % and by 20 % of the longest
     side. The first object of every pair, with a tree state of its own, moves between the finest level of detail and the
-    coarsest one for which k stays below 10 % of the faces; then all intersecting face pairs are asked. Where 32 pairs
-    share one state, one update serves all.
+    coarsest one for which k stays below 10 % of the faces; then all intersecting face pairs are asked. Where pairs
+    share one state, one update serves all. A GPU has batches of 1,024 of the smaller models, too.
     """
-    most = context.size(32, 4)
+    most, batch = context.size(32, 4), context.size(1024, 8)
     for model in paper_models(context, largest=False):
         context.progress(model.name)
-        for count, states in [(1, 1), (most, most), (most, 1)]:
+        counts = [(1, 1), (most, most), (most, 1)]
+        if context.device.is_cuda and model.face_count <= BATCH_FACES:
+            counts += [(batch, batch), (batch, 1)]
+        for count, states in counts:
             yield from time_shares(context, model, find_tenth(model), count, states)
 
 
