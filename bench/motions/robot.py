@@ -1,7 +1,7 @@
 """A robot arm among obstacles: configurations a second, self-collision included, beside python-fcl link by link.
 
 The arm is that of the URDF or MJCF file in $ABTREE_ROBOT with its visual meshes; without, one with the joints of a
-Franka Panda and links of our own, rounded tubes of about 100,000 faces together. Around it stand real meshes, joined to
+Franka Panda and links of our own, rounded tubes of about 70,000 faces together. Around it stand real meshes, joined to
 one of about 190,000 faces; without these a knot.
 """
 
@@ -20,9 +20,11 @@ from warp_abtree.model.mesh import load_mesh
 from ..meshes import mesh_file
 from ..shapes import knot
 from ..timing import one_core, summarise, time_call, time_rounds
+from .spheres import run_spheres
 
-FULL = {"count": 4096, "fcl": 512, "repeats": 7, "fine": 22}
-QUICK = {"count": 24, "fcl": 24, "repeats": 1, "fine": 6}
+FULL = {"count": 4096, "fcl": 512, "repeats": 7, "fine": 22, "spheres": (60, 250, 1000), "posed": 8192, "scale": 1}
+QUICK = {"count": 24, "fcl": 24, "repeats": 1, "fine": 6, "spheres": (30,), "posed": 64, "scale": 5}
+PARTS = ("any", "distance", "edges", "spheres")
 AROUND = ("stanford-bunny", "rocker-arm", "homer", "fandisk", "cow", "factory-bolt-m16", "factory-gear-medium")
 LONG = 2.8973
 # Joint of each link: x y z and turn about x [rad] from the link before, limits; lengths in metres.
@@ -157,11 +159,11 @@ class FclRobot:
         return any(self.fcl.collide(a, b, request, self.fcl.CollisionResult()) for a, b in pairs)
 
 
-def run(device, quick=False):
+def run(device, quick=False, only=PARTS):
     """Yield a row for each output: configurations a second, of random ones within limits.
 
     On the CPU one thread works. Forward kinematics is part of our time, and none of python-fcl's, which asks pair by
-    pair until two intersect. Answers that differ from its are counted.
+    pair until two intersect. Answers that differ from its are counted. Last come the errors of `spheres`.
     """
     device, sizes = wp.get_device(device), QUICK if quick else FULL
     with tempfile.TemporaryDirectory() as folder:
@@ -173,36 +175,52 @@ def run(device, quick=False):
     around = ab.Model.load(mesh, base_faces=len(mesh.faces))
     count, rng = sizes["count"] if device.is_cpu else 2**20, np.random.default_rng(0)
     configurations = rng.uniform(*robot.limits.T, (count, len(robot.joint_names)))
-    fcl_robot, some = FclRobot(robot, around), configurations[: sizes["fcl"]]
-    poses = robot.forward(some).numpy()
     about = {
         "device": device.name,
         "robot_faces": sum(model.face_count for model in robot.models),
         "world_faces": around.face_count,
         "self_pairs": len(robot.pairs),
-        "configurations": count,
     }
     # One thread works: its own time leaves out other processes.
     clock = time.thread_time if device.is_cpu else time.perf_counter
     with one_core():
-        found = robot.check(configurations, around)
-        runs = {
-            "ours": time_call(lambda: robot.check(configurations, around), device, clock),
-            "fcl": time_call(lambda: fcl_robot.any(poses), clock=clock),
-        }
-        times = time_rounds(runs, sizes["repeats"])
-        row = about | {"output": "any", "meet": round(float(found.mean()), 4)} | summarise(times)
-        row["differ_from_fcl"] = int((fcl_robot.any(poses) != found[: len(some)]).sum())
-        row["configurations_s"] = round(1e3 * count / row["ours_ms"])
-        row["fcl_configurations_s"] = round(1e3 * len(some) / row["fcl_ms"])
-        yield row
-        part = configurations[: max(2, count // 8)]
-        for beyond in (None, 0.05):
-            ask = time_call(lambda beyond=beyond: robot.check(part, around, "distance", beyond), device, clock)
-            times = time_rounds({"ours": ask}, 1)
-            row = about | {"output": "distance", "beyond": beyond, "configurations": len(part)} | summarise(times)
-            yield row | {"configurations_s": round(1e3 * len(part) / row["ours_ms"])}
-        yield about | run_edges(device, clock, robot, around, configurations[~found])
+        if "any" in only:
+            yield about | run_any(device, clock, robot, around, configurations, sizes)
+        if "distance" in only:
+            for beyond in (None, 0.05):
+                part = configurations[: max(2, count // 8)]
+                yield about | run_distance(device, clock, robot, around, part, beyond)
+        if "edges" in only:
+            free = configurations[~robot.check(configurations, around)]
+            yield about | run_edges(device, clock, robot, around, free)
+    if "spheres" in only:
+        for row in run_spheres(robot, mesh, around, sizes["spheres"], sizes["posed"], sizes["scale"]):
+            yield about | row
+
+
+def run_any(device, clock, robot, around, configurations, sizes):
+    """Return the columns of yes or no, beside python-fcl."""
+    fcl_robot, some = FclRobot(robot, around), configurations[: sizes["fcl"]]
+    poses, found = robot.forward(some).numpy(), robot.check(configurations, around)
+    runs = {
+        "ours": time_call(lambda: robot.check(configurations, around), device, clock),
+        "fcl": time_call(lambda: fcl_robot.any(poses), clock=clock),
+    }
+    times = time_rounds(runs, sizes["repeats"])
+    row = {"output": "any", "configurations": len(configurations), "meet": round(float(found.mean()), 4)}
+    row |= summarise(times)
+    row["differ_from_fcl"] = int((fcl_robot.any(poses) != found[: len(some)]).sum())
+    row["configurations_s"] = round(1e3 * len(configurations) / row["ours_ms"])
+    row["fcl_configurations_s"] = round(1e3 * len(some) / row["fcl_ms"])
+    return row
+
+
+def run_distance(device, clock, robot, around, configurations, beyond):
+    """Return the columns of least distances."""
+    ask = time_call(lambda: robot.check(configurations, around, "distance", beyond), device, clock)
+    row = {"output": "distance", "beyond": beyond, "configurations": len(configurations)}
+    row |= summarise(time_rounds({"ours": ask}, 1))
+    return row | {"configurations_s": round(1e3 * len(configurations) / row["ours_ms"])}
 
 
 def run_edges(device, clock, robot, around, free):

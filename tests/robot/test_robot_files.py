@@ -8,6 +8,9 @@ from helpers.robots import MJCF, URDF, random_configurations, write_arm
 
 import warp_abtree as ab
 
+BEND_LIMIT, GRIP_LIMIT = (
+    f'<limit lower="{low}" upper="{high}" effort="1" velocity="1"/>' for low, high in ((-2.8, 2.8), (0, 0.1))
+)
 SRDF = '<robot name="arm"><disable_collisions link1="{}" link2="fore" reason="Never"/></robot>'
 
 
@@ -104,6 +107,11 @@ def test_files_answer_as_scenes_of_their_links(urdf, device):
     np.testing.assert_array_equal(arm.check(rows), expected)
 
 
+def test_a_limit_that_urdf_leaves_out_is_zero(urdf):
+    urdf.write_text(URDF.replace('lower="-2.8"', ""), encoding="utf-8")
+    np.testing.assert_array_equal(ab.Robot.load(urdf, device="cpu").limits[1], [0, 2.8])
+
+
 @pytest.mark.parametrize(
     "before, after, message",
     [
@@ -116,6 +124,13 @@ def test_files_answer_as_scenes_of_their_links(urdf, device):
         ('<robot name="arm">', "arm", "not read as URDF"),
         ('lower="-2.8"', 'lower="2.9"', "joint 'bend': limits 2.9 .. 2.8 leave no value"),
         ('lower="-2.8"', 'lower="nan"', "joint 'bend': limits nan .. 2.8 leave no value"),
+        (BEND_LIMIT, "", "joint 'bend' is revolute and has no limits; .*, or make it continuous$"),
+        (BEND_LIMIT, '<limit effort="1" velocity="1"/>', "joint 'bend' is revolute and has no limits"),
+        (
+            '<limit lower="0" upper="0.1" effort="1" velocity="1"/>',
+            "",
+            r"'grip' is prismatic and has no limits; .*\.\.>$",
+        ),
         ('size="0.08 0.08 0.5"', 'size="0.08 0.5"', "link 'upper': sizes .* are not 3"),
         ('radius="0.1" length', 'radius="-0.1" length', "link 'base': sizes .* are not 2"),
         ('radius="0.03"', 'radius="nan"', "link 'left': sizes .* are not 1"),

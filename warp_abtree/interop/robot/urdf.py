@@ -71,9 +71,16 @@ def _check_joint(joint, joints, names, path):
 
 
 def _limits(joint, path) -> tuple[float, float]:
-    if joint.type == "continuous" or joint.limit is None or joint.limit.lower is None or joint.limit.upper is None:
+    """Return the limits of a joint: URDF requires them unless it is continuous, and has 0 for one that is not given."""
+    if joint.type == "continuous":
         return -math.inf, math.inf
-    low, high = float(joint.limit.lower), float(joint.limit.upper)
+    given = (None, None) if joint.limit is None else (joint.limit.lower, joint.limit.upper)
+    if given == (None, None):
+        raise RobotError(
+            f"{path}: joint {joint.name!r} is {joint.type} and has no limits; give <limit lower=... upper=...>"
+            + (", or make it continuous" if joint.type == "revolute" else "")
+        )
+    low, high = (0.0 if value is None else float(value) for value in given)
     if not low <= high:
         raise RobotError(f"{path}: joint {joint.name!r}: limits {low:g} .. {high:g} leave no value")
     return low, high
