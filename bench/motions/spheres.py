@@ -8,7 +8,7 @@ How the cover is made, so that its errors are those of spheres and not of a bad 
   candidate's depth. What is minimised is the most that any sphere sticks out, its margin.
 * The next sphere goes to the link with the largest margin, where its worst piece is (farthest first); now and then
   pieces go to the sphere that sticks out least for them, and each sphere to the candidate that is best for its pieces
-  (Lloyd). All links share a number, so that none has a worse margin than need be.
+  (Lloyd). Links share a number of spheres, so that none has a worse margin than need be.
 * Every triangle of each link, cut to short edges, then lies wholly in a sphere: a cover is conservative, it misses
   nothing. A radius is no larger than that takes.
 
@@ -25,9 +25,9 @@ from scipy.spatial.distance import cdist
 
 import warp_abtree as ab
 
-GRID, PIECE = 0.003, 0.006  # [m]: of the grid, and edges of pieces
-CANDIDATES, ROUNDS = 2000, 12  # on the medial axis of a link; and rounds of a Lloyd step
-GROWTH = 1.2  # spheres of a link between two Lloyd steps
+GRID, PIECE = 0.003, 0.005  # [m]: of the grid, and edges of pieces
+CANDIDATES = 2500  # on the medial axis of a link
+GROWTH, ROUNDS = 1.2, 12  # spheres of a link between two Lloyd steps, and rounds of one
 ROUNDING = 1e-6  # [m], of float32 positions
 
 
