@@ -75,10 +75,10 @@ class Robot:
     def load(cls, path, geometry="collision", device=None, mounted=(), srdf=None, neutral=None) -> "Robot":
         """Load a robot from a URDF (.urdf, by yourdfpy) or MJCF file (.xml, by MuJoCo).
 
-        Joints may be fixed, revolute, continuous, prismatic, and mimic others; of URDF, revolute and prismatic ones have
-        limits, 0 where one is not given. Tested against one another are all links
-        but those that are rigidly joined, that a joint joins, or that the file (MJCF: `contact/exclude`, contype and
-        conaffinity) or the SRDF excludes.
+        Joints may be fixed, revolute, continuous, prismatic, and mimic others. Of URDF, revolute and prismatic ones
+        must have limits, 0 where one of two is not given. Tested against one another are all links but those that are
+        rigidly joined, that a joint joins, or that the file (MJCF: `contact/exclude`, contype and conaffinity) or the
+        SRDF excludes.
 
         Args:
             geometry: "collision" or "visual" meshes; boxes, cylinders and the like are tessellated. Of MJCF, "visual"
