@@ -1,4 +1,4 @@
-"""Bounds of `kernels.motion.linear`, each by itself, as `test_bounds`: what they cover, in longer numbers."""
+"""Bounds of `kernels.motion.linear`, each by itself, as `test_motion_bounds`: what they cover, in longer numbers."""
 
 import numpy as np
 import pytest
