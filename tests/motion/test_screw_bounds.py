@@ -48,11 +48,13 @@ def turn_between_kernel(x: wp.array2d(dtype=wp.float64), out: wp.array(dtype=wp.
     out[i] = turn_between(x[i, 0], x[i, 1])
 
 
-def random_patch(rng):
-    """Return corners of a flat patch of `FACES` about the point (1, 0, 0), and its normal."""
-    width = rng.choice([0.03, 0.3], 2) * rng.uniform(0.5, 1, 2)
+def random_patch(rng, pitch):
+    """Return corners of a flat patch of `FACES` about the point (1, 0, 0), and its normal; some lie along the screw."""
+    width = rng.choice([[0.03, 0.03], [0.03, 0.3], [0.3, 0.3], [0.42, 0.02]]) * rng.uniform(0.5, 1, 2)
     u, v = (np.stack(np.meshgrid([-1, 0, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 2) * width).T
     tilt = Rotation.from_rotvec([0, rng.uniform(-1.5, 1.5), rng.uniform(-0.5, 0.5)])
+    if rng.random() < 0.5:
+        tilt = Rotation.from_rotvec([np.arctan(pitch), 0, 0]) * Rotation.from_rotvec([0, rng.uniform(1.4, 1.7), 0])
     return tilt.apply(np.stack([0 * u, u, v], 1)) + [rng.uniform(0.9, 1.1), 0, 0], tilt.apply([1, 0, 0])
 
 
@@ -71,8 +73,8 @@ def touching_patches(rng, off, drift):
 
     None where these are not the farthest ones. The moving one's is moved away by `off` along the direction.
     """
-    (rest, normal), (moving, other) = random_patch(rng), random_patch(rng)
     turn, way, t = rng.uniform(0.2, 3), np.array([0, 0, rng.normal()]), rng.choice([0, rng.uniform(), 1])
+    (rest, normal), (moving, other) = (random_patch(rng, way[2] / turn) for _ in range(2))
     side = rng.normal(size=3) * [1, 1, 0]
     way += drift * side / np.linalg.norm(side)
     base, pitch = (rest.min(0) + rest.max(0)) / 2, way[2] / turn
