@@ -175,7 +175,7 @@ def test_what_is_undecided_waits_and_is_no_error(device):
     np.testing.assert_array_equal(dynamics.certified.fraction.numpy(), 0)
 
 
-@pytest.mark.parametrize("speed", [30.0, 1e3, 1e5])
+@pytest.mark.parametrize("speed", [30.0, 1e3, 1e9])
 def test_a_body_that_strikes_the_floor_stays_there(device, speed):
     """The impulse that stopped it is not what it rests by: little of it may lift the body in the next step."""
     placed = box(0.8, 0.6, 0.4), (0, 0, 0.5, *about((0, 0, 1), 0.3))
