@@ -19,6 +19,9 @@ SLOP = wp.constant(wp.float64(2.0**-9))
 MATCH_RADIUS = wp.constant(wp.float64(0.05))
 """Largest distance of a point from its match in the step before, as a fraction of the bounding radius."""
 
+IMPACT = wp.constant(wp.float64(64.0))
+"""Speed of impacts from which on nothing is kept, times what gravity adds in two steps."""
+
 
 @wp.struct
 class Constraints:
@@ -30,6 +33,7 @@ class Constraints:
     tangent_mass: wp.array2d(dtype=wp.mat33d)  # effective mass across the normal, world frame
     bias: wp.array2d(dtype=wp.float64)  # separation speed that the position correction aims for [world units/s]
     approach: wp.array2d(dtype=wp.float64)  # speed at which points that are apart meet after the step [world units/s]
+    speed: wp.array2d(dtype=wp.float64)  # of separation before the step [world units/s]
     impulse: wp.array2d(dtype=wp.float64)  # accumulated, along the normal
     friction_impulse: wp.array2d(dtype=wp.vec3d)  # accumulated, across the normal, world frame
     pseudo_impulse: wp.array2d(dtype=wp.float64)  # accumulated, of the position correction
@@ -171,8 +175,9 @@ def prepare_constraints_kernel(
         constraints_out.impulse[p, k] = wp.float64(0.0)
         constraints_out.friction_impulse[p, k] = wp.vec3d()
         constraints_out.pseudo_impulse[p, k] = wp.float64(0.0)
-        velocity = relative_velocity(constraints_out, bodies, c)
-        if known and wp.abs(wp.dot(c.normal, velocity)) <= fast:
+        speed = wp.dot(c.normal, relative_velocity(constraints_out, bodies, c))
+        constraints_out.speed[p, k] = speed
+        if known and wp.abs(speed) <= fast:
             local = wp.transpose(objects.rotation[a]) * (x - objects.position[a])
             match = find_match(warm_start, row, MATCH_RADIUS * radius, local, used)
             if match >= 0:
@@ -184,6 +189,8 @@ def prepare_constraints_kernel(
 
 @wp.kernel
 def save_impulses_kernel(
+    # static
+    fast: wp.float64,
     # state
     key: wp.array(dtype=wp.int64),
     pairs: wp.array(dtype=wp.vec2i),
@@ -194,7 +201,10 @@ def save_impulses_kernel(
     # out
     warm_start_out: WarmStart,
 ):
-    """Save the impulses of one pair a thread for the next step, with points relative to the first object."""
+    """Save the impulses of one pair a thread for the next step, with points relative to the first object.
+
+    But for those of impacts, much faster than `fast`: what the next step's rounds leave of them would lift the body.
+    """
     p = wp.tid()
     if bodies.is_whole[0] == 0:
         return
@@ -204,5 +214,6 @@ def save_impulses_kernel(
     for k in range(manifolds.count[p]):
         local = wp.transpose(objects.rotation[a]) * (manifolds.point[p, k] - objects.position[a])
         warm_start_out.point[p, k] = local
-        warm_start_out.impulse[p, k] = constraints.impulse[p, k]
-        warm_start_out.friction_impulse[p, k] = constraints.friction_impulse[p, k]
+        strikes = fast > wp.float64(0.0) and constraints.speed[p, k] < -IMPACT * fast
+        warm_start_out.impulse[p, k] = wp.where(strikes, wp.float64(0.0), constraints.impulse[p, k])
+        warm_start_out.friction_impulse[p, k] = wp.where(strikes, wp.vec3d(), constraints.friction_impulse[p, k])

@@ -10,7 +10,7 @@ base's frame. ANY n proves what `path` says; the best joins the nearest points. 
 * undecided, at t, after `STEPS_MAX` steps.
 
 Gaps and speeds err by `slack` and `speed_slack`, which also cover the dot products' roundings, 8 u of the sizes. The
-root's is covered by `EARLIER`, 2^-40 of the step.
+root's is covered by `EARLIER`, 2^-40 of the step, and that of the time after it by `TIME_DOWN`.
 """
 
 import warp as wp
@@ -147,14 +147,20 @@ def axis_of(base: corners_type, at: corners_type, k: wp.int32):
 
 @wp.func
 def step_along(gap: wp.float64, rate: wp.float64, bend: wp.float64):
-    """Return how long a gap stays open, as `node_pair.step_of`; infinite where it does for ever."""
+    """Return how long a gap stays open for certain, as `node_pair.step_of`; infinite where it does for ever."""
     zero, two = wp.float64(0.0), wp.float64(2.0)
     if gap <= zero or not (gap > zero):
         return zero
     root = wp.sqrt(rate * rate + two * bend * gap)
     if rate > zero:
-        return wp.where(bend > zero, (rate + root) / wp.where(bend > zero, bend, two), wp.float64(wp.inf))
-    return wp.where(root > rate, two * gap / wp.where(root > rate, root - rate, two), wp.float64(wp.inf))
+        return wp.where(bend > zero, (rate + root) / wp.where(bend > zero, bend, two) * EARLIER, wp.float64(wp.inf))
+    return wp.where(root > rate, two * gap / wp.where(root > rate, root - rate, two) * EARLIER, wp.float64(wp.inf))
+
+
+@wp.func
+def time_after(t: wp.float64, step: wp.float64):
+    """Return the time that a step leads to, rounded down."""
+    return (t + step) * TIME_DOWN
 
 
 @wp.func
@@ -202,7 +208,7 @@ def plane_step(motion: Motion, base: corners_type, m: Moment, mover: corners_typ
     step = safe_step(motion, n, base, m, mover, at)
     n = wp.normalize(wp.cross(at[1] - at[0], at[2] - at[0]))
     n = wp.where(wp.dot(n, at[0] - base[0]) < wp.float64(0.0), -n, n)
-    return wp.max(step, safe_step(motion, n, base, m, mover, at)) * EARLIER
+    return wp.max(step, safe_step(motion, n, base, m, mover, at))
 
 
 @wp.func
@@ -227,18 +233,18 @@ def advance_faces(
         at = map_corners(m.rotation, m.shift, mover)
         step = plane_step(motion, base, m, mover, at)
         # A pair may end here for the best time so far, if it would go on after it whatever that is.
-        if step >= tolerance and (t + step) * TIME_DOWN > best:
+        if step >= tolerance and time_after(t, step) > best:
             contact.end = CLEAR
             return contact
         if step < LONG_STEP:
             n = separating_direction(base, at)
-            step = wp.max(step, safe_step(motion, n, base, m, mover, at) * EARLIER)
+            step = wp.max(step, safe_step(motion, n, base, m, mover, at))
         contact.time = t
         contact.end = UNDECIDED
-        then = (t + step) * TIME_DOWN
+        then = time_after(t, step)
         if then <= t:
-            step = longest_step(motion, step, base, m, mover, at) * EARLIER
-            then = (t + step) * TIME_DOWN
+            step = longest_step(motion, step, base, m, mover, at)
+            then = time_after(t, step)
         if then <= t:
             contact.end = TOUCHES
             return contact

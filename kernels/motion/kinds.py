@@ -12,7 +12,7 @@ from warp_abtree.kernels.motion.linear import (
     start_linear_motion,
 )
 from warp_abtree.kernels.motion.node_pair import advance_children, box_motion
-from warp_abtree.kernels.motion.path import Motion, Paths, bound_motion, place_motion, start_motion
+from warp_abtree.kernels.motion.path import Motion, Paths, bound_motion, place_motion, skew_of, start_motion
 from warp_abtree.kernels.motion.screw import is_screw, parent_of, slides_apart
 from warp_abtree.kernels.poses import NO_NODE, PairPose
 from warp_abtree.kernels.traversal.node_pair import item_first, item_second
@@ -32,7 +32,8 @@ def make_motion(
     pair: wp.vec2i,
 ):
     """Return the motion of objects a < b of the kind that is named."""
-    return bound_motion(start_motion(paths, models, states, objects, pair), states, pose)
+    motion = start_motion(paths, models, states, objects, pair)
+    return bound_motion(motion, states, pose, skew_of(objects, pair[0], motion.first))
 
 
 @wp.func
@@ -46,7 +47,8 @@ def make_motion(  # noqa: F811 - Warp takes the one for the type
     pose: PairPose,
     pair: wp.vec2i,
 ):
-    return bound_linear_motion(start_linear_motion(ends, models, states, objects, pair), states, pose)
+    motion = start_linear_motion(ends, models, states, objects, pair)
+    return bound_linear_motion(motion, states, pose, skew_of(objects, pair[0], motion.first))
 
 
 @wp.func

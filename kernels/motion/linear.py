@@ -13,9 +13,7 @@ from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.motion.face_pair import (
     AXIS_COUNT,
     CLEAR,
-    EARLIER,
     STEPS_MAX,
-    TIME_DOWN,
     TOUCHES,
     UNDECIDED,
     Contact,
@@ -24,6 +22,7 @@ from warp_abtree.kernels.motion.face_pair import (
     map_corners,
     separating_direction,
     step_along,
+    time_after,
 )
 from warp_abtree.kernels.motion.node_pair import go_on, later, longest_step
 from warp_abtree.kernels.motion.path import BEND_LEAST, SCALE_MAX
@@ -94,8 +93,8 @@ def start_linear_motion(
 
 
 @wp.func
-def bound_linear_motion(before: LinearMotion, states: StatePool, pose: PairPose) -> LinearMotion:
-    """Return a motion with its bounds."""
+def bound_linear_motion(before: LinearMotion, states: StatePool, pose: PairPose, skew: wp.float64) -> LinearMotion:
+    """Return a motion with its bounds, of rotations off by `path.skew_of`."""
     motion = before
     root_a = load_node(states, pose.node_a + 1)
     root_b = load_node(states, pose.node_b + 1)
@@ -104,7 +103,7 @@ def bound_linear_motion(before: LinearMotion, states: StatePool, pose: PairPose)
     away = largest(motion.centre_a) + largest(motion.centre_b)
     travel = largest(motion.shift_a) + largest(motion.shift_b)
     sizes = ((reach_a + reach_b) + away) + (largest(motion.offset) + travel)
-    motion.slack = two * POSE_ROUNDING * sizes
+    motion.slack = (two * POSE_ROUNDING + wp.float64(6.0) * skew) * sizes
     far = two * (largest(motion.offset) + travel) + two * away
     most = wp.max(wp.max(reach_a, reach_b), far)
     power = wp.cast(wp.cast(most, wp.int64) & EXPONENT_BITS, wp.float64)
@@ -235,18 +234,18 @@ def advance_straight(
         steps += 1
         x, y = a + t * way_a, b + t * way_b
         n = separating_direction(x, y)
-        step = straight_step(slack, n, x, y, way_a, way_b) * EARLIER
+        step = straight_step(slack, n, x, y, way_a, way_b)
         contact.time = t
         contact.end = UNDECIDED
-        then = (t + step) * TIME_DOWN
+        then = time_after(t, step)
         if then <= t:
             k = wp.int32(0)
             while k < AXIS_COUNT:
                 n = axis_of(x, y, k)
-                step = wp.max(step, straight_step(slack, n, x, y, way_a, way_b) * EARLIER)
-                step = wp.max(step, straight_step(slack, -n, x, y, way_a, way_b) * EARLIER)
+                step = wp.max(step, straight_step(slack, n, x, y, way_a, way_b))
+                step = wp.max(step, straight_step(slack, -n, x, y, way_a, way_b))
                 k += 1
-            then = (t + step) * TIME_DOWN
+            then = time_after(t, step)
         if then <= t:
             contact.end = TOUCHES
             return contact

@@ -19,10 +19,11 @@ in the model frames, B's point b lies in A's frame at R b + x, where it moves wi
    turn, y moves straight and |y|' is largest at an end and a corner of B's box; else |y|' <= |b'| + |d|.
 2. So along a unit n that is fixed in A's frame a point that is g over a plane at t is still over it at t + h if
    g + h s - M h^2 / 2 > 0, s = n . (K b + v) and M the bound of 1. `step_of` takes the root.
-3. Rounding. E errs by 20 u in each entry, u = 2^-53, R by 70 u; axes and angles by 8 u, which moves points by 16 u of
-   their distance from the anchor. With S = |a'| + |b'| + |d| + |anchors| points in A's frame err by under 2^-45 S, and
-   velocities by 2^-45 (S (A + B) + |d1|). What rotations are off orthonormal, k = |R^T R - I| in its largest entry,
-   counts 6 k S where A's points are taken to B's frame by R^T, as in the static test.
+3. Rounding. E errs by 20 u in each entry, u = 2^-53, R by 70 u; axes times angles by 8 u, which moves points by 16 u
+   of their distance from the anchor. With S = |a'| + |b'| + |d| + |anchors| points in A's frame err by under 2^-45 S,
+   and velocities by 2^-45 (S (A + B) + |d1|), but for what axes of slow turns are off: under 2^-45 S in unit time,
+   for which slacks have room. What rotations are off orthonormal counts 6 k S: k the largest entry of |Ra^T Ra - I|,
+   as Ra^T takes A's points to A's first frame, and that of |R0^T R0 - I|, as R^T takes them to B's.
 """
 
 import warp as wp
@@ -199,8 +200,16 @@ def start_motion(paths: Paths, models: ModelPool, states: StatePool, objects: Ob
 
 
 @wp.func
-def bound_motion(before: Motion, states: StatePool, pose: PairPose):
-    """Return a motion with its bounds."""
+def skew_of(objects: ObjectPool, a: wp.int32, first: wp.mat33d):
+    """Return how far rotations of A, and of B in its frame, are off orthonormal."""
+    own, _ = measure_rotation(objects.rotation[a])
+    skew, _ = measure_rotation(first)
+    return own + skew
+
+
+@wp.func
+def bound_motion(before: Motion, states: StatePool, pose: PairPose, skew: wp.float64):
+    """Return a motion with its bounds, of rotations off by `skew_of`."""
     motion = before
     root_a = load_node(states, pose.node_a + 1)
     root_b = load_node(states, pose.node_b + 1)
@@ -218,7 +227,6 @@ def bound_motion(before: Motion, states: StatePool, pose: PairPose):
     motion.base = wp.where(bend_b <= bend_a, 0, 1)
     motion.bend_size = wp.where(bend_b <= bend_a, size_b, size_a)
     motion.bend_rest = wp.where(bend_b <= bend_a, rest_b, rest_a)
-    skew, _ = measure_rotation(motion.first)
     reach_a, reach_b = reach_box(root_a.lower, root_a.upper), reach_box(root_b.lower, root_b.upper)
     way = wp.max(largest(motion.d0), largest(motion.d0 + motion.d1))
     anchors = largest(motion.anchor_a) + largest(motion.anchor_b)

@@ -12,7 +12,7 @@ from bench import tables
 from bench.shapes import knot
 from bench.studies import study
 from bench.studies.paper import meshes, static, update
-from bench.studies.tradeoff import competitors, distances, lods, settings
+from bench.studies.tradeoff import competitors, distances, lods, motions, settings
 from bench.tables import pick
 
 pytestmark = pytest.mark.slow
@@ -79,6 +79,7 @@ def check_tradeoff(parts, model):
     for row in pick(rows, method=competitors.HULL):
         assert row["missed"] == 0 and row["late_max"] < 1e-6 and row["contact_mean"] > 1e-3
     check_distances(parts["distances"])
+    check_motions(parts["motions"])
     assert any(row["front"] for row in rows) and not all(row["front"] for row in rows)
 
 
@@ -98,6 +99,15 @@ def check_distances(rows):
     refined = pick(rows, case="refine")
     assert len(refined) == len(distances.REFINED) * len(distances.ASKED)
     assert all(0 <= row["decided"] <= 1 and row["refine_cost"] > 0 for row in refined)
+
+
+def check_motions(rows):
+    ended, levels = (pick(rows, method=name) for name in (motions.TOLERANCE, motions.OURS))
+    assert len(ended) == len(motions.TOLERANCES) and len(levels) == len(motions.FRACTIONS) + 1
+    for row, tolerance in zip(ended, motions.TOLERANCES, strict=True):
+        assert row["early_max"] <= tolerance + motions.LEAST and row["late_max"] <= motions.LEAST
+        assert row["missed"] == row["invented"] == row["undecided"] == 0 < row["meet"]
+    assert levels[0]["time_mean"] > levels[2]["time_mean"] > 1e-6 >= levels[-1]["early_max"]
 
 
 def check_settings(rows):

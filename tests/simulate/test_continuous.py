@@ -161,3 +161,27 @@ def test_a_step_without_room_for_pairs_moves_nothing_and_says_so(device):
         dynamics.check()
     dynamics.finish(1 / 60)
     assert not np.array_equal(dynamics.poses(), before) and not surfaces_meet(dynamics)
+
+
+def test_what_is_undecided_waits_and_is_no_error(device):
+    """Ways beyond float64: nothing is proved of them, so the bodies stay where they are."""
+    placed = [(BRICK, (x, 0, 0, 0, 0, 0, 1)) for x in (0, 3)]
+    with np.errstate(over="ignore"):
+        dynamics = make(device, *placed, velocity=[(1e308, 0, 0), (-1e308, 0, 0)], continuous=True, **FREE)
+    dynamics.step(1.0)
+    dynamics.check()
+    assert dynamics.certified.pair_totals()["undecided"] > 0
+    np.testing.assert_array_equal(dynamics.poses()[:, 0], [0, 3])
+    np.testing.assert_array_equal(dynamics.certified.fraction.numpy(), 0)
+
+
+@pytest.mark.parametrize("speed", [30.0, 1e3, 1e9])
+def test_a_body_that_strikes_the_floor_stays_there(device, speed):
+    """The impulse that stopped it is not what it rests by: little of it may lift the body in the next step."""
+    placed = box(0.8, 0.6, 0.4), (0, 0, 0.5, *about((0, 0, 1), 0.3))
+    dynamics = on_ground(device, placed, velocity=(0, 0, -speed), continuous=True)
+    slop = dynamics.bodies.bounding_radius.numpy()[1] / 512
+    for _ in range(12):
+        dynamics.step(1 / 60)
+        assert dynamics.poses()[1, 2] < 0.2 + 2 * slop
+    assert np.abs(dynamics.velocities()[0][1]).max() < 0.01

@@ -174,7 +174,7 @@ class Dynamics(RigidBodies):
             self._relax(solve.WARM_START, 1, fast)
             self._relax(solve.VELOCITY, ITERATIONS, fast)
             self._relax(solve.POSITION, ITERATIONS, fast)
-            inputs = [query.broad_phase.key, *posed, self.constraints, bodies, self._warm_start]
+            inputs = [fast, query.broad_phase.key, *posed, self.constraints, bodies, self._warm_start]
             self._launch(constraint_kernels.save_impulses_kernel, room, inputs)
             posed = self._pool if self.certified is None else self.certified.goals
             self._launch(body_kernels.integrate_kernel, n, [dt, self.targets, bodies, posed])

@@ -2,9 +2,15 @@
 
 from functools import partial
 
-from . import competitors, distances, lods, settings, summaries
+from . import competitors, distances, lods, motions, settings, summaries
 
-PARTS = {"lods": lods.run, "settings": settings.run, "competitors": competitors.run, "distances": distances.run}
+PARTS = {
+    "lods": lods.run,
+    "settings": settings.run,
+    "competitors": competitors.run,
+    "distances": distances.run,
+    "motions": motions.run,
+}
 SUMMARIES = {
     "over_meshes": summaries.over_meshes,
     "choose": summaries.choose,
@@ -14,5 +20,6 @@ SUMMARIES = {
     "margins": partial(summaries.summarise, names=("value", "factor")),
     "over_workloads": summaries.over_workloads,
     "distances": partial(summaries.summarise, names=("method", "setting", "where")),
+    "motions": partial(summaries.summarise, names=("method", "setting")),
     "refined": partial(summaries.summarise, names=("value", "asked")),
 }

@@ -4,7 +4,7 @@ import numpy as np
 
 from ...tables import pick
 
-SUMMED = ("poses", "meet", "missed", "invented", "hits", "faces_missed", "faces_invented")
+SUMMED = ("poses", "meet", "missed", "invented", "undecided", "hits", "faces_missed", "faces_invented")
 LARGEST = ("early_max", "late_max", "contact_max", "region_hausdorff_max", "distance_max")
 RATIOS = ("us", "cost", "build_s", "of_finest", "any_cost", "contacts_cost", "refine_cost")
 TESTS = ("node_tests", "contacts_node_tests")

@@ -1,0 +1,168 @@
+"""Bounds of the steps in time of `kernels.motion`, each by itself, in fractions: no step is too long, nor any sum."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import warp as wp
+from helpers.motions import STILL, find
+from helpers.questions import launch, pairs_of, scene_of
+from oracles.motion import translation_contact
+
+import warp_abtree as ab
+from warp_abtree.kernels.motion.face_pair import safe_step, step_along, time_after
+from warp_abtree.kernels.motion.linear import straight_step
+from warp_abtree.kernels.motion.node_pair import later, step_of
+from warp_abtree.kernels.motion.path import Moment, Motion
+from warp_abtree.kernels.triangle.distance import corners_type
+
+COUNT = 1000
+
+
+@wp.kernel(module="unique", module_options={"fuse_fp": False})
+def float32_step_kernel(x: wp.array2d(dtype=wp.float32), out: wp.array2d(dtype=wp.float32)):
+    i = wp.tid()
+    out[i, 0] = later(wp.float32(0.0), step_of(x[i, 0], x[i, 1], x[i, 2]))
+    out[i, 1] = later(x[i, 3], x[i, 4])
+
+
+@wp.kernel(module="unique", module_options={"fuse_fp": False})
+def float64_step_kernel(x: wp.array2d(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)):
+    i = wp.tid()
+    out[i, 0] = step_along(x[i, 0], x[i, 1], x[i, 2])
+    out[i, 1] = time_after(x[i, 3], x[i, 4])
+
+
+@pytest.mark.parametrize(
+    ("kernel", "real", "off"),
+    [(float32_step_kernel, np.float32, 2.0**-21), (float64_step_kernel, np.float64, 0)],
+    ids=["float32", "float64"],
+)
+def test_no_step_is_too_long(device, kernel, real, off):
+    """A gap is still open where a step ends, and a time is not after what it sums, of a step that may be off."""
+    rng = np.random.default_rng(1)
+    x = 10 ** rng.uniform(-5, 1, (COUNT, 5))
+    x[:, 1] *= rng.choice([-1, 1], COUNT)
+    x[:, 2] *= rng.choice([1, 2.0**-70 if real is np.float32 else 0], COUNT)
+    x[:, 3] = rng.uniform(0.5, 1, COUNT) * rng.choice([0, 1], COUNT)
+    x = x.astype(real)
+    steps = launch(kernel, device, COUNT, x, columns=2)
+    for (gap, rate, bend, t, step), (h, then) in zip(x.tolist(), steps.tolist(), strict=True):
+        assert h > 0
+        if h < np.inf:
+            h = Fraction(h)
+            assert Fraction(gap) + Fraction(rate) * h - Fraction(bend) * h * h / 2 >= 0
+        else:
+            assert bend == 0 and rate >= 0
+        assert Fraction(then) <= Fraction(t) + Fraction(step) * (1 - Fraction(off)) or then == t
+
+
+def test_what_is_no_gap_has_no_step(device):
+    x = np.array([[gap, rate, bend, 0, 0] for gap in (0, -1, np.nan) for rate in (-1, 0, 1) for bend in (0.5, 1)])
+    for kernel, real in ((float32_step_kernel, np.float32), (float64_step_kernel, np.float64)):
+        steps = launch(kernel, device, len(x), x.astype(real), columns=2)
+        np.testing.assert_array_equal(steps, 0)
+
+
+@wp.struct
+class Slide:
+    """Two faces, how the mover's points lie and move in the base's frame, and what both err by."""
+
+    n: wp.vec3d
+    base: corners_type
+    mover: corners_type
+    moment: Moment
+    slack: wp.float64
+    speed_slack: wp.float64
+    bend: wp.vec2d
+
+
+@wp.kernel(module="unique", module_options={"fuse_fp": False})
+def safe_step_kernel(slides: wp.array(dtype=Slide), out: wp.array2d(dtype=wp.float64)):
+    i = wp.tid()
+    s = slides[i]
+    motion = Motion()
+    motion.slack = s.slack
+    motion.speed_slack = s.speed_slack
+    motion.bend_size = s.bend[0]
+    motion.bend_rest = s.bend[1]
+    motion.axis_b = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
+    at, way = corners_type(), corners_type()
+    for k in range(3):
+        at[k] = s.moment.rotation * s.mover[k] + s.moment.shift
+        way[k] = s.moment.spin * s.mover[k] + s.moment.speed
+    out[i, 0] = safe_step(motion, s.n, s.base, s.moment, s.mover, at)
+    out[i, 1] = straight_step(s.slack, s.n, s.base, at, corners_type(), way)
+
+
+def test_steps_of_faces_leave_room_for_all_that_they_may_be_off(device):
+    """Slacks so large that each shows: gaps are narrower by one, speeds are less by the other."""
+    rng, rows = np.random.default_rng(2), []
+    for _ in range(200):
+        n = rng.normal(size=3)
+        row = {"n": n / np.linalg.norm(n), "base": rng.uniform(-1, 1, (3, 3)), "mover": rng.uniform(-1, 1, (3, 3))}
+        row |= {"rotation": rng.normal(size=(3, 3)), "shift": 8 * row["n"] + rng.normal(size=3)}
+        row |= {"spin": rng.normal(size=(3, 3)), "speed": rng.normal(size=3) - 3 * row["n"]}
+        rows.append(row | dict(zip(("slack", "speed_slack", "bend"), (*rng.uniform(0, 1, 2), rng.uniform(0, 1, 2)))))
+    slides = np.zeros(len(rows), Slide.numpy_dtype())
+    for k, row in enumerate(rows):
+        for name, value in row.items():
+            (slides["moment"] if name in Moment.vars else slides)[name][k] = value
+    found = launch(safe_step_kernel, device, len(rows), wp.array(slides, dtype=Slide, device=device), columns=2)
+    for row, (bent, straight) in zip(rows, found, strict=True):
+        n, top = row["n"], (row["base"] @ row["n"]).max() + row["slack"]
+        gaps = (row["mover"] @ row["rotation"].T + row["shift"]) @ n - top
+        rates = (row["mover"] @ row["spin"].T + row["speed"]) @ n
+        bends = row["bend"][0] * np.linalg.norm(row["mover"][:, :2], axis=1) + row["bend"][1]
+        for step, rate, bend in (
+            (bent, rates - row["speed_slack"], bends),
+            (straight, rates - row["slack"], 0 * bends),
+        ):
+            times = [step_in(*terms) for terms in zip(gaps, rate, bend)]
+            assert step == pytest.approx(min(times), rel=1e-10)
+
+
+def step_in(gap, rate, bend):
+    """Return the first root of gap + rate h - bend h^2 / 2, 0 without a gap."""
+    if gap <= 0:
+        return 0.0
+    roots = np.roots([-bend / 2, rate, gap])
+    return min((h for h in roots.real if h > 0), default=np.inf)
+
+
+@pytest.mark.parametrize("linear", [False, True], ids=["straight", "linear"])
+@pytest.mark.parametrize(("far", "size"), [(1e6, 1.0), (1e6, 1e-3), (0.0, 1e-6), (30.0, 1e6)])
+def test_contacts_are_not_late_where_float64_rounds_much(device, far, size, linear):
+    """Small faces far from the origin, or from their frames, in fractions: rounding alone moves what they meet by."""
+    rng = np.random.default_rng(3)
+    cases, ends, truths = [], [], []
+    for k in range(60):
+        a, b = (size * (rng.normal(size=(1, 1, 3)) + rng.normal(size=(2, 3, 3))) for _ in range(2))
+        off = far * rng.normal(size=(2, 3)) * (k % 2)
+        models = [ab.Model.from_arrays((s + x).reshape(-1, 3), np.arange(6).reshape(-1, 3), base_faces=2)
+                  for s, x in zip((a, b), off)]  # fmt: skip
+        still, start = np.array(STILL), np.array(STILL)
+        still[:3] = far * rng.normal(size=3) - off[0]
+        way = size * rng.normal(size=3)
+        start[:3] = still[:3] + off[0] - off[1] - 3 * way
+        end = start.copy()
+        end[:3] += 6 * way
+        cases.append([models[0], models[0].lod_max, still, models[1], models[1].lod_max, start])
+        ends += [still, end]
+        corners = [model.mesh_at(model.lod_max)[0][model.mesh_at(model.lod_max)[1]] for model in models]
+        truths.append(contact_in_fractions(corners, still[:3], start[:3], end[:3]))
+    result = find(device, cases, np.array(ends), tolerance=2.0**-40, linear=linear)
+    met = scene_of(device, cases).intersect(pairs_of(cases)).any
+    touching = [truth is not None for truth in truths]
+    assert sum(touching) > 15
+    for truth, hit, time, clear in zip(truths, met, result.time.tolist(), result.clear, strict=True):
+        if not hit and truth is not None:
+            assert not clear and Fraction(time) <= truth
+
+
+def contact_in_fractions(corners, still, start, end):
+    """Return when faces first touch that move from start to end past others, all of which are sums of float64."""
+    exact = [[[[Fraction(x) for x in corner] for corner in face] for face in soup.tolist()] for soup in corners]
+    places = [[Fraction(x) for x in place.tolist()] for place in (still, start, end)]
+    posed = [np.array(soup) + np.array(place) for soup, place in zip(exact, places)]
+    return translation_contact(posed[0], posed[1], np.array(places[2]) - np.array(places[1]))
