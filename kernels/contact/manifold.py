@@ -85,6 +85,19 @@ def unite_roots(parent: wp.array(dtype=wp.int32), i: wp.int32, j: wp.int32):
             b = find_root(parent, low)
 
 
+@wp.func
+def are_across(contacts: Contacts, normal: wp.array(dtype=wp.vec3d), i: wp.int32, j: wp.int32):
+    """Return whether two contacts of a face are of two walls that face each other, which push it either way.
+
+    Args:
+        normal: Outward normals of the walls, `Contacts.normal_a` or `normal_b`.
+    """
+    zero = wp.float64(0.0)
+    between = (contacts.p0[j] + contacts.p1[j]) - (contacts.p0[i] + contacts.p1[i])
+    opposed = wp.dot(normal[i], normal[j]) < zero
+    return opposed and wp.dot(between, normal[i]) > zero and wp.dot(between, normal[j]) < zero
+
+
 @wp.kernel
 def begin_loop_kernel(
     start: wp.array(dtype=wp.int32),
@@ -111,24 +124,26 @@ def link_loop_kernel(
     key: wp.array(dtype=wp.int64),
     curves_inout: Curves,
 ):
-    """Unite neighbours that share a face, in the order of the first object's faces and in that of the second's."""
+    """Unite each contact with the next of its face, not across a gap: by the first object's faces, then the second's."""
     i = wp.tid()
     last = start[start.shape[0] - 1]
     if i + 1 >= last:
         return
-    j = i + 1
     if have_crossed(contacts, i):
-        # The next one that intersects, of the same face.
-        while j + 1 < last and faces[j][1] == faces[i][1] and not have_crossed(contacts, j):
+        j = i + 1
+        while j < last and faces[j][0] == faces[i][0] and faces[j][1] == faces[i][1]:
+            if have_crossed(contacts, j) and not are_across(contacts, contacts.normal_b, i, j):
+                unite_roots(curves_inout.parent, i, j)
+                j = last
             j += 1
-        if faces[i][0] == faces[j][0] and faces[i][1] == faces[j][1] and have_crossed(contacts, j):
-            unite_roots(curves_inout.parent, i, j)
-    j = i + 1
-    if have_crossed(contacts, order[i]):
-        while j + 1 < last and key[j] == key[i] and not have_crossed(contacts, order[j]):
+    k = order[i]
+    if have_crossed(contacts, k):
+        j = i + 1
+        while j < last and key[j] == key[i]:
+            if have_crossed(contacts, order[j]) and not are_across(contacts, contacts.normal_a, k, order[j]):
+                unite_roots(curves_inout.parent, k, order[j])
+                j = last
             j += 1
-        if key[i] == key[j] and have_crossed(contacts, order[j]):
-            unite_roots(curves_inout.parent, order[i], order[j])
 
 
 @wp.kernel
@@ -343,7 +358,8 @@ def find_candidate_kernel(
 ):
     """Find the normal and two candidate points of one contact a thread, of faces that intersect.
 
-    Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least.
+    Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least; of
+    the faces' normals alone where none is like it and one face looks the other way.
 
     Args:
         gap: How far outside the second point may be, of faces that look at one another [world units], shape [pair]; [0]
@@ -369,9 +385,14 @@ def find_candidate_kernel(
     n = back * curves_inout.loop_normal[curves_inout.loop[i]]
     loop = n
     depth, point, other, second = measure_column(corner, n, normal_a, normal_b, first, least)
+    toward_a, toward_b = wp.dot(loop, normal_a), -wp.dot(loop, normal_b)
+    # A loop that runs round a part in another, as round a thread, has no one way out.
+    contrary = wp.max(toward_a, toward_b) <= LIKENESS and wp.min(toward_a, toward_b) < zero
+    if contrary:
+        depth = NO_DEPTH
     for k in range(2):
         m = wp.where(k == 0, normal_a, -normal_b)
-        if wp.dot(m, loop) > LIKENESS:
+        if contrary or wp.dot(m, loop) > LIKENESS:
             d, x, e, y = measure_column(corner, m, normal_a, normal_b, first, least)
             if d >= zero and (depth < zero or d <= depth):
                 n = m

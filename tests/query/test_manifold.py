@@ -130,6 +130,20 @@ def test_separate_contacts_are_separate_loops(device):
     check_upward(points)
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_bar_that_jams_in_a_slot_is_pushed_by_each_wall_by_what_it_is_in_it(device, order):
+    """Its sides cross both walls: two loops on faces that they share."""
+    slot = boxes_at(((1, 4, 4), (-1, 0, 0)), ((1, 4, 4), (1, 0, 0)))
+    placed = [(slot, STILL), (box(1.02, 0.9, 0.8), (0.002, 0.1, 0.2, 0, 0, 0, 1))][::order]
+    query, result = ask(device, *placed)
+    assert len(set(query.curves.loop.numpy()[: result.count[0]].tolist())) == 2
+    normal, depth = order * result.points["normal"], result.points["depth"]
+    for side in (1, -1):
+        of_wall = np.abs(normal - [side, 0, 0]).max(1) < 1e-9
+        assert of_wall.sum() >= 3
+        np.testing.assert_allclose(depth[of_wall], 0.01 - 0.002 * side, atol=1e-9)
+
+
 def test_apart_inside_and_touching(device):
     cube, small, sheet = box(1, 1, 1), box(0.2, 0.2, 0.2), ([[-2, -2, 0], [2, -2, 0], [0, 3, 0.0]], [[0, 1, 2]])
     _, inside = ask(device, (cube, STILL), (small, STILL), pairs=[(0, 1)])

@@ -1,0 +1,220 @@
+"""Nuts on their bolts in Newton's worlds: `NewtonContacts` beside Newton's own pass, by signed distance fields.
+
+Fields, reduction and room are those of its example nut_bolt_sdf: 512 voxels along the longest side, within 5 mm of the
+surface, and a gap of 5 mm a shape; and the gap that `NewtonContacts` has here, 0.05 mm, with which Newton has less to
+do. Fields need CUDA; on the CPU its BVH takes their place. The bolt is a body as well, and there is no ground.
+"""
+
+import time
+import warnings
+
+import numpy as np
+import warp as wp
+
+import warp_abtree as ab
+
+from ..timing import make_replay, medians, time_call, time_events, time_rounds
+from .newton import Pipeline
+
+RESOLUTION, BAND = 512, 0.005
+GAP, EXAMPLE_GAP = 5e-5, 0.005  # [m] a shape
+CONTACTS_PER_WORLD = 500
+POINTS = (32, 8)
+FIELDS = tuple(f"rigid_contact_{name}" for name in ("shape0", "shape1", "point0", "point1", "normal"))
+ROOM_TRIES = 4
+
+
+class Fields:
+    """Newton's meshes of bolt and nut, on CUDA with fields of distances.
+
+    Attributes:
+        meshes: `newton.Mesh` of each.
+        seconds: What each round of cooking both took; the first compiles.
+        mib: Device memory of the fields.
+    """
+
+    def __init__(self, models, device):
+        import newton
+
+        self.seconds = []
+        parts = [model.mesh_at(model.lod_max)[:2] for model in models]
+        before = used_memory(device)
+        for _ in range(2 if device.is_cuda else 1):
+            self.meshes = []
+            self.meshes = [newton.Mesh(v.astype(np.float32), f.reshape(-1)) for v, f in parts]
+            begin = time.perf_counter()
+            for mesh in self.meshes if device.is_cuda else []:
+                band = (-BAND, BAND)
+                mesh.build_sdf(device=device, max_resolution=RESOLUTION, narrow_band_range=band, margin=EXAMPLE_GAP)
+            wp.synchronize_device(device)
+            self.seconds.append(round(time.perf_counter() - begin, 3))
+        self.mib = used_memory(device) - before
+
+
+def used_memory(device) -> int:
+    """Return the memory that is taken on a device [MiB]; 0 on the CPU."""
+    wp.synchronize_device(device)
+    return (device.total_memory - device.free_memory) >> 20 if device.is_cuda else 0
+
+
+def make_model(meshes, worlds, device):
+    """Return a `newton.Model` of worlds that have a bolt and a nut."""
+    import newton
+
+    config = newton.ModelBuilder.ShapeConfig(density=8000.0, mu=0.01, ke=1e7, kd=1e4, margin=0.0, gap=GAP)
+    world, builder = newton.ModelBuilder(), newton.ModelBuilder()
+    for mesh in meshes:
+        world.add_shape_mesh(world.add_body(), mesh=mesh, cfg=config)
+    builder.replicate(world, worlds)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of inertia
+        return builder.finalize(device=device)
+
+
+class NutFields(Pipeline):
+    """Newton's pipeline over given pairs of a bolt and a nut, with room for what it finds."""
+
+    def __init__(self, model, gap, poses):
+        import newton
+
+        self.model, self.gap, worlds = model, gap, model.shape_count // 2
+        pairs = wp.array(np.arange(2 * worlds).reshape(-1, 2), dtype=wp.vec2i, device=model.device)
+        self.state, room = model.state(), max(1_000_000, 2000 * worlds)
+        for k in range(ROOM_TRIES):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of large buffers
+                self.pipeline = newton.CollisionPipeline(
+                    model,
+                    reduce_contacts=True,
+                    broad_phase="explicit",
+                    shape_pairs_filtered=pairs,
+                    rigid_contact_max=CONTACTS_PER_WORLD * worlds,
+                    max_triangle_pairs=room << 2 * k,
+                    verify_buffers=False,
+                )
+                self.contacts = self.pipeline.contacts()
+            self.place(poses)
+            self.launch()
+            try:
+                self.check()
+                break
+            except RuntimeError:
+                if k == ROOM_TRIES - 1:
+                    raise
+
+    def launch(self):
+        self.model.shape_gap.fill_(self.gap)
+        super().launch()
+
+
+class Ours:
+    """`NewtonContacts` of the same model, with the same calls."""
+
+    def __init__(self, model, models, points, poses):
+        shapes = {shape: models[shape % 2] for shape in range(model.shape_count)}
+        model.shape_gap.fill_(GAP)  # read once
+        self.found, self.state = ab.NewtonContacts(model, models=shapes, points=points), model.state()
+        self.contacts = self.found.contacts()
+        self.place(poses)
+        self.found.collide(self.state, self.contacts)
+
+    def place(self, poses):
+        self.state.body_q.assign(poses)
+
+    def launch(self):
+        self.found.launch(self.state, self.contacts)
+
+    def check(self):
+        self.found.check(self.contacts)
+
+
+def read_contacts(contacts):
+    """Return the rows of contacts in place, as bytes of their fields side by side, (k, bytes)."""
+    count = int(contacts.rigid_contact_count.numpy()[0])
+    rows = [getattr(contacts, name).numpy()[:count].reshape(count, -1) for name in FIELDS]
+    return np.concatenate([np.ascontiguousarray(row).view(np.uint8).reshape(count, -1) for row in rows], 1)
+
+
+def same_twice(one, poses, others):
+    """Return whether contacts have the same bits twice, in order, and whether in any order; other poses between."""
+    found = []
+    for placed in (poses, others, poses):
+        one.place(placed)
+        one.launch()
+        found.append(read_contacts(one.contacts))
+    one.check()
+    first, _, second = found
+    in_order = np.array_equal(first, second)
+    return in_order, in_order or sorted(map(bytes, first)) == sorted(map(bytes, second))
+
+
+def worlds_with_contacts(one, worlds):
+    """Return which worlds have contacts, bool (worlds,)."""
+    count = int(one.contacts.rigid_contact_count.numpy()[0])
+    return np.isin(np.arange(worlds), one.contacts.rigid_contact_shape0.numpy()[:count] // 2)
+
+
+def measure(models, matrices, others, device, repeats):
+    """Return a row: times of a launch over all worlds [ms], in turn; contacts, bits, fields and memory.
+
+    Args:
+        models: Bolt and nut.
+        matrices, others: Two sets of poses of the nuts in their bolts' frames, (worlds, 4, 4).
+
+    Raises:
+        RuntimeError: Contacts do not fit, or ours are not those of the nuts that meet.
+    """
+    worlds = len(matrices)
+    fields = Fields(models, device)
+    model = make_model(fields.meshes, worlds, device)
+    poses, others = (body_poses(m) for m in (matrices, others))
+    row = {"device": device.name, "worlds": worlds, "cook_s": fields.seconds, "fields_mib": fields.mib}
+    makers = {f"ours_{points}": lambda points=points: Ours(model, models, points, poses) for points in POINTS}
+    kind = "sdf" if device.is_cuda else "bvh"
+    gaps = {f"{kind}_same_gap": GAP} | ({f"{kind}_example": EXAMPLE_GAP} if device.is_cuda else {})
+    makers |= {name: lambda gap=gap: NutFields(model, gap, poses) for name, gap in gaps.items()}
+    made, runs = {}, {}
+    for name, make in makers.items():
+        before = used_memory(device)
+        try:
+            made[name] = one = make()
+            row[f"{name}_same_bits"], row[f"{name}_same_set"] = same_twice(one, poses, others)
+        except Exception as error:  # another package's failure must not cost the rest of a run
+            if name.startswith("ours"):
+                raise
+            row[f"{name}_skipped"] = f"{type(error).__name__}: {error}"
+            made.pop(name, None)
+            continue
+        row[f"{name}_mib"] = used_memory(device) - before
+        row[f"{name}_contacts"] = len(read_contacts(one.contacts))
+        row[f"{name}_worlds"] = int(worlds_with_contacts(one, worlds).sum())
+        runs[name] = timed(one, device)
+    check_ours(row, made["ours_32"], models, matrices)
+    row |= {f"{name}_ms": round(ms, 3) for name, ms in medians(time_rounds(runs, repeats)).items()}
+    row |= {f"{name}_ratio": round(row[f"{name}_ms"] / row["ours_32_ms"], 2) for name in runs}
+    return row
+
+
+def timed(one, device):
+    """Return a callable that launches, as a graph on CUDA, and returns the time [ms]."""
+    replay = make_replay(one.launch, device)
+    return time_events(replay, device) if device.is_cuda else time_call(replay, device)
+
+
+def body_poses(matrices):
+    """Return the poses of bolts, which stand at the origin, and nuts, float32 (2 worlds, 7)."""
+    poses = np.zeros((2 * len(matrices), 7), np.float32)
+    poses[:, 6] = 1
+    poses[1::2] = [wp.transform(*wp.transform_decompose(wp.mat44(matrix))[:2]) for matrix in matrices]
+    return poses
+
+
+def check_ours(row, ours, models, matrices):
+    """Add how many nuts meet their bolts to a row, and hold our contacts against it."""
+    ours.place(body_poses(matrices))
+    ours.launch()
+    found = ours.found.query.result()
+    scene = ours.found.scene
+    row["meet"] = int(scene.intersect(found.pairs, "any").any.sum())
+    if row["meet"] != int(found.any.sum()):
+        raise RuntimeError(f"{row['meet']} nuts meet their bolts, {int(found.any.sum())} have contacts that cross")
