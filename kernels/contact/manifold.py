@@ -124,7 +124,7 @@ def link_loop_kernel(
     key: wp.array(dtype=wp.int64),
     curves_inout: Curves,
 ):
-    """Unite each contact with the next of its face, not across a gap: by the first object's faces, then the second's."""
+    """Unite each contact with the next of its face that is not across a gap, for faces of either object."""
     i = wp.tid()
     last = start[start.shape[0] - 1]
     if i + 1 >= last:
@@ -359,7 +359,7 @@ def find_candidate_kernel(
     """Find the normal and two candidate points of one contact a thread, of faces that intersect.
 
     Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least; of
-    the faces' normals alone where none is like it and one face looks the other way.
+    both faces' normals where neither is like it and one looks the other way.
 
     Args:
         gap: How far outside the second point may be, of faces that look at one another [world units], shape [pair]; [0]
@@ -386,10 +386,9 @@ def find_candidate_kernel(
     loop = n
     depth, point, other, second = measure_column(corner, n, normal_a, normal_b, first, least)
     toward_a, toward_b = wp.dot(loop, normal_a), -wp.dot(loop, normal_b)
-    # A loop that runs round a part in another, as round a thread, has no one way out.
-    contrary = wp.max(toward_a, toward_b) <= LIKENESS and wp.min(toward_a, toward_b) < zero
-    if contrary:
-        depth = NO_DEPTH
+    toward = wp.max(toward_a, toward_b)
+    # A loop that runs all round a part in another, as round a thread, has no one way out.
+    contrary = FACING <= toward and toward <= LIKENESS and wp.min(toward_a, toward_b) < -FACING
     for k in range(2):
         m = wp.where(k == 0, normal_a, -normal_b)
         if contrary or wp.dot(m, loop) > LIKENESS:
