@@ -5,7 +5,7 @@ jump no thread. Nuts start at angles of their own, and differ in speed and blows
 two files. Needs the extra `newton`, and `mujoco-warp` for MuJoCo:
 
     python scenes/newton_nut_and_bolt.py [--solver xpbd|mujoco] [--nuts 100] [--turns 2] [--hammer 0.5] [--device cpu]
-    python scenes/newton_nut_and_bolt.py --bolt bolt.obj --nut nut.obj --pitch 0.0025 --height 0.03
+    python scenes/newton_nut_and_bolt.py --bolt bolt.obj --nut nut.obj --pitch 0.0025 --height 0.01
 """
 
 import argparse
@@ -21,7 +21,7 @@ RADIUS, PITCH, DEPTH = 0.01, 0.0025, 0.00135  # of the generated thread [m]
 RATE = 240  # collision steps a second
 SPEED, SPREAD = 2.0, 0.2  # turns a second of the motor, and by which part of it nuts differ
 SETTLE = 24  # steps before the motor starts, and between blows
-GAP = 5e-5  # [m] a shape, about what threads approach one another in a step
+GAP = 5e-5  # [m] a shape, about what threads approach one another in a step; tight ones want less
 POINTS = 32  # contact points of a nut and its bolt; with the usual 8 a nut tilts under blows
 
 
@@ -73,11 +73,11 @@ def find_height(bolt, nut, pitch, height):
     return poses[max(ranges, key=len), 2, 3].mean()
 
 
-def build_model(bolt, nut, height, pitch, nuts, device):
+def build_model(bolt, nut, height, pitch, nuts, device, gap=GAP):
     """Return a `newton.Model` of worlds with a bolt that stands and a nut that is free, each at another angle."""
     import newton
 
-    config = newton.ModelBuilder.ShapeConfig(density=8000.0, mu=0.1, ke=1e7, kd=1e4, gap=GAP)
+    config = newton.ModelBuilder.ShapeConfig(density=8000.0, mu=0.1, ke=1e7, kd=1e4, gap=gap)
     builder, meshes = newton.ModelBuilder(), []
     for model in (bolt, nut):
         vertices, faces = model.mesh_at(model.lod_max)[:2]
@@ -216,6 +216,7 @@ def main():
     parser.add_argument("--bolt", help="mesh file, with --nut; both about z, in metres")
     parser.add_argument("--nut")
     parser.add_argument("--pitch", type=float, default=PITCH)
+    parser.add_argument("--gap", type=float, default=GAP, help="of a shape, within which there are contacts [m]")
     parser.add_argument("--height", type=float, default=2 * PITCH, help="of the nut, about [m]")
     options = parser.parse_args()
     if options.bolt:
@@ -224,7 +225,7 @@ def main():
         parts = make_bolt(options.sections, 6), make_nut(options.sections, 3)
         bolt, nut = (ab.Model.from_arrays(*part) for part in parts)
     height = find_height(bolt, nut, options.pitch, options.height)
-    model = build_model(bolt, nut, height, options.pitch, options.nuts, options.device)
+    model = build_model(bolt, nut, height, options.pitch, options.nuts, options.device, options.gap)
     nuts = Nuts(model, bolt, nut, options.solver, options.pitch, options.hammer, options.seed)
     begin = time.perf_counter()
     nuts.run(options.turns)

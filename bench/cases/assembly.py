@@ -4,7 +4,8 @@ The meshes are those of IsaacGymEnvs (`bench.meshes`: ABTREE_MESHES, or ../share
 from a height at which it is free; crossing poses are moved sideways, gears turned. Baselines are python-fcl and the
 wp.Bvh over faces whose constructor answers fastest. Times are of a pose: of all poses at once from the launch to the
 result on the host, and of one pair alone, which a query answers (one) or `Scene.intersect` (scene). A baseline takes
-objects made before. `--only newton`, where Newton is installed: contacts of nuts on bolts in `--count` worlds.
+objects made before. Of `--count` worlds each: `--only newton`, contacts of nuts on bolts where Newton is installed;
+`--only hammered`, nuts under blows.
 """
 
 import importlib.util
@@ -19,10 +20,14 @@ from ..baselines import newton_nuts
 from ..baselines.fcl import Fcl
 from ..baselines.wp_bvh import BvhPosed, find_constructor
 from ..meshes import ModelFolder
+from ..motions import hammered
 from ..shapes import scene_of_poses
 from ..timing import medians, no_garbage_collection, one_core, time_in_turn
 
-FULL, QUICK = {"poses": 64, "worlds": 2048, "repeats": 5}, {"poses": 3, "worlds": 2, "repeats": 1}
+FULL, QUICK = (
+    {"poses": 64, "worlds": 2048, "nuts": 1000, "repeats": 5},
+    {"poses": 3, "worlds": 1, "nuts": 1, "repeats": 1},
+)
 IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 OUTPUTS = ("faces", "any")
 TURNS, PITCH = 5, 2.5e-3  # of a nut that starts at the first height, and of an M20 thread [m]
@@ -49,6 +54,9 @@ def run(device, quick=False, only=None, count=None, models=None):
         for kind, matrices in place(loaded, sizes["poses"]).items():
             with one_core():
                 yield measure(f"{name}, {kind}", loaded, matrices, device, sizes["repeats"])
+    if not only or "hammered" in only:
+        steps = 4 if quick else hammered.STEPS
+        yield {"case": "hammered"} | hammered.measure(count or sizes["nuts"], device, steps)
 
 
 def measure_newton(models, worlds, device, repeats):

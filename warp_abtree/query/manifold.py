@@ -44,7 +44,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
-from warp_abtree.kernels.contact import manifold
+from warp_abtree.kernels.contact import loops, manifold
 from warp_abtree.kernels.contact import points as point_kernels
 from warp_abtree.kernels.gap import near_points
 from warp_abtree.kernels.solid import inside_points
@@ -104,18 +104,18 @@ class ManifoldQuery(ContactQuery):
         start, rows, curves, contacts = self.start, self.faces, self.curves, self.contacts
         gap = self._no_gap if self._gap is None else self.hits.gap
         posed = [*pools, self.pairs, self.pair_poses]
-        self._launch_kernel(manifold.begin_loop_kernel, count, [start, rows, curves, self._order, self._key])
+        self._launch_kernel(loops.begin_loop_kernel, count, [start, rows, curves, self._order, self._key])
         self._sort_keys(count, 31 + room.bit_length())
-        self._launch_kernel(manifold.link_loop_kernel, count, [start, rows, contacts, self._order, self._key, curves])
+        self._launch_kernel(loops.link_loop_kernel, count, [start, rows, contacts, self._order, self._key, curves])
         if self._gap is not None:
             both = near_points.Rows()
             both.start, both.faces, both.order, both.key = start, rows, self._order, self._key
             inputs = [*posed, gap, both, contacts, curves]
             self._launch_kernel(near_points.find_near_candidate_kernel, count, inputs, WARP_SIZE)
-        self._launch_kernel(manifold.name_loop_kernel, count, [start, contacts, curves, self._order, self._key])
+        self._launch_kernel(loops.name_loop_kernel, count, [start, contacts, curves, self._order, self._key])
         self._sort_keys(count, 31)
         inputs = [*pools, self.pairs, start, rows, contacts, self._order, curves]
-        self._launch_kernel(manifold.average_loop_kernel, count, inputs)
+        self._launch_kernel(loops.average_loop_kernel, count, inputs)
         inputs = [*posed, gap, start, rows, contacts, curves]
         self._launch_kernel(manifold.find_candidate_kernel, count, inputs)
         spread = point_kernels.point_spreader(self.point_max)
