@@ -38,7 +38,7 @@ OPTIONS = {
     "largest": {"type": int, "metavar": "FACES", "help": "leave larger meshes out"},
     "models": {"metavar": "DIR", "help": "keep the models there"},
     "plots": {"metavar": "DIR", "help": "draw figures there"},
-    "count": {"type": int, "help": "random pairs, and a tenth as many adversarial ones; or configurations"},
+    "count": {"type": int, "help": "random pairs, and a tenth as many adversarial ones; configurations; or worlds"},
     "out": {"required": True, "metavar": "DIR", "help": "where to write JSON, tables and figures"},
     "only": {"nargs": "+", "metavar": "PART", "help": "run these parts, or cases, alone; others are kept from before"},
     "processes": {"type": int, "help": "processes that run the oracle"},

@@ -1,10 +1,11 @@
 """Newton turns nuts down their bolts, by contacts between the threads themselves; no field of distances is made.
 
 Each nut is alone with its bolt in a world. A motor turns it, blows of a hammer push it: it must follow the pitch and
-jump no thread. The thread is generated, or read from two files. Needs the extra `newton`, and `mujoco-warp` for MuJoCo:
+jump no thread. Nuts start at angles of their own, and differ in speed and blows. The thread is generated, or read from
+two files. Needs the extra `newton`, and `mujoco-warp` for MuJoCo:
 
-    python scenes/newton_nut_and_bolt.py [--solver xpbd|mujoco] [--nuts 4] [--turns 2] [--hammer 0.5] [--device cpu]
-    python scenes/newton_nut_and_bolt.py --bolt bolt.obj --nut nut.obj --pitch 0.0025 --height 0.03
+    python scenes/newton_nut_and_bolt.py [--solver xpbd|mujoco] [--nuts 100] [--turns 2] [--hammer 0.5] [--device cpu]
+    python scenes/newton_nut_and_bolt.py --bolt bolt.obj --nut nut.obj --pitch 0.0025 --height 0.01
 """
 
 import argparse
@@ -18,9 +19,9 @@ import warp_abtree as ab
 
 RADIUS, PITCH, DEPTH = 0.01, 0.0025, 0.00135  # of the generated thread [m]
 RATE = 240  # collision steps a second
-SPEED = 2.0  # turns a second
+SPEED, SPREAD = 2.0, 0.2  # turns a second of the motor, and by which part of it nuts differ
 SETTLE = 24  # steps before the motor starts, and between blows
-GAP = 5e-5  # [m] a shape, about what threads approach one another in a step
+GAP = 5e-5  # [m] a shape, about what threads approach one another in a step; tight ones want less
 POINTS = 32  # contact points of a nut and its bolt; with the usual 8 a nut tilts under blows
 
 
@@ -63,20 +64,20 @@ def make_nut(sections, turns):
 
 def find_height(bolt, nut, pitch, height):
     """Return the middle of the widest range of heights, from a given one on, at which a nut is free on its bolt."""
-    poses = np.tile(np.eye(4), (501, 1, 1))
-    poses[:, 2, 3] = height + np.linspace(0, pitch, 501)
+    poses = np.tile(np.eye(4), (2001, 1, 1))
+    poses[:, 2, 3] = height + np.linspace(0, 1.5 * pitch, 2001)
     free = np.flatnonzero(~ab.sweep(bolt, nut, poses, output="any"))
     if not len(free):
-        raise ValueError(f"the nut crosses the bolt at every height from {height} to {height + pitch}")
+        raise ValueError(f"the nut crosses the bolt at every height from {height} to {height + 1.5 * pitch}")
     ranges = np.split(free, np.flatnonzero(np.diff(free) > 1) + 1)
     return poses[max(ranges, key=len), 2, 3].mean()
 
 
-def build_model(bolt, nut, height, pitch, nuts, device):
+def build_model(bolt, nut, height, pitch, nuts, device, gap=GAP):
     """Return a `newton.Model` of worlds with a bolt that stands and a nut that is free, each at another angle."""
     import newton
 
-    config = newton.ModelBuilder.ShapeConfig(density=8000.0, mu=0.1, ke=1e7, kd=1e4, gap=GAP)
+    config = newton.ModelBuilder.ShapeConfig(density=8000.0, mu=0.1, ke=1e7, kd=1e4, gap=gap)
     builder, meshes = newton.ModelBuilder(), []
     for model in (bolt, nut):
         vertices, faces = model.mesh_at(model.lod_max)[:2]
@@ -108,15 +109,17 @@ def make_solver(name, model):
 def drive_nut_kernel(
     step: wp.float32,
     drive: wp.array(dtype=wp.float32),
+    speed: wp.array(dtype=wp.float32),
+    blow: wp.array(dtype=wp.float32),
     mass: wp.array(dtype=wp.float32),
     inertia: wp.array(dtype=wp.mat33),
     body_qd: wp.array(dtype=wp.spatial_vector),
     body_f_out: wp.array(dtype=wp.spatial_vector),
 ):
-    """Pull a nut to the speed drive[0] of the motor, by a part drive[1] a step, and add a downward speed drive[2]."""
+    """Pull a nut to its motor's speed, by a part drive[0] a step, and add drive[1] of the downward speed of a blow."""
     i = wp.tid()
-    push = -drive[2] * mass[i] / step
-    torque = drive[1] * (drive[0] - body_qd[i][5]) * inertia[i][2, 2] / step
+    push = -drive[1] * blow[i] * mass[i] / step
+    torque = drive[0] * (speed[i] - body_qd[i][5]) * inertia[i][2, 2] / step
     body_f_out[i] = wp.spatial_vector(0.0, 0.0, push, 0.0, 0.0, torque)
 
 
@@ -128,14 +131,17 @@ class Nuts:
         lag: How far each was at most from where its thread leads [m].
     """
 
-    def __init__(self, model, bolt, nut, solver, pitch):
+    def __init__(self, model, bolt, nut, solver, pitch, hammer=0.0, seed=0):
         self.model, self.pitch = model, pitch
         shapes = {shape: (bolt, nut)[shape % 2] for shape in range(model.shape_count)}
         self.found = ab.NewtonContacts(model, models=shapes, points=POINTS)
         self.contacts, self.control = self.found.contacts(), model.control()
         self.solver, self.substeps = make_solver(solver, model)
-        self.state, self.after = model.state(), model.state()
-        self.drive = wp.zeros(3, dtype=wp.float32, device=model.device)
+        self.state, self.after, self.before = (model.state() for _ in range(3))
+        rng, n = np.random.default_rng(seed), model.body_count
+        speed = -2 * np.pi * SPEED * rng.uniform(1 - SPREAD, 1 + SPREAD, n)
+        columns = speed, hammer * rng.uniform(0.5, 1.5, n), np.zeros(2)
+        self.speed, self.blow, self.drive = (wp.array(c, dtype=wp.float32, device=model.device) for c in columns)
         self.graph = None
         self.begin()
 
@@ -151,18 +157,25 @@ class Nuts:
         self.found.collide(state, self.contacts)
         for _ in range(self.substeps):
             state.clear_forces()
-            inputs = [step, self.drive, model.body_mass, model.body_inertia, state.body_qd, state.body_f]
-            wp.launch(drive_nut_kernel, model.body_count, inputs, device=model.device)
+            inputs = [step, self.drive, self.speed, self.blow, model.body_mass, model.body_inertia]
+            wp.launch(drive_nut_kernel, model.body_count, [*inputs, state.body_qd, state.body_f], device=model.device)
             self.solver.step(state, self.after, self.control, self.contacts, step)
             state.assign(self.after)
 
     def step(self, gain, blow):
         """Advance by a collision step, and measure. Waits for the device."""
-        self.drive.assign([-2 * np.pi * SPEED, gain, blow / self.substeps])
-        if self.graph is not None:
-            wp.capture_launch(self.graph)
-        else:
+        self.drive.assign([gain, blow / self.substeps])
+        if self.graph is None:
             self.simulate()
+        else:
+            self.before.assign(self.state)
+            wp.capture_launch(self.graph)
+            try:
+                self.found.check(self.contacts)
+            except ab.CapacityError:  # again, with more room
+                self.state.assign(self.before)
+                self.simulate()
+                self.capture()
         pose = self.state.body_q.numpy().copy()
         turn = 2 * np.arctan2(pose[:, 5], pose[:, 6]) - 2 * np.arctan2(self.last[:, 5], self.last[:, 6])
         self.turned += ((turn + np.pi) % (2 * np.pi) - np.pi) / (2 * np.pi)
@@ -176,14 +189,14 @@ class Nuts:
                 self.simulate()
             self.graph = capture.graph
 
-    def run(self, turns, hammer):
-        """Settle, and turn by about so much under blows, each of a downward speed [m/s]."""
+    def run(self, turns):
+        """Settle, and turn by about so much under blows."""
         for _ in range(SETTLE):
             self.step(0.0, 0.0)
         self.capture()
         self.begin()
         for k in range(round(turns / SPEED * RATE)):
-            self.step(0.5, hammer if k % SETTLE == SETTLE // 2 else 0.0)
+            self.step(0.5, float(k % SETTLE == SETTLE // 2))
         self.found.check(self.contacts)
 
     def travel(self):
@@ -197,11 +210,13 @@ def main():
     parser.add_argument("--device", default=None)
     parser.add_argument("--nuts", type=int, default=4)
     parser.add_argument("--turns", type=float, default=2.0)
-    parser.add_argument("--hammer", type=float, default=0.5, help="downward speed of a blow [m/s], ten a second")
+    parser.add_argument("--hammer", type=float, default=0.5, help="mean downward speed of a blow [m/s], ten a second")
+    parser.add_argument("--seed", type=int, default=0, help="of speeds and blows")
     parser.add_argument("--sections", type=int, default=24, help="of the generated thread")
     parser.add_argument("--bolt", help="mesh file, with --nut; both about z, in metres")
     parser.add_argument("--nut")
     parser.add_argument("--pitch", type=float, default=PITCH)
+    parser.add_argument("--gap", type=float, default=GAP, help="of a shape, within which there are contacts [m]")
     parser.add_argument("--height", type=float, default=2 * PITCH, help="of the nut, about [m]")
     options = parser.parse_args()
     if options.bolt:
@@ -210,10 +225,10 @@ def main():
         parts = make_bolt(options.sections, 6), make_nut(options.sections, 3)
         bolt, nut = (ab.Model.from_arrays(*part) for part in parts)
     height = find_height(bolt, nut, options.pitch, options.height)
-    model = build_model(bolt, nut, height, options.pitch, options.nuts, options.device)
-    nuts = Nuts(model, bolt, nut, options.solver, options.pitch)
+    model = build_model(bolt, nut, height, options.pitch, options.nuts, options.device, options.gap)
+    nuts = Nuts(model, bolt, nut, options.solver, options.pitch, options.hammer, options.seed)
     begin = time.perf_counter()
-    nuts.run(options.turns, options.hammer)
+    nuts.run(options.turns)
     spent = time.perf_counter() - begin
     travel, through = nuts.travel(), nuts.lag > options.pitch / 2
     print(

@@ -18,7 +18,31 @@ CONTACTS_PER_PAIR = 512  # what is left of them after reduction
 CANDIDATES_PER_HIT = 4
 
 
-class Newton:
+class Pipeline:
+    """A `newton.CollisionPipeline` with its state and contacts, in the attributes of these names."""
+
+    def place(self, poses):
+        """Move all bodies, float32 (n, 7)."""
+        self.state.body_q.assign(poses)
+
+    def launch(self):
+        self.pipeline.collide(self.state, self.contacts)
+
+    def check(self):
+        """Raise a RuntimeError that names a buffer that overflowed in the last launch. Waits for the device."""
+        narrow, reducer = self.pipeline.narrow_phase, self.pipeline.narrow_phase.global_contact_reducer
+        lost = {
+            "contacts": int(self.contacts.rigid_contact_count.numpy()[0]) - self.contacts.rigid_contact_max,
+            "pairs": int(narrow.shape_pairs_mesh_mesh_count.numpy()[0]) - len(narrow.shape_pairs_mesh_mesh),
+            "candidates": int(reducer.buffer_overflows.numpy()[0]),
+            "hash table entries": int(reducer.ht_insert_failures.numpy()[0]),
+        }
+        for what, count in lost.items():
+            if count > 0:
+                raise RuntimeError(f"Newton lost {count} {what}")
+
+
+class Newton(Pipeline):
     """Newton's pipeline over given pairs of one mesh.
 
     Args:
@@ -61,26 +85,6 @@ class Newton:
             )
             self.state = self.model.state()
             self.contacts = self.pipeline.contacts()
-
-    def place(self, poses):
-        """Move all objects, float32 (2 p, 7)."""
-        self.state.body_q.assign(poses)
-
-    def launch(self):
-        self.pipeline.collide(self.state, self.contacts)
-
-    def check(self):
-        """Raise a RuntimeError that names a buffer that overflowed in the last launch. Waits for the device."""
-        narrow, reducer = self.pipeline.narrow_phase, self.pipeline.narrow_phase.global_contact_reducer
-        lost = {
-            "contacts": int(self.contacts.rigid_contact_count.numpy()[0]) - self.contacts.rigid_contact_max,
-            "pairs": int(narrow.shape_pairs_mesh_mesh_count.numpy()[0]) - len(narrow.shape_pairs_mesh_mesh),
-            "candidates": int(reducer.buffer_overflows.numpy()[0]),
-            "hash table entries": int(reducer.ht_insert_failures.numpy()[0]),
-        }
-        for what, count in lost.items():
-            if count > 0:
-                raise RuntimeError(f"Newton lost {count} {what}")
 
     def result(self):
         """Return whether each pair has a contact, bool (p,), and the number of contacts.

@@ -4,9 +4,11 @@ The meshes are those of IsaacGymEnvs (`bench.meshes`: ABTREE_MESHES, or ../share
 from a height at which it is free; crossing poses are moved sideways, gears turned. Baselines are python-fcl and the
 wp.Bvh over faces whose constructor answers fastest. Times are of a pose: of all poses at once from the launch to the
 result on the host, and of one pair alone, which a query answers (one) or `Scene.intersect` (scene). A baseline takes
-objects made before.
+objects made before. Of `--count` worlds each: `--only newton`, contacts of nuts on bolts where Newton is installed;
+`--only hammered`, nuts under blows.
 """
 
+import importlib.util
 import time
 
 import numpy as np
@@ -14,13 +16,18 @@ import warp as wp
 
 import warp_abtree as ab
 
+from ..baselines import newton_nuts
 from ..baselines.fcl import Fcl
 from ..baselines.wp_bvh import BvhPosed, find_constructor
-from ..meshes import ModelFolder, mesh_file
+from ..meshes import ModelFolder
+from ..motions import hammered
 from ..shapes import scene_of_poses
 from ..timing import medians, no_garbage_collection, one_core, time_in_turn
 
-FULL, QUICK = {"poses": 64, "repeats": 5}, {"poses": 3, "repeats": 1}
+FULL, QUICK = (
+    {"poses": 64, "worlds": 2048, "nuts": 1000, "repeats": 5},
+    {"poses": 3, "worlds": 1, "nuts": 1, "repeats": 1},
+)
 IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 OUTPUTS = ("faces", "any")
 TURNS, PITCH = 5, 2.5e-3  # of a nut that starts at the first height, and of an M20 thread [m]
@@ -28,20 +35,50 @@ NUT_HEIGHT, PEG_HEIGHT = 0.01, -0.01  # where heights are scanned from; where th
 GEAR_TURN = 0.03  # that teeth have room for, at most, either way
 
 
-def run(device, quick=False):
+def run(device, quick=False, only=None, count=None, models=None):
     """Yield a row a workload: times a pose [ms] of ours, and those of baselines over ours."""
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
+    folder = ModelFolder(models)
     for name, files, place in CASES:
-        missing = [file for file in files if mesh_file(file) is None]
+        if only and name.split()[0] not in only:
+            continue
+        missing = [file for file in files if not folder.has(file)]
         if missing:
             yield {"case": name, "skipped": f"no {', '.join(missing)}: set ABTREE_MESHES to a folder that has them"}
             continue
-        folder = ModelFolder(None)
-        models = [folder.load([file]) for file in files]
-        for kind, matrices in place(models, sizes["poses"]).items():
+        loaded = [folder.load([file]) for file in files]
+        if place is None:
+            yield {"case": name} | measure_newton(loaded, count or sizes["worlds"], device, sizes["repeats"])
+            continue
+        for kind, matrices in place(loaded, sizes["poses"]).items():
             with one_core():
-                yield measure(f"{name}, {kind}", models, matrices, device, sizes["repeats"])
+                yield measure(f"{name}, {kind}", loaded, matrices, device, sizes["repeats"])
+    if not only or "hammered" in only:
+        steps = 4 if quick else hammered.STEPS
+        yield {"case": "hammered"} | hammered.measure(count or sizes["nuts"], device, steps)
+
+
+def measure_newton(models, worlds, device, repeats):
+    """Return the row of nuts in worlds of Newton's, or why there is none."""
+    if importlib.util.find_spec("newton") is None:
+        return {"skipped": "no package newton"}
+    poses = (rest_nuts(models, worlds, seed) for seed in (0, 1))
+    return newton_nuts.measure(models, *poses, device, 3 * repeats)
+
+
+def rest_nuts(models, count, seed):
+    """Return poses of nuts anywhere along the thread, which they rest on: it is as far as 5 um, or within 1 um."""
+    rng = np.random.default_rng(seed)
+    heights = NUT_HEIGHT + np.linspace(0, PITCH, 51)
+    free = heights[count_hits(models, np.stack([turned(0, z=z) for z in heights])) == 0]
+    height, step = free.min(), PITCH / 50
+    while step > 1e-7:  # the lowest that is free
+        step /= 2
+        height -= step * (count_hits(models, turned(0, z=height - step)[None])[0] == 0)
+    angles = rng.uniform(0, 2 * np.pi * TURNS, count)
+    rise = height + PITCH * angles / (2 * np.pi) + rng.uniform(-1e-6, 5e-6, count)
+    return np.stack([turned(angle, z=z) for angle, z in zip(angles, rise)])
 
 
 def turned(angle, x=0.0, y=0.0, z=0.0, centre=(0.0, 0.0, 0.0)):
@@ -99,6 +136,7 @@ CASES = (
     ("nut on bolt", ("factory-bolt-m20", "factory-nut-m20"), place_nut),
     ("peg in hole", ("factory-hole-8mm", "factory-peg-8mm"), place_peg),
     ("gears", ("factory-gear-medium", "factory-gear-small"), place_gears),
+    ("newton", ("factory-bolt-m20", "factory-nut-m20"), None),
 )
 
 

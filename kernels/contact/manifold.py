@@ -1,13 +1,9 @@
-"""Contact loops of an object pair, their normals, and candidate points: depths behind faces along those normals.
-
-A loop is a set of contacts that faces link: two contacts of a pair that share a face of either object are of one loop.
-Faces that are apart, nearer than a gap, are of no loop; their candidates have a negative depth.
-"""
+"""Candidate points of contacts: depths behind faces along the normals of their loops, or of the faces."""
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import LAST_KEY, ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.contact.contact import Contacts, have_crossed, load_corners, pair_direction
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.contact.contact import Contacts, have_crossed, load_corners
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
@@ -20,8 +16,6 @@ POINTS = wp.constant(8)
 FACING = wp.constant(wp.float64(0.1))
 # A face's own normal serves in place of the loop's within 60 degrees of it.
 LIKENESS = wp.constant(wp.float64(0.5))
-# Areas of a loop, relative to its length squared, that have no direction worth the name.
-LEAST_LOOP_AREA = wp.constant(wp.float64(2.0**-20))
 # By which part of a face's size its column is wider, so that walls that stand on its rim are inside.
 COLUMN_SLACK = wp.constant(wp.float64(2.0**-36))
 CORNERS = wp.constant(8)
@@ -50,163 +44,6 @@ class Manifolds:
     point: wp.array2d(dtype=wp.vec3d)  # [world units], shape [pair, points]
     normal: wp.array2d(dtype=wp.vec3d)  # unit, from the pair's first object to its second, shape [pair, points]
     depth: wp.array2d(dtype=wp.float64)  # [world units] along the normal, negative if apart, shape [pair, points]
-
-
-@wp.func
-def find_root(parent: wp.array(dtype=wp.int32), i: wp.int32):
-    """Return the root of a set, and halve the way to it: threads that link neighbours at once make long ways."""
-    root = i
-    up = parent[root]
-    while up != root:
-        top = parent[up]
-        if top != up:
-            # Nothing but such a step changes the entry of a member, so that it stays one towards the root.
-            parent[root] = top
-        root = up
-        up = top
-    return root
-
-
-@wp.func
-def unite_roots(parent: wp.array(dtype=wp.int32), i: wp.int32, j: wp.int32):
-    """Unite two sets; the root of a set is its least member, whatever the order of unions."""
-    a = find_root(parent, i)
-    b = find_root(parent, j)
-    while a != b:
-        high = wp.max(a, b)
-        low = wp.min(a, b)
-        old = wp.atomic_cas(parent, high, high, low)
-        if old == high:
-            a = low
-            b = low
-        else:
-            # Another thread was first; what it wrote is less than high, so that this ends.
-            a = find_root(parent, old)
-            b = find_root(parent, low)
-
-
-@wp.kernel
-def begin_loop_kernel(
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    curves_out: Curves,
-    order_out: wp.array(dtype=wp.int32),
-    key_out: wp.array(dtype=wp.int64),
-):
-    """Make each contact a loop of its own, with a key that brings contacts of one face of B together."""
-    i = wp.tid()
-    order_out[i] = i
-    key_out[i] = LAST_KEY
-    if i < start[start.shape[0] - 1]:
-        curves_out.parent[i] = i
-        key_out[i] = (wp.int64(faces[i][0]) << wp.int64(31)) | wp.int64(faces[i][2])
-
-
-@wp.kernel
-def link_loop_kernel(
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    contacts: Contacts,
-    order: wp.array(dtype=wp.int32),
-    key: wp.array(dtype=wp.int64),
-    curves_inout: Curves,
-):
-    """Unite neighbours that share a face, in the order of the first object's faces and in that of the second's."""
-    i = wp.tid()
-    last = start[start.shape[0] - 1]
-    if i + 1 >= last:
-        return
-    j = i + 1
-    if have_crossed(contacts, i):
-        # The next one that intersects, of the same face.
-        while j + 1 < last and faces[j][1] == faces[i][1] and not have_crossed(contacts, j):
-            j += 1
-        if faces[i][0] == faces[j][0] and faces[i][1] == faces[j][1] and have_crossed(contacts, j):
-            unite_roots(curves_inout.parent, i, j)
-    j = i + 1
-    if have_crossed(contacts, order[i]):
-        while j + 1 < last and key[j] == key[i] and not have_crossed(contacts, order[j]):
-            j += 1
-        if key[i] == key[j] and have_crossed(contacts, order[j]):
-            unite_roots(curves_inout.parent, order[i], order[j])
-
-
-@wp.kernel
-def name_loop_kernel(
-    start: wp.array(dtype=wp.int32),
-    contacts: Contacts,
-    curves_inout: Curves,
-    order_out: wp.array(dtype=wp.int32),
-    key_out: wp.array(dtype=wp.int64),
-):
-    """Name the loop of each contact by its first, as the key that brings loops together."""
-    i = wp.tid()
-    order_out[i] = i
-    key_out[i] = LAST_KEY
-    if i < start[start.shape[0] - 1]:
-        root = find_root(curves_inout.parent, i)
-        curves_inout.loop[i] = root
-        if have_crossed(contacts, i):
-            key_out[i] = wp.int64(root)
-
-
-@wp.kernel
-def average_loop_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
-    contacts: Contacts,
-    order: wp.array(dtype=wp.int32),
-    curves_inout: Curves,
-):
-    """Find the normal of one loop, by the thread of its first contact: the direction of the area within the curve.
-
-    Moving an object by dx changes the volume that closed surfaces share by the vector area of the curve times dx, so
-    this is the direction that frees them soonest. An open or empty curve takes the mean of its contacts' normals.
-    """
-    k = wp.tid()
-    last = start[start.shape[0] - 1]
-    if k >= last or curves_inout.loop[order[k]] != order[k] or not have_crossed(contacts, order[k]):
-        return
-    root = order[k]
-    origin = contacts.p0[root]
-    total = wp.float64(0.0)
-    half = wp.float64(0.5)
-    middle = wp.vec3d()
-    gap = wp.vec3d()
-    mean = wp.vec3d()
-    plain = wp.vec3d()
-    area = wp.vec3d()
-    i = root
-    while i >= 0:
-        along = contacts.p1[i] - contacts.p0[i]
-        length = measure_length(along)
-        mean += length * contacts.normal[i]
-        plain += contacts.normal[i]
-        if contacts.coplanar[i] == 0:
-            total += length
-            gap += along
-            middle += (length * half) * ((contacts.p0[i] - origin) + (contacts.p1[i] - origin))
-            area += half * wp.cross(contacts.p0[i] - origin, along)
-        k += 1
-        i = wp.int32(-1)
-        if k < last and curves_inout.loop[order[k]] == root:
-            i = order[k]
-    n = area
-    if total > wp.float64(0.0):
-        # About the mean point, since for an open curve the area depends on where it is measured from.
-        n = (area - half * wp.cross(middle / total, gap)) / (total * total)
-    if measure_length(n) <= LEAST_LOOP_AREA:
-        n = mean
-        if measure_length(mean) <= LEAST_LOOP_AREA * total:
-            n = plain
-        if measure_length(plain) <= LEAST_LOOP_AREA:
-            p = faces[root][0]
-            n = pair_direction(models, states, objects, pairs[p][0], pairs[p][1])
-    curves_inout.loop_normal[root] = unit_vector(n)
 
 
 @wp.func
@@ -343,7 +180,8 @@ def find_candidate_kernel(
 ):
     """Find the normal and two candidate points of one contact a thread, of faces that intersect.
 
-    Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least.
+    Of the loop's normal and of those faces' normals that are like it, the one along which the faces overlap least; of
+    both faces' normals where neither is like it and one looks the other way.
 
     Args:
         gap: How far outside the second point may be, of faces that look at one another [world units], shape [pair]; [0]
@@ -369,9 +207,13 @@ def find_candidate_kernel(
     n = back * curves_inout.loop_normal[curves_inout.loop[i]]
     loop = n
     depth, point, other, second = measure_column(corner, n, normal_a, normal_b, first, least)
+    toward_a, toward_b = wp.dot(loop, normal_a), -wp.dot(loop, normal_b)
+    toward = wp.max(toward_a, toward_b)
+    # A loop that runs all round a part in another, as round a thread, has no one way out.
+    contrary = FACING <= toward and toward <= LIKENESS and wp.min(toward_a, toward_b) < -FACING
     for k in range(2):
         m = wp.where(k == 0, normal_a, -normal_b)
-        if wp.dot(m, loop) > LIKENESS:
+        if contrary or wp.dot(m, loop) > LIKENESS:
             d, x, e, y = measure_column(corner, m, normal_a, normal_b, first, least)
             if d >= zero and (depth < zero or d <= depth):
                 n = m

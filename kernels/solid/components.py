@@ -7,7 +7,7 @@ mesh: a neck that is thinned to an edge without faces leaves two.
 import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.contact.manifold import find_root, unite_roots
+from warp_abtree.kernels.contact.loops import find_root, unite_roots
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.traversal.warp_stack import warp_lane, warp_size, warp_sync
 

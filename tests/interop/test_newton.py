@@ -73,6 +73,47 @@ def test_a_cube_on_a_floor_has_its_corners(device):
     assert np.unique(contacts.rigid_contact_margin0.numpy()[:4]) == pytest.approx(0.02)
 
 
+@pytest.mark.parametrize("captured", [False, True])
+def test_what_is_inside_a_solid_is_pushed_out(device, captured):
+    """A cube wholly inside a floor crosses no face of it; as a solid the floor knows how deep it is."""
+    builder = newton.ModelBuilder()
+    builder.add_shape_mesh(-1, mesh=mesh_of(FLOOR))
+    body = builder.add_body(xform=placed((0.3, 0.2, 0.3), (0, 0, 1), 0.4))
+    builder.add_shape_mesh(body, mesh=mesh_of(CUBE), scale=wp.vec3(0.2, 0.2, 0.2))
+    builder.add_shape_sphere(body, radius=0.01)
+    model = builder.finalize(device=device)
+    model.shape_gap.fill_(0.0)
+    state, depths = model.state(), {}
+    for solids in (False, [0], True):
+        found = ab.NewtonContacts(model, solids=solids)
+        contacts = found.contacts()
+        found.collide(state, contacts)
+        if captured:
+            with wp.ScopedCapture(wp.get_device(device)) as capture:
+                found.launch(state, contacts)
+            contacts.clear()
+            wp.capture_launch(capture.graph)
+        (first, second), normals = world_points(model, state, contacts)
+        of_cube = contacts.rigid_contact_shape1.numpy()[: len(normals)] == 1
+        depths[str(solids)] = sorted(((first - second) * normals).sum(1)[of_cube])
+        assert all(normal @ [0, 0, 1] > 1 - 1e-6 for normal in normals)
+    assert depths["False"] == [] and depths["[0]"] == depths["True"]
+    np.testing.assert_allclose(depths["True"][-1], 0.3, atol=1e-6)
+    with pytest.raises(ValueError, match="shape 2 is no mesh"):
+        ab.NewtonContacts(model, solids=[0, 2])
+
+
+def test_a_solid_is_closed(device):
+    builder = newton.ModelBuilder()
+    open_cube = trimesh.Trimesh(CUBE.vertices, CUBE.faces[:-1], process=False)
+    for mesh in (CUBE, open_cube):
+        builder.add_shape_mesh(builder.add_body(), mesh=mesh_of(mesh))
+    model = builder.finalize(device=device)
+    ab.NewtonContacts(model, solids=[0])
+    with pytest.raises(ab.MeshError, match="not closed"):
+        ab.NewtonContacts(model, solids=True)
+
+
 def test_filters_groups_and_worlds(device):
     def add(builder, **config):
         body = builder.add_body(xform=placed((0, 0, 0)))

@@ -1,6 +1,8 @@
 """Contact points: depths and normals of boxes in closed form, area vectors against clipped faces, order and room."""
 
 import itertools
+import pathlib
+import runpy
 
 import numpy as np
 import pytest
@@ -128,6 +130,42 @@ def test_separate_contacts_are_separate_loops(device):
     assert len(points["pair"]) == 4, "legs are boxes: what lies between their outermost corners adds nothing"
     assert len({tuple(np.sign(p[:2])) for p in points["point"]}) == 4, "the points are spread over all legs"
     check_upward(points)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_bar_that_jams_in_a_slot_is_pushed_by_each_wall_by_what_it_is_in_it(device, order):
+    """Its sides cross both walls: two loops on faces that they share."""
+    slot = boxes_at(((1, 4, 4), (-1, 0, 0)), ((1, 4, 4), (1, 0, 0)))
+    placed = [(slot, STILL), (box(1.02, 0.9, 0.8), (0.002, 0.1, 0.2, 0, 0, 0, 1))][::order]
+    query, result = ask(device, *placed)
+    assert len(set(query.curves.loop.numpy()[: result.count[0]].tolist())) == 2
+    normal, depth = order * result.points["normal"], result.points["depth"]
+    for side in (1, -1):
+        of_wall = np.abs(normal - [side, 0, 0]).max(1) < 1e-9
+        assert of_wall.sum() >= 3
+        np.testing.assert_allclose(depth[of_wall], 0.01 - 0.002 * side, atol=1e-9)
+
+
+def test_a_nut_is_no_deeper_in_its_thread_than_it_was_moved(device):
+    """From where it is free, by shifts and tilts of at most so much; loops run from flank to flank of the thread."""
+    parts = runpy.run_path(str(pathlib.Path(__file__).parents[2] / "scenes/newton_nut_and_bolt.py"))
+    pitch, (vertices, faces) = parts["PITCH"], parts["make_nut"](16, 3)
+    bolt, wide = ab.Model.from_arrays(*parts["make_bolt"](16, 8)), ab.Model.from_arrays(vertices, faces)
+    middle = parts["find_height"](bolt, wide, pitch, 2 * pitch)
+    nut = ab.Model.from_arrays(vertices * [0.975, 0.975, 1], faces)
+    rng = np.random.default_rng(0)
+    for moved in (0.0, 2.5e-4 / 3):
+        scene = ab.Scene(device)
+        for k in range(100):
+            shift, tilt = rng.uniform(-1, 1, 3) * moved, rng.uniform(-1, 1, 2) * moved / 0.008
+            turn = np.array([*tilt / 2, np.sin(np.pi * k / 16), np.cos(np.pi * k / 16)])
+            height = middle + pitch * (k % 16) / 16 + shift[2]
+            scene.add(bolt, static=True, world=k)
+            scene.add(nut, (*shift[:2], height, *(turn / np.linalg.norm(turn))), world=k)
+        result = ab.ManifoldQuery(scene, points=32).run()
+        assert result.any.sum() == 0 if moved == 0 else result.any.sum() > 90
+    way = moved * (np.sqrt(3) + np.sqrt(2) * np.hypot(1.05 * parts["RADIUS"], 3 * pitch) / 0.008)
+    assert len(result.points["depth"]) > 1000 and result.points["depth"].max() < way
 
 
 def test_apart_inside_and_touching(device):

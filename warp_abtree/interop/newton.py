@@ -98,6 +98,17 @@ def _other_pairs(model, is_mesh, collide):
     return np.stack(np.divmod(keys, int(model.shape_count)), 1).astype(np.int32)
 
 
+def _find_solids(shapes, solids):
+    """Return whether each mesh shape is a solid, of what `NewtonContacts` takes for it."""
+    if isinstance(solids, bool):
+        return solids
+    solids = np.asarray(solids, np.int64).reshape(-1)
+    others = np.setdiff1d(solids, shapes)
+    if len(others):
+        raise ValueError(f"solids: shape {others[0]} is no mesh that collides")
+    return np.isin(shapes, solids)
+
+
 class NewtonContacts:
     """Contacts of Newton's mesh shapes: allocates once, collides many times.
 
@@ -108,6 +119,8 @@ class NewtonContacts:
         capacity: As for `ManifoldQuery`; `collide` makes more room, `launch` does not.
         points: Most points of a pair, as for `ManifoldQuery`: 8 hold up what rests, nested parts such as a nut on its
             bolt want 32.
+        solids: Mesh shapes that are solids, by index, or True for all: what lies inside one has points as deep as it
+            is far from the surface, also once no face crosses. Of closed models, see `Scene.add`.
 
     Attributes:
         scene: `Scene` of the shapes, at their finest LODs; `scene.set_lods` changes these.
@@ -117,10 +130,12 @@ class NewtonContacts:
 
     Raises:
         ImportError: Newton is not installed.
-        ValueError: Fewer than two mesh shapes; or a mesh whose surface moves (`enable_surface_velocity`).
+        ValueError: Fewer than two mesh shapes; a mesh whose surface moves (`enable_surface_velocity`); or a solid that
+            is no mesh shape.
+        MeshError: A solid whose mesh is not closed; the message names edges.
     """
 
-    def __init__(self, model, models=None, capacity=None, points=POINTS_MAX):
+    def __init__(self, model, models=None, capacity=None, points=POINTS_MAX, solids=False):
         import newton
 
         self.newton = newton
@@ -136,7 +151,8 @@ class NewtonContacts:
         self.scene = Scene(str(self.device))
         still = np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(found), 1))
         static, world = model.shape_body.numpy()[found] < 0, model.shape_world.numpy()[found]
-        self.scene.add_many(self._find_models(found, models or {}), still, worlds=world, statics=static)
+        inside = _find_solids(found, solids)
+        self.scene.add_many(self._find_models(found, models or {}), still, worlds=world, statics=static, solids=inside)
         self.scene.filter(_excluded_pairs(model, self.shapes))
         self._pairs_of_others = _other_pairs(model, is_mesh, collide)
         self._has_others = len(self._pairs_of_others) > 0 or model.particle_count > 0
@@ -239,7 +255,7 @@ class NewtonContacts:
         room = len(contacts.rigid_contact_shape0)
         if found > room:
             raise CapacityError(f"{found} rigid contacts, newton.Contacts has room for {room}")
-        self.query.result().check()
+        self.query.result(with_points=False).check()
 
     def _place(self, body_q):
         body_q = self._no_body if body_q is None else body_q

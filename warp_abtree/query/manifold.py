@@ -2,13 +2,16 @@
 
 Meshes meet in curves, and a curve alone has no depth. Here is what is made of it, for each object pair:
 
-* Contacts that share a face of either object form a loop. The normal of a loop is the direction of the area vector of
+* Contacts that share a face of either object form a loop, unless their other faces are two walls that face each other:
+  what jams in a slot has a loop at either wall. The normal of a loop is the direction of the area vector of
   its curve, 1/2 sum p x dp: the volume that two closed surfaces share shrinks by that vector times a motion, so it is
   the way out, for edges against edges and for corners too, and it needs the curve alone. A curve without area gives way
   to the mean of its contacts' normals.
 * A contact's depth is how far the one face lies behind the other's plane within the column of that face along the
   normal, at the deepest place. Where the normal of either face is within 60 degrees of the loop's and makes that
   depth no larger, it takes the place of the loop's: so a box in a corner is pushed by floor and wall, each its own way.
+  So does that of either face, however it looks, where neither is within 60 degrees of the loop's and one looks the
+  other way: a loop that runs from one flank of a thread to the other has no one way out.
 * Of all candidates of the pair an outermost one is taken, then those farthest, in place and in normal, from the
   segments between those before, and the deepest, up to 8 of them or as many as asked for, in the order in which they
   lie along a fixed direction of the lower object: points that stay keep their order from launch to launch.
@@ -44,7 +47,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
-from warp_abtree.kernels.contact import manifold
+from warp_abtree.kernels.contact import loops, manifold
 from warp_abtree.kernels.contact import points as point_kernels
 from warp_abtree.kernels.gap import near_points
 from warp_abtree.kernels.solid import inside_points
@@ -104,18 +107,18 @@ class ManifoldQuery(ContactQuery):
         start, rows, curves, contacts = self.start, self.faces, self.curves, self.contacts
         gap = self._no_gap if self._gap is None else self.hits.gap
         posed = [*pools, self.pairs, self.pair_poses]
-        self._launch_kernel(manifold.begin_loop_kernel, count, [start, rows, curves, self._order, self._key])
+        self._launch_kernel(loops.begin_loop_kernel, count, [start, rows, curves, self._order, self._key])
         self._sort_keys(count, 31 + room.bit_length())
-        self._launch_kernel(manifold.link_loop_kernel, count, [start, rows, contacts, self._order, self._key, curves])
+        self._launch_kernel(loops.link_loop_kernel, count, [start, rows, contacts, self._order, self._key, curves])
         if self._gap is not None:
             both = near_points.Rows()
             both.start, both.faces, both.order, both.key = start, rows, self._order, self._key
             inputs = [*posed, gap, both, contacts, curves]
             self._launch_kernel(near_points.find_near_candidate_kernel, count, inputs, WARP_SIZE)
-        self._launch_kernel(manifold.name_loop_kernel, count, [start, contacts, curves, self._order, self._key])
+        self._launch_kernel(loops.name_loop_kernel, count, [start, contacts, curves, self._order, self._key])
         self._sort_keys(count, 31)
         inputs = [*pools, self.pairs, start, rows, contacts, self._order, curves]
-        self._launch_kernel(manifold.average_loop_kernel, count, inputs)
+        self._launch_kernel(loops.average_loop_kernel, count, inputs)
         inputs = [*posed, gap, start, rows, contacts, curves]
         self._launch_kernel(manifold.find_candidate_kernel, count, inputs)
         spread = point_kernels.point_spreader(self.point_max)

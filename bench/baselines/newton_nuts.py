@@ -1,0 +1,224 @@
+"""Nuts on their bolts in Newton's worlds: `NewtonContacts` beside Newton's own pass, by signed distance fields.
+
+Fields, reduction and room are those of its example nut_bolt_sdf: 512 voxels along the longest side, within 5 mm of the
+surface, and a gap of 5 mm a shape; and the gap that `NewtonContacts` has here, 0.05 mm, with which Newton has less to
+do. Fields need CUDA; on the CPU its BVH takes their place. The bolt is a body as well, and there is no ground.
+"""
+
+import time
+import warnings
+
+import numpy as np
+import warp as wp
+
+import warp_abtree as ab
+
+from ..timing import make_replay, medians, time_call, time_events, time_rounds
+from .newton import Pipeline
+
+RESOLUTION, BAND = 512, 0.005
+GAP, EXAMPLE_GAP = 5e-5, 0.005  # [m] a shape
+CONTACTS_PER_WORLD = 500
+POINTS = 32
+# Certified tolerance of the meshes' LODs [m], and near faces of a world that there is room for: twice the demand, as
+# `collide` makes, is twice the memory and nearly twice the time.
+OURS = {"ours": (None, 62_000), "ours_10um": (1e-5, 20_000), "ours_30um": (3e-5, 9_000)}
+FIELDS = tuple(f"rigid_contact_{name}" for name in ("shape0", "shape1", "point0", "point1", "normal"))
+ROOM_TRIES = 4
+
+
+class Fields:
+    """Newton's meshes of bolt and nut, on CUDA with fields of distances.
+
+    Attributes:
+        meshes: `newton.Mesh` of each.
+        seconds: What each round of cooking both took; the first compiles.
+        mib: Device memory of the fields.
+    """
+
+    def __init__(self, models, device):
+        import newton
+
+        self.seconds = []
+        parts = [model.mesh_at(model.lod_max)[:2] for model in models]
+        before = used_memory(device)
+        for _ in range(2 if device.is_cuda else 1):
+            self.meshes = []
+            self.meshes = [newton.Mesh(v.astype(np.float32), f.reshape(-1)) for v, f in parts]
+            begin = time.perf_counter()
+            for mesh in self.meshes if device.is_cuda else []:
+                band = (-BAND, BAND)
+                mesh.build_sdf(device=device, max_resolution=RESOLUTION, narrow_band_range=band, margin=EXAMPLE_GAP)
+            wp.synchronize_device(device)
+            self.seconds.append(round(time.perf_counter() - begin, 3))
+        self.mib = used_memory(device) - before
+
+
+def used_memory(device) -> int:
+    """Return the memory that is taken on a device [MiB]; 0 on the CPU."""
+    wp.synchronize_device(device)
+    return (device.total_memory - device.free_memory) >> 20 if device.is_cuda else 0
+
+
+def make_model(meshes, worlds, device):
+    """Return a `newton.Model` of worlds that have a bolt and a nut."""
+    import newton
+
+    config = newton.ModelBuilder.ShapeConfig(density=8000.0, mu=0.01, ke=1e7, kd=1e4, margin=0.0, gap=GAP)
+    world, builder = newton.ModelBuilder(), newton.ModelBuilder()
+    for mesh in meshes:
+        world.add_shape_mesh(world.add_body(), mesh=mesh, cfg=config)
+    builder.replicate(world, worlds)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of inertia
+        return builder.finalize(device=device)
+
+
+class NutFields(Pipeline):
+    """Newton's pipeline over given pairs of a bolt and a nut, with room for what it finds."""
+
+    def __init__(self, model, gap, poses):
+        import newton
+
+        self.model, self.gap, worlds = model, gap, model.shape_count // 2
+        pairs = wp.array(np.arange(2 * worlds).reshape(-1, 2), dtype=wp.vec2i, device=model.device)
+        self.state, room = model.state(), max(1_000_000, 2000 * worlds)
+        for k in range(ROOM_TRIES):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of large buffers
+                self.pipeline = newton.CollisionPipeline(
+                    model,
+                    reduce_contacts=True,
+                    broad_phase="explicit",
+                    shape_pairs_filtered=pairs,
+                    rigid_contact_max=CONTACTS_PER_WORLD * worlds,
+                    max_triangle_pairs=room << 2 * k,
+                    verify_buffers=False,
+                )
+                self.contacts = self.pipeline.contacts()
+            self.place(poses)
+            self.launch()
+            try:
+                self.check()
+                break
+            except RuntimeError:
+                if k == ROOM_TRIES - 1:
+                    raise
+
+    def launch(self):
+        self.model.shape_gap.fill_(self.gap)
+        super().launch()
+
+
+class Ours:
+    """`NewtonContacts` of the same model, with the same calls; all faces, or LODs within a tolerance."""
+
+    def __init__(self, model, models, tolerance, room, poses):
+        shapes = {shape: models[shape % 2] for shape in range(model.shape_count)}
+        model.shape_gap.fill_(GAP)  # read once
+        capacity = ab.Buffers(hits=room * (model.shape_count // 2))
+        self.found, self.state = ab.NewtonContacts(model, shapes, capacity, POINTS), model.state()
+        lods = [m.lod_max if tolerance is None else m.lod_for(tolerance=tolerance) for m in models]
+        self.found.scene.set_lods(lods * (model.shape_count // 2))
+        self.faces = [len(m.mesh_at(lod)[1]) for m, lod in zip(models, lods)]
+        self.contacts = self.found.contacts()
+        self.place(poses)
+        self.found.collide(self.state, self.contacts)
+
+    def place(self, poses):
+        self.state.body_q.assign(poses)
+
+    def launch(self):
+        self.found.launch(self.state, self.contacts)
+
+    def check(self):
+        self.found.check(self.contacts)
+
+
+def read_contacts(contacts):
+    """Return the rows of contacts in place, as bytes of their fields side by side, (k, bytes)."""
+    count = int(contacts.rigid_contact_count.numpy()[0])
+    rows = [getattr(contacts, name).numpy()[:count].reshape(count, -1) for name in FIELDS]
+    return np.concatenate([np.ascontiguousarray(row).view(np.uint8).reshape(count, -1) for row in rows], 1)
+
+
+def same_twice(one, poses, others):
+    """Return whether contacts have the same bits twice, in order, and whether in any order; other poses between."""
+    found = []
+    for placed in (poses, others, poses):
+        one.place(placed)
+        one.launch()
+        found.append(read_contacts(one.contacts))
+    one.check()
+    first, _, second = found
+    in_order = np.array_equal(first, second)
+    return in_order, in_order or sorted(map(bytes, first)) == sorted(map(bytes, second))
+
+
+def worlds_with_contacts(one, worlds):
+    """Return which worlds have contacts, bool (worlds,)."""
+    count = int(one.contacts.rigid_contact_count.numpy()[0])
+    return np.isin(np.arange(worlds), one.contacts.rigid_contact_shape0.numpy()[:count] // 2)
+
+
+def measure(models, matrices, others, device, repeats):
+    """Return a row: times of a launch over all worlds [ms], in turn; contacts, bits, fields and memory.
+
+    Args:
+        models: Bolt and nut.
+        matrices, others: Two sets of poses of the nuts in their bolts' frames, (worlds, 4, 4).
+
+    Raises:
+        RuntimeError: Nuts that meet their bolts and nuts whose contacts cross are not the same number.
+    """
+    worlds = len(matrices)
+    fields = Fields(models, device)
+    model = make_model(fields.meshes, worlds, device)
+    poses, others = (body_poses(m) for m in (matrices, others))
+    row = {"device": device.name, "worlds": worlds, "cook_s": fields.seconds, "fields_mib": fields.mib}
+    makers = {name: lambda given=given: Ours(model, models, *given, poses) for name, given in OURS.items()}
+    kind = "sdf" if device.is_cuda else "bvh"
+    gaps = {f"{kind}_same_gap": GAP} | ({f"{kind}_example": EXAMPLE_GAP} if device.is_cuda else {})
+    makers |= {name: lambda gap=gap: NutFields(model, gap, poses) for name, gap in gaps.items()}
+    runs = {}
+    for name, make in makers.items():
+        before = used_memory(device)
+        try:
+            one = make()
+            row[f"{name}_same_bits"], row[f"{name}_same_set"] = same_twice(one, poses, others)
+            runs[name] = timed(one, device)
+        except (RuntimeError, MemoryError) as error:  # what has no room must not cost the rest of a run
+            row[f"{name}_skipped"] = f"{type(error).__name__}: {error}"
+            continue
+        row[f"{name}_mib"] = used_memory(device) - before
+        row[f"{name}_contacts"] = len(read_contacts(one.contacts))
+        row[f"{name}_worlds"] = int(worlds_with_contacts(one, worlds).sum())
+        if isinstance(one, Ours):
+            row[f"{name}_faces"] = one.faces
+            check_ours(row, name, one)
+    row |= {f"{name}_ms": round(ms, 3) for name, ms in medians(time_rounds(runs, repeats)).items()}
+    row |= {f"{name}_ratio": round(row[f"{name}_ms"] / row["ours_ms"], 3) for name in runs if "ours" in runs}
+    return row
+
+
+def timed(one, device):
+    """Return a callable that launches, as a graph on CUDA, and returns the time [ms]."""
+    replay = make_replay(one.launch, device)
+    return time_events(replay, device) if device.is_cuda else time_call(replay, device)
+
+
+def body_poses(matrices):
+    """Return the poses of bolts, which stand at the origin, and nuts, float32 (2 worlds, 7)."""
+    poses = np.zeros((2 * len(matrices), 7), np.float32)
+    poses[:, 6] = 1
+    poses[1::2] = [wp.transform(*wp.transform_decompose(wp.mat44(matrix))[:2]) for matrix in matrices]
+    return poses
+
+
+def check_ours(row, name, ours):
+    """Add how many nuts meet their bolts to a row, and hold the contacts against it; poses are those of a launch."""
+    found, scene = ours.found.query.result(with_points=False), ours.found.scene
+    row[f"{name}_meet"] = int(scene.intersect(found.pairs, "any").any.sum())
+    row[f"{name}_near"] = int(found.count.sum())
+    if row[f"{name}_meet"] != int(found.any.sum()):
+        raise RuntimeError(f"{row[f'{name}_meet']} nuts meet their bolts, {int(found.any.sum())} have faces that cross")
