@@ -186,7 +186,7 @@ def measure(models, matrices, others, device, repeats):
         try:
             one = make()
             row[f"{name}_same_bits"], row[f"{name}_same_set"] = same_twice(one, poses, others)
-            runs[name] = timed(one, device)
+            runs[name], row[f"{name}_graph"] = timed(one, device)
         except (RuntimeError, MemoryError) as error:  # what has no room must not cost the rest of a run
             row[f"{name}_skipped"] = f"{type(error).__name__}: {error}"
             continue
@@ -202,9 +202,15 @@ def measure(models, matrices, others, device, repeats):
 
 
 def timed(one, device):
-    """Return a callable that launches, as a graph on CUDA, and returns the time [ms]."""
-    replay = make_replay(one.launch, device)
-    return time_events(replay, device) if device.is_cuda else time_call(replay, device)
+    """Return a callable that launches and returns the time [ms], and whether it replays a graph: on CUDA, if it can."""
+    if not device.is_cuda:
+        return time_call(one.launch, device), False
+    try:
+        replay = make_replay(one.launch, device)
+        replay()
+    except RuntimeError:
+        return time_events(one.launch, device), False
+    return time_events(replay, device), True
 
 
 def body_poses(matrices):
