@@ -7,8 +7,9 @@ import warp as wp
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.generation import record_launch
 from warp_abtree.kernels.poses import PairPose, pair_pose
+from warp_abtree.kernels.small_trees.gather import is_small
 from warp_abtree.kernels.traversal.face_pairs import OUTPUT_ANY, Hits
-from warp_abtree.kernels.traversal.load_balance import NO_UNIT, Work, units_per_pair
+from warp_abtree.kernels.traversal.load_balance import NO_UNIT, Work, note_descent, units_per_pair
 from warp_abtree.kernels.triangle.distance import DISTANCE_MAX, pad_distance
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
@@ -86,6 +87,8 @@ def relative_poses(with_distances: bool):
                 # Nothing is proved where distances may overflow: every box passes, and the first faces count as near.
                 pose.within = wp.float64(wp.inf)
                 pose.margin = wp.inf
+        if pose.margin >= 0.0 and not is_small(pose, work_out.small_faces):
+            note_descent(work_out)
         pose.swapped = wp.where(pairs[p][0] > pairs[p][1], 1, 0)
         pair_pose_out[p] = pose
 

@@ -3,6 +3,12 @@
 #include "builtin.h"
 #include "sizes.h"
 
+inline CUDA_CALLABLE wp::int32 first_ended(bool descends, wp::array_t<wp::int32> counter) {
+#include "sizes.h"
+    const int noted = *(const volatile int*)(counter.data + 4);
+    return descends || noted != 0 ? 0 : -NO_UNIT;
+}
+
 inline CUDA_CALLABLE wp::int32 first_unit(wp::array_t<wp::int32> counter) {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
@@ -19,6 +25,14 @@ inline CUDA_CALLABLE wp::int32 take_unit(wp::array_t<wp::int32> counter) {
     if (threadIdx.x == 0)
         unit = atomicAdd(counter.data + 3, 1);
     return __shfl_sync(0xffffffffu, unit, 0);
+#else
+    return __atomic_fetch_add(counter.data + 3, 1, __ATOMIC_RELAXED);
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 claim_unit(wp::array_t<wp::int32> counter) {
+#if defined(__CUDA_ARCH__)
+    return threadIdx.x == 0 ? atomicAdd(counter.data + 3, 1) : 0;
 #else
     return __atomic_fetch_add(counter.data + 3, 1, __ATOMIC_RELAXED);
 #endif
@@ -68,12 +82,15 @@ inline CUDA_CALLABLE wp::int32 await_donation(wp::array_t<wp::int32> counter, wp
         __threadfence();
     }
     __syncwarp();
-    if (ended > 0 && __shfl_sync(0xffffffffu, left, 0) == 0)
+    if (ended > 0 && __shfl_sync(0xffffffffu, left, 0) == 0) {
+        counter.data[4] = 0;
         for (int i = threadIdx.x; i < SLOT_COUNT / 4; i += 32)
             ((int4*)flag.data)[i] = make_int4(-1, -1, -1, -1);
+    }
     return __shfl_sync(0xffffffffu, slot, 0);
 #else
     counter.data[2] -= ended;
+    counter.data[4] = 0;
     return -1;
 #endif
 }

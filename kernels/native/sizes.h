@@ -33,17 +33,26 @@ static_assert(ITEM_BYTES * (SLAB_PAIR_START + SLAB_PAIR_LENGTH) <= PLACE_MASK, "
 static_assert(STACK_LIST == 2 * LEAF_PAIR_LIST, "places do not overlap");
 static_assert((unsigned int)(ITEM_BYTES * STACK_LENGTH) << STACK_LIST == 0, "the stack is a ring in the word, too");
 
-// Two small trees where a warp's stack lies otherwise: leaves of each, and inner nodes before boxes of A's leaves take
-// their place. In words of 4 bytes, a box three quarters of 4 words.
+// Two small trees where a warp's stack lies otherwise: boxes and corners of faces of A and B, three quarters of 4 words
+// each, the leaves of each tree, and face pairs and hits, half a word each. The inner nodes come first, where boxes
+// take their place. Places are words of 4 bytes, but for TILE_PAIRS and TILE_HITS, which are half words.
+constexpr int TILE_FACES = 32;
+constexpr int TILE_WORDS = 384;
+constexpr int TILE_CORNERS = 768;
 constexpr int SMALL_LEAVES = 96;
 constexpr int SMALL_INNER = 192;
-constexpr int SMALL_ROWS = 64;
-constexpr int SMALL_FACES = 768;
-constexpr int SMALL_A = 832;
-constexpr int SMALL_B = 928;
-static_assert(SMALL_INNER >= 2 * SMALL_LEAVES && SMALL_FACES >= SMALL_INNER, "both trees' inner nodes have room");
-static_assert(SMALL_FACES == 12 * SMALL_ROWS && SMALL_A == SMALL_FACES + SMALL_ROWS, "boxes, then their faces");
-static_assert(SMALL_B == SMALL_A + SMALL_LEAVES && 4 * (SMALL_B + SMALL_LEAVES) <= STACK_LENGTH * ITEM_BYTES, "room");
+constexpr int SMALL_A = 1536;
+constexpr int SMALL_B = 1632;
+constexpr int TILE_PAIRS = 3456;
+constexpr int TILE_HITS = 3520;
+constexpr int TILE_HITS_LENGTH = 63;
+static_assert(TILE_FACES == WARP_SIZE && TILE_WORDS == 12 * TILE_FACES, "a face of A is a bit, one of B a lane");
+static_assert(TILE_CORNERS == 2 * TILE_WORDS && SMALL_A == 4 * TILE_WORDS, "boxes of A and B, corners of A and B");
+static_assert(SMALL_INNER >= 2 * SMALL_LEAVES && TILE_WORDS >= SMALL_INNER, "both trees' inner nodes have room");
+static_assert(SMALL_B == SMALL_A + SMALL_LEAVES && TILE_PAIRS == 2 * (SMALL_B + SMALL_LEAVES), "no gap");
+static_assert(TILE_HITS - TILE_PAIRS >= (WARP_SIZE - 1) + WARP_SIZE, "fewer than a warp wait, each lane adds one");
+static_assert(TILE_HITS_LENGTH >= (WARP_SIZE - 1) + WARP_SIZE, "fewer than a warp wait, each lane adds one");
+static_assert(2 * (TILE_HITS + TILE_HITS_LENGTH) <= ITEM_BYTES * (SLAB_PAIR_START + SLAB_PAIR_LENGTH), "room");
 
 // Of a search for the nearest faces: node pairs, face pairs for float32, and behind them those for float64.
 constexpr int NEAREST_OPEN_START = 672;
@@ -51,6 +60,9 @@ constexpr int NEAREST_OPEN_LENGTH = 64;
 constexpr int NEAREST_LENGTH = 736;
 static_assert(NEAREST_OPEN_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
 static_assert(NEAREST_LENGTH == NEAREST_OPEN_START + NEAREST_OPEN_LENGTH, "lists lie one behind the other");
+
+// Warps of a block that resolves uncertain face pairs: fewer blocks start sooner where there are none.
+constexpr int RESOLVE_WARPS = 4;
 
 // Slots of the queue in which idle warps wait, each with room for so many items: one a lane.
 // More than there are units of any launch: as the number of units taken, it leaves none.

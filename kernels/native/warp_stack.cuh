@@ -19,6 +19,14 @@ inline CUDA_CALLABLE wp::int32 warp_lane() {
 #endif
 }
 
+inline CUDA_CALLABLE wp::int32 resolve_lane() {
+#if defined(__CUDA_ARCH__)
+    return threadIdx.x & 31;
+#else
+    return 0;
+#endif
+}
+
 inline CUDA_CALLABLE wp::uint64 warp_stack() {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
@@ -117,8 +125,8 @@ inline CUDA_CALLABLE wp::int32 read_signs(wp::uint64 items, wp::int32 i) {
 inline CUDA_CALLABLE wp::uint64 signed_pairs() {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
-    __shared__ int4 items[STRADDLING_LENGTH];
-    return __cvta_generic_to_shared(items);
+    __shared__ int4 items[RESOLVE_WARPS * STRADDLING_LENGTH];
+    return __cvta_generic_to_shared(items + (threadIdx.x >> 5) * STRADDLING_LENGTH);
 #else
     static int items[STRADDLING_LENGTH * 4];
     return (wp::uint64)items;
@@ -129,7 +137,8 @@ inline CUDA_CALLABLE wp::int32 push_signed_pair(wp::uint64 list, wp::int32 end, 
                                                 wp::int32 signs) {
 #if defined(__CUDA_ARCH__)
     const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    const unsigned int at = (unsigned int)list + 16 * (end + __popc(votes & ((1u << threadIdx.x) - 1u)));
+    const unsigned int below = (1u << (threadIdx.x & 31)) - 1u;
+    const unsigned int at = (unsigned int)list + 16 * (end + __popc(votes & below));
     if (flag)
         asm volatile("st.shared.v4.b32 [%0], {%1, %2, %3, %4};" ::"r"(at), "r"(item[0]), "r"(item[1]), "r"(item[2]),
                      "r"(signs)

@@ -58,7 +58,7 @@ inline CUDA_CALLABLE wp::int32 reserve_slot(wp::array_t<wp::int32> total, bool f
     unsigned int votes = __ballot_sync(0xffffffffu, flag);
     if (votes == 0)
         return 0;
-    int lane = threadIdx.x;
+    int lane = threadIdx.x & 31;
     int leader = __ffs(votes) - 1;
     int start = 0;
     if (lane == leader)
@@ -98,7 +98,7 @@ inline CUDA_CALLABLE void count_flags(wp::array_t<wp::int64> totals, wp::int32 i
     if (!__any_sync(0xffffffffu, flag))
         return;
     unsigned int same = __match_any_sync(0xffffffffu, flag ? i : -1);
-    if (flag && threadIdx.x + 1 == __ffs(same))
+    if (flag && (threadIdx.x & 31) + 1 == __ffs(same))
         atomicAdd((unsigned long long*)totals.data + i, (unsigned long long)__popc(same));
 #else
     if (flag)

@@ -12,6 +12,7 @@ from warp_abtree.kernels.arithmetic.predicates import EXACT
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.poses import NO_NODE, PairPose
 from warp_abtree.kernels.slabs.overlap import slabs_overlap
+from warp_abtree.kernels.small_trees.gather import SmallLists, gather_leaves, is_small, test_small_trees
 from warp_abtree.kernels.traversal.face_pairs import OUTPUT_ANY, Hits
 from warp_abtree.kernels.traversal.leaf_pairs import separate_leaf_pairs, test_straddling
 from warp_abtree.kernels.traversal.load_balance import (
@@ -19,20 +20,21 @@ from warp_abtree.kernels.traversal.load_balance import (
     SLOT_COUNT,
     SLOT_ITEMS,
     Work,
-    await_donation,
+    await_items,
+    claim_ahead,
     claim_slot,
     count_idle,
     fill_slot,
+    first_ended,
     first_unit,
     free_slot,
     load_tickets,
     next_unit,
     parts_at_once,
     start_items,
-    units_per_pair,
+    units_of_pair,
 )
 from warp_abtree.kernels.traversal.node_pair import compare_node_pair
-from warp_abtree.kernels.traversal.small_trees import SmallLists, gather_leaves, is_small, test_small_trees
 from warp_abtree.kernels.traversal.warp_stack import (
     SLAB_PAIR_LENGTH,
     SLAB_PAIR_START,
@@ -139,6 +141,14 @@ def receive_items(items: wp.uint64, slot: wp.int32, work: Work):
         write_item(items, lane, work.item[slot * SLOT_ITEMS + lane])
     free_slot(work.flag, slot)
     return size
+
+
+@wp.func
+def first_items(items: wp.uint64, slot: wp.int32, task: wp.vec3i, pose: PairPose, work: Work):
+    """Put what lies in a slot on the empty stack, or without one what a unit starts with; return the stack's end."""
+    if slot >= 0:
+        return receive_items(items, slot, work)
+    return start_items(items, task[1], task[2], pose)
 
 
 @wp.func
@@ -317,43 +327,40 @@ def warp_traversal(mode: int, for_any: bool):
     ):
         """Traverse units of work, each a part of one object pair, and donated items, until there are none."""
         count = wp.min(pair_count[0], pair_poses.shape[0])
-        parts = units_per_pair(work_inout.warps_per_pair, count)
+        ended = first_ended(wp.static(mode != int(EXACT)), work_inout.counter)
+        unit = first_unit(work_inout.counter)
+        parts = units_of_pair(ended, count, work_inout)
         pace = set_pace(stack_room, parts, wp.static(for_any))
         asked = wp.where(wp.static(for_any), OUTPUT_ANY, output)
         own = open_stack()
-        unit, units, ended = first_unit(work_inout.counter), count * parts, wp.int32(0)
+        units = count * parts
         while True:
             p = unit / parts
             slot = wp.int32(-1)
             if unit >= units:
-                slot = await_donation(work_inout.counter, work_inout.flag, ended)
+                slot = await_items(ended, work_inout)
                 if slot < 0:
                     return
                 ended = 0
                 p = work_inout.owner[slot][0]
-            pose = pair_poses[p]
-            pose.floor = slab_floor(pose, parts)
-            node_tests, tests = wp.int32(0), wp.vec3i()
-            lists = SmallLists()
             task = wp.vec3i(p, unit - p * parts, parts)
+            unit = claim_ahead(ended, unit, units, work_inout)
+            pose = pair_poses[p]
+            lists = SmallLists()
             if wp.static(mode == int(EXACT)):
                 if slot < 0 and is_small(pose, work_inout.small_faces):
                     task[2] = parts_at_once(parts, count, work_inout.warps)
                     lists = gather_leaves(task, own.items, states, pose)
             if lists.fits:
-                node_tests, tests = test_small_trees(
-                    asked, pace.for_any, task, lists, models, states, pose, own.items, hits_inout
-                )
+                test_small_trees(asked, pace.for_any, task, lists, models, states, pose, own.items, hits_inout)
             else:
-                if slot >= 0:
-                    own.end = receive_items(own.items, slot, work_inout)
-                else:
-                    own.end = start_items(own.items, task[1], task[2], pose)
+                pose.floor = slab_floor(pose, parts)
+                own.end = first_items(own.items, slot, task, pose, work_inout)
                 node_tests, tests = traverse_items(
                     asked, wp.static(mode), pace, p, models, states, pose, own, hits_inout, work_inout
                 )
-            count_tests(hits_inout, p, node_tests, tests)
+                count_tests(hits_inout, p, node_tests, tests)
             ended += 1
-            unit = next_unit(unit, units, work_inout)
+            unit = next_unit(ended, unit, units, work_inout)
 
     return traverse_warp_kernel

@@ -26,7 +26,7 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.generation import LaunchRecord
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.node_pair import pack_item
-from warp_abtree.kernels.traversal.warp_stack import warp_lane, warp_size, warp_sync, write_item
+from warp_abtree.kernels.traversal.warp_stack import hold_uniform, warp_lane, warp_size, warp_sync, write_item
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -34,7 +34,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 SLOT_COUNT = native.constant("SLOT_COUNT")
 SLOT_ITEMS = native.constant("SLOT_ITEMS")
 DONATIONS_AT_ONCE = wp.constant(3)
-COUNTER_COUNT = 4
+COUNTER_COUNT = 5
 
 NO_UNIT = native.constant("NO_UNIT")
 # The bit of half an item that names two siblings.
@@ -45,7 +45,8 @@ SIBLINGS = wp.constant(-(2**31))
 class Work:
     """Counters and slots of one launch."""
 
-    counter: wp.array(dtype=wp.int32)  # tickets served, tickets taken, units and donations not ended, units taken
+    # Tickets served, tickets taken, units and donations not ended, units taken; not 0 where there may be descents.
+    counter: wp.array(dtype=wp.int32)
     flag: wp.array(dtype=wp.int32)  # 0 free, the ticket + 1 that it is full for, -1 when all is done, shape [slot]
     owner: wp.array(dtype=wp.vec2i)  # (object pair, number of items), shape [slot]
     item: wp.array(dtype=wp.int64)  # node pairs (`node_pair`), shape [slot * SLOT_ITEMS]
@@ -58,6 +59,11 @@ class Work:
 balance_code = functools.partial(native.body, "load_balance.cuh")
 
 
+@wp.func_native(balance_code("first_ended"))
+def first_ended(descends: bool, counter: wp.array(dtype=wp.int32)) -> wp.int32:
+    """Return 0 units and donations ended, or less than any number where all pairs are small: nothing is given away."""
+
+
 @wp.func_native(balance_code("first_unit"))
 def first_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
     """Return the unit that this warp starts with, NO_UNIT or more where there is no work."""
@@ -66,6 +72,11 @@ def first_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
 @wp.func_native(balance_code("take_unit"))
 def take_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
     """Return the number of a unit of work that no other warp has; from the number of units on there is none."""
+
+
+@wp.func_native(balance_code("claim_unit"))
+def claim_unit(counter: wp.array(dtype=wp.int32)) -> wp.int32:
+    """Return what `take_unit` does, in the first lane alone, so that nobody waits for it yet."""
 
 
 @wp.func_native(balance_code("load_tickets"))
@@ -101,14 +112,36 @@ def fill_slot(flag: wp.array(dtype=wp.int32), ticket: wp.int32):
 
 
 @wp.func
+def note_descent(work: Work):
+    """Note that an object pair is not for `small_trees`; the warp that ends the last unit forgets it."""
+    work.counter[4] = 1
+
+
+@wp.func
 def units_per_pair(warps_per_pair: wp.int32, count: wp.int32):
     """Return how many units an object pair is at first; more of them cost more, since each starts at the roots."""
     return wp.max(1, wp.int32(wp.float32(warps_per_pair) / wp.sqrt(wp.float32(wp.max(count, 1)))))
 
 
 @wp.func
-def next_unit(unit: wp.int32, units: wp.int32, work: Work):
-    """Return the unit that follows one, `units` or more where there is none or the warp has had none."""
+def claim_ahead(ended: wp.int32, unit: wp.int32, units: wp.int32, work: Work):
+    """Return the unit, or where nothing is ever given away the one after it, in the first lane alone."""
+    claimed = wp.int32(unit)
+    if ended < 0:
+        claimed = units
+        if units > work.warps:
+            claimed = claim_unit(work.counter)
+    return claimed
+
+
+@wp.func
+def next_unit(ended: wp.int32, unit: wp.int32, units: wp.int32, work: Work):
+    """Return the unit that follows what `claim_ahead` returned, `units` or more where there is none.
+
+    Where the warp has had none, but a donation, `units` or more comes back as it is.
+    """
+    if ended < 0:
+        return hold_uniform(unit)
     if unit < units:
         unit = wp.int32(units)
         if units > work.warps:
@@ -120,6 +153,24 @@ def next_unit(unit: wp.int32, units: wp.int32, work: Work):
 def parts_at_once(parts: wp.int32, count: wp.int32, warps: wp.int32):
     """Return by how many units a pair is divided that each starts with as much work as the whole pair."""
     return wp.clamp(warps / wp.max(count, 1), 1, parts)
+
+
+@wp.func
+def units_of_pair(ended: wp.int32, count: wp.int32, work: Work):
+    """Return how many units an object pair is: no more than start at once where all pairs are small."""
+    parts = units_per_pair(work.warps_per_pair, count)
+    if ended < 0:
+        parts = parts_at_once(parts, count, work.warps)
+    return parts
+
+
+@wp.func
+def await_items(ended: wp.int32, work: Work):
+    """Return what `await_donation` does, -1 at once where nothing is ever given away."""
+    slot = wp.int32(-1)
+    if ended >= 0:
+        slot = await_donation(work.counter, work.flag, ended)
+    return slot
 
 
 @wp.func

@@ -1,7 +1,7 @@
 """The passes over uncertain face pairs: float64 for all of them, exact signs for the few that are inexact there.
 
-Each pass works off a list of its own, so that the threads of a warp do much the same. A block is a warp: neighbours on
-a list are of the same few object pairs, and count for them together.
+Each pass works off a list of its own, so that the threads of a warp do much the same. Neighbours on a list are of
+the same few object pairs, and a warp counts for them together.
 """
 
 import warp as wp
@@ -24,8 +24,8 @@ from warp_abtree.kernels.traversal.warp_stack import (
     push_signed_pair,
     read_signed_pair,
     reserve_slot,
+    resolve_lane,
     signed_pairs,
-    warp_lane,
     warp_size,
     warp_sync,
 )
@@ -107,7 +107,7 @@ def resolve_rounded_kernel(
     hits_inout: Hits,
 ):
     """Decide the uncertain face pairs of FLOAT32 by rounded determinants: every so many-th a thread."""
-    lane = warp_lane()
+    lane = resolve_lane()
     end = wp.min(hits_inout.uncertain_total[0], hits_inout.uncertain.shape[0])
     at_once = items_at_once(end, threads)
     first = at_once * (wp.tid() / warp_size())
@@ -157,7 +157,7 @@ def resolve_straddling(
     hits: Hits,
 ):
     """Decide straddling pairs, one a lane, and report those that meet."""
-    lane = warp_lane()
+    lane = resolve_lane()
     waiting = read_signed_pair(list, first + wp.min(lane, popped - 1))
     item = wp.vec3i(waiting[0], waiting[1], waiting[2])
     p = item[0]
@@ -184,7 +184,7 @@ def float64_filter_kernel(
 
     Planes first: they separate most pairs, and only straddling pairs take edges, when a warp of them waits.
     """
-    lane = warp_lane()
+    lane = resolve_lane()
     list = signed_pairs()
     end = wp.min(hits_inout.uncertain_total[0], hits_inout.uncertain.shape[0])
     at_once = items_at_once(end, threads)
@@ -218,7 +218,7 @@ def resolve_inexact_kernel(
     hits_inout: Hits,
 ):
     """Decide the inexact face pairs by exact signs: every so many-th a thread."""
-    lane = warp_lane()
+    lane = resolve_lane()
     end = hits_inout.inexact_total[0]
     at_once = items_at_once(end, threads)
     first = at_once * (wp.tid() / warp_size())

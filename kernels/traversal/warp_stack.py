@@ -13,6 +13,7 @@ from warp_abtree.kernels.traversal.node_pair import four_items
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 WARP_SIZE = native.constant("WARP_SIZE")
+RESOLVE_WARPS = native.constant("RESOLVE_WARPS")
 STACK_LENGTH = native.constant("STACK_LENGTH")  # node pairs
 STRADDLING_START = native.constant("STRADDLING_START")
 SLAB_PAIR_START, SLAB_PAIR_LENGTH = native.constant("SLAB_PAIR_START"), native.constant("SLAB_PAIR_LENGTH")
@@ -29,6 +30,11 @@ def warp_size() -> wp.int32: ...
 
 @wp.func_native(stack_code("warp_lane"))
 def warp_lane() -> wp.int32: ...
+
+
+@wp.func_native(stack_code("resolve_lane"))
+def resolve_lane() -> wp.int32:
+    """Return the lane of a warp in a block of RESOLVE_WARPS."""
 
 
 @wp.func_native(stack_code("warp_sync"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from conftest import slow
-from helpers.questions import ask, in_a_row, launch, pairs_of, random_case, scene_of, sort_rows
+from helpers.questions import GpuQuery, ask, in_a_row, launch, pairs_of, random_case, scene_of, sort_rows
 from helpers.samples import REAL_MESHES, STILL, WARP_MESHES, contact_poses, random_poses, sample, true_faces
 from oracles.peers import fcl_faces, judge
 from oracles.triangle import into_frame_of_a
@@ -156,7 +156,7 @@ def test_pairs_far_apart(device, far):
 
 @pytest.mark.parametrize("room", [STACK_LENGTH, 0])
 @pytest.mark.parametrize("parts", [1, 5, 300])
-@pytest.mark.parametrize("small", [0, 10**6])
+@pytest.mark.parametrize("small", [0, 96, 10**6])
 @pytest.mark.slow
 def test_warps_give_the_same_answers(device, room, parts, small):
     """One warp a pair and several, with room on the stack or none, so that they go one item at a time; trees level by
@@ -190,6 +190,26 @@ def test_warps_give_the_same_answers(device, room, parts, small):
             assert result.exact_tests[-1] > 2, "the list of uncertain pairs has grown"
     if parts == 1:
         assert visits["any"] < visits["count"], "a pair ends at its first hit"
+
+
+def test_small_and_large_trees_by_turns(device):
+    """One query at LODs where warps wait for one another and where none does, many pairs more than warps too."""
+    rng = np.random.default_rng(11)
+    model, count = sample("torus"), 40
+    coarse, fine = model.lod_for(fraction=40 / model.face_count), model.lod_max
+    cases = [(model, fine, *random_poses(rng, 1, 0.3), model, fine, *random_poses(rng, 1, 0.3)) for _ in range(count)]
+    scene = scene_of(device, cases)
+    mixed = np.where(np.arange(scene.object_count) % 3 == 0, fine, coarse)
+    pairs = np.tile(pairs_of(cases), (100, 1))
+    queries = {output: GpuQuery(scene, output, pairs=pairs) for output in ("faces", "any")}
+    for lods in (coarse, fine, coarse, mixed, coarse):
+        scene.set_lods(np.broadcast_to(lods, scene.object_count))
+        with testing.regime(small_faces=0):
+            plain = ab.Query(scene, "faces", pairs=pairs).run()
+        faces, alone = queries["faces"].run(), queries["any"].run()
+        np.testing.assert_array_equal(faces.faces, plain.faces)
+        np.testing.assert_array_equal([faces.any, alone.any], [plain.any] * 2)
+        assert faces.any.any() and (np.diff(faces.count.reshape(-1, count), axis=0) == 0).all()
 
 
 def test_coincident_meshes_go_to_float64_at_once(device):

@@ -14,7 +14,7 @@ from warp_abtree.kernels import relative_pose
 from warp_abtree.kernels.gap import near_faces
 from warp_abtree.kernels.solid.containment import find_contained_kernel
 from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, simd, uncertain_pairs
-from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
+from warp_abtree.kernels.traversal.warp_stack import RESOLVE_WARPS, STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.readout import QueryReadout
 from warp_abtree.query.request import LIST_MAX, OUTPUTS, PRECISIONS, check_capacity, check_request, check_within
@@ -27,6 +27,7 @@ UNCERTAIN_ROOM = 65536
 # Warps that one multiprocessor runs at a time by their registers: of the traversal, of float64, of exact signs.
 WARPS_A_PROCESSOR = 16
 FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
+RESOLVE_THREADS = RESOLVE_WARPS * WARP_SIZE  # of a block
 # So that each finds a slot for all that it gives away at once.
 WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
@@ -268,24 +269,24 @@ class Query(QueryReadout):
             within = self.hits.gap
         made = self._make_search(within, self.hits, mode, output, launch)
         models, states, _ = self.batch.pools
-        for kernel, warps in self._passes() if len(self.hits.uncertain) else ():
+        for kernel, warps, block in self._passes() if len(self.hits.uncertain) else ():
             threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
             given = [] if kernel is near_faces.find_near_kernel else [output]
             inputs = [threads, *given, models, states, self.pair_poses, self.hits]
-            made.append(launch(kernel, dim=threads, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
+            made.append(launch(kernel, dim=threads, inputs=inputs, block_dim=block, device=self.device))
         return made
 
     def _mode(self) -> int:
         return int(PRECISIONS[self.precision] if self._asked_gap is None else face_pairs.GAP)
 
     def _passes(self) -> list:
-        """Return the kernels that decide what the traversal lists, and their warps on a multiprocessor."""
+        """Return what decides what the traversal lists: kernels, their warps a multiprocessor, threads of a block."""
         if int(PRECISIONS[self.precision]) != EXACT:
-            return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR)]
+            return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR, RESOLVE_THREADS)]
         return [
-            (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR),
-            (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR),
-            *([] if self._asked_gap is None else [(near_faces.find_near_kernel, EXACT_WARPS_A_PROCESSOR)]),
+            (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR, RESOLVE_THREADS),
+            (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR, RESOLVE_THREADS),
+            *([] if self._asked_gap is None else [(near_faces.find_near_kernel, EXACT_WARPS_A_PROCESSOR, WARP_SIZE)]),
         ]
 
     def _slow_kernels(self, with_distances: bool) -> list:
@@ -294,11 +295,11 @@ class Query(QueryReadout):
         modes = [self._mode(), *([within] if with_distances else [])]
         if self.uses_warps():
             kernels = [dual_tree.warp_traversal(mode, mode == within or self.output == "any") for mode in modes]
-            kernels += reversed([kernel for kernel, _ in self._passes()])
+            passes = [(kernel, block) for kernel, _, block in reversed(self._passes())]
         else:
-            kernels = [simd.thread_traversal(mode) for mode in modes]
-        kernels += [relative_pose.relative_poses(mode in (within, int(face_pairs.GAP))) for mode in modes]
-        return [(kernel, WARP_SIZE) for kernel in kernels]
+            kernels, passes = [simd.thread_traversal(mode) for mode in modes], []
+        poses = [relative_pose.relative_poses(mode in (within, int(face_pairs.GAP))) for mode in modes]
+        return [*[(kernel, WARP_SIZE) for kernel in kernels], *passes, *[(kernel, WARP_SIZE) for kernel in poses]]
 
     def result(self, device: bool = False) -> Result:
         """Return the results of the last launch, sorted. Waits for the device.

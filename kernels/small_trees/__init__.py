@@ -1,0 +1,1 @@
+"""Object pairs whose trees are both small: leaves all against all."""
