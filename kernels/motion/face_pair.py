@@ -38,6 +38,8 @@ LONG_STEP = wp.constant(wp.float64(2.0**-5))
 TIME_DOWN = wp.constant(wp.float64(1.0 - 2.0**-50))
 # How a pair of faces ended.
 CLEAR, TOUCHES, UNDECIDED = wp.constant(0), wp.constant(1), wp.constant(2)
+# Of faces whose corners move straight: to be gone on with in double words.
+STALLED = wp.constant(3)
 
 
 @wp.struct

@@ -5,6 +5,7 @@ import warp as wp
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.motion.face_pair import advance_pair
 from warp_abtree.kernels.motion.linear import (
+    EndPoses,
     LinearMotion,
     advance_linear_children,
     advance_linear_pair,
@@ -134,6 +135,7 @@ def advance_faces(
     tolerance: wp.float64,
     models: ModelPool,
     states: StatePool,
+    poses: EndPoses,
     pose: PairPose,
     motion: Motion,
     faces: wp.vec2i,
@@ -149,10 +151,11 @@ def advance_faces(  # noqa: F811
     tolerance: wp.float64,
     models: ModelPool,
     states: StatePool,
+    poses: EndPoses,
     pose: PairPose,
     motion: LinearMotion,
     faces: wp.vec2i,
     start: wp.float64,
     best: wp.float64,
 ):
-    return advance_linear_pair(tolerance, models, states, pose, motion, faces[0], faces[1], start, best)
+    return advance_linear_pair(tolerance, models, states, poses, pose, motion, faces[0], faces[1], start, best)

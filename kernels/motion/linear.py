@@ -13,9 +13,9 @@ from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.motion.face_pair import (
     AXIS_COUNT,
     CLEAR,
+    STALLED,
     STEPS_MAX,
     TOUCHES,
-    UNDECIDED,
     Contact,
     axis_of,
     load_corners,
@@ -26,6 +26,7 @@ from warp_abtree.kernels.motion.face_pair import (
 )
 from warp_abtree.kernels.motion.node_pair import go_on, later, longest_step
 from warp_abtree.kernels.motion.path import BEND_LEAST, SCALE_MAX
+from warp_abtree.kernels.motion.stalled import carry_on, plain_row, posed_row, words_type
 from warp_abtree.kernels.poses import ROUNDING_32, PairPose, reach_box
 from warp_abtree.kernels.traversal.boxes import pose_box
 from warp_abtree.kernels.traversal.node_pair import INDEX_MASK, four_items, item_first, item_second
@@ -34,6 +35,9 @@ from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, 
 from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+# 9 u^2 and some, that posed corners err by of the magnitudes that they are sums of.
+POSED_WORDS = wp.constant(wp.float64(2.0**-102))
 
 
 @wp.struct
@@ -52,6 +56,15 @@ class LinearMotion:
     scale: wp.float64  # power of two that boxes are scaled by
     margin: wp.float32  # that boxes are widened by, scaled
     speed_margin: wp.float32  # that their speeds are, scaled
+    objects: wp.vec2i  # A and B
+
+
+@wp.struct
+class EndPoses:
+    """Poses of all objects."""
+
+    first: ObjectPool  # where motions start
+    last: ObjectPool  # where they end
 
 
 @wp.struct
@@ -81,6 +94,7 @@ def start_linear_motion(
     a, b = pair[0], pair[1]
     home = wp.transpose(objects.rotation[a])
     motion = LinearMotion()
+    motion.objects = pair
     motion.first = home * objects.rotation[b]
     motion.offset = home * (objects.position[b] - objects.position[a])
     motion.way_a = home * ends.rotation[a] - home * objects.rotation[a]
@@ -227,7 +241,7 @@ def advance_straight(
     start: wp.float64,
     best: wp.float64,
 ):
-    """Return when two faces whose corners move straight first touch, as `face_pair.advance_faces`."""
+    """Return when two faces whose corners move straight first touch, or STALLED, as `face_pair.advance_faces`."""
     contact = Contact()
     t, steps = wp.float64(start), wp.int32(0)
     while steps < STEPS_MAX:
@@ -236,7 +250,7 @@ def advance_straight(
         n = separating_direction(x, y)
         step = straight_step(slack, n, x, y, way_a, way_b)
         contact.time = t
-        contact.end = UNDECIDED
+        contact.end = STALLED
         then = time_after(t, step)
         if then <= t:
             k = wp.int32(0)
@@ -247,10 +261,10 @@ def advance_straight(
                 k += 1
             then = time_after(t, step)
         if then <= t:
-            contact.end = TOUCHES
             return contact
-        if step < tolerance:
-            soon = wp.min(t + tolerance, wp.float64(1.0))
+        # At the end itself faces may be as near as coordinates err, and meet where those are rounded.
+        soon = t + tolerance
+        if step < tolerance and soon < wp.float64(1.0):
             p, q = a + soon * way_a, b + soon * way_b
             if float64_filter_triangles(p[0], p[1], p[2], q[0], q[1], q[2]) == 1:
                 contact.end = TOUCHES
@@ -263,10 +277,34 @@ def advance_straight(
 
 
 @wp.func
+def posed_corners(poses: ObjectPool, pair: wp.vec2i, a: corners_type, b: corners_type):
+    """Return corners of A's face and of B's in the world, and what magnitudes they are sums of."""
+    corners = words_type()
+    size = wp.float64(0.0)
+    for k in range(3):
+        corners[k] = posed_row(poses.rotation[pair[0]], poses.position[pair[0]], a[k])
+        corners[3 + k] = posed_row(poses.rotation[pair[1]], poses.position[pair[1]], b[k])
+        size = wp.max(size, wp.max(largest(a[k]), largest(b[k])))
+    away = wp.max(largest(poses.position[pair[0]]), largest(poses.position[pair[1]]))
+    return corners, wp.float64(4.0) * size + away
+
+
+@wp.func(inline=False)
+def carry_on_in_world(
+    poses: EndPoses, pair: wp.vec2i, a: corners_type, b: corners_type, start: wp.float64, best: wp.float64
+):
+    """Return the `Contact` of faces of models, see `stalled`."""
+    starts, first = posed_corners(poses.first, pair, a, b)
+    ends, last = posed_corners(poses.last, pair, a, b)
+    return carry_on(starts, ends, POSED_WORDS * wp.max(first, last), start, best)
+
+
+@wp.func
 def advance_linear_pair(
     tolerance: wp.float64,
     models: ModelPool,
     states: StatePool,
+    poses: EndPoses,
     pose: PairPose,
     motion: LinearMotion,
     face_a: wp.int32,
@@ -279,8 +317,11 @@ def advance_linear_pair(
     b = load_corners(models, states, pose.corner_b + face_b)
     way_a = map_corners(motion.way_a, motion.shift_a, a)
     way_b = map_corners(motion.way_b, motion.shift_b, b)
-    b = map_corners(motion.first, motion.offset, b)
-    return advance_straight(tolerance, motion.slack, a, b, way_a, way_b, start, best)
+    at_b = map_corners(motion.first, motion.offset, b)
+    contact = advance_straight(tolerance, motion.slack, a, at_b, way_a, way_b, start, best)
+    if contact.end == STALLED:
+        contact = carry_on_in_world(poses, motion.objects, a, b, contact.time, best)
+    return contact
 
 
 @wp.kernel
@@ -300,7 +341,14 @@ def advance_corners_kernel(
     size = wp.float64(0.0)
     for k in range(6):
         size = wp.max(size, wp.max(largest(starts[i, k]), largest(ends[i, k])))
-    contact = advance_straight(tolerance, rounding * size, a, b, c - a, d - b, wp.float64(0.0), wp.float64(1.0))
+    zero, one = wp.float64(0.0), wp.float64(1.0)
+    contact = advance_straight(tolerance, rounding * size, a, b, c - a, d - b, zero, one)
+    if contact.end == STALLED:
+        first, last = words_type(), words_type()
+        for k in range(6):
+            first[k] = plain_row(starts[i, k])
+            last[k] = plain_row(ends[i, k])
+        contact = carry_on(first, last, zero, contact.time, one)
     if contact.end == CLEAR:
-        contact.time = wp.float64(1.0)
+        contact.time = one
     contact_out[i] = contact

@@ -23,6 +23,7 @@ from warp_abtree.kernels.distance.search import (
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED, Contact
 from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, slide_floor, slides_past
+from warp_abtree.kernels.motion.linear import EndPoses
 from warp_abtree.kernels.motion.start import OPEN, Contacts
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.face_pairs import Hits
@@ -61,6 +62,7 @@ def meet_faces(
     tolerance: wp.float64,
     models: ModelPool,
     states: StatePool,
+    poses: EndPoses,
     pose: PairPose,
     motion: Any,
     before: Contact,
@@ -73,7 +75,7 @@ def meet_faces(
     own = Contact()
     if live:
         faces = wp.vec2i(item_first(item), item_second(item))
-        own = advance_faces(tolerance, models, states, pose, motion, faces, start, before.time)
+        own = advance_faces(tolerance, models, states, poses, pose, motion, faces, start, before.time)
     time = wp.where(own.end == CLEAR, wp.float64(wp.inf), own.time)
     best = before
     earliest = warp_min(time)
@@ -92,6 +94,7 @@ def search_contact(
     tolerance: wp.float64,
     models: ModelPool,
     states: StatePool,
+    poses: EndPoses,
     pose: PairPose,
     motions: Any,
     p: wp.int32,
@@ -131,7 +134,9 @@ def search_contact(
         if waiting >= warp_size() or (waiting > 0 and (end == 0 or best.end == CLEAR)):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
-            best, advanced = meet_faces(items, waiting, popped, tolerance, models, states, pose, motions[p], best)
+            best, advanced = meet_faces(
+                items, waiting, popped, tolerance, models, states, poses, pose, motions[p], best
+            )
             tests[1] += advanced
     return best, tests
 
@@ -142,13 +147,17 @@ def warp_search(kind):
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def search_warp_kernel(
+        # static
         room: wp.int32,
         tolerance: wp.float64,
         models: ModelPool,
+        # state
         states: StatePool,
+        poses: EndPoses,
         pair_count: wp.array(dtype=wp.int32),
         pair_poses: wp.array(dtype=PairPose),
         motion: wp.array(dtype=kind),
+        # out
         hits_inout: Hits,
         contacts_inout: Contacts,
     ):
@@ -159,7 +168,8 @@ def warp_search(kind):
         if contacts_inout.end[p] != OPEN:
             return
         items, start = nearest_stack(), contacts_inout.time[p]
-        contact, tests = search_contact(items, room, tolerance, models, states, pair_poses[p], motion, p, start)
+        pose = pair_poses[p]
+        contact, tests = search_contact(items, room, tolerance, models, states, poses, pose, motion, p, start)
         if warp_lane() == 0:
             contacts_inout.time[p] = contact.time
             contacts_inout.end[p] = contact.end
@@ -175,13 +185,17 @@ def thread_search(kind):
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def search_thread_kernel(
+        # static
         room: wp.int32,
         tolerance: wp.float64,
         models: ModelPool,
+        # state
         states: StatePool,
+        poses: EndPoses,
         pair_count: wp.array(dtype=wp.int32),
         pair_poses: wp.array(dtype=PairPose),
         motion: wp.array(dtype=kind),
+        # out
         hits_inout: Hits,
         contacts_inout: Contacts,
         memory_out: wp.array2d(dtype=wp.int64),
@@ -198,7 +212,7 @@ def thread_search(kind):
         while p < count:
             if contacts_inout.end[p] == OPEN:
                 pose, start = pair_poses[p], contacts_inout.time[p]
-                contact, tests = search_contact(items, room, tolerance, models, states, pose, motion, p, start)
+                contact, tests = search_contact(items, room, tolerance, models, states, poses, pose, motion, p, start)
                 contacts_inout.time[p] = contact.time
                 contacts_inout.end[p] = contact.end
                 hits_inout.node_tests[p] += wp.int64(tests[0])

@@ -231,9 +231,12 @@ class FirstContactQuery(Query):
         return [paths, launch(start.contact_starter(self._kind), dim=room, inputs=inputs, block_dim=WARP_SIZE)]
 
     def _make_contacts(self, launch) -> list:
-        models, states, _ = self.batch.pools
+        models, states, objects = self.batch.pools
         room, launch = len(self.pairs), partial(launch, device=self.device)
-        inputs = [self._stack_length(), self.tolerance, models, states, self.pair_count, self.pair_poses, self._motion]
+        poses = straight.EndPoses()
+        poses.first, poses.last = objects, self.ends
+        inputs = [self._stack_length(), self.tolerance, models, states, poses]
+        inputs += [self.pair_count, self.pair_poses, self._motion]
         if self.uses_warps():
             dim, inputs = room * (WARP_SIZE if self.device.is_cuda else 1), [*inputs, self.hits, self.contacts]
             return [launch(search.warp_search(self._kind), dim=dim, inputs=inputs, block_dim=WARP_SIZE)]
