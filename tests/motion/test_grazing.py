@@ -1,0 +1,175 @@
+"""Corners that move straight and come as near as it gets, or just touch: what float64 cannot tell, in fractions."""
+
+import itertools
+
+import numpy as np
+import pytest
+import trimesh
+from oracles.straight import Motion
+from oracles.triangle import triangles_intersect
+
+import warp_abtree as ab
+from bench.motions.ccd_queries import CORNERS
+from warp_abtree import testing
+
+KINDS = ("vertex-face", "edge-edge")
+FACE = [(0, 0, 0), (4, 0, 0), (0, 4, 0)]
+ACROSS = [(0, 0, 0), (4, 0, 0), (2, -2, 0), (2, 2, 0)]
+
+
+def moved(points, *ways):
+    """Return points and where they end, which go by ways; the last way for the rest."""
+    ways = [*ways, *[ways[-1]] * (len(points) - len(ways))]
+    return points, [tuple(np.add(p, w)) for p, w in zip(points, ways)]
+
+
+KNOWN = {
+    "through a face": ("vertex-face", moved([(1, 1, 1), *FACE], (0, 0, -2), (0, 0, 0)), True),
+    "beside it": ("vertex-face", moved([(3, 3, 1), *FACE], (0, 0, -2), (0, 0, 0)), False),
+    "onto it at last": ("vertex-face", moved([(1, 1, 1), *FACE], (0, 0, -1), (0, 0, 0)), True),
+    "not quite": ("vertex-face", moved([(1, 1, 1), *FACE], (0, 0, -0.99), (0, 0, 0)), False),
+    "in its plane, past a corner": ("vertex-face", moved([(-2, -1, 0), *FACE], (4, -2, 0), (0, 0, 0)), False),
+    "in its plane, over a corner": ("vertex-face", moved([(-1, 1, 0), *FACE], (2, -2, 0), (0, 0, 0)), True),
+    "onto a face that becomes a line": (
+        "vertex-face",
+        moved([(1, 1, 0), *FACE], (0, 0, 0), (0, 0, 0), (0, 0, 0), (4, -4, 0)),
+        True,
+    ),
+    "one edge over the other": ("edge-edge", moved([*ACROSS[:2], (2, -2, 1), (2, 2, 1)], (0, 0, 2), (0, 0, 0)), True),
+    "along the other's line": ("edge-edge", moved([(0, 0, 0), (1, 0, 0), (3, 0, 0), (4, 0, 0)], (1, 0, 0)), False),
+    "onto its end": (
+        "edge-edge",
+        moved([(0, 0, 0), (1, 0, 0), (3, 0, 0), (4, 0, 0)], (2, 0, 0), (2, 0, 0), (0, 0, 0)),
+        True,
+    ),
+    "parallel, over": (
+        "edge-edge",
+        moved([(0, 0, 1), (2, 0, 1), (1, 0, 0), (4, 0, 0)], (0, 0, -2), (0, 0, -2), (0, 0, 0)),
+        True,
+    ),
+    "parallel, past the end": (
+        "edge-edge",
+        moved([(0, 0, 1), (2, 0, 1), (3, 0, 0), (4, 0, 0)], (0, 0, -2), (0, 0, -2), (0, 0, 0)),
+        False,
+    ),
+}
+
+
+def truth(kind, starts, ends):
+    return np.array([Motion(s, e, kind == "edge-edge").meet() for s, e in zip(starts.tolist(), ends.tolist())])
+
+
+def answers(kind, starts, ends, device):
+    """Return times, and which are clear and undecided, of points (p, 4, 3)."""
+    corners = list(CORNERS[kind])
+    return testing.advance_corners(starts[:, corners], ends[:, corners], 1e-6, device)
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_known_answers(name, device):
+    kind, (first, last), meets = KNOWN[name]
+    starts, ends = np.array([first], float), np.array([last], float)
+    assert truth(kind, starts, ends)[0] == meets
+    assert answers(kind, starts, ends, device)[1][0] == (not meets)
+
+
+def lattice(rng, count, flat):
+    """Return starts and ends (count, 4, 3) of coordinates 0, 1 and 2, of some in one plane at all times."""
+    starts, ends = rng.integers(0, 3, (2, count, 4, 3)).astype(float)
+    for points in (starts, ends):
+        points[:flat, :, 2] = 0
+    return starts, ends
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_lattice_seen_askew(kind, device):
+    """Corners on corners, edges in line, faces without area: nothing is missed, and all else proved clear.
+
+    A matrix of whole numbers of 40 bits changes no answer, but rounds what is computed.
+    """
+    rng = np.random.default_rng(1)
+    starts, ends = lattice(rng, 500, 200)
+    askew = rng.integers(-(2**40), 2**40, (3, 3)).astype(float)
+    meets = truth(kind, starts, ends)
+    assert 150 < meets.sum() < 350
+    for m in (np.eye(3), askew):
+        _, clear, undecided = answers(kind, starts @ m, ends @ m, device)
+        assert clear.tolist() == (~meets).tolist() and not undecided.any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_lattice_moved_by_very_little(kind, device):
+    """Gaps down to 2^-90 and, where corners nearly meet edges in line, squares of that: nothing is missed."""
+    rng = np.random.default_rng(2)
+    starts, ends = lattice(rng, 1500, 100)
+    power = np.where(np.arange(1500) % 2 == 0, rng.integers(35, 41, 1500), rng.integers(41, 91, 1500))
+    for points in (starts, ends):
+        points += (points == 0) * rng.integers(-1, 2, points.shape) * 2.0 ** -power[:, None, None]
+    meets = truth(kind, starts, ends)
+    _, clear, _ = answers(kind, starts, ends, device)
+    assert not clear[meets].any() and meets.sum() > 100
+    assert (clear | meets)[power < 41].mean() > 0.99
+    assert (~clear & ~meets).sum() < 0.1 * (~meets).sum()
+
+
+def features_at_origin():
+    """Yield two faces (6, 3) of which any corner and the other face, or any edges, meet at 0, A's below B's."""
+    point, face = np.array([[0, 0, 0], [2, 0, -1], [1, 2, -1]]), np.array([[-1, -1, 0], [2, -1, 0], [-1, 2, 0]])
+    along, over = np.array([[-1, 0, 0], [1, 0, 0], [0, 1, -1]]), np.array([[0, -1, 0], [0, 1, 0], [1, 0, 1]])
+    for i in range(3):
+        yield np.concatenate([np.roll(point, i, 0), face])
+        yield np.concatenate([-face, np.roll(-point, i, 0)])
+        for j in range(3):
+            yield np.concatenate([np.roll(along, i, 0), np.roll(over, j, 0)])
+
+
+@pytest.mark.parametrize("gap", [2.0**-60, 0.0, -(2.0**-60)])
+def test_each_pair_of_features(gap, device):
+    """B comes down on A, and stops before that, or not."""
+    starts = np.array(list(features_at_origin()), float)
+    ends = starts.copy()
+    starts[:, 3:, 2] += 1
+    ends[:, 3:, 2] += gap * (ends[:, 3:, 2] == 0)
+    time, clear, undecided = testing.advance_corners(starts, ends, 1e-6, device)
+    assert (clear == (gap > 0)).all() and not undecided.any() and len(starts) == 15
+    assert (time >= 1 - 1e-6).all()
+
+
+def faces_meet(first, last):
+    """Return whether two faces (6, 3) meet: at first, or later where a corner meets a face or an edge an edge."""
+    if triangles_intersect(*(tuple(map(tuple, corners)) for corners in (first[:3], first[3:]))):
+        return True
+    faces = (0, 1, 2), (3, 4, 5)
+    chosen = [([k, *face], False) for face, other in (faces, faces[::-1]) for k in other]
+    sides = [[(face[k], face[k - 1]) for k in range(3)] for face in faces]
+    chosen += [([*p, *q], True) for p, q in itertools.product(*sides)]
+    return any(Motion([first[k] for k in rows], [last[k] for k in rows], edges).meet() for rows, edges in chosen)
+
+
+def test_faces_on_a_lattice(device):
+    """Whole faces, of which a half hardly move: some pierce one another from first to last, and no corner meets."""
+    rng = np.random.default_rng(3)
+    starts, ends = rng.integers(0, 4, (2, 160, 6, 3)).astype(float)
+    ends[:80] = starts[:80] + (rng.random((80, 6, 3)) < 0.1) * 2.0**-50
+    meets = np.array([faces_meet(*case) for case in zip(starts.tolist(), ends.tolist())])
+    _, clear, undecided = testing.advance_corners(starts, ends, 1e-6, device)
+    assert clear.tolist() == (~meets).tolist() and not undecided.any() and 40 < meets.sum() < 120
+
+
+@pytest.mark.parametrize("way", ["slides", "comes down"])
+@pytest.mark.parametrize("gap, clear", [(2.0**-70, True), (2.0**-50, True), (0.0, False), (-(2.0**-50), False)])
+def test_posed_meshes_come_as_near(gap, clear, way, device):
+    """A box is that far above another at last, or all the time; poses hold the gap exactly, also in turned frames."""
+    block = trimesh.creation.box(bounds=[[-1, -1, 0], [1, 2, 1]])
+    top, base = ab.Model.load(block), ab.Model.load(block.apply_translation([0, 0, -1]))
+    first = np.array([0, 0, 1.0 if way == "comes down" else gap])
+    last = np.array([0.375, 0.5, gap])
+    for turn, end_turn, axes in (((0, 0, 0, 1), (0, 0, 0.6, 0.8), [0, 1, 2]), ((0.5,) * 4, (0.5,) * 4, [2, 0, 1])):
+        scene = ab.Scene(device)
+        scene.add(base, (0, 0, 0, *turn))
+        scene.add(top, (*first[axes], *turn))
+        ends = np.array([(0, 0, 0, *turn), (*last[axes], *end_turn)])
+        result = scene.first_contact([(0, 1)], ends, linear=True)
+        assert result.clear[0] == clear and not result.undecided[0]
+        if not clear:
+            assert 1 - 1e-6 <= result.time[0] <= 1 if way == "comes down" else result.time[0] == 0
