@@ -1,6 +1,7 @@
 """First contacts: public queries, random motions checked, and times against python-fcl's continuous collision.
 
-* queries: contacts missed and reported beyond the truth of `ccd_queries`, where its files are at hand.
+* queries: contacts missed and reported beyond the truth of `ccd_queries`, where its files are at hand; beside
+  Tight-Inclusion's, where ipctk is installed.
 * checked: random motions of two meshes; late and missed by exact tests at many times, early by one after the tolerance.
 * times [ms] of a motion, by tolerance and LOD: meshes that pass each other (across), from far away, in a planner's
   short steps; and a nut that turns on its bolt, which moves on a screw. On the CPU all on one core.
@@ -14,12 +15,13 @@ import warp as wp
 import warp_abtree as ab
 from warp_abtree import testing
 
+from ..baselines import tight_inclusion
 from ..baselines.fcl import Fcl
 from ..cases.assembly import PITCH, place_nut, turned
 from ..meshes import ModelFolder, knot_model, mesh_file
 from ..shapes import longest_side, pose_matrices, random_directions, scene_of_poses
 from ..timing import medians, no_garbage_collection, one_core, time_in_turn
-from .ccd_queries import FOLDER, read_queries
+from .ccd_queries import FOLDER, POINTS, read_queries
 
 FULL = {"count": 65536, "checked": 1_000_000, "samples": 32, "repeats": 5, "turn": 163.0, "fcl": 0}
 CPU = FULL | {"count": 256, "checked": 20_000, "fcl": 8}
@@ -35,7 +37,7 @@ def run(device, count=None, quick=False):
     device = wp.get_device(device)
     sizes = dict(QUICK if quick else CPU if device.is_cpu else FULL)
     sizes["checked"] = count or sizes["checked"]
-    yield check_queries(device)
+    yield check_queries(device, tight_inclusion.AVAILABLE and device.is_cpu and not quick)
     folder = ModelFolder(None)
     at_hand = mesh_file("cow") and not quick
     name, model = ("cow", folder.load(["cow"])) if at_hand else ("knot", knot_model(300))
@@ -69,26 +71,38 @@ def random_motions(model, count, first, last, seed=0):
     return tuple(np.concatenate(rows, 1) for rows in zip(ends, turn))
 
 
-def check_queries(device):
-    """Return how public queries are answered."""
-    row = {
-        "device": device.name,
-        "case": "queries",
-        "asked": 0,
-        "contacts": 0,
-        "missed": 0,
-        "beyond": 0,
-        "undecided": 0,
-    }
-    for path in sorted(FOLDER.glob("*.csv.gz")):
+def check_queries(device, baseline):
+    """Return how public queries are answered, and by the baseline if asked, each in so many us a query."""
+    counts = dict.fromkeys(("asked", "contacts", "missed", "beyond", "undecided"), 0)
+    theirs, seconds = dict.fromkeys(("missed", "beyond"), 0), [0.0, 0.0]
+    for number, path in enumerate(sorted(FOLDER.glob("*.csv.gz"))):
         starts, ends, truth = read_queries(path)
+        if number == 0:
+            testing.advance_corners(starts, ends, TOLERANCES[0], device)  # compiles
+        began = time.perf_counter()
         _, clear, undecided = testing.advance_corners(starts, ends, TOLERANCES[0], device)
-        row["asked"] += len(truth)
-        row["contacts"] += int(truth.sum())
-        row["missed"] += int((truth & clear).sum())
-        row["beyond"] += int((~truth & ~clear).sum())
-        row["undecided"] += int(undecided.sum())
-    return row if row["asked"] else {"case": "queries", "skipped": "no files: set ABTREE_CCD to their folder"}
+        seconds[0] += time.perf_counter() - began
+        counts["asked"] += len(truth)
+        counts["contacts"] += int(truth.sum())
+        counts["missed"] += int((truth & clear).sum())
+        counts["beyond"] += int((~truth & ~clear).sum())
+        counts["undecided"] += int(undecided.sum())
+        if baseline:
+            kind = path.name.split(".")[1]
+            points = list(POINTS[kind])
+            began = time.perf_counter()
+            collide = np.array(tight_inclusion.find_collisions(kind, starts[:, points], ends[:, points]))
+            seconds[1] += time.perf_counter() - began
+            theirs["missed"] += int((truth & ~collide).sum())
+            theirs["beyond"] += int((~truth & collide).sum())
+    row = {"device": device.name, "case": "queries", **counts}
+    if not row["asked"]:
+        return {"case": "queries", "skipped": "no files: set ABTREE_CCD to their folder"}
+    row["us"] = 1e6 * seconds[0] / row["asked"]
+    if baseline:
+        row |= {f"tight_inclusion_{name}": count for name, count in theirs.items()}
+        row["tight_inclusion_us"] = 1e6 * seconds[1] / row["asked"]
+    return row
 
 
 def between(first, last, times):

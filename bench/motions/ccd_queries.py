@@ -16,6 +16,8 @@ import numpy as np
 FOLDER = Path(os.environ.get("ABTREE_CCD", Path(__file__).resolve().parents[3] / "shared" / "ccd"))
 # Which rows at either time are the corners of A's face and of B's, a vertex or an edge as a face without area.
 CORNERS = {"vertex-face": (0, 0, 0, 1, 2, 3), "edge-edge": (0, 1, 1, 2, 3, 3)}
+# Which of those corners are the points of a query.
+POINTS = {"vertex-face": (0, 3, 4, 5), "edge-edge": (0, 1, 3, 4)}
 
 
 def read_queries(path: Path):
