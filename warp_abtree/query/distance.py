@@ -223,12 +223,15 @@ class DistanceQuery(Query):
             rows = wp.array(beyond, dtype=wp.float64, device="cpu", copy=False)
             wp.copy(self._found.beyond, rows, count=len(rows))
 
-    def _slow_kernels(self, with_distances: bool) -> list:
-        kernels = [search_simd.search_thread_kernel]
-        if self.uses_warps():
-            kernels = [search.search_warp_kernel, report.report_distance_kernel, frame.start_distance_kernel]
+    @classmethod
+    def kernels(cls, device, output, precision, with_gap: bool, with_distances: bool) -> list:
+        with_warps = current_regime().uses_warps(device)
+        kernels = [search.search_warp_kernel if with_warps else search_simd.search_thread_kernel]
         kernels += [crossing.search_crossing_kernel, crossing.report_crossing_kernel]
-        return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._slow_kernels(with_distances)]
+        kernels += [report.report_distance_kernel, frame.start_distance_kernel] if with_warps else []
+        searching = super().kernels(device, output, precision, with_gap, with_distances)
+        refreshing = [] if with_warps else [(slabs.refresh_slab_kernel, 256)]
+        return [*[(kernel, WARP_SIZE) for kernel in kernels], *searching, *refreshing]
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
