@@ -105,7 +105,7 @@ def test_an_error_ahead_is_said_by_the_launch(device, monkeypatch):
 
 
 # Modules of the first answer about two small models: on threads of the CPU, and on warps.
-MODULES = {"any": (6, 10), "faces": (6, 11), "contacts": (9, 13), "distance": (9, 14)}
+MODULES = {"any": (6, 10), "faces": (6, 11), "contacts": (9, 13), "distance": (7, 12)}
 
 
 @pytest.mark.parametrize("output", MODULES)
@@ -128,4 +128,5 @@ def test_all_that_a_first_query_launches_is_loaded_before(device, monkeypatch, o
     with regime(warps=warps, packs_results=warps):
         scene.intersect([(0, 1)] if output == "distance" else None, output=output)
     assert {module.name for module in launched if "packer" not in module.name} == {module.name for module in loaded}
-    assert len(set(loaded)) == MODULES[output][warps]
+    crossing = 2 if output == "distance" and wp.get_device(device).is_cuda else 0  # elsewhere where pairs cross
+    assert len(set(loaded)) == MODULES[output][warps] + crossing
