@@ -10,9 +10,10 @@ from warp_abtree.kernels.poses import PairPose, pair_pose
 from warp_abtree.kernels.small_trees.gather import is_small
 from warp_abtree.kernels.traversal.face_pairs import OUTPUT_ANY, Hits
 from warp_abtree.kernels.traversal.load_balance import NO_UNIT, Work, note_descent, units_per_pair
+from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.kernels.triangle.distance import DISTANCE_MAX, pad_distance
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False, "block_dim": WARP_SIZE}
 wp.set_module_options(MODULE_OPTIONS)
 
 

@@ -39,6 +39,7 @@ from warp_abtree.kernels.traversal.warp_stack import (
     SLAB_PAIR_LENGTH,
     SLAB_PAIR_START,
     STACK_LENGTH,
+    WARP_SIZE,
     add_warp_sum,
     hold_uniform,
     push_children,
@@ -52,7 +53,7 @@ from warp_abtree.kernels.traversal.warp_stack import (
     write_item,
 )
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False, "block_dim": WARP_SIZE}
 wp.set_module_options(MODULE_OPTIONS)
 
 # A test replaces an item by four at most, each a level deeper in both trees, or by two, a level deeper in one. So depth

@@ -172,13 +172,20 @@ def test_faces(
     a = states.face_corner[pose.corner_a + face_a]
     b = states.face_corner[pose.corner_b + face_b]
     a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
-    if mode == WITHIN:
-        return triangles_near(pose.within, a0, a1, a2, b0, b1, b2)
     if mode == FLOAT32:
         # A power of two brings the model to unit size, so that no product leaves float32's range.
         s = pose.scale
         return decide_triangles(mode, a0 * s, a1 * s, a2 * s, b0 * s, b1 * s, b2 * s)
     return decide_triangles(mode, a0, a1, a2, b0, b1, b2)
+
+
+@wp.func
+def faces_near(models: ModelPool, states: StatePool, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
+    """Return 1 unless the faces are proved farther apart than `within`, in float64; then 0."""
+    a = states.face_corner[pose.corner_a + face_a]
+    b = states.face_corner[pose.corner_b + face_b]
+    a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
+    return triangles_near(pose.within, a0, a1, a2, b0, b1, b2)
 
 
 @wp.func
@@ -193,7 +200,7 @@ def try_straddling_faces(
 ):
     """Return whether straddling faces meet in the first stage: 1, 0 or UNCERTAIN; for WITHIN, in all stages."""
     if mode == WITHIN:
-        return test_faces(mode, models, states, pose, face_a, face_b)
+        return faces_near(models, states, pose, face_a, face_b)
     return intersect_straddling_faces(mode, models, states, pose, face_a, face_b, signs)
 
 

@@ -30,6 +30,7 @@ from warp_abtree.kernels.traversal.face_pairs import (
     OUTPUT_FACES,
     WITHIN,
     Hits,
+    faces_near,
     float32_bounds,
     report_hit,
     scaled_gap,
@@ -129,7 +130,12 @@ def resolve_faces(
         if output != OUTPUT_ANY or met == 0:
             item = faces[i]
             tested += 1
-            if test_faces(mode, models, states, pose, item_first(item), item_second(item)) == 1:
+            meets = wp.int32(0)
+            if mode == WITHIN:
+                meets = faces_near(models, states, pose, item_first(item), item_second(item))
+            else:
+                meets = test_faces(mode, models, states, pose, item_first(item), item_second(item))
+            if meets == 1:
                 met_inout[met] = item
                 met += 1
     return met, tested

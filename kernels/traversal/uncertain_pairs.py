@@ -20,6 +20,8 @@ from warp_abtree.kernels.traversal.face_pairs import (
     test_faces,
 )
 from warp_abtree.kernels.traversal.warp_stack import (
+    RESOLVE_WARPS,
+    WARP_SIZE,
     count_flags,
     push_signed_pair,
     read_signed_pair,
@@ -32,7 +34,8 @@ from warp_abtree.kernels.traversal.warp_stack import (
 from warp_abtree.kernels.triangle.float32_filter import SEPARATED, rotate_corners
 from warp_abtree.kernels.triangle.float64_filter import SHARED_CORNER, UNDECIDED, filter_planes, filter_straddling
 
-MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+RESOLVE_THREADS = RESOLVE_WARPS * WARP_SIZE  # of a block
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False, "block_dim": RESOLVE_THREADS}
 wp.set_module_options(MODULE_OPTIONS)
 
 

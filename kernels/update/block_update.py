@@ -14,6 +14,7 @@ from warp_abtree.kernels.update.refine import refine_face
 from warp_abtree.kernels.update.refit import block_sync, refit_inner, refit_leaf, unite_nodes
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 
+THREADS = 1024  # of a block, where there are few states or deep trees
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
@@ -231,7 +232,7 @@ def state_update(shallow: bool):
     """Return the kernel that brings states to their LODs, for trees of SHALLOW_DEPTH or of BLOCK_DEPTH at most."""
     find_marks = shallow_marks if shallow else block_marks
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, cuda_max_registers=64)
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": THREADS}, cuda_max_registers=64)
     def update_state_kernel(
         blocks: wp.int32,
         threads: wp.int32,

@@ -8,7 +8,9 @@ from warp_abtree.kernels.traversal.boxes import round_down_vec, round_up_vec
 from warp_abtree.kernels.traversal.nodes import Node, empty_node, load_node, store_node
 from warp_abtree.kernels.update.work_lists import UpdateLists
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+TOP_THREADS = 512  # of the block that refits the levels next to the root
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
 
 
 @wp.func
@@ -106,7 +108,8 @@ def refit_level_kernel(step: wp.int32, level: wp.int32, models: ModelPool, plan:
 def block_sync(): ...
 
 
-@wp.kernel
+# A module of its own: its blocks are larger, and a module is compiled for every size of blocks that it is launched in.
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": TOP_THREADS})
 def refit_top_kernel(step: wp.int32, levels: wp.int32, models: ModelPool, plan: UpdateLists, states_inout: StatePool):
     """Refit what an update asks for on so many levels from the root on, deepest first: one block for all of them."""
     level = levels - 1

@@ -1,9 +1,15 @@
 """Kernels that several threads compile: each once, all before they are launched, and errors come through."""
 
+import time
+from pathlib import Path
+
 import pytest
+import trimesh
 import warp as wp
 
+import warp_abtree as ab
 from warp_abtree.checks import kernel_loading
+from warp_abtree.testing import regime
 
 
 def make_kernel(snippet):
@@ -12,7 +18,7 @@ def make_kernel(snippet):
     @wp.func_native(snippet)
     def write(x: wp.array(dtype=wp.int32)): ...
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options={"enable_backward": False, "block_dim": 32})
     def write_kernel(x: wp.array(dtype=wp.int32)):
         write(x)
 
@@ -61,3 +67,66 @@ def test_an_error_ends_it_and_is_said_again(device, monkeypatch):
         with pytest.raises(Exception, match="build failed"), kernel_loading.loading(device, kernels):
             pass
         assert loaded
+
+
+def compile_ahead(monkeypatch, device, cores, kernels, number):
+    """Return how many of some kernels that a query would launch are compiled while a model seems to be built."""
+    found, force_load, compile_module = [], wp.force_load, wp.compile_aot_module
+    monkeypatch.setattr(kernel_loading, "core_count", lambda: cores)
+    monkeypatch.setattr(kernel_loading, "_first_query", [lambda device, face_counts: kernels])
+    monkeypatch.setattr(
+        wp, "force_load", lambda device, modules, *given: found.append(force_load(device, modules, *given))
+    )
+    monkeypatch.setattr(wp, "compile_aot_module", lambda *given: found.append(compile_module(*given)))
+    end = time.monotonic() + 60
+    with wp.ScopedDevice(device), kernel_loading.compiling_ahead(1):
+        while len(found) < number and time.monotonic() < end:
+            time.sleep(0.01)
+    monkeypatch.undo()
+    return len(found)
+
+
+def test_kernels_of_a_query_are_compiled_beside_a_build(device, monkeypatch):
+    """As a launch finds them, where there are cores; what has not begun by the end is left."""
+    kernels = make_kernels(time.time_ns() % 10**7)
+    assert compile_ahead(monkeypatch, device, 3, kernels, 0) == 0
+    assert compile_ahead(monkeypatch, device, 4, kernels, 0) < len(kernels)
+    assert compile_ahead(monkeypatch, device, 4, kernels, len(kernels)) == len(kernels)
+    for kernel, block_dim in kernels:
+        folder = kernel.module.get_module_identifier(1 if wp.get_device(device).is_cpu else block_dim)
+        assert [file.suffix for file in Path(wp.config.kernel_cache_dir, folder).iterdir() if file.suffix == ".meta"]
+
+
+def test_an_error_ahead_is_said_by_the_launch(device, monkeypatch):
+    kernels = make_kernels(4, "no code {};")
+    compile_ahead(monkeypatch, device, 4, kernels, 0)
+    with pytest.raises(Exception, match="build failed"), kernel_loading.loading(wp.get_device(device), kernels):
+        pass
+
+
+# Modules of the first answer about two small models: on threads of the CPU, and on warps.
+MODULES = {"any": (6, 10), "faces": (6, 11), "contacts": (9, 13), "distance": (7, 12)}
+
+
+@pytest.mark.parametrize("output", MODULES)
+@pytest.mark.parametrize("warps", [False, True])
+def test_all_that_a_first_query_launches_is_loaded_before(device, monkeypatch, output, warps):
+    """Nothing else is compiled, and no launch waits for the compiler; but for records of contacts, which are small."""
+    if not warps and wp.get_device(device).is_cuda:
+        pytest.skip("threads take pairs on the CPU alone")
+    ball = ab.Model.load(trimesh.creation.icosphere(subdivisions=1))
+    loaded, launched, launch = loads_of(monkeypatch, 4), [], wp.launch
+    monkeypatch.setattr(kernel_loading, "_asked", set())
+    monkeypatch.setattr(
+        wp,
+        "launch",
+        lambda kernel, *given, **named: (launched.append(kernel.module), launch(kernel, *given, **named))[1],
+    )
+    scene = ab.Scene(device)
+    for x in (0.0, 3.0 if output == "distance" else 0.5):
+        scene.add(ball, (x, 0.1, 0.2, 0, 0, 0, 1))
+    with regime(warps=warps, packs_results=warps):
+        scene.intersect([(0, 1)] if output == "distance" else None, output=output)
+    assert {module.name for module in launched if "packer" not in module.name} == {module.name for module in loaded}
+    crossing = 2 if output == "distance" and wp.get_device(device).is_cuda else 0  # elsewhere where pairs cross
+    assert len(set(loaded)) == MODULES[output][warps] + crossing

@@ -1,16 +1,27 @@
 """Kernels compiled by several threads at a time: the first query of a machine would wait for one after the other."""
 
 from collections import deque
-from contextlib import contextmanager
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 
 import warp as wp
 
 from warp_abtree.checks.cpu_threads import core_count, wait_for, workers
 
 # Threads beside the calling one: on the CPU each compiles Warp's headers for itself first.
-THREADS = {"cpu": 1, "cuda": 3}
+THREADS = {"cpu": 1, "cuda": 7}
+# The same beside the build of a model, which keeps two cores busy itself.
+AHEAD_THREADS, BUILD_CORES = {"cpu": 2, "cuda": 6}, 2
 
 _asked: set[tuple] = set()
+_first_query: list[Callable] = []
+
+
+def _new_kernels(device, kernels) -> deque:
+    """Return the modules and block sizes of launches that no thread has loaded in this process."""
+    asked = dict.fromkeys((device.alias, kernel.module, block_dim) for kernel, block_dim in kernels)
+    return deque(key for key in asked if key not in _asked)
 
 
 @contextmanager
@@ -24,8 +35,7 @@ def loading(device, kernels):
     Raises:
         Exception: What the compiler says, as a launch would.
     """
-    asked = dict.fromkeys((device.alias, kernel.module, block_dim) for kernel, block_dim in kernels)
-    new = deque(key for key in asked if key not in _asked)
+    new = _new_kernels(device, kernels)
     threads = min(THREADS["cpu" if device.is_cpu else "cuda"], core_count() - 1, len(new))
 
     def load():
@@ -47,3 +57,41 @@ def loading(device, kernels):
         wait_for(jobs)
     for job in jobs:
         job.result()
+
+
+def of_first_query(function):
+    """Register the function (device, face_counts) that returns what the first query launches, as `loading` takes it."""
+    _first_query.append(function)
+    return function
+
+
+@contextmanager
+def compiling_ahead(face_count: int):
+    """Compile beside what is done inside, the build of a model, what a query on Warp's default device will launch.
+
+    Only what has begun by the end is waited for; where there are few cores nothing begins. On a GPU nothing is loaded,
+    so that a process which only builds models has no CUDA context. What the compiler says, a launch will say again.
+    """
+    device = wp.get_device()
+    kind = "cpu" if device.is_cpu else "cuda"
+    threads = min(AHEAD_THREADS[kind], core_count() - BUILD_CORES)
+    if threads < 2:
+        yield
+        return
+    new = deque(key for kernels in _first_query for key in _new_kernels(device, kernels(device, [face_count])))
+
+    def compile_one(_):
+        with suppress(IndexError):  # emptied at the end
+            _, module, block_dim = new.popleft()
+            if kind == "cpu":
+                wp.force_load(device, [module], block_dim)
+            elif module.options["block_dim"] == block_dim:  # else a launch would look for another file
+                wp.compile_aot_module(module, device)
+
+    with ThreadPoolExecutor(min(threads, max(1, len(new)))) as pool:
+        try:
+            for key in tuple(new):
+                pool.submit(compile_one, key)
+            yield
+        finally:
+            new.clear()

@@ -40,6 +40,14 @@ class Regime:
     relax_by_color: bool | None = None
     captures_frames: bool | None = None
 
+    def uses_warps(self, device) -> bool:
+        """Return whether warps work on object pairs; on the CPU each thread takes one pair after the other."""
+        return device.is_cuda if self.warps is None else self.warps
+
+    def packs(self, device) -> bool:
+        """Return whether kernels pack results on the device."""
+        return device.is_cuda if self.packs_results is None else self.packs_results
+
 
 _current = Regime()
 

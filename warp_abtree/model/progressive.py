@@ -1,5 +1,6 @@
 """The progressive mesh: a collapse sequence, the vertex forest it makes, and a certified error for every LOD."""
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -9,7 +10,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.cpu_threads import core_count, wait_for, workers
-from warp_abtree.checks.kernel_loading import loading
+from warp_abtree.checks.kernel_loading import compiling_ahead, loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels import active_build
 from warp_abtree.kernels.progressive import collapse as collapse_kernels
@@ -146,8 +147,16 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     if 2 * len(vertices) >= NODE_LIMIT or 3 * len(faces) >= 2**31:
         raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
     report = progress if progress is not None else lambda stage, done, total: None
-    with loading(wp.get_device("cpu"), KERNELS):
-        collapse = Collapse(vertices, faces, int(base_faces))
+    with ExitStack() as beside:
+        # What is to be launched next is compiled last.
+        with loading(wp.get_device("cpu"), KERNELS):
+            beside.enter_context(compiling_ahead(len(faces)))
+            collapse = Collapse(vertices, faces, int(base_faces))
+        return _build(collapse, vertices, faces, report, then)
+
+
+def _build(collapse, vertices, faces, report, then):
+    """Run a collapse and bound its merges, beside one another where there are cores; return the `ProgressiveMesh`."""
 
     def finish():
         parent = collapse.parents()

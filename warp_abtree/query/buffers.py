@@ -59,8 +59,7 @@ class QueryBuffers:
 
     def uses_warps(self) -> bool:
         """Return whether warps work on the pairs; on the CPU each thread takes one pair after the other."""
-        warps = self._regime.warps
-        return self.device.is_cuda if warps is None else warps
+        return self._regime.uses_warps(self.device)
 
     def _take_gap(self, pair_count: int | None):
         """Check the gap that is asked, if any; what the broad phase reads of it goes to the device."""

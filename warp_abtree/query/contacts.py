@@ -138,9 +138,11 @@ class ContactQuery(Query):
         """
         self._set_pairs(pairs, within, gap)
 
-    def _slow_kernels(self, with_distances: bool) -> list:
-        kernels = [contact.find_contact_kernel, summary.sum_loop_kernel]
-        return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._slow_kernels(with_distances)]
+    @classmethod
+    def kernels(cls, device, output, precision, with_gap: bool, with_distances: bool) -> list:
+        kernels = [(contact.find_contact_kernel, WARP_SIZE), (summary.sum_loop_kernel, WARP_SIZE)]
+        searching = super().kernels(device, output, precision, with_gap, with_distances)
+        return [*kernels, *searching, (sort_hits.make_key_kernel, 256)]
 
     def resize(self, capacity: int):
         """Make room for a number of contacts.

@@ -50,6 +50,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device, flag, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
+from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd, slabs
 from warp_abtree.kernels.solid.containment import report_contained_kernel
@@ -70,6 +71,7 @@ NOT_BEYOND.flags.writeable = False
 FIELDS = {"point_faces": "faces"}  # of `report.Distances`, where a result's name is another
 # Pairs from which on warps search each roughly first; fewer leave some idle, and those share the search.
 ROUGH_LEAST = 1024
+CROSSING_KERNELS = [crossing.search_crossing_kernel, crossing.report_crossing_kernel]
 
 
 def check_beyond(beyond, pair_count=None) -> np.ndarray:
@@ -223,12 +225,15 @@ class DistanceQuery(Query):
             rows = wp.array(beyond, dtype=wp.float64, device="cpu", copy=False)
             wp.copy(self._found.beyond, rows, count=len(rows))
 
-    def _slow_kernels(self, with_distances: bool) -> list:
-        kernels = [search_simd.search_thread_kernel]
-        if self.uses_warps():
-            kernels = [search.search_warp_kernel, report.report_distance_kernel, frame.start_distance_kernel]
-        kernels += [crossing.search_crossing_kernel, crossing.report_crossing_kernel]
-        return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._slow_kernels(with_distances)]
+    @classmethod
+    def kernels(cls, device, output, precision, with_gap: bool, with_distances: bool) -> list:
+        with_warps = current_regime().uses_warps(device)
+        kernels = [search.search_warp_kernel if with_warps else search_simd.search_thread_kernel]
+        kernels += CROSSING_KERNELS if device.is_cuda else []  # on the CPU where pairs cross
+        kernels += [report.report_distance_kernel, frame.start_distance_kernel] if with_warps else []
+        searching = super().kernels(device, output, precision, with_gap, with_distances)
+        refreshing = [] if with_warps else [(slabs.refresh_slab_kernel, 256)]
+        return [*[(kernel, WARP_SIZE) for kernel in kernels], *searching, *refreshing]
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
@@ -280,6 +285,8 @@ class DistanceQuery(Query):
 
     def _make_crossings(self, launch) -> list:
         """Make the launches that find points of pairs that intersect, see `Commands.find`."""
+        with loading(self.device, [(kernel, WARP_SIZE) for kernel in CROSSING_KERNELS]):
+            pass
         room, device = len(self.pairs), self.device
         models, states, objects = self.batch.pools
         inputs = [self._stack_length(), models, states, self.pair_count, self.pair_poses, self.hits, self._found]

@@ -11,10 +11,14 @@ from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels import relative_pose
+from warp_abtree.kernels.contact.sort_hits import make_key_kernel
 from warp_abtree.kernels.gap import near_faces
+from warp_abtree.kernels.results import BLOCK_DIM as PACK_DIM
+from warp_abtree.kernels.results import pack_pair_kernel
+from warp_abtree.kernels.slabs.make_slabs import make_slab_kernel
 from warp_abtree.kernels.solid.containment import find_contained_kernel
 from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, simd, uncertain_pairs
-from warp_abtree.kernels.traversal.warp_stack import RESOLVE_WARPS, STACK_LENGTH, WARP_SIZE
+from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.readout import QueryReadout
 from warp_abtree.query.request import LIST_MAX, OUTPUTS, PRECISIONS, check_capacity, check_request, check_within
@@ -27,11 +31,25 @@ UNCERTAIN_ROOM = 65536
 # Warps that one multiprocessor runs at a time by their registers: of the traversal, of float64, of exact signs.
 WARPS_A_PROCESSOR = 16
 FILTER_WARPS_A_PROCESSOR, EXACT_WARPS_A_PROCESSOR = 20, 12
-RESOLVE_THREADS = RESOLVE_WARPS * WARP_SIZE  # of a block
 # So that each finds a slot for all that it gives away at once.
 WARPS_MAX = load_balance.SLOT_COUNT // int(load_balance.DONATIONS_AT_ONCE)
 
 EXACT = int(PRECISIONS["exact"])
+
+
+def _mode(precision, with_gap: bool) -> int:
+    return int(face_pairs.GAP if with_gap else PRECISIONS[precision])
+
+
+def _passes(precision, with_gap: bool) -> list:
+    """Return what decides what the traversal lists: kernels, their warps a multiprocessor, threads of a block."""
+    if int(PRECISIONS[precision]) != EXACT:
+        return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS)]
+    return [
+        (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS),
+        (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR, uncertain_pairs.RESOLVE_THREADS),
+        *([(near_faces.find_near_kernel, EXACT_WARPS_A_PROCESSOR, WARP_SIZE)] if with_gap else []),
+    ]
 
 
 class Query(QueryReadout):
@@ -75,7 +93,7 @@ class Query(QueryReadout):
         room = check_capacity(capacity)
         self._regime = current_regime()
         self.output, self.precision, self.device = output, precision, scene.device
-        with loading(self.device, self._slow_kernels(within is not None)):
+        with loading(self.device, self._kernels(within is not None)):
             self.batch = batch = scene if isinstance(scene, Batch) else scene.batch()
             if self.uses_warps() and self._regime.slabs:
                 batch.models.make_slabs()
@@ -264,42 +282,39 @@ class Query(QueryReadout):
 
     def _make_traversal(self, launch) -> list:
         """Make the launches of the narrow phase."""
-        output, mode, within = int(OUTPUTS[self.output]), self._mode(), self._no_distance
+        output, within = int(OUTPUTS[self.output]), self._no_distance
+        mode = _mode(self.precision, self._asked_gap is not None)
         if self._gap is not None:
             within = self.hits.gap
         made = self._make_search(within, self.hits, mode, output, launch)
         models, states, _ = self.batch.pools
-        for kernel, warps, block in self._passes() if len(self.hits.uncertain) else ():
+        passes = _passes(self.precision, self._asked_gap is not None) if len(self.hits.uncertain) else ()
+        for kernel, warps, block in passes:
             threads = warps * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
             given = [] if kernel is near_faces.find_near_kernel else [output]
             inputs = [threads, *given, models, states, self.pair_poses, self.hits]
             made.append(launch(kernel, dim=threads, inputs=inputs, block_dim=block, device=self.device))
         return made
 
-    def _mode(self) -> int:
-        return int(PRECISIONS[self.precision] if self._asked_gap is None else face_pairs.GAP)
-
-    def _passes(self) -> list:
-        """Return what decides what the traversal lists: kernels, their warps a multiprocessor, threads of a block."""
-        if int(PRECISIONS[self.precision]) != EXACT:
-            return [(uncertain_pairs.resolve_rounded_kernel, FILTER_WARPS_A_PROCESSOR, RESOLVE_THREADS)]
-        return [
-            (uncertain_pairs.float64_filter_kernel, FILTER_WARPS_A_PROCESSOR, RESOLVE_THREADS),
-            (uncertain_pairs.resolve_inexact_kernel, EXACT_WARPS_A_PROCESSOR, RESOLVE_THREADS),
-            *([] if self._asked_gap is None else [(near_faces.find_near_kernel, EXACT_WARPS_A_PROCESSOR, WARP_SIZE)]),
-        ]
-
-    def _slow_kernels(self, with_distances: bool) -> list:
-        """Return the kernels that take longest to compile, with block sizes, the longest first."""
-        within = int(face_pairs.WITHIN)
-        modes = [self._mode(), *([within] if with_distances else [])]
-        if self.uses_warps():
-            kernels = [dual_tree.warp_traversal(mode, mode == within or self.output == "any") for mode in modes]
-            passes = [(kernel, block) for kernel, _, block in reversed(self._passes())]
+    @classmethod
+    def kernels(cls, device, output, precision, with_gap: bool, with_distances: bool) -> list:
+        """Return the kernels of the first launch, with block sizes, those first that take longest to compile."""
+        within, mode, regime = int(face_pairs.WITHIN), _mode(precision, with_gap), current_regime()
+        modes = [mode, *([within] if with_distances else [])]
+        if regime.uses_warps(device):
+            found: list = [dual_tree.warp_traversal(mode, mode == within or output == "any") for mode in modes]
+            passes = [(kernel, block) for kernel, _, block in reversed(_passes(precision, with_gap))]
         else:
-            kernels, passes = [simd.thread_traversal(mode) for mode in modes], []
+            found, passes = [simd.thread_traversal(mode) for mode in modes], []
         poses = [relative_pose.relative_poses(mode in (within, int(face_pairs.GAP))) for mode in modes]
-        return [*[(kernel, WARP_SIZE) for kernel in kernels], *passes, *[(kernel, WARP_SIZE) for kernel in poses]]
+        further = [(make_slab_kernel, 256)] if regime.uses_warps(device) and regime.slabs else []
+        if regime.packs(device):
+            further += [(pack_pair_kernel, PACK_DIM), *([(make_key_kernel, 256)] if output == "faces" else [])]
+        found, poses = ([(kernel, WARP_SIZE) for kernel in made] for made in (found, poses))
+        return [*found, *passes, *poses, *further]
+
+    def _kernels(self, with_distances: bool) -> list:
+        return self.kernels(self.device, self.output, self.precision, self._asked_gap is not None, with_distances)
 
     def result(self, device: bool = False) -> Result:
         """Return the results of the last launch, sorted. Waits for the device.

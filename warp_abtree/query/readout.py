@@ -41,8 +41,7 @@ class QueryReadout(QueryBuffers):
         return self._made_staging
 
     def _packs(self) -> bool:
-        packs = self._regime.packs_results
-        return self.device.is_cuda if packs is None else packs
+        return self._regime.packs(self.device)
 
     def _read(self, device: bool, with_rows: bool = True) -> Result:
         """Return the result of the last launch, on any stream, perhaps without what has an entry a hit."""

@@ -178,10 +178,10 @@ class FirstContactQuery(Query):
             self.tolerance, self.screw = asked
             self._commands = Commands()
 
-    def _slow_kernels(self, with_distances: bool) -> list:
+    def _kernels(self, with_distances: bool) -> list:
         make = search.warp_search if self.uses_warps() else search.thread_search
         kernels = [make(self._kind), start.contact_starter(self._kind), path.prepare_path_kernel]
-        return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._slow_kernels(with_distances)]
+        return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._kernels(with_distances)]
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)

@@ -4,15 +4,34 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from warp_abtree.checks.arguments import to_numpy
+from warp_abtree.checks.kernel_loading import loading, of_first_query
+from warp_abtree.kernels.broad_phase import pose_box_kernel
+from warp_abtree.kernels.place_poses import pose_setter
+from warp_abtree.kernels.traversal.nodes import clear_node_kernel
 from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.distance import check_beyond, check_flags, check_tolerances, prepare_query
+from warp_abtree.query.distance import DistanceQuery, check_beyond, check_flags, check_tolerances, prepare_query
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import Result
 from warp_abtree.scene.first_contact import FirstContactQuery, check_path
 from warp_abtree.scene.originals import OriginalDistances
+from warp_abtree.state.work_lists import update_kernels
+
+
+def scene_kernels(device, face_counts, with_broad_phase: bool) -> list:
+    """Return the kernels that make tree states, poses and object pairs of a scene, with block sizes; see `loading`."""
+    kernels = [pose_box_kernel] if with_broad_phase else []
+    kernels += [clear_node_kernel, pose_setter(wp.float64, 7)]
+    return [*update_kernels(face_counts, device), *[(kernel, 256) for kernel in kernels]]
+
+
+@of_first_query
+def yes_or_no_kernels(device, face_counts) -> list:
+    """Return the kernels of a scene's first `intersect`, as `loading` takes them."""
+    return [*Query.kernels(device, "any", "exact", False, False), *scene_kernels(device, face_counts, True)]
 
 
 class KeptQueries:
@@ -42,10 +61,13 @@ class KeptQueries:
         refuse_options(output, {name: True for name in options if name not in taken})
         check_request("faces" if with_contacts else output, precision)
         reach = max((self._one_for_all(options[name], name) for name in options), default=0.0)
+        key = output, precision, *sorted(options)
+        if key not in self.kept:
+            kind, told = (ContactQuery, "faces") if with_contacts else (Query, output)
+            self._load(kind, pairs is None, told, precision, "gap" in options, "within" in options)
         pairs = self._find_pairs(pairs, reach)
         given = {name: check_within(value, len(pairs), name) for name, value in options.items()}
         within, gap = given.get("within"), given.get("gap")
-        key = output, precision, *sorted(given)
         query = self.kept.pop(key, None)
         if query is not None:
             if not query.is_asked(pairs, within, gap):
@@ -72,6 +94,8 @@ class KeptQueries:
             # Originals may lie out of the boxes of their LODs.
             pairs = self._find_pairs(pairs, reach + (self._originals.reach() if pairs is None else 0.0))
             return self._originals.run(pairs, check_beyond(beyond, len(pairs)), **tolerances, device=device)
+        if ("distance", signed) not in self.kept:
+            self._load(DistanceQuery, pairs is None, "any", "exact", False, False)
         pairs = self._find_pairs(pairs, reach)
         beyond = check_beyond(beyond, len(pairs))
         query = prepare_query(self.kept.pop(("distance", signed), None), self._scene, pairs, beyond, tolerances, signed)
@@ -96,6 +120,15 @@ class KeptQueries:
         """Return a distance that is one for all pairs, checked; 0 where each pair has its own."""
         distance = to_numpy(distance, name)
         return float(check_within(distance, name=name)) if distance.ndim == 0 else 0.0
+
+    def _load(self, kind, with_broad_phase: bool, *request):
+        """Load what the first query of a kind launches, all at the same time: from the tree states to the answers."""
+        scene = self._scene
+        if not scene.object_count:
+            return
+        with_states = scene_kernels(scene.device, [model.face_count for model in scene.models], with_broad_phase)
+        with loading(scene.device, [*kind.kernels(scene.device, *request), *with_states]):
+            pass
 
     def _run(self, key: tuple, query: Query, device: bool) -> Result:
         """Run a query and keep it for the next time; one that fails, for lack of memory, gives its own back."""

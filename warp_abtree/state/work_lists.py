@@ -13,15 +13,14 @@ from warp_abtree.kernels.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import block_update, mark, refine, refit
 from warp_abtree.kernels.update.work_lists import UpdateLists
 
-# Nodes of a level that one block refits, at most: a launch costs about as much. And the threads of that block.
+# Nodes of a level that one block refits, at most: a launch costs about as much.
 TOP_ROOM = 1024
-TOP_THREADS = 512
 # On a GPU: faces of a slice, or of a tree, that a block updates where there are fewer states than multiprocessors; with
-# more states, as many times more. Threads of a block: of many states with trees of at most SMALL_DEPTH, with shallow
-# ones, and of others. And blocks of a launch, at most.
+# more states, as many times more. Threads of a block: of many states with trees of at most SMALL_DEPTH, and with
+# shallow ones. And blocks of a launch, at most.
 BLOCK_SLICE, BLOCK_FACES = 1024, 4096
 SMALL_DEPTH = 10
-SMALL_THREADS, SHALLOW_THREADS, THREADS = 64, 256, 1024
+SMALL_THREADS, SHALLOW_THREADS = 64, 256
 BLOCKS_MOST = 8192
 # Fraction of the longest slice of a partial update that level lists take.
 LISTED_FRACTION = 0.1
@@ -37,6 +36,21 @@ def launch_items(kernel, items: int, inputs: list, device):
     if items:
         step = min(items, THREADS_AT_ONCE * device.sm_count) if device.is_cuda else 1
         wp.launch(kernel, dim=step, inputs=[step, *inputs], device=device)
+
+
+def update_kernels(face_counts, device) -> list:
+    """Return the kernels, with block sizes, that bring a state of each model to its first LOD; see `loading`.
+
+    Args:
+        face_counts: Faces of each model.
+    """
+    most = 2 ** int(block_update.BLOCK_DEPTH) if device.is_cpu else BLOCK_FACES
+    by_blocks = [current_regime().block_updates and count <= most for count in face_counts]
+    kernels: list = [(block_update.state_update(False), block_update.THREADS)] if any(by_blocks) else []
+    if not all(by_blocks):
+        kernels += [(refit.refit_top_kernel, refit.TOP_THREADS)]
+        kernels += [(kernel, 256) for kernel in (refit.refit_level_kernel, refine.refine_all_kernel)]
+    return kernels
 
 
 def block_limits(models, state_count: int, device):
@@ -104,7 +118,7 @@ class WorkLists:
         if self.device.is_cuda:
             shallow = self.depth <= block_update.SHALLOW_DEPTH and self.block_room > self.device.sm_count
             few_faces = SMALL_THREADS if self.depth <= SMALL_DEPTH else SHALLOW_THREADS
-            blocks, threads = min(self.block_room, BLOCKS_MOST), few_faces if shallow else THREADS
+            blocks, threads = min(self.block_room, BLOCKS_MOST), few_faces if shallow else block_update.THREADS
         inputs = [blocks, threads, models, self._scratch, states, self.plan]
         kernel = block_update.state_update(shallow)
         wp.launch(kernel, (blocks, threads), inputs, block_dim=threads, device=self.device)
@@ -144,7 +158,7 @@ def active_walk(models, states, work: WorkLists):
     for level in reversed(range(top, len(work.level_room))):
         launch_items(refit.refit_level_kernel, work.level_room[level], [level, models, work.plan, states], work.device)
     if any(work.level_room[:top]):
-        threads = TOP_THREADS if work.device.is_cuda else 1
+        threads = refit.TOP_THREADS if work.device.is_cuda else 1
         inputs = [threads, top, models, work.plan, states]
         wp.launch(refit.refit_top_kernel, threads, inputs, block_dim=threads, device=work.device)
 
