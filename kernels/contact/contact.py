@@ -5,6 +5,7 @@ import warp as wp
 from warp_abtree.kernels.arithmetic.expansion import EXPANSION_LANES
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
 from warp_abtree.kernels.poses import PairPose, pose_point
+from warp_abtree.kernels.traversal.face_pairs import load_corner_ids
 from warp_abtree.kernels.traversal.uncertain_pairs import items_at_once
 from warp_abtree.kernels.traversal.warp_stack import warp_lane, warp_size
 from warp_abtree.kernels.triangle.segment import face_normal, intersect_faces, unit_vector
@@ -141,6 +142,7 @@ def find_contact_kernel(
     objects: ObjectPool,
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
+    proven: bool,
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     deferred_inout: Deferred,
@@ -149,6 +151,7 @@ def find_contact_kernel(
     """Compute the contact of one intersecting face pair a thread, or defer it where float64 is not sure of it.
 
     Args:
+        proven: Whether face pairs are known to intersect, by exact signs.
         start: Where the face pairs of each object pair start, shape [pair + 1]; after the last pair, where all end.
     """
     i = wp.tid()
@@ -156,8 +159,8 @@ def find_contact_kernel(
         return
     p = faces[i][0]
     own = contact_objects(pairs, pair_poses, p)
-    a = states.face_corner[pair_poses[p].corner_a + faces[i][1 + own.swapped]]
-    b = states.face_corner[pair_poses[p].corner_b + faces[i][2 - own.swapped]]
+    a = load_corner_ids(states, pair_poses[p].corner_a + faces[i][1 + own.swapped])
+    b = load_corner_ids(states, pair_poses[p].corner_b + faces[i][2 - own.swapped])
     rotation = pair_poses[p].rotation
     shift = pair_poses[p].translation
     a0 = load_vertex(models.vertex_pos, a[0])
@@ -168,7 +171,7 @@ def find_contact_kernel(
     b2 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[2]))
     normal_a, sure_a = filter_normal(a0, a1, a2)
     normal_b, sure_b = filter_normal(b0, b1, b2)
-    p0, p1, sure = filter_segment(a0, a1, a2, b0, b1, b2)
+    p0, p1, sure = filter_segment(proven, a0, a1, a2, b0, b1, b2)
     if sure and sure_a and sure_b:
         write_contact(models, states, objects, own, i, p0, p1, normal_a, normal_b, contacts_out)
         contacts_out.coplanar[i] = 0

@@ -64,7 +64,8 @@ ends and signs; sums follow the order of the faces as named, so that its summary
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.contact import contact, pack, sort_hits, summary
+from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.contact import chunks, contact, pack, simd, sort_hits, sort_pairs, summary
 from warp_abtree.kernels.gap import separation
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.narrow_phase import Query
@@ -75,6 +76,9 @@ from warp_abtree.state.batch import Batch
 
 # Warps that a multiprocessor runs at a time, by their registers, of those that find deferred contacts.
 DEFERRED_WARPS = 8
+# Threads that sort the hits of a pair, and pairs up to which each warp adds up what others found before it.
+BLOCK_DIM = 256
+SORTED_PAIRS_MAX = 65536
 
 
 class ContactQuery(Query):
@@ -108,6 +112,7 @@ class ContactQuery(Query):
     start: wp.array
     _key: wp.array
     _order: wp.array
+    _next: wp.array
     _places = 0
 
     def __init__(
@@ -140,8 +145,11 @@ class ContactQuery(Query):
 
     @classmethod
     def kernels(cls, device, output, precision, with_gap: bool, with_distances: bool) -> list:
-        kernels = [(contact.find_contact_kernel, WARP_SIZE), (summary.sum_loop_kernel, WARP_SIZE)]
         searching = super().kernels(device, output, precision, with_gap, with_distances)
+        if not current_regime().uses_warps(device):
+            kernels = [(simd.find_pair_contacts_kernel, WARP_SIZE), (contact.find_deferred_kernel, WARP_SIZE)]
+            return [*kernels, *searching, (sort_hits.sort_by_pair_kernel, 256)]
+        kernels = [(contact.find_contact_kernel, WARP_SIZE), (summary.sum_loop_kernel, WARP_SIZE)]
         return [*kernels, *searching, (sort_hits.make_key_kernel, 256)]
 
     def resize(self, capacity: int):
@@ -170,13 +178,12 @@ class ContactQuery(Query):
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
         made.append((self, "start", wp.zeros(room + 1, dtype=wp.int32, device=self.device)))
+        made.append((self, "_next", self._empty(room, wp.int32)))
         for owner, name, dtype in (
             (self.pair_contacts, "point", wp.vec3d),
             (self.pair_contacts, "normal", wp.vec3d),
             (self.pair_contacts, "travel", wp.float64),
-            (self._sums, "total", wp.float64),
             (self._sums, "middle", wp.vec3d),
-            *([] if self._gap is None else [(self._sums, "number", wp.float64)]),
         ):
             made.append((owner, name, self._empty(room, dtype)))
         return made + self._chunk_arrays(self._chunk_count(self._places, room))
@@ -185,7 +192,7 @@ class ContactQuery(Query):
         """Return (owner, attribute, new array) of whatever has an entry a chunk."""
         made = [(self._sums, "span", self._empty(count, wp.vec3i))]
         made += [(self._sums, name, self._empty(count, wp.vec3d)) for name in ("point", "normal")]
-        names = ("length", "area", "change", "front", "back", *(["crossed"] if self._gap is not None else []))
+        names = ("length", "crossed", "area", "change", "front", "back")
         return made + [(self._sums, name, self._empty(count, wp.float64)) for name in names]
 
     def _empty(self, count, dtype):
@@ -194,7 +201,7 @@ class ContactQuery(Query):
     @staticmethod
     def _chunk_count(places: int, pairs: int) -> int:
         """Return how many chunks there may be: `first_chunk` of the pair after the last, if all places are taken."""
-        return places // int(summary.CHUNK) + pairs
+        return places // int(chunks.CHUNK) + pairs
 
     def finish(self, count: int | None = None):
         """Make the contacts of the hits in place. Launches only."""
@@ -229,10 +236,30 @@ class ContactQuery(Query):
         self._launch_kernel(kernel, count * lanes, inputs, WARP_SIZE)
 
     def _sort(self, count: int):
-        self._sort_into(count, self._order, self._key, self.faces)
-        passes, room = self._sort_passes(), len(self.pairs)
-        inputs = [count, sum(passes[-1][1:]), self._key, self.start, self._deferred.total]
-        self._repeat((count,), sort_hits.start_pair_kernel, room + 1, inputs)
+        room, hits = len(self.pairs), self.hits
+        if not self.uses_warps():
+            inputs = [count, hits.total, hits.face, self._key, self.faces, *self._sorted_ends()]
+            self._repeat((count,), sort_hits.sort_by_pair_kernel, 1, inputs)
+        elif count <= sort_pairs.SORT_ROOM * room and room <= SORTED_PAIRS_MAX and len(self._sort_passes()) == 1:
+            inputs = [count, hits.total, hits.face, hits.count, self.start, self._next, self._deferred.total]
+            threads = room // WARP_SIZE * WARP_SIZE + WARP_SIZE
+            self._repeat((count,), sort_pairs.start_pair_kernel, threads, inputs, WARP_SIZE)
+            inputs = [count, hits.total, hits.face, self._next, self._key]
+            self._repeat((count,), sort_pairs.place_key_kernel, -(-count // BLOCK_DIM) * BLOCK_DIM, inputs, BLOCK_DIM)
+            threads = BLOCK_DIM if self.device.is_cuda else 1
+            inputs = [self.start, self._key, self.faces, self._sums.span]
+            self._launch_kernel(sort_pairs.sort_pair_kernel, room * threads, inputs, BLOCK_DIM)
+        else:
+            if count > 0:
+                self._sort_into(count, self._order, self._key, self.faces)
+            else:
+                self.start.zero_()
+                self._deferred.total.zero_()
+            inputs = [self.start, self._sums.span]
+            self._launch_kernel(chunks.locate_chunk_kernel, self._chunk_count(count, room), inputs)
+
+    def _sorted_ends(self) -> tuple:
+        return self.start, self._deferred.total
 
     def _find(self, count: int):
         posed = [*self.batch.pools, self.pairs, self.pair_poses]
@@ -240,26 +267,28 @@ class ContactQuery(Query):
             marks = [self.start, self.faces, self.contacts]
             self._launch_kernel(separation.mark_near_kernel, count, marks)
             self._launch_kernel(separation.find_separation_kernel, count, [*posed, *marks], WARP_SIZE)
-        inputs = [*posed, self.start, self.faces, self._deferred, self.contacts]
-        self._launch_kernel(contact.find_contact_kernel, count, inputs, WARP_SIZE)
+        proven = self.precision == "exact"
+        inputs = [*posed, proven, self.start, self.faces, self._deferred, self.contacts]
+        if self.uses_warps():
+            self._launch_kernel(contact.find_contact_kernel, count, inputs, WARP_SIZE)
+        else:
+            self._launch_kernel(simd.find_pair_contacts_kernel, len(self.pairs), inputs)
         step = DEFERRED_WARPS * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
         inputs = [step, *posed, self.faces, self._deferred, self.contacts]
         self._launch_kernel(contact.find_deferred_kernel, step, inputs, WARP_SIZE)
 
     def _reduce(self, count: int):
         room = len(self.pairs)
-        chunks = self._chunk_count(count, room)
-        pools = self.batch.pools
+        count = self._chunk_count(count, room)
         start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
-        self._launch_warps(summary.sum_length_kernel, chunks, [start, contacts, sums])
-        self._launch_kernel(summary.total_length_kernel, room, [start, sums], WARP_SIZE)
-        self._launch_warps(summary.sum_mean_kernel, chunks, [start, contacts, sums])
-        self._launch_kernel(summary.average_contact_kernel, room, [*pools, self.pairs, start, sums, means], WARP_SIZE)
-        posed = [*pools, self.pairs, self.pair_poses]
-        self._launch_warps(summary.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
-        self._launch_kernel(
-            summary.measure_travel_kernel, room, [*pools, self.pairs, start, contacts, sums, means], WARP_SIZE
-        )
+        posed = [*self.batch.pools, self.pairs, self.pair_poses]
+        if not self.uses_warps():
+            self._launch_kernel(simd.sum_pair_kernel, room, [*posed, start, self.faces, contacts, means])
+            return
+        self._launch_warps(summary.sum_length_kernel, count, [start, contacts, sums])
+        self._launch_warps(summary.sum_mean_kernel, count, [start, contacts, sums])
+        self._launch_warps(summary.sum_loop_kernel, count, [*posed, start, self.faces, contacts, sums, means])
+        self._launch_warps(summary.measure_travel_kernel, room, [*posed, start, self.faces, contacts, sums, means])
 
     def _read_rows(self, found: Found, count: int, device: bool):
         if device:
