@@ -51,32 +51,30 @@ def make_key_kernel(
 
 @wp.kernel
 def place_row_kernel(
+    capacity: wp.int32,
+    shift: wp.int32,
     total: wp.array(dtype=wp.int32),
     face: wp.array(dtype=wp.vec3i),
     order: wp.array(dtype=wp.int32),
-    sorted_out: wp.array(dtype=wp.vec3i),
-):
-    """Put one hit a thread in its place."""
-    i = wp.tid()
-    if i < count_rows(total[0], face.shape[0]):
-        sorted_out[i] = face[order[i]]
-
-
-@wp.kernel
-def start_pair_kernel(
-    capacity: wp.int32,
-    shift: wp.int32,
     key: wp.array(dtype=wp.int64),
+    sorted_out: wp.array(dtype=wp.vec3i),
     start_out: wp.array(dtype=wp.int32),
     deferred_total_out: wp.array(dtype=wp.int32),
 ):
-    """Find where the hits of one object pair a thread start, and after the last pair where they end; defer none yet.
+    """Put one hit a thread in its place; find where the hits of one object pair a thread start, after the last pair
+    where they end, and defer none yet.
 
     Args:
+        capacity: Places that were sorted.
         key: Sorted keys of the last pass, with the pair above `shift` bits, then scratch, shape [2 capacity].
+        start_out: Shape [pair + 1], or [0] if nobody asks.
     """
-    p = wp.tid()
-    if p == 0:
-        deferred_total_out[0] = 0
-    # One more than there are keys: the search never looks at its end, and returns the place before it if all are less.
-    start_out[p] = wp.lower_bound(key, 0, capacity + 1, wp.int64(p) << wp.int64(shift))
+    i = wp.tid()
+    if i < wp.min(count_rows(total[0], face.shape[0]), capacity):
+        sorted_out[i] = face[order[i]]
+    if i < start_out.shape[0]:
+        if i == 0:
+            deferred_total_out[0] = 0
+        # One more than there are keys: the search never looks at its end, and returns the place before it if all are
+        # less.
+        start_out[i] = wp.lower_bound(key, 0, capacity + 1, wp.int64(i) << wp.int64(shift))

@@ -1,8 +1,9 @@
 """One summary an object pair of its sorted contacts, in sums of a fixed shape.
 
-A chunk is CHUNK contacts of one pair, the pair's last one shorter. One warp a chunk sums its contacts in their order
-(on the CPU a thread), then one thread a pair its chunks in theirs, so that no bit depends on the device or on the order
-in which threads run. With a gap contacts of faces that are apart count nothing.
+A chunk is CHUNK contacts of one pair, the pair's last one shorter. One warp a chunk sums its contacts in their order;
+what it needs of the whole pair it sums itself, of the pair's chunks in theirs, so that no bit depends on the device or
+on the order in which threads run. With a gap contacts of faces that are apart count nothing. The CPU sums a pair after
+the other (`simd`).
 """
 
 import warp as wp
@@ -12,13 +13,21 @@ from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_ve
 from warp_abtree.kernels.contact.contact import (
     SHORTEST_NORMAL,
     Contacts,
+    PairObjects,
     contact_objects,
     have_crossed,
     pair_direction,
 )
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.traversal.nodes import load_node
-from warp_abtree.kernels.traversal.warp_stack import add_in_order, six_numbers, warp_lane, warp_max, warp_size
+from warp_abtree.kernels.traversal.warp_stack import (
+    add_in_order,
+    six_numbers,
+    warp_any,
+    warp_lane,
+    warp_max,
+    warp_size,
+)
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -47,11 +56,9 @@ class ChunkSums:
     normal: wp.array(dtype=wp.vec3d)  # weighted, shape [chunk]
     area: wp.array(dtype=wp.float64)  # that the contact curve encloses, shape [chunk]
     change: wp.array(dtype=wp.float64)  # how fast the area changes, shape [chunk]
-    front: wp.array(dtype=wp.float64)  # how far the first object's faces reach along the normal, shape [chunk]
+    front: wp.array(dtype=wp.float64)  # how far the first object's faces reach along the normal, shape [chunk]; or NaN
     back: wp.array(dtype=wp.float64)  # how far the second's reach against it, shape [chunk]
-    crossed: wp.array(dtype=wp.float64)  # contacts whose faces intersect, shape [chunk]; [0] without a gap
-    total: wp.array(dtype=wp.float64)  # length of all contacts, or 0, shape [pair]
-    number: wp.array(dtype=wp.float64)  # of contacts whose faces intersect, shape [pair]; [0] without a gap
+    crossed: wp.array(dtype=wp.float64)  # contacts whose faces intersect, shape [chunk]
     middle: wp.array(dtype=wp.vec3d)  # mean point from the first end, shape [pair]
 
 
@@ -82,6 +89,14 @@ def locate_chunk(c: wp.int32, start: wp.array(dtype=wp.int32)):
     return wp.vec3i(low, first, wp.min(first + CHUNK, start[low + 1]))
 
 
+@wp.func
+def two_numbers(x: wp.float64, y: wp.float64):
+    numbers = six_numbers()
+    numbers[0] = x
+    numbers[1] = y
+    return numbers
+
+
 @wp.kernel
 def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_out: ChunkSums):
     """Locate one chunk a warp and sum the lengths of its contacts."""
@@ -101,35 +116,20 @@ def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_
     if warp_lane() == 0:
         sums_out.span[c] = span
         sums_out.length[c] = sums[0]
-        if sums_out.crossed.shape[0] > 0:
-            sums_out.crossed[c] = sums[1]
-
-
-@wp.kernel
-def total_length_kernel(start: wp.array(dtype=wp.int32), sums_inout: ChunkSums):
-    """Sum the lengths of one object pair's chunks a thread."""
-    p = wp.tid()
-    total = wp.float64(0.0)
-    number = wp.float64(0.0)
-    c = first_chunk(p, start)
-    end = end_chunk(p, start)
-    while c < end:
-        total += sums_inout.length[c]
-        if sums_inout.crossed.shape[0] > 0:
-            number += sums_inout.crossed[c]
-        c += 1
-    sums_inout.total[p] = total
-    if sums_inout.crossed.shape[0] > 0:
-        sums_inout.number[p] = number
+        sums_out.crossed[c] = sums[1]
 
 
 @wp.func
-def count_crossed(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
-    """Return how many contacts of a pair are of faces that intersect."""
-    number = wp.float64(start[p + 1] - start[p])
-    if sums.number.shape[0] > 0:
-        number = sums.number[p]
-    return number
+def sum_lengths(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
+    """Return the length of all contacts of a pair, or 0, and how many are of faces that intersect."""
+    all = six_numbers()
+    c = first_chunk(p, start)
+    end = end_chunk(p, start)
+    while c < end:
+        k = wp.min(c + warp_lane(), end - 1)
+        all = add_in_order(all, two_numbers(sums.length[k], sums.crossed[k]), wp.min(end - c, warp_size()))
+        c += warp_size()
+    return all[0], all[1]
 
 
 @wp.kernel
@@ -145,13 +145,13 @@ def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_in
     p = span[0]
     origin = contacts.p0[start[p]]
     half = wp.float64(0.5)
-    total = sums_inout.total[p]
+    total, number = sum_lengths(p, start, sums_inout)
     sums = six_numbers()
     first = wp.int32(span[1])
     while first < span[2]:
         k = wp.min(first + warp_lane(), span[2] - 1)
         count = wp.min(span[2] - first, warp_size())
-        weight = wp.float64(1.0) / count_crossed(p, start, sums_inout)
+        weight = wp.float64(1.0) / number
         if total != wp.float64(0.0):
             weight = measure_length(contacts.p1[k] - contacts.p0[k]) / total
         if not have_crossed(contacts, k):
@@ -171,33 +171,27 @@ def no_vector() -> wp.vec3d:
     """Return three NaNs of the bits 0x7ff8000000000000 on every device."""
 
 
-@wp.kernel
-def average_contact_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    start: wp.array(dtype=wp.int32),
-    sums_inout: ChunkSums,
-    pair_contacts_out: PairContacts,
-):
-    """Sum one object pair's chunks a thread to its mean point and normal; NaN for a pair without contacts."""
-    p = wp.tid()
-    point = wp.vec3d()
-    n = no_vector()
+@wp.func
+def sum_means(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
+    """Return a pair's mean point, from its first end, and the sum of its weighted normals."""
+    all = six_numbers()
     c = first_chunk(p, start)
     end = end_chunk(p, start)
-    if count_crossed(p, start, sums_inout) > wp.float64(0.0):
-        n = wp.vec3d()
-        while c < end:
-            point += sums_inout.point[c]
-            n += sums_inout.normal[c]
-            c += 1
-        if measure_length(n) <= SHORTEST_NORMAL:
-            n = pair_direction(models, states, objects, pairs[p][0], pairs[p][1])
-        n = unit_vector(n)
-    sums_inout.middle[p] = point
-    pair_contacts_out.normal[p] = n
+    while c < end:
+        k = wp.min(c + warp_lane(), end - 1)
+        x, n = sums.point[k], sums.normal[k]
+        all = add_in_order(all, six_numbers(x[0], x[1], x[2], n[0], n[1], n[2]), wp.min(end - c, warp_size()))
+        c += warp_size()
+    return wp.vec3d(all[0], all[1], all[2]), wp.vec3d(all[3], all[4], all[5])
+
+
+@wp.func
+def mean_normal(models: ModelPool, states: StatePool, objects: ObjectPool, pair: wp.vec2i, sum: wp.vec3d):
+    """Return the unit normal of a sum of weighted normals; where it is short, the direction between the models."""
+    n = sum
+    if measure_length(n) <= SHORTEST_NORMAL:
+        n = pair_direction(models, states, objects, pair[0], pair[1])
+    return unit_vector(n)
 
 
 @wp.func
@@ -229,7 +223,60 @@ def loop_change(segment: wp.vec3d, normal_a: wp.vec3d, normal_b: wp.vec3d, n: wp
     return y * wp.dot(normal_b - normal_a * cosine, wp.cross(segment, n))
 
 
-@wp.kernel
+@wp.func
+def reach_faces(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    own: PairObjects,
+    pose: PairPose,
+    face: wp.vec3i,
+    n: wp.vec3d,
+    origin: wp.vec3d,
+):
+    """Return how far the first object's face reaches along n from a point, and the second's against it."""
+    a = states.face_corner[pose.corner_a + face[1 + own.swapped]]
+    b = states.face_corner[pose.corner_b + face[2 - own.swapped]]
+    front = -wp.float64(wp.inf)
+    back = -wp.float64(wp.inf)
+    for i in range(3):
+        corner_a = load_vertex(models.vertex_pos, a[i])
+        corner_b = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[i]))
+        reach_a = wp.dot(n, pose_point(objects.rotation[own.a], objects.position[own.a], corner_a) - origin)
+        reach_b = wp.dot(n, pose_point(objects.rotation[own.a], objects.position[own.a], corner_b) - origin)
+        # The normal goes from the object that the pair names first.
+        front = wp.max(front, wp.where(own.swapped == 0, reach_a, reach_b))
+        back = wp.max(back, -wp.where(own.swapped == 0, reach_b, reach_a))
+    return front, back
+
+
+@wp.func
+def reach_contacts(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    own: PairObjects,
+    pose: PairPose,
+    span: wp.vec3i,
+    faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
+    n: wp.vec3d,
+    origin: wp.vec3d,
+):
+    """Return `reach_faces` of all contacts of a span, for all lanes of a warp."""
+    front = -wp.float64(wp.inf)
+    back = -wp.float64(wp.inf)
+    k = span[1] + warp_lane()
+    while k < span[2]:
+        if have_crossed(contacts, k):
+            ahead, behind = reach_faces(models, states, objects, own, pose, faces[k], n, origin)
+            front = wp.max(front, ahead)
+            back = wp.max(back, behind)
+        k += warp_size()
+    return warp_max(front), -warp_max(back)
+
+
+@wp.kernel(cuda_max_registers=96)
 def sum_loop_kernel(
     models: ModelPool,
     states: StatePool,
@@ -239,100 +286,129 @@ def sum_loop_kernel(
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
-    pair_contacts: PairContacts,
+    pair_contacts_out: PairContacts,
     sums_inout: ChunkSums,
 ):
-    """Sum what the travel needs of one chunk a warp: area within the contact curve, its change, extents of faces."""
+    """Sum what the travel needs of one chunk a warp: area within the contact curve, its change, extents of faces.
+
+    Extents serve pairs without an area, which as a rule have none in any chunk: others are left out.
+    """
     c = wp.tid() / warp_size()
     span = sums_inout.span[c]
     if span[1] >= span[2]:
         return
     p = span[0]
-    n = pair_contacts.normal[p]
     origin = contacts.p0[start[p]]
-    own = contact_objects(pairs, pair_poses, p)
-    front = -wp.float64(wp.inf)
-    back = -wp.float64(wp.inf)
+    middle, normals = sum_means(p, start, sums_inout)
+    n = mean_normal(models, states, objects, pairs[p], normals)
     sums = six_numbers()
     first = wp.int32(span[1])
     while first < span[2]:
         k = wp.min(first + warp_lane(), span[2] - 1)
-        count = wp.min(span[2] - first, warp_size())
-        a = states.face_corner[pair_poses[p].corner_a + faces[k][1 + own.swapped]]
-        b = states.face_corner[pair_poses[p].corner_b + faces[k][2 - own.swapped]]
-        for i in range(3):
-            corner_a = load_vertex(models.vertex_pos, a[i])
-            corner_b = pose_point(
-                pair_poses[p].rotation, pair_poses[p].translation, load_vertex(models.vertex_pos, b[i])
-            )
-            reach_a = wp.dot(n, pose_point(objects.rotation[own.a], objects.position[own.a], corner_a) - origin)
-            reach_b = wp.dot(n, pose_point(objects.rotation[own.a], objects.position[own.a], corner_b) - origin)
-            # The normal goes from the object that the pair names first.
-            if have_crossed(contacts, k):
-                front = wp.max(front, wp.where(own.swapped == 0, reach_a, reach_b))
-                back = wp.max(back, -wp.where(own.swapped == 0, reach_b, reach_a))
         # About the mean point, since for an open curve the area depends on where it is measured from.
-        r = contacts.p0[k] - origin - sums_inout.middle[p]
+        r = contacts.p0[k] - origin - middle
         s = contacts.p1[k] - contacts.p0[k]
         parts = six_numbers()
         if contacts.coplanar[k] == 0 and have_crossed(contacts, k):
             parts[0] = wp.float64(0.5) * wp.dot(n, wp.cross(r, s))
             parts[1] = loop_change(s, contacts.normal_a[k], contacts.normal_b[k], n)
-        sums = add_in_order(sums, parts, count)
+        sums = add_in_order(sums, parts, wp.min(span[2] - first, warp_size()))
         first += warp_size()
-    front = warp_max(front)
-    back = -warp_max(back)
+    front = wp.float64(wp.nan)
+    back = wp.float64(wp.nan)
+    if sums[0] == wp.float64(0.0):
+        own = contact_objects(pairs, pair_poses, p)
+        front, back = reach_contacts(
+            models, states, objects, own, pair_poses[p], span, faces, contacts, n, origin
+        )
     if warp_lane() == 0:
         sums_inout.area[c] = sums[0]
         sums_inout.change[c] = sums[1]
         sums_inout.front[c] = front
         sums_inout.back[c] = back
+        if c == first_chunk(p, start):
+            sums_inout.middle[p] = middle
+            pair_contacts_out.normal[p] = n
 
 
 @wp.func
 def sum_loop(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
-    """Return area, change, and the overlap of the faces along the normal, of all chunks of a pair."""
+    """Return area and change of all chunks of a pair, how far its faces reach along the normal, and whether that is
+    known of all chunks."""
+    all = six_numbers()
     front = -wp.float64(wp.inf)
-    back = wp.float64(wp.inf)
-    area = wp.float64(0.0)
-    change = wp.float64(0.0)
+    back = -wp.float64(wp.inf)
+    measured = bool(True)
     c = first_chunk(p, start)
     end = end_chunk(p, start)
     while c < end:
-        front = wp.max(front, sums.front[c])
-        back = wp.min(back, sums.back[c])
-        area += sums.area[c]
-        change += sums.change[c]
-        c += 1
-    return area, change, front - back
+        k = wp.min(c + warp_lane(), end - 1)
+        measured = measured and sums.front[k] == sums.front[k]
+        front = wp.max(front, sums.front[k])
+        back = wp.max(back, -sums.back[k])
+        all = add_in_order(all, two_numbers(sums.area[k], sums.change[k]), wp.min(end - c, warp_size()))
+        c += warp_size()
+    return all[0], all[1], warp_max(front), -warp_max(back), not warp_any(not measured)
 
 
-@wp.kernel
+@wp.func
+def choose_travel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pair: wp.vec2i,
+    n: wp.vec3d,
+    origin: wp.vec3d,
+    area: wp.float64,
+    change: wp.float64,
+    overlap: wp.float64,
+):
+    """Return the travel of a pair, `overlap` that of its faces where there is no area."""
+    travel = box_support(models, states, objects, pair[0], n, origin)
+    travel += box_support(models, states, objects, pair[1], -n, origin)
+    if area == wp.float64(0.0):
+        travel = wp.min(travel, overlap)
+    elif area * change < wp.float64(0.0):
+        travel = wp.min(travel, -area / change)
+    return wp.max(travel, wp.float64(0.0))
+
+
+@wp.func
+def write_no_contacts(p: wp.int32, pair_contacts: PairContacts):
+    pair_contacts.normal[p] = no_vector()
+    pair_contacts.point[p] = no_vector()
+    pair_contacts.travel[p] = wp.float64(0.0)
+
+
+@wp.kernel(cuda_max_registers=96)
 def measure_travel_kernel(
     models: ModelPool,
     states: StatePool,
     objects: ObjectPool,
     pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
     start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
     sums: ChunkSums,
     pair_contacts_inout: PairContacts,
 ):
-    """Estimate the travel of one object pair a thread, and pose its mean point; docstring of warp_abtree/contact.py."""
-    p = wp.tid()
-    first = start[p]
-    if count_crossed(p, start, sums) == wp.float64(0.0):
-        pair_contacts_inout.point[p] = no_vector()
-        pair_contacts_inout.travel[p] = wp.float64(0.0)
+    """Estimate the travel of one object pair a warp, and pose its mean point; docstring of warp_abtree/contact.py."""
+    p = wp.tid() / warp_size()
+    _, number = sum_lengths(p, start, sums)
+    if number == wp.float64(0.0):
+        if warp_lane() == 0:
+            write_no_contacts(p, pair_contacts_inout)
         return
-    origin = contacts.p0[first]
+    origin = contacts.p0[start[p]]
     n = pair_contacts_inout.normal[p]
-    area, change, overlap = sum_loop(p, start, sums)
-    travel = box_support(models, states, objects, pairs[p][0], n, origin)
-    travel += box_support(models, states, objects, pairs[p][1], -n, origin)
-    if area == wp.float64(0.0):
-        travel = wp.min(travel, overlap)
-    elif area * change < wp.float64(0.0):
-        travel = wp.min(travel, -area / change)
-    pair_contacts_inout.point[p] = origin + sums.middle[p]
-    pair_contacts_inout.travel[p] = wp.max(travel, wp.float64(0.0))
+    area, change, front, back, measured = sum_loop(p, start, sums)
+    if area == wp.float64(0.0) and not measured:
+        own = contact_objects(pairs, pair_poses, p)
+        span = wp.vec3i(p, start[p], start[p + 1])
+        front, back = reach_contacts(models, states, objects, own, pair_poses[p], span, faces, contacts, n, origin)
+    if warp_lane() == 0:
+        pair_contacts_inout.point[p] = origin + sums.middle[p]
+        pair_contacts_inout.travel[p] = choose_travel(
+            models, states, objects, pairs[p], n, origin, area, change, front - back
+        )

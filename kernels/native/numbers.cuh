@@ -114,6 +114,38 @@ inline CUDA_CALLABLE wp::int32 add_signs(wp::int32 signs, wp::vec_t<3, wp::float
     return all;
 }
 
+inline CUDA_CALLABLE bool shares_reciprocal(wp::vec_t<3, wp::float64> v, wp::float64 s) {
+#if defined(__CUDA_ARCH__)
+    // Exponents that leave room for remainders, and a reciprocal that is rounded correctly.
+    auto is_usual = [](double x) { return ((__double2hiint(x) >> 20) & 2047) - 523u < 1000u; };
+    return is_usual(s) & (__double2loint(s) != -1) & ((v[0] == 0.0) | is_usual(v[0])) &
+           ((v[1] == 0.0) | is_usual(v[1])) & ((v[2] == 0.0) | is_usual(v[2]));
+#else
+    return true;
+#endif
+}
+
+inline CUDA_CALLABLE wp::vec_t<3, wp::float64> multiply_reciprocal(wp::vec_t<3, wp::float64> v, wp::float64 s) {
+#if defined(__CUDA_ARCH__)
+    // The steps of a division, the first five once for three: y ends as 1 / s, rounded.
+    double y;
+    asm("rcp.approx.ftz.f64 %0, %1;" : "=d"(y) : "d"(s));
+    double e = __fma_rn(-s, y, 1.0);
+    e = __fma_rn(e, e, e);
+    y = __fma_rn(y, e, y);
+    e = __fma_rn(-s, y, 1.0);
+    y = __fma_rn(y, e, y);
+    wp::vec_t<3, wp::float64> quotient;
+    for (int k = 0; k < 3; ++k) {
+        const double q = __dmul_rn(v[k], y);
+        quotient[k] = v[k] == 0.0 ? q : __fma_rn(__fma_rn(-s, q, v[k]), y, q);
+    }
+    return quotient;
+#else
+    return wp::vec_t<3, wp::float64>(v[0] / s, v[1] / s, v[2] / s);
+#endif
+}
+
 inline CUDA_CALLABLE wp::vec_t<3, wp::float64> no_vector() {
     // NumPy's NaN: devices differ in the sign and payload of the NaN that they make.
     union {

@@ -109,6 +109,9 @@ static_assert(MARK_START % 32 == 0 && 32 * MARK_WORDS == MARK_START + 3 * (1 << 
 constexpr int UNCERTAIN = 8;
 constexpr double COORDINATE_MIN = 0x1p-290;
 constexpr double BOUND_3D = 0x1.0000000000008p-50;
+constexpr double BOUND_2D = 0x1.8000000000004p-52;
+constexpr double RELATIVE_ERROR = 0x1p-42;
+constexpr double SHORTEST_NORMAL = 0x1p-20;
 
 // Certified errors: faces about a merge, distances of corners to them, corners of a polygon, polygons on the stack,
 // faces that cover a triangle, cuts of one, and triangles covered at once.

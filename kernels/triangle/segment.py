@@ -7,6 +7,7 @@ on, and the rounding of its coordinates. Nothing here depends on the order in wh
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.arithmetic.expansion import expand_area, expand_volume
 from warp_abtree.kernels.arithmetic.predicates import (
     BOUND_2D,
@@ -33,11 +34,8 @@ ratios = wp.types.vector(length=9, dtype=wp.float64)  # where each edge of A cro
 
 
 @wp.func
-def round_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Return det(a - d, b - d, c - d) as float64 has it, and the sum of magnitudes."""
-    u = a - d
-    v = b - d
-    w = c - d
+def round_volume(u: wp.vec3d, v: wp.vec3d, w: wp.vec3d):
+    """Return det(u, v, w) of three differences as float64 has it, and the sum of magnitudes."""
     v1w2 = v[1] * w[2]
     v2w1 = v[2] * w[1]
     w1u2 = w[1] * u[2]
@@ -53,7 +51,7 @@ def round_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 @wp.func
 def signed_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """Return det(a - d, b - d, c - d) with the sign of `orient3d` and a relative error of at most RELATIVE_ERROR."""
-    value, size = round_volume(a, b, c, d)
+    value, size = round_volume(a - d, b - d, c - d)
     if BOUND_3D * size > RELATIVE_ERROR * wp.abs(value):
         value = expand_volume(a, b, c, d)
     return value
@@ -77,13 +75,38 @@ def signed_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
     return value
 
 
+@wp.func_native(native.body("numbers.cuh", "shares_reciprocal"))
+def shares_reciprocal(v: wp.vec3d, s: wp.float64) -> bool:
+    """Return whether `multiply_reciprocal` rounds as a division does."""
+
+
+@wp.func_native(native.body("numbers.cuh", "multiply_reciprocal"))
+def multiply_reciprocal(v: wp.vec3d, s: wp.float64) -> wp.vec3d: ...
+
+
+@wp.func(inline=False)
+def divide_plainly(v: wp.vec3d, s: wp.float64):
+    return v / s
+
+
+@wp.func
+def divide_vector(v: wp.vec3d, s: wp.float64):
+    """Return v / s, each number rounded once. CUDA divides by the one reciprocal where that rounds the same.
+
+    Source: Markstein 1990, Computation of elementary functions on the IBM RISC System/6000 processor, theorem 3.
+    """
+    if shares_reciprocal(v, s):
+        return multiply_reciprocal(v, s)
+    return divide_plainly(v, s)
+
+
 @wp.func
 def measure_length(v: wp.vec3d):
     """Return the length of a vector whose squares may underflow or overflow."""
     m = wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
     if m == wp.float64(0.0):
         return m
-    u = v / m
+    u = divide_vector(v, m)
     return m * wp.sqrt(wp.dot(u, u))
 
 
@@ -93,8 +116,8 @@ def unit_vector(v: wp.vec3d):
     m = wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
     if m == wp.float64(0.0):
         return v
-    u = v / m
-    return u / wp.sqrt(wp.dot(u, u))
+    u = divide_vector(v, m)
+    return divide_vector(u, wp.sqrt(wp.dot(u, u)))
 
 
 @wp.func

@@ -14,11 +14,20 @@ from conftest import slow
 from warp_abtree import kernels
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arithmetic.expansion import two_sum
-from warp_abtree.kernels.arithmetic.predicates import BOUND_3D, EXACT, FLOAT32, UNCERTAIN
+from warp_abtree.kernels.arithmetic.predicates import BOUND_2D, BOUND_3D, EXACT, FLOAT32, UNCERTAIN
+from warp_abtree.kernels.contact.contact import SHORTEST_NORMAL
 from warp_abtree.kernels.poses import COORDINATE_MIN
 from warp_abtree.kernels.traversal import dual_tree, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.face_pairs import WITHIN
+from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR
 
+DOUBLES = {
+    "BOUND_2D": BOUND_2D,
+    "BOUND_3D": BOUND_3D,
+    "COORDINATE_MIN": COORDINATE_MIN,
+    "RELATIVE_ERROR": RELATIVE_ERROR,
+    "SHORTEST_NORMAL": SHORTEST_NORMAL,
+}
 PASSES = ("resolve_rounded", "float64_filter", "resolve_inexact")
 # Approximate on purpose, or without arithmetic.
 OTHERS = re.compile(r"\.(progressive|lod|arrays|native)\b")
@@ -104,7 +113,7 @@ def test_every_function_has_one_stub_of_its_name_and_parameters():
 def test_constants_are_those_of_python():
     text = native.read("sizes.h")
     values = {name: float.fromhex(value) for name, value in re.findall(r"constexpr double (\w+) = (\S+);", text)}
-    assert values == {"BOUND_3D": float(BOUND_3D), "COORDINATE_MIN": float(COORDINATE_MIN)}
+    assert values == {name: float(value) for name, value in DOUBLES.items()}
     assert native.constant("UNCERTAIN") == int(UNCERTAIN)
 
 

@@ -64,7 +64,7 @@ ends and signs; sums follow the order of the faces as named, so that its summary
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.contact import contact, pack, sort_hits, summary
+from warp_abtree.kernels.contact import contact, pack, simd, summary
 from warp_abtree.kernels.gap import separation
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.narrow_phase import Query
@@ -172,9 +172,7 @@ class ContactQuery(Query):
             (self.pair_contacts, "point", wp.vec3d),
             (self.pair_contacts, "normal", wp.vec3d),
             (self.pair_contacts, "travel", wp.float64),
-            (self._sums, "total", wp.float64),
             (self._sums, "middle", wp.vec3d),
-            *([] if self._gap is None else [(self._sums, "number", wp.float64)]),
         ):
             made.append((owner, name, self._empty(room, dtype)))
         return made + self._chunk_arrays(self._chunk_count(self._places, room))
@@ -183,7 +181,7 @@ class ContactQuery(Query):
         """Return (owner, attribute, new array) of whatever has an entry a chunk."""
         made = [(self._sums, "span", self._empty(count, wp.vec3i))]
         made += [(self._sums, name, self._empty(count, wp.vec3d)) for name in ("point", "normal")]
-        names = ("length", "area", "change", "front", "back", *(["crossed"] if self._gap is not None else []))
+        names = ("length", "crossed", "area", "change", "front", "back")
         return made + [(self._sums, name, self._empty(count, wp.float64)) for name in names]
 
     def _empty(self, count, dtype):
@@ -228,9 +226,12 @@ class ContactQuery(Query):
 
     def _sort(self, count: int):
         self._sort_into(count, self._order, self._key, self.faces)
-        passes, room = self._sort_passes(), len(self.pairs)
-        inputs = [count, sum(passes[-1][1:]), self._key, self.start, self._deferred.total]
-        self._repeat((count,), sort_hits.start_pair_kernel, room + 1, inputs)
+        if count == 0:
+            self.start.zero_()
+            self._deferred.total.zero_()
+
+    def _sorted_ends(self) -> tuple:
+        return self.start, self._deferred.total
 
     def _find(self, count: int):
         posed = [*self.batch.pools, self.pairs, self.pair_poses]
@@ -238,26 +239,25 @@ class ContactQuery(Query):
             marks = [self.start, self.faces, self.contacts]
             self._launch_kernel(separation.mark_near_kernel, count, marks)
             self._launch_kernel(separation.find_separation_kernel, count, [*posed, *marks], WARP_SIZE)
-        inputs = [*posed, self.start, self.faces, self._deferred, self.contacts]
-        self._launch_kernel(contact.find_contact_kernel, count, inputs, WARP_SIZE)
+        proven = self.precision == "exact"
+        inputs = [*posed, proven, self.start, self.faces, self._deferred, self.contacts]
+        if self.uses_warps():
+            self._launch_kernel(contact.find_contact_kernel, count, inputs, WARP_SIZE)
+        else:
+            self._launch_kernel(simd.find_pair_contacts_kernel, len(self.pairs), inputs)
         step = DEFERRED_WARPS * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
-        inputs = [step, *posed, self.faces, self._deferred, self.contacts]
+        inputs = [step, *posed, proven, self.faces, self._deferred, self.contacts]
         self._launch_kernel(contact.find_deferred_kernel, step, inputs, WARP_SIZE)
 
     def _reduce(self, count: int):
         room = len(self.pairs)
         chunks = self._chunk_count(count, room)
-        pools = self.batch.pools
         start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
+        posed = [*self.batch.pools, self.pairs, self.pair_poses]
         self._launch_warps(summary.sum_length_kernel, chunks, [start, contacts, sums])
-        self._launch_kernel(summary.total_length_kernel, room, [start, sums], WARP_SIZE)
         self._launch_warps(summary.sum_mean_kernel, chunks, [start, contacts, sums])
-        self._launch_kernel(summary.average_contact_kernel, room, [*pools, self.pairs, start, sums, means], WARP_SIZE)
-        posed = [*pools, self.pairs, self.pair_poses]
         self._launch_warps(summary.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
-        self._launch_kernel(
-            summary.measure_travel_kernel, room, [*pools, self.pairs, start, contacts, sums, means], WARP_SIZE
-        )
+        self._launch_warps(summary.measure_travel_kernel, room, [*posed, start, self.faces, contacts, sums, means])
 
     def _read_rows(self, found: Found, count: int, device: bool):
         if device:

@@ -1,7 +1,6 @@
 """Reading what a launch found: to the host in one transfer of each kind, or into arrays that stay on the device."""
 
 from contextlib import nullcontext
-from functools import partial
 
 import numpy as np
 import warp as wp
@@ -240,9 +239,18 @@ class QueryReadout(QueryBuffers):
         if count == 0:
             return
         passes = self._sort_passes()
-        make = partial(make_sort, self.hits, count, len(self.pairs), passes, order, key, rows)
+        made = self.hits, count, len(self.pairs), passes, order, key, rows
+
+        def make(launch):
+            return make_sort(*made, self._sorted_ends(), launch)
+
         given = *self.guard.given(), count, order.ptr, key.ptr, rows.ptr
         sort_on_device(self._commands.find_callables("sort", given, self.device, make), count, passes, order, key)
+
+    def _sorted_ends(self) -> tuple:
+        """Return what the sort writes beside rows, see `make_sort`."""
+        none = wp.empty(0, dtype=wp.int32, device=self.device)
+        return none, none
 
     def _sort_passes(self) -> list:
         return sort_passes(len(self.pairs), int(self.batch.models.face_count.max()), self._regime.key_bits)

@@ -36,21 +36,24 @@ def sort_passes(pair_room: int, face_count: int, key_bits: int) -> list:
     return [(0, 0, face), (pair, face, 0)]
 
 
-def make_sort(hits, count: int, pair_room: int, passes: list, order, key, rows, launch) -> list:
+def make_sort(hits, count: int, pair_room: int, passes: list, order, key, rows, ends, launch) -> list:
     """Return what `launch` makes of the kernels that sort the first hits: one a pass, and the last.
 
     Args:
         hits: `Hits` whose face pairs are sorted; those that it lacks count as a pair of their own, the last.
         order, key: Scratch, device int32 and int64 (2 count,); the keys of the last pass stay.
         rows: Device vec3i (count,), for the hits in order.
+        ends: Device int32 (pair_room + 1,), for where those of each pair start, and int32 (1,), which becomes 0; or
+            (0,) twice.
         launch: Takes what `wp.launch` does.
     """
     made = []
     for number, widths in enumerate(passes):
         inputs = [pair_room, wp.vec3i(*widths), number == 0, hits.total, hits.face, order, key]
         made.append(launch(sort_hits.make_key_kernel, count, inputs, device=hits.face.device))
-    inputs = [hits.total, hits.face, order, rows]
-    return [*made, launch(sort_hits.place_row_kernel, count, inputs, device=hits.face.device)]
+    inputs = [count, sum(passes[-1][1:]), hits.total, hits.face, order, key, rows, *ends]
+    threads = max(count, len(ends[0]))
+    return [*made, launch(sort_hits.place_row_kernel, threads, inputs, device=hits.face.device)]
 
 
 def sort_on_device(launches: list, count: int, passes: list, order, key):

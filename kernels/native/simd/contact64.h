@@ -1,0 +1,110 @@
+// What contacts of 8 face pairs take, as functions of the same names one by one: no rounding differs.
+#pragma once
+#include "builtin.h"
+#include "sizes.h"
+#include "simd/float64.h"
+
+struct Contact64 {
+    typedef Float64 F;
+    typedef F::lanes lanes;
+    typedef F::bits bits;
+    typedef F::Point Point;
+
+    // Ends of edges in order, as `order_ends` says: 1 and -1.
+    struct Order {
+        bits after, before;
+    };
+
+    static Point negate(const Point& v) { return Point{-v.x, -v.y, -v.z}; }
+    static lanes dot(const Point& a, const Point& b) { return (a.x * b.x + a.y * b.y) + a.z * b.z; }
+    static lanes largest(const Point& v) {
+        const lanes x = F::absolute(v.x), y = F::absolute(v.y), z = F::absolute(v.z);
+        const lanes m = x >= y ? x : y;
+        return m >= z ? m : z;
+    }
+    static Point divide(const Point& v, const lanes& s) { return Point{v.x / s, v.y / s, v.z / s}; }
+    static lanes root(const lanes& x) { return __builtin_elementwise_sqrt(x); }
+    static lanes measure_length(const Point& v) {
+        const lanes m = largest(v);
+        const Point u = divide(v, m);
+        return m == 0.0 ? m : m * root(dot(u, u));
+    }
+    static Point unit_vector(const Point& v) {
+        const lanes m = largest(v);
+        const Point u = divide(v, m);
+        return F::choose(m == 0.0, v, divide(u, root(dot(u, u))));
+    }
+    // By columns, as Warp multiplies.
+    static Point turn(const double (&m)[3][3], const Point& v) {
+        return Point{(m[0][0] * v.x + m[0][1] * v.y) + m[0][2] * v.z, (m[1][0] * v.x + m[1][1] * v.y) + m[1][2] * v.z,
+                     (m[2][0] * v.x + m[2][1] * v.y) + m[2][2] * v.z};
+    }
+    static Point pose(const double (&m)[3][3], const wp::vec_t<3, wp::float64>& t, const Point& p) {
+        const Point v = turn(m, p);
+        const lanes x = v.x + t[0], y = v.y + t[1], z = v.z + t[2];
+        return Point{F::absolute(x) < COORDINATE_MIN ? lanes{} : x, F::absolute(y) < COORDINATE_MIN ? lanes{} : y,
+                     F::absolute(z) < COORDINATE_MIN ? lanes{} : z};
+    }
+    // As `round_volume`, of differences; adds the lanes whose error is not small enough to a mask.
+    static lanes volume(const Point& u, const Point& v, const Point& w, bits& open) {
+        const lanes v1w2 = v.y * w.z, v2w1 = v.z * w.y, w1u2 = w.y * u.z, w2u1 = w.z * u.y;
+        const lanes u1v2 = u.y * v.z, u2v1 = u.z * v.y;
+        const lanes value = (u.x * (v1w2 - v2w1) + v.x * (w1u2 - w2u1)) + w.x * (u1v2 - u2v1);
+        lanes size = F::absolute(u.x) * (F::absolute(v1w2) + F::absolute(v2w1));
+        size = size + F::absolute(v.x) * (F::absolute(w1u2) + F::absolute(w2u1));
+        size = size + F::absolute(w.x) * (F::absolute(u1v2) + F::absolute(u2v1));
+        open |= BOUND_3D * size > RELATIVE_ERROR * F::absolute(value);
+        return value;
+    }
+    // As `round_area`, of differences.
+    static lanes area(const lanes& ux, const lanes& uy, const lanes& vx, const lanes& vy, bits& open) {
+        const lanes left = ux * vy, right = uy * vx, value = left - right;
+        open |= BOUND_2D * (F::absolute(left) + F::absolute(right)) > RELATIVE_ERROR * F::absolute(value);
+        return value;
+    }
+    static Point face_normal(const Point& a, const Point& b, const Point& c, bits& open) {
+        const Point u = F::minus(a, c), v = F::minus(b, c);
+        return unit_vector(Point{area(u.y, u.z, v.y, v.z, open), area(u.z, u.x, v.z, v.x, open),
+                                 area(u.x, u.y, v.x, v.y, open)});
+    }
+    static Order order_ends(const Point& p1, const Point& e1, const Point& p2, const Point& e2, bits& open) {
+        const Point u = F::minus(p1, e2), v = F::minus(e1, e2), w = F::minus(p2, e2);
+        const F::Sign sign = F::determinant(u, v, w, F::sizes(u), F::sizes(v), F::sizes(w));
+        const lanes bound = BOUND_3D * sign.size;
+        const Order order = {sign.value > bound, sign.value < -bound};
+        open |= ~(order.after | order.before) & (bound != 0.0);
+        return order;
+    }
+    // As `rotate_triangles`: corners and their volumes from the lone one on, in either direction.
+    static void rotate(const bits& first, const bits& second, const bits& back, const Point (&c)[3],
+                       const lanes (&x)[3], Point& p, Point& q, Point& r, lanes& of_p, lanes& of_q, lanes& of_r) {
+        p = F::choose(first, c[0], F::choose(second, c[1], c[2]));
+        of_p = first ? x[0] : second ? x[1] : x[2];
+        const Point next = F::choose(first, c[1], F::choose(second, c[2], c[0]));
+        const Point last = F::choose(first, c[2], F::choose(second, c[0], c[1]));
+        const lanes of_next = first ? x[1] : second ? x[2] : x[0], of_last = first ? x[2] : second ? x[0] : x[1];
+        q = F::choose(back, last, next);
+        r = F::choose(back, next, last);
+        of_q = back ? of_last : of_next;
+        of_r = back ? of_next : of_last;
+    }
+    static Point cross_edge(const Point& p, const Point& q, const lanes& value_p, const lanes& value_q) {
+        const lanes part = value_p / (value_p - value_q);
+        const Point way = F::minus(q, p);
+        return Point{p.x + way.x * part, p.y + way.y * part, p.z + way.z * part};
+    }
+    static Point blend_normals(const Point& normal_a, const Point& normal_b) {
+        const Point normal = F::minus(normal_a, normal_b);
+        return unit_vector(F::choose(dot(normal, normal) <= SHORTEST_NORMAL * SHORTEST_NORMAL, normal_a, normal));
+    }
+    // Points as 24 numbers, one point after the other.
+    static void store(double* numbers, const Point& p) {
+        typedef double loose __attribute__((vector_size(64), aligned(8)));
+        const lanes xy_low = __builtin_shufflevector(p.x, p.y, 0, 8, 1, 9, 2, 10, 3, 11);
+        const lanes xy_high = __builtin_shufflevector(p.x, p.y, 4, 12, 5, 13, 6, 14, 7, 15);
+        const lanes xy_middle = __builtin_shufflevector(p.x, p.y, 10, 3, 11, 4, 12, 5, 13, 6);
+        *(loose*)numbers = __builtin_shufflevector(xy_low, p.z, 0, 1, 8, 2, 3, 9, 4, 5);
+        *(loose*)(numbers + 8) = __builtin_shufflevector(xy_middle, p.z, 10, 1, 2, 11, 3, 4, 12, 5);
+        *(loose*)(numbers + 16) = __builtin_shufflevector(xy_high, p.z, 3, 13, 4, 5, 14, 6, 7, 15);
+    }
+};

@@ -1,0 +1,122 @@
+// Contacts of the CPU: those of 8 face pairs at a time, as `find_contact` one by one.
+#pragma once
+#include "builtin.h"
+#include "simd/contact64.h"
+
+template <class ModelPool, class StatePool, class PairPose, class Contacts>
+wp::int32 simd_contacts(ModelPool models, StatePool states, PairPose pose, wp::mat_t<3, 3, wp::float64> rotation,
+                        wp::vec_t<3, wp::float64> position, bool proven, wp::vec_t<2, wp::int32> ends,
+                        wp::array_t<wp::vec_t<3, wp::int32>> faces, wp::int32 waiting, wp::array_t<wp::int32> place,
+                        Contacts contacts) {
+    wp::int32 result = 0;
+#if defined(__CUDA_ARCH__)
+    __trap();  // a lane finds a contact
+#else
+    {
+#pragma clang fp contract(off)
+#include "simd/contact64.h"
+        typedef Contact64 C;
+        typedef Float64 F;
+        typedef F::bits bits;
+        typedef F::lanes lanes;
+        typedef F::Point Point;
+        typedef double rows[24];
+        const double* vertices = (const double*)models.vertex_pos.data;
+        const wp::vec_t<4, wp::int32>* corners = states.face_corner.data;
+        const bool with_gap = contacts.separation.shape[0] != 0, back = pose.swapped != 0;
+        wp::vec_t<3, wp::float64>* target[5] = {contacts.p0.data, contacts.p1.data, contacts.normal_a.data,
+                                                contacts.normal_b.data, contacts.normal.data};
+        int from = ends[0];
+        while (from < ends[1]) {
+            // Faces that are apart for a gap have what they need.
+            int hit[8], start[6][8], count = 0;
+            for (; from < ends[1] && count < 8; ++from)
+                if (!with_gap || contacts.separation.data[from] < 0.0)
+                    hit[count++] = from;
+            if (count == 0)
+                break;
+            for (int k = 0; k < 8; ++k) {
+                const wp::vec_t<3, wp::int32>& pair = faces.data[hit[k < count ? k : 0]];
+                const wp::vec_t<4, wp::int32>& a = corners[pose.corner_a + pair[back ? 2 : 1]];
+                const wp::vec_t<4, wp::int32>& b = corners[pose.corner_b + pair[back ? 1 : 2]];
+                for (int i = 0; i < 3; ++i) {
+                    start[i][k] = 4 * a[i];
+                    start[3 + i][k] = 4 * b[i];
+                }
+            }
+            Point a[3], b[3], d[3][3];
+            for (int i = 0; i < 3; ++i) {
+                a[i] = F::gather(vertices, start[i]);
+                b[i] = C::pose(pose.rotation.data, pose.translation, F::gather(vertices, start[3 + i]));
+            }
+            // From each corner of A to each of B: the other way round, every rounding is the same.
+            for (int i = 0; i < 3; ++i)
+                for (int j = 0; j < 3; ++j)
+                    d[i][j] = F::minus(b[j], a[i]);
+            bits open = {};
+            const Point own_a = C::face_normal(a[0], a[1], a[2], open), own_b = C::face_normal(b[0], b[1], b[2], open);
+            lanes u[3], v[3];
+            bits up_a[3], up_b[3];
+            for (int i = 0; i < 3; ++i) {
+                u[i] = C::volume(d[i][0], d[i][1], d[i][2], open);
+                v[i] = -C::volume(d[0][i], d[1][i], d[2][i], open);
+                up_a[i] = u[i] > 0.0;
+                up_b[i] = v[i] > 0.0;
+                open |= (u[i] == 0.0) | (v[i] == 0.0);
+            }
+            // All corners of either on one side: as a coarser precision can report them.
+            open |= ~(up_a[0] ^ up_a[1]) & ~(up_a[1] ^ up_a[2]);
+            open |= ~(up_b[0] ^ up_b[1]) & ~(up_b[1] ^ up_b[2]);
+            // As `rotate_triangles` where no corner touches: p the lone corner, then q and r.
+            const bits first_a = (up_a[0] ^ up_a[1]) & ~(up_a[1] ^ up_a[2]);
+            const bits second_a = (up_a[0] ^ up_a[1]) & (up_a[1] ^ up_a[2]);
+            const bits first_b = (up_b[0] ^ up_b[1]) & ~(up_b[1] ^ up_b[2]);
+            const bits second_b = (up_b[0] ^ up_b[1]) & (up_b[1] ^ up_b[2]);
+            const bits below_a = ~(first_a ? up_a[0] : second_a ? up_a[1] : up_a[2]);
+            const bits below_b = ~(first_b ? up_b[0] : second_b ? up_b[1] : up_b[2]);
+            Point pa, qa, ra, pb, qb, rb;
+            lanes up, uq, ur, vp, vq, vr;
+            C::rotate(first_a, second_a, below_b, a, u, pa, qa, ra, up, uq, ur);
+            C::rotate(first_b, second_b, below_a, b, v, pb, qb, rb, vp, vq, vr);
+            // Of X(q), X(r) on A's edges against Y(q), Y(r) on B's; that the other two are in order is why faces meet.
+            const bits qr = C::order_ends(pa, qa, pb, rb, open).after, rq = C::order_ends(pa, ra, pb, qb, open).after;
+            if (!proven) {
+                open |= C::order_ends(pa, qa, pb, qb, open).after;
+                open |= C::order_ends(pa, ra, pb, rb, open).before;
+            }
+            Point p0 = C::cross_edge(F::choose(qr, pa, pb), F::choose(qr, qa, rb), qr ? up : vp, qr ? uq : vr);
+            Point p1 = C::cross_edge(F::choose(rq, pb, pa), F::choose(rq, qb, ra), rq ? vp : up, rq ? vq : ur);
+            p0 = C::pose(rotation.data, position, p0);
+            p1 = C::pose(rotation.data, position, p1);
+            const Point normal_a = C::unit_vector(C::turn(rotation.data, own_a));
+            const Point normal_b = C::unit_vector(C::turn(rotation.data, own_b));
+            const Point normal = C::blend_normals(normal_a, normal_b);
+            // Segments run the other way for one of two orders of the lone corners' sides, and of the objects.
+            const bits turned = (below_a ^ below_b) ^ (bits{} - (wp::int64)back);
+            const Point found[5] = {F::choose(turned, p1, p0), F::choose(turned, p0, p1), back ? normal_b : normal_a,
+                                    back ? normal_a : normal_b, back ? C::negate(normal) : normal};
+            const unsigned int unsure = F::to_mask(open) & ((1u << count) - 1);
+            for (unsigned int left = unsure; __builtin_expect(left != 0, 0); left &= left - 1)
+                place.data[waiting++] = hit[__builtin_ctz(left)];
+            if (count == 8 && hit[7] - hit[0] == 7) {
+                for (int i = 0; i < 5; ++i)
+                    C::store((double*)(target[i] + hit[0]), found[i]);
+                for (int k = 0; k < 8; ++k)
+                    contacts.coplanar.data[hit[k]] = 0;
+                continue;
+            }
+            for (int i = 0; i < 5; ++i) {
+                rows numbers;
+                C::store(numbers, found[i]);
+                for (int k = 0; k < count; ++k)
+                    for (int c = 0; c < 3; ++c)
+                        target[i][hit[k]][c] = numbers[3 * k + c];
+            }
+            for (int k = 0; k < count; ++k)
+                contacts.coplanar.data[hit[k]] = 0;
+        }
+        result = waiting;
+    }
+#endif
+    return result;
+}
