@@ -135,65 +135,6 @@ def write_contact(
     contacts.normal[i] = wp.where(back, -normal, normal)
 
 
-@wp.func
-def filter_contact(
-    extends: bool,
-    proven: bool,
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    i: wp.int32,
-    faces: wp.array(dtype=wp.vec3i),
-    contacts: Contacts,
-):
-    """Write a contact where float64 is sure of it, and return whether; with double words, `extends`, it is of more."""
-    p = faces[i][0]
-    own = contact_objects(pairs, pair_poses, p)
-    a = load_corner_ids(states, pair_poses[p].corner_a + faces[i][1 + own.swapped])
-    b = load_corner_ids(states, pair_poses[p].corner_b + faces[i][2 - own.swapped])
-    rotation = pair_poses[p].rotation
-    shift = pair_poses[p].translation
-    a0 = load_vertex(models.vertex_pos, a[0])
-    a1 = load_vertex(models.vertex_pos, a[1])
-    a2 = load_vertex(models.vertex_pos, a[2])
-    b0 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[0]))
-    b1 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[1]))
-    b2 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[2]))
-    normal_a, sure_a = filter_normal(extends, a0, a1, a2)
-    normal_b, sure_b = filter_normal(extends, b0, b1, b2)
-    p0, p1, sure = filter_segment(extends, proven, a0, a1, a2, b0, b1, b2)
-    sure = sure and sure_a and sure_b
-    if sure:
-        write_contact(models, states, objects, own, i, p0, p1, normal_a, normal_b, contacts)
-        contacts.coplanar[i] = 0
-    return sure
-
-
-@wp.func
-def decide_contact(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    i: wp.int32,
-    faces: wp.array(dtype=wp.vec3i),
-    contacts: Contacts,
-):
-    """Write a contact by exact signs."""
-    p = faces[i][0]
-    own = contact_objects(pairs, pair_poses, p)
-    corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(models, states, pair_poses[p], faces[i][1 + own.swapped], faces[i][2 - own.swapped], corner)
-    p0, p1, coplanar = intersect_faces(pair_poses[p].scale, corner)
-    normal_a = face_normal(corner[0], corner[1], corner[2])
-    normal_b = face_normal(corner[3], corner[4], corner[5])
-    write_contact(models, states, objects, own, i, p0, p1, normal_a, normal_b, contacts)
-    contacts.coplanar[i] = coplanar
-
-
 @wp.kernel(cuda_max_registers=128)
 def find_contact_kernel(
     models: ModelPool,
@@ -210,13 +151,31 @@ def find_contact_kernel(
     """Compute the contact of one intersecting face pair a thread, or defer it where float64 is not sure of it.
 
     Args:
-        proven: Whether the face pairs are known to intersect, by exact signs.
+        proven: Whether face pairs are known to intersect, by exact signs.
         start: Where the face pairs of each object pair start, shape [pair + 1]; after the last pair, where all end.
     """
     i = wp.tid()
     if i >= start[start.shape[0] - 1] or not have_crossed(contacts_out, i):
         return
-    if not filter_contact(False, proven, models, states, objects, pairs, pair_poses, i, faces, contacts_out):
+    p = faces[i][0]
+    own = contact_objects(pairs, pair_poses, p)
+    a = load_corner_ids(states, pair_poses[p].corner_a + faces[i][1 + own.swapped])
+    b = load_corner_ids(states, pair_poses[p].corner_b + faces[i][2 - own.swapped])
+    rotation = pair_poses[p].rotation
+    shift = pair_poses[p].translation
+    a0 = load_vertex(models.vertex_pos, a[0])
+    a1 = load_vertex(models.vertex_pos, a[1])
+    a2 = load_vertex(models.vertex_pos, a[2])
+    b0 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[0]))
+    b1 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[1]))
+    b2 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[2]))
+    normal_a, sure_a = filter_normal(a0, a1, a2)
+    normal_b, sure_b = filter_normal(b0, b1, b2)
+    p0, p1, sure = filter_segment(proven, a0, a1, a2, b0, b1, b2)
+    if sure and sure_a and sure_b:
+        write_contact(models, states, objects, own, i, p0, p1, normal_a, normal_b, contacts_out)
+        contacts_out.coplanar[i] = 0
+    else:
         deferred_inout.place[wp.atomic_add(deferred_inout.total, 0, 1)] = i
 
 
@@ -228,16 +187,23 @@ def find_deferred_kernel(
     objects: ObjectPool,
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
-    proven: bool,
     faces: wp.array(dtype=wp.vec3i),
     deferred: Deferred,
     contacts_out: Contacts,
 ):
-    """Compute deferred contacts, in double words or by exact signs: few at a time in each warp of so many threads."""
+    """Compute deferred contacts by exact signs: few at a time in each warp of so many threads."""
     at_once = wp.min(items_at_once(deferred.total[0], step), EXPANSION_LANES)
     k = at_once * (wp.tid() / warp_size()) + warp_lane()
     while warp_lane() < at_once and k < deferred.total[0]:
         i = deferred.place[k]
-        if not filter_contact(True, proven, models, states, objects, pairs, pair_poses, i, faces, contacts_out):
-            decide_contact(models, states, objects, pairs, pair_poses, i, faces, contacts_out)
+        p = faces[i][0]
+        own = contact_objects(pairs, pair_poses, p)
+        corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
+        face_a, face_b = faces[i][1 + own.swapped], faces[i][2 - own.swapped]
+        load_corners(models, states, pair_poses[p], face_a, face_b, corner)
+        p0, p1, coplanar = intersect_faces(pair_poses[p].scale, corner)
+        normal_a = face_normal(corner[0], corner[1], corner[2])
+        normal_b = face_normal(corner[3], corner[4], corner[5])
+        write_contact(models, states, objects, own, i, p0, p1, normal_a, normal_b, contacts_out)
+        contacts_out.coplanar[i] = coplanar
         k += at_once * (step / warp_size())

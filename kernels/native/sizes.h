@@ -110,6 +110,7 @@ constexpr int UNCERTAIN = 8;
 constexpr double COORDINATE_MIN = 0x1p-290;
 constexpr double BOUND_3D = 0x1.0000000000008p-50;
 constexpr double BOUND_2D = 0x1.8000000000004p-52;
+constexpr double BOUND_DOUBLE = 0x1p-100;
 constexpr double RELATIVE_ERROR = 0x1p-42;
 constexpr double SHORTEST_NORMAL = 0x1p-20;
 

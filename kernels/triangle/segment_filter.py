@@ -2,7 +2,7 @@
 
 What this is sure of has the bits of `segment`, which decides the rest: a determinant whose float64 value may err too
 much there is the sum of an expansion, off the float64 number next to it by nothing but a tie that double words exclude.
-Without double words, `extends` False, it is sure of fewer; as a constant the flag costs nothing.
+Each thread of a warp takes its own next of them, so that threads need not wait for one another.
 """
 
 import warp as wp
@@ -16,75 +16,75 @@ from warp_abtree.kernels.arithmetic.predicates import (
     filter_orient3d,
     plain_sign,
 )
-from warp_abtree.kernels.triangle.intersect import find_alone, is_one_sided, rotate_triangles
+from warp_abtree.kernels.traversal.warp_stack import lowest_bit
+from warp_abtree.kernels.triangle.intersect import find_alone, is_one_sided, pick_corners, rotate_triangles
 from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR, cross_edge, round_area, round_volume, unit_vector
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 @wp.func(inline=False)
-def extend_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, size: wp.float64):
+def extend_volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """Return det(a - d, b - d, c - d) rounded once, or NaN. Not inlined: long, and rarely called."""
+    _, size = round_volume(a - d, b - d, c - d)
     return round_double(double_orient3d(a, b, c, d), BOUND_DOUBLE * size)
 
 
 @wp.func(inline=False)
-def extend_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, size: wp.float64):
-    """Return det(a - c, b - c) rounded once, or NaN."""
-    return round_double(double_orient2d(a, b, c), BOUND_DOUBLE * size)
+def extend_area(axis: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """Return det(a - c, b - c) along an axis rounded once, or NaN."""
+    a2, b2, c2 = drop_axis(a, axis), drop_axis(b, axis), drop_axis(c, axis)
+    _, size = round_area(a2, b2, c2)
+    return round_double(double_orient2d(a2, b2, c2), BOUND_DOUBLE * size)
 
 
 @wp.func
-def filter_volume(
-    extends: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, u: wp.vec3d, v: wp.vec3d, w: wp.vec3d
-):
-    """Return `signed_volume`, or NaN; u, v and w are a - d, b - d and c - d."""
-    value, size = round_volume(u, v, w)
-    if BOUND_3D * size > RELATIVE_ERROR * wp.abs(value):
-        value = wp.float64(wp.nan)
-        if extends:
-            value = extend_volume(a, b, c, d, size)
-    return value
+def plain_volume(k: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Return det(a - d, b - d, c - d) as float64 has it, and bit k where that may err too much."""
+    value, size = round_volume(a - d, b - d, c - d)
+    return value, wp.where(BOUND_3D * size > RELATIVE_ERROR * wp.abs(value), 1 << k, 0)
 
 
 @wp.func
-def filter_area(extends: bool, a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
-    """Return `signed_area`, or NaN."""
-    value, size = round_area(a, b, c)
-    if BOUND_2D * size > RELATIVE_ERROR * wp.abs(value):
-        value = wp.float64(wp.nan)
-        if extends:
-            value = extend_area(a, b, c, size)
-    return value
-
-
-@wp.func
-def filter_normal(extends: bool, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
-    """Return `face_normal`, and whether it is sure of it."""
-    x = filter_area(extends, drop_axis(a, 0), drop_axis(b, 0), drop_axis(c, 0))
-    y = filter_area(extends, drop_axis(a, 1), drop_axis(b, 1), drop_axis(c, 1))
-    z = filter_area(extends, drop_axis(a, 2), drop_axis(b, 2), drop_axis(c, 2))
-    return unit_vector(wp.vec3d(x, y, z)), x == x and y == y and z == z
-
-
-@wp.func
-def filter_volumes(
-    extends: bool, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d
-):
-    """Return the volume of each corner of A and triangle B, then of each of B and A.
-
-    The differences of corners are those of either: the other way round, every rounding is the same.
-    """
-    d00, d01, d02 = b0 - a0, b1 - a0, b2 - a0
-    d10, d11, d12 = b0 - a1, b1 - a1, b2 - a1
-    d20, d21, d22 = b0 - a2, b1 - a2, b2 - a2
-    u0 = filter_volume(extends, b0, b1, b2, a0, d00, d01, d02)
-    u1 = filter_volume(extends, b0, b1, b2, a1, d10, d11, d12)
-    u2 = filter_volume(extends, b0, b1, b2, a2, d20, d21, d22)
-    v0 = filter_volume(extends, a0, a1, a2, b0, -d00, -d10, -d20)
-    v1 = filter_volume(extends, a0, a1, a2, b1, -d01, -d11, -d21)
-    v2 = filter_volume(extends, a0, a1, a2, b2, -d02, -d12, -d22)
+def filter_volumes(a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
+    """Return `signed_volume` of triangle B and each corner of A, then of A and each of B, or NaN."""
+    u0, pending0 = plain_volume(0, b0, b1, b2, a0)
+    u1, pending1 = plain_volume(1, b0, b1, b2, a1)
+    u2, pending2 = plain_volume(2, b0, b1, b2, a2)
+    v0, pending3 = plain_volume(3, a0, a1, a2, b0)
+    v1, pending4 = plain_volume(4, a0, a1, a2, b1)
+    v2, pending5 = plain_volume(5, a0, a1, a2, b2)
+    pending = pending0 | pending1 | pending2 | pending3 | pending4 | pending5
+    while pending != 0:
+        k = lowest_bit(pending)
+        pending &= pending - 1
+        a, b, c, d = pick_corners(k, a0, a1, a2, b0, b1, b2)
+        value = extend_volume(a, b, c, d)
+        u0, u1, u2 = wp.where(k == 0, value, u0), wp.where(k == 1, value, u1), wp.where(k == 2, value, u2)
+        v0, v1, v2 = wp.where(k == 3, value, v0), wp.where(k == 4, value, v1), wp.where(k == 5, value, v2)
     return u0, u1, u2, v0, v1, v2
+
+
+@wp.func
+def plain_area(k: wp.int32, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """Return det(a - c, b - c) along axis k as float64 has it, and bit k where that may err too much."""
+    value, size = round_area(drop_axis(a, k), drop_axis(b, k), drop_axis(c, k))
+    return value, wp.where(BOUND_2D * size > RELATIVE_ERROR * wp.abs(value), 1 << k, 0)
+
+
+@wp.func
+def filter_normal(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    """Return `face_normal`, and whether it is sure of it."""
+    x, pending0 = plain_area(0, a, b, c)
+    y, pending1 = plain_area(1, a, b, c)
+    z, pending2 = plain_area(2, a, b, c)
+    pending = pending0 | pending1 | pending2
+    while pending != 0:
+        k = lowest_bit(pending)
+        pending &= pending - 1
+        value = extend_area(k, a, b, c)
+        x, y, z = wp.where(k == 0, value, x), wp.where(k == 1, value, y), wp.where(k == 2, value, z)
+    return unit_vector(wp.vec3d(x, y, z)), x == x and y == y and z == z
 
 
 @wp.func
@@ -96,20 +96,13 @@ def order_ends(p1: wp.vec3d, e1: wp.vec3d, p2: wp.vec3d, e2: wp.vec3d):
 
 @wp.func
 def filter_segment(
-    extends: bool,
-    proven: bool,
-    a0: wp.vec3d,
-    a1: wp.vec3d,
-    a2: wp.vec3d,
-    b0: wp.vec3d,
-    b1: wp.vec3d,
-    b2: wp.vec3d,
+    proven: bool, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d
 ):
     """Return the ends of `cross_planes`, and whether it is sure of them; `proven` that the triangles intersect.
 
     Source: as `cross_planes`, whose names these are.
     """
-    u0, u1, u2, v0, v1, v2 = filter_volumes(extends, a0, a1, a2, b0, b1, b2)
+    u0, u1, u2, v0, v1, v2 = filter_volumes(a0, a1, a2, b0, b1, b2)
     sa = wp.vec3i(plain_sign(u0), plain_sign(u1), plain_sign(u2))
     sb = wp.vec3i(plain_sign(v0), plain_sign(v1), plain_sign(v2))
     # NaN has no sign.

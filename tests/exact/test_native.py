@@ -13,6 +13,7 @@ from conftest import slow
 
 from warp_abtree import kernels
 from warp_abtree.kernels import native
+from warp_abtree.kernels.arithmetic.double_word import BOUND_DOUBLE
 from warp_abtree.kernels.arithmetic.expansion import two_sum
 from warp_abtree.kernels.arithmetic.predicates import BOUND_2D, BOUND_3D, EXACT, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.contact.contact import SHORTEST_NORMAL
@@ -24,6 +25,7 @@ from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR
 DOUBLES = {
     "BOUND_2D": BOUND_2D,
     "BOUND_3D": BOUND_3D,
+    "BOUND_DOUBLE": BOUND_DOUBLE,
     "COORDINATE_MIN": COORDINATE_MIN,
     "RELATIVE_ERROR": RELATIVE_ERROR,
     "SHORTEST_NORMAL": SHORTEST_NORMAL,

@@ -246,7 +246,7 @@ class ContactQuery(Query):
         else:
             self._launch_kernel(simd.find_pair_contacts_kernel, len(self.pairs), inputs)
         step = DEFERRED_WARPS * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
-        inputs = [step, *posed, proven, self.faces, self._deferred, self.contacts]
+        inputs = [step, *posed, self.faces, self._deferred, self.contacts]
         self._launch_kernel(contact.find_deferred_kernel, step, inputs, WARP_SIZE)
 
     def _reduce(self, count: int):

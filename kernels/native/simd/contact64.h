@@ -2,10 +2,11 @@
 #pragma once
 #include "builtin.h"
 #include "sizes.h"
-#include "simd/float64.h"
+#include "simd/double64.h"
 
 struct Contact64 {
     typedef Float64 F;
+    typedef Double64 D;
     typedef F::lanes lanes;
     typedef F::bits bits;
     typedef F::Point Point;
@@ -45,27 +46,42 @@ struct Contact64 {
         return Point{F::absolute(x) < COORDINATE_MIN ? lanes{} : x, F::absolute(y) < COORDINATE_MIN ? lanes{} : y,
                      F::absolute(z) < COORDINATE_MIN ? lanes{} : z};
     }
-    // As `round_volume`, of differences; adds the lanes whose error is not small enough to a mask.
-    static lanes volume(const Point& u, const Point& v, const Point& w, bits& open) {
+    // As `round_volume`, of differences, and the sum of magnitudes.
+    static lanes volume(const Point& u, const Point& v, const Point& w, lanes& size) {
         const lanes v1w2 = v.y * w.z, v2w1 = v.z * w.y, w1u2 = w.y * u.z, w2u1 = w.z * u.y;
         const lanes u1v2 = u.y * v.z, u2v1 = u.z * v.y;
-        const lanes value = (u.x * (v1w2 - v2w1) + v.x * (w1u2 - w2u1)) + w.x * (u1v2 - u2v1);
-        lanes size = F::absolute(u.x) * (F::absolute(v1w2) + F::absolute(v2w1));
+        size = F::absolute(u.x) * (F::absolute(v1w2) + F::absolute(v2w1));
         size = size + F::absolute(v.x) * (F::absolute(w1u2) + F::absolute(w2u1));
         size = size + F::absolute(w.x) * (F::absolute(u1v2) + F::absolute(u2v1));
-        open |= BOUND_3D * size > RELATIVE_ERROR * F::absolute(value);
+        return (u.x * (v1w2 - v2w1) + v.x * (w1u2 - w2u1)) + w.x * (u1v2 - u2v1);
+    }
+    // As `filter_volumes`, or without double words where it does not extend: of triangle (a, b, c) and d, with u, v and
+    // w their differences, perhaps all turned round. Adds the lanes that it is not sure of to a mask.
+    static lanes filter_volume(bool extends, const Point (&c)[3], const Point& d, const Point& u, const Point& v,
+                               const Point& w, bits& unsure) {
+        lanes size, value = volume(u, v, w, size);
+        bits open = BOUND_3D * size > RELATIVE_ERROR * F::absolute(value);
+        if (__builtin_expect(extends && F::to_mask(open) != 0, 0))
+            value = D::round(D::orient3d(c[0], c[1], c[2], d), BOUND_DOUBLE * size, value, open);
+        unsure |= open;
         return value;
     }
-    // As `round_area`, of differences.
-    static lanes area(const lanes& ux, const lanes& uy, const lanes& vx, const lanes& vy, bits& open) {
-        const lanes left = ux * vy, right = uy * vx, value = left - right;
-        open |= BOUND_2D * (F::absolute(left) + F::absolute(right)) > RELATIVE_ERROR * F::absolute(value);
+    // As `filter_normal`, in the same way.
+    static lanes filter_area(bool extends, const lanes& ax, const lanes& ay, const lanes& bx, const lanes& by,
+                             const lanes& cx, const lanes& cy, bits& unsure) {
+        const lanes left = (ax - cx) * (by - cy), right = (ay - cy) * (bx - cx);
+        const lanes size = F::absolute(left) + F::absolute(right);
+        lanes value = left - right;
+        bits open = BOUND_2D * size > RELATIVE_ERROR * F::absolute(value);
+        if (__builtin_expect(extends && F::to_mask(open) != 0, 0))
+            value = D::round(D::orient2d(ax, ay, bx, by, cx, cy), BOUND_DOUBLE * size, value, open);
+        unsure |= open;
         return value;
     }
-    static Point face_normal(const Point& a, const Point& b, const Point& c, bits& open) {
-        const Point u = F::minus(a, c), v = F::minus(b, c);
-        return unit_vector(Point{area(u.y, u.z, v.y, v.z, open), area(u.z, u.x, v.z, v.x, open),
-                                 area(u.x, u.y, v.x, v.y, open)});
+    static Point filter_normal(bool extends, const Point& a, const Point& b, const Point& c, bits& unsure) {
+        return unit_vector(Point{filter_area(extends, a.y, a.z, b.y, b.z, c.y, c.z, unsure),
+                                 filter_area(extends, a.z, a.x, b.z, b.x, c.z, c.x, unsure),
+                                 filter_area(extends, a.x, a.y, b.x, b.y, c.x, c.y, unsure)});
     }
     static Order order_ends(const Point& p1, const Point& e1, const Point& p2, const Point& e2, bits& open) {
         const Point u = F::minus(p1, e2), v = F::minus(e1, e2), w = F::minus(p2, e2);

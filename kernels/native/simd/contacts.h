@@ -20,21 +20,14 @@ wp::int32 simd_contacts(ModelPool models, StatePool states, PairPose pose, wp::m
         typedef F::bits bits;
         typedef F::lanes lanes;
         typedef F::Point Point;
-        typedef double rows[24];
         const double* vertices = (const double*)models.vertex_pos.data;
         const wp::vec_t<4, wp::int32>* corners = states.face_corner.data;
         const bool with_gap = contacts.separation.shape[0] != 0, back = pose.swapped != 0;
         wp::vec_t<3, wp::float64>* target[5] = {contacts.p0.data, contacts.p1.data, contacts.normal_a.data,
                                                 contacts.normal_b.data, contacts.normal.data};
-        int from = ends[0];
-        while (from < ends[1]) {
-            // Faces that are apart for a gap have what they need.
-            int hit[8], start[6][8], count = 0;
-            for (; from < ends[1] && count < 8; ++from)
-                if (!with_gap || contacts.separation.data[from] < 0.0)
-                    hit[count++] = from;
-            if (count == 0)
-                break;
+        // So many face pairs; returns those that it is not sure of, a bit each.
+        auto find = [&](bool extends, const int* hit, int count) {
+            int start[6][8];
             for (int k = 0; k < 8; ++k) {
                 const wp::vec_t<3, wp::int32>& pair = faces.data[hit[k < count ? k : 0]];
                 const wp::vec_t<4, wp::int32>& a = corners[pose.corner_a + pair[back ? 2 : 1]];
@@ -54,12 +47,14 @@ wp::int32 simd_contacts(ModelPool models, StatePool states, PairPose pose, wp::m
                 for (int j = 0; j < 3; ++j)
                     d[i][j] = F::minus(b[j], a[i]);
             bits open = {};
-            const Point own_a = C::face_normal(a[0], a[1], a[2], open), own_b = C::face_normal(b[0], b[1], b[2], open);
+            const Point own_a = C::filter_normal(extends, a[0], a[1], a[2], open);
+            const Point own_b = C::filter_normal(extends, b[0], b[1], b[2], open);
             lanes u[3], v[3];
             bits up_a[3], up_b[3];
             for (int i = 0; i < 3; ++i) {
-                u[i] = C::volume(d[i][0], d[i][1], d[i][2], open);
-                v[i] = -C::volume(d[0][i], d[1][i], d[2][i], open);
+                u[i] = C::filter_volume(extends, b, a[i], d[i][0], d[i][1], d[i][2], open);
+                v[i] = C::filter_volume(extends, a, b[i], C::negate(d[0][i]), C::negate(d[1][i]), C::negate(d[2][i]),
+                                        open);
                 up_a[i] = u[i] > 0.0;
                 up_b[i] = v[i] > 0.0;
                 open |= (u[i] == 0.0) | (v[i] == 0.0);
@@ -95,27 +90,43 @@ wp::int32 simd_contacts(ModelPool models, StatePool states, PairPose pose, wp::m
             const bits turned = (below_a ^ below_b) ^ (bits{} - (wp::int64)back);
             const Point found[5] = {F::choose(turned, p1, p0), F::choose(turned, p0, p1), back ? normal_b : normal_a,
                                     back ? normal_a : normal_b, back ? C::negate(normal) : normal};
-            const unsigned int unsure = F::to_mask(open) & ((1u << count) - 1);
-            for (unsigned int left = unsure; __builtin_expect(left != 0, 0); left &= left - 1)
-                place.data[waiting++] = hit[__builtin_ctz(left)];
             if (count == 8 && hit[7] - hit[0] == 7) {
                 for (int i = 0; i < 5; ++i)
                     C::store((double*)(target[i] + hit[0]), found[i]);
-                for (int k = 0; k < 8; ++k)
-                    contacts.coplanar.data[hit[k]] = 0;
-                continue;
-            }
-            for (int i = 0; i < 5; ++i) {
-                rows numbers;
-                C::store(numbers, found[i]);
-                for (int k = 0; k < count; ++k)
-                    for (int c = 0; c < 3; ++c)
-                        target[i][hit[k]][c] = numbers[3 * k + c];
+            } else {
+                for (int i = 0; i < 5; ++i) {
+                    double numbers[24];
+                    C::store(numbers, found[i]);
+                    for (int k = 0; k < count; ++k)
+                        for (int c = 0; c < 3; ++c)
+                            target[i][hit[k]][c] = numbers[3 * k + c];
+                }
             }
             for (int k = 0; k < count; ++k)
                 contacts.coplanar.data[hit[k]] = 0;
+            return F::to_mask(open) & ((1u << count) - 1);
+        };
+        // First without double words, then with them those that need them, side by side: on the list, which they leave.
+        int* list = place.data + waiting;
+        int from = ends[0], count = 0, left = 0, hit[8];
+        for (; from < ends[1]; ++from) {
+            // Faces that are apart for a gap have what they need.
+            if (!with_gap || contacts.separation.data[from] < 0.0)
+                hit[count++] = from;
+            if (count == 8 || (count > 0 && from + 1 == ends[1])) {
+                for (unsigned int open = find(false, hit, count); open != 0; open &= open - 1)
+                    list[left++] = hit[__builtin_ctz(open)];
+                count = 0;
+            }
         }
         result = waiting;
+        for (int i = 0; i < left; i += 8) {
+            count = left - i < 8 ? left - i : 8;
+            for (int k = 0; k < count; ++k)
+                hit[k] = list[i + k];
+            for (unsigned int open = find(true, hit, count); open != 0; open &= open - 1)
+                place.data[result++] = hit[__builtin_ctz(open)];
+        }
     }
 #endif
     return result;
