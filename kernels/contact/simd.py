@@ -4,8 +4,16 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.contact.contact import Contacts, Deferred
+from warp_abtree.kernels.contact.contact import Contacts, Deferred, contact_objects
+from warp_abtree.kernels.contact.summary import (
+    PairContacts,
+    choose_travel,
+    mean_normal,
+    reach_contacts,
+    write_no_contacts,
+)
 from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.warp_stack import six_numbers
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -34,6 +42,21 @@ def simd_contacts(
 
     Returns how many entries the list has then.
     """
+
+
+@wp.func_native(native.body("simd/contact_sums.h", "simd_sum_lengths"))
+def simd_sum_lengths(contacts: Contacts, ends: wp.vec2i) -> six_numbers:
+    """Return the length of an object pair's contacts, and how many are of faces that intersect, as `sum_lengths`."""
+
+
+@wp.func_native(native.body("simd/contact_sums.h", "simd_sum_means"))
+def simd_sum_means(contacts: Contacts, ends: wp.vec2i, total: wp.float64, number: wp.float64) -> six_numbers:
+    """Return the mean point of a pair's contacts, from the first end, and the mean of normals, as `sum_means`."""
+
+
+@wp.func_native(native.body("simd/contact_sums.h", "simd_sum_areas"))
+def simd_sum_areas(contacts: Contacts, ends: wp.vec2i, middle: wp.vec3d, normal: wp.vec3d) -> six_numbers:
+    """Return the area within a pair's contact curve and its change, as `sum_loop`."""
 
 
 @wp.kernel
@@ -66,3 +89,39 @@ def find_pair_contacts_kernel(
             deferred_inout.place,
             contacts_out,
         )
+
+
+@wp.kernel
+def sum_pair_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
+    pair_contacts_out: PairContacts,
+):
+    """Sum the contacts of one object pair a thread, as the kernels of `summary` do; CPU only."""
+    p = wp.tid()
+    ends = wp.vec2i(start[p], start[p + 1])
+    lengths = simd_sum_lengths(contacts, ends)
+    if lengths[1] == wp.float64(0.0):
+        write_no_contacts(p, pair_contacts_out)
+        return
+    means = simd_sum_means(contacts, ends, lengths[0], lengths[1])
+    middle = wp.vec3d(means[0], means[1], means[2])
+    n = mean_normal(models, states, objects, pairs[p], wp.vec3d(means[3], means[4], means[5]))
+    areas = simd_sum_areas(contacts, ends, middle, n)
+    origin = contacts.p0[ends[0]]
+    front, back = wp.float64(0.0), wp.float64(0.0)
+    if areas[0] == wp.float64(0.0):
+        own = contact_objects(pairs, pair_poses, p)
+        span = wp.vec3i(p, ends[0], ends[1])
+        front, back = reach_contacts(models, states, objects, own, pair_poses[p], span, faces, contacts, n, origin)
+    pair_contacts_out.normal[p] = n
+    pair_contacts_out.point[p] = origin + middle
+    pair_contacts_out.travel[p] = choose_travel(
+        models, states, objects, pairs[p], n, origin, areas[0], areas[1], front - back
+    )

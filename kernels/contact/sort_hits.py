@@ -1,11 +1,13 @@
 """Hits in the order of `Result.faces`, (pair, face a, face b), on the device: what goes before and after a radix sort.
 
 All of it has the size of the buffer of hits, so that a CUDA graph can hold it; places without a hit sort behind them.
+One thread of the CPU sorts the hits of contacts by itself, in the caches.
 """
 
 import warp as wp
 
-from warp_abtree.kernels.traversal.face_pairs import PAIR_MASK
+from warp_abtree.kernels import native
+from warp_abtree.kernels.traversal.face_pairs import NEAR_BIT, PAIR_MASK
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -78,3 +80,36 @@ def place_row_kernel(
         # One more than there are keys: the search never looks at its end, and returns the place before it if all are
         # less.
         start_out[i] = wp.lower_bound(key, 0, capacity + 1, wp.int64(i) << wp.int64(shift))
+
+
+@wp.func_native(native.body("sort_by_pair.h", "sort_by_pair"))
+def sort_by_pair(
+    count: wp.int32,
+    pair_mask: wp.int32,
+    flag: wp.int32,
+    face: wp.array(dtype=wp.vec3i),
+    key: wp.array(dtype=wp.int64),
+    sorted: wp.array(dtype=wp.vec3i),
+    start: wp.array(dtype=wp.int32),
+):
+    """Write the first hits in order, whose pairs are numbers with a flag, and where those of each pair start."""
+
+
+@wp.kernel
+def sort_by_pair_kernel(
+    capacity: wp.int32,
+    total: wp.array(dtype=wp.int32),
+    face: wp.array(dtype=wp.vec3i),
+    key_inout: wp.array(dtype=wp.int64),
+    sorted_out: wp.array(dtype=wp.vec3i),
+    start_out: wp.array(dtype=wp.int32),
+    deferred_total_out: wp.array(dtype=wp.int32),
+):
+    """Do all that the sort of contacts does, in one thread; CPU only.
+
+    Args:
+        key_inout: Scratch, shape [2 capacity].
+    """
+    count = wp.min(count_rows(total[0], face.shape[0]), capacity)
+    sort_by_pair(count, PAIR_MASK, NEAR_BIT, face, key_inout, sorted_out, start_out)
+    deferred_total_out[0] = 0

@@ -32,7 +32,7 @@ from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-CHUNK = wp.constant(32)
+CHUNK = native.constant("CHUNK")
 # Squared sine of the angle between two planes, under which their line runs away too fast to tell how fast.
 LEAST_SINE_SQUARED = wp.constant(wp.float64(2.0**-40))
 

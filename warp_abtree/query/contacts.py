@@ -64,7 +64,7 @@ ends and signs; sums follow the order of the faces as named, so that its summary
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.contact import contact, pack, simd, summary
+from warp_abtree.kernels.contact import contact, pack, simd, sort_hits, summary
 from warp_abtree.kernels.gap import separation
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.narrow_phase import Query
@@ -225,6 +225,10 @@ class ContactQuery(Query):
         self._launch_kernel(kernel, count * lanes, inputs, WARP_SIZE)
 
     def _sort(self, count: int):
+        if not self.uses_warps():
+            inputs = [count, self.hits.total, self.hits.face, self._key, self.faces, *self._sorted_ends()]
+            self._repeat((count,), sort_hits.sort_by_pair_kernel, 1, inputs)
+            return
         self._sort_into(count, self._order, self._key, self.faces)
         if count == 0:
             self.start.zero_()
@@ -254,6 +258,9 @@ class ContactQuery(Query):
         chunks = self._chunk_count(count, room)
         start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
         posed = [*self.batch.pools, self.pairs, self.pair_poses]
+        if not self.uses_warps():
+            self._launch_kernel(simd.sum_pair_kernel, room, [*posed, start, self.faces, contacts, means])
+            return
         self._launch_warps(summary.sum_length_kernel, chunks, [start, contacts, sums])
         self._launch_warps(summary.sum_mean_kernel, chunks, [start, contacts, sums])
         self._launch_warps(summary.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])

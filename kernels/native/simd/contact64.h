@@ -113,7 +113,33 @@ struct Contact64 {
         const Point normal = F::minus(normal_a, normal_b);
         return unit_vector(F::choose(dot(normal, normal) <= SHORTEST_NORMAL * SHORTEST_NORMAL, normal_a, normal));
     }
-    // Points as 24 numbers, one point after the other.
+    static Point cross(const Point& a, const Point& b) {
+        return Point{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+    }
+    // 1 where faces intersect, 0 where a gap lies between them.
+    static void load_crossed(const double* separation, bool with_gap, int first, int count, lanes& crossed) {
+        crossed = lanes{} + 1.0;
+        for (int k = 0; k < (with_gap ? count : 0); ++k)
+            crossed[k] = separation[first + k] < 0.0 ? 1.0 : 0.0;
+    }
+    // So many points, of 24 numbers, one point after the other; 0 behind them.
+    static Point load(const double* numbers, int count) {
+        typedef double loose __attribute__((vector_size(64), aligned(8)));
+        double few[24] = {};
+        if (__builtin_expect(count < 8, 0)) {
+            for (int k = 0; k < 3 * count; ++k)
+                few[k] = numbers[k];
+            numbers = few;
+        }
+        const lanes a = *(const loose*)numbers, b = *(const loose*)(numbers + 8), c = *(const loose*)(numbers + 16);
+        const lanes x_ab = __builtin_shufflevector(a, b, 0, 3, 6, 9, 12, 15, 0, 0);
+        const lanes y_ab = __builtin_shufflevector(a, b, 1, 4, 7, 10, 13, 1, 1, 1);
+        const lanes z_ab = __builtin_shufflevector(a, b, 2, 5, 8, 11, 14, 2, 2, 2);
+        return Point{__builtin_shufflevector(x_ab, c, 0, 1, 2, 3, 4, 5, 10, 13),
+                     __builtin_shufflevector(y_ab, c, 0, 1, 2, 3, 4, 8, 11, 14),
+                     __builtin_shufflevector(z_ab, c, 0, 1, 2, 3, 4, 9, 12, 15)};
+    }
+    // Points as such numbers.
     static void store(double* numbers, const Point& p) {
         typedef double loose __attribute__((vector_size(64), aligned(8)));
         const lanes xy_low = __builtin_shufflevector(p.x, p.y, 0, 8, 1, 9, 2, 10, 3, 11);

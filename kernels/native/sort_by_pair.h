@@ -1,0 +1,59 @@
+// Hits in order on the CPU: by object pair in one pass, then each pair's faces by their digits, in the caches.
+#pragma once
+#include "builtin.h"
+
+inline CUDA_CALLABLE void sort_by_pair(wp::int32 count, wp::int32 pair_mask, wp::int32 flag,
+                                       wp::array_t<wp::vec_t<3, wp::int32>> face, wp::array_t<wp::int64> key,
+                                       wp::array_t<wp::vec_t<3, wp::int32>> sorted, wp::array_t<wp::int32> start) {
+#if defined(__CUDA_ARCH__)
+    __trap();  // see `sort_hits`
+#else
+    typedef unsigned long long word;
+    const int pairs = start.shape[0] - 1;
+    // Faces and the pair's flag in one word, by pairs; `start` counts to where each ends meanwhile.
+    word *one = (word*)key.data, *other = one + key.shape[0] / 2;
+    for (int p = 0; p <= pairs; ++p)
+        start.data[p] = 0;
+    for (int i = 0; i < count; ++i)
+        ++start.data[face.data[i][0] & pair_mask];
+    for (int p = 0, sum = 0; p <= pairs; ++p) {
+        const int own = start.data[p];
+        start.data[p] = sum;
+        sum += own;
+    }
+    for (int i = 0; i < count; ++i) {
+        const wp::vec_t<3, wp::int32>& row = face.data[i];
+        const word second = 2u * (unsigned int)row[2] + (row[0] & flag ? 1u : 0u);
+        one[start.data[row[0] & pair_mask]++] = (word)(unsigned int)row[1] << 32 | second;
+    }
+    for (int p = pairs; p > 0; --p)
+        start.data[p] = start.data[p - 1];
+    start.data[0] = 0;
+    for (int p = 0; p < pairs; ++p) {
+        const int first = start.data[p], length = start.data[p + 1] - first;
+        word *from = one + first, *to = other + first, varied = 0;
+        for (int i = 1; i < length; ++i)
+            varied |= from[i] ^ from[0];
+        for (int shift = 0; shift < 64; shift += 8) {
+            if ((varied >> shift & 255) == 0)
+                continue;
+            unsigned int place[256] = {};
+            for (int i = 0; i < length; ++i)
+                ++place[from[i] >> shift & 255];
+            for (unsigned int digit = 0, sum = 0; digit < 256; ++digit) {
+                const unsigned int own = place[digit];
+                place[digit] = sum;
+                sum += own;
+            }
+            for (int i = 0; i < length; ++i)
+                to[place[from[i] >> shift & 255]++] = from[i];
+            word* last = from;
+            from = to;
+            to = last;
+        }
+        for (int i = 0; i < length; ++i)
+            sorted.data[first + i] = wp::vec_t<3, wp::int32>(p | (from[i] & 1 ? flag : 0), (wp::int32)(from[i] >> 32),
+                                                             (wp::int32)((unsigned int)from[i] >> 1));
+    }
+#endif
+}
