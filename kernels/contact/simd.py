@@ -5,20 +5,15 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.contact.contact import Contacts, Deferred, contact_objects
-from warp_abtree.kernels.contact.summary import (
-    PairContacts,
-    choose_travel,
-    mean_normal,
-    reach_contacts,
-    write_no_contacts,
-)
+from warp_abtree.kernels.contact.summary import PairContacts, mean_normal, write_no_contacts
+from warp_abtree.kernels.contact.travel import choose_travel, reach_contacts
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.warp_stack import six_numbers
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
-@wp.func_native(native.body("simd/contacts.h", "simd_contacts"))
+@wp.func_native(native.body("contact/contacts.h", "simd_contacts"))
 def simd_contacts(
     models: ModelPool,
     states: StatePool,
@@ -26,9 +21,8 @@ def simd_contacts(
     rotation: wp.mat33d,
     position: wp.vec3d,
     proven: bool,
-    ends: wp.vec2i,
+    span: wp.vec3i,
     faces: wp.array(dtype=wp.vec3i),
-    waiting: wp.int32,
     place: wp.array(dtype=wp.int32),
     contacts: Contacts,
 ) -> wp.int32:
@@ -37,24 +31,23 @@ def simd_contacts(
     Args:
         rotation, position: Pose of object A.
         proven: Whether the face pairs are known to intersect.
-        ends: First face pair, and the one behind the last.
-        waiting: Entries of the list.
+        span: First face pair, the one behind the last, and how many entries the list has.
 
     Returns how many entries the list has then.
     """
 
 
-@wp.func_native(native.body("simd/contact_sums.h", "simd_sum_lengths"))
+@wp.func_native(native.body("contact/contact_sums.h", "simd_sum_lengths"))
 def simd_sum_lengths(contacts: Contacts, ends: wp.vec2i) -> six_numbers:
     """Return the length of an object pair's contacts, and how many are of faces that intersect, as `sum_lengths`."""
 
 
-@wp.func_native(native.body("simd/contact_sums.h", "simd_sum_means"))
+@wp.func_native(native.body("contact/contact_sums.h", "simd_sum_means"))
 def simd_sum_means(contacts: Contacts, ends: wp.vec2i, total: wp.float64, number: wp.float64) -> six_numbers:
     """Return the mean point of a pair's contacts, from the first end, and the mean of normals, as `sum_means`."""
 
 
-@wp.func_native(native.body("simd/contact_sums.h", "simd_sum_areas"))
+@wp.func_native(native.body("contact/contact_sums.h", "simd_sum_areas"))
 def simd_sum_areas(contacts: Contacts, ends: wp.vec2i, middle: wp.vec3d, normal: wp.vec3d) -> six_numbers:
     """Return the area within a pair's contact curve and its change, as `sum_loop`."""
 
@@ -83,9 +76,8 @@ def find_pair_contacts_kernel(
             objects.rotation[a],
             objects.position[a],
             proven,
-            wp.vec2i(start[p], start[p + 1]),
+            wp.vec3i(start[p], start[p + 1], deferred_inout.total[0]),
             faces,
-            deferred_inout.total[0],
             deferred_inout.place,
             contacts_out,
         )

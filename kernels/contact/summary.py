@@ -9,17 +9,17 @@ the other (`simd`).
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.contact.chunks import end_chunk, first_chunk
 from warp_abtree.kernels.contact.contact import (
     SHORTEST_NORMAL,
     Contacts,
-    PairObjects,
     contact_objects,
     have_crossed,
     pair_direction,
 )
-from warp_abtree.kernels.poses import PairPose, pose_point
-from warp_abtree.kernels.traversal.nodes import load_node
+from warp_abtree.kernels.contact.travel import choose_travel, loop_change, reach_contacts
+from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.warp_stack import (
     add_in_order,
     six_numbers,
@@ -31,10 +31,6 @@ from warp_abtree.kernels.traversal.warp_stack import (
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
-CHUNK = native.constant("CHUNK")
-# Squared sine of the angle between two planes, under which their line runs away too fast to tell how fast.
-LEAST_SINE_SQUARED = wp.constant(wp.float64(2.0**-40))
 
 
 @wp.struct
@@ -50,7 +46,7 @@ class PairContacts:
 class ChunkSums:
     """Sums over each chunk, and what a pair's chunks need of each other."""
 
-    span: wp.array(dtype=wp.vec3i)  # (pair, first contact, end), shape [chunk]
+    span: wp.array(dtype=wp.vec3i)  # (pair, first contact, end), shape [chunk]; nothing behind the last pair's
     length: wp.array(dtype=wp.float64)  # sum of lengths, shape [chunk]
     point: wp.array(dtype=wp.vec3d)  # weighted, from the pair's first end, shape [chunk]
     normal: wp.array(dtype=wp.vec3d)  # weighted, shape [chunk]
@@ -63,33 +59,6 @@ class ChunkSums:
 
 
 @wp.func
-def first_chunk(p: wp.int32, start: wp.array(dtype=wp.int32)):
-    """Return the place of a pair's first chunk: each pair before has at most one chunk more than whole ones fit."""
-    return start[p] // CHUNK + p
-
-
-@wp.func
-def end_chunk(p: wp.int32, start: wp.array(dtype=wp.int32)):
-    """Return the place after a pair's last chunk."""
-    return first_chunk(p, start) + (start[p + 1] - start[p] + CHUNK - 1) // CHUNK
-
-
-@wp.func
-def locate_chunk(c: wp.int32, start: wp.array(dtype=wp.int32)):
-    """Return (pair, first contact, end) of a chunk; a place without one has its end at or before the first."""
-    low = wp.int32(0)
-    high = start.shape[0] - 1
-    while high - low > 1:  # the pair is one of low .. high - 1
-        middle = (low + high) // 2
-        if first_chunk(middle, start) <= c:
-            low = middle
-        else:
-            high = middle
-    first = start[low] + (c - first_chunk(low, start)) * CHUNK
-    return wp.vec3i(low, first, wp.min(first + CHUNK, start[low + 1]))
-
-
-@wp.func
 def two_numbers(x: wp.float64, y: wp.float64):
     numbers = six_numbers()
     numbers[0] = x
@@ -98,10 +67,12 @@ def two_numbers(x: wp.float64, y: wp.float64):
 
 
 @wp.kernel
-def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_out: ChunkSums):
-    """Locate one chunk a warp and sum the lengths of its contacts."""
+def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_inout: ChunkSums):
+    """Sum the lengths of the contacts of one chunk a warp."""
     c = wp.tid() / warp_size()
-    span = locate_chunk(c, start)
+    if c >= first_chunk(start.shape[0] - 1, start):
+        return
+    span = sums_inout.span[c]
     sums = six_numbers()
     length = six_numbers()
     first = wp.int32(span[1])
@@ -114,9 +85,8 @@ def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_
         sums = add_in_order(sums, length, count)
         first += warp_size()
     if warp_lane() == 0:
-        sums_out.span[c] = span
-        sums_out.length[c] = sums[0]
-        sums_out.crossed[c] = sums[1]
+        sums_inout.length[c] = sums[0]
+        sums_inout.crossed[c] = sums[1]
 
 
 @wp.func
@@ -139,6 +109,8 @@ def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_in
     Where all lengths vanish all weights are the same.
     """
     c = wp.tid() / warp_size()
+    if c >= first_chunk(start.shape[0] - 1, start):
+        return
     span = sums_inout.span[c]
     if span[1] >= span[2]:
         return
@@ -194,88 +166,6 @@ def mean_normal(models: ModelPool, states: StatePool, objects: ObjectPool, pair:
     return unit_vector(n)
 
 
-@wp.func
-def box_support(models: ModelPool, states: StatePool, objects: ObjectPool, i: wp.int32, n: wp.vec3d, origin: wp.vec3d):
-    """Return how far the root box of a posed object reaches along n from a point, world frame."""
-    state = objects.state[i]
-    root = load_node(states, states.node_start[state] + 1)
-    lower = wp.vec3d(root.lower)
-    upper = wp.vec3d(root.upper)
-    centre = pose_point(objects.rotation[i], objects.position[i], models.centre[states.model[state]])
-    m = wp.transpose(objects.rotation[i]) * n
-    reach = wp.dot(n, centre - origin)
-    for k in range(3):
-        reach += wp.max(m[k] * lower[k], m[k] * upper[k])
-    return reach
-
-
-@wp.func
-def loop_change(segment: wp.vec3d, normal_a: wp.vec3d, normal_b: wp.vec3d, n: wp.vec3d):
-    """Return how fast the area within a contact curve changes, a segment's part, as B moves along n at unit speed.
-
-    The line of the two planes moves at v = x normal_a + y normal_b with v . normal_a = 0, v . normal_b = n . normal_b.
-    """
-    cosine = wp.dot(normal_a, normal_b)
-    square = wp.float64(1.0) - cosine * cosine
-    if square < LEAST_SINE_SQUARED:
-        return wp.float64(0.0)
-    y = wp.dot(n, normal_b) / square
-    return y * wp.dot(normal_b - normal_a * cosine, wp.cross(segment, n))
-
-
-@wp.func
-def reach_faces(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    own: PairObjects,
-    pose: PairPose,
-    face: wp.vec3i,
-    n: wp.vec3d,
-    origin: wp.vec3d,
-):
-    """Return how far the first object's face reaches along n from a point, and the second's against it."""
-    a = states.face_corner[pose.corner_a + face[1 + own.swapped]]
-    b = states.face_corner[pose.corner_b + face[2 - own.swapped]]
-    front = -wp.float64(wp.inf)
-    back = -wp.float64(wp.inf)
-    for i in range(3):
-        corner_a = load_vertex(models.vertex_pos, a[i])
-        corner_b = pose_point(pose.rotation, pose.translation, load_vertex(models.vertex_pos, b[i]))
-        reach_a = wp.dot(n, pose_point(objects.rotation[own.a], objects.position[own.a], corner_a) - origin)
-        reach_b = wp.dot(n, pose_point(objects.rotation[own.a], objects.position[own.a], corner_b) - origin)
-        # The normal goes from the object that the pair names first.
-        front = wp.max(front, wp.where(own.swapped == 0, reach_a, reach_b))
-        back = wp.max(back, -wp.where(own.swapped == 0, reach_b, reach_a))
-    return front, back
-
-
-@wp.func
-def reach_contacts(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    own: PairObjects,
-    pose: PairPose,
-    span: wp.vec3i,
-    faces: wp.array(dtype=wp.vec3i),
-    contacts: Contacts,
-    n: wp.vec3d,
-    origin: wp.vec3d,
-):
-    """Return `reach_faces` of all contacts of a span, for all lanes of a warp."""
-    front = -wp.float64(wp.inf)
-    back = -wp.float64(wp.inf)
-    k = span[1] + warp_lane()
-    while k < span[2]:
-        if have_crossed(contacts, k):
-            ahead, behind = reach_faces(models, states, objects, own, pose, faces[k], n, origin)
-            front = wp.max(front, ahead)
-            back = wp.max(back, behind)
-        k += warp_size()
-    return warp_max(front), -warp_max(back)
-
-
 @wp.kernel(cuda_max_registers=96)
 def sum_loop_kernel(
     models: ModelPool,
@@ -286,14 +176,16 @@ def sum_loop_kernel(
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
     contacts: Contacts,
-    pair_contacts_out: PairContacts,
     sums_inout: ChunkSums,
+    pair_contacts_out: PairContacts,
 ):
     """Sum what the travel needs of one chunk a warp: area within the contact curve, its change, extents of faces.
 
     Extents serve pairs without an area, which as a rule have none in any chunk: others are left out.
     """
     c = wp.tid() / warp_size()
+    if c >= first_chunk(start.shape[0] - 1, start):
+        return
     span = sums_inout.span[c]
     if span[1] >= span[2]:
         return
@@ -318,9 +210,7 @@ def sum_loop_kernel(
     back = wp.float64(wp.nan)
     if sums[0] == wp.float64(0.0):
         own = contact_objects(pairs, pair_poses, p)
-        front, back = reach_contacts(
-            models, states, objects, own, pair_poses[p], span, faces, contacts, n, origin
-        )
+        front, back = reach_contacts(models, states, objects, own, pair_poses[p], span, faces, contacts, n, origin)
     if warp_lane() == 0:
         sums_inout.area[c] = sums[0]
         sums_inout.change[c] = sums[1]
@@ -349,28 +239,6 @@ def sum_loop(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
         all = add_in_order(all, two_numbers(sums.area[k], sums.change[k]), wp.min(end - c, warp_size()))
         c += warp_size()
     return all[0], all[1], warp_max(front), -warp_max(back), not warp_any(not measured)
-
-
-@wp.func
-def choose_travel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pair: wp.vec2i,
-    n: wp.vec3d,
-    origin: wp.vec3d,
-    area: wp.float64,
-    change: wp.float64,
-    overlap: wp.float64,
-):
-    """Return the travel of a pair, `overlap` that of its faces where there is no area."""
-    travel = box_support(models, states, objects, pair[0], n, origin)
-    travel += box_support(models, states, objects, pair[1], -n, origin)
-    if area == wp.float64(0.0):
-        travel = wp.min(travel, overlap)
-    elif area * change < wp.float64(0.0):
-        travel = wp.min(travel, -area / change)
-    return wp.max(travel, wp.float64(0.0))
 
 
 @wp.func

@@ -95,9 +95,7 @@ def order_ends(p1: wp.vec3d, e1: wp.vec3d, p2: wp.vec3d, e2: wp.vec3d):
 
 
 @wp.func
-def filter_segment(
-    proven: bool, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d
-):
+def filter_segment(proven: bool, a0: wp.vec3d, a1: wp.vec3d, a2: wp.vec3d, b0: wp.vec3d, b1: wp.vec3d, b2: wp.vec3d):
     """Return the ends of `cross_planes`, and whether it is sure of them; `proven` that the triangles intersect.
 
     Source: as `cross_planes`, whose names these are.
@@ -121,7 +119,9 @@ def filter_segment(
         rr = order_ends(ap, ar, bp, br)
         sure = sure and qq <= 0 and rr >= 0 and rr != UNCERTAIN
     first, last = qr > 0, rq > 0
-    start = cross_edge(wp.where(first, ap, bp), wp.where(first, aq, br), wp.where(first, up, vp), wp.where(first, uq, vr))
+    start = cross_edge(
+        wp.where(first, ap, bp), wp.where(first, aq, br), wp.where(first, up, vp), wp.where(first, uq, vr)
+    )
     end = cross_edge(wp.where(last, bp, ap), wp.where(last, bq, ar), wp.where(last, vp, up), wp.where(last, vq, ur))
     back = side_a * side_b < 0
     return wp.where(back, end, start), wp.where(back, start, end), sure

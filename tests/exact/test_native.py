@@ -17,7 +17,7 @@ from warp_abtree.kernels.arithmetic.double_word import BOUND_DOUBLE
 from warp_abtree.kernels.arithmetic.expansion import two_sum
 from warp_abtree.kernels.arithmetic.predicates import BOUND_2D, BOUND_3D, EXACT, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.contact.contact import SHORTEST_NORMAL
-from warp_abtree.kernels.contact.summary import LEAST_SINE_SQUARED
+from warp_abtree.kernels.contact.travel import LEAST_SINE_SQUARED
 from warp_abtree.kernels.poses import COORDINATE_MIN
 from warp_abtree.kernels.traversal import dual_tree, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.face_pairs import WITHIN

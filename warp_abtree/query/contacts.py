@@ -64,7 +64,7 @@ ends and signs; sums follow the order of the faces as named, so that its summary
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.contact import contact, pack, simd, sort_hits, summary
+from warp_abtree.kernels.contact import chunks, contact, pack, simd, sort_hits, sort_pairs, summary
 from warp_abtree.kernels.gap import separation
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.narrow_phase import Query
@@ -75,6 +75,9 @@ from warp_abtree.state.batch import Batch
 
 # Warps that a multiprocessor runs at a time, by their registers, of those that find deferred contacts.
 DEFERRED_WARPS = 8
+# Threads that sort the hits of a pair, and pairs up to which each warp adds up what others found before it.
+BLOCK_DIM = 256
+SORTED_PAIRS_MAX = 65536
 
 
 class ContactQuery(Query):
@@ -108,6 +111,7 @@ class ContactQuery(Query):
     start: wp.array
     _key: wp.array
     _order: wp.array
+    _next: wp.array
     _places = 0
 
     def __init__(
@@ -168,6 +172,7 @@ class ContactQuery(Query):
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
         made.append((self, "start", wp.zeros(room + 1, dtype=wp.int32, device=self.device)))
+        made.append((self, "_next", self._empty(room, wp.int32)))
         for owner, name, dtype in (
             (self.pair_contacts, "point", wp.vec3d),
             (self.pair_contacts, "normal", wp.vec3d),
@@ -190,7 +195,7 @@ class ContactQuery(Query):
     @staticmethod
     def _chunk_count(places: int, pairs: int) -> int:
         """Return how many chunks there may be: `first_chunk` of the pair after the last, if all places are taken."""
-        return places // int(summary.CHUNK) + pairs
+        return places // int(chunks.CHUNK) + pairs
 
     def finish(self, count: int | None = None):
         """Make the contacts of the hits in place. Launches only."""
@@ -225,14 +230,26 @@ class ContactQuery(Query):
         self._launch_kernel(kernel, count * lanes, inputs, WARP_SIZE)
 
     def _sort(self, count: int):
+        room, hits = len(self.pairs), self.hits
         if not self.uses_warps():
-            inputs = [count, self.hits.total, self.hits.face, self._key, self.faces, *self._sorted_ends()]
+            inputs = [count, hits.total, hits.face, self._key, self.faces, *self._sorted_ends()]
             self._repeat((count,), sort_hits.sort_by_pair_kernel, 1, inputs)
-            return
-        self._sort_into(count, self._order, self._key, self.faces)
-        if count == 0:
-            self.start.zero_()
-            self._deferred.total.zero_()
+        elif count <= sort_pairs.SORT_ROOM * room and room <= SORTED_PAIRS_MAX and len(self._sort_passes()) == 1:
+            inputs = [count, hits.total, hits.face, hits.count, self.start, self._next, self._deferred.total]
+            self._repeat((count,), sort_pairs.start_pair_kernel, room // WARP_SIZE * WARP_SIZE + WARP_SIZE, inputs)
+            inputs = [count, hits.total, hits.face, self._next, self._key]
+            self._repeat((count,), sort_pairs.place_key_kernel, -(-count // BLOCK_DIM) * BLOCK_DIM, inputs, BLOCK_DIM)
+            threads = BLOCK_DIM if self.device.is_cuda else 1
+            inputs = [self.start, self._key, self.faces, self._sums.span]
+            self._launch_kernel(sort_pairs.sort_pair_kernel, room * threads, inputs, BLOCK_DIM)
+        else:
+            if count > 0:
+                self._sort_into(count, self._order, self._key, self.faces)
+            else:
+                self.start.zero_()
+                self._deferred.total.zero_()
+            inputs = [self.start, self._sums.span]
+            self._launch_kernel(chunks.locate_chunk_kernel, self._chunk_count(count, room), inputs)
 
     def _sorted_ends(self) -> tuple:
         return self.start, self._deferred.total
@@ -255,15 +272,15 @@ class ContactQuery(Query):
 
     def _reduce(self, count: int):
         room = len(self.pairs)
-        chunks = self._chunk_count(count, room)
+        count = self._chunk_count(count, room)
         start, contacts, sums, means = self.start, self.contacts, self._sums, self.pair_contacts
         posed = [*self.batch.pools, self.pairs, self.pair_poses]
         if not self.uses_warps():
             self._launch_kernel(simd.sum_pair_kernel, room, [*posed, start, self.faces, contacts, means])
             return
-        self._launch_warps(summary.sum_length_kernel, chunks, [start, contacts, sums])
-        self._launch_warps(summary.sum_mean_kernel, chunks, [start, contacts, sums])
-        self._launch_warps(summary.sum_loop_kernel, chunks, [*posed, start, self.faces, contacts, means, sums])
+        self._launch_warps(summary.sum_length_kernel, count, [start, contacts, sums])
+        self._launch_warps(summary.sum_mean_kernel, count, [start, contacts, sums])
+        self._launch_warps(summary.sum_loop_kernel, count, [*posed, start, self.faces, contacts, sums, means])
         self._launch_warps(summary.measure_travel_kernel, room, [*posed, start, self.faces, contacts, sums, means])
 
     def _read_rows(self, found: Found, count: int, device: bool):

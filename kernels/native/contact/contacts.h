@@ -1,20 +1,19 @@
 // Contacts of the CPU: those of 8 face pairs at a time, as `find_contact` one by one.
 #pragma once
 #include "builtin.h"
-#include "simd/contact64.h"
+#include "contact/contact64.h"
 
 template <class ModelPool, class StatePool, class PairPose, class Contacts>
 wp::int32 simd_contacts(ModelPool models, StatePool states, PairPose pose, wp::mat_t<3, 3, wp::float64> rotation,
-                        wp::vec_t<3, wp::float64> position, bool proven, wp::vec_t<2, wp::int32> ends,
-                        wp::array_t<wp::vec_t<3, wp::int32>> faces, wp::int32 waiting, wp::array_t<wp::int32> place,
-                        Contacts contacts) {
+                        wp::vec_t<3, wp::float64> position, bool proven, wp::vec_t<3, wp::int32> span,
+                        wp::array_t<wp::vec_t<3, wp::int32>> faces, wp::array_t<wp::int32> place, Contacts contacts) {
     wp::int32 result = 0;
 #if defined(__CUDA_ARCH__)
     __trap();  // a lane finds a contact
 #else
     {
 #pragma clang fp contract(off)
-#include "simd/contact64.h"
+#include "contact/contact64.h"
         typedef Contact64 C;
         typedef Float64 F;
         typedef F::bits bits;
@@ -107,19 +106,19 @@ wp::int32 simd_contacts(ModelPool models, StatePool states, PairPose pose, wp::m
             return F::to_mask(open) & ((1u << count) - 1);
         };
         // First without double words, then with them those that need them, side by side: on the list, which they leave.
-        int* list = place.data + waiting;
-        int from = ends[0], count = 0, left = 0, hit[8];
-        for (; from < ends[1]; ++from) {
+        int* list = place.data + span[2];
+        int from = span[0], count = 0, left = 0, hit[8];
+        for (; from < span[1]; ++from) {
             // Faces that are apart for a gap have what they need.
             if (!with_gap || contacts.separation.data[from] < 0.0)
                 hit[count++] = from;
-            if (count == 8 || (count > 0 && from + 1 == ends[1])) {
+            if (count == 8 || (count > 0 && from + 1 == span[1])) {
                 for (unsigned int open = find(false, hit, count); open != 0; open &= open - 1)
                     list[left++] = hit[__builtin_ctz(open)];
                 count = 0;
             }
         }
-        result = waiting;
+        result = span[2];
         for (int i = 0; i < left; i += 8) {
             count = left - i < 8 ? left - i : 8;
             for (int k = 0; k < count; ++k)

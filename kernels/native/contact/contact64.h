@@ -2,7 +2,7 @@
 #pragma once
 #include "builtin.h"
 #include "sizes.h"
-#include "simd/double64.h"
+#include "contact/double64.h"
 
 struct Contact64 {
     typedef Float64 F;

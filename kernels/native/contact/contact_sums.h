@@ -2,7 +2,7 @@
 // `contact.summary`.
 #pragma once
 #include "builtin.h"
-#include "simd/contact64.h"
+#include "contact/contact64.h"
 
 template <class Contacts>
 wp::vec_t<6, wp::float64> simd_sum_lengths(Contacts contacts, wp::vec_t<2, wp::int32> ends) {
@@ -12,7 +12,7 @@ wp::vec_t<6, wp::float64> simd_sum_lengths(Contacts contacts, wp::vec_t<2, wp::i
 #else
     {
 #pragma clang fp contract(off)
-#include "simd/contact64.h"
+#include "contact/contact64.h"
         typedef Contact64 C;
         C::lanes length, crossed;
         double sum[2] = {};
@@ -45,7 +45,7 @@ wp::vec_t<6, wp::float64> simd_sum_means(Contacts contacts, wp::vec_t<2, wp::int
 #else
     {
 #pragma clang fp contract(off)
-#include "simd/contact64.h"
+#include "contact/contact64.h"
         typedef Contact64 C;
         typedef C::Point Point;
         const wp::vec_t<3, wp::float64> first = contacts.p0.data[ends[0]];
@@ -92,7 +92,7 @@ wp::vec_t<6, wp::float64> simd_sum_areas(Contacts contacts, wp::vec_t<2, wp::int
 #else
     {
 #pragma clang fp contract(off)
-#include "simd/contact64.h"
+#include "contact/contact64.h"
         typedef Contact64 C;
         typedef C::Point Point;
         const auto spread = [](const wp::vec_t<3, wp::float64>& v) {
