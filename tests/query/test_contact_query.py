@@ -9,6 +9,9 @@ from helpers.samples import STILL, contact_poses, sample
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.kernels.triangle.segment import divide_vector
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
 def teeth(count, seed, points=False):
@@ -69,6 +72,38 @@ def test_any_order_of_hits(device):
             query.hits.face.assign(hits)
             query.find_contacts()
             same(query.result(), expected)
+
+
+@pytest.mark.parametrize("gap", [None, 0.05])
+def test_vector_code_is_the_same_as_one_by_one(gap):
+    """The CPU's kernels against those that warps run, each of one thread: sorting, contacts and sums."""
+    scene, pairs = touching("cpu")
+    expected = ab.ContactQuery(scene, pairs, gap=gap).run()
+    for regime in ({"warps": True}, {"warps": True, "key_bits": 20}):
+        with testing.regime(**regime):
+            query = ab.ContactQuery(scene, pairs, gap=gap)
+            same(query.run(), expected)
+
+
+@wp.kernel
+def divide_kernel(v: wp.array[wp.vec3d], s: wp.array[wp.float64], quotient_out: wp.array[wp.vec3d]):
+    i = wp.tid()
+    quotient_out[i] = divide_vector(v[i], s[i])
+
+
+def test_divisions_are_rounded(device):
+    """By the reciprocal on CUDA: usual numbers, powers of two and their neighbours, all exponents, zeros."""
+    rng, count = np.random.default_rng(4), 300_000
+    v, s = rng.uniform(1, 2, (count, 3)), rng.uniform(1, 2, count)
+    near, odd = rng.integers(-9, 9, (count, 3)) * 2.0**-52, rng.integers(-9, 9, count) * 2.0**-52
+    v[::3], s[::4] = 1 + near[::3], 1 + odd[::4]
+    wide = rng.random(count) < 0.3
+    v[wide], s[wide] = np.ldexp(v[wide], rng.integers(-1060, 1000, (wide.sum(), 3))), np.ldexp(s[wide], 30)
+    v[rng.random((count, 3)) < 0.02] = -0.0
+    quotient = wp.empty(count, dtype=wp.vec3d, device=device)
+    inputs = [wp.array(v, dtype=wp.vec3d, device=device), wp.array(s, dtype=wp.float64, device=device), quotient]
+    wp.launch(divide_kernel, count, inputs, device=device)
+    assert quotient.numpy().tobytes() == (v / s[:, None]).tobytes()
 
 
 def test_any_batch(device):
