@@ -32,10 +32,6 @@ def sort_block(key: wp.array(dtype=wp.int64), first: wp.int32, length: wp.int32)
     """Sort so many keys in place. For all threads of a block."""
 
 
-@wp.func_native(native.body("sort_pairs.cuh", "block_lane"))
-def block_lane() -> wp.int32: ...
-
-
 @wp.func_native(native.body("sort_pairs.cuh", "block_size"))
 def block_size() -> wp.int32: ...
 
@@ -52,7 +48,7 @@ def start_pair_kernel(
 ):
     """Find where the hits of one object pair a thread start, by the counts of those before; defer none yet.
 
-    Where counts say more than was written, for lack of room, hits are counted anew.
+    A block is a warp. Where counts say more than was written, for lack of room, hits are counted anew.
     """
     lane = warp_lane()
     first = wp.tid() / warp_size() * warp_size()
@@ -117,16 +113,17 @@ def sort_pair_kernel(
 ):
     """Sort the hits of one object pair a block, and locate its chunks and the places behind them."""
     p = wp.tid() / block_size()
+    thread = wp.tid() - p * block_size()
     first = start[p]
     length = start[p + 1] - first
-    c = first_chunk(p, start) + block_lane()
+    c = first_chunk(p, start) + thread
     while c < first_chunk(p + 1, start):
         span_out[c] = chunk_span(p, c, start)
         c += block_size()
     if length == 0:
         return
     sort_block(key_inout, first, length)
-    k = first + block_lane()
+    k = first + thread
     while k < first + length:
         key = key_inout[k]
         pair = p | wp.where((key & wp.int64(1)) != wp.int64(0), NEAR_BIT, 0)

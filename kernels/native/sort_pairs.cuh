@@ -6,10 +6,10 @@
 
 inline CUDA_CALLABLE wp::int32 warp_sum(wp::int32 x) {
 #if defined(__CUDA_ARCH__)
-    return __reduce_add_sync(0xffffffffu, x);
-#else
-    return x;
+    for (int step = 16; step > 0; step >>= 1)
+        x += __shfl_xor_sync(0xffffffffu, x, step);
 #endif
+    return x;
 }
 
 inline CUDA_CALLABLE wp::int32 sum_before(wp::int32 x) {
@@ -80,14 +80,6 @@ inline CUDA_CALLABLE void sort_block(wp::array_t<wp::int64> key, wp::int32 first
         for (int i = thread; i < length; i += threads)
             key.data[first + i] = few[i];
     __syncthreads();
-#endif
-}
-
-inline CUDA_CALLABLE wp::int32 block_lane() {
-#if defined(__CUDA_ARCH__)
-    return threadIdx.x;
-#else
-    return 0;
 #endif
 }
 

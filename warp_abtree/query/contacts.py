@@ -143,7 +143,9 @@ class ContactQuery(Query):
         self._set_pairs(pairs, within, gap)
 
     def _slow_kernels(self, with_distances: bool) -> list:
-        kernels = [contact.find_contact_kernel, summary.sum_loop_kernel]
+        kernels = [simd.find_pair_contacts_kernel, contact.find_deferred_kernel]
+        if self.uses_warps():
+            kernels = [contact.find_contact_kernel, summary.sum_loop_kernel]
         return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._slow_kernels(with_distances)]
 
     def resize(self, capacity: int):
@@ -236,7 +238,8 @@ class ContactQuery(Query):
             self._repeat((count,), sort_hits.sort_by_pair_kernel, 1, inputs)
         elif count <= sort_pairs.SORT_ROOM * room and room <= SORTED_PAIRS_MAX and len(self._sort_passes()) == 1:
             inputs = [count, hits.total, hits.face, hits.count, self.start, self._next, self._deferred.total]
-            self._repeat((count,), sort_pairs.start_pair_kernel, room // WARP_SIZE * WARP_SIZE + WARP_SIZE, inputs)
+            threads = room // WARP_SIZE * WARP_SIZE + WARP_SIZE
+            self._repeat((count,), sort_pairs.start_pair_kernel, threads, inputs, WARP_SIZE)
             inputs = [count, hits.total, hits.face, self._next, self._key]
             self._repeat((count,), sort_pairs.place_key_kernel, -(-count // BLOCK_DIM) * BLOCK_DIM, inputs, BLOCK_DIM)
             threads = BLOCK_DIM if self.device.is_cuda else 1
