@@ -144,3 +144,8 @@ constexpr int THREADS = 64;
 // lanes of a warp have room for one in shared memory.
 constexpr int EXPANSION_LENGTH = 192;
 constexpr int EXPANSION_LANES = 16;
+
+// Hits sorted by object pair: threads of a block, and keys that each has room for twice in shared memory.
+constexpr int SEGMENT_THREADS = 256;
+constexpr int SEGMENT_KEYS = 8;
+static_assert(2 * SEGMENT_KEYS * SEGMENT_THREADS * 8 <= 32768, "7 blocks fit into a multiprocessor");

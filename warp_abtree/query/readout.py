@@ -11,7 +11,14 @@ from warp_abtree.kernels import results as kernels
 from warp_abtree.query.buffers import QueryBuffers
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.result import COUNTERS, Found, Result, Totals
-from warp_abtree.query.sorting import make_sort, sort_on_device, sort_passes, sort_rows
+from warp_abtree.query.sorting import (
+    make_segment_sort,
+    make_sort,
+    segment_threads,
+    sort_on_device,
+    sort_passes,
+    sort_rows,
+)
 from warp_abtree.query.staging import Staging, first_rows, view_memory
 
 # Rows that are expected come in steps.
@@ -238,6 +245,12 @@ class QueryReadout(QueryBuffers):
         """Write the first hits to rows in order, with such scratch. Launches only."""
         if count == 0:
             return
+        chosen = self._regime.segments
+        if self.device.is_cuda or chosen:
+            threads = segment_threads(count, len(self.pairs), chosen)
+            if threads:
+                self._sort_segments(count, threads, key, rows)
+                return
         passes = self._sort_passes()
         made = self.hits, count, len(self.pairs), passes, order, key, rows
 
@@ -246,6 +259,20 @@ class QueryReadout(QueryBuffers):
 
         given = *self.guard.given(), count, order.ptr, key.ptr, rows.ptr
         sort_on_device(self._commands.find_callables("sort", given, self.device, make), count, passes, order, key)
+
+    def _sort_segments(self, count: int, threads: int, key, rows):
+        """Write the first hits to rows in order by a segment a pair, with such scratch. Launches only."""
+        start, deferred = self._sorted_ends()
+        if not len(start):
+            length = len(self.pairs) + 1
+            start = first_rows(self._staging.room("start", length, wp.int32), length)
+
+        def make(launch):
+            return make_segment_sort(self.hits, count, threads, key, rows, (start, deferred), launch)
+
+        given = *self.guard.given(), count, threads, key.ptr, rows.ptr, start.ptr
+        for launch in self._commands.find_callables("segments", given, self.device, make):
+            launch()
 
     def _sorted_ends(self) -> tuple:
         """Return what the sort writes beside rows, see `make_sort`."""
