@@ -11,6 +11,7 @@ A key in a pair's segment, the same as that of `sort_by_pair`:
 import warp as wp
 
 from warp_abtree.kernels import native
+from warp_abtree.kernels.contact.chunks import chunk_span, first_chunk
 from warp_abtree.kernels.contact.sort_hits import count_rows
 from warp_abtree.kernels.traversal.face_pairs import NEAR_BIT, PAIR_MASK
 
@@ -104,12 +105,21 @@ def sort_segment_kernel(
     start: wp.array(dtype=wp.int32),
     key_inout: wp.array(dtype=wp.int64),
     sorted_out: wp.array(dtype=wp.vec3i),
+    span_out: wp.array(dtype=wp.vec3i),
 ):
-    """Sort each pair's keys, and write them as rows.
+    """Sort each pair's keys, and write them as rows; locate the pair's chunks, and places behind them.
 
     Args:
         lanes: 1, on the CPU `threads`.
         threads: Of a group, which sorts a pair's hits: a power of two from 32 to SEGMENT_THREADS.
         key_inout: Keys, then scratch, shape [2 capacity].
+        span_out: `ChunkSums.span`, or [0] if nobody asks.
     """
-    sort_segment(wp.tid() * lanes, threads, NEAR_BIT, start, key_inout, sorted_out)
+    thread = wp.tid() * lanes
+    p = thread // threads
+    if span_out.shape[0] > 0 and p + 1 < start.shape[0]:
+        c = first_chunk(p, start) + thread % threads
+        while c < first_chunk(p + 1, start):
+            span_out[c] = chunk_span(p, c, start)
+            c += threads // lanes
+    sort_segment(thread, threads, NEAR_BIT, start, key_inout, sorted_out)

@@ -115,8 +115,6 @@ constexpr double RELATIVE_ERROR = 0x1p-42;
 constexpr double SHORTEST_NORMAL = 0x1p-20;
 constexpr double LEAST_SINE_SQUARED = 0x1p-40;
 constexpr int CHUNK = 32;
-// Hits of an object pair that a block sorts in shared memory.
-constexpr int SORT_ROOM = 2048;
 
 // Certified errors: faces about a merge, distances of corners to them, corners of a polygon, polygons on the stack,
 // faces that cover a triangle, cuts of one, and triangles covered at once.

@@ -8,9 +8,9 @@ from warp_abtree.kernels.contact import sort_hits, sort_segments
 # Rows whose sorting takes longer than packing each into one number, which sorts 20 times as fast.
 ROWS_TO_PACK = 1000
 
-# Hits are sorted by a segment a pair from so many pairs on, up to so many, whose starts each block sums anew, and up to
-# so many hits a pair, which a group of threads sorts by itself.
-SEGMENTS_LEAST, SEGMENTS_MOST, SEGMENT_LONGEST = 32, 2**17, 2048
+# Hits are sorted by a segment a pair up to so many pairs, whose starts each block sums anew, and up to so many hits a
+# pair on average, which a group of threads sorts by itself.
+SEGMENTS_MOST, SEGMENT_LONGEST = 2**17, 2048
 
 
 def sort_rows(rows: np.ndarray) -> np.ndarray:
@@ -74,11 +74,11 @@ def segment_threads(count: int, pair_room: int, chosen: bool | None) -> int:
 
     Args:
         count: Hits that are sorted, at most.
-        chosen: `Regime.segments`; None: there are many pairs, and few hits of each on average.
+        chosen: `Regime.segments`; None: there are few hits a pair on average.
     """
     mean, thread_max = count / pair_room, sort_segments.SEGMENT_THREADS
     if chosen is None:
-        chosen = SEGMENTS_LEAST <= pair_room <= SEGMENTS_MOST and mean <= SEGMENT_LONGEST
+        chosen = pair_room <= SEGMENTS_MOST and mean <= SEGMENT_LONGEST
     # A few keys a thread, and room in shared memory for pairs of twice as many hits as the mean.
     threads = 32 if mean <= 64 else 128 if mean <= 512 else thread_max
     return threads if chosen and count < 2**30 else 0
@@ -89,10 +89,10 @@ def make_segment_sort(hits, count: int, threads: int, key, rows, ends, launch) -
 
     Args:
         hits, key, rows, launch: As for `make_sort`.
-        ends: Device int32 (pair_room + 1,), for where the hits of each pair start, and int32 (1,), which becomes 0, or
-            (0,).
+        ends: Device int32 (pair_room + 1,), for where the hits of each pair start; int32 (1,), which becomes 0, and
+            vec3i for `ChunkSums.span`, or (0,).
     """
-    start, deferred = ends
+    start, deferred, span = ends
     device, block, room = key.device, sort_segments.SEGMENT_THREADS, len(start) - 1
     lanes, group = (block, threads) if device.is_cuda else (1, 1)
     blocks = -(-room // block), -(-room * group // lanes)
@@ -103,5 +103,5 @@ def make_segment_sort(hits, count: int, threads: int, key, rows, ends, launch) -
     inputs = [lanes, count, hits.total, hits.count, hits.face, start, deferred]
     made = [make(sort_segments.start_segment_kernel, blocks[0] * lanes, inputs)]
     made.append(make(sort_segments.take_place_kernel, count, [count, hits.total, hits.face, start, key]))
-    inputs = [threads // group, threads, start, key, rows]
+    inputs = [threads // group, threads, start, key, rows, span]
     return [*made, make(sort_segments.sort_segment_kernel, blocks[1] * lanes, inputs)]
