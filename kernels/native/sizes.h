@@ -127,8 +127,6 @@ constexpr double RELATIVE_ERROR = 0x1p-42;
 constexpr double SHORTEST_NORMAL = 0x1p-20;
 constexpr double LEAST_SINE_SQUARED = 0x1p-40;
 constexpr int CHUNK = 32;
-// Hits of an object pair that a block sorts in shared memory.
-constexpr int SORT_ROOM = 2048;
 
 // Certified errors: faces about a merge, distances of corners to them, corners of a polygon, polygons on the stack,
 // faces that cover a triangle, cuts of one, and triangles covered at once.
@@ -156,3 +154,8 @@ constexpr int THREADS = 64;
 // lanes of a warp have room for one in shared memory.
 constexpr int EXPANSION_LENGTH = 192;
 constexpr int EXPANSION_LANES = 16;
+
+// Hits sorted by object pair: threads of a block, and keys that each has room for twice in shared memory.
+constexpr int SEGMENT_THREADS = 256;
+constexpr int SEGMENT_KEYS = 8;
+static_assert(2 * SEGMENT_KEYS * SEGMENT_THREADS * 8 <= 32768, "7 blocks fit into a multiprocessor");

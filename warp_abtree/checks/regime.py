@@ -13,6 +13,7 @@ class Regime:
         stack_length: Items on a warp's stack before the rest goes depth-first; None is all there is room for.
         small_faces: Faces up to which warps compare two trees at once, not level by level.
         key_bits: Bits of a sort key; an object pair and two faces that take more are sorted in two passes.
+        segments: Whether hits are sorted by a segment a pair; None: on CUDA where pairs have few.
         cpu_threads: Threads of a launch on the CPU; None is all that the process may use.
         plain_tests: Pairs of nodes that a thread of the CPU compares by boxes alone before it looks whether few of them
             hit, and makes slabs of subtrees where they do, which as many more tests have to pay for.
@@ -31,6 +32,7 @@ class Regime:
     stack_length: int | None = None
     small_faces: int = 96
     key_bits: int = 63
+    segments: bool | None = None
     cpu_threads: int | None = None
     plain_tests: int = 6144
     slabs: bool = True

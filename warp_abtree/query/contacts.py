@@ -65,20 +65,18 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.contact import chunks, contact, pack, simd, sort_hits, sort_pairs, summary
+from warp_abtree.kernels.contact import chunks, contact, pack, simd, sort_hits, summary
 from warp_abtree.kernels.gap import separation
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import CapacityError
 from warp_abtree.query.result import VECTORS, Found, contact_dtypes
+from warp_abtree.query.sorting import first_sort
 from warp_abtree.query.staging import first_rows
 from warp_abtree.state.batch import Batch
 
 # Warps that a multiprocessor runs at a time, by their registers, of those that find deferred contacts.
 DEFERRED_WARPS = 8
-# Threads that sort the hits of a pair, and pairs up to which each warp adds up what others found before it.
-BLOCK_DIM = 256
-SORTED_PAIRS_MAX = 65536
 
 
 class ContactQuery(Query):
@@ -150,7 +148,8 @@ class ContactQuery(Query):
             kernels = [(simd.find_pair_contacts_kernel, WARP_SIZE), (contact.find_deferred_kernel, WARP_SIZE)]
             return [*kernels, *searching, (sort_hits.sort_by_pair_kernel, 256)]
         kernels = [(contact.find_contact_kernel, WARP_SIZE), (summary.sum_loop_kernel, WARP_SIZE)]
-        return [*kernels, *searching, (sort_hits.make_key_kernel, 256)]
+        further = [] if device.is_cuda else [(chunks.locate_chunk_kernel, 256)]
+        return [*kernels, *searching, *first_sort(device), *further]
 
     def resize(self, capacity: int):
         """Make room for a number of contacts.
@@ -238,28 +237,18 @@ class ContactQuery(Query):
     def _sort(self, count: int):
         room, hits = len(self.pairs), self.hits
         if not self.uses_warps():
-            inputs = [count, hits.total, hits.face, self._key, self.faces, *self._sorted_ends()]
+            inputs = [count, hits.total, hits.face, self._key, self.faces, *self._sorted_ends()[:2]]
             self._repeat((count,), sort_hits.sort_by_pair_kernel, 1, inputs)
-        elif count <= sort_pairs.SORT_ROOM * room and room <= SORTED_PAIRS_MAX and len(self._sort_passes()) == 1:
-            inputs = [count, hits.total, hits.face, hits.count, self.start, self._next, self._deferred.total]
-            threads = room // WARP_SIZE * WARP_SIZE + WARP_SIZE
-            self._repeat((count,), sort_pairs.start_pair_kernel, threads, inputs, WARP_SIZE)
-            inputs = [count, hits.total, hits.face, self._next, self._key]
-            self._repeat((count,), sort_pairs.place_key_kernel, -(-count // BLOCK_DIM) * BLOCK_DIM, inputs, BLOCK_DIM)
-            threads = BLOCK_DIM if self.device.is_cuda else 1
-            inputs = [self.start, self._key, self.faces, self._sums.span]
-            self._launch_kernel(sort_pairs.sort_pair_kernel, room * threads, inputs, BLOCK_DIM)
-        else:
-            if count > 0:
-                self._sort_into(count, self._order, self._key, self.faces)
-            else:
-                self.start.zero_()
-                self._deferred.total.zero_()
+            return
+        if count == 0:
+            self.start.zero_()
+            self._deferred.total.zero_()
+        if count == 0 or not self._sort_into(count, self._order, self._key, self.faces):
             inputs = [self.start, self._sums.span]
             self._launch_kernel(chunks.locate_chunk_kernel, self._chunk_count(count, room), inputs)
 
     def _sorted_ends(self) -> tuple:
-        return self.start, self._deferred.total
+        return self.start, self._deferred.total, self._sums.span
 
     def _find(self, count: int):
         posed = [*self.batch.pools, self.pairs, self.pair_poses]

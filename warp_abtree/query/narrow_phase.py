@@ -11,7 +11,6 @@ from warp_abtree.checks.cpu_threads import launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels import relative_pose
-from warp_abtree.kernels.contact.sort_hits import make_key_kernel
 from warp_abtree.kernels.gap import near_faces
 from warp_abtree.kernels.results import BLOCK_DIM as PACK_DIM
 from warp_abtree.kernels.results import pack_pair_kernel
@@ -23,6 +22,7 @@ from warp_abtree.query.commands import Commands
 from warp_abtree.query.readout import QueryReadout
 from warp_abtree.query.request import LIST_MAX, OUTPUTS, PRECISIONS, check_capacity, check_request, check_within
 from warp_abtree.query.result import Found, Result
+from warp_abtree.query.sorting import first_sort
 from warp_abtree.state.batch import Batch
 from warp_abtree.state.generation import LaunchGuard
 
@@ -309,7 +309,7 @@ class Query(QueryReadout):
         poses = [relative_pose.relative_poses(mode in (within, int(face_pairs.GAP))) for mode in modes]
         further = [(make_slab_kernel, 256)] if regime.uses_warps(device) and regime.slabs else []
         if regime.packs(device):
-            further += [(pack_pair_kernel, PACK_DIM), *([(make_key_kernel, 256)] if output == "faces" else [])]
+            further += [(pack_pair_kernel, PACK_DIM), *(first_sort(device) if output == "faces" else [])]
         found, poses = ([(kernel, WARP_SIZE) for kernel in made] for made in (found, poses))
         return [*found, *passes, *poses, *further]
 

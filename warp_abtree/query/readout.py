@@ -11,7 +11,14 @@ from warp_abtree.kernels import results as kernels
 from warp_abtree.query.buffers import QueryBuffers
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.result import COUNTERS, Found, Result, Totals
-from warp_abtree.query.sorting import make_sort, sort_on_device, sort_passes, sort_rows
+from warp_abtree.query.sorting import (
+    make_segment_sort,
+    make_sort,
+    segment_threads,
+    sort_on_device,
+    sort_passes,
+    sort_rows,
+)
 from warp_abtree.query.staging import Staging, first_rows, view_memory
 
 # Rows that are expected come in steps.
@@ -233,23 +240,44 @@ class QueryReadout(QueryBuffers):
         self._sort_into(count, order, key, rows)
         return rows
 
-    def _sort_into(self, count: int, order, key, rows):
-        """Write the first hits to rows in order, with such scratch. Launches only."""
+    def _sort_into(self, count: int, order, key, rows) -> bool:
+        """Write the first hits to rows in order, with such scratch; return whether by segments. Launches only."""
         if count == 0:
-            return
+            return False
+        chosen = self._regime.segments
+        if self.device.is_cuda or chosen:
+            threads = segment_threads(count, len(self.pairs), chosen)
+            if threads:
+                self._sort_segments(count, threads, key, rows)
+                return True
         passes = self._sort_passes()
         made = self.hits, count, len(self.pairs), passes, order, key, rows
 
         def make(launch):
-            return make_sort(*made, self._sorted_ends(), launch)
+            return make_sort(*made, self._sorted_ends()[:2], launch)
 
         given = *self.guard.given(), count, order.ptr, key.ptr, rows.ptr
         sort_on_device(self._commands.find_callables("sort", given, self.device, make), count, passes, order, key)
+        return False
+
+    def _sort_segments(self, count: int, threads: int, key, rows):
+        """Write the first hits to rows in order by a segment a pair, with such scratch. Launches only."""
+        start, *ends = self._sorted_ends()
+        if not len(start):
+            length = len(self.pairs) + 1
+            start = first_rows(self._staging.room("start", length, wp.int32), length)
+
+        def make(launch):
+            return make_segment_sort(self.hits, count, threads, key, rows, (start, *ends), launch)
+
+        given = *self.guard.given(), count, threads, key.ptr, rows.ptr, start.ptr
+        for launch in self._commands.find_callables("segments", given, self.device, make):
+            launch()
 
     def _sorted_ends(self) -> tuple:
-        """Return what the sort writes beside rows, see `make_sort`."""
+        """Return what the sort writes beside rows, see `make_segment_sort`."""
         none = wp.empty(0, dtype=wp.int32, device=self.device)
-        return none, none
+        return none, none, wp.empty(0, dtype=wp.vec3i, device=self.device)
 
     def _sort_passes(self) -> list:
         return sort_passes(len(self.pairs), int(self.batch.models.face_count.max()), self._regime.key_bits)

@@ -3,10 +3,15 @@
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.contact import sort_hits
+from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.contact import sort_hits, sort_segments
 
 # Rows whose sorting takes longer than packing each into one number, which sorts 20 times as fast.
 ROWS_TO_PACK = 1000
+
+# Hits are sorted by a segment a pair up to so many pairs, whose starts each block sums anew, and up to so many hits a
+# pair on average, which a group of threads sorts by itself.
+SEGMENTS_MOST, SEGMENT_LONGEST = 2**17, 2048
 
 
 def sort_rows(rows: np.ndarray) -> np.ndarray:
@@ -63,3 +68,48 @@ def sort_on_device(launches: list, count: int, passes: list, order, key):
         with wp.ScopedDevice(key.device):
             wp.utils.radix_sort_pairs(key, order, count, end_bit=sum(widths))
     launches[-1]()
+
+
+def first_sort(device) -> list:
+    """Return the kernel that sorts few hits, and its block size."""
+    if device.is_cuda or current_regime().segments:
+        return [(sort_segments.sort_segment_kernel, sort_segments.SEGMENT_THREADS)]
+    return [(sort_hits.make_key_kernel, 256)]
+
+
+def segment_threads(count: int, pair_room: int, chosen: bool | None) -> int:
+    """Return the threads of a group that sorts the hits of one pair on CUDA, 0 for a radix sort of them all.
+
+    Args:
+        count: Hits that are sorted, at most.
+        chosen: `Regime.segments`; None: there are few hits a pair on average.
+    """
+    mean, thread_max = count / pair_room, sort_segments.SEGMENT_THREADS
+    if chosen is None:
+        chosen = pair_room <= SEGMENTS_MOST and mean <= SEGMENT_LONGEST
+    # A few keys a thread, and room in shared memory for pairs of twice as many hits as the mean.
+    threads = 32 if mean <= 64 else 128 if mean <= 512 else thread_max
+    return threads if chosen and count < 2**30 else 0
+
+
+def make_segment_sort(hits, count: int, threads: int, key, rows, ends, launch) -> list:
+    """Return what `launch` makes of the kernels that sort the first hits by a segment a pair, with so many threads.
+
+    Args:
+        hits, key, rows, launch: As for `make_sort`.
+        ends: Device int32 (pair_room + 1,), for where the hits of each pair start; int32 (1,), which becomes 0, and
+            vec3i for `ChunkSums.span`, or (0,).
+    """
+    start, deferred, span = ends
+    device, block, room = key.device, sort_segments.SEGMENT_THREADS, len(start) - 1
+    lanes, group = (block, threads) if device.is_cuda else (1, 1)
+    blocks = -(-room // block), -(-room * group // lanes)
+
+    def make(kernel, dim, inputs):
+        return launch(kernel, dim=dim, inputs=inputs, device=device, block_dim=block)
+
+    inputs = [lanes, count, hits.total, hits.count, hits.face, start, deferred]
+    made = [make(sort_segments.start_segment_kernel, blocks[0] * lanes, inputs)]
+    made.append(make(sort_segments.take_place_kernel, count, [count, hits.total, hits.face, start, key]))
+    inputs = [threads // group, threads, start, key, rows, span]
+    return [*made, make(sort_segments.sort_segment_kernel, blocks[1] * lanes, inputs)]

@@ -125,7 +125,7 @@ class Staging:
         self.device = device
         self.pair_pool, self.row_pool = HostPool(device), HostPool(device)
         self.no_flags, self.no_pairs = (wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int32, wp.vec2i))
-        self.words = self._packed = self.rows = self.order = self.key = self.no_flags
+        self.words = self._packed = self.rows = self.order = self.key = self.start = self.no_flags
 
     def room(self, name: str, count: int, dtype) -> wp.array:
         """Return the array of a name, at least so long."""
