@@ -61,10 +61,12 @@ class LinearMotion:
 
 @wp.struct
 class EndPoses:
-    """Poses of all objects."""
+    """Poses of all objects, as in `ObjectPool`: where motions start and end."""
 
-    first: ObjectPool  # where motions start
-    last: ObjectPool  # where they end
+    rotation: wp.array(dtype=wp.mat33d)  # at first
+    position: wp.array(dtype=wp.vec3d)  # at first
+    end_rotation: wp.array(dtype=wp.mat33d)  # at last
+    end_position: wp.array(dtype=wp.vec3d)  # at last
 
 
 @wp.struct
@@ -277,15 +279,21 @@ def advance_straight(
 
 
 @wp.func
-def posed_corners(poses: ObjectPool, pair: wp.vec2i, a: corners_type, b: corners_type):
+def posed_corners(
+    rotation: wp.array(dtype=wp.mat33d),
+    position: wp.array(dtype=wp.vec3d),
+    pair: wp.vec2i,
+    a: corners_type,
+    b: corners_type,
+):
     """Return corners of A's face and of B's in the world, and what magnitudes they are sums of."""
     corners = words_type()
     size = wp.float64(0.0)
     for k in range(3):
-        corners[k] = posed_row(poses.rotation[pair[0]], poses.position[pair[0]], a[k])
-        corners[3 + k] = posed_row(poses.rotation[pair[1]], poses.position[pair[1]], b[k])
+        corners[k] = posed_row(rotation[pair[0]], position[pair[0]], a[k])
+        corners[3 + k] = posed_row(rotation[pair[1]], position[pair[1]], b[k])
         size = wp.max(size, wp.max(largest(a[k]), largest(b[k])))
-    away = wp.max(largest(poses.position[pair[0]]), largest(poses.position[pair[1]]))
+    away = wp.max(largest(position[pair[0]]), largest(position[pair[1]]))
     return corners, wp.float64(4.0) * size + away
 
 
@@ -294,8 +302,8 @@ def carry_on_in_world(
     poses: EndPoses, pair: wp.vec2i, a: corners_type, b: corners_type, start: wp.float64, best: wp.float64
 ):
     """Return the `Contact` of faces of models, see `stalled`."""
-    starts, first = posed_corners(poses.first, pair, a, b)
-    ends, last = posed_corners(poses.last, pair, a, b)
+    starts, first = posed_corners(poses.rotation, poses.position, pair, a, b)
+    ends, last = posed_corners(poses.end_rotation, poses.end_position, pair, a, b)
     return carry_on(starts, ends, POSED_WORDS * wp.max(first, last), start, best)
 
 

@@ -234,7 +234,8 @@ class FirstContactQuery(Query):
         models, states, objects = self.batch.pools
         room, launch = len(self.pairs), partial(launch, device=self.device)
         poses = straight.EndPoses()
-        poses.first, poses.last = objects, self.ends
+        poses.rotation, poses.position = objects.rotation, objects.position
+        poses.end_rotation, poses.end_position = self.ends.rotation, self.ends.position
         inputs = [self._stack_length(), self.tolerance, models, states, poses]
         inputs += [self.pair_count, self.pair_poses, self._motion]
         if self.uses_warps():
