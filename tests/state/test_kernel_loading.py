@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import trimesh
@@ -9,6 +10,7 @@ import warp as wp
 
 import warp_abtree as ab
 from warp_abtree.checks import kernel_loading
+from warp_abtree.scene.kept_queries import yes_or_no_kernels
 from warp_abtree.testing import regime
 
 
@@ -125,8 +127,16 @@ def test_all_that_a_first_query_launches_is_loaded_before(device, monkeypatch, o
     scene = ab.Scene(device)
     for x in (0.0, 3.0 if output == "distance" else 0.5):
         scene.add(ball, (x, 0.1, 0.2, 0, 0, 0, 1))
-    with regime(warps=warps, packs_results=warps):
+    with regime(warps=warps, packs_results=warps, segments=warps or None):
         scene.intersect([(0, 1)] if output == "distance" else None, output=output)
     assert {module.name for module in launched if "packer" not in module.name} == {module.name for module in loaded}
     crossing = 2 if output == "distance" and wp.get_device(device).is_cuda else 0  # elsewhere where pairs cross
     assert len(set(loaded)) == MODULES[output][warps] + crossing
+
+
+@pytest.mark.parametrize("faces", [1000, 5000])
+def test_modules_compiled_for_a_gpu_ahead_are_those_of_the_launches(faces):
+    """A module is compiled for its own size of blocks there: a launch in another would compile it again."""
+    gpu = SimpleNamespace(is_cuda=True, is_cpu=False, alias="cuda:0")
+    for kernel, block_dim in yes_or_no_kernels(gpu, [faces]):
+        assert kernel.module.options["block_dim"] == block_dim, kernel.key

@@ -143,13 +143,12 @@ class ContactQuery(Query):
 
     @classmethod
     def kernels(cls, device, output, precision, with_gap: bool, with_distances: bool) -> list:
-        searching = super().kernels(device, output, precision, with_gap, with_distances)
+        searching = super().kernels(device, "contacts", precision, with_gap, with_distances)
         if not current_regime().uses_warps(device):
             kernels = [(simd.find_pair_contacts_kernel, WARP_SIZE), (contact.find_deferred_kernel, WARP_SIZE)]
             return [*kernels, *searching, (sort_hits.sort_by_pair_kernel, 256)]
         kernels = [(contact.find_contact_kernel, WARP_SIZE), (summary.sum_loop_kernel, WARP_SIZE)]
-        further = [] if device.is_cuda else [(chunks.locate_chunk_kernel, 256)]
-        return [*kernels, *searching, *first_sort(device), *further]
+        return [*kernels, *searching, *first_sort(device)]
 
     def resize(self, capacity: int):
         """Make room for a number of contacts.
