@@ -110,7 +110,6 @@ class ContactQuery(Query):
     start: wp.array
     _key: wp.array
     _order: wp.array
-    _next: wp.array
     _places = 0
 
     def __init__(
@@ -176,7 +175,6 @@ class ContactQuery(Query):
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
         made.append((self, "start", wp.zeros(room + 1, dtype=wp.int32, device=self.device)))
-        made.append((self, "_next", self._empty(room, wp.int32)))
         for owner, name, dtype in (
             (self.pair_contacts, "point", wp.vec3d),
             (self.pair_contacts, "normal", wp.vec3d),
