@@ -86,6 +86,8 @@ def take_place_kernel(
 ):
     """Put the key of one hit a thread anywhere into its pair's segment.
 
+    A readout may sort ahead of the check that there are rows at all: whatever lies there, all stays in bounds.
+
     Args:
         start_inout: Of `start_segment_kernel`; becomes where the hits of each pair start, and after the last, end.
         key_out: Keys, then scratch, shape [2 capacity].
@@ -94,7 +96,8 @@ def take_place_kernel(
     if i < wp.min(count_rows(total[0], face.shape[0]), capacity):
         row = face[i]
         apart = wp.int64(wp.where((row[0] & NEAR_BIT) != 0, 1, 0))
-        place = take_place(start_inout, row[0] & PAIR_MASK)
+        pair = wp.min(row[0] & PAIR_MASK, start_inout.shape[0] - 2)
+        place = wp.min(take_place(start_inout, pair), capacity - 1)
         key_out[place] = (wp.int64(row[1]) << wp.int64(32)) | (wp.int64(row[2]) << wp.int64(1)) | apart
 
 

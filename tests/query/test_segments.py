@@ -179,3 +179,31 @@ def test_sort_in_a_graph(device):
         with testing.regime(segments=False):
             expected = ab.ContactQuery(scene, pairs).run()
         assert found.contacts.tobytes() == expected.contacts.tobytes() and len(found.faces) > 0
+
+
+def with_margins(count, dtype, device):
+    """Return an array, and the whole of which it is the middle."""
+    whole = wp.zeros(3 * count, dtype=dtype, device=device)
+    whole.fill_(-9)
+    return whole[count : 2 * count], whole
+
+
+@pytest.mark.parametrize("threads", [32, 256])
+@pytest.mark.parametrize("lowest, highest", [(0, 2**30), (0, 1), (99, 100), (-(2**31), 2**31)])
+def test_rows_that_no_launch_has_written_stay_in_bounds(device, threads, lowest, highest):
+    """A buffer may be new where a readout sorts ahead of the check that there was a launch; counts are of before."""
+    rng, sizes = np.random.default_rng(3), np.full(40, 70)
+    capacity, hits = int(sizes.sum()), Hits()
+    rows = rng.integers(lowest, highest, (capacity, 3), dtype=np.int64).astype(np.int32)
+    hits.face = wp.array(rows, dtype=wp.vec3i, device=device)
+    hits.count = wp.array(sizes, dtype=wp.int64, device=device)
+    hits.total = wp.array([capacity], dtype=wp.int32, device=device)
+    key, keys = with_margins(2 * capacity, wp.int64, device)
+    found, all_found = with_margins(3 * capacity, wp.int32, device)
+    start, starts = with_margins(len(sizes) + 1, wp.int32, device)
+    none = wp.empty(0, dtype=wp.int32, device=device), wp.empty(0, dtype=wp.vec3i, device=device)
+    found = wp.array(ptr=found.ptr, shape=capacity, dtype=wp.vec3i, device=device)
+    make_segment_sort(hits, capacity, threads, key, found, (start, *none), wp.launch)
+    for whole in (keys, all_found, starts):
+        third = len(whole) // 3
+        assert (whole.numpy()[:third] == -9).all() and (whole.numpy()[2 * third :] == -9).all()

@@ -124,7 +124,11 @@ inline CUDA_CALLABLE void sort_segment(wp::int32 thread, wp::int32 threads, wp::
 #endif
     if (pair + 1 >= start.shape[0])
         return;
-    const int first = start.data[pair], n = start.data[pair + 1] - first;
+    // Rows that no launch has written may send starts and ends anywhere up to twice the room.
+    const int room = sorted.shape[0] < key.shape[0] / 2 ? sorted.shape[0] : key.shape[0] / 2;
+    const int first = start.data[pair], end = start.data[pair + 1], n = (end < room ? end : room) - first;
+    if (n <= 0)
+        return;
     word *own = (word*)key.data + first, *other = own + key.shape[0] / 2;
     if (n <= run) {
         sort.sort_lanes(own, near, n);
