@@ -76,15 +76,14 @@ def check_buffer_lengths(queries):
         rooms += [] if query.broad_phase is None else [query.broad_phase.pairs]
         if isinstance(query, ab.ContactQuery):
             means, sums, contacts = query.pair_contacts, query._sums, query.contacts
-            rooms += [means.point, means.normal, means.travel, sums.total, sums.middle, query.start[1:]]
+            rooms += [means.point, means.normal, means.travel, sums.middle, query.start[1:]]
             places = [query.hits.face, query.faces, *(getattr(contacts, name) for name in (*VECTORS, "coplanar"))]
-            with_gap = query._gap is not None
-            if with_gap:
-                rooms += [query.hits.gap, sums.number]
+            if query._gap is not None:
+                rooms.append(query.hits.gap)
                 places.append(contacts.separation)
             assert len({len(array) for array in (*places, query._key[::2], query._order[::2])}) == 1
-            chunks = [sums.point, sums.normal, sums.length, sums.area, sums.change, sums.front, sums.back, sums.span]
-            chunks += [sums.crossed] if with_gap else []
+            names = ("point", "normal", "length", "area", "change", "front", "back", "crossed", "span")
+            chunks = [getattr(sums, name) for name in names]
             assert {len(array) for array in chunks} == {len(query.hits.face) // int(CHUNK) + len(query.pairs)}
         assert len({len(room) for room in rooms}) == 1
 
