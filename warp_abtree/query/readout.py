@@ -1,6 +1,7 @@
 """Reading what a launch found: to the host in one transfer of each kind, or into arrays that stay on the device."""
 
 from contextlib import nullcontext
+from functools import cached_property
 
 import numpy as np
 import warp as wp
@@ -276,6 +277,10 @@ class QueryReadout(QueryBuffers):
 
     def _sorted_ends(self) -> tuple:
         """Return what the sort writes beside rows, see `make_segment_sort`."""
+        return self._no_ends
+
+    @cached_property
+    def _no_ends(self) -> tuple:
         none = wp.empty(0, dtype=wp.int32, device=self.device)
         return none, none, wp.empty(0, dtype=wp.vec3i, device=self.device)
 

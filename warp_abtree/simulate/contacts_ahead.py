@@ -19,13 +19,16 @@ class NearestQuery(DistanceQuery):
         place = wp.empty(room, dtype=wp.int32, device=self.device)
         return [*super()._pair_arrays(room), (self._chosen, "place", place)]
 
-    def cut(self, query, gap, bodies):
-        """Cut the gaps of a query's pairs; see `kernels.dynamics.ahead`. Launches only."""
-        room, pools = len(query.pairs), self.batch.pools
-        if len(self.pairs) != room:
+    def make_room(self, room: int):
+        """Make room for so many pairs."""
+        if len(self.pairs) < room:
             self._take_pairs(wp.empty(room, dtype=wp.vec2i, device=self.device))
-        chosen = self._chosen
-        chosen.count, chosen.pairs, chosen.beyond = self.pair_count, self.pairs, self._found.beyond
+            chosen = self._chosen
+            chosen.count, chosen.pairs, chosen.beyond = self.pair_count, self.pairs, self._found.beyond
+
+    def cut(self, query, gap, bodies):
+        """Cut the gaps of a query's pairs, which there is room for; see `kernels.dynamics.ahead`. Launches only."""
+        room, pools, chosen = len(query.pairs), self.batch.pools, self._chosen
         given = query.guard.given()
         with self.guard.launching(self):
             self.pair_count.zero_()
@@ -55,9 +58,12 @@ class AheadQuery(ManifoldQuery):
     """
 
     def __init__(self, scene, bodies, capacity=None):
-        self._bodies = bodies
+        self._bodies, self._nearest = bodies, NearestQuery(scene)
         super().__init__(scene, None, capacity, gap=bodies.reach)
-        self._nearest = NearestQuery(self.batch)
+
+    def _take_pairs(self, pairs):
+        self._nearest.make_room(len(pairs))
+        super()._take_pairs(pairs)
 
     def prove_apart(self):
         """Cut gaps to a little over the distances of the pairs. Launches only."""
