@@ -13,7 +13,7 @@ from warp_abtree.kernels.motion.linear import (
     start_linear_motion,
 )
 from warp_abtree.kernels.motion.node_pair import advance_children, box_motion
-from warp_abtree.kernels.motion.path import Motion, Paths, bound_motion, place_motion, skew_of, start_motion
+from warp_abtree.kernels.motion.path import Motion, Paths, bound_motion, pair_skew, place_motion, start_motion
 from warp_abtree.kernels.motion.screw import is_screw, parent_of, slides_apart
 from warp_abtree.kernels.poses import NO_NODE, PairPose
 from warp_abtree.kernels.traversal.node_pair import item_first, item_second
@@ -34,7 +34,7 @@ def make_motion(
 ):
     """Return the motion of objects a < b of the kind that is named."""
     motion = start_motion(paths, models, states, objects, pair)
-    return bound_motion(motion, states, pose, skew_of(objects, pair[0], motion.first))
+    return bound_motion(motion, states, pose, pair_skew(objects, pair[0], motion.first))
 
 
 @wp.func
@@ -49,7 +49,7 @@ def make_motion(  # noqa: F811 - Warp takes the one for the type
     pair: wp.vec2i,
 ):
     motion = start_linear_motion(ends, models, states, objects, pair)
-    return bound_linear_motion(motion, states, pose, skew_of(objects, pair[0], motion.first))
+    return bound_linear_motion(motion, states, pose, pair_skew(objects, pair[0], motion.first))
 
 
 @wp.func

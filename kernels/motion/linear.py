@@ -110,7 +110,7 @@ def start_linear_motion(
 
 @wp.func
 def bound_linear_motion(before: LinearMotion, states: StatePool, pose: PairPose, skew: wp.float64) -> LinearMotion:
-    """Return a motion with its bounds, of rotations off by `path.skew_of`."""
+    """Return a motion with its bounds, of rotations off by `path.pair_skew`."""
     motion = before
     root_a = load_node(states, pose.node_a + 1)
     root_b = load_node(states, pose.node_b + 1)

@@ -200,7 +200,7 @@ def start_motion(paths: Paths, models: ModelPool, states: StatePool, objects: Ob
 
 
 @wp.func
-def skew_of(objects: ObjectPool, a: wp.int32, first: wp.mat33d):
+def pair_skew(objects: ObjectPool, a: wp.int32, first: wp.mat33d):
     """Return how far rotations of A, and of B in its frame, are off orthonormal."""
     own, _ = measure_rotation(objects.rotation[a])
     skew, _ = measure_rotation(first)
@@ -209,7 +209,7 @@ def skew_of(objects: ObjectPool, a: wp.int32, first: wp.mat33d):
 
 @wp.func
 def bound_motion(before: Motion, states: StatePool, pose: PairPose, skew: wp.float64):
-    """Return a motion with its bounds, of rotations off by `skew_of`."""
+    """Return a motion with its bounds, of rotations off by `pair_skew`."""
     motion = before
     root_a = load_node(states, pose.node_a + 1)
     root_b = load_node(states, pose.node_b + 1)

@@ -17,7 +17,7 @@ from warp_abtree.kernels.motion.linear import (
     see,
     start_linear_motion,
 )
-from warp_abtree.kernels.motion.path import skew_of
+from warp_abtree.kernels.motion.path import pair_skew
 from warp_abtree.kernels.poses import place_trees
 from warp_abtree.kernels.traversal.nodes import load_node
 
@@ -47,7 +47,7 @@ def view_kernel(
     t, a, b, o = times[i], 2 * i, 2 * i + 1, wp.vec3()
     pose = place_trees(models, states, objects.state[a], objects.state[b])
     m = start_linear_motion(ends, models, states, objects, wp.vec2i(a, b))
-    m = bound_linear_motion(m, states, pose, skew_of(objects, a, m.first))
+    m = bound_linear_motion(m, states, pose, pair_skew(objects, a, m.first))
     speed = (m.way_b * m.centre_b + m.shift_b) - (m.way_a * m.centre_a + m.shift_a)
     shift = ((m.first * m.centre_b + m.offset) - m.centre_a) + t * speed
     at = image_of(wp.identity(n=3, dtype=wp.float64) + t * m.way_a, m.first + t * m.way_b, shift, m.scale)

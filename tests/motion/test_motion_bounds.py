@@ -19,10 +19,10 @@ from warp_abtree.kernels.motion.path import (
     Motion,
     Paths,
     bound_motion,
+    pair_skew,
     place_motion,
     prepare_path_kernel,
     reverse_moment,
-    skew_of,
     start_motion,
 )
 from warp_abtree.kernels.poses import place_trees
@@ -57,7 +57,7 @@ def see_kernel(
     pose = place_trees(models, states, objects.state[a], objects.state[b])
     seen = Seen()
     motion = start_motion(paths, models, states, objects, wp.vec2i(a, b))
-    seen.motion = bound_motion(motion, states, pose, skew_of(objects, a, motion.first))
+    seen.motion = bound_motion(motion, states, pose, pair_skew(objects, a, motion.first))
     seen.b_in_a = place_motion(seen.motion, times[i])
     seen.a_in_b = reverse_moment(seen.b_in_a)
     boxes = box_motion(seen.motion, seen.b_in_a)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.motion.path import Paths, bound_motion, prepare_path_kernel, skew_of, start_motion
+from warp_abtree.kernels.motion.path import Paths, bound_motion, pair_skew, prepare_path_kernel, start_motion
 from warp_abtree.kernels.motion.screw import TURN_ROUNDING, slides_apart, turn_between
 from warp_abtree.kernels.poses import place_trees
 
@@ -36,7 +36,7 @@ def slide_kernel(
     a, b = 2 * i, 2 * i + 1
     pose = place_trees(models, states, objects.state[a], objects.state[b])
     motion = start_motion(paths, models, states, objects, wp.vec2i(a, b))
-    motion = bound_motion(motion, states, pose, skew_of(objects, a, motion.first))
+    motion = bound_motion(motion, states, pose, pair_skew(objects, a, motion.first))
     if slack > wp.float64(0.0):
         motion.slack = slack
     apart_out[i] = wp.where(slides_apart(models, states, pose, motion, wp.float64(0.0), 1, 1), 1, 0)
