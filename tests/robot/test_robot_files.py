@@ -134,6 +134,12 @@ def test_a_limit_that_urdf_leaves_out_is_zero(urdf):
         ('size="0.08 0.08 0.5"', 'size="0.08 0.5"', "link 'upper': sizes .* are not 3"),
         ('radius="0.1" length', 'radius="-0.1" length', "link 'base': sizes .* are not 2"),
         ('radius="0.03"', 'radius="nan"', "link 'left': sizes .* are not 1"),
+        ('radius="0.03"', 'radius="0"', "link 'left': a sphere has radius 0"),
+        ('<link name="flange"/>', '<link name="base"/>', "2 links have the name 'base'"),
+        ('<joint name="mount"', '<joint name="turn"', "2 joints have the name 'turn'"),
+        ('multiplier="-1"', 'multiplier="nan"', "joint 'follow' mimics 'grip' by numbers that are not finite"),
+        ('scale="2 1 1"', 'scale="2 1"', "link 'upper': scale .* of a mesh is not 3 finite numbers"),
+        ('size="0.06 0.06 0.4"', 'size="0 0 0"', "urdf: link 'fore': .*no face has three distinct corners"),
     ],
 )
 def test_bad_urdf_is_refused(urdf, before, after, message):

@@ -1,6 +1,7 @@
 """Robots of URDF files, read by yourdfpy (extra `robot`), and pairs that an SRDF file excludes."""
 
 import math
+from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -34,6 +35,10 @@ def read_urdf(path: Path, geometry: str) -> Description:
         raise RobotError(f"{path}: not read as URDF ({first_line(error)})") from None
     description, joints = Description(), {joint.child: joint for joint in robot.joints}
     names = [link.name for link in robot.links]
+    for what, given in (("links", names), ("joints", [joint.name for joint in robot.joints])):
+        name, count = max(Counter(given).items(), key=lambda item: item[1], default=("", 0))
+        if count > 1:
+            raise RobotError(f"{path}: {count} {what} have the name {name!r}")
     for joint in robot.joints:
         _check_joint(joint, joints, names, path)
     for joint in robot.joints:  # in the file's order, as configurations are
@@ -55,7 +60,10 @@ def read_urdf(path: Path, geometry: str) -> Description:
             (*_load_shape(shape.geometry, where, find_file), check_rigid(shape.origin, where)) for shape in shapes
         ]
         if placed:
-            description.parts.append(Part(k, join_meshes(placed, link.name)))
+            try:
+                description.parts.append(Part(k, join_meshes(placed, link.name)))
+            except MeshError as error:
+                raise RobotError(f"{where}: {first_line(error)}") from None
     return description
 
 
@@ -97,6 +105,8 @@ def _value_of(joint, joints, path) -> tuple[str, float, float]:
         by = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
         offset += scale * (0.0 if joint.mimic.offset is None else float(joint.mimic.offset))
         scale *= by
+        if not (math.isfinite(scale) and math.isfinite(offset)):
+            raise RobotError(f"{path}: joint {joint.name!r} mimics {source!r} by numbers that are not finite")
         joint = named[source]
         seen.add(source)
     return joint.name, scale, offset
@@ -135,7 +145,9 @@ def _load_shape(geometry, where, find_file):
             mesh = load_mesh(file)
         except MeshError as error:
             raise RobotError(f"{where}: {first_line(error)}") from None
-        scale = 1.0 if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale, np.float64)
+        scale = np.asarray(1.0 if geometry.mesh.scale is None else geometry.mesh.scale, np.float64)
+        if scale.shape not in ((), (1,), (3,)) or not np.isfinite(scale).all():
+            raise RobotError(f"{where}: scale {scale.tolist()} of a mesh is not 3 finite numbers")
         return mesh.vertices * scale, np.delete(mesh.faces, mesh.dropped_faces, axis=0)
     if geometry.box is not None:
         made = trimesh.creation.box(_sizes(geometry.box.size, 3, where))
@@ -143,6 +155,8 @@ def _load_shape(geometry, where, find_file):
         made = trimesh.creation.cylinder(*_sizes([geometry.cylinder.radius, geometry.cylinder.length], 2, where))
     elif geometry.sphere is not None:
         (radius,) = _sizes([geometry.sphere.radius], 1, where)
+        if radius == 0:
+            raise RobotError(f"{where}: a sphere has radius 0")
         made = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     else:
         raise RobotError(f"{where}: a shape that is neither mesh, box, cylinder nor sphere")
