@@ -71,6 +71,8 @@ REFUSED = [
     *refuse(r"^budget_ms\b", lambda x: ab.PredictiveController(balls(), x), *BAD_NUMBERS),
     *refuse(r"^tolerance\b", lambda x: ab.ToleranceController(balls(), x), *BAD_NUMBERS),
     *refuse(r"^threshold_ms\b", lambda x: ab.PaperController(balls(), 8.0, threshold_ms=x), "8", np.nan, -1.0),
+    *refuse("^device 'cpu'", lambda x: balls().intersect(device=x), "cpu"),
+    *refuse("^device 'cpu'", lambda x: balls().first_contact(None, np.eye(4)[None].repeat(2, 0), device=x), "cpu"),
     *refuse("friction", lambda x: ab.Dynamics(balls(count=1), friction=x), np.inf),
     *refuse(
         "base_faces", lambda x: ab.Model.from_arrays(np.eye(3), [[0, 1, 2]], base_faces=x), 1.5, np.inf, "ten", True

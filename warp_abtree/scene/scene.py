@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.arguments import check_device, to_numpy, whole_number
+from warp_abtree.checks.arguments import check_device, flag, to_numpy, whole_number
 from warp_abtree.model.model import Model
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.request import given_options, refuse_options
@@ -317,6 +317,7 @@ class Scene:
         """
         check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)
+        flag(device, "device")
         options = given_options("intersect", within=within, **options)
         if output == "distance":
             refuse_options(output, {"precision": precision != "exact"})
@@ -347,6 +348,7 @@ class Scene:
                 revolution, within 1e-6 rad, which has no shortest way.
         """
         check_device(self.device, "Scene.first_contact (FirstContactQuery.launch can)")
+        flag(device, "device")
         if pairs is not None:
             pairs = check_pairs(pairs, self.object_count)
         return self._queries.find_first_contacts(pairs, end_poses, tolerance, screw, linear, device)
