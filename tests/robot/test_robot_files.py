@@ -157,6 +157,12 @@ def test_bad_urdf_is_refused(urdf, before, after, message):
         ('type="cylinder" size="0.1 0.1"', 'name="ground" type="plane" size="1 1 1"', "geom 'ground' is a plane"),
         ('polycoef="-0.04 -1 0 0 0"', 'polycoef="0 -1 1 0 0"', "follows another by a curve"),
         ('file="part.stl"', 'file="lost.stl"', "lost.stl"),
+        ('<body name="flange" pos="0 0 0.45">', '<body><body name="body 4"/>', "2 bodies have the name 'body 4'"),
+        (
+            '<joint name="turn" axis="0 0 1"/>',
+            '<joint/><joint name="joint 0" axis="1 0 0"/>',
+            "2 joints have the name 'joint 0'",
+        ),
     ],
 )
 def test_bad_mjcf_is_refused(mjcf, before, after, message):

@@ -1,6 +1,8 @@
 """What a robot's file says, whatever its format: frames and their joints, links, parts, and pairs never tested."""
 
+from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -143,6 +145,17 @@ def unit_axis(axis, what: str) -> tuple:
     if axis.shape != (3,) or not (np.isfinite(size) and size > 1e-12):
         raise RobotError(f"{what}: {axis.tolist()} is no axis")
     return tuple(axis / size)
+
+
+def check_names(names: list[str], what: str, path: Path):
+    """Refuse names of links or joints that are not each there once.
+
+    Raises:
+        RobotError: One comes again.
+    """
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise RobotError(f"{path}: {count} {what} have the name {name!r}")
 
 
 def check_rigid(matrix, what: str) -> np.ndarray:

@@ -6,7 +6,15 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
-from warp_abtree.interop.robot.description import Description, Frame, Part, RobotError, join_meshes, unit_axis
+from warp_abtree.interop.robot.description import (
+    Description,
+    Frame,
+    Part,
+    RobotError,
+    check_names,
+    join_meshes,
+    unit_axis,
+)
 from warp_abtree.interop.robot.urdf import INSTALL
 
 KINDS = {"hinge": "revolute", "slide": "prismatic"}
@@ -24,6 +32,7 @@ def read_mjcf(path: Path, geometry: str) -> Description:
     except Exception as error:
         raise RobotError(f"{path}: not read as MJCF ({first_line(error)})") from None
     description, names = Description(), [model.body(b).name or f"body {b}" for b in range(model.nbody)]
+    check_names(names, "bodies", path)
     values = _joint_values(mujoco, model, path)
     for j in range(model.njnt):
         if values[j] == (model.joint(j).name or f"joint {j}", 1.0, 0.0):
@@ -43,6 +52,7 @@ def read_mjcf(path: Path, geometry: str) -> Description:
 def _joint_values(mujoco, model, path) -> list[tuple[str, float, float]]:
     """Return for each joint that which a configuration sets, and scale and offset of what this one makes of it."""
     names = [model.joint(j).name or f"joint {j}" for j in range(model.njnt)]
+    check_names(names, "joints", path)
     values, leads = [(name, 1.0, 0.0) for name in names], {}
     for j, name in enumerate(names):
         kind = mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()

@@ -1,7 +1,6 @@
 """Robots of URDF files, read by yourdfpy (extra `robot`), and pairs that an SRDF file excludes."""
 
 import math
-from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -13,6 +12,7 @@ from warp_abtree.interop.robot.description import (
     Frame,
     Part,
     RobotError,
+    check_names,
     check_rigid,
     join_meshes,
     unit_axis,
@@ -36,9 +36,7 @@ def read_urdf(path: Path, geometry: str) -> Description:
     description, joints = Description(), {joint.child: joint for joint in robot.joints}
     names = [link.name for link in robot.links]
     for what, given in (("links", names), ("joints", [joint.name for joint in robot.joints])):
-        name, count = max(Counter(given).items(), key=lambda item: item[1], default=("", 0))
-        if count > 1:
-            raise RobotError(f"{path}: {count} {what} have the name {name!r}")
+        check_names(given, what, path)
     for joint in robot.joints:
         _check_joint(joint, joints, names, path)
     for joint in robot.joints:  # in the file's order, as configurations are
