@@ -177,6 +177,22 @@ def ask_slabs(models: ModelPool, states: StatePool, slabs: Slabs, state: wp.int3
         slabs.made[state] = wp.vec4i(key[0], key[1], key[2], uses)
 
 
+@wp.func
+def refresh_slabs(
+    p: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    slabs: Slabs,
+):
+    """Count what an object pair asks for, and make the slabs that pay; one thread after the other."""
+    own = wp.vec2i(objects.state[pairs[p][0]], objects.state[pairs[p][1]])
+    slabs.states[p] = own
+    ask_slabs(models, states, slabs, own[0])
+    ask_slabs(models, states, slabs, own[1])
+
+
 @wp.kernel
 def refresh_slab_kernel(
     models: ModelPool,
@@ -188,16 +204,9 @@ def refresh_slab_kernel(
     slabs_inout: Slabs,
     counter_out: wp.array(dtype=wp.int32),
 ):
-    """Count what pairs ask for, and make the slabs that pay; CPU only, one thread after the other.
-
-    Counters of the search start at 0.
-    """
+    """Do what comes before a search by several threads, see `refresh_slabs`; CPU only. Its counters start at 0."""
     p = wp.tid()
     if p < counter_out.shape[0]:
         counter_out[p] = 0
-    if p >= wp.min(pair_count[0], pairs.shape[0]) or found.launched[0] == STALE:
-        return
-    own = wp.vec2i(objects.state[pairs[p][0]], objects.state[pairs[p][1]])
-    slabs_inout.states[p] = own
-    ask_slabs(models, states, slabs_inout, own[0])
-    ask_slabs(models, states, slabs_inout, own[1])
+    if p < wp.min(pair_count[0], pairs.shape[0]) and found.launched[0] != STALE:
+        refresh_slabs(p, models, states, objects, pairs, slabs_inout)
