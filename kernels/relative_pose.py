@@ -43,6 +43,16 @@ def clear_hits(p: wp.int32, hits: Hits):
     hits.exact_tests[p] = wp.int64(0)
 
 
+@wp.struct
+class Started:
+    """The object pairs of the threads of the CPU; one that is alone starts them itself."""
+
+    pair_count: wp.array(dtype=wp.int32)  # shape (1,)
+    pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]; [0] where `relative_poses` have started them
+    within: wp.array(dtype=wp.float64)  # as for `relative_pose_kernel`
+    pair_poses: wp.array(dtype=PairPose)  # shape [pair]
+
+
 @functools.cache
 def pose_starter(with_distances: bool):
     """Return the function that starts the traversal of a pair: for pairs that meet, or are nearer than distances."""
@@ -117,3 +127,30 @@ def relative_poses(with_distances: bool):
         start_pose(p, output, models, states, objects, pairs, within, pair_pose_out, work_out)
 
     return relative_pose_kernel
+
+
+@functools.cache
+def pairs_starter(with_distances: bool):
+    """Return the function by which one thread does what `relative_poses` do, where it is to."""
+    start_pose = pose_starter(with_distances)
+
+    @wp.func
+    def start_pairs(
+        output: wp.int32,
+        models: ModelPool,
+        states: StatePool,
+        objects: ObjectPool,
+        started: Started,
+        hits: Hits,
+        work: Work,
+    ):
+        room = started.pairs.shape[0]
+        if room > 0:
+            count = wp.min(started.pair_count[0], room)
+            clear_work(count, work)
+            for p in range(room):
+                clear_hits(p, hits)
+            for p in range(count):
+                start_pose(p, output, models, states, objects, started.pairs, started.within, started.pair_poses, work)
+
+    return start_pairs

@@ -121,7 +121,6 @@ class Query(QueryReadout):
         self.near = None if within is None else self._make_hits()
         self.work = self._make_work()
         self._no_distance = wp.empty(0, dtype=wp.float64, device=self.device)
-        self._no_pairs = wp.empty(0, dtype=wp.vec2i, device=self.device)
         self._within = within
         self._resize_uncertain((room.uncertain or UNCERTAIN_ROOM) if self.uses_warps() else 0)
         self._take_pairs(self.pairs)
@@ -238,8 +237,11 @@ class Query(QueryReadout):
             kernel = relative_pose.relative_poses(len(within) > 0)
             made.append(launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
         if not self.uses_warps():
-            inputs = [output, *pools, self.pair_count, self.pairs if alone else self._no_pairs, within]
-            inputs += [self.pair_poses, self._regime.plain_tests, self.slab_memory, hits, self.work]
+            started = relative_pose.Started()
+            started.pair_count, started.pair_poses, started.within = self.pair_count, self.pair_poses, within
+            if alone:
+                started.pairs = self.pairs
+            inputs = [output, *pools, started, self._regime.plain_tests, self.slab_memory, hits, self.work]
             return [*made, launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device)]
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
         traversal = launch(
