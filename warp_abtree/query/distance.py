@@ -44,6 +44,7 @@ first where that may decide it (`warp_abtree.kernels.distance.originals`):
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -266,7 +267,7 @@ class DistanceQuery(Query):
         if self.device.is_capturing:
             self._launch_all("distances", self._make_distances)
             self._launch_all("crossings", self._make_crossings)
-            self._launch_all("inside", self._make_inside)
+            self._report_inside()
             return
         cores = self._search_cores()
         given = (cores == 1, *self.guard.given())
@@ -277,7 +278,12 @@ class DistanceQuery(Query):
         # On the CPU what is launched is done.
         if self.device.is_cuda or self._views.any_hit.any():
             self._launch_all("crossings", self._make_crossings)
-        self._launch_all("inside", self._make_inside)
+        self._report_inside()
+
+    def _report_inside(self):
+        """Report pairs of which one is inside the other, where there are solids. Launches only."""
+        if self.batch.solids is not None:
+            self._launch_all("inside", self._make_inside)
 
     def _search_cores(self) -> int:
         """Return how many cores share the search; a graph of the CPU has one."""
@@ -302,15 +308,14 @@ class DistanceQuery(Query):
         return [search, launch(kernel, dim=room, inputs=inputs, block_dim=WARP_SIZE, device=device)]
 
     def _make_inside(self, launch) -> list:
-        """Make the launch that reports pairs of which one is inside the other, where there are solids."""
-        if self.batch.solids is None:
-            return []
+        """Make the launches of `_report_inside`."""
+        solids: Any = self.batch.solids
         posed = [*self.batch.pools, self.pair_count, self.pairs, self.pair_poses]
         inputs = [*posed, self.guard.launched, self.hits, self.contained, self.distances]
         made = [launch(report_contained_kernel, dim=len(self.pairs), inputs=inputs, device=self.device)]
         if self._signed:
             models, states, *posed = posed
-            inputs = [self._stack_length(), models, states, self.batch.solids.pool, *posed]
+            inputs = [self._stack_length(), models, states, solids.pool, *posed]
             inputs += [self.guard.launched, self.hits, self.distances]
             dim = len(self.pairs) * (WARP_SIZE if self.device.is_cuda else 1)
             made.append(launch(find_depth_kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
