@@ -43,9 +43,56 @@ def clear_hits(p: wp.int32, hits: Hits):
     hits.exact_tests[p] = wp.int64(0)
 
 
+@wp.struct
+class Started:
+    """The object pairs of the threads of the CPU; one that is alone starts them itself."""
+
+    pair_count: wp.array(dtype=wp.int32)  # shape (1,)
+    pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]; [0] where `relative_poses` have started them
+    within: wp.array(dtype=wp.float64)  # as for `relative_pose_kernel`
+    pair_poses: wp.array(dtype=PairPose)  # shape [pair]
+
+
+@functools.cache
+def pose_starter(with_distances: bool):
+    """Return the function that starts the traversal of a pair: for pairs that meet, or are nearer than distances."""
+
+    @wp.func
+    def start_pose(
+        p: wp.int32,
+        output: wp.int32,
+        models: ModelPool,
+        states: StatePool,
+        objects: ObjectPool,
+        pairs: wp.array(dtype=wp.vec2i),
+        within: wp.array(dtype=wp.float64),
+        pair_poses: wp.array(dtype=PairPose),
+        work: Work,
+    ):
+        """Compute the pose of B in A's frame, A the smaller index."""
+        a = wp.min(pairs[p][0], pairs[p][1])
+        b = wp.max(pairs[p][0], pairs[p][1])
+        distance = wp.float64(0.0)
+        if wp.static(with_distances):
+            distance = pad_distance(models, states, objects, a, b, within[p])
+        pose = pair_pose(output != OUTPUT_ANY, models, states, objects, a, b, distance)
+        if wp.static(with_distances):
+            if within[p] >= DISTANCE_MAX:
+                # Nothing is proved where distances may overflow: every box passes, and the first faces count as near.
+                pose.within = wp.float64(wp.inf)
+                pose.margin = wp.inf
+        if pose.margin >= 0.0 and not is_small(pose, work.small_faces):
+            note_descent(work)
+        pose.swapped = wp.where(pairs[p][0] > pairs[p][1], 1, 0)
+        pair_poses[p] = pose
+
+    return start_pose
+
+
 @functools.cache
 def relative_poses(with_distances: bool):
-    """Return the kernel that starts a traversal: for pairs that meet, or that are nearer than distances."""
+    """Return the kernel that starts a traversal, as `pose_starter`."""
+    start_pose = pose_starter(with_distances)
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def relative_pose_kernel(
@@ -77,20 +124,33 @@ def relative_poses(with_distances: bool):
         clear_hits(p, hits_out)
         if p >= count:
             return
-        a = wp.min(pairs[p][0], pairs[p][1])
-        b = wp.max(pairs[p][0], pairs[p][1])
-        distance = wp.float64(0.0)
-        if wp.static(with_distances):
-            distance = pad_distance(models, states, objects, a, b, within[p])
-        pose = pair_pose(output != OUTPUT_ANY, models, states, objects, a, b, distance)
-        if wp.static(with_distances):
-            if within[p] >= DISTANCE_MAX:
-                # Nothing is proved where distances may overflow: every box passes, and the first faces count as near.
-                pose.within = wp.float64(wp.inf)
-                pose.margin = wp.inf
-        if pose.margin >= 0.0 and not is_small(pose, work_out.small_faces):
-            note_descent(work_out)
-        pose.swapped = wp.where(pairs[p][0] > pairs[p][1], 1, 0)
-        pair_pose_out[p] = pose
+        start_pose(p, output, models, states, objects, pairs, within, pair_pose_out, work_out)
 
     return relative_pose_kernel
+
+
+@functools.cache
+def pairs_starter(with_distances: bool):
+    """Return the function by which one thread does what `relative_poses` do, where it is to."""
+    start_pose = pose_starter(with_distances)
+
+    @wp.func
+    def start_pairs(
+        output: wp.int32,
+        models: ModelPool,
+        states: StatePool,
+        objects: ObjectPool,
+        started: Started,
+        hits: Hits,
+        work: Work,
+    ):
+        room = started.pairs.shape[0]
+        if room > 0:
+            count = wp.min(started.pair_count[0], room)
+            clear_work(count, work)
+            for p in range(room):
+                clear_hits(p, hits)
+            for p in range(count):
+                start_pose(p, output, models, states, objects, started.pairs, started.within, started.pair_poses, work)
+
+    return start_pairs

@@ -22,7 +22,7 @@ from warp_abtree.kernels.distance.frame import (
     start_pair,
 )
 from warp_abtree.kernels.distance.report import Distances, report_pair
-from warp_abtree.kernels.distance.slabs import Slabs, has_slabs
+from warp_abtree.kernels.distance.slabs import Slabs, has_slabs, refresh_slabs
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import PairPose
@@ -107,6 +107,7 @@ class Asked:
     pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]
     pair_poses: wp.array(dtype=PairPose)  # shape [pair]
     tolerances: Tolerances  # when they are near enough
+    alone: wp.bool  # whether one thread takes them all, and first does what `refresh_slab_kernel` does
 
 
 @wp.func
@@ -168,6 +169,11 @@ def search_thread_kernel(
         return
     pairs, poses = asked.pairs, asked.pair_poses
     count = wp.min(asked.pair_count[0], poses.shape[0])
+    if asked.alone:
+        for i in range(counter.shape[0]):
+            counter[i] = 0
+        for i in range(count):
+            refresh_slabs(i, models, states, objects, pairs, slabs)
     thread = take_thread(counter)
     if thread >= memory_out.shape[0]:
         return

@@ -8,7 +8,7 @@ A slab is two entries of 16 bytes a node, as `nodes.Node` has:
 
     127        96 95         64 63         32 31          0
     [    low     |  normal z   |  normal y   |  normal x   ]
-    [     -      |      -      | area of sum |    high     ]
+    [     -      |   radius    | area of sum |    high     ]
 """
 
 import warp as wp
@@ -42,6 +42,7 @@ class Slab:
     low: wp.float32  # least
     high: wp.float32  # greatest
     weight: wp.float32  # length of the sum of the faces' normals, each as long as twice its area
+    radius: wp.float32  # of a ball about the middle of the node's box that holds the faces
 
 
 @wp.func
@@ -52,6 +53,7 @@ def load_slab(slabs: Slabs, at: wp.int32):
     slab.low = first[3]
     slab.high = second[0]
     slab.weight = second[1]
+    slab.radius = second[2]
     return slab
 
 
@@ -59,7 +61,7 @@ def load_slab(slabs: Slabs, at: wp.int32):
 def store_slab(slabs: Slabs, at: wp.int32, slab: Slab):
     n = slab.normal
     slabs.record[2 * at] = wp.vec4(n[0], n[1], n[2], slab.low)
-    slabs.record[2 * at + 1] = wp.vec4(slab.high, slab.weight, 0.0, 0.0)
+    slabs.record[2 * at + 1] = wp.vec4(slab.high, slab.weight, slab.radius, 0.0)
 
 
 @wp.func
@@ -76,7 +78,13 @@ def set_normal(slab: Slab, sum: wp.vec3d):
 
 
 @wp.func
-def face_slab(models: ModelPool, states: StatePool, at: wp.int32):
+def middle_of(node: Node):
+    """Return the middle of a node's box."""
+    return wp.float64(0.5) * (wp.vec3d(node.lower) + wp.vec3d(node.upper))
+
+
+@wp.func
+def face_slab(models: ModelPool, states: StatePool, node: Node, at: wp.int32):
     """Return the slab of one active face."""
     c = states.face_corner[at]
     p = models.vertex_near[c[0]]
@@ -89,6 +97,8 @@ def face_slab(models: ModelPool, states: StatePool, at: wp.int32):
     n = wp.vec3d(slab.normal)
     slab.low = round_down(wp.min(wp.min(wp.dot(n, a), wp.dot(n, b)), wp.dot(n, d)))
     slab.high = round_up(wp.max(wp.max(wp.dot(n, a), wp.dot(n, b)), wp.dot(n, d)))
+    m = middle_of(node)
+    slab.radius = round_up(wp.max(wp.max(wp.length(a - m), wp.length(b - m)), wp.length(d - m)))
     return slab
 
 
@@ -108,8 +118,8 @@ def top_of(node: Node, slab: Slab, n: wp.vec3d):
 
 
 @wp.func
-def join_slabs(states: StatePool, slabs: Slabs, at: wp.int32):
-    """Return the slab of two siblings of the pool together."""
+def join_slabs(states: StatePool, slabs: Slabs, node: Node, at: wp.int32):
+    """Return the slab of a node whose children are two siblings of the pool."""
     first, second = load_slab(slabs, at), load_slab(slabs, at + 1)
     sum = wp.float64(first.weight) * wp.vec3d(first.normal) + wp.float64(second.weight) * wp.vec3d(second.normal)
     slab = set_normal(Slab(), sum)
@@ -117,6 +127,11 @@ def join_slabs(states: StatePool, slabs: Slabs, at: wp.int32):
     a, b = load_node(states, at), load_node(states, at + 1)
     slab.high = round_up(wp.max(top_of(a, first, n), top_of(b, second, n)))
     slab.low = round_down(-wp.max(top_of(a, first, -n), top_of(b, second, -n)))
+    m = middle_of(node)
+    one = wp.length(middle_of(a) - m) + wp.float64(first.radius)
+    other = wp.length(middle_of(b) - m) + wp.float64(second.radius)
+    box = wp.length(wp.vec3d(node.upper) - m)
+    slab.radius = round_up(wp.min(box, wp.max(one, other)))
     return slab
 
 
@@ -130,11 +145,11 @@ def make_slabs(models: ModelPool, states: StatePool, slabs: Slabs, state: wp.int
         node = load_node(states, start + i)
         if node.skip >= 0:
             if node.face >= 0:
-                store_slab(slabs, start + i, face_slab(models, states, states.face_start[state] + node.face))
+                store_slab(slabs, start + i, face_slab(models, states, node, states.face_start[state] + node.face))
             elif node.skip != i:
                 store_slab(slabs, start + i, load_slab(slabs, start + node.skip))
             else:
-                store_slab(slabs, start + i, join_slabs(states, slabs, start + 2 * i))
+                store_slab(slabs, start + i, join_slabs(states, slabs, node, start + 2 * i))
 
 
 @wp.func
@@ -162,6 +177,22 @@ def ask_slabs(models: ModelPool, states: StatePool, slabs: Slabs, state: wp.int3
         slabs.made[state] = wp.vec4i(key[0], key[1], key[2], uses)
 
 
+@wp.func
+def refresh_slabs(
+    p: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    slabs: Slabs,
+):
+    """Count what an object pair asks for, and make the slabs that pay; one thread after the other."""
+    own = wp.vec2i(objects.state[pairs[p][0]], objects.state[pairs[p][1]])
+    slabs.states[p] = own
+    ask_slabs(models, states, slabs, own[0])
+    ask_slabs(models, states, slabs, own[1])
+
+
 @wp.kernel
 def refresh_slab_kernel(
     models: ModelPool,
@@ -173,16 +204,9 @@ def refresh_slab_kernel(
     slabs_inout: Slabs,
     counter_out: wp.array(dtype=wp.int32),
 ):
-    """Count what pairs ask for, and make the slabs that pay; CPU only, one thread after the other.
-
-    Counters of the search start at 0.
-    """
+    """Do what comes before a search by several threads, see `refresh_slabs`; CPU only. Its counters start at 0."""
     p = wp.tid()
     if p < counter_out.shape[0]:
         counter_out[p] = 0
-    if p >= wp.min(pair_count[0], pairs.shape[0]) or found.launched[0] == STALE:
-        return
-    own = wp.vec2i(objects.state[pairs[p][0]], objects.state[pairs[p][1]])
-    slabs_inout.states[p] = own
-    ask_slabs(models, states, slabs_inout, own[0])
-    ask_slabs(models, states, slabs_inout, own[1])
+    if p < wp.min(pair_count[0], pairs.shape[0]) and found.launched[0] != STALE:
+        refresh_slabs(p, models, states, objects, pairs, slabs_inout)

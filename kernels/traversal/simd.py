@@ -10,9 +10,10 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arithmetic.predicates import EXACT
-from warp_abtree.kernels.arrays import ModelPool, StatePool
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.gap.near_faces import part_uncertain, report_near
 from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.relative_pose import Started, pairs_starter
 from warp_abtree.kernels.traversal.descent import (
     CPU_STACK_LENGTH,
     NEVER,
@@ -229,21 +230,24 @@ def test_gap_pairs(
 @functools.cache
 def thread_traversal(mode: int):
     """Return the kernel whose threads share the object pairs, at a precision, WITHIN or GAP."""
+    start_pairs = pairs_starter(mode in (int(WITHIN), int(GAP)))
 
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def traverse_thread_kernel(
         output: wp.int32,
         models: ModelPool,
         states: StatePool,
-        pair_count: wp.array(dtype=wp.int32),
-        pair_poses: wp.array(dtype=PairPose),
+        objects: ObjectPool,
+        started: Started,
         plain_tests: wp.int32,
         memory: wp.array2d(dtype=wp.float32),
         hits_inout: Hits,
         work_inout: Work,
     ):
         """Take one object pair after the other and traverse it depth first; CPU only, a thread a core."""
-        count = wp.min(pair_count[0], pair_poses.shape[0])
+        start_pairs(output, models, states, objects, started, hits_inout, work_inout)
+        pair_poses = started.pair_poses
+        count = wp.min(started.pair_count[0], pair_poses.shape[0])
         stack = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
         below = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
         faces = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)

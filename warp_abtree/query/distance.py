@@ -44,6 +44,7 @@ first where that may decide it (`warp_abtree.kernels.distance.originals`):
 """
 
 import math
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -62,8 +63,6 @@ from warp_abtree.query.request import check_request, check_within, refuse_option
 from warp_abtree.query.result import DISTANCES, Found, Result
 from warp_abtree.query.staging import first_rows
 
-# Place of the CPU's search among its launches.
-SEARCH = 1
 # Pairs that make a further core worth its while, which costs some 50 us.
 PAIRS_A_CORE = 4
 NOT_BEYOND = np.array(np.inf)  # one for all, so that it is known again at once
@@ -268,20 +267,30 @@ class DistanceQuery(Query):
         if self.device.is_capturing:
             self._launch_all("distances", self._make_distances)
             self._launch_all("crossings", self._make_crossings)
-            self._launch_all("inside", self._make_inside)
+            self._report_inside()
             return
-        given = self.guard.given()
-        for place, command in enumerate(self._commands.find("distances", given, self._make_distances)):
-            if place == SEARCH and not self.uses_warps():
-                rooms = len(self._memory)
-                cores = min(current_regime().cpu_threads or rooms, rooms)
-                launch_on_cores(command.launch, room, cores, PAIRS_A_CORE)
-            else:
-                command.launch()
+        cores = self._search_cores()
+        given = (cores == 1, *self.guard.given())
+        *first, last = self._commands.find("distances", given, self._make_distances)
+        for command in first:
+            command.launch()
+        launch_on_cores(last.launch, room, cores)
         # On the CPU what is launched is done.
         if self.device.is_cuda or self._views.any_hit.any():
             self._launch_all("crossings", self._make_crossings)
-        self._launch_all("inside", self._make_inside)
+        self._report_inside()
+
+    def _report_inside(self):
+        """Report pairs of which one is inside the other, where there are solids. Launches only."""
+        if self.batch.solids is not None:
+            self._launch_all("inside", self._make_inside)
+
+    def _search_cores(self) -> int:
+        """Return how many cores share the search; a graph of the CPU has one."""
+        if self.uses_warps() or self.device.is_capturing:
+            return 1
+        rooms = len(self._memory)
+        return max(1, min(current_regime().cpu_threads or rooms, rooms, len(self.pairs) // PAIRS_A_CORE))
 
     def _make_crossings(self, launch) -> list:
         """Make the launches that find points of pairs that intersect, see `Commands.find`."""
@@ -299,15 +308,14 @@ class DistanceQuery(Query):
         return [search, launch(kernel, dim=room, inputs=inputs, block_dim=WARP_SIZE, device=device)]
 
     def _make_inside(self, launch) -> list:
-        """Make the launch that reports pairs of which one is inside the other, where there are solids."""
-        if self.batch.solids is None:
-            return []
+        """Make the launches of `_report_inside`."""
+        solids: Any = self.batch.solids
         posed = [*self.batch.pools, self.pair_count, self.pairs, self.pair_poses]
         inputs = [*posed, self.guard.launched, self.hits, self.contained, self.distances]
         made = [launch(report_contained_kernel, dim=len(self.pairs), inputs=inputs, device=self.device)]
         if self._signed:
             models, states, *posed = posed
-            inputs = [self._stack_length(), models, states, self.batch.solids.pool, *posed]
+            inputs = [self._stack_length(), models, states, solids.pool, *posed]
             inputs += [self.guard.launched, self.hits, self.distances]
             dim = len(self.pairs) * (WARP_SIZE if self.device.is_cuda else 1)
             made.append(launch(find_depth_kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
@@ -334,14 +342,17 @@ class DistanceQuery(Query):
         reports = [*posed, found, hits, self.distances]
         if not self.uses_warps():
             counter = self.work.counter
-            inputs = [models, states, objects, self.pair_count, self.pairs, found, self._slabs, counter]
-            refresh = launch(slabs.refresh_slab_kernel, inputs=inputs, dim=max(room, len(counter)), device=device)
             asked = search_simd.Asked()
             asked.pair_count, asked.pairs, asked.pair_poses = self.pair_count, self.pairs, self.pair_poses
-            asked.tolerances = self._tolerances
+            asked.tolerances, asked.alone = self._tolerances, self._search_cores() == 1
             inputs = [asked, models, states, objects, counter, self._slabs, found, hits]
             inputs += [self.distances, self._memory]
-            return [refresh, launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device)]
+            made = [launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device)]
+            if not asked.alone:
+                inputs = [models, states, objects, self.pair_count, self.pairs, found, self._slabs, counter]
+                dim = max(room, len(counter))
+                made.insert(0, launch(slabs.refresh_slab_kernel, inputs=inputs, dim=dim, device=device))
+            return made
         start = {**threads, "dim": max(room, len(self.work.flag))}
         inputs = [length, ROUGH_LEAST, self._tolerances, *shared, found, hits, self.work]
         searching = {"dim": self._warp_count() * lanes, "block_dim": WARP_SIZE, "device": device}

@@ -198,17 +198,24 @@ class Query(QueryReadout):
         if self.device.is_capturing:
             self._launch_all(name, make)
             return
-        first, traversal, *passes = self._commands.find(name, self.guard.given(), make)
+        given, cores = self.guard.given(), self._traversal_cores()
+        if cores == 1 and not self.uses_warps():
+            for command in self._commands.find(f"{name} alone", given, make):
+                command.launch()
+            return
+        first, traversal, *passes = self._commands.find(name, given, make)
         first.launch()
-        if self.uses_warps():
-            traversal.launch()
-        else:
-            # Each has memory for slabs: tests do not depend on which thread takes a pair.
-            rooms = len(self.slab_memory)
-            cores = min(current_regime().cpu_threads or rooms, rooms)
-            launch_on_cores(traversal.launch, len(self.pairs), cores, self._least_pairs())
+        launch_on_cores(traversal.launch, len(self.pairs), cores)
         for command in passes:
             command.launch()
+
+    def _traversal_cores(self) -> int:
+        """Return how many cores share the traversal; a graph of the CPU has one."""
+        if self.uses_warps() or self.device.is_capturing:
+            return 1
+        # Each has memory for slabs: tests do not depend on which thread takes a pair.
+        rooms = len(self.slab_memory)
+        return max(1, min(current_regime().cpu_threads or rooms, rooms, len(self.pairs) // self._least_pairs()))
 
     def _least_pairs(self) -> int:
         """Return the pairs that make a further core worth its while, which costs some 50 us.
@@ -221,15 +228,22 @@ class Query(QueryReadout):
         """Make the launches that bring relative poses and traverse all pairs, see `Commands.find`."""
         pools, room = self.batch.pools, len(self.pairs)
         self.work.warps = self._warp_count() if self.uses_warps() else 0
-        inputs = [output, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
-        dim = max(room, len(self.work.flag))
-        # A warp a block: few pairs lie on as many multiprocessors.
-        kernel = relative_pose.relative_poses(len(within) > 0)
-        first = launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
-        inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
+        alone = not self.uses_warps() and self._traversal_cores() == 1
+        made = []
+        if not alone:
+            inputs = [output, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
+            dim = max(room, len(self.work.flag))
+            # A warp a block: few pairs lie on as many multiprocessors.
+            kernel = relative_pose.relative_poses(len(within) > 0)
+            made.append(launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
         if not self.uses_warps():
-            inputs += [self._regime.plain_tests, self.slab_memory, hits, self.work]
-            return [first, launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device)]
+            started = relative_pose.Started()
+            started.pair_count, started.pair_poses, started.within = self.pair_count, self.pair_poses, within
+            if alone:
+                started.pairs = self.pairs
+            inputs = [output, *pools, started, self._regime.plain_tests, self.slab_memory, hits, self.work]
+            return [*made, launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device)]
+        inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
         traversal = launch(
             dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
             dim=self._warp_count() * (WARP_SIZE if self.device.is_cuda else 1),
@@ -237,7 +251,7 @@ class Query(QueryReadout):
             block_dim=WARP_SIZE,
             device=self.device,
         )
-        return [first, traversal]
+        return [*made, traversal]
 
     def _warp_count(self) -> int:
         """Return the warps of a launch: more than units, where these are few, so that some wait for donations."""

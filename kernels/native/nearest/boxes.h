@@ -57,6 +57,8 @@ struct NearBoxes : SlabBounds {
                              (unsigned int)(PAIRS_USED >> (((turned & 3) << 2) | ((turned >> 28) & 48))) & 15};
         __builtin_prefetch(taken.a);
         __builtin_prefetch(taken.b);
+        __builtin_prefetch(taken.a + slabs);
+        __builtin_prefetch(taken.b + slabs);
         return taken;
     }
     static lanes square_gap(const lanes& x, const lanes& reach) {

@@ -55,7 +55,7 @@ struct SlabBounds {
         const lanes normal[3] = {slab[0], slab[1], slab[2]};
         const lanes along = way[0] * slab[0] + way[1] * slab[1] + way[2] * slab[2];
         const lanes top = tops(way, along, normal, slab[3], slab[4], sum, size) - far;
-        const lanes ball = __builtin_elementwise_sqrt(size[0] * size[0] + size[1] * size[1] + size[2] * size[2]);
+        const lanes ball = slab[6] * (2.0f * scale);
         const lanes w[3] = {lanes{} + way[0][0], lanes{} + way[1][0], lanes{} + way[2][0]};
         const lanes d = apart[0] * w[0] + apart[1] * w[1] + apart[2] * w[2];
         lanes across = {};
