@@ -128,7 +128,7 @@ def keep_nearest_kernel(
     contacts: Contacts,
     curves_inout: Curves,
 ):
-    """Take candidates from contacts where a face in contact with either of theirs is nearer to its points than they are.
+    """Take candidates from contacts that have a neighbour with a face nearer to their points than theirs are.
 
     A warp has `CONTACTS_A_WARP` contacts. A lane takes the next of them when it is done with one, so that none waits
     for the lane whose faces have most neighbours.
