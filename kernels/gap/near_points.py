@@ -267,8 +267,10 @@ def find_facing_candidate_kernel(
     first = 3 * pose.swapped
     n = normal_a
     depth, point, other, second = measure_column(corner, normal_a, normal_a, normal_b, first, -gap[p])
-    d, x, e, y = measure_column(corner, -normal_b, normal_a, normal_b, first, -gap[p])
-    if d > NO_DEPTH and (depth == NO_DEPTH or d < depth):
-        n, depth, point, other, second = -normal_b, d, x, e, y
+    # A gap wider than the distance stays so whatever the other normal says.
+    if depth == NO_DEPTH or -depth - contacts.separation[i] <= ALIKE * contacts.separation[i]:
+        d, x, e, y = measure_column(corner, -normal_b, normal_a, normal_b, first, -gap[p])
+        if d > NO_DEPTH and (depth == NO_DEPTH or d < depth):
+            n, depth, point, other, second = -normal_b, d, x, e, y
     depths = wp.vec2d(depth, other)
     write_near_candidates(i, objects, a, pose.scale, n, depths, point, second, contacts, curves_inout)
