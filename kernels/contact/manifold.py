@@ -33,6 +33,7 @@ class Curves:
     point: wp.array2d(dtype=wp.vec3d)  # the deepest candidate and one far from it [world units], shape [contact, 2]
     depth: wp.array2d(dtype=wp.float64)  # [world units], or NO_DEPTH or NO_POINT, shape [contact, 2]
     normal: wp.array(dtype=wp.vec3d)  # of both candidates, shape [contact]
+    listed: wp.array(dtype=wp.int32)  # contacts of each pair that have candidates, shape [contact]
     nearest: wp.array2d(dtype=wp.float64)  # squared distance from the points chosen, shape [contact, 2]
 
 

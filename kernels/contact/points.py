@@ -6,7 +6,8 @@ import warp as wp
 
 from warp_abtree.kernels.arrays import ObjectPool
 from warp_abtree.kernels.contact.manifold import NO_DEPTH, POINTS, Curves, Manifolds
-from warp_abtree.kernels.traversal.warp_stack import warp_lane, warp_max, warp_size
+from warp_abtree.kernels.small_trees.tiles import rank_flag
+from warp_abtree.kernels.traversal.warp_stack import warp_lane, warp_max, warp_size, warp_sync
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
@@ -32,17 +33,39 @@ def best_of_warp(value: wp.float64, candidate: wp.int32):
 
 
 @wp.func
+def list_candidates(first: wp.int32, end: wp.int32, curves: Curves):
+    """List the contacts of a pair that have candidates, in their order, where its contacts start; return its end.
+
+    Of faces that are apart a fifth has some, which every choice looks at.
+    """
+    listed, next = wp.int32(first), wp.int32(first)
+    while next < end:
+        i = next + warp_lane()
+        has = i < end
+        if has:
+            has = curves.depth[i, 0] == curves.depth[i, 0] or curves.depth[i, 1] == curves.depth[i, 1]
+        rank = rank_flag(has)
+        if has:
+            curves.listed[listed + (rank & 0xFFFF)] = i
+        listed += rank >> 16
+        next += warp_size()
+    warp_sync()
+    return listed
+
+
+@wp.func
 def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
-    """Return the deepest candidate of a pair and its depth, NO_DEPTH where there is none."""
+    """Return the deepest candidate of those listed and its depth, NO_DEPTH where there is none."""
     deepest = NO_DEPTH
     best = CANDIDATES * first
-    i = first + warp_lane()
-    while i < end:
+    at = first + warp_lane()
+    while at < end:
+        i = curves.listed[at]
         for k in range(CANDIDATES):
             if curves.depth[i, k] > deepest:
                 deepest = curves.depth[i, k]
                 best = CANDIDATES * i + k
-        i += warp_size()
+        at += warp_size()
     return best_of_warp(deepest, best)
 
 
@@ -52,14 +75,15 @@ def find_outermost(first: wp.int32, end: wp.int32, least: wp.float64, along: wp.
     origin = curves.point[first, 0]
     farthest = -wp.float64(wp.inf)
     best = CANDIDATES * first
-    i = first + warp_lane()
-    while i < end:
+    at = first + warp_lane()
+    while at < end:
+        i = curves.listed[at]
         for k in range(CANDIDATES):
             reach = wp.dot(along, curves.point[i, k] - origin)
             if curves.depth[i, k] >= least and reach > farthest:
                 farthest = reach
                 best = CANDIDATES * i + k
-        i += warp_size()
+        at += warp_size()
     return best_of_warp(farthest, best)
 
 
@@ -123,13 +147,14 @@ def find_farthest(
     Those on one side are favoured a little, so that noise does not choose between two that are as far.
 
     Args:
-        ends: First contact of the pair, and the one behind its last.
+        ends: Where the list of the pair's contacts begins and ends.
         count: Points chosen. From the second on a candidate keeps its distance from those before.
     """
     farthest = wp.float64(-1.0)
     best = CANDIDATES * ends[0]
-    i = ends[0] + warp_lane()
-    while i < ends[1]:
+    at = ends[0] + warp_lane()
+    while at < ends[1]:
+        i = curves.listed[at]
         for k in range(CANDIDATES):
             if curves.depth[i, k] >= choice.lowest:
                 x = curves.point[i, k]
@@ -144,7 +169,7 @@ def find_farthest(
                 if d > farthest and curves.depth[i, k] >= choice.floor:
                     farthest = d
                     best = CANDIDATES * i + k
-        i += warp_size()
+        at += warp_size()
     return best_of_warp(farthest, best)
 
 
@@ -251,6 +276,7 @@ def point_spreader(most: int):
         if gap.shape[0] > 0:
             shell = gap[p]
         along = order_direction(objects.rotation[wp.min(pairs[p][0], pairs[p][1])])
+        end = list_candidates(first, end, curves_inout)
         deepest_at, deepest = find_deepest(first, end, curves_inout)
         half = wp.float64(0.5) * (deepest + shell) - shell
         best, reach = find_outermost(first, end, half, along, curves_inout)

@@ -7,10 +7,13 @@ inside, or beyond a thin wall. In either case points count only where no other f
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.contact.contact import Contacts, have_crossed, load_corners
+from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.contact.contact import Contacts, Deferred, have_crossed, load_corners
 from warp_abtree.kernels.contact.manifold import NO_DEPTH, NO_POINT, Curves, measure_column, write_candidates
-from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.poses import PairPose, pose_point
+from warp_abtree.kernels.small_trees.tiles import rank_flag
+from warp_abtree.kernels.traversal.face_pairs import load_corner_ids
+from warp_abtree.kernels.traversal.warp_stack import reserve_slot, warp_any, warp_size
 from warp_abtree.kernels.triangle.segment import nearest_on_triangle
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -19,8 +22,13 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 FACING = wp.constant(wp.float64(0.5))
 # Part of the distance that the gap along a face's normal differs by, where that is the direction of the distance.
 ALIKE = wp.constant(wp.float64(2.0**-10))
+# Cosine between a face's normal and the direction of the distance from which on they may be alike: ALIKE asks for more.
+ALONG = wp.constant(wp.float64(0.998))
 # Part of a squared distance under which another face is nearer.
 NEARER = wp.constant(wp.float64(0.998))
+# In place of the loop of a contact whose candidates count only if no other face is nearer.
+UNDECIDED = wp.constant(wp.int32(-1))
+CONTACTS_A_WARP = wp.constant(wp.int32(256))
 
 
 @wp.struct
@@ -44,6 +52,11 @@ class NearRow:
 
 
 @wp.func
+def pair_key(pair: wp.int32, face: wp.int32):
+    return (wp.int64(pair) << wp.int64(31)) | wp.int64(face)
+
+
+@wp.func
 def make_row(pose: PairPose, back: wp.mat33d, position: wp.vec3d, p0: wp.vec3d, p1: wp.vec3d):
     row = NearRow()
     row.first = back * (p0 - position) * pose.scale
@@ -54,57 +67,172 @@ def make_row(pose: PairPose, back: wp.mat33d, position: wp.vec3d, p0: wp.vec3d, 
 
 
 @wp.func
-def is_nearer(
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    row: NearRow,
-    faces: wp.vec3i,
-    of_first: bool,
-    corner: wp.array(dtype=wp.vec3d),
-):
-    """Return whether the first object's face of another contact is nearer to `second`, or the second's to `first`."""
-    load_corners(models, states, pose, faces[1 + row.swapped], faces[2 - row.swapped], corner)
-    base = wp.where(of_first, 3 * row.swapped, 3 - 3 * row.swapped)
+def is_nearer(models: ModelPool, states: StatePool, pose: PairPose, row: NearRow, face: wp.int32, of_first: bool):
+    """Return whether another face of the first object is nearer to `second`, or one of the second's to `first`."""
     point = wp.where(of_first, row.second, row.first)
-    v = nearest_on_triangle(pose.scale, base, corner, point) - point
+    of_b = of_first == (row.swapped != 0)
+    ids = load_corner_ids(states, wp.where(of_b, pose.corner_b, pose.corner_a) + face)
+    a, b = load_vertex(models.vertex_pos, ids[0]), load_vertex(models.vertex_pos, ids[1])
+    c = load_vertex(models.vertex_pos, ids[2])
+    if of_b:
+        a = pose_point(pose.rotation, pose.translation, a)
+        b = pose_point(pose.rotation, pose.translation, b)
+        c = pose_point(pose.rotation, pose.translation, c)
+    v = nearest_on_triangle(a * pose.scale, b * pose.scale, c * pose.scale, point) - point
     return wp.dot(v, v) < row.square
 
 
 @wp.func
-def are_surfaces_nearest(
+def next_neighbour(i: wp.int32, turn: wp.int32, before: wp.int32, rows: Rows, contacts: Contacts):
+    """Return the next contact that has a face of contact i and less separation, as (turn, place, contact).
+
+    Those of the first object's face come before i, turn 0, and after it, 1, those of the second's at last, 2; -1 for no
+    more. No other has a face nearer to the points of i: none of it is nearer than its separation.
+    """
+    own = rows.faces[i]
+    p, j = own[0], before
+    while turn < 3:
+        other = wp.int32(-1)
+        j += wp.where(turn == 0, -1, 1)
+        if turn == 2:
+            if j < rows.start[p + 1] and rows.key[j] == pair_key(p, own[2]):
+                other = rows.order[j]
+        elif j >= rows.start[p] and j < rows.start[p + 1] and rows.faces[j][1] == own[1]:
+            other = j
+        if other < 0:
+            j = i
+            if turn == 1:
+                j = wp.lower_bound(rows.key, rows.start[p], rows.start[p + 1], pair_key(p, own[2])) - 1
+            turn += 1
+        elif contacts.separation[other] < contacts.separation[i]:
+            return wp.vec3i(turn, j, other)
+    return wp.vec3i(turn, j, -1)
+
+
+@wp.func
+def is_undecided(contacts: Contacts, curves: Curves, i: wp.int32, end: wp.int32):
+    """Return whether contact i has candidates that count only where its faces are nearest."""
+    if i >= end:
+        return False
+    return not have_crossed(contacts, i) and curves.loop[i] == UNDECIDED
+
+
+@wp.kernel(cuda_max_registers=128)
+def keep_nearest_kernel(
     models: ModelPool,
     states: StatePool,
-    pose: PairPose,
-    row: NearRow,
-    i: wp.int32,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
     rows: Rows,
-    corner: wp.array(dtype=wp.vec3d),
+    contacts: Contacts,
+    curves_inout: Curves,
 ):
-    """Return whether no face in contact with either face of contact i is nearer to its points than they are."""
-    own = rows.faces[i]
-    count = rows.start[rows.start.shape[0] - 1]
-    j = i - 1
-    while j >= 0 and rows.faces[j][0] == own[0] and rows.faces[j][1] == own[1]:
-        if is_nearer(models, states, pose, row, rows.faces[j], False, corner):
-            return False
-        j -= 1
-    j = i + 1
-    while j < count and rows.faces[j][0] == own[0] and rows.faces[j][1] == own[1]:
-        if is_nearer(models, states, pose, row, rows.faces[j], False, corner):
-            return False
-        j += 1
-    wanted = (wp.int64(own[0]) << wp.int64(31)) | wp.int64(own[2])
-    j = wp.lower_bound(rows.key, 0, count, wanted)
-    while j < count and rows.key[j] == wanted:
-        if is_nearer(models, states, pose, row, rows.faces[rows.order[j]], True, corner):
-            return False
-        j += 1
-    return True
+    """Take candidates from contacts that have a neighbour with a face nearer to their points than theirs are.
+
+    A warp has `CONTACTS_A_WARP` contacts. A lane takes the next of them when it is done with one, so that none waits
+    for the lane whose faces have most neighbours.
+    """
+    queue = wp.tid() / warp_size() * CONTACTS_A_WARP
+    end = wp.min(queue + CONTACTS_A_WARP, rows.start[rows.start.shape[0] - 1])
+    i, turn, j, p = wp.int32(-1), wp.int32(0), wp.int32(0), wp.int32(0)
+    row = NearRow()
+    while queue < end or warp_any(i >= 0):
+        rank = rank_flag(i < 0)
+        if i < 0 and is_undecided(contacts, curves_inout, queue + (rank & 0xFFFF), end):
+            i = queue + (rank & 0xFFFF)
+            turn, j, p = wp.int32(0), i, rows.faces[i][0]
+            a = wp.min(pairs[p][0], pairs[p][1])
+            back = wp.transpose(objects.rotation[a])
+            row = make_row(pair_poses[p], back, objects.position[a], contacts.p0[i], contacts.p1[i])
+        queue += rank >> 16
+        if i >= 0:
+            found = next_neighbour(i, turn, j, rows, contacts)
+            turn, j = found[0], found[1]
+            if found[2] < 0:
+                i = wp.int32(-1)
+            else:
+                face = rows.faces[found[2]][wp.where(turn == 2, 1, 2)]
+                if is_nearer(models, states, pair_poses[p], row, face, turn == 2):
+                    curves_inout.depth[i, 0] = NO_POINT
+                    curves_inout.depth[i, 1] = NO_POINT
+                    i = wp.int32(-1)
+
+
+@wp.func
+def write_near_candidates(
+    i: wp.int32,
+    objects: ObjectPool,
+    a: wp.int32,
+    scale: wp.float64,
+    n: wp.vec3d,
+    depths: wp.vec2d,
+    point: wp.vec3d,
+    second: wp.vec3d,
+    contacts: Contacts,
+    curves: Curves,
+):
+    """Write the candidates of a contact along n, whose first is `depths[0]` deep; its nearest points if that is no way.
+
+    Args:
+        a: Object in whose frame n and the points are.
+    """
+    rotation, position = objects.rotation[a], objects.position[a]
+    back = wp.transpose(rotation)
+    nearest, loop = bool(True), i
+    separation = contacts.separation[i]
+    if not (wp.abs(wp.abs(depths[0]) - separation) <= ALIKE * separation):
+        n = back * contacts.normal[i]
+        depths = wp.vec2d(-separation, NO_POINT)
+        first = back * (contacts.p0[i] - position) * scale
+        point = (first + back * (contacts.p1[i] - position) * scale) * (wp.float64(0.5) / scale)
+        ahead_a, ahead_b = wp.dot(n, back * contacts.normal_a[i]), wp.dot(n, back * contacts.normal_b[i])
+        nearest = ahead_a > wp.float64(0.0) and ahead_b < wp.float64(0.0)
+    if nearest and (depths[0] > wp.float64(0.0) or depths[1] != depths[1]):
+        loop = UNDECIDED
+    if not nearest:
+        depths = wp.vec2d(NO_POINT, NO_POINT)
+    curves.loop[i] = loop
+    write_candidates(i, rotation, position, n, depths, point, second, contacts, curves)
 
 
 @wp.kernel
 def find_near_candidate_kernel(
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    rows: Rows,
+    contacts: Contacts,
+    facing_inout: Deferred,
+    curves_inout: Curves,
+):
+    """Find the candidate of one contact of faces that are apart a thread: their nearest points; or list it.
+
+    Where both faces look at one another and the distance may be along the normal of either, it is listed. Of all gaps
+    that a direction leaves the distance is the widest, so it is so only where its direction is about that normal.
+    """
+    i = wp.tid()
+    listed = bool(False)
+    apart = i < rows.start[rows.start.shape[0] - 1]
+    if apart:
+        apart = not have_crossed(contacts, i)
+    if apart:
+        n, normal_a, normal_b = contacts.normal[i], contacts.normal_a[i], contacts.normal_b[i]
+        along = wp.max(wp.abs(wp.dot(n, normal_a)), wp.abs(wp.dot(n, normal_b)))
+        listed = -wp.dot(normal_a, normal_b) >= FACING and along >= ALONG
+        if not listed:
+            p = rows.faces[i][0]
+            a, zero = wp.min(pairs[p][0], pairs[p][1]), wp.vec3d()
+            none = wp.vec2d(NO_DEPTH, NO_DEPTH)
+            scale = pair_poses[p].scale
+            write_near_candidates(i, objects, a, scale, zero, none, zero, zero, contacts, curves_inout)
+    slot = reserve_slot(facing_inout.total, listed)
+    if listed:
+        facing_inout.place[slot] = i
+
+
+@wp.kernel
+def find_facing_candidate_kernel(
     models: ModelPool,
     states: StatePool,
     objects: ObjectPool,
@@ -113,9 +241,10 @@ def find_near_candidate_kernel(
     gap: wp.array(dtype=wp.float64),
     rows: Rows,
     contacts: Contacts,
+    facing: Deferred,
     curves_inout: Curves,
 ):
-    """Find the normal and two candidate points of one contact of faces that are apart a thread.
+    """Find the normal and two candidate points of one listed contact of faces that are apart a thread.
 
     Along the normal of either face, whichever leaves the wider gap, if that is the distance; else the nearest points,
     where both faces look at one another. A face that lies behind the other one's plane is inside, as deep as it is far.
@@ -123,38 +252,25 @@ def find_near_candidate_kernel(
     Args:
         gap: Under which face pairs are near [world units], shape [pair].
     """
-    i = wp.tid()
-    if i >= rows.start[rows.start.shape[0] - 1] or have_crossed(contacts, i):
+    k = wp.tid()
+    if k >= facing.total[0]:
         return
+    i = facing.place[k]
     own = rows.faces[i]
     p = own[0]
     pose = pair_poses[p]
     a = wp.min(pairs[p][0], pairs[p][1])
-    rotation, position = objects.rotation[a], objects.position[a]
-    back = wp.transpose(rotation)
+    back = wp.transpose(objects.rotation[a])
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
     load_corners(models, states, pose, own[1 + pose.swapped], own[2 - pose.swapped], corner)
     normal_a, normal_b = back * contacts.normal_a[i], back * contacts.normal_b[i]
     first = 3 * pose.swapped
-    n = back * contacts.normal[i]
-    depth, other = NO_DEPTH, NO_DEPTH
-    point, second = wp.vec3d(), wp.vec3d()
-    if -wp.dot(normal_a, normal_b) >= FACING:
-        depth, point, other, second = measure_column(corner, normal_a, normal_a, normal_b, first, -gap[p])
+    n = normal_a
+    depth, point, other, second = measure_column(corner, normal_a, normal_a, normal_b, first, -gap[p])
+    # A gap wider than the distance stays so whatever the other normal says.
+    if depth == NO_DEPTH or -depth - contacts.separation[i] <= ALIKE * contacts.separation[i]:
         d, x, e, y = measure_column(corner, -normal_b, normal_a, normal_b, first, -gap[p])
         if d > NO_DEPTH and (depth == NO_DEPTH or d < depth):
             n, depth, point, other, second = -normal_b, d, x, e, y
-        elif depth > NO_DEPTH:
-            n = normal_a
-    row = make_row(pose, back, position, contacts.p0[i], contacts.p1[i])
-    nearest = bool(True)
-    if not (wp.abs(wp.abs(depth) - contacts.separation[i]) <= ALIKE * contacts.separation[i]):
-        n = back * contacts.normal[i]
-        depth, other = -contacts.separation[i], NO_POINT
-        point = (row.first + row.second) * (wp.float64(0.5) / pose.scale)
-        nearest = wp.dot(n, normal_a) > wp.float64(0.0) and wp.dot(n, normal_b) < wp.float64(0.0)
-    if nearest and (depth > wp.float64(0.0) or other != other):
-        nearest = are_surfaces_nearest(models, states, pose, row, i, rows, corner)
-    if not nearest:
-        depth, other = NO_POINT, NO_POINT
-    write_candidates(i, rotation, position, n, wp.vec2d(depth, other), point, second, contacts, curves_inout)
+    depths = wp.vec2d(depth, other)
+    write_near_candidates(i, objects, a, pose.scale, n, depths, point, second, contacts, curves_inout)

@@ -180,6 +180,8 @@ def test_small_trees(
         else:
             rows, next_a = count, left
             next_b = wp.where(rows > 0, 0, lists.leaves_b)
+    # What the warp writes next may be over the last tile.
+    warp_sync()
     if tests[0] > 0:
         hits.any_hit[task[0]] = 1
     if warp_lane() == 0:

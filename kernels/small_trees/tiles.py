@@ -173,6 +173,8 @@ def place_leaves(
 
     Return how many, and the first leaf that had no room.
     """
+    # Lanes may still read the tile before: a vote, which is all that lies between, orders no memory.
+    warp_sync()
     root = load_constant_node(states, wp.where(of_b, pose.node_a, pose.node_b) + 1)
     list = wp.where(of_b, SMALL_B, SMALL_A)
     count = wp.int32(0)

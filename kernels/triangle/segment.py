@@ -308,24 +308,18 @@ def nearest_on_segment(a: wp.vec3d, b: wp.vec3d, p: wp.vec3d):
 
 
 @wp.func
-def nearest_on_triangle(scale: wp.float64, base: wp.int32, corner: wp.array(dtype=wp.vec3d), p: wp.vec3d):
-    """Return the point of a closed triangle, segment or point nearest to p, all scaled."""
+def nearest_on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, p: wp.vec3d):
+    """Return the point of a closed triangle, segment or point nearest to p."""
     zero = wp.float64(0.0)
-    a = corner[base] * scale
-    n = wp.cross(corner[base + 1] * scale - a, corner[base + 2] * scale - a)
-    best = nearest_on_segment(a, corner[base + 1] * scale, p)
-    inside = bool(True)
-    k = wp.int32(0)
-    while k < 3:
-        u = corner[base + k] * scale
-        v = corner[base + (k + 1) % 3] * scale
-        q = nearest_on_segment(u, v, p)
+    n = wp.cross(b - a, c - a)
+    best = nearest_on_segment(a, b, p)
+    for k in range(2):
+        q = nearest_on_segment(wp.where(k == 0, b, c), wp.where(k == 0, c, a), p)
         if wp.dot(q - p, q - p) < wp.dot(best - p, best - p):
             best = q
-        if wp.dot(wp.cross(v - u, p - u), n) <= zero:
-            inside = False
-        k += 1
-    if inside and wp.dot(n, n) > zero:
+    outside = wp.dot(wp.cross(b - a, p - a), n) <= zero or wp.dot(wp.cross(c - b, p - b), n) <= zero
+    outside = outside or wp.dot(wp.cross(a - c, p - c), n) <= zero
+    if not outside and wp.dot(n, n) > zero:
         best = p - n * (wp.dot(p - a, n) / wp.dot(n, n))
     return best
 
@@ -337,8 +331,8 @@ def nearest_middle(scale: wp.float64, corner: wp.array(dtype=wp.vec3d)):
     p = q
     k = wp.int32(0)
     while k < NEAREST_STEPS:
-        p = nearest_on_triangle(scale, 0, corner, q)
-        q = nearest_on_triangle(scale, 3, corner, p)
+        p = nearest_on_triangle(corner[0] * scale, corner[1] * scale, corner[2] * scale, q)
+        q = nearest_on_triangle(corner[3] * scale, corner[4] * scale, corner[5] * scale, p)
         k += 1
     return (p + q) * (wp.float64(0.5) / scale)
 

@@ -135,3 +135,38 @@ def test_same_bits_on_every_path(device, gap):
         found.append([points[name].tobytes() for name in ("pair", "point", "normal", "depth")])
     assert found[0] == found[1] == found[2]
     assert (points["depth"] < 0).any() == (gap is not None) and (points["depth"] > 0).any()
+
+
+@pytest.mark.parametrize("named", [(0, 1), (1, 0)])
+def test_edges_have_points_only_where_no_other_face_is_nearer(device, named):
+    """Every contact of faces that are apart, by NumPy: its nearest points against all faces in contact with its own."""
+    torus = model_of(trimesh.creation.torus(0.5, 0.2, 24, 12))
+    poses = [(0, 0, 0, 0, 0, 0, 1), (0.6, 0.1, 0.43, *about((1, 2, 0.5), 0.4))]
+    query = ask(device, *((torus, pose) for pose in poses), pairs=[named], gap=0.15)[0]
+    count = query.start.numpy()[1]
+    read = {name: getattr(query.contacts, name).numpy()[:count] for name in ("p0", "p1", "normal", "separation")}
+    sides = [query.contacts.normal_a.numpy()[:count], query.contacts.normal_b.numpy()[:count]]
+    rows, depth = query.faces.numpy()[:count, 1:], query.curves.depth.numpy()[:count]
+    vertices, faces, ids = torus.mesh_at(torus.lod_max)
+    place = np.empty(ids.max() + 1, int)
+    place[ids] = np.arange(len(ids))
+    worlds = [(vertices @ quaternion_matrix(poses[i][3:]).T + poses[i][:3])[faces] for i in named]
+    own = [worlds[k][place[rows[:, k]]] for k in range(2)]
+    ends, kept, dropped = (read["p0"], read["p1"]), 0, 0
+    for i in np.flatnonzero(read["separation"] > 0):
+        nearest = np.inf
+        for k in range(2):
+            others = (rows[:, k] == rows[i, k]) & (np.arange(count) != i)
+            if others.any():
+                p = np.tile(ends[k][i], (others.sum(), 1))
+                at = trimesh.triangles.closest_point(own[1 - k][others], p)
+                nearest = min(nearest, np.linalg.norm(at - p, axis=1).min())
+        nearer, none = nearest / read["separation"][i], np.isnan(depth[i])
+        ahead = read["normal"][i] @ sides[0][i], read["normal"][i] @ sides[1][i]
+        if not none[0] and none[1] and abs(depth[i, 0] + read["separation"][i]) < 1e-12:
+            assert nearer > 0.998999
+            kept += 1
+        elif none.all() and ahead[0] > 1e-9 and ahead[1] < -1e-9:
+            assert nearer < 0.999001
+            dropped += 1
+    assert count > 512 and kept > 2 and dropped > 20

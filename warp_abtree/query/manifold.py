@@ -83,7 +83,7 @@ class ManifoldQuery(ContactQuery):
 
     def _place_arrays(self, capacity: int) -> list:
         made = super()._place_arrays(capacity)
-        made += [(self.curves, name, self._empty(capacity, wp.int32)) for name in ("parent", "loop")]
+        made += [(self.curves, name, self._empty(capacity, wp.int32)) for name in ("parent", "loop", "listed")]
         made += [(self.curves, name, self._empty(capacity, wp.vec3d)) for name in ("loop_normal", "normal")]
         made.append((self.curves, "point", self._empty((capacity, 2), wp.vec3d)))
         made += [(self.curves, name, self._empty((capacity, 2), wp.float64)) for name in ("depth", "nearest")]
@@ -107,14 +107,13 @@ class ManifoldQuery(ContactQuery):
         start, rows, curves, contacts = self.start, self.faces, self.curves, self.contacts
         gap = self._no_gap if self._gap is None else self.hits.gap
         posed = [*pools, self.pairs, self.pair_poses]
-        self._launch_kernel(loops.begin_loop_kernel, count, [start, rows, curves, self._order, self._key])
+        listed = self._deferred
+        inputs = [start, rows, curves, self._order, self._key, listed.total]
+        self._launch_kernel(loops.begin_loop_kernel, count, inputs)
         self._sort_keys(count, 31 + room.bit_length())
         self._launch_kernel(loops.link_loop_kernel, count, [start, rows, contacts, self._order, self._key, curves])
         if self._gap is not None:
-            both = near_points.Rows()
-            both.start, both.faces, both.order, both.key = start, rows, self._order, self._key
-            inputs = [*posed, gap, both, contacts, curves]
-            self._launch_kernel(near_points.find_near_candidate_kernel, count, inputs, WARP_SIZE)
+            self._find_near(count, posed, gap)
         self._launch_kernel(loops.name_loop_kernel, count, [start, contacts, curves, self._order, self._key])
         self._sort_keys(count, 31)
         inputs = [*pools, self.pairs, start, rows, contacts, self._order, curves]
@@ -124,6 +123,17 @@ class ManifoldQuery(ContactQuery):
         spread = point_kernels.point_spreader(self.point_max)
         self._launch_warps(spread, room, [pools[2], self.pairs, gap, start, curves, self.manifolds])
         self._add_inside_points()
+
+    def _find_near(self, count, posed, gap):
+        """Find the candidates of faces that are apart. Launches only."""
+        both, contacts, listed, curves = near_points.Rows(), self.contacts, self._deferred, self.curves
+        both.start, both.faces, both.order, both.key = self.start, self.faces, self._order, self._key
+        warps, threads = (-(-count // share) for share in (int(near_points.CONTACTS_A_WARP), WARP_SIZE))
+        inputs = [*posed[2:], both, contacts, listed, curves]
+        self._launch_kernel(near_points.find_near_candidate_kernel, threads * WARP_SIZE, inputs, WARP_SIZE)
+        inputs = [*posed, gap, both, contacts, listed, curves]
+        self._launch_kernel(near_points.find_facing_candidate_kernel, count, inputs, WARP_SIZE)
+        self._launch_warps(near_points.keep_nearest_kernel, warps, [*posed, both, contacts, curves])
 
     def _add_inside_points(self):
         """Add points of what is inside, where there are solids. Launches only."""
