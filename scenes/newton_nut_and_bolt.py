@@ -131,10 +131,12 @@ class Nuts:
         lag: How far each was at most from where its thread leads [m].
     """
 
-    def __init__(self, model, bolt, nut, solver, pitch, hammer=0.0, seed=0):
+    def __init__(self, model, bolt, nut, solver, pitch, hammer=0.0, seed=0, tolerance=None):
         self.model, self.pitch = model, pitch
         shapes = {shape: (bolt, nut)[shape % 2] for shape in range(model.shape_count)}
         self.found = ab.NewtonContacts(model, models=shapes, points=POINTS)
+        if tolerance is not None:
+            self.found.scene.set_lods([shapes[shape].lod_for(tolerance=tolerance) for shape in range(len(shapes))])
         self.contacts, self.control = self.found.contacts(), model.control()
         self.solver, self.substeps = make_solver(solver, model)
         self.state, self.after, self.before = (model.state() for _ in range(3))
@@ -218,6 +220,7 @@ def main():
     parser.add_argument("--pitch", type=float, default=PITCH)
     parser.add_argument("--gap", type=float, default=GAP, help="of a shape, within which there are contacts [m]")
     parser.add_argument("--height", type=float, default=2 * PITCH, help="of the nut, about [m]")
+    parser.add_argument("--tolerance", type=float, help="certified, of the LODs that meet [m]; all faces without it")
     options = parser.parse_args()
     if options.bolt:
         bolt, nut = ab.Model.load(options.bolt), ab.Model.load(options.nut)
@@ -226,7 +229,7 @@ def main():
         bolt, nut = (ab.Model.from_arrays(*part) for part in parts)
     height = find_height(bolt, nut, options.pitch, options.height)
     model = build_model(bolt, nut, height, options.pitch, options.nuts, options.device, options.gap)
-    nuts = Nuts(model, bolt, nut, options.solver, options.pitch, options.hammer, options.seed)
+    nuts = Nuts(model, bolt, nut, options.solver, options.pitch, options.hammer, options.seed, options.tolerance)
     begin = time.perf_counter()
     nuts.run(options.turns)
     spent = time.perf_counter() - begin

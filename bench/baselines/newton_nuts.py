@@ -180,37 +180,48 @@ def measure(models, matrices, others, device, repeats):
     kind = "sdf" if device.is_cuda else "bvh"
     gaps = {f"{kind}_same_gap": GAP} | ({f"{kind}_example": EXAMPLE_GAP} if device.is_cuda else {})
     makers |= {name: lambda gap=gap: NutFields(model, gap, poses) for name, gap in gaps.items()}
-    runs = {}
+    made = {}
     for name, make in makers.items():
         before = used_memory(device)
         try:
             one = make()
             row[f"{name}_same_bits"], row[f"{name}_same_set"] = same_twice(one, poses, others)
-            runs[name], row[f"{name}_graph"] = timed(one, device)
         except (RuntimeError, MemoryError) as error:  # what has no room must not cost the rest of a run
             row[f"{name}_skipped"] = f"{type(error).__name__}: {error}"
             continue
+        made[name] = one
         row[f"{name}_mib"] = used_memory(device) - before
         row[f"{name}_contacts"] = len(read_contacts(one.contacts))
         row[f"{name}_worlds"] = int(worlds_with_contacts(one, worlds).sum())
         if isinstance(one, Ours):
             row[f"{name}_faces"] = one.faces
             check_ours(row, name, one)
-    row |= {f"{name}_ms": round(ms, 3) for name, ms in medians(time_rounds(runs, repeats)).items()}
-    row |= {f"{name}_ratio": round(row[f"{name}_ms"] / row["ours_ms"], 3) for name in runs if "ours" in runs}
+    runs, row["graphs"] = timed(made, device)
+    times = medians(time_rounds(runs, repeats))
+    row |= {f"{name}_ms": round(ms, 3) for name, ms in times.items()}
+    row |= {f"{name}_ratio": round(times[name] / times["ours"], 3) for name in times if "ours" in times}
     return row
 
 
-def timed(one, device):
-    """Return a callable that launches and returns the time [ms], and whether it replays a graph: on CUDA, if it can."""
+def timed(made, device):
+    """Return callables that launch and return the time [ms], all in the same way, and whether that is replaying graphs.
+
+    On the CPU each is launched; on CUDA replayed as a graph, or launched between events, each alone on the device, if a
+    graph of any cannot be made: the reason is in the place of True.
+    """
     if not device.is_cuda:
-        return time_call(one.launch, device), False
-    try:
-        replay = make_replay(one.launch, device)
-        replay()
-    except RuntimeError:
-        return time_events(one.launch, device), False
-    return time_events(replay, device), True
+        return {name: time_call(one.launch, device) for name, one in made.items()}, False
+    graphs = True
+    replays = {}
+    for name, one in made.items():
+        try:
+            replays[name] = make_replay(one.launch, device)
+            replays[name]()
+        except RuntimeError as error:
+            graphs = f"none of {name}: {error}"
+            replays = {name: one.launch for name, one in made.items()}
+            break
+    return {name: time_events(replay, device) for name, replay in replays.items()}, graphs
 
 
 def body_poses(matrices):

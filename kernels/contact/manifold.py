@@ -34,7 +34,8 @@ class Curves:
     depth: wp.array2d(dtype=wp.float64)  # [world units], or NO_DEPTH or NO_POINT, shape [contact, 2]
     normal: wp.array(dtype=wp.vec3d)  # of both candidates, shape [contact]
     listed: wp.array(dtype=wp.int32)  # contacts of each pair that have candidates, shape [contact]
-    nearest: wp.array2d(dtype=wp.float64)  # squared distance from the points chosen, shape [contact, 2]
+    nearest: wp.array2d(dtype=wp.float64)  # squared distance from points chosen, shape [contact, 2]
+    seen: wp.array(dtype=wp.int32)  # from how many of them, shape [contact]
 
 
 @wp.struct

@@ -16,6 +16,8 @@ wp.set_module_options(MODULE_OPTIONS)
 NEAREST_POINT = wp.constant(wp.float64(2.0**-9))
 # By which part of its distance a point is favoured at the far end of the spread.
 FAVOUR = wp.constant(wp.float64(2.0**-5))
+# More than that favour makes of a squared distance, at most.
+WIDEST = wp.constant(wp.float64(1.0625))
 # Part of the spread by which points may be less deep than the deepest, and apart, to be chosen before others.
 FIRST_PART = wp.constant(wp.float64(2.0**-9))
 # The deepest point is among those chosen if this part of its depth is more than theirs.
@@ -148,27 +150,33 @@ def find_farthest(
 
     Args:
         ends: Where the list of the pair's contacts begins and ends.
-        count: Points chosen. From the second on a candidate keeps its distance from those before.
+        count: Points chosen. From the second on a candidate keeps its distance from those seen before, which bounds
+            that from all: only candidates that may be the farthest yet look at the points chosen since.
     """
     farthest = wp.float64(-1.0)
     best = CANDIDATES * ends[0]
     at = ends[0] + warp_lane()
     while at < ends[1]:
         i = curves.listed[at]
+        before = wp.where(count > 2, curves.seen[i], 0)
+        stale = before == 0
         for k in range(CANDIDATES):
-            if curves.depth[i, k] >= choice.lowest:
-                x = curves.point[i, k]
-                d = distance_squared(x, curves.normal[i], choice.size, count - 1, point, normals)
-                if count == 2:
-                    d = wp.min(d, distance_squared(x, curves.normal[i], choice.size, 0, point, normals))
-                if count > 2:
-                    d = wp.min(d, curves.nearest[i, k])
-                curves.nearest[i, k] = d
-                if choice.size > wp.float64(0.0):
-                    d = d * (wp.float64(1.0) + FAVOUR * wp.dot(along, x - point[0]) / choice.size)
-                if d > farthest and curves.depth[i, k] >= choice.floor:
-                    farthest = d
-                    best = CANDIDATES * i + k
+            if curves.depth[i, k] >= choice.floor and WIDEST * curves.nearest[i, k] > farthest:
+                stale = True
+        if stale:
+            curves.seen[i] = count
+            for k in range(CANDIDATES):
+                if curves.depth[i, k] >= choice.lowest:
+                    x = curves.point[i, k]
+                    d = wp.where(before == 0, wp.float64(wp.inf), curves.nearest[i, k])
+                    for end in range(before, count):
+                        d = wp.min(d, distance_squared(x, curves.normal[i], choice.size, end, point, normals))
+                    curves.nearest[i, k] = d
+                    if choice.size > wp.float64(0.0):
+                        d = d * (wp.float64(1.0) + FAVOUR * wp.dot(along, x - point[0]) / choice.size)
+                    if d > farthest and curves.depth[i, k] >= choice.floor:
+                        farthest = d
+                        best = CANDIDATES * i + k
         at += warp_size()
     return best_of_warp(farthest, best)
 

@@ -83,7 +83,7 @@ class ManifoldQuery(ContactQuery):
 
     def _place_arrays(self, capacity: int) -> list:
         made = super()._place_arrays(capacity)
-        made += [(self.curves, name, self._empty(capacity, wp.int32)) for name in ("parent", "loop", "listed")]
+        made += [(self.curves, name, self._empty(capacity, wp.int32)) for name in ("parent", "loop", "listed", "seen")]
         made += [(self.curves, name, self._empty(capacity, wp.vec3d)) for name in ("loop_normal", "normal")]
         made.append((self.curves, "point", self._empty((capacity, 2), wp.vec3d)))
         made += [(self.curves, name, self._empty((capacity, 2), wp.float64)) for name in ("depth", "nearest")]
