@@ -22,7 +22,7 @@ from warp_abtree.kernels.distance.search import (
 )
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED, Contact
-from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, slide_floor, slides_past
+from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, proves_clear, slide_floor, slides_past
 from warp_abtree.kernels.motion.linear import EndPoses
 from warp_abtree.kernels.motion.start import OPEN, Contacts
 from warp_abtree.kernels.poses import PairPose
@@ -104,6 +104,9 @@ def search_contact(
     best = Contact()
     best.time = wp.float64(1.0)
     best.end = CLEAR
+    if proves_clear(items, models, states, pose, motions[p]):
+        return best, wp.vec2i()
+    warp_sync()
     if warp_lane() == 0:
         write_item(items, 0, first_item(states, pose))
         write_bound(items, 0, wp.float32(start))
