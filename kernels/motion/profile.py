@@ -5,14 +5,14 @@ round, the rest of u = z / h - a / (2 pi) do not change. So objects do not meet 
 one are over all of the other's: one pass over the faces of A finds between which radii they are in each of `CELLS` cells
 of u, and one pass over those of B compares. Faces that the other's heights do not reach all the way are left out.
 
-1. Of a face, D the longest edge seen along the axis and q <= all its radii. Any point is within D / sqrt 3 of a corner,
-   so q = (least radius of a corner) - 0.58 D; where q < 2 D, any u is taken, and radii from its distance to the axis.
+1. Of a face, D is the longest edge seen along the axis, and q its distance from that. Where q < 3 D, any u is taken.
 2. What is linear between the corners differs from a function whose second derivatives are at most M by at most
    M D^2 / 6: for x = sum l_i p_i, sum l_i |p_i - x|^2 = sum l_i l_j |p_i - p_j|^2 <= D^2 / 3. M is 1 / q for r, which is
    convex, and 1 / q^2 for a. So over the triangle of its corners' r and u, r is at most D^2 / (6 q) lower, and u off by
    D^2 / (12 pi q^2). In a cell, radii of that triangle are between those of its edges.
-3. Corners' angles are those of the first, and from there x - x^3 / 3 + x^5 / 5, x = tan < 0.56: off by x^7 / 7.
-4. Points off the screw by e have r and z off by e, a by asin(e / q) <= 1.1 e / q. `MARGIN` is far over all rounding.
+3. Corners' angles are that of the first, and from there x - x^3 / 3 + x^5 / 5 for the tangent x. As D < q / 3, angles are
+   under 0.335 and x < 1.05 D / q, so this errs by x^7 / 7 < 0.001 (D / q)^2: `SIXTH` has room for it.
+4. Points off the screw by e have r and z off by e, a by asin(e / q) <= 1.1 e / q. Half of e is for rounding (`screw`).
 """
 
 import math
@@ -33,15 +33,12 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 CELLS = wp.constant(64)
 CELL = wp.constant(wp.float64(1.0 / 64.0))
-# Of a revolution's rise, and of sizes, which are at most `LENGTH_MAX` times that.
-MARGIN, LENGTH_MAX = wp.constant(wp.float64(2.0**-30)), wp.constant(wp.float64(64.0))
-# Shorter turns are searched as fast.
-TURN_MIN = wp.constant(wp.float64(2.0**-3))
+# Lengths are under so many times what a revolution rises by: faces along the axis are in so many times `CELLS` cells.
+LENGTH_MAX = wp.constant(wp.float64(64.0))
 # Centres of boxes are so near the axis, of the least of their half widths.
 NEAR_AXIS = wp.constant(wp.float64(0.125))
-REVOLUTION, NEAREST_CORNER = wp.constant(wp.float64(2.0 * math.pi)), wp.constant(wp.float64(0.58))
-HALF, SIXTH, SEVENTH = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(0.17)), wp.constant(wp.float64(0.15))
-THIRD, FIFTH = wp.constant(wp.float64(1.0 / 3.0)), wp.constant(wp.float64(0.2))
+REVOLUTION, HALF = wp.constant(wp.float64(2.0 * math.pi)), wp.constant(wp.float64(0.5))
+SIXTH, THIRD, FIFTH = wp.constant(wp.float64(0.17)), wp.constant(wp.float64(1.0 / 3.0)), wp.constant(wp.float64(0.2))
 
 
 @wp.struct
@@ -130,23 +127,20 @@ def image_face(models: ModelPool, states: StatePool, frame: AxisFrame, at: wp.in
     image.radius = wp.vec3d(flat_radius(p), flat_radius(q), flat_radius(s))
     square = wp.max(wp.max(flat_square(p, q), flat_square(q, s)), flat_square(s, p))
     longest = wp.sqrt(square)
-    least = wp.min(image.radius) - NEAREST_CORNER * longest
-    image.narrow = least > wp.float64(2.0) * (longest + frame.off)
+    image.least = axis_distance(p, q, s)
+    image.narrow = image.least > wp.float64(3.0) * (longest + frame.off)
     if not image.narrow:
-        image.least = axis_distance(p, q, s)
         return image
     x = wp.vec2d(cross_flat(p, q) / (p[0] * q[0] + p[1] * q[1]), cross_flat(p, s) / (p[0] * s[0] + p[1] * s[1]))
     angle = turn_between(p[1] / image.radius[0], p[0] / image.radius[0])
     image.turned[0] = p[2] / frame.rise - angle / REVOLUTION
-    error = wp.float64(0.0)
     for k in range(2):
         y = x[k] * x[k]
         turn = x[k] * (wp.float64(1.0) - y * (THIRD - y * FIFTH))
         image.turned[1 + k] = wp.where(k == 0, q[2], s[2]) / frame.rise - (angle + turn) / REVOLUTION
-        error = wp.max(error, wp.abs(x[k]) * (y * y * y) * SEVENTH)
-    image.sag = SIXTH * square / least
-    error += (image.sag + ASIN_SLOPE * frame.off) / least
-    image.wide = error / REVOLUTION + frame.off / wp.abs(frame.rise) + MARGIN
+    image.sag = SIXTH * square / image.least
+    error = (image.sag + ASIN_SLOPE * frame.off) / image.least
+    image.wide = error / REVOLUTION + frame.off / wp.abs(frame.rise)
     return image
 
 
@@ -269,7 +263,38 @@ def is_nested(frame: ScrewFrame, a: wp.vec2d, b: wp.vec2d):
     length = wp.max(wp.max(wp.abs(a)), wp.max(wp.abs(b))) + wp.abs(frame.rise)
     common = wp.min(a[1], b[1]) - wp.max(a[0], b[0]) - wp.abs(frame.rise)
     half = HALF * wp.min(a[1] - a[0], b[1] - b[0])
-    return common >= half and length + frame.off < LENGTH_MAX * wp.abs(rise) and frame.turn >= TURN_MIN
+    return common >= half and length + frame.off < LENGTH_MAX * wp.abs(rise)
+
+
+@wp.func
+def frame_of_a(motion: Motion, screw: ScrewFrame, b: wp.vec2d):
+    """Return the `AxisFrame` of A; B's root box has heights b."""
+    frame = AxisFrame()
+    frame.home = wp.identity(n=3, dtype=wp.float64)
+    frame.away = screw.away_a - motion.centre_a
+    frame.axis = screw.axis_a
+    x = wp.where(wp.abs(frame.axis[0]) < HALF, wp.float64(1.0), wp.float64(0.0))
+    frame.first = wp.normalize(wp.cross(frame.axis, wp.vec3d(x, wp.float64(1.0) - x, wp.float64(0.0))))
+    frame.second = wp.cross(frame.axis, frame.first)
+    # What turns seen from the other, B or A, turns that way: A's points rise against B's.
+    frame.rise = wp.where(screw.a_turns, -screw.rise, screw.rise) / screw.turn * REVOLUTION
+    frame.off = screw.off
+    reach = wp.abs(screw.rise) + frame.off
+    frame.lower = b[0] - reach
+    frame.upper = b[1] + reach
+    return frame
+
+
+@wp.func
+def frame_of_b(motion: Motion, screw: ScrewFrame, of_a: AxisFrame, a: wp.vec2d):
+    """Return the same of B; A's root box has heights a."""
+    frame = of_a
+    frame.home = motion.first
+    frame.away = screw.away_b - motion.centre_b
+    reach = wp.abs(screw.rise) + frame.off
+    frame.lower = a[0] - reach
+    frame.upper = a[1] + reach
+    return frame
 
 
 @wp.func
@@ -278,29 +303,11 @@ def profiles_apart(items: wp.uint64, models: ModelPool, states: StatePool, pose:
     if pose.floor[0] == NO_NODE:
         return False
     screw = screw_frame(motion)
-    low_high_a, about_a = box_heights(states, pose.node_a + 1, screw.away_a, screw.axis_a)
-    low_high_b, about_b = box_heights(states, pose.node_b + 1, screw.away_b, screw.axis_b)
-    if not (about_a and about_b and is_nested(screw, low_high_a, low_high_b)):
+    heights_a, about_a = box_heights(states, pose.node_a + 1, screw.away_a, screw.axis_a)
+    heights_b, about_b = box_heights(states, pose.node_b + 1, screw.away_b, screw.axis_b)
+    if not (about_a and about_b and is_nested(screw, heights_a, heights_b)):
         return False
-    # In A's frame; seen from there the mover rises by as much, whichever turns, relative to its turn.
-    frame = AxisFrame()
-    frame.axis = screw.axis_a
-    x = wp.where(wp.abs(frame.axis[0]) < HALF, wp.float64(1.0), wp.float64(0.0))
-    frame.first = wp.normalize(wp.cross(frame.axis, wp.vec3d(x, wp.float64(1.0) - x, wp.float64(0.0))))
-    frame.second = wp.cross(frame.axis, frame.first)
-    frame.rise = screw.rise / screw.turn * REVOLUTION
-    if screw.a_turns:
-        frame.rise = -frame.rise
-    size = wp.max(wp.max(wp.abs(low_high_a)), wp.max(wp.abs(low_high_b)))
-    frame.off = screw.off + MARGIN * (size + wp.abs(frame.rise))
-    frame.home = wp.identity(n=3, dtype=wp.float64)
-    frame.away = screw.away_a - motion.centre_a
-    reach = wp.abs(screw.rise) + frame.off
-    frame.lower = low_high_b[0] - reach
-    frame.upper = low_high_b[1] + reach
+    frame = frame_of_a(motion, screw, heights_b)
     profile_faces(items, models, states, frame, pose.corner_a, pose.faces_a)
-    frame.home = motion.first
-    frame.away = screw.away_b - motion.centre_b
-    frame.lower = low_high_a[0] - reach
-    frame.upper = low_high_a[1] + reach
+    frame = frame_of_b(motion, screw, frame, heights_a)
     return faces_clear_profile(items, models, states, frame, pose.corner_b, pose.faces_b)
