@@ -2,16 +2,16 @@
 
 As in `screw`, cylinder coordinates r, a, z about the axis, and k = v / w. With h = 2 pi k a point's r and, as a turns
 round, the rest of u = z / h - a / (2 pi) do not change. So objects do not meet while at each u, modulo 1, all radii of
-one are over all of the other's: one pass over the faces of A finds between which radii they are in each of `CELLS` cells
-of u, and one pass over those of B compares. Faces that the other's heights do not reach all the way are left out.
+one are over all of the other's: one pass over the faces of A finds between which radii they are in each of `CELLS`
+cells of u, and one pass over those of B compares. Faces that the other's heights do not reach all the way are left out.
 
 1. Of a face, D is the longest edge seen along the axis, and q its distance from that. Where q < 3 D, any u is taken.
 2. What is linear between the corners differs from a function whose second derivatives are at most M by at most
-   M D^2 / 6: for x = sum l_i p_i, sum l_i |p_i - x|^2 = sum l_i l_j |p_i - p_j|^2 <= D^2 / 3. M is 1 / q for r, which is
-   convex, and 1 / q^2 for a. So over the triangle of its corners' r and u, r is at most D^2 / (6 q) lower, and u off by
-   D^2 / (12 pi q^2). In a cell, radii of that triangle are between those of its edges.
-3. Corners' angles are that of the first, and from there x - x^3 / 3 + x^5 / 5 for the tangent x. As D < q / 3, angles are
-   under 0.335 and x < 1.05 D / q, so this errs by x^7 / 7 < 0.001 (D / q)^2: `SIXTH` has room for it.
+   M D^2 / 6: for x = sum l_i p_i, sum l_i |p_i - x|^2 = sum l_i l_j |p_i - p_j|^2 <= D^2 / 3. M is 1 / q for r, which
+   is convex, and 1 / q^2 for a. So over the triangle of its corners' r and u, r is at most D^2 / (6 q) lower, and u off
+   by D^2 / (12 pi q^2). In a cell, radii of that triangle are between those of its edges.
+3. Corners' angles are that of the first, and from there x - x^3 / 3 + x^5 / 5 for the tangent x. As D < q / 3, these
+   are under 0.335 and x < 1.05 D / q, so this errs by x^7 / 7 < 0.001 (D / q)^2: `SIXTH` has room for it.
 4. Points off the screw by e have r and z off by e, a by asin(e / q) <= 1.1 e / q. Half of e is for rounding (`screw`).
 """
 

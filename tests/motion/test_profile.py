@@ -1,4 +1,4 @@
-"""Profiles of nested objects on a screw: each face is within its profile, in longer numbers; threads that are nested."""
+"""Profiles of nested objects on a screw: each face is within its profile, in longer numbers; nested threads."""
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from oracles.path import HAS_LONG, LONG
 from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
+from warp_abtree import testing
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.motion.path import Paths, bound_motion, pair_skew, prepare_path_kernel, start_motion
 from warp_abtree.kernels.motion.profile import (
@@ -75,9 +76,9 @@ def profiles(rng, device, faces, turn, rise, slack=0.0):
 
     Of each pair the second turns and rises, or the first does so the other way; so both have the same screw.
     """
-    scene, ends = ab.Scene(device), []
+    scene, ends, frames = ab.Scene(device), [], random_poses(rng, len(faces) // 2, 1.0)
     for k, face in enumerate(faces):
-        whole = random_poses(rng, 1, 1.0)[0] if k % 2 == 0 else whole
+        whole = frames[k // 2]
         frame, moves = Rotation.from_quat(whole[3:]), (k % 2 == 1) == (k % 4 < 2)
         last = whole[:3] + frame.apply([0, 0, rise[k // 2]]), (frame * Rotation.from_euler("z", turn[k // 2])).as_quat()
         scene.add(ab.Model.from_arrays(face, [[0, 1, 2]], base_faces=1), whole)
@@ -120,7 +121,7 @@ def check_inside(found, points, pitch):
     return (r - low).min(1), (high - r).min(1)
 
 
-SIZES = [(0.3, False), (0.05, False), (1e-3, False), (0.05, True), (0.3, True)]
+SIZES = [(0.3, False), (0.05, False), (1e-3, False), (0.05, True), (0.3, True), (1e-3, True)]
 
 
 @pytest.mark.skipif(not HAS_LONG, reason="no floating-point numbers longer than float64")
@@ -204,18 +205,20 @@ def nested_threads(rng, gap, length, burr=0.0, count=8):
         both = [[bolt, bolt.lod_max, whole], [nut, nut.lod_max, np.array(moves[0])]]
         last = [whole, np.array(moves[1])]
         order = slice(None, None, 1 if k % 2 else -1)
-        cases.append(sum(both[order], []))
+        cases.append([x for rows in both[order] for x in rows])
         ends += last[order]
     return cases, np.array(ends)
 
 
-def test_nested_threads_need_no_search(device):
+@pytest.mark.parametrize("warps", [False, True])
+def test_nested_threads_need_no_search(device, warps):
     rng = np.random.default_rng(3)
     cases, ends = nested_threads(rng, 0.08, 4)
-    result = find(device, cases, ends)
+    with testing.regime(warps=warps):
+        result = find(device, cases, ends)
+        still = scene_of(device, cases).intersect(pairs_of(cases))
     assert result.clear.all()
     # What is counted is the test of the start.
-    still = scene_of(device, cases).intersect(pairs_of(cases))
     assert (result.triangle_tests == still.triangle_tests).all()
 
 
