@@ -92,9 +92,9 @@ def profiles(rng, device, faces, turn, rise, slack=0.0):
 
 
 def random_faces(rng, size, near):
-    """Return faces (2 n, 3, 3) of a size some 1 from the z axis, or as near to it as 2 to 6 sizes."""
+    """Return faces (2 n, 3, 3) of a size some 1 from the z axis, or up to 6 sizes from it."""
     centre = np.zeros((2 * COUNT, 1, 3))
-    centre[..., 0] = size * rng.uniform(2, 6, (2 * COUNT, 1)) if near else rng.uniform(0.8, 1.2, (2 * COUNT, 1))
+    centre[..., 0] = size * rng.uniform(0, 6, (2 * COUNT, 1)) if near else rng.uniform(0.8, 1.2, (2 * COUNT, 1))
     angle = rng.uniform(0, 2 * np.pi, 2 * COUNT)
     flat = centre + size * rng.normal(size=(2 * COUNT, 3, 3)) * rng.choice([1, 0.1], (2 * COUNT, 1, 3))
     return np.array([Rotation.from_euler("z", a).apply(face) for a, face in zip(angle, flat)])
