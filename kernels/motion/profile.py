@@ -49,11 +49,11 @@ class AxisFrame:
     away: wp.vec3d  # from a point of the axis to the object's origin, in the object's frame
     axis: wp.vec3d  # unit
     first: wp.vec3d  # unit, square to it
-    second: wp.vec3d
+    second: wp.vec3d  # axis x first
     rise: wp.float64  # h, signed
     off: wp.float64  # that points are off the screw, and rounding
     lower: wp.float64  # heights that the other object reaches
-    upper: wp.float64
+    upper: wp.float64  # the same
 
 
 @wp.struct

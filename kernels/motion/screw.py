@@ -195,13 +195,13 @@ class ScrewFrame:
     """The screw of a motion in the frames of both objects."""
 
     axis_a: wp.vec3d  # unit
-    axis_b: wp.vec3d
+    axis_b: wp.vec3d  # the same in B's frame
     away_a: wp.vec3d  # from a point of the axis to the centre of A's model at first
-    away_b: wp.vec3d
+    away_b: wp.vec3d  # the same of B's
     turn: wp.float64  # of what turns, in unit time
     rise: wp.float64  # of B along the axis, seen from A
     off: wp.float64  # that points are off the screw, and err by
-    a_turns: bool
+    a_turns: bool  # else B does
 
 
 @wp.func
