@@ -14,6 +14,7 @@ from warp_abtree.kernels.motion.linear import (
 )
 from warp_abtree.kernels.motion.node_pair import advance_children, box_motion
 from warp_abtree.kernels.motion.path import Motion, Paths, bound_motion, pair_skew, place_motion, start_motion
+from warp_abtree.kernels.motion.profile import profiles_apart
 from warp_abtree.kernels.motion.screw import is_screw, parent_of, slides_apart
 from warp_abtree.kernels.poses import NO_NODE, PairPose
 from warp_abtree.kernels.traversal.node_pair import item_first, item_second
@@ -91,6 +92,21 @@ def advance_nodes(  # noqa: F811
 ):
     items, kinds, times, tests = advance_linear_children(states, pose, motion, t, best, item, live)
     return items, kinds, times, tests
+
+
+@wp.func
+def proves_clear(items: wp.uint64, models: ModelPool, states: StatePool, pose: PairPose, motion: Motion):
+    """Return whether objects are proved apart for all of a motion without a search; `items` is memory."""
+    if not is_screw(motion):
+        return False
+    return profiles_apart(items, models, states, pose, motion)
+
+
+@wp.func
+def proves_clear(  # noqa: F811
+    items: wp.uint64, models: ModelPool, states: StatePool, pose: PairPose, motion: LinearMotion
+):
+    return False
 
 
 @wp.func

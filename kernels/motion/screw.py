@@ -190,25 +190,47 @@ def is_screw(motion: Motion):
     return wp.length(motion.d1 - wp.dot(motion.d1, axis) * axis) * motion.scale < DRIFT_MAX
 
 
+@wp.struct
+class ScrewFrame:
+    """The screw of a motion in the frames of both objects."""
+
+    axis_a: wp.vec3d  # unit
+    axis_b: wp.vec3d  # the same in B's frame
+    away_a: wp.vec3d  # from a point of the axis to the centre of A's model at first
+    away_b: wp.vec3d  # the same of B's
+    turn: wp.float64  # of what turns, in unit time
+    rise: wp.float64  # of B along the axis, seen from A
+    off: wp.float64  # that points are off the screw, and err by
+    a_turns: bool  # else B does
+
+
+@wp.func
+def screw_frame(motion: Motion):
+    """Return the screw of a motion for which `is_screw` holds."""
+    s = ScrewFrame()
+    s.a_turns = motion.angle_a > wp.float64(0.0)
+    s.turn = wp.max(motion.angle_a, motion.angle_b)
+    back = wp.transpose(motion.first)
+    s.axis_a = wp.where(s.a_turns, motion.axis_a, motion.first * motion.axis_b)
+    s.axis_b = wp.where(s.a_turns, back * motion.axis_a, motion.axis_b)
+    # The axis goes through the anchor of what turns; seen from the base it is where that is at first.
+    away_a = motion.centre_a - motion.anchor_a
+    away_b = motion.centre_b - motion.anchor_b
+    s.away_a = wp.where(s.a_turns, away_a, away_a - motion.d0)
+    s.away_b = wp.where(s.a_turns, away_b + back * motion.d0, away_b)
+    s.rise = wp.dot(motion.d1, s.axis_a)
+    s.off = wp.length(motion.d1 - s.rise * s.axis_a) + wp.float64(2.0) * motion.slack
+    return s
+
+
 @wp.func
 def slides_apart(
     models: ModelPool, states: StatePool, pose: PairPose, motion: Motion, t: wp.float64, x: wp.int32, y: wp.int32
 ):
     """Return whether nodes x of A and y of B stay apart from t on for sure; one object moves nearly on a screw."""
-    a_turns = motion.angle_a > wp.float64(0.0)
-    turn = wp.max(motion.angle_a, motion.angle_b)
-    back = wp.transpose(motion.first)
-    axis_a = wp.where(a_turns, motion.axis_a, motion.first * motion.axis_b)
-    axis_b = wp.where(a_turns, back * motion.axis_a, motion.axis_b)
-    # The axis goes through the anchor of what turns; seen from the base it is where that is at first.
-    away_a = motion.centre_a - motion.anchor_a
-    away_b = motion.centre_b - motion.anchor_b
-    away_a = wp.where(a_turns, away_a, away_a - motion.d0)
-    away_b = wp.where(a_turns, away_b + back * motion.d0, away_b)
-    rise = wp.dot(motion.d1, axis_a)
-    off = wp.length(motion.d1 - rise * axis_a) + wp.float64(2.0) * motion.slack
-    a = load_ring(models, states, pose.node_a, pose.slab[0], x, away_a, axis_a, off)
-    b = load_ring(models, states, pose.node_b, pose.slab[1], y, away_b, axis_b, off)
-    if a_turns:
-        return part_on_screw(b, a, back, turn, -rise, t, off)
-    return part_on_screw(a, b, motion.first, turn, rise, t, off)
+    s = screw_frame(motion)
+    a = load_ring(models, states, pose.node_a, pose.slab[0], x, s.away_a, s.axis_a, s.off)
+    b = load_ring(models, states, pose.node_b, pose.slab[1], y, s.away_b, s.axis_b, s.off)
+    if s.a_turns:
+        return part_on_screw(b, a, wp.transpose(motion.first), s.turn, -s.rise, t, s.off)
+    return part_on_screw(a, b, motion.first, s.turn, s.rise, t, s.off)

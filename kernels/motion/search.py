@@ -22,8 +22,9 @@ from warp_abtree.kernels.distance.search import (
 )
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED, Contact
-from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, slide_floor, slides_past
+from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, proves_clear, slide_floor, slides_past
 from warp_abtree.kernels.motion.linear import EndPoses
+from warp_abtree.kernels.motion.path import Motion
 from warp_abtree.kernels.motion.start import OPEN, Contacts
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.face_pairs import Hits
@@ -141,6 +142,29 @@ def search_contact(
     return best, tests
 
 
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+def profile_warp_kernel(
+    models: ModelPool,
+    states: StatePool,
+    pair_count: wp.array(dtype=wp.int32),
+    pair_poses: wp.array(dtype=PairPose),
+    motion: wp.array(dtype=Motion),
+    contacts_inout: Contacts,
+):
+    """Decide the object pairs that `profile` proves apart, a warp a pair; within `warp_search` it would spill."""
+    p = wp.tid() / warp_size()
+    if p >= pair_count[0] or contacts_inout.launched[0] == STALE:
+        return
+    if contacts_inout.end[p] != OPEN:
+        return
+    if proves_clear(nearest_stack(), models, states, pair_poses[p], motion[p]):
+        # All lanes have read what the first one writes.
+        warp_sync()
+        if warp_lane() == 0:
+            contacts_inout.time[p] = wp.float64(1.0)
+            contacts_inout.end[p] = CLEAR
+
+
 @cache
 def warp_search(kind):
     """Return the kernel of warps for motions of a kind: `path.Motion` or `linear.LinearMotion`."""
@@ -210,6 +234,9 @@ def thread_search(kind):
         items = thread_lists(memory_out, thread)
         p = take_unit(contacts_inout.counter)
         while p < count:
+            if contacts_inout.end[p] == OPEN and proves_clear(items, models, states, pair_poses[p], motion[p]):
+                contacts_inout.time[p] = wp.float64(1.0)
+                contacts_inout.end[p] = CLEAR
             if contacts_inout.end[p] == OPEN:
                 pose, start = pair_poses[p], contacts_inout.time[p]
                 contact, tests = search_contact(items, room, tolerance, models, states, poses, pose, motion, p, start)

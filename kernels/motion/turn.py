@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Turns by more than half a revolution less about 1e-6 rad have no shortest way: a quaternion's least real part.
 REAL_LEAST = wp.constant(wp.float64(2.0**-21))
-NEWTON_STEPS = wp.constant(4)
+NEWTON_STEPS = wp.constant(2)
 
 
 # Factors of the sums, the last first. A literal inside a kernel would be a float32.
@@ -49,7 +49,10 @@ def turn_matrix(axis: wp.vec3d, angle: wp.float64):
 
 @wp.func
 def angle_of(s: wp.float64, c: wp.float64):
-    """Return twice the angle whose sine and cosine these are, both from 0 to 1."""
+    """Return twice the angle whose sine and cosine these are, both from 0 to 1.
+
+    r / (1 + 0.28 r^2) is within 0.005 of it, and a step leaves e - sin e < e^3 / 6 of an error e: 2^-25, then 2^-79.
+    """
     least, most = wp.min(s, c), wp.max(s, c)
     r = least / most
     x = r / (wp.float64(1.0) + wp.float64(0.28) * r * r)

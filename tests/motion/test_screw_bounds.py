@@ -95,12 +95,18 @@ def touching_patches(rng, off, drift):
 
 def found_apart(rng, device, off=0.0, slack=0.0, drift=0.0):
     """Return which of `COUNT` pairs that touch, but for `off`, are found apart where points are off by a slack."""
-    scene, ends = ab.Scene(device), []
-    while len(ends) < 2 * COUNT:
+    cases = []
+    while len(cases) < COUNT:
         found = touching_patches(rng, off, drift)
-        if found is None:
-            continue
-        rest, moving, turn, way = found
+        if found is not None:
+            cases.append(found)
+    return slides(rng, device, cases, slack)
+
+
+def slides(rng, device, cases, slack=0.0):
+    """Return which pairs of corners of a resting patch and of a moving one, its turn and its way, are found apart."""
+    scene, ends = ab.Scene(device), []
+    for rest, moving, turn, way in cases:
         whole = random_poses(rng, 1, 1.0)[0]
         frame = Rotation.from_quat(whole[3:])
         last = [*(frame.apply(way) + whole[:3]), *(frame * Rotation.from_euler("z", turn)).as_quat()]
@@ -128,6 +134,20 @@ def test_points_may_be_off_the_screw(device):
     assert not found_apart(rng, device, drift=0.02).any()
     for slack in (0.01, 0.1):
         assert not found_apart(rng, device, off=0.9 * slack, slack=slack).any()
+
+
+def test_wide_balls_near_the_axis_say_nothing_of_times(device):
+    """The corner that meets the other patch at the end is farther from its box's centre than 1.1 x, x of the radius."""
+    cases = []
+    for x in np.linspace(0.72, 0.95, COUNT):
+        # From the centre (1, 0, 0), x long, to where a line from the axis touches the ball.
+        side, angle, turn = x * np.array([-x, np.sqrt(1 - x * x), 0]), np.arcsin(x), 0.5
+        u, v = np.stack(np.meshgrid([-1, 0, 1], [-1e-4, 1e-4], indexing="ij"), -1).reshape(-1, 2).T
+        moving = [1, 0, 0] + u[:, None] * side + v[:, None] * [0, 0, 1]
+        small = np.sqrt(1 - x * x) * np.array([1, 0, 0]) + 1e-3 * np.stack([0 * u, u, v], 1)
+        way = np.array([0, 0, 0.1 * turn])
+        cases.append((Rotation.from_euler("z", angle + turn).apply(small) + way, moving, turn, way))
+    assert not slides(np.random.default_rng(4), device, cases).any()
 
 
 @pytest.mark.skipif(not HAS_LONG, reason="no floating-point numbers longer than float64")
