@@ -15,7 +15,7 @@ class ViewArrays:
     centre: wp.array(dtype=wp.vec3d)  # [model] middle, model frame [model units]
     camera: wp.array(dtype=wp.float64)  # [15] eye [world units]; rows right, up, back; focal length, W [pixels]; D
     # state
-    frame: wp.array(dtype=wp.int32)  # [1] frames measured
+    frame: wp.array(dtype=wp.int32)  # [object] frames measured: an entry each, so that no launch need count them
     screen: wp.array(dtype=wp.vec3d)  # [object] x, y on the screen a frame ago [pixels], 1 if in front of the camera
     path: wp.array(dtype=wp.float64)  # [slot * objects + object] motion in each frame of the window [pixels]
     # out
@@ -52,7 +52,8 @@ def measure_view_kernel(
     if place[2] > wp.float64(0.0) and before[2] > wp.float64(0.0):
         moved = wp.length(place - before)
     view_inout.screen[i] = place
-    view_inout.path[(view_inout.frame[0] % view_inout.window) * n + i] = moved
+    view_inout.path[(view_inout.frame[i] % view_inout.window) * n + i] = moved
+    view_inout.frame[i] = view_inout.frame[i] + 1
     motion = wp.float64(0.0)
     for slot in range(view_inout.window):
         motion += view_inout.path[slot * n + i]
@@ -62,9 +63,3 @@ def measure_view_kernel(
     far = camera[14]
     f = wp.min((far - distance) / far, (wide - motion) / wide)
     view_inout.focus[i] = wp.clamp(f, wp.float64(0.0), wp.float64(1.0))
-
-
-@wp.kernel
-def advance_frame_kernel(frame_inout: wp.array(dtype=wp.int32)):
-    """Count a frame."""
-    frame_inout[0] = frame_inout[0] + 1

@@ -97,7 +97,7 @@ class View:
         self._arrays.object_model = wp.array(np.array(scene.object_model, np.int32), dtype=wp.int32, device=self.device)
         self._arrays.centre = self.batch.models.pool.centre
         self._camera = Upload(15, self.device)
-        self._arrays.camera, self._arrays.frame = self._camera.array, zeros(1, wp.int32)
+        self._arrays.camera, self._arrays.frame = self._camera.array, zeros(count, wp.int32)
         self._arrays.screen, self._arrays.path = zeros(count, wp.vec3d), zeros(self.window * count)
         self._arrays.distance, self._arrays.motion, self._arrays.focus = self.distance, self.motion, self.focus
 
@@ -110,7 +110,7 @@ class View:
         self.batch.check("selection")
 
     def launch(self):
-        """Measure. Launches only.
+        """Measure, in one launch.
 
         Raises:
             RuntimeError: The scene's objects changed.
@@ -119,4 +119,3 @@ class View:
         pool = self.batch.objects.pool
         inputs = [pool.rotation, pool.position, self._arrays]
         wp.launch(kernels.measure_view_kernel, dim=len(self.focus), inputs=inputs, device=self.device)
-        wp.launch(kernels.advance_frame_kernel, dim=1, inputs=[self._arrays.frame], device=self.device)
