@@ -24,9 +24,9 @@ def run(device, quick=False):
 
     Columns: launches of a `Query` with room for the hits (replays of a graph on CUDA); intersect is
     `Scene.intersect` as a loop calls it, which holds the result before until the next is there; result is
-    `Query.result` of what was launched; on_device is intersect with `device=True`; unpacked is what it took to query,
-    read each array by itself and sort rows on the host. bytes are those of the arrays asked for, with what the result
-    says of each pair; goal_ms is launches and their transfer at 20 GB/s, ratio intersect over it.
+    `Query.result` of what was launched; on_device is intersect with `device=True`. bytes are those of the arrays asked
+    for, with what the result says of each pair; goal_ms is launches and their transfer at 20 GB/s, ratio intersect over
+    it. Results are compared with each array read by itself, rows sorted on the host.
     """
     device = wp.get_device(device)
     sizes = QUICK if quick else FULL
@@ -55,7 +55,6 @@ def time_outputs(device, model, count, distance, repeats):
         runs["intersect"] = time_call(Keeper(lambda output=output: scene.intersect(pairs, output)), device)
         runs["result"] = time_call(query.result, device)
         runs["on_device"] = time_call(lambda output=output: scene.intersect(pairs, output, device=True), device)
-        runs["unpacked"] = time_call(lambda query=query: unpacked(query, pairs), device)
         times = medians(time_rounds(runs, repeats))
         size = sum(array.nbytes for array in host_arrays(found))
         goal = times["launches"] + size / BYTES_PER_MS

@@ -30,7 +30,7 @@ KEYS = {
     "sweep": ("model", "case", "poses"),
     "distance": ("workload",),
 }
-OTHERS = ("peer", "fcl", "bvh", "unpacked", "goal")  # columns that are no time of the library
+OTHERS = ("peer", "fcl", "bvh", "goal")  # columns that are no time of the library
 RUNS, BEFORE = 3, 7  # runs of a case; lines that a new one is compared with
 LEAST = 0.05  # fraction below which no change is named: times of one process differ by as much from another's
 
