@@ -54,7 +54,8 @@ inline CUDA_CALLABLE void fold_bound(wp::uint64 items, wp::int32 i, wp::float32 
         asm volatile("red.shared.min.s32 [%0], %1;" ::"r"(at), "r"(__float_as_int(bound)) : "memory");
 #else
     float& all = ((float*)((long long*)items + NEAREST_LENGTH))[i];
-    if (greatest ? bound > all : bound < all) all = bound;
+    if (greatest ? bound > all : bound < all)
+        all = bound;
 #endif
 }
 
