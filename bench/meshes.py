@@ -63,7 +63,8 @@ class ModelFolder:
 
     def has(self, name) -> bool:
         """Return whether a mesh can be loaded, or its model lies in the folder."""
-        return has_source(name) or any(self.folder.glob(self.file(name, "*").name))
+        kept = () if self.folder is None else self.folder.glob(self.file(name, "*").name)
+        return has_source(name) or any(kept)
 
     def load(self, names, base_faces=10) -> ab.Model:
         """Return the model of the first name that is at hand; its `name` is that name.

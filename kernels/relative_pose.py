@@ -45,12 +45,13 @@ def clear_hits(p: wp.int32, hits: Hits):
 
 @wp.struct
 class Started:
-    """The object pairs of the threads of the CPU; one that is alone starts them itself."""
+    """The object pairs of the threads of the CPU: one thread starts them, alone or before others are there."""
 
     pair_count: wp.array(dtype=wp.int32)  # shape (1,)
-    pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]; [0] where `relative_poses` have started them
+    pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]; [0] where they are started
     within: wp.array(dtype=wp.float64)  # as for `relative_pose_kernel`
     pair_poses: wp.array(dtype=PairPose)  # shape [pair]
+    only: wp.bool  # whether nothing is traversed
 
 
 @functools.cache

@@ -107,7 +107,8 @@ class Asked:
     pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]
     pair_poses: wp.array(dtype=PairPose)  # shape [pair]
     tolerances: Tolerances  # when they are near enough
-    alone: wp.bool  # whether one thread takes them all, and first does what `refresh_slab_kernel` does
+    refreshes: wp.bool  # whether a thread that is still alone makes slabs, see `refresh_slabs`
+    searches: wp.bool
 
 
 @wp.func
@@ -169,11 +170,13 @@ def search_thread_kernel(
         return
     pairs, poses = asked.pairs, asked.pair_poses
     count = wp.min(asked.pair_count[0], poses.shape[0])
-    if asked.alone:
+    if asked.refreshes:
         for i in range(counter.shape[0]):
             counter[i] = 0
         for i in range(count):
             refresh_slabs(i, models, states, objects, pairs, slabs)
+    if not asked.searches:
+        return
     thread = take_thread(counter)
     if thread >= memory_out.shape[0]:
         return

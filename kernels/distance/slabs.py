@@ -14,8 +14,6 @@ A slab is two entries of 16 bytes a node, as `nodes.Node` has:
 import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.distance.frame import Found
-from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.traversal.boxes import round_down, round_up
 from warp_abtree.kernels.traversal.nodes import Node, load_node
 
@@ -186,27 +184,8 @@ def refresh_slabs(
     pairs: wp.array(dtype=wp.vec2i),
     slabs: Slabs,
 ):
-    """Count what an object pair asks for, and make the slabs that pay; one thread after the other."""
+    """Count what an object pair asks for, and make the slabs that pay; one pair after the other, CPU only."""
     own = wp.vec2i(objects.state[pairs[p][0]], objects.state[pairs[p][1]])
     slabs.states[p] = own
     ask_slabs(models, states, slabs, own[0])
     ask_slabs(models, states, slabs, own[1])
-
-
-@wp.kernel
-def refresh_slab_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    found: Found,
-    slabs_inout: Slabs,
-    counter_out: wp.array(dtype=wp.int32),
-):
-    """Do what comes before a search by several threads, see `refresh_slabs`; CPU only. Its counters start at 0."""
-    p = wp.tid()
-    if p < counter_out.shape[0]:
-        counter_out[p] = 0
-    if p < wp.min(pair_count[0], pairs.shape[0]) and found.launched[0] != STALE:
-        refresh_slabs(p, models, states, objects, pairs, slabs_inout)

@@ -246,6 +246,8 @@ def thread_traversal(mode: int):
     ):
         """Take one object pair after the other and traverse it depth first; CPU only, a thread a core."""
         start_pairs(output, models, states, objects, started, hits_inout, work_inout)
+        if started.only:
+            return
         pair_poses = started.pair_poses
         count = wp.min(started.pair_count[0], pair_poses.shape[0])
         stack = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)

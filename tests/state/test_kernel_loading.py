@@ -107,7 +107,7 @@ def test_an_error_ahead_is_said_by_the_launch(device, monkeypatch):
 
 
 # Modules of the first answer about two small models: on threads of the CPU, and on warps.
-MODULES = {"any": (6, 10), "faces": (6, 11), "contacts": (9, 13), "distance": (7, 12)}
+MODULES = {"any": (5, 10), "faces": (5, 11), "contacts": (8, 13), "distance": (5, 12)}
 
 
 @pytest.mark.parametrize("output", MODULES)

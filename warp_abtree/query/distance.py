@@ -231,8 +231,7 @@ class DistanceQuery(Query):
         kernels += CROSSING_KERNELS if device.is_cuda else []  # on the CPU where pairs cross
         kernels += [report.report_distance_kernel, frame.start_distance_kernel] if with_warps else []
         searching = super().kernels(device, output, precision, with_gap, with_distances)
-        refreshing = [] if with_warps else [(slabs.refresh_slab_kernel, 256)]
-        return [*[(kernel, WARP_SIZE) for kernel in kernels], *searching, *refreshing]
+        return [*[(kernel, WARP_SIZE) for kernel in kernels], *searching]
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
@@ -341,17 +340,14 @@ class DistanceQuery(Query):
         threads = {"dim": room, "block_dim": WARP_SIZE, "device": device}
         reports = [*posed, found, hits, self.distances]
         if not self.uses_warps():
-            counter = self.work.counter
-            asked = search_simd.Asked()
-            asked.pair_count, asked.pairs, asked.pair_poses = self.pair_count, self.pairs, self.pair_poses
-            asked.tolerances, asked.alone = self._tolerances, self._search_cores() == 1
-            inputs = [asked, models, states, objects, counter, self._slabs, found, hits]
-            inputs += [self.distances, self._memory]
-            made = [launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device)]
-            if not asked.alone:
-                inputs = [models, states, objects, self.pair_count, self.pairs, found, self._slabs, counter]
-                dim = max(room, len(counter))
-                made.insert(0, launch(slabs.refresh_slab_kernel, inputs=inputs, dim=dim, device=device))
+            made = []
+            for steps in [(True, True)] if self._search_cores() == 1 else [(True, False), (False, True)]:
+                asked = search_simd.Asked()
+                asked.pair_count, asked.pairs, asked.pair_poses = self.pair_count, self.pairs, self.pair_poses
+                asked.tolerances, (asked.refreshes, asked.searches) = self._tolerances, steps
+                inputs = [asked, models, states, objects, self.work.counter, self._slabs, found, hits]
+                inputs += [self.distances, self._memory]
+                made.append(launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device))
             return made
         start = {**threads, "dim": max(room, len(self.work.flag))}
         inputs = [length, ROUGH_LEAST, self._tolerances, *shared, found, hits, self.work]

@@ -227,22 +227,14 @@ class Query(QueryReadout):
     def _make_search(self, within, hits, mode, output, launch) -> list:
         """Make the launches that bring relative poses and traverse all pairs, see `Commands.find`."""
         pools, room = self.batch.pools, len(self.pairs)
-        self.work.warps = self._warp_count() if self.uses_warps() else 0
-        alone = not self.uses_warps() and self._traversal_cores() == 1
-        made = []
-        if not alone:
-            inputs = [output, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
-            dim = max(room, len(self.work.flag))
-            # A warp a block: few pairs lie on as many multiprocessors.
-            kernel = relative_pose.relative_poses(len(within) > 0)
-            made.append(launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device))
         if not self.uses_warps():
-            started = relative_pose.Started()
-            started.pair_count, started.pair_poses, started.within = self.pair_count, self.pair_poses, within
-            if alone:
-                started.pairs = self.pairs
-            inputs = [output, *pools, started, self._regime.plain_tests, self.slab_memory, hits, self.work]
-            return [*made, launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device)]
+            return self._make_threads(within, hits, mode, output, launch)
+        self.work.warps = self._warp_count()
+        inputs = [output, *pools, self.pair_count, self.pairs, within, self.pair_poses, hits, self.work]
+        dim = max(room, len(self.work.flag))
+        # A warp a block: few pairs lie on as many multiprocessors.
+        kernel = relative_pose.relative_poses(len(within) > 0)
+        first = launch(kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE, device=self.device)
         inputs = [output, *pools[:2], self.pair_count, self.pair_poses]
         traversal = launch(
             dual_tree.warp_traversal(mode, output == int(face_pairs.OUTPUT_ANY)),
@@ -251,7 +243,20 @@ class Query(QueryReadout):
             block_dim=WARP_SIZE,
             device=self.device,
         )
-        return [*made, traversal]
+        return [first, traversal]
+
+    def _make_threads(self, within, hits, mode, output, launch) -> list:
+        """Make the launch in which a thread starts all pairs and traverses them, or one for each of the two."""
+        made = []
+        for starts, only in [(True, False)] if self._traversal_cores() == 1 else [(True, True), (False, False)]:
+            started = relative_pose.Started()
+            started.pair_count, started.pair_poses, started.within = self.pair_count, self.pair_poses, within
+            started.only = only
+            if starts:
+                started.pairs = self.pairs
+            inputs = [output, *self.batch.pools, started, self._regime.plain_tests, self.slab_memory, hits, self.work]
+            made.append(launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device))
+        return made
 
     def _warp_count(self) -> int:
         """Return the warps of a launch: more than units, where these are few, so that some wait for donations."""
@@ -317,10 +322,10 @@ class Query(QueryReadout):
         modes = [mode, *([within] if with_distances else [])]
         if regime.uses_warps(device):
             found: list = [dual_tree.warp_traversal(mode, mode == within or output == "any") for mode in modes]
+            poses = [relative_pose.relative_poses(mode in (within, int(face_pairs.GAP))) for mode in modes]
             passes = [(kernel, block) for kernel, _, block in reversed(_passes(precision, with_gap))]
         else:
-            found, passes = [simd.thread_traversal(mode) for mode in modes], []
-        poses = [relative_pose.relative_poses(mode in (within, int(face_pairs.GAP))) for mode in modes]
+            found, passes, poses = [simd.thread_traversal(mode) for mode in modes], [], []
         further = [(make_slab_kernel, 256)] if regime.uses_warps(device) and regime.slabs else []
         if regime.packs(device):
             further += [(pack_pair_kernel, PACK_DIM), *(first_sort(device) if output == "faces" else [])]
