@@ -108,7 +108,7 @@ class Asked:
     pair_poses: wp.array(dtype=PairPose)  # shape [pair]
     tolerances: Tolerances  # when they are near enough
     refreshes: wp.bool  # whether a thread that is still alone makes slabs, see `refresh_slabs`
-    searches: wp.bool
+    searches: wp.bool  # whether it, or each of several, then takes pairs
 
 
 @wp.func

@@ -244,7 +244,7 @@ def thread_traversal(mode: int):
         hits_inout: Hits,
         work_inout: Work,
     ):
-        """Take one object pair after the other and traverse it depth first; CPU only, a thread a core."""
+        """Start all object pairs, by one thread; take one after the other and traverse it depth first. CPU only."""
         start_pairs(output, models, states, objects, started, hits_inout, work_inout)
         if started.only:
             return
@@ -262,9 +262,8 @@ def thread_traversal(mode: int):
             pose = pair_poses[p]
             stack[0] = first_item(states, pose)
             slabs = descent.thread < memory.shape[0] and wp.static(mode != int(WITHIN)) and pose.error < wp.inf
-            descent = start_pair(
-                output, wp.where(slabs, wp.int64(plain_tests), NEVER), count_repeats(p, pair_poses), descent
-            )
+            plain = wp.where(slabs, wp.int64(plain_tests), NEVER)
+            descent = start_pair(output, plain, count_repeats(p, pair_poses), descent)
             hit_count, near_count, tests = wp.int64(0), wp.int64(0), long_counts()
             while descent.top > 0 or descent.deep > 0:
                 descent, waiting, compared = advance(

@@ -220,6 +220,58 @@ def test_points_are_as_many_as_asked_for(device, most):
     assert (1 - normals @ normals.T + 2 * np.eye(len(normals))).min() > 0.02
 
 
+def choose_plainly(x, normal, depth, shell, along, most):
+    """Return which candidates stand for a pair, by the distance of each from every segment, each time: an oracle."""
+    deepest, lowest = depth.max(), -shell
+    taken, size, least, floor = [], 0.0, 0.0, lowest
+
+    def find_farthest():
+        place, far = np.hstack([x, size * normal]), np.full(len(x), np.inf)
+        for end, b in enumerate(place[taken]):
+            for a in place[taken[: end + 1]] if end < 8 else [b]:
+                t = np.clip((place - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0, 1)
+                far = np.minimum(far, ((place - a - t[:, None] * (b - a)) ** 2).sum(1))
+        if size:
+            far *= 1 + 2**-5 * ((x - x[taken[0]]) @ along) / size
+        far[depth < floor] = -1
+        return far.argmax(), far.max()
+
+    best = np.where(depth >= 0.5 * (deepest + shell) - shell, x @ along, -np.inf).argmax()
+    while True:
+        taken.append(best)
+        best, farthest = find_farthest()
+        if len(taken) == 1:
+            size, least = np.sqrt(farthest), 2**-9 * farthest
+            floor = max((min(deepest, 0.0) if shell else lowest) - 2**-9 * size, lowest)
+            best, farthest = find_farthest() if floor > lowest else (best, farthest)
+        if farthest <= least and floor > lowest:
+            floor = lowest
+            best, farthest = find_farthest()
+        if farthest <= least or len(taken) == most - 1:
+            deep = max(0.0 - shell, depth[taken].max())
+            return [*taken, depth.argmax()] if 0.9 * (deepest + shell) > deep + shell else taken
+
+
+@pytest.mark.parametrize("most", [8, 32])
+@pytest.mark.parametrize("gap", [None, 0.1])
+def test_points_are_those_of_a_plain_choice(device, gap, most):
+    torus, counts = model_of(trimesh.creation.torus(0.5, 0.2, 24, 12)), []
+    for k, height in enumerate((0.1, 0.2, 0.33)):
+        shifts = (0, 0, 0), (0.3, 0.1, height)
+        placed = [(torus, (*shift, *about((1, 2, k), 0.5 + j + k))) for j, shift in enumerate(shifts)]
+        query, result = ask(device, *placed, gap=gap, points=most)
+        count, curves, along = query.start.numpy()[1], query.curves, [0.6134, 0.5327, 0.5831]
+        depth = curves.depth.numpy()[:count]
+        i = np.nonzero(~np.isnan(depth))
+        x, normal = curves.point.numpy()[:count][i], curves.normal.numpy()[:count][i[0]]
+        along = quaternion_matrix(placed[0][1][3:]) @ along
+        taken = choose_plainly(x, normal, depth[i], gap or 0.0, along, most)
+        expected = x[taken][np.argsort(x[taken] @ along)]
+        np.testing.assert_array_equal(result.points["point"], expected)
+        counts.append(len(taken))
+    assert max(counts) == most or (gap is None and max(counts) > most / 4), counts
+
+
 def test_numbers_of_points_that_are_none_are_refused(device):
     for points in (0, 65, 2.5, "8"):
         with pytest.raises(ValueError, match="points"):

@@ -11,7 +11,7 @@ from helpers.scenes import add_objects
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.checks.cpu_threads import launch_on_cores
+from warp_abtree.checks.cpu_threads import cores_for, launch_on_cores
 from warp_abtree.kernels.traversal.warp_stack import take_slots
 
 MODELS = ("torus", "small ball", "box", "crumbs", "soup", "twins")
@@ -106,8 +106,9 @@ def count_item_kernel(count: int, taken: wp.array[int], seen: wp.array[int]):
 def test_threads_take_every_item_once_and_raise_what_fails():
     for threads, count in ((1, 17), (2, 1), (3, 1000), (7, 16), (2, 100)):
         seen, taken = (wp.zeros(length, dtype=int, device="cpu") for length in (count, 1))
-        launch_on_cores(partial(wp.launch, count_item_kernel, 1, [count, taken, seen], device="cpu"), count, threads)
+        inputs = [count, taken, seen]
+        launch_on_cores(partial(wp.launch, count_item_kernel, 1, inputs, device="cpu"), cores_for(count, 1, threads))
         # Each thread that began before the items were gone has found that none is left.
         assert (seen.numpy() == 1).all() and 1 <= taken.numpy()[0] - count <= min(threads, count)
     with pytest.raises(Exception, match="'seen'"):
-        launch_on_cores(partial(wp.launch, count_item_kernel, 1, [100, taken, 3.5], device="cpu"), 100, 2)
+        launch_on_cores(partial(wp.launch, count_item_kernel, 1, [100, taken, 3.5], device="cpu"), 2)

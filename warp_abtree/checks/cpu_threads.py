@@ -5,6 +5,8 @@ import os
 import threading
 from concurrent.futures import ThreadPoolExecutor, wait
 
+from warp_abtree.checks.regime import current_regime
+
 
 def core_count() -> int:
     """Return the cores that this process may use."""
@@ -12,6 +14,17 @@ def core_count() -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on every system
         return os.cpu_count() or 1
+
+
+def cores_for(count: int, least: int, rooms: int) -> int:
+    """Return how many cores share a launch.
+
+    Args:
+        count: Items that they share.
+        least: Items that make a further core worth its while.
+        rooms: Cores that there is memory for.
+    """
+    return max(1, min(current_regime().cpu_threads or rooms, rooms, count // least))
 
 
 @functools.cache
@@ -66,17 +79,16 @@ class _Share:
             raise interruption
 
 
-def launch_on_cores(launch, count, cores, least=1):
-    """Launch a kernel on several threads of the CPU, which share a number of items; waits for them.
+def launch_on_cores(launch, cores):
+    """Launch a kernel on several threads of the CPU, which share its items; waits for them.
 
     Each thread of the kernel takes one item after the other until there are none. It writes what belongs to its item
     alone, or with true atomics: Warp's own are none on the CPU.
 
     Args:
         launch: Launches a kernel that is loaded, one thread of it.
-        least: Items that make a further core worth its while.
+        cores: How many, the calling one too.
     """
-    cores = max(1, min(cores, count // least))
     if cores == 1:
         launch()
         return

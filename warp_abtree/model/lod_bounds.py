@@ -75,7 +75,7 @@ class LodBounds:
         def work():
             launch(merge_window.work_windows_kernel, *inputs, self._bound_sq)
 
-        launch_on_cores(work, cores, cores)
+        launch_on_cores(work, cores)
         if counter[merge_window.MERGES] == 0 and self.done < self._known:
             self._advance_alone(self.done + 1)
 

@@ -50,7 +50,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, flag, to_numpy
-from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
+from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd, slabs
@@ -273,7 +273,7 @@ class DistanceQuery(Query):
         *first, last = self._commands.find("distances", given, self._make_distances)
         for command in first:
             command.launch()
-        launch_on_cores(last.launch, room, cores)
+        launch_on_cores(last.launch, cores)
         # On the CPU what is launched is done.
         if self.device.is_cuda or self._views.any_hit.any():
             self._launch_all("crossings", self._make_crossings)
@@ -288,8 +288,7 @@ class DistanceQuery(Query):
         """Return how many cores share the search; a graph of the CPU has one."""
         if self.uses_warps() or self.device.is_capturing:
             return 1
-        rooms = len(self._memory)
-        return max(1, min(current_regime().cpu_threads or rooms, rooms, len(self.pairs) // PAIRS_A_CORE))
+        return cores_for(len(self.pairs), PAIRS_A_CORE, len(self._memory))
 
     def _make_crossings(self, launch) -> list:
         """Make the launches that find points of pairs that intersect, see `Commands.find`."""

@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device
-from warp_abtree.checks.cpu_threads import launch_on_cores
+from warp_abtree.checks.cpu_threads import cores_for, launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels import relative_pose
@@ -205,7 +205,7 @@ class Query(QueryReadout):
             return
         first, traversal, *passes = self._commands.find(name, given, make)
         first.launch()
-        launch_on_cores(traversal.launch, len(self.pairs), cores)
+        launch_on_cores(traversal.launch, cores)
         for command in passes:
             command.launch()
 
@@ -213,16 +213,10 @@ class Query(QueryReadout):
         """Return how many cores share the traversal; a graph of the CPU has one."""
         if self.uses_warps() or self.device.is_capturing:
             return 1
+        # A further core costs some 50 us: many pairs of "any"; else a pair in contact takes the root of its faces.
+        least = 32 if self.output == "any" else max(1, int(50 / math.sqrt(self.batch.mean_faces)))
         # Each has memory for slabs: tests do not depend on which thread takes a pair.
-        rooms = len(self.slab_memory)
-        return max(1, min(current_regime().cpu_threads or rooms, rooms, len(self.pairs) // self._least_pairs()))
-
-    def _least_pairs(self) -> int:
-        """Return the pairs that make a further core worth its while, which costs some 50 us.
-
-        Many of "any"; else about the root of the faces is the time that a pair in contact takes.
-        """
-        return 32 if self.output == "any" else max(1, int(50 / math.sqrt(self.batch.mean_faces)))
+        return cores_for(len(self.pairs), least, len(self.slab_memory))
 
     def _make_search(self, within, hits, mode, output, launch) -> list:
         """Make the launches that bring relative poses and traverse all pairs, see `Commands.find`."""

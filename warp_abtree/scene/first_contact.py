@@ -23,7 +23,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy
-from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
+from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import ObjectPool
 from warp_abtree.kernels.motion import face_pair, path, search, start, swept_boxes
@@ -219,9 +219,7 @@ class FirstContactQuery(Query):
         if self.device.is_capturing or self.uses_warps():
             launch()
         else:
-            rooms = len(self._memory)
-            cores = min(current_regime().cpu_threads or rooms, rooms)
-            launch_on_cores(launch, len(self.pairs), cores, PAIRS_A_CORE)
+            launch_on_cores(launch, cores_for(len(self.pairs), PAIRS_A_CORE, len(self._memory)))
 
     def _find_launches(self, name, make) -> list:
         return self._commands.find_callables(name, self.guard.given(), self.device, make)
