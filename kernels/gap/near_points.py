@@ -22,7 +22,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 FACING = wp.constant(wp.float64(0.5))
 # Part of the distance that the gap along a face's normal differs by, where that is the direction of the distance.
 ALIKE = wp.constant(wp.float64(2.0**-10))
-# Cosine between a face's normal and the direction of the distance from which on they may be alike: ALIKE asks for more.
+# Cosine between a face's normal and the direction of the distance under which the gap differs by more than `ALIKE`.
 ALONG = wp.constant(wp.float64(0.998))
 # Part of a squared distance under which another face is nearer.
 NEARER = wp.constant(wp.float64(0.998))
@@ -117,7 +117,7 @@ def is_undecided(contacts: Contacts, curves: Curves, i: wp.int32, end: wp.int32)
     return not have_crossed(contacts, i) and curves.loop[i] == UNDECIDED
 
 
-@wp.kernel(cuda_max_registers=128)
+@wp.kernel
 def keep_nearest_kernel(
     models: ModelPool,
     states: StatePool,
@@ -208,8 +208,9 @@ def find_near_candidate_kernel(
 ):
     """Find the candidate of one contact of faces that are apart a thread: their nearest points; or list it.
 
-    Where both faces look at one another and the distance may be along the normal of either, it is listed. Of all gaps
-    that a direction leaves the distance is the widest, so it is so only where its direction is about that normal.
+    Where both faces look at one another and the distance may be along the normal of either, it is listed. A gap along
+    a normal is that of two points of faces, which are convex: points farther apart than the nearest by a fraction e at
+    most are so in a direction whose cosine with that of the distance is at least 1 / (1 + e).
     """
     i = wp.tid()
     listed = bool(False)

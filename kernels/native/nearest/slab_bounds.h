@@ -49,7 +49,7 @@ struct SlabBounds {
     }
     static lanes square(const lanes& gap) { return gap > 0.0f ? gap * gap : lanes{}; }
 
-    // Along the direction from A to B by boxes and slabs, across it by the balls about boxes.
+    // Along the direction from A to B by boxes and slabs, across it by balls about the middles of boxes.
     lanes bound_way(const lanes (&slab)[8], const lanes (&sum)[3], const lanes (&size)[3],
                     const lanes (&apart)[3]) const {
         const lanes normal[3] = {slab[0], slab[1], slab[2]};
