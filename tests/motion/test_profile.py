@@ -182,12 +182,13 @@ def thread(rng, radius, depth, pitch, length, more=0.0, segments=24, rings=(0, 0
     return ab.Model.from_arrays(points, rng.permutation(faces), base_faces=4)
 
 
-def nested_threads(rng, gap, length, burr=0.0, count=8):
+def nested_threads(rng, gap, length, burr=0.0, count=8, fraction=1.0):
     """Return cases of a nut turned on its bolt by up to 170 degrees, a gap in radius apart, either of which moves.
 
     Args:
         length: Of the nut, in pitches.
         burr: By how much a corner of the bolt's is outwards, up to 120 degrees ahead of the nut.
+        fraction: Of the faces, at which LOD they are.
     """
     cases, ends = [], []
     for k in range(count):
@@ -202,7 +203,10 @@ def nested_threads(rng, gap, length, burr=0.0, count=8):
             + [*(frame * Rotation.from_euler("z", a)).as_quat()]
             for a in (start, start + turn)
         ]
-        both = [[bolt, bolt.lod_max, whole], [nut, nut.lod_max, np.array(moves[0])]]
+        both = [
+            [bolt, bolt.lod_for(fraction=fraction), whole],
+            [nut, nut.lod_for(fraction=fraction), np.array(moves[0])],
+        ]
         last = [whole, np.array(moves[1])]
         order = slice(None, None, 1 if k % 2 else -1)
         cases.append([x for rows in both[order] for x in rows])
@@ -224,9 +228,10 @@ def test_nested_threads_need_no_search(device, warps):
     assert (result.triangle_tests == still.triangle_tests).all()
 
 
-def test_nested_threads_that_meet_are_never_late(device):
+@pytest.mark.parametrize("fraction", [1.0, 0.9])
+def test_nested_threads_that_meet_are_never_late(device, fraction):
     rng = np.random.default_rng(4)
-    cases, ends = nested_threads(rng, 0.05, 1, burr=0.1, count=16)
+    cases, ends = nested_threads(rng, 0.05, 1, burr=0.1, count=16, fraction=fraction)
     result = find(device, cases, ends)
     assert not result.undecided.any() and (result.time > 0).all() and 3 < result.clear.sum() < 13
     starts = np.array([pose for case in cases for pose in (case[2], case[5])])
