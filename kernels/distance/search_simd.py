@@ -155,8 +155,8 @@ def search_thread_kernel(
     models: ModelPool,
     states: StatePool,
     objects: ObjectPool,
-    counter: wp.array(dtype=wp.int32),
-    slabs: Slabs,
+    counter_inout: wp.array(dtype=wp.int32),
+    slabs_inout: Slabs,
     found_inout: Found,
     hits_inout: Hits,
     distances_out: Distances,
@@ -171,19 +171,19 @@ def search_thread_kernel(
     pairs, poses = asked.pairs, asked.pair_poses
     count = wp.min(asked.pair_count[0], poses.shape[0])
     if asked.refreshes:
-        for i in range(counter.shape[0]):
-            counter[i] = 0
+        for i in range(counter_inout.shape[0]):
+            counter_inout[i] = 0
         for i in range(count):
-            refresh_slabs(i, models, states, objects, pairs, slabs)
+            refresh_slabs(i, models, states, objects, pairs, slabs_inout)
     if not asked.searches:
         return
-    thread = take_thread(counter)
+    thread = take_thread(counter_inout)
     if thread >= memory_out.shape[0]:
         return
-    p = take_unit(counter)
+    p = take_unit(counter_inout)
     while p < count:
         start_pair(p, models, states, objects, pairs, poses, found_inout)
         if hits_inout.any_hit[p] == 0:
-            search_pair(p, asked, models, states, slabs, thread, found_inout, hits_inout, memory_out)
+            search_pair(p, asked, models, states, slabs_inout, thread, found_inout, hits_inout, memory_out)
         report_pair(p, asked.tolerances, models, states, objects, pairs, poses, found_inout, hits_inout, distances_out)
-        p = take_unit(counter)
+        p = take_unit(counter_inout)

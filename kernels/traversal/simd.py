@@ -238,18 +238,18 @@ def thread_traversal(mode: int):
         models: ModelPool,
         states: StatePool,
         objects: ObjectPool,
-        started: Started,
         plain_tests: wp.int32,
-        memory: wp.array2d(dtype=wp.float32),
+        started_inout: Started,
+        memory_inout: wp.array2d(dtype=wp.float32),
         hits_inout: Hits,
         work_inout: Work,
     ):
         """Start all object pairs, by one thread; take one after the other and traverse it depth first. CPU only."""
-        start_pairs(output, models, states, objects, started, hits_inout, work_inout)
-        if started.only:
+        start_pairs(output, models, states, objects, started_inout, hits_inout, work_inout)
+        if started_inout.only:
             return
-        pair_poses = started.pair_poses
-        count = wp.min(started.pair_count[0], pair_poses.shape[0])
+        pair_poses = started_inout.pair_poses
+        count = wp.min(started_inout.pair_count[0], pair_poses.shape[0])
         stack = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
         below = wp.zeros(shape=CPU_STACK_LENGTH, dtype=wp.int64)
         faces = wp.zeros(shape=WAITING_LENGTH, dtype=wp.int64)
@@ -261,13 +261,13 @@ def thread_traversal(mode: int):
         while p < count:
             pose = pair_poses[p]
             stack[0] = first_item(states, pose)
-            slabs = descent.thread < memory.shape[0] and wp.static(mode != int(WITHIN)) and pose.error < wp.inf
+            slabs = descent.thread < memory_inout.shape[0] and wp.static(mode != int(WITHIN)) and pose.error < wp.inf
             plain = wp.where(slabs, wp.int64(plain_tests), NEVER)
             descent = start_pair(output, plain, count_repeats(p, pair_poses), descent)
             hit_count, near_count, tests = wp.int64(0), wp.int64(0), long_counts()
             while descent.top > 0 or descent.deep > 0:
                 descent, waiting, compared = advance(
-                    models, states, pose, hit_count, tests[0], descent, stack, below, memory, faces
+                    models, states, pose, hit_count, tests[0], descent, stack, below, memory_inout, faces
                 )
                 met, clear, stages = wp.int32(0), wp.int32(0), long_counts()
                 if wp.static(mode == int(GAP)):

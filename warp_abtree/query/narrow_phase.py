@@ -248,7 +248,7 @@ class Query(QueryReadout):
             started.only = only
             if starts:
                 started.pairs = self.pairs
-            inputs = [output, *self.batch.pools, started, self._regime.plain_tests, self.slab_memory, hits, self.work]
+            inputs = [output, *self.batch.pools, self._regime.plain_tests, started, self.slab_memory, hits, self.work]
             made.append(launch(simd.thread_traversal(mode), dim=1, inputs=inputs, device=self.device))
         return made
 
