@@ -64,6 +64,12 @@ def are_across(contacts: Contacts, normal: wp.array(dtype=wp.vec3d), i: wp.int32
     return opposed and wp.dot(between, normal[i]) > zero and wp.dot(between, normal[j]) < zero
 
 
+@wp.func
+def pair_key(pair: wp.int32, face: wp.int32):
+    """Return the key that sorts contacts by their pairs, and those by faces of B."""
+    return (wp.int64(pair) << wp.int64(31)) | wp.int64(face)
+
+
 @wp.kernel
 def begin_loop_kernel(
     start: wp.array(dtype=wp.int32),
@@ -81,7 +87,7 @@ def begin_loop_kernel(
     key_out[i] = LAST_KEY
     if i < start[start.shape[0] - 1]:
         curves_out.parent[i] = i
-        key_out[i] = (wp.int64(faces[i][0]) << wp.int64(31)) | wp.int64(faces[i][2])
+        key_out[i] = pair_key(faces[i][0], faces[i][2])
 
 
 @wp.kernel

@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
 from warp_abtree.kernels.contact.contact import Contacts, Deferred, have_crossed, load_corners
+from warp_abtree.kernels.contact.loops import pair_key
 from warp_abtree.kernels.contact.manifold import NO_DEPTH, NO_POINT, Curves, measure_column, write_candidates
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.small_trees.tiles import rank_flag
@@ -38,7 +39,7 @@ class Rows:
     start: wp.array(dtype=wp.int32)  # where those of each pair start, shape [pair + 1]
     faces: wp.array(dtype=wp.vec3i)  # pair and faces, in the order of the first object's faces, shape [contact]
     order: wp.array(dtype=wp.int32)  # contacts in the order of the second object's faces, shape [contact]
-    key: wp.array(dtype=wp.int64)  # pair and face of each in that order, shape [contact]
+    key: wp.array(dtype=wp.int64)  # `pair_key` of each in that order, shape [contact]
 
 
 @wp.struct
@@ -49,11 +50,6 @@ class NearRow:
     second: wp.vec3d  # of the second's
     square: wp.float64  # of their distance, under which another face is nearer
     swapped: wp.int32  # 1 where the pair names B first
-
-
-@wp.func
-def pair_key(pair: wp.int32, face: wp.int32):
-    return (wp.int64(pair) << wp.int64(31)) | wp.int64(face)
 
 
 @wp.func
