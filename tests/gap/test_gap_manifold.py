@@ -137,6 +137,19 @@ def test_same_bits_on_every_path(device, gap):
     assert (points["depth"] < 0).any() == (gap is not None) and (points["depth"] > 0).any()
 
 
+@pytest.mark.parametrize(
+    ("tilt", "serves"), [(0.02, True), (0.043, True), (0.045, False), (0.06, False), (0.07, False)]
+)
+def test_normals_serve_where_the_distance_is_nearly_along_them(device, tilt, serves):
+    """Edges cross, and both faces fall away from them: the gap along either normal is the distance over a cosine."""
+    height, rise = 0.1, np.tan(tilt)
+    lower = ab.Model.from_arrays([[0, -1, 0], [0, 1, 0], [-1, 0, -rise]], [[0, 1, 2]], base_faces=1)
+    upper = ab.Model.from_arrays([[-1, 0, height], [1, 0, height], [0, 1, height + rise]], [[1, 0, 2]], base_faces=1)
+    points = ask(device, (lower, STILL), (upper, STILL), gap=0.2)[1].points
+    assert points["depth"].max() == pytest.approx(-height / (np.cos(tilt) if serves else 1), rel=1e-9)
+    assert points["normal"][0] @ UP == pytest.approx(np.cos(tilt) if serves else 1, abs=1e-9)
+
+
 @pytest.mark.parametrize("named", [(0, 1), (1, 0)])
 def test_edges_have_points_only_where_no_other_face_is_nearer(device, named):
     """Every contact of faces that are apart, by NumPy: its nearest points against all faces in contact with its own."""
