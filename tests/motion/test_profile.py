@@ -182,27 +182,30 @@ def thread(rng, radius, depth, pitch, length, more=0.0, segments=24, rings=(0, 0
     return ab.Model.from_arrays(points, rng.permutation(faces), base_faces=4)
 
 
-def nested_threads(rng, gap, length, burr=0.0, count=8):
-    """Return cases of a nut turned on its bolt by up to 170 degrees, a gap in radius apart, either of which moves.
+def nested_threads(rng, gap, length, burr=0.0, count=8, least=1, short_nut=True):
+    """Return cases of a nut and a bolt, a gap in radius apart, one of which is turned on the other by up to 170 degrees.
 
     Args:
-        length: Of the nut, in pitches.
-        burr: By how much a corner of the bolt's is outwards, up to 120 degrees ahead of the nut.
+        length: Of the shorter, in pitches.
+        burr: By how much a corner of the longer is towards the shorter, up to 120 degrees ahead of that.
+        least: Degrees of the turns.
+        short_nut: Whether the nut is the shorter, else the bolt.
     """
     cases, ends = [], []
+    radii, way = ((1.0, 1.0 + gap), burr) if short_nut else ((1.0 + gap, 1.0), -burr)
     for k in range(count):
         sign, pitch, depth = rng.choice([-1, 1]), rng.uniform(0.2, 0.4), rng.uniform(0.1, 0.3)
         corner = 4 * (24 * (3 + length) + rng.integers(1, 9)) + rng.integers(4)
-        bolt = thread(rng, 1.0, depth, sign * pitch, 10, burr * (np.arange(964) == corner))
-        nut = thread(rng, 1.0 + gap, depth, sign * pitch, length)
-        whole, turn = random_poses(rng, 1, 1.0)[0], np.deg2rad(rng.uniform(1, 170))
+        long = thread(rng, radii[0], depth, sign * pitch, 10, way * (np.arange(964) == corner))
+        short = thread(rng, radii[1], depth, sign * pitch, length)
+        whole, turn = random_poses(rng, 1, 1.0)[0], np.deg2rad(rng.uniform(least, 170))
         frame, start = Rotation.from_quat(whole[3:]), 6 * np.pi + (rng.uniform(0, 2 * np.pi) if not burr else 0)
         moves = [
             [*(frame.apply([0, 0, sign * pitch * a / (2 * np.pi)]) + whole[:3])]
             + [*(frame * Rotation.from_euler("z", a)).as_quat()]
             for a in (start, start + turn)
         ]
-        both = [[bolt, bolt.lod_max, whole], [nut, nut.lod_max, np.array(moves[0])]]
+        both = [[long, long.lod_max, whole], [short, short.lod_max, np.array(moves[0])]]
         last = [whole, np.array(moves[1])]
         order = slice(None, None, 1 if k % 2 else -1)
         cases.append([x for rows in both[order] for x in rows])
@@ -235,3 +238,12 @@ def test_nested_threads_that_meet_are_never_late(device):
         times = np.repeat(part * result.time, 2)
         scene.set_poses(np.array([pose_between(*row) for row in zip(starts, ends, times)]))
         assert not scene.intersect(pairs).any.any(), part
+
+
+@pytest.mark.parametrize("short_nut", [True, False])
+def test_burrs_of_either_are_met(device, short_nut):
+    """Half of them are A's, where a cell has plain faces too: no nut is over those of a bolt alone, nor under."""
+    for burr in (0.0, 0.2):
+        cases, ends = nested_threads(np.random.default_rng(5), 0.08, 4, burr, least=150, short_nut=short_nut)
+        result = find(device, cases, ends)
+        assert (result.clear == (burr == 0)).all() and (result.time > 0).all() and not result.undecided.any()
