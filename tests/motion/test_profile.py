@@ -17,7 +17,6 @@ from warp_abtree.kernels.motion.path import Paths, bound_motion, pair_skew, prep
 from warp_abtree.kernels.motion.profile import (
     CELLS,
     box_heights,
-    cells_of,
     frame_of_a,
     frame_of_b,
     image_face,
@@ -60,14 +59,13 @@ def profile_kernel(
     for k in range(CELLS):
         out[i, k] = wp.float64(wp.inf)
         out[i, CELLS + k] = wp.float64(0.0)
-    for k in range(3):
-        cell, last = cells_of(image, k)
-        while cell <= last:
-            radii = radii_of(frame, image, k, cell)
-            j = cell & (CELLS - 1)
-            out[i, j] = wp.min(out[i, j], radii[0])
-            out[i, CELLS + j] = wp.max(out[i, CELLS + j], radii[1])
-            cell += 1
+    cell = image.first
+    while cell <= image.last:
+        radii = radii_of(image, cell)
+        j = cell & (CELLS - 1)
+        out[i, j] = wp.min(out[i, j], wp.float64(wp.float32(radii[0])))
+        out[i, CELLS + j] = wp.max(out[i, CELLS + j], wp.float64(wp.float32(radii[1])))
+        cell += 1
     out[i, 2 * CELLS] = wp.where(image.reached, wp.float64(1.0), wp.float64(0.0))
 
 
@@ -146,6 +144,21 @@ def test_points_are_in_the_profiles_of_their_faces(device, size, near, slack):
         check_inside(found[reached], moved[reached], pitch[reached])
 
 
+@pytest.mark.skipif(not HAS_LONG, reason="no floating-point numbers longer than float64")
+def test_cells_are_wider_by_what_angles_err_by(device):
+    rng = np.random.default_rng(6)
+    turn, rise = rng.uniform(0.5, 2.5, COUNT), rng.uniform(0.2, 2, COUNT) * rng.choice([-1, 1], COUNT)
+    faces, pitch = random_faces(rng, 1e-8, False), np.repeat(rise / turn * 2 * np.pi, 2)
+    x, y, z = faces.mean(1).T
+    # Near the border of a cell.
+    u = z / pitch - np.arctan2(-x, y) / (2 * np.pi)
+    faces[..., 2] += (((rng.uniform(-2e-6, 2e-6, 2 * COUNT) - u) % (1 / N)) * pitch)[:, None]
+    found = profiles(rng, device, faces, turn, rise)
+    reached = found[:, -1] != 0
+    assert reached.mean() > 0.9
+    check_inside(found[reached], points_of(rng, faces)[reached], pitch[reached])
+
+
 def test_faces_that_the_other_reaches_at_last_count(device):
     """They touch from above or below at one end of the motion, off the screw by twice the slack."""
     rng = np.random.default_rng(2)
@@ -183,7 +196,7 @@ def thread(rng, radius, depth, pitch, length, more=0.0, segments=24, rings=(0, 0
 
 
 def nested_threads(rng, gap, length, burr=0.0, count=8, least=1, short_nut=True):
-    """Return cases of a nut and a bolt, a gap in radius apart, one of which is turned on the other by up to 170 degrees.
+    """Return cases of nuts and bolts, a gap in radius apart, one turned on the other by up to 170 degrees.
 
     Args:
         length: Of the shorter, in pitches.
