@@ -11,9 +11,10 @@ cells of u, and one pass over those of B compares. Faces that the other's height
    is not, any u is taken, and q is computed.
 2. What is linear between the corners differs from a function whose second derivatives are at most M by at most
    M D^2 / 6, for the same reason. M is 1 / q for r, which is convex, and 1 / q^2 for a. So over the triangle of its
-   corners' r and u, r is at most D^2 / (6 q) < 0.172 D^2 / r lower, and a off by D^2 / (6 q^2) < 0.177 (D / r)^2.
-3. The first corner's angle is a polynomial that errs by less than 2^-16, and the others' from there x - x^3 / 3 +
-   x^5 / 5 for the tangent x < 1.05 D / q, so this errs by x^7 / 7 < 0.0026 (D / r)^2: `BEND` has room for it.
+   corners' r and u, with x = (D / r)^2 < 0.16, r is at most D^2 / (6 q) < (1 + x / 5) D^2 / (6 r) lower, and a off by
+   D^2 / (6 q^2) < (1 + 0.36 x) x / 6.
+3. The first corner's angle is a polynomial that errs by less than 2^-16, and the others' from there t - t^3 / 3 +
+   t^5 / 5 for the tangent t < 1.05 D / q, so this errs by t^7 / 7 < 0.016 x^2: with (1 + x / 2) x / 6 there is room.
 4. Points off the screw by e have r and z off by e, a by asin(e / q) <= 1.1 e / r, where r > 2.5 (D + e). Half of e is
    for rounding (`screw`).
 5. The triangle lies in a strip between two parallel lines: along its edge of the widest u, through the corners that are
@@ -44,7 +45,7 @@ LENGTH_MAX = wp.constant(wp.float64(64.0))
 NEAR_AXIS = wp.constant(wp.float64(0.125))
 REVOLUTION, HALF = wp.constant(wp.float64(2.0 * math.pi)), wp.constant(wp.float64(0.5))
 QUARTER, PER_RADIAN = wp.constant(wp.float64(0.5 * math.pi)), wp.constant(wp.float64(0.5 / math.pi))
-NARROW, BEND = wp.constant(wp.float64(2.5)), wp.constant(wp.float64(0.18))
+NARROW, SIXTH = wp.constant(wp.float64(2.5)), wp.constant(wp.float64(1.0 / 6.0))
 THIRD, FIFTH = wp.constant(wp.float64(1.0 / 3.0)), wp.constant(wp.float64(0.2))
 # Abramowitz and Stegun 4.4.47: factors of x, x^3 ... x^9 of the arc tangent of x from 0 to 1, and what it errs by.
 ARC_TANGENT = wp.constant(wp.types.vector(5, wp.float64)(0.999866, -0.3302995, 0.180141, -0.085133, 0.0208351))
@@ -212,7 +213,7 @@ def image_face(models: ModelPool, states: StatePool, frame: AxisFrame, at: wp.in
         image.least = wp.max((axis_distance(p, q, s) - off) * (one - SINGLE), zero)
         return image
     near = one / least
-    sag = BEND * square * near
+    sag = SIXTH * (one + HALF * square * near * near) * square * near
     image.least = wp.max((least - sag - off) * (one - SINGLE), zero)
     wide = ((sag + ASIN_SLOPE * off) * near + ANGLE_ERROR) * PER_RADIAN + off * wp.abs(frame.per_rise)
     angle = angle_near(p[0], p[1])
