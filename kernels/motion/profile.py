@@ -60,8 +60,7 @@ class AxisFrame:
     axis: wp.vec3d  # unit
     first: wp.vec3d  # unit, square to it
     second: wp.vec3d  # axis x first
-    rise: wp.float64  # h, signed
-    per_rise: wp.float64  # 1 / h
+    per_rise: wp.float64  # 1 / h, signed
     off: wp.float64  # that points are off the screw, and rounding
     lower: wp.float64  # heights that the other object reaches
     upper: wp.float64  # the same
@@ -322,8 +321,8 @@ def frame_of_a(motion: Motion, screw: ScrewFrame, b: wp.vec2d):
     frame.first = wp.normalize(wp.cross(frame.axis, wp.vec3d(x, wp.float64(1.0) - x, wp.float64(0.0))))
     frame.second = wp.cross(frame.axis, frame.first)
     # What turns seen from the other, B or A, turns that way: A's points rise against B's.
-    frame.rise = wp.where(screw.a_turns, -screw.rise, screw.rise) / screw.turn * REVOLUTION
-    frame.per_rise = wp.float64(1.0) / frame.rise
+    rise = wp.where(screw.a_turns, -screw.rise, screw.rise) / screw.turn * REVOLUTION
+    frame.per_rise = wp.float64(1.0) / rise
     frame.off = screw.off
     reach = wp.abs(screw.rise) + frame.off
     frame.lower = b[0] - reach
