@@ -17,7 +17,6 @@ from warp_abtree.kernels.motion.path import Paths, bound_motion, pair_skew, prep
 from warp_abtree.kernels.motion.profile import (
     CELLS,
     box_heights,
-    cells_of,
     frame_of_a,
     frame_of_b,
     image_face,
@@ -60,14 +59,13 @@ def profile_kernel(
     for k in range(CELLS):
         out[i, k] = wp.float64(wp.inf)
         out[i, CELLS + k] = wp.float64(0.0)
-    for k in range(3):
-        cell, last = cells_of(image, k)
-        while cell <= last:
-            radii = radii_of(frame, image, k, cell)
-            j = cell & (CELLS - 1)
-            out[i, j] = wp.min(out[i, j], radii[0])
-            out[i, CELLS + j] = wp.max(out[i, CELLS + j], radii[1])
-            cell += 1
+    cell = image.first
+    while cell <= image.last:
+        radii = radii_of(image, cell)
+        j = cell & (CELLS - 1)
+        out[i, j] = wp.min(out[i, j], wp.float64(wp.float32(radii[0])))
+        out[i, CELLS + j] = wp.max(out[i, CELLS + j], wp.float64(wp.float32(radii[1])))
+        cell += 1
     out[i, 2 * CELLS] = wp.where(image.reached, wp.float64(1.0), wp.float64(0.0))
 
 
@@ -146,6 +144,21 @@ def test_points_are_in_the_profiles_of_their_faces(device, size, near, slack):
         check_inside(found[reached], moved[reached], pitch[reached])
 
 
+@pytest.mark.skipif(not HAS_LONG, reason="no floating-point numbers longer than float64")
+def test_cells_are_wider_by_what_angles_err_by(device):
+    rng = np.random.default_rng(6)
+    turn, rise = rng.uniform(0.5, 2.5, COUNT), rng.uniform(0.2, 2, COUNT) * rng.choice([-1, 1], COUNT)
+    faces, pitch = random_faces(rng, 1e-8, False), np.repeat(rise / turn * 2 * np.pi, 2)
+    x, y, z = faces.mean(1).T
+    # Near the border of a cell.
+    u = z / pitch - np.arctan2(-x, y) / (2 * np.pi)
+    faces[..., 2] += (((rng.uniform(-2e-6, 2e-6, 2 * COUNT) - u) % (1 / N)) * pitch)[:, None]
+    found = profiles(rng, device, faces, turn, rise)
+    reached = found[:, -1] != 0
+    assert reached.mean() > 0.9
+    check_inside(found[reached], points_of(rng, faces)[reached], pitch[reached])
+
+
 def test_faces_that_the_other_reaches_at_last_count(device):
     """They touch from above or below at one end of the motion, off the screw by twice the slack."""
     rng = np.random.default_rng(2)
@@ -182,21 +195,24 @@ def thread(rng, radius, depth, pitch, length, more=0.0, segments=24, rings=(0, 0
     return ab.Model.from_arrays(points, rng.permutation(faces), base_faces=4)
 
 
-def nested_threads(rng, gap, length, burr=0.0, count=8, fraction=1.0):
-    """Return cases of a nut turned on its bolt by up to 170 degrees, a gap in radius apart, either of which moves.
+def nested_threads(rng, gap, length, burr=0.0, count=8, least=1, short_nut=True, fraction=1.0):
+    """Return cases of nuts and bolts, a gap in radius apart, one turned on the other by up to 170 degrees.
 
     Args:
-        length: Of the nut, in pitches.
-        burr: By how much a corner of the bolt's is outwards, up to 120 degrees ahead of the nut.
+        length: Of the shorter, in pitches.
+        burr: By how much a corner of the longer is towards the shorter, up to 120 degrees ahead of that.
+        least: Degrees of the turns.
+        short_nut: Whether the nut is the shorter, else the bolt.
         fraction: Of the faces, at which LOD they are.
     """
     cases, ends = [], []
+    radii, way = ((1.0, 1.0 + gap), burr) if short_nut else ((1.0 + gap, 1.0), -burr)
     for k in range(count):
         sign, pitch, depth = rng.choice([-1, 1]), rng.uniform(0.2, 0.4), rng.uniform(0.1, 0.3)
         corner = 4 * (24 * (3 + length) + rng.integers(1, 9)) + rng.integers(4)
-        bolt = thread(rng, 1.0, depth, sign * pitch, 10, burr * (np.arange(964) == corner))
-        nut = thread(rng, 1.0 + gap, depth, sign * pitch, length)
-        whole, turn = random_poses(rng, 1, 1.0)[0], np.deg2rad(rng.uniform(1, 170))
+        long = thread(rng, radii[0], depth, sign * pitch, 10, way * (np.arange(964) == corner))
+        short = thread(rng, radii[1], depth, sign * pitch, length)
+        whole, turn = random_poses(rng, 1, 1.0)[0], np.deg2rad(rng.uniform(least, 170))
         frame, start = Rotation.from_quat(whole[3:]), 6 * np.pi + (rng.uniform(0, 2 * np.pi) if not burr else 0)
         moves = [
             [*(frame.apply([0, 0, sign * pitch * a / (2 * np.pi)]) + whole[:3])]
@@ -204,8 +220,8 @@ def nested_threads(rng, gap, length, burr=0.0, count=8, fraction=1.0):
             for a in (start, start + turn)
         ]
         both = [
-            [bolt, bolt.lod_for(fraction=fraction), whole],
-            [nut, nut.lod_for(fraction=fraction), np.array(moves[0])],
+            [long, long.lod_for(fraction=fraction), whole],
+            [short, short.lod_for(fraction=fraction), np.array(moves[0])],
         ]
         last = [whole, np.array(moves[1])]
         order = slice(None, None, 1 if k % 2 else -1)
@@ -240,3 +256,12 @@ def test_nested_threads_that_meet_are_never_late(device, fraction):
         times = np.repeat(part * result.time, 2)
         scene.set_poses(np.array([pose_between(*row) for row in zip(starts, ends, times)]))
         assert not scene.intersect(pairs).any.any(), part
+
+
+@pytest.mark.parametrize("short_nut", [True, False])
+def test_burrs_of_either_are_met(device, short_nut):
+    """Half of them are A's, where a cell has plain faces too: no nut is over those of a bolt alone, nor under."""
+    for burr in (0.0, 0.2):
+        cases, ends = nested_threads(np.random.default_rng(5), 0.08, 4, burr, least=150, short_nut=short_nut)
+        result = find(device, cases, ends)
+        assert (result.clear == (burr == 0)).all() and (result.time > 0).all() and not result.undecided.any()
