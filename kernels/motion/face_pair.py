@@ -40,14 +40,29 @@ TIME_DOWN = wp.constant(wp.float64(1.0 - 2.0**-50))
 CLEAR, TOUCHES, UNDECIDED = wp.constant(0), wp.constant(1), wp.constant(2)
 # Of faces whose corners move straight: to be gone on with in double words.
 STALLED = wp.constant(3)
+# Not ended: apart until a time, and to be gone on with.
+GOES_ON = wp.constant(4)
+# Both normals, what joins the nearest points, and either way along the axes.
+DIRECTION_COUNT = wp.constant(3 + 2 * 17)
+# How far a pair of faces is advanced: by a step along normals if they do, by a step, or to its end.
+NORMALS, ONE_STEP, TO_THE_END = wp.constant(0), wp.constant(1), wp.constant(2)
 
 
 @wp.struct
 class Contact:
     """How a pair of faces ended, and when."""
 
-    end: wp.int32  # CLEAR, TOUCHES or UNDECIDED
+    end: wp.int32  # CLEAR, TOUCHES or UNDECIDED; GOES_ON
     time: wp.float64  # up to which they are proved apart
+
+
+@wp.struct
+class Progress:
+    """How far a pair of faces has come."""
+
+    time: wp.float64  # up to which they are proved apart
+    steps: wp.int32  # made
+    mode: wp.int32  # NORMALS, ONE_STEP or TO_THE_END, from there on
 
 
 @wp.func
@@ -154,9 +169,9 @@ def step_along(gap: wp.float64, rate: wp.float64, bend: wp.float64):
     if gap <= zero or not (gap > zero):
         return zero
     root = wp.sqrt(rate * rate + two * bend * gap)
-    if rate > zero:
-        return wp.where(bend > zero, (rate + root) / wp.where(bend > zero, bend, two) * EARLIER, wp.float64(wp.inf))
-    return wp.where(root > rate, two * gap / wp.where(root > rate, root - rate, two) * EARLIER, wp.float64(wp.inf))
+    above = wp.where(rate > zero, rate + root, two * gap)
+    below = wp.where(rate > zero, bend, root - rate)
+    return wp.where(below > zero, above / wp.where(below > zero, below, two) * EARLIER, wp.float64(wp.inf))
 
 
 @wp.func
@@ -166,51 +181,46 @@ def time_after(t: wp.float64, step: wp.float64):
 
 
 @wp.func
-def safe_step(motion: Motion, n: wp.vec3d, base: corners_type, m: Moment, mover: corners_type, at: corners_type):
+def bend_of_face(motion: Motion, mover: corners_type):
+    """Return a bound of the accelerations of a face of the mover in the base's frame."""
+    anchor = wp.where(motion.base == 0, motion.anchor_b, motion.anchor_a)
+    axis = wp.where(motion.base == 0, motion.axis_b, motion.axis_a)
+    away = wp.max(across(axis, mover[0] - anchor), across(axis, mover[1] - anchor))
+    return motion.bend_size * wp.max(away, across(axis, mover[2] - anchor)) + motion.bend_rest
+
+
+@wp.func
+def safe_step(
+    motion: Motion, n: wp.vec3d, base: corners_type, at: corners_type, velocity: corners_type, bend: wp.float64
+):
     """Return how long faces stay apart for certain along a unit vector n, from the base's to the mover's.
 
     Args:
-        mover: The mover's corners in its own frame.
-        at: The same in the base's frame.
+        at: The mover's corners in the base's frame.
+        velocity: Theirs there.
+        bend: A bound of their accelerations.
     """
     top = wp.max(wp.max(wp.dot(n, base[0]), wp.dot(n, base[1])), wp.dot(n, base[2])) + motion.slack
-    anchor = wp.where(motion.base == 0, motion.anchor_b, motion.anchor_a)
-    axis = wp.where(motion.base == 0, motion.axis_b, motion.axis_a)
     step = wp.float64(wp.inf)
     for k in range(3):
-        rate = wp.dot(n, m.spin * mover[k] + m.speed) - motion.speed_slack
-        bend = motion.bend_size * across(axis, mover[k] - anchor) + motion.bend_rest
+        rate = wp.dot(n, velocity[k]) - motion.speed_slack
         step = wp.min(step, step_along(wp.dot(n, at[k]) - top, rate, bend))
     return step
 
 
 @wp.func
-def longest_step(
-    motion: Motion, tried: wp.float64, base: corners_type, m: Moment, mover: corners_type, at: corners_type
-):
-    """Return the longest step along any axis, and the one tried before.
-
-    What joins points that are very near errs in its direction, so that long edges seem to reach across it.
-    """
-    step = tried
-    k = wp.int32(0)
-    while k < AXIS_COUNT:
-        n = axis_of(base, at, k)
-        step = wp.max(step, safe_step(motion, n, base, m, mover, at))
-        step = wp.max(step, safe_step(motion, -n, base, m, mover, at))
-        k += 1
-    return step
-
-
-@wp.func
-def plane_step(motion: Motion, base: corners_type, m: Moment, mover: corners_type, at: corners_type):
-    """Return the longer of the steps along both normals, each towards the other face's first corner."""
-    n = wp.normalize(wp.cross(base[1] - base[0], base[2] - base[0]))
-    n = wp.where(wp.dot(n, at[0] - base[0]) < wp.float64(0.0), -n, n)
-    step = safe_step(motion, n, base, m, mover, at)
-    n = wp.normalize(wp.cross(at[1] - at[0], at[2] - at[0]))
-    n = wp.where(wp.dot(n, at[0] - base[0]) < wp.float64(0.0), -n, n)
-    return wp.max(step, safe_step(motion, n, base, m, mover, at))
+def direction_of(base: corners_type, at: corners_type, k: wp.int32):
+    """Return the k-th unit vector that is tried: both normals, what joins the nearest points, then all axes."""
+    zero = wp.float64(0.0)
+    if k < 2:
+        face = wp.where(k == 0, base, at)
+        n = wp.normalize(wp.cross(face[1] - face[0], face[2] - face[0]))
+        return wp.where(wp.dot(n, at[0] - base[0]) < zero, -n, n)
+    if k == 2:
+        return separating_direction(base, at)
+    # What joins points that are very near errs in its direction, so that long edges seem to reach across it.
+    n = axis_of(base, at, (k - 3) / 2)
+    return wp.where((k & 1) == 0, -n, n)
 
 
 @wp.func
@@ -222,42 +232,51 @@ def meet_at(motion: Motion, t: wp.float64, base: corners_type, mover: corners_ty
 
 
 @wp.func
-def advance_faces(
-    tolerance: wp.float64, motion: Motion, base: corners_type, mover: corners_type, start: wp.float64, best: wp.float64
+def advance_once(
+    tolerance: wp.float64,
+    motion: Motion,
+    base: corners_type,
+    mover: corners_type,
+    bend: wp.float64,
+    t: wp.float64,
+    best: wp.float64,
+    normals: bool,
 ):
-    """Return when two faces that are apart until a start first touch, if not after the best time so far."""
+    """Return what a step from t on leaves of two faces that are apart until then; GOES_ON from the time it leads to.
+
+    With normals alone it may lead nowhere, where it is cheap: GOES_ON from t.
+    """
+    m = mover_moment(motion, t)
+    at = map_corners(m.rotation, m.shift, mover)
+    velocity = map_corners(m.spin, m.speed, mover)
     contact = Contact()
-    t = start
-    steps = wp.int32(0)
-    while steps < STEPS_MAX:
-        steps += 1
-        m = mover_moment(motion, t)
-        at = map_corners(m.rotation, m.shift, mover)
-        step = plane_step(motion, base, m, mover, at)
-        # A pair may end here for the best time so far, if it would go on after it whatever that is.
-        if step >= tolerance and time_after(t, step) > best:
-            contact.end = CLEAR
-            return contact
-        if step < LONG_STEP:
-            n = separating_direction(base, at)
-            step = wp.max(step, safe_step(motion, n, base, m, mover, at))
-        contact.time = t
-        contact.end = UNDECIDED
+    contact.time = t
+    step, then = wp.float64(0.0), wp.float64(0.0)
+    k = wp.int32(0)
+    while k < DIRECTION_COUNT:
+        step = wp.max(step, safe_step(motion, direction_of(base, at, k), base, at, velocity, bend))
         then = time_after(t, step)
-        if then <= t:
-            step = longest_step(motion, step, base, m, mover, at)
-            then = time_after(t, step)
-        if then <= t:
-            contact.end = TOUCHES
-            return contact
-        if step < tolerance:
-            if meet_at(motion, wp.min(t + tolerance, wp.float64(1.0)), base, mover):
-                contact.end = TOUCHES
+        k += 1
+        if k == 2:
+            # A pair may end here for the best time so far, if it would go on after it whatever that is.
+            if step >= tolerance and then > best:
+                contact.end = CLEAR
                 return contact
-        if then > best:
-            contact.end = CLEAR
+            if step >= LONG_STEP:
+                k = DIRECTION_COUNT
+            elif normals:
+                contact.end = GOES_ON
+                return contact
+        elif k > 2 and then > t:
+            k = DIRECTION_COUNT
+    contact.end = TOUCHES
+    if then <= t:
+        return contact
+    if step < tolerance:
+        if meet_at(motion, wp.min(t + tolerance, wp.float64(1.0)), base, mover):
             return contact
-        t = then
+    contact.time = then
+    contact.end = wp.where(then > best, CLEAR, GOES_ON)
     return contact
 
 
@@ -268,14 +287,30 @@ def advance_pair(
     states: StatePool,
     pose: PairPose,
     motion: Motion,
-    face_a: wp.int32,
-    face_b: wp.int32,
-    start: wp.float64,
+    faces: wp.vec2i,
+    before: Progress,
     best: wp.float64,
 ):
-    """Return the `Contact` of a face of A and one of B."""
-    a = load_corners(models, states, pose.corner_a + face_a)
-    b = load_corners(models, states, pose.corner_b + face_b)
-    if motion.base != 0:
-        return advance_faces(tolerance, motion, b, a, start, best)
-    return advance_faces(tolerance, motion, a, b, start, best)
+    """Return how a face of A and one of B that are apart until a time end, and what was done.
+
+    They go on where `before` says that a step is enough.
+    """
+    a = load_corners(models, states, pose.corner_a + faces[0])
+    b = load_corners(models, states, pose.corner_b + faces[1])
+    base, mover = wp.where(motion.base == 0, a, b), wp.where(motion.base == 0, b, a)
+    bend = bend_of_face(motion, mover)
+    contact = Contact()
+    t, steps = wp.float64(0.0) + before.time, wp.int32(0) + before.steps
+    going = bool(True)
+    while going:
+        contact = advance_once(tolerance, motion, base, mover, bend, t, best, before.mode == NORMALS)
+        going = contact.end == GOES_ON and before.mode == TO_THE_END
+        if contact.end == GOES_ON:
+            # Normals alone may lead nowhere, which is no step.
+            steps += wp.where(contact.time > t, 1, 0)
+            if steps == STEPS_MAX:
+                contact.time = t
+                contact.end = UNDECIDED
+                going = False
+            t = contact.time
+    return contact, steps

@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.motion.face_pair import advance_pair
+from warp_abtree.kernels.motion.face_pair import Progress, advance_pair
 from warp_abtree.kernels.motion.linear import (
     EndPoses,
     LinearMotion,
@@ -155,11 +155,12 @@ def advance_faces(
     pose: PairPose,
     motion: Motion,
     faces: wp.vec2i,
-    start: wp.float64,
+    before: Progress,
     best: wp.float64,
 ):
-    """Return the `Contact` of a face of A and one of B."""
-    return advance_pair(tolerance, models, states, pose, motion, faces[0], faces[1], start, best)
+    """Return the `Contact` of a face of A and one of B, and the steps made so far."""
+    contact, steps = advance_pair(tolerance, models, states, pose, motion, faces, before, best)
+    return contact, steps
 
 
 @wp.func
@@ -171,7 +172,10 @@ def advance_faces(  # noqa: F811
     pose: PairPose,
     motion: LinearMotion,
     faces: wp.vec2i,
-    start: wp.float64,
+    before: Progress,
     best: wp.float64,
 ):
-    return advance_linear_pair(tolerance, models, states, poses, pose, motion, faces[0], faces[1], start, best)
+    contact = advance_linear_pair(
+        tolerance, models, states, poses, pose, motion, faces[0], faces[1], before.time, best
+    )
+    return contact, wp.int32(0)

@@ -59,6 +59,9 @@ constexpr int NEAREST_OPEN_START = 672;
 constexpr int NEAREST_OPEN_LENGTH = 64;
 constexpr int NEAREST_LENGTH = 736;
 static_assert(NEAREST_OPEN_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
+// Of a search for first contacts: times of the face pairs that go on, at the end of the stack's room.
+constexpr int TIMES_START = 448;
+static_assert(TIMES_START + NEAREST_OPEN_LENGTH == STACK_LENGTH, "one for each");
 static_assert(NEAREST_LENGTH == NEAREST_OPEN_START + NEAREST_OPEN_LENGTH, "lists lie one behind the other");
 
 // Warps of a block that resolves uncertain face pairs: fewer blocks start sooner where there are none.

@@ -10,7 +10,7 @@ from helpers.questions import launch, pairs_of, scene_of
 from oracles.motion import translation_contact
 
 import warp_abtree as ab
-from warp_abtree.kernels.motion.face_pair import safe_step, step_along, time_after
+from warp_abtree.kernels.motion.face_pair import bend_of_face, safe_step, step_along, time_after
 from warp_abtree.kernels.motion.linear import straight_step
 from warp_abtree.kernels.motion.node_pair import later, step_of
 from warp_abtree.kernels.motion.path import Moment, Motion
@@ -22,7 +22,8 @@ COUNT = 1000
 @wp.kernel(module="unique", module_options={"fuse_fp": False})
 def float32_step_kernel(x: wp.array2d(dtype=wp.float32), out: wp.array2d(dtype=wp.float32)):
     i = wp.tid()
-    out[i, 0] = later(wp.float32(0.0), step_of(x[i, 0], x[i, 1], x[i, 2]))
+    step = step_of(x[i, 0], x[i, 1], x[i, 2])
+    out[i, 0] = later(wp.float32(0.0), step[0] / step[1])
     out[i, 1] = later(x[i, 3], x[i, 4])
 
 
@@ -91,7 +92,7 @@ def safe_step_kernel(slides: wp.array(dtype=Slide), out: wp.array2d(dtype=wp.flo
     for k in range(3):
         at[k] = s.moment.rotation * s.mover[k] + s.moment.shift
         way[k] = s.moment.spin * s.mover[k] + s.moment.speed
-    out[i, 0] = safe_step(motion, s.n, s.base, s.moment, s.mover, at)
+    out[i, 0] = safe_step(motion, s.n, s.base, at, way, bend_of_face(motion, s.mover))
     out[i, 1] = straight_step(s.slack, s.n, s.base, at, corners_type(), way)
 
 
@@ -113,7 +114,7 @@ def test_steps_of_faces_leave_room_for_all_that_they_may_be_off(device):
         n, top = row["n"], (row["base"] @ row["n"]).max() + row["slack"]
         gaps = (row["mover"] @ row["rotation"].T + row["shift"]) @ n - top
         rates = (row["mover"] @ row["spin"].T + row["speed"]) @ n
-        bends = row["bend"][0] * np.linalg.norm(row["mover"][:, :2], axis=1) + row["bend"][1]
+        bends = row["bend"][0] * np.linalg.norm(row["mover"][:, :2], axis=1).max() + row["bend"][1]
         for step, rate, bend in (
             (bent, rates - row["speed_slack"], bends),
             (straight, rates - row["slack"], 0 * bends),
