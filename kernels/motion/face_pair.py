@@ -42,8 +42,6 @@ CLEAR, TOUCHES, UNDECIDED = wp.constant(0), wp.constant(1), wp.constant(2)
 STALLED = wp.constant(3)
 # Not ended: apart until a time, and to be gone on with.
 GOES_ON = wp.constant(4)
-# Both normals, what joins the nearest points, and either way along the axes.
-DIRECTION_COUNT = wp.constant(3 + 2 * 17)
 # How far a pair of faces is advanced: by a step along normals if they do, by a step, or to its end.
 NORMALS, ONE_STEP, TO_THE_END = wp.constant(0), wp.constant(1), wp.constant(2)
 
@@ -209,18 +207,31 @@ def safe_step(
 
 
 @wp.func
-def direction_of(base: corners_type, at: corners_type, k: wp.int32):
-    """Return the k-th unit vector that is tried: both normals, what joins the nearest points, then all axes."""
-    zero = wp.float64(0.0)
-    if k < 2:
-        face = wp.where(k == 0, base, at)
-        n = wp.normalize(wp.cross(face[1] - face[0], face[2] - face[0]))
-        return wp.where(wp.dot(n, at[0] - base[0]) < zero, -n, n)
-    if k == 2:
-        return separating_direction(base, at)
-    # What joins points that are very near errs in its direction, so that long edges seem to reach across it.
-    n = axis_of(base, at, (k - 3) / 2)
-    return wp.where((k & 1) == 0, -n, n)
+def longest_step(
+    motion: Motion, tried: wp.float64, base: corners_type, at: corners_type, velocity: corners_type, bend: wp.float64
+):
+    """Return the longest step along any axis, and the one tried before.
+
+    What joins points that are very near errs in its direction, so that long edges seem to reach across it.
+    """
+    step = tried
+    k = wp.int32(0)
+    while k < 2 * AXIS_COUNT:
+        n = axis_of(base, at, k / 2)
+        step = wp.max(step, safe_step(motion, wp.where((k & 1) == 0, n, -n), base, at, velocity, bend))
+        k += 1
+    return step
+
+
+@wp.func
+def plane_step(motion: Motion, base: corners_type, at: corners_type, velocity: corners_type, bend: wp.float64):
+    """Return the longer of the steps along both normals, each towards the other face's first corner."""
+    n = wp.normalize(wp.cross(base[1] - base[0], base[2] - base[0]))
+    n = wp.where(wp.dot(n, at[0] - base[0]) < wp.float64(0.0), -n, n)
+    step = safe_step(motion, n, base, at, velocity, bend)
+    n = wp.normalize(wp.cross(at[1] - at[0], at[2] - at[0]))
+    n = wp.where(wp.dot(n, at[0] - base[0]) < wp.float64(0.0), -n, n)
+    return wp.max(step, safe_step(motion, n, base, at, velocity, bend))
 
 
 @wp.func
@@ -250,25 +261,22 @@ def advance_once(
     at = map_corners(m.rotation, m.shift, mover)
     velocity = map_corners(m.spin, m.speed, mover)
     contact = Contact()
+    step = plane_step(motion, base, at, velocity, bend)
+    # A pair may end here for the best time so far, if it would go on after it whatever that is.
+    if step >= tolerance and time_after(t, step) > best:
+        contact.end = CLEAR
+        return contact
     contact.time = t
-    step, then = wp.float64(0.0), wp.float64(0.0)
-    k = wp.int32(0)
-    while k < DIRECTION_COUNT:
-        step = wp.max(step, safe_step(motion, direction_of(base, at, k), base, at, velocity, bend))
+    if step < LONG_STEP:
+        contact.end = GOES_ON
+        if normals:
+            return contact
+        n = separating_direction(base, at)
+        step = wp.max(step, safe_step(motion, n, base, at, velocity, bend))
+    then = time_after(t, step)
+    if then <= t:
+        step = longest_step(motion, step, base, at, velocity, bend)
         then = time_after(t, step)
-        k += 1
-        if k == 2:
-            # A pair may end here for the best time so far, if it would go on after it whatever that is.
-            if step >= tolerance and then > best:
-                contact.end = CLEAR
-                return contact
-            if step >= LONG_STEP:
-                k = DIRECTION_COUNT
-            elif normals:
-                contact.end = GOES_ON
-                return contact
-        elif k > 2 and then > t:
-            k = DIRECTION_COUNT
     contact.end = TOUCHES
     if then <= t:
         return contact

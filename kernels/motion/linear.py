@@ -149,9 +149,7 @@ def see(node: Node, motion: LinearMotion, at: wp.mat33, shift: wp.vec3, way: wp.
 def compare(a: Seen, b: Seen, before: wp.vec2) -> wp.vec2:
     """Return the longest step and the widest gap along three axes, and of what was found before."""
     bend = wp.float32(BEND_LEAST)
-    found = wp.vec3(before[0], 1.0, before[1])
-    found = longest_step(b.sum - a.sum, a.size + b.size, b.speed - a.speed, a.spread + b.spread, bend, found)
-    return wp.vec2(found[0] / found[1], found[2])
+    return longest_step(b.sum - a.sum, a.size + b.size, b.speed - a.speed, a.spread + b.spread, bend, before)
 
 
 @wp.func

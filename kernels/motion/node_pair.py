@@ -82,54 +82,35 @@ def move_box(
 
 @wp.func
 def step_of(gap: wp.float32, rate: wp.float32, bend: wp.float32):
-    """Return how long a gap stays open that grows at a rate, less bend / 2 times the time squared; 0 if it is none.
-
-    As two numbers, the step above and below the line.
-    """
+    """Return how long a gap stays open that grows at a rate, less bend / 2 times the time squared; 0 if it is none."""
     zero, two = wp.float32(0.0), wp.float32(2.0)
-    root = wp.sqrt(rate * rate + two * bend * wp.max(gap, zero))
-    grows = rate > zero
-    above = wp.where(grows, rate + root, two * gap)
-    below = wp.where(grows, bend, root - rate)
-    return wp.where(gap > zero, wp.vec2(above, below), wp.vec2(zero, wp.float32(1.0)))
+    root = wp.sqrt(rate * rate + two * bend * gap)
+    above = wp.where(rate > zero, rate + root, two * gap)
+    below = wp.where(rate > zero, bend, root - rate)
+    return wp.where(gap > zero, above / below, zero)
 
 
 @wp.func
 def longest_step(
-    between: wp.vec3, reach: wp.vec3, speed: wp.vec3, spread: wp.vec3, bend: wp.float32, best: wp.vec3
-) -> wp.vec3:
-    """Return the longest step along three axes as two numbers, the widest gap, and of what was found before.
-
-    Products say which step is longer, but for rounding; any of them is one for which boxes stay apart.
-    """
-    longest = best
+    between: wp.vec3, reach: wp.vec3, speed: wp.vec3, spread: wp.vec3, bend: wp.float32, best: wp.vec2
+) -> wp.vec2:
+    """Return the longest step and the widest gap along three axes, and of what was found before."""
+    step, widest = best[0], best[1]
     for i in range(3):
         gap = wp.abs(between[i]) - reach[i]
         rate = wp.where(between[i] > wp.float32(0.0), speed[i], -speed[i]) - spread[i]
-        step = step_of(gap, rate, bend)
-        longer = step[0] * longest[1] > longest[0] * step[1]
-        longest[0] = wp.where(longer, step[0], longest[0])
-        longest[1] = wp.where(longer, step[1], longest[1])
-        longest[2] = wp.max(longest[2], gap)
-    return longest
-
-
-@wp.func
-def no_step() -> wp.vec3:
-    """Return what `longest_step` starts with."""
-    return wp.vec3(0.0, 1.0, 0.0)
+        step = wp.max(step, step_of(gap, rate, bend))
+        widest = wp.max(widest, gap)
+    return wp.vec2(step, widest)
 
 
 @wp.func
 def step_boxes(a: MovingBox, b: MovingBox, motion: Motion):
     """Return how long two boxes stay apart, 0 if they may not be, and the widest gap between them."""
     first = longest_step(
-        b.at.posed_sum - a.at.sum, b.at.posed_size + a.at.size, b.speed, b.spread, motion.bend_b, no_step()
+        b.at.posed_sum - a.at.sum, b.at.posed_size + a.at.size, b.speed, b.spread, motion.bend_b, wp.vec2()
     )
-    longest = longest_step(
-        a.at.posed_sum - b.at.sum, a.at.posed_size + b.at.size, a.speed, a.spread, motion.bend_a, first
-    )
-    return wp.vec2(longest[0] / longest[1], longest[2])
+    return longest_step(a.at.posed_sum - b.at.sum, a.at.posed_size + b.at.size, a.speed, a.spread, motion.bend_a, first)
 
 
 @wp.func

@@ -29,7 +29,7 @@ in the model frames, B's point b lies in A's frame at R b + x, where it moves wi
 import warp as wp
 
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.motion.turn import cross_matrix, shortest_turn, turn_matrix
+from warp_abtree.kernels.motion.turn import shortest_turn, turn_matrix
 from warp_abtree.kernels.poses import ROUNDING_32, PairPose, measure_rotation, reach_box, sum_products
 from warp_abtree.kernels.traversal.nodes import load_node
 from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, largest
@@ -108,7 +108,13 @@ def place_motion(motion: Motion, t: wp.float64):
         d = back * d
         travel = back * travel
     turn_a = motion.angle_a * motion.axis_a
-    k = r * cross_matrix(motion.angle_b * motion.axis_b) - cross_matrix(turn_a) * r
+    # R [wb] and [wa] R by rows, without the products with 0.
+    turn_b = motion.angle_b * motion.axis_b
+    k = wp.matrix_from_rows(
+        wp.cross(r[0], turn_b) - (turn_a[1] * r[2] - turn_a[2] * r[1]),
+        wp.cross(r[1], turn_b) - (turn_a[2] * r[0] - turn_a[0] * r[2]),
+        wp.cross(r[2], turn_b) - (turn_a[0] * r[1] - turn_a[1] * r[0]),
+    )
     moment.rotation = r
     moment.shift = (motion.anchor_a + d) - r * motion.anchor_b
     moment.spin = k

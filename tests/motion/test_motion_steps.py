@@ -22,8 +22,7 @@ COUNT = 1000
 @wp.kernel(module="unique", module_options={"fuse_fp": False})
 def float32_step_kernel(x: wp.array2d(dtype=wp.float32), out: wp.array2d(dtype=wp.float32)):
     i = wp.tid()
-    step = step_of(x[i, 0], x[i, 1], x[i, 2])
-    out[i, 0] = later(wp.float32(0.0), step[0] / step[1])
+    out[i, 0] = later(wp.float32(0.0), step_of(x[i, 0], x[i, 1], x[i, 2]))
     out[i, 1] = later(x[i, 3], x[i, 4])
 
 
