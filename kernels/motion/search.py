@@ -14,10 +14,8 @@ from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, StatePool
 from warp_abtree.kernels.distance.search import (
     DEPTH_FIRST_ROOM,
-    OPEN_START,
     nearest_stack,
     push_nearest,
-    push_open,
     read_bound,
     warp_min,
     write_bound,
@@ -25,9 +23,6 @@ from warp_abtree.kernels.distance.search import (
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.motion.face_pair import (
     CLEAR,
-    GOES_ON,
-    NORMALS,
-    ONE_STEP,
     TO_THE_END,
     TOUCHES,
     UNDECIDED,
@@ -46,7 +41,6 @@ from warp_abtree.kernels.traversal.simd import take_thread
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
     STRADDLING_START,
-    add_warp_sum,
     read_item,
     warp_any,
     warp_lane,
@@ -59,8 +53,6 @@ MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
 # Words of 8 bytes of the lists of a thread of the CPU.
-# Times of the face pairs that go on, at the end of the stack's room.
-TIMES_START = native.constant("TIMES_START")
 LIST_WORDS = int(STRADDLING_START) + int(STRADDLING_START) // 2
 
 
@@ -69,16 +61,11 @@ def thread_lists(memory: wp.array2d(dtype=wp.int64), thread: wp.int32) -> wp.uin
     """Return where the lists of a thread of the CPU lie."""
 
 
-@wp.func_native(native.body("nearest_stack.cuh", "push_times"))
-def push_times(items: wp.uint64, end: wp.int32, flag: bool, time: wp.float64):
-    """Write the times of the face pairs that `push_open` appends after this."""
-
-
 @wp.func
 def meet_faces(
     items: wp.uint64,
-    counts: wp.vec2i,
-    mode: wp.int32,
+    first: wp.int32,
+    popped: wp.int32,
     tolerance: wp.float64,
     models: ModelPool,
     states: StatePool,
@@ -87,35 +74,19 @@ def meet_faces(
     motion: Any,
     before: Contact,
 ):
-    """Advance face pairs, one a lane; return the earliest, both lists' counts, and how many this lane took up.
-
-    Args:
-        counts: Face pairs that wait, and those that go on: the list for ONE_STEP.
-    """
-    waiting, going = counts[0], counts[1]
-    count = wp.where(mode == ONE_STEP, going, waiting)
-    popped = wp.min(count, warp_size())
-    at = count - popped + wp.min(warp_lane(), popped - 1)
-    progress = Progress()
-    progress.mode = mode
-    item = wp.int64(0)
-    if mode == ONE_STEP:
-        going -= popped
-        item = read_item(items, OPEN_START + at)
-        progress.time = wp.cast(read_item(items, TIMES_START + at), wp.float64)
-        progress.steps = wp.int32(read_bound(items, OPEN_START + at))
-    else:
-        waiting -= popped
-        item = read_item(items, STACK_LENGTH + at)
-        progress.time = wp.float64(read_bound(items, STACK_LENGTH + at))
-    live = warp_lane() < popped and progress.time <= before.time
+    """Advance the face pairs first to first + popped, one a lane; return the earliest, and how many this lane took."""
+    at = STACK_LENGTH + first + wp.min(warp_lane(), popped - 1)
+    item, start = read_item(items, at), wp.float64(read_bound(items, at))
+    live = warp_lane() < popped and start <= before.time
     warp_sync()
-    own, steps = Contact(), wp.int32(0)
+    own = Contact()
     if live:
         faces = wp.vec2i(item_first(item), item_second(item))
-        own, steps = advance_faces(tolerance, models, states, poses, pose, motion, faces, progress, before.time)
-    goes_on = own.end == GOES_ON
-    time = wp.where(own.end == CLEAR or goes_on, wp.float64(wp.inf), own.time)
+        progress = Progress()
+        progress.time = start
+        progress.mode = TO_THE_END
+        own, _ = advance_faces(tolerance, models, states, poses, pose, motion, faces, progress, before.time)
+    time = wp.where(own.end == CLEAR, wp.float64(wp.inf), own.time)
     best = before
     earliest = warp_min(time)
     if earliest < best.time or (earliest == best.time and best.end != TOUCHES):
@@ -123,18 +94,12 @@ def meet_faces(
         touches = warp_any(time == earliest and own.end == TOUCHES)
         best.time = earliest
         best.end = wp.where(touches, TOUCHES, UNDECIDED)
-    if mode != TO_THE_END:
-        goes_on = goes_on and own.time <= best.time
-        push_times(items, going, goes_on, own.time)
-        going = push_open(items, going, goes_on, item, wp.float32(steps))
-        warp_sync()
-    return best, wp.vec2i(waiting, going), wp.where(live and mode != ONE_STEP, 1, 0)
+    return best, wp.where(live, 1, 0)
 
 
 @wp.func
 def search_contact(
     items: wp.uint64,
-    first_mode: wp.int32,
     room: wp.int32,
     tolerance: wp.float64,
     models: ModelPool,
@@ -145,11 +110,7 @@ def search_contact(
     p: wp.int32,
     start: wp.float64,
 ):
-    """Return the first contact of an object pair that is apart until a start, and what this lane compared.
-
-    Args:
-        first_mode: How far face pairs are advanced at first, see `face_pair.Progress`.
-    """
+    """Return the first contact of an object pair that is apart until a start, and what this lane compared."""
     best = Contact()
     best.time = wp.float64(1.0)
     best.end = CLEAR
@@ -157,10 +118,10 @@ def search_contact(
         write_item(items, 0, first_item(states, pose))
         write_bound(items, 0, wp.float32(start))
     warp_sync()
-    end, counts = wp.int32(1), wp.vec2i()
+    end, waiting = wp.int32(1), wp.int32(0)
     tests, floor = wp.vec2i(), slide_floor(pose, motions[p])
-    while end > 0 or counts[0] > 0 or counts[1] > 0:
-        if end > 0 and counts[0] < warp_size() and counts[1] < warp_size():
+    while end > 0 or waiting > 0:
+        if end > 0 and waiting < warp_size():
             # One at a time, depth first, needs little room; more where there is.
             popped = wp.max(1, (room - DEPTH_FIRST_ROOM - end) >> 2)
             popped = wp.min(popped, wp.min(warp_size(), end))
@@ -174,17 +135,17 @@ def search_contact(
             children, kinds, times, compared = four_items(), wp.vec4i(), wp.vec4(), wp.int32(0)
             if warp_any(live < 0):
                 children, kinds, times, compared = advance_nodes(states, pose, motions[p], t, best.time, item, live)
-            ends = push_nearest(items, end, counts[0], kinds, children, times)
+            ends = push_nearest(items, end, waiting, kinds, children, times)
             warp_sync()
             end = item_second(ends)
-            counts[0] = item_first(ends)
+            waiting = item_first(ends)
             tests[0] += compared
-        # A step of face pairs takes a warp as long as its slowest lane: they wait until there is one for each.
-        mode = wp.where(counts[1] >= warp_size() or counts[0] == 0, ONE_STEP, first_mode)
-        most = wp.where(mode == ONE_STEP, counts[1], counts[0])
-        if most >= warp_size() or (end == 0 and most > 0):
-            best, counts, advanced = meet_faces(
-                items, counts, mode, tolerance, models, states, poses, pose, motions[p], best
+        # The first face pairs are advanced at once: until then, little is dropped.
+        if waiting >= warp_size() or (waiting > 0 and (end == 0 or best.end == CLEAR)):
+            popped = wp.min(waiting, warp_size())
+            waiting -= popped
+            best, advanced = meet_faces(
+                items, waiting, popped, tolerance, models, states, poses, pose, motions[p], best
             )
             tests[1] += advanced
     return best, tests
@@ -211,45 +172,6 @@ def profile_warp_kernel(
         if warp_lane() == 0:
             contacts_inout.time[p] = wp.float64(1.0)
             contacts_inout.end[p] = CLEAR
-
-
-@cache
-def warp_search(kind):
-    """Return the kernel of warps for motions of a kind: `path.Motion` or `linear.LinearMotion`."""
-
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
-    def search_warp_kernel(
-        # static
-        room: wp.int32,
-        tolerance: wp.float64,
-        models: ModelPool,
-        # state
-        states: StatePool,
-        poses: EndPoses,
-        pair_count: wp.array(dtype=wp.int32),
-        pair_poses: wp.array(dtype=PairPose),
-        motion: wp.array(dtype=kind),
-        # out
-        hits_inout: Hits,
-        contacts_inout: Contacts,
-    ):
-        """Search the object pairs that are open, a warp a pair."""
-        p = wp.tid() / warp_size()
-        if p >= pair_count[0] or contacts_inout.launched[0] == STALE:
-            return
-        if contacts_inout.end[p] != OPEN:
-            return
-        items, start = nearest_stack(), contacts_inout.time[p]
-        stack_room = wp.min(room, TIMES_START)
-        pose = pair_poses[p]
-        contact, tests = search_contact(items, NORMALS, stack_room, tolerance, models, states, poses, pose, motion, p, start)
-        if warp_lane() == 0:
-            contacts_inout.time[p] = contact.time
-            contacts_inout.end[p] = contact.end
-        add_warp_sum(hits_inout.node_tests, p, tests[0])
-        add_warp_sum(hits_inout.triangle_tests, p, tests[1])
-
-    return search_warp_kernel
 
 
 @cache
@@ -288,7 +210,7 @@ def thread_search(kind):
                 contacts_inout.end[p] = CLEAR
             if contacts_inout.end[p] == OPEN:
                 pose, start = pair_poses[p], contacts_inout.time[p]
-                contact, tests = search_contact(items, TO_THE_END, room, tolerance, models, states, poses, pose, motion, p, start)
+                contact, tests = search_contact(items, room, tolerance, models, states, poses, pose, motion, p, start)
                 contacts_inout.time[p] = contact.time
                 contacts_inout.end[p] = contact.end
                 hits_inout.node_tests[p] += wp.int64(tests[0])

@@ -160,16 +160,3 @@ inline CUDA_CALLABLE wp::int32 push_open(wp::uint64 items, wp::int32 end, bool f
     return end + flag;
 #endif
 }
-
-inline CUDA_CALLABLE void push_times(wp::uint64 items, wp::int32 end, bool flag, wp::float64 time) {
-#include "sizes.h"
-#if defined(__CUDA_ARCH__)
-    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
-    const int at = TIMES_START + end + __popc(votes & ((1u << threadIdx.x) - 1u));
-    if (flag)
-        asm volatile("st.shared.f64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "d"(time) : "memory");
-#else
-    if (flag)
-        ((double*)items)[TIMES_START + end] = time;
-#endif
-}

@@ -59,10 +59,19 @@ constexpr int NEAREST_OPEN_START = 672;
 constexpr int NEAREST_OPEN_LENGTH = 64;
 constexpr int NEAREST_LENGTH = 736;
 static_assert(NEAREST_OPEN_START == STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
-// Of a search for first contacts: times of the face pairs that go on, at the end of the stack's room.
-constexpr int TIMES_START = 448;
-static_assert(TIMES_START + NEAREST_OPEN_LENGTH == STACK_LENGTH, "one for each");
 static_assert(NEAREST_LENGTH == NEAREST_OPEN_START + NEAREST_OPEN_LENGTH, "lists lie one behind the other");
+
+// A warp's search for first contacts: node pairs, face pairs that wait, and those that go on; object pairs at once.
+constexpr int MOTION_STACK_LENGTH = 704;
+constexpr int MOTION_GOING_START = 864;
+constexpr int MOTION_LENGTH = 928;
+constexpr int MOTION_TIMES_START = 1392;
+constexpr int MOTION_WORDS = 1572;
+constexpr int MOTION_GROUP = 4;
+static_assert(MOTION_GOING_START == MOTION_STACK_LENGTH + LEAF_PAIR_LENGTH, "lists lie one behind the other");
+static_assert(MOTION_LENGTH == MOTION_GOING_START + 2 * WARP_SIZE, "fewer than a warp go on, each lane adds one");
+static_assert(2 * MOTION_TIMES_START == 3 * MOTION_LENGTH, "bounds lie behind the items");
+static_assert(MOTION_WORDS == MOTION_TIMES_START + 2 * WARP_SIZE + MOTION_LENGTH / 8, "then times, then slots");
 
 // Warps of a block that resolves uncertain face pairs: fewer blocks start sooner where there are none.
 constexpr int RESOLVE_WARPS = 4;

@@ -26,7 +26,7 @@ from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import ObjectPool
-from warp_abtree.kernels.motion import face_pair, path, search, start, swept_boxes
+from warp_abtree.kernels.motion import face_pair, group, path, search, start, swept_boxes
 from warp_abtree.kernels.motion import linear as straight
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
@@ -179,7 +179,7 @@ class FirstContactQuery(Query):
             self._commands = Commands()
 
     def _kernels(self, with_distances: bool) -> list:
-        make = search.warp_search if self.uses_warps() else search.thread_search
+        make = group.warp_search if self.uses_warps() else search.thread_search
         kernels = [make(self._kind), start.contact_starter(self._kind), path.prepare_path_kernel]
         kernels += [search.profile_warp_kernel] if self._has_profiles() else []
         return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._kernels(with_distances)]
@@ -248,7 +248,7 @@ class FirstContactQuery(Query):
         inputs += [self.pair_count, self.pair_poses, self._motion]
         if self.uses_warps():
             dim, inputs = room * (WARP_SIZE if self.device.is_cuda else 1), [*inputs, self.hits, self.contacts]
-            return [launch(search.warp_search(self._kind), dim=dim, inputs=inputs, block_dim=WARP_SIZE)]
+            return [launch(group.warp_search(self._kind), dim=dim, inputs=inputs, block_dim=WARP_SIZE)]
         inputs += [self.hits, self.contacts, self._memory]
         return [launch(search.thread_search(self._kind), dim=1, inputs=inputs)]
 

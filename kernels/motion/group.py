@@ -1,0 +1,334 @@
+"""The search for first contacts by warps, a few object pairs at once: node and face pairs of any of them fill the lanes.
+
+As `search`, whose answers it has. A face pair is advanced by normals first, which decide most; what is left goes on
+step by step, each with 31 others, since a step takes as long as its slowest lane, and the others are ten times as long.
+"""
+
+from functools import cache, partial
+from typing import Any
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.arrays import ModelPool, StatePool
+from warp_abtree.kernels.distance.node_pair import FACES, NODES
+from warp_abtree.kernels.distance.search import DEPTH_FIRST_ROOM, warp_min
+from warp_abtree.kernels.generation import STALE
+from warp_abtree.kernels.motion.face_pair import (
+    CLEAR,
+    GOES_ON,
+    NORMALS,
+    ONE_STEP,
+    TOUCHES,
+    UNDECIDED,
+    Contact,
+    Progress,
+)
+from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, slide_floor, slides_past
+from warp_abtree.kernels.motion.linear import EndPoses
+from warp_abtree.kernels.motion.start import OPEN, Contacts
+from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.face_pairs import Hits
+from warp_abtree.kernels.traversal.node_pair import first_item, four_items, item_first, item_second
+from warp_abtree.kernels.traversal.warp_stack import (
+    STACK_LENGTH,
+    add_warp_sum,
+    read_item,
+    warp_any,
+    warp_lane,
+    warp_size,
+    warp_sync,
+)
+
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
+
+GROUP = native.constant("MOTION_GROUP")
+# Object pairs from which on a warp takes a group: fewer leave multiprocessors idle.
+GROUPED_LEAST = wp.constant(8192)
+MOTION_STACK_LENGTH = native.constant("MOTION_STACK_LENGTH")
+GOING_START, TIMES_START = native.constant("MOTION_GOING_START"), native.constant("MOTION_TIMES_START")
+
+stack_code = partial(native.body, "motion_stack.cuh")
+
+
+@wp.func_native(stack_code("motion_stack"))
+def motion_stack() -> wp.uint64:
+    """Return where this warp's lists lie, an address in shared memory on CUDA."""
+
+
+@wp.func_native(stack_code("read_number"))
+def read_number(items: wp.uint64, i: wp.int32) -> wp.float32: ...
+
+
+@wp.func_native(stack_code("read_slot"))
+def read_slot(items: wp.uint64, i: wp.int32) -> wp.int32: ...
+
+
+@wp.func_native(stack_code("write_entry"))
+def write_entry(items: wp.uint64, i: wp.int32, item: wp.int64, number: wp.float32, slot: wp.int32): ...
+
+
+@wp.func_native(stack_code("write_time"))
+def write_time(items: wp.uint64, i: wp.int32, time: wp.float64):
+    """Write the time of the i-th face pair that goes on."""
+
+
+@wp.func_native(stack_code("place_in"))
+def place_in(end: wp.int32, flag: bool) -> wp.int32:
+    """Return where this lane's entry goes in a list that ends there, of the lanes whose flag is set."""
+
+
+@wp.func_native(stack_code("end_after"))
+def end_after(end: wp.int32, flag: bool) -> wp.int32:
+    """Return where such a list ends then."""
+
+
+@wp.struct
+class Group:
+    """Object pairs that a warp searches, a slot each."""
+
+    first: wp.int32  # the number of the first
+    time: wp.vec4d  # of the first contact so far
+    end: wp.vec4i  # CLEAR, TOUCHES or UNDECIDED
+    nodes: wp.vec4i  # node pairs that this lane has compared
+    faces: wp.vec4i  # face pairs that it has taken up
+
+
+@wp.func
+def time_of(group: Group, slot: wp.int32):
+    """Return the time of a slot."""
+    low = wp.where(slot == 0, group.time[0], group.time[1])
+    return wp.where(slot < 2, low, wp.where(slot == 2, group.time[2], group.time[3]))
+
+
+@wp.func
+def count_in(counts: wp.vec4i, slot: wp.int32, more: wp.int32):
+    """Return counts with more in a slot."""
+    sums = counts
+    for k in range(4):
+        sums[k] += wp.where(slot == k, more, 0)
+    return sums
+
+
+@wp.func
+def push_steps(
+    items: wp.uint64,
+    ends: wp.vec2i,
+    slot: wp.int32,
+    given_kinds: wp.vec4i,
+    given: four_items,
+    given_times: wp.vec4,
+):
+    """Append node pairs to the stack, the earliest of each lane last, and face pairs to theirs; return both ends."""
+    kinds, children, times = given_kinds, given, given_times
+    for n in range(5):
+        i, j = wp.static((0, 2, 0, 1, 1)[n]), wp.static((1, 3, 2, 3, 2)[n])
+        turn = times[i] < times[j]
+        t, u = times[i], times[j]
+        c, d = children[i], children[j]
+        k, m = kinds[i], kinds[j]
+        times[i] = wp.where(turn, u, t)
+        times[j] = wp.where(turn, t, u)
+        children[i] = wp.where(turn, d, c)
+        children[j] = wp.where(turn, c, d)
+        kinds[i] = wp.where(turn, m, k)
+        kinds[j] = wp.where(turn, k, m)
+    end, waiting = ends[0], ends[1]
+    for k in range(4):
+        node, face = kinds[k] == NODES, kinds[k] == FACES
+        place, face_place = place_in(end, node), MOTION_STACK_LENGTH + place_in(waiting, face)
+        if node or face:
+            write_entry(items, wp.where(node, place, face_place), children[k], times[k], slot)
+        end = end_after(end, node)
+        waiting = end_after(waiting, face)
+    return wp.vec2i(end, waiting)
+
+
+@wp.func
+def take_contacts(group: Group, slot: wp.int32, own: Contact):
+    """Return a group with the earliest of the contacts of all lanes."""
+    found = group
+    time = wp.where(own.end == CLEAR or own.end == GOES_ON, wp.float64(wp.inf), own.time)
+    for k in range(4):
+        mine = slot == k
+        earliest = warp_min(wp.where(mine, time, wp.float64(wp.inf)))
+        if earliest < found.time[k] or (earliest == found.time[k] and found.end[k] != TOUCHES):
+            # A pair that is undecided at the same time does not matter.
+            touches = warp_any(mine and time == earliest and own.end == TOUCHES)
+            found.time[k] = earliest
+            found.end[k] = wp.where(touches, TOUCHES, UNDECIDED)
+    return found
+
+
+@wp.func
+def meet_faces(
+    items: wp.uint64,
+    ends: wp.vec3i,
+    mode: wp.int32,
+    tolerance: wp.float64,
+    models: ModelPool,
+    states: StatePool,
+    poses: EndPoses,
+    pair_poses: wp.array(dtype=PairPose),
+    motion: Any,
+    before: Group,
+):
+    """Advance face pairs, one a lane; return what is found and the lists' ends.
+
+    Args:
+        mode: ONE_STEP for those that go on, NORMALS for those that wait.
+    """
+    group = before
+    waiting, going = ends[1], ends[2]
+    popped = wp.min(wp.where(mode == ONE_STEP, going, waiting), warp_size())
+    lane = wp.min(warp_lane(), popped - 1)
+    progress = Progress()
+    progress.mode = mode
+    at = wp.int32(0)
+    if mode == ONE_STEP:
+        going -= popped
+        at = GOING_START + going + lane
+        progress.time = wp.cast(read_item(items, TIMES_START + going + lane), wp.float64)
+        progress.steps = wp.int32(read_number(items, at))
+    else:
+        waiting -= popped
+        at = MOTION_STACK_LENGTH + waiting + lane
+        progress.time = wp.float64(read_number(items, at))
+    item, slot = read_item(items, at), read_slot(items, at)
+    best = time_of(group, slot)
+    live = warp_lane() < popped and progress.time <= best
+    warp_sync()
+    own, steps = Contact(), wp.int32(0)
+    if live:
+        p = group.first + slot
+        faces = wp.vec2i(item_first(item), item_second(item))
+        own, steps = advance_faces(tolerance, models, states, poses, pair_poses[p], motion[p], faces, progress, best)
+    group.faces = count_in(group.faces, slot, wp.where(live and mode != ONE_STEP, 1, 0))
+    group = take_contacts(group, slot, own)
+    goes_on = own.end == GOES_ON and own.time <= time_of(group, slot)
+    place = place_in(going, goes_on)
+    if goes_on:
+        write_entry(items, GOING_START + place, item, wp.float32(steps), slot)
+        write_time(items, place, own.time)
+    going = end_after(going, goes_on)
+    warp_sync()
+    return group, wp.vec3i(ends[0], waiting, going)
+
+
+@wp.func
+def start_group(
+    items: wp.uint64,
+    first: wp.int32,
+    size: wp.int32,
+    count: wp.int32,
+    states: StatePool,
+    pair_poses: wp.array(dtype=PairPose),
+    contacts: Contacts,
+):
+    """Put the roots of the object pairs that are open on the empty stack; return their group, and how many."""
+    group = Group()
+    group.first = first
+    end = wp.int32(0)
+    for k in range(4):
+        p = first + k
+        group.time[k] = wp.float64(1.0)
+        if k < size and p < count:
+            if contacts.end[p] == OPEN:
+                if warp_lane() == 0:
+                    write_entry(items, end, first_item(states, pair_poses[p]), wp.float32(contacts.time[p]), k)
+                end += 1
+    warp_sync()
+    return group, end
+
+
+@wp.func
+def search_group(
+    items: wp.uint64,
+    room: wp.int32,
+    tolerance: wp.float64,
+    models: ModelPool,
+    states: StatePool,
+    poses: EndPoses,
+    pair_poses: wp.array(dtype=PairPose),
+    motion: Any,
+    begun: Group,
+    roots: wp.int32,
+):
+    """Return a group with its first contacts."""
+    group = begun
+    ends = wp.vec3i(roots, 0, 0)
+    while ends[0] > 0 or ends[1] > 0 or ends[2] > 0:
+        if ends[0] > 0 and ends[1] < warp_size() and ends[2] < warp_size():
+            # One at a time, depth first, needs little room; more where there is.
+            popped = wp.max(1, (room - DEPTH_FIRST_ROOM - ends[0]) >> 2)
+            popped = wp.min(popped, wp.min(warp_size(), ends[0]))
+            end = ends[0] - popped
+            at = end + wp.min(warp_lane(), popped - 1)
+            item, t, slot = read_item(items, at), read_number(items, at), read_slot(items, at)
+            p, best = group.first + slot, time_of(group, slot)
+            live = wp.where(warp_lane() < popped and wp.float64(t) <= best, -1, 0)
+            floor = slide_floor(pair_poses[p], motion[p])
+            if live < 0 and slides_past(floor, models, states, pair_poses[p], motion[p], t, item):
+                live = 0
+            warp_sync()
+            children, kinds, times, compared = four_items(), wp.vec4i(), wp.vec4(), wp.int32(0)
+            if warp_any(live < 0):
+                children, kinds, times, compared = advance_nodes(states, pair_poses[p], motion[p], t, best, item, live)
+            pushed = push_steps(items, wp.vec2i(end, ends[1]), slot, kinds, children, times)
+            warp_sync()
+            ends = wp.vec3i(pushed[0], pushed[1], ends[2])
+            group.nodes = count_in(group.nodes, slot, compared)
+        mode = wp.where(ends[2] >= warp_size() or ends[1] == 0, ONE_STEP, NORMALS)
+        most = wp.where(mode == ONE_STEP, ends[2], ends[1])
+        if most >= warp_size() or (ends[0] == 0 and most > 0):
+            group, ends = meet_faces(
+                items, ends, mode, tolerance, models, states, poses, pair_poses, motion, group
+            )
+    return group
+
+
+@cache
+def warp_search(kind):
+    """Return the kernel of warps for motions of a kind: `path.Motion` or `linear.LinearMotion`."""
+
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    def search_warp_kernel(
+        # static
+        room: wp.int32,
+        tolerance: wp.float64,
+        models: ModelPool,
+        # state
+        states: StatePool,
+        poses: EndPoses,
+        pair_count: wp.array(dtype=wp.int32),
+        pair_poses: wp.array(dtype=PairPose),
+        motion: wp.array(dtype=kind),
+        # out
+        hits_inout: Hits,
+        contacts_inout: Contacts,
+    ):
+        """Search the object pairs that are open, a few a warp."""
+        count = pair_count[0]
+        size = wp.where(count >= GROUPED_LEAST, GROUP, 1)
+        first = size * (wp.tid() / warp_size())
+        if first >= count or contacts_inout.launched[0] == STALE:
+            return
+        items = motion_stack()
+        group, roots = start_group(items, first, size, count, states, pair_poses, contacts_inout)
+        if roots == 0:
+            return
+        stack_room = wp.where(room < STACK_LENGTH, room, MOTION_STACK_LENGTH)
+        group = search_group(items, stack_room, tolerance, models, states, poses, pair_poses, motion, group, roots)
+        for k in range(4):
+            p = first + k
+            if k < size and p < count:
+                if contacts_inout.end[p] == OPEN:
+                    add_warp_sum(hits_inout.node_tests, p, group.nodes[k])
+                    add_warp_sum(hits_inout.triangle_tests, p, group.faces[k])
+                    warp_sync()
+                    if warp_lane() == 0:
+                        contacts_inout.time[p] = group.time[k]
+                        contacts_inout.end[p] = group.end[k]
+
+    return search_warp_kernel
