@@ -24,7 +24,7 @@ from warp_abtree.kernels.distance.triangle_pair import (
     nearest_features,
     scale_triangles,
 )
-from warp_abtree.kernels.motion.path import Moment, Motion, across, place_motion, reverse_moment
+from warp_abtree.kernels.motion.path import Motion, across, place_motion, reverse_moment
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.triangle.distance import corners_type
 from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles

@@ -1,4 +1,4 @@
-"""The search for first contacts by warps, a few object pairs at once: node and face pairs of any of them fill the lanes.
+"""The search for first contacts by warps: node and face pairs of a few object pairs at once fill the lanes.
 
 As `search`, whose answers it has. A face pair is advanced by normals first, which decide most; what is left goes on
 step by step, each with 31 others, since a step takes as long as its slowest lane, and the others are ten times as long.
@@ -282,9 +282,7 @@ def search_group(
         mode = wp.where(ends[2] >= warp_size() or ends[1] == 0, ONE_STEP, NORMALS)
         most = wp.where(mode == ONE_STEP, ends[2], ends[1])
         if most >= warp_size() or (ends[0] == 0 and most > 0):
-            group, ends = meet_faces(
-                items, ends, mode, tolerance, models, states, poses, pair_poses, motion, group
-            )
+            group, ends = meet_faces(items, ends, mode, tolerance, models, states, poses, pair_poses, motion, group)
     return group
 
 

@@ -175,7 +175,5 @@ def advance_faces(  # noqa: F811
     before: Progress,
     best: wp.float64,
 ):
-    contact = advance_linear_pair(
-        tolerance, models, states, poses, pose, motion, faces[0], faces[1], before.time, best
-    )
+    contact = advance_linear_pair(tolerance, models, states, poses, pose, motion, faces[0], faces[1], before.time, best)
     return contact, wp.int32(0)

@@ -1,8 +1,8 @@
 """The search of two trees for their first contact: depth first, the earliest children first.
 
 Each node pair carries the time up to which it is proved apart, made of its own boxes and those above it alone, and is
-dropped if that is after the best time so far. So the earliest time is found whatever the order, on every device. A warp
-takes an object pair on CUDA; a thread of the CPU takes one after the other.
+dropped if that is after the best time so far. So the earliest time is found whatever the order, on every device. A
+thread of the CPU takes one object pair after the other; warps search as in `group`.
 """
 
 from functools import cache
@@ -12,23 +12,9 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.distance.search import (
-    DEPTH_FIRST_ROOM,
-    nearest_stack,
-    push_nearest,
-    read_bound,
-    warp_min,
-    write_bound,
-)
+from warp_abtree.kernels.distance.search import nearest_stack, push_nearest, read_bound, write_bound
 from warp_abtree.kernels.generation import STALE
-from warp_abtree.kernels.motion.face_pair import (
-    CLEAR,
-    TO_THE_END,
-    TOUCHES,
-    UNDECIDED,
-    Contact,
-    Progress,
-)
+from warp_abtree.kernels.motion.face_pair import CLEAR, TO_THE_END, TOUCHES, Contact, Progress
 from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, proves_clear, slide_floor, slides_past
 from warp_abtree.kernels.motion.linear import EndPoses
 from warp_abtree.kernels.motion.path import Motion
@@ -36,13 +22,12 @@ from warp_abtree.kernels.motion.start import OPEN, Contacts
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.face_pairs import Hits
 from warp_abtree.kernels.traversal.load_balance import take_unit
-from warp_abtree.kernels.traversal.node_pair import first_item, four_items, item_first, item_second
+from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
 from warp_abtree.kernels.traversal.simd import take_thread
 from warp_abtree.kernels.traversal.warp_stack import (
     STACK_LENGTH,
     STRADDLING_START,
     read_item,
-    warp_any,
     warp_lane,
     warp_size,
     warp_sync,
@@ -64,8 +49,7 @@ def thread_lists(memory: wp.array2d(dtype=wp.int64), thread: wp.int32) -> wp.uin
 @wp.func
 def meet_faces(
     items: wp.uint64,
-    first: wp.int32,
-    popped: wp.int32,
+    i: wp.int32,
     tolerance: wp.float64,
     models: ModelPool,
     states: StatePool,
@@ -74,33 +58,25 @@ def meet_faces(
     motion: Any,
     before: Contact,
 ):
-    """Advance the face pairs first to first + popped, one a lane; return the earliest, and how many this lane took."""
-    at = STACK_LENGTH + first + wp.min(warp_lane(), popped - 1)
-    item, start = read_item(items, at), wp.float64(read_bound(items, at))
-    live = warp_lane() < popped and start <= before.time
-    warp_sync()
-    own = Contact()
-    if live:
-        faces = wp.vec2i(item_first(item), item_second(item))
-        progress = Progress()
-        progress.time = start
-        progress.mode = TO_THE_END
-        own, _ = advance_faces(tolerance, models, states, poses, pose, motion, faces, progress, before.time)
-    time = wp.where(own.end == CLEAR, wp.float64(wp.inf), own.time)
+    """Advance the i-th face pair; return the earliest contact so far, and how many pairs were compared."""
     best = before
-    earliest = warp_min(time)
-    if earliest < best.time or (earliest == best.time and best.end != TOUCHES):
+    progress = Progress()
+    progress.time = wp.float64(read_bound(items, STACK_LENGTH + i))
+    progress.mode = TO_THE_END
+    if progress.time > best.time:
+        return best, 0
+    item = read_item(items, STACK_LENGTH + i)
+    faces = wp.vec2i(item_first(item), item_second(item))
+    own, _ = advance_faces(tolerance, models, states, poses, pose, motion, faces, progress, best.time)
+    if own.end != CLEAR and (own.time < best.time or (own.time == best.time and best.end != TOUCHES)):
         # A pair that is undecided at the same time does not matter.
-        touches = warp_any(time == earliest and own.end == TOUCHES)
-        best.time = earliest
-        best.end = wp.where(touches, TOUCHES, UNDECIDED)
-    return best, wp.where(live, 1, 0)
+        best = own
+    return best, 1
 
 
 @wp.func
 def search_contact(
     items: wp.uint64,
-    room: wp.int32,
     tolerance: wp.float64,
     models: ModelPool,
     states: StatePool,
@@ -110,44 +86,31 @@ def search_contact(
     p: wp.int32,
     start: wp.float64,
 ):
-    """Return the first contact of an object pair that is apart until a start, and what this lane compared."""
+    """Return the first contact of an object pair that is apart until a start, and how many pairs were compared."""
     best = Contact()
     best.time = wp.float64(1.0)
     best.end = CLEAR
-    if warp_lane() == 0:
-        write_item(items, 0, first_item(states, pose))
-        write_bound(items, 0, wp.float32(start))
-    warp_sync()
+    write_item(items, 0, first_item(states, pose))
+    write_bound(items, 0, wp.float32(start))
     end, waiting = wp.int32(1), wp.int32(0)
     tests, floor = wp.vec2i(), slide_floor(pose, motions[p])
     while end > 0 or waiting > 0:
-        if end > 0 and waiting < warp_size():
-            # One at a time, depth first, needs little room; more where there is.
-            popped = wp.max(1, (room - DEPTH_FIRST_ROOM - end) >> 2)
-            popped = wp.min(popped, wp.min(warp_size(), end))
-            end -= popped
-            at = end + wp.min(warp_lane(), popped - 1)
-            item, t = read_item(items, at), read_bound(items, at)
-            live = wp.where(warp_lane() < popped and wp.float64(t) <= best.time, -1, 0)
-            if live < 0 and slides_past(floor, models, states, pose, motions[p], t, item):
-                live = 0
-            warp_sync()
-            children, kinds, times, compared = four_items(), wp.vec4i(), wp.vec4(), wp.int32(0)
-            if warp_any(live < 0):
-                children, kinds, times, compared = advance_nodes(states, pose, motions[p], t, best.time, item, live)
-            ends = push_nearest(items, end, waiting, kinds, children, times)
-            warp_sync()
-            end = item_second(ends)
-            waiting = item_first(ends)
-            tests[0] += compared
-        # The first face pairs are advanced at once: until then, little is dropped.
-        if waiting >= warp_size() or (waiting > 0 and (end == 0 or best.end == CLEAR)):
-            popped = wp.min(waiting, warp_size())
-            waiting -= popped
-            best, advanced = meet_faces(
-                items, waiting, popped, tolerance, models, states, poses, pose, motions[p], best
-            )
+        if waiting > 0:
+            waiting -= 1
+            best, advanced = meet_faces(items, waiting, tolerance, models, states, poses, pose, motions[p], best)
             tests[1] += advanced
+        else:
+            end -= 1
+            item, t = read_item(items, end), read_bound(items, end)
+            live = wp.float64(t) <= best.time
+            if live and slides_past(floor, models, states, pose, motions[p], t, item):
+                live = False
+            if live:
+                children, kinds, times, compared = advance_nodes(states, pose, motions[p], t, best.time, item, -1)
+                ends = push_nearest(items, end, waiting, kinds, children, times)
+                end = item_second(ends)
+                waiting = item_first(ends)
+                tests[0] += compared
     return best, tests
 
 
@@ -181,7 +144,6 @@ def thread_search(kind):
     @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
     def search_thread_kernel(
         # static
-        room: wp.int32,
         tolerance: wp.float64,
         models: ModelPool,
         # state
@@ -210,7 +172,7 @@ def thread_search(kind):
                 contacts_inout.end[p] = CLEAR
             if contacts_inout.end[p] == OPEN:
                 pose, start = pair_poses[p], contacts_inout.time[p]
-                contact, tests = search_contact(items, room, tolerance, models, states, poses, pose, motion, p, start)
+                contact, tests = search_contact(items, tolerance, models, states, poses, pose, motion, p, start)
                 contacts_inout.time[p] = contact.time
                 contacts_inout.end[p] = contact.end
                 hits_inout.node_tests[p] += wp.int64(tests[0])

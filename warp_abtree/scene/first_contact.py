@@ -244,10 +244,10 @@ class FirstContactQuery(Query):
         poses = straight.EndPoses()
         poses.rotation, poses.position = objects.rotation, objects.position
         poses.end_rotation, poses.end_position = self.ends.rotation, self.ends.position
-        inputs = [self._stack_length(), self.tolerance, models, states, poses]
-        inputs += [self.pair_count, self.pair_poses, self._motion]
+        inputs = [self.tolerance, models, states, poses, self.pair_count, self.pair_poses, self._motion]
         if self.uses_warps():
-            dim, inputs = room * (WARP_SIZE if self.device.is_cuda else 1), [*inputs, self.hits, self.contacts]
+            dim = room * (WARP_SIZE if self.device.is_cuda else 1)
+            inputs = [self._stack_length(), *inputs, self.hits, self.contacts]
             return [launch(group.warp_search(self._kind), dim=dim, inputs=inputs, block_dim=WARP_SIZE)]
         inputs += [self.hits, self.contacts, self._memory]
         return [launch(search.thread_search(self._kind), dim=1, inputs=inputs)]
