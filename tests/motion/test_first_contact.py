@@ -12,6 +12,7 @@ from oracles.motion import apart_until, pose_between, rigid_soups, translation_c
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.kernels.motion import group
 
 
 def starts_of(cases):
@@ -130,6 +131,20 @@ def test_regimes_agree(device):
     for warps, length in ((True, None), (True, 129), (None, 200)):
         with testing.regime(warps=warps, stack_length=length, cpu_threads=1 if length else 2):
             assert to_bytes(find(device, cases, ends)) == first
+
+
+def test_warps_that_take_a_group_of_pairs_agree(device):
+    rng = np.random.default_rng(8)
+    cases, ends = random_motions(rng, 65, faces=30)
+    pairs = np.array([(i, j) for j in range(len(ends)) for i in range(j)])
+    assert len(pairs) > int(group.GROUPED_LEAST) and len(pairs) % int(group.GROUP)
+    found = []
+    for warps in (None, True):
+        with testing.regime(warps=warps):
+            found.append(scene_of(device, cases).first_contact(pairs, ends))
+    few = scene_of(device, cases).first_contact(pairs[:1000], ends)
+    assert to_bytes(found[0]) == to_bytes(found[1])
+    np.testing.assert_array_equal(found[1].time[:1000], few.time)
 
 
 @pytest.mark.parametrize("exponent", [-40, 40])

@@ -113,7 +113,7 @@ def test_steps_of_faces_leave_room_for_all_that_they_may_be_off(device):
         n, top = row["n"], (row["base"] @ row["n"]).max() + row["slack"]
         gaps = (row["mover"] @ row["rotation"].T + row["shift"]) @ n - top
         rates = (row["mover"] @ row["spin"].T + row["speed"]) @ n
-        bends = row["bend"][0] * np.linalg.norm(row["mover"][:, :2], axis=1).max() + row["bend"][1]
+        bends = row["bend"][0] * np.full(3, np.linalg.norm(row["mover"][:, :2], axis=1).max()) + row["bend"][1]
         for step, rate, bend in (
             (bent, rates - row["speed_slack"], bends),
             (straight, rates - row["slack"], 0 * bends),
