@@ -57,8 +57,9 @@ def motion_stack() -> wp.uint64:
     """Return where this warp's lists lie, an address in shared memory on CUDA."""
 
 
-@wp.func_native(stack_code("read_number"))
-def read_number(items: wp.uint64, i: wp.int32) -> wp.float32: ...
+@wp.func_native(stack_code("read_tag"))
+def read_tag(items: wp.uint64, i: wp.int32) -> wp.float32:
+    """Return until when the i-th pair is apart, or of a face pair that goes on how many steps were made."""
 
 
 @wp.func_native(stack_code("read_slot"))
@@ -66,7 +67,7 @@ def read_slot(items: wp.uint64, i: wp.int32) -> wp.int32: ...
 
 
 @wp.func_native(stack_code("write_entry"))
-def write_entry(items: wp.uint64, i: wp.int32, item: wp.int64, number: wp.float32, slot: wp.int32): ...
+def write_entry(items: wp.uint64, i: wp.int32, item: wp.int64, tag: wp.float32, slot: wp.int32): ...
 
 
 @wp.func_native(stack_code("write_time"))
@@ -190,11 +191,11 @@ def meet_faces(
         going -= popped
         at = GOING_START + going + lane
         progress.time = wp.cast(read_item(items, TIMES_START + going + lane), wp.float64)
-        progress.steps = wp.int32(read_number(items, at))
+        progress.steps = wp.int32(read_tag(items, at))
     else:
         waiting -= popped
         at = MOTION_STACK_LENGTH + waiting + lane
-        progress.time = wp.float64(read_number(items, at))
+        progress.time = wp.float64(read_tag(items, at))
     item, slot = read_item(items, at), read_slot(items, at)
     best = time_of(group, slot)
     live = warp_lane() < popped and progress.time <= best
@@ -265,7 +266,7 @@ def search_group(
             popped = wp.min(popped, wp.min(warp_size(), ends[0]))
             end = ends[0] - popped
             at = end + wp.min(warp_lane(), popped - 1)
-            item, t, slot = read_item(items, at), read_number(items, at), read_slot(items, at)
+            item, t, slot = read_item(items, at), read_tag(items, at), read_slot(items, at)
             p, best = group.first + slot, time_of(group, slot)
             live = wp.where(warp_lane() < popped and wp.float64(t) <= best, -1, 0)
             floor = slide_floor(pair_poses[p], motion[p])

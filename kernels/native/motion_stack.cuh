@@ -1,5 +1,5 @@
-// A warp's lists of a search for first contacts: node pairs, face pairs that wait and those that go on, each with a
-// number and the slot of its object pair; behind them the times of those that go on.
+// A warp's lists of a search for first contacts: node pairs, face pairs that wait and those that go on, each with a tag,
+// its time or its steps, and the slot of its object pair; behind them the times of those that go on.
 #pragma once
 #include "builtin.h"
 #include "sizes.h"
@@ -15,15 +15,15 @@ inline CUDA_CALLABLE wp::uint64 motion_stack() {
 #endif
 }
 
-inline CUDA_CALLABLE wp::float32 read_number(wp::uint64 items, wp::int32 i) {
+inline CUDA_CALLABLE wp::float32 read_tag(wp::uint64 items, wp::int32 i) {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
-    float number;
+    float tag;
     asm volatile("ld.shared.f32 %0, [%1];"
-                 : "=f"(number)
+                 : "=f"(tag)
                  : "r"((unsigned int)items + 8 * MOTION_LENGTH + 4 * i)
                  : "memory");
-    return number;
+    return tag;
 #else
     return ((const float*)((const long long*)items + MOTION_LENGTH))[i];
 #endif
@@ -43,19 +43,19 @@ inline CUDA_CALLABLE wp::int32 read_slot(wp::uint64 items, wp::int32 i) {
 #endif
 }
 
-inline CUDA_CALLABLE void write_entry(wp::uint64 items, wp::int32 i, wp::int64 item, wp::float32 number,
+inline CUDA_CALLABLE void write_entry(wp::uint64 items, wp::int32 i, wp::int64 item, wp::float32 tag,
                                       wp::int32 slot) {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
     const unsigned int start = items;
     asm volatile("st.shared.b64 [%0], %1; st.shared.f32 [%2], %3; st.shared.u8 [%4], %5;" ::"r"(start + 8 * i),
-                 "l"((long long)item), "r"(start + 8 * MOTION_LENGTH + 4 * i), "f"(number),
+                 "l"((long long)item), "r"(start + 8 * MOTION_LENGTH + 4 * i), "f"(tag),
                  "r"(start + 8 * (MOTION_TIMES_START + 2 * WARP_SIZE) + i), "r"(slot)
                  : "memory");
 #else
     long long* const start = (long long*)items;
     start[i] = item;
-    ((float*)(start + MOTION_LENGTH))[i] = number;
+    ((float*)(start + MOTION_LENGTH))[i] = tag;
     ((unsigned char*)(start + MOTION_TIMES_START + 2 * WARP_SIZE))[i] = slot;
 #endif
 }

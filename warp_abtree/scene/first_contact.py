@@ -26,7 +26,7 @@ from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.arrays import ObjectPool
-from warp_abtree.kernels.motion import face_pair, group, path, search, start, swept_boxes
+from warp_abtree.kernels.motion import face_pair, group, path, search, start
 from warp_abtree.kernels.motion import linear as straight
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
@@ -91,7 +91,7 @@ class SweptBroadPhase(BroadPhase):
     def _make_boxes(self, launch):
         query = self._query
         inputs = [query.linear, query.screw, *self.batch.pools, query.ends, self.guard.record(), self.lower, self.upper]
-        return launch(swept_boxes.sweep_box_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
+        return launch(start.sweep_box_kernel, dim=len(self.lower), inputs=inputs, device=self.device)
 
 
 class FirstContactQuery(Query):
