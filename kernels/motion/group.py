@@ -291,7 +291,8 @@ def search_group(
 def warp_search(kind):
     """Return the kernel of warps for motions of a kind: `path.Motion` or `linear.LinearMotion`."""
 
-    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    # Fourteen warps a multiprocessor hide more of what loads wait for than spilled registers cost.
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS, launch_bounds=(32, 14))
     def search_warp_kernel(
         # static
         room: wp.int32,
