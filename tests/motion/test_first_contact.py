@@ -225,6 +225,7 @@ def test_the_broad_phase_finds_all_that_touch(device, path):
         scene.add(sample("capsule"), pose, world=i % 2, lod=sample("capsule").lod_for(fraction=0.1))
     found = scene.first_contact(None, ends, **path)
     assert 0 < (~found.clear).sum() < len(found.pairs) < count * (count - 2) / 4
+    np.testing.assert_array_equal(found.pairs, np.unique(found.pairs, axis=0))
     every = np.array([(i, j) for i in range(count) for j in range(i + 2, count, 2)])
     whole = scene.first_contact(every, ends, **path)
     times = [dict(zip(map(tuple, r.pairs[~r.clear].tolist()), r.time[~r.clear].tolist())) for r in (found, whole)]

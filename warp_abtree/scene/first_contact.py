@@ -102,7 +102,8 @@ class FirstContactQuery(Query):
     Args:
         scene: As for `Query`: its poses at the time of each launch are where motions start.
         end_poses: As for `set_end_poses`; None for those of the scene as it stands, until others are set.
-        pairs, capacity: As for `Query`; the broad phase finds objects whose boxes overlap somewhere on their way.
+        pairs, capacity: As for `Query`; the broad phase finds objects whose boxes overlap somewhere on their way, and
+            sorts them.
         tolerance: What a time may be early by, as a part of the motion, from 2^-40 up.
         screw: Whether objects move on screws.
         linear: Whether vertices move straight instead, from one posed mesh to the other; whatever the turn.
@@ -125,7 +126,7 @@ class FirstContactQuery(Query):
         self.tolerance, self.screw, self.linear = check_tolerance(tolerance), bool(screw), bool(linear)
         self.contacts, self.ends, self._ways = start.Contacts(), ObjectPool(), start.Ways()
         self.contacts.counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
-        super().__init__(scene, "any", pairs, capacity)
+        super().__init__(scene, "any", pairs, capacity, sort_pairs=True)
         self.batch.models.make_slabs()
         self.contacts.launched = self.guard.launched
         paths = path.Paths()

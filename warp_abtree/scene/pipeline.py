@@ -56,8 +56,9 @@ class Pipeline:
 
     `launch()` only launches, on arrays that are allocated once, so that a graph can capture it, on CUDA and the CPU,
     together with the kernels of a simulator or an LOD controller that write `poses` and `lods`. The answers are those
-    of `set_poses`, `set_lods` and `intersect` of the scene, bit for bit. No launch waits for the host, and their number
-    depends on nothing but how many states there are and how deep their trees (at most 31 levels):
+    of `set_poses`, `set_lods` and `intersect` of the scene, bit for bit, but for the order of pairs: on CUDA the one in
+    which the broad phase found them. No launch waits for the host, and their number depends on nothing but how many
+    states there are and how deep their trees (at most 31 levels):
 
     * 1 for poses;
     * 3 for LODs; 4 more where there are trees that no block of threads takes (on CUDA from 4,096 faces on, or as many
