@@ -1,5 +1,5 @@
-// A warp's lists of a search for first contacts: node pairs, face pairs that wait and those that go on, each with a tag,
-// its time or its steps, and the slot of its object pair; behind them the times of those that go on.
+// A warp's lists of a search for first contacts: node pairs, face pairs that wait and those that go on, each with a
+// tag, its time or its steps, and the slot of its object pair; behind them the times of those that go on.
 #pragma once
 #include "builtin.h"
 #include "sizes.h"
@@ -43,8 +43,7 @@ inline CUDA_CALLABLE wp::int32 read_slot(wp::uint64 items, wp::int32 i) {
 #endif
 }
 
-inline CUDA_CALLABLE void write_entry(wp::uint64 items, wp::int32 i, wp::int64 item, wp::float32 tag,
-                                      wp::int32 slot) {
+inline CUDA_CALLABLE void write_entry(wp::uint64 items, wp::int32 i, wp::int64 item, wp::float32 tag, wp::int32 slot) {
 #include "sizes.h"
 #if defined(__CUDA_ARCH__)
     const unsigned int start = items;
