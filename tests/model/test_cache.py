@@ -10,6 +10,7 @@ import trimesh
 import warp_abtree as ab
 from warp_abtree.model import cache
 from warp_abtree.model import model as model_module
+from warp_abtree.model import progressive as progressive_module
 
 
 @pytest.fixture
@@ -38,12 +39,59 @@ def ball(tmp_path):
     return path
 
 
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:1000])
+
+
+def alter(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+
+
+def other_errors(path):
+    """Errors half as large, under the same key and digest."""
+    with np.load(path) as file:
+        members = dict(file)
+    np.savez(path, **members | {"lod_error": members["lod_error"] / 2})
+
+
 def test_a_file_that_comes_again_is_opened(folder, built, ball):
     first, second = ab.Model.load(ball), ab.Model.load(str(ball))
     assert built == ["ball"] and len(list(folder.iterdir())) == 1
     assert second.digest == first.digest and second.name == "ball" and second.error_at(7) == first.error_at(7)
     shutil.copy(ball, ball.with_name("copy.obj"))
     assert ab.Model.load(ball.with_name("copy.obj")).name == "copy" and built == ["ball"]
+
+
+def test_certified_errors_are_kept_when_there_are_any(folder, ball, monkeypatch):
+    first = ab.Model.load(ball)
+    assert first.progressive.known_error is None and len(list(folder.iterdir())) == 1
+    errors = first.progressive.lod_error
+    assert len(list(folder.iterdir())) == 2
+    monkeypatch.setattr(progressive_module, "certify_errors", lambda *_: pytest.fail("certified again"))
+    assert np.array_equal(ab.Model.load(ball).progressive.lod_error, errors)
+    monkeypatch.undo()
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_errors_can_be_certified_at_once(folder, ball, beside):
+    """Beside the collapse, or of a model that is found without them; either way they are kept."""
+    if not beside:
+        ab.Model.load(ball)
+    model = ab.Model.load(ball, certify=True)
+    assert beside == (model.progressive.known_error is not None) and len(list(folder.iterdir())) == 2
+    assert np.array_equal(model.progressive.lod_error, ab.Model.load(ball, cache=False).progressive.lod_error)
+
+
+@pytest.mark.parametrize("damage", [truncate, alter, other_errors])
+def test_damaged_errors_are_certified_again(folder, ball, damage):
+    errors = ab.Model.load(ball, certify=True).progressive.lod_error
+    (path,) = (path for path in folder.iterdir() if "lod_error" in np.load(path))
+    whole = path.read_bytes()
+    damage(path)
+    assert np.array_equal(ab.Model.load(ball).progressive.lod_error, errors)
+    assert path.read_bytes() == whole
 
 
 def test_options_and_other_contents_build_anew(folder, built, ball):
@@ -83,16 +131,6 @@ def test_where_the_folder_is(monkeypatch, tmp_path):
     assert cache.cache_folder() == tmp_path / "home" / ".cache" / "warp_abtree"
     monkeypatch.setenv("WARP_ABTREE_CACHE", "~/models")
     assert cache.cache_folder() == tmp_path / "home" / "models"
-
-
-def truncate(path):
-    path.write_bytes(path.read_bytes()[:1000])
-
-
-def alter(path):
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 255
-    path.write_bytes(data)
 
 
 def replace_by_another(path):

@@ -20,7 +20,7 @@ def with_errors(model):
     """Return the model with made-up errors."""
     m = model.lod_max
     errors = np.linspace(1.0, 0.0, m + 1) ** 3 if m else np.zeros(1)
-    return Model(dataclasses.replace(model.progressive, lod_error=errors), model.tree, model.name)
+    return Model(dataclasses.replace(model.progressive, known_error=errors), model.tree, model.name)
 
 
 def assert_same(model, other):
@@ -93,7 +93,8 @@ def test_equal_models_have_equal_digests(tmp_path):
     for name in ARRAYS:
         changed = getattr(model.progressive, name).copy()
         changed.flat[-1] += 1
-        digests.add(Model(dataclasses.replace(model.progressive, **{name: changed}), model.tree, "").digest)
+        arrays = {"known_error": model.progressive.lod_error, name.replace("lod_error", "known_error"): changed}
+        digests.add(Model(dataclasses.replace(model.progressive, **arrays), model.tree, "").digest)
     assert len(digests) == 2 + len(ARRAYS)
 
 

@@ -92,18 +92,19 @@ DIGESTS = {
 }
 
 
+@pytest.mark.parametrize("certify", [False, True], ids=["later", "beside"])
 @pytest.mark.parametrize("threads", [1, 2, 5])
 @pytest.mark.parametrize("name", MESHES)
-def test_a_model_keeps_its_digest(name, threads, monkeypatch):
+def test_a_model_keeps_its_digest(name, threads, certify, monkeypatch):
     monkeypatch.setattr(lod_bounds, "LEAST_FACES", 1)  # four cores and more work in windows
     with testing.regime(cpu_threads=threads):
-        assert ab.Model.from_arrays(*MESHES[name](), base_faces=4).digest == DIGESTS[name]
+        assert ab.Model.from_arrays(*MESHES[name](), base_faces=4, certify=certify).digest == DIGESTS[name]
 
 
 @pytest.mark.parametrize("mesh", [waves(16), bent_tube(16, 12), crowd(30)], ids=["waves", "tube", "crowd"])
 def test_covers_of_one_face_at_a_time_give_the_same(mesh, monkeypatch):
     """Where slots may run out, triangles are covered face by face: the same arithmetic without vectors."""
-    first = ab.Model.from_arrays(*mesh, base_faces=4)
+    first = ab.Model.from_arrays(*mesh, base_faces=4, certify=True)
     monkeypatch.setattr(lod_bounds, "SLOTS_PER_FACE", 0)
     monkeypatch.setattr(lod_bounds, "SLOTS_EXTRA", int(COVERS_AT_ONCE * SLOTS) - 1)
     assert ab.Model.from_arrays(*mesh, base_faces=4).digest == first.digest
@@ -144,7 +145,7 @@ def test_windows_leave_the_same_faces_to_cover_each_triangle(mesh, cores, monkey
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cow", "fandisk", "homer", "stanford-bunny"])
-@pytest.mark.parametrize("threads", [2, 5])
-def test_a_real_model_keeps_its_digest(name, threads):
+@pytest.mark.parametrize("threads, certify", [(2, True), (5, False)])
+def test_a_real_model_keeps_its_digest(name, threads, certify):
     with testing.regime(cpu_threads=threads):
-        assert ab.Model.load(real_mesh_path(name)).digest.startswith(DIGESTS[name])
+        assert ab.Model.load(real_mesh_path(name), certify=certify).digest.startswith(DIGESTS[name])

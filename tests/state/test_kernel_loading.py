@@ -1,5 +1,6 @@
 """Kernels that several threads compile: each once, all before they are launched, and errors come through."""
 
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -89,14 +90,35 @@ def compile_ahead(monkeypatch, device, cores, kernels, number):
 
 
 def test_kernels_of_a_query_are_compiled_beside_a_build(device, monkeypatch):
-    """As a launch finds them, where there are cores; what has not begun by the end is left."""
+    """As a launch finds them, where there are cores."""
     kernels = make_kernels(time.time_ns() % 10**7)
-    assert compile_ahead(monkeypatch, device, 3, kernels, 0) == 0
-    assert compile_ahead(monkeypatch, device, 4, kernels, 0) < len(kernels)
+    assert compile_ahead(monkeypatch, device, 1, kernels, 0) == 0
     assert compile_ahead(monkeypatch, device, 4, kernels, len(kernels)) == len(kernels)
     for kernel, block_dim in kernels:
         folder = kernel.module.get_module_identifier(1 if wp.get_device(device).is_cpu else block_dim)
         assert [file.suffix for file in Path(wp.config.kernel_cache_dir, folder).iterdir() if file.suffix == ".meta"]
+
+
+def test_the_end_of_a_build_waits_for_what_has_begun_and_compiles_meanwhile(monkeypatch):
+    """One thread is held at its first kernel; it takes no other, and the calling one goes on until that is done."""
+    held, compiled_two, taken = threading.Event(), threading.Event(), {True: 0, False: 0}
+
+    def load(*_):
+        calling = threading.current_thread() is threading.main_thread()
+        taken[calling] += 1
+        if calling and taken[calling] == 2:
+            compiled_two.set()
+        elif not calling:
+            held.set()
+            assert compiled_two.wait(60)
+
+    kernels = make_kernels(4)
+    monkeypatch.setattr(kernel_loading, "core_count", lambda: 2)
+    monkeypatch.setattr(kernel_loading, "_first_query", [lambda device, face_counts: kernels])
+    monkeypatch.setattr(wp, "force_load", load)
+    with wp.ScopedDevice("cpu"), kernel_loading.compiling_ahead(1) as busy:
+        assert busy == 1 and held.wait(60)
+    assert taken[False] == 1 and 2 <= taken[True] <= 3
 
 
 def test_an_error_ahead_is_said_by_the_launch(device, monkeypatch):

@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 
 import warp as wp
@@ -11,8 +10,8 @@ from warp_abtree.checks.cpu_threads import core_count, wait_for, workers
 
 # Threads beside the calling one: on the CPU each compiles Warp's headers for itself first.
 THREADS = {"cpu": 1, "cuda": 7}
-# The same beside the build of a model, which keeps two cores busy itself.
-AHEAD_THREADS, BUILD_CORES = {"cpu": 2, "cuda": 6}, 2
+# The same beside the build of a model, which keeps one core busy itself.
+AHEAD_THREADS = {"cpu": 2, "cuda": 6}
 
 _asked: set[tuple] = set()
 _first_query: list[Callable] = []
@@ -25,18 +24,19 @@ def _new_kernels(device, kernels) -> deque:
 
 
 @contextmanager
-def loading(device, kernels):
+def loading(device, kernels, busy: int = 0):
     """Load kernels beside what is done inside, and end when all are loaded; each is loaded once in a process.
 
     Args:
         device: Of the launches, `wp.Device`.
         kernels: The kernel and the block size of each launch, those first that take longest.
+        busy: Cores that other threads keep busy, as `compiling_ahead` says.
 
     Raises:
         Exception: What the compiler says, as a launch would.
     """
     new = _new_kernels(device, kernels)
-    threads = min(THREADS["cpu" if device.is_cpu else "cuda"], core_count() - 1, len(new))
+    threads = min(THREADS["cpu" if device.is_cpu else "cuda"], core_count() - 1 - busy, len(new))
 
     def load():
         while new:
@@ -50,7 +50,7 @@ def loading(device, kernels):
     jobs = [workers(threads).submit(load) for _ in range(threads)]
     try:
         yield
-        if jobs:
+        if jobs or busy:
             load()
     finally:
         new.clear()
@@ -69,29 +69,30 @@ def of_first_query(function):
 def compiling_ahead(face_count: int):
     """Compile beside what is done inside, the build of a model, what a query on Warp's default device will launch.
 
-    Only what has begun by the end is waited for; where there are few cores nothing begins. On a GPU nothing is loaded,
-    so that a process which only builds models has no CUDA context. What the compiler says, a launch will say again.
+    Yields the cores that this keeps busy. Only what has begun by the end is waited for, and the rest goes on meanwhile.
+    On a GPU nothing is loaded, so that a process which only builds models has no CUDA context. What the compiler says,
+    a launch will say again.
     """
     device = wp.get_device()
     kind = "cpu" if device.is_cpu else "cuda"
-    threads = min(AHEAD_THREADS[kind], core_count() - BUILD_CORES)
-    if threads < 2:
-        yield
-        return
     new = deque(key for kernels in _first_query for key in _new_kernels(device, kernels(device, [face_count])))
+    threads = min(AHEAD_THREADS[kind], core_count() - 1, len(new))
 
-    def compile_one(_):
-        with suppress(IndexError):  # emptied at the end
+    def compile_next():
+        with suppress(Exception):  # emptied at the end, or what the compiler says
             _, module, block_dim = new.popleft()
             if kind == "cpu":
                 wp.force_load(device, [module], block_dim)
             elif module.options["block_dim"] == block_dim:  # else a launch would look for another file
                 wp.compile_aot_module(module, device)
 
-    with ThreadPoolExecutor(min(threads, max(1, len(new)))) as pool:
-        try:
-            for key in tuple(new):
-                pool.submit(compile_one, key)
-            yield
-        finally:
-            new.clear()
+    # The threads that `loading` takes later, each with Warp's headers compiled.
+    jobs = [workers(threads).submit(compile_next) for _ in range(len(new))] if threads > 0 else []
+    try:
+        yield max(0, threads)
+        begun = [job for job in jobs if not job.cancel()]
+        while new and not all(job.done() for job in begun):
+            compile_next()
+    finally:
+        new.clear()
+        wait_for(jobs)

@@ -19,7 +19,7 @@ from warp_abtree.model.obj import split_file_name
 VARIABLE = "WARP_ABTREE_CACHE"
 SIZE_LIMIT = 2 << 30  # bytes in the folder; the models that were used least recently go
 KEY_DIGITS = 40
-BUILDER = 2  # grows with each change of what is built of the same mesh
+BUILDER = 3  # grows with each change of what is built of the same mesh
 LEAST_FACES = 1_000  # smaller models are built as fast as opened
 SELF_CONTAINED = {"obj", "ply", "stl", "off", "glb"}  # other formats may refer to further files
 
@@ -79,6 +79,30 @@ def find_model(key, open_model):
     with contextlib.suppress(OSError):
         os.utime(path)  # used now
     return model
+
+
+def error_key(key) -> str | None:
+    """Return the key of the certified errors of the model of a key."""
+    return None if key is None else _key([], key, "errors")
+
+
+def find_errors(key, length: int) -> np.ndarray | None:
+    """Return the certified errors of a key, float64 (length,), None if there are none that are whole."""
+
+    def read(path):
+        with np.load(path, allow_pickle=False) as file:
+            errors, digest = file["lod_error"], file["digest"]
+        if errors.shape != (length,) or digest.tobytes() != hashlib.blake2b(errors.tobytes()).digest():
+            raise ValueError("altered")
+        return errors
+
+    return find_model(key, read)
+
+
+def keep_errors(key, errors: np.ndarray):
+    """Write certified errors to the file of a key."""
+    digest = np.frombuffer(hashlib.blake2b(errors.tobytes()).digest(), np.uint8)
+    keep_model(key, {"lod_error": errors, "digest": digest})
 
 
 def keep_model(key, arrays):

@@ -92,6 +92,11 @@ class Collapse:
             self._moved.wait_for(lambda: self._ended or self._merges > merges)
             return self._merges, self._removed, self._ended
 
+    def merged(self, begin, end):
+        """Return the positions that some merges make [model units], float64 [end - begin, 3]."""
+        centre, scale = self.frame
+        return centre + scale * self.pos[self.vertex_count + begin : self.vertex_count + end]
+
     def stop(self):
         """Let `run` end after the launch under way."""
         self._stopped = True

@@ -1,9 +1,11 @@
-"""Certified errors of all LODs: a replay of the collapse sequence that keeps up with it."""
+"""Certified errors of all LODs: a replay of the collapse sequence, beside it or afterwards."""
 
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.cpu_threads import launch_on_cores
+from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
+from warp_abtree.checks.kernel_loading import loading
+from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.progressive import block_queue, hausdorff_bound, merge_window, polygon, triangle_cover
 from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, unwritten
 
@@ -18,6 +20,27 @@ SLOTS_PER_FACE, SLOTS_EXTRA = 3, 4096
 # both surfaces, a closest point of some ten operations, and the points of at most 64 cuts by three planes each, every
 # one within 2^-52 a coordinate of the segment that it cuts: 192 sqrt(3) 2^-52 and a little, under 2^-43.
 ROUNDING = 2.0**-43
+
+# With the threads of a block, as `loading` takes them; windows, of large models alone, are compiled when launched.
+ERROR_KERNELS = [(hausdorff_bound.replay_merges_kernel, 1)]
+
+
+def certify_errors(vertices, faces, parent, merged):
+    """Return the certified errors of all LODs [model units], float64 [m+1], of a forest and the positions it merges to.
+
+    Args:
+        parent: vertex_parent int32 [n_v+m].
+        merged: Positions of the nodes that merges make [model units], float64 [m, 3].
+    """
+    threads = current_regime().cpu_threads or core_count()
+    with loading(wp.get_device("cpu"), ERROR_KERNELS):
+        bounds = LodBounds(vertices, faces)
+        # The two nodes of each merge, the lower one first.
+        nodes = np.flatnonzero(parent >= 0).astype(np.int32)
+        bounds.add(nodes[np.argsort(parent[nodes], kind="stable")].reshape(-1, 2), merged)
+    while bounds.done < len(merged):
+        bounds.advance(threads)
+    return bounds.errors()
 
 
 class LodBounds:

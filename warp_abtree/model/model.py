@@ -2,7 +2,8 @@
 
 import hashlib
 import warnings
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from warp_abtree.checks.arguments import first_line, whole_number
 from warp_abtree.checks.atomic_write import atomic_write
-from warp_abtree.model.cache import LEAST_FACES, file_key, find_model, keep_model, mesh_key
+from warp_abtree.model.cache import LEAST_FACES, error_key, file_key, find_model, keep_errors, keep_model, mesh_key
 from warp_abtree.model.mesh import (
     COORDINATE_MAX,
     COORDINATE_MIN,
@@ -36,9 +37,8 @@ _ARRAYS = {
     "face_split": (np.int32, 1),
     "split_start": (None, 1),
     "split_face": (np.int32, 1),
-    "lod_error": (np.float64, 1),
 }
-_MEMBERS = (*_ARRAYS, "leaf_node", "name")
+_ERROR = {"lod_error": (np.float64, 1)}  # not of files of the cache, which keeps errors by themselves
 
 
 class ModelError(ValueError):
@@ -73,7 +73,9 @@ class Model:
         return f"Model({self.name!r}, {self.face_count:,} faces, LODs 0 .. {self.lod_max:,})"
 
     @classmethod
-    def load(cls, source, base_faces: int = 10, progress=None, cache: bool = True, orient: bool = False) -> "Model":
+    def load(
+        cls, source, base_faces: int = 10, progress=None, cache: bool = True, orient: bool = False, certify=False
+    ) -> "Model":
         """Load a mesh and build its progressive mesh and AB-Tree, or open the model that was built of it before.
 
         Models of 1,000 faces and more are kept in $WARP_ABTREE_CACHE, by default ~/.cache/warp_abtree, at most 2 GiB of
@@ -87,6 +89,8 @@ class Model:
             cache: Whether to look for the model in the cache, and to keep it there.
             orient: Whether to turn faces so that neighbours agree about the outside, and closed parts that are inside
                 out; face ids stay, and so does what has one side only.
+            certify: Whether to certify the errors of all LODs at once, beside the collapse, which takes less time in
+                all; else they are certified when `error_at`, a tolerance or `save` first needs them.
 
         Raises:
             MeshError: The mesh is missing, unreadable, empty or invalid.
@@ -95,24 +99,22 @@ class Model:
         base_faces = whole_number(base_faces, "base_faces", 1, 2**62)
         options = (FORMAT_VERSION, base_faces, "oriented") if orient else (FORMAT_VERSION, base_faces)
         key = file_key(source, *options) if cache else None
-        model = find_model(key, cls.open)
+        model = find_model(key, partial(_read, error_key=error_key(key)))
         if model is not None:
-            return cls(model.progressive, model.tree, split_file_name(Path(source))[0])
-        mesh = source if isinstance(source, Mesh) else load_mesh(source)
-        mesh = orient_mesh(mesh) if orient else mesh
-        cache = cache and len(mesh.faces) >= max(LEAST_FACES, base_faces)
-        if cache and key is None:
-            key = mesh_key(mesh, *options)
-            model = find_model(key, cls.open)
-        if model is None:
-            trees = []
-            progressive = build_progressive(
-                mesh, base_faces, progress, then=lambda: trees.append(active_build(mesh.vertices, mesh.faces))
-            )
-            model = cls(progressive, trees[0], mesh.name)
-            if cache:
-                keep_model(key, _file_members(progressive, model.tree, mesh.name))
-        return model if model.name == mesh.name else cls(model.progressive, model.tree, mesh.name)
+            model = cls(model.progressive, model.tree, split_file_name(Path(source))[0])
+        else:
+            mesh = source if isinstance(source, Mesh) else load_mesh(source)
+            mesh = orient_mesh(mesh) if orient else mesh
+            if not cache or len(mesh.faces) < max(LEAST_FACES, base_faces):
+                key = None
+            elif key is None:
+                key = mesh_key(mesh, *options)
+                model = find_model(key, partial(_read, error_key=error_key(key)))
+            model = model or _build(mesh, base_faces, progress, key, certify)
+            model = model if model.name == mesh.name else cls(model.progressive, model.tree, mesh.name)
+        if certify:
+            model.error_at(0)
+        return model
 
     @classmethod
     def from_arrays(
@@ -124,9 +126,10 @@ class Model:
         name: str = "arrays",
         cache: bool = True,
         orient: bool = False,
+        certify: bool = False,
     ):
         """Build a model from vertices (v, 3) and faces (n, 3); see `load`."""
-        return cls.load(mesh_from_arrays(vertices, faces, name=name), base_faces, progress, cache, orient)
+        return cls.load(mesh_from_arrays(vertices, faces, name=name), base_faces, progress, cache, orient, certify)
 
     @cached_property
     def winding(self) -> Winding:
@@ -145,7 +148,7 @@ class Model:
     @cached_property
     def digest(self) -> str:
         """Hash of mesh, collapses and tree, hexadecimal; equal for equal models whatever their names."""
-        return _hash_arrays(_model_arrays(self.progressive, self.tree)).hex()
+        return _hash_arrays(_model_arrays(self.progressive, self.tree, _ERROR)).hex()
 
     @property
     def face_count(self) -> int:
@@ -177,11 +180,12 @@ class Model:
         distance. Neither bounds the other: where a LOD closes a gap, "inward" may be 0 and "outward" large.
 
         Args:
-            side: "inward": largest distance of a point of the original surface from the surface at the LOD. Computed
-                when the model is built; falls with the LOD. "outward": largest distance of a point of the surface at
-                the LOD from the original surface; usually within 1 % of the true one. Computed on demand on one core of
-                the CPU, then cached: 2 to 4 us for each face of the original, more for soups of long faces. Not
-                monotone in the LOD.
+            side: "inward": largest distance of a point of the original surface from the surface at the LOD. Certified
+                for all LODs when one is first asked for, on all cores of the CPU, then cached: some 30 us for each face
+                of the original. Falls with the LOD. "outward": largest distance of a point of the surface at the LOD
+                from the original surface; usually within 1 % of the true one. Computed on demand on one core of the
+                CPU, then cached: 2 to 4 us for each face of the original, more for soups of long faces. Not monotone in
+                the LOD.
 
         Raises:
             ValueError: lod is no whole number from 0 to lod_max, or side is another word.
@@ -207,8 +211,9 @@ class Model:
 
     def save(self, path):
         """Write the model to an .npz file, atomically; raise OSError if that cannot be."""
+        members = _file_members(self.progressive, self.tree, self.name, _ERROR)
         with atomic_write(path) as file:
-            np.savez_compressed(file, **_file_members(self.progressive, self.tree, self.name))
+            np.savez_compressed(file, **members)
 
     @classmethod
     def open(cls, path) -> "Model":
@@ -217,32 +222,55 @@ class Model:
         Raises:
             ModelError: The file is missing, no model file, truncated, altered, or of another version.
         """
-        path = Path(path)
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                _check_format(path, file)
-                digest = file["digest"]
-                arrays = {name: file[name] for name in _MEMBERS}
-        except ModelError:
-            raise
-        except FileNotFoundError:
-            raise ModelError(f"{path}: no such file") from None
-        except Exception as error:  # NumPy's readers raise whatever goes wrong inside them
-            raise ModelError(f"{path}: cannot be read as a model file ({first_line(error)})") from None
-        model = _assemble(path, dict(arrays))
-        # Consistent arrays may still have altered values, such as a bound.
-        if not isinstance(digest, np.ndarray) or digest.tobytes() != _hash_arrays(arrays):
-            raise ModelError(f"{path}: altered since it was saved")
-        return model
+        return _read(Path(path), _ERROR)
 
 
-def _model_arrays(progressive: ProgressiveMesh, tree: Tree) -> dict[str, Any]:
-    return {name: getattr(progressive, name) for name in _ARRAYS} | {"leaf_node": tree.leaf_node}
+def _build(mesh, base_faces, progress, key, certify) -> Model:
+    """Build a model of a `Mesh`, and keep it in the cache by its key, None for not at all."""
+    trees: list[Tree] = []
+    progressive = build_progressive(
+        mesh, base_faces, progress, lambda: trees.append(active_build(mesh.vertices, mesh.faces)), certify
+    )
+    if key is not None:
+        progressive = replace(progressive, error_key=error_key(key))
+        keep_model(key, _file_members(progressive, trees[0], mesh.name))
+        if certify:
+            keep_errors(progressive.error_key, progressive.known_error)
+    return Model(progressive, trees[0], mesh.name)
 
 
-def _file_members(progressive: ProgressiveMesh, tree: Tree, name: str) -> dict[str, Any]:
-    """Return the arrays of a model file by name."""
-    arrays = _model_arrays(progressive, tree) | {"name": np.array(name)}
+def _read(path, more=(), error_key=None) -> Model:
+    """Read a model file with more arrays, and check all of it; errors that it lacks lie in the cache by a key.
+
+    Raises:
+        ModelError: As `Model.open`.
+    """
+    names = (*_ARRAYS, *more, "leaf_node", "name")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            _check_format(path, file, names)
+            digest = file["digest"]
+            arrays = {name: file[name] for name in names}
+    except ModelError:
+        raise
+    except FileNotFoundError:
+        raise ModelError(f"{path}: no such file") from None
+    except Exception as error:  # NumPy's readers raise whatever goes wrong inside them
+        raise ModelError(f"{path}: cannot be read as a model file ({first_line(error)})") from None
+    model = _assemble(path, dict(arrays), error_key)
+    # Consistent arrays may still have altered values, such as a bound.
+    if not isinstance(digest, np.ndarray) or digest.tobytes() != _hash_arrays(arrays):
+        raise ModelError(f"{path}: altered since it was saved")
+    return model
+
+
+def _model_arrays(progressive: ProgressiveMesh, tree: Tree, more) -> dict[str, Any]:
+    return {name: getattr(progressive, name) for name in (*_ARRAYS, *more)} | {"leaf_node": tree.leaf_node}
+
+
+def _file_members(progressive: ProgressiveMesh, tree: Tree, name: str, more=()) -> dict[str, Any]:
+    """Return the arrays of a model file by name, with more of the progressive mesh."""
+    arrays = _model_arrays(progressive, tree, more) | {"name": np.array(name)}
     digest = np.frombuffer(_hash_arrays(arrays), np.uint8)
     return {"format": np.array(FORMAT_NAME), "version": np.array(FORMAT_VERSION), "digest": digest} | arrays
 
@@ -257,7 +285,7 @@ def _hash_arrays(arrays: dict) -> bytes:
     return found.digest()
 
 
-def _check_format(path, file):
+def _check_format(path, file, names):
     """Check the format name, version and members of an opened file."""
     if not isinstance(file, np.lib.npyio.NpzFile) or not {"format", "version"} <= set(file.files):
         raise ModelError(f"{path}: not a warp_abtree model file")
@@ -266,12 +294,12 @@ def _check_format(path, file):
         raise ModelError(f"{path}: not a warp_abtree model file")
     if not isinstance(version, np.ndarray) or version.shape != () or version.tolist() != FORMAT_VERSION:
         raise ModelError(f"{path}: format version {version}, this library reads {FORMAT_VERSION}; build it again")
-    missing = [name for name in (*_MEMBERS, "digest") if name not in file.files]
+    missing = [name for name in (*names, "digest") if name not in file.files]
     if missing:
         raise ModelError(f"{path}: lacks the array {missing[0]!r}")
 
 
-def _assemble(path, arrays) -> Model:
+def _assemble(path, arrays, error_key) -> Model:
     """Check every array of a model file against the others and build the model."""
 
     def require(truth, what):
@@ -280,14 +308,14 @@ def _assemble(path, arrays) -> Model:
 
     require(all(isinstance(value, np.ndarray) for value in arrays.values()), "a member is no array")
     leaf_node, name = arrays.pop("leaf_node"), str(arrays.pop("name"))
-    for key, (dtype, ndim) in _ARRAYS.items():
-        value = arrays[key]
+    for key, value in arrays.items():
+        dtype, ndim = (_ARRAYS | _ERROR)[key]
         integral = value.dtype.kind == "i" if dtype is None else value.dtype == dtype
         require(integral and value.ndim == ndim, f"array {key!r} has type {value.dtype} and shape {value.shape}")
     parent, pos = arrays["vertex_parent"], arrays["vertex_pos"]
     faces, split = arrays["face_vertex"], arrays["face_split"]
-    start, error = arrays["split_start"], arrays["lod_error"]
-    m = len(error) - 1
+    start, error = arrays["split_start"], arrays.pop("lod_error", None)
+    m = len(start) - 1
     n_v = len(parent) - m
     n_f = len(faces)
     require(m >= 0 and n_v > 0 and n_f > 0, "empty arrays")
@@ -308,12 +336,13 @@ def _assemble(path, arrays) -> Model:
     require(EXTENT_LIMITS[0] <= extent <= EXTENT_LIMITS[1], f"extent {extent:g} lies outside 2^-100 .. 2^100")
     require(np.ptp(pos, axis=0).max() <= 2.0**120, "'vertex_pos' has merged vertices beyond float32")
     require((np.bincount(parent[parent >= 0] - n_v, minlength=m) == 2).all(), "'vertex_parent' has a merge not of two")
-    falls = np.isfinite(error).all() and error[-1] == 0 and (np.diff(error) <= 0).all()
-    require(falls, "'lod_error' is not finite, falling and 0 at the end")
+    if error is not None:
+        falls = len(error) == m + 1 and np.isfinite(error).all() and error[-1] == 0 and (np.diff(error) <= 0).all()
+        require(falls, "'lod_error' is not finite, falling and 0 at the end")
     require((split <= m).any(), "no face is ever active")
     require(leaf_node.dtype == np.int32 and leaf_node.shape == (n_f,), "'leaf_node' has the wrong type or length")
     try:
         tree = Tree.from_leaves(leaf_node)
     except ValueError as mistake:
         raise ModelError(f"{path}: {mistake}") from None
-    return Model(ProgressiveMesh(**arrays), tree, name)
+    return Model(ProgressiveMesh(**arrays, known_error=error, error_key=error_key), tree, name)

@@ -1,5 +1,7 @@
 """The progressive mesh: a collapse sequence, the vertex forest it makes, and a certified error for every LOD."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,19 +16,20 @@ from warp_abtree.checks.kernel_loading import compiling_ahead, loading
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels import active_build
 from warp_abtree.kernels.progressive import collapse as collapse_kernels
-from warp_abtree.kernels.progressive import hausdorff_bound, vertex_forest
+from warp_abtree.kernels.progressive import vertex_forest
+from warp_abtree.model.cache import find_errors, keep_errors
 from warp_abtree.model.collapse import Collapse
 from warp_abtree.model.cpu_arrays import cpu_array, launch
-from warp_abtree.model.lod_bounds import LodBounds
+from warp_abtree.model.lod_bounds import ERROR_KERNELS, LodBounds, certify_errors
 
 NODE_LIMIT = 1 << 30  # a heap entry holds two node ids and a stage in 64 bits
 # Of all modules of a build, those first that take longest to compile; each is launched as a block of one thread.
 KERNELS = [
-    (hausdorff_bound.replay_merges_kernel, 1),
     (collapse_kernels.collapse_edges_kernel, 1),
     (active_build.split_segment_kernel, 1),
     (vertex_forest.fill_events_kernel, 1),
 ]
+_certifying = threading.Lock()  # each takes all cores
 
 
 @dataclass(frozen=True)
@@ -43,8 +46,8 @@ class ProgressiveMesh:
         face_split: Face f is active iff lod >= face_split[f], m+1 for dropped faces; shape [n_f].
         split_start: Where each split's slice of `split_face` begins, shape [m+1].
         split_face: Slice i lists, ascending, every face that split i inserts or deforms.
-        lod_error: Certified bound [model units] on the distance of any point of the original surface from the
-            surface at each LOD, shape [m+1]; falls with lod, 0 at m.
+        known_error: `lod_error` where it was certified before, else None.
+        error_key: Key of the cache under which `lod_error` is kept once certified, None keeps none.
     """
 
     vertex_parent: np.ndarray
@@ -53,7 +56,25 @@ class ProgressiveMesh:
     face_split: np.ndarray
     split_start: np.ndarray
     split_face: np.ndarray
-    lod_error: np.ndarray
+    known_error: np.ndarray | None = None
+    error_key: str | None = None
+
+    @cached_property
+    def lod_error(self) -> np.ndarray:
+        """Certified bound [model units] on the distance of any point of the original surface from the surface at each
+        LOD, float64 [m+1]; falls with lod, 0 at m. Certified when it is first read, on all cores of the host."""
+        if self.known_error is not None:
+            return self.known_error
+        with _certifying:
+            if "lod_error" in self.__dict__:  # by another thread meanwhile
+                return self.__dict__["lod_error"]
+            errors = find_errors(self.error_key, self.lod_max + 1)
+            if errors is None:
+                vertices, merged = np.split(self.vertex_pos, [self.vertex_count])
+                errors = certify_errors(vertices, self.face_vertex, self.vertex_parent, merged)
+                keep_errors(self.error_key, errors)
+            self.__dict__["lod_error"] = errors
+            return errors
 
     @property
     def lod_max(self):
@@ -127,8 +148,8 @@ class ProgressiveMesh:
         return int(self.lod_max - np.argmin(miss[::-1]))
 
 
-def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
-    """Collapse a `Mesh` to a base of about `base_faces` faces and certify the error of every LOD on the way.
+def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None, certify=False):
+    """Collapse a `Mesh` to a base of about `base_faces` faces.
 
     The sequence for a larger base is a prefix of that for a smaller one, and does not depend on the mesh's scale by
     powers of two. It stops early only where every further merge would kill the last face.
@@ -136,7 +157,8 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     Args:
         base_faces: Stop when no more faces than this are left, >= 1.
         progress: Called as progress(stage, done, total) between launches; stages "collapse" and "LOD bounds".
-        then: Called when the collapse has ended, perhaps by another thread while errors are certified.
+        then: Called once, by another thread while the collapse goes on or after it.
+        certify: Whether to certify the error of every LOD beside the collapse, not when it is first read.
 
     Raises ValueError where base_faces is no whole number from 1, or the mesh has 2^29 vertices or 2^31 / 3 faces.
 
@@ -147,54 +169,69 @@ def build_progressive(mesh, base_faces=10, progress=None, then=lambda: None):
     if 2 * len(vertices) >= NODE_LIMIT or 3 * len(faces) >= 2**31:
         raise ValueError(f"too large: {len(vertices)} vertices and {len(faces)} faces")
     report = progress if progress is not None else lambda stage, done, total: None
+    kernels = [*ERROR_KERNELS, *KERNELS] if certify else KERNELS
     with ExitStack() as beside:
-        # What is to be launched next is compiled last.
-        with loading(wp.get_device("cpu"), KERNELS):
-            beside.enter_context(compiling_ahead(len(faces)))
+        busy = beside.enter_context(compiling_ahead(len(faces)))
+        with loading(wp.get_device("cpu"), kernels, busy):
             collapse = Collapse(vertices, faces, int(base_faces))
-        return _build(collapse, vertices, faces, report, then)
-
-
-def _build(collapse, vertices, faces, report, then):
-    """Run a collapse and bound its merges, beside one another where there are cores; return the `ProgressiveMesh`."""
-
-    def finish():
+        run = _certify_beside if certify else _collapse_alone
+        merged, errors = run(collapse, vertices, faces, report, then)
         parent = collapse.parents()
-        splits = _splits(parent, faces, len(vertices))
-        then()
-        return parent, splits
+        pos = np.concatenate([vertices, *merged])
+        face_split, split_start, split_face = _splits(parent, faces, len(vertices))
+        return ProgressiveMesh(parent, pos, faces, face_split, split_start, split_face, errors)
 
-    threads = current_regime().cpu_threads or core_count()
+
+def _thread_count():
+    return current_regime().cpu_threads or core_count()
+
+
+def _collapse_alone(collapse, vertices, faces, report, then):
+    """Run a collapse, and `then` beside it where there is a core; return the merged positions in parts, no errors."""
+    with ThreadPoolExecutor(1) as pool:
+        jobs = [pool.submit(then)] if _thread_count() > 1 else []
+        try:
+            for removed in collapse.steps():
+                report("collapse", removed, collapse.goal)
+        finally:
+            wait_for(jobs)
+    if not jobs:
+        then()
+    for job in jobs:
+        job.result()
+    merges, _, _ = collapse.follow(-1)
+    return [collapse.merged(0, merges)], None
+
+
+def _certify_beside(collapse, vertices, faces, report, then):
+    """Run a collapse and bound its merges, beside one another where there are cores; return positions and errors."""
+    threads = _thread_count()
     if threads == 1:
         for removed in collapse.steps():
             report("collapse", removed, collapse.goal)
         bounds = LodBounds(vertices, faces)
         merged = _follow(collapse, bounds, lambda: 1, report)
-        forest = finish()
+        then()
     else:
-        running = workers(1).submit(lambda: finish() if collapse.run() else None)
+        running = workers(1).submit(lambda: then() if collapse.run() else None)
         try:
             bounds = LodBounds(vertices, faces)
             merged = _follow(collapse, bounds, lambda: threads if running.done() else threads - 1, report)
         finally:
             collapse.stop()
             wait_for([running])
-        forest = running.result()
-    parent, (face_split, split_start, split_face) = forest
-    vertex_pos = np.concatenate([vertices, *merged])
-    return ProgressiveMesh(parent, vertex_pos, faces, face_split, split_start, split_face, bounds.errors())
+        running.result()
+    return merged, bounds.errors()
 
 
 def _follow(collapse, bounds, cores, report):
     """Bound the merges of a collapse while it goes on; return the positions that they make [model units], in parts."""
-    centre, scale = collapse.frame
     merged, known, ended = [], 0, False
     while not ended or bounds.done < known:
         if bounds.done == known or not ended:
             begin, (known, removed, ended) = known, collapse.follow(bounds.done)
             report("collapse", removed, collapse.goal)
-            first = collapse.vertex_count + begin
-            merged.append(centre + scale * collapse.pos[first : first + known - begin])
+            merged.append(collapse.merged(begin, known))
             bounds.add(collapse.pair[begin:known], merged[-1])
         if bounds.done < known:
             bounds.advance(cores())

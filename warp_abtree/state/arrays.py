@@ -29,7 +29,6 @@ class ModelArrays:
         device: As given.
         vertex_start, face_start, split_start, node_count, face_count, depth: NumPy, one entry a model.
         split_bounds: split_start of each model, offset into the pool's split_face.
-        lod_error: Of each model, as `ProgressiveMesh` has it.
         size: Longest side of each model's box [model units].
     """
 
@@ -50,7 +49,7 @@ class ModelArrays:
         self.node_count = np.array([model.tree.node_count for model in models], np.int64)
         self.depth = np.array([model.tree.depth for model in models], np.int64)
         self.lod_max = np.array([f.lod_max for f in forests], np.int64)
-        self.lod_error = [f.lod_error for f in forests]
+        self._forests = forests
         self.size = np.array([np.ptp(f.vertex_pos[: f.vertex_count], axis=0).max() for f in forests])
         self.split_bounds = [
             f.split_start.astype(np.int64) + s for f, s in zip(forests, self.split_start[:-1], strict=True)
@@ -85,6 +84,11 @@ class ModelArrays:
         pool.node_slab = wp.empty(0, dtype=wp.vec4, device=device)
         pool.slab_gain = wp.zeros(len(models), dtype=wp.vec2i, device=device)
         self.pool, self.device = pool, device
+
+    @property
+    def lod_error(self) -> list:
+        """Certified errors of each model, as `ProgressiveMesh` has them."""
+        return [f.lod_error for f in self._forests]
 
     def make_slabs(self):
         """Make slabs of nodes of few faces, for warps, unless there are any. Launches only."""

@@ -1,5 +1,7 @@
 """LOD ladders: the LODs that objects may stand at."""
 
+from functools import cached_property
+
 import numpy as np
 
 from warp_abtree.checks.arguments import whole_number
@@ -19,7 +21,6 @@ class Ladder:
 
     Attributes:
         lod: LOD of each level, int32 (models, steps + 1).
-        error: `Model.error_at` of each [model units], falling to 0, float64 (models, steps + 1).
         faces: Active faces of each, int32 (models, steps + 1).
         entry: Where each starts in the split faces of its model, int32 (models, steps + 1).
 
@@ -34,9 +35,14 @@ class Ladder:
         self.models = list(models)
         self.lod = np.array([self._levels(model, spacing) for model in models], np.int32)
         rows = [(model.progressive, lods) for model, lods in zip(models, self.lod, strict=True)]
-        self.error = np.array([progressive.lod_error[lods] for progressive, lods in rows])
         self.faces = np.array([progressive.active_count(lods) for progressive, lods in rows], np.int32)
         self.entry = np.array([progressive.split_start[lods] for progressive, lods in rows], np.int32)
+
+    @cached_property
+    def error(self) -> np.ndarray:
+        """`Model.error_at` of each level [model units], falling to 0, float64 (models, steps + 1)."""
+        rows = zip(self.models, self.lod, strict=True)
+        return np.array([model.progressive.lod_error[lods] for model, lods in rows])
 
     def levels(self) -> list:
         """Return the distinct LODs of each model, rising int arrays."""

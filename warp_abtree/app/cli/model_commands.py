@@ -108,7 +108,7 @@ def _model_file(folder, mesh) -> Path:
 def _build_file(mesh, file, options, progress) -> dict:
     """Build a model, save it and say what it holds."""
     begin = time.perf_counter()
-    model = Model.load(mesh, options.base_faces, progress, cache=False, orient=options.orient)
+    model = Model.load(mesh, options.base_faces, progress, cache=False, orient=options.orient, certify=True)
     seconds = time.perf_counter() - begin
     progress.close()
     model.save(file)
