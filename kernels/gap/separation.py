@@ -144,11 +144,16 @@ def find_separation_kernel(
     pair_poses: wp.array(dtype=PairPose),
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
+    uncertain_only: bool,
     contacts_inout: Contacts,
 ):
-    """Compute the separation of one face pair a thread, and of those that are apart the whole contact."""
+    """Compute the separation of one face pair a thread, and of those that are apart the whole contact.
+
+    Args:
+        uncertain_only: Whether `simd_contacts` has done all but those that are uncertain there, which keep their mark.
+    """
     i = wp.tid()
-    if i >= start[start.shape[0] - 1]:
+    if i >= start[start.shape[0] - 1] or (uncertain_only and contacts_inout.separation[i] != LEAST_SEPARATION):
         return
     p = faces[i][0]
     own = contact_objects(pairs, pair_poses, p)

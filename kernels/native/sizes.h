@@ -137,6 +137,8 @@ constexpr double BOUND_2D = 0x1.8000000000004p-52;
 constexpr double BOUND_DOUBLE = 0x1p-100;
 constexpr double RELATIVE_ERROR = 0x1p-42;
 constexpr double SHORTEST_NORMAL = 0x1p-20;
+constexpr double LEAST_SEPARATION = 0x1p-126;
+constexpr double CLOSEST = 0x1p-60;
 constexpr double LEAST_SINE_SQUARED = 0x1p-40;
 constexpr int CHUNK = 32;
 

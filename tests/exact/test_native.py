@@ -18,6 +18,7 @@ from warp_abtree.kernels.arithmetic.expansion import two_sum
 from warp_abtree.kernels.arithmetic.predicates import BOUND_2D, BOUND_3D, EXACT, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.contact.contact import SHORTEST_NORMAL
 from warp_abtree.kernels.contact.travel import LEAST_SINE_SQUARED
+from warp_abtree.kernels.gap.separation import CLOSEST, LEAST_SEPARATION
 from warp_abtree.kernels.poses import COORDINATE_MIN
 from warp_abtree.kernels.traversal import dual_tree, simd, uncertain_pairs
 from warp_abtree.kernels.traversal.face_pairs import WITHIN
@@ -31,6 +32,8 @@ DOUBLES = {
     "LEAST_SINE_SQUARED": LEAST_SINE_SQUARED,
     "RELATIVE_ERROR": RELATIVE_ERROR,
     "SHORTEST_NORMAL": SHORTEST_NORMAL,
+    "LEAST_SEPARATION": LEAST_SEPARATION,
+    "CLOSEST": CLOSEST,
 }
 PASSES = ("resolve_rounded", "float64_filter", "resolve_inexact")
 # Approximate on purpose, or without arithmetic.

@@ -249,16 +249,17 @@ class ContactQuery(Query):
 
     def _find(self, count: int):
         posed = [*self.batch.pools, self.pairs, self.pair_poses]
-        if self._gap is not None:
-            marks = [self.start, self.faces, self.contacts]
-            self._launch_kernel(separation.mark_near_kernel, count, marks)
-            self._launch_kernel(separation.find_separation_kernel, count, [*posed, *marks], WARP_SIZE)
         proven = self.precision == "exact"
         inputs = [*posed, proven, self.start, self.faces, self._deferred, self.contacts]
+        if self._gap is not None:
+            self._launch_kernel(separation.mark_near_kernel, count, [self.start, self.faces, self.contacts])
         if self.uses_warps():
             self._launch_kernel(contact.find_contact_kernel, count, inputs, WARP_SIZE)
         else:
             self._launch_kernel(simd.find_pair_contacts_kernel, len(self.pairs), inputs)
+        if self._gap is not None:
+            inputs = [*posed, self.start, self.faces, not self.uses_warps(), self.contacts]
+            self._launch_kernel(separation.find_separation_kernel, count, inputs, WARP_SIZE)
         step = DEFERRED_WARPS * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
         inputs = [step, *posed, self.faces, self._deferred, self.contacts]
         self._launch_kernel(contact.find_deferred_kernel, step, inputs, WARP_SIZE)

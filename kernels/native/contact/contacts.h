@@ -1,7 +1,7 @@
 // Contacts of the CPU: those of 8 face pairs at a time, as `find_contact` one by one.
 #pragma once
 #include "builtin.h"
-#include "contact/contact64.h"
+#include "contact/near64.h"
 
 template <class ModelPool, class StatePool, class PairPose, class Contacts>
 wp::int32 simd_contacts(ModelPool models, StatePool states, PairPose pose, wp::mat_t<3, 3, wp::float64> rotation,
@@ -13,7 +13,7 @@ wp::int32 simd_contacts(ModelPool models, StatePool states, PairPose pose, wp::m
 #else
     {
 #pragma clang fp contract(off)
-#include "contact/contact64.h"
+#include "contact/near64.h"
         typedef Contact64 C;
         typedef Float64 F;
         typedef F::bits bits;
@@ -24,8 +24,8 @@ wp::int32 simd_contacts(ModelPool models, StatePool states, PairPose pose, wp::m
         const bool with_gap = contacts.separation.shape[0] != 0, back = pose.swapped != 0;
         wp::vec_t<3, wp::float64>* target[5] = {contacts.p0.data, contacts.p1.data, contacts.normal_a.data,
                                                 contacts.normal_b.data, contacts.normal.data};
-        // So many face pairs; returns those that it is not sure of, a bit each.
-        auto find = [&](bool extends, const int* hit, int count) {
+        // Corners of so many face pairs, in A's frame.
+        auto load = [&](const int* hit, int count, Point(&a)[3], Point(&b)[3]) {
             int start[6][8];
             for (int k = 0; k < 8; ++k) {
                 const wp::vec_t<3, wp::int32>& pair = faces.data[hit[k < count ? k : 0]];
@@ -36,15 +36,64 @@ wp::int32 simd_contacts(ModelPool models, StatePool states, PairPose pose, wp::m
                     start[3 + i][k] = 4 * b[i];
                 }
             }
-            Point a[3], b[3], d[3][3];
             for (int i = 0; i < 3; ++i) {
                 a[i] = F::gather(vertices, start[i]);
                 b[i] = C::pose(pose.rotation.data, pose.translation, F::gather(vertices, start[3 + i]));
             }
+        };
+        auto store = [&](const int* hit, int count, const Point(&found)[5]) {
+            if (count == 8 && hit[7] - hit[0] == 7) {
+                for (int i = 0; i < 5; ++i)
+                    C::store((double*)(target[i] + hit[0]), found[i]);
+            } else {
+                for (int i = 0; i < 5; ++i) {
+                    double numbers[24];
+                    C::store(numbers, found[i]);
+                    for (int k = 0; k < count; ++k)
+                        for (int c = 0; c < 3; ++c)
+                            target[i][hit[k]][c] = numbers[3 * k + c];
+                }
+            }
+            for (int k = 0; k < count; ++k)
+                contacts.coplanar.data[hit[k]] = 0;
+        };
+        // Those of faces that are apart; what it is not sure of keeps its mark.
+        auto find_near = [&](const int* hit, int count) {
+            Point a[3], b[3], of_b[3];
+            load(hit, count, a, b);
+            for (int i = 0; i < 3; ++i)
+                of_b[i] = F::minus(b[i], a[0]);
+            const Depth64::Scaled t = Depth64::scale(a, of_b);
+            Near64 near;
+            near.search(t);
+            bits open = near.square <= CLOSEST;
+            const Point own_a = C::filter_normal(false, a[0], a[1], a[2], open);
+            const Point own_b = C::filter_normal(false, b[0], b[1], b[2], open);
+            const Point end_a = C::pose(rotation.data, position, Near64::sum(near.of_a, a));
+            const Point end_b = C::pose(rotation.data, position, Near64::sum(near.of_b, b));
+            const Point normal_a = C::unit_vector(C::turn(rotation.data, own_a));
+            const Point normal_b = C::unit_vector(C::turn(rotation.data, own_b));
+            const Point normal = C::unit_vector(C::turn(rotation.data, near.find_way(t)));
+            store(hit, count,
+                  {back ? end_b : end_a, back ? end_a : end_b, back ? normal_b : normal_a, back ? normal_a : normal_b,
+                   back ? C::negate(normal) : normal});
+            const lanes separation = open ? lanes{} : C::root(near.square) * t.size;
+            for (int k = 0; k < count; ++k)
+                contacts.separation.data[hit[k]] = separation[k] > LEAST_SEPARATION ? separation[k] : LEAST_SEPARATION;
+        };
+        // So many face pairs; returns those that it is not sure of, a bit each.
+        auto find = [&](bool extends, const int* hit, int count) {
+            Point a[3], b[3], d[3][3];
+            load(hit, count, a, b);
             // From each corner of A to each of B: the other way round, every rounding is the same.
             for (int i = 0; i < 3; ++i)
                 for (int j = 0; j < 3; ++j)
                     d[i][j] = F::minus(b[j], a[i]);
+            if (with_gap && !extends) {
+                const lanes depth = Depth64::measure(Depth64::scale(a, d[0]));
+                for (int k = 0; k < count; ++k)
+                    contacts.separation.data[hit[k]] = -(depth[k] < LEAST_SEPARATION ? LEAST_SEPARATION : depth[k]);
+            }
             bits open = {};
             const Point own_a = C::filter_normal(extends, a[0], a[1], a[2], open);
             const Point own_b = C::filter_normal(extends, b[0], b[1], b[2], open);
@@ -87,31 +136,23 @@ wp::int32 simd_contacts(ModelPool models, StatePool states, PairPose pose, wp::m
             const Point normal = C::blend_normals(normal_a, normal_b);
             // Segments run the other way for one of two orders of the lone corners' sides, and of the objects.
             const bits turned = (below_a ^ below_b) ^ (bits{} - (wp::int64)back);
-            const Point found[5] = {F::choose(turned, p1, p0), F::choose(turned, p0, p1), back ? normal_b : normal_a,
-                                    back ? normal_a : normal_b, back ? C::negate(normal) : normal};
-            if (count == 8 && hit[7] - hit[0] == 7) {
-                for (int i = 0; i < 5; ++i)
-                    C::store((double*)(target[i] + hit[0]), found[i]);
-            } else {
-                for (int i = 0; i < 5; ++i) {
-                    double numbers[24];
-                    C::store(numbers, found[i]);
-                    for (int k = 0; k < count; ++k)
-                        for (int c = 0; c < 3; ++c)
-                            target[i][hit[k]][c] = numbers[3 * k + c];
-                }
-            }
-            for (int k = 0; k < count; ++k)
-                contacts.coplanar.data[hit[k]] = 0;
+            store(hit, count,
+                  {F::choose(turned, p1, p0), F::choose(turned, p0, p1), back ? normal_b : normal_a,
+                   back ? normal_a : normal_b, back ? C::negate(normal) : normal});
             return F::to_mask(open) & ((1u << count) - 1);
         };
         // First without double words, then with them those that need them, side by side: on the list, which they leave.
         int* list = place.data + span[2];
-        int from = span[0], count = 0, left = 0, hit[8];
+        int from = span[0], count = 0, apart = 0, left = 0, hit[8], near[8];
         for (; from < span[1]; ++from) {
-            // Faces that are apart for a gap have what they need.
             if (!with_gap || contacts.separation.data[from] < 0.0)
                 hit[count++] = from;
+            else
+                near[apart++] = from;
+            if (apart == 8 || (apart > 0 && from + 1 == span[1])) {
+                find_near(near, apart);
+                apart = 0;
+            }
             if (count == 8 || (count > 0 && from + 1 == span[1])) {
                 for (unsigned int open = find(false, hit, count); open != 0; open &= open - 1)
                     list[left++] = hit[__builtin_ctz(open)];
