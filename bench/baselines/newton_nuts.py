@@ -7,6 +7,7 @@ do. Fields need CUDA; on the CPU its BVH takes their place. The bolt is a body a
 
 import time
 import warnings
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -176,31 +177,43 @@ def measure(models, matrices, others, device, repeats):
     model = make_model(fields.meshes, worlds, device)
     poses, others = (body_poses(m) for m in (matrices, others))
     row = {"device": device.name, "worlds": worlds, "cook_s": fields.seconds, "fields_mib": fields.mib}
-    makers = {name: lambda given=given: Ours(model, models, *given, poses) for name, given in OURS.items()}
     kind = "sdf" if device.is_cuda else "bvh"
     gaps = {f"{kind}_same_gap": GAP} | ({f"{kind}_example": EXAMPLE_GAP} if device.is_cuda else {})
-    makers |= {name: lambda gap=gap: NutFields(model, gap, poses) for name, gap in gaps.items()}
-    made = {}
-    for name, make in makers.items():
-        before = used_memory(device)
-        try:
-            one = make()
-            row[f"{name}_same_bits"], row[f"{name}_same_set"] = same_twice(one, poses, others)
-        except (RuntimeError, MemoryError) as error:  # what has no room must not cost the rest of a run
-            row[f"{name}_skipped"] = f"{type(error).__name__}: {error}"
-            continue
-        made[name] = one
-        row[f"{name}_mib"] = used_memory(device) - before
-        row[f"{name}_contacts"] = len(read_contacts(one.contacts))
-        row[f"{name}_worlds"] = int(worlds_with_contacts(one, worlds).sum())
-        if isinstance(one, Ours):
-            row[f"{name}_faces"] = one.faces
-            check_ours(row, name, one)
+    theirs = {}
+    for name, gap in gaps.items():
+        keep(row, name, partial(NutFields, model, gap, poses), poses, others, device, theirs)
+    for name, given in OURS.items():
+        make = partial(Ours, model, models, *given, poses)
+        time_one(row, name, make, poses, others, device, repeats, dict(theirs))
+    return row
+
+
+def time_one(row, name, make, poses, others, device, repeats, made):
+    """Add one of ours to a row, with times in turn with Newton's; it goes again, since all would take too much."""
+    keep(row, name, make, poses, others, device, made)
+    if name not in made:
+        return
+    row[f"{name}_faces"] = made[name].faces
+    check_ours(row, name, made[name])
     runs, row["graphs"] = timed(made, device)
     times = medians(time_rounds(runs, repeats))
-    row |= {f"{name}_ms": round(ms, 3) for name, ms in times.items()}
-    row |= {f"{name}_ratio": round(times[name] / times["ours"], 3) for name in times if "ours" in times}
-    return row
+    row |= {f"{key}_ms": round(ms, 3) for key, ms in times.items()}
+    row |= {f"{key}_over_{name}": round(ms / times[name], 3) for key, ms in times.items() if key != name}
+
+
+def keep(row, name, make, poses, others, device, made):
+    """Make a contender and keep it in `made`, or in the row why it cannot be; add what it found to the row."""
+    before = used_memory(device)
+    try:
+        one = make()
+        row[f"{name}_same_bits"], row[f"{name}_same_set"] = same_twice(one, poses, others)
+    except (RuntimeError, MemoryError) as error:  # what has no room must not cost the rest of a run
+        row[f"{name}_skipped"] = f"{type(error).__name__}: {error}"
+        return
+    made[name] = one
+    row[f"{name}_mib"] = used_memory(device) - before
+    row[f"{name}_contacts"] = len(read_contacts(one.contacts))
+    row[f"{name}_worlds"] = int(worlds_with_contacts(one, row["worlds"]).sum())
 
 
 def timed(made, device):

@@ -10,6 +10,8 @@ import warp as wp
 from warp_abtree.kernels.arrays import LAST_KEY, ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.contact.contact import Contacts, have_crossed, pair_direction
 from warp_abtree.kernels.contact.manifold import Curves
+from warp_abtree.kernels.small_trees.tiles import count_lanes, first_lane
+from warp_abtree.kernels.traversal.warp_stack import add_in_order, six_numbers, warp_lane, warp_size
 from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -78,11 +80,13 @@ def begin_loop_kernel(
     order_out: wp.array(dtype=wp.int32),
     key_out: wp.array(dtype=wp.int64),
     listed_total_out: wp.array(dtype=wp.int32),
+    large_total_out: wp.array(dtype=wp.int32),
 ):
     """Make each contact a loop of its own, with a key that brings contacts of one face of B together; list none yet."""
     i = wp.tid()
     if i == 0:
         listed_total_out[0] = 0
+        large_total_out[0] = 0
     order_out[i] = i
     key_out[i] = LAST_KEY
     if i < start[start.shape[0] - 1]:
@@ -140,6 +144,61 @@ def name_loop_kernel(
             key_out[i] = wp.int64(root)
 
 
+@wp.struct
+class LoopSums:
+    """Sums over the contacts of a loop, about its first point."""
+
+    total: wp.float64  # length of those that are not coplanar
+    gap: wp.vec3d  # from end to end of the same
+    middle: wp.vec3d  # their middles times their lengths
+    area: wp.vec3d  # vector area of the cone over them
+    mean: wp.vec3d  # normals of all times their lengths
+    plain: wp.vec3d  # normals of all
+
+
+@wp.func
+def six_of(x: wp.vec3d, y: wp.vec3d):
+    return six_numbers(x[0], x[1], x[2], y[0], y[1], y[2])
+
+
+@wp.func
+def sum_loop(
+    first: wp.int32, last: wp.int32, contacts: Contacts, order: wp.array(dtype=wp.int32), loop: wp.array(dtype=wp.int32)
+):
+    """Sum the contacts of a loop in their order, by all lanes of a warp; the loop is that of contact order[first]."""
+    zero, half = wp.float64(0.0), wp.float64(0.5)
+    root = order[first]
+    origin = contacts.p0[root]
+    normals, ends, areas = six_numbers(), six_numbers(), six_numbers()
+    at, count = wp.int32(first), warp_size()
+    while count == warp_size():
+        k = at + warp_lane()
+        i = order[wp.min(k, last - 1)]
+        belongs = k < last
+        if belongs:
+            belongs = loop[i] == root
+        along = contacts.p1[i] - contacts.p0[i]
+        length = measure_length(along)
+        mean, plain = length * contacts.normal[i], contacts.normal[i]
+        middle = (length * half) * ((contacts.p0[i] - origin) + (contacts.p1[i] - origin))
+        area = half * wp.cross(contacts.p0[i] - origin, along)
+        if contacts.coplanar[i] != 0:
+            length, along, middle, area = zero, wp.vec3d(), wp.vec3d(), wp.vec3d()
+        count = count_lanes(belongs)
+        normals = add_in_order(normals, six_of(mean, plain), count)
+        ends = add_in_order(ends, six_of(along, middle), count)
+        areas = add_in_order(areas, six_numbers(area[0], area[1], area[2], length, zero, zero), count)
+        at += count
+    sums = LoopSums()
+    sums.mean = wp.vec3d(normals[0], normals[1], normals[2])
+    sums.plain = wp.vec3d(normals[3], normals[4], normals[5])
+    sums.gap = wp.vec3d(ends[0], ends[1], ends[2])
+    sums.middle = wp.vec3d(ends[3], ends[4], ends[5])
+    sums.area = wp.vec3d(areas[0], areas[1], areas[2])
+    sums.total = areas[3]
+    return sums
+
+
 @wp.kernel
 def average_loop_kernel(
     models: ModelPool,
@@ -152,48 +211,33 @@ def average_loop_kernel(
     order: wp.array(dtype=wp.int32),
     curves_inout: Curves,
 ):
-    """Find the normal of one loop, by the thread of its first contact: the direction of the area within the curve.
+    """Find the normals of loops, by the warp of their first contact: the direction of the area within the curve.
 
     Moving an object by dx changes the volume that closed surfaces share by the vector area of the curve times dx, so
     this is the direction that frees them soonest. An open or empty curve takes the mean of its contacts' normals.
     """
-    k = wp.tid()
     last = start[start.shape[0] - 1]
-    if k >= last or curves_inout.loop[order[k]] != order[k] or not have_crossed(contacts, order[k]):
-        return
-    root = order[k]
-    origin = contacts.p0[root]
-    total = wp.float64(0.0)
-    half = wp.float64(0.5)
-    middle = wp.vec3d()
-    gap = wp.vec3d()
-    mean = wp.vec3d()
-    plain = wp.vec3d()
-    area = wp.vec3d()
-    i = root
-    while i >= 0:
-        along = contacts.p1[i] - contacts.p0[i]
-        length = measure_length(along)
-        mean += length * contacts.normal[i]
-        plain += contacts.normal[i]
-        if contacts.coplanar[i] == 0:
-            total += length
-            gap += along
-            middle += (length * half) * ((contacts.p0[i] - origin) + (contacts.p1[i] - origin))
-            area += half * wp.cross(contacts.p0[i] - origin, along)
-        k += 1
-        i = wp.int32(-1)
-        if k < last and curves_inout.loop[order[k]] == root:
-            i = order[k]
-    n = area
-    if total > wp.float64(0.0):
-        # About the mean point, since for an open curve the area depends on where it is measured from.
-        n = (area - half * wp.cross(middle / total, gap)) / (total * total)
-    if measure_length(n) <= LEAST_LOOP_AREA:
-        n = mean
-        if measure_length(mean) <= LEAST_LOOP_AREA * total:
-            n = plain
-        if measure_length(plain) <= LEAST_LOOP_AREA:
-            p = faces[root][0]
-            n = pair_direction(models, states, objects, pairs[p][0], pairs[p][1])
-    curves_inout.loop_normal[root] = unit_vector(n)
+    k = wp.tid()
+    begins = k < last
+    if begins:
+        begins = curves_inout.loop[order[k]] == order[k] and have_crossed(contacts, order[k])
+    lane = first_lane(begins)
+    while lane < warp_size():
+        first = k - warp_lane() + lane
+        sums = sum_loop(first, last, contacts, order, curves_inout.loop)
+        n = sums.area
+        if sums.total > wp.float64(0.0):
+            # About the mean point, since for an open curve the area depends on where it is measured from.
+            about = wp.cross(sums.middle / sums.total, sums.gap)
+            n = (sums.area - wp.float64(0.5) * about) / (sums.total * sums.total)
+        if measure_length(n) <= LEAST_LOOP_AREA:
+            n = sums.mean
+            if measure_length(sums.mean) <= LEAST_LOOP_AREA * sums.total:
+                n = sums.plain
+            if measure_length(sums.plain) <= LEAST_LOOP_AREA:
+                p = faces[order[first]][0]
+                n = pair_direction(models, states, objects, pairs[p][0], pairs[p][1])
+        begins = begins and warp_lane() != lane
+        if warp_lane() == 0:
+            curves_inout.loop_normal[order[first]] = unit_vector(n)
+        lane = first_lane(begins)

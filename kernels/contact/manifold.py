@@ -39,6 +39,16 @@ class Curves:
 
 
 @wp.struct
+class Rows:
+    """Contacts of all pairs in two orders."""
+
+    start: wp.array(dtype=wp.int32)  # where those of each pair start, shape [pair + 1]
+    faces: wp.array(dtype=wp.vec3i)  # pair and faces, in the order of the first object's faces, shape [contact]
+    order: wp.array(dtype=wp.int32)  # contacts by their keys, shape [contact]
+    key: wp.array(dtype=wp.int64)  # `pair_key` of each in that order, or its loop, shape [contact]
+
+
+@wp.struct
 class Manifolds:
     """Points that stand for each pair, world frame."""
 
@@ -175,8 +185,7 @@ def find_candidate_kernel(
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
     gap: wp.array(dtype=wp.float64),
-    start: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.vec3i),
+    rows: Rows,
     contacts: Contacts,
     curves_inout: Curves,
 ):
@@ -188,15 +197,18 @@ def find_candidate_kernel(
     Args:
         gap: How far outside the second point may be, of faces that look at one another [world units], shape [pair]; [0]
             for not at all.
+        rows: In the order of loops, those of faces that intersect first.
     """
-    i = wp.tid()
-    if i >= start[start.shape[0] - 1] or not have_crossed(contacts, i):
+    if wp.tid() >= rows.start[rows.start.shape[0] - 1]:
         return
-    p = faces[i][0]
+    i = rows.order[wp.tid()]
+    if not have_crossed(contacts, i):
+        return
+    p = rows.faces[i][0]
     swapped = pair_poses[p].swapped
     a = wp.min(pairs[p][0], pairs[p][1])
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(models, states, pair_poses[p], faces[i][1 + swapped], faces[i][2 - swapped], corner)
+    load_corners(models, states, pair_poses[p], rows.faces[i][1 + swapped], rows.faces[i][2 - swapped], corner)
     rotation, position = objects.rotation[a], objects.position[a]
     back = wp.transpose(rotation)
     normal_a = back * contacts.normal_a[i]

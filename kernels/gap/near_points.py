@@ -10,7 +10,7 @@ import warp as wp
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
 from warp_abtree.kernels.contact.contact import Contacts, Deferred, have_crossed, load_corners
 from warp_abtree.kernels.contact.loops import pair_key
-from warp_abtree.kernels.contact.manifold import NO_DEPTH, NO_POINT, Curves, measure_column, write_candidates
+from warp_abtree.kernels.contact.manifold import NO_DEPTH, NO_POINT, Curves, Rows, measure_column, write_candidates
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.small_trees.tiles import rank_flag
 from warp_abtree.kernels.traversal.face_pairs import load_corner_ids
@@ -30,16 +30,6 @@ NEARER = wp.constant(wp.float64(0.998))
 # In place of the loop of a contact whose candidates count only if no other face is nearer.
 UNDECIDED = wp.constant(wp.int32(-1))
 CONTACTS_A_WARP = wp.constant(wp.int32(256))
-
-
-@wp.struct
-class Rows:
-    """Contacts of all pairs in two orders."""
-
-    start: wp.array(dtype=wp.int32)  # where those of each pair start, shape [pair + 1]
-    faces: wp.array(dtype=wp.vec3i)  # pair and faces, in the order of the first object's faces, shape [contact]
-    order: wp.array(dtype=wp.int32)  # contacts in the order of the second object's faces, shape [contact]
-    key: wp.array(dtype=wp.int64)  # `pair_key` of each in that order, shape [contact]
 
 
 @wp.struct

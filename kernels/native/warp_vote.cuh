@@ -31,7 +31,7 @@ inline CUDA_CALLABLE wp::vec_t<6, wp::float64> add_in_order(wp::vec_t<6, wp::flo
         sum[k] = __shfl_sync(0xffffffffu, total, k);
     return sum;
 #else
-    for (int k = 0; k < 6; ++k)
+    for (int k = 0; count > 0 && k < 6; ++k)
         sum[k] += x[k];
     return sum;
 #endif

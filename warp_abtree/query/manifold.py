@@ -47,7 +47,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
-from warp_abtree.kernels.contact import loops, manifold
+from warp_abtree.kernels.contact import contact, loops, manifold
 from warp_abtree.kernels.contact import points as point_kernels
 from warp_abtree.kernels.gap import near_points
 from warp_abtree.kernels.solid import inside_points
@@ -77,7 +77,8 @@ class ManifoldQuery(ContactQuery):
 
     def __init__(self, scene, pairs=None, capacity=None, precision="exact", gap=None, points=POINTS_MAX):
         self.point_max = whole_number(points, "points", 1, 64)
-        self.manifolds, self.curves = manifold.Manifolds(), manifold.Curves()
+        self.manifolds, self.curves, self._large = manifold.Manifolds(), manifold.Curves(), contact.Deferred()
+        self._large.total = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, pairs, capacity, precision, sort_pairs=True, gap=gap)
         self._no_gap = wp.empty(0, dtype=wp.float64, device=self.device)
 
@@ -92,6 +93,7 @@ class ManifoldQuery(ContactQuery):
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
         points = (room, self.point_max)
+        made.append((self._large, "place", self._empty(room, wp.int32)))
         made.append((self.manifolds, "count", wp.zeros(room, dtype=wp.int32, device=self.device)))
         for name, dtype in (("point", wp.vec3d), ("normal", wp.vec3d), ("depth", wp.float64)):
             made.append((self.manifolds, name, self._empty(points, dtype)))
@@ -108,7 +110,7 @@ class ManifoldQuery(ContactQuery):
         gap = self._no_gap if self._gap is None else self.hits.gap
         posed = [*pools, self.pairs, self.pair_poses]
         listed = self._deferred
-        inputs = [start, rows, curves, self._order, self._key, listed.total]
+        inputs = [start, rows, curves, self._order, self._key, listed.total, self._large.total]
         self._launch_kernel(loops.begin_loop_kernel, count, inputs)
         self._sort_keys(count, 31 + room.bit_length())
         self._launch_kernel(loops.link_loop_kernel, count, [start, rows, contacts, self._order, self._key, curves])
@@ -117,17 +119,32 @@ class ManifoldQuery(ContactQuery):
         self._launch_kernel(loops.name_loop_kernel, count, [start, contacts, curves, self._order, self._key])
         self._sort_keys(count, 31)
         inputs = [*pools, self.pairs, start, rows, contacts, self._order, curves]
-        self._launch_kernel(loops.average_loop_kernel, count, inputs)
-        inputs = [*posed, gap, start, rows, contacts, curves]
+        self._launch_kernel(loops.average_loop_kernel, -(-count // WARP_SIZE) * WARP_SIZE, inputs, WARP_SIZE)
+        inputs = [*posed, gap, self._ordered_rows(), contacts, curves]
         self._launch_kernel(manifold.find_candidate_kernel, count, inputs)
-        spread = point_kernels.point_spreader(self.point_max)
-        self._launch_warps(spread, room, [pools[2], self.pairs, gap, start, curves, self.manifolds])
+        self._spread_points([pools[2], self.pairs, gap, start])
         self._add_inside_points()
+
+    def _ordered_rows(self):
+        rows = manifold.Rows()
+        rows.start, rows.faces, rows.order, rows.key = self.start, self.faces, self._order, self._key
+        return rows
+
+    def _spread_points(self, posed):
+        """Choose the points of each pair: on CUDA by a warp, of pairs with many contacts by a block. Launches only."""
+        cuda, room = self.device.is_cuda, len(self.pairs)
+        largest = int(point_kernels.LARGE_PAIR) if cuda else np.iinfo(np.int32).max
+        spread = point_kernels.point_spreader(self.point_max)
+        self._launch_warps(spread, room, [largest, *posed, self.curves, self._large, self.manifolds])
+        if cuda:
+            spread = point_kernels.large_point_spreader(self.point_max)
+            blocks, threads = min(room, self.device.sm_count), point_kernels.LARGE_BLOCK
+            inputs = [blocks, *posed, self._large, self.curves, self.manifolds]
+            self._launch_kernel(spread, blocks * threads, inputs, threads)
 
     def _find_near(self, count, posed, gap):
         """Find the candidates of faces that are apart. Launches only."""
-        both, contacts, listed, curves = near_points.Rows(), self.contacts, self._deferred, self.curves
-        both.start, both.faces, both.order, both.key = self.start, self.faces, self._order, self._key
+        both, contacts, listed, curves = self._ordered_rows(), self.contacts, self._deferred, self.curves
         warps, threads = (-(-count // share) for share in (int(near_points.CONTACTS_A_WARP), WARP_SIZE))
         inputs = [*posed[2:], both, contacts, listed, curves]
         self._launch_kernel(near_points.find_near_candidate_kernel, threads * WARP_SIZE, inputs, WARP_SIZE)
