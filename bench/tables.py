@@ -111,13 +111,14 @@ def markdown_run(study) -> str:
 
 
 def study_page(study) -> str:
-    """Return all tables of a study as one Markdown page."""
-    (title,) = {part["run"]["device"] for part in study["parts"].values()} or {"nothing"}
-    blocks = [f"# Study {study['study']}: {title}", markdown_run(study)]
+    """Return all tables of a study as one Markdown page; each says its device where parts ran on several."""
+    devices = {name: part["run"]["device"] for name, part in study["parts"].items()}
+    every = list(dict.fromkeys(devices.values()))
+    blocks = [f"# Study {study['study']}: {', '.join(every) or 'nothing'}", markdown_run(study)]
     for table in read_layout(f"studies/{study['study']}.toml")["table"]:
         if table["part"] in study["parts"]:
-            blocks += [f"## {table['title']}", markdown_table(table, study)]
-            blocks += [table["note"]] if "note" in table else []
+            blocks += [f"## {table['title']}"] + [f"Device: {devices[table['part']]}."] * (len(every) > 1)
+            blocks += [markdown_table(table, study)] + ([table["note"]] if "note" in table else [])
     blocks += [note for part in study["parts"].values() for note in part["notes"]]
     return "\n\n".join(blocks) + "\n"
 

@@ -16,6 +16,7 @@ from warp_abtree.kernels.contact.candidates import (
 )
 from warp_abtree.kernels.contact.contact import Deferred
 from warp_abtree.kernels.contact.manifold import NO_DEPTH, POINTS, Curves, Manifolds
+from warp_abtree.kernels.traversal.warp_stack import warp_any
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
@@ -23,7 +24,7 @@ wp.set_module_options(MODULE_OPTIONS)
 LARGE_PAIR = wp.constant(1024)
 """Contacts from which on a block of threads chooses the points of a pair, not a warp."""
 
-LARGE_BLOCK = 384
+LARGE_BLOCK = 512
 
 # Squared part of the spread within which a point adds nothing to others.
 NEAREST_POINT = wp.constant(wp.float64(2.0**-9))
@@ -126,28 +127,30 @@ def find_farthest(ends: wp.vec2i, choice: Choice, chosen: wp.array(dtype=wp.int3
 
     Those on one side are favoured a little, so that noise does not choose between two that are as far. From the second
     point on a candidate keeps its distance from those seen before, which bounds that from all: on a CPU only candidates
-    that may be the farthest yet look at the points chosen since. On a GPU all do, or a warp waits for whoever is late.
+    that may be the farthest yet look at the points chosen since. On a GPU all do: a warp would wait for those that are
+    late, and the vote keeps its lanes in step.
 
     Args:
         ends: Where the list of the pair's contacts begins and ends.
     """
     farthest = wp.float64(-1.0)
     best = CANDIDATES * ends[0]
-    at = ends[0] + group_lane()
-    while at < ends[1]:
-        i = curves.listed[at]
+    base = wp.int32(ends[0])
+    while base < ends[1]:
+        i = wp.int32(-1)
         stale = choice.count <= 2 or group_size() > 1
-        if not stale:
+        if base + group_lane() < ends[1]:
+            i = curves.listed[base + group_lane()]
             for k in range(CANDIDATES):
                 if curves.depth[i, k] >= choice.floor and WIDEST * curves.nearest[i, k] > farthest:
                     stale = True
-        if stale:
+        if warp_any(stale) and i >= 0:
             found = measure_contact(i, choice, chosen, curves)
             for k in range(CANDIDATES):
                 if found[k] > farthest:
                     farthest = found[k]
                     best = CANDIDATES * i + k
-        at += group_size()
+        base += group_size()
     return best_of_group(farthest, best)
 
 

@@ -56,12 +56,9 @@ def test_pages_repeat_their_data(file, tmp_path):
     page = tables.study_page(data)
     assert file.with_suffix(".md").read_text(encoding="utf-8") == page and "Not measured" not in page
     assert not any(part["run"]["quick"] for part in data["parts"].values())
-    # Of distances, what is shown is a core's time beside python-fcl's; motions are not measured on a GPU yet.
-    left_out = {"distances", "motions"} if file.stem == "tradeoff_gpu" else set()
-    assert set(study.find_study(data["study"]).PARTS) - set(data["parts"]) <= left_out
+    assert set(study.find_study(data["study"]).PARTS) == set(data["parts"])
     pytest.importorskip("matplotlib")
     figures = tables.read_layout(f"studies/{data['study']}.toml")["figure"]
-    figures = [figure for figure in figures if figure["part"] in data["parts"]]
     said = tables.draw(figures, lambda figure: tables.select_rows(figure, data), tmp_path)
     assert all(figure["file"] in said for figure in figures)
 
