@@ -26,6 +26,11 @@ def group_lane() -> wp.int32: ...
 def group_sync(): ...
 
 
+@wp.func_native(group_code("must_measure"))
+def must_measure(chosen: wp.int32) -> bool:
+    """Return whether all candidates look at the points chosen, so many: always on a GPU, whose lanes go in step."""
+
+
 @wp.func_native(group_code("greatest_of_group"))
 def greatest_of_group(x: wp.float64, item: wp.int32) -> wp.vec2d:
     """Return the greatest number of all threads, and the item of a thread that has it, the least of several."""

@@ -13,6 +13,7 @@ from warp_abtree.kernels.contact.candidates import (
     group_lane,
     group_size,
     list_candidates,
+    must_measure,
 )
 from warp_abtree.kernels.contact.contact import Deferred
 from warp_abtree.kernels.contact.manifold import NO_DEPTH, POINTS, Curves, Manifolds
@@ -138,7 +139,7 @@ def find_farthest(ends: wp.vec2i, choice: Choice, chosen: wp.array(dtype=wp.int3
     base = wp.int32(ends[0])
     while base < ends[1]:
         i = wp.int32(-1)
-        stale = choice.count <= 2 or group_size() > 1
+        stale = must_measure(choice.count)
         if base + group_lane() < ends[1]:
             i = curves.listed[base + group_lane()]
             for k in range(CANDIDATES):

@@ -18,6 +18,14 @@ inline CUDA_CALLABLE wp::int32 group_lane() {
 #endif
 }
 
+inline CUDA_CALLABLE bool must_measure(wp::int32 chosen) {
+#if defined(__CUDA_ARCH__)
+    return true;  // a constant, so that the loop holds no other test: registers are short
+#else
+    return chosen <= 2;
+#endif
+}
+
 inline CUDA_CALLABLE void group_sync() {
 #if defined(__CUDA_ARCH__)
     __syncthreads();
