@@ -156,6 +156,7 @@ def measure(name, models, matrices, device, repeats):
     row = {"device": device.name, "workload": name, "faces": " x ".join(str(len(mesh[1])) for mesh in meshes)}
     row |= {"poses": len(pairs), "meet": int(found["any"].any.sum()), "hits": int(found["faces"].count.sum())}
     others = {"wp_bvh": make_bvh(meshes, matrices, device, row["hits"])}
+    row["wp_bvh_differs"] = int((others["wp_bvh"]["any"]() != found["any"].any).sum())
     try:
         others["fcl"] = fcl = Fcl(*meshes, matrices)
         row["fcl_differs"] = int((np.array(fcl.any(), bool) != found["any"].any).sum())
