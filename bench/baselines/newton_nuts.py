@@ -176,7 +176,8 @@ def measure(models, matrices, others, device, repeats):
     fields = Fields(models, device)
     model = make_model(fields.meshes, worlds, device)
     poses, others = (body_poses(m) for m in (matrices, others))
-    row = {"device": device.name, "worlds": worlds, "cook_s": fields.seconds, "fields_mib": fields.mib}
+    row = {"device": device.name, "worlds": worlds, "fields_mib": fields.mib}
+    row |= {"cook_first_s": fields.seconds[0], "cook_s": fields.seconds[-1]}
     kind = "sdf" if device.is_cuda else "bvh"
     gaps = {f"{kind}_same_gap": GAP} | ({f"{kind}_example": EXAMPLE_GAP} if device.is_cuda else {})
     theirs = {}

@@ -2,8 +2,9 @@
 
 Gaps are fractions of the mesh's size, poses otherwise random. Times are of a pose: of all poses at once, where each
 search starts anew (fresh) or from the faces of the launch before (again), and of one pair alone, searched anew, by
-launches from Python (one) and as a captured graph (one_graph, on the CPU; on CUDA all are). On the CPU all on one core,
-beside python-fcl, whose answers must be ours but for rounding.
+launches from Python (one) and as a captured graph (one_graph, on the CPU; on CUDA all are); on the CPU also of one pair
+that is brought from pose to pose, each a call of `Scene.set_poses` and `DistanceQuery.run` (calls). On the CPU all on
+one core, beside python-fcl, whose answers must be ours but for rounding.
 
 The part `gap` is contacts with a gap: `bench.gap_contacts`. The part `originals` is distances of originals while
 objects stand at coarse LODs: `bench.originals`.
@@ -31,6 +32,7 @@ PARTS = ("nearest", "gap", "originals")
 IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 MESHES = ("cow", "rocker-arm", "stanford-bunny")
 NUT = ("factory-bolt-m20", "factory-nut-m20")
+BASES = ("fresh", "fcl"), ("again", "fcl"), ("calls", "fcl"), ("one", "fcl_one"), ("one_graph", "fcl_one")
 LAUNCHES_BEFORE = 20  # of the pair alone, as in a loop that goes on: slabs are made of what is asked often
 
 
@@ -100,6 +102,7 @@ def measure(name, models, matrices, device, repeats):
             launches["one_graph"] = make_replay(launch_one, device, captured=True)
         launches |= {"again": query.launch, "one": launch_one}
         if device.is_cpu:
+            launches["calls"] = make_calls(models, matrices, device)
             try:
                 fcl = make_fcl(models, matrices, found, row)
                 launches |= {"fcl": fcl.distances, "fcl_one": lambda: fcl.distances(middle)}
@@ -109,10 +112,25 @@ def measure(name, models, matrices, device, repeats):
             times = medians(time_in_turn(launches, device, repeats, time.thread_time))
     per = {key: time if "one" in key else time / len(pairs) for key, time in times.items()}
     row |= {f"{key}_ms": float(f"{value:.4g}") for key, value in per.items()}
-    for key, base in (("fresh", "fcl"), ("again", "fcl"), ("one", "fcl_one"), ("one_graph", "fcl_one")):
+    for key, base in BASES:
         if base in per:
             row[f"{key}_fcl_ratio"] = round(per[base] / per[key], 2)
     return row
+
+
+def make_calls(models, matrices, device):
+    """Return a callable that brings one pair from pose to pose, and reads its distance at each."""
+    scene, pairs = scene_of_poses(device, *models, [IDENTITY])
+    query = ab.DistanceQuery(scene, pairs)
+    poses = [np.stack([np.eye(4), matrix]) for matrix in matrices]
+
+    def call_each():
+        for both in poses:
+            scene.set_poses(both)
+            query.run()
+
+    call_each()
+    return call_each
 
 
 def make_fcl(models, matrices, found, row):

@@ -8,6 +8,7 @@ struct NearestMemory {
         float way[3];                         // direction in which the faces are nearest
         float upper;                          // that the nearest distance is not over, scaled
         int found;                            // whether there are faces at most that far: only then a tolerance counts
+        int diving;                           // whether the nearest node pair goes first, until faces are measured
         int level;                            // how far bounds may be that do not wait for later
         int top, later, waiting, open_count;  // entries of the lists
         int node_tests, face_tests;

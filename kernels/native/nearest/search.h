@@ -28,7 +28,6 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
         boxes.look(h.way);
         boxes.normals = h.face_tests >= NORMALS_LEAST;
     }
-    const float INF = __builtin_inff();
     // Apart from the memory that lists are written to.
     int top = h.top, later = h.later, waiting = h.waiting, node_tests = h.node_tests;
     // Bounds over `limit` are dropped; those over `soon` wait for later, when a nearer pair may have been found.
@@ -41,7 +40,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
             return x < 0.0f ? -1.0f : y * y;
         };
         limit = to_bound(cut);
-        soon = h.level < 2 && h.upper < INF ? to_bound(PART[h.level] * cut) : limit;
+        soon = h.level < 2 && !h.diving ? to_bound(PART[h.level] * cut) : limit;
     };
     auto measure = [&](int count) {
         waiting -= count;
@@ -54,6 +53,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
         const F::lanes error = N::error_of(d, size, frame.error), over = d + error, under = d - error;
         float low[16];
         int best = -1;
+        h.diving = 0;
         for (int i = 0; i < count; ++i)
             if (over[i] < h.upper) {
                 h.upper = over[i];
@@ -90,7 +90,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     while (h.open_count <= OPEN_LENGTH - 16) {
         while (top > 0 && waiting < 16) {
             const int room = (CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH - 16 - top) / 3, fits = room > 1 ? room : 1;
-            const int most = h.upper < INF ? NEAREST_AT_ONCE : 1, wanted = fits < most ? fits : most;
+            const int most = h.diving ? 1 : NEAREST_AT_ONCE, wanted = fits < most ? fits : most;
             NearBoxes::Taken taken[NEAREST_AT_ONCE / 4][4];
             int count = 0;
             while (top > 0 && count < wanted) {
@@ -120,7 +120,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
                 later += __builtin_popcount(nodes & ~first);
                 waiting += __builtin_popcount(near & tested.leaves);
                 // The nearest comes last, so that it is taken first.
-                for (int k = top; h.upper == INF && k < end - 1; ++k)
+                for (int k = top; h.diving && k < end - 1; ++k)
                     if (m.bound[k] < m.bound[end - 1]) {
                         const wp::int64 item = m.item[k];
                         const float bound = m.bound[k];
@@ -131,7 +131,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
                     }
                 top = end;
             }
-            if (h.upper == INF && waiting > 0)
+            if (h.diving && waiting > 0)
                 break;
         }
         if (waiting > 0) {
