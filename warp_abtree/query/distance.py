@@ -215,7 +215,7 @@ class DistanceQuery(Query):
         faces = np.where(order[:, None], faces[:, ::-1], faces).astype(np.int64)
         items = np.where(faces.min(1) < 0, int(frame.NO_FACES), (faces[:, 0] << 32) | faces[:, 1])
         wp.copy(self._found.faces, wp.array(items, dtype=wp.int64, device="cpu", copy=False), count=len(items))
-        self._found.distance.fill_(np.nan)
+        self._found.distance.fill_(np.nan)  # of no launch, so that it tells of no far move
 
     def _fill_within(self):
         beyond = self._asked if self._within is None else self._within

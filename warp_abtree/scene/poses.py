@@ -35,15 +35,14 @@ def check_poses(poses, what="poses", first=0) -> np.ndarray:
     if not (poses.ndim == 2 and poses.shape[1] == 7) and not (poses.ndim == 3 and poses.shape[1:] == (4, 4)):
         raise ValueError(f"{what}: shape {poses.shape} is neither (n, 7) nor (n, 4, 4)")
     poses = poses.astype(np.float64)
-    if not np.isfinite(poses).all():
-        bad = ~np.isfinite(poses).all(tuple(range(1, poses.ndim)))
-        raise ValueError(f"{what}: pose {first + bad.argmax()} is not finite")
-    # Whether all are sound takes half as long as which are, and single calls check two at a time.
+    sound = np.isfinite(poses).all(tuple(range(1, poses.ndim)))
+    if not sound.all():
+        raise ValueError(f"{what}: pose {first + sound.argmin()} is not finite")
     if poses.ndim == 2:
         norm = np.sqrt((poses[:, 3:] ** 2).sum(1))
-        off = np.abs(norm - 1)
-        if not (off <= QUATERNION_TOLERANCE).all():
-            i = int((off > QUATERNION_TOLERANCE).argmax())
+        sound = np.abs(norm - 1) <= QUATERNION_TOLERANCE
+        if not sound.all():
+            i = int(sound.argmin())
             raise ValueError(
                 f"{what}: pose {first + i} has a quaternion of norm {norm[i]:.6g}, "
                 f"off 1 by more than {QUATERNION_TOLERANCE}"
@@ -51,11 +50,9 @@ def check_poses(poses, what="poses", first=0) -> np.ndarray:
         return poses
     rotation = poses[:, :3, :3]
     off = np.abs(rotation.transpose(0, 2, 1) @ rotation - IDENTITY)
-    rigid = (off <= RIGID_TOLERANCE).all() and (np.linalg.det(rotation) > 0).all() and (poses[:, 3] == LAST_ROW).all()
-    if not rigid:
-        bad = ~(off.max((1, 2)) <= RIGID_TOLERANCE) | ~(np.linalg.det(rotation) > 0)
-        bad |= (poses[:, 3] != LAST_ROW).any(1)
-        raise ValueError(f"{what}: matrix {first + bad.argmax()} is not rigid within 1e-6")
+    sound = (off <= RIGID_TOLERANCE).all((1, 2)) & (np.linalg.det(rotation) > 0) & (poses[:, 3] == LAST_ROW).all(1)
+    if not sound.all():
+        raise ValueError(f"{what}: matrix {first + sound.argmin()} is not rigid within 1e-6")
     return poses
 
 
