@@ -19,6 +19,7 @@ from warp_abtree.kernels.distance.search import (
     warp_min_item,
     write_bound,
 )
+from warp_abtree.kernels.distance.slabs import Slabs
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.traversal.dual_tree import DEPTH_FIRST_ROOM
@@ -65,7 +66,9 @@ def search_crossing(models: ModelPool, states: StatePool, pose: PairPose, frame:
         live = wp.where(kind == NODES and warp_lane() < first, -1, 0)
         if kind != NODES:
             item = first_item(states, pose)
-        children, kinds, _bounds, _tests = bound_children(states, pose, frame, wp.float32(0.0), item, live)
+        children, kinds, _bounds, _tests, _most = bound_children(
+            False, states, Slabs(), pose, frame, wp.float32(0.0), item, live
+        )
         end = push_in_order(items, end, kinds, children)
         warp_sync()
     return found

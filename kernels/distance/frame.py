@@ -29,7 +29,6 @@ from warp_abtree.kernels.distance.triangle_pair import (
     nearest_features,
     scale_triangles,
 )
-from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import (
     ROUNDING_32,
     ROUNDING_64,
@@ -40,7 +39,6 @@ from warp_abtree.kernels.poses import (
     sum_products,
 )
 from warp_abtree.kernels.traversal.face_pairs import load_face_pair
-from warp_abtree.kernels.traversal.load_balance import NO_UNIT, Work
 from warp_abtree.kernels.traversal.node_pair import pack_item
 from warp_abtree.kernels.traversal.nodes import load_node
 from warp_abtree.kernels.triangle.distance import DISTANCE_MAX, EXPONENT_BITS, POSE_ROUNDING, largest, skew_of
@@ -100,7 +98,8 @@ class Found:
     faces: wp.array(dtype=wp.int64)  # see `Nearest`, shape [pair]; what lies there starts the next search
     frame: wp.array(dtype=Frame)  # shape [pair]
     beyond: wp.array(dtype=wp.float64)  # distance to end at [world units], infinite for none, shape [pair]
-    upper: wp.array(dtype=wp.float32)  # what no nearest faces are beyond, scaled, shape [pair]; of warps alone
+    # What no nearest faces are beyond, scaled: of faces, and twice that of nodes, shape [pair]; of warps alone.
+    upper: wp.array(dtype=wp.vec2)
     launched: wp.array(dtype=wp.int32)  # STALE where nothing is to be done, see `generation.LaunchRecord`
 
 
@@ -242,33 +241,4 @@ def start_pair(
     found.distance[p] = bound
     found.faces[p] = kept
     if p < found.upper.shape[0]:
-        found.upper[p] = scaled_up(bound, frame)
-
-
-@wp.kernel
-def start_distance_kernel(
-    models: ModelPool,
-    states: StatePool,
-    objects: ObjectPool,
-    pair_count: wp.array(dtype=wp.int32),
-    pairs: wp.array(dtype=wp.vec2i),
-    pair_poses: wp.array(dtype=PairPose),
-    found_inout: Found,
-    work_out: Work,
-):
-    """Prepare an object pair a thread, see `start_pair`.
-
-    A unit of work is an object pair; a stale launch is left none.
-    """
-    p = wp.tid()
-    if p < work_out.flag.shape[0]:
-        work_out.flag[p] = 0
-    if p == 0:
-        stale = found_inout.launched[0] == STALE
-        work_out.counter[0] = 0
-        work_out.counter[1] = 0
-        work_out.counter[2] = wp.where(stale, 0, wp.min(pair_count[0], pairs.shape[0]))
-        work_out.counter[3] = wp.where(stale, NO_UNIT, 0)
-    if p >= wp.min(pair_count[0], pairs.shape[0]) or found_inout.launched[0] == STALE:
-        return
-    start_pair(p, models, states, objects, pairs, pair_poses, found_inout)
+        found.upper[p] = wp.vec2(scaled_up(bound, frame), wp.inf)

@@ -2,13 +2,15 @@
 
 Items are those of `traversal.node_pair`. Boxes are compared along the axes of both frames, as in `traversal.boxes`: in
 each frame the six gaps between a box and the other's image bound the distance, and the larger bound counts. Bounds are
-squares of twice the distance, scaled (`frame.Frame`).
+squares of twice the distance, scaled (`frame.Frame`). Where there are slabs, theirs count too (`slab_bound`).
 """
 
 import warp as wp
 
 from warp_abtree.kernels.arrays import StatePool
 from warp_abtree.kernels.distance.frame import Frame
+from warp_abtree.kernels.distance.slab_bound import bound_child_slabs, square_gap
+from warp_abtree.kernels.distance.slabs import Slabs
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.boxes import PosedBox, pose_box
 from warp_abtree.kernels.traversal.node_pair import (
@@ -28,21 +30,18 @@ DROPPED, NODES, FACES = wp.constant(0), wp.constant(1), wp.constant(2)
 
 
 @wp.func
-def square_gap(x: wp.vec3, reach: wp.vec3):
-    """Return the squared length of what |x| exceeds a reach by."""
-    zero = wp.float32(0.0)
-    a = wp.max(wp.abs(x[0]) - reach[0], zero)
-    b = wp.max(wp.abs(x[1]) - reach[1], zero)
-    c = wp.max(wp.abs(x[2]) - reach[2], zero)
-    return (a * a + b * b) + c * c
-
-
-@wp.func
 def bound_boxes(a: PosedBox, b: PosedBox):
     """Return a lower bound of the squared distance of two boxes, see this module."""
     return wp.max(
         square_gap(a.sum - b.posed_sum, a.size + b.posed_size), square_gap(a.posed_sum - b.sum, a.posed_size + b.size)
     )
+
+
+@wp.func
+def square_limit(frame: Frame, twice: wp.float32):
+    """Return the bound of nodes over which nothing is as near as half of a length."""
+    x = twice * frame.grow + 2.0 * frame.least
+    return x * x
 
 
 @wp.func
@@ -60,8 +59,7 @@ def limit_of(frame: Frame, spare: wp.vec4, upper: wp.float32, held: wp.bool):
         cut = upper - wp.max(part - spare[3] * upper, 0.0)
     if cut < 0.0:
         return wp.float32(-1.0)
-    x = 2.0 * (cut * frame.grow + frame.least)
-    return x * x
+    return square_limit(frame, 2.0 * cut)
 
 
 @wp.func
@@ -84,8 +82,35 @@ def kind_of(used: wp.int32, a: Node, b: Node, bound: wp.float32, limit: wp.float
 
 
 @wp.func
-def bound_children(states: StatePool, pose: PairPose, frame: Frame, limit: wp.float32, item: wp.int64, live: wp.int32):
-    """Compare what an item names; return the items that follow, what each is, their bounds, and how many were compared.
+def bound_child_boxes(pose: PairPose, frame: Frame, a0: Node, a1: Node, b0: Node, b1: Node):
+    """Return lower bounds of the squared distances of the four pairs of two nodes of A and two of B."""
+    home = wp.transpose(pose.rotation32)
+    s = frame.scale
+    box_a0 = pose_box(a0.lower * s, a0.upper * s, home, frame.back, frame.margin)
+    box_a1 = pose_box(a1.lower * s, a1.upper * s, home, frame.back, frame.margin)
+    box_b0 = pose_box(b0.lower * s, b0.upper * s, pose.rotation32, frame.translation, frame.margin)
+    box_b1 = pose_box(b1.lower * s, b1.upper * s, pose.rotation32, frame.translation, frame.margin)
+    return wp.vec4(
+        bound_boxes(box_a0, box_b0),
+        bound_boxes(box_a0, box_b1),
+        bound_boxes(box_a1, box_b0),
+        bound_boxes(box_a1, box_b1),
+    )
+
+
+@wp.func
+def bound_children(
+    with_slabs: wp.bool,
+    states: StatePool,
+    slabs: Slabs,
+    pose: PairPose,
+    frame: Frame,
+    limit: wp.float32,
+    item: wp.int64,
+    live: wp.int32,
+):
+    """Compare what an item names; return the items that follow, what each is, their bounds, how many were compared, and
+    twice a distance that the nearest are not beyond, scaled: infinite without slabs.
 
     live is -1, or 0 where nothing is asked of the item, which still names nodes.
     """
@@ -93,22 +118,16 @@ def bound_children(states: StatePool, pose: PairPose, frame: Frame, limit: wp.fl
     y = item_second(item)
     at_a = pose.node_a + (x & INDEX_MASK)
     at_b = pose.node_b + (y & INDEX_MASK)
-    a0 = load_constant_node(states, at_a)
-    a1 = load_constant_node(states, at_a + wp.where(x < 0, 1, 0))
-    b0 = load_constant_node(states, at_b)
-    b1 = load_constant_node(states, at_b + wp.where(y < 0, 1, 0))
-    home = wp.transpose(pose.rotation32)
-    s = frame.scale
-    box_a0 = pose_box(a0.lower * s, a0.upper * s, home, frame.back, frame.margin)
-    box_a1 = pose_box(a1.lower * s, a1.upper * s, home, frame.back, frame.margin)
-    box_b0 = pose_box(b0.lower * s, b0.upper * s, pose.rotation32, frame.translation, frame.margin)
-    box_b1 = pose_box(b1.lower * s, b1.upper * s, pose.rotation32, frame.translation, frame.margin)
-    bounds = wp.vec4(
-        bound_boxes(box_a0, box_b0),
-        bound_boxes(box_a0, box_b1),
-        bound_boxes(box_a1, box_b0),
-        bound_boxes(box_a1, box_b1),
-    )
+    at = wp.vec4i(at_a, at_a + wp.where(x < 0, 1, 0), at_b, at_b + wp.where(y < 0, 1, 0))
+    a0, a1 = load_constant_node(states, at[0]), load_constant_node(states, at[1])
+    b0, b1 = load_constant_node(states, at[2]), load_constant_node(states, at[3])
+    bounds, most = wp.vec4(), wp.float32(wp.inf)
+    if with_slabs:
+        bounds, most_of = bound_child_slabs(slabs, pose, frame, at, a0, a1, b0, b1)
+        # A node that is alone counts twice.
+        most = wp.where(live < 0, wp.min(most_of), wp.inf)
+    else:
+        bounds = bound_child_boxes(pose, frame, a0, a1, b0, b1)
     kinds = wp.vec4i(
         kind_of(live, a0, b0, bounds[0], limit),
         kind_of(y & live, a0, b1, bounds[1], limit),
@@ -117,4 +136,4 @@ def bound_children(states: StatePool, pose: PairPose, frame: Frame, limit: wp.fl
     )
     items = four_items(item_of(a0, b0), item_of(a0, b1), item_of(a1, b0), item_of(a1, b1))
     tests = -((live >> 31) + ((y & live) >> 31) + ((x & live) >> 31) + ((x & y & live) >> 31))
-    return items, kinds, bounds, tests
+    return items, kinds, bounds, tests, most

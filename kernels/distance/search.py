@@ -21,8 +21,19 @@ from warp_abtree.kernels.distance.frame import (
     scaled_up,
     spare_of,
 )
-from warp_abtree.kernels.distance.node_pair import bound_children, limit_of
+from warp_abtree.kernels.distance.node_pair import bound_children, limit_of, square_limit
+from warp_abtree.kernels.distance.slabs import Slabs, has_slabs
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
+from warp_abtree.kernels.distance.warp_found import (
+    FACES_UPPER,
+    NODES_UPPER,
+    faces_code,
+    load_distance,
+    load_faces,
+    load_upper,
+    lower_upper,
+    offer_nearest,
+)
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.boxes import map_point
 from warp_abtree.kernels.traversal.dual_tree import DEPTH_FIRST_ROOM, STACK_MASK, donate_items, receive_items
@@ -58,7 +69,6 @@ OPEN_LENGTH = native.constant("NEAREST_OPEN_LENGTH")
 FIRST_TOLERANCE = wp.constant(wp.float64(0.25))
 
 stack_code = functools.partial(native.body, "nearest_stack.cuh")
-faces_code = functools.partial(native.body, "nearest_faces.cuh")
 
 three_points = wp.types.matrix(shape=(3, 3), dtype=wp.float32)
 
@@ -108,31 +118,6 @@ def bound_faces(own: wp.float32, a: three_points, b: three_points) -> wp.vec2:
     """
 
 
-@wp.func_native(faces_code("load_upper"))
-def load_upper(upper: wp.array(dtype=wp.float32), i: wp.int32) -> wp.float32:
-    """Return an entry that other warps write, past the first-level cache; the same in all lanes."""
-
-
-@wp.func_native(faces_code("lower_upper"))
-def lower_upper(upper: wp.array(dtype=wp.float32), i: wp.int32, x: wp.float32):
-    """Put in a number, 0 or more, if it is lower."""
-
-
-@wp.func_native(faces_code("load_distance"))
-def load_distance(distance: wp.array(dtype=wp.float64), i: wp.int32) -> wp.float64: ...
-
-
-@wp.func_native(faces_code("load_faces"))
-def load_faces(faces: wp.array(dtype=wp.int64), i: wp.int32) -> wp.int64: ...
-
-
-@wp.func_native(faces_code("offer_nearest"))
-def offer_nearest(
-    distance: wp.array(dtype=wp.float64), faces: wp.array(dtype=wp.int64), i: wp.int32, d: wp.float64, item: wp.int64
-):
-    """Put in faces that are nearer than those there, or as near and lower."""
-
-
 @wp.func_native(faces_code("warp_min"))
 def warp_min(x: wp.float64) -> wp.float64: ...
 
@@ -156,6 +141,7 @@ class Search:
     room: wp.int32  # items that the stack takes, STACK_LENGTH at most
     shared: wp.bool  # whether warps that are idle get some
     measures: wp.bool  # whether faces are measured in float64
+    slabs: wp.bool  # whether there are some of both states
 
 
 @wp.func
@@ -194,7 +180,7 @@ def bound_waiting(
         between = bound_faces(search.frame.error, a, b)
     least = warp_min32(between[1])
     if least < upper:
-        lower_upper(found.upper, search.pair, least)
+        lower_upper(found.upper, search.pair, FACES_UPPER, least)
     opened = push_open(items, opened, live and between[0] <= wp.min(least, upper), item, between[0])
     warp_sync()
     return opened, wp.where(live, 1, 0)
@@ -224,7 +210,7 @@ def decide_open(
         lowest = warp_min_item(wp.where(d == least, item, NO_FACES))
         if least <= load_distance(found.distance, search.pair):
             offer_nearest(found.distance, found.faces, search.pair, least, lowest)
-            lower_upper(found.upper, search.pair, scaled_up(least, search.frame))
+            lower_upper(found.upper, search.pair, FACES_UPPER, scaled_up(least, search.frame))
 
 
 @wp.func
@@ -235,17 +221,23 @@ def expand_nearest(
     waiting: wp.int32,
     limit: wp.float32,
     states: StatePool,
+    slabs: Slabs,
     search: Search,
 ):
-    """Compare what items first to first + popped name, one a lane; return both ends, see `push_nearest`, and tests."""
+    """Compare what items first to first + popped name, one a lane.
+
+    Returns both ends, see `push_nearest`, how many were compared, and twice a distance that nothing nearest is beyond.
+    """
     at = (first + wp.min(warp_lane(), popped - 1)) & STACK_MASK
     item = read_item(items, at)
     live = wp.where(warp_lane() < popped and read_bound(items, at) <= limit, -1, 0)
     warp_sync()
-    children, kinds, bounds, compared = bound_children(states, search.pose, search.frame, limit, item, live)
+    children, kinds, bounds, compared, most = bound_children(
+        search.slabs, states, slabs, search.pose, search.frame, limit, item, live
+    )
     ends = push_nearest(items, first, waiting, kinds, children, bounds)
     warp_sync()
-    return ends, compared
+    return ends, compared, most
 
 
 @wp.func
@@ -255,6 +247,7 @@ def search_items(
     count: wp.int32,
     models: ModelPool,
     states: StatePool,
+    slabs: Slabs,
     # state
     found: Found,
     work: Work,
@@ -271,18 +264,21 @@ def search_items(
         tickets = wp.int64(0)
         if search.shared:
             tickets = load_tickets(work.counter)
-        upper = load_upper(found.upper, pair)
+        least = load_upper(found.upper, pair)
+        upper, near = least[FACES_UPPER], least[NODES_UPPER]
         held = held or upper < beyond
-        limit = limit_of(frame, spare, upper, held)
+        limit = wp.min(limit_of(frame, spare, upper, held), square_limit(frame, near))
         if end > head and waiting < warp_size():
             # One at a time, depth first, needs little room; more where there is.
             popped = wp.max(1, (search.room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
             popped = wp.min(popped, wp.min(warp_size(), end - head))
             end -= popped
-            ends, compared = expand_nearest(items, end, popped, waiting, limit, states, search)
+            ends, compared, most = expand_nearest(items, end, popped, waiting, limit, states, slabs, search)
             end = item_second(ends)
             waiting = item_first(ends)
             tests[0] += compared
+            if warp_any(most < wp.min(near, 2.0 * upper)):
+                lower_upper(found.upper, pair, NODES_UPPER, warp_min32(most))
         # The first face pairs are measured at once: until then, nothing is dropped.
         if waiting >= warp_size() or (waiting > 0 and (end == head or not held)):
             popped = wp.min(waiting, warp_size())
@@ -295,7 +291,7 @@ def search_items(
             popped = wp.min(opened, warp_size())
             opened -= popped
             if search.measures:
-                upper = load_upper(found.upper, pair)
+                upper = load_upper(found.upper, pair)[FACES_UPPER]
                 decide_open(items, opened, popped, upper, search, models, states, found)
         idle = count_idle(tickets)
         if idle > 0 and end - head >= 2 * DONATION_LEAST:
@@ -327,6 +323,7 @@ def search_warp_kernel(
     states: StatePool,
     pair_count: wp.array(dtype=wp.int32),
     pair_poses: wp.array(dtype=PairPose),
+    slabs: Slabs,
     found_inout: Found,
     hits_inout: Hits,
     work_inout: Work,
@@ -353,6 +350,7 @@ def search_warp_kernel(
             search.pair = p
             search.pose = pair_poses[p]
             search.frame = found_inout.frame[p]
+            search.slabs = has_slabs(states, slabs, p)
             tests = wp.vec2i()
             rough = slot < 0 and count >= rough_least and load_faces(found_inout.faces, p) == NO_FACES
             # Within a tolerance what bounds the distance may not be found again: it is measured at once.
@@ -367,7 +365,7 @@ def search_warp_kernel(
                 search.measures = within or not rough
                 search.tolerances = asked
                 size = start_items(slot, states, search.pose, work_inout)
-                tests += search_items(search, size, models, states, found_inout, work_inout)
+                tests += search_items(search, size, models, states, slabs, found_inout, work_inout)
                 searching = rough
                 rough = False
             add_warp_sum(hits_inout.node_tests, p, tests[0])

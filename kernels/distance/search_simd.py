@@ -22,7 +22,7 @@ from warp_abtree.kernels.distance.frame import (
     start_pair,
 )
 from warp_abtree.kernels.distance.report import Distances, report_pair
-from warp_abtree.kernels.distance.slabs import Slabs, has_slabs, refresh_slabs
+from warp_abtree.kernels.distance.slabs import Slabs, count_uses, has_slabs, make_due
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import PairPose
@@ -117,7 +117,7 @@ class Asked:
     pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]
     pair_poses: wp.array(dtype=PairPose)  # shape [pair]
     tolerances: Tolerances  # when they are near enough
-    refreshes: wp.bool  # whether a thread that is still alone makes slabs, see `refresh_slabs`
+    refreshes: wp.bool  # whether a thread that is still alone makes the slabs that are due
     searches: wp.bool  # whether it, or each of several, then takes pairs
 
 
@@ -150,7 +150,7 @@ def search_pair(
     diving = nearest.distance == wp.float64(wp.inf)
     if nearest.faces != NO_FACES:
         diving = nearest.distance > wp.float64(2.0) * before or before > wp.float64(2.0) * nearest.distance
-    with_slabs = has_slabs(slabs, p)
+    with_slabs = has_slabs(states, slabs, p)
     spare = spare_of(asked.tolerances, frame)
     open_search(
         scaled_up(nearest.distance, frame),
@@ -195,8 +195,10 @@ def search_thread_kernel(
     if asked.refreshes:
         for i in range(counter_inout.shape[0]):
             counter_inout[i] = 0
+        slabs_inout.due_count[0] = 0
         for i in range(count):
-            refresh_slabs(i, models, states, objects, pairs, slabs_inout)
+            count_uses(i, models, states, objects, pairs, slabs_inout)
+        make_due(0, 1, 0, 1, models, states, slabs_inout)
     if not asked.searches:
         return
     thread = take_thread(counter_inout)

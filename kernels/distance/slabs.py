@@ -1,8 +1,9 @@
-"""Slabs of nodes on the CPU: how far the faces below a node reach along their mean normal, both ways.
+"""Slabs of nodes: how far the faces below a node reach along their mean normal, both ways.
 
 A box has corners that no face has. Along the direction in which two surfaces are nearest, faces that look that way
-reach no farther than their slab, so a node's box and slab together bound it closely (`nearest/boxes.h`). A slab is
-made of a state at a LOD once so many pairs have asked for it that it pays.
+reach no farther than their slab, so a node's box and slab together bound it closely (`slab_bound`, on the CPU
+`nearest/boxes.h`). The slabs of a state at a LOD are made once so many pairs have been searched without that it pays:
+on the CPU by the thread that counts, on CUDA by blocks that share its subtrees.
 
 A slab is two entries of 16 bytes a node, as `nodes.Node` has:
 
@@ -13,14 +14,19 @@ A slab is two entries of 16 bytes a node, as `nodes.Node` has:
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.traversal.boxes import round_down, round_up
-from warp_abtree.kernels.traversal.nodes import Node, load_node
+from warp_abtree.kernels.traversal.nodes import Node, load_node, store_entry
+from warp_abtree.kernels.update.refit import block_sync
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
 
-# Pairs that ask for the slabs of a state before they are made: it takes about as long as so many searches save.
+# Pairs that are searched without slabs of a state before these are made: it takes about as long as so many save.
 USES_MIN = wp.constant(16)
+THREADS = 256  # of a block that makes slabs
+SUBTREE_LEVELS = wp.constant(10)  # of those that blocks share
 
 
 @wp.struct
@@ -28,7 +34,11 @@ class Slabs:
     """Slabs of all states, and what they were made of."""
 
     record: wp.array(dtype=wp.vec4)  # two entries a node of the pool, shape [2 node]
-    made: wp.array(dtype=wp.vec4i)  # (LOD, model, where its nodes begin, pairs that have asked), shape [state]
+    made: wp.array(dtype=wp.vec3i)  # (LOD, model, where its nodes begin) of what they are of, shape [state]
+    uses: wp.array(dtype=wp.int32)  # pairs searched since, without, shape [state]
+    due: wp.array(dtype=wp.int32)  # states whose slabs are to be made in this launch, shape [state]
+    due_count: wp.array(dtype=wp.int32)  # how many, shape [1]
+    ended: wp.array(dtype=wp.int32)  # subtrees of a state that blocks have ended, shape [state]
     states: wp.array(dtype=wp.vec2i)  # those of its objects, shape [pair]
 
 
@@ -43,9 +53,20 @@ class Slab:
     radius: wp.float32  # of a ball about the middle of the node's box that holds the faces
 
 
+@wp.func_native(native.body("slabs.cuh", "is_last_block"))
+def is_last_block(ended: wp.array(dtype=wp.int32), i: wp.int32, amount: wp.int32, whole: wp.int32) -> bool:
+    """Add what this block has ended; return whether it is the last, which then sees what the others have written."""
+
+
+@wp.func_native(native.body("slabs.cuh", "load_written"))
+def load_written(values: wp.array(dtype=wp.vec4), i: wp.int64) -> wp.vec4:
+    """Return an entry that another block may have written."""
+
+
 @wp.func
 def load_slab(slabs: Slabs, at: wp.int32):
-    first, second = slabs.record[2 * at], slabs.record[2 * at + 1]
+    i = wp.int64(2) * wp.int64(at)
+    first, second = load_written(slabs.record, i), load_written(slabs.record, i + wp.int64(1))
     slab = Slab()
     slab.normal = wp.vec3(first[0], first[1], first[2])
     slab.low = first[3]
@@ -58,8 +79,9 @@ def load_slab(slabs: Slabs, at: wp.int32):
 @wp.func
 def store_slab(slabs: Slabs, at: wp.int32, slab: Slab):
     n = slab.normal
-    slabs.record[2 * at] = wp.vec4(n[0], n[1], n[2], slab.low)
-    slabs.record[2 * at + 1] = wp.vec4(slab.high, slab.weight, slab.radius, 0.0)
+    i = wp.int64(2) * wp.int64(at)
+    store_entry(slabs.record, i, wp.vec4(n[0], n[1], n[2], slab.low))
+    store_entry(slabs.record, i + wp.int64(1), wp.vec4(slab.high, slab.weight, slab.radius, 0.0))
 
 
 @wp.func
@@ -134,49 +156,50 @@ def join_slabs(states: StatePool, slabs: Slabs, node: Node, at: wp.int32):
 
 
 @wp.func
-def make_slabs(models: ModelPool, states: StatePool, slabs: Slabs, state: wp.int32):
-    """Make the slabs of all active nodes of a state, children first."""
+def make_slab(models: ModelPool, states: StatePool, slabs: Slabs, state: wp.int32, i: wp.int32):
+    """Make the slab of node i of a state, if it is active; those of the nodes below are made."""
     start = states.node_start[state]
-    i = wp.int32(2) << models.depth[states.model[state]]
-    while i > 1:
-        i -= 1
-        node = load_node(states, start + i)
-        if node.skip >= 0:
-            if node.face >= 0:
-                store_slab(slabs, start + i, face_slab(models, states, node, states.face_start[state] + node.face))
-            elif node.skip != i:
-                store_slab(slabs, start + i, load_slab(slabs, start + node.skip))
-            else:
-                store_slab(slabs, start + i, join_slabs(states, slabs, node, start + 2 * i))
+    node = load_node(states, start + i)
+    if node.skip >= 0:
+        if node.face >= 0:
+            store_slab(slabs, start + i, face_slab(models, states, node, states.face_start[state] + node.face))
+        elif node.skip != i:
+            store_slab(slabs, start + i, load_slab(slabs, start + node.skip))
+        else:
+            store_slab(slabs, start + i, join_slabs(states, slabs, node, start + 2 * i))
 
 
 @wp.func
-def has_slabs(slabs: Slabs, p: wp.int32):
+def key_of(states: StatePool, state: wp.int32):
+    """Return what slabs of a state are of."""
+    return wp.vec3i(states.lod[state], states.model[state], states.node_start[state])
+
+
+@wp.func
+def is_made(states: StatePool, slabs: Slabs, state: wp.int32):
+    """Return whether slabs of a state are those of its LOD."""
+    return state < slabs.made.shape[0] and slabs.made[state] == key_of(states, state)
+
+
+@wp.func
+def has_slabs(states: StatePool, slabs: Slabs, p: wp.int32):
     """Return whether there are slabs of both objects of a pair."""
     own = slabs.states[p]
-    if wp.max(own[0], own[1]) >= slabs.made.shape[0]:
-        return False
-    return slabs.made[own[0]][3] >= USES_MIN and slabs.made[own[1]][3] >= USES_MIN
+    return is_made(states, slabs, own[0]) and is_made(states, slabs, own[1])
 
 
 @wp.func
-def ask_slabs(models: ModelPool, states: StatePool, slabs: Slabs, state: wp.int32):
-    """Count a pair that asks for the slabs of a state, and make them if they pay and there is room."""
+def count_use(models: ModelPool, states: StatePool, slabs: Slabs, state: wp.int32):
+    """Count a pair that is searched without slabs of a state; return whether they are to be made now."""
     end = states.node_start[state] + (wp.int32(2) << models.depth[states.model[state]])
-    if state >= slabs.made.shape[0] or 2 * end > slabs.record.shape[0]:
-        return
-    key = wp.vec3i(states.lod[state], states.model[state], states.node_start[state])
-    made = slabs.made[state]
-    uses = wp.where(made[0] == key[0] and made[1] == key[1] and made[2] == key[2], made[3], 0)
-    if uses < USES_MIN:
-        uses += 1
-        if uses == USES_MIN:
-            make_slabs(models, states, slabs, state)
-        slabs.made[state] = wp.vec4i(key[0], key[1], key[2], uses)
+    # What a graph has no room for has none.
+    if state >= slabs.made.shape[0] or 2 * end > slabs.record.shape[0] or is_made(states, slabs, state):
+        return False
+    return slabs.uses[state] < USES_MIN and wp.atomic_add(slabs.uses, state, 1) == USES_MIN - 1
 
 
 @wp.func
-def refresh_slabs(
+def count_uses(
     p: wp.int32,
     models: ModelPool,
     states: StatePool,
@@ -184,8 +207,70 @@ def refresh_slabs(
     pairs: wp.array(dtype=wp.vec2i),
     slabs: Slabs,
 ):
-    """Count what an object pair asks for, and make the slabs that pay; one pair after the other, CPU only."""
+    """Count an object pair, and list its states whose slabs are to be made now."""
     own = wp.vec2i(objects.state[pairs[p][0]], objects.state[pairs[p][1]])
     slabs.states[p] = own
-    ask_slabs(models, states, slabs, own[0])
-    ask_slabs(models, states, slabs, own[1])
+    for k in range(2):
+        if count_use(models, states, slabs, own[k]):
+            slabs.due[wp.atomic_add(slabs.due_count, 0, 1)] = own[k]
+
+
+@wp.func
+def make_below(
+    top: wp.int32,
+    levels: wp.int32,
+    thread: wp.int32,
+    threads: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    slabs: Slabs,
+    state: wp.int32,
+):
+    """Make the slabs of a node and of so many levels below it, children first, by the threads of a block."""
+    level = levels
+    while level >= 0:
+        i = thread
+        while i < wp.int32(1) << level:
+            make_slab(models, states, slabs, state, (top << level) + i)
+            i += threads
+        block_sync()
+        level -= 1
+
+
+@wp.func
+def make_due(
+    first: wp.int32,
+    step: wp.int32,
+    thread: wp.int32,
+    threads: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    slabs: Slabs,
+):
+    """Make the slabs of the states that are listed: every so manieth subtree, and what is above them where they end.
+
+    Subtrees are shared among blocks; the block that ends the last one of a state makes what is above.
+    """
+    for k in range(slabs.due_count[0]):
+        state = slabs.due[k]
+        depth = models.depth[states.model[state]]
+        above = wp.max(0, depth - SUBTREE_LEVELS)
+        made = wp.int32(0)
+        i = (first + k) % step
+        while i < wp.int32(1) << above:
+            make_below((wp.int32(1) << above) + i, depth - above, thread, threads, models, states, slabs, state)
+            made += 1
+            i += step
+        if made > 0 and is_last_block(slabs.ended, state, made, wp.int32(1) << above):
+            make_below(1, above - 1, thread, threads, models, states, slabs, state)
+            if thread == 0:
+                slabs.made[state] = key_of(states, state)
+                slabs.uses[state] = 0
+                slabs.ended[state] = 0
+
+
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS | {"block_dim": THREADS})
+def make_slabs_kernel(threads: wp.int32, blocks: wp.int32, models: ModelPool, states: StatePool, slabs_inout: Slabs):
+    """Make the slabs that are due."""
+    i = wp.tid()
+    make_due(i / threads, blocks, i % threads, threads, models, states, slabs_inout)

@@ -18,23 +18,27 @@ inline CUDA_CALLABLE wp::vec_t<2, wp::float32> bound_faces(wp::float32 own, Corn
     return wp::vec_t<2, wp::float32>(N::F::first(d - error), N::F::first(d + error));
 }
 
-inline CUDA_CALLABLE wp::float32 load_upper(wp::array_t<wp::float32> upper, wp::int32 i) {
+inline CUDA_CALLABLE wp::vec_t<2, wp::float32> load_upper(wp::array_t<wp::vec_t<2, wp::float32>> upper, wp::int32 i) {
 #if defined(__CUDA_ARCH__)
-    // Lanes that were not together read at different times; what follows needs the same number in all.
-    return __shfl_sync(0xffffffffu, *(const volatile float*)(upper.data + i), 0);
+    // Lanes that were not together read at different times; what follows needs the same numbers in all.
+    const unsigned long long both = *(const volatile unsigned long long*)(upper.data + i);
+    const unsigned long long x = __shfl_sync(0xffffffffu, both, 0);
+    return wp::vec_t<2, wp::float32>(__int_as_float((int)x), __int_as_float((int)(x >> 32)));
 #else
     return upper.data[i];
 #endif
 }
 
-inline CUDA_CALLABLE void lower_upper(wp::array_t<wp::float32> upper, wp::int32 i, wp::float32 x) {
+inline CUDA_CALLABLE void lower_upper(wp::array_t<wp::vec_t<2, wp::float32>> upper, wp::int32 i, wp::int32 k,
+                                      wp::float32 x) {
 #if defined(__CUDA_ARCH__)
     // Numbers of 0 and more are in the order of their bits.
     if (threadIdx.x == 0)
-        atomicMin((int*)(upper.data + i), __float_as_int(x));
+        atomicMin((int*)(upper.data + i) + k, __float_as_int(x));
     __syncwarp();
 #else
-    upper.data[i] = x < upper.data[i] ? x : upper.data[i];
+    float& most = upper.data[i][k];
+    most = x < most ? x : most;
 #endif
 }
 

@@ -53,7 +53,7 @@ from warp_abtree.checks.arguments import check_device, flag, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd, slabs
+from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd, slabs, start
 from warp_abtree.kernels.solid.containment import report_contained_kernel
 from warp_abtree.kernels.solid.depth import find_depth_kernel
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
@@ -176,9 +176,10 @@ class DistanceQuery(Query):
         self._asked = check_beyond(beyond, None if pairs is None else len(to_numpy(pairs, "pairs")))
         self.distances, self._found, self._slabs = report.Distances(), frame.Found(), slabs.Slabs()
         self._slabs.record = wp.empty(0, dtype=wp.vec4, device=scene.device)
-        self._slabs.made = wp.empty(0, dtype=wp.vec4i, device=scene.device)
+        self._slabs.due_count = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity)
         self._found.launched = self.guard.launched
+        self._fit_slabs()
 
     def set_pairs(self, pairs, beyond=None):
         """Query other pairs from now on, in the room there is if they fit; beyond None keeps the distances.
@@ -230,9 +231,10 @@ class DistanceQuery(Query):
         with_warps = current_regime().uses_warps(device)
         kernels = [search.search_warp_kernel if with_warps else search_simd.search_thread_kernel]
         kernels += CROSSING_KERNELS if device.is_cuda else []  # on the CPU where pairs cross
-        kernels += [report.report_distance_kernel, frame.start_distance_kernel] if with_warps else []
+        kernels += [report.report_distance_kernel, start.start_distance_kernel] if with_warps else []
         searching = super().kernels(device, output, precision, with_gap, with_distances)
-        return [*[(kernel, WARP_SIZE) for kernel in kernels], *searching]
+        making = [(slabs.make_slabs_kernel, slabs.THREADS)] if with_warps else []
+        return [*[(kernel, WARP_SIZE) for kernel in kernels], *making, *searching]
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
@@ -247,7 +249,7 @@ class DistanceQuery(Query):
         ):
             made.append((owner, name, wp.empty(room, dtype=dtype, device=self.device)))
         uppers = room if self.uses_warps() else 0
-        made.append((self._found, "upper", wp.empty(uppers, dtype=wp.float32, device=self.device)))
+        made.append((self._found, "upper", wp.empty(uppers, dtype=wp.vec2, device=self.device)))
         threads = 0 if self.uses_warps() else min(room, current_regime().cpu_threads or core_count())
         made.append((self._slabs, "states", wp.empty(room, dtype=wp.vec2i, device=self.device)))
         made.append(
@@ -261,8 +263,7 @@ class DistanceQuery(Query):
         room = len(self.pairs)
         if not room:
             return
-        if not self.uses_warps():
-            self._fit_slabs()
+        self._fit_slabs()
         super().traverse()
         if self.device.is_capturing:
             self._launch_all("distances", self._make_distances)
@@ -322,13 +323,21 @@ class DistanceQuery(Query):
 
     def _fit_slabs(self):
         """Make room for the slabs of all tree states that there are now; a graph goes on without."""
-        pool = self.batch.states.pool
-        fits = len(self._slabs.record) == len(pool.node_box) and len(self._slabs.made) == len(pool.lod)
-        if fits or self.device.is_capturing:
+        nodes, states = len(self.batch.states.pool.node_box), len(self.batch.states.pool.lod)
+        nodes = nodes if self._regime.slabs else 0
+        made = self._slabs.made
+        if self.device.is_capturing or (made is not None and (len(self._slabs.record), len(made)) == (nodes, states)):
             return
-        made = wp.zeros(len(pool.lod), dtype=wp.vec4i, device=self.device)
-        record = wp.empty(len(pool.node_box), dtype=wp.vec4, device=self.device)
-        self._replace([(self._slabs, "record", record), (self._slabs, "made", made)])
+        device = self.device
+        self._replace(
+            [
+                (self._slabs, "record", wp.empty(nodes, dtype=wp.vec4, device=device)),
+                (self._slabs, "made", wp.full(states, wp.vec3i(-1), dtype=wp.vec3i, device=device)),
+                (self._slabs, "uses", wp.zeros(states, dtype=wp.int32, device=device)),
+                (self._slabs, "due", wp.empty(states, dtype=wp.int32, device=device)),
+                (self._slabs, "ended", wp.zeros(states, dtype=wp.int32, device=device)),
+            ]
+        )
 
     def _make_distances(self, launch) -> list:
         """Make the launches that find distances, after the exact test, see `Commands.find`."""
@@ -338,7 +347,7 @@ class DistanceQuery(Query):
         shared = [models, states, self.pair_count, self.pair_poses]
         hits, found, length = self.hits, self._found, self._stack_length()
         threads = {"dim": room, "block_dim": WARP_SIZE, "device": device}
-        reports = [*posed, found, hits, self.distances]
+        reports = [self._tolerances, *posed, found, hits, self.distances, self._slabs.due_count]
         if not self.uses_warps():
             made = []
             for steps in [(True, True)] if self._search_cores() == 1 else [(True, False), (False, True)]:
@@ -349,13 +358,17 @@ class DistanceQuery(Query):
                 inputs += [self.distances, self._memory]
                 made.append(launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device))
             return made
-        start = {**threads, "dim": max(room, len(self.work.flag))}
-        inputs = [length, ROUGH_LEAST, self._tolerances, *shared, found, hits, self.work]
+        started = {**threads, "dim": max(room, len(self.work.flag))}
+        inputs = [length, ROUGH_LEAST, self._tolerances, *shared, self._slabs, found, hits, self.work]
         searching = {"dim": self._warp_count() * lanes, "block_dim": WARP_SIZE, "device": device}
+        block = slabs.THREADS if self.device.is_cuda else 1
+        blocks = self.device.sm_count if self.device.is_cuda else 1
+        making = {"dim": blocks * block, "block_dim": slabs.THREADS, "device": device}
         return [
-            launch(frame.start_distance_kernel, inputs=[*posed, found, self.work], **start),
+            launch(start.start_distance_kernel, inputs=[*posed, self._slabs, found, self.work], **started),
+            launch(slabs.make_slabs_kernel, inputs=[block, blocks, models, states, self._slabs], **making),
             launch(search.search_warp_kernel, inputs=inputs, **searching),
-            launch(report.report_distance_kernel, inputs=[self._tolerances, *reports], **threads),
+            launch(report.report_distance_kernel, inputs=reports, **threads),
         ]
 
     def _make_result(self, found: Found, device: bool, with_rows: bool = True) -> Result:

@@ -1,0 +1,159 @@
+"""Bounds of the distances of two nodes by slabs and boxes together, for a lane of a warp.
+
+Along a direction, a node reaches no farther than its slab and its box do; across it, no farther than a ball about its
+box's centre; docs/exactness.md has the margins. The direction joins the nodes' middles, turned a little towards their
+mean normals: where small nodes face each other it is the one in which they are nearest, but for an angle like their
+size, so that such bounds err by the square of the size, where boxes err by the size.
+
+Neither are all faces farther than the balls' far sides, so that something near is known before a face is measured.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.distance.frame import ROUNDING_UP, Frame
+from warp_abtree.kernels.distance.slabs import Slabs
+from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.traversal.boxes import fuse32, map_point
+from warp_abtree.kernels.traversal.nodes import Node, load_constant
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+# Margins of boxes that a bound leaves off, of twice the distance.
+MARGINS = wp.constant(wp.float32(16.0))
+# How much the sums of two nodes' normals count for the direction, beside what joins their middles; as was counted.
+NORMAL_WEIGHT = wp.constant(wp.float32(0.0625))
+
+
+@wp.struct
+class Body:
+    """A node's box and slab, scaled; twice all lengths but the size."""
+
+    sum: wp.vec3  # twice the centre, own frame
+    size: wp.vec3  # whole width, own frame
+    normal: wp.vec3  # of the slab, own frame
+    low: wp.float32  # least along the normal
+    high: wp.float32  # greatest
+    ball: wp.float32  # radius about the centre
+
+
+@wp.func
+def square_gap(x: wp.vec3, reach: wp.vec3):
+    """Return the squared length of what |x| exceeds a reach by."""
+    zero = wp.float32(0.0)
+    a = wp.max(wp.abs(x[0]) - reach[0], zero)
+    b = wp.max(wp.abs(x[1]) - reach[1], zero)
+    c = wp.max(wp.abs(x[2]) - reach[2], zero)
+    return (a * a + b * b) + c * c
+
+
+@wp.func
+def square_over(x: wp.float32, margin: wp.float32):
+    over = wp.max(x - margin, 0.0)
+    return over * over
+
+
+@wp.func
+def add_products(x: wp.vec3, y: wp.vec3, sum: wp.float32):
+    return fuse32(x[0], y[0], fuse32(x[1], y[1], fuse32(x[2], y[2], sum)))
+
+
+@wp.func
+def take_multiple(x: wp.vec3, factor: wp.float32, y: wp.vec3):
+    """Return x - factor y."""
+    return wp.vec3(fuse32(-factor, y[0], x[0]), fuse32(-factor, y[1], x[1]), fuse32(-factor, y[2], x[2]))
+
+
+@wp.func
+def load_body(slabs: Slabs, at: wp.int32, node: Node, scale: wp.float32):
+    i = wp.int64(2) * wp.int64(at)
+    first, second = load_constant(slabs.record, i), load_constant(slabs.record, i + wp.int64(1))
+    lower, upper, twice = node.lower * scale, node.upper * scale, 2.0 * scale
+    body = Body()
+    body.sum = upper + lower
+    body.size = upper - lower
+    body.normal = wp.vec3(first[0], first[1], first[2])
+    body.low = first[3] * twice
+    body.high = second[0] * twice
+    body.ball = second[2] * twice
+    return body
+
+
+@wp.func
+def top_of(body: Body, n: wp.vec3):
+    """Return twice an upper bound of n . x for the points x of a node, in its own frame."""
+    along = add_products(n, body.normal, 0.0)
+    rest = take_multiple(n, along, body.normal)
+    by_slab = fuse32(
+        along,
+        wp.where(along > 0.0, body.high, body.low),
+        add_products(rest, body.sum, add_products(wp.abs(rest), body.size, 0.0)),
+    )
+    return wp.min(by_slab, add_products(n, body.sum, add_products(wp.abs(n), body.size, 0.0)))
+
+
+@wp.func
+def reach_there(rotation: wp.mat33, size: wp.vec3, margin: wp.float32):
+    """Return the width of a box's image in the other frame, wider by a margin on either side."""
+    reach = wp.vec3()
+    for i in range(3):
+        x = fuse32(wp.abs(rotation[i, 2]), size[2], margin + margin)
+        reach[i] = fuse32(wp.abs(rotation[i, 0]), size[0], fuse32(wp.abs(rotation[i, 1]), size[1], x))
+    return reach
+
+
+@wp.func
+def direction_of(apart: wp.vec3, a: wp.vec3, b: wp.vec3):
+    """Return the unit direction in which two nodes are compared, in A's frame.
+
+    Args:
+        apart: Between their middles.
+        a, b: Sums of unit normals, turned either way.
+    """
+    c = wp.normalize(apart)
+    c = take_multiple(take_multiple(c, -NORMAL_WEIGHT * wp.dot(a, c), a), -NORMAL_WEIGHT * wp.dot(b, c), b)
+    return wp.normalize(c)
+
+
+@wp.func
+def bound_pair(n: wp.vec3, gap: wp.float32, margin: wp.float32, apart: wp.vec3, balls: wp.float32, boxes: wp.float32):
+    """Return a lower bound of the square of twice the distance of two nodes, and an upper bound of twice it.
+
+    Args:
+        gap: Twice their gap along n.
+        boxes: The lower bound by boxes.
+    """
+    d = add_products(apart, n, 0.0)
+    across = take_multiple(apart, d, n)
+    square = add_products(across, across, 0.0)
+    most = (wp.sqrt(fuse32(d, d, square)) + balls) * ROUNDING_UP + margin
+    least = square_over(gap, margin) + square_over(wp.sqrt(square) - balls, margin)
+    return wp.max(least, boxes), most
+
+
+@wp.func
+def bound_child_slabs(
+    slabs: Slabs, pose: PairPose, frame: Frame, at: wp.vec4i, node_a0: Node, node_a1: Node, node_b0: Node, node_b1: Node
+):
+    """Return lower bounds of the squared distances of the four pairs of nodes of A and B, and twice upper ones.
+
+    Args:
+        at: Where the nodes lie in the pool.
+    """
+    s, rotation, margin = frame.scale, pose.rotation32, MARGINS * frame.margin
+    a0, a1 = load_body(slabs, at[0], node_a0, s), load_body(slabs, at[1], node_a1, s)
+    b0, b1 = load_body(slabs, at[2], node_b0, s), load_body(slabs, at[3], node_b1, s)
+    shift = frame.translation + frame.translation
+    there0, there1 = map_point(rotation, shift, b0.sum), map_point(rotation, shift, b1.sum)
+    normal_b = map_point(rotation, wp.vec3(), b0.normal + b1.normal)
+    n = direction_of((there0 + there1) - (a0.sum + a1.sum), a0.normal + a1.normal, normal_b)
+    back = -map_point(wp.transpose(rotation), wp.vec3(), n)
+    far = wp.dot(shift, n)
+    far0, far1 = far - top_of(b0, back), far - top_of(b1, back)
+    top0, top1 = top_of(a0, n), top_of(a1, n)
+    reach0, reach1 = reach_there(rotation, b0.size, frame.margin), reach_there(rotation, b1.size, frame.margin)
+    d00, d01, d10, d11 = there0 - a0.sum, there1 - a0.sum, there0 - a1.sum, there1 - a1.sum
+    least00, most00 = bound_pair(n, far0 - top0, margin, d00, a0.ball + b0.ball, square_gap(d00, a0.size + reach0))
+    least01, most01 = bound_pair(n, far1 - top0, margin, d01, a0.ball + b1.ball, square_gap(d01, a0.size + reach1))
+    least10, most10 = bound_pair(n, far0 - top1, margin, d10, a1.ball + b0.ball, square_gap(d10, a1.size + reach0))
+    least11, most11 = bound_pair(n, far1 - top1, margin, d11, a1.ball + b1.ball, square_gap(d11, a1.size + reach1))
+    return wp.vec4(least00, least01, least10, least11), wp.vec4(most00, most01, most10, most11)
