@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arrays import ModelPool, StatePool
+from warp_abtree.kernels.distance.faces32 import bound_faces, load_points
 from warp_abtree.kernels.distance.frame import (
     NO_FACES,
     ROUNDING_DOWN,
@@ -35,9 +36,8 @@ from warp_abtree.kernels.distance.warp_found import (
     offer_nearest,
 )
 from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal.boxes import map_point
 from warp_abtree.kernels.traversal.dual_tree import DEPTH_FIRST_ROOM, STACK_MASK, donate_items, receive_items
-from warp_abtree.kernels.traversal.face_pairs import Hits, load_corner_ids, load_near
+from warp_abtree.kernels.traversal.face_pairs import Hits
 from warp_abtree.kernels.traversal.load_balance import (
     Work,
     await_donation,
@@ -66,11 +66,12 @@ DONATION_LEAST = wp.constant(4)
 OPEN_START = native.constant("NEAREST_OPEN_START")
 OPEN_LENGTH = native.constant("NEAREST_OPEN_LENGTH")
 
+# Face pairs from which on it is known whether slabs pay, and node pairs for each that they leave where they do.
+MANY_FACES, FEW_FACES = wp.constant(wp.int64(4096)), wp.constant(wp.int64(6))
+
 FIRST_TOLERANCE = wp.constant(wp.float64(0.25))
 
 stack_code = functools.partial(native.body, "nearest_stack.cuh")
-
-three_points = wp.types.matrix(shape=(3, 3), dtype=wp.float32)
 
 
 @wp.func_native(stack_code("nearest_stack"))
@@ -109,15 +110,6 @@ def push_open(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, bound
     """Append the face pairs whose flag is set to those for float64; return the new end."""
 
 
-@wp.func_native(faces_code("bound_faces"))
-def bound_faces(own: wp.float32, a: three_points, b: three_points) -> wp.vec2:
-    """Return a lower and an upper bound of the distance of two triangles, their corners in rows.
-
-    Args:
-        own: What errors of the coordinates add.
-    """
-
-
 @wp.func_native(faces_code("warp_min"))
 def warp_min(x: wp.float64) -> wp.float64: ...
 
@@ -145,18 +137,6 @@ class Search:
 
 
 @wp.func
-def load_points(models: ModelPool, states: StatePool, search: Search, face_a: wp.int32, face_b: wp.int32):
-    """Return the corners of a face of A and of one of B in rows, in A's frame, scaled."""
-    pose, frame = search.pose, search.frame
-    a, b = load_corner_ids(states, pose.corner_a + face_a), load_corner_ids(states, pose.corner_b + face_b)
-    of_a, of_b = three_points(), three_points()
-    for k in range(3):
-        of_a[k] = load_near(models, a[k]) * frame.scale
-        of_b[k] = map_point(pose.rotation32, frame.translation, load_near(models, b[k]) * frame.scale)
-    return of_a, of_b
-
-
-@wp.func
 def bound_waiting(
     items: wp.uint64,
     first: wp.int32,
@@ -176,7 +156,9 @@ def bound_waiting(
     warp_sync()
     between = wp.vec2(wp.inf, wp.inf)
     if live:
-        a, b = load_points(models, states, search, item_first(item), item_second(item))
+        pose, frame = search.pose, search.frame
+        face_a, face_b = item_first(item), item_second(item)
+        a, b = load_points(models, states, pose, frame.translation, frame.scale, face_a, face_b)
         between = bound_faces(search.frame.error, a, b)
     least = warp_min32(between[1])
     if least < upper:
@@ -192,12 +174,16 @@ def decide_open(
     first: wp.int32,
     popped: wp.int32,
     upper: wp.float32,
-    search: Search,
+    pair: wp.int32,
     models: ModelPool,
     states: StatePool,
+    pair_poses: wp.array(dtype=PairPose),
     found: Found,
 ):
-    """Measure in float64 what face pairs may still be nearest, one a lane."""
+    """Measure in float64 what face pairs may still be nearest, one a lane.
+
+    The pose in float64 is loaded here, so that the search need not keep it in registers.
+    """
     at = OPEN_START + first + wp.min(warp_lane(), popped - 1)
     item = read_item(items, at)
     live = warp_lane() < popped and read_bound(items, at) <= upper
@@ -205,12 +191,12 @@ def decide_open(
     if warp_any(live):
         d = wp.float64(wp.inf)
         if live:
-            d = triangle_distance(load_triangles(models, states, search.pose, item_first(item), item_second(item)))
+            d = triangle_distance(load_triangles(models, states, pair_poses[pair], item_first(item), item_second(item)))
         least = warp_min(d)
         lowest = warp_min_item(wp.where(d == least, item, NO_FACES))
-        if least <= load_distance(found.distance, search.pair):
-            offer_nearest(found.distance, found.faces, search.pair, least, lowest)
-            lower_upper(found.upper, search.pair, FACES_UPPER, scaled_up(least, search.frame))
+        if least <= load_distance(found.distance, pair):
+            offer_nearest(found.distance, found.faces, pair, least, lowest)
+            lower_upper(found.upper, pair, FACES_UPPER, scaled_up(least, found.frame[pair]))
 
 
 @wp.func
@@ -247,6 +233,7 @@ def search_items(
     count: wp.int32,
     models: ModelPool,
     states: StatePool,
+    pair_poses: wp.array(dtype=PairPose),
     slabs: Slabs,
     # state
     found: Found,
@@ -292,7 +279,7 @@ def search_items(
             opened -= popped
             if search.measures:
                 upper = load_upper(found.upper, pair)[FACES_UPPER]
-                decide_open(items, opened, popped, upper, search, models, states, found)
+                decide_open(items, opened, popped, upper, pair, models, states, pair_poses, found)
         idle = count_idle(tickets)
         if idle > 0 and end - head >= 2 * DONATION_LEAST:
             head = donate_items(DONATION_LEAST, pair, idle, items, head, end, work)
@@ -314,7 +301,14 @@ def start_items(slot: wp.int32, states: StatePool, pose: PairPose, work: Work):
     return size
 
 
-@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+@wp.func
+def slabs_pay(hits: Hits, p: wp.int32):
+    """Return whether slabs leave few face pairs, as seen so far: of nested parts they leave as many as boxes do."""
+    faces = hits.triangle_tests[p]
+    return faces < MANY_FACES or FEW_FACES * faces < hits.node_tests[p]
+
+
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS, launch_bounds=(32, 12))
 def search_warp_kernel(
     room: wp.int32,
     rough_least: wp.int32,
@@ -350,7 +344,7 @@ def search_warp_kernel(
             search.pair = p
             search.pose = pair_poses[p]
             search.frame = found_inout.frame[p]
-            search.slabs = has_slabs(states, slabs, p)
+            search.slabs = has_slabs(states, slabs, p) and slabs_pay(hits_inout, p)
             tests = wp.vec2i()
             rough = slot < 0 and count >= rough_least and load_faces(found_inout.faces, p) == NO_FACES
             # Within a tolerance what bounds the distance may not be found again: it is measured at once.
@@ -365,7 +359,7 @@ def search_warp_kernel(
                 search.measures = within or not rough
                 search.tolerances = asked
                 size = start_items(slot, states, search.pose, work_inout)
-                tests += search_items(search, size, models, states, slabs, found_inout, work_inout)
+                tests += search_items(search, size, models, states, pair_poses, slabs, found_inout, work_inout)
                 searching = rough
                 rough = False
             add_warp_sum(hits_inout.node_tests, p, tests[0])

@@ -9,14 +9,27 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.arithmetic.predicates import EXACT
 from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.distance.frame import load_triangles
+from warp_abtree.kernels.distance.faces32 import bound_faces, load_points
+from warp_abtree.kernels.distance.frame import ROUNDING_UP, load_triangles
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.face_pairs import NEAR_BIT, Hits, report_hit, test_faces
 from warp_abtree.kernels.traversal.node_pair import item_first, item_second
-from warp_abtree.kernels.traversal.warp_stack import count_flags, reserve_slot, take_slots, warp_lane
+from warp_abtree.kernels.traversal.warp_stack import (
+    count_flags,
+    push_signed_pair,
+    read_signed_pair,
+    reserve_slot,
+    signed_pairs,
+    take_slots,
+    warp_lane,
+    warp_size,
+    warp_sync,
+)
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+ERROR_MAX, GAP_MAX = wp.constant(wp.float32(2.0**20)), wp.constant(wp.float32(2.0**40))
 
 
 @wp.func_native(native.body("simd/near_filter.h", "simd_near_filter"))
@@ -80,6 +93,41 @@ def report_near(
     return near
 
 
+@wp.func
+def may_be_near(models: ModelPool, states: StatePool, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
+    """Return False only where float32 proves two faces farther apart than `within`, as `simd_near_filter`."""
+    scale, gap = wp.float32(pose.scale), wp.float32(pose.within * pose.scale)
+    # Beyond these numbers float32 has no squares, or no bounds.
+    if not (pose.error < ERROR_MAX and gap < GAP_MAX):
+        return True
+    a, b = load_points(models, states, pose, pose.translation32 * scale, scale, face_a, face_b)
+    # Differences of corners err by `error` along an axis.
+    return not (bound_faces(2.0 * pose.error, a, b)[0] > gap * ROUNDING_UP)
+
+
+@wp.func
+def report_waiting(
+    list: wp.uint64,
+    first: wp.int32,
+    popped: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pair_poses: wp.array(dtype=PairPose),
+    hits: Hits,
+):
+    """Report which of the face pairs that wait are nearer than the gap, one a lane."""
+    item = read_signed_pair(list, first + wp.min(warp_lane(), popped - 1))
+    p = item[0]
+    near = warp_lane() < popped
+    if near:
+        near = are_near(models, states, pair_poses[p], hits.gap[p], item[1], item[2])
+    warp_sync()
+    count_flags(hits.count, p, near)
+    slot = reserve_slot(hits.total, near)
+    if near:
+        report_hit(slot, p | NEAR_BIT, pair_poses[p].swapped, item[1], item[2], hits)
+
+
 @wp.kernel(module="unique", module_options={"enable_backward": False, "fuse_fp": False}, cuda_max_registers=128)
 def find_near_kernel(
     threads: wp.int32,
@@ -88,20 +136,26 @@ def find_near_kernel(
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
-    """Report the face pairs that are apart and nearer than the gap, every so many-th a thread; a block is a warp."""
+    """Report the face pairs that are apart and nearer than the gap, every so many-th a thread; a block is a warp.
+
+    Float32 drops most; those it leaves wait for float64 until a warp of them does.
+    """
+    list, waiting = signed_pairs(), wp.int32(0)
     end = wp.min(hits_inout.apart_total[0], hits_inout.apart.shape[0])
     first = wp.tid() - warp_lane()
-    while first < end:
-        item = hits_inout.apart[wp.min(first + warp_lane(), end - 1)]
-        p = item[0]
-        near = first + warp_lane() < end
-        if near:
-            near = are_near(models, states, pair_poses[p], hits_inout.gap[p], item[1], item[2])
-        count_flags(hits_inout.count, p, near)
-        slot = reserve_slot(hits_inout.total, near)
-        if near:
-            report_hit(slot, p | NEAR_BIT, pair_poses[p].swapped, item[1], item[2], hits_inout)
-        first += wp.min(threads, end - first)
+    while first < end or waiting > 0:
+        if first < end:
+            item = hits_inout.apart[wp.min(first + warp_lane(), end - 1)]
+            kept = first + warp_lane() < end
+            if kept:
+                kept = may_be_near(models, states, pair_poses[item[0]], item[1], item[2])
+            waiting = push_signed_pair(list, waiting, kept, item, 0)
+            warp_sync()
+            first += wp.min(threads, end - first)
+        if waiting >= warp_size() or (first >= end and waiting > 0):
+            popped = wp.min(waiting, warp_size())
+            waiting -= popped
+            report_waiting(list, waiting, popped, models, states, pair_poses, hits_inout)
 
 
 @wp.kernel

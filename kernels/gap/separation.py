@@ -12,12 +12,15 @@ from warp_abtree.kernels.arithmetic.predicates import BOUND_2D, drop_axis
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.contact.contact import (
     Contacts,
+    Deferred,
+    PairObjects,
     blend_normals,
     contact_objects,
     have_crossed,
     load_corners,
     pair_direction,
 )
+from warp_abtree.kernels.distance.frame import load_triangles
 from warp_abtree.kernels.distance.triangle_pair import (
     Triangles,
     between_features,
@@ -28,6 +31,7 @@ from warp_abtree.kernels.distance.triangle_pair import (
 )
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.traversal.face_pairs import NEAR_BIT, PAIR_MASK
+from warp_abtree.kernels.traversal.warp_stack import reserve_slot
 from warp_abtree.kernels.triangle.distance import divide
 from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR, round_area, unit_vector
 
@@ -123,49 +127,67 @@ def crossing_depth(t: Triangles):
 
 
 @wp.kernel
-def mark_near_kernel(start: wp.array(dtype=wp.int32), faces_inout: wp.array(dtype=wp.vec3i), contacts_out: Contacts):
-    """Take the marks of those that are apart from sorted face pairs: as signs of separations."""
+def mark_near_kernel(
+    start: wp.array(dtype=wp.int32),
+    faces_inout: wp.array(dtype=wp.vec3i),
+    listed_inout: Deferred,
+    contacts_out: Contacts,
+):
+    """Take the marks of those that are apart from sorted face pairs, as signs of separations, and list these.
+
+    The list goes from the end of its places on, since those that are deferred are listed from their start.
+    """
     i = wp.tid()
-    if i >= start[start.shape[0] - 1]:
-        return
-    row = faces_inout[i]
-    near = (row[0] & NEAR_BIT) != 0
-    row[0] = row[0] & PAIR_MASK
-    faces_inout[i] = row
-    contacts_out.separation[i] = wp.where(near, LEAST_SEPARATION, -LEAST_SEPARATION)
+    near = bool(False)
+    if i < start[start.shape[0] - 1]:
+        row = faces_inout[i]
+        near = (row[0] & NEAR_BIT) != 0
+        row[0] = row[0] & PAIR_MASK
+        faces_inout[i] = row
+        contacts_out.separation[i] = wp.where(near, LEAST_SEPARATION, -LEAST_SEPARATION)
+    slot = reserve_slot(listed_inout.total, near)
+    if near:
+        listed_inout.place[listed_inout.place.shape[0] - 1 - slot] = i
 
 
 @wp.kernel(cuda_max_registers=128)
-def find_separation_kernel(
+def find_depth_kernel(
     models: ModelPool,
     states: StatePool,
-    objects: ObjectPool,
-    pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
     start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
-    uncertain_only: bool,
     contacts_inout: Contacts,
 ):
-    """Compute the separation of one face pair a thread, and of those that are apart the whole contact.
-
-    Args:
-        uncertain_only: Whether `simd_contacts` has done all but those that are uncertain there, which keep their mark.
-    """
+    """Compute the separation of one face pair that intersects a thread."""
     i = wp.tid()
-    if i >= start[start.shape[0] - 1] or (uncertain_only and contacts_inout.separation[i] != LEAST_SEPARATION):
+    if i >= start[start.shape[0] - 1] or not have_crossed(contacts_inout, i):
         return
-    p = faces[i][0]
-    own = contact_objects(pairs, pair_poses, p)
+    row = faces[i]
+    p = row[0]
+    swapped = pair_poses[p].swapped
+    t = load_triangles(models, states, pair_poses[p], row[1 + swapped], row[2 - swapped])
+    contacts_inout.separation[i] = -wp.max(crossing_depth(t) * t.size, LEAST_SEPARATION)
+
+
+@wp.func
+def write_near_contact(
+    i: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    own: PairObjects,
+    pose: PairPose,
+    row: wp.vec3i,
+    contacts: Contacts,
+):
+    """Compute the contact of two faces that are apart."""
     corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
-    load_corners(models, states, pair_poses[p], faces[i][1 + own.swapped], faces[i][2 - own.swapped], corner)
+    load_corners(models, states, pose, row[1 + own.swapped], row[2 - own.swapped], corner)
     t = scale_triangles(corner[0], corner[1], corner[2], corner[3], corner[4], corner[5])
-    if have_crossed(contacts_inout, i):
-        contacts_inout.separation[i] = -wp.max(crossing_depth(t) * t.size, LEAST_SEPARATION)
-        return
     near = nearest_features(t)
-    contacts_inout.separation[i] = wp.max(wp.sqrt(near.square) * t.size, LEAST_SEPARATION)
-    contacts_inout.coplanar[i] = 0
+    contacts.separation[i] = wp.max(wp.sqrt(near.square) * t.size, LEAST_SEPARATION)
+    contacts.coplanar[i] = 0
     u, v = feature_weights(near)
     point_a = u[0] * corner[0] + u[1] * corner[1] + u[2] * corner[2]
     point_b = v[0] * corner[3] + v[1] * corner[4] + v[2] * corner[5]
@@ -179,8 +201,36 @@ def find_separation_kernel(
         if wp.dot(normal, normal) == wp.float64(0.0):
             normal = pair_direction(models, states, objects, own.a, own.b)
     back = own.swapped != 0
-    contacts_inout.p0[i] = wp.where(back, end_b, end_a)
-    contacts_inout.p1[i] = wp.where(back, end_a, end_b)
-    contacts_inout.normal_a[i] = wp.where(back, normal_b, normal_a)
-    contacts_inout.normal_b[i] = wp.where(back, normal_a, normal_b)
-    contacts_inout.normal[i] = wp.where(back, -normal, normal)
+    contacts.p0[i] = wp.where(back, end_b, end_a)
+    contacts.p1[i] = wp.where(back, end_a, end_b)
+    contacts.normal_a[i] = wp.where(back, normal_b, normal_a)
+    contacts.normal_b[i] = wp.where(back, normal_a, normal_b)
+    contacts.normal[i] = wp.where(back, -normal, normal)
+
+
+@wp.kernel(cuda_max_registers=128)
+def find_near_contact_kernel(
+    step: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    faces: wp.array(dtype=wp.vec3i),
+    listed: Deferred,
+    uncertain_only: bool,
+    contacts_inout: Contacts,
+):
+    """Compute the contacts of faces that are apart, which are listed, every so many-th a thread.
+
+    Args:
+        uncertain_only: Whether `simd_contacts` has done all but those that are uncertain there, which keep their mark.
+    """
+    k = wp.tid()
+    while k < listed.total[0]:
+        i = listed.place[listed.place.shape[0] - 1 - k]
+        if not uncertain_only or contacts_inout.separation[i] == LEAST_SEPARATION:
+            p = faces[i][0]
+            own = contact_objects(pairs, pair_poses, p)
+            write_near_contact(i, models, states, objects, own, pair_poses[p], faces[i], contacts_inout)
+        k += step
