@@ -66,8 +66,10 @@ DONATION_LEAST = wp.constant(4)
 OPEN_START = native.constant("NEAREST_OPEN_START")
 OPEN_LENGTH = native.constant("NEAREST_OPEN_LENGTH")
 
-# Face pairs from which on it is known whether slabs pay, and node pairs for each that they leave where they do.
-MANY_FACES, FEW_FACES = wp.constant(wp.int64(4096)), wp.constant(wp.int64(6))
+# Face pairs from which on it is known whether slabs pay, and items for three of them that they leave where they do.
+MANY_FACES, FEW_FACES = wp.constant(1024), wp.constant(2)
+# Items at once before any faces are known: more would be looked at in vain.
+DIVE_ITEMS = wp.constant(8)
 
 FIRST_TOLERANCE = wp.constant(wp.float64(0.25))
 
@@ -227,6 +229,12 @@ def expand_nearest(
 
 
 @wp.func
+def slabs_pay(faces: wp.int32, items: wp.int32):
+    """Return whether slabs leave few face pairs, as seen so far: of nested parts they leave as many as boxes do."""
+    return faces < MANY_FACES or faces < FEW_FACES * (items / 3)
+
+
+@wp.func
 def search_items(
     # static
     search: Search,
@@ -242,7 +250,7 @@ def search_items(
     """Search so many items on the stack that are not given away; return what this lane compared: boxes and faces."""
     items, pair, frame = nearest_stack(), search.pair, search.frame
     head, end, waiting, opened = wp.int32(0), wp.int32(count), wp.int32(0), wp.int32(0)
-    tests = wp.vec2i()
+    tests, seen = wp.vec2i(), wp.vec2i()
     held = load_faces(found.faces, pair) != NO_FACES
     # Bounds under it are of faces that are as near as is asked.
     beyond = wp.float32(load_distance(found.distance, pair) * frame.scale64) * ROUNDING_DOWN
@@ -258,8 +266,9 @@ def search_items(
         if end > head and waiting < warp_size():
             # One at a time, depth first, needs little room; more where there is.
             popped = wp.max(1, (search.room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
-            popped = wp.min(popped, wp.min(warp_size(), end - head))
+            popped = wp.min(popped, wp.min(wp.where(held, warp_size(), wp.min(DIVE_ITEMS, warp_size())), end - head))
             end -= popped
+            seen[0] += popped
             ends, compared, most = expand_nearest(items, end, popped, waiting, limit, states, slabs, search)
             end = item_second(ends)
             waiting = item_first(ends)
@@ -270,6 +279,8 @@ def search_items(
         if waiting >= warp_size() or (waiting > 0 and (end == head or not held)):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
+            seen[1] += popped
+            search.slabs = search.slabs and slabs_pay(seen[1], seen[0])
             opened, measured = bound_waiting(
                 items, waiting, popped, opened, limit, upper, search, models, states, found
             )
@@ -299,13 +310,6 @@ def start_items(slot: wp.int32, states: StatePool, pose: PairPose, work: Work):
         write_bound(items, warp_lane(), wp.float32(0.0))
     warp_sync()
     return size
-
-
-@wp.func
-def slabs_pay(hits: Hits, p: wp.int32):
-    """Return whether slabs leave few face pairs, as seen so far: of nested parts they leave as many as boxes do."""
-    faces = hits.triangle_tests[p]
-    return faces < MANY_FACES or FEW_FACES * faces < hits.node_tests[p]
 
 
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS, launch_bounds=(32, 12))
@@ -344,7 +348,8 @@ def search_warp_kernel(
             search.pair = p
             search.pose = pair_poses[p]
             search.frame = found_inout.frame[p]
-            search.slabs = has_slabs(states, slabs, p) and slabs_pay(hits_inout, p)
+            faces, items = wp.int32(hits_inout.triangle_tests[p]), wp.int32(hits_inout.node_tests[p]) / 4
+            search.slabs = has_slabs(states, slabs, p) and slabs_pay(faces, items)
             tests = wp.vec2i()
             rough = slot < 0 and count >= rough_least and load_faces(found_inout.faces, p) == NO_FACES
             # Within a tolerance what bounds the distance may not be found again: it is measured at once.

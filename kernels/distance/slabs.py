@@ -177,8 +177,8 @@ def key_of(states: StatePool, state: wp.int32):
 
 @wp.func
 def is_made(states: StatePool, slabs: Slabs, state: wp.int32):
-    """Return whether slabs of a state are those of its LOD."""
-    return state < slabs.made.shape[0] and slabs.made[state] == key_of(states, state)
+    """Return whether slabs of a state are those of its LOD; not of state -1."""
+    return state >= 0 and state < slabs.made.shape[0] and slabs.made[state] == key_of(states, state)
 
 
 @wp.func

@@ -12,6 +12,20 @@ from warp_abtree.kernels.traversal.load_balance import NO_UNIT, Work
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
+# Pairs, or depth of both trees, from which on slabs make a search shorter; else it takes as many steps, longer ones.
+PAIRS_LEAST, DEPTH_LEAST = wp.constant(24), wp.constant(36)
+
+
+@wp.func
+def wants_slabs(count: wp.int32, models: ModelPool, states: StatePool, a: wp.int32, b: wp.int32):
+    """Return whether a search by warps is shorter with slabs: many warps that share few pairs have the time anyway.
+
+    Args:
+        a, b: Tree states of the object pair.
+    """
+    return count >= PAIRS_LEAST or models.depth[states.model[a]] + models.depth[states.model[b]] >= DEPTH_LEAST
+
+
 @wp.kernel
 def start_distance_kernel(
     models: ModelPool,
@@ -39,5 +53,9 @@ def start_distance_kernel(
         work_out.counter[3] = wp.where(stale, NO_UNIT, 0)
     if p >= wp.min(pair_count[0], pairs.shape[0]) or found_inout.launched[0] == STALE:
         return
-    count_uses(p, models, states, objects, pairs, slabs_inout)
+    a, b = objects.state[pairs[p][0]], objects.state[pairs[p][1]]
+    if wants_slabs(pair_count[0], models, states, a, b):
+        count_uses(p, models, states, objects, pairs, slabs_inout)
+    else:
+        slabs_inout.states[p] = wp.vec2i(-1, -1)
     start_pair(p, models, states, objects, pairs, pair_poses, found_inout)
