@@ -70,7 +70,7 @@ class PairObjects:
 
 @wp.struct
 class Deferred:
-    """Contacts that float64 is not sure of."""
+    """Contacts that are left for a launch of their own."""
 
     total: wp.array(dtype=wp.int32)  # how many, shape [1]
     place: wp.array(dtype=wp.int32)  # of each in `Contacts`, shape [capacity]

@@ -61,7 +61,7 @@ def place_row_kernel(
     key: wp.array(dtype=wp.int64),
     sorted_out: wp.array(dtype=wp.vec3i),
     start_out: wp.array(dtype=wp.int32),
-    deferred_total_out: wp.array(dtype=wp.int32),
+    listed_totals_out: wp.array(dtype=wp.int32),
 ):
     """Put one hit a thread in its place; find where the hits of one object pair a thread start, after the last pair
     where they end, and defer none yet.
@@ -76,7 +76,8 @@ def place_row_kernel(
         sorted_out[i] = face[order[i]]
     if i < start_out.shape[0]:
         if i == 0:
-            deferred_total_out[0] = 0
+            listed_totals_out[0] = 0
+            listed_totals_out[1] = 0
         # One more than there are keys: the search never looks at its end, and returns the place before it if all are
         # less.
         start_out[i] = wp.lower_bound(key, 0, capacity + 1, wp.int64(i) << wp.int64(shift))
@@ -103,7 +104,7 @@ def sort_by_pair_kernel(
     key_inout: wp.array(dtype=wp.int64),
     sorted_out: wp.array(dtype=wp.vec3i),
     start_out: wp.array(dtype=wp.int32),
-    deferred_total_out: wp.array(dtype=wp.int32),
+    listed_totals_out: wp.array(dtype=wp.int32),
 ):
     """Do all that the sort of contacts does, in one thread; CPU only.
 
@@ -112,4 +113,5 @@ def sort_by_pair_kernel(
     """
     count = wp.min(count_rows(total[0], face.shape[0]), capacity)
     sort_by_pair(count, PAIR_MASK, NEAR_BIT, face, key_inout, sorted_out, start_out)
-    deferred_total_out[0] = 0
+    listed_totals_out[0] = 0
+    listed_totals_out[1] = 0

@@ -59,7 +59,7 @@ def start_segment_kernel(
     count: wp.array(dtype=wp.int64),
     face: wp.array(dtype=wp.vec3i),
     start_out: wp.array(dtype=wp.int32),
-    deferred_total_out: wp.array(dtype=wp.int32),
+    listed_totals_out: wp.array(dtype=wp.int32),
 ):
     """Sum how many hits there are before each pair, and defer none yet.
 
@@ -68,11 +68,12 @@ def start_segment_kernel(
         capacity: Hits that are sorted, at most.
         count: `Hits.count`. Where its sum is not what there is in the buffer, the rows there are counted.
         start_out: Start of pair p at p + 1, where `take_place_kernel` goes on counting; shape [pair + 1].
-        deferred_total_out: Shape [1], or [0] if nobody asks.
+        listed_totals_out: Shape [2], or [0] if nobody asks.
     """
     i = wp.tid()
-    if i == 0 and deferred_total_out.shape[0] > 0:
-        deferred_total_out[0] = 0
+    if i == 0 and listed_totals_out.shape[0] > 0:
+        listed_totals_out[0] = 0
+        listed_totals_out[1] = 0
     start_segments(i // lanes, wp.min(count_rows(total[0], face.shape[0]), capacity), PAIR_MASK, count, face, start_out)
 
 

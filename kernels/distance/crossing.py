@@ -66,7 +66,7 @@ def search_crossing(models: ModelPool, states: StatePool, pose: PairPose, frame:
         live = wp.where(kind == NODES and warp_lane() < first, -1, 0)
         if kind != NODES:
             item = first_item(states, pose)
-        children, kinds, _bounds, _tests, _most = bound_children(
+        children, kinds, _bounds, _tests = bound_children(
             False, states, Slabs(), pose, frame, wp.float32(0.0), item, live
         )
         end = push_in_order(items, end, kinds, children)

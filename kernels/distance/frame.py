@@ -98,7 +98,7 @@ class Found:
     faces: wp.array(dtype=wp.int64)  # see `Nearest`, shape [pair]; what lies there starts the next search
     frame: wp.array(dtype=Frame)  # shape [pair]
     beyond: wp.array(dtype=wp.float64)  # distance to end at [world units], infinite for none, shape [pair]
-    # What no nearest faces are beyond, scaled: of faces, and twice that of nodes, shape [pair]; of warps alone.
+    # What no nearest faces are beyond, scaled, and 0 where slabs do not pay, else 1; shape [pair], of warps alone.
     upper: wp.array(dtype=wp.vec2)
     launched: wp.array(dtype=wp.int32)  # STALE where nothing is to be done, see `generation.LaunchRecord`
 
@@ -241,4 +241,4 @@ def start_pair(
     found.distance[p] = bound
     found.faces[p] = kept
     if p < found.upper.shape[0]:
-        found.upper[p] = wp.vec2(scaled_up(bound, frame), wp.inf)
+        found.upper[p] = wp.vec2(scaled_up(bound, frame), 1.0)

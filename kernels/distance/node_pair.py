@@ -38,13 +38,6 @@ def bound_boxes(a: PosedBox, b: PosedBox):
 
 
 @wp.func
-def square_limit(frame: Frame, twice: wp.float32):
-    """Return the bound of nodes over which nothing is as near as half of a length."""
-    x = twice * frame.grow + 2.0 * frame.least
-    return x * x
-
-
-@wp.func
 def limit_of(frame: Frame, spare: wp.vec4, upper: wp.float32, held: wp.bool):
     """Return the bound over which nothing matters any more: negative where all is known.
 
@@ -59,7 +52,8 @@ def limit_of(frame: Frame, spare: wp.vec4, upper: wp.float32, held: wp.bool):
         cut = upper - wp.max(part - spare[3] * upper, 0.0)
     if cut < 0.0:
         return wp.float32(-1.0)
-    return square_limit(frame, 2.0 * cut)
+    x = 2.0 * (cut * frame.grow + frame.least)
+    return x * x
 
 
 @wp.func
@@ -109,8 +103,7 @@ def bound_children(
     item: wp.int64,
     live: wp.int32,
 ):
-    """Compare what an item names; return the items that follow, what each is, their bounds, how many were compared, and
-    twice a distance that the nearest are not beyond, scaled: infinite without slabs.
+    """Compare what an item names; return the items that follow, what each is, their bounds, and how many were compared.
 
     live is -1, or 0 where nothing is asked of the item, which still names nodes.
     """
@@ -121,11 +114,9 @@ def bound_children(
     at = wp.vec4i(at_a, at_a + wp.where(x < 0, 1, 0), at_b, at_b + wp.where(y < 0, 1, 0))
     a0, a1 = load_constant_node(states, at[0]), load_constant_node(states, at[1])
     b0, b1 = load_constant_node(states, at[2]), load_constant_node(states, at[3])
-    bounds, most = wp.vec4(), wp.float32(wp.inf)
+    bounds = wp.vec4()
     if with_slabs:
-        bounds, most_of = bound_child_slabs(slabs, pose, frame, at, a0, a1, b0, b1)
-        # A node that is alone counts twice.
-        most = wp.where(live < 0, wp.min(most_of), wp.inf)
+        bounds = bound_child_slabs(slabs, pose, frame, at, a0, a1, b0, b1)
     else:
         bounds = bound_child_boxes(pose, frame, a0, a1, b0, b1)
     kinds = wp.vec4i(
@@ -136,4 +127,4 @@ def bound_children(
     )
     items = four_items(item_of(a0, b0), item_of(a0, b1), item_of(a1, b0), item_of(a1, b1))
     tests = -((live >> 31) + ((y & live) >> 31) + ((x & live) >> 31) + ((x & y & live) >> 31))
-    return items, kinds, bounds, tests, most
+    return items, kinds, bounds, tests

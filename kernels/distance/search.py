@@ -22,12 +22,12 @@ from warp_abtree.kernels.distance.frame import (
     scaled_up,
     spare_of,
 )
-from warp_abtree.kernels.distance.node_pair import bound_children, limit_of, square_limit
+from warp_abtree.kernels.distance.node_pair import bound_children, limit_of
 from warp_abtree.kernels.distance.slabs import Slabs, has_slabs
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.distance.warp_found import (
-    FACES_UPPER,
-    NODES_UPPER,
+    SLABS_PAY,
+    UPPER,
     faces_code,
     load_distance,
     load_faces,
@@ -68,10 +68,8 @@ OPEN_LENGTH = native.constant("NEAREST_OPEN_LENGTH")
 
 # Face pairs from which on it is known whether slabs pay, and items for three of them that they leave where they do.
 MANY_FACES, FEW_FACES = wp.constant(1024), wp.constant(2)
-# Items at once before any faces are known: more would be looked at in vain.
-DIVE_ITEMS = wp.constant(8)
-
-FIRST_TOLERANCE = wp.constant(wp.float64(0.25))
+# Items at once, at most, before any faces are known: more would be looked at in vain.
+DIVE_ITEMS = wp.constant(4)
 
 stack_code = functools.partial(native.body, "nearest_stack.cuh")
 
@@ -133,8 +131,6 @@ class Search:
     frame: Frame  # how boxes are compared
     tolerances: Tolerances  # when they are near enough
     room: wp.int32  # items that the stack takes, STACK_LENGTH at most
-    shared: wp.bool  # whether warps that are idle get some
-    measures: wp.bool  # whether faces are measured in float64
     slabs: wp.bool  # whether there are some of both states
 
 
@@ -164,7 +160,7 @@ def bound_waiting(
         between = bound_faces(search.frame.error, a, b)
     least = warp_min32(between[1])
     if least < upper:
-        lower_upper(found.upper, search.pair, FACES_UPPER, least)
+        lower_upper(found.upper, search.pair, UPPER, least)
     opened = push_open(items, opened, live and between[0] <= wp.min(least, upper), item, between[0])
     warp_sync()
     return opened, wp.where(live, 1, 0)
@@ -198,7 +194,7 @@ def decide_open(
         lowest = warp_min_item(wp.where(d == least, item, NO_FACES))
         if least <= load_distance(found.distance, pair):
             offer_nearest(found.distance, found.faces, pair, least, lowest)
-            lower_upper(found.upper, pair, FACES_UPPER, scaled_up(least, found.frame[pair]))
+            lower_upper(found.upper, pair, UPPER, scaled_up(least, found.frame[pair]))
 
 
 @wp.func
@@ -208,24 +204,25 @@ def expand_nearest(
     popped: wp.int32,
     waiting: wp.int32,
     limit: wp.float32,
+    with_slabs: wp.bool,
     states: StatePool,
     slabs: Slabs,
     search: Search,
 ):
     """Compare what items first to first + popped name, one a lane.
 
-    Returns both ends, see `push_nearest`, how many were compared, and twice a distance that nothing nearest is beyond.
+    Returns both ends, see `push_nearest`, and how many were compared.
     """
     at = (first + wp.min(warp_lane(), popped - 1)) & STACK_MASK
     item = read_item(items, at)
     live = wp.where(warp_lane() < popped and read_bound(items, at) <= limit, -1, 0)
     warp_sync()
-    children, kinds, bounds, compared, most = bound_children(
-        search.slabs, states, slabs, search.pose, search.frame, limit, item, live
+    children, kinds, bounds, compared = bound_children(
+        with_slabs, states, slabs, search.pose, search.frame, limit, item, live
     )
     ends = push_nearest(items, first, waiting, kinds, children, bounds)
     warp_sync()
-    return ends, compared, most
+    return ends, compared
 
 
 @wp.func
@@ -256,31 +253,28 @@ def search_items(
     beyond = wp.float32(load_distance(found.distance, pair) * frame.scale64) * ROUNDING_DOWN
     spare = spare_of(search.tolerances, frame)
     while end > head or waiting > 0 or opened > 0:
-        tickets = wp.int64(0)
-        if search.shared:
-            tickets = load_tickets(work.counter)
-        least = load_upper(found.upper, pair)
-        upper, near = least[FACES_UPPER], least[NODES_UPPER]
+        tickets = load_tickets(work.counter)
+        known = load_upper(found.upper, pair)
+        upper, with_slabs = known[UPPER], search.slabs and known[SLABS_PAY] > 0.0
         held = held or upper < beyond
-        limit = wp.min(limit_of(frame, spare, upper, held), square_limit(frame, near))
+        limit = limit_of(frame, spare, upper, held)
         if end > head and waiting < warp_size():
             # One at a time, depth first, needs little room; more where there is.
             popped = wp.max(1, (search.room - DEPTH_FIRST_ROOM - (end - head)) >> 2)
             popped = wp.min(popped, wp.min(wp.where(held, warp_size(), wp.min(DIVE_ITEMS, warp_size())), end - head))
             end -= popped
             seen[0] += popped
-            ends, compared, most = expand_nearest(items, end, popped, waiting, limit, states, slabs, search)
+            ends, compared = expand_nearest(items, end, popped, waiting, limit, with_slabs, states, slabs, search)
             end = item_second(ends)
             waiting = item_first(ends)
             tests[0] += compared
-            if warp_any(most < wp.min(near, 2.0 * upper)):
-                lower_upper(found.upper, pair, NODES_UPPER, warp_min32(most))
         # The first face pairs are measured at once: until then, nothing is dropped.
         if waiting >= warp_size() or (waiting > 0 and (end == head or not held)):
             popped = wp.min(waiting, warp_size())
             waiting -= popped
             seen[1] += popped
-            search.slabs = search.slabs and slabs_pay(seen[1], seen[0])
+            if with_slabs and not slabs_pay(seen[1], seen[0]):
+                lower_upper(found.upper, pair, SLABS_PAY, 0.0)
             opened, measured = bound_waiting(
                 items, waiting, popped, opened, limit, upper, search, models, states, found
             )
@@ -288,9 +282,8 @@ def search_items(
         if opened > OPEN_LENGTH - warp_size() or (opened > 0 and end == head and waiting == 0):
             popped = wp.min(opened, warp_size())
             opened -= popped
-            if search.measures:
-                upper = load_upper(found.upper, pair)[FACES_UPPER]
-                decide_open(items, opened, popped, upper, pair, models, states, pair_poses, found)
+            upper = load_upper(found.upper, pair)[UPPER]
+            decide_open(items, opened, popped, upper, pair, models, states, pair_poses, found)
         idle = count_idle(tickets)
         if idle > 0 and end - head >= 2 * DONATION_LEAST:
             head = donate_items(DONATION_LEAST, pair, idle, items, head, end, work)
@@ -315,7 +308,6 @@ def start_items(slot: wp.int32, states: StatePool, pose: PairPose, work: Work):
 @wp.kernel(module="unique", module_options=MODULE_OPTIONS, launch_bounds=(32, 12))
 def search_warp_kernel(
     room: wp.int32,
-    rough_least: wp.int32,
     tolerances: Tolerances,
     models: ModelPool,
     states: StatePool,
@@ -326,14 +318,11 @@ def search_warp_kernel(
     hits_inout: Hits,
     work_inout: Work,
 ):
-    """Search the object pairs that do not intersect: units of work, a pair each, and donated items.
-
-    Args:
-        rough_least: Object pairs from which on each is searched roughly first.
-    """
+    """Search the object pairs that do not intersect: units of work, a pair each, and donated items."""
     count = wp.min(pair_count[0], pair_poses.shape[0])
     search = Search()
     search.room = room
+    search.tolerances = tolerances
     p = take_unit(work_inout.counter)
     ended = wp.int32(0)
     while True:
@@ -348,25 +337,9 @@ def search_warp_kernel(
             search.pair = p
             search.pose = pair_poses[p]
             search.frame = found_inout.frame[p]
-            faces, items = wp.int32(hits_inout.triangle_tests[p]), wp.int32(hits_inout.node_tests[p]) / 4
-            search.slabs = has_slabs(states, slabs, p) and slabs_pay(faces, items)
-            tests = wp.vec2i()
-            rough = slot < 0 and count >= rough_least and load_faces(found_inout.faces, p) == NO_FACES
-            # Within a tolerance what bounds the distance may not be found again: it is measured at once.
-            within = tolerances.tolerance > wp.float64(0.0) or tolerances.relative > wp.float64(0.0)
-            searching = bool(True)
-            while searching:
-                # What is found within a wide tolerance is a start: far fewer are looked at in vain.
-                asked = tolerances
-                if rough:
-                    asked.relative = wp.max(tolerances.relative, FIRST_TOLERANCE)
-                search.shared = not rough
-                search.measures = within or not rough
-                search.tolerances = asked
-                size = start_items(slot, states, search.pose, work_inout)
-                tests += search_items(search, size, models, states, pair_poses, slabs, found_inout, work_inout)
-                searching = rough
-                rough = False
+            search.slabs = has_slabs(states, slabs, p)
+            size = start_items(slot, states, search.pose, work_inout)
+            tests = search_items(search, size, models, states, pair_poses, slabs, found_inout, work_inout)
             add_warp_sum(hits_inout.node_tests, p, tests[0])
             add_warp_sum(hits_inout.triangle_tests, p, tests[1])
         ended += 1

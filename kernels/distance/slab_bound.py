@@ -4,13 +4,11 @@ Along a direction, a node reaches no farther than its slab and its box do; acros
 box's centre; docs/exactness.md has the margins. The direction joins the nodes' middles, turned a little towards their
 mean normals: where small nodes face each other it is the one in which they are nearest, but for an angle like their
 size, so that such bounds err by the square of the size, where boxes err by the size.
-
-Neither are all faces farther than the balls' far sides, so that something near is known before a face is measured.
 """
 
 import warp as wp
 
-from warp_abtree.kernels.distance.frame import ROUNDING_UP, Frame
+from warp_abtree.kernels.distance.frame import Frame
 from warp_abtree.kernels.distance.slabs import Slabs
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.traversal.boxes import fuse32, map_point
@@ -116,7 +114,7 @@ def direction_of(apart: wp.vec3, a: wp.vec3, b: wp.vec3):
 
 @wp.func
 def bound_pair(n: wp.vec3, gap: wp.float32, margin: wp.float32, apart: wp.vec3, balls: wp.float32, boxes: wp.float32):
-    """Return a lower bound of the square of twice the distance of two nodes, and an upper bound of twice it.
+    """Return a lower bound of the square of twice the distance of two nodes.
 
     Args:
         gap: Twice their gap along n.
@@ -124,17 +122,15 @@ def bound_pair(n: wp.vec3, gap: wp.float32, margin: wp.float32, apart: wp.vec3, 
     """
     d = add_products(apart, n, 0.0)
     across = take_multiple(apart, d, n)
-    square = add_products(across, across, 0.0)
-    most = (wp.sqrt(fuse32(d, d, square)) + balls) * ROUNDING_UP + margin
-    least = square_over(gap, margin) + square_over(wp.sqrt(square) - balls, margin)
-    return wp.max(least, boxes), most
+    beside = wp.sqrt(add_products(across, across, 0.0)) - balls
+    return wp.max(square_over(gap, margin) + square_over(beside, margin), boxes)
 
 
 @wp.func
 def bound_child_slabs(
     slabs: Slabs, pose: PairPose, frame: Frame, at: wp.vec4i, node_a0: Node, node_a1: Node, node_b0: Node, node_b1: Node
 ):
-    """Return lower bounds of the squared distances of the four pairs of nodes of A and B, and twice upper ones.
+    """Return lower bounds of the squares of twice the distances of the four pairs of nodes of A and B.
 
     Args:
         at: Where the nodes lie in the pool.
@@ -152,8 +148,9 @@ def bound_child_slabs(
     top0, top1 = top_of(a0, n), top_of(a1, n)
     reach0, reach1 = reach_there(rotation, b0.size, frame.margin), reach_there(rotation, b1.size, frame.margin)
     d00, d01, d10, d11 = there0 - a0.sum, there1 - a0.sum, there0 - a1.sum, there1 - a1.sum
-    least00, most00 = bound_pair(n, far0 - top0, margin, d00, a0.ball + b0.ball, square_gap(d00, a0.size + reach0))
-    least01, most01 = bound_pair(n, far1 - top0, margin, d01, a0.ball + b1.ball, square_gap(d01, a0.size + reach1))
-    least10, most10 = bound_pair(n, far0 - top1, margin, d10, a1.ball + b0.ball, square_gap(d10, a1.size + reach0))
-    least11, most11 = bound_pair(n, far1 - top1, margin, d11, a1.ball + b1.ball, square_gap(d11, a1.size + reach1))
-    return wp.vec4(least00, least01, least10, least11), wp.vec4(most00, most01, most10, most11)
+    return wp.vec4(
+        bound_pair(n, far0 - top0, margin, d00, a0.ball + b0.ball, square_gap(d00, a0.size + reach0)),
+        bound_pair(n, far1 - top0, margin, d01, a0.ball + b1.ball, square_gap(d01, a0.size + reach1)),
+        bound_pair(n, far0 - top1, margin, d10, a1.ball + b0.ball, square_gap(d10, a1.size + reach0)),
+        bound_pair(n, far1 - top1, margin, d11, a1.ball + b1.ball, square_gap(d11, a1.size + reach1)),
+    )

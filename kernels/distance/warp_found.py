@@ -11,8 +11,8 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 faces_code = functools.partial(native.body, "nearest_faces.cuh")
 
 
-# What `Found.upper` has of faces, and of nodes.
-FACES_UPPER, NODES_UPPER = wp.constant(0), wp.constant(1)
+# Components of `Found.upper`.
+UPPER, SLABS_PAY = wp.constant(0), wp.constant(1)
 
 
 @wp.func_native(faces_code("load_upper"))

@@ -12,6 +12,7 @@ from warp_abtree.kernels.arithmetic.predicates import BOUND_2D, drop_axis
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.contact.contact import (
     Contacts,
+    Deferred,
     PairObjects,
     blend_normals,
     contact_objects,
@@ -30,14 +31,7 @@ from warp_abtree.kernels.distance.triangle_pair import (
 )
 from warp_abtree.kernels.poses import PairPose, pose_point
 from warp_abtree.kernels.traversal.face_pairs import NEAR_BIT, PAIR_MASK
-from warp_abtree.kernels.traversal.warp_stack import (
-    push_signed_pair,
-    read_signed_pair,
-    signed_pairs,
-    warp_lane,
-    warp_size,
-    warp_sync,
-)
+from warp_abtree.kernels.traversal.warp_stack import reserve_slot
 from warp_abtree.kernels.triangle.distance import divide
 from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR, round_area, unit_vector
 
@@ -45,8 +39,6 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Separations are no smaller in magnitude, so that their sign says which faces intersect, as float32 too.
 LEAST_SEPARATION = wp.constant(wp.float64(2.0**-126))
-# Rows that a warp looks through for faces that are apart.
-CONTACTS_A_WARP = wp.constant(wp.int32(512))
 # Nearest points that are closer, squared and in the size of the faces, do not tell a direction: the faces do.
 CLOSEST = wp.constant(wp.float64(2.0**-60))
 
@@ -135,16 +127,27 @@ def crossing_depth(t: Triangles):
 
 
 @wp.kernel
-def mark_near_kernel(start: wp.array(dtype=wp.int32), faces_inout: wp.array(dtype=wp.vec3i), contacts_out: Contacts):
-    """Take the marks of those that are apart from sorted face pairs: as signs of separations."""
+def mark_near_kernel(
+    start: wp.array(dtype=wp.int32),
+    faces_inout: wp.array(dtype=wp.vec3i),
+    listed_inout: Deferred,
+    contacts_out: Contacts,
+):
+    """Take the marks of those that are apart from sorted face pairs, as signs of separations, and list these.
+
+    The list goes from the end of its places on, since those that are deferred are listed from their start.
+    """
     i = wp.tid()
-    if i >= start[start.shape[0] - 1]:
-        return
-    row = faces_inout[i]
-    near = (row[0] & NEAR_BIT) != 0
-    row[0] = row[0] & PAIR_MASK
-    faces_inout[i] = row
-    contacts_out.separation[i] = wp.where(near, LEAST_SEPARATION, -LEAST_SEPARATION)
+    near = bool(False)
+    if i < start[start.shape[0] - 1]:
+        row = faces_inout[i]
+        near = (row[0] & NEAR_BIT) != 0
+        row[0] = row[0] & PAIR_MASK
+        faces_inout[i] = row
+        contacts_out.separation[i] = wp.where(near, LEAST_SEPARATION, -LEAST_SEPARATION)
+    slot = reserve_slot(listed_inout.total, near)
+    if near:
+        listed_inout.place[listed_inout.place.shape[0] - 1 - slot] = i
 
 
 @wp.kernel(cuda_max_registers=128)
@@ -207,36 +210,27 @@ def write_near_contact(
 
 @wp.kernel(cuda_max_registers=128)
 def find_near_contact_kernel(
+    step: wp.int32,
     models: ModelPool,
     states: StatePool,
     objects: ObjectPool,
     pairs: wp.array(dtype=wp.vec2i),
     pair_poses: wp.array(dtype=PairPose),
-    start: wp.array(dtype=wp.int32),
     faces: wp.array(dtype=wp.vec3i),
+    listed: Deferred,
+    uncertain_only: bool,
     contacts_inout: Contacts,
 ):
-    """Compute the contacts of faces that are apart, which have their mark; a warp has `CONTACTS_A_WARP` contacts.
+    """Compute the contacts of faces that are apart, which are listed, every so many-th a thread.
 
-    They are few among those that intersect, so they wait until each lane of the warp has one. On the CPU
-    `simd_contacts` has done all but those that are uncertain there.
+    Args:
+        uncertain_only: Whether `simd_contacts` has done all but those that are uncertain there, which keep their mark.
     """
-    list, waiting = signed_pairs(), wp.int32(0)
-    first = wp.tid() / warp_size() * CONTACTS_A_WARP
-    end = wp.min(first + CONTACTS_A_WARP, start[start.shape[0] - 1])
-    while first < end or waiting > 0:
-        if first < end:
-            i = wp.min(first + warp_lane(), end - 1)
-            near = first + warp_lane() < end and contacts_inout.separation[i] == LEAST_SEPARATION
-            waiting = push_signed_pair(list, waiting, near, faces[i], i)
-            warp_sync()
-            first += warp_size()
-        if waiting >= warp_size() or (first >= end and waiting > 0):
-            popped = wp.min(waiting, warp_size())
-            waiting -= popped
-            item = read_signed_pair(list, waiting + wp.min(warp_lane(), popped - 1))
-            warp_sync()
-            if warp_lane() < popped:
-                p, row = item[0], wp.vec3i(item[0], item[1], item[2])
-                own = contact_objects(pairs, pair_poses, p)
-                write_near_contact(item[3], models, states, objects, own, pair_poses[p], row, contacts_inout)
+    k = wp.tid()
+    while k < listed.total[0]:
+        i = listed.place[listed.place.shape[0] - 1 - k]
+        if not uncertain_only or contacts_inout.separation[i] == LEAST_SEPARATION:
+            p = faces[i][0]
+            own = contact_objects(pairs, pair_poses, p)
+            write_near_contact(i, models, states, objects, own, pair_poses[p], faces[i], contacts_inout)
+        k += step

@@ -75,8 +75,9 @@ from warp_abtree.query.sorting import first_sort
 from warp_abtree.query.staging import first_rows
 from warp_abtree.state.batch import Batch
 
-# Warps that a multiprocessor runs at a time, by their registers, of those that find deferred contacts.
-DEFERRED_WARPS = 8
+# Warps that a multiprocessor runs at a time, by their registers, of those that find deferred contacts, and of those
+# that find contacts of faces that are apart.
+DEFERRED_WARPS, LISTED_WARPS = 8, 16
 
 
 class ContactQuery(Query):
@@ -126,10 +127,12 @@ class ContactQuery(Query):
         contact_dtypes(contact_dtype)
         self.contact_dtype, self._asked_gap = contact_dtype, gap
         self.contacts, self.pair_contacts = contact.Contacts(), summary.PairContacts()
-        self._sums, self._deferred = summary.ChunkSums(), contact.Deferred()
+        self._sums, self._deferred, self._near = summary.ChunkSums(), contact.Deferred(), contact.Deferred()
         for model in () if isinstance(scene, Batch) else scene.models:
             model.warn_of_winding("the normals of its contacts depend on the winding", stacklevel=5)
-        self._deferred.total = wp.zeros(1, dtype=wp.int32, device=scene.device)
+        # As many of one and of the other as there are contacts at most: one array has room for both.
+        self._listed_totals = wp.zeros(2, dtype=wp.int32, device=scene.device)
+        self._deferred.total, self._near.total = self._listed_totals[:1], self._listed_totals[1:]
         super().__init__(scene, "faces", pairs, capacity, precision, within, sort_pairs)
 
     def set_pairs(self, pairs, within=None, gap=None):
@@ -166,7 +169,8 @@ class ContactQuery(Query):
         made.append((self.contacts, "coplanar", self._empty(capacity, wp.int32)))
         if self._gap is not None:
             made.append((self.contacts, "separation", self._empty(capacity, wp.float64)))
-        made.append((self._deferred, "place", self._empty(capacity, wp.int32)))
+        places = self._empty(capacity, wp.int32)
+        made += [(self._deferred, "place", places), (self._near, "place", places)]
         # The sort takes as much again as scratch.
         made.append((self, "_key", self._empty(2 * capacity, wp.int64)))
         made.append((self, "_order", self._empty(2 * capacity, wp.int32)))
@@ -239,31 +243,32 @@ class ContactQuery(Query):
             return
         if count == 0:
             self.start.zero_()
-            self._deferred.total.zero_()
+            self._listed_totals.zero_()
         if count == 0 or not self._sort_into(count, self._order, self._key, self.faces):
             inputs = [self.start, self._sums.span]
             self._launch_kernel(chunks.locate_chunk_kernel, self._chunk_count(count, room), inputs)
 
     def _sorted_ends(self) -> tuple:
-        return self.start, self._deferred.total, self._sums.span
+        return self.start, self._listed_totals, self._sums.span
 
     def _find(self, count: int):
         posed = [*self.batch.pools, self.pairs, self.pair_poses]
         proven = self.precision == "exact"
         inputs = [*posed, proven, self.start, self.faces, self._deferred, self.contacts]
         if self._gap is not None:
-            self._launch_kernel(separation.mark_near_kernel, count, [self.start, self.faces, self.contacts])
+            marked = [self.start, self.faces, self._near, self.contacts]
+            self._launch_kernel(separation.mark_near_kernel, -(-count // WARP_SIZE) * WARP_SIZE, marked)
         if self.uses_warps():
             self._launch_kernel(contact.find_contact_kernel, count, inputs, WARP_SIZE)
         else:
             self._launch_kernel(simd.find_pair_contacts_kernel, len(self.pairs), inputs)
+        step = LISTED_WARPS * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
         if self._gap is not None:
             if self.uses_warps():
                 inputs = [*self.batch.pools[:2], self.pair_poses, self.start, self.faces, self.contacts]
                 self._launch_kernel(separation.find_depth_kernel, count, inputs, WARP_SIZE)
-            inputs = [*posed, self.start, self.faces, self.contacts]
-            warps = -(-count // int(separation.CONTACTS_A_WARP))
-            self._launch_warps(separation.find_near_contact_kernel, warps, inputs)
+            inputs = [step, *posed, self.faces, self._near, not self.uses_warps(), self.contacts]
+            self._launch_kernel(separation.find_near_contact_kernel, step, inputs, WARP_SIZE)
         step = DEFERRED_WARPS * self.device.sm_count * WARP_SIZE if self.device.is_cuda else 1
         inputs = [step, *posed, self.faces, self._deferred, self.contacts]
         self._launch_kernel(contact.find_deferred_kernel, step, inputs, WARP_SIZE)

@@ -68,8 +68,6 @@ PAIRS_A_CORE = 4
 NOT_BEYOND = np.array(np.inf)  # one for all, so that it is known again at once
 NOT_BEYOND.flags.writeable = False
 FIELDS = {"point_faces": "faces"}  # of `report.Distances`, where a result's name is another
-# Pairs from which on warps search each roughly first; fewer leave some idle, and those share the search.
-ROUGH_LEAST = 1024
 CROSSING_KERNELS = [crossing.search_crossing_kernel, crossing.report_crossing_kernel]
 
 
@@ -359,7 +357,7 @@ class DistanceQuery(Query):
                 made.append(launch(search_simd.search_thread_kernel, dim=1, inputs=inputs, device=device))
             return made
         started = {**threads, "dim": max(room, len(self.work.flag))}
-        inputs = [length, ROUGH_LEAST, self._tolerances, *shared, self._slabs, found, hits, self.work]
+        inputs = [length, self._tolerances, *shared, self._slabs, found, hits, self.work]
         searching = {"dim": self._warp_count() * lanes, "block_dim": WARP_SIZE, "device": device}
         block = slabs.THREADS if self.device.is_cuda else 1
         blocks = self.device.sm_count if self.device.is_cuda else 1
