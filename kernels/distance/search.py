@@ -69,7 +69,7 @@ OPEN_LENGTH = native.constant("NEAREST_OPEN_LENGTH")
 # Face pairs from which on it is known whether slabs pay, and items for three of them that they leave where they do.
 MANY_FACES, FEW_FACES = wp.constant(1024), wp.constant(2)
 # Items at once, at most, before any faces are known: more would be looked at in vain.
-DIVE_ITEMS = wp.constant(4)
+DIVE_ITEMS = wp.constant(8)
 
 stack_code = functools.partial(native.body, "nearest_stack.cuh")
 
