@@ -25,9 +25,8 @@ import warp as wp
 from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.distance.triangle_pair import (
     PAIR_ROUNDING,
-    between_features,
-    nearest_features,
     scale_triangles,
+    triangle_distance,
 )
 from warp_abtree.kernels.poses import (
     ROUNDING_32,
@@ -62,7 +61,6 @@ class Frame:
 
     translation: wp.vec3  # between the models' centres, of B to A, scaled
     back: wp.vec3  # the same, of A to B
-    way: wp.vec3  # unit, in A's frame, about the direction in which the surfaces are nearest
     scale: wp.float32  # power of two that boxes are scaled by
     margin: wp.float32  # that posed boxes are widened by, scaled
     grow: wp.float32  # a little over 1: bounds of boxes may be so much too large
@@ -135,7 +133,6 @@ def make_frame(models: ModelPool, states: StatePool, objects: ObjectPool, pose: 
     frame = Frame()
     frame.translation = wp.vec3(shift * scale)
     frame.back = wp.vec3(back * scale)
-    frame.way = wp.normalize(frame.translation)
     frame.scale = wp.float32(scale)
     frame.margin = wp.float32(margin * scale)
     frame.scale64 = scale
@@ -231,12 +228,10 @@ def start_pair(
     face_a, face_b = wp.int32(faces >> wp.int64(32)), wp.int32(faces & wp.int64(0x7FFFFFFF))
     if is_active(models, states, objects.state[a], face_a) and is_active(models, states, objects.state[b], face_b):
         triangles = load_triangles(models, states, pose, face_a, face_b)
-        near = nearest_features(triangles)
-        d = wp.sqrt(near.square) * triangles.size
+        d = triangle_distance(triangles)
         if d <= bound:
             bound = d
             kept = pack_item(face_a, face_b)
-            frame.way = wp.vec3(wp.normalize(between_features(triangles, near)))
     found.frame[p] = frame
     found.distance[p] = bound
     found.faces[p] = kept

@@ -43,7 +43,6 @@ def open_search(
     found: bool,
     diving: bool,
     first: wp.int64,
-    way: wp.vec3,
     thread: wp.int32,
     memory: wp.array2d(dtype=wp.float32),
 ):
@@ -54,7 +53,6 @@ def open_search(
         found: Whether there are faces at that distance.
         diving: Whether the nearest node pairs go first until some faces are measured.
         first: The roots.
-        way: Unit direction in which the surfaces may be nearest.
     """
 
 
@@ -157,7 +155,6 @@ def search_pair(
         nearest.faces != NO_FACES,
         diving,
         first_item(states, pose),
-        frame.way,
         thread,
         memory,
     )

@@ -14,7 +14,7 @@ inline CUDA_CALLABLE wp::vec_t<2, wp::float32> bound_faces(wp::float32 own, Corn
         c.b[k] = N::Point{zero + b.data[k][0], zero + b.data[k][1], zero + b.data[k][2]};
     }
     N::lanes size;
-    const N::lanes d = N::F::root(N::measure(c, size).square), error = N::error_of(d, size, own);
+    const N::lanes d = N::F::root(N::measure(c, size)), error = N::error_of(d, size, own);
     return wp::vec_t<2, wp::float32>(N::F::first(d - error), N::F::first(d + error));
 }
 

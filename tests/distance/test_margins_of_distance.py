@@ -9,6 +9,7 @@ from oracles.triangle import into_frame_of_a, quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.kernels.distance.start import PAIRS_LEAST
 
 STILL = (0, 0, 0, 0, 0, 0, 1)
 ANSWERS = ("distance", "bracket", "points", "point_faces")
@@ -34,8 +35,12 @@ def sheets(rng, roughness, far, bend, side=9):
     return models, poses
 
 
-def anchored_sheets(rng, roughness, far):
-    """Return two flat sheets, each with a face far behind it, so that centres lie far from them, and poses."""
+def anchored_sheets(rng, roughness, far, aside):
+    """Return two flat sheets, each with a face far behind it, so that centres lie far from them, and poses.
+
+    Args:
+        aside: How far the poses are aside; 0 puts faces of the same number right over one another.
+    """
     vertices, faces = grid(9)
     models, poses = [], []
     for side, height in ((-1, 0.0), (1, 0.25)):
@@ -44,7 +49,7 @@ def anchored_sheets(rng, roughness, far):
         corners = np.concatenate([points, behind])
         count = len(points)
         models.append(ab.Model.from_arrays(corners, [*faces, [count, count + 1, count + 2]], base_faces=200))
-        poses.append(np.array([*(0.1 * rng.normal(size=2)), height, 0, 0, 0, 1]))
+        poses.append(np.array([*(aside * rng.normal(size=2)), height, 0, 0, 0, 1]))
     return models, poses
 
 
@@ -58,31 +63,45 @@ def test_nearly_equally_near_faces(device, roughness, far, bend):
 
 @pytest.mark.parametrize("roughness", [1e-6, 1e-8])
 @pytest.mark.parametrize("far", [3.0, 100.0])
-def test_nearly_equally_near_faces_of_large_objects(device, roughness, far):
+@pytest.mark.parametrize("aside", [0.1, 0.0])
+def test_nearly_equally_near_faces_of_large_objects(device, roughness, far, aside):
     rng = np.random.default_rng(3)
-    check_sheets(device, [anchored_sheets(rng, roughness, far) for _ in range(20)], 1 + far)
+    check_sheets(device, [anchored_sheets(rng, roughness, far, aside) for _ in range(20)], 1 + far)
 
 
 def check_sheets(device, sheets, size):
-    """Compare with brute force, without slabs, with slabs from the start, and from the answer."""
+    """Compare with brute force, without slabs, with slabs from the start, and from the answer; threads and warps."""
     cases = [(a, None, pose_a, b, None, pose_b) for (a, b), (pose_a, pose_b) in sheets]
-    query = ab.DistanceQuery(scene_of(device, cases), pairs_of(cases))
+    scene, pairs = scene_of(device, cases), pairs_of(cases)
+    # So many that warps, too, make slabs of them.
+    pairs = np.tile(pairs, (-(-int(PAIRS_LEAST) // len(pairs)), 1))
+    truths = [true_distance(case) for case in cases]
+    for warps in (None, True):
+        with testing.regime(warps=warps):
+            check_queries(ab.DistanceQuery(scene, pairs), truths, size)
+
+
+def true_distance(case):
+    a, _, pose_a, b, _, pose_b = case
+    (vertices_a, faces_a, _), (vertices_b, faces_b, _) = a.mesh_at(a.lod_max), b.mesh_at(b.lod_max)
+    return surface_distance(vertices_a[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b])
+
+
+def check_queries(query, truths, size):
     first = query.run()
-    for (a, _, pose_a, b, _, pose_b), found in zip(cases, first.distance, strict=True):
-        (vertices_a, faces_a, _), (vertices_b, faces_b, _) = a.mesh_at(a.lod_max), b.mesh_at(b.lod_max)
-        truth = surface_distance(vertices_a[faces_a], into_frame_of_a(vertices_b, pose_a, pose_b)[faces_b])
-        assert found == pytest.approx(truth, rel=1e-13, abs=1e-15 * size)
+    assert first.distance[: len(truths)] == pytest.approx(truths, rel=1e-13, abs=1e-15 * size)
     for turn in range(20):
         query.launch()
         assert to_bytes(query.result()) == to_bytes(first)
         if turn > 16:
             query.forget()
+    assert (query._slabs.made.numpy()[:, 0] >= 0).sum() == len(query.batch.states.slots), "slabs of all states"
 
 
 @pytest.mark.parametrize("far", [0.0, 100.0])
 @pytest.mark.parametrize("roughness", [1e-7, 1e-9])
 def test_very_many_nearly_equally_near_faces(device, roughness, far):
-    """So many that slabs are compared along the nodes' own normals, on the CPU; warps have no slabs."""
+    """So many that slabs are compared along the nodes' own normals, on the CPU; warps have none for so few pairs."""
     rng = np.random.default_rng(4)
     cases = []
     for bend in (0.0, 0.1, 0.02):

@@ -35,9 +35,11 @@ struct NearBoxes : SlabBounds {
         for (int i = 0; i < 3; ++i) {
             for (int k = 0; k < 3; ++k) {
                 s.axes[i][k] = join(r[k][i], r[i][k]);
+                s.home[i][k] = lanes{} + r[k][i];
                 s.sizes[i][k] = __builtin_elementwise_abs(s.axes[i][k]);
             }
             s.shift[i] = join(2 * back[i], 2 * there[i]);
+            s.there[i] = lanes{} + 2 * there[i];
         }
         s.wide = 2 * margin;
         s.margin = 16 * margin;  // docs/exactness.md
@@ -119,7 +121,7 @@ struct NearBoxes : SlabBounds {
         if (slabs != 0) {
             lanes slab[8];
             turn(taken, slabs, slab);
-            const lanes more = normals ? bound_normals(slab, sum, size, apart) : bound_way(slab, sum, size, apart);
+            const lanes more = normals ? bound_normals(slab, sum, size, apart) : bound_between(slab, sum, size, apart);
             tested.bound = tested.bound > more ? tested.bound : more;
         }
         // What follows, as in `item_of`.

@@ -29,11 +29,6 @@ struct NearestFaces {
         return most(most(F::absolute(p.x), F::absolute(p.y)), F::absolute(p.z));
     }
 
-    // Squared distances, and vectors from A's points to B's.
-    struct Nearest {
-        lanes square;
-        Point v;
-    };
     static CUDA_CALLABLE Point between_edges(const Point& r, const Point& e, const Point& f, const lanes& inverse_e,
                                              const lanes& inverse_f) {
         const Point n = F::cross(e, f);
@@ -52,18 +47,13 @@ struct NearestFaces {
         const lanes far = lanes{} + 0x1p60f;
         return Point{inside ? v.x : far, inside ? v.y : far, inside ? v.z : far};
     }
-    static CUDA_CALLABLE void offer(Nearest& nearest, const Point& v) {
-        const lanes square = F::dot(v, v);
-        const bits closer = square < nearest.square;
-        nearest.square = closer ? square : nearest.square;
-        nearest.v = F::choose(closer, v, nearest.v);
-    }
-    // Where pairs are nearest, and the largest coordinate of what joins corners.
-    static CUDA_CALLABLE Nearest measure(const Corners& c, lanes& size) {
+    static CUDA_CALLABLE void offer(lanes& nearest, const Point& v) { nearest = least(nearest, F::dot(v, v)); }
+    // Squared distances, and the largest coordinate of what joins corners.
+    static CUDA_CALLABLE lanes measure(const Corners& c, lanes& size) {
         const Point e[3] = {F::minus(c.a[1], c.a[0]), F::minus(c.a[2], c.a[1]), F::minus(c.a[0], c.a[2])};
         const Point f[3] = {F::minus(c.b[1], c.b[0]), F::minus(c.b[2], c.b[1]), F::minus(c.b[0], c.b[2])};
         lanes inverse_e[3], inverse_f[3];
-        Nearest nearest = {lanes{} + 0x1.fffffep127f, Point{}};
+        lanes nearest = lanes{} + 0x1.fffffep127f;
         for (int k = 0; k < 3; ++k) {
             inverse_e[k] = invert(F::dot(e[k], e[k]));
             inverse_f[k] = invert(F::dot(f[k], f[k]));
@@ -80,8 +70,7 @@ struct NearestFaces {
         const lanes inverse_n = invert(F::dot(n, n)), inverse_m = invert(F::dot(m, m));
         for (int k = 0; k < 3; ++k) {
             offer(nearest, over_face(F::minus(c.b[k], c.a[0]), e[0], back_a, n, inverse_n));
-            const Point v = over_face(F::minus(c.a[k], c.b[0]), f[0], back_b, m, inverse_m);
-            offer(nearest, Point{-v.x, -v.y, -v.z});
+            offer(nearest, over_face(F::minus(c.a[k], c.b[0]), f[0], back_b, m, inverse_m));
         }
         size = most(most(size, largest(e[0])), most(largest(back_a), most(largest(f[0]), largest(back_b))));
         return nearest;

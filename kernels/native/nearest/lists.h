@@ -3,8 +3,8 @@
 #include "builtin.h"
 #include "nearest/memory.h"
 
-void open_search(wp::float32 upper, bool found, bool diving, wp::int64 first, wp::vec_t<3, wp::float32> way,
-                 wp::int32 thread, wp::array_t<wp::float32> memory) {
+void open_search(wp::float32 upper, bool found, bool diving, wp::int64 first, wp::int32 thread,
+                 wp::array_t<wp::float32> memory) {
 #include "nearest/memory.h"
     const NearestMemory m = NearestMemory::find(memory.data, thread);
     NearestMemory::Header& h = *m.header;
@@ -13,8 +13,6 @@ void open_search(wp::float32 upper, bool found, bool diving, wp::int64 first, wp
     h.found = found;
     h.diving = diving;
     h.top = 1;
-    for (int k = 0; k < 3; ++k)
-        h.way[k] = way[k];
     m.item[0] = first;
     m.bound[0] = 0.0f;
 }

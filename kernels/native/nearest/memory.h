@@ -5,7 +5,6 @@
 
 struct NearestMemory {
     struct Header {
-        float way[3];                         // direction in which the faces are nearest
         float upper;                          // that the nearest distance is not over, scaled
         int found;                            // whether there are faces at most that far: only then a tolerance counts
         int diving;                           // whether the nearest node pair goes first, until faces are measured

@@ -25,7 +25,6 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
                                       pose.node_a, pose.node_b);
     if (with_slabs) {
         boxes.slabs = (const char*)slabs.record.data - (const char*)states.node_box.data;
-        boxes.look(h.way);
         boxes.normals = h.face_tests >= NORMALS_LEAST;
     }
     // Apart from the memory that lists are written to.
@@ -48,25 +47,15 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
         const N::Corners corners = NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a,
                                                         pose.corner_b, r, frame.translation, frame.scale, items, count);
         F::lanes size;
-        const N::Nearest nearest = N::measure(corners, size);
-        const F::lanes d = __builtin_elementwise_sqrt(nearest.square);
+        const F::lanes d = __builtin_elementwise_sqrt(N::measure(corners, size));
         const F::lanes error = N::error_of(d, size, frame.error), over = d + error, under = d - error;
         float low[16];
-        int best = -1;
         h.diving = 0;
         for (int i = 0; i < count; ++i)
             if (over[i] < h.upper) {
                 h.upper = over[i];
                 h.found = 1;
-                best = i;
             }
-        if (best >= 0 && with_slabs && d[best] > 0.0f) {
-            const float way[3] = {nearest.v.x[best] / d[best], nearest.v.y[best] / d[best],
-                                  nearest.v.z[best] / d[best]};
-            boxes.look(way);
-            for (int k = 0; k < 3; ++k)
-                h.way[k] = way[k];
-        }
         __builtin_memcpy(low, &under, sizeof(low));
         set_limits();
         for (int i = 0; i < count; ++i)

@@ -7,7 +7,7 @@ struct SlabBounds {
     typedef float lanes __attribute__((vector_size(64)));
     lanes axes[3][3], shift[3];  // to the other tree's frame: rotation, and twice the translation
     float scale, margin;
-    lanes way[3], far;  // direction from A for A's nodes, to A for B's, in their own frames; and -t . n of B's
+    lanes home[3][3], there[3];  // from A's frame to B's; twice the translation of B to A
 
     static lanes of_a(const lanes& v) {
         return __builtin_shufflevector(v, v, 0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5, 6, 6, 7, 7);
@@ -15,19 +15,6 @@ struct SlabBounds {
     static lanes of_b(const lanes& v) {
         return __builtin_shufflevector(v, v, 8, 9, 8, 9, 10, 11, 10, 11, 12, 13, 12, 13, 14, 15, 14, 15);
     }
-    // Take a unit vector of A's frame as the direction along which slabs are compared.
-    void look(const float* n) {
-        float back[3];
-        for (int i = 0; i < 3; ++i)
-            back[i] = axes[0][i][15] * n[0] + axes[1][i][15] * n[1] + axes[2][i][15] * n[2];
-        const float t = shift[0][15] * n[0] + shift[1][15] * n[1] + shift[2][15] * n[2];
-        for (int i = 0; i < 3; ++i) {
-            const float a = n[i], b = -back[i];
-            way[i] = lanes{a, a, a, a, a, a, a, a, b, b, b, b, b, b, b, b};
-        }
-        far = lanes{0, 0, 0, 0, 0, 0, 0, 0, t, t, t, t, t, t, t, t};
-    }
-
     // Upper bounds of twice the coordinate of each node along a direction of its own frame, by its box and by its slab.
     lanes tops(const lanes (&w)[3], const lanes& along, const lanes (&normal)[3], const lanes& low, const lanes& high,
                const lanes (&sum)[3], const lanes (&size)[3]) const {
@@ -49,40 +36,67 @@ struct SlabBounds {
     }
     static lanes square(const lanes& gap) { return gap > 0.0f ? gap * gap : lanes{}; }
 
-    // Along the direction from A to B by boxes and slabs, across it by balls about the middles of boxes.
-    lanes bound_way(const lanes (&slab)[8], const lanes (&sum)[3], const lanes (&size)[3],
-                    const lanes (&apart)[3]) const {
+    // The other lane of a pair of lanes, or of pairs of them, added to each.
+    static lanes add_next(const lanes& v) {
+        return v + __builtin_shufflevector(v, v, 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14);
+    }
+    static lanes add_second(const lanes& v) {
+        return v + __builtin_shufflevector(v, v, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13);
+    }
+    static lanes inverse_root(const lanes& square) {
+        return square > 0x1p-100f ? 1.0f / __builtin_elementwise_sqrt(square) : lanes{};
+    }
+
+    // Along the direction between the middles of an item's nodes, turned a little towards their mean normals, by boxes
+    // and slabs; across it by balls about the middles of boxes. See `slab_bound`.
+    lanes bound_between(const lanes (&slab)[8], const lanes (&sum)[3], const lanes (&size)[3],
+                        const lanes (&apart)[3]) const {
+        constexpr float NORMAL_WEIGHT = 0.0625f;
         const lanes normal[3] = {slab[0], slab[1], slab[2]};
-        const lanes along = way[0] * slab[0] + way[1] * slab[1] + way[2] * slab[2];
-        const lanes top = tops(way, along, normal, slab[3], slab[4], sum, size) - far;
-        const lanes ball = slab[6] * (2.0f * scale);
-        const lanes w[3] = {lanes{} + way[0][0], lanes{} + way[1][0], lanes{} + way[2][0]};
-        const lanes d = apart[0] * w[0] + apart[1] * w[1] + apart[2] * w[2];
+        lanes w[3], a[3], b[3], back[3], way[3];
+        for (int i = 0; i < 3; ++i) {
+            w[i] = -add_second(add_next(apart[i]));
+            a[i] = add_second(of_a(normal[i]));
+            b[i] = add_next(of_b(fuse(axes[i][2], normal[2], fuse(axes[i][1], normal[1], axes[i][0] * normal[0]))));
+        }
+        const lanes unit = inverse_root(dot(w, w));
+        const lanes of_first = NORMAL_WEIGHT * unit * dot(a, w), of_second = NORMAL_WEIGHT * unit * dot(b, w);
+        for (int i = 0; i < 3; ++i)
+            w[i] = fuse(of_second, b[i], fuse(of_first, a[i], unit * w[i]));
+        const lanes length = inverse_root(dot(w, w));
+        for (int i = 0; i < 3; ++i)
+            w[i] *= length;
+        for (int i = 0; i < 3; ++i) {
+            back[i] = -fuse(home[i][2], w[2], fuse(home[i][1], w[1], home[i][0] * w[0]));
+            way[i] = __builtin_shufflevector(w[i], back[i], 0, 0, 4, 4, 8, 8, 12, 12, 16, 16, 20, 20, 24, 24, 28, 28);
+        }
+        const lanes top = tops(way, dot(way, normal), normal, slab[3], slab[4], sum, size);
+        const lanes ball = slab[6] * (2.0f * scale), d = dot(apart, w), far = dot(there, w);
         lanes across = {};
         for (int i = 0; i < 3; ++i) {
-            const lanes x = apart[i] - d * w[i];
-            across += x * x;
+            const lanes x = fuse(-d, w[i], apart[i]);
+            across = fuse(x, x, across);
         }
-        return square(-(of_a(top) + of_b(top)) - margin) +
+        return square(far - (of_a(top) + of_b(top)) - margin) +
                square(__builtin_elementwise_sqrt(across) - (of_a(ball) + of_b(ball)) - margin);
     }
 
     // Along the mean normal of either node: own slab against the other's box and slab.
     lanes bound_normals(const lanes (&slab)[8], const lanes (&sum)[3], const lanes (&size)[3],
                         const lanes (&apart)[3]) const {
-        lanes there[3], towards = {}, along = {};
+        lanes rotated[3], along = {};
         for (int i = 0; i < 3; ++i)
-            there[i] = fuse(axes[i][2], slab[2], fuse(axes[i][1], slab[1], axes[i][0] * slab[0]));
+            rotated[i] = fuse(axes[i][2], slab[2], fuse(axes[i][1], slab[1], axes[i][0] * slab[0]));
         // Both in A's frame.
         const lanes of_first[3] = {of_a(slab[0]), of_a(slab[1]), of_a(slab[2])};
-        const lanes of_second[3] = {of_b(there[0]), of_b(there[1]), of_b(there[2])};
+        const lanes of_second[3] = {of_b(rotated[0]), of_b(rotated[1]), of_b(rotated[2])};
         lanes bound = {};
         along = dot(of_first, of_second);
         for (int k = 0; k < 2; ++k) {
             // The other's reach along a node's normal, which is turned away from the other.
             lanes w[3], normal[3], middle[3], half[3], step = {};
             for (int i = 0; i < 3; ++i) {
-                w[i] = k == 0 ? of_a(there[i]) : of_b(there[i]);
+                w[i] = k == 0 ? of_a(rotated[i]) : of_b(rotated[i]);
                 normal[i] = k == 0 ? of_b(slab[i]) : of_a(slab[i]);
                 middle[i] = k == 0 ? of_b(sum[i]) : of_a(sum[i]);
                 half[i] = k == 0 ? of_b(size[i]) : of_a(size[i]);

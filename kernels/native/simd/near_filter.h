@@ -28,7 +28,7 @@ wp::int32 simd_near_filter(ModelPool models, StatePool states, PairPose pose, wp
             NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a, pose.corner_b,
                                  pose.rotation32.data, there, scale, list + done, count);
         F::lanes size;
-        const F::lanes d = __builtin_elementwise_sqrt(N::measure(corners, size).square);
+        const F::lanes d = __builtin_elementwise_sqrt(N::measure(corners, size));
         // Differences of corners err by `error` along an axis.
         const F::lanes under = d - N::error_of(d, size, 2.0f * pose.error);
         for (int i = 0; i < count; ++i) {
