@@ -19,9 +19,9 @@ from warp_abtree.kernels.distance.search import (
     warp_min_item,
     write_bound,
 )
-from warp_abtree.kernels.distance.slabs import Slabs
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import PairPose, pose_point
+from warp_abtree.kernels.slabs.mean_slabs import Slabs
 from warp_abtree.kernels.traversal.dual_tree import DEPTH_FIRST_ROOM
 from warp_abtree.kernels.traversal.face_pairs import Hits, test_faces
 from warp_abtree.kernels.traversal.node_pair import first_item, four_items, item_first, item_second

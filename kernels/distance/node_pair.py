@@ -10,8 +10,8 @@ import warp as wp
 from warp_abtree.kernels.arrays import StatePool
 from warp_abtree.kernels.distance.frame import Frame
 from warp_abtree.kernels.distance.slab_bound import bound_child_slabs, square_gap
-from warp_abtree.kernels.distance.slabs import Slabs
 from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.slabs.mean_slabs import Slabs
 from warp_abtree.kernels.traversal.boxes import PosedBox, pose_box
 from warp_abtree.kernels.traversal.node_pair import (
     INDEX_MASK,

@@ -112,12 +112,9 @@ def report_distance_kernel(
     found: Found,
     hits: Hits,
     distances_out: Distances,
-    due_count_out: wp.array(dtype=wp.int32),
 ):
-    """Report an object pair a thread, see `report_pair`; leave no slabs due."""
+    """Report an object pair a thread, see `report_pair`."""
     p = wp.tid()
-    if p == 0:
-        due_count_out[0] = 0
     if p >= pair_count[0] or found.launched[0] == STALE:
         return
     report_pair(p, tolerances, models, states, objects, pairs, pair_poses, found, hits, distances_out)

@@ -23,7 +23,6 @@ from warp_abtree.kernels.distance.frame import (
     spare_of,
 )
 from warp_abtree.kernels.distance.node_pair import bound_children, limit_of
-from warp_abtree.kernels.distance.slabs import Slabs, has_slabs
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.distance.warp_found import (
     SLABS_PAY,
@@ -36,6 +35,7 @@ from warp_abtree.kernels.distance.warp_found import (
     offer_nearest,
 )
 from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.slabs.mean_slabs import Slabs, has_slabs
 from warp_abtree.kernels.traversal.dual_tree import DEPTH_FIRST_ROOM, STACK_MASK, donate_items, receive_items
 from warp_abtree.kernels.traversal.face_pairs import Hits
 from warp_abtree.kernels.traversal.load_balance import (
@@ -313,16 +313,21 @@ def search_warp_kernel(
     states: StatePool,
     pair_count: wp.array(dtype=wp.int32),
     pair_poses: wp.array(dtype=PairPose),
-    slabs: Slabs,
+    slabs_inout: Slabs,
     found_inout: Found,
     hits_inout: Hits,
     work_inout: Work,
 ):
-    """Search the object pairs that do not intersect: units of work, a pair each, and donated items."""
+    """Search the object pairs that do not intersect: units of work, a pair each, and donated items.
+
+    The slabs that were due have been made.
+    """
     count = wp.min(pair_count[0], pair_poses.shape[0])
     search = Search()
     search.room = room
     search.tolerances = tolerances
+    if wp.tid() == 0:
+        slabs_inout.due_count[0] = 0
     p = take_unit(work_inout.counter)
     ended = wp.int32(0)
     while True:
@@ -337,9 +342,9 @@ def search_warp_kernel(
             search.pair = p
             search.pose = pair_poses[p]
             search.frame = found_inout.frame[p]
-            search.slabs = has_slabs(states, slabs, p)
+            search.slabs = has_slabs(states, slabs_inout, p)
             size = start_items(slot, states, search.pose, work_inout)
-            tests = search_items(search, size, models, states, pair_poses, slabs, found_inout, work_inout)
+            tests = search_items(search, size, models, states, pair_poses, slabs_inout, found_inout, work_inout)
             add_warp_sum(hits_inout.node_tests, p, tests[0])
             add_warp_sum(hits_inout.triangle_tests, p, tests[1])
         ended += 1

@@ -22,10 +22,10 @@ from warp_abtree.kernels.distance.frame import (
     start_pair,
 )
 from warp_abtree.kernels.distance.report import Distances, report_pair
-from warp_abtree.kernels.distance.slabs import Slabs, count_uses, has_slabs, make_due
 from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.generation import STALE
 from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.slabs.mean_slabs import Slabs, count_uses, has_slabs, make_due
 from warp_abtree.kernels.traversal.face_pairs import Hits
 from warp_abtree.kernels.traversal.load_balance import take_unit
 from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second

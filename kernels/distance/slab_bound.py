@@ -9,8 +9,8 @@ size, so that such bounds err by the square of the size, where boxes err by the 
 import warp as wp
 
 from warp_abtree.kernels.distance.frame import Frame
-from warp_abtree.kernels.distance.slabs import Slabs
 from warp_abtree.kernels.poses import PairPose
+from warp_abtree.kernels.slabs.mean_slabs import Slabs
 from warp_abtree.kernels.traversal.boxes import fuse32, map_point
 from warp_abtree.kernels.traversal.nodes import Node, load_constant
 

@@ -1,1 +1,1 @@
-"""Slabs of nodes: how far faces reach along the direction in which they are thinnest."""
+"""Slabs of nodes: how far faces reach along a direction, that in which they are thinnest or their mean normal."""

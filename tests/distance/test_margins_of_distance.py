@@ -9,7 +9,7 @@ from oracles.triangle import into_frame_of_a, quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.kernels.distance.start import PAIRS_LEAST
+from warp_abtree.kernels.distance.frame import PAIRS_LEAST
 
 STILL = (0, 0, 0, 0, 0, 0, 1)
 ANSWERS = ("distance", "bracket", "points", "point_faces")

@@ -53,7 +53,8 @@ from warp_abtree.checks.arguments import check_device, flag, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd, slabs, start
+from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd
+from warp_abtree.kernels.slabs import mean_slabs
 from warp_abtree.kernels.solid.containment import report_contained_kernel
 from warp_abtree.kernels.solid.depth import find_depth_kernel
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
@@ -172,7 +173,7 @@ class DistanceQuery(Query):
         self._tolerances.tolerance, self._tolerances.relative = self._asked_tolerances
         self._answer_views: tuple[int, dict] = (-1, {})
         self._asked = check_beyond(beyond, None if pairs is None else len(to_numpy(pairs, "pairs")))
-        self.distances, self._found, self._slabs = report.Distances(), frame.Found(), slabs.Slabs()
+        self.distances, self._found, self._slabs = report.Distances(), frame.Found(), mean_slabs.Slabs()
         self._slabs.record = wp.empty(0, dtype=wp.vec4, device=scene.device)
         self._slabs.due_count = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity)
@@ -229,9 +230,9 @@ class DistanceQuery(Query):
         with_warps = current_regime().uses_warps(device)
         kernels = [search.search_warp_kernel if with_warps else search_simd.search_thread_kernel]
         kernels += CROSSING_KERNELS if device.is_cuda else []  # on the CPU where pairs cross
-        kernels += [report.report_distance_kernel, start.start_distance_kernel] if with_warps else []
+        kernels += [report.report_distance_kernel, frame.start_distance_kernel] if with_warps else []
         searching = super().kernels(device, output, precision, with_gap, with_distances)
-        making = [(slabs.make_slabs_kernel, slabs.THREADS)] if with_warps else []
+        making = [(mean_slabs.make_slabs_kernel, mean_slabs.THREADS)] if with_warps else []
         return [*[(kernel, WARP_SIZE) for kernel in kernels], *making, *searching]
 
     def _pair_arrays(self, room: int) -> list:
@@ -345,7 +346,7 @@ class DistanceQuery(Query):
         shared = [models, states, self.pair_count, self.pair_poses]
         hits, found, length = self.hits, self._found, self._stack_length()
         threads = {"dim": room, "block_dim": WARP_SIZE, "device": device}
-        reports = [self._tolerances, *posed, found, hits, self.distances, self._slabs.due_count]
+        reports = [self._tolerances, *posed, found, hits, self.distances]
         if not self.uses_warps():
             made = []
             for steps in [(True, True)] if self._search_cores() == 1 else [(True, False), (False, True)]:
@@ -359,12 +360,12 @@ class DistanceQuery(Query):
         started = {**threads, "dim": max(room, len(self.work.flag))}
         inputs = [length, self._tolerances, *shared, self._slabs, found, hits, self.work]
         searching = {"dim": self._warp_count() * lanes, "block_dim": WARP_SIZE, "device": device}
-        block = slabs.THREADS if self.device.is_cuda else 1
+        block = mean_slabs.THREADS if self.device.is_cuda else 1
         blocks = self.device.sm_count if self.device.is_cuda else 1
-        making = {"dim": blocks * block, "block_dim": slabs.THREADS, "device": device}
+        making = {"dim": blocks * block, "block_dim": mean_slabs.THREADS, "device": device}
         return [
-            launch(start.start_distance_kernel, inputs=[*posed, self._slabs, found, self.work], **started),
-            launch(slabs.make_slabs_kernel, inputs=[block, blocks, models, states, self._slabs], **making),
+            launch(frame.start_distance_kernel, inputs=[*posed, self._slabs, found, self.work], **started),
+            launch(mean_slabs.make_slabs_kernel, inputs=[block, blocks, models, states, self._slabs], **making),
             launch(search.search_warp_kernel, inputs=inputs, **searching),
             launch(report.report_distance_kernel, inputs=reports, **threads),
         ]

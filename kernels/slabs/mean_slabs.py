@@ -53,12 +53,12 @@ class Slab:
     radius: wp.float32  # of a ball about the middle of the node's box that holds the faces
 
 
-@wp.func_native(native.body("slabs.cuh", "is_last_block"))
+@wp.func_native(native.body("nearest/slabs.cuh", "is_last_block"))
 def is_last_block(ended: wp.array(dtype=wp.int32), i: wp.int32, amount: wp.int32, whole: wp.int32) -> bool:
     """Add what this block has ended; return whether it is the last, which then sees what the others have written."""
 
 
-@wp.func_native(native.body("slabs.cuh", "load_written"))
+@wp.func_native(native.body("nearest/slabs.cuh", "load_written"))
 def load_written(values: wp.array(dtype=wp.vec4), i: wp.int64) -> wp.vec4:
     """Return an entry that another block may have written."""
 
