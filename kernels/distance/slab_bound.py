@@ -11,6 +11,7 @@ import warp as wp
 from warp_abtree.kernels.distance.frame import Frame
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.slabs.mean_slabs import Slabs
+from warp_abtree.kernels.slabs.overlap import add_product, take_multiple
 from warp_abtree.kernels.traversal.boxes import fuse32, map_point
 from warp_abtree.kernels.traversal.nodes import Node, load_constant
 
@@ -51,17 +52,6 @@ def square_over(x: wp.float32, margin: wp.float32):
 
 
 @wp.func
-def add_products(x: wp.vec3, y: wp.vec3, sum: wp.float32):
-    return fuse32(x[0], y[0], fuse32(x[1], y[1], fuse32(x[2], y[2], sum)))
-
-
-@wp.func
-def take_multiple(x: wp.vec3, factor: wp.float32, y: wp.vec3):
-    """Return x - factor y."""
-    return wp.vec3(fuse32(-factor, y[0], x[0]), fuse32(-factor, y[1], x[1]), fuse32(-factor, y[2], x[2]))
-
-
-@wp.func
 def load_body(slabs: Slabs, at: wp.int32, node: Node, scale: wp.float32):
     i = wp.int64(2) * wp.int64(at)
     first, second = load_constant(slabs.record, i), load_constant(slabs.record, i + wp.int64(1))
@@ -79,14 +69,14 @@ def load_body(slabs: Slabs, at: wp.int32, node: Node, scale: wp.float32):
 @wp.func
 def top_of(body: Body, n: wp.vec3):
     """Return twice an upper bound of n . x for the points x of a node, in its own frame."""
-    along = add_products(n, body.normal, 0.0)
+    along = add_product(n, body.normal, 0.0)
     rest = take_multiple(n, along, body.normal)
     by_slab = fuse32(
         along,
         wp.where(along > 0.0, body.high, body.low),
-        add_products(rest, body.sum, add_products(wp.abs(rest), body.size, 0.0)),
+        add_product(rest, body.sum, add_product(wp.abs(rest), body.size, 0.0)),
     )
-    return wp.min(by_slab, add_products(n, body.sum, add_products(wp.abs(n), body.size, 0.0)))
+    return wp.min(by_slab, add_product(n, body.sum, add_product(wp.abs(n), body.size, 0.0)))
 
 
 @wp.func
@@ -120,9 +110,9 @@ def bound_pair(n: wp.vec3, gap: wp.float32, margin: wp.float32, apart: wp.vec3, 
         gap: Twice their gap along n.
         boxes: The lower bound by boxes.
     """
-    d = add_products(apart, n, 0.0)
+    d = add_product(apart, n, 0.0)
     across = take_multiple(apart, d, n)
-    beside = wp.sqrt(add_products(across, across, 0.0)) - balls
+    beside = wp.sqrt(add_product(across, across, 0.0)) - balls
     return wp.max(square_over(gap, margin) + square_over(beside, margin), boxes)
 
 

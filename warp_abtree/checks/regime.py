@@ -17,7 +17,7 @@ class Regime:
         cpu_threads: Threads of a launch on the CPU; None is all that the process may use.
         plain_tests: Pairs of nodes that a thread of the CPU compares by boxes alone before it looks whether few of them
             hit, and makes slabs of subtrees where they do, which as many more tests have to pay for.
-        slabs: Whether warps compare slabs of nodes of few faces, too.
+        slabs: Whether warps compare slabs of nodes of few faces, too, and distances slabs of all nodes.
         full_refit: Fraction of its faces past which a state is refitted whole, by kind of device, as measured. A slice
             repeats faces, so k is smaller still.
         block_updates: Whether a block updates a tree state by itself where it can; False: all by level lists.
