@@ -25,11 +25,11 @@ from . import tables
 
 CASES = (
     *("assembly", "baselines", "budget", "build", "coarse", "distance", "exact", "frame"),
-    *("host", "motion", "query", "robot", "scale", "sweep", "update"),
+    *("gate", "host", "motion", "query", "robot", "scale", "sweep", "update"),
 )
 STUDIES = {"paper": "study", "tradeoff": "study", "nightly": "nightly"}  # and the modules that run them
 MODULES = {name: f"bench.cases.{name}" for name in CASES} | {"motion": "bench.motions.case"}
-MODULES["robot"] = "bench.motions.robot"
+MODULES |= {"robot": "bench.motions.robot", "gate": "bench.gate.compare"}
 MODULES |= {name: f"bench.studies.{module}" for name, module in STUDIES.items()}
 FIGURES = ("scale", "update")  # cases whose figures are laid out in cases/figures.toml
 # A case, and a study, takes the options that its function `run` has as arguments.
@@ -41,6 +41,7 @@ OPTIONS = {
     "count": {"type": int, "help": "random pairs, and a tenth as many adversarial ones; configurations; or worlds"},
     "out": {"required": True, "metavar": "DIR", "help": "where to write JSON, tables and figures"},
     "only": {"nargs": "+", "metavar": "PART", "help": "run these parts, or cases, alone; others are kept from before"},
+    "before": {"metavar": "TREE", "help": "the other checkout"},
     "processes": {"type": int, "help": "processes that run the oracle"},
 }
 

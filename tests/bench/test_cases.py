@@ -163,6 +163,13 @@ def check_robot(rows):
     assert less["all_false"] < cover["all_false"]
 
 
+def check_gate(rows):
+    assert rows[0]["case"] == "trees" and rows[-1]["digests_differ"] == 0 < rows[-1]["first_now_s"]
+    kinds = [row["case"] for row in rows]
+    assert kinds.count("digest") >= 40 and kinds.count("time") >= 20
+    assert not [row for row in rows if row["case"] == "digest" and row["now"] is None]
+
+
 @pytest.mark.parametrize("name", main.CASES)
 def test_case(name, device, tmp_path, monkeypatch, capsys):
     """Every number is finite, no time or size is negative, and each case's own facts hold."""
