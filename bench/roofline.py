@@ -10,7 +10,7 @@ subtractions, multiplications, comparisons (a fused multiply-add is two), and by
   plane and two more signs of 42 each: 152 more.
 * float64 test (kernels/triangle/float64_filter.py): 2 corner triples and 6 vertices of 24 bytes; 63 operations to pose
   three, and at least one plane, 18, and three signs of 16 each, in float64.
-* exact test: the same again, and 244 for at least one sign in double words (kernels/arithmetic/double_word.py).
+* exact test: the same again, and 244 for at least one sign in double words (kernels/exact/double_word.py).
 * an object pair: a relative pose of 200 bytes, written and read; a hit: 12 bytes.
 """
 

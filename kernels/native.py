@@ -46,5 +46,5 @@ def body(file: str, name: str) -> str:
 @cache
 def constant(name: str) -> int:
     """Return an integer of sizes.h."""
-    (value,) = re.findall(rf"^constexpr int {name} = (\d+);$", read("sizes.h"), re.M)
+    (value,) = re.findall(rf"^constexpr int {name} = (\d+);$", read("base/sizes.h"), re.M)
     return int(value)

@@ -10,6 +10,11 @@ ROOT = Path(__file__).resolve().parents[1]
 CORE = ["checks", "model", "state", "query", "scene", "lod", "simulate"]
 MAY_IMPORT = {name: set(CORE[:place]) for place, name in enumerate(CORE)}
 MAY_IMPORT |= {"interop": set(CORE), "jobs": set(CORE), "app": {*CORE, "interop", "jobs"}}
+# A group of kernels may import itself, those before it, and what loads native code.
+KERNEL_GROUPS = (
+    *("base", "exact", "triangle", "search", "intersect", "update", "build", "distance", "contacts", "motion"),
+    *("inside", "lod", "bodies", "robot", "io"),
+)
 CORE_DEPENDENCIES = {"warp", "numpy", "trimesh", "warp_abtree"}
 # What users, benchmarks among them, may import beside public names.
 OPEN = {"checks", "testing"}
@@ -108,12 +113,11 @@ def private_faults(tree):
     return faults
 
 
-def import_edges(path):
-    """Return the modules of warp_abtree that a module imports when it is itself imported."""
-    top = ast.Module([node for node in parse(path).body if isinstance(node, ast.Import | ast.ImportFrom)], [])
+def import_edges(path, tree=None):
+    """Return the modules of warp_abtree that a module imports, inside functions too."""
     return {
         found
-        for module, name, _ in imports(top, package_of(path))
+        for module, name, _ in imports(tree or parse(path), package_of(path))
         if module.split(".")[0] == "warp_abtree"
         for found in [f"{module}.{name}", module]
     }
@@ -174,6 +178,23 @@ def kernel_import_faults(tree):
         root = module.split(".")[0]
         if not inside and root not in {"warp", "numpy"} and root not in sys.stdlib_module_names:
             faults.append(f"line {line}: imports {module}")
+    return faults
+
+
+def group_of(path):
+    """Return the group of a kernel file, None for what stands beside the groups."""
+    parts = path.relative_to(ROOT / "kernels").parts
+    return parts[0] if len(parts) > 1 else None
+
+
+def group_faults(tree, group):
+    """List imports of a kernel file from groups above its own."""
+    place = KERNEL_GROUPS.index(group) if group else -1
+    faults = []
+    for module, name, line in imports(tree, "warp_abtree.kernels"):
+        found = [*module.split("."), name][2:3] if module.startswith("warp_abtree.kernels") else []
+        if {*found} & {*KERNEL_GROUPS[place + 1 :]}:
+            faults.append(f"line {line}: {group} imports {found[0]}")
     return faults
 
 

@@ -9,6 +9,7 @@ from layout_rules import (
     CORE_DEPENDENCIES,
     FILES,
     FOLDER_FILES,
+    KERNEL_GROUPS,
     KERNELS,
     MAY_IMPORT,
     NATIVE,
@@ -22,6 +23,8 @@ from layout_rules import (
     direction_faults,
     documented,
     find_cycle,
+    group_faults,
+    group_of,
     hidden_import_faults,
     import_edges,
     imports,
@@ -90,6 +93,19 @@ def test_kernels(path):
     assert not kernel_faults(tree)
     assert not struct_faults(tree, text)
     assert not snippet_faults(tree)
+
+
+@pytest.mark.parametrize("path", KERNELS, ids=shown)
+def test_kernel_groups_import_those_below(path):
+    assert not group_faults(parse(path), group_of(path))
+
+
+def test_one_subject_has_one_word():
+    groups = {path.name for path in (ROOT / "kernels").iterdir() if path.is_dir()} - {"native", "__pycache__"}
+    assert groups == {*KERNEL_GROUPS}
+    assert {path.parent.name for path in NATIVE} <= groups
+    folders = {path.name for path in (ROOT / "tests").iterdir() if path.is_dir() and path.name != "__pycache__"}
+    assert folders <= groups | {*MAY_IMPORT, "bench", "helpers", "oracles"}
 
 
 @pytest.mark.parametrize("path", FILES, ids=shown)
@@ -212,7 +228,9 @@ def test_rule_of_kernels_catches(source):
 @pytest.mark.parametrize("source", ["from .pose import x", "from warp_abtree.model.mesh import x", "import trimesh"])
 def test_rule_of_kernel_imports_catches(source):
     assert kernel_import_faults(parse(source))
-    assert not kernel_import_faults(parse("import warp as wp\nfrom warp_abtree.kernels.poses import x\nimport math"))
+    assert not kernel_import_faults(
+        parse("import warp as wp\nfrom warp_abtree.kernels.base.poses import x\nimport math")
+    )
 
 
 @pytest.mark.parametrize(
@@ -253,3 +271,22 @@ def test_rule_of_native_code_catches():
 def test_rule_of_names_catches(source):
     assert banned_faults(parse(source))
     assert not banned_faults(parse("rungs_of_the_sea = strung = 1".replace("rungs_of_the_sea", "sprung")))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from warp_abtree.kernels.intersect.face_pairs import Hits",
+        "from warp_abtree.kernels.distance import frame",
+        "from warp_abtree.kernels import contacts",
+        "def f():\n    from warp_abtree.kernels.io.results import pack_pair_kernel",
+    ],
+)
+def test_rule_of_kernel_groups_catches(source):
+    assert group_faults(parse(source), "search") and not group_faults(parse(source), "io")
+
+
+def test_rule_of_cycles_sees_imports_inside_functions():
+    path = ROOT / "warp_abtree" / "model" / "inside.py"
+    source = "def f():\n    from warp_abtree.model import tree"
+    assert "warp_abtree.model.tree" in import_edges(path, parse(source))

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.regime import Regime, change_regime, current_regime, restore_regime
-from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
+from warp_abtree.kernels.exact.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
 from warp_abtree.kernels.motion.face_pair import CLEAR, UNDECIDED, Contact
 from warp_abtree.kernels.motion.linear import advance_corners_kernel
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, float32_filter_triangles

@@ -7,32 +7,28 @@ lie on one stack in their order, a hit drops what comes after it, and the search
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arithmetic.predicates import EXACT
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.contact.contact import load_corners
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.generation import STALE
+from warp_abtree.kernels.base.lanes import warp_lane, warp_min_item, warp_size, warp_sync
+from warp_abtree.kernels.base.poses import PairPose, pose_point
 from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame
-from warp_abtree.kernels.distance.node_pair import DROPPED, FACES, NODES, bound_children
+from warp_abtree.kernels.distance.node_pair import bound_children
 from warp_abtree.kernels.distance.report import Distances, write_nearest
-from warp_abtree.kernels.distance.search import (
-    nearest_stack,
-    read_bound,
-    warp_min_item,
-    write_bound,
-)
-from warp_abtree.kernels.generation import STALE
-from warp_abtree.kernels.poses import PairPose, pose_point
-from warp_abtree.kernels.slabs.mean_slabs import Slabs
-from warp_abtree.kernels.traversal.dual_tree import DEPTH_FIRST_ROOM
-from warp_abtree.kernels.traversal.face_pairs import Hits, test_faces
-from warp_abtree.kernels.traversal.node_pair import first_item, four_items, item_first, item_second
-from warp_abtree.kernels.traversal.warp_stack import read_item, warp_lane, warp_size, warp_sync, write_item
+from warp_abtree.kernels.exact.predicates import EXACT
+from warp_abtree.kernels.intersect.face_pairs import Hits, test_faces
+from warp_abtree.kernels.search.item import DROPPED, FACES, NODES, first_item, four_items, item_first, item_second
+from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
+from warp_abtree.kernels.search.mean_slabs import Slabs
+from warp_abtree.kernels.search.nearest_stack import nearest_stack, read_bound, write_bound
+from warp_abtree.kernels.search.warp_stack import read_item, write_item
+from warp_abtree.kernels.triangle.corners import load_corners
 from warp_abtree.kernels.triangle.segment import intersect_faces
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
 
-@wp.func_native(native.body("nearest_stack.cuh", "push_in_order"))
+@wp.func_native(native.body("search/nearest_stack.cuh", "push_in_order"))
 def push_in_order(items: wp.uint64, end: wp.int32, kinds: wp.vec4i, children: four_items) -> wp.int32:
     """Append what is not dropped to the stack, the first child of the first lane last; return the new end."""
 

@@ -22,14 +22,11 @@ D is small: `stretch` and `slack_of`.
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.distance.triangle_pair import (
-    PAIR_ROUNDING,
-    scale_triangles,
-    triangle_distance,
-)
-from warp_abtree.kernels.generation import STALE
-from warp_abtree.kernels.poses import (
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.boxes import ROUNDING_DOWN, ROUNDING_UP
+from warp_abtree.kernels.base.generation import STALE
+from warp_abtree.kernels.base.nodes import load_node
+from warp_abtree.kernels.base.poses import (
     ROUNDING_32,
     ROUNDING_64,
     UNIT_32,
@@ -38,12 +35,12 @@ from warp_abtree.kernels.poses import (
     reach_box,
     sum_products,
 )
-from warp_abtree.kernels.slabs.mean_slabs import Slabs, count_uses
-from warp_abtree.kernels.traversal.face_pairs import load_face_pair
-from warp_abtree.kernels.traversal.load_balance import NO_UNIT, Work
-from warp_abtree.kernels.traversal.node_pair import pack_item
-from warp_abtree.kernels.traversal.nodes import load_node
+from warp_abtree.kernels.search.item import pack_item
+from warp_abtree.kernels.search.load_balance import NO_UNIT, Work
+from warp_abtree.kernels.search.mean_slabs import Slabs, count_uses
+from warp_abtree.kernels.triangle.corners import load_triangles
 from warp_abtree.kernels.triangle.distance import DISTANCE_MAX, EXPONENT_BITS, POSE_ROUNDING, largest, skew_of
+from warp_abtree.kernels.triangle.triangle_pair import PAIR_ROUNDING, triangle_distance
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -53,8 +50,6 @@ NO_FACES = wp.constant(wp.int64(2**63 - 1))
 BOUND_ROUNDING = wp.constant(wp.float64(2.0**-19))
 # Distances over so many times a `pair_slack`, which is 2^-44 S, are not small.
 SMALL_DISTANCE = wp.constant(wp.float64(2.0**25))
-ROUNDING_UP = wp.constant(wp.float32(1.0 + 2.0**-20))
-ROUNDING_DOWN = wp.constant(wp.float32(1.0 - 2.0**-20))
 # Pairs, or depth of both trees, from which on slabs make a search shorter; else it takes as many steps, longer ones.
 PAIRS_LEAST, DEPTH_LEAST = wp.constant(24), wp.constant(36)
 SCALE_MAX = wp.constant(wp.float64(2.0**100))
@@ -191,15 +186,6 @@ def spare_of(tolerances: Tolerances, frame: Frame):
         wp.float32(width * frame.scale64) * ROUNDING_UP,
         wp.float32(part) * ROUNDING_UP,
     )
-
-
-@wp.func
-def load_triangles(models: ModelPool, states: StatePool, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
-    """Return the corners of a face of A and of one of B, in A's frame."""
-    a = states.face_corner[pose.corner_a + face_a]
-    b = states.face_corner[pose.corner_b + face_b]
-    a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
-    return scale_triangles(a0, a1, a2, b0, b1, b2)
 
 
 @wp.func

@@ -7,26 +7,25 @@ squares of twice the distance, scaled (`frame.Frame`). Where there are slabs, th
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import StatePool
+from warp_abtree.kernels.base.arrays import StatePool
+from warp_abtree.kernels.base.boxes import PosedBox, pose_box
+from warp_abtree.kernels.base.nodes import Node, load_constant_node
+from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.distance.frame import Frame
 from warp_abtree.kernels.distance.slab_bound import bound_child_slabs, square_gap
-from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.slabs.mean_slabs import Slabs
-from warp_abtree.kernels.traversal.boxes import PosedBox, pose_box
-from warp_abtree.kernels.traversal.node_pair import (
+from warp_abtree.kernels.search.item import (
+    DROPPED,
+    FACES,
     INDEX_MASK,
-    children_of,
+    NODES,
     four_items,
     item_first,
+    item_of,
     item_second,
-    pack_item,
 )
-from warp_abtree.kernels.traversal.nodes import Node, load_constant_node
+from warp_abtree.kernels.search.mean_slabs import Slabs
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
-# What a pair of children is: dropped, to go on with, or two faces.
-DROPPED, NODES, FACES = wp.constant(0), wp.constant(1), wp.constant(2)
 
 
 @wp.func
@@ -54,19 +53,6 @@ def limit_of(frame: Frame, spare: wp.vec4, upper: wp.float32, held: wp.bool):
         return wp.float32(-1.0)
     x = 2.0 * (cut * frame.grow + frame.least)
     return x * x
-
-
-@wp.func
-def item_of(a: Node, b: Node):
-    """Return the item that two nodes leave: their faces, where both are leaves.
-
-    Else the next step goes down both, or only the one that is more than twice as large as the other, or no leaf.
-    """
-    leaves = (a.face | b.face) >= 0
-    span_a, span_b = wp.cast(a.face, wp.float32), wp.cast(b.face, wp.float32)
-    x = wp.where(leaves, a.face, wp.where(span_a + span_a <= span_b, children_of(a.skip), a.skip))
-    y = wp.where(leaves, b.face, wp.where(span_b + span_b <= span_a, children_of(b.skip), b.skip))
-    return pack_item(x, y)
 
 
 @wp.func

@@ -10,13 +10,13 @@ Vertices of an original may lie beyond the boxes that a `Frame` was made of, tho
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.base.nodes import load_node
+from warp_abtree.kernels.base.poses import PairPose, pose_point
 from warp_abtree.kernels.distance.frame import make_frame
 from warp_abtree.kernels.distance.report import LEAST_DISTANCE, Distances, write_nearest
-from warp_abtree.kernels.distance.triangle_pair import feature_weights, nearest_features, scale_triangles
-from warp_abtree.kernels.poses import PairPose, pose_point
-from warp_abtree.kernels.traversal.nodes import load_node
 from warp_abtree.kernels.triangle.distance import corners_type
+from warp_abtree.kernels.triangle.triangle_pair import feature_weights, nearest_features, scale_triangles
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

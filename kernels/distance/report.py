@@ -2,15 +2,15 @@
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool, load_vertex
-from warp_abtree.kernels.contact.summary import no_vector
-from warp_abtree.kernels.distance.frame import NO_FACES, Found, Tolerances, cut_of, load_triangles, slack_of
-from warp_abtree.kernels.distance.triangle_pair import feature_weights, nearest_features
-from warp_abtree.kernels.generation import STALE
-from warp_abtree.kernels.poses import PairPose, pose_point
-from warp_abtree.kernels.traversal.face_pairs import Hits
-from warp_abtree.kernels.traversal.node_pair import item_first, item_second
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool, load_vertex, no_vector
+from warp_abtree.kernels.base.generation import STALE
+from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.distance.frame import NO_FACES, Found, Tolerances, cut_of, slack_of
+from warp_abtree.kernels.intersect.face_pairs import Hits
+from warp_abtree.kernels.search.item import item_first, item_second
+from warp_abtree.kernels.triangle.corners import load_triangles
 from warp_abtree.kernels.triangle.distance import DISTANCE_MAX
+from warp_abtree.kernels.triangle.triangle_pair import feature_weights, nearest_features
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -5,57 +5,59 @@ far; never where a pair of faces below may be as near, so that the nearest dista
 lowest pair, are found whatever the order. With a tolerance other faces are found in another order, within it.
 """
 
-import functools
-
 import warp as wp
 
-from warp_abtree.kernels import native
-from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.distance.faces32 import bound_faces, load_points
-from warp_abtree.kernels.distance.frame import (
-    NO_FACES,
-    ROUNDING_DOWN,
-    Found,
-    Frame,
-    Tolerances,
-    load_triangles,
-    scaled_up,
-    spare_of,
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.boxes import ROUNDING_DOWN
+from warp_abtree.kernels.base.counters import add_warp_sum
+from warp_abtree.kernels.base.lanes import (
+    warp_any,
+    warp_lane,
+    warp_min,
+    warp_min32,
+    warp_min_item,
+    warp_size,
+    warp_sync,
 )
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.distance.frame import NO_FACES, Found, Frame, Tolerances, scaled_up, spare_of
 from warp_abtree.kernels.distance.node_pair import bound_children, limit_of
-from warp_abtree.kernels.distance.triangle_pair import triangle_distance
 from warp_abtree.kernels.distance.warp_found import (
     SLABS_PAY,
     UPPER,
-    faces_code,
     load_distance,
     load_faces,
     load_upper,
     lower_upper,
     offer_nearest,
 )
-from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.slabs.mean_slabs import Slabs, has_slabs
-from warp_abtree.kernels.traversal.dual_tree import DEPTH_FIRST_ROOM, STACK_MASK, donate_items, receive_items
-from warp_abtree.kernels.traversal.face_pairs import Hits
-from warp_abtree.kernels.traversal.load_balance import (
+from warp_abtree.kernels.intersect.face_pairs import Hits
+from warp_abtree.kernels.search.item import first_item, item_first, item_second
+from warp_abtree.kernels.search.load_balance import (
+    DEPTH_FIRST_ROOM,
+    STACK_MASK,
     Work,
     await_donation,
     count_idle,
+    donate_items,
     load_tickets,
+    receive_items,
     take_unit,
 )
-from warp_abtree.kernels.traversal.node_pair import first_item, four_items, item_first, item_second
-from warp_abtree.kernels.traversal.warp_stack import (
-    STACK_LENGTH,
-    add_warp_sum,
-    read_item,
-    warp_any,
-    warp_lane,
-    warp_size,
-    warp_sync,
-    write_item,
+from warp_abtree.kernels.search.mean_slabs import Slabs, has_slabs
+from warp_abtree.kernels.search.nearest_stack import (
+    OPEN_LENGTH,
+    OPEN_START,
+    nearest_stack,
+    push_nearest,
+    push_open,
+    read_bound,
+    write_bound,
 )
+from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item, write_item
+from warp_abtree.kernels.triangle.corners import load_triangles
+from warp_abtree.kernels.triangle.distance_bounds import bound_faces, load_points
+from warp_abtree.kernels.triangle.triangle_pair import triangle_distance
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
@@ -63,63 +65,11 @@ wp.set_module_options(MODULE_OPTIONS)
 # Fewer items than the traversal gives away: far more lies below one.
 DONATION_LEAST = wp.constant(4)
 
-OPEN_START = native.constant("NEAREST_OPEN_START")
-OPEN_LENGTH = native.constant("NEAREST_OPEN_LENGTH")
 
 # Face pairs from which on it is known whether slabs pay, and items for three of them that they leave where they do.
 MANY_FACES, FEW_FACES = wp.constant(1024), wp.constant(2)
 # Items at once, at most, before any faces are known: more would be looked at in vain.
 DIVE_ITEMS = wp.constant(8)
-
-stack_code = functools.partial(native.body, "nearest_stack.cuh")
-
-
-@wp.func_native(stack_code("nearest_stack"))
-def nearest_stack() -> wp.uint64:
-    """Return where this warp's lists lie, an address in shared memory on CUDA, and behind them a bound for each entry.
-
-    Node pairs, face pairs for float32, and face pairs for float64.
-    """
-
-
-@wp.func_native(stack_code("read_bound"))
-def read_bound(items: wp.uint64, i: wp.int32) -> wp.float32: ...
-
-
-@wp.func_native(stack_code("write_bound"))
-def write_bound(items: wp.uint64, i: wp.int32, bound: wp.float32): ...
-
-
-@wp.func_native(stack_code("fold_bound"))
-def fold_bound(items: wp.uint64, i: wp.int32, bound: wp.float32, greatest: bool):
-    """Raise a bound, or lower it, to one that is not negative, whatever other lanes do."""
-
-
-@wp.func_native(stack_code("push_nearest"))
-def push_nearest(
-    items: wp.uint64, end: wp.int32, leaf_end: wp.int32, kinds: wp.vec4i, children: four_items, bounds: wp.vec4
-) -> wp.int64:
-    """Append node pairs to the stack, the nearest of each lane last, and face pairs to theirs.
-
-    Returns both ends as an item, that of the face pairs first.
-    """
-
-
-@wp.func_native(stack_code("push_open"))
-def push_open(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, bound: wp.float32) -> wp.int32:
-    """Append the face pairs whose flag is set to those for float64; return the new end."""
-
-
-@wp.func_native(faces_code("warp_min"))
-def warp_min(x: wp.float64) -> wp.float64: ...
-
-
-@wp.func_native(faces_code("warp_min32"))
-def warp_min32(x: wp.float32) -> wp.float32: ...
-
-
-@wp.func_native(faces_code("warp_min_item"))
-def warp_min_item(x: wp.int64) -> wp.int64: ...
 
 
 @wp.struct

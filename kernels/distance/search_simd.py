@@ -9,27 +9,26 @@ between those that may be the nearest. It is the same answer that warps give on 
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.generation import STALE
+from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.distance.frame import (
     NO_FACES,
     Found,
     Frame,
     Nearest,
     Tolerances,
-    load_triangles,
     scaled_up,
     spare_of,
     start_pair,
 )
 from warp_abtree.kernels.distance.report import Distances, report_pair
-from warp_abtree.kernels.distance.triangle_pair import triangle_distance
-from warp_abtree.kernels.generation import STALE
-from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.slabs.mean_slabs import Slabs, count_uses, has_slabs, make_due
-from warp_abtree.kernels.traversal.face_pairs import Hits
-from warp_abtree.kernels.traversal.load_balance import take_unit
-from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
-from warp_abtree.kernels.traversal.simd import take_thread
+from warp_abtree.kernels.intersect.face_pairs import Hits
+from warp_abtree.kernels.search.item import first_item, item_first, item_second
+from warp_abtree.kernels.search.load_balance import take_thread, take_unit
+from warp_abtree.kernels.search.mean_slabs import Slabs, count_uses, has_slabs, make_due
+from warp_abtree.kernels.triangle.corners import load_triangles
+from warp_abtree.kernels.triangle.triangle_pair import triangle_distance
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
@@ -37,7 +36,7 @@ wp.set_module_options(MODULE_OPTIONS)
 NEAREST_WORDS = native.constant("NEAREST_WORDS")
 
 
-@wp.func_native(native.body("nearest/lists.h", "open_search"))
+@wp.func_native(native.body("distance/lists.h", "open_search"))
 def open_search(
     upper: wp.float32,
     found: bool,
@@ -56,7 +55,7 @@ def open_search(
     """
 
 
-@wp.func_native(native.body("nearest/search.h", "search_nearest"))
+@wp.func_native(native.body("distance/search.h", "search_nearest"))
 def search_nearest(
     models: ModelPool,
     states: StatePool,
@@ -74,7 +73,7 @@ def search_nearest(
     """
 
 
-@wp.func_native(native.body("nearest/lists.h", "take_nearest"))
+@wp.func_native(native.body("distance/lists.h", "take_nearest"))
 def take_nearest(upper: wp.float32, thread: wp.int32, memory: wp.array2d(dtype=wp.float32)) -> wp.int64:
     """Return the faces that wait and seem nearest, -1 if none may be the nearest.
 

@@ -8,12 +8,12 @@ size, so that such bounds err by the square of the size, where boxes err by the 
 
 import warp as wp
 
+from warp_abtree.kernels.base.boxes import fuse32, map_point
+from warp_abtree.kernels.base.nodes import Node, load_constant
+from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.distance.frame import Frame
-from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.slabs.mean_slabs import Slabs
-from warp_abtree.kernels.slabs.overlap import add_product, take_multiple
-from warp_abtree.kernels.traversal.boxes import fuse32, map_point
-from warp_abtree.kernels.traversal.nodes import Node, load_constant
+from warp_abtree.kernels.search.mean_slabs import Slabs
+from warp_abtree.kernels.search.slab_overlap import add_product, take_multiple
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

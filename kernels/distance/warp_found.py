@@ -8,7 +8,7 @@ from warp_abtree.kernels import native
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-faces_code = functools.partial(native.body, "nearest_faces.cuh")
+faces_code = functools.partial(native.body, "distance/warp_found.cuh")
 
 
 # Components of `Found.upper`.

@@ -2,9 +2,8 @@
 
 import warp as wp
 
-from warp_abtree.kernels.lod.ladder import add_lanes
-from warp_abtree.kernels.results import count_apart
-from warp_abtree.kernels.traversal.face_pairs import Hits
+from warp_abtree.kernels.base.counters import add_lanes
+from warp_abtree.kernels.intersect.face_pairs import Hits, count_apart
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -2,8 +2,6 @@
 
 import warp as wp
 
-from warp_abtree.kernels import native
-
 
 @wp.struct
 class LodPool:
@@ -28,8 +26,3 @@ class LodPool:
 
 WARP = 32
 """Threads of a launch that adds lanes are a multiple of it."""
-
-
-@wp.func_native(native.body("warp_vote.cuh", "add_lanes"))
-def add_lanes(totals: wp.array(dtype=wp.int64), i: wp.int32, x: wp.int64):
-    """Add to a total what each lane of a warp brings; all lanes call it together, with the same i."""

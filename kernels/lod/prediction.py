@@ -7,7 +7,8 @@ every object at its level whatever the view. Sums are of whole numbers, so that 
 
 import warp as wp
 
-from warp_abtree.kernels.lod.ladder import LodPool, add_lanes
+from warp_abtree.kernels.base.counters import add_lanes
+from warp_abtree.kernels.lod.ladder import LodPool
 from warp_abtree.kernels.lod.tolerance import loosening
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

@@ -15,8 +15,12 @@ root's is covered by `EARLIER`, 2^-40 of the step, and that of the time after it
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, StatePool, load_vertex
-from warp_abtree.kernels.distance.triangle_pair import (
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool, load_vertex
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.motion.path import Motion, across, place_motion, reverse_moment
+from warp_abtree.kernels.triangle.distance import corners_type
+from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles
+from warp_abtree.kernels.triangle.triangle_pair import (
     CORNERS_OF_A,
     CORNERS_OF_B,
     between_features,
@@ -24,10 +28,6 @@ from warp_abtree.kernels.distance.triangle_pair import (
     nearest_features,
     scale_triangles,
 )
-from warp_abtree.kernels.motion.path import Motion, across, place_motion, reverse_moment
-from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.triangle.distance import corners_type
-from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

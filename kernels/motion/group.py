@@ -10,10 +10,12 @@ from typing import Any
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.distance.node_pair import FACES, NODES
-from warp_abtree.kernels.distance.search import DEPTH_FIRST_ROOM, warp_min
-from warp_abtree.kernels.generation import STALE
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.counters import add_warp_sum
+from warp_abtree.kernels.base.generation import STALE
+from warp_abtree.kernels.base.lanes import warp_any, warp_lane, warp_min, warp_size, warp_sync
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import (
     CLEAR,
     GOES_ON,
@@ -27,18 +29,9 @@ from warp_abtree.kernels.motion.face_pair import (
 from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, slide_floor, slides_past
 from warp_abtree.kernels.motion.linear import EndPoses
 from warp_abtree.kernels.motion.start import OPEN, Contacts
-from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal.face_pairs import Hits
-from warp_abtree.kernels.traversal.node_pair import first_item, four_items, item_first, item_second
-from warp_abtree.kernels.traversal.warp_stack import (
-    STACK_LENGTH,
-    add_warp_sum,
-    read_item,
-    warp_any,
-    warp_lane,
-    warp_size,
-    warp_sync,
-)
+from warp_abtree.kernels.search.item import FACES, NODES, first_item, four_items, item_first, item_second
+from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
+from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
@@ -49,7 +42,7 @@ GROUPED_LEAST = wp.constant(8192)
 MOTION_STACK_LENGTH = native.constant("MOTION_STACK_LENGTH")
 GOING_START, TIMES_START = native.constant("MOTION_GOING_START"), native.constant("MOTION_TIMES_START")
 
-stack_code = partial(native.body, "motion_stack.cuh")
+stack_code = partial(native.body, "search/motion_stack.cuh")
 
 
 @wp.func_native(stack_code("motion_stack"))

@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.poses import NO_NODE, PairPose
 from warp_abtree.kernels.motion.face_pair import Progress, advance_pair
 from warp_abtree.kernels.motion.linear import (
     EndPoses,
@@ -16,8 +17,7 @@ from warp_abtree.kernels.motion.node_pair import advance_children, box_motion
 from warp_abtree.kernels.motion.path import Motion, Paths, bound_motion, pair_skew, place_motion, start_motion
 from warp_abtree.kernels.motion.profile import profiles_apart
 from warp_abtree.kernels.motion.screw import is_screw, parent_of, slides_apart
-from warp_abtree.kernels.poses import NO_NODE, PairPose
-from warp_abtree.kernels.traversal.node_pair import item_first, item_second
+from warp_abtree.kernels.search.item import item_first, item_second
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

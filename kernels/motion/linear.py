@@ -9,7 +9,10 @@ grows at a rate s stays open until g + s h = 0; of faces it is taken for each of
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.boxes import pose_box
+from warp_abtree.kernels.base.nodes import Node, load_constant_node, load_node
+from warp_abtree.kernels.base.poses import ROUNDING_32, PairPose, reach_box
 from warp_abtree.kernels.motion.face_pair import (
     AXIS_COUNT,
     CLEAR,
@@ -27,10 +30,7 @@ from warp_abtree.kernels.motion.face_pair import (
 from warp_abtree.kernels.motion.node_pair import go_on, later, longest_step
 from warp_abtree.kernels.motion.path import BEND_LEAST, SCALE_MAX
 from warp_abtree.kernels.motion.stalled import carry_on, plain_row, posed_row, words_type
-from warp_abtree.kernels.poses import ROUNDING_32, PairPose, reach_box
-from warp_abtree.kernels.traversal.boxes import pose_box
-from warp_abtree.kernels.traversal.node_pair import INDEX_MASK, four_items, item_first, item_second
-from warp_abtree.kernels.traversal.nodes import Node, load_constant_node, load_node
+from warp_abtree.kernels.search.item import INDEX_MASK, four_items, item_first, item_second
 from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, corners_type, largest
 from warp_abtree.kernels.triangle.float64_filter import float64_filter_triangles
 

@@ -13,13 +13,22 @@ numbers that are not negative, so it errs by 8 u of itself, and `LATER` takes of
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import StatePool
-from warp_abtree.kernels.distance.node_pair import DROPPED, FACES, NODES, item_of
+from warp_abtree.kernels.base.arrays import StatePool
+from warp_abtree.kernels.base.boxes import PosedBox, pose_box
+from warp_abtree.kernels.base.nodes import Node, load_constant_node
+from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.motion.path import Moment, Motion
-from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal.boxes import PosedBox, pose_box
-from warp_abtree.kernels.traversal.node_pair import INDEX_MASK, four_items, item_first, item_second, pack_item
-from warp_abtree.kernels.traversal.nodes import Node, load_constant_node
+from warp_abtree.kernels.search.item import (
+    DROPPED,
+    FACES,
+    INDEX_MASK,
+    NODES,
+    four_items,
+    item_first,
+    item_of,
+    item_second,
+    pack_item,
+)
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

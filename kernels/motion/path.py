@@ -28,10 +28,10 @@ in the model frames, B's point b lies in A's frame at R b + x, where it moves wi
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.nodes import load_node
+from warp_abtree.kernels.base.poses import ROUNDING_32, PairPose, measure_rotation, reach_box, sum_products
 from warp_abtree.kernels.motion.turn import shortest_turn, turn_matrix
-from warp_abtree.kernels.poses import ROUNDING_32, PairPose, measure_rotation, reach_box, sum_products
-from warp_abtree.kernels.traversal.nodes import load_node
 from warp_abtree.kernels.triangle.distance import EXPONENT_BITS, POSE_ROUNDING, largest
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

@@ -26,14 +26,14 @@ import math
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.distance.search import fold_bound, read_bound, write_bound
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.lanes import warp_any, warp_lane, warp_size, warp_sync
+from warp_abtree.kernels.base.nodes import load_node
+from warp_abtree.kernels.base.poses import NO_NODE, PairPose
 from warp_abtree.kernels.motion.face_pair import load_corners
 from warp_abtree.kernels.motion.path import Motion
 from warp_abtree.kernels.motion.screw import ASIN_SLOPE, ScrewFrame, reach_sides, screw_frame
-from warp_abtree.kernels.poses import NO_NODE, PairPose
-from warp_abtree.kernels.traversal.nodes import load_node
-from warp_abtree.kernels.traversal.warp_stack import warp_any, warp_lane, warp_size, warp_sync
+from warp_abtree.kernels.search.nearest_stack import fold_bound, read_bound, write_bound
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

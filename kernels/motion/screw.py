@@ -20,13 +20,13 @@ import math
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.nodes import load_constant_node
+from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.motion.path import Motion
 from warp_abtree.kernels.motion.turn import angle_of
-from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.slabs.overlap import load_slab
-from warp_abtree.kernels.traversal.node_pair import INDEX_MASK
-from warp_abtree.kernels.traversal.nodes import load_constant_node
+from warp_abtree.kernels.search.item import INDEX_MASK
+from warp_abtree.kernels.search.slab_overlap import load_slab
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -11,28 +11,20 @@ from typing import Any
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.distance.search import nearest_stack, push_nearest, read_bound, write_bound
-from warp_abtree.kernels.generation import STALE
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.generation import STALE
+from warp_abtree.kernels.base.lanes import warp_lane, warp_size, warp_sync
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, TO_THE_END, TOUCHES, Contact, Progress
 from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, proves_clear, slide_floor, slides_past
 from warp_abtree.kernels.motion.linear import EndPoses
 from warp_abtree.kernels.motion.path import Motion
 from warp_abtree.kernels.motion.start import OPEN, Contacts
-from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal.face_pairs import Hits
-from warp_abtree.kernels.traversal.load_balance import take_unit
-from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
-from warp_abtree.kernels.traversal.simd import take_thread
-from warp_abtree.kernels.traversal.warp_stack import (
-    STACK_LENGTH,
-    STRADDLING_START,
-    read_item,
-    warp_lane,
-    warp_size,
-    warp_sync,
-    write_item,
-)
+from warp_abtree.kernels.search.item import first_item, item_first, item_second
+from warp_abtree.kernels.search.load_balance import take_thread, take_unit
+from warp_abtree.kernels.search.nearest_stack import nearest_stack, push_nearest, read_bound, write_bound
+from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, STRADDLING_START, read_item, write_item
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
@@ -41,7 +33,7 @@ wp.set_module_options(MODULE_OPTIONS)
 LIST_WORDS = int(STRADDLING_START) + int(STRADDLING_START) // 2
 
 
-@wp.func_native(native.body("nearest_stack.cuh", "thread_lists"))
+@wp.func_native(native.body("search/nearest_stack.cuh", "thread_lists"))
 def thread_lists(memory: wp.array2d(dtype=wp.int64), thread: wp.int32) -> wp.uint64:
     """Return where the lists of a thread of the CPU lie."""
 

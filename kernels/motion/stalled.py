@@ -16,8 +16,8 @@ times that is undecided.
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arithmetic.double_word import add_double
-from warp_abtree.kernels.arithmetic.expansion import two_product
+from warp_abtree.kernels.exact.double_word import add_double
+from warp_abtree.kernels.exact.expansion import two_product
 from warp_abtree.kernels.motion.face_pair import Contact, separating_direction
 from warp_abtree.kernels.triangle.distance import largest
 

@@ -10,19 +10,18 @@ from typing import Any
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.broad_phase import ROUNDING_64, measure_skew
-from warp_abtree.kernels.distance.node_pair import DROPPED
-from warp_abtree.kernels.generation import STALE, LaunchRecord, is_stale
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.boxes import round_down, round_up
+from warp_abtree.kernels.base.generation import STALE, LaunchRecord, is_stale
+from warp_abtree.kernels.base.nodes import load_node
+from warp_abtree.kernels.base.poses import PairPose, measure_skew
+from warp_abtree.kernels.intersect.broad_phase import ROUNDING_64
+from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, TOUCHES, UNDECIDED
 from warp_abtree.kernels.motion.kinds import advance_nodes, has_way, make_motion
 from warp_abtree.kernels.motion.path import Paths, make_path
 from warp_abtree.kernels.motion.turn import turn_matrix
-from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal.boxes import round_down, round_up
-from warp_abtree.kernels.traversal.face_pairs import Hits
-from warp_abtree.kernels.traversal.node_pair import first_item
-from warp_abtree.kernels.traversal.nodes import load_node
+from warp_abtree.kernels.search.item import DROPPED, first_item
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)

@@ -7,7 +7,7 @@ import math
 
 import warp as wp
 
-from warp_abtree.kernels.poses import unit_quaternion_matrix
+from warp_abtree.kernels.base.poses import unit_quaternion_matrix
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

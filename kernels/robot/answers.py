@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from warp_abtree.kernels.broad_phase import pair_key
+from warp_abtree.kernels.base.arrays import pair_key
 from warp_abtree.kernels.distance.report import Distances, two_points
+from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.robot.link_pairs import Chunk
-from warp_abtree.kernels.traversal.face_pairs import Hits
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

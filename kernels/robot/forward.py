@@ -8,7 +8,7 @@ import math
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ObjectPool
+from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.motion.turn import cross_matrix, sin_cos_quarter
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

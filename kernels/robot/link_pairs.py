@@ -13,8 +13,8 @@ The joints that both parts of a pair hang on move them as one and do not count.
 
 import warp as wp
 
+from warp_abtree.kernels.base.boxes import round_down, round_up
 from warp_abtree.kernels.robot.forward import PRISMATIC, REVOLUTE, Chain, Frames
-from warp_abtree.kernels.traversal.boxes import round_down, round_up
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.arithmetic.predicates import drop_axis, orient2d, orient3d, orient_edges
+from warp_abtree.kernels.exact.predicates import drop_axis, orient2d, orient3d, orient_edges
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

@@ -13,9 +13,9 @@ itself, d |n| by 2 u more. `GAP_ROUNDING` is 128 u. What underflows is under 2^-
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.poses import reach_box, sum_products
-from warp_abtree.kernels.traversal.nodes import load_node
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.nodes import load_node
+from warp_abtree.kernels.base.poses import reach_box, sum_products
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

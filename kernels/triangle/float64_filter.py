@@ -6,7 +6,7 @@ Source: as `intersect_triangles`. `simd.simd_float64_filter` does the same for 8
 
 import warp as wp
 
-from warp_abtree.kernels.arithmetic.predicates import FILTER, UNCERTAIN, filter_rows, orient_edges, sum_sizes64
+from warp_abtree.kernels.exact.predicates import FILTER, UNCERTAIN, filter_rows, orient_edges, sum_sizes64
 from warp_abtree.kernels.triangle.float32_filter import SEPARATED, rotate_corners
 from warp_abtree.kernels.triangle.intersect import intersect_triangles, is_one_sided
 

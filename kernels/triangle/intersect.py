@@ -4,8 +4,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, UNCERTAIN, orient3d, orient_edges
-from warp_abtree.kernels.traversal.warp_stack import lowest_bit
+from warp_abtree.kernels.base.lanes import lowest_bit
+from warp_abtree.kernels.exact.predicates import EXACT, FILTER, UNCERTAIN, orient3d, orient_edges
 from warp_abtree.kernels.triangle.coplanar import intersect_coplanar, intersect_degenerate, widest_axis
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

@@ -8,17 +8,9 @@ on, and the rounding of its coordinates. Nothing here depends on the order in wh
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arithmetic.expansion import expand_area, expand_volume
-from warp_abtree.kernels.arithmetic.predicates import (
-    BOUND_2D,
-    BOUND_3D,
-    EXACT,
-    drop_axis,
-    orient2d,
-    orient3d,
-    plain_sign,
-)
-from warp_abtree.kernels.traversal.warp_stack import lowest_bit
+from warp_abtree.kernels.base.lanes import lowest_bit
+from warp_abtree.kernels.exact.expansion import expand_area, expand_volume
+from warp_abtree.kernels.exact.predicates import BOUND_2D, BOUND_3D, EXACT, drop_axis, orient2d, orient3d, plain_sign
 from warp_abtree.kernels.triangle.coplanar import find_ends, widest_axis
 from warp_abtree.kernels.triangle.intersect import find_alone, is_one_sided
 
@@ -75,12 +67,12 @@ def signed_area(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d):
     return value
 
 
-@wp.func_native(native.body("numbers.cuh", "shares_reciprocal"))
+@wp.func_native(native.body("base/numbers.cuh", "shares_reciprocal"))
 def shares_reciprocal(v: wp.vec3d, s: wp.float64) -> bool:
     """Return whether `multiply_reciprocal` rounds as a division does."""
 
 
-@wp.func_native(native.body("numbers.cuh", "multiply_reciprocal"))
+@wp.func_native(native.body("base/numbers.cuh", "multiply_reciprocal"))
 def multiply_reciprocal(v: wp.vec3d, s: wp.float64) -> wp.vec3d: ...
 
 

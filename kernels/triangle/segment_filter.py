@@ -7,16 +7,9 @@ Each thread of a warp takes its own next of them, so that threads need not wait 
 
 import warp as wp
 
-from warp_abtree.kernels.arithmetic.double_word import BOUND_DOUBLE, double_orient2d, double_orient3d, round_double
-from warp_abtree.kernels.arithmetic.predicates import (
-    BOUND_2D,
-    BOUND_3D,
-    UNCERTAIN,
-    drop_axis,
-    filter_orient3d,
-    plain_sign,
-)
-from warp_abtree.kernels.traversal.warp_stack import lowest_bit
+from warp_abtree.kernels.base.lanes import lowest_bit
+from warp_abtree.kernels.exact.double_word import BOUND_DOUBLE, double_orient2d, double_orient3d, round_double
+from warp_abtree.kernels.exact.predicates import BOUND_2D, BOUND_3D, UNCERTAIN, drop_axis, filter_orient3d, plain_sign
 from warp_abtree.kernels.triangle.intersect import find_alone, is_one_sided, pick_corners, rotate_triangles
 from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR, cross_edge, round_area, round_volume, unit_vector
 

@@ -8,10 +8,11 @@ import functools
 import warp as wp
 
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.traversal.nodes import Node, load_node, store_node
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.lanes import block_sync
+from warp_abtree.kernels.base.nodes import Node, load_node, store_node
 from warp_abtree.kernels.update.refine import refine_face
-from warp_abtree.kernels.update.refit import block_sync, refit_inner, refit_leaf, unite_nodes
+from warp_abtree.kernels.update.refit import refit_inner, refit_leaf, unite_nodes
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 
 THREADS = 1024  # of a block, where there are few states or deep trees
@@ -26,7 +27,7 @@ MARK_WORDS = native.constant("MARK_WORDS")
 MARK_START = wp.constant(native.constant("MARK_START"))
 CHANGED, MARKED = wp.constant(0), wp.constant(1)
 
-marks_code = functools.partial(native.body, "block_marks.cuh")
+marks_code = functools.partial(native.body, "update/block_marks.cuh")
 
 
 @wp.func_native(marks_code("block_marks"))

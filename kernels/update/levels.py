@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ObjectPool
+from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.update.work_lists import note_fault
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
 from warp_abtree.kernels.update.work_lists import UpdateLists, find_update, item_count, list_length
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from warp_abtree.kernels import native
-from warp_abtree.kernels.arrays import ModelPool, StatePool, load_vertex
-from warp_abtree.kernels.traversal.boxes import round_down_vec, round_up_vec
-from warp_abtree.kernels.traversal.nodes import Node, empty_node, load_node, store_node
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool, load_vertex
+from warp_abtree.kernels.base.boxes import round_down_vec, round_up_vec
+from warp_abtree.kernels.base.lanes import block_sync
+from warp_abtree.kernels.base.nodes import Node, empty_node, load_node, store_node
 from warp_abtree.kernels.update.work_lists import UpdateLists
 
 TOP_THREADS = 512  # of the block that refits the levels next to the root
@@ -102,10 +102,6 @@ def refit_level(
 def refit_level_kernel(step: wp.int32, level: wp.int32, models: ModelPool, plan: UpdateLists, states_inout: StatePool):
     """Refit what an update asks for on one level."""
     refit_level(wp.tid(), step, level, models, plan, states_inout)
-
-
-@wp.func_native(native.body("block_marks.cuh", "block_sync"))
-def block_sync(): ...
 
 
 # A module of its own: its blocks are larger, and a module is compiled for every size of blocks that it is launched in.

@@ -6,7 +6,7 @@ are none left.
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import LEVEL_MAX, ModelPool, StatePool
+from warp_abtree.kernels.base.arrays import LEVEL_MAX, ModelPool, StatePool
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

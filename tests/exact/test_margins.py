@@ -15,7 +15,7 @@ from oracles.signs import true_signs
 from oracles.triangle import into_frame_of_a, quaternion_matrix, triangles_intersect
 
 import warp_abtree as ab
-from warp_abtree.kernels.arithmetic.predicates import UNCERTAIN
+from warp_abtree.kernels.exact.predicates import UNCERTAIN
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, side_of_plane
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

@@ -13,15 +13,15 @@ from conftest import slow
 
 from warp_abtree import kernels
 from warp_abtree.kernels import native
-from warp_abtree.kernels.arithmetic.double_word import BOUND_DOUBLE
-from warp_abtree.kernels.arithmetic.expansion import two_sum
-from warp_abtree.kernels.arithmetic.predicates import BOUND_2D, BOUND_3D, EXACT, FLOAT32, UNCERTAIN
-from warp_abtree.kernels.contact.contact import SHORTEST_NORMAL
-from warp_abtree.kernels.contact.travel import LEAST_SINE_SQUARED
-from warp_abtree.kernels.gap.separation import CLOSEST, LEAST_SEPARATION
-from warp_abtree.kernels.poses import COORDINATE_MIN
-from warp_abtree.kernels.traversal import dual_tree, simd, uncertain_pairs
-from warp_abtree.kernels.traversal.face_pairs import WITHIN
+from warp_abtree.kernels.base.poses import COORDINATE_MIN
+from warp_abtree.kernels.contacts.contact import SHORTEST_NORMAL
+from warp_abtree.kernels.contacts.separation import CLOSEST, LEAST_SEPARATION
+from warp_abtree.kernels.contacts.travel import LEAST_SINE_SQUARED
+from warp_abtree.kernels.exact.double_word import BOUND_DOUBLE
+from warp_abtree.kernels.exact.expansion import two_sum
+from warp_abtree.kernels.exact.predicates import BOUND_2D, BOUND_3D, EXACT, FLOAT32, UNCERTAIN
+from warp_abtree.kernels.intersect import dual_tree, simd, uncertain_pairs
+from warp_abtree.kernels.intersect.face_pairs import WITHIN
 from warp_abtree.kernels.triangle.segment import RELATIVE_ERROR
 
 DOUBLES = {
@@ -119,7 +119,7 @@ def test_every_function_has_one_stub_of_its_name_and_parameters():
 
 
 def test_constants_are_those_of_python():
-    text = native.read("sizes.h")
+    text = native.read("base/sizes.h")
     values = {name: float.fromhex(value) for name, value in re.findall(r"constexpr double (\w+) = (\S+);", text)}
     assert values == {name: float(value) for name, value in DOUBLES.items()}
     assert native.constant("UNCERTAIN") == int(UNCERTAIN)
@@ -151,7 +151,7 @@ def test_files_compile_together_and_alone(tmp_path, files):
 
 def test_static_assertions_hold_sizes_together(tmp_path):
     """A list too short for what a warp pushes is refused, so the compiler reads the file at all."""
-    text = (native.FOLDER / "sizes.h").read_text()
+    text = (native.FOLDER / "base/sizes.h").read_text()
     assert compile_alone(text, tmp_path)
     for name, value in (("STACK_LENGTH", 500), ("LEAF_PAIR_LENGTH", 100), ("SLOT_ITEMS", 16), ("CPU_STACK_LENGTH", 99)):
         changed = re.sub(rf"({name} =) \d+", rf"\1 {value}", text)

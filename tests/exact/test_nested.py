@@ -9,17 +9,17 @@ from helpers.samples import STILL, random_poses, sample, true_faces
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal import descent
-from warp_abtree.kernels.traversal.descent import (
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.intersect import descent
+from warp_abtree.kernels.intersect.descent import (
     CPU_STACK_LENGTH,
     WAITING_LENGTH,
     descend_subtrees,
     open_subtrees,
     slab_memory_words,
 )
-from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
+from warp_abtree.kernels.search.item import first_item, item_first, item_second
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

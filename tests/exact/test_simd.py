@@ -9,14 +9,14 @@ from helpers.questions import GpuQuery, scene_of
 from helpers.samples import STILL, contact_poses, sample
 
 from warp_abtree import testing
-from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
-from warp_abtree.kernels.arrays import ModelPool, StatePool
-from warp_abtree.kernels.poses import PairPose
-from warp_abtree.kernels.traversal import descent, face_pairs
-from warp_abtree.kernels.traversal.descent import CPU_STACK_LENGTH, ITEMS_AT_ONCE, WAITING_LENGTH
-from warp_abtree.kernels.traversal.face_pairs import face_plane_signs, intersect_straddling_faces
-from warp_abtree.kernels.traversal.node_pair import first_item, item_first, item_second
-from warp_abtree.kernels.traversal.simd import simd_float32_filter, simd_float64_filter
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.exact.predicates import EXACT, FILTER, FLOAT32, UNCERTAIN
+from warp_abtree.kernels.intersect import descent, face_pairs
+from warp_abtree.kernels.intersect.descent import CPU_STACK_LENGTH, ITEMS_AT_ONCE, WAITING_LENGTH
+from warp_abtree.kernels.intersect.face_pairs import face_plane_signs, intersect_straddling_faces
+from warp_abtree.kernels.intersect.simd import simd_float32_filter, simd_float64_filter
+from warp_abtree.kernels.search.item import first_item, item_first, item_second
 from warp_abtree.kernels.triangle.float32_filter import FLOAT32_UNIT, SEPARATED
 
 pytestmark = pytest.mark.slow

@@ -8,7 +8,7 @@ import warp as wp
 from helpers.questions import launch
 from oracles import triangle as oracle
 
-from warp_abtree.kernels.arithmetic.predicates import EXACT, FILTER, UNCERTAIN
+from warp_abtree.kernels.exact.predicates import EXACT, FILTER, UNCERTAIN
 from warp_abtree.kernels.triangle.float64_filter import decide_triangles
 
 pytestmark = pytest.mark.slow

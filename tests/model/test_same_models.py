@@ -10,7 +10,7 @@ from conftest import real_mesh_path
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.kernels.progressive.triangle_cover import COVERS_AT_ONCE, SLOT_FACE, SLOT_SIBLING, SLOTS
+from warp_abtree.kernels.build.triangle_cover import COVERS_AT_ONCE, SLOT_FACE, SLOT_SIBLING, SLOTS
 from warp_abtree.model import lod_bounds
 from warp_abtree.model.collapse import Collapse
 from warp_abtree.model.lod_bounds import LodBounds

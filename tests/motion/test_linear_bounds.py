@@ -8,7 +8,9 @@ from helpers.questions import launch
 from oracles.path import HAS_LONG, LONG, apply, invert
 
 import warp_abtree as ab
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.nodes import load_node
+from warp_abtree.kernels.base.poses import place_trees
 from warp_abtree.kernels.motion.linear import (
     LinearMotion,
     Seen,
@@ -18,8 +20,6 @@ from warp_abtree.kernels.motion.linear import (
     start_linear_motion,
 )
 from warp_abtree.kernels.motion.path import pair_skew
-from warp_abtree.kernels.poses import place_trees
-from warp_abtree.kernels.traversal.nodes import load_node
 
 pytestmark = pytest.mark.skipif(not HAS_LONG, reason="no floating-point numbers longer than float64")
 COUNT = 24

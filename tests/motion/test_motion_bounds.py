@@ -12,7 +12,9 @@ from oracles.path import HAS_LONG, LONG, apply, frames_at, move, seen_from, shor
 from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.nodes import load_node
+from warp_abtree.kernels.base.poses import place_trees
 from warp_abtree.kernels.motion.node_pair import MovingBox, box_motion, move_box
 from warp_abtree.kernels.motion.path import (
     Moment,
@@ -25,8 +27,6 @@ from warp_abtree.kernels.motion.path import (
     reverse_moment,
     start_motion,
 )
-from warp_abtree.kernels.poses import place_trees
-from warp_abtree.kernels.traversal.nodes import load_node
 
 pytestmark = pytest.mark.skipif(not HAS_LONG, reason="no floating-point numbers longer than float64")
 COUNT = 24

@@ -12,18 +12,11 @@ from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.poses import place_trees
 from warp_abtree.kernels.motion.path import Paths, bound_motion, pair_skew, prepare_path_kernel, start_motion
-from warp_abtree.kernels.motion.profile import (
-    CELLS,
-    box_heights,
-    frame_of_a,
-    frame_of_b,
-    image_face,
-    radii_of,
-)
+from warp_abtree.kernels.motion.profile import CELLS, box_heights, frame_of_a, frame_of_b, image_face, radii_of
 from warp_abtree.kernels.motion.screw import screw_frame
-from warp_abtree.kernels.poses import place_trees
 
 COUNT, SAMPLES, N = 400, 300, int(CELLS)
 

@@ -13,10 +13,10 @@ from oracles.path import HAS_LONG, LONG
 from scipy.spatial.transform import Rotation
 
 import warp_abtree as ab
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.poses import place_trees
 from warp_abtree.kernels.motion.path import Paths, bound_motion, pair_skew, prepare_path_kernel, start_motion
 from warp_abtree.kernels.motion.screw import TURN_ROUNDING, slides_apart, turn_between
-from warp_abtree.kernels.poses import place_trees
 
 COUNT = 300
 FACES = [[0, 2, 1], [1, 2, 3], [2, 4, 3], [3, 4, 5]]

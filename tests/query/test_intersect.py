@@ -13,8 +13,8 @@ from oracles.triangle import into_frame_of_a
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.kernels.poses import PairPose, pose_point
-from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH
+from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.search.warp_stack import STACK_LENGTH
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 

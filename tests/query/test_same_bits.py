@@ -12,7 +12,7 @@ from helpers.scenes import add_objects
 import warp_abtree as ab
 from warp_abtree import testing
 from warp_abtree.checks.cpu_threads import cores_for, launch_on_cores
-from warp_abtree.kernels.traversal.warp_stack import take_slots
+from warp_abtree.kernels.base.counters import take_slots
 
 MODELS = ("torus", "small ball", "box", "crumbs", "soup", "twins")
 COUNTERS = ("node_tests", "triangle_tests", "exact_tests")

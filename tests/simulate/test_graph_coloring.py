@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_abtree.kernels.dynamics import bodies as body_kernels
-from warp_abtree.kernels.dynamics import graph_coloring
+from warp_abtree.kernels.bodies import bodies as body_kernels
+from warp_abtree.kernels.bodies import graph_coloring
 from warp_abtree.simulate.body_state import zeros_of
 
 COLORS = int(graph_coloring.COLOR_COUNT)

@@ -9,7 +9,7 @@ from helpers.bodies import BALL, BRICK, CUBE, FLOOR, GROUND, TORUS, bits, box, m
 
 import warp_abtree as ab
 from warp_abtree import testing
-from warp_abtree.kernels.dynamics import graph_coloring
+from warp_abtree.kernels.bodies import graph_coloring
 
 pytestmark = pytest.mark.slow
 

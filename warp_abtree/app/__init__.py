@@ -1,6 +1,6 @@
 """Applications of the library: scene files, pictures, the viewer and the command line."""
 
-from warp_abtree.app.toml.decode import SceneError
+from warp_abtree.app.toml.errors import SceneError
 from warp_abtree.app.toml.scene_file import SceneFile, load_scene
 from warp_abtree.app.viewer.still import view
 

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, wrap_array
-from warp_abtree.kernels import pipeline as kernels
+from warp_abtree.kernels.io import pipeline as kernels
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE
 from warp_abtree.state.device_update import NO_FAULTS
 from warp_abtree.state.generation import STALE_GRAPH, LaunchGuard

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels import newton as kernels
+from warp_abtree.kernels.io import newton as kernels
 from warp_abtree.model.model import Model
 from warp_abtree.query.manifold import POINTS_MAX, ManifoldQuery
 from warp_abtree.query.request import CapacityError

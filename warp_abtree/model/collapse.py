@@ -8,9 +8,9 @@ import threading
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.progressive import collapse
-from warp_abtree.kernels.progressive.heap import Heap
-from warp_abtree.kernels.progressive.quadric import Quadric
+from warp_abtree.kernels.build import collapse
+from warp_abtree.kernels.build.heap import Heap
+from warp_abtree.kernels.build.quadric import Quadric
 from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, unwritten
 
 # Merges per launch.

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.progressive import polygon, vertex_forest
+from warp_abtree.kernels.build import polygon, vertex_forest
 
 
 def cpu_array(values, dtype):

@@ -6,7 +6,7 @@ import warp as wp
 from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.progressive import block_queue, hausdorff_bound, merge_window, polygon, triangle_cover
+from warp_abtree.kernels.build import block_queue, hausdorff_bound, merge_window, polygon, triangle_cover
 from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, unwritten
 
 # Cores and faces from which on windows gain: gathering them takes half as long again as going on merge by merge.

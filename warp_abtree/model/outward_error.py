@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.progressive import outward_bound
+from warp_abtree.kernels.build import outward_bound
 from warp_abtree.model.cpu_arrays import cpu_array, find_frame, make_scratch
 from warp_abtree.model.lod_bounds import ROUNDING
 

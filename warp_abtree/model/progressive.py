@@ -14,9 +14,8 @@ from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.cpu_threads import core_count, wait_for, workers
 from warp_abtree.checks.kernel_loading import compiling_ahead, loading
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels import active_build
-from warp_abtree.kernels.progressive import collapse as collapse_kernels
-from warp_abtree.kernels.progressive import vertex_forest
+from warp_abtree.kernels.build import active_build, vertex_forest
+from warp_abtree.kernels.build import collapse as collapse_kernels
 from warp_abtree.model.cache import find_errors, keep_errors
 from warp_abtree.model.collapse import Collapse
 from warp_abtree.model.cpu_arrays import cpu_array, launch

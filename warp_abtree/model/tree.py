@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.active_build import FaceBoxes, split_segment_kernel
+from warp_abtree.kernels.build.active_build import FaceBoxes, split_segment_kernel
 from warp_abtree.model.cpu_arrays import cpu_array
 from warp_abtree.model.mesh import FACE_LIMIT
 

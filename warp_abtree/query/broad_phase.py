@@ -7,7 +7,12 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device
-from warp_abtree.kernels.broad_phase import find_pair_kernel, make_pair_key_kernel, place_pair_kernel, pose_box_kernel
+from warp_abtree.kernels.intersect.broad_phase import (
+    find_pair_kernel,
+    make_pair_key_kernel,
+    place_pair_kernel,
+    pose_box_kernel,
+)
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.request import CapacityError
 from warp_abtree.state.batch import Batch

@@ -9,8 +9,8 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.cpu_threads import core_count
 from warp_abtree.checks.regime import Regime, current_regime
-from warp_abtree.kernels import poses
-from warp_abtree.kernels.traversal import descent, face_pairs
+from warp_abtree.kernels.base import poses
+from warp_abtree.kernels.intersect import descent, face_pairs
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.request import check_gap, check_pair_room, check_within
 from warp_abtree.query.result import COUNTERS

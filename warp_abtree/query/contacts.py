@@ -65,9 +65,10 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.contact import chunks, contact, pack, simd, sort_hits, summary
-from warp_abtree.kernels.gap import separation
-from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
+from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.contacts import chunks, contact, separation, simd, summary
+from warp_abtree.kernels.io import contact_results as pack
+from warp_abtree.kernels.io import sort_hits
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import CapacityError
 from warp_abtree.query.result import VECTORS, Found, contact_dtypes

@@ -53,11 +53,11 @@ from warp_abtree.checks.arguments import check_device, flag, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
+from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.distance import crossing, frame, report, search, search_simd
-from warp_abtree.kernels.slabs import mean_slabs
-from warp_abtree.kernels.solid.containment import report_contained_kernel
-from warp_abtree.kernels.solid.depth import find_depth_kernel
-from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
+from warp_abtree.kernels.inside.containment import report_contained_kernel
+from warp_abtree.kernels.inside.depth import find_depth_kernel
+from warp_abtree.kernels.search import mean_slabs
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request, check_within, refuse_options

@@ -47,11 +47,10 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import whole_number
-from warp_abtree.kernels.contact import contact, loops, manifold
-from warp_abtree.kernels.contact import points as point_kernels
-from warp_abtree.kernels.gap import near_points
-from warp_abtree.kernels.solid import inside_points
-from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
+from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.contacts import contact, loops, manifold, near_points
+from warp_abtree.kernels.contacts import points as point_kernels
+from warp_abtree.kernels.inside import inside_points
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.result import Found, Result
 from warp_abtree.query.staging import first_rows

@@ -10,14 +10,14 @@ from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.cpu_threads import cores_for, launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels import relative_pose
-from warp_abtree.kernels.gap import near_faces
-from warp_abtree.kernels.results import BLOCK_DIM as PACK_DIM
-from warp_abtree.kernels.results import pack_pair_kernel
-from warp_abtree.kernels.slabs.make_slabs import make_slab_kernel
-from warp_abtree.kernels.solid.containment import find_contained_kernel
-from warp_abtree.kernels.traversal import dual_tree, face_pairs, load_balance, simd, uncertain_pairs
-from warp_abtree.kernels.traversal.warp_stack import STACK_LENGTH, WARP_SIZE
+from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.inside.containment import find_contained_kernel
+from warp_abtree.kernels.intersect import dual_tree, face_pairs, near_faces, relative_pose, simd, uncertain_pairs
+from warp_abtree.kernels.io.results import BLOCK_DIM as PACK_DIM
+from warp_abtree.kernels.io.results import pack_pair_kernel
+from warp_abtree.kernels.search import load_balance
+from warp_abtree.kernels.search.make_slabs import make_slab_kernel
+from warp_abtree.kernels.search.warp_stack import STACK_LENGTH
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.readout import QueryReadout
 from warp_abtree.query.request import LIST_MAX, OUTPUTS, PRECISIONS, check_capacity, check_request, check_within

@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.regime import Regime
-from warp_abtree.kernels import results as kernels
+from warp_abtree.kernels.io import results as kernels
 from warp_abtree.query.buffers import QueryBuffers
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.result import COUNTERS, Found, Result, Totals

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_abtree.checks.arguments import to_numpy, whole_number
-from warp_abtree.kernels.arithmetic import predicates
-from warp_abtree.kernels.traversal import face_pairs
+from warp_abtree.kernels.exact import predicates
+from warp_abtree.kernels.intersect import face_pairs
 
 OUTPUTS = {"any": face_pairs.OUTPUT_ANY, "count": face_pairs.OUTPUT_COUNT, "faces": face_pairs.OUTPUT_FACES}
 PRECISIONS = {"exact": predicates.EXACT, "float32": predicates.FLOAT32}

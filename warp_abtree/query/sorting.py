@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.contact import sort_hits, sort_segments
+from warp_abtree.kernels.io import sort_hits, sort_segments
 
 # Rows whose sorting takes longer than packing each into one number, which sorts 20 times as fast.
 ROWS_TO_PACK = 1000

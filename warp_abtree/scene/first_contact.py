@@ -25,10 +25,10 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device, to_numpy
 from warp_abtree.checks.cpu_threads import core_count, cores_for, launch_on_cores
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.arrays import ObjectPool
+from warp_abtree.kernels.base.arrays import ObjectPool
+from warp_abtree.kernels.base.lanes import WARP_SIZE
 from warp_abtree.kernels.motion import face_pair, group, path, search, start
 from warp_abtree.kernels.motion import linear as straight
-from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.narrow_phase import Query

@@ -8,9 +8,9 @@ import warp as wp
 
 from warp_abtree.checks.arguments import to_numpy
 from warp_abtree.checks.kernel_loading import loading, of_first_query
-from warp_abtree.kernels.broad_phase import pose_box_kernel
-from warp_abtree.kernels.place_poses import pose_setter
-from warp_abtree.kernels.traversal.nodes import clear_node_kernel
+from warp_abtree.kernels.base.nodes import clear_node_kernel
+from warp_abtree.kernels.intersect.broad_phase import pose_box_kernel
+from warp_abtree.kernels.io.place_poses import pose_setter
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.distance import DistanceQuery, check_beyond, check_flags, check_tolerances, prepare_query
 from warp_abtree.query.narrow_phase import Query

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy
-from warp_abtree.kernels import pipeline as kernels
+from warp_abtree.kernels.io import pipeline as kernels
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import CapacityError, check_capacity

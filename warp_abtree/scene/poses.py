@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import is_device_array, to_numpy, wrap_array
-from warp_abtree.kernels import place_poses
+from warp_abtree.kernels.io import place_poses
 
 QUATERNION_TOLERANCE = 1e-3
 RIGID_TOLERANCE = 1e-6

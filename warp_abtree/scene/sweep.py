@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_lock import device_lock
-from warp_abtree.kernels.sweep import NONE_REFUSED, pose_placer, report_chunk_kernel
+from warp_abtree.kernels.io.sweep import NONE_REFUSED, pose_placer, report_chunk_kernel
 from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond, check_flags
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.scene.first_contact import FirstContactQuery, check_asked_contacts

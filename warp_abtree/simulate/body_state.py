@@ -7,8 +7,8 @@ import warp as wp
 
 from warp_abtree.checks.arguments import broadcast_rows, finite_array, first_line
 from warp_abtree.checks.quaternions import quaternions_of
-from warp_abtree.kernels.arrays import ObjectPool
-from warp_abtree.kernels.dynamics import bodies as kernels
+from warp_abtree.kernels.base.arrays import ObjectPool
+from warp_abtree.kernels.bodies import bodies as kernels
 from warp_abtree.model.model import Model
 from warp_abtree.scene.poses import check_poses, launch_place
 from warp_abtree.scene.scene import Scene

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.dynamics import ahead
+from warp_abtree.kernels.bodies import ahead
 from warp_abtree.query.distance import DistanceQuery
 from warp_abtree.query.manifold import ManifoldQuery
 

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from warp_abtree.kernels.arrays import ObjectPool
-from warp_abtree.kernels.dynamics import continuous as kernels
+from warp_abtree.kernels.base.arrays import ObjectPool
+from warp_abtree.kernels.bodies import continuous as kernels
 from warp_abtree.query.request import Buffers
 from warp_abtree.scene.first_contact import FirstContactQuery
 from warp_abtree.scene.scene import Scene

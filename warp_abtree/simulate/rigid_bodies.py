@@ -13,10 +13,10 @@ import warp as wp
 
 from warp_abtree.checks.arguments import finite_array, flag, positive
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.arrays import LAST_KEY
-from warp_abtree.kernels.dynamics import bodies as body_kernels
-from warp_abtree.kernels.dynamics import constraints as constraint_kernels
-from warp_abtree.kernels.dynamics import graph_coloring, solve
+from warp_abtree.kernels.base.arrays import LAST_KEY
+from warp_abtree.kernels.bodies import bodies as body_kernels
+from warp_abtree.kernels.bodies import constraints as constraint_kernels
+from warp_abtree.kernels.bodies import graph_coloring, solve
 from warp_abtree.query.manifold import POINTS_MAX
 from warp_abtree.query.request import Buffers, check_capacity
 from warp_abtree.scene.scene import Scene

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.poses import SLAB_DEPTH
-from warp_abtree.kernels.slabs.make_slabs import make_slab_kernel
-from warp_abtree.kernels.traversal.nodes import clear_node_kernel
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.nodes import clear_node_kernel
+from warp_abtree.kernels.base.poses import SLAB_DEPTH
+from warp_abtree.kernels.search.make_slabs import make_slab_kernel
 from warp_abtree.state.generation import Generation
 
 # Columns of `StatePool` that mirror the host's slots.

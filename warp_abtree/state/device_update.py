@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.arrays import LEVEL_MAX
+from warp_abtree.kernels.base.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import levels as level_kernels
 from warp_abtree.kernels.update import work_lists
 from warp_abtree.state.arrays import ModelArrays, StateArrays

@@ -6,7 +6,7 @@ launch writes on the device which generation it was given, and `LaunchGuard.chec
 
 import warp as wp
 
-from warp_abtree.kernels.generation import STALE, LaunchRecord
+from warp_abtree.kernels.base.generation import STALE, LaunchRecord
 
 # States of `LaunchRecord.launched` beside generations, which count from 0, and STALE.
 NOT_LAUNCHED, INTERRUPTED = -1, -3

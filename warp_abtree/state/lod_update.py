@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.arrays import LEVEL_MAX
+from warp_abtree.kernels.base.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import refit
 from warp_abtree.kernels.update.work_lists import WHOLE, UpdateLists
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays

@@ -3,7 +3,7 @@
 A closed mesh (`warp_abtree.model.winding`) divides space into inside and outside, at every LOD and however it is wound.
 An object pair with a solid intersects if the surfaces meet, or if a component of one surface lies inside the other
 object, a solid. Surfaces that do not meet leave each component wholly inside or outside, so this is decided exactly, on
-the numbers of `docs/exactness.md`, by the parity of the crossings of a ray (`warp_abtree.kernels.solid.parity`); at
+the numbers of `docs/exactness.md`, by the parity of the crossings of a ray (`warp_abtree.kernels.inside.parity`); at
 the LODs of the objects, it says nothing of the originals. Of an object pair that intersects in this way alone
 
 * any is True, count is 0, and it has no faces and no contacts: these are of surfaces; contact points it has, see
@@ -19,8 +19,8 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device
-from warp_abtree.kernels.solid.components import Solids, find_component_kernel
-from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
+from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.inside.components import Solids, find_component_kernel
 from warp_abtree.state.arrays import ModelArrays, StateArrays
 
 SLOT_ARRAYS = {"shift": wp.int32, "first": wp.int32, "count": wp.int32, "made": wp.vec3i}

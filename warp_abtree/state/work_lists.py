@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.arrays import LEVEL_MAX
+from warp_abtree.kernels.base.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import block_update, mark, refine, refit
 from warp_abtree.kernels.update.work_lists import UpdateLists
 

@@ -2,12 +2,12 @@
 #pragma once
 #include "builtin.h"
 #include "exact/expansion_sum.h"
-#include "sizes.h"
+#include "base/sizes.h"
 
 inline CUDA_CALLABLE wp::float64 sum_volume(wp::vec_t<3, wp::float64> a, wp::vec_t<3, wp::float64> b,
                                             wp::vec_t<3, wp::float64> c, wp::vec_t<3, wp::float64> d) {
 #include "exact/expansion_sum.h"
-#include "sizes.h"
+#include "base/sizes.h"
 #if defined(__CUDA_ARCH__)
     // Of odd length, so that lanes at the same component take different banks.
     __shared__ double rows[EXPANSION_LANES][EXPANSION_LENGTH + 1];

@@ -1,13 +1,13 @@
 // Signs of determinants known to be small, in integers of 128 bits that wrap.
 #pragma once
 #include "builtin.h"
-#include "sizes.h"
+#include "base/sizes.h"
 #include "exact/wide_integer.h"
 
 inline CUDA_CALLABLE wp::int32 integer_orient3d(wp::vec_t<3, wp::float64> a, wp::vec_t<3, wp::float64> b,
                                                 wp::vec_t<3, wp::float64> c, wp::vec_t<3, wp::float64> d,
                                                 wp::float64 bound) {
-#include "sizes.h"
+#include "base/sizes.h"
 #include "exact/wide_integer.h"
     typedef WideInteger Wide;
     const int top = Wide::exponent_of(bound);
@@ -44,7 +44,7 @@ inline CUDA_CALLABLE wp::int32 integer_orient3d(wp::vec_t<3, wp::float64> a, wp:
 
 inline CUDA_CALLABLE wp::int32 integer_orient2d(wp::vec_t<2, wp::float64> a, wp::vec_t<2, wp::float64> b,
                                                 wp::vec_t<2, wp::float64> c, wp::float64 bound) {
-#include "sizes.h"
+#include "base/sizes.h"
 #include "exact/wide_integer.h"
     typedef WideInteger Wide;
     const int top = Wide::exponent_of(bound);

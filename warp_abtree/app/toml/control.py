@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 
-from warp_abtree.app.toml.decode import fail
+from warp_abtree.app.toml.errors import fail
 from warp_abtree.lod.controllers import PaperController, PredictiveController, ToleranceController
 from warp_abtree.scene.scene import Scene
 

@@ -1,10 +1,10 @@
-"""Scene files as typed tables, and the one line that says what is wrong with a file."""
+"""Scene files as typed tables."""
 
 import math
 import re
 from pathlib import Path
-from typing import NoReturn
 
+from warp_abtree.app.toml.errors import SceneError, fail
 from warp_abtree.app.toml.folder import scene_names
 
 TYPES = {
@@ -15,15 +15,6 @@ TYPES = {
     "float": "a number",
     "bool": "true or false",
 }
-
-
-class SceneError(ValueError):
-    """What is wrong with a scene file, with the file and the key, in one line."""
-
-
-def fail(path, key: str, message) -> NoReturn:
-    """Raise SceneError about a key of a file."""
-    raise SceneError(" ".join(f"{path}: {key}: {message}".split())) from None
 
 
 def import_msgspec(path):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from warp_abtree.app.toml.decode import fail
+from warp_abtree.app.toml.errors import fail
 from warp_abtree.app.toml.shapes import GENERATED
 from warp_abtree.model.mesh import Mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_abtree.app.toml.decode import SceneError, fail
+from warp_abtree.app.toml.errors import SceneError, fail
 
 OBJECT_LIMIT = 1_000_000  # of one entry of [[objects]]
 

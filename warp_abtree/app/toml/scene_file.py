@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from warp_abtree.app.toml.control import LodControl, make_control
-from warp_abtree.app.toml.decode import SceneError, fail, read_tables
+from warp_abtree.app.toml.decode import read_tables
+from warp_abtree.app.toml.errors import SceneError, fail
 from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.models import build_model
 from warp_abtree.app.toml.objects import make_groups

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_abtree.kernels.broad_phase import pose_box_kernel
+from warp_abtree.kernels.intersect.broad_phase import pose_box_kernel
 from warp_abtree.kernels.robot import answers, forward, link_pairs
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.distance import DistanceQuery

@@ -1,0 +1,1 @@
+"""Arrays, nodes, boxes, poses and lanes: what every group builds on."""

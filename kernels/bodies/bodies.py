@@ -1,0 +1,165 @@
+"""Rigid bodies: their state, and the motion of one step.
+
+A body frame has its origin at the centre of mass and its axes along the principal axes of inertia.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.base.arrays import ObjectPool
+from warp_abtree.kernels.intersect.face_pairs import Hits
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+STATIC = wp.constant(0)
+KINEMATIC = wp.constant(1)
+DYNAMIC = wp.constant(2)
+"""Motion type of an object: it stands, its motion is prescribed, or it is a rigid body."""
+
+HALF = wp.constant(wp.float64(0.5))
+
+REACH_LEAST, REACH_MAX = wp.constant(wp.float64(2.0**-8)), wp.constant(wp.float64(0.25))
+"""How far ahead of a body contacts are looked for, beside its motion in a step, and motion at most, in its radii."""
+
+
+@wp.struct
+class Bodies:
+    """Bodies, one entry an object. Those that are not DYNAMIC have infinite mass: inverses are 0."""
+
+    # static
+    motion_type: wp.array(dtype=wp.int32)  # STATIC, KINEMATIC or DYNAMIC
+    rank: wp.array(dtype=wp.int32)  # rank among the rigid bodies of the same world
+    inverse_mass: wp.array(dtype=wp.float64)  # [1 / mass]
+    inverse_moment: wp.array(dtype=wp.vec3d)  # of the principal moments of inertia
+    centre: wp.array(dtype=wp.vec3d)  # centre of mass, model frame [world units]
+    axes: wp.array(dtype=wp.mat33d)  # principal axes as columns, model frame
+    bounding_radius: wp.array(dtype=wp.float64)  # about the centre of mass [world units]
+    # state
+    position: wp.array(dtype=wp.vec3d)  # of the body frame [world units]
+    rotation: wp.array(dtype=wp.quatd)  # of the body frame, x y z w
+    velocity: wp.array(dtype=wp.vec3d)  # of the centre of mass [world units/s]
+    momentum: wp.array(dtype=wp.vec3d)  # angular momentum, world frame; of kinematic objects angular velocity [rad/s]
+    reach: wp.array(dtype=wp.vec4d)  # motion in a step, and reach beside it, for contacts ahead [world units]
+    # of one step
+    inverse_inertia: wp.array(dtype=wp.mat33d)  # world frame; of kinematic objects the identity
+    pseudo_velocity: wp.array(dtype=wp.vec3d)  # of the position correction [world units/s]
+    pseudo_momentum: wp.array(dtype=wp.vec3d)  # its angular momentum
+    bid: wp.array(dtype=wp.int64)  # highest bid of the graph coloring
+    is_whole: wp.array(dtype=wp.int32)  # entry 0: whether all contacts are known, 0 or 1; else bodies keep their state
+
+
+@wp.func
+def rotation_by(v: wp.vec3d):
+    """Return the quaternion of a rotation vector, axis times angle [rad]."""
+    return wp.quat_from_axis_angle(wp.normalize(v), wp.length(v))
+
+
+@wp.func
+def integrate_rotation(q: wp.quatd, momentum: wp.vec3d, inverse_moment: wp.vec3d, dt: wp.float64):
+    """Return the rotation of a free body after a time; its angular momentum [world frame] is constant.
+
+    The kinetic energy is split into that of the three axes, each of which gives a plain rotation. Their symmetric
+    product is symplectic: the energy oscillates and does not drift.
+    Source: McLachlan 1993, Explicit Lie-Poisson integration and the Euler equations; Reich 1994.
+    """
+    m = wp.quat_rotate_inv(q, momentum)
+    for k in range(5):
+        axis = wp.where(k < 3, k, 4 - k)
+        part = wp.where(k == 2, dt, HALF * dt)
+        v = wp.vec3d()
+        v[axis] = part * m[axis] * inverse_moment[axis]
+        turn = rotation_by(v)
+        q = q * turn
+        m = wp.quat_rotate_inv(turn, m)
+    return wp.normalize(q)
+
+
+@wp.kernel
+def judge_contacts_kernel(
+    launched: wp.array(dtype=wp.int32),
+    pair_count: wp.array(dtype=wp.int32),
+    pair_room: wp.int32,
+    hits: Hits,
+    # out
+    bodies_out: Bodies,
+):
+    """Find whether a query has found all contacts in the room that it had; one thread."""
+    whole = launched[0] >= 0 and wp.uint32(pair_count[0]) <= wp.uint32(pair_room)
+    whole = whole and wp.uint32(hits.total[0]) <= wp.uint32(hits.face.shape[0])
+    if hits.uncertain.shape[0] > 0:
+        whole = whole and wp.uint32(hits.uncertain_total[0]) <= wp.uint32(hits.uncertain.shape[0])
+    if hits.apart.shape[0] > 0:
+        whole = whole and wp.uint32(hits.apart_total[0]) <= wp.uint32(hits.apart.shape[0])
+    bodies_out.is_whole[0] = wp.where(whole, 1, 0)
+
+
+@wp.kernel
+def begin_step_kernel(
+    dt: wp.float64,
+    velocity_change: wp.vec3d,
+    targets: ObjectPool,
+    objects: ObjectPool,
+    # state
+    bodies_inout: Bodies,
+):
+    """Initialise a step: gravity changes velocities; kinematic objects get those that take them to their targets."""
+    i = wp.tid()
+    if bodies_inout.is_whole[0] == 0:
+        return
+    bodies_inout.pseudo_velocity[i] = wp.vec3d()
+    bodies_inout.pseudo_momentum[i] = wp.vec3d()
+    bodies_inout.bid[i] = wp.int64(0)
+    if bodies_inout.motion_type[i] == DYNAMIC:
+        r = wp.quat_to_matrix(bodies_inout.rotation[i])
+        bodies_inout.inverse_inertia[i] = r * wp.diag(bodies_inout.inverse_moment[i]) * wp.transpose(r)
+        bodies_inout.velocity[i] += velocity_change
+        return
+    bodies_inout.position[i] = objects.position[i]
+    if bodies_inout.motion_type[i] == KINEMATIC:
+        turn = wp.quat_from_matrix(targets.rotation[i] * wp.transpose(objects.rotation[i]))
+        axis, angle = wp.quat_to_axis_angle(turn)
+        bodies_inout.velocity[i] = (targets.position[i] - objects.position[i]) / dt
+        bodies_inout.momentum[i] = (angle / dt) * axis
+        bodies_inout.inverse_inertia[i] = wp.identity(n=3, dtype=wp.float64)
+
+
+@wp.func
+def reach_of(bodies: Bodies, i: wp.int32, dt: wp.float64):
+    """Return how an object's centre moves in a step, and how far its surface may beside that, and a little more."""
+    motion = dt * bodies.velocity[i]
+    if bodies.motion_type[i] != DYNAMIC:
+        return wp.vec4d(motion[0], motion[1], motion[2], wp.float64(0.0))
+    radius = bodies.bounding_radius[i]
+    most = REACH_MAX * radius
+    motion = motion * wp.min(most / wp.max(wp.length(motion), most), wp.float64(1.0))
+    turn = dt * wp.length(bodies.inverse_inertia[i] * bodies.momentum[i]) * radius
+    return wp.vec4d(motion[0], motion[1], motion[2], wp.min(turn, most) + REACH_LEAST * radius)
+
+
+@wp.kernel
+def integrate_kernel(
+    dt: wp.float64,
+    targets: ObjectPool,
+    # state
+    bodies_inout: Bodies,
+    objects_inout: ObjectPool,
+):
+    """Move each body by its velocity and its position correction, and pose its object."""
+    i = wp.tid()
+    if bodies_inout.is_whole[0] == 0:
+        return
+    bodies_inout.reach[i] = reach_of(bodies_inout, i, dt)
+    if bodies_inout.motion_type[i] == KINEMATIC:
+        objects_inout.rotation[i] = targets.rotation[i]
+        objects_inout.position[i] = targets.position[i]
+    if bodies_inout.motion_type[i] != DYNAMIC:
+        return
+    bodies_inout.position[i] += dt * (bodies_inout.velocity[i] + bodies_inout.pseudo_velocity[i])
+    q = integrate_rotation(bodies_inout.rotation[i], bodies_inout.momentum[i], bodies_inout.inverse_moment[i], dt)
+    correction = rotation_by(dt * (bodies_inout.inverse_inertia[i] * bodies_inout.pseudo_momentum[i]))
+    q = wp.normalize(correction * q)
+    # The momentum rotates along, otherwise the kinetic energy would change.
+    bodies_inout.momentum[i] = wp.quat_rotate(correction, bodies_inout.momentum[i])
+    bodies_inout.rotation[i] = q
+    rotation = wp.quat_to_matrix(q) * wp.transpose(bodies_inout.axes[i])
+    objects_inout.rotation[i] = rotation
+    objects_inout.position[i] = bodies_inout.position[i] - rotation * bodies_inout.centre[i]

@@ -1,0 +1,103 @@
+"""The candidates of a pair's contacts, listed and searched by the threads of a block, on the CPU by one."""
+
+import functools
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.contacts.manifold import NO_DEPTH, Curves
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+CANDIDATES = wp.constant(2)  # of each contact, numbered on from contact to contact
+
+group_code = functools.partial(native.body, "contacts/groups.cuh")
+
+
+@wp.func_native(group_code("group_size"))
+def group_size() -> wp.int32: ...
+
+
+@wp.func_native(group_code("group_lane"))
+def group_lane() -> wp.int32: ...
+
+
+@wp.func_native(group_code("group_sync"))
+def group_sync(): ...
+
+
+@wp.func_native(group_code("must_measure"))
+def must_measure(chosen: wp.int32) -> bool:
+    """Return whether all candidates look at the points chosen, so many: always on a GPU, whose lanes go in step."""
+
+
+@wp.func_native(group_code("greatest_of_group"))
+def greatest_of_group(x: wp.float64, item: wp.int32) -> wp.vec2d:
+    """Return the greatest number of all threads, and the item of a thread that has it, the least of several."""
+
+
+@wp.func_native(group_code("rank_in_group"))
+def rank_in_group(flag: bool) -> wp.int32:
+    """Return how many threads have set their flag, times 2^16, and how many before this one."""
+
+
+@wp.func
+def best_of_group(value: wp.float64, candidate: wp.int32):
+    """Return the candidate of the greatest value of all threads, the first of several, and that value."""
+    best = greatest_of_group(value, candidate)
+    return wp.int32(best[1]), best[0]
+
+
+@wp.func
+def list_candidates(first: wp.int32, end: wp.int32, curves: Curves):
+    """List the contacts of a pair that have candidates, in their order, where its contacts start; return its end.
+
+    Of faces that are apart a fifth has some, which every choice looks at.
+    """
+    listed, next = wp.int32(first), wp.int32(first)
+    while next < end:
+        i = next + group_lane()
+        has = i < end
+        if has:
+            has = curves.depth[i, 0] == curves.depth[i, 0] or curves.depth[i, 1] == curves.depth[i, 1]
+        rank = rank_in_group(has)
+        if has:
+            curves.listed[listed + (rank & 0xFFFF)] = i
+        listed += rank >> 16
+        next += group_size()
+    group_sync()
+    return listed
+
+
+@wp.func
+def find_deepest(first: wp.int32, end: wp.int32, curves: Curves):
+    """Return the deepest candidate of those listed and its depth, NO_DEPTH where there is none."""
+    deepest = NO_DEPTH
+    best = CANDIDATES * first
+    at = first + group_lane()
+    while at < end:
+        i = curves.listed[at]
+        for k in range(CANDIDATES):
+            if curves.depth[i, k] > deepest:
+                deepest = curves.depth[i, k]
+                best = CANDIDATES * i + k
+        at += group_size()
+    return best_of_group(deepest, best)
+
+
+@wp.func
+def find_outermost(first: wp.int32, end: wp.int32, least: wp.float64, along: wp.vec3d, curves: Curves):
+    """Return the candidate that reaches farthest along a direction, of those of a least depth, and how far."""
+    origin = curves.point[first, 0]
+    farthest = -wp.float64(wp.inf)
+    best = CANDIDATES * first
+    at = first + group_lane()
+    while at < end:
+        i = curves.listed[at]
+        for k in range(CANDIDATES):
+            reach = wp.dot(along, curves.point[i, k] - origin)
+            if curves.depth[i, k] >= least and reach > farthest:
+                farthest = reach
+                best = CANDIDATES * i + k
+        at += group_size()
+    return best_of_group(farthest, best)

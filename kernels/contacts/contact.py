@@ -1,0 +1,192 @@
+"""Contacts of intersecting face pairs in the world: by float64 where it is sure, else by exact signs."""
+
+import warp as wp
+
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool, load_vertex
+from warp_abtree.kernels.base.lanes import warp_lane, warp_size
+from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.exact.expansion import EXPANSION_LANES
+from warp_abtree.kernels.intersect.uncertain_pairs import items_at_once
+from warp_abtree.kernels.triangle.corners import load_corner_ids, load_corners
+from warp_abtree.kernels.triangle.segment import face_normal, intersect_faces, unit_vector
+from warp_abtree.kernels.triangle.segment_filter import filter_normal, filter_segment
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+# Differences of unit normals, and means of them, that are shorter have no direction worth the name.
+SHORTEST_NORMAL = wp.constant(wp.float64(2.0**-20))
+
+
+@wp.struct
+class Contacts:
+    """One entry an intersecting face pair, its objects in the order in which the pair names them, world frame."""
+
+    p0: wp.array(dtype=wp.vec3d)  # first end [world units]
+    p1: wp.array(dtype=wp.vec3d)  # second end [world units]
+    normal_a: wp.array(dtype=wp.vec3d)  # unit normal of the first object's face
+    normal_b: wp.array(dtype=wp.vec3d)  # unit normal of the second object's face
+    normal: wp.array(dtype=wp.vec3d)  # unit normal of the contact, from the first object to the second
+    coplanar: wp.array(dtype=wp.int32)  # 0 or 1
+    separation: wp.array(dtype=wp.float64)  # [world units], negative where the faces intersect; [0] without a gap
+
+
+@wp.func
+def pair_direction(models: ModelPool, states: StatePool, objects: ObjectPool, a: wp.int32, b: wp.int32):
+    """Return the unit vector between the centres of two models, world frame; x where they coincide."""
+    centre_a = models.centre[states.model[objects.state[a]]]
+    centre_b = models.centre[states.model[objects.state[b]]]
+    from_a = pose_point(objects.rotation[a], objects.position[a], centre_a)
+    v = unit_vector(pose_point(objects.rotation[b], objects.position[b], centre_b) - from_a)
+    if wp.dot(v, v) == wp.float64(0.0):
+        return wp.vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
+    return v
+
+
+@wp.struct
+class PairObjects:
+    """An object pair as its contacts need it."""
+
+    a: wp.int32  # object with the smaller index
+    b: wp.int32  # the other
+    swapped: wp.int32  # 1 where the pair names b first
+
+
+@wp.struct
+class Deferred:
+    """Contacts that are left for a launch of their own."""
+
+    total: wp.array(dtype=wp.int32)  # how many, shape [1]
+    place: wp.array(dtype=wp.int32)  # of each in `Contacts`, shape [capacity]
+
+
+@wp.func
+def contact_objects(pairs: wp.array(dtype=wp.vec2i), pair_poses: wp.array(dtype=PairPose), p: wp.int32):
+    own = PairObjects()
+    own.a = wp.min(pairs[p][0], pairs[p][1])
+    own.b = wp.max(pairs[p][0], pairs[p][1])
+    own.swapped = pair_poses[p].swapped
+    return own
+
+
+@wp.func
+def have_crossed(contacts: Contacts, i: wp.int32):
+    """Return whether a contact's faces intersect; with a gap they may be apart."""
+    if contacts.separation.shape[0] == 0:
+        return True
+    return contacts.separation[i] < wp.float64(0.0)
+
+
+@wp.func
+def blend_normals(normal_a: wp.vec3d, normal_b: wp.vec3d):
+    """Return the direction from A to B that the normals of two faces tell, 0 where neither has an area."""
+    normal = normal_a - normal_b
+    if wp.dot(normal, normal) <= SHORTEST_NORMAL * SHORTEST_NORMAL:
+        normal = normal_a
+    return unit_vector(normal)
+
+
+@wp.func
+def write_contact(
+    # static
+    models: ModelPool,
+    # state
+    states: StatePool,
+    objects: ObjectPool,
+    own: PairObjects,
+    i: wp.int32,
+    p0: wp.vec3d,
+    p1: wp.vec3d,
+    face_normal_a: wp.vec3d,
+    face_normal_b: wp.vec3d,
+    # out
+    contacts: Contacts,
+):
+    """Pose a contact to the world, from points and normals in the frame of object a."""
+    rotation = objects.rotation[own.a]
+    end0 = pose_point(rotation, objects.position[own.a], p0)
+    end1 = pose_point(rotation, objects.position[own.a], p1)
+    normal_a = unit_vector(rotation * face_normal_a)
+    normal_b = unit_vector(rotation * face_normal_b)
+    normal = blend_normals(normal_a, normal_b)
+    if wp.dot(normal, normal) == wp.float64(0.0):
+        normal = pair_direction(models, states, objects, own.a, own.b)
+    back = own.swapped != 0
+    contacts.p0[i] = wp.where(back, end1, end0)
+    contacts.p1[i] = wp.where(back, end0, end1)
+    contacts.normal_a[i] = wp.where(back, normal_b, normal_a)
+    contacts.normal_b[i] = wp.where(back, normal_a, normal_b)
+    contacts.normal[i] = wp.where(back, -normal, normal)
+
+
+@wp.kernel(cuda_max_registers=128)
+def find_contact_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    proven: bool,
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    deferred_inout: Deferred,
+    contacts_out: Contacts,
+):
+    """Compute the contact of one intersecting face pair a thread, or defer it where float64 is not sure of it.
+
+    Args:
+        proven: Whether face pairs are known to intersect, by exact signs.
+        start: Where the face pairs of each object pair start, shape [pair + 1]; after the last pair, where all end.
+    """
+    i = wp.tid()
+    if i >= start[start.shape[0] - 1] or not have_crossed(contacts_out, i):
+        return
+    p = faces[i][0]
+    own = contact_objects(pairs, pair_poses, p)
+    a = load_corner_ids(states, pair_poses[p].corner_a + faces[i][1 + own.swapped])
+    b = load_corner_ids(states, pair_poses[p].corner_b + faces[i][2 - own.swapped])
+    rotation = pair_poses[p].rotation
+    shift = pair_poses[p].translation
+    a0 = load_vertex(models.vertex_pos, a[0])
+    a1 = load_vertex(models.vertex_pos, a[1])
+    a2 = load_vertex(models.vertex_pos, a[2])
+    b0 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[0]))
+    b1 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[1]))
+    b2 = pose_point(rotation, shift, load_vertex(models.vertex_pos, b[2]))
+    normal_a, sure_a = filter_normal(a0, a1, a2)
+    normal_b, sure_b = filter_normal(b0, b1, b2)
+    p0, p1, sure = filter_segment(proven, a0, a1, a2, b0, b1, b2)
+    if sure and sure_a and sure_b:
+        write_contact(models, states, objects, own, i, p0, p1, normal_a, normal_b, contacts_out)
+        contacts_out.coplanar[i] = 0
+    else:
+        deferred_inout.place[wp.atomic_add(deferred_inout.total, 0, 1)] = i
+
+
+@wp.kernel
+def find_deferred_kernel(
+    step: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    faces: wp.array(dtype=wp.vec3i),
+    deferred: Deferred,
+    contacts_out: Contacts,
+):
+    """Compute deferred contacts by exact signs: few at a time in each warp of so many threads."""
+    at_once = wp.min(items_at_once(deferred.total[0], step), EXPANSION_LANES)
+    k = at_once * (wp.tid() / warp_size()) + warp_lane()
+    while warp_lane() < at_once and k < deferred.total[0]:
+        i = deferred.place[k]
+        p = faces[i][0]
+        own = contact_objects(pairs, pair_poses, p)
+        corner = wp.zeros(shape=(6,), dtype=wp.vec3d)
+        face_a, face_b = faces[i][1 + own.swapped], faces[i][2 - own.swapped]
+        load_corners(models, states, pair_poses[p], face_a, face_b, corner)
+        p0, p1, coplanar = intersect_faces(pair_poses[p].scale, corner)
+        normal_a = face_normal(corner[0], corner[1], corner[2])
+        normal_b = face_normal(corner[3], corner[4], corner[5])
+        write_contact(models, states, objects, own, i, p0, p1, normal_a, normal_b, contacts_out)
+        contacts_out.coplanar[i] = coplanar
+        k += at_once * (step / warp_size())

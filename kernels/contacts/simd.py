@@ -1,0 +1,119 @@
+"""Contacts on the CPU: 8 face pairs of an object pair at a time, in vector instructions, and their sums."""
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.lanes import six_numbers
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.contacts.contact import Contacts, Deferred, contact_objects
+from warp_abtree.kernels.contacts.summary import PairContacts, mean_normal, write_no_contacts
+from warp_abtree.kernels.contacts.travel import choose_travel, reach_contacts
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.func_native(native.body("contacts/contacts.h", "simd_contacts"))
+def simd_contacts(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    rotation: wp.mat33d,
+    position: wp.vec3d,
+    proven: bool,
+    span: wp.vec3i,
+    faces: wp.array(dtype=wp.vec3i),
+    place: wp.array(dtype=wp.int32),
+    contacts: Contacts,
+) -> wp.int32:
+    """Compute the contacts of an object pair's face pairs, as `find_contact`, and list those that it is not sure of.
+
+    Args:
+        rotation, position: Pose of object A.
+        proven: Whether the face pairs are known to intersect.
+        span: First face pair, the one behind the last, and how many entries the list has.
+
+    Returns how many entries the list has then.
+    """
+
+
+@wp.func_native(native.body("contacts/contact_sums.h", "simd_sum_lengths"))
+def simd_sum_lengths(contacts: Contacts, ends: wp.vec2i) -> six_numbers:
+    """Return the length of an object pair's contacts, and how many are of faces that intersect, as `sum_lengths`."""
+
+
+@wp.func_native(native.body("contacts/contact_sums.h", "simd_sum_means"))
+def simd_sum_means(contacts: Contacts, ends: wp.vec2i, total: wp.float64, number: wp.float64) -> six_numbers:
+    """Return the mean point of a pair's contacts, from the first end, and the mean of normals, as `sum_means`."""
+
+
+@wp.func_native(native.body("contacts/contact_sums.h", "simd_sum_areas"))
+def simd_sum_areas(contacts: Contacts, ends: wp.vec2i, middle: wp.vec3d, normal: wp.vec3d) -> six_numbers:
+    """Return the area within a pair's contact curve and its change, as `sum_loop`."""
+
+
+@wp.kernel
+def find_pair_contacts_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    proven: bool,
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    deferred_inout: Deferred,
+    contacts_out: Contacts,
+):
+    """Compute the contacts of one object pair, or defer them; one thread after the other, CPU only."""
+    p = wp.tid()
+    a = wp.min(pairs[p][0], pairs[p][1])
+    if start[p] < start[p + 1]:
+        deferred_inout.total[0] = simd_contacts(
+            models,
+            states,
+            pair_poses[p],
+            objects.rotation[a],
+            objects.position[a],
+            proven,
+            wp.vec3i(start[p], start[p + 1], deferred_inout.total[0]),
+            faces,
+            deferred_inout.place,
+            contacts_out,
+        )
+
+
+@wp.kernel
+def sum_pair_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
+    pair_contacts_out: PairContacts,
+):
+    """Sum the contacts of one object pair a thread, as the kernels of `summary` do; CPU only."""
+    p = wp.tid()
+    ends = wp.vec2i(start[p], start[p + 1])
+    lengths = simd_sum_lengths(contacts, ends)
+    if lengths[1] == wp.float64(0.0):
+        write_no_contacts(p, pair_contacts_out)
+        return
+    means = simd_sum_means(contacts, ends, lengths[0], lengths[1])
+    middle = wp.vec3d(means[0], means[1], means[2])
+    n = mean_normal(models, states, objects, pairs[p], wp.vec3d(means[3], means[4], means[5]))
+    areas = simd_sum_areas(contacts, ends, middle, n)
+    origin = contacts.p0[ends[0]]
+    front, back = wp.float64(0.0), wp.float64(0.0)
+    if areas[0] == wp.float64(0.0):
+        own = contact_objects(pairs, pair_poses, p)
+        span = wp.vec3i(p, ends[0], ends[1])
+        front, back = reach_contacts(models, states, objects, own, pair_poses[p], span, faces, contacts, n, origin)
+    pair_contacts_out.normal[p] = n
+    pair_contacts_out.point[p] = origin + middle
+    pair_contacts_out.travel[p] = choose_travel(
+        models, states, objects, pairs[p], n, origin, areas[0], areas[1], front - back
+    )

@@ -1,0 +1,269 @@
+"""One summary an object pair of its sorted contacts, in sums of a fixed shape.
+
+A chunk is CHUNK contacts of one pair, the pair's last one shorter. One warp a chunk sums its contacts in their order;
+what it needs of the whole pair it sums itself, of the pair's chunks in theirs, so that no bit depends on the device or
+on the order in which threads run. With a gap contacts of faces that are apart count nothing. The CPU sums a pair after
+the other (`simd`).
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool, no_vector
+from warp_abtree.kernels.base.lanes import add_in_order, six_numbers, warp_any, warp_lane, warp_max, warp_size
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.contacts.chunks import end_chunk, first_chunk
+from warp_abtree.kernels.contacts.contact import (
+    SHORTEST_NORMAL,
+    Contacts,
+    contact_objects,
+    have_crossed,
+    pair_direction,
+)
+from warp_abtree.kernels.contacts.travel import choose_travel, loop_change, reach_contacts
+from warp_abtree.kernels.triangle.segment import measure_length, unit_vector
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.struct
+class PairContacts:
+    """One entry an object pair, world frame."""
+
+    point: wp.array(dtype=wp.vec3d)  # mean point [world units]
+    normal: wp.array(dtype=wp.vec3d)  # unit mean normal
+    travel: wp.array(dtype=wp.float64)  # [world units]
+
+
+@wp.struct
+class ChunkSums:
+    """Sums over each chunk, and what a pair's chunks need of each other."""
+
+    span: wp.array(dtype=wp.vec3i)  # (pair, first contact, end), shape [chunk]; nothing behind the last pair's
+    length: wp.array(dtype=wp.float64)  # sum of lengths, shape [chunk]
+    point: wp.array(dtype=wp.vec3d)  # weighted, from the pair's first end, shape [chunk]
+    normal: wp.array(dtype=wp.vec3d)  # weighted, shape [chunk]
+    area: wp.array(dtype=wp.float64)  # that the contact curve encloses, shape [chunk]
+    change: wp.array(dtype=wp.float64)  # how fast the area changes, shape [chunk]
+    front: wp.array(dtype=wp.float64)  # how far the first object's faces reach along the normal, shape [chunk]; or NaN
+    back: wp.array(dtype=wp.float64)  # how far the second's reach against it, shape [chunk]
+    crossed: wp.array(dtype=wp.float64)  # contacts whose faces intersect, shape [chunk]
+    middle: wp.array(dtype=wp.vec3d)  # mean point from the first end, shape [pair]
+
+
+@wp.func
+def two_numbers(x: wp.float64, y: wp.float64):
+    numbers = six_numbers()
+    numbers[0] = x
+    numbers[1] = y
+    return numbers
+
+
+@wp.kernel
+def sum_length_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_inout: ChunkSums):
+    """Sum the lengths of the contacts of one chunk a warp."""
+    c = wp.tid() / warp_size()
+    if c >= first_chunk(start.shape[0] - 1, start):
+        return
+    span = sums_inout.span[c]
+    sums = six_numbers()
+    length = six_numbers()
+    first = wp.int32(span[1])
+    while first < span[2]:
+        k = wp.min(first + warp_lane(), span[2] - 1)
+        count = wp.min(span[2] - first, warp_size())
+        crossed = wp.where(have_crossed(contacts, k), wp.float64(1.0), wp.float64(0.0))
+        length[0] = crossed * measure_length(contacts.p1[k] - contacts.p0[k])
+        length[1] = crossed
+        sums = add_in_order(sums, length, count)
+        first += warp_size()
+    if warp_lane() == 0:
+        sums_inout.length[c] = sums[0]
+        sums_inout.crossed[c] = sums[1]
+
+
+@wp.func
+def sum_lengths(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
+    """Return the length of all contacts of a pair, or 0, and how many are of faces that intersect."""
+    all = six_numbers()
+    c = first_chunk(p, start)
+    end = end_chunk(p, start)
+    while c < end:
+        k = wp.min(c + warp_lane(), end - 1)
+        all = add_in_order(all, two_numbers(sums.length[k], sums.crossed[k]), wp.min(end - c, warp_size()))
+        c += warp_size()
+    return all[0], all[1]
+
+
+@wp.kernel
+def sum_mean_kernel(start: wp.array(dtype=wp.int32), contacts: Contacts, sums_inout: ChunkSums):
+    """Sum one chunk's points, from the first end of its pair, and normals, weighted by their part of the pair's length.
+
+    Where all lengths vanish all weights are the same.
+    """
+    c = wp.tid() / warp_size()
+    if c >= first_chunk(start.shape[0] - 1, start):
+        return
+    span = sums_inout.span[c]
+    if span[1] >= span[2]:
+        return
+    p = span[0]
+    origin = contacts.p0[start[p]]
+    half = wp.float64(0.5)
+    total, number = sum_lengths(p, start, sums_inout)
+    sums = six_numbers()
+    first = wp.int32(span[1])
+    while first < span[2]:
+        k = wp.min(first + warp_lane(), span[2] - 1)
+        count = wp.min(span[2] - first, warp_size())
+        weight = wp.float64(1.0) / number
+        if total != wp.float64(0.0):
+            weight = measure_length(contacts.p1[k] - contacts.p0[k]) / total
+        if not have_crossed(contacts, k):
+            weight = wp.float64(0.0)
+        middle = weight * (half * (contacts.p0[k] - origin) + half * (contacts.p1[k] - origin))
+        normal = weight * contacts.normal[k]
+        both = six_numbers(middle[0], middle[1], middle[2], normal[0], normal[1], normal[2])
+        sums = add_in_order(sums, both, count)
+        first += warp_size()
+    if warp_lane() == 0:
+        sums_inout.point[c] = wp.vec3d(sums[0], sums[1], sums[2])
+        sums_inout.normal[c] = wp.vec3d(sums[3], sums[4], sums[5])
+
+
+@wp.func
+def sum_means(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
+    """Return a pair's mean point, from its first end, and the sum of its weighted normals."""
+    all = six_numbers()
+    c = first_chunk(p, start)
+    end = end_chunk(p, start)
+    while c < end:
+        k = wp.min(c + warp_lane(), end - 1)
+        x, n = sums.point[k], sums.normal[k]
+        all = add_in_order(all, six_numbers(x[0], x[1], x[2], n[0], n[1], n[2]), wp.min(end - c, warp_size()))
+        c += warp_size()
+    return wp.vec3d(all[0], all[1], all[2]), wp.vec3d(all[3], all[4], all[5])
+
+
+@wp.func
+def mean_normal(models: ModelPool, states: StatePool, objects: ObjectPool, pair: wp.vec2i, sum: wp.vec3d):
+    """Return the unit normal of a sum of weighted normals; where it is short, the direction between the models."""
+    n = sum
+    if measure_length(n) <= SHORTEST_NORMAL:
+        n = pair_direction(models, states, objects, pair[0], pair[1])
+    return unit_vector(n)
+
+
+@wp.kernel(cuda_max_registers=96)
+def sum_loop_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
+    sums_inout: ChunkSums,
+    pair_contacts_out: PairContacts,
+):
+    """Sum what the travel needs of one chunk a warp: area within the contact curve, its change, extents of faces.
+
+    Extents serve pairs without an area, which as a rule have none in any chunk: others are left out.
+    """
+    c = wp.tid() / warp_size()
+    if c >= first_chunk(start.shape[0] - 1, start):
+        return
+    span = sums_inout.span[c]
+    if span[1] >= span[2]:
+        return
+    p = span[0]
+    origin = contacts.p0[start[p]]
+    middle, normals = sum_means(p, start, sums_inout)
+    n = mean_normal(models, states, objects, pairs[p], normals)
+    sums = six_numbers()
+    first = wp.int32(span[1])
+    while first < span[2]:
+        k = wp.min(first + warp_lane(), span[2] - 1)
+        # About the mean point, since for an open curve the area depends on where it is measured from.
+        r = contacts.p0[k] - origin - middle
+        s = contacts.p1[k] - contacts.p0[k]
+        parts = six_numbers()
+        if contacts.coplanar[k] == 0 and have_crossed(contacts, k):
+            parts[0] = wp.float64(0.5) * wp.dot(n, wp.cross(r, s))
+            parts[1] = loop_change(s, contacts.normal_a[k], contacts.normal_b[k], n)
+        sums = add_in_order(sums, parts, wp.min(span[2] - first, warp_size()))
+        first += warp_size()
+    front = wp.float64(wp.nan)
+    back = wp.float64(wp.nan)
+    if sums[0] == wp.float64(0.0):
+        own = contact_objects(pairs, pair_poses, p)
+        front, back = reach_contacts(models, states, objects, own, pair_poses[p], span, faces, contacts, n, origin)
+    if warp_lane() == 0:
+        sums_inout.area[c] = sums[0]
+        sums_inout.change[c] = sums[1]
+        sums_inout.front[c] = front
+        sums_inout.back[c] = back
+        if c == first_chunk(p, start):
+            sums_inout.middle[p] = middle
+            pair_contacts_out.normal[p] = n
+
+
+@wp.func
+def sum_loop(p: wp.int32, start: wp.array(dtype=wp.int32), sums: ChunkSums):
+    """Return area and change of all chunks of a pair, how far its faces reach along the normal, and whether that is
+    known of all chunks."""
+    all = six_numbers()
+    front = -wp.float64(wp.inf)
+    back = -wp.float64(wp.inf)
+    measured = bool(True)
+    c = first_chunk(p, start)
+    end = end_chunk(p, start)
+    while c < end:
+        k = wp.min(c + warp_lane(), end - 1)
+        measured = measured and sums.front[k] == sums.front[k]
+        front = wp.max(front, sums.front[k])
+        back = wp.max(back, -sums.back[k])
+        all = add_in_order(all, two_numbers(sums.area[k], sums.change[k]), wp.min(end - c, warp_size()))
+        c += warp_size()
+    return all[0], all[1], warp_max(front), -warp_max(back), not warp_any(not measured)
+
+
+@wp.func
+def write_no_contacts(p: wp.int32, pair_contacts: PairContacts):
+    pair_contacts.normal[p] = no_vector()
+    pair_contacts.point[p] = no_vector()
+    pair_contacts.travel[p] = wp.float64(0.0)
+
+
+@wp.kernel(cuda_max_registers=96)
+def measure_travel_kernel(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    start: wp.array(dtype=wp.int32),
+    faces: wp.array(dtype=wp.vec3i),
+    contacts: Contacts,
+    sums: ChunkSums,
+    pair_contacts_inout: PairContacts,
+):
+    """Estimate the travel of one object pair a warp, and pose its mean point; docstring of warp_abtree/contact.py."""
+    p = wp.tid() / warp_size()
+    _, number = sum_lengths(p, start, sums)
+    if number == wp.float64(0.0):
+        if warp_lane() == 0:
+            write_no_contacts(p, pair_contacts_inout)
+        return
+    origin = contacts.p0[start[p]]
+    n = pair_contacts_inout.normal[p]
+    area, change, front, back, measured = sum_loop(p, start, sums)
+    if area == wp.float64(0.0) and not measured:
+        own = contact_objects(pairs, pair_poses, p)
+        span = wp.vec3i(p, start[p], start[p + 1])
+        front, back = reach_contacts(models, states, objects, own, pair_poses[p], span, faces, contacts, n, origin)
+    if warp_lane() == 0:
+        pair_contacts_inout.point[p] = origin + sums.middle[p]
+        pair_contacts_inout.travel[p] = choose_travel(
+            models, states, objects, pairs[p], n, origin, area, change, front - back
+        )

@@ -1,1 +1,0 @@
-"""Face pairs that are apart by less than a gap."""

@@ -1,0 +1,287 @@
+"""How deep an object pair is: the greatest depth of samples of one surface inside the other object, a solid.
+
+A motion shorter than the depth of a sample (`solid.samples`) leaves it inside, so the greatest depth is a lower bound
+of any motion that frees the two. Nodes of the tree whose samples are looked at are dropped where, by the distance of
+their middle from the surface, nothing below can be inside, or deeper than what is known; never where it may be as deep,
+so that the deepest sample, the lowest of several, is found in any order.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.boxes import round_up
+from warp_abtree.kernels.base.generation import STALE
+from warp_abtree.kernels.base.lanes import warp_lane, warp_max, warp_min_item, warp_size, warp_sync
+from warp_abtree.kernels.base.nodes import Node, load_node
+from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.distance.frame import Frame, make_frame, slack_of
+from warp_abtree.kernels.distance.report import Distances, blend_corners, write_nearest
+from warp_abtree.kernels.inside.components import Solids
+from warp_abtree.kernels.inside.nearest_face import (
+    NO_NEAREST,
+    Whose,
+    into_frame,
+    make_whose,
+    nearest_face,
+    point_features,
+    point_weights,
+    square_outside,
+)
+from warp_abtree.kernels.inside.parity import face_corners, is_inside
+from warp_abtree.kernels.inside.samples import (
+    HALF,
+    KNOWN,
+    NO_SAMPLE,
+    SAMPLES,
+    Deepest,
+    Sampling,
+    is_avoided,
+    measure_samples,
+    sample_weights,
+)
+from warp_abtree.kernels.intersect.face_pairs import Hits
+from warp_abtree.kernels.search.item import FACES, NODES, four_items, item_first, item_second, pack_item
+from warp_abtree.kernels.search.load_balance import DEPTH_FIRST_ROOM
+from warp_abtree.kernels.search.nearest_stack import nearest_stack, push_nearest, read_bound, write_bound
+from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, read_item, write_item
+
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(MODULE_OPTIONS)
+
+
+@wp.func
+def bound_depth(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    inner: Whose,
+    outer: Whose,
+    node: Node,
+    hint: wp.int32,
+    known: wp.float64,
+    sampling: Sampling,
+):
+    """Return an upper bound of the depth below a node, negative only where it is less than what is known, and a face.
+
+    With the node's middle at a distance d from the surface, and points within r of it, an inside point is no deeper
+    than d + r, and no deeper than r - d where the middle is outside: the surface lies between them.
+    """
+    none = -wp.float64(1.0)
+    if node.skip < 0:
+        return none, hint
+    lower, upper = wp.vec3d(node.lower), wp.vec3d(node.upper)
+    middle = HALF * (lower + upper) + inner.centre
+    if inner.of_b:
+        middle = pose_point(pose.rotation, pose.translation, middle)
+    reach = wp.length(HALF * (upper - lower)) * outer.grow + outer.margin
+    if is_avoided(sampling, middle, reach):
+        return none, hint
+    # What is inside lies within the root's box, and no deeper than its nearest side.
+    root = load_node(states, outer.node + 1)
+    x = into_frame(pose, outer, middle)
+    if square_outside(root, x) > reach * reach:
+        return none, hint
+    for i in range(3):
+        side = wp.min(x[i] - wp.float64(root.lower[i]), wp.float64(root.upper[i]) - x[i])
+        if side + reach < known:
+            return none, hint
+    distance, near = nearest_face(models, states, pose, outer, middle, hint, known - reach)
+    if distance + reach < known:
+        return none, near
+    if reach - distance < known or distance > reach:
+        centre = wp.where(inner.of_b, outer.centre, inner.centre)
+        if not is_inside(models, states, pose, outer.of_b, centre, middle):
+            return none, near
+    return distance + reach, near
+
+
+@wp.func
+def agree(best: Deepest):
+    """Return the deepest of what all lanes have found, the lowest of several."""
+    found = Deepest()
+    found.depth = warp_max(best.depth)
+    found.item = warp_min_item(wp.where(best.depth == found.depth, best.item, NO_SAMPLE))
+    return found
+
+
+@wp.func
+def find_deepest(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    inner: Whose,
+    outer: Whose,
+    room: wp.int32,
+    known: Deepest,
+    sampling: Sampling,
+):
+    """Return the deepest of what is known and all samples of one object inside the other, the same in all lanes.
+
+    The children that may be deepest come first; faces wait until there is one for each lane. An item names a node or a
+    face, and the outer face that was nearest above it, where the next search starts.
+    """
+    best = known
+    items = nearest_stack()
+    root = load_node(states, inner.node + 1)
+    # A single face waits at once.
+    waiting = wp.where(root.face >= 0, 1, 0)
+    end = 1 - waiting
+    if warp_lane() == 0:
+        at = STACK_LENGTH * waiting
+        write_item(items, at, pack_item(wp.where(root.face >= 0, root.face, root.skip), NO_NEAREST))
+        write_bound(items, at, -wp.float32(wp.inf))
+    warp_sync()
+    while end > 0 or waiting > 0:
+        if end > 0 and waiting < warp_size():
+            popped = wp.max(1, (room - DEPTH_FIRST_ROOM - end) >> 1)
+            popped = wp.min(popped, wp.min(warp_size(), end))
+            end -= popped
+            at = end + wp.min(warp_lane(), popped - 1)
+            item = read_item(items, at)
+            node = item_first(item)
+            live = warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth
+            warp_sync()
+            children, kinds, bounds = four_items(), wp.vec4i(), wp.vec4()
+            for k in range(2):
+                child = load_node(states, inner.node + wp.where(live, 2 * node + k, 1))
+                if live:
+                    near = item_second(item)
+                    bound, near = bound_depth(models, states, pose, inner, outer, child, near, best.depth, sampling)
+                    if bound >= wp.float64(0.0):
+                        kinds[k] = wp.where(child.face >= 0, FACES, NODES)
+                        children[k] = pack_item(wp.where(child.face >= 0, child.face, child.skip), near)
+                        bounds[k] = -round_up(bound)
+            ends = push_nearest(items, end, waiting, kinds, children, bounds)
+            warp_sync()
+            waiting, end = item_first(ends), item_second(ends)
+        if waiting >= warp_size() or (waiting > 0 and end == 0):
+            popped = wp.min(waiting, warp_size())
+            waiting -= popped
+            at = STACK_LENGTH + waiting + wp.min(warp_lane(), popped - 1)
+            item = read_item(items, at)
+            if warp_lane() < popped and wp.float64(-read_bound(items, at)) >= best.depth:
+                face, near = item_first(item), item_second(item)
+                best = measure_samples(models, states, pose, inner, outer, face, near, best, sampling)
+            warp_sync()
+            best = agree(best)
+    return best
+
+
+@wp.func
+def deepest_of_both(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    solids: Solids,
+    first: Whose,
+    second: Whose,
+    pair: wp.vec2i,
+    room: wp.int32,
+    known: Deepest,
+    sampling: Sampling,
+):
+    """Return the deepest of what is known and all samples of either object inside the other, where that is a solid."""
+    best = known
+    if solids.is_solid[wp.max(pair[0], pair[1])] != 0:
+        best = find_deepest(models, states, pose, first, second, room, known, sampling)
+    if solids.is_solid[wp.min(pair[0], pair[1])] != 0:
+        other = Deepest()
+        other.depth = best.depth
+        other.item = KNOWN
+        other = find_deepest(models, states, pose, second, first, room, other, sampling)
+        if other.item != KNOWN:
+            best = other
+            best.of_b = True
+    return best
+
+
+@wp.func
+def deepest_points(
+    models: ModelPool, states: StatePool, objects: ObjectPool, pose: PairPose, pair: wp.vec2i, best: Deepest
+):
+    """Return the deepest sample of a pair and the point of the other's surface that is nearest: in A's frame, posed."""
+    face = wp.int32(best.item >> wp.int64(33))
+    weights = sample_weights(wp.int32((best.item >> wp.int64(30)) & wp.int64(7)))
+    nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
+    a, b = wp.min(pair[0], pair[1]), wp.max(pair[0], pair[1])
+    inner, outer = wp.where(best.of_b, b, a), wp.where(best.of_b, a, b)
+    u, v, w = face_corners(models, states, pose, best.of_b, face)
+    point = (weights[0] * u + weights[1] * v) + weights[2] * w
+    u, v, w = face_corners(models, states, pose, not best.of_b, nearest)
+    near, _size = point_features(u, v, w, point)
+    ids = states.face_corner[states.face_start[objects.state[outer]] + nearest]
+    foot = blend_corners(models, ids, point_weights(near))
+    foot = pose_point(objects.rotation[outer], objects.position[outer], foot)
+    ids = states.face_corner[states.face_start[objects.state[inner]] + face]
+    sample = blend_corners(models, ids, weights)
+    sample = pose_point(objects.rotation[inner], objects.position[inner], sample)
+    return point, sample, foot
+
+
+@wp.func
+def report_deepest(
+    models: ModelPool,
+    states: StatePool,
+    objects: ObjectPool,
+    pose: PairPose,
+    frame: Frame,
+    pair: wp.vec2i,
+    best: Deepest,
+    p: wp.int32,
+    distances: Distances,
+):
+    """Write the deepest sample of a pair, the point of the other's surface that is nearest, and their faces."""
+    _point, sample, foot = deepest_points(models, states, objects, pose, pair, best)
+    face = wp.int32(best.item >> wp.int64(33))
+    nearest = wp.int32(best.item & wp.int64(0x3FFFFFFF))
+    d = best.depth
+    slack = slack_of(frame, d)
+    least = wp.max((d - slack) / frame.stretch, wp.float64(0.0))
+    distances.distance[p] = -d
+    distances.bracket[p] = wp.vec2d(-(d * frame.stretch + slack), -least)
+    if best.of_b:
+        write_nearest(p, pose.swapped, nearest, face, foot, sample, distances)
+    else:
+        write_nearest(p, pose.swapped, face, nearest, sample, foot, distances)
+
+
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+def find_depth_kernel(
+    # static
+    room: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    solids: Solids,
+    # state
+    objects: ObjectPool,
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    launched: wp.array(dtype=wp.int32),
+    hits: Hits,
+    # out
+    distances_inout: Distances,
+):
+    """Find the depth of the object pairs that intersect and have samples of one in the other, a solid; a warp a pair.
+
+    Others keep the rows that they have.
+    """
+    p = wp.tid() / warp_size()
+    if p >= pair_count[0] or p >= pairs.shape[0] or launched[0] == STALE:
+        return
+    if hits.any_hit[p] == 0:
+        return
+    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
+    if solids.is_solid[a] == 0 and solids.is_solid[b] == 0:
+        return
+    pose = pair_poses[p]
+    frame = make_frame(models, states, objects, pose, a, b)
+    first = make_whose(models, states, pose, frame, False, objects.state[a])
+    second = make_whose(models, states, pose, frame, True, objects.state[b])
+    best = Deepest()
+    best.item = KNOWN
+    sampling = Sampling()
+    sampling.samples = SAMPLES
+    best = deepest_of_both(models, states, pose, solids, first, second, pairs[p], room, best, sampling)
+    if best.item != KNOWN and warp_lane() == 0:
+        report_deepest(models, states, objects, pose, frame, pairs[p], best, p, distances_inout)

@@ -1,0 +1,205 @@
+"""Contact points of what lies inside a solid: how deep it is where faces that cross or are near do not tell.
+
+A contact knows depth as far as its two faces reach, and a gap as far as the gap. What has gone under farther, or lies
+inside whole, has samples (`solid.depth`) deeper than any point of its pair; the deepest of these, far from one another,
+become points: depth is the distance from the other's surface, the normal the way there. They take the places of
+the nearest other points where there is no room.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.generation import STALE
+from warp_abtree.kernels.base.lanes import warp_lane, warp_size
+from warp_abtree.kernels.base.nodes import load_node
+from warp_abtree.kernels.base.poses import PairPose, pose_point
+from warp_abtree.kernels.contacts.manifold import Manifolds
+from warp_abtree.kernels.contacts.points import order_direction
+from warp_abtree.kernels.distance.frame import make_frame
+from warp_abtree.kernels.inside.components import Solids
+from warp_abtree.kernels.inside.containment import FIRST_INSIDE, SECOND_INSIDE
+from warp_abtree.kernels.inside.depth import MODULE_OPTIONS, deepest_of_both, deepest_points
+from warp_abtree.kernels.inside.nearest_face import NO_NEAREST, Whose, make_whose, nearest_face
+from warp_abtree.kernels.inside.parity import is_inside
+from warp_abtree.kernels.inside.samples import AVOIDED_MAX, HALF, KNOWN, Deepest, Sampling, way_out
+from warp_abtree.kernels.intersect.face_pairs import Hits
+from warp_abtree.kernels.triangle.segment import unit_vector
+
+wp.set_module_options(MODULE_OPTIONS)
+
+# Part of the smaller object's size by which a sample must be deeper than all points of its pair; and under which the
+# points of a pair that has some tell that nothing is deep.
+DEEPER = wp.constant(wp.float64(2.0**-12))
+# Part of that size by which samples lie apart, and of the first one's depth that others have at least.
+APART, LESS = wp.constant(wp.float64(0.25)), wp.constant(wp.float64(0.5))
+
+
+@wp.func
+def size_of(states: StatePool, whose: Whose):
+    """Return the diagonal of a root's box."""
+    root = load_node(states, whose.node + 1)
+    return wp.float64(wp.length(root.upper - root.lower))
+
+
+@wp.func
+def known_depth(manifolds: Manifolds, p: wp.int32):
+    """Return the greatest depth of the points of a pair, 0 without."""
+    deepest = wp.float64(0.0)
+    for k in range(manifolds.count[p]):
+        deepest = wp.max(deepest, manifolds.depth[p, k])
+    return deepest
+
+
+@wp.func
+def way_of_points(manifolds: Manifolds, p: wp.int32):
+    """Return the sum of the normals of the points of a pair."""
+    way = wp.vec3d()
+    for k in range(manifolds.count[p]):
+        way += manifolds.normal[p, k]
+    return way
+
+
+@wp.func
+def way_of_middle(models: ModelPool, states: StatePool, pose: PairPose, inner: Whose, outer: Whose):
+    """Return the way out of the middle of the inner object's box, in A's frame."""
+    root = load_node(states, inner.node + 1)
+    middle = HALF * (wp.vec3d(root.lower) + wp.vec3d(root.upper)) + inner.centre
+    if inner.of_b:
+        middle = pose_point(pose.rotation, pose.translation, middle)
+    _, face = nearest_face(models, states, pose, outer, middle, NO_NEAREST, wp.float64(0.0))
+    way = way_out(models, states, pose, outer, face, middle)
+    if not is_inside(models, states, pose, outer.of_b, wp.where(inner.of_b, outer.centre, inner.centre), middle):
+        way = -way
+    return way
+
+
+@wp.func
+def way_of_second(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    first: Whose,
+    second: Whose,
+    which: wp.int32,
+    normals: wp.vec3d,
+):
+    """Return the way on which B comes free, in A's frame.
+
+    Args:
+        which: What of the pair is inside, `Hits.any_hit`.
+        normals: Sum of the normals of its points, in the order of the pair.
+    """
+    if which == FIRST_INSIDE:
+        return -way_of_middle(models, states, pose, first, second)
+    if which == SECOND_INSIDE:
+        return way_of_middle(models, states, pose, second, first)
+    return wp.where(pose.swapped != 0, -normals, normals)
+
+
+@wp.func
+def avoid_point(before: Sampling, point: wp.vec3d):
+    """Return a sampling that avoids one more point."""
+    sampling = before
+    if before.count == 0:
+        sampling.first = point
+    elif before.count == 1:
+        sampling.second = point
+    else:
+        sampling.third = point
+    sampling.count += 1
+    return sampling
+
+
+@wp.func
+def remove_nearest(p: wp.int32, x: wp.vec3d, limit: wp.float64, manifolds: Manifolds):
+    """Remove the point of a full pair that is nearest to x, of those less deep than a limit."""
+    count = manifolds.count[p]
+    place = wp.int32(count)
+    nearest = wp.float64(wp.inf)
+    for k in range(count):
+        v = manifolds.point[p, k] - x
+        if manifolds.depth[p, k] < limit and wp.dot(v, v) < nearest:
+            nearest = wp.dot(v, v)
+            place = k
+    for k in range(place + 1, count):
+        manifolds.point[p, k - 1] = manifolds.point[p, k]
+        manifolds.normal[p, k - 1] = manifolds.normal[p, k]
+        manifolds.depth[p, k - 1] = manifolds.depth[p, k]
+    manifolds.count[p] = wp.min(count, manifolds.point.shape[1] - 1)
+
+
+@wp.func
+def insert_point(p: wp.int32, along: wp.vec3d, x: wp.vec3d, normal: wp.vec3d, depth: wp.float64, manifolds: Manifolds):
+    """Insert a point where it lies in the order of `contact.points`."""
+    k = wp.int32(manifolds.count[p])
+    manifolds.count[p] = k + 1
+    while k > 0 and wp.dot(along, manifolds.point[p, wp.max(k, 1) - 1] - x) > wp.float64(0.0):
+        manifolds.point[p, k] = manifolds.point[p, k - 1]
+        manifolds.normal[p, k] = manifolds.normal[p, k - 1]
+        manifolds.depth[p, k] = manifolds.depth[p, k - 1]
+        k -= 1
+    manifolds.point[p, k] = x
+    manifolds.normal[p, k] = normal
+    manifolds.depth[p, k] = depth
+
+
+@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+def add_inside_point_kernel(
+    # static
+    room: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    solids: Solids,
+    # state
+    objects: ObjectPool,
+    pair_count: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    pair_poses: wp.array(dtype=PairPose),
+    launched: wp.array(dtype=wp.int32),
+    hits: Hits,
+    # out
+    manifolds_inout: Manifolds,
+):
+    """Add points of what is inside to those of the pairs that intersect, of which one is a solid; a warp a pair."""
+    p = wp.tid() / warp_size()
+    if p >= pair_count[0] or p >= pairs.shape[0] or launched[0] == STALE:
+        return
+    a, b = wp.min(pairs[p][0], pairs[p][1]), wp.max(pairs[p][0], pairs[p][1])
+    if hits.any_hit[p] == 0 or (solids.is_solid[a] == 0 and solids.is_solid[b] == 0):
+        return
+    pose = pair_poses[p]
+    frame = make_frame(models, states, objects, pose, a, b)
+    first = make_whose(models, states, pose, frame, False, objects.state[a])
+    second = make_whose(models, states, pose, frame, True, objects.state[b])
+    size = wp.min(size_of(states, first), size_of(states, second))
+    deep = known_depth(manifolds_inout, p)
+    if manifolds_inout.count[p] > 0 and deep < DEEPER * size:
+        return
+    deep += DEEPER * size
+    least = wp.float64(deep)
+    sampling = Sampling()
+    most = manifolds_inout.point.shape[1]
+    sampling.samples = 3
+    sampling.radius = APART * size
+    normals = wp.transpose(objects.rotation[a]) * way_of_points(manifolds_inout, p)
+    sampling.way = way_of_second(models, states, pose, first, second, hits.any_hit[p], normals)
+    along = order_direction(objects.rotation[a])
+    searching = bool(True)
+    while searching:
+        best = Deepest()
+        best.item = KNOWN
+        best.depth = least
+        best = deepest_of_both(models, states, pose, solids, first, second, pairs[p], room, best, sampling)
+        searching = best.item != KNOWN
+        if searching:
+            point, sample, foot = deepest_points(models, states, objects, pose, pairs[p], best)
+            if warp_lane() == 0:
+                # The way out of what is inside, of the higher object, or of the lower one turned.
+                normal = unit_vector(wp.where(best.of_b != (pose.swapped != 0), foot - sample, sample - foot))
+                if manifolds_inout.count[p] == most:
+                    remove_nearest(p, sample, deep, manifolds_inout)
+                insert_point(p, along, sample, normal, best.depth, manifolds_inout)
+            if sampling.count == 0:
+                least = wp.max(deep, LESS * best.depth)
+            sampling = avoid_point(sampling, point)
+            searching = sampling.count <= AVOIDED_MAX and sampling.count < most

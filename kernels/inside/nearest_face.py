@@ -1,0 +1,169 @@
+"""The face of A or B that is nearest to a point in A's frame, by a search of its tree.
+
+Distances are those of `distance.triangle_pair` for a face and a point: at most the slack of `Whose` off, whatever the
+face. Boxes are compared in their own frame, to which the point is taken by the transpose of the rotation; the margin
+of `PairPose` covers that, a rotation off orthonormal included, along each axis, so twice of it along any line.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.nodes import Node, load_node
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.distance.frame import Frame
+from warp_abtree.kernels.inside.parity import STACK_ROOM, face_corners
+from warp_abtree.kernels.triangle.distance import clamp_unit, divide
+from warp_abtree.kernels.triangle.triangle_pair import Features, cross_exactly, offer, offer_corner, scale_triangles
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+# The candidate inside a face, after those on its three edges.
+INSIDE_FACE = wp.constant(3)
+NO_NEAREST = wp.constant(2**31 - 1)
+
+
+@wp.struct
+class Whose:
+    """One object of a pair, as distances of points from it are asked."""
+
+    of_b: bool  # whether it is B
+    node: wp.int32  # where its tree lies in the pool
+    centre: wp.vec3d  # of its model
+    slack: wp.float64  # that distances to its faces err by [model units]
+    margin: wp.float64  # that boxes are wider by, beside a part of the distance
+    grow: wp.float64  # a little over 1: that part
+
+
+@wp.func
+def make_whose(models: ModelPool, states: StatePool, pose: PairPose, frame: Frame, of_b: bool, state: wp.int32):
+    """Return A or B of a pair, of a state."""
+    whose = Whose()
+    whose.of_b = of_b
+    whose.node = wp.where(of_b, pose.node_b, pose.node_a)
+    whose.centre = models.centre[states.model[state]]
+    whose.slack = frame.pair_slack
+    whose.margin = wp.float64(2.0) * wp.float64(pose.margin) + frame.pair_slack
+    whose.grow = wp.float64(frame.grow)
+    return whose
+
+
+@wp.func
+def into_frame(pose: PairPose, whose: Whose, point: wp.vec3d):
+    """Return a point of A's frame in that of an object, about its model's centre."""
+    x = point
+    if whose.of_b:
+        x = wp.transpose(pose.rotation) * (point - pose.translation)
+    return x - whose.centre
+
+
+@wp.func
+def square_outside(node: Node, x: wp.vec3d):
+    """Return the squared distance of a point from a node's box."""
+    total = wp.float64(0.0)
+    for i in range(3):
+        gap = wp.max(wp.max(wp.float64(node.lower[i]) - x[i], x[i] - wp.float64(node.upper[i])), wp.float64(0.0))
+        total += gap * gap
+    return wp.where(node.skip < 0, wp.float64(wp.inf), total)
+
+
+@wp.func
+def offer_edge(best: Features, kind: wp.int32, w: wp.vec3d, u: wp.vec3d, v: wp.vec3d):
+    """Offer the point of an edge from u to v that is nearest to w."""
+    e = v - u
+    s = clamp_unit(divide(wp.dot(w - u, e), wp.dot(e, e)))
+    r = (w - u) - s * e
+    return offer(best, kind, wp.dot(r, r), s, wp.float64(0.0))
+
+
+@wp.func
+def point_features(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d):
+    """Return which point of a face is nearest to a point, scaled, and the scale."""
+    t = scale_triangles(a, b, c, point, point, point)
+    best = Features()
+    best.square = wp.float64(wp.inf)
+    zero = wp.vec3d()
+    best = offer_edge(best, 0, t.b0, zero, t.a1)
+    best = offer_edge(best, 1, t.b0, t.a1, t.a2)
+    best = offer_edge(best, 2, t.b0, t.a2, zero)
+    return offer_corner(best, INSIDE_FACE, t.b0, t.a1, t.a2, cross_exactly(t.a1, t.a2)), t.size
+
+
+@wp.func
+def point_weights(near: Features):
+    """Return the weights of a face's corners at its nearest point."""
+    one, zero = wp.float64(1.0), wp.float64(0.0)
+    rest = one - near.x
+    if near.kind == INSIDE_FACE:
+        return wp.vec3d(rest - near.y, near.x, near.y)
+    if near.kind == 0:
+        return wp.vec3d(rest, near.x, zero)
+    if near.kind == 1:
+        return wp.vec3d(zero, rest, near.x)
+    return wp.vec3d(near.x, zero, rest)
+
+
+@wp.func
+def point_distance(models: ModelPool, states: StatePool, pose: PairPose, whose: Whose, face: wp.int32, point: wp.vec3d):
+    """Return the distance of a point in A's frame from an active face of an object."""
+    a, b, c = face_corners(models, states, pose, whose.of_b, face)
+    near, size = point_features(a, b, c, point)
+    return wp.sqrt(near.square) * size
+
+
+@wp.func
+def nearest_face(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    whose: Whose,
+    point: wp.vec3d,
+    hint: wp.int32,
+    enough: wp.float64,
+):
+    """Return the least distance of a point from the faces of an object, and the lowest face that has it.
+
+    Args:
+        point: In A's frame.
+        hint: A face that may be near, or NO_NEAREST.
+        enough: The search ends with the first face that is nearer.
+    """
+    x = into_frame(pose, whose, point)
+    least, face = wp.float64(wp.inf), wp.int32(hint)
+    if hint != NO_NEAREST:
+        least = point_distance(models, states, pose, whose, hint, point)
+        if least < enough:
+            return least, face
+    limit = (least + whose.margin) * whose.grow
+    limit = limit * limit
+    stack = wp.zeros(shape=(STACK_ROOM,), dtype=wp.int32)
+    bound = wp.zeros(shape=(STACK_ROOM,), dtype=wp.float64)
+    stack[0] = 1
+    bound[0] = square_outside(load_node(states, whose.node + 1), x)
+    end = wp.int32(1)
+    while end > 0:
+        end -= 1
+        # Infinite where nothing is active.
+        live = bound[end] <= limit and bound[end] < wp.float64(wp.inf)
+        node = load_node(states, whose.node + stack[end])
+        if live and node.face < 0:
+            first = 2 * node.skip
+            d0 = square_outside(load_node(states, whose.node + first), x)
+            d1 = square_outside(load_node(states, whose.node + first + 1), x)
+            # The nearer one on top.
+            turn = wp.where(d0 < d1, 1, 0)
+            stack[end] = first + turn
+            bound[end] = wp.max(d0, d1)
+            stack[end + 1] = first + 1 - turn
+            bound[end + 1] = wp.min(d0, d1)
+            end += 2
+        elif live:
+            d = point_distance(models, states, pose, whose, node.face, point)
+            if d < least or (d == least and node.face < face):
+                face = node.face
+                if d < least:
+                    least = d
+                    limit = (d + whose.margin) * whose.grow
+                    limit = limit * limit
+                if d < enough:
+                    end = 0
+    return least, face

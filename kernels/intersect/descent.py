@@ -1,0 +1,234 @@
+"""How a thread of the CPU descends into an object pair: by boxes of nodes, then by slabs of subtrees where they pay.
+
+Slabs are made where few of many tests of boxes have led to hits. Of an object that is the first of several pairs in a
+row they serve all of these, and so pay where hits are more frequent too. What decides is the list of pairs alone, so
+that node pair tests are the same in every launch.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+ITEMS_AT_ONCE = native.constant("ITEMS_AT_ONCE")
+CPU_STACK_LENGTH = native.constant("CPU_STACK_LENGTH")
+DEPTH_FIRST_LENGTH = native.constant("DEPTH_FIRST_LENGTH")
+SUBTREES_KEPT = 512
+SUBTREE_DEPTH, SUBTREE_RECORDS = native.constant("SUBTREE_DEPTH"), native.constant("SUBTREE_RECORDS")
+# Zeros in front of a thread's memory say that it holds nothing.
+SLAB_ZEROS = 32
+SLAB_HEADER = native.constant("SLAB_HEADER")
+NO_FLOOR = native.constant("NO_FLOOR")
+# Slabs are made where so many pairs of nodes were compared for a hit, or more; the second is enough where all hits are
+# wanted and the tests have taken longer than slabs do.
+NODE_TESTS_A_HIT, NODE_TESTS_A_DENSE_HIT = wp.constant(wp.int64(256)), wp.constant(wp.int64(24))
+NEVER = wp.constant(wp.int64(2**62))
+
+# A thread tests so many face pairs at a time, so that its processor finds its way through either loop. For `any`, which
+# an early hit ends, few at first, and twice as many after each search without one, so that what an end wastes is at
+# most a part of what was needed.
+FACES_READY, FACES_FOR_ANY = wp.constant(128), wp.constant(4)
+ITEMS_FOR_ANY = wp.constant(8)
+# So many items leave room to go on depth first from any of them.
+STACK_TO_SHUFFLE = wp.constant(CPU_STACK_LENGTH // 2)
+WAITING_LENGTH = int(FACES_READY) + 4 * ITEMS_AT_ONCE + 16  # 16 are written at a time
+
+three_numbers = wp.types.vector(length=3, dtype=wp.int64)
+
+
+@wp.func_native(native.body("intersect/descend.h", "descend"))
+def descend(
+    states: StatePool,
+    pose: PairPose,
+    at_once: wp.int32,
+    ready: wp.int32,
+    most: wp.int64,
+    top: wp.int32,
+    stack: wp.array(dtype=wp.int64),
+    faces: wp.array(dtype=wp.int64),
+) -> three_numbers:
+    """Test items from the top of a stack until there are none, or so many leaf pairs wait as are asked for.
+
+    The same as `compare_node_pair`, four pairs of boxes at a time. Ends also once so many pairs of boxes were compared.
+
+    Returns the items left on the stack, the leaf pairs that wait, and the pairs of boxes compared.
+    """
+
+
+@wp.func_native(native.body("intersect/descend.h", "move_below"))
+def move_below(
+    floors: wp.vec2i, top: wp.int32, stack: wp.array(dtype=wp.int64), below: wp.array(dtype=wp.int64)
+) -> wp.vec2i:
+    """Move items near the top of a stack to a list if both nodes lie in subtrees whose roots are on floors.
+
+    Returns the items left on the stack, and those on the list, at most ITEMS_AT_ONCE.
+    """
+
+
+@wp.func_native(native.body("intersect/open_subtrees.h", "slab_cost"))
+def slab_cost(models: ModelPool, states: StatePool, pose: PairPose, repeats: wp.int32) -> wp.int64:
+    """Return about how many node pair tests the slabs of an object pair take, for an A of one pair before it or two."""
+
+
+@wp.func_native(native.body("intersect/open_subtrees.h", "open_subtrees"))
+def open_subtrees(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    thread: wp.int32,
+    memory: wp.array2d(dtype=wp.float32),
+) -> wp.vec2i:
+    """Choose the directions of slabs for an object pair; return its floors, see `move_below`.
+
+    Directions and slabs of A stay for the next pair with it, in this launch or a later one.
+    """
+
+
+@wp.func_native(native.body("intersect/subtrees.h", "descend_subtrees"))
+def descend_subtrees(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    thread: wp.int32,
+    ready: wp.int32,
+    top: wp.int32,
+    stack: wp.array(dtype=wp.int64),
+    memory: wp.array2d(dtype=wp.float32),
+    faces: wp.array(dtype=wp.int64),
+) -> three_numbers:
+    """Test items below the floors until there are none, or so many leaf pairs wait as are asked for.
+
+    Returns the items left on the stack, the leaf pairs that wait, and the pairs of nodes compared.
+    """
+
+
+def slab_memory_words(depth: int) -> int:
+    """Return the length of a thread's memory for slabs, for trees of a depth at most."""
+    slots = max(16, min(SUBTREES_KEPT, 2 ** max(0, depth - SUBTREE_DEPTH)))
+    return 16 + SLAB_HEADER + slots * (2 + 32 * SUBTREE_RECORDS)
+
+
+@wp.struct
+class Descent:
+    """How a thread goes through an object pair, and how far it is."""
+
+    thread: wp.int32  # row of the memory for slabs
+    at_once: wp.int32  # items taken from the stack
+    ready: wp.int32  # leaf pairs that are tested together
+    top: wp.int32  # items on the stack
+    deep: wp.int32  # items below the floors
+    floors: wp.vec2i  # levels of the subtrees that have slabs, NO_FLOOR for none
+    plain_tests: wp.int64  # node pair tests after which a pair of few hits has slabs
+    looks: wp.int64  # node pair tests after which to look whether slabs are to be made
+    repeats: wp.int32  # object pairs just before this one that have its A, at most 2: slabs of A serve them all
+    cost: wp.int64  # `slab_cost`, -1 while it is not known
+
+
+@wp.func
+def count_repeats(p: wp.int32, pair_poses: wp.array(dtype=PairPose)):
+    """Return how many object pairs just before one have the same A, at most 2."""
+    node_a = pair_poses[p].node_a
+    repeats = wp.int32(0)
+    while repeats < wp.min(p, 2) and pair_poses[p - 1 - repeats].node_a == node_a:
+        repeats += 1
+    return repeats
+
+
+@wp.func
+def start_pair(output: wp.int32, plain_tests: wp.int64, repeats: wp.int32, before: Descent):
+    """Return the descent from the item on the stack."""
+    descent = before
+    descent.at_once = wp.where(output == OUTPUT_ANY, ITEMS_FOR_ANY, ITEMS_AT_ONCE)
+    descent.ready = wp.where(output == OUTPUT_ANY, FACES_FOR_ANY, FACES_READY)
+    descent.top = 1
+    descent.deep = 0
+    descent.floors = wp.vec2i(NO_FLOOR, NO_FLOOR)
+    descent.plain_tests = plain_tests
+    descent.repeats = repeats
+    # An early hit ends `any`.
+    descent.cost = wp.where(output == OUTPUT_ANY or repeats == 0, NEVER, wp.int64(-1))
+    descent.looks = wp.where(descent.cost == NEVER, plain_tests, plain_tests / wp.int64(3))
+    return descent
+
+
+@wp.func
+def wants_slabs(
+    models: ModelPool, states: StatePool, pose: PairPose, hit_count: wp.int64, tested: wp.int64, before: Descent
+):
+    """Return whether slabs are to be made, and the descent with the next time to look."""
+    descent = before
+    if tested >= descent.plain_tests and hit_count * NODE_TESTS_A_HIT <= tested:
+        return True, descent
+    if descent.cost < wp.int64(0):
+        descent.cost = slab_cost(models, states, pose, descent.repeats)
+    if tested >= descent.cost and hit_count * NODE_TESTS_A_DENSE_HIT <= tested:
+        return True, descent
+    descent.looks = tested * wp.int64(2)
+    if tested < descent.plain_tests:
+        descent.looks = wp.min(descent.looks, descent.plain_tests)
+    if tested < descent.cost:
+        descent.looks = wp.min(descent.looks, descent.cost)
+    return False, descent
+
+
+@wp.func
+def advance(
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    hit_count: wp.int64,
+    tested: wp.int64,
+    before: Descent,
+    stack: wp.array(dtype=wp.int64),
+    below: wp.array(dtype=wp.int64),
+    memory: wp.array2d(dtype=wp.float32),
+    faces: wp.array(dtype=wp.int64),
+):
+    """Descend until leaf pairs wait; return the descent then, the leaf pairs, and the node pair tests more.
+
+    Boxes decide until slabs are made; then these, below the floors.
+    """
+    descent = before
+    if descent.top > 0 and tested >= descent.looks:
+        wanted, descent = wants_slabs(models, states, pose, hit_count, tested, descent)
+        if wanted:
+            descent.floors = open_subtrees(models, states, pose, descent.thread, memory)
+            descent.looks = NEVER
+    plain = descent.floors[0] == NO_FLOOR
+    if not plain and descent.deep == 0:
+        moved = move_below(descent.floors, descent.top, stack, below)
+        descent.top = moved[0]
+        descent.deep = moved[1]
+    progress = three_numbers()
+    if descent.deep > 0:
+        progress = descend_subtrees(
+            models, states, pose, descent.thread, descent.ready, descent.deep, below, memory, faces
+        )
+        descent.deep = wp.int32(progress[0])
+    else:
+        most = wp.where(plain, descent.looks - tested, wp.int64(1))
+        progress = descend(states, pose, descent.at_once, descent.ready, most, descent.top, stack, faces)
+        descent.top = wp.int32(progress[0])
+    return descent, wp.int32(progress[1]), progress[2]
+
+
+@wp.func
+def seek_elsewhere(met: wp.int32, number: wp.int64, before: Descent, stack: wp.array(dtype=wp.int64)):
+    """End a search that found a hit; else go on with some other item of the stack, and with more at a time."""
+    descent = before
+    if met > 0:
+        descent.top = 0
+        descent.deep = 0
+    descent.at_once = wp.min(2 * descent.at_once, ITEMS_AT_ONCE)
+    descent.ready = wp.min(2 * descent.ready, FACES_READY)
+    last = descent.top - 1
+    if last > 0 and last < STACK_TO_SHUFFLE:
+        at = wp.int32((number * wp.int64(40503) >> wp.int64(8)) % wp.int64(descent.top))
+        item = stack[at]
+        stack[at] = stack[last]
+        stack[last] = item
+    return descent

@@ -1,0 +1,211 @@
+"""Face pairs of an object pair: the stages that decide them, and the report of those that meet."""
+
+import warp as wp
+
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.boxes import map_point
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.exact.predicates import FLOAT32, UNCERTAIN
+from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair, load_near
+from warp_abtree.kernels.triangle.distance import triangles_near
+from warp_abtree.kernels.triangle.float32_filter import (
+    FLOAT32_UNIT,
+    are_uncertain,
+    gap_signs,
+    have_one_side,
+    intersect_straddling,
+    plane_signs,
+    rotate_corners,
+)
+from warp_abtree.kernels.triangle.float64_filter import decide_triangles
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+OUTPUT_ANY = wp.constant(0)
+OUTPUT_COUNT = wp.constant(1)
+OUTPUT_FACES = wp.constant(2)
+
+# In place of a precision: faces count as met unless proved farther apart than a distance.
+WITHIN = wp.constant(-1)
+# EXACT, and face pairs that are apart by less than a gap are listed too.
+GAP = wp.constant(-2)
+
+# On the pair of a face pair in `Hits.face`: it is apart.
+NEAR_BIT = wp.constant(1 << 30)
+PAIR_MASK = wp.constant((1 << 30) - 1)
+# In float32 a gap is no larger, so that its products with lengths are finite; and rounded up.
+GAP_MAX, GAP_ROUNDING_32 = wp.constant(2.0**60), wp.constant(1.0 + 2.0**-20)
+
+
+@wp.struct
+class Hits:
+    """Results of a batch of pairs. Lists are full where their total is beyond their shape, which is then the demand."""
+
+    any_hit: wp.array(dtype=wp.int32)  # 0, 1 where the surfaces meet, more where a solid holds the other, shape [pair]
+    count: wp.array(dtype=wp.int64)  # face pairs that intersect, shape [pair]
+    face: wp.array(dtype=wp.vec3i)  # (pair, face of its first object, face of its second), shape [capacity]
+    total: wp.array(dtype=wp.int32)  # numbers `face` and may wrap: the demand is the sum of `count`
+    node_tests: wp.array(dtype=wp.int64)  # pairs of boxes compared, shape [pair]
+    triangle_tests: wp.array(dtype=wp.int64)  # face pairs tested, shape [pair]
+    float64_tests: wp.array(dtype=wp.int64)  # those that are uncertain in float32, shape [pair]
+    exact_tests: wp.array(dtype=wp.int64)  # those that are inexact in float64 and took exact signs, shape [pair]
+    uncertain: wp.array(dtype=wp.vec3i)  # (pair, face of the lower object, face of the higher), shape [capacity]
+    uncertain_total: wp.array(dtype=wp.int32)  # numbers `uncertain`
+    inexact: wp.array(dtype=wp.vec3i)  # as `uncertain`, of the same shape where there is an exact stage
+    inexact_total: wp.array(dtype=wp.int32)  # numbers `inexact`
+    gap: wp.array(dtype=wp.float64)  # under which face pairs are near [world units], shape [pair]; [0] for no gap
+    apart: wp.array(dtype=wp.vec3i)  # as `uncertain`: pairs that are apart and may be near, shape [capacity]
+    apart_total: wp.array(dtype=wp.int32)  # numbers `apart`
+
+
+@wp.func
+def near_of_a(models: ModelPool, pose: PairPose, vertex: wp.int32):
+    return load_near(models, vertex) * wp.float32(pose.scale)
+
+
+@wp.func
+def near_of_b(models: ModelPool, pose: PairPose, vertex: wp.int32):
+    return map_point(pose.rotation32, pose.translation32, load_near(models, vertex)) * wp.float32(pose.scale)
+
+
+@wp.func
+def float32_bounds(mode: wp.int32, pose: PairPose):
+    """Return the error of coordinates and of arithmetic that signs allow for; none for FLOAT32."""
+    return wp.where(mode == FLOAT32, 0.0, pose.error), wp.where(mode == FLOAT32, 0.0, FLOAT32_UNIT)
+
+
+@wp.func
+def scaled_gap(pose: PairPose):
+    """Return the distance that boxes are widened by at the scale of float32, not too small."""
+    return wp.min(wp.float32(pose.within * pose.scale) * GAP_ROUNDING_32, GAP_MAX)
+
+
+@wp.func
+def face_plane_signs(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+):
+    """Return SEPARATED where the plane of one of two active faces separates them in float32, else the signs."""
+    if mode == WITHIN or (mode != FLOAT32 and pose.error == wp.inf):
+        return 0
+    a = load_corner_ids(states, pose.corner_a + face_a)
+    b = load_corner_ids(states, pose.corner_b + face_b)
+    error, unit = float32_bounds(mode, pose)
+    a0, a1, a2 = near_of_a(models, pose, a[0]), near_of_a(models, pose, a[1]), near_of_a(models, pose, a[2])
+    b0, b1, b2 = near_of_b(models, pose, b[0]), near_of_b(models, pose, b[1]), near_of_b(models, pose, b[2])
+    if mode == GAP:
+        return gap_signs(error, unit, scaled_gap(pose), a0, a1, a2, b0, b1, b2)
+    return plane_signs(error, unit, a0, a1, a2, b0, b1, b2)
+
+
+@wp.func
+def intersect_straddling_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+    signs: wp.int32,
+):
+    """Test straddling faces in float32, with the signs of `face_plane_signs`; return 1, 0 or UNCERTAIN."""
+    error, unit = float32_bounds(mode, pose)
+    if mode == GAP and have_one_side(signs):
+        return 0
+    if are_uncertain(unit, signs):
+        return UNCERTAIN
+    a = load_corner_ids(states, pose.corner_a + face_a)
+    b = load_corner_ids(states, pose.corner_b + face_b)
+    p1, q1, r1, p2, q2, r2 = rotate_corners(signs, a[0], a[1], a[2], b[0], b[1], b[2])
+    return intersect_straddling(
+        error,
+        unit,
+        near_of_a(models, pose, p1),
+        near_of_a(models, pose, q1),
+        near_of_a(models, pose, r1),
+        near_of_b(models, pose, p2),
+        near_of_b(models, pose, q2),
+        near_of_b(models, pose, r2),
+    )
+
+
+@wp.func
+def test_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+):
+    """Test one active face of A against one of B in float64, in A's frame; return 1, 0 or UNCERTAIN."""
+    a = states.face_corner[pose.corner_a + face_a]
+    b = states.face_corner[pose.corner_b + face_b]
+    a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
+    if mode == FLOAT32:
+        # A power of two brings the model to unit size, so that no product leaves float32's range.
+        s = pose.scale
+        return decide_triangles(mode, a0 * s, a1 * s, a2 * s, b0 * s, b1 * s, b2 * s)
+    return decide_triangles(mode, a0, a1, a2, b0, b1, b2)
+
+
+@wp.func
+def faces_near(models: ModelPool, states: StatePool, pose: PairPose, face_a: wp.int32, face_b: wp.int32):
+    """Return 1 unless the faces are proved farther apart than `within`, in float64; then 0."""
+    a = states.face_corner[pose.corner_a + face_a]
+    b = states.face_corner[pose.corner_b + face_b]
+    a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
+    return triangles_near(pose.within, a0, a1, a2, b0, b1, b2)
+
+
+@wp.func
+def try_straddling_faces(
+    mode: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    face_a: wp.int32,
+    face_b: wp.int32,
+    signs: wp.int32,
+):
+    """Return whether straddling faces meet in the first stage: 1, 0 or UNCERTAIN; for WITHIN, in all stages."""
+    if mode == WITHIN:
+        return faces_near(models, states, pose, face_a, face_b)
+    return intersect_straddling_faces(mode, models, states, pose, face_a, face_b, signs)
+
+
+@wp.func
+def defer_uncertain(slot: wp.int32, pair: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+    """Put a face pair on the list of uncertain ones, if there is room."""
+    if slot >= 0 and slot < hits.uncertain.shape[0]:
+        hits.uncertain[slot] = wp.vec3i(pair, face_a, face_b)
+
+
+@wp.func
+def list_apart(slot: wp.int32, pair: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+    """Put a face pair on the list of those that are apart, if there is room."""
+    if slot >= 0 and slot < hits.apart.shape[0]:
+        hits.apart[slot] = wp.vec3i(pair, face_a, face_b)
+
+
+@wp.func
+def report_hit(slot: wp.int32, pair: wp.int32, swapped: wp.int32, face_a: wp.int32, face_b: wp.int32, hits: Hits):
+    """Write a hit in the order in which the pair names its objects, if there is room."""
+    if slot >= 0 and slot < hits.face.shape[0]:
+        if swapped != 0:
+            hits.face[slot] = wp.vec3i(pair, face_b, face_a)
+        else:
+            hits.face[slot] = wp.vec3i(pair, face_a, face_b)
+
+
+@wp.func
+def count_apart(hits: Hits):
+    """Return how many face pairs are listed as apart; a count past 2^31 goes past the sign bit, not around."""
+    count = wp.int64(0)
+    if hits.gap.shape[0] > 0:
+        count = wp.int64(wp.uint32(hits.apart_total[0]))
+    return count

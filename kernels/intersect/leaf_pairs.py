@@ -1,0 +1,91 @@
+"""Leaf pairs that wait in a warp's lists, in two passes: planes first, and only of straddling pairs the edges.
+
+A pair is separated where the plane of one face has the other on one side, else it straddles. All lanes of a warp come
+here together.
+"""
+
+import warp as wp
+
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.base.counters import reserve_slot
+from warp_abtree.kernels.base.lanes import warp_lane, warp_sync
+from warp_abtree.kernels.base.poses import PairPose
+from warp_abtree.kernels.exact.predicates import UNCERTAIN
+from warp_abtree.kernels.intersect.face_pairs import (
+    GAP,
+    OUTPUT_FACES,
+    Hits,
+    defer_uncertain,
+    face_plane_signs,
+    list_apart,
+    report_hit,
+    try_straddling_faces,
+)
+from warp_abtree.kernels.search.item import item_first, item_second
+from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, STRADDLING_START, push_straddling, read_item, read_signs
+from warp_abtree.kernels.triangle.float32_filter import SEPARATED
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.func
+def separate_leaf_pairs(
+    mode: wp.int32,
+    items: wp.uint64,
+    first: wp.int32,
+    popped: wp.int32,
+    straddling: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+):
+    """Drop the leaf pairs that a plane separates, one a lane; return how many straddling pairs wait then."""
+    lane = warp_lane()
+    item = read_item(items, STACK_LENGTH + first + wp.min(lane, popped - 1))
+    signs = face_plane_signs(mode, models, states, pose, item_first(item), item_second(item))
+    signs = wp.where(lane < popped, signs, SEPARATED)
+    straddling = push_straddling(items, straddling, signs != SEPARATED, item, signs)
+    warp_sync()
+    return straddling
+
+
+@wp.func
+def test_straddling(
+    output: wp.int32,
+    mode: wp.int32,
+    items: wp.uint64,
+    first: wp.int32,
+    popped: wp.int32,
+    pair: wp.int32,
+    models: ModelPool,
+    states: StatePool,
+    pose: PairPose,
+    hits: Hits,
+):
+    """Test straddling pairs, one a lane; return whether this lane's meets, and whether it is uncertain.
+
+    With a gap pairs straddle that no plane parts by more than that, and those that are apart are listed.
+    """
+    lane = warp_lane()
+    at = first + wp.min(lane, popped - 1)
+    item = read_item(items, STRADDLING_START + at)
+    signs = read_signs(items, at)
+    meet = try_straddling_faces(mode, models, states, pose, item_first(item), item_second(item), signs)
+    if mode == GAP:
+        apart = meet == 0 and lane < popped
+        slot = reserve_slot(hits.apart_total, apart)
+        if apart:
+            list_apart(slot, pair, item_first(item), item_second(item), hits)
+    meet = wp.where(lane < popped, meet, 0)
+    warp_sync()
+    found = meet == 1
+    if output == OUTPUT_FACES:
+        slot = reserve_slot(hits.total, found)
+        if found:
+            report_hit(slot, pair, pose.swapped, item_first(item), item_second(item), hits)
+    if found:
+        hits.any_hit[pair] = 1
+    slot = reserve_slot(hits.uncertain_total, meet == UNCERTAIN)
+    if meet == UNCERTAIN:
+        defer_uncertain(slot, pair, item_first(item), item_second(item), hits)
+    return found, meet == UNCERTAIN

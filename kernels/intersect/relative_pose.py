@@ -1,0 +1,157 @@
+"""The start of a traversal: the relative pose of each object pair, and its counters at 0."""
+
+import functools
+
+import warp as wp
+
+from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
+from warp_abtree.kernels.base.generation import record_launch
+from warp_abtree.kernels.base.lanes import WARP_SIZE
+from warp_abtree.kernels.base.poses import PairPose, pair_pose
+from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, Hits
+from warp_abtree.kernels.intersect.small_trees import is_small
+from warp_abtree.kernels.search.load_balance import NO_UNIT, Work, note_descent, units_per_pair
+from warp_abtree.kernels.triangle.distance import DISTANCE_MAX, pad_distance
+
+MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False, "block_dim": WARP_SIZE}
+wp.set_module_options(MODULE_OPTIONS)
+
+
+@wp.func
+def clear_work(count: wp.int32, work: Work):
+    """Set out the units of so many pairs; none for a stale launch, whose tree states may be half changed in bounds."""
+    stale = record_launch(work.record)
+    work.counter[0] = 0
+    work.counter[1] = 0
+    work.counter[2] = wp.where(stale, 0, count * units_per_pair(work.warps_per_pair, count))
+    work.counter[3] = wp.where(stale, NO_UNIT, work.warps)
+
+
+@wp.func
+def clear_hits(p: wp.int32, hits: Hits):
+    if p == 0:
+        hits.total[0] = 0
+        hits.uncertain_total[0] = 0
+        hits.inexact_total[0] = 0
+        if hits.gap.shape[0] > 0:
+            hits.apart_total[0] = 0
+    hits.any_hit[p] = 0
+    hits.count[p] = wp.int64(0)
+    hits.node_tests[p] = wp.int64(0)
+    hits.triangle_tests[p] = wp.int64(0)
+    hits.float64_tests[p] = wp.int64(0)
+    hits.exact_tests[p] = wp.int64(0)
+
+
+@wp.struct
+class Started:
+    """The object pairs of the threads of the CPU: one thread starts them, alone or before others are there."""
+
+    pair_count: wp.array(dtype=wp.int32)  # shape (1,)
+    pairs: wp.array(dtype=wp.vec2i)  # objects, shape [pair]; [0] where they are started
+    within: wp.array(dtype=wp.float64)  # as for `relative_pose_kernel`
+    pair_poses: wp.array(dtype=PairPose)  # shape [pair]
+    only: wp.bool  # whether nothing is traversed
+
+
+@functools.cache
+def pose_starter(with_distances: bool):
+    """Return the function that starts the traversal of a pair: for pairs that meet, or are nearer than distances."""
+
+    @wp.func
+    def start_pose(
+        p: wp.int32,
+        output: wp.int32,
+        models: ModelPool,
+        states: StatePool,
+        objects: ObjectPool,
+        pairs: wp.array(dtype=wp.vec2i),
+        within: wp.array(dtype=wp.float64),
+        pair_poses: wp.array(dtype=PairPose),
+        work: Work,
+    ):
+        """Compute the pose of B in A's frame, A the smaller index."""
+        a = wp.min(pairs[p][0], pairs[p][1])
+        b = wp.max(pairs[p][0], pairs[p][1])
+        distance = wp.float64(0.0)
+        if wp.static(with_distances):
+            distance = pad_distance(models, states, objects, a, b, within[p])
+        pose = pair_pose(output != OUTPUT_ANY, models, states, objects, a, b, distance)
+        if wp.static(with_distances):
+            if within[p] >= DISTANCE_MAX:
+                # Nothing is proved where distances may overflow: every box passes, and the first faces count as near.
+                pose.within = wp.float64(wp.inf)
+                pose.margin = wp.inf
+        if pose.margin >= 0.0 and not is_small(pose, work.small_faces):
+            note_descent(work)
+        pose.swapped = wp.where(pairs[p][0] > pairs[p][1], 1, 0)
+        pair_poses[p] = pose
+
+    return start_pose
+
+
+@functools.cache
+def relative_poses(with_distances: bool):
+    """Return the kernel that starts a traversal, as `pose_starter`."""
+    start_pose = pose_starter(with_distances)
+
+    @wp.kernel(module="unique", module_options=MODULE_OPTIONS)
+    def relative_pose_kernel(
+        output: wp.int32,
+        models: ModelPool,
+        states: StatePool,
+        objects: ObjectPool,
+        pair_count: wp.array(dtype=wp.int32),
+        pairs: wp.array(dtype=wp.vec2i),
+        within: wp.array(dtype=wp.float64),
+        pair_pose_out: wp.array(dtype=PairPose),
+        hits_out: Hits,
+        work_out: Work,
+    ):
+        """Compute the pose of B in A's frame once a pair, A the smaller index, and clear what the traversal counts.
+
+        Args:
+            within: Distances [world units] that boxes are to be widened by, shape [pair]; [0] for intersection.
+        """
+        p = wp.tid()
+        count = wp.min(pair_count[0], pairs.shape[0])
+        if p < work_out.flag.shape[0]:
+            work_out.flag[p] = 0
+        # By the last thread, which has no pose to wait for unless there are very many.
+        if p == wp.max(pairs.shape[0], work_out.flag.shape[0]) - 1:
+            clear_work(count, work_out)
+        if p >= pairs.shape[0]:
+            return
+        clear_hits(p, hits_out)
+        if p >= count:
+            return
+        start_pose(p, output, models, states, objects, pairs, within, pair_pose_out, work_out)
+
+    return relative_pose_kernel
+
+
+@functools.cache
+def pairs_starter(with_distances: bool):
+    """Return the function by which one thread does what `relative_poses` do, where it is to."""
+    start_pose = pose_starter(with_distances)
+
+    @wp.func
+    def start_pairs(
+        output: wp.int32,
+        models: ModelPool,
+        states: StatePool,
+        objects: ObjectPool,
+        started: Started,
+        hits: Hits,
+        work: Work,
+    ):
+        room = started.pairs.shape[0]
+        if room > 0:
+            count = wp.min(started.pair_count[0], room)
+            clear_work(count, work)
+            for p in range(room):
+                clear_hits(p, hits)
+            for p in range(count):
+                start_pose(p, output, models, states, objects, started.pairs, started.within, started.pair_poses, work)
+
+    return start_pairs

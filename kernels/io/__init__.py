@@ -1,0 +1,1 @@
+"""Results, sorting and poses between device and host."""

@@ -1,0 +1,132 @@
+"""Between the poses of Newton's bodies and those of objects, and from contact points to `newton.Contacts`."""
+
+import warp as wp
+
+from warp_abtree.kernels.base.arrays import ObjectPool
+from warp_abtree.kernels.base.poses import rotate_quaternion
+from warp_abtree.kernels.contacts.manifold import Manifolds
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.struct
+class RigidContacts:
+    """Rigid contacts of `newton.Contacts` as its solvers read them; shape [rigid_contact_max] except count."""
+
+    count: wp.array(dtype=wp.int32)  # [1], contacts
+    shape0: wp.array(dtype=wp.int32)  # first shape of each contact
+    shape1: wp.array(dtype=wp.int32)  # second shape
+    point0: wp.array(dtype=wp.vec3)  # contact point of shape 0 [m], body frame
+    point1: wp.array(dtype=wp.vec3)  # contact point of shape 1 [m], body frame
+    offset0: wp.array(dtype=wp.vec3)  # from point0 to the surface with margin [m], body frame
+    offset1: wp.array(dtype=wp.vec3)  # from point1 to the surface with margin [m], body frame
+    normal: wp.array(dtype=wp.vec3)  # unit, from shape 0 to shape 1, world
+    margin0: wp.array(dtype=wp.float32)  # surface margin of shape 0 [m]
+    margin1: wp.array(dtype=wp.float32)  # surface margin of shape 1 [m]
+
+
+@wp.func
+def pose_shape(
+    body_q: wp.array(dtype=wp.transform),
+    shape_body: wp.array(dtype=wp.int32),
+    shape_transform: wp.array(dtype=wp.transform),
+    shape: wp.int32,
+):
+    """Return where a shape stands in the world."""
+    if shape_body[shape] < 0:
+        return shape_transform[shape]
+    return body_q[shape_body[shape]] * shape_transform[shape]
+
+
+@wp.kernel
+def pose_object_kernel(
+    shapes: wp.array(dtype=wp.int32),
+    body_q: wp.array(dtype=wp.transform),
+    shape_body: wp.array(dtype=wp.int32),
+    shape_transform: wp.array(dtype=wp.transform),
+    objects_out: ObjectPool,
+):
+    """Put each object where its shape stands, its quaternion normalised in float64."""
+    i = wp.tid()
+    x = pose_shape(body_q, shape_body, shape_transform, shapes[i])
+    q = wp.transform_get_rotation(x)
+    objects_out.position[i] = wp.vec3d(wp.transform_get_translation(x))
+    objects_out.rotation[i] = rotate_quaternion(
+        wp.vec4d(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3]))
+    )
+
+
+@wp.func
+def enter_body(
+    body_q: wp.array(dtype=wp.transform), shape_body: wp.array(dtype=wp.int32), shape: wp.int32, point: wp.vec3d
+):
+    """Return a point of the world in the frame of a shape's body."""
+    if shape_body[shape] < 0:
+        return wp.vec3(point)
+    x = body_q[shape_body[shape]]
+    q = wp.transform_get_rotation(x)
+    turned = rotate_quaternion(wp.vec4d(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3])))
+    return wp.vec3(wp.transpose(turned) * (point - wp.vec3d(wp.transform_get_translation(x))))
+
+
+@wp.func
+def turn_into_body(
+    body_q: wp.array(dtype=wp.transform), shape_body: wp.array(dtype=wp.int32), shape: wp.int32, v: wp.vec3
+):
+    """Return a vector of the world in the frame of a shape's body."""
+    if shape_body[shape] < 0:
+        return v
+    return wp.quat_rotate_inv(wp.transform_get_rotation(body_q[shape_body[shape]]), v)
+
+
+@wp.kernel
+def count_point_kernel(pair_count: wp.array(dtype=wp.int32), manifolds: Manifolds, count_out: wp.array(dtype=wp.int32)):
+    """Count the points of each pair in place, 0 behind the last."""
+    p = wp.tid()
+    count_out[p] = wp.where(p < pair_count[0], manifolds.count[p], 0)
+
+
+@wp.kernel
+def write_contact_kernel(
+    first: wp.array(dtype=wp.int32),
+    margin: wp.array(dtype=wp.float32),
+    shapes: wp.array(dtype=wp.int32),
+    body_q: wp.array(dtype=wp.transform),
+    shape_body: wp.array(dtype=wp.int32),
+    pairs: wp.array(dtype=wp.vec2i),
+    manifolds: Manifolds,
+    end: wp.array(dtype=wp.int32),
+    count: wp.array(dtype=wp.int32),
+    contacts_out: RigidContacts,
+):
+    """Write the points of one pair a thread: half the depth on either side of where the manifold has them.
+
+    Args:
+        first: Contacts that are there already, which stay, shape [1].
+        margin: Surface margin of each shape [m].
+        end: Sum of the counts of points up to and with each pair.
+    """
+    p = wp.tid()
+    if p == pairs.shape[0] - 1:
+        contacts_out.count[0] = first[0] + end[p]
+    shape0 = shapes[pairs[p][0]]
+    shape1 = shapes[pairs[p][1]]
+    k = wp.int32(0)
+    while k < count[p]:
+        at = first[0] + end[p] - count[p] + k
+        if at < contacts_out.shape0.shape[0]:
+            n = manifolds.normal[p, k]
+            half = wp.float64(0.5) * manifolds.depth[p, k]
+            x0 = manifolds.point[p, k] + n * half
+            x1 = manifolds.point[p, k] - n * half
+            normal = wp.vec3(n)
+            contacts_out.shape0[at] = shape0
+            contacts_out.shape1[at] = shape1
+            contacts_out.point0[at] = enter_body(body_q, shape_body, shape0, x0)
+            contacts_out.point1[at] = enter_body(body_q, shape_body, shape1, x1)
+            contacts_out.offset0[at] = turn_into_body(body_q, shape_body, shape0, margin[shape0] * normal)
+            contacts_out.offset1[at] = turn_into_body(body_q, shape_body, shape1, -margin[shape1] * normal)
+            contacts_out.normal[at] = normal
+            contacts_out.margin0[at] = margin[shape0]
+            contacts_out.margin1[at] = margin[shape1]
+        k += 1

@@ -1,0 +1,68 @@
+// Counters and totals in memory, which the lanes of a warp add to by one atomic. On the CPU a warp is one thread.
+#pragma once
+#include "builtin.h"
+
+inline CUDA_CALLABLE wp::int32 reserve_slot(wp::array_t<wp::int32> total, bool flag) {
+#if defined(__CUDA_ARCH__)
+    unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    if (votes == 0)
+        return 0;
+    int lane = threadIdx.x & 31;
+    int leader = __ffs(votes) - 1;
+    int start = 0;
+    if (lane == leader)
+        start = atomicAdd(total.data, __popc(votes));
+    start = __shfl_sync(0xffffffffu, start, leader);
+    return start + __popc(votes & ((1u << lane) - 1u));
+#else
+    int start = total.data[0];
+    if (flag)
+        total.data[0] = start + 1;
+    return start;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 take_slots(wp::array_t<wp::int32> total, wp::int32 count) {
+#if defined(__CUDA_ARCH__)
+    return atomicAdd(total.data, count);
+#else
+    return __atomic_fetch_add(total.data, count, __ATOMIC_RELAXED);
+#endif
+}
+
+inline CUDA_CALLABLE void add_warp_sum(wp::array_t<wp::int64> totals, wp::int32 i, wp::int32 x) {
+#if defined(__CUDA_ARCH__)
+    long long sum = x;
+    for (int step = 16; step > 0; step >>= 1)
+        sum += __shfl_down_sync(0xffffffffu, sum, step);
+    if (threadIdx.x == 0 && sum != 0)
+        atomicAdd((unsigned long long*)totals.data + i, (unsigned long long)sum);
+#else
+    totals.data[i] += x;
+#endif
+}
+
+inline CUDA_CALLABLE void count_flags(wp::array_t<wp::int64> totals, wp::int32 i, bool flag) {
+#if defined(__CUDA_ARCH__)
+    if (!__any_sync(0xffffffffu, flag))
+        return;
+    unsigned int same = __match_any_sync(0xffffffffu, flag ? i : -1);
+    if (flag && (threadIdx.x & 31) + 1 == __ffs(same))
+        atomicAdd((unsigned long long*)totals.data + i, (unsigned long long)__popc(same));
+#else
+    if (flag)
+        totals.data[i] += 1;
+#endif
+}
+
+inline CUDA_CALLABLE void add_lanes(wp::array_t<wp::int64> totals, wp::int32 i, wp::int64 x) {
+#if defined(__CUDA_ARCH__)
+    long long sum = x;
+    for (int step = 16; step > 0; step >>= 1)
+        sum += __shfl_down_sync(0xffffffffu, sum, step);
+    if ((threadIdx.x & 31) == 0 && sum != 0)
+        atomicAdd((unsigned long long*)totals.data + i, (unsigned long long)sum);
+#else
+    totals.data[i] += x;
+#endif
+}

@@ -1,0 +1,19 @@
+// Bounds of the distance of two triangles, in float32.
+#pragma once
+#include "builtin.h"
+#include "distance/faces32.h"
+
+template <class Corners>
+inline CUDA_CALLABLE wp::vec_t<2, wp::float32> bound_faces(wp::float32 own, Corners a, Corners b) {
+#include "distance/faces32.h"
+    typedef NearestFaces N;
+    N::Corners c;
+    const N::lanes zero = {};
+    for (int k = 0; k < 3; ++k) {
+        c.a[k] = N::Point{zero + a.data[k][0], zero + a.data[k][1], zero + a.data[k][2]};
+        c.b[k] = N::Point{zero + b.data[k][0], zero + b.data[k][1], zero + b.data[k][2]};
+    }
+    N::lanes size;
+    const N::lanes d = N::F::root(N::measure(c, size)), error = N::error_of(d, size, own);
+    return wp::vec_t<2, wp::float32>(N::F::first(d - error), N::F::first(d + error));
+}

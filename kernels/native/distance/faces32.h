@@ -1,0 +1,82 @@
+// Distances of pairs of faces in float32, within an error that is known: as `nearest_features`.
+#pragma once
+#include "builtin.h"
+#include "base/float32.h"
+
+struct NearestFaces {
+    typedef Float32 F;
+    typedef F::lanes lanes;
+    typedef F::bits bits;
+    typedef F::Point Point;
+    struct Corners {
+        Point a[3], b[3];
+    };
+    static CUDA_CALLABLE lanes most(const lanes& a, const lanes& b) { return a > b ? a : b; }
+    static CUDA_CALLABLE lanes least(const lanes& a, const lanes& b) { return a < b ? a : b; }
+    static CUDA_CALLABLE lanes clamp(const lanes& x) { return least(most(x, lanes{}), lanes{} + 1.0f); }
+    static CUDA_CALLABLE lanes invert(const lanes& x) { return x > 0x1p-126f ? 1.0f / x : lanes{}; }
+    static CUDA_CALLABLE Point add(const Point& p, const lanes& s, const Point& v) {
+        return Point{F::fuse(s, v.x, p.x), F::fuse(s, v.y, p.y), F::fuse(s, v.z, p.z)};
+    }
+    static CUDA_CALLABLE lanes minor(const lanes& a, const lanes& b, const lanes& c, const lanes& d) {
+        const lanes w = c * d;
+        return F::fuse(a, b, -w) - F::fuse(c, d, -w);
+    }
+    static CUDA_CALLABLE Point cross_exactly(const Point& u, const Point& v) {
+        return Point{minor(u.y, v.z, u.z, v.y), minor(u.z, v.x, u.x, v.z), minor(u.x, v.y, u.y, v.x)};
+    }
+    static CUDA_CALLABLE lanes largest(const Point& p) {
+        return most(most(F::absolute(p.x), F::absolute(p.y)), F::absolute(p.z));
+    }
+
+    static CUDA_CALLABLE Point between_edges(const Point& r, const Point& e, const Point& f, const lanes& inverse_e,
+                                             const lanes& inverse_f) {
+        const Point n = F::cross(e, f);
+        lanes s = clamp(F::dot(F::cross(r, f), n) * invert(F::dot(n, n)));
+        const lanes t = clamp((F::dot(e, f) * s - F::dot(r, f)) * inverse_f);
+        s = clamp(F::dot(add(r, t, f), e) * inverse_e);
+        return add(add(r, t, f), -s, e);
+    }
+    static CUDA_CALLABLE Point over_face(const Point& w, const Point& e1, const Point& e2, const Point& n,
+                                         const lanes& inverse) {
+        const Point level = add(w, -F::dot(w, n) * inverse, n);
+        const lanes x = F::dot(cross_exactly(level, e2), n) * inverse;
+        const lanes y = F::dot(cross_exactly(e1, level), n) * inverse;
+        const Point v = add(add(w, -x, e1), -y, e2);
+        const bits inside = (inverse > 0.0f) & (x >= 0.0f) & (y >= 0.0f) & (x + y <= 1.0f);
+        const lanes far = lanes{} + 0x1p60f;
+        return Point{inside ? v.x : far, inside ? v.y : far, inside ? v.z : far};
+    }
+    static CUDA_CALLABLE void offer(lanes& nearest, const Point& v) { nearest = least(nearest, F::dot(v, v)); }
+    // Squared distances, and the largest coordinate of what joins corners.
+    static CUDA_CALLABLE lanes measure(const Corners& c, lanes& size) {
+        const Point e[3] = {F::minus(c.a[1], c.a[0]), F::minus(c.a[2], c.a[1]), F::minus(c.a[0], c.a[2])};
+        const Point f[3] = {F::minus(c.b[1], c.b[0]), F::minus(c.b[2], c.b[1]), F::minus(c.b[0], c.b[2])};
+        lanes inverse_e[3], inverse_f[3];
+        lanes nearest = lanes{} + 0x1.fffffep127f;
+        for (int k = 0; k < 3; ++k) {
+            inverse_e[k] = invert(F::dot(e[k], e[k]));
+            inverse_f[k] = invert(F::dot(f[k], f[k]));
+        }
+        size = lanes{};
+        for (int i = 0; i < 3; ++i)
+            for (int j = 0; j < 3; ++j) {
+                const Point r = F::minus(c.b[j], c.a[i]);
+                size = most(size, largest(r));
+                offer(nearest, between_edges(r, e[i], f[j], inverse_e[i], inverse_f[j]));
+            }
+        const Point back_a = F::minus(c.a[2], c.a[0]), back_b = F::minus(c.b[2], c.b[0]);
+        const Point n = cross_exactly(e[0], back_a), m = cross_exactly(f[0], back_b);
+        const lanes inverse_n = invert(F::dot(n, n)), inverse_m = invert(F::dot(m, m));
+        for (int k = 0; k < 3; ++k) {
+            offer(nearest, over_face(F::minus(c.b[k], c.a[0]), e[0], back_a, n, inverse_n));
+            offer(nearest, over_face(F::minus(c.a[k], c.b[0]), f[0], back_b, m, inverse_m));
+        }
+        size = most(most(size, largest(e[0])), most(largest(back_a), most(largest(f[0]), largest(back_b))));
+        return nearest;
+    }
+    // What distances err by: over 48 u L where they are small. `own` is what coordinates make of it.
+    static CUDA_CALLABLE lanes error_of(const lanes& d, const lanes& size, float own) {
+        return size * (d > size * 0x1p-10f ? lanes{} + 48 * 0x1p-24f : lanes{} + 256 * 0x1p-24f) + own;
+    }
+};

@@ -1,0 +1,41 @@
+// What a thread of the CPU keeps of a search for the nearest faces.
+#pragma once
+#include "builtin.h"
+#include "base/sizes.h"
+
+struct NearestMemory {
+    struct Header {
+        float upper;                          // that the nearest distance is not over, scaled
+        int found;                            // whether there are faces at most that far: only then a tolerance counts
+        int diving;                           // whether the nearest node pair goes first, until faces are measured
+        int level;                            // how far bounds may be that do not wait for later
+        int top, later, waiting, open_count;  // entries of the lists
+        int node_tests, face_tests;
+    };
+    Header* header;
+    float *bound, *later_bound, *open_bound;
+    wp::int64 *item, *later, *open, *face;  // the stack, what waits, faces for float64, faces for float32
+
+    static NearestMemory find(float* data, int thread) {
+        char* p = (char*)data + 4ll * NEAREST_WORDS * thread;
+        NearestMemory m;
+        m.header = (Header*)p;
+        p += 64;
+        auto longs = [&](int count) { return (wp::int64*)((p += 8 * count) - 8 * count); };
+        auto floats = [&](int count) { return (float*)((p += 4 * count) - 4 * count); };
+        m.item = longs(CPU_STACK_LENGTH);
+        m.later = longs(LATER_LENGTH);
+        m.open = longs(OPEN_LENGTH);
+        m.face = longs(NEAREST_FACES);
+        m.bound = floats(CPU_STACK_LENGTH);
+        m.later_bound = floats(LATER_LENGTH);
+        m.open_bound = floats(OPEN_LENGTH);
+        return m;
+    }
+    // Under which a pair of faces matters, as `cut_of`.
+    static float cut_of(float upper, const wp::vec_t<4, float>& spare) {
+        const float part = spare[1] * upper - spare[2], more = part > spare[0] ? part : spare[0];
+        const float off = more - spare[3] * upper;
+        return off > 0.0f ? upper - off : upper;
+    }
+};

@@ -1,0 +1,158 @@
+// The search for the nearest faces on the CPU: node pairs in vector instructions, faces in float32 with bounds.
+#pragma once
+#include "builtin.h"
+#include "distance/boxes.h"
+#include "distance/corners32.h"
+#include "distance/memory.h"
+
+template <class ModelPool, class StatePool, class PairPose, class Frame, class Slabs>
+wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairPose pose, Frame frame,
+                                       wp::vec_t<4, wp::float32> spare, Slabs slabs, bool with_slabs, wp::int32 thread,
+                                       wp::array_t<wp::float32> memory) {
+#if defined(__CUDA_ARCH__)
+    __trap();  // warps have a search of their own
+    return wp::vec_t<3, wp::int32>();
+#else
+#include "distance/boxes.h"
+#include "distance/corners32.h"
+#include "distance/memory.h"
+    typedef NearestFaces N;
+    typedef N::F F;
+    const NearestMemory m = NearestMemory::find(memory.data, thread);
+    NearestMemory::Header& h = *m.header;
+    const auto& r = pose.rotation32.data;
+    NearBoxes boxes = NearBoxes::make(r, frame.back, frame.translation, frame.margin, frame.scale, states.node_box.data,
+                                      pose.node_a, pose.node_b);
+    if (with_slabs) {
+        boxes.slabs = (const char*)slabs.record.data - (const char*)states.node_box.data;
+        boxes.normals = h.face_tests >= NORMALS_LEAST;
+    }
+    // Apart from the memory that lists are written to.
+    int top = h.top, later = h.later, waiting = h.waiting, node_tests = h.node_tests;
+    // Bounds over `limit` are dropped; those over `soon` wait for later, when a nearer pair may have been found.
+    float cut = 0.0f, limit = 0.0f, soon = 0.0f;
+    auto set_limits = [&]() {
+        constexpr float PART[] = {0.6f, 0.85f, 1.0f};
+        cut = h.found ? NearestMemory::cut_of(h.upper, spare) : h.upper;
+        auto to_bound = [&](float x) {
+            const float y = 2.0f * (x * frame.grow + frame.least);
+            return x < 0.0f ? -1.0f : y * y;
+        };
+        limit = to_bound(cut);
+        soon = h.level < 2 && !h.diving ? to_bound(PART[h.level] * cut) : limit;
+    };
+    auto measure = [&](int count) {
+        waiting -= count;
+        wp::int64* items = m.face + waiting;
+        const N::Corners corners = NearestCorners::load(models.vertex_near.data, states.face_corner.data, pose.corner_a,
+                                                        pose.corner_b, r, frame.translation, frame.scale, items, count);
+        F::lanes size;
+        const F::lanes d = __builtin_elementwise_sqrt(N::measure(corners, size));
+        const F::lanes error = N::error_of(d, size, frame.error), over = d + error, under = d - error;
+        float low[16];
+        h.diving = 0;
+        for (int i = 0; i < count; ++i)
+            if (over[i] < h.upper) {
+                h.upper = over[i];
+                h.found = 1;
+            }
+        __builtin_memcpy(low, &under, sizeof(low));
+        set_limits();
+        for (int i = 0; i < count; ++i)
+            if (low[i] <= h.upper) {
+                m.open[h.open_count] = items[i];
+                m.open_bound[h.open_count++] = low[i];
+            }
+        h.face_tests += count;
+        boxes.normals = h.face_tests >= NORMALS_LEAST;
+    };
+    auto keep_open = [&]() {
+        int kept = 0;
+        for (int i = 0; i < h.open_count; ++i)
+            if (m.open_bound[i] <= h.upper) {
+                m.open[kept] = m.open[i];
+                m.open_bound[kept++] = m.open_bound[i];
+            }
+        h.open_count = kept;
+    };
+    set_limits();
+    while (h.open_count <= OPEN_LENGTH - 16) {
+        while (top > 0 && waiting < 16) {
+            const int room = (CPU_STACK_LENGTH - DEPTH_FIRST_LENGTH - 16 - top) / 3, fits = room > 1 ? room : 1;
+            const int most = h.diving ? 1 : NEAREST_AT_ONCE, wanted = fits < most ? fits : most;
+            NearBoxes::Taken taken[NEAREST_AT_ONCE / 4][4];
+            int count = 0;
+            while (top > 0 && count < wanted) {
+                --top;
+                if (m.bound[top] <= limit) {
+                    taken[count >> 2][count & 3] = boxes.take(m.item[top]);
+                    ++count;
+                }
+            }
+            for (int i = count; i & 3; ++i) {
+                taken[i >> 2][i & 3] = taken[0][0];
+                taken[i >> 2][i & 3].used = 0;
+            }
+            const float now = later <= LATER_LENGTH - 4 * NEAREST_AT_ONCE - 16 ? soon : limit;
+            for (int i = 0; 4 * i < count; ++i) {
+                const NearBoxes::Tested tested = boxes.test(taken[i]);
+                node_tests += __builtin_popcount(tested.used);
+                const unsigned int near = tested.used & NearBoxes::to_mask(tested.bound <= limit);
+                const unsigned int nodes = near & ~tested.leaves,
+                                   first = nodes & NearBoxes::to_mask(tested.bound <= now);
+                NearBoxes::append_items(m.item + top, tested, first);
+                NearBoxes::append_bounds(m.bound + top, tested.bound, first);
+                NearBoxes::append_items(m.later + later, tested, nodes & ~first);
+                NearBoxes::append_bounds(m.later_bound + later, tested.bound, nodes & ~first);
+                NearBoxes::append_items(m.face + waiting, tested, near & tested.leaves);
+                const int end = top + __builtin_popcount(first);
+                later += __builtin_popcount(nodes & ~first);
+                waiting += __builtin_popcount(near & tested.leaves);
+                // The nearest comes last, so that it is taken first.
+                for (int k = top; h.diving && k < end - 1; ++k)
+                    if (m.bound[k] < m.bound[end - 1]) {
+                        const wp::int64 item = m.item[k];
+                        const float bound = m.bound[k];
+                        m.item[k] = m.item[end - 1];
+                        m.bound[k] = m.bound[end - 1];
+                        m.item[end - 1] = item;
+                        m.bound[end - 1] = bound;
+                    }
+                top = end;
+            }
+            if (h.diving && waiting > 0)
+                break;
+        }
+        if (waiting > 0) {
+            measure(waiting < 16 ? waiting : 16);
+            if (h.open_count > OPEN_LENGTH - 16)
+                keep_open();
+        } else if (later > 0) {
+            // What waited for later, of which much is too far by now; on the stack as much as leaves it room.
+            h.level = h.level < 2 ? h.level + 1 : 2;
+            set_limits();
+            int kept = 0;
+            for (int i = 0; i < later; ++i) {
+                const float bound = m.later_bound[i];
+                const wp::int64 item = m.later[i];
+                if (bound <= soon && top < CPU_STACK_LENGTH / 2) {
+                    m.item[top] = item;
+                    m.bound[top++] = bound;
+                } else if (bound <= limit) {
+                    m.later[kept] = item;
+                    m.later_bound[kept++] = bound;
+                }
+            }
+            later = kept;
+        } else if (top == 0) {
+            keep_open();
+            return wp::vec_t<3, wp::int32>(1, node_tests, h.face_tests);
+        }
+    }
+    h.top = top;
+    h.later = later;
+    h.waiting = waiting;
+    h.node_tests = node_tests;
+    return wp::vec_t<3, wp::int32>(0, node_tests, h.face_tests);
+#endif
+}

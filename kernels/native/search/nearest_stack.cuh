@@ -1,0 +1,162 @@
+// A warp's lists of a search for the nearest faces: a ring of node pairs, face pairs to be measured in float32 and
+// those to be measured in float64, each with a bound of its distance.
+#pragma once
+#include "builtin.h"
+#include "base/sizes.h"
+
+inline CUDA_CALLABLE wp::uint64 nearest_stack() {
+#include "base/sizes.h"
+#if defined(__CUDA_ARCH__)
+    __shared__ long long items[NEAREST_LENGTH + NEAREST_LENGTH / 2];
+    return __cvta_generic_to_shared(items);
+#else
+    static long long items[NEAREST_LENGTH + NEAREST_LENGTH / 2];
+    return (wp::uint64)items;
+#endif
+}
+
+inline CUDA_CALLABLE wp::uint64 thread_lists(wp::array_t<wp::int64> memory, wp::int32 thread) {
+    return (wp::uint64)(memory.data + (wp::int64)thread * memory.shape[1]);
+}
+
+inline CUDA_CALLABLE wp::float32 read_bound(wp::uint64 items, wp::int32 i) {
+#include "base/sizes.h"
+#if defined(__CUDA_ARCH__)
+    float bound;
+    asm volatile("ld.shared.f32 %0, [%1];"
+                 : "=f"(bound)
+                 : "r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * i)
+                 : "memory");
+    return bound;
+#else
+    return ((const float*)((const long long*)items + NEAREST_LENGTH))[i];
+#endif
+}
+
+inline CUDA_CALLABLE void write_bound(wp::uint64 items, wp::int32 i, wp::float32 bound) {
+#include "base/sizes.h"
+#if defined(__CUDA_ARCH__)
+    asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * i), "f"(bound)
+                 : "memory");
+#else
+    ((float*)((long long*)items + NEAREST_LENGTH))[i] = bound;
+#endif
+}
+
+inline CUDA_CALLABLE void fold_bound(wp::uint64 items, wp::int32 i, wp::float32 bound, bool greatest) {
+#include "base/sizes.h"
+#if defined(__CUDA_ARCH__)
+    // Numbers that are not negative are ordered as their bits are.
+    const unsigned int at = (unsigned int)items + 8 * NEAREST_LENGTH + 4 * i;
+    if (greatest)
+        asm volatile("red.shared.max.s32 [%0], %1;" ::"r"(at), "r"(__float_as_int(bound)) : "memory");
+    else
+        asm volatile("red.shared.min.s32 [%0], %1;" ::"r"(at), "r"(__float_as_int(bound)) : "memory");
+#else
+    float& all = ((float*)((long long*)items + NEAREST_LENGTH))[i];
+    if (greatest ? bound > all : bound < all)
+        all = bound;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp::int32 leaf_end,
+                                            wp::vec_t<4, wp::int32> kinds, wp::vec_t<4, wp::int64> children,
+                                            wp::vec_t<4, wp::float32> bounds) {
+#include "base/sizes.h"
+    // The nearest of each lane comes last, so that it is taken first.
+    int order[5][2] = {{0, 1}, {2, 3}, {0, 2}, {1, 3}, {1, 2}};
+#pragma unroll
+    for (int n = 0; n < 5; ++n) {
+        const int i = order[n][0], j = order[n][1];
+        const bool turn = bounds[i] < bounds[j];
+        const float bound = bounds[i];
+        const long long child = children[i];
+        const int kind = kinds[i];
+        bounds[i] = turn ? bounds[j] : bound;
+        bounds[j] = turn ? bound : bounds[j];
+        children[i] = turn ? children[j] : child;
+        children[j] = turn ? child : children[j];
+        kinds[i] = turn ? kinds[j] : kind;
+        kinds[j] = turn ? kind : kinds[j];
+    }
+#pragma unroll
+    for (int k = 0; k < 4; ++k) {
+#if defined(__CUDA_ARCH__)
+        const unsigned int below = (1u << threadIdx.x) - 1u;
+        const unsigned int nodes = __ballot_sync(0xffffffffu, kinds[k] == 1);
+        const unsigned int faces = __ballot_sync(0xffffffffu, kinds[k] == 2);
+        const int place = (end + __popc(nodes & below)) & (STACK_LENGTH - 1);
+        const int at = kinds[k] == 1 ? place : STACK_LENGTH + leaf_end + __popc(faces & below);
+        if (kinds[k] != 0) {
+            asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"(children[k]) : "memory");
+            asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * at),
+                         "f"(bounds[k])
+                         : "memory");
+        }
+        end += __popc(nodes);
+        leaf_end += __popc(faces);
+#else
+        if (kinds[k] != 0) {
+            const int at = kinds[k] == 1 ? end++ & (STACK_LENGTH - 1) : STACK_LENGTH + leaf_end++;
+            ((long long*)items)[at] = children[k];
+            ((float*)((long long*)items + NEAREST_LENGTH))[at] = bounds[k];
+        }
+#endif
+    }
+    return ((long long)leaf_end << 32) | (unsigned int)end;
+}
+
+inline CUDA_CALLABLE wp::int32 push_in_order(wp::uint64 items, wp::int32 end, wp::vec_t<4, wp::int32> kinds,
+                                             wp::vec_t<4, wp::int64> children) {
+#include "base/sizes.h"
+    const int mine = (kinds[0] != 0) + (kinds[1] != 0) + (kinds[2] != 0) + (kinds[3] != 0);
+#if defined(__CUDA_ARCH__)
+    int sum = mine;
+    for (int step = 1; step < 32; step <<= 1) {
+        const int more = __shfl_up_sync(0xffffffffu, sum, step);
+        sum += (int)threadIdx.x >= step ? more : 0;
+    }
+    const int top = end + __shfl_sync(0xffffffffu, sum, 31);
+    // The first lane's children on top.
+    int at = top - (sum - mine);
+    for (int k = 0; k < 4; ++k)
+        if (kinds[k] != 0) {
+            --at;
+            asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"(children[k]) : "memory");
+            asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * at),
+                         "f"((float)kinds[k])
+                         : "memory");
+        }
+    return top;
+#else
+    int at = end + mine;
+    for (int k = 0; k < 4; ++k)
+        if (kinds[k] != 0) {
+            --at;
+            ((long long*)items)[at] = children[k];
+            ((float*)((long long*)items + NEAREST_LENGTH))[at] = (float)kinds[k];
+        }
+    return end + mine;
+#endif
+}
+
+inline CUDA_CALLABLE wp::int32 push_open(wp::uint64 items, wp::int32 end, bool flag, wp::int64 item,
+                                         wp::float32 bound) {
+#include "base/sizes.h"
+#if defined(__CUDA_ARCH__)
+    const unsigned int votes = __ballot_sync(0xffffffffu, flag);
+    const int at = NEAREST_OPEN_START + end + __popc(votes & ((1u << threadIdx.x) - 1u));
+    if (flag) {
+        asm volatile("st.shared.b64 [%0], %1;" ::"r"((unsigned int)items + 8 * at), "l"((long long)item) : "memory");
+        asm volatile("st.shared.f32 [%0], %1;" ::"r"((unsigned int)items + 8 * NEAREST_LENGTH + 4 * at), "f"(bound)
+                     : "memory");
+    }
+    return end + __popc(votes);
+#else
+    if (flag) {
+        ((long long*)items)[NEAREST_OPEN_START + end] = item;
+        ((float*)((long long*)items + NEAREST_LENGTH))[NEAREST_OPEN_START + end] = bound;
+    }
+    return end + flag;
+#endif
+}

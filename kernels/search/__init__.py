@@ -1,0 +1,1 @@
+"""What every search of two trees shares: items, stacks, load balancing, slabs."""

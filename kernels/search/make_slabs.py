@@ -1,0 +1,147 @@
+"""Slabs of a model's nodes of few faces, of its original faces: they serve trees at the finest LOD."""
+
+import warp as wp
+
+from warp_abtree.kernels.base.arrays import ModelPool, load_vertex
+from warp_abtree.kernels.base.boxes import round_up
+from warp_abtree.kernels.base.poses import SLAB_GAIN_UNIT
+from warp_abtree.kernels.search.slab_overlap import DIRECTION_LENGTH
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.struct
+class Extent:
+    """How far faces reach along a direction."""
+
+    direction: wp.vec3d  # whole numbers
+    low: wp.float64  # least product with it
+    high: wp.float64  # greatest
+
+
+@wp.func
+def face_below(models: ModelPool, start: wp.int32, node: wp.int32, level: wp.int32, i: wp.int32):
+    """Return the i-th face so many levels below a node, -1 where there is none: leaves lie on the last two levels."""
+    face = models.node_face[start + (node << level) + i]
+    if face < 0 and level > 0 and (i & 1) == 0:
+        face = models.node_face[start + (((node << level) + i) >> 1)]
+    return face
+
+
+@wp.func
+def face_normal(models: ModelPool, corner: wp.vec3i):
+    """Return the unit normal of a face, 0 where it has no area."""
+    a = load_vertex(models.vertex_pos, corner[0])
+    n = wp.cross(load_vertex(models.vertex_pos, corner[1]) - a, load_vertex(models.vertex_pos, corner[2]) - a)
+    length = wp.length(n)
+    if length > wp.float64(0.0) and length < wp.float64(wp.inf):
+        return n / length
+    return wp.vec3d()
+
+
+@wp.func
+def whole_direction(n: wp.vec3d):
+    """Return about 2^14 times a unit vector in whole numbers, an axis for 0."""
+    length = wp.float64(DIRECTION_LENGTH)
+    if wp.dot(n, n) == wp.float64(0.0):
+        return wp.vec3d(wp.float64(0.0), wp.float64(0.0), length)
+    return wp.vec3d(wp.rint(n[0] * length), wp.rint(n[1] * length), wp.rint(n[2] * length))
+
+
+@wp.func
+def measure_faces(models: ModelPool, model: wp.int32, node: wp.int32, level: wp.int32, direction: wp.vec3d):
+    """Return how far the faces below a node reach along a direction."""
+    extent = Extent()
+    extent.direction = direction
+    extent.low = wp.float64(wp.inf)
+    extent.high = -wp.float64(wp.inf)
+    for i in range(1 << level):
+        face = face_below(models, models.node_start[model], node, level, i)
+        if face >= 0:
+            corner = models.face_vertex[models.face_start[model] + face]
+            for k in range(3):
+                x = wp.dot(direction, load_vertex(models.vertex_pos, corner[k]) - models.centre[model])
+                extent.low = wp.min(extent.low, x)
+                extent.high = wp.max(extent.high, x)
+    return extent
+
+
+@wp.func
+def record_of(extent: Extent):
+    n = wp.vec3i(
+        wp.int32(extent.direction[0]) + DIRECTION_LENGTH,
+        wp.int32(extent.direction[1]) + DIRECTION_LENGTH,
+        wp.int32(extent.direction[2]) + DIRECTION_LENGTH,
+    )
+    sum = wp.float32(extent.low + extent.high)
+    middle = wp.float64(sum)
+    two = wp.float64(2.0)
+    size = round_up(wp.max(two * extent.high - middle, middle - two * extent.low))
+    return wp.vec4(wp.cast(n[0] | (n[1] << 16), wp.float32), wp.cast(n[2], wp.float32), sum, size)
+
+
+@wp.func
+def measure_box(models: ModelPool, model: wp.int32, node: wp.int32, level: wp.int32):
+    """Return the widths of the box of the faces below a node."""
+    widths = wp.vec3d()
+    for k in range(3):
+        axis = wp.vec3d()
+        axis[k] = wp.float64(1.0)
+        extent = measure_faces(models, model, node, level, axis)
+        widths[k] = extent.high - extent.low
+    return widths
+
+
+@wp.func
+def gain_of(widths: wp.vec3d, slab: Extent):
+    """Return by how much a box is wider than a slab, along the slab's direction, see `poses.SLAB_GAIN_UNIT`."""
+    n = slab.direction
+    whole = (wp.abs(n[0]) * widths[0] + wp.abs(n[1]) * widths[1]) + wp.abs(n[2]) * widths[2]
+    most = wp.float64(DIRECTION_LENGTH) * ((widths[0] + widths[1]) + widths[2])
+    if not most > wp.float64(0.0):
+        return wp.int32(0)
+    return wp.int32(wp.float64(SLAB_GAIN_UNIT) * (whole - (slab.high - slab.low)) / most)
+
+
+@wp.kernel
+def make_slab_kernel(
+    model: wp.int32,
+    first: wp.int32,
+    models: ModelPool,
+    slab_out: wp.array(dtype=wp.vec4),
+    gain_out: wp.array(dtype=wp.vec2i),
+):
+    """Make the slab of each node of few faces, along its faces' mean normal or that of a face.
+
+    Args:
+        first: The first such node.
+    """
+    node = first + wp.tid()
+    start = models.node_start[model]
+    level = wp.int32(0)
+    while (node << level) < (1 << models.depth[model]):
+        level += 1
+    mean = wp.vec3d()
+    count = wp.int32(0)
+    for i in range(1 << level):
+        face = face_below(models, start, node, level, i)
+        if face >= 0:
+            mean += face_normal(models, models.face_vertex[models.face_start[model] + face])
+            count += 1
+    if count == 0:
+        slab_out[start + node] = wp.vec4()
+        return
+    if wp.length(mean) > wp.float64(0.0):
+        mean = mean / wp.length(mean)
+    best = measure_faces(models, model, node, level, whole_direction(mean))
+    for i in range(1 << level):
+        face = face_below(models, start, node, level, i)
+        if face >= 0:
+            normal = face_normal(models, models.face_vertex[models.face_start[model] + face])
+            extent = measure_faces(models, model, node, level, whole_direction(normal))
+            if extent.high - extent.low < best.high - best.low:
+                best = extent
+    slab_out[start + node] = record_of(best)
+    if count > 1:
+        gain = gain_of(measure_box(models, model, node, level), best)
+        wp.atomic_add(gain_out, model, wp.vec2i(gain, 1))

@@ -1,0 +1,75 @@
+"""The lanes of a warp at work on lists in shared memory: a block is a warp, on the CPU one thread.
+
+All lanes must reach these functions together, but for those that read or write one entry.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_abtree.kernels import native
+from warp_abtree.kernels.search.item import four_items
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+STACK_LENGTH = native.constant("STACK_LENGTH")  # node pairs
+STRADDLING_START = native.constant("STRADDLING_START")
+SLAB_PAIR_START, SLAB_PAIR_LENGTH = native.constant("SLAB_PAIR_START"), native.constant("SLAB_PAIR_LENGTH")
+
+
+stack_code = functools.partial(native.body, "search/warp_stack.cuh")
+
+
+@wp.func_native(stack_code("warp_stack"))
+def warp_stack() -> wp.uint64:
+    """Return where this warp's items lie, an address in shared memory on CUDA.
+
+    Its stack, its leaf pairs, those that straddle each other's planes, the signs of these, half an item each, and its
+    slab pairs.
+    """
+
+
+@wp.func_native(stack_code("read_item"))
+def read_item(items: wp.uint64, i: wp.int32) -> wp.int64: ...
+
+
+@wp.func_native(stack_code("write_item"))
+def write_item(items: wp.uint64, i: wp.int32, item: wp.int64): ...
+
+
+@wp.func_native(native.body("search/push_children.cuh", "push_children"))
+def push_children(items: wp.uint64, ends: wp.vec3i, lists: wp.vec4i, children: four_items) -> wp.vec3i:
+    """Append children to the lists that they are for, if any, see `node_pair`.
+
+    Returns the new ends of the stack, the slab pairs and the leaf pairs.
+    """
+
+
+@wp.func_native(stack_code("push_items"))
+def push_items(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64) -> wp.int32:
+    """Append the items whose flag is set to the stack; return its new end."""
+
+
+@wp.func_native(stack_code("push_straddling"))
+def push_straddling(items: wp.uint64, end: wp.int32, flag: bool, item: wp.int64, signs: wp.int32) -> wp.int32:
+    """Append the leaf pairs whose flag is set, with their signs, to the straddling pairs; return the new end."""
+
+
+@wp.func_native(stack_code("read_signs"))
+def read_signs(items: wp.uint64, i: wp.int32) -> wp.int32:
+    """Return the signs of the i-th straddling pair."""
+
+
+@wp.func_native(stack_code("signed_pairs"))
+def signed_pairs() -> wp.uint64:
+    """Return where this warp holds face pairs with their signs, an address in shared memory on CUDA."""
+
+
+@wp.func_native(stack_code("push_signed_pair"))
+def push_signed_pair(list: wp.uint64, end: wp.int32, flag: bool, item: wp.vec3i, signs: wp.int32) -> wp.int32:
+    """Append the face pairs whose flag is set, with their signs, to a list; return the new end."""
+
+
+@wp.func_native(stack_code("read_signed_pair"))
+def read_signed_pair(list: wp.uint64, i: wp.int32) -> wp.vec4i:
+    """Return the i-th face pair of a list, and its signs."""

@@ -1,1 +1,0 @@
-"""Object pairs whose trees are both small: leaves all against all."""

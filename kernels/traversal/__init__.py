@@ -1,1 +1,0 @@
-"""Dual-tree traversal of object pairs."""
