@@ -23,7 +23,7 @@ from ..shapes import longest_side, pose_matrices, random_directions, scene_of_po
 from ..timing import medians, no_garbage_collection, one_core, time_in_turn
 from .ccd_queries import FOLDER, POINTS, read_queries
 
-FULL = {"count": 65536, "checked": 1_000_000, "samples": 32, "repeats": 5, "turn": 163.0, "fcl": 0}
+FULL = {"count": 65536, "checked": 1_000_000, "samples": 32, "repeats": 5, "turn": 10.0, "fcl": 0}
 CPU = FULL | {"count": 256, "checked": 20_000, "fcl": 8}
 HALF_REVOLUTION = 2.0**-16  # real part of a turn, under which there is none
 QUICK = {"count": 3, "checked": 20, "samples": 4, "repeats": 1, "turn": 0.01, "fcl": 1}

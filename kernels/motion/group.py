@@ -26,7 +26,7 @@ from warp_abtree.kernels.motion.face_pair import (
     Contact,
     Progress,
 )
-from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, slide_floor, slides_past
+from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
 from warp_abtree.kernels.motion.linear import EndPoses
 from warp_abtree.kernels.motion.start import OPEN, Contacts
 from warp_abtree.kernels.search.item import FACES, NODES, first_item, four_items, item_first, item_second
@@ -262,9 +262,6 @@ def search_group(
             item, t, slot = read_item(items, at), read_tag(items, at), read_slot(items, at)
             p, best = group.first + slot, time_of(group, slot)
             live = wp.where(warp_lane() < popped and wp.float64(t) <= best, -1, 0)
-            floor = slide_floor(pair_poses[p], motion[p])
-            if live < 0 and slides_past(floor, models, states, pair_poses[p], motion[p], t, item):
-                live = 0
             warp_sync()
             children, kinds, times, compared = four_items(), wp.vec4i(), wp.vec4(), wp.int32(0)
             if warp_any(live < 0):

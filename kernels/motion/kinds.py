@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
-from warp_abtree.kernels.base.poses import NO_NODE, PairPose
+from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.motion.face_pair import Progress, advance_pair
 from warp_abtree.kernels.motion.linear import (
     EndPoses,
@@ -15,9 +15,6 @@ from warp_abtree.kernels.motion.linear import (
 )
 from warp_abtree.kernels.motion.node_pair import advance_children, box_motion
 from warp_abtree.kernels.motion.path import Motion, Paths, bound_motion, pair_skew, place_motion, start_motion
-from warp_abtree.kernels.motion.profile import profiles_apart
-from warp_abtree.kernels.motion.screw import is_screw, parent_of, slides_apart
-from warp_abtree.kernels.search.item import item_first, item_second
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -92,58 +89,6 @@ def advance_nodes(  # noqa: F811
 ):
     items, kinds, times, tests = advance_linear_children(states, pose, motion, t, best, item, live)
     return items, kinds, times, tests
-
-
-@wp.func
-def proves_clear(items: wp.uint64, models: ModelPool, states: StatePool, pose: PairPose, motion: Motion):
-    """Return whether objects are proved apart for all of a motion without a search; `items` is memory."""
-    if not is_screw(motion):
-        return False
-    return profiles_apart(items, models, states, pose, motion)
-
-
-@wp.func
-def proves_clear(  # noqa: F811
-    items: wp.uint64, models: ModelPool, states: StatePool, pose: PairPose, motion: LinearMotion
-):
-    return False
-
-
-@wp.func
-def slide_floor(pose: PairPose, motion: Motion):
-    """Return the nodes of A and of B from which on `slides_past` has something to say."""
-    if is_screw(motion):
-        return pose.floor
-    return wp.vec2i(NO_NODE, NO_NODE)
-
-
-@wp.func
-def slide_floor(pose: PairPose, motion: LinearMotion):  # noqa: F811
-    return wp.vec2i(NO_NODE, NO_NODE)
-
-
-@wp.func
-def slides_past(
-    floor: wp.vec2i, models: ModelPool, states: StatePool, pose: PairPose, motion: Motion, t: wp.float32, item: wp.int64
-):
-    """Return whether the nodes that an item goes down from stay apart from t on, see `screw`."""
-    x, y = parent_of(item_first(item)), parent_of(item_second(item))
-    if x < floor[0] or y < floor[1]:
-        return False
-    return slides_apart(models, states, pose, motion, wp.float64(t), x, y)
-
-
-@wp.func
-def slides_past(  # noqa: F811
-    floor: wp.vec2i,
-    models: ModelPool,
-    states: StatePool,
-    pose: PairPose,
-    motion: LinearMotion,
-    t: wp.float32,
-    item: wp.int64,
-):
-    return False
 
 
 @wp.func

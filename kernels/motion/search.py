@@ -13,17 +13,15 @@ import warp as wp
 from warp_abtree.kernels import native
 from warp_abtree.kernels.base.arrays import ModelPool, StatePool
 from warp_abtree.kernels.base.generation import STALE
-from warp_abtree.kernels.base.lanes import warp_lane, warp_size, warp_sync
 from warp_abtree.kernels.base.poses import PairPose
 from warp_abtree.kernels.intersect.face_pairs import Hits
 from warp_abtree.kernels.motion.face_pair import CLEAR, TO_THE_END, TOUCHES, Contact, Progress
-from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes, proves_clear, slide_floor, slides_past
+from warp_abtree.kernels.motion.kinds import advance_faces, advance_nodes
 from warp_abtree.kernels.motion.linear import EndPoses
-from warp_abtree.kernels.motion.path import Motion
 from warp_abtree.kernels.motion.start import OPEN, Contacts
 from warp_abtree.kernels.search.item import first_item, item_first, item_second
 from warp_abtree.kernels.search.load_balance import take_thread, take_unit
-from warp_abtree.kernels.search.nearest_stack import nearest_stack, push_nearest, read_bound, write_bound
+from warp_abtree.kernels.search.nearest_stack import push_nearest, read_bound, write_bound
 from warp_abtree.kernels.search.warp_stack import STACK_LENGTH, STRADDLING_START, read_item, write_item
 
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
@@ -85,7 +83,7 @@ def search_contact(
     write_item(items, 0, first_item(states, pose))
     write_bound(items, 0, wp.float32(start))
     end, waiting = wp.int32(1), wp.int32(0)
-    tests, floor = wp.vec2i(), slide_floor(pose, motions[p])
+    tests = wp.vec2i()
     while end > 0 or waiting > 0:
         if waiting > 0:
             waiting -= 1
@@ -94,39 +92,13 @@ def search_contact(
         else:
             end -= 1
             item, t = read_item(items, end), read_bound(items, end)
-            live = wp.float64(t) <= best.time
-            if live and slides_past(floor, models, states, pose, motions[p], t, item):
-                live = False
-            if live:
+            if wp.float64(t) <= best.time:
                 children, kinds, times, compared = advance_nodes(states, pose, motions[p], t, best.time, item, -1)
                 ends = push_nearest(items, end, waiting, kinds, children, times)
                 end = item_second(ends)
                 waiting = item_first(ends)
                 tests[0] += compared
     return best, tests
-
-
-@wp.kernel(module="unique", module_options=MODULE_OPTIONS)
-def profile_warp_kernel(
-    models: ModelPool,
-    states: StatePool,
-    pair_count: wp.array(dtype=wp.int32),
-    pair_poses: wp.array(dtype=PairPose),
-    motion: wp.array(dtype=Motion),
-    contacts_inout: Contacts,
-):
-    """Decide the object pairs that `profile` proves apart, a warp a pair; within `warp_search` it would spill."""
-    p = wp.tid() / warp_size()
-    if p >= pair_count[0] or contacts_inout.launched[0] == STALE:
-        return
-    if contacts_inout.end[p] != OPEN:
-        return
-    if proves_clear(nearest_stack(), models, states, pair_poses[p], motion[p]):
-        # All lanes have read what the first one writes.
-        warp_sync()
-        if warp_lane() == 0:
-            contacts_inout.time[p] = wp.float64(1.0)
-            contacts_inout.end[p] = CLEAR
 
 
 @cache
@@ -159,9 +131,6 @@ def thread_search(kind):
         items = thread_lists(memory_out, thread)
         p = take_unit(contacts_inout.counter)
         while p < count:
-            if contacts_inout.end[p] == OPEN and proves_clear(items, models, states, pair_poses[p], motion[p]):
-                contacts_inout.time[p] = wp.float64(1.0)
-                contacts_inout.end[p] = CLEAR
             if contacts_inout.end[p] == OPEN:
                 pose, start = pair_poses[p], contacts_inout.time[p]
                 contact, tests = search_contact(items, tolerance, models, states, poses, pose, motion, p, start)

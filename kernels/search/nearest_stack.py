@@ -30,11 +30,6 @@ def read_bound(items: wp.uint64, i: wp.int32) -> wp.float32: ...
 def write_bound(items: wp.uint64, i: wp.int32, bound: wp.float32): ...
 
 
-@wp.func_native(stack_code("fold_bound"))
-def fold_bound(items: wp.uint64, i: wp.int32, bound: wp.float32, greatest: bool):
-    """Raise a bound, or lower it, to one that is not negative, whatever other lanes do."""
-
-
 @wp.func_native(stack_code("push_nearest"))
 def push_nearest(
     items: wp.uint64, end: wp.int32, leaf_end: wp.int32, kinds: wp.vec4i, children: four_items, bounds: wp.vec4

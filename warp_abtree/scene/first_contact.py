@@ -127,7 +127,6 @@ class FirstContactQuery(Query):
         self.contacts, self.ends, self._ways = start.Contacts(), ObjectPool(), start.Ways()
         self.contacts.counter = wp.zeros(COUNTER_COUNT, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity, sort_pairs=True)
-        self.batch.models.make_slabs()
         self.contacts.launched = self.guard.launched
         paths = path.Paths()
         for name in ("axis", "angle", "anchor", "start", "travel"):
@@ -182,12 +181,7 @@ class FirstContactQuery(Query):
     def _kernels(self, with_distances: bool) -> list:
         make = group.warp_search if self.uses_warps() else search.thread_search
         kernels = [make(self._kind), start.contact_starter(self._kind), path.prepare_path_kernel]
-        kernels += [search.profile_warp_kernel] if self._has_profiles() else []
         return [*[(kernel, WARP_SIZE) for kernel in kernels], *super()._kernels(with_distances)]
-
-    def _has_profiles(self) -> bool:
-        """Return whether nested objects are compared by a kernel of its own; threads do so as they search."""
-        return self.uses_warps() and not self.linear
 
     def _pair_arrays(self, room: int) -> list:
         made = super()._pair_arrays(room)
@@ -232,12 +226,7 @@ class FirstContactQuery(Query):
         paths = launch(path.prepare_path_kernel, dim=self.batch.object_count, inputs=inputs)
         inputs = [models, states, objects, self._ways, self.pair_count, self.pairs, self.pair_poses]
         inputs += [self.hits, self.contacts, self._motion]
-        made = [paths, launch(start.contact_starter(self._kind), dim=room, inputs=inputs, block_dim=WARP_SIZE)]
-        if self._has_profiles():
-            dim = room * (WARP_SIZE if self.device.is_cuda else 1)
-            inputs = [models, states, self.pair_count, self.pair_poses, self._motion, self.contacts]
-            made.append(launch(search.profile_warp_kernel, dim=dim, inputs=inputs, block_dim=WARP_SIZE))
-        return made
+        return [paths, launch(start.contact_starter(self._kind), dim=room, inputs=inputs, block_dim=WARP_SIZE)]
 
     def _make_contacts(self, launch) -> list:
         models, states, objects = self.batch.pools

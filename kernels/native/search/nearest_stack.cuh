@@ -43,22 +43,6 @@ inline CUDA_CALLABLE void write_bound(wp::uint64 items, wp::int32 i, wp::float32
 #endif
 }
 
-inline CUDA_CALLABLE void fold_bound(wp::uint64 items, wp::int32 i, wp::float32 bound, bool greatest) {
-#include "base/sizes.h"
-#if defined(__CUDA_ARCH__)
-    // Numbers that are not negative are ordered as their bits are.
-    const unsigned int at = (unsigned int)items + 8 * NEAREST_LENGTH + 4 * i;
-    if (greatest)
-        asm volatile("red.shared.max.s32 [%0], %1;" ::"r"(at), "r"(__float_as_int(bound)) : "memory");
-    else
-        asm volatile("red.shared.min.s32 [%0], %1;" ::"r"(at), "r"(__float_as_int(bound)) : "memory");
-#else
-    float& all = ((float*)((long long*)items + NEAREST_LENGTH))[i];
-    if (greatest ? bound > all : bound < all)
-        all = bound;
-#endif
-}
-
 inline CUDA_CALLABLE wp::int64 push_nearest(wp::uint64 items, wp::int32 end, wp::int32 leaf_end,
                                             wp::vec_t<4, wp::int32> kinds, wp::vec_t<4, wp::int64> children,
                                             wp::vec_t<4, wp::float32> bounds) {
