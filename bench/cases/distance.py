@@ -6,8 +6,7 @@ launches from Python (one) and as a captured graph (one_graph, on the CPU; on CU
 that is brought from pose to pose, each a call of `Scene.set_poses` and `DistanceQuery.run` (calls). On the CPU all on
 one core, beside python-fcl, whose answers must be ours but for rounding.
 
-The part `gap` is contacts with a gap: `bench.gap_contacts`. The part `originals` is distances of originals while
-objects stand at coarse LODs: `bench.originals`.
+The part `gap` is contacts with a gap: `bench.gap_contacts`.
 """
 
 import time
@@ -18,7 +17,7 @@ import warp as wp
 import warp_abtree as ab
 from warp_abtree import testing
 
-from .. import gap_contacts, originals
+from .. import gap_contacts
 from ..baselines.fcl import Fcl
 from ..meshes import ModelFolder, knot_model, mesh_file
 from ..shapes import longest_side, place_at_gaps, pose_matrices, random_poses, scene_of_poses
@@ -28,7 +27,7 @@ from .assembly import place_nut
 FULL = {"poses": 32, "counts": (1, 1024, 65536), "knot": 5000, "repeats": 7}
 CPU = FULL | {"counts": (1, 1024)}
 QUICK = {"poses": 3, "counts": (3,), "knot": 300, "repeats": 1}
-PARTS = ("nearest", "gap", "originals")
+PARTS = ("nearest", "gap")
 IDENTITY = (0, 0, 0, 0, 0, 0, 1)
 MESHES = ("cow", "rocker-arm", "stanford-bunny")
 NUT = ("factory-bolt-m20", "factory-nut-m20")
@@ -36,18 +35,12 @@ BASES = ("fresh", "fcl"), ("again", "fcl"), ("calls", "fcl"), ("one", "fcl_one")
 LAUNCHES_BEFORE = 20  # of the pair alone, as in a loop that goes on: slabs are made of what is asked often
 
 
-def run(device, count=None, quick=False, only=PARTS):
-    """Yield a row a workload: times [ms] and what the searches took; of baselines, where they are at hand.
-
-    Args:
-        count: Configurations whose brackets of originals are checked.
-    """
+def run(device, quick=False, only=PARTS):
+    """Yield a row a workload: times [ms] and what the searches took; of baselines, where they are at hand."""
     if "nearest" in only:
         yield from measure_all(wp.get_device(device), quick)
     if "gap" in only:
         yield from gap_contacts.run(device, quick)
-    if "originals" in only:
-        yield from originals.run(device, count, quick)
 
 
 def measure_all(device, quick):

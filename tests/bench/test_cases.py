@@ -103,11 +103,6 @@ def check_distance(rows):
     rows = [row for row in rows if "gap" not in row]
     assert [row["gap"] for row in gaps] == list(gap_contacts.GAPS)
     assert gaps[0]["more"] == 1 < gaps[-1]["more"] and all(row["ratio"] > 0 for row in gaps)
-    checked = [row for row in rows if row["workload"].startswith("brackets")]
-    refined = [row for row in rows if row["workload"].startswith("originals")]
-    assert sum(row["configurations"] for row in checked) >= 60 and all(row["violations"] == 0 for row in checked)
-    assert all(min(row[f"{name}_ms"] for name in ("finest", "moved", "originals", "first")) > 0 for row in refined)
-    rows = rows[: len(rows) - len(checked) - len(refined)]
     assert rows[-1]["workload"] == "knot, 3 poses"
     for row in rows:
         assert row["poses"] == 3 > row["meet"] and row["median_gap"] > 0 and 0 < row["face_tests"] < row["node_tests"]

@@ -1,4 +1,4 @@
-"""Distances of originals: certified brackets from coarse LODs, refined where these leave undecided what is asked."""
+"""Distances of originals, whatever the LODs of their objects."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,6 @@ from oracles.distance import brute_distances, mesh_distance
 from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
-from warp_abtree.scene import originals
-from warp_abtree.scene.originals import OriginalDistances
 
 ROWS = ("any", "distance", "bracket", "points", "point_faces")
 SAMPLES = ("torus", "ball", "capsule", "soup", "cow")
@@ -103,10 +101,9 @@ def test_brackets_hold_brute_force(device):
     truth = np.array([mesh_distance(*finest(small)[i]) for i in apart])
     lower, upper = result.bracket[apart].T
     assert (lower <= truth * CLOSE).all() and (truth <= upper * CLOSE).all()
-    assert (upper - lower > 1e-6).any(), "some stand as the LODs decide them"
 
 
-def test_errors_count_to_the_last(device, monkeypatch):
+def test_what_lods_lack_counts_to_the_last(device):
     """A spike that its LOD lacks reaches out by 0.98 of the certified error, towards a plate."""
     vertices, faces = grid(8)
     vertices[40, 2] = 1.6
@@ -119,10 +116,6 @@ def test_errors_count_to_the_last(device, monkeypatch):
         asked = {"beyond": beyond, "relative": 0.5, "originals": True}
         found = scene_of(device, cases).intersect([(0, 1)], "distance", **asked)
         assert found.distance[0] == pytest.approx(distance)
-    monkeypatch.setattr(originals, "SEARCHED", 1e-6)
-    asked = OriginalDistances(scene_of(device, cases).batch())
-    lower, upper = asked.run(np.array([[0, 1]]), np.array(np.inf), tolerance=2.5 * error).bracket[0]
-    assert asked.finest is None and 0.8 - 0.02 * error < lower <= 0.8 <= upper
 
 
 def test_without_tolerance_the_answer_is_that_of_the_finest(device):
@@ -136,31 +129,6 @@ def test_without_tolerance_the_answer_is_that_of_the_finest(device):
     at_finest = scene_of(device, finest(cases)).intersect(pairs_of(cases), "distance", originals=True)
     for name in ROWS:
         np.testing.assert_array_equal(getattr(at_finest, name), getattr(expected, name))
-
-
-def test_only_models_of_undecided_pairs_are_refined(device):
-    """Far pairs are decided at their LODs; the pair that is not takes tree states of its own models alone."""
-    names = ("torus", "ball", "capsule", "cow")
-    models = [sample(name) for name in names]
-    places = [(0, 0, 0), (9, 0, 0), (0, 9, 0), (0, 11.5, 0)]
-    scene = ab.Scene(device)
-    for model, place in zip(models, places):
-        scene.add(model, (*place, 0, 0, 0, 1), lod=model.lod_for(fraction=0.3))
-    asked = OriginalDistances(scene.batch())
-    pairs, no_end = np.array([[0, 1], [0, 2], [1, 2], [2, 3]]), np.array(np.inf)
-    poses = [(*place, 0, 0, 0, 1) for place in places]
-    cases = [(models[i], None, poses[i], models[j], None, poses[j]) for i, j in pairs]
-    truth = scene_of(device, cases).intersect(pairs_of(cases), "distance").distance
-    check(asked.run(pairs[:3], no_end, tolerance=1.0), truth[:3], tolerance=1.0)
-    assert asked.finest is None
-    errors = [model.error_at(lod) for model, lod in zip(models, scene.lods)]
-    tolerance = 2.5 * (errors[0] + errors[1])
-    check(asked.run(pairs, no_end, tolerance=tolerance), truth, tolerance=tolerance)
-    made = {slot.model for slot in asked.finest.states.slots} if asked.finest else set()
-    assert made <= {2, 3}
-    check(asked.run(pairs[2:], no_end), truth[2:])
-    assert {slot.model for slot in asked.finest.states.slots} == {1, 2, 3}
-    check(asked.run(pairs, no_end), truth)
 
 
 def test_poses_lods_and_objects_change(device):

@@ -31,16 +31,7 @@ With the default tolerance, all of this is the same, bit for bit, on CPU and CUD
 With a tolerance points, faces and distance may also depend on what the last launch found.
 
 With `originals=True` (`Scene.intersect`, `sweep`) all of this, `any` too, is of the original meshes, whatever the LODs
-of their objects; with the default tolerance it is what the finest LODs answer, bit for bit. A pair is asked at its LODs
-first where that may decide it (`warp_abtree.kernels.distance.originals`):
-
-* Originals are no nearer than the surfaces at LODs less both `Model.error_at(lod)`: the bracket's lower end. Only the
-  inward error counts, how far an original lies from its LOD.
-* They are no farther apart than any two of their faces: a pair that stands near the nearest points at the LODs gives
-  the upper end, the distance and the points. Where LODs intersect, or may, nothing is decided.
-* Pairs whose bracket is wider than asked go to the finest LODs, with these faces as the start. Tree states of their
-  models are made there and stay; where they are at hand, pairs are asked there at once, which takes no longer. Pairs
-  with a solid always are: errors of surfaces say nothing of what is inside.
+of their objects, as the finest LODs answer it: tree states there are made at the first such query, and stay.
 """
 
 import math
@@ -208,14 +199,6 @@ class DistanceQuery(Query):
     def forget(self):
         """Let the next launch start anew, and not from the faces that the last one found. Launches only."""
         self._found.faces.fill_(int(frame.NO_FACES))
-
-    def start_from(self, faces: np.ndarray):
-        """Let the next launch start from a face of each object of the pairs in place, int32 (p, 2); -1 for none."""
-        order = self._given[:, 0] > self._given[:, 1]
-        faces = np.where(order[:, None], faces[:, ::-1], faces).astype(np.int64)
-        items = np.where(faces.min(1) < 0, int(frame.NO_FACES), (faces[:, 0] << 32) | faces[:, 1])
-        wp.copy(self._found.faces, wp.array(items, dtype=wp.int64, device="cpu", copy=False), count=len(items))
-        self._found.distance.fill_(np.nan)  # of no launch, so that it tells of no far move
 
     def _fill_within(self):
         beyond = self._asked if self._within is None else self._within

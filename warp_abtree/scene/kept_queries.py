@@ -11,13 +11,14 @@ from warp_abtree.checks.kernel_loading import loading, of_first_query
 from warp_abtree.kernels.base.nodes import clear_node_kernel
 from warp_abtree.kernels.intersect.broad_phase import pose_box_kernel
 from warp_abtree.kernels.io.place_poses import pose_setter
+from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.distance import DistanceQuery, check_beyond, check_flags, check_tolerances, prepare_query
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.query.request import check_request, check_within, refuse_options
 from warp_abtree.query.result import Result
 from warp_abtree.scene.first_contact import FirstContactQuery, check_path
-from warp_abtree.scene.originals import OriginalDistances
+from warp_abtree.state.batch import Batch
 from warp_abtree.state.work_lists import update_kernels
 
 
@@ -48,12 +49,12 @@ class KeptQueries:
     def __init__(self, scene, find_pairs: Callable[[Any, float], np.ndarray]):
         self._scene, self._find_pairs = scene, find_pairs
         self.kept: dict[tuple, Query] = {}
-        self._originals: OriginalDistances | None = None
+        self._finest: Batch | None = None
 
     def clear(self):
         """Forget all queries."""
         self.kept.clear()
-        self._originals = None
+        self._finest = None
 
     def find_hits(self, pairs, output, precision, contact_dtype, options: dict, device: bool) -> Result:
         """Answer any output but "distance"; options are those that are given, `Scene.intersect` has them."""
@@ -88,18 +89,28 @@ class KeptQueries:
         check_tolerances(**tolerances)
         beyond = options.get("beyond")
         reach = 0.0 if beyond is None else self._one_for_all(beyond, "beyond")
+        asked, key = self._scene, ("distance", signed, of_originals)
         if of_originals:
-            if self._originals is None:
-                self._originals = OriginalDistances(self._scene.batch())
+            asked = self._find_finest()
             # Originals may lie out of the boxes of their LODs.
-            pairs = self._find_pairs(pairs, reach + (self._originals.reach() if pairs is None else 0.0))
-            return self._originals.run(pairs, check_beyond(beyond, len(pairs)), **tolerances, device=device)
-        if ("distance", signed) not in self.kept:
+            pairs = BroadPhase(asked).find(reach) if pairs is None else pairs
+        elif key not in self.kept:
             self._load(DistanceQuery, pairs is None, "any", "exact", False, False)
         pairs = self._find_pairs(pairs, reach)
         beyond = check_beyond(beyond, len(pairs))
-        query = prepare_query(self.kept.pop(("distance", signed), None), self._scene, pairs, beyond, tolerances, signed)
-        return self._run(("distance", signed), query, device)
+        query = prepare_query(self.kept.pop(key, None), asked, pairs, beyond, tolerances, signed)
+        return self._run(key, query, device)
+
+    def _find_finest(self) -> Batch:
+        """Return a batch of the objects at their finest LODs, as posed, whose tree states are made once."""
+        batch, finest = self._scene.batch(), self._finest
+        if finest is None:
+            finest = batch.with_own_states(follows_poses=True)
+            finest.add_finest(range(len(finest.models.lod_max)))
+            self._finest = finest
+        if finest.excluded is not batch.excluded:
+            finest.exclude(batch.excluded)
+        return finest
 
     def find_first_contacts(self, pairs, end_poses, tolerance, screw, linear, device: bool) -> Result:
         """Answer `Scene.first_contact`; pairs are checked."""

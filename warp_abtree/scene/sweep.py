@@ -17,7 +17,6 @@ from warp_abtree.kernels.io.sweep import NONE_REFUSED, pose_placer, report_chunk
 from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond, check_flags
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.scene.first_contact import FirstContactQuery, check_asked_contacts
-from warp_abtree.scene.originals import OriginalDistances
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
 from warp_abtree.scene.sweep_poses import DeviceRows, refuse_row, take_ends, take_rows
@@ -114,15 +113,12 @@ class _ChunkQuery:
 
     def __init__(self, chunk: _Chunk, key):
         self.key = key
-        self.output, precision, (signed, of_originals), proves = key
+        self.output, precision, signed, proves = key
         self.device, self.room, self.objects = chunk.batch.device, chunk.room, chunk.batch.objects
         self.pairs = np.zeros((self.room, 2), np.int32)
         self.pairs[:, 1] = np.arange(1, self.room + 1)
-        self.originals: OriginalDistances | None = None
         if self.output == "distance":
-            self.query: Query = (distances := DistanceQuery(chunk.batch, self.pairs, signed=signed))
-            if of_originals:
-                self.originals = OriginalDistances(chunk.batch, distances)
+            self.query: Query = DistanceQuery(chunk.batch, self.pairs, signed=signed)
         elif self.output == "first_contact":
             self.query = FirstContactQuery(chunk.batch, None, self.pairs, linear=precision == "linear")
         else:
@@ -263,8 +259,6 @@ class _ChunkQuery:
         assert isinstance(self.query, DistanceQuery)
         self.query.set_tolerance(**tolerances)
         run = functools.partial(self._run, within=beyond)
-        if self.originals is not None:
-            run = functools.partial(self.originals.run, beyond=beyond, **tolerances)
         found = np.empty(len(poses), DISTANCE_ROWS)
         for part, result in self._ask(poses, run):
             rows = found[part]
@@ -323,9 +317,8 @@ def sweep(
 
     Poses are checked on the device; on CUDA transfers overlap with launches, except for "faces". The arrays of the last
     four pairs of models, LODs and devices stay on the device for the next call as long as both models live: models and
-    tree states, some 190 bytes a face, and 0.5 KB for each of at most 74,752 poses in chunks of three sizes; for
-    distances of originals tree states at the finest LODs, too. Whatever the number of poses, a call needs no more
-    memory besides its answer. Calls of several threads take turns on a GPU.
+    tree states, some 190 bytes a face, and 0.5 KB for each of at most 74,752 poses in chunks of three sizes. Whatever
+    the number of poses, a call needs no more memory besides its answer. Calls of several threads take turns on a GPU.
 
     Args:
         model_a, model_b: `Model`; may be the same.
@@ -365,6 +358,8 @@ def sweep(
         solids = solid if isinstance(solid, tuple | list) and len(solid) == 2 else (solid, solid)
         for model, lod, is_solid in zip((model_a, model_b), (lod_a, lod_b), solids):
             pair.add(model, lod=lod, solid=is_solid)
+        if options.get("originals"):
+            pair.set_lods([model.lod_max for model in (model_a, model_b)])
         return _sweep(pair, poses, (output, precision), options)
 
 
@@ -385,7 +380,7 @@ def _sweep(pair, poses, asked, options):
         owners = [weakref.ref(model, lambda _: _kept.pop(key, None)) for model in models]
         posed = _PosedModels(pair, owners)
     chunk = posed.find_chunk(len(poses))
-    query = chunk.find_query(output, precision, check_flags(options), within is not None)
+    query = chunk.find_query(output, precision, check_flags(options)[0], within is not None)
     if output == "distance":
         tolerances = {name: value for name, value in options.items() if name in ("tolerance", "relative")}
         answers = query.find_distances(poses, tolerances, check_beyond(options.get("beyond")))
