@@ -217,16 +217,16 @@ def cover_queued(replay: Replay, t: int, first: int, near_count: int, shared: in
 
 
 @wp.func
-def register_covers(replay: Replay, covers: Covers, begin: int, end: int, row: int):
-    """Register triangles with the faces that were found to cover them, for the first at `row`."""
+def register_covers(replay: Replay, covers: Covers, begin: int, end: int):
+    """Register triangles with the faces that were found to cover them, for the first in row 0."""
     face_count = replay.face_slot.shape[0]
     free = replay.counter[FREE_SLOTS]
     for i in range(begin, end):
         t = covers.triangle[i]
         free = release_triangle(replay, t, face_count, free)
-        used = covers.count[row + i - begin]
+        used = covers.count[i - begin]
         for k in range(used):
-            replay.scratch.used[k] = covers.face[row + i - begin, k]
+            replay.scratch.used[k] = covers.face[i - begin, k]
         free = register_triangle(replay, t, used, free)
     replay.counter[FREE_SLOTS] = free
 
@@ -241,10 +241,10 @@ def cover_queue(
         end = i
         if replay.counter[FREE_SLOTS] >= COVERS_AT_ONCE * SLOTS:
             end = wp.min(i + COVERS_AT_ONCE, queued)
-            end = cover_ring(replay, covers, merge, 0, near_count, i, end, 0, limit, True)
+            end = cover_ring(replay, covers, merge, near_count, i, end, limit)
             if end > i:
                 limit = covers.limit[end - i - 1]
-            register_covers(replay, covers, i, end, 0)
+            register_covers(replay, covers, i, end)
         if end < wp.min(i + COVERS_AT_ONCE, queued):
             limit = cover_queued(replay, replay.queue[end], replay.queue_face[end], near_count, shared, limit)
             end += 1

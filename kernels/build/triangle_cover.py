@@ -61,7 +61,7 @@ class Replay:
 
 @wp.struct
 class Covers:
-    """Triangles to cover, and the faces found for each; of one merge, or of all merges of a window."""
+    """Triangles of a merge to cover, and the faces found for each."""
 
     triangle: wp.array(dtype=int)  # [any], triangles in order
     first: wp.array(dtype=int)  # [any], a face that covered each: the first to try
@@ -76,20 +76,17 @@ def cover_ring(
     replay: Replay,
     covers: Covers,
     merge: wp.vec3i,
-    near_begin: wp.int32,
     near_count: wp.int32,
     begin: wp.int32,
     end: wp.int32,
-    row: wp.int32,
     limit: wp.float64,
-    raises: bool,
 ) -> wp.int32:
     """Cover triangles of a merge again, 8 faces at a time, number by number as `cover_triangle`.
 
     Args:
         merge: The two nodes of the merge and the one that it makes; the forest may be that before the merge or after.
-        begin, end: Triangles, at most COVERS_AT_ONCE; what is found for the first goes to `row`.
-        limit: Squared running maximum, which a triangle raises for those after it, if `raises`.
+        begin, end: Triangles, at most COVERS_AT_ONCE; what is found for the first goes to row 0.
+        limit: Squared running maximum, which a triangle raises for those after it.
 
     Returns where it stopped: `end`, or a triangle that only `cover_triangle` can cover, as other faces may be nearer.
     """

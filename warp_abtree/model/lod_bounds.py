@@ -3,14 +3,10 @@
 import numpy as np
 import warp as wp
 
-from warp_abtree.checks.cpu_threads import core_count, launch_on_cores
 from warp_abtree.checks.kernel_loading import loading
-from warp_abtree.checks.regime import current_regime
-from warp_abtree.kernels.build import block_queue, hausdorff_bound, merge_window, polygon, triangle_cover
+from warp_abtree.kernels.build import hausdorff_bound, polygon, triangle_cover
 from warp_abtree.model.cpu_arrays import cpu_array, filled, find_frame, launch, linked_rings, make_scratch, unwritten
 
-# Cores and faces from which on windows gain: gathering them takes half as long again as going on merge by merge.
-LEAST_CORES, LEAST_FACES = 2, 20_000
 # Triangles covered per launch, about.
 COVERS = 200_000
 # Pooled slots for each face, and beyond these; an empty pool loosens bounds only.
@@ -21,7 +17,7 @@ SLOTS_PER_FACE, SLOTS_EXTRA = 3, 4096
 # one within 2^-52 a coordinate of the segment that it cuts: 192 sqrt(3) 2^-52 and a little, under 2^-43.
 ROUNDING = 2.0**-43
 
-# With the threads of a block, as `loading` takes them; windows, of large models alone, are compiled when launched.
+# With the threads of a block, as `loading` takes them.
 ERROR_KERNELS = [(hausdorff_bound.replay_merges_kernel, 1)]
 
 
@@ -32,14 +28,13 @@ def certify_errors(vertices, faces, parent, merged):
         parent: vertex_parent int32 [n_v+m].
         merged: Positions of the nodes that merges make [model units], float64 [m, 3].
     """
-    threads = current_regime().cpu_threads or core_count()
     with loading(wp.get_device("cpu"), ERROR_KERNELS):
         bounds = LodBounds(vertices, faces)
         # The two nodes of each merge, the lower one first.
         nodes = np.flatnonzero(parent >= 0).astype(np.int32)
         bounds.add(nodes[np.argsort(parent[nodes], kind="stable")].reshape(-1, 2), merged)
     while bounds.done < len(merged):
-        bounds.advance(threads)
+        bounds.advance()
     return bounds.errors()
 
 
@@ -66,7 +61,7 @@ class LodBounds:
         self._pair = filled((len(vertices), 2), 0)
         self._bound_sq = wp.zeros(len(vertices), dtype=wp.float64, device="cpu")
         self._state = self.replay.counter.numpy()  # shares the memory
-        self._known, self._window = 0, None
+        self._known = 0
 
     @property
     def done(self):
@@ -80,31 +75,9 @@ class LodBounds:
         self._pos[self._vertex_count + begin : self._vertex_count + end] = (merged - self._centre) / self._scale
         self._known = end
 
-    def advance(self, cores=1):
-        """Bound some of the merges that are known, on so many cores."""
-        if cores >= LEAST_CORES and len(self.replay.face_slot) >= LEAST_FACES:
-            self._advance_together(cores)
-        else:
-            self._advance_alone(self._known)
-
-    def _advance_together(self, cores):
-        """Bound merges window by window."""
-        if self._window is None:
-            self._window = _new_window(self.replay)
-        counter = self._window.counter.numpy()  # shares the memory
-        counter[[int(block_queue.ENDED), int(block_queue.THREADS)]] = 0
-        inputs = [self._vertex_count, self._known, COVERS, self._pair, self.replay, self._window, self._covers]
-
-        def work():
-            launch(merge_window.work_windows_kernel, *inputs, self._bound_sq)
-
-        launch_on_cores(work, cores)
-        if counter[merge_window.MERGES] == 0 and self.done < self._known:
-            self._advance_alone(self.done + 1)
-
-    def _advance_alone(self, merges):
-        """Bound merges one after the other, at most up to a number of them."""
-        inputs = [self._vertex_count, merges, COVERS, self._pair, self.replay, self._covers, self._bound_sq]
+    def advance(self):
+        """Bound some of the merges that are known, one after the other."""
+        inputs = [self._vertex_count, self._known, COVERS, self._pair, self.replay, self._covers, self._bound_sq]
         launch(hausdorff_bound.replay_merges_kernel, *inputs)
         if self._state[5] < 0:
             bvh = _index(self.replay)
@@ -139,26 +112,6 @@ def _new_covers(replay):
     covers.count, covers.face = filled(rows, 0), filled((rows, triangle_cover.SLOTS), 0)
     covers.limit = wp.zeros(rows, dtype=wp.float64, device="cpu")
     return covers
-
-
-def _new_window(replay):
-    window, covers = merge_window.Window(), triangle_cover.Covers()
-    merges, face_count = int(merge_window.MERGE_ROOM), len(replay.face_slot)
-    rows = face_count + int(merge_window.TRIANGLE_ROOM)
-    blocks = merges + rows // int(triangle_cover.COVERS_AT_ONCE) + 1
-    window.counter = filled(block_queue.COUNTER_COUNT, 0)
-    window.merge = filled((merges, 3), 0, wp.vec3i)
-    window.start, window.near_start = filled(merges + 1, 0), filled(merges + 1, 0)
-    window.first_block = filled(merges + 1, 0)
-    for name in ("block_merge", "block_start", "block_done"):
-        setattr(window, name, unwritten(blocks))
-    window.face_mark = filled(face_count, -1)
-    covers.triangle, covers.first, covers.count = unwritten(rows), unwritten(rows), unwritten(rows)
-    covers.near = unwritten((merges + 1) * int(merge_window.NEAR_MOST))
-    covers.face = unwritten((rows, int(merge_window.COLUMNS)))
-    window.limit, covers.limit = (wp.empty(n, dtype=wp.float64, device="cpu") for n in (1, rows))
-    window.covers = covers
-    return window
 
 
 def _index(replay):

@@ -204,18 +204,17 @@ def _collapse_alone(collapse, vertices, faces, report, then):
 
 def _certify_beside(collapse, vertices, faces, report, then):
     """Run a collapse and bound its merges, beside one another where there are cores; return positions and errors."""
-    threads = _thread_count()
-    if threads == 1:
+    if _thread_count() == 1:
         for removed in collapse.steps():
             report("collapse", removed, collapse.goal)
         bounds = LodBounds(vertices, faces)
-        merged = _follow(collapse, bounds, lambda: 1, report)
+        merged = _follow(collapse, bounds, report)
         then()
     else:
         running = workers(1).submit(lambda: then() if collapse.run() else None)
         try:
             bounds = LodBounds(vertices, faces)
-            merged = _follow(collapse, bounds, lambda: threads if running.done() else threads - 1, report)
+            merged = _follow(collapse, bounds, report)
         finally:
             collapse.stop()
             wait_for([running])
@@ -223,7 +222,7 @@ def _certify_beside(collapse, vertices, faces, report, then):
     return merged, bounds.errors()
 
 
-def _follow(collapse, bounds, cores, report):
+def _follow(collapse, bounds, report):
     """Bound the merges of a collapse while it goes on; return the positions that they make [model units], in parts."""
     merged, known, ended = [], 0, False
     while not ended or bounds.done < known:
@@ -233,7 +232,7 @@ def _follow(collapse, bounds, cores, report):
             merged.append(collapse.merged(begin, known))
             bounds.add(collapse.pair[begin:known], merged[-1])
         if bounds.done < known:
-            bounds.advance(cores())
+            bounds.advance()
             if ended:
                 report("LOD bounds", bounds.done, known)
     return merged

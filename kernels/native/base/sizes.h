@@ -158,12 +158,6 @@ constexpr int SLOT_NEXT = 3;
 constexpr int SLOT_FIELDS = 8;
 static_assert(NEAR_ROOM % 8 == 0 && DISTANCE_ROOM >= 64 * NEAR_ROOM, "8 faces a vector, and room for cuts");
 
-// Counters that threads share while they cover triangles, each in a cache line of its own.
-constexpr int BLOCKS_ADDED = 16;
-constexpr int BLOCKS_TAKEN = 32;
-constexpr int WINDOWS_ENDED = 48;
-constexpr int THREADS = 64;
-
 // Expansions in 3D: 6 products of three differences, each of two components, and each product of three of four. So many
 // lanes of a warp have room for one in shared memory.
 constexpr int EXPANSION_LENGTH = 192;

@@ -4,9 +4,8 @@
 #include "build/polygon_cuts.h"
 
 template <class Replay, class Covers>
-wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge, wp::int32 near_begin,
-                     wp::int32 near_count, wp::int32 begin, wp::int32 end, wp::int32 row, wp::float64 limit,
-                     bool raises) {
+wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge, wp::int32 near_count, wp::int32 begin,
+                     wp::int32 end, wp::float64 limit) {
 #if defined(__CUDA_ARCH__)
     __trap();  // models are built on the host
 #else
@@ -25,12 +24,11 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
     for (double* x = &near.place[0][0][0]; x != &near.place[0][0][0] + NEAR_ROOM * 9; ++x)
         *x = 0.0;
     for (int i = 0; i < near_count; ++i)
-        near.add(covers.near.data[near_begin + i]);
+        near.add(covers.near.data[i]);
     near.load_groups(0);
     auto slot_at = [&](int slot) { return replay.slot.data + SLOT_FIELDS * (wp::int64)slot; };
     auto corners_of = [&](int t) { return (const double*)replay.triangle_pos.data + 9 * (wp::int64)t; };
     const int columns = covers.face.shape[1];
-    const double start = limit;
     int used[COVER_SLOTS], count = 0;
     // As `cover_triangle`, of the one polygon on the stack; false where that has to do it.
     auto cover_triangle = [&]() {
@@ -112,10 +110,9 @@ wp::int32 cover_ring(Replay replay, Covers covers, wp::vec_t<3, wp::int32> merge
         }
         lists = kept;
     }
-    for (int i = begin; i < end; ++i, ++row) {
+    for (int i = begin, row = 0; i < end; ++i, ++row) {
         const int t = covers.triangle.data[i];
         int* found = covers.face.data + columns * (wp::int64)row;
-        limit = raises ? limit : start;
         if (first_bound[i - begin] <= limit) {
             covers.count.data[row] = 1;
             covers.limit.data[row] = limit;
