@@ -21,7 +21,7 @@ from warp_abtree.interop.robot.check import RobotQuery, check_edges
 from warp_abtree.interop.robot.description import Description, RobotError
 from warp_abtree.interop.robot.mjcf import read_mjcf
 from warp_abtree.interop.robot.surroundings import make_surroundings
-from warp_abtree.interop.robot.urdf import read_disabled_pairs, read_urdf
+from warp_abtree.interop.robot.urdf import apply_srdf, read_urdf
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.model import Model
 from warp_abtree.query.distance import check_beyond
@@ -72,21 +72,29 @@ class Robot:
         self._kept: dict[tuple, RobotQuery] = {}
 
     @classmethod
-    def load(cls, path, geometry="collision", device=None, mounted=(), srdf=None, neutral=None) -> "Robot":
+    def load(cls, path, geometry="collision", device=None, mounted=(), srdf=None, neutral=None, strict=True) -> "Robot":
         """Load a robot from a URDF (.urdf, by yourdfpy) or MJCF file (.xml, by MuJoCo).
 
         Joints may be fixed, revolute, continuous, prismatic, and mimic others. Of URDF, revolute and prismatic ones
         must have limits, 0 where one of two is not given. Tested against one another are all links but those that are
-        rigidly joined, that a joint joins, or that the file (MJCF: `contact/exclude`, contype and conaffinity) or the
-        SRDF excludes.
+        rigidly joined, that a joint joins, or that the file or the SRDF excludes. Of MJCF, "collision" has MuJoCo's
+        pairs: by contype, conaffinity, `contact/exclude` and `contact/pair`, and links on a joint are tested against
+        what it hangs on where that stands still, or with `filterparent` disabled. Meshes of a URDF are mirrored by
+        negative scales; those of Collada are scaled by their unit to meters, their up axis is ignored, as in RViz.
 
         Args:
             geometry: "collision" or "visual" meshes; boxes, cylinders and the like are tessellated. Of MJCF, "visual"
                 are the geoms of groups 0 to 2, and meshes have vertices in float32, as MuJoCo compiles them.
             device: Warp device; None for Warp's default.
             mounted: Names of links that are never tested against what surrounds the robot, as a base that stands on it.
-            srdf: Path of an SRDF file, whose `disable_collisions` exclude links.
+            srdf: Path of an SRDF file: pairs that `disable_collisions` names are excluded, others that
+                `enable_collisions` names are tested, whatever else holds, and of the rest those are excluded with a
+                link of `disable_default_collisions`.
             neutral: Configuration in which links that intersect are excluded, too; None for none.
+            strict: Whether to refuse an SRDF that names links which the robot has not, rather than warn.
+
+        Warns of what ties links beside their joints and is not enforced: of MJCF `equality` other than between joints,
+        and limits of tendons; of URDF joints of Gazebo's and Drake's elements.
 
         Raises:
             ImportError: The extra `robot` is not installed.
@@ -103,7 +111,7 @@ class Robot:
                 raise RobotError(f"{file}: no such file")
         description = ENDINGS[path.suffix.lower()](path, geometry)
         if srdf is not None:
-            description.excluded |= read_disabled_pairs(Path(srdf), set(description.links))
+            apply_srdf(description, Path(srdf), flag(strict, "strict"))
         robot = cls(description, device, mounted)
         if neutral is not None:
             robot.exclude_meeting(neutral)
