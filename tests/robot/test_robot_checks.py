@@ -180,56 +180,6 @@ def test_a_query_is_captured_and_says_when_room_was_short(arm, device, monkeypat
     np.testing.assert_array_equal(short.nearest.distance.numpy() == 0, expected)
 
 
-def edges(count, seed, part=0.15):
-    """Return short edges within limits."""
-    starts, others = random_configurations(count, seed=seed), random_configurations(count, seed=seed + 1)
-    return starts, starts + part * (others - starts)
-
-
-def test_edges_are_never_late(arm):
-    starts, ends = edges(40, 7)
-    times = np.linspace(0, 1, 801)
-    sampled = np.array([arm.check(a + times[:, None] * (b - a), AROUND) for a, b in zip(starts, ends)])
-    met = sampled.any(1)
-    first = np.where(met, times[sampled.argmax(1)], np.inf)
-    rows = arm.check_edges(starts, ends, AROUND, tolerance=1e-3)
-    assert 10 < met.sum() < 36 and not rows["undecided"].any()
-    assert (rows["time"] <= np.minimum(first, 1.0)).all()
-    assert not (rows["clear"] & met).any() and rows["clear"].sum() > 5
-    moving = first > 0
-    # No earlier than the tolerance before what a sample may have missed.
-    early = np.minimum(first, 1.0) - rows["time"]
-    assert (early[moving & met] <= 1e-3 + times[1]).all()
-    assert (rows["time"][~moving] == 0).all() and (rows["time"][rows["clear"]] == 1).all()
-
-
-def test_an_edge_passes_through_nothing_thin(device):
-    arm = ab.Robot(described_arm(), device, mounted=["base"])
-    # A blade of no thickness in the way of the bent arm, which turns three times and stands free at most samples.
-    blade = [ab.Model.from_arrays([[0.3, 0, 0.2], [2, 0, 0.2], [2, 0, 3], [0.3, 0, 3]], [[0, 1, 2], [0, 2, 3]])]
-    ends = np.array([[-9.0, 1.4, 0.05, 0], [9.0, 1.4, 0.05, 0]])
-    sampled = arm.check(np.linspace(*ends, 60), blade)
-    assert not sampled[0] and sampled.mean() < 0.3
-    rows = arm.check_edges(ends[:1], ends[1:], blade, tolerance=1e-5)
-    assert not rows["clear"][0] and not rows["undecided"][0]
-    # Within the tolerance of the time there is contact, and before it none at as many more configurations.
-    time = rows["time"][0]
-    at, before = (
-        ends[0] + np.linspace(*span, 500)[:, None] * (ends[1] - ends[0]) for span in ((time, time + 1e-5), (0, time))
-    )
-    assert arm.check(at, blade).any() and not arm.check(before, blade).any()
-
-
-def test_edges_that_slide_are_undecided(arm, monkeypatch):
-    monkeypatch.setattr(check, "STRETCHES_MAX", 64)
-    # The ring turns in its own plane, so near a plate that no stretch is proved free.
-    plate = [(ab.Model.load(trimesh.creation.box((3, 3, 0.02))), (0, 0, 0.36 - 0.01 - 1e-7, 0, 0, 0, 1))]
-    ends = np.array([[0.0, 0, 0.05, 0], [3.0, 0, 0.05, 0]])
-    assert not arm.check(ends, plate).any()
-    row = arm.check_edges(ends[:1], ends[1:], plate)[0]
-    assert row["undecided"] and not row["clear"] and row["time"] == 0
-
-
 @pytest.mark.parametrize(
     "bad, message",
     [
