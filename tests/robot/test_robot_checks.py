@@ -1,5 +1,8 @@
 """Robots at many configurations against FCL, a scene of posed links, and dense samples of edges."""
 
+import copy
+import pickle
+import re
 from dataclasses import replace
 
 import fcl
@@ -7,10 +10,11 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from helpers.robots import described_arm, pose_frames, random_configurations
+from helpers.robots import described_arm, described_chain, pose_frames, random_configurations
 
 import warp_abtree as ab
 from warp_abtree.interop.robot import check, robot
+from warp_abtree.interop.robot.description import Description, Frame
 
 STILL = (0, 0, 0, 0, 0, 0, 1)
 RING = ab.Model.load(trimesh.creation.torus(0.45, 0.12, 32, 12))
@@ -194,6 +198,84 @@ def test_bad_configurations_are_refused(arm, bad, message):
     for call in (arm.check, arm.forward):
         with pytest.raises(ValueError, match=message):
             call(bad)
+
+
+def test_limits_hold_to_within_the_rounding_of_float32(arm, device):
+    low, high = np.array(arm.limits, np.float32).T
+    assert (high > arm.limits[:, 1]).any()
+    inside = [low, high, *np.nextafter([low, high], np.float32(99) * np.sign([low, high]))]
+    for taken in (np.array, list, lambda rows: np.array(rows, np.float64), lambda rows: np.array(rows).tolist()):
+        poses = arm.forward(taken(inside)).numpy()
+        np.testing.assert_array_equal(poses, arm.forward(np.array(inside, np.float64), limits=False).numpy())
+    on_device = wp.array(np.array(inside), dtype=wp.float32, device=device)
+    assert len(arm.check(on_device)) == len(arm.check_edges(inside, inside)) == 4
+    arm.exclude_meeting(high)
+    for beyond in (np.float32(0.1) + np.float32(1.5e-8), np.nextafter(0.1, 1)):
+        with pytest.raises(
+            ValueError, match=r"configuration 1 has (\S+) for joint 'grip', outside 0 .. (\S+) "
+        ) as raised:
+            arm.check([[0, 0, 0, 0], [0, 0, beyond, 0]])
+        told = re.search(r"has (\S+) for .* .. (\S+) ", str(raised.value))
+        assert [float(number) for number in told.groups()] == [beyond, 0.1]
+
+
+def test_a_robot_without_joints_is_asked_like_any_other(device):
+    cup = ab.Robot(described_chain(trimesh.creation.box()), device)
+    box = ab.Model.load(trimesh.creation.box())
+    for world, far in ((box, 0.0), ([(box, (9, 0, 0, 0, 0, 0, 1))], 8.0), (None, np.inf)):
+        for rows in (np.empty((3, 0)), np.empty((0, 0), np.float32), np.empty((300, 0))):
+            assert cup.check(rows, world).tolist() == [far == 0] * len(rows)
+            assert cup.check(rows, world, output="distance")["distance"].tolist() == [far] * len(rows)
+            edges = cup.check_edges(rows, rows, world)
+            assert edges.tolist() == [(float(far > 0), far > 0, False)] * len(rows)
+            assert cup.forward(rows).shape == (len(rows), 1)
+        for output in ("any", "distance"):
+            query = cup.query(world, output, room=2)
+            query.launch()
+            query.check()
+            assert query.hit.numpy().tolist() == [far == 0] * 2
+            assert output == "any" or query.nearest.distance.numpy().tolist() == [far] * 2
+
+
+def test_a_mounted_link_without_a_mesh_takes_those_fixed_to_it(device):
+    """A world, a base without a mesh, two plates fixed to it, and what turns on them; a frame that turns alone."""
+    description = described_arm()
+    fixed = [Frame(-1, np.eye(4)), Frame(0, np.eye(4))]
+    frames = [*fixed, *[replace(f, parent=f.parent + 2 if f.parent >= 0 else 1) for f in description.frames]]
+    names = {"world": 0, "stand": 1, **{name: k + 2 for name, k in description.links.items()}, "eye": len(frames)}
+    frames.append(Frame(len(frames) - 1, np.eye(4), "revolute", (0, 0, 1), "turn"))
+    order = list(names)
+    parts = [replace(part, link=order.index(list(description.links)[part.link])) for part in description.parts]
+    parts.append(replace(parts[0], link=order.index("stand")))
+    made = Description(frames, description.joints, names, parts, description.excluded)
+    for mounted, expected in (
+        (["world"], {"world", "stand", "base"}),
+        (["stand"], {"stand"}),
+        (["base", "world"], {"world", "stand", "base"}),
+        (["flange"], {"fore", "flange"}),
+        ([], set()),
+    ):
+        robot = ab.Robot(made, device, mounted)
+        assert {robot.link_names[k] for k in robot.mounted} == expected
+    # Nothing but the stand and the base is where the ground is.
+    ground = [(ab.Model.load(trimesh.creation.box((1, 1, 0.01))), (0, 0, -0.1, 0, 0, 0, 1))]
+    rows = np.array([[0.0, 0, 0.05, 0]])
+    assert ab.Robot(made, device, ["base"]).check(rows, ground)[0]
+    assert not ab.Robot(made, device, ["world"]).check(rows, ground)[0]
+    with pytest.warns(RuntimeWarning, match="no mesh is fixed to the link 'eye'"):
+        assert ab.Robot(made, device, ["eye"]).check(rows, ground)[0]
+
+
+def test_a_robot_is_copied_and_pickled(arm):
+    rows = random_configurations(60, seed=8)
+    arm.exclude_meeting(rows[np.flatnonzero(arm.check(rows))[0]])
+    expected = arm.check(rows, AROUND)
+    for other in (copy.copy(arm), copy.deepcopy(arm), pickle.loads(pickle.dumps(arm))):
+        np.testing.assert_array_equal(other.check(rows, AROUND), expected)
+        assert other.pairs.tolist() == arm.pairs.tolist() and other.mounted == arm.mounted
+    for make in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match="RobotQuery holds memory"):
+            make(arm.query(AROUND, room=1))
 
 
 def test_bad_options_are_refused(arm, device):

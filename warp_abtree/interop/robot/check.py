@@ -48,7 +48,8 @@ def ask_about(robot, robots: RobotBatch, room: int) -> Asked:
     radii = [np.sqrt(((v - m) ** 2).sum(1).max()) * (1 + 2.0**-40) for v, m in zip(vertices, middles)]
     parts.radius = wp.array(np.array(radii), dtype=wp.float64, device=device)
     sizes = len(robot.joint_names), len(description.frames), len(frame)
-    return Asked(description.make_chain(device), parts, stages, robots.count, room, *sizes)
+    # A launch is one even where there is nothing to ask.
+    return Asked(description.make_chain(device), parts, stages or [(0, 0)], robots.count, room, *sizes)
 
 
 class RobotQuery:
@@ -81,6 +82,11 @@ class RobotQuery:
         self.hit = self._chunk.hit
         self._chunk.count.fill_(room)
         self.take_poses()
+
+    def __reduce__(self):
+        raise TypeError(
+            "a RobotQuery holds memory of its device and is neither copied nor pickled; make one of a Robot"
+        )
 
     def is_of(self, around) -> bool:
         """Return whether what surrounds the robot has the objects and LODs of before."""

@@ -49,7 +49,7 @@ class Robot:
         mounted: Indices into `link_names` of the links that are not tested against what surrounds the robot.
         description: What the file says, `warp_abtree.interop.robot.description.Description`.
 
-    A copy, or what is unpickled, is made anew from the description, on the same device, with the same `pairs`.
+    A copy, or what is unpickled, is made anew from the description, on the same device, with the same `pairs` and `mounted`.
     """
 
     def __init__(self, description: Description, device=None, mounted=()):
@@ -129,8 +129,8 @@ class Robot:
         return list(found)
 
     def __reduce__(self):
-        mounted = [self.link_names[k] for k in self.mounted]
-        return Robot, (self.description, self.device.alias, mounted), {"pairs": self.pairs}
+        kept = {"pairs": self.pairs, "mounted": self.mounted}
+        return type(self), (self.description, self.device.alias), kept
 
     def __repr__(self):
         faces = sum(model.face_count for model in self.models)
@@ -216,7 +216,8 @@ class Robot:
 
         Returns:
             Structured array (e,): time, from 0 to 1, parts are proved apart before; clear, whether they are for all of
-            the edge; undecided, whether contact within the tolerance is neither proved nor excluded.
+            the edge; undecided, whether contact within the tolerance of the time is neither proved nor excluded. The
+            same bits for an edge alone and in any batch.
 
         Raises:
             TypeError, ValueError: As `check`.
