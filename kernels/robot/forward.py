@@ -24,8 +24,8 @@ QUARTER_1 = wp.constant(wp.float64(1.57079632673412561417e00))
 QUARTER_2 = wp.constant(wp.float64(6.07710050630396597660e-11))
 QUARTER_3 = wp.constant(wp.float64(2.02226624879595063154e-21))
 
-# Of a limit: what rounding to float32, once or twice, may put a value beyond it.
-LIMIT_ROUNDING = wp.constant(wp.float64(2.0**-23))
+# Of the greater limit: what float32 may put a value beyond one of them, as lower + 1 * (upper - lower) does.
+LIMIT_ROUNDING = wp.constant(wp.float64(2.0**-22))
 
 NONE_REFUSED = wp.constant(wp.int64(2**63 - 1))
 
@@ -101,10 +101,11 @@ def move_joint(chain: Chain, configurations: wp.array2d(dtype=wp.float64), i: wp
 @wp.func
 def keeps_limits(value: wp.float64, lower: wp.float64, upper: wp.float64):
     """Return whether a value is within limits, or a float32 number that is beyond one by rounding alone."""
+    none = wp.float64(0.0)
     beyond = wp.max(lower - value, value - upper)
-    limit = wp.where(value > upper, upper, lower)
+    size = wp.max(wp.where(wp.isfinite(lower), wp.abs(lower), none), wp.where(wp.isfinite(upper), wp.abs(upper), none))
     rounded = wp.float64(wp.float32(value)) == value
-    return beyond <= wp.float64(0.0) or (rounded and beyond <= LIMIT_ROUNDING * wp.abs(limit))
+    return beyond <= none or (rounded and beyond <= LIMIT_ROUNDING * size)
 
 
 @wp.kernel

@@ -201,20 +201,24 @@ def test_bad_configurations_are_refused(arm, bad, message):
 
 
 def test_limits_hold_to_within_the_rounding_of_float32(arm, device):
-    low, high = np.array(arm.limits, np.float32).T
-    assert (high > arm.limits[:, 1]).any()
-    inside = [low, high, *np.nextafter([low, high], np.float32(99) * np.sign([low, high]))]
+    arm.description.joints |= {"bend": (-2.8718, -0.0698), "swing": (-np.inf, 2.5)}
+    arm = ab.Robot(arm.description, device)
+    low, high = np.array(np.maximum(arm.limits, -9), np.float32).T
+    inside = [low, high, low + np.float32(1) * (high - low), np.nextafter(high, np.float32(99))]
+    assert ((inside[2] > high) & (high > arm.limits[:, 1])).any()
     for taken in (np.array, list, lambda rows: np.array(rows, np.float64), lambda rows: np.array(rows).tolist()):
         poses = arm.forward(taken(inside)).numpy()
         np.testing.assert_array_equal(poses, arm.forward(np.array(inside, np.float64), limits=False).numpy())
     on_device = wp.array(np.array(inside), dtype=wp.float32, device=device)
     assert len(arm.check(on_device)) == len(arm.check_edges(inside, inside)) == 4
     arm.exclude_meeting(high)
-    for beyond in (np.float32(0.1) + np.float32(1.5e-8), np.nextafter(0.1, 1)):
+    with pytest.raises(ValueError, match="has 3 for joint 'swing', outside -inf .. 2.5 "):
+        arm.check([[0, -1, 0, 3]])
+    for beyond in (np.float32(0.1) + np.float32(4e-8), np.nextafter(0.1, 1)):
         with pytest.raises(
             ValueError, match=r"configuration 1 has (\S+) for joint 'grip', outside 0 .. (\S+) "
         ) as raised:
-            arm.check([[0, 0, 0, 0], [0, 0, beyond, 0]])
+            arm.check([[0, -1, 0, 0], [0, -1, beyond, 0]])
         told = re.search(r"has (\S+) for .* .. (\S+) ", str(raised.value))
         assert [float(number) for number in told.groups()] == [beyond, 0.1]
 

@@ -49,7 +49,7 @@ class Robot:
         mounted: Indices into `link_names` of the links that are not tested against what surrounds the robot.
         description: What the file says, `warp_abtree.interop.robot.description.Description`.
 
-    A copy, or what is unpickled, is made anew from the description, on the same device, with the same `pairs` and `mounted`.
+    A copy, or what is unpickled, is made anew from the description, on the same device, with `pairs` and `mounted`.
     """
 
     def __init__(self, description: Description, device=None, mounted=()):
@@ -112,6 +112,7 @@ class Robot:
         """Return the links of names, and in the place of one without a mesh all that are rigidly fixed to it."""
         if isinstance(names, str):
             raise TypeError(f"mounted: {names!r} is a name, not a list of names of links")
+        names = list(names)
         unknown = set(names) - set(self.link_names)
         if unknown:
             raise ValueError(f"mounted: the robot has no link {sorted(unknown)[0]!r}")
@@ -153,7 +154,7 @@ class Robot:
         Args:
             configurations: (c, n) of any framework; float64 on the robot's GPU is read where it lies.
             limits: Whether to refuse configurations out of limits. A float32 number that is beyond a limit by no more
-                than 2^-23 of it, as rounding puts it there, is within, and taken as it is.
+                than 2^-22 of the greater one, as rounding puts it there, is within, and taken as it is.
 
         Raises:
             ValueError: Another shape, a number that is not finite, one out of its limits; the first is named.
