@@ -212,7 +212,7 @@ def test_limits_hold_to_within_the_rounding_of_float32(arm, device):
     on_device = wp.array(np.array(inside), dtype=wp.float32, device=device)
     assert len(arm.check(on_device)) == len(arm.check_edges(inside, inside)) == 4
     arm.exclude_meeting(high)
-    with pytest.raises(ValueError, match="has 3 for joint 'swing', outside -inf .. 2.5 "):
+    with pytest.raises(ValueError, match=r"has 3 for joint 'swing', outside -inf .. 2.5 "):
         arm.check([[0, -1, 0, 3]])
     for beyond in (np.float32(0.1) + np.float32(4e-8), np.nextafter(0.1, 1)):
         with pytest.raises(
