@@ -11,7 +11,7 @@ import numpy as np
 
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.model.obj import MeshError, read_file, read_warp_asset, split_file_name
-from warp_abtree.model.winding import component_labels, find_winding
+from warp_abtree.model.winding import component_labels, find_winding, keep_outside
 
 FACE_LIMIT = 2**30  # int32 forest ids count up to two nodes a vertex, and heap indices up to two a face
 EXTENT_LIMITS = (2.0**-100, 2.0**100)  # boxes are float32
@@ -165,8 +165,7 @@ def _join_geometry(geometry, name, where=None):
         if not np.array_equal(pose, np.eye(4)):
             with np.errstate(invalid="ignore", over="ignore"):
                 part_vertices = part_vertices @ pose[:3, :3].T + pose[:3, 3]
-            if np.linalg.det(pose[:3, :3]) < 0.0:
-                part_faces = part_faces[:, ::-1]  # keeps the outside of a mirrored surface
+            part_faces = keep_outside(part_faces, pose[:3, :3])
         vertices.append(part_vertices)
         faces.append(part_faces + vertex_count)
         vertex_count += len(part_vertices)

@@ -122,6 +122,11 @@ def refuse_open(winding: Winding, name: str):
         raise MeshError(f"model {name!r} is no solid: it is not closed, {winding.describe_open()}")
 
 
+def keep_outside(faces, linear):
+    """Return faces (n, 3) for vertices that a matrix (3, 3) maps: turned where it mirrors, so that they face out."""
+    return faces[:, ::-1] if np.linalg.det(linear) < 0 else faces
+
+
 def component_labels(faces, vertex_count):
     """Return the lowest vertex that each vertex is joined to through faces, int (v,)."""
     label = np.arange(vertex_count)

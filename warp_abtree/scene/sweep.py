@@ -14,7 +14,7 @@ import warp as wp
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.sweep import NONE_REFUSED, pose_placer, report_chunk_kernel
-from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond, check_flags
+from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond, check_flags, refuse_signed
 from warp_abtree.query.narrow_phase import Query
 from warp_abtree.scene.first_contact import FirstContactQuery, check_asked_contacts
 from warp_abtree.scene.originals import OriginalDistances
@@ -352,7 +352,8 @@ def sweep(
 
     Raises:
         TypeError: model_a or model_b is no Model; an option has another name.
-        ValueError: Bad poses, the first of which is named, a LOD out of range, an unknown option or device.
+        ValueError: Bad poses, the first of which is named, a LOD out of range, an unknown option or device, or signed
+            and neither is a solid.
         RuntimeError: A graph is being captured.
     """
     (check_asked_contacts if output == "first_contact" else check_asked)(output, precision, options)
@@ -365,6 +366,7 @@ def sweep(
         solids = solid if isinstance(solid, tuple | list) and len(solid) == 2 else (solid, solid)
         for model, lod, is_solid in zip((model_a, model_b), (lod_a, lod_b), solids):
             pair.add(model, lod=lod, solid=is_solid)
+        refuse_signed(options.get("signed") or False, any(pair.object_solid))
         return _sweep(pair, poses, (output, precision), options)
 
 
