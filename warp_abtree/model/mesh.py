@@ -97,7 +97,8 @@ def describe_mesh(mesh):
     computation. Faces with the same three corners in any order are duplicates; each one after the first counts. Faces
     that share a vertex are of one component. A mesh is closed if every edge belongs to an even number of faces. Its
     winding is mixed where two faces run along an edge the same way, inside out where parts are, see
-    `warp_abtree.model.winding`, else consistent, and outwards if the mesh is closed too.
+    `warp_abtree.model.winding`, else consistent, and outwards if the mesh is closed too. What it holds as a solid is
+    told in words.
     """
     faces = np.delete(mesh.faces, mesh.dropped_faces, axis=0).astype(np.int64)
     vertex_count = len(mesh.vertices)
@@ -124,6 +125,7 @@ def describe_mesh(mesh):
         "winding": "mixed" if winding.mixed_edges else "inside out" if len(winding.inside_out) else right,
         "mixed_edges": winding.mixed_edges,
         "inside_out_faces": len(winding.inside_out),
+        "solid": winding.describe_solid(),
         "extents": (upper - lower).tolist(),
         "bounds": [lower.tolist(), upper.tolist()],
         "diagonal": float(np.linalg.norm(upper - lower)),

@@ -314,8 +314,8 @@ class Scene(DeviceMemory):
 
         Raises:
             TypeError: An option with another name.
-            ValueError: Bad pairs, a bad distance, an unknown option, a scene without objects, or signed and no object of
-                the given pairs, else of the scene, is a solid.
+            ValueError: Bad pairs, a bad distance, an unknown option, a scene without objects; or signed and no object
+                of the given pairs, else of the scene, is a solid.
         """
         check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)
