@@ -85,6 +85,25 @@ def test_parity_decides_which_way_parts_face(name):
             assert set(np.flatnonzero(wrong)) == set(find_winding(mesh.vertices, mesh.faces).inside_out)
 
 
+@pytest.mark.parametrize("name", SHELLS)
+def test_turned_parts_touch_as_near_as_they_round(name):
+    """Planes that were shared are so but for rounding, and stay so far from the origin."""
+    vertices, faces, _ = SHELLS[name]
+    turn = trimesh.transformations.rotation_matrix(0.7, (1, 2, 3))[:3, :3]
+    vertices = (vertices[:, None] * turn).sum(2)
+    for at in (0.0, 1e9):
+        mesh = mesh_from_arrays(vertices + at, faces)
+        mended, expected = orient_mesh(mesh), orient_mesh(mesh_from_arrays(*SHELLS[name][:2]))
+        np.testing.assert_array_equal(mended.faces, expected.faces)
+
+
+def test_a_wall_that_is_out_by_a_rounding_is_a_wall():
+    vertices, faces, part = joined(box(3), box(1))
+    vertices[8:][vertices[8:] == 0] = -1e-15
+    mesh = mesh_from_arrays(vertices, faces)
+    np.testing.assert_array_equal((orient_mesh(mesh).faces != mesh.faces).any(1), part == 1)
+
+
 def volume(vertices, faces):
     """Return six times the volume within a surface, exactly."""
     total = Fraction(0)
@@ -137,6 +156,15 @@ def test_open_parts_stay_and_hold_nothing():
     mended = orient_mesh(mesh_from_arrays(parts[0], parts[1][:, ::-1]))
     changed = (mended.faces != mesh.faces[:, ::-1]).any(1)
     np.testing.assert_array_equal(changed, parts[2] == 1)
+
+
+def test_walls_listed_several_times_count_as_often():
+    ball_in, wall = ball(1, (4, 4, 4)), box(9)
+    for count in (1, 2, 3):
+        vertices, faces, part = joined(*[wall] * count, ball_in)
+        mesh = mesh_from_arrays(vertices, faces)
+        changed = (orient_mesh(mesh).faces != mesh.faces).any(1)
+        np.testing.assert_array_equal(changed, (part == count) & (count % 2 == 1))
 
 
 def test_closed_parts_with_a_fin_hold_what_is_in_them():

@@ -255,11 +255,14 @@ def _inside_out(vertices, faces, part):
     upper = np.maximum.reduceat(corners.max(1)[order], start)
     turned = []
     for k in np.flatnonzero(is_whole):
-        around = counts & (lower <= lower[k]).all(1) & (upper >= upper[k]).all(1)
+        near = _nearness(lower[k], upper[k])
+        around = counts & (lower <= lower[k] + near).all(1) & (upper >= upper[k] - near).all(1)
         around[k] = False
-        some = corners[rows[k][np.unique(np.linspace(0, len(rows[k]) - 1, SAMPLED_FACES).astype(int))]]
-        points = np.stack([some[:, 0], some.mean(1)], 1).reshape(-1, 3)
-        depth = sum(_holds(corners[rows[other]], points) for other in np.flatnonzero(around))
+        depth = 0
+        if around.any():
+            some = corners[rows[k][np.unique(np.linspace(0, len(rows[k]) - 1, SAMPLED_FACES).astype(int))]]
+            points = np.stack([some[:, 0], some.mean(1)], 1).reshape(-1, 3)
+            depth = sum(_holds(corners[rows[other]], points) for other in np.flatnonzero(around))
         if _volume_sign(corners[rows[k]]) == (1 if depth % 2 else -1):
             turned.append(rows[k])
     return np.sort(np.concatenate(turned)) if turned else np.empty(0, np.int64)
@@ -284,29 +287,35 @@ def _exact_volume(a, b, c) -> Fraction:
     return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
 
 
+def _nearness(lower, upper):
+    """Return how near to a surface in a box counts as on it."""
+    return max(NEAR * (upper - lower).max(), NEAR_ROUNDING * max(np.abs(lower).max(), np.abs(upper).max()))
+
+
 def _holds(corners, points) -> bool:
     """Return whether a closed surface holds those of some points that are not on it, and there are some."""
-    lower, upper = corners.min(1), corners.max(1)
-    near = max(NEAR * np.ptp(corners, axis=(0, 1)).max(), NEAR_ROUNDING * np.abs(corners).max())
+    box = corners.min(1).T, corners.max(1).T
+    near = _nearness(box[0].min(1), box[1].max(1))
     step = max(1, TABLE // len(corners))
     held = False
     for at in range(0, len(points), step):
-        sides = _sides(corners, lower, upper, points[at : at + step], near)
+        sides = _sides(corners, box, points[at : at + step], near)
         if (sides < 0).any():
             return False
         held |= bool((sides > 0).any())
     return held
 
 
-def _sides(corners, lower, upper, points, near):
+def _sides(corners, box, points, near):
     """Return 1 for points in a closed surface, -1 for those outside, 0 for those on it: crossings of rays along z."""
-    above_face = points[:, None] + near >= lower
-    below_face = points[:, None] - near <= upper
-    point, face = np.nonzero(above_face[..., :2].all(2) & below_face.all(2))
+    lower, upper = box
+    least, most = (points - near).T[..., None], (points + near).T[..., None]
+    column = (most[0] >= lower[0]) & (most[1] >= lower[1]) & (least[0] <= upper[0]) & (least[1] <= upper[1])
+    point, face = np.nonzero(column & (least[2] <= upper[2]))
     x = corners[face] - points[point, None]
     normal = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
     height = np.einsum("ij,ij->i", normal, x[:, 0])
-    on = above_face[point, face, 2] & (np.abs(height) <= near * np.linalg.norm(normal, axis=1))
+    on = (most[2, point, 0] >= lower[2, face]) & (np.abs(height) <= near * np.linalg.norm(normal, axis=1))
     high = x[:, :, 1] > 0
     crosses = np.zeros(len(x), bool)
     for k in range(3):
