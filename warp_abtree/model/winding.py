@@ -74,11 +74,12 @@ class Winding:
     def describe_solid(self) -> str:
         """Return what the mesh holds as a solid, in a few words."""
         if not self.is_closed:
-            return "no, not closed"
-        count, even = len(self.doubled), "are listed an even number of times and hold nothing"
+            return "no: not closed"
+        count = len(self.doubled)
         if not count:
             return "yes"
-        return f"no, all {count} faces {even}" if count == len(self.faces) else f"in part, {count} faces {even}"
+        what = "holds nothing: all" if count == len(self.faces) else "holds less than it shows:"
+        return f"{what} {count} faces are listed an even number of times"
 
     def fault(self) -> str | None:
         """Return what is wrong with the winding in a few words, or None."""
@@ -140,8 +141,8 @@ def check_solid(winding: Winding, name: str, stacklevel: int = 2):
     if not winding.is_closed:
         raise MeshError(f"model {name!r} is no solid: it is not closed, {winding.describe_open()}")
     if len(winding.doubled):
-        what = winding.describe_solid()
-        warnings.warn(f"model {name!r} as a solid: {what}; list each once", RuntimeWarning, stacklevel=stacklevel + 1)
+        what = f"model {name!r} as a solid {winding.describe_solid()}; keep one of each"
+        warnings.warn(what, RuntimeWarning, stacklevel=stacklevel + 1)
 
 
 def keep_outside(faces, linear):
