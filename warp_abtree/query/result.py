@@ -154,7 +154,7 @@ class Result(DeviceMemory):
 
     def __bool__(self):
         """Refuse a truth value: it would say nothing of what was found."""
-        raise TypeError("a Result is neither true nor false; ask result.any.any() whether any of its pairs intersect")
+        raise TypeError("a Result is neither true nor false; ask result.any.any(), result.clear.all() or len(result)")
 
     def __reduce_ex__(self, protocol):
         """Pickle or copy what lies on the host; refuse arrays on the device."""

@@ -156,5 +156,5 @@ def check_columns(models, worlds, importances, flags, bits) -> dict[str, list]:
         "mask": check_numbers(masks, "collision_mask", 0, ALL_BITS, count),
     }
     for model in {id(model): model for model, solid in zip(models, columns["solid"]) if solid}.values():
-        check_solid(model.winding, model.name, stacklevel=4)
+        check_solid(model.winding, model.name, stacklevel=3)
     return columns
