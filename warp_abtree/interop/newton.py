@@ -118,8 +118,8 @@ class NewtonContacts(DeviceMemory):
     Read at every call: poses of bodies, `shape_transform`, and what Newton's own pipeline reads of shapes that are no
     meshes. Read once: meshes (`shape_source`), `shape_scale`, `shape_margin` and `shape_gap` of mesh shapes, and of all
     shapes `shape_body`, `shape_world`, `shape_collision_group`, `shape_flags` and `shape_collision_filter_pairs`. Where
-    these are others than they were, `collide` and `check` raise RuntimeError; filters are told by their number, and
-    vertices that a mesh changes in place are not noticed.
+    these are others than they were, `collide` and `check` raise RuntimeError. What a mesh changes in place, such as its
+    vertices, is not noticed.
 
     Args:
         model: `newton.Model`.
@@ -191,13 +191,15 @@ class NewtonContacts(DeviceMemory):
             if given.get(shape) is None and key not in known:
                 vertices = np.asarray(source.vertices, np.float64) * scale[shape]
                 faces = np.asarray(source.indices).reshape(-1, 3)
-                known[key] = Model.from_arrays(vertices, keep_outside(faces, np.diag(scale[shape])))
+                faces = keep_outside(faces, np.diag(scale[shape]))
+                known[key] = Model.from_arrays(vertices, faces, name=f"shape {shape}")
             models.append(known[key] if given.get(shape) is None else given[shape])
         return models
 
     def _keep_settings(self):
         """Keep what is read once, for `_refuse_changes`."""
-        self._sources, self._filter_count = list(self.model.shape_source), len(self.model.shape_collision_filter_pairs)
+        self._sources, self._filters = list(self.model.shape_source), self.model.shape_collision_filter_pairs
+        self._filter_count = len(self._filters)
         own = np.zeros(int(self.model.shape_count), np.int32)
         own[self.shapes] = 1
         self._is_own = wp.array(own, dtype=wp.int32, device=self.device)
@@ -217,6 +219,7 @@ class NewtonContacts(DeviceMemory):
     def _refuse_changes(self):
         """Raise where the last call found other settings than there were. Waits for the device."""
         what, shape = "", int(self._changed.numpy()[0])
+        filters = self.model.shape_collision_filter_pairs
         if shape < len(self._is_own):
             self._changed.fill_(len(self._is_own))
             now = [getattr(self.model, f"shape_{name}").numpy()[shape].tolist() for name in SETTINGS]
@@ -225,7 +228,7 @@ class NewtonContacts(DeviceMemory):
             what = f"{', '.join(names) or 'settings'} of shape {shape}"
         elif self.model.shape_source != self._sources:
             what = "shape_source"
-        elif len(self.model.shape_collision_filter_pairs) != self._filter_count:
+        elif len(filters) != self._filter_count or (filters is not self._filters and filters != self._filters):
             what = "shape_collision_filter_pairs"
         if what:
             raise RuntimeError(f"{what} changed since NewtonContacts read it, once; make a new one")
