@@ -61,7 +61,7 @@ from warp_abtree.kernels.solid.depth import find_depth_kernel
 from warp_abtree.kernels.traversal.warp_stack import WARP_SIZE
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.narrow_phase import Query
-from warp_abtree.query.request import check_request, check_within, refuse_options
+from warp_abtree.query.request import check_request, check_within, refuse_options, refuse_signed
 from warp_abtree.query.result import DISTANCES, Found, Result
 from warp_abtree.query.staging import first_rows
 
@@ -108,12 +108,6 @@ def check_flags(options: dict) -> tuple[bool, bool]:
     if signed and originals:
         raise ValueError("signed means nothing beside originals; ask at the finest LODs")
     return signed, originals
-
-
-def refuse_signed(signed: bool, has_solid: bool):
-    """Raise ValueError where depths are asked of surfaces alone: all would be 0."""
-    if signed and not has_solid:
-        raise ValueError("signed: no object of the pairs is a solid (solid=True), so that nothing has a depth")
 
 
 def check_asked(output, precision, options):

@@ -12,16 +12,9 @@ from warp_abtree.kernels.broad_phase import pose_box_kernel
 from warp_abtree.kernels.place_poses import pose_setter
 from warp_abtree.kernels.traversal.nodes import clear_node_kernel
 from warp_abtree.query.contacts import ContactQuery
-from warp_abtree.query.distance import (
-    DistanceQuery,
-    check_beyond,
-    check_flags,
-    check_tolerances,
-    prepare_query,
-    refuse_signed,
-)
+from warp_abtree.query.distance import DistanceQuery, check_beyond, check_flags, check_tolerances, prepare_query
 from warp_abtree.query.narrow_phase import Query
-from warp_abtree.query.request import check_request, check_within, refuse_options
+from warp_abtree.query.request import check_request, check_within, refuse_options, refuse_signed
 from warp_abtree.query.result import Result
 from warp_abtree.scene.first_contact import FirstContactQuery, check_path
 from warp_abtree.scene.originals import OriginalDistances
