@@ -51,7 +51,7 @@ def test_device_memory_is_not_copied(device, name, scenes):
         for way in WAYS.values():
             if way is copy.copy and held is not made:
                 continue
-            with pytest.raises(TypeError, match=f"^a {name} holds device memory and cannot be pickled or copied; "):
+            with pytest.raises(TypeError, match=f"^this {name} holds device memory and cannot be pickled or copied; "):
                 way(held)
 
 

@@ -7,6 +7,6 @@ class DeviceMemory:
     def __reduce_ex__(self, protocol):
         """Refuse `pickle`, `copy.copy` and `copy.deepcopy` with a TypeError."""
         raise TypeError(
-            f"a {type(self).__name__} holds device memory and cannot be pickled or copied; "
+            f"this {type(self).__name__} holds device memory and cannot be pickled or copied; "
             "pickle or copy what it was made of, such as models and poses, and make it anew"
         )
