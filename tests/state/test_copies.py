@@ -27,7 +27,6 @@ MAKERS = {
     "PoseInput": ab.PoseInput,
     "Pipeline": ab.Pipeline,
     "Frame": ab.Frame,
-    "Kinematic": lambda scene: ab.Kinematic(np.zeros((2, 3))),
     "Dynamics": ab.Dynamics,
     "PaperController": lambda scene: ab.PaperController(scene, 8.0),
     "PredictiveController": lambda scene: ab.PredictiveController(scene, 8.0),
@@ -61,5 +60,7 @@ def test_what_lies_on_the_host_is_copied(device):
     for made in (pickle.loads(pickle.dumps(result)), copy.deepcopy(result), copy.copy(result)):
         assert made.contacts.tobytes() == result.contacts.tobytes() and len(made) == len(result)
         made.check()
-    for made in (scene.models[0], ab.Ladder(scene.models), scene.tree_state(0), ab.Buffers(hits=5)):
+    motion = ab.Kinematic(np.zeros((2, 3)))
+    ab.Frame(scene, motion=motion).run(1)
+    for made in (scene.models[0], ab.Ladder(scene.models), scene.tree_state(0), ab.Buffers(hits=5), motion):
         assert type(pickle.loads(pickle.dumps(copy.deepcopy(made)))) is type(made)

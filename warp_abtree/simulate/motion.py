@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from warp_abtree.checks.arguments import broadcast_rows
-from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.quaternions import multiply_quaternions, quaternions_about
 from warp_abtree.scene.poses import check_poses
 
@@ -19,7 +18,7 @@ def triangle_wave(phase) -> np.ndarray:
 
 
 @dataclass(eq=False)
-class Kinematic(DeviceMemory):
+class Kinematic:
     """Prescribed motion of n objects.
 
     The position at time t is position + velocity t + wave(t / period + phase) shuttle, where the triangle wave runs
