@@ -11,7 +11,7 @@ import numpy as np
 
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.model.obj import MeshError, read_file, read_warp_asset, split_file_name
-from warp_abtree.model.winding import component_labels, find_winding
+from warp_abtree.model.winding import component_labels, find_winding, keep_outside
 
 FACE_LIMIT = 2**30  # int32 forest ids count up to two nodes a vertex, and heap indices up to two a face
 EXTENT_LIMITS = (2.0**-100, 2.0**100)  # boxes are float32
@@ -97,7 +97,8 @@ def describe_mesh(mesh):
     computation. Faces with the same three corners in any order are duplicates; each one after the first counts. Faces
     that share a vertex are of one component. A mesh is closed if every edge belongs to an even number of faces. Its
     winding is mixed where two faces run along an edge the same way, inside out where parts are, see
-    `warp_abtree.model.winding`, else consistent, and outwards if the mesh is closed too.
+    `warp_abtree.model.winding`, else consistent, and outwards if the mesh is closed too. What it holds as a solid is
+    told in words.
     """
     faces = np.delete(mesh.faces, mesh.dropped_faces, axis=0).astype(np.int64)
     vertex_count = len(mesh.vertices)
@@ -124,6 +125,7 @@ def describe_mesh(mesh):
         "winding": "mixed" if winding.mixed_edges else "inside out" if len(winding.inside_out) else right,
         "mixed_edges": winding.mixed_edges,
         "inside_out_faces": len(winding.inside_out),
+        "solid": winding.describe_solid(),
         "extents": (upper - lower).tolist(),
         "bounds": [lower.tolist(), upper.tolist()],
         "diagonal": float(np.linalg.norm(upper - lower)),
@@ -165,8 +167,7 @@ def _join_geometry(geometry, name, where=None):
         if not np.array_equal(pose, np.eye(4)):
             with np.errstate(invalid="ignore", over="ignore"):
                 part_vertices = part_vertices @ pose[:3, :3].T + pose[:3, 3]
-            if np.linalg.det(pose[:3, :3]) < 0.0:
-                part_faces = part_faces[:, ::-1]  # keeps the outside of a mirrored surface
+            part_faces = keep_outside(part_faces, pose[:3, :3])
         vertices.append(part_vertices)
         faces.append(part_faces + vertex_count)
         vertex_count += len(part_vertices)

@@ -88,7 +88,8 @@ class Model:
             progress: Called as progress(stage, done, total) during long builds.
             cache: Whether to look for the model in the cache, and to keep it there.
             orient: Whether to turn faces so that neighbours agree about the outside, and closed parts that are inside
-                out; face ids stay, and so does what has one side only.
+                out, walls of cavities among them (`warp_abtree.model.winding`); face ids stay, and so does what has one
+                side only.
             certify: Whether to certify the errors of all LODs at once, beside the collapse, which takes less time in
                 all; else they are certified when `error_at`, a tolerance or `save` first needs them.
 
@@ -97,7 +98,7 @@ class Model:
             ValueError: base_faces is below 1.
         """
         base_faces = whole_number(base_faces, "base_faces", 1, 2**62)
-        options = (FORMAT_VERSION, base_faces, "oriented") if orient else (FORMAT_VERSION, base_faces)
+        options = (FORMAT_VERSION, base_faces, "oriented by parity") if orient else (FORMAT_VERSION, base_faces)
         key = file_key(source, *options) if cache else None
         model = find_model(key, partial(_read, error_key=error_key(key)))
         if model is not None:

@@ -16,6 +16,7 @@ from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.sweep import NONE_REFUSED, pose_placer, report_chunk_kernel
 from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond, check_flags
 from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.request import refuse_signed
 from warp_abtree.scene.first_contact import FirstContactQuery, check_asked_contacts
 from warp_abtree.scene.originals import OriginalDistances
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
@@ -136,8 +137,7 @@ class _ChunkQuery:
         """Return the slots of poses of one type, made at the first use."""
         kind = poses.scalar, poses.width
         if kind not in self._slots:
-            count = 2 if self.output in ANSWERS else 1
-            made = [_Slot(self.device, self.room, self.output, *kind) for _ in range(count)]
+            made = [_Slot(self.device, self.room, self.output, *kind) for _ in range(1 + (self.output in ANSWERS))]
             if self.device.is_cuda:
                 # Another stream may touch what was allocated on this one only once it is there.
                 wp.synchronize_device(self.device)
@@ -352,7 +352,7 @@ def sweep(
 
     Raises:
         TypeError: model_a or model_b is no Model; an option has another name.
-        ValueError: Bad poses, the first of which is named, a LOD out of range, an unknown option or device.
+        ValueError: Bad poses, the first named, a LOD out of range, an unknown option or device, signed without a solid.
         RuntimeError: A graph is being captured.
     """
     (check_asked_contacts if output == "first_contact" else check_asked)(output, precision, options)
@@ -365,12 +365,12 @@ def sweep(
         solids = solid if isinstance(solid, tuple | list) and len(solid) == 2 else (solid, solid)
         for model, lod, is_solid in zip((model_a, model_b), (lod_a, lod_b), solids):
             pair.add(model, lod=lod, solid=is_solid)
+        refuse_signed(options.get("signed", False), any(pair.object_solid))
         return _sweep(pair, poses, (output, precision), options)
 
 
 def _sweep(pair, poses, asked, options):
-    output, precision = asked
-    within = options.get("within")
+    (output, precision), within = asked, options.get("within")
     if output == "first_contact":
         precision = "linear" if options.pop("linear", False) else "rigid"
     if len(poses) == 0:

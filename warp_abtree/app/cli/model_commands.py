@@ -70,7 +70,9 @@ def add_build_arguments(sub: Parser):
     sub.add_file("mesh", metavar="MESH", nargs="+", help=f"{MESHES}; one after another")
     sub.add_file("out", metavar="OUT", type=Path, help="file to write (.npz), or a folder for NAME.npz of each mesh")
     sub.add_argument("--base-faces", type=positive, default=10, metavar="N", help="faces of the coarsest LOD (10)")
-    sub.add_argument("--orient", action="store_true", help="turn faces that disagree with neighbours or face inwards")
+    sub.add_argument(
+        "--orient", action="store_true", help="turn faces that disagree with neighbours or point into the solid"
+    )
 
 
 def build(options, progress):

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.interop.robot.link_query import Asked, LinkDistances, LinkHits
 from warp_abtree.interop.robot.surroundings import RobotBatch
 from warp_abtree.kernels.robot.link_pairs import Parts
@@ -52,7 +53,7 @@ def ask_about(robot, robots: RobotBatch, room: int) -> Asked:
     return Asked(description.make_chain(device), parts, stages or [(0, 0)], robots.count, room, *sizes)
 
 
-class RobotQuery:
+class RobotQuery(DeviceMemory):
     """A fixed number of configurations as an operator: allocates once, launches many times.
 
     `launch()` only launches, so that a CUDA graph can capture it; `configurations` and the poses of what surrounds the
