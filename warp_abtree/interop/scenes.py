@@ -104,12 +104,13 @@ def scene_from_file(path, device=None, base_faces=10, progress=None):
     path, remarks = Path(path), Remarks()
     name, kind, _ = split_file_name(path)
     found = read_usd(path, remarks) if kind in USD and path.is_file() else read_file(path, remarks)
-    remarks.warn(path)
     try:
         source = found.as_scene(name) if isinstance(found, Surface) else found
-        return scene_from_trimesh(source, device, base_faces, progress)
+        made = scene_from_trimesh(source, device, base_faces, progress)
     except MeshError as error:
-        raise MeshError(f"{path}: {error}") from None
+        raise MeshError(f"{path}: {error}" + (f" ({remarks})" if str(remarks) else "")) from None
+    remarks.warn(path)
+    return made
 
 
 def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 40), colour=(176, 176, 176)):

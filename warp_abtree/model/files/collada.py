@@ -8,6 +8,9 @@ from warp_abtree.checks.arguments import first_line
 from warp_abtree.model.files.found import MeshError, Remarks
 from warp_abtree.model.files.polygons import triangulate
 
+# What tells errors of pycollada that concern no shapes.
+LOOKS = ("effect", "material", "image", "surface", "sampler", "texture", "camera", "light", "animation")
+
 
 def read_collada(data: bytes, where: str, remarks: Remarks):
     """Return a Collada file as a trimesh.Scene, in the file's units and axes.
@@ -22,12 +25,12 @@ def read_collada(data: bytes, where: str, remarks: Remarks):
     except ImportError:
         raise MeshError(f"{where}: reading it needs pycollada: pip install pycollada") from None
     try:
-        # Materials and textures may be broken; what else is, is left out and named.
         file = collada.Collada(io.BytesIO(data), ignore=[collada.common.DaeError])
     except Exception as error:  # XML, or whatever goes wrong inside the parser
         raise MeshError(f"{where}: cannot be read as dae: {first_line(error)}") from None
-    for broken in file.errors:
-        remarks.add("left out what is broken:", first_line(broken))
+    for broken in map(first_line, file.errors):
+        if not any(word in broken.lower() for word in LOOKS):
+            remarks.add("left out what is broken:", broken)
     for geometry in file.geometries:
         if geometry.xmlnode is not None and any(str(node.tag).endswith("}ph") for node in geometry.xmlnode.iter()):
             raise MeshError(f"{where}: geometry {geometry.id!r} has polygons with holes (<ph>), which are not read")
@@ -38,7 +41,7 @@ def read_collada(data: bytes, where: str, remarks: Remarks):
         if isinstance(node, collada.scene.Node):
             pose = above @ np.asarray(node.matrix, np.float64)
             # An instance of a node has none of its own.
-            title = node.xmlnode.get("name") or node.xmlnode.get("id") or name
+            title = node.xmlnode.get("name") or node.xmlnode.get("id") or name or node.id
             open_nodes += [(child, pose, title) for child in reversed(node.children or [])]
         elif isinstance(node, collada.scene.ControllerNode):
             remarks.add("left out", f"{name or node.controller.id} (skin or morph)")

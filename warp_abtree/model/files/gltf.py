@@ -11,7 +11,7 @@ import numpy as np
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.model.files.found import MeshError, Remarks
 from warp_abtree.model.files.polygons import cut_strip
-from warp_abtree.model.files.unpack import exceeds_limit, limit_message
+from warp_abtree.model.files.unpack import exceeds_limit
 
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -35,6 +35,8 @@ def read_gltf(data: bytes, where: str, resolver, remarks: Remarks):
         text, binary = _split_binary(data, where) if data[:4] == b"glTF" else (data, None)
         tree = json.loads(text)
         version = str(tree["asset"]["version"])
+    except MeshError:
+        raise
     except (ValueError, KeyError, TypeError, RecursionError, struct.error) as error:
         raise MeshError(f"{where}: cannot be read as glTF: {type(error).__name__}: {first_line(error)}") from None
     if not version.startswith("2."):
@@ -44,9 +46,9 @@ def read_gltf(data: bytes, where: str, resolver, remarks: Remarks):
             raise MeshError(f"{where}: requires the glTF extension {name}, which is not read")
     try:
         return _Reader(tree, binary, where, resolver, remarks).scene()
+    except MeshError:
+        raise
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
-        if isinstance(error, MeshError):
-            raise
         raise MeshError(f"{where}: is damaged: {type(error).__name__}: {first_line(error)}") from None
 
 
@@ -72,7 +74,8 @@ class _Reader:
 
     def __init__(self, tree, binary, where, resolver, remarks):
         self.tree, self.where, self.resolver, self.remarks = tree, where, resolver, remarks
-        self._buffers = {} if binary is None else {0: binary}
+        own = binary is not None and "uri" not in tree.get("buffers", [{}])[0]
+        self._buffers = {0: binary} if own else {}
         self._meshes: dict[int, str | None] = {}
 
     def scene(self):
@@ -225,9 +228,8 @@ class _Reader:
         if "bufferView" in about:
             values = self._strided(about, count, width, kind)
         else:
-            size = count * width * kind.itemsize
-            if exceeds_limit(size, 0):
-                raise MeshError(f"{self.where}: accessor {index} {limit_message(0)}")
+            if exceeds_limit(count * width * kind.itemsize, 0):
+                raise MeshError(f"{self.where}: accessor {index} declares {count:,} values and has none")
             values = np.zeros((count, width), kind)
         if "sparse" in about:
             sparse, values = about["sparse"], values.copy()

@@ -101,14 +101,18 @@ def _read_archive(archive, where, remarks):
 
     members = {member.filename: archive.read(member) for member in archive.infolist() if not member.is_dir()}
     resolver = trimesh.resolvers.ZipResolver({name: io.BytesIO(data) for name, data in members.items()})
-    scenes = []
+    merged = trimesh.Scene()
     for name, data in members.items():
         stem, kind, _ = split_file_name(Path(name))
         if kind in trimesh.available_formats() - UNREAD - {"zip"} or kind in NEEDED:
             found = _read_data(data, kind, f"{where}: {name}", resolver, remarks)
-            scenes.append(found.as_scene(stem) if isinstance(found, Surface) else found)
+            scene = found.as_scene(stem) if isinstance(found, Surface) else found
+            for node in scene.graph.nodes_geometry:
+                pose, part = scene.graph[node]
+                title = trimesh.util.unique_name(node, merged.graph.nodes)
+                merged.add_geometry(scene.geometry[part], title, f"{name}: {part}", transform=pose)
         elif kind in USD or kind in UNREAD or kind in ("zip", "gz"):
             remarks.add("left out", name)
-    if not scenes:
+    if not merged.geometry:
         raise MeshError(f"{where}: holds no mesh file")
-    return trimesh.scene.scene.append_scenes(scenes)
+    return merged

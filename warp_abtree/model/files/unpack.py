@@ -18,7 +18,7 @@ def exceeds_limit(unpacked: int, packed: int) -> bool:
 def limit_message(packed: int) -> str:
     """Return what to say of a file that exceeds the limit."""
     limit = max(UNPACKED_BYTES, UNPACKED_RATIO * packed)
-    return f"unpacks to more than {limit >> 20:,} MiB, {UNPACKED_RATIO} times its size or more, and is not read"
+    return f"unpacks to more than {limit >> 20:,} MiB, the most that is read of a file of {packed:,} bytes"
 
 
 def gunzip(data: bytes, where: str) -> bytes:
