@@ -256,6 +256,10 @@ def test_what_usd_hides_is_left_out_and_named(tmp_path):
     for k in (1, 3):
         place = posed_triangles(scene, names.index(f"/many[{k}]/many/prototype")).reshape(-1, 3)
         assert np.allclose((place.min(0) + place.max(0)) / 2, [100, 7, {1: 1, 3: 2}[k]] + BOX.bounds.mean(0))
+    many.CreatePositionsAttr([Gf.Vec3f(0, 0, 1)])
+    stage.GetRootLayer().Save()
+    with pytest.raises(ab.MeshError, match="/many: its 4 instances do not have a place each"):
+        ab.scene_from_file(path, device="cpu")
 
 
 def test_usd_purposes_and_what_is_not_carried_out(tmp_path):

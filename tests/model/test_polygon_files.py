@@ -33,14 +33,14 @@ source="#p"/></vertices>{primitives}</mesh></geometry></library_geometries><libr
 INPUT = '<input semantic="VERTEX" source="#v" offset="0"/>'
 
 
-def ply(points, faces, order="", kind="int"):
+def ply(points, faces, order="", kind="int", length="uchar"):
     """Return a PLY file with more columns than are needed, in text ("") or binary ("<", ">")."""
     name = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
     data = (
         f"ply\nformat {name} 1.0\ncomment by hand\nelement vertex {len(points)}\nproperty float x\nproperty double y\n"
     )
     data += f"property float z\nproperty uchar red\nelement face {len(faces)}\nproperty uchar flag\n"
-    data += f"property list uchar {kind} vertex_indices\nproperty list uchar float texcoord\nend_header\n"
+    data += f"property list {length} {kind} vertex_indices\nproperty list uchar float texcoord\nend_header\n"
     if order == "":
         data += "".join(f"{x} {y} 0 255\n" for x, y in points)
         data += "".join(f"1 {len(face)} {' '.join(map(str, face))} 2 0.5 0.5\n" for face in faces)
@@ -48,7 +48,8 @@ def ply(points, faces, order="", kind="int"):
     body = b"".join(struct.pack(order + "fdfB", x, y, 0, 255) for x, y in points)
     for face in faces:
         corners = np.array(face, order + {"int": "i4", "ushort": "u2"}[kind]).tobytes()
-        body += struct.pack("BB", 1, len(face)) + corners + struct.pack(order + "Bff", 2, 0.5, 0.5)
+        counts = struct.pack(order + {"uchar": "BB", "short": "Bh"}[length], 1, len(face))
+        body += counts + corners + struct.pack(order + "Bff", 2, 0.5, 0.5)
     return data.encode() + body
 
 
@@ -90,7 +91,7 @@ WRITERS = {
     "a.obj": obj,
     "text.ply": ply,
     "little.ply": lambda points, faces: ply(points, faces, "<"),
-    "big.ply": lambda points, faces: ply(points, faces, ">", "ushort"),
+    "big.ply": lambda points, faces: ply(points, faces, ">", "ushort", "short"),
     "packed.ply.gz": lambda points, faces: gzip.compress(ply(points, faces, "<", "ushort")),
     "plain.off": off,
     "joined.off": lambda points, faces: off(points, faces, "OFF"),
@@ -187,6 +188,7 @@ def test_objects_of_dae(tmp_path):
 
 # What is damaged, cut short or not read.
 
+LATTICE = b'<?xml version="1.0"?><model xmlns:b="http://x/beamlattice/2017/02" requiredextensions="b"></model>'
 FACES, HEAD = [list(range(8))], ply(LETTER, [])
 BOX = trimesh.creation.box()
 BINARY, TEXT = BOX.export(file_type="stl"), BOX.export(file_type="stl_ascii").encode()
@@ -218,6 +220,8 @@ BINARY, TEXT = BOX.export(file_type="stl"), BOX.export(file_type="stl_ascii").en
         ("a.dae", dae(LETTER, polylist(FACES).replace(">8<", ">7<")), "'g': its polygons have 7 corners"),
         ("a.zip", zipped(off(LETTER, [[0, 1]])), "inside.off: line"),
         ("a.zip", zipped(b"", "b.txt"), "holds no mesh file"),
+        ("a.3mf", zipped(LATTICE, "3D/3dmodel.model"), "requires the 3MF extension http://x/beamlattice/2017/02"),
+        ("a.obj", b"o a\n" + obj(LETTER, [[0, 1, 8]]), "face 0 refers to vertex 8"),
         ("a.step", b"ISO-10303-21;", "pip install cascadio"),
         ("a.usda", b"#usda 1.0", "read by scene_from_file"),
     ],
@@ -225,6 +229,8 @@ BINARY, TEXT = BOX.export(file_type="stl"), BOX.export(file_type="stl_ascii").en
 def test_damaged_files(tmp_path, name, data, message):
     if name == "a.dae":
         pytest.importorskip("collada")
+    if name == "a.3mf":
+        pytest.importorskip("lxml")
     if name == "a.step" and "step" in trimesh.available_formats():
         pytest.skip("cascadio is here")
     (tmp_path / name).write_bytes(data)

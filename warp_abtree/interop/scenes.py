@@ -91,7 +91,7 @@ def scene_from_file(path, device=None, base_faces=10, progress=None):
             solid is one. Objects of USD are its visible meshes and basic shapes of default or render purpose, including
             instances and those of point instancers. Cubes and planes are exact; spheres (5,120 faces), cylinders, cones
             and capsules (64 sections) lie within 0.002 of their radius inside. A warning names what is left out, such
-            as invisible prims, guides and proxies, points and lines, and shapes that are taken at rest or undivided.
+            as invisible prims, guides, proxies, points and lines, and what is taken at rest or not subdivided.
         device, base_faces, progress: As for `scene_from_trimesh`.
 
     Returns:

@@ -69,8 +69,6 @@ class Surface:
                 vertices = self.vertices
                 if self.parts is not None:
                     used, corners = np.unique(faces, return_inverse=True)
-                    if used[0] < 0 or used[-1] >= len(vertices):
-                        raise MeshError(f"a face refers to vertex {used[-1]}, but there are {len(vertices)}")
                     vertices, faces = vertices[used], corners.reshape(-1, 3)
                 mesh = trimesh.Trimesh(vertices, faces, process=False)
                 title = trimesh.util.unique_name(own or name, scene.geometry)

@@ -24,7 +24,7 @@ def _parse_plain_obj(data) -> Surface | None:
         return None
     points = _plain_triples([line[2:] for line in lines if line[:2] == b"v "], float)
     corners = _plain_triples([line[2:] for line in lines if line[:2] == b"f "], int)
-    if points is None or corners is None or corners.min() <= 0:
+    if points is None or corners is None or corners.min() <= 0 or corners.max() > len(points):
         return None
     parts, count = _Parts(), 0
     for line in lines if b"o " in starts else ():

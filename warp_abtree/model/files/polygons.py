@@ -11,16 +11,18 @@ def triangulate(vertices, counts, corners, where):
     Raises:
         MeshError: A polygon has fewer than three corners, or refers to no vertex.
     """
-    if (counts == 3).all():
-        return corners.reshape(-1, 3)
+    if not len(vertices):
+        raise MeshError(f"{where}: no vertices")
     few = np.flatnonzero(counts < 3)
     if len(few):
         raise MeshError(f"{where}: face {few[0]} has {counts[few[0]]} corners")
-    outside = np.flatnonzero((corners < 0) | (corners >= len(vertices)))
-    if len(outside):
-        face = np.searchsorted(np.cumsum(counts), outside[0], side="right")
-        vertex = corners[outside[0]]
-        raise MeshError(f"{where}: face {face} refers to vertex {vertex}, but they run from 0 to {len(vertices) - 1}")
+    if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
+        wrong = np.argmax((corners < 0) | (corners >= len(vertices)))
+        face = np.searchsorted(np.cumsum(counts), wrong, side="right")
+        last = len(vertices) - 1
+        raise MeshError(f"{where}: face {face} refers to vertex {corners[wrong]}, but they run from 0 to {last}")
+    if (counts == 3).all():
+        return corners.reshape(-1, 3)
     polygon_start = np.cumsum(counts) - counts
     triangle_start = np.cumsum(counts - 2) - (counts - 2)
     polygon = np.repeat(np.arange(len(counts)), counts - 2)

@@ -1,6 +1,7 @@
 """Mesh files of all formats: our own readers where polygons, parts or what is left out matter, trimesh for the rest."""
 
 import io
+import re
 import warnings
 import zlib
 from pathlib import Path
@@ -84,7 +85,7 @@ def _read_data(data, kind, where, resolver, remarks):
         if kind in ("zip", "zae"):
             return _read_archive(open_zip(data, where), where, remarks)
         if kind in ("3mf", "3dxml"):
-            open_zip(data, where)
+            _check_extensions(open_zip(data, where), where)
         with warnings.catch_warnings():
             # Older NumPy only warns where a number in a text file cannot be read, and cuts the file short there.
             warnings.filterwarnings("error", message="string or file could not be read")
@@ -93,6 +94,18 @@ def _read_data(data, kind, where, resolver, remarks):
         raise
     except Exception as error:  # trimesh's readers raise whatever goes wrong inside them
         raise MeshError(f"{where}: cannot be read as {kind}: {first_line(error)}") from None
+
+
+def _check_extensions(archive, where):
+    """Refuse a 3MF file that requires an extension which trimesh passes over, such as beam lattices."""
+    for name in archive.namelist():
+        root = re.search(rb"<(\w+:)?model\b[^>]*>", archive.read(name)) if name.lower().endswith(".model") else None
+        required = re.search(rb"""requiredextensions\s*=\s*["']([^"']*)""", root[0]) if root else None
+        for prefix in required[1].split() if required else ():
+            space = re.search(rb"xmlns:" + re.escape(prefix) + rb"""\s*=\s*["']([^"']*)""", root[0])
+            title = (space[1] if space else prefix).decode(errors="replace")
+            if not any(known in title for known in ("/production/", "/material/")):
+                raise MeshError(f"{where}: requires the 3MF extension {title}, which is not read")
 
 
 def _read_archive(archive, where, remarks):
