@@ -100,9 +100,10 @@ def _check_extensions(archive, where):
     """Refuse a 3MF file that requires an extension which trimesh passes over, such as beam lattices."""
     for name in archive.namelist():
         root = re.search(rb"<(\w+:)?model\b[^>]*>", archive.read(name)) if name.lower().endswith(".model") else None
-        required = re.search(rb"""requiredextensions\s*=\s*["']([^"']*)""", root[0]) if root else None
+        text = root[0] if root else b""
+        required = re.search(rb"""requiredextensions\s*=\s*["']([^"']*)""", text)
         for prefix in required[1].split() if required else ():
-            space = re.search(rb"xmlns:" + re.escape(prefix) + rb"""\s*=\s*["']([^"']*)""", root[0])
+            space = re.search(rb"xmlns:" + re.escape(prefix) + rb"""\s*=\s*["']([^"']*)""", text)
             title = (space[1] if space else prefix).decode(errors="replace")
             if not any(known in title for known in ("/production/", "/material/")):
                 raise MeshError(f"{where}: requires the 3MF extension {title}, which is not read")
