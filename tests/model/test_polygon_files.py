@@ -79,11 +79,11 @@ def polygons(faces):
     return f'<polygons count="{len(faces)}">{INPUT}{listed}</polygons>'
 
 
-def zipped(data, name="inside.off"):
+def zipped(data, name="inside.off", other="readme.txt"):
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(name, data)
-        archive.writestr("readme.txt", "none")
+        archive.writestr(other, "none")
     return file.getvalue()
 
 
@@ -251,6 +251,7 @@ def test_damaged_files(tmp_path, name, data, message):
         ("a.ply", ply(LETTER, FACES).replace(b"element face", b"element edge 0\nelement face"), 6, None),
         ("a.off", off(LETTER, FACES) + b"3 0 1 2\n", 6, "left out 1 lines"),
         ("a.obj", obj(LETTER, FACES) + b"l 1 2\np 3\n", 6, "left out lines, points"),
+        ("a.zip", zipped(obj(LETTER, FACES), "a.obj", "b.obj.gz"), 6, "left out b.obj.gz"),
     ],
 )
 def test_what_is_left_out_is_named(tmp_path, name, data, count, message, recwarn):

@@ -117,16 +117,16 @@ def _read_archive(archive, where, remarks):
     resolver = trimesh.resolvers.ZipResolver({name: io.BytesIO(data) for name, data in members.items()})
     merged = trimesh.Scene()
     for name, data in members.items():
-        stem, kind, _ = split_file_name(Path(name))
-        if kind in trimesh.available_formats() - UNREAD - {"zip"} or kind in NEEDED:
+        stem, kind, zipped = split_file_name(Path(name))
+        if zipped or kind in {*USD, *UNREAD, "zip"}:
+            remarks.add("left out", name)
+        elif kind in trimesh.available_formats() or kind in NEEDED:
             found = _read_data(data, kind, f"{where}: {name}", resolver, remarks)
             scene = found.as_scene(stem) if isinstance(found, Surface) else found
             for node in scene.graph.nodes_geometry:
                 pose, part = scene.graph[node]
                 title = trimesh.util.unique_name(node, merged.graph.nodes)
                 merged.add_geometry(scene.geometry[part], title, f"{name}: {part}", transform=pose)
-        elif kind in USD or kind in UNREAD or kind in ("zip", "gz"):
-            remarks.add("left out", name)
     if not merged.geometry:
         raise MeshError(f"{where}: holds no mesh file")
     return merged
