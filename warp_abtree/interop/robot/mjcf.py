@@ -17,6 +17,8 @@ from warp_abtree.interop.robot.description import (
     unit_axis,
 )
 from warp_abtree.interop.robot.urdf import INSTALL
+from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.read import read_file, split_file_name
 
 KINDS = {"hinge": "revolute", "slide": "prismatic"}
 VISUAL_GROUPS = 3  # MuJoCo shows geoms of the groups below
@@ -192,7 +194,7 @@ def _shape(mujoco, model, g, where):
         m = int(model.geom_dataid[g])
         vertex, face = int(model.mesh_vertadr[m]), int(model.mesh_faceadr[m])
         vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[m]].astype(np.float64)
-        return vertices, model.mesh_face[face : face + model.mesh_facenum[m]]
+        return vertices, _recut(model, m, vertices, model.mesh_face[face : face + model.mesh_facenum[m]], where)
     if kind == "box":
         made = trimesh.creation.box(2 * size)
     elif kind in ("sphere", "ellipsoid"):
@@ -209,3 +211,31 @@ def _shape(mujoco, model, g, where):
             "given to Robot.check"
         )
     return np.asarray(made.vertices), np.asarray(made.faces)
+
+
+def _recut(model, m, vertices, faces, where):
+    """Return the faces of a mesh, those of an OBJ file with polygons cut anew: MuJoCo's may fold over.
+
+    Raises:
+        RobotError: MuJoCo has other vertices than the file.
+    """
+    start = int(model.mesh_pathadr[m])
+    path = Path(model.paths[start : model.paths.index(b"\0", start)].decode() if start >= 0 else "")
+    if split_file_name(path)[1] != "obj" or not path.is_file():
+        return faces
+    try:
+        found = read_file(path, Remarks())
+    except MeshError as error:
+        raise RobotError(f"{where}: {first_line(error)}") from None
+    polygons = sum(line.split(maxsplit=1)[:1] == [b"f"] for line in path.read_bytes().splitlines())
+    if not isinstance(found, Surface) or len(found.faces) <= polygons:
+        return faces
+    # MuJoCo scales, turns and shifts the vertices, and keeps their order.
+    apart, to = math.inf, np.eye(4)[:, :3]
+    if len(found.vertices) == len(vertices):
+        given = np.column_stack([found.vertices, np.ones(len(vertices))])
+        to = np.linalg.lstsq(given, vertices, rcond=None)[0]
+        apart = np.abs(given @ to - vertices).max() / np.ptp(vertices, axis=0).max()
+    if not apart <= 1e-5:
+        raise RobotError(f"{where}: {path.name} has polygons and vertices that are not MuJoCo's; make it of triangles")
+    return found.faces[:, ::-1] if np.linalg.det(to[:3]) < 0 else found.faces

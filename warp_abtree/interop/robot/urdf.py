@@ -21,8 +21,8 @@ from warp_abtree.interop.robot.description import (
     join_meshes,
     unit_axis,
 )
+from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.mesh import MeshError, load_mesh
-from warp_abtree.model.obj import split_file_name
 
 KINDS = {"fixed": "fixed", "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 INSTALL = "needs the extra `robot`: pip install 'warp-abtree[robot]'"
