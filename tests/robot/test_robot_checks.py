@@ -278,7 +278,7 @@ def test_a_robot_is_copied_and_pickled(arm):
         np.testing.assert_array_equal(other.check(rows, AROUND), expected)
         assert other.pairs.tolist() == arm.pairs.tolist() and other.mounted == arm.mounted
     for make in (copy.copy, copy.deepcopy, pickle.dumps):
-        with pytest.raises(TypeError, match="RobotQuery holds memory"):
+        with pytest.raises(TypeError, match="this RobotQuery holds device memory"):
             make(arm.query(AROUND, room=1))
 
 

@@ -84,11 +84,6 @@ class RobotQuery(DeviceMemory):
         self._chunk.count.fill_(room)
         self.take_poses()
 
-    def __reduce__(self):
-        raise TypeError(
-            "a RobotQuery holds memory of its device and is neither copied nor pickled; make one of a Robot"
-        )
-
     def is_of(self, around) -> bool:
         """Return whether what surrounds the robot has the objects and LODs of before."""
         return self._robots.is_of(around)
