@@ -57,13 +57,13 @@ def test_an_interrupted_job_continues(tmp_path, monkeypatch):
     out = tmp_path / "out"
     run(job, tmp_path / "whole")
     out.mkdir()
-    (out / f"{MANIFEST}.1.partial").write_text("{")  # of a run interrupted at its first file
+    (out / f"{MANIFEST}.1-0123abcd.partial").write_text("{")  # of a run interrupted at its first file
     with pytest.raises(KeyboardInterrupt):
         run(job, out, progress=stop_after(4))
     assert len(list(out.glob("shard-*.npz"))) == 4
     with pytest.raises(ValueError, match="8 of 12 shards are missing"):
         list(read_shards(out))
-    (out / "shard-000000000099-000000000100.npz.77.partial").write_bytes(b"half")
+    (out / "shard-000000000099-000000000100.npz.77-0123abcd.partial").write_bytes(b"half")
     computed = []
     monkeypatch.setattr(again, "task", lambda *part: computed.append(part) or job.task(*part))
     assert run(again, out)["kept"] == 4
