@@ -16,13 +16,13 @@ import numpy as np
 
 from warp_abtree.checks.atomic_write import atomic_write, sweep_up
 from warp_abtree.checks.version import __version__
-from warp_abtree.model.obj import split_file_name
+from warp_abtree.model.files.read import split_file_name
 
 VARIABLE = "WARP_ABTREE_CACHE"
 SIZE_LIMIT = 2 << 30  # bytes in the folder; the models that were used least recently go
 KEY_DIGITS = 40
 _NAME = re.compile(rf"[0-9a-f]{{{KEY_DIGITS}}}\.npz")  # a folder that the user names may hold other files
-BUILDER = 3  # grows with each change of what is built of the same mesh
+BUILDER = 4  # grows with each change of what is built of the same mesh
 LEAST_FACES = 1_000  # smaller models are built as fast as opened
 SELF_CONTAINED = {"obj", "ply", "stl", "off", "glb"}  # other formats may refer to further files
 

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
-from warp_abtree.model.obj import MeshError, read_file, read_warp_asset, split_file_name
+from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.read import read_file, split_file_name
+from warp_abtree.model.files.usd_mesh import read_warp_asset
 from warp_abtree.model.winding import component_labels, find_winding
 
 FACE_LIMIT = 2**30  # int32 forest ids count up to two nodes a vertex, and heap indices up to two a face
@@ -31,6 +33,7 @@ class Mesh:
         file_vertex_count: Vertices in the source.
         unreferenced_count: Vertices of the source that no face refers to.
         welded_count: Vertices that coincide with an earlier one and were merged into it.
+        remarks: What the file holds and was not read, in one line, empty if nothing.
     """
 
     vertices: np.ndarray
@@ -40,22 +43,25 @@ class Mesh:
     file_vertex_count: int
     unreferenced_count: int
     welded_count: int
+    remarks: str = ""
 
 
 def load_mesh(source, name=None):
     """Load a triangle mesh; return a Mesh.
 
     Args:
-        source: One of: a path to anything that trimesh loads, gzipped (``.obj.gz``) or not; ``"warp:bunny"``,
+        source: One of: a path to an OBJ, PLY, OFF, STL, glTF, GLB or DAE file (the last by pycollada), or to anything
+            else that trimesh loads, gzipped (``.obj.gz``) or not, or to a zip archive of these; ``"warp:bunny"``,
             ``"warp:bear"`` or ``"warp:rocks"``, meshes inside Warp (these need the extra ``usd``); a trimesh.Trimesh;
             a trimesh.Scene, whose meshes are joined where its transforms put them.
         name: Name for people; by default the file's, without its extensions.
 
-    Polygons of OBJ and USD are cut into fans from their first corner, or by clipping ears where that fan would fold
-    over; either way polygon by polygon in the source's order.
+    Polygons are cut into fans from their first corner, or by clipping ears where that fan would fold over; either way
+    polygon by polygon in the source's order. A warning names what a file holds and is not read, such as lines, points,
+    or the facets that one cut short lacks.
 
     Raises:
-        MeshError: The source cannot be read, or holds no mesh that can be used.
+        MeshError: The source cannot be read, holds no mesh that can be used, or unpacks past the limit.
     """
     if not isinstance(source, str | os.PathLike):
         import trimesh  # takes as long as the rest of the library
@@ -67,12 +73,15 @@ def load_mesh(source, name=None):
         asset = source[len("warp:") :]
         return _weld_mesh(*read_warp_asset(source, asset), asset if name is None else name, where=source)
     path = Path(source)
-    found = read_file(path)
+    remarks = Remarks()
+    found = read_file(path, remarks)
     name = split_file_name(path)[0] if name is None else name
-    if not isinstance(found, tuple):
-        return _join_geometry(found, name, where=str(path))
-    vertices, faces = found
-    return _weld_mesh(vertices, faces, name, where=str(path))
+    if isinstance(found, Surface):
+        mesh = _weld_mesh(found.vertices, found.faces, name, where=str(path))
+    else:
+        mesh = _join_geometry(found, name, where=str(path), remarks=str(remarks))
+    remarks.warn(path)
+    return replace(mesh, remarks=str(remarks))
 
 
 def mesh_from_arrays(vertices, faces, name="arrays"):
@@ -141,7 +150,7 @@ def orient_mesh(mesh):
 # Validation and welding.
 
 
-def _join_geometry(geometry, name, where=None):
+def _join_geometry(geometry, name, where=None, remarks=""):
     """Join the triangles of a trimesh object; points and paths are ignored."""
     import trimesh
 
@@ -151,7 +160,7 @@ def _join_geometry(geometry, name, where=None):
         nodes = map(geometry.graph.get, geometry.graph.nodes_geometry)
         placed = [(geometry.geometry[part], pose) for pose, part in nodes]
     if not placed:
-        raise MeshError(f"{where}: no faces")
+        raise MeshError(f"{where}: no faces" + (f" ({remarks})" if remarks else ""))
     vertices, faces, vertex_count = [], [], 0
     for mesh, pose in placed:
         if not isinstance(mesh, trimesh.Trimesh):

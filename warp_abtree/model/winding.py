@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from warp_abtree.model.obj import MeshError
+from warp_abtree.model.files.found import MeshError
 
 SHOWN_EDGES = 4
 # Of the sum of all products of three coordinates: 80 roundings of 2^-53 in each, and those of the sum.

@@ -8,9 +8,9 @@ import numpy as np
 
 from warp_abtree.app.cli.arguments import MESHES, PROGRAM, Parser, positive
 from warp_abtree.app.cli.report import check_output, print_result
+from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.mesh import describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model
-from warp_abtree.model.obj import split_file_name
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.lod_request import resolve_lod
 

@@ -10,7 +10,7 @@ from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISIONS, Parser
 from warp_abtree.app.cli.model_commands import active_count, load_model, lod_at
 from warp_abtree.app.cli.report import check_output, print_result
 from warp_abtree.checks.atomic_write import atomic_write
-from warp_abtree.model.obj import MeshError
+from warp_abtree.model.files.found import MeshError
 from warp_abtree.scene.scene import Scene
 
 SUMMARY = "intersect two meshes, A at the origin and B at a pose"

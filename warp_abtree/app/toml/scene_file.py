@@ -16,7 +16,7 @@ from warp_abtree.app.toml.folder import find_scene
 from warp_abtree.app.toml.models import build_model, check_faces
 from warp_abtree.app.toml.objects import make_groups
 from warp_abtree.checks.arguments import whole_number
-from warp_abtree.model.obj import MeshError
+from warp_abtree.model.files.found import MeshError
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame
 from warp_abtree.simulate.lod_request import LodSweep, resolve_lod
