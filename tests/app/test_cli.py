@@ -5,6 +5,7 @@ import io
 import json
 import re
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,10 @@ import trimesh
 from helpers.viewer import run_command as run
 
 import warp_abtree as ab
+import warp_abtree.app as ab_app
 from warp_abtree.app.cli import main as cli
 from warp_abtree.app.cli import model_commands, report
+from warp_abtree.app.open_playback import open_playback
 from warp_abtree.model.mesh import describe_mesh, load_mesh
 
 COMMANDS = "info build query run sweep view picture bench".split()
@@ -170,6 +173,56 @@ def test_record_of_each_output(files, capsys):
     run(capsys, *words.split(), "out.csv", "--output", "faces")
     rows = list(csv.reader(io.StringIO(Path("out.csv").read_text())))
     assert rows[0] == ["face_a", "face_b"] and [[int(x) for x in row] for row in rows[1:]] == found["faces"]
+
+
+# Files of several parts.
+
+
+@pytest.fixture
+def assemblies(files):
+    """Return files by name with the number of parts of each; those of two and three clash."""
+    ball, box = trimesh.creation.icosphere(3), trimesh.creation.box()
+    scene = trimesh.Scene()
+    scene.add_geometry(ball, "left", "ball")
+    scene.add_geometry(ball, "right", "ball", transform=trimesh.transformations.translation_matrix((0.5, 0, 0)))
+    scene.export("two.glb")
+    scene.add_geometry(box, "box", "box")
+    scene.export("three.glb")
+    cube = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + "f 1 3 7 5\nf 2 6 8 4\n"
+    Path("two.obj").write_text("o a\n" + cube + "o b\n" + cube.replace("f 1 3 7 5", "f 9 11 15 13"))
+    Path("one.obj").write_text("o a\ng p\n" + cube + "g q\nusemtl r\nf 1 2 3\n")
+    Path("two.stl").write_text(2 * trimesh.exchange.stl.export_stl_ascii(box))
+    ball.export("one.glb")
+    return {"two.glb": 2, "three.glb": 3, "two.obj": 2, "one.obj": 1, "two.stl": 2, "one.glb": 1, "ring.ply": 1}
+
+
+def test_a_file_of_parts_is_said_to_be_joined(assemblies, capsys, monkeypatch):
+    """By each command that reads meshes; again when the model comes from the cache."""
+    monkeypatch.setenv("WARP_ABTREE_CACHE", "models")
+    for name, parts in assemblies.items():
+        joined = f"{name}: its {parts} parts are joined into one mesh"
+        for words in ("info {}", "build {} built.npz", "query {} one.obj --device cpu") * 2:
+            assert cli.main([*words.format(name).split(), "--json"]) == 0
+            shown = capsys.readouterr()
+            assert (joined in shown.err) == (parts > 1) == ("scene_from_file" in shown.err), words
+            assert words != "info {}" or json.loads(shown.out)["parts"] == parts
+        title = Path(name).stem + (f" ({parts} parts joined)" if parts > 1 else "")
+        assert open_playback([name], "cpu").title == title
+        assert (joined in capsys.readouterr().err) == (parts > 1)
+        assert ab.Model.load(name).parts == parts and ab.Model.load(name, orient=True).parts == parts
+        if name.endswith(("glb", "obj", "stl")):
+            assert ab.scene_from_file(name, "cpu")[0].object_count == parts
+
+
+def test_a_scene_file_of_parts_warns(assemblies):
+    for name, parts in assemblies.items():
+        Path("scene.toml").write_text(f'[models.m]\nmesh = "{name}"\n[[objects]]\nmodel = "m"\n')
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            ab_app.load_scene("scene.toml", device="cpu")
+        told = [str(each.message) for each in caught if "joined" in str(each.message)]
+        start = f"scene.toml: models.m: the {parts} parts of {name} are joined into one mesh; scene_from_file"
+        assert len(told) == (parts > 1) and all(each.startswith(start) for each in told)
 
 
 # Statuses, help, extras.

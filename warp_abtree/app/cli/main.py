@@ -8,6 +8,7 @@ import argparse
 import os
 import signal
 import sys
+import warnings
 from pathlib import Path
 
 import warp as wp
@@ -84,6 +85,7 @@ def main(argv=None) -> int:
     try:
         if argv is None:
             handle_signals(signal.default_int_handler, terminate)
+            warnings.formatwarning = lambda message, *_, **__: f"{PROGRAM}: {message}\n"
         argv = list(sys.argv[1:] if argv is None else argv)
         if argv[:1] == ["bench"] and argv[1:] not in (["-h"], ["--help"]):
             start_warp()

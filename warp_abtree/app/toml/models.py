@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,9 @@ def build_model(path: Path, name: str, table, progress=None) -> Model:
         SceneError: A mesh is missing or bad, or its coordinates leave the range of numbers.
     """
     mesh = _load(path, name, table)
+    if mesh.parts > 1:
+        about = f"the {mesh.parts} parts of {table.mesh} are joined into one mesh"
+        warnings.warn(f"{path}: models.{name}: {about}; scene_from_file makes an object of each", stacklevel=2)
     try:
         lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         vertices = mesh.vertices - (lower / 2 + upper / 2) if table.centre else mesh.vertices
