@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 import re
 import sys
 import warnings
@@ -114,10 +115,15 @@ def test_query_against_the_library(files, capsys):
     assert of_originals["bracket"][0] <= apart["distance"] <= of_originals["bracket"][1]
     assert answer(capsys, *asked, "--originals")["distance"] == apart["distance"]
     assert answer(capsys, *asked, "--beyond", 2, "--tolerance", 0.1)["bracket"] == [2, None]
+    words = [*asked[:10], "--output", "distance", "--beyond", 2.5, "--device", "cpu"]
+    shown, _ = run(capsys, "query", *words)
+    assert shown.endswith("distance                farther than 2.5\n") and "points" not in shown
     apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "contacts")
     nowhere = [None, None, None]
     assert apart["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere, "travel": 0}
     assert apart["count"] == 0 and apart["faces"] == apart["contacts"] == []
+    shown, _ = run(capsys, "query", *asked[:10], "--output", "contacts", "--device", "cpu")
+    assert "pair contacts           count 0, point none, normal none, travel 0\n" in shown and "nan" not in shown
     shown, _ = run(capsys, "query", "ball.obj", "ring.ply", "--output", "contacts", "--device", "cpu")
     assert "intersects              yes\n" in shown and len(re.findall(r"^\d+ +\d+$", shown, re.M)) == report.LISTED
     assert re.search(r"^and \d+ more; --json lists all$", shown, re.M) and "face_a  face_b  p0" in shown
@@ -173,6 +179,37 @@ def test_record_of_each_output(files, capsys):
     run(capsys, *words.split(), "out.csv", "--output", "faces")
     rows = list(csv.reader(io.StringIO(Path("out.csv").read_text())))
     assert rows[0] == ["face_a", "face_b"] and [[int(x) for x in row] for row in rows[1:]] == found["faces"]
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (0.0, "0"),
+        (-0.0, "0"),
+        (1 / 3, "0.333333"),
+        (1e-16, "1e-16"),
+        (1234.5678, "1234.57"),
+        (123456.789, "123456.79"),
+        (4512345.678, "4512345.68"),
+        (-4512345.678, "-4512345.68"),
+        (999999.996, "999999.996"),
+        (1e6, "1000000"),
+        (1e15, "1e+15"),
+        (np.float32(0.1), "0.1"),
+        (math.inf, "inf"),
+        (math.nan, "none"),
+    ],
+)
+def test_numbers_for_people(value, shown):
+    assert report.show_number(value) == shown
+
+
+def test_a_mesh_far_from_the_origin_has_bounds(files, capsys):
+    mesh = trimesh.creation.box()
+    mesh.apply_translation((4512345.25, 612345.5, 100.0))
+    mesh.export("far.obj", digits=9)
+    shown, _ = run(capsys, "info", "far.obj")
+    assert re.search(r"^bounds +4512344.75 612345 99.5 4512345.75 612346 100.5$", shown, re.M)
 
 
 # Files of several parts.

@@ -267,6 +267,30 @@ def test_progress_without_a_bar_is_a_line_a_stage(monkeypatch, terminal):
     assert stream.getvalue() == "collapse ...\nLOD bounds ...\n"
 
 
+def test_long_stages_are_estimated():
+    """At 5 s, and whenever twice the time has gone by: of 1,000 steps of a second each."""
+    stream, now = io.StringIO(), [0]
+    progress = progress_module.Progress(stream, clock=lambda: now[0])
+    for done in range(101):
+        now[0] = done
+        progress("frames", done, 1000)
+    progress("other", 0, 2)
+    now[0] += 7
+    progress("other", 1, 2)
+    progress("other", 1, 2)
+    seen = [(5, "0:16:35"), (10, "0:16:30"), (20, "0:16:20"), (40, "0:16:00"), (80, "0:15:20")]
+    lines = [f"frames: {done} of 1,000, about {left} left" for done, left in seen]
+    assert stream.getvalue().splitlines() == ["frames ...", *lines, "other ...", "other: 1 of 2, about 0:00:07 left"]
+
+
+def test_an_estimate_of_years_is_one():
+    stream, clock = io.StringIO(), iter(range(100))
+    progress = progress_module.Progress(stream, clock=lambda: next(clock))
+    for done in range(8):
+        progress("frames", done, 10**30)
+    assert stream.getvalue().splitlines()[1].endswith(", about years left")
+
+
 def test_compiling_is_announced(tmp_path, monkeypatch):
     stream, now = io.StringIO(), time.monotonic()
     (tmp_path / f"wp_module_p{os.getpid()}_t1").mkdir()

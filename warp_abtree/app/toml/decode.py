@@ -10,6 +10,7 @@ from warp_abtree.app.toml.folder import scene_names
 SIZE_LIMIT = 2**24  # bytes of a file
 DEPTH_LIMIT = 16  # of tables and lists in one another
 DOT_LIMIT = 1000  # in a key: the parser takes the square of their number
+NO_SCENE = "is no scene file, which is TOML (.toml); info, query, view and picture take meshes and models"
 KEY_SHOWN, MESSAGE_SHOWN = 100, 300  # characters of an error
 TYPES = {
     "object": "a table",
@@ -56,15 +57,15 @@ def read_tables(path: Path, text: str | None = None):
 
     try:
         tree = _parse(path, msgspec, text)
+    except ValueError as error:  # bytes that are no UTF-8 among them
+        if text is None and path.suffix.lower() not in ("", ".toml"):
+            raise SceneError(f"{path}: {NO_SCENE}") from None
+        raise error if isinstance(error, SceneError) else SceneError(f"{path}: not valid TOML: {error}") from None
     except FileNotFoundError as error:
         known = ", ".join(scene_names())
         raise SceneError(f"{path}: {error.strerror}; scenes that come with the package: {known}") from None
     except OSError as error:
         raise SceneError(f"{path}: {error.strerror or error}") from None
-    except SceneError:
-        raise
-    except ValueError as error:  # bytes that are no UTF-8 among them
-        raise SceneError(f"{path}: not valid TOML: {error}") from None
     _check_values(path, "", tree)
 
     def convert(table, kind, where=""):
