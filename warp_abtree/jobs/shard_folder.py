@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
-from warp_abtree.checks.atomic_write import atomic_write, find_partial
+from warp_abtree.checks.atomic_write import atomic_write, find_partial, is_special
 
 FORMAT_NAME, FORMAT_VERSION = "warp_abtree shards", 2
 MANIFEST = "job.json"
@@ -269,7 +269,7 @@ def _find_shards(path, job) -> dict[tuple[int, int], Path]:
     Raises:
         ValueError: A shard's name is not one of the job.
     """
-    held = {entry.name for entry in path.iterdir() if SHARD_NAME.fullmatch(entry.name) and entry.is_file()}
+    held = {entry.name for entry in path.iterdir() if SHARD_NAME.fullmatch(entry.name) and not is_special(entry)}
     names = {part: _shard_name(*part, job["file"]) for part in _ranges(job)}
     for other in sorted(held.difference(names.values())):
         raise ValueError(f"{path / other}: a shard of another job")
