@@ -198,6 +198,12 @@ def test_a_signal_during_imports_is_not_caught(module, number, told):
     assert run_process("info ball.obj", STOP_AT, STOP_AT=module, NUMBER=str(number.value)) == told
 
 
+def test_a_warning_is_one_line(files):
+    Path("lines.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nl 1 2\n")
+    status, _, errors = run_process("info lines.obj --device cpu")
+    assert (status, errors) == (0, "warp-abtree: lines.obj: left out lines\n")
+
+
 def test_a_kernel_cache_that_cannot_be_written_names_its_variable(files):
     status, _, errors = run_process("info ball.obj --device cpu", WARP_CACHE_PATH=str(files / "ball.obj" / "cache"))
     assert status == 2 and errors.count("\n") == 1 and "ball.obj/cache" in errors
