@@ -34,6 +34,7 @@ class Mesh:
         unreferenced_count: Vertices of the source that no face refers to.
         welded_count: Vertices that coincide with an earlier one and were merged into it.
         remarks: What the file holds and was not read, in one line, empty if nothing.
+        parts: Of the source that were joined; `scene_from_file` makes an object of each.
     """
 
     vertices: np.ndarray
@@ -44,6 +45,7 @@ class Mesh:
     unreferenced_count: int
     welded_count: int
     remarks: str = ""
+    parts: int = 1
 
 
 def load_mesh(source, name=None):
@@ -78,6 +80,7 @@ def load_mesh(source, name=None):
     name = split_file_name(path)[0] if name is None else name
     if isinstance(found, Surface):
         mesh = _weld_mesh(found.vertices, found.faces, name, where=str(path))
+        mesh = replace(mesh, parts=1 if found.parts is None else len(np.unique(found.parts)))
     else:
         mesh = _join_geometry(found, name, where=str(path), remarks=str(remarks))
     remarks.warn(path)
@@ -119,6 +122,7 @@ def describe_mesh(mesh):
     right = "outwards" if winding.is_closed else "consistent"
     return {
         "name": mesh.name,
+        "parts": mesh.parts,
         "faces": len(mesh.faces),
         "vertices": vertex_count,
         "file_vertices": mesh.file_vertex_count,
@@ -183,7 +187,7 @@ def _join_geometry(geometry, name, where=None, remarks=""):
     if not faces:
         kinds = sorted({type(part).__name__ for part, _ in placed})
         raise MeshError(f"{where}: no faces (it holds {', '.join(kinds)})")
-    return _weld_mesh(np.concatenate(vertices), np.concatenate(faces), name, where)
+    return replace(_weld_mesh(np.concatenate(vertices), np.concatenate(faces), name, where), parts=len(faces))
 
 
 def _weld_mesh(vertices, faces, name, where):

@@ -61,12 +61,13 @@ class Model:
         tree: `Tree`.
         dropped_faces: Faces that welding left without three distinct corners, int32; never active.
         centre: Middle of the box of the original vertices [model units], float64 (3,); boxes are kept about it.
+        parts: Of the source that `load` joined into one mesh; 1 for a model that `open` read.
     """
 
-    def __init__(self, progressive: ProgressiveMesh, tree: Tree, name: str):
+    def __init__(self, progressive: ProgressiveMesh, tree: Tree, name: str, parts: int = 1):
         self.progressive = progressive
         self.tree = tree
-        self.name = name
+        self.name, self.parts = name, parts
         self.dropped_faces = np.flatnonzero(progressive.face_split > progressive.lod_max).astype(np.int32)
         original = progressive.vertex_pos[: progressive.vertex_count]
         self.centre = 0.5 * original.min(0) + 0.5 * original.max(0)
@@ -112,11 +113,11 @@ class Model:
             mesh = orient_mesh(mesh) if orient else mesh
             if not cache or len(mesh.faces) < max(LEAST_FACES, base_faces):
                 key = None
-            elif key is None or mesh.remarks:  # then the file is read again, and the warning given again
+            elif key is None or mesh.remarks or mesh.parts > 1:  # then the file is read again, and told of again
                 key = mesh_key(mesh, *options)
                 model = find_model(key, partial(_read, error_key=error_key(key)))
             model = model or _build(mesh, base_faces, progress, key, certify)
-            model = model if model.name == mesh.name else cls(model.progressive, model.tree, mesh.name)
+            model = cls(model.progressive, model.tree, mesh.name, mesh.parts)
         if certify:
             model.error_at(0)
         return model
