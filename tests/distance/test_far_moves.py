@@ -38,7 +38,7 @@ def test_far_moves_cost_no_more_than_a_fresh_search():
 
 
 def test_searches_never_start_from_faces_that_are_not_there(device):
-    """Faces that the LOD lacks, of a ring about its frame's origin and of a ball there, as well as faces that it has."""
+    """Faces that the LOD lacks, of a ring about its frame's origin and of a ball there, and faces that it has."""
     ring, ball = ab.Model.load(trimesh.creation.torus(0.5, 0.1, major_sections=24, minor_sections=12)), sample("ball")
     small = ab.Model.from_arrays(ball.mesh_at(ball.lod_max)[0] / 8, ball.mesh_at(ball.lod_max)[1])
     scene, lods = ab.Scene(device), [model.lod_for(fraction=0.3) for model in (ring, small)]
