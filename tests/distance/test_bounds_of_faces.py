@@ -2,9 +2,9 @@
 
 import numpy as np
 import warp as wp
+from helpers.nested import speck_cases
 from helpers.questions import launch, pairs_of, scene_of
 from helpers.samples import random_poses, sample
-from helpers.specks import speck_cases
 from oracles.triangle_distance import triangle_distance
 
 import warp_abtree as ab

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import warp as wp
+from helpers.nested import speck_cases
 from helpers.questions import pairs_of, scene_of
-from helpers.specks import speck_cases
 
 from warp_abtree import testing
 
