@@ -18,7 +18,7 @@ from warp_abtree.kernels.traversal.nodes import Node, load_constant
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Margins of boxes that a bound leaves off, of twice the distance.
-MARGINS = wp.constant(wp.float32(16.0))
+MARGINS = wp.constant(wp.float32(6.0))
 # How much the sums of two nodes' normals count for the direction, beside what joins their middles; as was counted.
 NORMAL_WEIGHT = wp.constant(wp.float32(0.0625))
 

@@ -136,6 +136,47 @@ def test_points_may_be_off_the_screw(device):
         assert not found_apart(rng, device, off=0.9 * slack, slack=slack).any()
 
 
+def blade(radius, out, along, slope, corner):
+    """Return corners of a flat patch some radius from the axis, and which of them is farthest out and along.
+
+    Args:
+        out, along: Half widths from the axis and around it.
+        slope: By which it rises around the axis.
+        corner: Signs of the corner outwards and around.
+    """
+    u, v = np.stack(np.meshgrid([-1, 0, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 2).T
+    points = np.stack([radius + out * v, along * u, slope * along * u], 1)
+    return points, np.flatnonzero((v == corner[0]) & (u == corner[1]))[0]
+
+
+# Half widths out and around of the resting patch, 1 from the axis, and of the moving one, of which corners meet.
+THIN = 1e-3
+BLADES = {
+    "around, at a corner of the resting one": ((0.05, 0.4), (THIN, THIN)),
+    "around, at a corner of the moving one": ((THIN, THIN), (THIN, 0.4)),
+    "out and around, at a corner of the resting one": ((0.25, 0.25), (THIN, THIN)),
+    "at an end of either": ((0.3, THIN), (THIN, 0.3)),
+}
+
+
+@pytest.mark.parametrize("kind", BLADES)
+def test_patches_that_twist_as_angles_do_are_not_apart(device, kind):
+    """Along a screw angles are not what is linear: patches as thin as that leaves them, in the plane of a screw."""
+    rng, (rest_widths, (out, along)) = np.random.default_rng(5), BLADES[kind]
+    cases = []
+    for _ in range(COUNT):
+        turn, t, signs = rng.uniform(0.2, 3), rng.choice([0, rng.uniform(), 1]), rng.choice([-1, 1], (2, 2))
+        pitch = rng.uniform(0.5, 3) * rng.choice([-1, 1])
+        rest, i = blade(1.0, *rest_widths, pitch, signs[0])
+        radius = np.sqrt(np.hypot(*rest[i, :2]) ** 2 - along**2) - signs[1][0] * out
+        moving, j = blade(radius, out, along, pitch, signs[1])
+        angle = np.arctan2(*rest[i, 1::-1]) - np.arctan2(*moving[j, 1::-1])
+        moving = Rotation.from_euler("z", angle).apply(moving) + [0, 0, rest[i, 2] - moving[j, 2]]
+        way = np.array([0, 0, pitch * turn])
+        cases.append((rest, Rotation.from_euler("z", -turn * t).apply(moving - t * way), turn, way))
+    assert not slides(rng, device, cases).any()
+
+
 def test_wide_balls_near_the_axis_say_nothing_of_times(device):
     """The corner that meets the other patch at the end is farther from its box's centre than 1.1 x, x of the radius."""
     cases = []
