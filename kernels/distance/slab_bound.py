@@ -8,6 +8,7 @@ size, so that such bounds err by the square of the size, where boxes err by the 
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.distance.frame import Frame
 from warp_abtree.kernels.poses import PairPose
 from warp_abtree.kernels.slabs.mean_slabs import Slabs
@@ -18,7 +19,7 @@ from warp_abtree.kernels.traversal.nodes import Node, load_constant
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Margins of boxes that a bound leaves off, of twice the distance.
-MARGINS = wp.constant(wp.float32(6.0))
+MARGINS = wp.constant(wp.float32(native.constant("SLAB_MARGINS")))
 # How much the sums of two nodes' normals count for the direction, beside what joins their middles; as was counted.
 NORMAL_WEIGHT = wp.constant(wp.float32(0.0625))
 

@@ -9,14 +9,17 @@ from oracles.triangle import into_frame_of_a, quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree import testing
+from warp_abtree.kernels import native
 from warp_abtree.kernels.distance.frame import PAIRS_LEAST
+from warp_abtree.kernels.distance.slab_bound import MARGINS
+from warp_abtree.kernels.poses import ROUNDING_32
 
 STILL = (0, 0, 0, 0, 0, 0, 1)
 ANSWERS = ("distance", "bracket", "points", "point_faces")
 
 
 # Corners of A and of B, B's quaternion, and how far the first corners are apart: slabs' roundings add up to 5.4 times
-# u (r_a + r_b + s) for warps, to 4.2 times that on a CPU, of 27 that margins have.
+# u (r_a + r_b + s) for warps, to 4.2 times that on a CPU, of 45 that margins have.
 ROUNDED = [
     (
         [
@@ -209,3 +212,11 @@ def test_margins_of_slabs_cover_roundings_that_add_up(device, case):
             found = query.run()
             assert (query._slabs.made.numpy()[:, 0] >= 0).sum() == 2
         np.testing.assert_allclose(found.distance, distance, rtol=1e-6)
+
+
+def test_slabs_leave_off_what_roundings_add_up_to():
+    """Those of docs/exactness.md, in u of the reaches of A and of B and of the translation, along n and across it."""
+    along, across = (17.6, 26.9, 8.3), (25, 37, 27)
+    room = float(MARGINS) / 2 * float(ROUNDING_32) / 2.0**-24
+    assert room >= max(*along, *across) and int(MARGINS) == native.constant("SLAB_MARGINS")
+    assert "boxes.margin = SLAB_MARGINS * frame.margin;" in native.body("nearest/search.h", "search_nearest")
