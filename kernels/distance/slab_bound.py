@@ -8,6 +8,7 @@ size, so that such bounds err by the square of the size, where boxes err by the 
 
 import warp as wp
 
+from warp_abtree.kernels import native
 from warp_abtree.kernels.base.boxes import fuse32, map_point
 from warp_abtree.kernels.base.nodes import Node, load_constant
 from warp_abtree.kernels.base.poses import PairPose
@@ -18,7 +19,7 @@ from warp_abtree.kernels.search.slab_overlap import add_product, take_multiple
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 # Margins of boxes that a bound leaves off, of twice the distance.
-MARGINS = wp.constant(wp.float32(16.0))
+MARGINS = wp.constant(wp.float32(native.constant("SLAB_MARGINS")))
 # How much the sums of two nodes' normals count for the direction, beside what joins their middles; as was counted.
 NORMAL_WEIGHT = wp.constant(wp.float32(0.0625))
 

@@ -39,7 +39,7 @@ def make_turns(rng, device, count):
 def test_a_graph_answers_what_is_in_place(device, warps):
     """Captured before there was a launch; and calls one after the other, from the fourth on a graph on a GPU."""
     rng = np.random.default_rng(15)
-    scene, turns = make_turns(rng, device, 20)
+    scene, turns = make_turns(rng, device, 8)
     if scene.device.is_cuda and not warps:
         pytest.skip("CUDA has warps alone")
     met = []

@@ -1,10 +1,20 @@
-"""Searches that start from the last faces where objects have moved far since."""
+"""Searches that start from the last faces where objects have moved far since, or where these faces are gone."""
 
 import numpy as np
 import trimesh
-from helpers.samples import random_poses
+import warp as wp
+from helpers.questions import launch
+from helpers.samples import random_poses, sample
 
 import warp_abtree as ab
+from warp_abtree.kernels.base.arrays import ModelPool, StatePool
+from warp_abtree.kernels.distance.frame import is_active
+
+
+@wp.kernel(module="unique")
+def is_active_kernel(models: ModelPool, states: StatePool, active_out: wp.array(dtype=wp.int32)):
+    """Tell of each face of state 0, and of some beyond its last."""
+    active_out[wp.tid()] = wp.where(is_active(models, states, 0, wp.tid()), 1, 0)
 
 
 def test_far_moves_cost_no_more_than_a_fresh_search():
@@ -25,3 +35,25 @@ def test_far_moves_cost_no_more_than_a_fresh_search():
     fresh = query.run()
     apart &= ~fresh.any
     assert apart.sum() > 100 and moved[apart].sum() < 1.1 * fresh.node_tests[apart].sum()
+
+
+def test_searches_never_start_from_faces_that_are_not_there(device):
+    """Faces that the LOD lacks, of a ring about its frame's origin and of a ball there, and faces that it has."""
+    ring, ball = ab.Model.load(trimesh.creation.torus(0.5, 0.1, major_sections=24, minor_sections=12)), sample("ball")
+    small = ab.Model.from_arrays(ball.mesh_at(ball.lod_max)[0] / 8, ball.mesh_at(ball.lod_max)[1])
+    scene, lods = ab.Scene(device), [model.lod_for(fraction=0.3) for model in (ring, small)]
+    for _ in range(20):
+        for model, lod in zip((ring, small), lods):
+            scene.add(model, lod=lod)
+    pairs, rng = np.arange(40).reshape(-1, 2), np.random.default_rng(1)
+    query = ab.DistanceQuery(scene, pairs)
+    expected = query.run()
+    there = [np.isin(np.arange(model.face_count), model.mesh_at(lod)[2]) for model, lod in zip((ring, small), lods)]
+    active = launch(is_active_kernel, device, ring.face_count + 5, *scene.batch().pools[:2])
+    np.testing.assert_array_equal(active, [*there[0], *[False] * 5])
+    for kinds in ((False, False), (False, True), (True, False), (True, True)):
+        faces = [rng.choice(np.flatnonzero(rows == kind), len(pairs)) for rows, kind in zip(there, kinds)]
+        query.start_from(np.stack(faces, 1))
+        found = query.run()
+        for name in ("distance", "bracket", "points", "point_faces"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))

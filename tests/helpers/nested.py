@@ -1,9 +1,13 @@
-"""Surfaces inside one another, near or touching."""
+"""Surfaces inside one another, near or touching; and specks nearer to a large object than coordinates round."""
 
 import numpy as np
+from oracles.triangle import into_frame_of_a, quaternion_matrix
+from oracles.triangle_distance import triangle_distance
 
 import warp_abtree as ab
-from helpers.samples import random_poses, sample
+from helpers.samples import STILL, random_poses, random_quaternions, sample
+
+STEP = 2.0**-23  # of float32 from 1 to 2
 
 
 def shells(rng, gap):
@@ -32,3 +36,30 @@ def nested_cases(rng, gap, count=2):
         moved[:3] += gap / 4 * rng.normal(size=3)
         cases.append((outer, lods[0], pose, inner, lods[1], moved))
     return cases
+
+
+def nearly_halfway(x, sign):
+    """Return numbers from 1 to 2 near x that float32 rounds by almost half a step, up or down by a sign."""
+    return STEP * (np.floor(x / STEP) + 0.5 + 0.01 * sign)
+
+
+def speck_cases(rng, count, gap, size=1e-3):
+    """Return cases of a large object and a speck, and how far each pair is apart, about a gap, in integers.
+
+    The first face of either is the nearest. A's looks outwards near (1, 1, 1), and B is over its first corner;
+    roundings of that corner and of the place of B are towards one another, or apart.
+    """
+    cases, distances = [], []
+    out = np.ones(3) / np.sqrt(3)
+    across = np.linalg.svd(out[None])[2][1:]
+    for k in range(count):
+        sign = 1 if k % 2 else -1
+        pose = np.array([*nearly_halfway(rng.uniform(1, 1.01, 3), sign), *random_quaternions(rng, 1)[0]])
+        corner = nearly_halfway(pose[:3] - gap * out, -sign)
+        face = np.stack([corner, *(corner + size * (rng.normal(size=(2, 2)) @ across - 0.1 * out))])
+        above = size * (rng.normal(size=(2, 2)) @ across + rng.uniform(0.5, 1, (2, 1)) * out)
+        speck = np.concatenate([np.zeros((1, 3)), above @ quaternion_matrix(pose[3:])])
+        a = ab.Model.from_arrays(np.concatenate([face, -face]), [[0, 1, 2], [3, 4, 5]])
+        cases.append((a, None, np.array(STILL), ab.Model.from_arrays(speck, [[0, 1, 2]]), None, pose))
+        distances.append(triangle_distance(face, into_frame_of_a(speck, STILL, pose)))
+    return cases, np.array(distances)

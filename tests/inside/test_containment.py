@@ -9,6 +9,7 @@ from helpers.solids import ask, lattice_pose, model_of, shell, voxel_mesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.inside import components, parity, solids_intersect
+from oracles.triangle import quaternion_matrix
 
 import warp_abtree as ab
 from warp_abtree.kernels.inside.parity import Ray, crosses_face
@@ -313,3 +314,29 @@ def solid_angle(triangles):
     volume = np.einsum("ij,ij->i", a, np.cross(b, c))
     rest = x * y * z + np.einsum("ij,ij->i", a, b) * z + np.einsum("ij,ij->i", b, c) * x
     return 2 * np.arctan2(volume, rest + np.einsum("ij,ij->i", c, a) * y).sum()
+
+
+def test_boxes_that_rays_meet_are_as_wide_as_they_round(device):
+    """Specks far from the middle of their object, in and about a solid that is hardly larger than what rounds there."""
+    rng = np.random.default_rng(7)
+    size, count = 2.0**-20, 160
+    corners, faces = (
+        np.concatenate([np.zeros((1, 3)), np.eye(3)]),
+        np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]),
+    )
+    body = trimesh.creation.box((2 * size,) * 3)
+    solid = ab.Model.from_arrays(body.vertices, body.faces, base_faces=4)
+    scene, truth = ab.Scene(device), []
+    for _ in range(count):
+        pose = np.concatenate([rng.normal(size=3), random_poses(rng, 1, 0.0)[0, 3:]])
+        inside = size * rng.uniform(-1.2, 1.2, 3)
+        speck = quaternion_matrix(pose[3:]) @ inside + pose[:3] + size * 2.0**-10 * corners
+        specks = np.concatenate([speck, -speck]), np.concatenate([faces, faces + 4])
+        scene.add(ab.Model.from_arrays(*specks, base_faces=8))
+        scene.add(solid, pose, solid=True)
+        truth.append(solids_intersect(specks, (body.vertices, body.faces), moved(), pose, False, True))
+    found = scene.intersect(np.arange(2 * count).reshape(-1, 2), "count")
+    meet, held = np.array(truth).T
+    assert 30 < held.sum() < count - 30
+    np.testing.assert_array_equal(found.count > 0, meet)
+    np.testing.assert_array_equal(found.any, meet | held)

@@ -42,7 +42,6 @@ struct NearBoxes : SlabBounds {
             s.there[i] = lanes{} + 2 * there[i];
         }
         s.wide = 2 * margin;
-        s.margin = 16 * margin;  // docs/exactness.md
         s.slabs = 0;
         s.normals = false;
         s.scale = scale;

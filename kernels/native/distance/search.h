@@ -23,6 +23,7 @@ wp::vec_t<3, wp::int32> search_nearest(ModelPool models, StatePool states, PairP
     const auto& r = pose.rotation32.data;
     NearBoxes boxes = NearBoxes::make(r, frame.back, frame.translation, frame.margin, frame.scale, states.node_box.data,
                                       pose.node_a, pose.node_b);
+    boxes.margin = SLAB_MARGINS * frame.margin;
     if (with_slabs) {
         boxes.slabs = (const char*)slabs.record.data - (const char*)states.node_box.data;
         boxes.normals = h.face_tests >= NORMALS_LEAST;
