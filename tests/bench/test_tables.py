@@ -53,14 +53,41 @@ def test_labels_of_a_logarithmic_axis_do_not_overlap(tmp_path):
 def test_pages_repeat_their_data(file, tmp_path):
     """python -m bench.tables docs/data/*.json writes the pages; all tables and figures have rows."""
     data = json.loads(file.read_text(encoding="utf-8"))
-    page = tables.study_page(data)
-    assert file.with_suffix(".md").read_text(encoding="utf-8") == page and "Not measured" not in page
+    pages = tables.find_pages(file)
+    assert pages and not any("Not measured" in text for text in pages.values())
+    assert {page: page.read_text(encoding="utf-8") for page in pages} == pages
+    if file.with_suffix(".md") not in pages:
+        return
     assert not any(part["run"]["quick"] for part in data["parts"].values())
     assert set(study.find_study(data["study"]).PARTS) == set(data["parts"])
     pytest.importorskip("matplotlib")
     figures = tables.read_layout(f"studies/{data['study']}.toml")["figure"]
     said = tables.draw(figures, lambda figure: tables.select_rows(figure, data), tmp_path)
     assert all(figure["file"] in said for figure in figures)
+
+
+def test_tables_of_pages_change_with_their_data(tmp_path):
+    """A number of one row stands in the README and in performance.md; every layout has a place in one of them."""
+    data = json.loads((DATA / "performance.json").read_text(encoding="utf-8"))
+    (row,) = tables.pick(data["parts"]["distance"]["rows"], workload="knot", poses=65536)
+    row["again_ms"] = 8.7654
+    changed = tmp_path / "performance.json"
+    tables.write_json(changed, data)
+    pages = tables.find_pages(changed)
+    for name in ("README.md", "performance.md"):
+        (page,) = [path for path in pages if path.name == name]
+        assert "8.7654" in pages[page] and "8.7654" not in page.read_text(encoding="utf-8")
+    laid_out = [table["name"] for table in tables.read_layout("studies/performance.toml")["table"]]
+    places = [place["table"] for text in pages.values() for place in tables.PLACE.finditer(text)]
+    assert sorted(places) == sorted(laid_out)
+
+
+def test_a_place_for_a_table_that_there_is_not():
+    data = json.loads((DATA / "performance.json").read_text(encoding="utf-8"))
+    other = "<!-- table other gone -->\n<!-- end -->"
+    assert tables.fill_page(other, "performance", data) == other
+    with pytest.raises(ValueError, match="no table gone in bench/studies/performance.toml"):
+        tables.fill_page(other.replace("other", "performance"), "performance", data)
 
 
 def test_models_are_kept(tmp_path, monkeypatch):
