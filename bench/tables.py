@@ -85,8 +85,7 @@ def shown(value, form="") -> str:
 def select_rows(layout, study):
     """Return the rows of a table or figure: of its part, chosen by `where`, and summarised where it says so.
 
-    Where a layout has `rows`, each of them is made of one row: of the part and `where` that it names, whose values stand
-    in the texts that it shows.
+    A layout's `rows` are texts, each with the values of one row of the study in it.
     """
     if "rows" in layout:
         return [show_row(row, study) for row in layout["rows"]]
@@ -163,7 +162,7 @@ def fill_page(text, name, study) -> str:
 
 
 def find_pages(file) -> dict:
-    """Return what the pages that show a file's rows are to hold: of a study its own, and all with a place for a table."""
+    """Return what the pages that show a file's rows hold: a study's own, and all that have places for its tables."""
     study = json.loads(file.read_text(encoding="utf-8"))
     own = read_layout(f"studies/{study['study']}.toml").get("own_page", True)
     texts = {file.with_suffix(".md"): study_page(study)} if own else {}

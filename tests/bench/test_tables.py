@@ -86,7 +86,7 @@ def test_a_place_for_a_table_that_there_is_not():
     data = json.loads((DATA / "performance.json").read_text(encoding="utf-8"))
     other = "<!-- table other gone -->\n<!-- end -->"
     assert tables.fill_page(other, "performance", data) == other
-    with pytest.raises(ValueError, match="no table gone in bench/studies/performance.toml"):
+    with pytest.raises(ValueError, match="no table gone in "):
         tables.fill_page(other.replace("other", "performance"), "performance", data)
 
 
