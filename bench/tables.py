@@ -101,12 +101,14 @@ def show_row(layout, study) -> dict:
     return {name: text.format(**row) for name, text in layout["show"].items()}
 
 
-def markdown_table(layout, study) -> str:
-    """Return a table of a study as Markdown."""
-    rows = select_rows(layout, study)
+def markdown_table(layout, study, short=None) -> str:
+    """Return a table of a study as Markdown; `short` has the rows (`where`) and `columns` that are shown, others not."""
+    short = short or {}
+    rows = pick(select_rows(layout, study), **short.get("where", {}))
     if not rows:
         return "Not measured in this run."
     columns = [(name, heading, *form, "")[:3] for name, heading, *form in layout["columns"]]
+    columns = [column for column in columns if column[0] in short.get("columns", [column[0]])]
     left = [any(isinstance(row.get(name), str) for row in rows) for name, _, _ in columns]
     lines = [[heading for _, heading, _ in columns], ["---" if is_left else "--:" for is_left in left]]
     lines += [[shown(row.get(name), form) for name, _, form in columns] for row in rows]
@@ -114,26 +116,34 @@ def markdown_table(layout, study) -> str:
 
 
 def markdown_run(study) -> str:
-    """Return device, date, versions and command as a Markdown list; seconds are summed."""
+    """Return what is known of device, date, versions and command as a Markdown list; seconds are summed."""
     runs = [part["run"] for part in study["parts"].values()]
     lines = []
     for key in SHOWN_RUN:
-        values = [run[key] for run in runs]
+        values = [run[key] for run in runs if key in run]
         text = f"{sum(values):.0f}" if key == "seconds" else ", ".join(dict.fromkeys(map(str, values)))
-        lines.append(f"- {key}: `{text}`" if key == "command" else f"- {key}: {text}")
-    if any(run["quick"] for run in runs):
+        if values and (key not in ("device", "command") or len(set(values)) == 1):  # else each table says it
+            lines.append(f"- {key}: `{text}`" if key == "command" else f"- {key}: {text}")
+    if any(run.get("quick") for run in runs):
         lines.append("- size: quick, to try the parts out, not to be quoted")
     return "\n".join(lines)
 
 
+def say_run(run) -> str:
+    """Return the device and the command of a part."""
+    return f"{run['device']}: `{run['command']}`."
+
+
 def study_page(study) -> str:
-    """Return all tables of a study as one Markdown page; each says its device where parts ran on several."""
-    devices = {name: part["run"]["device"] for name, part in study["parts"].items()}
-    every = list(dict.fromkeys(devices.values()))
-    blocks = [f"# Study {study['study']}: {', '.join(every) or 'nothing'}", markdown_run(study)]
-    for table in read_layout(f"studies/{study['study']}.toml")["table"]:
-        if table["part"] in study["parts"]:
-            blocks += [f"## {table['title']}"] + [f"Device: {devices[table['part']]}."] * (len(every) > 1)
+    """Return all tables of a study as one Markdown page; each says its device and command where parts differ in them."""
+    ran = {name: say_run(part["run"]) for name, part in study["parts"].items()}
+    devices = list(dict.fromkeys(part["run"]["device"] for part in study["parts"].values()))
+    layout = read_layout(f"studies/{study['study']}.toml")
+    title = layout.get("title", f"Study {study['study']}: {', '.join(devices) or 'nothing'}")
+    blocks = [f"# {title}", markdown_run(study)]
+    for table in layout["table"]:
+        if table.get("part") in study["parts"]:
+            blocks += [f"## {table['title']}"] + [ran[table["part"]]] * (len(set(ran.values())) > 1)
             blocks += [markdown_table(table, study)] + ([table["note"]] if "note" in table else [])
     blocks += [note for part in study["parts"].values() for note in part["notes"]]
     return "\n\n".join(blocks) + "\n"
@@ -141,6 +151,8 @@ def study_page(study) -> str:
 
 def fill_page(text, name, study) -> str:
     """Return the text of a page with the tables of a file of rows in their places, each with its device and command.
+
+    Of a layout that has `short` only that is shown.
 
     Raises:
         ValueError: The layout has no such table.
@@ -154,9 +166,8 @@ def fill_page(text, name, study) -> str:
             raise ValueError(f"no table {place['table']} in bench/studies/{study['study']}.toml")
         layout, said = layouts[place["table"]], ""
         if "part" in layout:
-            run = study["parts"][layout["part"]]["run"]
-            said = f"\n{run['device']}: `{run['command']}`. "
-        return f"{place[1]}{markdown_table(layout, study)}\n{said}{place[4]}"
+            said = f"\n{say_run(study['parts'][layout['part']]['run'])} "
+        return f"{place[1]}{markdown_table(layout, study, layout.get('short'))}\n{said}{place[4]}"
 
     return PLACE.sub(fill, text)
 
@@ -164,8 +175,7 @@ def fill_page(text, name, study) -> str:
 def find_pages(file) -> dict:
     """Return what the pages that show a file's rows hold: a study's own, and all that have places for its tables."""
     study = json.loads(file.read_text(encoding="utf-8"))
-    own = read_layout(f"studies/{study['study']}.toml").get("own_page", True)
-    texts = {file.with_suffix(".md"): study_page(study)} if own else {}
+    texts = {file.with_suffix(".md"): study_page(study)}
     for page in sorted(path for pattern in PAGES for path in HERE.parent.glob(pattern)):
         text = page.read_text(encoding="utf-8")
         if any(place["file"] == file.stem for place in PLACE.finditer(text)):
