@@ -102,7 +102,7 @@ def show_row(layout, study) -> dict:
 
 
 def markdown_table(layout, study, short=None) -> str:
-    """Return a table of a study as Markdown; `short` has the rows (`where`) and `columns` that are shown, others not."""
+    """Return a table of a study as Markdown; of `short` only its `columns`, and the rows that `where` selects."""
     short = short or {}
     rows = pick(select_rows(layout, study), **short.get("where", {}))
     if not rows:
@@ -135,7 +135,7 @@ def say_run(run) -> str:
 
 
 def study_page(study) -> str:
-    """Return all tables of a study as one Markdown page; each says its device and command where parts differ in them."""
+    """Return all tables of a study as one Markdown page; each says its device and command where these differ."""
     ran = {name: say_run(part["run"]) for name, part in study["parts"].items()}
     devices = list(dict.fromkeys(part["run"]["device"] for part in study["parts"].values()))
     layout = read_layout(f"studies/{study['study']}.toml")
