@@ -132,7 +132,7 @@ def test_info_reads_a_built_model(tmp_path, capsys):
         assert main(["info", str(tmp_path / name), "--json", "--device", "cpu"]) == 0
         found[name] = json.loads(capsys.readouterr().out)
     own = {"lods": model.lod_max + 1, "base_faces": len(model.mesh_at(0)[2])}
-    of_file = ("file_vertices", "unreferenced_vertices", "welded_vertices")
+    of_file = ("parts", "file_vertices", "unreferenced_vertices", "welded_vertices")
     assert found["m.obj"]["dropped_faces"] == 1
     assert found["m.npz"] == {key: value for key, value in found["m.obj"].items() if key not in of_file} | own
     assert main(["info", str(tmp_path / "m.npz"), "--device", "cpu"]) == 0

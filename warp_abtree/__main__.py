@@ -1,24 +1,32 @@
 """Run the command line: ``warp-abtree`` or ``python -m warp_abtree``.
 
-What needs no Warp stands here: the version, and an interrupt while the library is being imported.
+What needs no Warp stands here: the version, and signals while the library is being imported.
 """
 
+import os
+import signal
 import sys
 
 
 def main() -> int:
     """Run the command line of this process and return its exit status."""
+    from warp_abtree.checks.signals import handle_signals
     from warp_abtree.checks.version import __version__
 
+    handle_signals(end_process, end_process)
     if sys.argv[1:] == ["--version"]:
         print(f"warp-abtree {__version__}")
         return 0
-    try:
-        from warp_abtree.app.cli.main import main as run
-    except KeyboardInterrupt:
-        print("warp-abtree: interrupted", file=sys.stderr)
-        return 130
+    from warp_abtree.app.cli.main import main as run
+
     return run()
+
+
+def end_process(number, frame):
+    """Handle SIGINT and SIGTERM by the end of the process: modules that are being imported may catch any exception."""
+    told = "interrupted" if number == signal.SIGINT else "terminated"
+    os.write(2, f"warp-abtree: {told}\n".encode())
+    os._exit(128 + number)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,44 @@ class RigidContacts:
     margin1: wp.array(dtype=wp.float32)  # surface margin of shape 1 [m]
 
 
+@wp.struct
+class ShapeSettings:
+    """Settings of shapes as of `newton.Model`, shape [shape_count]."""
+
+    scale: wp.array(dtype=wp.vec3)  # along the axes of the shape's frame
+    margin: wp.array(dtype=wp.float32)  # surface margin [m]
+    gap: wp.array(dtype=wp.float32)  # how far beyond the margin contacts begin [m]
+    flags: wp.array(dtype=wp.int32)  # newton.ShapeFlags
+    collision_group: wp.array(dtype=wp.int32)  # 0 collides with none
+    world: wp.array(dtype=wp.int32)  # -1 is in every one
+    body: wp.array(dtype=wp.int32)  # -1 is static
+
+
+@wp.kernel
+def find_changed_kernel(
+    collides: wp.int32,
+    is_own: wp.array(dtype=wp.int32),
+    kept: ShapeSettings,
+    now: ShapeSettings,
+    changed_out: wp.array(dtype=wp.int32),
+):
+    """Find the first shape whose settings are others than were kept.
+
+    Args:
+        collides: Flags that count.
+        is_own: Whether each shape is one of the scene's, whose geometry counts too.
+        changed_out: The least such shape so far, shape [1].
+    """
+    s = wp.tid()
+    same = ((kept.flags[s] ^ now.flags[s]) & collides) == 0 and kept.collision_group[s] == now.collision_group[s]
+    same = same and kept.world[s] == now.world[s] and kept.body[s] == now.body[s]
+    if is_own[s] != 0:
+        same = same and kept.scale[s] == now.scale[s]
+        same = same and kept.margin[s] == now.margin[s] and kept.gap[s] == now.gap[s]
+    if not same:
+        wp.atomic_min(changed_out, 0, s)
+
+
 @wp.func
 def pose_shape(
     body_q: wp.array(dtype=wp.transform),

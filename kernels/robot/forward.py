@@ -24,7 +24,10 @@ QUARTER_1 = wp.constant(wp.float64(1.57079632673412561417e00))
 QUARTER_2 = wp.constant(wp.float64(6.07710050630396597660e-11))
 QUARTER_3 = wp.constant(wp.float64(2.02226624879595063154e-21))
 
-NONE_REFUSED = wp.constant(2**31 - 1)
+# Of the greater limit: what float32 may put a value beyond one of them, as lower + 1 * (upper - lower) does.
+LIMIT_ROUNDING = wp.constant(wp.float64(2.0**-22))
+
+NONE_REFUSED = wp.constant(wp.int64(2**63 - 1))
 
 
 @wp.struct
@@ -95,30 +98,41 @@ def move_joint(chain: Chain, configurations: wp.array2d(dtype=wp.float64), i: wp
     return rotation, position
 
 
+@wp.func
+def keeps_limits(value: wp.float64, lower: wp.float64, upper: wp.float64):
+    """Return whether a value is within limits, or a float32 number that is beyond one by rounding alone."""
+    none = wp.float64(0.0)
+    beyond = wp.max(lower - value, value - upper)
+    size = wp.max(wp.where(wp.isfinite(lower), wp.abs(lower), none), wp.where(wp.isfinite(upper), wp.abs(upper), none))
+    rounded = wp.float64(wp.float32(value)) == value
+    return beyond <= none or (rounded and beyond <= LIMIT_ROUNDING * size)
+
+
 @wp.kernel
 def check_configuration_kernel(
     limited: wp.int32,
     count: wp.int32,
     chain: Chain,
     configurations: wp.array2d(dtype=wp.float64),
-    first_inout: wp.array(dtype=wp.int32),
+    first_inout: wp.array(dtype=wp.int64),
 ):
-    """Find the first configuration with a number that is not finite, too large an angle, or out of its limits.
+    """Find the first value of configurations that is not finite, too large, or out of its limits.
 
     Args:
         limited: Whether limits are kept to, 0 or 1.
-        first_inout: Index of the first one, NONE_REFUSED for none, shape [1].
+        first_inout: Where it is, configuration * values + value, NONE_REFUSED for none, shape [1].
     """
     i = wp.tid()
     if i >= count:
         return
-    for k in range(chain.lower.shape[0]):
+    width = chain.lower.shape[0]
+    for k in range(width):
         value = configurations[i, k]
         fine = wp.abs(value) < wp.float64(wp.static(ANGLE_MAX))  # false for NaN
         if limited != 0:
-            fine = fine and value >= chain.lower[k] and value <= chain.upper[k]
+            fine = fine and keeps_limits(value, chain.lower[k], chain.upper[k])
         if not fine:
-            wp.atomic_min(first_inout, 0, i)
+            wp.atomic_min(first_inout, 0, wp.int64(i) * wp.int64(width) + wp.int64(k))
 
 
 @wp.kernel

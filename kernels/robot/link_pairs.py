@@ -3,10 +3,12 @@
 A configuration is asked part by part, and no more once it is decided. Edges of a planner ask how far the points of a
 part are from where they stand at the middle of a stretch of the edge. To get from there to any other configuration of
 the stretch, let the joints turn one by one, the outermost first: the joints that a joint hangs on still stand as in the
-middle, and so does its axis. A turn by an angle moves a point by no more than the angle times its distance from the
-axis, which is that of the part in the middle and what outer joints have moved the point by:
+middle, and so does its axis. A turn T takes a point p that outer joints have moved to q by
 
-    reach = 0;  from the part inwards:  reach += angle (distance of the part's farthest point + reach)
+    |T q - p| <= |T q - T p| + |T p - p| = |q - p| + |T p - p|
+
+and |T p - p| is at most the angle times the distance of p from the axis, both in the middle. So the reach of a part is
+the sum over its joints of angle times distance of its farthest point, or of how far a joint slides.
 
 The joints that both parts of a pair hang on move them as one and do not count.
 """
@@ -77,7 +79,7 @@ def part_reach(chain: Chain, frames: Frames, parts: Parts, chunk: Chunk, i: wp.i
             if kind == REVOLUTE:
                 axis = frames.rotation[i, f] * chain.axis[f]
                 far = wp.length(wp.cross(axis, point - frames.position[i, f])) + radius
-                reach += value * (far + reach)
+                reach += value * far
             elif kind == PRISMATIC:
                 reach += value
         f = chain.parent[f]

@@ -1,5 +1,7 @@
 """Bad input to any command: one line on stderr that says what and where, status 2, and nothing is written."""
 
+import os
+
 import numpy as np
 import pytest
 import trimesh
@@ -45,6 +47,16 @@ CASES = [
     ("run scene.toml --picture out.jpg", "must end in .png"),
     ("run scene.toml --record rows.xls", ".csv or .json"),
     ("run scene.toml --plot gone/plots", "no folder gone"),
+    ("run scene.toml --plot ball.obj", "--plot: ball.obj is no folder"),
+    ("run scene.toml --plot ball.obj/plots", "ball.obj is no folder"),
+    ("run scene.toml --plot nowhere", "--plot: nowhere is no folder"),
+    ("run scene.toml --plot plot.png", "--plot: plot.png names a picture; give a folder"),
+    ("run scene.toml --record pipe.csv", "pipe.csv: is neither a file nor a folder"),
+    ("query ball.obj ball.obj --output faces --record pipe.csv", "pipe.csv: is neither a file nor a folder"),
+    ("build ball.obj ball.obj/ball.npz", "ball.obj is no folder"),
+    ("run ball.obj", "ball.obj: is no scene file, which is TOML (.toml); info, query, view and picture take meshes"),
+    ("run ball.glb", "ball.glb: is no scene file, which is TOML (.toml)"),
+    ("run face.npz", "face.npz: is no scene file, which is TOML (.toml)"),
     ("run one.toml --objects 5", "count or worlds"),
     ("run scene.toml --budget soon", "'soon' is no time above 0"),
     ("run scene.toml --budget 8", "'8' has no unit; give 8ms or 8s"),
@@ -59,6 +71,11 @@ CASES = [
     ("picture ball.obj scene.toml --out out.png", "a scene file is looked at alone"),
     ("picture ball.obj --out x.jpg", "must end in .png"),
     ("picture ball.obj --frame -1 --out out.png", "--frame: -1 is below 0"),
+    (
+        "picture ball.obj --frames 100000 --out out.gif",
+        "--frames: 100,000 pictures of 800 x 800 pixels take",
+    ),
+    ("picture ball.obj --frames 100000 --size 50 --out out.gif", "draw fewer by --every"),
     ("picture ball.obj --size 9 --out out.png", "--size: 9 is outside 50 .. 8000"),
     ("picture ball.obj --eye 0 1 0 --out out.png", "--eye: eye and up"),
     ("picture ball.obj --eye nan 1 0 --out out.png", "--eye: eye and up"),
@@ -97,7 +114,10 @@ FILES = {
 def folder(tmp_path_factory):
     """Give a folder with a mesh, a model and a scene, and files that are none."""
     path = tmp_path_factory.mktemp("files")
-    trimesh.creation.icosphere(subdivisions=2).export(path / "ball.obj")
+    for name in ("ball.obj", "ball.glb"):
+        trimesh.creation.icosphere(subdivisions=2).export(path / name)
+    os.mkfifo(path / "pipe.csv")
+    os.symlink("gone", path / "nowhere")
     ab.Model.from_arrays(np.eye(3), [[0, 1, 2]]).save(path / "face.npz")
     write_scene(path)
     for name, text in FILES.items():

@@ -3,8 +3,10 @@
 import csv
 import io
 import json
+import math
 import re
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +15,10 @@ import trimesh
 from helpers.viewer import run_command as run
 
 import warp_abtree as ab
+import warp_abtree.app as ab_app
 from warp_abtree.app.cli import main as cli
 from warp_abtree.app.cli import model_commands, report
+from warp_abtree.app.open_playback import open_playback
 from warp_abtree.model.mesh import describe_mesh, load_mesh
 
 COMMANDS = "info build query run sweep view picture bench".split()
@@ -111,10 +115,15 @@ def test_query_against_the_library(files, capsys):
     assert of_originals["bracket"][0] <= apart["distance"] <= of_originals["bracket"][1]
     assert answer(capsys, *asked, "--originals")["distance"] == apart["distance"]
     assert answer(capsys, *asked, "--beyond", 2, "--tolerance", 0.1)["bracket"] == [2, None]
+    words = [*asked[:10], "--output", "distance", "--beyond", 2.5, "--device", "cpu"]
+    shown, _ = run(capsys, "query", *words)
+    assert shown.endswith("distance                farther than 2.5\n") and "points" not in shown
     apart = answer(capsys, "ball.obj", "ring.ply", "--pose", 9, 0, 0, 0, 0, 0, 1, "--output", "contacts")
     nowhere = [None, None, None]
     assert apart["pair_contacts"] == {"count": 0, "point": nowhere, "normal": nowhere, "travel": 0}
     assert apart["count"] == 0 and apart["faces"] == apart["contacts"] == []
+    shown, _ = run(capsys, "query", *asked[:10], "--output", "contacts", "--device", "cpu")
+    assert "pair contacts           count 0, point none, normal none, travel 0\n" in shown and "nan" not in shown
     shown, _ = run(capsys, "query", "ball.obj", "ring.ply", "--output", "contacts", "--device", "cpu")
     assert "intersects              yes\n" in shown and len(re.findall(r"^\d+ +\d+$", shown, re.M)) == report.LISTED
     assert re.search(r"^and \d+ more; --json lists all$", shown, re.M) and "face_a  face_b  p0" in shown
@@ -170,6 +179,87 @@ def test_record_of_each_output(files, capsys):
     run(capsys, *words.split(), "out.csv", "--output", "faces")
     rows = list(csv.reader(io.StringIO(Path("out.csv").read_text())))
     assert rows[0] == ["face_a", "face_b"] and [[int(x) for x in row] for row in rows[1:]] == found["faces"]
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        (0.0, "0"),
+        (-0.0, "0"),
+        (1 / 3, "0.333333"),
+        (1e-16, "1e-16"),
+        (1234.5678, "1234.57"),
+        (123456.789, "123456.79"),
+        (4512345.678, "4512345.68"),
+        (-4512345.678, "-4512345.68"),
+        (999999.996, "999999.996"),
+        (1e6, "1000000"),
+        (1e15, "1e+15"),
+        (np.float32(0.1), "0.1"),
+        (math.inf, "inf"),
+        (math.nan, "none"),
+    ],
+)
+def test_numbers_for_people(value, shown):
+    assert report.show_number(value) == shown
+
+
+def test_a_mesh_far_from_the_origin_has_bounds(files, capsys):
+    mesh = trimesh.creation.box()
+    mesh.apply_translation((4512345.25, 612345.5, 100.0))
+    mesh.export("far.obj", digits=9)
+    shown, _ = run(capsys, "info", "far.obj")
+    assert re.search(r"^bounds +4512344.75 612345 99.5 4512345.75 612346 100.5$", shown, re.M)
+
+
+# Files of several parts.
+
+
+@pytest.fixture
+def assemblies(files):
+    """Return files by name with the number of parts of each; those of two and three clash."""
+    ball, box = trimesh.creation.icosphere(3), trimesh.creation.box()
+    scene = trimesh.Scene()
+    scene.add_geometry(ball, "left", "ball")
+    scene.add_geometry(ball, "right", "ball", transform=trimesh.transformations.translation_matrix((0.5, 0, 0)))
+    scene.export("two.glb")
+    scene.add_geometry(box, "box", "box")
+    scene.export("three.glb")
+    cube = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1)) + "f 1 3 7 5\nf 2 6 8 4\n"
+    Path("two.obj").write_text("o a\n" + cube + "o b\n" + cube.replace("f 1 3 7 5", "f 9 11 15 13"))
+    Path("one.obj").write_text("o a\ng p\n" + cube + "g q\nusemtl r\nf 1 2 3\n")
+    Path("two.stl").write_text(2 * trimesh.exchange.stl.export_stl_ascii(box))
+    ball.export("one.glb")
+    return {"two.glb": 2, "three.glb": 3, "two.obj": 2, "one.obj": 1, "two.stl": 2, "one.glb": 1, "ring.ply": 1}
+
+
+def test_a_file_of_parts_is_said_to_be_joined(assemblies, capsys, monkeypatch):
+    """By each command that reads meshes; again when the model comes from the cache."""
+    monkeypatch.setenv("WARP_ABTREE_CACHE", "models")
+    for name, parts in assemblies.items():
+        joined = f"{name}: its {parts} parts are joined into one mesh"
+        for words in ("info {}", "build {} built.npz", "query {} one.obj --device cpu") * 2:
+            assert cli.main([*words.format(name).split(), "--json"]) == 0
+            shown = capsys.readouterr()
+            assert (joined in shown.err) == (parts > 1) == ("scene_from_file" in shown.err), words
+            assert words != "info {}" or json.loads(shown.out)["parts"] == parts
+        title = Path(name).stem + (f" ({parts} parts joined)" if parts > 1 else "")
+        assert open_playback([name], "cpu").title == title
+        assert (joined in capsys.readouterr().err) == (parts > 1)
+        assert ab.Model.load(name).parts == parts and ab.Model.load(name, orient=True).parts == parts
+        if name.endswith(("glb", "obj", "stl")):
+            assert ab.scene_from_file(name, "cpu")[0].object_count == parts
+
+
+def test_a_scene_file_of_parts_warns(assemblies):
+    for name, parts in assemblies.items():
+        Path("scene.toml").write_text(f'[models.m]\nmesh = "{name}"\n[[objects]]\nmodel = "m"\n')
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            ab_app.load_scene("scene.toml", device="cpu")
+        told = [str(each.message) for each in caught if "joined" in str(each.message)]
+        start = f"scene.toml: models.m: the {parts} parts of {name} are joined into one mesh; scene_from_file"
+        assert len(told) == (parts > 1) and all(each.startswith(start) for each in told)
 
 
 # Statuses, help, extras.

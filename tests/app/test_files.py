@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import signal
 import stat
 import subprocess
@@ -213,18 +214,38 @@ def test_sweeping_up_leaves_what_another_process_is_writing(tmp_path):
     live, dead = (start(HALF, tmp_path / name) for name in ("live", "dead"))
     try:
         assert live.stdout.readline() == dead.stdout.readline() == "half\n"
-        (tmp_path / f"shard.npz.{live.pid}{SUFFIX}").touch()  # of a writer that had the same id once
+        (tmp_path / f"dead.{live.pid}-0123abcd{SUFFIX}").touch()  # of a writer that had the same id once
         (tmp_path / "other").touch()
+        strangers = [f"film{SUFFIX}", f"dead.1{SUFFIX}", f"undead.1-0123abcd{SUFFIX}"]
+        for name in strangers:
+            (tmp_path / name).touch()
+        os.symlink(tmp_path / "other", tmp_path / f"dead.2-0123abcd{SUFFIX}")
+        os.mkfifo(tmp_path / f"dead.3-0123abcd{SUFFIX}")
         dead.send_signal(signal.SIGKILL)
         dead.wait()
-        assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 3
-        sweep_up(tmp_path)
-        assert [path.name[:5] for path in tmp_path.glob(f"*{SUFFIX}")] == ["live."]
+        assert len(list(tmp_path.glob(f"*{SUFFIX}"))) == 8
+        sweep_up(tmp_path, re.compile("live|dead"))
+        kept = sorted(path.name for path in tmp_path.glob(f"*{SUFFIX}") if not path.name.startswith("live."))
+        assert kept == sorted([*strangers, f"dead.2-0123abcd{SUFFIX}", f"dead.3-0123abcd{SUFFIX}"])
+        assert len(list(tmp_path.glob("live.*"))) == 1
         live.communicate("\n")
         assert live.returncode == 0
     finally:
         end((live, dead))
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"live": "half and half", "other": ""}
+    assert (tmp_path / "live").read_text() == "half and half" and not list(tmp_path.glob("live.*"))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes of POSIX")
+def test_a_pipe_or_a_device_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    os.symlink(tmp_path / "pipe", tmp_path / "link")
+    os.symlink(os.devnull, tmp_path / "null")
+    for name in ("pipe", "link", "null"):
+        with pytest.raises(OSError, match="is neither a file nor a folder") as caught, atomic_write(tmp_path / name):
+            pass
+        assert caught.value.filename == str(tmp_path / name)
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["link", "null", "pipe"]
+    assert (tmp_path / "pipe").is_fifo()
 
 
 def test_a_file_that_is_swept_up_before_it_is_locked_is_made_again(tmp_path, monkeypatch):

@@ -160,13 +160,19 @@ def test_an_interrupted_run_keeps_its_rows(files, name):
     assert [int(row["frame"]) for row in rows] == [0, 1, 2]
 
 
-STOP_AT_WARP = """
-import sys
+# A signal comes while the module of $STOP_AT is looked for, whose importer catches what a handler raises.
+STOP_AT = """
+import os, signal, sys, time
+{signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}  # as shells do in the background
 
 class Stop:
     def find_spec(self, name, *_):
-        if name == "warp":
-            raise KeyboardInterrupt
+        if name == os.environ["STOP_AT"]:
+            try:
+                os.kill(os.getpid(), int(os.environ["NUMBER"]))
+                time.sleep(0.1)
+            except BaseException:
+                pass
 
 sys.meta_path.insert(0, Stop())
 from warp_abtree.__main__ import main
@@ -175,11 +181,27 @@ sys.exit(main())
 
 
 def test_the_version_needs_no_warp():
-    assert run_process("--version", STOP_AT_WARP) == (0, f"warp-abtree {ab.__version__}\n", "")
+    told = run_process("--version", STOP_AT, STOP_AT="warp", NUMBER=str(INTERRUPT.value))
+    assert told == (0, f"warp-abtree {ab.__version__}\n", "")
 
 
-def test_an_interrupt_during_imports_is_one_line():
-    assert run_process("info ball.obj", STOP_AT_WARP) == (130, "", "warp-abtree: interrupted\n")
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize(
+    ("module", "number", "told"),
+    [
+        ("warp", INTERRUPT, (130, "", "warp-abtree: interrupted\n")),
+        ("scipy.sparse", INTERRUPT, (130, "", "warp-abtree: interrupted\n")),
+        ("trimesh", TERMINATE, (143, "", "warp-abtree: terminated\n")),
+    ],
+)
+def test_a_signal_during_imports_is_not_caught(module, number, told):
+    assert run_process("info ball.obj", STOP_AT, STOP_AT=module, NUMBER=str(number.value)) == told
+
+
+def test_a_warning_is_one_line(files):
+    Path("lines.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nl 1 2\n")
+    status, _, errors = run_process("info lines.obj --device cpu")
+    assert (status, errors) == (0, "warp-abtree: lines.obj: left out lines\n")
 
 
 def test_a_kernel_cache_that_cannot_be_written_names_its_variable(files):
@@ -249,6 +271,30 @@ def test_progress_without_a_bar_is_a_line_a_stage(monkeypatch, terminal):
             progress(stage, done, 4)
     progress.close()
     assert stream.getvalue() == "collapse ...\nLOD bounds ...\n"
+
+
+def test_long_stages_are_estimated():
+    """At 5 s, and whenever twice the time has gone by: of 1,000 steps of a second each."""
+    stream, now = io.StringIO(), [0]
+    progress = progress_module.Progress(stream, clock=lambda: now[0])
+    for done in range(101):
+        now[0] = done
+        progress("frames", done, 1000)
+    progress("other", 0, 2)
+    now[0] += 7
+    progress("other", 1, 2)
+    progress("other", 1, 2)
+    seen = [(5, "0:16:35"), (10, "0:16:30"), (20, "0:16:20"), (40, "0:16:00"), (80, "0:15:20")]
+    lines = [f"frames: {done} of 1,000, about {left} left" for done, left in seen]
+    assert stream.getvalue().splitlines() == ["frames ...", *lines, "other ...", "other: 1 of 2, about 0:00:07 left"]
+
+
+def test_an_estimate_of_years_is_one():
+    stream, clock = io.StringIO(), iter(range(100))
+    progress = progress_module.Progress(stream, clock=lambda: next(clock))
+    for done in range(8):
+        progress("frames", done, 10**30)
+    assert stream.getvalue().splitlines()[1].endswith(", about years left")
 
 
 def test_compiling_is_announced(tmp_path, monkeypatch):

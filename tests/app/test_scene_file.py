@@ -9,6 +9,9 @@ from helpers.viewer import write_scene
 
 from warp_abtree.app import SceneError, load_scene
 from warp_abtree.app.pictures.scenes import panel_lods
+from warp_abtree.app.toml import decode, objects, scene_file
+from warp_abtree.app.toml.shapes import FACE_BOUNDS, GENERATED
+from warp_abtree.app.toml.tables import SHAPES
 
 BALL = '[models.ball]\nshape = "icosphere"\nsubdivisions = 1\n'
 M = '[models.m]\n{}\n[[objects]]\nmodel = "m"\n'
@@ -248,3 +251,107 @@ def test_file_that_is_none(tmp_path):
     for path, message in ((tmp_path / "gone.toml", ""), (tmp_path, ""), (tmp_path / "bytes.toml", ": not valid TOML")):
         with pytest.raises(SceneError, match=f"{path}{message}"):
             load_scene(path, device="cpu")
+
+
+# What would exhaust the memory, or the parser.
+
+
+def deep(count, value="1"):
+    return ".".join(["a"] * count) + f" = {value}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (ONE + deep(17), "objects[0].a.a.a"),
+        (ONE + deep(5000), "line 6: a key nested more than 16 deep"),
+        (ONE + "random." + deep(5000), "line 6: a key nested"),
+        (ONE + "[" + deep(5000).replace(" = 1", "]"), "line 6: a key nested"),
+        (ONE + "random = { " + deep(5000).strip() + " }", "line 6: a key nested"),
+        (ONE + "# " + 5000 * "." + "\nlod = 0.5 # " + 5000 * "." + "\n" + deep(5000), "line 8: a key nested"),
+        (ONE + "position = [\n0,\n" + 5000 * "[" + 5000 * "]" + "]", "line 8: nested more than 16 deep"),
+        (ONE + "x = " + 5000 * "{a=" + "1" + 5000 * "}", "line 6: nested more than 16 deep"),
+        (ONE + 'model = "' + 10**6 * "x" + '"\n', "not valid TOML"),
+        (ONE.replace('"ball"', '"' + 10**6 * "x" + '"'), "objects[0].model: there is no [models.xxx"),
+        (ONE + 10**6 * "x" + " = 3", "xxx: unknown key"),
+        (M.format('mesh = "' + 10**4 * "x" + '"'), "models.m.mesh: File name too long"),
+        (ONE + "worlds = " + 400 * "9", "objects[0].worlds: expected a whole number <= 1000000"),
+        (M.format('shape = "uv_sphere"\ncount = [10000, 10000]'), "models.m: asks for 400,160,016 faces; a file may"),
+        (M.format('shape = "box"\nfaces = 2000000000'), "models.m: asks for 2,000,000,000 faces"),
+        (M.format('shape = "box"\nfaces = 4000000'), "models.m: faces: Loop subdivision of 12 faces reaches 3,145,728"),
+        (
+            "".join(f"[models.m{i}]\nshape = 'icosphere'\nsubdivisions = 8\n" for i in range(4)) + ONE,
+            "models.m3: asks for 1,310,720 faces, 5,242,880 with those of the models before",
+        ),
+        (ONE + "count = 2\n" + ONE[len(BALL) :] + "worlds = 1000000\n", "objects[1].worlds: more than 1,000,000"),
+        (ONE + "[picture]\nlods = " + str(100 * [0.5]), "picture.lods: expected a list of length <= 64"),
+    ],
+)
+def test_what_is_too_much_is_refused_at_once(tmp_path, monkeypatch, text, message):
+    """Before any mesh is made: the numbers are within the limits of their own keys."""
+    for name in ("uv_sphere", "icosphere"):
+        monkeypatch.setattr(trimesh.creation, name, lambda **_: pytest.fail("made"))
+    with pytest.raises(SceneError) as caught:
+        load(tmp_path, text)
+    told = str(caught.value)
+    assert told.startswith(str(tmp_path / "scene.toml")) and message in told and len(told) < 700 and "\n" not in told
+
+
+def test_a_file_of_any_size_is_not_read_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr(decode, "SIZE_LIMIT", len(ONE))
+    load(tmp_path, ONE)
+    with pytest.raises(SceneError, match=f"the file: has more than {len(ONE)} bytes"):
+        load(tmp_path, ONE + "\n")
+
+
+def test_lods_that_take_too_much_together_are_refused(tmp_path, monkeypatch):
+    """A model takes memory once for each LOD that an object begins at, whatever the number of objects."""
+    monkeypatch.setattr(scene_file, "STATE_LIMIT", 3 * 80)
+    load(tmp_path, ONE + "count = 100\nlod = [9, 8, 7, 6]\n")
+    with pytest.raises(SceneError, match=r"objects\[0\].lod: 5 LODs of 1 models have more than 240 faces together"):
+        load(tmp_path, ONE + "count = 100\nlod = [9, 8, 7, 6, 5]\n")
+
+
+def test_objects_and_frames_of_a_window_are_limited_together(tmp_path, monkeypatch):
+    text = ONE + "count = {}\n[lod]\nbudget_ms = 5\nwindow = 1000\n[camera]\neye = [0, 0, 9]\ntarget = [0, 0, 0]\n"
+    monkeypatch.setattr(scene_file, "MOTION_LIMIT", 100_000)
+    load(tmp_path, text.format(100))
+    with pytest.raises(SceneError, match=r"lod\.window: 1,000 frames of 101 objects"):
+        load(tmp_path, text.format(101))
+
+
+def test_all_objects_of_a_file_are_limited_together(tmp_path, monkeypatch):
+    monkeypatch.setattr(objects, "OBJECT_LIMIT", 5)
+    text = ONE + "count = 3\n" + ONE[len(BALL) :]
+    load(tmp_path, text + "worlds = 2\n")
+    for more, key in (("worlds = 3\n", "worlds"), ("grid = { size = [3, 1, 1], spacing = [1, 1, 1] }", "grid.size")):
+        with pytest.raises(SceneError, match=rf"objects\[1\].{key}: more than 5 objects in all"):
+            load(tmp_path, text + more)
+
+
+SIZES = {
+    "box": [{}],
+    "icosphere": [{"subdivisions": 4}],
+    **{name: [{"count": [n, k]} for n, k in ((3, 3), (8, 5), (5, 8), (40, 31))] for name in ("uv_sphere", "capsule")},
+    "cylinder": [{"radius": 1, "height": 1, "sections": n} for n in (3, 50)],
+    "cone": [{"radius": 1, "height": 1, "sections": n} for n in (3, 50)],
+    "annulus": [{"r_min": 1, "r_max": 2, "height": 1, "sections": n} for n in (3, 50)],
+    "torus": [{"major_radius": 1, "minor_radius": 0.3, "major_sections": n, "minor_sections": 7} for n in (3, 50)],
+    "knot": [{"radius": 1, "tube_radius": 0.2, "sections": [50, 7]}],
+    "terrain": [{"extents": [1, 1], "cells": [30, 7], "bumps": 0, "waves": 1, "rim": 0}],
+    "bolt": [{"radius": 1, "length": 3, "pitch": 0.1, "head": 3, "sections": [20, 9]}],
+    "nut": [{"radius": 1, "height": 3, "pitch": 0.1, "width": 3, "sections": [20, 9]}],
+    "revolve": [{"profile": [[1, 0], [2, 1], [1, 4]], "sections": 9}],
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_faces_of_a_shape_are_known_before_it_is_made(shape):
+    """Within a bound that is not far above."""
+    make, ones = GENERATED.get(shape) or getattr(trimesh.creation, shape), SIZES[shape]
+    required = {"cylinder": {"radius": 1, "height": 1}, "cone": {"radius": 1, "height": 1}}
+    required |= {"annulus": {"r_min": 1, "r_max": 2, "height": 1}, "torus": {"major_radius": 1, "minor_radius": 0.3}}
+    defaults = [] if shape in GENERATED else [required.get(shape, {})]
+    for parameters in [*ones, *defaults]:
+        faces = len(make(**parameters).faces)
+        assert faces <= FACE_BOUNDS[shape](**parameters) <= 1.5 * faces + 100

@@ -6,6 +6,7 @@ import shutil
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import PIL.Image
@@ -16,8 +17,11 @@ import warp_abtree as ab
 
 pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 
+from websockets import Headers
+
 from warp_abtree.app import view
 from warp_abtree.app.viewer.command import serve
+from warp_abtree.app.viewer.guard import is_refused, refuse_foreign
 from warp_abtree.app.viewer.page import Page
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -53,6 +57,69 @@ def act(page, *action, seconds=0.2):
     """Do what a user asks of a page, and let it run."""
     page._post(*action)
     page.run(seconds=seconds)
+
+
+# Who may ask. Headers that are sent, where P is the port, and whether a server at loopback, at all addresses, and at
+# a name of its own refuses them.
+EVIL = "http://evil.example"
+ASKED = [
+    ({"Host": "localhost:P"}, "..."),
+    ({"Host": "127.0.0.1:P", "Origin": "http://127.0.0.1:P"}, "..."),
+    ({"Host": "[::1]:P", "Origin": "http://[::1]:P"}, "..."),
+    ({"Host": "localhost:9", "Origin": "http://localhost:9"}, "..."),  # forwarded from another port
+    ({"Host": "127.0.0.1:P", "Origin": "http://localhost:P"}, "..."),
+    ({"Host": "LOCALHOST.:P"}, "..."),
+    ({}, "..."),
+    ({"Host": "localhost:P", "Origin": EVIL}, "xxx"),
+    ({"Host": "localhost:P", "Origin": "null"}, "xxx"),
+    ({"Host": "localhost:P", "Origin": "http://localhost:3000"}, "xxx"),
+    ({"Host": "localhost:P", "Origin": "http://localhost.evil.example:P"}, "xxx"),
+    ({"Origin": EVIL}, "xxx"),
+    ({"Host": "evil.example:P"}, "xxx"),
+    ({"Host": "evil.example:P", "Origin": "http://evil.example:P"}, "xxx"),  # whose name leads here
+    ({"Host": "127.0.0.1.evil.example:P"}, "xxx"),
+    ({"Host": "[::1:P"}, "xxx"),
+    ({"Host": "10.1.2.3:P", "Origin": "http://10.1.2.3:P"}, "x.."),
+    ({"Host": "10.1.2.3:P", "Origin": "http://10.1.2.4:P"}, "xxx"),
+    ({"Host": "NAME:P", "Origin": "http://NAME:P"}, "x.."),
+    ({"Host": "view.example:P", "Origin": "http://view.example:P"}, "xx."),
+]
+
+
+def fill(headers, port=8080):
+    name = socket.gethostname()
+    return [(key, re.sub("P$", str(port), value).replace("NAME", name)) for key, value in headers.items()]
+
+
+@pytest.mark.parametrize(("headers", "refused"), ASKED)
+def test_pages_of_others_are_refused(headers, refused):
+    request = SimpleNamespace(headers=Headers(fill(headers)))
+    for host, mark in zip(("127.0.0.1", "0.0.0.0", "View.example"), refused):
+        assert is_refused(request, host) is (mark == "x")
+    assert is_refused(request, "localhost") is is_refused(request, "::1") is (refused[0] == "x")
+
+
+def test_what_is_said_twice_is_refused():
+    headers = [("Host", "localhost:1"), ("Origin", "http://localhost:1")]
+    for again in headers:
+        assert is_refused(SimpleNamespace(headers=Headers([*headers, again])), "127.0.0.1")
+
+
+def test_the_server_refuses_websockets_and_files(server):
+    """Answers of HTTP to what `ASKED` sends, as of browsers, over a plain socket."""
+    upgrade = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
+    upgrade |= {"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Protocol": "viser-v1"}
+    for headers, refused in ASKED:
+        for more, status in (({}, 200), (upgrade, 101)):
+            lines = [f"{key}: {value}" for key, value in [*fill(headers, server.get_port()), *more.items()]]
+            with socket.create_connection(("127.0.0.1", server.get_port()), timeout=20) as asked:
+                asked.sendall("\r\n".join(["GET / HTTP/1.1", *lines, "", ""]).encode())
+                assert int(asked.recv(100).split()[1]) == (403 if refused[0] == "x" else status), (headers, more)
+
+
+def test_a_server_that_does_not_ask_is_not_used():
+    with pytest.raises(ValueError, match="cannot be kept from foreign pages"), refuse_foreign("127.0.0.1"):
+        pass
 
 
 @pytest.mark.slow

@@ -165,7 +165,7 @@ def test_powers_of_two_scale_every_bit(device):
     for k in (0, -60, 60):
         a, b = (ab.Model.from_arrays(np.ldexp(vertices, k), faces) for vertices, faces in (soup_mesh, ball_mesh))
         result = contacts_of(device, (a, STILL), (b, [*np.ldexp([0.3, 0.2, 0.1], k), *turn]))
-        plain = plain or result
+        plain = result if plain is None else plain
         for rows, wanted in ((result.contacts, plain.contacts), (result.pair_contacts, plain.pair_contacts)):
             for name in rows.dtype.names:
                 scaled = name in ("p0", "p1", "point", "travel")

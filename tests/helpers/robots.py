@@ -101,6 +101,18 @@ def described_arm() -> Description:
     return Description(frames, joints, {name: k for k, name in enumerate(names)}, parts, {frozenset(("base", "fore"))})
 
 
+def described_chain(mesh, *joints) -> Description:
+    """Return links in a row and a mesh on the last: joints are (kind, axis, place, scale), of a value each."""
+    frames = [Frame(-1, np.eye(4))]
+    for k, (kind, axis, place, scale) in enumerate(joints):
+        origin = np.eye(4)
+        origin[:3, 3] = place
+        frames.append(Frame(k, origin, kind, axis, None if kind == "fixed" else f"joint {k}", scale))
+    limits = {frame.joint: (-np.inf, np.inf) for frame in frames if frame.joint is not None}
+    part = Part(len(joints), mesh_from_arrays(mesh.vertices, mesh.faces, name="last"))
+    return Description(frames, limits, {f"link {k}": k for k in range(len(frames))}, [part])
+
+
 def pose_frames(description, row) -> np.ndarray:
     """Return the pose of each frame at a configuration, one product after the other, (frames, 4, 4)."""
     values, poses = dict(zip(description.joints, row)), []

@@ -202,11 +202,45 @@ def test_sweeps_and_captured_queries(device):
         assert query.result().distance[0] == found["distance"][k]
 
 
-def test_without_solids_signs_do_not_matter(device):
-    scene = ab.Scene(device)
-    scene.add(KNOT)
-    scene.add(BALL, moved(1.0))
-    with_sign, plain = (scene.intersect(np.array([(0, 1)]), "distance", signed=signed) for signed in (True, None))
-    assert with_sign.distance == plain.distance
+def signed_anyhow(scene, pairs):
+    """Yield every way to ask a scene for the depths of pairs, None for those of the broad phase."""
+    yield lambda: scene.intersect(pairs, "distance", signed=True)
+    yield lambda: ab.DistanceQuery(scene, pairs, signed=True).run()
+    if pairs is not None:
+        others = ab.DistanceQuery(scene, np.array([(0, 3)]), signed=True) if any(scene.object_solid) else None
+        yield lambda: others.set_pairs(pairs) if others is not None else ab.DistanceQuery(scene, pairs, signed=True)
+
+
+@pytest.mark.parametrize("pairs", [None, [(0, 1)], [(0, 1), (2, 1)], []], ids=str)
+def test_depths_of_surfaces_are_refused(device, pairs):
+    """Three surfaces, beside which a solid stands or does not."""
+    given = None if pairs is None else np.array(pairs, np.int32).reshape(-1, 2)
+    for with_solid in (False, True):
+        scene = ab.Scene(device)
+        for x in (0.0, 1.0, 1.5):
+            scene.add(BALL, moved(x))
+        scene.add(BOX, moved(50.0), solid=with_solid)
+        # Of no pair at all nothing is wrong; nor of what the broad phase happens to find in a scene with a solid.
+        fine = with_solid and not pairs
+        for ask_it in signed_anyhow(scene, given):
+            if fine:
+                ask_it()
+                continue
+            with pytest.raises(ValueError, match=r"^signed: no object of the pairs is a solid"):
+                ask_it()
+        found = scene.intersect(given, "distance")
+        if fine:
+            np.testing.assert_array_equal(scene.intersect(given, "distance", signed=True).distance, found.distance)
+    mixed = scene.intersect([(0, 1), (0, 3)], "distance", signed=True)
+    np.testing.assert_array_equal(mixed.distance, scene.intersect([(0, 1), (0, 3)], "distance").distance)
     with pytest.raises(ValueError, match="signed means nothing"):
         scene.intersect(np.array([(0, 1)]), "any", signed=True)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_depths_of_surfaces_in_sweeps_are_refused(device, count):
+    poses = np.array([moved(0.5)] * 3)[:count]
+    with pytest.raises(ValueError, match=r"^signed: no object of the pairs is a solid"):
+        ab.sweep(BALL, BOX, poses, output="distance", device=device, signed=True)
+    for solid in ((True, False), (False, True)):
+        assert len(ab.sweep(BALL, BOX, poses, output="distance", device=device, signed=True, solid=solid)) == count

@@ -256,6 +256,75 @@ def test_what_usd_hides_is_left_out_and_named(tmp_path):
     for k in (1, 3):
         place = posed_triangles(scene, names.index(f"/many[{k}]/many/prototype")).reshape(-1, 3)
         assert np.allclose((place.min(0) + place.max(0)) / 2, [100, 7, {1: 1, 3: 2}[k]] + BOX.bounds.mean(0))
+    many.CreatePositionsAttr([Gf.Vec3f(0, 0, 1)])
+    stage.GetRootLayer().Save()
+    with pytest.raises(ab.MeshError, match="/many: its 4 instances do not have a place each"):
+        ab.scene_from_file(path, device="cpu")
+
+
+def test_usd_purposes_and_what_is_not_carried_out(tmp_path):
+    """Default and render are read, guide and proxy named, inherited ones too; subdivision, skins and holes."""
+    pytest.importorskip("pxr")
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel
+
+    path = tmp_path / "purposes.usda"
+    stage = Usd.Stage.CreateNew(str(path))
+
+    def define(where, purpose=None):
+        mesh = UsdGeom.Mesh.Define(stage, where)
+        mesh.GetPointsAttr().Set([Gf.Vec3f(*map(float, v)) for v in BOX.vertices])
+        mesh.GetFaceVertexCountsAttr().Set([3] * len(BOX.faces))
+        mesh.GetFaceVertexIndicesAttr().Set(BOX.faces.ravel().tolist())
+        if purpose is not None:
+            mesh.CreatePurposeAttr(purpose)
+        return mesh
+
+    define("/plain").CreateSubdivisionSchemeAttr("none")
+    for purpose in ("default", "render", "guide", "proxy"):
+        define(f"/{purpose}", purpose)
+    UsdGeom.Xform.Define(stage, "/helpers").CreatePurposeAttr("guide")
+    define("/helpers/arrow"), define("/helpers/kept", "render")
+    many = UsdGeom.PointInstancer.Define(stage, "/many")
+    many.CreatePurposeAttr("proxy")
+    many.CreatePrototypesRel().AddTarget(define("/many/prototype").GetPath())
+    many.CreateProtoIndicesAttr([0]), many.CreatePositionsAttr([Gf.Vec3f(0, 0, 1)])
+    define("/smooth").CreateSubdivisionSchemeAttr("catmullClark")
+    define("/holed").CreateHoleIndicesAttr([0, 5])
+    skin = UsdSkel.BindingAPI.Apply(define("/skinned").GetPrim())
+    skin.CreateSkeletonRel().AddTarget(UsdSkel.Skeleton.Define(stage, "/bones").GetPath())
+    stage.OverridePrim("/gone").GetReferences().AddReference("./gone.usda")
+    stage.GetPrimAtPath("/gone").SetSpecifier(Sdf.SpecifierDef)
+    stage.GetRootLayer().Save()
+    with pytest.warns(UserWarning) as caught:
+        scene, names = ab.scene_from_file(path, device="cpu")
+    shown = ["/plain", "/default", "/render", "/helpers/kept", "/smooth", "/holed", "/skinned"]
+    assert sorted(names) == sorted(shown)
+    counts = {name: scene.models[scene.object_model[i]].face_count for i, name in enumerate(names)}
+    assert counts == dict.fromkeys(shown, 12) | {"/holed": 10}
+    (said,) = [str(warning.message) for warning in caught]
+    purposes = "/guide (purpose guide), /proxy (purpose proxy), /helpers/arrow (purpose guide), /many (purpose proxy)"
+    for part in (
+        purposes,
+        "not subdivided: /smooth (catmullClark)",
+        "taken at rest: /skinned (skin or blend",
+        "gone.usda",
+    ):
+        assert part in said
+
+
+@pytest.mark.parametrize("turned", range(4))
+def test_usd_polygons_do_not_fold(tmp_path, turned):
+    pytest.importorskip("pxr")
+    from pxr import Gf, Usd, UsdGeom
+
+    letter = np.roll([(4, 1), (1, 1), (1, 3), (4, 3), (4, 4), (0, 4), (0, 0), (4, 0)], turned, axis=0)
+    stage = Usd.Stage.CreateNew(str(tmp_path / "letter.usda"))
+    mesh = UsdGeom.Mesh.Define(stage, "/letter")
+    mesh.GetPointsAttr().Set([Gf.Vec3f(float(x), float(y), 0.0) for x, y in letter])
+    mesh.GetFaceVertexCountsAttr().Set([8]), mesh.GetFaceVertexIndicesAttr().Set(list(range(8)))
+    stage.GetRootLayer().Save()
+    scene, _ = ab.scene_from_file(tmp_path / "letter.usda", device="cpu")
+    assert trimesh.triangles.area(posed_triangles(scene, 0)).sum() == pytest.approx(10)
 
 
 def red_faces(mesh):

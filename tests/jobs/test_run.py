@@ -1,6 +1,7 @@
 """Running jobs: one folder per job, atomic files, continued after an interrupt, the same bytes on several devices."""
 
 import contextlib
+import os
 import threading
 
 import numpy as np
@@ -57,19 +58,46 @@ def test_an_interrupted_job_continues(tmp_path, monkeypatch):
     out = tmp_path / "out"
     run(job, tmp_path / "whole")
     out.mkdir()
-    (out / f"{MANIFEST}.1.partial").write_text("{")  # of a run interrupted at its first file
+    (out / f"{MANIFEST}.1-0123abcd.partial").write_text("{")  # of a run interrupted at its first file
     with pytest.raises(KeyboardInterrupt):
         run(job, out, progress=stop_after(4))
     assert len(list(out.glob("shard-*.npz"))) == 4
     with pytest.raises(ValueError, match="8 of 12 shards are missing"):
         list(read_shards(out))
-    (out / "shard-000000000099-000000000100.npz.77.partial").write_bytes(b"half")
+    (out / "shard-000000000099-000000000100.npz.77-0123abcd.partial").write_bytes(b"half")
     computed = []
     monkeypatch.setattr(again, "task", lambda *part: computed.append(part) or job.task(*part))
     assert run(again, out)["kept"] == 4
     assert computed == [(start, min(start + 9, 100)) for start in range(36, 100, 9)]
     assert contents(out) == contents(tmp_path / "whole")
     assert run(again, out)["kept"] == 12
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes of POSIX")
+def test_a_pipe_is_no_shard(tmp_path):
+    """It would be waited for."""
+    job, out = job_of("any", count=20, shard=10), tmp_path / "out"
+    run(job, out)
+    path = out / "shard-000000000010-000000000020.npz"
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(ValueError, match="1 of 2 shards are missing"):
+        list(read_shards(out))
+    with pytest.raises(OSError, match="is neither a file nor a folder"):
+        run(job, out)
+
+
+def test_files_of_other_programs_stay(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "film.partial").write_text("half")
+    with pytest.raises(ValueError, match="is not empty"):
+        run(job_of("any", count=20), out)
+    (out / "film.partial").unlink()
+    run(job_of("any", count=20), out)
+    (out / "film.partial").write_text("half")
+    run(job_of("any", count=20), out)
+    assert (out / "film.partial").read_text() == "half"
 
 
 def test_a_folder_is_of_one_job(tmp_path):

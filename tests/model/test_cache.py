@@ -190,3 +190,34 @@ def test_a_model_beyond_the_limit_is_not_kept(folder, built, ball, monkeypatch):
     monkeypatch.setattr(cache, "SIZE_LIMIT", 1000)
     ab.Model.load(ball)
     assert not folder.exists()
+
+
+def test_files_of_other_programs_stay(folder, ball):
+    folder.mkdir()
+    key = "0123456789" * 4
+    names = ["film.partial", "mine.npz.12-0123abcd.partial", f"{key}.npz.12.partial", f"x{key}.npz.12-0123abcd.partial"]
+    left = folder / f"{key}.npz.12-0123abcd.partial"  # of a writer of the cache that was killed
+    for path in (left, *(folder / name for name in names)):
+        path.write_text("half")
+    ab.Model.load(ball)
+    assert not left.exists() and all((folder / name).read_text() == "half" for name in names)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes and links of POSIX")
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda path: os.symlink(path, path)])
+def test_what_is_no_file_is_passed_by(folder, built, ball, make):
+    """Under the name of a model, which a pipe would make wait for ever, and under that of its errors."""
+    ab.Model.load(ball, certify=True)
+    paths = list(folder.iterdir())
+    for path in paths:
+        path.unlink()
+        make(path)
+    built.clear()
+    model = ab.Model.load(ball, certify=True)
+    assert built == ["ball"] and model.error_at(0) > 0 and len(paths) == 2
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes of POSIX")
+def test_a_mesh_that_is_no_file_has_no_key(tmp_path):
+    os.mkfifo(tmp_path / "ball.obj")
+    assert cache.file_key(tmp_path / "ball.obj") is None

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from warp_abtree.model.files.found import Remarks
+from warp_abtree.model.files.obj import read_obj
 from warp_abtree.model.mesh import MeshError, describe_mesh, load_mesh
-from warp_abtree.model.obj import parse_obj
 
 STL = b"solid\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
 
@@ -205,7 +206,8 @@ def test_plain_files_are_read_as_any_others(text):
 
     def read(data):
         try:
-            return [array.tolist() for array in parse_obj(data, "here")]
+            surface = read_obj(data, "here", Remarks())
+            return surface.vertices.tolist(), surface.faces.tolist()
         except MeshError as error:
             return str(error)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import os
 import pickle
 import zipfile
 
@@ -96,6 +97,28 @@ def test_equal_models_have_equal_digests(tmp_path):
         arrays = {"known_error": model.progressive.lod_error, name.replace("lod_error", "known_error"): changed}
         digests.add(Model(dataclasses.replace(model.progressive, **arrays), model.tree, "").digest)
     assert len(digests) == 2 + len(ARRAYS)
+
+
+@pytest.mark.parametrize("name", ["a.obj", "a.txt", "a.glb", "a.npy", "other.npz", "objects.npz", "a.zip", "empty.npz"])
+def test_other_files_are_no_models(tmp_path, name):
+    """In the library's own words, which say what reads a mesh."""
+    path = tmp_path / name
+    if name == "a.npy":
+        np.save(path, np.zeros(3))
+    elif name.endswith(("npz", "zip")) and name != "empty.npz":
+        with open(path, "wb") as file:
+            np.savez(file, a=np.array([{}] if name == "objects.npz" else [1], object if name == "objects.npz" else int))
+    else:
+        path.write_bytes(b"" if name == "empty.npz" else b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    with pytest.raises(ab.ModelError, match=r"not a warp_abtree model file.*meshes are read by") as caught:
+        Model.open(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_folders_and_pipes_are_no_models(tmp_path):
+    os.mkfifo(tmp_path / "pipe.npz")
+    for path in (tmp_path, tmp_path / "pipe.npz"):
+        refuse(path, "no regular file")
 
 
 # Damage; another kind of file, another version, another content.

@@ -8,7 +8,12 @@ from oracles.triangle import brute_force_faces, clip, cross, dot, integer_points
 
 
 def parity(point, triangles):
-    """Return whether a point off a surface is inside it; triangles float64 (n, 3, 3).
+    """Return whether a point off a surface is inside it; triangles float64 (n, 3, 3)."""
+    return winding_number(point, triangles) % 2 == 1
+
+
+def winding_number(point, triangles):
+    """Return how many times a surface winds about a point off it; triangles float64 (n, 3, 3).
 
     Signs of three determinants with a direction say whether a line through the point passes a triangle, one more on
     which side of the point. A direction for which any of the three is 0 is not in general position: another is tried.
@@ -29,9 +34,10 @@ def parity(point, triangles):
             sides = [dot(direction, cross(u, v)) for u, v in ((a, b), (b, c), (c, a))]
             if 0 in sides:
                 break
-            crossings += (min(sides) > 0 or max(sides) < 0) and volume * sides[0] > 0
+            if (min(sides) > 0 or max(sides) < 0) and volume * sides[0] > 0:
+                crossings += 1 if sides[0] > 0 else -1  # out of the face's side that is wound about it, or in
         else:
-            return crossings % 2 == 1
+            return crossings
 
 
 def components(faces):

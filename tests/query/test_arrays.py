@@ -153,6 +153,28 @@ def test_what_lies_elsewhere_is_refused_or_copied(device, framework):
         np.testing.assert_array_equal(scene.batch().objects.pool.position.numpy(), before)
 
 
+def test_what_is_wrong_with_a_matrix_is_told(device, framework):
+    """Of one that drifted in float32 how to mend it, and that mends it."""
+    scene = make_scene(device)
+    turn = np.asarray(scene.batch().objects.pool.rotation.numpy()[1], np.float32)
+    drifted = np.eye(3, dtype=np.float32)
+    while np.abs(drifted.T @ drifted - np.eye(3)).max() < 2e-6:
+        drifted = drifted @ turn
+    poses, row = np.tile(np.eye(4, dtype=np.float32), (4, 1, 1)), np.tile(np.eye(4), (4, 1, 1))
+    poses[1, :3, :3], row[3, 3, 0] = drifted, 1e-3
+    for values, why in (
+        (poses, "matrix 1 is not rigid.*off the identity by .*e-06.*svd"),
+        (row, r"matrix 3 .*last row is \[0.001, "),
+        (np.diag([1, -1, 1, 1.0]) * np.ones((4, 1, 1)), "matrix 0 .*it mirrors"),
+        (np.diag([2, 2, 2, 1.0]) * np.ones((4, 1, 1)), "matrix 0 .*off the identity by 3; a scale"),
+    ):
+        with pytest.raises(ValueError, match=why):
+            scene.set_poses(framework(values))
+    u, _, v = np.linalg.svd(drifted)
+    poses[1, :3, :3] = u @ v
+    scene.set_poses(framework(poses))
+
+
 def test_what_is_on_the_gpu_is_read_there(device):
     """Contiguous rows without a copy, Warp's transforms and matrices too; other types and devices are brought over."""
     target = wp.get_device(device)

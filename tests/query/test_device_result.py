@@ -271,3 +271,27 @@ def test_records_pass_in_parts(device, monkeypatch):
         query = ab.ContactQuery(scene, MORE_PAIRS)
         assert describe(query.run()) == describe(expected)
     assert len(expected.contacts) > 100
+
+
+@pytest.mark.parametrize("on_device", [False, True])
+def test_results_have_a_length_and_no_truth_value(device, on_device):
+    scene = add_objects(device)
+    ends = scene.batch().objects
+    poses = np.tile(np.eye(4), (scene.object_count, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = ends.pool.rotation.numpy(), ends.pool.position.numpy()
+    for pairs in (MORE_PAIRS, MORE_PAIRS[:1], MORE_PAIRS[:0]):
+        found = [
+            scene.intersect(pairs, output, device=on_device) for output in ("any", "faces", "contacts", "distance")
+        ]
+        found.append(scene.first_contact(pairs, poses, device=on_device))
+        found.append(ab.ManifoldQuery(scene, pairs).run())
+        for result in found:
+            assert len(result) == len(pairs)
+            for ask in (
+                bool,
+                lambda result: not result,
+                lambda result: 1 if result else 0,
+                lambda result: any([result]),
+            ):
+                with pytest.raises(TypeError, match="a Result is neither true nor false; ask result"):
+                    ask(result)

@@ -1,5 +1,8 @@
 """Robots at many configurations against FCL, a scene of posed links, and dense samples of edges."""
 
+import copy
+import pickle
+import re
 from dataclasses import replace
 
 import fcl
@@ -7,10 +10,11 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from helpers.robots import described_arm, pose_frames, random_configurations
+from helpers.robots import described_arm, described_chain, pose_frames, random_configurations
 
 import warp_abtree as ab
 from warp_abtree.interop.robot import check, robot
+from warp_abtree.interop.robot.description import Description, Frame
 
 STILL = (0, 0, 0, 0, 0, 0, 1)
 RING = ab.Model.load(trimesh.creation.torus(0.45, 0.12, 32, 12))
@@ -180,56 +184,6 @@ def test_a_query_is_captured_and_says_when_room_was_short(arm, device, monkeypat
     np.testing.assert_array_equal(short.nearest.distance.numpy() == 0, expected)
 
 
-def edges(count, seed, part=0.15):
-    """Return short edges within limits."""
-    starts, others = random_configurations(count, seed=seed), random_configurations(count, seed=seed + 1)
-    return starts, starts + part * (others - starts)
-
-
-def test_edges_are_never_late(arm):
-    starts, ends = edges(40, 7)
-    times = np.linspace(0, 1, 801)
-    sampled = np.array([arm.check(a + times[:, None] * (b - a), AROUND) for a, b in zip(starts, ends)])
-    met = sampled.any(1)
-    first = np.where(met, times[sampled.argmax(1)], np.inf)
-    rows = arm.check_edges(starts, ends, AROUND, tolerance=1e-3)
-    assert 10 < met.sum() < 36 and not rows["undecided"].any()
-    assert (rows["time"] <= np.minimum(first, 1.0)).all()
-    assert not (rows["clear"] & met).any() and rows["clear"].sum() > 5
-    moving = first > 0
-    # No earlier than the tolerance before what a sample may have missed.
-    early = np.minimum(first, 1.0) - rows["time"]
-    assert (early[moving & met] <= 1e-3 + times[1]).all()
-    assert (rows["time"][~moving] == 0).all() and (rows["time"][rows["clear"]] == 1).all()
-
-
-def test_an_edge_passes_through_nothing_thin(device):
-    arm = ab.Robot(described_arm(), device, mounted=["base"])
-    # A blade of no thickness in the way of the bent arm, which turns three times and stands free at most samples.
-    blade = [ab.Model.from_arrays([[0.3, 0, 0.2], [2, 0, 0.2], [2, 0, 3], [0.3, 0, 3]], [[0, 1, 2], [0, 2, 3]])]
-    ends = np.array([[-9.0, 1.4, 0.05, 0], [9.0, 1.4, 0.05, 0]])
-    sampled = arm.check(np.linspace(*ends, 60), blade)
-    assert not sampled[0] and sampled.mean() < 0.3
-    rows = arm.check_edges(ends[:1], ends[1:], blade, tolerance=1e-5)
-    assert not rows["clear"][0] and not rows["undecided"][0]
-    # Within the tolerance of the time there is contact, and before it none at as many more configurations.
-    time = rows["time"][0]
-    at, before = (
-        ends[0] + np.linspace(*span, 500)[:, None] * (ends[1] - ends[0]) for span in ((time, time + 1e-5), (0, time))
-    )
-    assert arm.check(at, blade).any() and not arm.check(before, blade).any()
-
-
-def test_edges_that_slide_are_undecided(arm, monkeypatch):
-    monkeypatch.setattr(check, "STRETCHES_MAX", 64)
-    # The ring turns in its own plane, so near a plate that no stretch is proved free.
-    plate = [(ab.Model.load(trimesh.creation.box((3, 3, 0.02))), (0, 0, 0.36 - 0.01 - 1e-7, 0, 0, 0, 1))]
-    ends = np.array([[0.0, 0, 0.05, 0], [3.0, 0, 0.05, 0]])
-    assert not arm.check(ends, plate).any()
-    row = arm.check_edges(ends[:1], ends[1:], plate)[0]
-    assert row["undecided"] and not row["clear"] and row["time"] == 0
-
-
 @pytest.mark.parametrize(
     "bad, message",
     [
@@ -244,6 +198,88 @@ def test_bad_configurations_are_refused(arm, bad, message):
     for call in (arm.check, arm.forward):
         with pytest.raises(ValueError, match=message):
             call(bad)
+
+
+def test_limits_hold_to_within_the_rounding_of_float32(arm, device):
+    arm.description.joints |= {"bend": (-2.8718, -0.0698), "swing": (-np.inf, 2.5)}
+    arm = ab.Robot(arm.description, device)
+    low, high = np.array(np.maximum(arm.limits, -9), np.float32).T
+    inside = [low, high, low + np.float32(1) * (high - low), np.nextafter(high, np.float32(99))]
+    assert ((inside[2] > high) & (high > arm.limits[:, 1])).any()
+    for taken in (np.array, list, lambda rows: np.array(rows, np.float64), lambda rows: np.array(rows).tolist()):
+        poses = arm.forward(taken(inside)).numpy()
+        np.testing.assert_array_equal(poses, arm.forward(np.array(inside, np.float64), limits=False).numpy())
+    on_device = wp.array(np.array(inside), dtype=wp.float32, device=device)
+    assert len(arm.check(on_device)) == len(arm.check_edges(inside, inside)) == 4
+    arm.exclude_meeting(high)
+    with pytest.raises(ValueError, match=r"has 3 for joint 'swing', outside -inf .. 2.5 "):
+        arm.check([[0, -1, 0, 3]])
+    for beyond in (np.float32(0.1) + np.float32(4e-8), np.nextafter(0.1, 1)):
+        with pytest.raises(
+            ValueError, match=r"configuration 1 has (\S+) for joint 'grip', outside 0 .. (\S+) "
+        ) as raised:
+            arm.check([[0, -1, 0, 0], [0, -1, beyond, 0]])
+        told = re.search(r"has (\S+) for .* .. (\S+) ", str(raised.value))
+        assert [float(number) for number in told.groups()] == [beyond, 0.1]
+
+
+def test_a_robot_without_joints_is_asked_like_any_other(device):
+    cup = ab.Robot(described_chain(trimesh.creation.box()), device)
+    box = ab.Model.load(trimesh.creation.box())
+    for world, far in ((box, 0.0), ([(box, (9, 0, 0, 0, 0, 0, 1))], 8.0), (None, np.inf)):
+        for rows in (np.empty((3, 0)), np.empty((0, 0), np.float32), np.empty((300, 0))):
+            assert cup.check(rows, world).tolist() == [far == 0] * len(rows)
+            assert cup.check(rows, world, output="distance")["distance"].tolist() == [far] * len(rows)
+            edges = cup.check_edges(rows, rows, world)
+            assert edges.tolist() == [(float(far > 0), far > 0, False)] * len(rows)
+            assert cup.forward(rows).shape == (len(rows), 1)
+        for output in ("any", "distance"):
+            query = cup.query(world, output, room=2)
+            query.launch()
+            query.check()
+            assert query.hit.numpy().tolist() == [far == 0] * 2
+            assert output == "any" or query.nearest.distance.numpy().tolist() == [far] * 2
+
+
+def test_a_mounted_link_without_a_mesh_takes_those_fixed_to_it(device):
+    """A world, a base without a mesh, two plates fixed to it, and what turns on them; a frame that turns alone."""
+    description = described_arm()
+    fixed = [Frame(-1, np.eye(4)), Frame(0, np.eye(4))]
+    frames = [*fixed, *[replace(f, parent=f.parent + 2 if f.parent >= 0 else 1) for f in description.frames]]
+    names = {"world": 0, "stand": 1, **{name: k + 2 for name, k in description.links.items()}, "eye": len(frames)}
+    frames.append(Frame(len(frames) - 1, np.eye(4), "revolute", (0, 0, 1), "turn"))
+    order = list(names)
+    parts = [replace(part, link=order.index(list(description.links)[part.link])) for part in description.parts]
+    parts.append(replace(parts[0], link=order.index("stand")))
+    made = Description(frames, description.joints, names, parts, description.excluded)
+    for mounted, expected in (
+        (["world"], {"world", "stand", "base"}),
+        (["stand"], {"stand"}),
+        (["base", "world"], {"world", "stand", "base"}),
+        (["flange"], {"fore", "flange"}),
+        ([], set()),
+    ):
+        robot = ab.Robot(made, device, mounted)
+        assert {robot.link_names[k] for k in robot.mounted} == expected
+    # Nothing but the stand and the base is where the ground is.
+    ground = [(ab.Model.load(trimesh.creation.box((1, 1, 0.01))), (0, 0, -0.1, 0, 0, 0, 1))]
+    rows = np.array([[0.0, 0, 0.05, 0]])
+    assert ab.Robot(made, device, ["base"]).check(rows, ground)[0]
+    assert not ab.Robot(made, device, ["world"]).check(rows, ground)[0]
+    with pytest.warns(RuntimeWarning, match="no mesh is fixed to the link 'eye'"):
+        assert ab.Robot(made, device, ["eye"]).check(rows, ground)[0]
+
+
+def test_a_robot_is_copied_and_pickled(arm):
+    rows = random_configurations(60, seed=8)
+    arm.exclude_meeting(rows[np.flatnonzero(arm.check(rows))[0]])
+    expected = arm.check(rows, AROUND)
+    for other in (copy.copy(arm), copy.deepcopy(arm), pickle.loads(pickle.dumps(arm))):
+        np.testing.assert_array_equal(other.check(rows, AROUND), expected)
+        assert other.pairs.tolist() == arm.pairs.tolist() and other.mounted == arm.mounted
+    for make in (copy.copy, copy.deepcopy, pickle.dumps):
+        with pytest.raises(TypeError, match="this RobotQuery holds device memory"):
+            make(arm.query(AROUND, room=1))
 
 
 def test_bad_options_are_refused(arm, device):

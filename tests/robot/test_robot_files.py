@@ -89,8 +89,10 @@ def test_mjcf_meshes_and_pairs(mjcf):
     # The left finger has a part of other bits, which meets nothing.
     names = [arm.link_names[k] for k in arm.model_link]
     assert names == ["base", "upper", "fore", "left", "left", "right"] and not (arm.pairs == 4).any()
-    assert asked_pairs(arm) == pairs_of("base left", "base right", "upper left", "upper right", "left right")
+    pairs = pairs_of("base left", "base right", "upper left", "upper right", "left right")
+    assert asked_pairs(arm) == pairs | pairs_of("base upper")  # the base stands still
     visual = ab.Robot.load(mjcf, "visual", device="cpu")
+    assert asked_pairs(visual) == pairs
     assert visual.models[1].face_count > arm.models[1].face_count
 
 
@@ -117,11 +119,18 @@ def test_a_limit_that_urdf_leaves_out_is_zero(urdf):
     [
         ('type="continuous"', 'type="floating"', "joint 'turn' is floating"),
         ("package://arm/part.stl", "lost.stl", "link 'upper': no mesh file lost.stl"),
+        ("package://arm/part.stl", "package://arm/lost.stl", "no mesh file package://arm/lost.stl"),
+        ("package://arm/part.stl", "package://", "no mesh file package://$"),
+        ("package://arm/part.stl", "package://arm", "no mesh file package://arm$"),
+        ("package://arm/part.stl", r"C:\arm\part.stl", r"no mesh file C:\\arm\\part.stl$"),
         ('<mimic joint="grip"', '<mimic joint="gone"', "joint 'follow' mimics 'gone'"),
         ('<child link="fore"/>', '<child link="hand"/>', "joint 'bend': no link 'hand'"),
         ('<child link="left"/>', '<child link="fore"/>', "another joint moves link 'fore'"),
         ('xyz="0 0 2"', 'xyz="0 0 0"', "is no axis"),
         ('<robot name="arm">', "arm", "not read as URDF"),
+        ("</robot>", "", r"arm.urdf: not read as URDF \(line \d+: "),  # yourdfpy would read what is there
+        ('<box size="0.06 0.06 0.4"/>', "", r"not read as URDF \(line 10: a geometry has one shape\)"),
+        ('<box size="0.06', '<sphere radius="1"/><box size="0.06', r"\(line 10: a geometry has one shape\)"),
         ('lower="-2.8"', 'lower="2.9"', "joint 'bend': limits 2.9 .. 2.8 leave no value"),
         ('lower="-2.8"', 'lower="nan"', "joint 'bend': limits nan .. 2.8 leave no value"),
         (BEND_LIMIT, "", "joint 'bend' is revolute and has no limits; .*, or make it continuous$"),
@@ -156,6 +165,13 @@ def test_bad_urdf_is_refused(urdf, before, after, message):
         ('<body name="base">', '<body name="base"><freejoint name="loose"/>', "joint 'loose' is free"),
         ('type="cylinder" size="0.1 0.1"', 'name="ground" type="plane" size="1 1 1"', "geom 'ground' is a plane"),
         ('polycoef="-0.04 -1 0 0 0"', 'polycoef="0 -1 1 0 0"', "follows another by a curve"),
+        ("</equality>", '<joint joint1="follow" joint2="turn"/></equality>', "joint 'follow' follows two others"),
+        (
+            "</body></worldbody>",
+            '<flexcomp name="rag" type="grid" count="3 3 1" spacing="1 1 1" dim="2"><edge equality="true"/>'
+            "</flexcomp></body></worldbody>",
+            "flex 'rag' may deform",
+        ),
         ('file="part.stl"', 'file="lost.stl"', "lost.stl"),
         ('<body name="flange" pos="0 0 0.45">', '<body><body name="body 4"/>', "2 bodies have the name 'body 4'"),
         (
@@ -179,7 +195,7 @@ def test_bad_paths_and_options_are_refused(urdf, tmp_path):
         ({"path": tmp_path / "part.stl"}, "a robot is a .urdf or .xml file"),
         ({"path": urdf, "geometry": "both"}, "geometry 'both'"),
         ({"path": urdf, "srdf": tmp_path / "no.srdf"}, "no.srdf: no such file"),
-        ({"path": urdf, "srdf": tmp_path / "arm.srdf"}, "names 'elbow'"),
+        ({"path": urdf, "srdf": tmp_path / "arm.srdf"}, r"names 'elbow', .* \(strict=False goes on\)"),
         ({"path": urdf, "neutral": [0, 0]}, r"shape \(1, 2\)"),
         ({"path": urdf, "device": "cuda:9"}, "no device 'cuda:9'"),
     ):

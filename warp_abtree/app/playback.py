@@ -157,7 +157,7 @@ class MeshPlayback(Playback):
             mine = np.array([i for i, other in enumerate(models) if other is model])
             start = _fraction_at(model, lods[mine[0]])
             self._sweeps.append(LodSweep([(model, mine)], start, min(start, _fraction_at(model, 0)), SWEEP_PERIOD))
-        names = " and ".join(dict.fromkeys(model.name for model in models))
+        names = " and ".join(dict.fromkeys(map(_title, models)))
         super().__init__(scene, names, np.zeros(len(models), int), 1 / 30, MeshView())
 
     def _begin(self):
@@ -192,6 +192,10 @@ class StillPlayback(Playback):
 
     def _poses_now(self):
         return self._poses_held
+
+
+def _title(model) -> str:
+    return model.name if model.parts == 1 else f"{model.name} ({model.parts} parts joined)"
 
 
 def _fraction_at(model, lod) -> float:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
+from warp_abtree.app.cli.report import show_number
 from warp_abtree.query.result import Result
 from warp_abtree.simulate.frame_row import FrameRow
 
@@ -57,7 +58,7 @@ class RenderData:
     def labels(self) -> list:
         """Return (point, text) of the least distances, at the middles of their segments."""
         told = np.argsort(self.distance, kind="stable")[:LABELS]
-        return [(self.nearest[i].mean(axis=0), f"{self.distance[i]:.4g}") for i in told]
+        return [(self.nearest[i].mean(axis=0), show_number(self.distance[i], 4)) for i in told]
 
 
 def objects_of_world(worlds, world: int) -> np.ndarray:

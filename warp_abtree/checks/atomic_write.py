@@ -3,7 +3,9 @@
 import contextlib
 import errno
 import os
+import re
 import secrets
+import stat
 from pathlib import Path
 from typing import IO, Any
 
@@ -13,6 +15,7 @@ except ImportError:  # Windows, where a file that is open can be neither removed
     fcntl = None  # type: ignore[assignment]
 
 SUFFIX = ".partial"
+_PARTIAL = re.compile(rf"(.+)\.\d+-[0-9a-f]{{8}}{re.escape(SUFFIX)}", re.S)
 
 
 @contextlib.contextmanager
@@ -20,7 +23,8 @@ def atomic_write(path, mode="wb", **options):
     """Open a file to write that replaces the one at a path in one step, once it is whole and on the disk.
 
     The file is written beside the path under a name of its own, so that several processes may write one path: the last
-    one to finish wins, and a reader sees one of them whole. What stood there stays if anything fails.
+    one to finish wins, and a reader sees one of them whole. What stood there stays if anything fails, and so does
+    a pipe or a device.
 
     Args:
         mode: "wb" or "w".
@@ -30,6 +34,8 @@ def atomic_write(path, mode="wb", **options):
         OSError: The file cannot be written; it names the path that was asked for.
     """
     path, file = Path(path), None
+    if is_special(path):
+        raise OSError(errno.EINVAL, "is neither a file nor a folder", str(path))
     try:
         file = _open_partial(path, mode, options)
         with file:
@@ -95,9 +101,32 @@ def _sync_folder(folder):
         os.close(opened)
 
 
-def sweep_up(folder):
-    """Remove what killed writers left half written in a folder; files that are being written stay."""
-    for path in Path(folder).glob(f"*{SUFFIX}"):
+def is_special(path) -> bool:
+    """Return whether a path, or what a link there leads to, exists and is neither a file nor a folder."""
+    try:
+        mode = os.stat(path).st_mode
+    except OSError:
+        return False
+    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
+
+
+def find_partial(folder, names) -> list[Path]:
+    """Return the files in a folder that are half-written ones of `atomic_write` by their names, or were.
+
+    Args:
+        names: Compiled pattern of the whole names of what is written there. Other programs may call files ".partial".
+    """
+    found = []
+    for entry in os.scandir(folder):
+        shape = _PARTIAL.fullmatch(entry.name)
+        if shape and names.fullmatch(shape[1]) and entry.is_file(follow_symlinks=False):
+            found.append(Path(entry.path))
+    return found
+
+
+def sweep_up(folder, names):
+    """Remove what killed writers left half written in a folder; what is being written stays. `names` as above."""
+    for path in find_partial(folder, names):
         # A writer holds the lock of its file until the file has its name.
         with contextlib.suppress(OSError):
             if fcntl is None:

@@ -4,13 +4,14 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, wrap_array
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.io import pipeline as kernels
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE
 from warp_abtree.state.device_update import NO_FAULTS
 from warp_abtree.state.generation import STALE_GRAPH, LaunchGuard
 
 
-class PoseInput:
+class PoseInput(DeviceMemory):
     """Operator that sets the poses of a scene's objects from device memory, without the host.
 
     It is to `Query` and `ContactQuery` what `Pipeline.poses` is to a frame. `launch()` only launches, so that a CUDA

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from warp_abtree.checks.arguments import to_numpy
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.interop.collision_data import ContactData, DistanceData
 from warp_abtree.interop.placed_shapes import PlacedShapes, shape_of
 from warp_abtree.scene.poses import check_poses
@@ -20,7 +21,7 @@ def _join(first, *rest):
     return (first, *more) if more else first
 
 
-class CollisionManager:
+class CollisionManager(DeviceMemory):
     """Named, posed meshes and their collisions: a drop-in replacement for trimesh.collision.CollisionManager.
 
     Names, signatures and the shapes of results are trimesh's: what is asked for beside an answer makes a tuple of it.
@@ -297,7 +298,7 @@ class CollisionManager:
             return bool(len(hit)), [names[k] for k in hit.tolist()], []
         result = scene.intersect(pairs, output="contacts", gap=0.0)
         hit = np.flatnonzero(result.any)
-        deep = scene.intersect(pairs[hit], "distance", signed=True)
+        deep = scene.intersect(pairs[hit], "distance", signed=scene.batch().has_solid(pairs[hit]))
         depth = np.zeros(len(pairs))
         depth[hit] = -deep.distance
         rows = result.contacts
@@ -335,8 +336,8 @@ class CollisionManager:
             if rest.distance.min() < distance:
                 result, row = rest, int(rest.distance.argmin())
                 k, distance = int(others[row]), float(rest.distance[row])
-        if distance == 0 and self._solids:
-            overlapping = np.flatnonzero(gaps == 0)
+        overlapping = np.flatnonzero(gaps == 0)
+        if distance == 0 and placed.scene.batch().has_solid(pairs[overlapping]):
             result = placed.scene.intersect(pairs[overlapping], "distance", signed=True)
             row = int(result.distance.argmin())
             k, distance = int(overlapping[row]), float(result.distance[row])

@@ -7,9 +7,9 @@ pairs, and is deterministic.
 
 As Newton has it, two shapes have contacts where their distance is under the sum of both margins and both gaps
 (`ShapeConfig`), and rest with both margins between them. Newton's own gap of 0.1 m a shape makes very many contacts of
-fine meshes: give one that bodies move in a step. Gaps are read once. Depths and normals are those of
-`warp_abtree.query.manifold`. Pairs of shapes of which one is no mesh, and particles, are passed to a pipeline of
-Newton's, whose contacts come first. Tested with Newton 1.8 (extra `newton`), which calls its contacts experimental.
+fine meshes: give one that bodies move in a step. Depths and normals are those of `warp_abtree.query.manifold`. Pairs of
+shapes of which one is no mesh, and particles, are passed to a pipeline of Newton's, whose contacts come first. Tested
+with Newton 1.8 (extra `newton`), which calls its contacts experimental.
 """
 
 from typing import Any
@@ -17,14 +17,17 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.io import newton as kernels
 from warp_abtree.model.model import Model
+from warp_abtree.model.winding import keep_outside
 from warp_abtree.query.manifold import POINTS_MAX, ManifoldQuery
 from warp_abtree.query.request import CapacityError
 from warp_abtree.scene.scene import Scene
 
 # Pairs of other shapes that there is room for by default.
 OTHERS_MAX = 2**16
+SETTINGS = ("scale", "margin", "gap", "flags", "collision_group", "world", "body")
 FIELDS = ("shape0", "shape1", "point0", "point1", "offset0", "offset1", "normal", "margin0", "margin1")
 
 
@@ -109,8 +112,14 @@ def _find_solids(shapes, solids):
     return np.isin(shapes, solids)
 
 
-class NewtonContacts:
+class NewtonContacts(DeviceMemory):
     """Contacts of Newton's mesh shapes: allocates once, collides many times.
+
+    Read at every call: poses of bodies, `shape_transform`, and what Newton's own pipeline reads of shapes that are no
+    meshes. Read once: meshes (`shape_source`), `shape_scale`, `shape_margin` and `shape_gap` of mesh shapes, and of all
+    shapes `shape_body`, `shape_world`, `shape_collision_group`, `shape_flags` and `shape_collision_filter_pairs`. Where
+    these are others than they were, `collide` and `check` raise RuntimeError. What a mesh changes in place, such as its
+    vertices, is not noticed.
 
     Args:
         model: `newton.Model`.
@@ -164,6 +173,7 @@ class NewtonContacts:
             raise ValueError(f"gap: margin and gap of shape {bad} make no finite distance of 0 or more")
         self._ids = wp.array(self.shapes, dtype=wp.int32, device=self.device)
         self._no_body = wp.empty(0, dtype=wp.transform, device=self.device)
+        self._keep_settings()
         self._place(model.body_q)
         own = wp.array(reach, dtype=wp.vec4d, device=self.device)
         self.query = ManifoldQuery(self.scene, None, capacity, gap=own, points=points)
@@ -180,9 +190,48 @@ class NewtonContacts:
             key = (id(source), tuple(scale[shape].tolist()))
             if given.get(shape) is None and key not in known:
                 vertices = np.asarray(source.vertices, np.float64) * scale[shape]
-                known[key] = Model.from_arrays(vertices, np.asarray(source.indices).reshape(-1, 3))
+                faces = np.asarray(source.indices).reshape(-1, 3)
+                faces = keep_outside(faces, np.diag(scale[shape]))
+                known[key] = Model.from_arrays(vertices, faces, name=f"shape {shape}")
             models.append(known[key] if given.get(shape) is None else given[shape])
         return models
+
+    def _keep_settings(self):
+        """Keep what is read once, for `_refuse_changes`."""
+        self._sources, self._filters = list(self.model.shape_source), self.model.shape_collision_filter_pairs
+        self._filter_count = len(self._filters)
+        own = np.zeros(int(self.model.shape_count), np.int32)
+        own[self.shapes] = 1
+        self._is_own = wp.array(own, dtype=wp.int32, device=self.device)
+        self._changed = wp.full(1, len(own), dtype=wp.int32, device=self.device)
+        self._kept = kernels.ShapeSettings()
+        for name in SETTINGS:
+            setattr(self._kept, name, wp.clone(getattr(self.model, f"shape_{name}")))
+
+    def _find_changes(self):
+        """Report the first shape whose settings are others than they were. Launches only."""
+        now = kernels.ShapeSettings()
+        for name in SETTINGS:
+            setattr(now, name, getattr(self.model, f"shape_{name}"))
+        inputs = [int(self.newton.ShapeFlags.COLLIDE_SHAPES), self._is_own, self._kept, now, self._changed]
+        wp.launch(kernels.find_changed_kernel, len(self._is_own), inputs, device=self.device)
+
+    def _refuse_changes(self):
+        """Raise where the last call found other settings than there were. Waits for the device."""
+        what, shape = "", int(self._changed.numpy()[0])
+        filters = self.model.shape_collision_filter_pairs
+        if shape < len(self._is_own):
+            self._changed.fill_(len(self._is_own))
+            now = [getattr(self.model, f"shape_{name}").numpy()[shape].tolist() for name in SETTINGS]
+            kept = [getattr(self._kept, name).numpy()[shape].tolist() for name in SETTINGS]
+            names = [f"shape_{name}" for name, a, b in zip(SETTINGS, now, kept) if a != b]
+            what = f"{', '.join(names) or 'settings'} of shape {shape}"
+        elif self.model.shape_source != self._sources:
+            what = "shape_source"
+        elif len(filters) != self._filter_count or (filters is not self._filters and filters != self._filters):
+            what = "shape_collision_filter_pairs"
+        if what:
+            raise RuntimeError(f"{what} changed since NewtonContacts read it, once; make a new one")
 
     def _grow(self):
         room = len(self.query.pairs)
@@ -250,7 +299,9 @@ class NewtonContacts:
 
         Raises:
             CapacityError: The message names the demand.
+            RuntimeError: The model's shapes are others than those read at first, see the class.
         """
+        self._refuse_changes()
         found = int(contacts.rigid_contact_count.numpy()[0])
         room = len(contacts.rigid_contact_shape0)
         if found > room:
@@ -261,6 +312,7 @@ class NewtonContacts:
         body_q = self._no_body if body_q is None else body_q
         inputs = [self._ids, body_q, self.model.shape_body, self.model.shape_transform, self.scene.batch().objects.pool]
         wp.launch(kernels.pose_object_kernel, len(self.shapes), inputs, device=self.device)
+        self._find_changes()
 
     def _write(self, state, contacts):
         if self.others is None:

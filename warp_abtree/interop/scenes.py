@@ -4,14 +4,14 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_abtree.checks.arguments import first_line
 from warp_abtree.interop.usd import read_usd
+from warp_abtree.model.files.found import Remarks, Surface
+from warp_abtree.model.files.read import USD, read_file, split_file_name
 from warp_abtree.model.mesh import MeshError, load_mesh
 from warp_abtree.model.model import Model
 from warp_abtree.scene.poses import RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
 
-USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 # Stretches within this relative difference share a model.
 STRETCH_TOLERANCE = 1e-9
 
@@ -86,34 +86,31 @@ def scene_from_file(path, device=None, base_faces=10, progress=None):
     """Make a scene of a file: every node that holds a mesh becomes an object, equal meshes share a model.
 
     Args:
-        path: GLB, glTF or another format of trimesh; USD (extra `usd`), at the stage's first time, in the file's units
-            and axes. Objects of USD are its visible meshes and basic shapes, including instances and those of point
-            instancers. Cubes and planes are exact; spheres (5,120 faces), cylinders, cones and capsules (64 sections)
-            lie within 0.002 of their radius inside. A warning names what is left out: invisible prims, and geometry of
-            other kinds.
+        path: GLB, glTF or another format that `Model.load` reads; USD (extra `usd`), at the stage's first time. All in
+            the file's units and axes. Of OBJ each `o` line begins an object, `g` and `usemtl` do not; of STL, each
+            solid is one. Objects of USD are its visible meshes and basic shapes of default or render purpose, including
+            instances and those of point instancers. Cubes and planes are exact; spheres (5,120 faces), cylinders, cones
+            and capsules (64 sections) lie within 0.002 of their radius inside. A warning names what is left out, such
+            as invisible prims, guides, proxies, points and lines, and what is taken at rest or not subdivided.
         device, base_faces, progress: As for `scene_from_trimesh`.
 
     Returns:
-        The `Scene`, and the name of each object, a list: the node's, in USD the prim's path.
+        The `Scene`, and the name of each object, a list: the node's, the `o` line's, or the file's; in USD the
+        prim's path.
 
     Raises:
-        MeshError: The file is missing or cannot be read, or as for `scene_from_trimesh`.
+        MeshError: The file is missing or cannot be read, or as for `load_mesh` and `scene_from_trimesh`.
     """
-    import trimesh
-
-    path = Path(path)
-    if not path.is_file():
-        raise MeshError(f"{path}: no such file")
+    path, remarks = Path(path), Remarks()
+    name, kind, _ = split_file_name(path)
+    found = read_usd(path, remarks) if kind in USD and path.is_file() else read_file(path, remarks)
     try:
-        source = read_usd(path) if path.suffix.lower() in USD_SUFFIXES else trimesh.load_scene(path, process=False)
-    except MeshError:
-        raise
-    except Exception as error:  # trimesh's readers raise whatever goes wrong inside them
-        raise MeshError(f"{path}: cannot be read: {first_line(error)}") from None
-    try:
-        return scene_from_trimesh(source, device, base_faces, progress)
+        source = found.as_scene(name) if isinstance(found, Surface) else found
+        made = scene_from_trimesh(source, device, base_faces, progress)
     except MeshError as error:
-        raise MeshError(f"{path}: {error}") from None
+        raise MeshError(f"{path}: {error}" + (f" ({remarks})" if str(remarks) else "")) from None
+    remarks.warn(path)
+    return made
 
 
 def to_trimesh(scene, result=None, names=None, world=None, hit_colour=(214, 39, 40), colour=(176, 176, 176)):

@@ -1,24 +1,23 @@
 """USD stages as trimesh scenes: meshes, the basic shapes as meshes, instances and point instancers."""
 
-import warnings
-
 import numpy as np
 
-from warp_abtree.model.mesh import MeshError
-from warp_abtree.model.obj import read_usd_mesh
+from warp_abtree.checks.arguments import first_line
+from warp_abtree.model.files.found import MeshError
+from warp_abtree.model.files.usd_mesh import read_usd_mesh
 
 # Round shapes: 64 sections around, spheres of 5,120 faces. All lie within 0.002 of the radius inside.
 SECTIONS, SUBDIVISIONS = 64, 4
-# Prims that a warning names.
-NAMED = 4
+SHOWN = ("default", "render")  # purposes that are read
 # From a shape along z to one along another axis, cyclically, which mirrors nothing.
 ALONG = {"X": [2, 0, 1], "Y": [1, 2, 0], "Z": [0, 1, 2]}
 
 
-def read_usd(path):
+def read_usd(path, remarks):
     """Return a stage at its first time as a trimesh.Scene, with the prim's path for the name of each node.
 
-    Prims that are geometry but cannot be read, and those that are invisible, are left out with a warning.
+    Prims that are geometry but cannot be read, are invisible, or of another purpose than default or render, are left
+    out; subdivision is not carried out, and skins are taken at rest. The `Remarks` name all of these.
 
     Raises:
         MeshError: usd-core is missing, the file cannot be read, or a mesh is damaged.
@@ -31,28 +30,31 @@ def read_usd(path):
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
         raise MeshError(f"{path}: cannot be read: {str(error).splitlines()[-1].strip()}") from None
-    reader = _StageReader(path, stage)
-    reader.visit(stage.GetPseudoRoot(), "", reader.places.GetLocalToWorldTransform)
-    if reader.skipped:
-        listed = ", ".join(reader.skipped[:NAMED])
-        more = f" and {len(reader.skipped) - NAMED} more" if len(reader.skipped) > NAMED else ""
-        warnings.warn(f"{path}: left out {listed}{more}", stacklevel=3)
+    for broken in stage.GetCompositionErrors():
+        remarks.add("left out what refers to", first_line(broken))
+    reader = _StageReader(path, stage, remarks)
+    try:
+        reader.visit(stage.GetPseudoRoot(), "", reader.places.GetLocalToWorldTransform)
+    except (Tf.ErrorException, IndexError, TypeError, ValueError) as error:
+        if isinstance(error, MeshError):
+            raise
+        raise MeshError(f"{path}: cannot be read: {first_line(error)}") from None
     return reader.scene
 
 
 class _StageReader:
-    """What a walk over a stage has found: `scene`, and `skipped`, the prims that it left out and why."""
+    """What a walk over a stage has found: `scene`, and remarks on what it left out and why."""
 
-    def __init__(self, path, stage):
+    def __init__(self, path, stage, remarks):
         import trimesh
         from pxr import Usd, UsdGeom
 
-        self.path, self.stage = path, stage
+        self.path, self.stage, self.remarks = path, stage, remarks
         self.time = Usd.TimeCode.EarliestTime()
         if stage.HasAuthoredTimeCodeRange():
             self.time = Usd.TimeCode(stage.GetStartTimeCode())
         self.places = UsdGeom.XformCache(self.time)
-        self.scene, self.skipped = trimesh.Scene(), []
+        self.scene = trimesh.Scene()
         self._known: dict[tuple, str] = {}
 
     def visit(self, root, prefix, transform_of):
@@ -67,14 +69,21 @@ class _StageReader:
         prims = iter(Usd.PrimRange(root, Usd.TraverseInstanceProxies()))
         for prim in prims:
             name = prefix + str(prim.GetPath())
+            shape = prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer)
+            purpose = UsdGeom.Imageable(prim).ComputePurpose() if shape else None
             if self._is_hidden(prim):
                 prims.PruneChildren()
-                if any(part.IsA(UsdGeom.Gprim) for part in Usd.PrimRange(prim, Usd.TraverseInstanceProxies())):
-                    self.skipped.append(f"{name} (invisible)")
+                below = Usd.PrimRange(prim, Usd.TraverseInstanceProxies())
+                if any(part.IsA(UsdGeom.Gprim) or part.IsA(UsdGeom.PointInstancer) for part in below):
+                    self.remarks.add("left out", f"{name} (invisible)")
+            elif shape and purpose not in SHOWN:
+                self.remarks.add("left out", f"{name} (purpose {purpose})")
+                if prim.IsA(UsdGeom.PointInstancer):
+                    prims.PruneChildren()
             elif prim.IsA(UsdGeom.PointInstancer):
                 prims.PruneChildren()
                 self._spread(UsdGeom.PointInstancer(prim), name, transform_of(prim))
-            elif prim.IsA(UsdGeom.Gprim):
+            elif shape:
                 self._add(prim, name, transform_of(prim))
 
     def _is_hidden(self, prim) -> bool:
@@ -93,12 +102,13 @@ class _StageReader:
             if found is None:
                 return
             vertices, faces = found
+            self._remark_on(UsdGeom.Mesh(prim), name)
             if UsdGeom.Mesh(prim).GetOrientationAttr().Get(self.time) == UsdGeom.Tokens.leftHanded:
                 faces = faces[:, ::-1]
         else:
             shape = _make_shape(prim, self.time)
             if shape is None:
-                self.skipped.append(f"{name} ({prim.GetTypeName()})")
+                self.remarks.add("left out", f"{name} ({prim.GetTypeName()})")
                 return
             vertices, faces = shape
         mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -106,12 +116,25 @@ class _StageReader:
         self.scene.geometry.setdefault(geometry, mesh)
         self.scene.graph.update(name, geometry=geometry, matrix=np.array(transform).T)
 
+    def _remark_on(self, mesh, name):
+        """Remember what of a mesh is not carried out. One whose file is silent about subdivision is a polygon mesh."""
+        from pxr import UsdSkel
+
+        scheme = mesh.GetSubdivisionSchemeAttr()
+        if scheme.HasAuthoredValue() and scheme.Get() != "none":
+            self.remarks.add("not subdivided:", f"{name} ({scheme.Get()})")
+        skin = UsdSkel.BindingAPI(mesh.GetPrim())
+        if skin.GetInheritedSkeleton() or skin.GetBlendShapeTargetsRel().HasAuthoredTargets():
+            self.remarks.add("taken at rest:", f"{name} (skin or blend shapes)")
+
     def _spread(self, instancer, name, base):
         """Add the instances of a point instancer that are active and visible."""
         time, places = self.time, self.places
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
         indices = instancer.GetProtoIndicesAttr().Get(time) or []
         ways = instancer.ComputeInstanceTransformsAtTime(time, time, instancer.IncludeProtoXform, instancer.IgnoreMask)
+        if len(ways) != len(indices):
+            raise MeshError(f"{self.path}: {name}: its {len(indices)} instances do not have a place each")
         shown = instancer.ComputeMaskAtTime(time) or [True] * len(indices)
         for k, (index, way) in enumerate(zip(indices, ways)):
             if not shown[k]:

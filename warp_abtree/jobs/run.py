@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_abtree.checks.atomic_write import sweep_up
 from warp_abtree.checks.device_lock import device_lock
-from warp_abtree.jobs.shard_folder import ShardFolder
+from warp_abtree.jobs.shard_folder import WRITTEN, ShardFolder
 from warp_abtree.scene.scene import Scene
 
 
@@ -106,7 +106,7 @@ def run_shards(job, out, file="npz", pool=None, progress=None) -> dict:
         report("shards", total - len(left), total)
     if left:
         raise RuntimeError(f"{len(left)} of {total} shards were not answered")
-    sweep_up(folder.path)
+    sweep_up(folder.path, WRITTEN)
     about = {"count": job.count, "intersecting": folder.intersecting}
     about |= {"shards": total, "kept": kept, "damaged": len(folder.damaged)}
     return {**about, "workers": pool.workers, "lost": pool.lost}

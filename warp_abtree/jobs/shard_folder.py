@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
-from warp_abtree.checks.atomic_write import SUFFIX, atomic_write
+from warp_abtree.checks.atomic_write import atomic_write, find_partial, is_special
 
 FORMAT_NAME, FORMAT_VERSION = "warp_abtree shards", 2
 MANIFEST = "job.json"
 FILES = ("npz", "parquet")
-SHARD_NAME = re.compile(r"^shard-\d{12,}-\d{12,}\.(npz|parquet)$")
+SHARD_NAME = re.compile(r"shard-\d{12,}-\d{12,}\.(npz|parquet)")
+WRITTEN = re.compile(rf"{re.escape(MANIFEST)}|{SHARD_NAME.pattern}")
 STAMP = ("job", "range", "digest")
 
 
@@ -66,7 +67,7 @@ class ShardFolder:
             raise ValueError(f"{self.path}: there is no folder {self.path.parent}")
         self.path.mkdir(exist_ok=True)
         if not (self.path / MANIFEST).exists():
-            if any(entry.suffix != SUFFIX for entry in self.path.iterdir()):  # half a manifest may be left
+            if set(self.path.iterdir()) - set(find_partial(self.path, WRITTEN)):  # half a manifest may be left
                 raise ValueError(f"{self.path}: is not empty and holds no {MANIFEST}")
             with atomic_write(self.path / MANIFEST, "w", encoding="utf-8") as file:
                 json.dump(self.manifest, file, indent=1)
@@ -268,7 +269,7 @@ def _find_shards(path, job) -> dict[tuple[int, int], Path]:
     Raises:
         ValueError: A shard's name is not one of the job.
     """
-    held = {entry.name for entry in path.iterdir() if SHARD_NAME.match(entry.name)}
+    held = {entry.name for entry in path.iterdir() if SHARD_NAME.fullmatch(entry.name) and not is_special(entry)}
     names = {part: _shard_name(*part, job["file"]) for part in _ranges(job)}
     for other in sorted(held.difference(names.values())):
         raise ValueError(f"{path / other}: a shard of another job")

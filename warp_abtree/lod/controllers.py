@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import finite_array, positive, whole_number
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.upload import Upload
 from warp_abtree.kernels.lod import paper, prediction, tolerance
 from warp_abtree.kernels.lod.ladder import WARP
@@ -58,7 +59,7 @@ class Feedback:
         return sum(self.stage_ms.values()) if self.stage_ms else math.nan
 
 
-class Controller:
+class Controller(DeviceMemory):
     """What all controllers share.
 
     Args:

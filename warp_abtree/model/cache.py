@@ -7,6 +7,8 @@ The folder is $WARP_ABTREE_CACHE if that is set, and none if it is "off"; else $
 import contextlib
 import hashlib
 import os
+import re
+import stat
 from importlib.metadata import version
 from pathlib import Path
 
@@ -14,12 +16,13 @@ import numpy as np
 
 from warp_abtree.checks.atomic_write import atomic_write, sweep_up
 from warp_abtree.checks.version import __version__
-from warp_abtree.model.obj import split_file_name
+from warp_abtree.model.files.read import split_file_name
 
 VARIABLE = "WARP_ABTREE_CACHE"
 SIZE_LIMIT = 2 << 30  # bytes in the folder; the models that were used least recently go
 KEY_DIGITS = 40
-BUILDER = 3  # grows with each change of what is built of the same mesh
+_NAME = re.compile(rf"[0-9a-f]{{{KEY_DIGITS}}}\.npz")  # a folder that the user names may hold other files
+BUILDER = 4  # grows with each change of what is built of the same mesh
 LEAST_FACES = 1_000  # smaller models are built as fast as opened
 SELF_CONTAINED = {"obj", "ply", "stl", "off", "glb"}  # other formats may refer to further files
 
@@ -44,7 +47,7 @@ def file_key(source, *options) -> str | None:
         return None
     path = Path(source)
     kind = split_file_name(path)[1:]
-    if kind[0] not in SELF_CONTAINED:
+    if kind[0] not in SELF_CONTAINED or not path.is_file():  # what a pipe holds can be read once
         return None
     try:
         return _key([path.read_bytes()], kind, None if kind[0] == "obj" else version("trimesh"), *options)
@@ -67,7 +70,7 @@ def _key(parts, *options) -> str:
 def find_model(key, open_model):
     """Return what `open_model` makes of the file of a key, None if there is none that is whole."""
     path = _path(key)
-    if path is None:
+    if path is None or not path.is_file():  # a pipe would be waited for
         return None
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -112,7 +115,7 @@ def keep_model(key, arrays):
         return
     with contextlib.suppress(OSError):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        sweep_up(path.parent)
+        sweep_up(path.parent, _NAME)
         with atomic_write(path) as file:
             np.savez(file, key=np.array(key), **arrays)  # compressing takes longer than building
         _make_room(path)
@@ -126,11 +129,11 @@ def _path(key) -> Path | None:
 def _make_room(newest):
     """Remove the models that were used least recently, but not the newest, until the rest is within the limit."""
     files = []
-    # By the shape of their keys: a folder that the user names may hold other files.
-    for path in newest.parent.glob("[0-9a-f]" * KEY_DIGITS + ".npz"):
+    for path in newest.parent.iterdir():
         with contextlib.suppress(OSError):
-            about = path.stat()
-            files.append((path != newest, -about.st_mtime_ns, about.st_size, path))
+            about = path.lstat()
+            if _NAME.fullmatch(path.name) and stat.S_ISREG(about.st_mode):
+                files.append((path != newest, -about.st_mtime_ns, about.st_size, path))
     total = 0
     for other, _, size, path in sorted(files):
         total += size

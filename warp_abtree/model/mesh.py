@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from warp_abtree.checks.arguments import first_line
-from warp_abtree.model.obj import MeshError, read_file, read_warp_asset, split_file_name
-from warp_abtree.model.winding import component_labels, find_winding
+from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.read import read_file, split_file_name
+from warp_abtree.model.files.usd_mesh import read_warp_asset
+from warp_abtree.model.winding import component_labels, find_winding, keep_outside
 
 FACE_LIMIT = 2**30  # int32 forest ids count up to two nodes a vertex, and heap indices up to two a face
 EXTENT_LIMITS = (2.0**-100, 2.0**100)  # boxes are float32
@@ -31,6 +33,8 @@ class Mesh:
         file_vertex_count: Vertices in the source.
         unreferenced_count: Vertices of the source that no face refers to.
         welded_count: Vertices that coincide with an earlier one and were merged into it.
+        remarks: What the file holds and was not read, in one line, empty if nothing.
+        parts: Of the source that were joined; `scene_from_file` makes an object of each.
     """
 
     vertices: np.ndarray
@@ -40,22 +44,26 @@ class Mesh:
     file_vertex_count: int
     unreferenced_count: int
     welded_count: int
+    remarks: str = ""
+    parts: int = 1
 
 
 def load_mesh(source, name=None):
     """Load a triangle mesh; return a Mesh.
 
     Args:
-        source: One of: a path to anything that trimesh loads, gzipped (``.obj.gz``) or not; ``"warp:bunny"``,
+        source: One of: a path to an OBJ, PLY, OFF, STL, glTF, GLB or DAE file (the last by pycollada), or to anything
+            else that trimesh loads, gzipped (``.obj.gz``) or not, or to a zip archive of these; ``"warp:bunny"``,
             ``"warp:bear"`` or ``"warp:rocks"``, meshes inside Warp (these need the extra ``usd``); a trimesh.Trimesh;
             a trimesh.Scene, whose meshes are joined where its transforms put them.
         name: Name for people; by default the file's, without its extensions.
 
-    Polygons of OBJ and USD are cut into fans from their first corner, or by clipping ears where that fan would fold
-    over; either way polygon by polygon in the source's order.
+    Polygons are cut into fans from their first corner, or by clipping ears where that fan would fold over; either way
+    polygon by polygon in the source's order. A warning names what a file holds and is not read, such as lines, points,
+    or the facets that one cut short lacks.
 
     Raises:
-        MeshError: The source cannot be read, or holds no mesh that can be used.
+        MeshError: The source cannot be read, holds no mesh that can be used, or unpacks past the limit.
     """
     if not isinstance(source, str | os.PathLike):
         import trimesh  # takes as long as the rest of the library
@@ -67,12 +75,16 @@ def load_mesh(source, name=None):
         asset = source[len("warp:") :]
         return _weld_mesh(*read_warp_asset(source, asset), asset if name is None else name, where=source)
     path = Path(source)
-    found = read_file(path)
+    remarks = Remarks()
+    found = read_file(path, remarks)
     name = split_file_name(path)[0] if name is None else name
-    if not isinstance(found, tuple):
-        return _join_geometry(found, name, where=str(path))
-    vertices, faces = found
-    return _weld_mesh(vertices, faces, name, where=str(path))
+    if isinstance(found, Surface):
+        mesh = _weld_mesh(found.vertices, found.faces, name, where=str(path))
+        mesh = replace(mesh, parts=1 if found.parts is None else len(np.unique(found.parts)))
+    else:
+        mesh = _join_geometry(found, name, where=str(path), remarks=str(remarks))
+    remarks.warn(path)
+    return replace(mesh, remarks=str(remarks))
 
 
 def mesh_from_arrays(vertices, faces, name="arrays"):
@@ -97,7 +109,8 @@ def describe_mesh(mesh):
     computation. Faces with the same three corners in any order are duplicates; each one after the first counts. Faces
     that share a vertex are of one component. A mesh is closed if every edge belongs to an even number of faces. Its
     winding is mixed where two faces run along an edge the same way, inside out where parts are, see
-    `warp_abtree.model.winding`, else consistent, and outwards if the mesh is closed too.
+    `warp_abtree.model.winding`, else consistent, and outwards if the mesh is closed too. What it holds as a solid is
+    told in words.
     """
     faces = np.delete(mesh.faces, mesh.dropped_faces, axis=0).astype(np.int64)
     vertex_count = len(mesh.vertices)
@@ -109,6 +122,7 @@ def describe_mesh(mesh):
     right = "outwards" if winding.is_closed else "consistent"
     return {
         "name": mesh.name,
+        "parts": mesh.parts,
         "faces": len(mesh.faces),
         "vertices": vertex_count,
         "file_vertices": mesh.file_vertex_count,
@@ -124,6 +138,7 @@ def describe_mesh(mesh):
         "winding": "mixed" if winding.mixed_edges else "inside out" if len(winding.inside_out) else right,
         "mixed_edges": winding.mixed_edges,
         "inside_out_faces": len(winding.inside_out),
+        "solid": winding.describe_solid(),
         "extents": (upper - lower).tolist(),
         "bounds": [lower.tolist(), upper.tolist()],
         "diagonal": float(np.linalg.norm(upper - lower)),
@@ -141,7 +156,7 @@ def orient_mesh(mesh):
 # Validation and welding.
 
 
-def _join_geometry(geometry, name, where=None):
+def _join_geometry(geometry, name, where=None, remarks=""):
     """Join the triangles of a trimesh object; points and paths are ignored."""
     import trimesh
 
@@ -151,7 +166,7 @@ def _join_geometry(geometry, name, where=None):
         nodes = map(geometry.graph.get, geometry.graph.nodes_geometry)
         placed = [(geometry.geometry[part], pose) for pose, part in nodes]
     if not placed:
-        raise MeshError(f"{where}: no faces")
+        raise MeshError(f"{where}: no faces" + (f" ({remarks})" if remarks else ""))
     vertices, faces, vertex_count = [], [], 0
     for mesh, pose in placed:
         if not isinstance(mesh, trimesh.Trimesh):
@@ -165,15 +180,14 @@ def _join_geometry(geometry, name, where=None):
         if not np.array_equal(pose, np.eye(4)):
             with np.errstate(invalid="ignore", over="ignore"):
                 part_vertices = part_vertices @ pose[:3, :3].T + pose[:3, 3]
-            if np.linalg.det(pose[:3, :3]) < 0.0:
-                part_faces = part_faces[:, ::-1]  # keeps the outside of a mirrored surface
+            part_faces = keep_outside(part_faces, pose[:3, :3])
         vertices.append(part_vertices)
         faces.append(part_faces + vertex_count)
         vertex_count += len(part_vertices)
     if not faces:
         kinds = sorted({type(part).__name__ for part, _ in placed})
         raise MeshError(f"{where}: no faces (it holds {', '.join(kinds)})")
-    return _weld_mesh(np.concatenate(vertices), np.concatenate(faces), name, where)
+    return replace(_weld_mesh(np.concatenate(vertices), np.concatenate(faces), name, where), parts=len(faces))
 
 
 def _weld_mesh(vertices, faces, name, where):

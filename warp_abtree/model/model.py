@@ -1,6 +1,8 @@
 """Model: a mesh with its progressive mesh and its AB-Tree, saved and opened as .npz."""
 
 import hashlib
+import io
+import math
 import warnings
 from dataclasses import replace
 from functools import cached_property, partial
@@ -12,6 +14,8 @@ import numpy as np
 from warp_abtree.checks.arguments import first_line, whole_number
 from warp_abtree.checks.atomic_write import atomic_write
 from warp_abtree.model.cache import LEAST_FACES, error_key, file_key, find_model, keep_errors, keep_model, mesh_key
+from warp_abtree.model.files.read import split_file_name
+from warp_abtree.model.files.unpack import exceeds_limit, limit_message
 from warp_abtree.model.mesh import (
     COORDINATE_MAX,
     COORDINATE_MIN,
@@ -21,7 +25,6 @@ from warp_abtree.model.mesh import (
     mesh_from_arrays,
     orient_mesh,
 )
-from warp_abtree.model.obj import split_file_name
 from warp_abtree.model.outward_error import OutwardError
 from warp_abtree.model.progressive import ProgressiveMesh, build_progressive
 from warp_abtree.model.tree import Tree, active_build
@@ -29,6 +32,7 @@ from warp_abtree.model.winding import Winding, find_winding
 
 FORMAT_NAME = "warp_abtree model"
 FORMAT_VERSION = 2
+NO_MODEL = "not a warp_abtree model file, as Model.save writes; meshes are read by Model.load"
 
 _ARRAYS = {
     "vertex_parent": (np.int32, 1),
@@ -57,12 +61,13 @@ class Model:
         tree: `Tree`.
         dropped_faces: Faces that welding left without three distinct corners, int32; never active.
         centre: Middle of the box of the original vertices [model units], float64 (3,); boxes are kept about it.
+        parts: Of the source that `load` joined into one mesh; 1 for a model that `open` read.
     """
 
-    def __init__(self, progressive: ProgressiveMesh, tree: Tree, name: str):
+    def __init__(self, progressive: ProgressiveMesh, tree: Tree, name: str, parts: int = 1):
         self.progressive = progressive
         self.tree = tree
-        self.name = name
+        self.name, self.parts = name, parts
         self.dropped_faces = np.flatnonzero(progressive.face_split > progressive.lod_max).astype(np.int32)
         original = progressive.vertex_pos[: progressive.vertex_count]
         self.centre = 0.5 * original.min(0) + 0.5 * original.max(0)
@@ -82,13 +87,14 @@ class Model:
         them; "off" keeps none.
 
         Args:
-            source: Path of anything trimesh reads (also gzipped), trimesh.Trimesh or Scene, "warp:bunny", "warp:bear",
-                "warp:rocks", or a `Mesh`. What `save` wrote is read by `open`.
+            source: Path of a mesh file (also gzipped), trimesh.Trimesh or Scene, "warp:bunny", "warp:bear",
+                "warp:rocks", or a `Mesh`, as for `load_mesh`. What `save` wrote is read by `open`.
             base_faces: Faces at which the collapse sequence stops.
             progress: Called as progress(stage, done, total) during long builds.
             cache: Whether to look for the model in the cache, and to keep it there.
             orient: Whether to turn faces so that neighbours agree about the outside, and closed parts that are inside
-                out; face ids stay, and so does what has one side only.
+                out, walls of cavities among them (`warp_abtree.model.winding`); face ids stay, and so does what has one
+                side only.
             certify: Whether to certify the errors of all LODs at once, beside the collapse, which takes less time in
                 all; else they are certified when `error_at`, a tolerance or `save` first needs them.
 
@@ -97,7 +103,7 @@ class Model:
             ValueError: base_faces is below 1.
         """
         base_faces = whole_number(base_faces, "base_faces", 1, 2**62)
-        options = (FORMAT_VERSION, base_faces, "oriented") if orient else (FORMAT_VERSION, base_faces)
+        options = (FORMAT_VERSION, base_faces, "oriented by parity") if orient else (FORMAT_VERSION, base_faces)
         key = file_key(source, *options) if cache else None
         model = find_model(key, partial(_read, error_key=error_key(key)))
         if model is not None:
@@ -107,11 +113,11 @@ class Model:
             mesh = orient_mesh(mesh) if orient else mesh
             if not cache or len(mesh.faces) < max(LEAST_FACES, base_faces):
                 key = None
-            elif key is None:
+            elif key is None or mesh.remarks or mesh.parts > 1:  # then the file is read again, and told of again
                 key = mesh_key(mesh, *options)
                 model = find_model(key, partial(_read, error_key=error_key(key)))
             model = model or _build(mesh, base_faces, progress, key, certify)
-            model = model if model.name == mesh.name else cls(model.progressive, model.tree, mesh.name)
+            model = cls(model.progressive, model.tree, mesh.name, mesh.parts)
         if certify:
             model.error_at(0)
         return model
@@ -220,7 +226,8 @@ class Model:
         """Read a model that `save` wrote, and check all of it.
 
         Raises:
-            ModelError: The file is missing, no model file, truncated, altered, or of another version.
+            ModelError: The file is missing, no model file, truncated, altered, of another version, or unpacks past the
+                limit.
         """
         return _read(Path(path), _ERROR)
 
@@ -246,8 +253,15 @@ def _read(path, more=(), error_key=None) -> Model:
         ModelError: As `Model.open`.
     """
     names = (*_ARRAYS, *more, "leaf_node", "name")
+    if path.is_dir() or (path.exists() and not path.is_file()):
+        raise ModelError(f"{path}: is no regular file")
     try:
+        with path.open("rb") as raw:
+            begin = raw.read(4)
+        if begin[:2] != b"PK":  # as zip files do
+            raise ModelError(f"{path}: {NO_MODEL}")
         with np.load(path, allow_pickle=False) as file:
+            _check_size(path, file.zip)
             _check_format(path, file, names)
             digest = file["digest"]
             arrays = {name: file[name] for name in names}
@@ -285,13 +299,29 @@ def _hash_arrays(arrays: dict) -> bytes:
     return found.digest()
 
 
+def _check_size(path, archive):
+    """Refuse an archive that unpacks past the limit, or arrays larger than their members, before any is read."""
+    packed = path.stat().st_size
+    if exceeds_limit(sum(member.file_size for member in archive.infolist()), packed):
+        raise ModelError(f"{path}: {limit_message(packed)}")
+    for member in archive.infolist():
+        with archive.open(member) as file:
+            begin = file.read(min(member.file_size, 2**14))
+        if begin[:6] == b"\x93NUMPY":
+            header = io.BytesIO(begin)
+            read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+            shape, _, dtype = read[np.lib.format.read_magic(header)](header)
+            if not dtype.hasobject and math.prod(shape) * dtype.itemsize != member.file_size - header.tell():
+                raise ModelError(f"{path}: member {member.filename!r} has another length than its array")
+
+
 def _check_format(path, file, names):
     """Check the format name, version and members of an opened file."""
-    if not isinstance(file, np.lib.npyio.NpzFile) or not {"format", "version"} <= set(file.files):
-        raise ModelError(f"{path}: not a warp_abtree model file")
+    if not {"format", "version"} <= set(file.files):
+        raise ModelError(f"{path}: {NO_MODEL}")
     form, version = file["format"], file["version"]
     if not isinstance(form, np.ndarray) or form.shape != () or str(form) != FORMAT_NAME:
-        raise ModelError(f"{path}: not a warp_abtree model file")
+        raise ModelError(f"{path}: {NO_MODEL}")
     if not isinstance(version, np.ndarray) or version.shape != () or version.tolist() != FORMAT_VERSION:
         raise ModelError(f"{path}: format version {version}, this library reads {FORMAT_VERSION}; build it again")
     missing = [name for name in (*names, "digest") if name not in file.files]

@@ -5,22 +5,31 @@ point off it, crosses it an even or an odd number of times whichever way it goes
 every LOD: a face is active while its corners are distinct, a merge of two vertices maps faces to faces or to nothing
 and the edges of faces to the edges of their images or to nothing, and numbers of faces at an edge add up.
 
-Faces that meet at edges of two faces form a part. It is mixed where two faces run along an edge the same way, and
-inside out where it is closed by itself, not mixed, of negative volume, and within an even number of other such parts:
-the wall of a cavity may face inwards.
+Faces that meet at edges of two faces form a part. It is mixed where two faces run along an edge the same way. It is
+inside out where it is closed by itself and not mixed, and its faces point to where parity says inside: a body faces
+out, the wall of a cavity in it faces into the cavity, a body in that cavity faces out again. Of a part some corners and
+middles of faces are looked at, those that are not on another surface; it is within that where all of them are.
+
+Of faces with the same three corners an even number cancels: parity counts none of them.
 """
 
+import warnings
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
 
-from warp_abtree.model.obj import MeshError
+from warp_abtree.model.files.found import MeshError
 
 SHOWN_EDGES = 4
 # Of the sum of all products of three coordinates: 80 roundings of 2^-53 in each, and those of the sum.
 VOLUME_ROUNDING = 2.0**-45
+# Faces of a part whose first corner and middle are looked at, and entries of a table of points and faces.
+SAMPLED_FACES = 16
+TABLE = 2**22
+# Points as near to a surface count as on it, as a part of its size, and of coordinates.
+NEAR, NEAR_ROUNDING = 1e-9, 2.0**-48
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +66,21 @@ class Winding:
         """Rows of the faces of all parts that are inside out."""
         return _inside_out(self.vertices, self.faces, self.part)
 
+    @cached_property
+    def doubled(self) -> np.ndarray:
+        """Rows of the faces that are listed an even number of times and would enclose something if listed once."""
+        return _doubled(self.faces, len(self.vertices))
+
+    def describe_solid(self) -> str:
+        """Return what the mesh holds as a solid, in a few words."""
+        if not self.is_closed:
+            return "no: not closed"
+        count = len(self.doubled)
+        if not count:
+            return "yes"
+        what = "holds nothing: all" if count == len(self.faces) else "holds less than it shows:"
+        return f"{what} {count} faces are listed an even number of times"
+
     def fault(self) -> str | None:
         """Return what is wrong with the winding in a few words, or None."""
         if self.mixed_edges:
@@ -77,7 +101,7 @@ class Winding:
         return f"{count} edges belong to an odd number of faces: {', '.join(shown)}{more}"
 
     def oriented(self) -> np.ndarray:
-        """Return the faces (n, 3), turned so that neighbours agree, as most of them did, and closed parts face out.
+        """Return the faces (n, 3), turned so that neighbours agree, as most of them did, and no part is inside out.
 
         Parts that have one side only, as a Moebius strip, stay as they are.
         """
@@ -97,11 +121,7 @@ def find_winding(vertices, faces, dropped_faces=()) -> Winding:
     """Return the `Winding` of a welded mesh."""
     face_ids = np.delete(np.arange(len(faces)), dropped_faces)
     faces = np.asarray(faces, np.int64)[face_ids]
-    key, forward, row = _edges(faces, len(vertices))
-    order = np.argsort(key, kind="stable")
-    key, forward, row = key[order], forward[order], row[order]
-    start = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
-    count = np.diff(np.append(start, len(key)))
+    key, forward, row, start, count = _sorted_edges(faces, len(vertices))
     odd, two = start[count % 2 == 1], start[count == 2]
     first, second, opposite = row[two], row[two + 1], forward[two] != forward[two + 1]
     return Winding(
@@ -116,10 +136,18 @@ def find_winding(vertices, faces, dropped_faces=()) -> Winding:
     )
 
 
-def refuse_open(winding: Winding, name: str):
-    """Raise MeshError for a mesh that has no inside; its name stands in the message."""
+def check_solid(winding: Winding, name: str, stacklevel: int = 2):
+    """Raise MeshError for a mesh that has no inside, and warn of faces that hold nothing; its name stands in both."""
     if not winding.is_closed:
         raise MeshError(f"model {name!r} is no solid: it is not closed, {winding.describe_open()}")
+    if len(winding.doubled):
+        what = f"model {name!r} as a solid {winding.describe_solid()}; keep one of each"
+        warnings.warn(what, RuntimeWarning, stacklevel=stacklevel + 1)
+
+
+def keep_outside(faces, linear):
+    """Return faces (n, 3) for vertices that a matrix (3, 3) maps: turned where it mirrors, so that they face out."""
+    return faces[:, ::-1] if np.linalg.det(linear) < 0 else faces
 
 
 def component_labels(faces, vertex_count):
@@ -174,6 +202,37 @@ def _edges(faces, vertex_count):
     return np.minimum(tail, head) * vertex_count + np.maximum(tail, head), tail < head, np.arange(tail.size) // 3
 
 
+def _sorted_edges(faces, vertex_count):
+    """Return what `_edges` does, sorted by the key, and where the faces of each edge start and how many they are."""
+    key, forward, row = _edges(faces, vertex_count)
+    order = np.argsort(key, kind="stable")
+    key, forward, row = key[order], forward[order], row[order]
+    start = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
+    return key, forward, row, start, np.diff(np.append(start, len(key)))
+
+
+def _edge_groups(faces, vertex_count):
+    """Return the lowest row of the faces that each is joined to by edges, and whether these leave no edge odd."""
+    key, _, row, start, count = _sorted_edges(faces, vertex_count)
+    same = key[1:] == key[:-1]
+    group = component_labels(np.stack([row[:-1][same], row[1:][same]], 1), len(faces))
+    return group, ~np.isin(group, group[row[start[count % 2 == 1]]])
+
+
+def _doubled(faces, vertex_count):
+    """Return the rows of `Winding.doubled`: all, or those of closed surfaces of faces that cancel."""
+    corners = np.sort(faces, axis=1)
+    order = np.lexsort(corners.T)
+    new = np.append(True, (np.diff(corners[order], axis=0) != 0).any(1))
+    number = np.empty(len(faces), np.int64)
+    number[order] = np.cumsum(new) - 1
+    even = np.bincount(number) % 2 == 0
+    once = order[new][even]
+    if len(once) < len(even):
+        even[even] = _edge_groups(faces[once], vertex_count)[1]
+    return np.flatnonzero(even[number])
+
+
 def _inside_out(vertices, faces, part):
     """Return the rows of the faces of all parts that are inside out."""
     names, part = np.unique(part, return_inverse=True)
@@ -184,16 +243,28 @@ def _inside_out(vertices, faces, part):
     balance = np.bincount(place, np.where(forward, 1, -1))
     whole = np.ones(len(names), bool)
     whole[own[balance != 0] // len(edges)] = False
-    order = np.argsort(part, kind="stable")
-    rows = np.split(order, np.cumsum(np.bincount(part))[:-1])
+    # Parity counts whole parts, and what else there is of faces that leave no edge odd.
+    group, closed = _edge_groups(faces, len(vertices))
+    body = np.where(whole[part], part, len(names) + group)
+    order = np.argsort(body, kind="stable")
+    start = np.flatnonzero(np.append(True, np.diff(body[order]) != 0))
+    rows = np.split(order, start[1:])
+    is_whole = body[order[start]] < len(names)
+    counts = is_whole | closed[order[start]]
     corners = vertices[faces]
-    signs = np.array([_volume_sign(corners[rows[k]]) if whole[k] else 0 for k in range(len(names))])
-    boxes = np.array([(corners[of].min((0, 1)), corners[of].max((0, 1))) for of in rows])
+    lower = np.minimum.reduceat(corners.min(1)[order], start)
+    upper = np.maximum.reduceat(corners.max(1)[order], start)
     turned = []
-    for k in np.flatnonzero(signs < 0):
-        around = (boxes[:, 0] < boxes[k, 0]).all(1) & (boxes[:, 1] > boxes[k, 1]).all(1) & (signs != 0)
-        point = corners[rows[k][0], 0]
-        if sum(_contains(corners[rows[other]], point) for other in np.flatnonzero(around)) % 2 == 0:
+    for k in np.flatnonzero(is_whole):
+        near = _nearness(lower[k], upper[k])
+        around = counts & (lower <= lower[k] + near).all(1) & (upper >= upper[k] - near).all(1)
+        around[k] = False
+        depth = 0
+        if around.any():
+            some = corners[rows[k][np.unique(np.linspace(0, len(rows[k]) - 1, SAMPLED_FACES).astype(int))]]
+            points = np.stack([some[:, 0], some.mean(1)], 1).reshape(-1, 3)
+            depth = sum(_holds(corners[rows[other]], points) for other in np.flatnonzero(around))
+        if _volume_sign(corners[rows[k]]) == (1 if depth % 2 else -1):
             turned.append(rows[k])
     return np.sort(np.concatenate(turned)) if turned else np.empty(0, np.int64)
 
@@ -217,18 +288,44 @@ def _exact_volume(a, b, c) -> Fraction:
     return ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
 
 
-def _contains(corners, point) -> bool:
-    """Return whether a point lies within a closed surface that it is not on, in float64: crossings of a ray along z."""
-    corners = corners - point
-    above = corners[:, :, 1] > 0
-    crossings = np.zeros(len(corners), bool)
+def _nearness(lower, upper):
+    """Return how near to a surface in a box counts as on it."""
+    return max(NEAR * (upper - lower).max(), NEAR_ROUNDING * max(np.abs(lower).max(), np.abs(upper).max()))
+
+
+def _holds(corners, points) -> bool:
+    """Return whether a closed surface holds those of some points that are not on it, and there are some."""
+    box = corners.min(1).T, corners.max(1).T
+    near = _nearness(box[0].min(1), box[1].max(1))
+    step = max(1, TABLE // len(corners))
+    held = False
+    for at in range(0, len(points), step):
+        sides = _sides(corners, box, points[at : at + step], near)
+        if (sides < 0).any():
+            return False
+        held |= bool((sides > 0).any())
+    return held
+
+
+def _sides(corners, box, points, near):
+    """Return 1 for points in a closed surface, -1 for those outside, 0 for those on it: crossings of rays along z."""
+    lower, upper = box
+    least, most = (points - near).T[..., None], (points + near).T[..., None]
+    column = (most[0] >= lower[0]) & (most[1] >= lower[1]) & (least[0] <= upper[0]) & (least[1] <= upper[1])
+    point, face = np.nonzero(column & (least[2] <= upper[2]))
+    x = corners[face] - points[point, None]
+    normal = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
+    height = np.einsum("ij,ij->i", normal, x[:, 0])
+    on = (most[2, point, 0] >= lower[2, face]) & (np.abs(height) <= near * np.linalg.norm(normal, axis=1))
+    high = x[:, :, 1] > 0
+    crosses = np.zeros(len(x), bool)
     for k in range(3):
-        a, b = corners[:, k], corners[:, (k + 1) % 3]
+        a, b = x[:, k], x[:, (k + 1) % 3]
         # The same numbers for both faces of an edge.
-        swap = (above[:, k] > above[:, (k + 1) % 3])[:, None]
+        swap = (high[:, k] > high[:, (k + 1) % 3])[:, None]
         a, b = np.where(swap, b, a), np.where(swap, a, b)
-        right = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
-        crossings ^= (above[:, k] != above[:, (k + 1) % 3]) & right
-    a, b, c = (corners[crossings, k] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    return bool(np.count_nonzero(np.einsum("ij,ij->i", normal, a) * normal[:, 2] > 0) % 2)
+        crosses ^= (high[:, k] != high[:, (k + 1) % 3]) & (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0)
+    crosses &= (x[:, :, 2].min(1) > 0) | (height * normal[:, 2] > 0)
+    sides = np.where(np.bincount(point[crosses], minlength=len(points)) % 2, 1, -1)
+    sides[point[on]] = 0
+    return sides

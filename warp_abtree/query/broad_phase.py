@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.intersect.broad_phase import (
     find_pair_kernel,
     make_pair_key_kernel,
@@ -21,7 +22,7 @@ from warp_abtree.state.generation import LaunchGuard
 EVERY_WORLD = -1
 
 
-class BroadPhase:
+class BroadPhase(DeviceMemory):
     """Broad phase of a batch: allocates once, launches many times.
 
     Args:

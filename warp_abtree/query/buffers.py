@@ -8,6 +8,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import check_device
 from warp_abtree.checks.cpu_threads import core_count
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.regime import Regime, current_regime
 from warp_abtree.kernels.base import poses
 from warp_abtree.kernels.intersect import descent, face_pairs
@@ -31,7 +32,7 @@ class HostViews:
         self.faces: Any = None if query.hits.face is None else query.hits.face.numpy().reshape(-1, 3)
 
 
-class QueryBuffers:
+class QueryBuffers(DeviceMemory):
     """Device lists of an operator about object pairs; see `Query` for the attributes that users read."""
 
     batch: Batch

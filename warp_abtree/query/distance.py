@@ -25,7 +25,8 @@ middles of edges and centroids of faces, of both objects if both are solids. The
 
 Whatever the number of faces that have gone under, no shorter motion frees the objects: depth is a lower bound of the
 penetration depth, the length of the shortest motion that does, and that length for a body pressed into a flat floor or
-a peg that is too thick for its hole. Where solids cross and none of these points is inside, distance is 0.
+a peg that is too thick for its hole. Where solids cross and none of these points is inside, distance is 0. Pairs of
+which no object is a solid are refused.
 
 With the default tolerance, all of this is the same, bit for bit, on CPU and CUDA, whatever the search has started from.
 With a tolerance points, faces and distance may also depend on what the last launch found.
@@ -51,7 +52,7 @@ from warp_abtree.kernels.inside.depth import find_depth_kernel
 from warp_abtree.kernels.search import mean_slabs
 from warp_abtree.query.commands import Commands
 from warp_abtree.query.narrow_phase import Query
-from warp_abtree.query.request import check_request, check_within, refuse_options
+from warp_abtree.query.request import check_request, check_within, refuse_options, refuse_signed
 from warp_abtree.query.result import DISTANCES, Found, Result
 from warp_abtree.query.staging import first_rows
 
@@ -151,7 +152,8 @@ class DistanceQuery(Query):
         distances: The last launch's answers, device arrays (pair capacity,) of `kernels.distance.report.Distances`.
 
     Raises:
-        ValueError: As `Query`; a tolerance or distance that is negative, infinite or no number.
+        ValueError: As `Query`; a tolerance or distance that is negative, infinite or no number; or depths are asked of
+            pairs of which no object is a solid.
         RuntimeError: A graph is being captured.
     """
 
@@ -168,6 +170,7 @@ class DistanceQuery(Query):
         self._slabs.record = wp.empty(0, dtype=wp.vec4, device=scene.device)
         self._slabs.due_count = wp.zeros(1, dtype=wp.int32, device=scene.device)
         super().__init__(scene, "any", pairs, capacity)
+        refuse_signed(self._signed and pairs is None, self.batch.has_solid())
         self._found.launched = self.guard.launched
         self._fit_slabs()
 
@@ -175,12 +178,14 @@ class DistanceQuery(Query):
         """Query other pairs from now on, in the room there is if they fit; beyond None keeps the distances.
 
         Raises:
-            ValueError: Bad pairs or distances, or a query that runs the broad phase.
+            ValueError: Bad pairs or distances, a query that runs the broad phase, or signed and no object of the pairs
+                is a solid.
         """
         if self.broad_phase is not None:
             raise ValueError("this query takes its pairs from the broad phase")
         check_device(self.device, "giving a query other pairs")
         pairs = self.batch.check_pairs(pairs)
+        refuse_signed(self._signed, self.batch.has_solid(pairs))
         if beyond is None:
             beyond = self._asked if self._within is None else self._within
         self.replace_pairs(pairs, check_beyond(beyond, len(pairs)))

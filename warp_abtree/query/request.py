@@ -128,3 +128,9 @@ def check_pair_room(count: int):
     """Raise CapacityError for more object pairs than a launch holds."""
     if count > PAIRS_MAX:
         raise CapacityError(f"{count} object pairs at a time, more than 2^26; ask them in parts")
+
+
+def refuse_signed(signed: bool, has_solid: bool):
+    """Raise ValueError where depths are asked of surfaces alone: all would be 0."""
+    if signed and not has_solid:
+        raise ValueError("signed: no object of the pairs is a solid (solid=True), so that nothing has a depth")

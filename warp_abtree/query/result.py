@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.query.request import CapacityError
 
 COUNTERS = ("node_tests", "triangle_tests", "float64_tests", "exact_tests")
@@ -75,8 +76,10 @@ class Found:
     undecided: Any = None
 
 
-class Result:
+class Result(DeviceMemory):
     """What a query found: NumPy arrays, or Warp arrays of the query's device where `device=True` was asked.
+
+    Its length is the number of pairs; it has no truth value, `bool(result)` raises TypeError.
 
     Whatever the query does later, the arrays stay as they are. Those on the host are read in one piece, counters of
     tests among them, from a GPU into page-locked memory that is used again when no array of the result is left.
@@ -144,6 +147,19 @@ class Result:
     def __repr__(self):
         held = [name for name in (*ANSWERS[1:], "count") if getattr(self, name) is not None]
         return f"Result(pairs={len(self.pairs)}, {', '.join(held)})"
+
+    def __len__(self):
+        """Return the number of pairs."""
+        return len(self.pairs)
+
+    def __bool__(self):
+        """Refuse a truth value: it would say nothing of what was found."""
+        raise TypeError("a Result is neither true nor false; ask result.any.any(), result.clear.all() or len(result)")
+
+    def __reduce_ex__(self, protocol):
+        """Pickle or copy what lies on the host; refuse arrays on the device."""
+        on_host = isinstance(self.pairs, np.ndarray)
+        return object.__reduce_ex__(self, protocol) if on_host else super().__reduce_ex__(protocol)
 
     def check(self):
         """Raise where anything was lost.

@@ -15,7 +15,7 @@ from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.distance import DistanceQuery, check_beyond, check_flags, check_tolerances, prepare_query
 from warp_abtree.query.narrow_phase import Query
-from warp_abtree.query.request import check_request, check_within, refuse_options
+from warp_abtree.query.request import check_request, check_within, refuse_options, refuse_signed
 from warp_abtree.query.result import Result
 from warp_abtree.scene.first_contact import FirstContactQuery, check_path
 from warp_abtree.state.batch import Batch
@@ -96,7 +96,11 @@ class KeptQueries:
             pairs = BroadPhase(asked).find(reach) if pairs is None else pairs
         elif key not in self.kept:
             self._load(DistanceQuery, pairs is None, "any", "exact", False, False)
-        pairs = self._find_pairs(pairs, reach)
+        given, pairs = pairs, self._find_pairs(pairs, reach)
+        if signed:
+            batch = self._scene.batch()
+            refuse_signed(signed, batch.has_solid(None if given is None else pairs))
+            signed = batch.has_solid(pairs)  # the broad phase may have found surfaces alone
         beyond = check_beyond(beyond, len(pairs))
         query = prepare_query(self.kept.pop(key, None), asked, pairs, beyond, tolerances, signed)
         return self._run(key, query, device)

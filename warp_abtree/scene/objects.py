@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_abtree.checks.arguments import flag, to_numpy, whole_number
 from warp_abtree.model.model import Model
-from warp_abtree.model.winding import refuse_open
+from warp_abtree.model.winding import check_solid
 from warp_abtree.query.broad_phase import EVERY_WORLD
 from warp_abtree.scene.poses import launch_place
 
@@ -156,5 +156,5 @@ def check_columns(models, worlds, importances, flags, bits) -> dict[str, list]:
         "mask": check_numbers(masks, "collision_mask", 0, ALL_BITS, count),
     }
     for model in {id(model): model for model, solid in zip(models, columns["solid"]) if solid}.values():
-        refuse_open(model.winding, model.name)
+        check_solid(model.winding, model.name, stacklevel=3)
     return columns

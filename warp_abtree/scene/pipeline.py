@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.io import pipeline as kernels
 from warp_abtree.query.contacts import ContactQuery
 from warp_abtree.query.narrow_phase import Query
@@ -51,7 +52,7 @@ def check_ladder(ladder, models) -> list:
     return levels
 
 
-class Pipeline:
+class Pipeline(DeviceMemory):
     """A frame as an operator: sets poses, brings trees to LODs, runs broad and narrow phase, all on the device.
 
     `launch()` only launches, on arrays that are allocated once, so that a graph can capture it, on CUDA and the CPU,

@@ -8,6 +8,8 @@ from warp_abtree.kernels.io import place_poses
 
 QUATERNION_TOLERANCE = 1e-3
 RIGID_TOLERANCE = 1e-6
+# A matrix that is no farther off was rigid before rounding, for all that its numbers tell.
+ROUNDED_AT_MOST = 1e-2
 
 REALS = (wp.float32, wp.float64)
 # Warp's types of a pose, their numbers, and how many.
@@ -52,8 +54,23 @@ def check_poses(poses, what="poses", first=0) -> np.ndarray:
     off = np.abs(rotation.transpose(0, 2, 1) @ rotation - IDENTITY)
     sound = (off <= RIGID_TOLERANCE).all((1, 2)) & (np.linalg.det(rotation) > 0) & (poses[:, 3] == LAST_ROW).all(1)
     if not sound.all():
-        raise ValueError(f"{what}: matrix {first + sound.argmin()} is not rigid within 1e-6")
+        i = int(sound.argmin())
+        why = _why_not_rigid(poses[i], off[i].max())
+        raise ValueError(f"{what}: matrix {first + i} is not rigid within 1e-6: {why}")
     return poses
+
+
+def _why_not_rigid(matrix, off) -> str:
+    """Return what is wrong with a matrix (4, 4) whose R^T R is off the identity by so much."""
+    if not (matrix[3] == LAST_ROW).all():
+        return f"its last row is {matrix[3].tolist()}, not 0 0 0 1"
+    if np.linalg.det(matrix[:3, :3]) <= 0:
+        return "it mirrors or flattens"
+    told = f"R^T R is off the identity by {off:.3g}"
+    if off > ROUNDED_AT_MOST:
+        return f"{told}; a scale or shear belongs in the model"
+    nearest = "take the nearest rotation, u @ v of u, _, v = numpy.linalg.svd(R)"
+    return f"{told}, as many products in float32 leave it; {nearest}"
 
 
 def device_rows(poses, device, what="poses"):

@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, flag, to_numpy, whole_number
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.model.model import Model
 from warp_abtree.query.broad_phase import BroadPhase
 from warp_abtree.query.request import given_options, refuse_options
@@ -17,7 +18,7 @@ from warp_abtree.state.batch import Batch, check_pairs, exclusion_keys
 from warp_abtree.state.lod_update import LodUpdate
 
 
-class Scene:
+class Scene(DeviceMemory):
     """Many objects, many worlds, one device.
 
     Without objects `broad_phase` finds no pairs; `set_poses`, `set_lods` and `intersect` raise ValueError.
@@ -313,7 +314,8 @@ class Scene:
 
         Raises:
             TypeError: An option with another name.
-            ValueError: Bad pairs, a bad distance, an unknown option, or a scene without objects.
+            ValueError: Bad pairs, a bad distance, an unknown option, a scene without objects; or signed and no object
+                of the given pairs, else of the scene, is a solid.
         """
         check_device(self.device, "Scene.intersect (Query.launch can)")
         contact_dtypes(contact_dtype)

@@ -16,6 +16,7 @@ from warp_abtree.checks.device_lock import device_lock
 from warp_abtree.kernels.io.sweep import NONE_REFUSED, pose_placer, report_chunk_kernel
 from warp_abtree.query.distance import DistanceQuery, check_asked, check_beyond, check_flags
 from warp_abtree.query.narrow_phase import Query
+from warp_abtree.query.request import refuse_signed
 from warp_abtree.scene.first_contact import FirstContactQuery, check_asked_contacts
 from warp_abtree.scene.poses import QUATERNION_TOLERANCE, RIGID_TOLERANCE
 from warp_abtree.scene.scene import Scene
@@ -132,8 +133,7 @@ class _ChunkQuery:
         """Return the slots of poses of one type, made at the first use."""
         kind = poses.scalar, poses.width
         if kind not in self._slots:
-            count = 2 if self.output in ANSWERS else 1
-            made = [_Slot(self.device, self.room, self.output, *kind) for _ in range(count)]
+            made = [_Slot(self.device, self.room, self.output, *kind) for _ in range(1 + (self.output in ANSWERS))]
             if self.device.is_cuda:
                 # Another stream may touch what was allocated on this one only once it is there.
                 wp.synchronize_device(self.device)
@@ -316,9 +316,8 @@ def sweep(
     """Test one pair of models at many poses of B in A's frame. Waits for the device, 1 to 3 times a chunk of 65,536.
 
     Poses are checked on the device; on CUDA transfers overlap with launches, except for "faces". The arrays of the last
-    four pairs of models, LODs and devices stay on the device for the next call as long as both models live: models and
-    tree states, some 190 bytes a face, and 0.5 KB for each of at most 74,752 poses in chunks of three sizes. Whatever
-    the number of poses, a call needs no more memory besides its answer. Calls of several threads take turns on a GPU.
+    four pairs of models, LODs and devices stay on the device for the next call as long as both models live: some 190
+    bytes a face, and 0.5 KB for each of at most 74,752 poses. Calls of several threads take turns on a GPU.
 
     Args:
         model_a, model_b: `Model`; may be the same.
@@ -345,7 +344,7 @@ def sweep(
 
     Raises:
         TypeError: model_a or model_b is no Model; an option has another name.
-        ValueError: Bad poses, the first of which is named, a LOD out of range, an unknown option or device.
+        ValueError: Bad poses, the first named, a LOD out of range, an unknown option or device, signed without a solid.
         RuntimeError: A graph is being captured.
     """
     (check_asked_contacts if output == "first_contact" else check_asked)(output, precision, options)
@@ -358,14 +357,14 @@ def sweep(
         solids = solid if isinstance(solid, tuple | list) and len(solid) == 2 else (solid, solid)
         for model, lod, is_solid in zip((model_a, model_b), (lod_a, lod_b), solids):
             pair.add(model, lod=lod, solid=is_solid)
+        refuse_signed(options.get("signed", False), any(pair.object_solid))
         if options.get("originals"):
             pair.set_lods([model.lod_max for model in (model_a, model_b)])
         return _sweep(pair, poses, (output, precision), options)
 
 
 def _sweep(pair, poses, asked, options):
-    output, precision = asked
-    within = options.get("within")
+    (output, precision), within = asked, options.get("within")
     if output == "first_contact":
         precision = "linear" if options.pop("linear", False) else "rigid"
     if len(poses) == 0:

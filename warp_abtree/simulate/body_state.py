@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import broadcast_rows, finite_array, first_line
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.quaternions import quaternions_of
 from warp_abtree.kernels.base.arrays import ObjectPool
 from warp_abtree.kernels.bodies import bodies as kernels
@@ -123,7 +124,7 @@ def _finite_rows(values, what, count):
     return values
 
 
-class RigidBodies:
+class RigidBodies(DeviceMemory):
     """State of the bodies of a scene; `Dynamics` documents the arguments.
 
     Attributes:

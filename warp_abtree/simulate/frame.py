@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import positive
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.lod import frame_summary as words
 from warp_abtree.lod.controllers import Controller, Feedback
@@ -52,7 +53,7 @@ def load_update_kernels(scene: Scene):
         copy.set_lods(lods)
 
 
-class Frame:
+class Frame(DeviceMemory):
     """Runs a scene frame by frame and keeps a `FrameRow` on each.
 
     On a GPU, and without a clock of its own, a frame is the replay of one graph, captured at the second frame and

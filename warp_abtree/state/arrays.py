@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.kernels.base.arrays import ModelPool, ObjectPool, StatePool
 from warp_abtree.kernels.base.nodes import clear_node_kernel
 from warp_abtree.kernels.base.poses import SLAB_DEPTH
@@ -21,7 +22,7 @@ def _upload(values, dtype, device):
     return wp.array(values, dtype=dtype, device=device)
 
 
-class ModelArrays:
+class ModelArrays(DeviceMemory):
     """Static arrays of several models, concatenated on one device.
 
     Attributes:
@@ -112,7 +113,7 @@ class Slot:
     face_start: int
 
 
-class StateArrays:
+class StateArrays(DeviceMemory):
     """A pool of tree states that grows; a freed state is taken again by the same model.
 
     Attributes:
@@ -259,7 +260,7 @@ class StateArrays:
         wp.launch(clear_node_kernel, self.node_room, [0, self.pool], device=self.device)
 
 
-class ObjectArrays:
+class ObjectArrays(DeviceMemory):
     """Posed objects of a scene on one device.
 
     Attributes:

@@ -8,13 +8,14 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.checks.arguments import check_device, to_numpy
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.state.arrays import ModelArrays, ObjectArrays, StateArrays
 from warp_abtree.state.generation import Generation
 from warp_abtree.state.lod_update import LodUpdate, replace_states, set_object_lods
 from warp_abtree.state.solids import SolidArrays
 
 
-class Batch:
+class Batch(DeviceMemory):
     """What queries are about: the objects of a device, the tree states that they stand at, and their models.
 
     `Scene.batch()` returns that of a scene, which makes another when objects are added; `Pipeline` and `sweep` make
@@ -76,6 +77,12 @@ class Batch:
     def object_count(self) -> int:
         """How many objects there are."""
         return len(self.object_model)
+
+    def has_solid(self, pairs=None) -> bool:
+        """Return whether any object is a solid, of pairs (p, 2) any that they name where there are some."""
+        if self.solids is None:
+            return False
+        return pairs is None or len(pairs) == 0 or bool(self.solids.is_solid[pairs].any())
 
     @property
     def pools(self) -> list:

@@ -12,7 +12,8 @@ the LODs of the objects, it says nothing of the originals. Of an object pair tha
 * distance and bracket are 0, both points are a corner of the component that is inside, and point_faces names its face,
   beside -1 for the solid.
 
-A cavity is outside: what lies in it intersects nothing. So is what two overlapping parts of one mesh share.
+A cavity is outside: what lies in it intersects nothing. So is what two overlapping parts of one mesh share, and what
+faces enclose that are listed an even number of times: adding such a solid warns.
 """
 
 import numpy as np

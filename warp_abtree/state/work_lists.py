@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.checks.regime import current_regime
 from warp_abtree.kernels.base.arrays import LEVEL_MAX
 from warp_abtree.kernels.update import block_update, mark, refine, refit
@@ -86,7 +87,7 @@ def full_refit_fraction(device) -> float:
 
 
 @dataclass
-class WorkLists:
+class WorkLists(DeviceMemory):
     """What the kernels of an update of many tree states work through, and the most that there can be of it.
 
     Attributes:

@@ -8,7 +8,7 @@ import argparse
 import os
 import signal
 import sys
-import threading
+import warnings
 from pathlib import Path
 
 import warp as wp
@@ -18,6 +18,7 @@ from warp_abtree.app.cli.arguments import PROGRAM, STATUS, Parser, PrintCompleti
 from warp_abtree.app.cli.progress import Progress, compile_notice, start_warp
 from warp_abtree.app.pictures import command as picture_command
 from warp_abtree.app.viewer import command as view_command
+from warp_abtree.checks.signals import handle_signals
 from warp_abtree.checks.version import __version__
 
 
@@ -74,19 +75,6 @@ def terminate(number, frame):
     raise Terminated(128 + number)
 
 
-def handle_signals():
-    """Let SIGINT and SIGTERM stop the command, although the process may have inherited that they are ignored.
-
-    Shells start background jobs with SIGINT ignored.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        return  # only the main thread may, and receives signals
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, terminate)
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
-
-
 def main(argv=None) -> int:
     """Run the command line and return its exit status.
 
@@ -96,7 +84,8 @@ def main(argv=None) -> int:
     progress = Progress()
     try:
         if argv is None:
-            handle_signals()
+            handle_signals(signal.default_int_handler, terminate)
+            warnings.formatwarning = lambda message, *_, **__: f"{PROGRAM}: {message}\n"
         argv = list(sys.argv[1:] if argv is None else argv)
         if argv[:1] == ["bench"] and argv[1:] not in (["-h"], ["--help"]):
             start_warp()

@@ -8,9 +8,9 @@ import numpy as np
 
 from warp_abtree.app.cli.arguments import MESHES, PROGRAM, Parser, positive
 from warp_abtree.app.cli.report import check_output, print_result
+from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.mesh import describe_mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model
-from warp_abtree.model.obj import split_file_name
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.lod_request import resolve_lod
 
@@ -18,6 +18,7 @@ INFO_SUMMARY = "say what a mesh or a built model holds and what is odd about it"
 INFO_EXAMPLES = ("warp:bunny --json", "bunny.npz")
 BUILD_SUMMARY = "build models from meshes and save them"
 BUILD_EXAMPLES = ("warp:bunny bunny.npz --base-faces 100", "warp:bear warp:rocks .")
+KEPT_APART = "scene_from_file in Python, or a scene file with a model of each, keeps them apart"
 LISTED_FRACTIONS = (0.5, 0.2, 0.1, 0.05, 0.01)  # of the faces, at which `build` prints the errors
 
 
@@ -27,8 +28,19 @@ def is_model(source) -> bool:
 
 
 def load_model(source, progress) -> Model:
-    """Open a built model, or build one of a mesh."""
-    return Model.open(source) if is_model(source) else Model.load(source, progress=progress)
+    """Open a built model, or build one of a mesh; say on stderr if it is of several parts."""
+    model = Model.open(source) if is_model(source) else Model.load(source, progress=progress)
+    tell_joined(source, model, progress)
+    return model
+
+
+def tell_joined(source, mesh, progress):
+    """Say on stderr that a `Mesh` or a `Model` of a file is one mesh of several parts."""
+    if mesh.parts > 1:
+        if progress is not None:
+            progress.close()
+        told = f"{source}: its {mesh.parts} parts are joined into one mesh, and not asked of one another"
+        print(f"{PROGRAM}: {told}; {KEPT_APART}", file=sys.stderr)
 
 
 def lod_at(option, model, request) -> int:
@@ -52,7 +64,12 @@ def add_info_arguments(sub: Parser):
 def info(options, progress):
     """Print what a mesh file or a built model holds."""
     Scene(device=options.device)
-    found = _describe_model(options.mesh) if is_model(options.mesh) else describe_mesh(load_mesh(options.mesh))
+    if is_model(options.mesh):
+        found = _describe_model(options.mesh)
+    else:
+        mesh = load_mesh(options.mesh)
+        tell_joined(options.mesh, mesh, progress)
+        found = describe_mesh(mesh)
     print_result(found, options.json)
 
 
@@ -60,7 +77,7 @@ def _describe_model(path) -> dict:
     model = Model.open(path)
     forest = model.progressive
     found = describe_mesh(mesh_from_arrays(forest.vertex_pos[: model.vertex_count], forest.face_vertex, model.name))
-    for key in ("file_vertices", "unreferenced_vertices", "welded_vertices"):
+    for key in ("parts", "file_vertices", "unreferenced_vertices", "welded_vertices"):
         del found[key]  # a model does not keep them
     return found | {"lods": model.lod_max + 1, "base_faces": active_count(model, 0)}
 
@@ -70,7 +87,9 @@ def add_build_arguments(sub: Parser):
     sub.add_file("mesh", metavar="MESH", nargs="+", help=f"{MESHES}; one after another")
     sub.add_file("out", metavar="OUT", type=Path, help="file to write (.npz), or a folder for NAME.npz of each mesh")
     sub.add_argument("--base-faces", type=positive, default=10, metavar="N", help="faces of the coarsest LOD (10)")
-    sub.add_argument("--orient", action="store_true", help="turn faces that disagree with neighbours or face inwards")
+    sub.add_argument(
+        "--orient", action="store_true", help="turn faces that disagree with neighbours or point into the solid"
+    )
 
 
 def build(options, progress):
@@ -111,6 +130,7 @@ def _build_file(mesh, file, options, progress) -> dict:
     model = Model.load(mesh, options.base_faces, progress, cache=False, orient=options.orient, certify=True)
     seconds = time.perf_counter() - begin
     progress.close()
+    tell_joined(mesh, model, progress)
     model.save(file)
     rows = []
     for fraction in LISTED_FRACTIONS:

@@ -6,14 +6,19 @@ import sys
 import tempfile
 import threading
 import time
+from datetime import timedelta
 
 import warp as wp
 
+ESTIMATE_DELAY = 5.0  # seconds of a stage before its first estimate
+YEAR = 366 * 86400  # seconds
 NOTICE_DELAY = 1.5  # seconds of compiling before a word about it
 
 
 class Progress:
-    """On a terminal a bar of rich, where that is installed; otherwise a line a stage. Short stages are not shown.
+    """On a terminal a bar of rich, where that is installed; otherwise lines. Short stages are not shown.
+
+    A stage begins with a line; a long one says how much is done and what is left, each time after twice as long.
 
     Args:
         stream: Where to write; None for sys.stderr.
@@ -24,7 +29,7 @@ class Progress:
         self.stream = sys.stderr if stream is None else stream
         self.delay, self.clock = delay, clock
         self.stage, self.began, self.shown = None, 0.0, None
-        self._bar = None
+        self._bar, self._told = None, ESTIMATE_DELAY / 2
 
     def __call__(self, stage, done, total):
         """Show how much of a stage is done."""
@@ -38,18 +43,30 @@ class Progress:
             self._bar = _start_bar(self.stream, stage) if self.stream.isatty() else None
             if self._bar is None:
                 print(f"{stage} ...", file=self.stream, flush=True)
-        elif self._bar is None or (now - self.shown <= 0.05 and done < total):
+        elif self._bar is None:
+            self._estimate(done, total, now - self.began)
+            return
+        elif now - self.shown <= 0.05 and done < total:
             return
         self.shown = now
         if self._bar is not None:
             bar, task = self._bar
             bar.update(task, completed=done, total=max(total, 1), refresh=True)
 
+    def _estimate(self, done, total, spent):
+        """Say how much is done, if that was not said for as long as the stage had taken then."""
+        if 0 < done < total and spent >= 2 * self._told:
+            self._told = spent
+            left = round(spent * (total - done) / done)
+            about = str(timedelta(seconds=left)) if left < YEAR else "years"
+            print(f"{self.stage}: {done:,} of {total:,}, about {about} left", file=self.stream, flush=True)
+
     def close(self):
         """End the bar of the last stage."""
         if self._bar is not None:
             self._bar[0].stop()
         self._bar = self.stage = self.shown = None
+        self._told = ESTIMATE_DELAY / 2
 
 
 def _start_bar(stream, stage):

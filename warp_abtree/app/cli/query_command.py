@@ -8,9 +8,9 @@ import numpy as np
 
 from warp_abtree.app.cli.arguments import LOD_HELP, MESHES, PRECISIONS, Parser
 from warp_abtree.app.cli.model_commands import active_count, load_model, lod_at
-from warp_abtree.app.cli.report import check_output, print_result
+from warp_abtree.app.cli.report import check_output, print_result, show_number
 from warp_abtree.checks.atomic_write import atomic_write
-from warp_abtree.model.obj import MeshError
+from warp_abtree.model.files.found import MeshError
 from warp_abtree.scene.scene import Scene
 
 SUMMARY = "intersect two meshes, A at the origin and B at a pose"
@@ -80,6 +80,9 @@ def query(options, progress):
         result["faces"] = found.faces[:, 1:]
     if found.distance is not None:
         result |= {name: getattr(found, name)[0] for name in ("distance", "bracket", "points", "point_faces")}
+        if not options.json and np.isinf(result["distance"]):
+            result["distance"] = f"farther than {show_number(result.pop('bracket')[0])}"
+            del result["points"], result["point_faces"]
     if found.contacts is not None:
         result |= {"contacts": _flat_contacts(found.contacts), "pair_contacts": _named(found.pair_contacts[0])}
     if options.record:

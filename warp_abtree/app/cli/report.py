@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_abtree.checks.atomic_write import is_special
+
 LISTED = 20  # rows of a table that are printed
 
 
@@ -46,13 +48,24 @@ def _shown(value) -> str:
     """Return a value as people read it."""
     if isinstance(value, dict):
         return ", ".join(f"{key.replace('_', ' ')} {_shown(entry)}" for key, entry in value.items())
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f" and np.isnan(value).all():
+        return "none"
     if isinstance(value, list | tuple | np.ndarray):
         return " ".join(map(_shown, value))
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     if isinstance(value, float | np.floating):
-        return f"{value + 0.0:.6g}"  # + 0.0: no minus before a zero
+        return show_number(value)
     return f"{value:,}" if isinstance(value, int | np.integer) else "" if value is None else str(value)
+
+
+def show_number(value, digits=6) -> str:
+    """Return a number of so many digits, or more where it is large: six keep two after the point, four none."""
+    value = float(value) + 0.0  # no minus before a zero
+    if math.isnan(value):
+        return "none"
+    whole = len(f"{abs(value):.0f}") if abs(value) < 1e15 else 0
+    return f"{value:.{max(digits, whole + digits - 4)}g}"
 
 
 def print_table(rows):
@@ -73,9 +86,13 @@ def check_output(path, suffixes, inputs=(), make=False):
         raise ValueError(f"{path}: the name must end in {' or '.join(suffixes)}")
     folder = path.parent.parent if make and not path.parent.exists() else path.parent
     if not folder.is_dir():
-        raise ValueError(f"{path}: there is no folder {folder}")
+        raise ValueError(
+            f"{path}: {folder} is no folder" if folder.exists() else f"{path}: there is no folder {folder}"
+        )
     if path.is_dir():
         raise ValueError(f"{path}: is a folder")
+    if is_special(path):
+        raise ValueError(f"{path}: is neither a file nor a folder")
     if not all(os.access(place, os.W_OK) for place in (folder, path) if place.exists()):
         raise ValueError(f"{path}: cannot be written")
     if path.exists() and any(Path(name).exists() and path.samefile(name) for name in inputs):

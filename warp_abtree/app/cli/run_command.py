@@ -2,6 +2,7 @@
 
 import gc
 import importlib.util
+import os
 import sys
 from pathlib import Path
 
@@ -24,6 +25,7 @@ EXAMPLES = (
     "rain --budget 8ms --controller paper --plot plots",
 )
 PLOT_NAME = "frames.png"
+PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg", ".webp", ".gif")
 
 
 def add_arguments(sub: Parser):
@@ -92,6 +94,10 @@ def _check(options):
         check_output(options.picture, [".png"])
         import_pyvista("--picture")
     if options.plot:
+        if os.path.lexists(options.plot) and not options.plot.is_dir():
+            raise ValueError(f"--plot: {options.plot} is no folder, in which {PLOT_NAME} is drawn")
+        if options.plot.suffix.lower() in PICTURES and not options.plot.exists():
+            raise ValueError(f"--plot: {options.plot} names a picture; give a folder, in which {PLOT_NAME} is drawn")
         check_output(options.plot / PLOT_NAME, [".png"], make=True)
         if importlib.util.find_spec("matplotlib") is None:
             raise ValueError("--plot needs Matplotlib: pip install matplotlib")

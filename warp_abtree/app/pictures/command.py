@@ -21,6 +21,9 @@ EXAMPLES = (
     "bunny.npz --lod tol:0.01 --eye 1 0.3 0.5 --out bunny.png",
 )
 
+# Bytes of an animation, all of whose pictures are held until it is written: in all, and of the meshes of a picture.
+MEMORY_LIMIT, GEOMETRY = 2**32, 2**20
+
 
 def add_arguments(sub: Parser):
     """Add the arguments of the command to its parser."""
@@ -74,6 +77,10 @@ def _check(options):
         raise ValueError(f"--frames: {options.frames}, every {options.every}, is less than two to draw")
     if not 50 <= options.size <= 8000:
         raise ValueError(f"--size: {options.size} is outside 50 .. 8000")
+    count = 0 if options.frames is None else -(-options.frames // options.every)
+    if count * (3 * options.size**2 + GEOMETRY) > MEMORY_LIMIT:
+        told = f"{count:,} pictures of {options.size} x {options.size} pixels take more than {MEMORY_LIMIT >> 30} GiB"
+        raise ValueError(f"--frames: {told}; draw fewer by --every, or smaller ones by --size")
 
 
 def run_frames(playback, frames: range, output, progress=None):

@@ -7,6 +7,10 @@ from pathlib import Path
 from warp_abtree.app.toml.errors import SceneError, fail
 from warp_abtree.app.toml.folder import scene_names
 
+SIZE_LIMIT = 2**24  # bytes of a file
+DEPTH_LIMIT = 16  # of tables and lists in one another
+DOT_LIMIT = 1000  # in a key: the parser takes the square of their number
+NO_SCENE = "is no scene file, which is TOML (.toml); info, query, view and picture take meshes and models"
 TYPES = {
     "object": "a table",
     "array": "a list",
@@ -36,16 +40,17 @@ def read_tables(path: Path, text: str | None = None):
     from warp_abtree.app.toml import tables
 
     try:
-        text = path.read_bytes().decode() if text is None else text
-        tree = msgspec.toml.decode(text)
+        tree = _parse(path, msgspec, text)
+    except ValueError as error:  # bytes that are no UTF-8 among them
+        if text is None and path.suffix.lower() not in ("", ".toml"):
+            raise SceneError(f"{path}: {NO_SCENE}") from None
+        raise error if isinstance(error, SceneError) else SceneError(f"{path}: not valid TOML: {error}") from None
     except FileNotFoundError as error:
         known = ", ".join(scene_names())
         raise SceneError(f"{path}: {error.strerror}; scenes that come with the package: {known}") from None
     except OSError as error:
         raise SceneError(f"{path}: {error.strerror or error}") from None
-    except (ValueError, RecursionError) as error:  # bytes that are no UTF-8 among them
-        raise SceneError(f"{path}: not valid TOML: {error}") from None
-    _check_finite(path, "", tree)
+    _check_values(path, "", tree)
 
     def convert(table, kind, where=""):
         try:
@@ -60,16 +65,50 @@ def read_tables(path: Path, text: str | None = None):
     return msgspec.structs.replace(scene, models=models)
 
 
-def _check_finite(path, key, value):
-    """Refuse infinities and NaN anywhere, which TOML can write."""
+def _parse(path, msgspec, text: str | None):
+    """Return the TOML of a file, or of `text` in its place, as dictionaries and lists."""
+    if text is None:
+        with open(path, "rb") as file:
+            text = file.read(SIZE_LIMIT + 1).decode()
+    _check_text(path, text)
+    try:
+        return msgspec.toml.decode(text)
+    except RecursionError:
+        fail(path, f"line {_deepest_line(text)}", f"nested more than {DEPTH_LIMIT} deep")
+
+
+def _check_text(path, text: str):
+    """Refuse what the parser would take too long for."""
+    if len(text) > SIZE_LIMIT:
+        fail(path, "the file", f"has more than {SIZE_LIMIT:,} bytes")
+    for number, line in enumerate(text.splitlines(), start=1):
+        parts = line.partition("#")[0].replace(",", "=").split("=")
+        if max(part.count(".") for part in parts) > DOT_LIMIT:
+            fail(path, f"line {number}", f"a key nested more than {DEPTH_LIMIT} deep")
+
+
+def _deepest_line(text: str) -> int:
+    """Return the line at which the most brackets are open."""
+    line, depth, deepest = 1, 0, (0, 1)
+    for found in re.finditer(r"[\[{\]}\n]", text):
+        line += found[0] == "\n"
+        depth += (found[0] in "[{") - (found[0] in "]}")
+        deepest = max(deepest, (depth, -line))
+    return abs(deepest[1])
+
+
+def _check_values(path, key, value, depth=0):
+    """Refuse infinities and NaN anywhere, which TOML can write, and what is nested deeper than any key needs."""
+    if depth > DEPTH_LIMIT:
+        fail(path, key, f"nested more than {DEPTH_LIMIT} deep")
     if isinstance(value, float) and not math.isfinite(value):
         fail(path, key, f"{value} is not a finite number")
     elif isinstance(value, dict):
         for name, entry in value.items():
-            _check_finite(path, f"{key}.{name}" if key else name, entry)
+            _check_values(path, f"{key}.{name}" if key else name, entry, depth + 1)
     elif isinstance(value, list):
         for i, entry in enumerate(value):
-            _check_finite(path, f"{key}[{i}]", entry)
+            _check_values(path, f"{key}[{i}]", entry, depth + 1)
 
 
 def _explain(error: str, where: str, choices: dict) -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,31 @@ import numpy as np
 import trimesh
 
 from warp_abtree.app.toml.errors import fail
-from warp_abtree.app.toml.shapes import GENERATED
+from warp_abtree.app.toml.shapes import FACE_BOUNDS, GENERATED
 from warp_abtree.model.mesh import Mesh, load_mesh, mesh_from_arrays
 from warp_abtree.model.model import Model
+
+FACE_LIMIT = 2**22  # of all models of a file that are generated; a face takes 1 KB while a model is built
+
+
+def check_faces(path: Path, tables: dict):
+    """Refuse models whose faces would exhaust the memory, before any is made.
+
+    Args:
+        tables: `ModelTable`s by name.
+
+    Raises:
+        SceneError: Shapes, and meshes that are brought to a number of faces, have more than FACE_LIMIT together.
+    """
+    total = 0
+    for name, table in tables.items():
+        shape = table.__struct_config__.tag
+        made = 0 if shape is None else FACE_BOUNDS[shape](**table.parameters())
+        made = max(made, table.faces or 0)
+        total += made
+        if total > FACE_LIMIT:
+            among = "" if total == made else f", {total:,} with those of the models before"
+            fail(path, f"models.{name}", f"asks for {made:,} faces{among}; a file may generate {FACE_LIMIT:,}")
 
 
 def build_model(path: Path, name: str, table, progress=None) -> Model:
@@ -21,6 +44,9 @@ def build_model(path: Path, name: str, table, progress=None) -> Model:
         SceneError: A mesh is missing or bad, or its coordinates leave the range of numbers.
     """
     mesh = _load(path, name, table)
+    if mesh.parts > 1:
+        about = f"the {mesh.parts} parts of {table.mesh} are joined into one mesh"
+        warnings.warn(f"{path}: models.{name}: {about}; scene_from_file makes an object of each", stacklevel=2)
     try:
         lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         vertices = mesh.vertices - (lower / 2 + upper / 2) if table.centre else mesh.vertices
@@ -38,15 +64,17 @@ def build_model(path: Path, name: str, table, progress=None) -> Model:
 def _load(path, name, table) -> Mesh:
     """Return the mesh of a file, or of the shape that stands in for it."""
     names = [] if table.mesh is None else [table.mesh] if isinstance(table.mesh, str) else table.mesh
-    shape = table.__struct_config__.tag
-    source = _find_source(names, path.parent, shape is not None)
+    shape, source = table.__struct_config__.tag, None
     try:
+        source = _find_source(names, path.parent, shape is not None)
         if source is not None:
             chosen = len(names) + (shape is not None) > 1
             return load_mesh(source, name=f"{name} ({getattr(source, 'name', source)})" if chosen else None)
         make: Any = GENERATED.get(shape) or getattr(trimesh.creation, shape)
         title = f"{name} ({'an' if shape[0] in 'aeiou' else 'a'} {shape})" if names else name
         return load_mesh(make(**table.parameters()), name=title)
+    except OSError as error:  # a name that is too long
+        fail(path, f"models.{name}.mesh", error.strerror)
     except (ValueError, TypeError) as error:
         fail(path, f"models.{name}.{'shape' if source is None else 'mesh'}", error)
 
@@ -67,6 +95,9 @@ def _find_source(names, folder, has_shape):
 def _bring_to(mesh, faces, progress):
     """Return a mesh of that many faces, or one less: smoothed by Loop subdivision if need be, then collapsed."""
     rounds = math.ceil(math.log(faces / len(mesh.faces), 4)) if len(mesh.faces) < faces else 0
+    if rounds and len(mesh.faces) * 4**rounds > FACE_LIMIT:
+        most = len(mesh.faces) * 4 ** math.floor(math.log(FACE_LIMIT / len(mesh.faces), 4))
+        raise ValueError(f"faces: Loop subdivision of {len(mesh.faces):,} faces reaches {most:,} at most")
     vertices = mesh.vertices
     corners = np.delete(mesh.faces, mesh.dropped_faces, axis=0)
     if rounds:

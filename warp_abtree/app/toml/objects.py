@@ -8,7 +8,7 @@ import numpy as np
 
 from warp_abtree.app.toml.errors import SceneError, fail
 
-OBJECT_LIMIT = 1_000_000  # of one entry of [[objects]]
+OBJECT_LIMIT = 1_000_000  # of a file; an object takes 1 KB
 
 
 def unit(vector) -> np.ndarray:
@@ -28,17 +28,17 @@ class ObjectGroup:
     kinematic: np.ndarray  # whether it moves as told among rigid bodies, bool (n,)
 
 
-def make_group(path, key: str, table, dynamics, rng) -> ObjectGroup:
+def make_group(path, key: str, table, dynamics, rng, room: int) -> ObjectGroup:
     """Lay out the copies of the entry `key`, an `ObjectTable`; `rng` draws what is random.
 
     Raises:
-        SceneError: Too many copies, or keys of rigid bodies where there are none.
+        SceneError: More copies than there is room for, or keys of rigid bodies where there are none.
     """
     _check_dynamics(path, key, table, dynamics)
     layer = 1 if table.grid is None else math.prod(n for n in table.grid.size if n)
-    if max(table.count or 1, layer) * table.worlds > OBJECT_LIMIT:
-        cause = "worlds" if table.worlds > 1 else "grid.size" if layer > 1 else "count"
-        fail(path, f"{key}.{cause}", f"more than {OBJECT_LIMIT} objects")
+    if max(table.count or 1, layer) * table.worlds > room:
+        cause = "worlds" if table.worlds > 1 else "grid.size" if layer > 1 else "count" if table.count else "model"
+        fail(path, f"{key}.{cause}", f"more than {OBJECT_LIMIT:,} objects in all")
     offsets = _copy_offsets(table)
     count = len(offsets) * table.worlds
     motion = {
@@ -124,10 +124,11 @@ def make_groups(path, tables, dynamics, seed: int, objects: int | None = None) -
     """
 
     def make(tables):
-        return [
-            make_group(path, f"objects[{i}]", table, dynamics, np.random.default_rng([seed, i]))
-            for i, table in enumerate(tables)
-        ]
+        made, room = [], OBJECT_LIMIT
+        for i, table in enumerate(tables):
+            made.append(make_group(path, f"objects[{i}]", table, dynamics, np.random.default_rng([seed, i]), room))
+            room -= len(made[-1].world)
+        return made
 
     groups = make(tables)
     if objects is None:

@@ -14,15 +14,18 @@ from warp_abtree.app.toml.control import LodControl, make_control
 from warp_abtree.app.toml.decode import read_tables
 from warp_abtree.app.toml.errors import SceneError, fail
 from warp_abtree.app.toml.folder import find_scene
-from warp_abtree.app.toml.models import build_model
+from warp_abtree.app.toml.models import build_model, check_faces
 from warp_abtree.app.toml.objects import make_groups
 from warp_abtree.checks.arguments import whole_number
-from warp_abtree.model.obj import MeshError
+from warp_abtree.model.files.found import MeshError
 from warp_abtree.scene.scene import Scene
 from warp_abtree.simulate.frame import Frame
 from warp_abtree.simulate.lod_request import LodSweep, resolve_lod
 from warp_abtree.simulate.motion import Kinematic
 from warp_abtree.simulate.rigid_bodies import Dynamics
+
+STATE_LIMIT = 2**25  # faces of models times the LODs that their objects begin at; one takes 130 bytes
+MOTION_LIMIT = 2**27  # objects times frames of the window of a controller; one takes 8 bytes
 
 
 @dataclass(eq=False)
@@ -135,6 +138,7 @@ def load_scene(path: str | os.PathLike, device=None, progress=None, objects=None
         motion = Kinematic(**{key: np.concatenate([group.motion[key] for group in groups]) for key in groups[0].motion})
     except ValueError as error:  # a sum of finite numbers that is not
         fail(path, "objects", error)
+    _check_memory(path, tables, len(motion.position))
     models = {name: build_model(path, name, table, progress) for name, table in tables.models.items()}
     owners = _add_objects(path, scene, groups, models)
     loaded = SceneFile(
@@ -181,9 +185,18 @@ def _check_names(path, tables):
         fail(path, "lod", "LODs are swept, or chosen by a controller, not both")
 
 
+def _check_memory(path, tables, count):
+    """Refuse what would exhaust the memory although each number is within its own limits."""
+    check_faces(path, tables.models)
+    window = 1 if tables.lod is None else tables.lod.window or 1
+    if window * count > MOTION_LIMIT:
+        fail(path, "lod.window", f"{window:,} frames of {count:,} objects are more than {MOTION_LIMIT:,} together")
+
+
 def _add_objects(path, scene, groups, models):
     """Add every object of every group; return the names of the group and of the model of each."""
-    owners = []
+    owners, states = [], set()
+    room = STATE_LIMIT + sum(model.face_count for model in models.values())  # whatever the models, one LOD each
     for group in groups:
         table = group.table
         poses = np.concatenate([group.motion["position"], group.motion["rotation"]], axis=1)
@@ -193,6 +206,12 @@ def _add_objects(path, scene, groups, models):
             found = {(k, at): resolve_lod(models[names[k]], lods[at]) for k, at in dict.fromkeys(turns)}
         except ValueError as error:
             fail(path, f"{group.key}.lod", error)
+        asked = {(names[k], lod) for (k, _), lod in found.items()} - states
+        states |= asked
+        room -= sum(models[name].face_count for name, _ in asked)
+        if room < 0:
+            about = f"{len(states):,} LODs of {len(models):,} models have more than {STATE_LIMIT:,} faces together"
+            fail(path, f"{group.key}.lod", about)
         try:
             scene.add_many(
                 [models[names[k]] for k, _ in turns],

@@ -1,4 +1,4 @@
-"""Shapes of scene files that trimesh does not generate."""
+"""Shapes of scene files that trimesh does not generate, and bounds of the faces of all of them."""
 
 import numpy as np
 import trimesh
@@ -97,3 +97,20 @@ def revolve(profile, sections):
 
 
 GENERATED = {"knot": knot, "terrain": terrain, "bolt": bolt, "nut": nut, "revolve": revolve}
+
+# At least the faces that a shape has with its parameters, those of its module by default.
+FACE_BOUNDS = {
+    "box": lambda **_: 12,
+    "icosphere": lambda subdivisions=3, **_: 20 * 4**subdivisions,
+    "uv_sphere": lambda count=(32, 32), **_: 4 * (count[0] + 2) * (count[1] + 2),
+    "cylinder": lambda sections=32, **_: 4 * sections,
+    "cone": lambda sections=32, **_: 2 * sections,
+    "capsule": lambda count=(32, 64), **_: 2 * (count[0] + 4) * (count[1] + 4),
+    "annulus": lambda sections=32, **_: 8 * sections,
+    "torus": lambda major_sections=32, minor_sections=32, **_: 2 * major_sections * minor_sections,
+    "knot": lambda sections=(0, 0), **_: 2 * sections[0] * sections[1],
+    "terrain": lambda cells=(0, 0), **_: 2 * cells[0] * cells[1],
+    "bolt": lambda sections=(0, 0), **_: 2 * sections[0] * (sections[1] + 2),
+    "nut": lambda sections=(0, 0), **_: 2 * sections[0] * (sections[1] + 2),
+    "revolve": lambda profile=(), sections=0, **_: 2 * len(profile) * sections,
+}

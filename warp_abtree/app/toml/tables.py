@@ -35,6 +35,7 @@ Copies = Annotated[int, Meta(ge=1, le=OBJECT_LIMIT)]
 TerrainCells = Annotated[int, Meta(ge=1, le=4096)]
 Sections = Annotated[int, Meta(ge=3, le=10_000)]
 NonEmpty = Annotated[list[T], Meta(min_length=1)]
+Panels = Annotated[list[Fraction], Meta(min_length=1, max_length=64)]
 Vector = tuple[float, float, float]
 ORIGIN = (0.0, 0.0, 0.0)
 
@@ -304,7 +305,7 @@ class CameraTable(Table):
         for i, time in enumerate(times):
             if i and not time > times[i - 1]:
                 raise ValueError(f"keys[{i}].time: {time} is not after the one before, {times[i - 1]}")
-            self(time)
+            self.look(self.keys[i].eye, self.keys[i].target)
 
     def __call__(self, time: float) -> Camera:
         times = [key.time for key in self.keys]
@@ -314,6 +315,10 @@ class CameraTable(Table):
             [np.interp(time, times, line) for line in zip(*points)]
             for points in ([key.eye for key in self.keys], [key.target for key in self.keys])
         )
+        return self.look(eye, target)
+
+    def look(self, eye, target) -> Camera:
+        """Return the camera at a point that looks at another."""
         angle = math.radians(self.field_of_view)
         return Camera.look_at(eye, target, unit(self.up), field_of_view=angle, size=self.size, far=self.far)
 
@@ -333,7 +338,7 @@ class PictureTable(Table):
     up: Vector = (0.0, 1.0, 0.0)
     world: Annotated[int, Meta(ge=0, le=2**31 - 1)] = 0  # the world drawn
     time: float | None = None  # the last frame by default, which rigid bodies always show
-    lods: Fraction | NonEmpty[Fraction] | None = None  # of swept objects, a panel each; by default both ends
+    lods: Fraction | Panels | None = None  # of swept objects, a panel each; by default both ends
 
     def __post_init__(self):
         check_direction("eye", self.eye)

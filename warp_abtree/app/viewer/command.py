@@ -10,6 +10,7 @@ import socket
 from warp_abtree.app.cli.arguments import Parser, milliseconds
 from warp_abtree.app.open_playback import add_playback_arguments, open_playback
 from warp_abtree.app.playback import Playback
+from warp_abtree.app.viewer.guard import refuse_foreign
 
 HOST, PORT = "127.0.0.1", 8080
 SUMMARY = "look at a scene or meshes in the browser"
@@ -62,10 +63,10 @@ def check_port(host, port):
 
 @contextlib.contextmanager
 def serve(host="127.0.0.1", port=0):
-    """Give a viser server, stopped with its threads at the end."""
+    """Give a viser server that refuses pages of others, stopped with its threads at the end."""
     viser = import_viser()
     # The server prints where it is and that it stops; the command says that itself.
-    with contextlib.redirect_stdout(io.StringIO()):
+    with contextlib.redirect_stdout(io.StringIO()), refuse_foreign(host):
         server = viser.ViserServer(host=host, port=port, verbose=False)
     try:
         yield server
@@ -103,7 +104,7 @@ def show(playback: Playback, host=HOST, port=None, as_json=False, seconds=None):
         if port and server.get_port() != port:
             raise ValueError(f"{host}:{port}: cannot be served at")
         page = Page(server, playback)
-        shown = "localhost" if host in (HOST, "0.0.0.0") else host
+        shown = "localhost" if host in (HOST, "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
         address = f"http://{shown}:{server.get_port()}"
         found = {"address": address, "title": playback.title, "objects": playback.scene.object_count}
         with contextlib.suppress(KeyboardInterrupt):  # from when the address is told

@@ -10,6 +10,7 @@ import time
 import numpy as np
 
 from warp_abtree.app import scene_geometry as geometry
+from warp_abtree.app.cli.report import show_number
 from warp_abtree.app.playback import HOLD, OWN
 from warp_abtree.app.render_data import Settings, compose, objects_of_world
 from warp_abtree.app.styles import STAGE_LABELS
@@ -228,7 +229,7 @@ class Page:
             ("intersecting faces", f"{data.intersecting_count:,}"),
         ]
         if len(data.distance):
-            rows.append(("least distance", f"{data.distance.min():.6g}"))
+            rows.append(("least distance", show_number(data.distance.min())))
         if row is not None:
             rows += [(label, f"{getattr(row, name):.1f} ms") for name, label in STAGE_LABELS.items()]
             rows.append(("frame", f"{row.total_ms:.1f} ms"))

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.interop.robot.link_query import Asked, LinkDistances, LinkHits
 from warp_abtree.interop.robot.surroundings import RobotBatch
 from warp_abtree.kernels.robot.link_pairs import Parts
@@ -48,10 +49,11 @@ def ask_about(robot, robots: RobotBatch, room: int) -> Asked:
     radii = [np.sqrt(((v - m) ** 2).sum(1).max()) * (1 + 2.0**-40) for v, m in zip(vertices, middles)]
     parts.radius = wp.array(np.array(radii), dtype=wp.float64, device=device)
     sizes = len(robot.joint_names), len(description.frames), len(frame)
-    return Asked(description.make_chain(device), parts, stages, robots.count, room, *sizes)
+    # A launch is one even where there is nothing to ask.
+    return Asked(description.make_chain(device), parts, stages or [(0, 0)], robots.count, room, *sizes)
 
 
-class RobotQuery:
+class RobotQuery(DeviceMemory):
     """A fixed number of configurations as an operator: allocates once, launches many times.
 
     `launch()` only launches, so that a CUDA graph can capture it; `configurations` and the poses of what surrounds the
@@ -114,7 +116,7 @@ class RobotQuery:
             count = min(self.room, len(rows) - start)
             if self.output == "distance":
                 self._links.most = beyond
-            self._run(rows[start : start + count])
+            self._run(rows, start, count)
             part = answers[start : start + count]
             if self.output == "any":
                 part[:] = self.hit[:count].numpy() != 0
@@ -124,10 +126,11 @@ class RobotQuery:
             self._number(part["pair"])
         return answers
 
-    def _run(self, rows):
-        self._links.links.active = count = len(rows)
+    def _run(self, rows, first, count):
+        self._links.links.active = count
         self._chunk.count.fill_(count)
-        wp.copy(self.configurations, rows, count=rows.size)
+        width = self.configurations.shape[1]
+        wp.copy(self.configurations, rows, src_offset=first * width, count=count * width)
         self._links.run_stages()
 
     def _number(self, pairs: np.ndarray):
@@ -146,8 +149,8 @@ class RobotQuery:
             part = slice(start, start + self.room)
             for target, values in ((self._chunk.half, halves[part]), (self._chunk.size, sizes[part])):
                 wp.copy(target, wp.array(values, dtype=wp.float64, device=self.device), count=values.size)
-            self._run(wp.array(middles[part], dtype=wp.float64, device=self.device))
             count = len(middles[part])
+            self._run(wp.array(middles[part], dtype=wp.float64, device=self.device), 0, count)
             hit[part], near[part] = self.hit[:count].numpy() != 0, self._chunk.near[:count].numpy() != 0
         return hit, near
 
@@ -165,7 +168,8 @@ def check_edges(query: RobotQuery, starts, ends, tolerance: float) -> np.ndarray
 def _halve(query: RobotQuery, starts, ends, tolerance) -> np.ndarray:
     """Halve the stretches of edges until each is proved free, or the first contact is known within the tolerance.
 
-    A stretch k of a level is from k / 2^level to (k + 1) / 2^level, which float64 holds exactly.
+    A stretch k of a level is from k / 2^level to (k + 1) / 2^level, which float64 holds exactly. An edge keeps the
+    answer of the level that decides it, whatever levels the others go on to.
     """
     count, rows = len(starts), np.zeros(len(starts), CONTACT_ROWS)
     sizes, motion = np.maximum(np.abs(starts), np.abs(ends)), ends - starts
@@ -173,22 +177,23 @@ def _halve(query: RobotQuery, starts, ends, tolerance) -> np.ndarray:
     still = np.zeros_like(motion)
     met = np.where(query.ask_spread(ends, still, sizes)[0], 1.0, np.inf)
     met[query.ask_spread(starts, still, sizes)[0]] = 0.0
-    edge, place, width = np.flatnonzero(met > 0.0), np.zeros(np.count_nonzero(met > 0.0)), 1.0
     first = np.minimum(met, 1.0)  # start of the first stretch that is not proved free
+    edge = np.flatnonzero((met > 0.0) & motion.any(1))  # what rests is as it starts
+    place, width = np.zeros(len(edge)), 1.0
     while len(edge):
         middle = (place + 0.5) * width
         half = 0.5 * width * np.abs(motion[edge]) * (1 + 2.0**-50)
         hit, near = query.ask_spread(starts[edge] + middle[:, None] * motion[edge], half, sizes[edge])
         np.minimum.at(met, edge[hit], middle[hit])
+        first[edge] = np.minimum(met[edge], 1.0)
         is_open = (hit | near) & (place * width < met[edge])
         edge, place = edge[is_open], place[is_open]
-        first = np.minimum(met, 1.0)
         np.minimum.at(first, edge, place * width)
-        open_count = np.bincount(edge, minlength=count)
-        rows["undecided"] |= (open_count > STRETCHES_MAX) | ((open_count > 0) & (width <= WIDTH_LEAST))
-        done = rows["undecided"] | (met - first <= tolerance)
-        rows["undecided"] &= ~(met - first <= tolerance)
-        edge, place = edge[~done[edge]], place[~done[edge]]
+        open_count, close = np.bincount(edge, minlength=count), met - first <= tolerance
+        given_up = (open_count > STRETCHES_MAX) | ((open_count > 0) & (width <= WIDTH_LEAST))
+        rows["undecided"] |= given_up & ~close
+        goes_on = ~(given_up | close)[edge]
+        edge, place = edge[goes_on], place[goes_on]
         edge, place, width = np.repeat(edge, 2), (2 * place[:, None] + [0.0, 1.0]).ravel(), 0.5 * width
     rows["time"] = first
     rows["clear"] = ~rows["undecided"] & np.isinf(met)

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warp_abtree.kernels.robot import forward
-from warp_abtree.model.mesh import Mesh
+from warp_abtree.model.mesh import Mesh, load_mesh
 
 KINDS = {"fixed": int(forward.FIXED), "revolute": int(forward.REVOLUTE), "prismatic": int(forward.PRISMATIC)}
 ALL_BITS = 2**32 - 1
@@ -61,6 +61,9 @@ class Description:
         links: Index of the frame of each link, by its name.
         parts: Meshes of links; a link has none, one, or several whose bits differ.
         excluded: Pairs of names of links that the file says are never tested.
+        demanded: Pairs of indices of parts that the file says are tested, whatever else would leave them out.
+        neighbours: Links that a joint joins and that are not tested: "all", "moving" for those that both move against
+            the root, "none".
     """
 
     frames: list[Frame] = field(default_factory=list)
@@ -68,6 +71,8 @@ class Description:
     links: dict[str, int] = field(default_factory=dict)
     parts: list[Part] = field(default_factory=list)
     excluded: set[frozenset] = field(default_factory=set)
+    demanded: set[frozenset] = field(default_factory=set)
+    neighbours: str = "all"
 
     def bodies(self) -> np.ndarray:
         """Return the rigid body of each frame, int (frames,): the frame from which on no joint moves it."""
@@ -88,7 +93,8 @@ class Description:
     def allowed_pairs(self) -> list[tuple[int, int]]:
         """Return the pairs of parts that are tested: neither rigidly joined nor of links that a joint joins.
 
-        Links without a joint between them are one body; what the file excludes, or its bits forbid, is not tested.
+        Links without a joint between them are one body; what the file excludes, or its bits forbid, is not tested. What
+        it demands is, all the same.
         """
         body, names = self.bodies(), list(self.links)
         frames = [self.links[names[part.link]] for part in self.parts]
@@ -106,9 +112,11 @@ class Description:
             for j in range(i):
                 b = self.parts[j]
                 x, y = body[frames[i]], body[frames[j]]
-                near = x == y or (x >= 0 and holder(x) == y) or (y >= 0 and holder(y) == x)
+                joined = (x >= 0 and holder(x) == y) or (y >= 0 and holder(y) == x)
+                exempt = self.neighbours == "none" or (self.neighbours == "moving" and min(x, y) < 0)
                 told = frozenset((names[a.link], names[b.link])) in self.excluded
-                if not near and not told and (a.group & b.mask or b.group & a.mask):
+                tested = x != y and (exempt or not joined) and not told and (a.group & b.mask or b.group & a.mask)
+                if tested or frozenset((i, j)) in self.demanded:
                     found.append((j, i))
         return found
 
@@ -173,12 +181,14 @@ def check_rigid(matrix, what: str) -> np.ndarray:
 
 
 def join_meshes(placed, name: str) -> Mesh:
-    """Return meshes (vertices, faces, transform) as one, in the frame that they are placed in."""
-    from warp_abtree.model.mesh import mesh_from_arrays
+    """Return meshes (vertices, faces, transform) as one, in the frame that they are placed in.
 
-    vertices, faces, count = [], [], 0
-    for corners, triangles, transform in placed:
-        vertices.append(corners @ transform[:3, :3].T + transform[:3, 3])
-        faces.append(np.asarray(triangles) + count)
-        count += len(corners)
-    return mesh_from_arrays(np.concatenate(vertices), np.concatenate(faces), name=name)
+    Raises:
+        MeshError: They make no mesh.
+    """
+    import trimesh
+
+    scene = trimesh.Scene()
+    for vertices, faces, transform in placed:
+        scene.add_geometry(trimesh.Trimesh(vertices, faces, process=False), transform=transform)
+    return load_mesh(scene, name)

@@ -1,6 +1,7 @@
 """Robots of MJCF files, read and compiled by MuJoCo (extra `robot`)."""
 
 import math
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ from warp_abtree.interop.robot.description import (
     unit_axis,
 )
 from warp_abtree.interop.robot.urdf import INSTALL
+from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.read import read_file, split_file_name
 
 KINDS = {"hinge": "revolute", "slide": "prismatic"}
 VISUAL_GROUPS = 3  # MuJoCo shows geoms of the groups below
@@ -31,6 +34,7 @@ def read_mjcf(path: Path, geometry: str) -> Description:
         model = mujoco.MjModel.from_xml_path(str(path))
     except Exception as error:
         raise RobotError(f"{path}: not read as MJCF ({first_line(error)})") from None
+    _warn_of_closures(mujoco, model, path)
     description, names = Description(), [model.body(b).name or f"body {b}" for b in range(model.nbody)]
     check_names(names, "bodies", path)
     values = _joint_values(mujoco, model, path)
@@ -42,8 +46,11 @@ def read_mjcf(path: Path, geometry: str) -> Description:
         if model.body_mocapid[b] >= 0:
             raise RobotError(f"{path}: body {name!r} is moved by motion capture, not by joints")
         description.links[name] = _add_body(mujoco, model, b, description, names, values, path)
-    for b in range(model.nbody):
-        _add_parts(mujoco, model, b, description, geometry, f"{path}: body {names[b]!r}")
+    if int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
+        description.neighbours = "none"
+    elif geometry == "collision":
+        description.neighbours = "moving"
+    _add_all_parts(mujoco, model, description, geometry, [f"{path}: body {name!r}" for name in names])
     for signature in model.exclude_signature.tolist():
         description.excluded.add(frozenset((names[signature >> 16], names[signature & 0xFFFF])))
     return description
@@ -58,11 +65,13 @@ def _joint_values(mujoco, model, path) -> list[tuple[str, float, float]]:
         kind = mujoco.mjtJoint(int(model.jnt_type[j])).name[len("mjJNT_") :].lower()
         if kind not in KINDS:
             raise RobotError(f"{path}: joint {name!r} is {kind}; hinge and slide ones are supported")
-    for e in range(model.neq):
-        if int(model.eq_type[e]) != int(mujoco.mjtEq.mjEQ_JOINT) or not model.eq_active0[e]:
+    for e, kind in _equalities(mujoco, model):
+        if kind != "joint":
             continue
         j, k, factors = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e, :5]
-        if factors[2:].any():
+        if j in leads:
+            raise RobotError(f"{path}: joint {names[j]!r} follows two others")
+        if k >= 0 and factors[2:].any():
             raise RobotError(f"{path}: joint {names[j]!r} follows another by a curve; linear ones are supported")
         # y - y0 = a + b (x - x0)
         scale = float(factors[1]) if k >= 0 else 0.0
@@ -79,6 +88,35 @@ def _joint_values(mujoco, model, path) -> list[tuple[str, float, float]]:
             raise RobotError(f"{path}: joint {names[j]!r} follows itself")
         values[j] = (names[at] if at >= 0 else "", scale, offset)
     return values
+
+
+def _equalities(mujoco, model):
+    """Yield index and kind of each equality that MuJoCo enforces from the start."""
+    off = int(mujoco.mjtDisableBit.mjDSBL_EQUALITY) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    for e in range(0 if int(model.opt.disableflags) & off else model.neq):
+        if model.eq_active0[e]:
+            yield e, mujoco.mjtEq(int(model.eq_type[e])).name[len("mjEQ_") :].lower()
+
+
+def _warn_of_closures(mujoco, model, path):
+    """Refuse what deforms, and warn of what ties links beside their joints."""
+    for f in range(model.nflex):
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, f)
+        raise RobotError(f"{path}: flex {name or f!r} may deform; rigid geoms are supported")
+    found = []
+    for e, kind in _equalities(mujoco, model):
+        if kind != "joint":
+            of = mujoco.mjtObj.mjOBJ_TENDON if kind == "tendon" else mujoco.mjtObj(int(model.eq_objtype[e]))
+            ends = [int(k) for k in (model.eq_obj1id[e], model.eq_obj2id[e]) if k >= 0]
+            unnamed = of.name[len("mjOBJ_") :].lower()
+            tied = " and ".join(repr(mujoco.mj_id2name(model, of, k) or f"{unnamed} {k}") for k in ends)
+            name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_EQUALITY, e)
+            found.append(f"equality {kind} {name or e!r} of {tied}")
+    for t in np.flatnonzero(model.tendon_limited).tolist():
+        found.append(f"the limits of tendon {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TENDON, t) or t!r}")
+    if found:
+        message = f"{path}: not enforced: {', '.join(found)}; links stand where their joints alone put them"
+        warnings.warn(message, RuntimeWarning, stacklevel=4)
 
 
 def _pose(position, quaternion) -> np.ndarray:
@@ -121,22 +159,30 @@ def _shift(by) -> np.ndarray:
     return matrix
 
 
-def _add_parts(mujoco, model, b, description, geometry, where):
-    """Add the meshes of a body, one for all geoms of the same bits."""
-    placed: dict[tuple[int, int], list] = {}
-    for g in range(int(model.body_geomadr[b]), int(model.body_geomadr[b]) + int(model.body_geomnum[b])):
+def _add_all_parts(mujoco, model, description, geometry, where):
+    """Add the meshes of all bodies, one for a body's geoms of the same bits and partners, and the pairs of partners."""
+    partners: dict[int, set[int]] = {}
+    for a, b in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True):
+        partners.setdefault(a, set()).add(b)
+        partners.setdefault(b, set()).add(a)
+    placed: dict[tuple, list] = {}
+    for g, b in enumerate(model.geom_bodyid.tolist()):
+        met = frozenset(partners.get(g, ()))
         bits = int(model.geom_contype[g]), int(model.geom_conaffinity[g])
-        if geometry == "collision" and bits == (0, 0):
+        if geometry == "collision" and bits == (0, 0) and not met:
             continue
         if geometry == "visual":
             if model.geom_group[g] >= VISUAL_GROUPS:
                 continue
             bits = 1, 1
-        vertices, faces = _shape(mujoco, model, g, where)
-        placed.setdefault(bits, []).append((vertices, faces, _pose(model.geom_pos[g], model.geom_quat[g])))
-    for (group, mask), shapes in placed.items():
-        name = model.body(b).name or f"body {b}"
-        description.parts.append(Part(b, join_meshes(shapes, name), group, mask))
+        placed.setdefault((b, bits, met), []).append(g)
+    part_of = {}
+    for (b, bits, _), geoms in placed.items():
+        part_of |= dict.fromkeys(geoms, len(description.parts))
+        shapes = [(*_shape(mujoco, model, g, where[b]), _pose(model.geom_pos[g], model.geom_quat[g])) for g in geoms]
+        description.parts.append(Part(b, join_meshes(shapes, model.body(b).name or f"body {b}"), *bits))
+    for g, others in partners.items():
+        description.demanded |= {frozenset((part_of[g], part_of[h])) for h in others if {g, h} <= part_of.keys()}
 
 
 def _shape(mujoco, model, g, where):
@@ -148,7 +194,7 @@ def _shape(mujoco, model, g, where):
         m = int(model.geom_dataid[g])
         vertex, face = int(model.mesh_vertadr[m]), int(model.mesh_faceadr[m])
         vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[m]].astype(np.float64)
-        return vertices, model.mesh_face[face : face + model.mesh_facenum[m]]
+        return vertices, _recut(model, m, vertices, model.mesh_face[face : face + model.mesh_facenum[m]], where)
     if kind == "box":
         made = trimesh.creation.box(2 * size)
     elif kind in ("sphere", "ellipsoid"):
@@ -165,3 +211,31 @@ def _shape(mujoco, model, g, where):
             "given to Robot.check"
         )
     return np.asarray(made.vertices), np.asarray(made.faces)
+
+
+def _recut(model, m, vertices, faces, where):
+    """Return the faces of a mesh, those of an OBJ file with polygons cut anew: MuJoCo's may fold over.
+
+    Raises:
+        RobotError: MuJoCo has other vertices than the file.
+    """
+    start = int(model.mesh_pathadr[m])
+    path = Path(model.paths[start : model.paths.index(b"\0", start)].decode() if start >= 0 else "")
+    if split_file_name(path)[1] != "obj" or not path.is_file():
+        return faces
+    try:
+        found = read_file(path, Remarks())
+    except MeshError as error:
+        raise RobotError(f"{where}: {first_line(error)}") from None
+    polygons = sum(line.split(maxsplit=1)[:1] == [b"f"] for line in path.read_bytes().splitlines())
+    if not isinstance(found, Surface) or len(found.faces) <= polygons:
+        return faces
+    # MuJoCo scales, turns and shifts the vertices, and keeps their order.
+    apart, to = math.inf, np.eye(4)[:, :3]
+    if len(found.vertices) == len(vertices):
+        given = np.column_stack([found.vertices, np.ones(len(vertices))])
+        to = np.linalg.lstsq(given, vertices, rcond=None)[0]
+        apart = np.abs(given @ to - vertices).max() / np.ptp(vertices, axis=0).max()
+    if not apart <= 1e-5:
+        raise RobotError(f"{where}: {path.name} has polygons and vertices that are not MuJoCo's; make it of triangles")
+    return found.faces[:, ::-1] if np.linalg.det(to[:3]) < 0 else found.faces

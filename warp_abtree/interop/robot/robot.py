@@ -4,6 +4,7 @@ A configuration holds a value of each of `joint_names` [rad, or the file's unit 
 file: poses of links are in that of its root, and what surrounds the robot is placed in it.
 """
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from warp_abtree.interop.robot.check import RobotQuery, check_edges
 from warp_abtree.interop.robot.description import Description, RobotError
 from warp_abtree.interop.robot.mjcf import read_mjcf
 from warp_abtree.interop.robot.surroundings import make_surroundings
-from warp_abtree.interop.robot.urdf import read_disabled_pairs, read_urdf
+from warp_abtree.interop.robot.urdf import apply_srdf, read_urdf
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.model import Model
 from warp_abtree.query.distance import check_beyond
@@ -47,6 +48,8 @@ class Robot:
         pairs: Pairs of models that are tested against one another, int (p, 2).
         mounted: Indices into `link_names` of the links that are not tested against what surrounds the robot.
         description: What the file says, `warp_abtree.interop.robot.description.Description`.
+
+    A copy, or what is unpickled, is made anew from the description, on the same device, with `pairs` and `mounted`.
     """
 
     def __init__(self, description: Description, device=None, mounted=()):
@@ -61,32 +64,36 @@ class Robot:
         self.models = [Model.load(mesh, base_faces=len(mesh.faces)) for mesh in meshes]
         self.model_link = np.array([part.link for part in description.parts])
         self.pairs = np.array(description.allowed_pairs(), np.int64).reshape(-1, 2)
-        if isinstance(mounted, str):
-            raise TypeError(f"mounted: {mounted!r} is a name, not a list of names of links")
-        unknown = set(mounted) - set(self.link_names)
-        if unknown:
-            raise ValueError(f"mounted: the robot has no link {sorted(unknown)[0]!r}")
-        self.mounted = [self.link_names.index(name) for name in mounted]
+        self.mounted = self._find_mounted(mounted)
         self._chain = description.make_chain(self.device)
         self._links = wp.array(np.array(list(description.links.values()), np.int32), device=self.device)
         self._kept: dict[tuple, RobotQuery] = {}
 
     @classmethod
-    def load(cls, path, geometry="collision", device=None, mounted=(), srdf=None, neutral=None) -> "Robot":
+    def load(cls, path, geometry="collision", device=None, mounted=(), srdf=None, neutral=None, strict=True) -> "Robot":
         """Load a robot from a URDF (.urdf, by yourdfpy) or MJCF file (.xml, by MuJoCo).
 
         Joints may be fixed, revolute, continuous, prismatic, and mimic others. Of URDF, revolute and prismatic ones
         must have limits, 0 where one of two is not given. Tested against one another are all links but those that are
-        rigidly joined, that a joint joins, or that the file (MJCF: `contact/exclude`, contype and conaffinity) or the
-        SRDF excludes.
+        rigidly joined, that a joint joins, or that the file or the SRDF excludes. Of MJCF, "collision" has MuJoCo's
+        pairs: by contype, conaffinity, `contact/exclude` and `contact/pair`, and links on a joint are tested against
+        what it hangs on where that stands still, or with `filterparent` disabled. Meshes of a URDF are mirrored by
+        negative scales; those of Collada are scaled by their unit to meters, their up axis is ignored, as in RViz.
 
         Args:
             geometry: "collision" or "visual" meshes; boxes, cylinders and the like are tessellated. Of MJCF, "visual"
                 are the geoms of groups 0 to 2, and meshes have vertices in float32, as MuJoCo compiles them.
             device: Warp device; None for Warp's default.
             mounted: Names of links that are never tested against what surrounds the robot, as a base that stands on it.
-            srdf: Path of an SRDF file, whose `disable_collisions` exclude links.
+                One without a mesh stands for all links that are rigidly fixed to it; RuntimeWarning if none has one.
+            srdf: Path of an SRDF file: pairs that `disable_collisions` names are excluded, others that
+                `enable_collisions` names are tested, whatever else holds, and of the rest those are excluded with a
+                link of `disable_default_collisions`.
             neutral: Configuration in which links that intersect are excluded, too; None for none.
+            strict: Whether to refuse an SRDF that names links which the robot has not, rather than warn.
+
+        Warns of what ties links beside their joints and is not enforced: of MJCF `equality` other than between joints,
+        and limits of tendons; of URDF joints of Gazebo's and Drake's elements.
 
         Raises:
             ImportError: The extra `robot` is not installed.
@@ -103,11 +110,36 @@ class Robot:
                 raise RobotError(f"{file}: no such file")
         description = ENDINGS[path.suffix.lower()](path, geometry)
         if srdf is not None:
-            description.excluded |= read_disabled_pairs(Path(srdf), set(description.links))
+            apply_srdf(description, Path(srdf), flag(strict, "strict"))
         robot = cls(description, device, mounted)
         if neutral is not None:
             robot.exclude_meeting(neutral)
         return robot
+
+    def _find_mounted(self, names) -> list[int]:
+        """Return the links of names, and in the place of one without a mesh all that are rigidly fixed to it."""
+        if isinstance(names, str):
+            raise TypeError(f"mounted: {names!r} is a name, not a list of names of links")
+        names = list(names)
+        unknown = set(names) - set(self.link_names)
+        if unknown:
+            raise ValueError(f"mounted: the robot has no link {sorted(unknown)[0]!r}")
+        body = self.description.bodies()[list(self.description.links.values())]
+        found: dict[int, None] = {}
+        for k in map(self.link_names.index, names):
+            fixed = [k] if k in self.model_link else np.flatnonzero(body == body[k]).tolist()
+            if not np.isin(fixed, self.model_link).any():
+                warnings.warn(
+                    f"mounted: no mesh is fixed to the link {self.link_names[k]!r}: naming it changes nothing",
+                    RuntimeWarning,
+                    stacklevel=4,
+                )
+            found |= dict.fromkeys(fixed)
+        return list(found)
+
+    def __reduce__(self):
+        kept = {"pairs": self.pairs, "mounted": self.mounted}
+        return type(self), (self.description, self.device.alias), kept
 
     def __repr__(self):
         faces = sum(model.face_count for model in self.models)
@@ -115,7 +147,7 @@ class Robot:
 
     def exclude_meeting(self, configuration):
         """Test models no more that intersect at a configuration, (n,), as neighbours may. Waits for the device."""
-        poses = self.forward(np.asarray(configuration, np.float64)[None]).numpy()[0]
+        poses = self.forward(np.asarray(configuration)[None]).numpy()[0]
         scene = Scene(self.device)
         scene.add_many(self.models, poses[self.model_link])
         meet = scene.intersect(self.pairs).any
@@ -129,7 +161,8 @@ class Robot:
 
         Args:
             configurations: (c, n) of any framework; float64 on the robot's GPU is read where it lies.
-            limits: Whether to refuse configurations out of limits.
+            limits: Whether to refuse configurations out of limits. A float32 number that is beyond a limit by no more
+                than 2^-22 of the greater one, as rounding puts it there, is within, and taken as it is.
 
         Raises:
             ValueError: Another shape, a number that is not finite, one out of its limits; the first is named.
@@ -192,7 +225,8 @@ class Robot:
 
         Returns:
             Structured array (e,): time, from 0 to 1, parts are proved apart before; clear, whether they are for all of
-            the edge; undecided, whether contact within the tolerance is neither proved nor excluded.
+            the edge; undecided, whether contact within the tolerance of the time is neither proved nor excluded. The
+            same bits for an edge alone and in any batch.
 
         Raises:
             TypeError, ValueError: As `check`.
@@ -232,25 +266,22 @@ class Robot:
             raise ValueError(f"{what}: shape {tuple(rows.shape)}, not (c, {width}), a value of each joint")
         if len(rows) == 0:
             return wp.empty((0, width), dtype=wp.float64, device=self.device)
-        first = wp.full(1, forward.NONE_REFUSED, dtype=wp.int32, device=self.device)
+        first = wp.full(1, int(forward.NONE_REFUSED), dtype=wp.int64, device=self.device)
         inputs = [int(limits), len(rows), self._chain, rows, first]
         wp.launch(forward.check_configuration_kernel, len(rows), inputs, device=self.device)
         bad = int(first.numpy()[0])
-        if bad != forward.NONE_REFUSED:
-            self._refuse(rows[bad : bad + 1].numpy()[0], bad, what)
+        if bad != int(forward.NONE_REFUSED):
+            self._refuse(rows, *divmod(bad, width), what)
         return rows
 
-    def _refuse(self, row, i, what):
-        """Raise ValueError about the first value of a configuration that is none."""
-        for name, value, (low, high) in zip(self.joint_names, row.tolist(), self.limits.tolist(), strict=True):
-            if not abs(value) < forward.ANGLE_MAX:
-                raise ValueError(f"{what}: {what[:-1]} {i} has {value} for joint {name!r}")
-            if not low <= value <= high:
-                raise ValueError(
-                    f"{what}: {what[:-1]} {i} has {value:.6g} for joint {name!r}, outside {low:.6g} .. {high:.6g} "
-                    "(limits=False takes it)"
-                )
-        raise AssertionError("a configuration that was refused")
+    def _refuse(self, rows, i, k, what):
+        """Raise ValueError about a value of a configuration that is none."""
+        value = float(rows[i : i + 1].numpy()[0, k])
+        told = f"{what}: {what[:-1]} {i} has {exact(value)} for joint {self.joint_names[k]!r}"
+        if not abs(value) < forward.ANGLE_MAX:
+            raise ValueError(told)
+        low, high = map(exact, self.limits[k])
+        raise ValueError(f"{told}, outside {low} .. {high} (limits=False takes it)")
 
     def _find_query(self, world, output, count) -> RobotQuery:
         """Return a query of a room for a number of configurations: the one of before if it is of the same."""
@@ -264,3 +295,8 @@ class Robot:
         for old in list(self._kept)[:-KEPT]:
             del self._kept[old]
         return query
+
+
+def exact(number) -> str:
+    """Return a number with the fewest digits that tell it from every other."""
+    return str(float(number)).removesuffix(".0")

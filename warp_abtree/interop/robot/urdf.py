@@ -1,6 +1,10 @@
-"""Robots of URDF files, read by yourdfpy (extra `robot`), and pairs that an SRDF file excludes."""
+"""Robots of URDF files, read by yourdfpy (extra `robot`), and pairs that an SRDF file excludes or demands."""
 
+import gzip
 import math
+import os
+import re
+import warnings
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -17,6 +21,7 @@ from warp_abtree.interop.robot.description import (
     join_meshes,
     unit_axis,
 )
+from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.mesh import MeshError, load_mesh
 
 KINDS = {"fixed": "fixed", "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
@@ -30,7 +35,10 @@ def read_urdf(path: Path, geometry: str) -> Description:
     except ImportError:
         raise ImportError(f"a URDF file {INSTALL}") from None
     try:
+        _check_elements(path)
         robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+    except RobotError:
+        raise
     except Exception as error:
         raise RobotError(f"{path}: not read as URDF ({first_line(error)})") from None
     description, joints = Description(), {joint.child: joint for joint in robot.joints}
@@ -39,6 +47,10 @@ def read_urdf(path: Path, geometry: str) -> Description:
         check_names(given, what, path)
     for joint in robot.joints:
         _check_joint(joint, joints, names, path)
+    roots = [name for name in names if name not in joints]
+    if len(roots) > 1:
+        message = f"{path}: {', '.join(map(repr, roots[1:]))} hang on no joint, and are placed where {roots[0]!r} is"
+        warnings.warn(message, RuntimeWarning, stacklevel=3)
     for joint in robot.joints:  # in the file's order, as configurations are
         if joint.type != "fixed" and joint.mimic is None:
             description.joints[joint.name] = _limits(joint, path)
@@ -46,17 +58,15 @@ def read_urdf(path: Path, geometry: str) -> Description:
     for name in names:
         _add_link(name, description, joints, values, path, ())
 
-    def find_file(name):
-        return yourdfpy.urdf.filename_handler_magic(name, dir=str(path.parent))
-
     # By name: frames come parents first, links as they stand in the file.
     description.links = {name: description.links[name] for name in names}
     for k, link in enumerate(robot.links):
         shapes = link.collisions if geometry == "collision" else link.visuals
         where = f"{path}: link {link.name!r}"
-        placed = [
-            (*_load_shape(shape.geometry, where, find_file), check_rigid(shape.origin, where)) for shape in shapes
-        ]
+        placed = []
+        for shape in shapes:
+            vertices, faces, scale = _load_shape(shape.geometry, where, path)
+            placed.append((vertices, faces, check_rigid(shape.origin, where) @ np.diag([*scale, 1.0])))
         if placed:
             try:
                 description.parts.append(Part(k, join_meshes(placed, link.name)))
@@ -131,14 +141,51 @@ def _add_link(name, description, joints, values, path, below):
     description.frames.append(frame)
 
 
-def _load_shape(geometry, where, find_file):
-    """Return vertices and faces of a shape."""
+def _check_elements(path):
+    """Refuse what yourdfpy mends or leaves out in silence, and warn of joints that it does not read.
+
+    Raises:
+        RobotError: A line that is no XML, a geometry of other than one shape.
+    """
+    from lxml import etree  # of yourdfpy
+
+    parser = etree.XMLParser(recover=True)
+    root = etree.parse(str(path), parser).getroot()
+    for error in parser.error_log:
+        if error.level == etree.ErrorLevels.FATAL:  # a namespace that is not declared is none
+            raise RobotError(f"{path}: not read as URDF (line {error.line}: {error.message})")
+    for shape in root.xpath("//geometry[count(*) != 1]"):
+        raise RobotError(f"{path}: not read as URDF (line {shape.sourceline}: a geometry has one shape)")
+    found = root.xpath("//*[local-name()='gazebo']//joint | //*[contains(name(), 'loop_joint')]")
+    if found:
+        names = ", ".join(repr(joint.get("name")) for joint in found)
+        message = f"{path}: not enforced: joints {names} of a <gazebo> or loop_joint element"
+        warnings.warn(message, RuntimeWarning, stacklevel=4)
+
+
+def _find_file(name, where, path) -> Path:
+    """Return the file of a mesh, sought beside the robot's file and above: of a package with its folder, then without.
+
+    Raises:
+        RobotError: There is none.
+    """
+    given = (name or "").replace("\\", "/")
+    tails = [re.sub("^package:/+|^[a-z]+://", "", given)]
+    if given.startswith(("package:", "model:")):
+        tails.append(tails[0].partition("/")[2])
+    for tail in (name, *tails):
+        for folder in (*path.absolute().parents, Path.cwd()):
+            if tail and os.path.isfile(folder / tail):
+                return folder / tail
+    raise RobotError(f"{where}: no mesh file {name}")
+
+
+def _load_shape(geometry, where, path):
+    """Return vertices and faces of a shape, and what its mesh is scaled by, (3,)."""
     import trimesh
 
     if geometry.mesh is not None:
-        file = find_file(geometry.mesh.filename)
-        if not Path(file).is_file():
-            raise RobotError(f"{where}: no mesh file {geometry.mesh.filename}")
+        file = _find_file(geometry.mesh.filename, where, path)
         try:
             mesh = load_mesh(file)
         except MeshError as error:
@@ -146,7 +193,8 @@ def _load_shape(geometry, where, find_file):
         scale = np.asarray(1.0 if geometry.mesh.scale is None else geometry.mesh.scale, np.float64)
         if scale.shape not in ((), (1,), (3,)) or not np.isfinite(scale).all():
             raise RobotError(f"{where}: scale {scale.tolist()} of a mesh is not 3 finite numbers")
-        return mesh.vertices * scale, np.delete(mesh.faces, mesh.dropped_faces, axis=0)
+        faces = np.delete(mesh.faces, mesh.dropped_faces, axis=0)
+        return mesh.vertices, faces, np.broadcast_to(scale * _unit_of(file, where), 3)
     if geometry.box is not None:
         made = trimesh.creation.box(_sizes(geometry.box.size, 3, where))
     elif geometry.cylinder is not None:
@@ -158,7 +206,30 @@ def _load_shape(geometry, where, find_file):
         made = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     else:
         raise RobotError(f"{where}: a shape that is neither mesh, box, cylinder nor sphere")
-    return np.asarray(made.vertices), np.asarray(made.faces)
+    return np.asarray(made.vertices), np.asarray(made.faces), np.ones(3)
+
+
+def _unit_of(file: Path, where) -> float:
+    """Return the unit of a Collada file [m], 1 for files of other formats.
+
+    Raises:
+        RobotError: It is not positive.
+    """
+    _, kind, zipped = split_file_name(file)
+    if kind == "zae":
+        raise RobotError(f"{where}: {file.name} is an archive; unpack the .dae of it")
+    if kind != "dae":
+        return 1.0
+    with gzip.open(file) if zipped else open(file, "rb") as stream:
+        unit = ElementTree.parse(stream).getroot().find("{*}asset/{*}unit")
+    given = "1" if unit is None else unit.get("meter", "1")
+    try:
+        meters = float(given)
+    except ValueError:
+        meters = math.nan
+    if not 0 < meters < math.inf:
+        raise RobotError(f"{where}: {file.name} has a unit of {given!r} meters")
+    return meters
 
 
 def _sizes(given, count, where) -> np.ndarray:
@@ -169,21 +240,46 @@ def _sizes(given, count, where) -> np.ndarray:
     return sizes
 
 
-def read_disabled_pairs(path: Path, links: set[str]) -> set[frozenset]:
-    """Return the pairs of links whose collisions an SRDF file disables.
+def apply_srdf(description: Description, path: Path, strict: bool):
+    """Exclude and demand the pairs that an SRDF file does, as MoveIt: what it disables goes over what it enables, and
+    this over the links that it disables by default, whatever their order.
 
     Raises:
-        RobotError: It is unreadable, or names a link that the robot has not.
+        RobotError: It is unreadable, or names a link that the robot has not and `strict` holds, which otherwise warns.
     """
     try:
         root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as error:
         raise RobotError(f"{path}: not read as SRDF ({first_line(error)})") from None
-    pairs = set()
-    for entry in root.iter("disable_collisions"):
-        names = entry.get("link1"), entry.get("link2")
-        for name in names:
-            if name not in links:
-                raise RobotError(f"{path}: disable_collisions names {name!r}, which is no link of the robot")
-        pairs.add(frozenset(names))
-    return pairs
+    if root.tag != "robot":
+        raise RobotError(f"{path}: not read as SRDF (its root is {root.tag!r}, not 'robot')")
+    links, unknown = list(description.links), {}
+
+    def read(tag, *attributes):
+        pairs = []
+        for entry in root.findall(tag):
+            names = [(entry.get(attribute) or "").strip() for attribute in attributes]
+            if "" in names:
+                raise RobotError(f"{path}: a {tag} without {attributes[names.index('')]}")
+            missing = [name for name in names if name not in description.links]
+            if missing and strict:
+                raise RobotError(
+                    f"{path}: {tag} names {missing[0]!r}, which is no link of the robot (strict=False goes on)"
+                )
+            unknown.update(dict.fromkeys(missing))
+            pairs.append(frozenset(names))
+        return pairs
+
+    alone = {name for names in read("disable_default_collisions", "link") for name in names}
+    enabled, disabled = (set(read(f"{what}_collisions", "link1", "link2")) for what in ("enable", "disable"))
+    description.excluded |= disabled | {frozenset((name, other)) for name in alone for other in links}
+    for i, part in enumerate(description.parts):
+        for j in range(i):
+            pair = frozenset((links[part.link], links[description.parts[j].link]))
+            if pair in disabled:
+                description.demanded.discard(frozenset((i, j)))
+            elif pair in enabled:
+                description.demanded.add(frozenset((i, j)))
+    if unknown:
+        message = f"{path}: what is said of {', '.join(map(repr, unknown))} is left out: no links of the robot"
+        warnings.warn(message, RuntimeWarning, stacklevel=3)

@@ -1,0 +1,115 @@
+"""Faces that are listed an even number of times: what such solids hold, by exact rays, and that they say so."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+import trimesh
+from oracles.inside import parity
+
+import warp_abtree as ab
+from warp_abtree.app.cli.main import main
+from warp_abtree.model.mesh import describe_mesh, mesh_from_arrays
+
+BOX = trimesh.creation.box()
+BALL = trimesh.creation.icosphere(1, radius=0.1)
+
+
+def turned(mesh):
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False)
+
+
+def at(x, mesh=BOX):
+    return trimesh.Trimesh(mesh.vertices + [x, 0, 0], mesh.faces, process=False)
+
+
+def cut(keep):
+    return trimesh.Trimesh(BOX.vertices, BOX.faces[keep], process=False)
+
+
+WALL = np.array([f for f in range(12) if (BOX.vertices[BOX.faces[f], 0] > 0).all()])
+INNER = trimesh.Trimesh(0.6 * BOX.vertices, BOX.faces, process=False)
+# Meshes, where balls are put, and how many faces hold nothing.
+CASES = {
+    "once": ([BOX], (0.0,), 0),
+    "twice": ([BOX, BOX], (0.0,), 24),
+    "double-sided": ([BOX, turned(BOX)], (0.0,), 24),
+    "three times": ([BOX, turned(BOX), BOX], (0.0,), 0),
+    "four times": ([BOX, BOX, turned(BOX), BOX], (0.0,), 48),
+    "one of two bodies": ([BOX, BOX, at(3)], (0.0, 3.0), 24),
+    "a body in a doubled one": ([BOX, BOX, INNER], (0.0,), 24),
+    "bodies that share a wall": ([BOX, at(1)], (0.0, 1.0), 0),
+    "a wall in a body, of two sides": ([BOX, at(-0.5, cut(WALL)), turned(at(-0.5, cut(WALL)))], (0.0,), 0),
+    "a sheet of two sides": ([cut(WALL), turned(cut(WALL))], (0.0,), 4),
+}
+
+
+def quietly(call, *arguments, **options):
+    """Return what a call answers, and its warnings of solids."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        answer = call(*arguments, **options)
+    return answer, [str(each.message) for each in said if "as a solid" in str(each.message)]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_holds_nothing_says_so(device, name):
+    meshes, places, count = CASES[name]
+    mesh = trimesh.util.concatenate(meshes)
+    model = ab.Model.from_arrays(mesh.vertices, mesh.faces, base_faces=10**6, name="body")
+    faces = mesh_from_arrays(mesh.vertices, mesh.faces).faces
+    listed = np.sort(faces, axis=1).tolist()
+    assert {listed.count(listed[f]) % 2 for f in model.winding.doubled} <= {0} and len(model.winding.doubled) == count
+    scene = ab.Scene(device)
+    _, said = quietly(scene.add, model, solid=True)
+    assert len(said) == (count > 0)
+    if count:
+        assert "'body'" in said[0] and f"{count} faces are listed an even number of times" in said[0]
+        assert ("holds nothing: all" in said[0]) == (count == len(faces))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            with pytest.raises(RuntimeWarning, match="as a solid"):
+                scene.add(model, solid=True)
+            assert scene.object_count == 1
+            ab.Scene(device).add(model)  # as a surface it is as good as any
+    ball = ab.Model.load(BALL)
+    held = [parity(np.array([x + 0.01, 0.02, 0.03]), mesh.vertices[mesh.faces]) for x in places]
+    for x in places:
+        scene.add(ball, pose=(x + 0.01, 0.02, 0.03, 0, 0, 0, 1))
+    assert scene.intersect([(0, 1 + k) for k in range(len(places))]).any.tolist() == held
+    manager = ab.CollisionManager(device)
+    _, said = quietly(manager.add_object, "body", mesh)
+    assert len(said) == (count > 0)
+    found = [
+        manager.in_collision_single(BALL, trimesh.transformations.translation_matrix((x + 0.01, 0.02, 0.03)))
+        for x in places
+    ]
+    assert found == held
+    _, said = quietly(ab.CollisionManager(device, solids=False).add_object, "body", mesh)
+    assert not said
+    poses = [(x + 0.01, 0.02, 0.03, 0, 0, 0, 1) for x in places]
+    found, said = quietly(ab.sweep, model, ball, poses, solid=(True, False), device=device)
+    assert found.tolist() == held and len(said) == (count > 0)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_info_says_what_a_mesh_holds(name, tmp_path, capsys):
+    meshes, _, count = CASES[name]
+    mesh = trimesh.util.concatenate(meshes)
+    mesh.export(tmp_path / "body.stl")
+    main(["info", str(tmp_path / "body.stl"), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert told == describe_mesh(mesh_from_arrays(mesh.vertices, mesh.faces, "body")) | {"name": "body"} | {
+        key: told[key] for key in ("file_vertices", "unreferenced_vertices", "welded_vertices")
+    }
+    if not count:
+        assert told["solid"] == "yes"
+        return
+    assert f"{count} faces are listed an even number of times" in told["solid"]
+    assert told["solid"].startswith("holds nothing: all" if count == told["faces"] else "holds less")
+
+
+def test_an_open_mesh_is_no_solid():
+    told = describe_mesh(mesh_from_arrays(BOX.vertices, BOX.faces[1:]))
+    assert told["solid"] == "no: not closed"

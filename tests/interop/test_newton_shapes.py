@@ -1,0 +1,210 @@
+"""Shapes of Newton: mirrored ones against meshes mirrored by hand, and settings that change after they are read."""
+
+import itertools
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+
+import warp_abtree as ab
+
+newton = pytest.importorskip("newton")
+
+FLOOR = trimesh.creation.box((4, 4, 1))
+# A wedge with a step, like none of its mirror images.
+PART = trimesh.Trimesh(
+    [[0, 0, 0], [1, 0, 0], [0, 0.6, 0], [0, 0, 0.3], [0.7, 0, 0.5], [0.1, 0.5, 0.2]],
+    [[0, 2, 1], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]],
+    process=False,
+)
+NEAR = newton.ModelBuilder.ShapeConfig(gap=0.02, margin=0.0)
+
+
+def mesh_of(vertices, faces):
+    return newton.Mesh(np.asarray(vertices, np.float32), np.asarray(faces, np.int32).ravel())
+
+
+def at(x=0.0, y=0.0, z=0.0):
+    return wp.transform((x, y, z), wp.quat_identity())
+
+
+def points_of(model, **options):
+    """Return shapes, normals and points of the contacts of a model at its poses."""
+    found = ab.NewtonContacts(model, **options)
+    contacts = found.contacts()
+    found.collide(model.state(), contacts)
+    count = int(contacts.rigid_contact_count.numpy()[0])
+    names = ("shape0", "shape1", "normal", "point0", "point1")
+    return [getattr(contacts, f"rigid_contact_{name}").numpy()[:count] for name in names]
+
+
+def scene_of(device, scale, mirrored_by_hand, on_body, solids):
+    builder = newton.ModelBuilder()
+    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=mesh_of(FLOOR.vertices, FLOOR.faces), cfg=NEAR)
+    vertices, faces, given = PART.vertices, PART.faces, scale
+    if mirrored_by_hand:
+        faces = faces[:, ::-1] if np.prod(scale) < 0 else faces
+        vertices, given = vertices * scale, (1, 1, 1)
+    low = float((PART.vertices * scale)[:, 2].min())
+    place = at(0.2, 0.1, (-0.4 if solids else -0.01) - low)
+    body = builder.add_body(xform=place) if on_body else -1
+    shape = builder.add_shape_mesh(
+        body,
+        xform=at() if on_body else place,
+        mesh=mesh_of(vertices, faces),
+        scale=wp.vec3(*map(float, given)),
+        cfg=NEAR,
+    )
+    # The same mesh, not mirrored, far from the others: it shares no model with the mirrored one.
+    builder.add_shape_mesh(builder.add_body(xform=at(x=9)), mesh=mesh_of(vertices, faces), cfg=NEAR)
+    if not on_body:
+        # Two that are static never meet: the floor moves.
+        builder = newton.ModelBuilder()
+        builder.add_shape_mesh(builder.add_body(xform=at(z=-0.5)), mesh=mesh_of(FLOOR.vertices, FLOOR.faces), cfg=NEAR)
+        builder.add_shape_mesh(
+            -1, xform=place, mesh=mesh_of(vertices, faces), scale=wp.vec3(*map(float, given)), cfg=NEAR
+        )
+    return builder.finalize(device=device), shape
+
+
+@pytest.mark.parametrize("solids", [False, True])
+@pytest.mark.parametrize("on_body", [False, True])
+def test_mirrored_shapes_are_those_mirrored_by_hand(device, on_body, solids):
+    for scale in itertools.product((1.0, -1.0, -2.0), (1.0, -0.5), (1.0, -1.0)):
+        found, expected = (
+            points_of(scene_of(device, np.array(scale), by_hand, on_body, solids)[0], solids=solids)
+            for by_hand in (False, True)
+        )
+        assert len(found[0]) > 0
+        for a, b in zip(found, expected):
+            np.testing.assert_allclose(a, b, atol=1e-6)
+        # From the floor to what stands on it, also where that is in the floor.
+        up = found[2][:, 2] * np.where(found[0] == 0, 1, -1)
+        assert (up > 0.5).all(), scale
+
+
+def settle(model, pipeline, steps):
+    state, after, control = model.state(), model.state(), model.control()
+    contacts = pipeline.contacts()
+    solver = newton.solvers.SolverXPBD(model, iterations=10)
+    for _ in range(steps):
+        state.clear_forces()
+        pipeline.collide(state, contacts)
+        solver.step(state, after, control, contacts, 1 / 240)
+        state, after = after, state
+    return state.body_q.numpy()
+
+
+def test_mirrored_shapes_rest_where_newton_has_them(device):
+    """A mirrored ball on a mirrored floor, beside Newton's own contacts."""
+    ball = trimesh.creation.icosphere(1, radius=0.3)
+    low = float(ball.vertices[:, 2].min())
+    builder = newton.ModelBuilder()
+    floor = mesh_of(FLOOR.vertices, FLOOR.faces)
+    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=floor, scale=wp.vec3(1.0, -1.0, 1.0), cfg=NEAR)
+    body = builder.add_body(xform=at(z=-low))
+    builder.add_shape_mesh(body, mesh=mesh_of(ball.vertices, ball.faces), scale=wp.vec3(-1.0, -1.0, -1.0), cfg=NEAR)
+    model = builder.finalize(device=device)
+    ours, newtons = (settle(model, make(model), 40) for make in (ab.NewtonContacts, newton.CollisionPipeline))
+    assert ours[0, 2] == pytest.approx(newtons[0, 2], abs=0.003) == pytest.approx(-low, abs=0.003)
+
+
+def stack(device):
+    """Return a model of a mesh floor, two mesh bodies on it, and a sphere."""
+    builder = newton.ModelBuilder()
+    floor, part = mesh_of(FLOOR.vertices, FLOOR.faces), mesh_of(PART.vertices, PART.faces)
+    builder.add_shape_mesh(-1, xform=at(z=-0.5), mesh=floor, cfg=NEAR)
+    for x in (-1.0, 1.0):
+        builder.add_shape_mesh(builder.add_body(xform=at(x=x, z=-0.01)), mesh=part, cfg=NEAR)
+    builder.add_shape_sphere(builder.add_body(xform=at(z=0.29)), radius=0.3, cfg=NEAR)
+    builder.add_shape_collision_filter_pair(0, 3)
+    return builder.finalize(device=device)
+
+
+def change(model, name, shape, value):
+    """Change one entry of an array in place."""
+    values = getattr(model, name).numpy()
+    values[shape] = value
+    getattr(model, name).assign(values)
+
+
+CHANGES = {
+    "shape_scale": (1, (1.0, 1.0, -1.0)),
+    "shape_margin": (2, 0.01),
+    "shape_gap": (0, 0.5),
+    "shape_collision_group": (3, 7),
+    "shape_world": (1, 0),
+    "shape_body": (1, 1),
+    "shape_flags": (2, 0),
+}
+
+
+@pytest.mark.parametrize("captured", [False, True])
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_is_read_once_is_refused_where_it_changed(device, name, captured):
+    model = stack(device)
+    state, found = model.state(), ab.NewtonContacts(model)
+    contacts = found.contacts()
+    found.collide(state, contacts)
+    if captured:
+        if device != "cpu" and not wp.is_mempool_enabled(device):
+            pytest.skip("no graph without a memory pool")
+        with wp.ScopedCapture(wp.get_device(device)) as capture:
+            found.launch(state, contacts)
+    shape, value = CHANGES[name]
+    kept = np.array(getattr(model, name).numpy()[shape])
+    change(model, name, shape, value)
+    message = rf"^{name} of shape {shape} changed since NewtonContacts read it, once; make a new one$"
+    with pytest.raises(RuntimeError, match=message):
+        if captured:
+            wp.capture_launch(capture.graph)
+            wp.capture_launch(capture.graph)
+            found.check(contacts)
+        else:
+            found.collide(state, contacts)
+    change(model, name, shape, kept)
+    found.collide(state, contacts)
+    if not captured:
+        # Another array in its place.
+        values = getattr(model, name)
+        setattr(model, name, wp.clone(values))
+        found.collide(state, contacts)
+        change(model, name, shape, value)
+        with pytest.raises(RuntimeError, match=message):
+            found.collide(state, contacts)
+        setattr(model, name, values)
+
+
+def test_other_meshes_and_filters_are_refused(device):
+    model = stack(device)
+    state, found = model.state(), ab.NewtonContacts(model)
+    contacts = found.contacts()
+    found.collide(state, contacts)
+    pairs = sorted(model.shape_collision_filter_pairs)
+    for other in ([*pairs, (1, 3)], [*pairs, (1, 2)][1:], pairs):
+        model._set_shape_collision_filter_pairs(other)
+        if other == pairs:
+            found.collide(state, contacts)
+            continue
+        with pytest.raises(RuntimeError, match=r"^shape_collision_filter_pairs changed"):
+            found.collide(state, contacts)
+    model.shape_source[1] = mesh_of(2 * PART.vertices, PART.faces)
+    with pytest.raises(RuntimeError, match=r"^shape_source changed"):
+        found.collide(state, contacts)
+
+
+def test_what_is_read_at_every_call_may_change(device):
+    """Transforms of shapes, whether one is drawn, and the sizes of shapes that are no meshes."""
+    model = stack(device)
+    state, found = model.state(), ab.NewtonContacts(model)
+    contacts = found.contacts()
+    found.collide(state, contacts)
+    before = int(contacts.rigid_contact_count.numpy()[0])
+    change(model, "shape_flags", 2, int(model.shape_flags.numpy()[2]) ^ int(newton.ShapeFlags.VISIBLE))
+    change(model, "shape_scale", 3, (0.2, 0.0, 0.0))
+    change(model, "shape_transform", 1, (0.0, 0.0, 5.0, 0.0, 0.0, 0.0, 1.0))
+    found.collide(state, contacts)
+    assert 0 < int(contacts.rigid_contact_count.numpy()[0]) < before
+    touched = contacts.rigid_contact_shape1.numpy()[: int(contacts.rigid_contact_count.numpy()[0])]
+    assert 1 not in touched and 2 in touched

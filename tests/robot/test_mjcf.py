@@ -1,0 +1,143 @@
+"""Pairs of MJCF files are those that MuJoCo makes contacts of, and what ties links beside their joints is named."""
+
+import warnings
+
+import numpy as np
+import pytest
+from helpers.robots import random_configurations
+
+import warp_abtree as ab
+
+mujoco = pytest.importorskip("mujoco")
+OFF = 'contype="0" conaffinity="0"'
+GEOM = '<geom name="{}" type="{}" size="{}" pos="{}" {}/>'
+# Name, type, size and place of each geom: of the world, the base, links 1 (b), 2 (c) and 3 (d); c1 is rigidly on b.
+GEOMS = {
+    "w": [("w1", "box", ".3 .05 .05", ".25 0 .45")],
+    "a": [("a1", "box", ".06 .06 .05", "0 0 0"), ("a2", "box", ".05 .04 .04", "0.2 0 0.1")],
+    "b": [("b1", "box", ".03 .03 .1", "0 0 .15")],
+    "c1": [("c1", "box", ".02 .02 .05", "0 .06 0")],
+    "c": [("c2", "box", ".03 .03 .12", "0 0 .13"), ("c3", "box", ".04 .03 .03", "0 0.08 .2")],
+    "d": [("d1", "box", ".03 .03 .03", "0 0 .05")],
+}
+
+
+def arm(rest="", flags="", bits=("", "", "", "", "")):
+    """Return an arm on a base that is fixed to the world; bits of world, base and links 1 to 3."""
+    made = {
+        place: "".join(GEOM.format(*geom, bits["wabcd".index(place[0])]) for geom in geoms)
+        for place, geoms in GEOMS.items()
+    }
+    return """<mujoco><compiler angle="radian"/>{flags}<worldbody>{w}<body name="base">{a}
+    <body name="one" pos="0 0 .12"><joint name="p" axis="0 1 .1" range="-3 3"/><joint name="t" range="-3 3"/>{b}
+      <body name="tool" pos="0.05 0 .3">{c1}<body name="two"><joint name="q" axis="0 1 0" range="-3 3"/>{c}
+        <body name="three" pos="0 0 .25"><joint name="r" type="slide" axis="1 0 0" range="-.3 .3"/>{d}</body>
+      </body></body></body></body></worldbody>{rest}</mujoco>""".format(flags=flags, rest=rest, **made)
+
+
+def pairs(*named):
+    return "<contact>" + "".join('<pair geom1="{}" geom2="{}"/>'.format(*pair.split()) for pair in named) + "</contact>"
+
+
+ARMS = {
+    "masks": arm(bits=("", "", 'contype="2" conaffinity="4"', 'contype="4" conaffinity="0"', "")),
+    "plain": arm(),
+    "parents": arm(flags='<option><flag filterparent="disable"/></option>'),
+    "pairs only": arm(pairs("a1 c2", "b1 c3", "w1 d1"), bits=(OFF,) * 5),
+    "pairs of all geoms": arm(pairs("a1 c2", "a2 c2", "a1 c3", "a2 c3"), bits=(OFF,) * 5),
+    "a pair beside masks": arm(pairs("d1 a1", "d1 w1"), bits=(OFF, "", OFF, 'contype="4" conaffinity="0"', OFF)),
+    "neighbours": arm(pairs("c2 d1", "b1 c3", "b1 c1")),
+    "one body": arm(pairs("c2 c3")),
+    "still bodies": arm(pairs("w1 a2")),
+    "excluded": arm('<contact><exclude body1="world" body2="three"/><exclude body1="base" body2="one"/></contact>'),
+    "pair and exclude": arm(
+        '<contact><exclude body1="base" body2="two"/><exclude body1="two" body2="base"/>'
+        '<pair geom1="a2" geom2="c3"/></contact>'
+    ),
+}
+
+
+def load(text, folder, *rest, device="cpu"):
+    (folder / "arm.xml").write_text(text, encoding="utf-8")
+    return ab.Robot.load(folder / "arm.xml", *rest, device=device)
+
+
+def body_pairs(model, data):
+    return {frozenset(int(model.geom_bodyid[g]) for g in contact.geom) for contact in data.contact[: data.ncon]}
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_pairs_are_those_that_mujoco_has_contacts_of(name, tmp_path):
+    model = mujoco.MjModel.from_xml_string(ARMS[name])
+    # Within a margin of 100 all that may meet does; boxes so far apart have no contact points there.
+    model.geom_type[:], model.geom_margin[:], model.pair_margin[:] = mujoco.mjtGeom.mjGEOM_SPHERE, 50, 100
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)  # its boxes know no such margin
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    robot = load(ARMS[name], tmp_path)
+    found = {frozenset(robot.model_link[list(pair)].tolist()) for pair in robot.pairs}
+    assert found == body_pairs(model, data) and found
+
+
+@pytest.mark.parametrize("name", ["plain", "parents", "pairs only", "pair and exclude"])
+def test_links_meet_where_mujoco_has_contacts(name, tmp_path, device):
+    robot = load(ARMS[name], tmp_path, device=device)
+    model = mujoco.MjModel.from_xml_string(ARMS[name])
+    data, rows, expected = mujoco.MjData(model), random_configurations(100, robot.limits, seed=3), []
+    for row in rows:
+        data.qpos[:] = row
+        mujoco.mj_forward(model, data)
+        expected.append(data.ncon > 0)
+    assert 0 < sum(expected) < 100
+    np.testing.assert_array_equal(robot.check(rows), expected)
+
+
+def test_visual_geoms_leave_neighbours_out_unless_filterparent_is_disabled(tmp_path):
+    def of(name):
+        robot = load(ARMS[name], tmp_path, "visual")
+        names = [robot.link_names[k] for k in robot.model_link]
+        return {frozenset((names[i], names[j])) for i, j in robot.pairs}
+
+    joined = {frozenset(pair) for pair in (("base", "one"), ("world", "one"), ("two", "three"), ("one", "two"))}
+    assert not joined & of("plain") and joined <= of("parents") and of("parents") - of("plain") >= joined
+    assert of("neighbours") - of("plain") == {frozenset(p) for p in (("two", "three"), ("one", "two"), ("one", "tool"))}
+
+
+def test_equalities_and_tendons_that_nothing_enforces_are_named(tmp_path):
+    tendons = (
+        '<tendon><fixed name="short" range="0 1"><joint joint="p" coef="1"/></fixed>'
+        '<fixed name="free"><joint joint="q" coef="1"/></fixed></tendon>'
+    )
+    equalities = (
+        '<connect name="loop" body1="two" body2="base" anchor="0 0 0"/><weld body1="three"/><weld body1="one" active='
+        '"false"/><tendon tendon1="short" tendon2="free"/><joint joint1="t" joint2="q" polycoef=".1 .5 0 0 0"/>'
+        '<joint joint1="r" polycoef=".05 1 2 0 0"/>'
+    )
+    rest = f"{tendons}<equality>{equalities}</equality>"
+    off = '<option><flag equality="disable"/></option>'
+    with pytest.warns(RuntimeWarning) as caught:
+        robot = load(arm(rest), tmp_path)
+    assert [str(warning.message).split("arm.xml: ")[1] for warning in caught] == [
+        "not enforced: equality connect 'loop' of 'two' and 'base', equality weld 1 of 'three' and 'world', "
+        "equality tendon 3 of 'short' and 'free', the limits of tendon 'short'; "
+        "links stand where their joints alone put them"
+    ]
+    assert caught[0].filename == __file__ and robot.joint_names == ("p", "q")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Nothing is enforced there, and joints follow none.
+        for disabled in (equalities.split("<tendon")[0], '<joint joint1="t" joint2="q"/>'):
+            robot = load(arm(f"<equality>{disabled}</equality>", off), tmp_path)
+            assert robot.joint_names == ("p", "t", "q", "r")
+
+
+@pytest.mark.parametrize("scale", ["1 1 1", "-1 1 1", "-1 -2 1", "-1 -1 -1"])
+def test_mirrored_meshes_keep_their_outside(scale, tmp_path):
+    import trimesh
+
+    trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / "part.stl")
+    mesh = f'<asset><mesh name="m" file="part.stl" scale="{scale}"/></asset>'
+    robot = load(f'<mujoco>{mesh}<worldbody><body><geom type="mesh" mesh="m"/></body></worldbody></mujoco>', tmp_path)
+    vertices, faces = robot.models[0].mesh_at(robot.models[0].lod_max)[:2]
+    volume = trimesh.Trimesh(vertices, faces, process=False).volume
+    np.testing.assert_allclose(volume, 0.006 * abs(np.prod([float(x) for x in scale.split()])), rtol=1e-6)

@@ -1,0 +1,151 @@
+"""Edges of robots: the same bits alone and in any batch, against samples just before their times and dense ones."""
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.robots import described_arm, described_chain, random_configurations
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import warp_abtree as ab
+from warp_abtree.interop.robot import check, robot
+
+RING = ab.Model.load(trimesh.creation.torus(0.45, 0.12, 32, 12))
+ROOF = ab.Model.load(trimesh.creation.box((1.5, 0.1, 0.02)))
+AROUND = [(RING, (0, 0, 0.75, 0, 0, 0, 1)), (ROOF, (0, 0.3, 1.1, 0, 0, 0.6, 0.8))]
+WALL = ab.Model.load(trimesh.creation.box((0.1, 1, 1)))
+X, Y, Z, HERE = (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)
+CUBE = trimesh.creation.box((0.1, 0.1, 0.1))
+
+
+@pytest.fixture(scope="module")
+def arms():
+    """Return the arm of a device, made once."""
+    made = {}
+    return lambda device: made.setdefault(device, ab.Robot(described_arm(), device, mounted=["base"]))
+
+
+def random_edges(count, seed, part=0.15):
+    """Return short edges within limits."""
+    starts, others = random_configurations(count, seed=seed), random_configurations(count, seed=(seed, 1))
+    return starts, starts + part * (others - starts)
+
+
+def meets(arm, around, starts, ends, times):
+    """Return whether parts intersect on edges (e, n) at times (e, t), bool (e, t)."""
+    rows = starts[:, None] + times[..., None] * (ends - starts)[:, None]
+    return arm.check(rows.reshape(-1, starts.shape[1]), around, limits=False).reshape(times.shape)
+
+
+def check_never_late(arm, around, starts, ends, rows, tolerance):
+    """Sample edges before their times: within the tolerance, ever nearer, and all the way."""
+    time = rows["time"][:, None]
+    back = tolerance * np.append(2.0 ** -np.arange(1, 30), np.linspace(0.03, 1, 20))
+    times = np.concatenate([time - back, time * np.linspace(0, 1 - 2.0**-40, 60)], axis=1)
+    hit = meets(arm, around, starts, ends, np.maximum(times, 0.0))
+    assert not hit[(times >= 0) & (times < time)].any()
+    assert not (rows["clear"] & rows["undecided"]).any() and (rows["time"][rows["clear"]] == 1).all()
+
+
+# The fixtures are a name and what makes arms: the same for all examples.
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.9, 0.1, 1e-2, 1e-3, 2.0**-20]), st.floats(0.01, 0.4))
+def test_an_edge_alone_and_in_any_batch_has_the_same_bits(arms, device, seed, tolerance, part):
+    arm = arms(device)
+    starts, ends = random_edges(8, seed, part)
+    # One joint moves; none does; the same again, and back.
+    ends[0, 1:], ends[1] = starts[0, 1:], starts[1]
+    starts[3:5], ends[3:5] = (starts[2], ends[2]), (ends[2], starts[2])
+    alone = np.concatenate([arm.check_edges(a[None], b[None], AROUND, tolerance) for a, b in zip(starts, ends)])
+    order = np.random.default_rng(seed).permutation(8)
+    batch = arm.check_edges(starts[order], ends[order], AROUND, tolerance)
+    assert batch.tobytes() == alone[order].tobytes()
+    check_never_late(arm, AROUND, starts, ends, alone, tolerance)
+
+
+def test_times_are_never_late_and_early_by_the_tolerance_at_most(arms, device, monkeypatch):
+    arm, (starts, ends) = arms(device), random_edges(40, 7)
+    rows = arm.check_edges(starts, ends, AROUND, tolerance=2.0**-10)
+    met = ~rows["clear"]
+    assert 10 < met.sum() < 36 and 3 < (rows["time"] == 0).sum() and not rows["undecided"].any()
+    check_never_late(arm, AROUND, starts, ends, rows, 2.0**-10)
+    # What decides an edge is met in the middle of a stretch: a multiple of a small power of two.
+    after = np.minimum(rows["time"][:, None] + np.arange(17) * 2.0**-14, 1.0)
+    np.testing.assert_array_equal(meets(arm, AROUND, starts, ends, after).any(1), met)
+    monkeypatch.setattr(robot, "CHUNKS", {"cpu": (7,), "cuda": (7,)})
+    monkeypatch.setattr(check, "EDGES_AT_ONCE", 3)
+    assert arm.check_edges(starts, ends, AROUND, tolerance=2.0**-10).tobytes() == rows.tobytes()
+
+
+@pytest.mark.parametrize("tolerance", [0.3, 0.1, 1e-2])
+def test_an_edge_beside_one_that_slides_along_a_wall(device, tolerance):
+    car = ab.Robot(described_chain(CUBE, ("prismatic", X, HERE, 1.0), ("prismatic", Y, HERE, 1.0)), device)
+    wall = [(WALL, (0.71, 0, 0, 0, 0, 0, 1))]  # touched from x = 0.61 on
+    run, slide, near = ([0, 0], [1, 0]), ([0.6, -0.4], [0.6, 0.4]), ([0.61 - 1e-8, -0.4], [0.61 - 1e-8, 0.4])
+    for edges in ([run, slide], [near, run], [slide, near, run, run]):
+        starts, ends = np.array(edges, np.float64).transpose(1, 0, 2)
+        alone = [car.check_edges(a[None], b[None], wall, tolerance)[0] for a, b in zip(starts, ends)]
+        rows = car.check_edges(starts, ends, wall, tolerance)
+        assert rows.tolist() == [row.item() for row in alone]
+        for edge, row in zip(edges, rows):
+            least, most = {id(run): (0.61 - tolerance, 0.61), id(slide): (1, 1), id(near): (0, 0)}[id(edge)]
+            assert least <= row["time"] <= most
+            assert (row["clear"], row["undecided"]) == (edge is slide, edge is near)
+
+
+def test_edges_that_rest_are_as_they_start(device):
+    """Also where rounding could move parts by more than what is between them."""
+    car = ab.Robot(described_chain(CUBE, ("prismatic", X, HERE, 1.0)), device)
+    wall = [(WALL, (0.71, 0, 0, 0, 0, 0, 1))]
+    rest = np.nextafter(0.61, 0) * np.ones((3, 1)) - [[0.0], [1e-15], [-1e-12]]
+    rows = car.check_edges(rest, rest, wall)
+    np.testing.assert_array_equal(rows["clear"], ~car.check(rest, wall))
+    assert not rows["undecided"].any() and (rows["time"] == rows["clear"]).all() and not rows["clear"][2]
+
+
+@pytest.mark.parametrize("scale", [1.0, -1.0, -0.5])
+@pytest.mark.parametrize("kind", ["prismatic", "revolute"])
+def test_a_joint_that_mimics_backwards_meets_a_thin_wall(device, kind, scale):
+    """The cube slides along y, or turns around z at a distance of 1, to a wall before y = 0.3707."""
+    mesh = CUBE.copy()
+    mesh.apply_translation((1, 0, 0))
+    joint = (kind, Y if kind == "prismatic" else Z, HERE, scale)
+    finger = ab.Robot(described_chain(mesh, joint), device)
+    wall = [(ab.Model.load(trimesh.creation.box((1, 1e-4, 1))), (1, 0.3707, 0, 0, 0, 0, 1))]
+    starts, ends = np.zeros((1, 1)), np.full((1, 1), 1 / scale)
+    rows = finger.check_edges(starts, ends, wall)
+    check_never_late(finger, wall, starts, ends, rows, 1e-3)
+    # The corner that meets the wall first is at (1.05, 0.05) before the cube turns.
+    height = 0.3707 - 5e-5
+    contact = (
+        height - 0.05 if kind == "prismatic" else np.arcsin(height / np.hypot(1.05, 0.05)) - np.arctan2(0.05, 1.05)
+    )
+    assert not rows["clear"][0] and contact - 1e-3 <= rows["time"][0] <= contact
+
+
+def test_an_edge_passes_through_nothing_thin(arms, device):
+    arm = arms(device)
+    # A blade of no thickness in the way of the bent arm, which turns three times and stands free at most samples.
+    blade = [ab.Model.from_arrays([[0.3, 0, 0.2], [2, 0, 0.2], [2, 0, 3], [0.3, 0, 3]], [[0, 1, 2], [0, 2, 3]])]
+    ends = np.array([[-9.0, 1.4, 0.05, 0], [9.0, 1.4, 0.05, 0]])
+    sampled = arm.check(np.linspace(*ends, 60), blade)
+    assert not sampled[0] and sampled.mean() < 0.3
+    rows = arm.check_edges(ends[:1], ends[1:], blade, tolerance=1e-5)
+    assert not rows["clear"][0] and not rows["undecided"][0]
+    # Within the tolerance of the time there is contact, and before it none at as many more configurations.
+    time = rows["time"][0]
+    at, before = (
+        ends[0] + np.linspace(*span, 500)[:, None] * (ends[1] - ends[0]) for span in ((time, time + 1e-5), (0, time))
+    )
+    assert arm.check(at, blade).any() and not arm.check(before, blade).any()
+
+
+def test_edges_that_slide_are_undecided(arms, device, monkeypatch):
+    arm = arms(device)
+    monkeypatch.setattr(check, "STRETCHES_MAX", 64)
+    # The ring turns in its own plane, so near a plate that no stretch is proved free.
+    plate = [(ab.Model.load(trimesh.creation.box((3, 3, 0.02))), (0, 0, 0.36 - 0.01 - 1e-7, 0, 0, 0, 1))]
+    ends = np.array([[0.0, 0, 0.05, 0], [3.0, 0, 0.05, 0]])
+    assert not arm.check(ends, plate).any()
+    row = arm.check_edges(ends[:1], ends[1:], plate)[0]
+    assert row["undecided"] and not row["clear"] and row["time"] == 0

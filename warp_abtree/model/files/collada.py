@@ -1,0 +1,86 @@
+"""Collada files (DAE), parsed by pycollada: the polygons of their nodes, an object a node and geometry."""
+
+import io
+
+import numpy as np
+
+from warp_abtree.checks.arguments import first_line
+from warp_abtree.model.files.found import MeshError, Remarks
+from warp_abtree.model.files.polygons import triangulate
+
+# What tells errors of pycollada that concern no shapes.
+LOOKS = ("effect", "material", "image", "surface", "sampler", "texture", "camera", "light", "animation")
+
+
+def read_collada(data: bytes, where: str, remarks: Remarks):
+    """Return a Collada file as a trimesh.Scene, in the file's units and axes.
+
+    Raises:
+        MeshError: pycollada is missing, the file is damaged, or a polygon has holes.
+    """
+    import trimesh
+
+    try:
+        import collada
+    except ImportError:
+        raise MeshError(f"{where}: reading it needs pycollada: pip install pycollada") from None
+    try:
+        file = collada.Collada(io.BytesIO(data), ignore=[collada.common.DaeError])
+    except Exception as error:  # XML, or whatever goes wrong inside the parser
+        raise MeshError(f"{where}: cannot be read as dae: {first_line(error)}") from None
+    for broken in map(first_line, file.errors):
+        if not any(word in broken.lower() for word in LOOKS):
+            remarks.add("left out what is broken:", broken)
+    for geometry in file.geometries:
+        if geometry.xmlnode is not None and any(str(node.tag).endswith("}ph") for node in geometry.xmlnode.iter()):
+            raise MeshError(f"{where}: geometry {geometry.id!r} has polygons with holes (<ph>), which are not read")
+    made, known = trimesh.Scene(), {}
+    open_nodes = [(node, np.eye(4), None) for node in reversed(file.scene.nodes if file.scene else [])]
+    while open_nodes:
+        node, above, name = open_nodes.pop()
+        if isinstance(node, collada.scene.Node):
+            pose = above @ np.asarray(node.matrix, np.float64)
+            # An instance of a node has none of its own.
+            title = node.xmlnode.get("name") or node.xmlnode.get("id") or name or node.id
+            open_nodes += [(child, pose, title) for child in reversed(node.children or [])]
+        elif isinstance(node, collada.scene.ControllerNode):
+            remarks.add("left out", f"{name or node.controller.id} (skin or morph)")
+        elif isinstance(node, collada.scene.GeometryNode):
+            geometry = node.geometry
+            if geometry.id not in known:
+                known[geometry.id] = _read_geometry(geometry, where, remarks)
+                if known[geometry.id] is not None:
+                    made.geometry[geometry.id] = known[geometry.id]
+            if known[geometry.id] is not None:
+                frame = trimesh.util.unique_name(name or geometry.id, made.graph.nodes)
+                made.graph.update(frame, geometry=geometry.id, matrix=above)
+    return made
+
+
+def _read_geometry(geometry, where, remarks):
+    """Return a geometry as a trimesh.Trimesh, None without polygons."""
+    import collada
+    import trimesh
+
+    vertices, faces, count = [], [], 0
+    for primitive in geometry.primitives:
+        place = f"{where}: geometry {geometry.id!r}"
+        if isinstance(primitive, collada.lineset.LineSet):
+            remarks.add("left out", f"lines of {geometry.id!r}")
+            continue
+        if primitive.vertex is None:
+            continue
+        corners = np.asarray(primitive.vertex_index, np.int64)
+        points = np.asarray(primitive.vertex, np.float64)
+        if isinstance(primitive, collada.polylist.Polylist):
+            counts = np.asarray(primitive.vcounts, np.int64)
+            if counts.sum() != len(corners):
+                raise MeshError(f"{place}: its polygons have {counts.sum()} corners, their indices {len(corners)}")
+        else:
+            counts = np.full(len(corners), 3)
+        faces.append(triangulate(points, counts, corners.reshape(-1), place) + count)
+        vertices.append(points)
+        count += len(points)
+    if not sum(map(len, faces)):
+        return None
+    return trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)

@@ -1,0 +1,76 @@
+"""What the readers of mesh files return, and the error that they raise."""
+
+import inspect
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+NAMED = 4  # things that a warning lists by name
+
+
+class MeshError(ValueError):
+    """Say in one line what is wrong with a mesh, and where."""
+
+
+class Remarks:
+    """What a reader did not take as it stands in the file: what was done, and with which things."""
+
+    def __init__(self):
+        self._found: dict[str, list[str]] = {}
+
+    def add(self, what: str, name: str):
+        """Remember what was done with a thing: `add("left out", "edges")`."""
+        names = self._found.setdefault(what, [])
+        if name not in names:
+            names.append(name)
+
+    def __str__(self):
+        """All of them in one line, empty without any."""
+        said = []
+        for what, names in self._found.items():
+            more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+            said.append(f"{what} {', '.join(names[:NAMED])}{more}")
+        return "; ".join(said)
+
+    def warn(self, where):
+        """Warn of them, if any, at the line that called the library."""
+        frame, level = inspect.currentframe(), 1
+        while frame is not None and frame.f_globals.get("__name__", "").startswith("warp_abtree."):
+            frame, level = frame.f_back, level + 1
+        if str(self):
+            warnings.warn(f"{where}: {self}", stacklevel=level)
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles over one list of vertices, in the order of their file.
+
+    Attributes:
+        vertices: Positions [file's units], float64 (v, 3).
+        faces: Corners (n_f, 3), integers.
+        names: Of the parts that the file makes of its faces, None for one without a name.
+        parts: Part of each face (n_f,); None where there is one part.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    names: tuple[str | None, ...] = (None,)
+    parts: np.ndarray | None = None
+
+    def as_scene(self, name: str):
+        """Return a trimesh.Scene with a node of each part that has faces, those without a name called by one."""
+        import trimesh
+
+        scene = trimesh.Scene()
+        for part, own in enumerate(self.names):
+            faces = self.faces if self.parts is None else self.faces[self.parts == part]
+            if len(faces):
+                vertices = self.vertices
+                if self.parts is not None:
+                    used, corners = np.unique(faces, return_inverse=True)
+                    vertices, faces = vertices[used], corners.reshape(-1, 3)
+                mesh = trimesh.Trimesh(vertices, faces, process=False)
+                title = trimesh.util.unique_name(own or name, scene.geometry)
+                scene.add_geometry(mesh, node_name=title, geom_name=title)
+        return scene

@@ -1,0 +1,116 @@
+"""OBJ files in the order of their faces, a part an object (`o`)."""
+
+import codecs
+
+import numpy as np
+
+from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.polygons import triangulate
+
+# How lines of plain OBJ files begin; in others, a `v` or `f` might stand behind a tab, say.
+PLAIN_STARTS = {b"", b"v ", b"f ", b"vn", b"vt", b"# ", b"#", b"o ", b"g ", b"s ", b"us", b"mt"}
+LEFT_OUT = {b"p": "points", b"l": "lines", b"curv": "curves", b"curv2": "curves", b"surf": "free-form surfaces"}
+LEFT_OUT |= {b"call": "called files"}
+
+
+def _parse_plain_obj(data) -> Surface | None:
+    """Return what an OBJ file holds where each `v` has three numbers and each `f` three plain indices.
+
+    None for any other file, and for one that has mistakes.
+    """
+    lines = data.splitlines()
+    starts = {line[:2] for line in lines}
+    if any(mark in data for mark in (b"\\", b"\t", b"\v", b"\f")) or not starts <= PLAIN_STARTS:
+        return None
+    points = _plain_triples([line[2:] for line in lines if line[:2] == b"v "], float)
+    corners = _plain_triples([line[2:] for line in lines if line[:2] == b"f "], int)
+    if points is None or corners is None or corners.min() <= 0 or corners.max() > len(points):
+        return None
+    parts, count = _Parts(), 0
+    for line in lines if b"o " in starts else ():
+        if line[:2] == b"o ":
+            parts.begin(line, count)
+        count += line[:2] == b"f "
+    return Surface(points, corners - 1, *parts.of(np.ones(count, int)))
+
+
+def _plain_triples(rows, number) -> np.ndarray | None:
+    """Return the numbers of rows that have three each with a blank between them, [n, 3]; None if one has not."""
+    if {row.count(b" ") for row in rows} != {2}:
+        return None
+    words = b" ".join(rows).split()
+    try:
+        # Two blanks make three words at most, so every row has three if there are as many in all.
+        kind = np.float64 if number is float else np.int64
+        return np.array(list(map(number, words)), kind).reshape(-1, 3) if len(words) == 3 * len(rows) else None
+    except (ValueError, OverflowError):
+        return None
+
+
+class _Parts:
+    """The objects that a file's lines begin: each `o` line one, whatever its name."""
+
+    def __init__(self):
+        self.names: list[str | None] = [None]
+        self.starts = [0]
+
+    def begin(self, line, polygon_count):
+        """Begin an object with the next polygon."""
+        self.names.append(b" ".join(line.split()[1:]).decode(errors="replace") or None)
+        self.starts.append(polygon_count)
+
+    def of(self, triangle_counts):
+        """Return the names of the parts, and the part of each triangle, for the triangles of each polygon."""
+        if len(self.names) == 1:
+            return (None,), None
+        parts = np.searchsorted(self.starts, np.arange(len(triangle_counts)), side="right") - 1
+        return tuple(self.names), np.repeat(parts, triangle_counts)
+
+
+def read_obj(data: bytes, where: str, remarks: Remarks) -> Surface:
+    """Return what an OBJ file holds; raise MeshError with the line that cannot be read."""
+    data = data.removeprefix(codecs.BOM_UTF8)
+    plain = _parse_plain_obj(data)
+    if plain is not None:
+        return plain
+    vertices, corners, counts, parts = [], [], [], _Parts()
+    for number, line in enumerate(data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines(), start=1):
+        fields = line.split()
+        kind = fields[0] if fields else b""
+        if kind != b"v" and kind != b"f":
+            if kind == b"o":
+                parts.begin(line, len(counts))
+            elif kind in LEFT_OUT:
+                remarks.add("left out", LEFT_OUT[kind])
+            continue
+        if b"#" in line:
+            fields = line.split(b"#", 1)[0].split()
+        try:
+            if kind == b"v":
+                x, y, z = fields[1:4]
+                vertices.append((float(x), float(y), float(z)))
+                continue
+            if b"/" in line:
+                fields = [field.split(b"/", 1)[0] for field in fields]
+            polygon = [int(field) for field in fields[1:]]
+            if len(polygon) < 3:
+                raise ValueError
+        except ValueError:
+            text = line.decode(errors="replace").strip()
+            raise MeshError(f"{where}: line {number} cannot be read: {text[:60]}") from None
+        if min(polygon) <= 0:
+            # A negative index counts back from the last vertex so far.
+            polygon = [index if index > 0 else len(vertices) + index + 1 if index else 0 for index in polygon]
+            if min(polygon) <= 0:
+                raise MeshError(f"{where}: line {number} refers to a vertex before the first")
+        corners.extend(polygon)
+        counts.append(len(polygon))
+    if not counts:
+        raise MeshError(f"{where}: no faces")
+    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+    try:
+        indices = np.array(corners, dtype=np.int64) - 1
+    except OverflowError:
+        raise MeshError(f"{where}: a face refers to vertex {max(corners)}, but there are {len(points)}") from None
+    polygons = np.array(counts)
+    return Surface(points, triangulate(points, polygons, indices, where), *parts.of(polygons - 2))

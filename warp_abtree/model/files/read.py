@@ -1,0 +1,132 @@
+"""Mesh files of all formats: our own readers where polygons, parts or what is left out matter, trimesh for the rest."""
+
+import io
+import re
+import warnings
+import zlib
+from pathlib import Path
+
+from warp_abtree.checks.arguments import first_line
+from warp_abtree.model.files.collada import read_collada
+from warp_abtree.model.files.found import MeshError, Remarks, Surface
+from warp_abtree.model.files.gltf import read_gltf
+from warp_abtree.model.files.obj import read_obj
+from warp_abtree.model.files.off import read_off
+from warp_abtree.model.files.ply import read_ply
+from warp_abtree.model.files.stl import read_stl
+from warp_abtree.model.files.unpack import gunzip, open_zip
+
+SURFACES = {"obj": read_obj, "ply": read_ply, "off": read_off, "stl": read_stl, "stl_ascii": read_stl}
+USD = ("usd", "usda", "usdc", "usdz")
+# Of trimesh, or of ours: packages that some formats need.
+NEEDED = {"step": "cascadio", "stp": "cascadio", "dae": "pycollada", "zae": "pycollada", "xaml": "lxml"}
+NEEDED |= {"3mf": "lxml networkx", "3dxml": "lxml networkx"}
+UNREAD = {"tar.gz", "tar.bz2", "bz2"}  # archives that trimesh would read past the limit, and past our readers
+
+
+def split_file_name(path: Path) -> tuple[str, str, bool]:
+    """Return a mesh file's name without extensions, its format as trimesh calls it, and whether it is gzipped."""
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    archive = suffixes[-2:] in ([".tar", ".gz"], [".tar", ".bz2"])
+    zipped = suffixes[-1:] == [".gz"] and not archive
+    kind = "".join(suffixes[-2:-1] if zipped else suffixes[-2:] if archive else suffixes[-1:]).removeprefix(".")
+    stem = path.name.removesuffix(path.suffixes[-1]) if zipped else path.name
+    return stem[: len(stem) - len(kind) - 1] if kind else stem, kind, zipped
+
+
+def read_file(path: Path, remarks: Remarks):
+    """Return a `Surface` of a file with one list of vertices; of any other format a trimesh.Scene.
+
+    Raises:
+        MeshError: The file is missing, damaged, of an unknown format, or holds what cannot be read.
+    """
+    if path.is_dir():
+        raise MeshError(f"{path}: is a folder, not a mesh file")
+    if not path.exists():
+        raise MeshError(f"{path}: no such file")
+    if not path.is_file():
+        raise MeshError(f"{path}: is no regular file")
+    _, kind, zipped = split_file_name(path)
+    if kind == "npz":
+        raise MeshError(f"{path}: not a mesh file; a built model is read by Model.open")
+    if kind in USD:
+        raise MeshError(f"{path}: USD is read by scene_from_file alone, as a scene of its objects")
+    try:
+        data = path.read_bytes()
+        if zipped:
+            data = gunzip(data, str(path))
+    except (OSError, EOFError, zlib.error) as error:
+        raise MeshError(f"{path}: cannot be read: {first_line(error)}") from None
+    if kind in SURFACES:
+        return SURFACES[kind](data, str(path), remarks)
+    from trimesh.resolvers import FilePathResolver
+
+    return _read_data(data, kind, str(path), FilePathResolver(str(path)), remarks)
+
+
+def _read_data(data, kind, where, resolver, remarks):
+    """Return what the bytes of a file hold, as `read_file` does."""
+    import trimesh
+
+    if kind in SURFACES:
+        return SURFACES[kind](data, where, remarks)
+    if kind in ("glb", "gltf"):
+        return read_gltf(data, where, resolver, remarks)
+    if kind == "dae":
+        return read_collada(data, where, remarks)
+    if kind in UNREAD:
+        raise MeshError(f"{where}: unpack it; of archives zip and gz alone are read")
+    known = trimesh.available_formats() - UNREAD
+    if kind not in known and kind in NEEDED:
+        raise MeshError(f"{where}: reading it needs {NEEDED[kind]}: pip install {NEEDED[kind]}")
+    if kind not in known:
+        raise MeshError(f"{where}: cannot be read: unknown extension '{kind}'; known here: {' '.join(sorted(known))}")
+    try:
+        if kind in ("zip", "zae"):
+            return _read_archive(open_zip(data, where), where, remarks)
+        if kind in ("3mf", "3dxml"):
+            _check_extensions(open_zip(data, where), where)
+        with warnings.catch_warnings():
+            # Older NumPy only warns where a number in a text file cannot be read, and cuts the file short there.
+            warnings.filterwarnings("error", message="string or file could not be read")
+            return trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False)
+    except MeshError:
+        raise
+    except Exception as error:  # trimesh's readers raise whatever goes wrong inside them
+        raise MeshError(f"{where}: cannot be read as {kind}: {first_line(error)}") from None
+
+
+def _check_extensions(archive, where):
+    """Refuse a 3MF file that requires an extension which trimesh passes over, such as beam lattices."""
+    for name in archive.namelist():
+        root = re.search(rb"<(\w+:)?model\b[^>]*>", archive.read(name)) if name.lower().endswith(".model") else None
+        text = root[0] if root else b""
+        required = re.search(rb"""requiredextensions\s*=\s*["']([^"']*)""", text)
+        for prefix in required[1].split() if required else ():
+            space = re.search(rb"xmlns:" + re.escape(prefix) + rb"""\s*=\s*["']([^"']*)""", text)
+            title = (space[1] if space else prefix).decode(errors="replace")
+            if not any(known in title for known in ("/production/", "/material/")):
+                raise MeshError(f"{where}: requires the 3MF extension {title}, which is not read")
+
+
+def _read_archive(archive, where, remarks):
+    """Return the mesh files of a zip archive in one scene."""
+    import trimesh
+
+    members = {member.filename: archive.read(member) for member in archive.infolist() if not member.is_dir()}
+    resolver = trimesh.resolvers.ZipResolver({name: io.BytesIO(data) for name, data in members.items()})
+    merged = trimesh.Scene()
+    for name, data in members.items():
+        stem, kind, zipped = split_file_name(Path(name))
+        if zipped or kind in {*USD, *UNREAD, "zip"}:
+            remarks.add("left out", name)
+        elif kind in trimesh.available_formats() or kind in NEEDED:
+            found = _read_data(data, kind, f"{where}: {name}", resolver, remarks)
+            scene = found.as_scene(stem) if isinstance(found, Surface) else found
+            for node in scene.graph.nodes_geometry:
+                pose, part = scene.graph[node]
+                title = trimesh.util.unique_name(node, merged.graph.nodes)
+                merged.add_geometry(scene.geometry[part], title, f"{name}: {part}", transform=pose)
+    if not merged.geometry:
+        raise MeshError(f"{where}: holds no mesh file")
+    return merged
