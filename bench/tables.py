@@ -1,11 +1,13 @@
-"""python -m bench.tables STUDY.json ...: write STUDY.md beside it, as for the pages in docs/data.
+"""python -m bench.tables FILE.json ...: write the tables of these rows into the pages that show them.
 
-Rows as JSON, as Markdown tables and as figures. What tables and figures show is laid out in TOML files beside the cases
-and studies.
+A study has a page of its own beside its rows, with all tables. Other pages, README.md and docs/*.md, have tables
+between <!-- table FILE NAME --> and <!-- end -->. What tables and figures show is laid out in TOML files beside the
+cases and studies.
 """
 
 import importlib
 import json
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -17,6 +19,8 @@ from warp_abtree.checks.atomic_write import atomic_write
 from .timing import fit_slope, upper_half
 
 HERE = Path(__file__).parent
+PAGES = ("README.md", "docs/*.md")
+PLACE = re.compile(r"(<!-- table (?P<file>\w+) (?P<table>\w+) -->\n)(?:(?!<!-- table).)*?(<!-- end -->)", re.S)
 SHOWN_RUN = ("device", "date", "command", "seconds", "warp", "warp_abtree", "numpy", "python")
 DIGITS = 5  # significant ones of a number that is kept
 # Okabe and Ito's colours, which people with any colour vision tell apart; lines differ by dashes and markers as well.
@@ -39,8 +43,9 @@ def read_layout(name) -> dict:
 
 
 def pick(rows, **where) -> list:
-    """Return the rows that have all of these values."""
-    return [row for row in rows if all(row.get(name) == value for name, value in where.items())]
+    """Return the rows that have all of these values, or one of them where a list is given."""
+    wanted = {name: value if isinstance(value, list) else [value] for name, value in where.items()}
+    return [row for row in rows if all(row.get(name) in values for name, values in wanted.items())]
 
 
 def plain(value):
@@ -78,19 +83,32 @@ def shown(value, form="") -> str:
 
 
 def select_rows(layout, study):
-    """Return the rows of a table or figure: of its part, chosen by `where`, and summarised where it says so."""
+    """Return the rows of a table or figure: of its part, chosen by `where`, and summarised where it says so.
+
+    A layout's `rows` are texts, each with the values of one row of the study in it.
+    """
+    if "rows" in layout:
+        return [show_row(row, study) for row in layout["rows"]]
     rows = pick(study["parts"].get(layout["part"], {"rows": []})["rows"], **layout.get("where", {}))
     if rows and "select" in layout:
         rows = importlib.import_module(f"bench.studies.{study['study']}").SUMMARIES[layout["select"]](rows)
     return rows
 
 
-def markdown_table(layout, study) -> str:
-    """Return a table of a study as Markdown."""
-    rows = select_rows(layout, study)
+def show_row(layout, study) -> dict:
+    """Return the texts of a row, its values filled in."""
+    (row,) = pick(study["parts"][layout["part"]]["rows"], **layout["where"])
+    return {name: text.format(**row) for name, text in layout["show"].items()}
+
+
+def markdown_table(layout, study, short=None) -> str:
+    """Return a table of a study as Markdown; of `short` only its `columns`, and the rows that `where` selects."""
+    short = short or {}
+    rows = pick(select_rows(layout, study), **short.get("where", {}))
     if not rows:
         return "Not measured in this run."
     columns = [(name, heading, *form, "")[:3] for name, heading, *form in layout["columns"]]
+    columns = [column for column in columns if column[0] in short.get("columns", [column[0]])]
     left = [any(isinstance(row.get(name), str) for row in rows) for name, _, _ in columns]
     lines = [[heading for _, heading, _ in columns], ["---" if is_left else "--:" for is_left in left]]
     lines += [[shown(row.get(name), form) for name, _, form in columns] for row in rows]
@@ -98,29 +116,71 @@ def markdown_table(layout, study) -> str:
 
 
 def markdown_run(study) -> str:
-    """Return device, date, versions and command as a Markdown list; seconds are summed."""
+    """Return what is known of device, date, versions and command as a Markdown list; seconds are summed."""
     runs = [part["run"] for part in study["parts"].values()]
     lines = []
     for key in SHOWN_RUN:
-        values = [run[key] for run in runs]
+        values = [run[key] for run in runs if key in run]
         text = f"{sum(values):.0f}" if key == "seconds" else ", ".join(dict.fromkeys(map(str, values)))
-        lines.append(f"- {key}: `{text}`" if key == "command" else f"- {key}: {text}")
-    if any(run["quick"] for run in runs):
+        if values and (key not in ("device", "command") or len(set(values)) == 1):  # else each table says it
+            lines.append(f"- {key}: `{text}`" if key == "command" else f"- {key}: {text}")
+    if any(run.get("quick") for run in runs):
         lines.append("- size: quick, to try the parts out, not to be quoted")
     return "\n".join(lines)
 
 
+def say_run(run) -> str:
+    """Return the device and the command of a part."""
+    return f"{run['device']}: `{run['command']}`."
+
+
 def study_page(study) -> str:
-    """Return all tables of a study as one Markdown page; each says its device where parts ran on several."""
-    devices = {name: part["run"]["device"] for name, part in study["parts"].items()}
-    every = list(dict.fromkeys(devices.values()))
-    blocks = [f"# Study {study['study']}: {', '.join(every) or 'nothing'}", markdown_run(study)]
-    for table in read_layout(f"studies/{study['study']}.toml")["table"]:
-        if table["part"] in study["parts"]:
-            blocks += [f"## {table['title']}"] + [f"Device: {devices[table['part']]}."] * (len(every) > 1)
+    """Return all tables of a study as one Markdown page; each says its device and command where these differ."""
+    ran = {name: say_run(part["run"]) for name, part in study["parts"].items()}
+    devices = list(dict.fromkeys(part["run"]["device"] for part in study["parts"].values()))
+    layout = read_layout(f"studies/{study['study']}.toml")
+    title = layout.get("title", f"Study {study['study']}: {', '.join(devices) or 'nothing'}")
+    blocks = [f"# {title}", markdown_run(study)]
+    for table in layout["table"]:
+        if table.get("part") in study["parts"]:
+            blocks += [f"## {table['title']}"] + [ran[table["part"]]] * (len(set(ran.values())) > 1)
             blocks += [markdown_table(table, study)] + ([table["note"]] if "note" in table else [])
     blocks += [note for part in study["parts"].values() for note in part["notes"]]
     return "\n\n".join(blocks) + "\n"
+
+
+def fill_page(text, name, study) -> str:
+    """Return the text of a page with the tables of a file of rows in their places, each with its device and command.
+
+    Of a layout that has `short` only that is shown.
+
+    Raises:
+        ValueError: The layout has no such table.
+    """
+    layouts = {table["name"]: table for table in read_layout(f"studies/{study['study']}.toml")["table"]}
+
+    def fill(place):
+        if place["file"] != name:
+            return place[0]
+        if place["table"] not in layouts:
+            raise ValueError(f"no table {place['table']} in bench/studies/{study['study']}.toml")
+        layout, said = layouts[place["table"]], ""
+        if "part" in layout:
+            said = f"\n{say_run(study['parts'][layout['part']]['run'])} "
+        return f"{place[1]}{markdown_table(layout, study, layout.get('short'))}\n{said}{place[4]}"
+
+    return PLACE.sub(fill, text)
+
+
+def find_pages(file) -> dict:
+    """Return what the pages that show a file's rows hold: a study's own, and all that have places for its tables."""
+    study = json.loads(file.read_text(encoding="utf-8"))
+    texts = {file.with_suffix(".md"): study_page(study)}
+    for page in sorted(path for pattern in PAGES for path in HERE.parent.glob(pattern)):
+        text = page.read_text(encoding="utf-8")
+        if any(place["file"] == file.stem for place in PLACE.finditer(text)):
+            texts[page] = fill_page(text, file.stem, study)
+    return texts
 
 
 def draw(figures, rows, folder) -> str:
@@ -220,10 +280,10 @@ def label_ticks(axis, values):
 
 
 def main(files) -> int:
-    """Write the pages of studies."""
+    """Write the pages that show these files' rows."""
     for file in map(Path, files):
-        study = json.loads(file.read_text(encoding="utf-8"))
-        file.with_suffix(".md").write_text(study_page(study), encoding="utf-8")
+        for page, text in find_pages(file).items():
+            page.write_text(text, encoding="utf-8")
     return 0
 
 

@@ -53,14 +53,50 @@ def test_labels_of_a_logarithmic_axis_do_not_overlap(tmp_path):
 def test_pages_repeat_their_data(file, tmp_path):
     """python -m bench.tables docs/data/*.json writes the pages; all tables and figures have rows."""
     data = json.loads(file.read_text(encoding="utf-8"))
-    page = tables.study_page(data)
-    assert file.with_suffix(".md").read_text(encoding="utf-8") == page and "Not measured" not in page
-    assert not any(part["run"]["quick"] for part in data["parts"].values())
-    assert set(study.find_study(data["study"]).PARTS) == set(data["parts"])
+    pages = tables.find_pages(file)
+    assert pages and not any("Not measured" in text for text in pages.values())
+    assert {page: page.read_text(encoding="utf-8") for page in pages} == pages
+    assert not any(part["run"].get("quick") for part in data["parts"].values())
+    if data["study"] != "performance":
+        assert set(study.find_study(data["study"]).PARTS) == set(data["parts"])
     pytest.importorskip("matplotlib")
-    figures = tables.read_layout(f"studies/{data['study']}.toml")["figure"]
+    figures = tables.read_layout(f"studies/{data['study']}.toml").get("figure", [])
     said = tables.draw(figures, lambda figure: tables.select_rows(figure, data), tmp_path)
     assert all(figure["file"] in said for figure in figures)
+
+
+def test_tables_of_pages_change_with_their_data(tmp_path):
+    """A number of one row stands in three pages; each part and each layout has a place in one."""
+    data = json.loads((DATA / "performance.json").read_text(encoding="utf-8"))
+    (row,) = tables.pick(data["parts"]["distance"]["rows"], workload="knot", poses=65536)
+    row["again_ms"] = 8.7654
+    changed = tmp_path / "performance.json"
+    tables.write_json(changed, data)
+    pages = tables.find_pages(changed)
+    own = pages.pop(changed.with_suffix(".md"))
+    assert [path.name for path in pages] == ["README.md", "performance.md"] and "8.7654" in own
+    for page, text in pages.items():
+        assert "8.7654" in text and "8.7654" not in page.read_text(encoding="utf-8")
+    laid_out = tables.read_layout("studies/performance.toml")["table"]
+    places = {place["table"] for text in pages.values() for place in tables.PLACE.finditer(text)}
+    assert {table["name"] for table in laid_out if "title" not in table or "short" in table} <= places
+    assert {table["part"] for table in laid_out if "title" in table} == set(data["parts"])
+
+
+def test_a_short_table_has_some_rows_and_columns():
+    study = {"parts": {"one": {"rows": [{"a": n, "b": n + 0.5} for n in range(3)]}}}
+    layout = {"part": "one", "columns": [["a", "A"], ["b", "B", ".2f"]]}
+    assert tables.markdown_table(layout, study).count("\n") == 4
+    short = {"where": {"a": [1, 2]}, "columns": ["b"]}
+    assert tables.markdown_table(layout, study, short) == "| B |\n| --: |\n| 1.50 |\n| 2.50 |"
+
+
+def test_a_place_for_a_table_that_there_is_not():
+    data = json.loads((DATA / "performance.json").read_text(encoding="utf-8"))
+    other = "<!-- table other gone -->\n<!-- end -->"
+    assert tables.fill_page(other, "performance", data) == other
+    with pytest.raises(ValueError, match="no table gone in "):
+        tables.fill_page(other.replace("other", "performance"), "performance", data)
 
 
 def test_models_are_kept(tmp_path, monkeypatch):
