@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,8 @@ class Tree:
     """A process that answers for one checkout."""
 
     def __init__(self, root, device, quick, cache=None):
-        env = os.environ | {"PYTHONPATH": str(root)} | ({"WARP_CACHE_PATH": str(cache)} if cache else {})
+        paths = os.pathsep.join(filter(None, [str(root), os.environ.get("PYTHONPATH")]))
+        env = os.environ | {"PYTHONPATH": paths} | ({"WARP_CACHE_PATH": str(cache)} if cache else {})
         command = [sys.executable, "-P", str(WORKER), device, "quick" if quick else "full"]
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env, cwd=root
@@ -98,7 +100,9 @@ def compare_digests(trees, regimes):
     differing = 0
     for regime in regimes:
         for part in asked["now"]:
-            found = {name: tree.ask("digest", name=part, regime=regime) for name, tree in trees.items()}
+            command = {"do": "digest", "name": part, "regime": regime}
+            with ThreadPoolExecutor() as pool:  # each tree compiles its kernels
+                found = dict(zip(trees, pool.map(lambda tree, command=command: tree.ask(**command), trees.values())))
             for key in dict.fromkeys(key for answers in found.values() for key in answers):
                 row = {name: answers.get(key) for name, answers in found.items()}
                 differs = len(set(row.values())) > 1
