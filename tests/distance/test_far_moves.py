@@ -38,22 +38,26 @@ def test_far_moves_cost_no_more_than_a_fresh_search():
 
 
 def test_searches_never_start_from_faces_that_are_not_there(device):
-    """Faces that the LOD lacks, of a ring about its frame's origin and of a ball there, and faces that it has."""
+    """Faces that a LOD lacks, of a ring about its frame's origin and of a ball there or beside it."""
     ring, ball = ab.Model.load(trimesh.creation.torus(0.5, 0.1, major_sections=24, minor_sections=12)), sample("ball")
     small = ab.Model.from_arrays(ball.mesh_at(ball.lod_max)[0] / 8, ball.mesh_at(ball.lod_max)[1])
     scene, lods = ab.Scene(device), [model.lod_for(fraction=0.3) for model in (ring, small)]
-    for _ in range(20):
-        for model, lod in zip((ring, small), lods):
-            scene.add(model, lod=lod)
-    pairs, rng = np.arange(40).reshape(-1, 2), np.random.default_rng(1)
+    for offset in 0.1 * np.random.default_rng(1).normal(size=(20, 3)):
+        for model, lod, place in zip((ring, small), lods, (np.zeros(3), offset)):
+            scene.add(model, (*place, 0, 0, 0, 1), lod=lod)
+    pairs, gone = np.arange(40).reshape(-1, 2), 0
     query = ab.DistanceQuery(scene, pairs)
-    expected = query.run()
     there = [np.isin(np.arange(model.face_count), model.mesh_at(lod)[2]) for model, lod in zip((ring, small), lods)]
     active = launch(is_active_kernel, device, ring.face_count + 5, *scene.batch().pools[:2])
     np.testing.assert_array_equal(active, [*there[0], *[False] * 5])
-    for kinds in ((False, False), (False, True), (True, False), (True, True)):
-        faces = [rng.choice(np.flatnonzero(rows == kind), len(pairs)) for rows, kind in zip(there, kinds)]
-        query.start_from(np.stack(faces, 1))
+    # The last faces of other LODs: some of these are gone.
+    for fractions in ((1.0, 1.0), (0.3, 0.3), (1.0, 0.3), (0.3, 0.3), (0.05, 1.0), (0.3, 0.3)):
         found = query.run()
+        lods = [model.lod_for(fraction=fraction) for model, fraction in zip((ring, small), fractions)]
+        scene.set_lods(np.tile(lods, 20))
+        there = [np.isin(np.arange(model.face_count), model.mesh_at(lod)[2]) for model, lod in zip((ring, small), lods)]
+        gone += int((~there[0][found.point_faces[:, 0]] | ~there[1][found.point_faces[:, 1]]).sum())
+        found, expected = query.run(), ab.DistanceQuery(scene, pairs).run()
         for name in ("distance", "bracket", "points", "point_faces"):
             np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert gone > 20
