@@ -131,6 +131,9 @@ def test_a_limit_that_urdf_leaves_out_is_zero(urdf):
         ("</robot>", "", r"arm.urdf: not read as URDF \(line \d+: "),  # yourdfpy would read what is there
         ('<box size="0.06 0.06 0.4"/>', "", r"not read as URDF \(line 10: a geometry has one shape\)"),
         ('<box size="0.06', '<sphere radius="1"/><box size="0.06', r"\(line 10: a geometry has one shape\)"),
+        ('<link name="flange"/>', '<link name="flange"><collision/></link>', "line 12: a collision has one geometry"),
+        (' size="0.06 0.06 0.4"', "", "an element lacks 'size'"),
+        ('<robot name="arm">', '<robot name="arm" xmlns="urdf">', "its root is '{urdf}robot', not 'robot'"),
         ('lower="-2.8"', 'lower="2.9"', "joint 'bend': limits 2.9 .. 2.8 leave no value"),
         ('lower="-2.8"', 'lower="nan"', "joint 'bend': limits nan .. 2.8 leave no value"),
         (BEND_LIMIT, "", "joint 'bend' is revolute and has no limits; .*, or make it continuous$"),
@@ -186,6 +189,33 @@ def test_bad_mjcf_is_refused(mjcf, before, after, message):
     mjcf.write_text(MJCF.replace(before, after), encoding="utf-8")
     with pytest.raises(ValueError, match=message):
         ab.Robot.load(mjcf, device="cpu")
+
+
+def test_formats_are_told_apart_and_a_geometry_without_meshes_is_named(urdf, mjcf, tmp_path):
+    for source, name, message in (
+        (mjcf, "other.urdf", "other.urdf: not read as URDF .its root is 'mujoco', not 'robot'"),
+        (urdf, "other.xml", "other.xml: not read as MJCF .its root is 'robot', as of a URDF"),
+    ):
+        # A comment before the root counts for nothing.
+        (tmp_path / name).write_text("<!-- <mujoco> <robot> -->" + source.read_text("utf-8"), encoding="utf-8")
+        with pytest.raises(ValueError, match=message):
+            ab.Robot.load(tmp_path / name, device="cpu")
+    urdf.write_text(
+        '<robot name="r"><link name="l"><visual><geometry><sphere radius="1"/></geometry></visual></link></robot>'
+    )
+    mjcf.write_text('<mujoco><worldbody><geom size="1" contype="0" conaffinity="0"/></worldbody></mujoco>')
+    for path in (urdf, mjcf):
+        with pytest.raises(ValueError, match=f"{path.name}: no link has a mesh of geometry='collision'; .* 'visual'"):
+            ab.Robot.load(path, device="cpu")
+        assert len(ab.Robot.load(path, "visual", device="cpu").models) == 1
+
+
+def test_macros_that_were_not_expanded_are_named(urdf):
+    macros = '<robot name="arm" xmlns:x="http://www.ros.org/wiki/xacro"><x:include filename="hand.xacro"/><xacro:hand/>'
+    urdf.write_text(URDF.replace('<robot name="arm">', macros), encoding="utf-8")
+    with pytest.warns(RuntimeWarning, match="arm.urdf: not read: elements xacro:include, xacro:hand; xacro") as caught:
+        ab.Robot.load(urdf, device="cpu")
+    assert len(caught) == 1 and caught[0].filename == __file__
 
 
 def test_bad_paths_and_options_are_refused(urdf, tmp_path):

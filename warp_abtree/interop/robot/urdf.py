@@ -25,6 +25,11 @@ from warp_abtree.model.mesh import MeshError, load_mesh
 from warp_abtree.model.obj import split_file_name
 
 KINDS = {"fixed": "fixed", "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+# Those of pairs, and what says nothing of them.
+SRDF_TAGS = (
+    *("disable_collisions", "enable_collisions", "disable_default_collisions", "group", "group_state", "end_effector"),
+    *("virtual_joint", "passive_joint", "joint_property", "link_sphere_approximation"),
+)
 INSTALL = "needs the extra `robot`: pip install 'warp-abtree[robot]'"
 
 
@@ -40,7 +45,8 @@ def read_urdf(path: Path, geometry: str) -> Description:
     except RobotError:
         raise
     except Exception as error:
-        raise RobotError(f"{path}: not read as URDF ({first_line(error)})") from None
+        told = f"an element lacks {error}" if isinstance(error, KeyError) else first_line(error)
+        raise RobotError(f"{path}: not read as URDF ({told})") from None
     description, joints = Description(), {joint.child: joint for joint in robot.joints}
     names = [link.name for link in robot.links]
     for what, given in (("links", names), ("joints", [joint.name for joint in robot.joints])):
@@ -145,22 +151,38 @@ def _check_elements(path):
     """Refuse what yourdfpy mends or leaves out in silence, and warn of joints that it does not read.
 
     Raises:
-        RobotError: A line that is no XML, a geometry of other than one shape.
+        RobotError: A line that is no XML, another root, a geometry of other than one shape, a mesh of other than one.
     """
     from lxml import etree  # of yourdfpy
 
     parser = etree.XMLParser(recover=True)
     root = etree.parse(str(path), parser).getroot()
+    _check_root(root, "URDF", path)
     for error in parser.error_log:
         if error.level == etree.ErrorLevels.FATAL:  # a namespace that is not declared is none
             raise RobotError(f"{path}: not read as URDF (line {error.line}: {error.message})")
-    for shape in root.xpath("//geometry[count(*) != 1]"):
-        raise RobotError(f"{path}: not read as URDF (line {shape.sourceline}: a geometry has one shape)")
+    for odd in root.xpath("//geometry[count(*) != 1] | link/*[self::collision or self::visual][count(geometry) != 1]"):
+        one = "shape" if odd.tag == "geometry" else "geometry"
+        raise RobotError(f"{path}: not read as URDF (line {odd.sourceline}: a {odd.tag} has one {one})")
+    _warn_of_unread([e.tag for e in root.iter() if "xacro" in str(e.tag)], path, 5)
     found = root.xpath("//*[local-name()='gazebo']//joint | //*[contains(name(), 'loop_joint')]")
     if found:
         names = ", ".join(repr(joint.get("name")) for joint in found)
         message = f"{path}: not enforced: joints {names} of a <gazebo> or loop_joint element"
         warnings.warn(message, RuntimeWarning, stacklevel=4)
+
+
+def _check_root(root, what, path):
+    if root is None or root.tag != "robot":
+        told = "it has none" if root is None else f"its root is {root.tag!r}, not 'robot'"
+        raise RobotError(f"{path}: not read as {what} ({told})")
+
+
+def _warn_of_unread(tags, path, level):
+    if tags:
+        names = ", ".join(dict.fromkeys(re.sub(r"^\{.*\}", "xacro:" if "xacro" in tag else "", tag) for tag in tags))
+        told = "; xacro expands a file" if "xacro" in names else ""
+        warnings.warn(f"{path}: not read: elements {names}{told}", RuntimeWarning, stacklevel=level)
 
 
 def _find_file(name, where, path) -> Path:
@@ -251,8 +273,8 @@ def apply_srdf(description: Description, path: Path, strict: bool):
         root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as error:
         raise RobotError(f"{path}: not read as SRDF ({first_line(error)})") from None
-    if root.tag != "robot":
-        raise RobotError(f"{path}: not read as SRDF (its root is {root.tag!r}, not 'robot')")
+    _check_root(root, "SRDF", path)
+    _warn_of_unread([entry.tag for entry in root if entry.tag not in SRDF_TAGS], path, 4)
     links, unknown = list(description.links), {}
 
     def read(tag, *attributes):
