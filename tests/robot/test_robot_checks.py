@@ -232,6 +232,7 @@ def test_limits_hold_to_within_rounding(arm, device):
         poses = arm.forward(taken(inside)).numpy()
         np.testing.assert_array_equal(poses, arm.forward(np.array(inside, np.float64), limits=False).numpy())
     on_device = wp.array(np.array(inside), dtype=wp.float32, device=device)
+    assert len(arm.check(wp.zeros((3, 4), dtype=wp.int32, device=device), limits=False)) == 3
     assert len(arm.check(on_device)) == len(arm.check_edges(inside, inside)) == 4
     arm.exclude_meeting(high)
     with pytest.raises(ValueError, match=r"has 3 for joint 'swing', outside -inf .. 2.5 "):

@@ -100,6 +100,9 @@ def test_units_that_are_none_are_refused(unit, tmp_path):
         "package:///arm/meshes/part.stl",
         "model://arm/meshes/part.stl",
         "file://{}/arm/meshes/part.stl",
+        "file://{}/arm/%6Deshes/part.stl",
+        "package://arm/meshes/p%61rt.stl",
+        " package://arm/meshes/part.stl ",
         "{}/arm/meshes/part.stl",
     ],
 )
@@ -110,7 +113,7 @@ def test_files_are_found_by_all_ways_to_name_them(name, tmp_path, caplog):
     (tmp_path / "arm" / "urdf").mkdir()
     assert load(tmp_path / "arm" / "urdf", name.format(tmp_path)).volume == pytest.approx(1)
     assert not caplog.records
-    if name.startswith("package:"):  # of the package that is named, not of the one at hand
+    if name.strip().startswith("package:"):  # of the package that is named, not of the one at hand
         assert load(tmp_path / "arm" / "urdf", name.replace("arm", "hand")).volume == pytest.approx(8)
         assert load(tmp_path / "arm" / "urdf", name.replace("arm", "renamed")).volume == pytest.approx(1)
 

@@ -258,11 +258,9 @@ class Robot:
         """Return configurations as device rows, float64 (c, n), checked. Waits for the device."""
         limits = flag(limits, "limits")
         width = len(self.joint_names)
-        if is_device_array(configurations) and wrap_array(configurations, what).device == self.device:
-            rows = wrap_array(configurations, what)
-            if rows.dtype != wp.float64 and rows.dtype == wp.float32:
-                rows = wp.array(rows.numpy().astype(np.float64), device=self.device)
-            rows = rows if rows.is_contiguous else rows.contiguous()
+        given = wrap_array(configurations, what) if is_device_array(configurations) else None
+        if given is not None and given.device == self.device and given.dtype == wp.float64:
+            rows = given if given.is_contiguous else given.contiguous()
         else:
             numbers = np.ascontiguousarray(to_numpy(configurations, what), np.float64)
             dims = numbers.ndim == 2

@@ -6,6 +6,7 @@ import os
 import re
 import warnings
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
@@ -191,11 +192,11 @@ def _find_file(name, where, path) -> Path:
     Raises:
         RobotError: There is none.
     """
-    given = (name or "").replace("\\", "/")
+    given = (name or "").strip().replace("\\", "/")
     tails = [re.sub("^package:/+|^[a-z]+://", "", given)]
     if given.startswith(("package:", "model:")):
         tails.append(tails[0].partition("/")[2])
-    for tail in (name, *tails):
+    for tail in (name, *tails, *map(unquote, tails)):
         for folder in (*path.absolute().parents, Path.cwd()):
             if tail and os.path.isfile(folder / tail):
                 return folder / tail
