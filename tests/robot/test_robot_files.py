@@ -126,6 +126,7 @@ def test_a_limit_that_urdf_leaves_out_is_zero(urdf):
         ('<mimic joint="grip"', '<mimic joint="gone"', "joint 'follow' mimics 'gone'"),
         ('<child link="fore"/>', '<child link="hand"/>', "joint 'bend': no link 'hand'"),
         ('<child link="left"/>', '<child link="fore"/>', "another joint moves link 'fore'"),
+        ('<parent link="base"/>', '<parent link="left"/>', "link 'upper' hangs on itself"),
         ('xyz="0 0 2"', 'xyz="0 0 0"', "is no axis"),
         ('<robot name="arm">', "arm", "not read as URDF"),
         ("</robot>", "", r"arm.urdf: not read as URDF \(line \d+: "),  # yourdfpy would read what is there
@@ -208,6 +209,20 @@ def test_formats_are_told_apart_and_a_geometry_without_meshes_is_named(urdf, mjc
         with pytest.raises(ValueError, match=f"{path.name}: no link has a mesh of geometry='collision'; .* 'visual'"):
             ab.Robot.load(path, device="cpu")
         assert len(ab.Robot.load(path, "visual", device="cpu").models) == 1
+
+
+def test_links_may_stand_in_any_order(tmp_path):
+    pytest.importorskip("yourdfpy")
+    count = 1200  # deeper than Python's calls may nest
+    ends = '<link name="l{}"><collision><geometry><sphere radius="0.01"/></geometry></collision></link>'
+    links = [ends.format(0), *[f'<link name="l{k}"/>' for k in range(1, count)], ends.format(count)]
+    joint = '<joint name="j{0}" type="{1}"><parent link="l{0}"/><child link="l{2}"/><origin xyz="0 0 0.1"/></joint>'
+    joints = [joint.format(k, "continuous" if k == 500 else "fixed", k + 1) for k in range(count)]
+    path = tmp_path / "chain.urdf"
+    path.write_text(f'<robot name="chain">{"".join([*links, *joints][::-1])}</robot>', encoding="utf-8")
+    poses = ab.Robot.load(path, device="cpu").forward([[np.pi / 2]]).numpy()[0]
+    # Joints turn about x; links come as in the file, the last one first.
+    np.testing.assert_allclose(poses[0, :3, 3], [0, -0.1 * (count - 501), 50.1], atol=1e-9)
 
 
 def test_macros_that_were_not_expanded_are_named(urdf):

@@ -128,6 +128,8 @@ def test_what_joints_do_not_place_is_named(tmp_path):
         load(tmp_path, "part.stl", rest='<link name="m"/><link name="n"/>')
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        with pytest.raises(RuntimeWarning, match="not enforced"):
+            load(tmp_path, "part.stl", rest=loops)
         load(
             tmp_path, "part.stl", rest='<gazebo reference="l"/><transmission name="t"><joint name="x"/></transmission>'
         )

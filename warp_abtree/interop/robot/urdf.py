@@ -43,7 +43,7 @@ def read_urdf(path: Path, geometry: str) -> Description:
     try:
         _check_elements(path)
         robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
-    except RobotError:
+    except (RobotError, RuntimeWarning):  # a warning where these are errors
         raise
     except Exception as error:
         told = f"an element lacks {error}" if isinstance(error, KeyError) else first_line(error)
@@ -63,7 +63,7 @@ def read_urdf(path: Path, geometry: str) -> Description:
             description.joints[joint.name] = _limits(joint, path)
     values = {joint.name: _value_of(joint, robot.joints, path) for joint in robot.joints if joint.type != "fixed"}
     for name in names:
-        _add_link(name, description, joints, values, path, ())
+        _add_link(name, description, joints, values, path)
 
     # By name: frames come parents first, links as they stand in the file.
     description.links = {name: description.links[name] for name in names}
@@ -127,25 +127,24 @@ def _value_of(joint, joints, path) -> tuple[str, float, float]:
     return joint.name, scale, offset
 
 
-def _add_link(name, description, joints, values, path, below):
-    """Add the frame of a link, after those that it hangs on."""
-    if name in description.links:
-        return
-    if name in below:
-        raise RobotError(f"{path}: link {name!r} hangs on itself")
-    joint = joints.get(name)
-    if joint is None:
-        frame = Frame(-1, np.eye(4))
-    else:
-        _add_link(joint.parent, description, joints, values, path, (*below, name))
-        origin = check_rigid(joint.origin, f"{path}: joint {joint.name!r}")
-        frame = Frame(description.links[joint.parent], origin, KINDS[joint.type])
-        if joint.type != "fixed":
-            frame.joint, frame.scale, frame.offset = values[joint.name]
-            axis = (1.0, 0.0, 0.0) if joint.axis is None else joint.axis
-            frame.axis = unit_axis(axis, f"{path}: joint {joint.name!r}")
-    description.links[name] = len(description.frames)
-    description.frames.append(frame)
+def _add_link(name, description, joints, values, path):
+    """Add the frames of a link and of those that it hangs on, the first of these first."""
+    above: dict[str, None] = {}
+    while name is not None and name not in description.links:
+        if name in above:
+            raise RobotError(f"{path}: link {name!r} hangs on itself")
+        above[name] = None
+        name = joints[name].parent if name in joints else None
+    for link in reversed(above):
+        frame, joint = Frame(-1, np.eye(4)), joints.get(link)
+        if joint is not None:
+            where = f"{path}: joint {joint.name!r}"
+            frame = Frame(description.links[joint.parent], check_rigid(joint.origin, where), KINDS[joint.type])
+            if joint.type != "fixed":
+                frame.joint, frame.scale, frame.offset = values[joint.name]
+                frame.axis = unit_axis((1.0, 0.0, 0.0) if joint.axis is None else joint.axis, where)
+        description.links[link] = len(description.frames)
+        description.frames.append(frame)
 
 
 def _check_elements(path):
