@@ -211,6 +211,40 @@ def test_formats_are_told_apart_and_a_geometry_without_meshes_is_named(urdf, mjc
         assert len(ab.Robot.load(path, "visual", device="cpu").models) == 1
 
 
+def test_joints_that_follow_followers_and_stand_off_are_those_of_mujoco(tmp_path, device):
+    mujoco = pytest.importorskip("mujoco")
+    text = """<mujoco><worldbody><body name="one"><joint name="a" axis="0 0 1" pos=".1 0 0" ref="20"/>
+    <joint name="b" type="slide" axis="1 0 0" pos="0 .2 0" ref=".1"/><joint name="c" axis="0 1 0"
+    pos="0 .2 .3" ref="-15" range="-90 90"/><geom size=".1"/><body name="two" pos="0 0 .5">
+    <joint name="d" axis="1 0 0" ref="10"/>
+    <joint name="e" axis="1 1 0" pos=".1 .1 0" ref="5"/><geom size=".1"/></body></body></worldbody><equality>
+    <joint joint1="d" joint2="c" polycoef=".1 -2 0 0 0"/><joint joint1="c" joint2="a" polycoef=".2 .5 0 0 0"/>
+    <joint joint1="e" polycoef=".3 0 0 0 0"/></equality></mujoco>"""
+    (tmp_path / "arm.xml").write_text(text, encoding="utf-8")
+    arm, model = ab.Robot.load(tmp_path / "arm.xml", device=device), mujoco.MjModel.from_xml_string(text)
+    assert arm.joint_names == ("a", "b") and np.isinf(arm.limits).all()
+    data, start = mujoco.MjData(model), dict(zip("abcde", model.qpos0))
+    rows = random_configurations(20, [(-1, 1), (-1, 1)])
+    for (a, b), poses in zip(rows, arm.forward(rows).numpy()):
+        moved = 0.2 + 0.5 * (a - start["a"])
+        data.qpos[:] = a, b, start["c"] + moved, start["d"] + 0.1 - 2 * moved, start["e"] + 0.3
+        mujoco.mj_forward(model, data)
+        assert data.ne == 3 and np.abs(data.efc_pos[:3]).max() < 1e-12  # as MuJoCo's equalities want it
+        np.testing.assert_allclose(poses[:, :3, 3], data.xpos, atol=1e-12)
+        np.testing.assert_allclose(poses[:, :3, :3].reshape(-1, 9), data.xmat, atol=1e-12)
+
+
+def test_joints_may_mimic_ones_that_mimic(urdf, device):
+    added = """<link name="third"/><joint name="again" type="prismatic"><parent link="flange"/><child link="third"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="1"/><mimic joint="follow" multiplier="-2" offset="0.3"/>
+    </joint></robot>"""
+    urdf.write_text(URDF.replace("</robot>", added), encoding="utf-8")
+    arm = ab.Robot.load(urdf, device=device)
+    poses = dict(zip(arm.link_names, arm.forward([[0, 0, 0.07]]).numpy()[0]))
+    third = np.linalg.inv(poses["flange"]) @ poses["third"]
+    np.testing.assert_allclose(third[:3, 3], [0, -2 * (-0.07 - 0.04) + 0.3, 0], atol=1e-14)
+
+
 def test_links_may_stand_in_any_order(tmp_path):
     pytest.importorskip("yourdfpy")
     count = 1200  # deeper than Python's calls may nest
