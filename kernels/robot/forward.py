@@ -24,8 +24,9 @@ QUARTER_1 = wp.constant(wp.float64(1.57079632673412561417e00))
 QUARTER_2 = wp.constant(wp.float64(6.07710050630396597660e-11))
 QUARTER_3 = wp.constant(wp.float64(2.02226624879595063154e-21))
 
-# Of the greater limit: what float32 may put a value beyond one of them, as lower + 1 * (upper - lower) does.
+# Of the greater limit: what rounding may put a value beyond one of them, as lower + 1 * (upper - lower) does.
 LIMIT_ROUNDING = wp.constant(wp.float64(2.0**-22))
+LIMIT_ROUNDING_DOUBLE = wp.constant(wp.float64(2.0**-51))
 
 NONE_REFUSED = wp.constant(wp.int64(2**63 - 1))
 
@@ -100,12 +101,12 @@ def move_joint(chain: Chain, configurations: wp.array2d(dtype=wp.float64), i: wp
 
 @wp.func
 def keeps_limits(value: wp.float64, lower: wp.float64, upper: wp.float64):
-    """Return whether a value is within limits, or a float32 number that is beyond one by rounding alone."""
+    """Return whether a value is within limits, or beyond one by rounding alone, of float32 if it is such a number."""
     none = wp.float64(0.0)
     beyond = wp.max(lower - value, value - upper)
     size = wp.max(wp.where(wp.isfinite(lower), wp.abs(lower), none), wp.where(wp.isfinite(upper), wp.abs(upper), none))
     rounded = wp.float64(wp.float32(value)) == value
-    return beyond <= none or (rounded and beyond <= LIMIT_ROUNDING * size)
+    return beyond <= none or beyond <= wp.where(rounded, LIMIT_ROUNDING, LIMIT_ROUNDING_DOUBLE) * size
 
 
 @wp.kernel

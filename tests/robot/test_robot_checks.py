@@ -159,6 +159,28 @@ def test_a_robot_alone_is_asked_about_itself(arm):
     assert not arm.check(at[None])[0]
 
 
+def test_pairs_and_mounted_links_may_be_set(arm, device):
+    rows = random_configurations(50, seed=5)
+    alone, around, pairs = arm.check(rows), arm.check(rows, AROUND), arm.pairs
+    assert 0 < alone.sum() < around.sum()
+    arm.pairs = pairs[:0]
+    assert not arm.check(rows).any() and arm.check_edges(rows, rows)["clear"].all()
+    arm.mounted = range(len(arm.link_names))
+    assert not arm.check(rows, AROUND).any()
+    arm.pairs, arm.mounted = pairs[:, ::-1].tolist(), [0]
+    np.testing.assert_array_equal(arm.check(rows), alone)
+    np.testing.assert_array_equal(arm.check(rows, AROUND), around)
+    for name, value, message in (
+        ("pairs", [(0, 9)], "pair 0 is .0, 9."),
+        ("pairs", [(1, 1)], "with itself"),
+        ("mounted", ["base"], "mounted 'base' is not a whole number"),
+    ):
+        other = copy.copy(arm)
+        setattr(other, name, value)
+        with pytest.raises(ValueError, match=message):
+            other.check(rows, AROUND)
+
+
 def test_a_query_is_captured_and_says_when_room_was_short(arm, device, monkeypatch):
     rows = random_configurations(20, seed=6)
     expected = arm.check(rows, AROUND)
@@ -200,7 +222,7 @@ def test_bad_configurations_are_refused(arm, bad, message):
             call(bad)
 
 
-def test_limits_hold_to_within_the_rounding_of_float32(arm, device):
+def test_limits_hold_to_within_rounding(arm, device):
     arm.description.joints |= {"bend": (-2.8718, -0.0698), "swing": (-np.inf, 2.5)}
     arm = ab.Robot(arm.description, device)
     low, high = np.array(np.maximum(arm.limits, -9), np.float32).T
@@ -210,11 +232,15 @@ def test_limits_hold_to_within_the_rounding_of_float32(arm, device):
         poses = arm.forward(taken(inside)).numpy()
         np.testing.assert_array_equal(poses, arm.forward(np.array(inside, np.float64), limits=False).numpy())
     on_device = wp.array(np.array(inside), dtype=wp.float32, device=device)
+    assert len(arm.check(wp.zeros((3, 4), dtype=wp.int32, device=device), limits=False)) == 3
     assert len(arm.check(on_device)) == len(arm.check_edges(inside, inside)) == 4
     arm.exclude_meeting(high)
     with pytest.raises(ValueError, match=r"has 3 for joint 'swing', outside -inf .. 2.5 "):
         arm.check([[0, -1, 0, 3]])
-    for beyond in (np.float32(0.1) + np.float32(4e-8), np.nextafter(0.1, 1)):
+    low, high = np.maximum(arm.limits, -9).T
+    spread = low + 1.0 * (high - low)
+    assert (spread > arm.limits[:, 1]).any() and len(arm.check([spread, np.nextafter(high, 9)])) == 2
+    for beyond in (np.float32(0.1) + np.float32(4e-8), 0.1 * (1 + 2.0**-50)):
         with pytest.raises(
             ValueError, match=r"configuration 1 has (\S+) for joint 'grip', outside 0 .. (\S+) "
         ) as raised:
@@ -292,6 +318,7 @@ def test_bad_options_are_refused(arm, device):
         (lambda: arm.check(rows, beyond=1.0), ValueError, "beyond means nothing"),
         (lambda: arm.check(rows, [(RING, (0, 0, 0, 0, 0, 0, 2))]), ValueError, "world: pose 0"),
         (lambda: arm.check(rows, ["ring"]), TypeError, "world: entry 0"),
+        (lambda: arm.check(rows, [trimesh.creation.box()]), TypeError, "world: entry 0 is neither"),
         (lambda: arm.check(rows, 3), TypeError, "world: a int"),
         (lambda: arm.check(rows, other), ValueError, "several worlds"),
         (lambda: arm.check_edges(rows, rows[:0]), ValueError, "ends: 0 given for 1"),

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 import warp_abtree as ab
 from warp_abtree.interop.robot import check, robot
+from warp_abtree.interop.robot.description import Frame, Part
+from warp_abtree.model.mesh import mesh_from_arrays
 
 RING = ab.Model.load(trimesh.creation.torus(0.45, 0.12, 32, 12))
 ROOF = ab.Model.load(trimesh.creation.box((1.5, 0.1, 0.02)))
@@ -121,6 +123,34 @@ def test_a_joint_that_mimics_backwards_meets_a_thin_wall(device, kind, scale):
         height - 0.05 if kind == "prismatic" else np.arcsin(height / np.hypot(1.05, 0.05)) - np.arctan2(0.05, 1.05)
     )
     assert not rows["clear"][0] and contact - 1e-3 <= rows["time"][0] <= contact
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_parts_of_a_robot_meet_each_other_whichever_moves(device, turned):
+    """A cube slides along x on two joints; thin plates are on the base, at x = 2, and on a slide of their own."""
+    made = described_chain(CUBE, ("prismatic", X, HERE, 1.0), ("prismatic", Y, HERE, 1.0))
+    made.frames.append(Frame(0, np.eye(4), "prismatic", X, "plate"))
+    made.joints["plate"], made.links["plate"] = (-np.inf, np.inf), 3
+    for link, x in ((3, 0.0), (0, 2.0)):
+        plate = trimesh.creation.box((1e-4, 1, 1), trimesh.transformations.translation_matrix((x, 0, 0)))
+        made.parts.append(Part(link, mesh_from_arrays(plate.vertices, plate.faces, name=f"plate {link}")))
+    slides = ab.Robot(made, device)
+    assert sorted(slides.pairs.tolist()) == [[0, 1], [0, 2]]
+    slides.pairs = slides.pairs[:, ::-1] if turned else slides.pairs
+    near = 0.05 + 5e-5  # middles of the cube and a plate that touch
+    edges = {  # by the time of contact
+        0.3707 - near: ((0, 0, 0.3707), (1, 0, 0.3707)),
+        1 - near: ((0, 0, 1), (0, 0, 0)),
+        0.37 - near: ((0, 0, 0.37), (0.5, 0, -0.13)),
+        0.5 - near: ((1.5, 0, -3), (2.5, 0, -3)),
+        np.inf: ((0, 0, 0.37), (1, 0, 1.37)),
+    }
+    starts, ends = np.array(list(edges.values()), np.float64).transpose(1, 0, 2)
+    rows = slides.check_edges(starts, ends)
+    check_never_late(slides, None, starts, ends, rows, 1e-3)
+    contact = np.array(list(edges))
+    np.testing.assert_array_equal(rows["clear"], np.isinf(contact))
+    assert (rows["time"] <= contact).all() and (rows["time"] >= np.minimum(contact, 1) - 1e-3 - 1e-12).all()
 
 
 def test_an_edge_passes_through_nothing_thin(arms, device):

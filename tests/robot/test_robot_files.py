@@ -126,11 +126,15 @@ def test_a_limit_that_urdf_leaves_out_is_zero(urdf):
         ('<mimic joint="grip"', '<mimic joint="gone"', "joint 'follow' mimics 'gone'"),
         ('<child link="fore"/>', '<child link="hand"/>', "joint 'bend': no link 'hand'"),
         ('<child link="left"/>', '<child link="fore"/>', "another joint moves link 'fore'"),
+        ('<parent link="base"/>', '<parent link="left"/>', "link 'upper' hangs on itself"),
         ('xyz="0 0 2"', 'xyz="0 0 0"', "is no axis"),
         ('<robot name="arm">', "arm", "not read as URDF"),
         ("</robot>", "", r"arm.urdf: not read as URDF \(line \d+: "),  # yourdfpy would read what is there
         ('<box size="0.06 0.06 0.4"/>', "", r"not read as URDF \(line 10: a geometry has one shape\)"),
         ('<box size="0.06', '<sphere radius="1"/><box size="0.06', r"\(line 10: a geometry has one shape\)"),
+        ('<link name="flange"/>', '<link name="flange"><collision/></link>', "line 12: a collision has one geometry"),
+        (' size="0.06 0.06 0.4"', "", "an element lacks 'size'"),
+        ('<robot name="arm">', '<robot name="arm" xmlns="urdf">', "its root is '{urdf}robot', not 'robot'"),
         ('lower="-2.8"', 'lower="2.9"', "joint 'bend': limits 2.9 .. 2.8 leave no value"),
         ('lower="-2.8"', 'lower="nan"', "joint 'bend': limits nan .. 2.8 leave no value"),
         (BEND_LIMIT, "", "joint 'bend' is revolute and has no limits; .*, or make it continuous$"),
@@ -186,6 +190,81 @@ def test_bad_mjcf_is_refused(mjcf, before, after, message):
     mjcf.write_text(MJCF.replace(before, after), encoding="utf-8")
     with pytest.raises(ValueError, match=message):
         ab.Robot.load(mjcf, device="cpu")
+
+
+def test_formats_are_told_apart_and_a_geometry_without_meshes_is_named(urdf, mjcf, tmp_path):
+    for source, name, message in (
+        (mjcf, "other.urdf", "other.urdf: not read as URDF .its root is 'mujoco', not 'robot'"),
+        (urdf, "other.xml", "other.xml: not read as MJCF .its root is 'robot', as of a URDF"),
+    ):
+        # A comment before the root counts for nothing.
+        (tmp_path / name).write_text("<!-- <mujoco> <robot> -->" + source.read_text("utf-8"), encoding="utf-8")
+        with pytest.raises(ValueError, match=message):
+            ab.Robot.load(tmp_path / name, device="cpu")
+    urdf.write_text(
+        '<robot name="r"><link name="l"><visual><geometry><sphere radius="1"/></geometry></visual></link></robot>'
+    )
+    mjcf.write_text('<mujoco><worldbody><geom size="1" contype="0" conaffinity="0"/></worldbody></mujoco>')
+    for path in (urdf, mjcf):
+        with pytest.raises(ValueError, match=f"{path.name}: no link has a mesh of geometry='collision'; .* 'visual'"):
+            ab.Robot.load(path, device="cpu")
+        assert len(ab.Robot.load(path, "visual", device="cpu").models) == 1
+
+
+def test_joints_that_follow_followers_and_stand_off_are_those_of_mujoco(tmp_path, device):
+    mujoco = pytest.importorskip("mujoco")
+    text = """<mujoco><worldbody><body name="one"><joint name="a" axis="0 0 1" pos=".1 0 0" ref="20"/>
+    <joint name="b" type="slide" axis="1 0 0" pos="0 .2 0" ref=".1"/><joint name="c" axis="0 1 0"
+    pos="0 .2 .3" ref="-15" range="-90 90"/><geom size=".1"/><body name="two" pos="0 0 .5">
+    <joint name="d" axis="1 0 0" ref="10"/>
+    <joint name="e" axis="1 1 0" pos=".1 .1 0" ref="5"/><geom size=".1"/></body></body></worldbody><equality>
+    <joint joint1="d" joint2="c" polycoef=".1 -2 0 0 0"/><joint joint1="c" joint2="a" polycoef=".2 .5 0 0 0"/>
+    <joint joint1="e" polycoef=".3 0 0 0 0"/></equality></mujoco>"""
+    (tmp_path / "arm.xml").write_text(text, encoding="utf-8")
+    arm, model = ab.Robot.load(tmp_path / "arm.xml", device=device), mujoco.MjModel.from_xml_string(text)
+    assert arm.joint_names == ("a", "b") and np.isinf(arm.limits).all()
+    data, start = mujoco.MjData(model), dict(zip("abcde", model.qpos0))
+    rows = random_configurations(20, [(-1, 1), (-1, 1)])
+    for (a, b), poses in zip(rows, arm.forward(rows).numpy()):
+        moved = 0.2 + 0.5 * (a - start["a"])
+        data.qpos[:] = a, b, start["c"] + moved, start["d"] + 0.1 - 2 * moved, start["e"] + 0.3
+        mujoco.mj_forward(model, data)
+        assert data.ne == 3 and np.abs(data.efc_pos[:3]).max() < 1e-12  # as MuJoCo's equalities want it
+        np.testing.assert_allclose(poses[:, :3, 3], data.xpos, atol=1e-12)
+        np.testing.assert_allclose(poses[:, :3, :3].reshape(-1, 9), data.xmat, atol=1e-12)
+
+
+def test_joints_may_mimic_ones_that_mimic(urdf, device):
+    added = """<link name="third"/><joint name="again" type="prismatic"><parent link="flange"/><child link="third"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="1"/><mimic joint="follow" multiplier="-2" offset="0.3"/>
+    </joint></robot>"""
+    urdf.write_text(URDF.replace("</robot>", added), encoding="utf-8")
+    arm = ab.Robot.load(urdf, device=device)
+    poses = dict(zip(arm.link_names, arm.forward([[0, 0, 0.07]]).numpy()[0]))
+    third = np.linalg.inv(poses["flange"]) @ poses["third"]
+    np.testing.assert_allclose(third[:3, 3], [0, -2 * (-0.07 - 0.04) + 0.3, 0], atol=1e-14)
+
+
+def test_links_may_stand_in_any_order(tmp_path):
+    pytest.importorskip("yourdfpy")
+    count = 1200  # deeper than Python's calls may nest
+    ends = '<link name="l{}"><collision><geometry><sphere radius="0.01"/></geometry></collision></link>'
+    links = [ends.format(0), *[f'<link name="l{k}"/>' for k in range(1, count)], ends.format(count)]
+    joint = '<joint name="j{0}" type="{1}"><parent link="l{0}"/><child link="l{2}"/><origin xyz="0 0 0.1"/></joint>'
+    joints = [joint.format(k, "continuous" if k == 500 else "fixed", k + 1) for k in range(count)]
+    path = tmp_path / "chain.urdf"
+    path.write_text(f'<robot name="chain">{"".join([*links, *joints][::-1])}</robot>', encoding="utf-8")
+    poses = ab.Robot.load(path, device="cpu").forward([[np.pi / 2]]).numpy()[0]
+    # Joints turn about x; links come as in the file, the last one first.
+    np.testing.assert_allclose(poses[0, :3, 3], [0, -0.1 * (count - 501), 50.1], atol=1e-9)
+
+
+def test_macros_that_were_not_expanded_are_named(urdf):
+    macros = '<robot name="arm" xmlns:x="http://www.ros.org/wiki/xacro"><x:include filename="hand.xacro"/><xacro:hand/>'
+    urdf.write_text(URDF.replace('<robot name="arm">', macros), encoding="utf-8")
+    with pytest.warns(RuntimeWarning, match="arm.urdf: not read: elements xacro:include, xacro:hand; xacro") as caught:
+        ab.Robot.load(urdf, device="cpu")
+    assert len(caught) == 1 and caught[0].filename == __file__
 
 
 def test_bad_paths_and_options_are_refused(urdf, tmp_path):

@@ -109,20 +109,23 @@ def test_the_reach_of_a_straight_arm_is_what_its_joints_do(device, scales, moved
 FAR, OUT, BACK = (("fixed", Z, place, 1.0) for place in ((1e3, 0, 0), (1000.1, 0, 0), (-1000.0, 0.03, 0)))
 ROUNDED = {
     # Values near 2^20 round by 2^-34, which moves a part a thousand units from the axis.
-    "values": ([("revolute", Z, HERE, 1.0), FAR], [2.0**20 - 1], 0.0, 1.0),
+    "values": ([("revolute", Z, HERE, 1.0), FAR], [2.0**20 - 1], 0.0, 1.0, 0.0),
+    # So do sums with an offset of the size.
+    "offsets": ([("revolute", Z, HERE, 1.0), FAR], np.linspace(0.1, 0.9, 9), 0.0, 1.0, 2.0**20 - 1),
     # On a way of a thousand units out and back to the axis poses round by more than the angle.
-    "poses": ([("revolute", Z, HERE, 1.0), OUT, BACK], np.linspace(-1, 1, 20), 0.0, 1.0),
+    "poses": ([("revolute", Z, HERE, 1.0), OUT, BACK], np.linspace(-1, 1, 20), 0.0, 1.0, 0.0),
     # A slide of a thousand units along an axis that the transforms before it stretch.
-    "transforms": ([*20 * [("fixed", Z, HERE, 1.0)], ("prismatic", X, HERE, 1.0)], [0.0], 1e3, 1 + 4.9e-13),
+    "transforms": ([*20 * [("fixed", Z, HERE, 1.0)], ("prismatic", X, HERE, 1.0)], [0.0], 1e3, 1 + 4.9e-13, 0.0),
 }
 
 
 @pytest.mark.parametrize("name", ROUNDED)
 def test_the_reach_covers_rounding(device, name):
-    joints, middles, half, stretch = ROUNDED[name]
+    joints, middles, half, stretch, offset = ROUNDED[name]
     description = described_chain(needle(1e-3), *joints)
     for frame in description.frames:
         frame.origin[:3, :3] *= stretch
+    description.frames[1].offset = offset
     for middle in middles:
         reach, placed = find_reach(description, device, [middle], [half], [abs(middle) + half])
         rows = [[middle + half], [np.nextafter(middle, np.inf) + half]]

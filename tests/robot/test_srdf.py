@@ -82,6 +82,16 @@ def test_links_that_the_robot_lacks_are_refused_or_named(load):
         load(write([("disable_collisions", "l0", "l2")]), strict=False)
 
 
+def test_unknown_elements_are_named(load):
+    with pytest.warns(RuntimeWarning, match="r.srdf: not read: elements disable_collision, hand$") as caught:
+        assert load('<disable_collision link1="l0" link2="l2"/><hand/><hand/>') == ALL - JOINED
+    assert len(caught) == 1 and caught[0].filename == __file__
+    known = "group group_state end_effector virtual_joint passive_joint joint_property link_sphere_approximation"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load("<!-- none -->" + "".join(f"<{tag}/>" for tag in known.split()))
+
+
 @pytest.mark.parametrize(
     "srdf, root, message",
     [

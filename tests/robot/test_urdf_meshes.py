@@ -100,6 +100,9 @@ def test_units_that_are_none_are_refused(unit, tmp_path):
         "package:///arm/meshes/part.stl",
         "model://arm/meshes/part.stl",
         "file://{}/arm/meshes/part.stl",
+        "file://{}/arm/%6Deshes/part.stl",
+        "package://arm/meshes/p%61rt.stl",
+        " package://arm/meshes/part.stl ",
         "{}/arm/meshes/part.stl",
     ],
 )
@@ -110,7 +113,7 @@ def test_files_are_found_by_all_ways_to_name_them(name, tmp_path, caplog):
     (tmp_path / "arm" / "urdf").mkdir()
     assert load(tmp_path / "arm" / "urdf", name.format(tmp_path)).volume == pytest.approx(1)
     assert not caplog.records
-    if name.startswith("package:"):  # of the package that is named, not of the one at hand
+    if name.strip().startswith("package:"):  # of the package that is named, not of the one at hand
         assert load(tmp_path / "arm" / "urdf", name.replace("arm", "hand")).volume == pytest.approx(8)
         assert load(tmp_path / "arm" / "urdf", name.replace("arm", "renamed")).volume == pytest.approx(1)
 
@@ -125,6 +128,8 @@ def test_what_joints_do_not_place_is_named(tmp_path):
         load(tmp_path, "part.stl", rest='<link name="m"/><link name="n"/>')
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        with pytest.raises(RuntimeWarning, match="not enforced"):
+            load(tmp_path, "part.stl", rest=loops)
         load(
             tmp_path, "part.stl", rest='<gazebo reference="l"/><transmission name="t"><joint name="x"/></transmission>'
         )

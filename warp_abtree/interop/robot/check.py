@@ -5,12 +5,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_abtree.checks.arguments import whole_number
 from warp_abtree.checks.device_memory import DeviceMemory
 from warp_abtree.interop.robot.link_query import Asked, LinkDistances, LinkHits
 from warp_abtree.interop.robot.surroundings import RobotBatch
 from warp_abtree.kernels.robot.link_pairs import Parts
 from warp_abtree.query.request import CapacityError
 from warp_abtree.scene.sweep import CONTACT_ROWS
+from warp_abtree.state.batch import check_pairs
 
 NEAREST_ROWS = np.dtype(
     [("distance", np.float64), ("points", np.float64, (2, 3)), ("faces", np.int32, 2), ("pair", np.int32, 2)]
@@ -28,12 +30,13 @@ def ask_about(robot, robots: RobotBatch, room: int) -> Asked:
     frame = [description.links[robot.link_names[k]] for k in robot.model_link]
     paths = [description.path(f) for f in frame]
     order = sorted(range(len(frame)), key=lambda k: -len(paths[k]))
-    entries, stages = [], []
+    entries, stages, pairs = [], [], check_pairs(robot.pairs, len(frame))
+    mounted = {whole_number(k, "mounted", 0, len(robot.link_names) - 1) for k in robot.mounted}
     for k in order:
         first = len(entries)
-        if robots.count and robot.model_link[k] not in robot.mounted:
+        if robots.count and robot.model_link[k] not in mounted:
             entries.append((k, -1, -1))
-        for i, j in robot.pairs[robot.pairs[:, 1] == k].tolist():
+        for i, j in pairs[pairs[:, 1] == k].tolist():
             entries.append((j, i, max(set(paths[i]) & set(paths[j]), default=-1)))
         if len(entries) > first:
             stages.append((first, len(entries)))

@@ -1,6 +1,7 @@
 """Robots of MJCF files, read and compiled by MuJoCo (extra `robot`)."""
 
 import math
+import re
 import warnings
 from pathlib import Path
 
@@ -30,6 +31,9 @@ def read_mjcf(path: Path, geometry: str) -> Description:
         import mujoco
     except ImportError:
         raise ImportError(f"an MJCF file {INSTALL}") from None
+    root = re.search(rb"<([A-Za-z][\w.:]*)", re.sub(rb"<!--.*?-->", b"", path.read_bytes(), flags=re.DOTALL))
+    if root and root[1] == b"robot":  # MuJoCo would read it, less what it fuses
+        raise RobotError(f"{path}: not read as MJCF (its root is 'robot', as of a URDF; these end in .urdf)")
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except Exception as error:
@@ -46,7 +50,7 @@ def read_mjcf(path: Path, geometry: str) -> Description:
         if model.body_mocapid[b] >= 0:
             raise RobotError(f"{path}: body {name!r} is moved by motion capture, not by joints")
         description.links[name] = _add_body(mujoco, model, b, description, names, values, path)
-    if int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT):
+    if _is_off(mujoco, model, "FILTERPARENT"):
         description.neighbours = "none"
     elif geometry == "collision":
         description.neighbours = "moving"
@@ -90,16 +94,20 @@ def _joint_values(mujoco, model, path) -> list[tuple[str, float, float]]:
     return values
 
 
+def _is_off(mujoco, model, *flags) -> bool:
+    off = (int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")) for flag in flags)
+    return any(int(model.opt.disableflags) & bit for bit in off)
+
+
 def _equalities(mujoco, model):
     """Yield index and kind of each equality that MuJoCo enforces from the start."""
-    off = int(mujoco.mjtDisableBit.mjDSBL_EQUALITY) | int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-    for e in range(0 if int(model.opt.disableflags) & off else model.neq):
+    for e in range(0 if _is_off(mujoco, model, "EQUALITY", "CONSTRAINT") else model.neq):
         if model.eq_active0[e]:
             yield e, mujoco.mjtEq(int(model.eq_type[e])).name[len("mjEQ_") :].lower()
 
 
 def _warn_of_closures(mujoco, model, path):
-    """Refuse what deforms, and warn of what ties links beside their joints."""
+    """Refuse what deforms, and warn of what ties links beside their joints, and of contacts that are disabled."""
     for f in range(model.nflex):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, f)
         raise RobotError(f"{path}: flex {name or f!r} may deform; rigid geoms are supported")
@@ -112,8 +120,11 @@ def _warn_of_closures(mujoco, model, path):
             tied = " and ".join(repr(mujoco.mj_id2name(model, of, k) or f"{unnamed} {k}") for k in ends)
             name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_EQUALITY, e)
             found.append(f"equality {kind} {name or e!r} of {tied}")
-    for t in np.flatnonzero(model.tendon_limited).tolist():
+    for t in [] if _is_off(mujoco, model, "LIMIT", "CONSTRAINT") else np.flatnonzero(model.tendon_limited).tolist():
         found.append(f"the limits of tendon {mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_TENDON, t) or t!r}")
+    if _is_off(mujoco, model, "CONTACT", "CONSTRAINT"):
+        message = f"{path}: it disables contacts; Robot.check tests its pairs all the same"
+        warnings.warn(message, RuntimeWarning, stacklevel=4)
     if found:
         message = f"{path}: not enforced: {', '.join(found)}; links stand where their joints alone put them"
         warnings.warn(message, RuntimeWarning, stacklevel=4)

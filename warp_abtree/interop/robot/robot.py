@@ -27,6 +27,7 @@ from warp_abtree.kernels.robot import forward
 from warp_abtree.model.model import Model
 from warp_abtree.query.distance import check_beyond
 from warp_abtree.scene.scene import Scene
+from warp_abtree.state.batch import check_pairs
 
 ENDINGS = {".urdf": read_urdf, ".xml": read_mjcf, ".mjcf": read_mjcf}
 # Configurations of a launch: fewer where few are given.
@@ -49,7 +50,8 @@ class Robot:
         mounted: Indices into `link_names` of the links that are not tested against what surrounds the robot.
         description: What the file says, `warp_abtree.interop.robot.description.Description`.
 
-    A copy, or what is unpickled, is made anew from the description, on the same device, with `pairs` and `mounted`.
+    `pairs` and `mounted` may be set: each call goes by what they are then. A copy, or what is unpickled, is made anew
+    from the description, on the same device, with `pairs` and `mounted`.
     """
 
     def __init__(self, description: Description, device=None, mounted=()):
@@ -93,12 +95,13 @@ class Robot:
             strict: Whether to refuse an SRDF that names links which the robot has not, rather than warn.
 
         Warns of what ties links beside their joints and is not enforced: of MJCF `equality` other than between joints,
-        and limits of tendons; of URDF joints of Gazebo's and Drake's elements.
+        and limits of tendons; of URDF joints of Gazebo's and Drake's elements. And of what is not read: macros of xacro
+        that are not expanded, unknown elements of an SRDF. An MJCF file that disables contacts is asked all the same.
 
         Raises:
             ImportError: The extra `robot` is not installed.
-            ValueError: A file that is missing or unreadable, a joint or shape of another kind, a bad option; the
-                message names it.
+            ValueError: A file that is missing or unreadable, or has no mesh of this geometry, a joint or shape of
+                another kind, a bad option; the message names it.
         """
         path = Path(path)
         if path.suffix.lower() not in ENDINGS:
@@ -109,6 +112,9 @@ class Robot:
             if not file.is_file():
                 raise RobotError(f"{file}: no such file")
         description = ENDINGS[path.suffix.lower()](path, geometry)
+        if not description.parts:
+            other = "visual" if geometry == "collision" else "collision"
+            raise RobotError(f"{path}: no link has a mesh of geometry={geometry!r}; it may have some of {other!r}")
         if srdf is not None:
             apply_srdf(description, Path(srdf), flag(strict, "strict"))
         robot = cls(description, device, mounted)
@@ -150,9 +156,8 @@ class Robot:
         poses = self.forward(np.asarray(configuration)[None]).numpy()[0]
         scene = Scene(self.device)
         scene.add_many(self.models, poses[self.model_link])
-        meet = scene.intersect(self.pairs).any
-        self.pairs = self.pairs[~meet]
-        self._kept.clear()
+        pairs = check_pairs(self.pairs, len(self.models))
+        self.pairs = pairs[~scene.intersect(pairs).any]
 
     def forward(self, configurations, limits=True) -> wp.array:
         """Return the poses of all links, device mat44d (c, links), in the frame of the root.
@@ -161,8 +166,8 @@ class Robot:
 
         Args:
             configurations: (c, n) of any framework; float64 on the robot's GPU is read where it lies.
-            limits: Whether to refuse configurations out of limits. A float32 number that is beyond a limit by no more
-                than 2^-22 of the greater one, as rounding puts it there, is within, and taken as it is.
+            limits: Whether to refuse configurations out of limits. What is beyond a limit by no more than 2^-51 of the
+                greater one, 2^-22 if it is a float32 number, as rounding puts it there, is within, and taken as it is.
 
         Raises:
             ValueError: Another shape, a number that is not finite, one out of its limits; the first is named.
@@ -253,11 +258,9 @@ class Robot:
         """Return configurations as device rows, float64 (c, n), checked. Waits for the device."""
         limits = flag(limits, "limits")
         width = len(self.joint_names)
-        if is_device_array(configurations) and wrap_array(configurations, what).device == self.device:
-            rows = wrap_array(configurations, what)
-            if rows.dtype != wp.float64 and rows.dtype == wp.float32:
-                rows = wp.array(rows.numpy().astype(np.float64), device=self.device)
-            rows = rows if rows.is_contiguous else rows.contiguous()
+        given = wrap_array(configurations, what) if is_device_array(configurations) else None
+        if given is not None and given.device == self.device and given.dtype == wp.float64:
+            rows = given if given.is_contiguous else given.contiguous()
         else:
             numbers = np.ascontiguousarray(to_numpy(configurations, what), np.float64)
             dims = numbers.ndim == 2
@@ -286,6 +289,7 @@ class Robot:
     def _find_query(self, world, output, count) -> RobotQuery:
         """Return a query of a room for a number of configurations: the one of before if it is of the same."""
         around, key = make_surroundings(world, self.device)
+        key = (*key, check_pairs(self.pairs, len(self.models)).tobytes(), tuple(self.mounted))
         rooms = CHUNKS["cpu" if self.device.is_cpu else "cuda"]
         room = next((room for room in rooms if room >= count), rooms[-1])
         query = self._kept.pop((key, output, room), None)

@@ -34,7 +34,8 @@ def make_surroundings(world, device) -> tuple[Scene | None, tuple]:
         raise TypeError(f"world: a {type(world).__name__} is neither a Scene nor models with poses")
     scene, placed = Scene(device), []
     for k, entry in enumerate(listed):
-        model, pose = (entry, STILL) if isinstance(entry, Model) else entry if len(entry) == 2 else (None, STILL)
+        alone = isinstance(entry, Model) or not isinstance(entry, list | tuple) or len(entry) != 2
+        model, pose = (entry, STILL) if alone else entry
         if not isinstance(model, Model):
             raise TypeError(f"world: entry {k} is neither a Model nor a model with a pose")
         placed.append((model, check_poses(to_numpy(pose, "pose")[None], f"world: pose {k}")[0]))

@@ -6,6 +6,7 @@ import os
 import re
 import warnings
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
@@ -25,6 +26,11 @@ from warp_abtree.model.files.read import split_file_name
 from warp_abtree.model.mesh import MeshError, load_mesh
 
 KINDS = {"fixed": "fixed", "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+# Those of pairs, and what says nothing of them.
+SRDF_TAGS = (
+    *("disable_collisions", "enable_collisions", "disable_default_collisions", "group", "group_state", "end_effector"),
+    *("virtual_joint", "passive_joint", "joint_property", "link_sphere_approximation"),
+)
 INSTALL = "needs the extra `robot`: pip install 'warp-abtree[robot]'"
 
 
@@ -37,10 +43,11 @@ def read_urdf(path: Path, geometry: str) -> Description:
     try:
         _check_elements(path)
         robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
-    except RobotError:
+    except (RobotError, RuntimeWarning):  # a warning where these are errors
         raise
     except Exception as error:
-        raise RobotError(f"{path}: not read as URDF ({first_line(error)})") from None
+        told = f"an element lacks {error}" if isinstance(error, KeyError) else first_line(error)
+        raise RobotError(f"{path}: not read as URDF ({told})") from None
     description, joints = Description(), {joint.child: joint for joint in robot.joints}
     names = [link.name for link in robot.links]
     for what, given in (("links", names), ("joints", [joint.name for joint in robot.joints])):
@@ -56,7 +63,7 @@ def read_urdf(path: Path, geometry: str) -> Description:
             description.joints[joint.name] = _limits(joint, path)
     values = {joint.name: _value_of(joint, robot.joints, path) for joint in robot.joints if joint.type != "fixed"}
     for name in names:
-        _add_link(name, description, joints, values, path, ())
+        _add_link(name, description, joints, values, path)
 
     # By name: frames come parents first, links as they stand in the file.
     description.links = {name: description.links[name] for name in names}
@@ -120,47 +127,62 @@ def _value_of(joint, joints, path) -> tuple[str, float, float]:
     return joint.name, scale, offset
 
 
-def _add_link(name, description, joints, values, path, below):
-    """Add the frame of a link, after those that it hangs on."""
-    if name in description.links:
-        return
-    if name in below:
-        raise RobotError(f"{path}: link {name!r} hangs on itself")
-    joint = joints.get(name)
-    if joint is None:
-        frame = Frame(-1, np.eye(4))
-    else:
-        _add_link(joint.parent, description, joints, values, path, (*below, name))
-        origin = check_rigid(joint.origin, f"{path}: joint {joint.name!r}")
-        frame = Frame(description.links[joint.parent], origin, KINDS[joint.type])
-        if joint.type != "fixed":
-            frame.joint, frame.scale, frame.offset = values[joint.name]
-            axis = (1.0, 0.0, 0.0) if joint.axis is None else joint.axis
-            frame.axis = unit_axis(axis, f"{path}: joint {joint.name!r}")
-    description.links[name] = len(description.frames)
-    description.frames.append(frame)
+def _add_link(name, description, joints, values, path):
+    """Add the frames of a link and of those that it hangs on, the first of these first."""
+    above: dict[str, None] = {}
+    while name is not None and name not in description.links:
+        if name in above:
+            raise RobotError(f"{path}: link {name!r} hangs on itself")
+        above[name] = None
+        name = joints[name].parent if name in joints else None
+    for link in reversed(above):
+        frame, joint = Frame(-1, np.eye(4)), joints.get(link)
+        if joint is not None:
+            where = f"{path}: joint {joint.name!r}"
+            frame = Frame(description.links[joint.parent], check_rigid(joint.origin, where), KINDS[joint.type])
+            if joint.type != "fixed":
+                frame.joint, frame.scale, frame.offset = values[joint.name]
+                frame.axis = unit_axis((1.0, 0.0, 0.0) if joint.axis is None else joint.axis, where)
+        description.links[link] = len(description.frames)
+        description.frames.append(frame)
 
 
 def _check_elements(path):
     """Refuse what yourdfpy mends or leaves out in silence, and warn of joints that it does not read.
 
     Raises:
-        RobotError: A line that is no XML, a geometry of other than one shape.
+        RobotError: A line that is no XML, another root, a geometry of other than one shape, a mesh of other than one.
     """
     from lxml import etree  # of yourdfpy
 
     parser = etree.XMLParser(recover=True)
     root = etree.parse(str(path), parser).getroot()
+    _check_root(root, "URDF", path)
     for error in parser.error_log:
         if error.level == etree.ErrorLevels.FATAL:  # a namespace that is not declared is none
             raise RobotError(f"{path}: not read as URDF (line {error.line}: {error.message})")
-    for shape in root.xpath("//geometry[count(*) != 1]"):
-        raise RobotError(f"{path}: not read as URDF (line {shape.sourceline}: a geometry has one shape)")
+    for odd in root.xpath("//geometry[count(*) != 1] | link/*[self::collision or self::visual][count(geometry) != 1]"):
+        one = "shape" if odd.tag == "geometry" else "geometry"
+        raise RobotError(f"{path}: not read as URDF (line {odd.sourceline}: a {odd.tag} has one {one})")
+    _warn_of_unread([e.tag for e in root.iter() if "xacro" in str(e.tag)], path, 5)
     found = root.xpath("//*[local-name()='gazebo']//joint | //*[contains(name(), 'loop_joint')]")
     if found:
         names = ", ".join(repr(joint.get("name")) for joint in found)
         message = f"{path}: not enforced: joints {names} of a <gazebo> or loop_joint element"
         warnings.warn(message, RuntimeWarning, stacklevel=4)
+
+
+def _check_root(root, what, path):
+    if root is None or root.tag != "robot":
+        told = "it has none" if root is None else f"its root is {root.tag!r}, not 'robot'"
+        raise RobotError(f"{path}: not read as {what} ({told})")
+
+
+def _warn_of_unread(tags, path, level):
+    if tags:
+        names = ", ".join(dict.fromkeys(re.sub(r"^\{.*\}", "xacro:" if "xacro" in tag else "", tag) for tag in tags))
+        told = "; xacro expands a file" if "xacro" in names else ""
+        warnings.warn(f"{path}: not read: elements {names}{told}", RuntimeWarning, stacklevel=level)
 
 
 def _find_file(name, where, path) -> Path:
@@ -169,11 +191,11 @@ def _find_file(name, where, path) -> Path:
     Raises:
         RobotError: There is none.
     """
-    given = (name or "").replace("\\", "/")
+    given = (name or "").strip().replace("\\", "/")
     tails = [re.sub("^package:/+|^[a-z]+://", "", given)]
     if given.startswith(("package:", "model:")):
         tails.append(tails[0].partition("/")[2])
-    for tail in (name, *tails):
+    for tail in (name, *tails, *map(unquote, tails)):
         for folder in (*path.absolute().parents, Path.cwd()):
             if tail and os.path.isfile(folder / tail):
                 return folder / tail
@@ -251,8 +273,8 @@ def apply_srdf(description: Description, path: Path, strict: bool):
         root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as error:
         raise RobotError(f"{path}: not read as SRDF ({first_line(error)})") from None
-    if root.tag != "robot":
-        raise RobotError(f"{path}: not read as SRDF (its root is {root.tag!r}, not 'robot')")
+    _check_root(root, "SRDF", path)
+    _warn_of_unread([entry.tag for entry in root if entry.tag not in SRDF_TAGS], path, 4)
     links, unknown = list(description.links), {}
 
     def read(tag, *attributes):
