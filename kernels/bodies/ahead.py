@@ -1,4 +1,4 @@
-"""How far ahead of bodies contacts are looked for: as they may come in a step, but little beyond the nearest faces.
+"""Speculative contact gaps of rigid bodies: the motion of a step, but little beyond the nearest faces.
 
 Two fine surfaces that come together fast have very many pairs of faces within the motion of a step, of which the
 nearest are what they meet with. So the gap of such an object pair is cut to its distance and half the size of a face.

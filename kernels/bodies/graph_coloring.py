@@ -18,7 +18,7 @@ INACTIVE = wp.constant(127)
 """Color of pairs that are not solved."""
 
 
-HELD = wp.constant(wp.int64(2**55))
+HELD_BID = wp.constant(wp.int64(2**55))
 """Outbids all pairs of a round."""
 
 
@@ -39,7 +39,7 @@ def make_bid(p: wp.int32, turn: wp.int32, pair: wp.vec2i, bodies: Bodies):
 @wp.func
 def held_bid(color: wp.int32, rounds: wp.int32):
     """Return what stands for the bid of a pair that has won a body for the rounds of a color."""
-    return (wp.int64((color + 1) * rounds) << wp.int64(56)) | HELD
+    return (wp.int64((color + 1) * rounds) << wp.int64(56)) | HELD_BID
 
 
 @wp.kernel

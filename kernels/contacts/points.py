@@ -1,4 +1,4 @@
-"""The few points that stand for an object pair, chosen of the candidates of its contacts."""
+"""Contact reduction: a few points of an object pair, the farthest from one another of its candidates."""
 
 import functools
 

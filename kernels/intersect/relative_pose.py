@@ -1,4 +1,4 @@
-"""The start of a traversal: the relative pose of each object pair, and its counters at 0."""
+"""Start of a traversal: the relative pose of each object pair, and its counters at 0."""
 
 import functools
 

@@ -70,7 +70,7 @@ def append_nodes(items: wp.uint64, ends: wp.vec3i, live: bool, of_b: bool, node:
 
 @wp.func
 def level_size(faces: wp.int32):
-    """Return how many nodes the level has that leaves are gathered from: so deep that all of its nodes are there."""
+    """Return the number of nodes of the level to gather leaves from: complete, of at most GATHER_NODES."""
     size = wp.int32(GATHER_NODES)
     while size > 1 and size > faces:
         size /= 2

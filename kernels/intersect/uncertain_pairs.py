@@ -15,7 +15,12 @@ from warp_abtree.kernels.intersect.face_pairs import OUTPUT_ANY, OUTPUT_FACES, H
 from warp_abtree.kernels.search.warp_stack import push_signed_pair, read_signed_pair, signed_pairs
 from warp_abtree.kernels.triangle.corners import load_corner_ids, load_face_pair
 from warp_abtree.kernels.triangle.float32_filter import SEPARATED, rotate_corners
-from warp_abtree.kernels.triangle.float64_filter import SHARED_CORNER, UNDECIDED, filter_planes, filter_straddling
+from warp_abtree.kernels.triangle.float64_filter import (
+    PLANES_UNDECIDED,
+    SHARED_CORNER,
+    filter_planes,
+    filter_straddling,
+)
 
 RESOLVE_THREADS = RESOLVE_WARPS * WARP_SIZE  # of a block
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False, "block_dim": RESOLVE_THREADS}
@@ -185,7 +190,7 @@ def float64_filter_kernel(
                 signs = item_plane_signs(models, states, pair_poses[item[0]], item)
             list_apart_item(item, waits and signs == SEPARATED, hits_inout)
             straddling = push_signed_pair(list, straddling, signs >= 0, item, signs)
-            defer_inexact(hits_inout, signs == UNDECIDED, item)
+            defer_inexact(hits_inout, signs == PLANES_UNDECIDED, item)
             warp_sync()
             first += wp.min(at_once * (threads / warp_size()), end - first)
         if straddling >= warp_size() or (first >= end and straddling > 0):

@@ -1,4 +1,4 @@
-"""Between the poses of Newton's bodies and those of objects, and from contact points to `newton.Contacts`."""
+"""Poses of objects from those of Newton's bodies, and `newton.Contacts` from contact points."""
 
 import warp as wp
 

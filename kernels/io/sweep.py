@@ -11,11 +11,9 @@ from warp_abtree.kernels.io.place_poses import pose_readers
 MODULE_OPTIONS = {"enable_backward": False, "fuse_fp": False}
 wp.set_module_options(MODULE_OPTIONS)
 
-NONE_REFUSED = wp.constant(2**31 - 1)
-
 # report: what a chunk tells the host
 REFUSED = wp.constant(0)  # first pose that is none, NONE_REFUSED if all are
-UNCERTAIN = wp.constant(1)  # face pairs that float32 leaves to the later stages
+UNCERTAIN_COUNT = wp.constant(1)  # face pairs that float32 leaves to the later stages
 
 
 @wp.func
@@ -58,6 +56,6 @@ def report_chunk_kernel(
     """Pack yes and no into bytes, where there is room for them, and report how many face pairs waited."""
     i = wp.tid()
     if i == 0:
-        report_inout[UNCERTAIN] = hits.uncertain_total[0]
+        report_inout[UNCERTAIN_COUNT] = hits.uncertain_total[0]
     if i < any_out.shape[0]:
         any_out[i] = wp.uint8(wp.where(hits.any_hit[i] != 0, 1, 0))

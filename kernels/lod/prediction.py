@@ -35,7 +35,7 @@ RATE_DOWN = wp.constant(4)
 
 @wp.struct
 class Prediction:
-    """What each candidate would cost."""
+    """Predicted costs of each candidate."""
 
     change: wp.array(dtype=wp.int32)  # [candidate] change of the position
     rate: wp.array(dtype=wp.float64)  # [5] see the RATE constants

@@ -24,8 +24,6 @@ QUARTER_1 = wp.constant(wp.float64(1.57079632673412561417e00))
 QUARTER_2 = wp.constant(wp.float64(6.07710050630396597660e-11))
 QUARTER_3 = wp.constant(wp.float64(2.02226624879595063154e-21))
 
-NONE_REFUSED = wp.constant(2**31 - 1)
-
 
 @wp.struct
 class Chain:

@@ -140,7 +140,7 @@ def test_surroundings_are_a_scene_with_bits_lods_and_solids(arm, device):
 def test_chunks_and_small_buffers_change_nothing(arm, monkeypatch):
     rows = random_configurations(50, seed=4)
     whole = [arm.check(rows, AROUND, output=output) for output in ("any", "distance")]
-    monkeypatch.setattr(robot, "CHUNKS", {"cpu": (7,), "cuda": (7,)})
+    monkeypatch.setattr(robot, "ROOMS", {"cpu": (7,), "cuda": (7,)})
     monkeypatch.setattr(check, "PAIRS_GUESS", 0)
     for output, expected in zip(("any", "distance"), whole):
         np.testing.assert_array_equal(arm.check(rows, AROUND, output=output), expected)

@@ -22,6 +22,7 @@ from warp_abtree.interop.robot.description import Description, RobotError
 from warp_abtree.interop.robot.mjcf import read_mjcf
 from warp_abtree.interop.robot.surroundings import make_surroundings
 from warp_abtree.interop.robot.urdf import read_disabled_pairs, read_urdf
+from warp_abtree.kernels.base.arrays import NONE_REFUSED
 from warp_abtree.kernels.robot import forward
 from warp_abtree.model.model import Model
 from warp_abtree.query.distance import check_beyond
@@ -29,7 +30,7 @@ from warp_abtree.scene.scene import Scene
 
 ENDINGS = {".urdf": read_urdf, ".xml": read_mjcf, ".mjcf": read_mjcf}
 # Configurations of a launch: fewer where few are given.
-CHUNKS = {"cpu": (16, 256, 4096), "cuda": (1024, 8192, 65536)}
+ROOMS = {"cpu": (16, 256, 4096), "cuda": (1024, 8192, 65536)}
 # Stretches of an edge at a time, for the room of a chunk.
 STRETCHES = 16
 KEPT = 4  # surroundings whose arrays stay on the device
@@ -232,11 +233,11 @@ class Robot:
             raise ValueError(f"{what}: shape {tuple(rows.shape)}, not (c, {width}), a value of each joint")
         if len(rows) == 0:
             return wp.empty((0, width), dtype=wp.float64, device=self.device)
-        first = wp.full(1, forward.NONE_REFUSED, dtype=wp.int32, device=self.device)
+        first = wp.full(1, NONE_REFUSED, dtype=wp.int32, device=self.device)
         inputs = [int(limits), len(rows), self._chain, rows, first]
         wp.launch(forward.check_configuration_kernel, len(rows), inputs, device=self.device)
         bad = int(first.numpy()[0])
-        if bad != forward.NONE_REFUSED:
+        if bad != NONE_REFUSED:
             self._refuse(rows[bad : bad + 1].numpy()[0], bad, what)
         return rows
 
@@ -255,7 +256,7 @@ class Robot:
     def _find_query(self, world, output, count) -> RobotQuery:
         """Return a query of a room for a number of configurations: the one of before if it is of the same."""
         around, key = make_surroundings(world, self.device)
-        rooms = CHUNKS["cpu" if self.device.is_cpu else "cuda"]
+        rooms = ROOMS["cpu" if self.device.is_cpu else "cuda"]
         room = next((room for room in rooms if room >= count), rooms[-1])
         query = self._kept.pop((key, output, room), None)
         if query is None or not query.is_of(around):

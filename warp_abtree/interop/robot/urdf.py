@@ -9,9 +9,9 @@ import numpy as np
 from warp_abtree.checks.arguments import first_line
 from warp_abtree.interop.robot.description import (
     Description,
-    Frame,
     Part,
     RobotError,
+    RobotFrame,
     check_names,
     check_rigid,
     join_meshes,
@@ -19,7 +19,7 @@ from warp_abtree.interop.robot.description import (
 )
 from warp_abtree.model.mesh import MeshError, load_mesh
 
-KINDS = {"fixed": "fixed", "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+URDF_JOINTS = {"fixed": "fixed", "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 INSTALL = "needs the extra `robot`: pip install 'warp-abtree[robot]'"
 
 
@@ -67,7 +67,7 @@ def read_urdf(path: Path, geometry: str) -> Description:
 
 def _check_joint(joint, joints, names, path):
     where = f"{path}: joint {joint.name!r}"
-    if joint.type not in KINDS:
+    if joint.type not in URDF_JOINTS:
         raise RobotError(f"{where} is {joint.type}; fixed, revolute, continuous and prismatic ones are supported")
     for end in (joint.parent, joint.child):
         if end not in names:
@@ -118,11 +118,11 @@ def _add_link(name, description, joints, values, path, below):
         raise RobotError(f"{path}: link {name!r} hangs on itself")
     joint = joints.get(name)
     if joint is None:
-        frame = Frame(-1, np.eye(4))
+        frame = RobotFrame(-1, np.eye(4))
     else:
         _add_link(joint.parent, description, joints, values, path, (*below, name))
         origin = check_rigid(joint.origin, f"{path}: joint {joint.name!r}")
-        frame = Frame(description.links[joint.parent], origin, KINDS[joint.type])
+        frame = RobotFrame(description.links[joint.parent], origin, URDF_JOINTS[joint.type])
         if joint.type != "fixed":
             frame.joint, frame.scale, frame.offset = values[joint.name]
             axis = (1.0, 0.0, 0.0) if joint.axis is None else joint.axis
