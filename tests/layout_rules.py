@@ -285,9 +285,12 @@ def banned_faults(tree):
     return sorted(name for name in names if banned.search(name.lower()))
 
 
-def title_faults(tree):
-    """List the title of a module that asks in the place of naming the subject, or the lack of one."""
-    title = (ast.get_docstring(tree) or "").partition("\n")[0]
+def title_faults(source):
+    """List the title of a module or native file that asks in the place of naming the subject, or the lack of one."""
+    if source.lstrip().startswith("//"):
+        title = source.lstrip().partition("\n")[0].lstrip("/ ")
+    else:
+        title = (ast.get_docstring(parse(source)) or "").partition("\n")[0]
     return [f"line 1: {title}"] if not title or RIDDLES.match(title) else []
 
 

@@ -116,7 +116,7 @@ def test_files(path):
     assert not hidden_import_faults(tree)
     assert not size_faults(tree, text)
     assert not banned_faults(tree)
-    assert not title_faults(tree)
+    assert not title_faults(text)
 
 
 def test_a_name_has_one_definition():
@@ -139,6 +139,7 @@ def test_native_code_stands_in_its_folder():
     assert all(path.is_relative_to(ROOT / "kernels" / "native") for path in NATIVE)
     lengths = {shown(path): len(path.read_text(encoding="utf-8").splitlines()) for path in NATIVE}
     assert {name: count for name, count in lengths.items() if count > NATIVE_LINES} == {}
+    assert [shown(path) for path in NATIVE if title_faults(path.read_text(encoding="utf-8"))] == []
 
 
 def test_kernel_folders_hold_no_code_in_init():
@@ -281,11 +282,19 @@ def test_rule_of_names_catches(source):
 
 
 @pytest.mark.parametrize(
-    "source", ['"""Whether two boxes overlap."""', '"""How far."""\nx = 1', '"""\nWhich pairs meet."""', "x = 1"]
+    "source",
+    [
+        '"""Whether two boxes overlap."""',
+        '"""How far."""\nx = 1',
+        '"""\nWhich pairs meet."""',
+        "x = 1",
+        "// How wide.\n",
+    ],
 )
 def test_rule_of_titles_catches(source):
-    assert title_faults(parse(source))
-    assert not title_faults(parse('"""Whichever: even-odd ray test.\n\nWhether a point is inside."""'))
+    assert title_faults(source)
+    assert not title_faults('"""Whichever: even-odd ray test.\n\nWhether a point is inside."""')
+    assert not title_faults("// Slabs.\n// How wide.\n")
 
 
 @pytest.mark.parametrize(

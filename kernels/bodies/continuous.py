@@ -40,7 +40,7 @@ ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 
 @wp.struct
 class StepMotions:
-    """Ways of objects in a step."""
+    """Motions of objects in a step."""
 
     # static
     world: wp.array(dtype=wp.int32)  # number of the world that is held together, shape [object]

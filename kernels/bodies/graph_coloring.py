@@ -28,7 +28,7 @@ def make_bid(p: wp.int32, turn: wp.int32, pair: wp.vec2i, bodies: Bodies):
 
     The hash is of ranks in a world, not of object numbers, so a world has the same coloring alone and among others.
 
-    Bits: 63..56 round + 1 | 55 zero, or HELD | 54..31 hash | 30..0 pair
+    Bits: 63..56 round + 1 | 55 zero, or HELD_BID | 54..31 hash | 30..0 pair
     """
     mixed = wp.uint32(bodies.rank[pair[0]]) * wp.uint32(40503) + wp.uint32(bodies.rank[pair[1]])
     mixed = (mixed ^ (mixed >> wp.uint32(15))) * wp.uint32(739982445)

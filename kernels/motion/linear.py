@@ -298,7 +298,7 @@ def posed_corners(
 
 
 @wp.func(inline=False)
-def carry_on_in_world(
+def resolve_in_world(
     poses: EndPoses, pair: wp.vec2i, a: corners_type, b: corners_type, start: wp.float64, best: wp.float64
 ):
     """Return the `FirstContact` of faces of models, see `stalled`."""
@@ -328,7 +328,7 @@ def advance_linear_pair(
     at_b = map_corners(motion.first, motion.offset, b)
     contact = advance_straight(tolerance, motion.slack, a, at_b, way_a, way_b, start, best)
     if contact.end == STALLED:
-        contact = carry_on_in_world(poses, motion.objects, a, b, contact.time, best)
+        contact = resolve_in_world(poses, motion.objects, a, b, contact.time, best)
     return contact
 
 

@@ -1,4 +1,4 @@
-// What a thread of the CPU keeps of a search for the nearest faces.
+// Memory of a CPU thread that searches for the nearest faces.
 #pragma once
 #include "builtin.h"
 #include "base/sizes.h"
