@@ -98,7 +98,7 @@ def reach_box(lower: wp.vec3, upper: wp.vec3):
 
 @wp.func
 def measure_rotation(r: wp.mat33d):
-    """Return how far R^T R and R are off the identity, the largest entries."""
+    """Return the largest entries of |R^T R - 1| and |R - 1|."""
     skew = wp.float64(0.0)
     size = wp.float64(0.0)
     for i in range(3):
@@ -129,14 +129,14 @@ def has_node_slabs(models: ModelPool, states: StatePool, state: wp.int32):
 
 @wp.func
 def active_faces(models: ModelPool, states: StatePool, state: wp.int32):
-    """Return about how many faces a state has: a vertex split of a closed manifold adds two."""
+    """Estimate the number of faces of a state: a vertex split of a closed manifold adds two."""
     model = states.model[state]
     return models.face_count[model] - 2 * (models.lod_max[model] - states.lod[state])
 
 
 @wp.func
 def place_trees(models: ModelPool, states: StatePool, state_a: wp.int32, state_b: wp.int32):
-    """Return a `PairPose` that says where the trees lie, and no more."""
+    """Return a `PairPose` with the places of the trees in the pool, and no more."""
     pose = PairPose()
     pose.node_a = states.node_start[state_a]
     pose.node_b = states.node_start[state_b]

@@ -158,7 +158,7 @@ def widen_motion_kernel(
 
 @wp.func
 def way_length(objects: ObjectPool, motions: StepMotions, bodies: Bodies, i: wp.int32):
-    """Return about how far a body's surface moves, 0 for others."""
+    """Estimate the length of the path of a body's surface, 0 for others."""
     if bodies.motion_type[i] != DYNAMIC:
         return wp.length(motions.ends.position[i] - objects.position[i])
     turn = motions.ends.rotation[i] - objects.rotation[i]

@@ -38,7 +38,7 @@ def make_bid(p: wp.int32, turn: wp.int32, pair: wp.vec2i, bodies: Bodies):
 
 @wp.func
 def held_bid(color: wp.int32, rounds: wp.int32):
-    """Return what stands for the bid of a pair that has won a body for the rounds of a color."""
+    """Return the bid by which a pair holds a body that it has won, for the rounds of a color."""
     return (wp.int64((color + 1) * rounds) << wp.int64(56)) | HELD_BID
 
 

@@ -55,7 +55,7 @@ class Placement:
 
 @wp.func_native(native.body("build/fetch_edges.h", "fetch_edges"))
 def fetch_edges(surface: Surface, rings: Rings, heap: Heap, size: wp.int32):
-    """Bring what the next merges will read into the caches of this core."""
+    """Prefetch what the next merges will read into the caches of this core."""
 
 
 @wp.func

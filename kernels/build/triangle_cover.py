@@ -94,7 +94,7 @@ def cover_ring(
 
 @wp.func_native(native.body("build/fetch_merge.h", "fetch_merge"))
 def fetch_merge(replay: Replay, merge_pair: wp.array2d(dtype=int), merge_count: wp.int32, j: wp.int32):
-    """Bring what the merges after merge j will read into the caches of this core."""
+    """Prefetch what the merges after merge j will read into the caches of this core."""
 
 
 @wp.func

@@ -114,7 +114,7 @@ def keep_nearest_kernel(
     contacts: Contacts,
     curves_inout: Curves,
 ):
-    """Take candidates from contacts that have a neighbour with a face nearer to their points than theirs are.
+    """Drop the candidates of contacts of which a neighbour has a face nearer to their points than theirs are.
 
     A warp has `CONTACTS_A_WARP` contacts. A lane takes the next of them when it is done with one, so that none waits
     for the lane whose faces have most neighbours.

@@ -220,7 +220,7 @@ def find_near_contact_kernel(
     uncertain_only: bool,
     contacts_inout: Contacts,
 ):
-    """Compute the contacts of faces that are apart, which are listed, every so many-th a thread.
+    """Compute the contacts of faces that are apart, which are listed, in a grid-stride loop.
 
     Args:
         uncertain_only: Whether `simd_contacts` has done all but those that are uncertain there, which keep their mark.

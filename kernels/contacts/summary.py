@@ -36,7 +36,7 @@ class PairContacts:
 
 @wp.struct
 class ChunkSums:
-    """Sums over each chunk, and what a pair's chunks need of each other."""
+    """Sums over each chunk, and data of a pair that its chunks share."""
 
     span: wp.array(dtype=wp.vec3i)  # (pair, first contact, end), shape [chunk]; nothing behind the last pair's
     length: wp.array(dtype=wp.float64)  # sum of lengths, shape [chunk]

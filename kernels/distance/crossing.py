@@ -30,7 +30,7 @@ wp.set_module_options(MODULE_OPTIONS)
 
 @wp.func_native(native.body("search/nearest_stack.cuh", "push_in_order"))
 def push_in_order(items: wp.uint64, end: wp.int32, kinds: wp.vec4i, children: four_items) -> wp.int32:
-    """Append what is not dropped to the stack, the first child of the first lane last; return the new end."""
+    """Push the items that are not dropped, the first child of the first lane last; return the new end."""
 
 
 @wp.func

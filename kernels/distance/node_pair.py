@@ -89,7 +89,7 @@ def bound_children(
     item: wp.int64,
     live: wp.int32,
 ):
-    """Compare what an item names; return the items that follow, what each is, their bounds, and how many were compared.
+    """Expand an item; return the items that follow, their kinds, their bounds, and how many were compared.
 
     live is -1, or 0 where nothing is asked of the item, which still names nodes.
     """

@@ -70,7 +70,7 @@ def report_pair(
     hits: Hits,
     distances: Distances,
 ):
-    """Report an object pair; of those that intersect, what does not depend on where."""
+    """Report an object pair; of those that intersect only what needs no position."""
     zero = wp.float64(0.0)
     if hits.any_hit[p] != 0:
         distances.distance[p] = zero

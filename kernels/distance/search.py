@@ -166,7 +166,7 @@ def expand_nearest(
     slabs: Slabs,
     search: Search,
 ):
-    """Compare what items first to first + popped name, one a lane.
+    """Expand items first to first + popped, one a lane.
 
     Returns both ends, see `push_nearest`, and how many were compared.
     """
@@ -201,7 +201,7 @@ def search_items(
     found: NearestFound,
     work: Work,
 ):
-    """Search so many items on the stack that are not given away; return what this lane compared: boxes and faces."""
+    """Search so many items of the stack, less those donated; return this lane's tests of boxes and of faces."""
     items, pair, scaling = nearest_stack(), search.pair, search.scaling
     head, end, waiting, opened = wp.int32(0), wp.int32(count), wp.int32(0), wp.int32(0)
     tests, seen = wp.vec2i(), wp.vec2i()

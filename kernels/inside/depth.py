@@ -179,7 +179,7 @@ def deepest_of_both(
     known: Deepest,
     sampling: Sampling,
 ):
-    """Return the deepest of what is known and all samples of either object inside the other, where that is a solid."""
+    """Return the deepest of a known sample and all samples of either object inside the other, where that is a solid."""
     best = known
     if solids.is_solid[wp.max(pair[0], pair[1])] != 0:
         best = find_deepest_sample(models, states, pose, first, second, room, known, sampling)

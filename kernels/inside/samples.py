@@ -111,7 +111,7 @@ def measure_samples(
     known: Deepest,
     sampling: Sampling,
 ):
-    """Return the deepest of what is known and the samples of a face that are inside the outer object."""
+    """Return the deepest of a known sample and the samples of a face that are inside the outer object."""
     best = known
     a, b, c = load_posed_face(models, states, pose, inner.of_b, face)
     centre = wp.where(inner.of_b, outer.centre, inner.centre)

@@ -88,7 +88,7 @@ def expand_items(
     states: StatePool,
     pose: PairPose,
 ):
-    """Test items first to first + popped, one a lane, append what they emit; return ends and pairs compared.
+    """Expand items first to first + popped, one a lane, and append what they emit; return ends and pairs compared.
 
     Lanes without an item look at another's, so that none branches.
     """
@@ -190,7 +190,7 @@ def traverse_items(
     hits: Hits,
     work: Work,
 ):
-    """Traverse what is on the stack and is not given away; return pairs of boxes compared, and face pair tests."""
+    """Traverse the stack, less the items donated; return pairs of boxes compared, and face pair tests."""
     items, for_any = own.items, pace.for_any
     head, ends = wp.int32(0), wp.vec3i(own.end, 0, 0)
     node_tests, turn = wp.int32(0), wp.int32(0)
@@ -255,7 +255,7 @@ def open_stack():
 
 @wp.func
 def count_tests(hits: Hits, pair: wp.int32, node_tests: wp.int32, tests: wp.vec3i):
-    """Count what the lanes have tested: pairs of boxes, and what `traverse_items` returns of face pairs."""
+    """Count the tests of all lanes: pairs of boxes, and the face pair tests of `traverse_items`."""
     add_warp_sum(hits.node_tests, pair, node_tests)
     add_warp_sum(hits.count, pair, tests[0])
     add_warp_sum(hits.triangle_tests, pair, tests[1])

@@ -129,7 +129,7 @@ def find_near_kernel(
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
-    """Report the face pairs that are apart and nearer than the gap, every so many-th a thread; a block is a warp.
+    """Report the face pairs that are apart and nearer than the gap, in a grid-stride loop; a block is a warp.
 
     Float32 drops most; those it leaves wait for float64 until a warp of them does.
     """

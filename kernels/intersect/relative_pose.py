@@ -132,7 +132,7 @@ def relative_poses(with_distances: bool):
 
 @functools.cache
 def pairs_starter(with_distances: bool):
-    """Return the function by which one thread does what `relative_poses` do, where it is to."""
+    """Return the function by which one thread starts all pairs, as the kernels of `relative_poses` do."""
     start_pose = pose_starter(with_distances)
 
     @wp.func

@@ -149,7 +149,7 @@ def resolve_uncertain(
     uncertain: wp.array(dtype=wp.int64),
     met_inout: wp.array(dtype=wp.int64),
 ):
-    """Decide uncertain face pairs, as `resolve_faces`: for EXACT in float64, then what is inexact there.
+    """Decide uncertain face pairs, as `resolve_faces`: for EXACT in float64, then the inexact ones by exact signs.
 
     Not inlined: compiling takes less long, and most calls of its caller have none.
 
@@ -186,7 +186,7 @@ def test_leaf_pairs(
     faces: wp.array(dtype=wp.int64),
     uncertain: wp.array(dtype=wp.int64),
 ):
-    """Test leaf pairs in all stages; return how many met, which stand in front of the list then, and what it took."""
+    """Test leaf pairs in all stages; return how many met, put in front of the list, and the counts of tests."""
     if mode == WITHIN:
         near, decided = resolve_faces(mode, output, models, states, pose, 0, waiting, faces, faces)
         return near, long_counts(wp.int64(0), wp.int64(decided), wp.int64(0), wp.int64(0))

@@ -73,7 +73,7 @@ def compare_boxes(
 
 @wp.func_native(native.body("intersect/small_trees.cuh", "reserve_run"))
 def reserve_run(total: wp.array(dtype=wp.int32), count: wp.int32) -> wp.int32:
-    """Count so many into total[0], the same number in all lanes; return what it was."""
+    """Add the same number of all lanes to total[0]; return its value before."""
 
 
 @wp.func_native(native.body("intersect/small_trees.cuh", "read_quarter"))

@@ -97,7 +97,7 @@ def resolve_rounded_kernel(
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
-    """Decide the uncertain face pairs of FLOAT32 by rounded determinants: every so many-th a thread."""
+    """Decide the uncertain face pairs of FLOAT32 by rounded determinants, in a grid-stride loop."""
     lane = resolve_lane()
     end = wp.min(hits_inout.uncertain_total[0], hits_inout.uncertain.shape[0])
     at_once = items_at_once(end, threads)
@@ -113,7 +113,7 @@ def resolve_rounded_kernel(
 
 @wp.func
 def item_plane_signs(models: ModelPool, states: StatePool, pose: PairPose, item: wp.vec3i):
-    """Return what `filter_planes` says of a face pair."""
+    """Return the signs of `filter_planes` for a face pair."""
     a = load_corner_ids(states, pose.corner_a + item[1])
     b = load_corner_ids(states, pose.corner_b + item[2])
     a0, a1, a2, b0, b1, b2 = load_face_pair(models, pose, a, b)
@@ -171,7 +171,7 @@ def float64_filter_kernel(
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
-    """Decide the uncertain face pairs, every so many-th a thread, and list those that are inexact in float64.
+    """Decide the uncertain face pairs, in a grid-stride loop, and list those that are inexact in float64.
 
     Planes first: they separate most pairs, and only straddling pairs take edges, when a warp of them waits.
     """
@@ -208,7 +208,7 @@ def resolve_inexact_kernel(
     pair_poses: wp.array(dtype=PairPose),
     hits_inout: Hits,
 ):
-    """Decide the inexact face pairs by exact signs: every so many-th a thread."""
+    """Decide the inexact face pairs by exact signs, in a grid-stride loop."""
     lane = resolve_lane()
     end = hits_inout.inexact_total[0]
     at_once = items_at_once(end, threads)

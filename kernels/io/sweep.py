@@ -18,7 +18,7 @@ UNCERTAIN_COUNT = wp.constant(1)  # face pairs that float32 leaves to the later 
 
 @wp.func
 def refuse_pose(objects: ObjectPool, report: wp.array(dtype=wp.int32), i: wp.int32):
-    """Note that row i is no pose, and place its object where it meets nothing."""
+    """Note the index i of a bad pose, and place its object at NaN, where it meets nothing."""
     far = wp.float64(wp.nan)
     objects.position[i + 1] = wp.vec3d(far, far, far)
     objects.rotation[i + 1] = wp.identity(n=3, dtype=wp.float64)
@@ -53,7 +53,7 @@ def report_chunk_kernel(
     report_inout: wp.array(dtype=wp.int32),
     any_out: wp.array(dtype=wp.uint8),
 ):
-    """Pack yes and no into bytes, where there is room for them, and report how many face pairs waited."""
+    """Pack yes and no into bytes, where there is room for them, and report the number of uncertain face pairs."""
     i = wp.tid()
     if i == 0:
         report_inout[UNCERTAIN_COUNT] = hits.uncertain_total[0]

@@ -82,7 +82,7 @@ def begin_prediction_kernel(
 
 @wp.func
 def predict_nodes(entries: wp.int32, faces: wp.int32, full_share: wp.float64):
-    """Return about how many nodes an LOD change refits, by equation 1, from the entries of its slice.
+    """Estimate the number of nodes that an LOD change refits, by equation 1, from the entries of its slice.
 
     A slice lists each face about twice.
     """

@@ -174,7 +174,7 @@ def step_along(gap: wp.float64, rate: wp.float64, bend: wp.float64):
 
 @wp.func
 def time_after(t: wp.float64, step: wp.float64):
-    """Return the time that a step leads to, rounded down."""
+    """Return the time at the end of a step, rounded down."""
     return (t + step) * TIME_DOWN
 
 

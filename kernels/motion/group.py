@@ -47,7 +47,7 @@ motion_stack_code = partial(native.body, "search/motion_stack.cuh")
 
 @wp.func_native(motion_stack_code("motion_stack"))
 def motion_stack() -> wp.uint64:
-    """Return where this warp's lists lie, an address in shared memory on CUDA."""
+    """Return the address of this warp's lists, in shared memory on CUDA."""
 
 
 @wp.func_native(motion_stack_code("read_tag"))
@@ -168,7 +168,7 @@ def advance_face_pairs(
     motion: Any,
     before: Group,
 ):
-    """Advance face pairs, one a lane; return what is found and the lists' ends.
+    """Advance face pairs, one a lane; return the group with their contacts, and the lists' ends.
 
     Args:
         mode: ONE_STEP for those that go on, NORMALS for those that wait.

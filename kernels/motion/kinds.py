@@ -71,7 +71,7 @@ def advance_nodes(
     item: wp.int64,
     live: wp.int32,
 ):
-    """Compare what an item names from t on, see `node_pair.advance_children`."""
+    """Expand an item from time t on, see `node_pair.advance_children`."""
     boxes = box_motion(motion, place_motion(motion, wp.float64(t)))
     items, kinds, times, tests = advance_children(states, pose, motion, boxes, t, best, item, live)
     return items, kinds, times, tests

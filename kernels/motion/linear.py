@@ -147,7 +147,7 @@ def see(node: Node, motion: LinearMotion, at: wp.mat33, shift: wp.vec3, way: wp.
 
 @wp.func
 def compare(a: Seen, b: Seen, before: wp.vec2) -> wp.vec2:
-    """Return the longest step and the widest gap along three axes, and of what was found before."""
+    """Return the longest step and the widest gap along three axes, and of those found before."""
     bend = wp.float32(BEND_LEAST)
     return longest_step(b.sum - a.sum, a.size + b.size, b.speed - a.speed, a.spread + b.spread, bend, before)
 
@@ -184,7 +184,7 @@ def advance_linear_children(
     item: wp.int64,
     live: wp.int32,
 ):
-    """Compare what an item names from t on, as `node_pair.advance_children`."""
+    """Expand an item from time t on, as `node_pair.advance_children`."""
     x, y = item_first(item), item_second(item)
     at_a, at_b = pose.node_a + (x & INDEX_MASK), pose.node_b + (y & INDEX_MASK)
     a0 = load_constant_node(states, at_a)

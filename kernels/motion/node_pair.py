@@ -51,7 +51,7 @@ class BoxMotion:
 
 @wp.struct
 class MovingBox:
-    """A box in its own frame, in the other's, and how fast its points move there."""
+    """A box in its own frame, in the other's, and the speeds of its points there."""
 
     at: PosedBox  # in both frames
     speed: wp.vec3  # twice that of its centre, other frame
@@ -103,7 +103,7 @@ def step_of(gap: wp.float32, rate: wp.float32, bend: wp.float32):
 def longest_step(
     between: wp.vec3, reach: wp.vec3, speed: wp.vec3, spread: wp.vec3, bend: wp.float32, best: wp.vec2
 ) -> wp.vec2:
-    """Return the longest step and the widest gap along three axes, and of what was found before."""
+    """Return the longest step and the widest gap along three axes, and of those found before."""
     step, widest = best[0], best[1]
     for i in range(3):
         gap = wp.abs(between[i]) - reach[i]
@@ -124,7 +124,7 @@ def step_boxes(a: MovingBox, b: MovingBox, motion: Motion):
 
 @wp.func
 def later(t: wp.float32, step: wp.float32):
-    """Return the time that a step leads to, rounded down; t where the step is lost to rounding."""
+    """Return the time at the end of a step, rounded down; t where the step is lost to rounding."""
     return wp.max(t, (t + step * LATER) * SUM_DOWN)
 
 

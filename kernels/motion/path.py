@@ -206,7 +206,7 @@ def start_motion(paths: Paths, models: ModelPool, states: StatePool, objects: Ob
 
 @wp.func
 def pair_skew(objects: ObjectPool, a: wp.int32, first: wp.mat33d):
-    """Return how far rotations of A, and of B in its frame, are off orthonormal."""
+    """Return the errors of orthonormality of the rotations of A, and of B in its frame."""
     own, _ = measure_rotation(objects.rotation[a])
     skew, _ = measure_rotation(first)
     return own + skew

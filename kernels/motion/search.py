@@ -33,7 +33,7 @@ LIST_WORDS = int(STRADDLING_START) + int(STRADDLING_START) // 2
 
 @wp.func_native(native.body("search/nearest_stack.cuh", "thread_lists"))
 def thread_lists(memory: wp.array2d(dtype=wp.int64), thread: wp.int32) -> wp.uint64:
-    """Return where the lists of a thread of the CPU lie."""
+    """Return the address of a CPU thread's lists."""
 
 
 @wp.func

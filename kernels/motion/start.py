@@ -84,7 +84,7 @@ def contact_starter(kind):
         contacts_inout: FirstContacts,
         motion_out: wp.array(dtype=kind),
     ):
-        """Prepare an object pair a thread: decide what intersects at first, and what the root boxes prove clear."""
+        """Prepare an object pair a thread: settle pairs that intersect at first, or that the root boxes prove clear."""
         p = wp.tid()
         if p == 0:
             contacts_inout.counter[1] = 0

@@ -113,7 +113,7 @@ def write_nearest_kernel(
     nearest_inout: NearestParts,
     chunk_inout: Chunk,
 ):
-    """Write the answers of the pairs that `find_winner_kernel` has found; what intersects is decided."""
+    """Write the answers of the pairs of `find_winner_kernel`; pairs that intersect are settled."""
     p = wp.tid()
     if p >= wp.min(pair_count[0], pairs.shape[0]):
         return

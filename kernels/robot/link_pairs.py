@@ -48,7 +48,7 @@ class Parts:
 
 @wp.struct
 class Chunk:
-    """Configurations that are asked at a time, and what is known of them."""
+    """Configurations that are checked at a time, and their states so far."""
 
     count: wp.array(dtype=wp.int32)  # of configurations, shape [1]
     half: wp.array2d(dtype=wp.float64)  # what joint values may differ by, shape [configuration, column]; of ASK_WITHIN

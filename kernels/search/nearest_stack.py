@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.func_native(nearest_stack_code("nearest_stack"))
 def nearest_stack() -> wp.uint64:
-    """Return where this warp's lists lie, an address in shared memory on CUDA, and behind them a bound for each entry.
+    """Return the address of this warp's lists, in shared memory on CUDA, each entry's bound behind them.
 
     Node pairs, face pairs for float32, and face pairs for float64.
     """

@@ -22,7 +22,7 @@ warp_stack_code = functools.partial(native.body, "search/warp_stack.cuh")
 
 @wp.func_native(warp_stack_code("warp_stack"))
 def warp_stack() -> wp.uint64:
-    """Return where this warp's items lie, an address in shared memory on CUDA.
+    """Return the address of this warp's items, in shared memory on CUDA.
 
     Its stack, its leaf pairs, those that straddle each other's planes, the signs of these, half an item each, and its
     slab pairs.
@@ -62,7 +62,7 @@ def read_signs(items: wp.uint64, i: wp.int32) -> wp.int32:
 
 @wp.func_native(warp_stack_code("signed_pairs"))
 def signed_pairs() -> wp.uint64:
-    """Return where this warp holds face pairs with their signs, an address in shared memory on CUDA."""
+    """Return the address of this warp's face pairs with their signs, in shared memory on CUDA."""
 
 
 @wp.func_native(warp_stack_code("push_signed_pair"))

@@ -152,7 +152,7 @@ def refit_ancestors(own: BlockThread, states: StatePool, leaf: wp.int32, record:
 
 @wp.func
 def refit_slice(own: BlockThread, models: ModelPool, states: StatePool, slice: wp.vec2i):
-    """Refine each face of a slice, once, and refit its leaf and what is above."""
+    """Refine each face of a slice, once, and refit its leaf and the ancestors."""
     entry = own.thread
     while entry < slice[1]:
         face = models.split_face[slice[0] + entry]

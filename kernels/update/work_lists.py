@@ -22,7 +22,7 @@ WHOLE = wp.constant(-1)
 
 @wp.struct
 class UpdateLists:
-    """States under update: those that refit what a slice of faces touches (partial), and those refitted whole (full).
+    """States under update: partial, refitted where a slice of faces touches them, and full, refitted whole.
 
     A block updates a state by itself (`block_update`), or all threads work through lists, level by level. A total holds
     two counts in one word, so that one atomic takes an update's place and its items' places:

@@ -54,11 +54,10 @@ def _passes(precision, with_gap: bool) -> list:
 class Query(QueryReadout):
     """Intersection of many object pairs as an operator: allocates once, launches many times.
 
-    `launch()` only launches, so that a CUDA graph can capture it, the first launch too. Objects added to the scene ask
-    for a new query; so do pairs filtered out of it, where the query runs the broad phase. A captured graph holds until
-    arrays that it uses are replaced: by these, by a change of LODs that takes more tree states than the scene had room
-    for, and by a buffer that grows. `result()` refuses what a stale graph has left. Keep the query as long as its
-    graphs.
+    `launch()` only launches, so that a CUDA graph can capture it, the first launch too. Make a new query after adding
+    objects to the scene, or filtering pairs where the query runs the broad phase. A captured graph holds until arrays
+    that it uses are replaced: by these, by a change of LODs that takes more tree states than the scene had room for,
+    and by a buffer that grows. `result()` refuses what a stale graph has left. Keep the query as long as its graphs.
 
     Args:
         scene: `Scene` or `Batch` whose poses and LODs hold at the time of each launch.
